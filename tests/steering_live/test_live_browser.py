@@ -191,7 +191,7 @@ def type_into(page, label: str, text: str) -> None:
 
 def check(page, label: str) -> None:
     """Set a box, or leave it set."""
-    page.get_by_text(label).locator("xpath=following::input[@type='checkbox'][1]").check(force=True)
+    page.get_by_text(label, exact=True).locator("xpath=following::input[@type='checkbox'][1]").check(force=True)
 
 
 def pester(pages, until: float, least: int) -> int:
