@@ -1,5 +1,6 @@
 """A density of a few kilobytes that glides: small enough for tests that need any prior, not a good one."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -15,8 +16,15 @@ CONFIG = LstmGmmConfig(width=16, components=2)
 ABILITIES = DataLimits(slowest=0.2, fastest=2.0, turn_rate=1.5)
 
 
-def save_tiny_prior(path: Path, *, seed: int = 0, starts: int = 8, labels: tuple[str, ...] = ()) -> Path:
-    """Write the weights and the card; returns the path for --prior."""
+def save_tiny_prior(
+    path: Path,
+    *,
+    seed: int = 0,
+    starts: int = 8,
+    labels: tuple[str, ...] = (),
+    held_out: Mapping[str, Sequence[str]] | None = None,
+) -> Path:
+    """Write the weights and the card, which names the clips that training did not see; returns the path for --prior."""
     torch.manual_seed(seed)
     mean, std = _statistics()
     config = replace(CONFIG, labels=labels)
@@ -33,7 +41,7 @@ def save_tiny_prior(path: Path, *, seed: int = 0, starts: int = 8, labels: tuple
         kind="lstm-gmm",
         config=config.as_card(),
         licence="none, it is made up",
-        data={"starts": [f"start {number}" for number in range(starts)]},
+        data={"starts": [f"start {number}" for number in range(starts)], "held_out": dict(held_out or {})},
         quality={"mocap": {"sway_cm": {"mean": 1.9, "p2": 1.2, "p98": 2.6}}},
         abilities=asdict(ABILITIES),
         **checkpoints.Card.layout_fields(),

@@ -14,6 +14,7 @@ from mapctl import retarget
 from priors import checkpoints
 
 LONG = replace(tiny_stitcher.CONFIG, longest=61)
+HELD_OUT = {"validation": ["bandai/a_walk_0.bvh"], "test": ["bandai/a_walk_1.bvh"]}
 
 
 @pytest.fixture(scope="module")
@@ -25,8 +26,7 @@ def folder(tmp_path_factory):
         clip = path / "data" / "bandai" / f"a_walk_{number}.bvh"
         clip.parent.mkdir(parents=True, exist_ok=True)
         retarget.from_canonical(motion, retarget.identify_rig(motion.skeleton)).save(clip)
-    held = {"validation": ["bandai/a_walk_0.bvh"], "test": ["bandai/a_walk_1.bvh"]}
-    card = replace(tiny_transformer.card(), data={"held_out": held})
+    card = replace(tiny_transformer.card(), data={"held_out": HELD_OUT})
     checkpoints.save(tiny_transformer.network(drawn=0.05).state_dict(), card, path / "ours.safetensors")
     save_tiny_infiller(path / "other.safetensors", drawn=0.1)
     return path
@@ -58,8 +58,7 @@ def test_finished_rows_and_auto_if_asked(folder, capsys):
 
 
 def test_a_stitcher_has_rows_of_its_calm_answer_and_its_draws(folder, capsys):
-    held = {"validation": ["bandai/a_walk_0.bvh"], "test": ["bandai/a_walk_1.bvh"]}
-    network, card = tiny_stitcher.network(config=LONG), replace(tiny_stitcher.card(LONG), data={"held_out": held})
+    network, card = tiny_stitcher.network(config=LONG), replace(tiny_stitcher.card(LONG), data={"held_out": HELD_OUT})
     checkpoints.save(network.state_dict(), card, folder / "stitch.safetensors")
     name = str(folder / "stitch.safetensors")
     rows = measure(folder, capsys, "--past", "1", "--raw", "--stitcher", name)
@@ -75,14 +74,13 @@ def test_a_stitcher_has_rows_of_its_calm_answer_and_its_draws(folder, capsys):
 
 
 def test_with_a_density_there_are_its_rollouts_and_the_best_draw_by_its_energy(folder, capsys):
-    held = {"validation": ["bandai/a_walk_0.bvh"], "test": ["bandai/a_walk_1.bvh"]}
     names = []
     for number in range(2):
         network = tiny_stitcher.network(config=LONG, seed=number)
-        card = replace(tiny_stitcher.card(LONG), data={"held_out": held})
+        card = replace(tiny_stitcher.card(LONG), data={"held_out": HELD_OUT})
         checkpoints.save(network.state_dict(), card, folder / f"stitch-{number}.safetensors")
         names.append(str(folder / f"stitch-{number}.safetensors"))
-    prior = save_tiny_prior(folder / "prior.safetensors")
+    prior = save_tiny_prior(folder / "prior.safetensors", held_out=HELD_OUT)
     words = ("--count", "1", "--past", "1", "--raw", "--stitcher", ",".join(names), "--prior", prior)
     rows = measure(folder, capsys, *words)
     methods = {row["method"] for row in rows}
@@ -93,10 +91,13 @@ def test_with_a_density_there_are_its_rollouts_and_the_best_draw_by_its_energy(f
         assert nearest <= likeliest
 
 
-def test_a_stitcher_that_saw_the_clips_is_refused(folder, capsys):
-    tiny_stitcher.save_tiny_stitcher(folder / "seen.safetensors")
+@pytest.mark.parametrize(
+    ("option", "save"), [("--stitcher", tiny_stitcher.save_tiny_stitcher), ("--prior", save_tiny_prior)]
+)
+def test_models_that_saw_the_clips_are_refused(folder, capsys, option, save):
+    save(folder / "seen.safetensors")
     words = ["--data", folder / "data", "--inbetweener", folder / "ours.safetensors"]
-    assert run("bench", "transitions", *words, "--stitcher", folder / "seen.safetensors") == 2
+    assert run("bench", "transitions", *words, option, folder / "seen.safetensors") == 2
     assert "was trained on bandai/a_walk_0.bvh" in capsys.readouterr().err
 
 
