@@ -12,6 +12,8 @@ from linear_inbetweener import LinearInbetweener
 from methods import by_method
 from tiny_infiller import tiny_infiller
 
+from controllers.inbetweening.pipeline import InfillSettings
+from controllers.inbetweening.proposers import SlerpInbetweener
 from controllers.inbetweening.proposers.partial_keys import propose_through_keys
 from controllers.inbetweening.tween import tween
 from mapctl.inbetweening import GapQuery
@@ -134,3 +136,18 @@ def test_the_body_moves_for_a_hand_only_where_its_arm_does_not_reach(share, move
     assert float(away) <= limb.length(CANONICAL)
     if not moves:
         assert torch.equal(made.motion.local_quat_xyzw, freely.local_quat_xyzw)
+
+
+@pytest.mark.parametrize("finish", [False, True], ids=["proposed", "finished"])
+def test_hands_over_the_head_are_reached_by_the_arms(finish):
+    """By one that takes no such keys too: where its arms hung, the MAP stage had to lift the whole body."""
+    motion, hands = walk(31), CANONICAL.indices(("leftHand", "rightHand"))
+    places = motion.joint_positions().clone()
+    across = torch.tensor([0.8, 0.0, 0.8]).double()
+    head = places[15, CANONICAL.index("head")].clone()
+    places[15, hands] = head + (places[15, hands] - head) * across + torch.tensor([0.0, 0.15, 0.0]).double()
+    told = {CANONICAL.names[hand]: tuple(places[15, hand].tolist()) for hand in hands}
+    keys = Keys((0, Key(15, places=told), 30))
+    made = tween(motion, keys, SlerpInbetweener(), settings=InfillSettings(finish=finish)).motion
+    assert (made.joint_positions() - places)[15, hands].norm(dim=-1).max() < 0.01
+    assert made.root_position[:, 1].max() - motion.root_position[:, 1].max() < 0.03

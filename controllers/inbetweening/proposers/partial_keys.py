@@ -245,7 +245,9 @@ def _blend_key_poses(body: Motion, posed: Motion, keys: Bool[Tensor, " frames"],
         goals_made[:, foot] = positions[:, foot] + interpolate_offsets(
             (goals - positions)[:, foot] * keys[:, None], firm, seconds=limb, fps=fps
         )
-    return bend_limbs(made, body, goals_made, wanted, query.missing.joints)
+    # Legs alone: arms that are to reach something would be turned back to where they were.
+    turning = query.missing.joints.index_fill(1, torch.tensor(_ARMS), False)
+    return bend_limbs(made, body, goals_made, wanted, turning)
 
 
 def _compute_duration(distance: Float[Tensor, "frames parts"], least: float, calm: float) -> float:
