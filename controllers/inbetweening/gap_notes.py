@@ -73,7 +73,7 @@ def _estimate_gap_error(query: GapQuery, answer: Proposal, source: GapSource) ->
 
 def _describe_gap(query: GapQuery, made: Motion, source: GapSource) -> list[str]:
     """List remarks on one gap beyond its proposer and error estimate."""
-    remarks, seconds = [source.reason] if source.reason else [], (source.stop - source.start) / PRIOR_FPS
+    remarks, seconds = [*filter(None, (source.reason, source.remark))], (source.stop - source.start) / PRIOR_FPS
     if source.stop - source.start > _INFILLER_FRAMES and source.by == _INFILLER:
         remarks.append(f"and {seconds:.1f} s are longer than the {_INFILLER_FRAMES / PRIOR_FPS:.0f} s that it knows")
     if _is_morph(query, made, source):

@@ -16,6 +16,7 @@ from mapctl.motion import Motion
 from mapctl.numerics.intervals import true_intervals
 from mapctl.skeleton import CANONICAL, TOE_JOINTS, leg_length
 
+_MAX_ROOT_KEY_FRAMES = 5  # frames at PRIOR_FPS: hips that are known for longer, a network follows
 INTERPOLATION = "interpolation"
 """Name of the source of a gap that stays as it was interpolated."""
 
@@ -65,6 +66,22 @@ class GapQuery:
         return untold and self.loose is not None and not bool(self.loose.drawn.any())
 
     @property
+    def root_only_keys(self) -> Bool[Tensor, " frames"]:
+        """Single frames, or a few, of which nothing is known but the hips' position and rotation."""
+        turns, root = self.missing.joints, self.missing.root
+        alone = ~root & ~turns[:, 0] & turns[:, 1:].all(dim=1)
+        for _, start, stop in true_intervals(alone[:, None].clone()):
+            alone[start:stop] = stop - start <= _MAX_ROOT_KEY_FRAMES
+        return alone
+
+    def hide_partial_keys(self) -> "GapQuery":
+        """Return the query in which keys that give only positions of hands, feet or hips are missing like what is about
+        them."""
+        hips = self.root_only_keys
+        joints = self.missing.joints.index_put((hips, torch.tensor(0)), torch.tensor(True))
+        return replace(self, missing=MissingMask(joints, self.missing.root | hips), effector_targets=None)
+
+    @property
     def scale(self) -> float:
         """Ratio of the character's leg length to the canonical one."""
         return leg_length(self.motion.skeleton) / leg_length(CANONICAL)
@@ -92,6 +109,8 @@ class GapSource:
     """Why another in-betweener that was tried first did not propose; empty where none was."""
     apart: float | None = None
     """Mean distance of joints, metres, at which two sides met that were then joined; None of what has no sides."""
+    remark: str = ""
+    """What else is to be said of the gap; empty where there is nothing."""
 
 
 @dataclass(frozen=True, eq=False)

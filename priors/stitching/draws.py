@@ -26,6 +26,11 @@ class Draws:
     chunks: dict[tuple[bytes, int, int], Joined] = field(default_factory=dict)
     """Those made, by the ends, the frames from one to the other and the number of the chunk."""
 
+    def seed_chunk(self, start: int, chunk: int) -> torch.Generator:
+        """Return the generator of a chunk's noise, for the ends of a gap that starts at a frame."""
+        seed = (self.seed + 1_000_003 * start + 7_919 * chunk) % _LARGEST_SEED
+        return torch.Generator().manual_seed(seed)
+
     def pick(
         self, ends: Ends, start: int, frames: int, number: int, make: Callable[[torch.Generator, float], Joined]
     ) -> Joined | None:
@@ -35,8 +40,7 @@ class Draws:
         chunk, row = divmod(number, CHUNK)
         told = b"".join(part.numpy().tobytes() for part in (ends.features, ends.present, ends.place, ends.turn))
         if (made := self.chunks.get((told, frames, chunk))) is None:
-            seed = (self.seed + 1_000_003 * start + 7_919 * chunk) % _LARGEST_SEED
-            made = make(torch.Generator().manual_seed(seed), self.temperature)
+            made = make(self.seed_chunk(start, chunk), self.temperature)
             self.chunks[told, frames, chunk] = made
             self.dropped += int((~made.finite).sum())
         good = made.finite.roll(-row).nonzero()

@@ -19,16 +19,19 @@ from mapctl.protocols import Inbetweener
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors import checkpoints
 from priors.stitching.draws import CHUNK, Draws
+from priors.stitching.fitting import fit_shared
 from priors.stitching.joining import Joined, join_sides
 from priors.stitching.latents import DrawnLatents
 from priors.stitching.network import StitcherConfig, StitcherNetwork
 from priors.stitching.sides import Ends, count_made, walk_sides, walk_stepwise
+from priors.stitching.wishes import Wishes
 
 SOURCE = "stitcher"
 """Name of the in-betweener in notes."""
 MAX_CONTEXT = 10
 """Frames before a gap, and after it, that are looked at."""
 _NOT_FINITE = "nothing finite came of it"
+_FARTHEST = 0.3  # metres of unit size from a trajectory over which steps can be moved without breaking
 _PARTNERS = CANONICAL.mirror_partners()
 
 
@@ -78,10 +81,14 @@ class Stitcher(Inbetweener):
         return float(self.network.temperature) if temperature is None else temperature
 
     def _draw_chunk(self, ends: Ends, frames: int, generator: torch.Generator, temperature: float) -> Joined:
-        config, made = self.network.config, count_made(self.network, frames)
-        latents = DrawnLatents.sample(config, CHUNK, made, generator).scale(temperature)
-        ends = _repeat(ends, CHUNK)
-        return join_sides(walk_sides(self.network, ends, frames, latents))
+        return self._walk(ends, frames, self._draw_latents(frames, generator, temperature))
+
+    def _draw_latents(self, frames: int, generator: torch.Generator, temperature: float) -> DrawnLatents:
+        made = count_made(self.network, frames)
+        return DrawnLatents.sample(self.network.config, CHUNK, made, generator).scale(temperature)
+
+    def _walk(self, ends: Ends, frames: int, latents: DrawnLatents) -> Joined:
+        return join_sides(walk_sides(self.network, _repeat(ends, len(latents.shared)), frames, latents))
 
     @torch.no_grad()
     def answer(self, ends: Ends, frames: int) -> Joined:
@@ -138,23 +145,36 @@ class Stitcher(Inbetweener):
     def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
         """Propose motion for gaps between whole poses of up to `longest` frames; all else stays interpolated, and the
         proposal says so. Frames beside a gap that are wholly known, up to MAX_CONTEXT of them, are looked at. Draws
-        have a seed of their own."""
+        have a seed of their own. What is told within a gap of hands, feet, hips or their trajectory leads the answer
+        (see `priors.stitching.fitting`) and is met about as well as the motion of the data allows."""
         body = query.to_unit_size(query.motion)
         toes = body.joint_positions()[:, list(TOE_JOINTS)]
         root, quats = body.root_position.clone(), body.local_quat_xyzw.clone()
         logits = contacts.to_logits(contacts.detect_contacts(toes, PRIOR_FPS)).float()
         sources = []
-        for start, stop in query.enclosed_gaps:
-            reason = self._refuse(query, start, stop)
-            found = None if reason else self._find(see_ends(body, query.missing.frames, start, stop), start, stop)
+        whole = query.hide_partial_keys()
+        for start, stop in whole.enclosed_gaps:
+            reason, remark = self._refuse(whole, start, stop), ""
+            found, wishes = None, Wishes.of(query, start, stop)
+            if not reason:
+                ends = see_ends(body, whole.missing.frames, start, stop)
+                found = self._find(ends, start, stop) if wishes is None else self._fit(ends, start, stop, wishes)
+            if found is not None and wishes is not None:
+                off = wishes.measure_farthest(found)
+                remark = f"led by what is told in it, of which it is {100 * query.scale * off:.1f} cm off unbent"
+                if query.keep_trajectory and off > _FARTHEST:
+                    reason = f"with steps that stay {query.scale * off:.2f} m off the trajectory"
+                found = None if reason else wishes.lay_along(found)
+            parts = [gap for gap in query.enclosed_gaps if start <= gap[0] and gap[1] <= stop] or [(start, stop)]
             if found is None:
-                sources.append(GapSource(start, stop, INTERPOLATION, reason or _NOT_FINITE))
+                sources += [GapSource(*gap, INTERPOLATION, reason or _NOT_FINITE) for gap in parts]
                 continue
             part = slice(start, stop)
             root[part], quats[part] = _place(found, body, start)
             logits[part] = found.contacts[0]
-            sources.append(GapSource(start, stop, SOURCE, apart=query.scale * float(found.apart[0])))
-        sources += _list_partly_known(query)
+            apart = query.scale * float(found.apart[0])
+            sources += [GapSource(*gap, SOURCE, apart=apart, remark=remark) for gap in parts]
+        sources += _list_partly_known(whole)
         moved = replace(body, root_position=root, local_quat_xyzw=rotations.make_sign_continuous(quats))
         return Proposal(query.to_character(moved), logits, SOURCE, tuple(sources))
 
@@ -168,16 +188,32 @@ class Stitcher(Inbetweener):
         calm = self.answer(ends, frames)
         return calm if bool(calm.finite.all()) else None
 
+    def _fit(self, ends: Ends, start: int, stop: int, wishes: Wishes) -> Joined | None:
+        """Find the answer that meets the wishes about a gap, near the calm one or near the draw of this number; None
+        where it is not finite."""
+        frames, draws = stop - start + 1, self.draws
+        if draws is None:
+            spread = self._pick_temperature(None)
+            around = DrawnLatents.calm(self.network.config, 1, count_made(self.network, frames))
+        else:
+            chunk, row = divmod(self.number, CHUNK)
+            spread = draws.temperature
+            around = self._draw_latents(frames, draws.seed_chunk(start, chunk), spread).rows(torch.tensor([row]))
+
+        def make(shared: Float[Tensor, "batch shared"]) -> Joined:
+            return self._walk(ends, frames, DrawnLatents(shared, around.slow.expand(-1, len(shared), -1, -1)))
+
+        found = fit_shared(make, wishes.measure, around.shared[0], spread)
+        return found if bool(found.finite.all()) else None
+
     def _refuse(self, query: GapQuery, start: int, stop: int) -> str:
         """Return why a gap is not stitched; empty where it is."""
         if stop - start > self.longest:
             return f"longer than the {self.longest} frames that the {SOURCE} fills"
         edges = query.missing.joints[[start - 1, stop]].any() | query.missing.root[[start - 1, stop]].any()
-        targets = query.effector_targets
-        told = targets is not None and bool(targets.wanted[start:stop].any())
-        if bool(edges) or told or query.loose is not None:
+        if bool(edges) or query.loose is not None:
             return f"known in part, where the {SOURCE} takes whole poses"
-        return f"on a given way, which the {SOURCE} knows nothing of" if query.keep_trajectory else ""
+        return ""
 
 
 def see_ends(body: Motion, missing: Tensor, start: int, stop: int) -> Ends:

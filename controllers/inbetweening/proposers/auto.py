@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 import torch
 
 from controllers.inbetweening.proposers.extrapolation import extrapolate_end
-from controllers.inbetweening.proposers.partial_keys import hide_partial_keys, propose_through_keys
+from controllers.inbetweening.proposers.partial_keys import propose_through_keys
 from controllers.inbetweening.proposers.rollouts import RolloutSettings
 from controllers.inbetweening.proposers.walked import PlaceWalker
 from mapctl import contacts
@@ -86,7 +86,7 @@ class AutoInbetweener(Inbetweener):
             walked = PlaceWalker(tuple(self.densities)).propose(query, generator=generator)
             return walked or (self.tweener or self.network).propose(query, generator=generator)
         made = self.network.propose(query, generator=generator)
-        long = [gap for gap in hide_partial_keys(query).enclosed_gaps if self._is_tweeners(query, *gap)]
+        long = [gap for gap in query.hide_partial_keys().enclosed_gaps if self._is_tweeners(query, *gap)]
         if long and self.tweener is not None:
             made = _fill_from(propose_through_keys(query, self.tweener, generator)[0], made, query, long)
         for gap in query.enclosed_gaps:

@@ -18,16 +18,14 @@ from torch import Tensor
 from mapctl import rotations
 from mapctl.inbetweening import GapQuery, Proposal
 from mapctl.inbetweening.effector_targets import EffectorTargets
-from mapctl.inbetweening.missing import MissingMask
 from mapctl.inbetweening.whole_body import bend_limbs, reach_targets
 from mapctl.kinematics import heading
 from mapctl.motion import Motion
-from mapctl.numerics.intervals import last_observed, next_observed, true_intervals
+from mapctl.numerics.intervals import last_observed, next_observed
 from mapctl.numerics.smooth_offsets import interpolate_offsets, interpolate_turns
 from mapctl.protocols import Inbetweener
 from mapctl.skeleton import CANONICAL, LIMBS
 
-_MAX_ROOT_KEY_FRAMES = 5  # frames at the prior's rate: hips that are known for longer, a network follows
 _MIN_ROOT_UNCERTAINTY = 0.02  # metres, of the position of a standing body
 _ROOT_UNCERTAINTY_SHARE = 0.4  # of the distance travelled since the last known position
 _MIN_DIRECTION_SPEED = 0.2  # m/s from which a trajectory determines the facing
@@ -48,27 +46,19 @@ _TRUNK = [joint for joint in range(CANONICAL.num_joints) if joint not in _ARMS] 
 _FEET = tuple(limb.end for name, limb in LIMBS.items() if name.endswith("Foot"))
 
 
-def hide_partial_keys(query: GapQuery) -> GapQuery:
-    """Return a query in which keys that give only positions of hands, feet or hips are missing like what is about
-    them."""
-    hips = _find_root_only_keys(query)
-    joints = query.missing.joints.index_put((hips, torch.tensor(0)), torch.tensor(True))
-    return replace(query, missing=MissingMask(joints, query.missing.root | hips), effector_targets=None)
-
-
 def propose_through_keys(
     query: GapQuery, inbetweener: Inbetweener, generator: torch.Generator | None
 ) -> tuple[Proposal, EffectorTargets | None]:
     """Propose a motion with hands and feet at their targets, and the hips at theirs in frames that give no more; also
     return the targets, moved within reach where they are not.
     """
-    hips, targets = _find_root_only_keys(query), query.effector_targets
+    hips, targets = query.root_only_keys, query.effector_targets
     wanted = torch.zeros_like(hips) if targets is None else targets.wanted.any(dim=1)
     if not bool((hips | wanted).any()):
         return inbetweener.propose(query, generator=generator), targets
     if inbetweener.takes_partial_keys:
         return _reach_exactly(query, inbetweener.propose(query, generator=generator), wanted)
-    blind = guided = hide_partial_keys(query)
+    blind = guided = query.hide_partial_keys()
     if bool(query.missing.root.any()):
         first = inbetweener.rough.propose(blind, generator=generator).motion
         guided = _interpolate_trajectory(query, blind, first, targets, hips)
@@ -126,15 +116,6 @@ def _add_root_targets(query: GapQuery, hips: Bool[Tensor, " frames"]) -> Effecto
         return EffectorTargets(positions, wanted)
     positions = torch.where(targets.wanted[..., None], targets.places, positions)
     return EffectorTargets(positions, wanted | targets.wanted)
-
-
-def _find_root_only_keys(query: GapQuery) -> Bool[Tensor, " frames"]:
-    """Find single frames, or a few, of which nothing is known but the hips' position and rotation."""
-    turns, root = query.missing.joints, query.missing.root
-    alone = ~root & ~turns[:, 0] & turns[:, 1:].all(dim=1)
-    for _, start, stop in true_intervals(alone[:, None].clone()):
-        alone[start:stop] = stop - start <= _MAX_ROOT_KEY_FRAMES
-    return alone
 
 
 def _interpolate_trajectory(

@@ -1,11 +1,11 @@
-"""Stitched gaps, and another in-betweener for what cannot be stitched."""
+"""Stitched gaps, bent to what is told of parts of the body, and another in-betweener for what cannot be stitched."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
 
-from controllers.inbetweening.proposers.partial_keys import hide_partial_keys
+from controllers.inbetweening.proposers.partial_keys import propose_through_keys
 from mapctl.inbetweening import GapQuery, Proposal
 from mapctl.inbetweening.query import INTERPOLATION, GapSource
 from mapctl.protocols import Inbetweener
@@ -27,17 +27,31 @@ class StitchedInbetweener(Inbetweener):
         return True
 
     def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
-        """Propose for each gap the stitcher's motion; what it left is the other's, and the proposal says why."""
+        """Propose for each gap the stitcher's motion, bent to what is told of it in part; what it left is the other's,
+        and the proposal says why."""
         stitched = self.stitcher.propose(query, generator=generator)
         left = [source for source in stitched.attribute(query) if source.by == INTERPOLATION]
+        if len(left) < len(stitched.attribute(query)):
+            free = replace(query, keep_trajectory=False)
+            stitched = propose_through_keys(free, _Given(stitched), generator)[0]
         if not left:
             return stitched
         fallback = self.load_fallback()
-        asked = query if fallback.takes_partial_keys else hide_partial_keys(query)
+        asked = query if fallback.takes_partial_keys else query.hide_partial_keys()
         made = fallback.propose(asked, generator=generator)
         if len(left) == len(stitched.attribute(query)):
             return replace(made, others=_pass_on(left, made))
         return _put_in(stitched, replace(made, others=_pass_on(left, made)), query)
+
+
+@dataclass(frozen=True, eq=False)
+class _Given(Inbetweener):
+    """Proposes what it was given."""
+
+    proposal: Proposal
+
+    def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
+        return self.proposal
 
 
 def _pass_on(left: list[GapSource], made: Proposal) -> tuple[GapSource, ...]:
@@ -56,4 +70,7 @@ def _put_in(stitched: Proposal, made: Proposal, query: GapQuery) -> Proposal:
     sources = [source for source in stitched.attribute(query) if source.by != INTERPOLATION]
     starts = {source.start for source in sources}
     others = (*(other for other in made.others if other.start not in starts), *sources)
-    return replace(made.take(stitched, [(source.start, source.stop) for source in sources]), others=others)
+    # Partial keys divide a gap, and are the stitcher's too.
+    whole = query.hide_partial_keys().enclosed_gaps
+    gaps = [gap for gap in whole if any(gap[0] <= start < gap[1] for start in starts)]
+    return replace(made.take(stitched, gaps), others=others)

@@ -1,0 +1,172 @@
+"""Stitched gaps in which more is told than the poses beside them: hands, feet, hips, a trajectory."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from helpers import walk
+from scipy.optimize import least_squares
+from test_stitcher import query_of
+from tiny_stitcher import tiny_stitcher
+
+from controllers.inbetweening.pipeline import InfillSettings, fill
+from controllers.inbetweening.proposers import SlerpInbetweener, StitchedInbetweener
+from controllers.inbetweening.tween import tween
+from mapctl import curves
+from mapctl.inbetweening.effector_targets import EffectorTargets
+from mapctl.inbetweening.missing import MissingMask
+from mapctl.intent.keyframes import Keys
+from mapctl.rotations import about_y, multiply, rotate
+from priors.stitching.fitting import fit_shared
+from priors.stitching.joining import Joined
+from priors.stitching.wishes import Wishes
+
+RAW = InfillSettings(finish=False)
+GAP = slice(21, 40)
+
+
+def never():
+    raise AssertionError("nothing was left to the other")
+
+
+def wishing(motion, frame, limb, offset):
+    """A query that wants a limb elsewhere in a frame."""
+    joint = motion.skeleton.index(limb)
+    places = motion.joint_positions().clone()
+    places[frame, joint] += torch.tensor(offset).double()
+    wanted = torch.zeros(places.shape[:2], dtype=torch.bool)
+    wanted[frame, joint] = True
+    return replace(query_of(motion, (GAP.start, GAP.stop)), effector_targets=EffectorTargets(places, wanted))
+
+
+def miss(query, motion):
+    targets = query.effector_targets
+    return float((motion.joint_positions() - targets.places).norm(dim=-1)[targets.wanted].max())
+
+
+@pytest.mark.parametrize("spread", [0.7, 1.5])
+def test_the_fit_is_that_of_least_squares(spread):
+    """On a map that bends a little, beside scipy's: both minimise residuals and the distance from the centre."""
+    draw = np.random.default_rng(1)
+    matrix, wish, centre = draw.normal(size=(5, 4)), draw.normal(size=5), draw.normal(size=4)
+
+    def residuals(codes):
+        bent = codes @ matrix.T
+        return bent + 0.05 * np.sin(bent) - 3 * wish
+
+    def make(codes):  # motions whose hips go where the codes say
+        root = torch.nn.functional.pad(codes[..., None], (0, 2)).float()
+        return Joined(root, torch.zeros(len(codes), 4, 21, 4), torch.zeros(len(codes), 4, 2), torch.zeros(len(codes)))
+
+    def read(made):
+        return made.root_position[..., 0].double().numpy()
+
+    def measure(made):
+        return torch.as_tensor(residuals(read(made))).float()
+
+    def energy(codes):
+        return np.square(residuals(codes)).sum() + np.square((codes - centre) / spread).sum()
+
+    found = read(fit_shared(make, measure, torch.as_tensor(centre).float(), spread))[0]
+    best = least_squares(lambda codes: np.concatenate([residuals(codes), (codes - centre) / spread]), centre).x
+    assert energy(found) < 0.8 * energy(centre)
+    assert energy(found) == pytest.approx(energy(best), rel=0.02)
+
+
+def test_where_nothing_is_wanted_there_are_no_wishes():
+    query = query_of(walk(60), (GAP.start, GAP.stop))
+    assert Wishes.of(query, GAP.start, GAP.stop) is None
+
+
+@pytest.mark.parametrize("limb", ["leftHand", "rightFoot"])
+def test_what_is_wanted_leads_the_answer(limb):
+    query = wishing(walk(60), 30, limb, (0.2, 0.25, 0.1))
+    plain = tiny_stitcher().propose(replace(query, effector_targets=None))
+    led = tiny_stitcher().propose(query)
+    assert miss(query, led.motion) < miss(query, plain.motion) - 0.001
+    ends = [GAP.start - 1, GAP.stop]
+    assert torch.equal(led.motion.local_quat_xyzw[ends], query.motion.local_quat_xyzw[ends])
+    assert f"{100 * miss(query, led.motion):.1f} cm off unbent" in led.attribute(query)[0].remark
+
+
+def test_then_limbs_and_the_body_bend_until_it_is_met():
+    query = wishing(walk(60), 30, "leftHand", (0.1, 0.3, 0.2))
+    done = fill(
+        query.motion,
+        MissingMask.of_frames(query.missing.frames, 21),
+        StitchedInbetweener(tiny_stitcher(), never),
+        settings=RAW,
+        targets=query.effector_targets,
+    )
+    assert miss(query, done.motion) < 1e-3
+    assert [source.by for source in done.sources] == ["stitcher"]
+
+
+def test_the_same_wish_elsewhere_and_turned_leads_to_the_same_motion_there():
+    query = wishing(walk(60), 30, "leftHand", (0.2, 0.25, 0.1))
+    turn, shift = about_y(torch.tensor(2.0)).double(), torch.tensor([7.0, 0.0, -3.0]).double()
+    motion, targets = query.motion, query.effector_targets
+    quats = motion.local_quat_xyzw.clone()
+    quats[:, 0] = multiply(turn.expand(60, 4), quats[:, 0])
+    root = rotate(turn.expand(60, 4), motion.root_position) + shift
+    places = rotate(turn.expand(60, 21, 4), targets.places) + shift
+    there = replace(
+        query,
+        motion=replace(motion, root_position=root, local_quat_xyzw=quats),
+        effector_targets=EffectorTargets(places, targets.wanted),
+    )
+    here, moved = (tiny_stitcher().propose(each).motion.joint_positions() for each in (query, there))
+    assert float((rotate(turn.expand(60, 21, 4), here) + shift - moved).abs().max()) < 1e-4
+
+
+def test_draws_are_led_each_from_where_it_was_and_do_not_depend_on_others():
+    query, drawing = wishing(walk(60), 30, "leftHand", (0.2, 0.25, 0.1)), tiny_stitcher().drawing(seed=3)
+    plain = [drawing.numbered(n).propose(replace(query, effector_targets=None)).motion for n in range(2)]
+    led = [drawing.numbered(n).propose(query).motion for n in (1, 0)][::-1]
+    for one, other in zip(led, plain, strict=True):
+        assert miss(query, one) < miss(query, other)
+    assert float((led[0].joint_positions() - led[1].joint_positions())[GAP].norm(dim=-1).max()) > 0.01
+    again = tiny_stitcher().drawing(seed=3).numbered(1).propose(query).motion
+    assert torch.equal(again.local_quat_xyzw, led[1].local_quat_xyzw)
+
+
+def test_hips_that_are_told_alone_are_met_and_divide_the_gap():
+    motion = walk(60, turn_rate=0.5)
+    done = tween(motion, Keys.of([20, 28, 40], root_only=True), StitchedInbetweener(tiny_stitcher(), SlerpInbetweener))
+    torch.testing.assert_close(done.motion.root_position[28], motion.root_position[28], atol=1e-6, rtol=0)
+    inner = [(source.start, source.stop, source.by) for source in done.sources if 20 < source.start < 40]
+    assert inner == [(21, 28, "stitcher"), (29, 40, "stitcher")]
+    steps = torch.diff(done.motion.joint_positions()[20:41], dim=0).norm(dim=-1)
+    assert float(steps.max()) < 0.25  # nothing leaps
+
+
+def test_a_trajectory_is_followed_and_one_that_is_far_is_the_others():
+    query = query_of(walk(60), (GAP.start, GAP.stop))
+    bow = 0.15 * torch.sin(torch.linspace(0, torch.pi, GAP.stop - GAP.start + 2)[1:-1]).double()
+    for scale, by in ((1.0, "stitcher"), (8.0, "slerp")):
+        root = query.motion.root_position.clone()
+        root[GAP, 0] += scale * bow
+        led = replace(query, motion=replace(query.motion, root_position=root), keep_trajectory=True)
+        made = StitchedInbetweener(tiny_stitcher(), SlerpInbetweener).propose(led)
+        assert [source.by for source in made.attribute(led)] == [by]
+        assert float((made.motion.root_position - root)[GAP, ::2].norm(dim=-1).mean()) < 0.03
+    (source,) = made.attribute(led)
+    assert "off the trajectory" in source.reason
+
+
+def test_a_curve_is_followed_through_the_whole_job():
+    motion = walk(60)
+    start, stop = (motion.root_position[frame, ::2] for frame in (GAP.start - 1, GAP.stop))
+    free = torch.zeros(60, dtype=torch.bool)
+    free[GAP] = True
+    bow = torch.stack([torch.lerp(start, stop, 0.5) + torch.tensor([0.1, 0.0]).double(), stop])
+    curve = curves.through(torch.cat([start[None], bow]))
+    stitcher = StitchedInbetweener(tiny_stitcher(), never)
+    missing = MissingMask.of_frames(free, 21)
+    done = fill(motion, missing, stitcher, settings=RAW, curve=curve)
+    assert [source.by for source in done.sources] == ["stitcher"]
+    hips = done.motion.root_position[GAP, ::2]
+    off = (hips - curve.point(curve.nearest(hips))).norm(dim=-1)
+    plain = fill(motion, missing, stitcher, settings=RAW).motion.root_position[GAP, ::2]
+    assert float(off.max()) < 0.5 * float((plain - curve.point(curve.nearest(plain))).norm(dim=-1).max())
