@@ -39,12 +39,16 @@ class _Order:
     within: float
     command: Command
     chunks: list[FrameChunk] = field(default_factory=list)
-    """Frames on the way to the place; the first of them were forecast before the order was known."""
+    """Frames on the way to the place; the first of them were solved, to set out towards it."""
 
     def take(self, delivered: FrameChunk) -> None:
-        """Take frames in; those of a way to a place were solved by nobody."""
-        if delivered.evaluations == 0 and delivered.due > self.sent:
+        """Take frames in; those of a way to a place were solved by nobody, but for the step before them."""
+        if delivered.due <= self.sent:
+            return
+        if not delivered.evaluations:
             self.chunks.append(delivered)
+        elif not self.chunks or self.chunks[-1].evaluations:
+            self.chunks = [delivered]
 
     def measure(self) -> Row:
         """Measure an order that was carried out: seconds until it was seen, seconds by which the way took longer or
@@ -53,7 +57,7 @@ class _Order:
         end = last.due + len(last.root) / PRIOR_FPS
         facing = float(rotations.split_heading(torch.from_numpy(last.quats[-1:, 0]))[0])
         return {
-            "seen_s": self.chunks[1].due - self.sent,
+            "seen_s": first.due - self.sent,
             # Counted from when it was asked, one step before its first frames are due.
             "off_s": end - (first.due - len(first.root) / PRIOR_FPS + self.within) - 1 / PRIOR_FPS,
             "place_cm": 100 * math.dist(last.root[-1, ::2].tolist(), self.place),

@@ -2,7 +2,8 @@
 
 Ren et al. 2024 make what lies between two poses; here the first is the last that was delivered, with those before it,
 and the second is where the character is to be: in a pose that is given, or in that of one of the moments from which the
-prior begins, walking on or standing. The density's state is then advanced over what was shown, and steering goes on.
+prior begins, walking on or standing. A step that is steered toward the place plays while this is worked out. The
+density's state is then advanced over what was shown, and steering goes on.
 """
 
 import math
@@ -80,20 +81,50 @@ class Arriver:
         # Who has to walk first does so until little is left; a way that can be stitched as a whole is.
         most = self.transitions.longest + 1 if new else _STITCHED_FRAMES
         if approach.planned is None and not approach.refused and left <= most:
-            ahead, told = (None, plain.told) if old is None else (old.ahead(), old.held.told)
-            held, rest = begin_way(self.transitions, state, command, order, left, planned=ahead, told=told)
+            planned = None if old is None else old.ahead()
+            idle = planned is None or not len(planned)
+            if idle and (found := self._set_out(state, approach, command, left)) is not None:
+                after, frames, work = found
+                _proceed(work, began, seconds)
+                return after, frames
+            held, rest = begin_way(self.transitions, state, command, order, left, planned=planned)
             approach = replace(approach, planned=held, rest=rest)
         if approach.rest is not None and approach.planned is not None and not len(approach.planned):
             approach = replace(approach, planned=approach.rest.finish(), rest=None)
         if approach.planned is not None and len(approach.planned):
             delivered = _deliver(state, approach, plain)
-            if approach.rest is not None and seconds is not None:
-                approach.rest.proceed(seconds - (time.perf_counter() - began))
+            if approach.rest is not None:
+                _proceed(approach.rest, began, seconds)
             return delivered
         there = approach.refused or approach.planned is not None
         led = approach.held if there else _lead_to(state, plain, order, left)
         state, frames = step(replace(state, approach=approach), led, seconds=seconds)
         return state, replace(frames, refusal=refusal)
+
+    def _set_out(
+        self, state: SteerState, approach: Approach, command: Command, left: int
+    ) -> tuple[SteerState, SteerFrames, StepwiseWork[Tensor]] | None:
+        """Solve a step towards the place, so that the order is seen at once, and return it with the work of the way
+        from its end; None where that leaves too little time for the rest of the way."""
+        order, settings = command.arrival, state.settings
+        assert order is not None
+        if (rest := left - settings.commit) < LEAST_FRAMES:
+            return None
+        # In few evaluations, so that there is time for the way, and always as many, so that it is always the same.
+        quick = replace(settings, evaluations=settings.least_evaluations or 1)
+        led = _lead_to(state, replace(command, arrival=None), order, left)
+        there, frames = step(replace(state, settings=quick), led)
+        there = replace(there, settings=settings)
+        if needed_speed(there, order, rest) > state.prior.limits.max_steering_speed:
+            return None
+        nothing, work = begin_way(self.transitions, there, command, order, rest)
+        return replace(there, approach=replace(approach, planned=nothing, rest=work)), frames, work
+
+
+def _proceed(work: StepwiseWork[Tensor], began: float, seconds: float | None) -> None:
+    """Do as much of the work as the time of a step that began then allows."""
+    if seconds is not None:
+        work.proceed(seconds - (time.perf_counter() - began))
 
 
 def _arrival_frame(order: Arrival) -> int:

@@ -1,7 +1,7 @@
-"""The way to a place: frames that were forecast play while it is worked out, a frame at a time between deadlines."""
+"""The way to a place, worked out a frame at a time between deadlines, while frames that are known before it play."""
 
 import math
-from collections.abc import Generator, Sequence
+from collections.abc import Generator
 from dataclasses import replace
 from typing import Protocol, runtime_checkable
 
@@ -57,16 +57,14 @@ def begin_way(
     frames: int,
     *,
     planned: Float[Tensor, "ahead size"] | None = None,
-    told: Sequence[str] = (),
 ) -> tuple[Float[Tensor, "held size"], StepwiseWork[Float[Tensor, "rest size"]]]:
     """Begin the way to a place, so many frames away: return features of the first frames, which play meanwhile, and
     the work that makes the others.
 
-    The first are those of the next step as they were `planned` before, or else as the last window forecast them under
-    the labels that were `told`; there are none where nothing is forecast, and where no time is left for the rest of the
-    way after them.
+    The first are those of the next step as they were `planned` before; there are none where nothing was, and where no
+    time is left for the rest of the way after them.
     """
-    ahead = _forecast(state, told) if planned is None or not len(planned) else planned
+    ahead = state.committed.features[:0] if planned is None else planned
     held = ahead[: state.settings.commit]
     if frames - len(held) < LEAST_FRAMES:
         held = held[:0]
@@ -98,16 +96,6 @@ def needed_speed(state: SteerState, order: Arrival, frames: int) -> float:
     """Return the mean speed that a place needs, m/s of a body of unit size."""
     here = state.committed.place.position_xz * state.character.scale
     return math.dist(order.place, here.tolist()) / state.character.scale * PRIOR_FPS / frames
-
-
-@torch.no_grad()
-def _forecast(state: SteerState, told: Sequence[str]) -> Float[Tensor, "ahead size"]:
-    """Roll out what the last window found for the next step, under the labels that were told then."""
-    committed, prior = state.committed, condition_prior(state.prior, tuple(told)) if told else state.prior
-    noise = committed.warm_start[None, : state.settings.commit]
-    if not noise.shape[1]:
-        return committed.features[:0]
-    return prior.rollout(committed.state, noise, prior.plan(committed.state, noise))[0][0]  # pyright: ignore[reportArgumentType]
 
 
 def _plan(

@@ -140,16 +140,25 @@ def test_a_command_without_an_order_is_steered_as_ever():
     assert Command(1.0, 0.0).arrival is None
 
 
-def test_the_first_frames_of_a_way_are_those_that_were_forecast_and_play_while_it_is_worked_out():
+def test_the_first_step_is_steered_towards_the_place_and_plays_while_the_way_is_worked_out():
     state, _ = begun()
     for _ in range(2):
         state, _ = ARRIVER(state, AHEAD)
-    order = replace(AHEAD, arrival=Arrival((0.4, 0.6), state.frames / PRIOR_FPS + 0.6))
-    after, frames = ARRIVER(state, order)
-    count = state.settings.commit
-    joints = frames.motion.joint_positions()
-    torch.testing.assert_close(joints.float(), state.committed.forecast[:count], atol=1e-4, rtol=0)
-    assert after.approach.rest is not None
+    by, here = state.frames / PRIOR_FPS + 0.6, state.committed.place.position_xz.tolist()
+    plain = ARRIVER(state, AHEAD)[1]
+    for side in (-0.4, 0.4):
+        order = replace(AHEAD, arrival=Arrival((here[0] + side, here[1] + 0.4), by))
+        after, frames = ARRIVER(state, order)
+        assert frames.evaluations > 0
+        assert after.approach.rest is not None
+        turned = [target.heading - other.heading for target, other in both_targets(frames, plain)]
+        assert all(math.copysign(1, side) * turn > 0.01 for turn in turned)
+        assert not torch.equal(frames.motion.root_position, plain.motion.root_position)
+        assert after.settings == state.settings
+
+
+def both_targets(frames, others):
+    return zip(frames.steering_targets, others.steering_targets, strict=True)
 
 
 def test_a_way_that_is_worked_out_in_slices_is_the_same():
