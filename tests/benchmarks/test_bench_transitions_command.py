@@ -73,6 +73,23 @@ def test_a_stitcher_has_rows_of_its_calm_answer_and_its_draws(folder, capsys):
         assert by[f"{name}, calm, raw"]["apart_cm"] > 0
 
 
+def test_what_is_told_in_the_middle_is_met_by_all(folder, capsys):
+    network, card = tiny_stitcher.network(config=LONG), replace(tiny_stitcher.card(LONG), data={"held_out": HELD_OUT})
+    checkpoints.save(network.state_dict(), card, folder / "told.safetensors")
+    stitcher = str(folder / "told.safetensors")
+    rows = measure(folder, capsys, "--told", "--raw", "--stitcher", stitcher)
+    told = ["nothing", "both hands", "a foot", "the hips", "hands overhead"]
+    names = (str(folder / "ours.safetensors"), f"{stitcher}, calm")
+    assert [(row["told"], row["by"]) for row in rows] == [(what, name) for what in told for name in names]
+    for row in rows:
+        assert row["windows"] == 2
+        assert row["missed_cm"] < 0.1
+        assert ("ade_cm" in row) == (row["told"] != "hands overhead")  # which mocap did not do
+    by = {(row["told"], row["by"]): row for row in rows}
+    for what in told[1:]:
+        assert by[what, names[1]]["step_cm"] != by["nothing", names[1]]["step_cm"]
+
+
 def test_with_a_density_there_are_its_rollouts_and_the_best_draw_by_its_energy(folder, capsys):
     names = []
     for number in range(2):
@@ -99,6 +116,13 @@ def test_models_that_saw_the_clips_are_refused(folder, capsys, option, save):
     words = ["--data", folder / "data", "--inbetweener", folder / "ours.safetensors"]
     assert run("bench", "transitions", *words, option, folder / "seen.safetensors") == 2
     assert "was trained on bandai/a_walk_0.bvh" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("more", [["--auto"], ["--prior", "general"]])
+def test_told_is_about_in_betweeners(folder, capsys, more):
+    words = ["--data", folder / "data", "--inbetweener", folder / "ours.safetensors", "--told", *more]
+    assert run("bench", "transitions", *words) == 2
+    assert "leave --prior and --auto out" in capsys.readouterr().err
 
 
 def test_clips_that_are_no_longer_there_are_said(folder, tmp_path, capsys):

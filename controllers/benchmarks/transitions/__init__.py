@@ -13,6 +13,7 @@ from controllers.benchmarks.transitions.methods import (
     of_retrieval,
 )
 from controllers.benchmarks.transitions.table import ALL_KINDS, DRAWS, LENGTHS, benchmark_transitions
+from controllers.benchmarks.transitions.told import benchmark_told
 
 __all__ = [
     "ALL_KINDS",
@@ -22,6 +23,7 @@ __all__ = [
     "Filled",
     "Method",
     "Sampler",
+    "benchmark_told",
     "benchmark_transitions",
     "draw_retrieved",
     "hold_last_pose",

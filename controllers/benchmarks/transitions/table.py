@@ -13,9 +13,9 @@ from torch import Tensor
 
 from controllers.benchmarks.shared.tables import Row
 from controllers.benchmarks.transitions.methods import Energy, Filled, Method, Sampler
+from controllers.benchmarks.transitions.seen import measure_motion
 from controllers.benchmarks.transitions.twins import measure_twins
-from mapctl.features import PRIOR_FPS
-from mapctl.metrics import body, feet, transitions, worst_frame
+from mapctl.metrics import transitions
 from mapctl.metrics.realism import (
     RealismSettings,
     WindowSettings,
@@ -24,7 +24,6 @@ from mapctl.metrics.realism import (
     measure_window_realism,
 )
 from mapctl.motion import Motion
-from mapctl.skeleton import CANONICAL, TOES
 
 LENGTHS = (5, 15, 30, 45)
 """Frames of the gaps, as in the tables of LaFAN1."""
@@ -35,8 +34,6 @@ DRAWS = 8
 ALL_KINDS = "mean of kinds"
 """Kind of the rows that average those of all kinds."""
 _PAST = 10  # frames before the gap
-_TOES = CANONICAL.indices(TOES)
-_EFFECTORS = CANONICAL.indices(("leftHand", "rightHand", *TOES))
 _TOLD = ("kind", "frames", "windows", "method")
 _WORST = ("step_cm", "acceleration_m_s2", "apart_most_cm")
 _REALISM_LENGTH = 30
@@ -102,7 +99,7 @@ def benchmark_transitions(
             shared = {"kind": kind, "frames": length, "windows": len(gaps)}
             truth = [gap.around for gap in gaps]
             twins = measure_twins(clips, [gap.inner for gap in gaps]) if samplers else {}
-            made = [_Made("mocap", truth, {**_measure_motion(truth), **twins})]
+            made = [_Made("mocap", truth, {**measure_motion(truth), **twins})]
             for task in (
                 *(partial(_run_method, name, method) for name, method in methods.items()),
                 *(partial(_run_sampler, name, sampler, energy) for name, sampler in samplers.items()),
@@ -134,7 +131,7 @@ def _run_method(name: str, method: Method, gaps: Sequence[_Gap], std: Tensor) ->
     filled = [method(gap.part, gap.start, gap.stop) for gap in gaps]
     cost = _count_ms(began, gaps)
     motions = [_put_in(each, gap) for each, gap in zip(filled, gaps, strict=True)]
-    return [_Made(name, motions, {**_compare(motions, gaps, std), **_measure_motion(motions), **cost, **_tell(filled)})]
+    return [_Made(name, motions, {**_compare(motions, gaps, std), **measure_motion(motions), **cost, **_tell(filled)})]
 
 
 def _run_sampler(name: str, sampler: Sampler, energy: Energy | None, gaps: Sequence[_Gap], std: Tensor) -> list[_Made]:
@@ -149,12 +146,12 @@ def _run_sampler(name: str, sampler: Sampler, energy: Energy | None, gaps: Seque
     best = [_pick_nearest(each, gap, std) for each, gap in zip(motions, gaps, strict=True)]
     first, nearest, *likeliest = _name_draws(name, energy)
     made = [
-        _Made(first, one, {**_compare(one, gaps, std), **_measure_motion(one), **cost, **_tell(firsts), **spread}),
-        _Made(nearest, best, {**_compare(best, gaps, std), **_measure_motion(best)}),
+        _Made(first, one, {**_compare(one, gaps, std), **measure_motion(one), **cost, **_tell(firsts), **spread}),
+        _Made(nearest, best, {**_compare(best, gaps, std), **measure_motion(best)}),
     ]
     if energy is not None:
         least = [min(each, key=energy) for each in motions]
-        made.append(_Made(likeliest[0], least, {**_compare(least, gaps, std), **_measure_motion(least)}))
+        made.append(_Made(likeliest[0], least, {**_compare(least, gaps, std), **measure_motion(least)}))
     return made
 
 
@@ -225,25 +222,6 @@ def _compare(made: Sequence[Motion], gaps: Sequence[_Gap], std: Tensor) -> Row:
         "l2p": transitions.compute_l2p(positions, true_positions, std),
         "l2q": transitions.compute_l2q(quats, true_quats),
         "npss": transitions.compute_npss(quats, true_quats),
-    }
-
-
-def _measure_motion(motions: Sequence[Motion]) -> Row:
-    """Measure what a viewer sees: means over gaps, and the worst frame of all."""
-    planted, jitter, steps, accelerations = [], [], [], []
-    for motion in motions:
-        positions = motion.joint_positions()
-        toes = feet.ToeMeasurements.of(positions[:, _TOES], PRIOR_FPS)
-        planted.append(toes.speed[toes.planted[1:]])
-        jitter.append(body.jitter(positions, PRIOR_FPS))
-        peaks = worst_frame.measure_peaks(positions[:, _EFFECTORS], motion.root_position, PRIOR_FPS)
-        steps.append(peaks.step)
-        accelerations.append(peaks.acceleration)
-    return {
-        "planted_cm_s": 100 * float(torch.cat(planted).mean()),
-        "jitter_m_s3": sum(jitter) / len(jitter),
-        "step_cm": 100 * max(steps),
-        "acceleration_m_s2": max(accelerations),
     }
 
 

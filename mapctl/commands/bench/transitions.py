@@ -9,9 +9,11 @@ import torch
 import priors
 from controllers.benchmarks.infilling import scale_to_canonical_bones
 from controllers.benchmarks.shared.held_out import load_canonical
+from controllers.benchmarks.shared.tables import Row
 from controllers.benchmarks.transitions import (
     Method,
     Sampler,
+    benchmark_told,
     benchmark_transitions,
     draw_retrieved,
     hold_last_pose,
@@ -20,13 +22,19 @@ from controllers.benchmarks.transitions import (
     of_inbetweener,
     of_retrieval,
 )
-from controllers.inbetweening.proposers import AutoInbetweener, RolloutInbetweener, SlerpInbetweener
+from controllers.inbetweening.proposers import (
+    AutoInbetweener,
+    RolloutInbetweener,
+    SlerpInbetweener,
+    StitchedInbetweener,
+)
 from mapctl.commands.bench import Transitions
 from mapctl.commands.bench.output import print_rows
 from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS, GroundPose
 from mapctl.inbetweening.retrieval import MotionCollection
+from mapctl.motion import Motion
 from mapctl.pose import decode
 from mapctl.protocols import Inbetweener
 from priors.checkpoints import Card
@@ -41,6 +49,8 @@ def run(table: Transitions) -> int:
     held_out = network.card.data.get("held_out", {})
     kinds = load_canonical(table.data, held_out, table.count, fps=PRIOR_FPS)
     kinds = {kind: [scale_to_canonical_bones(clip) for clip in clips] for kind, clips in kinds.items()}
+    if table.told:
+        return print_rows(table, _measure_told(table, network, kinds, held_out))
     with TemporaryDirectory() as cache:
         corpus = read_corpus(table.data, match="", cache=Path(cache), skip_first=True)
     # By name: a folder with clips beside those of the training would be split otherwise.
@@ -53,8 +63,7 @@ def run(table: Transitions) -> int:
         "slerp": of_inbetweener(SlerpInbetweener(), finish=False),
         "retrieval": of_retrieval(collection),
     }
-    compared = {name: priors.load_inbetweener(name) for name in filter(None, table.baselines.split(","))}
-    for name, each in (compared | {table.inbetweener: network}).items():
+    for name, each in _load_compared(table, network).items():
         methods |= _name_methods(name, each, raw=table.raw)
     if table.auto:
         methods["auto"] = of_inbetweener(AutoInbetweener(network, priors.load_choice("auto")))
@@ -85,6 +94,33 @@ def run(table: Transitions) -> int:
     return print_rows(table, rows)
 
 
+def _measure_told(
+    table: Transitions,
+    network: Inbetweener,
+    kinds: Mapping[str, Sequence[Motion]],
+    held_out: Mapping[str, Sequence[str]],
+) -> list[Row]:
+    """Measure gaps in which more is told than the poses beside them."""
+    if table.prior is not None or table.auto:
+        raise RequestError("--told is about in-betweeners and stitchers; leave --prior and --auto out")
+    methods = _load_compared(table, network)
+    for name in filter(None, table.stitcher.split(",")):
+        methods[f"{name}, calm"] = StitchedInbetweener(_load_unseeing(name, held_out), lambda: network)
+    with show_progress("told") as progress:
+        rows = benchmark_told(kinds, methods, progress=progress)
+        if not table.raw:
+            rows = [row | {"by": f"{row['by']}, raw"} for row in rows]
+            finished = benchmark_told(kinds, methods, finish=True, progress=progress)
+            rows += [row | {"by": f"{row['by']}, finished"} for row in finished]
+    return rows
+
+
+def _load_compared(table: Transitions, network: Inbetweener) -> dict[str, Inbetweener]:
+    """Load the baselines, and name the in-betweener after them."""
+    compared = {name: priors.load_inbetweener(name) for name in filter(None, table.baselines.split(","))}
+    return compared | {table.inbetweener: network}
+
+
 def _name_methods(name: str, inbetweener: Inbetweener, *, raw: bool) -> dict[str, Method]:
     """Name the rows of an in-betweener: as it proposes, and finished unless they are to be raw."""
     methods = {f"{name}, raw": of_inbetweener(inbetweener, finish=False)}
@@ -103,4 +139,6 @@ def _check_unseen(name: str, card: Card, held_out: Mapping[str, Sequence[str]]) 
     own = {clip for clips in card.data.get("held_out", {}).values() for clip in clips}
     seen = [clip for clips in held_out.values() for clip in clips if clip not in own]
     if seen:
-        raise RequestError(f"{name} was trained on {seen[0]}, which is kept for measuring; train it with that seed")
+        raise RequestError(
+            f"{name} was trained on {seen[0]}, which is kept for measuring; train it with that seed on the same files"
+        )
