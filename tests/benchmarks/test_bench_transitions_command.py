@@ -118,11 +118,32 @@ def test_models_that_saw_the_clips_are_refused(folder, capsys, option, save):
     assert "was trained on bandai/a_walk_0.bvh" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("more", [["--auto"], ["--prior", "general"]])
-def test_told_is_about_in_betweeners(folder, capsys, more):
-    words = ["--data", folder / "data", "--inbetweener", folder / "ours.safetensors", "--told", *more]
-    assert run("bench", "transitions", *words) == 2
-    assert "leave --prior and --auto out" in capsys.readouterr().err
+def test_errors_over_the_frames_are_drawn(folder, tmp_path, capsys):
+    network, card = tiny_stitcher.network(config=LONG), replace(tiny_stitcher.card(LONG), data={"held_out": HELD_OUT})
+    checkpoints.save(network.state_dict(), card, folder / "curve.safetensors")
+    names = [str(folder / f"{each}.safetensors") for each in ("ours", "curve")]
+    rows = measure(folder, capsys, "--past", "1", "--stitcher", names[1], "--over-time", tmp_path / "errors.png")
+    assert [(row["by"], row["frame"]) for row in rows] == [(name, frame) for name in names for frame in range(1, 31)]
+    one, several = rows[:30], rows[30:]
+    assert all(row["nearest_cm"] == row["farthest_cm"] > 0 for row in one)
+    assert all(row["nearest_cm"] < row["error_cm"] < row["farthest_cm"] for row in several)
+    assert several[0]["error_cm"] < several[15]["error_cm"] > several[29]["error_cm"]  # both ends are known
+    assert (tmp_path / "errors.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--told", "--auto"], "leave --prior and --auto out"),
+        (["--over-time", "a.png", "--prior", "general"], "leave --prior and --auto out"),
+        (["--told", "--over-time", "a.png"], "choose one"),
+        (["--over-time", "a.bvh"], "draws a .png"),
+    ],
+)
+def test_options_that_exclude_each_other_are_refused(folder, capsys, words, said):
+    asked = ["--data", folder / "data", "--inbetweener", folder / "ours.safetensors", *words]
+    assert run("bench", "transitions", *asked) == 2
+    assert said in capsys.readouterr().err
 
 
 def test_clips_that_are_no_longer_there_are_said(folder, tmp_path, capsys):

@@ -12,6 +12,7 @@ from controllers.benchmarks.transitions.methods import (
     of_inbetweener,
     of_retrieval,
 )
+from controllers.benchmarks.transitions.over_time import benchmark_over_time
 from controllers.benchmarks.transitions.table import ALL_KINDS, DRAWS, LENGTHS, benchmark_transitions
 from controllers.benchmarks.transitions.told import benchmark_told
 
@@ -23,6 +24,7 @@ __all__ = [
     "Filled",
     "Method",
     "Sampler",
+    "benchmark_over_time",
     "benchmark_told",
     "benchmark_transitions",
     "draw_retrieved",

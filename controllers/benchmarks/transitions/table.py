@@ -4,7 +4,7 @@ bare pose, or with the whole clip around, by kind of clip, length and method.
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import torch
@@ -15,6 +15,7 @@ from controllers.benchmarks.shared.tables import Row
 from controllers.benchmarks.transitions.methods import Energy, Filled, Method, Sampler
 from controllers.benchmarks.transitions.seen import measure_motion
 from controllers.benchmarks.transitions.twins import measure_twins
+from controllers.benchmarks.transitions.windows import PAST, Gap, find_gaps, put_in
 from mapctl.metrics import transitions
 from mapctl.metrics.realism import (
     RealismSettings,
@@ -27,40 +28,14 @@ from mapctl.motion import Motion
 
 LENGTHS = (5, 15, 30, 45)
 """Frames of the gaps, as in the tables of LaFAN1."""
-WINDOW, STRIDE = 65, 40
-"""Frames of a test window, and from one to the next."""
 DRAWS = 8
 """Answers drawn of each gap."""
 ALL_KINDS = "mean of kinds"
 """Kind of the rows that average those of all kinds."""
-_PAST = 10  # frames before the gap
 _TOLD = ("kind", "frames", "windows", "method")
 _WORST = ("step_cm", "acceleration_m_s2", "apart_most_cm")
 _REALISM_LENGTH = 30
 _REALISM = RealismSettings(windows=WindowSettings(frames=30))
-
-
-@dataclass(frozen=True, eq=False)
-class _Gap:
-    """One gap of one clip."""
-
-    part: Motion
-    """Frames that a method is given."""
-    start: int
-    stop: int
-    """Frames of the gap in it."""
-    around: Motion
-    """The gap with up to ten true frames on either side."""
-
-    @property
-    def filled(self) -> slice:
-        """Frames of the gap in `around`."""
-        return slice(_PAST, _PAST + self.stop - self.start)
-
-    @property
-    def inner(self) -> Motion:
-        """The gap with the two poses beside it."""
-        return self.part.slice(self.start - 1, self.stop + 1)
 
 
 def benchmark_transitions(
@@ -93,7 +68,7 @@ def benchmark_transitions(
         cut: dict[str, list[Tensor]] = {name: [] for name in ("mocap", *names)}
         found = []
         for kind, clips in kinds.items():
-            gaps = [gap for clip in clips for gap in _find_gaps(clip, length, past)]
+            gaps = [gap for clip in clips for gap in find_gaps(clip, length, past)]
             if not gaps:
                 continue
             shared = {"kind": kind, "frames": length, "windows": len(gaps)}
@@ -126,20 +101,20 @@ class _Made:
     row: Row
 
 
-def _run_method(name: str, method: Method, gaps: Sequence[_Gap], std: Tensor) -> list[_Made]:
+def _run_method(name: str, method: Method, gaps: Sequence[Gap], std: Tensor) -> list[_Made]:
     began = time.process_time()
     filled = [method(gap.part, gap.start, gap.stop) for gap in gaps]
     cost = _count_ms(began, gaps)
-    motions = [_put_in(each, gap) for each, gap in zip(filled, gaps, strict=True)]
+    motions = [put_in(each, gap) for each, gap in zip(filled, gaps, strict=True)]
     return [_Made(name, motions, {**_compare(motions, gaps, std), **measure_motion(motions), **cost, **_tell(filled)})]
 
 
-def _run_sampler(name: str, sampler: Sampler, energy: Energy | None, gaps: Sequence[_Gap], std: Tensor) -> list[_Made]:
+def _run_sampler(name: str, sampler: Sampler, energy: Energy | None, gaps: Sequence[Gap], std: Tensor) -> list[_Made]:
     began = time.process_time()
     draws = [sampler(gap.part, gap.start, gap.stop, DRAWS) for gap in gaps]
     cost = _count_ms(began, gaps)
     firsts = [each[0] for each in draws]
-    motions = [[_put_in(one, gap) for one in each] for each, gap in zip(draws, gaps, strict=True)]
+    motions = [[put_in(one, gap) for one in each] for each, gap in zip(draws, gaps, strict=True)]
     spreads = [_measure_spread(each, gap) for each, gap in zip(motions, gaps, strict=True)]
     spread = {key: sum(each[key] for each in spreads) / len(spreads) for key in spreads[0]}
     one = [each[0] for each in motions]
@@ -160,7 +135,7 @@ def _name_draws(sampler: str, energy: Energy | None) -> list[str]:
     return names if energy is None else [*names, f"{sampler}, best of {DRAWS} by energy"]
 
 
-def _count_ms(began: float, gaps: Sequence[_Gap]) -> Row:
+def _count_ms(began: float, gaps: Sequence[Gap]) -> Row:
     return {"frame_ms": 1000 * (time.process_time() - began) / sum(gap.stop - gap.start for gap in gaps)}
 
 
@@ -170,40 +145,21 @@ def _tell(filled: Sequence[Filled]) -> Row:
     return {"apart_cm": sum(apart) / len(apart), "apart_most_cm": max(apart)} if apart else {}
 
 
-def _measure_spread(draws: Sequence[Motion], gap: _Gap) -> Row:
+def _measure_spread(draws: Sequence[Motion], gap: Gap) -> Row:
     """Measure how far draws are from each other: mean distance of joints, and Ren et al.'s APD."""
     positions = torch.stack([each.joint_positions()[gap.filled] for each in draws])
     mean, flat = transitions.compute_pairwise_distances(positions)
     return {"spread_cm": 100 * mean, "apd_cm": 100 * flat}
 
 
-def _pick_nearest(draws: Sequence[Motion], gap: _Gap, std: Tensor) -> Motion:
+def _pick_nearest(draws: Sequence[Motion], gap: Gap, std: Tensor) -> Motion:
     """Pick the draw with the least L2P: with the truth at hand, which nobody has."""
     truth = gap.around.joint_positions()[None, gap.filled]
     errors = [transitions.compute_l2p(each.joint_positions()[None, gap.filled], truth, std) for each in draws]
     return draws[min(range(len(draws)), key=errors.__getitem__)]
 
 
-def _find_gaps(clip: Motion, length: int, past: int | None) -> list[_Gap]:
-    gaps = []
-    for first in range(0, clip.num_frames - WINDOW, STRIDE):
-        start, stop = first + _PAST, first + _PAST + length
-        begin, end = (0, clip.num_frames) if past is None else (start - past, stop + 1)
-        after = min(clip.num_frames, stop + 10)
-        part = clip.slice(begin, end)
-        gaps.append(_Gap(part, start - begin, stop - begin, clip.slice(start - _PAST, after)))
-    return gaps
-
-
-def _put_in(filled: Filled, gap: _Gap) -> Motion:
-    """Return the gap as filled, with its true frames around."""
-    root, quats = gap.around.root_position.clone(), gap.around.local_quat_xyzw.clone()
-    made, here = filled.motion, slice(gap.start, gap.stop)
-    root[gap.filled], quats[gap.filled] = made.root_position[here], made.local_quat_xyzw[here]
-    return replace(gap.around, root_position=root, local_quat_xyzw=quats)
-
-
-def _compare(made: Sequence[Motion], gaps: Sequence[_Gap], std: Tensor) -> Row:
+def _compare(made: Sequence[Motion], gaps: Sequence[Gap], std: Tensor) -> Row:
     """Measure errors of one length."""
     part, sides = gaps[0].filled, []
     for motions in (made, [gap.around for gap in gaps]):
@@ -252,7 +208,7 @@ def _average_kinds(found: Sequence[Row], methods: Sequence[str], baseline: str, 
 
 def _cut(motion: Motion) -> Tensor:
     """Cut a gap out, with the frame before it, for the network that tells it from mocap."""
-    part = motion.slice(_PAST - 1, _PAST + _REALISM_LENGTH)
+    part = motion.slice(PAST - 1, PAST + _REALISM_LENGTH)
     return cut_windows(canonical_positions(part), _REALISM.windows)
 
 

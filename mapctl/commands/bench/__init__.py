@@ -241,6 +241,8 @@ class Transitions(Table):
     told: bool = False
     """Measure instead one gap of 30 frames a clip in whose middle hands, a foot or the hips are told, too: by the
     in-betweener, the baselines and the stitchers."""
+    over_time: options.MaybeFile = None
+    """Measure instead errors over the frames of gaps of 30 frames, of three answers each, and draw them as FILE.png."""
 
 
 @dataclass(frozen=True, kw_only=True)

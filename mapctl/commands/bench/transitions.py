@@ -13,6 +13,7 @@ from controllers.benchmarks.shared.tables import Row
 from controllers.benchmarks.transitions import (
     Method,
     Sampler,
+    benchmark_over_time,
     benchmark_told,
     benchmark_transitions,
     draw_retrieved,
@@ -30,6 +31,7 @@ from controllers.inbetweening.proposers import (
 )
 from mapctl.commands.bench import Transitions
 from mapctl.commands.bench.output import print_rows
+from mapctl.commands.shared import outputs
 from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS, GroundPose
@@ -41,16 +43,20 @@ from priors.checkpoints import Card
 from priors.stitching.inbetweener import Stitcher
 from priors.training.corpus import read_corpus
 from priors.training.transition_statistics import compute_position_std
+from scenes.plots.transitions import plot_errors
 
 
 def run(table: Transitions) -> int:
-    """Measure and print."""
+    """Check the options, measure and print."""
+    _check(table)
     network = priors.load_inbetweener(table.inbetweener)
     held_out = network.card.data.get("held_out", {})
     kinds = load_canonical(table.data, held_out, table.count, fps=PRIOR_FPS)
     kinds = {kind: [scale_to_canonical_bones(clip) for clip in clips] for kind, clips in kinds.items()}
     if table.told:
         return print_rows(table, _measure_told(table, network, kinds, held_out))
+    if table.over_time is not None:
+        return print_rows(table, _measure_over_time(table, network, kinds, held_out, table.over_time))
     with TemporaryDirectory() as cache:
         corpus = read_corpus(table.data, match="", cache=Path(cache), skip_first=True)
     # By name: a folder with clips beside those of the training would be split otherwise.
@@ -79,12 +85,11 @@ def run(table: Transitions) -> int:
         _check_unseen(str(table.prior), density.card, held_out)
     if density is not None:
         methods["rollouts"] = of_inbetweener(RolloutInbetweener([density], network), finish=False)
-    past = None if table.past == "all" else int(table.past)
     with show_progress("transitions") as progress:
         rows = benchmark_transitions(
             kinds,
             methods,
-            past=past,
+            past=_count_past(table),
             std=compute_position_std(train),
             baseline="slerp",
             samplers=samplers,
@@ -94,6 +99,41 @@ def run(table: Transitions) -> int:
     return print_rows(table, rows)
 
 
+def _check(table: Transitions) -> None:
+    """RequestError for options that exclude each other, and a picture that cannot be written."""
+    other = "--told" if table.told else "--over-time" if table.over_time is not None else None
+    if other and (table.prior is not None or table.auto):
+        raise RequestError(f"{other} is about in-betweeners and stitchers; leave --prior and --auto out")
+    if table.told and table.over_time is not None:
+        raise RequestError("--told and --over-time are two tables; choose one")
+    if table.over_time is not None:
+        if table.over_time.suffix.lower() != ".png":
+            raise RequestError(f"--over-time draws a .png, got {table.over_time}")
+        outputs.check_files([table.over_time])
+
+
+def _count_past(table: Transitions) -> int | None:
+    """Count the frames that are known before a gap; None where the whole clip is."""
+    return None if table.past == "all" else int(table.past)
+
+
+def _measure_over_time(
+    table: Transitions,
+    network: Inbetweener,
+    kinds: Mapping[str, Sequence[Motion]],
+    held_out: Mapping[str, Sequence[str]],
+    picture: Path,
+) -> list[Row]:
+    """Measure errors over the frames of gaps, and draw them."""
+    samplers = {name: of_draws(lambda _, each=each: each) for name, each in _load_compared(table, network).items()}
+    for name in filter(None, table.stitcher.split(",")):
+        samplers[name] = of_draws(_load_unseeing(name, held_out).drawing().numbered)
+    with show_progress("over time") as progress:
+        rows = benchmark_over_time(kinds, samplers, past=_count_past(table), progress=progress)
+    plot_errors(rows, picture)
+    return rows
+
+
 def _measure_told(
     table: Transitions,
     network: Inbetweener,
@@ -101,8 +141,6 @@ def _measure_told(
     held_out: Mapping[str, Sequence[str]],
 ) -> list[Row]:
     """Measure gaps in which more is told than the poses beside them."""
-    if table.prior is not None or table.auto:
-        raise RequestError("--told is about in-betweeners and stitchers; leave --prior and --auto out")
     methods = _load_compared(table, network)
     for name in filter(None, table.stitcher.split(",")):
         methods[f"{name}, calm"] = StitchedInbetweener(_load_unseeing(name, held_out), lambda: network)
