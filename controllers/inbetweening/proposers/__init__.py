@@ -37,8 +37,17 @@ class ModelLoaders:
     """Loader of the network that fills gaps from both sides."""
 
 
+def _build_auto(models: ModelLoaders) -> AutoInbetweener:
+    network = models.network("auto")
+
+    def stitch() -> Inbetweener:
+        return StitchedInbetweener(models.stitcher(), lambda: network)
+
+    return AutoInbetweener(network, models.densities(), tweener=models.tweener(), stitcher=stitch)
+
+
 METHODS: Mapping[str, Callable[[ModelLoaders], Inbetweener]] = {
-    "auto": lambda models: AutoInbetweener(models.network("auto"), models.densities(), tweener=models.tweener()),
+    "auto": _build_auto,
     "transformer": lambda models: models.network("transformer"),
     "infiller": lambda models: models.network("infiller"),
     "tweener": lambda models: models.network("tweener"),

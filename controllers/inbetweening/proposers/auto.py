@@ -1,11 +1,11 @@
-"""Choice of the proposer of each gap: a network, a tweener where the gap is longer than that network fills, a held pose
-where the body stands still.
+"""Choice of the proposer of each gap: a network, a tweener where the gap is longer than that network fills, a stitcher
+where hands, feet or hips are told between two poses, a held pose where the body stands still.
 
 Rollouts of a density have no part in it: their feet slide less as proposed, but the MAP stage plants the feet of
 either, and then the pose transformer's answer is nearer to mocap in all that it fills.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -17,7 +17,6 @@ from controllers.inbetweening.proposers.walked import PlaceWalker
 from mapctl import contacts
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening import GapQuery, Proposal
-from mapctl.inbetweening.query import GapSource
 from mapctl.protocols import Density, Inbetweener
 from mapctl.skeleton import CANONICAL, TOES
 
@@ -35,6 +34,8 @@ class ChoiceSettings:
     """Frames of the shortest gap between whole poses, with partial keys in it or none, that is a tweener's."""
     styled: int = 60
     """And where the tweener was told a style: in less than 2 s there is no room for one."""
+    stitched: int = 60
+    """Frames of the longest gap between whole poses, with partial keys in it, that is a stitcher's."""
     held: int = 46
     """Frames of the shortest gap in which a pose is held."""
     astray: float = 0.03
@@ -48,8 +49,8 @@ class ChoiceSettings:
 
 @dataclass(frozen=True, eq=False)
 class AutoInbetweener(Inbetweener):
-    """In-betweener that takes a network's proposal, except in gaps that are a tweener's and where a pose is held; the
-    end is extrapolated by a density.
+    """In-betweener that takes a network's proposal, except in gaps that are a tweener's or a stitcher's and where a
+    pose is held; the end is extrapolated by a density.
     """
 
     network: Inbetweener
@@ -60,6 +61,9 @@ class AutoInbetweener(Inbetweener):
     """Thresholds of the choice."""
     tweener: Inbetweener | None = None
     """In-betweener for long gaps between whole poses; without one they are the network's."""
+    stitcher: Callable[[], Inbetweener] | None = None
+    """Loader of the in-betweener for short gaps between whole poses in which parts of the body are told; without one
+    they are the network's. It is called where there is such a gap."""
 
     @property
     def rough(self) -> Inbetweener:
@@ -89,6 +93,9 @@ class AutoInbetweener(Inbetweener):
         long = [gap for gap in query.hide_partial_keys().enclosed_gaps if self._is_tweeners(query, *gap)]
         if long and self.tweener is not None:
             made = _fill_from(propose_through_keys(query, self.tweener, generator)[0], made, query, long)
+        told = [gap for gap in query.hide_partial_keys().enclosed_gaps if self._is_stitchers(query, *gap)]
+        if told and self.stitcher is not None:
+            made = _fill_from(self.stitcher().propose(query, generator=generator), made, query, told)
         for gap in query.enclosed_gaps:
             # Who was told to move in a style moves; tweeners let others tremble.
             held = not self.has_style if _is_within(gap, long) else _goes_astray(query, made, gap, self.settings)
@@ -105,6 +112,14 @@ class AutoInbetweener(Inbetweener):
         shortest = self.settings.styled if self.has_style else self.settings.long
         return stop - start >= shortest and not _is_beside_part(query, start, stop)
 
+    def _is_stitchers(self, query: GapQuery, start: int, stop: int) -> bool:
+        """Return whether a gap is the stitcher's: short, with more told in it than the poses beside it."""
+        if query.keep_trajectory or self._is_tweeners(query, start, stop) or _is_beside_part(query, start, stop):
+            return False
+        within, targets = slice(start, stop), query.effector_targets
+        told = query.root_only_keys[within].any() or (targets is not None and targets.wanted[within].any())
+        return bool(told) and stop - start <= self.settings.stitched
+
 
 def _is_beside_part(query: GapQuery, start: int, stop: int) -> bool:
     """Return whether a frame beside a gap is known in part."""
@@ -119,9 +134,8 @@ def _is_within(gap: tuple[int, int], gaps: Sequence[tuple[int, int]]) -> bool:
 
 def _fill_from(proposal: Proposal, made: Proposal, query: GapQuery, gaps: Sequence[tuple[int, int]]) -> Proposal:
     """Fill gaps as another proposal has them."""
-    reasons = {other.start: other.reason for other in proposal.others}
-    filled = [gap for gap in query.enclosed_gaps if _is_within(gap, gaps)]
-    others = tuple(GapSource(*gap, proposal.source, reasons.get(gap[0], "")) for gap in filled)
+    sources = proposal.attribute(query)
+    others = tuple(source for source in sources if _is_within((source.start, source.stop), gaps))
     return replace(made.take(proposal, gaps), others=(*made.others, *others))
 
 
