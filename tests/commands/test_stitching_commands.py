@@ -77,10 +77,18 @@ def test_a_gap_that_is_too_long_is_anothers_and_the_note_says_so(clip, capsys):
     assert "longer than the 23 frames that the stitcher fills" in told
 
 
+def test_auto_stitches_where_a_hand_is_told(clip, capsys):
+    words = ("tween", clip, "-o", "one.bvh", "--no-finish", "--stitcher", "own.safetensors", "--joints", "leftHand")
+    assert run(*words, "--keyframes", "0,10,20") == 0
+    assert "frames 1:20: stitcher, led by what is told in it" in capsys.readouterr().out
+    assert run(*words, "--keyframes", "0,10,30") == 0
+    assert "frames 1:30: transformer, longer than the 23 frames that the stitcher fills" in capsys.readouterr().out
+
+
 def test_a_stitcher_where_none_can_be_is_refused(clip, fails):
     tween = ("tween", clip, "-o", "out.bvh", "--keyframes", "0,20")
-    assert fails(*tween, "--stitcher", "own.safetensors") == (
-        "mapctl: --method auto stitches nothing; leave --stitcher out or take --method stitcher\n"
+    assert fails(*tween, "--method", "transformer", "--stitcher", "own.safetensors") == (
+        "mapctl: --method transformer stitches nothing; leave --stitcher out or take --method stitcher\n"
     )
     assert "is no stitcher" in fails(*tween, "--method", "stitcher", "--stitcher", "transformer")
     assert "no prior 'gone'" in fails(*tween, "--method", "stitcher", "--stitcher", "gone")

@@ -35,8 +35,8 @@ class Chain(Command):
     """The file or run folder of a trained transformer, infiller or tweener; the bundled one if not given. With auto a
     tweener is for long gaps, beside the bundled transformer."""
     stitcher: options.MaybeName = None
-    """The file or run folder of a trained stitcher for --method stitcher; the bundled one if not given. --inbetweener
-    then fills what it leaves."""
+    """The file or run folder of a trained stitcher for --method stitcher, where --inbetweener fills what it leaves, and
+    for auto; the bundled one if not given."""
     path: options.MaybeName = None
     """The file or run folder of the path predictor that the tweener was trained with; the bundled one if not given."""
     video: options.MaybeFile = None

@@ -28,10 +28,11 @@ class Infill(Command):
     joints: Annotated[str | None, arg(metavar="NAME,NAME")] = None
     """Only these joints are missing, canonical names or the rig's own: in the gaps, or throughout if there are none."""
     method: options.Method = "auto"
-    """Method that proposes. auto: the transformer, the tweener through gaps of more than 6 s, or a held pose where the
-    body stands still; a note on each gap names it. transformer, infiller, tweener: that network alone. stitcher:
-    gaps of up to 2 s between whole poses from both sides, led by hands, feet, hips or a trajectory told in them.
-    rollouts: a density's rollouts, wherever nothing is known. slerp: interpolation."""
+    """Method that proposes. auto: the transformer, the stitcher where hands, feet or hips are told in up to 2 s, the
+    tweener through gaps of more than 6 s, or a held pose where the body stands still; a note on each gap names it.
+    transformer, infiller, tweener: that network alone. stitcher: gaps of up to 2 s between whole poses from both sides,
+    led by hands, feet, hips or a trajectory told in them. rollouts: a density's rollouts, wherever nothing is known.
+    slerp: interpolation."""
     dna: options.MaybeDna = None
     """Motion files of any known rig, or classes that `mapctl info tweener` lists, whose style the tweener takes: in all
     gaps with --method tweener, in those of 2 s and more without parts with auto."""
@@ -46,8 +47,8 @@ class Infill(Command):
     """The file or run folder of a trained transformer, infiller or tweener; the bundled one if not given. With auto a
     tweener is for long gaps, beside the bundled transformer."""
     stitcher: options.MaybeName = None
-    """The file or run folder of a trained stitcher for --method stitcher; the bundled one if not given. --inbetweener
-    then fills what it leaves."""
+    """The file or run folder of a trained stitcher for --method stitcher, where --inbetweener fills what it leaves, and
+    for auto; the bundled one if not given."""
     path: options.MaybeName = None
     """For --way and the tweener: the file or run folder of a trained path predictor; the bundled one if not given."""
     prior: options.MaybeName = None

@@ -40,7 +40,7 @@ def check_method(
 ) -> None:
     """Raise RequestError for an unknown method, and for a density or a network that the method does not use."""
     proposers.check_method(method)
-    if stitcher is not None and method != "stitcher":
+    if stitcher is not None and method not in ("auto", "stitcher"):
         raise RequestError(f"--method {method} stitches nothing; leave --stitcher out or take --method stitcher")
     if prior is not None and not finish and method not in ("auto", "rollouts"):
         raise RequestError(f"--method {method} --no-finish has no MAP stage for a density; leave --prior out")
