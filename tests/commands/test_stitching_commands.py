@@ -82,7 +82,9 @@ def test_auto_stitches_where_a_hand_is_told(clip, capsys):
     assert run(*words, "--keyframes", "0,10,20") == 0
     assert "frames 1:20: stitcher, led by what is told in it" in capsys.readouterr().out
     assert run(*words, "--keyframes", "0,10,30") == 0
-    assert "frames 1:30: transformer, longer than the 23 frames that the stitcher fills" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "frames 1:30: transformer" in told
+    assert "longer than the 23 frames that the stitcher fills" in told
 
 
 def test_a_stitcher_where_none_can_be_is_refused(clip, fails):
