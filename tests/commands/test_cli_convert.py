@@ -55,9 +55,29 @@ def test_a_capture_says_its_rate_on_the_command_line(here):
     np.testing.assert_allclose(motion.joint_positions(), mapctl.load("in.amc").joint_positions()[::2], atol=1e-9)
 
 
+@pytest.mark.parametrize("frames", ["2:5", "0.0667s:0.1667s"])
+@pytest.mark.parametrize("source", ["in.bvh", "in.npz"])
+def test_some_frames_alone(here, source, frames):
+    """In the layout of the whole."""
+    assert run("convert", source, "out.bvh", "--frames", frames) == 0
+    some, whole = mapctl.load("out.bvh"), mapctl.load(source)
+    assert (some.num_frames, some.fps, some.skeleton.names) == (3, whole.fps, mapctl.load("in.bvh").skeleton.names)
+    where = [some.skeleton.index(name) for name in whole.skeleton.names]
+    np.testing.assert_allclose(some.joint_positions()[:, where], whole.joint_positions()[2:5], atol=2e-6)
+
+
+def test_frames_are_picked_before_the_rate_is_changed(here):
+    assert run("convert", "in.bvh", "out.npz", "--frames", "1:6", "--fps", "15") == 0
+    picked = mapctl.load("in.bvh").slice(1, 6).resample(15)
+    np.testing.assert_allclose(mapctl.load("out.npz").joint_positions(), picked.joint_positions(), atol=1e-9)
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
+        (("in.bvh", "out.npz", "--frames", "2:9"), "the range of frames 2:9 must begin before it ends, within the"),
+        (("in.bvh", "out.npz", "--frames", "3:3"), "must begin before it ends"),
+        (("in.bvh", "out.npz", "--frames", "3"), "a range of frames is A:B, frames or seconds as in 60:120"),
         (("gone.amc", "out.bvh"), "gone.amc: no such file"),
         (("gone.asf+in.amc", "out.bvh"), "gone.asf: no such file"),
         (
@@ -133,7 +153,7 @@ def test_the_page_names_every_format_and_key():
 
 def test_commands_of_the_page_are_understood():
     lines = [line.split("#")[0] for line in DOCS.splitlines() if line.startswith("mapctl ")]
-    assert len(lines) == 5
+    assert len(lines) == 6
     for line in lines:
         assert cli.parse(shlex.split(line)[1:]) is not None
 

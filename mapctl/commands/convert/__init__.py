@@ -12,7 +12,7 @@ from mapctl.commands.shared.command import Command
 
 @dataclass(frozen=True)
 class Convert(Command):
-    """Write a motion in another format, on another skeleton or at another frame rate."""
+    """Write a motion in another format, on another skeleton or at another frame rate, or some frames of it."""
 
     single_thread: ClassVar[bool] = False
 
@@ -27,6 +27,8 @@ class Convert(Command):
     get the bones of the canonical body."""
     source_rig: options.MaybeRig = None
     """The rig of IN, where it is not the one that would be recognised; see `mapctl info IN`."""
+    frames: Annotated[str | None, arg(metavar="A:B")] = None
+    """Only these frames of IN, or seconds as in 2s:4s; B is the first that is left out."""
     fps: Annotated[str | None, arg(metavar="F")] = None
     """Frames per second, as 30, 29.97 or 30000/1001: positions linear, rotations by slerp."""
     fps_in: Annotated[str | None, arg(metavar="F")] = None

@@ -5,6 +5,7 @@ from fractions import Fraction
 from mapctl import formats, retarget
 from mapctl.commands.convert import Convert
 from mapctl.commands.shared import inputs, outputs
+from mapctl.commands.shared.frame_syntax import parse_range
 from mapctl.errors import RequestError
 from mapctl.motion import Motion
 from mapctl.retarget.carry import RetargetedMotion, RiggedCharacter, retarget_motion
@@ -19,6 +20,11 @@ def run(command: Convert) -> int:
     source_rig = inputs.read_rig(command.source_rig)
     fps_in = None if command.fps_in is None else parse_fps(command.fps_in)
     motion, notes = inputs.read_motion(command.source, source_rig, fps=fps_in), ()
+    if command.frames is not None:
+        start, stop = parse_range(
+            command.frames, fps=float(motion.fps), frames=motion.num_frames, what="range of frames"
+        )
+        motion = motion.slice(start, stop)
     if command.rig is not None:
         retargeted = transfer_to_rig(motion, command.rig, source_rig)
         motion, notes = retargeted.motion, retargeted.notes
