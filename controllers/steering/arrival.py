@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from controllers.steering.steer import Refusal, SteerFrames, SteerState, step
-from controllers.steering.way import LEAST_FRAMES, TransitionMaker, begin_way, commit_frames, needed_speed
+from controllers.steering.way import LEAST_FRAMES, TransitionMaker, begin_way, commit_frames, needed_speed, plan_way
 from mapctl import rotations
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose
 from mapctl.intent.steering import Arrival, Command, SteeringTarget
@@ -81,9 +81,9 @@ class Arriver:
         # Who has to walk first does so until little is left; a way that can be stitched as a whole is.
         most = self.transitions.longest + 1 if new else _STITCHED_FRAMES
         if approach.planned is None and not approach.refused and left <= most:
-            planned = None if old is None else old.ahead()
-            idle = planned is None or not len(planned)
-            if idle and (found := self._set_out(state, approach, command, left)) is not None:
+            ahead = None if old is None else old.ahead()
+            planned = state.committed.features[:0] if ahead is None else ahead
+            if not len(planned) and (found := self._set_out(state, approach, command, left)) is not None:
                 after, frames, work = found
                 _proceed(work, began, seconds)
                 return after, frames
@@ -117,7 +117,8 @@ class Arriver:
         there = replace(there, settings=settings)
         if needed_speed(there, order, rest) > state.prior.limits.max_steering_speed:
             return None
-        nothing, work = begin_way(self.transitions, there, command, order, rest)
+        work = StepwiseWork(plan_way(self.transitions, there, command, order, rest))
+        nothing = there.committed.features[:0]
         return replace(there, approach=replace(approach, planned=nothing, rest=work)), frames, work
 
 

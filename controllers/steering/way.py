@@ -56,22 +56,21 @@ def begin_way(
     order: Arrival,
     frames: int,
     *,
-    planned: Float[Tensor, "ahead size"] | None = None,
+    planned: Float[Tensor, "ahead size"],
 ) -> tuple[Float[Tensor, "held size"], StepwiseWork[Float[Tensor, "rest size"]]]:
     """Begin the way to a place, so many frames away: return features of the first frames, which play meanwhile, and
     the work that makes the others.
 
-    The first are those of the next step as they were `planned` before; there are none where nothing was, and where no
-    time is left for the rest of the way after them.
+    The first are those of the next step as they were `planned` before; there are none where no time is left for the
+    rest of the way after them.
     """
-    ahead = state.committed.features[:0] if planned is None else planned
-    held = ahead[: state.settings.commit]
+    held = planned[: state.settings.commit]
     if frames - len(held) < LEAST_FRAMES:
         held = held[:0]
     there = replace(state, committed=commit_frames(state, held)) if len(held) else state
     if len(held) and needed_speed(there, order, frames - len(held)) > state.prior.limits.max_steering_speed:
         there, held = state, held[:0]
-    return held, StepwiseWork(_plan(transitions, there, command, order, frames - len(held)))
+    return held, StepwiseWork(plan_way(transitions, there, command, order, frames - len(held)))
 
 
 def commit_frames(state: SteerState, new: Float[Tensor, "frames size"]) -> CommittedFrames:
@@ -98,10 +97,10 @@ def needed_speed(state: SteerState, order: Arrival, frames: int) -> float:
     return math.dist(order.place, here.tolist()) / state.character.scale * PRIOR_FPS / frames
 
 
-def _plan(
+def plan_way(
     transitions: TransitionMaker, state: SteerState, command: Command, order: Arrival, frames: int
 ) -> Generator[None, None, Float[Tensor, "frames size"]]:
-    """Plan the frames to a place, in the pose there to which the way is smoothest."""
+    """Plan the frames to a place, a frame at a time, in the pose there to which the way is smoothest."""
     character = state.character
     after = _pose_candidates(state, command, order)
     here = state.committed.place

@@ -32,7 +32,7 @@ MAX_CONTEXT = 10
 """Frames before a gap, and after it, that are looked at."""
 _WIDENED = 1.25
 """By how much draws are wider than what training found, with which the best of eight is nearest to the truth: answers
-then differ by a quarter more, and the best of eight is farther from the truth by about two hundredths."""
+differ by as much more, and the best of eight is hardly farther from the truth."""
 _NOT_FINITE = "nothing finite came of it"
 _FARTHEST = 0.3  # metres of unit size from a trajectory over which steps can be moved without breaking
 _PARTNERS = CANONICAL.mirror_partners()
@@ -157,10 +157,9 @@ class Stitcher(Inbetweener):
         sources = []
         whole = query.hide_partial_keys()
         for start, stop in whole.enclosed_gaps:
-            reason, remark = self._refuse(whole, start, stop), ""
-            found, wishes = None, Wishes.of(query, start, stop)
+            reason, remark, found, wishes = self._refuse(whole, start, stop), "", None, None
             if not reason:
-                ends = see_ends(body, whole.missing.frames, start, stop)
+                ends, wishes = see_ends(body, whole.missing.frames, start, stop), Wishes.of(query, start, stop)
                 found = self._find(ends, start, stop) if wishes is None else self._fit(ends, start, stop, wishes)
             if found is not None and wishes is not None:
                 off = wishes.measure_farthest(found)

@@ -77,7 +77,7 @@ def test_what_is_told_in_the_middle_is_met_by_all(folder, capsys):
     network, card = tiny_stitcher.network(config=LONG), replace(tiny_stitcher.card(LONG), data={"held_out": HELD_OUT})
     checkpoints.save(network.state_dict(), card, folder / "told.safetensors")
     stitcher = str(folder / "told.safetensors")
-    rows = measure(folder, capsys, "--told", "--raw", "--stitcher", stitcher)
+    rows = measure(folder, capsys, "--partial-keys", "--raw", "--stitcher", stitcher)
     told = ["nothing", "both hands", "a foot", "the hips", "hands overhead"]
     names = (str(folder / "ours.safetensors"), f"{stitcher}, calm")
     assert [(row["told"], row["by"]) for row in rows] == [(what, name) for what in told for name in names]
@@ -134,9 +134,9 @@ def test_errors_over_the_frames_are_drawn(folder, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--told", "--auto"], "leave --prior and --auto out"),
+        (["--partial-keys", "--auto"], "leave --prior and --auto out"),
         (["--over-time", "a.png", "--prior", "general"], "leave --prior and --auto out"),
-        (["--told", "--over-time", "a.png"], "choose one"),
+        (["--partial-keys", "--over-time", "a.png"], "choose one"),
         (["--over-time", "a.bvh"], "draws a .png"),
     ],
 )

@@ -155,6 +155,27 @@ def test_a_trajectory_is_followed_and_one_that_is_far_is_the_others():
     assert "off the trajectory" in source.reason
 
 
+def test_a_trajectory_is_joined_at_both_ends_without_a_leap():
+    """Moved over by nothing in the frames beside the gap, and by little in those next to them."""
+    query = query_of(walk(60), (GAP.start, GAP.stop))
+    plain = tiny_stitcher().propose(query).motion.root_position
+    root = query.motion.root_position.clone()
+    root[GAP, 0] = plain[GAP, 0] + 0.15  # aside at once, as no smooth trajectory would be
+    led = replace(query, motion=replace(query.motion, root_position=root), keep_trajectory=True)
+    moved = (tiny_stitcher().propose(led).motion.root_position - plain)[GAP.start - 1 : GAP.stop + 1, 0]
+    assert float(moved.diff().abs().max()) < 0.03
+    assert float(moved[len(moved) // 2]) > 0.1
+
+
+@pytest.mark.parametrize("frames", [1, 2, 4])
+def test_a_trajectory_through_few_frames_is_no_matter(frames):
+    motion, (start, stop) = walk(60), (21, 21 + frames)
+    led = replace(query_of(motion, (start, stop)), keep_trajectory=True)
+    made = tiny_stitcher().propose(led)
+    assert [source.by for source in made.attribute(led)] == ["stitcher"]
+    assert float((made.motion.root_position - motion.root_position)[start:stop, ::2].norm(dim=-1).max()) < 0.05
+
+
 def test_a_curve_is_followed_through_the_whole_job():
     motion = walk(60)
     start, stop = (motion.root_position[frame, ::2] for frame in (GAP.start - 1, GAP.stop))

@@ -13,8 +13,8 @@ from controllers.benchmarks.transitions.methods import (
     of_retrieval,
 )
 from controllers.benchmarks.transitions.over_time import benchmark_over_time
+from controllers.benchmarks.transitions.partial_keys import benchmark_partial_keys
 from controllers.benchmarks.transitions.table import ALL_KINDS, DRAWS, LENGTHS, benchmark_transitions
-from controllers.benchmarks.transitions.told import benchmark_told
 
 __all__ = [
     "ALL_KINDS",
@@ -25,7 +25,7 @@ __all__ = [
     "Method",
     "Sampler",
     "benchmark_over_time",
-    "benchmark_told",
+    "benchmark_partial_keys",
     "benchmark_transitions",
     "draw_retrieved",
     "hold_last_pose",

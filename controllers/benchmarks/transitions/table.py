@@ -12,8 +12,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from controllers.benchmarks.shared.tables import Row
+from controllers.benchmarks.transitions.appearance import measure_appearance
 from controllers.benchmarks.transitions.methods import Energy, Filled, Method, Sampler
-from controllers.benchmarks.transitions.seen import measure_motion
 from controllers.benchmarks.transitions.twins import measure_twins
 from controllers.benchmarks.transitions.windows import PAST, Gap, find_gaps, put_in
 from mapctl.metrics import transitions
@@ -33,7 +33,7 @@ DRAWS = 8
 ALL_KINDS = "mean of kinds"
 """Kind of the rows that average those of all kinds."""
 _TOLD = ("kind", "frames", "windows", "method")
-_WORST = ("step_cm", "acceleration_m_s2", "apart_most_cm")
+_WORST = ("missed_cm", "step_cm", "acceleration_m_s2", "apart_most_cm")
 _REALISM_LENGTH = 30
 _REALISM = RealismSettings(windows=WindowSettings(frames=30))
 
@@ -74,7 +74,7 @@ def benchmark_transitions(
             shared = {"kind": kind, "frames": length, "windows": len(gaps)}
             truth = [gap.around for gap in gaps]
             twins = measure_twins(clips, [gap.inner for gap in gaps]) if samplers else {}
-            made = [_Made("mocap", truth, {**measure_motion(truth), **twins})]
+            made = [_Made("mocap", truth, {**measure_appearance(truth), **twins})]
             for task in (
                 *(partial(_run_method, name, method) for name, method in methods.items()),
                 *(partial(_run_sampler, name, sampler, energy) for name, sampler in samplers.items()),
@@ -106,7 +106,9 @@ def _run_method(name: str, method: Method, gaps: Sequence[Gap], std: Tensor) -> 
     filled = [method(gap.part, gap.start, gap.stop) for gap in gaps]
     cost = _count_ms(began, gaps)
     motions = [put_in(each, gap) for each, gap in zip(filled, gaps, strict=True)]
-    return [_Made(name, motions, {**_compare(motions, gaps, std), **measure_motion(motions), **cost, **_tell(filled)})]
+    return [
+        _Made(name, motions, {**_compare(motions, gaps, std), **measure_appearance(motions), **cost, **_tell(filled)})
+    ]
 
 
 def _run_sampler(name: str, sampler: Sampler, energy: Energy | None, gaps: Sequence[Gap], std: Tensor) -> list[_Made]:
@@ -121,12 +123,12 @@ def _run_sampler(name: str, sampler: Sampler, energy: Energy | None, gaps: Seque
     best = [_pick_nearest(each, gap, std) for each, gap in zip(motions, gaps, strict=True)]
     first, nearest, *likeliest = _name_draws(name, energy)
     made = [
-        _Made(first, one, {**_compare(one, gaps, std), **measure_motion(one), **cost, **_tell(firsts), **spread}),
-        _Made(nearest, best, {**_compare(best, gaps, std), **measure_motion(best)}),
+        _Made(first, one, {**_compare(one, gaps, std), **measure_appearance(one), **cost, **_tell(firsts), **spread}),
+        _Made(nearest, best, {**_compare(best, gaps, std), **measure_appearance(best)}),
     ]
     if energy is not None:
         least = [min(each, key=energy) for each in motions]
-        made.append(_Made(likeliest[0], least, {**_compare(least, gaps, std), **measure_motion(least)}))
+        made.append(_Made(likeliest[0], least, {**_compare(least, gaps, std), **measure_appearance(least)}))
     return made
 
 
@@ -181,6 +183,18 @@ def _compare(made: Sequence[Motion], gaps: Sequence[Gap], std: Tensor) -> Row:
     }
 
 
+def average_measures(rows: Sequence[Row]) -> Row:
+    """Average rows of measures over those that have them; of the worst frames the worst stays."""
+    # Kinds without twins, or without a gap that was stitched, have fewer columns.
+    columns = {name: [row[name] for row in rows if name in row] for row in rows for name in row}
+    return {name: max(each) if name in _WORST else sum(each) / len(each) for name, each in columns.items()}
+
+
+def _drop_told(row: Row) -> Row:
+    """Drop what tells rows apart, and is no measure."""
+    return {name: value for name, value in row.items() if name not in _TOLD}
+
+
 def _average_kinds(found: Sequence[Row], methods: Sequence[str], baseline: str, length: int) -> list[Row]:
     """Average over kinds, and add shares of the baseline's errors to all rows."""
     errors = ("ade_cm", "l2p", "l2q", "npss")
@@ -190,13 +204,8 @@ def _average_kinds(found: Sequence[Row], methods: Sequence[str], baseline: str, 
         own = [row for row in found if row["method"] == method]
         if not own:
             continue
-        # Kinds without twins, or without a gap that was stitched, have fewer columns.
-        columns = [name for name in dict.fromkeys(name for row in own for name in row) if name not in _TOLD]
         mean: Row = {"kind": ALL_KINDS, "frames": length, "windows": sum(row["windows"] for row in own)}
-        mean |= {"method": method}
-        for name in columns:
-            values = [row[name] for row in own if name in row]
-            mean[name] = max(values) if name in _WORST else sum(values) / len(values)
+        mean |= {"method": method} | average_measures([_drop_told(row) for row in own])
         rows.append(mean)
     by_kind |= {(row["kind"], row["method"]): row for row in rows}
     for row in by_kind.values():

@@ -37,17 +37,10 @@ class ModelLoaders:
     """Loader of the network that fills gaps from both sides."""
 
 
-def _build_auto(models: ModelLoaders) -> AutoInbetweener:
-    network = models.network("auto")
-
-    def stitch() -> Inbetweener:
-        return StitchedInbetweener(models.stitcher(), lambda: network)
-
-    return AutoInbetweener(network, models.densities(), tweener=models.tweener(), stitcher=stitch)
-
-
 METHODS: Mapping[str, Callable[[ModelLoaders], Inbetweener]] = {
-    "auto": _build_auto,
+    "auto": lambda models: AutoInbetweener(
+        models.network("auto"), models.densities(), tweener=models.tweener(), stitcher=models.stitcher
+    ),
     "transformer": lambda models: models.network("transformer"),
     "infiller": lambda models: models.network("infiller"),
     "tweener": lambda models: models.network("tweener"),

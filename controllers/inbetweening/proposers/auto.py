@@ -13,6 +13,7 @@ import torch
 from controllers.inbetweening.proposers.extrapolation import extrapolate_end
 from controllers.inbetweening.proposers.partial_keys import propose_through_keys
 from controllers.inbetweening.proposers.rollouts import RolloutSettings
+from controllers.inbetweening.proposers.stitched import Given, StitchedInbetweener
 from controllers.inbetweening.proposers.walked import PlaceWalker
 from mapctl import contacts
 from mapctl.features import PRIOR_FPS
@@ -62,8 +63,8 @@ class AutoInbetweener(Inbetweener):
     tweener: Inbetweener | None = None
     """In-betweener for long gaps between whole poses; without one they are the network's."""
     stitcher: Callable[[], Inbetweener] | None = None
-    """Loader of the in-betweener for short gaps between whole poses in which parts of the body are told; without one
-    they are the network's. It is called where there is such a gap."""
+    """Loader of the stitcher, for short gaps between whole poses in which parts of the body are told; without one they
+    are the network's. It is called where there is such a gap."""
 
     @property
     def rough(self) -> Inbetweener:
@@ -95,7 +96,9 @@ class AutoInbetweener(Inbetweener):
             made = _fill_from(propose_through_keys(query, self.tweener, generator)[0], made, query, long)
         told = [gap for gap in query.hide_partial_keys().enclosed_gaps if self._is_stitchers(query, *gap)]
         if told and self.stitcher is not None:
-            made = _fill_from(self.stitcher().propose(query, generator=generator), made, query, told)
+            proposed = Given(made)  # and not asked again for what the stitcher leaves
+            stitched = StitchedInbetweener(self.stitcher(), lambda: proposed).propose(query, generator=generator)
+            made = _fill_from(stitched, made, query, told)
         for gap in query.enclosed_gaps:
             # Who was told to move in a style moves; tweeners let others tremble.
             held = not self.has_style if _is_within(gap, long) else _goes_astray(query, made, gap, self.settings)

@@ -30,27 +30,30 @@ class StitchedInbetweener(Inbetweener):
         """Propose for each gap the stitcher's motion, bent to what is told of it in part; what it left is the other's,
         and the proposal says why."""
         stitched = self.stitcher.propose(query, generator=generator)
-        left = [source for source in stitched.attribute(query) if source.by == INTERPOLATION]
-        if len(left) < len(stitched.attribute(query)):
+        sources = stitched.attribute(query)
+        left = [source for source in sources if source.by == INTERPOLATION]
+        if len(left) < len(sources):
+            # Along a trajectory it is laid already, with the hips' sway, which would be taken for a miss.
             free = replace(query, keep_trajectory=False)
-            stitched = propose_through_keys(free, _Given(stitched), generator)[0]
+            stitched = propose_through_keys(free, Given(stitched), generator)[0]
         if not left:
             return stitched
         fallback = self.load_fallback()
         asked = query if fallback.takes_partial_keys else query.hide_partial_keys()
         made = fallback.propose(asked, generator=generator)
-        if len(left) == len(stitched.attribute(query)):
-            return replace(made, others=_pass_on(left, made))
-        return _put_in(stitched, replace(made, others=_pass_on(left, made)), query)
+        made = replace(made, others=_pass_on(left, made))
+        return made if len(left) == len(sources) else _put_in(stitched, made, query)
 
 
 @dataclass(frozen=True, eq=False)
-class _Given(Inbetweener):
+class Given(Inbetweener):
     """Proposes what it was given."""
 
     proposal: Proposal
+    """Its proposal."""
 
     def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
+        """Return the proposal, whatever is asked."""
         return self.proposal
 
 

@@ -238,7 +238,7 @@ class Transitions(Table):
     """Leave out the rows that a MAP stage finishes."""
     auto: bool = False
     """Also as --method auto chooses; its rollouts take seconds a gap."""
-    told: bool = False
+    partial_keys: bool = False
     """Measure instead one gap of 30 frames a clip in whose middle hands, a foot or the hips are told, too: by the
     in-betweener, the baselines and the stitchers."""
     over_time: options.MaybeFile = None

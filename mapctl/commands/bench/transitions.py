@@ -14,7 +14,7 @@ from controllers.benchmarks.transitions import (
     Method,
     Sampler,
     benchmark_over_time,
-    benchmark_told,
+    benchmark_partial_keys,
     benchmark_transitions,
     draw_retrieved,
     hold_last_pose,
@@ -53,8 +53,8 @@ def run(table: Transitions) -> int:
     held_out = network.card.data.get("held_out", {})
     kinds = load_canonical(table.data, held_out, table.count, fps=PRIOR_FPS)
     kinds = {kind: [scale_to_canonical_bones(clip) for clip in clips] for kind, clips in kinds.items()}
-    if table.told:
-        return print_rows(table, _measure_told(table, network, kinds, held_out))
+    if table.partial_keys:
+        return print_rows(table, _measure_partial_keys(table, network, kinds, held_out))
     if table.over_time is not None:
         return print_rows(table, _measure_over_time(table, network, kinds, held_out, table.over_time))
     with TemporaryDirectory() as cache:
@@ -101,11 +101,11 @@ def run(table: Transitions) -> int:
 
 def _check(table: Transitions) -> None:
     """RequestError for options that exclude each other, and a picture that cannot be written."""
-    other = "--told" if table.told else "--over-time" if table.over_time is not None else None
+    other = "--partial-keys" if table.partial_keys else "--over-time" if table.over_time is not None else None
     if other and (table.prior is not None or table.auto):
         raise RequestError(f"{other} is about in-betweeners and stitchers; leave --prior and --auto out")
-    if table.told and table.over_time is not None:
-        raise RequestError("--told and --over-time are two tables; choose one")
+    if table.partial_keys and table.over_time is not None:
+        raise RequestError("--partial-keys and --over-time are two tables; choose one")
     if table.over_time is not None:
         if table.over_time.suffix.lower() != ".png":
             raise RequestError(f"--over-time draws a .png, got {table.over_time}")
@@ -134,7 +134,7 @@ def _measure_over_time(
     return rows
 
 
-def _measure_told(
+def _measure_partial_keys(
     table: Transitions,
     network: Inbetweener,
     kinds: Mapping[str, Sequence[Motion]],
@@ -144,11 +144,11 @@ def _measure_told(
     methods = _load_compared(table, network)
     for name in filter(None, table.stitcher.split(",")):
         methods[f"{name}, calm"] = StitchedInbetweener(_load_unseeing(name, held_out), lambda: network)
-    with show_progress("told") as progress:
-        rows = benchmark_told(kinds, methods, progress=progress)
+    with show_progress("partial keys") as progress:
+        rows = benchmark_partial_keys(kinds, methods, progress=progress)
         if not table.raw:
             rows = [row | {"by": f"{row['by']}, raw"} for row in rows]
-            finished = benchmark_told(kinds, methods, finish=True, progress=progress)
+            finished = benchmark_partial_keys(kinds, methods, finish=True, progress=progress)
             rows += [row | {"by": f"{row['by']}, finished"} for row in finished]
     return rows
 

@@ -5,8 +5,8 @@ from collections.abc import Callable, Mapping, Sequence
 import torch
 
 from controllers.benchmarks.shared.tables import Row
-from controllers.benchmarks.transitions.seen import measure_motion
-from controllers.benchmarks.transitions.table import ALL_KINDS
+from controllers.benchmarks.transitions.appearance import measure_appearance
+from controllers.benchmarks.transitions.table import ALL_KINDS, average_measures
 from controllers.inbetweening.pipeline import InfillSettings
 from controllers.inbetweening.tween import measure_keyframe_errors, tween
 from mapctl.intent.keyframes import Key, Keys
@@ -43,7 +43,7 @@ def tell_middles(part: Motion) -> dict[str, Keys]:
     return {what: Keys((0, *([] if key is None else [key]), FRAMES)) for what, key in middles.items()}
 
 
-def benchmark_told(
+def benchmark_partial_keys(
     kinds: Mapping[str, Sequence[Motion]],
     inbetweeners: Mapping[str, Inbetweener],
     *,
@@ -52,7 +52,7 @@ def benchmark_told(
 ) -> list[Row]:
     """Measure one window of FRAMES frames from the middle of each clip (canonical, at PRIOR_FPS; shorter ones are left
     out), told more and more: ADE, cm, where mocap did so too, how far what was told is missed, cm, and what a viewer
-    sees (`measure_motion`). Rows are means of the kinds' own figures, and the worst frame of all.
+    sees (`measure_appearance`). Rows are means of the kinds' own figures, and the worst frame of all.
     """
     parts = {kind: [_cut_middle(clip) for clip in clips if clip.num_frames > FRAMES] for kind, clips in kinds.items()}
     found: dict[tuple[str, str], list[Row]] = {}
@@ -68,7 +68,7 @@ def benchmark_told(
             progress(number + 1, len(parts))
     count = sum(len(windows) for windows in parts.values())
     return [
-        {"told": what, "by": name, "windows": count, "kind": ALL_KINDS} | _average(rows)
+        {"told": what, "by": name, "windows": count, "kind": ALL_KINDS} | average_measures(rows)
         for (what, name), rows in found.items()
     ]
 
@@ -93,10 +93,4 @@ def _measure(
         missed += [row.get("missed_cm", 0.0) for row in measure_keyframe_errors(done, window, keys)]
         made.append(done)
     ade = {"ade_cm": 100 * sum(errors) / len(errors)} if true else {}
-    return ade | {"missed_cm": max(missed)} | measure_motion(made)
-
-
-def _average(rows: Sequence[Row]) -> Row:
-    worst = ("missed_cm", "step_cm", "acceleration_m_s2")
-    columns = {name: [row[name] for row in rows] for name in rows[0]}
-    return {name: max(each) if name in worst else sum(each) / len(each) for name, each in columns.items()}
+    return ade | {"missed_cm": max(missed)} | measure_appearance(made)

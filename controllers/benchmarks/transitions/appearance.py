@@ -14,7 +14,7 @@ _TOES = CANONICAL.indices(TOES)
 _EFFECTORS = CANONICAL.indices(("leftHand", "rightHand", *TOES))
 
 
-def measure_motion(motions: Sequence[Motion]) -> Row:
+def measure_appearance(motions: Sequence[Motion]) -> Row:
     """Measure what a viewer sees: means over motions on canonical bones at PRIOR_FPS, and the worst frame of all.
 
     Planted toes' speed, cm/s; jitter, m/s^3; the largest step, cm, and acceleration, m/s^2, of a hand or a foot, seen
