@@ -54,13 +54,13 @@ def folder(tmp_path, monkeypatch):
 @pytest.fixture
 def models(tiny, prior):
     """By method, the options that name what it needs."""
-    return {"map": ["--inbetweener", tiny, "--prior", prior], "infiller": ["--inbetweener", tiny], "slerp": []}
+    return {"auto": ["--inbetweener", tiny, "--prior", prior], "infiller": ["--inbetweener", tiny], "slerp": []}
 
 
 @pytest.fixture
 def tween(models):
     """Runs the command; returns the exit status."""
-    return lambda *words: run("tween", *words, *models["map"])
+    return lambda *words: run("tween", *words, *models["auto"])
 
 
 def test_keys_of_every_kind_are_met_in_the_file(tween, folder, capsys):
@@ -110,7 +110,7 @@ def test_timing_is_suggested_for_frames_of_a_clip_too(folder, capsys):
     ]
 
 
-@pytest.mark.parametrize("method", [pytest.param("map", marks=pytest.mark.slow), "infiller", "slerp"])
+@pytest.mark.parametrize("method", [pytest.param("auto", marks=pytest.mark.slow), "infiller", "slerp"])
 def test_the_same_bytes_come_twice_and_quiet_says_nothing(models, folder, capsys, method):
     found = set()
     for _ in range(2):
@@ -130,7 +130,7 @@ def test_a_file_that_keys_name_is_not_written_over(tween, folder, capsys, monkey
     assert (folder / "keys" / "walk.bvh").read_bytes() == before
 
 
-@pytest.mark.parametrize("method", ["slerp", *(pytest.param(m, marks=pytest.mark.slow) for m in ("map", "bundled"))])
+@pytest.mark.parametrize("method", ["slerp", *(pytest.param(m, marks=pytest.mark.slow) for m in ("auto", "bundled"))])
 def test_the_example_runs_on_a_clip_of_its_name(models, tiny, folder, method):
     """The clip that it names is made by the command that it tells; of the bundled densities the default ones roll."""
     text = (DOCS / "keys.toml").read_text()
@@ -195,12 +195,12 @@ half = "lower"
 DRAWING = "joint,x,y\nHips,3,98\nHead,4,160\nHand_L,30,130\nrightHand,0,80\nFoot_L,10,12\nFoot_R,-8,12\n"
 
 
-@pytest.mark.parametrize("method", ["tweener", pytest.param("map", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("method", ["tweener", pytest.param("auto", marks=pytest.mark.slow)])
 def test_keys_that_are_not_whole_are_met_in_the_file(models, folder, method):
     """The first of them tells but a place."""
     (folder / "keys" / "keys.toml").write_text(PARTS)
     (folder / "keys" / "pose.csv").write_text(DRAWING)
-    more = ["--method", "tweener", "--no-finish"] if method == "tweener" else models["map"]
+    more = ["--method", "tweener", "--no-finish"] if method == "tweener" else models["auto"]
     words = [folder / "keys" / "keys.toml", "-o", "out.bvh", "--report", "r.json", "--quiet"]
     assert run("tween", *words, *more) == 0
     first, drawn, half = json.loads(Path("r.json").read_text())["keys"]
