@@ -17,7 +17,10 @@ from mapctl import curves
 from mapctl.inbetweening.effector_targets import EffectorTargets
 from mapctl.inbetweening.missing import MissingMask
 from mapctl.intent.keyframes import Keys
+from mapctl.kinematics import heading
+from mapctl.metrics import worst_frame
 from mapctl.rotations import about_y, multiply, rotate
+from mapctl.skeleton import CANONICAL
 from priors.stitching.fitting import fit_shared
 from priors.stitching.joining import Joined
 from priors.stitching.wishes import Wishes
@@ -101,6 +104,48 @@ def test_then_limbs_and_the_body_bend_until_it_is_met():
     )
     assert miss(query, done.motion) < 1e-3
     assert [source.by for source in done.sources] == ["stitcher"]
+
+
+@pytest.mark.parametrize("limb", ["leftHand", "rightFoot"])
+def test_they_go_there_and_come_back_without_a_leap(limb):
+    query = wishing(walk(60), 30, limb, (0.15, 0.2, 0.1))
+    made = StitchedInbetweener(tiny_stitcher(), never).propose(query).motion
+    assert miss(query, made) < 2e-3
+    peaks = worst_frame.measure_peaks(made.joint_positions()[:, [CANONICAL.index(limb)]], made.root_position, 30.0)
+    assert peaks.step < 0.15
+    assert peaks.acceleration < 60
+
+
+def test_hips_that_are_told_are_wished_for_where_they_are_and_as_they_face():
+    """A metre off is as much as 3.3 radians, and a sigma is 2 cm of either."""
+    motion, frame, aside, turn = walk(60), 30, 0.2, 0.5
+    query = query_of(motion, (GAP.start, GAP.stop))
+    joints, roots = query.missing.joints.clone(), query.missing.root.clone()
+    joints[frame, 0] = roots[frame] = False
+    wishes = Wishes.of(replace(query, missing=MissingMask(joints, roots)), GAP.start, GAP.stop)
+    facing, at = heading(motion.local_quat_xyzw[GAP.start - 1, 0]), motion.root_position[GAP.start - 1]
+    frames = len(motion.root_position[GAP])
+    root = rotate(about_y(-facing).expand(frames, 4), motion.root_position[GAP] - at * torch.tensor([1.0, 0.0, 1.0]))
+    quats = motion.local_quat_xyzw[GAP].clone()
+    quats[:, 0] = multiply(about_y(turn - facing).expand(frames, 4), quats[:, 0])
+    root[:, 0] += aside
+    joined = Joined(root[None].float(), quats[None].float(), torch.zeros(1, frames, 2), torch.zeros(1))
+    expected = torch.tensor([[aside / 0.02, 0.0, 0.0, 0.3 * turn / 0.02]])
+    torch.testing.assert_close(wishes.measure(joined), expected, atol=0.05, rtol=0)  # its bones are not quite those
+    assert wishes.measure_farthest(joined) == pytest.approx(aside, abs=1e-3)
+
+
+def test_a_taller_character_is_led_as_one_of_unit_size():
+    query, size = wishing(walk(60), 30, "leftHand", (0.2, 0.25, 0.1)), 1.3
+    motion, targets = query.motion, query.effector_targets
+    bones = replace(motion.skeleton, offsets=size * motion.skeleton.offsets)
+    tall = replace(
+        query,
+        motion=replace(motion, skeleton=bones, root_position=size * motion.root_position),
+        effector_targets=EffectorTargets(size * targets.places, targets.wanted),
+    )
+    one, other = (tiny_stitcher().propose(each).motion.joint_positions() for each in (query, tall))
+    assert float((size * one - other).abs().max()) < 1e-4
 
 
 def test_the_same_wish_elsewhere_and_turned_leads_to_the_same_motion_there():

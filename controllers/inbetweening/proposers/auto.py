@@ -13,7 +13,7 @@ import torch
 from controllers.inbetweening.proposers.extrapolation import extrapolate_end
 from controllers.inbetweening.proposers.partial_keys import propose_through_keys
 from controllers.inbetweening.proposers.rollouts import RolloutSettings
-from controllers.inbetweening.proposers.stitched import Given, StitchedInbetweener
+from controllers.inbetweening.proposers.stitched import StitchedInbetweener
 from controllers.inbetweening.proposers.walked import PlaceWalker
 from mapctl import contacts
 from mapctl.features import PRIOR_FPS
@@ -96,7 +96,7 @@ class AutoInbetweener(Inbetweener):
             made = _fill_from(propose_through_keys(query, self.tweener, generator)[0], made, query, long)
         told = [gap for gap in query.hide_partial_keys().enclosed_gaps if self._is_stitchers(query, *gap)]
         if told and self.stitcher is not None:
-            proposed = Given(made)  # and not asked again for what the stitcher leaves
+            proposed = _Given(made)  # and not asked again for what the stitcher leaves
             stitched = StitchedInbetweener(self.stitcher(), lambda: proposed).propose(query, generator=generator)
             made = _fill_from(stitched, made, query, told)
         for gap in query.enclosed_gaps:
@@ -122,6 +122,16 @@ class AutoInbetweener(Inbetweener):
         within, targets = slice(start, stop), query.effector_targets
         told = query.root_only_keys[within].any() or (targets is not None and targets.wanted[within].any())
         return bool(told) and stop - start <= self.settings.stitched
+
+
+@dataclass(frozen=True, eq=False)
+class _Given(Inbetweener):
+    """Proposes what it was given, whatever is asked."""
+
+    proposal: Proposal
+
+    def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
+        return self.proposal
 
 
 def _is_beside_part(query: GapQuery, start: int, stop: int) -> bool:

@@ -52,8 +52,7 @@ def propose_through_keys(
     """Propose a motion with hands and feet at their targets, and the hips at theirs in frames that give no more; also
     return the targets, moved within reach where they are not.
     """
-    hips, targets = query.root_only_keys, query.effector_targets
-    wanted = torch.zeros_like(hips) if targets is None else targets.wanted.any(dim=1)
+    hips, targets, wanted = _find_partial_keys(query)
     if not bool((hips | wanted).any()):
         return inbetweener.propose(query, generator=generator), targets
     if inbetweener.takes_partial_keys:
@@ -63,7 +62,16 @@ def propose_through_keys(
         first = inbetweener.rough.propose(blind, generator=generator).motion
         guided = _interpolate_trajectory(query, blind, first, targets, hips)
     answer = inbetweener.propose(replace(guided, effector_targets=_add_root_targets(query, hips)), generator=generator)
-    made = answer.motion
+    return meet_partial_keys(query, answer)
+
+
+def meet_partial_keys(query: GapQuery, answer: Proposal) -> tuple[Proposal, EffectorTargets | None]:
+    """Bend a motion that does not meet partial keys until it does, going there and coming back as bodies do; also
+    return the targets, moved within reach where they are not."""
+    hips, targets, wanted = _find_partial_keys(query)
+    if not bool((hips | wanted).any()):
+        return answer, targets
+    blind, made = query.hide_partial_keys(), answer.motion
     posed = _set_hips(made, query.motion, hips)
     if targets is None:
         return replace(answer, motion=_blend_key_poses(made, posed, hips, blind)), None
@@ -73,6 +81,14 @@ def propose_through_keys(
     reached = torch.where(targets.wanted[..., None], posed.joint_positions(), targets.places)
     there = replace(answer, motion=_blend_key_poses(made, posed, hips | wanted, blind))
     return there, EffectorTargets(reached, targets.wanted)
+
+
+def _find_partial_keys(
+    query: GapQuery,
+) -> tuple[Bool[Tensor, " frames"], EffectorTargets | None, Bool[Tensor, " frames"]]:
+    """Find the frames in which the hips alone are told, the effector targets, and the frames that have some."""
+    hips, targets = query.root_only_keys, query.effector_targets
+    return hips, targets, torch.zeros_like(hips) if targets is None else targets.wanted.any(dim=1)
 
 
 def _reach_exactly(

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from controllers.inbetweening.proposers.partial_keys import propose_through_keys
+from controllers.inbetweening.proposers.partial_keys import meet_partial_keys
 from mapctl.inbetweening import GapQuery, Proposal
 from mapctl.inbetweening.query import INTERPOLATION, GapSource
 from mapctl.protocols import Inbetweener
@@ -33,9 +33,7 @@ class StitchedInbetweener(Inbetweener):
         sources = stitched.attribute(query)
         left = [source for source in sources if source.by == INTERPOLATION]
         if len(left) < len(sources):
-            # Along a trajectory it is laid already, with the hips' sway, which would be taken for a miss.
-            free = replace(query, keep_trajectory=False)
-            stitched = propose_through_keys(free, Given(stitched), generator)[0]
+            stitched = meet_partial_keys(query, stitched)[0]
         if not left:
             return stitched
         fallback = self.load_fallback()
@@ -43,18 +41,6 @@ class StitchedInbetweener(Inbetweener):
         made = fallback.propose(asked, generator=generator)
         made = replace(made, others=_pass_on(left, made))
         return made if len(left) == len(sources) else _put_in(stitched, made, query)
-
-
-@dataclass(frozen=True, eq=False)
-class Given(Inbetweener):
-    """Proposes what it was given."""
-
-    proposal: Proposal
-    """Its proposal."""
-
-    def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
-        """Return the proposal, whatever is asked."""
-        return self.proposal
 
 
 def _pass_on(left: list[GapSource], made: Proposal) -> tuple[GapSource, ...]:
