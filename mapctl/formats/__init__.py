@@ -1,38 +1,27 @@
 """Reading and writing motions in file formats, chosen by the ending; each module owns its format's quirks."""
 
-from collections.abc import Callable
 from fractions import Fraction
+from importlib import import_module
 from os import PathLike
-from pathlib import PurePath
+from pathlib import Path
+from types import ModuleType
 
 from mapctl.errors import FileFormatError, RequestError
-from mapctl.formats import acclaim, bvh, npz, usd
+from mapctl.formats import acclaim, bvh, usd
+from mapctl.formats.characters.selector import parse_character_path
 from mapctl.formats.missing import MissingValues
+from mapctl.mesh.character_mesh import CharacterMesh
 from mapctl.motion import Motion
 
-
-def _save_glb(motion: Motion, path: str | PathLike[str]) -> None:
-    """Write a .glb; its module is imported late, since it draws a body, which the other formats need not load."""
-    from mapctl.formats import gltf
-
-    gltf.save(motion, path)
-
-
-READERS: dict[str, Callable[[str | PathLike[str]], Motion]] = {".bvh": bvh.load, ".npz": npz.load, ".amc": acclaim.load}
-_READERS_WITH_MISSING: dict[str, Callable[[str | PathLike[str]], tuple[Motion, MissingValues]]] = {
-    ".bvh": bvh.load_with_missing,
-    ".npz": npz.load_lossy,
-    ".amc": acclaim.load_with_missing,
-}
-WRITERS: dict[str, Callable[[Motion, str | PathLike[str]], None]] = {
-    ".bvh": bvh.save,
-    ".npz": npz.save,
-    ".glb": _save_glb,
-    **dict.fromkeys(usd.ENDINGS, usd.save),
-}
+READERS = {".bvh": "bvh", ".npz": "npz", ".amc": "acclaim", ".glb": "gltf", ".gltf": "gltf", ".vrm": "gltf"}
+"""Endings that are read, each with its module of this package, which is imported when it is needed."""
+WRITERS = {".bvh": "bvh", ".npz": "npz", ".glb": "gltf", ".vrm": "gltf", **dict.fromkeys(usd.ENDINGS, "usd")}
+"""Endings that are written, likewise."""
+CHARACTERS = (".glb", ".gltf", ".vrm")
+"""Endings of files of skinned characters, that have a rest pose of their own."""
+_MAY_LACK_VALUES = (".bvh", ".npz", ".amc")
 _UNREADABLE_REASONS = {
     ".asf": "is a skeleton alone: name its motion, a .amc beside it or subject.asf+take.amc",
-    ".glb": "can be written but not read",
     **dict.fromkeys(usd.ENDINGS, "can be written but not read"),
 }
 
@@ -40,17 +29,42 @@ _UNREADABLE_REASONS = {
 def load(
     path: str | PathLike[str], *, fps: Fraction | float | None = None, metres_per_unit: float | None = None
 ) -> Motion:
-    """Read a motion from a .bvh, .npz or .amc file, the last with the .asf beside it (see `acclaim.load`).
+    """Read a motion from a file of `READERS`, an .amc with the .asf beside it (see `acclaim.load`).
 
-    `fps` is frames per second of an .amc, which does not say; RequestError with the others, which do. `metres_per_unit`
-    wins over what is found by the size of the body, in formats whose unit is not fixed. FileFormatError says what is
-    wrong with the file, and where: NaN in place of a number, too, which `load_with_missing` takes.
+    Of a character's file it is an animation, or one frame of the rest pose where there is none; `hero.glb#ARMATURE`,
+    `hero.glb#ARMATURE/ANIMATION` and `hero.glb#/ANIMATION` choose where there are several. `fps` is frames per second
+    of an .amc, which does not say; RequestError with the others, which do. `metres_per_unit` wins over what is found
+    by the size of the body, in formats whose unit is not fixed. FileFormatError says what is wrong with the file, and
+    where: NaN in place of a number, too, which `load_with_missing` takes.
     """
     ending = _check_readable(path)
     if fps is not None and ending != ".amc":
         raise RequestError(f"{path}: a {ending} file says its frame rate itself; only that of an .amc is asked for")
-    motion = READERS[ending](path) if fps is None else acclaim.load(path, fps=fps)
+    motion = _import_format(READERS[ending]).load(path) if fps is None else acclaim.load(path, fps=fps)
     return motion if metres_per_unit is None else bvh.convert_unit(motion, metres_per_unit)
+
+
+def load_rest(path: str | PathLike[str]) -> Motion | None:
+    """Read one frame of a character's rest pose; None for files that have none but their motion."""
+    ending = _check_readable(path)
+    return _import_format(READERS[ending]).load_rest(path) if ending in CHARACTERS else None
+
+
+def load_mesh(path: str | PathLike[str]) -> CharacterMesh:
+    """Read the triangles of a character's file, in its rest pose; FileFormatError where it has none."""
+    ending = _check_readable(path)
+    if ending not in CHARACTERS:
+        raise FileFormatError(path, f"is no character's file; those end as {', '.join(CHARACTERS)}")
+    return _import_format(READERS[ending]).load_mesh(path)
+
+
+def ending_of(path: str | PathLike[str]) -> str:
+    """Return a path's ending in lower case, without what it chooses of a character's file."""
+    return parse_character_path(path).file.suffix.lower()
+
+
+def _import_format(name: str) -> ModuleType:
+    return import_module(f"mapctl.formats.{name}")
 
 
 def load_with_missing(
@@ -61,13 +75,17 @@ def load_with_missing(
     The motion is finite: missing rotations repeat the last known one, missing positions are interpolated linearly.
     FileFormatError where nothing is known.
     """
-    motion, missing = _READERS_WITH_MISSING[_check_readable(path)](path)
+    ending = _check_readable(path)
+    if ending not in _MAY_LACK_VALUES:
+        motion = load(path, metres_per_unit=metres_per_unit)
+        return motion, MissingValues.none(motion.num_frames, motion.num_joints)
+    motion, missing = _import_format(READERS[ending]).load_with_missing(path)
     return motion if metres_per_unit is None else bvh.convert_unit(motion, metres_per_unit), missing
 
 
 def _check_readable(path: str | PathLike[str]) -> str:
     """Return the ending; FileFormatError unless it is one of `READERS`."""
-    ending = PurePath(path).suffix.lower()
+    ending = ending_of(path)
     if ending not in READERS:
         why = _UNREADABLE_REASONS.get(ending, f"cannot read the ending {ending!r}")
         raise FileFormatError(path, f"{why}; allowed: {', '.join(READERS)}")
@@ -77,13 +95,13 @@ def _check_readable(path: str | PathLike[str]) -> str:
 def save(motion: Motion, path: str | PathLike[str]) -> None:
     """Write a motion in a format of `WRITERS`, whole or not at all. RequestError if it cannot be written there."""
     check_ending(path)
-    WRITERS[PurePath(path).suffix.lower()](motion, path)
+    _import_format(WRITERS[Path(path).suffix.lower()]).save(motion, path)
 
 
 def check_ending(path: str | PathLike[str]) -> None:
     """Raise RequestError unless `path` ends as a format that can be written, and is installed; to fail before long
     work."""
-    ending = PurePath(path).suffix.lower()
+    ending = Path(path).suffix.lower()
     if ending not in WRITERS:
         raise RequestError(f"cannot write {path}: unknown ending {ending!r}; allowed: {', '.join(WRITERS)}")
     if ending in usd.ENDINGS:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from os import PathLike
 
 import numpy as np
+import torch
 from jaxtyping import Bool
 from torch import Tensor
 
@@ -22,6 +23,11 @@ class MissingValues:
     places: Bool[Tensor, "frames joints"]
     """Missing positions within the parent, of the root in the world; the motion interpolates linearly between known
     ones."""
+
+    @staticmethod
+    def none(frames: int, joints: int) -> "MissingValues":
+        """Return masks of a motion that lacks nothing."""
+        return MissingValues(*torch.zeros(2, frames, joints, dtype=torch.bool))
 
 
 def is_nan(word: str) -> bool:

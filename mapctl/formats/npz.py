@@ -76,7 +76,7 @@ def load(path: str | PathLike[str]) -> Motion:
     return _read(path, lossy=False)[0]
 
 
-def load_lossy(path: str | PathLike[str]) -> tuple[Motion, MissingValues]:
+def load_with_missing(path: str | PathLike[str]) -> tuple[Motion, MissingValues]:
     """Read an archive with rotations and positions that are NaN, and which they are; FileFormatError where all are."""
     return _read(path, lossy=True)
 

@@ -21,6 +21,15 @@ NUMBER = f"a finite number below {LARGEST_VALUE:g}"
 
 def read_bytes(path: str | PathLike[str]) -> bytes:
     """Read the file's content; FileFormatError if it is missing, empty, too large or not an ordinary file."""
+    check_ordinary(path)
+    try:
+        return Path(path).read_bytes()
+    except OSError as error:
+        raise FileFormatError(path, f"cannot be read: {error.strerror or error}") from error
+
+
+def check_ordinary(path: str | PathLike[str]) -> None:
+    """Raise FileFormatError unless this is an ordinary file that can be read, not empty and not too large."""
     file = Path(path)
     try:
         if file.is_dir():
@@ -35,7 +44,8 @@ def read_bytes(path: str | PathLike[str]) -> bytes:
             raise FileFormatError(path, "the file is empty")
         if size > MAX_FILE_BYTES:
             raise FileFormatError(path, f"has {size >> 20} MiB, allowed are {MAX_FILE_BYTES >> 20}")
-        return file.read_bytes()
+        with file.open("rb"):
+            pass
     except OSError as error:
         raise FileFormatError(path, f"cannot be read: {error.strerror or error}") from error
 

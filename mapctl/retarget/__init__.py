@@ -16,6 +16,7 @@ from torch import Tensor
 
 from mapctl import formats, kinematics, rotations
 from mapctl.errors import RequestError
+from mapctl.formats.characters.source import CharacterSource
 from mapctl.motion import Motion
 from mapctl.retarget import bone_offsets
 from mapctl.retarget.joint_matching import Match, correct_sides, match
@@ -98,14 +99,25 @@ def identify_rig(skeleton: Skeleton, rig: Rig | None = None, *, motion: Motion |
     mapctl.retarget.joint_matching). A `motion` of the skeleton shows the up axis, how knees bend, and whether it begins
     with a T-pose, where the pose with all rotations zero does not.
     """
+    character = _character_of(motion)
+    if character is not None and rig is None and character.humanoid:
+        rig = Rig("vrm", character.humanoid, about="VRM: the file itself says which joint is which.")
     found = match(skeleton, rig)
-    listed = _map_by_table(found, skeleton, motion)
+    # A preset's table tells of the rig's own joint frames, which are not those that a character's motion has.
+    foreign = character is not None and not character.frames.are_aligned and found.rig in known_rigs()
+    listed = None if foreign else _map_by_table(found, skeleton, motion)
     if listed is not None:
         return _set_hips_travel(listed, motion)
     found = correct_sides(found, skeleton, motion)
     zero = RigPoses.zero(skeleton, found.joint_of)
     clip = None if motion is None else RigPoses.of(motion, found.joint_of)
     return _set_hips_travel(_build_rig_map(found, skeleton, find_tpose(zero, clip, rig=found.rig)), motion)
+
+
+def _character_of(motion: Motion | None) -> CharacterSource | None:
+    """Return the character whose file the motion came from."""
+    source = None if motion is None else motion.source
+    return source if isinstance(source, CharacterSource) else None
 
 
 def as_rig(rigmap: RigMap) -> Rig:

@@ -40,6 +40,18 @@ def make_tpose_clip(rig: Rig) -> Motion:
     return replace(standing, source=replace(layout, metres_per_unit=rig.metres_per_unit))
 
 
+def hold_pose(pose: Motion) -> Motion:
+    """Hold the first frame of a motion for a second."""
+    frames = torch.zeros(_FRAMES, dtype=torch.long)
+    return replace(
+        pose,
+        fps=_FPS,
+        root_position=pose.root_position[frames],
+        local_quat_xyzw=pose.local_quat_xyzw[frames],
+        moving_offsets={joint: track[frames] for joint, track in pose.moving_offsets.items()},
+    )
+
+
 def _canonical_tpose() -> Motion:
     root = torch.zeros(_FRAMES, 3, dtype=torch.float64)
     root[:, 1] = TOE_REST_HEIGHT - _tpose_positions()[TOE_JOINTS[0], 1]

@@ -1,0 +1,49 @@
+"""Which armature and animation of a file with several is meant: FILE#ARMATURE, FILE#ARMATURE/ANIMATION, FILE#/ANIMATION."""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+
+from mapctl.errors import FileFormatError
+
+_MAX_NAMED = 8
+
+
+@dataclass(frozen=True)
+class CharacterPath:
+    """A character's file and what is chosen of it."""
+
+    file: Path
+    """The file."""
+    armature: str | None = None
+    """Name of the armature; None where the file has one."""
+    animation: str | None = None
+    """Name of the animation; None for the first."""
+
+
+def parse_character_path(path: str | PathLike[str]) -> CharacterPath:
+    """Split FILE#ARMATURE/ANIMATION; a file whose own name holds a # is taken as it is if it exists."""
+    text = os.fspath(path)
+    name, mark, choice = text.rpartition("#")
+    if not mark or Path(text).exists():
+        return CharacterPath(Path(text))
+    armature, _, animation = choice.partition("/")
+    return CharacterPath(Path(name), armature or None, animation or None)
+
+
+def choose_name(path: Path, names: Sequence[str], wanted: str | None, what: str, *, several: bool) -> int:
+    """Return the index of the wanted name, or of the only or first one; `what` is `armature` or `animation`.
+
+    FileFormatError lists the names where none is the wanted one, or several are there and one must be chosen.
+    """
+    listed = ", ".join(repr(name) for name in names[:_MAX_NAMED]) + (" ..." if len(names) > _MAX_NAMED else "")
+    example = f"{path.name}#{names[0] if what == 'armature' else '/' + names[0]}" if names else ""
+    if wanted is not None:
+        if wanted in names:
+            return names.index(wanted)
+        raise FileFormatError(path, f"has no {what} {wanted!r}; it has {listed or 'none'}")
+    if len(names) > 1 and not several:
+        raise FileFormatError(path, f"has {len(names)} {what}s: {listed}; choose one, as {example}")
+    return 0

@@ -1,0 +1,30 @@
+"""glTF 2.0 and VRM: characters in, and motions out, on the character that they are of or on a mannequin."""
+
+from os import PathLike
+from pathlib import PurePath
+
+from mapctl.errors import RequestError
+from mapctl.formats.bvh import check_finite
+from mapctl.formats.characters.source import character_of
+from mapctl.formats.gltf import character, mannequin
+from mapctl.formats.gltf.mesh import load_mesh
+from mapctl.formats.gltf.reader import load, load_rest
+from mapctl.motion import Motion
+
+__all__ = ["load", "load_mesh", "load_rest", "save"]
+
+
+def save(motion: Motion, path: str | PathLike[str]) -> None:
+    """Write a motion as .glb or .vrm: on the character whose file its skeleton came from, else on a mannequin.
+
+    RequestError where the motion holds a NaN, and for a .vrm of a motion that is of no VRM character.
+    """
+    check_finite(motion, path)
+    ending = PurePath(path).suffix.lower()
+    source = character_of(motion, ending)
+    if ending == ".vrm" and (source is None or not source.humanoid):
+        raise RequestError(f"cannot write {path}: a .vrm needs a character, as by --rig hero.vrm")
+    if source is None:
+        mannequin.save(motion, path)
+    else:
+        character.save(motion, path, source)
