@@ -3,7 +3,6 @@
 from fractions import Fraction
 from os import PathLike
 
-
 from mapctl.errors import FileFormatError
 from mapctl.formats.characters.rest_frames import RestFrames, chain_matrices
 from mapctl.formats.characters.selector import CharacterPath, choose_name, parse_character_path
