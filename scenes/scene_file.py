@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
-from mapctl import curves
+from mapctl import curves, formats
 from mapctl.curves import Curve
 from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import FileFormatError, MapctlError, RequestError
@@ -20,7 +20,7 @@ from mapctl.intent.shot_keys import ShotKey
 from mapctl.mesh import colours
 from scenes.cameras import CameraSettings
 
-_FILMS, _MOTIONS, _REPORTS = (".mp4", ".gif", ".png"), (".bvh", ".npz"), (".json",)
+_FILMS, _MOTIONS, _REPORTS = (".mp4", ".gif", ".png"), tuple(formats.WRITERS), (".json",)
 _ENDINGS = (*_FILMS, *_MOTIONS, *_REPORTS)
 _MAX_SECONDS = 3600.0
 _STAY = "line:1"  # of an actor without a curve, who stands at its beginning

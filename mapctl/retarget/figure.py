@@ -1,14 +1,16 @@
-"""A clip of standing still for a rig of which only names and T-pose are known: the canonical body, renamed."""
+"""Clips of standing still: of a character in its rest pose, and of a rig of which only names and T-pose are known."""
 
 from dataclasses import replace
 from fractions import Fraction
+from os import PathLike
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mapctl import retarget, rotations
-from mapctl.errors import RequestError
+from mapctl import formats, retarget, rotations
+from mapctl.errors import MapctlError, RequestError
 from mapctl.formats.bvh import layout as bvh_layout
 from mapctl.motion import Motion
 from mapctl.retarget.joint_matching import REQUIRED
@@ -40,16 +42,40 @@ def make_tpose_clip(rig: Rig) -> Motion:
     return replace(standing, source=replace(layout, metres_per_unit=rig.metres_per_unit))
 
 
-def hold_pose(pose: Motion) -> Motion:
-    """Hold the first frame of a motion for a second."""
+def load_standing_character(path: str | PathLike[str]) -> Motion | None:
+    """Load a second of a character's standing in the rest pose of its file, its soles on the floor; None for files that
+    have no rest pose of their own.
+
+    Soles are the lowest vertices that feet carry; where the file has no triangles, the floor is where it has it.
+    """
+    rest = formats.load_rest(path)
+    if rest is None:
+        return None
+    down = torch.tensor([0.0, _sole_height(rest, path), 0.0], dtype=torch.float64)
     frames = torch.zeros(_FRAMES, dtype=torch.long)
     return replace(
-        pose,
+        rest,
         fps=_FPS,
-        root_position=pose.root_position[frames],
-        local_quat_xyzw=pose.local_quat_xyzw[frames],
-        moving_offsets={joint: track[frames] for joint, track in pose.moving_offsets.items()},
+        root_position=(rest.root_position - down)[frames],
+        local_quat_xyzw=rest.local_quat_xyzw[frames],
+        moving_offsets={joint: track[frames] for joint, track in rest.moving_offsets.items()},
     )
+
+
+def _sole_height(rest: Motion, path: str | PathLike[str]) -> float:
+    """Return the height of the lowest vertex that a foot, toes or what is below them carry, metres."""
+    try:
+        mesh = formats.load_mesh(path)
+        rigmap = retarget.identify_rig(rest.skeleton, motion=rest)
+    except MapctlError:  # without triangles or a known rig there are no soles
+        return 0.0
+    below = {rigmap.joints[side + "Foot"] for side in ("left", "right")}
+    for joint, parent in enumerate(rest.skeleton.parents):
+        if parent in below:
+            below.add(joint)
+    main = np.take_along_axis(mesh.joints, mesh.weights.argmax(axis=1)[:, None], axis=1)[:, 0]
+    heights = mesh.vertices[np.isin(main, sorted(below)), 1]
+    return float(heights.min()) if len(heights) else 0.0
 
 
 def _canonical_tpose() -> Motion:

@@ -41,5 +41,8 @@ class Generate(Command):
     rig: options.OutRig = "canonical"
     """Body that moves: the canonical one, or that of a clip, on whose rig the motion is then written; or a rig by name
     or TOML file, whose joints get the canonical bones."""
+    to: Annotated[str, arg(metavar=".bvh|.npz|.glb|...")] = ".bvh"
+    """Format of the clips by its ending; a character of --rig is written with them where the ending is its own.
+    Only .bvh is written as it is sampled, the others take memory for the whole clip."""
     quiet: bool = False
     """No lines on the clips and no progress bar."""

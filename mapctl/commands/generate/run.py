@@ -20,6 +20,7 @@ from mapctl.commands.shared.resumption import explain_progress
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.formats.bvh.stream import open_bvh_stream
+from mapctl.formats.whole_stream import open_whole_stream
 from mapctl.motion import Motion
 
 _MAX_CLIPS = 10_000
@@ -46,7 +47,7 @@ def run(command: Generate) -> int:
             own = settings if settings.start is not None else replace(settings, start=starts[number])
             pieces = draw(generator=torch.Generator().manual_seed(seed), settings=own)
             motions = (character.on_rig(piece.motion) for piece in pieces)
-            _write(command, motions, folder / f"generated_{number:03d}.bvh", frames)
+            _write(command, motions, folder / f"generated_{number:03d}{command.to}", frames)
             finished(number + 1)
     return 0
 
@@ -56,6 +57,7 @@ def _check_settings(command: Generate) -> tuple[GenerateSettings, Motion | None]
     if not 1 <= command.count <= _MAX_CLIPS:
         raise RequestError(f"the count must be 1 to {_MAX_CLIPS}, got {command.count}")
     outputs.check_folder(command.out)
+    formats.check_ending(command.out / f"clip{command.to}")
     numbered = command.start is not None and command.start.lstrip("-").isdecimal()
     if command.no_refine and command.refiner != "auto":
         raise RequestError("--refiner and --no-refine exclude each other")
@@ -76,8 +78,8 @@ def _sample_seeds(command: Generate) -> list[int]:
 
 
 def _write(command: Generate, pieces: Iterable[Motion], path: Path, frames: int) -> None:
-    began = time.perf_counter()
-    with show_progress(path.name, quiet=command.quiet) as progress, open_bvh_stream(path, frames) as file:
+    began, open_stream = time.perf_counter(), open_bvh_stream if command.to == ".bvh" else open_whole_stream
+    with show_progress(path.name, quiet=command.quiet) as progress, open_stream(path, frames) as file:
         for piece in pieces:
             file.append(piece)
             if progress is not None:

@@ -39,11 +39,11 @@ def read_rig(text: str | None) -> Rig | None:
 
 
 def read_rig_clip(text: str) -> tuple[Motion, Rig | None]:
-    """Read the clip whose skeleton a --rig option names: a file, of a character its rest pose; or a T-pose on the joints
-    of a preset or a TOML file, and its rig."""
+    """Read the clip whose skeleton a --rig option names: a file, of a character standing in its rest pose; or a T-pose
+    on the joints of a preset or a TOML file, and its rig."""
     if formats.ending_of(text) in formats.READERS:
-        rest = formats.load_rest(text)
-        return (formats.load(text) if rest is None else figure.hold_pose(rest)), None
+        standing = figure.load_standing_character(text)
+        return (formats.load(text) if standing is None else standing), None
     rig = load_rig(text)
     return figure.make_tpose_clip(rig), rig
 

@@ -1,8 +1,8 @@
 """Between a character file's own joint frames and those of a `Motion`, which are aligned with the world at rest.
 
-A file turns a joint in a frame that its modeller chose; a `Motion` that comes from it turns it about the world's axes, so
-that all rotations zero are the rest pose, whatever the file's frames are. With R_j a joint's world rotation at rest and
-G_j that of a frame: rotation of the motion in the world = G_j * inverse(R_j).
+A file turns a joint in a frame that its modeller chose; a `Motion` that comes from it turns it about the world's axes,
+so that all rotations zero are the rest pose, whatever the file's frames are. With R_j a joint's world rotation at rest
+and G_j that of a frame: rotation of the motion in the world = G_j * inverse(R_j).
 """
 
 from collections.abc import Mapping

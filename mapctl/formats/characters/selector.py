@@ -1,4 +1,4 @@
-"""Which armature and animation of a file with several is meant: FILE#ARMATURE, FILE#ARMATURE/ANIMATION, FILE#/ANIMATION."""
+"""Which armature and animation of a file is meant: FILE#ARMATURE, FILE#ARMATURE/ANIMATION or FILE#/ANIMATION."""
 
 import os
 from collections.abc import Sequence

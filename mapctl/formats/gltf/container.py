@@ -56,7 +56,7 @@ def read_file(path: str | PathLike[str]) -> GltfFile:
     elif file.suffix.lower() == ".gltf":
         text, binary = whole, b""
     else:
-        raise FileFormatError(file, f"is no binary glTF: it begins with {shorten(repr(bytes(whole[:4])))}, not 'glTF'")
+        raise FileFormatError(file, f"is no binary glTF: it begins with {bytes(whole[:4])!r}, not b'glTF'")
     tree = _parse_json(file, text)
     try:
         document = Document.model_validate(tree)
