@@ -33,6 +33,7 @@ def _find_rate(keys: np.ndarray) -> Fraction:
     for seconds in candidates:
         if not 1 / FASTEST < seconds < 100:
             continue
+        seconds = keys[-1] / max(1, round(keys[-1] / seconds))  # keys are rounded one by one, their whole span hardly
         fps = frame_rate(f"{seconds:.7f}") if seconds > 1e-4 else Fraction(1 / seconds)
         frames = keys * float(fps)
         if np.abs(frames - np.rint(frames)).max() < _UNEVEN_SHARE:

@@ -49,6 +49,8 @@ def find_armatures(gltf: GltfFile) -> list[Armature]:
     groups: list[tuple[set[int], list[int]]] = []
     for number, skin in enumerate(document.skins):
         tree.check_nodes(skin.joints, f"skins[{number}].joints")
+        if len(skin.joints) > _MAX_JOINTS:
+            raise FileFormatError(gltf.path, f"skins[{number}] has {len(skin.joints)} joints, allowed are {_MAX_JOINTS}")
         joints = set(tree.connect(skin.joints))
         near = [group for group in groups if group[0] & joints or _share_line(tree, group[0], joints)]
         groups = [group for group in groups if group not in near]
@@ -107,16 +109,7 @@ class NodeTree:
                         gltf.path, f"nodes[{child}] has two parents, {self.parent[child]} and {number}"
                     )
                 self.parent[child] = number
-        above: set[int] = set()
-        for start in range(len(nodes)):
-            trail: list[int] = []
-            node: int | None = start
-            while node is not None and node not in above:
-                if node in trail[-1:] or len(trail) > len(nodes):
-                    raise FileFormatError(gltf.path, f"nodes[{start}] is below itself")
-                trail.append(node)
-                node = self.parent.get(node)
-            above.update(trail)
+        self._check_loops()
 
     def check_nodes(self, nodes: Iterable[int], what: str) -> None:
         """Raise FileFormatError unless all of these nodes are there."""
@@ -125,11 +118,24 @@ class NodeTree:
             if node >= count:
                 raise FileFormatError(self.gltf.path, f"{what} names node {node}, there are {count}")
 
+    def _check_loops(self) -> None:
+        reached: set[int] = set()
+        for start in range(len(self.gltf.document.nodes)):
+            trail, node = {start}, self.parent.get(start)
+            while node is not None and node not in reached:
+                if node in trail:
+                    raise FileFormatError(self.gltf.path, f"nodes[{node}] is below itself")
+                trail.add(node)
+                node = self.parent.get(node)
+            reached |= trail
+
     def line(self, node: int) -> list[int]:
         """Return a node and all above it, up to the scene."""
         found = [node]
         while found[-1] in self.parent:
             found.append(self.parent[found[-1]])
+            if len(found) > _MAX_JOINTS:
+                raise FileFormatError(self.gltf.path, f"nodes[{node}] lies deeper than {_MAX_JOINTS} others")
         return found
 
     def connect(self, nodes: Iterable[int]) -> list[int]:

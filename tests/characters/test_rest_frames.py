@@ -1,0 +1,138 @@
+"""Between a file's joint frames and those that are aligned with the world at rest."""
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from mapctl.formats.characters.rest_frames import (
+    RestFrames,
+    UnevenScaleError,
+    chain_matrices,
+    compose_matrices,
+    nearest_rotations,
+    split_scale,
+)
+
+PARENTS = (-1, 0, 1, 1, 3)
+NAMES = ("a", "b", "c", "d", "e")
+
+
+def random_matrices(random: np.random.Generator, *shape: int, scale: bool = True) -> np.ndarray:
+    """Turned, moved and (unless told otherwise) scaled."""
+    turns = Rotation.random(int(np.prod(shape)), rng=random).as_matrix().reshape(*shape, 3, 3)
+    matrices = np.zeros((*shape, 4, 4))
+    matrices[..., :3, :3] = turns * (random.uniform(0.5, 2.0, (*shape, 1, 1)) if scale else 1.0)
+    matrices[..., :3, 3] = random.normal(size=(*shape, 3))
+    matrices[..., 3, 3] = 1.0
+    return matrices
+
+
+def example(seed: int):
+    """Rest frames of a small tree, local matrices of some frames, and the world matrices they make."""
+    random = np.random.default_rng(seed)
+    outer, rest = random_matrices(random), random_matrices(random, len(PARENTS))
+    frames = RestFrames.of(NAMES, PARENTS, chain_matrices(PARENTS, rest, outer), outer)
+    local = np.tile(rest, (6, 1, 1, 1))
+    turned = random_matrices(random, 6, len(PARENTS), scale=False)
+    local[..., :3, :3] = local[..., :3, :3] @ turned[..., :3, :3]
+    local[:, 0, :3, 3] += random.normal(size=(6, 3))
+    return frames, local, chain_matrices(PARENTS, local, outer)
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=40, deadline=None)
+def test_joints_are_where_the_file_has_them(seed):
+    frames, _, worlds = example(seed)
+    motion = frames.to_motion(worlds, Fraction(30), frames.skeleton({}), None)
+    np.testing.assert_allclose(motion.joint_positions().numpy(), worlds[..., :3, 3], atol=1e-9)
+    assert motion.moving_offsets == {}
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=40, deadline=None)
+def test_locals_come_back(seed):
+    frames, local, worlds = example(seed)
+    moved, turned = frames.to_locals(frames.to_motion(worlds, Fraction(30), frames.skeleton({}), None))
+    np.testing.assert_allclose(moved, local[..., :3, 3], atol=1e-9)
+    scale = np.linalg.norm(local[..., :3, 0], axis=-1)[..., None, None]
+    np.testing.assert_allclose(
+        Rotation.from_quat(turned.reshape(-1, 4)).as_matrix().reshape(local[..., :3, :3].shape),
+        local[..., :3, :3] / scale,
+        atol=1e-9,
+    )
+
+
+def test_no_rotation_is_the_rest_pose():
+    frames, _, _ = example(3)
+    motion = frames.to_motion(frames.matrices()[None], Fraction(30), frames.skeleton({}), None)
+    np.testing.assert_allclose(motion.local_quat_xyzw[..., 3].abs().numpy(), 1.0, atol=1e-12)
+    np.testing.assert_allclose(motion.joint_positions()[0].numpy(), frames.positions, atol=1e-12)
+
+
+def test_a_joint_that_moves_within_its_parent_is_kept():
+    frames, local, _ = example(5)
+    local = local.copy()
+    local[2:, 3, :3, 3] += 0.1
+    worlds = chain_matrices(PARENTS, local, frames.outer)
+    motion = frames.to_motion(worlds, Fraction(30), frames.skeleton({}), None)
+    assert set(motion.moving_offsets) == {3}
+    np.testing.assert_allclose(motion.joint_positions().numpy(), worlds[..., :3, 3], atol=1e-9)
+    np.testing.assert_allclose(frames.to_locals(motion)[0], local[..., :3, 3], atol=1e-9)
+
+
+def test_end_sites_are_offsets_from_their_joint():
+    frames, _, _ = example(1)
+    skeleton = frames.skeleton({4: frames.positions[4] + [0.0, 0.1, 0.2]})
+    assert skeleton.end_offsets == {"e": pytest.approx((0.0, 0.1, 0.2))}
+
+
+@pytest.mark.parametrize(
+    ("linear", "why"),
+    [
+        (np.diag([1.0, 1.0, 1.1]), "not the same along all axes"),
+        (np.diag([1.0, 1.0, -1.0]), "negative"),
+        (np.zeros((3, 3)), "zero"),
+        (np.array([[1.0, 0.3, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), "not the same along all axes"),
+    ],
+)
+def test_uneven_scale_is_told_with_its_joint(linear, why):
+    worlds = np.tile(np.eye(4), (2, 1, 1))
+    worlds[1, :3, :3] = linear
+    with pytest.raises(UnevenScaleError, match=f"joint b: .*{why}"):
+        RestFrames.of(("a", "b"), (-1, 0), worlds, np.eye(4))
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=20, deadline=None)
+def test_rotation_and_scale_of_a_matrix(seed):
+    random = np.random.default_rng(seed)
+    turn, scale = Rotation.random(rng=random).as_matrix(), float(random.uniform(0.01, 100))
+    matrix = np.eye(4)
+    matrix[:3, :3] = scale * turn
+    found = split_scale(matrix)
+    np.testing.assert_allclose(found[0], turn, atol=1e-9)
+    assert found[1] == pytest.approx(scale)
+    noisy = turn + random.normal(scale=1e-4, size=(3, 3))
+    assert np.linalg.det(nearest_rotations(noisy)) == pytest.approx(1.0)
+    np.testing.assert_allclose(nearest_rotations(noisy), turn, atol=1e-3)
+
+
+def test_parts_make_the_matrix_that_scipy_makes():
+    random = np.random.default_rng(0)
+    quat = Rotation.random(5, rng=random).as_quat()
+    moved, scale = random.normal(size=(5, 3)), random.uniform(0.5, 2, (5, 3))
+    found = compose_matrices(moved, quat, scale)
+    for k in range(5):
+        point = random.normal(size=3)
+        wanted = Rotation.from_quat(quat[k]).apply(scale[k] * point) + moved[k]
+        np.testing.assert_allclose((found[k] @ [*point, 1.0])[:3], wanted, atol=1e-12)
+
+
+def test_aligned_frames_are_told():
+    worlds = np.tile(np.eye(4), (2, 1, 1))
+    assert RestFrames.of(("a", "b"), (-1, 0), worlds, np.eye(4)).are_aligned
+    assert not example(0)[0].are_aligned
