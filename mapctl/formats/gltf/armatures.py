@@ -50,7 +50,9 @@ def find_armatures(gltf: GltfFile) -> list[Armature]:
     for number, skin in enumerate(document.skins):
         tree.check_nodes(skin.joints, f"skins[{number}].joints")
         if len(skin.joints) > _MAX_JOINTS:
-            raise FileFormatError(gltf.path, f"skins[{number}] has {len(skin.joints)} joints, allowed are {_MAX_JOINTS}")
+            raise FileFormatError(
+                gltf.path, f"skins[{number}] has {len(skin.joints)} joints, allowed are {_MAX_JOINTS}"
+            )
         joints = set(tree.connect(skin.joints))
         near = [group for group in groups if group[0] & joints or _share_line(tree, group[0], joints)]
         groups = [group for group in groups if group not in near]
@@ -70,13 +72,13 @@ def read_rest_frames(gltf: GltfFile, armature: Armature) -> RestFrames:
     local = np.stack([node_matrix(gltf.document.nodes[node]) for node in armature.nodes])
     outer = tree.outer_matrix(armature.nodes[0])
     worlds = chain_matrices(armature.parents, local, outer)
-    bound = None if is_vrm(gltf) else _bind_worlds(gltf, armature, worlds, outer)
     try:
-        return RestFrames.of(names, armature.parents, worlds if bound is None else bound, outer)
+        frames = RestFrames.of(names, armature.parents, worlds, outer)
     except UnevenScaleError as error:
-        raise FileFormatError(
-            gltf.path, f"armature {armature.name!r}: {error.args[0]}; apply it and export again"
-        ) from None
+        what = f"armature {armature.name!r}: {error.args[0]}; apply it and export again"
+        raise FileFormatError(gltf.path, what) from None
+    bound = None if is_vrm(gltf) else _bind_worlds(gltf, armature, worlds, outer)
+    return frames if bound is None else RestFrames.of(names, armature.parents, bound, outer)
 
 
 def read_humanoid_names(gltf: GltfFile, armature: Armature, names: tuple[str, ...]) -> dict[str, str]:

@@ -1,0 +1,336 @@
+"""Characters of glTF and VRM: read as rigs and clips, and written back, as a viewer of their own sees them."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from character_maker import make_character_glb
+from forged_characters import join_glb, split_glb
+from glb_viewer import GlbViewer
+from helpers import random_motion, walk
+
+import mapctl
+from mapctl import formats, retarget, rotations
+from mapctl.errors import FileFormatError, RequestError
+from mapctl.formats.characters.source import CharacterSource
+from mapctl.retarget import figure
+from mapctl.retarget.carry import RiggedCharacter, retarget_motion
+from mapctl.skeleton import CANONICAL
+
+KINDS = {
+    "mixamo": {},
+    "a-pose": {"pose": "A", "leaves": "joints"},
+    "posed-nodes": {"pose": "T", "node_pose": "bent"},
+    "bound-in-armature": {"bind": "armature", "pose": "A"},
+    "matrices": {"matrices": True, "pose": "A"},
+    "unreal": {"names": "unreal", "root": "root", "leaves": "none", "pose": "A"},
+    "metres": {"armature_scale": 1.0, "zup_armature": False, "names": "readyplayer"},
+    "two-skins": {"second_skin": True, "hat": True, "extra_nodes": True},
+    "compact": {"compact": True, "morphs": 2, "size": 1.3},
+    "aligned": {"bones_along_y": False, "armature_scale": 1.0, "zup_armature": False},
+    "vrm": {"names": "vrm", "armature_scale": 1.0, "zup_armature": False},
+    "vrm0": {"names": "vrm0", "armature_scale": 1.0, "zup_armature": False, "size": 0.8},
+}
+POSITIONS = dict(rtol=0, atol=2e-6)
+
+
+def make(folder, kind, **more):
+    ending = ".vrm" if kind.startswith("vrm") else ".glb"
+    return make_character_glb(folder / f"hero{ending}", **(KINDS[kind] | more))
+
+
+def walk_of(made):
+    """The animation's joints and skinned vertices over its frames, by the viewer."""
+    viewer = GlbViewer(made.path)
+    number = viewer.animation(made.animations[0])
+    return viewer, number
+
+
+@pytest.fixture(params=KINDS)
+def kind(request):
+    return request.param
+
+
+def test_the_rest_pose_is_the_bound_one(kind, tmp_path):
+    made = make(tmp_path, kind)
+    rest = formats.load_rest(made.path)
+    at = [rest.skeleton.index(name) for name in made.names if name in rest.skeleton.names]
+    told = [k for k, name in enumerate(made.names) if name in rest.skeleton.names]
+    assert len(told) >= 22
+    np.testing.assert_allclose(rest.joint_positions()[0, at].numpy(), made.positions[told], **POSITIONS)
+    assert float(rest.local_quat_xyzw[..., 3].abs().min()) == pytest.approx(1.0)
+
+
+def test_joints_are_recognised(kind, tmp_path):
+    made = make(tmp_path, kind)
+    rest = formats.load_rest(made.path)
+    canonical, rigmap = retarget.to_canonical(rest)
+    wanted = {joint: name for joint, name in made.joint.items() if joint in CANONICAL.names}
+    assert rigmap.joint_names == wanted
+    assert rigmap.up == "y"
+    assert rigmap.facing == ("-z" if kind == "vrm0" else "z")
+    # standing in the T-pose: hands far to their sides, at shoulder height where the file says T
+    left = canonical.skeleton.offsets[CANONICAL.index("leftLowerArm")]
+    torch.testing.assert_close(left / left.norm(), torch.tensor([1.0, 0, 0]).double(), atol=1e-6, rtol=0)
+    assert rigmap.rest == ("A" if KINDS[kind].get("pose") == "A" else "T")
+
+
+def test_meshes_are_where_a_viewer_draws_them(kind, tmp_path):
+    made = make(tmp_path, kind, animations=("walk",))
+    motion, mesh = formats.load(made.path), formats.load_mesh(made.path)
+    viewer, number = walk_of(made)
+    skinned = len(made.vertices)
+    np.testing.assert_allclose(mesh.vertices[:skinned], made.vertices, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(mesh.weights.sum(axis=1), 1.0, atol=1e-9)
+    assert len(mesh.vertices) == skinned + (8 if KINDS[kind].get("hat") else 0)
+    for frame in (0, 11, motion.num_frames - 1):
+        turns = rotations.to_matrix(motion.joint_rotations()[frame]).numpy()
+        vertices, normals = mesh.pose(motion.joint_positions()[frame].numpy(), turns)
+        wanted = viewer.skinned(number, frame / 30)
+        near = 1e-5 if kind != "posed-nodes" else 2e-5
+        np.testing.assert_allclose(vertices[:skinned], wanted, rtol=0, atol=near)
+        np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("interpolation", ["LINEAR", "STEP", "CUBICSPLINE"])
+@pytest.mark.parametrize("kind", ["mixamo", "unreal", "posed-nodes", "vrm"])
+def test_animations_are_read(kind, interpolation, tmp_path):
+    made = make(tmp_path, kind, animations=("walk", "other"), interpolation=interpolation)
+    motion = formats.load(made.path)
+    viewer, number = walk_of(made)
+    assert (motion.fps, motion.num_frames) == (30, 31)
+    for frame in range(0, 31, 6):
+        for name, node in zip(made.names, made.nodes, strict=True):
+            if name in motion.skeleton.names:
+                place = motion.joint_positions()[frame, motion.skeleton.index(name)].numpy()
+                np.testing.assert_allclose(place, viewer.world(node, number, frame / 30)[:3, 3], rtol=0, atol=5e-6)
+    other = formats.load(f"{made.path}#/other")
+    assert float((other.joint_positions() - motion.joint_positions()).abs().max()) > 0.01
+    assert isinstance(other.source, CharacterSource)
+    assert other.source.animation == "other"
+
+
+def follow_up(made, frames=20):
+    """A walk on the character that was made."""
+    body = RiggedCharacter.of(figure.load_standing_character(made.path))[1]
+    return body.on_rig(retarget_motion(walk(frames), body).motion)
+
+
+def without_additions(tree):
+    """All of a document but what an animation adds."""
+    return {
+        key: value for key, value in tree.items() if key not in ("animations", "accessors", "bufferViews", "buffers")
+    }
+
+
+def test_a_motion_is_added_and_all_else_stays(kind, tmp_path):
+    made = make(tmp_path, kind, animations=("walk",))
+    motion = follow_up(made)
+    out = tmp_path / f"new{made.path.suffix}"
+    motion.save(out)
+    (old, before), (new, after) = split_glb(made.path.read_bytes()), split_glb(out.read_bytes())
+    assert after[: len(before)] == before
+    if not KINDS[kind].get("matrices"):
+        assert without_additions(old) == without_additions(new)
+    for part in ("accessors", "bufferViews"):
+        assert new[part][: len(old[part])] == old[part]
+    assert [animation["name"] for animation in new["animations"]] == ["new", "walk"]
+    viewer = GlbViewer(out)
+    for frame in (0, 7, 19):
+        for name in motion.skeleton.names:
+            joint = motion.skeleton.index(name)
+            node = int(motion.source.nodes[joint])
+            place = motion.joint_positions()[frame, joint].numpy()
+            np.testing.assert_allclose(viewer.world(node, 0, frame / 30)[:3, 3], place, rtol=0, atol=1e-5)
+    again = formats.load(out)
+    np.testing.assert_allclose(again.joint_positions().numpy(), motion.joint_positions().numpy(), rtol=0, atol=1e-5)
+
+
+def test_soles_are_on_the_floor(kind, tmp_path):
+    made = make(tmp_path, kind)
+    standing = figure.load_standing_character(made.path)
+    feet = [standing.skeleton.index(made.joint[side + "Foot"]) for side in ("left", "right")]
+    shift = (
+        standing.joint_positions()[0, feet, 1].numpy() - made.positions[[made.names.index(made.joint["leftFoot"])], 1]
+    )
+    lowest = made.vertices[:, 1].min()  # shoes are the lowest
+    np.testing.assert_allclose(shift, -lowest, atol=1e-5)
+    assert standing.num_frames == 30
+
+
+def test_one_animation_is_replaced_where_it_was_the_one(tmp_path):
+    made = make(tmp_path, "mixamo", animations=("walk", "wave"))
+    motion = mapctl.load(f"{made.path}#/wave").slice(3, 20)
+    motion.save(tmp_path / "cut.glb")
+    tree, _ = split_glb((tmp_path / "cut.glb").read_bytes())
+    assert [animation["name"] for animation in tree["animations"]] == ["cut", "walk"]
+    again = formats.load(tmp_path / "cut.glb")
+    np.testing.assert_allclose(again.joint_positions().numpy(), motion.joint_positions().numpy(), rtol=0, atol=1e-5)
+
+
+def test_other_files_are_put_into_the_one(tmp_path):
+    (tmp_path / "in").mkdir()
+    made = make_character_glb(tmp_path / "in" / "hero.gltf")
+    motion = follow_up(made)
+    motion.save(tmp_path / "out.glb")
+    shutil.rmtree(tmp_path / "in")
+    tree, binary = split_glb((tmp_path / "out.glb").read_bytes())
+    assert "uri" not in json.dumps(tree)
+    view = tree["bufferViews"][tree["images"][0]["bufferView"]]
+    assert binary[view["byteOffset"] :][:4] == b"\x89PNG"
+    mesh = formats.load_mesh(tmp_path / "out.glb")
+    assert len(mesh.vertices) == len(made.vertices)
+    assert len(np.unique(mesh.rgba.round(2), axis=0)) > 3
+
+
+def test_the_same_motion_gives_the_same_bytes(tmp_path):
+    motion = follow_up(make(tmp_path, "mixamo"))
+    motion.save(tmp_path / "a.glb")
+    first = (tmp_path / "a.glb").read_bytes()
+    motion.save(tmp_path / "a.glb")
+    assert (tmp_path / "a.glb").read_bytes() == first
+
+
+def test_a_character_may_be_written_over_its_own_file(tmp_path):
+    made = make(tmp_path, "mixamo")
+    motion = follow_up(made)
+    motion.save(made.path)
+    np.testing.assert_allclose(
+        formats.load(made.path).joint_positions().numpy(), motion.joint_positions().numpy(), rtol=0, atol=1e-5
+    )
+    with pytest.raises(RequestError, match="has changed since it was read"):
+        motion.save(tmp_path / "late.glb")
+    assert not (tmp_path / "late.glb").exists()
+
+
+def test_a_vrm_needs_a_character(tmp_path):
+    with pytest.raises(RequestError, match=r"a \.vrm needs a character"):
+        random_motion(CANONICAL).save(tmp_path / "x.vrm")
+    assert not list(tmp_path.iterdir())
+
+
+def test_armatures_are_chosen_by_name(tmp_path):
+    first = make(tmp_path, "mixamo", armature="Ann")
+    second = make_character_glb(tmp_path / "second.glb", armature="Bob", size=1.5)
+    path = _merge_files(tmp_path, first.path, second.path)
+    with pytest.raises(FileFormatError, match=r"2 armatures: 'Ann_skin', 'Bob_skin'; choose one, as both.glb#Ann_skin"):
+        formats.load(path)
+    tall = formats.load_rest(f"{path}#Bob_skin")
+    np.testing.assert_allclose(
+        tall.joint_positions()[0, tall.skeleton.index("mixamorig:Head")].numpy(),
+        second.positions[second.names.index("mixamorig:Head")],
+        **POSITIONS,
+    )
+    motion = formats.load(f"{path}#Ann_skin")
+    motion.save(tmp_path / "ann.glb")
+    assert len(split_glb((tmp_path / "ann.glb").read_bytes())[0]["skins"]) == 2
+    with pytest.raises(FileFormatError, match="no armature 'Eve'; it has 'Ann_skin', 'Bob_skin'"):
+        formats.load(f"{path}#Eve")
+
+
+def _merge_files(folder, *paths):
+    """One file of several: each one's indices after those before."""
+    whole, blob = {"asset": {"version": "2.0"}, "scenes": [{"nodes": []}], "scene": 0}, b""
+    for path in paths:
+        tree, binary = split_glb(path.read_bytes())
+        at = {
+            key: len(whole.get(key, []))
+            for key in ("nodes", "skins", "meshes", "accessors", "bufferViews", "materials")
+        }
+        for node in tree["nodes"]:
+            node["children"] = [child + at["nodes"] for child in node.get("children", [])]
+            for key, table in (("mesh", "meshes"), ("skin", "skins")):
+                if key in node:
+                    node[key] += at[table]
+            if not node["children"]:
+                del node["children"]
+        for skin in tree["skins"]:
+            skin["joints"] = [joint + at["nodes"] for joint in skin["joints"]]
+            skin["inverseBindMatrices"] += at["accessors"]
+            skin.pop("skeleton", None)
+        for primitive in (p for mesh in tree["meshes"] for p in mesh["primitives"]):
+            primitive["attributes"] = {k: v + at["accessors"] for k, v in primitive["attributes"].items()}
+            primitive["indices"] += at["accessors"]
+            primitive.pop("material", None)
+        for accessor in tree["accessors"]:
+            accessor["bufferView"] += at["bufferViews"]
+        for view in tree["bufferViews"]:
+            view["byteOffset"] = view.get("byteOffset", 0) + len(blob)
+        for key in ("nodes", "skins", "meshes", "accessors", "bufferViews"):
+            whole.setdefault(key, []).extend(tree[key])
+        blob += binary + bytes(-len(binary) % 4)
+    whole["buffers"] = [{"byteLength": len(blob)}]
+    path = folder / "both.glb"
+    path.write_bytes(join_glb(whole, blob))
+    return path
+
+
+def edit(path, change):
+    """The file with another document."""
+    tree, binary = split_glb(path.read_bytes())
+    change(tree)
+    path.write_bytes(join_glb(tree, binary))
+
+
+def hips_of(made):
+    return made.nodes[made.names.index("mixamorig:Hips")]
+
+
+BROKEN = {
+    "no skin": (lambda t, m: t.pop("skins"), "has no skin"),
+    "non-uniform scale": (lambda t, m: t["nodes"][0].update(scale=[0.01, 0.02, 0.01]), "not the same along all axes"),
+    "negative scale": (lambda t, m: t["nodes"][0].update(scale=[-0.01, 0.01, 0.01]), "negative, which mirrors"),
+    "no scale": (lambda t, m: t["nodes"][0].update(scale=[0, 0, 0]), "zero"),
+    "draco": (lambda t, m: t.update(extensionsRequired=["KHR_draco_mesh_compression"]), "compressed .Draco"),
+    "meshopt": (lambda t, m: t.update(extensionsRequired=["EXT_meshopt_compression"]), "compressed .meshopt"),
+    "missing buffer": (lambda t, m: t["buffers"][0].update(byteLength=2**28), "should have 268435456 bytes, there are"),
+    "file that is not there": (lambda t, m: t["buffers"][0].update(uri="gone.bin"), "'gone.bin', which is not there"),
+    "file elsewhere": (lambda t, m: t["buffers"][0].update(uri="../x.bin"), "'../x.bin', which is not in its folder"),
+    "absolute file": (lambda t, m: t["buffers"][0].update(uri="/etc/passwd"), "which is not in its folder"),
+    "web address": (lambda t, m: t["buffers"][0].update(uri="https://host/x.bin"), "which is not in its folder"),
+    "glTF 1": (lambda t, m: t["asset"].update(version="1.0"), "is glTF '1.0', expected 2.0"),
+    "loop": (lambda t, m: t["nodes"][hips_of(m)].setdefault("children", []).append(0), "below itself"),
+    "two parents": (lambda t, m: t["nodes"][0]["children"].append(hips_of(m) + 1), "has two parents"),
+    "joint beyond": (lambda t, m: t["skins"][0]["joints"].append(999), "names node 999"),
+}
+
+
+@pytest.mark.parametrize("fault", BROKEN)
+def test_faults_are_told_in_a_line(fault, tmp_path):
+    made = make(tmp_path, "mixamo")
+    change, told = BROKEN[fault]
+    edit(made.path, lambda tree: change(tree, made))
+    with pytest.raises(FileFormatError, match=told) as caught:
+        formats.load(made.path)
+    assert "\n" not in str(caught.value)
+    assert str(made.path) in str(caught.value)
+
+
+def test_a_cut_file_is_told(tmp_path):
+    made = make(tmp_path, "mixamo")
+    raw = made.path.read_bytes()
+    for length in (3, 11, 19, 100, len(raw) - 1):
+        made.path.write_bytes(raw[:length])
+        with pytest.raises(FileFormatError):
+            formats.load(made.path)
+
+
+def test_neighbours_within_the_folder_are_read(tmp_path):
+    made = make_character_glb(tmp_path / "hero.gltf")
+    (tmp_path / "below").mkdir()
+    tree = json.loads(made.path.read_text())
+    name = tree["buffers"][0]["uri"]
+    (tmp_path / name).rename(tmp_path / "below" / "the data.bin")
+    tree["buffers"][0]["uri"] = "below/the%20data.bin"
+    made.path.write_text(json.dumps(tree))
+    assert formats.load_rest(made.path).num_joints > 20
+    link = tmp_path / "out.bin"
+    outside = tmp_path.parent / f"{tmp_path.name}.bin"
+    shutil.move(tmp_path / "below" / "the data.bin", outside)
+    link.symlink_to(outside)
+    tree["buffers"][0]["uri"] = "out.bin"
+    made.path.write_text(json.dumps(tree))
+    with pytest.raises(FileFormatError, match="not in its folder"):
+        formats.load(made.path)
