@@ -8,6 +8,7 @@ from pathlib import Path
 
 from acclaim import pair
 from captures import on_rig
+from character_maker import make_character_glb
 from helpers import walk, write_corpus
 from rig_maker import Make, make, names_of
 from tiny_denoiser import save_tiny_denoiser
@@ -108,6 +109,7 @@ def write_files(folder: Path) -> None:
     ours.motion(walk(100)).save(folder / "walk.bvh")
     on_rig("cmu", 40).save(folder / "mine.bvh")
     walk(40).save(folder / "walk.npz")
+    make_character_glb(folder / "hero.glb", animations=("Walk",))
     for seed, name in enumerate("abcd"):
         walk(150, seed=seed, cadence=0.8 + 0.05 * seed).save(folder / f"{name}.bvh")
     for name in ("takes", "mocap", "mine", "everything", "clips"):

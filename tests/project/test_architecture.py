@@ -17,7 +17,8 @@ MAX_LINES = 400
 FLOORS = {
     "mapctl": (
         "contacts joint_ranges mesh numerics solver",
-        "formats kinematics",
+        "kinematics",
+        "formats",
         "curves retarget",
         "intent motion_dna recording terms",
         "inbetweening problem runtime",

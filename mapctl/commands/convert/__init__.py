@@ -18,9 +18,11 @@ class Convert(Command):
 
     source: options.InFile
     """.bvh, .npz, or .amc: its skeleton is the .asf of the same name, else the only one in the folder, else
-    named as in subject.asf+take.amc."""
+    named as in subject.asf+take.amc. Of a character (.glb, .gltf, .vrm) its first animation, else one frame of its
+    rest pose; hero.glb#ARMATURE, hero.glb#ARMATURE/ANIMATION and hero.glb#/ANIMATION choose others."""
     out: Positional[Annotated[Path, arg(metavar="OUT")]]
-    """.bvh, .npz, or with a skinned body .glb, .usda, .usdc or .usd."""
+    """.bvh, .npz, or with a skinned body .glb, .usda, .usdc or .usd: that of the character in IN or in --rig, where it
+    came from such a file, else a mannequin. A .vrm is written of a VRM character only."""
     rig: Annotated[str | None, arg(metavar="canonical|PRESET|FILE.toml|CLIP")] = None
     """`canonical`: canonical joints with the performer's own bones; or a clip whose skeleton is wanted, on which the
     character has its floor and planted feet, in the clip's layout; or a rig by name or TOML file, whose joints
