@@ -95,6 +95,6 @@ def _replace_value(tree: dict[str, Any], random: np.random.Generator) -> None:
         holder[key] = ODD[int(random.integers(len(ODD)))]
 
 
-def count_of(path: Path) -> int:
+def count_nodes(path: Path) -> int:
     """Nodes in a .glb's document."""
     return len(split_glb(path.read_bytes())[0]["nodes"])
