@@ -3,7 +3,7 @@
 The quick run tries a cell of every row and of every column, `make test-all` all cells.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -67,7 +67,8 @@ def rigs(walked, tmp_path_factory):
             folder = tmp_path_factory.mktemp(name.replace(".", "-"))
             file = clip = folder / name
             if name in _BVH:
-                make(_BVH[name]).motion(walked).save(file)
+                sized = replace(walked, root_position=walked.root_position * _BVH[name].size)
+                make(_BVH[name]).motion(sized).save(file)
             else:
                 make_character_glb(file, **_CHARACTERS[name])
                 clip = folder / f"walk-{name}"
@@ -117,7 +118,7 @@ def words_of(command: str, rig: Rig, out: Path, walked: Motion) -> list[object]:
         "convert": ["convert", folder / "walked.npz", out, "--rig", rig.file],
         "denoise": ["denoise", rig.clip, "-o", out],
         "infill": ["infill", rig.clip, "-o", out, "--gap", "30:55"],
-        "tween": ["tween", rig.clip, "-o", out, "--keyframes", "0:20,50,89"],
+        "tween": ["tween", rig.clip, "-o", out, "--keyframes", "0,20,50,89"],
     }[command]
 
 
