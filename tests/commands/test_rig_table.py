@@ -118,7 +118,7 @@ def words_of(command: str, rig: Rig, out: Path, walked: Motion) -> list[object]:
         "convert": ["convert", folder / "walked.npz", out, "--rig", rig.file],
         "denoise": ["denoise", rig.clip, "-o", out],
         "infill": ["infill", rig.clip, "-o", out, "--gap", "30:55"],
-        "tween": ["tween", rig.clip, "-o", out, "--keyframes", "0,20,50,89"],
+        "tween": ["tween", rig.clip, "-o", out, "--keyframes", "0,15,30,45,60,75,89"],
     }[command]
 
 
