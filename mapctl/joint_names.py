@@ -13,7 +13,7 @@ _MAX_SUGGESTIONS = 3  # names in a refusal
 
 
 # Beginnings that say which program made the rig rather than what the joint is.
-_PREFIX = re.compile(r"^(.*[:|]|mixamorig\d*[ _]*|bip\d+[ _]+|j_bip_(c_)?|(joint|def)[ _-]+)", re.IGNORECASE)
+_PREFIX = re.compile(r"^(.*[:|]|mixamorig\d*[ _]*|bip\d+[ _]+|j_bip_(c_)?|(joint|def|org)[ _-]+)", re.IGNORECASE)
 
 
 class Part(Enum):
@@ -59,28 +59,30 @@ class Role:
 
 
 # The first pattern that the lower-case name without its side holds decides, so the narrow ones stand first.
+# Chinese and Japanese words stand beside the English ones; in Japanese 腕 is an arm and 足 a leg or a foot.
 _PARTS = (
-    (r"thumb|index|middle|mid\d|ring\d|ring$|pinky|little|finger", Part.FINGER),
-    (r"toe", Part.TOES),
-    (r"foot|ankle", Part.FOOT),
-    (r"upper_?leg|up_?leg|thigh|femur", Part.UPPER_LEG),
-    (r"lower_?leg|shin|calf|knee|tibia|leg", Part.LOWER_LEG),
-    (r"fore_?arm|lower_?arm|low_?arm|elbow|radius", Part.LOWER_ARM),
-    (r"hand|wrist|palm", Part.HAND),
-    (r"collar|clavicle", Part.SHOULDER),
-    (r"upper_?arm|up_?arm|shldr|humerus|arm", Part.UPPER_ARM),
-    (r"shoulder", Part.SHOULDER),
-    (r"neck", Part.NECK),
-    (r"head|skull", Part.HEAD),
-    (r"hip|pelvis|root|buttock", Part.HIPS),
-    (r"spine|chest|abdomen|torso|back|waist|thorax|belly", Part.TORSO),
+    (r"thumb|index|middle|mid\d|ring\d|ring$|pinky|little|finger|(?<![足脚])指", Part.FINGER),
+    (r"toe|つま先|趾|足指|足先", Part.TOES),
+    (r"foot|ankle|足首|足踝|脚踝", Part.FOOT),
+    (r"upper_?leg|up_?leg|thigh|femur|大腿|太もも", Part.UPPER_LEG),
+    (r"lower_?leg|shin|calf|knee|tibia|leg|小腿|膝|ひざ|すね", Part.LOWER_LEG),
+    (r"足|脚", Part.FOOT),
+    (r"fore_?arm|lower_?arm|low_?arm|elbow|radius|前臂|小臂|前腕|下腕|肘|ひじ", Part.LOWER_ARM),
+    (r"hand|wrist|palm|手首|手腕|手", Part.HAND),
+    (r"collar|clavicle|锁骨|鎖骨", Part.SHOULDER),
+    (r"upper_?arm|up_?arm|shldr|humerus|arm|上臂|大臂|腕", Part.UPPER_ARM),
+    (r"shoulder|肩", Part.SHOULDER),
+    (r"neck|首|颈|頸|脖", Part.NECK),
+    (r"head|skull|头|頭", Part.HEAD),
+    (r"hip|pelvis|root|buttock|骨盆|盆骨|骨盤|臀|下半身", Part.HIPS),
+    (r"spine|chest|abdomen|torso|back|waist|thorax|belly|脊|腰|胸|腹|上半身", Part.TORSO),
 )
 
 
 # Spelled out; alone between separators; before a capital (`lThigh`); before a Latin name (`lfemur`).
 _SIDE = (
     r"{word}|{title}|{upper}|(?:^|[_.:\- ])[{letter}](?=[_.\- ]|$)|(?:^|:)[{letter}](?=[A-Z])"
-    r"|^{small}(?=femur|tibia|foot|toes|humerus|radius|wrist|hand|fingers|thumb|clavicle|hipjoint)"
+    r"|[{han}]|^{small}(?=femur|tibia|foot|toes|humerus|radius|wrist|hand|fingers|thumb|clavicle|hipjoint)"
 )
 
 
@@ -89,11 +91,16 @@ _SIDES = tuple(
         side,
         re.compile(
             _SIDE.format(
-                word=word, title=word.title(), upper=word.upper(), letter=word[0] + word[0].upper(), small=word[0]
+                word=word,
+                title=word.title(),
+                upper=word.upper(),
+                letter=word[0] + word[0].upper(),
+                small=word[0],
+                han=han,
             )
         ),
     )
-    for side, word in ((Side.LEFT, "left"), (Side.RIGHT, "right"))
+    for side, word, han in ((Side.LEFT, "left", "左"), (Side.RIGHT, "right", "右"))
 )
 
 
@@ -102,7 +109,7 @@ def normalise_name(name: str) -> str:
     """Normalise a name to lower case without program prefix and punctuation: `mixamorig:LeftToe` is `lefttoe`."""
     strip = partial(_PREFIX.sub, "")
     # Twice, for prefixes in a namespace; a name that is all prefix keeps itself.
-    return re.sub(r"[^a-z0-9]", "", (strip(strip(name)) or name).lower())
+    return re.sub(r"[\W_]", "", (strip(strip(name)) or name).lower())
 
 
 def classify_joint(name: str) -> Role:

@@ -1,7 +1,7 @@
 """People on any rig: skeletons of any naming, rest pose, size and axes, and motion on them that looks like walking."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -41,6 +41,13 @@ class Make:
     """Whether feet and hands without further joints end in End Sites."""
     swapped: bool = False
     """Whether left is called right."""
+    between: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    """Joints between a canonical joint and the one above it, from above: halves of limbs, which twist about their
+    bone."""
+    hanging: Mapping[str, str] = field(default_factory=dict)
+    """The rig's name of what a canonical joint hangs from, where it is not the canonical joint above it."""
+    further: Mapping[str, str] = field(default_factory=dict)
+    """Joints at the ends, and the canonical joint that they hang from."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +62,8 @@ class Made:
     """Turns the file's world so that Y is up."""
     joint: Mapping[str, str]
     """Canonical joint to the rig's name."""
+    twisting: frozenset[str] = frozenset()
+    """Joints that turn about their bone alone."""
 
     def motion(self, canonical: Motion) -> Motion:
         """The canonical motion on this rig, with the rig's further joints turning at random and the root travelling."""
@@ -73,12 +82,21 @@ class Made:
             elif parent < 0 or k < names.index(self.joint["hips"]):
                 local.append(still.expand(frames, 4))
             else:
-                local.append(rotations.slerp(still.expand(frames, 4), noise[:, k], torch.full((frames,), 0.1).double()))
+                turn = rotations.slerp(still.expand(frames, 4), noise[:, k], torch.full((frames,), 0.1).double())
+                local.append(self._about_bone(k, turn) if name in self.twisting else turn)
             turned.append(above * Rotation.from_quat(local[-1].numpy()))
         hips = torch.from_numpy(self.upright.inv().apply(canonical.root_position.numpy()))
         motion = Motion(self.skeleton, canonical.fps, hips, rotations.make_sign_continuous(torch.stack(local, 1)))
         own = names.index(self.joint["hips"])
         return motion if own == 0 else replace(motion, root_position=hips - motion.joint_positions()[:, own] + hips)
+
+
+    def _about_bone(self, joint: int, turn: Tensor) -> Tensor:
+        """The turn of a joint, about its bone alone; of one from which several hang, none."""
+        below = self.skeleton.children(joint)
+        bone = torch.nn.functional.normalize(self.skeleton.offsets[below[0]], dim=0)
+        twist = rotations.from_rotation_vector(bone * (rotations.to_rotation_vector(turn) @ bone)[:, None])
+        return twist if len(below) == 1 else rotations.from_rotation_vector(torch.zeros(len(turn), 3).double())
 
 
 def names_of(preset: str, version: int = 0) -> dict[str, str]:
@@ -91,7 +109,7 @@ def names_of(preset: str, version: int = 0) -> dict[str, str]:
 def versions_of(preset: str) -> int:
     """In how many ways a listed rig is written."""
     rig = next(rig for rig in rigs.known_rigs() if rig.name == preset)
-    return 1 + min(len(rig.aliases.get(c, ())) for c in ("hips", "leftFoot"))
+    return 1 + max(len(rig.aliases.get(c, ())) for c in ("hips", "leftUpperArm", "leftFoot"))
 
 
 def make(wanted: Make) -> Made:
@@ -112,7 +130,8 @@ def make(wanted: Make) -> Made:
     ends = {}
     if wanted.end_sites:
         ends = {names[c]: tuple(frame[names[c]].inv().apply(tip.numpy()).tolist()) for c, tip in _tips(names, placed)}
-    return Made(Skeleton(tuple(order), parents, torch.stack(offsets), ends), tpose, upright, names)
+    skeleton = Skeleton(tuple(order), parents, torch.stack(offsets), ends)
+    return Made(skeleton, tpose, upright, names, frozenset(name for chain in wanted.between.values() for name in chain))
 
 
 def _tips(names: Mapping[str, str], placed: Mapping[str, Tensor]):
@@ -135,8 +154,28 @@ def _joints(wanted: Make, names: Mapping[str, str], placed: Mapping[str, Tensor]
             while above >= 0 and CANONICAL.names[above] not in names:
                 above = CANONICAL.parents[above]
             parent = names[CANONICAL.names[above]] if above >= 0 else wanted.root or ""
-            joints.append((names[c], parent, placed[c]))
+            if above >= 0:
+                parent = _put_between(wanted, c, parent, joints, placed, frame)
+            joints.append((names[c], wanted.hanging.get(c, parent), placed[c]))
+    for name, c in wanted.further.items():
+        joints.append((name, names[c], placed[c] + torch.tensor([0.0, 0.02, 0.01]).double()))
+        frame[name] = frame[names[c]]
     return _with_extras(joints, names, placed, frame) if wanted.extras else joints
+
+
+def _put_between(wanted: Make, c: str, parent: str, joints, placed: Mapping[str, Tensor], frame: dict[str, Rotation]):
+    """Put the joints between a canonical joint and the one above it, and return the last of them."""
+    chain, known = wanted.between.get(c, ()), {name: place for name, _, place in joints}
+    start, stop = known[parent], placed[c]
+    for number, name in enumerate(chain):
+        shared = sum(name in other for other in wanted.between.values()) > 1
+        if name not in known:
+            place = start - torch.tensor([0.0, 0.02, 0.0]).double() if shared else None
+            share = (number + 1) / (len(chain) + 1)
+            joints.append((name, parent, start + (stop - start) * share if place is None else place))
+            frame[name] = frame[parent]
+        parent = name
+    return parent
 
 
 def person(size: float = 1.0, frames: int = 40) -> Motion:

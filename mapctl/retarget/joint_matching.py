@@ -5,14 +5,16 @@ Sides are checked by the positions of the joints where toes show the facing of t
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from enum import Enum
 
 from mapctl.errors import RequestError
-from mapctl.joint_names import Part, Role, Side, abbreviate_names, describe_nearest, normalise_name
+from mapctl.joint_names import Part, Role, Side, abbreviate_names, describe_nearest
 from mapctl.joint_roles import classify_joints, find_hips
 from mapctl.motion import Motion
 from mapctl.retarget import topology
 from mapctl.retarget.pose_axes import RigPoses, are_sides_swapped
+from mapctl.retarget.recognition.listed_names import Listed, find_listed_rig, match_by_rig
 from mapctl.retarget.rigs import Rig, known_rigs
 from mapctl.skeleton import CANONICAL, Skeleton, mirror_name
 
@@ -25,12 +27,26 @@ REQUIRED = (
 )
 """Canonical joints that a rig must have; the others are put in between or at the end where it lacks them."""
 
-_BY_NAME, _BY_TOPOLOGY, _ABSENT, _SWAPPED = 1.0, 0.7, 0.4, 0.9
+_ABSENT, _SWAPPED = 0.4, 0.9
 _HELPER_NAME = re.compile(
     r"twist|roll|\bik|ik_|_ik|pole|ctrl|control|nub|_end|\bend|site|tip|prop|weapon|aim|target|"
     r"helper|corrective|attach|socket|skirt|hair|cloth|breast|bust",
     re.IGNORECASE,
 )
+
+
+class KnownBy(Enum):
+    """What tells which canonical joint a joint is."""
+
+    LIST = "list"
+    """Its name, which a listed rig or the user's rig names."""
+    WORDS = "words"
+    """The words of its name: a side and a body part."""
+    PLACE = "place"
+    """Its place in the tree and the lengths of the bones alone."""
+
+
+_CREDIT = {KnownBy.LIST: 1.0, KnownBy.WORDS: 1.0, KnownBy.PLACE: 0.7}
 
 
 @dataclass(frozen=True)
@@ -48,6 +64,10 @@ class Match:
     """Joints of the rig that are no canonical one, as fingers, twists and props."""
     sides_exchanged: bool = False
     """Whether joints named left are on the right."""
+    known_by: Mapping[str, KnownBy] = field(default_factory=dict)
+    """What each canonical joint that the rig has is known by."""
+    rivals: tuple[tuple[str, str], ...] = ()
+    """Other listed rigs that fit as well and take another joint for a canonical one: each with that canonical name."""
 
 
 def match(skeleton: Skeleton, rig: Rig | None = None) -> Match:
@@ -55,20 +75,22 @@ def match(skeleton: Skeleton, rig: Rig | None = None) -> Match:
 
     RequestError where a score of MIN_SCORE is not reached or a joint of REQUIRED is not found, naming what is missing.
     """
-    chosen, found = _find_preset(skeleton) if rig is None else (rig, _match_by_rig(rig, skeleton))
+    listed = find_listed_rig(skeleton, REQUIRED) if rig is None else Listed(rig, match_by_rig(rig, skeleton))
+    chosen, found = (listed.rig, dict(listed.joints)) if listed else (None, {})
     if rig is not None:
         _check_given(rig, found, skeleton)
-    credit = dict.fromkeys(found, _BY_NAME)
+    known = dict.fromkeys(found, KnownBy.LIST)
     complete = all(name in found for name in REQUIRED)
     if chosen is None or not complete or (rig is None and not chosen.fits(skeleton)):
-        found, credit = _complete_match(skeleton, found)
+        found, known = _complete_match(skeleton, found)
     absent = _ABSENT if all(name in found for name in REQUIRED) else 0.0
-    worth = [credit.get(name, 0.0 if name in REQUIRED else absent) for name in CANONICAL.names]
+    worth = [_CREDIT[known[c]] if c in known else 0.0 if c in REQUIRED else absent for c in CANONICAL.names]
     score = sum(worth) / len(worth)
     _check_match(skeleton, found, score)
     if chosen is None:
         chosen = Rig("unlisted", {name: skeleton.names[joint] for name, joint in found.items()})
-    return Match(chosen, tuple(found.get(name) for name in CANONICAL.names), score, _unmapped(skeleton, found))
+    joint_of, rivals = tuple(found.get(name) for name in CANONICAL.names), listed.rivals if listed else ()
+    return Match(chosen, joint_of, score, _unmapped(skeleton, found), known_by=known, rivals=rivals)
 
 
 def correct_sides(found: Match, skeleton: Skeleton, motion: Motion | None) -> Match:
@@ -79,64 +101,25 @@ def correct_sides(found: Match, skeleton: Skeleton, motion: Motion | None) -> Ma
         return found
     partner = [CANONICAL.index(mirror_name(name)) for name in CANONICAL.names]
     joint_of = tuple(found.joint_of[other] for other in partner)
+    known = {mirror_name(name): how for name, how in found.known_by.items()}
     named = any(r.side is not Side.MIDDLE for j, r in enumerate(classify_joints(skeleton)) if j in found.joint_of)
-    return replace(found, joint_of=joint_of, score=found.score * (_SWAPPED if named else 1.0), sides_exchanged=named)
+    score = found.score * (_SWAPPED if named else 1.0)
+    return replace(found, joint_of=joint_of, score=score, sides_exchanged=named, known_by=known)
 
 
-def _match_by_rig(rig: Rig, skeleton: Skeleton) -> dict[str, int]:
-    """Match joints by a rig's names, in the version that fits best; spelling counts only where it must."""
-    exact = {name: joint for joint, name in enumerate(skeleton.names)}
-    plain = {normalise_name(name): joint for joint, name in reversed(list(enumerate(skeleton.names)))}
-    listed = {c: (own, *rig.aliases.get(c, ())) for c, own in rig.joints.items()}
-    joint_of = {name: exact.get(name, plain.get(normalise_name(name))) for names in listed.values() for name in names}
-
-    best: dict[str, int] = {}
-    versions = 1 + max((len(others) for others in rig.aliases.values()), default=0)
-    for version in range(versions):
-        found: dict[str, int] = {}
-        for first in (True, False):
-            for canonical, names in listed.items():
-                tried = [names[min(version, len(names) - 1)]] if first else names
-                hits = [hit for hit in map(joint_of.get, tried) if hit is not None and hit not in found.values()]
-                if hits and canonical not in found:
-                    found[canonical] = hits[0]
-        if len(found) > len(best):
-            best = found
-    return best
-
-
-def _find_preset(skeleton: Skeleton) -> tuple[Rig | None, dict[str, int]]:
-    """Find the listed rig that explains most of the skeleton, if one has all that is required."""
-    best, chosen, joints = 0.0, None, {}
-    plain = {normalise_name(name) for name in skeleton.names}
-    for rig in known_rigs():
-        found = _match_by_rig(rig, skeleton)
-        if any(name not in found for name in REQUIRED) or (rig.name == "canonical" and not rig.fits(skeleton)):
-            continue
-        extra = {normalise_name(name) for name in rig.also}
-        explained = len(found) + len(extra & plain - {normalise_name(skeleton.names[j]) for j in found.values()})
-        lacking = len(rig.joints) - len(found) + len(extra - plain)
-        # Fingers and props beyond what a preset lists do not count against it; what it lists and the rig lacks does.
-        spelled = sum(skeleton.names[joint] in (rig.joints[c], *rig.aliases.get(c, ())) for c, joint in found.items())
-        fit = len(found) + explained / (explained + lacking) + spelled / len(found)
-        if fit > best:
-            best, chosen, joints = fit, rig, found
-    return chosen, joints
-
-
-def _complete_match(skeleton: Skeleton, given: Mapping[str, int]) -> tuple[dict[str, int], dict[str, float]]:
-    """Match joints by the words in their names, completed by the tree; also return what each is worth, 0 to 1."""
+def _complete_match(skeleton: Skeleton, given: Mapping[str, int]) -> tuple[dict[str, int], dict[str, KnownBy]]:
+    """Match joints by the words in their names, completed by the tree; also return what each is known by."""
     found = dict(given)
     for name, joint in _match_by_words(skeleton, given.get("hips")).items():
         if joint not in found.values():
             found.setdefault(name, joint)
-    credit = dict.fromkeys(found, _BY_NAME)
+    known = {name: KnownBy.LIST if name in given else KnownBy.WORDS for name in found}
     by_tree = _assign_sides(topology.match_by_tree(skeleton), classify_joints(skeleton), skeleton)
     for name, joint in by_tree.items():
         helper = _HELPER_NAME.search(skeleton.names[joint])
         if name not in found and joint not in found.values() and not helper:
-            found[name], credit[name] = joint, _BY_TOPOLOGY
-    return found, credit
+            found[name], known[name] = joint, KnownBy.PLACE
+    return found, known
 
 
 def _match_by_words(skeleton: Skeleton, hips: int | None) -> dict[str, int]:

@@ -1,0 +1,159 @@
+"""The trees of rigs as programs write them: the joints between and beyond the canonical ones (sources: the presets)."""
+
+from rig_maker import Make, names_of
+
+
+def both(text: str, sides: tuple[str, str]) -> dict[str, tuple[str, ...]]:
+    """What lies between, of both sides: `UpperLeg: hip{s} pelvis{s}; LowerLeg: knee{s}`."""
+    found = {}
+    for side, mark in zip(("left", "right"), sides, strict=True):
+        for entry in text.split(";"):
+            part, names = entry.split(":")
+            found[side + part.strip()] = tuple(names.replace("{s}", mark).split())
+    return found
+
+
+def ends(text: str, sides: tuple[str, str], hand: str = "Hand") -> dict[str, str]:
+    """Joints at the ends of both hands."""
+    pairs = zip(("left", "right"), sides, strict=True)
+    return {name: side + hand for side, mark in pairs for name in text.replace("{s}", mark).split()}
+
+
+LR, lr, WORDS, HAN = ("L", "R"), ("l", "r"), ("Left", "Right"), ("左", "右")
+
+TREES: dict[tuple[str, str], Make] = {
+    ("daz-genesis", "3 and 8"): Make(
+        names_of("daz-genesis", 0),
+        root="Genesis8Female",
+        between=both(
+            "UpperLeg: pelvis; LowerLeg: {s}ThighTwist; Toes: {s}Metatarsals; LowerArm: {s}ShldrTwist; "
+            "Hand: {s}ForearmTwist",
+            lr,
+        )
+        | {"chest": ("abdomenUpper", "chestLower"), "head": ("neckUpper",)},
+        further=ends("{s}Thumb1 {s}Carpal1 {s}Carpal2", lr) | {"lEye": "head", "rEye": "head", "lowerJaw": "head"},
+    ),
+    ("daz-genesis", "9"): Make(
+        names_of("daz-genesis", 1),
+        root="Genesis9",
+        between=both("UpperLeg: pelvis; Toes: {s}_metatarsal", lr) | {"chest": ("spine2", "spine3"), "head": ("neck2",)},
+        further=ends("{s}_thumb1 {s}_indexmetacarpal", lr) | ends("{s}_thightwist1 {s}_thightwist2", lr, "UpperLeg"),
+    ),
+    ("daz-genesis", "1 and 2"): Make(
+        names_of("daz-genesis", 2), between=both("UpperLeg: pelvis", lr) | {"chest": ("abdomen2",)}
+    ),
+    ("metahuman", "body and face"): Make(
+        names_of("metahuman"),
+        root="root",
+        between={"chest": ("spine_02", "spine_03", "spine_04"), "head": ("neck_02",)},
+        further={"FACIAL_C_FacialRoot": "head", "spine_04_latissimus_l": "chest"}
+        | ends("thigh_twist_01_{s} thigh_twist_02_{s} thigh_correctiveRoot_{s}", lr, "UpperLeg")
+        | ends("upperarm_twist_01_{s} upperarm_correctiveRoot_{s}", lr, "UpperArm")
+        | ends("clavicle_out_{s} clavicle_scap_{s}", lr, "Shoulder")
+        | ends("index_metacarpal_{s} thumb_01_{s} wrist_inner_{s}", lr),
+    ),
+    ("rigify", "deforming"): Make(
+        names_of("rigify", 0),
+        root="root",
+        between=both(
+            "LowerLeg: DEF-thigh.{s}.001; Foot: DEF-shin.{s}.001; LowerArm: DEF-upper_arm.{s}.001; "
+            "Hand: DEF-forearm.{s}.001",
+            LR,
+        )
+        | {"chest": ("DEF-spine.002",), "head": ("DEF-spine.005",)},
+        further=ends("DEF-palm.01.{s} DEF-thumb.01.{s}", LR) | {"DEF-pelvis.L": "hips", "DEF-breast.L": "chest"},
+        zup=True,
+    ),
+    ("rigify", "metarig"): Make(
+        names_of("rigify", 1),
+        between={"chest": ("spine.002",), "head": ("spine.005",)},
+        further=ends("palm.01.{s} thumb.01.{s}", LR) | {"pelvis.L": "hips", "pelvis.R": "hips", "face": "head"},
+        zup=True,
+    ),
+    ("rigify", "original"): Make(
+        names_of("rigify", 2), between={"chest": ("ORG-spine.002",), "head": ("ORG-spine.005",)}, root="root"
+    ),
+    ("rigify", "FK controls"): Make(
+        names_of("rigify", 3),
+        root="root",
+        between=both("UpperLeg: MCH-thigh_parent.{s}; Shoulder: MCH-spine", LR) | {"chest": ("spine_fk.002",)},
+        further=ends("hand_ik.{s}", LR) | ends("foot_ik.{s}", LR, "Foot"),
+        zup=True,
+    ),
+    ("rigify", "everything"): Make(
+        names_of("rigify", 0),
+        root="root",
+        further={own: c for version in (2, 3) for c, own in names_of("rigify", version).items()},
+    ),
+    ("makehuman", "default"): Make(
+        names_of("makehuman"),
+        between=both(
+            "UpperLeg: pelvis.{s}; LowerLeg: upperleg02.{s}; Foot: lowerleg02.{s}; UpperArm: shoulder01.{s}; "
+            "LowerArm: upperarm02.{s}; Hand: lowerarm02.{s}",
+            LR,
+        )
+        | {"chest": ("spine04", "spine03", "spine02"), "head": ("neck02", "neck03")},
+        further=ends("toe2-1.{s}", LR, "Foot") | ends("finger1-1.{s} metacarpal1.{s}", LR),
+    ),
+    ("advanced-skeleton", "with parts"): Make(
+        names_of("advanced-skeleton"),
+        between=both(
+            "LowerLeg: HipPart1_{s} HipPart2_{s}; Foot: KneePart1_{s} KneePart2_{s}; "
+            "LowerArm: ShoulderPart1_{s} ShoulderPart2_{s}; Hand: ElbowPart1_{s} ElbowPart2_{s}",
+            LR,
+        )
+        | {"chest": ("Spine2_M",), "head": ("NeckPart1_M",)},
+        further=ends("IndexFinger1_{s} ThumbFinger1_{s}", LR),
+    ),
+    ("auto-rig-pro", "for engines"): Make(
+        names_of("auto-rig-pro"),
+        between={"chest": ("spine_02.x",)},
+        further=ends("thigh_twist.{s}", lr, "UpperLeg") | ends("index1.{s} thumb1.{s}", lr),
+    ),
+    ("deepmotion", "default"): Make(names_of("deepmotion"), between={"chest": ("spine1_JNT",)}),
+    ("humanik", "Character1"): Make(
+        names_of("humanik"),
+        root="Character1_Reference",
+        between={"chest": ("Character1_Spine1",)} | both("LowerArm: Character1_{s}ArmRoll", WORDS),
+    ),
+    ("humanik", "Axis Neuron"): Make(
+        {c: own for c, own in names_of("humanik", 1).items() if "Toes" not in c},
+        root="Robot_Reference",
+        between={"chest": ("Robot_Spine1",)},
+        further=ends("Robot_{s}HandThumb1 Robot_{s}InHandIndex Robot_{s}InHandRing", WORDS),
+    ),
+    ("mmd", "Japanese"): Make(
+        names_of("mmd"),
+        root="センター",
+        hanging={"spine": "センター"},
+        between=both("LowerArm: {s}腕捩; Hand: {s}手捩; UpperArm: {s}肩C", HAN),
+        further=ends("{s}親指０ {s}人指１", HAN) | ends("{s}足D", HAN, "UpperLeg"),
+    ),
+    ("mmd", "mmd_tools"): Make(names_of("mmd", 1), root="センター", hanging={"spine": "センター"}),
+    ("mmd", "English"): Make(names_of("mmd", 2), root="center", hanging={"spine": "center"}),
+    ("xsens", "BVH"): Make(names_of("xsens"), between={"chest": ("Chest2", "Chest3")}),
+    ("xsens", "FBX and MVNX"): Make(names_of("xsens", 1), between={"chest": ("L3", "T12")}),
+    ("rokoko", "Newton"): Make(
+        names_of("rokoko"), between={"chest": ("Spine2", "Spine3")}, further=ends("{s}ToeTip", WORDS, "Toes")
+    ),
+    ("vrm", "VRoid"): Make(names_of("vrm"), root="Root", between={"chest": ("J_Bip_C_Chest",)}),
+    ("vrm", "1"): Make(
+        names_of("vrm", 1), between={"chest": ("chest",)}, further=ends("{s}ThumbMetacarpal", ("left", "right"))
+    ),
+    ("vrm", "0, facing back"): Make(
+        names_of("vrm", 1),
+        between={"chest": ("chest",)},
+        further=ends("{s}ThumbProximal", ("left", "right")),
+        turned_deg=180,
+    ),
+    ("optitrack", "Motive"): Make(names_of("optitrack")),
+    ("optitrack", "longer names"): Make(names_of("optitrack", 1)),
+    ("unity", "avatar"): Make(names_of("unity"), between={"chest": ("Chest",)}, root="Root"),
+    ("synty", "POLYGON"): Make(
+        names_of("synty"),
+        root="Root",
+        between={"chest": ("Spine_02",)},
+        further=ends("Toes_{s}", LR, "Toes") | ends("Thumb_01_{s}", LR),
+    ),
+}
+"""A rig as it is written, by preset and version."""
