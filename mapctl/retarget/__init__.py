@@ -21,6 +21,7 @@ from mapctl.motion import Motion
 from mapctl.retarget import bone_offsets
 from mapctl.retarget.joint_matching import Match, correct_sides, match
 from mapctl.retarget.pose_axes import RigPoses, find_up_axis
+from mapctl.retarget.recognition.body_plan import goes_on_four_legs
 from mapctl.retarget.reference_pose import (
     TPose,
     align_bone,
@@ -103,6 +104,8 @@ def identify_rig(skeleton: Skeleton, rig: Rig | None = None, *, motion: Motion |
     if character is not None and rig is None and character.humanoid:
         rig = Rig("vrm", character.humanoid, about="VRM: the file itself says which joint is which.")
     found = match(skeleton, rig)
+    if rig is None:
+        _check_body_plan(found, skeleton, motion)
     # A preset's table tells of the rig's own joint frames, which are not those that a character's motion has.
     foreign = character is not None and not character.frames.are_aligned and found.rig in known_rigs()
     listed = None if foreign else _map_by_table(found, skeleton, motion)
@@ -118,6 +121,17 @@ def _character_of(motion: Motion | None) -> CharacterSource | None:
     """Return the character whose file the motion came from."""
     source = None if motion is None else motion.source
     return source if isinstance(source, CharacterSource) else None
+
+
+def _check_body_plan(found: Match, skeleton: Skeleton, motion: Motion | None) -> None:
+    """Raise RequestError for a four-legged body."""
+    zero = RigPoses.zero(skeleton, found.joint_of)
+    clip = None if motion is None else RigPoses.of(motion, found.joint_of)
+    if goes_on_four_legs(skeleton, zero, clip):
+        raise RequestError(
+            "this is a body on four legs, by the names of its joints or by its pose with all rotations zero; "
+            "--rig with a TOML file that names the joints of a person takes it all the same"
+        )
 
 
 def as_rig(rigmap: RigMap) -> Rig:

@@ -31,6 +31,13 @@ def match_by_tree(skeleton: Skeleton) -> Mapping[str, int]:
     return {}
 
 
+def find_limb_pairs(skeleton: Skeleton, joint: int, *, at_least: float) -> list[tuple[int, int]]:
+    """Find the first joints of each pair of limbs of at least this length, metres, that hangs from a joint."""
+    tree = _JointTree(skeleton)
+    pairs = tree.find_limb_pairs(joint)
+    return [(a[0], b[0]) for a, b in pairs if sum(tree.length[below] for below in a[1:]) >= at_least]
+
+
 def _name_body_joints(tree: "_JointTree", hips: int, legs: LimbPair, chest: int, arms: LimbPair) -> Mapping[str, int]:
     found = {"hips": hips}
     for side, leg, arm in zip(("left", "right"), legs, arms, strict=True):

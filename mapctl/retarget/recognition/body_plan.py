@@ -1,0 +1,112 @@
+"""Whether a skeleton is one two-legged body: four legs, a second body, or a second pair of arms."""
+
+import re
+from collections.abc import Mapping
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mapctl.retarget import topology
+from mapctl.retarget.pose_axes import RigPoses, unit_vectors
+from mapctl.skeleton import Skeleton
+
+_ANIMAL = re.compile(r"paw|hoof|fetlock|hock|fore_?leg|(front|hind|rear)_?(left_?|right_?|[lr]_?)?(up|low|leg|foot|thigh)")
+_MIN_ANIMAL = 2  # joints named as an animal's, from which it is one
+_SQUARE = 0.5  # cosine between trunk and legs, below which the trunk lies across them
+_ALONG = 0.7  # cosine between arms and legs, above which the arms stand beside the legs
+_STANDS = -0.7  # cosine between trunk and legs, below which somebody stands upright
+_MOST = 0.95  # share of a clip's frames on all fours that shows it, where the rest pose does not
+_APART = 0.1  # metres between the hips of two bodies
+_LIMB_SHARE = 0.7  # of an arm's length, from which another pair of limbs is one
+
+
+def goes_on_four_legs(skeleton: Skeleton, zero: RigPoses, clip: RigPoses | None) -> bool:
+    """Return whether the body is a four-legged one: by its joints' names, or by a trunk across four parallel limbs.
+
+    The pose with all rotations zero tells where it is one; a clip in which the body stands upright overrules it.
+    """
+    if sum(bool(_ANIMAL.search(name.lower())) for name in skeleton.names) >= _MIN_ANIMAL:
+        return True
+    if clip is not None and bool((_trunk_against_legs(clip) < _STANDS).any()):
+        return False
+    return bool(_is_on_all_fours(zero)[0])
+
+
+def stays_on_all_fours(clip: RigPoses) -> bool:
+    """Return whether the body has hands beside its feet under a level trunk in nearly all frames."""
+    return float(_is_on_all_fours(clip).double().mean()) >= _MOST
+
+
+def find_second_body(poses: RigPoses, joints: Mapping[str, int]) -> int | None:
+    """Find the hips of another body in the file than the one that is matched, by its tree; None where there is none.
+
+    A second set of joints in the same place, as the controls of a rig are, is no other body.
+    """
+    skeleton = poses.skeleton
+    rest = _outside(skeleton, set(joints.values()))
+    place = {joint: number for number, joint in enumerate([-1, *rest])}
+    parents = (-1, *(place.get(skeleton.parents[joint], 0) for joint in rest))
+    offsets = torch.cat([torch.zeros(1, 3, dtype=skeleton.offsets.dtype), skeleton.offsets[rest]])
+    ends = {name: end for name, end in skeleton.end_offsets.items() if skeleton.index(name) in place}
+    other = topology.match_by_tree(Skeleton(("", *(skeleton.names[j] for j in rest)), parents, offsets, ends))
+    if "hips" not in other or other["hips"] == 0:
+        return None
+    hips = rest[other["hips"] - 1]
+    apart = (poses.positions[:, hips] - poses.positions[:, joints["hips"]]).norm(dim=-1).mean()
+    return hips if float(apart) > _APART else None
+
+
+def find_further_limbs(skeleton: Skeleton, joints: Mapping[str, int]) -> tuple[int, int] | None:
+    """Find a pair of limbs as long as the arms that hangs from the trunk beside arms and legs; None where none does."""
+    trunk = [joints[name] for name in ("hips", "spine", "chest", "neck") if name in joints]
+    inside = {joint for joint in _descendants(skeleton, {joints["hips"]}) if _descendants(skeleton, {joint}) & {*trunk}}
+    limbs = {joint for name, joint in joints.items() if joint not in trunk and name != "head"}
+    for joint in sorted({*trunk, *inside}):
+        for first, second in topology.find_limb_pairs(skeleton, joint, at_least=_LIMB_SHARE * _arm(skeleton, joints)):
+            if not _descendants(skeleton, {first, second}) & limbs:
+                return first, second
+    return None
+
+
+def _arm(skeleton: Skeleton, joints: Mapping[str, int]) -> float:
+    """Return the length of the left arm, metres."""
+    length, joint = 0.0, joints.get("leftHand", joints["leftLowerArm"])
+    while joint not in (joints["leftUpperArm"], -1):
+        length, joint = length + float(skeleton.offsets[joint].norm()), skeleton.parents[joint]
+    return length
+
+
+def _outside(skeleton: Skeleton, joints: set[int]) -> list[int]:
+    """Return the joints that are neither these nor above or below one of them."""
+    near = _descendants(skeleton, joints)
+    for joint in joints:
+        while joint >= 0:
+            near.add(joint)
+            joint = skeleton.parents[joint]
+    return [joint for joint in range(skeleton.num_joints) if joint not in near]
+
+
+def _descendants(skeleton: Skeleton, joints: set[int]) -> set[int]:
+    """Return the joints and all below them."""
+    found = set(joints)
+    for child, parent in enumerate(skeleton.parents):
+        if parent in found:
+            found.add(child)
+    return found
+
+
+def _is_on_all_fours(poses: RigPoses) -> Bool[Tensor, " poses"]:
+    legs, arms = _limbs(poses, "Leg"), _limbs(poses, "Arm")
+    return (_trunk_against_legs(poses).abs() < _SQUARE) & ((legs * arms).sum(-1) > _ALONG)
+
+
+def _trunk_against_legs(poses: RigPoses) -> Float[Tensor, " poses"]:
+    """Return the cosine between trunk and legs: -1 where somebody stands upright."""
+    return (poses.up() * _limbs(poses, "Leg")).sum(-1)
+
+
+def _limbs(poses: RigPoses, part: str) -> Float[Tensor, "poses 3"]:
+    """Return the mean direction of both upper and lower limbs of a kind, downward along them."""
+    bones = [poses.bone(f"{side}{half}{part}") for side in ("left", "right") for half in ("Upper", "Lower")]
+    return unit_vectors(sum((bone for bone in bones if bone is not None), torch.zeros_like(poses.positions[:, 0])))

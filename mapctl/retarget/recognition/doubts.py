@@ -1,0 +1,168 @@
+"""What is doubtful about how a rig was understood: each reason in a sentence, with the joints that it is about."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+
+from mapctl.joint_names import Part, Side
+from mapctl.joint_roles import classify_joints
+from mapctl.motion import Motion
+from mapctl.retarget import RigMap
+from mapctl.retarget.joint_matching import KnownBy, Match
+from mapctl.retarget.pose_axes import RigPoses
+from mapctl.retarget.recognition import body_plan, proportions
+from mapctl.retarget.recognition.doubt import Doubt
+from mapctl.skeleton import mirror_name
+
+_MAX_LISTED = 4  # joints that have a line each; of more there is one line
+_MIN_FRONT = 0.3  # least triple product left x up . toes from which the toes tell the front
+_BELOW = {"LowerArm": "UpperArm", "Hand": "LowerArm", "LowerLeg": "UpperLeg", "Foot": "LowerLeg", "Toes": "Foot"}
+_PARTS = {
+    "hips": {Part.HIPS},
+    "spine": {Part.TORSO},
+    "chest": {Part.TORSO},
+    "neck": {Part.NECK, Part.TORSO},
+    "head": {Part.HEAD, Part.NECK},
+    "Shoulder": {Part.SHOULDER},
+    "UpperArm": {Part.UPPER_ARM, Part.SHOULDER},
+    "LowerArm": {Part.LOWER_ARM, Part.UPPER_ARM},
+    "Hand": {Part.HAND},
+    "UpperLeg": {Part.UPPER_LEG, Part.HIPS, Part.LOWER_LEG},
+    "LowerLeg": {Part.LOWER_LEG, Part.UPPER_LEG},
+    "Foot": {Part.FOOT},
+    "Toes": {Part.TOES, Part.FOOT},
+}
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Whether a rig's understanding can be relied on."""
+
+    doubts: tuple[Doubt, ...]
+    """What is doubtful, the gravest first; empty for a sure fit."""
+
+    @property
+    def verdict(self) -> str:
+        """`sure` where nothing is doubtful, else `doubtful`."""
+        return "doubtful" if self.doubts else "sure"
+
+    @property
+    def joints(self) -> frozenset[str]:
+        """Canonical joints that some doubt is about."""
+        return frozenset(joint for doubt in self.doubts for joint in doubt.joints)
+
+
+def assess_fit(rigmap: RigMap, motion: Motion | None = None) -> Fit:
+    """Assess how sure it is that a rig was understood, by its names, its tree, its bones and a motion of it."""
+    found = rigmap.match
+    if found is None:
+        return Fit(())
+    zero = RigPoses.zero(rigmap.rig_skeleton, found.joint_of)
+    clip = None if motion is None else RigPoses.of(motion, found.joint_of)
+    doubts: list[Doubt] = []
+    for look in (
+        partial(_find_other_bodies, rigmap, clip or zero),
+        partial(_find_wrong_order, rigmap),
+        partial(_compare_sides, rigmap, found, zero, clip),
+        partial(_list_rivals, rigmap, found),
+        partial(_list_joints_by_place, rigmap, found),
+        partial(_compare_words, rigmap, found),
+        partial(_find_single_sides, rigmap),
+        partial(proportions.check_bones, rigmap.skeleton),
+        partial(proportions.check_poses, rigmap, clip),
+    ):
+        doubts += look()
+    return Fit(tuple(doubts))
+
+
+def _find_other_bodies(rigmap: RigMap, poses: RigPoses) -> Iterator[Doubt]:
+    """Find a second body in the file, and a second pair of arms on this one."""
+    other = body_plan.find_second_body(poses, rigmap.joints)
+    if other is not None:
+        yield Doubt(f"another body is in the file, with hips {_quote(rigmap, other)}; only one is used", ("hips",))
+    if rigmap.match is not None and all(how is KnownBy.LIST for how in rigmap.match.known_by.values()):
+        return
+    pair = body_plan.find_further_limbs(rigmap.rig_skeleton, rigmap.joints)
+    if pair is not None:
+        names = " and ".join(_quote(rigmap, joint) for joint in pair)
+        yield Doubt(f"a further pair of limbs hangs from the trunk: {names}", ("leftUpperArm", "rightUpperArm"))
+
+
+def _find_wrong_order(rigmap: RigMap) -> Iterator[Doubt]:
+    """Find joints of a limb that do not hang from the one before."""
+    joints, parents = rigmap.joints, rigmap.rig_skeleton.parents
+    for name, joint in joints.items():
+        side, part = _split(name)
+        above = joints.get(side + _BELOW.get(part, "none"))
+        while above is not None and joint >= 0 and joint != above:
+            joint = parents[joint]
+        if above is not None and joint < 0:
+            own, upper = _quote(rigmap, joints[name]), _quote(rigmap, above)
+            yield Doubt(f"{name} {own} does not hang from {side + _BELOW[part]} {upper}", (name,))
+
+
+def _compare_sides(rigmap: RigMap, found: Match, zero: RigPoses, clip: RigPoses | None) -> Iterator[Doubt]:
+    """Compare the sides that names tell with each other and with where the toes point."""
+    if found.sides_exchanged:
+        yield Doubt("joints called left are on the right, by where the toes point; places win over names", ())
+    roles = classify_joints(rigmap.rig_skeleton)
+    named = [name for name, joint in rigmap.joints.items() if roles[joint].side is not Side.MIDDLE]
+    for name in named:
+        told = roles[rigmap.joints[name]].side.value
+        told = told if not found.sides_exchanged else mirror_name(told)
+        if not name.startswith(told):
+            yield Doubt(f"{name} is {_quote(rigmap, rigmap.joints[name])}, a name of the other side", (name,))
+    front = max(abs(float(poses.handedness().median())) for poses in (zero, clip or zero))
+    if not named and front < _MIN_FRONT:
+        yield Doubt("nothing tells the front: no names of sides, no toes; left may be right", ())
+
+
+def _list_rivals(rigmap: RigMap, found: Match) -> Iterator[Doubt]:
+    """List presets that fit as well as the one that was taken."""
+    for rival, name in found.rivals:
+        own = _quote(rigmap, rigmap.joints[name])
+        yield Doubt(f"the rig {rival} fits as well, and has another joint than {own} for {name}", (name,))
+
+
+def _list_joints_by_place(rigmap: RigMap, found: Match) -> Iterator[Doubt]:
+    """List the joints whose names tell nothing."""
+    placed = [name for name, how in found.known_by.items() if how is KnownBy.PLACE and name in rigmap.joints]
+    if len(placed) <= _MAX_LISTED:
+        for name in placed:
+            yield Doubt(f"{name} is known by its place alone (joint {_quote(rigmap, rigmap.joints[name])})", (name,))
+        return
+    listed = ", ".join(f"{name} ({_quote(rigmap, rigmap.joints[name])})" for name in placed[:_MAX_LISTED])
+    more = len(placed) - _MAX_LISTED
+    yield Doubt(f"{len(placed)} joints are known by their places alone: {listed} and {more} more", tuple(placed))
+
+
+def _compare_words(rigmap: RigMap, found: Match) -> Iterator[Doubt]:
+    """Compare what the name of a joint says with what its place made it."""
+    roles = classify_joints(rigmap.rig_skeleton)
+    for name, how in found.known_by.items():
+        joint = rigmap.joints.get(name)
+        if how is not KnownBy.PLACE or joint is None:
+            continue
+        part = roles[joint].part
+        if part is not Part.OTHER and part not in _PARTS[_split(name)[1]]:
+            yield Doubt(f"{name} is {_quote(rigmap, joint)}, whose name is that of a {part.value}", (name,))
+
+
+def _find_single_sides(rigmap: RigMap) -> Iterator[Doubt]:
+    """Find joints that only one side has."""
+    for name in rigmap.joints:
+        other = mirror_name(name)
+        if other not in rigmap.joints:
+            yield Doubt(f"{other} is missing, {name} is there", (other, name))
+
+
+def _split(name: str) -> tuple[str, str]:
+    """Split a canonical name into its side, if it has one, and its part."""
+    for side in ("left", "right"):
+        if name.startswith(side):
+            return side, name.removeprefix(side)
+    return "", name
+
+
+def _quote(rigmap: RigMap, joint: int) -> str:
+    return repr(rigmap.rig_skeleton.names[joint])
