@@ -119,7 +119,22 @@ def _complete_match(skeleton: Skeleton, given: Mapping[str, int]) -> tuple[dict[
         helper = _HELPER_NAME.search(skeleton.names[joint])
         if name not in found and joint not in found.values() and not helper:
             found[name], known[name] = joint, KnownBy.PLACE
+    for name, joint in _find_middles(skeleton, found).items():
+        found[name], known[name] = joint, KnownBy.PLACE
     return found, known
+
+
+def _find_middles(skeleton: Skeleton, found: Mapping[str, int]) -> dict[str, int]:
+    """Find elbows and knees as the only joint between two that are known."""
+    middles = {}
+    for side in ("left", "right"):
+        for upper, lower, end in (("UpperArm", "LowerArm", "Hand"), ("UpperLeg", "LowerLeg", "Foot")):
+            above, below = found.get(side + upper), found.get(side + end)
+            if side + lower not in found and above is not None and below is not None:
+                joint = skeleton.parents[below]
+                if joint >= 0 and skeleton.parents[joint] == above:
+                    middles[side + lower] = joint
+    return middles
 
 
 def _match_by_words(skeleton: Skeleton, hips: int | None) -> dict[str, int]:

@@ -9,6 +9,7 @@ from mapctl.commands.shared.frame_syntax import parse_range
 from mapctl.errors import RequestError
 from mapctl.motion import Motion
 from mapctl.retarget.carry import RetargetedMotion, RiggedCharacter, retarget_motion
+from mapctl.retarget.recognition.doubts import assess_fit
 from mapctl.retarget.rigs import Rig
 
 
@@ -26,8 +27,9 @@ def run(command: Convert) -> int:
         )
         motion = motion.slice(start, stop)
     if command.rig is not None:
+        doubts = describe_doubts(motion, source_rig)
         retargeted = transfer_to_rig(motion, command.rig, source_rig)
-        motion, notes = retargeted.motion, retargeted.notes
+        motion, notes = retargeted.motion, (*doubts, *retargeted.notes)
     if fps is not None:
         motion = motion.resample(fps)
     formats.save(motion, command.out)
@@ -47,6 +49,15 @@ def parse_fps(text: str) -> Fraction:
     if not Fraction(1, 100) <= fps <= 1000:
         raise RequestError(f"the frame rate must be 0.01 to 1000, got {text}")
     return fps
+
+
+def describe_doubts(motion: Motion, rig: Rig | None) -> tuple[str, ...]:
+    """Describe in one note what is doubtful about how a motion's rig is understood; empty where nothing is."""
+    doubts = assess_fit(retarget.identify_rig(motion.skeleton, rig, motion=motion), motion).doubts
+    if not doubts:
+        return ()
+    more = f", and {len(doubts) - 1} more" if len(doubts) > 1 else ""
+    return (f"how the rig of IN is understood is doubtful: {doubts[0].reason}{more}; see mapctl info IN",)
 
 
 def transfer_to_rig(motion: Motion, rig: str, source_rig: Rig | None = None) -> RetargetedMotion:

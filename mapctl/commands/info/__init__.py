@@ -1,6 +1,7 @@
 """`mapctl info`: what is installed: priors and their cards, scenes, versions, rendering, threads; or what a clip is."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, ClassVar
 
 from tyro.conf import Positional, arg
@@ -17,8 +18,10 @@ class Info(Command):
 
     name: Positional[Annotated[str | None, arg(metavar="NAME|CLIP")]] = None
     """A prior whose whole card is printed, as JSON: bundled, a file, or a run folder. Or a clip (.bvh, .npz), of which
-    rig, joints, unit, axes and length are printed."""
+    rig, joints, unit, axes and length are printed, and whether the fit is sure, doubtful or refused, with reasons."""
     rig: options.MaybeRig = None
     """The clip's rig, where it is not the one that would be recognised."""
+    out: Annotated[Path | None, arg(aliases=["-o"], metavar="FILE.png")] = None
+    """A picture of a clip's rig: its T-pose with both names of each joint, two frames, axes, and what is doubtful."""
     json: bool = False
     """Print JSON instead of tables."""

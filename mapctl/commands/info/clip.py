@@ -4,10 +4,17 @@ from pathlib import Path
 from typing import Any
 
 from mapctl import formats, report, retarget
-from mapctl.commands.shared import inputs
+from mapctl.commands.shared import inputs, outputs
 from mapctl.commands.shared.tables import print_table
+from mapctl.errors import RequestError
 from mapctl.formats import bvh
+from mapctl.motion import Motion
+from mapctl.retarget import RigMap
+from mapctl.retarget.recognition.doubts import Fit, assess_fit
 from mapctl.skeleton import CANONICAL
+from scenes.plots import rig_picture
+
+_LISTS = ("joints", "known_by", "unmapped", "doubts", "fit")
 
 _UNITS = {1.0: "metres", 0.01: "centimetres", 0.001: "millimetres", 0.0254: "inches"}
 
@@ -17,28 +24,28 @@ def is_clip(name: str) -> bool:
     return Path(name).suffix.lower() in formats.READERS
 
 
-def print_clip(path: Path, rig: str | None, *, as_json: bool) -> None:
-    """Print a clip's description; RequestError where the rig is not recognised, naming what is missing."""
-    described = describe_clip(path, rig)
-    if as_json:
-        print(report.to_json(described), end="")
-        return
-    shown = {key: value for key, value in described.items() if key not in ("joints", "unmapped")}
-    shown["fps"] = f"{described['fps']:.6g}"
-    shown["seconds"] = f"{described['seconds']:.2f}"
-    shown["unit"] = _format_unit(described["metres_per_unit"])
-    shown["up"] = f"+{described['up']}" if len(described["up"]) == 1 else described["up"]
-    del shown["metres_per_unit"]
-    print_table(["clip", ""], [[key.replace("_", " "), str(value)] for key, value in shown.items()])
-    print_table(["canonical", "joint of the rig"], [[c, own] for c, own in described["joints"].items()])
-    print(f"not canonical ({len(described['unmapped'])}): {', '.join(described['unmapped']) or 'none'}")
+def print_clip(path: Path, rig: str | None, *, as_json: bool, picture: Path | None = None) -> None:
+    """Print a clip's description, and draw it where a picture is asked for.
+
+    RequestError where the rig is not recognised, naming what is missing; what can be told of the clip is printed first.
+    """
+    outputs.check_picture(picture, given=path)
+    given = inputs.read_rig(rig)
+    motion = inputs.read_motion(path, given)
+    try:
+        rigmap = retarget.to_canonical(motion, given)[1]
+    except RequestError as refusal:
+        refused = {"file": str(path), "fit": "refused", "doubts": [str(refusal)], **_describe_file(motion)}
+        _print({**refused, "joints": {}, "unmapped": list(motion.skeleton.names)}, as_json=as_json)
+        raise
+    fit = assess_fit(rigmap, motion)
+    _print(describe_clip(path, motion, rigmap, fit), as_json=as_json)
+    if picture is not None:
+        rig_picture.plot_rig(rig_picture.RigPicture(rigmap, motion, fit, path.name), picture)
 
 
-def describe_clip(path: Path, rig_text: str | None) -> dict[str, Any]:
+def describe_clip(path: Path, motion: Motion, rigmap: RigMap, fit: Fit) -> dict[str, Any]:
     """Describe a clip by name and value, as `mapctl info` prints it."""
-    rig = inputs.read_rig(rig_text)
-    motion = inputs.read_motion(path, rig)
-    rigmap = retarget.to_canonical(motion, rig)[1]
     names = motion.skeleton.names
     joints = {c: None if j is None else names[j] for c, j in zip(CANONICAL.names, rigmap.joint_of, strict=True)}
     found = rigmap.match
@@ -47,19 +54,50 @@ def describe_clip(path: Path, rig_text: str | None) -> dict[str, Any]:
         "rig": rigmap.rig.name,
         "about": rigmap.rig.about,
         "score": 1.0 if found is None else round(found.score, 3),
+        "fit": fit.verdict,
+        "doubts": [doubt.reason for doubt in fit.doubts],
         "sides_exchanged": found is not None and found.sides_exchanged,
         "rest_pose": rigmap.rest,
         "tpose_from": rigmap.tpose_from,
         "up": rigmap.up,
         "facing": rigmap.facing,
+        **_describe_file(motion),
+        "joints": joints,
+        "known_by": {} if found is None else {c: how.value for c, how in found.known_by.items() if joints[c]},
+        "unmapped": [] if found is None else list(found.unmapped),
+    }
+
+
+def _describe_file(motion: Motion) -> dict[str, Any]:
+    """Describe what is known of a clip without its rig."""
+    return {
         "metres_per_unit": bvh.unit_of(motion) or 1.0,
         "num_joints": motion.num_joints,
         "frames": motion.num_frames,
         "fps": float(motion.fps),
         "seconds": motion.seconds,
-        "joints": joints,
-        "unmapped": [] if found is None else list(found.unmapped),
     }
+
+
+def _print(described: dict[str, Any], *, as_json: bool) -> None:
+    if as_json:
+        print(report.to_json(described), end="")
+        return
+    shown = {key: value for key, value in described.items() if key not in _LISTS}
+    shown["fps"] = f"{described['fps']:.6g}"
+    shown["seconds"] = f"{described['seconds']:.2f}"
+    shown["unit"] = _format_unit(described["metres_per_unit"])
+    if "up" in described:
+        shown["up"] = f"+{described['up']}" if len(described["up"]) == 1 else described["up"]
+    del shown["metres_per_unit"]
+    print_table(["clip", ""], [[key.replace("_", " "), str(value)] for key, value in shown.items()])
+    if described["joints"]:
+        print_table(["canonical", "joint of the rig"], [[c, own] for c, own in described["joints"].items()])
+    print(f"not canonical ({len(described['unmapped'])}): {', '.join(described['unmapped']) or 'none'}")
+    print(f"fit: {described['fit']}")
+    if described["fit"] == "doubtful":  # why a rig is refused, standard error says
+        for reason in described["doubts"]:
+            print(f"doubtful: {reason}")
 
 
 def _format_unit(metres: float) -> str:

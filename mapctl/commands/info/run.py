@@ -21,7 +21,9 @@ NOTICE = "The code is MIT. Weights trained on Bandai Namco data are CC BY-NC 4.0
 def run(command: Info) -> int:
     """Collect and print."""
     if command.name is not None and clip.is_clip(command.name):
-        clip.print_clip(Path(command.name), command.rig, as_json=command.json)
+        clip.print_clip(Path(command.name), command.rig, as_json=command.json, picture=command.out)
+    elif command.out is not None:
+        raise RequestError("--out is a picture of a clip's rig: mapctl info CLIP -o rig.png")
     elif command.rig is not None:
         raise RequestError("--rig is of a clip: mapctl info CLIP --rig PRESET|FILE.toml|CLIP")
     elif command.name is not None:
