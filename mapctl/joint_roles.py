@@ -9,9 +9,10 @@ from mapctl.skeleton import Skeleton
 
 # Without their side, best guess first: VRM, Bandai Namco, Mixamo, Daz, Biped, Unreal, ASF, SMPL.
 # Where a rig has no toe joint, its foot stands for it.
-_TOES = ("toes", "toebase", "toe", "toe0", "toejoint", "ball", "toeend", "foot", "footjoint", "ankle")
-_UPPER_LEGS = ("upperleg", "upleg", "thigh", "thighbend", "femur", "legupper", "hip", "hipjoint")
-_HIPS = ("hips", "hip", "pelvis")
+_TOES = ("toes", "toebase", "toe", "toe0", "toejoint", "ball", "toeend", "つま先", "脚趾", "足指")
+_TOES += ("foot", "footjoint", "ankle", "足首", "脚踝", "脚")
+_UPPER_LEGS = ("upperleg", "upleg", "thigh", "thighbend", "femur", "legupper", "hip", "hipjoint", "大腿", "太もも", "足")
+_HIPS = ("hips", "hip", "pelvis", "骨盆", "盆骨", "骨盤", "下半身")
 _ROOTS = ("rootjoint", "root")  # of rigs without hips
 
 
@@ -48,7 +49,8 @@ def _find_pair(skeleton: Skeleton, parts: Sequence[str], role: str) -> tuple[int
 
 def _side_spellings(part: str, side: str) -> set[str]:
     """Spell a part of one side in plain ways: leftfoot, footleft, lfoot, footl."""
-    return {f"{mark}{part}" for mark in (side, side[0])} | {f"{part}{mark}" for mark in (side, side[0])}
+    marks = (side, side[0], "左" if side == "left" else "右")
+    return {f"{mark}{part}" for mark in marks} | {f"{part}{mark}" for mark in marks}
 
 
 def _match_exactly(names: Sequence[str], wanted: set[str]) -> int | None:

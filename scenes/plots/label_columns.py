@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-_MAX_NAME = 27  # characters of a name
+_MAX_NAME = 24  # characters of a name
 _GAP = 0.056  # of the height of the axes between two labels
 _TOP, _BOTTOM = 0.965, 0.035  # of the height of the axes
 _HAN_FONTS = ("Noto Sans CJK JP", "Noto Sans CJK SC", "IPAexGothic", "IPAGothic", "WenQuanYi Zen Hei", "Yu Gothic")
@@ -84,7 +84,7 @@ def _draw(axes: Any, label: Label, height: float) -> None:
     low, high = axes.get_xlim()
     bottom, top = axes.get_ylim()
     edge, align = (0.995, "right") if label.on_right else (0.005, "left")
-    corner = 0.835 if label.on_right else 0.165
+    corner = 0.815 if label.on_right else 0.185
     place = dict(transform=axes.transAxes, ha=align, zorder=6)
     axes.text(edge, height + 0.003, label.title, fontsize=9.5, weight="bold", color=label.colour, va="bottom", **place)
     axes.text(edge, height, shorten(printable(label.name)), fontsize=8.5, color="#555555", va="top", **place)

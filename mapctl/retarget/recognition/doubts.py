@@ -4,6 +4,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 
+import torch
+
 from mapctl.joint_names import Part, Side
 from mapctl.joint_roles import classify_joints
 from mapctl.motion import Motion
@@ -16,7 +18,18 @@ from mapctl.skeleton import mirror_name
 
 _MAX_LISTED = 4  # joints that have a line each; of more there is one line
 _MIN_FRONT = 0.3  # least triple product left x up . toes from which the toes tell the front
-_BELOW = {"LowerArm": "UpperArm", "Hand": "LowerArm", "LowerLeg": "UpperLeg", "Foot": "LowerLeg", "Toes": "Foot"}
+_BELOW = {
+    "chest": ("spine",),
+    "neck": ("chest", "spine"),
+    "head": ("neck", "chest", "spine"),
+    "UpperArm": ("Shoulder",),
+    "LowerArm": ("UpperArm",),
+    "Hand": ("LowerArm",),
+    "LowerLeg": ("UpperLeg",),
+    "Foot": ("LowerLeg",),
+    "Toes": ("Foot",),
+}
+"""What each part hangs from: the first that a rig has."""
 _PARTS = {
     "hips": {Part.HIPS},
     "spine": {Part.TORSO},
@@ -89,16 +102,16 @@ def _find_other_bodies(rigmap: RigMap, poses: RigPoses) -> Iterator[Doubt]:
 
 
 def _find_wrong_order(rigmap: RigMap) -> Iterator[Doubt]:
-    """Find joints of a limb that do not hang from the one before."""
+    """Find joints of a limb or of the trunk that do not hang from the one before."""
     joints, parents = rigmap.joints, rigmap.rig_skeleton.parents
     for name, joint in joints.items():
         side, part = _split(name)
-        above = joints.get(side + _BELOW.get(part, "none"))
-        while above is not None and joint >= 0 and joint != above:
+        above = next((side + upper for upper in _BELOW.get(part, ()) if side + upper in joints), None)
+        while above is not None and joint >= 0 and joint != joints[above]:
             joint = parents[joint]
         if above is not None and joint < 0:
-            own, upper = _quote(rigmap, joints[name]), _quote(rigmap, above)
-            yield Doubt(f"{name} {own} does not hang from {side + _BELOW[part]} {upper}", (name,))
+            own, upper = _quote(rigmap, joints[name]), _quote(rigmap, joints[above])
+            yield Doubt(f"{name} {own} does not hang from {above} {upper}", (name,))
 
 
 def _compare_sides(rigmap: RigMap, found: Match, zero: RigPoses, clip: RigPoses | None) -> Iterator[Doubt]:
@@ -112,9 +125,18 @@ def _compare_sides(rigmap: RigMap, found: Match, zero: RigPoses, clip: RigPoses 
         told = told if not found.sides_exchanged else mirror_name(told)
         if not name.startswith(told):
             yield Doubt(f"{name} is {_quote(rigmap, rigmap.joints[name])}, a name of the other side", (name,))
+    if _are_arms_turned(zero if clip is None else clip):
+        yield Doubt("the left arm is on the side of the right leg", ("leftUpperArm", "rightUpperArm"))
     front = max(abs(float(poses.handedness().median())) for poses in (zero, clip or zero))
     if not named and front < _MIN_FRONT:
         yield Doubt("nothing tells the front: no names of sides, no toes; left may be right", ())
+
+
+def _are_arms_turned(poses: RigPoses) -> bool:
+    """Return whether the left arm is on the side of the right leg, in most poses."""
+    arms = poses.place("leftUpperArm") - poses.place("rightUpperArm")
+    legs = poses.place("leftUpperLeg") - poses.place("rightUpperLeg")
+    return float(torch.nn.functional.cosine_similarity(arms, legs, dim=-1).median()) < -_MIN_FRONT
 
 
 def _list_rivals(rigmap: RigMap, found: Match) -> Iterator[Doubt]:

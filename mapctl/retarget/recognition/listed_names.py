@@ -1,7 +1,7 @@
 """Matching joints by the names of the listed rigs: which rig explains most of a skeleton, and which one as much."""
 
 import re
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 from mapctl.joint_names import normalise_name
@@ -11,6 +11,7 @@ from mapctl.skeleton import CANONICAL, Skeleton
 _ARMS_ON_CHEST = 0.5  # joints that a chest from which the shoulders hang is worth
 _NEAR = 0.05  # joints by which a rig may fit less well and still be as near
 _MIN_PREFIXED = 5  # joints whose names begin alike, from which this is a prefix
+_BEGINNING = re.compile(r"[^_:|.\- ]+[_:|.\- ](?=.)")  # of a name, up to its first separator
 
 
 @dataclass(frozen=True)
@@ -65,19 +66,19 @@ def match_by_rig(rig: Rig, skeleton: Skeleton) -> dict[str, int]:
     return best
 
 
-def without_shared_prefix(names: Collection[str]) -> Iterator[str]:
-    """Yield the names without what most of them begin with, up to a separator: `Skeleton0_Hips` is `Hips`."""
-    beginnings = [match[0] for match in (re.match(r"[^_:|.\- ]+[_:|.\- ](?=.)", name) for name in names) if match]
+def without_shared_prefix(names: Sequence[str]) -> list[str]:
+    """Return the names without what most of them begin with, up to a separator: `Skeleton0_Hips` is `Hips`."""
+    beginnings = [match[0] for match in map(_BEGINNING.match, names) if match]
     most = max(beginnings, key=beginnings.count, default="")
-    shared = beginnings.count(most) > max(_MIN_PREFIXED, len(names) / 2)
-    for name in names:
-        yield name.removeprefix(most) if shared else name
+    if beginnings.count(most) <= max(_MIN_PREFIXED, len(names) / 2):
+        return list(names)
+    return without_shared_prefix([name.removeprefix(most) for name in names])
 
 
 def _index_plain_names(skeleton: Skeleton) -> dict[str, int]:
     """Return the joint by normalised name, with and without a prefix that joints share; whole names come first."""
     joints = reversed(range(skeleton.num_joints))
-    bare = list(without_shared_prefix(skeleton.names))
+    bare = without_shared_prefix(skeleton.names)
     found = {normalise_name(bare[joint]): joint for joint in joints}
     return found | {normalise_name(skeleton.names[joint]): joint for joint in reversed(range(skeleton.num_joints))}
 

@@ -20,6 +20,7 @@ _MIN_DIFFERENCE = 0.02  # metres by which bones of both sides differ at least, t
 _ARM_BY_LEG = (0.35, 1.4)
 _TRUNK_BY_LEG = (0.25, 1.4)
 _HIPS_METRES = (0.4, 1.6)  # metres of the hips over the toes, of people
+_MAX_SINK = 0.03  # metres that a joint of the trunk may be under the one before
 _NO_BONE = 0.01  # metres of a bone that is none
 _UPRIGHT = 0.5  # cosine between a body and the vertical, below which it lies
 _MIN_BEND = math.radians(6)  # mean bend of knees over a clip from which it tells how legs are twisted
@@ -95,8 +96,8 @@ def _compare_limbs(places: Places) -> Iterator[Doubt]:
 def _check_order(places: Places) -> Iterator[Doubt]:
     """Check that the trunk goes up, shoulders are over the hips, and left is on the left."""
     trunk = [name for name in ("hips", "spine", "chest", "neck", "head") if name in places]
-    for below, above in zip(trunk[1:-1], trunk[2:], strict=True):
-        if float(places[above][1] - places[below][1]) < -_NO_BONE:
+    for below, above in zip(trunk[:-1], trunk[1:], strict=True):
+        if float(places[above][1] - places[below][1]) < -_MAX_SINK:
             yield Doubt(f"{above} is below {below} in the T-pose", (below, above))
     for side, sign in (("left", 1.0), ("right", -1.0)):
         if float(places[side + "UpperArm"][1]) < float(places["hips"][1]):
