@@ -25,8 +25,25 @@ NAMES = {
 }
 
 
+HAN = {
+    (Side.LEFT, Part.UPPER_LEG): "左大腿 左太もも",
+    (Side.RIGHT, Part.LOWER_LEG): "右小腿 右ひざ 右膝",
+    (Side.LEFT, Part.FOOT): "左足首 左脚 左脚踝",
+    (Side.RIGHT, Part.TOES): "右つま先 右脚趾 右足指",
+    (Side.LEFT, Part.UPPER_ARM): "左腕 左上臂 左上腕 腕.L",
+    (Side.RIGHT, Part.LOWER_ARM): "右ひじ 右前臂 右前腕 右肘",
+    (Side.LEFT, Part.HAND): "左手 左手首 左手腕",
+    (Side.RIGHT, Part.FINGER): "右人指１ 右食指",
+    (Side.MIDDLE, Part.NECK): "首 脖子",
+    (Side.MIDDLE, Part.HEAD): "頭 头",
+    (Side.MIDDLE, Part.HIPS): "下半身 骨盆",
+    (Side.MIDDLE, Part.TORSO): "上半身 上半身2 腰 胸",
+}
+"""The same in Chinese and Japanese."""
+
+
 @pytest.mark.parametrize(
-    ("name", "side", "part"), [(name, *key) for key, names in NAMES.items() for name in names.split()]
+    ("name", "side", "part"), [(name, *key) for table in (NAMES, HAN) for key, names in table.items() for name in names.split()]
 )
 def test_role_of_every_way_to_name_it(name, side, part):
     assert classify_joint(name) == Role(side, part)

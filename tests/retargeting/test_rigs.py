@@ -111,7 +111,7 @@ EVERY_PRESET = [
 @pytest.mark.parametrize(("preset", "version", "rest"), EVERY_PRESET)
 def test_every_preset_there_and_back(preset, version, rest):
     made, wanted, motion, canonical, rigmap = converted(replace(RESTS[rest], names=names_of(preset, version)))
-    assert rigmap.rig.name == preset
+    assert rigmap.rig.name == ("ue5" if preset == "metahuman" else preset)  # which further joints tell apart
     assert rigmap.match.score > 0.9
     assert_understood(made, wanted, canonical, rigmap)
     assert_returns(motion, canonical, rigmap)

@@ -1,0 +1,138 @@
+"""What is doubtful about how a rig is understood: never a wrong match that is sure, and no doubt about the listed."""
+
+import random
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers import bandai_skeleton, cmu_skeleton, walk
+from rig_maker import Make, make, names_of, person
+from strange_rigs import CASES, DOUBTFUL, REFUSED, SURE, rigged, swap
+
+from mapctl import retarget
+from mapctl.errors import RequestError
+from mapctl.retarget import rigs
+from mapctl.retarget.joint_matching import KnownBy
+from mapctl.retarget.pose_axes import RigPoses
+from mapctl.retarget.recognition import body_plan
+from mapctl.retarget.recognition.doubts import Fit, assess_fit
+from mapctl.skeleton import CANONICAL
+
+
+def judge(motion):
+    """The verdict, its reasons in one text, and the rig as it was understood."""
+    try:
+        rigmap = retarget.to_canonical(motion)[1]
+    except RequestError as refusal:
+        return REFUSED, str(refusal), None
+    fit = assess_fit(rigmap, motion)
+    return fit.verdict, "; ".join(doubt.reason for doubt in fit.doubts), rigmap
+
+
+@pytest.mark.parametrize("label", CASES)
+def test_strange_rigs_are_refused_or_doubtful_or_right(label):
+    case = CASES[label]
+    verdict, why, rigmap = judge(case.motion)
+    assert verdict in case.allowed, why
+    assert case.reason in why
+    if verdict == SURE and case.truth is not None:
+        assert rigmap.joint_names == dict(case.truth)
+    if case.rig is not None:
+        assert rigmap.rig.name == case.rig
+    if rigmap is not None:  # and whatever is said of it, the motion comes back
+        back = retarget.from_canonical(*retarget.to_canonical(case.motion), case.motion)
+        torch.testing.assert_close(back.joint_positions(), case.motion.joint_positions(), atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("preset", ["mixamo", "ue5", "smpl", "cmu-daz", "rigify", "xsens"])
+def test_names_in_disorder_are_never_a_sure_match(preset):
+    order = random.Random(3)
+    for pairs in (1, 1, 1, 1, 2, 6):
+        names = names_of(preset)
+        mixed = swap(names, *(order.sample(list(names), 2) for _ in range(pairs)))
+        verdict, _, rigmap = judge(rigged(mixed, arms_down_deg=40)[0])
+        assert verdict != SURE or rigmap.joint_names == mixed
+
+
+@pytest.mark.parametrize("preset", [rig.name for rig in rigs.known_rigs() if rig.name != "metahuman"])
+def test_no_listed_rig_is_doubtful(preset):
+    for wish in (Make(names_of(preset)), Make(names_of(preset), arms_down_deg=50, zup=True, root="Ground")):
+        assert judge(make(wish).motion(person(1.0, 30)))[:2] == (SURE, "")
+
+
+@pytest.mark.parametrize("skeleton", [bandai_skeleton(), cmu_skeleton()], ids=["Bandai Namco", "CMU"])
+def test_the_rigs_of_the_data_are_sure(skeleton):
+    motion = retarget.from_canonical(walk(20), retarget.identify_rig(skeleton))
+    assert judge(motion)[:2] == (SURE, "")
+
+
+def test_each_joint_says_what_it_is_known_by():
+    rigmap = retarget.identify_rig(rigged(names_of("mixamo") | {"leftHand": "a17", "rightHand": "RightHandle"})[0].skeleton)
+    known = rigmap.match.known_by
+    assert (known["leftHand"], known["rightHand"], known["head"]) == (KnownBy.PLACE, KnownBy.WORDS, KnownBy.LIST)
+    assert "leftHand" in assess_fit(rigmap).joints
+
+
+def test_a_name_of_another_part_contradicts_a_place():
+    names = {c: f"b{n}" for n, c in enumerate(CANONICAL.names)} | {"leftLowerArm": "some_shin", "head": "sole_foot"}
+    verdict, why, _ = judge(rigged(names, extras=False)[0])
+    assert verdict == REFUSED or "whose name is that of a" in why
+
+
+def test_presets_that_fit_as_well_and_take_another_joint_are_named(monkeypatch):
+    mixamo = retarget.load_rig("mixamo")
+    twin = replace(mixamo, name="twin", joints={**mixamo.joints, "chest": "mixamorig:Spine1"}, aliases={})
+    monkeypatch.setattr("mapctl.retarget.recognition.listed_names.known_rigs", lambda: (mixamo, twin))
+    names = names_of("mixamo")
+    # With the shoulders on neither of the two, nothing decides between them.
+    wish = Make(names, between={"chest": ("mixamorig:Spine1",)}, extras=False)
+    wish = replace(wish, hanging={"leftShoulder": names["neck"], "rightShoulder": names["neck"]})
+    verdict, why, _ = judge(make(wish).motion(person(1.0, 10)))
+    assert verdict == DOUBTFUL
+    assert "the rig twin fits as well, and has another joint than 'mixamorig:Spine2' for chest" in why
+
+
+def test_a_clip_without_bent_knees_leaves_the_twist_of_limbs_open():
+    made = make(Make(names_of("mixamo"), bones_along_x=True))
+    stiff = replace(person(1.0, 20), local_quat_xyzw=torch.tensor([0.0, 0, 0, 1]).double().expand(20, 21, 4).clone())
+    drop = replace(stiff, local_quat_xyzw=stiff.local_quat_xyzw)
+    arms = [CANONICAL.index(side + "UpperArm") for side in ("left", "right")]
+    for arm, sign in zip(arms, (-1.0, 1.0), strict=True):  # hanging, so that the clip does not begin with a T-pose
+        drop.local_quat_xyzw[:, arm] = torch.tensor([0.0, 0.0, sign * 0.6, 0.8]).double()
+    verdict, why, _ = judge(made.motion(drop))
+    assert (verdict, "knees hardly bend" in why) == (DOUBTFUL, True)
+    assert judge(made.motion(person(1.0, 20)))[0] == SURE
+
+
+def test_somebody_who_lies_or_crawls_is_a_person_all_the_same_and_it_is_said():
+    lying = person(1.0, 10)
+    turn = torch.tensor([-(0.5**0.5), 0.0, 0.0, 0.5**0.5]).double()
+    laid = lying.local_quat_xyzw.clone()
+    laid[:, 0] = turn
+    verdict, why, rigmap = judge(make(Make(names_of("mixamo"))).motion(replace(lying, local_quat_xyzw=laid)))
+    assert verdict == DOUBTFUL
+    assert "lies or hangs" in why
+    assert rigmap.joint_names == names_of("mixamo")
+
+
+def test_a_body_on_four_legs_is_taken_where_the_user_says_so():
+    motion = CASES["a dog with a person's names"].motion
+    rig = retarget.load_rig("mixamo")
+    assert retarget.identify_rig(motion.skeleton, rig).joint_names["leftHand"] == "LeftHand"
+
+
+def test_second_bodies_and_controls_in_the_same_place():
+    rigmap = retarget.identify_rig(CASES["two people by name"].motion.skeleton)
+    zero = RigPoses.zero(rigmap.rig_skeleton, rigmap.joint_of)
+    hips = body_plan.find_second_body(zero, rigmap.joints)
+    assert rigmap.rig_skeleton.names[hips] == "char2:Hips"
+    one = replace(CASES["two people by name"].motion)
+    offsets = one.skeleton.offsets.clone()
+    offsets[one.skeleton.index("char2:Hips")] = offsets[one.skeleton.index("char1:Hips")]
+    same = retarget.identify_rig(replace(one.skeleton, offsets=offsets))
+    assert body_plan.find_second_body(RigPoses.zero(same.rig_skeleton, same.joint_of), same.joints) is None
+
+
+def test_a_fit_without_doubts_is_sure():
+    assert Fit(()).verdict == SURE
+    assert Fit(()).joints == frozenset()

@@ -1,0 +1,130 @@
+"""Rigs with the trees that programs give them: twists in the chain of a limb, metatarsals, correctives, controls."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from helpers import turn_between
+from rig_maker import Make, make, names_of, person, versions_of
+from rig_trees import TREES
+
+from mapctl import retarget
+from mapctl.retarget import figure, rigs
+from mapctl.retarget.recognition.doubts import assess_fit
+from mapctl.retarget.recognition.listed_names import without_shared_prefix
+from mapctl.skeleton import CANONICAL
+
+NEW = (
+    "advanced-skeleton auto-rig-pro daz-genesis deepmotion humanik makehuman metahuman mmd optitrack rigify synty unity"
+).split()
+
+
+@pytest.mark.parametrize("arms", [0, 40], ids=["T", "A"])
+@pytest.mark.parametrize(("preset", "version"), TREES)
+def test_a_rig_as_a_program_writes_it_is_known_and_comes_back(preset, version, arms):
+    wish = replace(TREES[preset, version], arms_down_deg=arms, extras=False)
+    made, wanted = make(wish), person(1.0, 30)
+    motion = made.motion(wanted)
+    canonical, rigmap = retarget.to_canonical(motion)
+    absent = CANONICAL.num_joints - len(made.joint)
+    assert rigmap.rig.name == preset
+    assert rigmap.match.score == pytest.approx(1.0 - 0.6 * absent / CANONICAL.num_joints)
+    assert rigmap.joint_names == dict(made.joint)
+    assert (rigmap.rest, rigmap.up) == ("T" if arms == 0 else "A", "z" if wish.zup else "y")
+    facing = {(False, 0): "z", (False, 180): "-z", (True, 0): "-y"}[wish.zup, wish.turned_deg]
+    assert rigmap.facing == facing
+    assert assess_fit(rigmap, motion).doubts == ()
+    known = [CANONICAL.index(name) for name in made.joint]
+    turned = turn_between(canonical.joint_rotations()[:, known], wanted.joint_rotations()[:, known])
+    assert np.rad2deg(turned) < 0.01
+    # Twists in the chain move no joint of a limb: hands and feet are where they are in truth.
+    places = canonical.joint_positions()[:, known], wanted.joint_positions()[:, known]
+    torch.testing.assert_close(*places, atol=1e-6, rtol=0)
+    back = retarget.from_canonical(canonical, rigmap, motion)
+    assert turn_between(back.local_quat_xyzw, motion.local_quat_xyzw) < 1e-6
+    torch.testing.assert_close(back.joint_positions(), motion.joint_positions(), atol=1e-8, rtol=0)
+
+
+@pytest.mark.parametrize("tree", [("daz-genesis", "3 and 8"), ("rigify", "deforming"), ("makehuman", "default")], ids=str)
+def test_another_motion_on_limbs_of_two_halves_puts_hands_and_feet_where_they_belong(tree):
+    """Without the rig's own motion the twists rest."""
+    made, wanted = make(replace(TREES[tree], arms_down_deg=40, extras=False)), person(1.0, 20)
+    rigmap = retarget.identify_rig(made.skeleton, motion=made.motion(wanted))
+    on_rig = retarget.from_canonical(replace(wanted, skeleton=rigmap.skeleton), rigmap)
+    known = [CANONICAL.index(name) for name in made.joint]
+    places = retarget.rig_joint_positions(on_rig, rigmap)[:, known]
+    torch.testing.assert_close(places, wanted.joint_positions()[:, known], atol=1e-6, rtol=0)
+
+
+def test_every_preset_of_several_versions_is_made_in_each():
+    assert {name: versions_of(name) for name in ("daz-genesis", "rigify", "mmd", "xsens", "vrm")} == {
+        "daz-genesis": 3,
+        "rigify": 4,
+        "mmd": 3,
+        "xsens": 2,
+        "vrm": 2,
+    }
+    assert set(NEW) <= {preset for preset, _ in TREES}
+
+
+@pytest.mark.parametrize("preset", NEW)
+def test_a_preset_says_where_its_names_are_from(preset):
+    path = rigs.files("mapctl.retarget").joinpath("presets", preset.replace("-", "_") + ".toml")
+    assert path.read_text("utf-8").startswith("# ")
+
+
+@pytest.mark.parametrize("preset", NEW)
+def test_the_canonical_body_stands_on_a_preset_as_that_preset(preset):
+    standing = figure.make_tpose_clip(retarget.load_rig(preset))
+    canonical, rigmap = retarget.to_canonical(standing, retarget.load_rig(preset))
+    still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).expand_as(canonical.local_quat_xyzw)
+    turned = turn_between(canonical.local_quat_xyzw, still)
+    assert np.rad2deg(turned) < 0.01
+    assert rigmap.match.score == 1
+
+
+def test_metahuman_is_told_from_ue5_by_its_further_joints_and_both_take_the_same_ones():
+    alone = make(Make(names_of("metahuman"))).skeleton
+    whole = make(TREES["metahuman", "body and face"]).skeleton
+    assert retarget.identify_rig(alone).rig.name == "ue5"
+    assert retarget.identify_rig(whole).rig.name == "metahuman"
+    assert retarget.load_rig("ue5").joints == retarget.load_rig("metahuman").joints
+    assert retarget.identify_rig(whole).match.rivals == ()
+
+
+def test_a_rig_with_controls_and_copies_is_taken_by_its_deforming_joints():
+    rigmap = retarget.identify_rig(make(replace(TREES["rigify", "everything"], extras=False)).skeleton)
+    assert set(rigmap.joint_names.values()) == set(names_of("rigify", 0).values())
+
+
+def test_vrm_0_faces_back_and_is_not_the_canonical_skeleton_of_the_same_names():
+    back = make(replace(TREES["vrm", "0, facing back"], extras=False)).skeleton
+    front = make(replace(TREES["vrm", "1"], extras=False)).skeleton
+    assert (retarget.identify_rig(back).facing, retarget.identify_rig(front).facing) == ("-z", "z")
+    assert retarget.identify_rig(front).joint_names["chest"] == "upperChest"
+    assert retarget.identify_rig(CANONICAL).rig.name == "canonical"
+
+
+@pytest.mark.parametrize(
+    ("trunk", "chest"),
+    [(("Spine",), None), (("Spine", "Spine1"), "Spine1"), (("Spine", "Spine1", "Spine2"), "Spine2")]
+    + [(("Spine", "Spine1", "Spine2", "Spine3"), "Spine3")],
+)
+def test_of_rigs_that_share_names_the_chest_is_what_the_arms_hang_from(trunk, chest):
+    """HumanIK's names without prefix have trunks of one to ten joints."""
+    names = names_of("mixamo", 1) | {"chest": trunk[-1]} if chest else names_of("mixamo", 1)
+    if chest is None:
+        del names["chest"]
+    made = make(Make(names, between={"chest": trunk[1:-1]} if chest else {}, extras=False))
+    found = retarget.identify_rig(made.skeleton).joint_names
+    assert found.get("chest") == chest
+    assert found["spine"] == "Spine"
+
+
+def test_a_prefix_is_what_most_names_begin_with():
+    names = [f"m_avg_{name}" for name in ("Pelvis", "L_Hip", "R_Hip", "Spine1", "Neck", "Head", "L_Knee")]
+    assert without_shared_prefix(names) == ["Pelvis", "L_Hip", "R_Hip", "Spine1", "Neck", "Head", "L_Knee"]
+    bare = ["Hips", "LeftLeg", "Left_Arm", "Left_Hand", "b_1", "b_2", "b_3"]
+    assert without_shared_prefix(bare) == bare
+    assert without_shared_prefix([]) == []
