@@ -72,7 +72,7 @@ def printable(name: str) -> str:
 
 def shorten(name: str) -> str:
     """Shorten a long name in its middle."""
-    return name if len(name) <= _MAX_NAME else name[: _MAX_NAME // 2] + "..." + name[-_MAX_NAME // 2 + 2 :]
+    return name if len(name) <= _MAX_NAME else name[: _MAX_NAME // 2] + "..." + name[3 - _MAX_NAME // 2 :]
 
 
 def _to_height(axes: Any, label: Label) -> float:

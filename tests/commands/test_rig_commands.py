@@ -6,7 +6,9 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers import bandai_skeleton, generator, run, tiny_density, turn_between
+from PIL import Image
 from rig_maker import Make, make, names_of, person
+from strange_rigs import CASES
 
 import controllers
 import mapctl
@@ -59,6 +61,77 @@ def test_info_tells_a_clips_rig(clip, capsys):
     assert all(word in shown for word in ("mixamo", "centimetres", "+z", "1.50", "mixamorig:LeftUpLeg", "Prop_sword"))
 
 
+def test_info_tells_a_sure_fit_and_draws_it(clip, tmp_path, capsys):
+    assert run("info", clip, "-o", tmp_path / "rig.png") == 0
+    assert "fit: sure\n" in capsys.readouterr().out
+    with Image.open(tmp_path / "rig.png") as picture:
+        assert picture.size == (1600, 960)
+        colours = {colour for _, colour in picture.convert("RGB").getcolors(1 << 20)}
+    assert {(0x4C, 0x78, 0xA8), (0xF5, 0x85, 0x18), (0x33, 0x33, 0x33)} <= colours  # left, right and middle
+    assert run("info", clip, "--json") == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["fit"], told["doubts"]) == ("sure", [])
+    assert set(told["known_by"].values()) == {"list"}
+
+
+@pytest.fixture
+def odd(tmp_path):
+    """A rig of which one joint has no name that tells anything."""
+    path = tmp_path / "odd.bvh"
+    make(Make(names_of("mixamo") | {"leftHand": "a17"}, arms_down_deg=40)).motion(person(1.0, 20)).save(path)
+    return path
+
+
+def test_info_tells_each_doubt_in_a_line_and_convert_notes_it(odd, tmp_path, capsys):
+    reason = "leftHand is known by its place alone (joint 'a17')"
+    assert run("info", odd, "--out", tmp_path / "odd.png") == 0
+    assert f"fit: doubtful\ndoubtful: {reason}\n" in capsys.readouterr().out
+    assert (tmp_path / "odd.png").stat().st_size > 10_000
+    assert run("info", odd, "--json") == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["fit"], told["doubts"]) == ("doubtful", [reason])
+    assert told["known_by"]["leftHand"] == "place"
+    assert run("convert", odd, tmp_path / "a.bvh", "--rig", "canonical") == 0
+    notes = [line for line in capsys.readouterr().out.splitlines() if line.startswith("note:")]
+    assert notes == [f"note: how the rig of IN is understood is doubtful: {reason}; see mapctl info IN"]
+    assert run("convert", odd, tmp_path / "b.bvh") == 0  # where no rig is asked for, none is doubted
+    assert "note" not in capsys.readouterr().out
+
+
+def test_info_tells_of_a_refused_clip_what_can_be_told(tmp_path, capsys):
+    CASES["a dog with a person's names"].motion.save(tmp_path / "dog.bvh")
+    assert run("info", tmp_path / "dog.bvh", "-o", tmp_path / "dog.png") == 2
+    told = capsys.readouterr()
+    assert told.err.count("\n") == 1
+    assert "on four legs" in told.err
+    assert all(word in told.out for word in ("fit: refused", "LeftForeArm", "frames"))
+    assert not (tmp_path / "dog.png").exists()
+    assert run("info", tmp_path / "dog.bvh", "--json") == 2
+    told = json.loads(capsys.readouterr().out)
+    assert (told["fit"], told["joints"], told["frames"]) == ("refused", {}, 12)
+    assert "on four legs" in told["doubts"][0]
+    assert run("convert", tmp_path / "dog.bvh", tmp_path / "a.bvh", "--rig", "canonical") == 2
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["odd.bvh", "-o", "rig.jpg"], "--out writes .png, not .jpg"),
+        (["odd.bvh", "-o", "rig"], "--out writes .png, not a file without ending"),
+        (["odd.bvh", "-o", "none/rig.png"], "none"),
+        (["-o", "rig.png"], "a picture of a clip's rig: mapctl info CLIP -o rig.png"),
+        (["missing.bvh", "-o", "rig.png"], "no such file"),
+    ],
+)
+def test_pictures_that_cannot_be_are_refused_before_anything_is_read(odd, words, said, capsys, monkeypatch):
+    monkeypatch.chdir(odd.parent)
+    assert run("info", *words) == 2
+    told = capsys.readouterr().err
+    assert said in told
+    assert told.count("\n") == 1
+    assert not list(odd.parent.glob("rig*"))
+
+
 def test_a_rig_that_is_given_wins(clip, tmp_path, capsys):
     (tmp_path / "mine.toml").write_text('unit = "in"\nup = "y"\n[joints]\nhips = "mixamorig:Hips"\n')
     assert run("info", clip, "--json", "--rig", tmp_path / "mine.toml") == 0
@@ -98,7 +171,9 @@ def told_rig(request, tmp_path):
     ("job", "told_rig"),
     [
         *(("convert", rig) for rig in ("mixamo", "Bandai-Namco", "cmu-daz", "iclone", "TOML")),
+        *(("convert", rig) for rig in ("daz-genesis", "metahuman", "rigify", "vrm", "xsens", "rokoko", "mmd")),
         ("follow", "TOML"),
+        *(pytest.param("follow", rig, marks=pytest.mark.slow) for rig in ("daz-genesis", "rigify", "mmd")),
         *(pytest.param(*pair, marks=pytest.mark.slow) for pair in (("steer", "mixamo"), ("run", "iclone"))),
         ("generate", "TOML"),
     ],
@@ -139,7 +214,7 @@ def test_who_stands_on_a_preset_is_the_canonical_body_in_its_t_pose(preset):
     rig = retarget.load_rig(preset)
     standing = figure.make_tpose_clip(rig)
     canonical, rigmap = retarget.to_canonical(standing)
-    assert rigmap.rig.name == preset  # told by its names alone
+    assert rigmap.rig.name == ("ue5" if preset == "metahuman" else preset)  # told by its names alone
     toes = [CANONICAL.index(side + "Toes") for side in ("left", "right")]
     heights = canonical.joint_positions()[:, toes, 1]
     torch.testing.assert_close(heights, torch.full_like(heights, TOE_REST_HEIGHT), atol=1e-4, rtol=0)

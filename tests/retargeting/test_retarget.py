@@ -135,7 +135,7 @@ def test_one_walk_on_two_rigs_goes_the_same_way():
 
 def test_what_is_no_body_is_refused_with_what_is_missing_and_the_known_rigs():
     strange = Skeleton(("bone_1", "bone_2"), (-1, 0), torch.zeros(2, 3).double())
-    with pytest.raises(RequestError, match=r"hips, spine.*bone_1, bone_2.*canonical, bandai-namco,.* cmu-daz"):
+    with pytest.raises(RequestError, match=r"hips, spine.*bone_1, bone_2.*canonical, .*bandai-namco,.* cmu-daz"):
         retarget.identify_rig(strange)
 
 
