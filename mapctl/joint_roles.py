@@ -11,7 +11,8 @@ from mapctl.skeleton import Skeleton
 # Where a rig has no toe joint, its foot stands for it.
 _TOES = ("toes", "toebase", "toe", "toe0", "toejoint", "ball", "toeend", "つま先", "脚趾", "足指")
 _TOES += ("foot", "footjoint", "ankle", "足首", "脚踝", "脚")
-_UPPER_LEGS = ("upperleg", "upleg", "thigh", "thighbend", "femur", "legupper", "hip", "hipjoint", "大腿", "太もも", "足")
+_UPPER_LEGS = ("upperleg", "upleg", "thigh", "thighbend", "femur", "legupper", "hip", "hipjoint")
+_UPPER_LEGS += ("大腿", "太もも", "足")
 _HIPS = ("hips", "hip", "pelvis", "骨盆", "盆骨", "骨盤", "下半身")
 _ROOTS = ("rootjoint", "root")  # of rigs without hips
 

@@ -90,7 +90,6 @@ class Made:
         own = names.index(self.joint["hips"])
         return motion if own == 0 else replace(motion, root_position=hips - motion.joint_positions()[:, own] + hips)
 
-
     def _about_bone(self, joint: int, turn: Tensor) -> Tensor:
         """The turn of a joint, about its bone alone; of one from which several hang, none."""
         below = self.skeleton.children(joint)

@@ -36,7 +36,8 @@ TREES: dict[tuple[str, str], Make] = {
     ("daz-genesis", "9"): Make(
         names_of("daz-genesis", 1),
         root="Genesis9",
-        between=both("UpperLeg: pelvis; Toes: {s}_metatarsal", lr) | {"chest": ("spine2", "spine3"), "head": ("neck2",)},
+        between=both("UpperLeg: pelvis; Toes: {s}_metatarsal", lr)
+        | {"chest": ("spine2", "spine3"), "head": ("neck2",)},
         further=ends("{s}_thumb1 {s}_indexmetacarpal", lr) | ends("{s}_thightwist1 {s}_thightwist2", lr, "UpperLeg"),
     ),
     ("daz-genesis", "1 and 2"): Make(

@@ -23,8 +23,8 @@ def both_sides(middle: Sequence[str], limbs: str) -> dict[str, str]:
     return names
 
 
-CHINESE = both_sides("骨盆 腰 胸 脖子 头".split(), "左肩 左上臂 左前臂 左手 左大腿 左小腿 左脚 左脚趾")
-JAPANESE = both_sides("骨盤 腹 胸 首 頭".split(), "左鎖骨 左上腕 左前腕 左手 左太もも 左すね 左足首 左足指")
+CHINESE = both_sides(["骨盆", "腰", "胸", "脖子", "头"], "左肩 左上臂 左前臂 左手 左大腿 左小腿 左脚 左脚趾")
+JAPANESE = both_sides(["骨盤", "腹", "胸", "首", "頭"], "左鎖骨 左上腕 左前腕 左手 左太もも 左すね 左足首 左足指")
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,13 +287,14 @@ def _told(rig: tuple[Motion, Mapping[str, str]], *allowed: str) -> tuple[Motion,
 
 def _invented() -> dict[str, str]:
     """Names that no program gives, of words that tell side and part."""
-    words = "collarbone humerus elbow wrist thighbone kneejoint anklejoint toe_root".split()
+    middle = ["Pelvis", "belly", "upperBack", "nape_neck", "skull"]
+    words = ["collarbone", "humerus", "elbow", "wrist", "thighbone", "kneejoint", "anklejoint", "toe_root"]
     limbs = {
         side + part: f"{word}.{side[0].upper()}"
         for side in ("left", "right")
         for part, word in zip(_SHORT, words, strict=True)
     }
-    return dict(zip(("hips", "spine", "chest", "neck", "head"), "Pelvis belly upperBack nape_neck skull".split())) | limbs
+    return dict(zip(("hips", "spine", "chest", "neck", "head"), middle, strict=True)) | limbs
 
 
 CASES = _cases()

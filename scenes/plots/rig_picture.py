@@ -112,12 +112,13 @@ def plot_rig(picture: RigPicture, path: str | PathLike[str]) -> None:
 def _draw(figure: Any, picture: RigPicture) -> None:
     tpose = _stand_on_floor(picture, picture.tpose())
     height = float(tpose[picture.shown, 1].max()) + _HEADROOM
+    tall = 0.765 * _SIZE[1]
     front = figure.add_axes((0.005, 0.155, 0.565, 0.765))
     side = figure.add_axes((0.585, 0.155, 0.135, 0.765))
     _draw_body(front, picture, tpose, 0)
     _draw_body(side, picture, tpose, 2)
-    _set_scale(front, height, marks=False, width=0.565 * _SIZE[0], tall=0.765 * _SIZE[1], title="T-pose, from the front")
-    _set_scale(side, height, width=0.135 * _SIZE[0], tall=0.765 * _SIZE[1], title="from its right")
+    _set_scale(front, height, marks=False, width=0.565 * _SIZE[0], tall=tall, title="T-pose, from the front")
+    _set_scale(side, height, width=0.135 * _SIZE[0], tall=tall, title="from its right")
     draw_columns(front, _label_joints(picture, tpose))
     _draw_frames(figure, picture)
     _draw_axes(figure, picture)

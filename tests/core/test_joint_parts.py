@@ -43,7 +43,8 @@ HAN = {
 
 
 @pytest.mark.parametrize(
-    ("name", "side", "part"), [(name, *key) for table in (NAMES, HAN) for key, names in table.items() for name in names.split()]
+    ("name", "side", "part"),
+    [(name, *key) for table in (NAMES, HAN) for key, names in table.items() for name in names.split()],
 )
 def test_role_of_every_way_to_name_it(name, side, part):
     assert classify_joint(name) == Role(side, part)

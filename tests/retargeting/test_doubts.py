@@ -67,7 +67,9 @@ def test_the_rigs_of_the_data_are_sure(skeleton):
 
 
 def test_each_joint_says_what_it_is_known_by():
-    rigmap = retarget.identify_rig(rigged(names_of("mixamo") | {"leftHand": "a17", "rightHand": "RightHandle"})[0].skeleton)
+    rigmap = retarget.identify_rig(
+        rigged(names_of("mixamo") | {"leftHand": "a17", "rightHand": "RightHandle"})[0].skeleton
+    )
     known = rigmap.match.known_by
     assert (known["leftHand"], known["rightHand"], known["head"]) == (KnownBy.PLACE, KnownBy.WORDS, KnownBy.LIST)
     assert "leftHand" in assess_fit(rigmap).joints

@@ -15,9 +15,7 @@ from mapctl.retarget.recognition.doubts import assess_fit
 from mapctl.retarget.recognition.listed_names import without_shared_prefix
 from mapctl.skeleton import CANONICAL
 
-NEW = (
-    "advanced-skeleton auto-rig-pro daz-genesis deepmotion humanik makehuman metahuman mmd optitrack rigify synty unity"
-).split()
+NEW = sorted({preset for preset, _ in TREES} - {"xsens", "rokoko", "vrm"})
 
 
 @pytest.mark.parametrize("arms", [0, 40], ids=["T", "A"])
@@ -46,7 +44,9 @@ def test_a_rig_as_a_program_writes_it_is_known_and_comes_back(preset, version, a
     torch.testing.assert_close(back.joint_positions(), motion.joint_positions(), atol=1e-8, rtol=0)
 
 
-@pytest.mark.parametrize("tree", [("daz-genesis", "3 and 8"), ("rigify", "deforming"), ("makehuman", "default")], ids=str)
+@pytest.mark.parametrize(
+    "tree", [("daz-genesis", "3 and 8"), ("rigify", "deforming"), ("makehuman", "default")], ids=str
+)
 def test_another_motion_on_limbs_of_two_halves_puts_hands_and_feet_where_they_belong(tree):
     """Without the rig's own motion the twists rest."""
     made, wanted = make(replace(TREES[tree], arms_down_deg=40, extras=False)), person(1.0, 20)
@@ -65,7 +65,6 @@ def test_every_preset_of_several_versions_is_made_in_each():
         "xsens": 2,
         "vrm": 2,
     }
-    assert set(NEW) <= {preset for preset, _ in TREES}
 
 
 @pytest.mark.parametrize("preset", NEW)
@@ -108,8 +107,12 @@ def test_vrm_0_faces_back_and_is_not_the_canonical_skeleton_of_the_same_names():
 
 @pytest.mark.parametrize(
     ("trunk", "chest"),
-    [(("Spine",), None), (("Spine", "Spine1"), "Spine1"), (("Spine", "Spine1", "Spine2"), "Spine2")]
-    + [(("Spine", "Spine1", "Spine2", "Spine3"), "Spine3")],
+    [
+        (("Spine",), None),
+        (("Spine", "Spine1"), "Spine1"),
+        (("Spine", "Spine1", "Spine2"), "Spine2"),
+        (("Spine", "Spine1", "Spine2", "Spine3"), "Spine3"),
+    ],
 )
 def test_of_rigs_that_share_names_the_chest_is_what_the_arms_hang_from(trunk, chest):
     """HumanIK's names without prefix have trunks of one to ten joints."""

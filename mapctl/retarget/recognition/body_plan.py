@@ -11,7 +11,11 @@ from mapctl.retarget import topology
 from mapctl.retarget.pose_axes import RigPoses, unit_vectors
 from mapctl.skeleton import Skeleton
 
-_ANIMAL = re.compile(r"paw|hoof|fetlock|hock|fore_?leg|(front|hind|rear)_?(left_?|right_?|[lr]_?)?(up|low|leg|foot|thigh)")
+_ANIMAL = re.compile(
+    r"(?<![A-Za-z])(paw|hoof|hock|fetlock)|Paw|Hoof|Hock|Fetlock|[Ff]ore_?[Ll]eg"
+    r"|(?i:(front|hind|rear)_?(left_?|right_?|[lr]_?)?(up|low|leg|limb|thigh))"
+)
+"""In names of joints; people have a hindfoot and a forefoot, too."""
 _MIN_ANIMAL = 2  # joints named as an animal's, from which it is one
 _SQUARE = 0.5  # cosine between trunk and legs, below which the trunk lies across them
 _ALONG = 0.7  # cosine between arms and legs, above which the arms stand beside the legs
@@ -26,7 +30,7 @@ def goes_on_four_legs(skeleton: Skeleton, zero: RigPoses, clip: RigPoses | None)
 
     The pose with all rotations zero tells where it is one; a clip in which the body stands upright overrules it.
     """
-    if sum(bool(_ANIMAL.search(name.lower())) for name in skeleton.names) >= _MIN_ANIMAL:
+    if sum(bool(_ANIMAL.search(name)) for name in skeleton.names) >= _MIN_ANIMAL:
         return True
     if clip is not None and bool((_trunk_against_legs(clip) < _STANDS).any()):
         return False

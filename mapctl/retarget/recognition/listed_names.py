@@ -1,8 +1,10 @@
 """Matching joints by the names of the listed rigs: which rig explains most of a skeleton, and which one as much."""
 
 import re
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 from mapctl.joint_names import normalise_name
 from mapctl.retarget.rigs import Rig, known_rigs
@@ -33,7 +35,8 @@ def find_listed_rig(skeleton: Skeleton, required: Collection[str]) -> Listed | N
     plain = {normalise_name(name) for name in skeleton.names}
     for rig in known_rigs():
         found = match_by_rig(rig, skeleton)
-        if any(name not in found for name in required) or (rig.name == "canonical" and not _is_canonical(found, skeleton)):
+        complete = all(name in found for name in required)
+        if not complete or (rig.name == "canonical" and not _is_canonical(found, skeleton)):
             continue
         fits.append((_measure_fit(rig, found, skeleton, plain), rig, found))
     if not fits:
@@ -45,9 +48,9 @@ def find_listed_rig(skeleton: Skeleton, required: Collection[str]) -> Listed | N
 
 
 def match_by_rig(rig: Rig, skeleton: Skeleton) -> dict[str, int]:
-    """Match joints by a rig's names, in the version that fits best; spelling and prefixes count only where they must."""
+    """Match joints by a rig's names, in the version that fits best; spelling and prefixes count where they must."""
     exact = {name: joint for joint, name in enumerate(skeleton.names)}
-    plain = _index_plain_names(skeleton)
+    plain = _index_plain_names(skeleton.names)
     listed = {c: (own, *rig.aliases.get(c, ())) for c, own in rig.joints.items()}
     joint_of = {name: exact.get(name, plain.get(normalise_name(name))) for names in listed.values() for name in names}
 
@@ -69,18 +72,20 @@ def match_by_rig(rig: Rig, skeleton: Skeleton) -> dict[str, int]:
 def without_shared_prefix(names: Sequence[str]) -> list[str]:
     """Return the names without what most of them begin with, up to a separator: `Skeleton0_Hips` is `Hips`."""
     beginnings = [match[0] for match in map(_BEGINNING.match, names) if match]
-    most = max(beginnings, key=beginnings.count, default="")
-    if beginnings.count(most) <= max(_MIN_PREFIXED, len(names) / 2):
+    (most, count), *_ = Counter(beginnings).most_common(1) or [("", 0)]
+    if count <= max(_MIN_PREFIXED, len(names) / 2):
         return list(names)
     return without_shared_prefix([name.removeprefix(most) for name in names])
 
 
-def _index_plain_names(skeleton: Skeleton) -> dict[str, int]:
+@lru_cache(maxsize=8)
+def _index_plain_names(names: tuple[str, ...]) -> dict[str, int]:
     """Return the joint by normalised name, with and without a prefix that joints share; whole names come first."""
-    joints = reversed(range(skeleton.num_joints))
-    bare = without_shared_prefix(skeleton.names)
-    found = {normalise_name(bare[joint]): joint for joint in joints}
-    return found | {normalise_name(skeleton.names[joint]): joint for joint in reversed(range(skeleton.num_joints))}
+    found: dict[str, int] = {}
+    for spelled in (names, without_shared_prefix(names)):
+        for joint, name in enumerate(spelled):
+            found.setdefault(normalise_name(name), joint)
+    return found
 
 
 def _measure_fit(rig: Rig, found: Mapping[str, int], skeleton: Skeleton, plain: set[str]) -> float:
@@ -102,5 +107,5 @@ def _arms_hang_from_chest(found: Mapping[str, int], skeleton: Skeleton) -> bool:
 
 
 def _is_canonical(found: Mapping[str, int], skeleton: Skeleton) -> bool:
-    """Return whether the skeleton is the canonical one; VRM's has its names too, and arms on a joint above its chest."""
+    """Return whether the skeleton is the canonical one; VRM's has its names, and arms above its chest."""
     return set(CANONICAL.names) <= set(skeleton.names) and _arms_hang_from_chest(found, skeleton)

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator
+from itertools import pairwise
 
 import torch
 from jaxtyping import Float
@@ -50,7 +51,7 @@ def check_poses(rigmap: RigMap, clip: RigPoses | None) -> Iterator[Doubt]:
     elif float(up[:, 1].median()) < _UPRIGHT:
         yield Doubt(f"the body lies or hangs upside down in most frames if {rigmap.up} is up")
     if rigmap.rest == "neither" and rigmap.tpose_from == "rest pose" and _mean_bend(clip) < _MIN_BEND:
-        yield Doubt("the rest pose is no T- or A-pose and knees hardly bend in the clip: how limbs are twisted is a guess")
+        yield Doubt("the rest pose is no T- or A-pose and knees hardly bend: how limbs are twisted is a guess")
 
 
 def _compare_halves(skeleton: Skeleton) -> Iterator[Doubt]:
@@ -96,7 +97,7 @@ def _compare_limbs(places: Places) -> Iterator[Doubt]:
 def _check_order(places: Places) -> Iterator[Doubt]:
     """Check that the trunk goes up, shoulders are over the hips, and left is on the left."""
     trunk = [name for name in ("hips", "spine", "chest", "neck", "head") if name in places]
-    for below, above in zip(trunk[:-1], trunk[1:], strict=True):
+    for below, above in pairwise(trunk):
         if float(places[above][1] - places[below][1]) < -_MAX_SINK:
             yield Doubt(f"{above} is below {below} in the T-pose", (below, above))
     for side, sign in (("left", 1.0), ("right", -1.0)):
@@ -118,7 +119,7 @@ def _length(skeleton: Skeleton, name: str) -> float:
 
 
 def _way(places: Places, *names: str) -> float:
-    return sum(float((places[b] - places[a]).norm()) for a, b in zip(names[:-1], names[1:], strict=True))
+    return sum(float((places[b] - places[a]).norm()) for a, b in pairwise(names))
 
 
 def _mean_bend(clip: RigPoses) -> float:
