@@ -1,8 +1,13 @@
-"""Labels in two columns beside a drawing, each with a line to its point, none over another."""
+"""Labels in two columns beside a drawing, each with a line to its point, none over another.
+
+Imported late, where they are needed: matplotlib may not be installed.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
+
+from matplotlib import font_manager
 
 _MAX_NAME = 24  # characters of a name
 _GAP = 0.056  # of the height of the axes between two labels
@@ -55,16 +60,12 @@ def spread(heights: Sequence[float]) -> list[float]:
 
 def font_families(text: str) -> list[str]:
     """Return the fonts for a text: with one that has its Chinese and Japanese characters, where one is installed."""
-    from matplotlib import font_manager
-
     known = {font.name for font in font_manager.fontManager.ttflist}
     return ["DejaVu Sans", *(font for font in _HAN_FONTS if font in known and not text.isascii())]
 
 
 def printable(name: str) -> str:
     """Return a name as the fonts at hand can show it: other characters as their code."""
-    from matplotlib import font_manager
-
     fonts = [font_manager.get_font(font_manager.findfont(family)) for family in font_families(name)]
     shown = "".join(c if any(font.get_char_index(ord(c)) for font in fonts) else f"\\u{ord(c):04x}" for c in name)
     return shown

@@ -1,4 +1,7 @@
-"""A picture of a rig as it was understood: its T-pose with both names of each joint, frames of the clip, and doubts."""
+"""A picture of a rig as it was understood: its T-pose with both names of each joint, frames of the clip, and doubts.
+
+Imported late, where it is needed: matplotlib may not be installed.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -7,12 +10,13 @@ from os import PathLike
 from textwrap import wrap
 from typing import Any
 
+import matplotlib
 import numpy as np
 import torch
 from jaxtyping import Float
+from matplotlib.figure import Figure
 
 from mapctl import kinematics, retarget, rotations
-from mapctl.errors import RequestError
 from mapctl.formats.atomic import atomic_path
 from mapctl.motion import Motion
 from mapctl.retarget import RigMap
@@ -94,13 +98,7 @@ class RigPicture:
 
 
 def plot_rig(picture: RigPicture, path: str | PathLike[str]) -> None:
-    """Write a PNG, 1600 pixels wide. RequestError where matplotlib is not installed."""
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise RequestError(f"pictures need matplotlib ({error}): pip install 'mapctl[render]'") from error
-    import matplotlib
-
+    """Write a PNG, 1600 pixels wide."""
     names = "".join(picture.rigmap.rig_skeleton.names)
     with matplotlib.rc_context({"font.family": font_families(names)}):
         figure = Figure(figsize=_SIZE, dpi=_DPI, facecolor="white")

@@ -93,7 +93,7 @@ def test_info_tells_each_doubt_in_a_line_and_convert_notes_it(odd, tmp_path, cap
     assert told["known_by"]["leftHand"] == "place"
     assert run("convert", odd, tmp_path / "a.bvh", "--rig", "canonical") == 0
     notes = [line for line in capsys.readouterr().out.splitlines() if line.startswith("note:")]
-    assert notes == [f"note: how the rig of IN is understood is doubtful: {reason}; see mapctl info IN"]
+    assert notes == [f"note: the rig of IN is doubtful: {reason}; see mapctl info IN"]
     assert run("convert", odd, tmp_path / "b.bvh") == 0  # where no rig is asked for, none is doubted
     assert "note" not in capsys.readouterr().out
 
@@ -130,6 +130,13 @@ def test_pictures_that_cannot_be_are_refused_before_anything_is_read(odd, words,
     assert said in told
     assert told.count("\n") == 1
     assert not list(odd.parent.glob("rig*"))
+
+
+def test_without_matplotlib_a_picture_is_refused_and_the_extra_named(odd, monkeypatch, capsys):
+    monkeypatch.setattr("mapctl.commands.shared.outputs.find_spec", lambda name: None)
+    assert run("info", odd, "-o", odd.parent / "rig.png") == 2
+    assert "pip install 'mapctl[render]'" in capsys.readouterr().err
+    assert run("info", odd) == 0
 
 
 def test_a_rig_that_is_given_wins(clip, tmp_path, capsys):

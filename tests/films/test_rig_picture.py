@@ -14,7 +14,6 @@ from rig_trees import TREES
 from strange_rigs import CASES
 
 from mapctl import retarget
-from mapctl.errors import RequestError
 from mapctl.retarget.recognition.doubts import assess_fit
 from mapctl.skeleton import CANONICAL
 from scenes.plots import rig_picture
@@ -29,12 +28,11 @@ def picture_of(motion):
 
 
 def drawn(picture):
-    """The figure of it, and its texts."""
+    """What measures its texts, and they."""
     figure = Figure(figsize=(16.0, 9.6), dpi=100)
-    FigureCanvasAgg(figure)
     rig_picture._draw(figure, picture)
     texts = [*figure.texts, *(text for axes in figure.axes for text in axes.texts)]
-    return figure, [text for text in texts if text.get_text()]
+    return FigureCanvasAgg(figure).get_renderer(), [text for text in texts if text.get_text()]
 
 
 @given(st.lists(st.floats(-0.5, 1.5), max_size=16))
@@ -66,12 +64,12 @@ def test_labels_that_have_room_stay_where_their_joints_are():
 )
 def test_every_joint_has_its_label_and_no_label_covers_another(motion):
     picture = picture_of(motion)
-    figure, texts = drawn(picture)
+    renderer, texts = drawn(picture)
     words = [text.get_text() for text in texts]
     for name, own in picture.rigmap.joint_names.items():
         assert any(word == name or word.startswith(name + " [") for word in words)
         assert shorten(printable(own)) in words
-    boxes = [text.get_window_extent(figure.canvas.get_renderer()) for text in texts]
+    boxes = [text.get_window_extent(renderer) for text in texts]
     for k, box in enumerate(boxes):
         for other, word in zip(boxes[:k], words[:k], strict=True):
             apart = min(box.x1, other.x1) - max(box.x0, other.x0), min(box.y1, other.y1) - max(box.y0, other.y0)
@@ -128,12 +126,6 @@ def test_a_picture_is_there_whole_or_not_at_all(tmp_path, monkeypatch):
     with pytest.raises(ZeroDivisionError):
         plot_rig(picture, tmp_path / "b.png")
     assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
-
-
-def test_without_matplotlib_the_extra_is_named(tmp_path, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "matplotlib.figure", None)
-    with pytest.raises(RequestError, match="mapctl\\[render\\]"):
-        plot_rig(picture_of(CASES["Mixamo"].motion), tmp_path / "a.png")
 
 
 def test_a_rig_that_lacks_joints_says_which():

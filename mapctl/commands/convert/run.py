@@ -20,7 +20,7 @@ def run(command: Convert) -> int:
     fps = None if command.fps is None else parse_fps(command.fps)
     source_rig = inputs.read_rig(command.source_rig)
     fps_in = None if command.fps_in is None else parse_fps(command.fps_in)
-    motion, notes = inputs.read_motion(command.source, source_rig, fps=fps_in), ()
+    motion, notes = inputs.read_motion(command.source, source_rig, fps=fps_in), []
     if command.frames is not None:
         start, stop = parse_range(
             command.frames, fps=float(motion.fps), frames=motion.num_frames, what="range of frames"
@@ -29,7 +29,7 @@ def run(command: Convert) -> int:
     if command.rig is not None:
         doubts = describe_doubts(motion, source_rig)
         retargeted = transfer_to_rig(motion, command.rig, source_rig)
-        motion, notes = retargeted.motion, (*doubts, *retargeted.notes)
+        motion, notes = retargeted.motion, [*doubts, *retargeted.notes]
     if fps is not None:
         motion = motion.resample(fps)
     formats.save(motion, command.out)
@@ -51,13 +51,11 @@ def parse_fps(text: str) -> Fraction:
     return fps
 
 
-def describe_doubts(motion: Motion, rig: Rig | None) -> tuple[str, ...]:
+def describe_doubts(motion: Motion, rig: Rig | None) -> list[str]:
     """Describe in one note what is doubtful about how a motion's rig is understood; empty where nothing is."""
     doubts = assess_fit(retarget.identify_rig(motion.skeleton, rig, motion=motion), motion).doubts
-    if not doubts:
-        return ()
     more = f", and {len(doubts) - 1} more" if len(doubts) > 1 else ""
-    return (f"how the rig of IN is understood is doubtful: {doubts[0].reason}{more}; see mapctl info IN",)
+    return [f"the rig of IN is doubtful: {doubt.reason}{more}; see mapctl info IN" for doubt in doubts[:1]]
 
 
 def transfer_to_rig(motion: Motion, rig: str, source_rig: Rig | None = None) -> RetargetedMotion:

@@ -12,7 +12,6 @@ from mapctl.motion import Motion
 from mapctl.retarget import RigMap
 from mapctl.retarget.recognition.doubts import Fit, assess_fit
 from mapctl.skeleton import CANONICAL
-from scenes.plots import rig_picture
 
 _LISTS = ("joints", "known_by", "unmapped", "doubts", "fit")
 
@@ -41,6 +40,8 @@ def print_clip(path: Path, rig: str | None, *, as_json: bool, picture: Path | No
     fit = assess_fit(rigmap, motion)
     _print(describe_clip(path, motion, rigmap, fit), as_json=as_json)
     if picture is not None:
+        from scenes.plots import rig_picture
+
         rig_picture.plot_rig(rig_picture.RigPicture(rigmap, motion, fit, path.name), picture)
 
 
