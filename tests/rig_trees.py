@@ -77,7 +77,7 @@ TREES: dict[tuple[str, str], Make] = {
     ("rigify", "FK controls"): Make(
         names_of("rigify", 3),
         root="root",
-        between=both("UpperLeg: MCH-thigh_parent.{s}; Shoulder: MCH-spine", LR) | {"chest": ("spine_fk.002",)},
+        between=both("UpperLeg: MCH-thigh_parent.{s}", LR) | {"chest": ("spine_fk.002",)},
         further=ends("hand_ik.{s}", LR) | ends("foot_ik.{s}", LR, "Foot"),
         zup=True,
     ),

@@ -166,6 +166,14 @@ def _cases() -> dict[str, Strange]:
         "an elbow without a name": Strange(
             *_told(rigged(mixamo | {"leftLowerArm": "a17"}), DOUBTFUL), reason="leftLowerArm is known by its place"
         ),
+        "no head": Strange(
+            *_told(rigged({c: o for c, o in mixamo.items() if c not in ("head", "neck")}), DOUBTFUL),
+            reason="no joint is known for head",
+        ),
+        "no hands": Strange(
+            *_told(rigged({c: o for c, o in mixamo.items() if "Hand" not in c}, extras=False), DOUBTFUL),
+            reason="no joint is known for leftHand",
+        ),
         "too large": Strange(*_told(rigged(mixamo, size=3.0), DOUBTFUL), reason="the unit may be wrong"),
         "too small": Strange(*_told(rigged(mixamo, size=0.1), DOUBTFUL), reason="the unit may be wrong"),
         "one long shin": Strange(

@@ -15,6 +15,7 @@ from mapctl.motion import Motion
 from mapctl.retarget import topology
 from mapctl.retarget.pose_axes import RigPoses, are_sides_swapped
 from mapctl.retarget.recognition.listed_names import Listed, find_listed_rig, match_by_rig
+from mapctl.retarget.recognition.other_side import find_by_other_side
 from mapctl.retarget.rigs import Rig, known_rigs
 from mapctl.skeleton import CANONICAL, Skeleton, mirror_name
 
@@ -28,11 +29,12 @@ REQUIRED = (
 """Canonical joints that a rig must have; the others are put in between or at the end where it lacks them."""
 
 _ABSENT, _SWAPPED = 0.4, 0.9
-_HELPER_NAME = re.compile(
+HELPER_NAME = re.compile(
     r"twist|roll|\bik|ik_|_ik|pole|ctrl|control|nub|_end|\bend|site|tip|prop|weapon|aim|target|"
-    r"helper|corrective|attach|socket|skirt|hair|cloth|breast|bust",
+    r"helper|corrective|attach|socket|skirt|hair|cloth|breast|bust|捩|ＩＫ",
     re.IGNORECASE,
 )
+"""In names of joints that are no body part's."""
 
 
 class KnownBy(Enum):
@@ -114,27 +116,14 @@ def _complete_match(skeleton: Skeleton, given: Mapping[str, int]) -> tuple[dict[
         if joint not in found.values():
             found.setdefault(name, joint)
     known = {name: KnownBy.LIST if name in given else KnownBy.WORDS for name in found}
+    beside = find_by_other_side(skeleton, found)
+    found, known = found | beside, known | dict.fromkeys(beside, KnownBy.PLACE)
     by_tree = _assign_sides(topology.match_by_tree(skeleton), classify_joints(skeleton), skeleton)
     for name, joint in by_tree.items():
-        helper = _HELPER_NAME.search(skeleton.names[joint])
+        helper = HELPER_NAME.search(skeleton.names[joint])
         if name not in found and joint not in found.values() and not helper:
             found[name], known[name] = joint, KnownBy.PLACE
-    for name, joint in _find_middles(skeleton, found).items():
-        found[name], known[name] = joint, KnownBy.PLACE
     return found, known
-
-
-def _find_middles(skeleton: Skeleton, found: Mapping[str, int]) -> dict[str, int]:
-    """Find elbows and knees as the only joint between two that are known."""
-    middles = {}
-    for side in ("left", "right"):
-        for upper, lower, end in (("UpperArm", "LowerArm", "Hand"), ("UpperLeg", "LowerLeg", "Foot")):
-            above, below = found.get(side + upper), found.get(side + end)
-            if side + lower not in found and above is not None and below is not None:
-                joint = skeleton.parents[below]
-                if joint >= 0 and skeleton.parents[joint] == above:
-                    middles[side + lower] = joint
-    return middles
 
 
 def _match_by_words(skeleton: Skeleton, hips: int | None) -> dict[str, int]:
@@ -145,10 +134,13 @@ def _match_by_words(skeleton: Skeleton, hips: int | None) -> dict[str, int]:
         except RequestError:
             return {}
     found = {"hips": hips}
+    told = classify_joints(skeleton)
     inside = _descendants(skeleton, hips)
+    if skeleton.parents[hips] >= 0 and not any(told[joint].part is Part.UPPER_ARM for joint in inside):
+        inside = _descendants(skeleton, skeleton.parents[hips])  # a trunk beside the hips, as MMD has it
     roles = [
-        r if j in inside and not _HELPER_NAME.search(skeleton.names[j]) else Role(Side.MIDDLE, Part.OTHER)
-        for j, r in enumerate(classify_joints(skeleton))
+        r if j in inside and not HELPER_NAME.search(skeleton.names[j]) else Role(Side.MIDDLE, Part.OTHER)
+        for j, r in enumerate(told)
     ]
     for side in (Side.LEFT, Side.RIGHT):
         found |= _match_limb_by_words(roles, side)

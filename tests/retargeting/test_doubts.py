@@ -7,6 +7,7 @@ import pytest
 import torch
 from helpers import bandai_skeleton, cmu_skeleton, walk
 from rig_maker import Make, make, names_of, person
+from rig_trees import TREES
 from strange_rigs import CASES, DOUBTFUL, REFUSED, SURE, rigged, swap
 
 from mapctl import retarget
@@ -52,6 +53,33 @@ def test_names_in_disorder_are_never_a_sure_match(preset):
         mixed = swap(names, *(order.sample(list(names), 2) for _ in range(pairs)))
         verdict, _, rigmap = judge(rigged(mixed, arms_down_deg=40)[0])
         assert verdict != SURE or rigmap.joint_names == mixed
+
+
+LOST = [
+    pytest.param(tree, name, marks=() if name in ("leftHand", "chest") else pytest.mark.slow)
+    for tree in TREES
+    if tree != ("rigify", "everything")  # every joint is there thrice, in one place
+    for name in ("leftHand", "chest", "head", "leftFoot", "leftLowerArm", "leftShoulder", "leftToes")
+    if name in TREES[tree].names
+]
+
+
+@pytest.mark.parametrize(("tree", "name"), LOST, ids=str)
+def test_a_rig_of_which_a_joint_lost_its_name_is_never_understood_wrongly_and_surely(tree, name):
+    wish = replace(TREES[tree], names={**TREES[tree].names, name: "a17"}, extras=False, arms_down_deg=30)
+    made = make(wish)
+    verdict, _, rigmap = judge(made.motion(person(1.0, 30)))
+    if verdict == SURE:
+        assert rigmap.joint_names == {c: own for c, own in made.joint.items() if c in rigmap.joint_names}
+
+
+@pytest.mark.parametrize("name", ["leftHand", "leftLowerArm", "leftFoot", "leftToes", "leftShoulder"])
+@pytest.mark.parametrize("tree", [("daz-genesis", "3 and 8"), ("xsens", "BVH"), ("unity", "avatar")], ids=str)
+def test_a_joint_without_a_name_is_found_by_the_other_side(tree, name):
+    wish = replace(TREES[tree], names={**TREES[tree].names, name: "a17"}, extras=False, arms_down_deg=30)
+    verdict, why, rigmap = judge(make(wish).motion(person(1.0, 30)))
+    assert (verdict, rigmap.joint_names[name]) == (DOUBTFUL, "a17")
+    assert f"{name} is known by its place alone (joint 'a17')" in why
 
 
 @pytest.mark.parametrize("preset", [rig.name for rig in rigs.known_rigs() if rig.name != "metahuman"])

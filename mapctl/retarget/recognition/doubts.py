@@ -10,7 +10,7 @@ from mapctl.joint_names import Part, Side
 from mapctl.joint_roles import classify_joints
 from mapctl.motion import Motion
 from mapctl.retarget import RigMap
-from mapctl.retarget.joint_matching import KnownBy, Match
+from mapctl.retarget.joint_matching import HELPER_NAME, KnownBy, Match
 from mapctl.retarget.pose_axes import RigPoses
 from mapctl.retarget.recognition import body_plan, proportions
 from mapctl.retarget.recognition.doubt import Doubt
@@ -30,6 +30,7 @@ _BELOW = {
     "Toes": ("Foot",),
 }
 """What each part hangs from: the first that a rig has."""
+_LIMBS = ("LowerArm", "Hand", "LowerLeg", "Foot")
 _PARTS = {
     "hips": {Part.HIPS},
     "spine": {Part.TORSO},
@@ -80,6 +81,8 @@ def assess_fit(rigmap: RigMap, motion: Motion | None = None) -> Fit:
         partial(_list_rivals, rigmap, found),
         partial(_list_joints_by_place, rigmap, found),
         partial(_compare_words, rigmap, found),
+        partial(_find_skipped_joints, rigmap, found),
+        partial(_compare_knowledge, rigmap, found),
         partial(_find_single_sides, rigmap),
         partial(proportions.check_bones, rigmap.skeleton),
         partial(proportions.check_poses, rigmap, clip),
@@ -170,8 +173,59 @@ def _compare_words(rigmap: RigMap, found: Match) -> Iterator[Doubt]:
             yield Doubt(f"{name} is {_quote(rigmap, joint)}, whose name is that of a {part.value}", (name,))
 
 
+def _find_skipped_joints(rigmap: RigMap, found: Match) -> Iterator[Doubt]:
+    """Find joints between the chest and the arms, or within a limb of which no list knows the next joint."""
+    told: set[int] = set()
+    for name, joint in rigmap.joints.items():
+        side, part = _split(name)
+        first = part == "Shoulder" or (part == "UpperArm" and side + "Shoulder" not in rigmap.joints)
+        above = "chest" if first else side + _BELOW[part][0] if part in _LIMBS else None
+        if above not in rigmap.joints or (above != "chest" and found.known_by.get(name) is KnownBy.LIST):
+            continue
+        between = _joints_between(rigmap, rigmap.joints[above], joint)
+        if between and between[0] not in told:
+            own, skipped = _quote(rigmap, rigmap.joints[above]), _quote(rigmap, between[0])
+            yield Doubt(f"between {above} {own} and {name} {_quote(rigmap, joint)} is {skipped}", (above, name))
+        told |= {*between}
+
+
+def _joints_between(rigmap: RigMap, above: int, joint: int) -> list[int]:
+    """Return the joints between two of which one hangs from the other, but for twists and other helpers."""
+    names, parents, between = rigmap.rig_skeleton.names, rigmap.rig_skeleton.parents, []
+    joint = parents[joint]
+    while joint >= 0 and joint != above:
+        between.append(joint)
+        joint = parents[joint]
+    matched = rigmap.joints.values()
+    return [one for one in between if joint == above and one not in matched and not HELPER_NAME.search(names[one])]
+
+
+def _compare_knowledge(rigmap: RigMap, found: Match) -> Iterator[Doubt]:
+    """Compare what both sides are known by: one version of a list, or words alone."""
+    for name in rigmap.joints:
+        other = mirror_name(name)
+        versions = [_version(rigmap, found, one) for one in (name, other)]
+        if other in rigmap.joints and None not in versions and versions[0] > versions[1]:
+            own, theirs = _quote(rigmap, rigmap.joints[name]), _quote(rigmap, rigmap.joints[other])
+            yield Doubt(f"{name} is {own} and {other} is {theirs}, which is named otherwise", (name,))
+
+
+def _version(rigmap: RigMap, found: Match, name: str) -> int | None:
+    """Return the version of the rig's list that has the name of a joint, or one more than any where words tell it;
+    None where it is spelled otherwise or known by its place."""
+    rig, how = found.rig, found.known_by.get(name)
+    listed = (rig.joints.get(name), *rig.aliases.get(name, ()))
+    if how is KnownBy.WORDS and rig.aliases.keys() | rig.joints.keys() >= {name}:
+        return len(listed)
+    own = rigmap.joint_names.get(name)
+    return listed.index(own) if how is KnownBy.LIST and own in listed else None
+
+
 def _find_single_sides(rigmap: RigMap) -> Iterator[Doubt]:
-    """Find joints that only one side has."""
+    """Find joints that only one side has, and a body without head or hands."""
+    for name in ("head", "leftHand", "rightHand"):
+        if name not in rigmap.joints and mirror_name(name) not in rigmap.joints:
+            yield Doubt(f"no joint is known for {name}", (name,))
     for name in rigmap.joints:
         other = mirror_name(name)
         if other not in rigmap.joints:
