@@ -8,7 +8,7 @@ import torch
 from helpers import bandai_skeleton, cmu_skeleton, walk
 from rig_maker import Make, make, names_of, person
 from rig_trees import TREES
-from strange_rigs import CASES, DOUBTFUL, REFUSED, SURE, rigged, swap
+from strange_rigs import CASES, DOUBTFUL, REFUSED, SURE, rigged, swap, with_joints
 
 from mapctl import retarget
 from mapctl.errors import RequestError
@@ -101,6 +101,15 @@ def test_each_joint_says_what_it_is_known_by():
     known = rigmap.match.known_by
     assert (known["leftHand"], known["rightHand"], known["head"]) == (KnownBy.PLACE, KnownBy.WORDS, KnownBy.LIST)
     assert "leftHand" in assess_fit(rigmap).joints
+
+
+def test_what_the_other_side_shows_is_above_what_is_known_of_its_own_side():
+    """A decoy with as many joints as the right shoulder has; the left arm hangs from the true one."""
+    motion = rigged(names_of("mixamo") | {"leftShoulder": "a17"})[0]
+    chest, length = names_of("mixamo")["chest"], float(motion.skeleton.offsets[motion.skeleton.index("a17")].norm())
+    decoy = [(f"d{n}", f"d{n - 1}" if n else chest, (length, 0.0, 0.0)) for n in range(8)]
+    rigmap = retarget.identify_rig(with_joints(motion, decoy).skeleton)
+    assert rigmap.joint_names["leftShoulder"] == "a17"
 
 
 def test_a_name_of_another_part_contradicts_a_place():

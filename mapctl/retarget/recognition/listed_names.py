@@ -8,7 +8,7 @@ from functools import lru_cache
 
 from mapctl.joint_names import normalise_name
 from mapctl.retarget.rigs import Rig, known_rigs
-from mapctl.skeleton import CANONICAL, Skeleton
+from mapctl.skeleton import Skeleton
 
 _ARMS_ON_CHEST = 0.5  # joints that a chest from which the shoulders hang is worth
 _NEAR = 0.05  # joints by which a rig may fit less well and still be as near
@@ -36,7 +36,7 @@ def find_listed_rig(skeleton: Skeleton, required: Collection[str]) -> Listed | N
     for rig in known_rigs():
         found = match_by_rig(rig, skeleton)
         complete = all(name in found for name in required)
-        if not complete or (rig.name == "canonical" and not _is_canonical(found, skeleton)):
+        if not complete or (rig.name == "canonical" and not rig.fits(skeleton)):
             continue
         fits.append((_measure_fit(rig, found, skeleton, plain), rig, found))
     if not fits:
@@ -104,8 +104,3 @@ def _arms_hang_from_chest(found: Mapping[str, int], skeleton: Skeleton) -> bool:
     """Return whether the chest is the joint from which the shoulders, or else the upper arms, hang."""
     arms = [found.get(side + "Shoulder", found.get(side + "UpperArm")) for side in ("left", "right")]
     return all(arm is not None and skeleton.parents[arm] == found.get("chest") for arm in arms)
-
-
-def _is_canonical(found: Mapping[str, int], skeleton: Skeleton) -> bool:
-    """Return whether the skeleton is the canonical one; VRM's has its names, and arms above its chest."""
-    return set(CANONICAL.names) <= set(skeleton.names) and _arms_hang_from_chest(found, skeleton)
