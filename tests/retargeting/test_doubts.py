@@ -8,7 +8,7 @@ import torch
 from helpers import bandai_skeleton, cmu_skeleton, walk
 from rig_maker import Make, make, names_of, person
 from rig_trees import TREES
-from strange_rigs import CASES, DOUBTFUL, REFUSED, SURE, rigged, swap, with_joints
+from strange_rigs import CASES, DOUBTFUL, REFUSED, SURE, renamed, rigged, stretched, swap, with_joints
 
 from mapctl import retarget
 from mapctl.errors import RequestError
@@ -175,3 +175,40 @@ def test_second_bodies_and_controls_in_the_same_place():
 def test_a_fit_without_doubts_is_sure():
     assert Fit(()).verdict == SURE
     assert Fit(()).joints == frozenset()
+
+
+def _stretched_trunk():
+    walking, names = rigged(names_of("mixamo"), extras=False)[0], names_of("mixamo")
+    return stretched(walking, **{names["chest"]: 16.0})
+
+
+REASONS = {
+    "does not hang from leftLowerArm": lambda: rigged(swap(names_of("mixamo"), ("leftLowerArm", "leftHand")))[0],
+    "is below": lambda: rigged(swap(names_of("mixamo"), ("hips", "spine")))[0],
+    "between chest 'mixamorig:Spine1' and leftShoulder": lambda: make(
+        Make(names_of("mixamo") | {"chest": "a17"}, between={"chest": ("mixamorig:Spine1",)}, extras=False)
+    ).motion(person(1.0, 10)),
+    "which is named otherwise": lambda: make(
+        replace(TREES["metahuman", "body and face"], names={**names_of("metahuman"), "leftHand": "a17"}, extras=False)
+    ).motion(person(1.0, 10)),
+    "nothing tells the front": lambda: rigged(
+        {c: f"b{n}" for n, c in enumerate(CANONICAL.names) if "Toes" not in c}, extras=False, end_sites=False
+    )[0],
+    "trunk is": _stretched_trunk,
+}
+"""A motion by what is doubtful about its rig."""
+
+
+@pytest.mark.parametrize("reason", REASONS)
+def test_each_reason_is_given_where_it_holds(reason):
+    verdict, why, _ = judge(REASONS[reason]())
+    assert verdict == DOUBTFUL
+    assert reason in why
+
+
+def test_an_animal_is_told_by_its_paws_in_any_pose():
+    made = make(Make(names_of("mixamo"), extras=False))
+    standing = RigPoses.zero(made.skeleton, retarget.identify_rig(made.skeleton).joint_of)
+    assert not body_plan.goes_on_four_legs(made.skeleton, standing, None)
+    paws = renamed(made.motion(person(1.0, 2)), lambda name: name.replace("Hand", "Paw")).skeleton
+    assert body_plan.goes_on_four_legs(paws, standing, None)
