@@ -204,8 +204,8 @@ def _compare_knowledge(rigmap: RigMap, found: Match) -> Iterator[Doubt]:
     """Compare what both sides are known by: one version of a list, or words alone."""
     for name in rigmap.joints:
         other = mirror_name(name)
-        versions = [_version(rigmap, found, one) for one in (name, other)]
-        if other in rigmap.joints and None not in versions and versions[0] > versions[1]:
+        version, usual = _version(rigmap, found, name), _version(rigmap, found, other)
+        if other in rigmap.joints and version is not None and usual is not None and version > usual:
             own, theirs = _quote(rigmap, rigmap.joints[name]), _quote(rigmap, rigmap.joints[other])
             yield Doubt(f"{name} is {own} and {other} is {theirs}, which is named otherwise", (name,))
 
