@@ -28,6 +28,7 @@ _EXTRAS = {
     "render": {"pyrender", "trimesh", "OpenGL", "av", "PIL", "matplotlib"},
     "live": {"viser"},
     "usd": {"pxr"},
+    "stream": {"pythonosc"},
     "cluster": {"ray"},
 }
 """Packages by the extra that installs them."""

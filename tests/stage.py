@@ -71,10 +71,10 @@ class Actor:
 
 
 @contextmanager
-def live_app(actors: list[Actor]) -> Iterator[LiveApp]:
-    """The viewer of these characters."""
+def live_app(actors: list[Actor], **more) -> Iterator[LiveApp]:
+    """The viewer of these characters; `more` as LiveApp takes it."""
     labels = {"gait": ["run", "walk"], "style": ["old"]}
-    show = LiveApp(actors, [SteeringInputs() for _ in actors], port=8090, fastest=3.8, labels=labels)
+    show = LiveApp(actors, [SteeringInputs() for _ in actors], port=8090, fastest=3.8, labels=labels, **more)
     try:
         yield show
     finally:

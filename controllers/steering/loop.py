@@ -97,6 +97,10 @@ class WallClock:
         """See Clock."""
         self._began += seconds
 
+    def perf_counter_at(self, seconds: float) -> float:
+        """Return the value of time.perf_counter at a time of this clock, if it is not held until then."""
+        return self._began + seconds
+
 
 class StreamClock:
     """Time that passes only by waiting: as fast as the machine can, so that nothing is late."""
@@ -193,6 +197,11 @@ class Recorder:
         return ledger
 
 
+def find_second_zero(clock: Clock, state: SteerState) -> float:
+    """Return the clock's time at the stream's second 0, for a next step that begins now."""
+    return clock.now() + (state.settings.commit - state.frames) / PRIOR_FPS
+
+
 def iterate_steps(
     state: SteerState,
     source: Source,
@@ -208,7 +217,7 @@ def iterate_steps(
     """
     settings = settings or LoopSettings()
     lead = state.settings.commit / PRIOR_FPS
-    begun = clock.now() - state.frames / PRIOR_FPS + lead
+    begun = find_second_zero(clock, state)
     while True:
         due = state.frames / PRIOR_FPS
         clock.wait_until(begun + due - lead)

@@ -11,8 +11,6 @@ import re
 import threading
 from collections import deque
 from collections.abc import Sequence
-from contextlib import suppress
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +21,7 @@ from mapctl import curves
 from mapctl.errors import MapctlError, RequestError
 from mapctl.intent.steering import Arrival, Command
 from mapctl.runtime.live_protocol import FrameChunk
-from mapctl.runtime.processes import spawn
+from mapctl.runtime.processes import send_queued, spawn
 from mapctl.skeleton import CANONICAL, Skeleton
 
 __all__ = ["CharacterProcess", "CharacterRequest"]
@@ -121,7 +119,7 @@ class CharacterProcess:
         # does not read its orders does not block the caller.
         self._receiver = threading.Thread(target=self._receive, daemon=True)
         self._receiver.start()
-        threading.Thread(target=_send_orders, args=(self._ours, self._orders), daemon=True).start()
+        threading.Thread(target=send_queued, args=(self._ours, self._orders), daemon=True).start()
 
     def _send(self, *message: Any) -> None:
         self._orders.put(message)
@@ -138,10 +136,3 @@ class CharacterProcess:
         except (EOFError, OSError):
             self._failed = self._failed or _PROCESS_ENDED
             self._ready.set()
-
-
-def _send_orders(connection: Connection, orders: "queue.SimpleQueue[tuple[Any, ...] | None]") -> None:
-    """Send queued orders, until None or the end of the process, which the receiver notices."""
-    with suppress(OSError):
-        while (message := orders.get()) is not None:
-            connection.send(message)

@@ -14,11 +14,10 @@ import torch
 from controllers.steering import steer
 from controllers.steering.arrival import Arriver
 from controllers.steering.autopilot import Autopilot
-from controllers.steering.loop import iterate_steps
+from controllers.steering.loop import find_second_zero, iterate_steps
 from controllers.steering.steer import SteerFrames, SteerSettings
 from mapctl import curves
 from mapctl.errors import MapctlError
-from mapctl.features import PRIOR_FPS
 from mapctl.intent.steering import Arrival, Command
 from mapctl.protocols import Density
 from mapctl.runtime.live_protocol import FrameChunk
@@ -94,8 +93,7 @@ class ProcessClock:
     def begin(self, state: steer.SteerState, frames: SteerFrames) -> None:
         """Show the first pose, and start the stream's seconds there."""
         self.again = False
-        lead = state.settings.commit / PRIOR_FPS
-        self._began = self.now() - state.frames / PRIOR_FPS + lead  # as in controllers.steering.loop.iterate_steps
+        self._began = find_second_zero(self, state)
         self.show(frames, 0.0)
 
     def _handle_order(self) -> None:

@@ -1,11 +1,13 @@
 """Processes beside this one, and Ctrl-C, which comes to all of them."""
 
 import multiprocessing
+import queue
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from multiprocessing import resource_tracker
+from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from types import FrameType
 from typing import Any
@@ -21,6 +23,13 @@ def spawn(target: Callable[..., None], *arguments: Any) -> SpawnProcess:
     with _defer_ctrl_c():
         process.start()
     return process
+
+
+def send_queued(connection: Connection, messages: "queue.SimpleQueue[Any]") -> None:
+    """Send queued messages, until None or the end of the process at the other end: for a thread, which may wait."""
+    with suppress(OSError):
+        while (message := messages.get()) is not None:
+            connection.send(message)
 
 
 @contextmanager

@@ -11,21 +11,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 import viser
 
+from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import MapctlError
 from mapctl.features import PRIOR_FPS
 from mapctl.runtime.live_protocol import LiveCharacter
+from mapctl.streaming.protocols import FrameStream, MessageSource
 from scenes.live import ground
-from scenes.live.access import ServerErrorReporter, format_error, restrict_to_own_pages
+from scenes.live.access import ServerErrorReporter, restrict_to_own_pages
 from scenes.live.actor import LiveActor
 from scenes.live.controls import ControlPanel
 from scenes.live.going import GoThere
-from scenes.live.inputs import InputLimits, SteeringInputs
+from scenes.live.inputs import InputLimits, Refusal, SteeringInputs
 from scenes.live.notifications import Notifications
 from scenes.live.readouts import Readouts
-from scenes.live.recording import FORMATS, RecordedFile, Recording, encode_with_fallback, save_without_replacing
+from scenes.live.recording import FORMATS, Recording, RecordingDelivery, encode_with_fallback, save_without_replacing
+from scenes.live.remote.orders import RemoteOrders
 from scenes.live.target_orders import LiveTargets
 
 HOST = "127.0.0.1"
@@ -49,13 +51,19 @@ class LiveApp:
         port: int,
         fastest: float,
         labels: Mapping[str, Sequence[str]],
+        stream: FrameStream | None = None,
+        source: MessageSource | None = None,
     ):
-        """Open the page. `fastest` is the prior's, m/s; `labels` are the prior's, by group."""
+        """Open the page. `fastest` is the prior's, m/s; `labels` are the prior's, by group.
+
+        Frames also go to `stream`, and orders also come from `source`; whoever made these closes them.
+        """
         with redirect_stdout(io.StringIO()), restrict_to_own_pages():  # viser greets in a box of its own
             self.server = viser.ViserServer(host=HOST, port=port, label="mapctl live", verbose=False)
         self._bounds = InputLimits(math.floor(10 * fastest) / 10, labels)
         scene, gui = self.server.scene, self.server.gui
         self._notices = Notifications(self.server)
+        self._delivery = RecordingDelivery(self.server, self._notices)
         self._quiet = ServerErrorReporter(self.server.get_event_loop(), self._notices.console)
         _set_up_stage(self.server)
         self._world = scene.add_frame(_WORLD, show_axes=False)
@@ -65,6 +73,7 @@ class LiveApp:
             LiveActor(scene, _WORLD, k, *pair) for k, pair in enumerate(zip(characters, orders, strict=True))
         ]
         self._chosen, self._is_paused = 0, False
+        self._stream, self._began = stream, 0.0
         self._typed_at: float | None = None
         self._todo: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self.targets = LiveTargets(scene, _WORLD, self._members, lambda: self._chosen_member, self._enqueue)
@@ -72,6 +81,7 @@ class LiveApp:
             gui, self, self.targets, characters=len(characters), bounds=self._bounds, below=self._notices.below
         )
         self._panel.show(self._members[0].orders)
+        self._remote = None if source is None else RemoteOrders(source, self, self._members, groups=list(labels))
         self._going = GoThere(gui, scene, _WORLD)
         self._gauges = Readouts(gui)
         scene.on_click()(lambda event: self._draw_at(event.ray_origin, event.ray_direction))
@@ -83,12 +93,15 @@ class LiveApp:
 
     def run(self, stop: Callable[[], bool] = lambda: False) -> None:
         """Run until `stop()` is true or Ctrl-C."""
+        self._began = time.perf_counter()  # what was due before is not streamed: it would only come late
         for tick in range(2**62):
             if stop():
                 return
             began = time.perf_counter()
             while not self._todo.empty():
                 self._run_safely(self._todo.get())
+            if self._remote is not None:
+                self._run_safely(self._remote.obey)
             with self.server.atomic():
                 self._run_safely(lambda now=began: self._show_due(now))
             if tick % _READOUT_TICKS == 0:
@@ -117,7 +130,7 @@ class LiveApp:
         """Change the chosen character's orders, and show them; it leaves its path."""
 
         def ordered() -> None:
-            self._apply_order(changes)
+            self._apply_order(self._chosen_member, changes)
             self._panel.show(self._chosen_member.orders)
 
         self._enqueue(ordered)
@@ -126,7 +139,7 @@ class LiveApp:
         """Change orders from a control, which already shows them and may still be typed into."""
 
         def ordered() -> None:
-            self._apply_order(changes)
+            self._apply_order(self._chosen_member, changes)
             self._panel.enable(self._chosen_member.orders)
             self._typed_at = time.perf_counter()
 
@@ -142,7 +155,7 @@ class LiveApp:
                 wanted["speed"] = min(self._bounds.fastest, max(0.0, wanted["speed"]))
             if "heading" in wanted:
                 wanted["heading"] = math.remainder(wanted["heading"], 360)
-            self._apply_order(wanted)
+            self._apply_order(self._chosen_member, wanted)
             self._panel.show(self._chosen_member.orders)
 
         self._enqueue(ordered)
@@ -163,40 +176,68 @@ class LiveApp:
 
     def toggle_pause(self) -> None:
         """Stop everybody, or go on."""
+        self._enqueue(lambda: self.set_paused(not self._is_paused))
 
-        def toggled() -> None:
-            self._is_paused = not self._is_paused
-            self._panel.paused.label = "Go on" if self._is_paused else "Pause"
-            for member in self._members:
-                member.pace.forget()
-                self._run_safely(lambda one=member: one.character.pause(self._is_paused))
-
-        self._enqueue(toggled)
+    def set_paused(self, paused: bool) -> None:
+        """See RemoteStage."""
+        self._is_paused = paused
+        self._panel.paused.label = "Go on" if paused else "Pause"
+        if self._stream is not None:
+            self._stream.pause()
+        for member in self._members:
+            member.pace.forget()
+            self._run_safely(lambda one=member: one.character.pause(paused))
 
     def reset(self) -> None:
         """Restart all characters."""
+        self._enqueue(self.restart)
 
-        def begun_anew() -> None:
-            for member in self._members:
-                self._notices.state(f"gone {member.name}", None)
-                self._run_safely(lambda one=member: one.reset(self.targets.obstacles))
-            self._gauges.forget()
-            self._panel.show(self._chosen_member.orders)
-            self.targets.show()
-
-        self._enqueue(begun_anew)
+    def restart(self) -> None:
+        """See RemoteStage."""
+        for number, member in enumerate(self._members):
+            self._notices.state(f"gone {member.name}", None)
+            self._run_safely(lambda one=member: one.reset(self.targets.obstacles))
+            if self._stream is not None:
+                self._stream.forget(number)
+        self._gauges.forget()
+        self._panel.show(self._chosen_member.orders)
+        self.targets.show()
 
     def walk_path(self) -> None:
         """Let the chosen character walk the drawn path."""
 
         def walked() -> None:
-            member = self._chosen_member
             try:
-                member.character.walk(list(self._path.points), member.orders.speed or 1.2)
+                self.walk(self._chosen_member, self._path.points)
             except MapctlError as error:
                 self._notices.event("No path to walk", str(error), console=False)
 
         self._enqueue(walked)
+
+    def walk(self, member: LiveActor, points: Sequence[tuple[float, float]]) -> None:
+        """See RemoteStage."""
+        member.character.walk(list(points), member.orders.speed or 1.2)
+
+    def change(self, member: LiveActor, changes: Mapping[str, Any]) -> list[Refusal]:
+        """See RemoteStage."""
+        refusals = self._apply_order(member, changes)
+        self._show_orders(member)
+        return refusals
+
+    def aim(self, member: LiveActor) -> None:
+        """See RemoteStage."""
+        member.aim(self.targets.obstacles)
+        self._show_orders(member)
+
+    def go(self, member: LiveActor, place: tuple[float, float], within: float, facing: float | None) -> None:
+        """See RemoteStage."""
+        member.go(place, within, facing, self.targets.obstacles, stand=False)
+        self._going.mark(place)
+
+    def set_disc(self, disc: Obstacle | None) -> None:
+        """See RemoteStage."""
+        self.targets.set_disc(disc)
+        self._panel.disc.value = disc is not None
 
     def clear_path(self) -> None:
         """Forget the drawn points."""
@@ -212,7 +253,7 @@ class LiveApp:
             else:
                 recording, member.recording = member.recording, None
                 ending = self._panel.ending.value if self._panel.ending.value in FORMATS else FORMATS[0]
-                threading.Thread(target=self._export_recording, args=(recording, ending, client), daemon=True).start()
+                threading.Thread(target=self._delivery.export, args=(recording, ending, client), daemon=True).start()
             self._label_recording()
 
         self._enqueue(toggled)
@@ -232,13 +273,18 @@ class LiveApp:
         except Exception as error:
             self._notices.fault(error)
 
-    def _apply_order(self, changes: Mapping[str, Any]) -> None:
-        member = self._chosen_member
+    def _show_orders(self, member: LiveActor) -> None:
+        if member is self._chosen_member:
+            self._panel.show(member.orders)
+            self.targets.show()
+
+    def _apply_order(self, member: LiveActor, changes: Mapping[str, Any]) -> list[Refusal]:
         member.orders, refusals = self._bounds.changed(member.orders, changes)
         for name in changes:
             self._notices.held(name, getattr(member.orders, name))
         self._notices.show_refusals(refusals)
         member.command(self.targets.obstacles)
+        return refusals
 
     def _show_due(self, now: float) -> None:
         for member in self._members:
@@ -260,6 +306,9 @@ class LiveApp:
             return
         for delivered in arrived:
             member.take(delivered, now)
+            if self._stream is not None and delivered.due >= self._began:
+                number = self._members.index(member)
+                self._stream.put(number, delivered.due, delivered.seconds, delivered.root, delivered.quats)
             for note in delivered.notes:
                 self._notices.event(member.name.capitalize(), note)
             if member is self._chosen_member:
@@ -269,6 +318,8 @@ class LiveApp:
         """Do what need not be done every time."""
         self._gauges.show()
         self._notices.expire_refusal(now)
+        if self._remote is not None and (said := self._remote.report(now)) is not None:
+            self._notices.console(said)
         if self._typed_at is not None and now - self._typed_at > _TYPING_SECONDS:
             self._typed_at = None
             self._panel.show(self._chosen_member.orders)
@@ -304,28 +355,6 @@ class LiveApp:
 
     def _label_recording(self) -> None:
         self._panel.record.label = "Record" if self._chosen_member.recording is None else "Stop and save"
-
-    def _export_recording(self, recording: Recording, ending: str, client: viser.ClientHandle | None) -> None:
-        torch.set_num_threads(1)
-        try:
-            made = encode_with_fallback(recording.motion(), ending)
-            if made.ending != ending:
-                self._notices.event(f"No {ending} could be made, here is a {made.ending}", made.fallback_reason)
-            self._send(made, client)
-        except Exception as error:
-            self._notices.event("Nothing saved", format_error(error))
-
-    def _send(self, made: RecordedFile, client: viser.ClientHandle | None) -> None:
-        """Send the file to the browser that asked; to all others if it is gone; to the current folder if nobody is
-        left."""
-        others = self.server.get_clients()
-        if client is None or client.client_id not in others:
-            if not others:
-                return self._notices.console(
-                    f"nobody is left to take the recording: {save_without_replacing(made, Path.cwd())}"
-                )
-            return self.server.send_file_download(made.name, made.content, save_immediately=True)
-        return client.send_file_download(made.name, made.content, save_immediately=True)
 
 
 def _set_up_stage(server: viser.ViserServer) -> None:

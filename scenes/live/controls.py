@@ -10,9 +10,8 @@ from typing import Any, Protocol, runtime_checkable
 import viser
 
 from mapctl.intent.steering import STEP_LENGTHS
-from scenes.live.inputs import UNCONDITIONED, InputLimits, SteeringInputs
+from scenes.live.inputs import DISC_RADII, HANDS, UNCONDITIONED, InputLimits, SteeringInputs
 from scenes.live.recording import FORMATS
-from scenes.live.targets import DISC_RADII, HANDS
 
 _SPEED_STEP, _HEADING_STEP = 0.2, 15.0  # m/s and degrees of one press of a key
 _NO_HAND = "none"

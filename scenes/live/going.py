@@ -7,12 +7,11 @@ import viser
 
 from mapctl.curves.obstacles import Obstacle
 from mapctl.mesh import colours
+from mapctl.numerics.checks import is_number
 from scenes.live.actor import LiveActor
 from scenes.live.ground import to_rgb_bytes
-from scenes.live.inputs import is_number
+from scenes.live.inputs import WITHIN
 
-WITHIN = (0.5, 10.0)
-"""Shortest and longest time in which somebody can be sent anywhere, seconds."""
 _WALK_ON, _STAND = "walk on", "stand"
 _MARK_RADIUS = 0.08  # metres
 
@@ -40,8 +39,12 @@ class GoThere:
         if not (is_number(within) and WITHIN[0] <= within <= WITHIN[1]) or not (facing is None or is_number(facing)):
             return True  # no browser of ours sends such
         member.go(place, within, None if facing is None else math.radians(facing), obstacles, stand=self._stands)
-        self._mark.position, self._mark.visible = (place[0], 0.0, place[1]), True
+        self.mark(place)
         return True
+
+    def mark(self, place: tuple[float, float]) -> None:
+        """Show where somebody was sent, x and z in metres."""
+        self._mark.position, self._mark.visible = (place[0], 0.0, place[1]), True
 
     @property
     def _stands(self) -> bool:

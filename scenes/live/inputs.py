@@ -5,10 +5,21 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
+
 from mapctl.intent.steering import STEP_LENGTHS, Command
+from mapctl.numerics.checks import is_number
 
 UNCONDITIONED = "any"
 """The choice that gives a prior no label."""
+Place = tuple[float, float, float]
+HANDS = ("left", "right")
+"""Hands that reach for a target."""
+DISC_RADII = (0.2, 2.0)
+"""Smallest and largest disc to walk round, metres."""
+WITHIN = (0.5, 10.0)
+"""Shortest and longest time in which somebody can be sent anywhere, seconds."""
+_MAX_COORDINATE = 1e4  # metres from the origin beyond which nobody looks
 _NUMBER_FIELDS = ("speed", "heading", "facing", "step_length")
 _WORDS_AND_UNITS = {"speed": ("speed", "m/s"), "step_length": ("step length", "m")}
 
@@ -33,19 +44,24 @@ class SteeringInputs:
     """Whether the head looks at the target."""
     target: tuple[float, float, float] | None = None
     """Place of the target in the world, metres; None until there is one."""
+    reach: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
+    """Places that hands reach for because a program said so, metres, by `left` and `right`; the target comes before."""
+    look_at: tuple[float, float, float] | None = None
+    """Place that the head looks at because a program said so; likewise."""
 
     @property
     def command(self) -> Command:
         """Command for a LiveCharacter."""
         facing = None if self.facing is None else math.radians(self.facing)
+        reach = {**self.reach, **({self.hand: self.target} if self.hand and self.target else {})}
         return Command(
             self.speed,
             math.radians(self.heading),
             facing,
             step_length=self.step_length,
             told=tuple(self.told.values()),
-            reach={f"{self.hand}Hand": self.target} if self.hand and self.target else {},
-            look_at=self.target if self.looks else None,
+            reach={f"{hand}Hand": place for hand, place in reach.items()},
+            look_at=self.target if self.looks else self.look_at,
         )
 
 
@@ -126,6 +142,12 @@ class InputLimits:
         return f"A {words} of {asked:g} {unit} was {way} to {held:g}: it can be {low:g} to {high:g} {unit}."
 
 
-def is_number(value: Any) -> bool:
-    """Return whether what a browser sent is a finite number."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+def parse_place(place: object) -> Place | None:
+    """Return a place that a browser or another program sent, metres; None where it is none near the stage."""
+    try:
+        found = np.array(place, dtype=np.float64)
+    except (TypeError, ValueError):
+        return None
+    if found.shape != (3,) or not np.isfinite(found).all() or np.abs(found).max() > _MAX_COORDINATE:
+        return None
+    return float(found[0]), float(found[1]), float(found[2])

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
+import viser
 
 from mapctl import formats
 from mapctl.errors import MapctlError, RequestError
@@ -16,6 +17,8 @@ from mapctl.runtime.live_protocol import FrameChunk
 from mapctl.runtime.processes import spawn
 from mapctl.skeleton import Skeleton
 from scenes.film import film
+from scenes.live.access import format_error
+from scenes.live.notifications import Notifications
 
 FORMATS = ("bvh", "glb", "mp4")
 
@@ -55,6 +58,36 @@ class RecordedFile:
     def name(self) -> str:
         """Name under which the file is given out."""
         return f"mapctl.{self.ending}"
+
+
+class RecordingDelivery:
+    """Gives recordings to browsers, from a thread beside the show's own."""
+
+    def __init__(self, server: viser.ViserServer, notices: Notifications):
+        self._server, self._notices = server, notices
+
+    def export(self, recording: Recording, ending: str, client: viser.ClientHandle | None) -> None:
+        """Encode a recording and give it to the browser that asked; errors are said."""
+        torch.set_num_threads(1)
+        try:
+            made = encode_with_fallback(recording.motion(), ending)
+            if made.ending != ending:
+                self._notices.event(f"No {ending} could be made, here is a {made.ending}", made.fallback_reason)
+            self._send(made, client)
+        except Exception as error:
+            self._notices.event("Nothing saved", format_error(error))
+
+    def _send(self, made: RecordedFile, client: viser.ClientHandle | None) -> None:
+        """Send the file to the browser that asked; to all others if it is gone; to the current folder if nobody is
+        left."""
+        others = self._server.get_clients()
+        if client is None or client.client_id not in others:
+            if not others:
+                return self._notices.console(
+                    f"nobody is left to take the recording: {save_without_replacing(made, Path.cwd())}"
+                )
+            return self._server.send_file_download(made.name, made.content, save_immediately=True)
+        return client.send_file_download(made.name, made.content, save_immediately=True)
 
 
 def encode_with_fallback(motion: Motion, ending: str) -> RecordedFile:

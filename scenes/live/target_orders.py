@@ -7,18 +7,10 @@ from typing import Any
 import viser
 
 from mapctl.curves.obstacles import Obstacle
+from mapctl.numerics.checks import is_number
 from scenes.live.actor import LiveActor
-from scenes.live.inputs import is_number
-from scenes.live.targets import (
-    DISC_RADII,
-    HANDS,
-    DraggableDisc,
-    DraggableTarget,
-    Place,
-    disc_before,
-    parse_place,
-    place_before,
-)
+from scenes.live.inputs import DISC_RADII, HANDS, Place, parse_place
+from scenes.live.targets import DraggableDisc, DraggableTarget, disc_before, place_before
 
 _KNOWN: Mapping[str, Callable[[Any], bool]] = {
     "hand": lambda value: value is None or value in HANDS,
@@ -72,9 +64,9 @@ class LiveTargets:
 
         def put() -> None:
             if radius is None or not self.obstacles:
-                self._set_disc(None if radius is None else self._place_disc(radius))
+                self.set_disc(None if radius is None else self._place_disc(radius))
             else:
-                self._set_disc(replace(self.obstacles[0], radius=radius))
+                self.set_disc(replace(self.obstacles[0], radius=radius))
 
         self._enqueue(put)
 
@@ -83,7 +75,7 @@ class LiveTargets:
 
         def brought() -> None:
             if self.obstacles:
-                self._set_disc(self._place_disc(self.obstacles[0].radius or 0.0))
+                self.set_disc(self._place_disc(self.obstacles[0].radius or 0.0))
             member = self._chosen()
             member.orders = replace(member.orders, target=_place_target(member))
             member.aim(self.obstacles)
@@ -94,11 +86,12 @@ class LiveTargets:
     def _move_disc(self, place: Place) -> None:
         def moved() -> None:
             if self.obstacles:
-                self._set_disc(replace(self.obstacles[0], place=(place[0], place[2])))
+                self.set_disc(replace(self.obstacles[0], place=(place[0], place[2])))
 
         self._enqueue(moved)
 
-    def _set_disc(self, disc: Obstacle | None) -> None:
+    def set_disc(self, disc: Obstacle | None) -> None:
+        """Have everybody walk round a disc, or round nothing; for the show's own thread."""
         self.obstacles = () if disc is None else (disc,)
         self._disc.show(disc)
         for member in self._members:

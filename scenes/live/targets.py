@@ -9,16 +9,10 @@ import viser
 from mapctl.curves.obstacles import Obstacle
 from mapctl.mesh import colours
 from scenes.live.ground import to_rgb_bytes
+from scenes.live.inputs import Place, parse_place
 
-Place = tuple[float, float, float]
-
-HANDS = ("left", "right")
-"""Hands that reach for a target."""
-DISC_RADII = (0.2, 2.0)
-"""Smallest and largest disc to walk round, metres."""
 _HANDLE_SIZE, _BALL_RADIUS = 0.25, 0.045  # metres
 _DISC_HEIGHT, _DISC_COLOUR = 0.35, (185, 170, 156)
-_MAX_COORDINATE = 1e4  # metres from the origin beyond which nobody looks
 _TARGET_AHEAD, _TARGET_ASIDE, _TARGET_HEIGHT = 0.45, 0.3, 1.2  # metres from a character, where a target appears
 _DISC_AHEAD = 2.5
 
@@ -91,17 +85,6 @@ def disc_before(place: np.ndarray, heading_deg: float, radius: float) -> Obstacl
     x, z = np.asarray(place, dtype=np.float64)
     angle = math.radians(heading_deg)
     return Obstacle((float(x + _DISC_AHEAD * math.sin(angle)), float(z + _DISC_AHEAD * math.cos(angle))), radius)
-
-
-def parse_place(place: object) -> Place | None:
-    """Return a place that a browser sent, metres; None where it is none near the stage."""
-    try:
-        found = np.array(place, dtype=np.float64)
-    except (TypeError, ValueError):
-        return None
-    if found.shape != (3,) or not np.isfinite(found).all() or np.abs(found).max() > _MAX_COORDINATE:
-        return None
-    return float(found[0]), float(found[1]), float(found[2])
 
 
 def _report_drags(handle: viser.TransformControlsHandle, moved: Callable[[Place], None]) -> None:

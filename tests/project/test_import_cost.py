@@ -3,7 +3,18 @@
 import subprocess
 import sys
 
-LATE = ("torch._dynamo", "torch._inductor", "pyswarms", "pygltflib", "pxr", "matplotlib", "PIL", "pyrender", "ray")
+LATE = (
+    "torch._dynamo",
+    "torch._inductor",
+    "pyswarms",
+    "pygltflib",
+    "pxr",
+    "matplotlib",
+    "PIL",
+    "pyrender",
+    "ray",
+    "pythonosc",
+)
 
 
 def python(script: str) -> str:

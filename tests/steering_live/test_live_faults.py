@@ -157,10 +157,10 @@ def test_a_recording_for_somebody_who_left_is_written_here_where_nobody_else_is(
     monkeypatch.chdir(tmp_path)
     recording = Recording(CANONICAL)
     recording.add(delivered())
-    show._export_recording(recording, "bvh", None)
+    show._delivery.export(recording, "bvh", None)
     assert formats.load(tmp_path / "mapctl.bvh").num_frames == 3
     assert "nobody is left to take the recording" in said()[1]
-    show._export_recording(Recording(CANONICAL), "bvh", None)
+    show._delivery.export(Recording(CANONICAL), "bvh", None)
     assert "Nothing saved: RequestError: nothing was recorded" in said()[1]
 
 

@@ -21,3 +21,13 @@ class Live(Command):
     """A bundled prior, or the file or run folder of a trained one."""
     seed: options.Count = 0
     """Seed of the first poses."""
+    stream: options.MaybeEndpoint = None
+    """Where poses go over the VMC protocol (most programs receive at port 39539): a port alone is on this machine. The
+    second character's poses go to the next port, and so on."""
+    stream_root: bool = False
+    """Let the root travel over the ground in the stream, and not the hips."""
+    stream_delay: options.Number = 0.1
+    """Seconds by which the stream is behind, so that a frame that is computed late is not sent late."""
+    listen: options.MaybeEndpoint = None
+    """Where orders come from over OSC, as /mapctl/speed 1.4 (docs/streaming.md): a port alone is on this machine, and
+    nobody else can send there; 0.0.0.0:PORT hears everybody."""

@@ -4,16 +4,21 @@ import functools
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import priors
 from controllers.steering.process import CharacterProcess, CharacterRequest
 from mapctl.commands.live import Live
-from mapctl.commands.shared import options
+from mapctl.commands.shared import options, streaming
 from mapctl.errors import RequestError
 from mapctl.intent.steering import Command
 from mapctl.runtime.processes import reraise_ctrl_c
 from scenes.live.app import LiveApp
 from scenes.live.inputs import SteeringInputs
+
+if TYPE_CHECKING:
+    from mapctl.streaming.receiver import OscReceiver
+    from mapctl.streaming.sender import PoseStream
 
 _MAX_CHARACTERS = 16
 _START_SPACING = 1.5  # metres between characters where they begin
@@ -22,11 +27,22 @@ _START_SPACING = 1.5  # metres between characters where they begin
 def run(command: Live) -> int:
     """Check, open, serve until Ctrl-C."""
     _check(command)
+    receiver = streaming.open_receiver(command.listen)
+    try:
+        return _serve(command, receiver)
+    finally:
+        if receiver is not None:
+            receiver.close()
+
+
+def _serve(command: Live, receiver: "OscReceiver | None") -> int:
     with reraise_ctrl_c():
-        show = _open_app(command)
+        show, stream = _open_app(command, receiver)
     try:
         if not show.url.endswith(f":{command.port}"):
             print(f"port {command.port} is in use")
+        for line in streaming.describe(stream, receiver):
+            print(line)
         print(f"open {show.url} in a browser; Ctrl-C ends", flush=True)
         show.run()
     except KeyboardInterrupt:
@@ -35,18 +51,30 @@ def run(command: Live) -> int:
             print(f"the recording that was going on is in {path.name}")
     finally:
         show.close()
+        if stream is not None:
+            stream.close()
+            print(streaming.summarise(stream))
     return 0
 
 
-def _open_app(command: Live) -> LiveApp:
+def _open_app(command: Live, receiver: "OscReceiver | None") -> "tuple[LiveApp, PoseStream | None]":
     prior = priors.load(command.prior)
     orders = [SteeringInputs() for _ in range(command.characters)]
     with reraise_ctrl_c():
         characters = _start_characters(command)
     try:
-        return LiveApp(
-            characters, orders, port=command.port, fastest=prior.limits.max_steering_speed, labels=prior.labels
+        skeletons = [character.skeleton for character in characters]
+        stream = streaming.open_stream(_stream(command), skeletons)
+        show = LiveApp(
+            characters,
+            orders,
+            port=command.port,
+            fastest=prior.limits.max_steering_speed,
+            labels=prior.labels,
+            stream=stream,
+            source=receiver,
         )
+        return show, stream
     except BaseException:
         for character in characters:
             character.close()
@@ -62,6 +90,11 @@ def _check(command: Live) -> None:
     for package in ("viser", "trimesh"):
         if find_spec(package) is None:
             raise RequestError(f"this needs the package {package}: pip install 'mapctl[live]'")
+    streaming.check(_stream(command), command.listen, characters=command.characters)
+
+
+def _stream(command: Live) -> streaming.StreamOptions:
+    return streaming.StreamOptions(command.stream, command.stream_root, command.stream_delay)
 
 
 def _start_characters(command: Live) -> Sequence[CharacterProcess]:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from controllers.common.character import Character
 from controllers.steering import steer
 from controllers.steering.arrival import Arriver
 from controllers.steering.loop import (
+    Display,
     Recorder,
     Stepper,
     StepRecord,
@@ -22,10 +23,12 @@ from controllers.steering.loop import (
     summarise_step_timing,
 )
 from mapctl import formats, metrics, report
-from mapctl.commands.shared import inputs, options, outputs, results
+from mapctl.commands.shared import inputs, options, outputs, results, streaming
 from mapctl.commands.shared.character import read_character
 from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.commands.steer import Steer
+from mapctl.commands.steer.links import Links
+from mapctl.commands.steer.remote import RemoteScript
 from mapctl.curves.obstacles import Obstacle, measure_clearance
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
@@ -38,6 +41,7 @@ from mapctl.motion import Motion
 from mapctl.problem.solution import Outcome, Solution, Status
 from mapctl.terms import FootContact
 from priors.lstm_gmm.density import LstmGmmDensity
+from scenes.live.inputs import InputLimits
 from scenes.plots.steering import plot
 
 _PLACE_WORDS = {"leftHand": "left hand", "rightHand": "right hand"}
@@ -54,12 +58,19 @@ def run(command: Steer) -> int:
     for labels in {wanted.told for wanted in track.commands if wanted.told}:
         prior.conditioned_on(labels)  # unknown labels are refused now
     stepper = _choose_stepper(command, track)
-    recorder, records, frames = _run_steering(command, prior, track, character, stepper)
+    links = _open_links(command, character, prior, track)
+    try:
+        recorder, records, frames = _run_steering(command, prior, track, character, stepper, links)
+    finally:
+        links.close()
     motion = recorder.motion(frames)
     character.on_rig(motion).save(command.out)
     arrivals = [time for time in track.times[1:] if time < motion.seconds]
-    timing = summarise_step_timing(records, arrivals) | {"peak_memory_mb": report.peak_memory_mb()}
-    done = _conclude_steering(motion, recorder, lowered, timing, interrupted=motion.num_frames < frames)
+    timing: dict[str, Any] = {**summarise_step_timing(records, arrivals), "peak_memory_mb": report.peak_memory_mb()}
+    if links.stream is not None:
+        timing["stream"] = asdict(links.stream.statistics)
+    heard = [] if links.script is None else links.script.notes
+    done = _conclude_steering(motion, recorder, [*lowered, *heard], timing, interrupted=motion.num_frames < frames)
     refused = [refusal.order for refusal in recorder.refusals]
     found = _build_report(command, done, track, prior, timing, refused)
     if command.report is not None:
@@ -67,7 +78,9 @@ def run(command: Steer) -> int:
     if command.plot is not None:
         plot(motion, track, command.plot)
     if not command.quiet:
-        print("\n".join(_format_summary(found, options.collect_paths(command.out, command.report, command.plot))))
+        files = options.collect_paths(command.out, command.report, command.plot)
+        streamed = None if links.stream is None else streaming.summarise(links.stream)
+        print("\n".join(_format_summary(found, files, streamed)))
     return results.conclude(done.status, strict=command.strict)
 
 
@@ -77,6 +90,20 @@ def _check(command: Steer) -> None:
     formats.check_ending(command.out)
     outputs.check_files(options.collect_paths(command.out, command.report, command.plot))
     outputs.check_plot(command.plot)
+    if (command.stream is not None or command.listen is not None) and not command.realtime:
+        raise RequestError("--stream and --listen go by the clock, which needs --realtime; give both")
+    streaming.check(_stream(command), command.listen)
+
+
+def _stream(command: Steer) -> streaming.StreamOptions:
+    return streaming.StreamOptions(command.stream, command.stream_root, command.stream_delay)
+
+
+def _open_links(command: Steer, character: Character, prior: LstmGmmDensity, track: CommandTrack) -> Links:
+    receiver = streaming.open_receiver(command.listen)
+    bounds = InputLimits(prior.limits.max_steering_speed, prior.labels)
+    script = None if receiver is None else RemoteScript(track, receiver, bounds, _limits(command))
+    return Links(streaming.open_stream(_stream(command), [character.skeleton]), receiver, script)
 
 
 def _limits(command: Steer) -> SteeringLimits:
@@ -93,7 +120,7 @@ def _add_obstacles(track: CommandTrack, obstacles: Sequence[Obstacle]) -> Comman
 
 def _choose_stepper(command: Steer, track: CommandTrack) -> Stepper:
     """Choose who makes the next frames: with a stitcher where the script has orders to be somewhere."""
-    if any(wanted.arrival is not None for wanted in track.commands):
+    if command.listen is not None or any(wanted.arrival is not None for wanted in track.commands):
         return Arriver(priors.load_stitcher(command.stitcher or "stitcher"))
     if command.stitcher is not None:
         raise RequestError("--stitcher makes ways to a place, and the script has no goto_x_m; leave it out")
@@ -101,7 +128,7 @@ def _choose_stepper(command: Steer, track: CommandTrack) -> Stepper:
 
 
 def _run_steering(
-    command: Steer, prior: LstmGmmDensity, track: CommandTrack, character: Character, stepper: Stepper
+    command: Steer, prior: LstmGmmDensity, track: CommandTrack, character: Character, stepper: Stepper, links: Links
 ) -> tuple[Recorder, list[StepRecord], int]:
     first, recorder = track.commands[0], Recorder()
     frames = inputs.count_frames(_find_end(track))
@@ -114,8 +141,11 @@ def _run_steering(
         steer.step(state, wanted)  # compiling, loading and conditioning on first use must not cost frames
     clock = WallClock() if command.realtime else StreamClock()
     with show_progress("steering", quiet=command.quiet) as progress:
-        displays = [recorder] if progress is None else [recorder, _ProgressDisplay(progress, frames)]
-        _, records = drive(state, track, displays, frames=frames, clock=clock, stepper=stepper)
+        displays: list[Display] = [recorder, *links.displays(clock, state, pose, frames=frames)]
+        if progress is not None:
+            displays.append(_ProgressDisplay(progress, frames))
+        source = links.script or track
+        _, records = drive(state, source, displays, frames=frames, clock=clock, stepper=stepper)
     return recorder, records, frames
 
 
@@ -131,11 +161,12 @@ def _conclude_steering(
     motion: Motion, recorder: Recorder, lowered: Sequence[str], timing: Mapping[str, Any], *, interrupted: bool
 ) -> Solution:
     """Sum up all steps; lowered commands and late frames make the status infeasible."""
-    late = timing["late_frames"]
+    late, sent_late = timing["late_frames"], timing.get("stream", {}).get("late", 0)
     notes = [
         *lowered,
         *(refusal.reason for refusal in recorder.refusals),
         *([f"{late} frames came after they were due"] if late else []),
+        *([f"{sent_late} frames were sent late"] if sent_late else []),
     ]
     status = Status(Outcome.INTERRUPTED if interrupted else Outcome.DONE).with_notes(notes, infeasible=bool(notes))
     return Solution(motion, status, recorder.ledger, seconds=sum(piece.seconds for piece in recorder.pieces))
@@ -191,7 +222,7 @@ def _format_arrival(row: Mapping[str, Any]) -> str:
     return f"{row['by_s']:6.1f} s  at {where}: {row['place_error_cm']:.2f} cm off{turned}{posed}"
 
 
-def _format_summary(found: Mapping[str, Any], files: Sequence[Path]) -> list[str]:
+def _format_summary(found: Mapping[str, Any], files: Sequence[Path], streamed: str | None) -> list[str]:
     lines = []
     for row in found["commands"][:-1]:
         reached = "not reached" if row["reached_s"] is None else f"reached after {row['reached_s']:.1f} s"
@@ -216,6 +247,7 @@ def _format_summary(found: Mapping[str, Any], files: Sequence[Path]) -> list[str
         *lines,
         f"cost      {cost['frame_ms_p50']:.1f} ms a frame (p99 {cost['frame_ms_p99']:.1f}), "
         f"{cost['late_frames']} late, {cost['evaluations_per_frame']:.1f} evaluations a frame{waited}{slow}",
+        *([] if streamed is None else [streamed]),
         f"status    {found['status']['text']}",
         f"wrote     {', '.join(map(str, files))}",
     ]

@@ -1,0 +1,130 @@
+"""Sending of packets at the moment at which they are due, in a process of its own that imports nothing heavy.
+
+A thread beside a solver would wait for Python's lock, and on a busy machine for whoever holds it: 22 ms were measured.
+"""
+
+import heapq
+import itertools
+import socket
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from multiprocessing.connection import Connection
+from typing import Any
+
+_MAX_WAITING = 3000  # frames that wait: beyond them the oldest is dropped
+
+
+@dataclass(frozen=True)
+class StreamStatistics:
+    """What was sent, of all characters."""
+
+    frames_sent: int = 0
+    """Frames sent."""
+    late: int = 0
+    """Frames sent later after they were due than a frame may be."""
+    largest_gap_ms: float = 0.0
+    """Largest time between two frames of a character, pauses left out, milliseconds."""
+    largest_lateness_ms: float = 0.0
+    """Largest time from when a frame was due to when it was sent, milliseconds."""
+    not_sent: int = 0
+    """Frames that the system would not send, or for which there was no room."""
+    fault: str = ""
+    """Why the first of those was not sent."""
+
+
+@dataclass(frozen=True)
+class PostRequest:
+    """Request for a process that sends."""
+
+    family: int
+    """Family of the socket."""
+    address: str
+    """Numeric address of the receivers."""
+    ports: tuple[int, ...]
+    """Port of each character's receiver."""
+    late_seconds: float
+    """How long after it was due a frame is late, seconds."""
+
+
+class _Post:
+    def __init__(self, request: PostRequest):
+        self._request = request
+        self._socket = socket.socket(request.family, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        self._waiting: list[tuple[float, int, int, Sequence[bytes]]] = []
+        self._counter = itertools.count()
+        self._last_sent: dict[int, float] = {}
+        self.statistics = StreamStatistics()
+
+    def seconds_left(self) -> float | None:
+        """Return the time until the next frame is due; None if none waits."""
+        return max(0.0, self._waiting[0][0] - time.perf_counter()) if self._waiting else None
+
+    def put(self, character: int, due: float, packets: Sequence[bytes]) -> None:
+        heapq.heappush(self._waiting, (due, next(self._counter), character, packets))
+        if len(self._waiting) > _MAX_WAITING:
+            heapq.heappop(self._waiting)
+            self._count_unsent("too many frames waited")
+
+    def forget(self, character: int) -> None:
+        self._waiting = [frame for frame in self._waiting if frame[2] != character]
+        heapq.heapify(self._waiting)
+        self._last_sent.pop(character, None)
+
+    def pause(self) -> None:
+        self._last_sent.clear()
+
+    def send_due(self) -> None:
+        """Send what is due now."""
+        while self._waiting and self._waiting[0][0] <= time.perf_counter():
+            due, _, character, packets = heapq.heappop(self._waiting)
+            try:
+                for packet in packets:
+                    self._socket.sendto(packet, (self._request.address, self._request.ports[character]))
+            except OSError as error:  # nobody there, or no room: the next frame comes anyway
+                self._count_unsent(error.strerror or str(error))
+            else:
+                self._count_sent(character, due, time.perf_counter())
+
+    def _count_sent(self, character: int, due: float, now: float) -> None:
+        known, gap = self.statistics, now - self._last_sent.get(character, now)
+        self._last_sent[character] = now
+        self.statistics = replace(
+            known,
+            frames_sent=known.frames_sent + 1,
+            late=known.late + (now - due > self._request.late_seconds),
+            largest_gap_ms=max(known.largest_gap_ms, 1000 * gap),
+            largest_lateness_ms=max(known.largest_lateness_ms, 1000 * (now - due)),
+        )
+
+    def _count_unsent(self, why: str) -> None:
+        known = self.statistics
+        self.statistics = replace(known, not_sent=known.not_sent + 1, fault=known.fault or why)
+
+
+def run_post(connection: Connection, request: PostRequest) -> None:
+    """Send frames until told to close, or until the parent has ended; then send what waits, and say what was sent."""
+    post, listening = _Post(request), True
+    while listening or post.seconds_left() is not None:
+        if not listening:
+            time.sleep(post.seconds_left() or 0.0)
+        elif connection.poll(post.seconds_left()):
+            listening = _obey(post, connection)
+        post.send_due()
+    try:
+        connection.send(post.statistics)
+    except OSError:  # nobody asks any more
+        return
+
+
+def _obey(post: _Post, connection: Connection) -> bool:
+    """Take one message; return whether there will be more."""
+    try:
+        word, *content = connection.recv()
+    except EOFError:
+        return False
+    actions: dict[str, Any] = {"put": post.put, "forget": post.forget, "pause": post.pause}
+    if word in actions:
+        actions[word](*content)
+    return word != "close"
