@@ -1,0 +1,251 @@
+"""Orders over OSC on the stage: obeyed as the page's are, within the same limits, and shown in its panel."""
+
+import math
+import time
+from contextlib import contextmanager
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from stage import Actor, live_app, run
+
+from mapctl.curves.obstacles import Obstacle
+from mapctl.intent.steering import Command
+from mapctl.streaming.messages import Message
+from mapctl.streaming.orders import NUMBERS
+from mapctl.streaming.protocols import MessageSource
+
+
+class Source:
+    """A MessageSource that a test fills."""
+
+    def __init__(self):
+        self.waiting: list[Message] = []
+        self.dropped, self.fault = 0, ""
+
+    def poll(self):
+        found, self.waiting = self.waiting, []
+        return found
+
+
+class Stream:
+    """A FrameStream that notes what it gets."""
+
+    def __init__(self):
+        self.heard: list[tuple] = []
+
+    def put(self, character, due, seconds, root, quats):
+        self.heard.append(("put", character, seconds, len(root)))
+
+    def forget(self, character):
+        self.heard.append(("forget", character))
+
+    def pause(self):
+        self.heard.append(("pause",))
+
+
+@contextmanager
+def staged():
+    """Two characters, the viewer, and a function that sends messages and lets it look once."""
+    actors, source, stream = [Actor(), Actor()], Source(), Stream()
+    with live_app(actors, source=source, stream=stream) as show:
+
+        def send(*messages: tuple):
+            source.waiting += [Message(f"/mapctl/{name}", tuple(arguments)) for name, *arguments in messages]
+            run(show, 1)
+
+        yield show, actors, stream, send
+
+
+@pytest.fixture
+def stage():
+    with staged() as made:
+        yield made
+
+
+def words(actor: Actor) -> list[str]:
+    return [word for word, *_ in actor.heard]
+
+
+def test_the_source_is_one():
+    assert isinstance(Source(), MessageSource)
+
+
+def test_numbers_and_labels_become_one_command_for_their_character(stage):
+    show, actors, _, send = stage
+    send(("speed", 2.0), ("heading", 90.0), ("style", "old"), ("2/speed", 0.5), ("2/facing", -90.0))
+    assert actors[0].heard == [("command", Command(2.0, math.pi / 2, told=("old",)))]
+    assert actors[1].heard == [("command", Command(0.5, 0.0, -math.pi / 2))]
+    assert (show._panel.speed.value, show._panel.heading.value) == (2.0, 90)
+    assert show._panel.told["style"].value == "old"
+    send(("2/facing",), ("style", "any"), ("step_length", 0.5))
+    assert actors[1].heard[-1] == ("command", Command(0.5, 0.0))
+    assert actors[0].heard[-1] == ("command", Command(2.0, math.pi / 2, step_length=0.5))
+    send(("step_length",), ("stop",))
+    assert actors[0].heard[-1] == ("command", Command(0.0, math.pi / 2))
+    send(("stop",), ("speed", 1.0))
+    assert actors[0].heard[-1][1].speed == 1.0, "the last of what came counts"
+
+
+def test_a_heading_of_more_than_half_a_turn_is_the_same_heading(stage, capsys):
+    _, actors, _, send = stage
+    send(("heading", 270.0), ("facing", -190.0))
+    command = actors[0].heard[-1][1]
+    assert (command.heading, command.facing) == pytest.approx((-math.pi / 2, math.radians(170)))
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize(
+    ("name", "asked", "held"),
+    [("speed", 1e30, 3.8), ("speed", -5.0, 0.0), ("step_length", 99.0, 1.2), ("step_length", -1e30, 0.3)],
+)
+def test_numbers_are_brought_to_the_nearest_that_can_be_and_it_is_said(stage, capsys, name, asked, held):
+    _, actors, _, send = stage
+    send((name, asked))
+    assert getattr(actors[0].heard[-1][1], name) == held
+    assert "mapctl: OSC: A s" in capsys.readouterr().err
+
+
+def test_hands_reach_together_and_let_go_alone(stage):
+    _, actors, _, send = stage
+    send(("hand/left", 1.0, 1.1, 2.0), ("hand/right", -1.0, 1.2, 2.0), ("look", 0.0, 1.5, 9.0))
+    word, command = actors[0].heard[-1]
+    assert word == "aim"
+    assert command.reach == {"leftHand": (1.0, 1.1, 2.0), "rightHand": (-1.0, 1.2, 2.0)}
+    assert command.look_at == (0.0, 1.5, 9.0)
+    assert words(actors[0]) == ["aim"]
+    send(("hand/left",))
+    assert actors[0].heard[-1][1].reach == {"rightHand": (-1.0, 1.2, 2.0)}
+    send(("speed", 1.0))
+    assert actors[0].heard[-1][1].reach == {"rightHand": (-1.0, 1.2, 2.0)}
+    send(("hand/right",), ("look",))
+    assert (actors[0].heard[-1][1].reach, actors[0].heard[-1][1].look_at) == ({}, None)
+
+
+def test_the_last_word_on_a_hand_is_whoevers_it_is(stage):
+    show, actors, _, send = stage
+    show.targets.aim(hand="left", target=(0.0, 1.0, 1.0))
+    show.targets.aim(looks=True)
+    run(show, 1)
+    send(("hand/left", 1.0, 1.1, 2.0), ("look", 0.0, 1.5, 9.0))
+    command = actors[0].heard[-1][1]
+    assert (command.reach, command.look_at) == ({"leftHand": (1.0, 1.1, 2.0)}, (0.0, 1.5, 9.0))
+    assert (show._panel.hand.value, show._panel.looks.value) == ("none", False)
+    show.targets.aim(hand="left")
+    run(show, 1)
+    assert actors[0].heard[-1][1].reach == {"leftHand": (0.0, 1.0, 1.0)}
+
+
+def test_places_and_paths_are_gone_to_after_what_else_came(stage):
+    _, actors, _, send = stage
+    send(("place", 1.0, 2.0), ("speed", 0.0))
+    assert words(actors[0]) == ["command", "go"]
+    _, command, place, within, facing = actors[0].heard[-1]
+    assert (command.speed, place, within, facing) == (0.0, (1.0, 2.0), 2.0, None)
+    send(("2/place", -1.0, 3.0, 1.5, 450.0))
+    assert actors[1].heard[-1][2:] == ((-1.0, 3.0), 1.5, pytest.approx(math.pi / 2))
+    send(("place", 1.0, 2.0, 99.0))
+    assert actors[0].heard[-1][3] == 10.0
+    send(("path", 0.0, 0.0, 1.0, 1.0, 2.0, 1.0))
+    assert actors[0].heard[-1] == ("walk", [(0.0, 0.0), (1.0, 1.0), (2.0, 1.0)], 1.2)
+
+
+def test_a_disc_a_pause_and_a_restart_are_for_everybody(stage):
+    show, actors, stream, send = stage
+    send(("disc", 1.0, 4.0, 0.5))
+    assert [actor.heard[-1][1].obstacles for actor in actors] == [(Obstacle((1.0, 4.0), 0.5),)] * 2
+    assert show._panel.disc.value is True
+    send(("disc",))
+    assert actors[1].heard[-1][1].obstacles == ()
+    assert show._panel.disc.value is False
+    send(("pause",))
+    send(("pause", 1))
+    assert [a.heard[-1] for a in actors] == [("pause", True)] * 2
+    assert show._panel.paused.label == "Go on"
+    send(("pause", 0.0))
+    assert [a.heard[-1] for a in actors] == [("pause", False)] * 2
+    send(("hand/left", 1.0, 1.0, 1.0))
+    send(("reset",))
+    assert [words(a)[-1] for a in actors] == ["reset"] * 2
+    assert show._members[0].orders.reach == {}
+    assert stream.heard.count(("pause",)) == 3
+    assert [entry for entry in stream.heard if entry[0] == "forget"] == [("forget", 0), ("forget", 1)]
+
+
+def test_what_was_due_before_it_began_is_not_streamed(stage):
+    show, _, stream, _ = stage
+    show._began = time.perf_counter() + 60.0
+    show._show_due(time.perf_counter())
+    assert stream.heard == []
+
+
+def test_every_frame_goes_to_the_stream_too(stage):
+    show, actors, stream, _ = stage
+    run(show, 4)
+    put = [entry for entry in stream.heard if entry[0] == "put"]
+    assert [sum(entry[3] for entry in put if entry[1] == k) for k in (0, 1)] == [actor.frames for actor in actors]
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        ("hand/left", 1e6, 0.0, 0.0),
+        ("look", 0.0, -1e300, 0.0),
+        ("place", 1e5, 0.0),
+        ("place", 0.0, math.nan),
+        ("path", 0.0, 0.0, 0.0, 1e9),
+        ("path", 0.0, 0.0, 1.0),
+        ("disc", 0.0, 1.0, 5.0),
+        ("disc", 1e9, 1.0, 0.5),
+        ("3/stop",),
+        ("dance",),
+        ("gait", 3.0),
+        ("speed", "fast"),
+    ],
+)
+def test_what_cannot_be_is_said_and_changes_nothing(stage, capsys, message):
+    show, actors, _, send = stage
+    before = show._members[0].orders
+    send(message)
+    run(show, 20)
+    assert show._members[0].orders == before
+    assert {word for actor in actors for word in words(actor)} <= {"aim"}, "the same as before is aimed at"
+    assert capsys.readouterr().err.startswith("mapctl: OSC: ")
+
+
+def test_a_label_that_the_prior_does_not_know_is_said(stage, capsys):
+    _, actors, _, send = stage
+    send(("style", "swim\nnow" * 50))
+    assert actors[0].heard == [("command", Command(1.2, 0.0))]
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_many_faults_are_few_lines(stage, capsys):
+    _, _, _, send = stage
+    for k in range(100):
+        send((f"nothing{'x' * (k % 20)}", float(k)))
+    lines = capsys.readouterr().err.splitlines()
+    assert 1 <= len(lines) <= 4, "one in two seconds"
+
+
+VALUES = st.one_of(
+    st.floats(width=32), st.integers(-(2**31), 2**31 - 1), st.text(max_size=20), st.booleans(), st.none(), st.binary()
+)
+
+
+@settings(max_examples=40)
+@given(
+    messages=st.lists(
+        st.tuples(st.sampled_from([*NUMBERS, "gait", "style", "2/speed", "2/place"]), st.lists(VALUES, max_size=7)),
+        max_size=40,
+    )
+)
+def test_whatever_comes_every_command_is_one_that_can_be_obeyed(messages):
+    with staged() as (show, actors, _, send):
+        send(*[(name, *arguments) for name, arguments in messages])
+        for actor in actors:
+            for word, *content in actor.heard:
+                command = next((one for one in content if isinstance(one, Command)), None)
+                assert word in ("command", "aim", "go", "walk", "pause", "reset")
+                assert command is None or (0 <= command.speed <= 3.8 and abs(command.heading) <= math.pi + 1e-9)
+        assert not [text for text in show._notices._said if "wrong" in text]

@@ -1,0 +1,167 @@
+"""The stream itself: each frame at its time, to its character's port."""
+
+import socket
+import time
+from contextlib import ExitStack
+
+import numpy as np
+import pytest
+from helpers import walk
+
+from mapctl.errors import RequestError
+from mapctl.skeleton import CANONICAL
+from mapctl.streaming.endpoint import Endpoint
+from mapctl.streaming.protocols import FrameStream
+from mapctl.streaming.receiver import read_messages
+from mapctl.streaming.sender import PoseStream
+from mapctl.streaming.vmc import FrameAssembler, VmcFrame
+
+MOTION = walk(30)
+ROOT, QUATS = MOTION.root_position.numpy(), MOTION.local_quat_xyzw.numpy()
+ALLOWED = 1.0  # seconds by which a busy machine may be late; how late a quiet one is, slow tests say
+
+
+def open_ports(count: int, stack: ExitStack) -> list[socket.socket]:
+    """Sockets at ports that follow each other."""
+    for base in range(42000, 60000, 50):
+        made = [stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(count)]
+        try:
+            for k, one in enumerate(made):
+                one.bind(("127.0.0.1", base + k))
+                one.settimeout(5.0)
+        except OSError:
+            continue
+        return made
+    raise AssertionError("no free ports")
+
+
+@pytest.fixture
+def ports():
+    with ExitStack() as stack:
+        yield open_ports(2, stack)
+
+
+@pytest.fixture
+def stream(ports):
+    """To both ports, without delay; whoever uses it closes it."""
+    made = PoseStream(Endpoint("127.0.0.1", ports[0].getsockname()[1]), [CANONICAL] * 2, delay=0.0)
+    yield made
+    if made._process.is_alive():
+        made.close()
+
+
+def received(port: socket.socket, count: int) -> list[tuple[float, VmcFrame]]:
+    """So many frames with the time at which each was whole."""
+    assembler, found = FrameAssembler(), []
+    while len(found) < count:
+        packet, now = port.recv(65536), time.perf_counter()
+        found += [(now, frame) for message in read_messages(packet) if (frame := assembler.take(message)) is not None]
+    return found
+
+
+def start(stream: PoseStream) -> float:
+    """A moment at which its process has surely begun."""
+    return time.perf_counter() + 1.0
+
+
+def test_frames_come_when_they_are_due_and_are_those_that_were_put(stream, ports):
+    due = start(stream)
+    for first in (3, 0, 6):  # in whatever order they are put
+        stream.put(0, due + first / 30, first / 30, ROOT[first : first + 3], QUATS[first : first + 3])
+    found = received(ports[0], 9)
+    for k, (at, frame) in enumerate(found):
+        assert -0.001 < at - (due + k / 30) < ALLOWED
+        assert frame.seconds == pytest.approx(k / 30, abs=1e-6)
+        np.testing.assert_allclose(frame.joint_positions(), MOTION.joint_positions()[k], atol=1e-5)
+    stream.close()
+    sent = stream.statistics
+    assert (sent.frames_sent, sent.not_sent, sent.fault) == (9, 0, "")
+    assert 33 <= sent.largest_gap_ms < 33.4 + 1000 * ALLOWED
+    assert isinstance(stream, FrameStream)
+
+
+def test_the_stream_is_behind_by_its_delay(ports):
+    stream = PoseStream(Endpoint("127.0.0.1", ports[0].getsockname()[1]), [CANONICAL], delay=0.5)
+    due = start(stream)
+    stream.put(0, due, 0.0, ROOT[:1], QUATS[:1])
+    ((at, _),) = received(ports[0], 1)
+    assert 0.499 < at - due < 0.5 + ALLOWED
+    stream.close()
+    assert stream.statistics.late == (at - due - 0.5 > 0.5 / 30)
+
+
+def test_each_character_has_its_port_and_is_forgotten_alone(stream, ports):
+    due = start(stream)
+    stream.put(0, due, 0.0, ROOT[:3], QUATS[:3])
+    stream.put(1, due, 0.0, ROOT[3:6], QUATS[3:6])
+    stream.forget(0)
+    stream.put(0, due, 7.0, ROOT[9:10], QUATS[9:10])
+    ((_, only),) = received(ports[0], 1)
+    assert only.seconds == 7.0
+    others = received(ports[1], 3)
+    np.testing.assert_allclose(others[0][1].joint_positions(), MOTION.joint_positions()[3], atol=1e-5)
+    stream.close()
+    assert stream.statistics.frames_sent == 4
+
+
+def test_late_frames_are_counted_and_sent(stream, ports):
+    now = start(stream)
+    stream.put(0, now - 5.0, 0.0, ROOT[:3], QUATS[:3])
+    assert len(received(ports[0], 3)) == 3
+    stream.close()
+    assert stream.statistics.late == 3
+    assert stream.statistics.largest_lateness_ms > 3000
+
+
+@pytest.mark.parametrize("paused", [False, True])
+def test_a_pause_is_no_gap(stream, ports, paused):
+    due = start(stream)
+    stream.put(0, due, 0.0, ROOT[:1], QUATS[:1])
+    received(ports[0], 1)
+    if paused:
+        stream.pause()
+    stream.put(0, due + 0.6, 0.0, ROOT[1:2], QUATS[1:2])
+    received(ports[0], 1)
+    stream.close()
+    assert (stream.statistics.largest_gap_ms > 500) is not paused
+
+
+def test_closing_sends_what_waits(stream, ports):
+    due = start(stream)
+    stream.put(0, due, 0.0, ROOT[:9], QUATS[:9])
+    stream.close()
+    assert len(received(ports[0], 9)) == 9
+    assert time.perf_counter() > due + 8 / 30
+    assert not stream._process.is_alive()
+
+
+def test_nobody_need_listen(stream, ports):
+    for port in ports:
+        port.close()
+    stream.put(0, start(stream), 0.0, ROOT[:6], QUATS[:6])
+    stream.close()
+    assert stream.statistics.frames_sent + stream.statistics.not_sent == 6
+
+
+def test_a_place_that_cannot_be_sent_to_ends_nothing():
+    stream = PoseStream(Endpoint("255.255.255.255", 39539), [CANONICAL], delay=0.0)
+    stream.put(0, start(stream), 0.0, ROOT[:3], QUATS[:3])
+    stream.close()
+    assert (stream.statistics.frames_sent, stream.statistics.not_sent) == (0, 3)
+    assert stream.statistics.fault
+
+
+def test_a_process_that_has_ended_ends_nothing(stream):
+    stream._process.kill()
+    stream._process.join()
+    for _ in range(100):
+        stream.put(0, time.perf_counter(), 0.0, ROOT[:3], QUATS[:3])
+    stream.close()
+    assert stream.statistics.frames_sent == 0
+
+
+def test_unknown_hosts_and_ports_are_refused():
+    with pytest.raises(RequestError, match="is not known"):
+        PoseStream(Endpoint("no such.host", 39539), [CANONICAL])
+    with pytest.raises(RequestError, match="character 2 would be at port 65536"):
+        PoseStream(Endpoint("127.0.0.1", 65535), [CANONICAL] * 2)

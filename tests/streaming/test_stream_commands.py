@@ -1,0 +1,319 @@
+"""`mapctl steer` and `mapctl live` with programs at the other end, as a user types it."""
+
+import functools
+import json
+import math
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from contextlib import closing
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers import run, walk
+from listening import engine, free_ports
+from pythonosc.udp_client import SimpleUDPClient
+from tiny_stitcher import save_tiny_stitcher
+
+import mapctl
+import priors
+from controllers.steering.process import CharacterProcess, CharacterRequest
+from mapctl.commands.live import run as live
+from mapctl.commands.shared import streaming
+from mapctl.commands.steer.remote import RemoteScript
+from mapctl.curves.obstacles import Obstacle
+from mapctl.intent.steering import Command, CommandTrack
+from mapctl.intent.steering_limits import SteeringLimits
+from mapctl.skeleton import CANONICAL
+from mapctl.streaming.messages import Message
+from scenes.live.app import LiveApp
+from scenes.live.inputs import InputLimits
+
+ROOT = Path(__file__).resolve().parents[2]
+SCRIPT = "time_s,speed_mps,heading_deg\n0,1.2,0\n0.5,1.0,40\n1.5,1.0,40\n"
+LONG_SCRIPT = "time_s,speed_mps,heading_deg\n0,1.2,0\n5,1.0,60\n10,2.0,-40\n20,0.5,90\n25,0,90\n30,0,90\n"
+ALLOWED = 1 / 30  # seconds: of a frame's own time
+
+
+def joints_of(path: Path) -> np.ndarray:
+    """A file's joints in canonical order."""
+    motion = mapctl.load(path)
+    return motion.joint_positions()[:, [motion.skeleton.index(name) for name in CANONICAL.names]].numpy()
+
+
+@pytest.fixture
+def script(tmp_path) -> Path:
+    path = tmp_path / "script.csv"
+    path.write_text(SCRIPT)
+    return path
+
+
+@pytest.mark.parametrize("more", [(), ("--stream-root", "--stream-delay", "0")])
+def test_the_joints_of_a_script_are_rebuilt_from_its_stream(script, prior, tmp_path, capsys, more):
+    port, out, report = free_ports(1), tmp_path / "out.npz", tmp_path / "report.json"
+    with engine(port) as listener:
+        words = ("steer", script, "-o", out, "--prior", prior, "--realtime", "--report", report, "--stream", f":{port}")
+        assert run(*words, *more) == 0
+        listener.wait(45)
+    joints = joints_of(out)
+    assert joints.shape == (45, 21, 3)
+    assert np.abs(listener.joints() - joints).max() < 0.001
+    assert [frame.seconds for frame in listener.frames] == pytest.approx(np.arange(45) / 30, abs=1e-5)
+    travels = max(np.abs(frame.root_position).max() for frame in listener.frames) > 0.01
+    assert travels == bool(more)
+    sent = json.loads(report.read_text())["timing"]["stream"]
+    assert (sent["frames_sent"], sent["not_sent"]) == (45, 0)
+    assert f"45 frames to 127.0.0.1:{port}" in capsys.readouterr().out
+
+
+def test_nobody_need_listen(script, prior, tmp_path):
+    words = ("steer", script, "-o", tmp_path / "a.npz", "--prior", prior, "--realtime", "--quiet")
+    assert run(*words, "--stream", free_ports(1)) == 0
+
+
+def test_the_stream_has_the_size_of_the_character(script, prior, tmp_path):
+    tall = mapctl.load(_tall(tmp_path))
+    port, out = free_ports(1), tmp_path / "out.npz"
+    with engine(port) as listener:
+        words = ("steer", script, "-o", out, "--prior", prior, "--realtime", "--quiet", "--rig", tmp_path / "tall.npz")
+        assert run(*words, "--stream", port) == 0
+        listener.wait(45)
+    assert np.abs(listener.joints() - joints_of(out)).max() < 0.001
+    bones = np.linalg.norm(listener.frames[-1].bone_positions[1:], axis=-1)
+    np.testing.assert_allclose(bones, tall.skeleton.offsets[1:].norm(dim=-1), rtol=1e-5)
+
+
+def _tall(folder: Path) -> Path:
+    motion = walk(60)
+    skeleton = replace(motion.skeleton, offsets=motion.skeleton.offsets * 1.25)
+    path = folder / "tall.npz"
+    replace(motion, skeleton=skeleton, root_position=motion.root_position * 1.25).save(path)
+    return path
+
+
+@pytest.fixture
+def other():
+    """The port that another program holds."""
+    with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as held:
+        held.bind(("127.0.0.1", 0))
+        yield held.getsockname()[1]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--stream", "39539"), "--stream and --listen go by the clock, which needs --realtime"),
+        (("--listen", "39540"), "--stream and --listen go by the clock, which needs --realtime"),
+        (("--realtime", "--stream", "host"), "--stream must be HOST:PORT"),
+        (("--realtime", "--stream", ":99999"), "--stream must be HOST:PORT"),
+        (("--realtime", "--stream", "no such.host:1"), "the host 'no such.host' is not known"),
+        (("--realtime", "--stream-root"), "--stream-root says how --stream is sent"),
+        (("--realtime", "--stream", "1", "--stream-delay", "-1"), "--stream-delay must be 0 to 5 seconds, got -1"),
+        (("--realtime", "--stream", "1", "--stream-delay", "nan"), "--stream-delay must be 0 to 5 seconds"),
+        (("--realtime", "--stream", ":4000", "--listen", "4000"), "--listen 127.0.0.1:4000 is where --stream sends"),
+    ],
+)
+def test_a_script_cannot_be_streamed_so(fails, tmp_path, prior, words, said):
+    (tmp_path / "c.csv").write_text(SCRIPT)
+    assert said in fails("steer", "c.csv", "-o", "a.bvh", "--prior", prior, *words)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--stream", "65530", "--characters", "8"), "character 7 would be at port 65536"),
+        (("--stream", "4000", "--characters", "2", "--listen", "4001"), "is where --stream sends poses to"),
+        (("--listen", "192.0.2.1:4000"), "cannot listen on 192.0.2.1:4000"),
+        (("--listen", "x"), "--listen must be HOST:PORT"),
+    ],
+)
+def test_characters_cannot_be_streamed_so(fails, words, said):
+    assert said in fails("live", *words)
+
+
+def test_a_port_that_is_taken_is_one_line(fails, tmp_path, prior, other):
+    (tmp_path / "c.csv").write_text(SCRIPT)
+    said = f"port {other} of 127.0.0.1 is in use by another program"
+    assert said in fails("live", "--listen", other)
+    assert said in fails("steer", "c.csv", "-o", "a.bvh", "--prior", prior, "--realtime", "--listen", other)
+
+
+@pytest.mark.parametrize("option", ["--stream", "--listen"])
+def test_a_missing_package_is_named(fails, monkeypatch, tmp_path, prior, option):
+    (tmp_path / "c.csv").write_text(SCRIPT)
+    monkeypatch.setattr(streaming, "find_spec", lambda name: None if name == "pythonosc" else find_spec(name))
+    for words in (("live",), ("steer", "c.csv", "-o", "a.bvh", "--prior", prior, "--realtime")):
+        assert "pip install 'mapctl[stream]'" in fails(*words, option, "39539")
+
+
+class Source:
+    """A MessageSource that a test fills."""
+
+    dropped, fault = 0, ""
+
+    def __init__(self):
+        self.waiting: list[Message] = []
+
+    def poll(self):
+        found, self.waiting = self.waiting, []
+        return found
+
+
+@pytest.fixture
+def played():
+    """A script that takes orders, and a function that gives them."""
+    lines = (Command(1.2, 0.0, turning=0.5, told=("old",), obstacles=(Obstacle((0.0, 9.0), 0.5),)), Command(2.0, 1.0))
+    source = Source()
+    bounds = InputLimits(3.8, {"style": ["old"]})
+    made = RemoteScript(CommandTrack((0.0, 5.0), lines), source, bounds, SteeringLimits())
+
+    def at(seconds: float, *messages: tuple) -> Command:
+        source.waiting = [Message(f"/mapctl/{name}", tuple(arguments)) for name, *arguments in messages]
+        return made.at(seconds)
+
+    return made, at, lines
+
+
+def test_a_script_plays_as_it_is_until_an_order_comes(played):
+    _, at, lines = played
+    assert at(0.0) is lines[0]
+    changed = at(1.0, ("speed", 0.5), ("hand/left", 0.1, 1.0, 3.0))
+    assert (changed.speed, changed.turning, changed.told, changed.obstacles) == (0.5, 0.5, ("old",), lines[0].obstacles)
+    assert changed.reach == {"leftHand": (0.1, 1.0, 3.0)}
+    assert at(2.0) == changed
+    turned = at(3.0, ("heading", 90.0), ("style", "any"), ("disc", 1.0, 2.0, 0.5))
+    assert (turned.heading, turned.turning, turned.told) == (pytest.approx(math.pi / 2), None, ())
+    assert turned.obstacles == (*lines[0].obstacles, Obstacle((1.0, 2.0), 0.5))
+    assert at(5.0) is lines[1], "the next line ends what was ordered"
+
+
+def test_places_and_paths_of_a_script(played):
+    _, at, _ = played
+    order = at(1.0, ("place", 2.0, 3.0, 1.5, 90.0)).arrival
+    assert (order.place, order.by, order.facing) == ((2.0, 3.0), 2.5, pytest.approx(math.pi / 2))
+    assert at(1.5, ("path", 0.0, 0.0, 3.0, 0.0)).heading == pytest.approx(math.pi / 2, abs=0.2)
+
+
+@pytest.mark.parametrize(
+    ("message", "said"), [(("pause", 1), "pause is for mapctl live"), (("speed", 99.0), "lowered")]
+)
+def test_what_a_script_cannot_obey_is_noted(played, message, said):
+    made, at, _ = played
+    at(1.0, message)
+    assert said in made.notes[0]
+
+
+def test_orders_reach_a_script_that_is_played(script, prior, tmp_path):
+    """An order beyond the limits is in the report; another process sends it all the while."""
+    listen, report = free_ports(1), tmp_path / "r.json"
+    code = f"import time;from pythonosc.udp_client import SimpleUDPClient as C;c=C('127.0.0.1',{listen})\n"
+    code += "while True: c.send_message('/mapctl/speed', 99.0); time.sleep(.02)"
+    sender = subprocess.Popen([sys.executable, "-c", code])
+    try:
+        words = ("steer", script, "-o", tmp_path / "a.npz", "--prior", prior, "--realtime", "--quiet")
+        assert run(*words, "--listen", listen, "--report", report) == 0
+    finally:
+        sender.kill()
+        sender.wait()
+    assert "OSC: A speed of 99 m/s was lowered to" in json.loads(report.read_text())["status"]["text"]
+
+
+def test_characters_obey_what_comes_over_osc_and_their_poses_go_out(prior, tmp_path, monkeypatch, capsys):
+    """The whole of `mapctl live` but the browser: two characters in their processes, on tiny models."""
+    stitcher = functools.partial(priors.load_stitcher, str(save_tiny_stitcher(tmp_path / "s.safetensors")))
+
+    def start(command):
+        load = functools.partial(priors.load, prior)
+        requests = [CharacterRequest(load, Command(1.2, 0.0), at=(3.0 * k, 0.0), transitions=stitcher) for k in (0, 1)]
+        made = [CharacterProcess(request) for request in requests]
+        for one in made:
+            one.wait()
+        return made
+
+    ports, listen = free_ports(2), free_ports(3) + 2
+    hand, shoulder = CANONICAL.index("leftHand"), CANONICAL.index("leftUpperArm")
+    with engine(ports) as first, engine(ports + 1) as second, SimpleUDPClient("127.0.0.1", listen) as client:
+
+        def wait(show, seconds):
+            end = time.perf_counter() + seconds
+            loop(show, lambda: time.perf_counter() > end)
+
+        def play(show):
+            client.send_message("/mapctl/2/stop", [])
+            wait(show, 1.0)
+            play.asked, play.target = len(second.frames), second.joints()[-1, shoulder] + [0.3, 0.2, 0.1]
+            client.send_message("/mapctl/2/hand/left", play.target.tolist())
+            wait(show, 2.0)
+            play.held = [member.orders for member in show._members]
+            raise KeyboardInterrupt
+
+        loop = LiveApp.run
+        monkeypatch.setattr(live, "_start_characters", start)
+        monkeypatch.setattr(LiveApp, "run", play)
+        words = ("live", "--port", 8180, "--prior", prior, "--characters", 2)
+        assert run(*words, "--stream", ports, "--listen", listen) == 0
+    assert [orders.reach for orders in play.held] == [{}, {"left": pytest.approx(tuple(play.target))}]
+    assert play.held[1].speed == 0.0
+    assert min(len(first.frames), len(second.frames)) > 30
+    assert all(np.all(np.diff([f.seconds for f in one.frames]) > 0) for one in (first, second))
+    away = np.linalg.norm(second.joints()[play.asked - 1 :, hand] - play.target, axis=-1)
+    assert away.min() < 0.5 * away[0], "its hand goes to what was ordered"
+    assert np.abs(first.joints()[0, 0, 0]) < 0.5 < second.joints()[0, 0, 0]
+    out = capsys.readouterr().out
+    assert f"poses go to 127.0.0.1:{ports}, 127.0.0.1:{ports + 1} (VMC)" in out
+    assert f"orders come from 127.0.0.1:{listen} (OSC)" in out
+    assert "late, at most" in out
+
+
+def start_command(*words: object) -> subprocess.Popen:
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    return subprocess.Popen(
+        [sys.executable, "-m", "mapctl", *map(str, words)], env=environment, stdout=subprocess.PIPE, text=True
+    )
+
+
+@pytest.mark.slow
+def test_thirty_seconds_of_a_script_come_whole_and_none_late(tmp_path):
+    """On a machine with a core to spare; the bundled prior."""
+    (tmp_path / "c.csv").write_text(LONG_SCRIPT)
+    port, out, report = free_ports(1), tmp_path / "out.npz", tmp_path / "r.json"
+    with engine(port) as listener:
+        words = ("steer", tmp_path / "c.csv", "-o", out, "--realtime", "--quiet", "--report", report)
+        assert start_command(*words, "--stream", port).wait(150) == 0
+        listener.wait(900)
+    assert np.abs(listener.joints() - joints_of(out)).max() < 0.001
+    assert listener.lateness().max() < ALLOWED
+    assert np.diff(listener.times).max() < 2 * ALLOWED
+    assert json.loads(report.read_text())["timing"]["stream"]["late"] == 0
+
+
+@pytest.mark.slow
+def test_a_character_walks_where_osc_says(tmp_path):
+    """`mapctl live` as it is, for 15 seconds, with the bundled prior; Ctrl-C ends it."""
+    port, listen = free_ports(1), free_ports(3) + 2
+    with engine(port) as listener, SimpleUDPClient("127.0.0.1", listen) as client:
+        show = start_command("live", "--port", 8190, "--stream", port, "--listen", listen)
+        try:
+            listener.wait(60, seconds=120)
+            client.send_message("/mapctl/heading", 90.0)
+            client.send_message("/mapctl/speed", 1.5)
+            begun = len(listener.frames)
+            listener.wait(begun + 210)
+            client.send_message("/mapctl/stop", [])
+            listener.wait(begun + 330)
+        finally:
+            show.send_signal(signal.SIGINT)
+            out, _ = show.communicate(timeout=60)
+    hips = listener.joints()[:, 0]
+    way = hips[begun + 200] - hips[begun + 80]
+    assert way[0] / 4 == pytest.approx(1.5, abs=0.2), "m/s along +X"
+    assert abs(way[2]) < 0.6
+    assert np.linalg.norm(hips[begun + 320] - hips[begun + 300]) < 0.1
+    assert listener.lateness().max() < ALLOWED
+    assert ", 0 late" in out

@@ -1,0 +1,189 @@
+"""Poses as VMC messages: what a Unity program would make of them, and back."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from helpers import random_motion, walk
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from mapctl.skeleton import CANONICAL, Skeleton
+from mapctl.streaming import vmc
+from mapctl.streaming.messages import Message
+from mapctl.streaming.receiver import read_messages
+from mapctl.streaming.sender import pack
+
+HUMAN_BODY_BONES = (
+    "Hips LeftUpperLeg RightUpperLeg LeftLowerLeg RightLowerLeg LeftFoot RightFoot Spine Chest Neck Head LeftShoulder "
+    "RightShoulder LeftUpperArm RightUpperArm LeftLowerArm RightLowerArm LeftHand RightHand LeftToes RightToes"
+)
+PARENTS = {
+    "Spine": "Hips",
+    "Chest": "Spine",
+    "Neck": "Chest",
+    "Head": "Neck",
+    **{f"{side}UpperLeg": "Hips" for side in ("Left", "Right")},
+    **{f"{side}LowerLeg": f"{side}UpperLeg" for side in ("Left", "Right")},
+    **{f"{side}Foot": f"{side}LowerLeg" for side in ("Left", "Right")},
+    **{f"{side}Toes": f"{side}Foot" for side in ("Left", "Right")},
+    **{f"{side}Shoulder": "Chest" for side in ("Left", "Right")},
+    **{f"{side}UpperArm": f"{side}Shoulder" for side in ("Left", "Right")},
+    **{f"{side}LowerArm": f"{side}UpperArm" for side in ("Left", "Right")},
+    **{f"{side}Hand": f"{side}LowerArm" for side in ("Left", "Right")},
+}
+"""The tree as Unity's documentation draws it."""
+FLIP = np.diag([-1.0, 1.0, 1.0])
+
+
+def body(seed: int) -> Skeleton:
+    """Canonical joints with bones of any length."""
+    offsets = CANONICAL.offsets * (0.5 + torch.rand(21, 1, generator=torch.Generator().manual_seed(seed)).double())
+    return replace(CANONICAL, offsets=offsets)
+
+
+def frame(seed: int):
+    """A random pose of a random body, and its messages."""
+    motion = random_motion(body(seed), 1, seed=seed)
+    root, quats = motion.root_position[0].numpy(), motion.local_quat_xyzw[0].numpy()
+    return motion, vmc.encode_frame(motion.skeleton, root, quats, 1.5)
+
+
+def sent_over(messages):
+    """What arrives of messages that are packed, as 32-bit numbers."""
+    return [message for packet in pack(messages) for message in read_messages(packet)]
+
+
+def assembled(messages):
+    assembler = vmc.FrameAssembler()
+    return [found for message in messages if (found := assembler.take(message)) is not None]
+
+
+@given(seed=st.integers(0, 10**6), root_travels=st.booleans())
+def test_joints_come_back(seed, root_travels):
+    motion = random_motion(body(seed), 1, seed=seed)
+    root, quats = motion.root_position[0].numpy(), motion.local_quat_xyzw[0].numpy()
+    messages = vmc.encode_frame(motion.skeleton, root, quats, 12.25, root_travels=root_travels)
+    (exact,) = assembled(messages)
+    np.testing.assert_allclose(exact.joint_positions(), motion.joint_positions()[0], atol=1e-12)
+    np.testing.assert_array_equal(exact.bone_quats_xyzw, quats)
+    (found,) = assembled(sent_over(messages))
+    assert found.seconds == 12.25
+    np.testing.assert_allclose(found.joint_positions(), motion.joint_positions()[0], atol=3e-6)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_rotations_are_the_mirror_image_by_matrices(seed):
+    motion, messages = frame(seed)
+    for joint, message in enumerate(m for m in messages if m.address == vmc.BONE):
+        ours = Rotation.from_quat(motion.local_quat_xyzw[0, joint].numpy()).as_matrix()
+        theirs = Rotation.from_quat(message.arguments[4:8]).as_matrix()
+        np.testing.assert_allclose(theirs, FLIP @ ours @ FLIP, atol=1e-12)
+        if joint:
+            np.testing.assert_allclose(message.arguments[1:4], FLIP @ motion.skeleton.offsets[joint].numpy())
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_left_handed_program_rebuilds_the_body(seed):
+    """By its own tree and by scipy: whatever shares no code with the project."""
+    motion, messages = frame(seed)
+    local = {m.arguments[0]: m.arguments[1:] for m in sent_over(messages) if m.address == vmc.BONE}
+
+    def world(name):
+        place, turn = np.array(local[name][:3]), Rotation.from_quat(local[name][3:])
+        if name == "Hips":
+            return place, turn
+        at, above = world(PARENTS[name])
+        return at + above.apply(place), above * turn
+
+    for joint, name in enumerate(vmc.BONE_NAMES):
+        np.testing.assert_allclose(FLIP @ world(name)[0], motion.joint_positions()[0, joint], atol=3e-6)
+
+
+def test_bones_are_those_of_unity():
+    assert sorted(vmc.BONE_NAMES) == sorted(HUMAN_BODY_BONES.split())
+    assert {name: vmc.BONE_NAMES[p] for name, p in zip(vmc.BONE_NAMES, CANONICAL.parents, strict=True) if p >= 0} == (
+        PARENTS
+    )
+
+
+def test_the_t_pose_has_no_rotation_and_its_left_hand_at_minus_x():
+    still = np.tile([0.0, 0.0, 0.0, 1.0], (21, 1))
+    messages = vmc.encode_frame(CANONICAL, np.array([0.0, 0.9, 0.0]), still, 0.0)
+    bones = {m.arguments[0]: m.arguments[1:] for m in messages if m.address == vmc.BONE}
+    assert {tuple(np.abs(values[3:])) for values in bones.values()} == {(0.0, 0.0, 0.0, 1.0)}
+    assert bones["LeftUpperArm"][0] < 0 < bones["RightUpperArm"][0]
+    assert bones["LeftToes"][2] > 0
+
+
+def test_a_turn_to_the_left_is_negative_about_the_vertical_of_a_left_handed_space():
+    quats = np.tile([0.0, 0.0, 0.0, 1.0], (21, 1))
+    quats[0] = [0.0, math.sin(math.pi / 4), 0.0, math.cos(math.pi / 4)]  # from +Z toward +X, its left
+    hips = next(m for m in vmc.encode_frame(CANONICAL, np.zeros(3), quats, 0.0) if m.address == vmc.BONE)
+    np.testing.assert_allclose(hips.arguments[4:], [0, -math.sin(math.pi / 4), 0, math.cos(math.pi / 4)])
+
+
+def test_hips_travel_or_the_root_does():
+    motion = walk(60, turn_rate=0.5)
+    place, quats = motion.root_position[50].numpy(), motion.local_quat_xyzw[50].numpy()
+    by_hips = vmc.encode_frame(CANONICAL, place, quats, 0.0)
+    by_root = vmc.encode_frame(CANONICAL, place, quats, 0.0, root_travels=True)
+    mirrored = FLIP @ place
+    assert by_hips[0] == Message(vmc.ROOT, ("root", *np.zeros(3) * [-1, 1, 1], 0.0, 0.0, 0.0, 1.0))
+    np.testing.assert_allclose(by_hips[1].arguments[1:4], mirrored)
+    np.testing.assert_allclose(by_root[0].arguments[1:4], mirrored * [1, 0, 1])
+    np.testing.assert_allclose(by_root[1].arguments[1:4], mirrored * [0, 1, 0])
+
+
+def test_packets_are_small_typed_as_the_protocol_says_and_end_with_the_time():
+    _, messages = frame(0)
+    packets = pack(messages)
+    assert max(map(len, packets)) <= 1200
+    assert len(packets) == 2
+    whole = b"".join(packets)
+    assert whole.count(b",sfffffff\0") == 22
+    assert whole.count(b",iii\0") == whole.count(b",f\0\0") == 1
+    assert [m.address for m in messages[-2:]] == [vmc.OK, vmc.TIME]
+    assert messages[-2].arguments == (1, 3, 0)
+
+
+def test_a_frame_with_a_lost_packet_is_left_out():
+    _, messages = frame(0)
+    first, second = ([*read_messages(packet)] for packet in pack(messages))
+    assert len(assembled([*first, *second, *second, *first, *second])) == 2
+    assert assembled(second) == []
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        Message(vmc.BONE),
+        Message(vmc.BONE, ("Hips", 1.0, 2.0)),
+        Message(vmc.BONE, ("Hips", *[math.nan] * 7)),
+        Message(vmc.BONE, ("Tail", *[0.0] * 7)),
+        Message(vmc.BONE, (3, *[0.0] * 7)),
+        Message(vmc.BONE, ("Hips", *["x"] * 7)),
+        Message(vmc.BONE, ("Hips", *[[0.0]] * 7)),
+        Message("/VMC/Ext/Blend/Val", ("Joy", 1.0)),
+    ],
+)
+def test_what_is_no_pose_is_passed_over(message):
+    motion, messages = frame(1)
+    (found,) = assembled([*messages[:-1], message, *messages[-1:]])
+    np.testing.assert_allclose(found.joint_positions(), motion.joint_positions()[0], atol=1e-12)
+
+
+@pytest.mark.parametrize("arguments", [(), ("now",), (math.nan,), (None,)])
+def test_a_frame_without_a_time_is_none(arguments):
+    _, messages = frame(1)
+    assert assembled([*messages[:-1], Message(vmc.TIME, arguments)]) == []
+
+
+def test_arguments_of_later_versions_mean_nothing():
+    motion, messages = frame(2)
+    root = Message(vmc.ROOT, (*messages[0].arguments, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0))
+    (found,) = assembled([root, *messages[1:]])
+    np.testing.assert_allclose(found.joint_positions(), motion.joint_positions()[0], atol=1e-12)
