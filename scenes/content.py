@@ -1,13 +1,13 @@
 """Content of one picture, and the protocol of its painter."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from mapctl.mesh import colours
-from mapctl.mesh.mannequin import Mannequin
+from mapctl.mesh.body import Body
 from mapctl.mesh.primitives import Array, Surface
 from scenes.cameras import View
 
@@ -18,7 +18,7 @@ _VEIL_OPACITY = 0.4
 class Figure:
     """One body in one pose."""
 
-    body: Mannequin
+    body: Body
     """Body of an actor."""
     frame: int
     """Frame of the actor's own motion."""
@@ -34,7 +34,7 @@ class Figure:
         skin = self.body.surface(self.frame)
         assert skin.normals is not None, "bodies are lit"
         rgba = np.column_stack([self.tint(skin.rgba[:, :3]), skin.rgba[:, 3]])
-        return Surface(skin.vertices + self.shell * skin.normals, skin.faces, rgba, skin.normals)
+        return replace(skin, vertices=skin.vertices + self.shell * skin.normals, rgba=rgba)
 
     def tint(self, rgb: Array) -> Array:
         """Return colours of the body (n, 3) as they are shown."""

@@ -1,5 +1,6 @@
 """Films of motions: MP4, GIF, and a PNG contact sheet. Files appear whole or not at all."""
 
+import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from fractions import Fraction
@@ -16,6 +17,7 @@ from mapctl.motion import Motion
 from scenes.cameras import CameraSettings
 from scenes.contact_sheet import draw_contact_sheet, draw_strips
 from scenes.content import Painter
+from scenes.renderers import STICK_FIGURES
 from scenes.renderers.select import RendererName, select_painter
 from scenes.stage import Shot, Stage
 from scenes.writers import gif_writer, mp4_writer, save_png
@@ -24,6 +26,7 @@ WRITERS = {".mp4": mp4_writer, ".gif": gif_writer}
 ENDINGS = (*WRITERS, ".png")
 """Endings that `film` can write."""
 _MIN_PIXELS, _MAX_PIXELS = 16, 8192
+_log = logging.getLogger("mapctl.scenes")
 
 PathOrText = str | PathLike[str]
 
@@ -41,19 +44,18 @@ def film(
 ) -> list[Path]:
     """Film the actors walking together; one pass serves all outputs. Returns the paths written.
 
-    `actors` are Shots, or tuples (motion, curve, colour, start seconds, wishes) of which all but the motion may be
-    left out. `out` is a path or several, each ending in .mp4, .gif or .png (a contact sheet: ghosts along
+    `actors` are Shots, or tuples (motion, curve, colour, start seconds, wishes, drawn) of which all but the motion may
+    be left out. Where stick figures are drawn a character is one of them, and a line is logged that says so. `out` is a path or several, each ending in .mp4, .gif or .png (a contact sheet: ghosts along
     the trajectory over a row of stills). Each frame of the motions is one frame of the film unless `fps` resamples
     them. `size` is the width and height in pixels (MP4 rounds up to even). `props` are what stands around
     (`scenes.props`). `progress` is called with frames done and all frames. `renderer` is that of
     `scenes.renderers.select.select_painter`. RequestError for endings, sizes and paths that cannot be.
     """
     paths = check_outputs([out] if isinstance(out, str | PathLike) else out, size)
-    stage, brush, camera = (
-        Stage([Shot(*actor) for actor in actors], fps, props),
-        select_painter(renderer),
-        camera or CameraSettings(),
-    )
+    shots, brush, camera = [Shot(*actor) for actor in actors], select_painter(renderer), camera or CameraSettings()
+    stage = Stage(shots, fps, props)
+    if brush.name == STICK_FIGURES and any(shot.drawn is not None for shot in shots):
+        _log.warning("stick figures show no mesh: characters are drawn by their bones")
     moving, sheets = (
         [p for p in paths if p.suffix.lower() in WRITERS],
         [p for p in paths if p.suffix.lower() == ".png"],

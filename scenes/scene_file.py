@@ -49,6 +49,8 @@ class Actor:
     """Seed of everything random about this actor."""
     colour: str | None = None
     """Torso colour: a name from `mapctl.mesh.colours.ACTORS` or `#rrggbb`; each actor's own if not given."""
+    character: Annotated[str, Field(min_length=1)] | None = None
+    """File of a skinned character that is drawn, relative to the scene file; the mannequin if not given."""
     speed_by_time: tuple[tuple[Seconds0, Annotated[float, Field(ge=0, le=20)]], ...] | None = None
     """Speed along the curve by time, pairs of seconds and m/s, zero allowed; instead of `speed`."""
     gait: str | None = None

@@ -13,12 +13,14 @@ from mapctl.curves import Curve
 from mapctl.errors import RequestError
 from mapctl.joint_names import Side
 from mapctl.mesh import colours
+from mapctl.mesh.body import Body
 from mapctl.mesh.mannequin import Mannequin
 from mapctl.mesh.primitives import Array, Surface, merge_surfaces
 from mapctl.motion import Motion
 from scenes import overlays
 from scenes.cameras import CameraSettings, View, compute_views
 from scenes.content import Content, Figure
+from scenes.drawn_character import DrawnMotion
 from scenes.wishes import StagedWishes, Wishes
 
 _RIBBON_STEP = 0.06
@@ -37,13 +39,15 @@ class Shot(NamedTuple):
     """Start of the motion, seconds; until then the actor holds its first pose."""
     wishes: Wishes = Wishes()
     """What the actor is asked for beside the curve."""
+    drawn: DrawnMotion | None = None
+    """The motion on a character that is drawn with its own mesh; a mannequin is drawn if None."""
 
 
 @dataclass(frozen=True, eq=False)
 class StagedActor:
     """An actor made ready: its body, and its ribbons and contacts computed once."""
 
-    body: Mannequin
+    body: Body
     wish: Surface | None
     trail: Surface
     planted: Array
@@ -104,7 +108,7 @@ class Stage:
     def views(self, settings: CameraSettings, size: tuple[int, int]) -> list[View]:
         """Return one view a frame that shows all actors, and all curves unless the camera follows."""
         index = [[p.frame(k) for k in range(self.num_frames)] for p in self.players]
-        bodies = [p.body.anatomy.seen[i] for p, i in zip(self.players, index, strict=True)]
+        bodies = [p.body.seen[i] for p, i in zip(self.players, index, strict=True)]
         hips = [p.body.anatomy.hips_world[i] for p, i in zip(self.players, index, strict=True)]
         seen = np.concatenate(bodies, axis=1)
         if settings.kind != "follow":
@@ -122,9 +126,9 @@ class Stage:
 def _prepare_actor(shot: Shot, number: int, count: int, fps: Fraction) -> StagedActor:
     if not 0 <= shot.start_seconds < 3600:
         raise RequestError(f"start_seconds must be from 0 to 3600, got {shot.start_seconds:g}")
-    motion = shot.motion.resample(fps)
     colour = colours.rgb(shot.colour or colours.default_colour(number))
-    body = Mannequin(motion, colour)
+    motion = shot.motion.resample(fps)
+    body = Mannequin(motion, colour) if shot.drawn is None else shot.drawn.build_body(fps, colour)
     # One actor has a red curve and a yellow trail as in Wang et al. 2019; among several both have the actor's colour.
     wish, trod = colours.rgb(colours.TARGET), colours.rgb(colours.TRAIL)
     if count > 1:
@@ -132,7 +136,8 @@ def _prepare_actor(shot: Shot, number: int, count: int, fps: Fraction) -> Staged
     ribbon = None if shot.curve is None else _build_curve_ribbon(shot.curve, wish)
     path = body.anatomy.hips_world[:, [0, 2]]
     trail = overlays.build_ribbon(path, width=0.05, rgb=trod, height=overlays.TRAIL_HEIGHT)
-    planted, wishes = _detect_foot_contacts(body, float(fps)), StagedWishes.of(shot.wishes, motion, shot.start_seconds)
+    wishes = StagedWishes.of(shot.wishes, motion, shot.start_seconds, shot.drawn)
+    planted = _detect_foot_contacts(body, float(fps))
     return StagedActor(body, ribbon, trail, planted, round(shot.start_seconds * fps), wishes)
 
 
@@ -144,7 +149,7 @@ def _build_curve_ribbon(curve: Curve, rgb: Array) -> Surface:
     return overlays.build_ribbon(thin, width=0.11, rgb=rgb, height=overlays.TARGET_HEIGHT)
 
 
-def _detect_foot_contacts(body: Mannequin, fps: float) -> Array:
+def _detect_foot_contacts(body: Body, fps: float) -> Array:
     balls = [foot.ball for foot in body.anatomy.feet]
     if len(balls) != 2:
         return np.zeros((body.num_frames, len(balls)), bool)

@@ -11,6 +11,7 @@ from mapctl.mesh.mannequin import Mannequin
 from mapctl.mesh.primitives import Surface
 from mapctl.motion import Motion
 from scenes.content import Figure
+from scenes.drawn_character import DrawnMotion
 
 _LEAST_SECONDS = 0.3  # for which what is asked for at one moment is shown strongly
 _FAINT = 0.25  # opacity of marks before and after their time
@@ -47,15 +48,18 @@ class StagedWishes:
     """Bodies in the poses."""
 
     @staticmethod
-    def of(wishes: Wishes, motion: Motion, start_seconds: float) -> "StagedWishes":
-        """Prepare the wishes of an actor whose motion, at the film's rate, starts at a time."""
+    def of(
+        wishes: Wishes, motion: Motion, start_seconds: float, drawn: DrawnMotion | None = None
+    ) -> "StagedWishes":
+        """Prepare the wishes of an actor whose motion, at the film's rate, starts at a time; of a character that is
+        drawn with its own mesh poses are shown with it too."""
         marks, fps = [], motion.fps
         for mark in wishes.marks:
             early, late = mark.seconds
             margin = max(0.0, _LEAST_SECONDS - (late - early)) / 2
             first, last = (round((start_seconds + at) * fps) for at in (early - margin, late + margin))
             marks.append((mark.surface, first, last))
-        return StagedWishes(marks, _build_figures(wishes.poses, motion))
+        return StagedWishes(marks, _build_figures(wishes.poses, motion, drawn))
 
     def marks_at(self, frame: int) -> list[Surface]:
         """Return the marks in a frame of the film: strong while they are asked for, faint before and after."""
@@ -68,9 +72,12 @@ class StagedWishes:
         return [surface for surface, _, _ in self.marks]
 
 
-def _build_figures(poses: Sequence[Motion], motion: Motion) -> list[Figure]:
+def _build_figures(poses: Sequence[Motion], motion: Motion, drawn: DrawnMotion | None) -> list[Figure]:
     if not poses:
         return []
+    if drawn is not None:
+        bodies = [drawn.build_pose(pose, colours.rgb(colours.TARGET)) for pose in poses]
+        return [Figure(body, 0, _TINT, toward=colours.TARGET, shell=_SHELL) for body in bodies]
     # A body's shoes are as its whole motion shows them flat; a pose alone may stand on its toes.
     whole = reduce(lambda joined, pose: joined.join(replace(pose, fps=motion.fps)), poses, motion)
     body = Mannequin(whole, colours.rgb(colours.TARGET))

@@ -76,6 +76,11 @@ class Mannequin:
         """Frames of the motion."""
         return len(self.anatomy.points.world)
 
+    @property
+    def seen(self) -> Array:
+        """Positions (frames, n, 3) of hips and all below, metres, without a root on the floor."""
+        return self.anatomy.seen
+
     def boxes(self, frame: int) -> list[RoundedBoxes]:
         """Return limbs and trunk, skull and shoes in one frame."""
         feet = [_shoe(self.anatomy, foot, frame) for foot in self.anatomy.feet]

@@ -26,10 +26,12 @@ class Surface:
     """(n, 4) sRGB colour and opacity, 0 to 1."""
     normals: Array | None = None
     """(n, 3) unit normals of a lit surface; None for flat colour."""
+    is_open: bool = False
+    """Whether it is seen from both sides; else it is the skin of solids, of which only the outside is drawn."""
 
 
 def merge_surfaces(surfaces: Sequence[Surface]) -> Surface:
-    """Merge surfaces into one, faces in the order given; all are lit or none is."""
+    """Merge surfaces into one, faces in the order given; all are lit or none is, and it is open if any is."""
     counts = np.cumsum([0, *(len(s.vertices) for s in surfaces)])
     lit = surfaces[0].normals is not None
     return Surface(
@@ -37,6 +39,7 @@ def merge_surfaces(surfaces: Sequence[Surface]) -> Surface:
         faces=np.concatenate([s.faces + start for s, start in zip(surfaces, counts, strict=False)]),
         rgba=np.concatenate([s.rgba for s in surfaces]),
         normals=np.concatenate([s.normals for s in surfaces if s.normals is not None]) if lit else None,
+        is_open=any(s.is_open for s in surfaces),
     )
 
 

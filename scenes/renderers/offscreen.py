@@ -2,7 +2,7 @@
 
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping
 from functools import cache
 from types import ModuleType
 from typing import Any
@@ -11,11 +11,11 @@ import numpy as np
 
 from mapctl.errors import MapctlError
 from mapctl.mesh import colours
-from mapctl.mesh.primitives import Array, Surface, merge_surfaces
+from mapctl.mesh.primitives import Array, Surface
 from scenes.cameras import View
 from scenes.content import Content, blend_veils
 from scenes.overlays import build_shadow
-from scenes.renderers.lighting import shade
+from scenes.renderers.layers import Layer, list_layers
 
 _NEAR, _FAR = 0.3, 400.0
 
@@ -34,36 +34,41 @@ class OffscreenPainter:
         gl = self._gl
         self._scene = gl.Scene(bg_color=[*colours.rgb(colours.BACKGROUND), 1.0])
         self._camera = self._scene.add(gl.PerspectiveCamera(yfov=1.0, znear=_NEAR, zfar=_FAR))
-        self._solid = gl.MetallicRoughnessMaterial(baseColorFactor=[1.0] * 4)
-        self._sheer = gl.MetallicRoughnessMaterial(baseColorFactor=[1.0] * 4, alphaMode="BLEND", doubleSided=True)
+        looks = {
+            Layer.CLOSED: {},
+            Layer.OPEN: {"doubleSided": True},
+            Layer.SHEER: {"doubleSided": True, "alphaMode": "BLEND"},
+        }
+        self._looks = {
+            layer: gl.MetallicRoughnessMaterial(baseColorFactor=[1.0] * 4, **look) for layer, look in looks.items()
+        }
 
     def paint(self, view: View, content: Content) -> Array:
         """Paint the picture, (height, width, 3) uint8."""
         eye = view.pose[:3, 3]
-        bodies = [figure.surface() for figure in content.figures]
         shadows = [build_shadow(*f.body.sticks(f.frame)[:2], layer=k) for k, f in enumerate(content.figures)]
-        groups = (([*content.ground, *shadows], self._sheer), (bodies, self._solid))
-        nodes = [self._scene.add(self._build_mesh(group, material, eye)) for group, material in groups if group]
+        nodes = self._add(list_layers([*content.ground, *shadows], [f.surface() for f in content.figures], eye))
         camera = self._camera.camera
         camera.yfov, camera.aspectRatio = view.fov, view.width / view.height
         self._scene.set_pose(self._camera, view.pose)
         self._renderer.viewport_width, self._renderer.viewport_height = view.width, view.height
         picture, _ = self._renderer.render(self._scene, self._gl.RenderFlags.FLAT)
         if content.veils:
-            veils = [figure.surface() for figure in content.veils]
-            nodes.append(self._scene.add(self._build_mesh(veils, self._solid, eye)))
+            nodes += self._add(list_layers([], [figure.surface() for figure in content.veils], eye))
             picture = blend_veils(picture, self._renderer.render(self._scene, self._gl.RenderFlags.FLAT)[0])
         for node in nodes:
             self._scene.remove_node(node)
         return picture
 
-    def _build_mesh(self, surfaces: Sequence[Surface], material: object, eye: Array):
-        """Build all surfaces as one mesh: a draw call costs more than a body's triangles, and the order stays."""
-        surface = merge_surfaces(surfaces)
-        primitive = self._gl.Primitive(
-            positions=surface.vertices, indices=surface.faces, color_0=shade(surface, eye), material=material
-        )
-        return self._gl.Mesh([primitive])
+    def _add(self, layers: Mapping[Layer, Surface]) -> list[Any]:
+        """Add each layer as one mesh: a draw call costs more than a body's triangles, and the order stays."""
+        nodes = []
+        for layer, surface in layers.items():
+            primitive = self._gl.Primitive(
+                positions=surface.vertices, indices=surface.faces, color_0=surface.rgba, material=self._looks[layer]
+            )
+            nodes.append(self._scene.add(self._gl.Mesh([primitive])))
+        return nodes
 
 
 @cache

@@ -50,6 +50,9 @@ class FollowCurve(Command):
     """Solve again without each wish, and tell what it costs the others."""
     video: options.MaybeFile = None
     """Film of the walk: .mp4, .gif or .png (contact sheet)."""
+    character: options.MaybeCharacter = None
+    """File of a skinned character, as .glb or .vrm, that the film shows in place of the mannequin; the motion stays
+    that of --rig."""
     camera: Annotated[options.CameraKind | None, arg(metavar="follow|fixed|top")] = None
     """Camera of the film; follow if not given."""
     size: options.MaybeSize = None

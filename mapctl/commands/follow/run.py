@@ -8,7 +8,7 @@ from controllers.common.character import Character
 from mapctl import formats, report
 from mapctl.commands.follow import FollowCurve
 from mapctl.commands.shared import inputs, options, outputs, results
-from mapctl.commands.shared.character import read_character
+from mapctl.commands.shared.character import read_character, read_drawn_character
 from mapctl.commands.shared.path_walk import Walk, parse_follow, walk
 from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.commands.shared.shots.plan import ShotPlan, plan_shot
@@ -21,6 +21,7 @@ from mapctl.intent.cornering import turns_sharply
 from mapctl.intent.shot_keys import read_shot_keys
 from priors.lstm_gmm.density import LstmGmmDensity
 from scenes.cameras import CameraSettings
+from scenes.drawn_character import DrawnCharacter
 from scenes.film import film
 from scenes.scene_file import Actor
 
@@ -32,6 +33,7 @@ def run(command: FollowCurve) -> int:
     _check(command)
     curve = inputs.read_curve(command.curve, command.metres_per_unit)
     request = parse_follow(curve, command.speed, command.seconds)
+    drawn = read_drawn_character(command.character)
     character, prior = read_character(command.rig), priors.load(command.prior)
     cornering = command.speed is None and turns_sharply(curve)
     plan = _plan(command, curve, prior, character) if cornering or _wishes_more(command) else None
@@ -41,7 +43,7 @@ def run(command: FollowCurve) -> int:
         else:
             done = walk(prior, request, seed=command.seed, progress=progress, character=character)
     video = None if done.interrupted else command.video
-    _write(command, done, video)
+    _write(command, done, video, drawn)
     if not command.quiet:
         files = ", ".join(map(str, options.collect_paths(command.out, video, command.report)))
         print("\n".join([*done.summary(), f"wrote     {files}"]))
@@ -83,19 +85,21 @@ def _check(command: FollowCurve) -> None:
         raise RequestError(f"--fps must be 1 to 1000, got {command.fps:g}")
     formats.check_ending(command.out)
     outputs.check_files(options.collect_paths(command.out, command.video, command.report))
-    for name in ("camera", "size"):
+    for name in ("camera", "size", "character"):
         if command.video is None and getattr(command, name) is not None:
             raise RequestError(f"--{name} is of the film, and --video asks for none")
     if command.video is not None:
         outputs.check_film(command.video, options.parse_size(command.size or _SIZE))
 
 
-def _write(command: FollowCurve, done: Walk | PlayedShot, video: Path | None) -> None:
+def _write(
+    command: FollowCurve, done: Walk | PlayedShot, video: Path | None, character: DrawnCharacter | None
+) -> None:
     done.on_rig.save(command.out)
     if command.report is not None:
         report.write_report(done.report(options.describe_request("follow", command)), command.report)
     if video is not None:
-        actors, camera = [stage_actor(done)], CameraSettings(command.camera or "follow")
+        actors, camera = [stage_actor(done, character=character)], CameraSettings(command.camera or "follow")
         with show_progress("filming", quiet=command.quiet) as progress:
             size = options.parse_size(command.size or _SIZE)
             film(actors, video, camera=camera, size=size, props=build_obstacles([done]), progress=progress)

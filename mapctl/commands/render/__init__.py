@@ -21,6 +21,9 @@ class Render(Command):
     """.mp4, .gif or .png."""
     curve: options.MaybeCurve = None
     """Curve drawn on the ground: circle:4, a CSV, an SVG (see `mapctl follow --help`)."""
+    character: options.MaybeCharacter = None
+    """File of a skinned character, as .glb or .vrm, that is drawn in place of the mannequin: with its own mesh, moved
+    as `mapctl convert --rig` moves it. A motion that is read from that file needs no conversion."""
     camera: Annotated[options.CameraKind, arg(metavar="follow|fixed|top")] = "follow"
     """Camera that follows, is fixed with all in view, or looks from above."""
     size: options.Size = "1280x720"

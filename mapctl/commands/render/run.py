@@ -4,9 +4,13 @@ from mapctl import formats
 from mapctl.commands.render import Render
 from mapctl.commands.shared import inputs, options, outputs
 from mapctl.commands.shared.progress_bar import show_progress
+from mapctl.curves import Curve
+from mapctl.motion import Motion
 from mapctl.retarget.upright import put_upright
 from scenes.cameras import CameraSettings
+from scenes.drawn_character import DrawnCharacter
 from scenes.film import film
+from scenes.stage import Shot
 
 
 def run(command: Render) -> int:
@@ -14,10 +18,19 @@ def run(command: Render) -> int:
     size = options.parse_size(command.size)
     outputs.check_film(command.out, size)
     curve = None if command.curve is None else inputs.read_curve(command.curve, command.metres_per_unit)
-    motion, notes = put_upright(formats.load(command.source))
+    shot, notes = _prepare_shot(formats.load(command.source), curve, command.character)
     with show_progress("filming", quiet=command.quiet) as progress:
         camera = CameraSettings(command.camera)
-        film([(motion, curve)], command.out, camera=camera, size=size, progress=progress)
+        film([shot], command.out, camera=camera, size=size, progress=progress)
     if not command.quiet:
-        print("\n".join((f"{command.out}: {motion.seconds:.1f} s of {size[0]}x{size[1]}", *notes)))
+        print("\n".join((f"{command.out}: {shot.motion.seconds:.1f} s of {size[0]}x{size[1]}", *notes)))
     return 0
+
+
+def _prepare_shot(motion: Motion, curve: Curve | None, character: str | None) -> tuple[Shot, tuple[str, ...]]:
+    """Put the motion upright, or on a character; also return notes on what is not known or not kept."""
+    if character is None:
+        upright, notes = put_upright(motion)
+        return Shot(upright, curve), notes
+    drawn = DrawnCharacter.load(character).put_on(motion)
+    return Shot(motion, curve, drawn=drawn), drawn.notes

@@ -11,7 +11,7 @@ from controllers.common.character import Character
 from mapctl import report
 from mapctl.commands.run import RunScene
 from mapctl.commands.shared import exit_status, options, outputs, results
-from mapctl.commands.shared.character import read_character
+from mapctl.commands.shared.character import read_character, read_drawn_character
 from mapctl.commands.shared.path_walk import Walk, parse_follow, walk
 from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.commands.shared.shots.plan import ShotPlan, plan_shot
@@ -22,8 +22,12 @@ from mapctl.errors import FileFormatError, RequestError
 from mapctl.intent.cornering import turns_sharply
 from mapctl.intent.path import PathRequest
 from priors.lstm_gmm.density import LstmGmmDensity
+from scenes.drawn_character import DrawnCharacter
 from scenes.film import film
 from scenes.scene_file import Actor, SceneDescription, load
+
+Drawn = Sequence[DrawnCharacter | None]
+"""By actor the character that is drawn, None for a mannequin."""
 
 
 def run(command: RunScene) -> int:
@@ -38,12 +42,13 @@ def run(command: RunScene) -> int:
         _plan(scene, actor, curve, prior, character, Path(path))
         for actor, curve in zip(scene.actors, curves, strict=True)
     ]
+    drawn = _read_drawn(command, scene, Path(path))
     outputs.check_folder(command.out)
     for film_path in scene.films(command.out):
         outputs.require_render("av" if film_path.suffix.lower() == ".mp4" else "PIL")
     walks, interrupted = _solve(command, scene, plans, prior, character)
     with outputs.make_folder(command.out):
-        _write(command, scene, walks, films=() if interrupted else scene.films(command.out))
+        _write(command, scene, walks, films=() if interrupted else scene.films(command.out), drawn=drawn)
     if interrupted:
         return exit_status.INTERRUPTED
     return max(results.conclude(done.solution.status, strict=command.strict) for done in walks)
@@ -61,6 +66,19 @@ def _plan(
         return plan_shot(actor, curve, prior, character=character, folder=path.parent, obstacles=obstacles)
     except RequestError as error:
         raise FileFormatError(path, f"{actor.name}: {error}") from error
+
+
+def _read_drawn(command: RunScene, scene: SceneDescription, path: Path) -> Drawn:
+    """Read each actor's character once, of those that are filmed: the scene file's own, else that of the option."""
+    if not scene.films(command.out):
+        if command.character is not None:
+            raise RequestError(f"--character is of the film, and {path} asks for none")
+        return [None] * len(scene.actors)
+    named = [
+        command.character if actor.character is None else str(path.parent / actor.character) for actor in scene.actors
+    ]
+    read = {file: read_drawn_character(file) for file in dict.fromkeys(named)}
+    return [read[file] for file in named]
 
 
 def _solve(
@@ -105,7 +123,12 @@ def _solve(
 
 
 def _write(
-    command: RunScene, scene: SceneDescription, walks: Sequence[Walk | PlayedShot], films: Sequence[Path]
+    command: RunScene,
+    scene: SceneDescription,
+    walks: Sequence[Walk | PlayedShot],
+    *,
+    films: Sequence[Path],
+    drawn: Drawn,
 ) -> None:
     motions, reports = scene.motions(command.out), scene.reports(command.out)
     begun = scene.actors[: len(walks)]
@@ -119,17 +142,21 @@ def _write(
     for path in reports:
         report.write_report(_report(command, scene, walks), path)
     if films:
-        _film(command, scene, walks, films)
+        _film(command, scene, walks, films, drawn)
     if not command.quiet:
         print(f"wrote {', '.join(map(str, written))}")
 
 
 def _film(
-    command: RunScene, scene: SceneDescription, walks: Sequence[Walk | PlayedShot], films: Sequence[Path]
+    command: RunScene,
+    scene: SceneDescription,
+    walks: Sequence[Walk | PlayedShot],
+    films: Sequence[Path],
+    drawn: Drawn,
 ) -> None:
     shots = [
-        stage_actor(done, colour=actor.colour, start_seconds=actor.start_seconds)
-        for actor, done in zip(scene.actors, walks, strict=True)
+        stage_actor(done, colour=actor.colour, start_seconds=actor.start_seconds, character=character)
+        for actor, done, character in zip(scene.actors, walks, drawn, strict=True)
     ]
     with show_progress("filming", quiet=command.quiet) as progress:
         props = build_obstacles(walks)

@@ -1,8 +1,9 @@
-"""The character of a --rig option."""
+"""The characters of --rig and --character: the body that moves, and the one that is drawn."""
 
 from controllers.common.character import Character
 from mapctl.commands.shared import inputs
 from mapctl.retarget.carry import RiggedCharacter
+from scenes.drawn_character import DrawnCharacter
 
 
 def read_character(text: str) -> Character:
@@ -11,3 +12,15 @@ def read_character(text: str) -> Character:
         return Character()
     body = RiggedCharacter.of(*inputs.read_rig_clip(text))[1]
     return Character(body.leveled, float(body.stance.toe_height.mean()), body.leveled_map, body.source)
+
+
+def read_drawn_character(text: str | None) -> DrawnCharacter | None:
+    """Read the character of a --character option, on which any motion can be put; None without the option.
+
+    FileFormatError for files without one, RequestError where its joints cannot be identified.
+    """
+    if text is None:
+        return None
+    character = DrawnCharacter.load(text)
+    character.check_rig(text)
+    return character

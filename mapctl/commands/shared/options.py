@@ -30,6 +30,7 @@ MaybeDna = Annotated[str | None, arg(metavar="CLIP|NAME,...")]
 MaybeRig = Annotated[str | None, arg(metavar="PRESET|FILE.toml|CLIP")]
 MaybeEndpoint = Annotated[str | None, arg(metavar="HOST:PORT")]
 MaybeSize = Annotated[str | None, arg(metavar="WxH")]
+MaybeCharacter = Annotated[str | None, arg(metavar="CHARACTER")]
 CameraKind = Literal["follow", "fixed", "top"]
 Size = Annotated[str, arg(metavar="WxH")]
 

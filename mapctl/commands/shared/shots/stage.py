@@ -8,16 +8,25 @@ from mapctl import kinematics
 from mapctl.commands.shared.path_walk import Walk
 from mapctl.commands.shared.shots.play import PlayedShot
 from mapctl.mesh.primitives import Surface
+from scenes.drawn_character import DrawnCharacter
 from scenes.props import build_hips_mark, build_look_mark, build_obstacle, build_target
 from scenes.stage import Shot
 from scenes.wishes import Mark, Wishes
 
 
-def stage_actor(done: Walk | PlayedShot, *, colour: str | None = None, start_seconds: float = 0.0) -> Shot:
+def stage_actor(
+    done: Walk | PlayedShot,
+    *,
+    colour: str | None = None,
+    start_seconds: float = 0.0,
+    character: DrawnCharacter | None = None,
+) -> Shot:
     """Put what an actor did on a stage, and what it was asked for: targets, places to look at, places and facings of
-    the hips, and whole poses."""
+    the hips, and whole poses. It is drawn as a character if there is one."""
     wishes = _collect_wishes(done) if isinstance(done, PlayedShot) else Wishes()
-    return Shot(done.solution.motion, done.request.curve, colour, start_seconds, wishes)
+    motion = done.solution.motion
+    drawn = None if character is None else character.put_on(motion)
+    return Shot(motion, done.request.curve, colour, start_seconds, wishes, drawn)
 
 
 def build_obstacles(done: Sequence[Walk | PlayedShot]) -> list[Surface]:

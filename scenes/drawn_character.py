@@ -1,0 +1,128 @@
+"""A user's character, drawn with its own mesh in place of the mannequin, and any motion put on it for that."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from functools import cached_property
+from os import PathLike
+
+from mapctl import formats
+from mapctl.errors import RequestError
+from mapctl.mesh.character_mesh import CharacterMesh
+from mapctl.mesh.mannequin import Mannequin
+from mapctl.mesh.primitives import Array
+from mapctl.mesh.skinned_body import SkinnedBody
+from mapctl.motion import Motion
+from mapctl.retarget import as_rig, from_canonical, to_canonical
+from mapctl.retarget.carry import RiggedCharacter, retarget_canonical
+from mapctl.retarget.figure import load_standing_character
+from mapctl.retarget.upright import put_upright
+
+_SAME_BONE = 1e-4  # metres by which bones of one character may differ between files, which round
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """A motion on a character's joints."""
+
+    motion: Motion
+    """On the joints of the character's file."""
+    bones: Motion
+    """The same on joints that are recognised: canonical ones, or the file's where they are all that is known."""
+    notes: tuple[str, ...] = ()
+    """What could not be kept."""
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnMotion:
+    """A motion put on a character, to be filmed."""
+
+    mesh: CharacterMesh
+    """The character's."""
+    placed: Placed
+    """The motion on its joints."""
+    place: Callable[[Motion], Placed]
+    """Puts further frames of the same giver on it, as poses that are asked for."""
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What could not be kept."""
+        return self.placed.notes
+
+    def build_body(self, fps: Fraction, colour: Array) -> SkinnedBody:
+        """Build the body at a film's rate; `colour` is that of its bones, where these are drawn."""
+        return _build_body(self.mesh, self.placed, fps, colour)
+
+    def build_pose(self, pose: Motion, colour: Array) -> SkinnedBody:
+        """Build the body in one frame of the giver's skeleton."""
+        return _build_body(self.mesh, self.place(pose), pose.fps, colour)
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnCharacter:
+    """A character's mesh and joints, as its file has them."""
+
+    mesh: CharacterMesh
+    """Its triangles."""
+    standing: Motion
+    """It stands on the floor in its rest pose."""
+
+    @staticmethod
+    def load(path: str | PathLike[str]) -> "DrawnCharacter":
+        """Load the character of a file; `hero.glb#ARMATURE` chooses where there are several.
+
+        FileFormatError where the file has none, or no triangles that its joints carry.
+        """
+        mesh = formats.load_mesh(path)
+        standing = load_standing_character(path)
+        assert standing is not None, "files with a mesh have a rest pose"
+        return DrawnCharacter(mesh, standing)
+
+    @cached_property
+    def body(self) -> RiggedCharacter:
+        """Its rig and stance; RequestError where its joints cannot be identified."""
+        return RiggedCharacter.of(self.standing)[1]
+
+    def check_rig(self, path: str | PathLike[str]) -> None:
+        """Raise RequestError that names the file unless motions of other rigs can be put on it."""
+        try:
+            self.body  # noqa: B018 - computed once, and kept
+        except RequestError as error:
+            raise RequestError(f"{path}: {error}") from error
+
+    def put_on(self, motion: Motion) -> DrawnMotion:
+        """Put a motion of any rig on the character.
+
+        One that is of this character already stays as it is; so does one of canonical joints with its bones. Others
+        are retargeted (mapctl.retarget.carry), as by `mapctl convert --rig`. RequestError where the joints of either
+        cannot be identified.
+        """
+        place = self._choose_way(motion)
+        return DrawnMotion(self.mesh, place(motion), place)
+
+    def _choose_way(self, motion: Motion) -> Callable[[Motion], Placed]:
+        if motion.skeleton.matches(self.standing.skeleton, _SAME_BONE):
+            return _keep
+        for rigmap in (self.body.leveled_map, self.body.rigmap):
+            if motion.skeleton.matches(rigmap.skeleton, _SAME_BONE):
+                return lambda own: Placed(from_canonical(own, rigmap), own)
+        giver = RiggedCharacter.of(motion)[1]
+
+        def retarget(part: Motion) -> Placed:
+            done = retarget_canonical(to_canonical(part, as_rig(giver.rigmap))[0], giver, self.body)
+            return Placed(self.body.on_rig(done.motion), done.motion, done.notes)
+
+        return retarget
+
+
+def _keep(motion: Motion) -> Placed:
+    upright = put_upright(motion)[0]
+    try:
+        return Placed(upright, to_canonical(upright)[0])
+    except RequestError:  # a creature, whose joints are drawn all the same
+        return Placed(upright, upright)
+
+
+def _build_body(mesh: CharacterMesh, placed: Placed, fps: Fraction, colour: Array) -> SkinnedBody:
+    motion, bones = placed.motion.resample(fps), replace(placed.bones, source=None).resample(fps)
+    return SkinnedBody(mesh, motion, Mannequin(bones, colour))
