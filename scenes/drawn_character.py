@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property
-from os import PathLike
+from os import PathLike, fspath
 
 from mapctl import formats
 from mapctl.errors import RequestError
@@ -62,6 +62,8 @@ class DrawnMotion:
 class DrawnCharacter:
     """A character's mesh and joints, as its file has them."""
 
+    path: str
+    """Its file, and what is chosen of it."""
     mesh: CharacterMesh
     """Its triangles."""
     standing: Motion
@@ -76,19 +78,19 @@ class DrawnCharacter:
         mesh = formats.load_mesh(path)
         standing = load_standing_character(path)
         assert standing is not None, "files with a mesh have a rest pose"
-        return DrawnCharacter(mesh, standing)
+        return DrawnCharacter(fspath(path), mesh, standing)
 
     @cached_property
     def body(self) -> RiggedCharacter:
         """Its rig and stance; RequestError where its joints cannot be identified."""
         return RiggedCharacter.of(self.standing)[1]
 
-    def check_rig(self, path: str | PathLike[str]) -> None:
+    def check_rig(self) -> None:
         """Raise RequestError that names the file unless motions of other rigs can be put on it."""
         try:
             self.body  # noqa: B018 - computed once, and kept
         except RequestError as error:
-            raise RequestError(f"{path}: {error}") from error
+            raise RequestError(f"{self.path}: {error}") from error
 
     def put_on(self, motion: Motion) -> DrawnMotion:
         """Put a motion of any rig on the character.
@@ -105,7 +107,7 @@ class DrawnCharacter:
             return _keep
         for rigmap in (self.body.leveled_map, self.body.rigmap):
             if motion.skeleton.matches(rigmap.skeleton, _SAME_BONE):
-                return lambda own: Placed(from_canonical(own, rigmap), own)
+                return lambda own: Placed(replace(from_canonical(own, rigmap), source=self.standing.source), own)
         giver = RiggedCharacter.of(motion)[1]
 
         def retarget(part: Motion) -> Placed:

@@ -48,9 +48,7 @@ class StagedWishes:
     """Bodies in the poses."""
 
     @staticmethod
-    def of(
-        wishes: Wishes, motion: Motion, start_seconds: float, drawn: DrawnMotion | None = None
-    ) -> "StagedWishes":
+    def of(wishes: Wishes, motion: Motion, start_seconds: float, drawn: DrawnMotion | None = None) -> "StagedWishes":
         """Prepare the wishes of an actor whose motion, at the film's rate, starts at a time; of a character that is
         drawn with its own mesh poses are shown with it too."""
         marks, fps = [], motion.fps

@@ -22,7 +22,7 @@ from mapctl.errors import MapctlError, RequestError
 from mapctl.intent.steering import Arrival, Command
 from mapctl.runtime.live_protocol import FrameChunk
 from mapctl.runtime.processes import send_queued, spawn
-from mapctl.skeleton import CANONICAL, Skeleton
+from mapctl.skeleton import Skeleton
 
 __all__ = ["CharacterProcess", "CharacterRequest"]
 
@@ -34,11 +34,10 @@ _PROCESS_ENDED = "a character's process ended by itself"
 class CharacterProcess:
     """A LiveCharacter (mapctl.runtime.live_protocol) in a process of its own."""
 
-    skeleton: Skeleton = CANONICAL
-
     def __init__(self, request: CharacterRequest):
         """Start the process; several start in parallel if all are made before the first `wait`."""
         self._request = request
+        self.skeleton: Skeleton = request.skeleton
         self._start()
 
     def wait(self) -> None:

@@ -21,6 +21,7 @@ from mapctl.errors import MapctlError
 from mapctl.intent.steering import Arrival, Command
 from mapctl.protocols import Density
 from mapctl.runtime.live_protocol import FrameChunk
+from mapctl.skeleton import CANONICAL, Skeleton
 
 _WARM_UP_STEPS = 3  # steps before the clock starts, which compile and load what is needed
 
@@ -39,6 +40,8 @@ class CharacterRequest:
     """Position of the first pose, x and z in metres."""
     settings: SteerSettings = field(default_factory=SteerSettings)
     """Sigmas, window lengths and budget."""
+    skeleton: Skeleton = CANONICAL
+    """Bones of the character, on canonical joints; the toes' height of its stance is that of the settings' footing."""
     transitions: Callable[[], Any] | None = None
     """Loader of who makes the way to a place, called there too; without one the character can be sent nowhere."""
 
@@ -159,7 +162,9 @@ def _run_character(connection: Connection, request: CharacterRequest) -> None:
     clock = ProcessClock(connection, pilot, prior)
     stepper = steer.step if request.transitions is None else Arriver(request.transitions())
     for number in itertools.count():
-        state, pose = steer.begin(prior, first, generator=generator, at=request.at, settings=request.settings)
+        state, pose = steer.begin(
+            prior, first, generator=generator, at=request.at, settings=request.settings, skeleton=request.skeleton
+        )
         if number == 0:
             for _ in range(_WARM_UP_STEPS):
                 steer.step(state, first)

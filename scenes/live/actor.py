@@ -11,31 +11,40 @@ from mapctl.curves.obstacles import Obstacle
 from mapctl.features import PRIOR_FPS
 from mapctl.mesh import colours
 from mapctl.runtime.live_protocol import FrameChunk, LiveCharacter
+from scenes.drawn_character import DrawnCharacter
 from scenes.live import ground
+from scenes.live.bodies.body import BodyPose, LiveBody
+from scenes.live.bodies.mannequin import LiveMannequin
+from scenes.live.bodies.skinned import LiveCharacterBody
 from scenes.live.inputs import SteeringInputs
 from scenes.live.realtime import RealtimeMonitor
 from scenes.live.recording import Recording
-from scenes.live.skinned_character import SkinnedCharacter
 
 
 class LiveActor:
-    """A LiveCharacter with its mannequin, orders, pace and recording."""
+    """A LiveCharacter with its body, orders, pace and recording."""
 
     def __init__(
-        self, scene: viser.SceneApi, world: str, number: int, character: LiveCharacter, orders: SteeringInputs
+        self,
+        scene: viser.SceneApi,
+        world: str,
+        number: int,
+        character: LiveCharacter,
+        orders: SteeringInputs,
+        drawn: DrawnCharacter | None = None,
     ):
-        """Set up character `number`, from 0, with its nodes below the node `world`."""
+        """Set up character `number`, from 0, with its nodes below the node `world`; it is `drawn` with a mesh of its
+        own, on whose bones it moves, or as a mannequin."""
         self.name = f"character {number + 1}"
         self.character, self.orders, self.first = character, orders, orders
         self.pace = RealtimeMonitor()
         self.recording: Recording | None = None
         self.gone = ""  # why it is no more
         self.place = np.zeros(2)
-        self._puppet = SkinnedCharacter(
-            scene, f"{world}/character{number + 1}", character.skeleton, colours.default_colour(number)
-        )
+        self.drawn = drawn
+        self._body = _add_body(scene, f"{world}/character{number + 1}", number, character, drawn)
         self._marks = ground.GroundMarks(scene, f"{world}/marks{number + 1}", character.skeleton)
-        self._waiting: deque[tuple[float, FrameChunk, int]] = deque()
+        self._waiting: deque[tuple[float, FrameChunk, int, BodyPose]] = deque()
 
     def command(self, obstacles: Sequence[Obstacle] = ()) -> None:
         """Send the character its orders; it leaves its path."""
@@ -73,7 +82,8 @@ class LiveActor:
         if self.recording is not None:
             self.recording.add(delivered)
         self.pace.add(now, delivered)
-        self._waiting.extend((delivered.due + k / PRIOR_FPS, delivered, k) for k in range(len(delivered.root)))
+        poses = self._body.prepare(delivered.motion(self.character.skeleton))
+        self._waiting.extend((delivered.due + k / PRIOR_FPS, delivered, k, pose) for k, pose in enumerate(poses))
         self._marks.forecast(delivered.forecast)
 
     def show_due(self, now: float) -> None:
@@ -84,8 +94,16 @@ class LiveActor:
         if due is not None:
             self._pose(*due[1:])
 
-    def _pose(self, delivered: FrameChunk, frame: int) -> None:
-        self._puppet.pose(delivered.root[frame], delivered.quats[frame])
+    def _pose(self, delivered: FrameChunk, frame: int, pose: BodyPose) -> None:
+        self._body.pose(pose)
         self.place = delivered.root[frame, ::2]
         joints = delivered.motion(self.character.skeleton).joint_positions()[frame].numpy()
         self._marks.planted(joints, delivered.contacts[frame])
+
+
+def _add_body(
+    scene: viser.SceneApi, name: str, number: int, character: LiveCharacter, drawn: DrawnCharacter | None
+) -> LiveBody:
+    if drawn is None:
+        return LiveMannequin(scene, name, character.skeleton, colours.default_colour(number))
+    return LiveCharacterBody(scene, name, drawn)

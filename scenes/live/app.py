@@ -18,6 +18,7 @@ from mapctl.errors import MapctlError
 from mapctl.features import PRIOR_FPS
 from mapctl.runtime.live_protocol import LiveCharacter
 from mapctl.streaming.protocols import FrameStream, MessageSource
+from scenes.drawn_character import DrawnCharacter
 from scenes.live import ground
 from scenes.live.access import ServerErrorReporter, restrict_to_own_pages
 from scenes.live.actor import LiveActor
@@ -53,10 +54,12 @@ class LiveApp:
         labels: Mapping[str, Sequence[str]],
         stream: FrameStream | None = None,
         source: MessageSource | None = None,
+        drawn: Sequence[DrawnCharacter | None] = (),
     ):
         """Open the page. `fastest` is the prior's, m/s; `labels` are the prior's, by group.
 
-        Frames also go to `stream`, and orders also come from `source`; whoever made these closes them.
+        Frames also go to `stream`, and orders also come from `source`; whoever made these closes them. `drawn` are the
+        meshes by character; where there is none a mannequin is shown.
         """
         with redirect_stdout(io.StringIO()), restrict_to_own_pages():  # viser greets in a box of its own
             self.server = viser.ViserServer(host=HOST, port=port, label="mapctl live", verbose=False)
@@ -70,7 +73,8 @@ class LiveApp:
         ground.add_grid(scene, f"{_WORLD}/grid")
         self._path = ground.DrawnPath(scene, f"{_WORLD}/path")
         self._members = [
-            LiveActor(scene, _WORLD, k, *pair) for k, pair in enumerate(zip(characters, orders, strict=True))
+            LiveActor(scene, _WORLD, k, *one)
+            for k, one in enumerate(zip(characters, orders, drawn or [None] * len(characters), strict=True))
         ]
         self._chosen, self._is_paused = 0, False
         self._stream, self._began = stream, 0.0
@@ -114,7 +118,7 @@ class LiveApp:
         for member in self._members:
             member.recording = None
         return [
-            save_without_replacing(encode_with_fallback(recording.motion(), FORMATS[0]), folder)
+            save_without_replacing(encode_with_fallback(recording.motion(), FORMATS[0], recording.drawn), folder)
             for recording in pending
         ]
 
@@ -249,7 +253,7 @@ class LiveApp:
         def toggled() -> None:
             member = self._chosen_member
             if member.recording is None:
-                member.recording = Recording(member.character.skeleton)
+                member.recording = Recording(member.character.skeleton, member.drawn)
             else:
                 recording, member.recording = member.recording, None
                 ending = self._panel.ending.value if self._panel.ending.value in FORMATS else FORMATS[0]

@@ -16,9 +16,11 @@ from mapctl.rotations import make_sign_continuous
 from mapctl.runtime.live_protocol import FrameChunk
 from mapctl.runtime.processes import spawn
 from mapctl.skeleton import Skeleton
+from scenes.drawn_character import DrawnCharacter
 from scenes.film import film
 from scenes.live.access import format_error
 from scenes.live.notifications import Notifications
+from scenes.stage import Shot
 
 FORMATS = ("bvh", "glb", "mp4")
 
@@ -28,6 +30,7 @@ class Recording:
     """Frames of one character, from one time on."""
 
     skeleton: Skeleton
+    drawn: DrawnCharacter | None = None
     pieces: list[Motion] = field(default_factory=list)
 
     def add(self, delivered: FrameChunk) -> None:
@@ -35,12 +38,13 @@ class Recording:
         self.pieces.append(delivered.motion(self.skeleton))
 
     def motion(self) -> Motion:
-        """Join all frames to a motion; RequestError where there are none."""
+        """Join all frames to a motion, on the joints of the character that is drawn; RequestError without frames."""
         if not self.pieces:
             raise RequestError("nothing was recorded")
         root = torch.cat([piece.root_position for piece in self.pieces])
         quats = make_sign_continuous(torch.cat([piece.local_quat_xyzw for piece in self.pieces]))
-        return Motion(self.skeleton, self.pieces[0].fps, root, quats)
+        motion = Motion(self.skeleton, self.pieces[0].fps, root, quats)
+        return motion if self.drawn is None else self.drawn.put_on(motion).placed.motion
 
 
 @dataclass(frozen=True)
@@ -70,7 +74,7 @@ class RecordingDelivery:
         """Encode a recording and give it to the browser that asked; errors are said."""
         torch.set_num_threads(1)
         try:
-            made = encode_with_fallback(recording.motion(), ending)
+            made = encode_with_fallback(recording.motion(), ending, recording.drawn)
             if made.ending != ending:
                 self._notices.event(f"No {ending} could be made, here is a {made.ending}", made.fallback_reason)
             self._send(made, client)
@@ -90,10 +94,10 @@ class RecordingDelivery:
         return client.send_file_download(made.name, made.content, save_immediately=True)
 
 
-def encode_with_fallback(motion: Motion, ending: str) -> RecordedFile:
+def encode_with_fallback(motion: Motion, ending: str, drawn: DrawnCharacter | None = None) -> RecordedFile:
     """Encode a file of that ending, or a BVH where none can be made, so that no recording is lost."""
     try:
-        return RecordedFile(ending, encode_motion(motion, ending))
+        return RecordedFile(ending, encode_motion(motion, ending, drawn))
     except Exception as error:
         if ending == FORMATS[0]:
             raise
@@ -110,8 +114,9 @@ def save_without_replacing(made: RecordedFile, folder: Path) -> Path:
     raise AssertionError  # there is always another number
 
 
-def encode_motion(motion: Motion, ending: str) -> bytes:
-    """Encode a file of one of FORMATS. A film is drawn in a process of its own, which takes a while."""
+def encode_motion(motion: Motion, ending: str, drawn: DrawnCharacter | None = None) -> bytes:
+    """Encode a file of one of FORMATS. A film is drawn in a process of its own, which takes a while; it shows the
+    character that the motion is of, if there is one."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"motion.{ending}"
         if ending != "mp4":
@@ -119,12 +124,14 @@ def encode_motion(motion: Motion, ending: str) -> bytes:
             return path.read_bytes()
         kept = Path(folder) / "motion.npz"
         formats.save(motion, kept)
-        painter = spawn(_render_film, kept, path)
+        painter = spawn(_render_film, kept, path, None if drawn is None else drawn.path)
         painter.join()
         if not path.is_file():
             raise MapctlError("the film could not be drawn; `mapctl render` on a recorded BVH says why")
         return path.read_bytes()
 
 
-def _render_film(source: Path, out: Path) -> None:
-    film([(formats.load(source), None)], out)
+def _render_film(source: Path, out: Path, character: str | None) -> None:
+    motion = formats.load(source)
+    drawn = None if character is None else DrawnCharacter.load(character).put_on(motion)
+    film([Shot(motion, drawn=drawn)], out)

@@ -92,9 +92,7 @@ def _check(command: FollowCurve) -> None:
         outputs.check_film(command.video, options.parse_size(command.size or _SIZE))
 
 
-def _write(
-    command: FollowCurve, done: Walk | PlayedShot, video: Path | None, character: DrawnCharacter | None
-) -> None:
+def _write(command: FollowCurve, done: Walk | PlayedShot, video: Path | None, character: DrawnCharacter | None) -> None:
     done.on_rig.save(command.out)
     if command.report is not None:
         report.write_report(done.report(options.describe_request("follow", command)), command.report)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Annotated
 
-from tyro.conf import arg
+from tyro.conf import UseAppendAction, arg
 
 from mapctl.commands.shared import options
 from mapctl.commands.shared.command import Command
@@ -17,6 +17,9 @@ class Live(Command):
     """Port of the page, on 127.0.0.1 only; the next free port if this one is taken."""
     characters: options.Count = 1
     """Number of characters, side by side; each computes on a core of its own as long as there are cores."""
+    character: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="CHARACTER")] = ()
+    """File of a skinned character, as .glb or .vrm, that is shown with its own mesh and moves on its own bones; may be
+    given several times, for the first character, the second and so on, and the last one for all others."""
     prior: options.Name = "locomotion-live"
     """A bundled prior, or the file or run folder of a trained one."""
     seed: options.Count = 0

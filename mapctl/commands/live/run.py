@@ -7,12 +7,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import priors
+from controllers.common.character import Character
 from controllers.steering.process import CharacterProcess, CharacterRequest
+from controllers.steering.steer import SteerSettings
 from mapctl.commands.live import Live
 from mapctl.commands.shared import options, streaming
+from mapctl.commands.shared.character import as_character, read_drawn_character
 from mapctl.errors import RequestError
 from mapctl.intent.steering import Command
 from mapctl.runtime.processes import reraise_ctrl_c
+from mapctl.terms import FootContact
+from scenes.drawn_character import DrawnCharacter
 from scenes.live.app import LiveApp
 from scenes.live.inputs import SteeringInputs
 
@@ -58,10 +63,10 @@ def _serve(command: Live, receiver: "OscReceiver | None") -> int:
 
 
 def _open_app(command: Live, receiver: "OscReceiver | None") -> "tuple[LiveApp, PoseStream | None]":
-    prior = priors.load(command.prior)
+    prior, drawn = priors.load(command.prior), _read_drawn(command)
     orders = [SteeringInputs() for _ in range(command.characters)]
     with reraise_ctrl_c():
-        characters = _start_characters(command)
+        characters = _start_characters(command, drawn)
     try:
         skeletons = [character.skeleton for character in characters]
         stream = streaming.open_stream(_stream(command), skeletons)
@@ -73,6 +78,7 @@ def _open_app(command: Live, receiver: "OscReceiver | None") -> "tuple[LiveApp, 
             labels=prior.labels,
             stream=stream,
             source=receiver,
+            drawn=drawn,
         )
         return show, stream
     except BaseException:
@@ -87,6 +93,10 @@ def _check(command: Live) -> None:
         raise RequestError(f"the port must be a number from 1 to 65535, got {command.port}")
     if not 1 <= command.characters <= _MAX_CHARACTERS:
         raise RequestError(f"--characters must be 1 to {_MAX_CHARACTERS}, got {command.characters}")
+    if len(command.character) > command.characters:
+        raise RequestError(
+            f"--character is given {len(command.character)} times for {command.characters} of --characters"
+        )
     for package in ("viser", "trimesh"):
         if find_spec(package) is None:
             raise RequestError(f"this needs the package {package}: pip install 'mapctl[live]'")
@@ -97,16 +107,30 @@ def _stream(command: Live) -> streaming.StreamOptions:
     return streaming.StreamOptions(command.stream, command.stream_root, command.stream_delay)
 
 
-def _start_characters(command: Live) -> Sequence[CharacterProcess]:
+def _read_drawn(command: Live) -> list[DrawnCharacter | None]:
+    """Read the file of each character; those without one are mannequins."""
+    read = {file: read_drawn_character(file) for file in dict.fromkeys(command.character)}
+    files = [*command.character, *command.character[-1:] * (command.characters - len(command.character))]
+    return [read[file] for file in files] or [None] * command.characters
+
+
+def _start_characters(command: Live, drawn: Sequence[DrawnCharacter | None]) -> Sequence[CharacterProcess]:
     load = functools.partial(priors.load, command.prior)
     positions = [
         (_START_SPACING * (number - (command.characters - 1) / 2), 0.0) for number in range(command.characters)
     ]
     found: list[CharacterProcess] = []
     try:
-        for number, at in enumerate(positions):
+        for number, (at, body) in enumerate(zip(positions, drawn, strict=True)):
+            own = Character() if body is None else as_character(body.body)
             request = CharacterRequest(
-                load, Command(1.2, 0.0), command.seed + number, at, transitions=priors.load_stitcher
+                load,
+                Command(1.2, 0.0),
+                command.seed + number,
+                at,
+                SteerSettings(footing=FootContact(rest_height=own.toe_rest_height)),
+                own.skeleton,
+                transitions=priors.load_stitcher,
             )
             found.append(CharacterProcess(request))
         for character in found:

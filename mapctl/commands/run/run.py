@@ -148,11 +148,7 @@ def _write(
 
 
 def _film(
-    command: RunScene,
-    scene: SceneDescription,
-    walks: Sequence[Walk | PlayedShot],
-    films: Sequence[Path],
-    drawn: Drawn,
+    command: RunScene, scene: SceneDescription, walks: Sequence[Walk | PlayedShot], films: Sequence[Path], drawn: Drawn
 ) -> None:
     shots = [
         stage_actor(done, colour=actor.colour, start_seconds=actor.start_seconds, character=character)

@@ -10,7 +10,11 @@ def read_character(text: str) -> Character:
     """Read the character: canonical, of a clip's skeleton, or with canonical bones on a preset's joints."""
     if text == "canonical":
         return Character()
-    body = RiggedCharacter.of(*inputs.read_rig_clip(text))[1]
+    return as_character(RiggedCharacter.of(*inputs.read_rig_clip(text))[1])
+
+
+def as_character(body: RiggedCharacter) -> Character:
+    """Return the body of a rig as one that is moved by controllers."""
     return Character(body.leveled, float(body.stance.toe_height.mean()), body.leveled_map, body.source)
 
 
@@ -22,5 +26,5 @@ def read_drawn_character(text: str | None) -> DrawnCharacter | None:
     if text is None:
         return None
     character = DrawnCharacter.load(text)
-    character.check_rig(text)
+    character.check_rig()
     return character

@@ -1,16 +1,17 @@
-"""A character in the browser: its mannequin sent once, skinned to joints that are then rotated."""
+"""The mannequin in the browser sent once, skinned to joints that are then rotated."""
 
 import numpy as np
 import trimesh
 import viser
 from trimesh.visual import ColorVisuals
 
-from mapctl.mesh.primitives import Array
 from mapctl.mesh.skinning import Skin, at_rest, build_skin
+from mapctl.motion import Motion
 from mapctl.skeleton import Skeleton
+from scenes.live.bodies.body import BodyPose
 
 
-class SkinnedCharacter:
+class LiveMannequin:
     """The mannequin of a skeleton below a node of a scene."""
 
     def __init__(self, scene: viser.SceneApi, name: str, skeleton: Skeleton, colour: str):
@@ -24,10 +25,15 @@ class SkinnedCharacter:
             if (part := _extract_part(body, joint)) is not None:
                 scene.add_mesh_trimesh(f"{paths[joint]}/skin", part)
 
-    def pose(self, root: Array, quats: Array) -> None:
-        """Set the root's position (3,), metres, and the rotation of every joint (joints, 4), xyzw."""
-        self._joints[0].position = root
-        for handle, (x, y, z, w) in zip(self._joints, quats, strict=True):
+    def prepare(self, motion: Motion) -> list[BodyPose]:
+        """Prepare the poses of delivered frames: position of the root, and local rotation of every joint."""
+        roots, quats = motion.root_position.numpy(), motion.local_quat_xyzw.numpy()
+        return [BodyPose(root[None], turns) for root, turns in zip(roots, quats, strict=True)]
+
+    def pose(self, pose: BodyPose) -> None:
+        """Move the root and turn the joints."""
+        self._joints[0].position = pose.positions[0]
+        for handle, (x, y, z, w) in zip(self._joints, pose.quat_xyzw, strict=True):
             handle.wxyz = (w, x, y, z)
 
 
