@@ -1,11 +1,12 @@
 """The body of one actor over a whole motion, as whoever paints it sees it."""
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from mapctl.mesh.anatomy import Anatomy
 from mapctl.mesh.primitives import Array, Surface
 
 
+@runtime_checkable
 class Body(Protocol):
     """A mannequin, or a character with a mesh of its own."""
 

@@ -32,7 +32,7 @@ def test_it_listens_on_this_machine_only(show):
 def test_a_port_that_is_taken_is_said_and_another_one_serves(monkeypatch, capsys, prior):
     """As `mapctl live` does it; the process of a character is left out."""
     actor = Actor()
-    monkeypatch.setattr(live, "_start_characters", lambda command: [actor])
+    monkeypatch.setattr(live, "_start_characters", lambda *_: [actor])
     monkeypatch.setattr(LiveApp, "run", lambda show: (_ for _ in ()).throw(KeyboardInterrupt))
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))

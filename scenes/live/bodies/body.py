@@ -1,7 +1,7 @@
 """What the viewer asks of a body in the browser."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from mapctl.mesh.primitives import Array
 from mapctl.motion import Motion
@@ -17,6 +17,7 @@ class BodyPose:
     """(n or more, 4) their rotations."""
 
 
+@runtime_checkable
 class LiveBody(Protocol):
     """A body below a node of the scene."""
 

@@ -1,5 +1,7 @@
 """A character's own mesh in the browser: sent once with its weights, then only its bones are moved."""
 
+from dataclasses import replace
+
 import numpy as np
 import viser
 
@@ -27,9 +29,10 @@ class LiveCharacterBody:
         carriers = find_carriers(character.body.leveled_map)
         self._joints = np.unique(carriers)
         shares = _sum_shares(mesh, np.searchsorted(self._joints, carriers), len(self._joints))
+        same = _find_same(np.column_stack([mesh.vertices, shares]))
         self._bones: list[tuple[int, viser.MeshSkinnedBoneHandle]] = []
         for number, group in enumerate(part_by_colour(mesh, _MOST_COLOURS)):
-            self._add_group(scene, f"{name}/skin{number}", group, shares)
+            self._add_group(scene, f"{name}/skin{number}", replace(group, faces=same[group.faces]), shares)
 
     def prepare(self, motion: Motion) -> list[BodyPose]:
         """Prepare the poses of frames on canonical joints with the character's bones: where its moving joints are."""
@@ -46,10 +49,7 @@ class LiveCharacterBody:
 
     def _add_group(self, scene: viser.SceneApi, name: str, group: ColourGroup, shares: Array) -> None:
         mesh = self._character.mesh
-        rows = np.column_stack([mesh.vertices, shares])
-        _, kept, merged = np.unique(rows.round(_DIGITS), axis=0, return_index=True, return_inverse=True)
-        used, faces = np.unique(merged.reshape(-1)[group.faces], return_inverse=True)
-        vertices = kept[used]
+        vertices, faces = np.unique(group.faces, return_inverse=True)
         bones = np.flatnonzero(shares[vertices].max(axis=0) > 0)
         handle = scene.add_mesh_skinned(
             name,
@@ -76,6 +76,13 @@ def find_carriers(rigmap: RigMap) -> Array:
     for joint, parent in enumerate(parents):
         found.append(joint if joint in moving or parent < 0 else found[parent])
     return np.array(found)
+
+
+def _find_same(rows: Array) -> Array:
+    """Return for each row the first of those that are the same: a browser's light is smooth over shared vertices
+    only, and files have several at a place where pictures meet."""
+    _, first, number = np.unique(rows.round(_DIGITS), axis=0, return_index=True, return_inverse=True)
+    return first[number.reshape(-1)]
 
 
 def _sum_shares(mesh: CharacterMesh, bone: Array, count: int) -> Array:

@@ -1,0 +1,294 @@
+"""Characters in films: their own mesh is where the file's matrices have it, stands on the floor, and is in the picture."""
+
+import logging
+from dataclasses import replace
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import torch
+from character_maker import make_character_glb
+from glb_viewer import GlbViewer
+from helpers import random_motion, turn_between
+from helpers import walk as long_walk
+from scenes_walks import walk
+
+from mapctl import formats
+from mapctl.contacts import detect_contacts
+from mapctl.errors import FileFormatError, MapctlError, RequestError
+from mapctl.mesh import colours
+from mapctl.mesh.character_mesh import CharacterMesh
+from mapctl.mesh.mannequin import Mannequin
+from mapctl.mesh.skinned_body import SkinnedBody
+from mapctl.retarget import to_canonical
+from mapctl.retarget.carry import RiggedCharacter, retarget_motion
+from mapctl.skeleton import CANONICAL, TOE_JOINTS
+from scenes.cameras import CameraSettings
+from scenes.content import Figure
+from scenes.drawn_character import DrawnCharacter
+from scenes.film import film
+from scenes.renderers import offscreen
+from scenes.renderers.select import select_painter
+from scenes.stage import Shot, Stage
+from scenes.wishes import Wishes
+
+GREY = colours.rgb("slate")
+MAKES = {
+    "mixamo": {"pose": "A"},
+    "two-skins": {"second_skin": True, "compact": True, "extra_nodes": True, "interpolation": "CUBICSPLINE"},
+    "unreal": {"names": "unreal", "root": "root", "size": 1.3, "bind": "armature", "matrices": True},
+    "vrm": {"names": "vrm", "armature_scale": 1.0, "zup_armature": False, "size": 0.6},
+}
+
+
+def has_graphics() -> bool:
+    try:
+        return bool(select_painter("egl"))
+    except offscreen.NoGraphicsError:
+        return False
+
+
+needs_graphics = pytest.mark.skipif(not has_graphics(), reason="no OpenGL without a window here")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("characters")
+
+
+@pytest.fixture(scope="module")
+def made(folder):
+    return {
+        name: make_character_glb(folder / f"{name}.{'vrm' if name == 'vrm' else 'glb'}", animations=("walk",), **make)
+        for name, make in MAKES.items()
+    }
+
+
+@pytest.fixture(scope="module")
+def hero(made):
+    return DrawnCharacter.load(made["mixamo"].path)
+
+
+def vertices_of(body, frame: int) -> np.ndarray:
+    return body.surface(frame).vertices
+
+
+@pytest.mark.parametrize("name", MAKES)
+def test_a_character_in_its_own_motion_is_where_its_file_has_it(made, name):
+    path, viewer = made[name].path, GlbViewer(made[name].path)
+    motion = formats.load(path)
+    drawn = DrawnCharacter.load(path).put_on(motion)
+    assert drawn.notes == ()
+    assert drawn.placed.motion is motion, "nothing is converted"
+    body = drawn.build_body(motion.fps, GREY)
+    for frame in (0, 7, 19, 30):
+        np.testing.assert_allclose(vertices_of(body, frame), viewer.skinned(0, frame / 30), atol=1e-5)
+
+
+@pytest.mark.parametrize("name", MAKES)
+def test_any_motion_is_put_on_it_as_convert_does(made, name, tmp_path):
+    path, clip = made[name].path, long_walk(45)
+    drawn = DrawnCharacter.load(path).put_on(clip)
+    written = tmp_path / f"walk{path.suffix}"
+    drawn.placed.motion.save(written)
+    viewer, body = GlbViewer(written), drawn.build_body(clip.fps, GREY)
+    for frame in (0, 20, 44):
+        np.testing.assert_allclose(vertices_of(body, frame), viewer.skinned(0, frame / 30), atol=1e-5)
+    own = RiggedCharacter.of(DrawnCharacter.load(path).standing)[1]
+    expected = own.on_rig(retarget_motion(clip, own).motion)
+    np.testing.assert_allclose(drawn.placed.motion.joint_positions(), expected.joint_positions(), atol=1e-9)
+
+
+@pytest.mark.parametrize("name", MAKES)
+def test_its_soles_are_on_the_floor_while_feet_are_planted(made, name):
+    clip = long_walk(90)
+    body = DrawnCharacter.load(made[name].path).put_on(clip).build_body(clip.fps, GREY)
+    lowest = np.array([vertices_of(body, frame)[:, 1].min() for frame in range(90)])
+    assert lowest.min() > -0.03
+    planted = detect_contacts(clip.joint_positions()[:, TOE_JOINTS], 30).any(dim=1).numpy()
+    assert planted.sum() > 30
+    assert np.abs(lowest[planted]).mean() < 0.015
+
+
+def test_normals_are_unit_and_point_outside_after_posing(hero):
+    body = hero.put_on(long_walk(20)).build_body(Fraction(30), GREY)
+    surface = body.surface(11)
+    np.testing.assert_allclose(np.linalg.norm(surface.normals, axis=1), 1, atol=1e-5)
+    corners = surface.vertices[surface.faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    outward = np.einsum("fi,fi->f", across, surface.normals[surface.faces].mean(axis=1))
+    assert (outward > 0)[np.linalg.norm(across, axis=1) > 1e-6].mean() > 0.97
+
+
+def test_far_from_the_origin_it_is_as_exact(hero):
+    clip = hero.put_on(long_walk(5)).placed.motion
+    away = replace(clip, root_position=clip.root_position + torch.tensor([4000.0, 0.0, -3000.0]))
+    near, far = (
+        SkinnedBody(hero.mesh, motion, Mannequin(to_canonical(motion)[0], GREY)).surface(3) for motion in (clip, away)
+    )
+    np.testing.assert_allclose(far.vertices - [4000.0, 0.0, -3000.0], near.vertices, atol=1e-5)
+
+
+def test_a_motion_with_the_characters_bones_keeps_them_as_they_are(hero):
+    """As `follow --rig hero.glb` solves: what the solver placed is drawn, to the micrometre."""
+    solved = random_motion(hero.body.leveled, 6, seed=3)
+    drawn = hero.put_on(solved)
+    joints = hero.body.leveled_map.joints
+    placed, wanted = drawn.placed.motion.joint_positions(), solved.joint_positions()
+    for name in ("hips", "leftLowerArm", "rightHand", "leftLowerLeg", "rightFoot"):
+        np.testing.assert_allclose(placed[:, joints[name]], wanted[:, CANONICAL.index(name)], atol=1e-6)
+    assert drawn.placed.bones is solved
+
+
+def test_a_creature_is_drawn_in_its_own_motion_and_takes_no_other(folder):
+    names = {joint: f"part{number}" for number, joint in enumerate(make_character_glb(folder / "x.glb").joint)}
+    made = make_character_glb(folder / "creature.glb", names=names, animations=("walk",))
+    creature, motion = DrawnCharacter.load(made.path), formats.load(made.path)
+    chain = replace(motion.skeleton, parents=(-1, *range(motion.num_joints - 1)))
+    strange = DrawnCharacter("creature.glb", creature.mesh, replace(creature.standing, skeleton=chain))
+    own = replace(motion, skeleton=chain)
+    body = strange.put_on(own).build_body(Fraction(30), GREY)
+    assert np.isfinite(vertices_of(body, 5)).all()
+    with pytest.raises(RequestError, match=r"^creature.glb: "):
+        strange.check_rig()
+    with pytest.raises(RequestError):
+        strange.put_on(walk())
+
+
+def test_what_is_no_character_is_refused(tmp_path):
+    walk().save(tmp_path / "walk.bvh")
+    with pytest.raises(FileFormatError, match=r"is no character's file"):
+        DrawnCharacter.load(tmp_path / "walk.bvh")
+    with pytest.raises(MapctlError):
+        DrawnCharacter.load(tmp_path / "missing.glb")
+
+
+def test_mesh_and_motion_must_fit(hero):
+    clip = walk(4)
+    with pytest.raises(MapctlError, match="4 frames got 21 joints and 4 frames"):
+        SkinnedBody(hero.mesh, clip, Mannequin(clip, GREY))
+    placed = hero.put_on(clip).placed
+    with pytest.raises(MapctlError, match="and 3 frames got"):
+        SkinnedBody(hero.mesh, placed.motion, Mannequin(placed.bones.slice(0, 3), GREY))
+
+
+def test_a_film_at_another_rate_shows_the_character_there(hero):
+    clip = long_walk(60)
+    drawn = hero.put_on(clip)
+    stage = Stage([Shot(clip, drawn=drawn)], fps=10)
+    assert stage.num_frames == 20
+    same = drawn.build_body(Fraction(30), GREY)
+    np.testing.assert_allclose(vertices_of(stage.players[0].body, 7), vertices_of(same, 21), atol=1e-6)
+
+
+def test_trail_marks_and_shadow_are_the_characters_own(folder):
+    clip = long_walk(90)
+    made = make_character_glb(folder / "child.glb", size=0.6)
+    drawn = DrawnCharacter.load(made.path).put_on(clip)
+    plain, dressed = Stage([Shot(clip)]), Stage([Shot(clip, drawn=drawn)])
+    ways = [stage.players[0].trail.vertices[:, 2].max() for stage in (plain, dressed)]
+    assert 0.5 < ways[1] / ways[0] < 0.75, "a child goes less far"
+    hips = dressed.players[0].body.anatomy.hips_world
+    assert hips[:, 1].mean() == pytest.approx(0.6 * 0.97, abs=0.05)
+    assert dressed.players[0].planted.mean() == pytest.approx(plain.players[0].planted.mean(), abs=0.15)
+    ends, radii, rgb = dressed.players[0].body.sticks(40)
+    assert len(ends) == len(radii) == len(rgb) > 10
+
+
+def test_all_of_a_character_is_in_view(folder):
+    made = make_character_glb(folder / "hat.glb", hat=True)
+    motion = walk(12)
+    drawn = DrawnCharacter.load(made.path).put_on(motion)
+    stage = Stage([Shot(motion, drawn=drawn)])
+    body = stage.players[0].body
+    top = vertices_of(body, 6)[:, 1].max()
+    assert body.seen[6, :, 1].max() == pytest.approx(top, abs=0.02), "the hat is over the head"
+    assert Mannequin(motion, GREY).seen[6, :, 1].max() < top - 0.05
+    for view, frame in zip(stage.views(CameraSettings("follow"), (160, 90)), range(12), strict=True):
+        at = view.project(vertices_of(body, frame))
+        assert (at[:, :2] > 0).all()
+        assert (at[:, :2] < [160, 90]).all()
+
+
+def test_ghosts_are_paler_and_keep_opacity(folder):
+    made = make_character_glb(folder / "hat.glb", hat=True)
+    drawn = DrawnCharacter.load(made.path).put_on(walk(8))
+    body = drawn.build_body(Fraction(12), GREY)
+    plain, ghost = Figure(body, 3).surface(), Figure(body, 3, fade=0.5).surface()
+    background = colours.rgb(colours.BACKGROUND)
+    np.testing.assert_allclose(ghost.rgba[:, :3], (plain.rgba[:, :3] + background) / 2, atol=1e-6)
+    np.testing.assert_array_equal(ghost.rgba[:, 3], plain.rgba[:, 3])
+    assert set(plain.rgba[:, 3]) == {0.5, 1.0}
+    assert ghost.is_open
+
+
+def test_poses_that_are_asked_for_are_shown_with_the_mesh(hero):
+    clip = long_walk(40)
+    pose = replace(clip.slice(20, 21), root_position=clip.root_position[20:21] + torch.tensor([1.0, 0.0, 0.0]))
+    drawn = hero.put_on(clip)
+    stage = Stage([Shot(clip, wishes=Wishes(poses=[pose]), drawn=drawn)])
+    (veil,) = stage.content(0).veils
+    there, here = veil.surface(), stage.players[0].body.surface(20)
+    assert len(there.vertices) == len(hero.mesh.vertices)
+    apart = (there.vertices - here.vertices).mean(axis=0)
+    scale = drawn.placed.bones.root_position[39, 2] / clip.root_position[39, 2]
+    np.testing.assert_allclose(apart, [float(scale), 0.0, 0.0], atol=0.06)
+    bodies = [drawn.placed.bones.joint_rotations()[20], drawn.place(pose).bones.joint_rotations()[0]]
+    assert turn_between(bodies[0][CANONICAL.index("leftLowerArm")], bodies[1][CANONICAL.index("leftLowerArm")]) < 1e-6
+
+
+@needs_graphics
+@pytest.mark.parametrize("kind", ["follow", "fixed", "top"])
+def test_its_pixels_are_where_it_is(hero, kind):
+    clip = long_walk(30)
+    shots = [Shot(clip, drawn=hero.put_on(clip))]
+    stage, brush, size = Stage(shots), select_painter("egl"), (320, 180)
+    view, content = stage.views(CameraSettings(kind), size)[15], stage.content(15)
+    picture = brush.paint(view, content).astype(int)
+    bare = brush.paint(view, replace(content, figures=[])).astype(int)
+    red = (picture[..., 0] > 1.6 * picture[..., 1]) & (picture[..., 0] > 90) & (picture[..., 2] < picture[..., 0] - 40)
+    red &= np.abs(picture - bare).max(axis=2) > 40
+    body = stage.players[0].body
+    shirt = view.project(vertices_of(body, 15)[: len(hero.mesh.vertices) // 3])
+    rows, columns = np.nonzero(red)
+    assert len(rows) > 4, "stripes of the shirt"
+    assert columns.mean() == pytest.approx(shirt[:, 0].mean(), abs=6)
+    assert rows.mean() == pytest.approx(shirt[:, 1].mean(), abs=8)
+
+
+@needs_graphics
+def test_one_sees_through_what_is_not_opaque_and_into_what_is_open(folder):
+    """A quad in front of another: half the front one's colour, half the other's; and both seen from behind."""
+    square = np.array([[-1.0, 0, 0], [1, 0, 0], [1, 2, 0], [-1, 2, 0]])
+    vertices = np.concatenate([square + [0, 0, 0.5], square])
+    faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])
+    rgba = np.repeat([[0.0, 0.0, 1.0, 0.5], [1.0, 0.0, 0.0, 1.0]], 4, axis=0)
+    carriers = np.zeros((8, 1), np.int64), np.ones((8, 1))
+    clip = walk(2)
+    rest = clip.joint_positions()[0].numpy()
+    mesh = CharacterMesh(vertices, np.tile([0.0, 0, 1], (8, 1)), faces, rgba, *carriers, rest)
+    body = SkinnedBody(mesh, clip, Mannequin(clip, GREY))
+    stage, brush = Stage([Shot(clip)]), select_painter("egl")
+
+    def middle(azimuth: float) -> np.ndarray:
+        content = replace(stage.content(0), figures=[Figure(body, 0)])
+        view = stage.views(CameraSettings("fixed", azimuth_deg=azimuth, elevation_deg=10), (64, 64))[0]
+        return brush.paint(view, content)[28:36, 28:36].reshape(-1, 3).mean(axis=0)
+
+    front, back = middle(0.0), middle(180.0)
+    assert front[0] > 60, "the red one is seen through the blue one"
+    assert front[2] > 60
+    assert back[0] > 100, "from behind too"
+    assert back[2] < 90
+
+
+def test_stick_figures_say_that_they_show_no_mesh(hero, tmp_path, caplog):
+    clip = walk(3)
+    with caplog.at_level(logging.WARNING):
+        film([Shot(clip, drawn=hero.put_on(clip))], tmp_path / "x.png", size=(96, 64), renderer="stick")
+    assert [record.message for record in caplog.records] == [
+        "stick figures show no mesh: characters are drawn by their bones"
+    ]
+    caplog.clear()
+    film([Shot(clip)], tmp_path / "y.png", size=(96, 64), renderer="stick")
+    assert caplog.records == []
