@@ -13,7 +13,7 @@ from mapctl.commands.shared.path_walk import Walk, parse_follow, walk
 from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.commands.shared.shots.plan import ShotPlan, plan_shot
 from mapctl.commands.shared.shots.play import PlayedShot, play_shot
-from mapctl.commands.shared.shots.stage import build_obstacles, stage_actor
+from mapctl.commands.shared.shots.stage import build_obstacles, print_notes, stage_actor
 from mapctl.curves import Curve
 from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import RequestError
@@ -101,3 +101,5 @@ def _write(command: FollowCurve, done: Walk | PlayedShot, video: Path | None, ch
         with show_progress("filming", quiet=command.quiet) as progress:
             size = options.parse_size(command.size or _SIZE)
             film(actors, video, camera=camera, size=size, props=build_obstacles([done]), progress=progress)
+        if not command.quiet:
+            print_notes(actors)

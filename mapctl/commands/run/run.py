@@ -16,7 +16,7 @@ from mapctl.commands.shared.path_walk import Walk, parse_follow, walk
 from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.commands.shared.shots.plan import ShotPlan, plan_shot
 from mapctl.commands.shared.shots.play import PlayedShot, let_others_pass, play_shot
-from mapctl.commands.shared.shots.stage import build_obstacles, stage_actor
+from mapctl.commands.shared.shots.stage import build_obstacles, print_notes, stage_actor
 from mapctl.curves import Curve
 from mapctl.errors import FileFormatError, RequestError
 from mapctl.intent.cornering import turns_sharply
@@ -157,6 +157,8 @@ def _film(
     with show_progress("filming", quiet=command.quiet) as progress:
         props = build_obstacles(walks)
         film(shots, films, camera=scene.camera, size=scene.size, fps=scene.fps, props=props, progress=progress)
+    if not command.quiet:
+        print_notes(shots)
 
 
 def _report(command: RunScene, scene: SceneDescription, walks: Sequence[Walk | PlayedShot]) -> dict[str, Any]:

@@ -29,6 +29,12 @@ def stage_actor(
     return Shot(motion, done.request.curve, colour, start_seconds, wishes, drawn)
 
 
+def print_notes(shots: Sequence[Shot]) -> None:
+    """Print what could not be kept of motions that are drawn on characters."""
+    for note in dict.fromkeys(note for shot in shots if shot.drawn is not None for note in shot.drawn.notes):
+        print(f"note      the character that is drawn: {note}")
+
+
 def build_obstacles(done: Sequence[Walk | PlayedShot]) -> list[Surface]:
     """Build every obstacle of some actors once."""
     shots = [one.request for one in done if isinstance(one, PlayedShot)]

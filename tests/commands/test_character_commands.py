@@ -1,0 +1,173 @@
+"""--character as a user types it: which films show a character, what stays as it is without it, and refusals."""
+
+from dataclasses import replace
+from importlib.util import find_spec
+
+import numpy as np
+import pytest
+from character_maker import make_character_glb
+from glb_builder import pack_glb
+from helpers import run, walk
+
+from mapctl.mesh.mannequin import Mannequin
+from mapctl.mesh.skinned_body import SkinnedBody
+from scenes.drawn_character import DrawnCharacter
+from scenes.stage import Stage
+
+pytestmark = pytest.mark.skipif(any(find_spec(name) is None for name in ("PIL", "av")), reason="needs mapctl[render]")
+
+
+@pytest.fixture
+def hero(tmp_path):
+    return make_character_glb(tmp_path / "hero.glb").path
+
+
+@pytest.fixture
+def staged(monkeypatch) -> list[Stage]:
+    """The stages of all films."""
+    found, plain = [], Stage.__init__
+
+    def noted(stage, *words, **named):
+        plain(stage, *words, **named)
+        found.append(stage)
+
+    monkeypatch.setattr(Stage, "__init__", noted)
+    monkeypatch.setenv("MAPCTL_RENDERER", "stick")  # quick, and needs no OpenGL
+    return found
+
+
+def kinds(stages: list[Stage]) -> list[list[type]]:
+    return [[type(player.body) for player in stage.players] for stage in stages]
+
+
+def test_render_shows_it_and_a_mannequin_without(hero, staged, tmp_path, caplog):
+    walk(12).save(tmp_path / "walk.bvh")
+    words = ("-o", tmp_path / "x.png", "--size", "96x64")
+    assert run("render", tmp_path / "walk.bvh", *words, "--character", hero) == 0
+    assert [record.message for record in caplog.records] == [
+        "stick figures show no mesh: characters are drawn by their bones"
+    ]
+    caplog.clear()
+    assert run("render", tmp_path / "walk.bvh", *words) == 0
+    assert caplog.records == []
+    assert kinds(staged) == [[SkinnedBody], [Mannequin]]
+
+
+def test_render_takes_a_characters_own_motion_as_it_is(staged, tmp_path):
+    made = make_character_glb(tmp_path / "two.glb", animations=("walk", "run"), frames=13)
+    out = tmp_path / "x.png"
+    for choice in ("", "#/run", "#Armature_skin/run"):
+        source = f"{made.path}{choice}"
+        assert run("render", source, "-o", out, "--character", made.path, "--size", "96x64", "--quiet") == 0
+    first, *others = [stage.players[0].body.surface(7).vertices for stage in staged]
+    assert np.abs(first - others[0]).max() > 0.02, "another animation"
+    np.testing.assert_array_equal(*others)
+
+
+def test_what_a_retargeted_motion_cannot_keep_is_told(prior, hero, staged, tmp_path, capsys, monkeypatch):
+    plain = DrawnCharacter.put_on
+
+    def with_note(character, motion):
+        drawn = plain(character, motion)
+        return replace(drawn, placed=replace(drawn.placed, notes=("its legs are too short",)))
+
+    monkeypatch.setattr(DrawnCharacter, "put_on", with_note)
+    walk(12).save(tmp_path / "walk.bvh")
+    (tmp_path / "scene.toml").write_text(SCENE.format(prior=prior, outputs="'x.png'").replace("own/child", "hero"))
+    film = ("--character", hero, "--size", "96x64")
+    follow = ("line:2", "--seconds", "1", "-o", tmp_path / "x.bvh", "--video", tmp_path / "x.png", "--prior", prior)
+    for words in (("render", tmp_path / "walk.bvh", "-o", tmp_path / "x.png", *film), ("follow", *follow, *film)):
+        assert run(*words) == 0
+        assert capsys.readouterr().out.count("its legs are too short") == 1
+        assert run(*words, "--quiet") == 0
+        assert capsys.readouterr().out == ""
+    assert run("run", tmp_path / "scene.toml", "-o", tmp_path / "out", "--character", hero) == 0
+    assert capsys.readouterr().out.count("its legs are too short") == 1
+
+
+def test_follow_shows_it_and_writes_the_same_motion(prior, hero, staged, tmp_path):
+    words = ("line:2", "--seconds", "1", "--prior", prior, "--quiet", "--size", "96x64")
+    for name, more in (("a", ("--character", hero)), ("b", ())):
+        out = tmp_path / f"{name}.bvh"
+        assert run("follow", *words, "-o", out, "--video", tmp_path / f"{name}.png", *more) == 0
+    assert kinds(staged) == [[SkinnedBody], [Mannequin]]
+    assert (tmp_path / "a.bvh").read_bytes() == (tmp_path / "b.bvh").read_bytes()
+
+
+def test_with_its_bones_the_character_keeps_to_the_curve(prior, hero, staged, tmp_path):
+    words = ("line:2", "--seconds", "1", "--prior", prior, "--quiet", "--size", "96x64", "--rig", hero)
+    assert run("follow", *words, "-o", tmp_path / "a.glb", "--video", tmp_path / "a.png", "--character", hero) == 0
+    assert run("render", tmp_path / "a.glb", "-o", tmp_path / "b.png", "--character", hero, "--size", "96x64") == 0
+    solved, read = (stage.players[0].body for stage in staged)
+    for frame in (0, 15, 29):
+        np.testing.assert_allclose(read.surface(frame).vertices, solved.surface(frame).vertices, atol=2e-5)
+
+
+SCENE = """prior = '{prior}'
+outputs = [{outputs}]
+size = [96, 64]
+actors = [
+    {{curve = 'line:2', seconds = 1, name = 'ann'}},
+    {{curve = 'line:2', seconds = 1, offset = [1, 0], name = 'bob', character = 'own/child.glb'}},
+]
+"""
+
+
+def test_scenes_tell_by_actor_and_the_option_for_all_others(prior, hero, staged, tmp_path):
+    (tmp_path / "own").mkdir()
+    make_character_glb(tmp_path / "own" / "child.glb", size=0.6)
+    scene = tmp_path / "scene.toml"
+    scene.write_text(SCENE.format(prior=prior, outputs="'x.png'"))
+    for more in ((), ("--character", hero)):
+        assert run("run", scene, "-o", tmp_path / "out", "--quiet", *more) == 0
+    assert kinds(staged) == [[Mannequin, SkinnedBody], [SkinnedBody, SkinnedBody]]
+    heights = [player.body.seen[..., 1].max() for player in staged[1].players]
+    assert heights[1] < 0.75 * heights[0]
+
+
+def test_a_scene_without_a_film_needs_no_character(prior, hero, staged, tmp_path, fails):
+    scene = tmp_path / "scene.toml"
+    scene.write_text(SCENE.format(prior=prior, outputs="'x.json'"))
+    assert "--character is of the film" in fails("run", scene, "-o", tmp_path / "out", "--character", hero)
+    assert run("run", scene, "-o", tmp_path / "out", "--quiet") == 0, "the missing own/child.glb is not asked for"
+    assert staged == []
+
+
+def write_broken(folder):
+    """By what is wrong: a file, and what is said of it."""
+    walk(12).save(folder / "walk.bvh")
+    (folder / "bare.glb").write_bytes(pack_glb({"asset": {"version": "2.0"}}, b""))
+    (folder / "text.glb").write_text("no glTF")
+    make_character_glb(folder / "hero.glb")
+    return {
+        "missing.glb": "missing.glb: no such file",
+        "walk.bvh": "walk.bvh: is no character's file; those end as",
+        "bare.glb": "bare.glb: has no skin",
+        "text.glb": "text.glb: is no binary glTF",
+        "hero.glb#Other": "hero.glb: has no armature 'Other'; it has 'Armature_skin'",
+    }
+
+
+def test_what_is_no_character_is_one_line_and_nothing_is_written(prior, tmp_path, fails, monkeypatch):
+    monkeypatch.setenv("MAPCTL_RENDERER", "stick")
+    for file, said in write_broken(tmp_path).items():
+        (tmp_path / "scene.toml").write_text(
+            f"prior = '{prior}'\noutputs = ['x.png']\n[[actors]]\ncurve = 'line:2'\ncharacter = '{file}'\n"
+        )
+        (tmp_path / "plain.toml").write_text(f"prior = '{prior}'\noutputs = ['x.png']\n[[actors]]\ncurve = 'line:2'\n")
+        films = {
+            "render": ("walk.bvh", "-o", "x.png"),
+            "follow": ("line:2", "-o", "x.bvh", "--video", "x.png", "--prior", prior),
+            "run": ("plain.toml", "-o", "out"),
+        }
+        for command, words in films.items():
+            assert said in fails(command, *words, "--character", file), (command, file)
+        assert said in fails("run", "scene.toml", "-o", "out")
+        assert said in fails("live", "--prior", prior, "--character", file)
+
+
+def test_what_needs_a_film_or_more_characters_says_so(prior, hero, fails):
+    words = ("follow", "line:2", "-o", "x.bvh", "--prior", prior)
+    assert "--character is of the film, and --video asks for none" in fails(*words, "--character", hero)
+    twice = ("--character", hero, "--character", hero)
+    assert "--character is given 2 times for 1 of --characters" in fails("live", "--prior", prior, *twice)
