@@ -47,9 +47,10 @@ def film(
     `actors` are Shots, or tuples (motion, curve, colour, start seconds, wishes, drawn) of which all but the motion may
     be left out. Where stick figures are drawn a character is one of them, and a line is logged that says so. `out` is a
     path or several, each ending in .mp4, .gif or .png (a contact sheet: ghosts along the trajectory over a row of
-    stills). Each frame of the motions is one frame of the film unless `fps` resamples them. `size` is the width and height in pixels (MP4 rounds up to even). `props` are what stands around
-    (`scenes.props`). `progress` is called with frames done and all frames. `renderer` is that of
-    `scenes.renderers.select.select_painter`. RequestError for endings, sizes and paths that cannot be.
+    stills). Each frame of the motions is one frame of the film unless `fps` resamples them. `size` is the width and
+    height in pixels (MP4 rounds up to even). `props` are what stands around (`scenes.props`). `progress` is called with
+    frames done and all frames. `renderer` is that of `scenes.renderers.select.select_painter`. RequestError for
+    endings, sizes and paths that cannot be.
     """
     paths = check_outputs([out] if isinstance(out, str | PathLike) else out, size)
     shots, brush, camera = [Shot(*actor) for actor in actors], select_painter(renderer), camera or CameraSettings()

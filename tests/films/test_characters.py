@@ -1,4 +1,4 @@
-"""Characters in films: their own mesh is where the file's matrices have it, stands on the floor, and is in the picture."""
+"""Characters in films: their mesh is where the file's matrices have it, stands on the floor, and is in the picture."""
 
 import logging
 from dataclasses import replace
@@ -260,7 +260,7 @@ def test_its_pixels_are_where_it_is(hero, kind):
 def test_one_sees_through_what_is_not_opaque_and_into_what_is_open(folder):
     """A quad in front of another: half the front one's colour, half the other's; and both seen from behind."""
     square = np.array([[-1.0, 0, 0], [1, 0, 0], [1, 2, 0], [-1, 2, 0]])
-    vertices = np.concatenate([square + [0, 0, 0.5], square])
+    vertices = np.concatenate([square + np.array([0.0, 0.0, 0.5]), square])
     faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])
     rgba = np.repeat([[0.0, 0.0, 1.0, 0.5], [1.0, 0.0, 0.0, 1.0]], 4, axis=0)
     carriers = np.zeros((8, 1), np.int64), np.ones((8, 1))

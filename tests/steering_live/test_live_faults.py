@@ -128,7 +128,7 @@ def test_too_slow_is_said_in_the_page_and_on_the_console_and_so_is_its_end(show,
 
 
 def test_a_file_that_cannot_be_made_comes_as_another_and_nothing_is_lost(monkeypatch, tmp_path):
-    def made_up(motion, ending, drawn):
+    def made_up(motion, ending, drawn=None):
         if ending == "mp4":
             raise OSError("no space left")
         return b"HIERARCHY"

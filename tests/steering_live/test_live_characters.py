@@ -1,0 +1,199 @@
+"""Characters in the live viewer: what a browser makes of what it is sent is the character's mesh in its pose."""
+
+import time
+from dataclasses import dataclass, replace
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import torch
+import viser
+from character_maker import make_character_glb
+from glb_viewer import GlbViewer
+from helpers import walk
+from stage import Actor, delivered, run
+
+from mapctl import rotations
+from mapctl.commands.live import Live
+from mapctl.commands.live import run as live
+from mapctl.mesh import colours
+from scenes.drawn_character import DrawnCharacter
+from scenes.live.app import LiveApp
+from scenes.live.bodies.colour_groups import part_by_colour
+from scenes.live.bodies.skinned import LiveCharacterBody, find_carriers
+from scenes.live.inputs import SteeringInputs
+from scenes.live.recording import Recording, encode_motion
+
+
+@dataclass
+class Bone:
+    position: np.ndarray
+    wxyz: np.ndarray
+
+
+@dataclass
+class SentMesh:
+    """What a browser has of a skinned mesh, and where it draws it: linear blend skinning by its four main bones."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    weights: np.ndarray
+    bind: np.ndarray
+    color: tuple
+    opacity: float | None
+    bones: list[Bone]
+
+    def drawn(self) -> np.ndarray:
+        weights = np.where(self.weights >= np.sort(self.weights, axis=1)[:, -4:][:, :1], self.weights, 0)
+        found = np.zeros_like(self.vertices)
+        for number, bone in enumerate(self.bones):
+            turn = rotations.to_matrix(torch.from_numpy(np.roll(bone.wxyz, -1))).numpy()
+            found += weights[:, number, None] * ((self.vertices - self.bind[number]) @ turn.T + bone.position)
+        return found
+
+
+class Scene(viser.SceneApi):
+    """Takes skinned meshes as viser's scene does."""
+
+    def __init__(self):
+        self.sent: list[SentMesh] = []
+
+    def add_mesh_skinned(
+        self, name, vertices, faces, *, bone_wxyzs, bone_positions, skin_weights, color, opacity, side
+    ):
+        assert (side, skin_weights.shape) == ("double", (len(vertices), len(bone_positions)))
+        np.testing.assert_allclose(skin_weights.sum(axis=1), 1, atol=1e-6)
+        bones = [Bone(place, turn) for place, turn in zip(bone_positions, bone_wxyzs, strict=True)]
+        self.sent.append(SentMesh(vertices, faces, skin_weights, bone_positions, color, opacity, bones))
+        return self.sent[-1]
+
+
+MAKES = {
+    "mixamo": {"pose": "A", "hat": True, "leaves": "joints"},
+    "unreal": {"names": "unreal", "root": "root", "size": 1.3, "second_skin": True},
+}
+
+
+@pytest.fixture(params=MAKES)
+def hero(request, tmp_path):
+    return DrawnCharacter.load(make_character_glb(tmp_path / "hero.glb", **MAKES[request.param]).path)
+
+
+def on_its_bones(hero, frames: int = 30):
+    return replace(walk(frames), skeleton=hero.body.leveled)
+
+
+def test_the_browser_draws_the_mesh_where_films_do(hero):
+    scene = Scene()
+    body = LiveCharacterBody(scene, "/hero", hero)
+    motion = on_its_bones(hero)
+    film = hero.put_on(motion).build_body(Fraction(30), colours.rgb("slate"))
+    poses = body.prepare(motion)
+    assert len(poses) == 30
+    for frame in (0, 14, 29):
+        body.pose(poses[frame])
+        surface = film.surface(frame)
+        wanted = np.sort(surface.vertices[surface.faces].mean(axis=1).round(4), axis=0)
+        drawn = np.concatenate([sent.drawn()[sent.faces].mean(axis=1) for sent in scene.sent])
+        np.testing.assert_allclose(np.sort(drawn.round(4), axis=0), wanted, atol=2e-4)
+
+
+def test_fingers_go_with_their_hand_and_need_no_bone(hero):
+    rigmap = hero.body.leveled_map
+    names, carriers = rigmap.rig_skeleton.names, find_carriers(rigmap)
+    by_name = {names[joint]: names[carrier] for joint, carrier in enumerate(carriers)}
+    finger = next(name for name in names if "Index1" in name or name == "index_01_l")
+    side = "left" if finger.endswith("_l") or "Left" in finger else "right"
+    assert by_name[finger] == rigmap.joint_names[f"{side}Hand"]
+    assert by_name[rigmap.joint_names["leftToes"]] == rigmap.joint_names["leftToes"]
+    assert len(set(carriers)) <= 22
+
+
+def test_colours_are_few_and_near_the_meshs(hero):
+    groups = part_by_colour(hero.mesh, 12)
+    assert len(groups) <= 12
+    assert sum(len(group.faces) for group in groups) == len(hero.mesh.faces)
+    apart = [np.abs(hero.mesh.rgba[group.faces].mean(axis=1) - group.rgba).max() for group in groups]
+    assert max(apart) < 0.35
+    shown = np.array([group.rgba[:3] for group in groups])
+    for wanted in ([200, 20, 30], [255, 255, 255]):
+        assert np.abs(shown - np.array(wanted) / 255).max(axis=1).min() < 0.08, "stripes of the shirt"
+    opacities = {round(float(group.rgba[3]), 3) for group in groups}
+    assert opacities == ({0.5, 1.0} if (hero.mesh.rgba[:, 3] < 1).any() else {1.0})
+    assert len(part_by_colour(replace(hero.mesh, rgba=np.ones_like(hero.mesh.rgba)), 12)) == 1
+
+
+@pytest.mark.parametrize("ending", ["glb", "bvh"])
+def test_a_recording_is_of_the_character(hero, ending, tmp_path):
+    recording = Recording(hero.body.leveled, hero)
+    for first in range(0, 12, 3):
+        recording.add(delivered(first))
+    motion, path = recording.motion(), tmp_path / f"recorded.{ending}"
+    assert motion.skeleton.names == hero.standing.skeleton.names
+    path.write_bytes(encode_motion(motion, ending, hero))
+    if ending == "glb":
+        own = on_its_bones(hero, 90).slice(0, 12)
+        film = hero.put_on(own).build_body(Fraction(30), colours.rgb("slate"))
+        skinned = GlbViewer(path).skinned(0, 5 / 30)
+        np.testing.assert_allclose(film.surface(5).vertices[: len(skinned)], skinned, atol=1e-4)
+
+
+def test_a_recording_as_a_film_shows_it(hero, monkeypatch):
+    asked = []
+    monkeypatch.setattr("scenes.live.recording._render_film", lambda *words: asked.append(words))
+    monkeypatch.setattr("scenes.live.recording.spawn", lambda work, *words: _Done(work, *words))
+    with pytest.raises(Exception, match="could not be drawn"):
+        encode_motion(hero.standing, "mp4", hero)
+    assert asked[0][2] == hero.path
+
+
+class _Done:
+    def __init__(self, work, *words):
+        work(*words)
+
+    def join(self):
+        pass
+
+
+def test_the_viewer_shows_a_mannequin_beside_it(hero, capsys):
+    actors = [Actor(), Actor()]
+    actors[1].skeleton = hero.body.leveled
+    labels = {"gait": ["walk"], "style": ["old"]}
+    show = LiveApp(
+        actors, [SteeringInputs() for _ in actors], port=8090, fastest=3.8, labels=labels, drawn=[None, hero]
+    )
+    try:
+        run(show, 12)
+        mesh = show.server.scene.get_handle_by_name("/world/character2/skin0")
+        assert show.server.scene.get_handle_by_name("/world/character1/skin0") is None
+        assert any(np.abs(bone.position).max() > 0.1 for bone in mesh.bones)
+        assert capsys.readouterr() == ("", "")
+    finally:
+        show.close()
+
+
+def test_each_character_has_its_file_and_the_last_one_is_for_all_others(tmp_path):
+    files = [str(make_character_glb(tmp_path / f"{name}.glb").path) for name in "ab"]
+    drawn = live._read_drawn(Live(characters=4, character=tuple(files)))
+    assert [one.path for one in drawn] == [files[0], files[1], files[1], files[1]]
+    assert drawn[1] is drawn[2], "read once"
+    assert live._read_drawn(Live(characters=3)) == [None, None, None]
+
+
+def test_a_character_moves_on_its_own_bones(prior, tmp_path):
+    child = str(make_character_glb(tmp_path / "child.glb", size=0.6).path)
+    command = Live(character=(child,), prior=prior)
+    (drawn,) = live._read_drawn(command)
+    (made,) = live._start_characters(command, [drawn])
+    try:
+        assert made.skeleton.matches(drawn.body.leveled)
+        chunk = next(chunk for _ in range(200) for chunk in made.poll() or _wait())
+        height = float(chunk.motion(made.skeleton).joint_positions()[0, 0, 1])
+        assert height == pytest.approx(0.6 * 0.95, abs=0.08), "hips of a child"
+    finally:
+        made.close()
+
+
+def _wait() -> list:
+    time.sleep(0.05)
+    return []
