@@ -7,6 +7,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from mapctl.mesh.primitives import Array
+from mapctl.mesh.refinement import Refinement, refine_nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +28,8 @@ class CharacterMesh:
     """(n, k) their shares; each vertex's add up to 1."""
     rest: Array
     """(joints, 3) positions of all joints in the rest pose, metres."""
+    fine: Refinement | None = None
+    """Finer triangles with colours, which are drawn instead where there are some."""
 
     def pose(self, positions: Array, turns: Array) -> tuple[Array, Array]:
         """Return vertices (n, 3) and unit normals (n, 3) of one pose.
@@ -73,6 +76,19 @@ def merge_meshes(meshes: list[CharacterMesh]) -> CharacterMesh:
         joints=np.concatenate(padded[::2]),
         weights=np.concatenate(padded[1::2]),
         rest=meshes[0].rest,
+        fine=_merge_refinements(meshes) if any(mesh.fine is not None for mesh in meshes) else None,
+    )
+
+
+def _merge_refinements(meshes: list[CharacterMesh]) -> Refinement:
+    fine = [refine_nothing(mesh.faces, mesh.rgba) if mesh.fine is None else mesh.fine for mesh in meshes]
+    vertices = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+    points = np.cumsum([0, *(len(one.corners) for one in fine)])
+    return Refinement(
+        np.concatenate([one.corners + start for one, start in zip(fine, vertices, strict=False)]),
+        np.concatenate([one.shares for one in fine]),
+        np.concatenate([one.faces + start for one, start in zip(fine, points, strict=False)]),
+        np.concatenate([one.rgba for one in fine]),
     )
 
 

@@ -9,7 +9,7 @@ from mapctl.errors import MapctlError
 from mapctl.mesh.anatomy import Anatomy
 from mapctl.mesh.body import Body
 from mapctl.mesh.character_mesh import CharacterMesh
-from mapctl.mesh.primitives import Array, Surface
+from mapctl.mesh.primitives import Array, Surface, unit
 from mapctl.motion import Motion
 
 
@@ -47,7 +47,10 @@ class SkinnedBody:
     def surface(self, frame: int) -> Surface:
         """Return the mesh in one frame; it is open, as clothes and hair are, and seen from both sides."""
         vertices, normals = self._mesh.pose(self._places[frame], self._turns[frame])
-        return Surface(vertices, self._mesh.faces, self._mesh.rgba, normals, is_open=True)
+        fine = self._mesh.fine
+        if fine is None:
+            return Surface(vertices, self._mesh.faces, self._mesh.rgba, normals, is_open=True)
+        return Surface(fine.spread(vertices), fine.faces, fine.rgba, unit(fine.spread(normals)), is_open=True)
 
     def sticks(self, frame: int) -> tuple[Array, Array, Array]:
         """Return all bones in one frame: ends (n, 2, 3) and radii (n,) in metres, colours (n, 3) sRGB."""

@@ -2,7 +2,6 @@
 
 import time
 from dataclasses import dataclass, replace
-from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -16,7 +15,6 @@ from stage import Actor, delivered, run
 from mapctl import rotations
 from mapctl.commands.live import Live
 from mapctl.commands.live import run as live
-from mapctl.mesh import colours
 from scenes.drawn_character import DrawnCharacter
 from scenes.live.app import LiveApp
 from scenes.live.bodies.colour_groups import part_by_colour
@@ -87,13 +85,14 @@ def test_the_browser_draws_the_mesh_where_films_do(hero):
     scene = Scene()
     body = LiveCharacterBody(scene, "/hero", hero)
     motion = on_its_bones(hero)
-    film = hero.put_on(motion).build_body(Fraction(30), colours.rgb("slate"))
     poses = body.prepare(motion)
     assert len(poses) == 30
     for frame in (0, 14, 29):
         body.pose(poses[frame])
-        surface = film.surface(frame)
-        wanted = np.sort(surface.vertices[surface.faces].mean(axis=1).round(4), axis=0)
+        placed = hero.put_on(motion).placed.motion
+        turns = rotations.to_matrix(placed.joint_rotations()[frame]).numpy()
+        vertices, _ = hero.mesh.pose(placed.joint_positions()[frame].numpy(), turns)
+        wanted = np.sort(vertices[hero.mesh.faces].mean(axis=1).round(4), axis=0)
         drawn = np.concatenate([sent.drawn()[sent.faces].mean(axis=1) for sent in scene.sent])
         np.testing.assert_allclose(np.sort(drawn.round(4), axis=0), wanted, atol=2e-4)
 
@@ -133,9 +132,11 @@ def test_a_recording_is_of_the_character(hero, ending, tmp_path):
     path.write_bytes(encode_motion(motion, ending, hero))
     if ending == "glb":
         own = on_its_bones(hero, 90).slice(0, 12)
-        film = hero.put_on(own).build_body(Fraction(30), colours.rgb("slate"))
+        placed = hero.put_on(own).placed.motion
+        turns = rotations.to_matrix(placed.joint_rotations()[5]).numpy()
+        vertices, _ = hero.mesh.pose(placed.joint_positions()[5].numpy(), turns)
         skinned = GlbViewer(path).skinned(0, 5 / 30)
-        np.testing.assert_allclose(film.surface(5).vertices[: len(skinned)], skinned, atol=1e-4)
+        np.testing.assert_allclose(vertices[: len(skinned)], skinned, atol=1e-4)
 
 
 def test_a_recording_as_a_film_shows_it(hero, monkeypatch):

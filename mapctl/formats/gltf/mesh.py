@@ -9,10 +9,11 @@ from mapctl.formats.characters.rest_frames import RestFrames
 from mapctl.formats.gltf.accessors import read_accessor
 from mapctl.formats.gltf.armatures import Armature, NodeTree, node_matrix
 from mapctl.formats.gltf.container import GltfFile
-from mapctl.formats.gltf.materials import vertex_colours
+from mapctl.formats.gltf.materials import read_paint
 from mapctl.formats.gltf.reader import open_character, read_skeleton
 from mapctl.formats.gltf.schema import Primitive
 from mapctl.mesh.character_mesh import CharacterMesh, compute_normals, merge_meshes
+from mapctl.mesh.refinement import MOST_CELLS, Refinement, choose_cell, refine
 
 Array = np.ndarray
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
@@ -90,15 +91,32 @@ def _read_primitive(
         blend += weight[:, None, None] * palette.matrices[joint]
     vertices = np.einsum("nab,nb->na", blend[:, :3, :3], points) + blend[:, :3, 3]
     faces = _read_faces(gltf, primitive, len(points), what)
+    rgba, fine = _read_colours(gltf, primitive, vertices, faces, what)
     return CharacterMesh(
         vertices=vertices,
         normals=compute_normals(vertices, faces),
         faces=faces,
-        rgba=vertex_colours(gltf, primitive, len(points), what),
+        rgba=rgba,
         joints=palette.joints[joints],
         weights=weights,
         rest=frames.positions,
+        fine=fine,
     )
+
+
+def _read_colours(
+    gltf: GltfFile, primitive: Primitive, vertices: Array, faces: Array, what: str
+) -> tuple[Array, Refinement | None]:
+    """Return the vertices' colours, and finer triangles where a picture shows more than these can."""
+    paint = read_paint(gltf, primitive, len(vertices), what)
+    if paint.picture is None or not len(faces):
+        return paint.at_vertices(), None
+    share = MOST_CELLS // sum(len(mesh.primitives) for mesh in gltf.document.meshes)
+    wrong, cell = choose_cell(vertices, faces, paint.colours, share)
+    if not wrong.any():
+        return paint.at_vertices(), None
+    paint = paint.coarsen(vertices, faces, cell)
+    return paint.at_vertices(), refine(vertices, faces, wrong, cell, paint.colours)
 
 
 def _read_carriers(
