@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from character_maker import make_character_glb, stripes
+from character_maker import make_character_glb
+from glb_builder import stripes
 
 from mapctl import formats
 from mapctl.mesh.refinement import choose_cell, part_triangle, refine
@@ -30,7 +31,7 @@ def test_cells_fill_a_triangle_once_and_face_as_it_does(count):
 
 
 def test_a_picture_is_shown_to_the_cell_and_edges_are_shared():
-    wrong, cell = choose_cell(SQUARE, FACES, board)
+    wrong, _ = choose_cell(SQUARE, FACES, board)
     assert wrong.all()
     fine = refine(SQUARE, FACES, wrong, 0.02, board)
     at = fine.spread(SQUARE)
