@@ -35,9 +35,13 @@ class SkinnedBody:
         """Frames of the motion."""
         return self._bones.num_frames
 
-    @cached_property
+    @property
     def seen(self) -> Array:
         """Positions (frames, n, 3) of its bones, and of the vertices that are outermost at rest, metres."""
+        return self._seen
+
+    @cached_property
+    def _seen(self) -> Array:
         vertices = self._mesh.vertices
         outer = np.concatenate([vertices.argmin(axis=0), vertices.argmax(axis=0)])
         joint = self._mesh.joints[outer, self._mesh.weights[outer].argmax(axis=1)]

@@ -315,3 +315,24 @@ def test_a_port_that_is_taken_is_said_and_another_one_serves(prior, live):
     assert f"port {live.port} is in use" in second.lines[0]
     assert second.url != live.url
     assert second.end() == 0
+
+
+@pytest.mark.slow
+def test_a_character_is_shown_and_walks(browser, prior, tmp_path):
+    from character_maker import make_character_glb
+
+    hero = make_character_glb(tmp_path / "hero.glb").path
+    show, faults = Live("--prior", prior, "--character", hero), list[str]()
+    page = browser.new_page(viewport=SIZE, accept_downloads=True)
+    try:
+        page.on("pageerror", lambda error: faults.append(str(error)))
+        page.goto(show.url)
+        page.get_by_text(COUNTED).wait_for(timeout=60_000)
+        put(page, "Speed, m/s", 1.2)
+        walked = recorded(page, tmp_path, 3)
+        assert walked.skeleton.names[0] == "mixamorig:Hips"
+        assert speed_of(walked) > 0.3
+    finally:
+        page.close()
+        assert show.end() == 0
+    assert faults == []
