@@ -14,6 +14,7 @@ import time
 
 import pytest
 import viser
+from character_maker import make_character_glb
 
 import mapctl
 
@@ -319,8 +320,6 @@ def test_a_port_that_is_taken_is_said_and_another_one_serves(prior, live):
 
 @pytest.mark.slow
 def test_a_character_is_shown_and_walks(browser, prior, tmp_path):
-    from character_maker import make_character_glb
-
     hero = make_character_glb(tmp_path / "hero.glb").path
     show, faults = Live("--prior", prior, "--character", hero), list[str]()
     page = browser.new_page(viewport=SIZE, accept_downloads=True)
