@@ -112,13 +112,19 @@ def normalise_name(name: str) -> str:
     return re.sub(r"[\W_]", "", (strip(strip(name)) or name).lower())
 
 
-def classify_joint(name: str) -> Role:
-    """Classify a joint's side and part by its name: `LeftUpLeg`, `lThigh`, `UpperLeg_L`, `mixamorig:LeftArm`."""
+def split_side(name: str) -> tuple[Side, str]:
+    """Split a name into the side that it tells and what is left of it: `LeftUpLeg` is left and `UpLeg`."""
     for side, pattern in _SIDES:
         found = pattern.search(name)
         if found:
-            return Role(side, _classify_part(name[: found.start()] + name[found.end() :]))
-    return Role(Side.MIDDLE, _classify_part(name))
+            return side, name[: found.start()] + name[found.end() :]
+    return Side.MIDDLE, name
+
+
+def classify_joint(name: str) -> Role:
+    """Classify a joint's side and part by its name: `LeftUpLeg`, `lThigh`, `UpperLeg_L`, `mixamorig:LeftArm`."""
+    side, rest = split_side(name)
+    return Role(side, _classify_part(rest))
 
 
 def _classify_part(name: str) -> Part:

@@ -20,7 +20,7 @@ FLOORS = {
         "kinematics",
         "formats",
         "curves retarget",
-        "intent motion_dna recording terms",
+        "editing intent motion_dna recording terms",
         "inbetweening problem runtime",
         "metrics streaming",
         "commands",

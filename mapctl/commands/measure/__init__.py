@@ -14,6 +14,7 @@ from mapctl.commands.shared.command import Command
 class Measure(Command):
     """Path, feet, jitter and more of a motion, beside a reference clip and mocap's own values.
 
+    Of a clip also its cycle, of a walk or a run one stride, or that it has none.
     All are measured as mocap's values were: on canonical joints with Y up, at 30 frames a second if there are more. Of
     a folder the means over its clips; beside a folder of mocap also whether the two can be told apart. Clips of a
     folder that cannot be measured are left out and listed.

@@ -5,7 +5,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from mapctl import formats, metrics, report
+from mapctl import editing, formats, metrics, report, retarget
 from mapctl.commands.measure import Measure
 from mapctl.commands.measure.clip_sets import ClipSet, compare_realism, compare_variability
 from mapctl.commands.shared import inputs, options
@@ -34,19 +34,30 @@ def run(command: Measure) -> int:
 
 def _measure_clips(command: Measure) -> dict[str, Any]:
     curve = _read_curve(command)
-    clip, notes = _load_comparable(command.clip)
+    whole = formats.load(command.clip)
+    clip, notes = _make_comparable(whole, command.clip)
     ours = metrics.measure(clip, curve, speed=command.speed)
     reference = {}
     if command.reference is not None:
-        other, more = _load_comparable(command.reference)
+        other, more = _make_comparable(formats.load(command.reference), command.reference)
         reference, notes = metrics.measure(other), notes + more
     return {
         "clip": str(command.clip),
         "measures": ours,
         "reference": reference,
         "mocap": _read_mocap_values(command.prior),
+        "cycle": _measure_cycle(whole),
         "notes": notes,
     }
+
+
+def _measure_cycle(motion: Motion) -> dict[str, Any]:
+    """Describe the cycle of a motion of any rig, at its own rate; else say why there is none."""
+    try:
+        canonical = retarget.to_canonical(motion)[0]
+        return editing.describe_cycle(canonical, editing.find_cycle(canonical))
+    except RequestError as error:
+        return {"none": str(error).removeprefix("no cycle is found: ")}
 
 
 def _read_curve(command: Measure) -> Curve | None:
@@ -105,6 +116,8 @@ def _print_tables(values: Mapping[str, Any]) -> None:
         rows = [[name, *row.values()] for name, row in values["spread"].items()]
         title = "how widely the clips spread (in pieces of 3 s)"
         print_table(["spread", "ours", "reference", "ratio"], rows, title=title)
+    if "cycle" in values:
+        print(_describe_cycle(values["cycle"]))
     for line in _shorten([*(f"left out {reason}" for reason in values.get("skipped", {}).values()), *values["notes"]]):
         print(line)
 
@@ -115,10 +128,25 @@ def _shorten(lines: Sequence[str]) -> list[str]:
     return [*lines[:_MAX_LINES], *([f"and {more} more, which --json lists"] if more > 0 else [])]
 
 
-def _load_comparable(path: Path) -> tuple[Motion, list[str]]:
-    """Load a clip as mocap's values were measured, and note what could not be made so."""
-    motion, notes = make_comparable(formats.load(path))
-    return motion, [f"{path}: {note}" for note in notes]
+def _make_comparable(motion: Motion, path: Path) -> tuple[Motion, list[str]]:
+    """Make a clip as mocap's values were measured, and note what could not be made so."""
+    comparable, notes = make_comparable(motion)
+    return comparable, [f"{path}: {note}" for note in notes]
+
+
+def _describe_cycle(cycle: Mapping[str, Any]) -> str:
+    if "none" in cycle:
+        return f"cycle: none, {cycle['none']}"
+    about = (
+        f"cycle: frames {cycle['start']}:{cycle['stop']}, {cycle['frames']} frames, {cycle['seconds']:.2f} s, with"
+        f" ends {cycle['mismatch_cm']:.1f} cm apart"
+    )
+    if not cycle["gait"]:
+        return about
+    return (
+        f"{about}; {cycle['steps_per_minute']:.0f} steps a minute, stride {cycle['stride_m']:.2f} m; right foot"
+        f" {cycle['right_after_left']:.2f} of a cycle after the left, mirrored {cycle['asymmetry_cm']:.1f} cm off"
+    )
 
 
 def _print_realism(realism: Mapping[str, Any]) -> None:

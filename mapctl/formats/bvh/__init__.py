@@ -120,6 +120,11 @@ def convert_unit(motion: Motion, metres_per_unit: float) -> Motion:
     )
 
 
+def add_root_to_layout(source: object | None, name: str) -> BvhLayout | None:
+    """Return the layout of a BVH file with a joint above its root, with six channels; None for what is no layout."""
+    return bvh_layout.add_root(source, name) if isinstance(source, BvhLayout) else None
+
+
 def save(motion: Motion, path: str | PathLike[str]) -> None:
     """Write a BVH file, in the layout the motion was read in where its skeleton still has the same joints.
 

@@ -67,6 +67,22 @@ def _source_layout(motion: Motion) -> BvhLayout | None:
     return motion.source if (tree.names, tree.parents) == (skeleton.names, skeleton.parents) else None
 
 
+def add_root(layout: BvhLayout, name: str) -> BvhLayout:
+    """Return the layout with a joint above its root, which has that one's channels if they are six, and stays still in
+    the numbers that were read."""
+    tree, values = layout.hierarchy, layout.values
+    own = tree.channels[0] if len(tree.channels[0]) == len(POSITIONS + ROTATIONS) else POSITIONS + ROTATIONS
+    above = Hierarchy(
+        (name, *tree.names),
+        (-1, *(parent + 1 for parent in tree.parents)),
+        ((0.0, 0.0, 0.0), *tree.offsets),
+        (own, *tree.channels),
+        {joint + 1: offset for joint, offset in tree.end_offsets.items()},
+    )
+    still = None if values is None else np.concatenate([np.zeros((len(values), len(own))), values], axis=1)
+    return replace(layout, hierarchy=above, values=still)
+
+
 def fit_hierarchy(layout: BvhLayout, translations: np.ndarray, quat_xyzw: np.ndarray) -> Hierarchy:
     """Fit the layout's hierarchy to this motion, with channels added where a joint's own cannot hold it.
 

@@ -1,0 +1,154 @@
+"""Footing: planted toes are held still and on the floor by the legs, and nothing else changes."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mapctl import contacts
+from mapctl.editing.ground_transform import GroundTransform, move_by_share, repeat_over_ground
+from mapctl.editing.legs import place_ankles
+from mapctl.editing.rigged_motion import RiggedMotion
+from mapctl.motion import Motion
+from mapctl.numerics import gaussian
+from mapctl.numerics.intervals import true_intervals
+from mapctl.numerics.smooth_offsets import interpolate_offsets
+from mapctl.retarget.rigs import Rig
+
+_MEDIAN_OF_NORMAL = 0.6745  # of the size of a normal variable, in standard deviations
+_NOISE_FRAMES = 12  # frames from which noise is estimated
+
+
+@dataclass(frozen=True)
+class FootingSettings:
+    """How contacts are found, and how a foot comes to its place and leaves it."""
+
+    noise_speed: float = 0.04
+    """Toes are smoothed, before contacts are looked for, until their noise makes this speed, m/s."""
+    smooth_seconds: tuple[float, float] = (0.04, 0.15)
+    """Least and greatest standard deviation of the Gaussian that they are smoothed by, seconds."""
+    merge_seconds: float = 0.15
+    """Contacts at one place with less time between them are one, seconds."""
+    merge_metres: float = 0.06
+    """How far apart such contacts are at most, metres."""
+    roll_metres: float = 0.005
+    """A planted toe higher than this over its usual height in that contact is on its way down or up, metres."""
+    fade_seconds: float = 0.12
+    """Time over which a foot comes to its place and leaves it, seconds: a swing foot is moved by as little as its next
+    contact asks for."""
+
+
+def plant_feet(
+    motion: Motion,
+    rig: Rig | None = None,
+    cycle: GroundTransform | None = None,
+    settings: FootingSettings = FootingSettings(),
+) -> Motion:
+    """Hold planted toes still and on the floor, on the motion's own rig at its own rate.
+
+    A toe is planted where it is low and slow (see `mapctl.contacts`), noise smoothed away; then it stays where it is on
+    average during that contact, at the height of its floor. Thighs and shins bring it there, feet keep their
+    orientation, and hips go down where a leg is too short. All other local rotations stay to the bit. `cycle` is the
+    travel of a loop, which stays one. `rig` wins over what would be recognised; RequestError where the rig's joints
+    cannot be identified.
+    """
+    rigged = RiggedMotion.of(motion, rig)
+    if cycle is None:
+        return rigged.with_motion(_plant(rigged, settings)).in_file_world(motion)
+    frames = motion.num_frames
+    around = rigged.with_motion(repeat_over_ground(rigged.motion, cycle, 3))
+    middle = _plant(around, settings).slice(frames, 2 * frames)
+    planted = move_by_share(middle, cycle, -torch.ones(frames, dtype=torch.float64))
+    return rigged.with_motion(planted).in_file_world(motion)
+
+
+def _plant(rigged: RiggedMotion, settings: FootingSettings) -> Motion:
+    toes, fps = rigged.positions("Toes"), float(rigged.motion.fps)
+    planted = find_contacts(toes, fps, settings)
+    if not bool(planted.any()):
+        return rigged.motion
+    corrections = correct_toes(toes, toes, planted, fps, settings)
+    corrections[..., 1] = _correct_heights(toes, planted, fps, settings)
+    return place_ankles(rigged, rigged.positions("Foot") + corrections)
+
+
+def find_contacts(
+    toes: Float[Tensor, "frames 2 3"], fps: float, settings: FootingSettings = FootingSettings()
+) -> Bool[Tensor, "frames 2"]:
+    """Find in which frames each toe is planted; contacts that noise alone parts are one. Positions in metres."""
+    sigma = _choose_smoothing(toes, fps, settings)
+    smooth = _smooth(toes, sigma)
+    planted = contacts.detect_contacts(smooth, fps)
+    if sigma <= settings.smooth_seconds[0] * fps:  # hardly any noise: what is seen as it is counts too
+        planted |= contacts.detect_contacts(toes, fps)
+    for foot, start, stop in list(true_intervals(~planted)):
+        inside = start > 0 and stop < len(planted)
+        if inside and stop - start < settings.merge_seconds * fps:
+            apart = (smooth[start - 1, foot] - smooth[stop, foot])[::2].norm()
+            planted[start:stop, foot] |= bool(apart < settings.merge_metres)
+    return planted
+
+
+def correct_toes(
+    toes: Float[Tensor, "frames 2 3"],
+    drift: Float[Tensor, "frames 2 3"],
+    planted: Bool[Tensor, "frames 2"],
+    fps: float,
+    settings: FootingSettings = FootingSettings(),
+) -> Float[Tensor, "frames 2 3"]:
+    """Return corrections of toe positions, metres, that take the drift out of each contact but for its mean, and are
+    smooth between contacts. Drift equal to the positions leaves toes quite still."""
+    corrections = torch.zeros_like(toes)
+    for foot, start, stop in true_intervals(planted):
+        own = drift[start:stop, foot]
+        corrections[start:stop, foot] = own.mean(dim=0) - own
+    return _interpolate(corrections, planted, fps, settings)
+
+
+def _correct_heights(
+    toes: Float[Tensor, "frames 2 3"], planted: Bool[Tensor, "frames 2"], fps: float, settings: FootingSettings
+) -> Float[Tensor, "frames 2"]:
+    """Return corrections that put planted toes at the height of their floor, and let no toe go lower. The ends of a
+    contact, in which a toe is on its way down or up, are left to what is between."""
+    heights = toes[..., 1]
+    smooth = _smooth(heights, _choose_smoothing(toes, fps, settings))
+    rest = torch.quantile(smooth, contacts.ContactSettings().floor_percentile / 100, dim=0)
+    firm = heights < rest
+    for foot, start, stop in true_intervals(planted):
+        usual = smooth[start:stop, foot].median()
+        firm[start:stop, foot] |= smooth[start:stop, foot] < usual + settings.roll_metres
+    return _interpolate(torch.where(firm, rest - heights, 0.0)[..., None], firm, fps, settings)[..., 0]
+
+
+def _choose_smoothing(toes: Float[Tensor, "frames 2 3"], fps: float, settings: FootingSettings) -> float:
+    """Choose the standard deviation in frames of the Gaussian that leaves so little of the noise.
+
+    Noise is told by third differences, of which white noise of 1 makes 20 in the square; most frames have little else.
+    Of it a Gaussian of s frames leaves velocities of (4 sqrt(pi) s^3)^-1/2 a frame.
+    """
+    least, most = (seconds * fps for seconds in settings.smooth_seconds)
+    if len(toes) < _NOISE_FRAMES:
+        return least
+    sizes = toes[..., ::2].diff(n=3, dim=0).abs().flatten()
+    noise = float(sizes.median()) / _MEDIAN_OF_NORMAL / math.sqrt(20)
+    wanted = ((noise * fps / settings.noise_speed) ** 2 / (4 * math.sqrt(math.pi))) ** (1 / 3)
+    return min(max(wanted, least), most)
+
+
+def _smooth(values: Float[Tensor, "frames *width"], sigma: float) -> Float[Tensor, "frames *width"]:
+    """Smooth values by a Gaussian of `sigma` frames."""
+    return gaussian.convolve(values, gaussian.kernel(max(sigma, 1e-6), side=max(1, round(3 * sigma))), "repeated")
+
+
+def _interpolate(
+    corrections: Float[Tensor, "frames 2 width"], firm: Bool[Tensor, "frames 2"], fps: float, settings: FootingSettings
+) -> Float[Tensor, "frames 2 width"]:
+    return torch.stack(
+        [
+            interpolate_offsets(corrections[:, foot], firm[:, foot], seconds=settings.fade_seconds, fps=fps)
+            for foot in range(corrections.shape[1])
+        ],
+        dim=1,
+    )

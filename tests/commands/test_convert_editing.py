@@ -1,0 +1,228 @@
+"""Edits of `mapctl convert` as a user types them: alone, together, over folders, and what is refused."""
+
+import itertools
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from acclaim import pair
+from helpers import run, walk
+
+import mapctl
+from mapctl import editing
+from mapctl.commands.convert import folder as convert_folder
+from mapctl.editing.rigged_motion import RiggedMotion
+
+EDITS = ["--mirror", "--loop", "--plant-feet"]
+TRAVEL = ["", "--in-place", "--root-motion"]
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """A folder with a walk, and a folder of some."""
+    monkeypatch.chdir(tmp_path)
+    walk(90, cadence=1.0).save("in.bvh")
+    below = tmp_path / "takes" / "day 1"
+    below.mkdir(parents=True)
+    walk(40).save(below / "a.bvh")
+    walk(30).save(below / "b.npz")
+    pair(20).write(tmp_path / "takes", subject="01", take="c")
+    return tmp_path
+
+
+@pytest.mark.parametrize("chosen", [c for n in range(4) for c in itertools.combinations(EDITS, n)], ids=" ".join)
+@pytest.mark.parametrize("travel", TRAVEL)
+def test_all_go_together(here, capsys, chosen, travel):
+    assert run("convert", "in.bvh", "out.bvh", *chosen, *([travel] if travel else [])) == 0
+    told, motion = capsys.readouterr(), mapctl.load("out.bvh")
+    assert told.err == ""
+    assert motion.num_frames == (30 if "--loop" in chosen else 90)
+    assert motion.skeleton.names[0] == ("root" if travel == "--root-motion" else "hips")
+    assert ("loop: frames" in told.out, "feet: planted toes" in told.out) == (
+        "--loop" in chosen,
+        "--plant-feet" in chosen,
+    )
+    hips = RiggedMotion.of(motion).position("hips")
+    assert (float((hips[-1] - hips[0]).norm()) < 0.2) == (travel == "--in-place")
+
+
+def test_the_command_does_what_the_functions_do(here):
+    assert run("convert", "in.bvh", "out.npz", "--mirror", "--in-place") == 0
+    wanted = editing.remove_travel(editing.mirror(mapctl.load("in.bvh")))
+    torch.testing.assert_close(mapctl.load("out.npz").joint_positions(), wanted.joint_positions(), atol=1e-9, rtol=0)
+
+
+def test_a_loop_is_a_whole_number_of_frames_at_the_wanted_rate(here, capsys):
+    assert run("convert", "in.bvh", "out.npz", "--loop", "--in-place", "--fps", "24") == 0
+    motion = mapctl.load("out.npz")
+    assert (motion.fps, motion.num_frames) == (24, 24)
+    bends = motion.join(motion).joint_positions().diff(n=2, dim=0).norm(dim=-1).amax(dim=1)
+    assert float(bends[22:24].max()) <= float(bends[:22].max())
+
+
+def test_edits_come_after_frames_and_rig(here):
+    assert run("convert", "takes/01.asf+c.amc", "rig.bvh") == 0
+    assert (
+        run("convert", "in.bvh", "out.bvh", "--rig", "rig.bvh", "--frames", "10:50", "--mirror", "--root-motion") == 0
+    )
+    motion = mapctl.load("out.bvh")
+    assert motion.num_frames == 40
+    assert motion.num_joints == mapctl.load("rig.bvh").num_joints + 1
+
+
+def test_the_rig_is_that_of_the_whole_clip_where_a_part_does_not_show_it(here):
+    assert run("convert", "takes/01.asf+c.amc", "rig.npz") == 0
+    assert run("convert", "rig.npz", "cut.npz", "--frames", "5:15", "--mirror") == 0
+    assert run("convert", "rig.npz", "whole.npz", "--mirror") == 0
+    cut, whole = mapctl.load("cut.npz"), mapctl.load("whole.npz").slice(5, 15)
+    torch.testing.assert_close(cut.joint_positions(), whole.joint_positions(), atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--in-place", "--root-motion"], "choose one"),
+        (["--loop", "--frames", "0:8"], "no cycle is found: 0.27 s are too short"),
+        (["--to", ".glb"], "--to is for folders; in.bvh is a file"),
+        (["--again"], "--again is for folders"),
+        (["--jobs", "2"], "--jobs is for folders"),
+    ],
+)
+def test_what_cannot_be_done_is_refused_in_a_line(here, capsys, options, said):
+    assert run("convert", "in.bvh", "out.bvh", *options) == 2
+    told = capsys.readouterr()
+    assert said in told.err
+    assert told.err.count("\n") == 1
+    assert not Path("out.bvh").exists()
+
+
+def test_no_cycle_says_what_comes_nearest(here, capsys):
+    motion = walk(90)
+    shift = torch.linspace(0, 4, 90).double() ** 2
+    moved = motion.root_position + torch.stack([shift, 0 * shift, 0 * shift], dim=-1)
+    mapctl.Motion(motion.skeleton, motion.fps, moved, motion.local_quat_xyzw).save("away.bvh")
+    assert run("convert", "away.bvh", "out.bvh", "--loop") == 2
+    assert "come nearest, with joints and velocities" in capsys.readouterr().err
+
+
+def test_a_folder_becomes_a_folder_with_the_same_names(here, capsys):
+    assert run("convert", "takes", "out", "--to", "npz", "--mirror") == 0
+    found = sorted(str(path.relative_to("out")) for path in Path("out").rglob("*.*"))
+    assert found == ["c.npz", "day 1/a.npz", "day 1/b.npz"]
+    assert "3 converted" in capsys.readouterr().out
+    wanted = editing.mirror(mapctl.load("takes/day 1/a.bvh")).joint_positions()
+    torch.testing.assert_close(mapctl.load("out/day 1/a.npz").joint_positions(), wanted, atol=1e-9, rtol=0)
+
+
+def test_without_an_ending_files_keep_their_own(here):
+    assert run("convert", "takes", "out", "--quiet") == 0
+    assert sorted(path.name for path in Path("out").rglob("*.*")) == ["a.bvh", "b.npz", "c.bvh"]
+
+
+def test_a_rate_of_captures_is_for_captures_alone(here):
+    assert run("convert", "takes", "out", "--to", ".npz", "--fps-in", "60", "--quiet") == 0
+    assert [mapctl.load(f"out/{name}.npz").fps for name in ("c", "day 1/a")] == [60, 30]
+
+
+def test_a_folder_on_another_rig(here):
+    assert run("convert", "takes", "out", "--rig", "mixamo", "--mirror", "--root-motion", "--quiet") == 0
+    assert mapctl.load("out/c.bvh").skeleton.names[:2] == ("root", "mixamorig:Hips")
+
+
+def test_a_clip_that_fails_stops_no_other_one(here, capsys):
+    Path("takes/0.bvh").write_text("HIERARCHY\nnonsense")
+    walk(5).save("takes/short.bvh")
+    assert run("convert", "takes", "out", "--loop") == 3
+    told = capsys.readouterr().out.splitlines()
+    assert "failed: takes/0.bvh, line 2" in told[1]
+    assert any(line.startswith("failed: takes/short.bvh: no cycle is found") for line in told)
+    assert not list(Path("out").rglob("0.*"))
+
+
+def test_what_is_there_is_done_again_only_if_asked_for(here, capsys):
+    assert run("convert", "takes", "out") == 0
+    Path("out/c.bvh").write_text("mine")
+    assert run("convert", "takes", "out") == 0
+    assert "0 converted, 3 there already" in capsys.readouterr().out
+    assert Path("out/c.bvh").read_text() == "mine"
+    assert run("convert", "takes", "out", "--again", "--quiet") == 0
+    assert Path("out/c.bvh").read_text() != "mine"
+
+
+def test_more_processes_give_the_same_files(here):
+    assert run("convert", "takes", "one", "--plant-feet", "--quiet") == 0
+    assert run("convert", "takes", "two", "--plant-feet", "--quiet", "--jobs", 2) == 0
+    for path in Path("one").rglob("*.*"):
+        assert path.read_bytes() == Path("two", path.relative_to("one")).read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["takes", "takes"], "takes is the folder that is read"),
+        (["takes/day 1", "out", "--to", ".mp3"], "unknown ending '.mp3'"),
+        (["takes", "out", "--jobs", "0"], "--jobs must be at least 1"),
+        (["takes", "out", "--fps", "many"], "a frame rate is a number"),
+        (["takes", "out", "--rig", "nobody"], "no rig 'nobody'"),
+        (["takes", "out", "--source-rig", "nobody"], "no rig 'nobody'"),
+        (["takes", "in.bvh"], "in.bvh"),
+        (["empty", "out"], "no .bvh or"),
+    ],
+)
+def test_what_no_file_could_do_is_refused_at_once(here, capsys, arguments, said):
+    Path("empty").mkdir()
+    assert run("convert", *arguments) == 2
+    told = capsys.readouterr()
+    assert said in told.err
+    assert told.err.count("\n") == 1
+    assert not Path("out").exists()
+
+
+def test_two_results_of_one_name_and_results_over_what_is_read_are_refused(here, capsys):
+    shutil.copy("takes/day 1/a.bvh", "takes/day 1/b.bvh")
+    assert run("convert", "takes", "out", "--to", "npz") == 2
+    assert "would both become" in capsys.readouterr().err
+    Path("takes/day 1/day 1").mkdir()
+    walk(5).save("takes/day 1/day 1/z.bvh")
+    walk(5).save("takes/z.bvh")
+    before = {path: path.read_bytes() for path in Path("takes").rglob("*.*")}
+    assert run("convert", "takes/day 1", "takes") in (0, 2)
+    after = {path: path.read_bytes() for path in before}
+    assert before == after
+
+
+def test_an_interrupted_folder_goes_on_where_it_was(here, monkeypatch, capsys):
+    convert, done = convert_folder.FileConverter._convert, []
+
+    def stop_after_one(self, job):
+        if done:
+            raise KeyboardInterrupt
+        done.append(job)
+        return convert(self, job)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(convert_folder.FileConverter, "_convert", stop_after_one)
+        assert run("convert", "takes", "out") == 130
+    assert "1 of 3 files are finished; the same command goes on with the others" in capsys.readouterr().err
+    assert run("convert", "takes", "out") == 0
+    assert "2 converted" in capsys.readouterr().out
+
+
+def test_measure_names_the_cycle(here, capsys):
+    assert run("measure", "in.bvh") == 0
+    line = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("cycle"))
+    assert ", 30 frames, 1.00 s," in line
+    assert "120 steps a minute, stride 1.3" in line
+    assert "right foot 0.48 of a cycle after the left" in line
+    assert run("measure", "in.bvh", "--json") == 0
+    told = json.loads(capsys.readouterr().out)["cycle"]
+    assert told["frames"] == 30
+    assert told["gait"]
+
+
+def test_measure_says_that_there_is_none(here, capsys):
+    walk(8).save("short.bvh")
+    assert run("measure", "short.bvh") == 0
+    assert "cycle: none, 0.27 s are too short for one" in capsys.readouterr().out

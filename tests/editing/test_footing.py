@@ -1,0 +1,132 @@
+"""Footing alone: planted toes stand still on their floor, and nothing but legs and hips changes."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers import generator, walk
+from rigs_to_edit import RIGS, on_rig, soft_knees, toe_speed
+
+import mapctl
+from mapctl import editing, retarget
+from mapctl.editing.footing import find_contacts
+from mapctl.editing.ground_transform import repeat_over_ground
+from mapctl.editing.rigged_motion import RiggedMotion
+from mapctl.skeleton import CANONICAL
+
+LEGS = [side + part for part in ("UpperLeg", "LowerLeg", "Foot") for side in ("left", "right")]
+
+
+def sliding(frames: int = 75, fps: int = 30):
+    """A walk whose body drifts sideways against its feet."""
+    motion = soft_knees(walk(frames, cadence=1.0, fps=fps))
+    drift = torch.linspace(0, 0.25 * frames / fps / 2.5, frames).double()
+    return replace(motion, root_position=motion.root_position + torch.stack([drift, 0 * drift, 0 * drift], dim=-1))
+
+
+def contacts_of(motion):
+    return find_contacts(RiggedMotion.of(motion).positions("Toes"), float(motion.fps))
+
+
+@pytest.mark.parametrize("name", RIGS)
+def test_planted_toes_are_still_on_any_rig_and_the_rest_stays_to_the_bit(name):
+    motion = on_rig(name, sliding())
+    planted = contacts_of(motion)
+    done = editing.plant_feet(motion)
+    assert toe_speed(motion, planted) > 0.08
+    assert toe_speed(done, planted) < 0.002
+    joints = retarget.identify_rig(motion.skeleton, motion=motion).joints
+    others = [j for j in range(motion.num_joints) if j not in {joints[name] for name in LEGS}]
+    assert torch.equal(done.local_quat_xyzw[:, others], motion.local_quat_xyzw[:, others])
+    feet = [joints[name] for name in ("leftFoot", "rightFoot")]
+    turned = (done.joint_rotations() * motion.joint_rotations())[:, feet].sum(dim=-1).abs()
+    torch.testing.assert_close(turned, torch.ones_like(turned), atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("fps", [30, 60, 120])
+def test_at_any_rate_without_a_jump(fps):
+    motion = sliding(5 * fps // 2, fps)
+    done = editing.plant_feet(motion)
+    assert toe_speed(done, contacts_of(motion)) < 0.002
+    before, after = (m.joint_positions().diff(n=2, dim=0).norm(dim=-1).max() * fps**2 for m in (motion, done))
+    assert float(after) < 1.6 * float(before)  # knees of this walk have kinks of their own
+
+
+def test_contacts_at_one_place_are_one_and_elsewhere_two():
+    toes = torch.zeros(60, 2, 3, dtype=torch.float64)
+    toes[27:30, :, 1] = 0.06
+    toes[30:, 1, 0] = 0.2
+    planted = find_contacts(toes, 30.0)
+    assert bool(planted[:, 0].all())
+    assert not bool(planted[28, 1])
+
+
+def test_noise_is_no_reason_to_let_go():
+    motion = sliding(120, 60)
+    noise = 0.004 * torch.randn(120, 3, generator=generator(), dtype=torch.float64)
+    noisy = replace(motion, root_position=motion.root_position + noise)
+    planted = contacts_of(motion)
+    assert float((contacts_of(noisy) == planted).double().mean()) > 0.9
+    assert toe_speed(noisy, planted) > 0.5
+    inner = planted[2:] & planted[1:-1] & planted[:-2]
+    still = torch.zeros_like(planted)
+    still[2:-2] = inner[1:-1]
+    assert toe_speed(editing.plant_feet(noisy), still & contacts_of(noisy)) < 0.01
+
+
+def test_toes_that_sink_and_float_are_put_on_the_floor():
+    motion = walk(75, cadence=1.0)
+    wave = 0.012 * torch.sin(torch.arange(75).double() / 9)
+    uneven = replace(motion, root_position=motion.root_position + torch.stack([0 * wave, wave, 0 * wave], dim=-1))
+    toes = [CANONICAL.index(side + "Toes") for side in ("left", "right")]
+    planted = contacts_of(uneven)
+    before, after = (m.joint_positions()[:, toes, 1] for m in (uneven, editing.plant_feet(uneven)))
+    assert float(before[planted].std()) > 0.004
+    assert float(after[planted].std()) < 0.5 * float(before[planted].std())
+    floor = before.quantile(0.05, dim=0)
+    assert float((after - floor).amin()) > -0.002
+
+
+def test_hips_go_down_where_a_leg_is_too_short():
+    motion = walk(75, cadence=1.0)
+    rise = 0.02 * (torch.arange(75) > 40).double()
+    high = replace(motion, root_position=motion.root_position + torch.stack([0 * rise, rise, 0 * rise], dim=-1))
+    planted = contacts_of(high)
+    done = editing.plant_feet(high)
+    assert toe_speed(done, planted) < 0.02
+    moved = done.root_position - high.root_position
+    assert -0.06 < float(moved[:, 1].min()) < 0
+    assert float(moved[:, ::2].abs().max()) == 0
+
+
+def test_who_never_stands_is_left_alone():
+    motion = walk(30)
+    flying = replace(motion, root_position=motion.root_position + torch.arange(30).double()[:, None] * 0.5)
+    assert torch.equal(editing.plant_feet(flying).local_quat_xyzw, motion.local_quat_xyzw)
+
+
+def test_a_loop_stays_one_with_feet_that_are_still_over_its_seam():
+    loop = editing.close_loop(sliding(120))
+    whole, frames = repeat_over_ground(loop.motion, loop.travel, 3), loop.motion.num_frames
+    stands = contacts_of(whole).any(dim=1)
+    start = next(f for f in range(frames, 2 * frames) if bool(stands[f - 2 : f + 3].all()))
+    motion = whole.slice(start, start + frames)  # begins amid a contact
+    planted = editing.plant_feet(motion, cycle=loop.travel)
+    alone = editing.remove_travel(planted, cycle=loop.travel)
+    bends = alone.join(alone).joint_positions().diff(n=2, dim=0).norm(dim=-1).amax(dim=1)
+    assert float(bends[frames - 2 : frames].max()) <= float(bends[: frames - 2].max())
+    before, after = (repeat_over_ground(m, loop.travel, 3) for m in (motion, planted))
+    contacts = contacts_of(before)
+    contacts[: frames // 2], contacts[-frames // 2 :] = False, False
+    assert toe_speed(after, contacts) < 0.003
+
+
+def test_a_file_keeps_the_numbers_of_what_stays(tmp_path):
+    on_rig("fingers, twists, a sword", sliding()).save(tmp_path / "in.bvh")
+    motion = mapctl.load(tmp_path / "in.bvh")
+    editing.plant_feet(motion).save(tmp_path / "out.bvh")
+    old, new = (
+        [line.split() for line in (tmp_path / name).read_text().splitlines()[-75:]] for name in ("in.bvh", "out.bvh")
+    )
+    columns = [c for c in range(len(old[0])) if any(a[c] != b[c] for a, b in zip(old, new, strict=True))]
+    assert 0 < len(columns) <= 18 + 1  # two legs of three joints, and the height of the hips
