@@ -162,7 +162,7 @@ def test_the_page_names_every_format_and_key():
 
 def test_commands_of_the_page_are_understood():
     lines = [line.split("#")[0] for line in DOCS.splitlines() if line.startswith("mapctl ")]
-    assert len(lines) == 6
+    assert len(lines) == 7
     for line in lines:
         assert cli.parse(shlex.split(line)[1:]) is not None
 
