@@ -18,6 +18,9 @@ from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, Skeleton, leg_length
 
 SIDES = ("left", "right")
 _MAX_FLOOR_OFFSET = 0.15  # of the leg: where toes rest further from 0, the floor is not at 0
+_MIN_FLOOR_OFFSET = 0.03  # metres that toes rest higher than bones say, which no toe joint's own height explains
+MAX_TOE_SINK = 0.008
+"""How far toe joints of a moving foot go under the height at which they rest at most, metres."""
 _MAX_TOE_DIFFERENCE = 0.05  # of the leg: of toes that rest further apart, one is held up all the time
 _FLAT_ANKLE_METRES = 0.01  # metres over its lowest that the ankle of a flat foot is
 _LOWEST_QUANTILE = 0.05  # quantile that is an ankle's lowest
@@ -40,6 +43,24 @@ class Stance:
     """Pitch of foot and toes by side, radians, positive up, against the T-pose while they lie flat."""
     floor: float = 0.0
     """Height of the clip's floor, metres: 0, but where all of it is above or below, as on a platform."""
+    toe_offset: float = 0.0
+    """How much higher toes rest in the clip than bones alone say, metres, mean of both; what `floor` has is not in
+    it."""
+
+    @property
+    def standing_height(self) -> Float[Tensor, "2"]:
+        """Height at which toe joints of others' flat feet are put over the floor, metres: as in the clip, but hardly
+        over the height of toes that rest."""
+        return torch.minimum(self.flat_height, self.toe_height + MAX_TOE_SINK)
+
+    def keep_floor(self) -> "Stance":
+        """Return the stance of the same clip in which a floor that seems to be off is off, from 3 cm on: as on a low
+        platform."""
+        off = self.toe_offset if abs(self.toe_offset) > _MIN_FLOOR_OFFSET else 0.0
+        heights = self.toe_height - off, self.flat_height - off
+        return replace(
+            self, toe_height=heights[0], flat_height=heights[1], floor=self.floor + off, toe_offset=self.toe_offset - off
+        )
 
     @staticmethod
     def at_rest(skeleton: Skeleton) -> "Stance":
@@ -69,7 +90,7 @@ class Stance:
         if float(seen.abs().max()) > _MAX_FLOOR_OFFSET * leg:
             floor = float((seen - rest.toe_height).mean())
             return Stance(rest.toe_height, rest.toe_height + laid - seen, tilt, floor)
-        return Stance(seen, laid, tilt)
+        return Stance(seen, laid, tilt, toe_offset=float((seen - rest.toe_height).mean()))
 
     def leveled(self, motion: Motion) -> Motion:
         """Return the same movement with a T-pose whose feet are flat: no joint moves, joint frames of feet rotate."""

@@ -15,7 +15,8 @@ from mapctl import contacts, retarget, rotations
 from mapctl.commands.shared import character
 from mapctl.formats.bvh.layout import BvhLayout
 from mapctl.motion import Motion
-from mapctl.retarget.carry import RiggedCharacter, _soft_clamp, retarget_motion
+from mapctl.retarget.carry import RiggedCharacter, retarget_motion
+from mapctl.retarget.carry.holding import soft_clamp
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, leg_length
 
 USUAL = Performer()
@@ -163,7 +164,7 @@ def test_nearly_straight_legs_reach_and_do_not_snap():
 def test_a_leg_gives_in_before_it_is_straight():
     """Never beyond the most, untouched well before it, and no faster than what it follows."""
     far, most = torch.linspace(0.5, 1.2, 701, dtype=torch.float64)[:, None].expand(-1, 2), torch.ones(2).double()
-    given = _soft_clamp(far, most)
+    given = soft_clamp(far, most, 0.004)
     assert float(given.max()) <= 1.0
     torch.testing.assert_close(given[far < 0.99], far[far < 0.99], atol=0, rtol=0)
     steps = given.diff(dim=0) / far.diff(dim=0)

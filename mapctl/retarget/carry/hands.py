@@ -1,0 +1,209 @@
+"""Hands near the body, each other or the floor: where they are relative to these is kept on other bones.
+
+A hand has two points, palm and finger tips. For each segment of the giver's body (see `segments`) that a point is near,
+the same place on the receiving body is where that point should be, and all these places are averaged, the nearest
+counting most; beside them the place that rotations alone lead to, the more the farther the hand is from everything.
+Places relative to a body's surface are kept in the manner of Molla et al. 2018.
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mapctl import contacts, kinematics, rotations
+from mapctl.kinematics import inverse
+from mapctl.motion import Motion
+from mapctl.numerics.easing import smootherstep
+from mapctl.retarget.carry import segments
+from mapctl.retarget.carry.holding import envelope, hold_through, mean_by_span, merge_contacts, soft_clamp
+from mapctl.retarget.stance import SIDES, Stance
+from mapctl.skeleton import LIMBS
+
+_ARMS = [LIMBS[side + "Hand"] for side in SIDES]
+_HANDS = [arm.end for arm in _ARMS]
+_POINTS = (0.08, 0.15)  # metres from the wrist to palm and finger tips along the hand, of the canonical body
+_PALM_THICKNESS = 0.03  # metres from the middle of a hand to what it touches, of the canonical body
+_TOUCH_METRES, _FAR_METRES = 0.04, 0.22  # metres off a surface within which a hand touches, and from which it is free
+_FADE_SECONDS = 0.12  # seconds over which a relation comes and goes
+_SHARPNESS = 0.05  # how much less a segment counts that is a little farther than the nearest
+_ROUNDS = 3  # times that hands are placed, since each arm is something that the other hand is near
+_EASE_WEIGHT = 0.1  # strength from which the arm is solved for entirely
+_MOST_EXTENSION, _SOFT_MARGIN = 0.998, 0.03  # of the arm: how straight one is made, and over which share it gives in
+_HELD_SPEED = 0.25  # m/s below which a hand on the floor stands on it
+_LEAST_STRENGTH = 0.5  # of a relation, from which a hand that does not get there is worth a line
+
+
+@dataclass(frozen=True, eq=False)
+class HandTargets:
+    """What hands were aimed at, in the order left, right."""
+
+    offset: Float[Tensor, "frames 2 3"]
+    """From where rotations alone lead to where the hand should be, metres."""
+    errors: Float[Tensor, "frames 2"]
+    """How far hands that are near something are from where they should be, metres."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Relations:
+    """Of the giver's hands; the points of both hands one after another, left first."""
+
+    near: segments.Near
+    """To the segments of its body."""
+    weight: Float[Tensor, "frames points segments"]
+    """How much each counts, 0 to 1."""
+    apart: Float[Tensor, "frames 3"]
+    """From the middle of the left hand to that of the right, metres."""
+    together: Float[Tensor, "frames 1"]
+    """How much that counts, 0 to 1."""
+    floor_height: Float[Tensor, "frames points"]
+    """Height of the points over the floor, metres, less what a hand is thick."""
+    floor_weight: Float[Tensor, "frames points"]
+    """How much that counts, 0 to 1."""
+    planted: Bool[Tensor, "frames points"]
+    """Whether a point stands on the floor."""
+
+    def strength(self) -> Float[Tensor, "frames 2"]:
+        """Return how much hands are bound to anything, 0 to 1."""
+        return 1 - (1 - self.body_strength()) * (1 - self.together)
+
+    def body_strength(self) -> Float[Tensor, "frames 2"]:
+        """Return how much hands are bound to body and floor, 0 to 1."""
+        free = (1 - self.weight).prod(dim=-1) * (1 - self.floor_weight)
+        return 1 - free.unflatten(1, (2, -1)).prod(dim=-1)
+
+
+
+def keep_hand_relations(own: Motion, moved: Motion, giver: Stance, *, scale: float) -> tuple[Motion, HandTargets]:
+    """Bring hands to where the giver's are relative to body, each other and floor, as far as arms allow.
+
+    Both are motions of canonical joints, `own` the giver's, `moved` with its rotations but of legs on other bones. Hands
+    keep their orientation in the world, and elbows go on to where they point.
+    """
+    relations = _find_relations(own, giver)
+    if not bool((relations.strength() > 0).any()):
+        still = torch.zeros(own.num_frames, 2, dtype=torch.float64)
+        return moved, HandTargets(still[..., None].expand(-1, -1, 3), still)
+    at_floor = _floor_offsets(own, moved, relations, giver, scale=scale)
+    done, offset = moved, torch.zeros(own.num_frames, 2, 3, dtype=torch.float64)
+    for _ in range(_ROUNDS):
+        offset = _offset_hands(relations, moved, done, at_floor)
+        done = _reach(moved, offset, relations.strength())
+    aimed = moved.joint_positions()[:, _HANDS] + offset
+    errors = (done.joint_positions()[:, _HANDS] - aimed).norm(dim=-1)
+    return done, HandTargets(offset, torch.where(relations.strength() > _LEAST_STRENGTH, errors, 0.0))
+
+
+def _find_relations(own: Motion, giver: Stance) -> _Relations:
+    size, fps, body = segments.girth(own.skeleton), float(own.fps), segments.place_segments(own)
+    points, thick = _hand_points(own, size), size * _PALM_THICKNESS
+    near = segments.find_nearest(points, body)
+    weight = _weigh(near.distance - thick) * _others_arms()
+    left, right = points.unflatten(1, (2, -1)).unbind(dim=1)
+    between = (left[:, :, None] - right[:, None]).norm(dim=-1).flatten(1).amin(dim=1, keepdim=True)
+    height = points[..., 1] - giver.floor - thick
+    return _Relations(
+        near=near,
+        weight=envelope(weight.flatten(1), _FADE_SECONDS, fps).view_as(weight),
+        apart=(right - left).mean(dim=1),
+        together=envelope(_weigh(between - 2 * thick), _FADE_SECONDS, fps),
+        floor_height=height,
+        floor_weight=envelope(_weigh(height), _FADE_SECONDS, fps),
+        planted=_detect_planted(points, height, fps),
+    )
+
+
+def _weigh(distance: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """Return how much a relation over a distance counts: entirely where it is a touch, not at all from far on."""
+    return 1 - smootherstep((distance - _TOUCH_METRES) / (_FAR_METRES - _TOUCH_METRES))
+
+
+def _others_arms() -> Float[Tensor, "points segments"]:
+    """Return 0 where a segment belongs to the arm of the point's own hand, else 1."""
+    sides = torch.arange(2, dtype=torch.float64).repeat_interleave(len(_POINTS))
+    return (segments.layout().arm[None] != sides[:, None]).double()
+
+
+def _hand_points(motion: Motion, size: float) -> Float[Tensor, "frames points 3"]:
+    """Return the world positions of palms and finger tips, left ones first, metres."""
+    along = torch.tensor([[sign * far for far in _POINTS] for sign in (1, -1)], dtype=torch.float64)
+    offsets = torch.zeros(*along.shape, 3, dtype=torch.float64)
+    offsets[..., 0] = size * along
+    turns = motion.joint_rotations()[:, _HANDS, None].expand(-1, -1, len(_POINTS), 4)
+    reaching = rotations.rotate(turns, offsets.expand(*turns.shape[:3], 3))
+    return (motion.joint_positions()[:, _HANDS, None] + reaching).flatten(1, 2)
+
+
+def _detect_planted(
+    points: Float[Tensor, "frames points 3"], height: Float[Tensor, "frames points"], fps: float
+) -> Bool[Tensor, "frames points"]:
+    """Detect points that stand on the floor: near it and slow, for a while."""
+    if len(points) < 2:
+        return torch.zeros_like(height, dtype=torch.bool)
+    settings = contacts.ContactSettings()
+    step = min(len(points) - 1, max(1, round(settings.speed_window * fps)))
+    speed = (points[step:] - points[:-step]).norm(dim=-1) * (fps / step)
+    slow = torch.cat([speed[:1].expand(step, -1), speed]) < _HELD_SPEED
+    return contacts.remove_short_runs(slow & (height < _TOUCH_METRES), max(1, round(settings.shortest * fps)))
+
+
+def _floor_offsets(
+    own: Motion, moved: Motion, relations: _Relations, giver: Stance, *, scale: float
+) -> Float[Tensor, "frames points 3"]:
+    """Return offsets that bring points as high over the floor as the giver's, metres, and hold over the ground what
+    stands on it."""
+    size = segments.girth(moved.skeleton)
+    points, given = _hand_points(moved, size), scale * _hand_points(own, segments.girth(own.skeleton))
+    offsets = torch.zeros_like(points)
+    offsets[..., 1] = relations.floor_height + giver.floor + size * _PALM_THICKNESS - points[..., 1]
+    for k, spans in enumerate(merge_contacts(relations.planted, given, float(own.fps))):
+        if spans:
+            shift = (points - given)[:, k, ::2]
+            offsets[:, k, ::2] = hold_through(spans, mean_by_span(shift, spans), len(shift)) - shift
+    return offsets
+
+
+def _offset_hands(
+    relations: _Relations, moved: Motion, done: Motion, at_floor: Float[Tensor, "frames points 3"]
+) -> Float[Tensor, "frames 2 3"]:
+    """Return where hands should be from where rotations alone lead, metres; `done` shows where the other arm is."""
+    points = _hand_points(moved, segments.girth(moved.skeleton))
+    places = segments.place_nearest(relations.near, segments.place_segments(done))
+    offsets = torch.cat([places - points[:, :, None], at_floor[:, :, None]], dim=2)
+    weight = torch.cat([relations.weight, relations.floor_weight[..., None]], dim=2)
+    say = (weight / (1 - weight + _SHARPNESS))[..., None]
+    total, summed = (each.unflatten(1, (2, -1)).sum(dim=(2, 3)) for each in (say, say * offsets))
+    strength = relations.body_strength()[..., None]
+    offset = strength * summed / total.clamp_min(1e-9)
+    middle = points.unflatten(1, (2, -1)).mean(dim=2) + offset
+    missing = relations.together * (relations.apart - (middle[:, 1] - middle[:, 0]))
+    # A hand that touches the body stays there; the other comes to it.
+    gives = 1 - strength + _SHARPNESS
+    shares = gives / gives.sum(dim=1, keepdim=True) * gives.new_tensor([[-1.0], [1.0]])
+    return offset + shares * missing[:, None]
+
+
+def _reach(moved: Motion, offset: Float[Tensor, "frames 2 3"], strength: Float[Tensor, "frames 2"]) -> Motion:
+    """Bend arms so that hands are moved by an offset, as far as that is in reach; where relations are weak, hardly."""
+    places, world = moved.joint_positions(), moved.joint_rotations()
+    ease, turned = smootherstep(strength / _EASE_WEIGHT), world.clone()
+    for k, arm in enumerate(_ARMS):
+        to_hand = places[:, arm.end] - places[:, arm.upper]
+        direction = _keep_in_reach(to_hand, to_hand + offset[:, k], arm.length(moved.skeleton))
+        upper, bent = world[:, arm.upper], moved.local_quat_xyzw[:, arm.lower]
+        reached = inverse.reach(arm, upper, bent, direction, moved.skeleton.offsets)
+        upper, bent = (rotations.slerp(a, b, ease[:, k]) for a, b in zip((upper, bent), reached, strict=True))
+        turned[:, arm.upper], turned[:, arm.lower] = upper, rotations.multiply(upper, bent)
+    local = kinematics.local_from_world(moved.skeleton.parents, turned)
+    return replace(moved, local_quat_xyzw=rotations.make_sign_continuous(local))
+
+
+def _keep_in_reach(
+    before: Float[Tensor, "frames 3"], wanted: Float[Tensor, "frames 3"], length: float
+) -> Float[Tensor, "frames 3"]:
+    """Shorten vectors from the shoulder to what an arm reaches; what is no farther than before is as it is."""
+    was, far = before.norm(dim=-1, keepdim=True), wanted.norm(dim=-1, keepdim=True)
+    most = far.new_tensor([_MOST_EXTENSION * length])
+    near = torch.minimum(far, torch.maximum(soft_clamp(far, most, _SOFT_MARGIN), was))
+    return wanted * (near / far.clamp_min(1e-9))

@@ -1,0 +1,137 @@
+"""A body as rounded segments between joints: what hands may touch, and where on it a point is."""
+
+from dataclasses import dataclass
+from functools import cache
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mapctl import rotations
+from mapctl.motion import Motion
+from mapctl.skeleton import CANONICAL, Skeleton, leg_length
+
+# From joint, to joint, half widths at both ends in metres for the canonical body: of the trunk along x and z, of limbs
+# all around. A name that begins with + is an offset from the first joint.
+_TRUNK = (
+    ("hips", "spine", (0.135, 0.095), (0.125, 0.090)),
+    ("spine", "chest", (0.125, 0.090), (0.135, 0.098)),
+    ("chest", "neck", (0.135, 0.098), (0.075, 0.060)),
+    ("neck", "head", (0.050, 0.050), (0.050, 0.050)),
+    ("head", "", (0.078, 0.095), (0.078, 0.095)),
+)
+_LIMBS = (
+    ("Shoulder", "UpperArm", 0.055, 0.055),
+    ("UpperLeg", "LowerLeg", 0.080, 0.057),
+    ("LowerLeg", "Foot", 0.050, 0.036),
+    ("Foot", "Toes", 0.040, 0.035),
+)
+_ARMS = (("UpperArm", "LowerArm", 0.046, 0.040), ("LowerArm", "Hand", 0.037, 0.028))
+_HEAD_TIP = (0.0, 0.12, 0.0)  # metres from the head joint to the middle of the skull's top, of the canonical body
+_SIDES = ("left", "right")
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """Which segments a body has."""
+
+    start: tuple[int, ...]
+    """Canonical joint at which each begins, which also turns it."""
+    stop: tuple[int, ...]
+    """Canonical joint at which it ends; its start again for the head, which ends at a point of its own."""
+    widths: Float[Tensor, "segments 2 3"]
+    """Half widths along the axes of the start's frame at both ends, metres, of the canonical body."""
+    arm: Float[Tensor, "segments"]
+    """Of segments of an arm the side: 0 left, 1 right; -1 of others."""
+
+
+@dataclass(frozen=True, eq=False)
+class Segments:
+    """The segments of one body in every frame."""
+
+    begin: Float[Tensor, "frames segments 3"]
+    """World position at which each begins, metres."""
+    end: Float[Tensor, "frames segments 3"]
+    """World position at which each ends, metres."""
+    quat_xyzw: Float[Tensor, "frames segments 4"]
+    """Rotation of each in the world."""
+    widths: Float[Tensor, "segments 2 3"]
+    """Half widths along its own axes at both ends, metres."""
+
+
+@dataclass(frozen=True, eq=False)
+class Near:
+    """Where points are on each segment: the same place may be found on another body."""
+
+    share: Float[Tensor, "frames points segments 1"]
+    """Share of the way along the segment's axis to the place nearest to the point."""
+    aside: Float[Tensor, "frames points segments 3"]
+    """From there to the point, in half widths, along the segment's own axes."""
+    away: Float[Tensor, "frames points segments 3"]
+    """From the surface to the point, metres, along the segment's own axes; 0 within the body."""
+    distance: Float[Tensor, "frames points segments"]
+    """From the surface to the point, metres; negative within the body."""
+
+
+@cache
+def layout() -> Layout:
+    """Return the segments of the canonical body."""
+    rows = [(start, stop or start, [(x, x, z), (u, u, w)], -1) for start, stop, (x, z), (u, w) in _TRUNK]
+    for side, name in enumerate(_SIDES):
+        for start, stop, first, last in (*_LIMBS, *_ARMS):
+            arm = side if (start, stop, first, last) in _ARMS else -1
+            rows.append((name + start, name + stop, [(first,) * 3, (last,) * 3], arm))
+    start, stop, widths, arms = zip(*rows, strict=True)
+    return Layout(
+        tuple(CANONICAL.indices(start)),
+        tuple(CANONICAL.indices(stop)),
+        torch.tensor(widths, dtype=torch.float64),
+        torch.tensor(arms, dtype=torch.float64),
+    )
+
+
+def girth(skeleton: Skeleton) -> float:
+    """Return how thick a body of canonical joints is against the canonical one: by its legs and its trunk."""
+    trunk = [CANONICAL.index(name) for name in ("spine", "chest", "neck")]
+    longer = skeleton.offsets[trunk].norm(dim=-1).sum() / CANONICAL.offsets[trunk].norm(dim=-1).sum()
+    return float((longer * leg_length(skeleton) / leg_length(CANONICAL)).sqrt())
+
+
+def place_segments(motion: Motion) -> Segments:
+    """Place the segments of a body in every frame of a motion of canonical joints."""
+    found, size = layout(), girth(motion.skeleton)
+    places, turns = motion.joint_positions(), motion.joint_rotations()
+    begin, end = places[:, list(found.start)], places[:, list(found.stop)].clone()
+    for k, (start, stop) in enumerate(zip(found.start, found.stop, strict=True)):
+        if start == stop:
+            tip = size * torch.tensor(_HEAD_TIP, dtype=torch.float64)
+            end[:, k] = begin[:, k] + rotations.rotate(turns[:, start], tip.expand(len(places), 3))
+    return Segments(begin, end, turns[:, list(found.start)], size * found.widths)
+
+
+def find_nearest(points: Float[Tensor, "frames points 3"], body: Segments) -> Near:
+    """Find where points are on each segment of a body."""
+    axis = (body.end - body.begin)[:, None]
+    way = points[:, :, None] - body.begin[:, None]
+    share = (way * axis).sum(-1, keepdim=True) / axis.square().sum(-1, keepdim=True).clamp_min(1e-9)
+    share = share.clamp(0, 1)
+    turns = rotations.inverse(body.quat_xyzw)[:, None].expand(*share.shape[:3], 4)
+    aside = rotations.rotate(turns, way - share * axis)
+    aside_widths = aside / _width_at(body, share)
+    round_off = aside_widths.norm(dim=-1, keepdim=True)
+    away = aside * (1 - 1 / round_off.clamp_min(1))
+    depth = (aside.norm(dim=-1) / round_off[..., 0].clamp_min(1e-6)) * (round_off[..., 0] - 1)
+    return Near(share, aside_widths / round_off.clamp_min(1), away, depth)
+
+
+def place_nearest(near: Near, body: Segments) -> Float[Tensor, "frames points segments 3"]:
+    """Return world positions of the same places on another body, metres: as far along each segment and about it, and as
+    many metres off its surface."""
+    axis = (body.end - body.begin)[:, None]
+    turns = body.quat_xyzw[:, None].expand(*near.share.shape[:3], 4)
+    aside = rotations.rotate(turns, near.aside * _width_at(body, near.share) + near.away)
+    return body.begin[:, None] + near.share * axis + aside
+
+
+def _width_at(body: Segments, share: Tensor) -> Float[Tensor, "frames points segments 3"]:
+    return torch.lerp(body.widths[:, 0], body.widths[:, 1], share)
