@@ -41,7 +41,7 @@ def retarget_motion(
         return RetargetedMotion(replace(to_canonical(clip, as_rig(body.rigmap))[0], skeleton=body.skeleton))
     canonical, giver = RiggedCharacter.of(clip, rig)
     found = retarget_canonical(canonical, giver, body, ground=ground)
-    unmatched = list_unmatched_joints(clip, giver.rigmap, body.rigmap)
+    unmatched = list_unmatched_joints(clip, giver.rigmap)
     return replace(found, changes=replace(found.changes, unmatched_joints=unmatched))
 
 

@@ -117,14 +117,16 @@ def measure_changes(
     )
 
 
-def list_unmatched_joints(clip: Motion, giver: RigMap, body: RigMap) -> tuple[str, ...]:
-    """List the joints of a clip that move and are neither canonical ones nor above the hips."""
-    hips = giver.joints["hips"]
-    matched = {*giver.joints.values(), *range(hips)}
-    first = clip.local_quat_xyzw[:1]
-    dots = (clip.local_quat_xyzw * first).sum(-1).abs().amin(dim=0).clamp(max=1.0)
+def list_unmatched_joints(clip: Motion, giver: RigMap) -> tuple[str, ...]:
+    """List the joints of a clip that move and that no canonical joint is or hangs from: what their turns do is lost."""
+    led_by, parents = {*giver.joints.values()}, clip.skeleton.parents
+    for joint in sorted(led_by, reverse=True):
+        while parents[joint] >= 0:
+            joint = parents[joint]
+            led_by.add(joint)
+    dots = (clip.local_quat_xyzw * clip.local_quat_xyzw[:1]).sum(-1).abs().amin(dim=0).clamp(max=1.0)
     moves = 2 * torch.acos(dots) > _MOVES_RADIANS
-    return tuple(name for j, name in enumerate(clip.skeleton.names) if j not in matched and bool(moves[j]))
+    return tuple(name for j, name in enumerate(clip.skeleton.names) if j not in led_by and bool(moves[j]))
 
 
 def _measure_miss(off: Float[Tensor, "frames 2"], noted: float) -> Miss:

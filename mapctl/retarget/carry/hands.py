@@ -25,12 +25,16 @@ _ARMS = [LIMBS[side + "Hand"] for side in SIDES]
 _HANDS = [arm.end for arm in _ARMS]
 _POINTS = (0.08, 0.15)  # metres from the wrist to palm and finger tips along the hand, of the canonical body
 _PALM_THICKNESS = 0.03  # metres from the middle of a hand to what it touches, of the canonical body
-_TOUCH_METRES, _FAR_METRES = 0.04, 0.22  # metres off a surface within which a hand touches, and from which it is free
-_FADE_SECONDS = 0.12  # seconds over which a relation comes and goes
+_TOUCH_METRES, _FAR_METRES = 0.02, 0.16  # metres off a surface within which a hand touches, and from which it is free
+_SLIDE_METRES = 0.07  # metres off a surface from which a hand may slide along a limb or the trunk
+# Of the arm: from where on it is so straight that it hangs, and from where on it does so entirely.
+_HANGS_FROM, _HANGS_TO = 0.86, 0.94
+_FADE_SECONDS = 0.05  # seconds over which a relation comes and goes
 _SHARPNESS = 0.05  # how much less a segment counts that is a little farther than the nearest
 _ROUNDS = 3  # times that hands are placed, since each arm is something that the other hand is near
 _EASE_WEIGHT = 0.1  # strength from which the arm is solved for entirely
-_MOST_EXTENSION, _SOFT_MARGIN = 0.998, 0.03  # of the arm: how straight one is made, and over which share it gives in
+_FREE_EXTENSION, _MOST_EXTENSION = 0.97, 0.998  # of the arm: how straight one may be whatever the giver's is, and at most
+_SOFT_MARGIN = 0.03  # of the arm, before the most that it may be, over which it gives in
 _HELD_SPEED = 0.25  # m/s below which a hand on the floor stands on it
 _LEAST_STRENGTH = 0.5  # of a relation, from which a hand that does not get there is worth a line
 
@@ -53,6 +57,8 @@ class _Relations:
     """To the segments of its body."""
     weight: Float[Tensor, "frames points segments"]
     """How much each counts, 0 to 1."""
+    touch: Float[Tensor, "frames points segments"]
+    """How much it matters where along a segment a point is, 0 to 1: entirely where it touches."""
     apart: Float[Tensor, "frames 3"]
     """From the middle of the left hand to that of the right, metres."""
     together: Float[Tensor, "frames 1"]
@@ -68,6 +74,11 @@ class _Relations:
         """Return how much hands are bound to anything, 0 to 1."""
         return 1 - (1 - self.body_strength()) * (1 - self.together)
 
+    def touch_strength(self) -> Float[Tensor, "frames 2"]:
+        """Return how much hands touch anything, 0 to 1."""
+        of_hand = torch.cat([self.touch, self.floor_weight[..., None]], dim=2).unflatten(1, (2, -1)).amax(dim=(2, 3))
+        return torch.maximum(of_hand, self.together)
+
     def body_strength(self) -> Float[Tensor, "frames 2"]:
         """Return how much hands are bound to body and floor, 0 to 1."""
         free = (1 - self.weight).prod(dim=-1) * (1 - self.floor_weight)
@@ -82,30 +93,34 @@ def keep_hand_relations(own: Motion, moved: Motion, giver: Stance, *, scale: flo
     keep their orientation in the world, and elbows go on to where they point.
     """
     relations = _find_relations(own, giver)
-    if not bool((relations.strength() > 0).any()):
+    strength = relations.strength()
+    if not bool((strength > 0).any()):
         still = torch.zeros(own.num_frames, 2, dtype=torch.float64)
         return moved, HandTargets(still[..., None].expand(-1, -1, 3), still)
     at_floor = _floor_offsets(own, moved, relations, giver, scale=scale)
+    straight = _arm_extension(own)
     done, offset = moved, torch.zeros(own.num_frames, 2, 3, dtype=torch.float64)
     for _ in range(_ROUNDS):
         offset = _offset_hands(relations, moved, done, at_floor)
-        done = _reach(moved, offset, relations.strength())
+        done = _reach(moved, offset, strength, straight)
     aimed = moved.joint_positions()[:, _HANDS] + offset
     errors = (done.joint_positions()[:, _HANDS] - aimed).norm(dim=-1)
-    return done, HandTargets(offset, torch.where(relations.strength() > _LEAST_STRENGTH, errors, 0.0))
+    return done, HandTargets(offset, torch.where(relations.touch_strength() > _LEAST_STRENGTH, errors, 0.0))
 
 
 def _find_relations(own: Motion, giver: Stance) -> _Relations:
     size, fps, body = segments.girth(own.skeleton), float(own.fps), segments.place_segments(own)
     points, thick = _hand_points(own, size), size * _PALM_THICKNESS
     near = segments.find_nearest(points, body)
-    weight = _weigh(near.distance - thick) * _others_arms()
+    say = _let_hang(own)
+    weight, touch = (say * _weigh(near.distance - thick, far) for far in (_FAR_METRES, _SLIDE_METRES))
     left, right = points.unflatten(1, (2, -1)).unbind(dim=1)
     between = (left[:, :, None] - right[:, None]).norm(dim=-1).flatten(1).amin(dim=1, keepdim=True)
     height = points[..., 1] - giver.floor - thick
     return _Relations(
         near=near,
         weight=envelope(weight.flatten(1), _FADE_SECONDS, fps).view_as(weight),
+        touch=envelope(touch.flatten(1), _FADE_SECONDS, fps).view_as(touch),
         apart=(right - left).mean(dim=1),
         together=envelope(_weigh(between - 2 * thick), _FADE_SECONDS, fps),
         floor_height=height,
@@ -114,15 +129,18 @@ def _find_relations(own: Motion, giver: Stance) -> _Relations:
     )
 
 
-def _weigh(distance: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """Return how much a relation over a distance counts: entirely where it is a touch, not at all from far on."""
-    return 1 - smootherstep((distance - _TOUCH_METRES) / (_FAR_METRES - _TOUCH_METRES))
+def _weigh(distance: Float[Tensor, "*batch"], far: float = _FAR_METRES) -> Float[Tensor, "*batch"]:
+    """Return how much a relation over a distance counts: entirely where it is a touch, not at all from `far` on."""
+    return 1 - smootherstep((distance - _TOUCH_METRES) / (far - _TOUCH_METRES))
 
 
-def _others_arms() -> Float[Tensor, "points segments"]:
-    """Return 0 where a segment belongs to the arm of the point's own hand, else 1."""
-    sides = torch.arange(2, dtype=torch.float64).repeat_interleave(len(_POINTS))
-    return (segments.layout().arm[None] != sides[:, None]).double()
+def _let_hang(own: Motion) -> Float[Tensor, "frames points segments"]:
+    """Return how much points may be bound to each segment, 0 to 1: not to the own arm, and hardly to trunk and thigh
+    while the arm is straight: it hangs there, and its hand is not put anywhere."""
+    straight = (_arm_extension(own) - _HANGS_FROM) / (_HANGS_TO - _HANGS_FROM)
+    layout = segments.layout()
+    of_hand = (1 - smootherstep(straight)[..., None] * layout.beside.double()) * (~layout.is_arm).double()
+    return of_hand.repeat_interleave(len(_POINTS), dim=1)
 
 
 def _hand_points(motion: Motion, size: float) -> Float[Tensor, "frames points 3"]:
@@ -169,8 +187,11 @@ def _offset_hands(
 ) -> Float[Tensor, "frames 2 3"]:
     """Return where hands should be from where rotations alone lead, metres; `done` shows where the other arm is."""
     points = _hand_points(moved, segments.girth(moved.skeleton))
-    places = segments.place_nearest(relations.near, segments.place_segments(done))
-    offsets = torch.cat([places - points[:, :, None], at_floor[:, :, None]], dim=2)
+    body = segments.place_segments(done)
+    toward = segments.place_nearest(relations.near, body) - points[:, :, None]
+    slide = segments.find_slide(relations.near, body)
+    along = (1 - relations.touch[..., None]) * (toward * slide).sum(-1, keepdim=True)
+    offsets = torch.cat([toward - along * slide, at_floor[:, :, None]], dim=2)
     weight = torch.cat([relations.weight, relations.floor_weight[..., None]], dim=2)
     say = (weight / (1 - weight + _SHARPNESS))[..., None]
     total, summed = (each.unflatten(1, (2, -1)).sum(dim=(2, 3)) for each in (say, say * offsets))
@@ -184,13 +205,27 @@ def _offset_hands(
     return offset + shares * missing[:, None]
 
 
-def _reach(moved: Motion, offset: Float[Tensor, "frames 2 3"], strength: Float[Tensor, "frames 2"]) -> Motion:
-    """Bend arms so that hands are moved by an offset, as far as that is in reach; where relations are weak, hardly."""
+def _arm_extension(own: Motion) -> Float[Tensor, "frames 2"]:
+    """Return how straight arms are: shoulder to wrist over both bones' length."""
+    places = own.joint_positions()
+    far = torch.stack([places[:, arm.end] - places[:, arm.upper] for arm in _ARMS], dim=1).norm(dim=-1)
+    return far / torch.tensor([arm.length(own.skeleton) for arm in _ARMS], dtype=torch.float64)
+
+
+def _reach(
+    moved: Motion,
+    offset: Float[Tensor, "frames 2 3"],
+    strength: Float[Tensor, "frames 2"],
+    straight: Float[Tensor, "frames 2"],
+) -> Motion:
+    """Bend arms so that hands are moved by an offset, as far as that is in reach without arms that are straighter than
+    `straight`, or than most; where relations are weak, hardly."""
     places, world = moved.joint_positions(), moved.joint_rotations()
     ease, turned = smootherstep(strength / _EASE_WEIGHT), world.clone()
     for k, arm in enumerate(_ARMS):
         to_hand = places[:, arm.end] - places[:, arm.upper]
-        direction = _keep_in_reach(to_hand, to_hand + offset[:, k], arm.length(moved.skeleton))
+        most = straight[:, k, None].clamp(_FREE_EXTENSION, _MOST_EXTENSION) * arm.length(moved.skeleton)
+        direction = _keep_in_reach(to_hand, to_hand + offset[:, k], most)
         upper, bent = world[:, arm.upper], moved.local_quat_xyzw[:, arm.lower]
         reached = inverse.reach(arm, upper, bent, direction, moved.skeleton.offsets)
         upper, bent = (rotations.slerp(a, b, ease[:, k]) for a, b in zip((upper, bent), reached, strict=True))
@@ -200,10 +235,9 @@ def _reach(moved: Motion, offset: Float[Tensor, "frames 2 3"], strength: Float[T
 
 
 def _keep_in_reach(
-    before: Float[Tensor, "frames 3"], wanted: Float[Tensor, "frames 3"], length: float
+    before: Float[Tensor, "frames 3"], wanted: Float[Tensor, "frames 3"], most: Float[Tensor, "frames 1"]
 ) -> Float[Tensor, "frames 3"]:
     """Shorten vectors from the shoulder to what an arm reaches; what is no farther than before is as it is."""
     was, far = before.norm(dim=-1, keepdim=True), wanted.norm(dim=-1, keepdim=True)
-    most = far.new_tensor([_MOST_EXTENSION * length])
     near = torch.minimum(far, torch.maximum(soft_clamp(far, most, _SOFT_MARGIN), was))
     return wanted * (near / far.clamp_min(1e-9))

@@ -4,15 +4,16 @@ from dataclasses import dataclass
 from functools import cache
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl import rotations
 from mapctl.motion import Motion
+from mapctl.numerics.easing import smootherstep
 from mapctl.skeleton import CANONICAL, Skeleton, leg_length
 
 # From joint, to joint, half widths at both ends in metres for the canonical body: of the trunk along x and z, of limbs
-# all around. A name that begins with + is an offset from the first joint.
+# all around. The head ends at a point of its own.
 _TRUNK = (
     ("hips", "spine", (0.135, 0.095), (0.125, 0.090)),
     ("spine", "chest", (0.125, 0.090), (0.135, 0.098)),
@@ -28,6 +29,7 @@ _LIMBS = (
 )
 _ARMS = (("UpperArm", "LowerArm", 0.046, 0.040), ("LowerArm", "Hand", 0.037, 0.028))
 _HEAD_TIP = (0.0, 0.12, 0.0)  # metres from the head joint to the middle of the skull's top, of the canonical body
+_END_SHARE = 0.15  # of a segment, before its ends, over which points stop being beside it
 _SIDES = ("left", "right")
 
 
@@ -41,8 +43,10 @@ class Layout:
     """Canonical joint at which it ends; its start again for the head, which ends at a point of its own."""
     widths: Float[Tensor, "segments 2 3"]
     """Half widths along the axes of the start's frame at both ends, metres, of the canonical body."""
-    arm: Float[Tensor, "segments"]
-    """Of segments of an arm the side: 0 left, 1 right; -1 of others."""
+    is_arm: Bool[Tensor, "2 segments"]
+    """Whether each belongs to the arm of a side: left, right."""
+    beside: Bool[Tensor, "2 segments"]
+    """Whether each is beside the arm of a side while that hangs: trunk and thigh."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,25 +80,26 @@ class Near:
 @cache
 def layout() -> Layout:
     """Return the segments of the canonical body."""
-    rows = [(start, stop or start, [(x, x, z), (u, u, w)], -1) for start, stop, (x, z), (u, w) in _TRUNK]
-    for side, name in enumerate(_SIDES):
-        for start, stop, first, last in (*_LIMBS, *_ARMS):
-            arm = side if (start, stop, first, last) in _ARMS else -1
-            rows.append((name + start, name + stop, [(first,) * 3, (last,) * 3], arm))
-    start, stop, widths, arms = zip(*rows, strict=True)
-    return Layout(
-        tuple(CANONICAL.indices(start)),
-        tuple(CANONICAL.indices(stop)),
-        torch.tensor(widths, dtype=torch.float64),
-        torch.tensor(arms, dtype=torch.float64),
+    rows = [(start, stop or start, [(x, x, z), (u, u, w)]) for start, stop, (x, z), (u, w) in _TRUNK]
+    for name in _SIDES:
+        rows += [
+            (name + start, name + stop, [(first,) * 3, (last,) * 3]) for start, stop, first, last in (*_LIMBS, *_ARMS)
+        ]
+    start, stop, widths = zip(*rows, strict=True)
+    arms, beside = (
+        torch.tensor([[name in {side + part for part in parts} for name in start] for side in _SIDES])
+        for parts in (("UpperArm", "LowerArm"), ("UpperLeg",))
     )
+    trunk = torch.tensor([name in ("hips", "spine", "chest") for name in start])
+    joints = (tuple(CANONICAL.indices(names)) for names in (start, stop))
+    return Layout(*joints, torch.tensor(widths, dtype=torch.float64), arms, beside | trunk)
 
 
 def girth(skeleton: Skeleton) -> float:
-    """Return how thick a body of canonical joints is against the canonical one: by its legs and its trunk."""
+    """Return how thick a body of canonical joints is against the canonical one: as it is taller from ankles to neck."""
     trunk = [CANONICAL.index(name) for name in ("spine", "chest", "neck")]
-    longer = skeleton.offsets[trunk].norm(dim=-1).sum() / CANONICAL.offsets[trunk].norm(dim=-1).sum()
-    return float((longer * leg_length(skeleton) / leg_length(CANONICAL)).sqrt())
+    tall, usual = (leg_length(s) + float(s.offsets[trunk].norm(dim=-1).sum()) for s in (skeleton, CANONICAL))
+    return tall / usual
 
 
 def place_segments(motion: Motion) -> Segments:
@@ -131,6 +136,14 @@ def place_nearest(near: Near, body: Segments) -> Float[Tensor, "frames points se
     turns = body.quat_xyzw[:, None].expand(*near.share.shape[:3], 4)
     aside = rotations.rotate(turns, near.aside * _width_at(body, near.share) + near.away)
     return body.begin[:, None] + near.share * axis + aside
+
+
+def find_slide(near: Near, body: Segments) -> Float[Tensor, "frames points segments 3"]:
+    """Return the directions along which points beside a segment may slide without coming nearer or going farther: its
+    axis, of length 1 in the middle and 0 toward its ends, where there is no such direction."""
+    axis = torch.nn.functional.normalize(body.end - body.begin, dim=-1)[:, None]
+    inside = smootherstep(near.share / _END_SHARE) * smootherstep((1 - near.share) / _END_SHARE)
+    return inside * axis
 
 
 def _width_at(body: Segments, share: Tensor) -> Float[Tensor, "frames points segments 3"]:
