@@ -17,7 +17,7 @@ from mapctl.kinematics import inverse
 from mapctl.motion import Motion
 from mapctl.numerics.easing import smootherstep
 from mapctl.retarget.carry import segments
-from mapctl.retarget.carry.holding import envelope, hold_through, mean_by_span, merge_contacts, soft_clamp
+from mapctl.retarget.carry.holding import envelope, hold_through, low_pass, mean_by_span, merge_contacts, soft_clamp
 from mapctl.retarget.stance import SIDES, Stance
 from mapctl.skeleton import LIMBS
 
@@ -30,6 +30,8 @@ _SLIDE_METRES = 0.07  # metres off a surface from which a hand may slide along a
 # Of the arm: from where on it is so straight that it hangs, and from where on it does so entirely.
 _HANGS_FROM, _HANGS_TO = 0.86, 0.94
 _FADE_SECONDS = 0.05  # seconds over which a relation comes and goes
+_SLOW_SPEED, _FAST_SPEED = 0.2, 0.6  # m/s beside a segment up to which a hand stays there, and from which it passes
+_SPEED_SECONDS = 0.1  # seconds over which that speed is smoothed
 _SHARPNESS = 0.05  # how much less a segment counts that is a little farther than the nearest
 _ROUNDS = 3  # times that hands are placed, since each arm is something that the other hand is near
 _EASE_WEIGHT = 0.1  # strength from which the arm is solved for entirely
@@ -113,7 +115,8 @@ def _find_relations(own: Motion, giver: Stance) -> _Relations:
     points, thick = _hand_points(own, size), size * _PALM_THICKNESS
     near = segments.find_nearest(points, body)
     say = _let_hang(own)
-    weight, touch = (say * _weigh(near.distance - thick, far) for far in (_FAR_METRES, _SLIDE_METRES))
+    far = torch.lerp(near.distance.new_tensor(_SLIDE_METRES), near.distance.new_tensor(_FAR_METRES), _stays(near, fps))
+    weight, touch = (say * _weigh(near.distance - thick, reach) for reach in (far, _SLIDE_METRES))
     left, right = points.unflatten(1, (2, -1)).unbind(dim=1)
     between = (left[:, :, None] - right[:, None]).norm(dim=-1).flatten(1).amin(dim=1, keepdim=True)
     height = points[..., 1] - giver.floor - thick
@@ -129,9 +132,18 @@ def _find_relations(own: Motion, giver: Stance) -> _Relations:
     )
 
 
-def _weigh(distance: Float[Tensor, "*batch"], far: float = _FAR_METRES) -> Float[Tensor, "*batch"]:
+def _weigh(distance: Float[Tensor, "*batch"], far: Float[Tensor, "*batch"] | float = _FAR_METRES) -> Float[Tensor, "*batch"]:
     """Return how much a relation over a distance counts: entirely where it is a touch, not at all from `far` on."""
     return 1 - smootherstep((distance - _TOUCH_METRES) / (far - _TOUCH_METRES))
+
+
+def _stays(near: segments.Near, fps: float) -> Float[Tensor, "frames points segments"]:
+    """Return how much points stay where they are beside a segment, 0 to 1: a hand that swings past is not put there."""
+    if len(near.local) < 2:
+        return torch.ones_like(near.distance)
+    speed = near.local.diff(dim=0).norm(dim=-1) * fps
+    smooth = low_pass(torch.cat([speed[:1], speed]).flatten(1), _SPEED_SECONDS * fps).view_as(near.distance)
+    return 1 - smootherstep((smooth - _SLOW_SPEED) / (_FAST_SPEED - _SLOW_SPEED))
 
 
 def _let_hang(own: Motion) -> Float[Tensor, "frames points segments"]:

@@ -75,6 +75,8 @@ class Near:
     """From the surface to the point, metres, along the segment's own axes; 0 within the body."""
     distance: Float[Tensor, "frames points segments"]
     """From the surface to the point, metres; negative within the body."""
+    local: Float[Tensor, "frames points segments 3"]
+    """From where the segment begins to the point, metres, along the segment's own axes."""
 
 
 @cache
@@ -121,12 +123,13 @@ def find_nearest(points: Float[Tensor, "frames points 3"], body: Segments) -> Ne
     share = (way * axis).sum(-1, keepdim=True) / axis.square().sum(-1, keepdim=True).clamp_min(1e-9)
     share = share.clamp(0, 1)
     turns = rotations.inverse(body.quat_xyzw)[:, None].expand(*share.shape[:3], 4)
-    aside = rotations.rotate(turns, way - share * axis)
+    local = rotations.rotate(turns, way)
+    aside = local - rotations.rotate(turns, share * axis)
     aside_widths = aside / _width_at(body, share)
     round_off = aside_widths.norm(dim=-1, keepdim=True)
     away = aside * (1 - 1 / round_off.clamp_min(1))
     depth = (aside.norm(dim=-1) / round_off[..., 0].clamp_min(1e-6)) * (round_off[..., 0] - 1)
-    return Near(share, aside_widths / round_off.clamp_min(1), away, depth)
+    return Near(share, aside_widths / round_off.clamp_min(1), away, depth, local)
 
 
 def place_nearest(near: Near, body: Segments) -> Float[Tensor, "frames points segments 3"]:
