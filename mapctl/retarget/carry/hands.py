@@ -35,7 +35,7 @@ _SPEED_SECONDS = 0.1  # seconds over which that speed is smoothed
 _SHARPNESS = 0.05  # how much less a segment counts that is a little farther than the nearest
 _ROUNDS = 3  # times that hands are placed, since each arm is something that the other hand is near
 _EASE_WEIGHT = 0.1  # strength from which the arm is solved for entirely
-_FREE_EXTENSION, _MOST_EXTENSION = 0.97, 0.998  # of the arm: how straight one may be whatever the giver's is, and at most
+_FREE_EXTENSION, _MOST_EXTENSION = 0.98, 0.998  # of the arm: how straight one may be whatever the giver's is, and at most
 _SOFT_MARGIN = 0.03  # of the arm, before the most that it may be, over which it gives in
 _HELD_SPEED = 0.25  # m/s below which a hand on the floor stands on it
 _LEAST_STRENGTH = 0.5  # of a relation, from which a hand that does not get there is worth a line
@@ -101,12 +101,14 @@ def keep_hand_relations(own: Motion, moved: Motion, giver: Stance, *, scale: flo
         return moved, HandTargets(still[..., None].expand(-1, -1, 3), still)
     at_floor = _floor_offsets(own, moved, relations, giver, scale=scale)
     straight = _arm_extension(own)
-    done, offset = moved, torch.zeros(own.num_frames, 2, 3, dtype=torch.float64)
+    done, before = moved, moved.joint_positions()[:, _HANDS]
+    offset = missed = torch.zeros_like(before)
     for _ in range(_ROUNDS):
-        offset = _offset_hands(relations, moved, done, at_floor)
+        # Where one of two hands that are together does not get, the other comes to where it does.
+        offset = _offset_hands(relations, moved, done, at_floor, relations.together[..., None] * missed)
         done = _reach(moved, offset, strength, straight)
-    aimed = moved.joint_positions()[:, _HANDS] + offset
-    errors = (done.joint_positions()[:, _HANDS] - aimed).norm(dim=-1)
+        missed = missed + done.joint_positions()[:, _HANDS] - (before + offset)
+    errors = (done.joint_positions()[:, _HANDS] - (before + offset)).norm(dim=-1)
     return done, HandTargets(offset, torch.where(relations.touch_strength() > _LEAST_STRENGTH, errors, 0.0))
 
 
@@ -195,9 +197,14 @@ def _floor_offsets(
 
 
 def _offset_hands(
-    relations: _Relations, moved: Motion, done: Motion, at_floor: Float[Tensor, "frames points 3"]
+    relations: _Relations,
+    moved: Motion,
+    done: Motion,
+    at_floor: Float[Tensor, "frames points 3"],
+    missed: Float[Tensor, "frames 2 3"],
 ) -> Float[Tensor, "frames 2 3"]:
-    """Return where hands should be from where rotations alone lead, metres; `done` shows where the other arm is."""
+    """Return where hands should be from where rotations alone lead, metres; `done` shows where the other arm is, and
+    `missed` by what hands that are together could not get there."""
     points = _hand_points(moved, segments.girth(moved.skeleton))
     body = segments.place_segments(done)
     toward = segments.place_nearest(relations.near, body) - points[:, :, None]
@@ -208,7 +215,7 @@ def _offset_hands(
     say = (weight / (1 - weight + _SHARPNESS))[..., None]
     total, summed = (each.unflatten(1, (2, -1)).sum(dim=(2, 3)) for each in (say, say * offsets))
     strength = relations.body_strength()[..., None]
-    offset = strength * summed / total.clamp_min(1e-9)
+    offset = strength * summed / total.clamp_min(1e-9) + missed
     middle = points.unflatten(1, (2, -1)).mean(dim=2) + offset
     missing = relations.together * (relations.apart - (middle[:, 1] - middle[:, 0]))
     # A hand that touches the body stays there; the other comes to it.

@@ -17,9 +17,11 @@ from mapctl.skeleton import LIMBS, Skeleton
 _FREE_EXTENSION = 0.985  # of the leg: a leg may be that straight, whatever the giver's is
 MAX_EXTENSION = 0.9995
 """How straight a leg may be at most, of its length."""
+_HIP_FIT_SECONDS = 0.06  # seconds over which the height of hips is smoothed
 _HIP_DROP_SECONDS = 0.12  # seconds over which hips go down for a leg that is too short, and up again
 _SMOOTH_SECONDS = 0.05  # seconds over which what hips carry is smoothed
-_STRAIGHT_SPREAD = 0.02  # of the leg: by how much straighter a leg is whose say in the hips' height is e times that
+# Of the leg's length, from where on a leg is so straight that the hips' height begins to matter to it, and does fully.
+_STRAIGHT_SHARES = (0.93, 0.985)
 # Of the leg's length, how far down a foot is from which the hips' height begins to matter to it, and matters fully.
 _DOWN_SHARES = (0.5, 0.8)
 _LEAST_SAY = 0.02  # of both legs together, below which the hips' height is left to the trajectory
@@ -64,10 +66,11 @@ def fit_hips(moved: Motion, ankles: Float[Tensor, "frames 2 3"], stretch: Float[
     """
     short, down = _find_missing_length(moved, ankles, stretch.clamp(max=MAX_EXTENSION))
     begin, end = _DOWN_SHARES
-    say = torch.exp((stretch - 1) / _STRAIGHT_SPREAD) * smootherstep((down - begin) / (end - begin))
+    bent, straight = _STRAIGHT_SHARES
+    say = smootherstep((stretch - bent) / (straight - bent)) * smootherstep((down - begin) / (end - begin))
     total = say.sum(dim=-1, keepdim=True)
     lower = (say * short).sum(dim=-1, keepdim=True) / (total + _LEAST_SAY)
-    return _lower(moved, low_pass(lower, _HIP_DROP_SECONDS * float(moved.fps)))
+    return _lower(moved, low_pass(lower, _HIP_FIT_SECONDS * float(moved.fps)))
 
 
 def lower_hips(moved: Motion, ankles: Float[Tensor, "frames 2 3"], stretch: Float[Tensor, "frames 2"]) -> Motion:
