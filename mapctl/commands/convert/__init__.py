@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Literal
 
 from tyro.conf import Positional, arg
 
@@ -35,6 +35,12 @@ class Convert(Command):
     """`canonical`: canonical joints with the performer's own bones; or a clip whose skeleton is wanted, on which the
     character has its floor and planted feet, in the clip's layout; or a rig by name or TOML file, whose joints
     get the bones of the canonical body."""
+    ground: Literal["fit", "keep"] = "fit"
+    """Of what feet stand on, as stairs and platforms, on the skeleton of another rig: `fit` scales its height with the
+    legs, `keep` keeps it in metres."""
+    report: options.MaybeFile = None
+    """Where to write what was changed on the way to the rig, as JSON: scale, travel, hips, feet and hands that do not
+    get where they should."""
     source_rig: options.MaybeRig = None
     """The rig of IN, where it is not the one that would be recognised; see `mapctl info IN`."""
     frames: Annotated[str | None, arg(metavar="A:B")] = None

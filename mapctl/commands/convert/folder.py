@@ -34,6 +34,8 @@ class FileConverter:
 
 def run(command: Convert) -> int:
     """Check, convert what is not done yet, list what failed."""
+    if command.report is not None:
+        raise RequestError("--report is on one file; a folder has none")
     if command.jobs < 1:
         raise RequestError(f"--jobs must be at least 1, got {command.jobs}")
     ending = command.to

@@ -19,7 +19,7 @@ from mapctl.errors import RequestError
 from mapctl.metrics import feet
 from mapctl.motion import Motion
 from mapctl.retarget import as_rig, identify_rig
-from mapctl.retarget.carry import RiggedCharacter, retarget_motion
+from mapctl.retarget.carry import Changes, GroundMode, RiggedCharacter, retarget_motion
 from mapctl.retarget.recognition.doubts import assess_fit
 from mapctl.retarget.rigs import Rig
 
@@ -36,6 +36,10 @@ class Converted:
     """What was done to it, for the user."""
     cycle: GroundTransform | None = None
     """Travel by cycle, of a loop."""
+    changes: Changes | None = None
+    """What was changed on the way to another rig."""
+    notes: tuple[str, ...] = ()
+    """The same in sentences, as far as it is worth one."""
 
 
 @dataclass(frozen=True)
@@ -67,8 +71,8 @@ class Conversion:
         done = self._cut(inputs.read_motion(source, self.source_rig, fps=self.fps_in))
         if command.rig is not None:
             doubts = describe_doubts(done.motion, self.source_rig)
-            done = transfer_to_rig(done.motion, self.body, self.source_rig)
-            done = replace(done, lines=(*(f"note: {doubt}" for doubt in doubts), *done.lines))
+            done = transfer_to_rig(done.motion, self.body, self.source_rig, ground=command.ground)
+            done = replace(done, lines=tuple(f"note: {note}" for note in (*doubts, *done.notes)))
         if self.fps is not None:
             done = replace(done, motion=done.motion.resample(self.fps))
         if command.mirror:
@@ -121,17 +125,21 @@ def read_body(rig: str | None) -> RiggedCharacter | None:
     return None if rig in (None, "canonical") else RiggedCharacter.of(*inputs.read_rig_clip(rig))[1]
 
 
-def transfer_to_rig(motion: Motion, body: RiggedCharacter | None, source_rig: Rig | None = None) -> Converted:
+def transfer_to_rig(
+    motion: Motion, body: RiggedCharacter | None, source_rig: Rig | None = None, *, ground: GroundMode = "fit"
+) -> Converted:
     """Retarget a motion to a body in the layout of its file, or without one to the canonical joints; and note what
     could not be kept.
 
-    A clip of the same skeleton stays as it is; others get their floor (see mapctl.retarget.carry).
+    A clip of the same skeleton stays as it is; others get their floor (see mapctl.retarget.carry), with stairs and
+    platforms as `ground` says.
     """
     if body is None:
         return Converted(retarget.to_canonical(motion, source_rig)[0], retarget.load_rig("canonical"))
-    retargeted = retarget_motion(motion, body, source_rig)
-    lines = tuple(f"note: {note}" for note in retargeted.notes)
-    return Converted(body.on_rig(retargeted.motion), as_rig(body.rigmap), lines)
+    found = retarget_motion(motion, body, source_rig, ground=ground)
+    original = motion if motion.skeleton.matches(body.rigmap.rig_skeleton) else None
+    on_rig = body.on_rig(found.motion, original=original, fingers=found.fingers)
+    return Converted(on_rig, as_rig(body.rigmap), changes=found.changes, notes=found.notes)
 
 
 def _loop(done: Converted) -> Converted:

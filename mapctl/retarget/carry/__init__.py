@@ -15,6 +15,7 @@ from mapctl.motion import Motion
 from mapctl.retarget import as_rig, to_canonical
 from mapctl.retarget.carry.changes import Changes, RetargetedMotion, list_unmatched_joints, measure_changes
 from mapctl.retarget.carry.character import RiggedCharacter
+from mapctl.retarget.carry.fingers import carry_fingers, match_fingers
 from mapctl.retarget.carry.feet import find_ankle_targets, reach_ankle_targets
 from mapctl.retarget.carry.ground import find_ground
 from mapctl.retarget.carry.hands import keep_hand_relations
@@ -41,8 +42,10 @@ def retarget_motion(
         return RetargetedMotion(replace(to_canonical(clip, as_rig(body.rigmap))[0], skeleton=body.skeleton))
     canonical, giver = RiggedCharacter.of(clip, rig)
     found = retarget_canonical(canonical, giver, body, ground=ground)
-    unmatched = list_unmatched_joints(clip, giver.rigmap)
-    return replace(found, changes=replace(found.changes, unmatched_joints=unmatched))
+    fingers = match_fingers(clip.skeleton, body.rigmap.rig_skeleton)
+    unmatched = list_unmatched_joints(clip, giver.rigmap, fingers.values())
+    carried = carry_fingers(clip, giver.rigmap, body.rigmap)
+    return replace(found, changes=replace(found.changes, unmatched_joints=unmatched), fingers=carried)
 
 
 def retarget_canonical(

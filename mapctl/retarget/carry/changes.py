@@ -1,6 +1,7 @@
 """What retargeting changed, in numbers and as sentences for the user."""
 
 import math
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 
 import torch
@@ -47,9 +48,9 @@ class Changes:
     """How much lower the hips are at most than in scale, metres, for legs that are too short."""
     hands_moved_m: float = 0.0
     """How far hands are moved at most to where they touch what the giver's touch, metres."""
-    feet_missed: Miss = field(default_factory=Miss)
+    feet_missed: Miss = Miss()
     """Ankles against their targets."""
-    hands_missed: Miss = field(default_factory=Miss)
+    hands_missed: Miss = Miss()
     """Hands that are near something against their targets."""
     foot_tilt_deg: float = 0.0
     """By how much the giver's T-pose lays its feet wrongly at most, degrees, positive down; it is taken out."""
@@ -85,8 +86,10 @@ class RetargetedMotion:
 
     motion: Motion
     """On canonical joints, with the bones of the body."""
-    changes: Changes = field(default_factory=Changes)
+    changes: Changes = Changes()
     """What was changed."""
+    fingers: Mapping[int, Float[Tensor, "frames 4"]] = field(default_factory=dict)
+    """Local rotations (xyzw) of the body's finger joints that turn as the giver's, by joint of its rig."""
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -117,9 +120,10 @@ def measure_changes(
     )
 
 
-def list_unmatched_joints(clip: Motion, giver: RigMap) -> tuple[str, ...]:
-    """List the joints of a clip that move and that no canonical joint is or hangs from: what their turns do is lost."""
-    led_by, parents = {*giver.joints.values()}, clip.skeleton.parents
+def list_unmatched_joints(clip: Motion, giver: RigMap, matched: Collection[int]) -> tuple[str, ...]:
+    """List the joints of a clip that move and are not `matched`, nor is or hangs from them any canonical joint: what
+    their turns do is lost."""
+    led_by, parents = {*giver.joints.values(), *matched}, clip.skeleton.parents
     for joint in sorted(led_by, reverse=True):
         while parents[joint] >= 0:
             joint = parents[joint]

@@ -1,8 +1,13 @@
 """The character that motion is put on, and the canonical joints of legs and arms by side."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+from jaxtyping import Float
+from torch import Tensor
+
+from mapctl import rotations
 from mapctl.motion import Motion
 from mapctl.retarget import RigMap, from_canonical, to_canonical
 from mapctl.retarget.rigs import Rig
@@ -46,6 +51,20 @@ class RiggedCharacter:
         """Canonical skeleton with this performer's bones in the T-pose whose feet lie flat."""
         return self.leveled_map.skeleton
 
-    def on_rig(self, motion: Motion) -> Motion:
-        """Put a canonical motion of this body on its rig, in its file's layout; joints that are not canonical rest."""
-        return replace(from_canonical(motion, self.rigmap), source=self.source)
+    def on_rig(
+        self,
+        motion: Motion,
+        *,
+        original: Motion | None = None,
+        fingers: Mapping[int, Float[Tensor, "frames 4"]] | None = None,
+    ) -> Motion:
+        """Put a canonical motion of this body on its rig, in its file's layout.
+
+        Joints that are not canonical turn as those of the `original`, of the same rig, or rest without one, but for
+        `fingers`: local rotations (xyzw) by joint of the rig, none of which carries a canonical joint.
+        """
+        made = from_canonical(motion, self.rigmap, original)
+        local = made.local_quat_xyzw.clone()
+        for joint, turns in (fingers or {}).items():
+            local[:, joint] = rotations.make_sign_continuous(turns)
+        return replace(made, local_quat_xyzw=local, source=self.source)

@@ -53,10 +53,10 @@ def _detect_raised(own: Motion, over: Float[Tensor, "frames 2"]) -> Bool[Tensor,
     """Detect feet that bear the body higher than the floor."""
     places, fps = own.joint_positions(), float(own.fps)
     step = max(1, round(contacts.ContactSettings().speed_window * fps))
-    speed = (places[step:, TOES] - places[:-step, TOES]).norm(dim=-1) * (fps / step)
-    speed = torch.cat([speed[:1].expand(min(step, own.num_frames), 2), speed])[: own.num_frames]
-    if len(speed) < own.num_frames:
+    if own.num_frames <= step:
         return torch.zeros_like(over, dtype=torch.bool)
+    speed = (places[step:, TOES] - places[:-step, TOES]).norm(dim=-1) * (fps / step)
+    speed = torch.cat([speed[:1].expand(step, 2), speed])
     forward = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand(own.num_frames, 2, 3)
     slope = rotations.rotate(own.joint_rotations()[:, FEET], forward)[..., 1].abs()
     bears = places[:, HIP_JOINTS, 1] - places[:, TOES, 1] > _HIPS_SHARE * leg_length(own.skeleton)

@@ -53,7 +53,7 @@ class HandTargets:
 
 @dataclass(frozen=True, eq=False)
 class _Relations:
-    """Of the giver's hands; the points of both hands one after another, left first."""
+    """What the giver's hands are near; the points of both hands one after another, left first."""
 
     near: segments.Near
     """To the segments of its body."""
