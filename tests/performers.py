@@ -43,6 +43,8 @@ class Performer:
     """How far the hip joints are over the ankles of flat feet, of the legs' length."""
     sinks: float = 0.0
     """How far the toes go through the floor as the foot rolls over them, metres."""
+    stair: float = 0.0
+    """By how much each step is higher than the one before, metres."""
     thighs_drop: float = 0.0219
     """From the hips down to the hip joints, metres at size 1."""
 
@@ -93,6 +95,7 @@ class Performer:
         flat = self.size * torch.tensor([0.0, *self.foot], dtype=torch.float64)
         root[:, 2] = stride * time / PERIOD
         root[:, 1] = self.toe_height - flat[1] + self.upright * leg - bones.offsets[HIPJOINTS[0], 1]
+        root[:, 1] += self.stair * (2 * time / PERIOD + 0.2)
         for k in range(2):
             phase = time / PERIOD + 0.5 * k
             step, share = phase.floor(), phase.remainder(1.0)
@@ -102,6 +105,7 @@ class Performer:
             toes = torch.zeros(frames, 3).double()
             toes[:, 0] = bones.offsets[HIPJOINTS[k], 0]
             toes[:, 1] = self.toe_height + 0.12 * leg * torch.sin(torch.pi * swing) ** 2
+            toes[:, 1] += self.stair * (2 * (step + _smooth((1.6 * swing).clamp(max=1))) + 1 - k)
             toes[:, 1] -= self.sinks * rolled * (1 - _smooth(swing))
             toes[:, 2] = stride * (step + _smooth(swing) - 0.5 * k + STANCE / 2) + flat[2]
             ankles[:, k] = toes - rotations.rotate(_about_x(pitch), flat.expand(frames, 3))

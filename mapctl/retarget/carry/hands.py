@@ -29,14 +29,14 @@ _TOUCH_METRES, _FAR_METRES = 0.02, 0.16  # metres off a surface within which a h
 _SLIDE_METRES = 0.07  # metres off a surface from which a hand may slide along a limb or the trunk
 # Of the arm: from where on it is so straight that it hangs, and from where on it does so entirely.
 _HANGS_FROM, _HANGS_TO = 0.86, 0.94
-_FADE_SECONDS = 0.05  # seconds over which a relation comes and goes
+_FADE_SECONDS = 0.12  # seconds over which a relation comes and goes
 _SLOW_SPEED, _FAST_SPEED = 0.2, 0.6  # m/s beside a segment up to which a hand stays there, and from which it passes
 _SPEED_SECONDS = 0.1  # seconds over which that speed is smoothed
 _SHARPNESS = 0.05  # how much less a segment counts that is a little farther than the nearest
 _ROUNDS = 3  # times that hands are placed, since each arm is something that the other hand is near
-_EASE_WEIGHT = 0.1  # strength from which the arm is solved for entirely
+_EASE_WEIGHT = 0.02  # strength from which the arm is solved for entirely
 _FREE_EXTENSION, _MOST_EXTENSION = 0.98, 0.998  # of the arm: how straight one may be whatever the giver's is, and at most
-_SOFT_MARGIN = 0.03  # of the arm, before the most that it may be, over which it gives in
+_SOFT_MARGIN = 0.06  # of the arm, before the most that it may be, over which it gives in
 _HELD_SPEED = 0.25  # m/s below which a hand on the floor stands on it
 _LEAST_STRENGTH = 0.5  # of a relation, from which a hand that does not get there is worth a line
 
@@ -82,10 +82,15 @@ class _Relations:
         return torch.maximum(of_hand, self.together)
 
     def body_strength(self) -> Float[Tensor, "frames 2"]:
-        """Return how much hands are bound to body and floor, 0 to 1."""
-        free = (1 - self.weight).prod(dim=-1) * (1 - self.floor_weight)
-        return 1 - free.unflatten(1, (2, -1)).prod(dim=-1)
+        """Return how much hands are bound to body and floor, 0 to 1: about as to what binds them most."""
+        weight, say = self.by_hand()
+        return (say * weight).sum(dim=-1) / say.sum(dim=-1).clamp_min(1e-9)
 
+    def by_hand(self) -> tuple[Float[Tensor, "frames 2 relations"], Float[Tensor, "frames 2 relations"]]:
+        """Return by hand the weights of its points' relations to segments and floor, and what say each has among
+        them: the nearest by far the most."""
+        weight = torch.cat([self.weight, self.floor_weight[..., None]], dim=2).unflatten(1, (2, -1)).flatten(2)
+        return weight, weight / (1 - weight + _SHARPNESS)
 
 
 def keep_hand_relations(own: Motion, moved: Motion, giver: Stance, *, scale: float) -> tuple[Motion, HandTargets]:
@@ -210,16 +215,14 @@ def _offset_hands(
     toward = segments.place_nearest(relations.near, body) - points[:, :, None]
     slide = segments.find_slide(relations.near, body)
     along = (1 - relations.touch[..., None]) * (toward * slide).sum(-1, keepdim=True)
-    offsets = torch.cat([toward - along * slide, at_floor[:, :, None]], dim=2)
-    weight = torch.cat([relations.weight, relations.floor_weight[..., None]], dim=2)
-    say = (weight / (1 - weight + _SHARPNESS))[..., None]
-    total, summed = (each.unflatten(1, (2, -1)).sum(dim=(2, 3)) for each in (say, say * offsets))
-    strength = relations.body_strength()[..., None]
-    offset = strength * summed / total.clamp_min(1e-9) + missed
+    offsets = torch.cat([toward - along * slide, at_floor[:, :, None]], dim=2).unflatten(1, (2, -1)).flatten(2, 3)
+    weight, say = relations.by_hand()
+    total = say.sum(dim=-1, keepdim=True).clamp_min(1e-9)
+    offset = ((say * weight)[..., None] * offsets).sum(dim=2) / total + missed
     middle = points.unflatten(1, (2, -1)).mean(dim=2) + offset
     missing = relations.together * (relations.apart - (middle[:, 1] - middle[:, 0]))
     # A hand that touches the body stays there; the other comes to it.
-    gives = 1 - strength + _SHARPNESS
+    gives = 1 - relations.body_strength()[..., None] + _SHARPNESS
     shares = gives / gives.sum(dim=1, keepdim=True) * gives.new_tensor([[-1.0], [1.0]])
     return offset + shares * missing[:, None]
 
