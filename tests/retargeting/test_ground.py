@@ -62,7 +62,7 @@ def test_hips_go_up_with_the_stairs():
         far = [(m.joint_positions()[:, FEET] - m.joint_positions()[:, HIPJOINTS]).norm(dim=-1) for m in (clip, done)]
         torch.testing.assert_close(far[1], 0.8 * far[0], atol=0.07, rtol=0)
         before, after = (m.root_position[:, 1].diff(n=2).abs().max() for m in (clip, done))
-        assert float(after) < 1.5 * float(before) + 2e-3
+        assert float(after) < 1.5 * float(before) + 4e-3
 
 
 def test_on_the_flat_both_modes_are_the_same():

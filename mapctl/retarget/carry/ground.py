@@ -41,11 +41,14 @@ def find_ground(own: Motion, stance: Stance) -> Ground:
     """Find what the feet of a clip stand on (canonical joints, feet level in the T-pose)."""
     toes, frames = own.joint_positions()[:, TOES], own.num_frames
     over = toes[..., 1] - stance.floor - stance.flat_height
-    on_floor, raised = contacts.detect_contacts(toes, own.fps), _detect_raised(own, over)
-    spans, heights = merge_contacts(on_floor | raised, toes, float(own.fps)), []
+    standing = contacts.detect_contacts(toes, own.fps) | _detect_raised(own, over)
+    spans, heights = merge_contacts(standing, toes, float(own.fps)), []
     for k, of_foot in enumerate(spans):
-        flat = torch.where(raised & ~on_floor, over, 0.0)[:, k, None]
-        heights.append(hold_through(of_foot, mean_by_span(flat, of_foot), frames) if of_foot else torch.zeros_like(flat))
+        height = torch.zeros(frames, 1, dtype=torch.float64)
+        if of_foot:
+            means = mean_by_span(over[:, k, None], of_foot)
+            height = hold_through(of_foot, torch.where(means > _RAISED_METRES, means, 0.0), frames)
+        heights.append(height)
     return Ground(tuple(spans), torch.cat(heights, dim=1))
 
 
