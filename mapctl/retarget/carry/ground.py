@@ -16,7 +16,8 @@ from mapctl.skeleton import leg_length
 
 # Who stands higher than the floor stands still on a level foot for a while, with the hips well over it.
 _RAISED_METRES = 0.05  # metres over the floor from which the ground is no floor
-_STILL_SPEED, _STILL_SECONDS = 0.15, 0.2  # m/s in space below which a toe is still, and for how long
+_STILL_SPEED, _STILL_SECONDS = 0.3, 0.2  # m/s in space below which a toe is still, and for how long
+_SPEED_SECONDS = 0.1  # seconds over which that speed is the mean, or a capture's noise looks like motion
 _LEVEL_DEG = 20.0  # degrees that a level foot is off
 _HIPS_SHARE = 0.5  # of the leg, that hips are over a foot that bears them
 _BODY_SECONDS = 0.2  # seconds over which the ground under the hips is smoothed
@@ -41,28 +42,29 @@ def find_ground(own: Motion, stance: Stance) -> Ground:
     """Find what the feet of a clip stand on (canonical joints, feet level in the T-pose)."""
     toes, frames = own.joint_positions()[:, TOES], own.num_frames
     over = toes[..., 1] - stance.floor - stance.flat_height
-    standing = contacts.detect_contacts(toes, own.fps) | _detect_raised(own, over)
-    spans, heights = merge_contacts(standing, toes, float(own.fps)), []
+    bearing = _detect_bearing(own)
+    spans, heights = merge_contacts(contacts.detect_contacts(toes, own.fps) | bearing, toes, float(own.fps)), []
     for k, of_foot in enumerate(spans):
         height = torch.zeros(frames, 1, dtype=torch.float64)
         if of_foot:
-            means = mean_by_span(over[:, k, None], of_foot)
-            height = hold_through(of_foot, torch.where(means > _RAISED_METRES, means, 0.0), frames)
+            means, bears = (mean_by_span(v[:, k, None], of_foot) for v in (over, bearing.double()))
+            height = hold_through(of_foot, torch.where((bears > 0.5) & (means > _RAISED_METRES), means, 0.0), frames)
         heights.append(height)
     return Ground(tuple(spans), torch.cat(heights, dim=1))
 
 
-def _detect_raised(own: Motion, over: Float[Tensor, "frames 2"]) -> Bool[Tensor, "frames 2"]:
-    """Detect feet that bear the body higher than the floor."""
+def _detect_bearing(own: Motion) -> Bool[Tensor, "frames 2"]:
+    """Detect feet that bear the body, at any height: higher than the floor, or on a floor that drifts with the take."""
     places, fps = own.joint_positions(), float(own.fps)
-    step = max(1, round(contacts.ContactSettings().speed_window * fps))
+    step = max(1, round(_SPEED_SECONDS * fps))
     if own.num_frames <= step:
-        return torch.zeros_like(over, dtype=torch.bool)
+        return torch.zeros(own.num_frames, 2, dtype=torch.bool)
     speed = (places[step:, TOES] - places[:-step, TOES]).norm(dim=-1) * (fps / step)
-    speed = torch.cat([speed[:1].expand(step, 2), speed])
+    before = step // 2  # a frame's speed is that of the time around it
+    speed = torch.cat([speed[:1].expand(before, 2), speed, speed[-1:].expand(step - before, 2)])
     forward = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand(own.num_frames, 2, 3)
     slope = rotations.rotate(own.joint_rotations()[:, FEET], forward)[..., 1].abs()
     bears = places[:, HIP_JOINTS, 1] - places[:, TOES, 1] > _HIPS_SHARE * leg_length(own.skeleton)
     level = slope < math.sin(math.radians(_LEVEL_DEG))
-    still = (speed < _STILL_SPEED) & (over > _RAISED_METRES) & level & bears
+    still = (speed < _STILL_SPEED) & level & bears
     return contacts.remove_short_runs(still, max(1, round(_STILL_SECONDS * fps)))
