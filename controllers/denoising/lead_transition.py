@@ -30,6 +30,7 @@ from mapctl.retarget import RigMap
 _LINE_FIT_SECONDS = 0.1  # seconds after a frame from which it is extrapolated
 _SEARCH_SECONDS, _MIN_SEARCH_FRAMES = 0.06, 4  # longest transition, the longer of the two
 _EVIDENCE_RATIO = 3.0  # ratio of squared errors at which one model is rejected for the other
+_POSITION_EVIDENCE_RATIO = 8.0  # the same for the body's position, which exporters seldom blend: noise may look like it
 _UNBLENDED_SHARE = 0.9  # share of the motion from which a frame counts as free of the pose
 
 
@@ -107,7 +108,7 @@ def _is_position_blended(
     share: Float[Tensor, " frames"],
 ) -> bool:
     away = (observed - torch.lerp(pose, ahead, share[:, None])).square().sum()
-    return bool(_EVIDENCE_RATIO * away < (observed - ahead).square().sum())
+    return bool(_POSITION_EVIDENCE_RATIO * away < (observed - ahead).square().sum())
 
 
 def restore_lead_transition(

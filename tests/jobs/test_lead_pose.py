@@ -131,6 +131,17 @@ def test_where_the_body_is_may_be_mixed_too():
     assert away[1:6].max() < 12  # of 1.8 m between the two places
 
 
+def test_where_the_body_is_is_not_taken_for_mixed_because_of_noise():
+    """The pose is a few centimetres from where the motion begins, as in most takes, and noise is 2 cm."""
+    truth = led(arms_down(on_rig("canonical", 120, fps=120)))
+    place = truth.root_position.clone()
+    place[0] += torch.tensor([0.01, 0.03, 0.07], dtype=torch.float64)
+    truth = replace(truth, root_position=place)
+    rigmap = retarget.identify_rig(truth.skeleton)
+    found = [find_lead_transition(noisy(truth, 5.0, 2.0, seed=seed), rigmap).position for seed in range(30)]
+    assert sum(found) <= 1
+
+
 def test_frames_that_the_user_masks_in_the_passage_are_told_as_lost():
     given = noisy(led(arms_down(on_rig("daz", 120, fps=120))), 3.0, 0.5)
     done = cleaned(given, masks=[Mask("lForeArm", 2, 4)])
