@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 from helpers import bandai_skeleton, generator, quat_xyzw, run
+from hand_poses import arms_down
 from performers import FEET, HIPJOINTS, KNEES, TOES, Performer, stance_of, tip_toed
 from rig_maker import Make, make, names_of
 
@@ -102,12 +103,16 @@ def test_a_clip_of_the_bodys_own_skeleton_stays_to_the_bit():
     torch.testing.assert_close(done.local_quat_xyzw, lifted.local_quat_xyzw, atol=1e-12, rtol=0)
 
 
-def test_there_and_back_is_where_one_was():
-    clip, other = USUAL.walks(), PEOPLE["drooping T-pose"].body()
+@pytest.mark.parametrize(("giver", "body"), PAIRS)
+def test_there_and_back_is_where_one_was(giver, body):
+    """Every joint of a walk within 1 cm on the mean of its frames, and hips, hands and toes always."""
+    clip, other = arms_down(performer(giver).walks()), performer(body).body()
     there = retarget_motion(clip, other).motion
     back = retarget_motion(there, RiggedCharacter.of(clip)[1]).motion
-    ends = [0, *FEET, *TOES]
-    torch.testing.assert_close(back.joint_positions()[:, ends], clip.joint_positions()[:, ends], atol=0.01, rtol=0)
+    away = (back.joint_positions() - clip.joint_positions()).norm(dim=-1)
+    assert float(away.mean(dim=0).max()) < 0.01
+    ends = [0, *(CANONICAL.index(side + "Hand") for side in ("left", "right")), *FEET, *TOES]
+    assert float(away[:, ends].max()) < 0.01
 
 
 def test_toes_that_go_through_the_floor_do_so_no_more():
