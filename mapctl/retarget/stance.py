@@ -59,7 +59,11 @@ class Stance:
         off = self.toe_offset if abs(self.toe_offset) > _MIN_FLOOR_OFFSET else 0.0
         heights = self.toe_height - off, self.flat_height - off
         return replace(
-            self, toe_height=heights[0], flat_height=heights[1], floor=self.floor + off, toe_offset=self.toe_offset - off
+            self,
+            toe_height=heights[0],
+            flat_height=heights[1],
+            floor=self.floor + off,
+            toe_offset=self.toe_offset - off,
         )
 
     @staticmethod

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers import bandai_skeleton, generator, quat_xyzw, run
 from hand_poses import arms_down
+from helpers import bandai_skeleton, generator, quat_xyzw, run
 from performers import FEET, HIPJOINTS, KNEES, TOES, Performer, stance_of, tip_toed
 from rig_maker import Make, make, names_of
 

@@ -1,4 +1,4 @@
-"""What retargeting says of what it changed, fingers on rigs that have the same ones, and the command that writes both."""
+"""What retargeting says of what it changed; fingers of rigs that have the same ones; the command that writes both."""
 
 import json
 import math
@@ -17,7 +17,7 @@ from mapctl.motion import Motion
 from mapctl.retarget.carry import RiggedCharacter, retarget_motion
 from mapctl.retarget.carry.changes import Changes, Miss
 from mapctl.retarget.carry.fingers import match_fingers
-from mapctl.skeleton import CANONICAL
+from mapctl.skeleton import Skeleton
 
 MIXAMO, UE5 = (make(Make(names_of(name), arms_down_deg=down)) for name, down in (("mixamo", 0.0), ("ue5", 45.0)))
 FINGERS = [f"{side}_{finger}_bone" for side in "LR" for finger in ("Thumb1", "Index1")]
@@ -91,7 +91,7 @@ def test_fingers_turn_as_the_givers_in_the_tposes_frames():
 def test_fingers_are_matched_by_side_finger_and_place():
     def hand(*names: str):
         names = ("Hips", *names)
-        return replace(CANONICAL, names=names, parents=tuple(range(-1, len(names) - 1)), offsets=torch.zeros(len(names), 3))
+        return Skeleton(names, tuple(range(-1, len(names) - 1)), torch.zeros(len(names), 3))
 
     one = hand("LeftHandThumb1", "LeftHandThumb2", "LeftHandPinky1", "RightHandIndex1", "RightHandIndex2")
     other = hand("lThumb1", "lThumb2", "lThumb3", "rIndex0", "rRing1", "little_01_l")

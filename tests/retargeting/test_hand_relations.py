@@ -47,7 +47,7 @@ BODIES = {
 }
 
 
-def at_hip(motion: Motion, side: int = 1, *, share=1.0) -> Motion:
+def at_hip(motion: Motion, side: int = 1, *, share: float | torch.Tensor = 1.0) -> Motion:
     """The palm at the side of the hips, the elbow out."""
     sign = (1, -1)[side]
     place = motion.joint_positions()[:, HIPS] + torch.tensor([0.135 * sign, 0.10, 0.02], dtype=torch.float64)
@@ -77,9 +77,7 @@ def test_a_hand_is_where_it_was_on_the_body(pose, name):
     clip, body = make(arms_down(standing())), body_of(BODIES[name])
     done = retarget_motion(clip, body)
     size = float(BODIES[name].offsets[1].norm() / CANONICAL.offsets[1].norm())
-    before, after = (
-        palms(m, s)[:, 1] - m.joint_positions()[:, anchor] for m, s in ((clip, 1.0), (done.motion, size))
-    )
+    before, after = (palms(m, s)[:, 1] - m.joint_positions()[:, anchor] for m, s in ((clip, 1.0), (done.motion, size)))
     assert float((after - size * before).norm(dim=-1).max()) < 0.015
     assert not [note for note in done.notes if "hands" in note]
 
@@ -178,8 +176,7 @@ def test_a_hand_comes_to_the_hip_and_leaves_without_a_jump(name):
     size = float(BODIES[name].offsets[1].norm() / CANONICAL.offsets[1].norm())
     for order, most in ((1, 1.4), (2, 2.0)):
         before, after = (
-            m.joint_positions()[:, [HANDS[1], LOWER[1]]].diff(n=order, dim=0).norm(dim=-1).amax(0)
-            for m in (clip, done)
+            m.joint_positions()[:, [HANDS[1], LOWER[1]]].diff(n=order, dim=0).norm(dim=-1).amax(0) for m in (clip, done)
         )
         assert (after < most * max(size, 1.0) * before + 2e-4).all(), (order, after / before)
 

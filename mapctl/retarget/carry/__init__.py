@@ -1,8 +1,8 @@
 """Retargeting: motion of one performer on the bones of another, with the same contacts.
 
 Rotations stay, but of legs, and of arms whose hands are near something. The hips go as far and as high as the legs'
-lengths and the ground ask for, each toe joint is as high over its own rest height as the giver's over his, in scale, and
-while a foot is planted it moves as little as the giver's. Hands near the body, each other or the floor are brought
+lengths and the ground ask for, each toe joint is as high over its own rest height as the giver's over his, in scale,
+and while a foot is planted it moves as little as the giver's. Hands near the body, each other or the floor are brought
 where they were relative to these. Two-bone inverse kinematics brings legs and arms there. (The footsteps are kept as
 in Gleicher 1998, but joint by joint instead of by spacetime optimisation.)
 """
@@ -15,8 +15,8 @@ from mapctl.motion import Motion
 from mapctl.retarget import as_rig, to_canonical
 from mapctl.retarget.carry.changes import Changes, RetargetedMotion, list_unmatched_joints, measure_changes
 from mapctl.retarget.carry.character import RiggedCharacter
-from mapctl.retarget.carry.fingers import carry_fingers, match_fingers
 from mapctl.retarget.carry.feet import find_ankle_targets, reach_ankle_targets
+from mapctl.retarget.carry.fingers import carry_fingers, match_fingers
 from mapctl.retarget.carry.ground import find_ground
 from mapctl.retarget.carry.hands import keep_hand_relations
 from mapctl.retarget.carry.hips import fit_hips, leg_extension, lower_hips, transfer_root
@@ -62,9 +62,7 @@ def retarget_canonical(
     found = find_ground(own, giver.stance)
     higher = 1 - scale if keeps else 0.0
     moved = transfer_root(own, giver, body, scale, higher * found.under_hips(float(own.fps)))
-    ankles = find_ankle_targets(
-        own, moved, giver.stance, body.stance, found, scale=scale, raised=higher * found.height
-    )
+    ankles = find_ankle_targets(own, moved, giver.stance, body.stance, found, scale=scale, raised=higher * found.height)
     fitted = fit_hips(moved, ankles, leg_extension(own))
     lowered = lower_hips(fitted, ankles, leg_extension(own))
     legs = reach_ankle_targets(lowered, ankles)

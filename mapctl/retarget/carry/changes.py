@@ -64,7 +64,9 @@ class Changes:
 
     def _note_feet(self) -> str:
         off = self.feet_missed
-        return _note_miss("the legs are too short for some of the way: feet are", off, _FOOT_METRES) if off.frames else ""
+        return (
+            _note_miss("the legs are too short for some of the way: feet are", off, _FOOT_METRES) if off.frames else ""
+        )
 
     def _note_hands(self) -> str:
         off = self.hands_missed

@@ -35,7 +35,10 @@ _SPEED_SECONDS = 0.1  # seconds over which that speed is smoothed
 _SHARPNESS = 0.05  # how much less a segment counts that is a little farther than the nearest
 _ROUNDS = 3  # times that hands are placed, since each arm is something that the other hand is near
 _EASE_WEIGHT = 0.02  # strength from which the arm is solved for entirely
-_FREE_EXTENSION, _MOST_EXTENSION = 0.98, 0.998  # of the arm: how straight one may be whatever the giver's is, and at most
+_FREE_EXTENSION, _MOST_EXTENSION = (
+    0.98,
+    0.998,
+)  # of the arm: how straight one may be whatever the giver's is, and at most
 _SOFT_MARGIN = 0.06  # of the arm, before the most that it may be, over which it gives in
 _HELD_SPEED = 0.25  # m/s below which a hand on the floor stands on it
 _LEAST_STRENGTH = 0.5  # of a relation, from which a hand that does not get there is worth a line
@@ -96,8 +99,8 @@ class _Relations:
 def keep_hand_relations(own: Motion, moved: Motion, giver: Stance, *, scale: float) -> tuple[Motion, HandTargets]:
     """Bring hands to where the giver's are relative to body, each other and floor, as far as arms allow.
 
-    Both are motions of canonical joints, `own` the giver's, `moved` with its rotations but of legs on other bones. Hands
-    keep their orientation in the world, and elbows go on to where they point.
+    Both are motions of canonical joints, `own` the giver's, `moved` with its rotations but of legs on other bones.
+    Hands keep their orientation in the world, and elbows go on pointing where they did.
     """
     relations = _find_relations(own, giver)
     strength = relations.strength()
@@ -139,7 +142,9 @@ def _find_relations(own: Motion, giver: Stance) -> _Relations:
     )
 
 
-def _weigh(distance: Float[Tensor, "*batch"], far: Float[Tensor, "*batch"] | float = _FAR_METRES) -> Float[Tensor, "*batch"]:
+def _weigh(
+    distance: Float[Tensor, "*batch"], far: Float[Tensor, "*batch"] | float = _FAR_METRES
+) -> Float[Tensor, "*batch"]:
     """Return how much a relation over a distance counts: entirely where it is a touch, not at all from `far` on."""
     return 1 - smootherstep((distance - _TOUCH_METRES) / (far - _TOUCH_METRES))
 

@@ -1,4 +1,4 @@
-"""Values over time that are held while something touches, and smooth between: spans of contact, and low-passed values."""
+"""Values over time that are held while something touches, and smooth between; and how far limbs are let reach."""
 
 import torch
 from jaxtyping import Bool, Float

@@ -93,8 +93,8 @@ def layout() -> Layout:
         for parts in (("UpperArm", "LowerArm"), ("UpperLeg",))
     )
     trunk = torch.tensor([name in ("hips", "spine", "chest") for name in start])
-    joints = (tuple(CANONICAL.indices(names)) for names in (start, stop))
-    return Layout(*joints, torch.tensor(widths, dtype=torch.float64), arms, beside | trunk)
+    begin, end = (tuple(CANONICAL.indices(names)) for names in (start, stop))
+    return Layout(begin, end, torch.tensor(widths, dtype=torch.float64), arms, beside | trunk)
 
 
 def girth(skeleton: Skeleton) -> float:
