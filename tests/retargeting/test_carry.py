@@ -17,6 +17,7 @@ from mapctl.commands.shared import character
 from mapctl.formats.bvh.layout import BvhLayout
 from mapctl.motion import Motion
 from mapctl.retarget.carry import RiggedCharacter, retarget_motion
+from mapctl.retarget.carry.hips import fit_hips, leg_extension
 from mapctl.retarget.carry.holding import soft_clamp
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, leg_length
 
@@ -113,6 +114,27 @@ def test_there_and_back_is_where_one_was(giver, body):
     assert float(away.mean(dim=0).max()) < 0.01
     ends = [0, *(CANONICAL.index(side + "Hand") for side in ("left", "right")), *FEET, *TOES]
     assert float(away[:, ends].max()) < 0.01
+
+
+@pytest.mark.parametrize("lower", [0.02, -0.02])
+def test_hips_follow_the_feet_of_straight_legs_both_ways(lower):
+    """Up as well as down, so that the way back undoes it; bent legs give in instead."""
+    ankles = {}
+    for upright in (0.995, 0.85):
+        clip = Performer(upright=upright).stands() if upright > 0.9 else crouching()
+        places = clip.joint_positions()[:, FEET].clone()
+        places[..., 1] -= lower
+        fitted = fit_hips(clip, places, leg_extension(clip))
+        ankles[upright] = float((clip.root_position - fitted.root_position)[:, 1].mean())
+    assert ankles[0.995] == pytest.approx(lower, abs=0.002)
+    assert ankles[0.85] == pytest.approx(0.0, abs=0.002)
+
+
+def crouching() -> Motion:
+    """Somebody who stands still on bent knees."""
+    bent = torch.full((60,), 1.0, dtype=torch.float64)
+    turned = {joint: sign * bent for joints, sign in ((HIPJOINTS, -0.5), (KNEES, 1.0)) for joint in joints}
+    return USUAL.stands(turned=turned)
 
 
 def test_toes_that_go_through_the_floor_do_so_no_more():
