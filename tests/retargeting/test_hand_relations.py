@@ -268,7 +268,7 @@ def test_a_hand_before_the_chest_keeps_its_distance_and_may_slide():
     done, turned = retarget_motion(clip, body_of(BODIES["short arms"])).motion, replace(clip, skeleton=bones(arms=0.9))
     was, now, plain = (palms(m)[0, 1] for m in (clip, done, turned))
     assert float((plain - was)[[0, 2]].norm()) > 1.5 * float((now - was)[[0, 2]].norm())
-    assert float((now - plain)[1].abs()) < 0.3 * float((was - plain)[1].abs())
+    assert float((now - plain)[1].abs()) < 0.5 * float((was - plain)[1].abs())
 
 
 def test_one_frame_is_enough():

@@ -1,7 +1,7 @@
 """ASF/AMC and BVH of one take: the capture on the other's rig travels as far and has the same contacts.
 
-The real takes are no part of the project: with MAPCTL_CMU=FOLDER, which holds `cmu-amc/02_01.amc` and `cmu/02/02_01.bvh`
-and so on, they are tried too.
+The real takes are no part of the project: with MAPCTL_CMU=FOLDER, which holds `cmu-amc/02_01.amc`,
+`cmu/02/02_01.bvh` and so on, they are tried too.
 """
 
 import os
