@@ -43,7 +43,8 @@ def atomic_path(path: str | PathLike[str]) -> Iterator[Path]:
 
 def write_bytes(path: str | PathLike[str], content: bytes) -> None:
     """Write `content` as the whole file `path`; WriteError if that cannot be."""
-    write_pieces(path, [content])
+    with atomic_path(path) as scratch:
+        scratch.write_bytes(content)
 
 
 def write_pieces(path: str | PathLike[str], pieces: "Iterable[bytes | memoryview]") -> None:
