@@ -92,7 +92,7 @@ def _define_animation(stage: Usd.Stage, motion: Motion, joints: Sequence[str]) -
 
 
 def _define_mesh(stage: Usd.Stage, body: SkinnedBody):
-    made = UsdGeom.Mesh.Define(stage, f"{_ROOT}/mannequin")
+    made = UsdGeom.Mesh.Define(stage, f"{_ROOT}/{body.name}")
     made.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(body.vertices.astype(np.float32)))
     made.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(body.faces), 3, np.int32)))
     made.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(body.faces.reshape(-1).astype(np.int32)))
@@ -103,8 +103,10 @@ def _define_mesh(stage: Usd.Stage, body: SkinnedBody):
     colour = made.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
     colour.Set(Vt.Vec3fArray.FromNumpy(body.linear_rgb.astype(np.float32)))
     binding = UsdSkel.BindingAPI.Apply(made.GetPrim())
-    binding.CreateJointIndicesPrimvar(False, 1).Set(Vt.IntArray.FromNumpy(body.joint.astype(np.int32)))
-    binding.CreateJointWeightsPrimvar(False, 1).Set(Vt.FloatArray.FromNumpy(np.ones(len(body.joint), np.float32)))
+    width = body.joints.shape[1]
+    joints, weights = body.joints.reshape(-1).astype(np.int32), body.weights.reshape(-1).astype(np.float32)
+    binding.CreateJointIndicesPrimvar(False, width).Set(Vt.IntArray.FromNumpy(joints))
+    binding.CreateJointWeightsPrimvar(False, width).Set(Vt.FloatArray.FromNumpy(weights))
     binding.CreateGeomBindTransformAttr(Gf.Matrix4d(1.0))
     return made.GetPrim()
 

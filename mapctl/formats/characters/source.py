@@ -16,6 +16,8 @@ class CharacterSource:
 
     path: Path
     """The file; read again when the character is written or drawn."""
+    armature: str
+    """Name of the armature in it."""
     stamp: tuple[int, int]
     """Its size in bytes and time of change, by which a later change of it is noticed."""
     frames: RestFrames
@@ -26,6 +28,11 @@ class CharacterSource:
     """Name of the animation that the motion was read from; None for the rest pose."""
     humanoid: Mapping[str, str] = field(default_factory=dict)
     """Joint name by canonical name, where the file itself says which is which (VRM)."""
+
+    @property
+    def choice(self) -> str:
+        """The path that chooses this armature."""
+        return f"{self.path}#{self.armature}"
 
     def holds(self, motion: Motion) -> bool:
         """Return whether the motion's skeleton still has this character's joints."""

@@ -103,9 +103,10 @@ def _build_nodes(motion: Motion) -> list[pygltflib.Node]:
 
 
 def _build_mesh(body: SkinnedBody, buffer: _Buffer) -> pygltflib.Mesh:
-    carrier = np.zeros((len(body.joint), 4), np.uint16)
-    carrier[:, 0] = body.joint
-    weight = np.tile(np.array([1, 0, 0, 0], np.float32), (len(carrier), 1))
+    missing = ((0, 0), (0, 4 - body.joints.shape[1]))
+    carrier = np.pad(body.joints, missing).astype(np.uint16)
+    weight = np.pad(body.weights, missing).astype(np.float32)
+    weight /= weight.sum(axis=1, keepdims=True)
     attributes = pygltflib.Attributes(
         POSITION=buffer.add(body.vertices.astype(np.float32), pygltflib.ARRAY_BUFFER),
         NORMAL=buffer.add(body.normals.astype(np.float32), pygltflib.ARRAY_BUFFER),
@@ -115,7 +116,7 @@ def _build_mesh(body: SkinnedBody, buffer: _Buffer) -> pygltflib.Mesh:
     )
     faces = buffer.add(body.faces.reshape(-1).astype(np.uint32), pygltflib.ELEMENT_ARRAY_BUFFER)
     return pygltflib.Mesh(
-        name="mannequin", primitives=[pygltflib.Primitive(attributes=attributes, indices=faces, material=0)]
+        name=body.name, primitives=[pygltflib.Primitive(attributes=attributes, indices=faces, material=0)]
     )
 
 

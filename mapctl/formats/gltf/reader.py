@@ -86,4 +86,6 @@ def _rest_motion(gltf: GltfFile, armature: Armature, frames: RestFrames, skeleto
 
 def _source(gltf: GltfFile, armature: Armature, frames: RestFrames, animation: str | None) -> CharacterSource:
     humanoid = read_humanoid_names(gltf, armature, frames.names)
-    return CharacterSource(gltf.path.resolve(), stamp_file(gltf.path), frames, armature.nodes, animation, humanoid)
+    return CharacterSource(
+        gltf.path.resolve(), armature.name, stamp_file(gltf.path), frames, armature.nodes, animation, humanoid
+    )
