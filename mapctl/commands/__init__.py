@@ -10,6 +10,7 @@ from typing import Protocol, runtime_checkable
 
 from mapctl.commands.bench import TABLES, Bench
 from mapctl.commands.blend import Blend
+from mapctl.commands.blender_addon import BlenderAddon
 from mapctl.commands.chain import Chain
 from mapctl.commands.convert import Convert
 from mapctl.commands.demo import Demo
@@ -53,6 +54,7 @@ COMMANDS: dict[str, type[Runnable]] = {
     "measure": Measure,
     "train": Train,
     "info": Info,
+    "blender-addon": BlenderAddon,
     "bench": Bench,
 }
 """Sub-commands by the name the user types, in the order of the help."""

@@ -15,6 +15,7 @@ from mapctl import __version__
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("mapctl", "priors", "controllers", "scenes")
 DATA = (
+    "mapctl/blender/addon/*.toml",
     "mapctl/joint_ranges/*.json",
     "mapctl/retarget/presets/*.toml",
     "priors/weights/*",

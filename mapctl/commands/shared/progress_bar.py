@@ -1,5 +1,6 @@
-"""Progress of long work: a bar on a terminal, nothing in a pipe."""
+"""Progress of long work: a bar on a terminal, lines for a program that asks for them, else nothing in a pipe."""
 
+import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,10 +10,18 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from mapctl.runtime import progress
 
+LINES = "MAPCTL_PROGRESS"
+"""Environment variable that asks for lines `progress DONE/TOTAL LABEL` on standard error."""
+
 
 @contextmanager
 def show_progress(label: str, *, quiet: bool = False) -> Iterator[progress.Progress | None]:
-    """Yield a function that moves a bar on standard error; None where there is no terminal, or with `quiet`."""
+    """Yield a function that moves a bar on standard error; None where there is no terminal, or with `quiet`. Where the
+    environment variable MAPCTL_PROGRESS is set to something, it writes a line for each hundredth instead.
+    """
+    if os.environ.get(LINES):
+        yield _write_lines(label)
+        return
     if quiet or not sys.stderr.isatty():
         yield None
         return
@@ -20,3 +29,16 @@ def show_progress(label: str, *, quiet: bool = False) -> Iterator[progress.Progr
     with Progress(*columns, console=Console(stderr=True), transient=True) as shown:
         task = shown.add_task(label, total=None)
         yield lambda done, total: shown.update(task, completed=done, total=total)
+
+
+def _write_lines(label: str) -> progress.Progress:
+    last = -1
+
+    def write(done: int, total: int) -> None:
+        nonlocal last
+        hundredth = 100 * done // max(total, 1)
+        if hundredth != last:
+            last = hundredth
+            print(f"progress {done}/{total} {label}", file=sys.stderr, flush=True)
+
+    return write
