@@ -1,0 +1,25 @@
+"""mapctl in Blender: walk along curves, clean up captures, fill gaps, in-between keys.
+
+Blender imports this package from the zip that `mapctl blender-addon` makes. It needs bpy, numpy and the standard
+library; mapctl itself runs as a process of its own.
+"""
+
+import bpy
+
+from . import operators, panel, settings
+
+_CLASSES = (*settings.CLASSES, *operators.OPERATORS, panel.MAPCTL_PT_sidebar)
+
+
+def register() -> None:
+    """Add all classes, and the options that scenes keep."""
+    for each in _CLASSES:
+        bpy.utils.register_class(each)
+    bpy.types.Scene.mapctl = bpy.props.PointerProperty(type=settings.MAPCTL_PG_settings)
+
+
+def unregister() -> None:
+    """Take all that away again."""
+    del bpy.types.Scene.mapctl
+    for each in reversed(_CLASSES):
+        bpy.utils.unregister_class(each)

@@ -1,0 +1,188 @@
+"""Actions and their curves, before Blender 4.4 and since, where a slot of an action has them in layers."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import bpy
+import numpy as np
+
+from .problem import AddonError
+
+_WIDTHS = {
+    "co": 2,
+    "handle_left": 2,
+    "handle_right": 2,
+    "interpolation": 1,
+    "handle_left_type": 1,
+    "handle_right_type": 1,
+    "easing": 1,
+    "type": 1,
+}
+"""Properties of a key, and how many numbers each has."""
+_CHANNELS = ("location", "rotation_quaternion", "rotation_euler", "rotation_axis_angle", "scale")
+_WHOLE = ("co", "handle_left", "handle_right")
+
+
+@dataclass(frozen=True, eq=False)
+class Channel:
+    """Values of a property in every frame."""
+
+    path: str
+    """Data path of the property."""
+    group: str
+    """Group in which the curve is listed: the bone's name."""
+    values: np.ndarray
+    """Values, (frames, numbers of the property)."""
+
+
+def name_channel(bone: str, attribute: str) -> str:
+    """Name the data path of a pose bone's property."""
+    return f'pose.bones["{bpy.utils.escape_identifier(bone)}"].{attribute}'
+
+
+def find_action(armature: bpy.types.Object) -> bpy.types.Action:
+    """Find the action that the armature plays; AddonError where there is none."""
+    data = armature.animation_data
+    if data is None or data.action is None:
+        raise AddonError(f"{armature.name} has no action: choose one in the Action Editor")
+    return data.action
+
+
+def assign_action(armature: bpy.types.Object, action: bpy.types.Action | None, slot: str = "") -> None:
+    """Let the armature play an action, by the slot of an identifier where actions have slots."""
+    data = armature.animation_data or armature.animation_data_create()
+    data.action = action
+    if action is not None and slot and hasattr(data, "action_slot"):
+        data.action_slot = action.slots[slot]
+
+
+def name_slot(armature: bpy.types.Object) -> str:
+    """Name the slot by which the armature plays its action; nothing where actions have none."""
+    slot = getattr(armature.animation_data, "action_slot", None)
+    return slot.identifier if slot else ""
+
+
+def add_action(armature: bpy.types.Object, name: str) -> bpy.types.Action:
+    """Add an empty action and let the armature play it."""
+    action = bpy.data.actions.new(name)
+    slot = action.slots.new(id_type="OBJECT", name=armature.name).identifier if hasattr(action, "slots") else ""
+    assign_action(armature, action, slot)
+    return action
+
+
+def copy_action(armature: bpy.types.Object, name: str) -> bpy.types.Action:
+    """Copy the action that the armature plays, and let it play the copy."""
+    action, slot = find_action(armature).copy(), name_slot(armature)
+    action.name = name
+    assign_action(armature, action, slot)
+    return action
+
+
+def open_curves(armature: bpy.types.Object):
+    """Open what holds the curves and groups by which an action moves the armature: the action itself, or since 4.4 the
+    bag of its slot."""
+    action = find_action(armature)
+    if not hasattr(action, "layers"):
+        return action
+    slot = armature.animation_data.action_slot
+    if slot is None:
+        raise AddonError(f"{action.name} has no slot for {armature.name}: choose one in the Action Editor")
+    layer = action.layers[0] if action.layers else action.layers.new("Layer")
+    strip = layer.strips[0] if layer.strips else layer.strips.new(type="KEYFRAME")
+    return strip.channelbag(slot, ensure=True)
+
+
+def list_keys(armature: bpy.types.Object) -> dict[int, bool]:
+    """List the frames in which bones have keys, and whether one of them is not a generated key."""
+    made, frames = number_type(generated=True), {}
+    for curve in open_curves(armature).fcurves:
+        if not curve.data_path.startswith("pose.bones["):
+            continue
+        keys = _read_keys(curve)
+        for frame, kind in zip(np.rint(keys["co"][:, 0]).astype(int).tolist(), keys["type"][:, 0], strict=True):
+            frames[frame] = frames.get(frame, False) or kind != made
+    return dict(sorted(frames.items()))
+
+
+def clear_bones(armature: bpy.types.Object, bones: Iterable[str]) -> dict[tuple[str, int], dict[str, np.ndarray]]:
+    """Remove the curves of the bones' places, rotations and scales; return the keys that they had."""
+    owned = {name_channel(bone, attribute) for bone in bones for attribute in _CHANNELS}
+    curves = open_curves(armature).fcurves
+    found = [curve for curve in curves if curve.data_path in owned]
+    keys = {(curve.data_path, curve.array_index): _read_keys(curve) for curve in found}
+    for curve in found:
+        curves.remove(curve)
+    return keys
+
+
+def set_constant(armature: bpy.types.Object, path: str, value: float, frame: int) -> None:
+    """Set a property to one value throughout."""
+    holder = open_curves(armature)
+    for curve in [curve for curve in holder.fcurves if curve.data_path == path]:
+        holder.fcurves.remove(curve)
+    curve = holder.fcurves.new(path)
+    curve.keyframe_points.insert(frame, value)
+
+
+def write_channel(
+    armature: bpy.types.Object,
+    channel: Channel,
+    frames: range,
+    made: np.ndarray,
+    kept: Mapping[tuple[str, int], dict[str, np.ndarray]],
+) -> None:
+    """Write a key for every frame, linear between them, generated ones where `made` (frames,) says so; `kept` keys of
+    before stay outside of the frames."""
+    holder = open_curves(armature)
+    for index, values in enumerate(channel.values.T):
+        keys = _make_keys(np.arange(frames.start, frames.stop), values, made)
+        before = kept.get((channel.path, index))
+        if before is not None:
+            keys = _join_keys(before, keys, frames)
+        curve = holder.fcurves.new(channel.path, index=index)
+        curve.group = holder.groups.get(channel.group) or holder.groups.new(channel.group)
+        curve.keyframe_points.add(len(keys["co"]))
+        for name, numbers in keys.items():
+            curve.keyframe_points.foreach_set(name, numbers.ravel())
+        curve.update()
+
+
+def number_type(*, generated: bool) -> int:
+    """Return Blender's number of the type of key; before 4.4 jitter stands for generated keys."""
+    items = bpy.types.Keyframe.bl_rna.properties["type"].enum_items
+    name = ("GENERATED" if "GENERATED" in items else "JITTER") if generated else "KEYFRAME"
+    return items[name].value
+
+
+def _make_keys(frames: np.ndarray, values: np.ndarray, made: np.ndarray) -> dict[str, np.ndarray]:
+    """Make linear keys. Handles lie on the neighbours' third, where Blender's own would."""
+    items = bpy.types.Keyframe.bl_rna.properties
+    co = np.stack([frames, values], axis=-1).astype(np.float32)
+    linear = items["interpolation"].enum_items["LINEAR"].value
+    automatic = items["handle_left_type"].enum_items["AUTO_CLAMPED"].value
+    third = np.array([1 / 3, 0.0], dtype=np.float32)
+    whole = {
+        "interpolation": np.full(len(co), linear),
+        "handle_left_type": np.full(len(co), automatic),
+        "handle_right_type": np.full(len(co), automatic),
+        "easing": np.full(len(co), items["easing"].enum_items["AUTO"].value),
+        "type": np.where(made, number_type(generated=True), number_type(generated=False)),
+    }
+    columns = {name: numbers.astype(np.int32)[:, None] for name, numbers in whole.items()}
+    return {"co": co, "handle_left": co - third, "handle_right": co + third, **columns}
+
+
+def _join_keys(before: dict[str, np.ndarray], keys: dict[str, np.ndarray], frames: range) -> dict[str, np.ndarray]:
+    """Join keys with those that were before and after the frames."""
+    early, late = before["co"][:, 0] < frames.start - 0.5, before["co"][:, 0] > frames.stop - 0.5
+    return {name: np.concatenate([before[name][early], keys[name], before[name][late]]) for name in _WIDTHS}
+
+
+def _read_keys(curve: bpy.types.FCurve) -> dict[str, np.ndarray]:
+    """Read all that a curve's keys are."""
+    count, keys = len(curve.keyframe_points), {}
+    for name, width in _WIDTHS.items():
+        numbers = np.empty(count * width, dtype=np.float32 if name in _WHOLE else np.int32)
+        curve.keyframe_points.foreach_get(name, numbers)
+        keys[name] = numbers.reshape(count, width)
+    return keys

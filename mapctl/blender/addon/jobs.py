@@ -1,0 +1,289 @@
+"""The four jobs, step by step: they read the scene, run mapctl, and make a new action of what it wrote."""
+
+import tempfile
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+from . import actions, exchange, rigify
+from .body import Body, take_bones
+from .drawn_curve import measure_height, sample_curve, write_curve
+from .exchange import WorldMotion
+from .posing import Keys, list_channels, place_joints, pose_bones, solve_controls
+from .problem import AddonError, Step
+from .process import run_command
+from .sampling import measure_fps, read_poses, sample_motion, sample_worlds, take_rest, to_armature
+
+Job = Generator[Step, None, list[str]]
+"""Steps of a job; it returns what to tell the user."""
+_WALK_FPS = 30
+_PROBES = 24  # frames in which the result is compared with what was wanted
+_OFF = 0.001  # metres from which on bones that do not follow are told
+_NEEDLESS = ("hips", "chest", "spine_fk.001")  # controls of a generated rig that a new action leaves alone
+
+
+@dataclass(frozen=True)
+class WalkOptions:
+    """How a character walks along a curve."""
+
+    speed: float = 0.0
+    """Metres a second; 0 for mapctl's own, which is slower in sharp corners."""
+    seconds: float = 0.0
+    """Duration; 0 for once along the curve."""
+    gait: str = ""
+    """Gait that the prior knows; nothing for any."""
+    style: str = ""
+    """Style that the prior knows; nothing for any."""
+    seed: int = 0
+    """Seed of everything random."""
+
+    def list_words(self, fps: str) -> list[str]:
+        """List the words of `mapctl follow`."""
+        words = ["--seed", str(self.seed)]
+        for name, value in (("--speed", self.speed), ("--seconds", self.seconds)):
+            words += [name, f"{value:.6g}"] if value > 0 else []
+        for name, value in (("--gait", self.gait), ("--style", self.style)):
+            words += [name, value] if value else []
+        return words + (["--fps", fps] if self.gait or self.style else [])
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What a job works on."""
+
+    scene: bpy.types.Scene
+    """The scene, whose frame rate and frames count."""
+    armature: bpy.types.Object
+    """The character."""
+    command: tuple[str, ...]
+    """Words that start mapctl."""
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """A motion that an action is to be made of."""
+
+    body: Body
+    """The character's joints."""
+    frames: range
+    """Frames of the scene."""
+    moved: np.ndarray
+    """What moves the joints from their rest in the armature's space, (frames, joints, 4, 4)."""
+    travelling: frozenset[int]
+    """Joints that travel within their parent."""
+    made: np.ndarray
+    """Which frames have generated keys, (frames,)."""
+    name: str
+    """Name of the new action."""
+    fresh: bool
+    """Whether the action is empty at first, not a copy of the one before."""
+
+
+def walk_along(at: Scene, drawn: bpy.types.Object, options: WalkOptions) -> Job:
+    """Let the character walk along a curve, from the scene's first frame on."""
+    body, points = take_body(at), sample_curve(drawn, at.scene)
+    height, level = measure_height(points)
+    fps = measure_fps(at.scene)
+    with _temporary_folder() as folder:
+        exchange.write(take_rest(body, fps), folder / "character.npz", _place_ends(body), frozenset())
+        write_curve(points, folder / "curve.csv")
+        words = ["follow", "curve.csv", "--rig", "character.npz", "-o", "walk.npz", *options.list_words(str(float(fps)))]
+        lines = yield from run_command([*at.command, *words], folder, "walking")
+        made, travelling = exchange.read(folder / "walk.npz")
+        if made.fps != fps:
+            words = ["convert", "walk.npz", "resampled.npz", "--fps", str(fps)]
+            yield from run_command([*at.command, *words], folder, "resampling")
+            made, travelling = exchange.read(folder / "resampled.npz")
+    made = replace(made, positions=made.positions + (0.0, height, 0.0))
+    first = at.scene.frame_preview_start if at.scene.use_preview_range else at.scene.frame_start
+    frames = range(first, first + len(made.positions))
+    with _restored_scene(at):
+        worlds = yield from sample_worlds(at.armature, at.scene, frames)
+        moved = to_armature(made, body, worlds)
+        plain = np.zeros(len(frames), dtype=bool)
+        name = f"{at.armature.name} along {drawn.name}"
+        notes = yield from _make_action(at, Result(body, frames, moved, travelling, plain, name, fresh=True))
+    at.scene.frame_end = max(at.scene.frame_end, frames.stop - 1)
+    return [*lines, *notes, *([] if level else [f"{drawn.name} is not level: the character walks at its median height"])]
+
+
+def clean_up(at: Scene, frames: range, *, anchor: bool) -> Job:
+    """Denoise the action in these frames."""
+    words = ["denoise", "IN", "-o", "OUT", *(["--anchor"] if anchor else [])]
+    made = np.zeros(len(frames), dtype=bool)
+    return (yield from _edit(at, frames, words, made, "clean", "cleaning up"))
+
+
+def fill_gap(at: Scene, frames: range, gap: range, joints: Sequence[str]) -> Job:
+    """Fill a gap in these frames, of some joints or of all."""
+    if not (gap and frames.start <= gap.start and gap.stop <= frames.stop):
+        raise AddonError(
+            f"the gap {gap.start} to {gap.stop - 1} is not within the action's frames {frames.start} to {frames.stop - 1}"
+        )
+    words = ["infill", "IN", "-o", "OUT", "--gap", f"{gap.start - frames.start}:{gap.stop - frames.start}"]
+    words += ["--joints", ",".join(joints)] if joints else []
+    made = np.array([frame in gap for frame in frames])
+    return (yield from _edit(at, frames, words, made, "filled", "filling the gap"))
+
+
+def fill_between_keys(at: Scene, frames: range, keyed: Sequence[int]) -> Job:
+    """Make the motion between the frames that have keys."""
+    inside = [frame for frame in keyed if frame in frames]
+    if len(inside) < 2:
+        raise AddonError("the action has keys in fewer than two frames: key at least a first and a last pose")
+    if len(inside) == inside[-1] - inside[0] + 1:
+        raise AddonError(f"every frame from {inside[0]} to {inside[-1]} has keys: there is nothing in between")
+    frames = range(inside[0], inside[-1] + 1)
+    words = ["tween", "IN", "-o", "OUT", "--keyframes", ",".join(str(frame - frames.start) for frame in inside)]
+    made = np.array([frame not in inside for frame in frames])
+    return (yield from _edit(at, frames, words, made, "in-between", "in-betweening"))
+
+
+def take_body(at: Scene) -> Body:
+    """Take the joints of the character: of a rig that Rigify made by its controls, else by its bones."""
+    if rigify.is_generated(at.armature):
+        return rigify.take_controls(at.armature, at.scene)
+    body = take_bones(at.armature, at.scene)
+    return replace(body, rig_toml=rigify.describe_names(body.names))
+
+
+def name_joints(at: Scene, bones: Sequence[str]) -> list[str]:
+    """Name the joints of selected bones; AddonError where none of them is one."""
+    body = take_body(at)
+    joint_of = {control.bone: body.names[control.joint] for control in body.controls}
+    joint_of |= dict(zip((*body.bones, *body.names), (*body.names, *body.names), strict=True))
+    found = list(dict.fromkeys(joint_of[bone] for bone in bones if bone in joint_of))
+    if not found:
+        raise AddonError("no selected bone is a joint of the body: select some in Pose Mode, or leave the choice out")
+    return found
+
+
+def _edit(at: Scene, frames: range, words: Sequence[str], made: np.ndarray, suffix: str, label: str) -> Job:
+    """Send the action to a command of mapctl, and make a new one of what comes back."""
+    body, old = take_body(at), actions.find_action(at.armature)
+    with _restored_scene(at), _temporary_folder() as folder:
+        motion, worlds = yield from sample_motion(at.armature, body, at.scene, frames)
+        exchange.write(motion, folder / "given.npz", _place_ends(body), body.movable)
+        names = {"IN": "given.npz", "OUT": "made.npz"}
+        rig = []
+        if body.rig_toml:
+            (folder / "rigify.toml").write_text(body.rig_toml, encoding="utf-8")
+            rig = ["--rig", "rigify.toml"]
+        lines = yield from run_command([*at.command, *(names.get(word, word) for word in words), *rig], folder, label)
+        answer, travelling = exchange.read(folder / "made.npz")
+        _check_length(answer, frames)
+        moved = to_armature(answer, body, worlds)
+        name = f"{old.name} {suffix}"
+        notes = yield from _make_action(at, Result(body, frames, moved, travelling, made, name, fresh=False))
+    return [*lines, *notes]
+
+
+def _check_length(motion: WorldMotion, frames: range) -> None:
+    if len(motion.positions) != len(frames):
+        raise AddonError(f"mapctl answered with {len(motion.positions)} frames where {len(frames)} were asked for")
+
+
+def _make_action(at: Scene, result: Result) -> Generator[Step, None, list[str]]:
+    """Make an action of a result; the one before is kept by a fake user. Ended early it leaves no trace."""
+    with _restored_pose(at):
+        if result.fresh:
+            actions.add_action(at.armature, result.name)
+        else:
+            actions.copy_action(at.armature, result.name)
+        keys, kept = yield from _find_keys(at, result)
+        for channel in list_channels(at.armature, keys):
+            actions.write_channel(at.armature, channel, result.frames, result.made, kept)
+        _reset_unkeyed(at.armature, keys)
+        return (yield from _compare(at, result))
+
+
+def _find_keys(at: Scene, result: Result) -> Generator[Step, None, tuple[list[Keys], dict]]:
+    """Find what bones or controls are keyed with, and take their keys of before out of the action."""
+    body = result.body
+    if not body.controls:
+        keys = pose_bones(at.armature, body, result.moved, result.travelling)
+        return keys, actions.clear_bones(at.armature, body.bones)
+    kept = actions.clear_bones(at.armature, [control.bone for control in body.controls])
+    for path, value in body.switches.items():
+        actions.set_constant(at.armature, path, value, result.frames.start)
+    if result.fresh:
+        _reset_needless(at.armature)
+    keys = yield from solve_controls(at.armature, body, at.scene, result.frames, result.moved)
+    return keys, kept
+
+
+def _compare(at: Scene, result: Result) -> Generator[Step, None, list[str]]:
+    """Compare what Blender makes of the action with what was wanted; return what to tell of it."""
+    body, scale = result.body, np.linalg.norm(result.body.frame[:3, 0])
+    worst, where = 0.0, ""
+    for number in np.unique(np.linspace(0, len(result.frames) - 1, _PROBES).astype(int)):
+        at.scene.frame_set(result.frames[number])
+        actual = read_poses(at.armature, body.bones) @ np.linalg.inv(body.rests)
+        apart = np.linalg.norm(place_joints(body, actual) - place_joints(body, result.moved[number]), axis=-1) * scale
+        if apart.max() > worst:
+            worst, where = float(apart.max()), body.names[int(apart.argmax())]
+        yield Step("checking", idle=False)
+    if worst < _OFF:
+        return []
+    return [f"{where} is up to {100 * worst:.1f} cm off: constraints or locks keep bones from where they should be"]
+
+
+def _reset_unkeyed(armature: bpy.types.Object, keys: Sequence[Keys]) -> None:
+    """Reset what else a keyed bone's place and scale were set to."""
+    for each in keys:
+        bone = armature.pose.bones[each.bone]
+        bone.scale = (1.0, 1.0, 1.0)
+        if not each.travels:
+            bone.location = (0.0, 0.0, 0.0)
+
+
+def _reset_needless(armature: bpy.types.Object) -> None:
+    """Reset the controls that would bend a generated rig beside those that are keyed."""
+    for bone in armature.pose.bones:
+        if bone.name in _NEEDLESS or "tweak" in bone.name:
+            bone.matrix_basis.identity()
+
+
+def _place_ends(body: Body) -> dict[str, np.ndarray]:
+    return {name: body.to_world(tail) for name, tail in body.ends.items()}
+
+
+@contextmanager
+def _temporary_folder() -> Iterator[Path]:
+    with tempfile.TemporaryDirectory(prefix="mapctl-") as folder:
+        yield Path(folder)
+
+
+@contextmanager
+def _restored_scene(at: Scene) -> Iterator[None]:
+    """Go back to the frame of before at the end."""
+    frame, subframe = at.scene.frame_current, at.scene.frame_subframe
+    try:
+        yield
+    finally:
+        at.scene.frame_set(frame, subframe=subframe)
+
+
+@contextmanager
+def _restored_pose(at: Scene) -> Iterator[None]:
+    """Keep the old action by a fake user at the end; go back to it, and to the pose, if the block ends early."""
+    armature = at.armature
+    before = {bone.name: bone.matrix_basis.copy() for bone in armature.pose.bones}
+    data = armature.animation_data
+    old, slot = (data.action, actions.name_slot(armature)) if data else (None, "")
+    known = set(bpy.data.actions)
+    try:
+        yield
+    except BaseException:
+        actions.assign_action(armature, old, slot)
+        for made in set(bpy.data.actions) - known:
+            bpy.data.actions.remove(made)
+        for name, basis in before.items():
+            armature.pose.bones[name].matrix_basis = basis
+        raise
+    if old is not None:
+        old.use_fake_user = True
