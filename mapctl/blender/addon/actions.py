@@ -1,6 +1,6 @@
 """Actions and their curves, before Blender 4.4 and since, where a slot of an action has them in layers."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import bpy
@@ -8,19 +8,7 @@ import numpy as np
 
 from .problem import AddonError
 
-_WIDTHS = {
-    "co": 2,
-    "handle_left": 2,
-    "handle_right": 2,
-    "interpolation": 1,
-    "handle_left_type": 1,
-    "handle_right_type": 1,
-    "easing": 1,
-    "type": 1,
-}
-"""Properties of a key, and how many numbers each has."""
 _CHANNELS = ("location", "rotation_quaternion", "rotation_euler", "rotation_axis_angle", "scale")
-_WHOLE = ("co", "handle_left", "handle_right")
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,52 +86,40 @@ def list_keys(armature: bpy.types.Object) -> dict[int, bool]:
     for curve in open_curves(armature).fcurves:
         if not curve.data_path.startswith("pose.bones["):
             continue
-        keys = _read_keys(curve)
-        for frame, kind in zip(np.rint(keys["co"][:, 0]).astype(int).tolist(), keys["type"][:, 0], strict=True):
+        keys = curve.keyframe_points
+        places, kinds = np.empty(2 * len(keys), dtype=np.float32), np.empty(len(keys), dtype=np.int32)
+        keys.foreach_get("co", places)
+        keys.foreach_get("type", kinds)
+        for frame, kind in zip(np.rint(places[::2]).astype(int).tolist(), kinds.tolist(), strict=True):
             frames[frame] = frames.get(frame, False) or kind != made
     return dict(sorted(frames.items()))
 
 
-def clear_bones(armature: bpy.types.Object, bones: Iterable[str]) -> dict[tuple[str, int], dict[str, np.ndarray]]:
-    """Remove the curves of the bones' places, rotations and scales; return the keys that they had."""
+def clear_bones(armature: bpy.types.Object, bones: Iterable[str]) -> None:
+    """Remove the curves of the bones' places, rotations and scales."""
     owned = {name_channel(bone, attribute) for bone in bones for attribute in _CHANNELS}
     curves = open_curves(armature).fcurves
-    found = [curve for curve in curves if curve.data_path in owned]
-    keys = {(curve.data_path, curve.array_index): _read_keys(curve) for curve in found}
-    for curve in found:
+    for curve in [curve for curve in curves if curve.data_path in owned]:
         curves.remove(curve)
-    return keys
 
 
 def set_constant(armature: bpy.types.Object, path: str, value: float, frame: int) -> None:
     """Set a property to one value throughout."""
-    holder = open_curves(armature)
-    for curve in [curve for curve in holder.fcurves if curve.data_path == path]:
-        holder.fcurves.remove(curve)
-    curve = holder.fcurves.new(path)
-    curve.keyframe_points.insert(frame, value)
+    curves = open_curves(armature).fcurves
+    for curve in [curve for curve in curves if curve.data_path == path]:
+        curves.remove(curve)
+    curves.new(path).keyframe_points.insert(frame, value)
 
 
-def write_channel(
-    armature: bpy.types.Object,
-    channel: Channel,
-    frames: range,
-    made: np.ndarray,
-    kept: Mapping[tuple[str, int], dict[str, np.ndarray]],
-) -> None:
-    """Write a key for every frame, linear between them, generated ones where `made` (frames,) says so; `kept` keys of
-    before stay outside of the frames."""
+def write_channel(armature: bpy.types.Object, channel: Channel, frames: range, made: np.ndarray) -> None:
+    """Write a key for every frame, linear between them, generated ones where `made` (frames,) says so."""
     holder = open_curves(armature)
     for index, values in enumerate(channel.values.T):
-        keys = _make_keys(np.arange(frames.start, frames.stop), values, made)
-        before = kept.get((channel.path, index))
-        if before is not None:
-            keys = _join_keys(before, keys, frames)
         curve = holder.fcurves.new(channel.path, index=index)
         curve.group = holder.groups.get(channel.group) or holder.groups.new(channel.group)
-        curve.keyframe_points.add(len(keys["co"]))
-        for name, numbers in keys.items():
-            curve.keyframe_points.foreach_set(name, numbers.ravel())
+        curve.keyframe_points.add(len(frames))
+        for name, numbers in _make_keys(np.arange(frames.start, frames.stop), values, made).items():
+            curve.keyframe_points.foreach_set(name, numbers)
         curve.update()
 
 
@@ -155,34 +131,11 @@ def number_type(*, generated: bool) -> int:
 
 
 def _make_keys(frames: np.ndarray, values: np.ndarray, made: np.ndarray) -> dict[str, np.ndarray]:
-    """Make linear keys. Handles lie on the neighbours' third, where Blender's own would."""
-    items = bpy.types.Keyframe.bl_rna.properties
-    co = np.stack([frames, values], axis=-1).astype(np.float32)
-    linear = items["interpolation"].enum_items["LINEAR"].value
-    automatic = items["handle_left_type"].enum_items["AUTO_CLAMPED"].value
-    third = np.array([1 / 3, 0.0], dtype=np.float32)
-    whole = {
-        "interpolation": np.full(len(co), linear),
-        "handle_left_type": np.full(len(co), automatic),
-        "handle_right_type": np.full(len(co), automatic),
-        "easing": np.full(len(co), items["easing"].enum_items["AUTO"].value),
-        "type": np.where(made, number_type(generated=True), number_type(generated=False)),
+    """Make linear keys, as Blender's own properties of a key want them."""
+    linear = bpy.types.Keyframe.bl_rna.properties["interpolation"].enum_items["LINEAR"].value
+    kinds = np.where(made, number_type(generated=True), number_type(generated=False))
+    return {
+        "co": np.stack([frames, values], axis=-1).astype(np.float32).ravel(),
+        "interpolation": np.full(len(frames), linear, dtype=np.int32),
+        "type": kinds.astype(np.int32),
     }
-    columns = {name: numbers.astype(np.int32)[:, None] for name, numbers in whole.items()}
-    return {"co": co, "handle_left": co - third, "handle_right": co + third, **columns}
-
-
-def _join_keys(before: dict[str, np.ndarray], keys: dict[str, np.ndarray], frames: range) -> dict[str, np.ndarray]:
-    """Join keys with those that were before and after the frames."""
-    early, late = before["co"][:, 0] < frames.start - 0.5, before["co"][:, 0] > frames.stop - 0.5
-    return {name: np.concatenate([before[name][early], keys[name], before[name][late]]) for name in _WIDTHS}
-
-
-def _read_keys(curve: bpy.types.FCurve) -> dict[str, np.ndarray]:
-    """Read all that a curve's keys are."""
-    count, keys = len(curve.keyframe_points), {}
-    for name, width in _WIDTHS.items():
-        numbers = np.empty(count * width, dtype=np.float32 if name in _WHOLE else np.int32)
-        curve.keyframe_points.foreach_get(name, numbers)
-        keys[name] = numbers.reshape(count, width)
-    return keys

@@ -18,12 +18,24 @@ from .problem import AddonError, Step
 from .process import run_command
 from .sampling import measure_fps, read_poses, sample_motion, sample_worlds, take_rest, to_armature
 
-Job = Generator[Step, None, list[str]]
-"""Steps of a job; it returns what to tell the user."""
 _WALK_FPS = 30
 _PROBES = 24  # frames in which the result is compared with what was wanted
 _OFF = 0.001  # metres from which on bones that do not follow are told
 _NEEDLESS = ("hips", "chest", "spine_fk.001")  # controls of a generated rig that a new action leaves alone
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What there is to tell of a job that was done."""
+
+    lines: tuple[str, ...]
+    """What mapctl said."""
+    warnings: tuple[str, ...] = ()
+    """What is not as it should be."""
+
+
+Job = Generator[Step, None, Outcome]
+"""Steps of a job, and what to tell of it."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +103,15 @@ def walk_along(at: Scene, drawn: bpy.types.Object, options: WalkOptions) -> Job:
     with _temporary_folder() as folder:
         exchange.write(take_rest(body, fps), folder / "character.npz", _place_ends(body), frozenset())
         write_curve(points, folder / "curve.csv")
-        words = ["follow", "curve.csv", "--rig", "character.npz", "-o", "walk.npz", *options.list_words(str(float(fps)))]
+        words = [
+            "follow",
+            "curve.csv",
+            "--rig",
+            "character.npz",
+            "-o",
+            "walk.npz",
+            *options.list_words(str(float(fps))),
+        ]
         lines = yield from run_command([*at.command, *words], folder, "walking")
         made, travelling = exchange.read(folder / "walk.npz")
         if made.fps != fps:
@@ -106,9 +126,11 @@ def walk_along(at: Scene, drawn: bpy.types.Object, options: WalkOptions) -> Job:
         moved = to_armature(made, body, worlds)
         plain = np.zeros(len(frames), dtype=bool)
         name = f"{at.armature.name} along {drawn.name}"
-        notes = yield from _make_action(at, Result(body, frames, moved, travelling, plain, name, fresh=True))
+        warnings = yield from _make_action(at, Result(body, frames, moved, travelling, plain, name, fresh=True))
     at.scene.frame_end = max(at.scene.frame_end, frames.stop - 1)
-    return [*lines, *notes, *([] if level else [f"{drawn.name} is not level: the character walks at its median height"])]
+    if not level:
+        warnings = (*warnings, f"{drawn.name} is not level: the character walks at its median height")
+    return Outcome(_shorten(lines), warnings)
 
 
 def clean_up(at: Scene, frames: range, *, anchor: bool) -> Job:
@@ -130,21 +152,25 @@ def fill_gap(at: Scene, frames: range, gap: range, joints: Sequence[str]) -> Job
     return (yield from _edit(at, frames, words, made, "filled", "filling the gap"))
 
 
-def fill_between_keys(at: Scene, frames: range, keyed: Sequence[int]) -> Job:
-    """Make the motion between the frames that have keys."""
-    inside = [frame for frame in keyed if frame in frames]
-    if len(inside) < 2:
+def fill_between_keys(at: Scene, keyed: Sequence[int]) -> Job:
+    """Make the motion between the frames that have keys, in order."""
+    if len(keyed) < 2:
         raise AddonError("the action has keys in fewer than two frames: key at least a first and a last pose")
-    if len(inside) == inside[-1] - inside[0] + 1:
-        raise AddonError(f"every frame from {inside[0]} to {inside[-1]} has keys: there is nothing in between")
-    frames = range(inside[0], inside[-1] + 1)
-    words = ["tween", "IN", "-o", "OUT", "--keyframes", ",".join(str(frame - frames.start) for frame in inside)]
-    made = np.array([frame not in inside for frame in frames])
+    if len(keyed) == keyed[-1] - keyed[0] + 1:
+        raise AddonError(f"every frame from {keyed[0]} to {keyed[-1]} has keys: there is nothing in between")
+    frames = range(keyed[0], keyed[-1] + 1)
+    words = ["tween", "IN", "-o", "OUT", "--keyframes", ",".join(str(frame - frames.start) for frame in keyed)]
+    made = np.array([frame not in keyed for frame in frames])
     return (yield from _edit(at, frames, words, made, "in-between", "in-betweening"))
 
 
 def take_body(at: Scene) -> Body:
-    """Take the joints of the character: of a rig that Rigify made by its controls, else by its bones."""
+    """Take the joints of the character: of a rig that Rigify made by its controls, else by its bones. AddonError where
+    it cannot be read or keyed."""
+    if at.armature.library is not None:
+        raise AddonError(f"{at.armature.name} is linked from another file: make a library override of it")
+    if at.armature.data.pose_position == "REST":
+        raise AddonError(f"{at.armature.name} shows its rest position: set it to Pose Position (Armature properties)")
     if rigify.is_generated(at.armature):
         return rigify.take_controls(at.armature, at.scene)
     body = take_bones(at.armature, at.scene)
@@ -178,8 +204,13 @@ def _edit(at: Scene, frames: range, words: Sequence[str], made: np.ndarray, suff
         _check_length(answer, frames)
         moved = to_armature(answer, body, worlds)
         name = f"{old.name} {suffix}"
-        notes = yield from _make_action(at, Result(body, frames, moved, travelling, made, name, fresh=False))
-    return [*lines, *notes]
+        warnings = yield from _make_action(at, Result(body, frames, moved, travelling, made, name, fresh=False))
+    return Outcome(_shorten(lines), warnings)
+
+
+def _shorten(lines: Sequence[str]) -> tuple[str, ...]:
+    """Leave the names of temporary files out of what mapctl said."""
+    return tuple(line.removeprefix("made.npz: ") for line in lines if not line.startswith("wrote "))
 
 
 def _check_length(motion: WorldMotion, frames: range) -> None:
@@ -187,37 +218,36 @@ def _check_length(motion: WorldMotion, frames: range) -> None:
         raise AddonError(f"mapctl answered with {len(motion.positions)} frames where {len(frames)} were asked for")
 
 
-def _make_action(at: Scene, result: Result) -> Generator[Step, None, list[str]]:
+def _make_action(at: Scene, result: Result) -> Generator[Step, None, tuple[str, ...]]:
     """Make an action of a result; the one before is kept by a fake user. Ended early it leaves no trace."""
     with _restored_pose(at):
         if result.fresh:
             actions.add_action(at.armature, result.name)
         else:
             actions.copy_action(at.armature, result.name)
-        keys, kept = yield from _find_keys(at, result)
+        keys = yield from _find_keys(at, result)
         for channel in list_channels(at.armature, keys):
-            actions.write_channel(at.armature, channel, result.frames, result.made, kept)
+            actions.write_channel(at.armature, channel, result.frames, result.made)
         _reset_unkeyed(at.armature, keys)
         return (yield from _compare(at, result))
 
 
-def _find_keys(at: Scene, result: Result) -> Generator[Step, None, tuple[list[Keys], dict]]:
+def _find_keys(at: Scene, result: Result) -> Generator[Step, None, list[Keys]]:
     """Find what bones or controls are keyed with, and take their keys of before out of the action."""
     body = result.body
     if not body.controls:
-        keys = pose_bones(at.armature, body, result.moved, result.travelling)
-        return keys, actions.clear_bones(at.armature, body.bones)
-    kept = actions.clear_bones(at.armature, [control.bone for control in body.controls])
+        actions.clear_bones(at.armature, body.bones)
+        return pose_bones(at.armature, body, result.moved, result.travelling)
+    actions.clear_bones(at.armature, [control.bone for control in body.controls])
     for path, value in body.switches.items():
         actions.set_constant(at.armature, path, value, result.frames.start)
     if result.fresh:
         _reset_needless(at.armature)
-    keys = yield from solve_controls(at.armature, body, at.scene, result.frames, result.moved)
-    return keys, kept
+    return (yield from solve_controls(at.armature, body, at.scene, result.frames, result.moved))
 
 
-def _compare(at: Scene, result: Result) -> Generator[Step, None, list[str]]:
-    """Compare what Blender makes of the action with what was wanted; return what to tell of it."""
+def _compare(at: Scene, result: Result) -> Generator[Step, None, tuple[str, ...]]:
+    """Compare what Blender makes of the action with what was wanted; return what is wrong with it."""
     body, scale = result.body, np.linalg.norm(result.body.frame[:3, 0])
     worst, where = 0.0, ""
     for number in np.unique(np.linspace(0, len(result.frames) - 1, _PROBES).astype(int)):
@@ -226,10 +256,10 @@ def _compare(at: Scene, result: Result) -> Generator[Step, None, list[str]]:
         apart = np.linalg.norm(place_joints(body, actual) - place_joints(body, result.moved[number]), axis=-1) * scale
         if apart.max() > worst:
             worst, where = float(apart.max()), body.names[int(apart.argmax())]
-        yield Step("checking", idle=False)
+        yield Step("checking")
     if worst < _OFF:
-        return []
-    return [f"{where} is up to {100 * worst:.1f} cm off: constraints or locks keep bones from where they should be"]
+        return ()
+    return (f"{where} is up to {100 * worst:.1f} cm off: constraints or drivers keep bones from where they should be",)
 
 
 def _reset_unkeyed(armature: bpy.types.Object, keys: Sequence[Keys]) -> None:

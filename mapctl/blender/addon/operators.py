@@ -3,7 +3,6 @@
 # pyright: reportInvalidTypeForm=false
 
 import time
-from collections.abc import Callable
 
 import bpy
 
@@ -36,7 +35,10 @@ class JobOperator:
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """Return whether an armature is active and no job runs."""
-        return Report.step is None and context.object is not None and context.object.type == "ARMATURE"
+        if context.object is None or context.object.type != "ARMATURE" or context.object.mode not in ("OBJECT", "POSE"):
+            cls.poll_message_set("needs an active armature in Object or Pose Mode")  # pyright: ignore
+            return False
+        return Report.step is None
 
     def prepare(self, context: bpy.types.Context, at: jobs.Scene) -> jobs.Job:
         """Check what is asked for and begin the job; AddonError where it cannot be done."""
@@ -59,8 +61,10 @@ class JobOperator:
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         """Run the job beside the interface."""
-        if bpy.app.background:
-            return self.execute(context)
+        return self.execute(context) if bpy.app.background else self.start(context)
+
+    def start(self, context: bpy.types.Context) -> set[str]:
+        """Begin the job, with a timer that takes it on."""
         self._job = self._begin(context)
         Report.step = Step("starting")
         context.window_manager.progress_begin(0, 100)
@@ -76,10 +80,11 @@ class JobOperator:
             return {"CANCELLED"}
         if event.type != "TIMER":
             return {"PASS_THROUGH"} if event.type in _VIEW_EVENTS else {"RUNNING_MODAL"}
-        until = time.monotonic() + _SLICE
-        step = self._advance(self._job)
-        while step is not None and not step.idle and time.monotonic() < until:
-            step = self._advance(self._job)
+        try:
+            step = self._advance_for(self._job, _SLICE)
+        except BaseException:
+            self._leave(context)
+            raise
         if step is not None:
             Report.step = step
             _show(context, step)
@@ -101,7 +106,7 @@ class JobOperator:
 
     def _begin(self, context: bpy.types.Context) -> jobs.Job:
         """Begin the job; what is wrong comes out of its first step, so that it is told in one place."""
-        self._lines: tuple[str, ...] = ()
+        self._outcome = jobs.Outcome(())
         self._problem = ""
 
         def run() -> jobs.Job:
@@ -116,19 +121,27 @@ class JobOperator:
         try:
             return next(job)
         except StopIteration as end:
-            self._lines = tuple(end.value)
+            self._outcome = end.value
         except AddonError as problem:
             self._problem = str(problem)
         return None
 
+    def _advance_for(self, job: jobs.Job, seconds: float) -> Step | None:
+        """Take steps for a while, but no more once the job waits; None at the end."""
+        until = time.monotonic() + seconds
+        step = self._advance(job)
+        while step is not None and not step.idle and time.monotonic() < until:
+            step = self._advance(job)
+        return step
+
     def _conclude(self, context: bpy.types.Context) -> set[str]:
-        self._tell((self._problem,) if self._problem else self._lines, failed=bool(self._problem))
+        told = (self._problem,) if self._problem else (*self._outcome.warnings, *self._outcome.lines)
+        self._tell(told, failed=bool(self._problem))
         if self._problem:
             self.report({"ERROR"}, self._problem)
             return {"CANCELLED"}
-        for line in self._lines:
-            if " off: " in line or "not level" in line:
-                self.report({"WARNING"}, line)
+        for line in self._outcome.warnings:
+            self.report({"WARNING"}, line)
         self.report({"INFO"}, f"new action: {context.object.animation_data.action.name}")
         return {"FINISHED"}
 
@@ -172,7 +185,7 @@ class MAPCTL_OT_fill_gap(JobOperator, GapProperties, bpy.types.Operator):
         """Find the gap, and the joints if only some are asked for."""
         selected = [bone.name for bone in context.selected_pose_bones or ()] if self.selected else []
         joints = jobs.name_joints(at, selected) if self.selected else []
-        return jobs.fill_gap(at, find_frames(at, whole=True), range(self.first, self.last + 1), joints)
+        return jobs.fill_gap(at, find_frames(at), range(self.first, self.last + 1), joints)
 
 
 class MAPCTL_OT_in_between(JobOperator, BetweenProperties, bpy.types.Operator):
@@ -184,21 +197,16 @@ class MAPCTL_OT_in_between(JobOperator, BetweenProperties, bpy.types.Operator):
     def prepare(self, context: bpy.types.Context, at: jobs.Scene) -> jobs.Job:
         """Find the keyed frames."""
         keyed = [frame for frame, own in actions.list_keys(at.armature).items() if own]
-        return jobs.fill_between_keys(at, find_frames(at), keyed)
+        return jobs.fill_between_keys(at, keyed)
 
 
-def find_frames(at: jobs.Scene, *, whole: bool = False) -> range:
-    """Find the frames from the first to the last key of the action's bones, unless `whole` only those within the
-    preview range where there is one; AddonError for none."""
+def find_frames(at: jobs.Scene) -> range:
+    """Find the frames from the first to the last key of the action's bones; AddonError for fewer than two."""
     keyed = list(actions.list_keys(at.armature))
-    if not keyed:
-        raise AddonError(f"{actions.find_action(at.armature).name} has no keys of bones")
-    first, last = keyed[0], keyed[-1]
-    if at.scene.use_preview_range and not whole:
-        first, last = max(first, at.scene.frame_preview_start), min(last, at.scene.frame_preview_end)
-    if last <= first:
-        raise AddonError(f"the action has only frame {keyed[0]} within the preview range" if first > last else "the action has one keyed frame only")
-    return range(first, last + 1)
+    if len(keyed) < 2:
+        name = actions.find_action(at.armature).name
+        raise AddonError(f"{name} has keys of bones in {len(keyed)} frames: a motion has two or more")
+    return range(keyed[0], keyed[-1] + 1)
 
 
 def _show(context: bpy.types.Context, step: Step) -> None:
@@ -215,5 +223,4 @@ def _redraw(context: bpy.types.Context) -> None:
             area.tag_redraw()
 
 
-OPERATORS: tuple[type[JobOperator], ...] = (MAPCTL_OT_walk, MAPCTL_OT_clean_up, MAPCTL_OT_fill_gap, MAPCTL_OT_in_between)
-Advance = Callable[[jobs.Job], Step | None]
+OPERATORS = (MAPCTL_OT_walk, MAPCTL_OT_clean_up, MAPCTL_OT_fill_gap, MAPCTL_OT_in_between)

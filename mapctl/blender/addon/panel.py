@@ -5,6 +5,7 @@ import textwrap
 import bpy
 
 from .operators import MAPCTL_OT_clean_up, MAPCTL_OT_fill_gap, MAPCTL_OT_in_between, MAPCTL_OT_walk, Report
+from .settings import MAPCTL_OT_preview_gap
 
 _WIDTH = 44  # characters of a line of the panel, about
 
@@ -23,6 +24,7 @@ class MAPCTL_PT_sidebar(bpy.types.Panel):
         self._draw_job(MAPCTL_OT_walk, settings.walk, ("speed", "seconds", "gait", "style", "seed"))
         self._draw_job(MAPCTL_OT_clean_up, settings.clean_up, ("anchor",))
         self._draw_job(MAPCTL_OT_fill_gap, settings.gap, ("first", "last", "selected"))
+        self.layout.operator(MAPCTL_OT_preview_gap.bl_idname)
         self._draw_job(MAPCTL_OT_in_between, None, ())
         self._draw_report()
 

@@ -48,10 +48,14 @@ def pose_bones(armature: bpy.types.Object, body: Body, moved: np.ndarray, travel
 def _ask_blender(bone: bpy.types.Bone, poses: np.ndarray, parents: np.ndarray) -> np.ndarray:
     """Find what a bone is keyed with that does not simply follow its parent."""
     rest, above = bone.matrix_local, bone.parent.matrix_local
-    return np.array([
-        bone.convert_local_to_pose(Matrix(pose), rest, parent_matrix=Matrix(parent), parent_matrix_local=above, invert=True)
-        for pose, parent in zip(poses, parents, strict=True)
-    ])
+    return np.array(
+        [
+            bone.convert_local_to_pose(
+                Matrix(pose), rest, parent_matrix=Matrix(parent), parent_matrix_local=above, invert=True
+            )
+            for pose, parent in zip(poses, parents, strict=True)
+        ]
+    )
 
 
 def solve_controls(

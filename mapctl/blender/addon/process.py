@@ -111,7 +111,9 @@ class Process:
         for thread in self._threads:
             thread.join()
         if self._process.wait() != 0:
-            said = [line for line in self.errors if line.strip()] or [f"it ended with status {self._process.returncode}"]
+            said = [line for line in self.errors if line.strip()] or [
+                f"it ended with status {self._process.returncode}"
+            ]
             own = [line for line in said if line.startswith("mapctl: ")]
             raise AddonError((own or said)[-1].removeprefix("mapctl: "))
 

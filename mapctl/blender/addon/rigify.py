@@ -82,7 +82,9 @@ def take_controls(armature: bpy.types.Object, scene: bpy.types.Scene) -> Body:
     missing = [name for joint, shown, _, control in rows for name in (f"DEF-{joint}", shown, control)]
     missing = [name for name in missing if name not in bones]
     if missing:
-        raise AddonError(f"{armature.name}: only rigs of Rigify's human metarigs are known, and {missing[0]} is missing")
+        raise AddonError(
+            f"{armature.name}: only rigs of Rigify's human metarigs are known, and {missing[0]} is missing"
+        )
     number = {joint: place for place, (joint, *_) in enumerate(rows)}
     shown = [row[1] for row in rows]
     return Body(

@@ -39,7 +39,9 @@ def sample_motion(
     basis = orthonormalise(worlds[:, None, :3, :3])
     rotations = basis @ orthonormalise(moved[..., :3, :3]) @ transpose(orthonormalise(body.frame[:3, :3]))
     places = np.einsum("fjab,jb->fja", worlds[:, None] @ moved, add_one(body.heads))[..., :3]
-    return WorldMotion(body.names, body.parents, body.to_world(body.heads), measure_fps(scene), rotations, places), worlds
+    return WorldMotion(
+        body.names, body.parents, body.to_world(body.heads), measure_fps(scene), rotations, places
+    ), worlds
 
 
 def sample_worlds(

@@ -80,6 +80,25 @@ class MAPCTL_OT_find(bpy.types.Operator):
         return {"FINISHED"}
 
 
+class MAPCTL_OT_preview_gap(bpy.types.Operator):
+    """Take the preview range as the gap"""
+
+    bl_idname = "mapctl.preview_gap"
+    bl_label = "Gap from Preview Range"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's own way
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Return whether there is a preview range."""
+        return context.scene.use_preview_range
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Take it."""
+        gap = context.scene.mapctl.gap
+        gap.first, gap.last = context.scene.frame_preview_start, context.scene.frame_preview_end
+        return {"FINISHED"}
+
+
 class MAPCTL_AP_preferences(bpy.types.AddonPreferences):
     """Preferences of the add-on."""
 
@@ -108,5 +127,6 @@ CLASSES = (
     MAPCTL_PG_gap,
     MAPCTL_PG_settings,
     MAPCTL_OT_find,
+    MAPCTL_OT_preview_gap,
     MAPCTL_AP_preferences,
 )
