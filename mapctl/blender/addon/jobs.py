@@ -13,15 +13,10 @@ from . import actions, exchange, rigify
 from .body import Body, take_bones
 from .drawn_curve import measure_height, sample_curve, write_curve
 from .exchange import WorldMotion
-from .posing import Keys, list_channels, place_joints, pose_bones, solve_controls
+from .making import Result, Scene, make_action, restored_scene
 from .problem import AddonError, Step
 from .process import run_command
-from .sampling import measure_fps, read_poses, sample_motion, sample_worlds, take_rest, to_armature
-
-_WALK_FPS = 30
-_PROBES = 24  # frames in which the result is compared with what was wanted
-_OFF = 0.001  # metres from which on bones that do not follow are told
-_NEEDLESS = ("hips", "chest", "spine_fk.001")  # controls of a generated rig that a new action leaves alone
+from .sampling import measure_fps, sample_motion, sample_worlds, take_rest, to_armature
 
 
 @dataclass(frozen=True)
@@ -53,84 +48,52 @@ class WalkOptions:
     seed: int = 0
     """Seed of everything random."""
 
-    def list_words(self, fps: str) -> list[str]:
+    def list_words(self, fps: float) -> list[str]:
         """List the words of `mapctl follow`."""
         words = ["--seed", str(self.seed)]
         for name, value in (("--speed", self.speed), ("--seconds", self.seconds)):
             words += [name, f"{value:.6g}"] if value > 0 else []
         for name, value in (("--gait", self.gait), ("--style", self.style)):
             words += [name, value] if value else []
-        return words + (["--fps", fps] if self.gait or self.style else [])
-
-
-@dataclass(frozen=True, eq=False)
-class Scene:
-    """What a job works on."""
-
-    scene: bpy.types.Scene
-    """The scene, whose frame rate and frames count."""
-    armature: bpy.types.Object
-    """The character."""
-    command: tuple[str, ...]
-    """Words that start mapctl."""
-
-
-@dataclass(frozen=True, eq=False)
-class Result:
-    """A motion that an action is to be made of."""
-
-    body: Body
-    """The character's joints."""
-    frames: range
-    """Frames of the scene."""
-    moved: np.ndarray
-    """What moves the joints from their rest in the armature's space, (frames, joints, 4, 4)."""
-    travelling: frozenset[int]
-    """Joints that travel within their parent."""
-    made: np.ndarray
-    """Which frames have generated keys, (frames,)."""
-    name: str
-    """Name of the new action."""
-    fresh: bool
-    """Whether the action is empty at first, not a copy of the one before."""
+        return words + (["--fps", f"{fps:.9g}"] if self.gait or self.style else [])
 
 
 def walk_along(at: Scene, drawn: bpy.types.Object, options: WalkOptions) -> Job:
     """Let the character walk along a curve, from the scene's first frame on."""
     body, points = take_body(at), sample_curve(drawn, at.scene)
     height, level = measure_height(points)
-    fps = measure_fps(at.scene)
-    with _temporary_folder() as folder:
-        exchange.write(take_rest(body, fps), folder / "character.npz", _place_ends(body), frozenset())
-        write_curve(points, folder / "curve.csv")
-        words = [
-            "follow",
-            "curve.csv",
-            "--rig",
-            "character.npz",
-            "-o",
-            "walk.npz",
-            *options.list_words(str(float(fps))),
-        ]
-        lines = yield from run_command([*at.command, *words], folder, "walking")
-        made, travelling = exchange.read(folder / "walk.npz")
-        if made.fps != fps:
-            words = ["convert", "walk.npz", "resampled.npz", "--fps", str(fps)]
-            yield from run_command([*at.command, *words], folder, "resampling")
-            made, travelling = exchange.read(folder / "resampled.npz")
-    made = replace(made, positions=made.positions + (0.0, height, 0.0))
+    made, travelling, lines = yield from _ask_for_walk(at, body, points, options)
+    made = replace(made, positions=made.positions + np.array([0.0, height, 0.0]))
     first = at.scene.frame_preview_start if at.scene.use_preview_range else at.scene.frame_start
     frames = range(first, first + len(made.positions))
-    with _restored_scene(at):
+    with restored_scene(at):
         worlds = yield from sample_worlds(at.armature, at.scene, frames)
         moved = to_armature(made, body, worlds)
         plain = np.zeros(len(frames), dtype=bool)
         name = f"{at.armature.name} along {drawn.name}"
-        warnings = yield from _make_action(at, Result(body, frames, moved, travelling, plain, name, fresh=True))
+        warnings = yield from make_action(at, Result(body, frames, moved, travelling, plain, name, fresh=True))
     at.scene.frame_end = max(at.scene.frame_end, frames.stop - 1)
     if not level:
         warnings = (*warnings, f"{drawn.name} is not level: the character walks at its median height")
     return Outcome(_shorten(lines), warnings)
+
+
+def _ask_for_walk(
+    at: Scene, body: Body, points: np.ndarray, options: WalkOptions
+) -> Generator[Step, None, tuple[WorldMotion, frozenset[int], list[str]]]:
+    """Ask mapctl for the walk, at the scene's frame rate; also return which joints travel, and what it said."""
+    fps = measure_fps(at.scene)
+    with _temporary_folder() as folder:
+        exchange.write(take_rest(body, fps), folder / "character.npz", _place_ends(body), frozenset())
+        write_curve(points, folder / "curve.csv")
+        words = ["follow", "curve.csv", "--rig", "character.npz", "-o", "walk.npz", *options.list_words(float(fps))]
+        lines = yield from run_command([*at.command, *words], folder, "walking")
+        made, travelling = exchange.read(folder / "walk.npz")
+        if made.fps != fps:  # resampling takes a moment, solving at another rate than the priors' takes long
+            words = ["convert", "walk.npz", "resampled.npz", "--fps", str(fps)]
+            yield from run_command([*at.command, *words], folder, "resampling")
+            made, travelling = exchange.read(folder / "resampled.npz")
+    return made, travelling, lines
 
 
 def clean_up(at: Scene, frames: range, *, anchor: bool) -> Job:
@@ -143,9 +106,8 @@ def clean_up(at: Scene, frames: range, *, anchor: bool) -> Job:
 def fill_gap(at: Scene, frames: range, gap: range, joints: Sequence[str]) -> Job:
     """Fill a gap in these frames, of some joints or of all."""
     if not (gap and frames.start <= gap.start and gap.stop <= frames.stop):
-        raise AddonError(
-            f"the gap {gap.start} to {gap.stop - 1} is not within the action's frames {frames.start} to {frames.stop - 1}"
-        )
+        asked, own = (f"{each.start} to {each.stop - 1}" for each in (gap, frames))
+        raise AddonError(f"the gap {asked} is not within the action's frames {own}")
     words = ["infill", "IN", "-o", "OUT", "--gap", f"{gap.start - frames.start}:{gap.stop - frames.start}"]
     words += ["--joints", ",".join(joints)] if joints else []
     made = np.array([frame in gap for frame in frames])
@@ -191,7 +153,7 @@ def name_joints(at: Scene, bones: Sequence[str]) -> list[str]:
 def _edit(at: Scene, frames: range, words: Sequence[str], made: np.ndarray, suffix: str, label: str) -> Job:
     """Send the action to a command of mapctl, and make a new one of what comes back."""
     body, old = take_body(at), actions.find_action(at.armature)
-    with _restored_scene(at), _temporary_folder() as folder:
+    with restored_scene(at), _temporary_folder() as folder:
         motion, worlds = yield from sample_motion(at.armature, body, at.scene, frames)
         exchange.write(motion, folder / "given.npz", _place_ends(body), body.movable)
         names = {"IN": "given.npz", "OUT": "made.npz"}
@@ -204,7 +166,7 @@ def _edit(at: Scene, frames: range, words: Sequence[str], made: np.ndarray, suff
         _check_length(answer, frames)
         moved = to_armature(answer, body, worlds)
         name = f"{old.name} {suffix}"
-        warnings = yield from _make_action(at, Result(body, frames, moved, travelling, made, name, fresh=False))
+        warnings = yield from make_action(at, Result(body, frames, moved, travelling, made, name, fresh=False))
     return Outcome(_shorten(lines), warnings)
 
 
@@ -218,66 +180,6 @@ def _check_length(motion: WorldMotion, frames: range) -> None:
         raise AddonError(f"mapctl answered with {len(motion.positions)} frames where {len(frames)} were asked for")
 
 
-def _make_action(at: Scene, result: Result) -> Generator[Step, None, tuple[str, ...]]:
-    """Make an action of a result; the one before is kept by a fake user. Ended early it leaves no trace."""
-    with _restored_pose(at):
-        if result.fresh:
-            actions.add_action(at.armature, result.name)
-        else:
-            actions.copy_action(at.armature, result.name)
-        keys = yield from _find_keys(at, result)
-        for channel in list_channels(at.armature, keys):
-            actions.write_channel(at.armature, channel, result.frames, result.made)
-        _reset_unkeyed(at.armature, keys)
-        return (yield from _compare(at, result))
-
-
-def _find_keys(at: Scene, result: Result) -> Generator[Step, None, list[Keys]]:
-    """Find what bones or controls are keyed with, and take their keys of before out of the action."""
-    body = result.body
-    if not body.controls:
-        actions.clear_bones(at.armature, body.bones)
-        return pose_bones(at.armature, body, result.moved, result.travelling)
-    actions.clear_bones(at.armature, [control.bone for control in body.controls])
-    for path, value in body.switches.items():
-        actions.set_constant(at.armature, path, value, result.frames.start)
-    if result.fresh:
-        _reset_needless(at.armature)
-    return (yield from solve_controls(at.armature, body, at.scene, result.frames, result.moved))
-
-
-def _compare(at: Scene, result: Result) -> Generator[Step, None, tuple[str, ...]]:
-    """Compare what Blender makes of the action with what was wanted; return what is wrong with it."""
-    body, scale = result.body, np.linalg.norm(result.body.frame[:3, 0])
-    worst, where = 0.0, ""
-    for number in np.unique(np.linspace(0, len(result.frames) - 1, _PROBES).astype(int)):
-        at.scene.frame_set(result.frames[number])
-        actual = read_poses(at.armature, body.bones) @ np.linalg.inv(body.rests)
-        apart = np.linalg.norm(place_joints(body, actual) - place_joints(body, result.moved[number]), axis=-1) * scale
-        if apart.max() > worst:
-            worst, where = float(apart.max()), body.names[int(apart.argmax())]
-        yield Step("checking")
-    if worst < _OFF:
-        return ()
-    return (f"{where} is up to {100 * worst:.1f} cm off: constraints or drivers keep bones from where they should be",)
-
-
-def _reset_unkeyed(armature: bpy.types.Object, keys: Sequence[Keys]) -> None:
-    """Reset what else a keyed bone's place and scale were set to."""
-    for each in keys:
-        bone = armature.pose.bones[each.bone]
-        bone.scale = (1.0, 1.0, 1.0)
-        if not each.travels:
-            bone.location = (0.0, 0.0, 0.0)
-
-
-def _reset_needless(armature: bpy.types.Object) -> None:
-    """Reset the controls that would bend a generated rig beside those that are keyed."""
-    for bone in armature.pose.bones:
-        if bone.name in _NEEDLESS or "tweak" in bone.name:
-            bone.matrix_basis.identity()
-
-
 def _place_ends(body: Body) -> dict[str, np.ndarray]:
     return {name: body.to_world(tail) for name, tail in body.ends.items()}
 
@@ -286,34 +188,3 @@ def _place_ends(body: Body) -> dict[str, np.ndarray]:
 def _temporary_folder() -> Iterator[Path]:
     with tempfile.TemporaryDirectory(prefix="mapctl-") as folder:
         yield Path(folder)
-
-
-@contextmanager
-def _restored_scene(at: Scene) -> Iterator[None]:
-    """Go back to the frame of before at the end."""
-    frame, subframe = at.scene.frame_current, at.scene.frame_subframe
-    try:
-        yield
-    finally:
-        at.scene.frame_set(frame, subframe=subframe)
-
-
-@contextmanager
-def _restored_pose(at: Scene) -> Iterator[None]:
-    """Keep the old action by a fake user at the end; go back to it, and to the pose, if the block ends early."""
-    armature = at.armature
-    before = {bone.name: bone.matrix_basis.copy() for bone in armature.pose.bones}
-    data = armature.animation_data
-    old, slot = (data.action, actions.name_slot(armature)) if data else (None, "")
-    known = set(bpy.data.actions)
-    try:
-        yield
-    except BaseException:
-        actions.assign_action(armature, old, slot)
-        for made in set(bpy.data.actions) - known:
-            bpy.data.actions.remove(made)
-        for name, basis in before.items():
-            armature.pose.bones[name].matrix_basis = basis
-        raise
-    if old is not None:
-        old.use_fake_user = True

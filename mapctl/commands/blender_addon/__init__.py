@@ -11,7 +11,7 @@ from mapctl.commands.shared.command import Command
 
 @dataclass(frozen=True)
 class BlenderAddon(Command):
-    """Write the add-on for Blender 4.2 and later, to be installed there by Preferences > Add-ons > Install from Disk."""
+    """Write the add-on for Blender 4.2 and later, installed there by Preferences > Add-ons > Install from Disk."""
 
     single_thread: ClassVar[bool] = False
 

@@ -1,0 +1,43 @@
+"""The add-on on an empty stage, for scripts that run in Blender: `python SCRIPT FOLDER PYTHON ...`."""
+
+import json
+import sys
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+FOLDER, PYTHON = Path(sys.argv[1]), sys.argv[2]
+SCRIPTS = Path(__file__).resolve().parent
+ADDON = "bl_ext.user_default.mapctl"
+
+
+def install() -> None:
+    """Install the zip as users do, and clear the scene."""
+    bpy.ops.extensions.package_install_files(
+        filepath=str(FOLDER / "addon.zip"), repo="user_default", enable_on_install=True
+    )
+    for each in list(bpy.data.objects):
+        bpy.data.objects.remove(each)
+
+
+def set_command(*words: object) -> None:
+    """Set the preference: the words that start mapctl."""
+    bpy.context.preferences.addons[ADDON].preferences.command = " ".join(map(str, words))
+
+
+def module(name: str):
+    """A module of the add-on as it is installed."""
+    return sys.modules[f"{ADDON}.{name}"]
+
+
+def told() -> tuple[str, ...]:
+    """What the panel tells."""
+    return tuple(module("operators").Report.lines)
+
+
+def finish(facts: dict, arrays: dict | None = None) -> None:
+    """Hand the results on."""
+    (FOLDER / "facts.json").write_text(json.dumps(facts))
+    if arrays is not None:
+        np.savez(FOLDER / "arrays.npz", **arrays)
