@@ -1,4 +1,4 @@
-"""Blender for the tests of the add-on: its own Python with the wheel `bpy`, apart from this one, and what is run there."""
+"""Blender for the tests of the add-on: a Python of its own with the wheel `bpy`, and what is run there."""
 
 import json
 import os

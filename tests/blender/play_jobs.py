@@ -1,16 +1,17 @@
 """All four operators on one armature: walk, shake and clean up, fill a gap, thin to a few keys and in-between them.
 
-python play_jobs.py FOLDER PYTHON KIND MODELS FPS
+python play_jobs.py FOLDER PYTHON KIND MODELS FPS STAGES: the operators are run in turn, so many of the stages.
 """
 
 import sys
+from itertools import pairwise
 
 import armatures
 import bpy
 import numpy as np
 import stage
 
-KIND, MODELS, FPS = sys.argv[3:6]
+KIND, MODELS, FPS, STAGES = sys.argv[3:7]
 MAKERS = {
     "mixamo": lambda: armatures.add_mixamo(imported=False),
     "imported": lambda: armatures.add_mixamo(imported=True),
@@ -43,7 +44,7 @@ def main() -> None:
         "again": bpy.ops.mapctl.in_between,
     }
     before = {"clean": lambda: armatures.add_noise(armature, 3.0), "tweened": lambda: thin(armature)}
-    for name, run in stages.items():
+    for name, run in list(stages.items())[: int(STAGES)]:
         before.get(name, lambda: None)()
         joints = names_of(armature)
         arrays[f"{name} before"] = armatures.joints_of(armature, joints, FRAMES) if name != "walk" else np.zeros(0)
@@ -88,7 +89,7 @@ def describe(armature) -> dict:
     """What its action is like: its name, the greatest step of an angle, keyed bones, and the kinds of its keys."""
     curves = armatures.curves_of(armature)
     steps = [
-        max((abs(b.co[1] - a.co[1]) for a, b in zip(points, points[1:], strict=False)), default=0.0)
+        max((abs(b.co[1] - a.co[1]) for a, b in pairwise(points)), default=0.0)
         for points in (list(curve.keyframe_points) for curve in curves if "rotation" in curve.data_path)
     ]
     turned = next(curve for curve in curves if "rotation" in curve.data_path)
