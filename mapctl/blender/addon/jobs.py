@@ -154,7 +154,8 @@ def _edit(at: Scene, frames: range, words: Sequence[str], made: np.ndarray, suff
     """Send the action to a command of mapctl, and make a new one of what comes back."""
     body, old = take_body(at), actions.find_action(at.armature)
     with restored_scene(at), _temporary_folder() as folder:
-        motion, worlds = yield from sample_motion(at.armature, body, at.scene, frames)
+        with rigify.keep_lengths(at.armature):
+            motion, worlds = yield from sample_motion(at.armature, body, at.scene, frames)
         exchange.write(motion, folder / "given.npz", _place_ends(body), body.movable)
         names = {"IN": "given.npz", "OUT": "made.npz"}
         rig = []
@@ -167,7 +168,8 @@ def _edit(at: Scene, frames: range, words: Sequence[str], made: np.ndarray, suff
         moved = to_armature(answer, body, worlds)
         name = f"{old.name} {suffix}"
         warnings = yield from make_action(at, Result(body, frames, moved, travelling, made, name, fresh=False))
-    return Outcome(_shorten(lines), warnings)
+    counted = f"frame 0 of what mapctl says is frame {frames.start} of the scene"
+    return Outcome((counted, *_shorten(lines)), warnings)
 
 
 def _shorten(lines: Sequence[str]) -> tuple[str, ...]:

@@ -5,6 +5,7 @@ bends from there to the hips and the upper spine to the chest.
 """
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 
 import bpy
 import numpy as np
@@ -99,6 +100,19 @@ def take_controls(armature: bpy.types.Object, scene: bpy.types.Scene) -> Body:
         switches={f'pose.bones["{bone.name}"]["{_SWITCH}"]': 1.0 for bone in armature.pose.bones if _SWITCH in bone},
         rig_toml=describe_names(tuple(names), "DEF-"),
     )
+
+
+@contextmanager
+def keep_lengths(armature: bpy.types.Object) -> Iterator[None]:
+    """Let limbs keep their lengths within, where inverse kinematics would stretch and squeeze them."""
+    before = {bone.name: bone.ik_stretch for bone in armature.pose.bones if bone.ik_stretch > 0}
+    try:
+        for name in before:
+            armature.pose.bones[name].ik_stretch = 0.0
+        yield
+    finally:
+        for name, value in before.items():
+            armature.pose.bones[name].ik_stretch = value
 
 
 def _list_rows(bones: bpy.types.bpy_prop_collection) -> Iterator[tuple[str, str, str | None, str]]:

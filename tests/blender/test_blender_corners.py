@@ -1,0 +1,159 @@
+"""The add-on in Blender: armatures of every kind come back as they were, errors are told, Esc and undo leave no trace."""
+
+import numpy as np
+import pytest
+from blender_session import needs_blender, run_in_blender
+
+from mapctl.blender.archive import build_addon_zip
+
+pytestmark = needs_blender
+
+CLOSE = 2e-6  # metres
+
+
+@pytest.fixture(scope="module")
+def facts(tmp_path_factory) -> dict:
+    """What was seen in Blender."""
+    folder = tmp_path_factory.mktemp("corners")
+    (folder / "addon.zip").write_bytes(build_addon_zip())
+    return run_in_blender("play_corners.py", folder)[0]
+
+
+@pytest.mark.parametrize(
+    "kind", ["imported", "object that is animated too", "scene in centimetres", "bones that do not follow"]
+)
+def test_armatures_come_back_as_they_were(facts, kind):
+    assert facts["apart"][kind] < CLOSE
+
+
+def test_other_curves_stay(facts):
+    root = 'pose.bones["mixamorig:Hips"]'
+    assert facts["other curves"] == ["location", f"{root}.location", f'{root}["mood"]']
+
+
+def test_bones_that_travel_keep_their_places(facts):
+    assert not facts["connected"]
+    assert facts["travelling"] == ["mixamorig:Hips", "mixamorig:LeftUpLeg"]
+
+
+def test_what_constraints_keep_from_its_place_is_told(facts):
+    assert facts["apart"]["arm that is stretched"] > 0.01
+    assert "LeftHand" in facts["stretched told"][0] or "LeftForeArm" in facts["stretched told"][0]
+    assert " cm off: constraints" in facts["stretched told"][0]
+
+
+def test_rigs_animated_by_ik_keep_hands_and_feet_where_they_were(facts):
+    assert facts["apart"]["hands and feet by IK"] < 2e-4
+    assert facts["apart"]["generated rig by IK"] < 0.03, "elbows and knees: limbs are no longer squeezed"
+    assert facts["turned"] < 1e-3
+    assert facts["stretch is back"] == pytest.approx(0.1)
+
+
+def test_walk_is_asked_for_as_the_options_say(facts):
+    words = ["follow", "curve.csv", "--rig", "character.npz", "-o", "walk.npz", "--seed", "3"]
+    wishes = ["--speed", "1.5", "--seconds", "2.5", "--style", "proud", "--fps", "30"]
+    assert facts["words"] == words + wishes
+
+
+def test_curves_are_sampled_in_the_world(facts):
+    points = np.array([line.split(",") for line in facts["curve"].split()[1:]], dtype=float)
+    assert facts["curve"].startswith("x,z\n")
+    assert points[0].tolist() == points[-1].tolist(), "a cyclic curve ends where it begins"
+    for knot in facts["knots"]:
+        assert np.linalg.norm(points - knot, axis=1).min() < 1e-5
+
+
+def test_walk_begins_where_the_preview_does_and_is_the_worlds(facts):
+    assert facts["range"] == [5.0, 16.0]
+    rng = np.random.default_rng(0)  # as in stub.py
+    rng.normal(size=(12, 27, 4))
+    wanted = rng.normal(size=(12, 3)) + np.array([0, 0.4, 0])
+    assert np.abs(np.array(facts["root"]) - wanted).max() < CLOSE
+
+
+def test_all_is_undone_in_one_step(facts):
+    assert facts["undone"] == [True, ["holderAction"], 1]
+
+
+ERRORS = {
+    "program that is not there": "/nowhere/mapctl: no such program; set mapctl's path in Edit > Preferences",
+    "program that is another": "does not answer like mapctl",
+    "program that is old": "mapctl 0.0.9 is too old, 0.1.0 or later is needed: pip install --upgrade mapctl",
+    "no curve": "select the armature and one curve; 0 curves are selected",
+    "curve of two splines": "has 2 splines",
+    "no action": "mixamo has no action",
+    "no action to in-between": "mixamo has no action",
+    "one key": "has keys of bones in 1 frames",
+    "one key to in-between": "keys in fewer than two frames",
+    "keys in every frame": "every frame from 3 to 4 has keys",
+    "gap that is outside": "the gap 8 to 13 is not within the action's frames 1 to 12",
+    "gap that is empty": "the gap 8 to 7",
+    "no bones selected": "no selected bone is a joint",
+    "rest position": "shows its rest position",
+    "uneven scale": "mixamo is scaled unevenly: apply its scale",
+    "mirrored": "mixamo is mirrored by a negative scale: apply its scale",
+    "mapctl's own": "nobody walks here",
+    "mapctl that crashes": "Segmentation fault",
+    "generated rig of another kind": "upper_arm_fk.L",
+}
+
+
+def test_every_error_is_looked_at(facts):
+    assert facts["errors"].keys() == ERRORS.keys()
+
+
+@pytest.mark.parametrize("name", ERRORS)
+def test_errors_are_told_and_nothing_is_changed(facts, name):
+    told, changed = facts["errors"][name]
+    assert ERRORS[name] in told
+    assert "\n" not in told
+    assert changed == "unchanged"
+
+
+def test_buttons_are_grey_without_an_armature_and_while_a_job_runs(facts):
+    assert facts["poll"] == [False, False]
+    assert facts["poll while one runs"] is False
+
+
+def test_selected_bones_alone_are_filled(facts):
+    assert facts["gap words"][4:] == ["--gap", "3:7", "--joints", "mixamorig:LeftArm,mixamorig:LeftHand"]
+
+
+def test_progress_is_shown(facts):
+    assert {"reading the action 8 %", "cleaning up", "walking 25 %"} <= set(facts["steps"])
+    assert facts["panel while it runs"][-2:] == ["walking 25 %", "Esc to cancel"]
+
+
+def test_only_the_view_can_be_used_while_a_job_runs(facts):
+    assert facts["keys are held"] == ["RUNNING_MODAL"]
+    assert facts["view is free"] == ["PASS_THROUGH"]
+
+
+def test_esc_ends_the_process_and_leaves_no_trace(facts):
+    cancelled = facts["cancelled"]
+    assert cancelled["notes"] == ["begin", "handler", "timer", "end", None]
+    assert cancelled["told"] == ["cancelled: nothing was changed"]
+    assert [cancelled[name] for name in ("ended", "folder", "unchanged", "step")] == [True, False, True, True]
+
+
+def test_jobs_end_by_themselves_in_the_interface(facts):
+    answer, told, notes = facts["modal end"]
+    assert answer == ["FINISHED"]
+    assert told == [[["INFO"], "new action: mixamoAction clean"]]
+    assert notes == ["timer", "end", None]
+    assert facts["modal failure"] == [["CANCELLED"], [[["ERROR"], "nobody walks here"]]]
+    assert facts["panel after a failure"][-1] == "nobody walks here"
+
+
+def test_panel_has_every_operator(facts):
+    operators = [f"mapctl.{name}" for name in ("walk", "clean_up", "fill_gap", "preview_gap", "in_between")]
+    assert [name for name in facts["panel"] if name.startswith("mapctl.")] == operators
+
+
+def test_gap_is_taken_from_the_preview_range(facts):
+    assert facts["gap"] == [20, 31]
+
+
+def test_addon_goes_and_comes(facts):
+    assert facts["gone"]
+    assert facts["back"]
