@@ -4,6 +4,7 @@ python play_corners.py FOLDER PYTHON
 """
 
 import os
+import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -431,6 +432,13 @@ def draw_panel() -> list[str]:
     return drawn
 
 
+def check_manifest() -> str:
+    """What Blender's own tool says of the zip."""
+    tool = Path(bpy.utils.system_resource("SCRIPTS")) / "addons_core" / "bl_pkg" / "cli" / "blender_ext.py"
+    command = [sys.executable, str(tool), "validate", str(stage.FOLDER / "addon.zip")]
+    return subprocess.run(command, capture_output=True, text=True).stdout
+
+
 def play_settings() -> None:
     """Options are the scene's, and the gap is taken from the preview range; the add-on goes and comes."""
     scene = bpy.context.scene
@@ -439,6 +447,7 @@ def play_settings() -> None:
     facts["gap"] = [scene.mapctl.gap.first, scene.mapctl.gap.last]
     facts["panel"] = draw_panel()
     bpy.ops.preferences.addon_disable(module=stage.ADDON)
+    facts["manifest"] = check_manifest()
     facts["gone"] = not hasattr(bpy.types.Scene, "mapctl")
     bpy.ops.preferences.addon_enable(module=stage.ADDON)
     facts["back"] = hasattr(bpy.types.Scene, "mapctl")

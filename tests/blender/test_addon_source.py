@@ -45,8 +45,6 @@ def test_zip_holds_the_source_and_a_manifest_of_this_version():
     assert manifest["version"] == __version__
     assert manifest["blender_version_min"] == "4.2.0"
     assert {"schema_version", "id", "name", "tagline", "maintainer", "type", "license"} <= manifest.keys()
-    assert len(manifest["tagline"]) <= 64
-    assert not manifest["tagline"].endswith(".")
 
 
 def test_zip_is_the_same_each_time():
@@ -101,10 +99,10 @@ def test_nearest_rotations_leave_scale_out(source):
 
 def test_signs_are_joined(source):
     angles = np.linspace(0, 4 * np.pi, 60)
-    quats = Rotation.from_rotvec(np.stack([angles, 0 * angles, 0 * angles], axis=1)).as_quat()
-    joined = source("rotations").join_signs(quats)
-    assert np.abs(np.diff(joined, axis=0)).max() < 0.2
+    turns = Rotation.from_rotvec(np.stack([angles, 0 * angles, 0 * angles], axis=1))
+    quats = source("rotations").to_quaternions(turns.as_matrix())
     assert np.abs(np.diff(quats, axis=0)).max() > 1
+    assert np.abs(np.diff(source("rotations").join_signs(quats), axis=0)).max() < 0.2
 
 
 @pytest.mark.parametrize("motion", [walk(20), random_motion(CANONICAL, 7, seed=3, fps=Fraction(24000, 1001))])
@@ -166,7 +164,7 @@ def test_mapctl_is_found_by_path_by_preference_and_by_python(source, tmp_path, m
     monkeypatch.setenv("PATH", str(found))
     with pytest.raises(source("problem").AddonError, match="was not found: pip install mapctl"):
         process.find_command("")
-    (found / "python3").write_text(f'#!/bin/sh\n[ "$1 $2 $3" = "-m mapctl --version" ] && echo mapctl 0.1.0\n')
+    (found / "python3").write_text('#!/bin/sh\n[ "$1 $2 $3" = "-m mapctl --version" ] && echo mapctl 0.1.0\n')
     (found / "python3").chmod(0o755)
     assert process.find_command("") == (str(found / "python3"), "-m", "mapctl")
     (found / "mapctl").symlink_to(program)
@@ -184,15 +182,18 @@ def test_this_version_is_accepted(source):
 
 
 def test_progress_and_errors_are_told_apart(source, tmp_path):
-    script = "import sys; print('progress 1/4 walking', file=sys.stderr, flush=True); print('mapctl: no', file=sys.stderr); sys.exit(2)"
+    script = "import sys\nprint('progress 1/4 walking', file=sys.stderr)\nsys.exit('mapctl: no')"
     steps = source("process").run_command((sys.executable, "-c", script), tmp_path, "walking")
-    with pytest.raises(source("problem").AddonError, match="^no$"):
+    with pytest.raises(source("problem").AddonError, match=r"^no$"):
         list(steps)
 
 
 def test_lines_of_progress_are_what_the_addon_reads(source, tmp_path, monkeypatch):
     process = source("process")
-    script = "from mapctl.commands.shared.progress_bar import show_progress\nwith show_progress('walking', quiet=True) as p:\n    p(3, 12)\n    input()"
+    script = (
+        "from mapctl.commands.shared.progress_bar import show_progress\n"
+        "with show_progress('walking', quiet=True) as progress: progress(3, 12)"
+    )
     running = process.Process((sys.executable, "-c", script), tmp_path)
     for thread in running._threads:
         thread.join()

@@ -1,4 +1,4 @@
-"""The add-on in Blender: armatures of every kind come back as they were, errors are told, Esc and undo leave no trace."""
+"""The add-on in Blender: any armature comes back as it was, errors are told, Esc and undo leave no trace."""
 
 import numpy as np
 import pytest
@@ -37,9 +37,10 @@ def test_bones_that_travel_keep_their_places(facts):
 
 
 def test_what_constraints_keep_from_its_place_is_told(facts):
-    assert facts["apart"]["arm that is stretched"] > 0.01
-    assert "LeftHand" in facts["stretched told"][0] or "LeftForeArm" in facts["stretched told"][0]
+    assert facts["apart"]["arm that is stretched"] < CLOSE, "constraints still hold"
+    assert "mixamorig:Left" in facts["stretched told"][0]
     assert " cm off: constraints" in facts["stretched told"][0]
+    assert facts["stretched told"][1:] == ["frame 0 of what mapctl says is frame 1 of the scene", "echoed"]
 
 
 def test_rigs_animated_by_ik_keep_hands_and_feet_where_they_were(facts):
@@ -152,6 +153,11 @@ def test_panel_has_every_operator(facts):
 
 def test_gap_is_taken_from_the_preview_range(facts):
     assert facts["gap"] == [20, 31]
+
+
+def test_blender_accepts_the_manifest(facts):
+    assert "Success" in facts["manifest"]
+    assert "ERROR" not in facts["manifest"]
 
 
 def test_addon_goes_and_comes(facts):
