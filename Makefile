@@ -2,6 +2,7 @@
 VENV := .venv/bin
 READY := .venv/.ready
 BROWSER := .venv/.browser
+BLENDER := .venv/.blender
 
 .PHONY: help setup demo test test-all bench check clean
 
@@ -24,6 +25,10 @@ $(BROWSER): $(READY)
 	@.ci/setup browser
 	@touch $@
 
+$(BLENDER): $(READY)
+	@.ci/setup blender
+	@touch $@
+
 demo: $(READY)
 	$(VENV)/mapctl demo -o demo-out
 
@@ -37,10 +42,10 @@ unexport PYTHONDONTWRITEBYTECODE
 # A file's tests stay together: they share what is costly to make. Tests run in as many processes as there are WORKERS.
 WORKERS := 2
 
-test: $(READY) $(BROWSER)
+test: $(READY) $(BROWSER) $(BLENDER)
 	$(VENV)/python -m pytest -m "not slow" -n $(WORKERS) --dist loadfile
 
-test-all: $(READY) $(BROWSER)
+test-all: $(READY) $(BROWSER) $(BLENDER)
 	$(VENV)/python -m pytest
 
 bench: $(READY)

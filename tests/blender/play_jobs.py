@@ -86,18 +86,19 @@ def thin(armature) -> None:
 
 
 def describe(armature) -> dict:
-    """What its action is like: its name, the greatest step of an angle, keyed bones, and the kinds of its keys."""
+    """What its action is like: its name, the greatest step of each kind of curve, keyed bones, and the kinds of its keys."""
     curves = armatures.curves_of(armature)
-    steps = [
-        max((abs(b.co[1] - a.co[1]) for a, b in pairwise(points)), default=0.0)
-        for points in (list(curve.keyframe_points) for curve in curves if "rotation" in curve.data_path)
-    ]
+    steps: dict[str, float] = {}
+    for curve in curves:
+        kind, points = curve.data_path.rpartition(".")[2], list(curve.keyframe_points)
+        step = max((abs(b.co[1] - a.co[1]) for a, b in pairwise(points)), default=0.0)
+        steps[kind] = max(step, steps.get(kind, 0.0))
     turned = next(curve for curve in curves if "rotation" in curve.data_path)
     own = [round(key.co[0]) for key in turned.keyframe_points if key.type == "KEYFRAME"]
     placed = {curve.data_path.split('"')[1] for curve in curves if curve.data_path.endswith("location")}
     return {
         "action": armature.animation_data.action.name,
-        "step": max(steps),
+        "steps": steps,
         "own keys": own,
         "placed": sorted(placed),
         "bones": sorted({curve.data_path.split('"')[1] for curve in curves}),

@@ -89,6 +89,17 @@ def test_rotations_are_scipys(source):
     assert (rotations.to_quaternions(turns.as_matrix())[:, 3] >= 0).all()
 
 
+def test_axes_do_not_turn_over(source):
+    rotations = source("rotations")
+    angles = 1.2 * np.sin(np.linspace(0.1, 12, 80))[:, None] * [0.6, 0, 0.8]
+    turns = Rotation.from_rotvec(angles)
+    quats = rotations.join_signs(np.roll(rotations.to_quaternions(turns.as_matrix()), 1, axis=-1))
+    found = rotations.to_axis_angles(quats)
+    assert np.abs(np.diff(found, axis=0)).max() < 0.2
+    back = Rotation.from_rotvec(found[:, :1] * found[:, 1:])
+    assert (back * turns.inv()).magnitude().max() < 1e-7
+
+
 def test_nearest_rotations_leave_scale_out(source):
     turns = Rotation.random(50, rng=1).as_matrix()
     scaled = turns * np.random.default_rng(0).uniform(0.2, 3, size=(50, 1, 3))

@@ -68,22 +68,38 @@ def copy_action(armature: bpy.types.Object, name: str) -> bpy.types.Action:
 
 def open_curves(armature: bpy.types.Object):
     """Open what holds the curves and groups by which an action moves the armature: the action itself, or since 4.4 the
-    bag of its slot."""
+    bag of its slot, which is made where there is none."""
     action = find_action(armature)
     if not hasattr(action, "layers"):
         return action
-    slot = armature.animation_data.action_slot
-    if slot is None:
-        raise AddonError(f"{action.name} has no slot for {armature.name}: choose one in the Action Editor")
     layer = action.layers[0] if action.layers else action.layers.new("Layer")
     strip = layer.strips[0] if layer.strips else layer.strips.new(type="KEYFRAME")
-    return strip.channelbag(slot, ensure=True)
+    return strip.channelbag(_find_slot(armature), ensure=True)
+
+
+def list_curves(armature: bpy.types.Object) -> list[bpy.types.FCurve]:
+    """List the curves by which the armature's action moves it."""
+    action = find_action(armature)
+    if not hasattr(action, "layers"):
+        return list(action.fcurves)
+    slot = _find_slot(armature)
+    bags = [strip.channelbag(slot) for layer in action.layers for strip in layer.strips]
+    return [curve for bag in bags if bag for curve in bag.fcurves]
+
+
+def _find_slot(armature: bpy.types.Object):
+    slot = armature.animation_data.action_slot
+    if slot is None:
+        raise AddonError(
+            f"{find_action(armature).name} has no slot for {armature.name}: choose one in the Action Editor"
+        )
+    return slot
 
 
 def list_keys(armature: bpy.types.Object) -> dict[int, bool]:
     """List the frames in which bones have keys, and whether one of them is not a generated key."""
     made, frames = number_type(generated=True), {}
-    for curve in open_curves(armature).fcurves:
+    for curve in list_curves(armature):
         if not curve.data_path.startswith("pose.bones["):
             continue
         keys = curve.keyframe_points

@@ -3,6 +3,7 @@
 # pyright: reportInvalidTypeForm=false
 
 import time
+from collections.abc import Callable
 
 import bpy
 
@@ -31,6 +32,8 @@ class JobOperator:
     """Base of operators: runs a job to its end, and tells of it."""
 
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's own way
+    report: Callable[[set[str], str], None]
+    """Blender's way to tell the user something."""
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:

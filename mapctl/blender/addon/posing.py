@@ -10,7 +10,7 @@ from mathutils import Matrix, Quaternion
 from .actions import Channel, name_channel
 from .body import Body, Control
 from .problem import Step
-from .rotations import join_signs, orthonormalise, to_quaternions
+from .rotations import join_signs, orthonormalise, to_axis_angles, to_quaternions
 from .sampling import add_one, read_poses
 
 _MOST_PASSES = 8
@@ -135,9 +135,7 @@ def _convert_rotations(matrices: np.ndarray, mode: str) -> tuple[str, np.ndarray
     if mode == "QUATERNION":
         return "rotation_quaternion", quaternions
     if mode == "AXIS_ANGLE":
-        half = np.arctan2(np.linalg.norm(quaternions[:, 1:], axis=-1), quaternions[:, 0])
-        length = np.maximum(np.linalg.norm(quaternions[:, 1:], axis=-1, keepdims=True), 1e-12)
-        return "rotation_axis_angle", np.concatenate([2 * half[:, None], quaternions[:, 1:] / length], axis=-1)
+        return "rotation_axis_angle", to_axis_angles(quaternions)
     angles = [Quaternion(quaternions[0]).to_euler(mode)]
     for quaternion in quaternions[1:]:
         angles.append(Quaternion(quaternion).to_euler(mode, angles[-1]))

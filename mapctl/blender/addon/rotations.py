@@ -46,6 +46,17 @@ def join_signs(quaternions: np.ndarray) -> np.ndarray:
     return quaternions * signs[:, None]
 
 
+def to_axis_angles(quat_wxyz: np.ndarray) -> np.ndarray:
+    """Convert quaternions (frames, 4) with joined signs, the real part first, to angles and unit axes (frames, 4). An
+    axis never turns over from one frame to the next; the angle goes through 0 instead."""
+    sine = np.linalg.norm(quat_wxyz[:, 1:], axis=-1)
+    axes = quat_wxyz[:, 1:] / np.maximum(sine, 1e-12)[:, None]
+    dots = np.einsum("ij,ij->i", axes[1:], axes[:-1])
+    signs = np.cumprod(np.r_[1.0, np.where(dots < 0, -1.0, 1.0)])[:, None]
+    angles = 2 * np.arctan2(signs[:, 0] * sine, quat_wxyz[:, 0])
+    return np.concatenate([np.unwrap(angles, period=4 * np.pi)[:, None], signs * axes], axis=-1)
+
+
 def transpose(matrices: np.ndarray) -> np.ndarray:
     """Exchange the last two axes: the inverses of rotations."""
     return np.swapaxes(matrices, -1, -2)
