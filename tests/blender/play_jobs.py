@@ -86,7 +86,7 @@ def thin(armature) -> None:
 
 
 def describe(armature) -> dict:
-    """What its action is like: its name, the greatest step of each kind of curve, keyed bones, and the kinds of its keys."""
+    """What its action is like: its name, the greatest step of curves by kind, keyed bones, kinds of keys."""
     curves = armatures.curves_of(armature)
     steps: dict[str, float] = {}
     for curve in curves:

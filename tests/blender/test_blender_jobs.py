@@ -145,7 +145,9 @@ def test_curves_have_no_jumps(played):
     *_, facts, _ = played
     for stage in facts["stages"].values():
         assert stage["steps"].get("rotation_quaternion", 0) < 1
-        assert stage["steps"].get("rotation_axis_angle", 0) < 1
+        assert stage["steps"].get("rotation_axis_angle", 0) < 1.42, (
+            "axes may swing where angles are small, not turn over"
+        )
         assert stage["steps"].get("rotation_euler", 0) < 3, "angles may run fast near gimbal lock, but not wrap"
         assert stage["linear"]
 
