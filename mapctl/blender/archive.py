@@ -3,7 +3,9 @@
 import io
 import re
 import zipfile
+from collections.abc import Iterator
 from importlib.resources import files
+from importlib.resources.abc import Traversable
 
 from mapctl.version import __version__
 
@@ -25,8 +27,13 @@ def build_addon_zip() -> bytes:
 
 def read_addon_files() -> dict[str, str]:
     """Read the files of the add-on by their names in the zip."""
-    folder = files("mapctl.blender").joinpath("addon")
-    found = {
-        entry.name: entry.read_text("utf-8") for entry in folder.iterdir() if entry.name.endswith((".py", ".toml"))
-    }
+    found = dict(_read_folder(files("mapctl.blender").joinpath("addon"), ""))
     return found | {_MANIFEST: re.sub(r'^version = ".*"$', f'version = "{__version__}"', found[_MANIFEST], flags=re.M)}
+
+
+def _read_folder(folder: Traversable, prefix: str) -> Iterator[tuple[str, str]]:
+    for entry in folder.iterdir():
+        if entry.is_dir():
+            yield from _read_folder(entry, f"{prefix}{entry.name}/")
+        elif entry.name.endswith((".py", ".toml")):
+            yield prefix + entry.name, entry.read_text("utf-8")

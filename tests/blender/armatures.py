@@ -124,6 +124,20 @@ def add_noise(armature, degrees: float, seed: int = 0) -> None:
             curve.update()
 
 
+def animate(armature, seed: int = 1, places: tuple[str, ...] = ()) -> None:
+    """Key every bone at three frames, and some bones' places."""
+    rng = np.random.default_rng(seed)
+    for frame in (1, 6, 12):
+        for bone in armature.pose.bones:
+            channel = {"QUATERNION": "rotation_quaternion", "AXIS_ANGLE": "rotation_axis_angle"}
+            path = channel.get(bone.rotation_mode, "rotation_euler")
+            setattr(bone, path, np.array(getattr(bone, path)) + rng.normal(size=len(getattr(bone, path))) * 0.4)
+            bone.keyframe_insert(path, frame=frame)
+            if bone.name in places:
+                bone.location = rng.normal(size=3) * 0.2 / armature.scale[0]
+                bone.keyframe_insert("location", frame=frame)
+
+
 def curves_of(armature) -> list:
     """The curves of its action, whichever way this Blender keeps them."""
     data = armature.animation_data

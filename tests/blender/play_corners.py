@@ -1,13 +1,9 @@
-"""What is hard about armatures, what users do wrong, Esc, undo, and the panel; mapctl itself is a stub.
+"""What is hard about armatures, what users do wrong, and undo; mapctl itself is a stub.
 
 python play_corners.py FOLDER PYTHON
 """
 
-import os
-import subprocess
 import sys
-from pathlib import Path
-from types import SimpleNamespace
 
 import armatures
 import bpy
@@ -17,35 +13,6 @@ from mathutils import Matrix
 
 FRAMES = range(1, 13)
 facts: dict = {"errors": {}, "apart": {}}
-
-
-def use(mode: str) -> None:
-    """Let the stub answer in this mode."""
-    stage.set_command(sys.executable, stage.SCRIPTS / "stub.py", mode, stage.FOLDER)
-
-
-def clear() -> None:
-    """An empty scene."""
-    for group in (bpy.data.objects, bpy.data.actions, bpy.data.curves):
-        for each in list(group):
-            group.remove(each)
-    scene = bpy.context.scene
-    scene.render.fps, scene.render.fps_base, scene.unit_settings.scale_length = 30, 1.0, 1.0
-    scene.frame_set(1)
-
-
-def animate(armature, seed: int = 1, places: tuple[str, ...] = ()) -> None:
-    """Key every bone at three frames, and some bones' places."""
-    rng = np.random.default_rng(seed)
-    for frame in (1, 6, 12):
-        for bone in armature.pose.bones:
-            channel = {"QUATERNION": "rotation_quaternion", "AXIS_ANGLE": "rotation_axis_angle"}
-            path = channel.get(bone.rotation_mode, "rotation_euler")
-            setattr(bone, path, np.array(getattr(bone, path)) + rng.normal(size=len(getattr(bone, path))) * 0.4)
-            bone.keyframe_insert(path, frame=frame)
-            if bone.name in places:
-                bone.location = rng.normal(size=3) * 0.2 / armature.scale[0]
-                bone.keyframe_insert("location", frame=frame)
 
 
 def apart(armature, run, bones: list[str] | None = None) -> float:
@@ -58,15 +25,15 @@ def apart(armature, run, bones: list[str] | None = None) -> float:
 
 def play_echoes() -> None:
     """What comes back as it was sent leaves every armature as it was."""
-    use("echo")
-    clear()
+    stage.use("echo")
+    stage.clear()
     armature = armatures.add_mixamo(imported=True)
-    animate(armature, places=("mixamorig:Hips",))
+    armatures.animate(armature, places=("mixamorig:Hips",))
     facts["apart"]["imported"] = apart(armature, bpy.ops.mapctl.clean_up)
 
-    clear()
+    stage.clear()
     armature = armatures.add_mixamo()
-    animate(armature, places=("mixamorig:Hips",))
+    armatures.animate(armature, places=("mixamorig:Hips",))
     armature.location, armature.rotation_euler = (3, 1, 0.5), (0.1, 0.2, 2.0)
     for frame, place in ((1, (0, 0, 0)), (12, (5, -2, 1))):
         armature.location = place
@@ -78,28 +45,28 @@ def play_echoes() -> None:
         {c.data_path for c in armatures.curves_of(armature) if "rotation" not in c.data_path}
     )
 
-    clear()
+    stage.clear()
     bpy.context.scene.unit_settings.scale_length = 0.01
     armature = armatures.add_mixamo()
     armature.scale = (100, 100, 100)
-    animate(armature)
+    armatures.animate(armature)
     facts["apart"]["scene in centimetres"] = apart(armature, bpy.ops.mapctl.clean_up)
 
-    clear()
+    stage.clear()
     armature = armatures.add_mixamo()
     spine, arm, leg = (armature.data.bones[f"mixamorig:{name}"] for name in ("Spine2", "LeftArm", "LeftUpLeg"))
     spine.use_inherit_rotation = False
     arm.use_local_location = False
-    animate(armature, places=("mixamorig:LeftUpLeg", "mixamorig:Hips"))
+    armatures.animate(armature, places=("mixamorig:LeftUpLeg", "mixamorig:Hips"))
     facts["apart"]["bones that do not follow"] = apart(armature, bpy.ops.mapctl.clean_up)
     facts["travelling"] = sorted(
         {c.data_path.split('"')[1] for c in armatures.curves_of(armature) if c.data_path.endswith("location")}
     )
     facts["connected"] = leg.use_connect
 
-    clear()
+    stage.clear()
     armature = armatures.add_mixamo()
-    animate(armature)
+    armatures.animate(armature)
     pull = armature.pose.bones["mixamorig:LeftArm"].constraints.new("STRETCH_TO")
     pull.target = bpy.data.objects.new("far", None)
     pull.target.location = (0.8, 0.5, 1.9)
@@ -110,8 +77,8 @@ def play_echoes() -> None:
 
 def play_generated() -> None:
     """A generated rig that is animated by its IK controls."""
-    use("echo")
-    clear()
+    stage.use("echo")
+    stage.clear()
     rig = armatures.add_generated()
     armatures.select(rig)
     rng = np.random.default_rng(0)
@@ -173,8 +140,8 @@ def turn_of(rig, bones: list[str]) -> float:
 
 def play_walks() -> None:
     """A character that stands anywhere follows the file, whose frames are the world's."""
-    use("echo")
-    clear()
+    stage.use("echo")
+    stage.clear()
     armature, drawn = armatures.add_mixamo(imported=True), armatures.add_curve(cyclic=True, height=0.4)
     holder = bpy.data.objects.new("holder", None)
     bpy.context.collection.objects.link(holder)
@@ -208,32 +175,18 @@ def play_walks() -> None:
 def expect(name: str, run, **options) -> None:
     """Note what the interface tells of an operator that cannot do its work, and that nothing was changed."""
     bpy.context.scene.frame_set(bpy.context.scene.frame_current)
-    before = state()
+    before = stage.state()
     try:
         facts["errors"][name] = [str(run(**options)), ""]
     except RuntimeError as error:
         told = stage.told()[0]
-        same = state() == before and stage.module("operators").Report.failed
+        same = stage.state() == before and stage.module("operators").Report.failed
         facts["errors"][name] = [told if told in str(error) else str(error), "unchanged" if same else "changed"]
-
-
-def state() -> list:
-    """All that an operator could have changed."""
-    armature = bpy.context.object
-    data = armature.animation_data
-    return [
-        sorted(each.name for each in bpy.data.actions),
-        data.action.name if data and data.action else None,
-        bpy.context.scene.frame_current,
-        bpy.context.scene.frame_end,
-        [tuple(map(tuple, bone.matrix_basis)) for bone in armature.pose.bones],
-        len(bpy.data.objects),
-    ]
 
 
 def play_errors() -> None:
     """What users do wrong."""
-    clear()
+    stage.clear()
     walk, clean_up = bpy.ops.mapctl.walk, bpy.ops.mapctl.clean_up
     armature = armatures.add_mixamo()
     armatures.select(armature)
@@ -241,9 +194,9 @@ def play_errors() -> None:
     expect("program that is not there", walk)
     stage.set_command(sys.executable, "-c", "pass")
     expect("program that is another", walk)
-    use("old")
+    stage.use("old")
     expect("program that is old", walk)
-    use("echo")
+    stage.use("echo")
     expect("no curve", walk)
     expect("no action", clean_up)
     expect("no action to in-between", bpy.ops.mapctl.in_between)
@@ -253,7 +206,7 @@ def play_errors() -> None:
     expect("one key to in-between", bpy.ops.mapctl.in_between)
     armature.pose.bones[0].keyframe_insert("location", frame=4)
     expect("keys in every frame", bpy.ops.mapctl.in_between)
-    animate(armature)
+    armatures.animate(armature)
     expect("gap that is outside", bpy.ops.mapctl.fill_gap, first=8, last=13)
     expect("gap that is empty", bpy.ops.mapctl.fill_gap, first=8, last=7)
     expect("no bones selected", bpy.ops.mapctl.fill_gap, first=4, last=7, selected=True)
@@ -268,14 +221,14 @@ def play_errors() -> None:
     expect("mirrored", clean_up)
     armature.scale = (1, 1, 1)
     bpy.context.view_layer.update()
-    use("fail")
+    stage.use("fail")
     expect("mapctl's own", clean_up)
-    use("crash")
+    stage.use("crash")
     expect("mapctl that crashes", clean_up)
     drawn = armatures.add_curve()
     drawn.data.splines.new("POLY")
     armatures.select(armature, drawn)
-    use("echo")
+    stage.use("echo")
     expect("curve of two splines", walk)
     armatures.select(drawn)
     facts["poll"] = [clean_up.poll(), walk.poll()]
@@ -283,10 +236,10 @@ def play_errors() -> None:
 
 def play_selection() -> None:
     """Selected bones alone are filled."""
-    use("echo")
-    clear()
+    stage.use("echo")
+    stage.clear()
     armature = armatures.add_mixamo()
-    animate(armature)
+    armatures.animate(armature)
     armatures.select(armature)
     bpy.ops.object.mode_set(mode="POSE")
     bpy.ops.pose.select_all(action="DESELECT")
@@ -298,162 +251,7 @@ def play_selection() -> None:
     bpy.ops.object.mode_set(mode="OBJECT")
 
 
-def make_window():
-    """What an operator asks of Blender's windows."""
-    notes: list = []
-    window = SimpleNamespace(
-        progress_begin=lambda *_: notes.append("begin"),
-        progress_update=lambda *_: None,
-        progress_end=lambda: notes.append("end"),
-        event_timer_add=lambda *_, **__: "timer",
-        event_timer_remove=notes.append,
-        modal_handler_add=lambda _: notes.append("handler"),
-    )
-    return window, notes
-
-
-def start_modal(mode: str):
-    """Begin a clean-up as the interface does."""
-    use(mode)
-    operators = stage.module("operators")
-    window, notes = make_window()
-    told: list = []
-    context = SimpleNamespace(
-        window_manager=window,
-        window=None,
-        workspace=SimpleNamespace(status_text_set=notes.append),
-        screen=None,
-        scene=bpy.context.scene,
-        object=bpy.context.object,
-        preferences=bpy.context.preferences,
-    )
-
-    class Pressed(operators.JobOperator):
-        """The operator without Blender's class, which only Blender makes."""
-
-        anchor = False
-        prepare = operators.MAPCTL_OT_clean_up.prepare
-
-        def report(self, kind, text):
-            told.append((sorted(kind), text))
-
-    pressed = Pressed()
-    assert pressed.start(context) == {"RUNNING_MODAL"}
-    return pressed, context, notes, told
-
-
-def play_modal() -> None:
-    """The operator in the interface: it goes on by a timer, ends by Esc or by itself."""
-    clear()
-    armature = armatures.add_mixamo()
-    animate(armature)
-    armatures.select(armature)
-    bpy.context.scene.frame_set(1)
-    before = state()
-    pressed, context, notes, told = start_modal("sleep")
-    timer, escape, key = (SimpleNamespace(type=kind) for kind in ("TIMER", "ESC", "A"))
-    process = stage.FOLDER / "process.txt"
-    seen = set()
-    facts["poll while one runs"] = bpy.ops.mapctl.clean_up.poll()
-    while "walking 25 %" not in seen:
-        assert pressed.modal(context, timer) == {"RUNNING_MODAL"}
-        seen.add(stage.module("operators").Report.step.describe())
-        stage.module("operators").time.sleep(0.02)
-    facts["steps"] = sorted(seen)
-    facts["panel while it runs"] = draw_panel()
-    facts["keys are held"] = sorted(pressed.modal(context, key))
-    facts["view is free"] = sorted(pressed.modal(context, SimpleNamespace(type="WHEELUPMOUSE")))
-    assert pressed.modal(context, escape) == {"CANCELLED"}
-    number, folder = process.read_text().split("\n")
-    facts["cancelled"] = {
-        "ended": not is_running(int(number)),
-        "folder": Path(folder).exists(),
-        "unchanged": state() == before,
-        "notes": [note for note in notes if note in ("begin", "end", "timer", "handler", None)],
-        "told": stage.told(),
-        "step": stage.module("operators").Report.step is None,
-    }
-    pressed, context, notes, told = start_modal("echo")
-    answer = {"RUNNING_MODAL"}
-    while answer == {"RUNNING_MODAL"}:
-        answer = pressed.modal(context, timer)
-    facts["modal end"] = [sorted(answer), told, notes[-3:]]
-    pressed, context, notes, told = start_modal("fail")
-    answer = {"RUNNING_MODAL"}
-    while answer == {"RUNNING_MODAL"}:
-        answer = pressed.modal(context, timer)
-    facts["modal failure"] = [sorted(answer), told]
-    facts["panel after a failure"] = draw_panel()
-
-
-def is_running(number: int) -> bool:
-    """Whether there is a process of this number."""
-    try:
-        os.kill(number, 0)
-    except ProcessLookupError:
-        return False
-    return True
-
-
-class Layout:
-    """What a panel asks of Blender's layout; what it draws is noted."""
-
-    def __init__(self, drawn: list):
-        self.drawn = drawn
-
-    def box(self):
-        return self
-
-    def column(self, align=False):
-        return self
-
-    def label(self, text, icon=""):
-        self.drawn.append(text)
-
-    def prop(self, options, name):
-        assert name in options.bl_rna.properties
-        self.drawn.append(name)
-
-    def operator(self, name):
-        self.drawn.append(name)
-        group, own = name.split(".")
-        kind = getattr(getattr(bpy.ops, group), own).get_rna_type()
-        return SimpleNamespace(**dict.fromkeys(kind.properties.keys()))
-
-
-def draw_panel() -> list[str]:
-    """What the panel shows now."""
-    drawn: list[str] = []
-    panel = stage.module("panel").MAPCTL_PT_sidebar
-    standing = SimpleNamespace(layout=Layout(drawn))
-    for name in ("_draw_job", "_draw_report"):
-        setattr(standing, name, getattr(panel, name).__get__(standing))
-    panel.draw(standing, bpy.context)
-    return drawn
-
-
-def check_manifest() -> str:
-    """What Blender's own tool says of the zip."""
-    tool = Path(bpy.utils.system_resource("SCRIPTS")) / "addons_core" / "bl_pkg" / "cli" / "blender_ext.py"
-    command = [sys.executable, str(tool), "validate", str(stage.FOLDER / "addon.zip")]
-    return subprocess.run(command, capture_output=True, text=True).stdout
-
-
-def play_settings() -> None:
-    """Options are the scene's, and the gap is taken from the preview range; the add-on goes and comes."""
-    scene = bpy.context.scene
-    scene.use_preview_range, scene.frame_preview_start, scene.frame_preview_end = True, 20, 31
-    bpy.ops.mapctl.preview_gap()
-    facts["gap"] = [scene.mapctl.gap.first, scene.mapctl.gap.last]
-    facts["panel"] = draw_panel()
-    bpy.ops.preferences.addon_disable(module=stage.ADDON)
-    facts["manifest"] = check_manifest()
-    facts["gone"] = not hasattr(bpy.types.Scene, "mapctl")
-    bpy.ops.preferences.addon_enable(module=stage.ADDON)
-    facts["back"] = hasattr(bpy.types.Scene, "mapctl")
-
-
 stage.install()
-for play in (play_echoes, play_walks, play_errors, play_selection, play_modal, play_generated, play_settings):
+for play in (play_echoes, play_walks, play_errors, play_selection, play_generated):
     play()
 stage.finish(facts)

@@ -27,9 +27,38 @@ def set_command(*words: object) -> None:
     bpy.context.preferences.addons[ADDON].preferences.command = " ".join(map(str, words))
 
 
+def use(mode: str) -> None:
+    """Let the stub answer in this mode."""
+    set_command(sys.executable, SCRIPTS / "stub.py", mode, FOLDER)
+
+
 def module(name: str):
     """A module of the add-on as it is installed."""
     return sys.modules[f"{ADDON}.{name}"]
+
+
+def clear() -> None:
+    """An empty scene."""
+    for group in (bpy.data.objects, bpy.data.actions, bpy.data.curves):
+        for each in list(group):
+            group.remove(each)
+    scene = bpy.context.scene
+    scene.render.fps, scene.render.fps_base, scene.unit_settings.scale_length = 30, 1.0, 1.0
+    scene.frame_set(1)
+
+
+def state() -> list:
+    """All that an operator could have changed."""
+    armature = bpy.context.object
+    data = armature.animation_data
+    return [
+        sorted(each.name for each in bpy.data.actions),
+        data.action.name if data and data.action else None,
+        bpy.context.scene.frame_current,
+        bpy.context.scene.frame_end,
+        [tuple(map(tuple, bone.matrix_basis)) for bone in armature.pose.bones],
+        len(bpy.data.objects),
+    ]
 
 
 def told() -> tuple[str, ...]:

@@ -41,7 +41,8 @@ def test_zip_holds_the_source_and_a_manifest_of_this_version():
         names = set(archive.namelist())
         manifest = tomllib.loads(archive.read("blender_manifest.toml").decode())
         assert archive.read("jobs.py").decode() == (SOURCE / "jobs.py").read_text("utf-8")
-    assert names == {file.name for file in SOURCE.iterdir() if file.is_file()}
+    own = [file for file in SOURCE.rglob("*") if file.suffix in (".py", ".toml")]
+    assert names == {file.relative_to(SOURCE).as_posix() for file in own}
     assert manifest["version"] == __version__
     assert manifest["blender_version_min"] == "4.2.0"
     assert {"schema_version", "id", "name", "tagline", "maintainer", "type", "license"} <= manifest.keys()
@@ -52,7 +53,7 @@ def test_zip_is_the_same_each_time():
 
 
 def test_addon_imports_nothing_that_blender_lacks():
-    for file in SOURCE.glob("*.py"):
+    for file in SOURCE.rglob("*.py"):
         for node in ast.walk(ast.parse(file.read_text("utf-8"))):
             names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
             if isinstance(node, ast.ImportFrom) and not node.level:
@@ -218,7 +219,7 @@ def test_rigify_names_are_told_where_they_are_all_there(source, monkeypatch):
     sys.modules["bpy"].types = types.SimpleNamespace(
         Object=object, Scene=object, Bone=object, bpy_prop_collection=object
     )
-    rigify = source("rigify")
+    rigify = source("scene.rigify")
     limbs = ("shoulder", "upper_arm", "forearm", "hand", "thigh", "shin", "foot", "toe")
     names = ("spine", "spine.001", "spine.003", "spine.004", "spine.006", *(f"{n}.{s}" for n in limbs for s in "LR"))
     table = tomllib.loads(rigify.describe_names(names))

@@ -9,14 +9,15 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from . import actions, exchange, rigify
-from .body import Body, take_bones
-from .drawn_curve import measure_height, sample_curve, write_curve
+from . import exchange
 from .exchange import WorldMotion
-from .making import Result, Scene, make_action, restored_scene
 from .problem import AddonError, Step
 from .process import run_command
-from .sampling import measure_fps, sample_motion, sample_worlds, take_rest, to_armature
+from .scene import actions, rigify
+from .scene.body import Body, take_bones
+from .scene.drawn_curve import measure_height, sample_curve, write_curve
+from .scene.making import Result, Scene, make_action, restored_scene
+from .scene.sampling import measure_fps, sample_motion, sample_worlds, take_rest, to_armature
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,9 @@ from collections.abc import Callable
 
 import bpy
 
-from . import actions, jobs, process
+from . import jobs, process
 from .problem import AddonError, Step
+from .scene import actions
 from .settings import BetweenProperties, CleanUpProperties, GapProperties, WalkProperties, read_command
 
 _TICK = 0.1  # seconds between two looks at a job

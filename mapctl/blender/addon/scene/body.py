@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import bpy
 import numpy as np
 
-from .problem import AddonError
+from ..problem import AddonError
 
 Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 """From Blender's axes, Z up and facing -Y, to mapctl's, Y up and facing +Z."""

@@ -7,10 +7,10 @@ import bpy
 import numpy as np
 from mathutils import Matrix, Quaternion
 
+from ..problem import Step
+from ..rotations import join_signs, orthonormalise, to_axis_angles, to_quaternions
 from .actions import Channel, name_channel
 from .body import Body, Control
-from .problem import Step
-from .rotations import join_signs, orthonormalise, to_axis_angles, to_quaternions
 from .sampling import add_one, read_poses
 
 _MOST_PASSES = 8

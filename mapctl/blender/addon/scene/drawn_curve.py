@@ -5,8 +5,8 @@ from pathlib import Path
 import bpy
 import numpy as np
 
+from ..problem import AddonError
 from .body import Y_UP
-from .problem import AddonError
 
 _LEVEL = 0.05  # metres that a level curve may rise and fall
 

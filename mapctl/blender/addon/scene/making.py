@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import bpy
 import numpy as np
 
+from ..problem import Step
 from . import actions
 from .body import Body
 from .posing import Keys, list_channels, place_joints, pose_bones, solve_controls
-from .problem import Step
 from .sampling import read_poses
 
 _PROBES = 24  # frames in which the result is compared with what was wanted

@@ -6,10 +6,10 @@ from fractions import Fraction
 import bpy
 import numpy as np
 
+from ..exchange import WorldMotion
+from ..problem import Step
+from ..rotations import orthonormalise, transpose
 from .body import Body, measure_world
-from .exchange import WorldMotion
-from .problem import Step
-from .rotations import orthonormalise, transpose
 
 
 def measure_fps(scene: bpy.types.Scene) -> Fraction:
