@@ -30,7 +30,7 @@ def make_window():
     return window, notes
 
 
-def start_modal(mode: str):
+def start_modal(mode: str, expected: frozenset = frozenset({"RUNNING_MODAL"})):
     """Begin a clean-up as the interface does."""
     stage.use(mode)
     operators = stage.module("operators")
@@ -56,7 +56,7 @@ def start_modal(mode: str):
             told.append((sorted(kind), text))
 
     pressed = Pressed()
-    assert pressed.start(context) == {"RUNNING_MODAL"}
+    assert pressed.start(context) == expected
     return pressed, context, notes, told
 
 
@@ -71,7 +71,7 @@ def play_modal() -> None:
     pressed, context, notes, told = start_modal("sleep")
     timer, escape, key = (SimpleNamespace(type=kind) for kind in ("TIMER", "ESC", "A"))
     process = stage.FOLDER / "process.txt"
-    seen = set()
+    seen = {stage.module("operators").Report.step.describe()}
     facts["poll while one runs"] = bpy.ops.mapctl.clean_up.poll()
     while "walking 25 %" not in seen:
         assert pressed.modal(context, timer) == {"RUNNING_MODAL"}
@@ -102,6 +102,9 @@ def play_modal() -> None:
         answer = pressed.modal(context, timer)
     facts["modal failure"] = [sorted(answer), told]
     facts["panel after a failure"] = draw_panel()
+    bpy.context.object.animation_data.action = None
+    kept = start_modal("echo", {"CANCELLED"})
+    facts["failure at once"] = [kept[2], kept[3], stage.module("operators").Report.step is None]
 
 
 def is_running(number: int) -> bool:

@@ -46,6 +46,11 @@ def test_jobs_end_by_themselves_in_the_interface(facts):
     assert facts["panel after a failure"][-1] == "nobody walks here"
 
 
+def test_what_is_wrong_at_once_is_told_at_once(facts):
+    message = "mixamo has no action: choose one in the Action Editor"
+    assert facts["failure at once"] == [[], [[["ERROR"], message]], True]
+
+
 def test_panel_has_every_operator(facts):
     operators = [f"mapctl.{name}" for name in ("walk", "clean_up", "fill_gap", "preview_gap", "in_between")]
     assert [name for name in facts["panel"] if name.startswith("mapctl.")] == operators

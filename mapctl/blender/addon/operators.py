@@ -68,9 +68,12 @@ class JobOperator:
         return self.execute(context) if bpy.app.background else self.start(context)
 
     def start(self, context: bpy.types.Context) -> set[str]:
-        """Begin the job, with a timer that takes it on."""
+        """Begin the job, with a timer that takes it on. What is selected counts now."""
         self._job = self._begin(context)
-        Report.step = Step("starting")
+        step = self._advance(self._job)
+        if step is None:
+            return self._conclude(context)
+        Report.step = step
         context.window_manager.progress_begin(0, 100)
         self._timer = context.window_manager.event_timer_add(_TICK, window=context.window)
         context.window_manager.modal_handler_add(self)
