@@ -51,6 +51,8 @@ def play_echoes() -> None:
     armature.scale = (100, 100, 100)
     armatures.animate(armature)
     facts["apart"]["scene in centimetres"] = apart(armature, bpy.ops.mapctl.clean_up)
+    with np.load(stage.FOLDER / "sent.npz") as sent:
+        facts["thigh"] = float(np.linalg.norm(sent["offsets"][sent["names"].tolist().index("mixamorig:LeftLeg")]))
 
     stage.clear()
     armature = armatures.add_mixamo()
@@ -114,6 +116,7 @@ def play_generated() -> None:
     facts["generated told"] = stage.told()
     facts["turned"] = turn_of(rig, bones)
 
+    facts["ended early"] = [end_at("setting the controls", 3), end_at("checking", 0)]
     facts["stretch is back"] = max(bone.ik_stretch for bone in rig.pose.bones)
     hands = ["DEF-hand.L", "DEF-hand.R", "DEF-foot.L", "DEF-foot.R", "DEF-spine", "DEF-spine.006"]
     rig.animation_data.action = bpy.data.actions["rigAction"]
@@ -121,6 +124,25 @@ def play_generated() -> None:
 
     rig.data.bones["upper_arm_fk.L"].name = "renamed"
     expect("generated rig of another kind", bpy.ops.mapctl.clean_up)
+
+
+def end_at(label: str, done: int) -> str:
+    """End a clean-up at this step; whether all is as it was."""
+    armature, jobs, operators = bpy.context.object, stage.module("jobs"), stage.module("operators")
+    bpy.context.scene.frame_set(5)
+    before, command = stage.state(), stage.module("process").find_command(read_command())
+    at = jobs.Scene(bpy.context.scene, armature, command)
+    job = jobs.clean_up(at, operators.find_frames(at), anchor=False)
+    while (step := next(job)).label != label or step.done < done:
+        pass
+    changed = stage.state() != before
+    job.close()
+    return f"{'changed' if changed else 'unchanged'}, then {'as before' if stage.state() == before else 'changed'}"
+
+
+def read_command() -> str:
+    """The preference."""
+    return bpy.context.preferences.addons[stage.ADDON].preferences.command
 
 
 def turn_of(rig, bones: list[str]) -> float:

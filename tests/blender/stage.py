@@ -56,7 +56,8 @@ def state() -> list:
         data.action.name if data and data.action else None,
         bpy.context.scene.frame_current,
         bpy.context.scene.frame_end,
-        [tuple(map(tuple, bone.matrix_basis)) for bone in armature.pose.bones],
+        [[round(value, 5) for row in bone.matrix_basis for value in row] for bone in armature.pose.bones],
+        [bone["IK_FK"] for bone in armature.pose.bones if "IK_FK" in bone],
         len(bpy.data.objects),
     ]
 

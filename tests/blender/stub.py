@@ -25,6 +25,7 @@ def main(mode: str, folder: Path, words: list[str]) -> int:
         np.savez(words[words.index("-o") + 1], **(tumble(arrays) if words[0] == "follow" else arrays))
         if words[0] == "follow":
             shutil.copy(words[1], folder / "curve.csv")
+        np.savez(folder / "sent.npz", **arrays)
         (folder / "words.txt").write_text("\n".join(words))
         print("echoed")
         return 0

@@ -26,6 +26,10 @@ def test_armatures_come_back_as_they_were(facts, kind):
     assert facts["apart"][kind] < CLOSE
 
 
+def test_mapctl_gets_metres(facts):
+    assert facts["thigh"] == pytest.approx(0.42, abs=0.01)
+
+
 def test_other_curves_stay(facts):
     root = 'pose.bones["mixamorig:Hips"]'
     assert facts["other curves"] == ["location", f"{root}.location", f'{root}["mood"]']
@@ -60,6 +64,7 @@ def test_curves_are_sampled_in_the_world(facts):
     points = np.array([line.split(",") for line in facts["curve"].split()[1:]], dtype=float)
     assert facts["curve"].startswith("x,z\n")
     assert points[0].tolist() == points[-1].tolist(), "a cyclic curve ends where it begins"
+    assert len(points) == 2 * 12 + 1, "two segments of the curve alone, not of its bevel"
     for knot in facts["knots"]:
         assert np.linalg.norm(points - knot, axis=1).min() < 1e-5
 
@@ -70,6 +75,10 @@ def test_walk_begins_where_the_preview_does_and_is_the_worlds(facts):
     rng.normal(size=(12, 27, 4))
     wanted = rng.normal(size=(12, 3)) + np.array([0, 0.4, 0])
     assert np.abs(np.array(facts["root"]) - wanted).max() < CLOSE
+
+
+def test_jobs_that_end_early_leave_no_trace(facts):
+    assert facts["ended early"] == ["changed, then as before"] * 2
 
 
 def test_all_is_undone_in_one_step(facts):

@@ -49,8 +49,8 @@ class Body:
     """Joints that may travel within their parent."""
     controls: tuple[Control, ...] = ()
     """What is keyed of a generated rig; where there are none, `bones` are."""
-    switches: dict[str, float] = field(default_factory=dict)
-    """Custom properties of a generated rig to be set, by data path."""
+    switches: dict[str, str] = field(default_factory=dict)
+    """Custom property of a bone of a generated rig that is keyed to 1, by bone."""
     rig_toml: str = ""
     """What mapctl is told of the joints by a rig file; nothing where it finds out itself."""
 

@@ -1,6 +1,6 @@
 """From a motion of mapctl's to a new action of the armature, or no trace of one."""
 
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -52,7 +52,7 @@ class Result:
 
 def make_action(at: Scene, result: Result) -> Generator[Step, None, tuple[str, ...]]:
     """Make an action of a result; the one before is kept by a fake user. Ended early it leaves no trace."""
-    with _restored_pose(at):
+    with _restored_pose(at, result.body.switches):
         if result.fresh:
             actions.add_action(at.armature, result.name)
         else:
@@ -71,8 +71,9 @@ def _find_keys(at: Scene, result: Result) -> Generator[Step, None, list[Keys]]:
         actions.clear_bones(at.armature, body.bones)
         return pose_bones(at.armature, body, result.moved, result.travelling)
     actions.clear_bones(at.armature, [control.bone for control in body.controls])
-    for path, value in body.switches.items():
-        actions.set_constant(at.armature, path, value, result.frames.start)
+    for bone, name in body.switches.items():
+        path = f'pose.bones["{bpy.utils.escape_identifier(bone)}"]["{name}"]'
+        actions.set_constant(at.armature, path, 1.0, result.frames.start)
     if result.fresh:
         _reset_needless(at.armature)
     return (yield from solve_controls(at.armature, body, at.scene, result.frames, result.moved))
@@ -121,10 +122,12 @@ def restored_scene(at: Scene) -> Iterator[None]:
 
 
 @contextmanager
-def _restored_pose(at: Scene) -> Iterator[None]:
+def _restored_pose(at: Scene, switches: Mapping[str, str]) -> Iterator[None]:
     """Keep the old action by a fake user at the end; go back to it, and to the pose, if the block ends early."""
     armature = at.armature
-    before = {bone.name: bone.matrix_basis.copy() for bone in armature.pose.bones}
+    bones = armature.pose.bones
+    before = {bone.name: bone.matrix_basis.copy() for bone in bones}
+    switched = {bone: bones[bone][name] for bone, name in switches.items()}
     data = armature.animation_data
     old, slot = (data.action, actions.name_slot(armature)) if data else (None, "")
     known = set(bpy.data.actions)
@@ -135,7 +138,9 @@ def _restored_pose(at: Scene) -> Iterator[None]:
         for made in set(bpy.data.actions) - known:
             bpy.data.actions.remove(made)
         for name, basis in before.items():
-            armature.pose.bones[name].matrix_basis = basis
+            bones[name].matrix_basis = basis
+        for bone, value in switched.items():
+            bones[bone][switches[bone]] = value
         raise
     if old is not None:
         old.use_fake_user = True

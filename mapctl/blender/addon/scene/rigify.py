@@ -97,7 +97,7 @@ def take_controls(armature: bpy.types.Object, scene: bpy.types.Scene) -> Body:
         ends={name: np.array(bones[name].tail_local, dtype=np.float64) for name in names if _is_last(name)},
         frame=measure_frame(armature, scene),
         controls=tuple(_list_controls(rows, number)),
-        switches={f'pose.bones["{bone.name}"]["{_SWITCH}"]': 1.0 for bone in armature.pose.bones if _SWITCH in bone},
+        switches={bone.name: _SWITCH for bone in armature.pose.bones if _SWITCH in bone},
         rig_toml=describe_names(tuple(names), "DEF-"),
     )
 
