@@ -1,6 +1,7 @@
 """Armatures for the tests of the add-on; this module runs in Blender."""
 
 import math
+from itertools import pairwise
 
 import bpy
 import numpy as np
@@ -136,6 +137,12 @@ def animate(armature, seed: int = 1, places: tuple[str, ...] = ()) -> None:
             if bone.name in places:
                 bone.location = rng.normal(size=3) * 0.2 / armature.scale[0]
                 bone.keyframe_insert("location", frame=frame)
+
+
+def largest_step(curve) -> float:
+    """The largest step from a key of a curve to the next."""
+    points = list(curve.keyframe_points)
+    return max((abs(b.co[1] - a.co[1]) for a, b in pairwise(points)), default=0.0)
 
 
 def curves_of(armature) -> list:

@@ -3,6 +3,8 @@
 python play_corners.py FOLDER PYTHON
 """
 
+import math
+import shutil
 import sys
 
 import armatures
@@ -13,6 +15,7 @@ from mathutils import Matrix
 
 FRAMES = range(1, 13)
 facts: dict = {"errors": {}, "apart": {}}
+walked: dict = {}
 
 
 def apart(armature, run, bones: list[str] | None = None) -> float:
@@ -76,6 +79,27 @@ def play_echoes() -> None:
     facts["apart"]["arm that is stretched"] = apart(armature, bpy.ops.mapctl.clean_up)
     facts["stretched told"] = stage.told()
 
+    clear_and_spin()
+
+
+def clear_and_spin() -> None:
+    """Bones that turn around and around, in each rotation mode."""
+    stage.clear()
+    armature = armatures.add_mixamo()
+    for bone in list(armature.pose.bones)[:4]:
+        for frame in FRAMES:
+            angle = 0.8 * frame
+            if bone.rotation_mode == "QUATERNION":
+                bone.rotation_quaternion = (math.cos(angle / 2), 0, math.sin(angle / 2), 0)
+            elif bone.rotation_mode == "AXIS_ANGLE":
+                bone.rotation_axis_angle = (angle, 0, 1, 0)
+            else:
+                bone.rotation_euler[1] = angle
+            paths = {"QUATERNION": "rotation_quaternion", "AXIS_ANGLE": "rotation_axis_angle"}
+            bone.keyframe_insert(paths.get(bone.rotation_mode, "rotation_euler"), frame=frame)
+    facts["apart"]["bones that spin"] = apart(armature, bpy.ops.mapctl.clean_up)
+    facts["spin"] = [armatures.largest_step(curve) for curve in armatures.curves_of(armature)]
+
 
 def play_generated() -> None:
     """A generated rig that is animated by its IK controls."""
@@ -112,11 +136,11 @@ def play_generated() -> None:
     trunk = [f"DEF-spine{end}" for end in ("", ".001", ".002", ".003", ".004", ".006")]
     limbs = ("shoulder", "upper_arm", "forearm", "hand", "thigh", "shin", "foot", "toe")
     bones = [*trunk, *(f"DEF-{limb}.{side}" for limb in limbs for side in "LR")]
+    facts["ended early"] = [end_at("setting the controls", 3), end_at("checking", 0)]
     facts["apart"]["generated rig by IK"] = apart(rig, bpy.ops.mapctl.clean_up, bones)
     facts["generated told"] = stage.told()
     facts["turned"] = turn_of(rig, bones)
 
-    facts["ended early"] = [end_at("setting the controls", 3), end_at("checking", 0)]
     facts["stretch is back"] = max(bone.ik_stretch for bone in rig.pose.bones)
     hands = ["DEF-hand.L", "DEF-hand.R", "DEF-foot.L", "DEF-foot.R", "DEF-spine", "DEF-spine.006"]
     rig.animation_data.action = bpy.data.actions["rigAction"]
@@ -171,6 +195,8 @@ def play_walks() -> None:
         holder.location = place
         holder.keyframe_insert("location", frame=frame)
     armature.parent = holder
+    armature.pose.bones["mixamorig:LeftUpLeg"].location = (3, 4, 5)
+    armature.pose.bones["mixamorig:Spine1"].scale = (1.3, 1.3, 1.3)
     bpy.context.scene.frame_preview_start, bpy.context.scene.use_preview_range = 5, True
     armatures.select(armature, drawn)
     bpy.ops.ed.undo_push(message="before")
@@ -180,6 +206,7 @@ def play_walks() -> None:
     facts["range"] = list(armature.animation_data.action.frame_range)
     root = armatures.joints_of(armature, ["mixamorig:Hips"], range(5, 17))[:, 0]
     facts["root"] = root.tolist()
+    walked["imported"] = walked_joints(armature, 5)
     facts["curve"] = (stage.FOLDER / "curve.csv").read_text()
     knots = [drawn.matrix_world @ knot.co for knot in drawn.data.splines[0].bezier_points]
     facts["knots"] = [[knot.x, -knot.y] for knot in knots]
@@ -192,6 +219,38 @@ def play_walks() -> None:
         [each.name for each in bpy.data.actions],
         len(bpy.data.curves),
     ]
+
+
+def play_generated_walk() -> None:
+    """A generated rig that was posed by hand, and walks then."""
+    stage.clear()
+    rig, drawn = armatures.add_generated(), armatures.add_curve()
+    armatures.select(rig, drawn)
+    rng = np.random.default_rng(1)
+    for name in ("chest", "hips", "spine_fk.001", "tweak_spine.002", "upper_arm_tweak.L", "thigh_ik.L", "torso"):
+        rig.pose.bones[name].location = rng.normal(size=3) * 0.1
+    bpy.context.view_layer.update()
+    facts["walk ended early"] = end_walk_early(drawn)
+    assert bpy.ops.mapctl.walk() == {"FINISHED"}
+    walked["generated"] = walked_joints(rig, 1)
+
+
+def end_walk_early(drawn) -> str:
+    """End a walk while the controls are set; whether all is as it was."""
+    jobs, before = stage.module("jobs"), stage.state()
+    at = jobs.Scene(bpy.context.scene, bpy.context.object, stage.module("process").find_command(read_command()))
+    job = jobs.walk_along(at, drawn, jobs.WalkOptions())
+    while (step := next(job)).label != "setting the controls" or step.done < 3:
+        pass
+    job.close()
+    return "as before" if stage.state() == before else "changed"
+
+
+def walked_joints(armature, first: int) -> np.ndarray:
+    """Where Blender shows the joints that mapctl answered with."""
+    shutil.copy(stage.FOLDER / "answer.npz", stage.FOLDER / f"{armature.name}.npz")
+    with np.load(stage.FOLDER / "answer.npz") as answer:
+        return armatures.joints_of(armature, answer["names"].tolist(), range(first, first + 12))
 
 
 def expect(name: str, run, **options) -> None:
@@ -274,6 +333,6 @@ def play_selection() -> None:
 
 
 stage.install()
-for play in (play_echoes, play_walks, play_errors, play_selection, play_generated):
+for play in (play_echoes, play_walks, play_generated_walk, play_errors, play_selection, play_generated):
     play()
-stage.finish(facts)
+stage.finish(facts, walked)

@@ -4,7 +4,6 @@ python play_jobs.py FOLDER PYTHON KIND MODELS FPS STAGES: the operators are run 
 """
 
 import sys
-from itertools import pairwise
 
 import armatures
 import bpy
@@ -90,9 +89,8 @@ def describe(armature) -> dict:
     curves = armatures.curves_of(armature)
     steps: dict[str, float] = {}
     for curve in curves:
-        kind, points = curve.data_path.rpartition(".")[2], list(curve.keyframe_points)
-        step = max((abs(b.co[1] - a.co[1]) for a, b in pairwise(points)), default=0.0)
-        steps[kind] = max(step, steps.get(kind, 0.0))
+        kind = curve.data_path.rpartition(".")[2]
+        steps[kind] = max(armatures.largest_step(curve), steps.get(kind, 0.0))
     turned = next(curve for curve in curves if "rotation" in curve.data_path)
     own = [round(key.co[0]) for key in turned.keyframe_points if key.type == "KEYFRAME"]
     placed = {curve.data_path.split('"')[1] for curve in curves if curve.data_path.endswith("location")}

@@ -44,6 +44,7 @@ def clear() -> None:
             group.remove(each)
     scene = bpy.context.scene
     scene.render.fps, scene.render.fps_base, scene.unit_settings.scale_length = 30, 1.0, 1.0
+    scene.use_preview_range = False
     scene.frame_set(1)
 
 

@@ -22,7 +22,9 @@ def main(mode: str, folder: Path, words: list[str]) -> int:
     if mode == "echo":
         with np.load(words[words.index("--rig") + 1] if words[0] == "follow" else words[1]) as archive:
             arrays = dict(archive)
-        np.savez(words[words.index("-o") + 1], **(tumble(arrays) if words[0] == "follow" else arrays))
+        answer = tumble(arrays) if words[0] == "follow" else arrays
+        np.savez(words[words.index("-o") + 1], **answer)
+        np.savez(folder / "answer.npz", **answer)
         if words[0] == "follow":
             shutil.copy(words[1], folder / "curve.csv")
         np.savez(folder / "sent.npz", **arrays)
@@ -38,9 +40,9 @@ def main(mode: str, folder: Path, words: list[str]) -> int:
 
 
 def tumble(arrays: dict) -> dict:
-    """Any rotation of every joint, anywhere."""
+    """Some rotation of every joint, anywhere."""
     rng = np.random.default_rng(0)
-    quats = rng.normal(size=(FRAMES, len(arrays["names"]), 4))
+    quats = 0.2 * rng.normal(size=(FRAMES, len(arrays["names"]), 4)) + (0, 0, 0, 1)
     return arrays | {
         "local_quat_xyzw": quats / np.linalg.norm(quats, axis=-1, keepdims=True),
         "root_position_world": rng.normal(size=(FRAMES, 3)),

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from blender_session import needs_blender, run_in_blender
 
+import mapctl
 from mapctl.blender.archive import build_addon_zip
 
 pytestmark = needs_blender
@@ -16,11 +17,13 @@ def facts(tmp_path_factory) -> dict:
     """What was seen in Blender."""
     folder = tmp_path_factory.mktemp("corners")
     (folder / "addon.zip").write_bytes(build_addon_zip())
-    return run_in_blender("play_corners.py", folder)[0]
+    found, walked = run_in_blender("play_corners.py", folder)
+    return found | {"walked": walked, "folder": folder}
 
 
 @pytest.mark.parametrize(
-    "kind", ["imported", "object that is animated too", "scene in centimetres", "bones that do not follow"]
+    "kind",
+    ["imported", "object that is animated too", "scene in centimetres", "bones that do not follow", "bones that spin"],
 )
 def test_armatures_come_back_as_they_were(facts, kind):
     assert facts["apart"][kind] < CLOSE
@@ -71,14 +74,24 @@ def test_curves_are_sampled_in_the_world(facts):
 
 def test_walk_begins_where_the_preview_does_and_is_the_worlds(facts):
     assert facts["range"] == [5.0, 16.0]
-    rng = np.random.default_rng(0)  # as in stub.py
-    rng.normal(size=(12, 27, 4))
-    wanted = rng.normal(size=(12, 3)) + np.array([0, 0.4, 0])
+    wanted = mapctl.load(facts["folder"] / "mixamo.npz").root_position.numpy() + np.array([0, 0.4, 0])
     assert np.abs(np.array(facts["root"]) - wanted).max() < CLOSE
+
+
+@pytest.mark.parametrize(("kind", "file", "height"), [("imported", "mixamo", 0.4), ("generated", "rig", 0.0)])
+def test_walks_start_from_a_clean_pose(facts, kind, file, height):
+    wanted = mapctl.load(facts["folder"] / f"{file}.npz").joint_positions().numpy() + np.array([0, height, 0])
+    assert np.abs(facts["walked"][kind] - wanted).max() < 1e-5
+
+
+def test_angles_do_not_wrap(facts):
+    assert len(facts["spin"]) > 20
+    assert max(facts["spin"]) < 1.0
 
 
 def test_jobs_that_end_early_leave_no_trace(facts):
     assert facts["ended early"] == ["changed, then as before"] * 2
+    assert facts["walk ended early"] == "as before"
 
 
 def test_all_is_undone_in_one_step(facts):
