@@ -101,6 +101,16 @@ def test_axes_do_not_turn_over(source):
     assert (back * turns.inv()).magnitude().max() < 1e-7
 
 
+def test_axes_stay_where_there_is_no_angle(source):
+    angles = np.array([0, 1e-9, 0.5, 1e-10, 0, 0.4])
+    turns = np.stack([np.cos(angles / 2), 0 * angles, 0 * angles, np.sin(angles / 2)], axis=1)
+    turns[1, 1:] = (1e-9, -1e-9, 0)
+    found = source("rotations").to_axis_angles(turns)
+    assert found[:, 1:].tolist() == [[0, 0, 1]] * 6
+    assert found[:, 0] == pytest.approx(angles, abs=1e-8)
+    assert source("rotations").to_axis_angles(turns[:2])[:, 1:].tolist() == [[0, 1, 0]] * 2
+
+
 def test_nearest_rotations_leave_scale_out(source):
     turns = Rotation.random(50, rng=1).as_matrix()
     scaled = turns * np.random.default_rng(0).uniform(0.2, 3, size=(50, 1, 3))
