@@ -233,6 +233,10 @@ def play_generated_walk() -> None:
     facts["walk ended early"] = end_walk_early(drawn)
     assert bpy.ops.mapctl.walk() == {"FINISHED"}
     walked["generated"] = walked_joints(rig, 1)
+    drawn.data.splines[0].bezier_points[0].co.z += 0.5
+    bpy.context.scene.frame_end = 3
+    assert bpy.ops.mapctl.walk() == {"FINISHED"}
+    facts["not level"] = [stage.told()[0], bpy.context.scene.frame_end]
 
 
 def end_walk_early(drawn) -> str:

@@ -84,6 +84,12 @@ def test_walks_start_from_a_clean_pose(facts, kind, file, height):
     assert np.abs(facts["walked"][kind] - wanted).max() < 1e-5
 
 
+def test_curves_that_are_not_level_are_told_and_the_scene_is_long_enough(facts):
+    told, end = facts["not level"]
+    assert told.endswith("is not level: the character walks at its median height")
+    assert end == 12
+
+
 def test_angles_do_not_wrap(facts):
     assert len(facts["spin"]) > 20
     assert max(facts["spin"]) < 1.0
