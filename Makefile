@@ -3,6 +3,7 @@ VENV := .venv/bin
 READY := .venv/.ready
 BROWSER := .venv/.browser
 BLENDER := .venv/.blender
+VALIDATOR := .venv/.validator
 
 .PHONY: help setup demo test test-all bench check clean
 
@@ -29,6 +30,10 @@ $(BLENDER): $(READY)
 	@.ci/setup blender
 	@touch $@
 
+$(VALIDATOR): $(READY)
+	@.ci/setup validator
+	@touch $@
+
 demo: $(READY)
 	$(VENV)/mapctl demo -o demo-out
 
@@ -42,10 +47,10 @@ unexport PYTHONDONTWRITEBYTECODE
 # A file's tests stay together: they share what is costly to make. Tests run in as many processes as there are WORKERS.
 WORKERS := 2
 
-test: $(READY) $(BROWSER) $(BLENDER)
+test: $(READY) $(BROWSER) $(BLENDER) $(VALIDATOR)
 	$(VENV)/python -m pytest -m "not slow" -n $(WORKERS) --dist loadfile
 
-test-all: $(READY) $(BROWSER) $(BLENDER)
+test-all: $(READY) $(BROWSER) $(BLENDER) $(VALIDATOR)
 	$(VENV)/python -m pytest
 
 bench: $(READY)
