@@ -13,11 +13,19 @@ from mapctl.formats.missing import MissingValues
 from mapctl.mesh.character_mesh import CharacterMesh
 from mapctl.motion import Motion
 
-READERS = {".bvh": "bvh", ".npz": "npz", ".amc": "acclaim", ".glb": "gltf", ".gltf": "gltf", ".vrm": "gltf"}
+READERS = {
+    ".bvh": "bvh",
+    ".npz": "npz",
+    ".amc": "acclaim",
+    ".glb": "gltf",
+    ".gltf": "gltf",
+    ".vrm": "gltf",
+    ".fbx": "fbx",
+}
 """Endings that are read, each with its module of this package, which is imported when it is needed."""
 WRITERS = {".bvh": "bvh", ".npz": "npz", ".glb": "gltf", ".vrm": "gltf", **dict.fromkeys(usd.ENDINGS, "usd")}
 """Endings that are written, likewise."""
-CHARACTERS = (".glb", ".gltf", ".vrm")
+CHARACTERS = (".glb", ".gltf", ".vrm", ".fbx")
 """Endings of files of skinned characters, that have a rest pose of their own."""
 _MAY_LACK_VALUES = (".bvh", ".npz", ".amc")
 _UNREADABLE_REASONS = {

@@ -16,7 +16,7 @@ PROCESSES = {"joblib", "joblib.Parallel", "joblib.delayed"}  # of an unpickler, 
 MAX_LINES = 400
 FLOORS = {
     "mapctl": (
-        "blender contacts joint_ranges mesh numerics solver",
+        "blender contacts isolated joint_ranges mesh numerics solver",
         "kinematics",
         "formats",
         "curves retarget",

@@ -7,8 +7,7 @@ from os import PathLike
 from pathlib import Path
 
 from mapctl.errors import FileFormatError
-
-_MAX_NAMED = 8
+from mapctl.isolated.naming import find_name
 
 
 @dataclass(frozen=True)
@@ -38,12 +37,7 @@ def choose_name(path: Path, names: Sequence[str], wanted: str | None, what: str,
 
     FileFormatError lists the names where none is the wanted one, or several are there and one must be chosen.
     """
-    listed = ", ".join(repr(name) for name in names[:_MAX_NAMED]) + (" ..." if len(names) > _MAX_NAMED else "")
-    example = f"{path.name}#{names[0] if what == 'armature' else '/' + names[0]}" if names else ""
-    if wanted is not None:
-        if wanted in names:
-            return names.index(wanted)
-        raise FileFormatError(path, f"has no {what} {wanted!r}; it has {listed or 'none'}")
-    if len(names) > 1 and not several:
-        raise FileFormatError(path, f"has {len(names)} {what}s: {listed}; choose one, as {example}")
-    return 0
+    try:
+        return find_name(path.name, names, wanted, what, several=several)
+    except LookupError as error:
+        raise FileFormatError(path, error.args[0]) from None

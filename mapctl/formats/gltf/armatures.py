@@ -6,21 +6,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapctl.errors import FileFormatError
+from mapctl.formats.characters.bind_pose import complete_bind_pose
 from mapctl.formats.characters.names import make_unique
-from mapctl.formats.characters.rest_frames import (
-    RestFrames,
-    UnevenScaleError,
-    chain_matrices,
-    compose_matrices,
-    split_scale,
-)
+from mapctl.formats.characters.rest_frames import RestFrames, UnevenScaleError, chain_matrices, compose_matrices
 from mapctl.formats.gltf.accessors import read_accessor
 from mapctl.formats.gltf.container import GltfFile
 from mapctl.formats.gltf.schema import Node
 from mapctl.formats.gltf.vrm import is_vrm, read_humanoid
 
 Array = np.ndarray
-_BONE_SHARE = 0.02  # of a bone's length by which it may differ between bind pose and nodes
 _MAX_JOINTS = 4096
 
 
@@ -237,25 +231,7 @@ def _bind_worlds(gltf: GltfFile, armature: Armature, worlds: Array, outer: Array
                     gltf.path, f"skins[{number}]: the bind matrix of joint {node} is singular"
                 ) from None
     for space in (np.eye(4), outer):
-        found = _complete_bind(armature, {joint: space @ matrix for joint, matrix in bound.items()}, worlds)
+        found = complete_bind_pose(armature.parents, {joint: space @ matrix for joint, matrix in bound.items()}, worlds)
         if found is not None:
             return found
     return None
-
-
-def _complete_bind(armature: Armature, bound: dict[int, Array], worlds: Array) -> Array | None:
-    """Complete bind matrices by the nodes' own for joints that carry nothing; None unless all bones fit the nodes'."""
-    done = np.empty_like(worlds)
-    for joint, parent in enumerate(armature.parents):
-        above = np.eye(4) if parent < 0 else done[parent]
-        own = worlds[joint] if parent < 0 else np.linalg.inv(worlds[parent]) @ worlds[joint]
-        done[joint] = bound.get(joint, above @ own)
-        if parent >= 0:
-            length, usual = (np.linalg.norm(w[joint][:3, 3] - w[parent][:3, 3]) for w in (done, worlds))
-            if abs(length - usual) > _BONE_SHARE * max(usual, 0.02):
-                return None
-    try:
-        scales = [split_scale(matrix)[1] / split_scale(world)[1] for matrix, world in zip(done, worlds, strict=True)]
-    except UnevenScaleError:
-        return None
-    return done if np.allclose(scales, 1.0, rtol=1e-2) else None

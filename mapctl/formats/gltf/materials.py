@@ -1,6 +1,5 @@
 """Colours of a glTF mesh at its vertices: base colour of the material, its picture, and the vertices' own."""
 
-import io
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,9 +8,9 @@ from mapctl.errors import FileFormatError
 from mapctl.formats.gltf.accessors import read_accessor, read_view
 from mapctl.formats.gltf.container import GltfFile, read_neighbour
 from mapctl.formats.gltf.schema import Metallic, Primitive, TextureInfo
+from mapctl.isolated.pictures import decode_picture, decode_srgb, encode_srgb, sample_picture
 
 Array = np.ndarray
-_MAX_PIXELS = 2**26
 _WEBP = "EXT_texture_webp"
 
 
@@ -33,7 +32,7 @@ class Paint:
         linear = np.einsum("nc,nck->nk", shares, self.linear[corners])
         light = linear[:, :3]
         if self.places is not None and self.picture is not None:
-            texels = _look_up(self.picture, np.einsum("nc,nck->nk", shares, self.places[corners]))
+            texels = sample_picture(self.picture, np.einsum("nc,nck->nk", shares, self.places[corners]))
             light, linear[:, 3] = light * decode_srgb(texels[:, :3]), linear[:, 3] * texels[:, 3]
         rgba = np.column_stack([encode_srgb(light), linear[:, 3]])
         if not self.blended:
@@ -79,17 +78,6 @@ def read_paint(gltf: GltfFile, primitive: Primitive, count: int, what: str) -> P
     return Paint(linear, places, picture, blended)
 
 
-def encode_srgb(linear: Array) -> Array:
-    """Return sRGB of colours that are in proportion to light, 0 to 1."""
-    linear = np.clip(linear, 0.0, 1.0)
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-
-
-def decode_srgb(srgb: Array) -> Array:
-    """Undo `encode_srgb`."""
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-
-
 def _read_shown(gltf: GltfFile, primitive: Primitive, info: TextureInfo, count: int) -> tuple[Array, Array] | None:
     """Return where the vertices are in the picture, and the picture; None where it cannot be read."""
     name = f"TEXCOORD_{info.texCoord}"
@@ -102,14 +90,6 @@ def _read_shown(gltf: GltfFile, primitive: Primitive, info: TextureInfo, count: 
     if len(where) != count:
         raise FileFormatError(gltf.path, f"{name} has {len(where)} rows for {count} vertices")
     return where, picture
-
-
-def _look_up(picture: Array, where: Array) -> Array:
-    """Return the picture's colours at places (n, 2), (n, 4) sRGB, 0 to 1; beyond its edges it is repeated."""
-    height, width = picture.shape[:2]
-    column = np.floor(np.mod(where[:, 0], 1.0) * width).astype(int).clip(0, width - 1)
-    row = np.floor(np.mod(where[:, 1], 1.0) * height).astype(int).clip(0, height - 1)
-    return picture[row, column] / 255.0
 
 
 def _shrink(picture: Array, factor: int) -> Array:
@@ -130,18 +110,4 @@ def _read_picture(gltf: GltfFile, texture: int) -> Array | None:
     data = read_neighbour(gltf.path, image.uri) if image.uri is not None else None
     if data is None and image.bufferView is not None:
         data = bytes(read_view(gltf, image.bufferView))
-    return None if data is None else _decode_picture(data)
-
-
-def _decode_picture(data: bytes) -> Array | None:
-    try:
-        from PIL import Image
-    except ImportError:  # the extra `render` is not installed, and nothing will be drawn
-        return None
-    try:
-        with Image.open(io.BytesIO(data)) as opened:
-            if opened.width * opened.height > _MAX_PIXELS:
-                return None
-            return np.asarray(opened.convert("RGBA"))
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
-        return None
+    return None if data is None else decode_picture(data)

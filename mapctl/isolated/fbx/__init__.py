@@ -1,0 +1,1 @@
+"""FBX files by the package ufbx."""

@@ -1,0 +1,93 @@
+"""Animations of an FBX file (its takes, or stacks), read at the frames of the file's rate."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import ufbx
+
+from mapctl.isolated.child import Refusal, check_extent
+from mapctl.isolated.fbx.armatures import Armature
+from mapctl.isolated.fbx.scene import line_of
+from mapctl.isolated.naming import find_name, make_unique
+
+Array = np.ndarray
+_USUAL_RATE = 30.0
+_EARLY_SHARE = 0.02  # of a frame by which a take may end before it
+
+
+@dataclass(frozen=True, eq=False)
+class Take:
+    """Poses of an armature at the frames of one rate."""
+
+    name: str
+    """Name of the animation."""
+    rate: float
+    """Frames per second, as the file says."""
+    local: Array
+    """(frames, joints, 10) of each joint in its parent's frame: translation, rotation xyzw, scale."""
+    above: Array
+    """(frames or 1, nodes above the root, 10) likewise, the outermost first."""
+
+
+def read_take(scene: ufbx.Scene, armature: Armature, wanted: str | None, most_poses: int) -> Take | None:
+    """Read the wanted animation, or the first that moves the armature; None where none does."""
+    stacks = list(scene.anim_stacks)
+    names = make_unique([stack.name or f"take_{k}" for k, stack in enumerate(stacks)])
+    outer = line_of(armature.nodes[0])[:0:-1]
+    own = {node.element_id for node in [*armature.nodes, *outer]}
+    if wanted is not None:
+        try:
+            number = find_name("", names, wanted, "animation", several=True)
+        except LookupError as error:
+            raise Refusal(error.args[0]) from None
+        if not _moved_nodes(stacks[number]) & own:
+            raise Refusal(f"animation {wanted!r} does not move {armature.name!r}")
+        return _sample(scene, stacks[number], names[number], armature, outer, most_poses)
+    for stack, name in zip(stacks, names, strict=True):
+        if _moved_nodes(stack) & own:
+            return _sample(scene, stack, name, armature, outer, most_poses)
+    return None
+
+
+def _moved_nodes(stack: ufbx.AnimStack) -> set[int]:
+    """Return the elements whose transforms the animation moves."""
+    moved = ("Lcl Translation", "Lcl Rotation", "Lcl Scaling")
+    return {
+        prop.element.element_id
+        for layer in stack.layers
+        for prop in layer.anim_props
+        if prop.prop_name in moved or "Pivot" in prop.prop_name or "Offset" in prop.prop_name
+    }
+
+
+def _sample(
+    scene: ufbx.Scene, stack: ufbx.AnimStack, name: str, armature: Armature, outer: list[ufbx.Node], most_poses: int
+) -> Take:
+    rate = scene.settings.frames_per_second
+    rate = rate if np.isfinite(rate) and 0.01 <= rate <= 1e5 else _USUAL_RATE
+    begin, end = stack.time_begin, stack.time_end
+    if not (np.isfinite(begin) and np.isfinite(end)) or end < begin:
+        raise Refusal(f"animation {name!r} lasts from {begin:g} to {end:g} s")
+    count = np.floor((end - begin) * rate + _EARLY_SHARE) + 1
+    check_extent(int(min(count, 1e15)), len(armature.nodes) + len(outer), most_poses)
+    times = begin + np.arange(int(count)) / rate
+    moved = _moved_nodes(stack)
+    anim = stack.anim
+    local = np.stack([_sample_node(anim, node, times, moved) for node in armature.nodes], axis=1)
+    above = np.zeros((1, 0, 10))
+    if outer:
+        above = np.stack([_sample_node(anim, node, times, moved) for node in outer], axis=1)
+    return Take(name, rate, local, above if {node.element_id for node in outer} & moved else above[:1])
+
+
+def _sample_node(anim: ufbx.Anim, node: ufbx.Node, times: Array, moved: set[int]) -> Array:
+    if node.is_root:
+        return np.tile(transform_of(node.local_transform), (len(times), 1))
+    if node.element_id not in moved:
+        return np.tile(transform_of(ufbx.evaluate_transform(anim, node, float(times[0]))), (len(times), 1))
+    return np.array([transform_of(ufbx.evaluate_transform(anim, node, time)) for time in times.tolist()])
+
+
+def transform_of(transform: ufbx.Transform) -> tuple[float, ...]:
+    """Return translation, rotation xyzw and scale as ten numbers."""
+    return (*transform.translation, *transform.rotation, *transform.scale)
