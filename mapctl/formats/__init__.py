@@ -13,25 +13,23 @@ from mapctl.formats.missing import MissingValues
 from mapctl.mesh.character_mesh import CharacterMesh
 from mapctl.motion import Motion
 
+_USD_ENDINGS = (".usda", ".usdc", ".usd", ".usdz")
 READERS = {
     ".bvh": "bvh",
     ".npz": "npz",
     ".amc": "acclaim",
-    ".glb": "gltf",
-    ".gltf": "gltf",
-    ".vrm": "gltf",
+    **dict.fromkeys((".glb", ".gltf", ".vrm"), "gltf"),
+    **dict.fromkeys(_USD_ENDINGS, "usd"),
     ".fbx": "fbx",
 }
 """Endings that are read, each with its module of this package, which is imported when it is needed."""
 WRITERS = {".bvh": "bvh", ".npz": "npz", ".glb": "gltf", ".vrm": "gltf", **dict.fromkeys(usd.ENDINGS, "usd")}
 """Endings that are written, likewise."""
-CHARACTERS = (".glb", ".gltf", ".vrm", ".fbx")
+CHARACTERS = (".glb", ".gltf", ".vrm", *_USD_ENDINGS, ".fbx")
 """Endings of files of skinned characters, that have a rest pose of their own."""
 _MAY_LACK_VALUES = (".bvh", ".npz", ".amc")
-_UNREADABLE_REASONS = {
-    ".asf": "is a skeleton alone: name its motion, a .amc beside it or subject.asf+take.amc",
-    **dict.fromkeys(usd.ENDINGS, "can be written but not read"),
-}
+_ONLY_READ = (".fbx", ".gltf", ".usdz", ".amc")
+_UNREADABLE_REASONS = {".asf": "is a skeleton alone: name its motion, a .amc beside it or subject.asf+take.amc"}
 
 
 def load(
@@ -111,6 +109,7 @@ def check_ending(path: str | PathLike[str]) -> None:
     work."""
     ending = Path(path).suffix.lower()
     if ending not in WRITERS:
-        raise RequestError(f"cannot write {path}: unknown ending {ending!r}; allowed: {', '.join(WRITERS)}")
+        why = f"{ending} is read but not written" if ending in _ONLY_READ else f"unknown ending {ending!r}"
+        raise RequestError(f"cannot write {path}: {why}; allowed: {', '.join(WRITERS)}")
     if ending in usd.ENDINGS:
         usd.check_installed(path)

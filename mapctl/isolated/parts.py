@@ -1,4 +1,4 @@
-"""Parts of a character's mesh, as a file has them: what carries every vertex, in the frames of the file's own joints."""
+"""Parts of a character's mesh, as a file has them: what carries every vertex, in frames of the file's own joints."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields

@@ -76,7 +76,7 @@ def _find_bones(scene: ufbx.Scene) -> dict[int, ufbx.Node]:
 
 
 def _group(scene: ufbx.Scene, bones: dict[int, ufbx.Node]) -> list[list[ufbx.Node]]:
-    """Return the topmost joints of each armature: those that share a skin, or hang on one node and are no two bodies."""
+    """Return the topmost joints by armature: those that share a skin, or hang on one node and are no two bodies."""
     tops = [node for node in walk(scene.root_node) if node.typed_id in bones and node.parent.typed_id not in bones]
     top_of = {below.typed_id: k for k, top in enumerate(tops) for below in walk(top)}
     group = list(range(len(tops)))

@@ -1,0 +1,1 @@
+"""USD files by the package usd-core."""

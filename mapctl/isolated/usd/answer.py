@@ -1,0 +1,52 @@
+"""What is asked of a USD file, and answered."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pxr import Usd
+
+from mapctl.isolated.child import Array, Found
+from mapctl.isolated.parts import pack_parts
+from mapctl.isolated.usd.animations import read_animation
+from mapctl.isolated.usd.layers import open_stage
+from mapctl.isolated.usd.mesh import read_parts
+from mapctl.isolated.usd.output import write_character
+from mapctl.isolated.usd.skeletons import SkeletonPrim, choose_skeleton, stage_to_world, world_of
+
+
+def answer(request: Mapping[str, Any], given: Mapping[str, Array]) -> Found:
+    """Answer a request: `armature` and `animation` are what was chosen or None; `wanted` is `rest`, `motion`, `mesh` or
+    `write`; `most_poses` is the greatest number of frames times joints, `most_bytes` the greatest size of a layer."""
+    path, wanted = request["path"], request["wanted"]
+    stage = open_stage(path, request["most_bytes"])
+    if wanted == "write":
+        return dict(write_character(stage, request, given)), {}
+    name, skeleton = choose_skeleton(stage, Path(path).name, request["armature"])
+    said, tables = _describe(stage, name, skeleton)
+    if wanted == "motion":
+        found = read_animation(stage, skeleton, request["animation"], request["most_poses"])
+        if found is not None:
+            said |= {"animation": found.name, "per_second": stage.GetTimeCodesPerSecond()}
+            tables |= {"seconds": found.seconds, "local": found.local, "outers": found.outer}
+    if wanted == "mesh":
+        parts = read_parts(stage, skeleton, Path(path).resolve().parent)
+        said["parts"] = len(parts)
+        tables |= pack_parts(parts)
+    return said, tables
+
+
+def _describe(stage: Usd.Stage, name: str, skeleton: SkeletonPrim) -> Found:
+    tables = {"outer": world_of(skeleton.prim, Usd.TimeCode.EarliestTime()), "stage": stage_to_world(stage)}
+    for kind, table in (("bind", skeleton.bind), ("rest", skeleton.rest)):
+        if table is not None:
+            tables[kind] = np.ascontiguousarray(table)
+    said = {
+        "armature": name,
+        "path": str(skeleton.prim.GetPath()),
+        "joints": skeleton.joints,
+        "names": skeleton.names,
+        "parents": skeleton.parents,
+    }
+    return said, tables
