@@ -45,7 +45,7 @@ def load(path: str | PathLike[str]) -> Motion:
     check_size(chosen.file, outers)
     local = compose_transforms(chosen.file, interpolate(seconds, local, times))
     if len(outers) > 1:
-        outers = compose_transforms(chosen.file, interpolate(seconds, _split(chosen, outers), times))
+        outers = compose_transforms(chosen.file, interpolate(seconds, _split(chosen, outers), times))[:, 0]
     if len(frames.names) > local.shape[1]:
         local = np.concatenate([np.tile(np.eye(4), (len(times), 1, 1, 1)), local], axis=1)
     worlds = chain_matrices(frames.parents, local, outers)
