@@ -35,13 +35,7 @@ class Answer:
 
 
 def ask(
-    module: str,
-    path: str | PathLike[str],
-    request: Mapping[str, Any],
-    arrays: Mapping[str, np.ndarray] | None = None,
-    *,
-    seconds: float = SECONDS,
-    memory_bytes: int = MEMORY_BYTES,
+    module: str, path: str | PathLike[str], request: Mapping[str, Any], arrays: Mapping[str, np.ndarray] | None = None
 ) -> Answer:
     """Run `mapctl.isolated.MODULE` on the file `path`; `request` and `arrays` are what it gets besides.
 
@@ -51,8 +45,8 @@ def ask(
         given = Path(folder) / "request.npz"
         if arrays:
             np.savez(given, **arrays)
-        words = {"path": str(Path(path).absolute()), "folder": folder, "memory_bytes": memory_bytes, **request}
-        text = _run(f"mapctl.isolated.{module}", path, json.dumps(words), seconds)
+        words = {"path": str(Path(path).absolute()), "folder": folder, "memory_bytes": MEMORY_BYTES, **request}
+        text = _run(f"mapctl.isolated.{module}", path, json.dumps(words))
         said = _parse(text)
         if "refused" in said:
             raise FileFormatError(path, _one_line(said["refused"]))
@@ -65,15 +59,12 @@ def ask(
             return Answer(said, dict(held))
 
 
-def _run(module: str, path: str | PathLike[str], request: str, seconds: float) -> str:
+def _run(module: str, path: str | PathLike[str], request: str) -> str:
     """Return what the process writes; what libraries say on its standard error is for nobody."""
-    words = [sys.executable, "-P", "-m", module]
     try:
-        done = subprocess.run(
-            words, input=request.encode(), capture_output=True, timeout=seconds, env=_environment(), check=False
-        )
+        done = execute(module, request.encode())
     except subprocess.TimeoutExpired:
-        raise FileFormatError(path, f"cannot be read within {seconds:g} seconds") from None
+        raise FileFormatError(path, f"cannot be read within {SECONDS:g} seconds") from None
     if done.returncode == 0:
         return done.stdout.decode()
     if b"MemoryError" in done.stderr or b"bad_alloc" in done.stderr:
@@ -82,6 +73,12 @@ def _run(module: str, path: str | PathLike[str], request: str, seconds: float) -
         raise FileFormatError(path, f"cannot be read: it is broken in a way that ends its reader ({_name(done)})")
     last = done.stderr.decode(errors="replace").strip().splitlines()[-1:] or ["no reason given"]
     raise RuntimeError(f"{module} cannot run: {last[0]}")
+
+
+def execute(module: str, request: bytes) -> subprocess.CompletedProcess[bytes]:
+    """Run a module with a request on its standard input; TimeoutExpired where it takes too long."""
+    words = [sys.executable, "-P", "-m", module]
+    return subprocess.run(words, input=request, capture_output=True, timeout=SECONDS, env=_environment(), check=False)
 
 
 def _name(done: subprocess.CompletedProcess[bytes]) -> str:

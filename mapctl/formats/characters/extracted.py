@@ -37,7 +37,8 @@ def check_size(path: str | PathLike[str], worlds: Array) -> None:
 
 def frame_rate_of(rate: float) -> Fraction:
     """Return the exact frame rate behind one that a file says as a floating-point number: 29.97 is 30000/1001."""
-    return frame_rate(f"{1.0 / rate:.9f}") if rate > 1e-3 and 1.0 / rate > 1e-4 else Fraction(rate)
+    near = frame_rate(f"{1.0 / rate:.6f}") if 0.01 < rate < 1e4 else Fraction(rate)
+    return near if abs(float(near) / rate - 1.0) < 1e-5 else Fraction(rate).limit_denominator(10_000)
 
 
 def build_mesh(

@@ -65,7 +65,7 @@ def _sample(
 ) -> Take:
     rate = scene.settings.frames_per_second
     rate = rate if np.isfinite(rate) and 0.01 <= rate <= 1e5 else _USUAL_RATE
-    begin, end = stack.time_begin, stack.time_end
+    begin, end = _find_range(stack, {node.element_id for node in [*armature.nodes, *outer]})
     if not (np.isfinite(begin) and np.isfinite(end)) or end < begin:
         raise Refusal(f"animation {name!r} lasts from {begin:g} to {end:g} s")
     count = np.floor((end - begin) * rate + _EARLY_SHARE) + 1
@@ -78,6 +78,22 @@ def _sample(
     if outer:
         above = np.stack([_sample_node(anim, node, times, moved) for node in outer], axis=1)
     return Take(name, rate, local, above if {node.element_id for node in outer} & moved else above[:1])
+
+
+def _find_range(stack: ufbx.AnimStack, own: set[int]) -> tuple[float, float]:
+    """Return the first and last second that the animation says, else those of the keys of these elements."""
+    if stack.time_end > stack.time_begin:
+        return stack.time_begin, stack.time_end
+    curves = [
+        curve
+        for layer in stack.layers
+        for prop in layer.anim_props
+        if prop.element.element_id in own
+        for curve in prop.anim_value.curves
+        if curve is not None and len(curve.keyframes)
+    ]
+    times = [time for curve in curves for time in (curve.min_time, curve.max_time)]
+    return min(times, default=0.0), max(times, default=0.0)
 
 
 def _sample_node(anim: ufbx.Anim, node: ufbx.Node, times: Array, moved: set[int]) -> Array:

@@ -1,0 +1,197 @@
+"""FBX in: joints, rest pose and skin are where the files' makers have them."""
+
+import subprocess
+import sys
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+pytest.importorskip("ufbx", reason="needs ufbx: pip install 'mapctl[fbx]'")
+
+from fbx_maker import JOINTS, make_fbx
+from forked_readers import fork_readers
+from helpers import walk
+
+from mapctl import cli, formats, rotations
+from mapctl.errors import FileFormatError, RequestError
+from mapctl.formats.fbx import reader
+from mapctl.isolated import process
+from mapctl.retarget import figure
+from mapctl.retarget.carry import RiggedCharacter, retarget_motion
+
+KINDS = {
+    "plain": {},
+    "z-up": {"z_up": True},
+    "metres": {"unit_cm": 100.0, "version": 7700},
+    "inches": {"unit_cm": 2.54, "z_up": True, "version": 7100},
+    "scaled": {"scale": (2.0, 2.0, 2.0)},
+    "no-skin": {"skin": False, "rate": 120},
+}
+NEAR = dict(rtol=0, atol=1e-9)
+
+
+@pytest.fixture(autouse=True)
+def forked():
+    with fork_readers():
+        yield
+
+
+@pytest.fixture(params=KINDS)
+def kind(request):
+    return request.param
+
+
+def in_order(motion):
+    """Positions (frames, joints, 3) in the maker's order; those of a file go down one limb after the other."""
+    assert sorted(motion.skeleton.names) == sorted(JOINTS)
+    return motion.joint_positions()[:, [motion.skeleton.index(joint) for joint in JOINTS]].numpy()
+
+
+def test_a_clip_is_where_fbx_has_it(kind, tmp_path):
+    made = make_fbx(tmp_path / "a.fbx", **KINDS[kind])
+    motion = formats.load(tmp_path / "a.fbx")
+    assert (motion.fps, motion.num_frames) == (KINDS[kind].get("rate", 30), 6)
+    assert motion.source.animation == "Take 001"
+    np.testing.assert_allclose(in_order(motion), made.places, **NEAR)
+    assert not motion.moving_offsets
+
+
+def test_the_rest_pose_is_that_of_the_skin(kind, tmp_path):
+    made = make_fbx(tmp_path / "a.fbx", **KINDS[kind])
+    np.testing.assert_allclose(in_order(formats.load_rest(tmp_path / "a.fbx"))[0], made.bound, **NEAR)
+    if KINDS[kind].get("skin", True):
+        mesh = formats.load_mesh(tmp_path / "a.fbx")
+        np.testing.assert_allclose(mesh.vertices, made.vertices, **NEAR)
+        assert mesh.faces.shape[1] == 3 and np.allclose(mesh.weights.sum(axis=1), 1.0)
+    else:
+        with pytest.raises(FileFormatError, match="'Armature' carries no triangles"):
+            formats.load_mesh(tmp_path / "a.fbx")
+
+
+def test_skin_follows_its_joints(tmp_path):
+    """At a vertex that one joint carries alone."""
+    make_fbx(tmp_path / "a.fbx", z_up=True)
+    motion, mesh = formats.load(tmp_path / "a.fbx"), formats.load_mesh(tmp_path / "a.fbx")
+    vertex = int(np.argmax((mesh.weights[:, 0] > 1 - 1e-9) & (mesh.joints[:, 0] == motion.skeleton.index("head"))))
+    head = motion.skeleton.index("head")
+    start = np.linalg.norm(mesh.vertices[vertex] - mesh.rest[head])
+    turns = rotations.to_matrix(motion.joint_rotations()[3]).numpy()
+    posed = mesh.pose(motion.joint_positions()[3].numpy(), turns)[0]
+    assert np.linalg.norm(posed[vertex] - motion.joint_positions()[3, head].numpy()) == pytest.approx(start)
+
+
+@pytest.mark.parametrize("rate", [24, 25, 60])
+def test_the_files_rate(tmp_path, rate):
+    make_fbx(tmp_path / "a.fbx", rate=rate, frames=9)
+    motion = formats.load(tmp_path / "a.fbx")
+    assert (motion.fps, motion.num_frames) == (Fraction(rate), 9)
+
+
+def test_the_rate_of_television(tmp_path):
+    path = tmp_path / "a.fbx"
+    make_fbx(path)
+    path.write_text(path.read_text().replace('P: "TimeMode", "enum", "", "",6', 'P: "TimeMode", "enum", "", "",8'))
+    assert formats.load(path).fps == Fraction(30000, 1001)
+
+
+def test_a_take_without_a_range_lasts_as_its_keys(tmp_path):
+    path = tmp_path / "a.fbx"
+    wanted = make_fbx(path).places
+    lines = [line for line in path.read_text().splitlines() if "KTime" not in line or "KeyTime" in line]
+    path.write_text("\n".join(lines))
+    np.testing.assert_allclose(in_order(formats.load(path)), wanted, **NEAR)
+
+
+def test_takes_and_armatures_are_told_by_name(tmp_path):
+    path = tmp_path / "a.fbx"
+    make_fbx(path, takes=("Walk", "Run"))
+    assert [formats.load(f"{path}{choice}").source.animation for choice in ("", "#/Run", "#Armature/Walk")] == [
+        "Walk",
+        "Run",
+        "Walk",
+    ]
+    assert not np.allclose(in_order(formats.load(path)), in_order(formats.load(f"{path}#/Run")))
+    with pytest.raises(FileFormatError, match="has no animation 'Hop'; it has 'Walk', 'Run'"):
+        formats.load(f"{path}#/Hop")
+    make_fbx(path, names=("Hero", "Villain"))
+    with pytest.raises(FileFormatError, match=r"has 2 armatures: 'Hero', 'Villain'; choose one, as a.fbx#Hero"):
+        formats.load(path)
+    assert formats.load(f"{path}#Villain").num_frames == 6
+
+
+def test_without_takes_it_is_the_rest_pose(tmp_path):
+    make_fbx(tmp_path / "a.fbx", takes=())
+    assert formats.load(tmp_path / "a.fbx").num_frames == 1
+
+
+def test_it_is_a_rig(tmp_path):
+    """The rest pose is understood, and a motion is carried over; FBX itself is not written."""
+    make_fbx(tmp_path / "a.fbx", takes=())
+    body = RiggedCharacter.of(figure.load_standing_character(tmp_path / "a.fbx"))[1]
+    motion = body.on_rig(retarget_motion(walk(10), body).motion)
+    assert motion.num_frames == 10
+    with pytest.raises(RequestError, match=r"\.fbx is read but not written; allowed: "):
+        motion.save(tmp_path / "b.fbx")
+    motion.save(tmp_path / "b.bvh")
+
+
+BAD = {
+    "no fbx": (lambda text: "hello", "is no sound FBX file"),
+    "cut off": (lambda text: text[: len(text) // 2], "is no sound FBX file"),
+    "a version to come": (lambda text: text.replace("FBX 7.4.0", "FBX 9.9.0"), "is FBX 9.9, read are 3 to 7.7"),
+    "no limbs": (lambda text: text.split("Objects:")[0], "has no limb nodes and no skin"),
+    "uneven scale": (lambda text: text.replace('"Lcl Scaling", "", "A",1,1,1', '"Lcl Scaling", "", "A",1,2,1'), "not the same along all axes"),
+    "negative scale": (lambda text: text.replace('"Lcl Scaling", "", "A",1,1,1', '"Lcl Scaling", "", "A",-1,1,1'), "negative"),
+    "too long": (lambda text: text.replace(f'"LocalStop", "KTime", "Time", "",{5 * 46186158000 // 30}', f'"LocalStop", "KTime", "Time", "",{10**18}'), "allowed are 33554432"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", BAD)
+def test_bad_files_are_refused_in_one_line(fault, tmp_path, capfd):
+    path = tmp_path / "a.fbx"
+    make_fbx(path, skin=False)
+    change, words = BAD[fault]
+    path.write_text(change(path.read_text()))
+    assert cli.main(["convert", str(path), str(tmp_path / "out.bvh")]) == 2
+    told = capfd.readouterr()
+    assert told.err.count("\n") == 1 and words in told.err, told.err
+    assert not told.out and not (tmp_path / "out.bvh").exists()
+
+
+def test_a_missing_package_is_named(tmp_path, monkeypatch):
+    make_fbx(tmp_path / "a.fbx", skin=False)
+    monkeypatch.setattr(reader, "is_installed", lambda: False)
+    with pytest.raises(FileFormatError, match=r"pip install 'mapctl\[fbx\]'"):
+        formats.load(tmp_path / "a.fbx")
+
+
+class TestProcess:
+    """The process that reads, itself."""
+
+    @pytest.fixture(autouse=True)
+    def forked(self):
+        return
+
+    def test_it_answers(self, tmp_path):
+        made = make_fbx(tmp_path / "a.fbx", skin=False)
+        np.testing.assert_allclose(in_order(formats.load(tmp_path / "a.fbx")), made.places, **NEAR)
+
+    def test_its_memory_is_bounded(self, tmp_path, monkeypatch):
+        make_fbx(tmp_path / "a.fbx")
+        monkeypatch.setattr(process, "MEMORY_BYTES", 2**26)
+        with pytest.raises(FileFormatError, match="memory|ends its reader"):
+            formats.load(tmp_path / "a.fbx")
+
+    def test_its_time_is_bounded(self, tmp_path, monkeypatch):
+        make_fbx(tmp_path / "a.fbx")
+        monkeypatch.setattr(process, "SECONDS", 0.01)
+        with pytest.raises(FileFormatError, match=r"cannot be read within 0\.01 seconds"):
+            formats.load(tmp_path / "a.fbx")
+
+    def test_a_crash_is_a_refusal(self, tmp_path, monkeypatch):
+        make_fbx(tmp_path / "a.fbx", skin=False)
+        crash = [sys.executable, "-c", "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)"]
+        monkeypatch.setattr(process, "execute", lambda *_: subprocess.run(crash, capture_output=True, check=False))
+        with pytest.raises(FileFormatError, match=r"ends its reader \(SIGSEGV\)"):
+            formats.load(tmp_path / "a.fbx")
