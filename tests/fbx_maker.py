@@ -61,12 +61,15 @@ def make_fbx(
     names: Sequence[str] = ("Armature",),
     skin: bool = True,
     scale: Sequence[float] = (1.0, 1.0, 1.0),
+    parts: Sequence[str] = ("shirt", "skin", "trousers", "shoes"),
     seed: int = 0,
 ) -> MadeFbx:
     """Write a file of a person for each name, below a node of that name that is scaled by `scale`."""
     random, document = np.random.default_rng(seed), _Document()
     turn = _Z_UP if z_up else Rotation.identity()
-    made = [_add_person(document, random, n, turn, 0.01 * unit_cm, frames, rate, takes, skin, scale) for n in names]
+    made = [
+        _add_person(document, random, n, turn, 0.01 * unit_cm, frames, rate, takes, skin, scale, parts) for n in names
+    ]
     head = [
         f"; FBX {version // 1000}.{version // 100 % 10}.0 project file",
         f"FBXHeaderExtension:  {{\n\tFBXHeaderVersion: 1003\n\tFBXVersion: {version}\n}}",
@@ -87,7 +90,7 @@ def _axes(z_up: bool) -> dict[str, int]:
     return {"UpAxis": up, "FrontAxis": front, "CoordAxis": 0, **signs}
 
 
-def _add_person(document, random, name, turn, metres, frames, rate, takes, skin, scale) -> MadeFbx:
+def _add_person(document, random, name, turn, metres, frames, rate, takes, skin, scale, only) -> MadeFbx:
     top = document.add("Model", f"Model::{name}", "Null", _properties(("Lcl Scaling", scale)))
     size = 1.0 / scale[0]
     pre = Rotation.from_rotvec(random.uniform(-1, 1, (len(JOINTS), 3)))
@@ -112,7 +115,7 @@ def _add_person(document, random, name, turn, metres, frames, rate, takes, skin,
     tracks = [_add_take(document, random, take, limbs, offsets, frames, rate) for take in takes]
     places = _pose(*tracks[0], own, offsets, turn, metres / size) if tracks else np.zeros((0, len(JOINTS), 3))
     rests = np.array([PLACES[joint] for joint in JOINTS])
-    vertices = _add_skin(document, name, limbs, bound, turn, metres, scale[0]) if skin else np.zeros((0, 3))
+    vertices = _add_skin(document, name, limbs, bound, turn, metres, scale[0], only) if skin else np.zeros((0, 3))
     return MadeFbx(places, rests, vertices)
 
 
@@ -179,8 +182,8 @@ def _pose(angles, ways, own, offsets, turn, metres) -> np.ndarray:
     return turn.inv().apply(stacked.reshape(-1, 3)).reshape(stacked.shape)
 
 
-def _add_skin(document, name, limbs, bound, turn, metres, size) -> np.ndarray:
-    parts = build_parts(1)
+def _add_skin(document, name, limbs, bound, turn, metres, size, only) -> np.ndarray:
+    parts = [part for part in build_parts(1) if part.name in only]
     counts = np.cumsum([0, *(len(part.vertices) for part in parts)])
     points = np.concatenate([part.vertices for part in parts])
     faces = np.concatenate([part.faces + start for part, start in zip(parts, counts, strict=False)])

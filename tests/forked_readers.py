@@ -14,6 +14,8 @@ from contextlib import contextmanager
 
 from mapctl.isolated import child, process
 
+os.environ.setdefault("PXR_WORK_THREAD_LIMIT", "1")  # before USD is imported: a forked process has none of its threads
+
 
 @contextmanager
 def fork_readers() -> Iterator[None]:

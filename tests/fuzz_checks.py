@@ -10,6 +10,7 @@ from forged_characters import count_nodes
 
 from mapctl import formats
 from mapctl.curves.files import read_csv, read_svg
+from mapctl.errors import FileFormatError
 from mapctl.formats.bvh import text as bvh_text
 from mapctl.formats.bvh.layout import BvhLayout
 from mapctl.intent.steering_csv import read_commands
@@ -128,12 +129,37 @@ def check_character(path: Path) -> None:
     require(formats.load(again).num_frames == motion.num_frames, "written, it is another motion")
 
 
+def check_other_character(path: Path) -> None:
+    """As a clip, and as triangles where there are any; written again where that can be, it is the same motion."""
+    motion = formats.load(path)
+    check_motion(motion)
+    require(motion.num_joints <= 64, f"{motion.num_joints} joints")
+    try:
+        mesh = formats.load_mesh(path)
+    except FileFormatError:
+        return
+    require(bool(np.isfinite(mesh.vertices).all() and np.isfinite(mesh.rgba).all()), "a vertex is not finite")
+    require(len(mesh.faces) == 0 or mesh.faces.max() < len(mesh.vertices), "a face without vertices")
+    require(bool(mesh.joints.max() < motion.num_joints), "a vertex without a joint")
+    if path.suffix != ".fbx":
+        again = path.with_name(f"again{path.suffix}")
+        motion.save(again)
+        other = formats.load(again)
+        require(other.num_frames == motion.num_frames, "written, it is another motion")
+        far = float((other.joint_positions() - motion.joint_positions()).abs().max())
+        size = float(motion.joint_positions().abs().max())
+        require(far < 1e-4 * max(size, 1.0), f"written, joints are {far:g} m elsewhere")
+
+
+ISOLATED = ("usda", "usdc", "fbx")
+"""Kinds that are read in a process of its own."""
 READERS: dict[str, tuple[str, Callable[[Path], None]]] = {
     "bvh": ("x.bvh", check_bvh),
     "amc": ("x.amc", check_acclaim),
     "asf": ("x.amc", check_acclaim),
     "npz": ("x.npz", check_npz),
     "glb": ("x.glb", check_character),
+    **{kind: (f"x.{kind}", check_other_character) for kind in ISOLATED},
     "commands": ("x.csv", check_commands),
     "curve": ("x.csv", check_curve),
     "svg": ("x.svg", check_svg),

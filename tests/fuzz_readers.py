@@ -19,15 +19,20 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from acclaim import pair
 from character_maker import make_character_glb
+from fbx_binary import to_binary
+from fbx_maker import make_fbx
 from forged_characters import forge_glb
-from fuzz_checks import READERS, Broken, require
+from forked_readers import fork_readers
+from fuzz_checks import ISOLATED, READERS, Broken, require
 from mutations import mutated
+from usd_specimens import make_usd_specimens
 
 from mapctl import formats
 from mapctl.errors import MapctlError
@@ -106,7 +111,17 @@ def case(specimens: Sequence[Specimen], seed: int, number: int) -> tuple[Specime
         return specimen, _forged(specimen.raw, random)
     if specimen.kind == "glb" and random.random() < 0.7:
         return specimen, forge_glb(specimen.raw, random)
+    if specimen.kind in ("usdc", "fbx") and random.random() < 0.5:
+        return specimen, _with_bytes(specimen.raw, random)
     return specimen, mutated(specimen.raw, random)
+
+
+def _with_bytes(raw: bytes, random: np.random.Generator) -> bytes:
+    """A few bytes replaced, so that most of the file is still read."""
+    changed = bytearray(raw)
+    for _ in range(int(random.integers(1, 6))):
+        changed[int(random.integers(len(raw)))] = int(random.choice((0, 1, 127, 128, 255, random.integers(256))))
+    return bytes(changed)
 
 
 def _forged(raw: bytes, random: np.random.Generator) -> bytes:
@@ -206,6 +221,14 @@ def _made() -> Iterator[Specimen]:
         for number, look in enumerate(_CHARACTERS):
             made = make_character_glb(folder / "x.glb", **look, frames=5)
             yield Specimen(f"made-{number}.glb", "glb", made.path.read_bytes())
+        if find_spec("ufbx"):
+            for number, look in enumerate(_FBX):
+                make_fbx(folder / "x.fbx", **look, frames=3)
+                raw = (folder / "x.fbx").read_bytes()
+                yield Specimen(f"made-{number}.fbx", "fbx", raw)
+                yield Specimen(f"made-{number}-binary.fbx", "fbx", to_binary(raw.decode()))
+        for name, raw in make_usd_specimens(folder):
+            yield Specimen(name, name.rpartition(".")[2], raw)
     for number, (kind, text) in enumerate(_TABLES):
         yield Specimen(f"made-{number}.{kind}", kind, text.encode())
 
@@ -222,6 +245,11 @@ _CHARACTERS: tuple[dict[str, Any], ...] = (
     },
     {"names": "vrm0", "compact": True, "morphs": 1},
     {"matrices": True, "node_pose": "bent", "root": "root"},
+)
+_FBX: tuple[dict[str, Any], ...] = (
+    {"skin": False},
+    {"z_up": True, "parts": ("shoes",)},
+    {"takes": ("a", "b"), "parts": ("shoes",), "scale": (2.0, 2.0, 2.0)},
 )
 _TABLES = (
     ("commands", "time_s,speed_mps,heading_deg\n0,1.2,0\n2,0.5,90\n4.5,0,-90\n"),
@@ -249,12 +277,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("folders", nargs="*", type=Path, help="real files to mutate")
     parser.add_argument("--cases", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--kinds", nargs="*", help="kinds of files; all unless told otherwise")
     parser.add_argument("--only", type=int, help="one case of the seed")
     parser.add_argument("--keep", type=Path, help="folder for the files that were found")
     words = parser.parse_args(argv)
-    samples, tally, failed, start = specimens(words.folders), Counter(), 0, time.perf_counter()
+    samples = [s for s in specimens(words.folders) if words.kinds is None or s.kind in words.kinds]
+    tally, failed, start = Counter(), 0, time.perf_counter()
     numbers = range(words.cases) if words.only is None else [words.only]
-    with tempfile.TemporaryDirectory() as name:
+    with tempfile.TemporaryDirectory() as name, fork_readers():
         for number in numbers:
             specimen, raw = case(samples, words.seed, number)
             try:

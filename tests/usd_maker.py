@@ -37,6 +37,7 @@ def make_character_usd(
     blend_shape: bool = False,
     bind: bool = True,
     crate: bool = False,
+    parts: Sequence[str] = ("shirt", "skin", "trousers", "shoes"),
 ) -> Usd.Stage:
     """Write a person, one by name, and return the stage.
 
@@ -60,7 +61,7 @@ def make_character_usd(
         skeleton = _define_skeleton(stage, f"{root.GetPath()}/{name}", (pose, rest_pose or pose), along_y, turn, inner)
         if not bind:
             skeleton.GetBindTransformsAttr().Clear()
-        _define_mesh(stage, root, skeleton, pose, turn, inner, blend_shape)
+        _define_mesh(stage, root, skeleton, pose, turn, inner, blend_shape, parts)
         if frames:
             times = start + step * np.arange(frames)
             _define_animation(stage, skeleton, times, number, inner, blend_shape)
@@ -118,9 +119,10 @@ def _define_mesh(
     turn: Rotation,
     unit: float,
     blend_shape: bool,
+    only: Sequence[str],
 ) -> None:
     """The body in the pose in which it is bound, its parts as subsets with materials of their own."""
-    parts, turns = build_parts(1), pose_turns(pose)
+    parts, turns = [part for part in build_parts(1) if part.name in only], pose_turns(pose)
     rests, places = pose_places(pose_turns("T")), pose_places(turns)
     points, faces, weights = [], [], []
     for part in parts:

@@ -4,6 +4,7 @@ import gc
 import json
 import os
 import sys
+import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ def serve(answer: Callable[[Mapping[str, Any], Mapping[str, Array]], Found]) -> 
     request = json.loads(sys.stdin.read())
     _bound_memory(request["memory_bytes"])
     gc.disable()
+    warnings.simplefilter("ignore")  # numbers that are not finite are looked for once they are read
     folder = Path(request["folder"])
     try:
         said, tables = answer(request, _read_arrays(folder / "request.npz"))

@@ -9,6 +9,7 @@ import pytest
 
 pytest.importorskip("ufbx", reason="needs ufbx: pip install 'mapctl[fbx]'")
 
+from fbx_binary import to_binary
 from fbx_maker import JOINTS, make_fbx
 from forked_readers import fork_readers
 from helpers import walk
@@ -67,6 +68,15 @@ def test_the_rest_pose_is_that_of_the_skin(kind, tmp_path):
     else:
         with pytest.raises(FileFormatError, match="'Armature' carries no triangles"):
             formats.load_mesh(tmp_path / "a.fbx")
+
+
+@pytest.mark.parametrize("version", [7400, 7500])
+def test_binary_files(tmp_path, version):
+    made = make_fbx(tmp_path / "a.fbx", version=version, z_up=True)
+    (tmp_path / "b.fbx").write_bytes(to_binary((tmp_path / "a.fbx").read_text(), version))
+    motion = formats.load(tmp_path / "b.fbx")
+    np.testing.assert_allclose(in_order(motion), made.places, rtol=0, atol=1e-5)  # curves are in 32 bits there
+    np.testing.assert_allclose(formats.load_mesh(tmp_path / "b.fbx").vertices, made.vertices, **NEAR)
 
 
 def test_skin_follows_its_joints(tmp_path):

@@ -82,7 +82,8 @@ def _read_skeleton(chosen: CharacterPath, found: Answer) -> tuple[RestFrames, Sk
         if f"bound_{number}" in found.arrays:
             joints, matrices = found.arrays[f"bound_joints_{number}"], found.arrays[f"bound_{number}"]
             bound = dict(zip(joints.tolist(), matrices, strict=True))
-            worlds = complete_bind_pose(parents, bound, worlds) if np.isfinite(matrices).all() else None
+            check_size(chosen.file, matrices)
+            worlds = complete_bind_pose(parents, bound, worlds)
             if worlds is not None:
                 break
             worlds = found.arrays["worlds"]

@@ -137,6 +137,7 @@ def _choose_rest(chosen: CharacterPath, parents: tuple[int, ...], tables: dict[s
         assert rest is not None
         return rest
     bound = outer @ tables["bind"]
+    check_size(chosen.file, bound)
     if rest is None:
         return bound
     check_size(chosen.file, rest)

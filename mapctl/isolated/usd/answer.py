@@ -5,12 +5,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pxr import Usd
+from pxr import Tf, Usd
 
-from mapctl.isolated.child import Array, Found
+from mapctl.isolated.child import Array, Found, Refusal
 from mapctl.isolated.parts import pack_parts
 from mapctl.isolated.usd.animations import read_animation
-from mapctl.isolated.usd.layers import open_stage
+from mapctl.isolated.usd.layers import first_reason, open_stage
 from mapctl.isolated.usd.mesh import read_parts
 from mapctl.isolated.usd.output import write_character
 from mapctl.isolated.usd.skeletons import SkeletonPrim, choose_skeleton, stage_to_world, world_of
@@ -19,6 +19,13 @@ from mapctl.isolated.usd.skeletons import SkeletonPrim, choose_skeleton, stage_t
 def answer(request: Mapping[str, Any], given: Mapping[str, Array]) -> Found:
     """Answer a request: `armature` and `animation` are what was chosen or None; `wanted` is `rest`, `motion`, `mesh` or
     `write`; `most_poses` is the greatest number of frames times joints, `most_bytes` the greatest size of a layer."""
+    try:
+        return _answer(request, given)
+    except (Tf.ErrorException, UnicodeDecodeError) as error:
+        raise Refusal(f"is no sound USD file: {first_reason(error)}") from None
+
+
+def _answer(request: Mapping[str, Any], given: Mapping[str, Array]) -> Found:
     path, wanted = request["path"], request["wanted"]
     stage = open_stage(path, request["most_bytes"])
     if wanted == "write":

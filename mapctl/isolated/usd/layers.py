@@ -3,6 +3,7 @@
 # The package loads its modules at run time and declares no types.
 # pyright: reportAttributeAccessIssue=false
 
+import re
 from pathlib import Path
 
 from pxr import Ar, Sdf, Tf, Usd, UsdUtils
@@ -10,6 +11,7 @@ from pxr import Ar, Sdf, Tf, Usd, UsdUtils
 from mapctl.isolated.child import Refusal
 
 _MAX_LAYERS = 1000
+_REASON = re.compile(r"in file \S+ : '(.+?)'?\s*$", re.MULTILINE)
 ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
 """Endings of USD files."""
 
@@ -63,10 +65,10 @@ def is_inside(full: str, folder: Path) -> bool:
 
 
 def first_reason(error: Exception) -> str:
-    """Return the reason that USD's many lines of an error hold."""
-    lines = [line.strip() for line in str(error).splitlines() if line.strip() and "Error in '" not in line]
-    text = lines[0] if lines else str(error).strip()
-    return text.rpartition("]: ")[2].strip("' ")[:160] or "no reason given"
+    """Return the reason that USD's many lines of an error hold, in short."""
+    found = _REASON.search(str(error))
+    text = found[1] if found else str(error)
+    return " ".join(text.split())[:160] or "no reason given"
 
 
 def _named_layers(layer: Sdf.Layer) -> set[str]:
