@@ -4,6 +4,7 @@ need, each takes a twentieth of a second instead of one."""
 import importlib
 import io
 import os
+import resource
 import select
 import signal
 import subprocess
@@ -11,6 +12,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 from mapctl.isolated import child, process
 
@@ -18,20 +20,27 @@ os.environ.setdefault("PXR_WORK_THREAD_LIMIT", "1")  # before USD is imported: a
 
 
 @contextmanager
-def fork_readers() -> Iterator[None]:
-    """Have readers forked; where the system cannot, they are started as always."""
+def fork_readers(seconds: float = process.SECONDS) -> Iterator[None]:
+    """Have readers forked, with less time than they have; where the system cannot, they are started as always."""
     if not hasattr(os, "fork"):
         yield
         return
-    before = process.execute, process.MEMORY_BYTES
-    process.execute, process.MEMORY_BYTES = _fork, process.MEMORY_BYTES + 16 * 2**30  # what torch reserves is in it
+    before = process.execute, process.MEMORY_BYTES, process.SECONDS
+    process.execute, process.MEMORY_BYTES = _fork, process.MEMORY_BYTES + _reserved_bytes()
+    process.SECONDS = seconds
     try:
         yield
     finally:
-        process.execute, process.MEMORY_BYTES = before
+        process.execute, process.MEMORY_BYTES, process.SECONDS = before
 
 
-def _fork(module: str, request: bytes) -> subprocess.CompletedProcess[bytes]:
+def _reserved_bytes() -> int:
+    """Address space of this process, which is a forked one's too; on Linux."""
+    told = Path("/proc/self/statm")
+    return int(told.read_text().split()[0]) * resource.getpagesize() if told.exists() else 0
+
+
+def _fork(module: str, request: bytes, seconds: float) -> subprocess.CompletedProcess[bytes]:
     answer = importlib.import_module(f"{module}.answer").answer
     out, told = os.pipe()
     pid = os.fork()
@@ -47,7 +56,7 @@ def _fork(module: str, request: bytes) -> subprocess.CompletedProcess[bytes]:
             os._exit(1)
     os.close(told)
     try:
-        text = _read_all(out, time.monotonic() + process.SECONDS)
+        text = _read_all(out, time.monotonic() + seconds)
     except BaseException:
         os.kill(pid, signal.SIGKILL)
         os.waitpid(pid, 0)

@@ -284,7 +284,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     samples = [s for s in specimens(words.folders) if words.kinds is None or s.kind in words.kinds]
     tally, failed, start = Counter(), 0, time.perf_counter()
     numbers = range(words.cases) if words.only is None else [words.only]
-    with tempfile.TemporaryDirectory() as name, fork_readers():
+    with tempfile.TemporaryDirectory() as name, fork_readers(SLOWEST_SECONDS - 1.0):
         for number in numbers:
             specimen, raw = case(samples, words.seed, number)
             try:

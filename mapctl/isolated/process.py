@@ -18,8 +18,8 @@ from mapctl.errors import FileFormatError
 
 MEMORY_BYTES = 4 * 2**30
 """Most address space of such a process."""
-SECONDS = 600.0
-"""Most time that it may take."""
+SECONDS, SECONDS_PER_MEBIBYTE = 120.0, 2.0
+"""Most time that it may take: for any file, and besides by its size."""
 _LONGEST_MESSAGE = 300
 _PACKAGE_FOLDER = str(Path(__file__).resolve().parents[2])
 
@@ -46,7 +46,8 @@ def ask(
         if arrays:
             np.savez(given, **arrays)
         words = {"path": str(Path(path).absolute()), "folder": folder, "memory_bytes": MEMORY_BYTES, **request}
-        text = _run(f"mapctl.isolated.{module}", path, json.dumps(words))
+        seconds = SECONDS + SECONDS_PER_MEBIBYTE * Path(path).stat().st_size / 2**20
+        text = _run(f"mapctl.isolated.{module}", path, json.dumps(words), seconds)
         said = _parse(text)
         if "refused" in said:
             raise FileFormatError(path, _one_line(said["refused"]))
@@ -59,12 +60,12 @@ def ask(
             return Answer(said, dict(held))
 
 
-def _run(module: str, path: str | PathLike[str], request: str) -> str:
+def _run(module: str, path: str | PathLike[str], request: str, seconds: float) -> str:
     """Return what the process writes; what libraries say on its standard error is for nobody."""
     try:
-        done = execute(module, request.encode())
+        done = execute(module, request.encode(), seconds)
     except subprocess.TimeoutExpired:
-        raise FileFormatError(path, f"cannot be read within {SECONDS:g} seconds") from None
+        raise FileFormatError(path, f"cannot be read within {seconds:.0f} seconds") from None
     if done.returncode == 0:
         return done.stdout.decode()
     if b"MemoryError" in done.stderr or b"bad_alloc" in done.stderr:
@@ -75,10 +76,10 @@ def _run(module: str, path: str | PathLike[str], request: str) -> str:
     raise RuntimeError(f"{module} cannot run: {last[0]}")
 
 
-def execute(module: str, request: bytes) -> subprocess.CompletedProcess[bytes]:
+def execute(module: str, request: bytes, seconds: float) -> subprocess.CompletedProcess[bytes]:
     """Run a module with a request on its standard input; TimeoutExpired where it takes too long."""
     words = [sys.executable, "-P", "-m", module]
-    return subprocess.run(words, input=request, capture_output=True, timeout=SECONDS, env=_environment(), check=False)
+    return subprocess.run(words, input=request, capture_output=True, timeout=seconds, env=_environment(), check=False)
 
 
 def _name(done: subprocess.CompletedProcess[bytes]) -> str:

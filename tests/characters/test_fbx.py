@@ -195,8 +195,8 @@ class TestProcess:
 
     def test_its_time_is_bounded(self, tmp_path, monkeypatch):
         make_fbx(tmp_path / "a.fbx")
-        monkeypatch.setattr(process, "SECONDS", 0.01)
-        with pytest.raises(FileFormatError, match=r"cannot be read within 0\.01 seconds"):
+        monkeypatch.setattr(process, "SECONDS", -0.5)
+        with pytest.raises(FileFormatError, match=r"cannot be read within \d seconds"):
             formats.load(tmp_path / "a.fbx")
 
     def test_a_crash_is_a_refusal(self, tmp_path, monkeypatch):

@@ -14,6 +14,7 @@ from mapctl.mesh.character_mesh import CharacterMesh, compute_normals, merge_mes
 
 Array = np.ndarray
 _FARTHEST = 1e6
+_LARGEST = 1e12  # whatever the unit
 _MAX_VERTICES = 2**23
 
 
@@ -55,6 +56,9 @@ def _build_part(path: str | PathLike[str], part: MeshPart, frames: RestFrames) -
     count = len(part.points)
     if count > _MAX_VERTICES:
         raise FileFormatError(path, f"a mesh has {count} vertices, allowed are {_MAX_VERTICES}")
+    for table in (part.points, part.matrices, part.rgba):
+        if not np.isfinite(table).all() or np.abs(table).max(initial=0.0) > _LARGEST:
+            raise FileFormatError(path, "its mesh holds numbers that are not finite, or too large")
     if part.faces.min() < 0 or part.faces.max() >= count:
         raise FileFormatError(path, f"a triangle names vertex {part.faces.max()} of {count}")
     if part.rows.min() < 0 or part.rows.max() >= len(part.joints):
