@@ -28,6 +28,7 @@ _EXTRAS = {
     "render": {"pyrender", "trimesh", "OpenGL", "av", "PIL", "matplotlib"},
     "live": {"viser"},
     "usd": {"pxr"},
+    "fbx": {"ufbx"},
     "stream": {"pythonosc"},
     "cluster": {"ray"},
 }

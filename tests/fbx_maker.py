@@ -145,7 +145,7 @@ def _table(name: str, numbers, form: str = ".17g") -> str:
 
 
 def _add_take(document, random, take, limbs, offsets, frames, rate):
-    """Keys of all rotations and of the hips' place; returns angles (frames, joints, 3), degrees, and the hips' places."""
+    """Keys of all rotations and of the hips' place; angles (frames, joints, 3), degrees, and the hips' places."""
     stop = (frames - 1) * TICKS // rate
     times = [frame * TICKS // rate for frame in range(frames)]
     ends = {"LocalStart": 0, "LocalStop": stop, "ReferenceStart": 0, "ReferenceStop": stop}

@@ -91,9 +91,7 @@ def add_body(armature) -> None:
     for bone in armature.data.bones:
         middle = (bone.head_local + bone.tail_local) / 2
         base = len(points)
-        points += [
-            tuple(middle + Vector((x, y, z)) * 0.06) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)
-        ]
+        points += [tuple(middle + Vector((x, y, z)) * 0.06) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
         sides = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
         faces += [tuple(base + corner for corner in side) for side in sides]
         owners += [bone.name] * 8

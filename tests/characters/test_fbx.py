@@ -1,5 +1,6 @@
 """FBX in: joints, rest pose and skin are where the files' makers have them."""
 
+import re
 import subprocess
 import sys
 from fractions import Fraction
@@ -64,7 +65,7 @@ def test_the_rest_pose_is_that_of_the_skin(kind, tmp_path):
     if KINDS[kind].get("skin", True):
         mesh = formats.load_mesh(tmp_path / "a.fbx")
         np.testing.assert_allclose(mesh.vertices, made.vertices, **NEAR)
-        assert mesh.faces.shape[1] == 3 and np.allclose(mesh.weights.sum(axis=1), 1.0)
+        np.testing.assert_allclose(mesh.weights.sum(axis=1), 1.0)
     else:
         with pytest.raises(FileFormatError, match="'Armature' carries no triangles"):
             formats.load_mesh(tmp_path / "a.fbx")
@@ -146,27 +147,33 @@ def test_it_is_a_rig(tmp_path):
     motion.save(tmp_path / "b.bvh")
 
 
+STOP = '"LocalStop", "KTime", "Time", "",'
+SCALING = '"Lcl Scaling", "", "A",'
 BAD = {
-    "no fbx": (lambda text: "hello", "is no sound FBX file"),
-    "cut off": (lambda text: text[: len(text) // 2], "is no sound FBX file"),
-    "a version to come": (lambda text: text.replace("FBX 7.4.0", "FBX 9.9.0"), "is FBX 9.9, read are 3 to 7.7"),
-    "no limbs": (lambda text: text.split("Objects:")[0], "has no limb nodes and no skin"),
-    "uneven scale": (lambda text: text.replace('"Lcl Scaling", "", "A",1,1,1', '"Lcl Scaling", "", "A",1,2,1'), "not the same along all axes"),
-    "negative scale": (lambda text: text.replace('"Lcl Scaling", "", "A",1,1,1', '"Lcl Scaling", "", "A",-1,1,1'), "negative"),
-    "too long": (lambda text: text.replace(f'"LocalStop", "KTime", "Time", "",{5 * 46186158000 // 30}', f'"LocalStop", "KTime", "Time", "",{10**18}'), "allowed are 33554432"),
-}  # fmt: skip
+    "no fbx": (r".*", "hello", "is no sound FBX file"),
+    "cut off": (r"Connections:.*", "", "has no limb nodes"),
+    "broken": (r"a: .*", "a: 1,2,", "is no sound FBX file"),
+    "a version to come": ("FBX 7.4.0", "FBX 9.9.0", "is FBX 9.9, read are 3 to 7.7"),
+    "no limbs": (r"Objects:.*", "", "has no limb nodes and no skin"),
+    "uneven scale": (f"{SCALING}1,1,1", f"{SCALING}1,2,1", "not the same along all axes"),
+    "negative scale": (f"{SCALING}1,1,1", f"{SCALING}-1,1,1", "negative"),
+    "too long": (STOP + r"\d+", f"{STOP}{10**18}", "allowed are 33554432"),
+}
+"""Pattern in a sound file, what stands in its place, and words of the message."""
 
 
 @pytest.mark.parametrize("fault", BAD)
 def test_bad_files_are_refused_in_one_line(fault, tmp_path, capfd):
     path = tmp_path / "a.fbx"
     make_fbx(path, skin=False)
-    change, words = BAD[fault]
-    path.write_text(change(path.read_text()))
+    pattern, instead, words = BAD[fault]
+    path.write_text(re.sub(pattern, instead, path.read_text(), count=1, flags=re.DOTALL))
     assert cli.main(["convert", str(path), str(tmp_path / "out.bvh")]) == 2
     told = capfd.readouterr()
-    assert told.err.count("\n") == 1 and words in told.err, told.err
-    assert not told.out and not (tmp_path / "out.bvh").exists()
+    assert told.err.count("\n") == 1, told.err
+    assert words in told.err
+    assert not told.out
+    assert not (tmp_path / "out.bvh").exists()
 
 
 def test_a_missing_package_is_named(tmp_path, monkeypatch):
@@ -190,7 +197,7 @@ class TestProcess:
     def test_its_memory_is_bounded(self, tmp_path, monkeypatch):
         make_fbx(tmp_path / "a.fbx")
         monkeypatch.setattr(process, "MEMORY_BYTES", 2**26)
-        with pytest.raises(FileFormatError, match="memory|ends its reader"):
+        with pytest.raises(FileFormatError, match=r"memory|ends its reader"):
             formats.load(tmp_path / "a.fbx")
 
     def test_its_time_is_bounded(self, tmp_path, monkeypatch):

@@ -33,7 +33,8 @@ def load(path: str | PathLike[str]) -> Motion:
     is bound to it.
 
     `path` may end as `#SKELETON`, `#SKELETON/ANIMATION` or `#/ANIMATION`; a file of several skeletons is refused,
-    naming them. Joint frames are aligned with the world in the rest pose. FileFormatError says what is wrong with the file.
+    naming them. Joint frames are aligned with the world in the rest pose. FileFormatError says what is wrong with the
+    file.
     """
     chosen, found = _ask(path, "motion")
     frames = _read_frames(chosen, found)
