@@ -33,7 +33,7 @@ def serve(answer: Callable[[Mapping[str, Any], Mapping[str, Array]], Found]) -> 
     try:
         said, tables = answer(request, _read_arrays(folder / "request.npz"))
         if tables:
-            np.savez(folder / "answer.npz", **tables)
+            np.savez(folder / "answer.npz", allow_pickle=False, **tables)
     except Refusal as refusal:
         said = {"refused": str(refusal.args[0])}
     except MemoryError:

@@ -44,7 +44,7 @@ def ask(
     with tempfile.TemporaryDirectory(prefix="mapctl-") as folder:
         given = Path(folder) / "request.npz"
         if arrays:
-            np.savez(given, **arrays)
+            np.savez(given, allow_pickle=False, **arrays)
         words = {"path": str(Path(path).absolute()), "folder": folder, "memory_bytes": MEMORY_BYTES, **request}
         seconds = SECONDS + SECONDS_PER_MEBIBYTE * Path(path).stat().st_size / 2**20
         text = _run(f"mapctl.isolated.{module}", path, json.dumps(words), seconds)

@@ -86,7 +86,7 @@ def interpolate(keys: Array, values: Array, times: Array) -> Array:
     turns = [torch.from_numpy(np.ascontiguousarray(table[..., 3:7])).reshape(-1, 4) for table in (low, high)]
     shares = torch.from_numpy(np.repeat(share, values.shape[1]))
     units = [turn / turn.norm(dim=-1, keepdim=True).clamp_min(1e-12) for turn in turns]
-    done[..., 3:7] = rotations.slerp(*units, shares).numpy().reshape(*low.shape[:2], 4)
+    done[..., 3:7] = rotations.slerp(units[0], units[1], shares).numpy().reshape(*low.shape[:2], 4)
     return done
 
 

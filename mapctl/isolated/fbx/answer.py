@@ -10,7 +10,7 @@ import ufbx
 from mapctl.isolated.child import Array, Found, Refusal
 from mapctl.isolated.fbx.armatures import Armature, find_armatures, read_bind_poses
 from mapctl.isolated.fbx.mesh import read_parts
-from mapctl.isolated.fbx.scene import open_scene, to_matrix
+from mapctl.isolated.fbx.scene import above, open_scene, to_matrix
 from mapctl.isolated.fbx.takes import read_take
 from mapctl.isolated.naming import find_name
 from mapctl.isolated.parts import pack_parts
@@ -44,7 +44,7 @@ def _describe(scene: ufbx.Scene, armature: Armature) -> Found:
     """Return names and parents of the joints, their world matrices, and those of the poses that skins are bound in."""
     worlds = np.stack([to_matrix(node.node_to_world) for node in armature.nodes])
     root = armature.nodes[0]
-    outer = np.eye(4) if root.is_root else to_matrix(root.parent.node_to_world)
+    outer = np.eye(4) if root.is_root else to_matrix(above(root).node_to_world)
     tables = {"worlds": worlds, "outer": outer}
     for number, bound in enumerate(read_bind_poses(scene, armature)):
         tables[f"bound_joints_{number}"] = np.array(list(bound), np.int64)

@@ -6,7 +6,7 @@ import numpy as np
 import ufbx
 
 from mapctl.isolated.child import Refusal
-from mapctl.isolated.fbx.scene import line_of, to_matrix, walk
+from mapctl.isolated.fbx.scene import above, line_of, to_matrix, walk
 from mapctl.isolated.naming import make_unique
 
 Array = np.ndarray
@@ -69,15 +69,15 @@ def _find_bones(scene: ufbx.Scene) -> dict[int, ufbx.Node]:
         if cluster.bone_node is not None and not cluster.bone_node.is_root:
             found[cluster.bone_node.typed_id] = cluster.bone_node
     for node in list(found.values()):
-        above = line_of(node)
-        last = max((k for k, other in enumerate(above) if other.typed_id in found), default=0)
-        found.update({other.typed_id: other for other in above[:last]})
+        line = line_of(node)
+        last = max((k for k, other in enumerate(line) if other.typed_id in found), default=0)
+        found.update({other.typed_id: other for other in line[:last]})
     return found
 
 
 def _group(scene: ufbx.Scene, bones: dict[int, ufbx.Node]) -> list[list[ufbx.Node]]:
     """Return the topmost joints by armature: those that share a skin, or hang on one node and are no two bodies."""
-    tops = [node for node in walk(scene.root_node) if node.typed_id in bones and node.parent.typed_id not in bones]
+    tops = [node for node in walk(scene.root_node) if node.typed_id in bones and above(node).typed_id not in bones]
     top_of = {below.typed_id: k for k, top in enumerate(tops) for below in walk(top)}
     group = list(range(len(tops)))
 
@@ -93,7 +93,7 @@ def _group(scene: ufbx.Scene, bones: dict[int, ufbx.Node]) -> list[list[ufbx.Nod
     sizes = [sum(below.typed_id in bones for below in walk(top)) for top in tops]
     for first in range(len(tops)):
         for second in range(first + 1, len(tops)):
-            same = tops[first].parent.typed_id == tops[second].parent.typed_id and not tops[first].parent.is_root
+            same = above(tops[first]).typed_id == above(tops[second]).typed_id and not above(tops[first]).is_root
             if same and min(sizes[first], sizes[second]) < _BODY_JOINTS:
                 join(first, second)
     return [[top for top, own in zip(tops, group, strict=True) if own == one] for one in dict.fromkeys(group)]
@@ -103,14 +103,14 @@ def _build(scene: ufbx.Scene, tops: list[ufbx.Node], bones: dict[int, ufbx.Node]
     root = tops[0] if len(tops) == 1 else _common_node(scene, tops)
     lines = {node.typed_id for top in tops for node in line_of(top)}
     joints = [node for node in walk(root) if node.typed_id in bones or node.typed_id in lines or node is root]
-    ends = {node.parent.typed_id: node for node in joints if _is_end(node) and node is not root}
+    ends = {above(node).typed_id: node for node in joints if _is_end(node) and node is not root}
     joints = [node for node in joints if not (node is not root and _is_end(node))]
     if len(joints) > MAX_JOINTS:
         raise Refusal(f"has an armature of {len(joints)} joints, allowed are {MAX_JOINTS}")
     place = {node.typed_id: index for index, node in enumerate(joints)}
-    parents = [-1 if node is root else place[node.parent.typed_id] for node in joints]
-    above = "" if root.is_root or root.parent.is_root else root.parent.name
-    name = above or root.name or "armature"
+    parents = [-1 if node is root else place[above(node).typed_id] for node in joints]
+    holder = "" if root.is_root or above(root).is_root else above(root).name
+    name = holder or root.name or "armature"
     return Armature(name, joints, parents, {place[number]: node for number, node in ends.items()})
 
 
@@ -129,6 +129,6 @@ def _is_end(node: ufbx.Node) -> bool:
     return (
         node.name.lower().endswith("_end")
         and len(node.children) == 0
-        and not node.parent.is_root
-        and len(node.parent.children) == 1
+        and not above(node).is_root
+        and len(above(node).children) == 1
     )

@@ -54,12 +54,19 @@ def walk(node: ufbx.Node) -> Iterator[ufbx.Node]:
         waiting += reversed(list(one.children))
 
 
+def above(node: ufbx.Node) -> ufbx.Node:
+    """Return the node above one that is not the scene's root."""
+    found = node.parent
+    assert found is not None
+    return found
+
+
 def line_of(node: ufbx.Node) -> list[ufbx.Node]:
     """Return a node and all above it but the scene's root."""
     found = []
     while not node.is_root:
         found.append(node)
-        node = node.parent
+        node = above(node)
     return found
 
 

@@ -1,5 +1,8 @@
 """What is asked of a USD file, and answered."""
 
+# The package loads its modules at run time and declares no types.
+# pyright: reportAttributeAccessIssue=false
+
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
