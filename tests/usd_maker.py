@@ -44,8 +44,8 @@ def make_character_usd(
     Lengths are in `unit` metres; with `up` Z the body stands along Z. `pose` is that in which the skin is bound,
     `rest_pose` the skeleton's rest pose, the same if not given, `bind` False leaves the former out. `placed` says how
     the prim above the skeleton is: still, moved (turned and scaled by 2, the body being half as large in it), or
-    animated. With `frames` an animation of random turns is bound, one sample every `step` time codes from `start` on, `rate` of
-    which are a second. `blend_shape` adds a morph, and moves it; `crate` a further prim that moves.
+    animated. With `frames` an animation of random turns is bound, one sample every `step` time codes from `start` on,
+    `rate` of which are a second. `blend_shape` adds a morph, and moves it; `crate` a further prim that moves.
     """
     stage = Usd.Stage.CreateNew(str(path))
     UsdGeom.SetStageUpAxis(stage, up)

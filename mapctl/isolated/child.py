@@ -11,6 +11,11 @@ from typing import Any
 
 import numpy as np
 
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None
+
 Array = np.ndarray
 Found = tuple[dict[str, Any], dict[str, Array]]
 """What is said of a file, and tables by name."""
@@ -46,9 +51,7 @@ def serve(answer: Callable[[Mapping[str, Any], Mapping[str, Array]], Found]) -> 
 
 def _bound_memory(count: int) -> None:
     """Bound the address space, where the system can (not on Windows), and leave no file where it crashes."""
-    try:
-        import resource
-    except ImportError:
+    if resource is None:
         return
     resource.setrlimit(resource.RLIMIT_AS, (count, count))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))

@@ -8,7 +8,8 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 from acclaim import Bone, Pair, assert_same_places
-from fuzz_readers import READERS, Specimen, case, main, run_case, specimens
+from forked_readers import fork_readers
+from fuzz_readers import READERS, SLOWEST_SECONDS, Specimen, case, main, run_case, specimens
 from hypothesis import given, settings
 from lossy_files import GOOD
 
@@ -21,6 +22,13 @@ from mapctl.intent.steering_csv import read_commands
 from mapctl.recording.masks import Mask, load_masks
 
 FEW = settings(max_examples=40, derandomize=True)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def forked():
+    """Readers in processes of their own start in no time."""
+    with fork_readers(SLOWEST_SECONDS - 1.0):
+        yield
 
 
 @pytest.fixture(scope="module")

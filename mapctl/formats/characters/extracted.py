@@ -7,7 +7,7 @@ from os import PathLike
 import numpy as np
 
 from mapctl.errors import FileFormatError
-from mapctl.formats.characters.rest_frames import RestFrames, compose_matrices
+from mapctl.formats.characters.rest_frames import RestFrames, chain_matrices, compose_matrices
 from mapctl.formats.frame_rate import frame_rate
 from mapctl.isolated.parts import MeshPart
 from mapctl.mesh.character_mesh import CharacterMesh, compute_normals, merge_meshes
@@ -33,7 +33,16 @@ def compose_transforms(path: str | PathLike[str], transforms: Array) -> Array:
 def check_size(path: str | PathLike[str], worlds: Array) -> None:
     """Raise FileFormatError unless matrices (..., 4, 4) are finite and within 1000 km."""
     if not np.isfinite(worlds).all() or np.abs(worlds).max(initial=0.0) > _FARTHEST:
-        raise FileFormatError(path, "its rest pose holds numbers that are not finite, or larger than 1000 km")
+        raise FileFormatError(path, "its joints are at places that are not finite, or larger than 1000 km")
+
+
+def place_joints(path: str | PathLike[str], parents: tuple[int, ...], local: Array, outer: Array) -> Array:
+    """Return world matrices (..., joints, 4, 4) of local ones, as `chain_matrices`. FileFormatError where they are not
+    finite, or larger than 1000 km."""
+    with np.errstate(all="ignore"):
+        worlds = chain_matrices(parents, local, outer)
+    check_size(path, worlds)
+    return worlds
 
 
 def frame_rate_of(rate: float) -> Fraction:

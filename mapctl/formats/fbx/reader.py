@@ -8,8 +8,8 @@ import numpy as np
 
 from mapctl.errors import FileFormatError
 from mapctl.formats.characters.bind_pose import complete_bind_pose
-from mapctl.formats.characters.extracted import build_mesh, check_size, compose_transforms, frame_rate_of
-from mapctl.formats.characters.rest_frames import RestFrames, UnevenScaleError, chain_matrices
+from mapctl.formats.characters.extracted import build_mesh, check_size, compose_transforms, frame_rate_of, place_joints
+from mapctl.formats.characters.rest_frames import RestFrames, UnevenScaleError
 from mapctl.formats.characters.selector import CharacterPath, parse_character_path
 from mapctl.formats.characters.source import CharacterSource, stamp_file
 from mapctl.formats.text import MAX_POSES, check_ordinary
@@ -43,7 +43,7 @@ def load(path: str | PathLike[str]) -> Motion:
     for one in np.moveaxis(compose_transforms(chosen.file, found.arrays["above"]), 1, 0):
         outer = outer @ one
     local = compose_transforms(chosen.file, found.arrays["local"])
-    worlds = chain_matrices(frames.parents, local, outer)
+    worlds = place_joints(chosen.file, frames.parents, local, outer)
     fps = frame_rate_of(found.said["rate"])
     return frames.to_motion(worlds, fps, skeleton, _source(chosen, frames, found.said["animation"]))
 

@@ -9,10 +9,10 @@ import torch
 from mapctl import rotations
 from mapctl.errors import FileFormatError
 from mapctl.formats.characters.bind_pose import complete_bind_pose
-from mapctl.formats.characters.extracted import build_mesh, check_size, compose_transforms, frame_rate_of
+from mapctl.formats.characters.extracted import build_mesh, check_size, compose_transforms, frame_rate_of, place_joints
 from mapctl.formats.characters.key_times import sample_times
 from mapctl.formats.characters.names import make_unique
-from mapctl.formats.characters.rest_frames import RestFrames, UnevenScaleError, chain_matrices, split_scale
+from mapctl.formats.characters.rest_frames import RestFrames, UnevenScaleError, split_scale
 from mapctl.formats.characters.selector import CharacterPath, parse_character_path
 from mapctl.formats.characters.source import CharacterSource, stamp_file
 from mapctl.formats.text import MAX_FILE_BYTES, MAX_POSES, check_extent, check_ordinary
@@ -41,15 +41,14 @@ def load(path: str | PathLike[str]) -> Motion:
     if "local" not in found.arrays:
         return _rest_motion(chosen, found, frames)
     seconds, local, outers = (found.arrays[name] for name in ("seconds", "local", "outers"))
-    fps, times = _choose_times(seconds, found.said["per_second"])
-    check_extent(chosen.file, len(times), len(frames.names))
+    fps, times = _choose_times(chosen, seconds, found.said["per_second"], len(frames.names))
     check_size(chosen.file, outers)
     local = compose_transforms(chosen.file, interpolate(seconds, local, times))
     if len(outers) > 1:
         outers = compose_transforms(chosen.file, interpolate(seconds, _split(chosen, outers), times))[:, 0]
     if len(frames.names) > local.shape[1]:
         local = np.concatenate([np.tile(np.eye(4), (len(times), 1, 1, 1)), local], axis=1)
-    worlds = chain_matrices(frames.parents, local, outers)
+    worlds = place_joints(chosen.file, frames.parents, local, outers)
     source = _source(chosen, found, frames, found.said["animation"])
     return frames.to_motion(worlds, fps, frames.skeleton({}), source)
 
@@ -90,13 +89,18 @@ def interpolate(keys: Array, values: Array, times: Array) -> Array:
     return done
 
 
-def _choose_times(seconds: Array, per_second: float) -> tuple[Fraction, Array]:
-    """Return frames per second and the frames' times: the time codes, where all samples lie on them."""
+def _choose_times(chosen: CharacterPath, seconds: Array, per_second: float, joints: int) -> tuple[Fraction, Array]:
+    """Return frames per second and the frames' times: the time codes, where all samples lie on them. FileFormatError
+    where there would be too many."""
+    check_extent(chosen.file, int(min(seconds[-1] - seconds[0], 1e15)), joints)
     codes = seconds * per_second
     if per_second <= _FASTEST_CODES and np.abs(codes - np.rint(codes)).max() < 1e-4:
-        count = round(codes[-1]) - round(codes[0]) + 1
+        count = int(min(np.rint(codes[-1]) - np.rint(codes[0]) + 1, 1e15))
+        check_extent(chosen.file, count, joints)
         return frame_rate_of(per_second), (round(codes[0]) + np.arange(count)) / per_second
-    return sample_times(seconds)
+    fps, times = sample_times(seconds)
+    check_extent(chosen.file, len(times), joints)
+    return fps, times
 
 
 def _ask(path: str | PathLike[str], wanted: str) -> tuple[CharacterPath, Answer]:
@@ -133,15 +137,15 @@ def _read_frames(chosen: CharacterPath, found: Answer) -> RestFrames:
 
 
 def _choose_rest(chosen: CharacterPath, parents: tuple[int, ...], tables: dict[str, Array], outer: Array) -> Array:
-    rest = chain_matrices(parents, tables["rest"], outer) if "rest" in tables else None
+    for kind in ("bind", "rest"):
+        check_size(chosen.file, tables.get(kind, outer))
+    rest = place_joints(chosen.file, parents, tables["rest"], outer) if "rest" in tables else None
     if "bind" not in tables:
         assert rest is not None
         return rest
     bound = outer @ tables["bind"]
-    check_size(chosen.file, bound)
     if rest is None:
         return bound
-    check_size(chosen.file, rest)
     for space in (outer, tables["stage"]):
         found = complete_bind_pose(parents, dict(enumerate(space @ tables["bind"])), rest)
         if found is not None:
