@@ -4,12 +4,15 @@ import re
 import shlex
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import pytest
 from acclaim import pair
 from character_maker import make_character_glb
+from fbx_maker import make_fbx
+from forked_readers import fork_readers
 from helpers import run, walk
 
 import mapctl
@@ -18,7 +21,12 @@ from mapctl.formats import npz, usd
 
 DOCS = (Path(__file__).parents[2] / "docs" / "formats.md").read_text("utf-8")
 needs_usd = pytest.mark.skipif(not usd.is_installed(), reason="needs usd-core: pip install 'mapctl[usd]'")
-OUT = [pytest.param(ending, marks=needs_usd if ending.startswith(".usd") else ()) for ending in formats.WRITERS]
+needs_ufbx = pytest.mark.skipif(find_spec("ufbx") is None, reason="needs ufbx: pip install 'mapctl[fbx]'")
+
+
+def _with_marks(endings):
+    needed = {".usd": needs_usd, ".fbx": needs_ufbx}
+    return [pytest.param(ending, marks=needed.get(ending[:4], ())) for ending in endings]
 
 
 @pytest.fixture
@@ -32,11 +40,19 @@ def here(tmp_path, monkeypatch):
     motion.save("in.glb")
     make_character_glb("in.gltf", animations=("walk",), frames=6)
     make_character_glb("in.vrm", names="vrm", animations=("walk",), frames=6)
-    return tmp_path
+    make_fbx("in.fbx", skin=False, frames=6)
+    if usd.is_installed():
+        from pxr import UsdUtils
+
+        for ending in usd.ENDINGS:
+            motion.save(f"in{ending}")
+        assert UsdUtils.CreateNewUsdzPackage("in.usdc", "in.usdz")
+    with fork_readers():
+        yield tmp_path
 
 
-@pytest.mark.parametrize("source", formats.READERS)
-@pytest.mark.parametrize("ending", OUT)
+@pytest.mark.parametrize("source", _with_marks(formats.READERS))
+@pytest.mark.parametrize("ending", _with_marks(formats.WRITERS))
 def test_any_format_to_any_format(here, capsys, source, ending):
     if ending == ".vrm" and source != ".vrm":
         assert run("convert", f"in{source}", "out.vrm") == 2
@@ -94,10 +110,13 @@ def test_frames_are_picked_before_the_rate_is_changed(here):
         ),
         (("gone.glb", "out.bvh"), "gone.glb: no such file"),
         (("in.gltf#Eve", "out.bvh"), "in.gltf: has no armature 'Eve'; it has 'Armature_skin'"),
-        (("in.usda", "out.bvh"), "can be written but not read"),
-        (("in.fbx", "out.bvh"), "cannot read the ending '.fbx'; allowed: .bvh, .npz, .amc"),
+        (("in.obj", "out.bvh"), "cannot read the ending '.obj'; allowed: .bvh, .npz, .amc"),
+        (("in.bvh", "out.fbx"), "cannot write out.fbx: .fbx is read but not written; allowed: .bvh, .npz"),
         (("in", "out.bvh"), "cannot read the ending ''"),
-        (("in.bvh", "out.amc"), "cannot write out.amc: unknown ending '.amc'; allowed: .bvh, .npz, .glb, .vrm, .usda"),
+        (
+            ("in.bvh", "out.amc"),
+            "cannot write out.amc: .amc is read but not written; allowed: .bvh, .npz, .glb, .vrm, .usda",
+        ),
         (("in.bvh", "out.npz", "--fps-in", "60"), "a .bvh file says its frame rate itself"),
         (("in.amc", "out.npz", "--fps-in", "none"), "a frame rate is a number"),
         (("in.amc", "out.npz", "--fps-in", "0"), "the frame rate must be 0.01 to 1000"),
