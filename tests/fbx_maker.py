@@ -62,13 +62,16 @@ def make_fbx(
     skin: bool = True,
     scale: Sequence[float] = (1.0, 1.0, 1.0),
     parts: Sequence[str] = ("shirt", "skin", "trousers", "shoes"),
+    posed: bool = False,
     seed: int = 0,
 ) -> MadeFbx:
-    """Write a file of a person for each name, below a node of that name that is scaled by `scale`."""
+    """Write a file of a person for each name, below a node of that name that is scaled by `scale`. With `posed` the
+    nodes stand otherwise than in the pose in which the skin is bound."""
     random, document = np.random.default_rng(seed), _Document()
     turn = _Z_UP if z_up else Rotation.identity()
     made = [
-        _add_person(document, random, n, turn, 0.01 * unit_cm, frames, rate, takes, skin, scale, parts) for n in names
+        _add_person(document, random, n, turn, 0.01 * unit_cm, frames, rate, takes, skin, scale, parts, posed)
+        for n in names
     ]
     head = [
         f"; FBX {version // 1000}.{version // 100 % 10}.0 project file",
@@ -90,7 +93,7 @@ def _axes(z_up: bool) -> dict[str, int]:
     return {"UpAxis": up, "FrontAxis": front, "CoordAxis": 0, **signs}
 
 
-def _add_person(document, random, name, turn, metres, frames, rate, takes, skin, scale, only) -> MadeFbx:
+def _add_person(document, random, name, turn, metres, frames, rate, takes, skin, scale, only, posed) -> MadeFbx:
     top = document.add("Model", f"Model::{name}", "Null", _properties(("Lcl Scaling", scale)))
     size = 1.0 / scale[0]
     pre = Rotation.from_rotvec(random.uniform(-1, 1, (len(JOINTS), 3)))
@@ -106,7 +109,7 @@ def _add_person(document, random, name, turn, metres, frames, rate, takes, skin,
         values = [
             ("Lcl Translation", offsets[joint]),
             ("PreRotation", _euler(own[joint], "xyz")),
-            ("Lcl Rotation", np.zeros(3)),
+            ("Lcl Rotation", random.uniform(-40, 40, 3) * posed),
         ]
         body = _properties(*values, order=number % 6)
         limbs[joint] = document.add("Model", f"Model::{joint}", "LimbNode", body, limbs[above] if above else top)

@@ -27,6 +27,7 @@ KINDS = {
     "z-up": {"z_up": True},
     "metres": {"unit_cm": 100.0, "version": 7700},
     "inches": {"unit_cm": 2.54, "z_up": True, "version": 7100},
+    "posed": {"posed": True, "z_up": True},
     "scaled": {"scale": (2.0, 2.0, 2.0)},
     "no-skin": {"skin": False, "rate": 120},
 }

@@ -14,7 +14,7 @@ from helpers import random_motion, walk
 
 pytest.importorskip("pxr", reason="needs usd-core: pip install 'mapctl[usd]'")
 
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, UsdUtils
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdSkel, UsdUtils
 from usd_maker import COLOURS, JOINTS, make_character_usd
 from usd_viewer import UsdViewer, find_faults
 
@@ -177,6 +177,71 @@ class TestReading:
         assert_same(formats.load(tmp_path / "hero.usda"), UsdViewer(tmp_path / "hero.usda"))
         assert len(formats.load_mesh(tmp_path / "hero.usda").faces) > 500
 
+    def test_value_clips_in_the_files_folder(self, tmp_path):
+        path = make(tmp_path, "plain", frames=4)
+        wanted = formats.load(path).joint_positions()
+        stage = Usd.Stage.Open(str(path))
+        clip = Sdf.Layer.CreateNew(str(tmp_path / "clip.1.usda"))
+        clip.TransferContent(stage.GetRootLayer())
+        clip.Save()
+        wild = stage.GetPrimAtPath("/World/BodyRoot/Body/wild")
+        for name in ("rotations", "translations"):
+            wild.GetAttribute(name).Clear()
+        api = Usd.ClipsAPI(wild)
+        api.SetClipAssetPaths(["./clip.1.usda"])
+        api.SetClipPrimPath("/World/BodyRoot/Body/wild")
+        api.SetClipActive([(0, 0)])
+        api.SetClipTimes([(0, 0), (3, 3)])
+        api.SetClipManifestAssetPath("./clip.1.usda")
+        stage.GetRootLayer().Save()
+        found = formats.load(path)
+        np.testing.assert_allclose(found.joint_positions()[[0, -1]], wanted[[0, 3]], **NEAR)
+
+    def test_faces_of_any_kind(self, tmp_path):
+        """Quads and holes, left-handed, on one joint alone, with a colour of their own."""
+        path = make(tmp_path, "plain")
+        stage = Usd.Stage.Open(str(path))
+        mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/World/BodyRoot/mesh"))
+        for prim in list(mesh.GetPrim().GetChildren()):
+            stage.RemovePrim(prim.GetPath())
+        mesh.GetPointsAttr().Set([(0, 1, 0), (1, 1, 0), (1, 2, 0), (0, 2, 0), (0.5, 2.5, 0), (5, 5, 5)])
+        mesh.GetFaceVertexCountsAttr().Set([5, 3, 3])
+        mesh.GetFaceVertexIndicesAttr().Set([0, 1, 2, 4, 3, 0, 1, 5, 1, 2, 5])
+        mesh.GetHoleIndicesAttr().Set([1])
+        mesh.GetOrientationAttr().Set("leftHanded")
+        mesh.CreateDisplayColorPrimvar("uniform").Set([(1, 0, 0), (0, 1, 0), (0, 0, 1)])
+        binding = UsdSkel.BindingAPI(mesh.GetPrim())
+        binding.CreateJointIndicesPrimvar(True, 1).Set([JOINTS.index("head")])
+        binding.CreateJointWeightsPrimvar(True, 1).Set([1.0])
+        stage.GetRootLayer().Save()
+        found = formats.load_mesh(path)
+        assert found.faces.tolist() == [[2, 1, 0], [4, 2, 0], [3, 4, 0], [5, 2, 1]]
+        assert set(found.joints.reshape(-1)) == {JOINTS.index("head")}
+        np.testing.assert_allclose(found.rgba[3], [1, 0, 0, 1], atol=1e-12)
+        assert found.rgba[5, 0] < found.rgba[5, 2]
+
+    def test_a_picture_is_seen_at_the_vertices(self, tmp_path):
+        pillow = pytest.importorskip("PIL.Image")
+        pillow.fromarray(np.array([[[255, 0, 0], [0, 0, 255]]], np.uint8).repeat(2, axis=0)).save(tmp_path / "a.png")
+        path = make(tmp_path, "plain")
+        stage = Usd.Stage.Open(str(path))
+        mesh = stage.GetPrimAtPath("/World/BodyRoot/mesh")
+        points = np.array(mesh.GetAttribute("points").Get())
+        st = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, "vertex")
+        st.Set(np.where(points[:, :1] > 0, [[0.75, 0.5]], [[0.25, 0.5]]).tolist())
+        picture = UsdShade.Shader.Define(stage, "/World/BodyRoot/picture")
+        picture.CreateIdAttr("UsdUVTexture")
+        picture.CreateInput("file", Sdf.ValueTypeNames.Asset).Set("./a.png")
+        shader = UsdShade.Shader(stage.GetPrimAtPath("/World/BodyRoot/shirt_look/surface"))
+        output = picture.CreateOutput("rgb", Sdf.ValueTypeNames.Float3)
+        shader.GetInput("diffuseColor").ConnectToSource(output)
+        stage.GetRootLayer().Save()
+        found = formats.load_mesh(path)
+        shirt = np.unique(found.faces[np.array(stage.GetAttributeAtPath("/World/BodyRoot/mesh/shirt.indices").Get())])
+        sides = found.rgba[shirt], points[shirt, 0] > 0
+        assert (sides[0][sides[1]] == (0, 0, 1, 1)).all()
+        assert (sides[0][~sides[1]] == (1, 0, 0, 1)).all()
+
     def test_packages(self, tmp_path):
         path = make(tmp_path, "centimetres", ".usdc", frames=5)
         assert UsdUtils.CreateNewUsdzPackage(str(path), str(tmp_path / "hero.usdz"))
@@ -250,6 +315,30 @@ class TestWriting:
         stages = [UsdViewer(file).stage for file in (out, path)]
         weights = [s.GetAttributeAtPath("/World/BodyRoot/Body/wild.blendShapeWeights") for s in stages]
         assert [list(weights[0].Get(k)) for k in range(6)] == [list(weights[1].Get(k)) for k in range(6)]
+
+    def test_a_shorter_motion_leaves_no_old_samples(self, tmp_path):
+        path, out = make(tmp_path, "plain", frames=9), tmp_path / "out.usda"
+        motion = formats.load(path).slice(2, 5)
+        motion.save(out)
+        viewer = UsdViewer(out)
+        for name in ("translations", "rotations"):
+            wild = viewer.stage.GetAttributeAtPath(f"/World/BodyRoot/Body/wild.{name}")
+            assert wild.GetTimeSamples() == [0, 1, 2]
+        assert_same(motion, viewer)
+
+    def test_the_extent_is_that_of_the_motion(self, tmp_path):
+        path, out = make(tmp_path, "z-up", unit=0.01), tmp_path / "out.usda"
+        motion = follow_up(path)
+        far = replace(motion, root_position=motion.root_position + 40.0)
+        far.save(out)
+        viewer = UsdViewer(out)
+        root = UsdSkel.Root.Find(viewer.skeleton).GetPrim()
+        box = np.array(root.GetAttribute("extent").Get())
+        ends = viewer._to_world(np.array(np.meshgrid(*box.T)).reshape(3, -1).T, 0)
+        places = far.joint_positions().reshape(-1, 3).numpy()
+        assert (ends.min(0) < places.min(0) - 0.29).all()
+        assert (ends.max(0) > places.max(0) + 0.29).all()
+        assert (np.ptp(ends, axis=0) < 5.0).all()
 
     def test_other_animations_stay_beside(self, tmp_path):
         path, out = make(tmp_path, "plain", frames=6), tmp_path / "2 steps.usda"
