@@ -38,20 +38,20 @@ def load(path: str | PathLike[str]) -> Motion:
     chosen, found = _ask(path, "motion")
     frames, skeleton = _read_skeleton(chosen, found)
     if "local" not in found.arrays:
-        return _rest_motion(chosen, frames, skeleton)
+        return _rest_motion(chosen, found, frames, skeleton)
     outer = np.eye(4) + np.zeros((1, 4, 4))
     for one in np.moveaxis(compose_transforms(chosen.file, found.arrays["above"]), 1, 0):
         outer = outer @ one
     local = compose_transforms(chosen.file, found.arrays["local"])
     worlds = place_joints(chosen.file, frames.parents, local, outer)
     fps = frame_rate_of(found.said["rate"])
-    return frames.to_motion(worlds, fps, skeleton, _source(chosen, frames, found.said["animation"]))
+    return frames.to_motion(worlds, fps, skeleton, _source(chosen, found, frames, found.said["animation"]))
 
 
 def load_rest(path: str | PathLike[str]) -> Motion:
     """Read one frame of the rest pose, as `load` reads an animation."""
     chosen, found = _ask(path, "rest")
-    return _rest_motion(chosen, *_read_skeleton(chosen, found))
+    return _rest_motion(chosen, found, *_read_skeleton(chosen, found))
 
 
 def load_mesh(path: str | PathLike[str]) -> CharacterMesh:
@@ -98,9 +98,10 @@ def _read_skeleton(chosen: CharacterPath, found: Answer) -> tuple[RestFrames, Sk
     return frames, frames.skeleton({joint: (rests[joint] @ np.append(end, 1.0))[:3] for joint, end in tips})
 
 
-def _rest_motion(chosen: CharacterPath, frames: RestFrames, skeleton: Skeleton) -> Motion:
-    return frames.to_motion(frames.matrices()[None], _REST_FPS, skeleton, _source(chosen, frames, None))
+def _rest_motion(chosen: CharacterPath, found: Answer, frames: RestFrames, skeleton: Skeleton) -> Motion:
+    return frames.to_motion(frames.matrices()[None], _REST_FPS, skeleton, _source(chosen, found, frames, None))
 
 
-def _source(chosen: CharacterPath, frames: RestFrames, animation: str | None) -> CharacterSource:
-    return CharacterSource(chosen.file.resolve(), stamp_file(chosen.file), frames, frames.names, animation)
+def _source(chosen: CharacterPath, found: Answer, frames: RestFrames, animation: str | None) -> CharacterSource:
+    stamp = stamp_file(chosen.file)
+    return CharacterSource(chosen.file.resolve(), found.said["armature"], stamp, frames, frames.names, animation)

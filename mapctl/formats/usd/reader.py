@@ -178,4 +178,5 @@ def _source(chosen: CharacterPath, found: Answer, frames: RestFrames, animation:
     """Return where the motion is from; its nodes are PRIM.JOINT, of a root that was added PRIM alone."""
     prim, joints = found.said["path"], found.said["joints"]
     nodes = [prim] * (len(frames.names) - len(joints)) + [f"{prim}.{joint}" for joint in joints]
-    return CharacterSource(chosen.file.resolve(), stamp_file(chosen.file), frames, tuple(nodes), animation)
+    stamp = stamp_file(chosen.file)
+    return CharacterSource(chosen.file.resolve(), found.said["armature"], stamp, frames, tuple(nodes), animation)
