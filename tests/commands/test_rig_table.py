@@ -4,12 +4,14 @@ The quick run tries a cell of every row and of every column, `make test-all` all
 """
 
 from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from character_maker import make_character_glb
+from fbx_maker import make_fbx
 from helpers import run
 from rig_maker import Make, make, names_of
 
@@ -37,7 +39,7 @@ _CHARACTERS = {
     "vroid.vrm": {"names": "vrm", "armature_scale": 1.0, "zup_armature": False, "size": 0.85},
     "old.vrm": {"names": "vrm0", "armature_scale": 1.0, "zup_armature": False},
 }
-RIGS = (*_BVH, *_CHARACTERS)
+RIGS = (*_BVH, *_CHARACTERS, "body.usda", "limbs.fbx")
 COMMANDS = ("follow", "generate", "steer", "convert", "denoise", "infill", "tween")
 
 
@@ -66,7 +68,16 @@ def rigs(walked, tmp_path_factory):
         if name not in made:
             folder = tmp_path_factory.mktemp(name.replace(".", "-"))
             file = clip = folder / name
-            if name in _BVH:
+            if name == "body.usda":
+                pytest.importorskip("pxr")
+                make_character_usd = import_module("usd_maker").make_character_usd
+                make_character_usd(file, up="Z", unit=0.01)
+                clip = folder / "walk.usda"
+            elif name == "limbs.fbx":
+                pytest.importorskip("ufbx")
+                make_fbx(file, z_up=True)
+                clip = folder / "walk.glb"
+            elif name in _BVH:
                 sized = replace(walked, root_position=walked.root_position * _BVH[name].size)
                 make(_BVH[name]).motion(sized).save(file)
             else:
@@ -133,7 +144,7 @@ def cells():
 @pytest.mark.parametrize(("name", "command"), [*cells()])
 def test_every_command_on_every_rig(name, command, rigs, walked, tmp_path, capsys):
     rig = rigs(name)
-    out = tmp_path / f"out{rig.file.suffix}"
+    out = tmp_path / f"out{rig.clip.suffix}"  # an FBX character comes back as .glb, with its mesh
     assert run(*words_of(command, rig, out, walked)) == 0, capsys.readouterr().err
     made = mapctl.load(tmp_path / f"generated_000{out.suffix}" if command == "generate" else out)
     expected = rig.body.rigmap.rig_skeleton
