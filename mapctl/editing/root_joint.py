@@ -9,6 +9,7 @@ from torch import Tensor
 
 from mapctl import rotations
 from mapctl.formats import bvh
+from mapctl.formats.characters.source import add_root_to_character
 from mapctl.motion import Motion
 from mapctl.skeleton import Skeleton
 
@@ -35,8 +36,8 @@ def set_root_track(
 
 
 def add_root(motion: Motion) -> Motion:
-    """Return the same motion with a still joint above its first one, at the origin of the world; the file's layout has
-    it too."""
+    """Return the same motion with a still joint above its first one, at the origin of the world; the file's layout, or
+    its character (glTF, VRM), has it too."""
     old, frames = motion.skeleton, motion.num_frames
     name = next(name for name in (*_NAMES, *(f"root_{n}" for n in range(old.num_joints + 1))) if name not in old.names)
     offsets = torch.cat([old.offsets.new_zeros(1, 3), old.offsets])
@@ -50,5 +51,5 @@ def add_root(motion: Motion) -> Motion:
         torch.zeros_like(motion.root_position),
         torch.cat([still, motion.local_quat_xyzw], dim=1),
         {1: motion.root_position, **moving},
-        bvh.add_root_to_layout(motion.source, name),
+        bvh.add_root_to_layout(motion.source, name) or add_root_to_character(motion.source, name),
     )

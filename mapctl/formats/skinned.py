@@ -57,7 +57,7 @@ def build_skinned_body(motion: Motion) -> SkinnedBody:
 def _load_own_mesh(motion: Motion) -> CharacterMesh | None:
     """Load the mesh of the character's file; None for other motions, and for files without triangles."""
     source = motion.source
-    if not isinstance(source, CharacterSource) or not source.holds(motion):
+    if not isinstance(source, CharacterSource) or not source.holds(motion) or source.has_new_root:
         return None
     try:
         source.check_unchanged()

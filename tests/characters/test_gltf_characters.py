@@ -12,7 +12,7 @@ from glb_viewer import GlbViewer
 from helpers import random_motion, walk
 
 import mapctl
-from mapctl import formats, retarget, rotations
+from mapctl import editing, formats, retarget, rotations
 from mapctl.errors import FileFormatError, RequestError
 from mapctl.formats.characters.source import CharacterSource
 from mapctl.retarget import figure
@@ -168,6 +168,27 @@ def test_one_animation_is_replaced_where_it_was_the_one(tmp_path):
     assert [animation["name"] for animation in tree["animations"]] == ["cut", "walk"]
     again = formats.load(tmp_path / "cut.glb")
     np.testing.assert_allclose(again.joint_positions().numpy(), motion.joint_positions().numpy(), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["mixamo", "vrm", "matrices", "aligned"])
+def test_a_root_joint_is_added_to_the_character(kind, tmp_path):
+    made = make(tmp_path, kind, animations=() if kind == "matrices" else ("walk",))
+    motion = follow_up(made)
+    rooted = editing.move_travel_to_root(motion)
+    out = tmp_path / f"rooted{made.path.suffix}"
+    rooted.save(out)
+    again = formats.load(out)
+    assert again.skeleton.names == rooted.skeleton.names == ("root", *motion.skeleton.names)
+    np.testing.assert_allclose(
+        again.joint_positions()[:, 1:].numpy(), motion.joint_positions().numpy(), rtol=0, atol=2e-5
+    )
+    np.testing.assert_allclose(again.joint_positions()[:, 0].numpy(), rooted.joint_positions()[:, 0].numpy(), atol=2e-5)
+    viewer, old = GlbViewer(out), GlbViewer(made.path)
+    assert len(viewer.nodes) == len(old.nodes) + 1
+    np.testing.assert_allclose(viewer.skinned(), old.skinned(), atol=1e-6)  # the character as it stands is the same
+    turns = rotations.to_matrix(motion.joint_rotations()[7]).numpy()
+    wanted, _ = formats.load_mesh(made.path).pose(motion.joint_positions()[7].numpy(), turns)
+    np.testing.assert_allclose(viewer.skinned(0, 7 / 30), wanted[: len(made.vertices)], rtol=0, atol=2e-5)
 
 
 def test_other_files_are_put_into_the_one(tmp_path):

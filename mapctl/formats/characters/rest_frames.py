@@ -64,6 +64,19 @@ class RestFrames:
         """Return the joints' world matrices at rest, (joints, 4, 4)."""
         return compose_matrices(self.positions, self.quat_xyzw, np.repeat(self.scales[:, None], 3, axis=1))
 
+    def with_root(self, name: str) -> "RestFrames":
+        """Return the same joints below a further one, which at rest is where the frame is that the root is in."""
+        turn, scale = split_scale(self.outer)
+        quat = rotations.from_matrix(torch.from_numpy(turn)).numpy()
+        return RestFrames(
+            (name, *self.names),
+            (-1, *(parent + 1 for parent in self.parents)),
+            np.vstack([self.outer[:3, 3], self.positions]),
+            np.vstack([quat, self.quat_xyzw]),
+            np.concatenate([[scale], self.scales]),
+            self.outer,
+        )
+
     def skeleton(self, end_positions: Mapping[int, Array]) -> Skeleton:
         """Return the skeleton whose frames are aligned with the world; `end_positions` are those of End Sites at rest,
         by joint, metres."""

@@ -1,13 +1,16 @@
 """What `Motion.source` keeps of a character's file, so that the character is written with the motion."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
 
 from mapctl.errors import RequestError
 from mapctl.formats.characters.rest_frames import RestFrames
 from mapctl.motion import Motion
+
+NEW_NODE = -1
+"""What stands for the node of a joint that the file is yet to get."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,11 +26,16 @@ class CharacterSource:
     frames: RestFrames
     """Its joints at rest."""
     nodes: tuple[int | str, ...]
-    """By joint what the file calls it: the index of a node, the path of a prim."""
+    """By joint what the file calls it: the index of a node, the path of a prim; `NEW_NODE` for one that it lacks."""
     animation: str | None = None
     """Name of the animation that the motion was read from; None for the rest pose."""
     humanoid: Mapping[str, str] = field(default_factory=dict)
     """Joint name by canonical name, where the file itself says which is which (VRM)."""
+
+    @property
+    def has_new_root(self) -> bool:
+        """Whether joint 0 is none of the file's, but above them."""
+        return self.nodes[0] == NEW_NODE
 
     @property
     def choice(self) -> str:
@@ -43,6 +51,13 @@ class CharacterSource:
         """Raise RequestError unless the file is as it was when it was read."""
         if not self.path.is_file() or stamp_file(self.path) != self.stamp:
             raise RequestError(f"{self.path} has changed since it was read; the character cannot be taken from it")
+
+
+def add_root_to_character(source: object | None, name: str) -> CharacterSource | None:
+    """Return a character with a joint above its root, where its file is of a kind that can get one: glTF and VRM."""
+    if not isinstance(source, CharacterSource) or ending_family(source.path.suffix) != ".glb" or source.has_new_root:
+        return None
+    return replace(source, frames=source.frames.with_root(name), nodes=(NEW_NODE, *source.nodes))
 
 
 def stamp_file(path: str | PathLike[str]) -> tuple[int, int]:

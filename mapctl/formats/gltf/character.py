@@ -1,6 +1,7 @@
 """glTF and VRM out: a user's own character with an animation added; all else of its file stays as it is."""
 
 import copy
+from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -33,7 +34,10 @@ def save(motion: Motion, path: str | PathLike[str], source: CharacterSource) -> 
     gltf = read_file(source.path)
     tree, binary = _gather(gltf)
     appended = _Appended(tree, sum(len(piece) for piece in binary))
-    animation = _build_animation(motion, source, tree, appended, Path(path).stem)
+    nodes = [int(node) for node in source.nodes]
+    if source.has_new_root:
+        nodes[0] = _add_node_above(tree, nodes[1], source.frames.names[0])
+    animation = _build_animation(motion, source, nodes, tree, appended, Path(path).stem)
     kept = [
         a for a, name in zip(tree.get("animations", []), name_animations(gltf), strict=True) if name != source.animation
     ]
@@ -106,15 +110,15 @@ class _Appended:
 
 
 def _build_animation(
-    motion: Motion, source: CharacterSource, tree: dict[str, Any], appended: _Appended, name: str
+    motion: Motion, source: CharacterSource, nodes: Sequence[int], tree: dict[str, Any], appended: _Appended, name: str
 ) -> dict[str, Any]:
     moved, turned = source.frames.to_locals(motion)
     times = np.arange(motion.num_frames) / float(motion.fps)
     still, every = appended.add(times[:1]), appended.add(times)
     animation: dict[str, Any] = {"name": name, "channels": [], "samplers": []}
-    for joint, node in enumerate(source.nodes):
-        _use_parts(tree["nodes"][int(node)])
-        own = tree["nodes"][int(node)]
+    for joint, node in enumerate(nodes):
+        own = tree["nodes"][node]
+        _use_parts(own)
         for path, values in (("translation", moved[:, joint]), ("rotation", turned[:, joint])):
             constant = bool((np.ptp(values, axis=0) < _STILL).all())
             usual = np.array(own.get(path, (0.0, 0.0, 0.0) if path == "translation" else (0.0, 0.0, 0.0, 1.0)))
@@ -122,12 +126,24 @@ def _build_animation(
                 continue
             output = appended.add(values[:1] if constant else values)
             animation["channels"].append(
-                {"sampler": len(animation["samplers"]), "target": {"node": int(node), "path": path}}
+                {"sampler": len(animation["samplers"]), "target": {"node": node, "path": path}}
             )
             animation["samplers"].append(
                 {"input": still if constant else every, "output": output, "interpolation": "LINEAR"}
             )
     return animation
+
+
+def _add_node_above(tree: dict[str, Any], node: int, name: str) -> int:
+    """Put a node that does nothing above a node, in its place among its parent's children or in the scenes."""
+    tree["nodes"].append({"name": name, "children": [node]})
+    added = len(tree["nodes"]) - 1
+    for holder in (
+        *(n.get("children", []) for n in tree["nodes"][:-1]),
+        *(s.get("nodes", []) for s in tree.get("scenes", [])),
+    ):
+        holder[:] = [added if child == node else child for child in holder]
+    return added
 
 
 def _use_parts(node: dict[str, Any]) -> None:
