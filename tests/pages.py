@@ -9,6 +9,7 @@ from pathlib import Path
 from acclaim import pair
 from captures import on_rig
 from character_maker import make_character_glb
+from fbx_maker import make_fbx
 from helpers import walk, write_corpus
 from rig_maker import Make, make, names_of
 from tiny_denoiser import save_tiny_denoiser
@@ -110,6 +111,7 @@ def write_files(folder: Path) -> None:
     on_rig("cmu", 40).save(folder / "mine.bvh")
     walk(40).save(folder / "walk.npz")
     make_character_glb(folder / "hero.glb", animations=("Walk",))
+    make_fbx(folder / "take.fbx")
     for seed, name in enumerate("abcd"):
         walk(150, seed=seed, cadence=0.8 + 0.05 * seed).save(folder / f"{name}.bvh")
     for name in ("takes", "mocap", "mine", "everything", "clips"):
