@@ -8,9 +8,9 @@ import shutil
 import sys
 
 import armatures
+import blender_stage
 import bpy
 import numpy as np
-import stage
 from mathutils import Matrix
 
 FRAMES = range(1, 13)
@@ -28,13 +28,13 @@ def apart(armature, run, bones: list[str] | None = None) -> float:
 
 def play_echoes() -> None:
     """What comes back as it was sent leaves every armature as it was."""
-    stage.use("echo")
-    stage.clear()
+    blender_stage.use("echo")
+    blender_stage.clear()
     armature = armatures.add_mixamo(imported=True)
     armatures.animate(armature, places=("mixamorig:Hips",))
     facts["apart"]["imported"] = apart(armature, bpy.ops.mapctl.clean_up)
 
-    stage.clear()
+    blender_stage.clear()
     armature = armatures.add_mixamo()
     armatures.animate(armature, places=("mixamorig:Hips",))
     armature.location, armature.rotation_euler = (3, 1, 0.5), (0.1, 0.2, 2.0)
@@ -48,16 +48,16 @@ def play_echoes() -> None:
         {c.data_path for c in armatures.curves_of(armature) if "rotation" not in c.data_path}
     )
 
-    stage.clear()
+    blender_stage.clear()
     bpy.context.scene.unit_settings.scale_length = 0.01
     armature = armatures.add_mixamo()
     armature.scale = (100, 100, 100)
     armatures.animate(armature)
     facts["apart"]["scene in centimetres"] = apart(armature, bpy.ops.mapctl.clean_up)
-    with np.load(stage.FOLDER / "sent.npz") as sent:
+    with np.load(blender_stage.FOLDER / "sent.npz") as sent:
         facts["thigh"] = float(np.linalg.norm(sent["offsets"][sent["names"].tolist().index("mixamorig:LeftLeg")]))
 
-    stage.clear()
+    blender_stage.clear()
     armature = armatures.add_mixamo()
     spine, arm, leg = (armature.data.bones[f"mixamorig:{name}"] for name in ("Spine2", "LeftArm", "LeftUpLeg"))
     spine.use_inherit_rotation = False
@@ -69,7 +69,7 @@ def play_echoes() -> None:
     )
     facts["connected"] = leg.use_connect
 
-    stage.clear()
+    blender_stage.clear()
     armature = armatures.add_mixamo()
     armatures.animate(armature)
     pull = armature.pose.bones["mixamorig:LeftArm"].constraints.new("STRETCH_TO")
@@ -77,14 +77,14 @@ def play_echoes() -> None:
     pull.target.location = (0.8, 0.5, 1.9)
     bpy.context.collection.objects.link(pull.target)
     facts["apart"]["arm that is stretched"] = apart(armature, bpy.ops.mapctl.clean_up)
-    facts["stretched told"] = stage.told()
+    facts["stretched told"] = blender_stage.told()
 
     clear_and_spin()
 
 
 def clear_and_spin() -> None:
     """Bones that turn around and around, in each rotation mode."""
-    stage.clear()
+    blender_stage.clear()
     armature = armatures.add_mixamo()
     for bone in list(armature.pose.bones)[:4]:
         for frame in FRAMES:
@@ -103,8 +103,8 @@ def clear_and_spin() -> None:
 
 def play_generated() -> None:
     """A generated rig that is animated by its IK controls."""
-    stage.use("echo")
-    stage.clear()
+    blender_stage.use("echo")
+    blender_stage.clear()
     rig = armatures.add_generated()
     armatures.select(rig)
     rng = np.random.default_rng(0)
@@ -138,7 +138,7 @@ def play_generated() -> None:
     bones = [*trunk, *(f"DEF-{limb}.{side}" for limb in limbs for side in "LR")]
     facts["ended early"] = [end_at("setting the controls", 3), end_at("checking", 0)]
     facts["apart"]["generated rig by IK"] = apart(rig, bpy.ops.mapctl.clean_up, bones)
-    facts["generated told"] = stage.told()
+    facts["generated told"] = blender_stage.told()
     facts["turned"] = turn_of(rig, bones)
 
     facts["stretch is back"] = max(bone.ik_stretch for bone in rig.pose.bones)
@@ -152,21 +152,23 @@ def play_generated() -> None:
 
 def end_at(label: str, done: int) -> str:
     """End a clean-up at this step; whether all is as it was."""
-    armature, jobs, operators = bpy.context.object, stage.module("jobs"), stage.module("operators")
+    armature, jobs, operators = bpy.context.object, blender_stage.module("jobs"), blender_stage.module("operators")
     bpy.context.scene.frame_set(5)
-    before, command = stage.state(), stage.module("process").find_command(read_command())
+    before, command = blender_stage.state(), blender_stage.module("process").find_command(read_command())
     at = jobs.Scene(bpy.context.scene, armature, command)
     job = jobs.clean_up(at, operators.find_frames(at), anchor=False)
     while (step := next(job)).label != label or step.done < done:
         pass
-    changed = stage.state() != before
+    changed = blender_stage.state() != before
     job.close()
-    return f"{'changed' if changed else 'unchanged'}, then {'as before' if stage.state() == before else 'changed'}"
+    return (
+        f"{'changed' if changed else 'unchanged'}, then {'as before' if blender_stage.state() == before else 'changed'}"
+    )
 
 
 def read_command() -> str:
     """The preference."""
-    return bpy.context.preferences.addons[stage.ADDON].preferences.command
+    return bpy.context.preferences.addons[blender_stage.ADDON].preferences.command
 
 
 def turn_of(rig, bones: list[str]) -> float:
@@ -186,8 +188,8 @@ def turn_of(rig, bones: list[str]) -> float:
 
 def play_walks() -> None:
     """A character that stands anywhere follows the file, whose frames are the world's."""
-    stage.use("echo")
-    stage.clear()
+    blender_stage.use("echo")
+    blender_stage.clear()
     armature, drawn = armatures.add_mixamo(imported=True), armatures.add_curve(cyclic=True, height=0.4)
     holder = bpy.data.objects.new("holder", None)
     bpy.context.collection.objects.link(holder)
@@ -201,13 +203,13 @@ def play_walks() -> None:
     armatures.select(armature, drawn)
     bpy.ops.ed.undo_push(message="before")
     assert bpy.ops.mapctl.walk("EXEC_DEFAULT", True, speed=1.5, seed=3, style="proud", seconds=2.5) == {"FINISHED"}
-    facts["words"] = (stage.FOLDER / "words.txt").read_text().split("\n")
+    facts["words"] = (blender_stage.FOLDER / "words.txt").read_text().split("\n")
     armature = bpy.data.objects["mixamo"]
     facts["range"] = list(armature.animation_data.action.frame_range)
     root = armatures.joints_of(armature, ["mixamorig:Hips"], range(5, 17))[:, 0]
     facts["root"] = root.tolist()
     walked["imported"] = walked_joints(armature, 5)
-    facts["curve"] = (stage.FOLDER / "curve.csv").read_text()
+    facts["curve"] = (blender_stage.FOLDER / "curve.csv").read_text()
     knots = [drawn.matrix_world @ knot.co for knot in drawn.data.splines[0].bezier_points]
     facts["knots"] = [[knot.x, -knot.y] for knot in knots]
     bpy.context.scene.use_preview_range = False
@@ -223,7 +225,7 @@ def play_walks() -> None:
 
 def play_generated_walk() -> None:
     """A generated rig that was posed by hand, and walks then."""
-    stage.clear()
+    blender_stage.clear()
     rig, drawn = armatures.add_generated(), armatures.add_curve()
     armatures.select(rig, drawn)
     rng = np.random.default_rng(1)
@@ -236,52 +238,52 @@ def play_generated_walk() -> None:
     drawn.data.splines[0].bezier_points[0].co.z += 0.5
     bpy.context.scene.frame_end = 3
     assert bpy.ops.mapctl.walk() == {"FINISHED"}
-    facts["not level"] = [stage.told()[0], bpy.context.scene.frame_end]
+    facts["not level"] = [blender_stage.told()[0], bpy.context.scene.frame_end]
 
 
 def end_walk_early(drawn) -> str:
     """End a walk while the controls are set; whether all is as it was."""
-    jobs, before = stage.module("jobs"), stage.state()
-    at = jobs.Scene(bpy.context.scene, bpy.context.object, stage.module("process").find_command(read_command()))
+    jobs, before = blender_stage.module("jobs"), blender_stage.state()
+    at = jobs.Scene(bpy.context.scene, bpy.context.object, blender_stage.module("process").find_command(read_command()))
     job = jobs.walk_along(at, drawn, jobs.WalkOptions())
     while (step := next(job)).label != "setting the controls" or step.done < 3:
         pass
     job.close()
-    return "as before" if stage.state() == before else "changed"
+    return "as before" if blender_stage.state() == before else "changed"
 
 
 def walked_joints(armature, first: int) -> np.ndarray:
     """Where Blender shows the joints that mapctl answered with."""
-    shutil.copy(stage.FOLDER / "answer.npz", stage.FOLDER / f"{armature.name}.npz")
-    with np.load(stage.FOLDER / "answer.npz") as answer:
+    shutil.copy(blender_stage.FOLDER / "answer.npz", blender_stage.FOLDER / f"{armature.name}.npz")
+    with np.load(blender_stage.FOLDER / "answer.npz") as answer:
         return armatures.joints_of(armature, answer["names"].tolist(), range(first, first + 12))
 
 
 def expect(name: str, run, **options) -> None:
     """Note what the interface tells of an operator that cannot do its work, and that nothing was changed."""
     bpy.context.scene.frame_set(bpy.context.scene.frame_current)
-    before = stage.state()
+    before = blender_stage.state()
     try:
         facts["errors"][name] = [str(run(**options)), ""]
     except RuntimeError as error:
-        told = stage.told()[0]
-        same = stage.state() == before and stage.module("operators").Report.failed
+        told = blender_stage.told()[0]
+        same = blender_stage.state() == before and blender_stage.module("operators").Report.failed
         facts["errors"][name] = [told if told in str(error) else str(error), "unchanged" if same else "changed"]
 
 
 def play_errors() -> None:
     """What users do wrong."""
-    stage.clear()
+    blender_stage.clear()
     walk, clean_up = bpy.ops.mapctl.walk, bpy.ops.mapctl.clean_up
     armature = armatures.add_mixamo()
     armatures.select(armature)
-    stage.set_command("/nowhere/mapctl")
+    blender_stage.set_command("/nowhere/mapctl")
     expect("program that is not there", walk)
-    stage.set_command(sys.executable, "-c", "pass")
+    blender_stage.set_command(sys.executable, "-c", "pass")
     expect("program that is another", walk)
-    stage.use("old")
+    blender_stage.use("old")
     expect("program that is old", walk)
-    stage.use("echo")
+    blender_stage.use("echo")
     expect("no curve", walk)
     expect("no action", clean_up)
     expect("no action to in-between", bpy.ops.mapctl.in_between)
@@ -306,14 +308,14 @@ def play_errors() -> None:
     expect("mirrored", clean_up)
     armature.scale = (1, 1, 1)
     bpy.context.view_layer.update()
-    stage.use("fail")
+    blender_stage.use("fail")
     expect("mapctl's own", clean_up)
-    stage.use("crash")
+    blender_stage.use("crash")
     expect("mapctl that crashes", clean_up)
     drawn = armatures.add_curve()
     drawn.data.splines.new("POLY")
     armatures.select(armature, drawn)
-    stage.use("echo")
+    blender_stage.use("echo")
     expect("curve of two splines", walk)
     armatures.select(drawn)
     facts["poll"] = [clean_up.poll(), walk.poll()]
@@ -321,8 +323,8 @@ def play_errors() -> None:
 
 def play_selection() -> None:
     """Selected bones alone are filled."""
-    stage.use("echo")
-    stage.clear()
+    blender_stage.use("echo")
+    blender_stage.clear()
     armature = armatures.add_mixamo()
     armatures.animate(armature)
     armatures.select(armature)
@@ -332,11 +334,11 @@ def play_selection() -> None:
         bone = armature.pose.bones[name]
         (bone if hasattr(bone, "select") else bone.bone).select = True
     assert bpy.ops.mapctl.fill_gap(first=4, last=7, selected=True) == {"FINISHED"}
-    facts["gap words"] = (stage.FOLDER / "words.txt").read_text().split("\n")
+    facts["gap words"] = (blender_stage.FOLDER / "words.txt").read_text().split("\n")
     bpy.ops.object.mode_set(mode="OBJECT")
 
 
-stage.install()
+blender_stage.install()
 for play in (play_echoes, play_walks, play_generated_walk, play_errors, play_selection, play_generated):
     play()
-stage.finish(facts, walked)
+blender_stage.finish(facts, walked)

@@ -10,8 +10,8 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import armatures
+import blender_stage
 import bpy
-import stage
 
 facts: dict = {}
 
@@ -32,8 +32,8 @@ def make_window():
 
 def start_modal(mode: str, expected: frozenset = frozenset({"RUNNING_MODAL"})):
     """Begin a clean-up as the interface does."""
-    stage.use(mode)
-    operators = stage.module("operators")
+    blender_stage.use(mode)
+    operators = blender_stage.module("operators")
     window, notes = make_window()
     told: list = []
     context = SimpleNamespace(
@@ -62,21 +62,21 @@ def start_modal(mode: str, expected: frozenset = frozenset({"RUNNING_MODAL"})):
 
 def play_modal() -> None:
     """The operator in the interface: it goes on by a timer, ends by Esc or by itself."""
-    stage.clear()
+    blender_stage.clear()
     armature = armatures.add_mixamo()
     armatures.animate(armature)
     armatures.select(armature)
     bpy.context.scene.frame_set(1)
-    before = stage.state()
+    before = blender_stage.state()
     pressed, context, notes, told = start_modal("sleep")
     timer, escape, key = (SimpleNamespace(type=kind) for kind in ("TIMER", "ESC", "A"))
-    process = stage.FOLDER / "process.txt"
-    seen = {stage.module("operators").Report.step.describe()}
+    process = blender_stage.FOLDER / "process.txt"
+    seen = {blender_stage.module("operators").Report.step.describe()}
     facts["poll while one runs"] = bpy.ops.mapctl.clean_up.poll()
     while "walking 25 %" not in seen:
         assert pressed.modal(context, timer) == {"RUNNING_MODAL"}
-        seen.add(stage.module("operators").Report.step.describe())
-        stage.module("operators").time.sleep(0.02)
+        seen.add(blender_stage.module("operators").Report.step.describe())
+        blender_stage.module("operators").time.sleep(0.02)
     facts["steps"] = sorted(seen)
     facts["panel while it runs"] = draw_panel()
     facts["keys are held"] = sorted(pressed.modal(context, key))
@@ -86,10 +86,10 @@ def play_modal() -> None:
     facts["cancelled"] = {
         "ended": not is_running(int(number)),
         "folder": Path(folder).exists(),
-        "unchanged": stage.state() == before,
+        "unchanged": blender_stage.state() == before,
         "notes": [note for note in notes if note in ("begin", "end", "timer", "handler", None)],
-        "told": stage.told(),
-        "step": stage.module("operators").Report.step is None,
+        "told": blender_stage.told(),
+        "step": blender_stage.module("operators").Report.step is None,
     }
     pressed, context, notes, told = start_modal("echo")
     answer = {"RUNNING_MODAL"}
@@ -104,7 +104,7 @@ def play_modal() -> None:
     facts["panel after a failure"] = draw_panel()
     bpy.context.object.animation_data.action = None
     kept = start_modal("echo", {"CANCELLED"})
-    facts["failure at once"] = [kept[2], kept[3], stage.module("operators").Report.step is None]
+    facts["failure at once"] = [kept[2], kept[3], blender_stage.module("operators").Report.step is None]
 
 
 def is_running(number: int) -> bool:
@@ -145,7 +145,7 @@ class Layout:
 def draw_panel() -> list[str]:
     """What the panel shows now."""
     drawn: list[str] = []
-    panel = stage.module("panel").MAPCTL_PT_sidebar
+    panel = blender_stage.module("panel").MAPCTL_PT_sidebar
     standing = SimpleNamespace(layout=Layout(drawn))
     for name in ("_draw_job", "_draw_report"):
         setattr(standing, name, getattr(panel, name).__get__(standing))
@@ -156,7 +156,7 @@ def draw_panel() -> list[str]:
 def check_manifest() -> str:
     """What Blender's own tool says of the zip."""
     tool = Path(bpy.utils.system_resource("SCRIPTS")) / "addons_core" / "bl_pkg" / "cli" / "blender_ext.py"
-    command = [sys.executable, str(tool), "validate", str(stage.FOLDER / "addon.zip")]
+    command = [sys.executable, str(tool), "validate", str(blender_stage.FOLDER / "addon.zip")]
     return subprocess.run(command, capture_output=True, text=True).stdout
 
 
@@ -167,14 +167,14 @@ def play_settings() -> None:
     bpy.ops.mapctl.preview_gap()
     facts["gap"] = [scene.mapctl.gap.first, scene.mapctl.gap.last]
     facts["panel"] = draw_panel()
-    bpy.ops.preferences.addon_disable(module=stage.ADDON)
+    bpy.ops.preferences.addon_disable(module=blender_stage.ADDON)
     facts["manifest"] = check_manifest()
     facts["gone"] = not hasattr(bpy.types.Scene, "mapctl")
-    bpy.ops.preferences.addon_enable(module=stage.ADDON)
+    bpy.ops.preferences.addon_enable(module=blender_stage.ADDON)
     facts["back"] = hasattr(bpy.types.Scene, "mapctl")
 
 
-stage.install()
+blender_stage.install()
 play_modal()
 play_settings()
-stage.finish(facts)
+blender_stage.finish(facts)

@@ -6,9 +6,9 @@ python play_jobs.py FOLDER PYTHON KIND MODELS FPS STAGES: the operators are run 
 import sys
 
 import armatures
+import blender_stage
 import bpy
 import numpy as np
-import stage
 
 KIND, MODELS, FPS, STAGES = sys.argv[3:7]
 MAKERS = {
@@ -25,8 +25,10 @@ FRAMES = range(1, 26)
 
 def main() -> None:
     """Play, and note what Blender shows after each."""
-    stage.install()
-    stage.set_command(stage.PYTHON, stage.SCRIPTS / "recorder.py", stage.FOLDER / "kept", MODELS)
+    blender_stage.install()
+    blender_stage.set_command(
+        blender_stage.PYTHON, blender_stage.SCRIPTS / "recorder.py", blender_stage.FOLDER / "kept", MODELS
+    )
     scene = bpy.context.scene
     scene.render.fps, scene.frame_end = int(FPS), 10
     armature = MAKERS[KIND]()
@@ -47,13 +49,13 @@ def main() -> None:
         before.get(name, lambda: None)()
         joints = names_of(armature)
         arrays[f"{name} before"] = armatures.joints_of(armature, joints, FRAMES) if name != "walk" else np.zeros(0)
-        facts["stages"][name] = {"status": list(run()), "told": stage.told(), **describe(armature)}
+        facts["stages"][name] = {"status": list(run()), "told": blender_stage.told(), **describe(armature)}
         arrays[name] = armatures.joints_of(armature, joints, range(1, 1 + count(armature)))
     facts |= {"joints": joints, "frame": scene.frame_current, "end": scene.frame_end}
     facts["actions"] = [(each.name, each.use_fake_user) for each in bpy.data.actions]
     facts["switches"] = [bone["IK_FK"] for bone in armature.pose.bones if "IK_FK" in bone]
     facts["left behind"] = [len(bpy.data.curves), len(bpy.data.objects) - len(bpy.context.scene.objects)]
-    stage.finish(facts, arrays)
+    blender_stage.finish(facts, arrays)
 
 
 def names_of(armature) -> list[str]:

@@ -338,10 +338,10 @@ def test_a_long_capture_is_read_and_written_quickly(tmp_path):
 
 
 def test_unknown_endings_name_the_known_ones(tmp_path):
-    with pytest.raises(MapctlError, match=r"'\.fbx'; allowed: \.bvh, \.npz"):
-        formats.load(tmp_path / "walk.fbx")
-    with pytest.raises(RequestError, match=r"'\.fbx'; allowed: \.bvh, \.npz"):
-        standing().save(tmp_path / "walk.fbx")
+    with pytest.raises(MapctlError, match=r"'\.c3d'; allowed: \.bvh, \.npz"):
+        formats.load(tmp_path / "walk.c3d")
+    with pytest.raises(RequestError, match=r"'\.c3d'; allowed: \.bvh, \.npz"):
+        standing().save(tmp_path / "walk.c3d")
 
 
 def test_two_joints_of_one_name_are_read_the_second_by_a_name_of_its_own(tmp_path, capsys):
