@@ -7,6 +7,7 @@ import numpy as np
 
 from mapctl.errors import MapctlError
 from mapctl.formats.characters.source import CharacterSource, ending_family
+from mapctl.isolated.pictures import decode_srgb
 from mapctl.mesh.character_mesh import CharacterMesh
 from mapctl.mesh.primitives import Array
 from mapctl.mesh.skinning import build_skin
@@ -45,12 +46,12 @@ def build_skinned_body(motion: Motion) -> SkinnedBody:
     if mesh is not None:
         joints, weights = _strongest(mesh)
         vertices, rgb = mesh.vertices - mesh.rest[0], mesh.rgba[:, :3]
-        return SkinnedBody("character", rest, vertices, mesh.normals, mesh.faces, _linear(rgb), joints, weights)
+        return SkinnedBody("character", rest, vertices, mesh.normals, mesh.faces, decode_srgb(rgb), joints, weights)
     body = build_skin(motion)
     one = np.ones((len(body.joint), 1))
     vertices = body.vertices + rest[body.joint]
     return SkinnedBody(
-        "mannequin", rest, vertices, body.normals, body.faces, _linear(body.rgb), body.joint[:, None], one
+        "mannequin", rest, vertices, body.normals, body.faces, decode_srgb(body.rgb), body.joint[:, None], one
     )
 
 
@@ -71,10 +72,6 @@ def _strongest(mesh: CharacterMesh) -> tuple[Array, Array]:
     order = np.argsort(-mesh.weights, axis=1, kind="stable")[:, :_MOST_CARRIERS]
     joints, weights = (np.take_along_axis(table, order, axis=1) for table in (mesh.joints, mesh.weights))
     return joints, weights / weights.sum(axis=1, keepdims=True)
-
-
-def _linear(rgb: Array) -> Array:
-    return np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
 
 
 def _rest_positions(motion: Motion) -> Array:
