@@ -39,6 +39,7 @@ def main(folder: Path, seed: int) -> None:
     scene = bpy.context.scene
     scene.frame_start, scene.frame_end, scene.render.fps = 1, FRAMES, (24, 30, 60)[seed % 3]
     bpy.ops.export_scene.fbx(filepath=str(folder / "skin.fbx"), add_leaf_bones=seed % 2 == 0)
+    bpy.ops.export_scene.gltf(filepath=str(folder / "skin.glb"), export_force_sampling=True)
     for ending in ("usda", "usdc"):
         bpy.ops.wm.usd_export(filepath=str(folder / f"skin.{ending}"), export_animation=True, export_armatures=True)
     bpy.ops.object.select_all(action="DESELECT")

@@ -1,10 +1,11 @@
-"""Files that Blender writes: FBX and USD have the joints of the BVH beside them."""
+"""Files that Blender writes: FBX, USD and GLB have the joints of the BVH beside them."""
 
 import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
+from glb_viewer import GlbViewer
 from helpers import walk
 
 from mapctl import formats, rotations
@@ -33,7 +34,7 @@ def plain(names):
     return [name.replace(".", "_") for name in names]
 
 
-@pytest.mark.parametrize("name", ["skin.fbx", "limbs.fbx", "skin.usda", "skin.usdc"])
+@pytest.mark.parametrize("name", ["skin.fbx", "limbs.fbx", "skin.usda", "skin.usdc", "skin.glb"])
 def test_joints_are_those_of_the_bvh(folder, name):
     """To 0.1 mm; the BVH has Blender's Z up."""
     pytest.importorskip("ufbx" if name.endswith("fbx") else "pxr")
@@ -54,7 +55,7 @@ def scale_of(folder):
 
 def test_boxes_stay_on_their_bones(folder):
     """In every frame each box is as far from its joint as in the rest pose."""
-    for name in ("skin.fbx", "skin.usda"):
+    for name in ("skin.fbx", "skin.usda", "skin.glb"):
         motion, mesh = formats.load(folder / name), formats.load_mesh(folder / name)
         starts = np.linalg.norm(mesh.vertices - mesh.rest[mesh.joints[:, 0]], axis=1)
         assert starts.max() < 0.4
@@ -63,6 +64,17 @@ def test_boxes_stay_on_their_bones(folder):
             posed = mesh.pose(places, rotations.to_matrix(motion.joint_rotations()[frame]).numpy())[0]
             ends = np.linalg.norm(posed - places[mesh.joints[:, 0]], axis=1)
             np.testing.assert_allclose(ends, starts, atol=1e-5)
+
+
+def test_glb_comes_back_animated(folder):
+    """Another motion on the character of the GLB file; a viewer of glTF has its joints within 0.1 mm."""
+    body = RiggedCharacter.of(figure.load_standing_character(folder / "skin.glb"))[1]
+    motion = body.on_rig(retarget_motion(walk(15), body).motion)
+    motion.save(folder / "out.glb")
+    viewer = GlbViewer(folder / "out.glb")
+    for frame in (0, 14):
+        places = [viewer.world(int(node), 0, frame / 30)[:3, 3] for node in motion.source.nodes]
+        np.testing.assert_allclose(motion.joint_positions()[frame], places, rtol=0, atol=1e-4)
 
 
 def test_usd_comes_back_animated(folder):
