@@ -154,7 +154,11 @@ def as_rig(rigmap: RigMap) -> Rig:
 
 def _set_hips_travel(rigmap: RigMap, motion: Motion | None) -> RigMap:
     """Return the map with whether the hips travel below the root; without a motion they may."""
-    return rigmap if motion is None else replace(rigmap, hips_travel=_hips_joint(rigmap) in motion.moving_offsets)
+    if motion is None:
+        return rigmap
+    # A character's rest pose shows no travel; a root on the floor is to stay there, not to rise and sink with the hips.
+    shown = _hips_joint(rigmap) in motion.moving_offsets
+    return replace(rigmap, hips_travel=shown or _character_of(motion) is not None)
 
 
 def _map_by_table(found: Match, skeleton: Skeleton, motion: Motion | None) -> RigMap | None:

@@ -10,11 +10,13 @@ from character_maker import make_character_glb
 from forged_characters import join_glb, split_glb
 from glb_viewer import GlbViewer
 from helpers import random_motion, walk
+from scipy.interpolate import CubicHermiteSpline
 
 import mapctl
 from mapctl import editing, formats, retarget, rotations
 from mapctl.errors import FileFormatError, RequestError
 from mapctl.formats.characters.source import CharacterSource
+from mapctl.formats.gltf.animations import Track, sample_track
 from mapctl.retarget import figure
 from mapctl.retarget.carry import RiggedCharacter, retarget_motion
 from mapctl.skeleton import CANONICAL
@@ -158,6 +160,50 @@ def test_soles_are_on_the_floor(kind, tmp_path):
     lowest = made.vertices[:, 1].min()  # shoes are the lowest
     np.testing.assert_allclose(shift, -lowest, atol=1e-5)
     assert standing.num_frames == 30
+
+
+def test_a_character_that_hovers_stands_on_its_soles(tmp_path):
+    made = make(tmp_path, "vrm")
+    edit(made.path, lambda tree: tree["nodes"][0].update(translation=[0.0, 0.3, 0.0]))
+    standing, hovering = figure.load_standing_character(made.path), formats.load_rest(made.path)
+    head = standing.skeleton.index(made.joint["head"])
+    there = made.positions[made.names.index(made.joint["head"]), 1]
+    assert float(hovering.joint_positions()[0, head, 1]) == pytest.approx(there + 0.3, abs=1e-5)
+    assert float(standing.joint_positions()[0, head, 1]) == pytest.approx(there - made.vertices[:, 1].min(), abs=1e-5)
+
+
+def test_a_vrm_rests_as_its_nodes_stand(tmp_path):
+    made = make(tmp_path, "vrm", pose="bent", node_pose="T")
+    rest, viewer = formats.load_rest(made.path), GlbViewer(made.path)
+    for name, node in zip(made.names, made.nodes, strict=True):
+        if name in rest.skeleton.names:
+            place = rest.joint_positions()[0, rest.skeleton.index(name)].numpy()
+            np.testing.assert_allclose(place, viewer.world(node)[:3, 3], **POSITIONS)
+
+
+def test_a_root_on_the_floor_stays_there(tmp_path):
+    motion = follow_up(make(tmp_path, "unreal"))
+    assert float(motion.joint_positions()[:, 0].abs().max()) < 1e-6
+    hips = motion.joint_positions()[:, motion.skeleton.index("pelvis")]
+    assert float(hips.diff(dim=0).norm(dim=-1).sum()) > 0.3
+
+
+def test_a_pose_bound_in_the_armatures_space_is_the_rest_pose(tmp_path):
+    made = make(tmp_path, "bound-in-armature", node_pose="bent")
+    rest = formats.load_rest(made.path)
+    at = [rest.skeleton.index(name) for name in made.names if name in rest.skeleton.names]
+    told = [k for k, name in enumerate(made.names) if name in rest.skeleton.names]
+    np.testing.assert_allclose(rest.joint_positions()[0, at].numpy(), made.positions[told], **POSITIONS)
+
+
+def test_cubic_keys_are_hermite_splines():
+    random = np.random.default_rng(0)
+    times, keys = np.array([0.0, 0.5, 1.25, 1.5]), random.normal(size=(4, 3, 3))
+    keys[:, 0] = keys[:, 2]  # one slope at a key, as scipy's have
+    track = Track(0, "translation", times, keys.reshape(-1, 3), "CUBICSPLINE")
+    at = np.linspace(0, 1.5, 23)
+    wanted = CubicHermiteSpline(times, keys[:, 1], keys[:, 0])(at)
+    np.testing.assert_allclose(sample_track(track, at), wanted, atol=1e-12)
 
 
 def test_one_animation_is_replaced_where_it_was_the_one(tmp_path):

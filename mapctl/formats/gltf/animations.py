@@ -102,14 +102,14 @@ def _sample_node(node: Node, tracks: Sequence[Track], times: Array) -> Array:
         "scale": np.tile(np.array(node.scale), (count, 1)),
     }
     for track in tracks:
-        parts[track.path] = _sample_track(track, times)
+        parts[track.path] = sample_track(track, times)
     lengths = np.linalg.norm(parts["rotation"], axis=1, keepdims=True)
     turns = np.where(lengths > 1e-9, parts["rotation"] / np.maximum(lengths, 1e-9), np.array([0.0, 0.0, 0.0, 1.0]))
     return compose_matrices(parts["translation"], turns, parts["scale"])
 
 
-def _sample_track(track: Track, times: Array) -> Array:
-    """Read a track at times; before its first and after its last key it holds."""
+def sample_track(track: Track, times: Array) -> Array:
+    """Return a track's values (times, 3 or 4) at times, seconds; before its first and after its last key it holds."""
     keys = track.times
     if len(keys) == 1:
         return np.tile(track.values[1 if track.interpolation == "CUBICSPLINE" else 0], (len(times), 1))
