@@ -2,6 +2,7 @@
 
 import json
 import struct
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +56,13 @@ def join_glb(tree: Any, binary: bytes) -> bytes:
     if binary:
         chunks += struct.pack("<I4s", len(binary), b"BIN\0") + binary
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+def edit_glb(path: Path, change: Callable[[Any], object]) -> None:
+    """Write the .glb with another document: CHANGE is given the old one to alter."""
+    tree, binary = split_glb(path.read_bytes())
+    change(tree)
+    path.write_bytes(join_glb(tree, binary))
 
 
 def forge_glb(raw: bytes, random: np.random.Generator) -> bytes:
