@@ -113,6 +113,49 @@ class DataLimits:
 
 
 @runtime_checkable
+class PreparedRollout(Protocol):
+    """Rollouts of one density from one state under one plan, for a search that asks for many, one after the other."""
+
+    @abstractmethod
+    def roll_out(
+        self, noise: Float[Tensor, "batch frames continuous"]
+    ) -> tuple[Float[Tensor, "batch frames size"], Float[Tensor, "batch frames"]]:
+        """Return features and log densities as `Density.rollout`, detached."""
+        ...
+
+    @abstractmethod
+    def pull_back(
+        self, d_features: Float[Tensor, "batch frames size"], d_log_density: Float[Tensor, "batch frames"]
+    ) -> Float[Tensor, "batch frames continuous"]:
+        """Return the gradient on the noise of the last `roll_out` from those on its features and log densities."""
+        ...
+
+
+class AutogradRollout(PreparedRollout):
+    """Prepared rollouts of any density: autograd differentiates its `rollout`."""
+
+    def __init__(self, density: "Density[Any]", state: Any, plan: DiscreteChoices):
+        self._density, self._state, self._plan = density, state, plan
+        self._rolled: tuple[Tensor, tuple[Tensor, Tensor]] | None = None
+
+    def roll_out(self, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """See PreparedRollout."""
+        noise = noise.detach().requires_grad_(True)
+        features, log_density = self._density.rollout(self._state, noise, self._plan)
+        self._rolled = noise, (features, log_density)
+        return features.detach(), log_density.detach()
+
+    def pull_back(self, d_features: Tensor, d_log_density: Tensor) -> Tensor:
+        """See PreparedRollout."""
+        assert self._rolled is not None, "there is no rollout yet"
+        noise, rolled = self._rolled
+        depends = [(out, d) for out, d in zip(rolled, (d_features, d_log_density), strict=True) if out.requires_grad]
+        outputs, gradients = zip(*depends, strict=True)
+        (gradient,) = torch.autograd.grad(outputs, noise, gradients, materialize_grads=True)
+        return gradient
+
+
+@runtime_checkable
 class Density(Protocol[State]):
     """A density over the next frame given those before, which an explicit state sums up; the prior of a MAP problem.
 
@@ -167,6 +210,10 @@ class Density(Protocol[State]):
         Standard normal noise gives the density itself, zero noise its plain continuation. A sigma may be a matrix.
         """
         ...
+
+    def prepare_rollout(self, state: State, plan: DiscreteChoices) -> PreparedRollout:
+        """Prepare the rollouts of a search: a density with a pullback of its own offers it here. Default: autograd."""
+        return AutogradRollout(self, state, plan)
 
     @abstractmethod
     def latents(

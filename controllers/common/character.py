@@ -114,7 +114,7 @@ class Character:
             features[..., LAYOUT.slices[block]] *= self.scale
         start = replace(trial.start, position_xz=trial.start.position_xz * self.scale)
         before = trial.before * self.scale
-        return replace(trial, features=features, start=start, before=before, skeleton=self.skeleton)
+        return replace(trial, features=features, start=start, before=before, skeleton=self.skeleton, world_poses=None)
 
     def on_rig(self, motion: Motion) -> Motion:
         """Retarget a canonical motion of this character to its rig; joints that are not canonical rest."""

@@ -4,6 +4,8 @@ Same mathematics as `features.integrate_root` and `kinematics.positions_from_mat
 and serve every case but float32 on the CPU. Each is one node of torch's graph, differentiable once.
 """
 
+from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -71,6 +73,52 @@ def compute_joints_world(
     return _Body.apply(features, root_xz_world, heading, skeleton)
 
 
+@dataclass(frozen=True, eq=False)
+class WorldPoses:
+    """Roots and joints of candidate windows in the world, without torch's graph, and the adjoint of how they came."""
+
+    root_xz_world: Float[Tensor, "batch frames 2"]
+    """Ground projection of the hips, metres."""
+    heading: Float[Tensor, "batch frames"]
+    """Heading of the hips, radians about +Y, not wrapped."""
+    joints_world: Float[Tensor, "batch frames joints 3"]
+    """World joint positions, metres."""
+    _features: np.ndarray
+    _start_heading: np.ndarray
+    _bones: tuple[np.ndarray, np.ndarray]
+    _rotations: np.ndarray
+
+    @staticmethod
+    def compute(features: Float[Tensor, "batch frames size"], start: GroundPose, skeleton: Skeleton) -> "WorldPoses":
+        """Compute the poses of features; what `is_supported` refuses is no input."""
+        batch, bones, known = len(features), _tabulate_bones(skeleton), _contiguous_array(features)
+        at, start_heading = start.position_xz.expand(batch, 2).contiguous(), start.heading.expand(batch).contiguous()
+        ground, heading = features.new_empty(*known.shape[:2], 2), features.new_empty(known.shape[:2])
+        fast_kernels.root_forward(known, _COLUMNS, at.numpy(), start_heading.numpy(), ground.numpy(), heading.numpy())
+        positions = features.new_empty(*known.shape[:2], len(bones[0]), 3)
+        turns = np.empty((*positions.shape, 3), np.float32)
+        fast_kernels.body_forward(known, _COLUMNS, ground.numpy(), heading.numpy(), *bones, positions.numpy(), turns)
+        return WorldPoses(ground, heading, positions, known, start_heading.numpy(), bones, turns)
+
+    def pull_back(self, d_root_xz: np.ndarray, d_heading: np.ndarray, d_joints: np.ndarray) -> np.ndarray:
+        """Return the gradient on the features (batch, frames, size) from those on roots, headings and joints."""
+        gradient, (batch, frames, _) = np.zeros(self._features.shape, np.float32), self._features.shape
+        ground, heading = np.empty((batch, frames, 2), np.float32), np.empty((batch, frames), np.float32)
+        fast_kernels.body_backward(
+            self._features, _COLUMNS, *self._bones, self._rotations, d_joints, gradient, ground, heading
+        )
+        ground += d_root_xz
+        heading += d_heading
+        fast_kernels.root_backward(self._features, _COLUMNS, self._start_heading, ground, heading, gradient)
+        return gradient
+
+
+@lru_cache(maxsize=16)
+def _tabulate_bones(skeleton: Skeleton) -> tuple[np.ndarray, np.ndarray]:
+    """Parents and offsets (float64); skeletons are compared by identity."""
+    return np.array(skeleton.parents), skeleton.offsets.double().numpy()
+
+
 def _contiguous_array(tensor: Tensor) -> np.ndarray:
     """Return a contiguous array, so that every kernel is compiled once."""
     return tensor.detach().contiguous().numpy()
@@ -97,7 +145,7 @@ class _Root(torch.autograd.Function):
 class _Body(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, features: Tensor, ground: Tensor, heading: Tensor, skeleton: Skeleton):
-        parents, offsets = np.array(skeleton.parents), skeleton.offsets.double().numpy()
+        parents, offsets = _tabulate_bones(skeleton)
         positions = features.new_empty(*features.shape[:2], len(parents), 3)
         world = np.empty((*positions.shape, 3), np.float32)
         known = _contiguous_array(features)

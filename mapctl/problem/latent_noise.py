@@ -1,14 +1,17 @@
 """Unknowns that are the noise of a rollout: x = mu_k + sigma_k d, components k and contact bits fixed by a plan."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl.features import LAYOUT
+from mapctl.kinematics import fast
 from mapctl.problem.context import WindowContext
-from mapctl.protocols import DiscreteChoices
+from mapctl.protocols import DiscreteChoices, PreparedRollout
+from mapctl.terms.adjoints.gradient import TrialGradient
 from mapctl.terms.trial import Trial
 
 
@@ -38,10 +41,47 @@ class LatentNoise:
         """Build the trials of the noise by a rollout of the density; differentiable."""
         context = self.context
         noise = torch.unflatten(unknowns, -1, (context.frames, LAYOUT.continuous))
-        batch = len(noise)
-        plan = DiscreteChoices(self.plan.component.expand(batch, -1), self.plan.contacts.expand(batch, -1, -1))
-        features, log_density = context.prior.rollout(context.expand_state(batch), noise, plan)
+        plan = self._expand_plan(len(noise))
+        features, log_density = context.prior.rollout(context.expand_state(len(noise)), noise, plan)
         return context.build_trial(features, plan.contacts, noise=noise, log_density=log_density)
+
+    def build_detached(self, unknowns: Float[Tensor, "batch unknowns"]) -> Trial | None:
+        """See AdjointParametrisation."""
+        context, batch = self.context, len(unknowns)
+        noise = torch.unflatten(unknowns.detach(), -1, (context.frames, LAYOUT.continuous))
+        if not fast.is_supported(noise, context.place, context.skeleton):
+            return None
+        rollout, contacts = self._prepare(batch)
+        features, log_density = rollout.roll_out(noise)
+        poses = fast.WorldPoses.compute(features, context.place, context.skeleton)
+        trial = context.build_trial(features, contacts, noise=noise, log_density=log_density)
+        return replace(trial, world_poses=poses)
+
+    def pull_back(self, trial: Trial, gradient: TrialGradient) -> Float[Tensor, "batch unknowns"]:
+        """See AdjointParametrisation."""
+        assert trial.world_poses is not None
+        on_world = (gradient.root_xz_world, gradient.heading, gradient.joints_world)
+        d_features = gradient.features + trial.world_poses.pull_back(*on_world)
+        rollout, _ = self._prepare(len(d_features))
+        d_noise = rollout.pull_back(torch.as_tensor(d_features), torch.as_tensor(gradient.log_density))
+        return (d_noise + torch.as_tensor(gradient.noise)).flatten(1)
+
+    def _prepare(self, batch: int) -> tuple[PreparedRollout, Bool[Tensor, "batch frames 2"]]:
+        """Prepare the rollouts of so many candidates, once, and their contacts."""
+        if batch not in self._prepared:
+            plan = self._expand_plan(batch)
+            rollout = self.context.prior.prepare_rollout(self.context.expand_state(batch), plan)
+            self._prepared[batch] = rollout, plan.contacts
+        return self._prepared[batch]
+
+    @cached_property
+    def _prepared(self) -> dict[int, tuple[PreparedRollout, Bool[Tensor, "batch frames 2"]]]:
+        return {}
+
+    def _expand_plan(self, batch: int) -> DiscreteChoices:
+        return DiscreteChoices(
+            self.plan.component.expand(batch, -1).contiguous(), self.plan.contacts.expand(batch, -1, -1).contiguous()
+        )
 
     def warm_start(self, unknowns: Float[Tensor, "1 unknowns"]) -> Float[Tensor, "frames width"]:
         """Return the noise by frame."""

@@ -1,22 +1,27 @@
-"""The MAP objective of one window: unknowns to a trial, terms to energies, autograd to the gradient (Wang et al. 2019,
+"""The MAP objective of one window: unknowns to a trial, terms to energies, and back to the gradient (Wang et al. 2019,
 Eq. 19).
 
-The density offers a rollout (and, on the fast path, its hand-written pullback behind autograd); a term offers an energy
-on the trial's quantities. Nothing here knows a network, and no network knows a term.
+The torch form is the specification: a rollout and energies on the trial's quantities, differentiated by autograd. The
+terms of following and steering have gradients of their own, which reach the unknowns by the parametrisation's adjoint;
+other terms join them by autograd on the trial. Nothing here knows a network, and no network knows a term.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from mapctl.errors import RequestError
 from mapctl.problem.ledger import Ledger, LedgerEntry
+from mapctl.problem.parametrisation import AdjointParametrisation, Parametrisation
 from mapctl.solver.gradient import differentiate
-from mapctl.terms.base import Term
+from mapctl.terms.adjoints.gradient import TrialGradient
+from mapctl.terms.base import DifferentiatedTerm, Term
 from mapctl.terms.trial import Trial
 
 
@@ -28,26 +33,48 @@ class Objective:
     """Unknowns to the trial; differentiable."""
     terms: Sequence[Term]
     """Terms whose energies are summed, over frames too."""
+    adjoint: AdjointParametrisation | None = None
+    """Parametrisation that differentiates by hand; None: autograd does all."""
+
+    @staticmethod
+    def of(unknowns: Parametrisation, terms: Sequence[Term]) -> "Objective":
+        """Return the objective of terms over a parametrisation, differentiated by hand as far as that can be."""
+        adjoint = unknowns if isinstance(unknowns, AdjointParametrisation) else None
+        return Objective(unknowns.build, terms, adjoint)
 
     def energy(self, unknowns: Float[Tensor, "batch unknowns"]) -> Float[Tensor, " batch"]:
         """Total nats of each candidate; RequestError where a term gives another shape than a number a frame."""
-        return self._sum_terms(self.build(unknowns)).sum(-1)
-
-    def _sum_terms(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        total = _evaluate(self.terms[0], "energy", trial)
-        for term in self.terms[1:]:
-            total = total + _evaluate(term, "energy", trial)
-        return total
+        return _sum_terms(self.terms, self.build(unknowns)).sum(-1)
 
     def energy_and_gradient(self, unknowns: Tensor) -> tuple[Tensor, Tensor]:
         """Nats (batch,) and their gradient (batch, unknowns); candidates are independent of each other.
 
         RequestError as in `energy`, and where a term is not finite, or its gradient, for a motion that is.
         """
-        energy, gradient = differentiate(self.energy)(unknowns)
+        energy, gradient = self._differentiate_by_hand(unknowns) or differentiate(self.energy)(unknowns)
         if not bool(torch.isfinite(energy.sum() + gradient.sum())):
             self._raise_for_bad_term(unknowns)
         return energy, gradient
+
+    def _differentiate_by_hand(self, unknowns: Tensor) -> tuple[Tensor, Tensor] | None:
+        """Energies and gradient through the parametrisation's own adjoint; None where it has none for these."""
+        trial = None if self.adjoint is None else self.adjoint.build_detached(unknowns)
+        if self.adjoint is None or trial is None:
+            return None
+        gradient, (by_hand, others) = TrialGradient.zeros(trial), self._parted_terms
+        energy = np.zeros(gradient.log_density.shape)
+        for term in by_hand:
+            energy += term.add_gradient(trial, gradient)
+        if others:
+            energy += _add_gradient_by_autograd(others, trial, gradient)
+        total = torch.as_tensor(energy.sum(axis=-1)).to(unknowns.dtype)
+        return total, self.adjoint.pull_back(trial, gradient)
+
+    @cached_property
+    def _parted_terms(self) -> tuple[list[DifferentiatedTerm], list[Term]]:
+        """The terms that have a gradient of their own, and the others."""
+        by_hand = [term for term in self.terms if isinstance(term, DifferentiatedTerm)]
+        return by_hand, [term for term in self.terms if not isinstance(term, DifferentiatedTerm)]
 
     def _raise_for_bad_term(self, unknowns: Tensor) -> None:
         """Find the first term that is not finite; do nothing where the motion or its log density is not finite."""
@@ -58,7 +85,7 @@ class Objective:
         for term in self.terms:
             # What the trial itself is made of: how it comes about is no term's fault.
             leaves = {name: values.detach().requires_grad_(True) for name, values in _parts(trial).items()}
-            energy = _evaluate(term, "energy", replace(trial, **leaves))
+            energy = _evaluate(term, "energy", replace(trial, **leaves, world_poses=None))
             _check_finite(term, "energy", energy)
             if energy.requires_grad:
                 slopes = torch.autograd.grad(energy.sum(), list(leaves.values()), materialize_grads=True)
@@ -73,6 +100,24 @@ class Objective:
 
 
 _PLAUSIBLE_LIMIT = 1e4  # metres or radians: a motion that a search has thrown this far says nothing of a term
+
+
+def _sum_terms(terms: Sequence[Term], trial: Trial) -> Float[Tensor, "batch frames"]:
+    total = _evaluate(terms[0], "energy", trial)
+    for term in terms[1:]:
+        total = total + _evaluate(term, "energy", trial)
+    return total
+
+
+def _add_gradient_by_autograd(terms: Sequence[Term], trial: Trial, gradient: TrialGradient) -> np.ndarray:
+    """Add the gradient of terms without one of their own; return their energies."""
+    leaves = {name: values.detach().requires_grad_(True) for name, values in _parts(trial).items()}
+    energy = _sum_terms(terms, replace(trial, **leaves, world_poses=None))
+    if energy.requires_grad:
+        slopes = torch.autograd.grad(energy.sum(), list(leaves.values()), materialize_grads=True)
+        for name, slope in zip(leaves, slopes, strict=True):
+            getattr(gradient, name)[...] += slope.numpy()
+    return energy.detach().double().numpy()
 
 
 def _parts(trial: Trial) -> dict[str, Tensor]:

@@ -12,6 +12,7 @@ from typing import Protocol, runtime_checkable
 from jaxtyping import Float
 from torch import Tensor
 
+from mapctl.terms.adjoints.gradient import TrialGradient
 from mapctl.terms.trial import Trial
 
 
@@ -25,4 +26,17 @@ class Parametrisation(Protocol):
 
     def warm_start(self, unknowns: Float[Tensor, "1 unknowns"]) -> Float[Tensor, "frames width"]:
         """Return by frame what the solver of a window that overlaps this one may start from."""
+        ...
+
+
+@runtime_checkable
+class AdjointParametrisation(Parametrisation, Protocol):
+    """A parametrisation that differentiates what it builds by hand, without torch's graph."""
+
+    def build_detached(self, unknowns: Float[Tensor, "batch unknowns"]) -> Trial | None:
+        """Build the trials of `build` without a graph, with their world poses; None where autograd must serve."""
+        ...
+
+    def pull_back(self, trial: Trial, gradient: TrialGradient) -> Float[Tensor, "batch unknowns"]:
+        """Return the gradient on the unknowns of the trial that was built last."""
         ...

@@ -89,7 +89,7 @@ class LatentNoiseSolver:
 
     def _run_round(self, request: WindowRequest, start: Tensor, meter: Meter) -> tuple[LatentNoise, LbfgsResult]:
         unknowns = LatentNoise.from_unknowns(request.context, start)
-        objective = Objective(unknowns.build, request.terms)
+        objective = Objective.of(unknowns, request.terms)
         return unknowns, minimise(objective.energy_and_gradient, start, settings=self.lbfgs, meter=meter)
 
 
@@ -127,7 +127,7 @@ def minimise_window(
     meter: Meter,
 ) -> SolvedWindow:
     """Minimise the terms' energies over a window's unknowns; the start itself is kept where nothing finite is found."""
-    result = minimise(Objective(unknowns.build, terms).energy_and_gradient, start, settings=lbfgs, meter=meter)
+    result = minimise(Objective.of(unknowns, terms).energy_and_gradient, start, settings=lbfgs, meter=meter)
     if not bool(torch.isfinite(result.energy).all()):
         result = replace(result, x=start)
     return _build_solved_window(unknowns, terms, result, meter)
@@ -141,7 +141,7 @@ def _build_solved_window(
     return SolvedWindow(
         trial,
         unknowns.warm_start(result.x),
-        Objective(unknowns.build, terms).build_ledger(trial),
+        Objective.of(unknowns, terms).build_ledger(trial),
         meter.evaluations,
         float(result.start_energy[0]),
         float(result.energy[0]),

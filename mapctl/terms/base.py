@@ -4,9 +4,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
+import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
+from mapctl.terms.adjoints.gradient import TrialGradient
 from mapctl.terms.trial import Trial
 
 
@@ -31,6 +33,16 @@ class Term(Protocol):
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Compute how far each frame is from what is wanted, in the term's unit."""
+        ...
+
+
+@runtime_checkable
+class DifferentiatedTerm(Term, Protocol):
+    """A term with a gradient of its own, which spares a search most of autograd's cost. `__call__` stays the
+    specification. A term needs none: autograd serves where there is none."""
+
+    def add_gradient(self, trial: Trial, gradient: TrialGradient) -> Float[np.ndarray, "batch frames"]:
+        """Add the gradient of the summed energies of a float32 trial, and return the energies, nats."""
         ...
 
 

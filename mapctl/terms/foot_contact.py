@@ -2,10 +2,13 @@
 
 from dataclasses import dataclass
 
+import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
 from mapctl.skeleton import TOE_REST_HEIGHT
+from mapctl.terms.adjoints import kernels
+from mapctl.terms.adjoints.gradient import TrialGradient
 from mapctl.terms.trial import Trial
 
 
@@ -30,6 +33,23 @@ class FootContact:
         above = trial.toe_heights - self.rest_height
         energy = energy + 0.5 * (trial.contacts * (above / self.sigma_height).square()).sum(-1)
         return energy + 0.5 * (above.clamp(max=0) / self.sigma_below).square().sum(-1)
+
+    def add_gradient(self, trial: Trial, gradient: TrialGradient) -> Float[np.ndarray, "batch frames"]:
+        """See DifferentiatedTerm."""
+        energy = np.empty(gradient.log_density.shape)
+        kernels.add_foot_contact(
+            trial.joints_world.numpy(),
+            trial.last_before.numpy(),
+            trial.contacts.numpy(),
+            trial.contacts_before.expand(len(energy), 2).numpy(),
+            trial.toes,
+            float(trial.fps),
+            (self.sigma_speed, self.sigma_height, self.sigma_below),
+            self.rest_height,
+            energy,
+            gradient.joints_world,
+        )
+        return energy
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Horizontal speed of the faster planted toe, m/s; 0 where none is planted."""

@@ -2,9 +2,12 @@
 
 from dataclasses import dataclass
 
+import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
+from mapctl.terms.adjoints import kernels
+from mapctl.terms.adjoints.gradient import TrialGradient
 from mapctl.terms.trial import Trial
 
 
@@ -20,6 +23,12 @@ class LatentPrior:
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Energies, nats: half the squared numbers of each frame over sigma squared."""
         return 0.5 * (trial.require_noise() / self.sigma).square().sum(-1)
+
+    def add_gradient(self, trial: Trial, gradient: TrialGradient) -> Float[np.ndarray, "batch frames"]:
+        """See DifferentiatedTerm."""
+        energy = np.empty(gradient.log_density.shape)
+        kernels.add_latent_prior(trial.require_noise().numpy(), self.sigma, energy, gradient.noise)
+        return energy
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Root mean square of a frame's numbers."""

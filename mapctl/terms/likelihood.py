@@ -2,9 +2,11 @@
 
 from dataclasses import dataclass
 
+import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
+from mapctl.terms.adjoints.gradient import TrialGradient
 from mapctl.terms.trial import Trial
 
 
@@ -20,6 +22,11 @@ class Likelihood:
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Energies, nats; negative where the density is above 1."""
         return -trial.require_log_density() / self.temperature
+
+    def add_gradient(self, trial: Trial, gradient: TrialGradient) -> Float[np.ndarray, "batch frames"]:
+        """See DifferentiatedTerm."""
+        gradient.log_density[...] -= 1 / self.temperature
+        return -trial.require_log_density().double().numpy() / self.temperature
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Minus the log density, nats."""

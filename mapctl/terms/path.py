@@ -8,6 +8,7 @@ So the slow part of the sideways offset is held tightly, and the raw offset is f
 from dataclasses import dataclass
 from functools import lru_cache
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -15,6 +16,8 @@ from torch import Tensor
 from mapctl.curves import Curve
 from mapctl.curves.local_frame import LocalFrame, find_local_frames
 from mapctl.numerics import gaussian, vectors
+from mapctl.terms.adjoints import kernels
+from mapctl.terms.adjoints.gradient import TrialGradient
 from mapctl.terms.trial import Trial
 
 _REACH = 0.6  # metres around the wanted arc in which the nearest point is sought: a crossing's other branch is farther
@@ -57,6 +60,29 @@ class Path:
         energy = (errors / self._axis_sigmas(positions.dtype)).square().sum(-1)
         return 0.5 * (energy + (self._low_pass_offset(trial, offsets[..., 0]) / self.sigma_slow).square())
 
+    def add_gradient(self, trial: Trial, gradient: TrialGradient) -> Float[np.ndarray, "batch frames"]:
+        """See DifferentiatedTerm."""
+        positions, energy = self._positions(trial).contiguous(), np.empty(gradient.log_density.shape)
+        near, sigma = self._nearest_frame(positions), self.slow_seconds * trial.fps
+        known, weights = _build_offset_smoother(
+            self, trial.before, trial.skeleton.index(self.joint), sigma, positions.dtype
+        )
+        pulled = np.zeros(tuple(positions.shape), np.float32)
+        kernels.add_path(
+            positions.numpy(),
+            near.tangent_extension.numpy(),
+            near.axes.numpy(),
+            known.numpy(),
+            weights.numpy(),
+            (self.sigma_raw, self.sigma_progress, self.sigma_height),
+            self.sigma_slow,
+            self.free_sway,
+            energy,
+            pulled,
+        )
+        self._select_target(trial, gradient)[...] += pulled
+        return energy
+
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Distance to the curve, metres."""
         positions = self._positions(trial)
@@ -66,6 +92,13 @@ class Path:
         if self.joint == "hips" and self.curve.dims == 2:  # no need of the whole body's kinematics
             return trial.root_xz_world
         return self._select_axes(trial.joint_world(self.joint))
+
+    def _select_target(self, trial: Trial, gradient: TrialGradient) -> np.ndarray:
+        """The part of a gradient that is on `_positions`."""
+        if self.joint == "hips" and self.curve.dims == 2:
+            return gradient.root_xz_world
+        joint = gradient.joints_world[:, :, trial.skeleton.index(self.joint)]
+        return joint[..., ::2] if self.curve.dims == 2 else joint
 
     def _select_axes(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch dims"]:
         return positions[..., ::2] if self.curve.dims == 2 else positions

@@ -8,11 +8,14 @@ import math
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from mapctl.numerics import gaussian, vectors
+from mapctl.terms.adjoints import kernels
+from mapctl.terms.adjoints.gradient import TrialGradient
 from mapctl.terms.trial import Trial
 
 
@@ -47,6 +50,25 @@ class RootVelocity:
             energy = energy + (apart / self.sigma_facing).square()
         return 0.5 * energy
 
+    def add_gradient(self, trial: Trial, gradient: TrialGradient) -> Float[np.ndarray, "batch frames"]:
+        """See DifferentiatedTerm."""
+        known, weights = _build_velocity_smoother(self, trial.before, trial.fps, trial.features.dtype)
+        energy, (velocities, units, facing) = np.empty(gradient.log_density.shape), self._tables
+        kernels.add_root_velocity(
+            trial.root_xz_world.numpy(),
+            trial.start.position_xz.expand(len(energy), 2).numpy(),
+            known.numpy(),
+            weights.numpy(),
+            velocities,
+            units,
+            float(trial.fps),
+            energy,
+            gradient.root_xz_world,
+        )
+        if facing is not None:
+            kernels.add_facing(trial.heading.numpy(), facing, self.sigma_facing, energy, gradient.heading)
+        return energy
+
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Size of the low-pass velocity error, m/s."""
         return vectors.length(self._velocity_error(trial))
@@ -60,6 +82,12 @@ class RootVelocity:
         across = torch.stack([along[:, 1], -along[:, 0]], dim=-1)
         sigma_across = (self.sigma_direction * speed).clamp_min(self.sigma_speed)  # at rest there is no direction
         return torch.stack([along / self.sigma_speed, across / sigma_across], dim=-2)
+
+    @cached_property
+    def _tables(self) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+        """Target velocities, axes and headings as kernels read them."""
+        facing = None if self.facing is None else self.facing.double().numpy()
+        return self.velocities.double().numpy(), self._units.double().numpy(), facing
 
     def _velocity_error(self, trial: Trial) -> Float[Tensor, "batch frames 2"]:
         known, weights = _build_velocity_smoother(self, trial.before, trial.fps, trial.features.dtype)

@@ -2,11 +2,14 @@
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from mapctl.skeleton import TOES
+from mapctl.terms.adjoints import kernels
+from mapctl.terms.adjoints.gradient import TrialGradient
 from mapctl.terms.trial import Trial
 
 _NEVER = -2  # below every frame
@@ -30,6 +33,21 @@ class StepLength:
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Energies in the frames of touch-downs, nats; 0 in all others."""
         return 0.5 * (self._length_error(trial) / self.sigma).square()
+
+    def add_gradient(self, trial: Trial, gradient: TrialGradient) -> Float[np.ndarray, "batch frames"]:
+        """See DifferentiatedTerm."""
+        energy = np.empty(gradient.log_density.shape)
+        kernels.add_step_length(
+            trial.joints_world.numpy(),
+            trial.last_before.numpy(),
+            trial.planted.numpy(),
+            trial.toes,
+            self.length,
+            self.sigma,
+            energy,
+            gradient.joints_world,
+        )
+        return energy
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Error of the step length, metres; 0 between touch-downs."""

@@ -40,6 +40,8 @@ class Trial:
     """Frames per second."""
     first_frame: int = 0
     """Frame of the whole motion that the window begins at, counted from 0."""
+    world_poses: fast.WorldPoses | None = None
+    """Roots and joints of the features in the world, where they are known already; they carry no gradient."""
 
     @staticmethod
     def of_features(features: Float[Tensor, "batch frames size"], *, skeleton: Skeleton = CANONICAL) -> "Trial":
@@ -72,6 +74,8 @@ class Trial:
 
     @cached_property
     def _root(self) -> tuple[Tensor, Tensor]:
+        if self.world_poses is not None:
+            return self.world_poses.root_xz_world, self.world_poses.heading
         integrate = fast.integrate_root_fast if self._use_kernels else integrate_root
         return integrate(self.features, self.start)
 
@@ -96,6 +100,8 @@ class Trial:
     @cached_property
     def joints_world(self) -> Float[Tensor, "batch frames joints 3"]:
         """World joint positions, metres, by forward kinematics of the whole body."""
+        if self.world_poses is not None:
+            return self.world_poses.joints_world
         if self._use_kernels:
             return fast.compute_joints_world(self.features, self.root_xz_world, self.heading, self.skeleton)
         return self.pose.joints_world(self.skeleton)
@@ -110,11 +116,22 @@ class Trial:
         past = self.contacts_before.to(self.contacts.device).expand(len(self.contacts), 2).unsqueeze(1)
         return torch.cat([past, self.contacts], dim=1)
 
+    @cached_property
+    def last_before(self) -> Float[Tensor, "past joints 3"]:
+        """World joint positions of the frame before the window, metres, as precise as features; none without a past."""
+        return self.before[-1:].to(self.features.dtype)
+
     def step(self, joint: int) -> Float[Tensor, "batch frames 3"]:
         """Displacement of a joint since the frame before, metres; the first frame's needs a past, or is 0."""
         positions = self.joints_world[..., joint, :]
         past = self.before[-1:, joint].to(positions.dtype) if len(self.before) else positions[:, :1].detach()
         return torch.diff(positions, dim=-2, prepend=past.expand(len(positions), 1, 3))
+
+    @property
+    def toes(self) -> tuple[int, int]:
+        """Indices of the left and the right toe joint."""
+        left, right = self.skeleton.indices(TOES)
+        return left, right
 
     @property
     def toe_speeds(self) -> Float[Tensor, "batch frames 2"]:

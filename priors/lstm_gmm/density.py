@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl.errors import RequestError
-from mapctl.protocols import DataLimits, Density, DiscreteChoices, InitialStates
+from mapctl.protocols import DataLimits, Density, DiscreteChoices, InitialStates, PreparedRollout
 from priors import checkpoints
 from priors.lstm_gmm import labels as clip_labels
 from priors.lstm_gmm.fast.rollout import FastRollout
@@ -34,11 +34,13 @@ class LstmGmmDensity(Density[LstmState]):
     """Card of the weights: configuration, data, licence, quality."""
     use_fast: bool = True
     """Whether rollouts and samples take the hand-written kernels."""
+    unconditioned: "LstmGmmDensity | None" = None
+    """Density of which this is a conditioned copy: both read the same packed weights."""
 
     @cached_property
     def _fast(self) -> FastRollout:
         """The kernels, built on first use."""
-        return FastRollout(self.reference)
+        return FastRollout(self.reference, relative=self.unconditioned and self.unconditioned._fast)
 
     @property
     def _rollout_engine(self) -> FastRollout | LstmGmm:
@@ -86,18 +88,18 @@ class LstmGmmDensity(Density[LstmState]):
             tuple(starts.names[i] for i in rows.tolist()),
             weight / weight.sum(),
         )
-        return replace(self, reference=self.reference.conditioned_on(full), initial_states=picked)
+        return replace(self._with_network(self.reference.conditioned_on(full)), initial_states=picked)
 
     def conditioned_like_start(self, start: int) -> "LstmGmmDensity":
         """Return the density given the labels of the clip that an initial state was taken from: its gait goes on."""
         held = clip_labels.read(self.initial_states.names, self.card.data.get("labels", ""))
         names = [name for name, holds in zip(held.names, held.held[start].tolist(), strict=True) if holds]
         known = [name for name in names if name in self.reference.config.labels]
-        return replace(self, reference=self.reference.conditioned_on(known))
+        return self._with_network(self.reference.conditioned_on(known))
 
     def with_observation_noise(self, sigma: Float[Tensor, " continuous"]) -> "LstmGmmDensity":
         """Return the density of motion observed with errors of this sigma (physical units); see `LstmGmm`."""
-        return replace(self, reference=self.reference.with_observation_noise(sigma))
+        return self._with_network(self.reference.with_observation_noise(sigma))
 
     @property
     def reference_log_density(self) -> float:
@@ -105,6 +107,10 @@ class LstmGmmDensity(Density[LstmState]):
         own held-out data reach, observed with errors of `proposal_sigma()`; minus infinity where the card has none.
         """
         return float(self.card.quality.get("windows", {}).get("p2", -math.inf))
+
+    def _with_network(self, network: LstmGmm) -> "LstmGmmDensity":
+        """Return this with a copy of its network that was made from it."""
+        return replace(self, reference=network, unconditioned=self.unconditioned or self)
 
     def _label(self, name: str) -> str:
         """Find the label `group=value` of a name, which may be the value alone; RequestError if there is none."""
@@ -151,6 +157,10 @@ class LstmGmmDensity(Density[LstmState]):
     def rollout(self, state: LstmState, noise: Tensor, plan: DiscreteChoices) -> tuple[Tensor, Tensor]:
         """See Density."""
         return self._rollout_engine.rollout(state, noise, plan)
+
+    def prepare_rollout(self, state: LstmState, plan: DiscreteChoices) -> PreparedRollout:
+        """See Density."""
+        return self._fast.prepare(state, plan) if self.use_fast else super().prepare_rollout(state, plan)
 
 
 def load(name: str) -> LstmGmmDensity:

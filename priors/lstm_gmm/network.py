@@ -149,11 +149,12 @@ class LstmGmm(nn.Module):
         return torch.linalg.solve_triangular(whitening, unit, upper=False, unitriangular=True)
 
     def conditioned_on(self, labels: Iterable[str]) -> "LstmGmm":
-        """Return a copy conditioned on these labels; its inputs are taken to be clean.
+        """Return a copy conditioned on these labels, whose weights are this network's; its inputs are taken to be
+        clean.
 
         RequestError for a label that the network does not know.
         """
-        labels, model = tuple(labels), copy.deepcopy(self)
+        labels, model = tuple(labels), self._copy_with_same_weights()
         for label in labels:
             if label not in self.config.labels:
                 raise RequestError(
@@ -163,16 +164,28 @@ class LstmGmm(nn.Module):
             known = torch.zeros(self.condition.in_features)
             known[[int(self.config.knows_noise) + self.config.labels.index(label) for label in labels]] = 1
             with torch.no_grad():
-                model.fc1.bias += self.condition(known.to(self.mean))
+                bias = self.fc1.bias + self.condition(known.to(self.mean))
+            model.fc1.bias = nn.Parameter(bias, requires_grad=self.fc1.bias.requires_grad)
         return model
 
+    def shares_weights(self, other: "LstmGmm") -> bool:
+        """Whether both are the same but for biases and the noise of observations: the weights are the same tensors."""
+        ours, theirs = dict(self.named_parameters()), dict(other.named_parameters())
+        same = all(ours[name] is theirs.get(name) for name in ours if not name.endswith("bias"))
+        return same and self.mean is other.mean and self.std is other.std
+
+    def _copy_with_same_weights(self) -> "LstmGmm":
+        kept = [*self.parameters(), *self.buffers()]
+        return copy.deepcopy(self, {id(tensor): tensor for tensor in kept})
+
     def with_observation_noise(self, sigma: Float[Tensor, " continuous"]) -> "LstmGmm":
-        """Return a copy whose `log_prob` is of motion observed with independent errors of this sigma (physical units).
+        """Return a copy, of the same weights, whose `log_prob` is of motion observed with independent errors of this
+        sigma (physical units).
 
         A sharp density hardly grades motions that are off by more than it allows. What the errors add to the correlated
         values is taken to be independent as well, so that the result is still a density.
         """
-        model, size = copy.deepcopy(self), self.layout.continuous
+        model, size = self._copy_with_same_weights(), self.layout.continuous
         variance = (sigma.to(self.std) / self.std[:size]).square().expand(self.config.components, size)
         if (whitening := self.whitening) is not None:
             variance = torch.einsum("kij,kj->ki", whitening.detach().square(), variance)

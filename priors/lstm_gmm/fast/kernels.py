@@ -3,9 +3,10 @@
 A rollout cannot run its frames side by side, so every frame reads every weight once. For one particle that
 is a matter of memory bandwidth, for many of arithmetic; `affine` serves both, by tiles of 4 rows by 4
 particles whose 16 sums stay in registers. It was measured as fast as BLAS for one particle and twice as
-fast for 8 to 32, and it has no threads to fight with. Sizes are padded with zeros, so no loop has a
-remainder: widths to multiples of 16, particles to multiples of 4. All kernels lie in one file because
-compiled code kept on disk goes stale by file.
+fast for 8 to 32, and it has no threads to fight with. Weights are float32, or the bits of half precision,
+which takes half the time. Sizes are padded with zeros, so no loop has a remainder: widths to multiples of
+16, particles to multiples of 4. All kernels lie in one file because compiled code kept on disk goes stale
+by file.
 """
 
 import math
@@ -13,6 +14,7 @@ import math
 import numpy as np
 
 from mapctl.numerics.jit import make_jit_decorators
+from priors.lstm_gmm.fast.half import widen
 from priors.lstm_gmm.fast.layout import GIVEN, LIKELIEST, SAMPLED
 
 _ZERO, _HALF, _ONE, _TWO, _FOUR = (np.float32(value) for value in (0, 0.5, 1, 2, 4))
@@ -68,7 +70,7 @@ def affine(weight, bias, x, out):
             a02 = a12 = a22 = a32 = bias[r + 2]
             a03 = a13 = a23 = a33 = bias[r + 3]
             for k in range(columns):
-                p0, p1, p2, p3 = w0[k], w1[k], w2[k], w3[k]
+                p0, p1, p2, p3 = widen(w0[k]), widen(w1[k]), widen(w2[k]), widen(w3[k])
                 q0, q1, q2, q3 = x0[k], x1[k], x2[k], x3[k]
                 a00, a01, a02, a03 = a00 + p0 * q0, a01 + p1 * q0, a02 + p2 * q0, a03 + p3 * q0
                 a10, a11, a12, a13 = a10 + p0 * q1, a11 + p1 * q1, a12 + p2 * q1, a13 + p3 * q1
@@ -82,8 +84,8 @@ def affine(weight, bias, x, out):
             xb = x[b]
             s0, s1, s2, s3 = bias[r], bias[r + 1], bias[r + 2], bias[r + 3]
             for k in range(columns):
-                q = xb[k]
-                s0, s1, s2, s3 = s0 + w0[k] * q, s1 + w1[k] * q, s2 + w2[k] * q, s3 + w3[k] * q
+                q, p0, p1, p2, p3 = xb[k], widen(w0[k]), widen(w1[k]), widen(w2[k]), widen(w3[k])
+                s0, s1, s2, s3 = s0 + p0 * q, s1 + p1 * q, s2 + p2 * q, s3 + p3 * q
             out[b, r], out[b, r + 1], out[b, r + 2], out[b, r + 3] = s0, s1, s2, s3
 
 
@@ -106,8 +108,8 @@ def affine_pullback(weight, transposed, nothing, gradient, out):
         w4, w5, w6, w7 = weight[r + 4], weight[r + 5], weight[r + 6], weight[r + 7]
         d0, d1, d2, d3, d4, d5, d6, d7 = d[r], d[r + 1], d[r + 2], d[r + 3], d[r + 4], d[r + 5], d[r + 6], d[r + 7]
         for k in range(columns):
-            low = (d0 * w0[k] + d1 * w1[k]) + (d2 * w2[k] + d3 * w3[k])
-            high = (d4 * w4[k] + d5 * w5[k]) + (d6 * w6[k] + d7 * w7[k])
+            low = (d0 * widen(w0[k]) + d1 * widen(w1[k])) + (d2 * widen(w2[k]) + d3 * widen(w3[k]))
+            high = (d4 * widen(w4[k]) + d5 * widen(w5[k])) + (d6 * widen(w6[k]) + d7 * widen(w7[k]))
             total[k] += low + high
 
 
@@ -358,11 +360,11 @@ def backward(
 ):
     """Pullback of `forward` by back-propagation through time: fills d_noise.
 
-    d_frame (batch, Z), d_input (2, batch, 2 W; the hidden state's half) and d_cell (2, batch, W) come in as
-    zeros and leave as gradients on the state. `nothing` is a zero bias.
+    d_frame (batch, Z), d_input (2, batch, 2 W; the hidden state's half) and d_cell (2, batch, W) come in as zeros and
+    leave as gradients on the state. `transposed` is read for several particles only. `nothing` is a zero bias.
     """
-    batch, width = len(noise), len(transposed.fc2)
-    d_head = np.zeros((batch, transposed.head.shape[2]), np.float32)
+    batch, width = len(noise), len(weights.fc2)
+    d_head = np.zeros((batch, weights.head.shape[1]), np.float32)
     d_third, d_above = np.zeros((batch, width), np.float32), np.zeros((batch, width), np.float32)
     d_gates, d_before = np.zeros((batch, 4 * width), np.float32), np.zeros_like(d_frame)
     d_spread = np.zeros(settings.continuous, np.float32)

@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from priors.lstm_gmm.fast import half
 from priors.lstm_gmm.network import LstmGmm
 
 Array = NDArray[np.float32]
@@ -25,8 +26,8 @@ WIDTH_STEP, BATCH_STEP, ROW_STEP = 16, 4, 4
 class Layers(NamedTuple):
     """The network's weights; transposed for the pullback; or its biases, with the last axis gone.
 
-    Axes are padded: Z features, W units, H rows of the head, which are means, log sigmas, weights, contact
-    logits.
+    Weights are float32, or uint16 where half precision holds them all (`half.to_half_bits`); biases are float32. Axes
+    are padded: Z features, W units, H rows of the head, which are means, log sigmas, weights, contact logits.
     """
 
     fc1: Array
@@ -134,12 +135,10 @@ def pack_constants(model: LstmGmm) -> MixtureConstants:
     )
 
 
-def pack_weights(model: LstmGmm) -> tuple[Layers, Layers]:
-    """Padded float32 copies of the weights and of the biases."""
-    width, lstm = round_up_to(model.config.width, WIDTH_STEP), model.lstm
-    features = round_up_to(model.layout.size, WIDTH_STEP)
-    gates = [[lstm.get_parameter(f"weight_{kind}_l{layer}") for kind in ("ih", "hh")] for layer in range(2)]
-    offsets = [lstm.get_parameter(f"bias_ih_l{k}") + lstm.get_parameter(f"bias_hh_l{k}") for k in range(2)]
+def pack_weights(model: LstmGmm) -> Layers:
+    """Padded copies of the weights: half precision where that holds them all and the processor converts it."""
+    width, features = _padded_sizes(model)
+    gates = [[model.lstm.get_parameter(f"weight_{kind}_l{layer}") for kind in ("ih", "hh")] for layer in range(2)]
     weights = Layers(
         fc1=_pad_matrix(_to_numpy(model.fc1.weight), width, features),
         fc2=_pad_matrix(_to_numpy(model.fc2.weight), width, width),
@@ -149,14 +148,22 @@ def pack_weights(model: LstmGmm) -> tuple[Layers, Layers]:
         fc3=_pad_matrix(_to_numpy(model.fc3.weight), width, width),
         head=_pack_head(model, _to_numpy(model.out.weight), width),
     )
-    biases = Layers(
+    if half.converts_half() and all(half.is_half(weight) for weight in weights):
+        return Layers(*(half.to_half_bits(weight) for weight in weights))
+    return weights
+
+
+def pack_biases(model: LstmGmm) -> Layers:
+    """Padded float32 copies of the biases."""
+    width, _ = _padded_sizes(model)
+    offsets = [model.lstm.get_parameter(f"bias_ih_l{k}") + model.lstm.get_parameter(f"bias_hh_l{k}") for k in range(2)]
+    return Layers(
         fc1=_pad_matrix(_to_column(model.fc1.bias), width, 1)[:, 0].copy(),
         fc2=_pad_matrix(_to_column(model.fc2.bias), width, 1)[:, 0].copy(),
         lstm=np.stack([_pack_gates(_to_column(offset), width, 1)[:, 0] for offset in offsets]),
         fc3=_pad_matrix(_to_column(model.fc3.bias), width, 1)[:, 0].copy(),
         head=_pack_head(model, _to_column(model.out.bias), 1)[..., 0].copy(),
     )
-    return weights, biases
 
 
 def transpose_layers(weights: Layers) -> Layers:
@@ -181,6 +188,11 @@ def allocate_tape(weights: Layers, *, slots: int, batch: int) -> Tape:
         third=empty(batch, width),
         head=empty(batch, rows),
     )
+
+
+def _padded_sizes(model: LstmGmm) -> tuple[int, int]:
+    """Units of a layer and features of a frame."""
+    return round_up_to(model.config.width, WIDTH_STEP), round_up_to(model.layout.size, WIDTH_STEP)
 
 
 def _to_numpy(tensor: Tensor) -> Array:

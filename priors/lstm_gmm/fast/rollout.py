@@ -6,6 +6,7 @@ autograd, and its gradient is the hand-written back-propagation through time.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from mapctl.protocols import DiscreteChoices
+from mapctl.protocols import DiscreteChoices, PreparedRollout
 from priors.lstm_gmm.fast import kernels, layout
 from priors.lstm_gmm.fast.layout import Array, ChoiceBuffers, Tape
 from priors.lstm_gmm.network import LstmGmm, LstmState
@@ -39,12 +40,20 @@ class FastRollout:
     load the result.
     """
 
-    def __init__(self, model: LstmGmm):
-        self._config, self._layout, self._kernels = model.config, model.layout, kernels
-        self._settings = layout.pack_constants(model)
-        self._weights, self._biases = layout.pack_weights(model)
-        self._transposed = layout.transpose_layers(self._weights)
+    def __init__(self, model: LstmGmm, *, relative: "FastRollout | None" = None):
+        """Pack the weights; those of a `relative` are taken where its model has the same, as a conditioned copy has."""
+        self._model, self._kernels = model, kernels
+        self._config, self._layout = model.config, model.layout
+        shared = relative if relative is not None and model.shares_weights(relative._model) else None
+        self._weights = layout.pack_weights(model) if shared is None else shared._weights
+        self._settings = layout.pack_constants(model) if shared is None else shared._settings
+        self._biases = layout.pack_biases(model)
         self._zero_bias = np.zeros(2 * len(self._weights.fc2) + self._weights.fc1.shape[1], np.float32)
+
+    @cached_property
+    def _transposed(self) -> layout.Layers:
+        """Weights for the pullback of several particles; most searches have but one."""
+        return layout.transpose_layers(self._weights)
 
     def plan(self, state: LstmState, noise: Float[Tensor, "batch frames continuous"]) -> DiscreteChoices:
         """The likeliest component and contact bits of each frame along the rollout that the noise gives."""
@@ -67,7 +76,12 @@ class FastRollout:
         Differentiable, once, with respect to the noise and to the state's previous frame, h and C.
         ValueError if the plan does not fit noise and network (compiled code would read past its arrays).
         """
-        self._check(plan, noise)
+        if plan.component.shape != noise.shape[:2] or plan.contacts.shape != (*noise.shape[:2], 2):
+            raise ValueError(
+                f"the plan is for {tuple(plan.component.shape)} particles and frames, "
+                f"the noise for {tuple(noise.shape[:2])}"
+            )
+        self._check_components(plan)
         batch = len(noise)
         previous = state.last_frame.expand(batch, -1)
         hidden, cell = state.hidden.expand(-1, batch, -1), state.cell.expand(-1, batch, -1)
@@ -84,38 +98,59 @@ class FastRollout:
         features = _to_tensor(run.features, batch).to(state.last_frame.dtype)
         return features, self._state_after(run, features[:, -1])
 
-    def _check(self, plan: DiscreteChoices, noise: Tensor) -> None:
-        if plan.component.shape != noise.shape[:2] or plan.contacts.shape != (*noise.shape[:2], 2):
-            raise ValueError(
-                f"the plan is for {tuple(plan.component.shape)} particles and frames, "
-                f"the noise for {tuple(noise.shape[:2])}"
-            )
+    def _check_components(self, plan: DiscreteChoices) -> None:
         if plan.component.amin() < 0 or plan.component.amax() >= self._config.components:
             raise ValueError(f"the plan names a component outside 0 to {self._config.components - 1}")
+
+    def prepare(self, state: LstmState, plan: DiscreteChoices) -> "FastWindow":
+        """Prepare rollouts of so many particles from one state under one plan, whose memory is used again and again.
+
+        ValueError if the plan names a component that there is not.
+        """
+        self._check_components(plan)
+        batch, frames = plan.component.shape
+        rows = layout.pad_batch_size(batch)
+        choices = ChoiceBuffers(*(_pad_rows(part, rows) for part in _plan_buffers(plan)))
+        return FastWindow(self, state, choices, (batch, frames))
 
     def _run(self, state: LstmState, noise: Tensor, choices: ChoiceBuffers, source: int, *, slots: int) -> _KernelPass:
         batch, frames, continuous = noise.shape
         if continuous != self._layout.continuous:
             raise ValueError(f"noise has {continuous} values a frame, the network {self._layout.continuous}")
-        rows, width = layout.pad_batch_size(batch), self._config.width
-        tape = layout.allocate_tape(self._weights, slots=slots, batch=rows)
-        settings, size, lanes = self._settings, self._layout.size, len(self._weights.fc2)
+        rows = layout.pad_batch_size(batch)
+        run = _KernelPass(
+            self._begin_tape(state, slots=slots, batch=batch),
+            _pad_rows(_to_array(noise), rows),
+            ChoiceBuffers(*(_pad_rows(part, rows) for part in choices)),
+            np.empty((rows, frames, self._layout.size), np.float32),
+            np.empty((rows, frames), np.float32),
+        )
+        self._roll(run, source)
+        return run
+
+    def _begin_tape(self, state: LstmState, *, slots: int, batch: int) -> Tape:
+        """A tape that begins in a state."""
+        width, size, settings, lanes = self._config.width, self._layout.size, self._settings, len(self._weights.fc2)
+        tape = layout.allocate_tape(self._weights, slots=slots, batch=layout.pad_batch_size(batch))
         tape.frame[0, :batch, :size] = (_to_array(state.last_frame) - settings.mean[:size]) / settings.std[:size]
         tape.lstm_input[0, :, :, lanes:] = 0
         tape.lstm_input[0, :, :batch, lanes : lanes + width] = _to_array(state.hidden)
         tape.cell[0] = 0
         tape.cell[0, :, :batch, :width] = _to_array(state.cell)
-        run = _KernelPass(
-            tape,
-            _pad_rows(_to_array(noise), rows),
-            ChoiceBuffers(*(_pad_rows(part, rows) for part in choices)),
-            np.empty((rows, frames, size), np.float32),
-            np.empty((rows, frames), np.float32),
-        )
+        return tape
+
+    def _roll(self, run: _KernelPass, source: int) -> None:
         self._kernels.forward(
-            self._weights, self._biases, settings, tape, run.noise, run.choices, source, run.features, run.density
+            self._weights,
+            self._biases,
+            self._settings,
+            run.tape,
+            run.noise,
+            run.choices,
+            source,
+            run.features,
+            run.density,
         )
-        return run
 
     def _state_after(self, run: _KernelPass, previous: Float[Tensor, "batch size"]) -> LstmState:
         slot, batch, width = run.noise.shape[1] % len(run.tape.frame), len(previous), self._config.width
@@ -124,29 +159,76 @@ class FastRollout:
         cell = run.tape.cell[slot, :, :batch, :width]
         return LstmState(previous, *(torch.from_numpy(part.copy()).to(previous.dtype) for part in (hidden, cell)))
 
-    def _pullback(self, run: _KernelPass, d_features: Tensor, d_density: Tensor) -> tuple[Array, Array, Array, Array]:
+    def _pull_back(self, run: _KernelPass, d_features: Tensor, d_density: Tensor) -> tuple[Array, Array, Array, Array]:
         """Gradients on the noise, the previous frame (physical units), h and C."""
         batch, rows, lanes = len(d_features), len(run.noise), len(self._weights.fc2)
         width, size = self._config.width, self._layout.size
-        d_noise, d_frame = np.empty_like(run.noise), np.zeros_like(run.tape.frame[0])
-        d_input, d_cell = np.zeros_like(run.tape.lstm_input[0]), np.zeros_like(run.tape.cell[0])
+        pulled = (_pad_rows(_to_array(d_features), rows), _pad_rows(_to_array(d_density), rows))
+        d_noise = np.empty_like(run.noise)
+        d_frame, d_input, d_cell = self._unroll(run, *pulled, d_noise)
+        d_previous = d_frame[:batch, :size] / self._settings.std[:size]
+        return (d_noise[:batch], d_previous, d_input[:, :batch, lanes : lanes + width], d_cell[:, :batch, :width])
+
+    def _unroll(
+        self, run: _KernelPass, d_features: Array, d_density: Array, d_noise: Array
+    ) -> tuple[Array, Array, Array]:
+        """Fill d_noise; return the gradients on the first slot of the tape."""
+        on_state = (run.tape.frame[0], run.tape.lstm_input[0], run.tape.cell[0])
+        d_frame, d_input, d_cell = (np.zeros_like(part) for part in on_state)
         self._kernels.backward(
             self._weights,
-            self._transposed,
+            self._weights if len(run.noise) == 1 else self._transposed,
             self._zero_bias,
             self._settings,
             run.tape,
             run.noise,
             run.choices.component,
-            _pad_rows(_to_array(d_features), rows),
-            _pad_rows(_to_array(d_density), rows),
+            d_features,
+            d_density,
             d_noise,
             d_frame,
             d_input,
             d_cell,
         )
-        d_previous = d_frame[:batch, :size] / self._settings.std[:size]
-        return (d_noise[:batch], d_previous, d_input[:, :batch, lanes : lanes + width], d_cell[:, :batch, :width])
+        return d_frame, d_input, d_cell
+
+
+class FastWindow(PreparedRollout):
+    """Rollouts of a window under one plan, one after the other, in the same memory."""
+
+    def __init__(self, fast: FastRollout, state: LstmState, choices: ChoiceBuffers, shape: tuple[int, int]):
+        """Allocate for `shape`, particles and frames."""
+        self._fast, self._batch = fast, shape[0]
+        rows, frames, size = layout.pad_batch_size(shape[0]), shape[1], fast._layout.size
+        self._run = _KernelPass(
+            fast._begin_tape(state, slots=frames + 1, batch=shape[0]),
+            np.zeros((rows, frames, fast._layout.continuous), np.float32),
+            choices,
+            np.empty((rows, frames, size), np.float32),
+            np.empty((rows, frames), np.float32),
+        )
+        self._pulled = (np.zeros((rows, frames, size), np.float32), np.zeros((rows, frames), np.float32))
+        self._d_noise = np.empty_like(self._run.noise)
+
+    def roll_out(
+        self, noise: Float[Tensor, "batch frames continuous"]
+    ) -> tuple[Float[Tensor, "batch frames size"], Float[Tensor, "batch frames"]]:
+        """See PreparedRollout."""
+        run, batch = self._run, self._batch
+        run.noise[:batch] = noise.detach().numpy()
+        self._fast._roll(run, layout.GIVEN)
+        return _to_tensor(run.features, batch).to(noise.dtype, copy=True), _to_tensor(run.density, batch).to(
+            noise.dtype, copy=True
+        )
+
+    def pull_back(
+        self, d_features: Float[Tensor, "batch frames size"], d_log_density: Float[Tensor, "batch frames"]
+    ) -> Float[Tensor, "batch frames continuous"]:
+        """See PreparedRollout."""
+        for pulled, given in zip(self._pulled, (d_features, d_log_density), strict=True):
+            pulled[: self._batch] = given.numpy()
+        self._fast._unroll(self._run, *self._pulled, self._d_noise)
+        return _to_tensor(self._d_noise, self._batch).to(d_features.dtype, copy=True)
 
 
 class _Rollout(torch.autograd.Function):
@@ -161,7 +243,7 @@ class _Rollout(torch.autograd.Function):
         fast: FastRollout,
     ):
         batch, frames, _ = noise.shape
-        choices = ChoiceBuffers(plan.component.numpy(), plan.contacts.numpy(), _NO_UNIFORM)
+        choices = _plan_buffers(plan)
         # Only a pullback needs every frame's activations; else they would but push the weights out of cache.
         slots = frames + 1 if any(ctx.needs_input_grad) else 2
         run = fast._run(LstmState(previous, hidden, cell), noise, choices, layout.GIVEN, slots=slots)
@@ -171,12 +253,16 @@ class _Rollout(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *pulled: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
-        gradients = ctx.fast._pullback(ctx.run, *pulled)
+        gradients = ctx.fast._pull_back(ctx.run, *pulled)
         tensors = [torch.from_numpy(part).to(kind) for part, kind in zip(gradients, ctx.types, strict=True)]
         return *tensors, None, None
 
 
 _NO_UNIFORM = np.zeros((1, 1, 3), np.float32)
+
+
+def _plan_buffers(plan: DiscreteChoices) -> ChoiceBuffers:
+    return ChoiceBuffers(plan.component.numpy(), plan.contacts.numpy(), _NO_UNIFORM)
 
 
 def _allocate_choices(batch: int, frames: int, uniform: Tensor | None = None) -> ChoiceBuffers:

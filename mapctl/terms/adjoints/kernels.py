@@ -1,0 +1,191 @@
+"""Compiled energies of terms with their gradients (imported late: needs numba). Arithmetic is float64 throughout.
+
+Each kernel is the adjoint of one term, whose torch form is the specification: it fills the energies (batch, frames) and
+adds to the gradients.
+"""
+
+# pyright: basic
+# (numba infers the types)
+
+import math
+
+import numpy as np
+
+from mapctl.numerics.jit import make_jit_decorators
+
+entry, inner = make_jit_decorators("contract", "nsz")
+
+_NEVER = -2  # below every frame
+
+
+@entry
+def add_latent_prior(noise, sigma, energy, d_noise):
+    """Normal noise: half the squared numbers over sigma squared."""
+    weight = 1.0 / (sigma * sigma)
+    for b in range(len(noise)):
+        for t in range(noise.shape[1]):
+            total = 0.0
+            for j in range(noise.shape[2]):
+                value = np.float64(noise[b, t, j])
+                total += value * value
+                d_noise[b, t, j] += weight * value
+            energy[b, t] = 0.5 * weight * total
+
+
+@inner
+def step_of(joints, before, b, t, joint, k):
+    """Displacement of a joint along an axis since the frame before, metres; 0 where there is none."""
+    now = np.float64(joints[b, t, joint, k])
+    if t > 0:
+        return now - np.float64(joints[b, t - 1, joint, k])
+    return now - np.float64(before[0, joint, k]) if len(before) else 0.0
+
+
+@entry
+def add_foot_contact(joints, before, contacts, contacts_before, toes, fps, sigmas, rest_height, energy, d_joints):
+    """Planted toes rest and are on the ground, none is below it. `before` (0 or 1, joints, 3) is the last frame before
+    the window; `sigmas` are speed, height and depth."""
+    travel, height = (fps / sigmas[0]) ** 2, 1.0 / sigmas[1] ** 2
+    below = 1.0 / sigmas[2] ** 2
+    for b in range(len(joints)):
+        for t in range(joints.shape[1]):
+            total = 0.0
+            for side in range(2):
+                toe, planted = toes[side], contacts[b, t, side]
+                above = np.float64(joints[b, t, toe, 1]) - rest_height
+                weight = (height if planted else 0.0) + (below if above < 0.0 else 0.0)
+                total += weight * above * above
+                d_joints[b, t, toe, 1] += weight * above
+                if planted and (contacts[b, t - 1, side] if t > 0 else contacts_before[b, side]):
+                    x, z = step_of(joints, before, b, t, toe, 0), step_of(joints, before, b, t, toe, 2)
+                    total += travel * (x * x + z * z + 1e-12)
+                    d_joints[b, t, toe, 0] += travel * x
+                    d_joints[b, t, toe, 2] += travel * z
+                    if t > 0:
+                        d_joints[b, t - 1, toe, 0] -= travel * x
+                        d_joints[b, t - 1, toe, 2] -= travel * z
+            energy[b, t] = 0.5 * total
+
+
+@entry
+def add_root_velocity(ground, start, known, weights, velocities, units, fps, energy, d_ground):
+    """The low-pass velocity is the target's. `known` and `weights` are the smoother's part of the past and of the
+    window, `units` (frames, 2, 2) the axes of the error over their sigmas."""
+    frames = ground.shape[1]
+    raw, pulled, d_raw = np.empty((frames, 2)), np.empty(2), np.empty((frames, 2))
+    for b in range(len(ground)):
+        for t in range(frames):
+            for k in range(2):
+                last = np.float64(ground[b, t - 1, k]) if t > 0 else np.float64(start[b, k])
+                raw[t, k] = (np.float64(ground[b, t, k]) - last) * fps - velocities[t, k]
+        d_raw[:] = 0.0
+        for t in range(frames):
+            x, z = np.float64(known[t, 0]), np.float64(known[t, 1])
+            for s in range(frames):
+                x += weights[t, s] * raw[s, 0]
+                z += weights[t, s] * raw[s, 1]
+            along = x * units[t, 0, 0] + z * units[t, 0, 1]
+            across = x * units[t, 1, 0] + z * units[t, 1, 1]
+            energy[b, t] = 0.5 * (along * along + across * across)
+            pulled[0] = along * units[t, 0, 0] + across * units[t, 1, 0]
+            pulled[1] = along * units[t, 0, 1] + across * units[t, 1, 1]
+            for s in range(frames):
+                d_raw[s, 0] += weights[t, s] * pulled[0]
+                d_raw[s, 1] += weights[t, s] * pulled[1]
+        for t in range(frames):
+            for k in range(2):
+                d_ground[b, t, k] += fps * (d_raw[t, k] - (d_raw[t + 1, k] if t + 1 < frames else 0.0))
+
+
+@entry
+def add_facing(heading, facing, sigma, energy, d_heading):
+    """The heading is the target's, up to whole turns; added to the energies."""
+    weight = 1.0 / (sigma * sigma)
+    for b in range(len(heading)):
+        for t in range(heading.shape[1]):
+            apart = np.float64(heading[b, t]) - facing[t]
+            apart -= 2.0 * math.pi * np.rint(apart / (2.0 * math.pi))
+            energy[b, t] += 0.5 * weight * apart * apart
+            d_heading[b, t] += weight * apart
+
+
+@inner
+def shrink(value, free):
+    """What of a value is beyond what is free."""
+    return value - free if value > free else (value + free if value < -free else 0.0)
+
+
+@entry
+def add_path(positions, extension, axes, known, weights, sigmas, sigma_slow, free_sway, energy, d_positions):
+    """Offsets from a curve that is held: sideways beyond the free sway, forward, in space upward (`sigmas`), and the
+    slow part of the sideways offset. `weights` (frames from, frames to) smooth it, `known` is what the past adds."""
+    frames, dims = positions.shape[1], positions.shape[2]
+    offsets, d_offsets = np.empty((frames, dims)), np.empty((frames, dims))
+    for b in range(len(positions)):
+        for t in range(frames):
+            total = 0.0
+            for axis in range(dims):
+                offset = 0.0
+                for k in range(dims):
+                    apart = np.float64(positions[b, t, k]) - np.float64(extension[b, t, k])
+                    offset += apart * np.float64(axes[b, t, axis, k])
+                offsets[t, axis] = offset
+                error = (shrink(offset, free_sway) if axis == 0 else offset) / sigmas[axis]
+                total += error * error
+                d_offsets[t, axis] = error / sigmas[axis]
+            energy[b, t] = 0.5 * total
+        for t in range(frames):
+            slow = np.float64(known[t])
+            for s in range(frames):
+                slow += offsets[s, 0] * weights[s, t]
+            error = slow / sigma_slow
+            energy[b, t] += 0.5 * error * error
+            for s in range(frames):
+                d_offsets[s, 0] += weights[s, t] * error / sigma_slow
+        for t in range(frames):
+            for k in range(dims):
+                total = 0.0
+                for axis in range(dims):
+                    total += d_offsets[t, axis] * np.float64(axes[b, t, axis, k])
+                d_positions[b, t, k] += total
+
+
+@inner
+def visit_touch_downs(joints, before, planted, toes, length, b, errors, weight, d_joints):
+    """Go through the touch-downs of a candidate: with weight 0 sum the errors of step length by frame, else add the
+    gradient that these sums have."""
+    apart = np.empty(2)
+    for side in range(2):
+        toe, other, last = toes[side], toes[1 - side], _NEVER
+        if planted[b, 0, 1 - side] and len(before) > 0:
+            last = -1
+        for t in range(joints.shape[1]):
+            if planted[b, t + 1, 1 - side]:
+                last = t
+            if not planted[b, t + 1, side] or planted[b, t, side] or last == _NEVER:
+                continue
+            for k in range(2):
+                foot = before[0, other, 2 * k] if last < 0 else joints[b, last, other, 2 * k]
+                apart[k] = np.float64(joints[b, t, toe, 2 * k]) - np.float64(foot)
+            distance = math.sqrt(apart[0] * apart[0] + apart[1] * apart[1] + 1e-12)
+            if weight == 0.0:
+                errors[t] += distance - length
+                continue
+            for k in range(2):
+                pulled = weight * errors[t] * apart[k] / distance
+                d_joints[b, t, toe, 2 * k] += pulled
+                if last >= 0:
+                    d_joints[b, last, other, 2 * k] -= pulled
+
+
+@entry
+def add_step_length(joints, before, planted, toes, length, sigma, energy, d_joints):
+    """A toe that touches down is at a distance from where the other was last planted. `planted` (batch, 1 + frames, 2)
+    begins before the window; `before` (0 or 1, joints, 3) is the frame there."""
+    weight, errors = 1.0 / (sigma * sigma), np.empty(joints.shape[1])
+    for b in range(len(joints)):
+        errors[:] = 0.0
+        visit_touch_downs(joints, before, planted, toes, length, b, errors, 0.0, d_joints)
+        visit_touch_downs(joints, before, planted, toes, length, b, errors, weight, d_joints)
+        for t in range(joints.shape[1]):
+            energy[b, t] = 0.5 * weight * errors[t] * errors[t]
