@@ -10,7 +10,7 @@ points.
 import math
 from collections import deque
 from collections.abc import Callable, Generator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any
 
@@ -147,25 +147,25 @@ def _collect_result(problems: list["_Problem"], x: Tensor) -> LbfgsResult:
 
 @dataclass(slots=True)
 class _EvaluatedPoint:
-    """An evaluated point of a line search."""
+    """An evaluated point; of a line search, how far along it lies and the slope there."""
 
-    step: float
     x: Point
     energy: float
     gradient: Vector
-    slope: float
+    step: float = 0.0
+    slope: float = 0.0
+    gradient_norm: float = field(init=False)
 
-    @property
-    def gradient_norm(self) -> float:
-        return float(np.abs(self.gradient).max(initial=0.0))
+    def __post_init__(self):
+        self.gradient_norm = float(np.abs(self.gradient).max(initial=0.0))
 
     @property
     def finite(self) -> bool:
         return math.isfinite(self.energy) and math.isfinite(self.gradient_norm)
 
 
-Search = Generator[Point, tuple[float, Vector]]
-"""Search of one problem: it yields points, and is sent energy and gradient."""
+Search = Generator[Point, _EvaluatedPoint]
+"""Search of one problem: it yields points, and is sent what they were evaluated to."""
 
 
 class _Problem:
@@ -176,7 +176,7 @@ class _Problem:
         self.evaluations = self.iterations = 0
         self.start_energy = math.inf
         self.status = LbfgsStatus.OUT_OF_BUDGET  # what it is until the search itself comes to an end
-        self.best = _EvaluatedPoint(0.0, start, math.inf, np.full(start.shape, math.inf), 0.0)
+        self.best = _EvaluatedPoint(start, math.inf, np.full(start.shape, math.inf))
         self.running = True
         self._search = self._descend(start)
         self.ask = next(self._search)
@@ -186,23 +186,22 @@ class _Problem:
         if not self.running:
             return
         self.evaluations += 1
-        point = _EvaluatedPoint(0.0, self.ask, energy, gradient, 0.0)
+        point = _EvaluatedPoint(self.ask, energy, gradient)
         if energy < self.best.energy and point.finite:
             self.best = point
         try:
             with np.errstate(over="ignore", invalid="ignore"):  # what overflows is seen to be not finite, and refused
-                self.ask = self._search.send((energy, gradient))
+                self.ask = self._search.send(point)
         except StopIteration as stop:
             self.running, self.status, self.ask = False, stop.value, self.best.x
 
-    def _descend(self, start: Point) -> Generator[Point, tuple[float, Vector], LbfgsStatus]:
+    def _descend(self, start: Point) -> Generator[Point, _EvaluatedPoint, LbfgsStatus]:
         settings, pairs = self.settings, _CurvaturePairs(self.settings.memory)
-        energy, gradient = yield start
-        here = _EvaluatedPoint(0.0, start, energy, gradient, 0.0)
+        here = yield start
         if not here.finite:
             return LbfgsStatus.NOT_FINITE
-        self.start_energy = energy
-        length = settings.initial_step or min(1.0, float(np.linalg.norm(gradient)))
+        self.start_energy = here.energy
+        length = settings.initial_step or min(1.0, float(np.linalg.norm(here.gradient)))
         while here.gradient_norm > settings.gradient_tolerance:
             if self.iterations == settings.max_iterations:
                 return LbfgsStatus.OUT_OF_BUDGET
@@ -269,7 +268,7 @@ def _descent_direction(here: _EvaluatedPoint, pairs: _CurvaturePairs, length: fl
 
 def _line_search(
     origin: _EvaluatedPoint, direction: Vector, first: float, settings: LbfgsSettings
-) -> Generator[Point, tuple[float, Vector], _EvaluatedPoint | None]:
+) -> Generator[Point, _EvaluatedPoint, _EvaluatedPoint | None]:
     """Find a point with enough decrease and enough curvature for a pair (weak Wolfe); None where no trial gains.
 
 
@@ -279,16 +278,16 @@ def _line_search(
     slope = float(direction @ origin.gradient)
     # Energies are rounded to the caller's precision: a rise within that says nothing.
     noise = 2.0 * float(np.finfo(origin.x.dtype).eps) * abs(origin.energy)
-    low = base = _EvaluatedPoint(0.0, origin.x, origin.energy, origin.gradient, slope)
+    low = base = _EvaluatedPoint(origin.x, origin.energy, origin.gradient, 0.0, slope)
     high: _EvaluatedPoint | None = None
     step = min(first, longest)
     for _ in range(settings.max_trials):
         x = (origin.x + step * direction).astype(origin.x.dtype)
         if np.array_equal(x, low.x):
             break  # the bracket is below the precision of the unknowns
-        energy, gradient = yield x
-        trial = _EvaluatedPoint(step, x, energy, gradient, float(direction @ gradient))
-        if not trial.finite or energy > base.energy + settings.armijo * step * slope + noise:
+        trial = yield x
+        trial.step, trial.slope = step, float(direction @ trial.gradient)
+        if not trial.finite or trial.energy > base.energy + settings.armijo * step * slope + noise:
             high = trial
         elif trial.slope >= settings.curvature * slope or step == longest:
             return trial
