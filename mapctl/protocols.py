@@ -215,6 +215,13 @@ class Density(Protocol[State]):
         """Prepare the rollouts of a search: a density with a pullback of its own offers it here. Default: autograd."""
         return AutogradRollout(self, state, plan)
 
+    def plan_search(
+        self, state: State, noise: Float[Tensor, "batch frames continuous"]
+    ) -> tuple[DiscreteChoices, PreparedRollout]:
+        """Plan along the rollout of a search's first noise, and prepare rollouts under that plan."""
+        plan = self.plan(state, noise)
+        return plan, self.prepare_rollout(state, plan)
+
     @abstractmethod
     def latents(
         self, features: Float[Tensor, "batch frames size"], state: State

@@ -24,11 +24,20 @@ class LatentNoise:
     plan: DiscreteChoices
     """Components and contact bits of each frame."""
 
+    prepared: PreparedRollout | None = None
+    """Rollouts of as many candidates as the plan is for, where they are prepared already."""
+
     @staticmethod
     def from_unknowns(context: WindowContext, unknowns: Float[Tensor, "batch unknowns"]) -> "LatentNoise":
         """Plan the likeliest components and contact bits along the rollout of the unknowns."""
         noise = torch.unflatten(unknowns.detach(), -1, (context.frames, LAYOUT.continuous))
         return LatentNoise(context, context.prior.plan(context.expand_state(len(noise)), noise))
+
+    @staticmethod
+    def begin_search(context: WindowContext, start: Float[Tensor, "batch unknowns"]) -> "LatentNoise":
+        """Plan like `from_unknowns`, for a search that evaluates the start first: its rollout is done only once."""
+        noise = torch.unflatten(start.detach(), -1, (context.frames, LAYOUT.continuous))
+        return LatentNoise(context, *context.prior.plan_search(context.expand_state(len(noise)), noise))
 
     @staticmethod
     def extend(warm_start: Float[Tensor, "ahead width"], frames: int) -> Float[Tensor, "1 unknowns"]:
@@ -76,7 +85,8 @@ class LatentNoise:
 
     @cached_property
     def _prepared(self) -> dict[int, tuple[PreparedRollout, Bool[Tensor, "batch frames 2"]]]:
-        return {}
+        rollout, contacts = self.prepared, self.plan.contacts
+        return {} if rollout is None else {len(contacts): (rollout, contacts)}
 
     def _expand_plan(self, batch: int) -> DiscreteChoices:
         return DiscreteChoices(

@@ -56,6 +56,14 @@ class Objective:
             self._raise_for_bad_term(unknowns)
         return energy, gradient
 
+    def build_detached(self, unknowns: Tensor) -> Trial:
+        """Build the trials of unknowns without a gradient."""
+        trial = None if self.adjoint is None else self.adjoint.build_detached(unknowns)
+        if trial is not None:
+            return trial
+        with torch.no_grad():
+            return self.build(unknowns)
+
     def _differentiate_by_hand(self, unknowns: Tensor) -> tuple[Tensor, Tensor] | None:
         """Energies and gradient through the parametrisation's own adjoint; None where it has none for these."""
         trial = None if self.adjoint is None else self.adjoint.build_detached(unknowns)

@@ -91,7 +91,7 @@ class LatentNoiseSolver:
         return replace(_build_solved_window(unknowns, request.terms, best, meter), start_energy=start_energy)
 
     def _run_round(self, request: WindowRequest, start: Tensor, meter: Meter) -> tuple[LatentNoise, LbfgsResult]:
-        unknowns = LatentNoise.from_unknowns(request.context, start)
+        unknowns = LatentNoise.begin_search(request.context, start)
         objective = Objective.of(unknowns, request.terms)
         return unknowns, minimise(objective.energy_and_gradient, start, settings=self.lbfgs, meter=meter)
 
@@ -139,12 +139,12 @@ def minimise_window(
 def _build_solved_window(
     unknowns: Parametrisation, terms: Sequence[Term], result: LbfgsResult, meter: Meter
 ) -> SolvedWindow:
-    with torch.no_grad():
-        trial = unknowns.build(result.x)
+    objective = Objective.of(unknowns, terms)
+    trial = objective.build_detached(result.x)
     return SolvedWindow(
         trial,
         unknowns.warm_start(result.x),
-        Objective.of(unknowns, terms).build_ledger(trial),
+        objective.build_ledger(trial),
         meter.evaluations,
         float(result.start_energy[0]),
         float(result.energy[0]),

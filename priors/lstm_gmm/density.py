@@ -162,6 +162,10 @@ class LstmGmmDensity(Density[LstmState]):
         """See Density."""
         return self._fast.prepare(state, plan) if self.use_fast else super().prepare_rollout(state, plan)
 
+    def plan_search(self, state: LstmState, noise: Tensor) -> tuple[DiscreteChoices, PreparedRollout]:
+        """See Density."""
+        return self._fast.plan_window(state, noise) if self.use_fast else super().plan_search(state, noise)
+
 
 def load(name: str) -> LstmGmmDensity:
     """Load a bundled prior by name, or a trained one by its file or run folder; CheckpointError if there is none."""

@@ -113,6 +113,14 @@ class FastRollout:
         choices = ChoiceBuffers(*(_pad_rows(part, rows) for part in _plan_buffers(plan)))
         return FastWindow(self, state, choices, (batch, frames))
 
+    def plan_window(
+        self, state: LstmState, noise: Float[Tensor, "batch frames continuous"]
+    ) -> tuple[DiscreteChoices, "FastWindow"]:
+        """`plan`, and rollouts prepared under it, of which that of this noise is done already."""
+        batch, frames, _ = noise.shape
+        window = FastWindow(self, state, _allocate_choices(layout.pad_batch_size(batch), frames), (batch, frames))
+        return window.plan(noise), window
+
     def _run(self, state: LstmState, noise: Tensor, choices: ChoiceBuffers, source: int, *, slots: int) -> _KernelPass:
         batch, frames, continuous = noise.shape
         if continuous != self._layout.continuous:
@@ -209,17 +217,29 @@ class FastWindow(PreparedRollout):
         )
         self._pulled = (np.zeros((rows, frames, size), np.float32), np.zeros((rows, frames), np.float32))
         self._d_noise = np.empty_like(self._run.noise)
+        self._rolled = False
+
+    def plan(self, noise: Float[Tensor, "batch frames continuous"]) -> DiscreteChoices:
+        """Make the plan the likeliest along the rollout of this noise."""
+        self._roll(noise, layout.LIKELIEST)
+        parts = (self._run.choices.component, self._run.choices.contacts)
+        return DiscreteChoices(*(_to_tensor(part, self._batch).clone() for part in parts))
 
     def roll_out(
         self, noise: Float[Tensor, "batch frames continuous"]
     ) -> tuple[Float[Tensor, "batch frames size"], Float[Tensor, "batch frames"]]:
         """See PreparedRollout."""
         run, batch = self._run, self._batch
-        run.noise[:batch] = noise.detach().numpy()
-        self._fast._roll(run, layout.GIVEN)
+        if not (self._rolled and np.array_equal(run.noise[:batch], noise.numpy())):
+            self._roll(noise, layout.GIVEN)
         return _to_tensor(run.features, batch).to(noise.dtype, copy=True), _to_tensor(run.density, batch).to(
             noise.dtype, copy=True
         )
+
+    def _roll(self, noise: Tensor, source: int) -> None:
+        self._run.noise[: self._batch] = _to_array(noise)
+        self._fast._roll(self._run, source)
+        self._rolled = True
 
     def pull_back(
         self, d_features: Float[Tensor, "batch frames size"], d_log_density: Float[Tensor, "batch frames"]
