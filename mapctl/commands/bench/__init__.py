@@ -39,9 +39,15 @@ class MocapTable(Table):
 
 @dataclass(frozen=True, kw_only=True)
 class Speed(PriorTable):
-    """Milliseconds a frame, fast path and reference."""
+    """Milliseconds a frame, fast path and reference; or this version and another in turn."""
 
     work = "mapctl.commands.bench.speed"
+
+    beside: options.MaybeDataFolder = None
+    """A checkout of another version, as `git worktree add DIR COMMIT` makes it, whose steering, following and start-up
+    are timed in turn with these."""
+    turns: options.Count = 8
+    """How often both take their turn."""
 
 
 @dataclass(frozen=True, kw_only=True)
