@@ -48,6 +48,8 @@ def test_every_table_has_help(name, capsys):
         (["fly"], "speed, ablation, free-run"),
         (["fly"], "(see mapctl bench --help)"),
         (["infill", "--data", "."], "does not hold the clips kept from training"),
+        (["speed", "--beside", "docs"], "docs is no checkout of mapctl"),
+        (["speed", "--beside", "docs", "--turns", "0"], "--turns must be 1 or more"),
         (["live", "--minutes", "0"], "--minutes must be more than 0"),
         (["live", "--characters", "1,two"], "--characters must be numbers from 1 to 64"),
     ],
@@ -67,6 +69,16 @@ def test_speed_is_measured(prior, monkeypatch, capsys):
         "energy and gradient, 34 frames, 1 candidates",
         "follow a circle for 1 s",
     ]
+
+
+@pytest.mark.slow
+def test_versions_take_turns(capsys):
+    """This version beside itself, as somebody would time two."""
+    root = Path(cli.__file__).parent.parent
+    assert run("bench", "speed", "--beside", str(root), "--turns", "2", "--json") == 0
+    rows = json.loads(capsys.readouterr().out)["rows"]
+    assert [row["what"].split(",")[0] for row in rows] == ["steer", "follow circle:4", "start-up of follow"]
+    assert all(0.3 < row["times_faster"] < 3 and row["this"] > 0 for row in rows)
 
 
 @pytest.mark.parametrize(
