@@ -5,8 +5,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal, cast
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d
-from scipy.optimize import brentq
+import scipy
 
 from mapctl.errors import RequestError
 from mapctl.mesh.primitives import Array, unit
@@ -132,7 +131,7 @@ def _find_centre(across: Array, depth: Array) -> float:
         seen = (across - place) / depth
         return float(seen.max() + seen.min())
 
-    return cast(float, brentq(lopsided, across.min() - 1e-6, across.max() + 1e-6, xtol=1e-6))
+    return cast(float, scipy.optimize.brentq(lopsided, across.min() - 1e-6, across.max() + 1e-6, xtol=1e-6))
 
 
 def compute_views(
@@ -161,7 +160,7 @@ def _smooth(path: Array, sigma: float) -> Array:
     """Smooth a path (frames, 3); it is extended straight at both ends, so that it does not lag there."""
     margin = math.ceil(3 * sigma)
     longer = np.pad(path, ((margin, margin), (0, 0)), mode="reflect", reflect_type="odd")
-    return gaussian_filter1d(longer, sigma, axis=0, truncate=3.0)[margin : margin + len(path)]
+    return scipy.ndimage.gaussian_filter1d(longer, sigma, axis=0, truncate=3.0)[margin : margin + len(path)]
 
 
 def _move_camera(pose: Array, eye: Array) -> Array:

@@ -4,7 +4,7 @@ All are flat surfaces a few millimetres apart; whoever draws them keeps the orde
 """
 
 import numpy as np
-from scipy.spatial import KDTree
+import scipy
 
 from mapctl.mesh import colours
 from mapctl.mesh.primitives import Array, Surface, unit
@@ -37,7 +37,7 @@ def build_grid(places: Array) -> Surface:
         step *= 5
     first, last = np.floor(low / step).astype(int), np.ceil(high / step).astype(int)
     x, z = (np.arange(a, b + 1) for a, b in zip(first, last, strict=True))
-    tree = KDTree(places)
+    tree = scipy.spatial.KDTree(places)
     tiles = _build_tiles(x, z, step)
     lines = [_build_lines(x, z, step), _build_lines(z, x, step)[:, ::-1, ::-1]]
     strong = np.concatenate([np.repeat(x % 5 == 0, len(z) - 1), np.repeat(z % 5 == 0, len(x) - 1)])
@@ -65,7 +65,7 @@ def _build_lines(x: Array, z: Array, step: float) -> Array:
     return np.stack([np.concatenate([left, left, right, right], 1), np.concatenate([near, far, far, near], 1)], axis=-1)
 
 
-def _fade_quads(quads: Array, height: Array, rgb: Array, strength: Array, tree: KDTree) -> Surface:
+def _fade_quads(quads: Array, height: Array, rgb: Array, strength: Array, tree: "scipy.spatial.KDTree") -> Surface:
     """Build quads whose colours fade to the background's; opaque, for eight bits of opacity show as rings."""
     distance = tree.query(quads.reshape(-1, 2))[0].reshape(-1, 4)
     share = np.clip((_FADE_END - distance) / (_FADE_END - _FADE_START), 0, 1)

@@ -9,7 +9,8 @@ import numpy as np
 from forged_characters import count_nodes
 
 from mapctl import formats
-from mapctl.curves.files import read_csv, read_svg
+from mapctl.curves.csv_file import read_csv
+from mapctl.curves.svg_file import read_svg
 from mapctl.errors import FileFormatError
 from mapctl.formats.bvh import text as bvh_text
 from mapctl.formats.bvh.layout import BvhLayout

@@ -8,11 +8,10 @@ transform. Their five bones are the two toes here, of which alone features hold 
 from typing import Any
 
 import numpy as np
+import scipy
 import torch
 from jaxtyping import Bool, Float
 from numpy import ndarray
-from scipy.ndimage import gaussian_filter1d, uniform_filter1d
-from scipy.signal import hilbert
 from torch import Tensor
 
 from mapctl.errors import RequestError
@@ -39,13 +38,13 @@ def compute_phases(planted: Bool[Tensor, "frames 2"] | Float[Tensor, "frames 2"]
     values = planted.detach().cpu().double().numpy()
     if len(values) == 0 or not np.isfinite(values).all():
         raise RequestError("phases need at least one frame of finite contacts")
-    smooth = gaussian_filter1d(values, SMOOTHING, axis=0, mode="nearest")
+    smooth = scipy.ndimage.gaussian_filter1d(values, SMOOTHING, axis=0, mode="nearest")
     mean = _average_around(smooth)
     variance = _average_around(np.square(smooth)) - np.square(mean)
     spread = np.sqrt(np.where(variance > _NO_SPREAD**2, variance, 0))
     standard = (smooth - mean) / np.maximum(spread, _LEAST_SPREAD)
     around = np.pad(standard, ((REACH, REACH), (0, 0)), mode="reflect")
-    whole: Any = hilbert(around, axis=0)
+    whole: Any = scipy.signal.hilbert(around, axis=0)
     analytic = whole[REACH:-REACH] * np.minimum(spread / _LEAST_SPREAD, 1)
     return torch.from_numpy(np.stack([analytic.real, analytic.imag], axis=-1)).flatten(1)
 
@@ -64,5 +63,5 @@ def reversed_phases(phases: Float[Tensor, "*batch frames 4"]) -> Float[Tensor, "
 
 def _average_around(values: Float[ndarray, "frames 2"]) -> Float[ndarray, "frames 2"]:
     """Average over the frames that there are up to REACH before and after each."""
-    count = uniform_filter1d(np.ones(len(values)), 2 * REACH + 1, mode="constant")
-    return uniform_filter1d(values, 2 * REACH + 1, axis=0, mode="constant") / count[:, None]
+    count = scipy.ndimage.uniform_filter1d(np.ones(len(values)), 2 * REACH + 1, mode="constant")
+    return scipy.ndimage.uniform_filter1d(values, 2 * REACH + 1, axis=0, mode="constant") / count[:, None]

@@ -1,17 +1,18 @@
 """Making curves: built-in shapes, points, CSV and SVG files. `Curve` itself is in `mapctl.curves.curve`."""
 
 import os
+from importlib import import_module
 from os import PathLike
 from pathlib import Path
 
 import numpy as np
+import scipy
 import torch
 from jaxtyping import Float
 from numpy import ndarray
-from scipy.interpolate import CubicSpline
 from torch import Tensor
 
-from mapctl.curves import files
+from mapctl.curves import csv_file
 from mapctl.curves.curve import Curve
 from mapctl.curves.polyline import build_dense_polyline
 from mapctl.curves.shapes import SHAPES, parse_shape, sample_shape
@@ -45,7 +46,7 @@ def through(points: Float[Tensor, "points dims"] | ndarray) -> Curve:
         return whole
     at = np.r_[0.0, np.cumsum(spans[kept[1:]])]
     fine = np.linspace(0.0, at[-1], max(2, round(whole.length / _SPLINE_SPACING)))
-    return from_points(CubicSpline(at, given[kept], bc_type="natural")(fine), closed=False)
+    return from_points(scipy.interpolate.CubicSpline(at, given[kept], bc_type="natural")(fine), closed=False)
 
 
 def circle(*, radius: float) -> Curve:
@@ -95,9 +96,10 @@ def read(source: str | PathLike[str], *, metres_per_unit: float | None = None) -
 
 def _read_file(path: str, metres_per_unit: float | None) -> Curve:
     if path.lower().endswith(".svg"):
-        points = files.read_svg(path, metres_per_unit or files.SVG_METRES_PER_UNIT)
+        svg_file = import_module("mapctl.curves.svg_file")  # its parser is slow to import
+        points = svg_file.read_svg(path, metres_per_unit or svg_file.SVG_METRES_PER_UNIT)
     else:
-        points = files.read_csv(path) * (metres_per_unit or 1.0)
+        points = csv_file.read_csv(path) * (metres_per_unit or 1.0)
     try:
         return from_points(points)
     except RequestError as error:

@@ -7,9 +7,9 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 
+import scipy
 import torch
 from jaxtyping import Float, Int
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from mapctl.curves.polyline import TANGENT_BASE
@@ -198,8 +198,8 @@ class Curve:
         return arcs.gather(-1, best).squeeze(-1)
 
     @cached_property
-    def _tree(self) -> KDTree:
-        return KDTree(self.points.numpy())
+    def _tree(self) -> "scipy.spatial.KDTree":
+        return scipy.spatial.KDTree(self.points.numpy())
 
     def _nearest_anywhere(self, points: Tensor) -> Tensor:
         count = len(self.points)

@@ -4,10 +4,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 import torch
 from jaxtyping import Bool, Float
 from numpy import ndarray
-from scipy import optimize, sparse
 from torch import Tensor
 
 from mapctl import curves
@@ -130,4 +130,5 @@ def _smooth_offsets(free: ndarray, offsets: ndarray, chosen: ndarray, settings: 
     line = np.eye(len(chosen))
     slopes, bends = np.diff(line, axis=0) / settings.spacing, np.diff(line, 2, axis=0) / settings.spacing**2
     rows = np.concatenate([line, settings.decay * slopes, settings.bend**2 * bends])
-    return optimize.lsq_linear(sparse.csr_array(rows), np.zeros(len(rows)), bounds=(lowest, widened), tol=1e-8).x
+    wanted = scipy.sparse.csr_array(rows)
+    return scipy.optimize.lsq_linear(wanted, np.zeros(len(rows)), bounds=(lowest, widened), tol=1e-8).x

@@ -7,13 +7,14 @@ from pathlib import Path
 from types import ModuleType
 
 from mapctl.errors import FileFormatError, RequestError
-from mapctl.formats import acclaim, bvh, usd
+from mapctl.formats import bvh
 from mapctl.formats.characters.selector import parse_character_path
+from mapctl.formats.endings import USD_WRITTEN
 from mapctl.formats.missing import MissingValues
 from mapctl.mesh.character_mesh import CharacterMesh
 from mapctl.motion import Motion
 
-_USD_ENDINGS = (".usda", ".usdc", ".usd", ".usdz")
+_USD_ENDINGS = (*USD_WRITTEN, ".usdz")
 READERS = {
     ".bvh": "bvh",
     ".npz": "npz",
@@ -23,7 +24,7 @@ READERS = {
     ".fbx": "fbx",
 }
 """Endings that are read, each with its module of this package, which is imported when it is needed."""
-WRITERS = {".bvh": "bvh", ".npz": "npz", ".glb": "gltf", ".vrm": "gltf", **dict.fromkeys(usd.ENDINGS, "usd")}
+WRITERS = {".bvh": "bvh", ".npz": "npz", ".glb": "gltf", ".vrm": "gltf", **dict.fromkeys(USD_WRITTEN, "usd")}
 """Endings that are written, likewise."""
 CHARACTERS = (".glb", ".gltf", ".vrm", *_USD_ENDINGS, ".fbx")
 """Endings of files of skinned characters, that have a rest pose of their own."""
@@ -46,7 +47,8 @@ def load(
     ending = _check_readable(path)
     if fps is not None and ending != ".amc":
         raise RequestError(f"{path}: a {ending} file says its frame rate itself; only that of an .amc is asked for")
-    motion = _import_format(READERS[ending]).load(path) if fps is None else acclaim.load(path, fps=fps)
+    reader = _import_format(READERS[ending])
+    motion = reader.load(path) if fps is None else reader.load(path, fps=fps)
     return motion if metres_per_unit is None else bvh.convert_unit(motion, metres_per_unit)
 
 
@@ -111,5 +113,5 @@ def check_ending(path: str | PathLike[str]) -> None:
     if ending not in WRITERS:
         why = f"{ending} is read but not written" if ending in _ONLY_READ else f"unknown ending {ending!r}"
         raise RequestError(f"cannot write {path}: {why}; allowed: {', '.join(WRITERS)}")
-    if ending in usd.ENDINGS:
-        usd.check_installed(path)
+    if ending in USD_WRITTEN:
+        _import_format("usd").check_installed(path)

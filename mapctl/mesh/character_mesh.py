@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.sparse import csr_array
+import scipy
 
 from mapctl.mesh.primitives import Array
 from mapctl.mesh.refinement import Refinement, refine_nothing
@@ -50,11 +50,11 @@ class CharacterMesh:
         return vertices + centre, normals / np.maximum(lengths, 1e-12)[:, None]
 
     @cached_property
-    def _shares(self) -> csr_array:
+    def _shares(self) -> "scipy.sparse.csr_array":
         """(n, joints) shares, for most of which are zero."""
         rows = np.repeat(np.arange(len(self.joints)), self.joints.shape[1])
         entries = (self.weights.reshape(-1).astype(np.float32), (rows, self.joints.reshape(-1)))
-        return csr_array(entries, shape=(len(self.joints), len(self.rest)))
+        return scipy.sparse.csr_array(entries, shape=(len(self.joints), len(self.rest)))
 
     @cached_property
     def _local(self) -> tuple[Array, Array]:

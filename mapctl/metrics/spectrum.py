@@ -1,9 +1,9 @@
 """How fast joints move by frequency: motion that trembles, or floats, shows there where a mean speed does not."""
 
 import numpy
+import scipy
 import torch
 from jaxtyping import Float
-from scipy import signal
 from torch import Tensor
 
 BANDS_HZ = ((0.0, 1.0), (1.0, 2.0), (2.0, 4.0), (4.0, 8.0), (8.0, 15.0))
@@ -20,7 +20,7 @@ def measure_speed_by_band(places: Float[Tensor, "frames joints 3"], fps: float) 
     if len(places) < 3:
         raise ValueError(f"a spectrum takes 3 frames at least, got {len(places)}")
     velocities = 100 * fps * numpy.diff(places.detach().double().numpy(), axis=0)
-    density = signal.periodogram(velocities, fps, "hann", detrend=False, axis=0)  # pyright: ignore[reportArgumentType]
+    density = scipy.signal.periodogram(velocities, fps, "hann", detrend=False, axis=0)  # pyright: ignore[reportArgumentType]
     frequencies, power = density  # (cm/s)^2 a Hz
     by_frequency = power.sum(axis=-1).mean(axis=-1) * (frequencies[1] - frequencies[0])
     edges = numpy.array([low for low, _ in BANDS_HZ])

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from jaxtyping import Float
 from numpy import ndarray
-from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
 from mapctl import contacts, rotations
@@ -41,7 +41,8 @@ def compute_low_pass_velocity(motion: Motion) -> LowPassVelocity:
     """Compute the slow velocity of a motion's root over the ground (Gaussian of 0.25 s)."""
     fps = float(motion.fps)
     ground = motion.joint_positions()[:, 0, ::2].numpy()
-    velocity = gaussian_filter1d(np.gradient(ground, axis=0) * fps, _SLOW_SECONDS * fps, axis=0, mode="nearest")
+    velocity = np.gradient(ground, axis=0) * fps
+    velocity = scipy.ndimage.gaussian_filter1d(velocity, _SLOW_SECONDS * fps, axis=0, mode="nearest")
     seconds = np.arange(len(ground)) / fps
     return LowPassVelocity(seconds, np.linalg.norm(velocity, axis=-1), np.arctan2(velocity[:, 0], velocity[:, 1]))
 

@@ -10,10 +10,10 @@ smoothest ones make who stands slide.
 import math
 
 import numpy as np
+import scipy
 import torch
 from jaxtyping import Bool, Float
 from numpy import ndarray
-from scipy.linalg import solveh_banded
 from torch import Tensor
 
 from mapctl import rotations
@@ -47,7 +47,7 @@ def solve_offsets(
             held = first[(first + tap >= 0) & (first + tap + beside < count)] + tap + beside
             bands[2 - beside, held] += weight * SECOND_DIFFERENCE[tap + beside]
     bands[2] += firm
-    return solveh_banded(bands, right)
+    return scipy.linalg.solveh_banded(bands, right)
 
 
 def interpolate_offsets(

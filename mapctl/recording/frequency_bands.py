@@ -9,10 +9,9 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 
 import numpy as np
+import scipy
 import torch
 from jaxtyping import Float
-from scipy.interpolate import CubicSpline
-from scipy.signal import butter, sosfiltfilt
 from torch import Tensor
 
 from mapctl import rotations
@@ -113,7 +112,7 @@ def upsample(
         return values.expand(frames, *values.shape[1:])
     times = seconds.numpy()
     wanted = np.clip(np.arange(frames) / fps, times[0], times[-1])
-    return torch.as_tensor(CubicSpline(times, values.double().numpy(), axis=0)(wanted))
+    return torch.as_tensor(scipy.interpolate.CubicSpline(times, values.double().numpy(), axis=0)(wanted))
 
 
 def resample_by_splines(motion: Motion, seconds: Float[Tensor, " shown"], *, fps: Fraction, frames: int) -> Motion:
@@ -132,12 +131,12 @@ def split_bands(motion: Motion) -> FrequencyBands:
         return FrequencyBands(
             slow, torch.zeros(*quats.shape[:2], 3, dtype=quats.dtype), torch.zeros_like(motion.root_position)
         )
-    sections = butter(_FILTER_ORDER, CROSSOVER_HZ / (fps / 2), output="sos")
+    sections = scipy.signal.butter(_FILTER_ORDER, CROSSOVER_HZ / (fps / 2), output="sos")
 
     def low(values: Tensor) -> Tensor:
         whole = _extend_ends(values.numpy(), round(fps / CROSSOVER_HZ))
         side = (len(whole) - len(values)) // 2
-        return torch.as_tensor(sosfiltfilt(sections, whole, axis=0, padlen=0)[side:-side].copy())
+        return torch.as_tensor(scipy.signal.sosfiltfilt(sections, whole, axis=0, padlen=0)[side:-side].copy())
 
     slow = Motion(
         motion.skeleton, motion.fps, low(motion.root_position), torch.nn.functional.normalize(low(quats), dim=-1)

@@ -44,7 +44,7 @@ def here(tmp_path, monkeypatch):
     if usd.is_installed():
         from pxr import UsdUtils
 
-        for ending in usd.ENDINGS:
+        for ending in USD_WRITTEN:
             motion.save(f"in{ending}")
         assert UsdUtils.CreateNewUsdzPackage("in.usdc", "in.usdz")
     with fork_readers():

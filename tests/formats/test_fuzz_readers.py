@@ -14,7 +14,8 @@ from hypothesis import given, settings
 from lossy_files import GOOD
 
 import mapctl
-from mapctl.curves.files import read_csv, read_svg
+from mapctl.curves.csv_file import read_csv
+from mapctl.curves.svg_file import read_svg
 from mapctl.errors import FileFormatError
 from mapctl.formats import npz
 from mapctl.formats import text as reading

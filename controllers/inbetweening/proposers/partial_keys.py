@@ -10,9 +10,9 @@ the whole body (see `mapctl.inbetweening.whole_body`), which goes there and back
 import math
 from dataclasses import replace
 
+import scipy
 import torch
 from jaxtyping import Bool, Float
-from scipy.interpolate import PchipInterpolator
 from torch import Tensor
 
 from mapctl import rotations
@@ -182,7 +182,7 @@ def _interpolate_knots(
         return values
     # Linear beyond the ends: a monotone cubic's own estimate of its slope there is up to half too large.
     at, known = (torch.cat([2 * v[:1] - v[1:2], v, 2 * v[-1:] - v[-2:-1]]) for v in (seconds[knots], values[knots]))
-    curve = PchipInterpolator(at.numpy(), known.numpy())
+    curve = scipy.interpolate.PchipInterpolator(at.numpy(), known.numpy())
     return torch.as_tensor(curve(seconds.clamp(at[1], at[-2]).numpy())).to(values)
 
 

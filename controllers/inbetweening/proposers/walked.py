@@ -3,9 +3,9 @@ section 5.2)."""
 
 from dataclasses import dataclass, field, replace
 
+import scipy
 import torch
 from jaxtyping import Float
-from scipy.interpolate import PchipInterpolator
 from torch import Tensor
 
 from controllers.common.character import Character
@@ -48,7 +48,7 @@ class WalkedPlaces:
         at = _find_arcs(curve, places)
         if float(torch.diff(at).min()) <= 0:
             return None
-        timed = PchipInterpolator(frames.numpy(), at.numpy())
+        timed = scipy.interpolate.PchipInterpolator(frames.numpy(), at.numpy())
         inside = torch.as_tensor(timed(torch.arange(int(frames[-1]) + 1).numpy()))
         speed = float(inside[-1] - inside[-2])
         beyond = inside[-1] + speed * torch.arange(1, ahead + 1)

@@ -6,6 +6,7 @@ from controllers.inbetweening.pipeline import InfillSettings
 from mapctl import formats
 from mapctl.commands.blend import Blend
 from mapctl.commands.shared import inputs, results
+from mapctl.commands.shared.conclusion import conclude
 from mapctl.commands.shared.frame_syntax import parse_frame, parse_range
 
 
@@ -23,4 +24,4 @@ def run(command: Blend) -> int:
     results.film_comparison(motion, done.motion, command.video, rig=rig, quiet=command.quiet)
     if not command.quiet:
         print("\n".join((f"{command.out}: {done.motion.num_frames} frames", *done.notes)))
-    return results.conclude(done.status, strict=command.strict)
+    return conclude(done.status, strict=command.strict)

@@ -7,6 +7,7 @@ from controllers.denoising.result import DenoiseSolution
 from mapctl import formats, report
 from mapctl.commands.denoise import Denoise, folder
 from mapctl.commands.shared import inputs, outputs, results
+from mapctl.commands.shared.conclusion import conclude
 from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.errors import RequestError
 from mapctl.recording.masks import load_masks
@@ -29,7 +30,7 @@ def run(command: Denoise) -> int:
     _draw_pictures(command, done)
     if not command.quiet:
         _tell(command, done)
-    return results.conclude(done.status, strict=command.strict)
+    return conclude(done.status, strict=command.strict)
 
 
 def _check(command: Denoise) -> None:

@@ -1,29 +1,25 @@
-"""`mapctl follow`: a character walks a drawn curve."""
+"""`mapctl follow`: a character walks a drawn curve.
 
-from fractions import Fraction
+What only some walks need, as films, is imported when one is asked for: it would double the time to the first step.
+"""
+
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import priors
-from controllers.common.character import Character
 from mapctl import formats, report
 from mapctl.commands.follow import FollowCurve
-from mapctl.commands.shared import inputs, options, outputs, results
+from mapctl.commands.shared import inputs, options, outputs
 from mapctl.commands.shared.character import read_character, read_drawn_character
+from mapctl.commands.shared.conclusion import conclude
 from mapctl.commands.shared.path_walk import Walk, parse_follow, walk
 from mapctl.commands.shared.progress_bar import show_progress
-from mapctl.commands.shared.shots.plan import ShotPlan, plan_shot
-from mapctl.commands.shared.shots.play import PlayedShot, play_shot
-from mapctl.commands.shared.shots.stage import build_obstacles, print_notes, stage_actor
-from mapctl.curves import Curve
-from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import RequestError
 from mapctl.intent.cornering import turns_sharply
-from mapctl.intent.shot_keys import read_shot_keys
-from priors.lstm_gmm.density import LstmGmmDensity
-from scenes.cameras import CameraSettings
-from scenes.drawn_character import DrawnCharacter
-from scenes.film import film
-from scenes.scene_file import Actor
+
+if TYPE_CHECKING:
+    from mapctl.commands.shared.shots.play import PlayedShot
+    from scenes.drawn_character import DrawnCharacter
 
 _SIZE = "1280x720"
 
@@ -36,18 +32,21 @@ def run(command: FollowCurve) -> int:
     drawn = read_drawn_character(command.character)
     character, prior = read_character(command.rig), priors.load(command.prior)
     cornering = command.speed is None and turns_sharply(curve)
-    plan = _plan(command, curve, prior, character) if cornering or _wishes_more(command) else None
-    with show_progress("walking", quiet=command.quiet) as progress:
-        if plan is not None:
-            done = play_shot(plan, [], priors.load_inbetweener(), prices=command.prices, progress=progress)
-        else:
+    if cornering or _wishes_more(command):
+        from mapctl.commands.follow import shot
+
+        planned = shot.plan(command, curve, prior, character)
+        with show_progress("walking", quiet=command.quiet) as progress:
+            done = shot.play(planned, prices=command.prices, progress=progress)
+    else:
+        with show_progress("walking", quiet=command.quiet) as progress:
             done = walk(prior, request, seed=command.seed, progress=progress, character=character)
     video = None if done.interrupted else command.video
     _write(command, done, video, drawn)
     if not command.quiet:
         files = ", ".join(map(str, options.collect_paths(command.out, video, command.report)))
         print("\n".join([*done.summary(), f"wrote     {files}"]))
-    return results.conclude(done.solution.status, strict=command.strict)
+    return conclude(done.solution.status, strict=command.strict)
 
 
 def _wishes_more(command: FollowCurve) -> bool:
@@ -56,27 +55,6 @@ def _wishes_more(command: FollowCurve) -> bool:
     return bool(
         told or command.avoid or command.start != "walk" or command.end != "walk" or command.loop or command.prices
     )
-
-
-def _plan(command: FollowCurve, curve: Curve, prior: LstmGmmDensity, character: Character) -> ShotPlan:
-    """Plan the shot that the options describe; files are relative to the working directory."""
-    actor = Actor(
-        curve=command.curve,
-        speed=command.speed,
-        seconds=command.seconds,
-        seed=command.seed,
-        gait=command.gait,
-        style=command.style,
-        start=command.start,
-        end=command.end,
-        loop=command.loop,
-        keys=() if command.keys is None else read_shot_keys(command.keys),
-    )
-    if actor.fault is not None:
-        raise RequestError(f"--{actor.fault}")
-    obstacles = [Obstacle.parse(text) for text in command.avoid]
-    fps = None if command.fps is None else Fraction(command.fps).limit_denominator(100_000)
-    return plan_shot(actor, curve, prior, character=character, folder=Path(), obstacles=obstacles, fps=fps)
 
 
 def _check(command: FollowCurve) -> None:
@@ -92,14 +70,24 @@ def _check(command: FollowCurve) -> None:
         outputs.check_film(command.video, options.parse_size(command.size or _SIZE))
 
 
-def _write(command: FollowCurve, done: Walk | PlayedShot, video: Path | None, character: DrawnCharacter | None) -> None:
+def _write(
+    command: FollowCurve, done: "Walk | PlayedShot", video: Path | None, character: "DrawnCharacter | None"
+) -> None:
     done.on_rig.save(command.out)
     if command.report is not None:
         report.write_report(done.report(options.describe_request("follow", command)), command.report)
     if video is not None:
-        actors, camera = [stage_actor(done, character=character)], CameraSettings(command.camera or "follow")
-        with show_progress("filming", quiet=command.quiet) as progress:
-            size = options.parse_size(command.size or _SIZE)
-            film(actors, video, camera=camera, size=size, props=build_obstacles([done]), progress=progress)
-        if not command.quiet:
-            print_notes(actors)
+        _film(command, done, video, character)
+
+
+def _film(command: FollowCurve, done: "Walk | PlayedShot", video: Path, character: "DrawnCharacter | None") -> None:
+    from mapctl.commands.shared.shots.stage import build_obstacles, print_notes, stage_actor
+    from scenes.cameras import CameraSettings
+    from scenes.film import film
+
+    actors, camera = [stage_actor(done, character=character)], CameraSettings(command.camera or "follow")
+    with show_progress("filming", quiet=command.quiet) as progress:
+        size = options.parse_size(command.size or _SIZE)
+        film(actors, video, camera=camera, size=size, props=build_obstacles([done]), progress=progress)
+    if not command.quiet:
+        print_notes(actors)

@@ -10,6 +10,7 @@ from controllers.inbetweening.proposers import build_inbetweener
 from mapctl import formats, report
 from mapctl.commands.infill import Infill
 from mapctl.commands.shared import inputs, options, results
+from mapctl.commands.shared.conclusion import conclude
 from mapctl.commands.shared.frame_syntax import parse_ranges
 from mapctl.commands.shared.style import read_dna
 from mapctl.errors import RequestError
@@ -34,7 +35,7 @@ def run(command: Infill) -> int:
     results.film_comparison(motion, done.motion, command.video, rig=rig, quiet=command.quiet)
     if not command.quiet:
         _tell(command, done)
-    return results.conclude(done.status, strict=command.strict)
+    return conclude(done.status, strict=command.strict)
 
 
 def _check(command: Infill) -> None:

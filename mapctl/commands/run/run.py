@@ -10,8 +10,9 @@ import scenes
 from controllers.common.character import Character
 from mapctl import report
 from mapctl.commands.run import RunScene
-from mapctl.commands.shared import exit_status, options, outputs, results
+from mapctl.commands.shared import exit_status, options, outputs
 from mapctl.commands.shared.character import read_character, read_drawn_character
+from mapctl.commands.shared.conclusion import conclude
 from mapctl.commands.shared.path_walk import Walk, parse_follow, walk
 from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.commands.shared.shots.plan import ShotPlan, plan_shot
@@ -51,7 +52,7 @@ def run(command: RunScene) -> int:
         _write(command, scene, walks, films=() if interrupted else scene.films(command.out), drawn=drawn)
     if interrupted:
         return exit_status.INTERRUPTED
-    return max(results.conclude(done.solution.status, strict=command.strict) for done in walks)
+    return max(conclude(done.solution.status, strict=command.strict) for done in walks)
 
 
 def _plan(

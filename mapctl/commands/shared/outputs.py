@@ -9,7 +9,6 @@ from pathlib import Path
 
 from mapctl.errors import RequestError
 from mapctl.formats import atomic
-from scenes.film import check_outputs
 
 
 def check_files(paths: Sequence[Path], *, given: Sequence[Path] = ()) -> None:
@@ -28,6 +27,8 @@ def check_files(paths: Sequence[Path], *, given: Sequence[Path] = ()) -> None:
 
 def check_film(path: Path, size: tuple[int, int]) -> None:
     """Raise RequestError where a film of this ending or size cannot be made, or its package is missing."""
+    from scenes.film import check_outputs
+
     check_outputs([path], size)
     require_render("av" if path.suffix.lower() == ".mp4" else "PIL")
 

@@ -1,4 +1,4 @@
-"""Shared parts of commands that return a motion: checks, models, report, exit status, film."""
+"""Shared parts of commands that return a motion: checks, models, report, film."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -10,13 +10,13 @@ from controllers.inbetweening import proposers
 from controllers.inbetweening.proposers import ModelLoaders
 from mapctl import formats, metrics
 from mapctl import report as reports
-from mapctl.commands.shared import exit_status, inputs, options, outputs
+from mapctl.commands.shared import inputs, options, outputs
 from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.commands.shared.style import Example, tell_style
 from mapctl.errors import RequestError
 from mapctl.metrics.comparison import make_comparable
 from mapctl.motion import Motion
-from mapctl.problem.solution import Outcome, Solution, Status
+from mapctl.problem.solution import Solution
 from mapctl.protocols import Inbetweener
 from mapctl.retarget.rigs import Rig
 from priors.stitching.inbetweener import Stitcher
@@ -95,13 +95,6 @@ def load_models(
     return ModelLoaders(
         load_network, load_densities, load_tweener, partial(priors.load_stitcher, stitcher or "stitcher")
     )
-
-
-def conclude(status: Status, *, strict: bool) -> int:
-    """Return the exit status of a command whose solve ended so; strict ones fail where not all that was asked holds."""
-    if status.outcome is Outcome.INTERRUPTED:
-        return exit_status.INTERRUPTED
-    return exit_status.NOT_SATISFIED if strict and not status.ok else 0
 
 
 def film_comparison(before: Motion, after: Motion, video: Path | None, *, rig: Rig | None, quiet: bool) -> None:

@@ -23,8 +23,9 @@ from controllers.steering.loop import (
     summarise_step_timing,
 )
 from mapctl import formats, metrics, report
-from mapctl.commands.shared import inputs, options, outputs, results, streaming
+from mapctl.commands.shared import inputs, options, outputs, streaming
 from mapctl.commands.shared.character import read_character
+from mapctl.commands.shared.conclusion import conclude
 from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.commands.steer import Steer
 from mapctl.commands.steer.links import Links
@@ -81,7 +82,7 @@ def run(command: Steer) -> int:
         files = options.collect_paths(command.out, command.report, command.plot)
         streamed = None if links.stream is None else streaming.summarise(links.stream)
         print("\n".join(_format_summary(found, files, streamed)))
-    return results.conclude(done.status, strict=command.strict)
+    return conclude(done.status, strict=command.strict)
 
 
 def _check(command: Steer) -> None:

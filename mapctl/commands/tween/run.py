@@ -17,6 +17,7 @@ from controllers.inbetweening.tween import measure_keyframe_errors, tween
 from controllers.inbetweening.variations import Tweening
 from mapctl import formats, report
 from mapctl.commands.shared import exit_status, inputs, results
+from mapctl.commands.shared.conclusion import conclude
 from mapctl.commands.shared.frame_syntax import parse_frame
 from mapctl.commands.shared.style import read_dna
 from mapctl.commands.shared.tables import print_table
@@ -50,7 +51,7 @@ def run(command: Tween) -> int:
     results.film_comparison(clip.motion, done.motion, command.video, rig=clip.rig, quiet=command.quiet)
     if not command.quiet:
         _tell(command, done, clip, intervals)
-    return results.conclude(done.status, strict=command.strict)
+    return conclude(done.status, strict=command.strict)
 
 
 def _tell(command: Tween, done: InbetweenSolution, clip: KeyframeClip, intervals: Sequence[KeyInterval]) -> None:

@@ -16,10 +16,7 @@ from mapctl.formats.usd.paths import joint_paths
 from mapctl.formats.usd.reader import load, load_mesh, load_rest
 from mapctl.motion import Motion
 
-__all__ = ["ENDINGS", "check_installed", "is_installed", "joint_paths", "load", "load_mesh", "load_rest", "save"]
-
-ENDINGS = (".usda", ".usdc", ".usd")
-"""Endings of USD files that are written."""
+__all__ = ["check_installed", "is_installed", "joint_paths", "load", "load_mesh", "load_rest", "save"]
 
 
 def check_installed(path: str | PathLike[str]) -> None:

@@ -6,7 +6,7 @@ instead of a network's features.
 
 from dataclasses import dataclass
 
-import scipy.linalg
+import scipy
 import torch
 from jaxtyping import Float
 from torch import Tensor
