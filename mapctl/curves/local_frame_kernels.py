@@ -1,4 +1,7 @@
-"""Compiled search of a curve's nearest position, and its axes there (imported late: needs numba). Float64."""
+"""Compiled search of a curve's nearest position, and its axes there (imported late: needs numba). Float64.
+
+Written in loops over numbers: whole arrays and numpy's own search would take as long again to compile, and to load.
+"""
 
 import math
 
@@ -17,8 +20,14 @@ def find_segment(curve, arc):
     count, lap = len(curve.directions), 0.0
     if curve.closed:
         lap = math.floor(arc / curve.length)
-    segment = np.searchsorted(curve.knots, arc - lap * curve.length, side="right") - 1
-    return np.int64(lap) * count + min(max(segment, 0), count - 1)
+    within, first, beyond = arc - lap * curve.length, 0, count
+    while beyond - first > 1:
+        middle = (first + beyond) // 2
+        if curve.knots[middle] <= within:
+            first = middle
+        else:
+            beyond = middle
+    return np.int64(lap) * count + first
 
 
 @inner
@@ -45,30 +54,42 @@ def find_nearest_arc(curve, point, around, reach):
         if curve.closed or index < count - 1:
             along = min(along, curve.knots[index + 1] - curve.knots[index])
         for k in range(len(point)):
-            apart += (curve.corners[index, k] + along * curve.directions[index, k] - point[k]) ** 2
+            off = curve.corners[index, k] + along * curve.directions[index, k] - point[k]
+            apart += off * off
         if apart < best:
             best, found = apart, lap * curve.length + curve.knots[index] + along
     return found
 
 
 @inner
-def evaluate_axes(curve, arc, axes):
-    """Evaluate rows: left on the ground, forward (a chord's direction), in space upward but for what lies forward."""
-    ahead, behind, last = np.empty(axes.shape[1]), np.empty(axes.shape[1]), axes.shape[1] - 1
+def evaluate_axes(curve, arc, ahead, behind, axes):
+    """Evaluate rows: left on the ground, forward (a chord's direction), in space upward but for what lies forward.
+
+    `ahead` and `behind` (dims) are scratch.
+    """
+    last = len(ahead) - 1
     evaluate_position(curve, arc + curve.half_base, ahead)
     evaluate_position(curve, arc - curve.half_base, behind)
-    ahead -= behind
-    length = math.sqrt((ahead * ahead).sum())
+    length = 0.0
+    for k in range(last + 1):
+        ahead[k] -= behind[k]
+        length += ahead[k] * ahead[k]
+    length = math.sqrt(length)
     if length < 1e-6:  # where a curve turns back on itself the chord vanishes
-        ahead[:] = curve.directions[find_segment(curve, arc) % len(curve.directions)]
-        length = math.sqrt((ahead * ahead).sum())
-    ahead /= length
+        segment, length = find_segment(curve, arc) % len(curve.directions), 0.0
+        for k in range(last + 1):
+            ahead[k] = curve.directions[segment, k]
+            length += ahead[k] * ahead[k]
+        length = math.sqrt(length)
+    for k in range(last + 1):
+        ahead[k] /= length
     ground = max(math.sqrt(ahead[0] * ahead[0] + ahead[last] * ahead[last]), 1e-9)
-    axes[:] = 0.0
+    for k in range(last + 1):
+        axes[0, k], axes[1, k] = 0.0, ahead[k]
     axes[0, 0], axes[0, last] = ahead[last] / ground, -ahead[0] / ground
-    axes[1] = ahead
     if last == 2:
-        axes[2] = -ahead[1] * ahead
+        for k in range(3):
+            axes[2, k] = -ahead[1] * ahead[k]
         axes[2, 1] += 1.0
 
 
@@ -78,15 +99,18 @@ def fill_local_frames(curve, points, around, reach, places, axes, straightened):
     if curve.closed:
         reach = min(reach, 0.5 * curve.length)  # a lap has every position once
     dims = points.shape[2]
-    place, frame = np.empty(dims), np.empty((dims, dims))
+    place, frame, scratch = np.empty(dims), np.empty((dims, dims)), np.empty((2, dims))
     for b in range(len(points)):
         for t in range(len(around)):
-            if not abs(around[t]) < _ARC_LIMIT:
-                places[b, t], axes[b, t], straightened[b, t] = math.nan, math.nan, math.nan
-                continue
-            arc = find_nearest_arc(curve, points[b, t], around[t], reach)
-            arc = arc if math.isfinite(arc) else around[t]
-            evaluate_position(curve, arc, place)
-            evaluate_axes(curve, arc, frame)
-            places[b, t], axes[b, t] = place, frame
-            straightened[b, t] = place + (around[t] - arc) * frame[1]
+            arc = math.nan
+            if abs(around[t]) < _ARC_LIMIT:
+                arc = find_nearest_arc(curve, points[b, t], around[t], reach)
+                arc = arc if math.isfinite(arc) else around[t]
+                evaluate_position(curve, arc, place)
+                evaluate_axes(curve, arc, scratch[0], scratch[1], frame)
+            for k in range(dims):
+                known = math.isfinite(arc)
+                places[b, t, k] = place[k] if known else math.nan
+                straightened[b, t, k] = place[k] + (around[t] - arc) * frame[1, k] if known else math.nan
+                for row in range(dims):
+                    axes[b, t, row, k] = frame[row, k] if known else math.nan

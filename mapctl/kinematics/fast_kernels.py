@@ -139,7 +139,9 @@ def body_backward(features, columns, parents, offsets, world, d_positions, d_fea
     for b in range(len(features)):
         for t in range(features.shape[1]):
             now, out, frames = features[b, t], d_features[b, t], world[b, t]
-            force[:], torque[:] = d_positions[b, t], 0.0
+            for joint in range(len(parents)):  # written out: slices take as long as all the rest to compile
+                for i in range(3):
+                    force[joint, i], torque[joint, i] = d_positions[b, t, joint, i], 0.0
             for joint in range(len(parents) - 1, 0, -1):
                 v = columns.joints + 3 * (joint - 1)
                 out[v], out[v + 1], out[v + 2] = rotation_vector_gradient(

@@ -2,11 +2,19 @@
 
 from collections.abc import Callable
 from contextlib import suppress
+from itertools import count
 from typing import Any
 
 from numba import njit
+from numba.core.caching import FunctionCache
+from numba.core.runtime import rtsys
+
+from mapctl.numerics import compilation
 
 JitDecorator = Callable[[Callable[..., Any]], Callable[..., Any]]
+
+_kernels: list[str] = []  # names of those that Python calls
+_first_uses = count(1)
 
 
 def make_jit_decorators(*relaxed: str) -> tuple[JitDecorator, JitDecorator]:
@@ -18,25 +26,40 @@ def make_jit_decorators(*relaxed: str) -> tuple[JitDecorator, JitDecorator]:
     shared: dict[str, Any] = {"error_model": "numpy", "fastmath": set(relaxed)}
 
     def entry(function: Callable[..., Any]) -> Callable[..., Any]:
-        try:
-            return _tolerate_full_disk(_njit(cache=True, nogil=True, **shared)(function))
-        except RuntimeError:  # numba found no folder that it may write to
-            return _njit(nogil=True, **shared)(function)
+        compiled: Any = _njit(nogil=True, **shared)(function)
+        _kernels.append(function.__name__)
+        with suppress(RuntimeError):  # numba found no folder that it may write to
+            compiled._cache = KernelCache(function)
+        return compiled
 
     return entry, _njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **shared)
 
 
-def _tolerate_full_disk(compiled: Any) -> Any:
-    """Ignore a full disk where numba keeps compiled code: the next start takes longer, nothing fails."""
-    cache = compiled._cache
-    keep = cache.save_overload
+class KernelCache(FunctionCache):
+    """Compiled kernels on disk, which load without numba's compiler.
 
-    def keep_if_possible(*overload: Any) -> None:
+    numba would import all of the compiler first, and scipy's linear algebra with it: a quarter of a second, of which a
+    kernel that is ready needs the memory manager alone. What is compiled after all gets the rest from the compiler
+    itself. A full disk is ignored: the next start takes longer, nothing fails.
+    """
+
+    _number = 0  # of the kernel that is compiled
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Return the code for a signature, None where it must be compiled."""
+        rtsys.initialize(target_context)
+        with self._guard_against_spurious_io_errors():
+            found = self._load_overload(sig, target_context)
+        self._number = next(_first_uses)
+        if found is None:
+            compilation.announce(self._number, len(_kernels), begins=True)
+        return found
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Keep what was compiled."""
         with suppress(OSError):
-            keep(*overload)
-
-    cache.save_overload = keep_if_possible
-    return compiled
+            super().save_overload(sig, data)
+        compilation.announce(self._number, len(_kernels), begins=False)
 
 
 def _njit(**options: Any) -> JitDecorator:

@@ -5,19 +5,26 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from mapctl.numerics import compilation
 from mapctl.runtime import progress
 
 LINES = "MAPCTL_PROGRESS"
 """Environment variable that asks for lines `progress DONE/TOTAL LABEL` on standard error."""
 
 
+_COMPILING = "compiling kernels, once"
+
+
 @contextmanager
 def show_progress(label: str, *, quiet: bool = False) -> Iterator[progress.Progress | None]:
     """Yield a function that moves a bar on standard error; None where there is no terminal, or with `quiet`. Where the
-    environment variable MAPCTL_PROGRESS is set to something, it writes a line for each hundredth instead.
+    environment variable MAPCTL_PROGRESS is set to something, it writes a line for each hundredth instead. Kernels that
+    must be compiled, which takes seconds, have a bar of their own.
     """
     if os.environ.get(LINES):
-        yield _write_lines(label)
+        write = _write_lines(_COMPILING)
+        with compilation.tell(lambda number, total, begins: write(number - begins, total)):
+            yield _write_lines(label)
         return
     if quiet or not sys.stderr.isatty():
         yield None
@@ -27,8 +34,14 @@ def show_progress(label: str, *, quiet: bool = False) -> Iterator[progress.Progr
 
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     with Progress(*columns, console=Console(stderr=True), transient=True) as shown:
+        compiling = shown.add_task(_COMPILING, visible=False)
         task = shown.add_task(label, total=None)
-        yield lambda done, total: shown.update(task, completed=done, total=total)
+
+        def tell(number: int, total: int, begins: bool) -> None:
+            shown.update(compiling, completed=number - begins, total=total, visible=begins, refresh=True)
+
+        with compilation.tell(tell):
+            yield lambda done, total: shown.update(task, completed=done, total=total)
 
 
 def _write_lines(label: str) -> progress.Progress:
