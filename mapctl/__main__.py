@@ -2,9 +2,12 @@
 
 import sys
 
+from mapctl.runtime import garbage
+
 
 def main() -> int:
     """The command line with the words of the process; returns the exit status."""
+    garbage.pause_collection()
     try:
         from mapctl.cli import main as command_line
     except KeyboardInterrupt:

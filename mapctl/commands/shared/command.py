@@ -4,6 +4,7 @@ from importlib import import_module
 from typing import ClassVar
 
 from mapctl.commands.shared.threads import use_single_thread
+from mapctl.runtime import garbage
 
 
 class Command:
@@ -18,4 +19,6 @@ class Command:
         """Do the work and return the exit status; MapctlError for what is wrong with the request."""
         if self.single_thread:
             use_single_thread()
-        return import_module(self.work or f"{type(self).__module__}.run").run(self)
+        work = import_module(self.work or f"{type(self).__module__}.run")
+        garbage.resume_collection()
+        return work.run(self)
