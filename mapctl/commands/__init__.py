@@ -12,6 +12,7 @@ from mapctl.commands.bench import TABLES, Bench
 from mapctl.commands.blend import Blend
 from mapctl.commands.blender_addon import BlenderAddon
 from mapctl.commands.chain import Chain
+from mapctl.commands.compile import CompileKernels
 from mapctl.commands.convert import Convert
 from mapctl.commands.demo import Demo
 from mapctl.commands.denoise import Denoise
@@ -54,6 +55,7 @@ COMMANDS: dict[str, type[Runnable]] = {
     "measure": Measure,
     "train": Train,
     "info": Info,
+    "compile": CompileKernels,
     "blender-addon": BlenderAddon,
     "bench": Bench,
 }

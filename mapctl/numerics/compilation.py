@@ -4,8 +4,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 Listener = Callable[[int, int, bool], None]
-"""Is called with a kernel's number, counted from 1 by first use, the number of kernels in the modules that are imported,
-and True before it is compiled, False after."""
+"""Is called with a kernel's number, counted from 1 by first use, with the number of kernels in the modules that are
+imported, and with True before it is compiled, False after."""
 
 _listeners: list[Listener] = []
 

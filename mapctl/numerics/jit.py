@@ -13,7 +13,7 @@ from mapctl.numerics import compilation
 
 JitDecorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
-_kernels: list[str] = []  # names of those that Python calls
+_kernels: list["KernelCache"] = []  # those that Python calls and that are kept on disk
 _first_uses = count(1)
 
 
@@ -27,12 +27,17 @@ def make_jit_decorators(*relaxed: str) -> tuple[JitDecorator, JitDecorator]:
 
     def entry(function: Callable[..., Any]) -> Callable[..., Any]:
         compiled: Any = _njit(nogil=True, **shared)(function)
-        _kernels.append(function.__name__)
         with suppress(RuntimeError):  # numba found no folder that it may write to
             compiled._cache = KernelCache(function)
+            _kernels.append(compiled._cache)
         return compiled
 
     return entry, _njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **shared)
+
+
+def find_folders() -> set[str]:
+    """Find the folders on disk in which kernels of the imported modules are kept; none where nothing may be written."""
+    return {kernel.cache_path for kernel in _kernels}
 
 
 class KernelCache(FunctionCache):
