@@ -41,7 +41,7 @@ _HOMES = {
     "RolloutInbetweener": "controllers.inbetweening.proposers",
     "SlerpInbetweener": "controllers.inbetweening.proposers",
     "tween": "controllers.inbetweening.tween",
-    "steer": "controllers.steering",
+    "steer": "controllers.steering.steer",
     "Drawing": "mapctl.intent.keyframes",
     "Key": "mapctl.intent.keyframes",
     "Keys": "mapctl.intent.keyframes",
@@ -51,4 +51,5 @@ _HOMES = {
 def __getattr__(name: str):
     if name not in _HOMES:
         raise AttributeError(f"module 'controllers' has no attribute {name!r}")
-    return getattr(import_module(_HOMES[name]), name)
+    module = import_module(_HOMES[name])
+    return module if name == "steer" else getattr(module, name)

@@ -1,7 +1,13 @@
 """What imports cost: no more than the packages compute with; slow or optional libraries wait for their first use."""
 
+import ast
 import subprocess
 import sys
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+from source_files import tree_of
 
 LATE = (
     "torch._dynamo",
@@ -17,6 +23,33 @@ LATE = (
 )
 
 
+FOLLOW_LATE = (
+    *LATE,
+    "sympy",
+    "scipy.interpolate",
+    "scipy.linalg",
+    "scipy.optimize",
+    "scipy.signal",
+    "scipy.sparse",
+    "scipy.spatial",
+    "scipy.stats",
+    "pydantic",
+    "rich",
+    "svgpathtools",
+    "numba.np.arraymath",  # of the compiler, for which numba imports all of scipy.linalg
+    "numba.typed.typedlist",
+    "controllers.denoising.denoise",
+    "controllers.inbetweening.pipeline",
+    "controllers.shots.shot",
+    "priors.refiner.network",
+    "priors.tweening.inbetweener",
+    "mapctl.formats.usd",
+    "scenes.film",
+)
+"""What a walk along a straight line needs none of."""
+FACADES = ("mapctl", "priors", "controllers", "scenes")
+
+
 def python(script: str) -> str:
     """Standard output of a fresh process."""
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
@@ -29,6 +62,60 @@ def test_slow_libraries_are_not_imported():
     packages = "mapctl, priors, controllers, scenes, mapctl.rotations, mapctl.formats, mapctl.solver.swarm, scenes.film"
     script = f"import sys, {packages}\nprint([name for name in {LATE} if name in sys.modules])"
     assert python(script) == "[]\n"
+
+
+def test_a_walk_imports_what_it_uses(tmp_path):
+    """With compiled kernels on disk, which the first command sees to."""
+    script = (
+        "import sys\nfrom mapctl.cli import main\n"
+        f"assert main({['follow', 'line:1', '--seconds', '0.1', '--quiet', '-o', str(tmp_path / 'walk.bvh')]!r}) == 0\n"
+        f"print([name for name in {FOLLOW_LATE} if name in sys.modules])"
+    )
+    python("import sys\nfrom mapctl.cli import main\nsys.exit(main(['compile', '--quiet']))")
+    assert python(script) == "[]\n"
+
+
+def test_help_does_not_wait_for_torch():
+    script = (
+        "import sys, time\nfrom mapctl.cli import main\n"
+        "try:\n    main(['--help'])\nexcept SystemExit:\n    pass\n"
+        "assert 'torch' not in sys.modules and 'numpy' not in sys.modules\n"
+        "sys.exit(time.process_time() > 0.5)"
+    )
+    python(script)
+
+
+@pytest.mark.parametrize("package", FACADES)
+def test_names_that_arrive_late_are_those_that_type_checkers_see(package):
+    module = import_module(package)
+    homes = getattr(module, "_HOMES", None) or module._MODULE_OF
+    tree = tree_of(Path(package) / "__init__.py")
+    (seen,) = (node for node in tree.body if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING")
+    assert homes.keys() == {alias.asname for node in seen.body for alias in node.names}
+    for name in homes:
+        assert getattr(module, name) is not None
+    with pytest.raises(AttributeError, match="nothing_of_this_name"):
+        _ = module.nothing_of_this_name
+
+
+def test_the_collector_is_off_until_a_command_has_imported():
+    script = (
+        "import gc, sys\nfrom mapctl import __main__\nfrom mapctl.commands.shared.command import Command\n"
+        "from mapctl.runtime import garbage\nfound = []\n"
+        "class Work(Command):\n    work = 'types_of_work'\n"
+        "class Run:\n    @staticmethod\n    def run(command):\n"
+        "        found.append((gc.isenabled(), gc.get_freeze_count() > 1000))\n        return 0\n"
+        "sys.modules['types_of_work'] = Run\n"
+        "garbage.pause_collection()\nfound.append((gc.isenabled(), gc.get_freeze_count() > 1000))\n"
+        "Work().run()\nprint(found)"
+    )
+    assert python(script) == "[(False, False), (True, True)]\n"
+
+
+def test_a_caller_without_a_collector_stays_without():
+    script = "import gc\nfrom mapctl.runtime import garbage\ngc.disable()\ngarbage.resume_collection()\n"
+    script += "print(gc.isenabled())"
+    assert python(script) == "False\n"
 
 
 def test_a_motion_made_by_hand_can_be_saved(tmp_path):

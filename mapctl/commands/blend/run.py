@@ -6,7 +6,7 @@ from controllers.inbetweening.pipeline import InfillSettings
 from mapctl import formats
 from mapctl.commands.blend import Blend
 from mapctl.commands.shared import inputs, results
-from mapctl.commands.shared.conclusion import conclude
+from mapctl.commands.shared.exit_status import conclude
 from mapctl.commands.shared.frame_syntax import parse_frame, parse_range
 
 

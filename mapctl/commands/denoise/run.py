@@ -7,7 +7,7 @@ from controllers.denoising.result import DenoiseSolution
 from mapctl import formats, report
 from mapctl.commands.denoise import Denoise, folder
 from mapctl.commands.shared import inputs, outputs, results
-from mapctl.commands.shared.conclusion import conclude
+from mapctl.commands.shared.exit_status import conclude
 from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.errors import RequestError
 from mapctl.recording.masks import load_masks

@@ -11,7 +11,7 @@ from mapctl import formats, report
 from mapctl.commands.follow import FollowCurve
 from mapctl.commands.shared import inputs, options, outputs
 from mapctl.commands.shared.character import read_character, read_drawn_character
-from mapctl.commands.shared.conclusion import conclude
+from mapctl.commands.shared.exit_status import conclude
 from mapctl.commands.shared.path_walk import Walk, parse_follow, walk
 from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.errors import RequestError

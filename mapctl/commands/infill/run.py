@@ -10,7 +10,7 @@ from controllers.inbetweening.proposers import build_inbetweener
 from mapctl import formats, report
 from mapctl.commands.infill import Infill
 from mapctl.commands.shared import inputs, options, results
-from mapctl.commands.shared.conclusion import conclude
+from mapctl.commands.shared.exit_status import conclude
 from mapctl.commands.shared.frame_syntax import parse_ranges
 from mapctl.commands.shared.style import read_dna
 from mapctl.errors import RequestError

@@ -12,7 +12,7 @@ from mapctl import report
 from mapctl.commands.run import RunScene
 from mapctl.commands.shared import exit_status, options, outputs
 from mapctl.commands.shared.character import read_character, read_drawn_character
-from mapctl.commands.shared.conclusion import conclude
+from mapctl.commands.shared.exit_status import conclude
 from mapctl.commands.shared.path_walk import Walk, parse_follow, walk
 from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.commands.shared.shots.plan import ShotPlan, plan_shot

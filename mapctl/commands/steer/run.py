@@ -25,7 +25,7 @@ from controllers.steering.loop import (
 from mapctl import formats, metrics, report
 from mapctl.commands.shared import inputs, options, outputs, streaming
 from mapctl.commands.shared.character import read_character
-from mapctl.commands.shared.conclusion import conclude
+from mapctl.commands.shared.exit_status import conclude
 from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.commands.steer import Steer
 from mapctl.commands.steer.links import Links

@@ -17,7 +17,7 @@ from controllers.inbetweening.tween import measure_keyframe_errors, tween
 from controllers.inbetweening.variations import Tweening
 from mapctl import formats, report
 from mapctl.commands.shared import exit_status, inputs, results
-from mapctl.commands.shared.conclusion import conclude
+from mapctl.commands.shared.exit_status import conclude
 from mapctl.commands.shared.frame_syntax import parse_frame
 from mapctl.commands.shared.style import read_dna
 from mapctl.commands.shared.tables import print_table
