@@ -45,7 +45,7 @@ class KernelCache(FunctionCache):
 
     numba would import all of the compiler first, and scipy's linear algebra with it: a quarter of a second, of which a
     kernel that is ready needs the memory manager alone. What is compiled after all gets the rest from the compiler
-    itself. A full disk is ignored: the next start takes longer, nothing fails.
+    itself. A full disk and damaged files are ignored: the next start takes longer, nothing fails.
     """
 
     _number = 0  # of the kernel that is compiled
@@ -53,8 +53,12 @@ class KernelCache(FunctionCache):
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Return the code for a signature, None where it must be compiled."""
         rtsys.initialize(target_context)
-        with self._guard_against_spurious_io_errors():
+        try:
             found = self._load_overload(sig, target_context)
+        except Exception:  # a damaged file leads to whatever unpickling it leads to
+            found = None
+            with suppress(OSError):
+                self.flush()
         self._number = next(_first_uses)
         if found is None:
             compilation.announce(self._number, len(_kernels), begins=True)

@@ -1,0 +1,130 @@
+"""Compiling kernels: who hears of it, what is kept, and the command that does it ahead."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+from helpers import run
+
+from mapctl.commands.shared.progress_bar import show_progress
+from mapctl.numerics import compilation
+
+KERNEL = """
+import sys
+from mapctl.numerics import compilation, jit
+
+entry, inner = jit.make_jit_decorators()
+
+@entry
+def twice(number):
+    return number + number
+
+heard = []
+with compilation.tell(lambda *words: heard.append(words)):
+    assert twice(21) == 42
+    assert twice(22) == 44
+    assert twice(1.5) == 3.0 if len(sys.argv) > 1 else True
+print(heard, jit.find_folders(), "numba.np.arraymath" in sys.modules)
+"""
+
+
+def use_kernel(folder, *words: str) -> str:
+    """Use the kernel of a file in a fresh process, with compiled code kept beside it."""
+    script = folder / "kernel.py"
+    if not script.exists():
+        script.write_text(KERNEL)
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(folder / "kept"), "PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run(
+        [sys.executable, script, *words], capture_output=True, text=True, timeout=120, env=environment
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+def test_a_kernel_is_compiled_once_and_loads_without_the_compiler(tmp_path):
+    assert use_kernel(tmp_path).startswith("[(1, 1, True), (1, 1, False)] ")
+    again = use_kernel(tmp_path)
+    assert again.startswith("[] ")
+    assert str(tmp_path / "kept") in again
+    assert again.endswith("False")
+
+
+def test_another_type_is_compiled_beside_one_on_disk(tmp_path):
+    use_kernel(tmp_path)
+    heard = use_kernel(tmp_path, "float")
+    assert heard.startswith("[(2, 2, True), (2, 2, False)] ")
+    assert heard.endswith("True")
+
+
+@pytest.mark.parametrize("ending", ["nbi", "nbc"])
+def test_damaged_code_is_compiled_anew(tmp_path, ending):
+    use_kernel(tmp_path)
+    for file in (tmp_path / "kept").rglob(f"*.{ending}"):
+        file.write_bytes(b"")
+    assert use_kernel(tmp_path).startswith("[(1, 1, True), (1, 1, False)] ")
+    assert use_kernel(tmp_path).startswith("[] ")
+
+
+def test_progress_lines_say_when_kernels_are_compiled(monkeypatch, capsys):
+    monkeypatch.setenv("MAPCTL_PROGRESS", "1")
+    with show_progress("walking") as progress:
+        compilation.announce(3, 7, begins=True)
+        compilation.announce(3, 7, begins=False)
+        progress(1, 2)
+    compilation.announce(4, 7, begins=True)
+    told = capsys.readouterr().err.splitlines()
+    assert told == [
+        "progress 2/7 compiling kernels, once",
+        "progress 3/7 compiling kernels, once",
+        "progress 1/2 walking",
+    ]
+
+
+@pytest.mark.parametrize("quiet", [False, True])
+def test_a_pipe_hears_nothing_of_kernels(quiet, capsys):
+    with show_progress("walking", quiet=quiet):
+        compilation.announce(1, 7, begins=True)
+    assert capsys.readouterr() == ("", "")
+
+
+def test_a_terminal_shows_a_bar_while_kernels_are_compiled(monkeypatch, capsys):
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
+    monkeypatch.setenv("TERM", "xterm")
+    with show_progress("walking"):
+        compilation.announce(3, 7, begins=True)
+        before = capsys.readouterr().err
+        compilation.announce(3, 7, begins=False)
+        after = capsys.readouterr().err
+    assert "compiling kernels, once" in before
+    assert "2/7" in before
+    assert "compiling" not in after.splitlines()[-1]
+    assert "walking" in after
+
+
+def test_the_command_says_what_it_compiled_and_where(capsys):
+    assert run("compile") == 0
+    first = capsys.readouterr().out
+    assert run("compile", "--quiet") == 0
+    assert capsys.readouterr().out == ""
+    assert first.startswith("kernels   ")
+    assert "kept in   /" in first
+
+
+@pytest.mark.slow
+def test_no_job_compiles_after_the_command(tmp_path):
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "kept")}
+    (tmp_path / "commands.csv").write_text("time_s,speed_mps,heading_deg\n0,1.2,0\n0.5,0,60\n")
+    jobs = (
+        "compile --quiet",
+        "follow circle:1 --seconds 1 --start stand --quiet -o a.bvh",
+        "steer commands.csv --quiet -o b.bvh",
+        "generate --seconds 1 --quiet -o c",
+    )
+    kept = []
+    for job in jobs:
+        words = [sys.executable, "-m", "mapctl", *job.split()]
+        subprocess.run(words, check=True, cwd=tmp_path, env=environment | {"PYTHONPATH": os.pathsep.join(sys.path)})
+        kept.append({path: path.stat().st_mtime_ns for path in (tmp_path / "kept").rglob("*.nb?")})
+    assert kept[0]
+    assert all(files == kept[0] for files in kept)
