@@ -6,14 +6,14 @@ from itertools import count
 from typing import Any
 
 from numba import njit
-from numba.core.caching import FunctionCache
+from numba.core.caching import FunctionCache, NullCache
 from numba.core.runtime import rtsys
 
 from mapctl.numerics import compilation
 
 JitDecorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
-_kernels: list["KernelCache"] = []  # those that Python calls and that are kept on disk
+_kernels: list["KernelCache | NoKernelCache"] = []  # of those that Python calls
 _first_uses = count(1)
 
 
@@ -27,9 +27,11 @@ def make_jit_decorators(*relaxed: str) -> tuple[JitDecorator, JitDecorator]:
 
     def entry(function: Callable[..., Any]) -> Callable[..., Any]:
         compiled: Any = _njit(nogil=True, **shared)(function)
-        with suppress(RuntimeError):  # numba found no folder that it may write to
+        try:
             compiled._cache = KernelCache(function)
-            _kernels.append(compiled._cache)
+        except RuntimeError:  # numba found no folder that it may write to
+            compiled._cache = NoKernelCache()
+        _kernels.append(compiled._cache)
         return compiled
 
     return entry, _njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **shared)
@@ -37,7 +39,7 @@ def make_jit_decorators(*relaxed: str) -> tuple[JitDecorator, JitDecorator]:
 
 def find_folders() -> set[str]:
     """Find the folders on disk in which kernels of the imported modules are kept; none where nothing may be written."""
-    return {kernel.cache_path for kernel in _kernels}
+    return {kernel.cache_path for kernel in _kernels if kernel.cache_path is not None}
 
 
 class KernelCache(FunctionCache):
@@ -61,14 +63,33 @@ class KernelCache(FunctionCache):
                 self.flush()
         self._number = next(_first_uses)
         if found is None:
-            compilation.announce(self._number, len(_kernels), begins=True)
+            _announce(self._number, begins=True)
         return found
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Keep what was compiled."""
         with suppress(OSError):
             super().save_overload(sig, data)
-        compilation.announce(self._number, len(_kernels), begins=False)
+        _announce(self._number, begins=False)
+
+
+class NoKernelCache(NullCache):
+    """Kernels that can be kept nowhere: each process compiles them, and says so."""
+
+    _number = 0
+
+    def load_overload(self, sig: Any, target_context: Any) -> None:
+        """Return nothing."""
+        self._number = next(_first_uses)
+        _announce(self._number, begins=True)
+
+    def save_overload(self, sig: Any, cres: Any) -> None:
+        """Keep nothing."""
+        _announce(self._number, begins=False)
+
+
+def _announce(number: int, *, begins: bool) -> None:
+    compilation.announce(number, len(_kernels), begins=begins)
 
 
 def _njit(**options: Any) -> JitDecorator:

@@ -5,7 +5,7 @@ import pytest
 import torch
 from numba import njit
 
-from mapctl.numerics import jit
+from mapctl.numerics import compilation, jit
 from mapctl.protocols import DiscreteChoices
 from priors.lstm_gmm.fast import kernels
 from priors.lstm_gmm.fast.rollout import FastRollout
@@ -193,4 +193,7 @@ def test_kernels_compile_where_nothing_can_be_kept(monkeypatch):
 
     monkeypatch.setattr(jit, "KernelCache", nowhere_to_write)
     entry, _ = jit.make_jit_decorators("contract")
-    assert entry(lambda x: x + 1)(1) == 2
+    heard = []
+    with compilation.tell(lambda number, total, begins: heard.append(begins)):
+        assert entry(lambda x: x + 1)(1) == 2
+    assert heard == [True, False]
