@@ -58,9 +58,14 @@ class MatchingSettings:
 
 
 def free_run_moment_loss(
-    model: LstmGmm, windows: Float[Tensor, "batch frames size"], settings: MatchingSettings, generator: torch.Generator
+    model: LstmGmm,
+    windows: Float[Tensor, "batch frames size"],
+    settings: MatchingSettings,
+    generator: torch.Generator,
+    common: torch.Generator | None = None,
 ) -> Tensor:
-    """How far free runs are from how the windows go on; differentiable in the network's weights.
+    """How far free runs are from how the windows go on; differentiable in the network's weights. `common` draws how
+    long they have run before, which processes that train together have in common; `generator` if None.
 
     RequestError for windows too short to hold both.
     """
@@ -71,7 +76,8 @@ def free_run_moment_loss(
         raise RequestError(f"free runs are matched in windows of at least {2 * _PAST_FRAMES} frames, got {length}")
     windows = windows[: settings.batch]
     state = model.advance(model.start_after(windows[:, 0]), windows[:, 1:context])
-    past, away = windows[:, :context], int(torch.randint(settings.wander + 1, (1,), generator=generator))
+    drawn = torch.randint(settings.wander + 1, (1,), generator=common or generator)
+    past, away = windows[:, :context], int(drawn)
     if away > 0:
         wandered, state = model.sample(state, away, generator)
         past = torch.cat([past, wandered], 1)

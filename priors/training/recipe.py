@@ -1,5 +1,6 @@
 """What a training run needs: data and settings. A model's own recipe says what is learnt, judged and described."""
 
+import os
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import Field, asdict, dataclass, field
@@ -78,6 +79,8 @@ class Recipe(ABC, Generic[C, S, T]):
     """Name of the kind of model, in its card and on the command line."""
     counter: ClassVar[str] = "step"
     """What one step of its trainer is called."""
+    steps_name: ClassVar[str] = "steps"
+    """Setting that tells how many there are in all."""
     guards: ClassVar[tuple[str, ...]] = ()
     """Losses by which training may end by itself (see `find_stop_reason`). Where there are any, they are saved with the
     checkpoints, and the best weights so far (see `score`) are exported instead of the last."""
@@ -100,6 +103,8 @@ class Recipe(ABC, Generic[C, S, T]):
     """Between lines of news."""
     validate_steps: int = 1000
     """Steps between two validations."""
+    processes: int = 1
+    """Processes that share the batch of each step: forked where there are several, unless torchrun has started them."""
     licence: str = "that of the training data"
     """Licence of the weights, for the card."""
     skip_first: bool = False
@@ -108,7 +113,7 @@ class Recipe(ABC, Generic[C, S, T]):
     """Refuse a folder with a file that cannot be used, rather than leave the file out."""
 
     def __post_init__(self):
-        require_at_least(self, 1, "report_steps", "validate_steps")
+        require_at_least(self, 1, "report_steps", "validate_steps", "processes")
 
     @abstractmethod
     def make_trainer(self, parts: Split) -> T:
@@ -118,6 +123,23 @@ class Recipe(ABC, Generic[C, S, T]):
         """Before anything is read."""
         if not self.data.is_dir():
             raise RequestError(f"{self.data} is not a folder of BVH files")
+        if not os.access(self.data, os.R_OK | os.X_OK):
+            raise RequestError(f"{self.data} cannot be read: permission denied")
+        if self.processes > self.most_processes:
+            raise RequestError(
+                f"{self.processes} processes cannot share what a {self.counter} of {self.kind} takes:"
+                f" {self.most_processes} at most"
+            )
+
+    @property
+    def most_processes(self) -> int:
+        """How many processes can share a step."""
+        return int(getattr(self.settings, "batch", 1))
+
+    @property
+    def steps(self) -> int:
+        """Steps in all, as the settings call them."""
+        return int(getattr(self.settings, self.steps_name))
 
     def source(self) -> DataSource:
         """Where motion comes from."""
@@ -139,9 +161,9 @@ class Recipe(ABC, Generic[C, S, T]):
         return corpus.identity()
 
     def pin(self, trainer: T, corpus: Corpus) -> dict[str, Row]:
-        """What must not change between a run's parts."""
+        """What must not change between a run's parts. The number of steps may: a run can be extended."""
         return {
-            "settings": asdict(self.settings),
+            "settings": {name: value for name, value in asdict(self.settings).items() if name != self.steps_name},
             "network": self.find_shape(trainer).as_card(),
             "data": self.describe_data(corpus),
         }
@@ -184,7 +206,12 @@ class Recipe(ABC, Generic[C, S, T]):
         parts = [f"mapctl train {self.kind} --data DATA -o RUN"]
         parts += [f"--match '{self.match}'"] if self.match else []
         parts += ["--skip-first"] * self.skip_first + self.format_shape()
-        return " ".join(parts + self.format_changed(self.usual_settings(), *told))
+        parts += self.format_changed(self.usual_settings(), *told)
+        return " ".join(parts + self.format_processes())
+
+    def format_processes(self) -> list[str]:
+        """The option for several processes, where there were any."""
+        return [f"--processes {self.processes}"] if self.processes > 1 else []
 
     def format_changed(self, usual: Any, *names: str, **renamed: str) -> list[str]:
         """Options for settings that are not the `usual` ones; `renamed` are those whose option is called otherwise."""
@@ -202,12 +229,6 @@ class NetworkRecipe(Recipe[C, S, G]):
 
     init: str | None = None
     """Begin with the weights of this model, bundled or trained."""
-    processes: int = 1
-    """Processes that compute the gradients of a step, each of a batch of its own."""
-
-    def __post_init__(self):
-        super().__post_init__()
-        require_at_least(self, 1, "processes")
 
     @property
     def split_seed(self) -> int:
@@ -221,7 +242,6 @@ class NetworkRecipe(Recipe[C, S, G]):
     def make_trainer(self, parts: Split) -> G:
         """As it is before the first step."""
         trainer = self.make_untaught(parts)
-        trainer.processes = self.processes
         if self.init is not None and not self.resume:
             trainer.network.load_state_dict(self.read_initial_weights(self.init, trainer))
         return trainer
@@ -236,13 +256,12 @@ class NetworkRecipe(Recipe[C, S, G]):
 
     def pin(self, trainer: G, corpus: Corpus) -> dict[str, Row]:
         """What must not change between a run's parts."""
-        return {**super().pin(trainer, corpus), "init": {"name": self.init}, "processes": {"number": self.processes}}
+        return {**super().pin(trainer, corpus), "init": {"name": self.init}}
 
     def format_command(self) -> str:
         """What to type for the same run, for the card; options that are the defaults are left out."""
         parts = ["--init INIT"] if self.init is not None else []
         parts += ["--bfloat16"] * bool(getattr(self.settings, "bfloat16", False))
-        parts += [f"--processes {self.processes}"] * (self.processes > 1)
         return " ".join([super().format_command(), *parts])
 
 

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from mapctl.errors import MapctlError
 from priors.training import run_files
 from priors.training.corpus import Corpus
-from priors.training.parallel import GradientHelpers
+from priors.training.parallel import ALONE, TrainingGroup
 
 _WARM_UP_SHARE = 0.05  # share of the steps in which the learning rate rises
 _MAX_GRADIENT_NORM = 1.0
@@ -27,7 +27,43 @@ class Trainer(ABC, Generic[Network]):
 
     def __init__(self, *, steps: int, seed: int):
         self.step, self.steps = 0, steps
+        self.first_steps = steps
+        """Steps that the run was begun with: what grows with the share of the steps that are done, or joins at one, goes
+        by these. Only the learning rate follows `steps` where the run is extended."""
+        self.group = ALONE
         self.generator = torch.Generator().manual_seed(seed)
+        """Draws what belongs to this process' share of a batch."""
+        self.common = self.generator
+        """Draws what all processes of a step have in common, as the length of its windows."""
+
+    def join(self, group: TrainingGroup) -> None:
+        """Train as one of a group from here on; all members are the same until then."""
+        self.group = group
+        if group.size > 1:
+            self.common = torch.Generator()
+            self.common.set_state(self.generator.get_state())
+
+    def set_first_steps(self, steps: int) -> None:
+        """Set the steps that the run was begun with, where they are not those that it goes on to."""
+        self.first_steps = steps
+
+    def take_step(self) -> dict[str, float]:
+        """One step of all processes, each with random numbers of its own; the parts of its loss, means over them."""
+        if self.group.size > 1:
+            seeds = torch.randint(2**62, (self.group.size,), generator=self.common)
+            self.generator.manual_seed(int(seeds[self.group.rank]))
+        return self.train_step()
+
+    def differentiate(
+        self, loss: Tensor | None, weights: Iterable[nn.Parameter], told: Mapping[str, Tensor]
+    ) -> dict[str, float]:
+        """Leave the loss' gradients in the weights, and return the numbers in `told`: means over the processes. A
+        process without a loss waits for those of the others."""
+        if loss is not None:
+            loss.backward()
+        learnt = [weight for weight in weights if weight.requires_grad]
+        values = self.group.average_gradients(learnt, [value.detach() for value in told.values()])
+        return {name: float(value) for name, value in zip(told, values, strict=True)}
 
     @abstractmethod
     def train_step(self) -> dict[str, float]:
@@ -51,8 +87,8 @@ class Trainer(ABC, Generic[Network]):
             raise make_divergence_error(self.step, "its weights are not finite")
 
     def state(self) -> dict[str, Tensor]:
-        """Everything that a bit-exact continuation needs, but the step."""
-        tensors = {"generator": self.generator.get_state()}
+        """Everything that a bit-exact continuation needs, but the step; all processes of the group are to call it."""
+        tensors = {"generator": self.common.get_state()}
         for kind, network in self.networks().items():
             tensors |= {f"{kind}.{name}": value for name, value in network.state_dict().items()}
         for kind, optimiser in self.optimisers().items():
@@ -60,8 +96,8 @@ class Trainer(ABC, Generic[Network]):
         return tensors
 
     def load_state(self, tensors: Mapping[str, Tensor], step: int) -> None:
-        """Go on from what `state` gave; KeyError or RuntimeError where it is not whole."""
-        self.generator.set_state(tensors["generator"])
+        """Go on from what `state` gave, before a group is joined; KeyError or RuntimeError where it is not whole."""
+        self.common.set_state(tensors["generator"])
         for kind, network in self.networks().items():
             network.load_state_dict(run_files.select_prefixed(f"{kind}.", tensors))
         for kind, optimiser in self.optimisers().items():
@@ -77,10 +113,7 @@ class GradientTrainer(Trainer[Network]):
         super().__init__(steps=steps, seed=seed)
         self.learning_rate = learning_rate
         self.network = draw_weights(make, seed)
-        self.processes = 1
-        """Processes that compute the gradients of a step, each of a batch of its own; to be set before the first."""
         self._optimisers = self.make_optimisers()
-        self._helpers: GradientHelpers | None = None
 
     @abstractmethod
     def losses(self) -> dict[str, Tensor]:
@@ -109,28 +142,19 @@ class GradientTrainer(Trainer[Network]):
             group["lr"] = self.compute_learning_rate()
         for optimiser in optimisers:
             optimiser.zero_grad(set_to_none=True)
-        parts = self._find_gradients()
-        if not torch.isfinite(parts["loss"]):
-            raise make_divergence_error(self.step + 1, f"the loss is {parts['loss'].item()}")
+        losses = self.losses()
+        parts = self.differentiate(losses["loss"], self.weights(), losses)
+        if not math.isfinite(parts["loss"]):
+            raise make_divergence_error(self.step + 1, f"the loss is {parts['loss']}")
         self.limit_gradients()
         for optimiser in optimisers:
             optimiser.step()
         self.step += 1
-        return {name: float(value.detach()) for name, value in parts.items()}
+        return parts
 
     def optimisers(self) -> dict[str, torch.optim.Optimizer]:
         """All."""
         return self._optimisers
-
-    def _find_gradients(self) -> dict[str, Tensor]:
-        """Leave gradients in the weights; the losses, averaged over the processes."""
-        if self.processes > 1 and self._helpers is None:
-            self._helpers = GradientHelpers(self, self.processes - 1)
-        if self._helpers is not None:
-            self._helpers.begin()
-        parts = self.losses()
-        parts["loss"].backward()
-        return parts if self._helpers is None else self._helpers.finish(parts)
 
 
 def make_adam(weights: Iterable[nn.Parameter], learning_rate: float) -> torch.optim.Optimizer:

@@ -79,7 +79,7 @@ class DenoiserTrainer(GradientTrainer[DenoiserNetwork]):
 
     def losses(self) -> dict[str, Tensor]:
         """Compute the losses of a newly drawn batch."""
-        windows = draw_performers(self.windows, self.settings, self.generator)
+        windows = draw_performers(self.windows, self.settings, self.generator, batch=self.group.share(self.settings.batch))
         return compute_denoiser_losses(self.network, windows, self.settings, self.generator)
 
     def validate(self, corpus: Corpus) -> dict[str, Any]:
@@ -89,7 +89,7 @@ class DenoiserTrainer(GradientTrainer[DenoiserNetwork]):
         drawn = FeatureWindows(corpus, min(settings.window, max(corpus.lengths)), evenness=settings.evenness)
         with torch.no_grad():
             for _ in range(6):
-                windows = draw_performers(drawn, settings, generator)
+                windows = draw_performers(drawn, settings, generator, batch=settings.batch)
                 rows.append(compute_denoiser_losses(self.network, windows, settings, generator))
         means = torch.stack([torch.stack(list(row.values())) for row in rows]).mean(dim=0)
         return dict(zip(rows[0], means.tolist(), strict=True))
@@ -115,11 +115,11 @@ class DenoiserRecipe(NetworkRecipe[DenoiserConfig, DenoiserSettings, DenoiserTra
 
 
 def draw_performers(
-    windows: FeatureWindows, settings: DenoiserSettings, generator: torch.Generator
+    windows: FeatureWindows, settings: DenoiserSettings, generator: torch.Generator, *, batch: int
 ) -> Float[Tensor, "batch window size"]:
-    """A batch of windows of performers a little larger or smaller, on rigs calibrated a little differently."""
-    features = windows.draw(settings.batch, generator).features.clone()
-    size = torch.exp(settings.corruption.size * torch.randn(settings.batch, 1, 1, generator=generator))
+    """So many windows of performers a little larger or smaller, on rigs calibrated a little differently."""
+    features = windows.draw(batch, generator).features.clone()
+    size = torch.exp(settings.corruption.size * torch.randn(batch, 1, 1, generator=generator))
     for block in ("root_displacement_heading", "root_height"):
         features[..., LAYOUT.slices[block]] *= size
     features[..., LAYOUT.slices["joint_rotations"]] = _perturb_joint_frames(

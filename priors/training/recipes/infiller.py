@@ -78,7 +78,7 @@ class InfillerTrainer(GradientTrainer[InfillerNetwork]):
 
     def losses(self) -> dict[str, Tensor]:
         """Compute the losses of a newly drawn batch."""
-        window, progress = self.windows.draw(self.settings.batch, self.generator), self.step / self.settings.steps
+        window, progress = self._draw(), self.step / self.first_steps
         gaps, generator = self.settings.gaps, self.generator
         if self.network.recurrent:
             known = sample_transition(
@@ -87,6 +87,9 @@ class InfillerTrainer(GradientTrainer[InfillerNetwork]):
         else:
             known = sample_observation_mask(window.present, gaps, progress=progress, generator=generator)
         return compute_infiller_losses(self.network, window, known, self.settings)
+
+    def _draw(self) -> Window:
+        return self.windows.draw(self.group.share(self.settings.batch), self.generator)
 
     @torch.no_grad()
     def validate(self, corpus: Corpus) -> dict[str, Any]:

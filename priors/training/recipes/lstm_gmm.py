@@ -5,6 +5,7 @@ comes from one generator whose state is in the checkpoint, so a resumed run cont
 """
 
 import math
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 
@@ -22,6 +23,7 @@ from priors.training.corpus import Corpus, Split
 from priors.training.gathering import describe_skipped
 from priors.training.initial_states import measure_data_limits, select_initial_states
 from priors.training.moment_matching import MatchingSettings, free_run_moment_loss
+from priors.training.parallel import count_launched
 from priors.training.quality import density as density_quality
 from priors.training.recipe import Export, Gathered, Recipe, Row, average, find_split_seed
 from priors.training.trainer import GradientTrainer
@@ -151,7 +153,7 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
             nn.utils.clip_grad_value_(self.network.parameters(), settings.gradient_clip)
         else:
             nn.utils.clip_grad_norm_(self.network.parameters(), settings.gradient_clip)
-        if self.step >= matching.begin * settings.steps and self.step % matching.every == 0:
+        if matching.begin < 1 and self.step >= matching.begin * self.first_steps and self.step % matching.every == 0:
             self._add_moment_gradient(self._latest)
 
     def compute_learning_rate(self) -> float:
@@ -161,7 +163,7 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
             passes = self.step * settings.batch * settings.window // max(1, len(self.windows.features))
             return settings.learning_rate * 0.95**passes
         warm = min(1.0, (self.step + 1) / 200)
-        return warm * settings.learning_rate * 0.5 * (1 + math.cos(math.pi * min(1.0, self.step / settings.steps)))
+        return warm * settings.learning_rate * 0.5 * (1 + math.cos(math.pi * min(1.0, self.step / self.steps)))
 
     def make_optimisers(self) -> dict[str, torch.optim.Optimizer]:
         """The recipe's own."""
@@ -182,19 +184,28 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
     def _add_moment_gradient(self, windows: Tensor) -> None:
         """Add the gradient of the free runs' mismatch, clipped on its own: neither loss drowns the other."""
         parameters = [p for p in self.network.parameters() if p.requires_grad]
-        loss = free_run_moment_loss(self.network, windows, self.settings.matching, self.generator)
-        gradients = torch.autograd.grad(loss, parameters, allow_unused=True)
-        found = [(p, g) for p, g in zip(parameters, gradients, strict=True) if g is not None]
-        norm = torch.linalg.vector_norm(torch.stack([torch.linalg.vector_norm(g) for _, g in found]))
-        if not torch.isfinite(norm):
-            return  # a free run that left the data's range says nothing
-        for parameter, gradient in found:
-            share = self.settings.gradient_clip / norm.clamp(min=self.settings.gradient_clip)
-            parameter.grad = share * gradient if parameter.grad is None else parameter.grad + share * gradient
+        before = [p.grad for p in parameters]
+        for parameter in parameters:
+            parameter.grad = None
+        matching = self.settings.matching
+        matching = replace(matching, batch=max(_LEAST_RUNS, self.group.share(matching.batch)))
+        loss = free_run_moment_loss(self.network, windows, matching, self.generator, self.common)
+        self.differentiate(loss, parameters, {})
+        found = [p.grad for p in parameters]
+        norm = torch.linalg.vector_norm(torch.stack([torch.linalg.vector_norm(g) for g in found if g is not None]))
+        share = self.settings.gradient_clip / norm.clamp(min=self.settings.gradient_clip)
+        # A free run that left the data's range says nothing.
+        share = share if bool(torch.isfinite(norm)) else None
+        for parameter, gradient, own in zip(parameters, found, before, strict=True):
+            parameter.grad = own
+            if gradient is not None and share is not None:
+                parameter.grad = share * gradient if own is None else own + share * gradient
 
     def _draw_windows(self) -> tuple[Float[Tensor, "batch window_and_one size"], Float[Tensor, "batch labels"]]:
         """Windows of clips with the labels that the network is shown."""
-        drawn = self.windows.draw(self.settings.batch, self.generator, mirror=self.settings.mirror)
+        drawn = self.windows.draw(
+            self.group.share(self.settings.batch), self.generator, mirror=self.settings.mirror
+        )
         labels = self.labels.held[torch.searchsorted(self.clip_ends, drawn.first, right=True)]
         labels = torch.where(drawn.mirrored[:, None], labels[:, self.labels.mirrored], labels)
         return drawn.features.to(self.device), self._tell_some(labels).to(self.device)
@@ -235,6 +246,7 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
 
 
 _KEEP_GROUP_PROBABILITY = 0.7
+_LEAST_RUNS = 4  # free runs that are compared: slow ones with slow ones, by quarters
 
 
 @dataclass(frozen=True)
@@ -261,7 +273,12 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
 
     def check(self) -> None:
         """Before anything is read."""
-        _select_device(self.device)
+        device = _select_device(self.device)
+        if device == "cuda" and self.processes > 1 and count_launched() is None:
+            raise RequestError(
+                "several processes on GPUs are started by torchrun, one a GPU: python -m torch.distributed.run"
+                f" --nproc-per-node {self.processes} -m mapctl train lstm-gmm ...; or use --device cpu"
+            )
         super().check()
 
     def make_trainer(self, parts: Split) -> DensityTrainer:
@@ -332,7 +349,7 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
         parts += [f"--init {self.init}"] if self.init else [f"--width {self.config.width}"]
         parts += ["--skip-first"] * self.skip_first + ["--bfloat16"] * self.settings.bfloat16
         parts += self.format_changed(TrainingSettings(), "steps", "batch", "window", "learning_rate", "seed")
-        return " ".join(parts) + (" --paper" if self.config.retain == 0 else "")
+        return " ".join(parts + self.format_processes()) + (" --paper" if self.config.retain == 0 else "")
 
 
 def _select_device(wanted: str) -> str:
@@ -340,4 +357,7 @@ def _select_device(wanted: str) -> str:
         raise RequestError(f"device must be auto, cpu or cuda, got {wanted!r}")
     if wanted == "cuda" and not torch.cuda.is_available():
         raise RequestError("this machine has no CUDA device; use --device cpu")
+    local, devices = int(os.environ.get("LOCAL_RANK", "0")), torch.cuda.device_count()
+    if wanted != "cpu" and devices and count_launched() is not None and local >= devices:
+        raise RequestError(f"this machine has {devices} CUDA devices, too few for process {local}; use --device cpu")
     return ("cuda" if torch.cuda.is_available() else "cpu") if wanted == "auto" else wanted

@@ -76,8 +76,8 @@ class PathTrainer(GradientTrainer[PathNetwork]):
     def losses(self) -> dict[str, Tensor]:
         """Compute the losses of a newly drawn batch."""
         spare = max(0, self.longest - _SHORTEST_WINDOW)
-        frames = min(self.longest, _SHORTEST_WINDOW + int(torch.randint(spare + 1, (), generator=self.generator)))
-        batch = max(1, self.settings.batch // frames)
+        frames = min(self.longest, _SHORTEST_WINDOW + int(torch.randint(spare + 1, (), generator=self.common)))
+        batch = self.group.share(max(1, self.settings.batch // frames))
         motion = self.windows.draw(batch, frames, self.generator, variation=self.settings.variation)
         return compute_path_losses(self.network, motion, self.settings)
 

@@ -128,9 +128,9 @@ class PoseTransformerTrainer(GradientTrainer[PoseTransformerNetwork]):
     def losses(self) -> dict[str, Tensor]:
         """Compute the losses of a newly drawn batch."""
         settings = self.settings
-        share = float(torch.rand((), generator=self.generator))
+        share = float(torch.rand((), generator=self.common))
         frames = round(_SHORTEST_WINDOW * (self.longest / _SHORTEST_WINDOW) ** share)
-        batch = max(1, settings.batch // frames)
+        batch = self.group.share(max(1, settings.batch // frames))
         truth = add_targets(self.windows.draw(batch, frames, self.generator, variation=settings.variation))
         hidden = sample_known_parts(truth, settings.parts, self.generator)
         return compute_losses(self.network, truth, hidden, settings)

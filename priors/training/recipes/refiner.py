@@ -24,6 +24,7 @@ from priors.training.adversaries.history import HistoryBuffer
 from priors.training.corpus import Corpus, Split, find_window_starts
 from priors.training.gathering import DataSource, describe_skipped
 from priors.training.moment_matching import MatchingSettings, moment_loss
+from priors.training.parallel import TrainingGroup
 from priors.training.quality.refiner import RefinerEvaluator, compute_realism_gap, sample_corpus
 from priors.training.recipe import Export, Gathered, Recipe, Row, average
 from priors.training.trainer import Trainer, draw_weights
@@ -152,6 +153,11 @@ class AdversarialTrainer(Trainer[RefinerNetwork]):
             first = [self.refiner(self._draw(self.raw))[0] for _ in range(-(-settings.history // settings.batch))]
         self.history = HistoryBuffer(torch.cat(first)[: settings.history])
 
+    def join(self, group: TrainingGroup) -> None:
+        """Train as one of a group from here on, each with its part of the history."""
+        super().join(group)
+        self.history = self.history.split(group)
+
     def networks(self) -> dict[str, nn.Module]:
         """All that is learnt, by its name in checkpoints."""
         return {"averaged": self.network, "refiner": self.refiner, "critic": self.critic}
@@ -194,7 +200,7 @@ class AdversarialTrainer(Trainer[RefinerNetwork]):
     def state(self) -> dict[str, Tensor]:
         """Everything that a bit-exact continuation needs."""
         counts = torch.tensor([self.step, self.updates])
-        return {**super().state(), "history": self.history.windows, "counts": counts}
+        return {**super().state(), "history": self.group.gather(self.history.windows), "counts": counts}
 
     def load_state(self, tensors: Mapping[str, Tensor], step: int) -> None:
         """Go on from what `state` gave; KeyError or RuntimeError where it is not whole."""
@@ -214,11 +220,11 @@ class AdversarialTrainer(Trainer[RefinerNetwork]):
         if self.settings.moments > 0:
             captured = self._draw(self.captured)
             total = total + self.settings.moments * moment_loss(refined, captured, REFINER_MOMENTS)
-        self._step(self.refiner_optimiser, self.refiner, total)
+        told = self._step(self.refiner_optimiser, self.refiner, total, {"loss": loss})
         with torch.no_grad():
             for mean, latest in zip(self.network.parameters(), self.refiner.parameters(), strict=True):
                 mean.lerp_(latest, 1 - self.settings.average)
-        return loss.item()
+        return told["loss"]
 
     def _criticise(self) -> tuple[float, float]:
         """One update of the critic (Eq. 10) on captured windows, fresh refined ones and kept ones."""
@@ -230,21 +236,25 @@ class AdversarialTrainer(Trainer[RefinerNetwork]):
             odds = self.critic(both).float()
         truth = torch.cat([torch.ones(len(odds) - len(made)), torch.zeros(len(made))])
         loss = cross_entropy(odds, truth[:, None].expand_as(odds))
-        self._step(self.critic_optimiser, self.critic, loss)
-        return loss.item(), float(((odds.mean(1) > 0) == (truth > 0.5)).float().mean())
+        right = ((odds.mean(1) > 0) == (truth > 0.5)).float().mean()
+        told = self._step(self.critic_optimiser, self.critic, loss, {"loss": loss, "right": right})
+        return told["loss"], told["right"]
 
-    def _step(self, optimiser: torch.optim.Optimizer, model: nn.Module, loss: Tensor) -> None:
+    def _step(
+        self, optimiser: torch.optim.Optimizer, model: nn.Module, loss: Tensor, told: Mapping[str, Tensor]
+    ) -> dict[str, float]:
         for each in self.optimisers().values():
             each.zero_grad(set_to_none=True)
-        loss.backward()
+        means = self.differentiate(loss, model.parameters(), told)
         nn.utils.clip_grad_norm_(model.parameters(), 5.0)
         optimiser.step()
+        return means
 
     def _autocast(self) -> torch.autocast:
         return torch.autocast("cpu", torch.bfloat16, enabled=self.settings.bfloat16)
 
     def _draw(self, windows: FeatureWindows) -> Float[Tensor, "batch frames size"]:
-        return windows.draw(self.settings.batch, self.generator).features
+        return windows.draw(self.group.share(self.settings.batch), self.generator).features
 
     def _make_optimiser(self, model: nn.Module, rate: float) -> torch.optim.Optimizer:
         if self.settings.optimiser == "rmsprop":
@@ -262,6 +272,7 @@ class RefinerRecipe(Recipe[RefinerConfig, AdversarialSettings, AdversarialTraine
 
     kind = "refiner"
     counter = "round"
+    steps_name = "rounds"
     guards = ("refiner", "critic", "told")
     config: RefinerConfig = field(default_factory=RefinerConfig)
     """The network."""
@@ -292,6 +303,11 @@ class RefinerRecipe(Recipe[RefinerConfig, AdversarialSettings, AdversarialTraine
     def source(self) -> DataSource:
         """Gather the data, split as the density's, so that its held-out clips stay held out."""
         return replace(super().source(), match=self._find_match())
+
+    @property
+    def most_processes(self) -> int:
+        """How many processes can share a round: half of what each takes goes into its history."""
+        return self.settings.batch // 2
 
     @property
     def split_seed(self) -> int:
@@ -341,7 +357,8 @@ class RefinerRecipe(Recipe[RefinerConfig, AdversarialSettings, AdversarialTraine
         parts += [f"--match '{self.match}'"] if self.match is not None else []
         usual = PAPER[1] if paper else AdversarialSettings()
         parts += self.format_changed(usual, "batch", "window", "seed", rounds="steps")
-        return " ".join(parts + ["--bfloat16"] * self.settings.bfloat16 + ["--paper"] * paper)
+        parts += ["--bfloat16"] * self.settings.bfloat16 + ["--paper"] * paper
+        return " ".join(parts + self.format_processes())
 
     def _find_match(self) -> str:
         return self.prior.card.data.get("match", "") if self.match is None else self.match

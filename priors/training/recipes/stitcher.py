@@ -118,10 +118,10 @@ class StitcherTrainer(GradientTrainer[StitcherNetwork]):
 
     def losses(self) -> dict[str, Tensor]:
         """Compute the losses of a newly drawn batch."""
-        settings, done = self.settings, 1.0 if self.grown else self.step / self.steps
+        settings, done = self.settings, 1.0 if self.grown else self.step / self.first_steps
         longest = _FIRST_LONGEST + max(0, self.longest - _FIRST_LONGEST) * min(1.0, done / _LENGTH_GROWTH)
         longest = max(_SHORTEST, min(round(longest), self.longest))
-        truth = self._draw_transitions(longest, self.generator)
+        truth = self._draw_transitions(longest, self.generator, self.common)
         weights, judge = settings.weights, None
         if self.critics is not None and self._criticised >= 0:
             self._truth, judge = truth, self.critics.hear
@@ -141,7 +141,7 @@ class StitcherTrainer(GradientTrainer[StitcherNetwork]):
         if self.critics is not None:
             parts = {"critics": 0.0, **parts, "critic": 1.0, "told": 0.5}
             if self._truth is not None:
-                parts |= self.critics.learn(self._truth, self.step)
+                parts |= self.critics.learn(self._truth, self)
                 self._truth = None
         keep = min(_AVERAGE, (1 + self.step) / (10 + self.step))
         with torch.no_grad():
@@ -158,18 +158,18 @@ class StitcherTrainer(GradientTrainer[StitcherNetwork]):
     @property
     def _criticised(self) -> int:
         """Updates since the critics joined; below 0 before."""
-        return self.step - round(self.settings.critics.begin * self.steps)
+        return self.step - round(self.settings.critics.begin * self.first_steps)
 
-    def _draw_transitions(self, longest: int, generator: torch.Generator) -> Transition:
-        frames = int(torch.randint(_SHORTEST, longest + 1, (), generator=generator))
-        return self.windows.draw(self.settings.batch, frames, _draw_known(generator), generator)
+    def _draw_transitions(self, longest: int, generator: torch.Generator, common: torch.Generator) -> Transition:
+        frames = int(torch.randint(_SHORTEST, longest + 1, (), generator=common))
+        return self.windows.draw(self.group.share(self.settings.batch), frames, _draw_known(common), generator)
 
     @torch.no_grad()
     def _measure_untrained(self) -> dict[str, float]:
         """Measure the losses that are weighed by what they are before training (the rule of Harvey et al. 2020)."""
         generator, found = torch.Generator().manual_seed(self.settings.seed), []
         for _ in range(_UNTRAINED_BATCHES):
-            truth = self._draw_transitions(self.longest, generator)
+            truth = self._draw_transitions(self.longest, generator, generator)
             settings = self.settings
             found.append(
                 find_stitcher_losses(

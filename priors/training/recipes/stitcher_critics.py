@@ -1,7 +1,9 @@
 """Critics of a stitcher (Ren et al. 2024, Eq. 8 and 9): they join its training late, and hear each side by itself."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -19,7 +21,10 @@ from priors.training.adversaries.sliding_windows import (
     show,
 )
 from priors.training.augmentation.transition_windows import Transition
-from priors.training.trainer import draw_weights, make_divergence_error
+from priors.training.trainer import Trainer, draw_weights, make_divergence_error
+
+_UNTOLD = {"total": torch.ones(()), "critic": torch.ones(()), "told": torch.full((), 0.5)}
+"""Of a process that was shown nothing."""
 
 
 @dataclass(frozen=True)
@@ -61,24 +66,31 @@ class StitcherCritics:
         self.made = shown.detach()
         return compute_generator_loss(self.network(self._blur(shown)))
 
-    def learn(self, truth: Transition, step: int) -> Mapping[str, float]:
+    def learn(self, truth: Transition, trainer: Trainer[Any]) -> Mapping[str, float]:
         """Take one update on the captured transitions and what was made of their ends; the loss (1 where nothing is
         known), and the share of windows told apart. Nothing is learnt of what was too short to be shown."""
-        if self.made is None:
+        (shown,) = trainer.group.agree(self.made is not None)
+        if not shown:
             return {}
-        real, made = show_truth(truth, self.made.shape[1]), self.made
+        self.optimiser.zero_grad(set_to_none=True)
+        total, told = self._compare(truth) if self.made is not None else (None, _UNTOLD)
         self.made = None
+        means = trainer.differentiate(total, self.network.parameters(), told)
+        if not math.isfinite(means["total"]):
+            raise make_divergence_error(trainer.step, f"the loss of the critics is {means['total']}")
+        self.optimiser.step()
+        return {name: means[name] for name in ("critic", "told")}
+
+    def _compare(self, truth: Transition) -> tuple[Tensor, dict[str, Tensor]]:
+        """The loss to differentiate, and the numbers to tell."""
+        assert self.made is not None
+        real, made = show_truth(truth, self.made.shape[1]), self.made
         for_real, for_made = self.network(self._blur(real)), self.network(self._blur(made))
         loss = compute_critic_loss(for_real, for_made)
         total = loss + self.settings.penalty * compute_slope(self.network, real)
-        if not torch.isfinite(total):
-            raise make_divergence_error(step, f"the loss of the critics is {total.item()}")
-        self.optimiser.zero_grad(set_to_none=True)
-        total.backward()
-        self.optimiser.step()
         right = [torch.cat([one > 0.5, other < 0.5]) for one, other in zip(for_real, for_made, strict=True)]
         told = torch.stack([each.float().mean() for each in right]).mean()
-        return {"critic": float(loss.detach()), "told": float(told)}
+        return total, {"total": total, "critic": loss, "told": told}
 
     def _blur(self, rows: Tensor) -> Tensor:
         return rows + self.settings.noise * torch.randn(rows.shape, generator=self.generator)

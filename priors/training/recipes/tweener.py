@@ -155,13 +155,13 @@ class TweenerTrainer(GradientTrainer[GeneratorNetwork]):
     def compute_losses(self, weights: LossWeights, judge: Judge | None = None) -> dict[str, Tensor]:
         """Compute the losses of a newly drawn batch at these weights; a `judge` adds to both its halves'."""
         settings = self.settings
-        progress = 1.0 if self.grown else self.step / settings.steps
+        progress = 1.0 if self.grown else self.step / self.first_steps
         reach = round(1.25 * settings.layout.longest_at(progress))
         shortest = min(self.shortest, self.longest)
         frames = self._draw_frames(shortest, min(self.longest, shortest + reach))
         one = draw_windows(
             self.windows,
-            max(1, round((1 - settings.spliced) * settings.batch / frames)),
+            self.group.share(max(1, round((1 - settings.spliced) * settings.batch / frames))),
             frames,
             settings.layout,
             progress=progress,
@@ -169,7 +169,7 @@ class TweenerTrainer(GradientTrainer[GeneratorNetwork]):
             generator=self.generator,
         )
         frames = self._draw_frames(*settings.splice)
-        batch = max(1, round(settings.spliced * settings.batch / frames))
+        batch = self.group.share(max(1, round(settings.spliced * settings.batch / frames)))
         other = draw_splices(self.windows, batch, frames, settings.layout, progress=progress, generator=self.generator)
         parts, spliced = (
             self._compare(sequences, foreign, weights, judge)
@@ -179,7 +179,7 @@ class TweenerTrainer(GradientTrainer[GeneratorNetwork]):
         return parts | {f"spliced_{name}": spliced[name] for name in ("keys_cm", "root_cm", "style_cm", "dwell_cm")}
 
     def _draw_frames(self, shortest: int, longest: int) -> int:
-        share = float(torch.rand((), generator=self.generator))
+        share = float(torch.rand((), generator=self.common))
         return round(shortest * (max(shortest, longest) / shortest) ** share)
 
     def _compare(

@@ -23,6 +23,7 @@ from priors.training.adversaries.history import HistoryBuffer
 from priors.training.augmentation.key_layouts import KeySettings, draw_windows
 from priors.training.augmentation.pose_windows import PoseWindows
 from priors.training.corpus import Corpus, Split
+from priors.training.parallel import TrainingGroup
 from priors.training.quality.gap import measure_kinds
 from priors.training.recipe import Export, Gathered, Row
 from priors.training.recipes.tweener import TweenerRecipe, TweenerTrainer
@@ -95,6 +96,17 @@ class CriticisedTrainer(Trainer[GeneratorNetwork]):
         self.history: HistoryBuffer | None = None
         self._made: list[Tensor] = []
 
+    def join(self, group: TrainingGroup) -> None:
+        """Train as one of a group from here on, each with its part of the history."""
+        super().join(group)
+        self.learner.group, self.learner.common = self.group, self.common
+        self.history = None if self.history is None else self.history.split(group)
+
+    def set_first_steps(self, steps: int) -> None:
+        """Set the steps that the run was begun with, where they are not those that it goes on to."""
+        super().set_first_steps(steps)
+        self.learner.set_first_steps(steps)
+
     def networks(self) -> dict[str, nn.Module]:
         """All that is learnt, by its name in checkpoints."""
         return {
@@ -139,7 +151,7 @@ class CriticisedTrainer(Trainer[GeneratorNetwork]):
 
     def state(self) -> dict[str, Tensor]:
         """Everything that a bit-exact continuation needs, but the step."""
-        kept = {} if self.history is None else {"history": self.history.windows}
+        kept = {} if self.history is None else {"history": self.group.gather(self.history.windows)}
         return super().state() | kept
 
     def load_state(self, tensors: Mapping[str, Tensor], step: int) -> None:
@@ -151,17 +163,16 @@ class CriticisedTrainer(Trainer[GeneratorNetwork]):
         if step > self.settings.begin:
             self.learner.shortest = self.settings.frames + 2
 
-    @property
-    def _done(self) -> float:
-        """Share of the steps with the critic that are done."""
-        return (self.step - self.settings.begin) / max(1, self.steps - self.settings.begin)
+    def _share_done(self, steps: int) -> float:
+        """Share of the steps with the critic that are done, of so many in all."""
+        return (self.step - self.settings.begin) / max(1, steps - self.settings.begin)
 
     def _improve(self) -> dict[str, float]:
         """One update of the generator, and of its running mean."""
         self._made = []
         settings, heard = self.settings, []
         weights = replace(self.learner.settings.weights, half=settings.half, far=settings.far)
-        share = 0.1 + 0.9 * min(1.0, self._done / settings.ramp)
+        share = 0.1 + 0.9 * min(1.0, self._share_done(self.first_steps) / settings.ramp)
 
         def judge(motion: LocalMotion, trajectory: RootTrajectory) -> Tensor:
             rows = body_motion.show(motion, trajectory)
@@ -172,20 +183,23 @@ class CriticisedTrainer(Trainer[GeneratorNetwork]):
             return settings.weight * share * heard[-1]
 
         parts = self.learner.compute_losses(weights, judge)
-        self._update(self.optimiser, self.learner.network, parts["loss"])
+        heard_mean = torch.stack(heard).mean() if heard else torch.full((), math.nan)
+        told = self._update(
+            self.optimiser, self.learner.network, parts["loss"], {**parts, "generator": heard_mean.detach()}
+        )
         with torch.no_grad():
             for mean, latest in zip(self.network.parameters(), self.learner.network.parameters(), strict=True):
                 mean.lerp_(latest, 1 - settings.average)
-        told = {name: float(value.detach()) for name, value in parts.items()}
-        return told | {"generator": float(torch.stack(heard).mean().detach()) if heard else math.nan}
+        return told
 
     def _criticise(self) -> dict[str, float]:
         """One update of the critic on captured windows, fresh made ones and kept ones."""
         settings, fresh = self.settings, torch.cat(self._made)
         if self.history is None:
-            self.history = HistoryBuffer(fresh.repeat(-(-settings.history // len(fresh)), 1, 1)[: settings.history])
+            size = self.group.share(settings.history)
+            self.history = HistoryBuffer(fresh.repeat(-(-size // len(fresh)), 1, 1)[:size])
         with torch.no_grad():
-            real = self._show_captured(self.learner.windows, settings.batch)
+            real = self._show_captured(self.learner.windows, self.group.share(settings.batch))
         made = self._blur(self.history.mix(fresh, self.generator))
         (for_real, one), (for_made, other) = self.critic(self._blur(real)), self.critic(made)
         loss = body_motion.compute_critic_loss(for_real, for_made)
@@ -193,21 +207,26 @@ class CriticisedTrainer(Trainer[GeneratorNetwork]):
         if self.step % settings.penalised == 0:
             penalty = body_motion.compute_gradient_penalty(self.critic, real)
             total = total + settings.penalty * settings.penalised * penalty
-        self._update(self.critic_optimiser, self.critic, total)
-        right = torch.cat([for_real.mean(dim=1) > 0, for_made.mean(dim=1) < 0])
-        return {"critic": float(loss.detach()), "told": float(right.float().mean())}
+        right = torch.cat([for_real.mean(dim=1) > 0, for_made.mean(dim=1) < 0]).float().mean()
+        told = {"total": total, "critic": loss, "told": right}
+        told = self._update(self.critic_optimiser, self.critic, total, told)
+        return {name: told[name] for name in ("critic", "told")}
 
-    def _update(self, optimiser: torch.optim.Optimizer, network: nn.Module, loss: Tensor) -> None:
-        if not torch.isfinite(loss):
-            raise make_divergence_error(self.step + 1, f"the loss is {loss.item()}")
+    def _update(
+        self, optimiser: torch.optim.Optimizer, network: nn.Module, loss: Tensor, told: Mapping[str, Tensor]
+    ) -> dict[str, float]:
+        """One step by the loss, of which the first in `told` is the mean; all means over the processes."""
         if optimiser is self.optimiser:
-            rate = self.settings.generator_rate * 0.5 * (1 + math.cos(math.pi * self._done))
+            rate = self.settings.generator_rate * 0.5 * (1 + math.cos(math.pi * self._share_done(self.steps)))
             optimiser.param_groups[0]["lr"] = rate
         for each in (self.optimiser, self.critic_optimiser):
             each.zero_grad(set_to_none=True)
-        loss.backward()
+        means = self.differentiate(loss, network.parameters(), told)
+        if not math.isfinite(first := next(iter(means.values()))):
+            raise make_divergence_error(self.step + 1, f"the loss is {first}")
         nn.utils.clip_grad_norm_(network.parameters(), 1.0)
         optimiser.step()
+        return means
 
     def _show_captured(self, windows: PoseWindows, batch: int) -> Float[Tensor, "batch frames rows"]:
         motion = windows.draw(batch, self.settings.frames + 2, self.generator)
