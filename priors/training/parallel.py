@@ -6,20 +6,20 @@ import multiprocessing
 import os
 import signal
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import timedelta
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any
 
 import torch
 import torch.distributed as dist
 from torch import Tensor, nn
 
 from mapctl.errors import MapctlError, RequestError
+from mapctl.runtime.interruption import SIGNALS
 
 _LAUNCHED = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")  # what torchrun tells a process of itself
 _TIMEOUT = timedelta(hours=2)  # that processes wait for each other: one reads and validates while the others wait
@@ -207,7 +207,7 @@ KEPT = "the last checkpoint, if there is one, is kept"
 
 def _help(meeting: str, rank: int, count: int, work: Callable[[TrainingGroup], None], told: Connection) -> None:
     """Work as one of a group; why that fails goes to the first process, which alone speaks and is sent signals."""
-    for kind in (signal.SIGINT, signal.SIGTERM):
+    for kind in SIGNALS:
         signal.signal(kind, signal.SIG_IGN)
     torch.set_num_threads(1)
     try:
@@ -261,14 +261,3 @@ def _end(helpers: Sequence[BaseProcess]) -> None:
 def _require_distributed() -> None:
     if not (dist.is_available() and dist.is_gloo_available()):
         raise RequestError("this PyTorch cannot train in several processes: it was built without gloo")
-
-
-def average_values(group: TrainingGroup, values: Mapping[str, Any]) -> dict[str, float]:
-    """Means over the processes of numbers that all have."""
-    tensors = [torch.as_tensor(value, dtype=torch.float64) for value in values.values()]
-    if group.size > 1:
-        flat = torch.stack(tensors)
-        with _tell_loss():
-            dist.all_reduce(flat)
-        tensors = list((flat / group.size).unbind())
-    return {name: float(value) for name, value in zip(values, tensors, strict=True)}

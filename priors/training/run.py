@@ -1,61 +1,118 @@
 """A training run: from a recipe to a run folder with a checkpoint, a curve and a loadable model with its card.
 
-One loop for every model: updates, validations and checkpoints, and an end at any moment that loses nothing.
+One loop for every model: updates, validations and checkpoints, and an end at any moment that loses nothing. Where
+several processes train together, each runs this loop; the first one validates, writes and speaks.
 """
 
 import json
 import math
 import time
-from dataclasses import asdict
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Generic
 
 from torch import Tensor
 
+from mapctl.errors import RequestError
 from mapctl.runtime.interruption import DeferredSignals, defer_signals
 from priors import checkpoints
-from priors.training import run_files
+from priors.training import parallel, run_files
 from priors.training.gathering import Progress, gather
+from priors.training.parallel import ALONE, TrainingGroup
 from priors.training.recipe import C, Gathered, Recipe, Row, S, T, average, copy_weights
+from priors.training.record.event_files import EventFiles
+from priors.training.record.losses_file import LossesFile
+from priors.training.record.watching import LineWatcher, RunStart, Watcher
+
+
+def _say_nothing(line: str) -> None:
+    pass
 
 
 def train(
-    recipe: Recipe[Any, Any, Any], progress: Progress = lambda line: None, *, warn: Progress = lambda line: None
+    recipe: Recipe[Any, Any, Any],
+    progress: Progress = _say_nothing,
+    *,
+    warn: Progress = _say_nothing,
+    watchers: Sequence[Watcher] | None = None,
 ) -> Path:
     """Train to the end of the recipe, or until its guard stops it, and write RUN/model.safetensors; returns its path.
-    `warn` is told of files that cannot be used.
+    `warn` is told of files that cannot be used. `watchers` are told each step; unless they are given, `progress` gets a
+    line at each report.
 
-    Ctrl-C and SIGTERM save a checkpoint and go on as KeyboardInterrupt. Interrupted or killed and resumed, a run gives
-    the same weights bit for bit on one machine. MapctlError where training diverges and no guard sees it; the last
-    checkpoint then stays as it was.
+    Several processes, forked here (`recipe.processes`) or started by torchrun, share the batch of each step. Ctrl-C and
+    SIGTERM save a checkpoint and go on as KeyboardInterrupt. Interrupted or killed and resumed, a run gives the same
+    weights bit for bit on one machine with as many processes. MapctlError where training diverges and no guard sees it,
+    or a process ends; the last checkpoint then stays as it was.
     """
+    launched = parallel.count_launched()
+    if launched is not None:
+        if recipe.processes not in (1, launched):
+            raise RequestError(f"torchrun has started {launched} processes; leave out --processes")
+        recipe = replace(recipe, processes=launched)
     recipe.check()
-    run_files.check_run_folder(recipe.out, resume=recipe.resume)
-    gathered = Gathered(*gather(recipe.source(), progress=progress, warn=warn))
-    run = TrainingRun(recipe, gathered, progress)
-    run.go()
-    return run.export()
+    with parallel.join_launched() as group:
+        if not group.leads:
+            progress, warn, watchers = _say_nothing, _say_nothing, ()
+        gathered = _gather_together(recipe, group, progress, warn)
+        watchers = [LineWatcher(progress)] if watchers is None else watchers
+        run = TrainingRun(recipe, gathered, progress, warn=warn, watchers=watchers, group=group)
+        run.go()
+        return run.export()
+
+
+def _gather_together(
+    recipe: Recipe[Any, Any, Any], group: TrainingGroup, progress: Progress, warn: Progress
+) -> Gathered:
+    """The first process checks the folder and reads the clips; the others then take them from its cache, or, on another
+    machine, read them themselves."""
+    found: list[Gathered] = []
+
+    def read() -> bytes:
+        if group.leads:
+            run_files.check_run_folder(recipe.out, resume=recipe.resume)
+        found.append(Gathered(*gather(recipe.source(), progress=progress, warn=warn)))
+        return b""
+
+    group.do_first(read)
+    if not group.leads:
+        read()
+    return found[0]
 
 
 class TrainingRun(Generic[C, S, T]):
     """A trainer, its curve and its checkpoints. Everything that a continuation needs is in what it saves."""
 
-    def __init__(self, recipe: Recipe[C, S, T], gathered: Gathered, progress: Progress):
-        self.recipe, self.gathered, self.progress = recipe, gathered, progress
+    def __init__(
+        self,
+        recipe: Recipe[C, S, T],
+        gathered: Gathered,
+        progress: Progress,
+        *,
+        warn: Progress = _say_nothing,
+        watchers: Sequence[Watcher] = (),
+        group: TrainingGroup = ALONE,
+    ):
+        self.recipe, self.gathered, self.progress, self.group = recipe, gathered, progress, group
         self.trainer = recipe.make_trainer(gathered.parts)
         self.pinned = json.loads(json.dumps(recipe.pin(self.trainer, gathered.corpus)))
         self.curve: list[Row] = []
-        self.losses: list[Row] = []  # since the last line of news but one, where there has just been one
+        self.losses: list[Row] = []  # since the last report but one, where there has just been one
+        self.extended: list[dict[str, int]] = []
+        """Where the number of steps was changed: at which step, from what, to what."""
         self.stop_reason: str | None = None
-        self.started_at = time.monotonic()
         self.best: dict[str, Tensor] = copy_weights(self.trainer.network) if recipe.guards else {}
+        self._check_together()
+        self._table = LossesFile(recipe.out, recipe.counter)
+        self.watchers: list[Watcher] = [self._table, EventFiles(recipe.out), *watchers] if group.leads else []
         if recipe.resume:
-            self._load()
+            self._load(warn)
             progress(f"resumed at {recipe.counter} {self.trainer.step}")
-        else:
+        if group.leads:
             recipe.out.mkdir(parents=True, exist_ok=True)
-            if recipe.guards:
-                self.judge()
+            self._table.cut(self.trainer.step, self.curve)
 
     @property
     def finished(self) -> bool:
@@ -64,7 +121,10 @@ class TrainingRun(Generic[C, S, T]):
 
     @property
     def evaluation_due(self) -> bool:
-        """Whether the weights as they are have still to be measured: every so many steps and at the end."""
+        """Whether the weights as they are have still to be measured: every so many steps and at the end, and, where the
+        best are kept, before the first step."""
+        if self.recipe.guards and not self.curve:
+            return True
         step, measured = self.trainer.step, self.curve[-1][self.recipe.counter] if self.curve else 0
         due = step >= self.trainer.steps or step % self.recipe.validate_steps == 0
         return due and step > measured and self.stop_reason is None
@@ -74,17 +134,52 @@ class TrainingRun(Generic[C, S, T]):
         checkpoint and goes on as KeyboardInterrupt; sent again after a second, it does not wait for the step, and the
         last checkpoint is the one before.
         """
+        if self.group.size > 1:
+            self._train_in(self.group)
+            return
+        with parallel.fork_group(self.recipe.processes, self._train_in) as group:
+            self._train_in(group)
+        self.group = self.trainer.group = ALONE
+
+    def _train_in(self, group: TrainingGroup) -> None:
+        """As one process of a group, of which only the first tells anybody."""
+        self.group = group
+        self.trainer.join(group)
+        if not group.leads:
+            self.watchers, self.progress = [], _say_nothing
+        recipe = self.recipe
+        start = RunStart(
+            recipe.kind,
+            recipe.counter,
+            self.trainer.step,
+            self.trainer.steps,
+            recipe.validate_steps,
+            recipe.out,
+            recipe.format_news,
+        )
+        try:
+            for watcher in self.watchers:
+                watcher.begin(start)
+            self._loop()
+        finally:
+            for watcher in self.watchers:
+                watcher.end()
+
+    def _loop(self) -> None:
         saved, unsaved = time.monotonic(), False
         with defer_signals() as held:
             while True:
                 if self.evaluation_due:
                     self._evaluate(held)
-                    unsaved = True
-                overdue = time.monotonic() - saved > 60 * self.recipe.checkpoint_minutes
-                if unsaved and (self.finished or overdue or held.wanted is not None):
+                    unsaved = self.trainer.step > 0
+                late = self.group.leads and time.monotonic() - saved > 60 * self.recipe.checkpoint_minutes
+                overdue, wanted = self.group.agree(late, held.wanted is not None)
+                if unsaved and (self.finished or overdue or wanted):
                     self._save_undisturbed(held)
                     saved, unsaved = time.monotonic(), False
-                held.release()
+                if wanted:
+                    held.release()
+                    raise KeyboardInterrupt  # of a process that another one told
                 if self.finished:
                     return
                 self.update()
@@ -95,16 +190,19 @@ class TrainingRun(Generic[C, S, T]):
         recipe, trainer = self.recipe, self.trainer
         if trainer.step % recipe.report_steps == 0:
             self.losses = []
-        self.losses.append(trainer.train_step())
+        self.losses.append(trainer.take_step())
+        for watcher in self.watchers:
+            watcher.see_step(trainer.step, self.losses[-1])
         if trainer.step >= trainer.steps or trainer.step % recipe.report_steps == 0:
-            seconds = time.monotonic() - self.started_at
-            self.progress(f"{recipe.counter} {trainer.step}: {recipe.format_news(self.losses)}, {seconds:.0f} s")
+            means = _none_where_not_finite({name: _average_known(self.losses, name) for name in self.losses[-1]})
+            for watcher in self.watchers:
+                watcher.see_losses(trainer.step, means)
         self.stop_reason = recipe.find_stop_reason(trainer, self.losses)
         if self.stop_reason is not None:
             self.progress(f"{self.stop_reason}: training ends with the best {recipe.kind} seen")
 
-    def judge(self) -> None:
-        """A row of the curve. It may be broken off and begun again: until its end it changes nothing."""
+    def judge(self) -> Row:
+        """Measure the weights as they are. It may be broken off and begun again: until its end it changes nothing."""
         recipe, trainer = self.recipe, self.trainer
         if not recipe.guards:
             trainer.check_finite()
@@ -114,21 +212,23 @@ class TrainingRun(Generic[C, S, T]):
             if score < min((recipe.score(before) for before in self.curve), default=math.inf) or not self.curve:
                 self.best = copy_weights(trainer.network)
             row = {**row, "score": score, **{f"training_{name}": average(self.losses, name) for name in self._watched}}
-        self.curve.append({recipe.counter: trainer.step, **_none_where_not_finite(row)})
-        self.progress(json.dumps(self.curve[-1]))
+        return _none_where_not_finite(row)
 
     def export(self) -> Path:
         """Write the model with its card."""
         recipe, path = self.recipe, self.recipe.out / "model.safetensors"
+        if not self.group.leads:
+            return path
         if recipe.guards:
             self.trainer.network.load_state_dict(self.best)
         made = recipe.export(self.trainer, self.gathered, self.curve)
+        training = {"settings": asdict(recipe.settings), "curve": self.curve, "command": recipe.format_command()}
         card = checkpoints.Card(
             kind=recipe.kind,
             config=recipe.find_shape(self.trainer).as_card(),
             licence=recipe.licence,
             data=made.data,
-            training={"settings": asdict(recipe.settings), "curve": self.curve, "command": recipe.format_command()},
+            training=training | ({"extended": self.extended} if self.extended else {}),
             quality=made.quality,
             abilities=made.abilities,
             **checkpoints.Card.layout_fields(),
@@ -142,13 +242,25 @@ class TrainingRun(Generic[C, S, T]):
         """
         if self.stop_reason is not None:
             return
-        tensors, index = self.trainer.state(), {**self.pinned, "curve": self.curve}
+        tensors = self.trainer.state()
+        self.group.do_first(partial(self._write_checkpoint, tensors))
+
+    def _write_checkpoint(self, tensors: dict[str, Tensor]) -> bytes:
+        index = {
+            **self.pinned,
+            "steps": self.trainer.steps,
+            "first_steps": self.trainer.first_steps,
+            "extended": self.extended,
+            "processes": self.recipe.processes,
+            "curve": self.curve,
+            "losses": [_none_where_not_finite(row) for row in self.losses],
+        }
         if self.recipe.guards:
-            tensors |= {f"best.{name}": value for name, value in self.best.items()}
-            index["losses"] = [{name: row[name] for name in self.recipe.guards} for row in self.losses]
+            tensors = tensors | {f"best.{name}": value for name, value in self.best.items()}
         else:
             self.trainer.check_finite()
         run_files.write_checkpoint(self.recipe.out, step=self.trainer.step, tensors=tensors, index=index)
+        return b""
 
     @property
     def _watched(self) -> tuple[str, ...]:
@@ -156,31 +268,75 @@ class TrainingRun(Generic[C, S, T]):
         return self.recipe.guards if self.losses else ()
 
     def _evaluate(self, held: DeferredSignals) -> None:
+        """The first process judges, and all add the row to their curves."""
+        told = self.group.do_first(partial(self._judge_or_break_off, held))
+        if not told:
+            if self.trainer.step > 0:
+                self._save_undisturbed(held)
+            raise KeyboardInterrupt
+        row = json.loads(told)
+        self.curve.append({self.recipe.counter: self.trainer.step, **row})
+        for watcher in self.watchers:
+            watcher.see_validation(self.trainer.step, row)
+
+    def _judge_or_break_off(self, held: DeferredSignals) -> bytes:
+        """The row; nothing where a signal breaks it off."""
         try:
             with held.let_through():
-                self.judge()
+                return json.dumps(self.judge()).encode()
         except KeyboardInterrupt:
-            self._save_undisturbed(held)
-            raise
+            return b""
 
     def _save_undisturbed(self, held: DeferredSignals) -> None:
         with held.defer_all():
             self.save()
 
-    def _load(self) -> None:
+    def _check_together(self) -> None:
+        """RequestError where processes on several machines have read other clips."""
+        own = json.dumps(self.pinned, sort_keys=True).encode()
+        (differs,) = self.group.agree(self.group.do_first(lambda: own) != own)
+        if differs:
+            raise RequestError("the processes do not train the same: data and options must be alike on all machines")
+
+    def _load(self, warn: Progress) -> None:
         out, recipe = self.recipe.out, self.recipe
         try:
-            index, tensors = run_files.read_checkpoint(out)
+            index, tensors = run_files.share_checkpoint(out, self.group)
             for part, now in self.pinned.items():
                 run_files.check_unchanged(out, part, then=index[part], now=now)
             self.curve = run_files.parse_curve(index, recipe.counter)
+            self.losses = run_files.parse_losses(index, recipe.guards)
             if recipe.guards:
-                self.losses = [{name: float(row[name]) for name in recipe.guards} for row in index["losses"]]
                 self.best = {name: tensors[f"best.{name}"] for name in self.best}
+            self._extend(index)
             self.trainer.load_state(tensors, int(index["step"]))
+            before = run_files.parse_processes(out, index)
         except run_files.UNREADABLE_ERRORS as error:
             raise run_files.make_unreadable_error(out, error) from error
+        if before != recipe.processes:
+            warn(
+                f"{out} was trained in {before} processes and goes on in {recipe.processes}:"
+                " the result is as good, but not the same to the bit"
+            )
+
+    def _extend(self, index: dict[str, Any]) -> None:
+        """Take what the checkpoint says of the number of steps; RequestError where more are done than are wanted."""
+        recipe, done = self.recipe, int(index["step"])
+        before = int(index.get("steps") or index["settings"][recipe.steps_name])
+        self.extended = [dict(row) for row in index.get("extended", [])]
+        self.trainer.set_first_steps(int(index.get("first_steps", before)))
+        if recipe.steps < done:
+            raise RequestError(
+                f"{recipe.out}: {done} {recipe.counter}s are done; --steps must be at least that, got {recipe.steps}"
+            )
+        if recipe.steps != before:
+            self.extended.append({"at": done, "from": before, "to": recipe.steps})
+            self.progress(f"{recipe.steps} {recipe.counter}s in all instead of {before}")
 
 
 def _none_where_not_finite(row: Row) -> Row:
     return {name: value if math.isfinite(value) else None for name, value in row.items()}
+
+
+def _average_known(rows: Sequence[Row], name: str) -> float:
+    return average([row for row in rows if name in row], name)

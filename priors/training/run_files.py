@@ -1,18 +1,20 @@
 """The checkpoint of a training run on disk: tensors and an index that names them, replaced together."""
 
 import json
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load_file
+from safetensors.torch import load
 
 from mapctl.errors import CheckpointError, RequestError
 from mapctl.formats.atomic import atomic_path, check_folder
 from priors.checkpoints import encode_json
 from priors.tensor_files import write_tensors
+from priors.training.parallel import TrainingGroup
 
 _TENSORS, _INDEX = "checkpoint.safetensors", "checkpoint.json"
 _MOVED = "moved"  # how many weights an optimiser has moved
@@ -60,10 +62,37 @@ def write_checkpoint(run: Path, *, step: int, tensors: Mapping[str, torch.Tensor
             old.unlink()
 
 
-def read_checkpoint(run: Path) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
-    """Index and tensors; one of UNREADABLE_ERRORS where they cannot be read."""
-    index = json.loads((run / _INDEX).read_text(encoding="utf-8"))
-    return index, load_file(run / index["tensors"])
+def share_checkpoint(run: Path, group: TrainingGroup) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
+    """Index and tensors, which the first process of the group reads; one of UNREADABLE_ERRORS where they cannot be."""
+    index = json.loads(group.do_first((run / _INDEX).read_bytes))
+    return index, load(group.do_first(lambda: (run / index["tensors"]).read_bytes()))
+
+
+def parse_losses(index: Mapping[str, Any], guards: Sequence[str]) -> list[dict[str, Any]]:
+    """The losses since the last report that an index holds; none where it is of an older version, without guards."""
+    rows = index["losses"] if guards else index.get("losses", [])
+    if any(name not in row for row in rows for name in guards):
+        raise KeyError("losses without those that guard the run")
+    return [{name: math.nan if value is None else float(value) for name, value in row.items()} for row in rows]
+
+
+def parse_processes(run: Path, index: Mapping[str, Any]) -> int:
+    """How many processes shared a step. CheckpointError for a run of an older version, in which each had a whole batch
+    of its own."""
+    found = index.get("processes", 1)
+    if isinstance(found, dict) and found["number"] > 1:
+        raise CheckpointError(f"{run} is a run of an older version, whose processes had a whole batch each")
+    return 1 if isinstance(found, dict) else int(found)
+
+
+def read_total_steps(run: Path) -> int | None:
+    """Read how many steps the run of the folder's checkpoint has in all; None where there is none that can be read."""
+    try:
+        index = json.loads((run / _INDEX).read_text(encoding="utf-8"))
+        settings = index["settings"]
+        return int(index.get("steps") or settings.get("steps") or settings["rounds"])
+    except UNREADABLE_ERRORS:
+        return None
 
 
 def parse_curve(index: Mapping[str, Any], count: str) -> list[dict[str, Any]]:

@@ -28,8 +28,8 @@ class Trainer(ABC, Generic[Network]):
     def __init__(self, *, steps: int, seed: int):
         self.step, self.steps = 0, steps
         self.first_steps = steps
-        """Steps that the run was begun with: what grows with the share of the steps that are done, or joins at one, goes
-        by these. Only the learning rate follows `steps` where the run is extended."""
+        """Steps that the run was begun with: what grows with the share of the steps that are done, or joins at one,
+        goes by these. Only the learning rate follows `steps` where the run is extended."""
         self.group = ALONE
         self.generator = torch.Generator().manual_seed(seed)
         """Draws what belongs to this process' share of a batch."""

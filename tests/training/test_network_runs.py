@@ -181,7 +181,7 @@ def test_a_finished_run_loads_with_a_complete_card(tmp_path, model, request_in):
     assert [row["step"] for row in card.training["curve"]] == [4, 6]
     assert all(math.isfinite(value) for value in card.quality["test"].values())
     assert set(card.data["held_out"]) == {"validation", "test"}
-    assert [line.split(":")[0] for line in news if line.startswith("step")] == ["step 2", "step 4", "step 6"]
+    assert [line.split(":")[0] for line in news if line.startswith("step")] == ["step 2/6", "step 4/6", "step 6/6"]
 
 
 def test_resuming_is_asked_for_and_needs_the_same_recipe_network_and_data(tmp_path, model, request_in):

@@ -100,9 +100,9 @@ def test_a_finished_run_loads_with_a_complete_card_and_only_its_files(tmp_path, 
         assert row["round"] == 0 or row["training_critic"] > 0
     assert card.quality == min(card.training["curve"], key=compute_realism_gap)
     assert f"--density {density}" in card.training["command"]
-    assert [line.split(":")[0] for line in news if line.startswith("round")] == ["round 2", "round 4", "round 6"]
+    assert [line.split(":")[0] for line in news if line.startswith("round")] == ["round 2/6", "round 4/6", "round 6/6"]
     files = {file.name for file in out.iterdir()}
-    assert files == {"cache", "checkpoint.json", "step-6-checkpoint.safetensors", "model.json", path.name}
+    assert files == {"cache", "checkpoint.json", "step-6-checkpoint.safetensors", "losses.csv", "model.json", path.name}
 
 
 @pytest.mark.parametrize(
@@ -192,7 +192,7 @@ def test_it_stops_with_the_best_when_the_critic_has_won(tmp_path, request_in, sc
     request = request_in(tmp_path / "run", settings={"rounds": 20})
     assert kept(train(request, news.append)) == 4
     assert news[-1] == "the critic has won: training ends with the best refiner seen"
-    assert news[-2].startswith("round 6:")
+    assert news[-2].startswith("round 6/20:")
     assert json.loads((tmp_path / "run" / "checkpoint.json").read_text())["step"] == 5
     again = []
     assert kept(train(replace(request, resume=True), again.append)) == 4

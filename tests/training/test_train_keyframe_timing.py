@@ -73,7 +73,7 @@ def test_the_bundled_one_has_a_card_that_says_where_it_comes_from():
 def test_a_run_leaves_float32_weights_with_a_complete_card(tmp_path, data):
     news = []
     path = train(KeyframeTimingRecipe(data, tmp_path / "run", licence="CC0"), news.append)
-    assert news[-2].startswith("step 15: half_off_by 1.")
+    assert news[-2].startswith("step 15/15: half_off_by 1.")
     assert {tensor.dtype for tensor in load_file(path).values()} == {torch.float32}
     card = priors.load_keyframe_timing(str(tmp_path / "run")).card
     assert (card.kind, card.licence, card.data["pairs"]) == ("keyframe-timing", "CC0", 3 * 5)

@@ -63,7 +63,7 @@ def killer(step):
     """Progress that ends the run when a step is reported."""
 
     def progress(line):
-        if line.startswith(f"step {step}:"):
+        if line.startswith(f"step {step}/6:"):
             raise Killed
 
     return progress
@@ -117,9 +117,9 @@ def test_a_finished_run_loads_with_a_complete_card_and_only_its_files(tmp_path, 
     assert card.quality["test_nats_per_frame"]
     assert prior.reference_log_density == card.quality["windows"]["p2"] <= card.quality["windows"]["mean"]
     assert 0 < prior.limits.slowest < prior.limits.fastest < 3
-    assert any("step 6: " in line for line in news)
+    assert any("step 6/6: " in line for line in news)
     files = {file.name for file in out.iterdir()}
-    assert files == {"cache", "checkpoint.json", "step-6-checkpoint.safetensors", "model.json", path.name}
+    assert files == {"cache", "checkpoint.json", "losses.csv", "step-6-checkpoint.safetensors", "model.json", path.name}
 
 
 def test_resuming_is_asked_for_and_needs_the_same_recipe(tmp_path, data):

@@ -79,7 +79,9 @@ class DenoiserTrainer(GradientTrainer[DenoiserNetwork]):
 
     def losses(self) -> dict[str, Tensor]:
         """Compute the losses of a newly drawn batch."""
-        windows = draw_performers(self.windows, self.settings, self.generator, batch=self.group.share(self.settings.batch))
+        windows = draw_performers(
+            self.windows, self.settings, self.generator, batch=self.group.share(self.settings.batch)
+        )
         return compute_denoiser_losses(self.network, windows, self.settings, self.generator)
 
     def validate(self, corpus: Corpus) -> dict[str, Any]:
@@ -89,7 +91,7 @@ class DenoiserTrainer(GradientTrainer[DenoiserNetwork]):
         drawn = FeatureWindows(corpus, min(settings.window, max(corpus.lengths)), evenness=settings.evenness)
         with torch.no_grad():
             for _ in range(6):
-                windows = draw_performers(drawn, settings, generator, batch=settings.batch)
+                windows = draw_performers(drawn, settings, generator)
                 rows.append(compute_denoiser_losses(self.network, windows, settings, generator))
         means = torch.stack([torch.stack(list(row.values())) for row in rows]).mean(dim=0)
         return dict(zip(rows[0], means.tolist(), strict=True))
@@ -115,9 +117,10 @@ class DenoiserRecipe(NetworkRecipe[DenoiserConfig, DenoiserSettings, DenoiserTra
 
 
 def draw_performers(
-    windows: FeatureWindows, settings: DenoiserSettings, generator: torch.Generator, *, batch: int
+    windows: FeatureWindows, settings: DenoiserSettings, generator: torch.Generator, *, batch: int | None = None
 ) -> Float[Tensor, "batch window size"]:
-    """So many windows of performers a little larger or smaller, on rigs calibrated a little differently."""
+    """Windows of performers a little larger or smaller, on rigs calibrated a little differently."""
+    batch = batch or settings.batch
     features = windows.draw(batch, generator).features.clone()
     size = torch.exp(settings.corruption.size * torch.randn(batch, 1, 1, generator=generator))
     for block in ("root_displacement_heading", "root_height"):

@@ -203,9 +203,7 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
 
     def _draw_windows(self) -> tuple[Float[Tensor, "batch window_and_one size"], Float[Tensor, "batch labels"]]:
         """Windows of clips with the labels that the network is shown."""
-        drawn = self.windows.draw(
-            self.group.share(self.settings.batch), self.generator, mirror=self.settings.mirror
-        )
+        drawn = self.windows.draw(self.group.share(self.settings.batch), self.generator, mirror=self.settings.mirror)
         labels = self.labels.held[torch.searchsorted(self.clip_ends, drawn.first, right=True)]
         labels = torch.where(drawn.mirrored[:, None], labels[:, self.labels.mirrored], labels)
         return drawn.features.to(self.device), self._tell_some(labels).to(self.device)
