@@ -191,7 +191,9 @@ def fail_elsewhere(monkeypatch, fail):
 
 def test_a_process_that_is_killed_ends_the_others_with_one_line(tmp_path, data, monkeypatch):
     fail_elsewhere(monkeypatch, lambda: os.kill(os.getpid(), signal.SIGKILL))
-    with pytest.raises(LostProcessError, match=r"process 1 of the training failed: it was killed; the last checkp.*kept"):
+    with pytest.raises(
+        LostProcessError, match=r"process 1 of the training failed: it was killed; the last checkp.*kept"
+    ):
         train(wanted(data, tmp_path / "run"))
     assert json.loads((tmp_path / "run" / "checkpoint.json").read_text())["step"] == 2
     assert not multiprocessing.active_children()

@@ -22,6 +22,7 @@ class Info(Command):
     rig: options.MaybeRig = None
     """The clip's rig, where it is not the one that would be recognised."""
     out: Annotated[Path | None, arg(aliases=["-o"], metavar="FILE.png")] = None
-    """A picture of a clip's rig: its T-pose with both names of each joint, two frames, axes, and what is doubtful."""
+    """A picture of a clip's rig: its T-pose with both names of each joint, two frames, axes, and what is doubtful. Of a
+    run folder or a prior: its losses and validations over the steps."""
     json: bool = False
     """Print JSON instead of tables."""

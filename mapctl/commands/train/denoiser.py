@@ -4,14 +4,14 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from mapctl.commands.shared import options
-from mapctl.commands.train.options import ParallelOptions
+from mapctl.commands.train.options import TunableOptions
 
 if TYPE_CHECKING:
     from priors.training.recipes.denoiser import DenoiserRecipe
 
 
 @dataclass(frozen=True)
-class TrainDenoiser(ParallelOptions):
+class TrainDenoiser(TunableOptions):
     """Train the denoiser that denoise begins with."""
 
     model = "denoiser"
@@ -32,5 +32,4 @@ class TrainDenoiser(ParallelOptions):
             settings=replace(DenoiserSettings(), bfloat16=self.bfloat16, **given),
             skip_first=self.skip_first,
             init=self.init,
-            processes=self.processes,
         )

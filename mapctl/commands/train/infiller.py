@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import arg
 
-from mapctl.commands.train.options import ParallelOptions
+from mapctl.commands.train.options import TunableOptions
 
 if TYPE_CHECKING:
     from priors.training.recipes.infiller import InfillerRecipe
@@ -14,7 +14,7 @@ _Architectures = Literal["skips", "image", "vanilla", "manifold", "recurrent"]
 
 
 @dataclass(frozen=True)
-class TrainInfiller(ParallelOptions):
+class TrainInfiller(TunableOptions):
     """Train an infiller, which infill, tween, blend and chain begin with if it is named."""
 
     model = "infiller"
@@ -36,5 +36,4 @@ class TrainInfiller(ParallelOptions):
             settings=replace(InfillerSettings(), bfloat16=self.bfloat16, **given),
             skip_first=self.skip_first,
             init=self.init,
-            processes=self.processes,
         )

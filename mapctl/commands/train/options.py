@@ -1,22 +1,27 @@
 """What `mapctl train` asks of any model: the options that all have, their checks, and the run."""
 
+import os
 import shlex
-import sys
+import signal
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from tyro.conf import arg
 
-from mapctl.commands.shared import options
+from mapctl.commands.shared import exit_status, options
 from mapctl.commands.shared.resumption import explain_end
 from mapctl.commands.shared.threads import use_single_thread
-from mapctl.errors import RequestError
+from mapctl.errors import MapctlError, RequestError
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from priors.training.recipe import Recipe
 
-_COUNTS = ("width", "components", "steps", "batch", "window", "pairs")
+CURVES = "curves.png"
+"""Of the plot in the run folder."""
+_COUNTS = ("width", "components", "steps", "batch", "window", "pairs", "processes")
 
 
 @dataclass(frozen=True)
@@ -37,7 +42,7 @@ class TrainOptions(ABC):
     match: Annotated[str | None, arg(metavar="REGEX")] = None
     """Only clips whose path below the data folder holds this regular expression."""
     steps: options.MaybeCount = None
-    """Optimiser steps in all."""
+    """Optimiser steps in all; with --resume, more than before extend a run, also a finished one."""
     seed: options.MaybeCount = None
     """Seed of weights, windows, noise and the split of the clips."""
     resume: bool = False
@@ -48,28 +53,69 @@ class TrainOptions(ABC):
     """Refuse a folder with a file that cannot be used; if not given, such files are left out and listed."""
     licence: Annotated[str, arg(metavar="TEXT")] = "that of the training data"
     """Licence of the weights, for their card."""
+    plot: bool = False
+    """Draw the losses and validations so far as RUN/curves.png at each validation."""
     quiet: bool = False
-    """No lines of news."""
+    """No table or lines of news."""
 
     @abstractmethod
     def recipe(self) -> "Recipe[Any, Any, Any]":
         """The options as the trainer takes them; RequestError for numbers that make no sense."""
 
     def run(self) -> int:
-        """Check, train, name the result."""
+        """Check, train, name the result. Of processes that torchrun started only the first speaks."""
+        if not self._leads():
+            return self._run_silently()
         with explain_end(self._describe_resumption):
-            recipe = self.recipe()
-            from mapctl.commands.shared import outputs
-
-            outputs.check_folder(self.out)
-            if self.single_thread:
-                use_single_thread()
-            from priors.training import run
-
-            path = run.train(recipe, (lambda line: None) if self.quiet else _print_line, warn=_warn)
+            path = self._train()
         if not self.quiet:
             print(f"wrote {path}; {self.used_by} {self.out}")
         return 0
+
+    def _train(self) -> "Path":
+        recipe = self._keep_steps().recipe()
+        from mapctl.commands.shared import outputs
+
+        outputs.check_folder(self.out)
+        if self.plot:
+            outputs.check_plot(self.out / CURVES)
+        if self.single_thread or recipe.processes > 1:
+            use_single_thread()
+        from mapctl.commands.train import progress
+        from priors.training import run
+
+        with progress.watch(quiet=self.quiet, plot=self.out / CURVES if self.plot else None) as watchers:
+            say = (lambda line: None) if self.quiet else progress.print_line
+            return run.train(recipe, say, warn=progress.warn, watchers=watchers)
+
+    def _leads(self) -> bool:
+        if "RANK" not in os.environ:  # torch is not imported before the options are known to make sense
+            return True
+        from priors.training.parallel import leads_launched
+
+        return leads_launched()
+
+    def _run_silently(self) -> int:
+        """Train as another process than the first, which says why training ends; but for what only this one knows."""
+        from priors.training.parallel import LostProcessError
+
+        try:
+            self._train()
+        except LostProcessError:
+            raise
+        except MapctlError:
+            return exit_status.INVALID
+        except KeyboardInterrupt:
+            return exit_status.SIGNALLED + signal.SIGTERM
+        return 0
+
+    def _keep_steps(self) -> "TrainOptions":
+        """A run that is resumed without --steps has as many as before."""
+        if not self.resume or self.steps is not None:
+            return self
+        from priors.training.run_files import read_total_steps
+
+        return replace(self, steps=read_total_steps(self.out))
 
     def check(self) -> None:
         """RequestError for numbers that make no sense for any model."""
@@ -89,7 +135,9 @@ class TrainOptions(ABC):
     def common(self) -> dict[str, Any]:
         """What every recipe takes, checked."""
         self.check()
+        shared = self.select_given("processes")
         return {
+            **shared,
             "data": self.data,
             "out": self.out,
             "match": self.match,
@@ -141,6 +189,9 @@ class NetworkOptions(TrainOptions):
     """Frames a window."""
     bfloat16: bool = False
     """Let the network compute in bfloat16: faster where the processor has it."""
+    processes: options.Count = 1
+    """Processes of this machine that share each step's batch, one a core; several machines: torchrun
+    (docs/training.md)."""
 
 
 @dataclass(frozen=True)
@@ -153,21 +204,3 @@ class TunableOptions(NetworkOptions):
     """Begin with the weights of this model, bundled or trained, and fine-tune them."""
     skip_first: bool = False
     """Leave out frame 0 of every clip (the T-pose of CMU takes)."""
-
-
-@dataclass(frozen=True)
-class ParallelOptions(TunableOptions):
-    """Options of any network whose batches several processes can share."""
-
-    processes: options.Count = 1
-    """Processes that compute the gradients of a step, each of --batch of its own; one for each core pays."""
-
-
-def _print_line(line: str) -> None:
-    # Flushed, so that a log file shows how far a run of hours has come.
-    print(line, flush=True)
-
-
-def _warn(line: str) -> None:
-    """Say it where --quiet and redirected output do not hide it."""
-    print(f"mapctl: {line}", file=sys.stderr, flush=True)

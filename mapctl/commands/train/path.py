@@ -4,14 +4,14 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from mapctl.commands.shared import options
-from mapctl.commands.train.options import ParallelOptions
+from mapctl.commands.train.options import TunableOptions
 
 if TYPE_CHECKING:
     from priors.training.recipes.path import PathRecipe
 
 
 @dataclass(frozen=True)
-class TrainPath(ParallelOptions):
+class TrainPath(TunableOptions):
     """Train a path predictor, which tells where the hips go from how the body moves about them."""
 
     model = "path"
@@ -32,5 +32,4 @@ class TrainPath(ParallelOptions):
             settings=replace(PathSettings(), bfloat16=self.bfloat16, **given),
             skip_first=self.skip_first,
             init=self.init,
-            processes=self.processes,
         )

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from mapctl.commands.shared import options
-from mapctl.commands.train.options import ParallelOptions
+from mapctl.commands.train.options import TunableOptions
 from mapctl.errors import RequestError
 
 if TYPE_CHECKING:
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class TrainPoseTransformer(ParallelOptions):
+class TrainPoseTransformer(TunableOptions):
     """Train the pose transformer that infill, tween, blend and chain begin with; --batch is in frames."""
 
     model = "pose-transformer"
@@ -52,5 +52,4 @@ class TrainPoseTransformer(ParallelOptions):
             settings=replace(usual[1], bfloat16=self.bfloat16, **{**plain[1], **given}),
             skip_first=self.skip_first,
             init=self.init,
-            processes=self.processes,
         )

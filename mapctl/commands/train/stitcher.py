@@ -3,14 +3,14 @@
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from mapctl.commands.train.options import ParallelOptions
+from mapctl.commands.train.options import TunableOptions
 
 if TYPE_CHECKING:
     from priors.training.recipes.stitcher import StitcherRecipe
 
 
 @dataclass(frozen=True)
-class TrainStitcher(ParallelOptions):
+class TrainStitcher(TunableOptions):
     """Train the stitcher, which makes many motions from one pose to another; --batch is in transitions, --window the
     frames of their longest."""
 
@@ -42,5 +42,4 @@ class TrainStitcher(ParallelOptions):
             settings=settings,
             skip_first=self.skip_first,
             init=self.init,
-            processes=self.processes,
         )

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import arg
 
-from mapctl.commands.train.options import ParallelOptions
+from mapctl.commands.train.options import TunableOptions
 from mapctl.errors import RequestError
 
 if TYPE_CHECKING:
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class TrainTweener(ParallelOptions):
+class TrainTweener(TunableOptions):
     """Train a tweener, which makes motion between keys that are seconds apart."""
 
     model = "tweener"
@@ -54,7 +54,6 @@ class TrainTweener(ParallelOptions):
             "settings": settings,
             "skip_first": self.skip_first,
             "init": self.init,
-            "processes": self.processes,
             "path": self.path,
             **({} if self.labels is None else {"labels": self.labels}),
         }

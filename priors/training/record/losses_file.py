@@ -9,7 +9,7 @@ from pathlib import Path
 
 from mapctl.errors import WriteError
 from mapctl.formats.atomic import write_text
-from priors.training.record.watching import Row, RunStart, Watcher
+from priors.training.record.watching import Row, Watcher
 
 NAME = "losses.csv"
 """Of the file in the run folder."""
@@ -36,13 +36,9 @@ class LossesFile(Watcher):
         self.path, self._counter = run / NAME, counter
         self._columns: list[str] = []
 
-    def begin_anew(self) -> None:
-        """Begin an empty table, in the place of one that may be there."""
-        self._columns = []
-        write_text(self.path, "")
-
     def cut(self, step: int, curve: Sequence[Mapping[str, float | None]]) -> None:
-        """Keep what was told up to the checkpoint of this step, whose validations `curve` holds; the rest comes again.
+        """Before training: keep what was told up to the checkpoint of this step, whose validations `curve` holds; the
+        rest comes again. At step 0 the table is empty.
 
         A table that is gone or damaged begins with the curve.
         """
@@ -51,10 +47,7 @@ class LossesFile(Watcher):
         told = {row.step for row in rows if row.part == VALIDATION}
         lacking = [row for row in curve if int(row[self._counter] or 0) not in told]
         rows += [LossRow(int(row[self._counter] or 0), VALIDATION, self._select_values(row)) for row in lacking]
-        self._write_all(sorted(rows, key=lambda row: row.step))
-
-    def begin(self, start: RunStart) -> None:
-        """Nothing: `begin_anew` or `cut` was called before."""
+        self._write_all(sorted((row for row in rows if row.values), key=lambda row: row.step))
 
     def see_losses(self, step: int, means: Row) -> None:
         """Append a row."""
@@ -69,6 +62,8 @@ class LossesFile(Watcher):
         return {name: float(value) for name, value in numbers.items() if name != self._counter and math.isfinite(value)}
 
     def _append(self, row: LossRow) -> None:
+        if not row.values:
+            return
         if not set(_name_columns([row])) <= set(self._columns):  # a column comes in once, at its first row
             self._write_all([*read_losses(self.path), row])
             return
