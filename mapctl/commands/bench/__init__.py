@@ -273,6 +273,27 @@ class Shots(PriorTable):
     """The bundled transformer, or the file or run folder of a trained transformer."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Training(Table):
+    """Seconds and memory of 100 training steps of each model's default recipe, and how much faster several processes
+    are, which take turns with one."""
+
+    work = "mapctl.commands.bench.training"
+
+    data: options.DataFolder
+    """Folder of .bvh files, searched below."""
+    models: Annotated[str, arg(metavar="MODEL,MODEL,...")] = "all"
+    """Models to train, as `mapctl train` calls them."""
+    processes: options.Count = 2
+    """Processes that share a step's batch, to compare with one; 1 measures one alone."""
+    steps: options.Count = 10
+    """Steps at each of five points of a run."""
+    rounds: options.Count = 1
+    """Measurements of each; the table shows their medians."""
+    cache: options.MaybeDataFolder = None
+    """Folder of a training run's clips as features (RUN/cache), which take minutes to read."""
+
+
 @dataclass(frozen=True)
 class Bench(Command):
     """Cost of the solver on this machine (`mapctl bench` alone), and what the jobs are worth: a table each."""
@@ -294,5 +315,6 @@ TABLES: dict[str, type[Table]] = {
     "transitions": Transitions,
     "timing": Timing,
     "shots": Shots,
+    "training": Training,
 }
 """By the name the user types; the first is what `mapctl bench` alone measures."""

@@ -93,15 +93,18 @@ class LiveTable(PacedWatcher):
     def render(self) -> RenderableType:
         """What the terminal shows."""
         assert self.start is not None
-        parts: list[RenderableType] = [self._make_bar(self.start)]
+        tables: list[RenderableType] = []
         if self._recent:
             means = {name: _average(self._recent, name) for name in self._recent[-1]}
             title = f"losses, mean of the last {len(self._recent)} {self.start.counter}s"
-            parts.append(_make_table(title, "now", [("first", self._first), ("now", means)]))
+            tables.append(_make_table(title, "now", [("first", self._first), ("now", means)]))
         if self._validations:
             columns = [(f"{self.start.counter} {step}", row) for step, row in self._validations]
-            parts.append(_make_table("validation", "measure", columns))
-        return Group(*parts)
+            tables.append(_make_table("validation", "measure", columns))
+        beside = Table.grid(padding=(0, 4))
+        if tables:
+            beside.add_row(*tables)
+        return Group(self._make_bar(self.start), beside)
 
     def _make_bar(self, start: RunStart) -> RenderableType:
         grid = Table.grid(padding=(0, 1))

@@ -101,11 +101,12 @@ class PacedWatcher(Watcher):
         self._clock = clock
         self.start: RunStart | None = None
         self.pace = Pace(clock)
-        self.step = 0
+        self.step = self._validated = 0
 
     def begin(self, start: RunStart) -> None:
         """Before the first step of this process."""
         self.start, self.step, self.pace = start, start.step, Pace(self._clock)
+        self._validated = start.step
 
     def see_step(self, step: int, losses: Row) -> None:
         """After each step."""
@@ -114,6 +115,7 @@ class PacedWatcher(Watcher):
 
     def see_validation(self, step: int, measures: Row) -> None:
         """After each validation."""
+        self._validated = step
         self.pace.mark_validation()
 
     def format_pace(self) -> str:
@@ -129,7 +131,9 @@ class PacedWatcher(Watcher):
         """Seconds to the end of the run; None before the first step."""
         assert self.start is not None
         every = self.start.validate_steps
-        validations = -(-self.start.steps // every) - self.step // every
+        validations = -(-self.start.steps // every) - self._validated // every
+        if self._validated >= self.start.steps:
+            validations = 0
         return self.pace.find_remaining(max(0, self.start.steps - self.step), max(0, validations))
 
 
