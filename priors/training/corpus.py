@@ -1,9 +1,10 @@
 """A folder of motion files as training features: read once, cached, split by clip."""
 
 import json
+import os
 import re
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
 
@@ -152,17 +153,36 @@ def read_corpus(
         pattern = re.compile(match)
     except re.error as error:
         raise RequestError(f"match must be a regular expression, got {match!r} ({error})") from error
-    files = [f for f in sorted(data.rglob("*.bvh")) if pattern.search(f.relative_to(data).as_posix())]
+    found, closed = _list_files(data)
+    files = [file for file in found if pattern.search(file.relative_to(data).as_posix())]
     if not files:
-        raise RequestError(f"no .bvh below {data} matches {match!r}")
+        unread = f"; {closed[0].name} cannot be read ({closed[0].reason})" if closed else ""
+        matching = f" matches {match!r}" if found else ""
+        raise RequestError(f"no .bvh below {data}{matching}{unread}")
     key = _compute_cache_key(data, files, skip_first)
     stored = cache / f"corpus-{key}.safetensors"
-    if (kept := _read_cache(stored)) is not None and not _has_become_readable(kept.skipped, data, skip_first):
-        return kept
-    corpus = _read_files(data, files, skip_first, progress or (lambda done, total: None))
-    cache.mkdir(parents=True, exist_ok=True)
-    _write_cache(corpus, stored)
-    return corpus
+    corpus = _read_cache(stored)
+    if corpus is None or _has_become_readable(corpus.skipped, data, skip_first):
+        corpus = _read_files(data, files, skip_first, progress or (lambda done, total: None))
+        cache.mkdir(parents=True, exist_ok=True)
+        _write_cache(corpus, stored)
+    return replace(corpus, skipped=(*corpus.skipped, *closed)) if closed else corpus
+
+
+def _list_files(data: Path) -> tuple[list[Path], list[SkippedFile]]:
+    """All .bvh below a folder, sorted, and the folders below it that cannot be looked into."""
+    closed: list[OSError] = []
+    found = [
+        Path(folder) / name
+        for folder, folders, files in os.walk(data, onerror=closed.append)
+        for name in (*files, *folders)
+        if name.lower().endswith(".bvh")
+    ]
+    skipped = [
+        SkippedFile(Path(error.filename or data).relative_to(data).as_posix(), f"{error.strerror or error}")
+        for error in closed
+    ]
+    return sorted(found), skipped
 
 
 def _read_files(data: Path, files: Sequence[Path], skip_first: bool, progress: Callable[[int, int], None]) -> Corpus:

@@ -154,7 +154,6 @@ class TrainingRun(Generic[C, S, T]):
             self.trainer.step,
             self.trainer.steps,
             recipe.validate_steps,
-            recipe.out,
             recipe.format_news,
         )
         try:

@@ -1,5 +1,7 @@
 """What training does with files that cannot be used, and with very few clips."""
 
+import errno
+import os
 import shutil
 from dataclasses import replace
 from functools import partial
@@ -9,12 +11,14 @@ import tiny_denoiser
 import tiny_infiller
 import tiny_transformer
 import torch
+from captures import on_rig
 from helpers import bandai_skeleton, corpus, run, walks
 
 import priors
 from mapctl import retarget
 from mapctl.errors import RequestError
 from priors.training import corpus as corpora
+from priors.training import recipe as recipe_module
 from priors.training import run as training_run
 from priors.training.gathering import DataSource, gather
 from priors.training.quality import density as density_quality
@@ -242,3 +246,41 @@ def test_a_window_longer_than_what_is_held_out_does_not_end_a_run():
     settings = DenoiserSettings(steps=1, batch=2, window=90)
     trainer = DenoiserTrainer(tiny_denoiser.CONFIG, settings, corpus(2, 100))
     assert trainer.validate(corpus(1, 80))["error_cm"] > 0
+
+
+def test_every_file_may_have_a_rig_of_its_own(tmp_path):
+    """Each is brought onto the canonical joints; one that is no person is left out and counted."""
+    folder = tmp_path / "rigs"
+    folder.mkdir()
+    rigs = ("bandai", "canonical", "daz")
+    for name in rigs:
+        on_rig(name, 160).save(folder / f"{name}.bvh")
+    (folder / "ball.bvh").write_text(BALL + "MOTION\nFrames: 2\nFrame Time: 0.1\n0 0 0\n0 0 0\n")
+    (folder / "LOUD.BVH").write_bytes((folder / "daz.bvh").read_bytes())
+    found, _, (warning,) = gathered(folder, tmp_path / "run")
+    assert found.names == ("LOUD.BVH", *(f"{name}.bvh" for name in rigs))
+    assert warning.startswith(f"left out 1 of 5 files: {folder / 'ball.bvh'}: ")
+    parts = dict(zip(found.names, found.clips(), strict=True))
+    assert torch.allclose(parts["canonical.bvh"], parts["bandai.bvh"], atol=0.02)
+    assert torch.equal(parts["LOUD.BVH"], parts["daz.bvh"])
+
+
+def test_folders_that_cannot_be_looked_into_are_named(tmp_path, data, monkeypatch):
+    """Without the permissions of the one who runs this test, which may be everyone's."""
+    whole = os.walk
+
+    def closed(top, onerror):
+        onerror(PermissionError(errno.EACCES, "Permission denied", str(data / "private")))
+        return whole(top, onerror=onerror)
+
+    monkeypatch.setattr(corpora.os, "walk", closed)
+    found, _, (warning,) = gathered(data, tmp_path / "run")
+    assert len(found.names) == 5
+    assert warning == f"left out 1 of 6 files: {data / 'private'}: Permission denied"
+    (tmp_path / "empty").mkdir()
+    monkeypatch.setattr(corpora.os, "walk", lambda top, onerror: whole(top, onerror=onerror))
+    with pytest.raises(RequestError, match=f"^no .bvh below {tmp_path / 'empty'}$"):
+        gathered(tmp_path / "empty", tmp_path / "run")
+    monkeypatch.setattr(recipe_module.os, "access", lambda path, mode: False)
+    assert run(*train_words("infiller", data, tmp_path / "none")) == 2
+    assert not (tmp_path / "none").exists()

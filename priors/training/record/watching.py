@@ -4,7 +4,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 Row = Mapping[str, float | None]
 """Losses of a step, or measures of held-out clips, by name; None for what is not finite."""
@@ -27,8 +26,6 @@ class RunStart:
     """Steps in all."""
     validate_steps: int
     """Steps from one validation to the next."""
-    out: Path
-    """Run folder."""
     format_news: Callable[[Sequence[Row]], str]
     """One line on the losses of some steps."""
 
