@@ -13,6 +13,7 @@ from datetime import timedelta
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
+from typing import Any
 
 import torch
 import torch.distributed as dist
@@ -185,7 +186,7 @@ def fork_group(count: int, work: Callable[[TrainingGroup], None]) -> Iterator[Tr
     with tempfile.TemporaryDirectory(prefix="mapctl-") as folder:
         meeting = f"file://{Path(folder) / 'meeting'}"
         helpers: list[BaseProcess] = []
-        pipes: list[Connection] = []
+        pipes: list[Any] = []
         for rank in range(1, count):
             here, there = context.Pipe(duplex=False)
             helpers.append(context.Process(target=_help, args=(meeting, rank, count, work, there), daemon=True))
@@ -239,7 +240,7 @@ def _tell_loss() -> Iterator[None]:
         raise LostProcessError("a process that trains along has ended") from error
 
 
-def _find_words(pipes: Sequence[Connection]) -> str:
+def _find_words(pipes: Sequence[Any]) -> str:
     """Why a process failed, as it told; nothing where none has failed."""
     for rank, pipe in enumerate(pipes, start=1):
         try:

@@ -16,12 +16,12 @@ from mapctl.metrics.realism import RealismSettings
 from priors.config import require_at_least
 from priors.lstm_gmm import density
 from priors.lstm_gmm.density import LstmGmmDensity
-from priors.refiner.end_effectors import compute_end_effectors
 from priors.refiner.network import RefinerConfig, RefinerNetwork
 from priors.training.adversaries.end_effectors import Critic
 from priors.training.adversaries.guard import find_winner
 from priors.training.adversaries.history import HistoryBuffer
-from priors.training.corpus import Corpus, Split, find_window_starts
+from priors.training.adversaries.statistics import compute_statistics
+from priors.training.corpus import Corpus, Split
 from priors.training.gathering import DataSource, describe_skipped
 from priors.training.moment_matching import MatchingSettings, moment_loss
 from priors.training.parallel import TrainingGroup
@@ -142,7 +142,7 @@ class AdversarialTrainer(Trainer[RefinerNetwork]):
         """`corpus` is captured, `raw` sampled from the density that is to be refined; `evaluate` measures a refiner."""
         super().__init__(steps=settings.rounds, seed=settings.seed)
         self.settings, self.updates, self.evaluate = settings, settings.refiner_updates, evaluate
-        statistics = _compute_statistics(corpus, config, settings.window)
+        statistics = compute_statistics(corpus, config, settings.window)
         self.refiner, self.critic = draw_weights(lambda: _make_sides(config, settings, statistics), settings.seed)
         self.network = deepcopy(self.refiner).requires_grad_(False)
         self.captured = FeatureWindows(corpus, settings.window)
@@ -386,19 +386,3 @@ def _compute_root_error(before: Tensor, after: Tensor) -> Tensor:
     ground = integrate_root(before, origin)[0] - integrate_root(after, origin)[0]
     height = LAYOUT.pick(before, "root_height") - LAYOUT.pick(after, "root_height")
     return (ground.square().sum(-1) + height[..., 0].square()).mean()
-
-
-def _compute_statistics(corpus: Corpus, config: RefinerConfig, window: int) -> dict[str, Tensor]:
-    """Mean and spread of features and end effectors over captured clips, with floors that keep held joints in hand."""
-    features = corpus.features
-    mean, std = features.mean(0), features.std(0).clamp(min=0.002)
-    bits = LAYOUT.slices["contacts"]
-    mean[bits], std[bits] = 0.5, 0.5
-    starts = find_window_starts(corpus.lengths, window)[:: max(1, window)]
-    reach = torch.cat(
-        [
-            compute_end_effectors(features[rows[:, None] + torch.arange(window)], config.joints).flatten(0, 1)
-            for rows in starts.split(512)
-        ]
-    )
-    return {"mean": mean, "std": std, "reach_mean": reach.mean(0), "reach_std": reach.std(0).clamp(min=0.01)}

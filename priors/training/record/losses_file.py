@@ -36,7 +36,7 @@ class LossesFile(Watcher):
         self.path, self._counter = run / NAME, counter
         self._columns: list[str] = []
 
-    def cut(self, step: int, curve: Sequence[Mapping[str, float | None]]) -> None:
+    def cut(self, step: int, curve: Sequence[Row]) -> None:
         """Before training: keep what was told up to the checkpoint of this step, whose validations `curve` holds; the
         rest comes again. At step 0 the table is empty.
 

@@ -2,10 +2,11 @@
 
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
-Row = Mapping[str, float | None]
+Row = dict[str, Any]
 """Losses of a step, or measures of held-out clips, by name; None for what is not finite."""
 FIRST_LINE_SECONDS, LINE_SECONDS = 5.0, 30.0
 """From the beginning to the first line of a log, and from line to line, seconds."""
