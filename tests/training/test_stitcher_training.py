@@ -26,6 +26,7 @@ from priors.training.adversaries.sliding_windows import (
     compute_slope,
 )
 from priors.training.augmentation.transition_windows import Known, Transition, TransitionWindows
+from priors.training.parallel import fork_group
 from priors.training.quality.stitcher import TEMPERATURES, calibrate_temperature, place
 from priors.training.recipes import stitcher as recipe_module
 from priors.training.recipes.stitcher import PAPER, StitcherRecipe, StitcherSettings, StitcherTrainer
@@ -129,7 +130,7 @@ def test_critics_learn_to_tell_what_trembles_from_what_was_captured():
     trembling[..., POSE] += noise
     for _ in range(60):
         trainer.critics.hear(replace(sides, features=trembling), truth.ends(), torch.ones(32, dtype=torch.bool))
-        found = trainer.critics.learn(truth, 1)
+        found = trainer.critics.learn(truth, trainer)
     assert found["told"] > 0.9
     assert found["critic"] < 0.5
 
@@ -178,24 +179,46 @@ def test_of_no_transitions_none_is_kept():
     assert nothing.shared.shape[0] == nothing.slow.shape[1] == 0
 
 
-def test_a_step_of_two_processes_has_the_mean_gradient_of_two_batches_for_the_posterior_too(monkeypatch):
-    trainer, alone = make_trainer(), make_trainer()
-    trainer.processes = 2
-    draws = torch.Generator()
-    draws.set_state(trainer.generator.get_state())
-    seed = int(torch.randint(2**62, (), generator=draws))
+def gather_from_two(work):
+    """What `work` finds in each of two processes, by row."""
     found = []
-    for begin in (lambda: alone.generator.set_state(draws.get_state()), lambda: alone.generator.manual_seed(seed)):
-        begin()
-        alone.network.zero_grad()
-        alone.posterior.zero_grad()
-        alone.losses()["loss"].backward()
-        found.append([torch.zeros_like(each) if each.grad is None else each.grad.clone() for each in alone.weights()])
-    monkeypatch.setattr(trainer, "limit_gradients", lambda: None)
-    trainer.train_step()
-    assert all(weight.is_shared() for weight in trainer.posterior.parameters())
-    for weight, one, other in zip(trainer.weights(), *found, strict=True):
-        torch.testing.assert_close(weight.grad, (one + other) / 2, atol=1e-5, rtol=1e-3)
+
+    def told(group):
+        found.append(group.gather(work(group)[None]))
+
+    with fork_group(2, told) as group:
+        told(group)
+    return found[0]
+
+
+def test_two_processes_have_the_mean_gradient_of_their_posteriors_too():
+    def find_gradients(group):
+        trainer = make_trainer()
+        trainer.limit_gradients = lambda: None
+        trainer.join(group)
+        trainer.take_step()
+        weights = trainer.posterior.parameters()
+        return torch.cat([each.grad.flatten() for each in weights if each.grad is not None])
+
+    one, other = gather_from_two(find_gradients)
+    assert one.any()
+    assert torch.equal(one, other)
+
+
+def test_critics_learn_alike_where_one_process_was_shown_nothing():
+    def learn(group):
+        trainer, truth = make_trainer(), transitions()
+        trainer.join(group)
+        before = torch.cat([each.detach().flatten() for each in trainer.critics.network.parameters()])
+        if group.leads:
+            trainer.critics.hear(follow_truth(truth, 12), truth.ends(), torch.ones(6, dtype=torch.bool))
+        assert set(trainer.critics.learn(truth, trainer)) == {"critic", "told"}
+        assert trainer.critics.learn(truth, trainer) == {}
+        return torch.cat([each.detach().flatten() for each in trainer.critics.network.parameters()]) - before
+
+    one, other = gather_from_two(learn)
+    assert one.any()
+    assert torch.equal(one, other)
 
 
 def make_printed(**settings):
@@ -256,7 +279,7 @@ def test_critics_say_nothing_of_a_batch_at_the_mean():
     truth = transitions()
     heard = trainer.critics.hear(follow_truth(truth, 12), truth.ends(), torch.zeros(6, dtype=torch.bool))
     assert float(heard) == 0.0
-    assert trainer.critics.learn(truth, 1) == {}
+    assert trainer.critics.learn(truth, trainer) == {}
 
 
 @pytest.mark.parametrize("words", [[], ["--paper"], ["--paper", "--steps", "12000"]])

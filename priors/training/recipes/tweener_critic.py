@@ -88,7 +88,7 @@ class CriticisedTrainer(Trainer[GeneratorNetwork]):
                 f"the critic sees windows of {critic.frames + 2} frames; the longest there are have {learner.longest}"
             )
         self.learner, self.settings = learner, critic
-        self.generator = learner.generator
+        self.generator = self.common = learner.generator
         self.network, self.before = (deepcopy(learner.network).requires_grad_(False) for _ in range(2))
         self.critic = draw_weights(BodyMotionCritic, learner.settings.seed)
         self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), lr=critic.rate, betas=_ADAM)
