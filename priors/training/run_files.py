@@ -73,7 +73,7 @@ def parse_losses(index: Mapping[str, Any], guards: Sequence[str]) -> list[dict[s
     rows = index["losses"] if guards else index.get("losses", [])
     if any(name not in row for row in rows for name in guards):
         raise KeyError("losses without those that guard the run")
-    return [{name: math.nan if value is None else float(value) for name, value in row.items()} for row in rows]
+    return [{name: math.nan if value is None else value + 0 for name, value in row.items()} for row in rows]
 
 
 def parse_processes(run: Path, index: Mapping[str, Any]) -> int:

@@ -124,6 +124,19 @@ def test_columns_come_in_at_their_first_row_and_what_is_not_finite_is_left_empty
     assert read_losses(tmp_path / "losses.csv")[-1] == LossRow(10, "validation", {"loss": 4.0})
 
 
+def test_columns_have_one_order_however_often_the_table_is_begun_anew(tmp_path):
+    table = LossesFile(tmp_path, "step")
+    table.cut(0, [])
+    table.see_validation(2, {"pairs": 3, "off": 1.0})
+    table.see_losses(3, {"off": 2.0})
+    whole = (tmp_path / "losses.csv").read_text()
+    assert whole.startswith("step,part,off,pairs\n")
+    again = LossesFile(tmp_path, "step")
+    again.cut(2, [{"step": 2, "pairs": 3, "off": 1.0}])
+    again.see_losses(3, {"off": 2.0})
+    assert (tmp_path / "losses.csv").read_text() == whole
+
+
 def test_a_table_that_cannot_be_written_is_told_in_one_line(tmp_path):
     table = LossesFile(tmp_path, "step")
     table.cut(0, [])

@@ -35,6 +35,7 @@ class LossesFile(Watcher):
     def __init__(self, run: Path, counter: str):
         self.path, self._counter = run / NAME, counter
         self._columns: list[str] = []
+        self._heads: list[LossRow] = []  # rows that brought in a name of their part
 
     def cut(self, step: int, curve: Sequence[Row]) -> None:
         """Before training: keep what was told up to the checkpoint of this step, whose validations `curve` holds; the
@@ -64,7 +65,9 @@ class LossesFile(Watcher):
     def _append(self, row: LossRow) -> None:
         if not row.values:
             return
-        if not set(_name_columns([row])) <= set(self._columns):  # a column comes in once, at its first row
+        if not set(row.values) <= {name for head in self._heads if head.part == row.part for name in head.values}:
+            self._heads.append(row)
+        if _name_columns(self._heads) != self._columns:
             self._write_all([*read_losses(self.path), row])
             return
         try:
@@ -74,6 +77,7 @@ class LossesFile(Watcher):
             raise WriteError(f"cannot write {self.path}: {error.strerror or error}") from error
 
     def _write_all(self, rows: Sequence[LossRow]) -> None:
+        self._heads = list(rows)
         self._columns = _name_columns(rows)
         head = ",".join([self._counter, "part", *self._columns]) + "\n"
         write_text(self.path, head + _format_rows(rows, self._columns) if rows else "")
