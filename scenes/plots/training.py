@@ -6,8 +6,10 @@ from dataclasses import dataclass
 from os import PathLike
 from typing import Any
 
+import numpy as np
+
 from mapctl.errors import RequestError
-from mapctl.formats.atomic import atomic_path
+from scenes.plots import open_plots
 
 _ACROSS, _INCHES, _DPI = 4, (3.6, 2.4), 100
 _MOST = 40  # plots of a picture; a run tells of thirty things at most
@@ -37,24 +39,19 @@ def plot_curves(curves: Sequence[Curve], path: str | PathLike[str], *, counter: 
     names = list(dict.fromkeys(curve.name for curve in curves))[:_MOST]
     if not names:
         raise RequestError("there are no losses to draw yet")
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise RequestError(f"plots need matplotlib ({error}): pip install 'mapctl[render]'") from error
     across = min(_ACROSS, len(names))
     down = -(-len(names) // across)
-    figure = Figure(figsize=(_INCHES[0] * across, _INCHES[1] * down + 0.5), layout="constrained")
-    plots = figure.subplots(down, across, squeeze=False, sharex=True).flatten()
-    for plot, name in zip(plots, names, strict=False):
-        _draw(plot, name, [curve for curve in curves if curve.name == name])
-    for plot in plots[len(names) :]:
-        plot.set_axis_off()
-    for plot in plots[max(0, len(names) - across) : len(names)]:
-        plot.set_xlabel(counter)
-        plot.tick_params(labelbottom=True)
-    figure.suptitle(f"{title}: training blue, validation red", fontsize=11)
-    with atomic_path(path) as scratch:
-        figure.savefig(scratch, format="png", dpi=_DPI)
+    inches = (_INCHES[0] * across, _INCHES[1] * down + 0.5)
+    with open_plots(path, down, inches=inches, dpi=_DPI, across=across) as axes:
+        plots = np.atleast_1d(axes).flatten()
+        for plot, name in zip(plots, names, strict=False):
+            _draw(plot, name, [curve for curve in curves if curve.name == name])
+        for plot in plots[len(names) :]:
+            plot.set_axis_off()
+        for plot in plots[max(0, len(names) - across) : len(names)]:
+            plot.set_xlabel(counter)
+            plot.tick_params(labelbottom=True)
+        plots[0].figure.suptitle(f"{title}: training blue, validation red", fontsize=11)
 
 
 def _draw(plot: Any, name: str, curves: Sequence[Curve]) -> None:

@@ -165,7 +165,7 @@ def lines_out_of_format() -> Iterable[str]:
 
 CEILINGS = {
     crowded_folders: 0,
-    late_imports: 9,
+    late_imports: 10,
     modules_in_cycles: 0,
     docstrings_that_begin_with_of: 0,
     docstrings_that_cite_what_is_not_here: 0,

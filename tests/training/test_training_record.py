@@ -217,7 +217,7 @@ def test_in_a_pipe_there_are_lines_and_quiet_says_nothing(tmp_path, data, capsys
 
 
 def test_a_plot_is_renewed_at_each_validation(tmp_path, data, capsys, monkeypatch):
-    from mapctl.commands.shared import training_curves
+    from mapctl.commands.train import curves as training_curves
 
     drawn = []
     monkeypatch.setattr(training_curves, "plot_curves", lambda curves, path, **told: drawn.append((curves, path, told)))

@@ -278,7 +278,7 @@ class Training(Table):
     """Seconds and memory of 100 training steps of each model's default recipe, and how much faster several processes
     are, which take turns with one."""
 
-    work = "mapctl.commands.bench.training"
+    work = "mapctl.commands.train.bench"
 
     data: options.DataFolder
     """Folder of .bvh files, searched below."""

@@ -42,7 +42,7 @@ def run(command: Info) -> int:
 def _plot_training(name: str, path: Path) -> None:
     """Draw how a run or prior was trained, and say what was written."""
     outputs.check_picture(path, given=Path(name))
-    from mapctl.commands.shared.training_curves import plot_run
+    from mapctl.commands.train.curves import plot_run
 
     count = plot_run(name, path)
     print(f"wrote {path} ({count} curves)")

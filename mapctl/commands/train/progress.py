@@ -23,7 +23,7 @@ _AVERAGED_STEPS = 100  # of which the table shows the mean
 def watch(*, quiet: bool, plot: Path | None) -> Iterator[Sequence[Watcher]]:
     """Yield who is told: a table on a terminal, lines elsewhere, nobody with `quiet`; and who draws, if that is asked
     for."""
-    from mapctl.commands.shared.training_curves import CurvePlotter
+    from mapctl.commands.train.curves import CurvePlotter
 
     drawers = [CurvePlotter(plot)] if plot is not None else []
     if quiet:
