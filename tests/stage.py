@@ -8,7 +8,7 @@ import numpy as np
 from helpers import walk
 
 from mapctl.errors import RequestError
-from mapctl.runtime.live_protocol import FrameChunk
+from mapctl.runtime.live_protocol import FrameChunk, SigmaRange
 from mapctl.skeleton import CANONICAL
 from scenes.live.app import LiveApp
 from scenes.live.inputs import SteeringInputs
@@ -37,6 +37,7 @@ class Actor:
     """A LiveCharacter that notes what it is told."""
 
     skeleton = CANONICAL
+    sigmas = (SigmaRange("speed", "Speed", "m/s", 0.1, 0.01, 1.0), SigmaRange("noise", "Noise", "", 2.0, 0.5, 8.0))
 
     def __init__(self):
         self.heard: list[tuple] = []
@@ -51,10 +52,18 @@ class Actor:
     def aim(self, command):
         self.heard.append(("aim", command))
 
-    def walk(self, points, speed):
+    def walk(self, points, speed, *, closed=False):
         if len(points) < 2:
             raise RequestError("a curve needs two points")
-        self.heard.append(("walk", points, speed))
+        self.heard.append(("walk", points, speed, *[True] * closed))
+
+    def set_rate(self, rate):
+        self.heard.append(("rate", rate))
+
+    def tune(self, values):
+        if any(value > 1 for value in values.values()):
+            raise RequestError(self.sigmas[0].explain_refusal(max(values.values())))
+        self.heard.append(("tune", values))
 
     def pause(self, paused):
         self.heard.append(("pause", paused))

@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,9 +14,11 @@ from controllers.steering.process import CharacterProcess, CharacterRequest
 from mapctl.features import PRIOR_FPS
 from mapctl.intent.steering import Command
 from mapctl.runtime.live_protocol import FrameChunk
+from mapctl.runtime.memory import measure_memory_mb, measure_own_memory_mb, measure_processor_seconds
 
 _SPEEDS = (0.0, 0.8, 1.2, 1.6, 2.6)
 _COMMAND_SECONDS = (4.5, 7.0)  # range of the time for which a command holds
+_SETTLING_SECONDS, _IDLE_SECONDS = 0.5, 2.0  # seconds until who is paused is still, and of the look at it
 _EVALUATED_FRAMES = 60  # frames before the next command in which it must be obeyed
 _VELOCITY_TOLERANCE, _VELOCITY_TOLERANCE_SHARE = 0.3, 0.25  # m/s or share of the speed, the larger of the two
 
@@ -85,10 +87,45 @@ def benchmark_live(
                     process.command(log.command)
             if progress is not None:
                 progress(round(now), round(60 * minutes))
+        use = _measure_use(processes)
     finally:
         for process in processes:
             process.close()
-    return _summarise_logs(logs, minutes)
+    return {**_summarise_logs(logs, minutes), **use}
+
+
+def find_most(measure: Callable[[int], Row], most: int) -> list[Row]:
+    """Measure 1, 2, 4, ... characters, at most so many, until frames are late, then between the last two numbers; the
+    row with the largest number of which no frame was late says so under `most`."""
+    rows: dict[int, Row] = {}
+    good, bad, count = 0, most + 1, 1
+    while bad - good > 1:
+        rows[count] = measure(count)
+        if rows[count]["late_frames"]:
+            bad = count
+        else:
+            good = count
+        count = min(2 * good, most) if bad > most else (good + bad) // 2
+    return [{"most": "yes" if count == good else "", **row} for count, row in sorted(rows.items())]
+
+
+def _measure_use(processes: Sequence[CharacterProcess]) -> Row:
+    """Measure memory now, and the processor time that all of them take while they are paused."""
+    pids = [process.pid for process in processes if process.pid is not None]
+    bases = {process.base_pid for process in processes if process.base_pid is not None}
+    own, everybody = [measure_own_memory_mb(pid) for pid in pids], [*pids, *bases]
+    total = sum(measure_memory_mb(pid) for pid in everybody)
+    for process in processes:
+        process.pause(True)
+    time.sleep(_SETTLING_SECONDS)
+    before = sum(measure_processor_seconds(pid) for pid in everybody)
+    time.sleep(_IDLE_SECONDS)
+    idle = (sum(measure_processor_seconds(pid) for pid in everybody) - before) / _IDLE_SECONDS
+    return {
+        "memory_mb_a_character": float(np.mean(own)) if own else math.nan,
+        "memory_mb_all": total,
+        "paused_core_percent": 100 * idle,
+    }
 
 
 def iterate_ticks(seconds: float) -> Iterator[float]:

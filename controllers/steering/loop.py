@@ -3,10 +3,10 @@
 The frames of a step are due when the ones before them have been shown. A step begins when those before it begin to be
 shown, so a command waits for two steps at most: 0.2 s at three frames a step.
 
-On a machine that is too slow, a step that begins late searches less, but never less than
-`SteerSettings.least_evaluations`, so that commands are obeyed. If its frames are still later than
-`LoopSettings.slack`, the stream's time is held for as long: motion plays slower than real time, and no frame and no
-command is dropped.
+On a machine that is too slow, a step that begins late searches less, but has time for
+`SteerSettings.least_evaluations`, by what steps cost lately, so that commands are obeyed. If its frames are still
+later than `LoopSettings.slack`, the stream's time is held for as long: motion plays slower than real time, and no frame
+and no command is dropped.
 """
 
 import time
@@ -126,8 +126,8 @@ class StreamClock:
 class LoopSettings:
     """Timing of the loop."""
 
-    margin: float = 0.026
-    """Seconds before frames are due at which the search for them ends: the time of the work after the search."""
+    margin: float = 0.015
+    """Seconds before frames are due at which a step is to end: for the way to the display, and for other processes."""
     slack: float = 0.1
     """Seconds by which frames may be late before time is held for them; less is compensated by searching less."""
 
@@ -222,8 +222,9 @@ def iterate_steps(
         due = state.frames / PRIOR_FPS
         clock.wait_until(begun + due - lead)
         asked = clock.now() - begun
-        left = due - asked - settings.margin if clock.real else None
-        state, new = (stepper or step)(state, source.at(asked), seconds=None if left is None else max(0.0, left))
+        left = due - asked - settings.margin
+        seconds = max(left, state.cost.needed_seconds(state.settings.least_evaluations)) if clock.real else None
+        state, new = (stepper or step)(state, source.at(asked), seconds=seconds)
         delivered = clock.now() - begun
         held = delivered - due if clock.real and delivered - due > settings.slack else 0.0
         if held:

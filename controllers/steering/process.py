@@ -4,24 +4,29 @@ Neither a web server nor another character then delays its steps: each has its o
 Times cross between processes as values of time.perf_counter, which all processes of a machine share.
 """
 
+import functools
 import math
 import multiprocessing
 import queue
-import re
 import threading
 from collections import deque
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Mapping, Sequence
+from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
 from typing import Any
 
 import numpy as np
 
-from controllers.steering.process_worker import CharacterRequest, run_worker
+from controllers.steering.process_worker import CharacterRequest, prepare_models, run_worker
+from controllers.steering.sigmas import check_sigmas, describe_sigmas
 from mapctl import curves
 from mapctl.errors import MapctlError, RequestError
 from mapctl.intent.steering import Arrival, Command
-from mapctl.runtime.live_protocol import FrameChunk
+from mapctl.runtime.forking import ForkedProcess, SharedBases, can_fork_for
+from mapctl.runtime.live_protocol import FrameChunk, SigmaRange
+from mapctl.runtime.memory import measure_memory_mb
 from mapctl.runtime.processes import send_queued, spawn
+from mapctl.runtime.stream_time import RATES
 from mapctl.skeleton import Skeleton
 
 __all__ = ["CharacterProcess", "CharacterRequest"]
@@ -29,6 +34,7 @@ __all__ = ["CharacterProcess", "CharacterRequest"]
 _READY_SECONDS = 120.0
 _MAX_QUEUED_STEPS = 3000  # steps that are kept for a caller that does not poll: five minutes
 _PROCESS_ENDED = "a character's process ended by itself"
+_BASES = SharedBases()
 
 
 class CharacterProcess:
@@ -38,6 +44,7 @@ class CharacterProcess:
         """Start the process; several start in parallel if all are made before the first `wait`."""
         self._request = request
         self.skeleton: Skeleton = request.skeleton
+        self._rate, self._sigmas = 1.0, dict[str, float]()
         self._start()
 
     def wait(self) -> None:
@@ -52,11 +59,16 @@ class CharacterProcess:
         """See LiveCharacter."""
         self._send("command", command)
 
-    def walk(self, points: Sequence[tuple[float, float]], speed: float) -> None:
+    @property
+    def sigmas(self) -> Sequence[SigmaRange]:
+        """See LiveCharacter."""
+        return describe_sigmas(self._request.settings)
+
+    def walk(self, points: Sequence[tuple[float, float]], speed: float, *, closed: bool = False) -> None:
         """See LiveCharacter. RequestError where the points make no curve."""
         positions = np.array(points, dtype=np.float64).reshape(-1, 2)
-        curves.through(positions)  # so that errors are raised here, not in the process
-        self._send("walk", positions, speed)
+        curves.through(positions, closed=closed)  # so that errors are raised here, not in the process
+        self._send("walk", positions, speed, closed)
 
     def aim(self, command: Command) -> None:
         """See LiveCharacter."""
@@ -73,11 +85,26 @@ class CharacterProcess:
         """See LiveCharacter."""
         self._send("pause", paused)
 
+    def set_rate(self, rate: float) -> None:
+        """See LiveCharacter; at least 1/64."""
+        if not RATES[0] <= rate <= RATES[1]:
+            raise RequestError(f"the rate of a character's clock can be {RATES[0]:g} to {RATES[1]:g}, got {rate:g}")
+        self._rate = rate
+        self._send("rate", rate)
+
+    def tune(self, values: Mapping[str, float]) -> None:
+        """See LiveCharacter."""
+        check_sigmas(self._request.settings, values)  # so that errors are raised here, not in the process
+        self._sigmas = dict(values)
+        self._send("tune", self._sigmas)
+
     def reset(self) -> None:
         """See LiveCharacter. A process that has ended is started again, which takes a while."""
         if self._failed:
             self.close()
             self._start()
+            self._send("rate", self._rate)
+            self._send("tune", self._sigmas)
         else:
             self._send("reset")
 
@@ -90,48 +117,94 @@ class CharacterProcess:
             raise MapctlError(failed)
         return found
 
+    @property
+    def pid(self) -> int | None:
+        """The process' id; None where there is none yet."""
+        return self._process.pid
+
+    @property
+    def base_pid(self) -> int | None:
+        """Id of the process that it was forked from, which others may share; None where it loaded by itself."""
+        return None if self._base is None else _BASES.pid(self._base)
+
     def memory_mb(self) -> float:
-        """Return the resident memory of the process, MB; NaN where the system does not report it."""
-        status = Path(f"/proc/{self._process.pid}/status")
-        found = re.search(r"VmRSS:\s*(\d+) kB", status.read_text()) if status.exists() else None
-        return int(found[1]) / 1024 if found else math.nan
+        """Return the memory of the process, MB, of which what it shares with others counts for a part (Linux' PSS);
+        NaN where the system does not report it."""
+        return math.nan if self.pid is None else measure_memory_mb(self.pid)
+
+    def __enter__(self) -> "CharacterProcess":
+        """Return it; it is closed at the end of a with block."""
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Close it."""
+        self.close()
 
     def close(self) -> None:
         """See LiveCharacter."""
+        self._is_closing = True
         self._send("close")
         self._process.join(2.0 if self._ready.is_set() else 0.1)  # while it loads it does not listen yet
         if self._process.is_alive():
             self._process.kill()
-            self._process.join()
-        self._receiver.join(1.0)  # it reads to the end, which is now
         self._orders.put(None)
+        self._receiver.join(1.0)  # it reads to the end, which is now
         self._ours.close()
+        if self._base is not None:
+            _BASES.release(self._base)
+            self._base = None
 
     def _start(self) -> None:
-        self._ours, worker_connection = multiprocessing.Pipe()
-        self._process = spawn(run_worker, worker_connection, self._request)
-        worker_connection.close()
         self._delivered: deque[FrameChunk] = deque(maxlen=_MAX_QUEUED_STEPS)
         self._orders: queue.SimpleQueue[tuple[Any, ...] | None] = queue.SimpleQueue()
-        self._ready, self._failed = threading.Event(), ""
+        self._ready, self._failed, self._is_closing = threading.Event(), "", False
+        self._base: bytes | None = None
+        self._ours, self._process = self._fork() or self._spawn()
         # A full pipe would block the character, so it is emptied whether or not the caller polls; and a character that
         # does not read its orders does not block the caller.
         self._receiver = threading.Thread(target=self._receive, daemon=True)
         self._receiver.start()
-        threading.Thread(target=send_queued, args=(self._ours, self._orders), daemon=True).start()
+
+    def _fork(self) -> tuple[Connection, ForkedProcess] | None:
+        """Start as the copy of a process that has loaded the same; None where that is impossible."""
+        request = self._request
+        prepare = functools.partial(prepare_models, request.load, request.transitions)
+        if not can_fork_for(prepare, request):
+            return None
+        self._base, base = _BASES.use(prepare, run_worker)
+        try:
+            return base.start(request)
+        except OSError:  # it has ended since
+            return None
+
+    def _spawn(self) -> tuple[Connection, SpawnProcess]:
+        """Start as a process that loads by itself."""
+        ours, theirs = multiprocessing.Pipe()
+        with theirs:
+            return ours, spawn(run_worker, theirs, None, self._request)
 
     def _send(self, *message: Any) -> None:
         self._orders.put(message)
 
     def _receive(self) -> None:
+        begun = False
         try:
             while True:
                 word, content = self._ours.recv()
+                begun = True
+                if word == "started":
+                    threading.Thread(target=send_queued, args=(self._ours, self._orders), daemon=True).start()
+                    continue
                 if word == "frames":
                     self._delivered.append(content)
                 elif word == "failed":
                     self._failed = content
                 self._ready.set()
         except (EOFError, OSError):
+            if isinstance(self._process, ForkedProcess) and not (begun or self._is_closing):  # nobody could be forked
+                self._ours.close()
+                self._ours, self._process = self._spawn()
+                self._receive()
+                return
             self._failed = self._failed or _PROCESS_ENDED
             self._ready.set()

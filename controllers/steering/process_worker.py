@@ -1,6 +1,7 @@
 """The process of a character that is steered live: load, begin, and at every step read orders and send frames."""
 
 import itertools
+import os
 import time
 import traceback
 from collections.abc import Callable
@@ -15,12 +16,14 @@ from controllers.steering import steer
 from controllers.steering.arrival import Arriver
 from controllers.steering.autopilot import Autopilot
 from controllers.steering.loop import find_second_zero, iterate_steps
+from controllers.steering.sigmas import TunedStepper
 from controllers.steering.steer import SteerFrames, SteerSettings
 from mapctl import curves
 from mapctl.errors import MapctlError
 from mapctl.intent.steering import Arrival, Command
 from mapctl.protocols import Density
 from mapctl.runtime.live_protocol import FrameChunk
+from mapctl.runtime.stream_time import StreamTime
 from mapctl.skeleton import CANONICAL, Skeleton
 
 _WARM_UP_STEPS = 3  # steps before the clock starts, which compile and load what is needed
@@ -46,6 +49,16 @@ class CharacterRequest:
     """Loader of who makes the way to a place, called there too; without one the character can be sent nowhere."""
 
 
+@dataclass(frozen=True, eq=False)
+class CharacterModels:
+    """What characters share."""
+
+    density: Density
+    """Density of their motion."""
+    transitions: Any | None = None
+    """Who makes the way to a place."""
+
+
 class ParentClosed(Exception):
     """The parent process closed the connection, or has ended."""
 
@@ -55,23 +68,22 @@ class ProcessClock:
 
     real = True
 
-    def __init__(self, connection: Connection, pilot: Autopilot, prior: Density):
-        self._connection, self._pilot, self._prior = connection, pilot, prior
+    def __init__(self, connection: Connection, pilot: Autopilot, prior: Density, stepper: TunedStepper):
+        self._connection, self._pilot, self._prior, self._stepper = connection, pilot, prior, stepper
         self.again = False
         self._began = 0.0  # time of the stream's second 0
-        self._paused_since: float | None = None
-        self._shift = 0.0
+        self._time = StreamTime()
         self._held = 0.0  # seconds by which the next frames are late
         self._notes: list[str] = []
 
     def now(self) -> float:
-        """See Clock: time.perf_counter less the pauses."""
-        return time.perf_counter() - self._shift
+        """See Clock: time.perf_counter less the pauses, and slower in slow motion."""
+        return self._time.now()
 
     def wait_until(self, seconds: float) -> None:
         """See Clock."""
         while True:
-            left = None if self._paused_since is not None else max(0.0, seconds - self.now())
+            left = self._time.wait_seconds(seconds)
             if self._connection.poll(left):
                 self._handle_order()
             elif left is not None:
@@ -79,17 +91,18 @@ class ProcessClock:
 
     def hold(self, seconds: float) -> None:
         """See Clock: like a pause."""
-        self._shift += seconds
-        self._held += seconds
+        self._time.hold(seconds)
+        self._held += seconds / self._time.rate
 
     def show(self, frames: SteerFrames, due: float) -> None:
         """See Display."""
         self._pilot.show(frames, due)
         if frames.refusal is not None:
             self._notes.append(frames.refusal.reason)
-        at = self._began + due + self._shift
+        at = self._time.perf_counter_at(self._began + due)
         spare = at - time.perf_counter() - self._held
-        self._connection.send(("frames", _to_frame_chunk(frames, due, at=at, spare=spare, notes=tuple(self._notes))))
+        chunk = _to_frame_chunk(frames, due, at=at, spare=spare, notes=tuple(self._notes), rate=self._time.rate)
+        self._connection.send(("frames", chunk))
         self._held = 0.0
         self._notes.clear()
 
@@ -115,7 +128,11 @@ class ProcessClock:
         if word == "reset":
             self.again = True
         elif word == "pause":
-            self._pause(*content)
+            self._time.pause(*content)
+        elif word == "rate":
+            self._time.set_rate(*content)
+        elif word == "tune":
+            self._stepper.tune(*content)
         elif word == "aim":
             self._pilot.aim(*content)
         elif word == "go":
@@ -124,27 +141,39 @@ class ProcessClock:
             self._notes += notes
             self._pilot.go(command, *where)
         elif word == "walk":
-            points, speed = content
-            self._pilot.walk(curves.through(points), min(speed, self._prior.limits.max_steering_speed))
+            points, speed, closed = content
+            self._pilot.walk(curves.through(points, closed=closed), min(speed, self._prior.limits.max_steering_speed))
         else:
             command, notes = steer.accept(self._prior, *content)
             self._notes += notes
             self._pilot.command(command)
 
-    def _pause(self, paused: bool) -> None:
-        if paused and self._paused_since is None:
-            self._paused_since = time.perf_counter()
-        elif not paused and self._paused_since is not None:
-            self._shift += time.perf_counter() - self._paused_since
-            self._paused_since = None
+
+def prepare_models(load: Callable[[], Any], transitions: Callable[[], Any] | None) -> CharacterModels | None:
+    """Load what characters share, and steer a little, which compiles and loads the rest; None where that is impossible.
+
+    A character that gets nothing loads by itself, and says what is wrong.
+    """
+    torch.set_num_threads(1)
+    try:
+        models = CharacterModels(load(), None if transitions is None else transitions())
+        first = Command(1.2, 0.0)
+        _warm_up(steer.begin(models.density, first, generator=torch.Generator().manual_seed(0))[0], first, models)
+    except Exception:
+        return None
+    return models
 
 
-def run_worker(connection: Connection, request: CharacterRequest) -> None:
-    """Steer until the parent closes the connection; anything else that ends it is sent to the parent, in a line."""
+def run_worker(connection: Connection, models: CharacterModels | None, request: CharacterRequest) -> None:
+    """Steer until the parent closes the connection; anything else that ends it is sent to the parent, in a line.
+
+    Without `models` they are loaded here.
+    """
     torch.set_num_threads(1)
     with suppress(ParentClosed, BrokenPipeError):
         try:
-            _run_character(connection, request)
+            connection.send(("started", os.getpid()))
+            _run_character(connection, models, request)
         except ParentClosed:  # a requested end is no failure to report
             return
         except MapctlError as error:
@@ -155,32 +184,41 @@ def run_worker(connection: Connection, request: CharacterRequest) -> None:
             connection.send(("failed", f"a character's process ended: {what} ({last.name}, line {last.lineno})"))
 
 
-def _run_character(connection: Connection, request: CharacterRequest) -> None:
-    prior, generator = request.load(), torch.Generator().manual_seed(request.seed)
+def _run_character(connection: Connection, models: CharacterModels | None, request: CharacterRequest) -> None:
+    warm = models is not None
+    if models is None:
+        models = CharacterModels(request.load(), None if request.transitions is None else request.transitions())
+    prior, generator = models.density, torch.Generator().manual_seed(request.seed)
     first, _ = steer.accept(prior, request.first)
     pilot = Autopilot(first, request.settings.limits)
-    clock = ProcessClock(connection, pilot, prior)
-    stepper = steer.step if request.transitions is None else Arriver(request.transitions())
+    stepper = steer.step if models.transitions is None else Arriver(models.transitions)
+    tuned = TunedStepper(stepper, request.settings)
+    clock = ProcessClock(connection, pilot, prior, tuned)
     for number in itertools.count():
         state, pose = steer.begin(
             prior, first, generator=generator, at=request.at, settings=request.settings, skeleton=request.skeleton
         )
         if number == 0:
-            for _ in range(_WARM_UP_STEPS):
-                steer.step(state, first)
-            if isinstance(stepper, Arriver):  # likewise
-                stepper(state, replace(first, arrival=Arrival(request.at, 1.0)))
+            if not warm:
+                _warm_up(state, first, models)
             connection.send(("ready", None))
         clock.begin(state, pose)
-        for _ in iterate_steps(state, pilot, [clock], clock=clock, stepper=stepper):
+        for _ in iterate_steps(state, pilot, [clock], clock=clock, stepper=tuned):
             if clock.again:
                 break
         pilot.stay()
         first = pilot.at(clock.now())
 
 
+def _warm_up(state: steer.SteerState, first: Command, models: CharacterModels) -> None:
+    for _ in range(_WARM_UP_STEPS):
+        steer.step(state, first)
+    if models.transitions is not None:
+        Arriver(models.transitions)(state, replace(first, arrival=Arrival((0.0, 0.0), 1.0)))
+
+
 def _to_frame_chunk(
-    frames: SteerFrames, seconds: float, *, at: float, spare: float, notes: tuple[str, ...]
+    frames: SteerFrames, seconds: float, *, at: float, spare: float, notes: tuple[str, ...], rate: float
 ) -> FrameChunk:
     energies = {entry.name: float(entry.energy.mean()) for entry in frames.ledger.entries}
     return FrameChunk(
@@ -196,4 +234,5 @@ def _to_frame_chunk(
         frames.seconds,
         frames.evaluations,
         notes,
+        rate,
     )

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from controllers.common.character import Character
 from controllers.common.initial_state import start_from_state
+from controllers.steering.cost import StepCost
 from controllers.steering.overlay import Overlay
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, ground_speed
@@ -55,8 +56,8 @@ class SteerSettings:
     evaluations: int = 14
     """Most evaluations of energy and gradient in a step: what one core computes while three frames are shown."""
     least_evaluations: int = 6
-    """Fewest evaluations in a step, however late it is: with fewer, targets are missed (docs/results.md). Never more
-    than `evaluations`."""
+    """Evaluations for which the loop gives a step time, however late it is: with fewer, targets are missed
+    (docs/results.md). Never more than `evaluations`."""
     limits: SteeringLimits = field(default_factory=SteeringLimits)
     """How fast a steering target may change."""
     sigma_speed: float = RootVelocity.sigma_speed
@@ -110,6 +111,8 @@ class SteerState:
     """The caller's own terms, for the prior's size."""
     overlay: Overlay = field(default_factory=Overlay)
     """What hands and head are doing beside the walk."""
+    cost: StepCost = field(default_factory=StepCost)
+    """What steps have cost lately."""
     approach: object | None = None
     """Last order to be somewhere, and how far it is carried out (`controllers.steering.arrival`)."""
 
@@ -194,8 +197,9 @@ def accept(prior: Density, command: Command) -> tuple[Command, list[str]]:
 
 
 def step(state: SteerState, command: Command, *, seconds: float | None = None) -> tuple[SteerState, SteerFrames]:
-    """Solve the next frames under a command, but for its arrival (see `controllers.steering.arrival`). After `seconds`
-    the best solution so far is returned, with a note, but not before `least_evaluations`.
+    """Solve the next frames under a command, but for its arrival (see `controllers.steering.arrival`). Within `seconds`
+    the best solution so far is returned, with a note; without an evaluation where there is no time for one: then the
+    last plan is carried on. What must be done in any case takes about 4 ms.
 
     RequestError for labels that the prior does not know. The first step under new labels takes longer.
     """
@@ -210,10 +214,11 @@ def step(state: SteerState, command: Command, *, seconds: float | None = None) -
     terms = (*_build_steering_terms(state, targets, command.step_length), *state.terms)
     if asked.obstacles:
         terms = (*terms, character.term(KeepClear(asked.obstacles)))
-    done, outcome = _solve_step(conditioned, terms, seconds, free=stuck)
+    search = None if seconds is None else state.cost.limit_search(seconds)
+    done, outcome = _solve_step(conditioned, terms, search, free=stuck)
     if outcome is not Outcome.DONE:
         cold = replace(state.committed, warm_start=state.committed.warm_start[:0], forecast=None)
-        restarted = replace(conditioned, settings=replace(settings, least_evaluations=0), committed=cold)
+        restarted = replace(conditioned, committed=cold)
         done, _ = _solve_step(restarted, terms, 0.0, free=False)  # the prior's own continuation, which always exists
     new = done.features[-settings.commit :]
     forecast = (done.forecast if done.forecast is not None else done.joints_world[:0]) * character.scale
@@ -223,13 +228,14 @@ def step(state: SteerState, command: Command, *, seconds: float | None = None) -
     cut_short = record.outcome == LbfgsStatus.OUT_OF_BUDGET.value and record.evaluations < settings.evaluations
     note = f"the deadline came after {record.evaluations} of {settings.evaluations} evaluations"
     status = Status(Outcome.BUDGET, (note,)) if cut_short else Status(Outcome.DONE)
+    ledger, spent = character.ledger(done.ledger), time.perf_counter() - began
     frames = SteerFrames(
         motion,
         status,
-        character.ledger(done.ledger),
+        ledger,
         done.windows,
         new,
-        time.perf_counter() - began,
+        spent,
         contacts=LAYOUT.pick(new, "contacts"),
         steering_targets=tuple(_scale_to_character(target, character) for target in committed_targets),
         forecast=forecast,
@@ -243,6 +249,7 @@ def step(state: SteerState, command: Command, *, seconds: float | None = None) -
         past_targets=torch.cat([state.past_targets, velocities])[-_PAST_TARGET_FRAMES:],
         frames=state.frames + len(new),
         overlay=overlay,
+        cost=state.cost.learn(time.perf_counter() - began, record.evaluations, search=search, cut_short=cut_short),
     )
     return next_state, frames
 
@@ -271,7 +278,7 @@ def _solve_step(
     state: SteerState, terms: Sequence[Term], seconds: float | None, *, free: bool
 ) -> tuple[CommittedFrames, Outcome]:
     settings = state.settings
-    method: SingleWindowSolver = _limit_evaluations(settings.evaluations, settings.least_evaluations, seconds)
+    method: SingleWindowSolver = _limit_evaluations(state, settings.evaluations, seconds)
     if free:
         method = _relax_footing_first(state, terms, seconds)
     window = HorizonSettings(frames=settings.horizon, overlap=settings.horizon - settings.commit)
@@ -282,20 +289,20 @@ def _solve_step(
     )
 
 
-def _limit_evaluations(evaluations: int, least: int, seconds: float | None) -> LatentNoiseSolver:
-    """Build a solver of one round within these evaluations and seconds, but of the least evaluations in any case."""
+def _limit_evaluations(state: SteerState, evaluations: int, seconds: float | None) -> LatentNoiseSolver:
+    """Build a solver of one round within these evaluations and seconds, which begins none that it cannot end."""
     most = max(1, evaluations)
-    budget = Budget(most, seconds, min(least, most))
+    budget = Budget(most, seconds, evaluation_seconds=state.cost.evaluation)
     return LatentNoiseSolver(rounds=1, lbfgs=LbfgsSettings(max_iterations=most), budget=budget)
 
 
 def _relax_footing_first(state: SteerState, terms: Sequence[Term], seconds: float | None) -> "_RelaxedFootingFirst":
-    """Build the solver for a stuck character: all samples are evaluated in any case, the evaluations are halved."""
+    """Build the solver for a stuck character: all samples, and half of the evaluations twice, as far as there is
+    time."""
     settings, half_seconds = state.settings, seconds and seconds / 2
-    half = _limit_evaluations(settings.evaluations // 2, max(1, settings.least_evaluations // 2), half_seconds)
-    evaluations, least = half.budget.evaluations or 1, half.budget.least
+    half = _limit_evaluations(state, settings.evaluations // 2, half_seconds)
     samples = BestOfSamples(settings.random_starts, SteeringKnots(_KNOTS, tuple(LAYOUT.slices)[:-1], _KNOT_SIGMA))
-    budget = Budget(settings.random_starts + evaluations, half_seconds, settings.random_starts + least)
+    budget = replace(half.budget, evaluations=settings.random_starts + (half.budget.evaluations or 1))
     relaxed = replace(half, proposal=samples, budget=budget)
     return _RelaxedFootingFirst(relaxed, half, [term for term in terms if term.name != settings.footing.name])
 

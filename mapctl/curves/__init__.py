@@ -31,22 +31,29 @@ def from_points(points: Float[Tensor, "points dims"] | ndarray, *, closed: bool 
     return Curve(*build_dense_polyline(points, closed))
 
 
-def through(points: Float[Tensor, "points dims"] | ndarray) -> Curve:
-    """Build a smooth open curve through a few points set by hand: a cubic spline over the square root of the chord
-    length.
+def through(points: Float[Tensor, "points dims"] | ndarray, *, closed: bool = False) -> Curve:
+    """Build a smooth curve through a few points set by hand, a closed one from the last to the first again: a cubic
+    spline over the square root of the chord length.
 
     That parameter (as in centripetal Catmull-Rom splines) keeps loops out where far and near points follow each other.
     Errors as of `from_points`, of which it is a finer case.
     """
     given = np.asarray(points, dtype=np.float64)
+    if closed and len(given) > 2:
+        given = np.concatenate([given, given[:1]])
     whole = from_points(given, closed=False)  # raises what is wrong with the points
     spans = np.sqrt(np.linalg.norm(np.diff(given, axis=0), axis=1))
     kept = np.r_[True, spans > 1e-3]
-    if kept.sum() < 3:
-        return whole
+    is_loop = closed and int(kept.sum()) > 3
+    if kept.sum() < 3 or (closed and not is_loop):
+        return from_points(given, closed=closed)
     at = np.r_[0.0, np.cumsum(spans[kept[1:]])]
     fine = np.linspace(0.0, at[-1], max(2, round(whole.length / _SPLINE_SPACING)))
-    return from_points(scipy.interpolate.CubicSpline(at, given[kept], bc_type="natural")(fine), closed=False)
+    knots = given[kept]
+    if is_loop:
+        knots[-1] = knots[0]  # exactly, as a periodic spline demands
+    spline = scipy.interpolate.CubicSpline(at, knots, bc_type="periodic" if is_loop else "natural")
+    return from_points(spline(fine), closed=is_loop)
 
 
 def circle(*, radius: float) -> Curve:

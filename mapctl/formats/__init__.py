@@ -19,6 +19,7 @@ READERS = {
     ".bvh": "bvh",
     ".npz": "npz",
     ".amc": "acclaim",
+    ".recording": "growing",
     **dict.fromkeys((".glb", ".gltf", ".vrm"), "gltf"),
     **dict.fromkeys(_USD_ENDINGS, "usd"),
     ".fbx": "fbx",
@@ -29,7 +30,7 @@ WRITERS = {".bvh": "bvh", ".npz": "npz", ".glb": "gltf", ".vrm": "gltf", **dict.
 CHARACTERS = (".glb", ".gltf", ".vrm", *_USD_ENDINGS, ".fbx")
 """Endings of files of skinned characters, that have a rest pose of their own."""
 _MAY_LACK_VALUES = (".bvh", ".npz", ".amc")
-_ONLY_READ = (".fbx", ".gltf", ".usdz", ".amc")
+_ONLY_READ = (".fbx", ".gltf", ".usdz", ".amc", ".recording")
 _UNREADABLE_REASONS = {".asf": "is a skeleton alone: name its motion, a .amc beside it or subject.asf+take.amc"}
 
 

@@ -82,7 +82,14 @@ def load_with_missing(path: str | PathLike[str]) -> tuple[Motion, MissingValues]
 
 
 def _read(path: str | PathLike[str], *, lossy: bool) -> tuple[Motion, MissingValues]:
-    arrays = _read_arrays(path, read_bytes(path))
+    return build_motion(path, read_arrays(path, read_bytes(path)), lossy=lossy)
+
+
+def build_motion(
+    path: str | PathLike[str], arrays: dict[str, np.ndarray], *, lossy: bool = False
+) -> tuple[Motion, MissingValues]:
+    """Build a motion of the arrays of a file; FileFormatError names the key that is wrong. With `lossy` tracks may
+    have NaN, and where is returned."""
     _check_shapes(path, arrays, lossy=lossy)
     lost = _replace_missing(path, arrays)
     if (found := str(arrays["format"])) != FORMAT:
@@ -96,16 +103,22 @@ def _read(path: str | PathLike[str], *, lossy: bool) -> tuple[Motion, MissingVal
 
 def save(motion: Motion, path: str | PathLike[str]) -> None:
     """Write the motion under the keys above. Same motion, same bytes. RequestError where it holds a NaN."""
-    arrays = _arrays(motion)
+    arrays = to_arrays(motion)
     for key, values in arrays.items():
         if values.dtype.kind == "f" and not np.isfinite(values).all():
             raise RequestError(f"cannot write {path}: {key} is not finite")
+    write_bytes(path, pack_arrays(arrays))
+
+
+def pack_arrays(arrays: dict[str, np.ndarray]) -> bytes:
+    """Return the archive of these arrays."""
     buffer = io.BytesIO()
     np.savez_compressed(buffer, allow_pickle=False, **arrays)
-    write_bytes(path, buffer.getvalue())
+    return buffer.getvalue()
 
 
-def _arrays(motion: Motion) -> dict[str, np.ndarray]:
+def to_arrays(motion: Motion) -> dict[str, np.ndarray]:
+    """Return the arrays of a motion, by the keys above."""
     skeleton, moving = motion.skeleton, sorted(motion.moving_offsets)
     tracks = np.array([_numbers(motion.moving_offsets[joint]) for joint in moving])
     return {
@@ -145,7 +158,7 @@ def _build_motion(arrays: dict[str, np.ndarray]) -> Motion:
     )
 
 
-def _read_arrays(path: str | PathLike[str], raw: bytes) -> dict[str, np.ndarray]:
+def read_arrays(path: str | PathLike[str], raw: bytes) -> dict[str, np.ndarray]:
     """Read the known keys. Sizes are bounded before anything is unpacked, and pickled objects are refused."""
     if not raw.startswith(b"PK\x03\x04"):
         raise FileFormatError(path, "is not an .npz archive")

@@ -20,7 +20,7 @@ def spawn(target: Callable[..., None], *arguments: Any) -> SpawnProcess:
     before `target` could look away; so it is born with the signal blocked, which no import undoes.
     """
     process = multiprocessing.get_context("spawn").Process(target=target, args=arguments, daemon=True)
-    with _defer_ctrl_c():
+    with defer_ctrl_c():
         process.start()
     return process
 
@@ -57,7 +57,7 @@ def reraise_ctrl_c() -> Iterator[None]:
 
 
 @contextmanager
-def _defer_ctrl_c() -> Iterator[None]:
+def defer_ctrl_c() -> Iterator[None]:
     """Defer a Ctrl-C to the end; a process that is started within never hears of one.
 
     The signal's mask is inherited by who is started. It does not keep Python from interrupting the main thread where

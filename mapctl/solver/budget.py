@@ -18,6 +18,9 @@ class Budget:
     """Time from the making of the meter, seconds."""
     least: int = 0
     """Number of evaluations allowed however late it is, within `evaluations`."""
+    evaluation_seconds: float | None = None
+    """Time of an evaluation, seconds, as far as known: one that would end after `seconds` is not begun. Later ones are
+    expected to take as long as the last. None asks for the time at the beginning alone."""
 
     def __post_init__(self):
         for name, limit in (("evaluations", self.evaluations), ("seconds", self.seconds), ("least", self.least)):
@@ -36,12 +39,17 @@ class Meter:
         self.budget = budget
         self.evaluations = 0
         self._clock = clock
-        self._began = clock()
+        self._began = self._taken_at = clock()
+        self._expected, self._taken = budget.evaluation_seconds or 0.0, 0
 
     def take(self, count: int = 1) -> bool:
         """Ask for `count` evaluations at once: True counts them; False counts none, make none."""
-        if self._late() or not self._affords(count):
+        now = self._clock()
+        if self.budget.evaluation_seconds is not None and self._taken:
+            self._expected = (now - self._taken_at) / self._taken
+        if self._late(count) or not self._affords(count):
             return False
+        self._taken_at, self._taken = now, count
         self.evaluations += count
         return True
 
@@ -72,11 +80,11 @@ class Meter:
         """Time since the meter was made."""
         return self._clock() - self._began
 
-    def _late(self) -> bool:
-        return self._past_deadline() and self.evaluations >= self.budget.least
+    def _late(self, count: int = 1) -> bool:
+        return self._past_deadline(count) and self.evaluations >= self.budget.least
 
-    def _past_deadline(self) -> bool:
-        return self.budget.seconds is not None and self.seconds >= self.budget.seconds
+    def _past_deadline(self, count: int = 1) -> bool:
+        return self.budget.seconds is not None and self.seconds + count * self._expected >= self.budget.seconds
 
     def _affords(self, count: int) -> bool:
         return self.budget.evaluations is None or self.evaluations + count <= self.budget.evaluations

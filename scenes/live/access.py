@@ -8,7 +8,7 @@ this machine (DNS rebinding), and a refusal to be framed keeps others from layin
 import asyncio
 import http
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -17,11 +17,14 @@ from websockets.datastructures import Headers
 from websockets.exceptions import WebSocketException
 from websockets.http11 import Request, Response
 
+from scenes.live.page.channel import PageChannel
+
 _NAMES = ("127.0.0.1", "localhost")
 _LOGGER = "websockets.server"  # of the library, which viser leaves as it is
 _NOT_FRAMED = {"Content-Security-Policy": "frame-ancestors 'none'", "X-Frame-Options": "DENY"}
 _REFUSAL = b"Only the page of mapctl live itself may do that.\n"
 
+_ConnectionHandler = Callable[[Any], Awaitable[None]]
 _RequestHandler = Callable[[Any, Request], Response | None]
 
 
@@ -41,8 +44,10 @@ def is_own_page(headers: Headers, port: int) -> bool:
 
 
 @contextmanager
-def restrict_to_own_pages() -> Iterator[None]:
+def restrict_to_own_pages(channel: PageChannel | None = None) -> Iterator[None]:
     """Make a viser server that is started within refuse all but its own pages, with status 403.
+
+    Its page gets the script of `channel`, which also takes that script's connections.
 
     viser has no option for it: it gives websockets neither `origins` nor a `process_request` of ours. What it calls
     is therefore replaced for as long as its server starts.
@@ -50,7 +55,8 @@ def restrict_to_own_pages() -> Iterator[None]:
     serve = websockets_server.serve
 
     def guarded(handler: Any, host: str, port: int, *, process_request: _RequestHandler, **options: Any) -> Any:
-        return serve(handler, host, port, process_request=_guard_request(process_request, port), **options)
+        taken = handler if channel is None else _share_connections(handler, channel)
+        return serve(taken, host, port, process_request=_guard_request(process_request, port, channel), **options)
 
     websockets_server.serve = guarded
     try:
@@ -59,17 +65,38 @@ def restrict_to_own_pages() -> Iterator[None]:
         websockets_server.serve = serve
 
 
-def _guard_request(answer: _RequestHandler, port: int) -> _RequestHandler:
+def _share_connections(handler: _ConnectionHandler, channel: PageChannel) -> _ConnectionHandler:
+    async def handled(connection: Any) -> None:
+        own = channel.is_own(connection.request.path)
+        await (channel.serve(connection) if own else handler(connection))
+
+    return handled
+
+
+def _guard_request(answer: _RequestHandler, port: int, channel: PageChannel | None) -> _RequestHandler:
+    written: dict[str | None, bytes] = {}  # viser's page with the script, by encoding
+
     def answered(connection: Any, request: Request) -> Response | None:
-        if not is_own_page(request.headers, port):
+        if not is_own_page(request.headers, port) or not (channel is None or channel.admits(request.path)):
             about = Headers({"Content-Length": str(len(_REFUSAL)), "Content-Type": "text/plain"})
             return Response(http.HTTPStatus.FORBIDDEN, "Forbidden", about, _REFUSAL)
         response = answer(connection, request)
         if response is not None:
             response.headers.update(_NOT_FRAMED)
+            if channel is not None and response.status_code == http.HTTPStatus.OK and _is_page(request.path):
+                encoding = response.headers.get("Content-Encoding")
+                if encoding not in written:
+                    written[encoding] = channel.insert_script(bytes(response.body), encoding)
+                response.body = written[encoding]
+                del response.headers["Content-Length"]
+                response.headers["Content-Length"] = str(len(response.body))
         return response
 
     return answered
+
+
+def _is_page(path: str) -> bool:
+    return path.partition("?")[0] in ("/", "/index.html")
 
 
 class ServerErrorReporter:

@@ -2,6 +2,7 @@
 
 import sys
 import time
+from collections.abc import Callable
 from contextlib import suppress
 
 import viser
@@ -13,6 +14,7 @@ from scenes.live.inputs import Refusal
 _REFUSAL_SECONDS = 8.0  # seconds for which a refusal is shown
 _REPEAT_SECONDS = 10.0  # seconds before the same message is shown again
 _EVENT_SECONDS = 8.0
+_MOST_STATES = 2  # that are shown at once, so that they do not push the controls away
 
 
 class Notifications:
@@ -37,7 +39,10 @@ class Notifications:
             self._states.pop(key, None)
         else:
             self._states[key] = text
-        _set_text(self._top, "\n\n".join(f"⚠️ {text}" for text in self._states.values()))
+        shown = [f"⚠️ {text}" for text in list(self._states.values())[:_MOST_STATES]]
+        if (more := len(self._states) - _MOST_STATES) > 0:
+            shown.append(f"and {more} more like this")
+        _set_text(self._top, "\n\n".join(shown))
 
     def show_refusals(self, refusals: list[Refusal]) -> None:
         """Show what was asked for and cannot be done."""
@@ -72,6 +77,13 @@ class Notifications:
             self.event("Not done", str(error))  # what was asked cannot be
         else:
             self.event("Something went wrong", format_error(error))
+
+    def run_safely(self, action: Callable[[], None]) -> None:
+        """Run an action; report whatever goes wrong, and go on."""
+        try:
+            action()
+        except Exception as error:
+            self.fault(error)
 
     def console(self, text: str) -> None:
         """Print a line on standard error; the same once in a while only."""

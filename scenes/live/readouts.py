@@ -19,15 +19,19 @@ class Readouts:
     """Text and two plots, of one character at a time."""
 
     def __init__(self, gui: viser.GuiApi):
+        """Add the text; `add_plots` adds the plots."""
         self._gui = gui
-        with gui.add_folder("Numbers"):
-            self._text = gui.add_markdown("...")
-            self._folder = gui.add_folder("Plots")
+        self._text = gui.add_markdown("...")
+        self._folder: viser.GuiFolderHandle | None = None
         self._plots: list[viser.GuiUplotHandle] = []
         self._rows: deque[tuple[float, ...]] = deque()
         self._names: tuple[str, ...] = ()
         self._places: deque[np.ndarray] = deque(maxlen=_SPEED_FRAMES + 1)
         self.forget()
+
+    def add_plots(self) -> None:
+        """Show the plots here, as soon as there is something to plot."""
+        self._folder = self._gui.add_folder("Plots")
 
     def forget(self) -> None:
         """Restart: another character, or the same from its start."""
@@ -64,16 +68,19 @@ class Readouts:
             return
         count = max(1, len(last.root))
         self._text.content = (
-            f"speed {self.speed:.2f} m/s, wanted {self._rows[-1][1]:.2f}\n\n"
-            f"{1000 * last.compute_seconds / count:.1f} ms a frame, {last.evaluations} evaluations a step\n\n"
-            f"{self.late} of {self.frames} frames late"
+            f"**{self.speed:.2f} m/s**, wanted {self._rows[-1][1]:.2f}  \n"
+            f"{1000 * last.compute_seconds / count:.1f} ms a frame · {self.late} of {self.frames} frames late"
         )
+        if self._folder is not None:
+            self._show_plots(self._folder)
+
+    def _show_plots(self, folder: viser.GuiFolderHandle) -> None:
         table = np.array(self._rows)
         data = [(table[:, 0], table[:, 1], table[:, 2]), (table[:, 0], *table[:, 3:].T)]
         if len(self._plots) == 0:
             labels = [("wanted", "got"), self._names]
             titles = ("Speed, m/s", "Ledger, nats a frame")
-            with self._folder:
+            with folder:
                 self._plots = [self._add_plot(*row) for row in zip(titles, data, labels, strict=True)]
         for plot, values in zip(self._plots, data, strict=True):
             plot.data = values

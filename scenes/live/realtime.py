@@ -27,6 +27,12 @@ class RealtimeMonitor:
     def __init__(self):
         self._rows: deque[tuple[float, float, int, int, int]] = deque()  # time, stream, frames, late, evaluations
         self.slow = False
+        self._rate = 1.0
+
+    def set_rate(self, rate: float) -> None:
+        """Judge by another rate from now on: seconds of the character that are to pass in a second."""
+        self._rate = rate
+        self.forget()
 
     def forget(self) -> None:
         """Restart: it was paused or reset, so what is missing is not late."""
@@ -43,7 +49,7 @@ class RealtimeMonitor:
         if not self._rows:
             return False
         quick, long = self._compute_late_share(now - _SHORT_SECONDS), self._compute_late_share(now - _LONG_SECONDS)
-        silent = now - self._rows[-1][0] > _SILENT_SECONDS
+        silent = now - self._rows[-1][0] > _SILENT_SECONDS / self._rate
         if self.slow:
             changed = (
                 not silent
@@ -63,13 +69,15 @@ class RealtimeMonitor:
 
     def text(self, now: float) -> str:
         """Describe how slow it is, for a person."""
+        if not self._rows:
+            return "no frame since it was stopped"
         first, last = self._rows[0], self._rows[-1]
-        if (silent := now - last[0]) > _SILENT_SECONDS:
+        if (silent := now - last[0]) > _SILENT_SECONDS / self._rate:
             return f"no frame for {silent:.0f} s"
         late = f"{100 * self._compute_late_share(now - _LONG_SECONDS):.0f} % of its frames come late"
         recent = [row for row in self._rows if row[0] > now - _SHORT_SECONDS] or [last]
         searched = sum(row[4] for row in recent) / len(recent)
-        rate = (last[1] - first[1]) / max(1e-9, last[0] - first[0])
+        rate = (last[1] - first[1]) / max(1e-9, last[0] - first[0]) / self._rate
         slowly = f"it plays at {100 * rate:.0f} % of real time, " if len(self._rows) > 2 and 0 < rate < 0.97 else ""
         return f"{slowly}{late}, {searched:.0f} evaluations a step"
 

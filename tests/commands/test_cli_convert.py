@@ -18,6 +18,7 @@ from helpers import run, walk
 import mapctl
 from mapctl import cli, formats
 from mapctl.formats import npz, usd
+from mapctl.formats.growing import MotionWriter
 
 DOCS = (Path(__file__).parents[2] / "docs" / "formats.md").read_text("utf-8")
 needs_usd = pytest.mark.skipif(not usd.is_installed(), reason="needs usd-core: pip install 'mapctl[usd]'")
@@ -36,6 +37,8 @@ def here(tmp_path, monkeypatch):
     motion = walk(6)
     motion.save("in.bvh")
     motion.save("in.npz")
+    with Path("in.recording").open("wb") as growing:
+        MotionWriter(growing).add(motion)
     pair(6).write(tmp_path, subject="01", take="in")
     motion.save("in.glb")
     make_character_glb("in.gltf", animations=("walk",), frames=6)
@@ -131,7 +134,7 @@ def test_what_cannot_be_is_said_in_one_line_and_nothing_is_written(here, capsys,
     Path("two").mkdir()
     for name in ("01.asf", "02.asf", "in.amc"):
         Path("two", name).write_text("x")
-    np.savez("objects.npz", **{**npz._arrays(walk(2)), "names": np.array([{}] * 21)})
+    np.savez("objects.npz", **{**npz.to_arrays(walk(2)), "names": np.array([{}] * 21)})
     before = sorted(here.rglob("*"))
     assert run("convert", *words) == 2
     told = capsys.readouterr()
@@ -176,7 +179,7 @@ def test_the_page_names_every_format_and_key():
         for e in re.findall(r"`(\.\w+)`", cell)
     }
     assert written == set(formats.WRITERS)
-    assert re.findall(r"^\| `(\w+)` \| ", DOCS, re.MULTILINE) == list(npz._arrays(walk(2)))
+    assert re.findall(r"^\| `(\w+)` \| ", DOCS, re.MULTILINE) == list(npz.to_arrays(walk(2)))
 
 
 def test_commands_of_the_page_are_understood():

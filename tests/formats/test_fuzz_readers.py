@@ -238,7 +238,7 @@ class TestArchives:
     @pytest.fixture
     def arrays(self, tmp_path):
         (tmp_path / "good.bvh").write_text(GOOD)
-        return npz._arrays(mapctl.load(tmp_path / "good.bvh"))
+        return npz.to_arrays(mapctl.load(tmp_path / "good.bvh"))
 
     @pytest.mark.parametrize(
         ("changes", "words"),

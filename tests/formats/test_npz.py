@@ -29,7 +29,7 @@ def example(frames=5, fps=Fraction(24000, 1001), seed=0) -> Motion:
 
 def archive(motion: Motion, **changes) -> bytes:
     """The archive of a motion with some keys changed, or left out where the change is None."""
-    arrays = {**npz._arrays(motion), **changes}
+    arrays = {**npz.to_arrays(motion), **changes}
     buffer = io.BytesIO()
     np.savez(buffer, **{key: values for key, values in arrays.items() if values is not None})
     return buffer.getvalue()
@@ -61,7 +61,7 @@ def test_the_keys_are_the_documented_ones(tmp_path):
         assert arrays["moving_offsets"].shape == (1, 5, 3)
 
 
-QUAT = npz._arrays(example())["local_quat_xyzw"]
+QUAT = npz.to_arrays(example())["local_quat_xyzw"]
 CHANGES = {
     "missing": ({"parents": None, "fps": None}, "lacks the keys parents, fps"),
     "other version": ({"format": np.array("mapctl-motion-9")}, "format is 'mapctl-motion-9'"),

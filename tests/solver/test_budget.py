@@ -91,3 +91,21 @@ def test_impossible_limits_are_refused():
     for seconds in (-0.1, math.nan):
         with pytest.raises(RequestError, match="seconds must be 0 or more"):
             Budget(seconds=seconds)
+
+
+def test_an_evaluation_that_would_end_too_late_is_not_begun():
+    now = [0.0]
+    meter = Meter(Budget(seconds=1.0, evaluation_seconds=0.3), clock=lambda: now[0])
+    for took in (0.3, 0.3, 0.1):
+        assert meter.take()
+        now[0] += took
+    assert meter.take(), "the last one took 0.1 s, and 0.3 s are left"
+    now[0] += 0.25
+    assert meter.exhausted
+    assert meter.remaining == 0
+    assert not meter.take()
+    assert meter.evaluations == 4
+    assert not Meter(Budget(seconds=0.2, evaluation_seconds=0.3), clock=lambda: now[0]).take()
+    assert not Meter(Budget(seconds=1.0, evaluation_seconds=0.3), clock=lambda: now[0]).take(4)
+    assert Meter(Budget(seconds=1.0, evaluation_seconds=0.3), clock=lambda: now[0]).take(3)
+    assert Meter(Budget(seconds=0.2), clock=lambda: now[0]).take(), "what is not known is not expected"

@@ -21,6 +21,7 @@ from scenes.live import ground
 from scenes.live.app import LiveApp
 from scenes.live.readouts import Readouts
 from scenes.live.recording import Recording, encode_motion
+from scenes.live.view.chase import CameraMode
 
 
 def test_it_listens_on_this_machine_only(show):
@@ -53,7 +54,7 @@ def test_orders_go_to_the_chosen_character_alone_and_the_panel_shows_them(show, 
     run(show)
     assert actors[0].heard == [("command", Command(2.0, math.pi / 2))]
     assert actors[1].heard == [("command", Command(0.5, 0.0, -math.pi / 2, told=("walk", "old")))]
-    panel = show._panel
+    panel = show._panel.steering
     assert (panel.speed.value, panel.facing.value, panel.told["gait"].value) == (0.5, -90, "walk")
     show.choose(0)
     run(show)
@@ -64,7 +65,7 @@ def test_orders_go_to_the_chosen_character_alone_and_the_panel_shows_them(show, 
 def test_pause_and_reset_are_for_everybody(show, actors):
     show.toggle_pause()
     run(show, 2)
-    assert show._panel.paused.label == "Go on"
+    assert show._panel.play.paused.label == "Go on"
     show.toggle_pause()
     show.order(speed=3.0)
     show.reset()
@@ -77,14 +78,17 @@ def test_pause_and_reset_are_for_everybody(show, actors):
 def test_frames_stand_the_puppet_where_they_say(show, actors):
     for _ in range(40):  # it walks; how far in so many frames depends on how busy the machine is
         run(show, 30)
-        if np.hypot(*show._members[0].place) > 0.1:
+        if np.hypot(*show._cast.members[0].place) > 0.1:
             break
-    frame = show._members[0].place
+    frame = show._cast.members[0].place
     assert np.hypot(*frame) > 0.1
-    np.testing.assert_allclose(show._world.position, [-frame[0], 0, -frame[1]], atol=1e-9)
-    show._panel.follow.value = False
+    world = show._view._director._world
+    assert np.dot(world.position[[0, 2]], frame) < 0, "the world goes past the camera"
+    show._view.set_camera(CameraMode.FREE)
     run(show, 1)
-    np.testing.assert_allclose(show._world.position, 0)
+    before = np.array(world.position)
+    run(show, 30)
+    np.testing.assert_array_equal(world.position, before)
 
 
 def test_a_drawn_path_is_given_to_walk_and_none_is_said(show, actors):
@@ -92,12 +96,12 @@ def test_a_drawn_path_is_given_to_walk_and_none_is_said(show, actors):
     run(show, 1)
     assert actors[0].heard == []
     for place in ((0.0, 0.0), (1.0, 1.0), (1.0, 3.0)):
-        show._path.add(*place)
+        show.path.place(*place)
     show.walk_path()
-    show.clear_path()
+    show.path.clear()
     run(show, 1)
     assert actors[0].heard == [("walk", [(0.0, 0.0), (1.0, 1.0), (1.0, 3.0)], 1.2)]
-    assert show._path.points == []
+    assert show.path.path.points == []
 
 
 def test_a_target_appears_is_dragged_and_belongs_to_its_character(show, actors):
@@ -186,18 +190,19 @@ def test_a_recording_can_be_a_film():
 def test_a_recording_begins_and_ends_with_the_button(show, actors):
     show.toggle_recording(None)
     run(show, 5)
-    assert show._panel.record.label == "Stop and save"
-    recording = show._members[0].recording
-    assert len(recording.pieces) == 5
+    assert show._panel.recording.record.label == "Stop and save"
+    recording = show._cast.members[0].recording
+    assert recording.frames == 15
     show.toggle_recording(None)
     run(show, 2)
-    assert show._panel.record.label == "Record"
-    assert len(recording.pieces) == 5
-    assert show._members[1].recording is None
+    assert show._panel.recording.record.label == "Record"
+    assert recording.frames == 15
+    assert show._cast.members[1].recording is None
 
 
 def test_gauges_count_late_frames_and_know_the_speed(show):
     gauges = Readouts(show.server.gui)
+    gauges.add_plots()
     for first in range(0, 30, 3):
         gauges.add(delivered(first, spare=-0.04 if first == 27 else 0.01), 30)
     gauges.show()
@@ -223,7 +228,7 @@ def test_a_click_sends_the_chosen_one_there(show, actors):
     run(show, 1)
     _, command, _, _, facing = actors[0].heard[-1]
     assert (command.speed, facing) == (0.0, pytest.approx(math.pi / 2))
-    assert show._panel.speed.value == 0.0
+    assert show._panel.steering.speed.value == 0.0
 
 
 @pytest.mark.parametrize("wrong", [0.0, math.nan, 1e300])

@@ -4,73 +4,17 @@ comes down as a file that can be read; two browsers, one that goes and comes bac
 import http.server
 import itertools
 import re
-import shutil
-import signal
-import socket
-import subprocess
-import sys
 import threading
 import time
 
 import pytest
 import viser
 from character_maker import make_character_glb
+from live_browser import CHROMIUM, COUNTED, SIZE, Live, open_chromium
 
 import mapctl
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-COUNTED = re.compile(r"\d+ of \d+ frames late")  # in the page once characters move
-SIZE = {"width": 760, "height": 620}  # small: these machines draw without a graphics card
-SWITCHES = [
-    "--no-sandbox",
-    "--use-gl=angle",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-]
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium; .ci/setup browser says how to get it")
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
-
-
-def _hear_ctrl_c() -> None:
-    """Shells let what they start in the background ignore Ctrl-C, and its children inherit that."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-
-class Live:
-    """`mapctl live` as a user starts it."""
-
-    def __init__(self, *words: object, port: int | None = None):
-        self.port = port or free_port()
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "mapctl.cli", "live", "--port", str(self.port), *map(str, words)],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            preexec_fn=_hear_ctrl_c,
-        )
-        self.lines: list[str] = []
-        assert self.process.stdout is not None
-        while not any("open http" in line for line in self.lines):
-            line = self.process.stdout.readline()
-            assert line, "".join(self.lines)
-            self.lines.append(line)
-        self.url = re.search(r"http://\S+", self.lines[-1]).group()
-        threading.Thread(target=lambda: self.lines.extend(self.process.stdout), daemon=True).start()
-
-    def end(self) -> int:
-        self.process.send_signal(signal.SIGINT)
-        try:
-            return self.process.wait(timeout=20)
-        finally:
-            self.process.kill()
 
 
 @pytest.fixture(scope="module")
@@ -82,17 +26,14 @@ def live(prior):
 
 @pytest.fixture(scope="module")
 def browser():
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as drivers:
-        opened = drivers.chromium.launch(executable_path=CHROMIUM, args=SWITCHES)
+    with open_chromium() as opened:
         yield opened
-        opened.close()
 
 
 @pytest.fixture(scope="module")
 def page(browser, live):
     opened = browser.new_page(viewport=SIZE, accept_downloads=True)
+    opened.add_init_script(GAMEPADS)
     faults: list[str] = []
     opened.on("pageerror", lambda error: faults.append(str(error)))
     opened.goto(live.url)
@@ -103,30 +44,48 @@ def page(browser, live):
 
 
 def number(page, label: str):
-    """The field beside a slider."""
+    """The field beside a slider; the tab with it is open."""
     row = page.get_by_text(label, exact=True).locator("xpath=ancestor::*[.//input[@type='text']][1]")
     return row.locator("input[type='text']").first
 
 
 def put(page, label: str, value: float) -> None:
+    open_tab(page, "Steer")
     field = number(page, label)
     field.fill(str(value))
     field.press("Enter")
 
 
 def shows(page, label: str, value: float) -> bool:
-    """Whether a slider comes to show a value within 5 s."""
-    for _ in range(50):
+    """Whether a slider comes to show a value within 20 s; a page that draws without a graphics card is slow."""
+    for _ in range(200):
         if number(page, label).input_value() not in ("", None) and float(number(page, label).input_value()) == value:
             return True
         time.sleep(0.1)
     return False
 
 
+PLUG_IN = """axes => { window.plugged = {
+    connected: true, axes: [...axes, 0, 0], buttons: Array(17).fill({value: 0}),
+}; }"""
+GAMEPADS = "window.plugged = null; navigator.getGamepads = () => [window.plugged];"
+
+
+def differs(page, label: str, value: float) -> bool:
+    """Whether a slider comes to show another value within 20 s."""
+    return any(time.sleep(0.1) or float(number(page, label).input_value() or value) != value for _ in range(200))
+
+
+def open_tab(page, name: str) -> None:
+    page.get_by_text(name, exact=True).first.click()
+
+
 def recorded(page, tmp_path, seconds: float, during=lambda: None) -> mapctl.Motion:
+    open_tab(page, "Play")
     page.get_by_role("button", name="Record", exact=True).click()
     page.get_by_role("button", name="Stop and save").wait_for()
     during()
+    open_tab(page, "Play")
     time.sleep(seconds)
     with page.expect_download(timeout=60_000) as coming:
         page.get_by_role("button", name="Stop and save").click()
@@ -150,11 +109,38 @@ def test_a_slider_and_keys_move_the_character_and_the_recording_shows_it(page, t
     assert walked.skeleton.names[0] == "hips"
     assert walked.num_frames >= 30
     assert speed_of(walked) > 0.7
+    open_tab(page, "Steer")
     page.mouse.click(150, 500)  # the scene, so that keys are not typed into a field
     page.keyboard.press("x")
     assert shows(page, "Speed, m/s", 0)
-    page.keyboard.press("a")
-    assert shows(page, "Heading, degrees", 15)
+
+
+def test_a_held_key_walks_away_from_the_camera_and_a_stick_that_is_unplugged_stands(page):
+    open_tab(page, "Steer")
+    put(page, "Speed, m/s", 1.1)
+    assert shows(page, "Speed, m/s", 1.1)
+    page.mouse.click(150, 500)
+    try:
+        page.keyboard.down("w")
+        assert differs(page, "Heading, degrees", 0.0), "as the camera sees it, which looks past the character"
+        page.keyboard.up("w")
+        assert shows(page, "Speed, m/s", 0)
+        page.evaluate(PLUG_IN, [1.0, 0.0])
+        assert differs(page, "Speed, m/s", 0.0)
+    finally:
+        page.keyboard.up("w")
+        page.evaluate("window.plugged = null")
+    page.get_by_text("it was unplugged; the character stands").wait_for(timeout=20_000)
+    assert shows(page, "Speed, m/s", 0)
+    page.keyboard.press("h")
+    page.get_by_text("bring everybody into view").wait_for()
+    page.keyboard.press("h")
+    page.get_by_role("button", name="Reset").click()
+
+
+def walk_path(page) -> None:
+    open_tab(page, "Path")
+    page.get_by_role("button", name="Walk it").click()
 
 
 def test_a_drawn_path_is_walked(page, tmp_path):
@@ -162,13 +148,15 @@ def test_a_drawn_path_is_walked(page, tmp_path):
     box = page.get_by_text("Draw by clicking on the ground").locator("xpath=following::input[@type='checkbox'][1]")
     put(page, "Speed, m/s", 0)
     page.get_by_role("button", name="Reset").click()
+    open_tab(page, "Path")
     box.check()
     for x, y in ((250, 400), (120, 450), (60, 380)):
         page.mouse.click(x, y)
         time.sleep(0.7)
-    walked = recorded(page, tmp_path, 4, during=page.get_by_role("button", name="Walk it").click)
+    walked = recorded(page, tmp_path, 4, during=lambda: walk_path(page))
     way = walked.root_position[:, ::2]
     assert float((way[-1] - way[0]).norm()) > 0.5
+    open_tab(page, "Path")
     box.uncheck()
     page.get_by_role("button", name="Clear").click()
 
@@ -239,9 +227,11 @@ def test_whatever_is_typed_by_two_people_the_show_goes_on_and_the_recording_is_w
     other.goto(live.url)
     other.get_by_text(COUNTED).wait_for(timeout=60_000)
     page.get_by_role("button", name="Reset").click()
+    open_tab(other, "Steer")
     typed, foreign = [], []
 
     def during() -> None:
+        open_tab(page, "Steer")
         until = time.monotonic() + seconds
         while time.monotonic() < until:
             typed.append(pester([page, other], min(until, time.monotonic() + 60), least=8))
@@ -265,6 +255,7 @@ def test_whatever_is_typed_by_two_people_the_show_goes_on_and_the_recording_is_w
 
 def test_a_number_typed_digit_by_digit_arrives_and_one_that_cannot_be_is_said(page):
     page.get_by_role("button", name="Reset").click()
+    open_tab(page, "Steer")
     check(page, "Measured steps")
     for _ in range(3):  # a starved machine may take longer over a key than a field waits for the next one
         type_into(page, "Step length, m", "0.8")

@@ -2,6 +2,8 @@
 
 import time
 from dataclasses import dataclass, replace
+from fractions import Fraction
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,11 +12,13 @@ import viser
 from character_maker import make_character_glb
 from glb_viewer import GlbViewer
 from helpers import walk
+from rig_maker import Make, make, names_of
 from stage import Actor, delivered, run
 
-from mapctl import rotations
+from mapctl import formats, rotations
 from mapctl.commands.live import Live
 from mapctl.commands.live import run as live
+from mapctl.motion import Motion
 from scenes.drawn_character import DrawnCharacter
 from scenes.live.app import LiveApp
 from scenes.live.bodies.colour_groups import part_by_colour
@@ -152,6 +156,9 @@ class _Done:
     def __init__(self, work, *words):
         work(*words)
 
+    def is_alive(self) -> bool:
+        return False
+
     def join(self):
         pass
 
@@ -185,7 +192,7 @@ def test_a_character_moves_on_its_own_bones(prior, tmp_path):
     child = str(make_character_glb(tmp_path / "child.glb", size=0.6).path)
     command = Live(character=(child,), prior=prior)
     (drawn,) = live._read_drawn(command)
-    (made,) = live._start_characters(command, [drawn])
+    (made,) = live._start_characters(command, live._read_bodies(command, [drawn]))
     try:
         assert made.skeleton.matches(drawn.body.leveled)
         chunk = next(chunk for _ in range(200) for chunk in made.poll() or _wait())
@@ -198,3 +205,42 @@ def test_a_character_moves_on_its_own_bones(prior, tmp_path):
 def _wait() -> list:
     time.sleep(0.05)
     return []
+
+
+def write_rig(preset: str, path: Path) -> None:
+    """A clip on the joints of a preset, of a small person."""
+    skeleton = make(Make(names=names_of(preset), size=0.8)).skeleton
+    still = torch.zeros(2, skeleton.num_joints, 4, dtype=torch.float64)
+    still[..., 3] = 1.0
+    root = torch.tensor([[0.0, 0.8, 0.0]], dtype=torch.float64).repeat(2, 1)
+    formats.save(Motion(skeleton, Fraction(30), root, still), path)
+
+
+def test_with_a_rig_a_mannequin_moves_on_its_bones_and_recordings_are_on_it(tmp_path):
+    file = tmp_path / "rig.bvh"
+    write_rig("mixamo", file)
+    command = Live(rig=str(file), characters=2)
+    drawn = live._read_drawn(command)
+    bodies = live._read_bodies(command, drawn)
+    rigs = live._choose_recorded_rigs(command, drawn, bodies)
+    assert drawn == [None, None]
+    assert bodies[0].scale == pytest.approx(0.8, abs=0.07)
+    recording = Recording(bodies[0].skeleton, on_rig=rigs[0])
+    recording.add(delivered(0, 6))
+    assert recording.motion().skeleton.names == formats.load(file).skeleton.names
+    plain = live._choose_recorded_rigs(Live(), [None], [bodies[0]])
+    assert plain == [None], "canonical joints stay"
+
+
+def test_a_character_is_recorded_on_the_rig_if_there_is_one(tmp_path):
+    hero, rig = make_character_glb(tmp_path / "hero.glb").path, tmp_path / "rig.bvh"
+    write_rig("lafan1", rig)
+    command = Live(rig=str(rig), character=(str(hero),))
+    drawn = live._read_drawn(command)
+    bodies = live._read_bodies(command, drawn)
+    assert bodies[0].skeleton.matches(drawn[0].body.leveled), "it moves on its own bones"
+    recording = Recording(bodies[0].skeleton, drawn[0], on_rig=live._choose_recorded_rigs(command, drawn, bodies)[0])
+    recording.add(delivered(0, 6))
+    motion = recording.motion()
+    assert motion.skeleton.names == formats.load(rig).skeleton.names
+    assert float(motion.joint_positions()[0, 0, 1]) < float(delivered(0).root[0, 1]), "of its size"

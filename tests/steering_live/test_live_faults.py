@@ -14,8 +14,8 @@ from mapctl import formats
 from mapctl.errors import MapctlError
 from mapctl.intent.steering import Command
 from mapctl.skeleton import CANONICAL
-from scenes.live import ground
 from scenes.live import recording as recording_module
+from scenes.live.paths import points
 from scenes.live.recording import Recording, encode_with_fallback, save_without_replacing
 
 
@@ -32,21 +32,21 @@ def said(show, capsys):
 
 def test_what_is_typed_is_clamped_said_and_put_right_when_typing_ends(show, actors, said):
     panel = show._panel
-    panel.speed._impl.value = 99.0  # as the server has it when a browser sent it
+    panel.steering.speed._impl.value = 99.0  # as the server has it when a browser sent it
     show.typed(speed=99.0)
     run(show, 2)
     assert actors[0].heard == [("command", Command(3.8, 0.0))]
-    assert panel.speed.value == 99.0, "somebody may still be typing"
+    assert panel.steering.speed.value == 99.0, "somebody may still be typing"
     assert said() == ("A speed of 99 m/s was lowered to 3.8: it can be 0 to 3.8 m/s.", "")
     run(show, 80)
-    assert panel.speed.value == 3.8
+    assert panel.steering.speed.value == 3.8
     assert "99" in said()[0], "it stays to be read"
 
 
 def test_a_number_typed_digit_by_digit_arrives_as_it_was_meant(show, actors, said):
     show.order(step_length=0.65)
     run(show, 1)
-    field = show._panel.step_length
+    field = show._panel.steering.step_length
     for text in ("0", "0.8", "0.85"):
         field._impl.value = float(text)
         show.typed(step_length=float(text))
@@ -66,7 +66,7 @@ def test_keys_go_as_far_as_they_go_without_a_word(show, actors, said):
     show.nudge(heading=-15.0)
     run(show, 2)
     assert actors[0].heard[-1][1].speed == 3.8
-    assert show._panel.heading.value == 165
+    assert show._panel.steering.heading.value == 165
     assert said() == ("", "")
 
 
@@ -89,8 +89,8 @@ def test_an_error_in_one_character_ends_nobody_else_and_no_recording(show, actor
     run(show, 10)
     assert said()[1] == "mapctl: Something went wrong: ZeroDivisionError: oh no\n"
     assert {word for word, *_ in actors[1].heard} == {"command", "pause", "reset"}
-    assert len(show._members[1].recording.pieces) == 13
-    assert len(show._members[0].recording.pieces) == (3 if where == "poll" else 13)
+    assert show._cast.members[1].recording.frames == 39
+    assert show._cast.members[0].recording.frames == (9 if where == "poll" else 39)
 
 
 def test_a_character_that_is_no_more_is_said_keeps_its_recording_and_comes_back(show, actors, said, monkeypatch):
@@ -106,11 +106,11 @@ def test_a_character_that_is_no_more_is_said_keeps_its_recording_and_comes_back(
         assert "character 1 is no more: it ended" in page
         assert console.count("\n") == 1
         assert actors[1].frames == 18
-        assert len(show._members[0].recording.pieces) == 3
+        assert show._cast.members[0].recording.frames == 9
     show.reset()
     run(show, 3)
     assert said()[0] == ""
-    assert len(show._members[0].recording.pieces) == 6
+    assert show._cast.members[0].recording.frames == 18
 
 
 @pytest.mark.slow  # what is too slow: test_live_realtime.py
@@ -128,7 +128,7 @@ def test_too_slow_is_said_in_the_page_and_on_the_console_and_so_is_its_end(show,
 
 
 def test_a_file_that_cannot_be_made_comes_as_another_and_nothing_is_lost(monkeypatch, tmp_path):
-    def made_up(motion, ending, drawn=None):
+    def made_up(motion, ending, drawn=None, work=None):
         if ending == "mp4":
             raise OSError("no space left")
         return b"HIERARCHY"
@@ -157,26 +157,26 @@ def test_a_recording_for_somebody_who_left_is_written_here_where_nobody_else_is(
     monkeypatch.chdir(tmp_path)
     recording = Recording(CANONICAL)
     recording.add(delivered())
-    show._delivery.export(recording, "bvh", None)
+    show._recorder._delivery.export(recording, "bvh", None)
     assert formats.load(tmp_path / "mapctl.bvh").num_frames == 3
     assert "nobody is left to take the recording" in said()[1]
-    show._delivery.export(Recording(CANONICAL), "bvh", None)
+    show._recorder._delivery.export(Recording(CANONICAL), "bvh", None)
     assert "Nothing saved: RequestError: nothing was recorded" in said()[1]
 
 
 def test_drawn_points_are_few_and_near(show, monkeypatch):
-    monkeypatch.setattr(ground, "_MAX_DRAWN_POINTS", 12)
-    show._panel.draw.value = True
+    monkeypatch.setattr(points, "MAX_POINTS", 12)
+    show._panel.path.draw.value = True
     down = (0.0, -1.0, 0.0)
     for ray in (None, [1.0], [math.nan] * 3, [1e300, 1, 0], "abc"):
         show._draw_at(ray, down)
         show._draw_at((0.0, 1.0, 0.0), ray)
     run(show, 2)
-    assert show._path.points == []
+    assert show.path.path.points == []
     for number in range(20):
         show._draw_at((number % 20, 1.0, number % 7), down)
     run(show, 2)
-    assert len(show._path.points) == 12
+    assert len(show.path.path.points) == 12
 
 
 VALUES = (
@@ -219,7 +219,7 @@ CAMERA = {
 def controls(show):
     """All that a browser can set a value of."""
     return [handle for handle in vars(show._panel).values() if isinstance(handle, viser.GuiInputHandle)] + [
-        *show._panel.told.values()
+        *show._panel.steering.told.values()
     ]
 
 
@@ -248,7 +248,7 @@ def test_whatever_two_browsers_send_every_command_can_be_obeyed_and_the_recordin
     _, console = said()
     assert "Traceback" not in console
     assert "went wrong" not in console
-    frames = show._members[0].recording.motion().num_frames
+    frames = show._cast.members[0].recording.motion().num_frames
     assert frames == actors[0].frames
-    panel, orders = show._panel, show._members[show._chosen].orders
-    assert (panel.speed.value, panel.heading.value) == (orders.speed, round(orders.heading))
+    panel, orders = show._panel, show._cast.chosen.orders
+    assert (panel.steering.speed.value, panel.steering.heading.value) == (orders.speed, round(orders.heading))

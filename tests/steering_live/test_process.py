@@ -14,6 +14,7 @@ from tiny_prior import save_tiny_prior
 from tiny_stitcher import save_tiny_stitcher
 
 import priors
+from controllers.steering import process
 from controllers.steering.process import CharacterProcess, CharacterRequest
 from controllers.steering.process_worker import run_worker
 from mapctl.errors import MapctlError, RequestError
@@ -212,12 +213,12 @@ def test_an_error_that_nobody_thought_of_is_told_in_a_line(load, capfd):
 def test_ctrl_c_is_not_for_it_and_when_it_hangs_it_holds_up_nobody(load, capfd):
     made = CharacterProcess(CharacterRequest(load, Command(1.0, 0.0)))
     for _ in range(20):  # while it imports
-        os.kill(made._process.pid, signal.SIGINT)
+        os.kill(process._BASES._bases[made._base].pid, signal.SIGINT)
         time.sleep(0.05)
     made.wait()
-    os.kill(made._process.pid, signal.SIGINT)
+    os.kill(made.pid, signal.SIGINT)
     assert len(collected(made, 0.5)) > 2
-    os.kill(made._process.pid, signal.SIGSTOP)
+    os.kill(made.pid, signal.SIGSTOP)
     began = time.perf_counter()
     for number in range(5000):
         made.command(Command(1.0, number / 5000, told=("x" * 100,)))
@@ -229,7 +230,7 @@ def test_ctrl_c_is_not_for_it_and_when_it_hangs_it_holds_up_nobody(load, capfd):
 
 def sent_by(here, there, load):
     """All messages of a worker in this process, until it ends."""
-    run_worker(there, CharacterRequest(load, Command(1.0, 0.0)))
+    run_worker(there, None, CharacterRequest(load, Command(1.0, 0.0)))
     messages = []
     while here.poll():
         messages.append(here.recv())
@@ -261,3 +262,23 @@ def test_a_worker_says_what_ends_it(load, breaking, said):
     word, text = sent_by(*Pipe(), breaking(load))[-1]
     assert word == "failed"
     assert re.search(said, text)
+
+
+def test_slow_motion_passes_slowly_and_is_not_late(remote):
+    remote.reset()
+    remote.set_rate(0.25)
+    remote.tune({"noise": 1.0})
+    collected(remote, 1.0)
+    pieces = collected(remote, 2.0)
+    frames = sum(len(piece.root) for piece in pieces)
+    assert 9 <= frames <= 21, "two seconds at a quarter of 30 frames a second"
+    assert {piece.rate for piece in pieces} == {0.25}
+    assert pieces[-1].due - pieces[-2].due == pytest.approx(0.4, abs=0.01)
+    assert sum(piece.late_frames for piece in pieces) == 0
+    for wrong in (0.0, -1.0, 2.0, np.nan):
+        with pytest.raises(RequestError, match="can be"):
+            remote.set_rate(wrong)
+    with pytest.raises(RequestError, match="sigma of noise"):
+        remote.tune({"noise": 1000.0})
+    remote.set_rate(1.0)
+    remote.tune({})

@@ -72,21 +72,22 @@ def test_the_state_does_not_grow():
     assert size(early) == size(late)
 
 
-@pytest.mark.parametrize(("least", "made"), [(0, 0), (2, 2), (9, 4)])
-def test_without_time_it_still_delivers_searches_the_least_and_says_so(least, made):
+@pytest.mark.parametrize("least", [0, 2])
+def test_without_time_it_still_delivers_and_says_so(least):
     state, _ = begun(settings=replace(QUICK, least_evaluations=least))
     _, piece = steer.step(state, AHEAD, seconds=0.0)
     assert piece.motion.num_frames == 3
-    assert piece.evaluations == made
-    assert piece.notes == ((f"the deadline came after {made} of 4 evaluations",) if made < 4 else ())
+    assert piece.evaluations == 0
+    assert piece.notes == ("the deadline came after 0 of 4 evaluations",)
     assert bool(torch.isfinite(piece.motion.local_quat_xyzw).all())
 
 
-def test_who_is_stuck_without_time_gets_the_draws_and_half_of_the_least_twice():
+def test_who_is_stuck_without_time_is_not_searched():
     state, _ = steered(8)
     stuck = replace(state, settings=replace(QUICK, stuck=-1.0, random_starts=5))
     _, piece = steer.step(stuck, AHEAD, seconds=0.0)
-    assert piece.evaluations == 5 + 1 + 1
+    assert piece.evaluations == 0
+    assert bool(torch.isfinite(piece.motion.local_quat_xyzw).all())
 
 
 def test_who_is_stuck_is_searched_without_footing_first():
@@ -173,8 +174,6 @@ def test_what_comes_too_late_is_counted_and_the_search_is_given_up():
     _, records = drive(state, Heard(), [], frames=7, clock=Slow())
     cost = summarise_step_timing(records)
     assert cost["late_frames"] == 6
-    assert cost["steps_cut_short"] == 2
-    assert cost["evaluations_per_frame"] == pytest.approx(2 / 3)
 
 
 class Labouring(StreamClock):

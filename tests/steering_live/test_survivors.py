@@ -11,6 +11,7 @@ from tiny_horizon import BEGUN, METHOD, SHORT, request, solver, terms_of
 from tiny_steering import AHEAD, QUICK, begun
 
 from controllers.steering import loop, steer
+from controllers.steering.cost import StepCost
 from controllers.steering.loop import LoopSettings
 from mapctl.intent.steering import Command, SteeringTarget
 from mapctl.intent.steering_limits import SteeringLimits
@@ -102,7 +103,9 @@ def test_a_search_ends_by_the_margin_before_its_frames_are_due(monkeypatch, marg
             return AHEAD
 
     loop.drive(begun()[0], Source(), [], frames=7, clock=Still(), settings=LoopSettings(margin=margin))
-    assert allowed == pytest.approx([max(0.0, QUICK.commit / 30 - margin)] * 2)
+    least = StepCost().needed_seconds(QUICK.least_evaluations)  # as guessed before the first step
+    assert allowed[0] == pytest.approx(max(least, QUICK.commit / 30 - margin))
+    assert allowed[1] > QUICK.commit / 30 - margin - 1e-9
 
 
 def test_who_is_stuck_is_searched_for_half_of_the_time_without_footing(monkeypatch):
@@ -117,8 +120,8 @@ def test_who_is_stuck_is_searched_for_half_of_the_time_without_footing(monkeypat
     stuck = replace(begun()[0], settings=replace(QUICK, stuck=-1.0, random_starts=5))
     steer.step(stuck, AHEAD, seconds=60.0)
     (first, loose), (second, whole) = budgets
-    assert first == pytest.approx(30)
-    assert second == pytest.approx(30)
+    assert first == pytest.approx(30, abs=0.1)
+    assert second == pytest.approx(30, abs=0.1)
     assert "footing" not in loose
     assert "footing" in whole
 

@@ -76,8 +76,8 @@ def test_numbers_and_labels_become_one_command_for_their_character(stage):
     send(("speed", 2.0), ("heading", 90.0), ("style", "old"), ("2/speed", 0.5), ("2/facing", -90.0))
     assert actors[0].heard == [("command", Command(2.0, math.pi / 2, told=("old",)))]
     assert actors[1].heard == [("command", Command(0.5, 0.0, -math.pi / 2))]
-    assert (show._panel.speed.value, show._panel.heading.value) == (2.0, 90)
-    assert show._panel.told["style"].value == "old"
+    assert (show._panel.steering.speed.value, show._panel.steering.heading.value) == (2.0, 90)
+    assert show._panel.steering.told["style"].value == "old"
     send(("2/facing",), ("style", "any"), ("step_length", 0.5))
     assert actors[1].heard[-1] == ("command", Command(0.5, 0.0))
     assert actors[0].heard[-1] == ("command", Command(2.0, math.pi / 2, step_length=0.5))
@@ -130,7 +130,7 @@ def test_the_last_word_on_a_hand_is_whoevers_it_is(stage):
     send(("hand/left", 1.0, 1.1, 2.0), ("look", 0.0, 1.5, 9.0))
     command = actors[0].heard[-1][1]
     assert (command.reach, command.look_at) == ({"leftHand": (1.0, 1.1, 2.0)}, (0.0, 1.5, 9.0))
-    assert (show._panel.hand.value, show._panel.looks.value) == ("none", False)
+    assert (show._panel.reaching.hand.value, show._panel.reaching.looks.value) == ("none", False)
     show.targets.aim(hand="left")
     run(show, 1)
     assert actors[0].heard[-1][1].reach == {"leftHand": (0.0, 1.0, 1.0)}
@@ -154,27 +154,27 @@ def test_a_disc_a_pause_and_a_restart_are_for_everybody(stage):
     show, actors, stream, send = stage
     send(("disc", 1.0, 4.0, 0.5))
     assert [actor.heard[-1][1].obstacles for actor in actors] == [(Obstacle((1.0, 4.0), 0.5),)] * 2
-    assert show._panel.disc.value is True
+    assert show._panel.reaching.disc.value is True
     send(("disc",))
     assert actors[1].heard[-1][1].obstacles == ()
-    assert show._panel.disc.value is False
+    assert show._panel.reaching.disc.value is False
     send(("pause",))
     send(("pause", 1))
     assert [a.heard[-1] for a in actors] == [("pause", True)] * 2
-    assert show._panel.paused.label == "Go on"
+    assert show._panel.play.paused.label == "Go on"
     send(("pause", 0.0))
     assert [a.heard[-1] for a in actors] == [("pause", False)] * 2
     send(("hand/left", 1.0, 1.0, 1.0))
     send(("reset",))
     assert [words(a)[-1] for a in actors] == ["reset"] * 2
-    assert show._members[0].orders.reach == {}
+    assert show._cast.members[0].orders.reach == {}
     assert stream.heard.count(("pause",)) == 3
     assert [entry for entry in stream.heard if entry[0] == "forget"] == [("forget", 0), ("forget", 1)]
 
 
 def test_what_was_due_before_it_began_is_not_streamed(stage):
     show, _, stream, _ = stage
-    show._began = time.perf_counter() + 60.0
+    show._cast.begin(time.perf_counter() + 60.0)
     show._show_due(time.perf_counter())
     assert stream.heard == []
 
@@ -205,10 +205,10 @@ def test_every_frame_goes_to_the_stream_too(stage):
 )
 def test_what_cannot_be_is_said_and_changes_nothing(stage, capsys, message):
     show, actors, _, send = stage
-    before = show._members[0].orders
+    before = show._cast.members[0].orders
     send(message)
     run(show, 20)
-    assert show._members[0].orders == before
+    assert show._cast.members[0].orders == before
     assert {word for actor in actors for word in words(actor)} <= {"aim"}, "the same as before is aimed at"
     assert capsys.readouterr().err.startswith("mapctl: OSC: ")
 

@@ -107,6 +107,8 @@ class Live(PriorTable):
     """How long each number of characters is steered."""
     characters: Annotated[str, arg(metavar="N,N,...")] = "1,2,4"
     """How many at once, one number after the other."""
+    find_most: bool = False
+    """Find how many this machine carries with no frame late instead: twice as many each time, then between."""
     orders: options.MaybeNumber = None
     """Order one character to be somewhere every so many seconds instead, and measure how it obeys."""
     stitcher: options.Name = "stitcher"

@@ -3,8 +3,9 @@
 import functools
 
 import priors
-from controllers.benchmarks.live import benchmark_live
+from controllers.benchmarks.live import benchmark_live, find_most
 from controllers.benchmarks.live_orders import benchmark_orders
+from controllers.benchmarks.shared.tables import Row
 from mapctl.commands.bench import Live
 from mapctl.commands.bench.output import print_rows
 from mapctl.commands.shared.progress_bar import show_progress
@@ -20,11 +21,14 @@ def run(table: Live) -> int:
         raise RequestError(f"--minutes must be more than 0 and at most a day, got {table.minutes:g}")
     if table.orders is not None:
         return _run_orders(table, table.orders)
-    rows, load = [], functools.partial(priors.load, table.prior)
-    for count in _parse_counts(table.characters):
+    load = functools.partial(priors.load, table.prior)
+
+    def measure(count: int) -> Row:
         with show_progress(f"{count} at once") as progress:
-            rows.append(benchmark_live(load, characters=count, minutes=table.minutes, progress=progress))
-    return print_rows(table, rows)
+            return benchmark_live(load, characters=count, minutes=table.minutes, progress=progress)
+
+    counts = _parse_counts(table.characters)
+    return print_rows(table, find_most(measure, _MAX_CHARACTERS) if table.find_most else [*map(measure, counts)])
 
 
 def _run_orders(table: Live, orders: float) -> int:

@@ -1,7 +1,7 @@
 """`mapctl live`: characters in the browser, steered live."""
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Literal
 
 from tyro.conf import UseAppendAction, arg
 
@@ -20,10 +20,15 @@ class Live(Command):
     character: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="CHARACTER")] = ()
     """File of a skinned character, as .glb or .vrm, that is shown with its own mesh and moves on its own bones; may be
     given several times, for the first character, the second and so on, and the last one for all others."""
+    rig: options.OutRig = "canonical"
+    """Joints and bones on which characters move, shown as mannequins: canonical, or those of a clip, a preset or a rig
+    file. Recordings are on them, of a --character too, which is retargeted when it is saved."""
     prior: options.Name = "locomotion-live"
     """A bundled prior, or the file or run folder of a trained one."""
     seed: options.Count = 0
     """Seed of the first poses."""
+    theme: Literal["light", "dark", "auto"] = "auto"
+    """Colours of the page; auto are those that the browser prefers."""
     stream: options.MaybeEndpoint = None
     """Where poses go over the VMC protocol (most programs receive at port 39539): a port alone is on this machine. The
     second character's poses go to the next port, and so on."""

@@ -1,7 +1,7 @@
 """`mapctl live`: characters in the browser, steered live."""
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,9 +12,11 @@ from controllers.steering.process import CharacterProcess, CharacterRequest
 from controllers.steering.steer import SteerSettings
 from mapctl.commands.live import Live
 from mapctl.commands.shared import options, streaming
-from mapctl.commands.shared.character import as_character, read_drawn_character
+from mapctl.commands.shared.character import as_character, read_character, read_drawn_character, read_rigged
 from mapctl.errors import RequestError
 from mapctl.intent.steering import Command
+from mapctl.motion import Motion
+from mapctl.retarget.carry import retarget_motion
 from mapctl.runtime.processes import reraise_ctrl_c
 from mapctl.terms import FootContact
 from scenes.drawn_character import DrawnCharacter
@@ -64,9 +66,10 @@ def _serve(command: Live, receiver: "OscReceiver | None") -> int:
 
 def _open_app(command: Live, receiver: "OscReceiver | None") -> "tuple[LiveApp, PoseStream | None]":
     prior, drawn = priors.load(command.prior), _read_drawn(command)
+    bodies = _read_bodies(command, drawn)
     orders = [SteeringInputs() for _ in range(command.characters)]
     with reraise_ctrl_c():
-        characters = _start_characters(command, drawn)
+        characters = _start_characters(command, bodies)
     try:
         skeletons = [character.skeleton for character in characters]
         stream = streaming.open_stream(_stream(command), skeletons)
@@ -79,6 +82,10 @@ def _open_app(command: Live, receiver: "OscReceiver | None") -> "tuple[LiveApp, 
             stream=stream,
             source=receiver,
             drawn=drawn,
+            rigs=_choose_recorded_rigs(command, drawn, bodies),
+            theme=command.theme,
+            rests=True,
+            recordings=Path.cwd(),
         )
         return show, stream
     except BaseException:
@@ -114,15 +121,34 @@ def _read_drawn(command: Live) -> list[DrawnCharacter | None]:
     return [read[file] for file in files] or [None] * command.characters
 
 
-def _start_characters(command: Live, drawn: Sequence[DrawnCharacter | None]) -> Sequence[CharacterProcess]:
+def _read_bodies(command: Live, drawn: Sequence[DrawnCharacter | None]) -> list[Character]:
+    """Read the body of each character: of its own file, else of --rig."""
+    rig = read_character(command.rig)
+    return [rig if one is None else as_character(one.body) for one in drawn]
+
+
+def _choose_recorded_rigs(
+    command: Live, drawn: Sequence[DrawnCharacter | None], bodies: Sequence[Character]
+) -> list[Callable[[Motion], Motion] | None]:
+    """Choose for each character what puts its recording on --rig; None where it stays as it is."""
+    if command.rig == "canonical":
+        return [None] * len(bodies)
+    rig = read_rigged(command.rig)
+
+    def carry(motion: Motion) -> Motion:
+        return rig.on_rig(retarget_motion(motion, rig).motion)
+
+    return [body.on_rig if one is None else carry for one, body in zip(drawn, bodies, strict=True)]
+
+
+def _start_characters(command: Live, bodies: Sequence[Character]) -> Sequence[CharacterProcess]:
     load = functools.partial(priors.load, command.prior)
     positions = [
         (_START_SPACING * (number - (command.characters - 1) / 2), 0.0) for number in range(command.characters)
     ]
     found: list[CharacterProcess] = []
     try:
-        for number, (at, body) in enumerate(zip(positions, drawn, strict=True)):
-            own = Character() if body is None else as_character(body.body)
+        for number, (at, own) in enumerate(zip(positions, bodies, strict=True)):
             request = CharacterRequest(
                 load,
                 Command(1.2, 0.0),

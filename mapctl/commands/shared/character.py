@@ -17,9 +17,14 @@ def read_character(text: str) -> Character:
     """Read the character: canonical, of a clip's skeleton, or with canonical bones on a preset's joints."""
     if text == "canonical":
         return Character()
+    return as_character(read_rigged(text))
+
+
+def read_rigged(text: str) -> "RiggedCharacter":
+    """Read the rig and stance of a clip, a preset or a rig file."""
     from mapctl.retarget.carry import RiggedCharacter
 
-    return as_character(RiggedCharacter.of(*inputs.read_rig_clip(text))[1])
+    return RiggedCharacter.of(*inputs.read_rig_clip(text))[1]
 
 
 def as_character(body: "RiggedCharacter") -> Character:

@@ -44,6 +44,6 @@ def _extract_part(body: Skin, joint: int) -> trimesh.Trimesh | None:
         return None
     used, packed = np.unique(faces, return_inverse=True)
     colours = np.column_stack([body.rgb[used], np.ones(len(used))])
-    mesh = trimesh.Trimesh(body.vertices[used], packed.reshape(-1, 3), process=False)
+    mesh = trimesh.Trimesh(body.vertices[used], packed.reshape(-1, 3), vertex_normals=body.normals[used], process=False)
     mesh.visual = ColorVisuals(mesh, vertex_colors=(255 * colours).round().astype(np.uint8))
     return mesh

@@ -1,0 +1,1 @@
+"""The panel of the live viewer: tabs in an order, and the controls in them."""

@@ -1,0 +1,1 @@
+"""How the live viewer looks: theme, ground and light, and where the camera is."""
