@@ -14,6 +14,7 @@ import subprocess
 import sys
 import threading
 import time
+import traceback
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -210,7 +211,7 @@ def _run_child(target: Target, ours: connection.Connection, prepared: Any, argum
         target(ours, prepared, *arguments)
         status = 0
     except BaseException:
-        sys.excepthook(*sys.exc_info())
+        traceback.print_exc()
     finally:
         with suppress(Exception):
             sys.stdout.flush()
@@ -232,7 +233,7 @@ def _dump(content: Any) -> bytes:
 
 
 def _load(content: bytes) -> Any:
-    return reduction.ForkingPickler.loads(content)
+    return reduction.ForkingPickler.loads(content)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _count_threads() -> int:

@@ -195,7 +195,7 @@ class Trap:
         return self.prior.rollout(*given, **named) if self.left else 1 / 0
 
 
-def trapped(load, left=150):
+def trapped(load, left=40):
     return Trap(load, left)
 
 
