@@ -6,7 +6,6 @@ Times cross between processes as values of time.perf_counter, which all processe
 
 import functools
 import math
-import multiprocessing
 import queue
 import threading
 from collections import deque
@@ -25,7 +24,7 @@ from mapctl.intent.steering import Arrival, Command
 from mapctl.runtime.forking import ForkedProcess, SharedBases, can_fork_for
 from mapctl.runtime.live_protocol import FrameChunk, SigmaRange
 from mapctl.runtime.memory import measure_memory_mb
-from mapctl.runtime.processes import send_queued, spawn
+from mapctl.runtime.processes import open_pipe, send_queued, spawn
 from mapctl.runtime.stream_time import RATES
 from mapctl.skeleton import Skeleton
 
@@ -179,7 +178,7 @@ class CharacterProcess:
 
     def _spawn(self) -> tuple[Connection, SpawnProcess]:
         """Start as a process that loads by itself."""
-        ours, theirs = multiprocessing.Pipe()
+        ours, theirs = open_pipe()
         with theirs:
             return ours, spawn(run_worker, theirs, None, self._request)
 

@@ -18,11 +18,11 @@ import traceback
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
-from multiprocessing import Pipe, connection, reduction, spawn
+from multiprocessing import connection, reduction, spawn
 from pathlib import Path
 from typing import Any
 
-from mapctl.runtime.processes import defer_ctrl_c
+from mapctl.runtime.processes import defer_ctrl_c, open_pipe
 
 AVAILABLE = sys.platform == "linux"
 """Whether processes are forked here. On macOS the system's own libraries do not survive it; Windows has no fork."""
@@ -90,7 +90,7 @@ class ForkingProcess:
 
     def __init__(self, prepare: Prepare, target: Target):
         """Start it; both are sent there, so that they must be importable by name."""
-        self._connection, theirs = Pipe()
+        self._connection, theirs = open_pipe()
         handle = theirs.fileno()
         path = spawn.get_preparation_data("forking")["sys_path"]
         code = f"import sys; sys.path[:] = {path!r}; from mapctl.runtime import forking; forking.serve({handle})"
@@ -121,8 +121,8 @@ class ForkingProcess:
         OSError where the process has ended.
         """
         message = _dump(arguments)
-        ours, theirs = Pipe()
-        reader, writer = Pipe(duplex=False)
+        ours, theirs = open_pipe()
+        reader, writer = open_pipe(duplex=False)
         with self._lock, theirs, writer:
             self._connection.send_bytes(message)
             for end in (theirs, writer):

@@ -25,6 +25,12 @@ def spawn(target: Callable[..., None], *arguments: Any) -> SpawnProcess:
     return process
 
 
+def open_pipe(*, duplex: bool = True) -> tuple[Connection, Connection]:
+    """Open a pipe and return its ends: both for reading and writing, or the first for reading, the second for writing."""
+    ends: Any = multiprocessing.Pipe(duplex)  # its type differs by system
+    return ends
+
+
 def send_queued(connection: Connection, messages: "queue.SimpleQueue[Any]") -> None:
     """Send queued messages, until None or the end of the process at the other end: for a thread, which may wait."""
     with suppress(OSError):
