@@ -167,6 +167,8 @@ class TrainingRun(Generic[C, S, T]):
     def _loop(self) -> None:
         saved, unsaved = time.monotonic(), False
         with defer_signals() as held:
+            if self.trainer.step == 0:  # there is nothing yet that an evaluation could be of use for
+                self._stop_if_wanted(held, *self.group.agree(held.wanted is not None))
             while True:
                 if self.evaluation_due:
                     self._evaluate(held)
@@ -176,13 +178,16 @@ class TrainingRun(Generic[C, S, T]):
                 if unsaved and (self.finished or overdue or wanted):
                     self._save_undisturbed(held)
                     saved, unsaved = time.monotonic(), False
-                if wanted:
-                    held.release()
-                    raise KeyboardInterrupt  # of a process that another one told
+                self._stop_if_wanted(held, wanted)
                 if self.finished:
                     return
                 self.update()
                 unsaved = True
+
+    def _stop_if_wanted(self, held: DeferredSignals, wanted: bool) -> None:
+        if wanted:
+            held.release()
+            raise KeyboardInterrupt  # of a process that another one told
 
     def update(self) -> None:
         """One step, of which half is of no use."""

@@ -190,12 +190,12 @@ class Trap:
     def __getattr__(self, name):
         return getattr(self.prior, name)
 
-    def rollout(self, *given, **named):
+    def plan_search(self, *given):
         self.left -= 1
-        return self.prior.rollout(*given, **named) if self.left else 1 / 0
+        return self.prior.plan_search(*given) if self.left else 1 / 0
 
 
-def trapped(load, left=40):
+def trapped(load, left=10):
     return Trap(load, left)
 
 
@@ -203,7 +203,9 @@ def trapped(load, left=40):
 def test_an_error_that_nobody_thought_of_is_told_in_a_line(load, capfd):
     broken = CharacterProcess(CharacterRequest(functools.partial(trapped, load), Command(1.0, 0.0)))
     broken.wait()
-    with pytest.raises(MapctlError, match=r"^a character's process ended: ZeroDivisionError: .*\(rollout, line \d+\)$"):
+    with pytest.raises(
+        MapctlError, match=r"^a character's process ended: ZeroDivisionError: .*\(plan_search, line \d+\)$"
+    ):
         collected(broken, 5.0)
     broken.close()
     assert "Traceback" not in "".join(capfd.readouterr())
@@ -251,8 +253,8 @@ def test_an_end_that_is_wanted_is_no_failure(load):
     [
         (lambda load: functools.partial(priors.load, "nobody"), r"no prior 'nobody'"),
         pytest.param(
-            lambda load: functools.partial(trapped, load, 40),
-            r"ZeroDivisionError: .*\(rollout, line \d+\)$",
+            lambda load: functools.partial(trapped, load, 10),
+            r"ZeroDivisionError: .*\(plan_search, line \d+\)$",
             marks=pytest.mark.slow,
         ),
     ],

@@ -85,11 +85,14 @@ def test_help_names_what_a_refiner_takes(capsys):
 def test_a_trained_refiner_is_used_by_generate(tmp_path, monkeypatch, capsys):
     train = run.train
 
-    def tiny(request, say, *, warn):
+    def tiny(request, say, *, warn, watchers):
         settings = replace(request.settings, window=10, batch=4, history=8, head_start=1, warm_up=1, critic_width=6)
         config = RefinerConfig(width=6, memory=5)
         return train(
-            replace(request, config=config, settings=settings, samples=4, judged=1, seconds=1.5), say, warn=warn
+            replace(request, config=config, settings=settings, samples=4, judged=1, seconds=1.5),
+            say,
+            warn=warn,
+            watchers=watchers,
         )
 
     monkeypatch.setattr(run, "train", tiny)

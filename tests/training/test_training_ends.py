@@ -299,7 +299,7 @@ def test_a_full_disk_ends_it_with_its_last_checkpoint(tmp_path, data, monkeypatc
     place = tmp_path / "run" / "step-3-checkpoint.safetensors"
     assert told.startswith(f"mapctl: cannot write {place}: No space left on device; step 2 is saved; go on with: ")
     left = {file.name for file in (tmp_path / "run").iterdir()}
-    assert left == {"cache", "checkpoint.json", "step-2-checkpoint.safetensors"}
+    assert left == {"cache", "checkpoint.json", "losses.csv", "step-2-checkpoint.safetensors"}
     monkeypatch.undo()
     assert mapctl_run(*words, "--resume") == 0
 
