@@ -101,7 +101,7 @@ def test_a_trained_refiner_is_used_by_generate(tmp_path, monkeypatch, capsys):
     assert cli.main([str(word) for word in words]) == 0
     told = capsys.readouterr()
     assert told.err == ""
-    assert "round 2: refiner" in told.out
+    assert "validation at round 2: " in told.out
     assert told.out.endswith(
         f"wrote {tmp_path / 'run' / 'model.safetensors'}; use it with --refiner {tmp_path / 'run'}\n"
     )
