@@ -9,6 +9,7 @@ import re
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -29,18 +30,16 @@ _PATIENCE_MS = 1500
 _TABS = ("Steer", "Path", "Reach", "Play", "Terms", "View")
 _TYPED = ("", "-", "1.2", "0", "99", "abc", "-40", "1e9", "3", "0.5")
 _KEYS = ("w", "a", "s", "d", "x", "b", "g", "c", "h", "r", "ArrowUp")
-_BUTTONS = (
-    "Walk it",
-    "Insert a point",
-    "Remove the point",
-    "Clear",
-    "Replay",
-    "Back to live",
-    "Reset",
-    "Pause",
-    "Go on",
-)
-_RECORD = ("Record", "Stop and save", "Break off", "Save again", "Download CSV", "Bring them here", "Reset the sigmas")
+_BUTTONS = {
+    "": ("Reset", "Pause", "Go on"),
+    "Path": ("Walk it", "Insert a point", "Remove the point", "Clear", "Download CSV"),
+    "Reach": ("Bring them here",),
+    "Play": ("Replay", "Back to live"),
+    "Terms": ("Reset the sigmas",),
+    "View": ("Show all",),
+}
+"""Buttons by the tab that holds them; the first are above the tabs."""
+_RECORD = ("Record", "Record", "Stop and save", "Break off", "Save again")
 
 
 @dataclass
@@ -105,8 +104,8 @@ class Visitor:
             "click": (6, self._click_ground),
             "drag": (4, self._drag),
             "check": (4, self._check),
-            "button": (8, lambda: self._press(self._random.choice(_BUTTONS))),
-            "record": (4, lambda: self._press(self._random.choice(_RECORD))),
+            "button": (8, self._press_any),
+            "record": (4, lambda: self._press("Play", self._random.choice(_RECORD))),
             "tab": (6, lambda: self._press_tab(self._random.choice(_TABS))),
             "reload": (1, self._reload),
             "vanish": (1, self._vanish),
@@ -169,11 +168,17 @@ class Visitor:
         if boxes:
             self._random.choice(boxes).click(force=True)
 
-    def _press(self, name: str) -> None:
-        self.page.get_by_role("button", name=name, exact=True).click(timeout=300)
+    def _press_any(self) -> None:
+        tab = self._random.choice(list(_BUTTONS))
+        self._press(tab, self._random.choice(_BUTTONS[tab]))
+
+    def _press(self, tab: str, name: str) -> None:
+        if tab:
+            self._press_tab(tab)
+        self.page.get_by_role("button", name=name, exact=True).click(timeout=500)
 
     def _press_tab(self, name: str) -> None:
-        self.page.get_by_role("tab", name=name).click(timeout=300)
+        self.page.get_by_role("tab", name=name).click(timeout=500)
 
     def _reload(self) -> None:
         self.page.reload(timeout=60_000)
@@ -182,9 +187,8 @@ class Visitor:
     def _vanish(self) -> None:
         """Go away, sometimes just after a file was asked for, and come back."""
         if self._random.random() < 0.5:
-            self.page.get_by_text("Stop and save").or_(self.page.get_by_text("Save again")).first.dispatch_event(
-                "click"
-            )
+            with suppress(Error):
+                self._press("Play", self._random.choice(("Stop and save", "Save again")))
         self.page.close()
         time.sleep(self._random.uniform(0, 4))
         self.page = self._open()
