@@ -26,7 +26,7 @@ def spawn(target: Callable[..., None], *arguments: Any) -> SpawnProcess:
 
 
 def open_pipe(*, duplex: bool = True) -> tuple[Connection, Connection]:
-    """Open a pipe and return its ends: both for reading and writing, or the first for reading, the second for writing."""
+    """Open a pipe and return its ends: the first reads and the second writes, or `duplex` both do both."""
     ends: Any = multiprocessing.Pipe(duplex)  # its type differs by system
     return ends
 

@@ -14,6 +14,7 @@ from mapctl.intent.steering import Command
 from mapctl.streaming.messages import Message
 from mapctl.streaming.orders import NUMBERS
 from mapctl.streaming.protocols import MessageSource
+from scenes.live.remote.orders import RemoteOrders
 
 
 class Source:
@@ -249,3 +250,14 @@ def test_whatever_comes_every_command_is_one_that_can_be_obeyed(messages):
                 assert word in ("command", "aim", "go", "walk", "pause", "reset")
                 assert command is None or (0 <= command.speed <= 3.8 and abs(command.heading) <= math.pi + 1e-9)
         assert not [text for text in show._notices._said if "wrong" in text]
+
+
+def test_packets_that_make_no_sense_are_said_once_a_minute():
+    source = Source()
+    orders = RemoteOrders(source, None, [], groups=())
+    source.dropped, source.fault = 3, "a packet that is no OSC (ParseError)"
+    said = [orders.report(100.0)]
+    source.dropped = 9
+    said += [orders.report(now) for now in (101.0, 159.0, 160.0, 161.0)]
+    fault = "OSC: a packet that is no OSC (ParseError)"
+    assert said == [f"{fault} (and 2 more)", None, None, f"{fault} (and 5 more)", None]

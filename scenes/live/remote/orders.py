@@ -13,6 +13,7 @@ from scenes.live.inputs import DISC_RADII, WITHIN, Refusal, SteeringInputs, pars
 
 _WITHIN_SECONDS = 2.0  # in which somebody is sent to a place, unless the order says
 _SAY_SECONDS = 2.0  # between two lines on the console, however many orders there are
+_SAY_DROPPED_SECONDS = 60.0  # between two lines about packets that make no sense
 _AIMS = (*HANDS, "look")
 _JOURNEYS = ("place", "path")
 _FOR_EVERYBODY = ("reset", "pause", "disc")
@@ -71,8 +72,8 @@ class RemoteOrders(Generic[MemberT]):
     ):
         """`groups` are the groups of the prior's labels."""
         self._source, self._stage, self._members, self._groups = source, stage, members, groups
-        self._noted, self._said_at, self._dropped = list[str](), -math.inf, 0
-        self._notes = 0
+        self._noted, self._said_at, self._notes = list[str](), -math.inf, 0
+        self._dropped, self._dropped_said_at = 0, -math.inf
 
     def obey(self) -> None:
         """Obey what came since the last time."""
@@ -91,9 +92,10 @@ class RemoteOrders(Generic[MemberT]):
 
     def report(self, now: float) -> str | None:
         """Return a line about orders that could not be obeyed, now and then; `now` is a value of time.perf_counter."""
-        if self._source.dropped > self._dropped:
-            self._dropped = self._source.dropped
-            self._note(self._source.fault)
+        dropped = self._source.dropped - self._dropped
+        if dropped and now - self._dropped_said_at >= _SAY_DROPPED_SECONDS:
+            self._dropped, self._dropped_said_at = self._source.dropped, now
+            return f"OSC: {self._source.fault}" + (f" (and {dropped - 1} more)" if dropped > 1 else "")
         if not self._notes or now - self._said_at < _SAY_SECONDS:
             return None
         more = f" (and {self._notes - 1} more)" if self._notes > 1 else ""
