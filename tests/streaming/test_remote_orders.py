@@ -254,7 +254,8 @@ def test_whatever_comes_every_command_is_one_that_can_be_obeyed(messages):
 
 def test_packets_that_make_no_sense_are_said_once_a_minute():
     source = Source()
-    orders = RemoteOrders(source, None, [], groups=())
+    with live_app([Actor()], source=source) as show:
+        orders = RemoteOrders(source, show, [], groups=())
     source.dropped, source.fault = 3, "a packet that is no OSC (ParseError)"
     said = [orders.report(100.0)]
     source.dropped = 9
