@@ -18,6 +18,7 @@ from helpers import run, walk
 import mapctl
 from mapctl import cli, formats
 from mapctl.formats import npz, usd
+from mapctl.formats.endings import USD_WRITTEN
 from mapctl.formats.growing import MotionWriter
 
 DOCS = (Path(__file__).parents[2] / "docs" / "formats.md").read_text("utf-8")
