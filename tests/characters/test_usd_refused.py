@@ -73,3 +73,16 @@ class TestBadFiles:
         monkeypatch.setattr(reader, "is_installed", lambda: False)
         with pytest.raises(FileFormatError, match=r"pip install 'mapctl\[usd\]'"):
             formats.load(path)
+
+
+def test_a_value_of_a_type_that_usd_does_not_know_is_none(monkeypatch):
+    """A damaged .usdc may hold one; it has no length."""
+    from pxr import Sdf, Usd
+
+    from mapctl.isolated.usd.skeletons import read_value
+
+    attribute = Usd.Stage.CreateInMemory().DefinePrim("/a").CreateAttribute("b", Sdf.ValueTypeNames.FloatArray)
+    attribute.Set([1.0, 2.0])
+    assert list(read_value(attribute)) == [1.0, 2.0]
+    monkeypatch.setattr(Usd.Attribute, "Get", lambda *given: Sdf.UnregisteredValue("mystery"))
+    assert read_value(attribute) is None

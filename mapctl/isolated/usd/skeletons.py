@@ -5,7 +5,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from pxr import Tf, Usd, UsdGeom, UsdSkel
+from pxr import Sdf, Tf, Usd, UsdGeom, UsdSkel
 
 from mapctl.isolated.child import Refusal
 from mapctl.isolated.naming import find_name, make_unique
@@ -91,11 +91,12 @@ def stage_to_world(stage: Usd.Stage) -> Array:
 
 
 def read_value(attribute: Usd.Attribute, time: Usd.TimeCode | None = None):
-    """Return an attribute's value, None where it has none: at a time, else its default or earliest one."""
+    """Return an attribute's value, None where it has none that USD knows: at a time, else its default or earliest one."""
     try:
-        return attribute.Get(Usd.TimeCode.EarliestTime() if time is None else time)
+        value = attribute.Get(Usd.TimeCode.EarliestTime() if time is None else time)
     except Tf.ErrorException:
         return None
+    return None if isinstance(value, Sdf.UnregisteredValue) else value
 
 
 def _find_parents(joints: list[str], where: str) -> list[int]:
