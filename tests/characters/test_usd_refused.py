@@ -81,7 +81,8 @@ def test_a_value_of_a_type_that_usd_does_not_know_is_none(monkeypatch):
 
     from mapctl.isolated.usd.skeletons import read_value
 
-    attribute = Usd.Stage.CreateInMemory().DefinePrim("/a").CreateAttribute("b", Sdf.ValueTypeNames.FloatArray)
+    stage = Usd.Stage.CreateInMemory()
+    attribute = stage.DefinePrim("/a").CreateAttribute("b", Sdf.ValueTypeNames.FloatArray)
     attribute.Set([1.0, 2.0])
     assert list(read_value(attribute)) == [1.0, 2.0]
     monkeypatch.setattr(Usd.Attribute, "Get", lambda *given: Sdf.UnregisteredValue("mystery"))

@@ -91,7 +91,7 @@ def stage_to_world(stage: Usd.Stage) -> Array:
 
 
 def read_value(attribute: Usd.Attribute, time: Usd.TimeCode | None = None):
-    """Return an attribute's value, None where it has none that USD knows: at a time, else its default or earliest one."""
+    """Return an attribute's value at a time, else its default or earliest one; None where it has none that is known."""
     try:
         value = attribute.Get(Usd.TimeCode.EarliestTime() if time is None else time)
     except Tf.ErrorException:
