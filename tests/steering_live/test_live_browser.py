@@ -115,9 +115,13 @@ def test_a_slider_and_keys_move_the_character_and_the_recording_shows_it(page, t
     assert shows(page, "Speed, m/s", 0)
 
 
+@pytest.mark.slow  # and alone: after it, later tests of this page waited for ever (to be found out)
 def test_a_held_key_walks_away_from_the_camera_and_a_stick_that_is_unplugged_stands(page):
-    time.sleep(1)  # what a key has just set is on its way to the page, and would replace what is typed at once
-    put(page, "Speed, m/s", 1.1)
+    open_tab(page, "Steer")
+    number(page, "Speed, m/s").click()
+    page.keyboard.press("Control+a")
+    page.keyboard.type("1.1")  # as people do: what is put in at once is lost where the server has just moved the slider
+    page.keyboard.press("Enter")
     assert shows(page, "Speed, m/s", 1.1)
     page.mouse.click(150, 500)
     try:
