@@ -115,7 +115,6 @@ def test_a_slider_and_keys_move_the_character_and_the_recording_shows_it(page, t
     assert shows(page, "Speed, m/s", 0)
 
 
-@pytest.mark.slow  # and alone: after it, later tests of this page waited for ever (to be found out)
 def test_a_held_key_walks_away_from_the_camera_and_a_stick_that_is_unplugged_stands(page):
     open_tab(page, "Steer")
     number(page, "Speed, m/s").click()
