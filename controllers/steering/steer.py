@@ -167,7 +167,9 @@ def begin(
     nearest = (starts.speed - command.speed).abs().argsort()[:_NEAREST_STARTS]
     pick = int(nearest[torch.randint(len(nearest), (1,), generator=generator)])
     state = starts.state.pick(torch.tensor([pick]))
-    ground_pose = GroundPose(torch.tensor(at) / character.scale, torch.tensor(command.heading))
+    ground_pose = GroundPose(
+        torch.tensor(at, dtype=torch.float32) / character.scale, torch.tensor(command.heading, dtype=torch.float32)
+    )
     start = start_from_state(state, ground_pose, character.unit_skeleton)
     first = start.committed.features
     motion = character.motion(decode(first, start.before_first, skeleton=character.unit_skeleton))
