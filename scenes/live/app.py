@@ -20,7 +20,7 @@ from scenes.drawn_character import DrawnCharacter
 from scenes.live import ground
 from scenes.live.access import ServerErrorReporter, restrict_to_own_pages
 from scenes.live.actor import LiveActor
-from scenes.live.cast import Cast
+from scenes.live.cast import Cast, make_members
 from scenes.live.export.recorder import Recorder
 from scenes.live.going import GoThere
 from scenes.live.inputs import InputLimits, Refusal, SteeringInputs
@@ -80,19 +80,14 @@ class LiveApp:
         Recordings grow in the folder `recordings`, where there is one, and survive a crash there.
         """
         channel = PageChannel()
-        with redirect_stdout(io.StringIO()), restrict_to_own_pages(channel):  # viser greets in a box of its own
-            self.server = viser.ViserServer(host=HOST, port=port, label="mapctl live", verbose=False)
+        self.server = _open_server(port, channel)
         self._bounds = InputLimits(math.floor(10 * fastest) / 10, labels)
         scene, gui = self.server.scene, self.server.gui
         self._layout = PanelLayout(gui)
         self._notices = Notifications(self.server)
         self._quiet = ServerErrorReporter(self.server.get_event_loop(), self._notices.console)
         scene.set_up_direction("+y")
-        nobody = [None] * len(characters)
-        members = [
-            LiveActor(scene, _WORLD, k, *one)
-            for k, one in enumerate(zip(characters, orders, drawn or nobody, rigs or nobody, strict=True))
-        ]
+        members = make_members(scene, _WORLD, characters, orders, drawn=drawn, rigs=rigs)
         self._todo: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._typed_at: float | None = None
         self._gauges = Readouts(gui)
@@ -111,20 +106,7 @@ class LiveApp:
         )
         self.path = PathEditor(scene, _WORLD, locate=self._find_ground, enqueue=self.enqueue)
         self._recorder = Recorder(lambda: self._cast.chosen, RecordingDelivery(self.server, self._notices), recordings)
-        self._panel = ControlPanel(
-            gui,
-            self._layout,
-            self,
-            self.targets,
-            self._view,
-            self.path,
-            self,
-            characters=len(characters),
-            bounds=self._bounds,
-            below=self._notices.below,
-            mode=self._view.mode,
-            theme=theme,
-        )
+        self._panel = self._build_panel(gui, len(characters), theme)
         self._view.attach(self._panel.viewing)
         self._panel.show(members[0].orders)
         self._timeline = Timeline(members, self.set_paused)
@@ -139,6 +121,22 @@ class LiveApp:
         self._watchers = Watchers(self.server, wake=lambda: self.enqueue(lambda: None))
         self._may_rest = rests and stream is None and source is None
         scene.on_click()(lambda event: self._draw_at(event.ray_origin, event.ray_direction))
+
+    def _build_panel(self, gui: viser.GuiApi, characters: int, theme: str) -> ControlPanel:
+        return ControlPanel(
+            gui,
+            self._layout,
+            self,
+            self.targets,
+            self._view,
+            self.path,
+            self,
+            characters=characters,
+            bounds=self._bounds,
+            below=self._notices.below,
+            mode=self._view.mode,
+            theme=theme,
+        )
 
     @property
     def url(self) -> str:
@@ -394,3 +392,8 @@ class LiveApp:
 
     def _label_recording(self) -> None:
         self._panel.recording.show(self._recorder)
+
+
+def _open_server(port: int, channel: PageChannel) -> viser.ViserServer:
+    with redirect_stdout(io.StringIO()), restrict_to_own_pages(channel):  # viser greets in a box of its own
+        return viser.ViserServer(host=HOST, port=port, label="mapctl live", verbose=False)

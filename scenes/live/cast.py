@@ -3,12 +3,17 @@
 import time
 from collections.abc import Callable, Sequence
 
+import viser
+
 from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import MapctlError
 from mapctl.features import PRIOR_FPS
-from mapctl.runtime.live_protocol import FrameChunk
+from mapctl.motion import Motion
+from mapctl.runtime.live_protocol import FrameChunk, LiveCharacter
 from mapctl.streaming.protocols import FrameStream
+from scenes.drawn_character import DrawnCharacter
 from scenes.live.actor import LiveActor
+from scenes.live.inputs import SteeringInputs
 from scenes.live.notifications import Notifications
 from scenes.live.readouts import Readouts
 
@@ -154,3 +159,19 @@ class Cast:
 
     def _run_safely(self, action: Callable[[], None]) -> None:
         self._notices.run_safely(action)
+
+
+def make_members(
+    scene: viser.SceneApi,
+    world: str,
+    characters: Sequence[LiveCharacter],
+    orders: Sequence[SteeringInputs],
+    *,
+    drawn: Sequence[DrawnCharacter | None] = (),
+    rigs: Sequence[Callable[[Motion], Motion] | None] = (),
+) -> list[LiveActor]:
+    """Make the characters below the scene's node `world`: mannequins without `drawn`, recorded as they move without
+    `rigs`."""
+    nobody = [None] * len(characters)
+    parts = zip(characters, orders, drawn or nobody, rigs or nobody, strict=True)
+    return [LiveActor(scene, world, k, *one) for k, one in enumerate(parts)]
