@@ -6,7 +6,8 @@ shown, so a command waits for two steps at most: 0.2 s at three frames a step.
 On a machine that is too slow, a step that begins late searches less, but has time for
 `SteerSettings.least_evaluations`, by what steps cost lately, so that commands are obeyed. If its frames are still
 later than `LoopSettings.slack`, the stream's time is held for as long: motion plays slower than real time, and no frame
-and no command is dropped.
+and no command is dropped. Where other processes hold steps up beyond the time that they were given, those that follow
+are to end earlier: several characters that share a machine's last processor all search less before any is late.
 """
 
 import time
@@ -25,6 +26,8 @@ from mapctl.intent.steering import Command, SteeringTarget
 from mapctl.motion import Motion
 from mapctl.problem.ledger import Ledger
 from mapctl.rotations import make_sign_continuous
+
+_MARGIN_USED, _MARGIN_RISE, _MARGIN_FALL = 0.75, 1.5, 0.997  # found within a second, and forgotten within a minute
 
 
 @runtime_checkable
@@ -128,8 +131,17 @@ class LoopSettings:
 
     margin: float = 0.015
     """Seconds before frames are due at which a step is to end: for the way to the display, and for other processes."""
+    most_margin: float = 0.05
+    """Seconds up to which the margin grows where steps end later than they were to."""
     slack: float = 0.1
     """Seconds by which frames may be late before time is held for them; less is compensated by searching less."""
+
+    def adapt_margin(self, margin: float, spare: float) -> float:
+        """Return the margin after a step of this one that ended `spare` seconds before its frames were due: larger if
+        much of it was used up, else a little smaller."""
+        if spare < _MARGIN_USED * margin:
+            return max(margin, min(self.most_margin, _MARGIN_RISE * margin))
+        return max(self.margin, _MARGIN_FALL * margin)
 
 
 @dataclass(frozen=True)
@@ -217,15 +229,16 @@ def iterate_steps(
     """
     settings = settings or LoopSettings()
     lead = state.settings.commit / PRIOR_FPS
-    begun = find_second_zero(clock, state)
+    begun, margin = find_second_zero(clock, state), settings.margin
     while True:
         due = state.frames / PRIOR_FPS
         clock.wait_until(begun + due - lead)
         asked = clock.now() - begun
-        left = due - asked - settings.margin
+        left = due - asked - margin
         seconds = max(left, state.cost.needed_seconds(state.settings.least_evaluations)) if clock.real else None
         state, new = (stepper or step)(state, source.at(asked), seconds=seconds)
         delivered = clock.now() - begun
+        margin = settings.adapt_margin(margin, due - delivered)
         held = delivered - due if clock.real and delivered - due > settings.slack else 0.0
         if held:
             clock.hold(held)  # before they are shown, since they are due now

@@ -20,6 +20,7 @@ from controllers.steering.sigmas import TunedStepper
 from controllers.steering.steer import SteerFrames, SteerSettings
 from mapctl import curves
 from mapctl.errors import MapctlError
+from mapctl.features import PRIOR_FPS
 from mapctl.intent.steering import Arrival, Command
 from mapctl.protocols import Density
 from mapctl.runtime.live_protocol import FrameChunk
@@ -27,6 +28,7 @@ from mapctl.runtime.stream_time import StreamTime
 from mapctl.skeleton import CANONICAL, Skeleton
 
 _WARM_UP_STEPS = 3  # steps before the clock starts, which compile and load what is needed
+_TURN = 0.618034  # share of a step between processes one after the other: multiples of the golden ratio spread evenly
 
 
 @dataclass(frozen=True)
@@ -202,12 +204,20 @@ def _run_character(connection: Connection, models: CharacterModels | None, reque
             if not warm:
                 _warm_up(state, first, models)
             connection.send(("ready", None))
+        _wait_for_turn(request.settings.commit / PRIOR_FPS)
         clock.begin(state, pose)
         for _ in iterate_steps(state, pilot, [clock], clock=clock, stepper=tuned):
             if clock.again:
                 break
         pilot.stay()
         first = pilot.at(clock.now())
+
+
+def _wait_for_turn(seconds: float) -> None:
+    """Wait until a moment that is this process's own among steps of so many seconds: characters that begin together
+    would search at the same time and then rest at the same time, and the last would have hardly any time to spare."""
+    turn = os.getpid() * _TURN % 1
+    time.sleep(seconds * ((turn - time.perf_counter() / seconds) % 1))
 
 
 def _warm_up(state: steer.SteerState, first: Command, models: CharacterModels) -> None:

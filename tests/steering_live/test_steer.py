@@ -12,7 +12,15 @@ from tiny_steering import AHEAD, DENSITY, QUICK, begun
 import priors
 from controllers.benchmarks.steering import SteeringBenchmarkSettings, benchmark_steering
 from controllers.steering import steer
-from controllers.steering.loop import Recorder, StepRecord, StreamClock, WallClock, drive, summarise_step_timing
+from controllers.steering.loop import (
+    LoopSettings,
+    Recorder,
+    StepRecord,
+    StreamClock,
+    WallClock,
+    drive,
+    summarise_step_timing,
+)
 from controllers.steering.pure_pursuit import PurePursuit
 from mapctl import curves
 from mapctl.curves.obstacles import Obstacle
@@ -227,6 +235,32 @@ def test_a_hiccup_is_made_up_for_and_time_goes_on():
     assert clock.held == 0.0
     assert sum(record.late_frames > 0 for record in records) == 1
     assert records[-1].asked == pytest.approx(records[-1].due - 0.1)
+
+
+def test_steps_that_others_hold_up_are_to_end_earlier():
+    clock, allowed = Labouring(0.0), []
+
+    def held_up(state, command, *, seconds=None):
+        allowed.append(seconds)
+        clock._now += seconds + 0.012
+        return steer.step(state, command)
+
+    _, records = drive(begun()[0], clock, [], frames=40, clock=clock, stepper=held_up)
+    spare = [record.due - record.delivered for record in records]
+    assert allowed[0] == pytest.approx(0.085)
+    assert spare[0] == pytest.approx(0.003)
+    assert min(spare[3:]) > 0.009
+
+
+def test_how_much_earlier_has_an_end_and_is_forgotten():
+    settings, margin = LoopSettings(), 0.015
+    for _ in range(100):
+        margin = settings.adapt_margin(margin, -0.2)
+    assert margin == settings.most_margin
+    for _ in range(600):
+        margin = settings.adapt_margin(margin, margin)
+    assert margin == settings.margin
+    assert LoopSettings(margin=0.2).adapt_margin(0.2, 0.0) == 0.2
 
 
 def test_against_the_wall_clock_it_takes_as_long_as_it_shows():
