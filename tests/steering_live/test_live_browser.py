@@ -199,12 +199,14 @@ def pester(pages, until: float, least: int) -> int:
 
 
 FOREIGN = """async port => {
+    const late = () => new Promise(done => setTimeout(() => done("no answer"), 20000));
     const outcome = socket => new Promise(done => {
         socket.onopen = () => done("open"); socket.onerror = () => done("refused");
     });
     const opened = name => outcome(new WebSocket(`ws://${name}:${port}`, "viser-v%s"));
     const fetched = fetch(`http://127.0.0.1:${port}/`).then(() => "read", () => "refused");
-    return await Promise.all([opened("127.0.0.1"), opened("localhost"), fetched]);
+    const tried = [opened("127.0.0.1"), opened("localhost"), fetched];
+    return await Promise.all(tried.map(one => Promise.race([one, late()])));
 }"""
 
 
