@@ -198,7 +198,7 @@ def soak(minutes: float, *words: object, seed: int = 0, tell: Callable[[str], No
     """Run `mapctl live` with these words, with a visitor, for some minutes."""
     report, live = SoakReport(), Live(*words)
     try:
-        with open_chromium() as browser:
+        with open_chromium(idle=True) as browser:
             visitor = Visitor(browser, live.url, report, seed)
             began, next_sample = time.monotonic(), 0.0
             while (gone := (time.monotonic() - began) / 60) < minutes and live.process.poll() is None:

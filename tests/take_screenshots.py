@@ -3,7 +3,8 @@
     python tests/take_screenshots.py FOLDER [NAME ...]
 
 starts `mapctl live` with one and with four characters, in both themes, and takes a picture of each at 700, 1280 and
-1920 pixels; a NAME such as four-dark-1280 takes that one alone. It needs Chromium and Playwright.
+1920 pixels; a NAME such as four-dark-1280 takes that one alone. All of them together are in sheet.jpg. It needs
+Chromium and Playwright.
 """
 
 import io
@@ -24,6 +25,7 @@ PUT_AWAY = """() => {
         if (/is too slow for this machine|more like this/.test(text.textContent)) text.remove();
 }"""
 MOST_BYTES = 250_000
+SHEET_HEIGHT = 300  # pixels of a row
 
 
 def list_names() -> Iterator[tuple[str, int, str, int]]:
@@ -42,6 +44,21 @@ def shrink(png: bytes) -> bytes:
     flat = Image.open(io.BytesIO(png)).convert("RGB").quantize(256, dither=Image.Dither.NONE)
     flat.save(packed, "PNG", optimize=True)
     return packed.getvalue()
+
+
+def write_sheet(folder: Path) -> None:
+    """All that were taken, small, those of a count and theme in a row."""
+    rows = []
+    for word in COUNTS:
+        for theme in THEMES:
+            paths = [folder / f"{word}-{theme}-{width}.png" for width in SIZES]
+            rows.append([Image.open(path).convert("RGB") for path in paths if path.exists()])
+    rows = [[one.resize((SHEET_HEIGHT * one.width // one.height, SHEET_HEIGHT)) for one in row] for row in rows if row]
+    sheet = Image.new("RGB", (max(sum(one.width for one in row) for row in rows), SHEET_HEIGHT * len(rows)))
+    for number, row in enumerate(rows):
+        for k, one in enumerate(row):
+            sheet.paste(one, (sum(before.width for before in row[:k]), number * SHEET_HEIGHT))
+    sheet.save(folder / "sheet.jpg", quality=85)
 
 
 def take(browser, live: Live, width: int) -> bytes:
@@ -74,6 +91,7 @@ def main(folder: Path, names: list[str]) -> None:
                     print(f"{name}: {len(png) / 1000:.0f} kB{' - too large' * (len(png) > MOST_BYTES)}")
             finally:
                 live.end()
+    write_sheet(folder)
 
 
 if __name__ == "__main__":
