@@ -81,8 +81,10 @@ def open_chromium(*, idle: bool = False) -> Iterator[Any]:
 
 
 def _write_idle_chromium(folder: Path) -> Path:
-    """Chromium raises the priority of the process that draws where it may, which this class of processes ignores."""
+    """Chromium raises the priority of the process that draws where it may, which this class of processes ignores. Of
+    sessions, whose shares are even on some systems whatever their processes' priority, its own is told to be small."""
     path = folder / "idle-chromium"
-    path.write_text(f'#!/bin/sh\nexec chrt --idle 0 "{CHROMIUM}" "$@"\n')
+    share = "echo 19 > /proc/self/autogroup"
+    path.write_text(f'#!/bin/sh\n({share}) 2> /dev/null\nexec chrt --idle 0 "{CHROMIUM}" "$@"\n')
     path.chmod(0o755)
     return path
