@@ -194,11 +194,13 @@ class Visitor:
         self.page = self._open()
 
 
-def soak(minutes: float, *words: object, seed: int = 0, tell: Callable[[str], None] = print) -> SoakReport:
-    """Run `mapctl live` with these words, with a visitor, for some minutes."""
+def soak(
+    minutes: float, *words: object, seed: int = 0, idle: bool = False, tell: Callable[[str], None] = print
+) -> SoakReport:
+    """Run `mapctl live` with these words, with a visitor, for some minutes; `idle` as in `open_chromium`."""
     report, live = SoakReport(), Live(*words)
     try:
-        with open_chromium(idle=True) as browser:
+        with open_chromium(idle=idle) as browser:
             visitor = Visitor(browser, live.url, report, seed)
             began, next_sample = time.monotonic(), 0.0
             while (gone := (time.monotonic() - began) / 60) < minutes and live.process.poll() is None:
@@ -252,7 +254,7 @@ def list_failures(report: SoakReport, minutes: float) -> list[str]:
 def main() -> int:
     """Run, and print what came of it."""
     minutes = float(os.environ.get(MINUTES, "30"))
-    report = soak(minutes, *sys.argv[1:])
+    report = soak(minutes, *sys.argv[1:], idle=True)
     failures = list_failures(report, minutes)
     if report.late_share > MAX_LATE_SHARE:
         failures.append(f"{100 * report.late_share:.1f} % of the frames were late")
