@@ -96,6 +96,14 @@ def data(tmp_path_factory) -> Path:
 
 
 @pytest.fixture
+def short_free_runs(monkeypatch):
+    """Densities in training are validated in a moment."""
+    from priors.training.quality import density
+
+    monkeypatch.setattr(density, "measure_free_runs", partial(density.measure_free_runs, runs=2, frames=20))
+
+
+@pytest.fixture
 def actors() -> list:
     """Two characters that note what they are told."""
     from stage import Actor

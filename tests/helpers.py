@@ -68,7 +68,7 @@ def _walk(frames: int, turn_rate: float, cadence: float, seed: int, fps: int) ->
     return Motion(CANONICAL, Fraction(fps), root, local)
 
 
-def walk_through(places_xz, *, headings=0.0, fps=30, swing=0.5, wobble=0.0, seed=0):
+def walk_through(places_xz, *, headings: float | Tensor = 0.0, fps=30, swing=0.5, wobble=0.0, seed=0):
     """The canonical body at these places; its legs swing once a second and its joints wobble (radians)."""
     frames = len(places_xz)
     time = torch.arange(frames, dtype=torch.float64) / fps

@@ -13,13 +13,14 @@ from jaxtyping import Float, Int
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from mapctl import retarget
 from mapctl.contacts import ContactSettings
-from mapctl.errors import MapctlError, RequestError
-from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode, integrate_root
-from mapctl.formats import load
+from mapctl.errors import RequestError
+from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, integrate_root
 from mapctl.retarget import rigs
 from priors.tensor_files import write_tensors
+from priors.training.mocap.clips import ClipReader
+from priors.training.mocap.cuts import find_cuts
+from priors.training.mocap.made import find_made
 
 LOCOMOTION = r"dataset-2_(walk|walk-turn-left|walk-turn-right|run)_"
 """Names of the clips that the bundled `locomotion` prior is trained on."""
@@ -51,6 +52,10 @@ class Corpus:
     """All frames, float32, physical units."""
     skipped: tuple[SkippedFile, ...] = ()
     """Files of the same folder that are not among the clips."""
+    cuts: tuple[str, ...] = ()
+    """For each table of frames that was used, its name and of how many of the clips it takes a part."""
+    made: tuple[str, ...] = ()
+    """How many of the clips are no mocap but made, and by which model (see `find_made`)."""
 
     def identity(self) -> dict[str, str]:
         """What tells this corpus from others: its size, and short hashes of names, lengths and features."""
@@ -142,12 +147,21 @@ def _split_by_frames(corpus: Corpus) -> Split:
 
 
 def read_corpus(
-    data: Path, *, match: str, cache: Path, skip_first: bool = False, progress: Callable[[int, int], None] | None = None
+    data: Path,
+    *,
+    match: str,
+    cache: Path,
+    skip_first: bool = False,
+    cuts: Path | None = None,
+    level: bool = False,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Corpus:
     """Every BVH below `data` whose path matches the pattern, as features at 30 fps; from the cache where it is fresh.
 
     Files that cannot be read or fit no known rig are left out, and listed in the corpus; RequestError where no other
-    is left. `skip_first` drops frame 0 (the T-pose of CMU takes).
+    is left. `skip_first` drops frame 0 (the T-pose of CMU takes). Of files that a table names, `cuts` or one found in
+    the folder (see `find_cuts`), only the frames that it says are taken. `level` puts every clip on the canonical body
+    and a level floor (see `stand_on_canonical`).
     """
     try:
         pattern = re.compile(match)
@@ -159,14 +173,20 @@ def read_corpus(
         unread = f"; {closed[0].name} cannot be read ({closed[0].reason})" if closed else ""
         matching = f" matches {match!r}" if found else ""
         raise RequestError(f"no .bvh below {data}{matching}{unread}")
-    key = _compute_cache_key(data, files, skip_first)
+    reader = ClipReader(data, skip_first, find_cuts(data, cuts), level)
+    key = _compute_cache_key(data, files, reader)
     stored = cache / f"corpus-{key}.safetensors"
     corpus = _read_cache(stored)
-    if corpus is None or _has_become_readable(corpus.skipped, data, skip_first):
-        corpus = _read_files(data, files, skip_first, progress or (lambda done, total: None))
+    if corpus is None or any(not isinstance(reader.read(data / file.name), str) for file in corpus.skipped):
+        corpus = _read_files(files, reader, progress or (lambda done, total: None))
         cache.mkdir(parents=True, exist_ok=True)
         _write_cache(corpus, stored)
-    return replace(corpus, skipped=(*corpus.skipped, *closed)) if closed else corpus
+    return replace(
+        corpus,
+        skipped=(*corpus.skipped, *closed),
+        cuts=reader.cuts.describe(corpus.names),
+        made=find_made(data, corpus.names),
+    )
 
 
 def _list_files(data: Path) -> tuple[list[Path], list[SkippedFile]]:
@@ -185,10 +205,10 @@ def _list_files(data: Path) -> tuple[list[Path], list[SkippedFile]]:
     return sorted(found), skipped
 
 
-def _read_files(data: Path, files: Sequence[Path], skip_first: bool, progress: Callable[[int, int], None]) -> Corpus:
+def _read_files(files: Sequence[Path], reader: ClipReader, progress: Callable[[int, int], None]) -> Corpus:
     clips, names, skipped = [], [], []
     for number, file in enumerate(files, start=1):
-        name, found = file.relative_to(data).as_posix(), _read_clip_or_reason(file, skip_first)
+        name, found = reader.name(file), reader.read(file)
         if isinstance(found, str):
             skipped.append(SkippedFile(name, found))
         else:
@@ -196,40 +216,9 @@ def _read_files(data: Path, files: Sequence[Path], skip_first: bool, progress: C
             names.append(name)
         progress(number, len(files))
     if not clips:
-        first = f"{data / skipped[0].name}: {skipped[0].reason}"
-        raise RequestError(f"none of the {len(files)} .bvh below {data} can be trained on ({first})")
+        first = f"{reader.data / skipped[0].name}: {skipped[0].reason}"
+        raise RequestError(f"none of the {len(files)} .bvh below {reader.data} can be trained on ({first})")
     return Corpus(tuple(names), tuple(len(c) for c in clips), torch.cat(clips), tuple(skipped))
-
-
-def _read_clip_or_reason(file: Path, skip_first: bool) -> Float[Tensor, "frames size"] | str:
-    """The clip, or why there is none. What no reader foresaw is a reason too: one file must not end a run."""
-    try:
-        return read_clip_features(file, skip_first=skip_first)
-    except (MapctlError, OSError) as error:
-        # The list has the name already.
-        return " ".join(str(error).split()).removeprefix(str(file)).lstrip(":, ")
-    except Exception as error:
-        return f"{type(error).__name__}: {' '.join(str(error).split())}"
-
-
-def _has_become_readable(skipped: Sequence[SkippedFile], data: Path, skip_first: bool) -> bool:
-    """Whether a file can be used that could not, though it is the same: permissions, a network drive."""
-    return any(not isinstance(_read_clip_or_reason(data / file.name, skip_first), str) for file in skipped)
-
-
-def read_clip_features(file: Path, *, skip_first: bool) -> Float[Tensor, "frames size"]:
-    """One file as features at 30 fps on the canonical joints; MapctlError, naming it, where that cannot be."""
-    motion = load(file)
-    if skip_first and motion.num_frames > 2:
-        motion = motion.slice(1, motion.num_frames)
-    try:
-        canonical, _ = retarget.to_canonical(motion)
-        features = encode(canonical.resample(PRIOR_FPS))[0].float()
-        if not bool(torch.isfinite(features).all()):
-            raise MapctlError("its motion is not finite")
-        return features
-    except MapctlError as error:
-        raise MapctlError(f"{file}: {error}") from error
 
 
 def find_window_starts(lengths: tuple[int, ...], window: int) -> Int[Tensor, " starts"]:
@@ -251,10 +240,17 @@ def number_clip_folders(corpus: Corpus) -> Int[Tensor, " clips"]:
     return torch.tensor([number[folder] for folder in folders])
 
 
-def _compute_cache_key(data: Path, files: list[Path], skip_first: bool) -> str:
-    """Hash everything that the features depend on: files, rig tables, contact thresholds, layout and rate."""
-    parts = [LAYOUT.fingerprint(), str(PRIOR_FPS), repr(rigs.known_rigs()), repr(ContactSettings()), str(skip_first)]
-    parts += [f"{f.relative_to(data)} {_read_file_stamp(f)}" for f in files]
+def _compute_cache_key(data: Path, files: list[Path], reader: ClipReader) -> str:
+    """Hash everything that the features depend on: files and their cuts, rig tables, contact thresholds, layout and
+    rate."""
+    parts = [LAYOUT.fingerprint(), str(PRIOR_FPS), repr(rigs.known_rigs()), repr(ContactSettings())]
+    parts += [
+        str(reader.skip_first),
+        *["level"] * reader.level,
+        *(f"{f.relative_to(data)} {_read_file_stamp(f)}" for f in files),
+    ]
+    cuts = [(reader.name(file), reader.cuts.find(reader.name(file))) for file in files]
+    parts += [f"{name} {cut.first} {cut.stop}" for name, cut in cuts if cut is not None]
     return sha256("\n".join(parts).encode(errors="surrogateescape")).hexdigest()[:16]
 
 

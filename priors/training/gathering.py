@@ -30,6 +30,10 @@ class DataSource:
     """Drop frame 0 of every clip (the T-pose of CMU takes)."""
     strict: bool = False
     """Refuse a folder with a file that cannot be used, rather than leave the file out."""
+    cuts: Path | None = None
+    """Table of the frames of each file that are motion; those named `Frame_Cuts.csv` in the folder are found."""
+    level: bool = False
+    """Put every clip on the canonical body and a level floor."""
     seed: int = 1
     """Seed of the split into training and validation clips."""
 
@@ -45,7 +49,13 @@ def gather(source: DataSource, *, progress: Progress, warn: Progress) -> tuple[C
             progress(f"read {done} of {total} clips")
 
     corpus = read_corpus(
-        source.data, match=source.match, cache=source.run / "cache", skip_first=source.skip_first, progress=news
+        source.data,
+        match=source.match,
+        cache=source.run / "cache",
+        skip_first=source.skip_first,
+        cuts=source.cuts,
+        level=source.level,
+        progress=news,
     )
     if source.strict and corpus.skipped:
         raise RequestError(f"--strict-data: {_list_skipped(corpus.skipped, source.data)}")
@@ -55,14 +65,26 @@ def gather(source: DataSource, *, progress: Progress, warn: Progress) -> tuple[C
         of = len(corpus.names) + len(corpus.skipped)
         warn(f"left out {len(corpus.skipped)} of {of} files: {_list_skipped(corpus.skipped, source.data)}{rest}")
         write_text(source.run / _SKIPPED_LIST, "".join(f"{file.name}: {file.reason}\n" for file in corpus.skipped))
+    for line in corpus.cuts:
+        progress(f"frames by {line}")
+    for line in corpus.made:
+        progress(f"made, not captured: {line}")
     size = f"{len(corpus.names)} clips, {len(corpus.features)} frames"
     progress(f"{size}; training on {len(parts.train.names)}{_describe_held_out(parts)}")
     return corpus, parts
 
 
-def describe_skipped(corpus: Corpus) -> dict[str, dict[str, str]]:
-    """For a card's data: the files that were left out and why; nothing where there are none."""
-    return {"skipped": {file.name: file.reason for file in corpus.skipped}} if corpus.skipped else {}
+def describe_selection(corpus: Corpus) -> dict[str, dict[str, str] | list[str]]:
+    """For a card's data: the files that were left out and why, and the tables that say which frames are motion, and
+    clips that a model made; nothing where there are none."""
+    found: dict[str, dict[str, str] | list[str]] = {}
+    if corpus.skipped:
+        found["skipped"] = {file.name: file.reason for file in corpus.skipped}
+    if corpus.cuts:
+        found["cuts"] = list(corpus.cuts)
+    if corpus.made:
+        found["made"] = list(corpus.made)
+    return found
 
 
 def _list_skipped(skipped: Sequence[SkippedFile], data: Path) -> str:

@@ -14,7 +14,7 @@ from mapctl.errors import CheckpointError, RequestError
 from priors import checkpoints
 from priors.config import NetworkConfig, require_at_least
 from priors.training.corpus import Corpus, Split
-from priors.training.gathering import DataSource, describe_skipped
+from priors.training.gathering import DataSource, describe_selection
 from priors.training.trainer import GradientTrainer, Trainer
 
 Row = dict[str, Any]
@@ -109,6 +109,10 @@ class Recipe(ABC, Generic[C, S, T]):
     """Licence of the weights, for the card."""
     skip_first: bool = False
     """Drop frame 0 of every clip (the T-pose of CMU takes)."""
+    cuts: Path | None = None
+    """Table of the frames of each file that are motion; those named `Frame_Cuts.csv` in the folder are found."""
+    level: bool = False
+    """Put every clip on the canonical body and a level floor."""
     strict_data: bool = False
     """Refuse a folder with a file that cannot be used, rather than leave the file out."""
 
@@ -144,7 +148,14 @@ class Recipe(ABC, Generic[C, S, T]):
     def source(self) -> DataSource:
         """Where motion comes from."""
         return DataSource(
-            self.data, self.out, self.match or "", self.skip_first, self.strict_data, seed=self.split_seed
+            self.data,
+            self.out,
+            self.match or "",
+            self.skip_first,
+            self.strict_data,
+            cuts=self.cuts,
+            level=self.level,
+            seed=self.split_seed,
         )
 
     @property
@@ -185,7 +196,7 @@ class Recipe(ABC, Generic[C, S, T]):
         corpus = gathered.corpus
         data = {
             **self.describe_data(corpus),
-            **describe_skipped(corpus),
+            **describe_selection(corpus),
             "match": self.match or "",
             "split_seed": self.split_seed,
             "held_out": gathered.held_out(),
@@ -205,9 +216,14 @@ class Recipe(ABC, Generic[C, S, T]):
         told = [name for name in _TOLD if hasattr(self.settings, name)]
         parts = [f"mapctl train {self.kind} --data DATA -o RUN"]
         parts += [f"--match '{self.match}'"] if self.match else []
-        parts += ["--skip-first"] * self.skip_first + self.format_shape()
+        parts += self.format_reading() + self.format_shape()
         parts += self.format_changed(self.usual_settings(), *told)
         return " ".join(parts + self.format_processes())
+
+    def format_reading(self) -> list[str]:
+        """The options for how clips are read, where they are not the defaults."""
+        parts = ["--skip-first"] * self.skip_first + ["--level"] * self.level
+        return parts + ([f"--cuts {self.cuts.name}"] if self.cuts else [])
 
     def format_processes(self) -> list[str]:
         """The option for several processes, where there were any."""

@@ -21,6 +21,7 @@ from priors.training import corpus as corpora
 from priors.training import recipe as recipe_module
 from priors.training import run as training_run
 from priors.training.gathering import DataSource, gather
+from priors.training.mocap import clips
 from priors.training.quality import density as density_quality
 from priors.training.recipes.denoiser import DenoiserSettings, DenoiserTrainer
 
@@ -113,34 +114,34 @@ def test_a_folder_of_nothing_else_is_refused(tmp_path, mixed):
 
 
 def test_a_fault_that_nobody_foresaw_leaves_one_file_out(tmp_path, data, monkeypatch):
-    whole = corpora.read_clip_features
+    whole = clips.read_clip_features
 
-    def odd(file, *, skip_first):
-        return 1 / 0 if file.name == "walk-1.bvh" else whole(file, skip_first=skip_first)
+    def odd(file, **told):
+        return 1 / 0 if file.name == "walk-1.bvh" else whole(file, **told)
 
-    monkeypatch.setattr(corpora, "read_clip_features", odd)
+    monkeypatch.setattr(clips, "read_clip_features", odd)
     found, _, _ = gathered(data, tmp_path / "run")
     assert found.skipped == (corpora.SkippedFile("walk-1.bvh", "ZeroDivisionError: division by zero"),)
 
 
 def test_the_cache_knows_what_was_left_out_and_tries_it_again(tmp_path, mixed, monkeypatch):
     first, _, warned = gathered(mixed, tmp_path / "run")
-    whole, read = corpora.read_clip_features, []
+    whole, read = clips.read_clip_features, []
 
-    def counted(file, *, skip_first):
+    def counted(file, **told):
         read.append(file.name)
-        return whole(file, skip_first=skip_first)
+        return whole(file, **told)
 
-    monkeypatch.setattr(corpora, "read_clip_features", counted)
+    monkeypatch.setattr(clips, "read_clip_features", counted)
     again, _, warned_again = gathered(mixed, tmp_path / "run")
     assert (again.skipped, warned_again) == (first.skipped, warned)
     assert set(read) == set(BAD)
 
-    def mended(file, *, skip_first):
-        return whole(mixed / "walk-1.bvh" if file.name == "lost.bvh" else file, skip_first=skip_first)
+    def mended(file, **told):
+        return whole(mixed / "walk-1.bvh" if file.name == "lost.bvh" else file, **told)
 
     monkeypatch.setattr(
-        corpora, "read_clip_features", mended
+        clips, "read_clip_features", mended
     )  # a drive that is there again: the files' dates are the same
     after, _, _ = gathered(mixed, tmp_path / "run")
     assert [name for name in after.names if name not in first.names] == ["lost.bvh"]

@@ -21,7 +21,8 @@ from mapctl.commands.train.options import TrainOptions
 from mapctl.runtime import interruption
 from mapctl.runtime.interruption import DeferredSignals
 from priors import checkpoints, tensor_files
-from priors.training import corpus, run, run_files
+from priors.training import run, run_files
+from priors.training.mocap import clips
 from priors.training.quality import density as density_quality
 from priors.training.recipes import lstm_gmm
 
@@ -254,7 +255,7 @@ def test_the_command_says_in_one_line_how_to_go_on(tmp_path, data, monkeypatch, 
 
 def test_the_command_says_where_nothing_is_saved(tmp_path, data, monkeypatch, capsys):
     interruption.raise_on_signals()
-    monkeypatch.setattr(corpus, "read_clip_features", lambda file, skip_first: send(signal.SIGINT))
+    monkeypatch.setattr(clips, "read_clip_features", lambda file, **told: send(signal.SIGINT))
     assert mapctl_run(*train_words(data, tmp_path / "run")) == 130
     assert capsys.readouterr().err == "mapctl: interrupted; nothing was saved yet\n"
     assert not (tmp_path / "run").exists()

@@ -29,12 +29,20 @@ class TrainDensity(TunableOptions):
     """The paper's own network and recipe instead of the measured better one; other options still hold."""
     labels: Annotated[str, arg(metavar="REGEX")] = ""
     """Named groups read labels from the clips' paths, as in '_(?P<gait>walk|run)_(?P<style>[a-z]+)_', for --style."""
+    copies: options.Count = 0
+    """Copies of each clip at other tempos and with other strides that training sees beside it: for a few minutes of
+    motion (docs/data.md)."""
+    tempo: options.Number = 0.15
+    """Largest change of a copy's tempo, as a share."""
+    strides: options.Number = 0.1
+    """Largest change of how far a copy steps, as a share: as of a body with other legs."""
     device: Annotated[Literal["auto", "cpu", "cuda"], arg(metavar="auto|cpu|cuda")] = "auto"
     """Where to compute."""
 
     def recipe(self) -> "DensityRecipe":
         """The options as the trainer takes them; RequestError for numbers that make no sense."""
         from priors.lstm_gmm.network import LstmGmmConfig
+        from priors.training.augmentation.clip_copies import ClipCopies
         from priors.training.recipes.lstm_gmm import PAPER, DensityRecipe, TrainingSettings
 
         common, shape = self.common(), self.select_given("width", "components")
@@ -42,12 +50,13 @@ class TrainDensity(TunableOptions):
             raise RequestError(
                 "with --init the network is that prior's; --width, --components and --paper do not apply"
             )
+        copies = ClipCopies(self.copies, tempo=self.tempo, strides=self.strides)
         config, settings = PAPER if self.paper else (LstmGmmConfig(), TrainingSettings())
         given = self.select_given("steps", "batch", "window", "learning_rate", "seed")
         return DensityRecipe(
             **common,
             config=replace(config, **shape),
-            settings=replace(settings, bfloat16=self.bfloat16, **given),
+            settings=replace(settings, bfloat16=self.bfloat16, copies=copies, **given),
             device=self.device,
             skip_first=self.skip_first,
             labels=self.labels,

@@ -41,6 +41,12 @@ class TrainOptions(ABC):
     """Run folder: checkpoints, training curve, and at the end model.safetensors with its card."""
     match: Annotated[str | None, arg(metavar="REGEX")] = None
     """Only clips whose path below the data folder holds this regular expression."""
+    cuts: options.MaybeFile = None
+    """Table (CSV) of file, first and last frame: which frames are motion. Each Frame_Cuts.csv in the data folder is
+    found by itself (docs/data.md)."""
+    level: bool = False
+    """Put every clip on the canonical body and a level floor: for captures whose floor slopes or whose feet rest at
+    other heights, as those of CMU."""
     steps: options.MaybeCount = None
     """Optimiser steps in all; with --resume, more than before extend a run, also a finished one."""
     seed: options.MaybeCount = None
@@ -141,6 +147,8 @@ class TrainOptions(ABC):
             "data": self.data,
             "out": self.out,
             "match": self.match,
+            "cuts": self.cuts,
+            "level": self.level,
             "resume": self.resume,
             "checkpoint_minutes": self.minutes_between_checkpoints,
             "strict_data": self.strict_data,

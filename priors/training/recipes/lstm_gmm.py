@@ -19,9 +19,11 @@ from priors.config import require_at_least
 from priors.lstm_gmm import density, labels
 from priors.lstm_gmm.labels import Labels
 from priors.lstm_gmm.network import NOISE_UNIT, LstmGmm, LstmGmmConfig
+from priors.training.augmentation.clip_copies import ClipCopies, add_copies
 from priors.training.corpus import Corpus, Split
-from priors.training.gathering import describe_skipped
+from priors.training.gathering import describe_selection
 from priors.training.initial_states import measure_data_limits, select_initial_states
+from priors.training.mocap.holdings import measure_holdings
 from priors.training.moment_matching import MatchingSettings, free_run_moment_loss
 from priors.training.parallel import count_launched
 from priors.training.quality import density as density_quality
@@ -57,6 +59,8 @@ class TrainingSettings:
     """Share of input contact bits that are flipped."""
     mirror: bool = True
     """Each window is mirrored left to right with probability one half."""
+    copies: ClipCopies = field(default_factory=ClipCopies)
+    """Copies of the clips at other tempos and with other strides, for corpora of a few minutes."""
     weight_decay: float = 1e-4
     """Decoupled, for adam."""
     matching: MatchingSettings = field(default_factory=MatchingSettings)
@@ -281,13 +285,14 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
 
     def make_trainer(self, parts: Split) -> DensityTrainer:
         """Make the trainer of a new network for the clips' labels, or of the initial network with its own labels."""
-        device, known = _select_device(self.device), labels.read(parts.train.names, self.labels)
+        corpus = add_copies(parts.train, self.settings.copies, torch.Generator().manual_seed(self.settings.seed))
+        device, known = _select_device(self.device), labels.read(corpus.names, self.labels)
         if self.init is None:
             config = replace(self.config, labels=known.names)
-            return DensityTrainer(config, self.settings, parts.train, device, labels=known)
+            return DensityTrainer(config, self.settings, corpus, device, labels=known)
         before = density.load(self.init).reference
         known = known.renamed(before.config.labels)
-        return DensityTrainer(before.config, self.settings, parts.train, device, labels=known, init=before.state_dict())
+        return DensityTrainer(before.config, self.settings, corpus, device, labels=known, init=before.state_dict())
 
     def find_shape(self, trainer: DensityTrainer) -> LstmGmmConfig:
         """Return the configuration of the network that is trained."""
@@ -319,7 +324,8 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
         data = {
             "clips": len(corpus.names),
             "frames": len(corpus.features),
-            **describe_skipped(corpus),
+            **describe_selection(corpus),
+            "holds": measure_holdings(corpus),
             "match": self.match or "",
             "labels": self.labels,
             "split_seed": self.split_seed,
@@ -345,8 +351,9 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
         parts = [f"mapctl train lstm-gmm --data DATA -o RUN --match '{self.match or ''}'"]
         parts += [f"--labels '{self.labels}'"] if self.labels else []
         parts += [f"--init {self.init}"] if self.init else [f"--width {self.config.width}"]
-        parts += ["--skip-first"] * self.skip_first + ["--bfloat16"] * self.settings.bfloat16
+        parts += self.format_reading() + ["--bfloat16"] * self.settings.bfloat16
         parts += self.format_changed(TrainingSettings(), "steps", "batch", "window", "learning_rate", "seed")
+        parts += self.settings.copies.format_options()
         return " ".join(parts + self.format_processes()) + (" --paper" if self.config.retain == 0 else "")
 
 

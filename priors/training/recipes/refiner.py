@@ -22,7 +22,7 @@ from priors.training.adversaries.guard import find_winner
 from priors.training.adversaries.history import HistoryBuffer
 from priors.training.adversaries.statistics import compute_statistics
 from priors.training.corpus import Corpus, Split
-from priors.training.gathering import DataSource, describe_skipped
+from priors.training.gathering import DataSource, describe_selection
 from priors.training.moment_matching import MatchingSettings, moment_loss
 from priors.training.parallel import TrainingGroup
 from priors.training.quality.refiner import RefinerEvaluator, compute_realism_gap, sample_corpus
@@ -346,7 +346,7 @@ class RefinerRecipe(Recipe[RefinerConfig, AdversarialSettings, AdversarialTraine
             "density_config": self.prior.reference.config.as_card(),
             "samples": self.samples,
             **self.describe_data(gathered.corpus),
-            **describe_skipped(gathered.corpus),
+            **describe_selection(gathered.corpus),
         }
         return Export(trainer.network.state_dict(), data, min(curve, key=compute_realism_gap))
 
@@ -355,6 +355,7 @@ class RefinerRecipe(Recipe[RefinerConfig, AdversarialSettings, AdversarialTraine
         paper = self.config == PAPER[0]
         parts = [f"mapctl train refiner --data DATA -o RUN --density {self.density}"]
         parts += [f"--match '{self.match}'"] if self.match is not None else []
+        parts += self.format_reading()
         usual = PAPER[1] if paper else AdversarialSettings()
         parts += self.format_changed(usual, "batch", "window", "seed", rounds="steps")
         parts += ["--bfloat16"] * self.settings.bfloat16 + ["--paper"] * paper

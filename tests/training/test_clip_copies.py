@@ -1,0 +1,188 @@
+"""Copies of clips at other tempos and with other strides are motions: feet stand, contacts hold, headings stay."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers import generator, moved, run, walk, write_corpus
+from performers import Performer
+
+import priors
+from mapctl.contacts import detect_contacts
+from mapctl.errors import RequestError
+from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode
+from mapctl.pose import BodyPose
+from mapctl.skeleton import TOE_JOINTS
+from priors.training.augmentation.clip_copies import ClipCopies, add_copies, change_strides, copy_clip
+from priors.training.augmentation.pose_windows import PoseWindows
+from priors.training.corpus import Corpus, Split
+from priors.training.recipes.lstm_gmm import DensityRecipe, TrainingSettings
+
+pytestmark = pytest.mark.usefixtures("short_free_runs")
+FACTORS = [(1.15, 1.0), (0.85, 1.0), (1.0, 1.1), (1.0, 0.9), (1.12, 1.08), (0.9, 0.93)]
+
+
+def corpus_of(*motions):
+    clips = [encode(motion)[0].float() for motion in motions]
+    return Corpus(tuple(f"{k}/walk_{k}.bvh" for k in range(len(clips))), tuple(map(len, clips)), torch.cat(clips))
+
+
+@pytest.fixture(scope="module")
+def corpus():
+    """A walk whose planted toes do not move at all, one that turns, and one who stands."""
+    turning = walk(90, turn_rate=0.6)
+    return corpus_of(Performer(upright=0.88).walks(120), turning, Performer().stands(60))
+
+
+@pytest.fixture(scope="module")
+def windows(corpus):
+    return PoseWindows(corpus, kinds=(), evenness=0.0)
+
+
+def decoded(features):
+    """World positions of joints on canonical bones, planted toes, and the features."""
+    places = BodyPose.of_features(features.double(), GroundPose.origin(torch.float64)).joints_world()
+    return places, places[:, list(TOE_JOINTS)], features[:, LAYOUT.slices["contacts"]] > 0.5
+
+
+def slide(toes, planted):
+    """Speeds of planted toes over the ground, m/s."""
+    return (torch.diff(toes, dim=0)[..., ::2].norm(dim=-1) * PRIOR_FPS)[planted[1:] & planted[:-1]]
+
+
+@pytest.mark.parametrize(("tempo", "strides"), FACTORS)
+def test_feet_that_stand_stand_in_a_copy(corpus, windows, tempo, strides):
+    before, after = decoded(corpus.clips()[0]), decoded(copy_clip(windows, 0, tempo=tempo, strides=strides))
+    for _, toes, planted in (before, after):
+        assert slide(toes, planted).quantile(0.9) < 0.01
+        # The first frame and the last of a contact are those of a toe that comes and goes.
+        assert slide(toes, planted).max() < 0.35 * tempo
+    heights = [toes[..., 1][planted] for _, toes, planted in (before, after)]
+    assert float((heights[1].median() - heights[0].median()).abs()) < 1e-3
+    assert after[1][..., 1].min() > before[1][..., 1].min() - 2e-3
+
+
+@pytest.mark.parametrize(("tempo", "strides"), FACTORS)
+@pytest.mark.parametrize("number", [0, 2])
+def test_contacts_are_those_that_are_detected_but_for_a_frame(windows, number, tempo, strides):
+    _, toes, planted = decoded(copy_clip(windows, number, tempo=tempo, strides=strides))
+    found = detect_contacts(toes, PRIOR_FPS)
+    wide = torch.nn.functional.max_pool1d(torch.stack([planted, ~planted]).double().movedim(1, -1), 5, 1, 2) > 0
+    allowed = wide.movedim(-1, 1)  # planted, or not, within two frames
+    assert bool(torch.where(found, allowed[0], allowed[1]).all())
+    assert float((found == planted).double().mean()) > 0.93
+
+
+@pytest.mark.parametrize(("tempo", "strides"), FACTORS)
+def test_ways_and_turns_are_in_proportion(corpus, windows, tempo, strides):
+    for number, clip in enumerate(corpus.clips()):
+        copy = copy_clip(windows, number, tempo=tempo, strides=strides)
+        assert len(copy) == int((len(clip) - 1) / tempo) + 1
+        turns = [float(LAYOUT.pick(features, "heading_change")[1:].sum()) for features in (clip, copy)]
+        # The last frame of a copy may lie before the last of its clip by less than a step.
+        assert turns[1] == pytest.approx(turns[0], abs=0.6 / PRIOR_FPS * tempo + 1e-3)
+        ways = [decoded(features)[0][:, 0, ::2] for features in (clip, copy)]
+        far = [float((way[-1] - way[0]).norm()) for way in ways]
+        assert far[1] == pytest.approx(strides * far[0], abs=0.05)
+        speeds = [LAYOUT.pick(f, "root_displacement_heading").norm(dim=-1).mean() for f in (clip, copy)]
+        assert float(speeds[1]) == pytest.approx(float(tempo * strides * speeds[0]), abs=3e-4)
+
+
+def test_a_direction_is_none(corpus):
+    """The same motion turned about the vertical and elsewhere gives the same features."""
+    clip = Performer().walks(60)
+    one, other = (encode(change_strides(m, 1.1))[0] for m in (clip, moved(clip, turn=2.0, shift=(4.0, -3.0))))
+    torch.testing.assert_close(one, other, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize(("tempo", "strides"), FACTORS)
+def test_nothing_jumps(corpus, windows, tempo, strides):
+    for number, clip in enumerate(corpus.clips()):
+        if number == 1:
+            continue  # legs that are straight to the hair are a procedure's, not a person's
+        before, after = (decoded(f)[0] for f in (clip, copy_clip(windows, number, tempo=tempo, strides=strides)))
+        step, jerk = ([torch.diff(p, n=n, dim=0).norm(dim=-1).max() for p in (before, after)] for n in (1, 2))
+        assert step[1] < step[0] * tempo * max(1, strides) * 1.05 + 1e-4
+        assert jerk[1] < jerk[0] * tempo**2 * max(1, strides) * 1.3 + 1e-3
+
+
+def test_a_copy_that_changes_nothing_is_the_clip(corpus, windows):
+    for number, clip in enumerate(corpus.clips()):
+        copy = copy_clip(windows, number, tempo=1.0, strides=1.0)
+        torch.testing.assert_close(copy, clip, atol=1e-5, rtol=0)
+
+
+def test_longer_strides_lower_the_hips_and_turn_no_other_joint(corpus):
+    clip = Performer().walks(90)
+    longer = change_strides(clip, 1.1)
+    assert float(longer.root_position[:, 1].mean()) < float(clip.root_position[:, 1].mean()) - 0.005
+    legs = {clip.skeleton.index(side + part) for side in ("left", "right") for part in ("UpperLeg", "LowerLeg", "Foot")}
+    others = [joint for joint in range(clip.skeleton.num_joints) if joint not in legs]
+    torch.testing.assert_close(longer.local_quat_xyzw[:, others].abs(), clip.local_quat_xyzw[:, others].abs())
+    assert torch.isfinite(longer.local_quat_xyzw).all()
+
+
+def test_copies_come_after_their_clips_with_their_names_and_the_seed_draws_them(corpus):
+    copies = ClipCopies(2)
+    one, again, other = (add_copies(corpus, copies, generator(seed)) for seed in (1, 1, 2))
+    assert one.names == corpus.names * 3
+    assert one.lengths[:3] == corpus.lengths
+    assert torch.equal(one.features[: len(corpus.features)], corpus.features)
+    assert torch.equal(one.features, again.features)
+    assert one.lengths != other.lengths
+    assert one.lengths[3:6] != one.lengths[6:9]
+    least, most = (corpus.lengths[0] / factor for factor in (1.15, 0.85))
+    assert all(least - 1 <= length <= most + 1 for length in (one.lengths[3], one.lengths[6]))
+    spread = [one.features[:, LAYOUT.slices["root_height"]], corpus.features]
+    assert all(map(lambda part: bool(torch.isfinite(part).all()), spread))
+
+
+def test_without_copies_the_corpus_is_what_it_was(corpus):
+    assert add_copies(corpus, ClipCopies(), generator()) is corpus
+    assert add_copies(corpus, ClipCopies(1, tempo=0.0, strides=0.0), generator()).lengths == corpus.lengths * 2
+
+
+def test_training_sees_copies_and_what_is_held_out_has_none(tmp_path):
+    clips = corpus_of(*(walk(90, turn_rate=0.2 * k, seed=k) for k in range(3)))
+    parts = Split(clips, clips.subset([0]), clips.subset([0]))
+    settings = TrainingSettings(window=20, batch=4, copies=ClipCopies(2))
+    recipe = DensityRecipe(tmp_path, tmp_path, settings=settings, labels=r"walk_(?P<which>\d)", device="cpu")
+    recipe = replace(recipe, config=replace(recipe.config, width=8, components=2))
+    trainer = recipe.make_trainer(parts)
+    assert len(trainer.clip_ends) == 9
+    assert len(trainer.windows.features) > 2.4 * len(clips.features)
+    held = trainer.labels.held
+    assert torch.equal(held[3:6], held[:3])
+    assert torch.equal(held[6:], held[:3])
+    assert math.isfinite(float(trainer.losses()["loss"].detach()))
+    plain = replace(recipe, settings=replace(settings, copies=ClipCopies())).make_trainer(parts)
+    assert torch.equal(plain.windows.features, clips.features)
+
+
+def test_the_command_takes_copies_and_resumes_with_them(tmp_path, capsys):
+    data, out = write_corpus(tmp_path / "data"), tmp_path / "run"
+    words = ("train", "lstm-gmm", "--data", data, "-o", out, "--width", 8, "--components", 2, "--window", 20)
+    words = (*words, "--batch", 3, "--device", "cpu", "--quiet", "--copies", 1, "--tempo", 0.1)
+    assert run(*words, "--steps", 1) == 0
+    command = priors.load(str(out)).card.training["command"]
+    assert "--copies 1 --tempo 0.1" in command
+    assert "--strides" not in command
+    assert run(*words, "--steps", 2, "--resume") == 0
+    assert run(*words[:-4], "--steps", 3, "--resume") == 2  # other data
+    assert "copies" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("option", "said"),
+    [
+        (("--copies", -1), "--copies must be 0 or more, got -1"),
+        (("--tempo", 0.5), "--tempo must lie between 0 and 0.3, got 0.5"),
+        (("--strides", -0.1), "--strides must lie between 0 and 0.3, got -0.1"),
+    ],
+)
+def test_numbers_that_make_no_sense_are_refused(tmp_path, capsys, option, said):
+    assert run("train", "lstm-gmm", "--data", tmp_path, "-o", tmp_path / "run", *option) == 2
+    assert capsys.readouterr().err == f"mapctl: {said}\n"
+    with pytest.raises(RequestError):
+        ClipCopies(-1)
