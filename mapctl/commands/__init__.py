@@ -26,7 +26,7 @@ from mapctl.commands.measure import Measure
 from mapctl.commands.render import Render
 from mapctl.commands.run import RunScene
 from mapctl.commands.steer import Steer
-from mapctl.commands.train import MODELS, Train
+from mapctl.commands.train import KINDS, Train
 from mapctl.commands.tween import Tween
 
 
@@ -62,7 +62,7 @@ COMMANDS: dict[str, type[Runnable]] = {
     "bench": Bench,
 }
 """Sub-commands by the name the user types, in the order of the help."""
-SUBCOMMANDS: dict[str, Mapping[str, type[Runnable]]] = {"bench": TABLES, "train": {kind.model: kind for kind in MODELS}}
+SUBCOMMANDS: dict[str, Mapping[str, type[Runnable]]] = {"bench": TABLES, "train": KINDS}
 """The sub-commands of commands that have some."""
 IMPLIED = {"bench": next(iter(TABLES))}
 """Default of the sub-commands, by command."""

@@ -1,9 +1,10 @@
 """What a training run needs: data and settings. A model's own recipe says what is learnt, judged and described."""
 
+import math
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
-from dataclasses import Field, asdict, dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import Field, asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Generic, Protocol, TypeVar, runtime_checkable
 
@@ -14,6 +15,8 @@ from mapctl.errors import CheckpointError, RequestError
 from priors import checkpoints
 from priors.config import NetworkConfig, require_at_least
 from priors.training.corpus import Corpus, Split
+from priors.training.ending.course import VALIDATIONS, End, UntilFlat
+from priors.training.ending.flatness import Point
 from priors.training.gathering import DataSource, describe_selection
 from priors.training.trainer import GradientTrainer, Trainer
 
@@ -84,6 +87,12 @@ class Recipe(ABC, Generic[C, S, T]):
     guards: ClassVar[tuple[str, ...]] = ()
     """Losses by which training may end by itself (see `find_stop_reason`). Where there are any, they are saved with the
     checkpoints, and the best weights so far (see `score`) are exported instead of the last."""
+    falls: ClassVar[bool] = True
+    """Whether the learning rate falls to nothing at the end, which then has to be known before it comes."""
+    decay_cost: ClassVar[float] = 1.0
+    """How much longer a step takes in the decay of a run until its curve is flat than before it."""
+    headline: ClassVar[str] = "error"
+    """What `find_headline` tells: the one number that says how good a model is, smaller where it is better."""
 
     data: Path
     """Folder of BVH files, searched below."""
@@ -102,7 +111,7 @@ class Recipe(ABC, Generic[C, S, T]):
     report_steps: int = 100
     """Between lines of news."""
     validate_steps: int = 1000
-    """Steps between two validations."""
+    """Steps between two validations; until its curve is flat a run has its own."""
     processes: int = 1
     """Processes that share the batch of each step: forked where there are several, unless torchrun has started them."""
     licence: str = "that of the training data"
@@ -115,6 +124,12 @@ class Recipe(ABC, Generic[C, S, T]):
     """Put every clip on the canonical body and a level floor."""
     strict_data: bool = False
     """Refuse a folder with a file that cannot be used, rather than leave the file out."""
+    split: int | None = None
+    """Seed by which clips are kept from training, where it is not that of all that is random."""
+    until_flat: UntilFlat | None = None
+    """Train until the curve of validations is flat; the settings' steps are then a plan."""
+    minutes: float | None = None
+    """Of one core, within which training ends as if it were finished."""
 
     def __post_init__(self):
         require_at_least(self, 1, "report_steps", "validate_steps", "processes")
@@ -133,6 +148,11 @@ class Recipe(ABC, Generic[C, S, T]):
             raise RequestError(
                 f"{self.processes} processes cannot share what a {self.counter} of {self.kind} takes:"
                 f" {self.most_processes} at most"
+            )
+        if self.minutes is not None and self.falls and self.until_flat is None:
+            raise RequestError(
+                f"minutes limit a {self.kind} only until its curve is flat (--until-flat):"
+                f" otherwise its learning rate goes by its {self.counter}s"
             )
 
     @property
@@ -161,7 +181,7 @@ class Recipe(ABC, Generic[C, S, T]):
     @property
     def split_seed(self) -> int:
         """Seed by which clips are kept from training."""
-        return self.settings.seed
+        return self.settings.seed if self.split is None else self.split
 
     def find_shape(self, trainer: T) -> C:
         """Return the configuration of the network that is trained."""
@@ -169,7 +189,11 @@ class Recipe(ABC, Generic[C, S, T]):
 
     def describe_data(self, corpus: Corpus) -> dict[str, str]:
         """What tells the data of this run from others'."""
-        return corpus.identity()
+        return corpus.identity() | self.describe_split()
+
+    def describe_split(self) -> dict[str, str]:
+        """The seed by which clips are kept from training, where it was told."""
+        return {} if self.split is None else {"split seed": str(self.split)}
 
     def pin(self, trainer: T, corpus: Corpus) -> dict[str, Row]:
         """What must not change between a run's parts. The number of steps may: a run can be extended."""
@@ -190,6 +214,48 @@ class Recipe(ABC, Generic[C, S, T]):
     def score(self, row: Row) -> float:
         """How far measures are from what is wanted."""
         return 0.0
+
+    @property
+    def validation_steps(self) -> int:
+        """Steps between two validations: of a run until its curve is flat so many that the curve can be judged."""
+        return self.validate_steps if self.until_flat is None else max(1, self.steps // VALIDATIONS)
+
+    def least_steps(self) -> int:
+        """Steps before which no curve is flat: until then something grows or joins."""
+        return self.steps // 2
+
+    def tell_end(self, end: End | None) -> "Recipe[C, S, T]":
+        """The recipe by which any other run ends where this one did: it tells what a clock has decided."""
+        if end is None or not end.by_clock:
+            return self
+        if self.until_flat is not None:
+            return replace(self, until_flat=replace(self.until_flat, decay_from=end.decay))
+        return replace(self, settings=replace(self.settings, **{self.steps_name: end.decay.end}))
+
+    @classmethod
+    def find_headline(cls, row: Row) -> float:
+        """Find the one number among measures of held-out clips that says how good a model is; NaN without one."""
+        return math.nan
+
+    @classmethod
+    def find_card_headline(cls, quality: Row) -> float:
+        """Find it in the quality that a card tells: that of the test clips, where there is no other."""
+        return cls.find_headline(quality.get("test", quality))
+
+    @classmethod
+    def find_log_error(cls, row: Row) -> float:
+        """The logarithm of the error that a row of measures tells: 0.01 less is one percent better."""
+        return cls.as_log_error(cls.find_headline(row))
+
+    @classmethod
+    def as_log_error(cls, value: float) -> float:
+        """The same of the one number that `find_headline` tells."""
+        return math.log(value) if 0 < value < math.inf else math.nan
+
+    def find_points(self, curve: Sequence[Row]) -> list[Point]:
+        """The curve of validations as it is looked at for being flat."""
+        points = [(int(row[self.counter]), self.find_log_error(row)) for row in curve]
+        return [point for point in points if math.isfinite(point[1])]
 
     def export(self, trainer: T, gathered: Gathered, curve: Sequence[Row]) -> Export:
         """What is written at the end."""
@@ -218,7 +284,16 @@ class Recipe(ABC, Generic[C, S, T]):
         parts += [f"--match '{self.match}'"] if self.match else []
         parts += self.format_reading() + self.format_shape()
         parts += self.format_changed(self.usual_settings(), *told)
-        return " ".join(parts + self.format_processes())
+        return " ".join(parts + self.format_processes() + self.format_ending())
+
+    def format_ending(self) -> list[str]:
+        """The options for a split of its own, and for a run until its curve is flat."""
+        parts = [] if self.split is None else [f"--split-seed {self.split}"]
+        if self.until_flat is None:
+            return parts
+        share, given = self.until_flat.share, self.until_flat.decay_from
+        parts += ["--until-flat"] if share == UntilFlat.share else [f"--until-flat --flat-share {share:g}"]
+        return parts + ([] if given is None else [f"--decay-from {given}"])
 
     def format_reading(self) -> list[str]:
         """The options for how clips are read, where they are not the defaults."""
@@ -289,6 +364,12 @@ def find_split_seed(init: str | None, own: int) -> int:
     if init is None:
         return own
     return checkpoints.load(checkpoints.locate(init))[1].data.get("split_seed", own)
+
+
+def average_logarithms(values: Iterable[float | None]) -> float:
+    """Geometric mean of the positive ones among them, NaN of none: a tenth less of any counts alike."""
+    logs = [math.log(value) for value in values if value is not None and value > 0]
+    return math.exp(sum(logs) / len(logs)) if logs else math.nan
 
 
 def average(rows: Sequence[Row], name: str) -> float:

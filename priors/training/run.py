@@ -19,6 +19,7 @@ from mapctl.errors import RequestError
 from mapctl.runtime.interruption import DeferredSignals, defer_signals
 from priors import checkpoints
 from priors.training import parallel, run_files
+from priors.training.ending.course import Course
 from priors.training.gathering import Progress, gather
 from priors.training.parallel import ALONE, TrainingGroup
 from priors.training.recipe import C, Gathered, Recipe, Row, S, T, average, copy_weights
@@ -104,6 +105,9 @@ class TrainingRun(Generic[C, S, T]):
         """Where the number of steps was changed: at which step, from what, to what."""
         self.stop_reason: str | None = None
         self.best: dict[str, Tensor] = copy_weights(self.trainer.network) if recipe.guards else {}
+        self.course = Course(
+            recipe.until_flat, recipe.minutes, self.trainer, least=recipe.least_steps(), cost=recipe.decay_cost
+        )
         self._check_together()
         self._table = LossesFile(recipe.out, recipe.counter)
         self.watchers: list[Watcher] = [self._table, EventFiles(recipe.out), *watchers] if group.leads else []
@@ -126,7 +130,7 @@ class TrainingRun(Generic[C, S, T]):
         if self.recipe.guards and not self.curve:
             return True
         step, measured = self.trainer.step, self.curve[-1][self.recipe.counter] if self.curve else 0
-        due = step >= self.trainer.steps or step % self.recipe.validate_steps == 0
+        due = step >= self.trainer.steps or step % self.recipe.validation_steps == 0
         return due and step > measured and self.stop_reason is None
 
     def go(self) -> None:
@@ -153,7 +157,7 @@ class TrainingRun(Generic[C, S, T]):
             recipe.counter,
             self.trainer.step,
             self.trainer.steps,
-            recipe.validate_steps,
+            recipe.validation_steps,
             recipe.format_news,
         )
         try:
@@ -174,7 +178,12 @@ class TrainingRun(Generic[C, S, T]):
                     self._evaluate(held)
                     unsaved = self.trainer.step > 0
                 late = self.group.leads and time.monotonic() - saved > 60 * self.recipe.checkpoint_minutes
-                overdue, wanted = self.group.agree(late, held.wanted is not None)
+                up = self.group.leads and self.course.overdue
+                overdue, wanted, up = self.group.agree(late, held.wanted is not None, up)
+                if self._decide_end(up):  # a clock does not decide twice at the same step: it is saved at once
+                    if self.evaluation_due:
+                        self._evaluate(held)
+                    overdue = True
                 if unsaved and (self.finished or overdue or wanted):
                     self._save_undisturbed(held)
                     saved, unsaved = time.monotonic(), False
@@ -183,6 +192,16 @@ class TrainingRun(Generic[C, S, T]):
                     return
                 self.update()
                 unsaved = True
+
+    def _decide_end(self, overdue: bool) -> bool:
+        """Whether it is decided now when the run ends."""
+        end = self.course.decide(self.recipe.find_points(self.curve), overdue=overdue, group=self.group)
+        if end is None:
+            return False
+        self.progress(f"{end.reason}: training ends at {self.recipe.counter} {self.trainer.steps}")
+        for watcher in self.watchers:
+            watcher.see_end(self.trainer.steps)
+        return True
 
     def _stop_if_wanted(self, held: DeferredSignals, wanted: bool) -> None:
         if wanted:
@@ -220,7 +239,7 @@ class TrainingRun(Generic[C, S, T]):
 
     def export(self) -> Path:
         """Write the model with its card."""
-        recipe, path = self.recipe, self.recipe.out / "model.safetensors"
+        recipe, path = self.recipe.tell_end(self.course.end), self.recipe.out / "model.safetensors"
         if not self.group.leads:
             return path
         if recipe.guards:
@@ -232,7 +251,7 @@ class TrainingRun(Generic[C, S, T]):
             config=recipe.find_shape(self.trainer).as_card(),
             licence=recipe.licence,
             data=made.data,
-            training=training | ({"extended": self.extended} if self.extended else {}),
+            training=training | ({"extended": self.extended} if self.extended else {}) | self.course.as_card(),
             quality=made.quality,
             abilities=made.abilities,
             **checkpoints.Card.layout_fields(),
@@ -252,7 +271,8 @@ class TrainingRun(Generic[C, S, T]):
     def _write_checkpoint(self, tensors: dict[str, Tensor]) -> bytes:
         index = {
             **self.pinned,
-            "steps": self.trainer.steps,
+            **self.course.as_index(),
+            "steps": self.recipe.steps if self.trainer.steady else self.trainer.steps,
             "first_steps": self.trainer.first_steps,
             "extended": self.extended,
             "processes": self.recipe.processes,
@@ -280,6 +300,7 @@ class TrainingRun(Generic[C, S, T]):
             raise KeyboardInterrupt
         row = json.loads(told)
         self.curve.append({self.recipe.counter: self.trainer.step, **row})
+        self.course.mark_validation()
         for watcher in self.watchers:
             watcher.see_validation(self.trainer.step, row)
 
@@ -313,6 +334,7 @@ class TrainingRun(Generic[C, S, T]):
             if recipe.guards:
                 self.best = {name: tensors[f"best.{name}"] for name in self.best}
             self._extend(index)
+            self.course.load(out, index)
             self.trainer.load_state(tensors, int(index["step"]))
             before = run_files.parse_processes(out, index)
         except run_files.UNREADABLE_ERRORS as error:
@@ -329,6 +351,10 @@ class TrainingRun(Generic[C, S, T]):
         before = int(index.get("steps") or index["settings"][recipe.steps_name])
         self.extended = [dict(row) for row in index.get("extended", [])]
         self.trainer.set_first_steps(int(index.get("first_steps", before)))
+        if recipe.until_flat is not None:
+            if recipe.steps != before:
+                raise RequestError(f"{recipe.out}: a run until its curve is flat keeps its --steps {before}")
+            return
         if recipe.steps < done:
             raise RequestError(
                 f"{recipe.out}: {done} {recipe.counter}s are done; --steps must be at least that, got {recipe.steps}"

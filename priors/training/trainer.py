@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from mapctl.errors import MapctlError
 from priors.training import run_files
 from priors.training.corpus import Corpus
+from priors.training.ending.decay import Decay
 from priors.training.parallel import ALONE, TrainingGroup
 
 _WARM_UP_SHARE = 0.05  # share of the steps in which the learning rate rises
@@ -30,6 +31,10 @@ class Trainer(ABC, Generic[Network]):
         self.first_steps = steps
         """Steps that the run was begun with: what grows with the share of the steps that are done, or joins at one,
         goes by these. Only the learning rate follows `steps` where the run is extended."""
+        self.steady = False
+        """Whether the learning rate stays at its highest until `decay` rather than follow a cosine over `steps`."""
+        self.decay: Decay | None = None
+        """Last steps of such a run, once it is known where they begin."""
         self.group = ALONE
         self.generator = torch.Generator().manual_seed(seed)
         """Draws what belongs to this process' share of a batch."""
@@ -46,6 +51,14 @@ class Trainer(ABC, Generic[Network]):
     def set_first_steps(self, steps: int) -> None:
         """Set the steps that the run was begun with, where they are not those that it goes on to."""
         self.first_steps = steps
+
+    def hold_rate(self, most: int) -> None:
+        """Keep the learning rate at its highest until a decay begins, over `most` steps in all."""
+        self.steady, self.steps = True, most
+
+    def begin_decay(self, decay: Decay) -> None:
+        """Let the learning rate fall to nothing in these steps, which are the last."""
+        self.decay, self.steps = decay, decay.end
 
     def take_step(self) -> dict[str, float]:
         """One step of all processes, each with random numbers of its own; the parts of its loss, means over them."""
@@ -129,7 +142,13 @@ class GradientTrainer(Trainer[Network]):
 
     def compute_learning_rate(self) -> float:
         """At the current step."""
+        if self.steady:
+            return self.learning_rate * find_rise(self.step, self.first_steps) * self.find_fall()
         return self.learning_rate * warmup_cosine(self.step, self.steps)
+
+    def find_fall(self) -> float:
+        """Share of the highest learning rate of a steady run: 1 until its decay begins."""
+        return 1.0 if self.decay is None else self.decay.compute_rate(self.step)
 
     def limit_gradients(self) -> None:
         """Clip what the loss has left in the weights, before the optimiser's step."""
@@ -183,3 +202,8 @@ def warmup_cosine(step: int, steps: int) -> float:
     if step < rise:
         return (step + 1) / rise
     return 0.5 * (1 + math.cos(math.pi * (step - rise) / max(1, steps - rise)))
+
+
+def find_rise(step: int, steps: int) -> float:
+    """Share of the highest learning rate in the beginning of a run of so many steps; 1 from then on."""
+    return min(1.0, (step + 1) / max(1, round(_WARM_UP_SHARE * steps)))

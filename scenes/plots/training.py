@@ -29,6 +29,8 @@ class Curve:
     """At which it was told."""
     values: tuple[float, ...]
     """At these steps, finite."""
+    mark: int | None = None
+    """Step from which the learning rate falls, drawn as a line, where that was decided in the run."""
 
 
 def plot_curves(curves: Sequence[Curve], path: str | PathLike[str], *, counter: str, title: str) -> None:
@@ -54,6 +56,25 @@ def plot_curves(curves: Sequence[Curve], path: str | PathLike[str], *, counter: 
         plots[0].figure.suptitle(f"{title}: training blue, validation red", fontsize=11)
 
 
+def plot_models(curves: Sequence[Curve], path: str | PathLike[str]) -> None:
+    """Write a PNG with a plot for each of several models, each over its own steps.
+
+    RequestError without matplotlib or curves.
+    """
+    if not curves:
+        raise RequestError("there are no curves to draw yet")
+    across = min(_ACROSS, len(curves))
+    down = -(-len(curves) // across)
+    inches = (_INCHES[0] * across, _INCHES[1] * down + 0.5)
+    with open_plots(path, down, inches=inches, dpi=_DPI, across=across, share_x=False) as axes:
+        plots = np.atleast_1d(axes).flatten()
+        for plot, curve in zip(plots, curves, strict=False):
+            _draw(plot, curve.name, [curve])
+        for plot in plots[len(curves) :]:
+            plot.set_axis_off()
+        plots[0].figure.suptitle("Unseen clips over the steps; dashed: the learning rate begins to fall", fontsize=11)
+
+
 def _draw(plot: Any, name: str, curves: Sequence[Curve]) -> None:
     for curve in curves:
         few = len(curve.steps) < 60
@@ -65,6 +86,8 @@ def _draw(plot: Any, name: str, curves: Sequence[Curve]) -> None:
             marker="o" if few else None,
             markersize=3,
         )
+        if curve.mark is not None:
+            plot.axvline(curve.mark, color="0.4", linewidth=0.8, linestyle="--")
     values = [value for curve in curves for value in curve.values]
     plot.set_title(name, fontsize=9)
     plot.tick_params(labelsize=7)

@@ -1,5 +1,6 @@
 """`mapctl train`: a model from a folder of BVH. One class of options a model, each in a file of its own."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import reduce
 from operator import or_
@@ -17,6 +18,7 @@ from mapctl.commands.train.pose_transformer import TrainPoseTransformer
 from mapctl.commands.train.refiner import TrainRefiner
 from mapctl.commands.train.stitcher import TrainStitcher
 from mapctl.commands.train.tweener import TrainTweener
+from mapctl.commands.train.whole_set import TrainAll
 
 MODELS: tuple[type[TrainOptions], ...] = (
     TrainDensity,
@@ -31,10 +33,16 @@ MODELS: tuple[type[TrainOptions], ...] = (
 )
 """Whatever can be trained: the options of each recipe in `priors.training.recipes`."""
 
+KINDS: Mapping[str, type[TrainOptions] | type[TrainAll]] = {
+    **{kind.model: kind for kind in MODELS},
+    TrainAll.model: TrainAll,
+}
+"""What `mapctl train` takes, by its name: one model, or all."""
+
 if TYPE_CHECKING:
     AnyModel = TrainOptions
 else:
-    AnyModel = reduce(or_, (Annotated[kind, subcommand(kind.model, prefix_name=False)] for kind in MODELS))
+    AnyModel = reduce(or_, (Annotated[kind, subcommand(name, prefix_name=False)] for name, kind in KINDS.items()))
 
 
 @dataclass(frozen=True)

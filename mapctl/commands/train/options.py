@@ -1,5 +1,6 @@
 """What `mapctl train` asks of any model: the options that all have, their checks, and the run."""
 
+import math
 import os
 import shlex
 import signal
@@ -17,6 +18,7 @@ from mapctl.errors import MapctlError, RequestError
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from priors.training.ending.course import UntilFlat
     from priors.training.recipe import Recipe
 
 CURVES = "curves.png"
@@ -51,6 +53,10 @@ class TrainOptions(ABC):
     """Optimiser steps in all; with --resume, more than before extend a run, also a finished one."""
     seed: options.MaybeCount = None
     """Seed of weights, windows, noise and the split of the clips."""
+    split_seed: options.MaybeCount = None
+    """Seed of the split of the clips alone, to compare runs of several seeds on the same unseen clips."""
+    minutes: options.MaybeNumber = None
+    """Of one core, within which training ends as if it were finished; networks need --until-flat for it."""
     resume: bool = False
     """Go on from the run folder's last checkpoint."""
     minutes_between_checkpoints: options.Number = 3.0
@@ -128,8 +134,11 @@ class TrainOptions(ABC):
         for name, value in self.select_given(*_COUNTS).items():
             if value < 1:
                 raise RequestError(f"--{name} must be at least 1, got {value}")
-        if self.seed is not None:
-            options.check_seed(self.seed)
+        for seed in (self.seed, self.split_seed):
+            if seed is not None:
+                options.check_seed(seed)
+        if self.minutes is not None and not 0 < self.minutes < math.inf:
+            raise RequestError(f"--minutes must be positive, got {self.minutes:g}")
         rate = getattr(self, "learning_rate", None)
         if rate is not None and not 0 < rate < 1:
             raise RequestError(f"the learning rate must lie between 0 and 1, got {rate:g}")
@@ -152,6 +161,8 @@ class TrainOptions(ABC):
             "resume": self.resume,
             "checkpoint_minutes": self.minutes_between_checkpoints,
             "strict_data": self.strict_data,
+            "split": self.split_seed,
+            "minutes": self.minutes,
             "licence": self.licence,
         }
 
@@ -212,3 +223,39 @@ class TunableOptions(NetworkOptions):
     """Begin with the weights of this model, bundled or trained, and fine-tune them."""
     skip_first: bool = False
     """Leave out frame 0 of every clip (the T-pose of CMU takes)."""
+    until_flat: bool = False
+    """Train until the curve of validations is flat, then let the learning rate fall; --steps is a plan, by which gaps
+    grow, of which a half is trained at least and three times as many at most (docs/training.md)."""
+    flat_share: options.MaybeNumber = None
+    """Flat is a curve whose error falls by less than this share over the last third of the steps; 0.02."""
+    decay_from: Annotated[str | None, arg(metavar="STEP:STEPS")] = None
+    """With --until-flat: let the learning rate fall from this step on, over so many, whatever the curve is like: what
+    the card names of a run that --minutes has ended."""
+
+    def check(self) -> None:
+        """RequestError for numbers that make no sense for any model."""
+        super().check()
+        if not self.until_flat and (self.flat_share is not None or self.decay_from is not None):
+            raise RequestError("--flat-share and --decay-from are for --until-flat")
+        if self.until_flat and getattr(self, "paper", False):
+            raise RequestError("--paper has a learning rate and a length of its own: leave out --until-flat")
+        if self.flat_share is not None and not 0 < self.flat_share < 1:
+            raise RequestError(f"--flat-share must lie between 0 and 1, got {self.flat_share:g}")
+
+    def common(self) -> dict[str, Any]:
+        """What every recipe takes, checked."""
+        return {**super().common(), "until_flat": self._make_rule() if self.until_flat else None}
+
+    def _make_rule(self) -> "UntilFlat":
+        from priors.training.ending.course import UntilFlat
+        from priors.training.ending.decay import Decay
+
+        decay = None if self.decay_from is None else Decay(*_parse_decay(self.decay_from))
+        return UntilFlat(decay_from=decay, **self.select_given(share="flat_share"))
+
+
+def _parse_decay(text: str) -> tuple[int, int]:
+    begin, _, steps = text.partition(":")
+    if not (begin.isdecimal() and steps.isdecimal()):
+        raise RequestError(f"--decay-from is STEP:STEPS, as 8000:2000, got {text!r}")
+    return int(begin), int(steps)

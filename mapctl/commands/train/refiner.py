@@ -28,6 +28,8 @@ class TrainRefiner(NetworkOptions):
     """The prior whose samples it refines."""
     paper: bool = False
     """The paper's own network and recipe instead of the measured better one; other options still hold."""
+    skip_first: bool = False
+    """Leave out frame 0 of every clip (the T-pose of CMU takes)."""
 
     def recipe(self) -> "RefinerRecipe":
         """The options as the trainer takes them; RequestError for numbers that make no sense."""
@@ -37,4 +39,6 @@ class TrainRefiner(NetworkOptions):
         config, settings = PAPER if self.paper else (RefinerConfig(), AdversarialSettings())
         given = self.select_given("batch", "window", "seed", rounds="steps")
         settings = replace(settings, bfloat16=self.bfloat16, **given)
-        return RefinerRecipe(**common, config=config, settings=settings, density=self.density)
+        return RefinerRecipe(
+            **common, config=config, settings=settings, density=self.density, skip_first=self.skip_first
+        )

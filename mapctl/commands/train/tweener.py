@@ -57,6 +57,8 @@ class TrainTweener(TunableOptions):
             "path": self.path,
             **({} if self.labels is None else {"labels": self.labels}),
         }
+        if self.until_flat and self.critic_from not in (None, "never"):
+            raise RequestError("a critic joins a run of a known length: leave out --until-flat or --critic-from")
         critic_from = self.critic_from or ("0" if self.paper else "never")
         if critic_from == "never":
             return TweenerRecipe(**everything)

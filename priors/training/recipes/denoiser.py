@@ -18,7 +18,7 @@ from priors.config import require_at_least
 from priors.denoiser.network import DenoiserConfig, DenoiserNetwork
 from priors.training.augmentation.corruption import CorruptionSettings, corrupt, make_clean_capture
 from priors.training.corpus import Corpus, Split
-from priors.training.recipe import NetworkRecipe
+from priors.training.recipe import NetworkRecipe, Row, average_logarithms
 from priors.training.trainer import GradientTrainer
 from priors.training.windows import FeatureWindows
 
@@ -102,6 +102,7 @@ class DenoiserRecipe(NetworkRecipe[DenoiserConfig, DenoiserSettings, DenoiserTra
     """What to train a denoiser on, and how."""
 
     kind = "denoiser"
+    headline = "loss, cm and weighted angles, feet, contacts"
     config: DenoiserConfig = field(default_factory=DenoiserConfig)
     """The network."""
     settings: DenoiserSettings = field(default_factory=DenoiserSettings)
@@ -110,6 +111,11 @@ class DenoiserRecipe(NetworkRecipe[DenoiserConfig, DenoiserSettings, DenoiserTra
     def make_untaught(self, parts: Split) -> DenoiserTrainer:
         """The trainer, its weights drawn."""
         return DenoiserTrainer(self.config, self.settings, parts.train)
+
+    @classmethod
+    def find_headline(cls, row: Row) -> float:
+        """The loss of unseen windows."""
+        return average_logarithms([row.get("loss")])
 
     def format_shape(self) -> list[str]:
         """The width, if it is another than usual."""

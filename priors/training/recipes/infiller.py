@@ -15,7 +15,7 @@ from priors.infiller.network import InfillerConfig, InfillerNetwork
 from priors.infiller.transitions import FRAMES_AFTER, PAST_FRAMES
 from priors.training.augmentation.gap_masks import GapSettings, sample_observation_mask, sample_transition
 from priors.training.corpus import Corpus, Split
-from priors.training.recipe import NetworkRecipe
+from priors.training.recipe import NetworkRecipe, Row, average_logarithms
 from priors.training.trainer import GradientTrainer
 from priors.training.windows import PositionWindows, Window
 
@@ -115,6 +115,7 @@ class InfillerRecipe(NetworkRecipe[InfillerConfig, InfillerSettings, InfillerTra
     """What to train an infiller on, and how."""
 
     kind = "infiller"
+    headline = "error over the guess's"
     config: InfillerConfig = field(default_factory=InfillerConfig)
     """The network."""
     settings: InfillerSettings = field(default_factory=InfillerSettings)
@@ -123,6 +124,12 @@ class InfillerRecipe(NetworkRecipe[InfillerConfig, InfillerSettings, InfillerTra
     def make_untaught(self, parts: Split) -> InfillerTrainer:
         """The trainer, its weights drawn."""
         return InfillerTrainer(self.config, self.settings, parts.train)
+
+    @classmethod
+    def find_headline(cls, row: Row) -> float:
+        """Error of gaps in unseen windows over that of the guess, geometric mean over their lengths."""
+        gaps = [gap for gap in VALIDATED_GAPS if row.get(f"guess_{gap}_cm") and row.get(f"error_{gap}_cm")]
+        return average_logarithms(row[f"error_{gap}_cm"] / row[f"guess_{gap}_cm"] for gap in gaps)
 
     def format_shape(self) -> list[str]:
         """The architecture, if it is another than usual."""

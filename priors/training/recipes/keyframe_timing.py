@@ -14,7 +14,7 @@ from mapctl.pose import decode
 from priors.config import require_at_least
 from priors.keyframe_timing.model import KeyframeTimingConfig, KeyframeTimingNetwork
 from priors.training.corpus import Corpus, Split
-from priors.training.recipe import Export, Gathered, Recipe, Row
+from priors.training.recipe import Export, Gathered, Recipe, Row, average_logarithms
 from priors.training.trainer import Trainer
 
 _PERCENTILES = (0.1, 0.9)  # between which four of five pairs lie
@@ -82,6 +82,8 @@ class KeyframeTimingRecipe(Recipe[KeyframeTimingConfig, KeyframeTimingSettings, 
     """What to fit a keyframe timing to, and how."""
 
     kind = "keyframe-timing"
+    falls = False
+    headline = "half of pairs off by a factor of"
     config: KeyframeTimingConfig = field(default_factory=KeyframeTimingConfig)
     """The regression."""
     settings: KeyframeTimingSettings = field(default_factory=KeyframeTimingSettings)
@@ -90,6 +92,11 @@ class KeyframeTimingRecipe(Recipe[KeyframeTimingConfig, KeyframeTimingSettings, 
     def make_trainer(self, parts: Split) -> KeyframeTimingTrainer:
         """With the pairs of poses that it is fitted to."""
         return KeyframeTimingTrainer(self.config, self.settings, parts.train)
+
+    @classmethod
+    def find_headline(cls, row: Row) -> float:
+        """The factor by which half of unseen pairs are off at most."""
+        return average_logarithms([row.get("half_off_by")])
 
     def export(self, trainer: KeyframeTimingTrainer, gathered: Gathered, curve: Sequence[Row]) -> Export:
         """Export the weights in float32: they are less than a kilobyte."""

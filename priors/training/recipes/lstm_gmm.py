@@ -157,7 +157,9 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
             nn.utils.clip_grad_value_(self.network.parameters(), settings.gradient_clip)
         else:
             nn.utils.clip_grad_norm_(self.network.parameters(), settings.gradient_clip)
-        if matching.begin < 1 and self.step >= matching.begin * self.first_steps and self.step % matching.every == 0:
+        # Of a run of unknown length the last part is its decay.
+        is_late = self.decay is not None if self.steady else self.step >= matching.begin * self.first_steps
+        if matching.begin < 1 and is_late and self.step % matching.every == 0:
             self._add_moment_gradient(self._latest)
 
     def compute_learning_rate(self) -> float:
@@ -167,6 +169,8 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
             passes = self.step * settings.batch * settings.window // max(1, len(self.windows.features))
             return settings.learning_rate * 0.95**passes
         warm = min(1.0, (self.step + 1) / 200)
+        if self.steady:
+            return warm * settings.learning_rate * self.find_fall()
         return warm * settings.learning_rate * 0.5 * (1 + math.cos(math.pi * min(1.0, self.step / self.steps)))
 
     def make_optimisers(self) -> dict[str, torch.optim.Optimizer]:
@@ -256,6 +260,8 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
     """What to train a density on, and how."""
 
     kind = "lstm-gmm"
+    headline = "nats a frame"
+    decay_cost = 1.4  # free runs are compared
     config: LstmGmmConfig = field(default_factory=LstmGmmConfig)
     """The network."""
     settings: TrainingSettings = field(default_factory=TrainingSettings)
@@ -302,7 +308,7 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
         """What tells the data of this run from others'."""
         return corpus.identity() | {
             "match": self.match or "",
-            "split seed": str(self.settings.seed),
+            "split seed": str(self.settings.seed if self.split is None else self.split),
             "labels": self.labels,
             "init": self.init or "",
         }
@@ -310,6 +316,21 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
     def format_news(self, rows: Sequence[Row]) -> str:
         """One line on the losses of some steps."""
         return f"{average(rows, 'loss'):.2f} nats"
+
+    @classmethod
+    def find_headline(cls, row: Row) -> float:
+        """Negative log density of unseen clips, nats a frame."""
+        return _number(row.get("validation_nats"))
+
+    @classmethod
+    def find_card_headline(cls, quality: Row) -> float:
+        """Find it in the quality that a card tells."""
+        return _number(quality.get("test_nats_per_frame"))
+
+    @classmethod
+    def as_log_error(cls, value: float) -> float:
+        """Nats by the numbers of a frame: the logarithm of how far each is off, up to a constant."""
+        return value / LAYOUT.continuous
 
     @property
     def split_seed(self) -> int:
@@ -354,7 +375,12 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
         parts += self.format_reading() + ["--bfloat16"] * self.settings.bfloat16
         parts += self.format_changed(TrainingSettings(), "steps", "batch", "window", "learning_rate", "seed")
         parts += self.settings.copies.format_options()
-        return " ".join(parts + self.format_processes()) + (" --paper" if self.config.retain == 0 else "")
+        parts += self.format_processes() + self.format_ending()
+        return " ".join(parts) + (" --paper" if self.config.retain == 0 else "")
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else float(value)
 
 
 def _select_device(wanted: str) -> str:

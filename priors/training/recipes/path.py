@@ -16,7 +16,7 @@ from mapctl.metrics.root_prediction import SPANS, average_displacement_errors, c
 from priors.config import require_at_least
 from priors.training.augmentation.pose_windows import PoseWindows, Variation, find_kind
 from priors.training.corpus import Corpus, Split
-from priors.training.recipe import NetworkRecipe
+from priors.training.recipe import NetworkRecipe, Row, average_logarithms
 from priors.training.trainer import GradientTrainer
 from priors.tweening.path import PathConfig, PathNetwork
 
@@ -104,6 +104,7 @@ class PathRecipe(NetworkRecipe[PathConfig, PathSettings, PathTrainer]):
     """What to train a path predictor on, and how."""
 
     kind = "path"
+    headline = "error, cm"
     config: PathConfig = field(default_factory=PathConfig)
     """The network."""
     settings: PathSettings = field(default_factory=PathSettings)
@@ -112,6 +113,11 @@ class PathRecipe(NetworkRecipe[PathConfig, PathSettings, PathTrainer]):
     def make_untaught(self, parts: Split) -> PathTrainer:
         """The trainer, its weights drawn."""
         return PathTrainer(self.config, self.settings, parts.train)
+
+    @classmethod
+    def find_headline(cls, row: Row) -> float:
+        """Errors over unseen clips, cm, geometric mean over spans and the height."""
+        return average_logarithms(row.get(f"all_{name}_cm") for name in _VALIDATED)
 
     def format_shape(self) -> list[str]:
         """The width, if it is another than usual."""

@@ -20,7 +20,7 @@ from priors.pose_transformer.network import QUANTILES, PoseTransformerConfig, Po
 from priors.training.augmentation.part_masks import PartSettings, sample_known_parts
 from priors.training.augmentation.pose_windows import PoseWindows, Variation, add_targets
 from priors.training.corpus import Corpus, Split
-from priors.training.recipe import Export, Gathered, NetworkRecipe, Row
+from priors.training.recipe import Export, Gathered, NetworkRecipe, Row, average_logarithms
 from priors.training.trainer import GradientTrainer, make_adam
 
 VALIDATED_GAPS = (5, 15, 30, 45, 60, 120)
@@ -164,6 +164,7 @@ class PoseTransformerRecipe(NetworkRecipe[PoseTransformerConfig, PoseTransformer
     """What to train a pose transformer on, and how."""
 
     kind = "pose-transformer"
+    headline = "error over interpolation's"
     config: PoseTransformerConfig = field(default_factory=PoseTransformerConfig)
     """The network."""
     settings: PoseTransformerSettings = field(default_factory=PoseTransformerSettings)
@@ -182,6 +183,11 @@ class PoseTransformerRecipe(NetworkRecipe[PoseTransformerConfig, PoseTransformer
                 return grow(tensors, small, trainer.network)
         wanted = f"{self.kind} of {self.config.as_card()}, or a smaller one with heads as wide"
         raise CheckpointError(f"{name} holds: {card.kind} of {card.config}; wanted: {wanted}")
+
+    @classmethod
+    def find_headline(cls, row: Row) -> float:
+        """Error of unseen windows over the interpolation's, geometric mean over gaps and lost arms."""
+        return average_logarithms(value for name, value in row.items() if name.startswith("share_"))
 
     def usual_settings(self) -> PoseTransformerSettings:
         """Those of the two-stage network, where it is trained."""

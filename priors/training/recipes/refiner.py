@@ -271,6 +271,8 @@ class RefinerRecipe(Recipe[RefinerConfig, AdversarialSettings, AdversarialTraine
     """
 
     kind = "refiner"
+    falls = False
+    headline = "distance from mocap"
     counter = "round"
     steps_name = "rounds"
     guards = ("refiner", "critic", "told")
@@ -340,6 +342,11 @@ class RefinerRecipe(Recipe[RefinerConfig, AdversarialSettings, AdversarialTraine
         """Measure how far foot speed, jitter and classifier accuracy are from mocap's."""
         return compute_realism_gap(row)
 
+    @classmethod
+    def find_headline(cls, row: Row) -> float:
+        """What the best is chosen by (see `compute_realism_gap`)."""
+        return compute_realism_gap(row)
+
     def export(self, trainer: AdversarialTrainer, gathered: Gathered, curve: Sequence[Row]) -> Export:
         """Return the best refiner so far."""
         data = {
@@ -359,7 +366,7 @@ class RefinerRecipe(Recipe[RefinerConfig, AdversarialSettings, AdversarialTraine
         usual = PAPER[1] if paper else AdversarialSettings()
         parts += self.format_changed(usual, "batch", "window", "seed", rounds="steps")
         parts += ["--bfloat16"] * self.settings.bfloat16 + ["--paper"] * paper
-        return " ".join(parts + self.format_processes())
+        return " ".join(parts + self.format_processes() + self.format_ending())
 
     def _find_match(self) -> str:
         return self.prior.card.data.get("match", "") if self.match is None else self.match

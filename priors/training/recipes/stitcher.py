@@ -18,7 +18,7 @@ from priors.stitching.posterior import PosteriorNetwork
 from priors.training.augmentation.transition_windows import Known, Transition, TransitionWindows
 from priors.training.corpus import Corpus, Split
 from priors.training.quality.stitcher import calibrate_temperature, measure_transitions
-from priors.training.recipe import Export, Gathered, NetworkRecipe, Row
+from priors.training.recipe import Export, Gathered, NetworkRecipe, Row, average_logarithms
 from priors.training.recipes.stitcher_critics import CriticSettings, StitcherCritics
 from priors.training.recipes.stitcher_losses import LossWeights, Shares, find_stitcher_losses
 from priors.training.trainer import GradientTrainer
@@ -200,6 +200,7 @@ class StitcherRecipe(NetworkRecipe[StitcherConfig, StitcherSettings, StitcherTra
     """What to train a stitcher on, and how."""
 
     kind = "stitcher"
+    headline = "error over interpolation's"
     config: StitcherConfig = field(default_factory=StitcherConfig)
     """The networks."""
     settings: StitcherSettings = field(default_factory=StitcherSettings)
@@ -223,6 +224,19 @@ class StitcherRecipe(NetworkRecipe[StitcherConfig, StitcherSettings, StitcherTra
         windows = TransitionWindows(gathered.parts.validation, kinds=self.settings.kinds, evenness=1.0)
         trainer.average.temperature.fill_(calibrate_temperature(trainer.average, windows))
         return replace(super().export(trainer, gathered, curve), tensors=trainer.average.state_dict())
+
+    def least_steps(self) -> int:
+        """Until the critics have joined, if there are any."""
+        if "d" in self.config.without:
+            return super().least_steps()
+        critics = self.settings.critics
+        return max(super().least_steps(), round(critics.begin * self.steps) + 2 * critics.head_start)
+
+    @classmethod
+    def find_headline(cls, row: Row) -> float:
+        """Error of the calm answer to unseen transitions over the interpolation's, geometric mean over lengths, after a
+        pose and after ten frames."""
+        return average_logarithms(value for name, value in row.items() if name.startswith(("bare_", "past_")))
 
     def usual_settings(self) -> StitcherSettings:
         """The paper's, where its scheme is trained."""

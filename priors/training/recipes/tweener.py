@@ -23,7 +23,7 @@ from priors.training.augmentation.pose_windows import PoseWindows
 from priors.training.augmentation.style_poses import draw_style_poses
 from priors.training.corpus import Corpus, Split
 from priors.training.quality.gap import measure_kinds
-from priors.training.recipe import Export, Gathered, NetworkRecipe, Row
+from priors.training.recipe import Export, Gathered, NetworkRecipe, Row, average_logarithms
 from priors.training.recipes.tweener_losses import Judge, LossWeights, compute_tweener_losses
 from priors.training.trainer import GradientTrainer
 from priors.tweening import generator
@@ -199,6 +199,7 @@ class TweenerRecipe(NetworkRecipe[GeneratorConfig, TweenerSettings, TweenerTrain
     """What to train the generator on, and how."""
 
     kind = "tweener"
+    headline = "error over slerp's"
     config: GeneratorConfig = field(default_factory=GeneratorConfig)
     """The network."""
     settings: TweenerSettings = field(default_factory=TweenerSettings)
@@ -223,6 +224,13 @@ class TweenerRecipe(NetworkRecipe[GeneratorConfig, TweenerSettings, TweenerTrain
         # Who begins with weights of a run has seen them grow.
         trainer.grown = self.init is not None
         return trainer
+
+    @classmethod
+    def find_headline(cls, row: Row) -> float:
+        """Error of unseen gaps over slerp's, geometric mean over kinds of clips."""
+        kinds = [name.removesuffix("_slerp_cm") for name, value in row.items() if name.endswith("_slerp_cm") and value]
+        pairs = [(row.get(f"{kind}_error_cm"), row[f"{kind}_slerp_cm"]) for kind in kinds if "before_" not in kind]
+        return average_logarithms(error / slerp for error, slerp in pairs if error is not None)
 
     def pin(self, trainer: TweenerTrainer, corpus: Corpus) -> dict[str, Row]:
         """What must not change between a run's parts."""

@@ -3,7 +3,7 @@
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 Row = dict[str, Any]
@@ -45,6 +45,9 @@ class Watcher:
 
     def see_validation(self, step: int, measures: Row) -> None:
         """After each validation."""
+
+    def see_end(self, steps: int) -> None:
+        """The run has so many steps in all: that is decided while it goes on, where its length was not told."""
 
     def end(self) -> None:
         """After the last step of this process, however it ends."""
@@ -115,6 +118,11 @@ class PacedWatcher(Watcher):
         """After each validation."""
         self._validated = step
         self.pace.mark_validation()
+
+    def see_end(self, steps: int) -> None:
+        """The run has so many steps in all."""
+        assert self.start is not None
+        self.start = replace(self.start, steps=steps)
 
     def format_pace(self) -> str:
         """The rate and the time that is left."""
