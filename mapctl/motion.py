@@ -32,6 +32,8 @@ class Motion:
     """Joints below the root whose offset is animated, as Hips under a static root; metres."""
     source: object | None = None
     """What a format needs to write the file back as it came (channel layout, unit); formats own its meaning."""
+    licence: str = ""
+    """Licence under which it may be used, with what it comes from, where that is known; some formats keep it."""
 
     def __post_init__(self):
         frames, joints = self.root_position.shape[0], self.skeleton.num_joints
@@ -90,6 +92,7 @@ class Motion:
             self,
             root_position=root,
             moving_offsets=moving,
+            licence="; ".join(dict.fromkeys(filter(None, (self.licence, other.licence)))),
             local_quat_xyzw=torch.cat([self.local_quat_xyzw, other.local_quat_xyzw]),
         )
 

@@ -5,7 +5,9 @@ from types import ModuleType
 from typing import TYPE_CHECKING
 
 from mapctl.errors import CheckpointError
-from priors import checkpoints
+from priors import checkpoints, weight_sets
+from priors.weight_sets import add_set as add_set
+from priors.weight_sets import use_weights as use_weights
 
 if TYPE_CHECKING:
     from priors.denoiser.network import ConvDenoiser as ConvDenoiser
@@ -44,7 +46,8 @@ def _import_model(name: str) -> ModuleType:
 
 
 AUTO = ("locomotion", "general")
-"""Bundled densities that `auto` chooses from, by likelihood (see mapctl.problem.density_selection)."""
+"""Bundled densities that `auto` chooses from, by likelihood (see mapctl.problem.density_selection): those of them that
+the set of weights in force has."""
 
 
 def load(name: str) -> "LstmGmmDensity":
@@ -56,7 +59,12 @@ def load_choice(name: str | None) -> "list[LstmGmmDensity]":
     """The densities that a --prior leaves to choose from: for `auto` the bundled ones, else the named one, or none."""
     if name is None:
         return []
-    return [load(each) for each in (AUTO if name == "auto" else (name,))]
+    return [load(each) for each in (_list_auto() if name == "auto" else (name,))]
+
+
+def _list_auto() -> list[str]:
+    there = weight_sets.list_models()
+    return [name for name in AUTO if name in there] or list(AUTO)  # to load what is not there says so
 
 
 def load_refiner(name: str) -> "LstmRefiner":
@@ -124,7 +132,7 @@ def refiner_of(prior: str, name: str = "auto") -> "LstmRefiner | None":
     if name != "auto":
         return load_refiner(name)
     own = f"{prior}-refiner"
-    return load_refiner(own) if own in checkpoints.list_bundled() else None
+    return None if weight_sets.find_file(own) is None else load_refiner(own)
 
 
 _INBETWEENERS = {"infiller": load_infiller, "pose-transformer": load_transformer, "stitcher": load_stitcher}

@@ -8,7 +8,6 @@ import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ from torch import Tensor
 from mapctl.errors import CheckpointError, RequestError
 from mapctl.features import LAYOUT
 from mapctl.formats.atomic import atomic_path
+from priors import licences, weight_sets
 from priors.tensor_files import write_tensors
 
 
@@ -100,6 +100,7 @@ def open_checkpoint(name: str, kind: str, *, called: str | None = None) -> Itera
     tensors, card = load(path)
     if card.kind != kind:
         raise CheckpointError(f"{path}: a {card.kind} is no {called or kind}")
+    _note_card(name, path, card)
     try:
         yield tensors, card
     except (KeyError, TypeError, RuntimeError, RequestError) as error:
@@ -115,20 +116,37 @@ def read_card(path: Path) -> Card:
 
 
 def list_bundled() -> list[str]:
-    """List names of the priors that come with the package."""
-    found = (p.name for p in files("priors.weights").iterdir())
-    return sorted(name.removesuffix(".safetensors") for name in found if name.endswith(".safetensors"))
+    """List names of the priors that come with the package, in the set of weights that is in force."""
+    return weight_sets.list_models()
 
 
 def locate(name: str) -> Path:
-    """Locate the safetensors file of a bundled name, of a path, or of a training run's folder."""
+    """Locate the safetensors file of a bundled name, of a path, or of a training run's folder.
+
+    A bundled name is one of the set of weights in force, unless it says its set (see `weight_sets`); CheckpointError
+    where that set has no such model, though another one may.
+    """
     path = Path(name)
-    for candidate in (path, path / "model.safetensors", Path(f"{name}.safetensors")):
-        if candidate.is_file() and candidate.suffix == ".safetensors":
-            return candidate
-    if name in list_bundled():
-        with as_file(files("priors.weights") / f"{name}.safetensors") as place:
-            return place
-    raise CheckpointError(
-        f"no prior {name!r}: neither a file nor one of {', '.join(list_bundled()) or 'the bundled (none)'}"
-    )
+    if not weight_sets.names_set(name):
+        for candidate in (path, path / "model.safetensors", Path(f"{name}.safetensors")):
+            if candidate.is_file() and candidate.suffix == ".safetensors":
+                return candidate
+    found = weight_sets.find_file(name)
+    if found is None:
+        raise weight_sets.explain_missing(name)
+    return found
+
+
+def note_use(name: str) -> None:
+    """Note the licence of a model that somebody else loads, as a process; CheckpointError if there is none."""
+    path = locate(name)
+    _note_card(name, path, read_card(path.with_suffix(".json")))
+
+
+def _note_card(name: str, path: Path, card: Card) -> None:
+    """Note a model's licence; CheckpointError where it lies in the free set and is not free."""
+    weights = weight_sets.find_set_of(path)
+    known = path.stem if weights == weight_sets.SETS[0] else f"{weights}/{path.stem}"
+    if weights == "free":
+        licences.check_free(known, card.licence, {"data": card.data, "training": card.training})
+    licences.note_licence(name if weights is None else known, card.licence)

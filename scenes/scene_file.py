@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from os import PathLike
 from pathlib import Path, PurePath
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field
@@ -149,6 +149,8 @@ class SceneDescription:
     """Description for people."""
     prior: str = "locomotion"
     """Bundled or trained prior that moves the actors."""
+    weights: Literal["free", "full"] | None = None
+    """Set of bundled models, where the command does not tell; the environment's or the full one if not given."""
     obstacles: tuple[SceneObstacle, ...] = ()
     """What all actors walk around, one [[obstacles]] table each."""
     keep_apart: Annotated[float, Field(gt=0, le=10)] | None = None

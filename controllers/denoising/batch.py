@@ -1,7 +1,7 @@
 """Denoise one of many files, in a process of its own (see mapctl.runtime.file_jobs)."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import torch
@@ -30,6 +30,8 @@ class FileDenoiser:
     """Rig of all files, where it is not the one that would be recognised."""
     after: Callable[[FileJob, DenoiseSolution], None] | None = None
     """Function called with each result, in that process: to write a report."""
+    licence: str = ""
+    """Licence of the results, beside that of each motion; for formats that keep one."""
 
     def __call__(self, job: FileJob) -> FileResult:
         """Denoise one file and write the result; errors are in what is returned, except DiskFullError."""
@@ -46,7 +48,8 @@ class FileDenoiser:
         job.out.parent.mkdir(parents=True, exist_ok=True)
         if self.after is not None:
             self.after(job, done)
-        formats.save(done.motion, job.out)
+        told = "; ".join(filter(None, dict.fromkeys((self.licence, motion.licence))))
+        formats.save(replace(done.motion, licence=told), job.out)
         return done.motion.num_frames, done.seconds
 
 

@@ -9,6 +9,7 @@ Keys (frames T, joints J, travelling joints M, joints with an End Site E; length
 - `fps` (2,) whole numbers: numerator and denominator of the frames per second
 - `root_position_world` (T, 3); `local_quat_xyzw` (T, J, 4): each joint's rotation in its parent's frame
 - `moving_joints` (M,) whole numbers and `moving_offsets` (M, T, 3): joints whose offset is animated
+- `licence`: a text, only where the motion has a licence
 
 What another format needs to write a file back as it came (`Motion.source`) is not kept.
 """
@@ -51,6 +52,8 @@ _KEYS = {
     "moving_offsets": ("f", "MT3"),
 }
 
+_LICENCE = "licence"
+"""Key that may be missing."""
 _TRACKS = ("root_position_world", "local_quat_xyzw", "moving_offsets")
 """Keys that change from frame to frame, and may hold NaN where a lossy reading is asked for."""
 _UNSOUND = (
@@ -121,7 +124,9 @@ def to_arrays(motion: Motion) -> dict[str, np.ndarray]:
     """Return the arrays of a motion, by the keys above."""
     skeleton, moving = motion.skeleton, sorted(motion.moving_offsets)
     tracks = np.array([_numbers(motion.moving_offsets[joint]) for joint in moving])
+    told = {_LICENCE: np.array(motion.licence)} if motion.licence else {}
     return {
+        **told,
         "format": np.array(FORMAT),
         "names": np.array(skeleton.names),
         "parents": np.array(skeleton.parents, dtype=np.int64),
@@ -155,6 +160,7 @@ def _build_motion(arrays: dict[str, np.ndarray]) -> Motion:
         root_position=_tensor(arrays["root_position_world"]),
         local_quat_xyzw=_tensor(arrays["local_quat_xyzw"]),
         moving_offsets={joint: _tensor(track) for joint, track in tracks},
+        licence=str(arrays.get(_LICENCE, "")),
     )
 
 
@@ -165,9 +171,14 @@ def read_arrays(path: str | PathLike[str], raw: bytes) -> dict[str, np.ndarray]:
     try:
         with zipfile.ZipFile(io.BytesIO(raw)) as archive:
             _check_members(path, archive)
-            return {key: _read_array(archive, key) for key in _KEYS}
+            return {key: _read_array(archive, key) for key in _list_keys(archive)}
     except _UNSOUND as error:
         raise FileFormatError(path, f"is not a sound .npz archive: {_shorten_reason(error)}") from error
+
+
+def _list_keys(archive: zipfile.ZipFile) -> list[str]:
+    """List the known keys that are there; those that must be have been checked."""
+    return [*_KEYS, *([_LICENCE] if f"{_LICENCE}.npy" in archive.namelist() else [])]
 
 
 def _read_array(archive: zipfile.ZipFile, key: str) -> np.ndarray:
@@ -184,7 +195,7 @@ def _check_members(path: str | PathLike[str], archive: zipfile.ZipFile) -> None:
     sizes = {member.filename: member.file_size for member in archive.infolist()}
     if missing := [key for key in _KEYS if f"{key}.npy" not in sizes]:
         raise FileFormatError(path, f"lacks the keys {', '.join(missing)}")
-    if (total := sum(sizes[f"{key}.npy"] for key in _KEYS)) > MAX_FILE_BYTES:
+    if (total := sum(sizes.get(f"{key}.npy", 0) for key in (*_KEYS, _LICENCE))) > MAX_FILE_BYTES:
         raise FileFormatError(path, f"unpacks to {total >> 20} MiB, allowed are {MAX_FILE_BYTES >> 20}")
 
 
@@ -192,7 +203,8 @@ def _check_shapes(path: str | PathLike[str], arrays: dict[str, np.ndarray], *, l
     sizes = {"2": 2, "3": 3, "4": 4}
     sizes |= {"J": arrays["names"].size, "E": arrays["end_names"].size, "M": arrays["moving_joints"].size}
     sizes["T"] = len(np.atleast_1d(arrays["root_position_world"]))
-    for key, (kind, letters) in _KEYS.items():
+    keys = _KEYS | ({_LICENCE: ("U", "")} if _LICENCE in arrays else {})
+    for key, (kind, letters) in keys.items():
         values, wanted = arrays[key], tuple(sizes[letter] for letter in letters)
         if values.dtype.kind != kind or values.shape != wanted:
             found = f"{values.dtype} and shape {values.shape}"

@@ -85,6 +85,8 @@ class KeyRequest:
     """The motion file whose skeleton moves; the first pose's if not given."""
     fps: Annotated[float, Field(ge=0.01, le=1000)] = 30.0
     """Frame rate of the motion that is made."""
+    weights: Literal["free", "full"] | None = None
+    """Set of bundled models, where the command does not tell; the environment's or the full one if not given."""
 
     def __post_init__(self):
         if len(self.key) < 2:

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from os import PathLike
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -105,6 +105,13 @@ class _ShotKeyFile:
 
     key: Annotated[tuple[ShotKey, ...], Field(min_length=1, max_length=10_000)]
     """One [[key]] table each."""
+    weights: Literal["free", "full"] | None = None
+    """Set of bundled models, where the command does not tell; the environment's or the full one if not given."""
+
+
+def read_shot_weights(path: str | PathLike[str]) -> str | None:
+    """Read which set of bundled models a TOML file of keys names, if any; FileFormatError names file and key."""
+    return toml.read(path, _ShotKeyFile, what="key file", unknown=_list_allowed_keys).weights
 
 
 def read_shot_keys(path: str | PathLike[str]) -> tuple[ShotKey, ...]:

@@ -52,10 +52,12 @@ class LiveActor:
         orders: SteeringInputs,
         drawn: DrawnCharacter | None = None,
         on_rig: Callable[[Motion], Motion] | None = None,
+        *,
+        licence: str = "",
     ):
         """Set up character `number`, from 0, with its nodes below the node `world`; it is `drawn` with a mesh of its
         own, or as a mannequin. `on_rig` puts its motion on the joints on which it is recorded, if these are others
-        than those of the drawn character."""
+        than those of the drawn character; its recordings have the `licence`."""
         self.name = f"character {number + 1}"
         self.character, self.orders, self.first = character, orders, orders
         self.pace = RealtimeMonitor()
@@ -66,7 +68,7 @@ class LiveActor:
         """Way that its hips face as it is shown, radians from +Z toward +X."""
         self.is_shown = False
         """Whether it has been posed."""
-        self.drawn, self._on_rig = drawn, on_rig
+        self.drawn, self._on_rig, self._licence = drawn, on_rig, licence
         self._body = _add_body(scene, f"{world}/character{number + 1}", number, character, drawn)
         self._marks = ground.GroundMarks(scene, f"{world}/marks{number + 1}", character.skeleton)
         self.tracks = Tracks(scene, f"{world}/tracks{number + 1}")
@@ -111,7 +113,8 @@ class LiveActor:
 
     def start_recording(self, folder: Path | None = None) -> None:
         """Record from now on, into a file that grows in a folder, or without a name."""
-        self.recording = Recording(self.character.skeleton, self.drawn, folder, on_rig=self._on_rig)
+        skeleton, told = self.character.skeleton, self._licence
+        self.recording = Recording(skeleton, self.drawn, folder, on_rig=self._on_rig, licence=told)
 
     def take(self, delivered: FrameChunk, now: float) -> None:
         """Keep what came until it is due, record it."""

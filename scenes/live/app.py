@@ -70,6 +70,7 @@ class LiveApp:
         theme: str = THEMES[0],
         rests: bool = False,
         recordings: Path | None = None,
+        licence: str = "",
     ):
         """Open the page. `fastest` is the prior's, m/s; `labels` are the prior's, by group.
 
@@ -77,7 +78,7 @@ class LiveApp:
         meshes by character; where there is none a mannequin is shown. `rigs` put a character's motion on the joints on
         which it is recorded, where these are not the drawn character's. `theme` is one of THEMES. With `rests`
         everybody stops while no browser shows them, nothing is recorded, and there is neither `stream` nor `source`.
-        Recordings grow in the folder `recordings`, where there is one, and survive a crash there.
+        Recordings, under the `licence`, grow in the folder `recordings`, where there is one, and survive a crash there.
         """
         channel = PageChannel()
         self.server = _open_server(port, channel)
@@ -87,7 +88,7 @@ class LiveApp:
         self._notices = Notifications(self.server)
         self._quiet = ServerErrorReporter(self.server.get_event_loop(), self._notices.console)
         scene.set_up_direction("+y")
-        members = make_members(scene, _WORLD, characters, orders, drawn=drawn, rigs=rigs)
+        members = make_members(scene, _WORLD, characters, orders, drawn=drawn, rigs=rigs, licence=licence)
         self._todo: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._typed_at: float | None = None
         self._gauges = Readouts(gui)

@@ -169,9 +169,10 @@ def make_members(
     *,
     drawn: Sequence[DrawnCharacter | None] = (),
     rigs: Sequence[Callable[[Motion], Motion] | None] = (),
+    licence: str = "",
 ) -> list[LiveActor]:
     """Make the characters below the scene's node `world`: mannequins without `drawn`, recorded as they move without
-    `rigs`."""
+    `rigs`, under a licence where formats keep one."""
     nobody = [None] * len(characters)
     parts = zip(characters, orders, drawn or nobody, rigs or nobody, strict=True)
-    return [LiveActor(scene, world, k, *one) for k, one in enumerate(parts)]
+    return [LiveActor(scene, world, k, *one, licence=licence) for k, one in enumerate(parts)]

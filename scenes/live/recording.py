@@ -49,10 +49,13 @@ class Recording:
         folder: Path | None = None,
         *,
         on_rig: Callable[[Motion], Motion] | None = None,
+        licence: str = "",
     ):
         """The file is in `folder`, under a name that nobody has; without one it has no name, and goes with this
-        program. `on_rig` puts the motion on the joints on which it is given out, where there is another rig."""
+        program. `on_rig` puts the motion on the joints on which it is given out, where there is another rig. Formats
+        that can tell the `licence`."""
         self.skeleton, self.drawn, self.on_rig, self._folder = skeleton, drawn, on_rig, folder
+        self._licence = licence
         self.path: Path | None = None
         """File of the recording, once it has frames and a name."""
         self.fault = ""
@@ -80,7 +83,7 @@ class Recording:
             if self._writer is None:
                 self._file = self._open()
                 self._writer = MotionWriter(self._file)
-            self._writer.add(delivered.motion(self.skeleton))
+            self._writer.add(replace(delivered.motion(self.skeleton), licence=self._licence))
         except OSError as error:
             self.fault = error.strerror or str(error)
 
@@ -95,8 +98,10 @@ class Recording:
         motion = decode(self.path or "the recording", self._file.read())
         motion = replace(motion, skeleton=self.skeleton, local_quat_xyzw=make_sign_continuous(motion.local_quat_xyzw))
         if self.on_rig is not None:
-            return self.on_rig(motion)
-        return motion if self.drawn is None else self.drawn.put_on(motion).placed.motion
+            motion = self.on_rig(motion)
+        elif self.drawn is not None:
+            motion = self.drawn.put_on(motion).placed.motion
+        return replace(motion, licence=self._licence)
 
     def discard(self) -> None:
         """Remove the file: what was recorded is kept elsewhere, or nobody wants it."""

@@ -83,11 +83,12 @@ def test_frames_keys_and_notes_are_told(tween, source, tmp_path, capsys):
     words = ["--keyframes", "0,20,21,44", *words_of("infiller")]
     assert tween(tmp_path / "leaping.bvh", "-o", tmp_path / "out.bvh", *words) == 0
     told = capsys.readouterr()
-    first, note, gaps = told.out.splitlines()
+    first, note, gaps, licence = told.out.splitlines()
     assert first.startswith(f"{tmp_path / 'out.bvh'}: 45 frames through 4 keys; ")
     assert note.startswith("the hips need ")
     assert note.endswith(" m/s between frames 20 and 21, faster than anyone runs")
     assert gaps == "frames 1:20, 22:44: infiller"
+    assert licence.startswith("licence   none, it is made up (")
     assert told.err == ""
     assert tween(tmp_path / "leaping.bvh", "-o", tmp_path / "out.bvh", *words, "--strict", "--quiet") == 3
 

@@ -183,6 +183,15 @@ def test_a_recording_is_the_motion_that_was_shown(ending, tmp_path):
         assert len(trimesh.load(path).geometry) == 1
 
 
+def test_a_recording_tells_its_licence_and_so_does_the_file_that_grows(tmp_path):
+    recording = Recording(CANONICAL, folder=tmp_path, on_rig=lambda motion: walk(3), licence="CC0 1.0 (mine)")
+    recording.add(delivered(0))
+    assert formats.load(tmp_path / "mapctl.recording").licence == "CC0 1.0 (mine)"
+    assert recording.motion().licence == "CC0 1.0 (mine)"
+    (tmp_path / "x.glb").write_bytes(encode_motion(recording.motion(), "glb"))
+    assert formats.load(tmp_path / "x.glb").licence == "CC0 1.0 (mine)"
+
+
 def test_a_recording_can_be_a_film():
     assert encode_motion(walk(3), "mp4")[4:8] == b"ftyp"
 

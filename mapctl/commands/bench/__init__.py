@@ -1,17 +1,19 @@
 """`mapctl bench TABLE`: what the solver costs on this machine, and what each job is worth; a sub-command a table."""
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from tyro.conf import arg
 
 from mapctl.commands.shared import options
-from mapctl.commands.shared.command import Command
+from mapctl.commands.shared.command import Command, ModelCommand
 
 
 @dataclass(frozen=True, kw_only=True)
-class Table(Command):
+class Table(ModelCommand):
     """What every table is asked."""
+
+    tells_licence: ClassVar[bool] = False
 
     json: bool = False
     """Print JSON instead of a table."""

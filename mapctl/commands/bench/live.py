@@ -21,7 +21,7 @@ def run(table: Live) -> int:
         raise RequestError(f"--minutes must be more than 0 and at most a day, got {table.minutes:g}")
     if table.orders is not None:
         return _run_orders(table, table.orders)
-    load = functools.partial(priors.load, table.prior)
+    load = functools.partial(priors.load, priors.add_set(table.prior))
 
     def measure(count: int) -> Row:
         with show_progress(f"{count} at once") as progress:
@@ -35,11 +35,11 @@ def _run_orders(table: Live, orders: float) -> int:
     if not _LEAST_ORDERS <= orders < 20 * table.minutes:
         least = f"{_LEAST_ORDERS:g} seconds or more, and less than a third of --minutes"
         raise RequestError(f"--orders must be {least}, got {orders:g}")
-    load = functools.partial(priors.load, table.prior)
+    load = functools.partial(priors.load, priors.add_set(table.prior))
     with show_progress("orders") as progress:
         row = benchmark_orders(
             load,
-            functools.partial(priors.load_stitcher, table.stitcher),
+            functools.partial(priors.load_stitcher, priors.add_set(table.stitcher)),
             minutes=table.minutes,
             every=orders,
             progress=progress,

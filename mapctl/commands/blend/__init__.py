@@ -7,11 +7,11 @@ from typing import Annotated
 from tyro.conf import arg
 
 from mapctl.commands.shared import options
-from mapctl.commands.shared.command import Command
+from mapctl.commands.shared.command import ModelCommand
 
 
 @dataclass(frozen=True)
-class Blend(Command):
+class Blend(ModelCommand):
     """Hands or feet of a clip move as in another one for some frames: a walk that reaches or waves."""
 
     source: options.InFile

@@ -3,9 +3,8 @@
 import priors
 from controllers.inbetweening.blend import LimbTransfer, blend
 from controllers.inbetweening.pipeline import InfillSettings
-from mapctl import formats
 from mapctl.commands.blend import Blend
-from mapctl.commands.shared import inputs, results
+from mapctl.commands.shared import inputs, licensing, results
 from mapctl.commands.shared.exit_status import conclude
 from mapctl.commands.shared.frame_syntax import parse_frame, parse_range
 
@@ -20,7 +19,7 @@ def run(command: Blend) -> int:
     transfer = LimbTransfer(names, start, stop, parse_frame(command.at, fps=float(motion.fps)), margin=command.margin)
     settings = InfillSettings(finish=not command.no_finish)
     done = blend(motion, other, transfer, priors.load_inbetweener(command.inbetweener), settings=settings, rig=rig)
-    formats.save(done.motion, command.out)
+    licensing.save_motion(done.motion, command.out)
     results.film_comparison(motion, done.motion, command.video, rig=rig, quiet=command.quiet)
     if not command.quiet:
         print("\n".join((f"{command.out}: {done.motion.num_frames} frames", *done.notes)))

@@ -8,11 +8,11 @@ import tyro
 from tyro.conf import arg
 
 from mapctl.commands.shared import options
-from mapctl.commands.shared.command import Command
+from mapctl.commands.shared.command import ModelCommand
 
 
 @dataclass(frozen=True)
-class Chain(Command):
+class Chain(ModelCommand):
     """One long motion through short pieces of many clips, the gaps between them filled in; on the first clip's rig."""
 
     clips: tyro.conf.Positional[Annotated[tuple[Path, ...], arg(metavar="CLIP CLIP ...")]]

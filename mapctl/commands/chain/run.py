@@ -5,9 +5,8 @@ import torch
 from controllers.inbetweening.chain import ChainSettings, chain
 from controllers.inbetweening.pipeline import InfillSettings
 from controllers.inbetweening.proposers import build_inbetweener
-from mapctl import formats
 from mapctl.commands.chain import Chain
-from mapctl.commands.shared import inputs, options, results
+from mapctl.commands.shared import inputs, licensing, options, results
 from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.commands.shared.style import read_dna
 from mapctl.errors import RequestError
@@ -35,7 +34,7 @@ def run(command: Chain) -> int:
         filling=InfillSettings(finish=not command.no_finish),
         generator=torch.Generator().manual_seed(command.seed),
     )
-    formats.save(done.motion, command.out)
+    licensing.save_motion(done.motion, command.out)
     if command.video is not None:
         with show_progress("filming", quiet=command.quiet) as progress:
             film([(to_canonical(done.motion)[0], None)], command.video, progress=progress)

@@ -4,11 +4,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mapctl.commands.shared import options
-from mapctl.commands.shared.command import Command
+from mapctl.commands.shared.command import ModelCommand
 
 
 @dataclass(frozen=True)
-class Demo(Command):
+class Demo(ModelCommand):
     """A character walks a figure-8 on the bundled prior: motion, film, contact sheet and report."""
 
     out: options.OutFolder = Path("demo-out")

@@ -5,7 +5,7 @@ from pathlib import Path
 import priors
 from mapctl import report
 from mapctl.commands.demo import Demo
-from mapctl.commands.shared import exit_status, inputs, options, outputs
+from mapctl.commands.shared import exit_status, inputs, licensing, options, outputs
 from mapctl.commands.shared.path_walk import Walk, parse_follow, walk
 from mapctl.commands.shared.progress_bar import show_progress
 from scenes.cameras import CameraSettings
@@ -37,7 +37,7 @@ def run(command: Demo) -> int:
 
 
 def _write(command: Demo, done: Walk, files: dict[str, Path]) -> None:
-    done.solution.motion.save(files["bvh"])
+    licensing.save_motion(done.solution.motion, files["bvh"])
     request = options.describe_request("demo", command) | {"curve": CURVE, "speed": SPEED}
     report.write_report(done.report(request), files["json"])
     films = [files[ending] for ending in ("mp4", "png") if ending in files]

@@ -7,11 +7,11 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from mapctl.commands.shared import options
-from mapctl.commands.shared.command import Command
+from mapctl.commands.shared.command import ModelCommand
 
 
 @dataclass(frozen=True)
-class Denoise(Command):
+class Denoise(ModelCommand):
     """Denoise a capture with noise, sliding and gaps, of any known rig: same skeleton, names, frames and rate."""
 
     source: Positional[Annotated[Path, arg(metavar="IN|FOLDER")]]

@@ -10,20 +10,24 @@ from controllers.denoising.denoise import DenoiseSettings
 from controllers.denoising.result import DenoiseSolution
 from mapctl import report
 from mapctl.commands.denoise import Denoise
-from mapctl.commands.shared import folders, inputs, outputs, results
+from mapctl.commands.shared import folders, inputs, licensing, outputs, results
 from mapctl.errors import RequestError
 from mapctl.runtime.file_jobs import FileJob, run_over_cluster, run_over_processes
+from priors import licences
+from priors.licences import Licences
 
 
 def run(command: Denoise, settings: DenoiseSettings) -> int:
     """Check, denoise what is not done yet, list what failed."""
     jobs, skipped = collect_jobs(command)
     priors.load_denoiser(command.denoiser)  # a typing error is reported once, now
-    load = partial(priors.load_denoiser, command.denoiser)
-    load_inbetweener = partial(priors.load_inbetweener, command.inbetweener or "transformer")
+    load = partial(priors.load_denoiser, priors.add_set(command.denoiser))
+    load_inbetweener = partial(priors.load_inbetweener, priors.add_set(command.inbetweener or "transformer"))
     load_inbetweener()
-    after = None if command.report is None else ReportWriter(command, command.report)
-    file_denoiser = FileDenoiser(load, settings, load_inbetweener, inputs.read_rig(command.rig), after)
+    used = licences.find_used_licences()  # what the processes use, and they do not record
+    after = None if command.report is None else ReportWriter(command, command.report, used)
+    licence = licensing.format_used_licences()
+    file_denoiser = FileDenoiser(load, settings, load_inbetweener, inputs.read_rig(command.rig), after, licence)
     if command.cluster is not None:
         ended = run_over_cluster(jobs, file_denoiser, address=command.cluster, workers=command.jobs)
     else:
@@ -54,9 +58,12 @@ class ReportWriter:
     """The command."""
     folder: Path
     """Folder of the reports, named as the results."""
+    used: Licences
+    """Licences of the models."""
 
     def __call__(self, job: FileJob, done: DenoiseSolution) -> None:
         """Write one report."""
         path = (self.folder / job.out.relative_to(self.command.out)).with_suffix(".json")
         path.parent.mkdir(parents=True, exist_ok=True)
-        report.write_report(results.build_report("denoise", self.command, done), path)
+        told = results.build_report("denoise", self.command, done)
+        report.write_report(told | licences.describe_licences(self.used), path)

@@ -4,9 +4,9 @@ import priors
 from controllers.denoising.causal import denoise_causal
 from controllers.denoising.denoise import DenoiseSettings, denoise
 from controllers.denoising.result import DenoiseSolution
-from mapctl import formats, report
+from mapctl import report
 from mapctl.commands.denoise import Denoise, folder
-from mapctl.commands.shared import inputs, outputs, results
+from mapctl.commands.shared import inputs, licensing, outputs, results
 from mapctl.commands.shared.exit_status import conclude
 from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.errors import RequestError
@@ -24,7 +24,7 @@ def run(command: Denoise) -> int:
         return folder.run(command, read_settings(command))
     _check(command)
     done = _run_denoising(command)
-    formats.save(done.motion, command.out)
+    licensing.save_motion(done.motion, command.out)
     if command.report is not None:
         report.write_report(results.build_report("denoise", command, done), command.report)
     _draw_pictures(command, done)

@@ -6,11 +6,11 @@ from typing import Annotated
 from tyro.conf import Positional, UseAppendAction, arg
 
 from mapctl.commands.shared import options
-from mapctl.commands.shared.command import Command
+from mapctl.commands.shared.command import ModelCommand
 
 
 @dataclass(frozen=True)
-class FollowCurve(Command):
+class FollowCurve(ModelCommand):
     """A character walks a curve: BVH and, if asked for, a film and a report."""
 
     curve: Positional[options.CurveText]

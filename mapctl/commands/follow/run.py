@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import priors
 from mapctl import formats, report
 from mapctl.commands.follow import FollowCurve
-from mapctl.commands.shared import inputs, options, outputs
+from mapctl.commands.shared import inputs, licensing, options, outputs
 from mapctl.commands.shared.character import read_character, read_drawn_character
 from mapctl.commands.shared.exit_status import conclude
 from mapctl.commands.shared.path_walk import Walk, parse_follow, walk
@@ -27,6 +27,20 @@ _SIZE = "1280x720"
 def run(command: FollowCurve) -> int:
     """Check everything, solve, write, report. Ctrl-C ends the solve; the motion so far is written, without a film."""
     _check(command)
+    with priors.use_weights(_find_weights(command)):
+        return _follow(command)
+
+
+def _find_weights(command: FollowCurve) -> str | None:
+    """Find the set of weights: of the option, else of the file of keys."""
+    if command.weights is not None or command.keys is None:
+        return command.weights
+    from mapctl.intent.shot_keys import read_shot_weights
+
+    return read_shot_weights(command.keys)
+
+
+def _follow(command: FollowCurve) -> int:
     curve = inputs.read_curve(command.curve, command.metres_per_unit)
     request = parse_follow(curve, command.speed, command.seconds)
     drawn = read_drawn_character(command.character)
@@ -73,7 +87,7 @@ def _check(command: FollowCurve) -> None:
 def _write(
     command: FollowCurve, done: "Walk | PlayedShot", video: Path | None, character: "DrawnCharacter | None"
 ) -> None:
-    done.on_rig.save(command.out)
+    licensing.save_motion(done.on_rig, command.out)
     if command.report is not None:
         report.write_report(done.report(options.describe_request("follow", command)), command.report)
     if video is not None:

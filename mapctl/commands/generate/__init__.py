@@ -6,11 +6,11 @@ from typing import Annotated
 from tyro.conf import arg
 
 from mapctl.commands.shared import options
-from mapctl.commands.shared.command import Command
+from mapctl.commands.shared.command import ModelCommand
 
 
 @dataclass(frozen=True)
-class Generate(Command):
+class Generate(ModelCommand):
     """Motion sampled from a prior, of any length: OUT/generated_000.bvh, generated_001.bvh, ..."""
 
     out: options.OutFolder

@@ -13,7 +13,7 @@ from controllers.generation.foot_cleanup import FootCleanupSettings
 from controllers.generation.generate import GenerateSettings, sample_stratified_starts, stream
 from mapctl import formats
 from mapctl.commands.generate import Generate
-from mapctl.commands.shared import inputs, options, outputs
+from mapctl.commands.shared import inputs, licensing, options, outputs
 from mapctl.commands.shared.character import read_character
 from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.commands.shared.resumption import explain_progress
@@ -46,7 +46,7 @@ def run(command: Generate) -> int:
         for number, seed in enumerate(_sample_seeds(command)):
             own = settings if settings.start is not None else replace(settings, start=starts[number])
             pieces = draw(generator=torch.Generator().manual_seed(seed), settings=own)
-            motions = (character.on_rig(piece.motion) for piece in pieces)
+            motions = (licensing.mark_motion(character.on_rig(piece.motion)) for piece in pieces)
             _write(command, motions, folder / f"generated_{number:03d}{command.to}", frames)
             finished(number + 1)
     return 0

@@ -6,11 +6,11 @@ from typing import Annotated
 from tyro.conf import UseAppendAction, arg
 
 from mapctl.commands.shared import options
-from mapctl.commands.shared.command import Command
+from mapctl.commands.shared.command import ModelCommand
 
 
 @dataclass(frozen=True)
-class Infill(Command):
+class Infill(ModelCommand):
     """Fill in missing frames or joints of a motion; all else stays as it was. On any known rig."""
 
     source: options.InFile

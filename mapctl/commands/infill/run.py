@@ -7,9 +7,9 @@ import torch
 import priors
 from controllers.inbetweening.infill import InbetweenSolution, InfillSettings, infill, retraced
 from controllers.inbetweening.proposers import build_inbetweener
-from mapctl import formats, report
+from mapctl import report
 from mapctl.commands.infill import Infill
-from mapctl.commands.shared import inputs, options, results
+from mapctl.commands.shared import inputs, licensing, options, results
 from mapctl.commands.shared.exit_status import conclude
 from mapctl.commands.shared.frame_syntax import parse_ranges
 from mapctl.commands.shared.style import read_dna
@@ -29,7 +29,7 @@ def run(command: Infill) -> int:
     ways = _parse_ways(command, motion)
     masks = (*marked, *_parse_masks(command, motion)) or (() if has_gaps or ways else find_gaps(motion))
     done = _run_infilling(command, motion, masks, ways, rig)
-    formats.save(done.motion, command.out)
+    licensing.save_motion(done.motion, command.out)
     if command.report is not None:
         report.write_report(results.build_report("infill", command, done), command.report)
     results.film_comparison(motion, done.motion, command.video, rig=rig, quiet=command.quiet)

@@ -7,12 +7,14 @@ from typing import Annotated, ClassVar
 from tyro.conf import Positional, arg
 
 from mapctl.commands.shared import options
-from mapctl.commands.shared.command import Command
+from mapctl.commands.shared.command import ModelCommand
 
 
 @dataclass(frozen=True)
-class Info(Command):
+class Info(ModelCommand):
     """Bundled priors with their cards and licences, scenes, versions, rendering back end, threads; or a clip's rig."""
+
+    tells_licence: ClassVar[bool] = False
 
     single_thread: ClassVar[bool] = False
 

@@ -72,6 +72,7 @@ def describe_clip(path: Path, motion: Motion, rigmap: RigMap, fit: Fit) -> dict[
 def _describe_file(motion: Motion) -> dict[str, Any]:
     """Describe what is known of a clip without its rig."""
     return {
+        **({"licence": motion.licence} if motion.licence else {}),
         "metres_per_unit": bvh.unit_of(motion) or 1.0,
         "num_joints": motion.num_joints,
         "frames": motion.num_frames,

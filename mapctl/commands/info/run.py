@@ -13,10 +13,15 @@ from mapctl.commands.info import Info, clip
 from mapctl.commands.shared import outputs
 from mapctl.commands.shared.tables import print_table
 from mapctl.errors import RequestError
-from priors import checkpoints
+from mapctl.features import PRIOR_FPS
+from priors import checkpoints, weight_sets
+from priors.licences import find_strictest
 from priors.tweening.styles import count_clips
 
-NOTICE = "The code is MIT. Weights trained on Bandai Namco data are CC BY-NC 4.0, as that data is."
+NOTICE = (
+    "The code is MIT. Weights trained on Bandai Namco data are CC BY-NC 4.0, as that data is; the free weights, by"
+    " --weights free, may be used for anything."
+)
 
 
 def run(command: Info) -> int:
@@ -32,7 +37,12 @@ def run(command: Info) -> int:
     elif command.name is not None:
         print(report.to_json(read_prior_card(command.name)), end="")
     elif command.json:
-        found = {"priors": list_priors(), "installation": describe_installation(), "notice": NOTICE}
+        found = {
+            "priors": list_priors(),
+            "weights": describe_weights(),
+            "installation": describe_installation(),
+            "notice": NOTICE,
+        }
         print(report.to_json(found), end="")
     else:
         _print_tables()
@@ -49,12 +59,13 @@ def _plot_training(name: str, path: Path) -> None:
 
 
 def _print_tables() -> None:
-    columns = ["prior", "kind", "size", "speeds", "licence of the weights"]
+    columns = ["prior", "kind", "size", "speeds", "data", "licence of the weights"]
     rows = [
-        [row["name"], row["kind"], f"{row['megabytes']:.1f} MB", _format_speeds(row), row["licence"]]
+        [row["name"], row["kind"], f"{row['megabytes']:.1f} MB", _format_speeds(row), _format_data(row), row["licence"]]
         for row in list_priors()
     ]
-    print_table(columns, rows or [["none is bundled", None, None, None, None]])
+    print_table(columns, rows or [["none is bundled", *[None] * (len(columns) - 1)]])
+    print_table(["weights", "models", "size", "licence"], [_format_set(name) for name in weight_sets.SETS])
     print_table(["installation", ""], [[name, str(value)] for name, value in describe_installation().items()])
     print(NOTICE)
 
@@ -68,8 +79,30 @@ def read_prior_card(name: str) -> dict[str, Any]:
 
 
 def list_priors() -> list[dict[str, Any]]:
-    """List the bundled priors in short."""
-    return [_summarise_prior(name, read_prior_card(name)) for name in checkpoints.list_bundled()]
+    """List the bundled priors of all sets in short; those of the default set by their bare names."""
+    return [row for weights in weight_sets.SETS for row in _list_set(weights)]
+
+
+def describe_weights() -> dict[str, Any]:
+    """Describe the sets of weights: which is in force, and of each its models, size and strictest licence."""
+    return {"in_force": weight_sets.find_current_set(), **{name: _describe_set(name) for name in weight_sets.SETS}}
+
+
+def _list_set(weights: str) -> list[dict[str, Any]]:
+    rows = []
+    for name in weight_sets.list_models(weights):
+        whole = read_prior_card(f"{weights}/{name}")
+        rows.append(_summarise_prior(name if weights == weight_sets.SETS[0] else f"{weights}/{name}", weights, whole))
+    return rows
+
+
+def _describe_set(weights: str) -> dict[str, Any]:
+    rows = _list_set(weights)
+    return {
+        "models": [row["name"] for row in rows],
+        "megabytes": sum(row["megabytes"] for row in rows),
+        "licence": find_strictest(row["licence"] for row in rows),
+    }
 
 
 def describe_installation() -> dict[str, Any]:
@@ -85,10 +118,25 @@ def describe_installation() -> dict[str, Any]:
     }
 
 
-def _summarise_prior(name: str, whole: Mapping[str, Any]) -> dict[str, Any]:
+def _summarise_prior(name: str, weights: str, whole: Mapping[str, Any]) -> dict[str, Any]:
     size = Path(whole["file"]).stat().st_size / 1e6
     kept = {key: whole[key] for key in ("kind", "licence", "abilities", "config")}
-    return {"name": name, **kept, "megabytes": size}
+    data = {key: int(whole["data"][key]) for key in ("clips", "frames") if key in whole["data"]}
+    return {"name": name, "weights": weights, **kept, "data": data, "megabytes": size}
+
+
+def _format_data(row: Mapping[str, Any]) -> str:
+    data = row["data"]
+    minutes = data.get("frames", 0) / PRIOR_FPS / 60
+    return f"{data['clips']:,} clips, {minutes:,.0f} min" if minutes else "-"
+
+
+def _format_set(weights: str) -> list[str]:
+    described = _describe_set(weights)
+    name = f"{weights} (in force)" if weights == weight_sets.find_current_set() else weights
+    if not described["models"]:
+        return [name, "none is bundled", "-", "-"]
+    return [name, str(len(described["models"])), f"{described['megabytes']:.1f} MB", described["licence"]]
 
 
 def _format_speeds(row: Mapping[str, Any]) -> str:

@@ -6,11 +6,11 @@ from typing import Annotated, Literal
 from tyro.conf import UseAppendAction, arg
 
 from mapctl.commands.shared import options
-from mapctl.commands.shared.command import Command
+from mapctl.commands.shared.command import ModelCommand
 
 
 @dataclass(frozen=True)
-class Live(Command):
+class Live(ModelCommand):
     """Steer characters in a browser on this machine: sliders, keys, drawn paths, recording."""
 
     port: Annotated[int, arg(metavar="P")] = 8080

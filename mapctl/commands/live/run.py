@@ -11,7 +11,7 @@ from controllers.common.character import Character
 from controllers.steering.process import CharacterProcess, CharacterRequest
 from controllers.steering.steer import SteerSettings
 from mapctl.commands.live import Live
-from mapctl.commands.shared import options, streaming
+from mapctl.commands.shared import licensing, options, streaming
 from mapctl.commands.shared.character import as_character, read_character, read_drawn_character, read_rigged
 from mapctl.errors import RequestError
 from mapctl.intent.steering import Command
@@ -19,6 +19,7 @@ from mapctl.motion import Motion
 from mapctl.retarget.carry import retarget_motion
 from mapctl.runtime.processes import reraise_ctrl_c
 from mapctl.terms import FootContact
+from priors import checkpoints
 from scenes.drawn_character import DrawnCharacter
 from scenes.live.app import LiveApp
 from scenes.live.inputs import SteeringInputs
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from mapctl.streaming.sender import PoseStream
 
 _MAX_CHARACTERS = 16
+_STITCHER = "stitcher"
 _START_SPACING = 1.5  # metres between characters where they begin
 
 
@@ -66,6 +68,7 @@ def _serve(command: Live, receiver: "OscReceiver | None") -> int:
 
 def _open_app(command: Live, receiver: "OscReceiver | None") -> "tuple[LiveApp, PoseStream | None]":
     prior, drawn = priors.load(command.prior), _read_drawn(command)
+    checkpoints.note_use(_STITCHER)  # the characters' processes load it
     bodies = _read_bodies(command, drawn)
     orders = [SteeringInputs() for _ in range(command.characters)]
     with reraise_ctrl_c():
@@ -86,6 +89,7 @@ def _open_app(command: Live, receiver: "OscReceiver | None") -> "tuple[LiveApp, 
             theme=command.theme,
             rests=True,
             recordings=Path.cwd(),
+            licence=licensing.format_used_licences(),
         )
         return show, stream
     except BaseException:
@@ -142,7 +146,7 @@ def _choose_recorded_rigs(
 
 
 def _start_characters(command: Live, bodies: Sequence[Character]) -> Sequence[CharacterProcess]:
-    load = functools.partial(priors.load, command.prior)
+    load = functools.partial(priors.load, priors.add_set(command.prior))
     positions = [
         (_START_SPACING * (number - (command.characters - 1) / 2), 0.0) for number in range(command.characters)
     ]
@@ -156,7 +160,7 @@ def _start_characters(command: Live, bodies: Sequence[Character]) -> Sequence[Ch
                 at,
                 SteerSettings(footing=FootContact(rest_height=own.toe_rest_height)),
                 own.skeleton,
-                transitions=priors.load_stitcher,
+                transitions=functools.partial(priors.load_stitcher, priors.add_set(_STITCHER)),
             )
             found.append(CharacterProcess(request))
         for character in found:

@@ -6,11 +6,11 @@ from typing import Annotated
 from tyro.conf import arg
 
 from mapctl.commands.shared import options
-from mapctl.commands.shared.command import Command
+from mapctl.commands.shared.command import ModelCommand
 
 
 @dataclass(frozen=True)
-class Make(Command):
+class Make(ModelCommand):
     """Motion that data lack, steered: starts, stops, turns on the spot, changes of pace; kept where it passes checks.
 
     Clips that are as good as mocap by every check go to OUT/made_000.bvh and so on, and can be trained on beside it;

@@ -2,16 +2,16 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from tyro.conf import Positional, arg
 
 from mapctl.commands.shared import options
-from mapctl.commands.shared.command import Command
+from mapctl.commands.shared.command import ModelCommand
 
 
 @dataclass(frozen=True)
-class Measure(Command):
+class Measure(ModelCommand):
     """Path, feet, jitter and more of a motion, beside a reference clip and mocap's own values.
 
     Of a clip also its cycle, of a walk or a run one stride, or that it has none.
@@ -19,6 +19,8 @@ class Measure(Command):
     a folder the means over its clips; beside a folder of mocap also whether the two can be told apart. Clips of a
     folder that cannot be measured are left out and listed.
     """
+
+    tells_licence: ClassVar[bool] = False
 
     clip: Positional[Annotated[Path, arg(metavar="CLIP|FOLDER")]]
     """.bvh, .npz or .amc; or a folder, every one of them below it."""

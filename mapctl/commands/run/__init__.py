@@ -7,11 +7,11 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from mapctl.commands.shared import options
-from mapctl.commands.shared.command import Command
+from mapctl.commands.shared.command import ModelCommand
 
 
 @dataclass(frozen=True)
-class RunScene(Command):
+class RunScene(ModelCommand):
     """A scripted scene of several actors, from a TOML file or a ready one by name."""
 
     scene: Positional[Annotated[str, arg(metavar="SCENE.toml")]]

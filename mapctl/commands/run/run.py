@@ -10,7 +10,7 @@ import scenes
 from controllers.common.character import Character
 from mapctl import report
 from mapctl.commands.run import RunScene
-from mapctl.commands.shared import exit_status, options, outputs
+from mapctl.commands.shared import exit_status, licensing, options, outputs
 from mapctl.commands.shared.character import read_character, read_drawn_character
 from mapctl.commands.shared.exit_status import conclude
 from mapctl.commands.shared.path_walk import Walk, parse_follow, walk
@@ -36,14 +36,18 @@ def run(command: RunScene) -> int:
 
     Ctrl-C ends the solves; those that have begun are written, without a film.
     """
-    path = scenes.find_scene(command.scene)
+    path = Path(scenes.find_scene(command.scene))
     scene, curves = load(path)
+    with priors.use_weights(command.weights or scene.weights):
+        return _run_scene(command, path, scene, curves)
+
+
+def _run_scene(command: RunScene, path: Path, scene: SceneDescription, curves: Sequence[Curve]) -> int:
     character, prior = read_character(command.rig), priors.load(scene.prior)
     plans = [
-        _plan(scene, actor, curve, prior, character, Path(path))
-        for actor, curve in zip(scene.actors, curves, strict=True)
+        _plan(scene, actor, curve, prior, character, path) for actor, curve in zip(scene.actors, curves, strict=True)
     ]
-    drawn = _read_drawn(command, scene, Path(path))
+    drawn = _read_drawn(command, scene, path)
     outputs.check_folder(command.out)
     for film_path in scene.films(command.out):
         outputs.require_render("av" if film_path.suffix.lower() == ".mp4" else "PIL")
@@ -139,7 +143,7 @@ def _write(
     outputs.check_files(written)
     for actor, done in zip(begun, walks, strict=True):
         for path in motions[actor.name]:
-            done.on_rig.save(path)
+            licensing.save_motion(done.on_rig, path)
     for path in reports:
         report.write_report(_report(command, scene, walks), path)
     if films:
@@ -169,4 +173,4 @@ def _report(command: RunScene, scene: SceneDescription, walks: Sequence[Walk | P
         actor.name: done.report(options.describe_request("follow", actor))
         for actor, done in zip(scene.actors, walks, strict=False)
     }
-    return {"request": request, "actors": actors}
+    return licensing.add_licence({"request": request, "actors": actors})

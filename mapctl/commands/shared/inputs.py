@@ -12,6 +12,7 @@ from mapctl.motion import Motion
 from mapctl.recording.masks import Mask, masks_from_missing
 from mapctl.retarget import figure, load_rig
 from mapctl.retarget.rigs import Rig
+from priors.licences import note_licence
 
 MAX_FRAMES = 3_600_000
 """Frames of the longest motion in one call: 33 hours at the priors' rate."""
@@ -50,10 +51,13 @@ def read_rig_clip(text: str) -> tuple[Motion, Rig | None]:
 
 def read_motion(path: Path, rig: Rig | None, *, fps: Fraction | None = None) -> Motion:
     """Read a motion in metres, from the rig's unit where it has one; `fps` is that of an .amc."""
-    return formats.load(path, fps=fps, metres_per_unit=None if rig is None else rig.metres_per_unit)
+    motion = formats.load(path, fps=fps, metres_per_unit=None if rig is None else rig.metres_per_unit)
+    note_licence(str(path), motion.licence)
+    return motion
 
 
 def read_motion_with_gaps(path: Path, rig: Rig | None) -> tuple[Motion, tuple[Mask, ...], bool]:
     """Read a motion in which missing values may be NaN; also return their masks, and whether there are any."""
     motion, missing = formats.load_with_missing(path, metres_per_unit=None if rig is None else rig.metres_per_unit)
+    note_licence(str(path), motion.licence)
     return motion, masks_from_missing(motion, missing), bool(missing.rotations.any() or missing.places.any())

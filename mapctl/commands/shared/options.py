@@ -31,6 +31,7 @@ MaybeRig = Annotated[str | None, arg(metavar="PRESET|FILE.toml|CLIP")]
 MaybeEndpoint = Annotated[str | None, arg(metavar="HOST:PORT")]
 MaybeSize = Annotated[str | None, arg(metavar="WxH")]
 MaybeCharacter = Annotated[str | None, arg(metavar="CHARACTER")]
+MaybeWeights = Annotated[str | None, arg(metavar="free|full")]
 CameraKind = Literal["follow", "fixed", "top"]
 Size = Annotated[str, arg(metavar="WxH")]
 

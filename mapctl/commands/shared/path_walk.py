@@ -10,6 +10,7 @@ import torch
 from controllers.common.character import Character
 from controllers.following.follow import FollowSettings, follow
 from mapctl import report
+from mapctl.commands.shared.licensing import add_licence
 from mapctl.curves.curve import Curve
 from mapctl.features import PRIOR_FPS
 from mapctl.intent.path import USUAL_SPEED, PathRequest, SpeedProfile
@@ -58,7 +59,8 @@ class Walk:
         """Build the report of this walk; `request` is what the user wrote."""
         card = self.prior.card
         prior = {"name": self.prior.name, "licence": card.licence, "quality": card.quality}
-        return report.build_report(self.solution, request=request, measures=self.measures, seed=self.seed, prior=prior)
+        told = report.build_report(self.solution, request=request, measures=self.measures, seed=self.seed, prior=prior)
+        return add_licence(told)
 
     def summary(self) -> list[str]:
         """Format a few lines for the user."""

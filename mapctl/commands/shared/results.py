@@ -11,6 +11,7 @@ from controllers.inbetweening.proposers import ModelLoaders
 from mapctl import formats, metrics
 from mapctl import report as reports
 from mapctl.commands.shared import inputs, options, outputs
+from mapctl.commands.shared.licensing import add_licence
 from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.commands.shared.style import Example, tell_style
 from mapctl.errors import RequestError
@@ -109,4 +110,4 @@ def build_report(name: str, command: Any, solution: Solution) -> dict[str, Any]:
     """Build the report on a job whose motion is measured as `mapctl measure` takes it, without a curve."""
     request = {key: value for key, value in options.describe_request(name, command).items() if value is not None}
     comparable = make_comparable(solution.motion, inputs.read_rig(command.rig))[0]
-    return reports.build_report(solution, request=request, measures=metrics.measure(comparable))
+    return add_licence(reports.build_report(solution, request=request, measures=metrics.measure(comparable)))

@@ -8,14 +8,14 @@ from typing import Annotated
 from tyro.conf import Positional, UseAppendAction, arg
 
 from mapctl.commands.shared import options
-from mapctl.commands.shared.command import Command
+from mapctl.commands.shared.command import ModelCommand
 from mapctl.intent.steering_limits import SteeringLimits
 
 _TURN_RATE_DEG = round(math.degrees(SteeringLimits.turn_rate), 1)
 
 
 @dataclass(frozen=True)
-class Steer(Command):
+class Steer(ModelCommand):
     """A character follows a script of speeds and directions, as in live steering."""
 
     commands: Positional[Annotated[Path, arg(metavar="COMMANDS.csv")]]

@@ -23,7 +23,7 @@ from controllers.steering.loop import (
     summarise_step_timing,
 )
 from mapctl import formats, metrics, report
-from mapctl.commands.shared import inputs, options, outputs, streaming
+from mapctl.commands.shared import inputs, licensing, options, outputs, streaming
 from mapctl.commands.shared.character import read_character
 from mapctl.commands.shared.exit_status import conclude
 from mapctl.commands.shared.progress_bar import show_progress
@@ -65,7 +65,7 @@ def run(command: Steer) -> int:
     finally:
         links.close()
     motion = recorder.motion(frames)
-    character.on_rig(motion).save(command.out)
+    licensing.save_motion(character.on_rig(motion), command.out)
     arrivals = [time for time in track.times[1:] if time < motion.seconds]
     timing: dict[str, Any] = {**summarise_step_timing(records, arrivals), "peak_memory_mb": report.peak_memory_mb()}
     if links.stream is not None:
@@ -191,7 +191,8 @@ def _build_report(
         timing=timing,
     )
     arrivals = measure_arrivals(done.motion, track, refused)
-    return found | {"commands": measure_commands(done.motion, track)} | ({"arrivals": arrivals} if arrivals else {})
+    found |= {"commands": measure_commands(done.motion, track)} | ({"arrivals": arrivals} if arrivals else {})
+    return licensing.add_licence(found)
 
 
 @dataclass(frozen=True)

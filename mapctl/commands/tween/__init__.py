@@ -6,11 +6,11 @@ from typing import Annotated
 from tyro.conf import arg
 
 from mapctl.commands.shared import options
-from mapctl.commands.shared.command import Command
+from mapctl.commands.shared.command import ModelCommand
 
 
 @dataclass(frozen=True)
-class Tween(Command):
+class Tween(ModelCommand):
     """Make the motion between keyframes: frames of a clip, or poses that a file sets in time and space. On any known
     rig."""
 

@@ -15,8 +15,8 @@ from controllers.inbetweening.proposers import build_inbetweener
 from controllers.inbetweening.solution import InbetweenSolution
 from controllers.inbetweening.tween import measure_keyframe_errors, tween
 from controllers.inbetweening.variations import Tweening
-from mapctl import formats, report
-from mapctl.commands.shared import exit_status, inputs, results
+from mapctl import report
+from mapctl.commands.shared import exit_status, inputs, licensing, results
 from mapctl.commands.shared.exit_status import conclude
 from mapctl.commands.shared.frame_syntax import parse_frame
 from mapctl.commands.shared.style import read_dna
@@ -32,6 +32,11 @@ from mapctl.retarget.rigs import Rig
 def run(command: Tween) -> int:
     """Check everything, make, write, report."""
     request = _read_key_request(command)
+    with priors.use_weights(command.weights or (None if request is None else request.weights)):
+        return _run_request(command, request)
+
+
+def _run_request(command: Tween, request: KeyRequest | None) -> int:
     _check(command, [command.source] if request is None else [command.source, *map(Path, request.files)])
     clip = _read_keyframe_clip(command, request)
     dna = read_dna(command.dna, command.method)
@@ -45,7 +50,7 @@ def run(command: Tween) -> int:
         done = variations.tween_lowest_energy(command, make, models)
     else:
         done = make(build_inbetweener(command.method, models), torch.Generator().manual_seed(command.seed))
-    formats.save(done.motion, command.out)
+    licensing.save_motion(done.motion, command.out)
     if command.report is not None:
         report.write_report(_build_report(command, done, clip, intervals), command.report)
     results.film_comparison(clip.motion, done.motion, command.video, rig=clip.rig, quiet=command.quiet)

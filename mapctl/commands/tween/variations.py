@@ -13,8 +13,8 @@ from controllers.inbetweening.proposers import ModelLoaders, RolloutInbetweener,
 from controllers.inbetweening.solution import InbetweenSolution
 from controllers.inbetweening.tween import measure_keyframe_errors
 from controllers.inbetweening.variations import Source, Tweening, Variations, lowest_energy, sample_variations
-from mapctl import formats, report
-from mapctl.commands.shared import options, results
+from mapctl import report
+from mapctl.commands.shared import licensing, options, results
 from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.commands.shared.style import Example, find_styles, find_tweener, restyle
 from mapctl.commands.tween import Tween
@@ -93,7 +93,7 @@ def run_variations(
     files = number_paths(command.out, command.variations)
     rows = list(zip(found.each, files, strict=True))
     for one, file in rows:
-        formats.save(one.solution.motion, file)
+        licensing.save_motion(one.solution.motion, file)
     if command.report is not None:
         report.write_report(_report_variations(command, clip, found, files), command.report)
     if command.video is not None:

@@ -15,6 +15,7 @@ from mapctl.formats.characters.rest_frames import split_scale
 from mapctl.formats.characters.source import CharacterSource
 from mapctl.formats.gltf.animations import name_animations
 from mapctl.formats.gltf.container import GltfFile, compose_glb, read_file, read_neighbour
+from mapctl.formats.gltf.schema import LICENCE
 from mapctl.motion import Motion
 
 Array = np.ndarray
@@ -42,9 +43,17 @@ def save(motion: Motion, path: str | PathLike[str], source: CharacterSource) -> 
         a for a, name in zip(tree.get("animations", []), name_animations(gltf), strict=True) if name != source.animation
     ]
     tree["animations"] = [animation, *kept]
+    if motion.licence:
+        asset = tree["asset"]
+        tree["asset"] = {**asset, "extras": {**_find_extras(asset), LICENCE: motion.licence}}
     first = tree["buffers"][0] if tree.get("buffers") else {}
     tree["buffers"] = [{**first, "byteLength": appended.size}]
     write_pieces(path, compose_glb(tree, [*binary, *appended.pieces]))
+
+
+def _find_extras(asset: dict[str, Any]) -> dict[str, Any]:
+    extras = asset.get("extras")
+    return extras if isinstance(extras, dict) else {}
 
 
 def _gather(gltf: GltfFile) -> "tuple[dict[str, Any], list[bytes | memoryview]]":

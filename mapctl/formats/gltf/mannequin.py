@@ -5,12 +5,14 @@ translation track, every joint a rotation track at the motion's own frames.
 """
 
 from os import PathLike
+from typing import Any
 
 import numpy as np
 import pygltflib
 
 from mapctl.errors import RequestError
 from mapctl.formats.atomic import write_bytes
+from mapctl.formats.gltf.schema import LICENCE
 from mapctl.formats.skinned import SkinnedBody, build_skinned_body
 from mapctl.motion import Motion
 from mapctl.rotations import make_sign_continuous
@@ -55,7 +57,8 @@ def to_bytes(motion: Motion, *, path: str | PathLike[str] = "a .glb file") -> by
     """Return the content of the file; `path` is what an error names."""
     if not (motion.root_position.isfinite().all() and motion.local_quat_xyzw.isfinite().all()):
         raise RequestError(f"cannot write {path}: the motion is not finite")
-    document = pygltflib.GLTF2(asset=pygltflib.Asset(version="2.0", generator=f"mapctl {__version__}"))
+    told: dict[str, Any] = {"copyright": motion.licence, "extras": {LICENCE: motion.licence}} if motion.licence else {}
+    document = pygltflib.GLTF2(asset=pygltflib.Asset(version="2.0", generator=f"mapctl {__version__}", **told))
     buffer = _Buffer(document)
     joints = motion.num_joints
     document.nodes = _build_nodes(motion)

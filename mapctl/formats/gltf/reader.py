@@ -1,5 +1,6 @@
 """glTF and VRM in: a skinned character's joints, its rest pose, and an animation where the file has one."""
 
+from dataclasses import replace
 from fractions import Fraction
 from os import PathLike
 
@@ -32,7 +33,8 @@ def load(path: str | PathLike[str]) -> Motion:
     name, tracks = found
     fps, local = sample_local_matrices(gltf, armature.nodes, tracks)
     worlds = chain_matrices(armature.parents, local, frames.outer)
-    return frames.to_motion(worlds, fps, skeleton, _source(gltf, armature, frames, name))
+    motion = frames.to_motion(worlds, fps, skeleton, _source(gltf, armature, frames, name))
+    return replace(motion, licence=gltf.document.asset.licence)
 
 
 def load_rest(path: str | PathLike[str]) -> Motion:

@@ -12,6 +12,10 @@ Quaternion = tuple[Number, Number, Number, Number]
 Matrix = Annotated[list[Number], Field(min_length=16, max_length=16)]
 
 
+LICENCE = "licence"
+"""Key of the asset's extras under which mapctl writes the licence of a motion."""
+
+
 class _Part(BaseModel):
     model_config = ConfigDict(frozen=True, extra="ignore", protected_namespaces=())
 
@@ -20,6 +24,13 @@ class Asset(_Part):
     """Version of the format."""
 
     version: str
+    extras: object = None
+
+    @property
+    def licence(self) -> str:
+        """What the file says of the licence of its motion; empty where it says nothing."""
+        told = self.extras.get(LICENCE) if isinstance(self.extras, dict) else None
+        return told if isinstance(told, str) else ""
 
 
 class Buffer(_Part):

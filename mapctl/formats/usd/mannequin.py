@@ -40,6 +40,8 @@ def build_stage(motion: Motion, joints: Sequence[str]) -> Usd.Stage:
     mesh = _define_mesh(stage, body)
     UsdSkel.BindingAPI.Apply(mesh).CreateSkeletonRel().SetTargets([skeleton.GetPath()])
     _set_extent(top, motion)
+    if motion.licence:
+        stage.GetRootLayer().customLayerData = {"licence": motion.licence}
     return stage
 
 

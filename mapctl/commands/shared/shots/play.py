@@ -15,6 +15,7 @@ from controllers.shots.prices import measure_prices
 from controllers.shots.request import Others, ShotRequest
 from controllers.shots.shot import ShotSettings, ShotSolution, solve_shot
 from mapctl import report
+from mapctl.commands.shared.licensing import add_licence
 from mapctl.commands.shared.shots.plan import ShotPlan
 from mapctl.commands.shared.shots.rates import resample_shot
 from mapctl.features import PRIOR_FPS
@@ -60,7 +61,8 @@ class PlayedShot:
         card = self.plan.prior.card
         prior = {"name": self.plan.prior.name, "licence": card.licence, "quality": card.quality}
         seed = self.plan.actor.seed
-        return report.build_report(self.solution, request=request, measures=self.measures, seed=seed, prior=prior)
+        told = report.build_report(self.solution, request=request, measures=self.measures, seed=seed, prior=prior)
+        return add_licence(told)
 
     def summary(self) -> list[str]:
         """Format a few lines for the user."""

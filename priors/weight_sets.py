@@ -1,0 +1,126 @@
+"""Sets of bundled weights: `full`, the default, and `free`, which anybody may use for anything.
+
+Files of the full set lie in `priors/weights`, those of the free one in `priors/weights/free`. Which file a name such as
+`locomotion` means is decided by the set in force; `free/locomotion` and `full/locomotion` always mean the same file.
+
+The set in force is what the environment variable MAPCTL_WEIGHTS says: it reaches processes that are started, too.
+"""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.resources import as_file, files
+from importlib.resources.abc import Traversable
+from pathlib import Path
+
+from mapctl.errors import CheckpointError, RequestError
+
+SETS = ("full", "free")
+"""The sets by name, the default first."""
+VARIABLE = "MAPCTL_WEIGHTS"
+"""Environment variable that holds the name of the set in force; the default if it is not set, or empty."""
+FOLDER_VARIABLE = "MAPCTL_WEIGHTS_FOLDER"
+"""Environment variable that names a folder in place of `priors/weights`, with the free set in its sub-folder `free`."""
+_ENDING = ".safetensors"
+
+
+def find_current_set() -> str:
+    """Find the set in force; RequestError where the environment names another than there is."""
+    return _check(os.environ.get(VARIABLE) or SETS[0], VARIABLE)
+
+
+@contextmanager
+def use_weights(name: str | None) -> Iterator[None]:
+    """Let bundled names mean the models of a set, `free` or `full`, until the block ends; None changes nothing.
+
+    It holds for all threads of this process, and for processes that are started meanwhile. RequestError for a set that
+    does not exist.
+    """
+    before = os.environ.get(VARIABLE)
+    if name is not None:
+        os.environ[VARIABLE] = _check(name, "the weights")
+    try:
+        yield
+    finally:
+        if name is not None:
+            _restore(before)
+
+
+def _restore(before: str | None) -> None:
+    if before is None:
+        os.environ.pop(VARIABLE, None)
+    else:
+        os.environ[VARIABLE] = before
+
+
+def _check(name: str, what: str) -> str:
+    if name not in SETS:
+        raise RequestError(f"{what} must be {' or '.join(reversed(SETS))}, got {name!r}")
+    return name
+
+
+def list_models(weights: str | None = None) -> list[str]:
+    """List the names of a set's models, without the set; of the set in force if none is named."""
+    found = _find_folder(weights or find_current_set())
+    names = (each.name for each in found.iterdir()) if found.is_dir() else ()
+    return sorted(name.removesuffix(_ENDING) for name in names if name.endswith(_ENDING))
+
+
+def split_name(name: str) -> tuple[str, str]:
+    """Split a bundled name into its set, that in force where it names none, and the model's name."""
+    weights, slash, model = name.partition("/")
+    return (weights, model) if slash and weights in SETS else (find_current_set(), name)
+
+
+def names_set(name: str) -> bool:
+    """Return whether a name says its set, and means a model of that set and no file or folder of that name."""
+    _weights, model = split_name(name)
+    return model != name and any(model in list_models(each) for each in SETS)
+
+
+def find_file(name: str) -> Path | None:
+    """Find the file of a bundled name, with or without a set in it; None where the set has no such model."""
+    weights, model = split_name(name)
+    if model not in list_models(weights):
+        return None
+    with as_file(_find_folder(weights) / f"{model}{_ENDING}") as place:
+        return place
+
+
+def find_set_of(path: Path) -> str | None:
+    """Find the set that a file is of; None for files that are not bundled."""
+    for weights in SETS:
+        with as_file(_find_folder(weights)) as folder:
+            if path.resolve().parent == folder.resolve():
+                return weights
+    return None
+
+
+def add_set(name: str) -> str:
+    """Add its set to a bundled name, where that is not the default one, so that it means the same file in another
+    process; other names, and paths, stay."""
+    weights, model = split_name(name)
+    bare = model == name and weights != SETS[0]
+    return f"{weights}/{name}" if bare and model in list_models(weights) and not _is_path(name) else name
+
+
+def _is_path(name: str) -> bool:
+    return Path(name).exists() or Path(f"{name}{_ENDING}").is_file()
+
+
+def explain_missing(name: str) -> CheckpointError:
+    """Explain that a name is neither a file nor bundled, and what there is."""
+    weights, model = split_name(name)
+    known, others = list_models(weights), [each for each in SETS if each != weights and model in list_models(each)]
+    there = ", ".join(known) or "the bundled (none)"
+    if weights == SETS[0] and model == name and not others:
+        return CheckpointError(f"no prior {name!r}: neither a file nor one of {there}")
+    held = f"they hold {', '.join(known)}" if known else "none are installed"
+    other = f"; {others[0]}/{model} is there, under a licence of its own (mapctl info)" if others else ""
+    return CheckpointError(f"the {weights} weights have no {model!r}: {held}{other}")
+
+
+def _find_folder(weights: str) -> Traversable:
+    own = os.environ.get(FOLDER_VARIABLE)
+    whole: Traversable = Path(own) if own else files("priors.weights")
+    return whole if weights == SETS[0] else whole / weights

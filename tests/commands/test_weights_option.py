@@ -1,0 +1,359 @@
+"""Commands with the free weights alone, as a user types them, and which set of weights is taken."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from helpers import run, walk
+from stage import Actor
+from tiny_weights import FREE, change_card, save_tiny_weights
+
+import mapctl
+import priors
+from controllers.steering.process import CharacterProcess
+from mapctl import formats
+from mapctl.cli import parse
+from mapctl.commands import COMMANDS
+from mapctl.commands.bench import TABLES
+from mapctl.commands.live import Live
+from mapctl.commands.live import run as live
+from mapctl.commands.shared.character import read_character
+from mapctl.commands.shared.command import ModelCommand
+from priors import weight_sets
+from scenes.live.app import LiveApp
+
+NOT_FREE = "CC BY-NC 4.0"
+SCENE = 'outputs = ["a.npz", "a.json"]\n[[actors]]\ncurve = "line:0.5"\n'
+KEYS = 'body = "in.bvh"\n[[key]]\nframe = 0\npose = "in.bvh"\n[[key]]\nframe = 12\npose = "in.bvh"\npose_frame = 12\n'
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory):
+    """The free set alone, under `free`, and beside it a whole folder of both, under `both`."""
+    folder = tmp_path_factory.mktemp("weights")
+    save_tiny_weights(folder / "alone" / "free")
+    shutil.copytree(folder / "alone", folder / "both")
+    save_tiny_weights(folder / "both", NOT_FREE)
+    return folder
+
+
+@pytest.fixture
+def work(tmp_path, monkeypatch):
+    """The current folder, with what commands read."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MAPCTL_RENDERER", "stick")
+    monkeypatch.delenv(weight_sets.VARIABLE, raising=False)
+    walk(40).save(tmp_path / "in.bvh")
+    walk(40, turn_rate=0.3, seed=1).save(tmp_path / "other.bvh")
+    (tmp_path / "clips").mkdir()
+    shutil.copy(tmp_path / "in.bvh", tmp_path / "clips" / "one.bvh")
+    (tmp_path / "scene.toml").write_text(SCENE)
+    (tmp_path / "keys.toml").write_text(KEYS)
+    (tmp_path / "c.csv").write_text("time_s,speed_mps,heading_deg\n0,1.0,0\n0.5,1.0,0\n")
+    return tmp_path
+
+
+@pytest.fixture
+def alone(saved, work, monkeypatch):
+    """The free weights without the full ones."""
+    monkeypatch.setenv(weight_sets.FOLDER_VARIABLE, str(saved / "alone"))
+    return work
+
+
+@pytest.fixture
+def both(saved, work, monkeypatch):
+    """Both sets, in a folder of their own."""
+    shutil.copytree(saved / "both", work / "weights")
+    monkeypatch.setenv(weight_sets.FOLDER_VARIABLE, str(work / "weights"))
+    return work
+
+
+def licence_of(report):
+    return json.loads(report.read_text())["licence"]
+
+
+JOBS = {
+    "follow": ("follow line:1 -o out.npz --report out.json", {"locomotion"}),
+    "follow a shot": ("follow line:1 -o out.npz --end stand --report out.json", {"locomotion", "transformer"}),
+    "run": ("run scene.toml", {"locomotion"}),
+    "generate": ("generate -o made --seconds 0.5 --no-footing --to .npz", {"locomotion"}),
+    "steer": ("steer c.csv -o out.npz --report out.json", {"locomotion-live"}),
+    "denoise": ("denoise in.bvh -o out.npz --report out.json", {"denoiser", "transformer"}),
+    "denoise with densities": (
+        "denoise in.bvh -o out.npz --prior auto --report out.json",
+        {"denoiser", "general", "locomotion", "transformer"},
+    ),
+    "denoise a folder": ("denoise clips -o clean --jobs 2 --report told", {"denoiser", "transformer"}),
+    "infill": ("infill in.bvh -o out.npz --gap 10:20 --report out.json", {"transformer"}),
+    "infill by a tweener": (
+        "infill in.bvh -o out.npz --gap 10:20 --method tweener --report out.json",
+        {"path", "tweener"},
+    ),
+    "infill by a stitcher": ("infill in.bvh -o out.npz --gap 10:20 --method stitcher --report out.json", {"stitcher"}),
+    "infill by rollouts": (
+        "infill in.bvh -o out.npz --gap 10:14 --method rollouts --report out.json",
+        {"general", "locomotion"},
+    ),
+    "tween": (
+        "tween in.bvh -o out.npz --keyframes 0,12 --suggest-timing --report out.json",
+        {"keyframe-timing", "transformer"},
+    ),
+    "blend": (
+        "blend in.bvh --from other.bvh --joints leftHand --frames 5:10 --at 15 -o out.npz --no-finish",
+        {"transformer"},
+    ),
+    "chain": ("chain in.bvh other.bvh -o out.npz --piece 10 --gap 9:10 --no-finish", {"transformer"}),
+}
+"""Words by what they do, and the models that they need at least."""
+LONG = ("follow a shot", "denoise a folder", "infill by rollouts")
+CASES = [pytest.param(name, marks=pytest.mark.slow if name in LONG else ()) for name in JOBS]
+OUTPUTS = ("out.npz", "a.npz", "made/generated_000.npz")
+REPORTS = ("out.json", "a.json", "told/one.json")
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_commands_work_with_the_free_weights_alone(alone, capsys, name):
+    words, needed = JOBS[name]
+    assert run(*words.split(), "--weights", "free") == 0
+    told = capsys.readouterr().out.splitlines()
+    (line,) = [line for line in told if line.startswith("licence   ")]
+    assert line.startswith(f"licence   {FREE} (free/")
+    assert all(f"free/{model}" in line for model in needed)
+    assert "CC BY-NC" not in line
+    for motion in map(alone.joinpath, OUTPUTS):
+        if motion.exists():
+            assert mapctl.load(motion).licence.startswith(f"{FREE} (free/")
+            assert "/tmp" not in mapctl.load(motion).licence
+    for report in map(alone.joinpath, REPORTS):
+        if report.exists():
+            licence = licence_of(report)
+            assert licence["strictest"] == FREE
+            assert {f"free/{model}" for model in needed} <= set(licence["models"])
+            assert set(licence["models"].values()) == {FREE}
+    assert weight_sets.VARIABLE not in os.environ
+
+
+@pytest.mark.slow
+def test_the_demo_works_with_the_free_weights_alone(alone, monkeypatch):
+    monkeypatch.setattr("mapctl.commands.demo.run.CURVE", "line:0.5")
+    monkeypatch.setattr("mapctl.commands.demo.run._SIZE", (96, 64))
+    assert run("demo", "-o", "demo", "--weights", "free", "--quiet") == 0
+    assert licence_of(alone / "demo" / "figure8.json")["models"] == {"free/locomotion": FREE}
+
+
+def test_measure_and_compile_work_with_the_free_weights_alone(alone, capsys):
+    assert run("measure", "in.bvh", "--weights", "free", "--json") == 0
+    assert "sway_cm" in json.loads(capsys.readouterr().out)["mocap"]
+    assert run("compile", "--weights", "free") == 0
+
+
+def test_all_commands_that_take_bundled_models_have_the_option():
+    without = {"bench", "train", "render", "convert", "blender-addon"}  # tables of bench have it
+    assert {name for name, kind in COMMANDS.items() if not issubclass(kind, ModelCommand)} == without
+    assert all(issubclass(table, ModelCommand) for table in TABLES.values())
+    assert not any(table.tells_licence for table in TABLES.values())  # JSON is theirs alone
+    assert getattr(parse(["bench", "--weights", "free"]), "weights", None) == "free"
+
+
+def test_the_live_page_tells_the_licence_of_what_its_characters_load(alone, monkeypatch, capsys):
+    """The process of a character is left out."""
+    asked = []
+    monkeypatch.setattr(live, "_start_characters", lambda *_: [Actor()])
+    monkeypatch.setattr(LiveApp, "__init__", lambda show, *_, **named: asked.append(named["licence"]))
+    monkeypatch.setattr(LiveApp, "url", "http://127.0.0.1:8080", raising=False)
+    monkeypatch.setattr(LiveApp, "run", lambda show: (_ for _ in ()).throw(KeyboardInterrupt))
+    monkeypatch.setattr(LiveApp, "save_recordings", lambda *_: [])
+    monkeypatch.setattr(LiveApp, "close", lambda show: None)
+    assert run("live", "--weights", "free") == 0
+    told = f"{FREE} (free/locomotion-live, free/stitcher)"
+    assert asked == [told]
+    assert f"licence   {told}" in capsys.readouterr().out
+
+
+def test_characters_of_the_live_page_load_the_free_weights(alone, monkeypatch):
+    requests = []
+
+    class Process(CharacterProcess):
+        """None at all."""
+
+        def __init__(self, request):
+            requests.append(request)
+
+        def wait(self):
+            pass
+
+    monkeypatch.setattr(live, "CharacterProcess", Process)
+    with priors.use_weights("free"):
+        live._start_characters(Live(), [read_character("canonical")])
+    (request,) = requests
+    assert request.load().card.licence == request.transitions().card.licence == FREE  # not in force here any more
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="sends Ctrl-C")
+def test_live_works_with_the_free_weights_alone(alone):
+    command = [sys.executable, "-m", "mapctl", "live", "--port", "8195", "--characters", "2", "--weights", "free"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as show:
+        assert show.stdout is not None
+        try:
+            next(line for line in show.stdout if line.startswith("open "))
+        finally:
+            show.send_signal(signal.SIGINT)
+        assert f"licence   {FREE} (free/locomotion-live, free/stitcher)" in show.stdout.read()
+    assert show.returncode == 0
+
+
+@pytest.mark.parametrize("words", [words for words, _ in JOBS.values()], ids=list(JOBS))
+def test_without_the_full_weights_nothing_else_stands_in(alone, fails, words):
+    told = fails(*words.split())
+    assert "the full weights have no" in told
+    assert "none are installed; free/" in told
+
+
+def test_what_the_free_set_lacks_is_refused_in_one_line(both, fails):
+    for name in ("transformer", "general"):
+        for ending in ("json", "safetensors"):
+            (both / "weights" / "free" / f"{name}.{ending}").unlink()
+    for words in (("infill", "in.bvh", "-o", "o.bvh", "--gap", "10:20"), ("denoise", "in.bvh", "-o", "o.bvh")):
+        assert "the free weights have no 'transformer': they hold denoiser, " in fails(*words, "--weights", "free")
+    assert "no 'general'" in fails("follow", "line:1", "-o", "o.bvh", "--weights", "free", "--prior", "general")
+
+
+def test_the_option_comes_before_the_scene_file_and_that_before_the_environment(both, monkeypatch):
+    def used(*words):
+        assert run("run", "scene.toml", "--quiet", *words) == 0
+        return set(licence_of(both / "a.json")["models"])
+
+    assert used() == {"locomotion"}
+    monkeypatch.setenv(weight_sets.VARIABLE, "free")
+    assert used() == {"free/locomotion"}
+    (both / "scene.toml").write_text(f'weights = "full"\n{SCENE}')
+    assert used() == {"locomotion"}
+    assert used("--weights", "free") == {"free/locomotion"}
+    monkeypatch.delenv(weight_sets.VARIABLE)
+    (both / "scene.toml").write_text(f'weights = "free"\n{SCENE}')
+    assert used() == {"free/locomotion"}
+    assert used("--weights", "full") == {"locomotion"}
+
+
+def test_a_key_file_may_name_the_weights(both):
+    words = ("tween", "keys.toml", "-o", "o.npz", "--no-finish", "--quiet", "--report", "o.json")
+    (both / "keys.toml").write_text(f'weights = "free"\n{KEYS}')
+    assert run(*words) == 0
+    assert licence_of(both / "o.json")["models"]["free/transformer"] == FREE
+    assert run(*words, "--weights", "full") == 0
+    assert licence_of(both / "o.json")["models"]["transformer"] == NOT_FREE
+
+
+def test_the_keys_of_a_shot_may_name_the_weights(both):
+    words = (
+        "follow",
+        "line:1",
+        "-o",
+        "o.npz",
+        "--seconds",
+        "1",
+        "--quiet",
+        "--keys",
+        "shot.toml",
+        "--report",
+        "o.json",
+    )
+    (both / "shot.toml").write_text('weights = "free"\n[[key]]\nseconds = 0.5\nlook_at = [0.0, 1.5, 3.0]\n')
+    assert run(*words) == 0
+    assert licence_of(both / "o.json")["models"] == {"free/locomotion": FREE, "free/transformer": FREE}
+
+
+def test_weights_that_do_not_exist_are_refused_in_one_line(both, fails, monkeypatch):
+    words = ("follow", "line:1", "-o", "out.bvh")
+    assert "must be free or full, got 'libre'" in fails(*words, "--weights", "libre")
+    (both / "scene.toml").write_text(f'weights = "libre"\n{SCENE}')
+    told = fails("run", "scene.toml")
+    assert "scene.toml" in told
+    assert "weights" in told
+    (both / "keys.toml").write_text(f'weights = "libre"\n{KEYS}')
+    assert "weights" in fails("tween", "keys.toml", "-o", "out.bvh")
+    (both / "shot.toml").write_text('weights = "libre"\n[[key]]\nseconds = 0.5\nlook_at = [0.0, 1.5, 3.0]\n')
+    assert "weights" in fails(*words, "--keys", "shot.toml")
+    monkeypatch.setenv(weight_sets.VARIABLE, "libre")
+    assert "MAPCTL_WEIGHTS must be free or full, got 'libre'" in fails(*words)
+
+
+def test_a_card_that_is_not_free_is_refused_in_one_line(both, fails):
+    change_card(both / "weights" / "free" / "locomotion.json", training={"began_with": "full/locomotion"})
+    told = fails("follow", "line:1", "-o", "out.bvh", "--weights", "free")
+    assert "free/locomotion is not free" in told
+    assert "began_with is 'full/locomotion', a model of the full weights" in told
+
+
+def test_the_strictest_of_all_models_is_the_licence(both, capsys):
+    assert run("denoise", "in.bvh", "-o", "out.glb", "--denoiser", "free/denoiser", "--report", "out.json") == 0
+    assert f"licence   {NOT_FREE} (transformer); {FREE} (free/denoiser)" in capsys.readouterr().out
+    told = licence_of(both / "out.json")
+    assert told == {"strictest": NOT_FREE, "models": {"free/denoiser": FREE, "transformer": NOT_FREE}}
+
+
+@pytest.mark.parametrize("ending", ["npz", "glb"])
+def test_a_motion_keeps_its_licence_from_file_to_file(both, capsys, ending):
+    assert run("follow", "line:1", "-o", f"walk.{ending}", "--quiet") == 0
+    assert run("info", f"walk.{ending}", "--json") == 0
+    assert json.loads(capsys.readouterr().out)["licence"] == f"{NOT_FREE} (locomotion)"
+    assert run("denoise", f"walk.{ending}", "-o", "clean.npz", "--weights", "free") == 0
+    line = f"{NOT_FREE} (walk.{ending}); {FREE} (free/denoiser, free/transformer)"
+    assert f"licence   {line}" in capsys.readouterr().out
+    assert mapctl.load("clean.npz").licence == line
+    assert run("convert", "clean.npz", "copy.glb") == 0
+    assert mapctl.load("copy.glb").licence == line
+
+
+def test_a_clip_that_is_blended_brings_its_licence(both, capsys):
+    assert run("follow", "line:1", "-o", "walk.npz", "--quiet") == 0
+    words = JOBS["blend"][0].replace("other.bvh", "walk.npz").split()
+    assert run(*words, "--weights", "free") == 0
+    assert f"licence   {NOT_FREE} (walk.npz); {FREE} (free/transformer)" in capsys.readouterr().out
+
+
+def test_a_command_that_makes_no_motion_tells_no_licence(both, capsys):
+    assert run("compile") == 0
+    told = capsys.readouterr().out
+    assert "kernels" in told
+    assert "licence" not in told
+
+
+def test_a_file_without_models_has_no_licence(both):
+    walk(10).save(both / "a.npz")
+    with np.load(both / "a.npz") as arrays:
+        assert "licence" not in arrays
+    walk(10).save(both / "a.glb")
+    assert mapctl.load("a.npz").licence == mapctl.load("a.glb").licence == ""
+    assert b"copyright" not in (both / "a.glb").read_bytes()
+
+
+def test_a_bvh_is_the_same_whatever_its_licence(both):
+    assert run("follow", "line:1", "-o", "a.bvh", "--quiet") == 0
+    assert run("follow", "line:1", "-o", "a.npz", "--quiet") == 0
+    formats.save(mapctl.load("a.npz"), "b.bvh")
+    assert (both / "a.bvh").read_bytes() == (both / "b.bvh").read_bytes()
+
+
+def test_info_lists_both_sets(both, capsys):
+    assert run("info", "--json", "--weights", "free") == 0
+    told = json.loads(capsys.readouterr().out)
+    names = [row["name"] for row in told["priors"]]
+    assert "locomotion" in names
+    assert "free/locomotion" in names
+    assert told["weights"]["in_force"] == "free"
+    assert told["weights"]["free"]["licence"] == FREE
+    assert told["weights"]["full"]["licence"] == NOT_FREE
+    assert told["weights"]["free"]["models"] == [name for name in names if name.startswith("free/")]
+    assert run("info") == 0
+    table = capsys.readouterr().out
+    assert "free/locomotion" in table
+    assert "full (in force)" in table
+    assert run("info", "locomotion", "--weights", "free") == 0
+    assert json.loads(capsys.readouterr().out)["licence"] == FREE

@@ -1,0 +1,236 @@
+"""Sets of weights: which file a bundled name means, what the free set refuses, and which licence is the strictest."""
+
+import os
+import shutil
+from functools import partial
+from pathlib import Path
+
+import pytest
+from tiny_weights import FREE, MODELS, change_card, save_tiny_weights
+
+import priors
+from mapctl.errors import CheckpointError, RequestError
+from mapctl.runtime.processes import open_pipe, spawn
+from priors import checkpoints, licences, weight_sets
+
+NOT_FREE = "CC BY-NC 4.0"
+
+
+@pytest.fixture(scope="module")
+def both(tmp_path_factory):
+    """Both sets; the free one has no `general` and no `tweener`."""
+    folder = save_tiny_weights(tmp_path_factory.mktemp("weights"), NOT_FREE)
+    save_tiny_weights(folder / "free", models=[name for name in MODELS if name not in ("general", "tweener")])
+    return folder
+
+
+@pytest.fixture
+def folder(both, tmp_path, monkeypatch):
+    """A copy of them, in place of those that come with the package."""
+    shutil.copytree(both, tmp_path, dirs_exist_ok=True)
+    monkeypatch.setenv(weight_sets.FOLDER_VARIABLE, str(tmp_path))
+    monkeypatch.delenv(weight_sets.VARIABLE, raising=False)
+    return tmp_path
+
+
+def test_names_mean_the_models_of_the_set_in_force(folder, monkeypatch):
+    full, free = folder / "locomotion.safetensors", folder / "free" / "locomotion.safetensors"
+    assert checkpoints.locate("locomotion") == full
+    with priors.use_weights("free"):
+        assert checkpoints.locate("locomotion") == free
+        with priors.use_weights("full"):
+            assert checkpoints.locate("locomotion") == full
+        with priors.use_weights(None):
+            assert checkpoints.locate("locomotion") == free
+        assert checkpoints.locate("full/locomotion") == full
+    assert checkpoints.locate("locomotion") == full
+    assert checkpoints.locate("free/locomotion") == free
+    monkeypatch.setenv(weight_sets.VARIABLE, "free")
+    assert checkpoints.locate("locomotion") == free
+    with priors.use_weights("full"):
+        assert checkpoints.locate("locomotion") == full
+    assert os.environ[weight_sets.VARIABLE] == "free"
+    monkeypatch.setenv(weight_sets.VARIABLE, "")
+    assert checkpoints.locate("locomotion") == full
+
+
+def test_the_set_is_restored_after_an_error(folder):
+    with pytest.raises(ZeroDivisionError), priors.use_weights("free"):
+        raise ZeroDivisionError
+    assert weight_sets.VARIABLE not in os.environ
+
+
+def test_a_set_that_does_not_exist_is_refused(folder, monkeypatch):
+    with pytest.raises(RequestError, match="must be free or full, got 'libre'"), priors.use_weights("libre"):
+        pass
+    assert weight_sets.VARIABLE not in os.environ
+    monkeypatch.setenv(weight_sets.VARIABLE, "libre")
+    with pytest.raises(RequestError, match="MAPCTL_WEIGHTS must be free or full, got 'libre'"):
+        priors.load("locomotion")
+
+
+def test_what_the_free_set_lacks_is_refused_though_the_full_one_has_it(folder):
+    with priors.use_weights("free"):
+        with pytest.raises(CheckpointError, match=r"the free weights have no 'general': they hold denoiser, .*; full/"):
+            priors.load("general")
+        with pytest.raises(CheckpointError, match="no 'tweener'"):
+            priors.load_tweener()
+        assert priors.load("full/general").card.licence == NOT_FREE  # who names it, gets it
+    with pytest.raises(CheckpointError, match="the free weights have no 'general'"):
+        priors.load("free/general")
+    with pytest.raises(CheckpointError, match="no prior 'nobody': neither a file nor one of denoiser"):
+        priors.load("nobody")
+
+
+def test_the_full_set_never_stands_in_for_a_missing_one(folder):
+    for path in (folder / "free").iterdir():
+        path.unlink()
+    with priors.use_weights("free"), pytest.raises(CheckpointError, match="none are installed"):
+        priors.load("locomotion")
+
+
+def test_a_name_with_a_set_means_no_file_of_that_name(folder, tmp_path_factory, monkeypatch):
+    elsewhere = tmp_path_factory.mktemp("elsewhere")
+    save_tiny_weights(elsewhere / "free")
+    monkeypatch.chdir(elsewhere)
+    assert checkpoints.locate("free/locomotion") == folder / "free" / "locomotion.safetensors"
+    with pytest.raises(CheckpointError, match="the free weights have no 'general'"):
+        checkpoints.locate("free/general")
+    assert checkpoints.locate("./free/general") == Path("free/general.safetensors")
+
+
+def test_auto_chooses_among_what_the_set_has(folder):
+    assert [each.name for each in priors.load_choice("auto")] == ["locomotion", "general"]
+    with priors.use_weights("free"):
+        assert [each.name for each in priors.load_choice("auto")] == ["locomotion"]
+        assert priors.load_choice("auto")[0].card.licence == FREE
+
+
+def test_a_prior_gets_the_refiner_of_its_own_set(folder):
+    for name, licence in (("locomotion", NOT_FREE), ("free/locomotion", FREE)):
+        refiner = priors.refiner_of(name)
+        assert refiner is not None
+        assert refiner.card.licence == licence
+    assert priors.refiner_of("general") is None
+    with priors.use_weights("free"):
+        refiner = priors.refiner_of("locomotion")
+        assert refiner is not None
+        assert refiner.card.licence == FREE
+
+
+def test_names_for_other_processes_say_their_set(folder):
+    assert priors.add_set("locomotion") == "locomotion"
+    with priors.use_weights("free"):
+        assert priors.add_set("locomotion") == "free/locomotion"
+        assert priors.add_set("free/locomotion") == "free/locomotion"
+        assert priors.add_set("full/locomotion") == "full/locomotion"
+        assert priors.add_set("runs/mine") == "runs/mine"
+
+
+def _send_licence(writer, load):
+    writer.send(load().card.licence)
+
+
+def test_the_set_reaches_processes(folder):
+    for load in (partial(priors.load, "locomotion"), partial(priors.load, "free/locomotion")):
+        reader, writer = open_pipe(duplex=False)
+        with reader, writer, priors.use_weights("free"):
+            process = spawn(_send_licence, writer, load)
+            assert reader.poll(60)
+            assert reader.recv() == FREE
+            process.join()
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"licence": NOT_FREE}, "its licence is 'CC BY-NC 4.0', allowed: free for any use"),
+        ({"licence": "that of the training data"}, "its licence is 'that of the training data'"),
+        ({"data": {"held_out": {"test": ["bandai-namco-1/data/dataset-1_run_old_001.bvh"]}}}, "names 'bandai'"),
+        ({"data": {"match": "dataset-2_(walk|run)_"}}, "names 'dataset-2_'"),
+        ({"data": {"source": "takes under CC BY-NC 4.0"}}, "names 'BY-NC'"),
+        ({"training": {"init": "full/general"}}, "init is 'full/general', a model of the full weights"),
+        ({"training": {"init": {"name": "runs/first"}}}, "init is 'runs/first', which is no model of the free"),
+        ({"training": {"began_with": ["locomotion", "general"]}}, "began_with is 'general'"),
+        ({"training": {"command": "mapctl train lstm-gmm --data DATA --init INIT"}}, "its command is 'INIT'"),
+        ({"training": {"remark": "SECOND: --init FIRST"}}, "its command is 'FIRST'"),
+        ({"training": {"command": "mapctl train refiner --density=full/locomotion"}}, "its command is 'full/locomot"),
+        ({"data": {"augmentation": {"splices": {"solved_by": "full/locomotion"}}}}, "solved_by is 'full/locomotion'"),
+        ({"data": {"refiner": "runs/refiner"}}, "refiner is 'runs/refiner'"),
+        ({"data": {"made": ["made.csv: 2 of 4 clips, by locomotion (CC BY-NC 4.0)"]}}, "names 'BY-NC'"),
+        ({"data": {"made": ["made.csv: 2 of 4 clips, by x (that of the training data)"]}}, "trained on clips of a mod"),
+    ],
+)
+def test_a_card_that_is_not_free_is_refused_in_the_free_set(folder, changes, why):
+    change_card(folder / "free" / "locomotion.json", **changes)
+    with pytest.raises(CheckpointError, match=r"^free/locomotion is not free, though") as refused:
+        priors.load("free/locomotion")
+    assert why in str(refused.value)
+    change_card(folder / "locomotion.json", **changes)
+    assert priors.load("locomotion").name == "locomotion"  # the full set may
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"licence": "CC0 1.0"},
+        {"training": {"init": None}},
+        {"training": {"init": {"name": None}, "command": "mapctl train lstm-gmm --data DATA --match ^cmu"}},
+        {"training": {"init": "free/denoiser", "command": "mapctl train x --init free/denoiser"}},
+        {"data": {"made": ["made.csv: 2 of 4 clips, by locomotion (free for any use)"]}},
+        {"data": {"solved_by": "locomotion", "held_out": {"test": ["cmu/02/02_01.bvh"]}}},
+    ],
+)
+def test_a_card_that_is_free_is_taken(folder, changes):
+    change_card(folder / "free" / "locomotion.json", **changes)
+    assert priors.load("free/locomotion").name == "free/locomotion"
+
+
+def test_a_refiner_of_another_density_of_that_name_is_refused(folder):
+    own = checkpoints.read_card(folder / "free" / "locomotion.json").config
+    card = folder / "free" / "locomotion-refiner.json"
+    change_card(card, data={"density": "locomotion", "density_config": own})
+    assert priors.load_refiner("free/locomotion-refiner").card.licence == FREE
+    change_card(card, data={"density": "locomotion", "density_config": {**own, "labels": ["gait=run"]}})
+    with pytest.raises(CheckpointError, match="its density, 'locomotion', has other settings"):
+        priors.load_refiner("free/locomotion-refiner")
+
+
+def test_bundled_models_of_the_free_set_are_free():
+    for name in weight_sets.list_models("free"):
+        checkpoints.note_use(f"free/{name}")
+
+
+def test_what_is_loaded_is_recorded_with_its_licence(folder):
+    priors.load("locomotion")
+    with licences.record_licences() as used:
+        assert not used
+        priors.load("locomotion")
+        priors.load_denoiser("free/denoiser")
+        checkpoints.note_use("stitcher")
+        priors.load(str(folder / "general.safetensors"))
+    assert used == {"locomotion": NOT_FREE, "free/denoiser": FREE, "stitcher": NOT_FREE, "general": NOT_FREE}
+    assert licences.find_used_licences() == {}
+    assert licences.describe_licences(used) == {"licence": {"strictest": NOT_FREE, "models": dict(used)}}
+    assert licences.format_licences(used) == f"{NOT_FREE} (locomotion, stitcher, general); {FREE} (free/denoiser)"
+
+
+@pytest.mark.parametrize(
+    ("held", "strictest"),
+    [
+        ([FREE, "CC0 1.0"], "CC0 1.0"),
+        (["CC BY 4.0", FREE], "CC BY 4.0"),
+        (["CC BY-NC 4.0", "CC BY 4.0", FREE], "CC BY-NC 4.0"),
+        (["CC BY-NC 4.0", "that of the training data"], "that of the training data"),
+        (["b", "CC BY 4.0", "a"], "a and b"),
+        (["CC BY 4.0 (walk.glb)", FREE], "CC BY 4.0 (walk.glb)"),
+        ([], ""),
+    ],
+)
+def test_the_strictest_licence(held, strictest):
+    assert licences.find_strictest(held) == strictest
+
+
+def test_a_file_does_not_tell_where_models_lay(folder):
+    used = {"runs/secret/mine": "b", "free/locomotion": FREE, "C:walk.glb": FREE}
+    assert licences.shorten_names(used) == {"mine": "b", "free/locomotion": FREE, "C:walk.glb": FREE}
