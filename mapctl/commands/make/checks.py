@@ -28,11 +28,8 @@ _LEAST_FRAMES = 30  # of a clip that says something
 def measure_checked(motion: Motion) -> dict[str, float]:
     """The measures of CHECKED of a motion."""
     found, places = metrics.measure(motion), motion.joint_positions()
-    hips, toes, fps = (
-        places[:, find_hips(motion.skeleton)],
-        places[:, list(find_feet(motion.skeleton))],
-        float(motion.fps),
-    )
+    hips, toes = places[:, find_hips(motion.skeleton)], places[:, list(find_feet(motion.skeleton))]
+    fps = float(motion.fps)
     peaks = measure_peaks(places, hips, fps)
     own = {
         "largest_step_cm": 100 * peaks.step,

@@ -18,15 +18,14 @@ def find_made(data: Path, names: Sequence[str]) -> tuple[str, ...]:
     """For each list below a data folder and each model in it how many of the clips (paths below the folder) it made, as
     `made/made.csv: 3 of 8 clips, by locomotion (its licence)`. FileFormatError for a list that is none."""
     found: list[str] = []
+    clips = set(names)
     for folder, folders, files in os.walk(data, onerror=lambda error: None):
         folders.sort()
         if TABLE_NAME in files:
             file = Path(folder) / TABLE_NAME
             below = file.parent.relative_to(data)
             counts = Counter(
-                (model, licence)
-                for name, model, licence in _read_makers(file)
-                if (below / name).as_posix() in set(names)
+                (model, licence) for name, model, licence in _read_makers(file) if (below / name).as_posix() in clips
             )
             shown = (below / TABLE_NAME).as_posix()
             found += [
