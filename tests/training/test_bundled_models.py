@@ -17,6 +17,7 @@ from priors import checkpoints
 from priors.checkpoints import Card
 from priors.training.bundled.models import DATA, RECIPES, RUN, SETS, list_models
 from priors.training.bundled.weights import copy_model, name_needs, read_finished
+from priors.training.mocap.cuts import CMU
 from priors.training.run import train
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "training.md"
@@ -65,7 +66,7 @@ def test_nothing_is_begun_with_other_weights():
         assert "--init" not in model.command
 
 
-def test_the_free_set_sees_takes_of_cmu_alone_without_their_first_frame():
+def test_the_free_set_sees_takes_of_cmu_alone_without_their_first_frames():
     free = list_models("free")
     assert [model.name for model in free] == [model.name for model in FULL]
     for model in free:
@@ -73,7 +74,8 @@ def test_the_free_set_sees_takes_of_cmu_alone_without_their_first_frame():
             assert model.recipe.match is None
         else:
             assert model.recipe.match.startswith("^cmu")
-        assert model.recipe.skip_first
+        assert model.recipe.cuts == CMU
+        assert model.recipe.level == (model.name != "denoiser")
         assert model.recipe.licence == "free for any use"
     assert {model.recipe.licence for model in FULL} == {"CC BY-NC 4.0"}
 
@@ -107,7 +109,7 @@ def test_the_bundled_cards_tell_how_good_they_are(name):
 
 def test_a_card_calls_what_a_model_needed_by_its_name():
     made = {"density": "/home/me/set/locomotion", "clips": "3"}
-    typed = "mapctl train refiner --data DATA -o RUN --density /home/me/set/locomotion --steps 3000 --bfloat16"
+    typed = named("locomotion-refiner").command.replace("--density ", "--density /home/me/set/")
     card = Card("refiner", {}, licence="", data=made, training={"command": typed}, **Card.layout_fields())
     named_card = name_needs(card, {"--density": "locomotion"})
     assert named_card.data == {"density": "locomotion", "clips": "3"}

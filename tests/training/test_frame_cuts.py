@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from pathlib import Path
 
 import mocap_folders
 import pytest
@@ -114,6 +115,15 @@ def test_frames_are_those_of_the_file_and_the_last_is_taken(files, tmp_path):
 def test_skip_first_drops_frame_0_where_a_cut_keeps_it(files, tmp_path):
     found = read(files, tmp_path, skip_first=True, cuts=table(tmp_path, "walk-0,,", "walk-1,5,"))
     assert found.lengths == (79, 75, 79)
+
+
+def test_takes_of_cmu_have_a_table_that_comes_with_mapctl(files, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (files / "walk-1.bvh").rename(files / "07_01.bvh")
+    assert read(files, tmp_path, cuts=Path("cmu")).cuts == ("cmu_cuts.csv: 1 of 3 clips",)
+    assert read(files, tmp_path, cuts=Path("cmu")).lengths[0] == 80 - 8
+    (tmp_path / "cmu").write_text("file,first,last\n07_01,20,59\n")
+    assert read(files, tmp_path, cuts=Path("cmu")).lengths[0] == 40
 
 
 def test_the_cache_knows_the_cuts(files, tmp_path):

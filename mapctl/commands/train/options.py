@@ -44,8 +44,8 @@ class TrainOptions(ABC):
     match: Annotated[str | None, arg(metavar="REGEX")] = None
     """Only clips whose path below the data folder holds this regular expression."""
     cuts: options.MaybeFile = None
-    """Table (CSV) of file, first and last frame: which frames are motion. Each Frame_Cuts.csv in the data folder is
-    found by itself (docs/data.md)."""
+    """Table (CSV) of file, first and last frame: which frames are motion; `cmu` is the one for takes of CMU that comes
+    with mapctl. Each Frame_Cuts.csv in the data folder is found by itself (docs/data.md)."""
     level: bool = False
     """Put every clip on the canonical body and a level floor: for captures whose floor slopes or whose feet rest at
     other heights, as those of CMU."""

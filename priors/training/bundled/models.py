@@ -8,17 +8,19 @@ from typing import Any
 from mapctl.errors import RequestError
 from priors.lstm_gmm.network import LstmGmmConfig
 from priors.stitching.network import StitcherConfig
+from priors.training.augmentation.clip_copies import ClipCopies
 from priors.training.ending.course import UntilFlat
+from priors.training.mocap.cuts import CMU
 from priors.training.recipe import Recipe
 from priors.training.recipes.denoiser import DenoiserRecipe, DenoiserSettings
 from priors.training.recipes.infiller import InfillerRecipe
 from priors.training.recipes.keyframe_timing import KeyframeTimingRecipe
 from priors.training.recipes.lstm_gmm import DensityRecipe, TrainingSettings
-from priors.training.recipes.path import PathRecipe
+from priors.training.recipes.path import PathRecipe, PathSettings
 from priors.training.recipes.pose_transformer import PoseTransformerRecipe, PoseTransformerSettings
 from priors.training.recipes.refiner import AdversarialSettings, RefinerRecipe
 from priors.training.recipes.stitcher import StitcherRecipe, StitcherSettings
-from priors.training.recipes.tweener import TweenerRecipe
+from priors.training.recipes.tweener import TweenerRecipe, TweenerSettings
 
 DATA, RUN = Path("DATA"), Path("RUN")
 """What a card's command calls the folders of clips and of the run."""
@@ -39,8 +41,21 @@ class Clips:
     """The same for those of walks and runs."""
     labels: str = ""
     """Regular expression whose groups read gait and style from them; nothing where names do not tell."""
-    skip_first: bool = False
-    """Leave out frame 0 of walks and runs (the T-pose of CMU takes)."""
+    level: bool = False
+    """Put every clip on the canonical body and a level floor, where a model does not have to know captures as they
+    come."""
+    copies: int = 0
+    """Copies of each clip, at other tempos and with other strides, that the densities are trained on beside it."""
+    window: int = TrainingSettings.window
+    """Frames of the windows of densities: short ones where runs are short."""
+    width: int = 256
+    """Of the densities' networks; the live one's is five eighths of it."""
+    share: float = 1.0
+    """Planned steps, as a share of those for hours of motion: curves of small sets are flat sooner."""
+
+    def plan(self, steps: int) -> int:
+        """Planned steps of a model that hours of motion would take so many."""
+        return round(self.share * steps)
 
 
 SETS: Mapping[str, Clips] = {
@@ -51,9 +66,14 @@ SETS: Mapping[str, Clips] = {
     ),
     "free": Clips(
         licence="free for any use",
-        match="^cmu",
-        locomotion=r"^cmu.*/(02_0[123]|05_01|06_01|07_\d+|08_\d+|09_\d+|10_04)\.",
-        skip_first=True,
+        match=r"^cmu(?!.*/(01_14|05_(0[568]|1[04-9])|07_12|09_10|14_36)\.)",  # faulty (docs/data.md)
+        locomotion=r"^cmu.*/(02_(0[1-36]|10)|05_01|06_(0\d|1[0-2])|07_(0\d|1[01])|08_\d\d|09_(0[1-69]|1[12])|10_0\d|11_01"
+        r"|13_(0[7-9]|1[4-6]|26)|14_(0[45]|1[27-9]|37))\.",
+        level=True,
+        copies=8,
+        window=40,
+        width=192,
+        share=0.4,
     ),
 }
 """Sets of models by their names: all that Bandai Namco and the CMU database hold, and what the latter holds alone."""
@@ -104,46 +124,65 @@ RECIPES: Mapping[str, type[AnyRecipe]] = {
 
 def _make_models(clips: Clips) -> tuple[BundledModel, ...]:
     """The table. Steps are a plan, where a run goes on until its curve is flat."""
-    shared: dict[str, Any] = {"data": DATA, "out": RUN, "licence": clips.licence}
-    timing: dict[str, Any] = {**shared, "match": clips.match or None, "skip_first": True}
-    everything: dict[str, Any] = {**timing, "until_flat": UntilFlat()}
-    general: dict[str, Any] = {**everything, "match": clips.match}  # which a density's command always tells
-    walks: dict[str, Any] = {
-        **shared,
-        "match": clips.locomotion,
-        "labels": clips.labels,
-        "skip_first": clips.skip_first,
-        "until_flat": UntilFlat(),
-    }
+    captures: dict[str, Any] = {"data": DATA, "out": RUN, "licence": clips.licence, "cuts": CMU}
+    shared: dict[str, Any] = {**captures, "level": clips.level}
+    until_flat: dict[str, Any] = {"match": clips.match or None, "until_flat": UntilFlat()}
+    everything = {**shared, **until_flat}
+    general = {**everything, "match": clips.match}  # which a density's command always tells
+    walks: dict[str, Any] = {**everything, "match": clips.locomotion, "labels": clips.labels}
+    live = clips.width * 5 // 8
     return (
-        BundledModel("locomotion", DensityRecipe(**walks, **_density(width=256, steps=10_000))),
-        BundledModel("locomotion-live", DensityRecipe(**walks, **_density(width=160, steps=10_000))),
-        BundledModel("general", DensityRecipe(**general, **_density(width=256, steps=12_000))),
+        BundledModel(
+            "locomotion", DensityRecipe(**walks, **_density(clips, width=clips.width, steps=clips.plan(10_000)))
+        ),
+        BundledModel(
+            "locomotion-live", DensityRecipe(**walks, **_density(clips, width=live, steps=clips.plan(10_000)))
+        ),
+        BundledModel(
+            "general", DensityRecipe(**general, **_density(clips, width=clips.width, steps=clips.plan(12_000)))
+        ),
         BundledModel(
             "locomotion-refiner",
-            RefinerRecipe(
-                **shared, skip_first=clips.skip_first, settings=AdversarialSettings(rounds=3000, bfloat16=True)
-            ),
+            RefinerRecipe(**shared, settings=AdversarialSettings(rounds=clips.plan(3000), bfloat16=True)),
             needs={"--density": "locomotion"},
         ),
-        BundledModel("path", PathRecipe(**everything)),
-        BundledModel("tweener", TweenerRecipe(**everything), needs={"--path": "path"}),
+        BundledModel("path", PathRecipe(**everything, settings=PathSettings(steps=clips.plan(PathSettings.steps)))),
+        BundledModel(
+            "tweener",
+            TweenerRecipe(**everything, settings=TweenerSettings(steps=clips.plan(TweenerSettings.steps))),
+            needs={"--path": "path"},
+        ),
         BundledModel(
             "stitcher",
             StitcherRecipe(
-                **everything, config=StitcherConfig(without=("d",)), settings=StitcherSettings(bfloat16=True)
+                **everything,
+                config=StitcherConfig(without=("d",)),
+                settings=StitcherSettings(steps=clips.plan(StitcherSettings.steps), bfloat16=True),
             ),
         ),
         BundledModel(
-            "transformer", PoseTransformerRecipe(**everything, settings=PoseTransformerSettings(bfloat16=True))
+            "transformer",
+            PoseTransformerRecipe(
+                **everything,
+                settings=PoseTransformerSettings(steps=clips.plan(PoseTransformerSettings.steps), bfloat16=True),
+            ),
         ),
-        BundledModel("denoiser", DenoiserRecipe(**everything, settings=DenoiserSettings(bfloat16=True))),
-        BundledModel("keyframe-timing", KeyframeTimingRecipe(**timing)),
+        # floors and bodies as captures have them are part of what it takes the noise from
+        BundledModel(
+            "denoiser",
+            DenoiserRecipe(
+                **captures,
+                **until_flat,
+                settings=DenoiserSettings(steps=clips.plan(DenoiserSettings.steps), bfloat16=True),
+            ),
+        ),
+        BundledModel("keyframe-timing", KeyframeTimingRecipe(**shared, match=clips.match or None)),
     )
 
 
-def _density(*, width: int, steps: int) -> dict[str, Any]:
-    settings = TrainingSettings(steps=steps, batch=64, bfloat16=True)
+def _density(clips: Clips, *, width: int, steps: int) -> dict[str, Any]:
+    copies = ClipCopies(clips.copies)
+    settings = TrainingSettings(steps=steps, batch=64, window=clips.window, bfloat16=True, copies=copies)
     return {"config": LstmGmmConfig(width=width), "settings": settings}
 
 

@@ -13,6 +13,9 @@ from mapctl.motion import Motion
 
 TABLE_NAME = "Frame_Cuts.csv"
 """Tables of this name are found in a data folder and below it; each holds for the files beside and below it."""
+CMU = Path("cmu")
+"""The name of the table for takes of the CMU database that comes with mapctl, in place of a file of one's own."""
+_CMU_TABLE = Path(__file__).with_name("cmu_cuts.csv")
 _EXPECTED = "a table of file, first, last, or of STYLE_NAME and a _START and a _STOP column for each kind of clip"
 _STYLE = "style_name"
 _COLUMNS = ("file", "first", "last")
@@ -92,8 +95,11 @@ class FrameCuts:
 def find_cuts(data: Path, given: Path | None) -> FrameCuts:
     """The table that was given, for all files, before every `Frame_Cuts.csv` in the data folder and below it.
 
-    FileFormatError names the row that makes no sense.
+    `cmu` is the table that comes with mapctl, unless a file is called so. FileFormatError names the row that makes no
+    sense.
     """
+    if given == CMU and not given.exists():
+        given = _CMU_TABLE
     tables = [] if given is None else [("", read_cuts(given))]
     own = None if given is None else given.resolve()
     for folder, folders, files in os.walk(data, onerror=lambda error: None):
