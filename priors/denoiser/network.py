@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import gelu
 
-from mapctl import rotations
+from mapctl import kinematics, rotations
 from mapctl.errors import RequestError
 from mapctl.numerics import gaussian
 from mapctl.pose import BodyPose
@@ -25,6 +25,7 @@ from priors.config import NetworkConfig
 _NON_ROOT_JOINTS = CANONICAL.num_joints - 1
 _ANGLE_CHANNELS = 2 + 3 * _NON_ROOT_JOINTS  # tilt and rotation vectors
 _INPUT_CHANNELS = 2 * _ANGLE_CHANNELS + 2 + 1 + 6 + 3 + 2 * (CANONICAL.num_joints + 1)
+_WORLD_CHANNELS = 2 * (6 + 3) * CANONICAL.num_joints  # world rotations and places, observed and smoothed
 _OUTPUT_CHANNELS = _ANGLE_CHANNELS + 1 + 3 + 2
 
 _SMOOTHING_SIGMA, _REFERENCE_SIGMA = 2.0, 6.0  # frames, sigma: of the proposal's start, and of the frame of reference
@@ -45,6 +46,9 @@ class DenoiserConfig(NetworkConfig):
     """Frames that one convolution sees."""
     dilations: tuple[int, ...] = (1, 2, 4, 8, 1, 2, 4, 8)
     """Dilation of each residual block, frames."""
+    sees_world: bool = True
+    """Whether joints' world rotations and places are inputs beside their angles: noise of places, which makes a joint's
+    angles err against its parent's, is independent there, and feet that slide can be seen."""
 
     def __post_init__(self):
         if self.width < 1 or self.kernel < 1 or self.kernel % 2 == 0 or min(self.dilations, default=0) < 1:
@@ -58,7 +62,8 @@ class DenoiserNetwork(nn.Module):
         """Compute convolutions in bfloat16 if so asked; what they are given and give back is not."""
         super().__init__()
         self.config, self.reduced_precision = config, bfloat16
-        self.first = nn.Conv1d(_INPUT_CHANNELS, config.width, config.kernel, padding=config.kernel // 2)
+        channels = _INPUT_CHANNELS + (_WORLD_CHANNELS if config.sees_world else 0)
+        self.first = nn.Conv1d(channels, config.width, config.kernel, padding=config.kernel // 2)
         self.blocks = nn.ModuleList(
             _ResidualBlock(config.width, config.kernel, dilation) for dilation in config.dilations
         )
@@ -69,7 +74,7 @@ class DenoiserNetwork(nn.Module):
     def forward(self, capture: Capture) -> CaptureProposal:
         """Propose a motion, frames that were not observed at all included."""
         view = _CaptureView(capture)
-        inputs = view.inputs().transpose(1, 2)
+        inputs = view.inputs(sees_world=self.config.sees_world).transpose(1, 2)
         with torch.autocast(inputs.device.type, torch.bfloat16, enabled=self.reduced_precision):
             hidden = self.first(inputs)
             for block in self.blocks:
@@ -106,25 +111,20 @@ class _CaptureView:
         root = (sigma_root.square() / (sigma_root.square() + _NEGLIGIBLE_SIGMA_ROOT**2))[:, None]
         self.root_noise_share = torch.where(capture.seen_root[..., None], root, 1.0)
 
-        batch, frames = capture.root.shape[:2]
+        batch = len(capture.root)
         angles = capture.joints.transpose(1, 2).flatten(0, 1)
         shown = fill_missing(angles, capture.seen[..., 1:].transpose(1, 2).flatten(0, 1))
         joints = shown.unflatten(0, (batch, _NON_ROOT_JOINTS)).transpose(1, 2).flatten(2)
         self.angles = torch.cat([capture.tilt, joints], dim=-1)
-        self.angle_noise_share = torch.cat(
-            [
-                self.noise_share[..., :1].expand(batch, frames, 2),
-                self.noise_share[..., 1:].repeat_interleave(3, dim=-1),
-            ],
-            dim=-1,
-        )
+        self.angle_noise = _spread_over_angles(noise)
+        self.angle_noise_share = _spread_over_angles(self.noise_share)
         root = fill_missing(capture.root, capture.seen_root)
         self.slow_heading = _smooth(capture.heading[..., None], _REFERENCE_SIGMA)[..., 0]
         self.slow_root = _smooth(root, _REFERENCE_SIGMA)
         self.turn = (capture.heading - self.slow_heading)[..., None]
         self.off = rotations.rotate_about_y(root - self.slow_root, -self.slow_heading)
 
-    def inputs(self) -> Float[Tensor, "batch frames inputs"]:
+    def inputs(self, *, sees_world: bool) -> Float[Tensor, "batch frames inputs"]:
         """Encode the capture in units of about one."""
         capture = self.capture
         rate = _difference_frames(self.slow_heading[..., None])
@@ -144,16 +144,29 @@ class _CaptureView:
                 (self.slow_root[..., 1:2] - _HIPS_HEIGHT) / _ANGLE_UNIT,
                 known.to(self.angles),
                 level[:, None].expand(-1, capture.frames, -1),
+                *(self._world() if sees_world else ()),
             ],
             dim=-1,
         )
 
+    def _world(self) -> list[Float[Tensor, "batch frames inputs"]]:
+        """Encode the world rotations and places of all joints in the slow frame of the hips."""
+        x, z = self.angles[..., :2].unbind(dim=-1)
+        tilt = rotations.rotation_vector_to_matrix(torch.stack([x, torch.zeros_like(x), z], dim=-1))
+        hips = rotations.to_matrix(rotations.about_y(self.turn[..., 0])) @ tilt
+        others = rotations.rotation_vector_to_matrix(self.angles[..., 2:].unflatten(-1, (-1, 3)))
+        matrices = torch.cat([hips[..., None, :, :], others], dim=-3)
+        places, world = kinematics.chain_matrices(CANONICAL.offsets.to(matrices), CANONICAL.parents, matrices)
+        six, places = rotations.to_six(world).flatten(-2), (places + self.off[..., None, :]).flatten(-2)
+        both = torch.cat([six, places / _ANGLE_UNIT], dim=-1)
+        return [both, _smooth(both, _SMOOTHING_SIGMA)]
+
     def changed(self, change: Float[Tensor, "batch frames outputs"]) -> CaptureProposal:
         """Apply a change to the smoothed observation, as far as noise or gaps allow one."""
         angles, turn, off, contacts = change.split([_ANGLE_CHANNELS, 1, 3, 2], dim=-1)
-        angles = self.angles + self.angle_noise_share * (
-            _smooth(self.angles, _SMOOTHING_SIGMA) - self.angles + _ANGLE_UNIT * angles
-        )
+        # What was not observed is on a straight line already: it is smoothed as far as what it lies between is noisy.
+        smoother = _smooth(self.angles, _SMOOTHING_SIGMA) - self.angles
+        angles = self.angles + self.angle_noise * smoother + self.angle_noise_share * _ANGLE_UNIT * angles
         turn = self.turn + self.noise_share[..., :1] * (
             _smooth(self.turn, _SMOOTHING_SIGMA) - self.turn + _ANGLE_UNIT * turn
         )
@@ -161,6 +174,11 @@ class _CaptureView:
         root = self.slow_root + rotations.rotate_about_y(off, self.slow_heading)
         packed = torch.cat([root, (self.slow_heading + turn[..., 0])[..., None], angles], dim=-1)
         return CaptureProposal(BodyPose.unpack(packed), contacts)
+
+
+def _spread_over_angles(joints: Float[Tensor, "batch frames joints"]) -> Float[Tensor, "batch frames angles"]:
+    """Repeat values of joints for the two angles of the hips' tilt and the three of each other joint."""
+    return torch.cat([joints[..., :1].expand(*joints.shape[:-1], 2), joints[..., 1:].repeat_interleave(3, -1)], dim=-1)
 
 
 def _difference_frames(values: Float[Tensor, "batch frames width"]) -> Float[Tensor, "batch frames width"]:
@@ -203,6 +221,6 @@ class ConvDenoiser:
 def load(name: str) -> ConvDenoiser:
     """Load the bundled denoiser by name, or one by its file or run folder; CheckpointError if there is none."""
     with checkpoints.open_checkpoint(name, "denoiser") as (tensors, card):
-        network = DenoiserNetwork(DenoiserConfig.of_card(card.config))
+        network = DenoiserNetwork(DenoiserConfig.of_card({"sees_world": False} | card.config))  # as older cards say
         network.load_state_dict(tensors)
     return ConvDenoiser(name, network.eval().requires_grad_(False), card)

@@ -1,5 +1,6 @@
 """Spoilt copies of clean motion: what is asked for happens, and nothing else."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -8,7 +9,10 @@ from helpers import corpus, generator
 
 from mapctl import rotations
 from mapctl.features import LAYOUT
+from mapctl.kinematics import chain_matrices
+from mapctl.recording.noise_estimation import estimate_angle_noise, estimate_position_noise
 from mapctl.skeleton import CANONICAL
+from priors.training.augmentation import corruption
 from priors.training.augmentation.corruption import CorruptionSettings, corrupt, make_clean_capture
 from priors.training.augmentation.draws import LIMBS
 
@@ -106,10 +110,54 @@ def test_even_noise_is_the_same_of_all_joints_and_uneven_is_not(clean):
     assert 0.2 < (uneven > 0.1).double().mean() < 0.8
 
 
-def test_the_noise_of_places_turns_short_bones_more(clean):
-    sigma = spoilt(clean, replace(PLAIN, markers=1.0)).sigma[0]
-    foot, thigh = (sigma[CANONICAL.index(name)] for name in ("leftFoot", "leftUpperLeg"))
-    assert foot > 1.5 * thigh
+def bone_directions(capture):
+    """World directions of the bones from each joint to the first below it (batch, frames, joint names)."""
+    quats = torch.cat([capture.hips[:, :, None], rotations.from_rotation_vector(capture.joints)], dim=2)
+    places, _ = chain_matrices(CANONICAL.offsets.float(), CANONICAL.parents, rotations.to_matrix(quats))
+    bones = {
+        name: places[..., below[0], :] - places[..., joint, :]
+        for joint, name in enumerate(CANONICAL.names)
+        if (below := CANONICAL.children(joint))
+    }
+    return {name: torch.nn.functional.normalize(bone, dim=-1) for name, bone in bones.items()}, bones
+
+
+def test_bones_point_from_one_noisy_place_to_the_next(clean):
+    noisy = spoilt(clean, replace(PLAIN, markers=1.0, marker_cm=(1.0, 1.0)))
+    assert torch.rad2deg((noisy.root - clean.root).std()) == pytest.approx(math.degrees(0.01), rel=0.05)
+    (was, bones), (now, _) = bone_directions(clean), bone_directions(noisy)
+    for name in ("leftUpperLeg", "rightLowerArm", "leftFoot"):
+        length = float(bones[name].norm(dim=-1).mean())
+        off = (now[name] - was[name]).square().sum(-1).mean().sqrt()
+        assert float(off) == pytest.approx(2 * 0.01 / length, rel=0.06)  # root of 2 for either of two directions
+    thigh, shin = now["leftUpperLeg"] - was["leftUpperLeg"], now["leftLowerLeg"] - was["leftLowerLeg"]
+    assert float((thigh * shin).sum(-1).mean()) < 0, "the knee is at the end of one and the beginning of the other"
+
+
+def test_the_sigma_told_of_noisy_places_is_what_an_estimate_finds(clean):
+    noisy = spoilt(clean, replace(PLAIN, markers=1.0, marker_cm=(0.5, 1.0)))
+    assert torch.allclose(noisy.sigma_root, (noisy.root - clean.root).std(dim=(1, 2)), rtol=0.25)
+    quats = torch.cat([noisy.hips[:, :, None], rotations.from_rotation_vector(noisy.joints)], dim=2).double()
+    every = torch.ones(FRAMES, JOINTS, dtype=torch.bool)
+    found = torch.stack([estimate_angle_noise(one, every) for one in quats[:8]])
+    share = (found / noisy.sigma[:8]).mean(dim=0)
+    assert ((share > 0.55) & (share < 1.3)).all(), share
+    assert noisy.sigma[0, CANONICAL.index("leftFoot")] > 1.2 * noisy.sigma[0, CANONICAL.index("leftUpperLeg")]
+
+
+def test_noise_that_lasts_is_told_as_an_estimate_from_frame_to_frame_would_tell_it():
+    stays = torch.tensor([0.0, 0.5, 0.9])
+    share = corruption._estimated_share(stays)
+    assert float(share[0]) == pytest.approx(1)
+    noise = corruption._correlate_in_time(torch.randn(3, 20_000, 1, 3, generator=generator(0)), stays)[:, 200:]
+    seen = torch.ones(noise.shape[1], dtype=torch.bool)
+    found = [estimate_position_noise(one[:, 0].double(), seen) for one in noise]
+    assert found == pytest.approx(share.tolist(), rel=0.05)
+    one = make_clean_capture(corpus().features[None, :FRAMES])
+    settings = replace(PLAIN, correlated=1.0, angle_deg=(5.0, 5.0))
+    told, untold = (corrupt(one, replace(settings, untold=share), generator(1)) for share in (0.0, 1.0))
+    assert torch.equal(told.joints, untold.joints)
+    assert (untold.sigma < 0.95 * told.sigma).all()
 
 
 def test_lasting_noise_has_the_same_spread_and_lasts(clean):

@@ -2,6 +2,7 @@
 anything. How much of each is drawn anew for every window, and the network is told the noise as a file's would be.
 """
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -10,6 +11,7 @@ from torch import Tensor
 
 from mapctl import rotations
 from mapctl.features import GroundPose
+from mapctl.kinematics import chain_matrices
 from mapctl.pose import BodyPose
 from mapctl.recording import Capture
 from mapctl.skeleton import CANONICAL
@@ -30,12 +32,17 @@ class CorruptionSettings:
     """Share of windows whose angles, and share whose hips, have no noise."""
     uneven: float = 0.5
     """Spread (of the logarithm) of the noise among joints, in half of the windows."""
-    markers: float = 0.15
-    """Share of windows whose noise is that of the joints' positions: the shorter a bone, the more it turns."""
+    markers: float = 0.25
+    """Share of windows whose noise is that of the joints' positions: bones point from one noisy place to the next, so
+    what a bone turns too far the next turns back."""
     marker_cm: tuple[float, float] = (0.5, 6.0)
     """Noise of the joints' positions, log-uniform."""
-    correlated: float = 0.2
-    """Share of windows whose noise lasts beyond a frame."""
+    correlated: float = 0.3
+    """Share of windows whose noise lasts beyond a frame, as that of a capture which was filtered before."""
+    lasting: float = 0.9
+    """Largest share of such noise that comes from the frame before."""
+    untold: float = 0.5
+    """Share of these windows whose noise the network is told as an estimate from frame to frame would tell it: less."""
     spikes: float = 0.02
     """Largest share of an angle's frames that are spikes, in half of the windows."""
     spike_deg: tuple[float, float] = (15.0, 60.0)
@@ -43,7 +50,7 @@ class CorruptionSettings:
     found: float = 0.8
     """Share of the spikes that are taken for what they are, and masked."""
     dropout: float = 0.4
-    """Largest share of a joint's frames that are lost, in a quarter of the windows."""
+    """Largest share of a joint's frames that are lost, in a third of the windows."""
     limb: float = 0.25
     """Share of windows that lose a limb for a while."""
     gap: float = 0.1
@@ -73,22 +80,43 @@ def make_clean_capture(features: Float[Tensor, "batch frames size"]) -> Capture:
 def corrupt(clean: Capture, settings: CorruptionSettings, generator: torch.Generator) -> Capture:
     """A spoilt copy; what is masked keeps its values, which nobody should look at."""
     draw = Draws(generator, *clean.root.shape[:2])
-    sigma, sigma_root = _sample_sigmas(settings, draw)
-    angles, spiky = _sample_angles(sigma, settings, draw)
+    noise = _sample_noise(settings, draw)
+    spikes = _sample_spikes(settings, draw)
     quats = torch.cat([clean.hips[:, :, None], rotations.from_rotation_vector(clean.joints)], dim=2)
-    quats = rotations.multiply(quats, rotations.from_rotation_vector(angles))
+    quats, root = _perturb_places(quats, clean.root, noise, draw)
+    angles = _correlate_in_time(draw.normal(draw.frames, _JOINTS, 3), noise.stays) * noise.angle[:, None, :, None]
+    quats = rotations.multiply(quats, rotations.from_rotation_vector(_turn_axes(angles + spikes, draw)))
+    root = root + draw.normal(draw.frames, 3) * noise.root[:, None, None]
     lost, nothing = _sample_missing(settings, draw)
-    found = spiky & (draw.uniform(draw.frames, _JOINTS) < settings.found)
+    found = (spikes != 0).any(dim=-1) & (draw.uniform(draw.frames, _JOINTS) < settings.found)
     error = torch.exp(settings.told * draw.normal(_JOINTS + 1))
     return Capture(
-        clean.root + draw.normal(draw.frames, 3) * sigma_root[:, None, None],
+        root,
         quats[:, :, 0],
         rotations.to_rotation_vector(quats[:, :, 1:]),
         ~nothing,
         ~(lost | found | nothing[..., None]),
-        sigma_root * error[:, -1],
-        sigma * error[:, :-1],
+        noise.told_root * error[:, -1],
+        noise.told_angle * error[:, :-1],
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _Noise:
+    """How noisy each window of a batch is."""
+
+    angle: Float[Tensor, "batch joints"]
+    """Of each of a joint's angles, radians; 0 where places are noisy."""
+    root: Float[Tensor, " batch"]
+    """Of each coordinate of the hips, metres; 0 where places are noisy."""
+    place: Float[Tensor, " batch"]
+    """Of each coordinate of every joint's place, metres; 0 where angles are noisy."""
+    stays: Float[Tensor, " batch"]
+    """Share of the noise that comes from the frame before."""
+    told_angle: Float[Tensor, "batch joints"]
+    """Noise of angles that the network is told, radians."""
+    told_root: Float[Tensor, " batch"]
+    """Noise of the hips' place that it is told, metres."""
 
 
 _MAX_NOISE_RAD = 0.6  # radians of noise; more is no noise but another motion
@@ -102,36 +130,82 @@ def _bone_lengths() -> Float[Tensor, " joints"]:
     )
 
 
-def _sample_sigmas(settings: CorruptionSettings, draw: Draws) -> tuple[Tensor, Tensor]:
-    """By joint, radians (batch, joints), and of the hips' position, metres (batch,)."""
+def _sample_noise(settings: CorruptionSettings, draw: Draws) -> _Noise:
+    """Draw the noise of angles and the hips, or that of all places."""
     angle = torch.deg2rad(draw.log_uniform(*settings.angle_deg, 1)) * (draw.uniform(1) > settings.clean)
     uneven = torch.where(draw.uniform(1) < 0.5, settings.uneven, 0.0) * draw.normal(_JOINTS)
     root = draw.log_uniform(*settings.root_cm) / 100 * (draw.uniform() > settings.clean)
-    place = draw.log_uniform(*settings.marker_cm, 1) / 100
-    of_places = (place / _bone_lengths()).clamp(max=_MAX_NOISE_RAD)
-    marked = draw.uniform(1) < settings.markers
-    return torch.where(marked, of_places, angle * torch.exp(uneven)), torch.where(marked[:, 0], place[:, 0], root)
+    marked = draw.uniform() < settings.markers
+    place = torch.where(marked, draw.log_uniform(*settings.marker_cm) / 100, 0.0)
+    angle, root = torch.where(marked[:, None], 0.0, angle * torch.exp(uneven)), torch.where(marked, 0.0, root)
+    stays = torch.where(draw.uniform() < settings.correlated, settings.lasting * draw.uniform(), 0.0)
+    share = torch.where(draw.uniform() < settings.untold, _estimated_share(stays), 1.0)
+    told_angle = torch.where(marked[:, None], _angles_of_places(place), angle)
+    return _Noise(angle, root, place, stays, share[:, None] * told_angle, torch.where(marked, share * place, root))
 
 
-def _sample_angles(
-    sigma: Tensor, settings: CorruptionSettings, draw: Draws
-) -> tuple[Float[Tensor, "batch frames joints 3"], Tensor]:
-    """Rotation vectors to add, and which joints a spike has hit (batch, frames, joints).
+def _angles_of_places(place: Float[Tensor, " batch"]) -> Float[Tensor, "batch joints"]:
+    """Noise of a joint's angles about its parent where both bones point from one noisy place to another, radians."""
+    own = (math.sqrt(2) * place[:, None] / _bone_lengths()).clamp(max=_MAX_NOISE_RAD)
+    own = own * torch.tensor([bool(CANONICAL.children(joint)) for joint in range(_JOINTS)])
+    above = own[:, [max(0, parent) for parent in CANONICAL.parents]].clone()
+    above[:, 0] = 0.0
+    return (own.square() + above.square()).sqrt().clamp(max=_MAX_NOISE_RAD)
 
-    Noise is added to a rig's three channels, whose axes are square at best: near gimbal lock two of them are one.
-    """
-    noise = draw.normal(draw.frames, _JOINTS, 3)
-    stays = torch.where(draw.uniform() < settings.correlated, 0.8 * draw.uniform(), 0.0)
-    noise = _correlate_in_time(noise, stays) * sigma[:, None, :, None]
+
+def _estimated_share(stays: Float[Tensor, " batch"]) -> Float[Tensor, " batch"]:
+    """What an estimate from fourth differences makes of noise of which so much stays from frame to frame, as a share of
+    its spread: 1 for white noise (`mapctl.recording.noise_estimation`)."""
+    weights = torch.tensor([1.0, -4.0, 6.0, -4.0, 1.0])
+    apart = (torch.arange(5)[:, None] - torch.arange(5)).abs()
+    power = torch.einsum("i,bij,j->b", weights, stays[:, None, None] ** apart, weights)
+    return (power / weights.square().sum()).sqrt()
+
+
+def _perturb_places(
+    quats: Float[Tensor, "batch frames joints 4"], root: Float[Tensor, "batch frames 3"], noise: _Noise, draw: Draws
+) -> tuple[Tensor, Tensor]:
+    """Turn the bones of windows whose places are noisy from each noisy place to that of the first joint below, and move
+    the hips by their own noise."""
+    rows = noise.place.nonzero()[:, 0]
+    if len(rows) == 0:
+        return quats, root
+    white = torch.randn(len(rows), draw.frames, _JOINTS, 3, generator=draw.generator)
+    moved = _correlate_in_time(white, noise.stays[rows]) * noise.place[rows, None, None, None]
+    matrices = rotations.to_matrix(quats[rows])
+    places, world = chain_matrices(CANONICAL.offsets.float(), CANONICAL.parents, matrices)
+    world = world.clone()
+    for joint in range(_JOINTS):
+        if below := CANONICAL.children(joint):
+            bone = places[..., below[0], :] - places[..., joint, :]
+            turn = rotations.between_vectors(bone, bone + moved[..., below[0], :] - moved[..., joint, :])
+            world[..., joint, :, :] = rotations.to_matrix(turn) @ world[..., joint, :, :]
+    above = world[..., [max(0, parent) for parent in CANONICAL.parents], :, :]
+    local = torch.cat([world[..., :1, :, :], (above.transpose(-1, -2) @ world)[..., 1:, :, :]], dim=-3)
+    quats, root = quats.clone(), root.clone()
+    quats[rows] = rotations.make_sign_continuous(rotations.from_matrix(local).movedim(1, 0)).movedim(0, 1)
+    root[rows] += moved[..., 0, :]
+    return quats, root
+
+
+def _sample_spikes(settings: CorruptionSettings, draw: Draws) -> Float[Tensor, "batch frames joints 3"]:
+    """Spikes of each angle, radians, in half of the windows; 0 elsewhere."""
     share = settings.spikes * draw.uniform() * (draw.uniform() < 0.5)
     hit = draw.uniform(draw.frames, _JOINTS, 3) < share[:, None, None, None]
     low, high = settings.spike_deg
     height = torch.deg2rad(low + (high - low) * draw.uniform(1, 1, 1))
-    noise = noise + hit * height * torch.sign(draw.normal(draw.frames, _JOINTS, 3))
+    return hit * height * torch.sign(draw.normal(draw.frames, _JOINTS, 3))
+
+
+def _turn_axes(angles: Float[Tensor, "batch frames joints 3"], draw: Draws) -> Tensor:
+    """Rotation vectors of angles about axes of a window's rig.
+
+    Noise is added to a rig's three channels, whose axes are square at best: near gimbal lock two of them are one.
+    """
     skewed = torch.nn.functional.normalize(draw.normal(_JOINTS, 3, 3), dim=-1)
     square = torch.linalg.qr(draw.normal(_JOINTS, 3, 3))[0]
     axes = torch.where(draw.uniform(1, 1, 1) < 0.5, square, skewed)
-    return torch.einsum("btjk,bjkc->btjc", noise, axes), hit.any(dim=-1)
+    return torch.einsum("btjk,bjkc->btjc", angles, axes)
 
 
 def _correlate_in_time(noise: Float[Tensor, "batch frames joints 3"], stays: Float[Tensor, " batch"]) -> Tensor:
@@ -147,7 +221,7 @@ def _correlate_in_time(noise: Float[Tensor, "batch frames joints 3"], stays: Flo
 
 def _sample_missing(settings: CorruptionSettings, draw: Draws) -> tuple[Tensor, Tensor]:
     """Which joints are lost (batch, frames, joints), and in which frames all are (batch, frames)."""
-    share = settings.dropout * draw.uniform(1, 1) * (draw.uniform(1, 1) < 0.25)
+    share = settings.dropout * draw.uniform(1, 1) * (draw.uniform(1, 1) < 1 / 3)
     lost = draw.uniform(draw.frames, _JOINTS) < share
     limb = draw.limb()
     during = _sample_interval(10, draw.frames, draw) & (draw.uniform(1) < settings.limb)
