@@ -22,11 +22,14 @@ class TrainPoseTransformer(TunableOptions):
     """Numbers of a frame's token, even; every 32 of them have a head of attention."""
     layers: options.MaybeCount = None
     """Layers of attention."""
+    detail: options.MaybeCount = None
+    """Layers of a second stage, which corrects what the first proposes; the first then looks at frames alone in which
+    something is known."""
     plain: bool = False
     """The plainest network of the kind, to compare: no convolutions, AdamW for all weights."""
     two_stage: bool = False
-    """Two networks in turn after Qin et al. 2022, for gaps of up to 70 frames between whole poses alone, to compare;
-    width and layers are its own."""
+    """Two networks in turn as Qin et al. 2022 have them, for gaps of up to 70 frames between whole poses alone, to
+    compare; its shape is its own."""
 
     def recipe(self) -> "PoseTransformerRecipe":
         """The options as the trainer takes them; RequestError for numbers that make no sense."""
@@ -39,11 +42,11 @@ class TrainPoseTransformer(TunableOptions):
 
         common = self.common()
         given = self.select_given("steps", "batch", "window", "seed", "learning_rate")
-        shape = self.select_given("width", "layers")
+        shape = self.select_given("width", "layers", "detail")
         if self.width is not None:
             shape["heads"] = max(1, self.width // 32)
         if self.two_stage and (shape or self.plain):
-            raise RequestError("--two-stage has a shape of its own: leave out --width, --layers and --plain")
+            raise RequestError("--two-stage has a shape of its own: leave out --width, --layers, --detail and --plain")
         usual = TWO_STAGE if self.two_stage else (PoseTransformerConfig(), PoseTransformerSettings())
         plain = ({"kernel": 0}, {"optimiser": "adam", "learning_rate": 8e-4}) if self.plain else ({}, {})
         return PoseTransformerRecipe(

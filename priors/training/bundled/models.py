@@ -7,6 +7,7 @@ from typing import Any
 
 from mapctl.errors import RequestError
 from priors.lstm_gmm.network import LstmGmmConfig
+from priors.pose_transformer.network import PoseTransformerConfig
 from priors.stitching.network import StitcherConfig
 from priors.training.augmentation.clip_copies import ClipCopies
 from priors.training.ending.course import UntilFlat
@@ -164,6 +165,7 @@ def _make_models(clips: Clips) -> tuple[BundledModel, ...]:
             "transformer",
             PoseTransformerRecipe(
                 **everything,
+                config=PoseTransformerConfig(width=192, layers=3, heads=6, detail=3),
                 settings=PoseTransformerSettings(steps=clips.plan(PoseTransformerSettings.steps), bfloat16=True),
             ),
         ),

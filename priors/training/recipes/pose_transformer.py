@@ -190,15 +190,15 @@ class PoseTransformerRecipe(NetworkRecipe[PoseTransformerConfig, PoseTransformer
         return average_logarithms(value for name, value in row.items() if name.startswith("share_"))
 
     def usual_settings(self) -> PoseTransformerSettings:
-        """Those of the two-stage network, where it is trained."""
-        return TWO_STAGE[1] if self.config.detail else PoseTransformerSettings()
+        """Those of the two-stage peer, where it is trained."""
+        return TWO_STAGE[1] if self.config == TWO_STAGE[0] else PoseTransformerSettings()
 
     def format_shape(self) -> list[str]:
         """Width, layers and plainness, where they are not the usual ones."""
         usual, plain = PoseTransformerConfig(), self.config.kernel == 0 and self.settings.optimiser == "adam"
-        words = [f"--{name} {getattr(self.config, name)}" for name in ("width", "layers")]
-        changed = [getattr(self.config, name) != getattr(usual, name) for name in ("width", "layers")]
-        if self.config.detail:
+        words = [f"--{name} {getattr(self.config, name)}" for name in ("width", "layers", "detail")]
+        changed = [getattr(self.config, name) != getattr(usual, name) for name in ("width", "layers", "detail")]
+        if self.config == TWO_STAGE[0]:
             return ["--two-stage"]
         return [word for word, told in zip(words, changed, strict=True) if told] + ["--plain"] * plain
 
