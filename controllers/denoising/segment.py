@@ -63,14 +63,15 @@ class SegmentDenoiser:
         self.inspection, self.denoiser, self.settings = inspection, denoiser, settings
         self.repaired = _smooth_noncanonical_joints(inspection, rig)
         canonical, self.rigmap = to_canonical(self.repaired, rig)
-        observed = _map_mask_to_canonical(inspection.seen, self.rigmap)
-        self.hidden_root = inspection.dropouts_root | ~_are_hip_ancestors_observed(~inspection.dropouts, self.rigmap)
-        self.observed_root = inspection.seen_root & _are_hip_ancestors_observed(inspection.seen, self.rigmap)
+        observed = _map_mask_to_canonical(inspection.known, self.rigmap)
+        self.hidden_root = inspection.dropouts_root | ~_are_hip_ancestors_observed(~inspection.lost, self.rigmap)
+        self.observed_root = inspection.seen_root & _are_hip_ancestors_observed(inspection.known, self.rigmap)
         self.sigma, self.sigma_root = self._estimate_noise(canonical, observed)
         self.bands = split_bands(canonical)
         if self.bands.exact:
             # Nothing is filtered: the network gets the raw frames, and a mask of those to ignore.
-            self.bands = split_bands(_match_quaternion_signs(to_canonical(inspection.motion, rig)[0], canonical))
+            raw = to_canonical(inspection.with_locked_joints(), rig)[0]
+            self.bands = split_bands(_match_quaternion_signs(raw, canonical))
         self.shown = self.bands.at_prior_rate()
         self.capture = self._build_capture(observed)
 
@@ -213,7 +214,7 @@ class SegmentDenoiser:
 
     def _redetect_spikes(self, proposal: Motion) -> Capture:
         """Detect spikes again in the residual beside the proposal: fast motion mistaken for one is observed again."""
-        dropouts = ~_map_mask_to_canonical(~self.inspection.dropouts, self.rigmap)
+        dropouts = ~_map_mask_to_canonical(~self.inspection.lost, self.rigmap)
         spikes = find_residual_spikes(self._compute_residual_rotations(proposal), self.capture.sigma[0].double())
         root = (self.shown.root_position - proposal.root_position)[:, None]
         leap = find_residual_spikes(root, self.capture.sigma_root.double())[:, 0]

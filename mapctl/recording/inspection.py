@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float
@@ -14,6 +15,7 @@ from mapctl.recording.masks import Mask, expand_valid_masks, travelling_joint
 from mapctl.recording.noise_estimation import estimate_angle_noise, estimate_position_noise
 from mapctl.recording.spike_detection import find_angle_spikes, find_position_spikes
 
+_LOCKED_CHANGE = 1e-6  # of a quaternion, that rounding leaves of a joint which never moves
 _FROZEN_SECONDS = 0.1  # that a joint which moves otherwise does not move at all
 
 
@@ -43,6 +45,24 @@ class Inspection:
         """Observation mask of rotations: neither spike nor missing."""
         return ~(self.spikes | self.dropouts)
 
+    @cached_property
+    def locked(self) -> Bool[Tensor, " joints"]:
+        """Whether a joint's rotation is the same wherever it is observed: it is known where it is not, too."""
+        quats = self.motion.local_quat_xyzw
+        held = _hold_last_observed(quats, self.seen)
+        still = (quats - held[:1]).norm(dim=-1) < _LOCKED_CHANGE
+        return (still | ~self.seen).all(dim=0) & self.seen.any(dim=0)
+
+    @property
+    def known(self) -> Bool[Tensor, "frames joints"]:
+        """Mask of rotations that are observed, or need not be, since the joint is locked."""
+        return self.seen | self.locked
+
+    @property
+    def lost(self) -> Bool[Tensor, "frames joints"]:
+        """Mask of rotations that are missing, of joints that move."""
+        return self.dropouts & ~self.locked
+
     @property
     def seen_root(self) -> Bool[Tensor, " frames"]:
         """Observation mask of the root's position: neither spike nor missing."""
@@ -63,6 +83,12 @@ class Inspection:
             spikes_root=self.spikes_root[part],
             dropouts_root=self.dropouts_root[part],
         )
+
+    def with_locked_joints(self) -> Motion:
+        """Return the recording, its locked joints as they are elsewhere in frames in which they are not observed."""
+        motion = self.motion
+        held = _hold_last_observed(motion.local_quat_xyzw, self.seen)
+        return replace(motion, local_quat_xyzw=torch.where(self.locked[:, None], held, motion.local_quat_xyzw))
 
     def repaired(self) -> Motion:
         """Return the recording with artefacts filled in, interpolated from the frames around them."""
@@ -88,7 +114,7 @@ def inspect_recording(motion: Motion, masks: Sequence[Mask] = ()) -> Inspection:
     hidden, hidden_root = expand_valid_masks(motion, masks)
     travels = travelling_joint(motion)
     place = motion.moving_offsets[travels] if travels else motion.root_position
-    frozen = _find_frozen_joints(quats, float(motion.fps))
+    frozen = _find_frozen_joints(quats, hidden, float(motion.fps))
     dropouts, dropouts_root = hidden | frozen, hidden_root
     noise, noise_root = estimate_angle_noise(quats, ~dropouts), estimate_position_noise(place, ~dropouts_root)
     spikes = find_angle_spikes(quats, noise) & ~dropouts
@@ -99,16 +125,19 @@ def inspect_recording(motion: Motion, masks: Sequence[Mask] = ()) -> Inspection:
     return Inspection(motion, spikes, dropouts, spikes_root, dropouts_root, noise, noise_root, travels)
 
 
-def _find_frozen_joints(quats: Float[Tensor, "frames joints 4"], fps: float) -> Bool[Tensor, "frames joints"]:
+def _find_frozen_joints(
+    quats: Float[Tensor, "frames joints 4"], hidden: Bool[Tensor, "frames joints"], fps: float
+) -> Bool[Tensor, "frames joints"]:
     """Find runs in which nothing of a joint's rotation changes, not even by rounding, of joints that move most of the
-    time.
+    time that they are not hidden.
 
     A whole body that stands still is a paused recording, or a stand: it is left alone.
     """
     still = (quats[1:] == quats[:-1]).all(dim=-1)
     if len(still) == 0:
         return torch.zeros(quats.shape[:2], dtype=torch.bool)
-    moves = (~still).double().mean(dim=0) > 0.5
+    told = ~(hidden[1:] | hidden[:-1])
+    moves = (~still & told).sum(dim=0) > 0.5 * told.sum(dim=0)
     still = still & moves & (still.double().mean(dim=1, keepdim=True) < 0.8)
     shortest = max(2, round(_FROZEN_SECONDS * fps))
     if len(still) < shortest:

@@ -12,8 +12,9 @@ from torch import Tensor
 
 from mapctl import rotations
 
-_ORDERS = (4, 3, 2)  # of the differences, the first that enough runs of frames are observed for
-_MIN_WINDOWS = 12  # runs
+# Orders of the differences, with the fewest runs of frames that each needs; the first that has them counts. Runs that
+# many losses leave are few and short: a rough estimate by the last order is better than none.
+_ORDERS = {4: 12, 3: 12, 2: 4}
 _MAD_TO_SIGMA = 1.4826  # of a normal number's size
 
 
@@ -45,15 +46,15 @@ def _estimate_sigma(
     `values` are differences of that order already.
     """
     sigma = torch.full((values.shape[1],), math.nan, dtype=values.dtype)
-    for order in _ORDERS:
+    for order, fewest in _ORDERS.items():
         differences, used = _differences(values, order - differenced), _observed_windows(seen, order + 1)
         if len(differences) == 0:
             continue
         # Not of a whole that is shorter, which has nothing better.
-        enough = used.sum(dim=0) >= min(_MIN_WINDOWS, len(used))
+        enough = used.sum(dim=0) >= min(fewest, len(used))
         found = _robust_sigma(differences, used) / math.sqrt(math.comb(2 * order, order))
         sigma = torch.where(sigma.isnan() & enough, found, sigma)
-    return sigma if len(values) > _ORDERS[-1] else torch.zeros_like(sigma)
+    return sigma if len(values) > min(_ORDERS) else torch.zeros_like(sigma)
 
 
 def _differences(values: Tensor, order: int) -> Tensor:

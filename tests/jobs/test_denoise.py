@@ -133,6 +133,17 @@ def test_what_masked_frames_show_does_not_leak(rig):
     assert apart_deg(out[0].local_quat_xyzw, truth.local_quat_xyzw)[50:58, joint].max() < 20
 
 
+def test_a_locked_root_above_the_hips_that_is_lost_now_and_then_changes_nothing():
+    given = noisy(on_rig("bandai", 120), 2.0, 0.5)
+    lost = torch.arange(120) % 3 == 1
+    quats = given.local_quat_xyzw.clone()
+    assert not (quats[1:, 0] - quats[:1, 0]).any()
+    quats[lost, 0] = shaken(given.local_quat_xyzw, 2.0)[lost, 0]
+    masks = [Mask(given.skeleton.names[0], frame, frame + 1) for frame in lost.nonzero()[:, 0].tolist()]
+    done, whole = cleaned(replace(given, local_quat_xyzw=quats), masks=masks), cleaned(given)
+    assert error_cm(whole.motion, done.motion) < 1e-3
+
+
 @pytest.mark.parametrize("rig", RIGS)
 def test_frames_in_which_everything_is_masked_are_filled_in(rig):
     truth = on_rig(rig, 120)

@@ -118,3 +118,11 @@ def test_the_sign_of_a_quaternion_says_nothing():
     quats = shaken(swaying(200), 2 * DEGREE)
     flipped = quats * torch.where(torch.rand(200, 6, 1, generator=generator(5)) < 0.5, -1.0, 1.0)
     assert torch.allclose(estimate_angle_noise(quats, all_seen(quats)), estimate_angle_noise(flipped, all_seen(quats)))
+
+
+def test_places_seen_a_few_frames_on_end_are_told_of_roughly():
+    places = smooth_place(60) + 0.02 * torch.randn(60, 3, generator=generator(), dtype=torch.float64)
+    seen = torch.zeros(60, dtype=torch.bool)
+    for start in range(0, 60, 10):
+        seen[start : start + 3] = True
+    assert estimate_position_noise(places, seen) == pytest.approx(0.02, rel=0.6)
