@@ -98,7 +98,7 @@ def find_cuts(data: Path, given: Path | None) -> FrameCuts:
     `cmu` is the table that comes with mapctl, unless a file is called so. FileFormatError names the row that makes no
     sense.
     """
-    if given == CMU and not given.exists():
+    if given is not None and given == CMU and not given.exists():
         given = _CMU_TABLE
     tables = [] if given is None else [("", read_cuts(given))]
     own = None if given is None else given.resolve()
