@@ -51,6 +51,9 @@ class Clips:
     """Frames of the windows of densities: short ones where runs are short."""
     width: int = 256
     """Of the densities' networks; the live one's is five eighths of it."""
+    flat: bool = True
+    """Whether runs of the densities end where their curve is flat. Of a few minutes the likelihood of unseen
+    clips rises long after a density has become too narrow to be steered: the steps are then told beforehand."""
     share: float = 1.0
     """Planned steps, as a share of those for hours of motion: curves of small sets are flat sooner."""
 
@@ -74,6 +77,7 @@ SETS: Mapping[str, Clips] = {
         copies=8,
         window=40,
         width=192,
+        flat=False,
         share=0.4,
     ),
 }
@@ -129,8 +133,9 @@ def _make_models(clips: Clips) -> tuple[BundledModel, ...]:
     shared: dict[str, Any] = {**captures, "level": clips.level}
     until_flat: dict[str, Any] = {"match": clips.match or None, "until_flat": UntilFlat()}
     everything = {**shared, **until_flat}
-    general = {**everything, "match": clips.match}  # which a density's command always tells
-    walks: dict[str, Any] = {**everything, "match": clips.locomotion, "labels": clips.labels}
+    density_end = {"until_flat": UntilFlat() if clips.flat else None}
+    general = {**everything, **density_end, "match": clips.match}  # which a density's command always tells
+    walks: dict[str, Any] = {**general, "match": clips.locomotion, "labels": clips.labels}
     live = clips.width * 5 // 8
     return (
         BundledModel(

@@ -63,7 +63,9 @@ def _type(model: BundledModel, data: Path, out: Path, minutes: float) -> tuple[s
     for option, need in model.needs.items():
         at = words.index(option) if option in words else len(words)
         words[at : at + 2] = [option, str(out / need)]
-    return (*words, "--licence", model.recipe.licence, "--minutes", f"{minutes:g}")
+    ends_anywhere = model.recipe.until_flat is not None or not model.recipe.falls
+    limit = ("--minutes", f"{minutes:g}") if ends_anywhere else ()
+    return (*words, "--licence", model.recipe.licence, *limit)
 
 
 @dataclass
