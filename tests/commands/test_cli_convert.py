@@ -181,7 +181,9 @@ def test_the_page_names_every_format_and_key():
         for e in re.findall(r"`(\.\w+)`", cell)
     }
     assert written == set(formats.WRITERS)
-    assert re.findall(r"^\| `(\w+)` \| ", DOCS, re.MULTILINE) == list(npz.to_arrays(replace(walk(2), licence="CC0 1.0")))
+    assert re.findall(r"^\| `(\w+)` \| ", DOCS, re.MULTILINE) == list(
+        npz.to_arrays(replace(walk(2), licence="CC0 1.0"))
+    )
 
 
 def test_commands_of_the_page_are_understood():
