@@ -46,6 +46,7 @@ class FileDenoiser:
         inbetweener = None if self.load_inbetweener is None else _load_once(self.load_inbetweener)
         denoiser = _load_once(self.load)
         done = denoise(motion, denoiser, inbetweener=inbetweener, masks=masks, settings=self.settings, rig=self.rig)
+        done = replace(done, motion=replace(done.motion, licence=motion.licence))
         job.out.parent.mkdir(parents=True, exist_ok=True)
         if self.after is not None:
             self.after(job, done)
