@@ -171,10 +171,10 @@ def test_help_names_every_format(capsys):
 
 
 @pytest.mark.parametrize(
-    "words", ["--rig canonical", "--rig lafan1", "--root-motion", "--fps 20", "--mirror", "--in-place"]
+    "words", ["--rig canonical", "--rig mixamo", "--root-motion", "--fps 20", "--mirror", "--in-place"]
 )
 def test_a_licence_outlives_what_is_done_to_the_motion(here, words):
-    formats.save(replace(walk(6), licence="CC BY 4.0 (somebody)"), "given.npz")
+    formats.save(replace(walk(40), licence="CC BY 4.0 (somebody)"), "given.npz")
     assert run("convert", "given.npz", "out.npz", *words.split()) == 0
     assert mapctl.load("out.npz").licence == "CC BY 4.0 (somebody)"
 
