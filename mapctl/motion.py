@@ -1,6 +1,6 @@
 """Motion: a skeleton moving through time. Immutable; every operation returns a new one."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property
@@ -92,7 +92,7 @@ class Motion:
             self,
             root_position=root,
             moving_offsets=moving,
-            licence="; ".join(dict.fromkeys(filter(None, (self.licence, other.licence)))),
+            licence=join_licences((self.licence, other.licence)),
             local_quat_xyzw=torch.cat([self.local_quat_xyzw, other.local_quat_xyzw]),
         )
 
@@ -162,3 +162,8 @@ class Motion:
             moving_offsets=moving,
             local_quat_xyzw=pick(self.local_quat_xyzw),
         )
+
+
+def join_licences(licences: Iterable[str]) -> str:
+    """Join licences into one text, each once; empty ones are left out."""
+    return "; ".join(dict.fromkeys(filter(None, licences)))

@@ -41,7 +41,12 @@ def record_licences() -> Iterator[Licences]:
 def note_licence(name: str, licence: str) -> None:
     """Note that something of this name and licence is used, where somebody records that; nothing without a licence."""
     for recording in _recordings if licence else ():
-        recording[name] = _find_known(licence) or licence
+        recording[name] = shorten_licence(licence)
+
+
+def shorten_licence(licence: str) -> str:
+    """Leave out the models that a motion's licence names beside it; one that is not known stays as it is."""
+    return _find_known(licence) or licence
 
 
 def find_used_licences() -> Licences:
@@ -159,8 +164,15 @@ def _list_texts_of_origin(value: Any) -> Iterator[str]:
 
 
 def _find_known(licence: str) -> str | None:
-    """Find the known licence that a text is, or begins with before names in parentheses."""
-    return next((known for known in _BY_STRICTNESS if licence == known or licence.startswith(f"{known} (")), None)
+    """Find the known licence that a text names, before models in parentheses; of several, which a motion has that is
+    joined from others, the strictest. None where one of them is not known."""
+    found = [_find_known_part(part) for part in licence.split("; ")]
+    known = [each for each in found if each is not None]
+    return max(known, key=_BY_STRICTNESS.index) if len(known) == len(found) else None
+
+
+def _find_known_part(part: str) -> str | None:
+    return next((known for known in _BY_STRICTNESS if part == known or part.startswith(f"{known} (")), None)
 
 
 def _rank(licence: str) -> int:

@@ -10,6 +10,7 @@ from controllers.denoising.denoise import denoise
 from controllers.denoising.result import DenoiseSolution
 from controllers.denoising.segment import DenoiseSettings
 from mapctl import formats
+from mapctl.motion import join_licences
 from mapctl.protocols import Denoiser, Inbetweener
 from mapctl.recording.masks import masks_from_missing
 from mapctl.retarget.rigs import Rig
@@ -45,11 +46,12 @@ class FileDenoiser:
         inbetweener = None if self.load_inbetweener is None else _load_once(self.load_inbetweener)
         denoiser = _load_once(self.load)
         done = denoise(motion, denoiser, inbetweener=inbetweener, masks=masks, settings=self.settings, rig=self.rig)
+        done = replace(done, motion=replace(done.motion, licence=motion.licence))
         job.out.parent.mkdir(parents=True, exist_ok=True)
         if self.after is not None:
             self.after(job, done)
-        told = "; ".join(filter(None, dict.fromkeys((self.licence, motion.licence))))
-        formats.save(replace(done.motion, licence=told), job.out)
+        licence = join_licences((self.licence, motion.licence))
+        formats.save(replace(done.motion, licence=licence), job.out)
         return done.motion.num_frames, done.seconds
 
 

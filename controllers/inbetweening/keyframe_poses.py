@@ -20,7 +20,7 @@ from mapctl.intent.drawing_csv import read_drawing
 from mapctl.intent.keyframe_toml import KeyEntry, KeyRequest
 from mapctl.intent.keyframes import Key, Keys
 from mapctl.kinematics import heading
-from mapctl.motion import Motion
+from mapctl.motion import Motion, join_licences
 from mapctl.retarget import RigMap, as_rig, from_canonical
 from mapctl.retarget.carry import RiggedCharacter, retarget_motion
 from mapctl.retarget.rigs import Rig
@@ -53,7 +53,8 @@ def build_keyframe_clip(request: KeyRequest, rig: Rig | None = None) -> Keyframe
         keys[frame] = _build_key(key, frame, body.rigmap, number)
         if key.needs_pose or key.tells_place:
             poses[frame] = replace(_build_pose(key, request, reader, body, number), fps=fps, source=body.clip.source)
-    return KeyframeClip(_interpolate_poses(poses, max(keys) + 1), Keys(tuple(keys.values())), as_rig(body.rigmap))
+    motion = replace(_interpolate_poses(poses, max(keys) + 1), licence=reader.licence)
+    return KeyframeClip(motion, Keys(tuple(keys.values())), as_rig(body.rigmap))
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +84,11 @@ class _PoseReader:
     """Rig of the body."""
     clips: dict[str, _LoadedClip] = field(default_factory=dict)
     """Loaded clips by path."""
+
+    @property
+    def licence(self) -> str:
+        """Licences of all loaded clips."""
+        return join_licences(each.clip.licence for each in self.clips.values())
 
     def body(self, path: str) -> _LoadedClip:
         """Load the body's own file, on its rig where one is given."""

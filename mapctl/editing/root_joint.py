@@ -52,4 +52,5 @@ def add_root(motion: Motion) -> Motion:
         torch.cat([still, motion.local_quat_xyzw], dim=1),
         {1: motion.root_position, **moving},
         bvh.add_root_to_layout(motion.source, name) or add_root_to_character(motion.source, name),
+        motion.licence,
     )

@@ -126,7 +126,6 @@ def to_arrays(motion: Motion) -> dict[str, np.ndarray]:
     tracks = np.array([_numbers(motion.moving_offsets[joint]) for joint in moving])
     told = {_LICENCE: np.array(motion.licence)} if motion.licence else {}
     return {
-        **told,
         "format": np.array(FORMAT),
         "names": np.array(skeleton.names),
         "parents": np.array(skeleton.parents, dtype=np.int64),
@@ -138,6 +137,7 @@ def to_arrays(motion: Motion) -> dict[str, np.ndarray]:
         "local_quat_xyzw": _numbers(motion.local_quat_xyzw),
         "moving_joints": np.array(moving, dtype=np.int64),
         "moving_offsets": tracks.reshape(len(moving), motion.num_frames, 3),
+        **told,
     }
 
 

@@ -231,7 +231,8 @@ def to_canonical(motion: Motion, rig: Rig | None = None) -> tuple[Motion, RigMap
     if upright is not None:  # all other joints rotate with the hips
         local[:, 0] = rotations.multiply(upright.expand(len(world), 4), local[:, 0])
         hips = rotations.rotate(upright.expand(len(world), 4), hips)
-    return Motion(rigmap.skeleton, motion.fps, hips, rotations.make_sign_continuous(local)), rigmap
+    quats = rotations.make_sign_continuous(local)
+    return Motion(rigmap.skeleton, motion.fps, hips, quats, licence=motion.licence), rigmap
 
 
 def rig_joint_positions(motion: Motion, rigmap: RigMap) -> Float[Tensor, "frames joints 3"]:
@@ -274,6 +275,7 @@ def from_canonical(motion: Motion, rigmap: RigMap, original: Motion | None = Non
         torch.zeros(frames, 3, dtype=torch.float64),
         rotations.make_sign_continuous(torch.stack(local, 1)),
         source=original.source if original is not None else None,
+        licence=motion.licence,
     )
     return _place_hips(on_rig, rigmap, hips, original if kept else None)
 

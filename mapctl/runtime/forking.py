@@ -196,13 +196,18 @@ def _fork(
     maker: connection.Connection, target: Target, prepared: Any, arguments: Any, ends: list[connection.Connection]
 ) -> None:
     ours, sentinel = ends
-    pid = 0
-    if _count_threads() == 1 and not (pid := os.fork()):
+    if _count_threads() > 1:
+        _send_pid(sentinel, 0)
+    elif not os.fork():
         maker.close()
+        _send_pid(sentinel, os.getpid())  # before all else, so that whoever hears of it can end it
         _run_child(target, ours, prepared, arguments)
-    sentinel.send_bytes(pid.to_bytes(_PID_BYTES, "big"))
     for end in ends:
         end.close()
+
+
+def _send_pid(sentinel: connection.Connection, pid: int) -> None:
+    sentinel.send_bytes(pid.to_bytes(_PID_BYTES, "big"))
 
 
 def _run_child(target: Target, ours: connection.Connection, prepared: Any, arguments: Any) -> None:

@@ -4,6 +4,7 @@ import re
 import shlex
 import subprocess
 import sys
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -169,6 +170,15 @@ def test_help_names_every_format(capsys):
     assert all(ending in told for ending in (*formats.READERS, *formats.WRITERS, ".asf"))
 
 
+@pytest.mark.parametrize(
+    "words", ["--rig canonical", "--rig mixamo", "--root-motion", "--fps 20", "--mirror", "--in-place"]
+)
+def test_a_licence_outlives_what_is_done_to_the_motion(here, words):
+    formats.save(replace(walk(40), licence="CC BY 4.0 (somebody)"), "given.npz")
+    assert run("convert", "given.npz", "out.npz", *words.split()) == 0
+    assert mapctl.load("out.npz").licence == "CC BY 4.0 (somebody)"
+
+
 def test_the_page_names_every_format_and_key():
     rows = dict(re.findall(r"^\| (`\.[^|]*) \| (yes|no) \| ", DOCS, re.MULTILINE))
     read = {ending for cell, yes in rows.items() if yes == "yes" for ending in re.findall(r"`(\.\w+)`", cell)}
@@ -180,7 +190,9 @@ def test_the_page_names_every_format_and_key():
         for e in re.findall(r"`(\.\w+)`", cell)
     }
     assert written == set(formats.WRITERS)
-    assert re.findall(r"^\| `(\w+)` \| ", DOCS, re.MULTILINE) == list(npz.to_arrays(walk(2)))
+    assert re.findall(r"^\| `(\w+)` \| ", DOCS, re.MULTILINE) == list(
+        npz.to_arrays(replace(walk(2), licence="CC0 1.0"))
+    )
 
 
 def test_commands_of_the_page_are_understood():

@@ -161,7 +161,7 @@ def test_broken_curves(fails, prior, kind):
         (["train", "refiner", "--data", ".", "-o", "run", "--components", "4"], "Unrecognized options: --components"),
         (["train", "refiner", "--data", ".", "-o", "run", "--labels", "(?P<a>b)"], "Unrecognized options: --labels"),
         (["train", "refiner", "--data", ".", "-o", "run", "--init", "locomotion"], "Unrecognized options: --init"),
-        (["train", "refiner", "--data", ".", "-o", "run", "--skip-first"], "Unrecognized options: --skip-first"),
+        (["train", "refiner", "--data", ".", "-o", "run", "--until-flat"], "Unrecognized options: --until-flat"),
         (["train", "refiner", "--data", ".", "-o", "run", "--device", "cuda"], "Unrecognized options: --device"),
         (["train", "refiner", "--data", ".", "-o", "run", "--minutes-between-checkpoints", "0"], "must be positive"),
         (["train", "gan", "--data", ".", "-o", "run"], "lstm-gmm"),

@@ -3,6 +3,7 @@
 import json
 import math
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -175,8 +176,8 @@ GOTO = "time_s,speed_mps,heading_deg,goto_x_m,goto_z_m,within_s,goto_facing_deg,
 
 def test_a_place_is_reached_in_time_and_told(steer, tmp_path, capsys):
     stitcher = save_tiny_stitcher(tmp_path / "stitch.safetensors")
-    walk(10).save(tmp_path / "pose.bvh")
-    script = GOTO + "0.2,1.0,40,0.3,0.4,0.7,20,pose.bvh:7\n"
+    replace(walk(10), licence="CC BY 4.0 (somebody)").save(tmp_path / "pose.npz")
+    script = GOTO + "0.2,1.0,40,0.3,0.4,0.7,20,pose.npz:7\n"
     assert steer(script, "--report", tmp_path / "r.json", "--stitcher", stitcher) == 0
     (row,) = json.loads((tmp_path / "r.json").read_text())["arrivals"]
     assert row["frame"] == 27
@@ -184,7 +185,9 @@ def test_a_place_is_reached_in_time_and_told(steer, tmp_path, capsys):
     assert row["facing_error_deg"] < 0.1
     assert row["pose_error_cm"] < 0.1
     assert mapctl.load(tmp_path / "a.bvh").num_frames >= 27 + 30
-    assert "0.9 s  at 0.3, 0.4 m: 0.00 cm off, 0.00 degrees off, joints 0.0 cm off the pose" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "0.9 s  at 0.3, 0.4 m: 0.00 cm off, 0.00 degrees off, joints 0.0 cm off the pose" in told
+    assert re.search(r"^licence .*; CC BY 4\.0 \(\S+\.csv\)$", told, re.MULTILINE)
 
 
 def test_a_place_that_nobody_reaches_is_said_and_strict_fails(steer, tmp_path, capsys):

@@ -6,6 +6,8 @@ import shutil
 import signal
 import subprocess
 import sys
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -15,15 +17,20 @@ from tiny_weights import FREE, change_card, save_tiny_weights
 
 import mapctl
 import priors
+from controllers.denoising.batch import FileDenoiser
+from controllers.denoising.denoise import DenoiseSettings
 from controllers.steering.process import CharacterProcess
 from mapctl import formats
 from mapctl.cli import parse
 from mapctl.commands import COMMANDS
 from mapctl.commands.bench import TABLES
+from mapctl.commands.denoise import Denoise
+from mapctl.commands.denoise.folder import ReportWriter
 from mapctl.commands.live import Live
 from mapctl.commands.live import run as live
 from mapctl.commands.shared.character import read_character
 from mapctl.commands.shared.command import ModelCommand
+from mapctl.runtime.file_jobs import FileJob
 from priors import weight_sets
 from scenes.live.app import LiveApp
 
@@ -316,6 +323,39 @@ def test_a_clip_that_is_blended_brings_its_licence(both, capsys):
     words = JOBS["blend"][0].replace("other.bvh", "walk.npz").split()
     assert run(*words, "--weights", "free") == 0
     assert f"licence   {NOT_FREE} (walk.npz); {FREE} (free/transformer)" in capsys.readouterr().out
+
+
+def mark(folder, source):
+    """Write a clip as `given.npz`, marked as if a model of the full set had made it."""
+    formats.save(replace(mapctl.load(folder / source), licence=f"{NOT_FREE} (somebody)"), folder / "given.npz")
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        ("tween keys.toml -o out.npz --no-finish", "keys.toml"),
+        ("tween other.bvh -o out.npz --keyframes 0,12 --no-finish --method tweener --dna given.npz", "given.npz"),
+        pytest.param("follow line:1 -o out.npz --start given.npz:10", "given.npz", marks=pytest.mark.slow),
+        ("generate -o made --seconds 0.5 --no-footing --to .npz --start given.npz", "given.npz"),
+    ],
+)
+def test_whatever_else_is_given_brings_its_licence(both, capsys, words, named):
+    mark(both, "in.bvh")
+    (both / "keys.toml").write_text(KEYS.replace('pose = "in.bvh"\npose_frame', 'pose = "given.npz"\npose_frame'))
+    assert run(*words.split(), "--weights", "free") == 0
+    assert f"licence   {NOT_FREE} ({named}); {FREE} (" in capsys.readouterr().out
+
+
+def test_a_file_of_a_folder_brings_its_licence(both):
+    mark(both, "in.bvh")
+    command = Denoise(both, both / "clean", report=both / "told")
+    job = FileJob(both / "given.npz", both / "clean" / "given.npz")
+    after = ReportWriter(command, both / "told", {"free/denoiser": FREE})
+    load = partial(priors.load_denoiser, "free/denoiser")
+    FileDenoiser(load, DenoiseSettings(), after=after, licence=f"{FREE} (free/denoiser)")(job)
+    used = {"free/denoiser": FREE, str(both / "given.npz"): NOT_FREE}
+    assert licence_of(both / "told" / "given.json") == {"strictest": NOT_FREE, "models": used}
+    assert mapctl.load(job.out).licence == f"{FREE} (free/denoiser); {NOT_FREE} (somebody)"
 
 
 def test_a_command_that_makes_no_motion_tells_no_licence(both, capsys):

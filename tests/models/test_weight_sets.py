@@ -224,11 +224,28 @@ def test_what_is_loaded_is_recorded_with_its_licence(folder):
         (["CC BY-NC 4.0", "that of the training data"], "that of the training data"),
         (["b", "CC BY 4.0", "a"], "a and b"),
         (["CC BY 4.0 (walk.glb)", FREE], "CC BY 4.0 (walk.glb)"),
+        ([f"{FREE} (a); {NOT_FREE} (b)", "CC BY 4.0"], f"{FREE} (a); {NOT_FREE} (b)"),
+        ([f"{FREE} (a); mine (b)", NOT_FREE], f"{FREE} (a); mine (b)"),
         ([], ""),
     ],
 )
 def test_the_strictest_licence(held, strictest):
     assert licences.find_strictest(held) == strictest
+
+
+@pytest.mark.parametrize(
+    ("told", "noted"),
+    [
+        (f"{NOT_FREE} (locomotion)", NOT_FREE),
+        (f"{FREE} (a); {NOT_FREE} (b, c)", NOT_FREE),
+        (f"{FREE} (a); mine (b)", f"{FREE} (a); mine (b)"),
+        ("mine", "mine"),
+    ],
+)
+def test_a_motion_that_is_joined_counts_as_its_strictest_part(told, noted):
+    with licences.record_licences() as used:
+        licences.note_licence("walk.npz", told)
+    assert used == {"walk.npz": noted}
 
 
 def test_a_file_does_not_tell_where_models_lay(folder):

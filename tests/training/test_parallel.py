@@ -221,6 +221,7 @@ def test_ctrl_c_saves_a_checkpoint_of_all_processes(tmp_path, data, monkeypatch)
             os.kill(os.getpid(), signal.SIGINT)  # a terminal sends it to all
         return step(trainer)
 
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # shells have it ignored by what runs in the background
     interruption.raise_on_signals()
     with monkeypatch.context() as patch:
         patch.setattr(InfillerTrainer, "train_step", signalled)

@@ -14,7 +14,6 @@ from mapctl.commands.shared import folders, inputs, licensing, outputs, results
 from mapctl.errors import RequestError
 from mapctl.runtime.file_jobs import FileJob, run_over_cluster, run_over_processes
 from priors import licences
-from priors.licences import Licences
 
 
 def run(command: Denoise, settings: DenoiseSettings) -> int:
@@ -24,7 +23,7 @@ def run(command: Denoise, settings: DenoiseSettings) -> int:
     load = partial(priors.load_denoiser, priors.add_set(command.denoiser))
     load_inbetweener = partial(priors.load_inbetweener, priors.add_set(command.inbetweener or "transformer"))
     load_inbetweener()
-    used = licences.find_used_licences()  # what the processes use, and they do not record
+    used = dict(licences.find_used_licences())  # what the processes use, and they do not record
     after = None if command.report is None else ReportWriter(command, command.report, used)
     licence = licensing.format_used_licences()
     file_denoiser = FileDenoiser(load, settings, load_inbetweener, inputs.read_rig(command.rig), after, licence)
@@ -58,12 +57,14 @@ class ReportWriter:
     """The command."""
     folder: Path
     """Folder of the reports, named as the results."""
-    used: Licences
-    """Licences of the models."""
+    used: dict[str, str]
+    """Licences of the models; that of the motion joins them."""
 
     def __call__(self, job: FileJob, done: DenoiseSolution) -> None:
         """Write one report."""
         path = (self.folder / job.out.relative_to(self.command.out)).with_suffix(".json")
         path.parent.mkdir(parents=True, exist_ok=True)
+        own = done.motion.licence
+        used = self.used | ({str(job.source): licences.shorten_licence(own)} if own else {})
         told = results.build_report("denoise", self.command, done)
-        report.write_report(told | licences.describe_licences(self.used), path)
+        report.write_report(told | licences.describe_licences(used), path)

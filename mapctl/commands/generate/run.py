@@ -68,7 +68,7 @@ def _check_settings(command: Generate) -> tuple[GenerateSettings, Motion | None]
     settings = GenerateSettings(command.temperature, start, command.style is None, finishing)
     if command.start is None or numbered:
         return settings, None
-    return settings, formats.load(command.start)
+    return settings, inputs.read_motion(Path(command.start), None)
 
 
 def _sample_seeds(command: Generate) -> list[int]:

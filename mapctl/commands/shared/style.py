@@ -6,6 +6,7 @@ from pathlib import Path
 
 from controllers.inbetweening.proposers import AutoInbetweener
 from mapctl import formats, motion_dna
+from mapctl.commands.shared.inputs import read_motion
 from mapctl.errors import RequestError
 from mapctl.motion_dna import MotionDna
 from mapctl.protocols import Inbetweener
@@ -43,7 +44,7 @@ def _read_example(name: str) -> Example:
     path = Path(name)
     if not path.is_file() and path.suffix.lower() not in formats.READERS:
         return Example(name, None)
-    motion = formats.load(path)
+    motion = read_motion(path, None)
     try:
         return Example(path.name, motion_dna.of(motion))
     except RequestError as error:

@@ -38,9 +38,10 @@ from mapctl.intent.steering_csv import read_commands
 from mapctl.intent.steering_limits import SteeringLimits
 from mapctl.metrics.arrivals import measure_arrivals
 from mapctl.metrics.travel import measure_commands
-from mapctl.motion import Motion
+from mapctl.motion import Motion, join_licences
 from mapctl.problem.solution import Outcome, Solution, Status
 from mapctl.terms import FootContact
+from priors.licences import note_licence
 from priors.lstm_gmm.density import LstmGmmDensity
 from scenes.live.inputs import InputLimits
 from scenes.plots.steering import plot
@@ -53,7 +54,7 @@ _LAST_COMMAND_SECONDS = 3.0  # seconds for which a script of a single command is
 def run(command: Steer) -> int:
     """Check everything, steer, write, report. Ctrl-C ends the script early; the motion so far is written."""
     _check(command)
-    track = _add_obstacles(read_commands(command.commands), [Obstacle.parse(text) for text in command.avoid])
+    track = _add_obstacles(_read_track(command.commands), [Obstacle.parse(text) for text in command.avoid])
     character, prior = read_character(command.rig), priors.load(command.prior)
     track, lowered = track.limit_speed(prior.limits.max_steering_speed)
     for labels in {wanted.told for wanted in track.commands if wanted.told}:
@@ -109,6 +110,15 @@ def _open_links(command: Steer, character: Character, prior: LstmGmmDensity, tra
 
 def _limits(command: Steer) -> SteeringLimits:
     return SteeringLimits(command.acceleration, command.braking, math.radians(command.turn_rate))
+
+
+def _read_track(path: Path) -> CommandTrack:
+    """Read the script, and note the licences of the motions whose poses it names."""
+    track = read_commands(path)
+    arrivals = [wanted.arrival for wanted in track.commands if wanted.arrival is not None]
+    poses = [arrival.pose for arrival in arrivals if arrival.pose is not None]
+    note_licence(str(path), join_licences(pose.licence for pose in poses))
+    return track
 
 
 def _add_obstacles(track: CommandTrack, obstacles: Sequence[Obstacle]) -> CommandTrack:

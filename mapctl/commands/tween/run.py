@@ -27,6 +27,7 @@ from mapctl.intent.keyframe_toml import KeyRequest, read_keys
 from mapctl.intent.keyframes import Keys
 from mapctl.protocols import Inbetweener
 from mapctl.retarget.rigs import Rig
+from priors import licences
 
 
 def run(command: Tween) -> int:
@@ -129,9 +130,11 @@ def _read_keyframe_clip(command: Tween, request: KeyRequest | None) -> KeyframeC
 
 def _load_key_file(command: Tween, request: KeyRequest, rig: Rig | None) -> KeyframeClip:
     try:
-        return build_keyframe_clip(request, rig)
+        clip = build_keyframe_clip(request, rig)
     except RequestError as error:
         raise FileFormatError(command.source, str(error)) from error
+    licences.note_licence(str(command.source), clip.motion.licence)
+    return clip
 
 
 def _prepare_tweening(command: Tween, clip: KeyframeClip) -> Tweening:

@@ -10,7 +10,7 @@ from controllers.shots.clips.arrival import Arrival
 from controllers.shots.clips.lead import Lead
 from controllers.shots.request import Look, PoseKey, Reach, ShotRequest
 from controllers.shots.rest_pose import build_rest_pose
-from mapctl import formats
+from mapctl.commands.shared.inputs import read_motion
 from mapctl.curves import Curve
 from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import RequestError
@@ -146,7 +146,7 @@ class _Body:
         if own is None:
             return found
         name = own[0]
-        clip = formats.load(folder / name)
+        clip = read_motion(folder / name, None)
         if character.rigmap is not None and not clip.skeleton.matches(character.rigmap.rig_skeleton):
             raise RequestError(
                 f"{name} is of another rig than the character; what goes on from a clip or ends in one is on its rig"
@@ -160,7 +160,7 @@ class _Body:
         """Return a clip on canonical joints with this body's bones; RequestError, which names it, for one whose joints
         cannot be identified."""
         if name not in self.clips:
-            clip = formats.load(self.folder / name)
+            clip = read_motion(self.folder / name, None)
             if self.rigged is None:
                 skeleton, height = self.character.skeleton, self.character.toe_rest_height
                 standing = self.character.on_rig(build_rest_pose(self.prior, skeleton, height))

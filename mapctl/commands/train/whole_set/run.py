@@ -2,7 +2,7 @@
 
 import math
 import shlex
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from mapctl.commands.shared import exit_status, options, outputs
@@ -10,7 +10,7 @@ from mapctl.commands.shared.resumption import explain_end
 from mapctl.commands.train.progress import print_line, warn
 from mapctl.commands.train.whole_set import TrainAll, summary
 from mapctl.commands.train.whole_set.plan import Job, Record, lock_folder, make_jobs
-from mapctl.commands.train.whole_set.workers import train_jobs
+from mapctl.commands.train.whole_set.workers import Say, train_jobs
 from mapctl.errors import MapctlError, RequestError
 from priors.training.bundled import weights
 from priors.training.bundled.models import BundledModel, list_models
@@ -85,7 +85,7 @@ def _choose(models: Sequence[BundledModel], only: str | None) -> list[BundledMod
     return [model for model in models if model.name in names]
 
 
-def _say(command: TrainAll):
+def _say(command: TrainAll) -> Say:
     """Lines of the models, with their names before them; with --quiet only what they have against the data."""
 
     def say(name: str, line: str) -> None:
@@ -97,7 +97,9 @@ def _say(command: TrainAll):
     return say
 
 
-def _finish(out: Path):
+def _finish(out: Path) -> Callable[[Job], None]:
+    """Copies a model that is finished into the folder of weights."""
+
     def finish(job: Job) -> None:
         weights.copy_model(job.model, job.run, out / "weights")
 
