@@ -18,7 +18,7 @@ from mapctl.commands.train.whole_set import TrainAll, summary, workers
 from mapctl.commands.train.whole_set.plan import lock_folder
 from priors import checkpoints
 from priors.checkpoints import Card
-from priors.training.bundled.models import list_models
+from priors.training.bundled.models import SETS, list_models
 
 PLOT_SET = summary.plot_set
 NAMES = [model.name for model in list_models()]
@@ -140,6 +140,12 @@ def test_all_are_trained_each_after_what_it_needs(tmp_path, stage, train_all, ca
     assert "path: step 24/24" in told.out
 
 
+def test_a_run_whose_steps_are_told_has_no_limit_in_minutes(stage, train_all):
+    assert train_all("--only", "locomotion,path", "--weights", "free") == 0
+    assert "--minutes" not in stage.words["locomotion"]
+    assert "--minutes" in stage.words["path"]
+
+
 def test_one_at_a_time_they_come_in_the_order_of_the_table(stage, train_all):
     assert train_all() == 0
     assert [name for what, name in stage.events if what == "begin"] == NAMES
@@ -150,11 +156,11 @@ def test_each_is_trained_by_the_command_of_the_table_with_folders_in_it(tmp_path
     assert train_all("--only", "path, tweener", "--minutes", 30) == 0
     out = tmp_path / "set"
     assert stage.words["path"] == shlex.split(
-        f"mapctl train path --data {data} -o {out / 'path'} --skip-first --until-flat"
+        f"mapctl train path --data {data} -o {out / 'path'} --cuts cmu --until-flat"
         " --licence 'CC BY-NC 4.0' --minutes 30"
     )
     assert stage.words["tweener"] == shlex.split(
-        f"mapctl train tweener --data {data} -o {out / 'tweener'} --skip-first --until-flat"
+        f"mapctl train tweener --data {data} -o {out / 'tweener'} --cuts cmu --until-flat"
         f" --path {out / 'path'} --licence 'CC BY-NC 4.0' --minutes 30"
     )
     assert (out / "path" / "cache").resolve() == (out / "tweener" / "cache").resolve() == out / "cache"
@@ -261,7 +267,8 @@ def test_the_bundled_set_is_checked_too(capsys):
 def test_the_commands_are_printed(capsys):
     assert run("train", "all", "--commands", "--only", "path", "--weights", "free") == 0
     assert capsys.readouterr().out == (
-        "path: mapctl train path --data DATA -o RUN --match '^cmu' --skip-first --until-flat\n"
+        f"path: mapctl train path --data DATA -o RUN --match '{SETS['free'].match}'"
+        " --level --cuts cmu --steps 4800 --until-flat\n"
     )
 
 
@@ -341,9 +348,7 @@ def test_processes_train_and_the_set_is_there(tmp_path, train_all, capsys):
     told = capsys.readouterr().out
     card = checkpoints.read_card(tmp_path / "set" / "weights" / "path.json")
     assert "0.02 minutes were nearly up" in told
-    assert card.training["command"].startswith(
-        "mapctl train path --data DATA -o RUN --skip-first --until-flat --decay-"
-    )
+    assert card.training["command"].startswith("mapctl train path --data DATA -o RUN --cuts cmu --until-flat --decay-")
     assert card.licence == "CC BY-NC 4.0"
     assert 0 < card.training["ended"]["minutes"] < 0.2
     log = (tmp_path / "set" / "path" / "losses.csv").read_text()
