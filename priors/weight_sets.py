@@ -97,11 +97,11 @@ def find_set_of(path: Path) -> str | None:
 
 
 def add_set(name: str) -> str:
-    """Add its set to a bundled name, where that is not the default one, so that it means the same file in another
-    process; other names, and paths, stay."""
+    """Add its set to a bundled name, so that it means the same file in another process or on another machine, whatever
+    set is in force there; other names, and paths, stay."""
     weights, model = split_name(name)
-    bare = model == name and weights != SETS[0]
-    return f"{weights}/{name}" if bare and model in list_models(weights) and not _is_path(name) else name
+    bare = model == name and model in list_models(weights)
+    return f"{weights}/{name}" if bare and not _is_path(name) else name
 
 
 def _is_path(name: str) -> bool:

@@ -119,7 +119,7 @@ def test_a_prior_gets_the_refiner_of_its_own_set(folder):
 
 
 def test_names_for_other_processes_say_their_set(folder):
-    assert priors.add_set("locomotion") == "locomotion"
+    assert priors.add_set("locomotion") == "full/locomotion"
     with priors.use_weights("free"):
         assert priors.add_set("locomotion") == "free/locomotion"
         assert priors.add_set("free/locomotion") == "free/locomotion"

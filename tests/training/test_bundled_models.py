@@ -16,7 +16,7 @@ from mapctl.errors import CheckpointError, RequestError
 from priors import checkpoints
 from priors.checkpoints import Card
 from priors.training.bundled.models import DATA, RECIPES, RUN, SETS, list_models
-from priors.training.bundled.weights import copy_model, name_needs, read_finished
+from priors.training.bundled.weights import MOST_BYTES, copy_model, name_needs, read_finished
 from priors.training.mocap.cuts import CMU
 from priors.training.run import train
 
@@ -45,6 +45,11 @@ def test_all_that_is_bundled_is_in_it_after_what_it_needs():
     assert {model.recipe.kind for model in FULL} <= set(RECIPES)
     assert named("locomotion-refiner").needs == {"--density": "locomotion"}
     assert named("tweener").needs == {"--path": "path"}
+
+
+def test_both_sets_together_are_as_small_as_is_promised():
+    folder = Path(checkpoints.__file__).parent / "weights"
+    assert sum(file.stat().st_size for file in folder.rglob("*") if file.is_file()) <= MOST_BYTES
 
 
 @pytest.mark.parametrize("name", checkpoints.list_bundled())

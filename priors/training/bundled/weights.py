@@ -14,7 +14,7 @@ from priors.checkpoints import Card
 from priors.training.bundled.models import RECIPES, BundledModel
 
 MOST_BYTES = 64_000_000
-"""Of all bundled files together."""
+"""Of a set, and of all bundled files together."""
 
 
 @dataclass(frozen=True)
