@@ -14,7 +14,7 @@ from torch import Tensor
 from mapctl import kinematics, rotations
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, integrate_root
 from mapctl.motion import Motion
-from mapctl.skeleton import CANONICAL, Skeleton
+from mapctl.skeleton import CANONICAL, FEET, Skeleton, find_heels
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +87,20 @@ class BodyPose:
     def joints_world(self, skeleton: Skeleton = CANONICAL) -> Float[Tensor, "*batch frames joints 3"]:
         """World joint positions by forward kinematics on a skeleton's bones, metres."""
         matrices = rotations.rotation_vector_to_matrix(self.rotation_vectors)
-        relative = kinematics.positions_from_matrices(skeleton, matrices)
+        return self._place_in_world(kinematics.positions_from_matrices(skeleton, matrices))
+
+    def joints_and_heels(
+        self, skeleton: Skeleton = CANONICAL
+    ) -> tuple[Float[Tensor, "*batch frames joints 3"], Float[Tensor, "*batch frames 2 3"]]:
+        """World joint positions, and those of the left and the right heel, metres."""
+        matrices = rotations.rotation_vector_to_matrix(self.rotation_vectors)
+        joints, turns = kinematics.chain_matrices(skeleton.offsets.to(matrices.dtype), skeleton.parents, matrices)
+        feet = skeleton.indices(FEET)
+        levers = (turns[..., feet, :, :] * find_heels(skeleton).to(turns)[:, None, :]).sum(-1)
+        return self._place_in_world(joints), self._place_in_world(joints[..., feet, :] + levers)
+
+    def _place_in_world(self, relative: Float[Tensor, "*batch frames points 3"]) -> Tensor:
+        """Turn positions relative to hips that face +Z by the heading, and put them where the hips are."""
         ground = rotations.rotate_ground(relative[..., ::2], self.heading[..., None])
         turned = torch.stack([ground[..., 0], relative[..., 1], ground[..., 1]], dim=-1)
         return turned + self.root_position[..., None, :]

@@ -1,8 +1,10 @@
 """Skeletons: joint names, the tree, and bone offsets; and the canonical one that priors speak."""
 
+import math
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import torch
 from jaxtyping import Float
@@ -125,6 +127,47 @@ TOES = ("leftToes", "rightToes")
 """Canonical toe joints, in the order of the two contact bits."""
 TOE_JOINTS = (CANONICAL.index(TOES[0]), CANONICAL.index(TOES[1]))
 """Indices of the canonical toe joints."""
+FEET = ("leftFoot", "rightFoot")
+"""Canonical foot joints (ankles), in the order of the toes."""
+
+
+@dataclass(frozen=True)
+class HeelPoint:
+    """Where the heel of a foot is: a point that moves with the foot joint, of which no rig has a joint."""
+
+    below_toes: float = 0.0201
+    """How far it is below the toe joint while the foot is flat, of the canonical foot, metres."""
+    behind: float = 0.05
+    """How far it is behind the foot joint, away from the toe joint, of the canonical foot, metres."""
+
+    def offset(self, toe: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        """Return the heel in the frame of the foot joint, metres, of a foot whose toe joint is at `toe` there and which
+        is flat while that frame is aligned with the world: both lengths are scaled by the foot bone's."""
+        scale = toe.norm(dim=-1, keepdim=True) / _FOOT_LENGTH
+        forward = toe * toe.new_tensor([1.0, 0.0, 1.0])
+        forward = forward / forward.norm(dim=-1, keepdim=True).clamp_min(1e-6)
+        below = toe[..., 1:2] - self.below_toes * scale
+        back = -self.behind * scale * forward
+        return torch.cat([back[..., :1], below, back[..., 2:]], dim=-1)
+
+
+_FOOT_LENGTH = math.hypot(0.0749, 0.0906)  # metres, from the canonical foot joint to the toe joint
+
+
+@lru_cache(maxsize=16)
+def find_heels(skeleton: Skeleton) -> Float[Tensor, "2 3"]:
+    """Find the left and the right heel in the frames of the foot joints, metres, float64; canonical names.
+
+    On walks, turns and runs of mocap it stands still while the foot is flat (docs/heels.md).
+    """
+    return HeelPoint().offset(skeleton.offsets[skeleton.indices(TOES)].double())
+
+
+@lru_cache(maxsize=16)
+def find_heel_drops(skeleton: Skeleton) -> tuple[float, float]:
+    """Find how far the left and the right heel are below the toe joint while the foot is flat, metres."""
+    left, right = (skeleton.offsets[skeleton.indices(TOES)].double() - find_heels(skeleton))[:, 1].tolist()
+    return left, right
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,7 @@ from mapctl import curves
 from mapctl.curves import Curve
 from mapctl.curves.obstacles import Obstacle
 from mapctl.features import LAYOUT, GroundPose, encode, integrate_root
+from mapctl.metrics.feet import locate_heels
 from mapctl.problem.window_solvers import LatentNoiseSolver
 from mapctl.protocols import Density, Inbetweener, Refiner
 from mapctl.solver.budget import Budget
@@ -45,6 +46,7 @@ from mapctl.terms import (
     Term,
     WithinReach,
 )
+from mapctl.terms.foot_contact import HeelSigmas
 from mapctl.terms.trial import Trial
 from priors.lstm_gmm.density import LstmGmmDensity
 from priors.lstm_gmm.network import LstmGmm
@@ -72,6 +74,7 @@ TERMS: dict[str, Term] = {
     "path of a hand": Path(curves.circle(radius=3), _ARCS, joint="leftHand"),
     "path in space": Path(_IN_SPACE, _ARCS, joint="rightToes"),
     "footing": FootContact(),
+    "footing of heels": FootContact(9.0, 9.0, 9.0, heels=HeelSigmas(0.2, 0.05, 0.02, doubt=3.0)),
     "steps": StepLength(0.6),
     "support": Support(rest_height=0.08),
     "clearance": Clearance(height=0.2, share=torch.linspace(0.5, 1, 2 * FRAMES).view(FRAMES, 2)),
@@ -96,6 +99,7 @@ def trial(batch=3, *, dtype=torch.float64, past=PAST, disturbed=0.05, seed=0):
     features = vectors[PAST:] + scale * torch.randn(batch, FRAMES, LAYOUT.size, generator=generator(seed)).double()
     draw = torch.randn(batch, FRAMES, LAYOUT.continuous + 1, generator=generator(seed + 1)).double()
     bits = torch.rand(batch, FRAMES, 2, generator=generator(seed + 2)) < 0.6
+    heels = torch.rand(batch, 1 + FRAMES, 2, generator=generator(seed + 3)) < 0.6
     place = GroundPose(ground[-1].to(dtype), heading[-1].to(dtype))
     before = motion.joint_positions()[PAST - past : PAST].to(dtype)
     planted = torch.tensor([True, False])
@@ -107,6 +111,8 @@ def trial(batch=3, *, dtype=torch.float64, past=PAST, disturbed=0.05, seed=0):
         log_density=30 * draw[..., 0].to(dtype),
         before=before,
         contacts_before=planted,
+        heels_before=locate_heels(motion)[PAST - min(past, 1) : PAST].to(dtype),
+        heel_contacts=heels,
     )
 
 

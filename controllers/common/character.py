@@ -78,13 +78,9 @@ class Character:
 
     def footing(self, footing: FootContact) -> FootContact:
         """Scale a contact term to the prior's size, with the character's own rest height."""
-        return replace(
-            footing,
-            sigma_speed=footing.sigma_speed / self.scale,
-            sigma_height=footing.sigma_height / self.scale,
-            sigma_below=footing.sigma_below / self.scale,
-            rest_height=self.toe_rest_height / self.scale,
-        )
+        sigmas = (footing.sigma_speed, footing.sigma_height, footing.sigma_below)
+        scaled = footing.with_sigmas(*(sigma / self.scale for sigma in sigmas))
+        return replace(scaled, rest_height=self.toe_rest_height / self.scale)
 
     def motion(self, motion: Motion) -> Motion:
         """Return a motion of the prior's size on the character's bones."""
@@ -113,8 +109,17 @@ class Character:
         for block in ("root_displacement_heading", "root_height"):
             features[..., LAYOUT.slices[block]] *= self.scale
         start = replace(trial.start, position_xz=trial.start.position_xz * self.scale)
-        before = trial.before * self.scale
-        return replace(trial, features=features, start=start, before=before, skeleton=self.skeleton, world_poses=None)
+        before, heels = trial.before * self.scale, trial.heels_before * self.scale
+        return replace(
+            trial,
+            features=features,
+            start=start,
+            before=before,
+            heels_before=heels,
+            heel_plan=trial if trial.heel_plan is None else trial.heel_plan,
+            skeleton=self.skeleton,
+            world_poses=None,
+        )
 
     def on_rig(self, motion: Motion) -> Motion:
         """Retarget a canonical motion of this character to its rig; joints that are not canonical rest."""

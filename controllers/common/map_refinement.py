@@ -44,7 +44,7 @@ class RefinementSettings:
     """Sigmas and search of MAP refinement."""
 
     footing: FootContact = field(
-        default_factory=lambda: FootContact(sigma_speed=0.1, sigma_height=0.03, sigma_below=0.02)
+        default_factory=lambda: FootContact(sigma_speed=0.1, sigma_height=0.03, sigma_below=0.02, heels=None)
     )
     """Contact term; its rest height becomes the performer's own. Loose, since mocap's planted toes move by 6 cm/s, and
     not every floor is level."""

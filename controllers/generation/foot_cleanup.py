@@ -121,7 +121,8 @@ def _clean_up_window(
 def _move_trial(trial: Trial, offset: Float[Tensor, "2"]) -> Trial:
     """Translate a trial over the ground to its position in the world."""
     start = replace(trial.start, position_xz=trial.start.position_xz + offset)
-    return replace(trial, start=start, before=trial.before + rotations.lift_ground(offset), world_poses=None)
+    before, heels = (points + rotations.lift_ground(offset) for points in (trial.before, trial.heels_before))
+    return replace(trial, start=start, before=before, heels_before=heels, world_poses=None)
 
 
 def _discard_history(done: CommittedFrames) -> CommittedFrames:

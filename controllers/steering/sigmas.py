@@ -45,9 +45,7 @@ def check_sigmas(settings: SteerSettings, values: Mapping[str, float]) -> None:
 def change_sigmas(settings: SteerSettings, values: Mapping[str, float]) -> SteerSettings:
     """Return the settings with these sigmas, by name, in metres and radians; the others are the settings' own."""
     now = {**_read(settings), **values}
-    footing = replace(
-        settings.footing, sigma_speed=now["foot speed"], sigma_height=now["foot height"], sigma_below=now["foot below"]
-    )
+    footing = settings.footing.with_sigmas(now["foot speed"], now["foot height"], now["foot below"])
     return replace(
         settings,
         sigma_speed=now["speed"],

@@ -16,7 +16,7 @@ from torch.autograd.function import once_differentiable
 
 from mapctl.features import LAYOUT, GroundPose
 from mapctl.kinematics import fast_kernels
-from mapctl.skeleton import Skeleton
+from mapctl.skeleton import FEET, Skeleton, find_heels
 
 
 class FeatureColumns(NamedTuple):
@@ -29,6 +29,19 @@ class FeatureColumns(NamedTuple):
     tilt_x: int
     tilt_z: int
     joints: int
+
+
+class Bones(NamedTuple):
+    """A skeleton's tree with its heels, which are points of the feet."""
+
+    parents: np.ndarray
+    """Index of each joint's parent."""
+    offsets: np.ndarray
+    """(joints, 3): each joint in its parent's frame, metres, float64."""
+    feet: np.ndarray
+    """Indices of the left and the right foot joint."""
+    heels: np.ndarray
+    """(2, 3): the heels in the frames of the feet, metres, float64."""
 
 
 def _find_columns() -> FeatureColumns:
@@ -70,6 +83,16 @@ def compute_joints_world(
     skeleton: Skeleton,
 ) -> Float[Tensor, "batch frames joints 3"]:
     """Compute the world joint positions, metres, of the root where `integrate_root_fast` puts it."""
+    return compute_joints_and_heels(features, root_xz_world, heading, skeleton)[0]
+
+
+def compute_joints_and_heels(
+    features: Float[Tensor, "batch frames size"],
+    root_xz_world: Float[Tensor, "batch frames 2"],
+    heading: Float[Tensor, "batch frames"],
+    skeleton: Skeleton,
+) -> tuple[Float[Tensor, "batch frames joints 3"], Float[Tensor, "batch frames 2 3"]]:
+    """Compute the world positions of joints, and of the left and the right heel (see `skeleton.find_heels`), metres."""
     return _Body.apply(features, root_xz_world, heading, skeleton)
 
 
@@ -83,9 +106,11 @@ class WorldPoses:
     """Heading of the hips, radians about +Y, not wrapped."""
     joints_world: Float[Tensor, "batch frames joints 3"]
     """World joint positions, metres."""
+    heels_world: Float[Tensor, "batch frames 2 3"]
+    """World positions of the left and the right heel, metres."""
     _features: np.ndarray
     _start_heading: np.ndarray
-    _bones: tuple[np.ndarray, np.ndarray]
+    _bones: Bones
     _rotations: np.ndarray
 
     @staticmethod
@@ -95,17 +120,21 @@ class WorldPoses:
         at, start_heading = start.position_xz.expand(batch, 2).contiguous(), start.heading.expand(batch).contiguous()
         ground, heading = features.new_empty(*known.shape[:2], 2), features.new_empty(known.shape[:2])
         fast_kernels.root_forward(known, _COLUMNS, at.numpy(), start_heading.numpy(), ground.numpy(), heading.numpy())
-        positions = features.new_empty(*known.shape[:2], len(bones[0]), 3)
+        positions, heels = _allocate_points(features, bones)
         turns = np.empty((*positions.shape, 3), np.float32)
-        fast_kernels.body_forward(known, _COLUMNS, ground.numpy(), heading.numpy(), *bones, positions.numpy(), turns)
-        return WorldPoses(ground, heading, positions, known, start_heading.numpy(), bones, turns)
+        fast_kernels.body_forward(
+            known, _COLUMNS, ground.numpy(), heading.numpy(), bones, positions.numpy(), heels.numpy(), turns
+        )
+        return WorldPoses(ground, heading, positions, heels, known, start_heading.numpy(), bones, turns)
 
-    def pull_back(self, d_root_xz: np.ndarray, d_heading: np.ndarray, d_joints: np.ndarray) -> np.ndarray:
-        """Return the gradient on the features (batch, frames, size) from those on roots, headings and joints."""
+    def pull_back(
+        self, d_root_xz: np.ndarray, d_heading: np.ndarray, d_joints: np.ndarray, d_heels: np.ndarray
+    ) -> np.ndarray:
+        """Return the gradient on the features (batch, frames, size) from those on roots, headings, joints and heels."""
         gradient, (batch, frames, _) = np.zeros(self._features.shape, np.float32), self._features.shape
         ground, heading = np.empty((batch, frames, 2), np.float32), np.empty((batch, frames), np.float32)
         fast_kernels.body_backward(
-            self._features, _COLUMNS, *self._bones, self._rotations, d_joints, gradient, ground, heading
+            self._features, _COLUMNS, self._bones, self._rotations, d_joints, d_heels, gradient, ground, heading
         )
         ground += d_root_xz
         heading += d_heading
@@ -114,9 +143,16 @@ class WorldPoses:
 
 
 @lru_cache(maxsize=16)
-def _tabulate_bones(skeleton: Skeleton) -> tuple[np.ndarray, np.ndarray]:
-    """Parents and offsets (float64); skeletons are compared by identity."""
-    return np.array(skeleton.parents), skeleton.offsets.double().numpy()
+def _tabulate_bones(skeleton: Skeleton) -> Bones:
+    """Skeletons are compared by identity."""
+    feet = np.array(skeleton.indices(FEET))
+    return Bones(np.array(skeleton.parents), skeleton.offsets.double().numpy(), feet, find_heels(skeleton).numpy())
+
+
+def _allocate_points(features: Tensor, bones: Bones) -> tuple[Tensor, Tensor]:
+    """Memory for the positions of joints and of heels."""
+    joints, heels = (features.new_empty(*features.shape[:2], len(points), 3) for points in (bones.offsets, bones.heels))
+    return joints, heels
 
 
 def _contiguous_array(tensor: Tensor) -> np.ndarray:
@@ -145,8 +181,8 @@ class _Root(torch.autograd.Function):
 class _Body(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, features: Tensor, ground: Tensor, heading: Tensor, skeleton: Skeleton):
-        parents, offsets = _tabulate_bones(skeleton)
-        positions = features.new_empty(*features.shape[:2], len(parents), 3)
+        bones = _tabulate_bones(skeleton)
+        positions, heels = _allocate_points(features, bones)
         world = np.empty((*positions.shape, 3), np.float32)
         known = _contiguous_array(features)
         fast_kernels.body_forward(
@@ -154,21 +190,21 @@ class _Body(torch.autograd.Function):
             _COLUMNS,
             _contiguous_array(ground),
             _contiguous_array(heading),
-            parents,
-            offsets,
+            bones,
             positions.numpy(),
+            heels.numpy(),
             world,
         )
-        ctx.known = known, parents, offsets, world
-        return positions
+        ctx.known = known, bones, world
+        return positions, heels
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, pulled: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
-        features, parents, offsets, world = ctx.known
+    def backward(ctx: Any, *pulled: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
+        features, bones, world = ctx.known
         gradient, shape = np.zeros(features.shape, np.float32), features.shape[:2]
         ground, heading = np.empty((*shape, 2), np.float32), np.empty(shape, np.float32)
         fast_kernels.body_backward(
-            features, _COLUMNS, parents, offsets, world, _contiguous_array(pulled), gradient, ground, heading
+            features, _COLUMNS, bones, world, *map(_contiguous_array, pulled), gradient, ground, heading
         )
         return *map(torch.from_numpy, (gradient, ground, heading)), None

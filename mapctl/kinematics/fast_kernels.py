@@ -86,8 +86,10 @@ def fill_rotation_about_y(turn, heading):
 
 
 @entry
-def body_forward(features, columns, ground, headings, parents, offsets, positions, world):
-    """Fill positions (batch, frames, joints, 3) and rotations `world` (batch, frames, joints, 3, 3) of every joint."""
+def body_forward(features, columns, ground, headings, bones, positions, heels, world):
+    """Fill positions (batch, frames, joints, 3) and rotations `world` (batch, frames, joints, 3, 3) of every joint, and
+    the positions of the heels (batch, frames, 2, 3). `bones` are those of `fast.Bones`."""
+    parents, offsets, feet, heel_offsets = bones.parents, bones.offsets, bones.feet, bones.heels
     heading_frame = np.empty((3, 3))
     for b in range(len(features)):
         for t in range(features.shape[1]):
@@ -109,6 +111,11 @@ def body_forward(features, columns, ground, headings, parents, offsets, position
                     np.float64(now[vector + 1]),
                     np.float64(now[vector + 2]),
                 )
+            for side in range(len(feet)):
+                above, bone, foot = frames[feet[side]], heel_offsets[side], feet[side]
+                for i in range(3):
+                    step = above[i, 0] * bone[0] + above[i, 1] * bone[1] + above[i, 2] * bone[2]
+                    heels[b, t, side, i] = at[foot, i] + step
 
 
 @inner
@@ -128,13 +135,15 @@ def rotation_vector_gradient(world, torque, x, y, z):
 
 
 @entry
-def body_backward(features, columns, parents, offsets, world, d_positions, d_features, d_ground, d_headings):
+def body_backward(features, columns, bones, world, d_positions, d_heels, d_features, d_ground, d_headings):
     """Apply the adjoint of `body_forward`, by forces and torques as in statics.
 
     A gradient on a position is a force there. The gradient of a joint's rotation is the torque about that joint of the
     forces on all its descendants; both are summed from the leaves to the root. Fills the body's columns of
     d_features, which come in as zeros, d_ground and d_headings.
     """
+    parents, offsets, feet, heel_offsets = bones.parents, bones.offsets, bones.feet, bones.heels
+    pulled, still = np.empty(3), np.zeros(3)
     force, torque = np.empty((len(parents), 3)), np.empty((len(parents), 3))
     for b in range(len(features)):
         for t in range(features.shape[1]):
@@ -142,6 +151,11 @@ def body_backward(features, columns, parents, offsets, world, d_positions, d_fea
             for joint in range(len(parents)):  # written out: slices take as long as all the rest to compile
                 for i in range(3):
                     force[joint, i], torque[joint, i] = d_positions[b, t, joint, i], 0.0
+            for side in range(len(feet)):
+                foot = feet[side]
+                for i in range(3):
+                    pulled[i] = d_heels[b, t, side, i]
+                accumulate_to_parent(frames[foot], heel_offsets[side], pulled, still, force[foot], torque[foot])
             for joint in range(len(parents) - 1, 0, -1):
                 v = columns.joints + 3 * (joint - 1)
                 out[v], out[v + 1], out[v + 2] = rotation_vector_gradient(

@@ -3,6 +3,7 @@
 A measure that a clip cannot give (sway of one second, contact speed without a contact) is NaN.
 """
 
+import math
 from collections.abc import Iterable
 from typing import NamedTuple
 
@@ -16,6 +17,7 @@ from mapctl.errors import RequestError
 from mapctl.joint_roles import find_feet, find_hips, find_upper_legs
 from mapctl.metrics import body, feet, path
 from mapctl.motion import Motion
+from mapctl.skeleton import CANONICAL
 
 _CM = 100.0
 
@@ -25,17 +27,19 @@ def measure(
 ) -> dict[str, float]:
     """Measure one motion, by name of the measure.
 
-    Always: skate_cm_s, skate_ratio, contact_speed_cm_s, planted_share, penetration_cm, float_cm, jitter_m_s3,
-    speed_m_s, turned_deg, turn_rate_deg_s, hips_height_m, pose_variation_cm, and sway_cm: from the straight line
-    between the walk's ends, or from the curve. With a curve also path_error_{mean,p95,max}_cm, likewise
-    path_error_low_passed_, and travelled_m; with the wanted `speed` (m/s) wanted_m and progress_ratio too. `joint`
-    names the one that follows the curve, else the hips do. MapctlError for rigs whose hips, legs or feet are not found,
-    unknown joints and motions of one frame.
+    Always: skate_cm_s, skate_ratio, contact_speed_cm_s, planted_share, penetration_cm, float_cm,
+    heel_contact_speed_cm_s, heel_planted_share, heel_slide_max_cm and foot_turn_deg_s (canonical joints alone tell
+    where heels are, else NaN), jitter_m_s3, speed_m_s, turned_deg, turn_rate_deg_s, hips_height_m, pose_variation_cm,
+    and sway_cm: from the straight line between the walk's ends, or from the curve. With a curve also
+    path_error_{mean,p95,max}_cm, likewise path_error_low_passed_, and travelled_m; with the wanted `speed` (m/s)
+    wanted_m and progress_ratio too. `joint` names the one that follows the curve, else the hips do. MapctlError for
+    rigs whose hips, legs or feet are not found, unknown joints and motions of one frame.
     """
     if motion.num_frames < 2:
         raise RequestError("measures need a motion of at least 2 frames")
     positions, fps, hips = motion.joint_positions(), float(motion.fps), find_hips(motion.skeleton)
     measures = _measure_feet(positions[:, list(find_feet(motion.skeleton))], fps)
+    measures |= _measure_heels(motion)
     measures |= _measure_body(positions, hips, find_upper_legs(motion.skeleton), fps)
     if curve is None:
         return measures | {"sway_cm": path.sway(path.straight_offset(positions[:, hips, ::2]), fps) * _CM}
@@ -53,6 +57,21 @@ def _measure_feet(toe_positions: Float[Tensor, "frames 2 3"], fps: float) -> dic
         "penetration_cm": feet.penetration(toes) * _CM,
         "float_cm": feet.float_height(toes) * _CM,
     }
+
+
+def _measure_heels(motion: Motion) -> dict[str, float]:
+    """Measure heels, of which only canonical joints tell where they are."""
+    names = "heel_contact_speed_cm_s", "heel_planted_share", "heel_slide_max_cm", "foot_turn_deg_s"
+    if motion.skeleton.names != CANONICAL.names:
+        return dict.fromkeys(names, float("nan"))
+    heels = feet.HeelMeasurements.of(motion)
+    values = (
+        heels.contact_speed() * _CM,
+        heels.planted_share(),
+        heels.largest_slide() * _CM,
+        math.degrees(heels.turn_rate()),
+    )
+    return dict(zip(names, values, strict=True))
 
 
 def _measure_body(positions: Tensor, hips: int, upper_legs: tuple[int, int], fps: float) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""Foot measures: skate, contact speed, planted share, penetration and float.
+"""Foot measures: skate, contact speed, planted share, penetration and float of toes; speed and slide of heels.
 
 The floor is the clip's own: the 5th percentile of each toe's height.
 """
@@ -6,10 +6,14 @@ The floor is the clip's own: the 5th percentile of each toe's height.
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mapctl import contacts
+from mapctl import contacts, rotations
+from mapctl.contacts.heels import derive_heel_contacts
+from mapctl.motion import Motion
+from mapctl.retarget.stance import level_feet
+from mapctl.skeleton import FEET, TOES, find_heel_drops, find_heels
 
 SKATE_REACH = 0.025
 """Height over the floor below which a moving toe skates, metres."""
@@ -65,3 +69,79 @@ def penetration(toes: ToeMeasurements) -> float:
 def float_height(toes: ToeMeasurements) -> float:
     """Return the mean height of planted toes over the floor, metres; NaN if none is ever planted."""
     return float(toes.height[toes.planted].clamp_min(0).mean())
+
+
+def locate_heels(motion: Motion) -> Float[Tensor, "frames 2 3"]:
+    """Locate the left and the right heel of a motion of canonical joints whose foot frames are aligned with the world
+    while feet are flat: world positions, metres (see `skeleton.find_heels`)."""
+    feet, offsets = motion.skeleton.indices(FEET), find_heels(motion.skeleton)
+    turned = rotations.rotate(motion.joint_rotations()[:, feet], offsets.expand(motion.num_frames, 2, 3))
+    return motion.joint_positions()[:, feet] + turned
+
+
+@dataclass(frozen=True, eq=False)
+class HeelMeasurements:
+    """Heels of a clip with the inputs of their measures."""
+
+    ground: Float[Tensor, "frames 2 2"]
+    """Place over the ground, metres."""
+    yaw: Float[Tensor, "frames 2"]
+    """Direction from heel to toe about +Y, radians, not wrapped."""
+    planted: Bool[Tensor, "frames 2"]
+    """Contacts by `contacts.heels.derive_heel_contacts`."""
+    fps: float
+    """Frames a second."""
+
+    @staticmethod
+    def of(motion: Motion) -> "HeelMeasurements":
+        """Measure a motion of canonical joints; how its feet lie flat is told by the clip."""
+        toes, heels, planted = _derive_heels(motion)
+        forward = toes - heels
+        yaw = rotations.unwrap_angle(torch.atan2(forward[..., 0], forward[..., 2]).T).T
+        return HeelMeasurements(heels[..., ::2], yaw, planted, float(motion.fps))
+
+    @property
+    def _stays(self) -> Bool[Tensor, "steps 2"]:
+        return self.planted[1:] & self.planted[:-1]
+
+    def contact_speed(self) -> float:
+        """Return the mean speed of planted heels over the ground, m/s; NaN if none is planted in two frames."""
+        return float((self.ground.diff(dim=0).norm(dim=-1) * self.fps)[self._stays].mean())
+
+    def planted_share(self) -> float:
+        """Return the share of heel-frames that are planted."""
+        return float(self.planted[1:].double().mean())
+
+    def largest_slide(self) -> float:
+        """Return how far a heel gets at most from where it was planted, within one contact, metres; NaN if none is
+        planted."""
+        start, slides = self.ground[0], []
+        for frame in range(len(self.ground)):
+            lands = ~self.planted[frame - 1] if frame else torch.ones_like(self.planted[0])
+            start = torch.where(lands[:, None], self.ground[frame], start)
+            slides.append((self.ground[frame] - start).norm(dim=-1))
+        held = torch.stack(slides)[self.planted]
+        return float(held.max()) if len(held) else float("nan")
+
+    def turn_rate(self) -> float:
+        """Return the mean rate at which feet turn about the vertical while toe and heel are planted, rad/s; NaN if none
+        is."""
+        return float((self.yaw.diff(dim=0).abs() * self.fps)[self._stays].mean())
+
+
+def count_derived_heels(motion: Motion) -> Int[Tensor, "2 2"]:
+    """Count frames of both heels by whether detection on the heel itself finds it planted (rows: no, yes) and whether
+    it is by the toe and the pose (columns); canonical joints."""
+    _, heels, derived = _derive_heels(motion)
+    detected = contacts.detect_contacts(heels, float(motion.fps))
+    return torch.bincount((2 * detected + 1 * derived).flatten(), minlength=4).view(2, 2)
+
+
+def _derive_heels(
+    motion: Motion,
+) -> tuple[Float[Tensor, "frames 2 3"], Float[Tensor, "frames 2 3"], Bool[Tensor, "frames 2"]]:
+    """Toes and heels in the world, metres, and whether each heel is planted."""
+    level, fps = level_feet(motion), float(motion.fps)
+    toes, heels = level.joint_positions()[:, level.skeleton.indices(TOES)], locate_heels(level)
+    drops = heels.new_tensor(find_heel_drops(level.skeleton))
+    return toes, heels, derive_heel_contacts(contacts.detect_contacts(toes, fps), toes, heels, drops, fps)

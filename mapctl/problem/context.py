@@ -37,6 +37,8 @@ class WindowContext:
     """Frames per second."""
     contacts_before: Bool[Tensor, "*batch 2"] = field(default_factory=lambda: torch.zeros(2, dtype=torch.bool))
     """Left and right toe planted in the last committed frame; unbatched or one row a candidate."""
+    heels_before: Float[Tensor, "known 2 3"] = field(default_factory=lambda: torch.zeros(0, 2, 3))
+    """World positions of the heels in the last committed frame, metres; none where it is not known."""
     first_frame: int = 0
     """Frame of the whole motion with which the window begins, from 0."""
 
@@ -64,8 +66,9 @@ class WindowContext:
         *,
         noise: Tensor | None,
         log_density: Tensor | None,
+        heel_plan: Trial | None = None,
     ) -> Trial:
-        """Build the trial of candidate features, physical units, in this context."""
+        """Build the trial of candidate features, physical units, in this context; `heel_plan` as `Trial` has it."""
         return Trial(
             features,
             self.place,
@@ -74,10 +77,18 @@ class WindowContext:
             log_density=log_density,
             before=self.before,
             contacts_before=self.contacts_before,
+            heels_before=self.heels_before,
+            heel_plan=heel_plan,
             skeleton=self.skeleton,
             fps=self.fps,
             first_frame=self.first_frame,
         )
+
+    def plan_heels(
+        self, features: Float[Tensor, "batch frames size"], contacts: Bool[Tensor, "batch frames 2"]
+    ) -> Trial:
+        """Return the trial of a plan, whose poses and toes' contacts say which heels are planted, for `build_trial`."""
+        return self.build_trial(features, contacts, noise=None, log_density=None)
 
 
 @dataclass(frozen=True, eq=False)

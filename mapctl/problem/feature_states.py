@@ -29,6 +29,8 @@ class FeatureStates:
     """Features of unknowns 0, physical units: the prior's means."""
     contacts: Bool[Tensor, "1 frames 2"]
     """Left and right toe planted in each frame; fixed."""
+    heel_plan: Trial | None = None
+    """Motion whose poses say which heels are planted; None: each candidate's own do."""
     input_noise: float = 0.05
     """Standard deviation of the input noise, normalised units: one unit of its unknowns (the paper's 0.05)."""
 
@@ -48,7 +50,7 @@ class FeatureStates:
         inputs = torch.cat([noisy, bits], dim=-1)
         log_density = context.prior.log_prob(features, context.expand_state(len(states)), inputs=inputs)
         contacts = self.contacts.expand(len(states), -1, -1)
-        return context.build_trial(features, contacts, noise=noise, log_density=log_density)
+        return context.build_trial(features, contacts, noise=noise, log_density=log_density, heel_plan=self.heel_plan)
 
     def warm_start(self, unknowns: Float[Tensor, "1 unknowns"]) -> Float[Tensor, "frames width"]:
         """Return the features by frame."""
@@ -75,7 +77,9 @@ class FeatureStateSolver:
         """Solve one window; the start stays where nothing finite is found."""
         meter = Meter(self.budget.within(request.seconds))
         features = _continue_features(request.context, request.warm_start)
-        states = FeatureStates(request.context, self.scale, self.centre, LAYOUT.pick(features, "contacts") > 0.5)
+        bits = LAYOUT.pick(features, "contacts") > 0.5
+        heels = request.context.plan_heels(features, bits)
+        states = FeatureStates(request.context, self.scale, self.centre, bits, heels)
         return minimise_window(states, request.terms, states.from_features(features), self.lbfgs, meter)
 
 

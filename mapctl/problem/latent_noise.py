@@ -26,6 +26,11 @@ class LatentNoise:
 
     prepared: PreparedRollout | None = None
     """Rollouts of as many candidates as the plan is for, where they are prepared already."""
+    heel_plan: Trial | None = None
+    """Motion whose poses say which heels are planted; None: see `holds_heels`."""
+    holds_heels: bool = False
+    """Whether the first trial that is built is the motion whose poses say which heels are planted; if not, each
+    candidate's own do."""
 
     @staticmethod
     def from_unknowns(context: WindowContext, unknowns: Float[Tensor, "batch unknowns"]) -> "LatentNoise":
@@ -37,7 +42,8 @@ class LatentNoise:
     def begin_search(context: WindowContext, start: Float[Tensor, "batch unknowns"]) -> "LatentNoise":
         """Plan like `from_unknowns`, for a search that evaluates the start first: its rollout is done only once."""
         noise = torch.unflatten(start.detach(), -1, (context.frames, LAYOUT.continuous))
-        return LatentNoise(context, *context.prior.plan_search(context.expand_state(len(noise)), noise))
+        planned = context.prior.plan_search(context.expand_state(len(noise)), noise)
+        return LatentNoise(context, *planned, holds_heels=True)
 
     @staticmethod
     def extend(warm_start: Float[Tensor, "ahead width"], frames: int) -> Float[Tensor, "1 unknowns"]:
@@ -52,7 +58,7 @@ class LatentNoise:
         noise = torch.unflatten(unknowns, -1, (context.frames, LAYOUT.continuous))
         plan = self._expand_plan(len(noise))
         features, log_density = context.prior.rollout(context.expand_state(len(noise)), noise, plan)
-        return context.build_trial(features, plan.contacts, noise=noise, log_density=log_density)
+        return self._hold_heels(context.build_trial(features, plan.contacts, noise=noise, log_density=log_density))
 
     def build_detached(self, unknowns: Float[Tensor, "batch unknowns"]) -> Trial | None:
         """See AdjointParametrisation."""
@@ -64,12 +70,12 @@ class LatentNoise:
         features, log_density = rollout.roll_out(noise)
         poses = fast.WorldPoses.compute(features, context.place, context.skeleton)
         trial = context.build_trial(features, contacts, noise=noise, log_density=log_density)
-        return replace(trial, world_poses=poses)
+        return self._hold_heels(replace(trial, world_poses=poses))
 
     def pull_back(self, trial: Trial, gradient: TrialGradient) -> Float[Tensor, "batch unknowns"]:
         """See AdjointParametrisation."""
         assert trial.world_poses is not None
-        on_world = (gradient.root_xz_world, gradient.heading, gradient.joints_world)
+        on_world = (gradient.root_xz_world, gradient.heading, gradient.joints_world, gradient.heels_world)
         d_features = gradient.features + trial.world_poses.pull_back(*on_world)
         rollout, _ = self._prepare(len(d_features))
         d_noise = rollout.pull_back(torch.as_tensor(d_features), torch.as_tensor(gradient.log_density))
@@ -87,6 +93,18 @@ class LatentNoise:
     def _prepared(self) -> dict[int, tuple[PreparedRollout, Bool[Tensor, "batch frames 2"]]]:
         rollout, contacts = self.prepared, self.plan.contacts
         return {} if rollout is None else {len(contacts): (rollout, contacts)}
+
+    def _hold_heels(self, trial: Trial) -> Trial:
+        """Let the planned motion say which heels are planted in a trial."""
+        if self.holds_heels and not self._held:
+            self._held.append(replace(trial, features=trial.features.detach(), noise=None, log_density=None))
+        plan = self._held[0] if self._held else self.heel_plan
+        return trial if plan is None else replace(trial, heel_plan=plan)
+
+    @cached_property
+    def _held(self) -> list[Trial]:
+        """The first trial that was built, where it says which heels are planted; without a gradient."""
+        return []
 
     def _expand_plan(self, batch: int) -> DiscreteChoices:
         return DiscreteChoices(

@@ -41,6 +41,12 @@ class PoseOffsets:
     """Sigma of the smoothing, frames."""
 
     @cached_property
+    def _heel_plan(self) -> Trial:
+        """The proposal, whose poses say which heels are planted."""
+        features = self.proposal.features(self.context.place, self.contacts)
+        return self.context.plan_heels(features[None], self.contacts[None])
+
+    @cached_property
     def _smoothing_matrix(self) -> Float[Tensor, "frames frames"]:
         return gaussian.unit_variance_matrix(len(self.sigma), self.smooth, self.sigma.dtype)
 
@@ -54,7 +60,9 @@ class PoseOffsets:
         if not isinstance(self.context.density, DensityEnsemble):
             log_density = self.context.density.log_prob(features, self.context.expand_state(len(white)))
         contacts = self.contacts.expand(len(white), -1, -1)
-        return self.context.build_trial(features, contacts, noise=white, log_density=log_density)
+        return self.context.build_trial(
+            features, contacts, noise=white, log_density=log_density, heel_plan=self._heel_plan
+        )
 
     def warm_start(self, unknowns: Float[Tensor, "1 unknowns"]) -> Float[Tensor, "frames width"]:
         """Return the white offsets by frame, in sigmas."""

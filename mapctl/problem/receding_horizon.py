@@ -22,6 +22,7 @@ from mapctl.problem.window_solvers import LatentNoiseSolver, SingleWindowSolver,
 from mapctl.protocols import AnyDensity, DensityState
 from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.terms.base import Term
+from mapctl.terms.trial import Trial
 
 TermsOf = Callable[[int, int], Sequence[Term]]
 """(first frame, number of frames) of a window to its terms."""
@@ -89,6 +90,15 @@ class CommittedFrames:
         if not len(self.features):
             return torch.zeros(2, dtype=torch.bool)
         return LAYOUT.pick(self.features[-1], "contacts") > 0.5
+
+    def locate_heels(self, skeleton: Skeleton) -> Float[Tensor, "past 2 3"]:
+        """Return the world positions of the heels in the last frame, metres; none before the first."""
+        if not (len(self.features) and len(self.joints_world)):
+            return torch.zeros(0, 2, 3)
+        last = self.features[-1:].clone()
+        last[:, : LAYOUT.slices["root_height"].start] = 0  # it is where the last step has led already
+        bits = LAYOUT.pick(last, "contacts") > 0.5
+        return Trial(last[None], self.place, contacts=bits[None], skeleton=skeleton).heels_world[0]
 
     def finite(self, count: int) -> bool:
         """Whether the last `count` frames and their energies are numbers."""
@@ -167,6 +177,7 @@ class RecedingHorizonSolver:
             self.skeleton,
             self.fps,
             contacts_before=committed.contacts,
+            heels_before=committed.locate_heels(self.skeleton),
             first_frame=committed.discarded + len(committed.features),
         )
         return self.method(WindowRequest(context, terms, committed.warm_start, generator, seconds))

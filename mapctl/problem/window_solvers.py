@@ -118,7 +118,8 @@ class GuidedNoiseSolver:
         plan, noise = context.prior.latents(self.guide.unsqueeze(0), context.prior_state)
         start = self.share * noise[0]
         start[: len(request.warm_start)] = request.warm_start[: len(start)]
-        unknowns = LatentNoise(context, plan)
+        heels = context.plan_heels(self.guide.unsqueeze(0), plan.contacts)
+        unknowns = LatentNoise(context, plan, heel_plan=heels)
         return minimise_window(unknowns, request.terms, start.flatten().unsqueeze(0), self.lbfgs, meter)
 
 

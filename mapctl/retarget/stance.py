@@ -111,6 +111,14 @@ class Stance:
         return replace(rigmap, tpose_quat_xyzw=tpose, skeleton=_rotate_bones(rigmap.skeleton, turns))
 
 
+def level_feet(clip: Motion) -> Motion:
+    """Return the same movement (canonical joints) with joint frames of feet and toes that are aligned with the world
+    while the foot is flat on the floor, as the clip shows it (see `Stance.of`); no joint moves."""
+    toes = clip.joint_positions()[:, _side_joints("Toes")]
+    tilt = _estimate_tilt(clip, _detect_flat_feet(clip, contacts.detect_contacts(toes, clip.fps)))
+    return _rotate_foot_frames(clip, rotations.from_rotation_vector(_about_x(-tilt)))
+
+
 def _side_joints(part: str) -> list[int]:
     return [CANONICAL.index(side + part) for side in SIDES]
 

@@ -1,20 +1,38 @@
-"""Foot contact: planted feet do not move and are on the ground (Wang et al. 2019, Eq. 18)."""
+"""Foot contact: planted toes and heels do not move and are on the ground (Wang et al. 2019, Eq. 18)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Float
+import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mapctl.skeleton import TOE_REST_HEIGHT
+from mapctl.skeleton import TOE_REST_HEIGHT, find_heel_drops
 from mapctl.terms.adjoints import kernels
 from mapctl.terms.adjoints.gradient import TrialGradient
 from mapctl.terms.trial import Trial
 
 
 @dataclass(frozen=True)
+class HeelSigmas:
+    """How far planted heels may be from resting: mocap's own move and sink more than its toes."""
+
+    speed: float = 0.1
+    """Standard deviation of the horizontal speed of a planted heel, m/s. Half of it holds heels better still, but toes,
+    paths and jitter pay for that (docs/heels.md)."""
+    height: float = 0.02
+    """Standard deviation of the height of a planted heel about its rest height, metres."""
+    below: float = 0.01
+    """Standard deviation of the depth of any heel below its rest height, metres."""
+    doubt: float = 4.0
+    """Energy of a planted heel, nats, from which on it counts less and less: a foot may roll off earlier than the plan
+    from which its contacts come, as where a command changes."""
+
+
+@dataclass(frozen=True)
 class FootContact:
-    """A toe whose contact bit is set does not travel and is at its rest height; no toe goes below it."""
+    """A toe whose contact bit is set does not travel and is at its rest height, nor does a heel while the foot is flat;
+    none goes below it."""
 
     sigma_speed: float = 0.03
     """Standard deviation of the horizontal speed of a planted toe, m/s."""
@@ -22,40 +40,84 @@ class FootContact:
     """Standard deviation of the height of a planted toe about its rest height, metres."""
     sigma_below: float = 0.005
     """Standard deviation of the depth of any toe below its rest height, metres."""
+    heels: HeelSigmas | None = field(default_factory=HeelSigmas)
+    """Sigmas of the heels; None leaves them out. They are planted by the toes' contacts and the planned pose."""
     rest_height: float = TOE_REST_HEIGHT
     """Height of the toe joint while the foot is flat on the ground, metres."""
     name: str = "footing"
     unit: str = "m/s"
 
+    def with_sigmas(self, speed: float, height: float, below: float) -> "FootContact":
+        """Return the term with these sigmas of toes, m/s and metres; those of heels change in proportion."""
+        heels = self.heels and replace(
+            self.heels,
+            speed=self.heels.speed * speed / self.sigma_speed,
+            height=self.heels.height * height / self.sigma_height,
+            below=self.heels.below * below / self.sigma_below,
+        )
+        return replace(self, sigma_speed=speed, sigma_height=height, sigma_below=below, heels=heels)
+
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Energies of both toes, nats."""
-        energy = 0.5 * (self._planted(trial) * (trial.toe_speeds / self.sigma_speed).square()).sum(-1)
+        """Energies of both feet, nats."""
         above = trial.toe_heights - self.rest_height
-        energy = energy + 0.5 * (trial.contacts * (above / self.sigma_height).square()).sum(-1)
-        return energy + 0.5 * (above.clamp(max=0) / self.sigma_below).square().sum(-1)
+        held = _hold(trial.planted, trial.toe_speeds / self.sigma_speed, above / self.sigma_height)
+        energy = (held + 0.5 * (above.clamp(max=0) / self.sigma_below).square()).sum(-1)
+        if self.heels is None:
+            return energy
+        drops = trial.features.new_tensor(find_heel_drops(trial.skeleton))
+        above = trial.heels_world[..., 1] - (self.rest_height - drops)
+        held = _hold(trial.heels_planted, trial.heel_speeds / self.heels.speed, above / self.heels.height)
+        held = self.heels.doubt * torch.log1p(held / self.heels.doubt)
+        return energy + (held + 0.5 * (above.clamp(max=0) / self.heels.below).square()).sum(-1)
 
     def add_gradient(self, trial: Trial, gradient: TrialGradient) -> Float[np.ndarray, "batch frames"]:
         """See DifferentiatedTerm."""
-        energy = np.empty(gradient.log_density.shape)
-        kernels.add_foot_contact(
+        energy = np.zeros(gradient.log_density.shape)
+        kernels.add_contact(
             trial.joints_world.numpy(),
             trial.last_before.numpy(),
-            trial.contacts.numpy(),
-            trial.contacts_before.expand(len(energy), 2).numpy(),
+            trial.planted.numpy(),
             trial.toes,
             float(trial.fps),
             (self.sigma_speed, self.sigma_height, self.sigma_below),
-            self.rest_height,
+            (self.rest_height, self.rest_height),
+            0.0,
             energy,
             gradient.joints_world,
         )
+        if self.heels is not None:
+            left, right = find_heel_drops(trial.skeleton)
+            kernels.add_contact(
+                trial.heels_world.numpy(),
+                trial.heels_before[-1:].to(trial.features.dtype).numpy(),
+                trial.heels_planted.numpy(),
+                (0, 1),
+                float(trial.fps),
+                (self.heels.speed, self.heels.height, self.heels.below),
+                (self.rest_height - left, self.rest_height - right),
+                float(self.heels.doubt),
+                energy,
+                gradient.heels_world,
+            )
         return energy
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Horizontal speed of the faster planted toe, m/s; 0 where none is planted."""
-        return (self._planted(trial) * trial.toe_speeds).amax(-1)
+        """Horizontal speed of the fastest planted toe or heel, m/s; 0 where none is planted."""
+        fastest = (_stays(trial.planted) * trial.toe_speeds).amax(-1)
+        if self.heels is None:
+            return fastest
+        return fastest.maximum((_stays(trial.heels_planted) * trial.heel_speeds).amax(-1))
 
-    def _planted(self, trial: Trial) -> Float[Tensor, "batch frames 2"]:
-        """1 where a toe is planted in a frame and in the one before it, be that before the window; else 0."""
-        planted = trial.planted
-        return (planted[:, 1:] & planted[:, :-1]).to(trial.features.dtype)
+
+def _hold(
+    planted: Bool[Tensor, "batch steps 2"],
+    speeds: Float[Tensor, "batch frames 2"],
+    above: Float[Tensor, "batch frames 2"],
+) -> Float[Tensor, "batch frames 2"]:
+    """Energies of planted points by their speeds and their heights over the floor, in sigmas."""
+    return 0.5 * (_stays(planted) * speeds.square() + planted[:, 1:].to(above.dtype) * above.square())
+
+
+def _stays(planted: Bool[Tensor, "batch steps 2"]) -> Bool[Tensor, "batch frames 2"]:
+    """True where a point is planted in a frame and in the one before it, be that before the window."""
+    return planted[:, 1:] & planted[:, :-1]

@@ -7,11 +7,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from mapctl.contacts.heels import derive_heel_contacts
 from mapctl.errors import MapctlError
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, integrate_root
 from mapctl.kinematics import fast
 from mapctl.pose import BodyPose
-from mapctl.skeleton import CANONICAL, TOES, Skeleton
+from mapctl.skeleton import CANONICAL, TOES, Skeleton, find_heel_drops
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +35,13 @@ class Trial:
     """World joint positions of the last frames before the window, metres, oldest first; the same for all."""
     contacts_before: Bool[Tensor, "*batch 2"] = field(default_factory=lambda: torch.zeros(2, dtype=torch.bool))
     """Left and right toe planted in the frame before the window; unbatched or with the batch's shape."""
+    heels_before: Float[Tensor, "known 2 3"] = field(default_factory=lambda: torch.zeros(0, 2, 3))
+    """World positions of the left and the right heel in the frame before the window, metres; none without a past."""
+    heel_contacts: Bool[Tensor, "batch steps 2"] | None = None
+    """Left and right heel planted in the frame before the window and in each of its frames; None: by `heel_plan`."""
+    heel_plan: "Trial | None" = None
+    """Trial of one candidate, or of as many, whose poses say which heels are planted, so that they do not change during
+    a solve; None: these very poses do."""
     skeleton: Skeleton = CANONICAL
     """Bones of the character."""
     fps: float = float(PRIOR_FPS)
@@ -97,24 +105,55 @@ class Trial:
         in_place = BodyPose.of_features_in_place(self.features)
         return replace(in_place, root_position=root, heading=self.heading)
 
-    @cached_property
+    @property
     def joints_world(self) -> Float[Tensor, "batch frames joints 3"]:
         """World joint positions, metres, by forward kinematics of the whole body."""
+        return self._points[0]
+
+    @property
+    def heels_world(self) -> Float[Tensor, "batch frames 2 3"]:
+        """World positions of the left and the right heel (see `skeleton.find_heels`), metres."""
+        return self._points[1]
+
+    @cached_property
+    def _points(self) -> tuple[Tensor, Tensor]:
         if self.world_poses is not None:
-            return self.world_poses.joints_world
+            return self.world_poses.joints_world, self.world_poses.heels_world
         if self._use_kernels:
-            return fast.compute_joints_world(self.features, self.root_xz_world, self.heading, self.skeleton)
-        return self.pose.joints_world(self.skeleton)
+            return fast.compute_joints_and_heels(self.features, self.root_xz_world, self.heading, self.skeleton)
+        return self.pose.joints_and_heels(self.skeleton)
 
     def joint_world(self, name: str) -> Float[Tensor, "batch frames 3"]:
         """World positions of one joint, metres."""
         return self.joints_world[..., self.skeleton.index(name), :]
 
-    @property
+    @cached_property
     def planted(self) -> Bool[Tensor, "batch steps 2"]:
         """Left and right toe planted in the frame before the window and in each of its frames."""
         past = self.contacts_before.to(self.contacts.device).expand(len(self.contacts), 2).unsqueeze(1)
         return torch.cat([past, self.contacts], dim=1)
+
+    @cached_property
+    def heels_planted(self) -> Bool[Tensor, "batch steps 2"]:
+        """Left and right heel planted in the frame before the window and in each of its frames; no gradient."""
+        if self.heel_contacts is not None:
+            return self.heel_contacts
+        if self.heel_plan is not None:
+            return self.heel_plan.heels_planted.expand(len(self.features), -1, -1).contiguous()
+        return self._derive_heel_contacts()
+
+    def _derive_heel_contacts(self) -> Bool[Tensor, "batch steps 2"]:
+        toes, heels = self.joints_world.detach()[..., self.skeleton.indices(TOES), :], self.heels_world.detach()
+        known = len(self.before) > 0 and len(self.heels_before) > 0
+        if known:
+            past = torch.stack([self.last_before[0, self.skeleton.indices(TOES)], self.heels_before[-1].to(heels)])
+            toes, heels = (
+                torch.cat([was.expand(len(now), 1, 2, 3), now], dim=1)
+                for was, now in zip(past, (toes, heels), strict=True)
+            )
+        drops = heels.new_tensor(find_heel_drops(self.skeleton))
+        planted = derive_heel_contacts(self.planted[:, 0 if known else 1 :], toes, heels, drops, self.fps)
+        return planted if known else torch.cat([torch.zeros_like(planted[:, :1]), planted], dim=1)
 
     @cached_property
     def last_before(self) -> Float[Tensor, "past joints 3"]:
@@ -133,11 +172,20 @@ class Trial:
         left, right = self.skeleton.indices(TOES)
         return left, right
 
-    @property
+    @cached_property
     def toe_speeds(self) -> Float[Tensor, "batch frames 2"]:
         """Speed of the left and the right toe over the ground since the frame before, m/s; its gradient exists at 0."""
-        steps = torch.stack([self.step(toe)[..., ::2] for toe in self.skeleton.indices(TOES)], dim=-2)
-        return torch.sqrt(steps.square().sum(-1) + 1e-12) * self.fps
+        return self._speed(torch.stack([self.step(toe) for toe in self.skeleton.indices(TOES)], dim=-2))
+
+    @cached_property
+    def heel_speeds(self) -> Float[Tensor, "batch frames 2"]:
+        """Speed of the left and the right heel over the ground since the frame before, m/s, likewise."""
+        heels = self.heels_world
+        past = self.heels_before[-1:].to(heels.dtype) if len(self.heels_before) else heels[:, :1].detach()
+        return self._speed(torch.diff(heels, dim=-3, prepend=past.expand(len(heels), 1, 2, 3)))
+
+    def _speed(self, steps: Float[Tensor, "batch frames 2 3"]) -> Float[Tensor, "batch frames 2"]:
+        return torch.sqrt(steps[..., ::2].square().sum(-1) + 1e-12) * self.fps
 
     @property
     def toe_heights(self) -> Float[Tensor, "batch frames 2"]:

@@ -141,11 +141,15 @@ def test_the_view_of_a_trial_at_another_size_is_to_scale():
 
     from catalogue import trial
 
-    small = replace(trial(2, dtype=torch.float64), skeleton=character.unit_skeleton)
+    small = replace(trial(2, dtype=torch.float64), skeleton=character.unit_skeleton, heel_contacts=None)
     character.term(Look())(small)
     (large,) = seen
     torch.testing.assert_close(large.joints_world, character.scale * small.joints_world)
     torch.testing.assert_close(large.before, character.scale * small.before)
+    torch.testing.assert_close(large.heels_world, character.scale * small.heels_world)
+    torch.testing.assert_close(large.heels_before, character.scale * small.heels_before)
+    assert torch.equal(large.heels_planted, small.heels_planted)
+    assert 0 < int(small.heels_planted.sum()) < small.heels_planted.numel()
 
 
 @dataclass(frozen=True)

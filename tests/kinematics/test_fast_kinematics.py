@@ -83,7 +83,7 @@ def body_of(whole):
 
 
 def everything_of(whole):
-    return torch.cat([root_of(whole), whole.joints_world.flatten(2)], dim=-1)
+    return torch.cat([root_of(whole), whole.joints_world.flatten(2), whole.heels_world.flatten(2)], dim=-1)
 
 
 PARTS = (root_of, body_of, everything_of)
@@ -162,7 +162,7 @@ def test_gradients_are_those_of_finite_differences():
 
 
 def test_the_body_is_left_alone_while_only_the_root_is_asked_for(monkeypatch):
-    monkeypatch.setattr(fast, "compute_joints_world", None)
+    monkeypatch.setattr(fast, "compute_joints_and_heels", None)
     whole = trial()
     assert TERMS["path of the hips"](whole).shape == (3, FRAMES)
     with pytest.raises(TypeError):

@@ -1,17 +1,21 @@
 """Measures against the design's definitions written out anew, and on motions whose measures are known."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from helpers import walk_through
+from helpers import walk, walk_through
 
 from mapctl import curves
+from mapctl.contacts import detect_contacts
+from mapctl.contacts.heels import derive_heel_contacts
 from mapctl.errors import MapctlError, RequestError
 from mapctl.metrics import body, compute_reference, feet, measure, path
 from mapctl.numerics.gaussian import gaussian_kernel, low_pass
-from mapctl.skeleton import CANONICAL
+from mapctl.retarget.stance import Stance
+from mapctl.skeleton import CANONICAL, find_heel_drops
 
 IDENTITY = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
 TOES = [CANONICAL.index("leftToes"), CANONICAL.index("rightToes")]
@@ -206,3 +210,62 @@ def test_what_cannot_be_measured_is_refused():
         measure(straight(1))
     with pytest.raises(MapctlError, match="tail"):
         measure(straight(90), curves.line(length=3.0), joint="tail")
+
+
+def test_heels_are_measured_by_their_definition():
+    clip = walk(120, turn_rate=0.6)
+    got, heels = measure(clip), feet.locate_heels(feet.level_feet(clip))
+    toes = clip.joint_positions()[:, TOES]
+    drops = torch.tensor(find_heel_drops(feet.level_feet(clip).skeleton))
+    planted = derive_heel_contacts(detect_contacts(toes, 30), toes, heels, drops, 30.0).numpy()
+    places, forward = heels[..., ::2].numpy(), (toes - heels)[..., ::2].numpy()
+    speeds, turns, slides = [], [], []
+    for side in range(2):
+        start = None
+        for t in range(120):
+            if not planted[t, side]:
+                start = None
+                continue
+            start = places[t, side] if start is None else start
+            slides.append(np.hypot(*(places[t, side] - start)))
+            if t and planted[t - 1, side]:
+                speeds.append(np.hypot(*(places[t, side] - places[t - 1, side])) * 30)
+                was, now = (math.atan2(*forward[k, side]) for k in (t - 1, t))
+                turns.append(abs(math.remainder(now - was, 2 * math.pi)) * 30)
+    assert got["heel_contact_speed_cm_s"] == pytest.approx(100 * np.mean(speeds))
+    assert got["heel_slide_max_cm"] == pytest.approx(100 * max(slides))
+    assert got["foot_turn_deg_s"] == pytest.approx(math.degrees(np.mean(turns)))
+    assert got["heel_planted_share"] == pytest.approx(planted[1:].mean())
+    assert 0.1 < got["heel_planted_share"] < 0.8
+    assert got["foot_turn_deg_s"] > 5
+
+
+def test_a_tilted_t_pose_moves_no_heel():
+    clip = walk(120)
+    tilted = Stance(torch.zeros(2), torch.zeros(2), torch.full((2, 2), 0.2).double()).restore_foot_tilt(clip)
+    got, wanted = measure(tilted), measure(clip)
+    for name in ("heel_contact_speed_cm_s", "heel_planted_share", "heel_slide_max_cm"):
+        assert got[name] == pytest.approx(wanted[name], rel=1e-3), name
+
+
+def test_a_clip_that_never_stands_and_an_unknown_rig_have_no_heels():
+    names = ("heel_contact_speed_cm_s", "heel_slide_max_cm", "foot_turn_deg_s")
+    flying = walk(40)
+    flying.root_position[:, 1] += torch.linspace(0, 8, 40).double()
+    assert all(math.isnan(measure(flying)[name]) for name in names)
+    clip = walk(40)
+    foreign = replace(clip, skeleton=replace(clip.skeleton, names=("pelvis", *clip.skeleton.names[1:])))
+    assert all(math.isnan(measure(foreign)[name]) for name in (*names, "heel_planted_share"))
+
+
+def test_derived_heels_are_counted_beside_detected_ones():
+    clip = walk(90)
+    toes, heels = clip.joint_positions()[:, TOES], feet.locate_heels(feet.level_feet(clip))
+    drops = torch.tensor(find_heel_drops(feet.level_feet(clip).skeleton))
+    derived = derive_heel_contacts(detect_contacts(toes, 30), toes, heels, drops, 30.0)
+    detected = detect_contacts(heels, 30)
+    counts = feet.count_derived_heels(clip)
+    for row, found in enumerate((~detected, detected)):
+        for column, made in enumerate((~derived, derived)):
+            assert int(counts[row, column]) == int((found & made).sum())
+    assert int(counts[1, 1]) > 10 * int(counts[0, 1] + counts[1, 0]) > 0

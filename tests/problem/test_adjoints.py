@@ -31,7 +31,8 @@ def pulled(term, whole):
     gradient = TrialGradient.zeros(whole)
     poses = WorldPoses.compute(whole.features, whole.start, whole.skeleton)
     energy = term.add_gradient(replace(whole, world_poses=poses), gradient)
-    on_features = gradient.features + poses.pull_back(gradient.root_xz_world, gradient.heading, gradient.joints_world)
+    on_world = (gradient.root_xz_world, gradient.heading, gradient.joints_world, gradient.heels_world)
+    on_features = gradient.features + poses.pull_back(*on_world)
     return energy, (on_features, gradient.noise, gradient.log_density)
 
 
@@ -101,6 +102,7 @@ def context(density):
 SETS = {
     "steering": ("noise", "travel, facing", "steps", "footing"),
     "following": ("noise", "path of the hips", "footing"),
+    "heels": ("noise", "footing of heels"),
     "with others": ("noise", "likelihood", "clear of a disc and a box", "path of a hand", "seam"),
 }
 

@@ -9,8 +9,12 @@ import torch
 from helpers import corpus, generator, tiny_density
 from tiny_horizon import ARCS, BEGUN, CURVE, DENSITY, METHOD, SHORT, context, request, solver, terms_of
 
+from mapctl import rotations
 from mapctl.errors import RequestError
-from mapctl.features import LAYOUT, integrate_root
+from mapctl.features import LAYOUT, GroundPose, integrate_root
+from mapctl.kinematics import heading
+from mapctl.metrics.feet import locate_heels
+from mapctl.pose import decode
 from mapctl.problem.feature_states import FeatureStateSolver
 from mapctl.problem.latent_noise import LatentNoise
 from mapctl.problem.objective import Objective
@@ -18,10 +22,13 @@ from mapctl.problem.receding_horizon import HorizonSettings, replay
 from mapctl.problem.solution import Outcome
 from mapctl.problem.warm_start import BestOfSamples, SteeringKnots, SwarmProposal
 from mapctl.problem.window_solvers import LatentNoiseSolver
+from mapctl.skeleton import CANONICAL, FEET
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings
 from mapctl.solver.swarm import SwarmSettings
-from mapctl.terms import LatentPrior, Likelihood
+from mapctl.terms import FootContact, LatentPrior, Likelihood
+from mapctl.terms.foot_contact import HeelSigmas
+from mapctl.terms.trial import Trial
 
 
 def solve(frames=20, *, method=METHOD, density=DENSITY, seed=0, **limits):
@@ -250,3 +257,48 @@ def test_a_replay_goes_on_from_a_state_or_from_the_likeliest():
     on = replay(DENSITY, features, part, since=12)
     for name in ("last_frame", "hidden", "cell"):
         torch.testing.assert_close(getattr(on, name), getattr(whole, name))
+
+
+def test_a_window_knows_the_heels_of_the_frame_before():
+    done, _ = solve(11)
+    (heels,) = done.locate_heels(CANONICAL)
+    last = decode(done.features, GroundPose.origin())
+    feet = last.skeleton.indices(FEET)
+    wanted = locate_heels(last)[-1] - last.joint_positions()[-1, feet]
+    turn = done.place.heading.double() - heading(last.local_quat_xyzw[-1, 0])
+    wanted = rotations.rotate(rotations.about_y(turn).expand(2, 4), wanted)
+    torch.testing.assert_close(heels.double() - done.joints_world[-1, feet].double(), wanted, atol=1e-5, rtol=0)
+    assert len(replace(done, features=done.features[:0]).locate_heels(CANONICAL)) == 0
+    assert len(replace(done, joints_world=done.joints_world[:0]).locate_heels(CANONICAL)) == 0
+
+
+def test_heels_that_no_term_asks_for_are_not_derived(monkeypatch):
+    derived = []
+    monkeypatch.setattr(Trial, "_derive_heel_contacts", lambda trial: derived.append(trial) or trial.planted)
+    for heels, times in ((None, 0), (HeelSigmas(), 1)):
+        terms = [*terms_of(1, SHORT.frames)[:2], FootContact(heels=heels)]
+        solver(replace(METHOD, rounds=1)).solve_window(BEGUN, terms, SHORT.frames, generator=generator(0))
+        assert len(derived) == times
+
+
+@pytest.mark.parametrize("method", [METHOD, METHODS["states"]], ids=["latents", "states"])
+def test_a_windows_heel_contacts_are_fixed_while_it_is_solved(method):
+    seen: list[Trial] = []
+
+    class Look(LatentPrior):
+        def __call__(self, trial):
+            seen.append(trial)
+            return super().__call__(trial)
+
+        def add_gradient(self, trial, gradient):
+            seen.append(trial)
+            return super().add_gradient(trial, gradient)
+
+    once = replace(METHOD, rounds=1) if method is METHOD else method
+    solver(once).solve_window(BEGUN, [Look(), *terms_of(1, SHORT.frames)[1:]], SHORT.frames, generator=generator(0))
+    assert len(seen) > 3
+    assert len({tuple(trial.heels_planted.flatten().tolist()) for trial in seen}) == 1
+    first = replace(seen[0], heel_plan=None)
+    assert torch.equal(first.heels_planted, seen[-1].heels_planted)
+    assert any(not torch.equal(replace(trial, heel_plan=None).heels_planted, first.heels_planted) for trial in seen)
+    assert all(trial.heel_plan is not None and len(trial.heels_before) == 1 for trial in seen)

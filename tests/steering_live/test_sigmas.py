@@ -1,6 +1,7 @@
 """Slow motion and sigmas that change while a character moves: the time, the settings, and the steps."""
 
 import math
+from dataclasses import replace
 
 import pytest
 from tiny_steering import QUICK, begun
@@ -50,6 +51,17 @@ def test_every_sigma_reaches_its_term_and_no_other():
         assert found == {other.name: other.default * (1 + (other.name == one.name)) for other in ranges}
         assert one.low < one.default < one.high
     assert change_sigmas(QUICK, {}) == QUICK
+
+
+def test_sigmas_of_heels_change_with_those_of_toes():
+    heels = QUICK.footing.heels
+    assert heels is not None
+    for name, part in (("foot speed", "speed"), ("foot height", "height"), ("foot below", "below")):
+        default = next(one.default for one in describe_sigmas(QUICK) if one.name == name)
+        changed = change_sigmas(QUICK, {name: 3 * default}).footing
+        assert vars(changed.heels) == pytest.approx(vars(heels) | {part: 3 * getattr(heels, part)})
+    without = replace(QUICK, footing=replace(QUICK.footing, heels=None))
+    assert change_sigmas(without, {"foot speed": 0.1}).footing.heels is None
 
 
 def sway(sigmas) -> tuple[float, float]:

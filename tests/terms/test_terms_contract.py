@@ -9,11 +9,14 @@ from catalogue import FRAMES, PAST, TERMS, moved_curve, trial
 from helpers import generator, walk
 
 from mapctl import terms
+from mapctl.contacts.heels import derive_heel_contacts
 from mapctl.curves import line
 from mapctl.features import LAYOUT, GroundPose, encode
+from mapctl.metrics.feet import locate_heels
 from mapctl.rotations import rotate_ground
-from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT
+from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, TOES
 from mapctl.terms import FootContact, Jerk, LatentPrior, Likelihood, Path
+from mapctl.terms.foot_contact import HeelSigmas
 
 each_term = pytest.mark.parametrize("name", TERMS)
 EXACT = pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -21,8 +24,9 @@ EXACT = pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 
 def rows(whole, picked):
     """The trial of some candidates."""
-    parts = ("features", "noise", "log_density", "contacts")
-    return replace(whole, **{part: getattr(whole, part)[picked] for part in parts})
+    names = ("features", "noise", "log_density", "contacts", "heel_contacts")
+    parts = {name: getattr(whole, name) for name in names}
+    return replace(whole, **{name: None if values is None else values[picked] for name, values in parts.items()})
 
 
 def test_the_catalogue_has_every_term():
@@ -136,9 +140,11 @@ def test_moving_the_whole_scene_changes_nothing(name, turn):
     place = GroundPose(
         rotate_ground(here.start.position_xz, angle) + torch.tensor(shift).double(), here.start.heading + turn
     )
-    before = here.before.clone()
-    before[..., ::2] = rotate_ground(before[..., ::2], angle.expand(before.shape[:-1])) + torch.tensor(shift).double()
-    there = replace(here, start=place, before=before)
+    before, heels = here.before.clone(), here.heels_before.clone()
+    for points in (before, heels):
+        turned = rotate_ground(points[..., ::2], angle.expand(points.shape[:-1]))
+        points[..., ::2] = turned + torch.tensor(shift).double()
+    there = replace(here, start=place, before=before, heels_before=heels)
     names = {field.name for field in fields(term)}
     if "curve" in names:
         term = replace(term, curve=moved_curve(term.curve, turn, shift))
@@ -209,22 +215,78 @@ def test_a_planted_toe_pays_for_speed_and_height_as_its_sigmas_say():
     speed = (places[1:, :, ::2] - places[:-1, :, ::2]).norm(dim=-1) * 30
     above = places[1:, :, 1] - TOE_REST_HEIGHT
     expected = 0.5 * ((speed / 0.03) ** 2 + (above / 0.01) ** 2 + (above.clamp(max=0) / 0.005) ** 2).sum(-1)
-    torch.testing.assert_close(FootContact()(resting)[0], expected, rtol=1e-4, atol=1e-4)
-    torch.testing.assert_close(FootContact().residual(resting)[0], speed.amax(-1), rtol=1e-4, atol=1e-5)
+    term = FootContact(heels=None)
+    torch.testing.assert_close(term(resting)[0], expected, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(term.residual(resting)[0], speed.amax(-1), rtol=1e-4, atol=1e-5)
     free = replace(whole, contacts=~planted)
-    assert float(FootContact().residual(free).abs().max()) == 0
-    assert float(FootContact()(free).max()) < float(FootContact()(resting).min()) + 1e-6
+    assert float(term.residual(free).abs().max()) == 0
+    assert float(term(free).max()) < float(term(resting).min()) + 1e-6
+
+
+@pytest.mark.parametrize("past", [0, PAST])
+def test_a_planted_heel_pays_for_speed_and_height_as_its_sigmas_say(past):
+    whole = trial(1, disturbed=0.0, past=past)
+    planted = torch.ones_like(whole.heel_contacts)
+    resting = replace(whole, heel_contacts=planted)
+    term, toes = FootContact(heels=HeelSigmas(0.2, 0.05, 0.02)), FootContact(heels=None)
+    heels = locate_heels(walk(PAST + FRAMES, turn_rate=0.2))
+    places = heels[PAST - 1 :] if past else heels[[PAST, *range(PAST, PAST + FRAMES)]]
+    torch.testing.assert_close(whole.heels_world[0], places[1:], atol=1e-9, rtol=0)
+    speed = (places[1:, :, ::2] - places[:-1, :, ::2]).norm(dim=-1) * 30
+    above = places[1:, :, 1] - (TOE_REST_HEIGHT - 0.0201)
+    held = 4 * torch.log1p(0.5 * ((speed / 0.2) ** 2 + (above / 0.05) ** 2) / 4)
+    expected = (held + 0.5 * (above.clamp(max=0) / 0.02) ** 2).sum(-1)
+    torch.testing.assert_close((term(resting) - toes(resting))[0], expected, rtol=1e-4, atol=1e-4)
+    residual = torch.maximum(toes.residual(resting)[0], speed.amax(-1))
+    torch.testing.assert_close(term.residual(resting)[0], residual, rtol=1e-4, atol=1e-4)
+    free = replace(whole, heel_contacts=~planted)
+    assert bool((term(free) - toes(free) < expected).all())
+
+
+def test_sigmas_of_heels_keep_their_proportion_to_those_of_toes():
+    term = FootContact(0.03, 0.01, 0.005, heels=HeelSigmas(0.05, 0.02, 0.01, doubt=3.0))
+    assert term.with_sigmas(0.06, 0.04, 0.0025).heels == HeelSigmas(0.1, 0.08, 0.005, doubt=3.0)
+    assert replace(term, heels=None).with_sigmas(0.06, 0.04, 0.0025) == FootContact(0.06, 0.04, 0.0025, heels=None)
+
+
+def test_another_motion_may_say_which_heels_are_planted():
+    whole = replace(trial(3, disturbed=0.0), heel_contacts=None)
+    raised = whole.features.clone()
+    raised[..., LAYOUT.slices["root_height"]] += 0.2
+    raised = replace(whole, features=raised)
+    assert torch.equal(raised.heels_planted[:, 1:], whole.heels_planted[:, 1:])
+    tilted = whole.features.clone()
+    tilted[..., LAYOUT.slices["root_tilt"]] += 0.5
+    tilted = replace(whole, features=tilted)
+    assert not torch.equal(tilted.heels_planted, whole.heels_planted)
+    assert torch.equal(replace(tilted, heel_plan=whole).heels_planted, whole.heels_planted)
+    alone = replace(tilted, heel_plan=rows(whole, slice(1))).heels_planted
+    assert torch.equal(alone, whole.heels_planted[:1].expand_as(alone))
+
+
+def test_heel_contacts_come_from_the_toes_and_the_pose():
+    whole = replace(trial(2, disturbed=0.0), heel_contacts=None)
+    motion = walk(PAST + FRAMES, turn_rate=0.2)
+    toes = motion.joint_positions()[PAST - 1 :, motion.skeleton.indices(TOES)].expand(2, -1, -1, -1)
+    heels, drops = locate_heels(motion)[PAST - 1 :].expand(2, -1, -1, -1), torch.tensor([0.0201, 0.0201]).double()
+    wanted = derive_heel_contacts(whole.planted, toes, heels, drops, 30.0)
+    assert bool(wanted.any())
+    assert torch.equal(whole.heels_planted, wanted)
+    unknown = replace(whole, before=whole.before[:0])
+    assert not unknown.heels_planted[:, 0].any()
+    assert torch.equal(unknown.heels_planted[:, 1:], wanted[:, 1:])
 
 
 def test_a_toe_that_lands_as_the_window_begins_is_not_held_by_its_swing():
     whole = trial(2, disturbed=0.0)
     both, left = torch.ones_like(whole.contacts), torch.tensor([[True, False], [False, False]])
     landing = replace(whole, contacts=both, contacts_before=torch.zeros(2, dtype=torch.bool))
-    assert float(FootContact().residual(landing)[:, 0].max()) == 0
-    standing = FootContact().residual(replace(landing, contacts_before=left))
+    term = FootContact(heels=None)
+    assert float(term.residual(landing)[:, 0].max()) == 0
+    standing = term.residual(replace(landing, contacts_before=left))
     assert float(standing[0, 0]) > 0
     assert float(standing[1, 0]) == 0
-    torch.testing.assert_close(standing[:, 1:], FootContact().residual(landing)[:, 1:])
+    torch.testing.assert_close(standing[:, 1:], term.residual(landing)[:, 1:])
 
 
 def test_the_seam_sees_a_jump_at_its_start_and_nothing_beyond():

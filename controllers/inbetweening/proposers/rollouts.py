@@ -49,7 +49,7 @@ class RolloutSettings:
     ahead: int = 15
     """Frames after a gap that are rolled with it, of which the known ones are targets too."""
     footing: FootContact = field(
-        default_factory=lambda: FootContact(sigma_speed=0.1, sigma_height=0.05, sigma_below=0.05)
+        default_factory=lambda: FootContact(sigma_speed=0.1, sigma_height=0.05, sigma_below=0.05, heels=None)
     )
     """Contact term."""
     shortest: int = 2

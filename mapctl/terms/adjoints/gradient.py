@@ -26,10 +26,12 @@ class TrialGradient:
     """(batch, frames): on the heading of the hips, likewise."""
     joints_world: Array
     """(batch, frames, joints, 3): on the world joint positions."""
+    heels_world: Array
+    """(batch, frames, 2, 3): on the world positions of the heels."""
 
     @staticmethod
     def zeros(trial: Trial) -> "TrialGradient":
         """Zeros for a trial that has noise."""
         batch, frames, size = trial.features.shape
-        shapes = ((size,), trial.require_noise().shape[2:], (), (2,), (), (trial.skeleton.num_joints, 3))
+        shapes = ((size,), trial.require_noise().shape[2:], (), (2,), (), (trial.skeleton.num_joints, 3), (2, 3))
         return TrialGradient(*(np.zeros((batch, frames, *shape), np.float32) for shape in shapes))

@@ -42,29 +42,36 @@ def step_of(joints, before, b, t, joint, k):
 
 
 @entry
-def add_foot_contact(joints, before, contacts, contacts_before, toes, fps, sigmas, rest_height, energy, d_joints):
-    """Planted toes rest and are on the ground, none is below it. `before` (0 or 1, joints, 3) is the last frame before
-    the window; `sigmas` are speed, height and depth."""
+def add_contact(points, before, planted, pair, fps, sigmas, rest_heights, doubt, energy, d_points):
+    """Two planted points rest and are on the ground, neither is below it; added to the energies. `before` (0 or 1,
+    points, 3) is the last frame before the window, `planted` (batch, 1 + frames, 2) begins there; `pair` are their
+    columns, `sigmas` are speed, height and depth. From `doubt` nats on a contact counts less and less; 0 for never."""
     travel, height = (fps / sigmas[0]) ** 2, 1.0 / sigmas[1] ** 2
     below = 1.0 / sigmas[2] ** 2
-    for b in range(len(joints)):
-        for t in range(joints.shape[1]):
-            total = 0.0
+    for b in range(len(points)):
+        for t in range(points.shape[1]):
             for side in range(2):
-                toe, planted = toes[side], contacts[b, t, side]
-                above = np.float64(joints[b, t, toe, 1]) - rest_height
-                weight = (height if planted else 0.0) + (below if above < 0.0 else 0.0)
-                total += weight * above * above
-                d_joints[b, t, toe, 1] += weight * above
-                if planted and (contacts[b, t - 1, side] if t > 0 else contacts_before[b, side]):
-                    x, z = step_of(joints, before, b, t, toe, 0), step_of(joints, before, b, t, toe, 2)
-                    total += travel * (x * x + z * z + 1e-12)
-                    d_joints[b, t, toe, 0] += travel * x
-                    d_joints[b, t, toe, 2] += travel * z
-                    if t > 0:
-                        d_joints[b, t - 1, toe, 0] -= travel * x
-                        d_joints[b, t - 1, toe, 2] -= travel * z
-            energy[b, t] = 0.5 * total
+                point = pair[side]
+                above = np.float64(points[b, t, point, 1]) - rest_heights[side]
+                if above < 0.0:
+                    energy[b, t] += 0.5 * below * above * above
+                    d_points[b, t, point, 1] += below * above
+                if not planted[b, t + 1, side]:
+                    continue
+                stays, x, z = planted[b, t, side], 0.0, 0.0
+                held = 0.5 * height * above * above
+                if stays:
+                    x, z = step_of(points, before, b, t, point, 0), step_of(points, before, b, t, point, 2)
+                    held += 0.5 * travel * (x * x + z * z + 1e-12)
+                share = doubt / (doubt + held) if doubt > 0.0 else 1.0
+                energy[b, t] += doubt * math.log1p(held / doubt) if doubt > 0.0 else held
+                d_points[b, t, point, 1] += share * height * above
+                x, z = share * travel * x, share * travel * z
+                d_points[b, t, point, 0] += x
+                d_points[b, t, point, 2] += z
+                if t > 0:
+                    d_points[b, t - 1, point, 0] -= x
+                    d_points[b, t - 1, point, 2] -= z
 
 
 @entry
