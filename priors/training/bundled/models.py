@@ -50,7 +50,9 @@ class Clips:
     window: int = TrainingSettings.window
     """Frames of the windows of densities: short ones where runs are short."""
     width: int = 256
-    """Of the densities' networks; the live one's is five eighths of it."""
+    """Of the densities' networks."""
+    live_width: int = 160
+    """Of the network of the density for live control. One of 120, trained on a few minutes, could not be steered."""
     flat: bool = True
     """Whether runs of the densities end where their curve is flat. Of a few minutes the likelihood of unseen
     clips rises long after a density has become too narrow to be steered: the steps are then told beforehand."""
@@ -136,13 +138,13 @@ def _make_models(clips: Clips) -> tuple[BundledModel, ...]:
     density_end = {"until_flat": UntilFlat() if clips.flat else None}
     general = {**everything, **density_end, "match": clips.match}  # which a density's command always tells
     walks: dict[str, Any] = {**general, "match": clips.locomotion, "labels": clips.labels}
-    live = clips.width * 5 // 8
     return (
         BundledModel(
             "locomotion", DensityRecipe(**walks, **_density(clips, width=clips.width, steps=clips.plan(10_000)))
         ),
         BundledModel(
-            "locomotion-live", DensityRecipe(**walks, **_density(clips, width=live, steps=clips.plan(10_000)))
+            "locomotion-live",
+            DensityRecipe(**walks, **_density(clips, width=clips.live_width, steps=clips.plan(10_000))),
         ),
         BundledModel(
             "general", DensityRecipe(**general, **_density(clips, width=clips.width, steps=clips.plan(12_000)))
