@@ -94,11 +94,15 @@ def load_inbetweener(
 def find_inbetweener_kind(name: str) -> str:
     """The kind of a bundled or trained in-betweener, from its card: `pose-transformer`, `infiller`, `tweener` or
     `stitcher`; CheckpointError for anything else."""
-    found = checkpoints.locate(name)
-    kind = checkpoints.read_card(found.with_suffix(".json")).kind
+    kind = find_kind(name)
     if kind not in (*_INBETWEENERS, "tweener"):
-        raise CheckpointError(f"{found}: a {kind} is no in-betweener")
+        raise CheckpointError(f"{checkpoints.locate(name)}: a {kind} is no in-betweener")
     return kind
+
+
+def find_kind(name: str) -> str:
+    """The kind of a bundled or trained model, from its card, as `mapctl train` calls it."""
+    return checkpoints.read_card(checkpoints.locate(name).with_suffix(".json")).kind
 
 
 def load_transformer(name: str = "transformer") -> "PoseTransformer":

@@ -48,6 +48,7 @@ class GenerationBenchmarkSettings:
 @dataclass(frozen=True)
 class _Variant:
     name: str
+    prior: Density
     refiner: Refiner | None
     foot_cleanup: FootCleanupSettings | None
 
@@ -57,8 +58,12 @@ def benchmark_generation(
     refiner: Refiner | None,
     mocap: Sequence[Motion],
     settings: GenerationBenchmarkSettings | None = None,
+    *,
+    densities: Mapping[str, Density] | None = None,
+    refiners: Mapping[str, Refiner] | None = None,
 ) -> list[Row]:
-    """Measure a row for mocap and one for each variant, walks and runs apart, then both together.
+    """Measure a row for mocap and one for each variant, walks and runs apart, then both together; other densities, and
+    other refiners of the prior, are variants by their names.
 
     `mocap` is canonical motion held out from training. RequestError where it holds no walk or no run.
     """
@@ -71,8 +76,8 @@ def benchmark_generation(
         for kind, clips in kinds.items()
     ]
     spread = measure_gait_spread(mocap)
-    for variant in _list_variants(refiner):
-        clips, cost = _generate_clips(prior, variant, settings)
+    for variant in _list_variants(prior, refiner, densities or {}, refiners or {}):
+        clips, cost = _generate_clips(variant, settings)
         for kind, kind_clips in _split_by_kind(clips, settings).items():
             rows.append(
                 {"motion": kind, "variant": variant.name, "clips": len(kind_clips), **_mean_measures(kind_clips)}
@@ -84,41 +89,45 @@ def benchmark_generation(
                 "clips": len(clips),
                 "ms_per_frame": cost,
                 **_measure_realism(clips, mocap, settings),
-                **_measure_diversity(prior, variant, settings),
+                **_measure_diversity(variant, settings),
                 **_compare_gait_spreads(clips, spread),
             }
         )
     return rows
 
 
-def _list_variants(refiner: Refiner | None) -> list[_Variant]:
-    variants = [_Variant("density", None, None), _Variant("density, footing", None, FootCleanupSettings())]
-    if refiner is not None:
-        variants.append(_Variant("density, refiner", refiner, None))
-        variants.append(_Variant("density, refiner, footing", refiner, FootCleanupSettings()))
-    return variants
+def _list_variants(
+    prior: Density, refiner: Refiner | None, densities: Mapping[str, Density], refiners: Mapping[str, Refiner]
+) -> list[_Variant]:
+    """Each density, and the prior with each refiner, without and with footing."""
+    ours: dict[str, Refiner | None] = {"density": None}
+    ours |= {} if refiner is None else {"density, refiner": refiner}
+    ours |= {f"density, {name}": each for name, each in refiners.items()}
+    made = [(name, prior, each) for name, each in ours.items()]
+    made += [(name, each, None) for name, each in densities.items()]
+    return [
+        _Variant(f"{name}{suffix}", density, each, footing)
+        for name, density, each in made
+        for suffix, footing in (("", None), (", footing", FootCleanupSettings()))
+    ]
 
 
-def _generate_clips(
-    prior: Density, variant: _Variant, settings: GenerationBenchmarkSettings
-) -> tuple[list[Motion], float]:
+def _generate_clips(variant: _Variant, settings: GenerationBenchmarkSettings) -> tuple[list[Motion], float]:
     """Generate clips, and measure milliseconds of processor time a frame."""
     variant_settings, clips = GenerateSettings(foot_cleanup=variant.foot_cleanup), []
-    starts = sample_stratified_starts(prior, settings.count, torch.Generator().manual_seed(settings.seed))
+    starts = sample_stratified_starts(variant.prior, settings.count, torch.Generator().manual_seed(settings.seed))
     began = time.process_time()
     for number, start in enumerate(starts):
         own = replace(variant_settings, start=start)
-        clips.append(_generate_clip(prior, variant, own, settings.seconds, settings.seed + number))
+        clips.append(_generate_clip(variant, own, settings.seconds, settings.seed + number))
     spent = time.process_time() - began
     return clips, 1000 * spent / sum(clip.num_frames for clip in clips)
 
 
-def _generate_clip(
-    prior: Density, variant: _Variant, variant_settings: GenerateSettings, seconds: float, seed: int
-) -> Motion:
+def _generate_clip(variant: _Variant, variant_settings: GenerateSettings, seconds: float, seed: int) -> Motion:
     generator = torch.Generator().manual_seed(seed)
     return generate(
-        prior, seconds=seconds, generator=generator, settings=variant_settings, refiner=variant.refiner
+        variant.prior, seconds=seconds, generator=generator, settings=variant_settings, refiner=variant.refiner
     ).motion
 
 
@@ -127,13 +136,13 @@ def _compare_gait_spreads(clips: Sequence[Motion], data: Mapping[str, GaitSpread
     return {f"{name}_spread": ratio for name, ratio in spread_ratios(measure_gait_spread(clips), data).items()}
 
 
-def _measure_diversity(prior: Density, variant: _Variant, settings: GenerationBenchmarkSettings) -> Row:
+def _measure_diversity(variant: _Variant, settings: GenerationBenchmarkSettings) -> Row:
     """Measure the average pairwise distance of samples from one initial state, mean over a few."""
-    found = []
-    for start in range(0, len(prior.initial_states.speed), max(1, len(prior.initial_states.speed) // 4)):
+    found, starts = [], len(variant.prior.initial_states.speed)
+    for start in range(0, starts, max(1, starts // 4)):
         variant_settings = replace(GenerateSettings(foot_cleanup=variant.foot_cleanup), start=start)
         samples = [
-            _generate_clip(prior, variant, variant_settings, settings.sample_seconds, settings.seed + k)
+            _generate_clip(variant, variant_settings, settings.sample_seconds, settings.seed + k)
             for k in range(settings.samples_per_start)
         ]
         found.append(measure_diversity(samples).root_aligned_cm)

@@ -21,17 +21,20 @@ from mapctl.recording import Capture, CaptureProposal, fill_missing
 from mapctl.skeleton import CANONICAL
 from priors import checkpoints
 from priors.config import NetworkConfig
+from priors.denoiser import plain
 
 _NON_ROOT_JOINTS = CANONICAL.num_joints - 1
 _ANGLE_CHANNELS = 2 + 3 * _NON_ROOT_JOINTS  # tilt and rotation vectors
 _INPUT_CHANNELS = 2 * _ANGLE_CHANNELS + 2 + 1 + 6 + 3 + 2 * (CANONICAL.num_joints + 1)
+_OBSERVED_CHANNELS = _ANGLE_CHANNELS + 2 + 3 + 3 + 2 * (CANONICAL.num_joints + 1)  # as they are alone
 _WORLD_CHANNELS = 2 * (6 + 3) * CANONICAL.num_joints  # world rotations and places, observed and smoothed
-_OUTPUT_CHANNELS = _ANGLE_CHANNELS + 1 + 3 + 2
+_OUTPUT_BLOCKS = (_ANGLE_CHANNELS, 1, 3, 2)  # angles, turn, place beside the slow one, contacts
 
 _SMOOTHING_SIGMA, _REFERENCE_SIGMA = 2.0, 6.0  # frames, sigma: of the proposal's start, and of the frame of reference
 _NEGLIGIBLE_SIGMA, _NEGLIGIBLE_SIGMA_ROOT = 0.0044, 0.001  # radians and metres: noise that is as often true motion
-# One unit of inputs and of outputs, about their standard deviation: radians, metres, metres a frame.
-_ANGLE_UNIT, _POSITION_UNIT, _VELOCITY_UNIT = 0.3, 0.02, 0.05
+ANGLE_UNIT, POSITION_UNIT = 0.3, 0.02
+"""One unit of inputs and of outputs, about their standard deviation: radians, metres."""
+_VELOCITY_UNIT = 0.05  # metres a frame
 _HIPS_HEIGHT = 0.85  # metres: height of the canonical skeleton's hips while it walks
 _CHUNK_FRAMES, _MARGIN_FRAMES = 512, 64  # frames cleaned at once, and beside them
 
@@ -49,38 +52,54 @@ class DenoiserConfig(NetworkConfig):
     sees_world: bool = True
     """Whether joints' world rotations and places are inputs beside their angles: noise of places, which makes a joint's
     angles err against its parent's, is independent there, and feet that slide can be seen."""
+    plain: bool = False
+    """Whether it is the plain peer (see priors.denoiser.plain), of which the width alone is told here: it sees what was
+    observed, neither smoothed nor in the world, and what it adds does not fade with the noise."""
 
     def __post_init__(self):
         if self.width < 1 or self.kernel < 1 or self.kernel % 2 == 0 or min(self.dilations, default=0) < 1:
             raise RequestError(f"a denoiser needs a positive width, an odd kernel and positive dilations, got {self}")
+        if self.plain and self.width % plain.HEADS:
+            raise RequestError(f"the width of a plain denoiser must be a multiple of {plain.HEADS}, got {self.width}")
 
 
 class DenoiserNetwork(nn.Module):
-    """Capture in, proposal out; untrained, it smooths."""
+    """Capture in, proposal out; untrained, it smooths, or changes nothing where it is plain."""
 
     def __init__(self, config: DenoiserConfig, *, bfloat16: bool = False):
         """Compute convolutions in bfloat16 if so asked; what they are given and give back is not."""
         super().__init__()
         self.config, self.reduced_precision = config, bfloat16
-        channels = _INPUT_CHANNELS + (_WORLD_CHANNELS if config.sees_world else 0)
-        self.first = nn.Conv1d(channels, config.width, config.kernel, padding=config.kernel // 2)
-        self.blocks = nn.ModuleList(
-            _ResidualBlock(config.width, config.kernel, dilation) for dilation in config.dilations
-        )
-        self.last = nn.Linear(config.width, _OUTPUT_CHANNELS)
+        if config.plain:
+            self.plain = plain.PlainLayers(_OBSERVED_CHANNELS, config.width)
+        else:
+            channels = _INPUT_CHANNELS + (_WORLD_CHANNELS if config.sees_world else 0)
+            self.first = nn.Conv1d(channels, config.width, config.kernel, padding=config.kernel // 2)
+            self.blocks = nn.ModuleList(
+                _ResidualBlock(config.width, config.kernel, dilation) for dilation in config.dilations
+            )
+        self.last = nn.Linear(config.width, sum(_OUTPUT_BLOCKS))
         nn.init.zeros_(self.last.weight)
         nn.init.zeros_(self.last.bias)
 
     def forward(self, capture: Capture) -> CaptureProposal:
         """Propose a motion, frames that were not observed at all included."""
-        view = _CaptureView(capture)
-        inputs = view.inputs(sees_world=self.config.sees_world).transpose(1, 2)
+        view, config = _CaptureView(capture), self.config
+        inputs = view.observed() if config.plain else view.inputs(sees_world=config.sees_world)
         with torch.autocast(inputs.device.type, torch.bfloat16, enabled=self.reduced_precision):
-            hidden = self.first(inputs)
-            for block in self.blocks:
-                hidden = block(hidden)
-            change = self.last(hidden.transpose(1, 2))
-        return view.changed(change.to(inputs.dtype))
+            change = self.last(self.plain(inputs) if config.plain else self._convolve(inputs)).to(inputs.dtype)
+        return view.added(change) if config.plain else view.changed(change)
+
+    @property
+    def piece_frames(self) -> tuple[int, int]:
+        """Frames of a long capture that are cleaned at once, and beside them."""
+        return (plain.PIECE_FRAMES, plain.MARGIN_FRAMES) if self.config.plain else (_CHUNK_FRAMES, _MARGIN_FRAMES)
+
+    def _convolve(self, inputs: Float[Tensor, "batch frames inputs"]) -> Float[Tensor, "batch frames width"]:
+        hidden = self.first(inputs.transpose(1, 2))
+        for block in self.blocks:
+            hidden = block(hidden)
+        return hidden.transpose(1, 2)
 
 
 class _ResidualBlock(nn.Module):
@@ -125,29 +144,42 @@ class _CaptureView:
         self.off = rotations.rotate_about_y(root - self.slow_root, -self.slow_heading)
 
     def inputs(self, *, sees_world: bool) -> Float[Tensor, "batch frames inputs"]:
-        """Encode the capture in units of about one."""
-        capture = self.capture
-        rate = _difference_frames(self.slow_heading[..., None])
-        way = rotations.rotate_about_y(_difference_frames(self.slow_root), -self.slow_heading)
-        level = torch.log(torch.cat([capture.sigma, 3 * capture.sigma_root[:, None]], dim=-1).clamp_min(0.001)) + 3
-        known = torch.cat([capture.seen, capture.seen_root[..., None]], dim=-1)
+        """Encode the capture, and the same smoothed, in units of about one."""
+        rate, *way = self._slow_way()
         return torch.cat(
             [
-                self.angles / _ANGLE_UNIT,
-                _smooth(self.angles, _SMOOTHING_SIGMA) / _ANGLE_UNIT,
-                self.turn / _ANGLE_UNIT,
-                _smooth(self.turn, _SMOOTHING_SIGMA) / _ANGLE_UNIT,
-                rate / _VELOCITY_UNIT,
-                self.off / _POSITION_UNIT,
-                _smooth(self.off, _SMOOTHING_SIGMA) / _POSITION_UNIT,
-                way[..., ::2] / _VELOCITY_UNIT,
-                (self.slow_root[..., 1:2] - _HIPS_HEIGHT) / _ANGLE_UNIT,
-                known.to(self.angles),
-                level[:, None].expand(-1, capture.frames, -1),
+                self.angles / ANGLE_UNIT,
+                _smooth(self.angles, _SMOOTHING_SIGMA) / ANGLE_UNIT,
+                self.turn / ANGLE_UNIT,
+                _smooth(self.turn, _SMOOTHING_SIGMA) / ANGLE_UNIT,
+                rate,
+                self.off / POSITION_UNIT,
+                _smooth(self.off, _SMOOTHING_SIGMA) / POSITION_UNIT,
+                *way,
+                *self._certainty(),
                 *(self._world() if sees_world else ()),
             ],
             dim=-1,
         )
+
+    def observed(self) -> Float[Tensor, "batch frames inputs"]:
+        """Encode the capture as it is in units of about one."""
+        own = (self.angles / ANGLE_UNIT, self.turn / ANGLE_UNIT, self.off / POSITION_UNIT)
+        return torch.cat([*own, *self._slow_way(), *self._certainty()], dim=-1)
+
+    def _slow_way(self) -> list[Float[Tensor, "batch frames inputs"]]:
+        """Encode how the slow frame of the hips turns and travels, and its height."""
+        rate = _difference_frames(self.slow_heading[..., None])
+        way = rotations.rotate_about_y(_difference_frames(self.slow_root), -self.slow_heading)
+        height = (self.slow_root[..., 1:2] - _HIPS_HEIGHT) / ANGLE_UNIT
+        return [rate / _VELOCITY_UNIT, way[..., ::2] / _VELOCITY_UNIT, height]
+
+    def _certainty(self) -> list[Float[Tensor, "batch frames inputs"]]:
+        """Encode what was observed, and the sigmas of its noise."""
+        capture = self.capture
+        level = torch.log(torch.cat([capture.sigma, 3 * capture.sigma_root[:, None]], dim=-1).clamp_min(0.001)) + 3
+        known = torch.cat([capture.seen, capture.seen_root[..., None]], dim=-1)
+        return [known.to(self.angles), level[:, None].expand(-1, capture.frames, -1)]
 
     def _world(self) -> list[Float[Tensor, "batch frames inputs"]]:
         """Encode the world rotations and places of all joints in the slow frame of the hips."""
@@ -158,19 +190,29 @@ class _CaptureView:
         matrices = torch.cat([hips[..., None, :, :], others], dim=-3)
         places, world = kinematics.chain_matrices(CANONICAL.offsets.to(matrices), CANONICAL.parents, matrices)
         six, places = rotations.to_six(world).flatten(-2), (places + self.off[..., None, :]).flatten(-2)
-        both = torch.cat([six, places / _ANGLE_UNIT], dim=-1)
+        both = torch.cat([six, places / ANGLE_UNIT], dim=-1)
         return [both, _smooth(both, _SMOOTHING_SIGMA)]
 
     def changed(self, change: Float[Tensor, "batch frames outputs"]) -> CaptureProposal:
         """Apply a change to the smoothed observation, as far as noise or gaps allow one."""
-        angles, turn, off, contacts = change.split([_ANGLE_CHANNELS, 1, 3, 2], dim=-1)
+        angles, turn, off, contacts = change.split(_OUTPUT_BLOCKS, dim=-1)
         # What was not observed is on a straight line already: it is smoothed as far as what it lies between is noisy.
         smoother = _smooth(self.angles, _SMOOTHING_SIGMA) - self.angles
-        angles = self.angles + self.angle_noise * smoother + self.angle_noise_share * _ANGLE_UNIT * angles
+        angles = self.angles + self.angle_noise * smoother + self.angle_noise_share * ANGLE_UNIT * angles
         turn = self.turn + self.noise_share[..., :1] * (
-            _smooth(self.turn, _SMOOTHING_SIGMA) - self.turn + _ANGLE_UNIT * turn
+            _smooth(self.turn, _SMOOTHING_SIGMA) - self.turn + ANGLE_UNIT * turn
         )
-        off = self.off + self.root_noise_share * (_smooth(self.off, _SMOOTHING_SIGMA) - self.off + _POSITION_UNIT * off)
+        off = self.off + self.root_noise_share * (_smooth(self.off, _SMOOTHING_SIGMA) - self.off + POSITION_UNIT * off)
+        return self._propose(angles, turn, off, contacts)
+
+    def added(self, change: Float[Tensor, "batch frames outputs"]) -> CaptureProposal:
+        """Add a change to the observation, whatever its noise."""
+        angles, turn, off, contacts = change.split(_OUTPUT_BLOCKS, dim=-1)
+        return self._propose(
+            self.angles + ANGLE_UNIT * angles, self.turn + ANGLE_UNIT * turn, self.off + POSITION_UNIT * off, contacts
+        )
+
+    def _propose(self, angles: Tensor, turn: Tensor, off: Tensor, contacts: Tensor) -> CaptureProposal:
         root = self.slow_root + rotations.rotate_about_y(off, self.slow_heading)
         packed = torch.cat([root, (self.slow_heading + turn[..., 0])[..., None], angles], dim=-1)
         return CaptureProposal(BodyPose.unpack(packed), contacts)
@@ -205,12 +247,12 @@ class ConvDenoiser:
 
     def clean(self, capture: Capture) -> CaptureProposal:
         """Propose the motion of a capture of any length, piece by piece, each with a margin that it shares."""
-        pieces = []
-        for start in range(0, capture.frames, _CHUNK_FRAMES):
-            first, stop = max(0, start - _MARGIN_FRAMES), min(capture.frames, start + _CHUNK_FRAMES + _MARGIN_FRAMES)
+        pieces, (count, margin) = [], self.network.piece_frames
+        for start in range(0, capture.frames, count):
+            first, stop = max(0, start - margin), min(capture.frames, start + count + margin)
             with torch.no_grad():
                 cleaned = self.network(capture.slice(first, stop))
-            kept = slice(start - first, start - first + _CHUNK_FRAMES)
+            kept = slice(start - first, start - first + count)
             pieces.append([value[:, kept] for value in (cleaned.pose.pack(), cleaned.contact_logits)])
         packed, contacts = (torch.cat(values, dim=1) for values in zip(*pieces, strict=True))
         pose = BodyPose.unpack(packed)
@@ -221,6 +263,7 @@ class ConvDenoiser:
 def load(name: str) -> ConvDenoiser:
     """Load the bundled denoiser by name, or one by its file or run folder; CheckpointError if there is none."""
     with checkpoints.open_checkpoint(name, "denoiser") as (tensors, card):
-        network = DenoiserNetwork(DenoiserConfig.of_card({"sees_world": False} | card.config))  # as older cards say
+        # Older cards do not tell what was not there yet; what is left out takes its default.
+        network = DenoiserNetwork(DenoiserConfig.of_card({"sees_world": False} | card.config))
         network.load_state_dict(tensors)
     return ConvDenoiser(name, network.eval().requires_grad_(False), card)

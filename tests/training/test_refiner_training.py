@@ -18,8 +18,8 @@ from priors.training.adversaries.end_effectors import Critic
 from priors.training.adversaries.history import HistoryBuffer
 from priors.training.corpus import Corpus
 from priors.training.moment_matching import moment_loss
-from priors.training.recipes import refiner as training
-from priors.training.recipes.refiner import REFINER_MOMENTS, AdversarialSettings, AdversarialTrainer
+from priors.training.recipes.refiner import AdversarialSettings, AdversarialTrainer
+from priors.training.recipes.refining.samples import REFINER_MOMENTS, compute_root_error
 
 TINY = RefinerConfig(width=8, memory=6, lookahead=1, joints=("hips", "leftHand", "rightToes"))
 SHORT = {"rounds": 5, "window": 12, "batch": 4, "warm_up": 2, "head_start": 0, "critic_updates": 1, "history": 10}
@@ -100,7 +100,7 @@ def test_the_roots_distance_is_that_of_the_decoded_motions():
     hips = [decode(clip[0], GroundPose.origin()).root_position[:25] for clip in (before, after)]
     expected = float((hips[0] - hips[1]).square().sum(-1).mean())
     assert expected > 0.01
-    assert float(training._compute_root_error(before, after)) == pytest.approx(expected, rel=1e-4)
+    assert float(compute_root_error(before, after)) == pytest.approx(expected, rel=1e-4)
 
 
 def test_the_critic_follows_equation_10_on_as_many_captured_as_made():
@@ -232,7 +232,7 @@ def test_the_refiner_lowers_its_loss_and_keeps_the_roots_way_where_that_weighs_m
     losses = [trainer._refine() for _ in range(40)]
     raw = drawn_next(trainer, lambda: trainer._draw(trainer.raw))
     with torch.no_grad():
-        metres = float(training._compute_root_error(raw[:, 2:], trainer.refiner(raw)[0])) ** 0.5
+        metres = float(compute_root_error(raw[:, 2:], trainer.refiner(raw)[0])) ** 0.5
     if root:
         assert metres < 0.02
     else:

@@ -20,6 +20,14 @@ class Table(ModelCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
+class ComparedTable(Table):
+    """A table that other models of the same kind may be in."""
+
+    baselines: Annotated[str, arg(metavar="RUN,RUN,...")] = ""
+    """Other models of the kind to compare, bundled or trained; each row then names its model."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class PriorTable(Table):
     """A table of one density."""
 
@@ -63,14 +71,14 @@ class Ablation(PriorTable):
 
 
 @dataclass(frozen=True, kw_only=True)
-class FreeRun(PriorTable):
+class FreeRun(PriorTable, ComparedTable):
     """8 random motions of 10,000 frames beside the training data."""
 
     work = "mapctl.commands.bench.free_run"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Generation(PriorTable):
+class Generation(PriorTable, ComparedTable):
     """Raw, refined and finished motion beside mocap that training did not see."""
 
     work = "mapctl.commands.bench.generation"
@@ -81,10 +89,12 @@ class Generation(PriorTable):
     """Clips of 10 s to draw."""
     refiner: options.Name = "auto"
     """A bundled refiner, or the file or run folder of a trained one; auto is the prior's own."""
+    baselines: Annotated[str, arg(metavar="RUN,RUN,...")] = ""
+    """Other densities, and other refiners of this one, to compare, bundled or trained."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Steer(PriorTable):
+class Steer(PriorTable, ComparedTable):
     """Random commands: which are reached, and how soon; or places to reach in passing, and discs to walk round."""
 
     work = "mapctl.commands.bench.steer"
@@ -118,7 +128,7 @@ class Live(PriorTable):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Denoise(MocapTable):
+class Denoise(MocapTable, ComparedTable):
     """Clips that training did not see, corrupted in several ways, beside filters tuned on the truth."""
 
     work = "mapctl.commands.bench.denoise"
@@ -141,11 +151,12 @@ class Infill(MocapTable):
     """A trained infiller, its file or run folder, for the tables of Kaufmann et al. 2020; without one they are left
     out."""
     baselines: Annotated[str, arg(metavar="RUN,RUN,...")] = ""
-    """Other trained infillers for them, to compare as they are."""
+    """Other models to compare, bundled or trained: infillers in those tables, as they are, and other in-betweeners in
+    the tables by kind of clip."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Tween(MocapTable):
+class Tween(MocapTable, ComparedTable):
     """Clips that training did not see, of which keys are left, and such clips without their ends."""
 
     work = "mapctl.commands.bench.tween"
@@ -256,7 +267,7 @@ class Transitions(Table):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Shots(PriorTable):
+class Shots(PriorTable, ComparedTable):
     """Random shots of one to four wishes: how many hold, which are told not to, and how it looks beside plain walks; or
     walks round corners."""
 

@@ -2,11 +2,17 @@
 
 import priors
 from controllers.benchmarks.free_run import benchmark_free_run
+from controllers.benchmarks.shared.tables import Row
 from mapctl.commands.bench import FreeRun
+from mapctl.commands.bench.baselines import list_models, measure_each
 from mapctl.commands.bench.output import print_rows
 
 
 def run(table: FreeRun) -> int:
     """Measure and print."""
-    prior = priors.load(table.prior)
-    return print_rows(table, benchmark_free_run(prior, prior.card.quality["data"]))
+
+    def measure(name: str) -> list[Row]:
+        prior = priors.load(name)
+        return benchmark_free_run(prior, prior.card.quality["data"])
+
+    return print_rows(table, measure_each(list_models(table.prior, table.baselines), measure))

@@ -8,6 +8,7 @@ from controllers.benchmarks.lost_joints import benchmark_missing_joints
 from controllers.benchmarks.shared.held_out import load_canonical
 from controllers.benchmarks.shared.tables import Row
 from mapctl.commands.bench import Infill
+from mapctl.commands.bench.baselines import check_unseen, list_models, measure_each
 from mapctl.commands.bench.output import print_rows
 from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.errors import RequestError
@@ -16,23 +17,32 @@ from mapctl.motion import Motion
 
 def run(table: Infill) -> int:
     """Measure and print."""
-    network = priors.load_inbetweener(table.inbetweener)
-    kinds = load_canonical(table.data, network.card.data.get("held_out", {}), table.count)
-    rows = _compare_infillers(table, kinds)
-    by_kind = benchmark_infilling_by_kind(kinds, network)
-    return print_rows(table, [*rows, *by_kind, *benchmark_missing_joints(kinds, network)])
+    models = list_models(table.inbetweener, table.baselines)
+    infillers = [name for name in models[1:] if priors.find_inbetweener_kind(name) == "infiller"]
+    networks = {name: priors.load_inbetweener(name) for name in models if name not in infillers}
+    held_out = networks[table.inbetweener].card.data.get("held_out", {})
+    for name, network in networks.items():
+        check_unseen(name, network.card, held_out)
+    kinds = load_canonical(table.data, held_out, table.count)
+    rows = _compare_infillers(table, kinds, infillers)
+
+    def measure(name: str) -> list[Row]:
+        network = networks[name]
+        return [*benchmark_infilling_by_kind(kinds, network), *benchmark_missing_joints(kinds, network)]
+
+    return print_rows(table, [*rows, *measure_each(list(networks), measure)])
 
 
-def _compare_infillers(table: Infill, kinds: Mapping[str, Sequence[Motion]]) -> list[Row]:
+def _compare_infillers(table: Infill, kinds: Mapping[str, Sequence[Motion]], baselines: Sequence[str]) -> list[Row]:
     """Measure the tables of infillers, if there is one."""
     if table.infiller is None:
-        if table.baselines:
-            raise RequestError("--baselines are compared with an infiller; name it by --infiller")
+        if baselines:
+            raise RequestError("infillers are compared with an infiller; name it by --infiller")
         return []
     infiller = priors.load_infiller(table.infiller)
     ours = infiller.card.config["architecture"]
     networks = {ours: infiller}
-    for name in filter(None, table.baselines.split(",")):
+    for name in baselines:
         other = priors.load_infiller(name)
         architecture = other.card.config["architecture"]
         # Two of one kind differ by their names.

@@ -30,6 +30,7 @@ from controllers.inbetweening.proposers import (
     StitchedInbetweener,
 )
 from mapctl.commands.bench import Transitions
+from mapctl.commands.bench.baselines import check_unseen
 from mapctl.commands.bench.output import print_rows
 from mapctl.commands.shared import outputs
 from mapctl.commands.shared.progress_bar import show_progress
@@ -39,7 +40,6 @@ from mapctl.inbetweening.retrieval import MotionCollection
 from mapctl.motion import Motion
 from mapctl.pose import decode
 from mapctl.protocols import Inbetweener
-from priors.checkpoints import Card
 from priors.stitching.inbetweener import Stitcher
 from priors.training.corpus import read_corpus
 from priors.training.transition_statistics import compute_position_std
@@ -82,7 +82,7 @@ def run(table: Transitions) -> int:
         samplers["retrieval"] = draw_retrieved(collection)
     density = None if table.prior is None else priors.load(table.prior)
     if density is not None:
-        _check_unseen(str(table.prior), density.card, held_out)
+        check_unseen(str(table.prior), density.card, held_out)
     if density is not None:
         methods["rollouts"] = of_inbetweener(RolloutInbetweener([density], network), finish=False)
     with show_progress("transitions") as progress:
@@ -168,15 +168,5 @@ def _name_methods(name: str, inbetweener: Inbetweener, *, raw: bool) -> dict[str
 def _load_unseeing(name: str, held_out: Mapping[str, Sequence[str]]) -> Stitcher:
     """Load a stitcher that has not seen the clips that are measured."""
     stitcher = priors.load_stitcher(name)
-    _check_unseen(name, stitcher.card, held_out)
+    check_unseen(name, stitcher.card, held_out)
     return stitcher
-
-
-def _check_unseen(name: str, card: Card, held_out: Mapping[str, Sequence[str]]) -> None:
-    """RequestError where a model's training saw clips that are kept for measuring."""
-    own = {clip for clips in card.data.get("held_out", {}).values() for clip in clips}
-    seen = [clip for clips in held_out.values() for clip in clips if clip not in own]
-    if seen:
-        raise RequestError(
-            f"{name} was trained on {seen[0]}, which is kept for measuring; train it with that seed on the same files"
-        )

@@ -19,17 +19,21 @@ class TrainDenoiser(TunableOptions):
 
     width: options.MaybeCount = None
     """Channels of every layer."""
+    plain: bool = False
+    """The plainest network of the kind, to compare: attention over the frames as they are, squared errors; no dilated
+    convolutions, smoothed or world inputs, and changes that do not fade with the noise."""
 
     def recipe(self) -> "DenoiserRecipe":
         """The options as the trainer takes them; RequestError for numbers that make no sense."""
-        from priors.training.recipes.denoiser import DenoiserConfig, DenoiserRecipe, DenoiserSettings
+        from priors.training.recipes.denoiser import PLAIN, DenoiserConfig, DenoiserRecipe, DenoiserSettings
 
         common = self.common()
+        config, settings = PLAIN if self.plain else (DenoiserConfig(), DenoiserSettings())
         given = self.select_given("steps", "batch", "window", "seed", "learning_rate")
         return DenoiserRecipe(
             **common,
-            config=replace(DenoiserConfig(), **self.select_given("width")),
-            settings=replace(DenoiserSettings(), bfloat16=self.bfloat16, **given),
+            config=replace(config, **self.select_given("width")),
+            settings=replace(settings, bfloat16=self.bfloat16, **given),
             skip_first=self.skip_first,
             init=self.init,
         )

@@ -27,6 +27,9 @@ class TrainDensity(TunableOptions):
     """Gaussians in the mixture."""
     paper: bool = False
     """The paper's own network and recipe instead of the measured better one; other options still hold."""
+    plain: bool = False
+    """The plainest network of the kind, to compare: one Gaussian a frame with independent values, one level of noise on
+    the input that it is not told, no free runs held to the data."""
     labels: Annotated[str, arg(metavar="REGEX")] = ""
     """Named groups read labels from the clips' paths, as in '_(?P<gait>walk|run)_(?P<style>[a-z]+)_', for --style."""
     copies: options.Count = 0
@@ -43,15 +46,18 @@ class TrainDensity(TunableOptions):
         """The options as the trainer takes them; RequestError for numbers that make no sense."""
         from priors.lstm_gmm.network import LstmGmmConfig
         from priors.training.augmentation.clip_copies import ClipCopies
-        from priors.training.recipes.lstm_gmm import PAPER, DensityRecipe, TrainingSettings
+        from priors.training.recipes.lstm_gmm import PAPER, PLAIN, DensityRecipe, TrainingSettings
 
         common, shape = self.common(), self.select_given("width", "components")
-        if self.init is not None and (self.paper or shape):
+        if self.init is not None and (self.paper or self.plain or shape):
             raise RequestError(
-                "with --init the network is that prior's; --width, --components and --paper do not apply"
+                "with --init the network is that prior's; --width, --components, --paper and --plain do not apply"
             )
+        if self.paper and self.plain:
+            raise RequestError("--paper and --plain are two variants; choose one")
         copies = ClipCopies(self.copies, tempo=self.tempo, strides=self.strides)
-        config, settings = PAPER if self.paper else (LstmGmmConfig(), TrainingSettings())
+        usual = (LstmGmmConfig(), TrainingSettings())
+        config, settings = PAPER if self.paper else PLAIN if self.plain else usual
         given = self.select_given("steps", "batch", "window", "learning_rate", "seed")
         return DensityRecipe(
             **common,

@@ -7,9 +7,11 @@ from tyro.conf import arg
 
 from mapctl.commands.shared import options
 from mapctl.commands.train.options import NetworkOptions
+from mapctl.errors import RequestError
 
 if TYPE_CHECKING:
     from priors.training.recipes.refiner import RefinerRecipe
+    from priors.training.recipes.refining.plain import PlainRefinerRecipe
 
 
 @dataclass(frozen=True)
@@ -28,17 +30,22 @@ class TrainRefiner(NetworkOptions):
     """The prior whose samples it refines."""
     paper: bool = False
     """The paper's own network and recipe instead of the measured better one; other options still hold."""
+    plain: bool = False
+    """The plainest training of the kind, to compare: the same network without a critic, held to the feet, jerk and
+    spread of captured windows and to the hips' way alone."""
     skip_first: bool = False
     """Leave out frame 0 of every clip (the T-pose of CMU takes)."""
 
-    def recipe(self) -> "RefinerRecipe":
+    def recipe(self) -> "RefinerRecipe | PlainRefinerRecipe":
         """The options as the trainer takes them; RequestError for numbers that make no sense."""
         from priors.training.recipes.refiner import PAPER, AdversarialSettings, RefinerConfig, RefinerRecipe
+        from priors.training.recipes.refining.plain import PlainRefinerRecipe, PlainRefinerSettings
 
-        common = self.common()
+        if self.paper and self.plain:
+            raise RequestError("--paper and --plain are two variants; choose one")
+        shared = {**self.common(), "density": self.density, "skip_first": self.skip_first}
+        given = {"bfloat16": self.bfloat16, **self.select_given("batch", "window", "seed", rounds="steps")}
+        if self.plain:
+            return PlainRefinerRecipe(**shared, settings=PlainRefinerSettings(**given))
         config, settings = PAPER if self.paper else (RefinerConfig(), AdversarialSettings())
-        given = self.select_given("batch", "window", "seed", rounds="steps")
-        settings = replace(settings, bfloat16=self.bfloat16, **given)
-        return RefinerRecipe(
-            **common, config=config, settings=settings, density=self.density, skip_first=self.skip_first
-        )
+        return RefinerRecipe(**shared, config=config, settings=replace(settings, **given))

@@ -13,9 +13,10 @@ from mapctl import rotations
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT
 from mapctl.pose import BodyPose
+from mapctl.recording import Capture
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors.config import require_at_least
-from priors.denoiser.network import DenoiserConfig, DenoiserNetwork
+from priors.denoiser.network import ANGLE_UNIT, POSITION_UNIT, DenoiserConfig, DenoiserNetwork
 from priors.training.augmentation.corruption import CorruptionSettings, corrupt, make_clean_capture
 from priors.training.corpus import Corpus, Split
 from priors.training.recipe import NetworkRecipe, Row, average_logarithms
@@ -52,6 +53,8 @@ class DenoiserSettings:
     other ways."""
     corruption: CorruptionSettings = field(default_factory=CorruptionSettings)
     """How windows are spoilt."""
+    squared: bool = False
+    """Squared error of the angles and of the hips' place instead of errors in cm, beside the contacts."""
     bfloat16: bool = False
     """The network computes in bfloat16; weights and loss stay in float32."""
     seed: int = 1
@@ -61,6 +64,10 @@ class DenoiserSettings:
         require_at_least(self, 1, "steps", "batch")
         if self.window < 16:
             raise RequestError(f"window must be at least 16 frames, got {self.window}")
+
+
+PLAIN = (DenoiserConfig(plain=True), DenoiserSettings(squared=True))
+"""The plain peer, on the same windows, spoilt in the same ways."""
 
 
 class DenoiserTrainer(GradientTrainer[DenoiserNetwork]):
@@ -82,7 +89,8 @@ class DenoiserTrainer(GradientTrainer[DenoiserNetwork]):
         windows = draw_performers(
             self.windows, self.settings, self.generator, batch=self.group.share(self.settings.batch)
         )
-        return compute_denoiser_losses(self.network, windows, self.settings, self.generator)
+        compute = compute_squared_losses if self.settings.squared else compute_denoiser_losses
+        return compute(self.network, windows, self.settings, self.generator)
 
     def validate(self, corpus: Corpus) -> dict[str, Any]:
         """Measure the errors on 6 batches of held-out windows, corrupted identically each time."""
@@ -118,8 +126,9 @@ class DenoiserRecipe(NetworkRecipe[DenoiserConfig, DenoiserSettings, DenoiserTra
         return average_logarithms([row.get("loss")])
 
     def format_shape(self) -> list[str]:
-        """The width, if it is another than usual."""
-        return [] if self.config.width == DenoiserConfig.width else [f"--width {self.config.width}"]
+        """The width, if it is another than usual, and plainness."""
+        width = [] if self.config.width == DenoiserConfig.width else [f"--width {self.config.width}"]
+        return width + ["--plain"] * self.config.plain
 
 
 def draw_performers(
@@ -161,10 +170,9 @@ def compute_denoiser_losses(
     """The loss, and in plain units the errors it is made of."""
     clean = make_clean_capture(windows)
     cleaned = network(corrupt(clean, settings.corruption, generator))
-    angles = torch.cat([clean.tilt, clean.joints.flatten(2)], dim=-1)
+    angles = _pack_angles(clean)
     bits = LAYOUT.pick(windows, "contacts")
-    packed = torch.cat([clean.root, clean.heading[..., None], angles], dim=-1)
-    wanted, got = BodyPose.unpack(packed).joints_world(), cleaned.pose.joints_world()
+    wanted, got = BodyPose.unpack(_pack(clean)).joints_world(), cleaned.pose.joints_world()
     place = 100 * _smooth_norm(got - wanted).mean()
     slip = 100 * _smooth_norm(torch.diff(got - wanted, dim=1))
     planted = bits[:, 1:] * bits[:, :-1]
@@ -185,6 +193,28 @@ def compute_denoiser_losses(
         "angles_deg": torch.rad2deg(turned),
         "contacts_nats": contacts,
     }
+
+
+def compute_squared_losses(
+    network: DenoiserNetwork, windows: Tensor, settings: DenoiserSettings, generator: torch.Generator
+) -> dict[str, Tensor]:
+    """The plain loss: the mean squared error of all numbers of a pose in the network's own units, and the contacts'
+    cross entropy, nats."""
+    clean = make_clean_capture(windows)
+    cleaned = network(corrupt(clean, settings.corruption, generator))
+    error = cleaned.pose.pack() - _pack(clean)
+    squares = torch.cat([error[..., :3] / POSITION_UNIT, error[..., 3:] / ANGLE_UNIT], dim=-1).square().mean()
+    contacts = cross_entropy(cleaned.contact_logits.float(), LAYOUT.pick(windows, "contacts"))
+    return {"loss": squares + settings.contacts * contacts, "squares": squares, "contacts_nats": contacts}
+
+
+def _pack_angles(clean: Capture) -> Float[Tensor, "batch frames angles"]:
+    return torch.cat([clean.tilt, clean.joints.flatten(2)], dim=-1)
+
+
+def _pack(clean: Capture) -> Float[Tensor, "batch frames width"]:
+    """The pose of clean motion as BodyPose packs it."""
+    return torch.cat([clean.root, clean.heading[..., None], _pack_angles(clean)], dim=-1)
 
 
 def _smooth_norm(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:

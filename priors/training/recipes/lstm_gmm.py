@@ -5,7 +5,6 @@ comes from one generator whose state is in the checkpoint, so a resumed run cont
 """
 
 import math
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 
@@ -21,6 +20,7 @@ from priors.lstm_gmm.labels import Labels
 from priors.lstm_gmm.network import NOISE_UNIT, LstmGmm, LstmGmmConfig
 from priors.training.augmentation.clip_copies import ClipCopies, add_copies
 from priors.training.corpus import Corpus, Split
+from priors.training.devices import select_device
 from priors.training.gathering import describe_selection
 from priors.training.initial_states import measure_data_limits, select_initial_states
 from priors.training.mocap.holdings import measure_holdings
@@ -95,6 +95,12 @@ PAPER = (
     ),
 )
 """The variant as the paper prints it (30,000 iterations)."""
+
+PLAIN = (
+    LstmGmmConfig(components=1, correlated=False, knows_noise=False),
+    TrainingSettings(noise_range=1.0, bit_flips=0.0, matching=MatchingSettings(begin=1.0)),
+)
+"""The plain peer: one Gaussian a frame whose values are independent, one level of noise, and likelihood alone."""
 
 
 def compute_feature_statistics(features: Float[Tensor, "frames size"]) -> tuple[Tensor, Tensor]:
@@ -281,7 +287,7 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
 
     def check(self) -> None:
         """Before anything is read."""
-        device = _select_device(self.device)
+        device = select_device(self.device)
         if device == "cuda" and self.processes > 1 and count_launched() is None:
             raise RequestError(
                 "several processes on GPUs are started by torchrun, one a GPU: python -m torch.distributed.run"
@@ -292,7 +298,7 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
     def make_trainer(self, parts: Split) -> DensityTrainer:
         """Make the trainer of a new network for the clips' labels, or of the initial network with its own labels."""
         corpus = add_copies(parts.train, self.settings.copies, torch.Generator().manual_seed(self.settings.seed))
-        device, known = _select_device(self.device), labels.read(corpus.names, self.labels)
+        device, known = select_device(self.device), labels.read(corpus.names, self.labels)
         if self.init is None:
             config = replace(self.config, labels=known.names)
             return DensityTrainer(config, self.settings, corpus, device, labels=known)
@@ -369,26 +375,26 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
 
     def format_command(self) -> str:
         """What to type for the same run, for the card; options that are the defaults are left out."""
+        option, config, settings = self._find_variant()
         parts = [f"mapctl train lstm-gmm --data DATA -o RUN --match '{self.match or ''}'"]
         parts += [f"--labels '{self.labels}'"] if self.labels else []
         parts += [f"--init {self.init}"] if self.init else [f"--width {self.config.width}"]
+        mixed = self.init is None and self.config.components != config.components
+        parts += [f"--components {self.config.components}"] if mixed else []
         parts += self.format_reading() + ["--bfloat16"] * self.settings.bfloat16
-        parts += self.format_changed(TrainingSettings(), "steps", "batch", "window", "learning_rate", "seed")
+        parts += self.format_changed(settings, "steps", "batch", "window", "learning_rate", "seed")
         parts += self.settings.copies.format_options()
         parts += self.format_processes() + self.format_ending()
-        return " ".join(parts) + (" --paper" if self.config.retain == 0 else "")
+        return " ".join(parts + option)
+
+    def _find_variant(self) -> tuple[list[str], LstmGmmConfig, TrainingSettings]:
+        """The option of the variant that this is one of, and what the command takes with it alone."""
+        for option, (config, settings) in (("--paper", PAPER), ("--plain", PLAIN)):
+            shape = {"width": self.config.width, "components": self.config.components, "labels": self.config.labels}
+            if self.init is None and replace(config, **shape) == self.config:
+                return [option], config, settings
+        return [], LstmGmmConfig(), TrainingSettings()
 
 
 def _number(value: float | None) -> float:
     return math.nan if value is None else float(value)
-
-
-def _select_device(wanted: str) -> str:
-    if wanted not in ("auto", "cpu", "cuda"):
-        raise RequestError(f"device must be auto, cpu or cuda, got {wanted!r}")
-    if wanted == "cuda" and not torch.cuda.is_available():
-        raise RequestError("this machine has no CUDA device; use --device cpu")
-    local, devices = int(os.environ.get("LOCAL_RANK", "0")), torch.cuda.device_count()
-    if wanted != "cpu" and devices and count_launched() is not None and local >= devices:
-        raise RequestError(f"this machine has {devices} CUDA devices, too few for process {local}; use --device cpu")
-    return ("cuda" if torch.cuda.is_available() else "cpu") if wanted == "auto" else wanted

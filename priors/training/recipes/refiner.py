@@ -2,8 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Float
@@ -11,27 +10,20 @@ from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits as cross_entropy
 
 from mapctl.errors import RequestError
-from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, integrate_root
-from mapctl.metrics.realism import RealismSettings
 from priors.config import require_at_least
-from priors.lstm_gmm import density
-from priors.lstm_gmm.density import LstmGmmDensity
 from priors.refiner.network import RefinerConfig, RefinerNetwork
 from priors.training.adversaries.end_effectors import Critic
 from priors.training.adversaries.guard import find_winner
 from priors.training.adversaries.history import HistoryBuffer
 from priors.training.adversaries.statistics import compute_statistics
 from priors.training.corpus import Corpus, Split
-from priors.training.gathering import DataSource, describe_selection
-from priors.training.moment_matching import MatchingSettings, moment_loss
+from priors.training.moment_matching import moment_loss
 from priors.training.parallel import TrainingGroup
-from priors.training.quality.refiner import RefinerEvaluator, compute_realism_gap, sample_corpus
-from priors.training.recipe import Export, Gathered, Recipe, Row, average
+from priors.training.recipe import Row, average
+from priors.training.recipes.refining.samples import REFINER_MOMENTS, SampleRecipe, compute_root_error
 from priors.training.trainer import Trainer, draw_weights
 from priors.training.windows import FeatureWindows
 
-REFINER_MOMENTS = MatchingSettings(feet=0.25, jerk=2.0, pace=0.0, spread=0.5, drift=0.0)
-"""That a refiner is held to, as pieces of a window show them."""
 _MIN_MOMENT_FRAMES = 8  # frames of a window that moments can be had of
 
 
@@ -216,7 +208,7 @@ class AdversarialTrainer(Trainer[RefinerNetwork]):
             odds = self.critic(refined.float())
         refined = refined.float()
         loss = cross_entropy(odds.float(), torch.ones(odds.shape))
-        total = loss + self.settings.root * _compute_root_error(raw[:, self.refiner.before :], refined)
+        total = loss + self.settings.root * compute_root_error(raw[:, self.refiner.before :], refined)
         if self.settings.moments > 0:
             captured = self._draw(self.captured)
             total = total + self.settings.moments * moment_loss(refined, captured, REFINER_MOMENTS)
@@ -263,70 +255,27 @@ class AdversarialTrainer(Trainer[RefinerNetwork]):
 
 
 @dataclass(frozen=True)
-class RefinerRecipe(Recipe[RefinerConfig, AdversarialSettings, AdversarialTrainer]):
+class RefinerRecipe(SampleRecipe[AdversarialSettings, AdversarialTrainer]):
     """What to train a refiner on, and how.
 
     A guard watches held-out samples: the best refiner seen is kept, and training stops and restores it where one side
     wins.
     """
 
-    kind = "refiner"
-    falls = False
-    headline = "distance from mocap"
-    counter = "round"
-    steps_name = "rounds"
     guards = ("refiner", "critic", "told")
     config: RefinerConfig = field(default_factory=RefinerConfig)
     """The network."""
     settings: AdversarialSettings = field(default_factory=AdversarialSettings)
     """How it is trained."""
-    match: str | None = None
-    """Regular expression for the clips; the density's own if None."""
-    report_steps: int = 50
-    """Rounds between lines of news."""
-    validate_steps: int = 300
-    """Rounds between measures of held-out samples."""
-    density: str = "locomotion"
-    """Prior whose samples are refined."""
-    samples: int = 300
-    """Motions of `seconds` drawn from the density to train on."""
-    seconds: float = 10.0
-    """Duration of each sampled motion, s."""
-    judged: int = 24
-    """Motions drawn to be measured, and held-out clips at least, if there are as many."""
-    realism: RealismSettings = field(default_factory=RealismSettings)
-    """Settings of the classifier that separates samples from mocap."""
-
-    @cached_property
-    def prior(self) -> LstmGmmDensity:
-        """The density, loaded."""
-        return density.load(self.density)
-
-    def source(self) -> DataSource:
-        """Gather the data, split as the density's, so that its held-out clips stay held out."""
-        return replace(super().source(), match=self._find_match())
 
     @property
     def most_processes(self) -> int:
         """How many processes can share a round: half of what each takes goes into its history."""
         return self.settings.batch // 2
 
-    @property
-    def split_seed(self) -> int:
-        """That of the density, so that its held-out clips stay held out."""
-        return self.prior.card.data.get("split_seed", self.settings.seed)
-
     def make_trainer(self, parts: Split) -> AdversarialTrainer:
         """With samples of the density, to train on and to be measured."""
-        generator, frames = torch.Generator().manual_seed(self.settings.seed), round(self.seconds * PRIOR_FPS)
-        raw = sample_corpus(self.prior, parts.train, self.samples, frames, generator)
-        measured = sample_corpus(self.prior, parts.train, self.judged, frames, generator)
-        evaluate = RefinerEvaluator.of(measured, parts, self.realism)
-        return AdversarialTrainer(self.config, self.settings, parts.train, raw, evaluate)
-
-    def describe_data(self, corpus: Corpus) -> dict[str, str]:
-        """What tells the data of this run from others'."""
-        return corpus.identity() | {"density": self.density, "match": self._find_match()}
+        return AdversarialTrainer(self.config, self.settings, parts.train, *self.draw_samples(parts))
 
     def format_news(self, rows: Sequence[Row]) -> str:
         """One line on the losses of some rounds."""
@@ -338,38 +287,13 @@ class RefinerRecipe(Recipe[RefinerConfig, AdversarialSettings, AdversarialTraine
         where = f"{self.counter} {trainer.step}"
         return find_winner(rows, losses=("refiner", "critic"), least=self.report_steps, step=where)
 
-    def score(self, row: Row) -> float:
-        """Measure how far foot speed, jitter and classifier accuracy are from mocap's."""
-        return compute_realism_gap(row)
-
-    @classmethod
-    def find_headline(cls, row: Row) -> float:
-        """What the best is chosen by (see `compute_realism_gap`)."""
-        return compute_realism_gap(row)
-
-    def export(self, trainer: AdversarialTrainer, gathered: Gathered, curve: Sequence[Row]) -> Export:
-        """Return the best refiner so far."""
-        data = {
-            "density_config": self.prior.reference.config.as_card(),
-            "samples": self.samples,
-            **self.describe_data(gathered.corpus),
-            **describe_selection(gathered.corpus),
-        }
-        return Export(trainer.network.state_dict(), data, min(curve, key=compute_realism_gap))
-
     def format_command(self) -> str:
         """What to type for the same run, for the card; options that are the defaults are left out."""
-        paper = self.config == PAPER[0]
-        parts = [f"mapctl train refiner --data DATA -o RUN --density {self.density}"]
-        parts += [f"--match '{self.match}'"] if self.match is not None else []
-        parts += self.format_reading()
+        paper, parts = self.config == PAPER[0], self.format_begin()
         usual = PAPER[1] if paper else AdversarialSettings()
         parts += self.format_changed(usual, "batch", "window", "seed", rounds="steps")
         parts += ["--bfloat16"] * self.settings.bfloat16 + ["--paper"] * paper
         return " ".join(parts + self.format_processes() + self.format_ending())
-
-    def _find_match(self) -> str:
-        return self.prior.card.data.get("match", "") if self.match is None else self.match
 
 
 def _make_sides(
@@ -385,12 +309,3 @@ def _make_sides(
         **{name: statistics[name] for name in ("reach_mean", "reach_std")},
     )
     return refiner, critic
-
-
-def _compute_root_error(before: Tensor, after: Tensor) -> Tensor:
-    """Mean squared distance of the roots' ways and heights (Eq. 13), m^2; `before` may go on longer."""
-    before = before[:, : after.shape[1]]
-    origin = GroundPose(before.new_zeros(len(before), 2), before.new_zeros(len(before)))
-    ground = integrate_root(before, origin)[0] - integrate_root(after, origin)[0]
-    height = LAYOUT.pick(before, "root_height") - LAYOUT.pick(after, "root_height")
-    return (ground.square().sum(-1) + height[..., 0].square()).mean()

@@ -1,0 +1,37 @@
+"""Models that are measured beside the one that a table is about: names, what they may not have seen, rows."""
+
+from collections.abc import Callable, Mapping, Sequence
+
+from controllers.benchmarks.shared.tables import Row
+from mapctl.errors import RequestError
+from priors.checkpoints import Card
+
+
+def list_models(own: str, baselines: str) -> list[str]:
+    """The model that a table is about, then those to compare; RequestError for one that is named twice."""
+    names = [own, *(name.strip() for name in baselines.split(",") if name.strip())]
+    twice = next((name for number, name in enumerate(names) if name in names[:number]), None)
+    if twice is not None:
+        raise RequestError(f"--baselines are other models than {own}, each named once; got {twice} twice")
+    return names
+
+
+def check_unseen(name: str, card: Card, held_out: Mapping[str, Sequence[str]]) -> None:
+    """RequestError where a model's training saw clips that are kept for measuring."""
+    own = {clip for clips in card.data.get("held_out", {}).values() for clip in clips}
+    seen = [clip for clips in held_out.values() for clip in clips if clip not in own]
+    if seen:
+        raise RequestError(
+            f"{name} was trained on {seen[0]}, which is kept for measuring; train it with that seed on the same files"
+        )
+
+
+def measure_each(names: Sequence[str], measure: Callable[[str], Sequence[Row]]) -> list[Row]:
+    """The rows of each model, which name it: those that tell of the same follow each other. One alone is not named."""
+    found = {name: measure(name) for name in names}
+    if len(found) == 1:
+        return list(found[names[0]])
+    named = [[{"model": name, **row} for row in rows] for name, rows in found.items()]
+    if len({len(rows) for rows in named}) > 1:  # a model for which something could not be measured
+        return [row for rows in named for row in rows]
+    return [row for rows in zip(*named, strict=True) for row in rows]

@@ -1,0 +1,144 @@
+"""Models that a table measures beside its own: the same rows, on clips that none of them has seen."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import tiny_denoiser
+import tiny_transformer
+from helpers import run, tiny_density, walk
+from tiny_prior import save_tiny_prior
+from tiny_refiner import refiner_of
+
+from controllers.benchmarks import generation
+from mapctl import cli, retarget
+from mapctl.commands import bench
+from mapctl.commands.bench import baselines
+from mapctl.errors import RequestError
+from priors import checkpoints
+
+HELD_OUT = {"validation": ["bandai/a_walk_0.bvh"], "test": ["bandai/a_walk_1.bvh"]}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Two clips, two denoisers and two in-betweeners that did not see them, and one of each that did."""
+    path = tmp_path_factory.mktemp("baselines")
+    for number in range(2):
+        motion = walk(60, seed=number)
+        clip = path / "data" / "bandai" / f"a_walk_{number}.bvh"
+        clip.parent.mkdir(parents=True, exist_ok=True)
+        retarget.from_canonical(motion, retarget.identify_rig(motion.skeleton)).save(clip)
+    for name, drawn, held_out in (("ours", 0.0, HELD_OUT), ("plain", 0.3, HELD_OUT), ("seeing", 0.0, {})):
+        for kind in (tiny_denoiser, tiny_transformer):
+            card = replace(kind.card(), data={"held_out": held_out})
+            kind_name = kind.__name__.removeprefix("tiny_")
+            checkpoints.save(kind.network(drawn=drawn).state_dict(), card, path / f"{name}-{kind_name}.safetensors")
+    return path
+
+
+def test_rows_of_the_same_follow_each_other_and_name_their_model():
+    rows = {"a": [{"what": 1}, {"what": 2}], "b": [{"what": 3}, {"what": 4}]}
+    assert baselines.measure_each(["a", "b"], rows.__getitem__) == [
+        {"model": "a", "what": 1},
+        {"model": "b", "what": 3},
+        {"model": "a", "what": 2},
+        {"model": "b", "what": 4},
+    ]
+    assert baselines.measure_each(["b"], rows.__getitem__) == rows["b"]
+    rows["b"].append({"what": 5})
+    assert [row["what"] for row in baselines.measure_each(["a", "b"], rows.__getitem__)] == [1, 2, 3, 4, 5]
+
+
+def test_models_are_named_once():
+    assert baselines.list_models("ours", " a, b,") == ["ours", "a", "b"]
+    assert baselines.list_models("ours", "") == ["ours"]
+    for twice in ("ours", "a,b,a"):
+        with pytest.raises(RequestError, match="each named once"):
+            baselines.list_models("ours", twice)
+
+
+@pytest.mark.parametrize("table", ["free-run", "generation", "steer", "shots", "denoise", "infill", "tween", "gaps"])
+def test_tables_take_others_beside_their_own(table):
+    words = ["--data", "mocap"] if table in ("generation", "denoise", "infill", "tween", "gaps") else []
+    given = cli.parse(["bench", table, *words, "--baselines", "one,two"])
+    assert isinstance(given, bench.TABLES[table])
+    assert vars(given)["baselines"] == "one,two"
+
+
+def words_of(folder, table, kind):
+    option = "--denoiser" if kind == "denoiser" else "--inbetweener"
+    return ["bench", table, "--data", folder / "data", option, folder / f"ours-{kind}.safetensors"]
+
+
+@pytest.mark.parametrize(
+    ("table", "kind"), [("denoise", "denoiser"), ("infill", "transformer"), ("tween", "transformer")], ids=str
+)
+def test_clips_that_another_model_has_seen_are_refused(folder, fails, table, kind):
+    seeing = folder / f"seeing-{kind}.safetensors"
+    said = fails(*words_of(folder, table, kind), "--baselines", seeing)
+    assert f"{seeing} was trained on bandai/a_walk_0.bvh" in said
+
+
+def test_denoisers_are_in_one_table(folder, capsys, monkeypatch):
+    def measure(clips, denoiser, *, inbetweener, densities, progress):
+        return [{"what": what, "clips": len(clips), "name": denoiser.name} for what in ("spikes", "gaps")]
+
+    monkeypatch.setattr("mapctl.commands.bench.denoise.benchmark_denoising", measure)
+    ours, plain = (str(folder / f"{name}-denoiser.safetensors") for name in ("ours", "plain"))
+    assert run(*words_of(folder, "denoise", "denoiser"), "--baselines", plain, "--json") == 0
+    rows = json.loads(capsys.readouterr().out)["rows"]
+    assert [(row["what"], row["model"]) for row in rows] == [
+        (what, name) for what in ("spikes", "gaps") for name in (ours, plain)
+    ]
+    assert all(row["name"] == row["model"] and row["clips"] == 2 for row in rows)
+
+
+def test_infillers_need_one_that_they_are_compared_with(folder, fails):
+    from tiny_infiller import save_tiny_infiller
+
+    save_tiny_infiller(folder / "infiller.safetensors", drawn=0.1)
+    said = fails(*words_of(folder, "infill", "transformer"), "--baselines", folder / "infiller.safetensors")
+    assert "name it by --infiller" in said
+
+
+def test_inbetweeners_are_in_the_tables_by_kind(folder, capsys, monkeypatch):
+    place = "mapctl.commands.bench.infill"
+    monkeypatch.setattr(f"{place}.benchmark_infilling_by_kind", lambda kinds, network: [{"what": network.name}])
+    monkeypatch.setattr(f"{place}.benchmark_missing_joints", lambda kinds, network: [{"what": "lost joints"}])
+    ours, plain = (str(folder / f"{name}-transformer.safetensors") for name in ("ours", "plain"))
+    assert run(*words_of(folder, "infill", "transformer"), "--baselines", plain, "--json") == 0
+    rows = json.loads(capsys.readouterr().out)["rows"]
+    assert [(row["model"], row["what"]) for row in rows] == [
+        (ours, ours),
+        (plain, plain),
+        (ours, "lost joints"),
+        (plain, "lost joints"),
+    ]
+
+
+def test_densities_and_refiners_are_variants_by_their_names():
+    prior, other = tiny_density(), tiny_density(seed=1)
+    ours, theirs = refiner_of(), refiner_of()
+    found = generation._list_variants(prior, ours, {"b": other}, {"c": theirs})
+    assert [(each.name, each.prior, each.refiner, each.foot_cleanup is not None) for each in found] == [
+        ("density", prior, None, False),
+        ("density, footing", prior, None, True),
+        ("density, refiner", prior, ours, False),
+        ("density, refiner, footing", prior, ours, True),
+        ("density, c", prior, theirs, False),
+        ("density, c, footing", prior, theirs, True),
+        ("b", other, None, False),
+        ("b, footing", other, None, True),
+    ]
+
+
+def test_free_runs_of_two_densities(tmp_path, capsys, monkeypatch):
+    one, other = (save_tiny_prior(tmp_path / f"{name}.safetensors") for name in ("one", "other"))
+    for path in (one, other):
+        tensors, card = checkpoints.load(path)
+        checkpoints.save(tensors, replace(card, quality=card.quality | {"data": {}}), path)
+    monkeypatch.setattr("mapctl.commands.bench.free_run.benchmark_free_run", lambda prior, data: [{"run": prior.name}])
+    assert run("bench", "free-run", "--prior", one, "--baselines", other, "--json") == 0
+    rows = json.loads(capsys.readouterr().out)["rows"]
+    assert rows == [{"model": str(path), "run": str(path)} for path in (one, other)]
