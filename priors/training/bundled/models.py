@@ -52,7 +52,8 @@ class Clips:
     width: int = 256
     """Of the densities' networks."""
     live_width: int = 160
-    """Of the network of the density for live control. One of 120, trained on a few minutes, could not be steered."""
+    """Of the network of the density for live control. Trained on a few minutes, networks of 120 and 160 lost their way
+    along some curves."""
     flat: bool = True
     """Whether runs of the densities end where their curve is flat. Of a few minutes the likelihood of unseen
     clips rises long after a density has become too narrow to be steered: the steps are then told beforehand."""
@@ -78,7 +79,7 @@ SETS: Mapping[str, Clips] = {
         level=True,
         copies=8,
         window=40,
-        width=192,
+        live_width=192,
         flat=False,
         share=0.4,
     ),
