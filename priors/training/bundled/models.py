@@ -55,8 +55,8 @@ class Clips:
     """Of the network of the density for live control. Trained on a few minutes, networks of 120 and 160 lost their way
     along some curves."""
     flat: bool = True
-    """Whether runs of the densities end where their curve is flat. Of a few minutes the likelihood of unseen
-    clips rises long after a density has become too narrow to be steered: the steps are then told beforehand."""
+    """Whether runs of the densities end where their curve is flat. The likelihood of the few clips that minutes of
+    motion spare for validation does not tell whether a density can be steered: the steps are then told beforehand."""
     share: float = 1.0
     """Planned steps, as a share of those for hours of motion: curves of small sets are flat sooner."""
 
