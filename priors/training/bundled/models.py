@@ -31,8 +31,8 @@ AnyRecipe = Recipe[Any, Any, Any]
 
 
 @dataclass(frozen=True)
-class Clips:
-    """Which clips a set of models is trained on, and under which licence their weights then are."""
+class WeightSet:
+    """A set of models: its clips, the licence of its weights, and what depends on how much motion there is."""
 
     licence: str
     """Of the weights."""
@@ -65,13 +65,13 @@ class Clips:
         return round(self.share * steps)
 
 
-SETS: Mapping[str, Clips] = {
-    "full": Clips(
+SETS: Mapping[str, WeightSet] = {
+    "full": WeightSet(
         licence="CC BY-NC 4.0",
         locomotion="dataset-2_(walk|walk-turn-left|walk-turn-right|run)_",
         labels="_(?P<gait>run|walk|walk-turn-left|walk-turn-right)_(?P<style>[a-z]+)_",
     ),
-    "free": Clips(
+    "free": WeightSet(
         licence="free for any use",
         match=r"^cmu(?!.*/(01_14|05_(0[568]|1[04-9])|07_12|09_10|14_36)\.)",  # faulty (docs/data.md)
         locomotion=r"^cmu.*/(02_(0[1-36]|10)|05_01|06_(0\d|1[0-2])|07_(0\d|1[01])|08_\d\d|09_(0[1-69]|1[12])|10_0\d|11_01"
@@ -109,8 +109,8 @@ def list_models(weights: str = "full", *, match: str | None = None, seed: int = 
     walks and runs, without labels. RequestError for a set that does not exist."""
     if weights not in SETS:
         raise RequestError(f"the weights are {' or '.join(SETS)}, got {weights!r}")
-    clips = SETS[weights] if match is None else replace(SETS[weights], locomotion=match, labels="")
-    return tuple(_seed(model, seed) for model in _make_models(clips))
+    chosen = SETS[weights] if match is None else replace(SETS[weights], locomotion=match, labels="")
+    return tuple(_seed(model, seed) for model in _make_models(chosen))
 
 
 RECIPES: Mapping[str, type[AnyRecipe]] = {
@@ -130,35 +130,35 @@ RECIPES: Mapping[str, type[AnyRecipe]] = {
 """Recipes by the kind of model that a card names."""
 
 
-def _make_models(clips: Clips) -> tuple[BundledModel, ...]:
+def _make_models(weights: WeightSet) -> tuple[BundledModel, ...]:
     """The table. Steps are a plan, where a run goes on until its curve is flat."""
-    captures: dict[str, Any] = {"data": DATA, "out": RUN, "licence": clips.licence, "cuts": CMU}
-    shared: dict[str, Any] = {**captures, "level": clips.level}
-    until_flat: dict[str, Any] = {"match": clips.match or None, "until_flat": UntilFlat()}
+    captures: dict[str, Any] = {"data": DATA, "out": RUN, "licence": weights.licence, "cuts": CMU}
+    shared: dict[str, Any] = {**captures, "level": weights.level}
+    until_flat: dict[str, Any] = {"match": weights.match or None, "until_flat": UntilFlat()}
     everything = {**shared, **until_flat}
-    density_end = {"until_flat": UntilFlat() if clips.flat else None}
-    general = {**everything, **density_end, "match": clips.match}  # which a density's command always tells
-    walks: dict[str, Any] = {**general, "match": clips.locomotion, "labels": clips.labels}
+    density_end = {"until_flat": UntilFlat() if weights.flat else None}
+    general = {**everything, **density_end, "match": weights.match}  # which a density's command always tells
+    walks: dict[str, Any] = {**general, "match": weights.locomotion, "labels": weights.labels}
     return (
         BundledModel(
-            "locomotion", DensityRecipe(**walks, **_density(clips, width=clips.width, steps=clips.plan(10_000)))
+            "locomotion", DensityRecipe(**walks, **_density(weights, width=weights.width, steps=weights.plan(10_000)))
         ),
         BundledModel(
             "locomotion-live",
-            DensityRecipe(**walks, **_density(clips, width=clips.live_width, steps=clips.plan(10_000))),
+            DensityRecipe(**walks, **_density(weights, width=weights.live_width, steps=weights.plan(10_000))),
         ),
         BundledModel(
-            "general", DensityRecipe(**general, **_density(clips, width=clips.width, steps=clips.plan(12_000)))
+            "general", DensityRecipe(**general, **_density(weights, width=weights.width, steps=weights.plan(12_000)))
         ),
         BundledModel(
             "locomotion-refiner",
-            RefinerRecipe(**shared, settings=AdversarialSettings(rounds=clips.plan(3000), bfloat16=True)),
+            RefinerRecipe(**shared, settings=AdversarialSettings(rounds=weights.plan(3000), bfloat16=True)),
             needs={"--density": "locomotion"},
         ),
-        BundledModel("path", PathRecipe(**everything, settings=PathSettings(steps=clips.plan(PathSettings.steps)))),
+        BundledModel("path", PathRecipe(**everything, settings=PathSettings(steps=weights.plan(PathSettings.steps)))),
         BundledModel(
             "tweener",
-            TweenerRecipe(**everything, settings=TweenerSettings(steps=clips.plan(TweenerSettings.steps))),
+            TweenerRecipe(**everything, settings=TweenerSettings(steps=weights.plan(TweenerSettings.steps))),
             needs={"--path": "path"},
         ),
         BundledModel(
@@ -166,7 +166,7 @@ def _make_models(clips: Clips) -> tuple[BundledModel, ...]:
             StitcherRecipe(
                 **everything,
                 config=StitcherConfig(without=("d",)),
-                settings=StitcherSettings(steps=clips.plan(StitcherSettings.steps), bfloat16=True),
+                settings=StitcherSettings(steps=weights.plan(StitcherSettings.steps), bfloat16=True),
             ),
         ),
         BundledModel(
@@ -174,7 +174,7 @@ def _make_models(clips: Clips) -> tuple[BundledModel, ...]:
             PoseTransformerRecipe(
                 **everything,
                 config=PoseTransformerConfig(width=192, layers=3, heads=6, detail=3),
-                settings=PoseTransformerSettings(steps=clips.plan(PoseTransformerSettings.steps), bfloat16=True),
+                settings=PoseTransformerSettings(steps=weights.plan(PoseTransformerSettings.steps), bfloat16=True),
             ),
         ),
         # floors and bodies as captures have them are part of what it takes the noise from
@@ -183,16 +183,16 @@ def _make_models(clips: Clips) -> tuple[BundledModel, ...]:
             DenoiserRecipe(
                 **captures,
                 **until_flat,
-                settings=DenoiserSettings(steps=clips.plan(DenoiserSettings.steps), bfloat16=True),
+                settings=DenoiserSettings(steps=weights.plan(DenoiserSettings.steps), bfloat16=True),
             ),
         ),
-        BundledModel("keyframe-timing", KeyframeTimingRecipe(**shared, match=clips.match or None)),
+        BundledModel("keyframe-timing", KeyframeTimingRecipe(**shared, match=weights.match or None)),
     )
 
 
-def _density(clips: Clips, *, width: int, steps: int) -> dict[str, Any]:
-    copies = ClipCopies(clips.copies)
-    settings = TrainingSettings(steps=steps, batch=64, window=clips.window, bfloat16=True, copies=copies)
+def _density(weights: WeightSet, *, width: int, steps: int) -> dict[str, Any]:
+    copies = ClipCopies(weights.copies)
+    settings = TrainingSettings(steps=steps, batch=64, window=weights.window, bfloat16=True, copies=copies)
     return {"config": LstmGmmConfig(width=width), "settings": settings}
 
 
