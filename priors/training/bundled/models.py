@@ -52,8 +52,8 @@ class WeightSet:
     width: int = 256
     """Of the densities' networks."""
     live_width: int = 160
-    """Of the network of the density for live control. Trained on a few minutes, networks of 120 and 160 lost their way
-    along some curves."""
+    """Of the network of the density for live control. Trained on a few minutes, networks of 120, 160 and 256 lost their
+    way along some curves."""
     flat: bool = True
     """Whether runs of the densities end where their curve is flat. The likelihood of the few clips that minutes of
     motion spare for validation does not tell whether a density can be steered: the steps are then told beforehand."""
@@ -79,6 +79,7 @@ SETS: Mapping[str, WeightSet] = {
         level=True,
         copies=8,
         window=40,
+        width=192,
         live_width=192,
         flat=False,
         share=0.4,
