@@ -35,13 +35,17 @@ from mapctl.problem.ledger import Ledger
 from mapctl.problem.solution import Outcome, Solution, Status
 from mapctl.protocols import Density, Inbetweener
 from mapctl.skeleton import CANONICAL, Skeleton
+from mapctl.terms import FootContact
+
+FOOTING = FootContact(heels=None)
+"""Contacts of a shot's walks: heels are left free, since about a corner a foot pivots while it lies flat."""
 
 
 @dataclass(frozen=True)
 class ShotSettings:
     """Settings of shots."""
 
-    follow: FollowSettings = field(default_factory=FollowSettings)
+    follow: FollowSettings = field(default_factory=lambda: FollowSettings(footing=FOOTING))
     """Sigmas and search of the walks."""
     join: JoinSettings = field(default_factory=JoinSettings)
     """How transitions between standing and walking are tried."""

@@ -25,7 +25,7 @@ def test_a_toe_below_the_ground_costs_whether_it_is_planted_or_not(planted):
     one = replace(one, contacts=torch.full_like(one.contacts, planted))
     toes = [one.skeleton.index(name) for name in ("leftToes", "rightToes")]
     lowest = float(one.joints_world[..., toes, 1].amin())
-    free = FootContact(rest_height=lowest, sigma_speed=1e6, sigma_height=1e6)
+    free = FootContact(rest_height=lowest, sigma_speed=1e6, sigma_height=1e6, heels=None)
     sunk = replace(free, rest_height=lowest + 0.2)
     below = (one.joints_world[..., toes, 1] - sunk.rest_height).clamp(max=0)
     assert float(free(one).sum()) == pytest.approx(0, abs=1e-6)
