@@ -35,17 +35,16 @@ from mapctl.problem.ledger import Ledger
 from mapctl.problem.solution import Outcome, Solution, Status
 from mapctl.protocols import Density, Inbetweener
 from mapctl.skeleton import CANONICAL, Skeleton
-from mapctl.terms import FootContact
 
-FOOTING = FootContact(heels=None)
-"""Contacts of a shot's walks: heels are left free, since about a corner a foot pivots while it lies flat."""
+_CORNER_STEP, _CORNER_CURVATURE = 0.1, 1.5
+# metres between the places where a way's curvature is looked at, and the 1/m from which on it is a corner
 
 
 @dataclass(frozen=True)
 class ShotSettings:
     """Settings of shots."""
 
-    follow: FollowSettings = field(default_factory=lambda: FollowSettings(footing=FOOTING))
+    follow: FollowSettings = field(default_factory=FollowSettings)
     """Sigmas and search of the walks."""
     join: JoinSettings = field(default_factory=JoinSettings)
     """How transitions between standing and walking are tried."""
@@ -103,7 +102,7 @@ def solve_shot(
         walked_way,
         rest,
         character=character,
-        settings=settings.follow,
+        settings=_free_heels_at_corners(settings.follow, way),
         generator=generator,
         progress=progress,
     )
@@ -123,6 +122,15 @@ def solve_shot(
         reaches=reaches,
         met=met,
     )
+
+
+def _free_heels_at_corners(settings: FollowSettings, way: Way) -> FollowSettings:
+    """Leave heels out of the footing where a way has a corner: a foot pivots there while it lies flat."""
+    curve = way.curve
+    arcs = torch.arange(0.0, curve.length, _CORNER_STEP, dtype=torch.float64)
+    turning = curve.curvature(arcs).abs()
+    cornered = len(turning) > 0 and float(turning.max()) > _CORNER_CURVATURE
+    return replace(settings, footing=replace(settings.footing, heels=None)) if cornered else settings
 
 
 def _join_walks(

@@ -27,3 +27,16 @@ def test_a_corner_is_kept_to_without_a_lunge(last):
     assert abs(float(facing[-10:].mean().abs()) - wanted) < 30
     if not last[0]:
         assert float((done.way.speeds == 0).sum()) > 10, "it turns on the spot"
+
+
+@pytest.mark.parametrize(("curve", "heels"), [("circle:1", True), ("line:3", True), ("wave:0.5x2", False)])
+def test_heels_are_left_free_where_the_way_has_a_corner(curve, heels, monkeypatch):
+    class Walked(Exception):
+        """Walking has begun."""
+
+    def walk(*_given, settings, **_more):
+        raise Walked(settings.footing.heels is not None)
+
+    monkeypatch.setattr("controllers.shots.shot.walk_pieces", walk)
+    with pytest.raises(Walked, match=str(heels)):
+        solve_shot(priors.load("locomotion"), priors.load_inbetweener(), ShotRequest(curves.read(curve)))

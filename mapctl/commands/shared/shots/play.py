@@ -13,7 +13,7 @@ from controllers.following.follow import FollowSettings
 from controllers.shots.planning.way import APART_MARGIN, Way, plan_way
 from controllers.shots.prices import measure_prices
 from controllers.shots.request import Others, ShotRequest
-from controllers.shots.shot import FOOTING, ShotSettings, ShotSolution, solve_shot
+from controllers.shots.shot import ShotSettings, ShotSolution, solve_shot
 from mapctl import report
 from mapctl.commands.shared.licensing import add_licence
 from mapctl.commands.shared.shots.plan import ShotPlan
@@ -23,6 +23,7 @@ from mapctl.motion import Motion
 from mapctl.problem.solution import Outcome
 from mapctl.protocols import Inbetweener
 from mapctl.runtime.progress import Progress
+from mapctl.terms import FootContact
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +95,7 @@ def play_shot(
     if keep_apart is not None and earlier:
         tracks = [(one.plan, one.solution.motion.root_position[:, ::2]) for one in earlier]
         plan = replace(plan, request=replace(plan.request, others=_find_others(plan, tracks, keep_apart)))
-    footing = replace(FOOTING, rest_height=plan.character.toe_rest_height)
+    footing = FootContact(rest_height=plan.character.toe_rest_height)
 
     def solve(request: ShotRequest, shown: Progress | None = None) -> ShotSolution:
         return solve_shot(
