@@ -7,7 +7,8 @@ from dataclasses import replace
 import pytest
 import tiny_denoiser
 import torch
-from helpers import corpus, generator, run, tiny_density, walk
+from helpers import corpus, generator, run, walk
+from tiny_prior import save_walking_density
 
 import priors
 from mapctl import cli
@@ -15,7 +16,6 @@ from mapctl.commands.train.options import TrainOptions
 from mapctl.errors import RequestError
 from mapctl.recording import Capture
 from mapctl.skeleton import CANONICAL
-from priors import checkpoints
 from priors.denoiser import network as denoisers
 from priors.denoiser.network import ConvDenoiser, DenoiserConfig, DenoiserNetwork
 from priors.lstm_gmm.network import LstmGmmConfig
@@ -232,16 +232,7 @@ def test_the_command_line_trains_a_plain_denoiser_that_denoise_begins_with(tmp_p
 
 
 def test_a_plain_refiner_is_trained_kept_at_its_best_and_loaded(tmp_path, data):
-    prior, path = tiny_density(), tmp_path / "walks.safetensors"
-    starts = prior.initial_states
-    tensors = prior.reference.state_dict() | {
-        "starts.previous": starts.state.last_frame,
-        "starts.hidden": starts.state.hidden,
-        "starts.cell": starts.state.cell,
-        "starts.speed": starts.speed,
-        "starts.weight": starts.weight,
-    }
-    checkpoints.save(tensors, replace(prior.card, data=prior.card.data | {"match": "walk", "split_seed": 1}), path)
+    path = save_walking_density(tmp_path / "walks.safetensors")
     config = RefinerConfig(width=6, memory=5, lookahead=1, joints=("hips", "rightToes"))
     settings = PlainRefinerSettings(rounds=4, window=10, batch=4)
     out, few = tmp_path / "run", {"samples": 6, "judged": 2, "seconds": 1.2, "validate_steps": 2}

@@ -7,16 +7,15 @@ from dataclasses import asdict, replace
 
 import pytest
 import torch
-from helpers import killing, tiny_density, write_corpus
+from helpers import killing, write_corpus
 from safetensors.torch import load_file, save_file
-from tiny_prior import save_tiny_prior
+from tiny_prior import save_tiny_prior, save_walking_density
 
 import priors
 from mapctl import cli
 from mapctl.commands.train.options import TrainOptions
 from mapctl.errors import CheckpointError, RequestError
 from mapctl.metrics.realism import ClassifierSettings, RealismSettings
-from priors import checkpoints
 from priors.refiner.network import RefinerConfig
 from priors.training import corpus as corpora
 from priors.training.quality.refiner import RefinerEvaluator, compute_realism_gap, sample_corpus
@@ -31,18 +30,7 @@ SETTINGS = AdversarialSettings(
 
 @pytest.fixture(scope="module")
 def density(tmp_path_factory):
-    """Untrained, with the statistics of the walks: it walks on, with noise."""
-    prior, path = tiny_density(), tmp_path_factory.mktemp("density") / "walks.safetensors"
-    starts = prior.initial_states
-    tensors = prior.reference.state_dict() | {
-        "starts.previous": starts.state.last_frame,
-        "starts.hidden": starts.state.hidden,
-        "starts.cell": starts.state.cell,
-        "starts.speed": starts.speed,
-        "starts.weight": starts.weight,
-    }
-    checkpoints.save(tensors, replace(prior.card, data=prior.card.data | {"match": "walk", "split_seed": 1}), path)
-    return str(path)
+    return str(save_walking_density(tmp_path_factory.mktemp("density") / "walks.safetensors"))
 
 
 @pytest.fixture

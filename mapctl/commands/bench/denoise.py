@@ -5,7 +5,7 @@ from controllers.benchmarks.denoising import benchmark_denoising
 from controllers.benchmarks.shared.held_out import load_clean_clips
 from controllers.benchmarks.shared.tables import Row
 from mapctl.commands.bench import Denoise
-from mapctl.commands.bench.baselines import check_unseen, list_models, measure_each
+from mapctl.commands.bench.baselines import find_held_out, list_models, measure_each
 from mapctl.commands.bench.output import print_rows
 from mapctl.commands.shared.progress_bar import show_progress
 
@@ -13,9 +13,7 @@ from mapctl.commands.shared.progress_bar import show_progress
 def run(table: Denoise) -> int:
     """Measure and print."""
     denoisers = {name: priors.load_denoiser(name) for name in list_models(table.denoiser, table.baselines)}
-    held_out = denoisers[table.denoiser].card.data.get("held_out", {})
-    for name, denoiser in denoisers.items():
-        check_unseen(name, denoiser.card, held_out)
+    held_out = find_held_out({name: each.card for name, each in denoisers.items()})
     inbetweener, densities = priors.load_inbetweener(table.inbetweener), priors.load_choice(table.prior)
     clips = load_clean_clips(table.data, held_out, table.count)
 

@@ -1,26 +1,10 @@
 """`mapctl bench gaps`: how far answers for gaps are from the truth."""
 
-import priors
 from controllers.benchmarks.gaps import benchmark_gaps
-from controllers.benchmarks.shared.held_out import load_canonical
-from controllers.benchmarks.shared.tables import Row
 from mapctl.commands.bench import Gaps
-from mapctl.commands.bench.baselines import check_unseen, list_models, measure_each
-from mapctl.commands.bench.output import print_rows
-from mapctl.commands.shared.progress_bar import show_progress
-from mapctl.features import PRIOR_FPS
+from mapctl.commands.bench.tween import compare_inbetweeners
 
 
 def run(table: Gaps) -> int:
     """Measure and print."""
-    inbetweeners = {name: priors.load_inbetweener(name) for name in list_models(table.inbetweener, table.baselines)}
-    held_out = inbetweeners[table.inbetweener].card.data.get("held_out", {})
-    for name, inbetweener in inbetweeners.items():
-        check_unseen(name, inbetweener.card, held_out)
-    kinds, densities = load_canonical(table.data, held_out, table.count, fps=PRIOR_FPS), priors.load_choice(table.prior)
-
-    def measure(name: str) -> list[Row]:
-        with show_progress("gaps") as progress:
-            return benchmark_gaps(kinds, inbetweeners[name], densities, progress=progress)
-
-    return print_rows(table, measure_each(list(inbetweeners), measure))
+    return compare_inbetweeners(table, "gaps", benchmark_gaps)

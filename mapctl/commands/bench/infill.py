@@ -8,7 +8,7 @@ from controllers.benchmarks.lost_joints import benchmark_missing_joints
 from controllers.benchmarks.shared.held_out import load_canonical
 from controllers.benchmarks.shared.tables import Row
 from mapctl.commands.bench import Infill
-from mapctl.commands.bench.baselines import check_unseen, list_models, measure_each
+from mapctl.commands.bench.baselines import find_held_out, list_models, measure_each
 from mapctl.commands.bench.output import print_rows
 from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.errors import RequestError
@@ -20,9 +20,7 @@ def run(table: Infill) -> int:
     models = list_models(table.inbetweener, table.baselines)
     infillers = [name for name in models[1:] if priors.find_inbetweener_kind(name) == "infiller"]
     networks = {name: priors.load_inbetweener(name) for name in models if name not in infillers}
-    held_out = networks[table.inbetweener].card.data.get("held_out", {})
-    for name, network in networks.items():
-        check_unseen(name, network.card, held_out)
+    held_out = find_held_out({name: each.card for name, each in networks.items()})
     kinds = load_canonical(table.data, held_out, table.count)
     rows = _compare_infillers(table, kinds, infillers)
 

@@ -6,7 +6,7 @@ from controllers.benchmarks.shared.tables import Row
 from controllers.benchmarks.shots.corners import benchmark_corners
 from controllers.benchmarks.shots.fulfilment import benchmark_shots
 from mapctl.commands.bench import Shots
-from mapctl.commands.bench.baselines import check_unseen, list_models, measure_each
+from mapctl.commands.bench.baselines import find_held_out, list_models, measure_each
 from mapctl.commands.bench.output import print_rows
 from mapctl.commands.shared.progress_bar import show_progress
 
@@ -16,10 +16,7 @@ def run(table: Shots) -> int:
     densities = {name: priors.load(name) for name in list_models(table.prior, table.baselines)}
     inbetweener, mocap = priors.load_inbetweener(table.inbetweener), []
     if table.data is not None and not table.corners:
-        held_out = densities[table.prior].card.data.get("held_out", {})
-        for name, prior in densities.items():
-            check_unseen(name, prior.card, held_out)
-        mocap = load_held_out(table.data, held_out)
+        mocap = load_held_out(table.data, find_held_out({name: each.card for name, each in densities.items()}))
 
     def measure(name: str) -> list[Row]:
         prior = densities[name]

@@ -16,6 +16,14 @@ def list_models(own: str, baselines: str) -> list[str]:
     return names
 
 
+def find_held_out(cards: Mapping[str, Card]) -> Mapping[str, Sequence[str]]:
+    """Find the clips that the model of the first card kept from training; RequestError where another has seen some."""
+    held_out = next(iter(cards.values())).data.get("held_out", {})
+    for name, card in cards.items():
+        check_unseen(name, card, held_out)
+    return held_out
+
+
 def check_unseen(name: str, card: Card, held_out: Mapping[str, Sequence[str]]) -> None:
     """RequestError where a model's training saw clips that are kept for measuring."""
     own = {clip for clips in card.data.get("held_out", {}).values() for clip in clips}
