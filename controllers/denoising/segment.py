@@ -27,6 +27,7 @@ from mapctl.recording import Capture, artefacts
 from mapctl.recording.frequency_bands import split_bands
 from mapctl.recording.inspection import Inspection
 from mapctl.recording.noise_estimation import estimate_angle_noise, estimate_position_noise
+from mapctl.recording.quaternion_signs import choose_continuous_signs
 from mapctl.recording.residual_motion import restore_residual_motion
 from mapctl.recording.spike_detection import find_residual_spikes
 from mapctl.recording.sure_smoothing import smooth_rotations
@@ -63,6 +64,7 @@ class SegmentDenoiser:
         self.inspection, self.denoiser, self.settings = inspection, denoiser, settings
         self.repaired = _smooth_noncanonical_joints(inspection, rig)
         canonical, self.rigmap = to_canonical(self.repaired, rig)
+        canonical = replace(canonical, local_quat_xyzw=choose_continuous_signs(canonical.local_quat_xyzw))
         observed = _map_mask_to_canonical(inspection.known, self.rigmap)
         self.hidden_root = inspection.dropouts_root | ~_are_hip_ancestors_observed(~inspection.lost, self.rigmap)
         self.observed_root = inspection.seen_root & _are_hip_ancestors_observed(inspection.known, self.rigmap)

@@ -8,11 +8,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mapctl import rotations
 from mapctl.motion import Motion
 from mapctl.numerics.intervals import fill_missing, last_observed
 from mapctl.recording.masks import Mask, expand_valid_masks, travelling_joint
 from mapctl.recording.noise_estimation import estimate_angle_noise, estimate_position_noise
+from mapctl.recording.quaternion_signs import choose_continuous_signs
 from mapctl.recording.spike_detection import find_angle_spikes, find_position_spikes
 
 _LOCKED_CHANGE = 1e-6  # of a quaternion, that rounding leaves of a joint which never moves
@@ -93,7 +93,7 @@ class Inspection:
     def repaired(self) -> Motion:
         """Return the recording with artefacts filled in, interpolated from the frames around them."""
         motion, seen = self.motion, self.seen
-        quats = rotations.make_sign_continuous(_hold_last_observed(motion.local_quat_xyzw, seen))
+        quats = choose_continuous_signs(_hold_last_observed(motion.local_quat_xyzw, seen))
         steps = fill_missing(quats.transpose(0, 1), seen.T).transpose(0, 1)
         root = fill_missing(motion.root_position[None], self.seen_root[None])[0]
         moving = {
@@ -110,7 +110,7 @@ class Inspection:
 
 def inspect_recording(motion: Motion, masks: Sequence[Mask] = ()) -> Inspection:
     """Look over a recording on any rig; RequestError for masks that name joints or frames it has not."""
-    quats = rotations.make_sign_continuous(motion.local_quat_xyzw)
+    quats = choose_continuous_signs(motion.local_quat_xyzw)
     hidden, hidden_root = expand_valid_masks(motion, masks)
     travels = travelling_joint(motion)
     place = motion.moving_offsets[travels] if travels else motion.root_position

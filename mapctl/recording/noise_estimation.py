@@ -11,11 +11,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl import rotations
+from mapctl.recording.quaternion_signs import average_over_time
 
 # Orders of the differences, with the fewest runs of frames that each needs; the first that has them counts. Runs that
 # many losses leave are few and short: a rough estimate by the last order is better than none.
 _ORDERS = {4: 12, 3: 12, 2: 4}
 _MAD_TO_SIGMA = 1.4826  # of a normal number's size
+_LARGE_NOISE = 0.2  # radians: turns between two frames with more do not add up any more
 
 
 def estimate_angle_noise(
@@ -24,13 +26,27 @@ def estimate_angle_noise(
     """Estimate the white noise of each of a joint's three angles, radians; 0 for a recording too short. A joint that is
     never observed for some frames on end is taken to be as noisy as the others.
 
-    Between two frames a joint turns by what it moved and by the difference of their noise.
+    Between two frames a joint turns by what it moved and by the difference of their noise. Where that is large, such
+    turns end at half a turn and their differences tell too little: what each frame is away from the mean of those
+    around it takes their place.
     """
     steps = rotations.to_rotation_vector(rotations.multiply(rotations.inverse(quats[:-1]), quats[1:]))
     sigma = _estimate_sigma(steps, seen, differenced=1)
+    large = sigma > _LARGE_NOISE
+    if large.any():
+        sigma[large] = torch.maximum(sigma[large], _estimate_about_mean(quats[:, large], seen[:, large]))
     known = sigma[(sigma > 0) & sigma.isfinite()]
     usual = known.median() if len(known) else sigma.new_zeros(())
     return torch.where(sigma.isnan(), usual, sigma)
+
+
+def _estimate_about_mean(
+    quats: Float[Tensor, "frames joints 4"], seen: Bool[Tensor, "frames joints"]
+) -> Float[Tensor, " joints"]:
+    """Estimate noise, radians, from the rotation vectors to each frame from the mean about it, which is smooth."""
+    mean = rotations.make_sign_continuous(average_over_time(quats, seen))
+    away = rotations.to_rotation_vector(rotations.multiply(rotations.inverse(mean), quats))
+    return _estimate_sigma(away, seen, differenced=0).nan_to_num(0.0)
 
 
 def estimate_position_noise(places: Float[Tensor, "frames 3"], seen: Bool[Tensor, " frames"]) -> float:

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mapctl import rotations
+from mapctl.recording.quaternion_signs import choose_continuous_signs
 
 _MEDIAN_FRAMES = 5  # frames of the running median: bursts of up to two are detected
 _STEP_FRAMES = 6  # frames on either side that tell how fast a joint is moving
@@ -27,7 +27,7 @@ def find_angle_spikes(
     quats: Float[Tensor, "frames joints 4"], sigma: Float[Tensor, " joints"]
 ) -> Bool[Tensor, "frames joints"]:
     """Find which joints spike in which frames; `sigma` is the noise of each angle, radians."""
-    quats = rotations.make_sign_continuous(quats)
+    quats = choose_continuous_signs(quats)
     middle = torch.nn.functional.normalize(_running_median(quats.flatten(1)).unflatten(1, quats.shape[1:]), dim=-1)
     away = _rotation_distance(middle, quats)
     usual = _mean_step(_rotation_distance(middle[:-1], middle[1:]))
