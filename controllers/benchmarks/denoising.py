@@ -16,11 +16,12 @@ from controllers.benchmarks.shared.tables import Row, average_rows
 from controllers.denoising.denoise import denoise
 from controllers.denoising.result import DenoiseSolution
 from controllers.inbetweening.infill import infill
-from mapctl import metrics, rotations
+from mapctl import metrics
 from mapctl.features import PRIOR_FPS
 from mapctl.motion import Motion
 from mapctl.protocols import Denoiser, Density, Inbetweener
 from mapctl.recording.inspection import Inspection, inspect_recording
+from mapctl.recording.quaternion_signs import choose_continuous_signs
 
 STANDARD_CONDITION = "5 degrees, 2 cm, 1 % spikes"
 """Condition of the table by kind of clip."""
@@ -137,7 +138,7 @@ def _apply_filter(motion: Motion, smooth: Callable[[np.ndarray], Any]) -> Motion
     def smooth_tensor(values: Tensor) -> Tensor:
         return torch.as_tensor(np.ascontiguousarray(np.asarray(smooth(values.numpy()))))
 
-    quats = smooth_tensor(rotations.make_sign_continuous(motion.local_quat_xyzw))
+    quats = smooth_tensor(choose_continuous_signs(motion.local_quat_xyzw))
     moving = {joint: smooth_tensor(values) for joint, values in motion.moving_offsets.items()}
     return replace(
         motion,

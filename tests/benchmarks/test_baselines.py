@@ -142,3 +142,22 @@ def test_free_runs_of_two_densities(tmp_path, capsys, monkeypatch):
     assert run("bench", "free-run", "--prior", one, "--baselines", other, "--json") == 0
     rows = json.loads(capsys.readouterr().out)["rows"]
     assert rows == [{"model": str(path), "run": str(path)} for path in (one, other)]
+
+
+def test_clips_are_those_whose_paths_hold_a_pattern(folder, fails):
+    cards = {"ours": checkpoints.read_card(folder / "ours-denoiser.json")}
+    assert baselines.find_held_out(cards, "_1") == {"validation": [], "test": ["bandai/a_walk_1.bvh"]}
+    assert baselines.find_held_out(cards) == HELD_OUT
+    words = words_of(folder, "denoise", "denoiser")
+    assert "none of the clips that were kept for measuring has a path with 'cmu'" in fails(*words, "--clips", "cmu")
+    assert "--clips is no regular expression" in fails(*words, "--clips", "(")
+
+
+def test_a_model_has_not_seen_what_its_pattern_for_paths_leaves_out(folder):
+    card = checkpoints.read_card(folder / "ours-denoiser.json")
+    other = replace(card, data={"match": "^cmu", "held_out": {}})
+    assert baselines.find_held_out({"ours": card, "other": other}) == HELD_OUT
+    seeing = replace(card, data={"match": "walk_0", "held_out": {}})
+    with pytest.raises(RequestError, match="other was trained on bandai/a_walk_0"):
+        baselines.find_held_out({"ours": card, "other": seeing})
+    assert baselines.find_held_out({"ours": card, "other": seeing}, "walk_1")["test"] == ["bandai/a_walk_1.bvh"]

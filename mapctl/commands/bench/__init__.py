@@ -43,6 +43,8 @@ class MocapTable(Table):
     """The folder that was trained on, for the clips that were held out."""
     count: options.Count = 48
     """Clips, spread over the kinds."""
+    clips: Annotated[str, arg(metavar="REGEX")] = ""
+    """Of these clips, those whose paths hold this: of two models, those that neither was trained on."""
     inbetweener: options.Name = "transformer"
     """The bundled transformer, or the file or run folder of a trained transformer or infiller."""
 

@@ -13,7 +13,7 @@ from mapctl.commands.shared.progress_bar import show_progress
 def run(table: Denoise) -> int:
     """Measure and print."""
     denoisers = {name: priors.load_denoiser(name) for name in list_models(table.denoiser, table.baselines)}
-    held_out = find_held_out({name: each.card for name, each in denoisers.items()})
+    held_out = find_held_out({name: each.card for name, each in denoisers.items()}, table.clips)
     inbetweener, densities = priors.load_inbetweener(table.inbetweener), priors.load_choice(table.prior)
     clips = load_clean_clips(table.data, held_out, table.count)
 

@@ -20,7 +20,7 @@ def run(table: Infill) -> int:
     models = list_models(table.inbetweener, table.baselines)
     infillers = [name for name in models[1:] if priors.find_inbetweener_kind(name) == "infiller"]
     networks = {name: priors.load_inbetweener(name) for name in models if name not in infillers}
-    held_out = find_held_out({name: each.card for name, each in networks.items()})
+    held_out = find_held_out({name: each.card for name, each in networks.items()}, table.clips)
     kinds = load_canonical(table.data, held_out, table.count)
     rows = _compare_infillers(table, kinds, infillers)
 

@@ -21,7 +21,7 @@ def run(table: Tween) -> int:
 def compare_inbetweeners(table: Tween, title: str, benchmark: Callable[..., list[Row]]) -> int:
     """Measure the in-betweeners of a table on the same clips, canonical and at the prior's rate, and print the rows."""
     inbetweeners = {name: priors.load_inbetweener(name) for name in list_models(table.inbetweener, table.baselines)}
-    held_out = find_held_out({name: each.card for name, each in inbetweeners.items()})
+    held_out = find_held_out({name: each.card for name, each in inbetweeners.items()}, table.clips)
     kinds, densities = load_canonical(table.data, held_out, table.count, fps=PRIOR_FPS), priors.load_choice(table.prior)
 
     def measure(name: str) -> list[Row]:

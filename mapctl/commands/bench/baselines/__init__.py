@@ -1,5 +1,6 @@
 """Models that are measured beside the one that a table is about: names, what they may not have seen, rows."""
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 
 from controllers.benchmarks.shared.tables import Row
@@ -16,18 +17,27 @@ def list_models(own: str, baselines: str) -> list[str]:
     return names
 
 
-def find_held_out(cards: Mapping[str, Card]) -> Mapping[str, Sequence[str]]:
-    """Find the clips that the model of the first card kept from training; RequestError where another has seen some."""
-    held_out = next(iter(cards.values())).data.get("held_out", {})
+def find_held_out(cards: Mapping[str, Card], clips: str = "") -> Mapping[str, Sequence[str]]:
+    """Find the clips that the model of the first card kept from training, of which the paths hold a regular expression;
+    RequestError where another has seen some, and where there are none."""
+    kept = next(iter(cards.values())).data.get("held_out", {})
+    try:
+        held_out = {part: [name for name in names if re.search(clips, name)] for part, names in kept.items()}
+    except re.error as error:
+        raise RequestError(f"--clips is no regular expression: {error}") from error
+    if clips and not any(held_out.values()):
+        raise RequestError(f"none of the clips that were kept for measuring has a path with {clips!r}")
     for name, card in cards.items():
         check_unseen(name, card, held_out)
     return held_out
 
 
 def check_unseen(name: str, card: Card, held_out: Mapping[str, Sequence[str]]) -> None:
-    """RequestError where a model's training saw clips that are kept for measuring."""
+    """RequestError where a model's training saw clips that are kept for measuring: all but those that it kept itself,
+    and those that its regular expression for paths leaves out."""
     own = {clip for clips in card.data.get("held_out", {}).values() for clip in clips}
-    seen = [clip for clips in held_out.values() for clip in clips if clip not in own]
+    trained_on = str(card.data.get("match") or "")
+    seen = [clip for clips in held_out.values() for clip in clips if clip not in own and re.search(trained_on, clip)]
     if seen:
         raise RequestError(
             f"{name} was trained on {seen[0]}, which is kept for measuring; train it with that seed on the same files"
