@@ -50,6 +50,11 @@ AUTO = ("locomotion", "general")
 the set of weights in force has."""
 
 
+def has_model(name: str) -> bool:
+    """Return whether the set of weights in force has a model of this bundled name, or one that stands in for it."""
+    return weight_sets.find_file(name) is not None
+
+
 def load(name: str) -> "LstmGmmDensity":
     """A bundled prior by name (`locomotion`), or a trained one by its file or run folder."""
     return _import_model("LstmGmmDensity").load(name)

@@ -119,7 +119,7 @@ def _find_origin_fault(origin: str) -> str | None:
     weights, model = weight_sets.split_name(origin)
     if model != origin and weights != "free":
         return f"a model of the {weights} weights"
-    if model not in weight_sets.list_models("free"):
+    if weight_sets.find_file(f"free/{model}") is None:
         return "which is no model of the free weights"
     return None
 

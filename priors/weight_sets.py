@@ -21,6 +21,9 @@ VARIABLE = "MAPCTL_WEIGHTS"
 """Environment variable that holds the name of the set in force; the default if it is not set, or empty."""
 FOLDER_VARIABLE = "MAPCTL_WEIGHTS_FOLDER"
 """Environment variable that names a folder in place of `priors/weights`, with the free set in its sub-folder `free`."""
+STAND_INS = {"locomotion-live": "locomotion"}
+"""Models by the name of one that a set may lack, because they serve as well: trained on a few minutes of motion, a
+density for live control is no smaller than the other."""
 _ENDING = ".safetensors"
 
 
@@ -75,16 +78,23 @@ def split_name(name: str) -> tuple[str, str]:
 def names_set(name: str) -> bool:
     """Return whether a name says its set, and means a model of that set and no file or folder of that name."""
     _weights, model = split_name(name)
-    return model != name and any(model in list_models(each) for each in SETS)
+    return model != name and any(_find_model(each, model) for each in SETS)
 
 
 def find_file(name: str) -> Path | None:
-    """Find the file of a bundled name, with or without a set in it; None where the set has no such model."""
+    """Find the file of a bundled name, with or without a set in it, or of the model that stands in for it; None where
+    the set has neither."""
     weights, model = split_name(name)
-    if model not in list_models(weights):
+    found = _find_model(weights, model)
+    if found is None:
         return None
-    with as_file(_find_folder(weights) / f"{model}{_ENDING}") as place:
+    with as_file(_find_folder(weights) / f"{found}{_ENDING}") as place:
         return place
+
+
+def _find_model(weights: str, model: str) -> str | None:
+    there = list_models(weights)
+    return next((each for each in (model, STAND_INS.get(model)) if each in there), None)
 
 
 def find_set_of(path: Path) -> str | None:
@@ -100,7 +110,7 @@ def add_set(name: str) -> str:
     """Add its set to a bundled name, so that it means the same file in another process or on another machine, whatever
     set is in force there; other names, and paths, stay."""
     weights, model = split_name(name)
-    bare = model == name and model in list_models(weights)
+    bare = model == name and _find_model(weights, model) is not None
     return f"{weights}/{name}" if bare and not _is_path(name) else name
 
 
@@ -111,7 +121,7 @@ def _is_path(name: str) -> bool:
 def explain_missing(name: str) -> CheckpointError:
     """Explain that a name is neither a file nor bundled, and what there is."""
     weights, model = split_name(name)
-    known, others = list_models(weights), [each for each in SETS if each != weights and model in list_models(each)]
+    known, others = list_models(weights), [each for each in SETS if each != weights and _find_model(each, model)]
     there = ", ".join(known) or "the bundled (none)"
     if weights == SETS[0] and model == name and not others:
         return CheckpointError(f"no prior {name!r}: neither a file nor one of {there}")

@@ -35,6 +35,8 @@ from priors import weight_sets
 from scenes.live.app import LiveApp
 
 NOT_FREE = "CC BY-NC 4.0"
+BUNDLED = weight_sets.list_models("free")
+"""Models that the free set really has: what commands do without others is what a user sees."""
 SCENE = 'outputs = ["a.npz", "a.json"]\n[[actors]]\ncurve = "line:0.5"\n'
 KEYS = 'body = "in.bvh"\n[[key]]\nframe = 0\npose = "in.bvh"\n[[key]]\nframe = 12\npose = "in.bvh"\npose_frame = 12\n'
 
@@ -43,9 +45,9 @@ KEYS = 'body = "in.bvh"\n[[key]]\nframe = 0\npose = "in.bvh"\n[[key]]\nframe = 1
 def saved(tmp_path_factory):
     """The free set alone, under `free`, and beside it a whole folder of both, under `both`."""
     folder = tmp_path_factory.mktemp("weights")
-    save_tiny_weights(folder / "alone" / "free")
-    shutil.copytree(folder / "alone", folder / "both")
+    save_tiny_weights(folder / "alone" / "free", models=BUNDLED)
     save_tiny_weights(folder / "both", NOT_FREE)
+    save_tiny_weights(folder / "both" / "free")
     return folder
 
 
@@ -57,6 +59,7 @@ def work(tmp_path, monkeypatch):
     monkeypatch.delenv(weight_sets.VARIABLE, raising=False)
     walk(40).save(tmp_path / "in.bvh")
     walk(40, turn_rate=0.3, seed=1).save(tmp_path / "other.bvh")
+    walk(210).save(tmp_path / "long.bvh")
     (tmp_path / "clips").mkdir()
     shutil.copy(tmp_path / "in.bvh", tmp_path / "clips" / "one.bvh")
     (tmp_path / "scene.toml").write_text(SCENE)
@@ -89,7 +92,7 @@ JOBS = {
     "follow a shot": ("follow line:1 -o out.npz --end stand --report out.json", {"locomotion", "transformer"}),
     "run": ("run scene.toml", {"locomotion"}),
     "generate": ("generate -o made --seconds 0.5 --no-footing --to .npz", {"locomotion"}),
-    "steer": ("steer c.csv -o out.npz --report out.json", {"locomotion-live"}),
+    "steer": ("steer c.csv -o out.npz --report out.json", {"locomotion"}),
     "denoise": ("denoise in.bvh -o out.npz --report out.json", {"denoiser", "transformer"}),
     "denoise with densities": (
         "denoise in.bvh -o out.npz --prior auto --report out.json",
@@ -97,10 +100,7 @@ JOBS = {
     ),
     "denoise a folder": ("denoise clips -o clean --jobs 2 --report told", {"denoiser", "transformer"}),
     "infill": ("infill in.bvh -o out.npz --gap 10:20 --report out.json", {"transformer"}),
-    "infill by a tweener": (
-        "infill in.bvh -o out.npz --gap 10:20 --method tweener --report out.json",
-        {"path", "tweener"},
-    ),
+    "infill a long gap": ("infill long.bvh -o out.npz --gap 10:200 --no-finish --report out.json", {"transformer"}),
     "infill by a stitcher": ("infill in.bvh -o out.npz --gap 10:20 --method stitcher --report out.json", {"stitcher"}),
     "infill by rollouts": (
         "infill in.bvh -o out.npz --gap 10:14 --method rollouts --report out.json",
@@ -177,7 +177,7 @@ def test_the_live_page_tells_the_licence_of_what_its_characters_load(alone, monk
     monkeypatch.setattr(LiveApp, "save_recordings", lambda *_: [])
     monkeypatch.setattr(LiveApp, "close", lambda show: None)
     assert run("live", "--weights", "free") == 0
-    told = f"{FREE} (free/locomotion-live, free/stitcher)"
+    told = f"{FREE} (free/locomotion, free/stitcher)"
     assert asked == [told]
     assert f"licence   {told}" in capsys.readouterr().out
 
@@ -211,7 +211,7 @@ def test_live_works_with_the_free_weights_alone(alone):
             next(line for line in show.stdout if line.startswith("open "))
         finally:
             show.send_signal(signal.SIGINT)
-        assert f"licence   {FREE} (free/locomotion-live, free/stitcher)" in show.stdout.read()
+        assert f"licence   {FREE} (free/locomotion, free/stitcher)" in show.stdout.read()
     assert show.returncode == 0
 
 
@@ -223,11 +223,13 @@ def test_without_the_full_weights_nothing_else_stands_in(alone, fails, words):
 
 
 def test_what_the_free_set_lacks_is_refused_in_one_line(both, fails):
-    for name in ("transformer", "general"):
+    for name in ("transformer", "general", "tweener"):
         for ending in ("json", "safetensors"):
             (both / "weights" / "free" / f"{name}.{ending}").unlink()
     for words in (("infill", "in.bvh", "-o", "o.bvh", "--gap", "10:20"), ("denoise", "in.bvh", "-o", "o.bvh")):
         assert "the free weights have no 'transformer': they hold denoiser, " in fails(*words, "--weights", "free")
+    told = fails("infill", "in.bvh", "-o", "o.bvh", "--gap", "10:20", "--method", "tweener", "--weights", "free")
+    assert "the free weights have no 'tweener': they hold denoiser, " in told
     assert "no 'general'" in fails("follow", "line:1", "-o", "o.bvh", "--weights", "free", "--prior", "general")
 
 

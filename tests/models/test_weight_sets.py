@@ -69,6 +69,21 @@ def test_a_set_that_does_not_exist_is_refused(folder, monkeypatch):
         priors.load("locomotion")
 
 
+def test_another_model_stands_in_where_a_set_has_none_of_its_own(folder):
+    free = folder / "free"
+    assert checkpoints.locate("free/locomotion-live") == free / "locomotion-live.safetensors"
+    for ending in ("json", "safetensors"):
+        (free / f"locomotion-live.{ending}").unlink()
+    assert checkpoints.locate("free/locomotion-live") == free / "locomotion.safetensors"
+    assert checkpoints.locate("locomotion-live") == folder / "locomotion-live.safetensors"
+    with priors.use_weights("free"):
+        assert priors.has_model("locomotion-live")
+        assert not priors.has_model("tweener")
+        assert priors.add_set("locomotion-live") == "free/locomotion-live"
+        assert priors.load("locomotion-live").card == priors.load("locomotion").card
+    assert "locomotion-live" not in weight_sets.list_models("free")
+
+
 def test_what_the_free_set_lacks_is_refused_though_the_full_one_has_it(folder):
     with priors.use_weights("free"):
         with pytest.raises(CheckpointError, match=r"the free weights have no 'general': they hold denoiser, .*; full/"):

@@ -11,10 +11,12 @@ from priors import weight_sets
 
 
 def describe(name: str, weights: str) -> str:
-    """What the page says of a model of a set: its size, and what it was trained on, by its card."""
+    """What the page says of a model of a set: its size, and what it was trained on, by its card; or what stands in."""
     path = weight_sets.find_file(f"{weights}/{name}")
     if path is None:
         return "-"
+    if path.stem != name:
+        return f"`{path.stem}` serves"
     data = json.loads(path.with_suffix(".json").read_text("utf-8"))["data"]
     size = f"{path.stat().st_size / 1e6:.1f} MB"
     if "frames" not in data:

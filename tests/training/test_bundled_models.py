@@ -19,6 +19,7 @@ from priors.training.bundled.models import DATA, RECIPES, RUN, SETS, list_models
 from priors.training.bundled.weights import MOST_BYTES, copy_model, name_needs, read_finished
 from priors.training.mocap.cuts import CMU
 from priors.training.run import train
+from priors.weight_sets import STAND_INS
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "training.md"
 FULL = list_models()
@@ -73,7 +74,8 @@ def test_nothing_is_begun_with_other_weights():
 
 def test_the_free_set_sees_takes_of_cmu_alone_without_their_first_frames():
     free = list_models("free")
-    assert [model.name for model in free] == [model.name for model in FULL]
+    assert {model.name for model in FULL} - {model.name for model in free} == set(STAND_INS)
+    assert set(STAND_INS.values()) <= {model.name for model in free} <= {model.name for model in FULL}
     for model in free:
         if model.name == "locomotion-refiner":  # has its density's
             assert model.recipe.match is None

@@ -31,8 +31,8 @@ class ModelLoaders:
     `auto` of whichever but a tweener."""
     densities: Callable[[], Sequence[Density]]
     """Loader of the densities for rollouts."""
-    tweener: Callable[[], Inbetweener]
-    """Loader of the network for long gaps that `auto` takes beside the other."""
+    tweener: Callable[[], Inbetweener | None]
+    """Loader of the network for long gaps that `auto` takes beside the other; of None where there is none."""
     stitcher: Callable[[], Inbetweener]
     """Loader of the network that fills gaps from both sides."""
 

@@ -89,7 +89,9 @@ def load_models(
             raise RequestError(f"--method {method} takes no {network.card.kind}; leave it or {inbetweener} out")
         return tell_style(network, dna)
 
-    def load_tweener() -> Inbetweener:
+    def load_tweener() -> Inbetweener | None:
+        if not (is_tweener or dna or path or priors.has_model("tweener")):
+            return None  # the free weights have none, and `auto` does without
         return tell_style(priors.load_tweener((is_tweener and inbetweener) or "tweener", path or "path"), dna)
 
     load_densities = partial(priors.load_choice, prior or "auto")

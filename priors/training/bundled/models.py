@@ -51,9 +51,9 @@ class WeightSet:
     """Frames of the windows of densities: short ones where runs are short."""
     width: int = 256
     """Of the densities' networks."""
-    live_width: int = 160
-    """Of the network of the density for live control. Trained on a few minutes, networks of 120, 160 and 256 lost their
-    way along some curves."""
+    live_width: int | None = 160
+    """Of the network of the density for live control; None where that of walks and runs serves. Trained on a few
+    minutes, networks of 120, 160 and 256 lost their way along some curves."""
     flat: bool = True
     """Whether runs of the densities end where their curve is flat. The likelihood of the few clips that minutes of
     motion spare for validation does not tell whether a density can be steered: the steps are then told beforehand."""
@@ -80,7 +80,7 @@ SETS: Mapping[str, WeightSet] = {
         copies=8,
         window=40,
         width=192,
-        live_width=192,
+        live_width=None,
         flat=False,
         share=0.4,
     ),
@@ -140,13 +140,12 @@ def _make_models(weights: WeightSet) -> tuple[BundledModel, ...]:
     density_end = {"until_flat": UntilFlat() if weights.flat else None}
     general = {**everything, **density_end, "match": weights.match}  # which a density's command always tells
     walks: dict[str, Any] = {**general, "match": weights.locomotion, "labels": weights.labels}
+    widths = {"locomotion": weights.width, "locomotion-live": weights.live_width}
     return (
-        BundledModel(
-            "locomotion", DensityRecipe(**walks, **_density(weights, width=weights.width, steps=weights.plan(10_000)))
-        ),
-        BundledModel(
-            "locomotion-live",
-            DensityRecipe(**walks, **_density(weights, width=weights.live_width, steps=weights.plan(10_000))),
+        *(
+            BundledModel(name, DensityRecipe(**walks, **_density(weights, width=width, steps=weights.plan(10_000))))
+            for name, width in widths.items()
+            if width is not None
         ),
         BundledModel(
             "general", DensityRecipe(**general, **_density(weights, width=weights.width, steps=weights.plan(12_000)))

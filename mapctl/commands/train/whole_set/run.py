@@ -21,7 +21,7 @@ def run(command: TrainAll) -> int:
     if sum((command.commands, command.check is not None, command.compare is not None)) > 1:
         raise RequestError("--commands, --check and --compare are asked for one at a time")
     if command.check is not None:
-        return _check(command.check)
+        return _check(command.check, command.weights)
     if command.compare is not None:
         return summary.print_comparison(*command.compare, percent=command.within)
     options.check_seed(command.seed)
@@ -67,9 +67,9 @@ def _conclude(out: Path, jobs: Sequence[Job], failed: dict[str, str]) -> int:
     return 0
 
 
-def _check(out: Path) -> int:
+def _check(out: Path, of: str) -> int:
     total = summary.print_set(summary.find_weights(out))
-    known = {name.name for name in list_models()}
+    known = {model.name for model in list_models(of)}
     lacking = sorted(known - set(summary.list_names(summary.find_weights(out))))
     if lacking:
         print(f"not there: {', '.join(lacking)}")
