@@ -125,6 +125,32 @@ def split_corpus(corpus: Corpus, seed: int) -> Split:
     return Split(*(corpus.subset(sorted(part)) for part in parts))
 
 
+def keep_share(corpus: Corpus, parts: Split, share: float, seed: int) -> tuple[Corpus, Split]:
+    """Keep a share of the clips that are trained on, and all that are held out, so that models of less motion are
+    measured on the same clips.
+
+    Clips are drawn with the seed, and those of a smaller share are among those of a larger one. At least one is kept;
+    RequestError for a share that is not above 0 and at most 1, and where only clips are left that are too short to warm
+    up on.
+    """
+    if not 0 < share <= 1:
+        raise RequestError(f"the share of the data must be above 0 and at most 1, got {share:g}")
+    if share == 1:
+        return corpus, parts
+    count = len(parts.train.names)
+    order = torch.randperm(count, generator=torch.Generator().manual_seed(seed)).tolist()
+    train = parts.train.subset(sorted(order[: max(1, round(share * count))]))
+    if (longest := max(train.lengths)) < MIN_CLIP_FRAMES:
+        raise RequestError(
+            f"{share:g} of the clips to train on are {len(train.names)}, of {longest} frames at {PRIOR_FPS} fps at"
+            f" most; one must reach {MIN_CLIP_FRAMES}"
+        )
+    dropped = set(parts.train.names) - set(train.names)
+    kept = corpus.subset(number for number, name in enumerate(corpus.names) if name not in dropped)
+    said = replace(kept, skipped=corpus.skipped, cuts=corpus.cuts, made=corpus.made)
+    return said, replace(parts, train=train)
+
+
 def _split_by_frames(corpus: Corpus) -> Split:
     at = corpus.lengths.index(longest := max(corpus.lengths))
     held = max(MIN_CLIP_FRAMES, round(0.1 * len(corpus.features)))

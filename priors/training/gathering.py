@@ -7,7 +7,7 @@ from pathlib import Path
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.formats.atomic import write_text
-from priors.training.corpus import Corpus, SkippedFile, Split, read_corpus, split_corpus
+from priors.training.corpus import Corpus, SkippedFile, Split, keep_share, read_corpus, split_corpus
 
 Progress = Callable[[str], None]
 """Called with one line of news."""
@@ -36,6 +36,8 @@ class DataSource:
     """Put every clip on the canonical body and a level floor."""
     seed: int = 1
     """Seed of the split into training and validation clips."""
+    share: float = 1.0
+    """Share of the training clips that are used (see `keep_share`)."""
 
 
 def gather(source: DataSource, *, progress: Progress, warn: Progress) -> tuple[Corpus, Split]:
@@ -59,7 +61,7 @@ def gather(source: DataSource, *, progress: Progress, warn: Progress) -> tuple[C
     )
     if source.strict and corpus.skipped:
         raise RequestError(f"--strict-data: {_list_skipped(corpus.skipped, source.data)}")
-    parts = split_corpus(corpus, source.seed)
+    corpus, parts = keep_share(corpus, split_corpus(corpus, source.seed), source.share, source.seed)
     if corpus.skipped:
         rest = f"; all are in {source.run / _SKIPPED_LIST}" if len(corpus.skipped) > _MOST_NAMED else ""
         of = len(corpus.names) + len(corpus.skipped)

@@ -126,6 +126,8 @@ class Recipe(ABC, Generic[C, S, T]):
     """Refuse a folder with a file that cannot be used, rather than leave the file out."""
     split: int | None = None
     """Seed by which clips are kept from training, where it is not that of all that is random."""
+    data_share: float = 1.0
+    """Share of the clips to train on that are used; the clips that are held out stay the same."""
     until_flat: UntilFlat | None = None
     """Train until the curve of validations is flat; the settings' steps are then a plan."""
     minutes: float | None = None
@@ -176,6 +178,7 @@ class Recipe(ABC, Generic[C, S, T]):
             cuts=self.cuts,
             level=self.level,
             seed=self.split_seed,
+            share=self.data_share,
         )
 
     @property
@@ -298,6 +301,7 @@ class Recipe(ABC, Generic[C, S, T]):
     def format_reading(self) -> list[str]:
         """The options for how clips are read, where they are not the defaults."""
         parts = ["--skip-first"] * self.skip_first + ["--level"] * self.level
+        parts += [] if self.data_share == 1 else [f"--data-share {self.data_share:g}"]
         return parts + ([f"--cuts {self.cuts.name}"] if self.cuts else [])
 
     def format_processes(self) -> list[str]:

@@ -55,6 +55,9 @@ class TrainOptions(ABC):
     """Seed of weights, windows, noise and the split of the clips."""
     split_seed: options.MaybeCount = None
     """Seed of the split of the clips alone, to compare runs of several seeds on the same unseen clips."""
+    data_share: options.Number = 1.0
+    """Share of the clips to train on that are used, drawn with the split's seed, to see what more motion would bring;
+    the clips that are held out stay the same."""
     minutes: options.MaybeNumber = None
     """Of one core, within which training ends as if it were finished; networks need --until-flat for it."""
     resume: bool = False
@@ -137,6 +140,8 @@ class TrainOptions(ABC):
         for seed in (self.seed, self.split_seed):
             if seed is not None:
                 options.check_seed(seed)
+        if not 0 < self.data_share <= 1:
+            raise RequestError(f"--data-share must be above 0 and at most 1, got {self.data_share:g}")
         if self.minutes is not None and not 0 < self.minutes < math.inf:
             raise RequestError(f"--minutes must be positive, got {self.minutes:g}")
         rate = getattr(self, "learning_rate", None)
@@ -162,6 +167,7 @@ class TrainOptions(ABC):
             "checkpoint_minutes": self.minutes_between_checkpoints,
             "strict_data": self.strict_data,
             "split": self.split_seed,
+            "data_share": self.data_share,
             "minutes": self.minutes,
             "licence": self.licence,
         }
