@@ -10,7 +10,7 @@ from helpers import generator, walk, walk_through
 from torch import Tensor
 
 from mapctl.metrics import realism
-from mapctl.metrics.realism.evidence import kinds, parts, paths
+from mapctl.metrics.realism.evidence import alone, kinds, parts, paths
 from mapctl.metrics.realism.windows import WindowSettings
 from mapctl.numerics.easing import smootherstep
 from mapctl.skeleton import CANONICAL
@@ -117,7 +117,7 @@ def hard_landings(clip: Tensor) -> Tensor:
     ],
 )
 def test_a_planted_cause_is_named_first(spoil, joint, band, kind):
-    four = replace(SETTINGS, classifier=replace(SETTINGS.classifier, folds=4))
+    four = replace(SETTINGS, classifier=replace(SETTINGS.classifier, folds=4, steps=300))
     found = explain([spoil(clip) for clip in clean()], clean(), settings=four if kind == "velocities" else SETTINGS)
     assert found.told_apart
     assert (found.joints[0].name, found.bands[0].name, found.inputs[0].name) == (joint, band, kind)
@@ -129,11 +129,11 @@ def test_a_planted_cause_is_named_first(spoil, joint, band, kind):
     assert found.joints[0].exchanged is not None
     assert found.joints[0].exchanged < 0.2  # each set's windows pass for the other's
     assert found.joints[1].exchanged is not None
-    assert found.joints[1].exchanged > 0.8
+    assert found.joints[1].exchanged > 0.6
     assert (found.moments[0].joint, found.moments[0].band) == (joint, band)
     (walking,) = found.gaits
     assert (walking.gait, walking.joint, walking.band) == ("walk", joint, band)
-    # the cause is there all the time, so that no moment of the step is named
+    # The cause is there all the time, so that no moment of the step is named
     assert max(abs(phase.times - 1) for phase in found.phases if phase.frames and phase.frames > 0.2) < 0.6
 
 
@@ -273,3 +273,15 @@ def test_the_body_lands_with_either_foot():
     feet = torch.tensor([[0, 0], [0, 2], [2, 2], [0, 1], [3, 1]])
     told = [kinds.BODY_PHASES[phase] for phase in kinds.join_foot_phases(feet).tolist()]
     assert told == ["on both feet", "on one foot", "in flight", "lift", "landing"]
+
+
+@pytest.mark.slow
+def test_what_a_group_tells_alone():
+    """The joint, the band and positions tell a lowered head alone, and others nothing."""
+    made = [lowered_head(clip) for clip in clean()]
+    found = alone.measure_alone(
+        made, clean(), windows=WINDOWS, classifier=replace(SETTINGS.classifier, steps=60), seed=1
+    )
+    assert set(found) == {*parts.BANDS, *parts.JOINTS, *paths.INPUTS}
+    assert min(found["head"], found["mean pose"], found["positions"]) > 0.9
+    assert max(found["leftHand"], found["3-6 Hz"], found["hips"]) < 0.7

@@ -19,6 +19,7 @@ from mapctl.metrics.realism.classifier import (
     judge_held_out,
 )
 from mapctl.metrics.realism.diversity import Diversity, average_pairwise_distance, measure_diversity
+from mapctl.metrics.realism.evidence.alone import GROUPS
 from mapctl.metrics.realism.evidence.explanation import Explanation, explain
 from mapctl.metrics.realism.evidence.gathering import EvidenceSettings
 from mapctl.metrics.realism.frechet import Basis, frechet_distance
@@ -170,17 +171,19 @@ class Judges:
         progress: Progress | None = None,
     ) -> Explanation:
         """Explain what the networks go by; `made` and `mocap` are the `canonical_positions` of the same clips."""
+        settings = settings or EvidenceSettings()
+        alone = len(GROUPS) if settings.alone_steps else 0
         return explain(
             self.folds,
             self.floor_folds,
             made,
             mocap,
             self.halves,
-            steps=self.settings.classifier.steps,
+            classifier=self.settings.classifier,
             windows=self.settings.windows,
-            settings=settings or EvidenceSettings(),
+            settings=settings,
             generator=generator,
-            tick=_make_tick(progress, self.settings.classifier.folds),
+            tick=_make_tick(progress, self.settings.classifier.folds + alone),
         )
 
 

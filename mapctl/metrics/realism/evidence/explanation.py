@@ -1,13 +1,14 @@
 """What gives made motion away: shares of joints, bands, inputs and moments in the verdict, and accuracy by gait."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mapctl.metrics.realism.classifier import HeldOutFold, average_verdicts, balanced_accuracy
+from mapctl.metrics.realism.classifier import ClassifierSettings, HeldOutFold, average_verdicts, balanced_accuracy
+from mapctl.metrics.realism.evidence.alone import measure_alone
 from mapctl.metrics.realism.evidence.gathering import EvidenceSettings, GatheredEvidence, gather_folds
 from mapctl.metrics.realism.evidence.kinds import BODY_PHASES, FOOT_PHASES, GAITS, classify_gaits, join_foot_phases
 from mapctl.metrics.realism.evidence.moments import Moment, is_leg, list_moments
@@ -93,7 +94,7 @@ def explain(
     mocap: Sequence[Float[Tensor, "_ joints 3"]],
     halves: tuple[Sequence[int], Sequence[int]],
     *,
-    steps: int,
+    classifier: ClassifierSettings,
     windows: WindowSettings,
     settings: EvidenceSettings,
     generator: torch.Generator,
@@ -107,6 +108,7 @@ def explain(
     section 10): made and mocap windows exchange it with that partner instead of any other window, so that what is
     exchanged fits. All is of windows that the network did not see.
     """
+    alone = _measure_alone(made, mocap, classifier, windows, settings, generator, tick)
     sides = gather_folds(folds, made, mocap, windows=windows, settings=settings, tick=tick)
     made_gaits, mocap_gaits = ([classify_gaits(clip, windows) for clip in clips] for clips in (made, mocap))
     judged = _judge(folds, [made_gaits, mocap_gaits])
@@ -115,13 +117,13 @@ def explain(
     low, high = torch.quantile(accuracies, torch.tensor([0.025, 0.975]).double()).tolist()
     above = accuracies - floors.clamp_min(0.5)
     return Explanation(
-        steps,
+        classifier.steps,
         average_verdicts(folds).accuracy,
         low,
         high,
         average_verdicts(floor_folds).accuracy,
         bool(torch.quantile(above, 0.025) > 0),
-        **_compute_tables(sides, generator),
+        **_compute_tables(sides, alone, generator),
         gaits=_compare_gaits(judged, floor, sides, generator),
         moments=list_moments(sides[0], settings.moments),
     )
@@ -148,7 +150,25 @@ def _draw_accuracies(sides: Sequence[JudgedWindows], generator: torch.Generator)
     return torch.stack([side.average(side.draw(generator))[:, 0] for side in by_clip]).mean(dim=0)
 
 
-def _compute_tables(sides: Sequence[GatheredEvidence], generator: torch.Generator) -> dict[str, list[Share]]:
+def _measure_alone(
+    made: Sequence[Tensor],
+    mocap: Sequence[Tensor],
+    classifier: ClassifierSettings,
+    windows: WindowSettings,
+    settings: EvidenceSettings,
+    generator: torch.Generator,
+    tick: Callable[[], None],
+) -> dict[str, float]:
+    """Measure accuracies by one group alone, where they are asked for."""
+    if not settings.alone_steps:
+        return {}
+    fewer, seed = replace(classifier, steps=settings.alone_steps), int(torch.randint(2**62, (1,), generator=generator))
+    return measure_alone(made, mocap, windows=windows, classifier=fewer, seed=seed, tick=tick)
+
+
+def _compute_tables(
+    sides: Sequence[GatheredEvidence], alone: Mapping[str, float], generator: torch.Generator
+) -> dict[str, list[Share]]:
     exchanged = [balanced_accuracy(*pair) for pair in zip(*(side.exchanged.T for side in sides), strict=True)]
     bands, joints = exchanged[: len(BANDS)], exchanged[len(BANDS) : -len(INPUTS)]
     cells = [f"{joint}, {band}" for band in BANDS for joint in JOINTS]
@@ -159,7 +179,7 @@ def _compute_tables(sides: Sequence[GatheredEvidence], generator: torch.Generato
 
     def share(names: Sequence[str], evidence: Sequence[Tensor], **more: Sequence[float]) -> list[Share]:
         groups = [Side.of(each, side.labels.clip) for each, side in zip(evidence, sides, strict=True)]
-        return compute_shares(names, groups, generator, **more)
+        return [replace(one, alone=alone.get(one.name)) for one in compute_shares(names, groups, generator, **more)]
 
     return {
         "joints": share(JOINTS, [side.evidence.cells.sum(dim=1) for side in sides], exchanged=joints),

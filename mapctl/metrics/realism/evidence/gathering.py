@@ -30,6 +30,8 @@ class EvidenceSettings:
     """Points of the way between the two where the gradient is taken."""
     moments: int = 10
     """Moments that are listed, at most."""
+    alone_steps: int = 0
+    """Training steps of networks that are given one group alone; 0 leaves them out."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -108,6 +108,11 @@ def join_parts(bones: Float[Tensor, "*batch frames_and_one joints 3"]) -> Float[
     return torch.cat([positions[..., 1:, :, :].flatten(-2), velocity.flatten(-2)], dim=-1)
 
 
+def join_bone(bone: Float[Tensor, "*batch frames_and_one 3"]) -> Float[Tensor, "*batch frames 6"]:
+    """Return the channels of one joint alone: its place from the joint above it (m), and its velocity from there."""
+    return torch.cat([bone[..., 1:, :], bone.diff(dim=-2) * PRIOR_FPS], dim=-1)
+
+
 def pull_back(
     gradient: Float[Tensor, "*batch frames channels"],
 ) -> tuple[Float[Tensor, "*batch frames joints 3"], Float[Tensor, "*batch frames joints 3"]]:
