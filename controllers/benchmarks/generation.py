@@ -46,11 +46,17 @@ class GenerationBenchmarkSettings:
 
 
 @dataclass(frozen=True)
-class _Variant:
+class Variant:
+    """A way of generating motion."""
+
     name: str
+    """Name in the table."""
     prior: Density
+    """Density that is drawn from."""
     refiner: Refiner | None
+    """Refiner of the draws; None leaves it out."""
     foot_cleanup: FootCleanupSettings | None
+    """Settings of the foot clean-up; None leaves it out."""
 
 
 def benchmark_generation(
@@ -76,8 +82,8 @@ def benchmark_generation(
         for kind, clips in kinds.items()
     ]
     spread = measure_gait_spread(mocap)
-    for variant in _list_variants(prior, refiner, densities or {}, refiners or {}):
-        clips, cost = _generate_clips(variant, settings)
+    for variant in list_variants(prior, refiner, densities or {}, refiners or {}):
+        clips, cost = _time_clips(variant, settings)
         for kind, kind_clips in _split_by_kind(clips, settings).items():
             rows.append(
                 {"motion": kind, "variant": variant.name, "clips": len(kind_clips), **_mean_measures(kind_clips)}
@@ -96,9 +102,9 @@ def benchmark_generation(
     return rows
 
 
-def _list_variants(
+def list_variants(
     prior: Density, refiner: Refiner | None, densities: Mapping[str, Density], refiners: Mapping[str, Refiner]
-) -> list[_Variant]:
+) -> list[Variant]:
     """Each density, and the prior with each refiner, without and with footing."""
     ours: dict[str, Refiner | None] = {"density": None}
     ours |= {} if refiner is None else {"density, refiner": refiner}
@@ -106,25 +112,32 @@ def _list_variants(
     made = [(name, prior, each) for name, each in ours.items()]
     made += [(name, each, None) for name, each in densities.items()]
     return [
-        _Variant(f"{name}{suffix}", density, each, footing)
+        Variant(f"{name}{suffix}", density, each, footing)
         for name, density, each in made
         for suffix, footing in (("", None), (", footing", FootCleanupSettings()))
     ]
 
 
-def _generate_clips(variant: _Variant, settings: GenerationBenchmarkSettings) -> tuple[list[Motion], float]:
+def _time_clips(variant: Variant, settings: GenerationBenchmarkSettings) -> tuple[list[Motion], float]:
     """Generate clips, and measure milliseconds of processor time a frame."""
-    variant_settings, clips = GenerateSettings(foot_cleanup=variant.foot_cleanup), []
-    starts = sample_stratified_starts(variant.prior, settings.count, torch.Generator().manual_seed(settings.seed))
     began = time.process_time()
-    for number, start in enumerate(starts):
-        own = replace(variant_settings, start=start)
-        clips.append(_generate_clip(variant, own, settings.seconds, settings.seed + number))
+    clips = generate_clips(variant, settings.count, settings.seconds, settings.seed)
     spent = time.process_time() - began
     return clips, 1000 * spent / sum(clip.num_frames for clip in clips)
 
 
-def _generate_clip(variant: _Variant, variant_settings: GenerateSettings, seconds: float, seed: int) -> Motion:
+def generate_clips(variant: Variant, count: int, seconds: float, seed: int) -> list[Motion]:
+    """Generate so many clips of a length from initial states that cover those of the prior; the seed is that of the
+    first clip."""
+    variant_settings = GenerateSettings(foot_cleanup=variant.foot_cleanup)
+    starts = sample_stratified_starts(variant.prior, count, torch.Generator().manual_seed(seed))
+    return [
+        _generate_clip(variant, replace(variant_settings, start=start), seconds, seed + number)
+        for number, start in enumerate(starts)
+    ]
+
+
+def _generate_clip(variant: Variant, variant_settings: GenerateSettings, seconds: float, seed: int) -> Motion:
     generator = torch.Generator().manual_seed(seed)
     return generate(
         variant.prior, seconds=seconds, generator=generator, settings=variant_settings, refiner=variant.refiner
@@ -136,7 +149,7 @@ def _compare_gait_spreads(clips: Sequence[Motion], data: Mapping[str, GaitSpread
     return {f"{name}_spread": ratio for name, ratio in spread_ratios(measure_gait_spread(clips), data).items()}
 
 
-def _measure_diversity(variant: _Variant, settings: GenerationBenchmarkSettings) -> Row:
+def _measure_diversity(variant: Variant, settings: GenerationBenchmarkSettings) -> Row:
     """Measure the average pairwise distance of samples from one initial state, mean over a few."""
     found, starts = [], len(variant.prior.initial_states.speed)
     for start in range(0, starts, max(1, starts // 4)):

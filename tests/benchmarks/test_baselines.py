@@ -58,9 +58,11 @@ def test_models_are_named_once():
             baselines.list_models("ours", twice)
 
 
-@pytest.mark.parametrize("table", ["free-run", "generation", "steer", "shots", "denoise", "infill", "tween", "gaps"])
+@pytest.mark.parametrize(
+    "table", ["free-run", "generation", "why", "steer", "shots", "denoise", "infill", "tween", "gaps"]
+)
 def test_tables_take_others_beside_their_own(table):
-    words = ["--data", "mocap"] if table in ("generation", "denoise", "infill", "tween", "gaps") else []
+    words = ["--data", "mocap"] if table in _WITH_DATA else []
     given = cli.parse(["bench", table, *words, "--baselines", "one,two"])
     assert isinstance(given, bench.TABLES[table])
     assert vars(given)["baselines"] == "one,two"
@@ -120,7 +122,7 @@ def test_inbetweeners_are_in_the_tables_by_kind(folder, capsys, monkeypatch):
 def test_densities_and_refiners_are_variants_by_their_names():
     prior, other = tiny_density(), tiny_density(seed=1)
     ours, theirs = refiner_of(), refiner_of()
-    found = generation._list_variants(prior, ours, {"b": other}, {"c": theirs})
+    found = generation.list_variants(prior, ours, {"b": other}, {"c": theirs})
     assert [(each.name, each.prior, each.refiner, each.foot_cleanup is not None) for each in found] == [
         ("density", prior, None, False),
         ("density, footing", prior, None, True),

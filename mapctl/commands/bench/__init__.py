@@ -96,6 +96,22 @@ class Generation(PriorTable, ComparedTable):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Why(Generation):
+    """What gives such motion away: joints, bands of frequency, moments of the step and gaits that classifiers go by."""
+
+    work = "mapctl.commands.bench.why"
+
+    seconds: options.Number = 10.0
+    """Length of each clip."""
+    steps: Annotated[str, arg(metavar="N,N,...")] = "400,2000"
+    """Training steps of the classifiers, a comparison for each; more make a stricter judge."""
+    variants: Annotated[str, arg(metavar="REGEX")] = "density(, footing)?"
+    """Variants of `mapctl bench generation` whose whole name fits."""
+    markdown: bool = False
+    """Print rows as a page's table in Markdown holds them."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Steer(PriorTable, ComparedTable):
     """Random commands: which are reached, and how soon; or places to reach in passing, and discs to walk round."""
 
@@ -321,6 +337,7 @@ TABLES: dict[str, type[Table]] = {
     "ablation": Ablation,
     "free-run": FreeRun,
     "generation": Generation,
+    "why": Why,
     "steer": Steer,
     "live": Live,
     "denoise": Denoise,

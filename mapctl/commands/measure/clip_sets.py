@@ -1,7 +1,7 @@
 """Folders of clips as sets to compare: read whole, with the files listed that cannot be used."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -25,6 +25,8 @@ SETTINGS = realism.RealismSettings()
 class _MeasuredClip:
     """One measured file of a folder."""
 
+    path: Path
+    """The file."""
     motion: Motion
     """Motion made comparable."""
     measures: dict[str, float]
@@ -44,7 +46,7 @@ class _MeasuredClip:
         if with_windows:
             positions = realism.canonical_positions(motion)
             windows = realism.cut_windows(positions, SETTINGS.windows)
-        return _MeasuredClip(motion, measures, positions, windows, [f"{path}: {note}" for note in notes])
+        return _MeasuredClip(path, motion, measures, positions, windows, [f"{path}: {note}" for note in notes])
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +55,8 @@ class ClipSet:
 
     folder: Path
     """Folder of the clips."""
+    names: list[str]
+    """Path of each clip below the folder."""
     motions: list[Motion]
     """Motions on canonical joints and at 30 frames/s at most, so that sets on different rigs compare (see
     `metrics.comparison`)."""
@@ -89,6 +93,7 @@ class ClipSet:
         positions, windows = [c.positions for c in clips if with_windows], [c.windows for c in clips if with_windows]
         return ClipSet(
             folder,
+            [clip.path.relative_to(folder).as_posix() for clip in clips],
             [clip.motion for clip in clips],
             _average_measures([clip.measures for clip in clips]),
             positions,
@@ -109,8 +114,9 @@ class ClipSet:
         return measure_position_diversity(torch.stack(pieces))
 
 
-def compare_realism(ours: ClipSet, reference: ClipSet, *, seed: int) -> realism.Realism:
-    """Compare our realism with the reference's; RequestError, which says what is left to do, for too few clips."""
+def train_judges(ours: ClipSet, reference: ClipSet, *, seed: int, steps: int | None) -> realism.Judges:
+    """Train networks that tell ours from the reference's, so many steps each or as many as by default; RequestError,
+    which says what is left to do, for too few clips."""
     fewest = SETTINGS.min_clips
     for clips in (ours, reference):
         if len(clips.motions) < fewest:
@@ -118,10 +124,27 @@ def compare_realism(ours: ClipSet, reference: ClipSet, *, seed: int) -> realism.
                 f"{clips.folder}: {len(clips.motions)} clips; a comparison needs at least {fewest} in each folder"
                 f"{_describe_skipped(clips)} (without --reference a folder of any size is measured)"
             )
+    classifier = SETTINGS.classifier if steps is None else replace(SETTINGS.classifier, steps=steps)
     generator = torch.Generator().manual_seed(seed)
     with show_progress("telling apart") as progress:
-        return realism.measure_window_realism(
-            ours.windows, reference.windows, generator=generator, settings=SETTINGS, progress=progress
+        return realism.train_judges(
+            ours.windows,
+            reference.windows,
+            generator=generator,
+            settings=replace(SETTINGS, classifier=classifier),
+            progress=progress,
+        )
+
+
+def explain_verdicts(
+    judges: realism.Judges, ours: ClipSet, reference: ClipSet, *, seed: int, alone: bool
+) -> realism.Explanation:
+    """Explain what the networks go by; with `alone` also what each group tells alone."""
+    settings = realism.EvidenceSettings(alone_steps=SETTINGS.classifier.steps if alone else 0)
+    generator = torch.Generator().manual_seed(seed)
+    with show_progress("finding out why") as progress:
+        return judges.explain(
+            ours.positions, reference.positions, generator=generator, settings=settings, progress=progress
         )
 
 

@@ -10,8 +10,18 @@ import torch
 from torch import Tensor
 
 from mapctl.errors import RequestError
-from mapctl.metrics.realism.classifier import ClassifierSettings, HeldOutVerdict, judge_held_out
+from mapctl.metrics.realism.classifier import (
+    ClassifierSettings,
+    HeldOutFold,
+    HeldOutVerdict,
+    average_verdicts,
+    judge_folds,
+    judge_held_out,
+)
 from mapctl.metrics.realism.diversity import Diversity, average_pairwise_distance, measure_diversity
+from mapctl.metrics.realism.evidence.alone import GROUPS
+from mapctl.metrics.realism.evidence.explanation import Explanation, explain
+from mapctl.metrics.realism.evidence.gathering import EvidenceSettings
 from mapctl.metrics.realism.frechet import Basis, frechet_distance
 from mapctl.metrics.realism.gait import GaitSpread, measure_gait_spread, spread_ratios
 from mapctl.metrics.realism.windows import WindowSettings, canonical_positions, cut_windows
@@ -21,8 +31,11 @@ from mapctl.runtime.progress import Progress
 __all__ = [
     "ClassifierSettings",
     "Diversity",
+    "EvidenceSettings",
+    "Explanation",
     "GaitSpread",
     "HeldOutVerdict",
+    "Judges",
     "Realism",
     "RealismSettings",
     "WindowSettings",
@@ -35,6 +48,7 @@ __all__ = [
     "measure_realism",
     "measure_window_realism",
     "spread_ratios",
+    "train_judges",
 ]
 
 
@@ -110,26 +124,92 @@ def measure_window_realism(
     progress: Progress | None = None,
 ) -> Realism:
     """Measure realism from `cut_windows` of each clip, (windows, frames, channels); RequestError for too few clips."""
+    return train_judges(made, mocap, generator=generator, settings=settings, progress=progress).summarise()
+
+
+@dataclass(frozen=True, eq=False)
+class Judges:
+    """Networks trained to tell made windows from mocap's, and one half of mocap's clips from the other."""
+
+    made: Sequence[Tensor]
+    """Windows of each made clip, (windows, frames, channels)."""
+    mocap: Sequence[Tensor]
+    """Windows of each mocap clip."""
+    halves: tuple[list[int], list[int]]
+    """Indices of the mocap clips in either half."""
+    folds: Sequence[HeldOutFold]
+    """Networks that tell made (first) from mocap."""
+    floor_folds: Sequence[HeldOutFold]
+    """Networks that tell the halves apart."""
+    settings: RealismSettings
+    """Settings of their training."""
+
+    def summarise(self) -> Realism:
+        """Compute the figures of realism."""
+        verdict, floor = average_verdicts(self.folds), average_verdicts(self.floor_folds)
+        halves = [[self.mocap[i] for i in half] for half in self.halves]
+        basis = Basis.of(torch.cat(list(self.mocap)), self.settings.dims)
+        points = [basis.project(torch.cat(list(clips))) for clips in (self.made, self.mocap, *halves)]
+        return Realism(
+            verdict.accuracy,
+            floor.accuracy,
+            verdict.preferred,
+            floor.preferred,
+            frechet_distance(points[0], points[1]),
+            frechet_distance(points[2], points[3]),
+            made_windows=len(points[0]),
+            mocap_windows=len(points[1]),
+        )
+
+    def explain(
+        self,
+        made: Sequence[Tensor],
+        mocap: Sequence[Tensor],
+        *,
+        generator: torch.Generator,
+        settings: EvidenceSettings | None = None,
+        progress: Progress | None = None,
+    ) -> Explanation:
+        """Explain what the networks go by; `made` and `mocap` are the `canonical_positions` of the same clips."""
+        settings = settings or EvidenceSettings()
+        alone = len(GROUPS) if settings.alone_steps else 0
+        return explain(
+            self.folds,
+            self.floor_folds,
+            made,
+            mocap,
+            self.halves,
+            classifier=self.settings.classifier,
+            windows=self.settings.windows,
+            settings=settings,
+            generator=generator,
+            tick=_make_tick(progress, self.settings.classifier.folds + alone),
+        )
+
+
+def train_judges(
+    made: Sequence[Tensor],
+    mocap: Sequence[Tensor],
+    *,
+    generator: torch.Generator,
+    settings: RealismSettings = RealismSettings(),
+    progress: Progress | None = None,
+) -> Judges:
+    """Train networks on `cut_windows` of each clip, (windows, frames, channels); RequestError for too few clips."""
     _check_counts(len(made), len(mocap), settings)
     seeds = torch.randint(2**62, (2,), generator=generator).tolist()
     shuffled, ours = (torch.Generator().manual_seed(seed) for seed in seeds)
     order = torch.randperm(len(mocap), generator=shuffled).tolist()
-    halves = [mocap[i] for i in order[::2]], [mocap[i] for i in order[1::2]]
+    halves = order[::2], order[1::2]
     tick = _make_tick(progress, 2 * settings.classifier.folds)
-    floor = judge_held_out(*halves, generator=shuffled, settings=settings.classifier, tick=tick)
-    verdict = judge_held_out(made, mocap, generator=ours, settings=settings.classifier, tick=tick)
-    basis = Basis.of(torch.cat(list(mocap)), settings.dims)
-    points = [basis.project(torch.cat(list(clips))) for clips in (made, mocap, *halves)]
-    return Realism(
-        verdict.accuracy,
-        floor.accuracy,
-        verdict.preferred,
-        floor.preferred,
-        frechet_distance(points[0], points[1]),
-        frechet_distance(points[2], points[3]),
-        made_windows=len(points[0]),
-        mocap_windows=len(points[1]),
-    )
+    folds: list[list[HeldOutFold]] = []
+    first, second = ([mocap[i] for i in half] for half in halves)
+    for sets, drawn in (((first, second), shuffled), ((made, mocap), ours)):
+        folds.append([])
+        for fold in judge_folds(*sets, generator=drawn, settings=settings.classifier):
+            folds[-1].append(fold)
+            tick()
+    return Judges(made, mocap, halves, folds[1], folds[0], settings)
 
 
 def _check_counts(made: int, mocap: int, settings: RealismSettings) -> None:

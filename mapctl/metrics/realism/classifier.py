@@ -70,31 +70,62 @@ def judge_held_out(
     settings: ClassifierSettings = ClassifierSettings(),
     tick: Callable[[], None] = lambda: None,
 ) -> HeldOutVerdict:
-    """Let networks learn to tell two sets apart, and judge clips that they did not see.
+    """Let networks learn to tell two sets apart, and judge clips that they did not see: the mean of `judge_folds`.
+
+    `tick` is called after each fold. RequestError for sets of fewer clips than folds.
+    """
+    folds = []
+    for fold in judge_folds(first, second, generator=generator, settings=settings):
+        folds.append(fold)
+        tick()
+    return average_verdicts(folds)
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOutFold:
+    """A network, and what it says of the clips that were held out from its training."""
+
+    network: nn.Module
+    """Network in evaluation mode: windows (batch, frames, channels) to logits, positive for the first set."""
+    clips: tuple[list[int], list[int]]
+    """Indices of the held-out clips in the first and in the second set."""
+    logits: tuple[Float[Tensor, " first"], Float[Tensor, " second"]]
+    """Logits of these clips' windows, clip after clip."""
+
+
+def judge_folds(
+    first: Sequence[Float[Tensor, "_ frames channels"]],
+    second: Sequence[Float[Tensor, "_ frames channels"]],
+    *,
+    generator: torch.Generator,
+    settings: ClassifierSettings = ClassifierSettings(),
+) -> Iterator[HeldOutFold]:
+    """Train a network for each fold, and yield it with its logits of the clips that it did not see.
 
     Each set is a list of clips' windows. Folds are by clip, for windows of one clip overlap. The same generator state
-    gives the same bits; torch's global generator and thread count are left as they were. `tick` is called after each
-    fold. RequestError for sets of fewer clips than folds.
+    gives the same bits; torch's global generator and thread count are left as they were. RequestError for sets of fewer
+    clips than folds.
     """
     if min(len(first), len(second)) < settings.folds:
         raise RequestError(f"{settings.folds} folds need as many clips in each set, got {len(first)} and {len(second)}")
-    sets = [_split_folds(clips, settings.folds, generator) for clips in (first, second)]
-    scores, shares = [], []
+    sets = [(clips, torch.randperm(len(clips), generator=generator).tolist()) for clips in (first, second)]
     for fold in range(settings.folds):
-        training = [torch.cat([part for k, part in enumerate(parts) if k != fold]) for parts in sets]
+        others = [k for k in range(settings.folds) if k != fold]
+        training = [torch.cat([clips[i] for k in others for i in order[k :: settings.folds]]) for clips, order in sets]
+        held_out = [torch.cat([clips[i] for i in order[fold :: settings.folds]]) for clips, order in sets]
         with _isolate_torch(generator):
             network = _train_network(training, settings)
-            logits = [_score(network, parts[fold]) for parts in sets]
-        scores.append(_balanced_accuracy(*logits))
-        shares.append(_share_preferred(*logits))
-        tick()
-    return HeldOutVerdict(sum(scores) / len(scores), sum(shares) / len(shares))
+            told = [score(network, windows) for windows in held_out]
+        first_clips, second_clips = (order[fold :: settings.folds] for _, order in sets)
+        yield HeldOutFold(network, (first_clips, second_clips), (told[0], told[1]))
 
 
-def _split_folds(clips: Sequence[Tensor], folds: int, generator: torch.Generator) -> list[Tensor]:
-    """Deal the windows of clips out to folds in a random order."""
-    order = torch.randperm(len(clips), generator=generator).tolist()
-    return [torch.cat([clips[i] for i in order[fold::folds]]) for fold in range(folds)]
+def average_verdicts(folds: Sequence[HeldOutFold]) -> HeldOutVerdict:
+    """Average what networks say of the clips that they did not see over folds."""
+    accuracy, preferred = (
+        sum(measure(*fold.logits) for fold in folds) / len(folds) for measure in (balanced_accuracy, _share_preferred)
+    )
+    return HeldOutVerdict(accuracy, preferred)
 
 
 @contextmanager
@@ -149,11 +180,13 @@ def _train_network(sets: Sequence[Float[Tensor, "_ frames channels"]], settings:
 
 
 @torch.no_grad()
-def _score(network: nn.Module, windows: Float[Tensor, "windows frames channels"]) -> Float[Tensor, " windows"]:
+def score(network: nn.Module, windows: Float[Tensor, "windows frames channels"]) -> Float[Tensor, " windows"]:
+    """Return the logits of windows, positive for the first set, a few hundred windows at a time."""
     return torch.cat([network(part) for part in windows.split(512)])
 
 
-def _balanced_accuracy(first: Float[Tensor, " first"], second: Float[Tensor, " second"]) -> float:
+def balanced_accuracy(first: Float[Tensor, " first"], second: Float[Tensor, " second"]) -> float:
+    """Return the mean over both sets of the share of windows whose logit names their own set."""
     return (float((first > 0).double().mean()) + 1 - float((second > 0).double().mean())) / 2
 
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from mapctl import retarget, rotations
@@ -61,12 +61,20 @@ def cut_windows(
     `positions` are those of `canonical_positions`. A window is relative to the hips' ground projection and facing in
     the frame before its first. RequestError for a clip shorter than one window.
     """
+    frames, ground, angle = find_window_frames(positions, settings)
+    relative = transform_to_ground_frame(positions[frames], ground, angle)
+    velocity = relative.diff(dim=1) * PRIOR_FPS
+    return torch.cat([relative[:, 1:].flatten(2), velocity.flatten(2)], dim=-1).float()
+
+
+def find_window_frames(
+    positions: Float[Tensor, "clip_frames joints 3"], settings: WindowSettings
+) -> tuple[Int[Tensor, "windows frames_and_one"], Float[Tensor, "windows 1 2"], Float[Tensor, "windows 1"]]:
+    """Find the frames of each window of a clip, the one before it first, with the hips' ground projection (m) and
+    facing (radians) in that one. RequestError for a clip shorter than one window."""
     needed = settings.frames + 1
     if len(positions) < needed:
         raise RequestError(f"{len(positions)} frames at {PRIOR_FPS} fps; a window needs at least {needed}")
     starts = torch.arange(0, len(positions) - settings.frames, settings.step)
-    pieces = positions[starts[:, None] + torch.arange(needed)]
-    first = positions[starts, HIPS, ::2], facing_angle(positions)[starts]
-    relative = transform_to_ground_frame(pieces, first[0].unsqueeze(1), first[1].unsqueeze(1))
-    velocity = relative.diff(dim=1) * PRIOR_FPS
-    return torch.cat([relative[:, 1:].flatten(2), velocity.flatten(2)], dim=-1).float()
+    ground, angle = positions[starts, HIPS, ::2], facing_angle(positions)[starts]
+    return starts[:, None] + torch.arange(needed), ground.unsqueeze(1), angle.unsqueeze(1)

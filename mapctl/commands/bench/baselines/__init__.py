@@ -3,9 +3,12 @@
 import re
 from collections.abc import Callable, Mapping, Sequence
 
+import priors
 from controllers.benchmarks.shared.tables import Row
 from mapctl.errors import RequestError
 from priors.checkpoints import Card
+from priors.lstm_gmm.density import LstmGmmDensity
+from priors.refiner.network import LstmRefiner
 
 
 def list_models(own: str, baselines: str) -> list[str]:
@@ -42,6 +45,20 @@ def check_unseen(name: str, card: Card, held_out: Mapping[str, Sequence[str]]) -
         raise RequestError(
             f"{name} was trained on {seen[0]}, which is kept for measuring; train it with that seed on the same files"
         )
+
+
+def load_generators(
+    own: str, baselines: str
+) -> tuple[LstmGmmDensity, Mapping[str, Sequence[str]], dict[str, LstmGmmDensity], dict[str, LstmRefiner]]:
+    """Load the density that a table is about, with the clips it kept from training, and by name the other densities and
+    refiners to compare; RequestError where a density has seen some of these clips."""
+    prior, others = priors.load(own), list_models(own, baselines)[1:]
+    held_out = prior.card.data.get("held_out", {})
+    refiners = [name for name in others if priors.find_kind(name) == "refiner"]
+    densities = {name: priors.load(name) for name in others if name not in refiners}
+    for name, density in densities.items():
+        check_unseen(name, density.card, held_out)
+    return prior, held_out, densities, {name: priors.load_refiner(name) for name in refiners}
 
 
 def measure_each(names: Sequence[str], measure: Callable[[str], Sequence[Row]]) -> list[Row]:
