@@ -58,9 +58,10 @@ def test_models_are_named_once():
             baselines.list_models("ours", twice)
 
 
-@pytest.mark.parametrize(
-    "table", ["free-run", "generation", "why", "steer", "shots", "denoise", "infill", "tween", "gaps"]
-)
+_WITH_DATA = ("generation", "why", "denoise", "infill", "tween", "gaps")
+
+
+@pytest.mark.parametrize("table", ["free-run", "steer", "shots", *_WITH_DATA])
 def test_tables_take_others_beside_their_own(table):
     words = ["--data", "mocap"] if table in _WITH_DATA else []
     given = cli.parse(["bench", table, *words, "--baselines", "one,two"])

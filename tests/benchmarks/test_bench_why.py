@@ -15,12 +15,12 @@ from mapctl.metrics.realism.evidence.kinds import GAITS
 from priors import checkpoints
 
 QUICK = RealismSettings(classifier=ClassifierSettings(folds=2, width=8, batch=32, learning_rate=3e-3))
-SETTINGS = why.WhyBenchmarkSettings(count=4, seconds=2.0, steps=(2, 40), realism=QUICK)
+SETTINGS = why.WhyBenchmarkSettings(count=8, seconds=2.0, steps=(2, 40), realism=QUICK)
 
 
 @pytest.fixture(scope="module")
 def mocap():
-    return [walk(62, cadence=0.8 + 0.05 * k, seed=k) for k in range(4)]
+    return [walk(62, cadence=0.8 + 0.05 * k, seed=k) for k in range(8)]
 
 
 @pytest.fixture
@@ -44,8 +44,12 @@ def test_each_variant_is_compared_at_each_number_of_steps(mocap):
     assert strict["low"] <= strict["told_apart"] <= strict["high"]
     rows = [row for row in parts["gaits"] if row["steps"] == 40]
     assert {row["gait"] for row in rows} <= set(GAITS)
-    assert sum(row["mocap_windows"] for row in rows) == 4 * 4
-    assert parts["joints"]
+    assert sum(row["mocap_windows"] for row in rows) == 8 * 4
+    assert strict["above_floor"]
+    named = [row for name in why.SHARES for row in parts[name]]
+    assert named
+    assert {row["steps"] for row in named} == {40}
+    assert all(row["low"] > 0 for row in named)
     assert len(parts["cells"]) <= 16
 
 
