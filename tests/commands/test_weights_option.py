@@ -35,8 +35,7 @@ from priors import weight_sets
 from scenes.live.app import LiveApp
 
 NOT_FREE = "CC BY-NC 4.0"
-BUNDLED = weight_sets.list_models("free")
-"""Models that the free set really has: what commands do without others is what a user sees."""
+BUNDLED = weight_sets.list_models("free")  # so that tests see what a user sees without the others
 SCENE = 'outputs = ["a.npz", "a.json"]\n[[actors]]\ncurve = "line:0.5"\n'
 KEYS = 'body = "in.bvh"\n[[key]]\nframe = 0\npose = "in.bvh"\n[[key]]\nframe = 12\npose = "in.bvh"\npose_frame = 12\n'
 
@@ -228,8 +227,8 @@ def test_what_the_free_set_lacks_is_refused_in_one_line(both, fails):
             (both / "weights" / "free" / f"{name}.{ending}").unlink()
     for words in (("infill", "in.bvh", "-o", "o.bvh", "--gap", "10:20"), ("denoise", "in.bvh", "-o", "o.bvh")):
         assert "the free weights have no 'transformer': they hold denoiser, " in fails(*words, "--weights", "free")
-    told = fails("infill", "in.bvh", "-o", "o.bvh", "--gap", "10:20", "--method", "tweener", "--weights", "free")
-    assert "the free weights have no 'tweener': they hold denoiser, " in told
+    words = ("infill", "in.bvh", "-o", "o.bvh", "--gap", "10:20", "--method", "tweener", "--weights", "free")
+    assert "the free weights have no 'tweener': they hold denoiser, " in fails(*words)
     assert "no 'general'" in fails("follow", "line:1", "-o", "o.bvh", "--weights", "free", "--prior", "general")
 
 
