@@ -93,6 +93,8 @@ def shorten(line: str) -> list[str]:
             tiny.clear()  # the bundled one is small, and without the MAP stage no density is asked
         if word == "--method" and words[place + 1] == "stitcher" and "--no-finish" in words:
             tiny.clear()  # likewise
+    if name == "measure" and "--why" in words:
+        words += ["--steps", "5"]
     if name == "measure" and "--curve" not in words:
         tiny.clear()
     return [*words, *(part for option in tiny.items() for part in option)]

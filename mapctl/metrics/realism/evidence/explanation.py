@@ -68,7 +68,7 @@ class Explanation:
     floor: float
     """The same accuracy for the halves of the mocap."""
     told_apart: bool
-    """Whether made motion is told apart more often than the halves; if not, shares are of chance and name no cause."""
+    """Whether that interval lies above both the floor and one half; if not, shares are of chance and name no cause."""
     joints: list[Share]
     """Shares by joint, each from the joint above it."""
     bands: list[Share]
@@ -113,16 +113,15 @@ def explain(
     made_gaits, mocap_gaits = ([classify_gaits(clip, windows) for clip in clips] for clips in (made, mocap))
     judged = _judge(folds, [made_gaits, mocap_gaits])
     floor = _judge(floor_folds, [[mocap_gaits[clip] for clip in half] for half in halves])
-    accuracies, floors = (_draw_accuracies(pair, generator) for pair in (judged, floor))
-    low, high = torch.quantile(accuracies, torch.tensor([0.025, 0.975]).double()).tolist()
-    above = accuracies - floors.clamp_min(0.5)
+    low, high = torch.quantile(_draw_accuracies(judged, generator), torch.tensor([0.025, 0.975]).double()).tolist()
+    floor_accuracy = average_verdicts(floor_folds).accuracy
     return Explanation(
         classifier.steps,
         average_verdicts(folds).accuracy,
         low,
         high,
-        average_verdicts(floor_folds).accuracy,
-        bool(torch.quantile(above, 0.025) > 0),
+        floor_accuracy,
+        low > max(floor_accuracy, 0.5),
         **_compute_tables(sides, alone, generator),
         gaits=_compare_gaits(judged, floor, sides, generator),
         moments=list_moments(sides[0], settings.moments),
