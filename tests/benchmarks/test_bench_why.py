@@ -7,8 +7,7 @@ import pytest
 from helpers import run, tiny_density, walk
 from tiny_prior import save_tiny_prior
 
-from controllers.benchmarks import why
-from controllers.benchmarks.generation import list_variants
+from controllers.benchmarks.generation import list_variants, why
 from mapctl.errors import RequestError
 from mapctl.metrics.realism import ClassifierSettings, RealismSettings
 from mapctl.metrics.realism.evidence.kinds import GAITS
@@ -62,7 +61,7 @@ def test_variants_and_sizes_are_chosen(prior, capsys, monkeypatch):
         about = {"clips": len(mocap), "count": settings.count, "seconds": settings.seconds, "steps": settings.steps}
         return {"accuracy": [{"variant": each.name, **about} for each in variants], "gaits": []}
 
-    monkeypatch.setattr("mapctl.commands.bench.why.benchmark_why", measure)
+    monkeypatch.setattr("mapctl.commands.bench.generation.why.benchmark_why", measure)
     sizes = ["--count", 9, "--seconds", 3, "--steps", "5,6", "--json"]
     assert run(*run_bench(prior, *sizes)) == 0
     told = json.loads(capsys.readouterr().out)

@@ -99,7 +99,7 @@ class Generation(PriorTable, ComparedTable):
 class Why(Generation):
     """What gives such motion away: joints, bands of frequency, moments of the step and gaits that classifiers go by."""
 
-    work = "mapctl.commands.bench.why"
+    work = "mapctl.commands.bench.generation.why"
 
     seconds: options.Number = 10.0
     """Length of each clip."""

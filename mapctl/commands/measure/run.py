@@ -9,8 +9,8 @@ from mapctl import editing, formats, metrics, report, retarget
 from mapctl.commands.measure import Measure
 from mapctl.commands.measure.clip_sets import ClipSet, compare_variability, explain_verdicts, train_judges
 from mapctl.commands.shared import inputs, options, outputs
-from mapctl.commands.shared.explanations import print_explanation, summarise_explanation
 from mapctl.commands.shared.tables import format_cell, print_table
+from mapctl.commands.shared.tables.explanations import print_explanation, summarise_explanation
 from mapctl.curves.curve import Curve
 from mapctl.errors import CheckpointError, RequestError
 from mapctl.metrics.comparison import make_comparable

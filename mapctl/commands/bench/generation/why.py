@@ -4,8 +4,8 @@ import re
 
 import priors
 from controllers.benchmarks.generation import Variant, list_variants
+from controllers.benchmarks.generation.why import WhyBenchmarkSettings, benchmark_why
 from controllers.benchmarks.shared.held_out import load_held_out
-from controllers.benchmarks.why import WhyBenchmarkSettings, benchmark_why
 from mapctl.commands.bench import Why
 from mapctl.commands.bench.baselines import load_generators
 from mapctl.commands.bench.output import print_parts
