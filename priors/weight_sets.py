@@ -93,6 +93,7 @@ def find_file(name: str) -> Path | None:
 
 
 def _find_model(weights: str, model: str) -> str | None:
+    """Find which model of a set serves under a name: its own, else its stand-in; None where the set has neither."""
     there = list_models(weights)
     return next((each for each in (model, STAND_INS.get(model)) if each in there), None)
 
