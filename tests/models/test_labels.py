@@ -14,7 +14,6 @@ from priors.lstm_gmm import labels
 from priors.lstm_gmm.density import LstmGmmDensity
 from priors.lstm_gmm.labels import Labels
 from priors.lstm_gmm.network import LstmGmm, LstmGmmConfig
-from priors.training.corpus import Corpus
 from priors.training.initial_states import select_initial_states
 from priors.training.moment_matching import MatchingSettings
 from priors.training.recipes.lstm_gmm import DensityTrainer, TrainingSettings, compute_feature_statistics
@@ -148,15 +147,3 @@ def test_the_fast_path_is_told_too():
     plan = told.reference.plan(state, noise)
     fast, reference = (engine.rollout(state, noise, plan)[0] for engine in (told, told.reference))
     torch.testing.assert_close(fast, reference, rtol=1e-4, atol=1e-5)
-
-
-def test_starts_weigh_as_much_as_the_data_has_of_their_speed():
-    data, model = corpus(5), told_network()
-    found = select_initial_states(model, data, count=5, generator=generator())
-    assert float(found.weight.sum()) == pytest.approx(1)
-    assert found.weight.tolist() == pytest.approx([0.2] * 5)  # each walk has a speed of its own, and all are as long
-    longer = Corpus(
-        data.names, (*data.lengths[:-1], data.lengths[-1] + 100), torch.cat([data.features, data.features[-100:]])
-    )
-    weight = select_initial_states(model, longer, count=5, generator=generator()).weight
-    assert sorted(weight.tolist()) == pytest.approx([1 / 6] * 4 + [2 / 6])

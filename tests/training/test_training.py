@@ -8,16 +8,15 @@ from functools import partial
 
 import pytest
 import torch
-from helpers import Killed, corpus, generator, walk, write_corpus
+from helpers import Killed, corpus, walk, write_corpus
 from safetensors.torch import load_file, save_file
 
 import priors
 from mapctl.errors import CheckpointError, MapctlError, RequestError
-from mapctl.features import LAYOUT, encode, ground_speed, mirror_features
+from mapctl.features import LAYOUT, encode, mirror_features
 from mapctl.metrics.states import summarise_states
 from priors.lstm_gmm.network import LstmGmmConfig
 from priors.training import corpus as corpora
-from priors.training import initial_states
 from priors.training.quality import density as density_quality
 from priors.training.recipes.lstm_gmm import (
     PAPER,
@@ -311,29 +310,6 @@ def test_statistics_are_symmetric_and_floored():
     assert float(std.min()) >= 0.001
     assert bool((mean[LAYOUT.continuous :] == 0.5).all())
     assert bool((std[LAYOUT.continuous :] == 0.5).all())
-
-
-def test_starts_are_the_states_after_stretches_of_clips():
-    data = corpus()
-    trainer = DensityTrainer(TINY, SETTINGS, data)
-    found = initial_states.select_initial_states(trainer.network, data, count=3, generator=generator())
-    assert len(set(found.names)) == 3
-    clips = dict(zip(data.names, data.clips(), strict=True))
-    for row, name in enumerate(found.names):
-        clip = clips[name]
-        end = 1 + int((clip == found.state.last_frame[row]).all(-1).nonzero()[0])
-        expected = trainer.network.advance(trainer.network.start_after(clip[:1]), clip[None, 1:end])
-        torch.testing.assert_close(found.state.hidden[:, row], expected.hidden[:, 0])
-        assert float(found.speed[row]) == pytest.approx(float(ground_speed(clip[end - 30 : end]).mean()), rel=1e-5)
-
-
-def test_abilities_are_the_speeds_and_turns_of_the_data():
-    found = initial_states.measure_data_limits(corpus())
-    speeds = [float(ground_speed(clip).mean()) for clip in corpus().clips()]
-    assert min(speeds) * 0.9 < found.slowest < found.fastest < max(speeds) * 1.05
-    assert found.turn_rate == pytest.approx(0.3, abs=0.05)
-    still = corpora.Corpus(("still",), (80,), torch.zeros(80, LAYOUT.size))
-    assert initial_states.measure_data_limits(still).turn_rate == 0
 
 
 def test_free_runs_are_compared_with_the_data():

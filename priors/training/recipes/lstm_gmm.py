@@ -346,8 +346,8 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
     def export(self, trainer: DensityTrainer, gathered: Gathered, curve: Sequence[Row]) -> Export:
         """The network with moments to start from, and what the data show to be possible."""
         model, corpus, parts = trainer.network.cpu().eval(), gathered.corpus, gathered.parts
-        seeded = torch.Generator().manual_seed(self.settings.seed)
-        found = select_initial_states(model, parts.train, count=self.starts, generator=seeded)
+        known, seeded = labels.read(parts.train.names, self.labels), torch.Generator().manual_seed(self.settings.seed)
+        found = select_initial_states(model, parts.train, count=self.starts, generator=seeded, labels=known.held)
         data = {
             "clips": len(corpus.names),
             "frames": len(corpus.features),
