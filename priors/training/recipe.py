@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from mapctl.errors import CheckpointError, RequestError
+from mapctl.features import PRIOR_FPS
 from priors import checkpoints
 from priors.config import NetworkConfig, require_at_least
 from priors.training.corpus import Corpus, Split
@@ -56,6 +57,11 @@ class Gathered:
     def held_out(self) -> dict[str, list[str]]:
         """For a card: the clips that training does not see."""
         return {"validation": list(self.parts.validation.names), "test": list(self.parts.test.names)}
+
+    def describe_training(self) -> dict[str, float]:
+        """For a card: how much motion training sees."""
+        train = self.parts.train
+        return {"clips": len(train.names), "minutes": round(len(train.features) / PRIOR_FPS / 60, 2)}
 
 
 @dataclass(frozen=True)

@@ -250,7 +250,7 @@ class TrainingRun(Generic[C, S, T]):
             kind=recipe.kind,
             config=recipe.find_shape(self.trainer).as_card(),
             licence=recipe.licence,
-            data=made.data,
+            data={**made.data, "trained_on": self.gathered.describe_training()},
             training=training | ({"extended": self.extended} if self.extended else {}) | self.course.as_card(),
             quality=made.quality,
             abilities=made.abilities,

@@ -139,6 +139,7 @@ def test_a_run_on_a_share_of_the_data_says_so_and_is_measured_on_the_same_clips(
     assert half["data"]["held_out"] == whole["data"]["held_out"]
     assert int(half["data"]["clips"]) < int(whole["data"]["clips"])
     assert "--data-share 0.5" in half["training"]["command"]
+    assert 0.3 < half["data"]["trained_on"]["minutes"] / whole["data"]["trained_on"]["minutes"] < 0.7
     assert "--data-share" not in whole["training"]["command"]
     words = ("train", "keyframe-timing", "--data", str(data), "-o", str(tmp_path / "none"))
     assert "--data-share must be above 0 and at most 1, got 0" in fails(*words, "--data-share", "0")

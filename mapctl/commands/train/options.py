@@ -140,8 +140,7 @@ class TrainOptions(ABC):
         for seed in (self.seed, self.split_seed):
             if seed is not None:
                 options.check_seed(seed)
-        if not 0 < self.data_share <= 1:
-            raise RequestError(f"--data-share must be above 0 and at most 1, got {self.data_share:g}")
+        check_share(self.data_share)
         if self.minutes is not None and not 0 < self.minutes < math.inf:
             raise RequestError(f"--minutes must be positive, got {self.minutes:g}")
         rate = getattr(self, "learning_rate", None)
@@ -265,3 +264,9 @@ def _parse_decay(text: str) -> tuple[int, int]:
     if not (begin.isdecimal() and steps.isdecimal()):
         raise RequestError(f"--decay-from is STEP:STEPS, as 8000:2000, got {text!r}")
     return int(begin), int(steps)
+
+
+def check_share(share: float) -> None:
+    """RequestError for a share of the clips that is not above 0 and at most 1."""
+    if not 0 < share <= 1:
+        raise RequestError(f"--data-share must be above 0 and at most 1, got {share:g}")

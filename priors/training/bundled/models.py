@@ -105,13 +105,17 @@ class BundledModel:
         return self.recipe.format_command()
 
 
-def list_models(weights: str = "full", *, match: str | None = None, seed: int = USUAL_SEED) -> tuple[BundledModel, ...]:
+def list_models(
+    weights: str = "full", *, match: str | None = None, seed: int = USUAL_SEED, share: float = 1.0
+) -> tuple[BundledModel, ...]:
     """List the models of a set, each after those that it needs; `match` chooses clips of one's own for the densities of
-    walks and runs, without labels. RequestError for a set that does not exist."""
+    walks and runs, without labels, and `share` is that of the clips that are trained on. RequestError for a set that
+    does not exist."""
     if weights not in SETS:
         raise RequestError(f"the weights are {' or '.join(SETS)}, got {weights!r}")
     chosen = SETS[weights] if match is None else replace(SETS[weights], locomotion=match, labels="")
-    return tuple(_seed(model, seed) for model in _make_models(chosen))
+    models = (_seed(model, seed) for model in _make_models(chosen))
+    return tuple(replace(model, recipe=replace(model.recipe, data_share=share)) for model in models)
 
 
 RECIPES: Mapping[str, type[AnyRecipe]] = {

@@ -52,17 +52,24 @@ class Finished:
         return (math.nan, "") if recipe is None else (recipe.find_card_headline(self.card.quality), recipe.headline)
 
     @property
+    def minutes_of_motion(self) -> float:
+        """Minutes of motion that it was trained on; NaN where the card is older than that it tells."""
+        return float(self.card.data.get("trained_on", {}).get("minutes", math.nan))
+
+    @property
+    def log_error(self) -> float:
+        """Logarithm of its error on unseen clips, up to a constant of its kind; NaN where the card lacks it."""
+        recipe = RECIPES.get(self.card.kind)
+        return math.nan if recipe is None else recipe.as_log_error(self.quality[0])
+
+    @property
     def held_out(self) -> object:
         """Names of the clips that training did not see; those of a refiner are its density's."""
         return self.card.data.get("held_out", self.card.data.get("density"))
 
     def find_change(self, other: "Finished") -> float:
         """By how many percent the other's error is larger than this one's; NaN where a card tells too little."""
-        recipe = RECIPES.get(self.card.kind)
-        if recipe is None:
-            return math.nan
-        own, others = (recipe.as_log_error(model.quality[0]) for model in (self, other))
-        return 100 * math.expm1(others - own)
+        return 100 * math.expm1(other.log_error - self.log_error)
 
 
 def read_finished(name: str, path: Path) -> Finished:

@@ -32,6 +32,9 @@ class TrainAll(Command):
     """Models to train; what they need must be among them or finished."""
     seed: options.Count = 1
     """Seed of weights, windows and noise. The clips that are kept from training stay the same."""
+    data_share: options.Number = 1.0
+    """Share of the clips to train on, to see what more would bring. The clips that are kept from training stay the
+    same, and those of a smaller share are among those of a larger one."""
     jobs: options.Count = 1
     """Models that are trained at once, each by a process of one thread: as many as there are cores pay."""
     minutes: options.Number = 360.0
@@ -44,6 +47,9 @@ class TrainAll(Command):
     """Print the table of a set and its size instead; exit status 3 where it is over 64 MB or lacks a model."""
     compare: Annotated[tuple[Path, Path] | None, arg(metavar="OUT1 OUT2")] = None
     """Print how good the models of two sets are, of two seeds say, instead."""
+    by_motion: Annotated[tuple[Path, ...] | None, arg(metavar="OUT OUT ...")] = None
+    """Print how good the models of sets with different shares of the clips are, by how much motion they were trained
+    on, and draw it as -o FILE.png, instead."""
     within: options.Number = 5.0
     """With --compare: percent by which the errors of two may differ; exit status 3 where they differ more."""
 
@@ -51,7 +57,7 @@ class TrainAll(Command):
         """What to type for the same; options that are the defaults are left out."""
         typed = ["mapctl", "train", self.model]
         for option in fields(self):
-            value, name = getattr(self, option.name), f"--{option.name}"
+            value, name = getattr(self, option.name), f"--{option.name.replace('_', '-')}"
             if value == option.default:
                 continue
             typed += [name] if value is True else [f"{name}={value}"] if str(value)[:1] == "-" else [name, str(value)]

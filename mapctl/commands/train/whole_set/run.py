@@ -7,8 +7,9 @@ from pathlib import Path
 
 from mapctl.commands.shared import exit_status, options, outputs
 from mapctl.commands.shared.resumption import explain_end
+from mapctl.commands.train.options import check_share
 from mapctl.commands.train.progress import print_line, warn
-from mapctl.commands.train.whole_set import TrainAll, summary
+from mapctl.commands.train.whole_set import TrainAll, data_scaling, summary
 from mapctl.commands.train.whole_set.plan import Job, Record, lock_folder, make_jobs
 from mapctl.commands.train.whole_set.workers import Say, train_jobs
 from mapctl.errors import MapctlError, RequestError
@@ -18,14 +19,18 @@ from priors.training.bundled.models import BundledModel, list_models
 
 def run(command: TrainAll) -> int:
     """Train, or tell of sets that there are."""
-    if sum((command.commands, command.check is not None, command.compare is not None)) > 1:
-        raise RequestError("--commands, --check and --compare are asked for one at a time")
+    told = (command.check, command.compare, command.by_motion)
+    if command.commands + sum(each is not None for each in told) > 1:
+        raise RequestError("--commands, --check, --compare and --by-motion are asked for one at a time")
     if command.check is not None:
         return _check(command.check, command.weights)
     if command.compare is not None:
         return summary.print_comparison(*command.compare, percent=command.within)
+    if command.by_motion is not None:
+        return data_scaling.print_scaling(command.by_motion, command.out)
     options.check_seed(command.seed)
-    models = list_models(command.weights, match=command.match, seed=command.seed)
+    check_share(command.data_share)
+    models = list_models(command.weights, match=command.match, seed=command.seed, share=command.data_share)
     chosen = _choose(models, command.only)
     if command.commands:
         for model in chosen:
