@@ -4,7 +4,7 @@ import json
 import os
 import re
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from hashlib import sha256
 from pathlib import Path
 
@@ -20,7 +20,7 @@ from mapctl.retarget import rigs
 from priors.tensor_files import write_tensors
 from priors.training.mocap.clips import ClipReader
 from priors.training.mocap.cuts import find_cuts
-from priors.training.mocap.made import find_made
+from priors.training.mocap.made import Made, find_made
 
 LOCOMOTION = r"dataset-2_(walk|walk-turn-left|walk-turn-right|run)_"
 """Names of the clips that the bundled `locomotion` prior is trained on."""
@@ -54,8 +54,8 @@ class Corpus:
     """Files of the same folder that are not among the clips."""
     cuts: tuple[str, ...] = ()
     """For each table of frames that was used, its name and of how many of the clips it takes a part."""
-    made: tuple[str, ...] = ()
-    """How many of the clips are no mocap but made, and by which model (see `find_made`)."""
+    made: Made = field(default_factory=Made)
+    """Which of the clips are no mocap but made, and by which model."""
 
     def identity(self) -> dict[str, str]:
         """What tells this corpus from others: its size, and short hashes of names, lengths and features."""
@@ -105,17 +105,20 @@ class Split:
 
 
 def split_corpus(corpus: Corpus, seed: int) -> Split:
-    """By clip, 90/5/5, drawn with the seed; a small corpus keeps at least one clip in each part.
+    """By clip, 90/5/5, drawn with the seed; a small corpus keeps at least one clip in each part. Clips that a model
+    made are trained on: nothing is measured on them, and they do not change which others are held out.
 
     Of fewer than FEW clips none can be spared: the end of the longest is held out, a tenth of all frames and SHORTEST
     at least, for validation and test alike. RequestError where a part has only clips too short to warm up on.
     """
-    count = len(corpus.names)
+    made = [number for number, name in enumerate(corpus.names) if name in corpus.made.clips]
+    captured = [number for number, name in enumerate(corpus.names) if name not in corpus.made.clips]
+    count = len(captured)
     if count < MIN_CLIPS_TO_SPLIT:
         return _split_by_frames(corpus)
     order = torch.randperm(count, generator=torch.Generator().manual_seed(seed)).tolist()
-    held = max(1, round(0.05 * count))
-    parts = order[2 * held :], order[:held], order[held : 2 * held]
+    drawn, held = [captured[number] for number in order], max(1, round(0.05 * count))
+    parts = drawn[2 * held :] + made, drawn[:held], drawn[held : 2 * held]
     for part in parts:
         if (longest := max(corpus.lengths[i] for i in part)) < MIN_CLIP_FRAMES:
             raise RequestError(

@@ -69,7 +69,7 @@ def gather(source: DataSource, *, progress: Progress, warn: Progress) -> tuple[C
         write_text(source.run / _SKIPPED_LIST, "".join(f"{file.name}: {file.reason}\n" for file in corpus.skipped))
     for line in corpus.cuts:
         progress(f"frames by {line}")
-    for line in corpus.made:
+    for line in corpus.made.told:
         progress(f"made, not captured: {line}")
     size = f"{len(corpus.names)} clips, {len(corpus.features)} frames"
     progress(f"{size}; training on {len(parts.train.names)}{_describe_held_out(parts)}")
@@ -84,8 +84,8 @@ def describe_selection(corpus: Corpus) -> dict[str, dict[str, str] | list[str]]:
         found["skipped"] = {file.name: file.reason for file in corpus.skipped}
     if corpus.cuts:
         found["cuts"] = list(corpus.cuts)
-    if corpus.made:
-        found["made"] = list(corpus.made)
+    if corpus.made.told:
+        found["made"] = list(corpus.made.told)
     return found
 
 

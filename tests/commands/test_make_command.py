@@ -147,7 +147,9 @@ def test_clips_of_the_list_that_are_not_there_do_not_count(tmp_path):
     (tmp_path / "made.csv").write_text(
         "file,kept,model,licence,seed,script,why not\na.bvh,yes,free,CC0,1,,\nb.bvh,no,free,CC0,2,,\n"
     )
-    assert find_made(tmp_path, ["a.bvh", "c.bvh"]) == ("made.csv: 1 of 2 clips, by free (CC0)",)
+    found = find_made(tmp_path, ["a.bvh", "c.bvh"])
+    assert found.told == ("made.csv: 1 of 2 clips, by free (CC0)",)
+    assert found.clips == {"a.bvh"}
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from mapctl.errors import MapctlError, RequestError
 from mapctl.features import LAYOUT
 from priors.training import corpus as corpora
 from priors.training.mocap import clips
+from priors.training.mocap.made import Made
 
 
 def test_a_clip_that_cannot_be_used_is_named(tmp_path):
@@ -95,7 +96,10 @@ def test_windows_stay_within_their_clips():
 
 def test_a_share_of_the_clips_is_part_of_a_larger_share_and_keeps_the_held_out_ones():
     many = corpora.Corpus(
-        tuple(map(str, range(60))), (80,) * 60, torch.arange(4800.0)[:, None].expand(-1, LAYOUT.size), made=("1 of 60",)
+        tuple(map(str, range(60))),
+        (80,) * 60,
+        torch.arange(4800.0)[:, None].expand(-1, LAYOUT.size),
+        made=Made(told=("1 of 60",)),
     )
     parts = corpora.split_corpus(many, 1)
     seen = []
@@ -143,3 +147,16 @@ def test_a_run_on_a_share_of_the_data_says_so_and_is_measured_on_the_same_clips(
     assert "--data-share" not in whole["training"]["command"]
     words = ("train", "keyframe-timing", "--data", str(data), "-o", str(tmp_path / "none"))
     assert "--data-share must be above 0 and at most 1, got 0" in fails(*words, "--data-share", "0")
+
+
+def test_clips_that_a_model_made_are_never_held_out_and_change_nothing_about_the_others():
+    names = tuple(f"b/{number:02d}" for number in range(40))
+    frames = torch.arange(50 * 80.0)[:, None].expand(-1, LAYOUT.size)
+    mocap = corpora.Corpus(names, (80,) * 40, frames[: 40 * 80])
+    made = tuple(f"a/{number}" for number in range(10))
+    both = corpora.Corpus((*made, *names), (80,) * 50, frames, made=Made(frozenset(made), ("10 of 50",)))
+    alone, beside = (corpora.split_corpus(data, 3) for data in (mocap, both))
+    assert beside.validation.names == alone.validation.names
+    assert beside.test.names == alone.test.names
+    assert set(beside.train.names) == {*alone.train.names, *made}
+    assert not {*corpora.split_corpus(replace(both, made=Made()), 3).train.names} >= {*made}

@@ -3,6 +3,7 @@
 import os
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from mapctl.errors import FileFormatError
@@ -14,25 +15,37 @@ COLUMNS = ("file", "kept", "model", "licence", "seed", "script", "why not")
 """Its first columns; measures follow."""
 
 
-def find_made(data: Path, names: Sequence[str]) -> tuple[str, ...]:
-    """For each list below a data folder and each model in it how many of the clips (paths below the folder) it made, as
-    `made/made.csv: 3 of 8 clips, by locomotion (its licence)`. FileFormatError for a list that is none."""
-    found: list[str] = []
-    clips = set(names)
+@dataclass(frozen=True)
+class Made:
+    """What of a data folder is no mocap."""
+
+    clips: frozenset[str] = frozenset()
+    """Paths below the folder of the clips that a model made."""
+    told: tuple[str, ...] = ()
+    """For each list and each model in it how many clips it made, as `made/made.csv: 3 of 8 clips, by locomotion (its
+    licence)`."""
+
+
+def find_made(data: Path, names: Sequence[str]) -> Made:
+    """Find which of the clips (paths below the folder) a model made, by the lists below the folder. FileFormatError for
+    a list that is none."""
+    told: list[str] = []
+    clips, made = set(names), set[str]()
     for folder, folders, files in os.walk(data, onerror=lambda error: None):
         folders.sort()
         if TABLE_NAME in files:
             file = Path(folder) / TABLE_NAME
             below = file.parent.relative_to(data)
-            counts = Counter(
-                (model, licence) for name, model, licence in _read_makers(file) if (below / name).as_posix() in clips
-            )
+            makers = {(below / name).as_posix(): by for name, *by in _read_makers(file)}
+            listed = {name: by for name, by in makers.items() if name in clips}
+            counts = Counter((model, licence) for model, licence in listed.values())
+            made |= listed.keys()
             shown = (below / TABLE_NAME).as_posix()
-            found += [
+            told += [
                 f"{shown}: {count} of {len(names)} clips, by {model} ({licence})"
                 for (model, licence), count in counts.items()
             ]
-    return tuple(found)
+    return Made(frozenset(made), tuple(told))
 
 
 def _read_makers(file: Path) -> list[tuple[str, str, str]]:
