@@ -106,14 +106,15 @@ class Split:
 
 def split_corpus(corpus: Corpus, seed: int) -> Split:
     """By clip, 90/5/5, drawn with the seed; a small corpus keeps at least one clip in each part. Clips that a model
-    made are trained on: nothing is measured on them, and they do not change which others are held out.
+    made are trained on, unless there are no others: nothing is measured on them, and they do not change which others
+    are held out.
 
     Of fewer than FEW clips none can be spared: the end of the longest is held out, a tenth of all frames and SHORTEST
     at least, for validation and test alike. RequestError where a part has only clips too short to warm up on.
     """
-    made = [number for number, name in enumerate(corpus.names) if name in corpus.made.clips]
-    captured = [number for number, name in enumerate(corpus.names) if name not in corpus.made.clips]
-    count = len(captured)
+    numbers = range(len(corpus.names))
+    captured = [number for number in numbers if corpus.names[number] not in corpus.made.clips] or list(numbers)
+    made, count = sorted({*numbers} - {*captured}), len(captured)
     if count < MIN_CLIPS_TO_SPLIT:
         return _split_by_frames(corpus)
     order = torch.randperm(count, generator=torch.Generator().manual_seed(seed)).tolist()
