@@ -289,6 +289,10 @@ class Density(Protocol[State]):
         """Return the density given the labels of the clip that an initial state was taken from. Default: itself."""
         return self
 
+    def conditioned_like_clip(self, name: str) -> "Density[State]":
+        """Return the density given the labels that a clip's path tells. Default: itself."""
+        return self
+
     def warm_up(self) -> None:
         """Load or compile what the first use would, so that no clock counts it. Default: nothing."""
 

@@ -92,9 +92,12 @@ class LstmGmmDensity(Density[LstmState]):
 
     def conditioned_like_start(self, start: int) -> "LstmGmmDensity":
         """Return the density given the labels of the clip that an initial state was taken from: its gait goes on."""
-        held = clip_labels.read(self.initial_states.names, self.card.data.get("labels", ""))
-        names = [name for name, holds in zip(held.names, held.held[start].tolist(), strict=True) if holds]
-        known = [name for name in names if name in self.reference.config.labels]
+        return self.conditioned_like_clip(self.initial_states.names[start])
+
+    def conditioned_like_clip(self, name: str) -> "LstmGmmDensity":
+        """Return the density given the labels that a clip's path tells, of those that it knows."""
+        told = clip_labels.read_name(name, self.card.data.get("labels", ""))
+        known = sorted(told & {*self.reference.config.labels})
         return self._with_network(self.reference.conditioned_on(known))
 
     def with_observation_noise(self, sigma: Float[Tensor, " continuous"]) -> "LstmGmmDensity":

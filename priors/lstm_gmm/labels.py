@@ -48,6 +48,11 @@ class Labels:
         return Labels(names, held)
 
 
+def read_name(clip: str, pattern: str) -> set[str]:
+    """Read the labels that one clip's name tells; none where the pattern is empty or is not found in it."""
+    return _parse_match(re.search(pattern, clip)) if pattern else set()
+
+
 def read(clips: Sequence[str], pattern: str) -> Labels:
     """Read labels from clips' names by the named groups of a regular expression; an empty pattern reads none.
 

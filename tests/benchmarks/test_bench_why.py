@@ -4,22 +4,24 @@ import json
 from dataclasses import replace
 
 import pytest
+import torch
 from helpers import run, tiny_density, walk
 from tiny_prior import save_tiny_prior
 
-from controllers.benchmarks.generation import list_variants, why
+from controllers.benchmarks.generation import continuations, list_variants, why
+from controllers.benchmarks.shared.held_out import NamedClip
 from mapctl.errors import RequestError
-from mapctl.metrics.realism import ClassifierSettings, RealismSettings
+from mapctl.metrics.realism import ClassifierSettings, RealismSettings, train_judges
 from mapctl.metrics.realism.evidence.kinds import GAITS
 from priors import checkpoints
 
 QUICK = RealismSettings(classifier=ClassifierSettings(folds=2, width=8, batch=32, learning_rate=3e-3))
-SETTINGS = why.WhyBenchmarkSettings(count=8, seconds=2.0, steps=(2, 40), realism=QUICK)
+SETTINGS = why.WhyBenchmarkSettings(continued=False, count=8, seconds=2.0, steps=(2, 40), realism=QUICK)
 
 
 @pytest.fixture(scope="module")
 def mocap():
-    return [walk(62, cadence=0.8 + 0.05 * k, seed=k) for k in range(8)]
+    return [NamedClip(f"{k}.bvh", walk(62, cadence=0.8 + 0.05 * k, seed=k)) for k in range(8)]
 
 
 @pytest.fixture
@@ -59,13 +61,14 @@ def run_bench(prior, *more):
 def test_variants_and_sizes_are_chosen(prior, capsys, monkeypatch):
     def measure(variants, mocap, settings):
         about = {"clips": len(mocap), "count": settings.count, "seconds": settings.seconds, "steps": settings.steps}
+        about |= {"continued": settings.continued}
         return {"accuracy": [{"variant": each.name, **about} for each in variants], "gaits": []}
 
     monkeypatch.setattr("mapctl.commands.bench.generation.why.benchmark_why", measure)
-    sizes = ["--count", 9, "--seconds", 3, "--steps", "5,6", "--json"]
+    sizes = ["--starts", "own", "--count", 9, "--seconds", 3, "--steps", "5,6", "--json"]
     assert run(*run_bench(prior, *sizes)) == 0
     told = json.loads(capsys.readouterr().out)
-    about = {"part": "accuracy", "clips": 8, "count": 9, "seconds": 3.0, "steps": [5, 6]}
+    about = {"part": "accuracy", "clips": 8, "count": 9, "seconds": 3.0, "steps": [5, 6], "continued": False}
     assert told["bench"] == "why"
     assert told["rows"] == [{"variant": name, **about} for name in ("density", "density, footing")]
     assert run(*run_bench(prior, *sizes, "--variants", "density")) == 0
@@ -78,7 +81,8 @@ def test_variants_and_sizes_are_chosen(prior, capsys, monkeypatch):
         (["--steps", "many"], "--steps are whole numbers with commas between, got 'many'"),
         (["--steps", "0"], "steps of at least 1"),
         (["--seconds", "0"], "a length above 0 s"),
-        (["--count", "3"], "at least 8 clips, got 3"),
+        (["--starts", "own", "--count", "3"], "at least 8 clips, got 3"),
+        ([], "no unseen clip is as long as 2.5 s"),
         (["--variants", "poem"], "no variant is called 'poem'; there are density; density, footing"),
         (["--variants", "("], "--variants is no regular expression"),
     ],
@@ -91,3 +95,35 @@ def test_what_cannot_be_is_refused(prior, fails, more, said):
 def test_settings_that_cannot_be_are_refused():
     with pytest.raises(RequestError, match="at least 4 clips, got 3"):
         replace(SETTINGS, count=3)
+
+
+def test_clips_gone_on_with_are_as_long_as_what_they_are_compared_with_and_are_told_their_labels():
+    told = []
+
+    class Telling(type(tiny_density())):
+        def conditioned_like_clip(self, name):
+            told.append(name)
+            return self
+
+    density = tiny_density()
+    variant = replace(list_variants(density, None, {}, {})[0], prior=Telling(**vars(density)))
+    clips = [NamedClip(f"{k}.bvh", walk(frames, seed=k)) for k, frames in enumerate((76, 90, 75))]
+    long = continuations.select_long_clips(clips)
+    assert [clip.name for clip in long] == ["0.bvh", "1.bvh"]
+    made = continuations.continue_clips(variant, long, 0)
+    assert [each.num_frames for each in made] == [36, 50]
+    assert [continuations.cut_continuation(clip).num_frames for clip in long] == [36, 50]
+    assert told == ["0.bvh", "1.bvh"]
+    first = made[0].root_position[0] - long[0].motion.root_position[40]
+    assert float(first.norm()) < 0.1  # where the clip was
+    other = continuations.continue_clips(variant, long, 1)
+    assert not other[0].root_position.equal(made[0].root_position)
+
+
+def test_pairs_are_judged_by_networks_that_saw_neither():
+    windows = [torch.randn(3, 30, 12, generator=torch.Generator().manual_seed(k)) for k in range(8)]
+    judges = train_judges(windows, windows[::-1], generator=torch.Generator(), settings=replace(QUICK), paired=True)
+    assert all(ours == theirs for ours, theirs in (fold.clips for fold in judges.folds))
+    assert any(ours != theirs for ours, theirs in (fold.clips for fold in judges.floor_folds))
+    with pytest.raises(RequestError, match="pairs need as many clips in each set, got 8 and 9"):
+        train_judges(windows, [*windows, windows[0]], generator=torch.Generator(), settings=QUICK, paired=True)

@@ -147,3 +147,14 @@ def test_the_fast_path_is_told_too():
     plan = told.reference.plan(state, noise)
     fast, reference = (engine.rollout(state, noise, plan)[0] for engine in (told, told.reference))
     torch.testing.assert_close(fast, reference, rtol=1e-4, atol=1e-5)
+
+
+def test_a_density_is_told_what_a_clips_path_tells_of_the_labels_that_it_knows():
+    density = labelled_density()
+    state, noise = density.initial_states.state.pick(torch.tensor([0])), torch.zeros(1, 3, 66)
+    plan = density.plan(state, noise)
+
+    for name, told in (("set/b_run_old_9.bvh", ["run", "old"]), ("set/b_walk_old_9.bvh", ["old"]), ("other.bvh", [])):
+        like, on = density.conditioned_like_clip(name), density.conditioned_on(told)
+        assert torch.allclose(like.rollout(state, noise, plan)[0], on.rollout(state, noise, plan)[0])
+        assert like.initial_states.names == density.initial_states.names

@@ -6,6 +6,8 @@ from dataclasses import asdict, dataclass, field, replace
 import torch
 
 from controllers.benchmarks.generation import Variant, generate_clips
+from controllers.benchmarks.generation.continuations import continue_clips, cut_continuation, select_long_clips
+from controllers.benchmarks.shared.held_out import NamedClip
 from controllers.benchmarks.shared.tables import Row
 from mapctl.errors import RequestError
 from mapctl.metrics.realism import (
@@ -27,10 +29,13 @@ _MOST = 8  # rows of a part for each variant
 class WhyBenchmarkSettings:
     """Size of the benchmark."""
 
+    continued: bool = True
+    """Whether each unseen clip is gone on with after its beginning, for as long as it lasts itself; else clips begin at
+    the density's own initial states."""
     count: int = 48
-    """Number of clips of each variant."""
+    """Number of clips of each variant from initial states."""
     seconds: float = 10.0
-    """Length of each clip, seconds."""
+    """Length of each clip from initial states, seconds."""
     steps: tuple[int, ...] = (400, 2000)
     """Training steps of the classifiers, one comparison for each."""
     seed: int = 0
@@ -43,24 +48,24 @@ class WhyBenchmarkSettings:
     def __post_init__(self):
         if min(self.steps, default=0) < 1 or not 0 < self.seconds < float("inf"):
             raise RequestError("the table needs a length above 0 s and steps of at least 1")
-        if self.count < self.realism.min_clips:
+        if not self.continued and self.count < self.realism.min_clips:
             raise RequestError(f"the table needs at least {self.realism.min_clips} clips, got {self.count}")
 
 
 def benchmark_why(
-    variants: Sequence[Variant], mocap: Sequence[Motion], settings: WhyBenchmarkSettings | None = None
+    variants: Sequence[Variant], mocap: Sequence[NamedClip], settings: WhyBenchmarkSettings | None = None
 ) -> dict[str, list[Row]]:
     """Explain how each variant's clips are told from mocap, by part: how often, by gait, and the shares of the evidence
     that are more than chance.
 
-    `mocap` is canonical motion held out from training. RequestError for fewer than 8 clips of it.
+    `mocap` is motion held out from training. RequestError for fewer than 8 clips of it.
     """
     settings = settings or WhyBenchmarkSettings()
-    real = [canonical_positions(clip) for clip in mocap]
+    clips = select_long_clips(mocap) if settings.continued else list(mocap)
+    real = [canonical_positions(cut_continuation(clip) if settings.continued else clip.motion) for clip in clips]
     parts: dict[str, list[Row]] = {"accuracy": [], "gaits": [], **{name: [] for name in SHARES}}
     for variant in variants:
-        clips = generate_clips(variant, settings.count, settings.seconds, settings.seed)
-        made = [canonical_positions(clip) for clip in clips]
+        made = [canonical_positions(clip) for clip in _make_clips(variant, clips, settings)]
         for steps in settings.steps:
             classifier = replace(settings.realism.classifier, steps=steps)
             judges = train_judges(
@@ -68,11 +73,18 @@ def benchmark_why(
                 [cut_windows(clip, settings.realism.windows) for clip in real],
                 generator=torch.Generator().manual_seed(settings.seed),
                 settings=replace(settings.realism, classifier=classifier),
+                paired=settings.continued,
             )
             generator = torch.Generator().manual_seed(settings.seed)
             found = judges.explain(made, real, generator=generator, settings=settings.evidence)
             _add_rows(parts, {"variant": variant.name, "steps": steps}, found)
     return parts
+
+
+def _make_clips(variant: Variant, clips: Sequence[NamedClip], settings: WhyBenchmarkSettings) -> list[Motion]:
+    if settings.continued:
+        return continue_clips(variant, clips, settings.seed)
+    return generate_clips(variant, settings.count, settings.seconds, settings.seed)
 
 
 def _add_rows(parts: dict[str, list[Row]], about: Row, found: Explanation) -> None:

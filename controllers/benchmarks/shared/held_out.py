@@ -35,6 +35,16 @@ class CleanClip:
     """Motion on its rig, without a leading T-pose."""
 
 
+@dataclass(frozen=True, eq=False)
+class NamedClip:
+    """A clip and where it came from."""
+
+    name: str
+    """Its path below the data folder."""
+    motion: Motion
+    """Motion on canonical joints at PRIOR_FPS."""
+
+
 def find_held_out(data: Path, held_out: HeldOut) -> list[Path]:
     """Find the held-out clips below the data folder; RequestError unless all are there."""
     paths = [data / name for part in ("validation", "test") for name in held_out.get(part, ())]
@@ -68,8 +78,16 @@ def load_canonical(data: Path, held_out: HeldOut, count: int, *, fps: int | None
 
 def load_held_out(data: Path, held_out: HeldOut) -> list[Motion]:
     """Load all held-out clips of more than a second, whole, on canonical joints at PRIOR_FPS."""
-    clips = [retarget.to_canonical(formats.load(path))[0].resample(PRIOR_FPS) for path in find_held_out(data, held_out)]
-    return [clip for clip in clips if clip.num_frames > PRIOR_FPS]
+    return [clip.motion for clip in load_named(data, held_out)]
+
+
+def load_named(data: Path, held_out: HeldOut) -> list[NamedClip]:
+    """Load all held-out clips of more than a second, whole, on canonical joints at PRIOR_FPS, with their names."""
+    clips = [
+        NamedClip(path.relative_to(data).as_posix(), retarget.to_canonical(formats.load(path))[0].resample(PRIOR_FPS))
+        for path in find_held_out(data, held_out)
+    ]
+    return [clip for clip in clips if clip.motion.num_frames > PRIOR_FPS]
 
 
 def classify_clip(name: str) -> str:

@@ -101,8 +101,13 @@ class Why(Generation):
 
     work = "mapctl.commands.bench.generation.why"
 
+    starts: Annotated[Literal["unseen", "own"], arg(metavar="unseen|own")] = "unseen"
+    """Where clips begin: each unseen clip is gone on with after its first 40 frames and compared with how it goes on
+    itself, so that both sets hold the same styles; or --count clips begin at the density's own starts."""
+    count: options.Count = 48
+    """Clips of each variant, with --starts own."""
     seconds: options.Number = 10.0
-    """Length of each clip."""
+    """Length of each clip, with --starts own."""
     steps: Annotated[str, arg(metavar="N,N,...")] = "400,2000"
     """Training steps of the classifiers, a comparison for each; more make a stricter judge."""
     variants: Annotated[str, arg(metavar="REGEX")] = "density(, footing)?"

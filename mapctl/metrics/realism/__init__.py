@@ -193,9 +193,12 @@ def train_judges(
     *,
     generator: torch.Generator,
     settings: RealismSettings = RealismSettings(),
+    paired: bool = False,
     progress: Progress | None = None,
 ) -> Judges:
-    """Train networks on `cut_windows` of each clip, (windows, frames, channels); RequestError for too few clips."""
+    """Train networks on `cut_windows` of each clip, (windows, frames, channels). `paired`: made and mocap clips of the
+    same number belong together, and no network sees one of those that it judges the other of. RequestError for too few
+    clips, and for pairs of which one is missing."""
     _check_counts(len(made), len(mocap), settings)
     seeds = torch.randint(2**62, (2,), generator=generator).tolist()
     shuffled, ours = (torch.Generator().manual_seed(seed) for seed in seeds)
@@ -204,9 +207,9 @@ def train_judges(
     tick = _make_tick(progress, 2 * settings.classifier.folds)
     folds: list[list[HeldOutFold]] = []
     first, second = ([mocap[i] for i in half] for half in halves)
-    for sets, drawn in (((first, second), shuffled), ((made, mocap), ours)):
+    for sets, drawn, held in (((first, second), shuffled, False), ((made, mocap), ours, paired)):
         folds.append([])
-        for fold in judge_folds(*sets, generator=drawn, settings=settings.classifier):
+        for fold in judge_folds(*sets, generator=drawn, settings=settings.classifier, paired=held):
             folds[-1].append(fold)
             tick()
     return Judges(made, mocap, halves, folds[1], folds[0], settings)

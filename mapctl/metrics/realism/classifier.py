@@ -99,16 +99,22 @@ def judge_folds(
     *,
     generator: torch.Generator,
     settings: ClassifierSettings = ClassifierSettings(),
+    paired: bool = False,
 ) -> Iterator[HeldOutFold]:
     """Train a network for each fold, and yield it with its logits of the clips that it did not see.
 
-    Each set is a list of clips' windows. Folds are by clip, for windows of one clip overlap. The same generator state
-    gives the same bits; torch's global generator and thread count are left as they were. RequestError for sets of fewer
-    clips than folds.
+    Each set is a list of clips' windows. Folds are by clip, for windows of one clip overlap; where the sets are
+    `paired`, clips of the same number in both are in the same fold, so that nothing is learnt of one from the other.
+    The same generator state gives the same bits; torch's global generator and thread count are left as they were.
+    RequestError for sets of fewer clips than folds, and for pairs of which one is missing.
     """
     if min(len(first), len(second)) < settings.folds:
         raise RequestError(f"{settings.folds} folds need as many clips in each set, got {len(first)} and {len(second)}")
+    if paired and len(first) != len(second):
+        raise RequestError(f"pairs need as many clips in each set, got {len(first)} and {len(second)}")
     sets = [(clips, torch.randperm(len(clips), generator=generator).tolist()) for clips in (first, second)]
+    if paired:
+        sets[1] = (second, sets[0][1])
     for fold in range(settings.folds):
         others = [k for k in range(settings.folds) if k != fold]
         training = [torch.cat([clips[i] for k in others for i in order[k :: settings.folds]]) for clips, order in sets]

@@ -5,7 +5,7 @@ import re
 import priors
 from controllers.benchmarks.generation import Variant, list_variants
 from controllers.benchmarks.generation.why import WhyBenchmarkSettings, benchmark_why
-from controllers.benchmarks.shared.held_out import load_held_out
+from controllers.benchmarks.shared.held_out import load_named
 from mapctl.commands.bench import Why
 from mapctl.commands.bench.baselines import load_generators
 from mapctl.commands.bench.output import print_parts
@@ -14,11 +14,11 @@ from mapctl.errors import RequestError
 
 def run(table: Why) -> int:
     """Measure and print."""
-    settings = WhyBenchmarkSettings(table.count, table.seconds, _read_steps(table.steps))
+    settings = WhyBenchmarkSettings(table.starts == "unseen", table.count, table.seconds, _read_steps(table.steps))
     prior, held_out, densities, refiners = load_generators(table.prior, table.baselines)
     refiner = priors.refiner_of(table.prior, table.refiner)
     variants = _pick_variants(list_variants(prior, refiner, densities, refiners), table.variants)
-    parts = benchmark_why(variants, load_held_out(table.data, held_out), settings)
+    parts = benchmark_why(variants, load_named(table.data, held_out), settings)
     return print_parts(table, {name: rows for name, rows in parts.items() if rows}, markdown=table.markdown)
 
 
