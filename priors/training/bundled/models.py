@@ -54,9 +54,6 @@ class WeightSet:
     live_width: int | None = 160
     """Of the network of the density for live control; None where that of walks and runs serves. Trained on a few
     minutes, networks of 120, 160 and 256 lost their way along some curves."""
-    flat: bool = True
-    """Whether runs of the densities end where their curve is flat. The likelihood of the few clips that minutes of
-    motion spare for validation does not tell whether a density can be steered: the steps are then told beforehand."""
     share: float = 1.0
     """Planned steps, as a share of those for hours of motion: curves of small sets are flat sooner."""
 
@@ -81,7 +78,6 @@ SETS: Mapping[str, WeightSet] = {
         window=40,
         width=192,
         live_width=None,
-        flat=False,
         share=0.4,
     ),
 }
@@ -136,13 +132,13 @@ RECIPES: Mapping[str, type[AnyRecipe]] = {
 
 
 def _make_models(weights: WeightSet) -> tuple[BundledModel, ...]:
-    """The table. Steps are a plan, where a run goes on until its curve is flat."""
+    """The table. Steps are a plan, where a run goes on until its curve is flat. Those of densities are told: a curve of
+    likelihoods goes on falling while free runs already drift off (docs/training.md)."""
     captures: dict[str, Any] = {"data": DATA, "out": RUN, "licence": weights.licence, "cuts": CMU}
     shared: dict[str, Any] = {**captures, "level": weights.level}
     until_flat: dict[str, Any] = {"match": weights.match or None, "until_flat": UntilFlat()}
     everything = {**shared, **until_flat}
-    density_end = {"until_flat": UntilFlat() if weights.flat else None}
-    general = {**everything, **density_end, "match": weights.match}  # which a density's command always tells
+    general = {**shared, "match": weights.match}  # which a density's command always tells
     walks: dict[str, Any] = {**general, "match": weights.locomotion, "labels": weights.labels}
     widths = {"locomotion": weights.width, "locomotion-live": weights.live_width}
     return (
