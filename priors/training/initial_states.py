@@ -42,9 +42,10 @@ def select_initial_states(
     )
     strata = _number_strata(labels, len(features))
     frames = torch.tensor(corpus.lengths, dtype=torch.float32)
-    held, of_starts = torch.zeros(int(strata.max()) + 1).index_add_(0, strata, frames), strata[shuffled]
+    frames_of, of_starts = torch.zeros(int(strata.max()) + 1).index_add_(0, strata, frames), strata[shuffled]
+    clips_of = torch.bincount(of_starts, minlength=len(frames_of))
     picked = []
-    for stratum, share in enumerate(_share_out(held.tolist(), torch.bincount(of_starts, minlength=len(held)), count)):
+    for stratum, share in enumerate(_share_out(frames_of.tolist(), clips_of, count)):
         members = torch.nonzero(of_starts == stratum)[:, 0]
         picked += members[_select_by_speed(speeds[members], share)].tolist() if share else []
     states = [_state_after(model, features[shuffled[k]][: ends[k]]) for k in picked]

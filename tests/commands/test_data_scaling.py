@@ -53,6 +53,8 @@ def test_only_sets_that_can_be_compared_are(sets, tmp_path, fails, capsys):
     assert "by other amounts of motion" in fails("train", "all", "--by-motion", sets[0], tmp_path / "old")
     save(tmp_path / "foreign", "path", "path", 80.0, {"test": {"all_V1_cm": 1.0}}, held_out=("c",))
     assert "by other amounts of motion" in fails("train", "all", "--by-motion", sets[0], tmp_path / "foreign")
+    for few in ([], [sets[0]]):
+        assert "compares two sets at least" in fails("train", "all", "--by-motion", *few, "-o", tmp_path / "one.png")
     assert "asked for one at a time" in fails("train", "all", "--by-motion", sets[0], sets[1], "--commands")
     assert "writes .png" in fails("train", "all", "--by-motion", *sets, "-o", tmp_path / "scaling.pdf")
     assert "--data-share must be above 0" in fails("train", "all", "--commands", "--data-share", "1.5")

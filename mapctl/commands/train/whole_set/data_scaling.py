@@ -26,6 +26,8 @@ def print_scaling(sets: Sequence[Path], picture: Path | None) -> int:
     RequestError where no model is in two sets that were trained on different amounts of motion and measured on the
     same unseen clips.
     """
+    if len(sets) < 2:
+        raise RequestError("--by-motion compares two sets at least")
     if picture is not None:
         outputs.check_picture(picture, given=sets[0])
     models = _collect(sets)
@@ -34,20 +36,9 @@ def print_scaling(sets: Sequence[Path], picture: Path | None) -> int:
             "no model is in two of these sets, by other amounts of motion and with the same unseen clips"
         )
     rows = [row for name, sizes in models.items() for row in _list_rows(name, sizes)]
-    columns = [
-        "model",
-        "minutes of motion",
-        "minutes of a core",
-        "steps",
-        "quality",
-        "that is",
-        "error to the largest's, %",
-    ]
-    print_table(columns, rows)
+    print_table(_COLUMNS, rows)
     changes = {name: _fit_change(sizes) for name, sizes in models.items()}
-    print_table(
-        ["model", "error changes with twice the motion by, %"], [[name, change] for name, change in changes.items()]
-    )
+    print_table(("model", "error changes with twice the motion by, %"), list(changes.items()))
     if picture is not None:
         plot_scaling([_make_plot(name, sizes, changes[name]) for name, sizes in models.items()], picture)
         print(f"wrote {picture}")
@@ -78,9 +69,8 @@ def _list_rows(name: str, sizes: Sequence[Finished]) -> list[list[object]]:
 
 def _fit_change(sizes: Sequence[Finished]) -> float:
     """Percent by which the error changes where there is twice the motion: the least-squares line of logarithms."""
-    slope = np.polyfit(
-        [math.log2(model.minutes_of_motion) for model in sizes], [model.log_error for model in sizes], 1
-    )[0]
+    doublings = [math.log2(model.minutes_of_motion) for model in sizes]
+    slope = np.polyfit(doublings, [model.log_error for model in sizes], 1)[0]
     return 100 * math.expm1(float(slope))
 
 
