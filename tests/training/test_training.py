@@ -18,6 +18,7 @@ from mapctl.metrics.states import summarise_states
 from priors.lstm_gmm.network import LstmGmmConfig
 from priors.training import corpus as corpora
 from priors.training.quality import density as density_quality
+from priors.training.recipes import lstm_gmm
 from priors.training.recipes.lstm_gmm import (
     PAPER,
     DensityRecipe,
@@ -336,3 +337,14 @@ def test_folders_that_cannot_be_trained_on_are_refused(tmp_path, data):
     with pytest.raises(RequestError, match="auto, cpu or cuda"):
         train(replace(request_in(tmp_path / "run", data), device="abacus"))
     assert not (tmp_path / "run" / "checkpoint.json").exists()
+
+
+def test_the_starts_of_a_density_are_chosen_by_its_labels(tmp_path, monkeypatch):
+    write_corpus(tmp_path / "data")
+    asked, select = [], lstm_gmm.select_initial_states
+    monkeypatch.setattr(
+        lstm_gmm, "select_initial_states", lambda *given, **named: asked.append(named) or select(*given, **named)
+    )
+    train(request_in(tmp_path / "run", tmp_path / "data", labels=r"(?P<clip>\d)\.bvh"))
+    (given,) = asked
+    assert given["labels"].tolist() == torch.eye(len(given["labels"])).tolist()
