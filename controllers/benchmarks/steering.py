@@ -1,4 +1,5 @@
-"""Benchmark of steering: random commands one after the other, which are reached, how soon, and the cost of a frame."""
+"""Benchmark of steering: random commands one after the other, which are reached, how soon, and the cost of a frame; and
+starts from a stand into every direction."""
 
 import math
 import statistics
@@ -19,6 +20,8 @@ from mapctl.metrics.travel import measure_commands
 from mapctl.protocols import Density
 
 _SPEEDS = (0.0, 0.8, 1.2, 1.6, 2.6)
+_TURNS = (0, 60, 120, 180, -120, -60)  # degrees from where a standing character faces to where it is to go
+_STAND_SECONDS, _GO_SECONDS, _GO_SPEED = 4.0, 4.0, 1.2
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,32 @@ def benchmark_steering(prior: Density, settings: SteeringBenchmarkSettings | Non
     return [
         *({"change": kind, **_summarise_commands(kind_rows)} for kind, kind_rows in sorted(kinds.items())),
         {"change": "all", **_summarise_commands(rows[1:]), **whole},
+    ]
+
+
+def benchmark_starts(prior: Density, characters: int = 8) -> list[Row]:
+    """Measure how soon characters that stand are under way at 1.2 m/s, a row for each angle that they turn by."""
+    times, commands, heading = [0.0], [Command(_GO_SPEED, 0.0)], 0.0
+    for turn in _TURNS:
+        stands = times[-1] + _STAND_SECONDS
+        times += [stands, stands + _GO_SECONDS]
+        commands.append(Command(0.0, heading))
+        heading += math.radians(turn)
+        commands.append(Command(_GO_SPEED, heading))
+    times.append(times[-1] + _GO_SECONDS)
+    track = CommandTrack(tuple(times), (*commands, commands[-1]))
+    found: dict[int, list[Row]] = {}
+    for seed in range(characters):
+        state, first = steer.begin(prior, track.commands[0], generator=torch.Generator().manual_seed(seed))
+        recorder = Recorder()
+        recorder.show(first, 0.0)
+        frames = round(times[-1] * PRIOR_FPS)
+        drive(state, track, [recorder], frames=frames)
+        for turn, row in zip(_TURNS, measure_commands(recorder.motion(frames), track)[2:-1:2], strict=True):
+            found.setdefault(abs(turn), []).append(row)
+    return [
+        {"change": f"from a stand, turning by {turn} degrees", **_summarise_commands(rows)}
+        for turn, rows in sorted(found.items())
     ]
 
 
@@ -98,11 +127,14 @@ def _classify_change(before: Command, after: Command) -> str:
 
 def _summarise_commands(rows: list[Row]) -> Row:
     reached = [row["reached_s"] for row in rows if row["reached_s"] is not None]
+    under_way = [row["under_way_s"] for row in rows if row["under_way_s"] is not None]
     errors = [abs(row["steady_heading_error_deg"]) for row in rows if row["steady_heading_error_deg"] is not None]
     return {
         "commands": len(rows),
         "reached": len(reached),
         "seconds_mean": statistics.mean(reached) if reached else None,
         "seconds_max": max(reached, default=None),
+        "under_way_s_mean": statistics.mean(under_way) if under_way else None,
+        "under_way_s_max": max(under_way, default=None),
         "direction_off_deg_median": statistics.median(errors) if errors else None,
     }

@@ -70,6 +70,10 @@ class SteerSettings:
     """Sigma of a requested step length, metres."""
     stuck: float = 0.4
     """Velocity error over the last half second, m/s, beyond which a step is first solved without contacts."""
+    standing: float = 0.25
+    """Mean speed over the last half second, m/s, below which a character whose target ahead is faster than it by more than
+    `stuck` is solved that way at once: both feet are planted, and half a second would pass before it counts as
+    stuck."""
     random_starts: int = 12
     """Random warm starts of that solve, evaluated in one batch beside the evaluations; it begins at the best."""
     footing: FootContact = field(default_factory=FootContact)
@@ -85,7 +89,7 @@ class SteerSettings:
 
     def scaled_to(self, character: Character) -> "SteerSettings":
         """Return the settings for a character of this size, in metres of the prior's size."""
-        sigmas = {name: getattr(self, name) / character.scale for name in ("sigma_speed", "sigma_step", "stuck")}
+        sigmas = {name: getattr(self, name) / character.scale for name in ("sigma_speed", "sigma_step", "stuck", "standing")}
         return replace(self, limits=character.limits(self.limits), footing=character.footing(self.footing), **sigmas)
 
 
@@ -217,7 +221,7 @@ def step(state: SteerState, command: Command, *, seconds: float | None = None) -
     if asked.obstacles:
         terms = (*terms, character.term(KeepClear(asked.obstacles)))
     search = None if seconds is None else state.cost.limit_search(seconds)
-    done, outcome = _solve_step(conditioned, terms, search, free=stuck)
+    done, outcome = _solve_step(conditioned, terms, search, free=stuck or _is_leaving(state, targets))
     if outcome is not Outcome.DONE:
         cold = replace(state.committed, warm_start=state.committed.warm_start[:0], forecast=None)
         restarted = replace(conditioned, committed=cold)
@@ -333,6 +337,14 @@ def _velocity_error(state: SteerState) -> float:
     if min(len(state.committed.joints_world) - 1, len(state.past_targets)) < _RECENT_FRAMES:
         return 0.0
     return float((_recent_velocity(state) - state.past_targets[-_RECENT_FRAMES:].mean(0)).norm())
+
+
+def _is_leaving(state: SteerState, targets: Sequence[SteeringTarget]) -> bool:
+    """Whether a standing character is told to go."""
+    if len(state.committed.joints_world) <= _RECENT_FRAMES:
+        return False
+    speed = float(_recent_velocity(state).norm())
+    return speed < state.settings.standing and targets[-1].speed > speed + state.settings.stuck
 
 
 def _recent_velocity(state: SteerState) -> Float[Tensor, "2"]:

@@ -22,6 +22,7 @@ _SLOW_SECONDS = 0.25  # a Gaussian that removes a stride's own rise and fall of 
 _HELD_DISTANCE = 0.01  # metres from its place within which a hand is there
 _STEADY_AFTER = 2.0  # seconds: from then on a command counts as obeyed or not
 _HOLD_SECONDS = 0.4  # seconds for which a command must hold to count as reached
+_UNDER_WAY_SHARE, _UNDER_WAY_ANGLE = 0.5, math.radians(30)  # of the speed; radians off the direction
 _NEAR_SPEED, _NEAR_STILL, _NEAR_ANGLE = 0.15, 0.15, math.radians(10)  # share of the speed; m/s at rest; radians
 
 
@@ -51,7 +52,8 @@ def measure_commands(motion: Motion, track: CommandTrack) -> list[dict[str, floa
     """Measure a row for each command: when it was reached, and the steady errors from 2 s after it to the next one.
 
     Keys: time_s, speed_mps, heading_deg, turn_deg_s (wanted; None unless it is to turn on and on), reached_s (None if
-    it never was), steady_speed_mps (net displacement over time; mean speed while turning), steady_heading_error_deg and
+    it never was), under_way_s (from when on it goes at half the speed and more within 30 degrees of the direction; None if
+    never, and where standing or turning on and on was wanted), steady_speed_mps (net displacement over time; mean speed while turning), steady_heading_error_deg and
     steady_turn_deg_s (None where the other, standing, or no steady part was wanted), step_m and steady_step_m (None
     unless a step length was wanted). For each hand with a place: `<hand>_nearest_cm`, and `<hand>_held_s`, the seconds
     in which it was within a centimetre of it; `look_nearest_deg`, the least
@@ -73,6 +75,7 @@ def measure_commands(motion: Motion, track: CommandTrack) -> list[dict[str, floa
             "heading_deg": math.degrees(command.heading),
         }
         row["reached_s"] = _find_time_reached(velocity, part, began, command, float(motion.fps))
+        row["under_way_s"] = _find_time_under_way(velocity, part, began, command)
         steady = np.flatnonzero(part & (velocity.seconds >= began + _STEADY_AFTER))
         row |= _measure_steady_errors(velocity, ground, steady, command, float(motion.fps))
         taken = steps[steady][~np.isnan(steps[steady])] if command.step_length is not None else ()
@@ -115,6 +118,15 @@ def _find_time_reached(
         if near[first : min(first + round(_HOLD_SECONDS * fps), at[-1] + 1)].all():
             return float(velocity.seconds[first] - began)
     return None
+
+
+def _find_time_under_way(velocity: LowPassVelocity, part: ndarray, began: float, command: Command) -> float | None:
+    if command.speed == 0 or command.turning is not None:
+        return None
+    along = velocity.speed * np.cos(velocity.direction - command.heading)
+    near = (along >= _UNDER_WAY_SHARE * command.speed) & (along >= math.cos(_UNDER_WAY_ANGLE) * velocity.speed)
+    at = np.flatnonzero(part & near)
+    return float(velocity.seconds[at[0]] - began) if len(at) else None
 
 
 def _measure_steady_errors(

@@ -117,11 +117,25 @@ def test_a_command_that_the_walk_obeys_is_reached_at_once_and_another_never():
     obeyed, not_obeyed = (
         measure_commands(motion, CommandTrack((0.0,), (Command(speed, way + off),)))[0] for off in (2 * math.pi, 1.0)
     )
-    assert obeyed["reached_s"] == 0
+    assert obeyed["reached_s"] == obeyed["under_way_s"] == 0
     assert obeyed["steady_speed_mps"] == pytest.approx(speed, rel=0.03)
     assert obeyed["steady_heading_error_deg"] == pytest.approx(0, abs=2)
     assert not_obeyed["reached_s"] is None
+    assert not_obeyed["under_way_s"] is None
     assert not_obeyed["steady_heading_error_deg"] == pytest.approx(-math.degrees(1.0), abs=2)
+
+
+def test_who_goes_at_half_the_speed_near_the_direction_is_under_way_but_has_not_reached_it():
+    motion = walk(150)
+    speed = float((motion.root_position[-1] - motion.root_position[0])[::2].norm()) / (149 / 30)
+    slow, aside, fast = (
+        measure_commands(motion, CommandTrack((0.0,), (Command(times * speed, way),)))[0]
+        for times, way in ((1.7, 0.0), (1.0, math.radians(25)), (2.5, 0.0))
+    )
+    assert slow["under_way_s"] is not None and slow["reached_s"] is None
+    assert aside["under_way_s"] is not None and aside["reached_s"] is None
+    assert fast["under_way_s"] is None
+    assert measure_commands(motion, CommandTrack((0.0,), (Command(0.0, 0.0),)))[0]["under_way_s"] is None
 
 
 def test_turning_on_is_measured_as_a_rate():

@@ -126,6 +126,26 @@ def test_who_is_stuck_is_searched_for_half_of_the_time_without_footing(monkeypat
     assert "footing" in whole
 
 
+@pytest.mark.parametrize(
+    ("standing", "speed", "searches"), [(0.25, 1.2, 2), (0.25, 0.3, 1), (0.0, 1.2, 1)], ids=["goes", "creeps", "never"]
+)
+def test_who_stands_and_is_told_to_go_is_searched_for_without_footing_at_once(monkeypatch, standing, speed, searches):
+    loose, solve = [], LatentNoiseSolver.__call__
+
+    def watched(self, request):
+        loose.append("footing" not in {term.name for term in request.terms})
+        return solve(self, request)
+
+    settings = replace(QUICK, horizon=34, standing=standing)
+    state, _ = begun(Command(0.0, 0.0), settings=settings)
+    walked = torch.zeros(steer._RECENT_FRAMES + 1, *state.committed.joints_world.shape[1:])
+    stands = replace(state, committed=replace(state.committed, joints_world=walked))
+    monkeypatch.setattr(LatentNoiseSolver, "__call__", watched)
+    steer.step(stands, Command(speed, 0.0))
+    assert len(loose) == searches
+    assert loose[0] == (searches == 2)
+
+
 def test_both_searches_of_who_is_stuck_share_the_windows_time(monkeypatch):
     given, solve = [], LatentNoiseSolver.__call__
 
