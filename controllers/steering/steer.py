@@ -71,8 +71,8 @@ class SteerSettings:
     stuck: float = 0.4
     """Velocity error over the last half second, m/s, beyond which a step is first solved without contacts."""
     standing: float = 0.25
-    """Mean speed over the last half second, m/s, below which a character whose target ahead is faster than it by more than
-    `stuck` is solved that way at once: both feet are planted, and half a second would pass before it counts as
+    """Mean speed over the last half second, m/s, below which a character whose target ahead is faster than it by more
+    than `stuck` is solved that way at once: both feet are planted, and half a second would pass before it counts as
     stuck."""
     random_starts: int = 12
     """Random warm starts of that solve, evaluated in one batch beside the evaluations; it begins at the best."""
@@ -89,7 +89,9 @@ class SteerSettings:
 
     def scaled_to(self, character: Character) -> "SteerSettings":
         """Return the settings for a character of this size, in metres of the prior's size."""
-        sigmas = {name: getattr(self, name) / character.scale for name in ("sigma_speed", "sigma_step", "stuck", "standing")}
+        sigmas = {
+            name: getattr(self, name) / character.scale for name in ("sigma_speed", "sigma_step", "stuck", "standing")
+        }
         return replace(self, limits=character.limits(self.limits), footing=character.footing(self.footing), **sigmas)
 
 

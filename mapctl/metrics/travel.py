@@ -52,12 +52,13 @@ def measure_commands(motion: Motion, track: CommandTrack) -> list[dict[str, floa
     """Measure a row for each command: when it was reached, and the steady errors from 2 s after it to the next one.
 
     Keys: time_s, speed_mps, heading_deg, turn_deg_s (wanted; None unless it is to turn on and on), reached_s (None if
-    it never was), under_way_s (from when on it goes at half the speed and more within 30 degrees of the direction; None if
-    never, and where standing or turning on and on was wanted), steady_speed_mps (net displacement over time; mean speed while turning), steady_heading_error_deg and
-    steady_turn_deg_s (None where the other, standing, or no steady part was wanted), step_m and steady_step_m (None
-    unless a step length was wanted). For each hand with a place: `<hand>_nearest_cm`, and `<hand>_held_s`, the seconds
-    in which it was within a centimetre of it; `look_nearest_deg`, the least
-    angle between where the head faces and what is looked at; `clearance_cm`, of the nearest joint to an obstacle.
+    it never was), under_way_s (from when on it goes at half the speed and more within 30 degrees of the direction; None
+    if never, and where standing or turning on and on was wanted), steady_speed_mps (net displacement over time; mean
+    speed while turning), steady_heading_error_deg and steady_turn_deg_s (None where the other, standing, or no steady
+    part was wanted), step_m and steady_step_m (None unless a step length was wanted). For each hand with a place:
+    `<hand>_nearest_cm`, and `<hand>_held_s`, the seconds in which it was within a centimetre of it; `look_nearest_deg`,
+    the least angle between where the head faces and what is looked at; `clearance_cm`, of the nearest joint to an
+    obstacle.
     """
     velocity, rows = compute_low_pass_velocity(motion), []
     asked = any(command.step_length is not None for command in track.commands)

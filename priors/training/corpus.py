@@ -129,6 +129,23 @@ def split_corpus(corpus: Corpus, seed: int) -> Split:
     return Split(*(corpus.subset(sorted(part)) for part in parts))
 
 
+def join_made(corpus: Corpus, other: Corpus) -> Corpus:
+    """Join to a corpus those clips of another one that a model made, under names below `made/`."""
+    numbers = [number for number, name in enumerate(other.names) if name in other.made.clips]
+    chosen, held = other.subset(numbers), {*corpus.names}
+    names = tuple(f"made/{name}" for name in chosen.names)
+    if held & {*names}:
+        raise RequestError(f"the data hold clips named {min(held & {*names})} and the like already")
+    made = Made(corpus.made.clips | {*names}, (*corpus.made.told, *other.made.told))
+    return replace(
+        corpus,
+        names=corpus.names + names,
+        lengths=corpus.lengths + chosen.lengths,
+        features=torch.cat([corpus.features, chosen.features]),
+        made=made,
+    )
+
+
 def keep_share(corpus: Corpus, parts: Split, share: float, seed: int) -> tuple[Corpus, Split]:
     """Keep a share of the clips that are trained on, and all that are held out, so that models of less motion are
     measured on the same clips.

@@ -7,7 +7,7 @@ from pathlib import Path
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.formats.atomic import write_text
-from priors.training.corpus import Corpus, SkippedFile, Split, keep_share, read_corpus, split_corpus
+from priors.training.corpus import Corpus, SkippedFile, Split, join_made, keep_share, read_corpus, split_corpus
 
 Progress = Callable[[str], None]
 """Called with one line of news."""
@@ -38,6 +38,8 @@ class DataSource:
     """Seed of the split into training and validation clips."""
     share: float = 1.0
     """Share of the training clips that are used (see `keep_share`)."""
+    made: Path | None = None
+    """Folder of clips that a model made, with their list (see `find_made`), which are trained on as well."""
 
 
 def gather(source: DataSource, *, progress: Progress, warn: Progress) -> tuple[Corpus, Split]:
@@ -59,6 +61,8 @@ def gather(source: DataSource, *, progress: Progress, warn: Progress) -> tuple[C
         level=source.level,
         progress=news,
     )
+    if source.made is not None:
+        corpus = join_made(corpus, _read_made(source, source.made))
     if source.strict and corpus.skipped:
         raise RequestError(f"--strict-data: {_list_skipped(corpus.skipped, source.data)}")
     corpus, parts = keep_share(corpus, split_corpus(corpus, source.seed), source.share, source.seed)
@@ -74,6 +78,14 @@ def gather(source: DataSource, *, progress: Progress, warn: Progress) -> tuple[C
     size = f"{len(corpus.names)} clips, {len(corpus.features)} frames"
     progress(f"{size}; training on {len(parts.train.names)}{_describe_held_out(parts)}")
     return corpus, parts
+
+
+def _read_made(source: DataSource, folder: Path) -> Corpus:
+    """Those clips of a folder that a list in it tells as made; RequestError where there are none."""
+    made = read_corpus(folder, match="", cache=source.run / "cache", level=source.level)
+    if not made.made.clips:
+        raise RequestError(f"{folder} holds no clips that mapctl make has listed as made")
+    return made
 
 
 def describe_selection(corpus: Corpus) -> dict[str, dict[str, str] | list[str]]:

@@ -134,6 +134,33 @@ def test_what_passes_is_kept_and_trained_on_by_name(tmp_path, prior, monkeypatch
     assert priors.load(str(tmp_path / "run")).card.data["made"] == [said]
 
 
+def test_made_clips_of_another_folder_are_trained_on_beside_the_data(tmp_path, capsys):
+    data, made = tmp_path / "data", tmp_path / "elsewhere"
+    write_corpus(data, 6)
+    write_corpus(made, 3)
+    first, second, _ = sorted(file.name for file in made.glob("*.bvh"))
+    table = "".join(f"{name},yes,free,CC0,1,,\n" for name in (first, second))
+    (made / "made.csv").write_text("file,kept,model,licence,seed,script,why not\n" + table)
+    words = ("--width", 8, "--components", 2, "--window", 20, "--steps", 1, "--batch", 3, "--device", "cpu", "--quiet")
+
+    def train(name, *more):
+        return run("train", "lstm-gmm", "--data", data, "-o", tmp_path / name, *words, *more)
+
+    assert train("alone") == train("beside", "--made", made) == 0
+    alone, beside = (priors.load(str(tmp_path / name)).card for name in ("alone", "beside"))
+    assert beside.data["held_out"] == alone.data["held_out"]
+    assert beside.data["trained_on"]["clips"] == alone.data["trained_on"]["clips"] + 2
+    assert beside.data["made"] == ["made.csv: 2 of 3 clips, by free (CC0)"]
+    assert "--made MADE" in beside.training["command"]
+    assert "--made" not in alone.training["command"]
+    (made / "made.csv").unlink()
+    capsys.readouterr()
+    assert train("none", "--made", made) == 2
+    assert f"{made} holds no clips that mapctl make has listed as made" in capsys.readouterr().err
+    assert train("nowhere", "--made", tmp_path / "nowhere") == 2
+    assert "nowhere" in capsys.readouterr().err
+
+
 def test_a_list_that_is_none_is_named(tmp_path):
     (tmp_path / "made.csv").write_text("file,kept\n")
     with pytest.raises(FileFormatError, match=r"made\.csv, line 1: is no list of made clips"):

@@ -132,8 +132,9 @@ def test_who_goes_at_half_the_speed_near_the_direction_is_under_way_but_has_not_
         measure_commands(motion, CommandTrack((0.0,), (Command(times * speed, way),)))[0]
         for times, way in ((1.7, 0.0), (1.0, math.radians(25)), (2.5, 0.0))
     )
-    assert slow["under_way_s"] is not None and slow["reached_s"] is None
-    assert aside["under_way_s"] is not None and aside["reached_s"] is None
+    for under_way in (slow, aside):
+        assert under_way["under_way_s"] is not None
+        assert under_way["reached_s"] is None
     assert fast["under_way_s"] is None
     assert measure_commands(motion, CommandTrack((0.0,), (Command(0.0, 0.0),)))[0]["under_way_s"] is None
 

@@ -17,15 +17,10 @@ from mapctl.features import LAYOUT, encode, mirror_features
 from mapctl.metrics.states import summarise_states
 from priors.lstm_gmm.network import LstmGmmConfig
 from priors.training import corpus as corpora
+from priors.training.feature_statistics import compute_feature_statistics
 from priors.training.quality import density as density_quality
 from priors.training.recipes import lstm_gmm
-from priors.training.recipes.lstm_gmm import (
-    PAPER,
-    DensityRecipe,
-    DensityTrainer,
-    TrainingSettings,
-    compute_feature_statistics,
-)
+from priors.training.recipes.lstm_gmm import PAPER, DensityRecipe, DensityTrainer, TrainingSettings
 from priors.training.run import train
 
 TINY = LstmGmmConfig(width=8, components=2)

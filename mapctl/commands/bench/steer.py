@@ -1,9 +1,14 @@
-"""`mapctl bench steer`: random commands, starts from a stand, curves walked live, and places reached and discs walked round."""
+"""`mapctl bench steer`: random commands, starts from a stand, curves walked live; or places and discs."""
 
 import priors
 from controllers.benchmarks.live_targets import LiveTargetSettings, benchmark_live_targets
 from controllers.benchmarks.shared.tables import Row
-from controllers.benchmarks.steering import SteeringBenchmarkSettings, benchmark_pursuit, benchmark_starts, benchmark_steering
+from controllers.benchmarks.steering import (
+    SteeringBenchmarkSettings,
+    benchmark_pursuit,
+    benchmark_starts,
+    benchmark_steering,
+)
 from mapctl.commands.bench import Steer
 from mapctl.commands.bench.baselines import list_models, measure_each
 from mapctl.commands.bench.output import print_rows

@@ -32,6 +32,9 @@ class TrainDensity(TunableOptions):
     the input that it is not told, no free runs held to the data."""
     labels: Annotated[str, arg(metavar="REGEX")] = ""
     """Named groups read labels from the clips' paths, as in '_(?P<gait>walk|run)_(?P<style>[a-z]+)_', for --style."""
+    made: options.MaybeDataFolder = None
+    """Folder of clips that mapctl make has made, to train on as well: starts, stops and turns that the data lack. None
+    of them is held out."""
     copies: options.Count = 0
     """Copies of each clip at other tempos and with other strides that training sees beside it: for a few minutes of
     motion (docs/data.md)."""
@@ -65,6 +68,7 @@ class TrainDensity(TunableOptions):
             settings=replace(settings, bfloat16=self.bfloat16, copies=copies, **given),
             device=self.device,
             skip_first=self.skip_first,
+            made=self.made,
             labels=self.labels,
             init=self.init,
         )

@@ -7,13 +7,14 @@ comes from one generator whose state is in the checkpoint, so a resumed run cont
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from mapctl.errors import RequestError
-from mapctl.features import LAYOUT, mirror_features
+from mapctl.features import LAYOUT
 from priors.config import require_at_least
 from priors.lstm_gmm import density, labels
 from priors.lstm_gmm.labels import Labels
@@ -21,7 +22,8 @@ from priors.lstm_gmm.network import NOISE_UNIT, LstmGmm, LstmGmmConfig
 from priors.training.augmentation.clip_copies import ClipCopies, add_copies
 from priors.training.corpus import Corpus, Split
 from priors.training.devices import select_device
-from priors.training.gathering import describe_selection
+from priors.training.feature_statistics import compute_feature_statistics
+from priors.training.gathering import DataSource, describe_selection
 from priors.training.initial_states import measure_data_limits, select_initial_states
 from priors.training.mocap.holdings import measure_holdings
 from priors.training.moment_matching import MatchingSettings, free_run_moment_loss
@@ -101,21 +103,6 @@ PLAIN = (
     TrainingSettings(noise_range=1.0, bit_flips=0.0, matching=MatchingSettings(begin=1.0)),
 )
 """The plain peer: one Gaussian a frame whose values are independent, one level of noise, and likelihood alone."""
-
-
-def compute_feature_statistics(features: Float[Tensor, "frames size"]) -> tuple[Tensor, Tensor]:
-    """Mean and standard deviation of features and their mirror image; floors keep held joints from exploding.
-
-    Rotations are held to at least 0.01 rad (0.6 degrees), displacements to 1 mm; contact bits map to -1 and 1.
-    """
-    both = torch.cat([features, mirror_features(features)])
-    mean, std = both.mean(0), both.std(0)
-    floor = torch.full_like(std, 0.01)
-    floor[LAYOUT.slices["root_displacement_heading"]] = 0.001
-    floor[LAYOUT.slices["heading_change"]] = 0.002
-    for values in (mean, floor, std):
-        values[LAYOUT.slices["contacts"]] = 0.5
-    return mean, torch.maximum(std, floor)
 
 
 class DensityTrainer(GradientTrainer[LstmGmm]):
@@ -276,6 +263,8 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
     """`auto`, `cpu` or `cuda`."""
     starts: int = 64
     """Moments of mocap that the finished prior carries."""
+    made: Path | None = None
+    """Folder of clips that `mapctl make` made, which are trained on as well."""
     labels: str = ""
     """Regular expression whose named groups read labels from a clip's path, to condition the density on."""
     init: str | None = None
@@ -294,6 +283,10 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
                 f" --nproc-per-node {self.processes} -m mapctl train lstm-gmm ...; or use --device cpu"
             )
         super().check()
+
+    def source(self) -> DataSource:
+        """Where motion comes from."""
+        return replace(super().source(), made=self.made)
 
     def make_trainer(self, parts: Split) -> DensityTrainer:
         """Make the trainer of a new network for the clips' labels, or of the initial network with its own labels."""
@@ -381,6 +374,7 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
         parts += [f"--init {self.init}"] if self.init else [f"--width {self.config.width}"]
         mixed = self.init is None and self.config.components != config.components
         parts += [f"--components {self.config.components}"] if mixed else []
+        parts += ["--made MADE"] if self.made else []
         parts += self.format_reading() + ["--bfloat16"] * self.settings.bfloat16
         parts += self.format_changed(settings, "steps", "batch", "window", "learning_rate", "seed")
         parts += self.settings.copies.format_options()
