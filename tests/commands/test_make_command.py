@@ -57,6 +57,9 @@ def test_scripts_stand_first_and_stay_within_what_the_prior_knows(seed):
         if kind == "veer":
             assert after.speed == before.speed > 0
             assert 0.5 < abs(after.heading - before.heading) < 2.2
+        if kind in ("go", "leave"):
+            assert before.speed == 0 < after.speed
+            assert (abs(after.heading - before.heading) > 0.5) == (kind == "leave") or before.turning is not None
         if kind == "spin":
             assert before.speed == 0
             assert math.radians(59) < abs(after.turning or 0.0) < math.radians(121)
@@ -70,6 +73,7 @@ def test_scripts_have_what_data_lack_and_the_seed_draws_them():
     assert {word.split()[0] for script in drawn for word in script.split(", ")} == {
         "stand",
         "go",
+        "leave",
         "spin",
         "pace",
         "stop",

@@ -11,12 +11,14 @@ from mapctl.protocols import DataLimits
 _HOLD = (1.5, 3.5)  # seconds for which a command holds
 _STAND = 1.0  # seconds at the beginning
 _SPIN = (60.0, 120.0)  # degrees a second on the spot
-_VEER = (30.0, 120.0)  # degrees by which the direction changes
+_VEER = (30.0, 120.0)  # degrees by which the direction changes under way
+_LEAVE = (30.0, 180.0)  # degrees by which it changes with a start
 
 
 def draw_script(limits: DataLimits, seconds: float, generator: torch.Generator) -> tuple[CommandTrack, str]:
-    """A script of this length, and what it has in words: it begins with standing; then starts, stops, turns on the
-    spot, changes of direction and of pace, within what the prior knows, follow each other, none twice in a row."""
+    """A script of this length, and what it has in words: it begins with standing; then starts ahead and to other sides,
+    stops, turns on the spot, changes of direction and of pace, within what the prior knows, follow each other, none
+    twice in a row."""
 
     def uniform(low: float, high: float) -> float:
         return low + (high - low) * float(torch.rand((), generator=generator))
@@ -37,7 +39,7 @@ def draw_script(limits: DataLimits, seconds: float, generator: torch.Generator) 
 
 
 def _list_kinds(*, standing: bool) -> list[str]:
-    return ["go", "spin"] if standing else ["pace", "stop", "veer"]
+    return ["go", "leave", "spin"] if standing else ["pace", "stop", "veer"]
 
 
 def _draw_command(
@@ -53,4 +55,7 @@ def _draw_command(
         by = math.copysign(uniform(*_VEER), uniform(-1, 1))
         return Command(speed, heading + math.radians(by)), f"{by:.0f} deg"
     pace = uniform(max(0.4, limits.slowest), limits.max_steering_speed)
+    if kind == "leave":
+        by = math.copysign(uniform(*_LEAVE), uniform(-1, 1))
+        return Command(pace, heading + math.radians(by)), f"{pace:.2f} m/s to {by:.0f} deg"
     return Command(pace, heading), f"{pace:.2f} m/s"
