@@ -136,7 +136,8 @@ def join_made(corpus: Corpus, other: Corpus) -> Corpus:
     names = tuple(f"made/{name}" for name in chosen.names)
     if held & {*names}:
         raise RequestError(f"the data hold clips named {min(held & {*names})} and the like already")
-    made = Made(corpus.made.clips | {*names}, (*corpus.made.told, *other.made.told))
+    told = (*corpus.made.told, *other.made.told)
+    made = Made(corpus.made.clips | {*names}, told, corpus.made.licences | other.made.licences)
     return replace(
         corpus,
         names=corpus.names + names,

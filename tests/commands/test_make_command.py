@@ -15,9 +15,11 @@ from mapctl.commands.make import checks
 from mapctl.commands.make import run as make_run
 from mapctl.commands.make.checks import CHECKED, find_bounds, list_faults, measure_checked
 from mapctl.commands.make.scripts import draw_script
+from mapctl.commands.train.whole_set.plan import make_jobs
 from mapctl.errors import FileFormatError
 from mapctl.protocols import DataLimits
 from mapctl.skeleton import CANONICAL
+from priors.training.bundled.models import list_models
 from priors.training.mocap.made import find_made
 
 pytestmark = pytest.mark.usefixtures("short_free_runs")
@@ -163,6 +165,34 @@ def test_made_clips_of_another_folder_are_trained_on_beside_the_data(tmp_path, c
     assert f"{made} holds no clips that mapctl make has listed as made" in capsys.readouterr().err
     assert train("nowhere", "--made", tmp_path / "nowhere") == 2
     assert "nowhere" in capsys.readouterr().err
+
+
+def write_list(folder, licence, *names):
+    folder.mkdir(parents=True)
+    for name in names:
+        (folder / name).write_text("")
+    rows = "".join(f"{name},yes,locomotion,{licence},1,,\n" for name in names)
+    (folder / "made.csv").write_text("file,kept,model,licence,seed,script,why not\n" + rows)
+    return folder
+
+
+def test_a_set_is_trained_on_made_clips_where_densities_know_walks(tmp_path, capsys):
+    made = write_list(tmp_path / "made", "CC BY-NC 4.0", "a.bvh")
+    assert run("train", "all", "--commands", "--made", made) == 0
+    commands = dict(line.split(": ", 1) for line in capsys.readouterr().out.splitlines())
+    assert {name for name, command in commands.items() if "--made MADE" in command} == {"locomotion", "locomotion-live"}
+    (job, *_) = make_jobs(list_models(with_made=True), tmp_path, tmp_path / "set", 1.0, made=made)
+    assert job.words[job.words.index("--made") + 1] == str(made)
+
+
+def test_a_free_set_sees_no_clips_of_a_model_that_is_not_free(tmp_path, capsys):
+    write_corpus(tmp_path / "mocap", 2)
+    words = ("train", "all", "--data", tmp_path / "mocap", "-o", tmp_path / "set", "--weights", "free", "--made")
+    assert run(*words, write_list(tmp_path / "theirs", "CC BY-NC 4.0", "a.bvh")) == 2
+    assert "holds clips under CC BY-NC 4.0; weights that are free for any use" in capsys.readouterr().err
+    assert run(*words, tmp_path / "mocap") == 2
+    assert "holds no clips that mapctl make has listed" in capsys.readouterr().err
+    assert not (tmp_path / "set").exists()
 
 
 def test_a_list_that_is_none_is_named(tmp_path):

@@ -23,8 +23,8 @@ from priors.training.recipes.refiner import AdversarialSettings, RefinerRecipe
 from priors.training.recipes.stitcher import StitcherRecipe, StitcherSettings
 from priors.training.recipes.tweener import TweenerRecipe, TweenerSettings
 
-DATA, RUN = Path("DATA"), Path("RUN")
-"""What a card's command calls the folders of clips and of the run."""
+DATA, RUN, MADE = Path("DATA"), Path("RUN"), Path("MADE")
+"""What a card's command calls the folders of clips, of the run, and of clips that a model made."""
 USUAL_SEED = 1
 """Seed by which clips are kept from training, whatever the seed of all else."""
 AnyRecipe = Recipe[Any, Any, Any]
@@ -102,15 +102,23 @@ class BundledModel:
 
 
 def list_models(
-    weights: str = "full", *, match: str | None = None, seed: int = USUAL_SEED, share: float = 1.0
+    weights: str = "full",
+    *,
+    match: str | None = None,
+    seed: int = USUAL_SEED,
+    share: float = 1.0,
+    with_made: bool = False,
 ) -> tuple[BundledModel, ...]:
-    """List the models of a set, each after those that it needs; `match` chooses clips of one's own for the densities of
-    walks and runs, without labels, and `share` is that of the clips that are trained on. RequestError for a set that
-    does not exist."""
+    """List the models of a set, each after those that it needs.
+
+    `match` chooses clips of one's own for the densities of walks and runs, without labels, `share` is that of the clips
+    that are trained on, and `with_made` has those densities see clips that a model made as well. RequestError for a set
+    that does not exist.
+    """
     if weights not in SETS:
         raise RequestError(f"the weights are {' or '.join(SETS)}, got {weights!r}")
     chosen = SETS[weights] if match is None else replace(SETS[weights], locomotion=match, labels="")
-    models = (_seed(model, seed) for model in _make_models(chosen))
+    models = (_seed(model, seed) for model in _make_models(chosen, MADE if with_made else None))
     return tuple(replace(model, recipe=replace(model.recipe, data_share=share)) for model in models)
 
 
@@ -131,7 +139,7 @@ RECIPES: Mapping[str, type[AnyRecipe]] = {
 """Recipes by the kind of model that a card names."""
 
 
-def _make_models(weights: WeightSet) -> tuple[BundledModel, ...]:
+def _make_models(weights: WeightSet, made: Path | None) -> tuple[BundledModel, ...]:
     """The table. Steps are a plan, where a run goes on until its curve is flat. Those of densities are told: a curve of
     likelihoods goes on falling while free runs already drift off (docs/training.md)."""
     captures: dict[str, Any] = {"data": DATA, "out": RUN, "licence": weights.licence, "cuts": CMU}
@@ -139,7 +147,7 @@ def _make_models(weights: WeightSet) -> tuple[BundledModel, ...]:
     until_flat: dict[str, Any] = {"match": weights.match or None, "until_flat": UntilFlat()}
     everything = {**shared, **until_flat}
     general = {**shared, "match": weights.match}  # which a density's command always tells
-    walks: dict[str, Any] = {**general, "match": weights.locomotion, "labels": weights.labels}
+    walks: dict[str, Any] = {**general, "match": weights.locomotion, "labels": weights.labels, "made": made}
     widths = {"locomotion": weights.width, "locomotion-live": weights.live_width}
     return (
         *(

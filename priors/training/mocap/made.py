@@ -24,13 +24,15 @@ class Made:
     told: tuple[str, ...] = ()
     """For each list and each model in it how many clips it made, as `made/made.csv: 3 of 8 clips, by locomotion (its
     licence)`."""
+    licences: frozenset[str] = frozenset()
+    """Licences of the models that made them."""
 
 
 def find_made(data: Path, names: Sequence[str]) -> Made:
     """Find which of the clips (paths below the folder) a model made, by the lists below the folder. FileFormatError for
     a list that is none."""
     told: list[str] = []
-    clips, made = set(names), set[str]()
+    clips, made, licences = set(names), set[str](), set[str]()
     for folder, folders, files in os.walk(data, onerror=lambda error: None):
         folders.sort()
         if TABLE_NAME in files:
@@ -40,12 +42,13 @@ def find_made(data: Path, names: Sequence[str]) -> Made:
             listed = {name: by for name, by in makers.items() if name in clips}
             counts = Counter((model, licence) for model, licence in listed.values())
             made |= listed.keys()
+            licences |= {licence for _, licence in listed.values()}
             shown = (below / TABLE_NAME).as_posix()
             told += [
                 f"{shown}: {count} of {len(names)} clips, by {model} ({licence})"
                 for (model, licence), count in counts.items()
             ]
-    return Made(frozenset(made), tuple(told))
+    return Made(frozenset(made), tuple(told), frozenset(licences))
 
 
 def _read_makers(file: Path) -> list[tuple[str, str, str]]:

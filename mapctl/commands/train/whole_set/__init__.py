@@ -28,6 +28,8 @@ class TrainAll(Command):
     """Which set: of all clips (full), or of takes of the CMU database alone, with weights free for any use (free)."""
     match: Annotated[str | None, arg(metavar="REGEX")] = None
     """Clips of your own for the densities of walks and runs, by what their paths hold; those have no labels then."""
+    made: options.MaybeDataFolder = None
+    """Folder of clips that mapctl make has made, which the densities of walks and runs are trained on as well."""
     only: Annotated[str | None, arg(metavar="NAME,NAME")] = None
     """Models to train; what they need must be among them or finished."""
     seed: options.Count = 1

@@ -4,7 +4,7 @@ import hashlib
 import json
 import os
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.util import find_spec
@@ -14,7 +14,7 @@ from typing import Any
 from mapctl.errors import RequestError
 from mapctl.formats.atomic import write_text
 from priors.training import run_files
-from priors.training.bundled.models import DATA, RUN, BundledModel
+from priors.training.bundled.models import DATA, MADE, RUN, BundledModel
 from priors.training.bundled.weights import is_finished
 
 RECORD, LOCK, CACHE = "all.json", ".lock", "cache"
@@ -45,21 +45,24 @@ class Job:
         return [*self.words, "--resume"] if run_files.has_checkpoint(self.run) else list(self.words)
 
 
-def make_jobs(models: Sequence[BundledModel], data: Path, out: Path, minutes: float) -> list[Job]:
-    """Make them in the order of the table. RequestError where one needs another that is not among them or there."""
+def make_jobs(
+    models: Sequence[BundledModel], data: Path, out: Path, minutes: float, *, made: Path | None = None
+) -> list[Job]:
+    """Make them in the order of the table; `made` is the folder of clips that a model made, where a command names one.
+    RequestError where one needs another that is not among them or there."""
     names = {model.name for model in models}
     for model in models:
         for need in model.needs.values():
             if need not in names and not is_finished(out / need):
                 raise RequestError(f"{model.name} needs {need}, which is not in {out}: add it to --only")
-    return [Job(model, out / model.name, _type(model, data, out, minutes)) for model in models]
+    folders = {DATA: data, MADE: made}
+    return [Job(model, out / model.name, _type(model, folders, out, minutes)) for model in models]
 
 
-def _type(model: BundledModel, data: Path, out: Path, minutes: float) -> tuple[str, ...]:
+def _type(model: BundledModel, folders: Mapping[Path, Path | None], out: Path, minutes: float) -> tuple[str, ...]:
     """The command of the card, with folders in it, and what changes no weight: licence and limit."""
-    words = shlex.split(model.command)
-    words[words.index(str(DATA))] = str(data)
-    words[words.index(str(RUN))] = str(out / model.name)
+    named = {str(name): str(folder) for name, folder in {**folders, RUN: out / model.name}.items() if folder}
+    words = [named.get(word, word) for word in shlex.split(model.command)]
     for option, need in model.needs.items():
         at = words.index(option) if option in words else len(words)
         words[at : at + 2] = [option, str(out / need)]

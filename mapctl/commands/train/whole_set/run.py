@@ -14,7 +14,8 @@ from mapctl.commands.train.whole_set.plan import Job, Record, lock_folder, make_
 from mapctl.commands.train.whole_set.workers import Say, train_jobs
 from mapctl.errors import MapctlError, RequestError
 from priors.training.bundled import weights
-from priors.training.bundled.models import BundledModel, list_models
+from priors.training.bundled.models import SETS, BundledModel, list_models
+from priors.training.mocap.made import find_made
 
 
 def run(command: TrainAll) -> int:
@@ -30,7 +31,13 @@ def run(command: TrainAll) -> int:
         return data_scaling.print_scaling(command.by_motion, command.out)
     options.check_seed(command.seed)
     check_share(command.data_share)
-    models = list_models(command.weights, match=command.match, seed=command.seed, share=command.data_share)
+    models = list_models(
+        command.weights,
+        match=command.match,
+        seed=command.seed,
+        share=command.data_share,
+        with_made=command.made is not None,
+    )
     chosen = _choose(models, command.only)
     if command.commands:
         for model in chosen:
@@ -46,7 +53,9 @@ def _train(command: TrainAll, chosen: Sequence[BundledModel]) -> int:
         raise RequestError(f"--jobs must be at least 1, got {command.jobs}")
     if not 0 < command.minutes < math.inf:
         raise RequestError(f"--minutes must be positive, got {command.minutes:g}")
-    jobs = make_jobs(chosen, command.data, command.out, command.minutes)
+    if command.made is not None:
+        _check_made(command.made, chosen[0].recipe.licence)
+    jobs = make_jobs(chosen, command.data, command.out, command.minutes, made=command.made)
     record = Record.read(command.out, command.data, jobs)
     outputs.check_folder(command.out)
     with explain_end(lambda: _describe_resumption(command, jobs)), lock_folder(command.out) as lock:
@@ -58,6 +67,19 @@ def _train(command: TrainAll, chosen: Sequence[BundledModel]) -> int:
 
         failed = train_jobs(jobs, command.jobs, start=start, lock=lock, say=_say(command), finish=_finish(command.out))
     return _conclude(command.out, jobs, failed)
+
+
+def _check_made(folder: Path, licence: str) -> None:
+    """RequestError for a folder without made clips, and for clips that came under a licence that is not that of a set
+    which anybody may use."""
+    made = find_made(folder, [file.relative_to(folder).as_posix() for file in folder.rglob("*.bvh")])
+    if not made.clips:
+        raise RequestError(f"{folder} holds no clips that mapctl make has listed as made")
+    others = sorted(made.licences - {licence})
+    if others and licence == SETS["free"].licence:
+        raise RequestError(
+            f"{folder} holds clips under {', '.join(others)}; weights that are {licence} must not see them"
+        )
 
 
 def _conclude(out: Path, jobs: Sequence[Job], failed: dict[str, str]) -> int:
