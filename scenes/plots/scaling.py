@@ -24,7 +24,7 @@ class Scaling:
     values: tuple[float, ...]
     """Of the measure."""
     change: float
-    """Percent by which the error changes with twice the motion."""
+    """Percent by which the error changes with twice the motion, between the two largest amounts."""
 
 
 def plot_scaling(models: Sequence[Scaling], path: str | PathLike[str]) -> None:
@@ -39,7 +39,7 @@ def plot_scaling(models: Sequence[Scaling], path: str | PathLike[str]) -> None:
             plot.set_xscale("log", base=2)
             plot.set_xticks(model.minutes, [f"{minutes:.3g}" for minutes in model.minutes])
             plot.minorticks_off()
-            plot.set_title(f"{model.name}\ntwice the motion: error {model.change:+.1f} %", fontsize=9)
+            plot.set_title(f"{model.name}\ntwice the motion at the end: error {model.change:+.1f} %", fontsize=9)
             plot.set_xlabel("minutes of motion", fontsize=8)
             plot.set_ylabel(model.measure, fontsize=8)
             plot.tick_params(labelsize=7)

@@ -41,10 +41,18 @@ def test_what_twice_the_motion_brings_is_the_slope_over_all_sets(sets, tmp_path,
     paths = [row for row in rows if row[0] == "path"]
     assert [row[1] for row in paths[:3]] == ["10", "20", "40"]
     assert [float(row[-1]) for row in paths[:3]] == pytest.approx([100 / 0.81 - 100, 100 / 0.9 - 100, 0], abs=0.01)
-    assert float(paths[3][-1]) == pytest.approx(-10, abs=0.01)
+    assert [float(word) for word in paths[3][1:]] == pytest.approx([-10, -10], abs=0.01)
     density = [row for row in rows if row[0] == "locomotion"]
     assert float(density[3][-1]) == pytest.approx(100 * math.expm1(-1 / 66), abs=0.05)
     assert picture.read_bytes()[:4] == b"\x89PNG"
+
+
+def test_a_curve_that_flattens_promises_no_more_than_its_end(tmp_path, capsys):
+    for minutes, error in ((10.0, 1.0), (20.0, 0.5), (40.0, 0.45)):
+        save(tmp_path / f"{minutes:g}", "path", "path", minutes, {"test": {"all_V1_cm": error}})
+    assert run("train", "all", "--by-motion", *(tmp_path / name for name in ("10", "20", "40"))) == 0
+    last = [line.split() for line in capsys.readouterr().out.splitlines() if line.split()[:1] == ["path"]][-1]
+    assert [float(word) for word in last[1:]] == pytest.approx([100 * (math.sqrt(0.45) - 1), -10], abs=0.01)
 
 
 def test_only_sets_that_can_be_compared_are(sets, tmp_path, fails, capsys):

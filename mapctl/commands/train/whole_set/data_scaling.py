@@ -21,7 +21,7 @@ _COLUMNS = (
 
 def print_scaling(sets: Sequence[Path], picture: Path | None) -> int:
     """Print each model's quality in each set by minutes of motion, and by how much its error changes with twice the
-    motion; draw that if a picture is asked for. Returns the exit status.
+    motion, over all sets and at the end; draw that if a picture is asked for. Returns the exit status.
 
     RequestError where no model is in two sets that were trained on different amounts of motion and measured on the
     same unseen clips.
@@ -37,10 +37,13 @@ def print_scaling(sets: Sequence[Path], picture: Path | None) -> int:
         )
     rows = [row for name, sizes in models.items() for row in _list_rows(name, sizes)]
     print_table(_COLUMNS, rows)
-    changes = {name: _fit_change(sizes) for name, sizes in models.items()}
-    print_table(("model", "error changes with twice the motion by, %"), list(changes.items()))
+    lasts = {name: _fit_change(_select_most(sizes)) for name, sizes in models.items()}
+    changes = [(name, _fit_change(sizes), lasts[name]) for name, sizes in models.items()]
+    print_table(
+        ("model", "error changes with twice the motion by, %", "between the two sets of most motion, %"), changes
+    )
     if picture is not None:
-        plot_scaling([_make_plot(name, sizes, changes[name]) for name, sizes in models.items()], picture)
+        plot_scaling([_make_plot(name, sizes, lasts[name]) for name, sizes in models.items()], picture)
         print(f"wrote {picture}")
     return 0
 
@@ -65,6 +68,12 @@ def _list_rows(name: str, sizes: Sequence[Finished]) -> list[list[object]]:
         [name, model.minutes_of_motion, model.minutes, model.steps, *model.quality, sizes[-1].find_change(model)]
         for model in sizes
     ]
+
+
+def _select_most(sizes: Sequence[Finished]) -> list[Finished]:
+    """Select those of the two largest amounts of motion: curves flatten, and what more would bring shows at the end."""
+    most = sorted({model.minutes_of_motion for model in sizes})[-2:]
+    return [model for model in sizes if model.minutes_of_motion in most]
 
 
 def _fit_change(sizes: Sequence[Finished]) -> float:
