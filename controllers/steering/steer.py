@@ -74,6 +74,9 @@ class SteerSettings:
     """Mean speed over the last half second, m/s, below which a character whose target ahead is faster than it by more
     than `stuck` is solved that way at once: both feet are planted, and half a second would pass before it counts as
     stuck."""
+    sigma_leaving: float = 0.1
+    """Sigma of the hips' heading in such steps, radians, where it is smaller than `sigma_facing`: who has to turn for a
+    start finds his first step sooner where the body turns first."""
     random_starts: int = 12
     """Random warm starts of that solve, evaluated in one batch beside the evaluations; it begins at the best."""
     footing: FootContact = field(default_factory=FootContact)
@@ -219,11 +222,13 @@ def step(state: SteerState, command: Command, *, seconds: float | None = None) -
         state = _restart_target(state)
     targets = state.target.ahead(command, settings.limits, frames=settings.horizon, fps=PRIOR_FPS)
     conditioned = replace(state, prior=condition_prior(state.prior, command.told)) if command.told else state
-    terms = (*_build_steering_terms(state, targets, command.step_length), *state.terms)
+    free = stuck or _is_leaving(state, targets)
+    sigma_facing = min(settings.sigma_facing, settings.sigma_leaving) if free else settings.sigma_facing
+    terms = (*_build_steering_terms(state, targets, command.step_length, sigma_facing), *state.terms)
     if asked.obstacles:
         terms = (*terms, character.term(KeepClear(asked.obstacles)))
     search = None if seconds is None else state.cost.limit_search(seconds)
-    done, outcome = _solve_step(conditioned, terms, search, free=stuck or _is_leaving(state, targets))
+    done, outcome = _solve_step(conditioned, terms, search, free=free)
     if outcome is not Outcome.DONE:
         cold = replace(state.committed, warm_start=state.committed.warm_start[:0], forecast=None)
         restarted = replace(conditioned, committed=cold)
@@ -368,7 +373,7 @@ def _restart_target(state: SteerState) -> SteerState:
 
 
 def _build_steering_terms(
-    state: SteerState, targets: Sequence[SteeringTarget], step_length: float | None
+    state: SteerState, targets: Sequence[SteeringTarget], step_length: float | None, sigma_facing: float
 ) -> Sequence[Term]:
     settings = state.settings
     velocity = RootVelocity(
@@ -377,7 +382,7 @@ def _build_steering_terms(
         facing=torch.tensor([target.facing for target in targets]),
         sigma_speed=settings.sigma_speed,
         sigma_direction=settings.sigma_direction,
-        sigma_facing=settings.sigma_facing,
+        sigma_facing=sigma_facing,
     )
     terms = settings.noise, velocity, settings.footing
     return (*terms, StepLength(step_length, sigma=settings.sigma_step)) if step_length else terms

@@ -16,7 +16,7 @@ from controllers.steering.loop import LoopSettings
 from mapctl.intent.steering import Command, SteeringTarget
 from mapctl.intent.steering_limits import SteeringLimits
 from mapctl.problem.window_solvers import LatentNoiseSolver
-from mapctl.terms import FootContact
+from mapctl.terms import FootContact, RootVelocity
 
 
 @pytest.mark.parametrize("planted", [True, False])
@@ -130,13 +130,14 @@ def test_who_is_stuck_is_searched_for_half_of_the_time_without_footing(monkeypat
     ("standing", "speed", "searches"), [(0.25, 1.2, 2), (0.25, 0.3, 1), (0.0, 1.2, 1)], ids=["goes", "creeps", "never"]
 )
 def test_who_stands_and_is_told_to_go_is_searched_for_without_footing_at_once(monkeypatch, standing, speed, searches):
-    loose, solve = [], LatentNoiseSolver.__call__
+    loose, facing, solve = [], [], LatentNoiseSolver.__call__
 
     def watched(self, request):
         loose.append("footing" not in {term.name for term in request.terms})
+        facing.extend(term.sigma_facing for term in request.terms if isinstance(term, RootVelocity))
         return solve(self, request)
 
-    settings = replace(QUICK, horizon=34, standing=standing)
+    settings = replace(QUICK, horizon=34, standing=standing, sigma_facing=0.5, sigma_leaving=0.2)
     state, _ = begun(Command(0.0, 0.0), settings=settings)
     walked = torch.zeros(steer._RECENT_FRAMES + 1, *state.committed.joints_world.shape[1:])
     stands = replace(state, committed=replace(state.committed, joints_world=walked))
@@ -144,6 +145,7 @@ def test_who_stands_and_is_told_to_go_is_searched_for_without_footing_at_once(mo
     steer.step(stands, Command(speed, 0.0))
     assert len(loose) == searches
     assert loose[0] == (searches == 2)
+    assert facing == ([0.2, 0.2] if searches == 2 else [0.5])
 
 
 def test_both_searches_of_who_is_stuck_share_the_windows_time(monkeypatch):
