@@ -77,6 +77,8 @@ class SteerSettings:
     sigma_leaving: float = 0.1
     """Sigma of the hips' heading in such steps, radians, where it is smaller than `sigma_facing`: who has to turn for a
     start finds his first step sooner where the body turns first."""
+    leaving_turn: float = 1.6
+    """Times the turn rate of `limits` at which the target of a standing character that is told to go may turn."""
     random_starts: int = 12
     """Random warm starts of that solve, evaluated in one batch beside the evaluations; it begins at the best."""
     footing: FootContact = field(default_factory=FootContact)
@@ -222,7 +224,10 @@ def step(state: SteerState, command: Command, *, seconds: float | None = None) -
         state = _restart_target(state)
     targets = state.target.ahead(command, settings.limits, frames=settings.horizon, fps=PRIOR_FPS)
     conditioned = replace(state, prior=condition_prior(state.prior, command.told)) if command.told else state
-    free = stuck or _is_leaving(state, targets)
+    if leaving := _is_leaving(state, targets):
+        limits = replace(settings.limits, turn_rate=settings.leaving_turn * settings.limits.turn_rate)
+        targets = state.target.ahead(command, limits, frames=settings.horizon, fps=PRIOR_FPS)
+    free = stuck or leaving
     sigma_facing = min(settings.sigma_facing, settings.sigma_leaving) if free else settings.sigma_facing
     terms = (*_build_steering_terms(state, targets, command.step_length, sigma_facing), *state.terms)
     if asked.obstacles:
