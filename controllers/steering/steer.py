@@ -41,6 +41,7 @@ KEPT_FRAMES = 11
 _PAST_TARGET_FRAMES = 60  # past targets that are kept: more than the root velocity term looks back on
 _RECENT_FRAMES = 15  # frames, half a second, over which the velocity error is measured
 _MIN_TRAVEL_SPEED = 0.3  # m/s below which the velocity has no direction
+_FAR_TURN = math.radians(75)
 _KNOTS, _KNOT_SIGMA = 7, 0.8  # samples for a stuck character: noise of every feature, slow enough for a step
 _NEAREST_STARTS = 6  # initial states nearest to the requested speed, of which one is sampled
 
@@ -78,7 +79,8 @@ class SteerSettings:
     """Sigma of the hips' heading in such steps, radians, where it is smaller than `sigma_facing`: who has to turn for a
     start finds his first step sooner where the body turns first."""
     leaving_turn: float = 1.6
-    """Times the turn rate of `limits` at which the target of a standing character that is told to go may turn."""
+    """Times the turn rate of `limits` at which the target of a standing character that is told to go far aside or back
+    may turn; for small turns feet would land hard."""
     random_starts: int = 12
     """Random warm starts of that solve, evaluated in one batch beside the evaluations; it begins at the best."""
     footing: FootContact = field(default_factory=FootContact)
@@ -224,7 +226,8 @@ def step(state: SteerState, command: Command, *, seconds: float | None = None) -
         state = _restart_target(state)
     targets = state.target.ahead(command, settings.limits, frames=settings.horizon, fps=PRIOR_FPS)
     conditioned = replace(state, prior=condition_prior(state.prior, command.told)) if command.told else state
-    if leaving := _is_leaving(state, targets):
+    leaving = _is_leaving(state, targets)
+    if leaving and abs(math.remainder(command.heading - state.target.heading, 2 * math.pi)) > _FAR_TURN:
         limits = replace(settings.limits, turn_rate=settings.leaving_turn * settings.limits.turn_rate)
         targets = state.target.ahead(command, limits, frames=settings.horizon, fps=PRIOR_FPS)
     free = stuck or leaving

@@ -148,6 +148,24 @@ def test_who_stands_and_is_told_to_go_is_searched_for_without_footing_at_once(mo
     assert facing == ([0.2, 0.2] if searches == 2 else [0.5])
 
 
+@pytest.mark.parametrize(("degrees", "times"), [(170, 1.6), (-100, 1.6), (60, 1.0)])
+def test_a_start_far_aside_may_turn_faster_than_others(monkeypatch, degrees, times):
+    facing, solve = [], LatentNoiseSolver.__call__
+
+    def watched(self, request):
+        facing.extend(term.facing for term in request.terms if isinstance(term, RootVelocity))
+        return solve(self, request)
+
+    settings = replace(QUICK, horizon=34, leaving_turn=1.6)
+    state, _ = begun(Command(0.0, 0.0), settings=settings)
+    still = torch.zeros(steer._RECENT_FRAMES + 1, *state.committed.joints_world.shape[1:])
+    stands = replace(state, committed=replace(state.committed, joints_world=still))
+    monkeypatch.setattr(LatentNoiseSolver, "__call__", watched)
+    steer.step(stands, Command(1.2, math.radians(degrees)))
+    turned = float(facing[0][0]) - stands.target.facing
+    assert turned == pytest.approx(math.copysign(times * settings.limits.turn_rate / 30, degrees), rel=1e-4)
+
+
 def test_both_searches_of_who_is_stuck_share_the_windows_time(monkeypatch):
     given, solve = [], LatentNoiseSolver.__call__
 
