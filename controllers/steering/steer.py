@@ -80,7 +80,7 @@ class SteerSettings:
     start finds his first step sooner where the body turns first."""
     leaving_turn: float = 1.6
     """Times the turn rate of `limits` at which the target of a standing character that is told to go far aside or back
-    may turn; for small turns feet would land hard."""
+    may turn; small turns are quick without."""
     random_starts: int = 12
     """Random warm starts of that solve, evaluated in one batch beside the evaluations; it begins at the best."""
     footing: FootContact = field(default_factory=FootContact)
