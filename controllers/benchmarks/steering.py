@@ -10,13 +10,14 @@ import torch
 
 from controllers.benchmarks.shared.tables import Row
 from controllers.steering import steer
-from controllers.steering.loop import Recorder, drive, summarise_step_timing
+from controllers.steering.loop import Recorder, StepRecord, drive, summarise_step_timing
 from controllers.steering.pure_pursuit import PurePursuit
 from mapctl import curves
 from mapctl.features import PRIOR_FPS
 from mapctl.intent.steering import Command, CommandTrack
 from mapctl.metrics import measure
 from mapctl.metrics.travel import measure_commands
+from mapctl.motion import Motion
 from mapctl.protocols import Density
 
 _SPEEDS = (0.0, 0.8, 1.2, 1.6, 2.6)
@@ -43,12 +44,7 @@ def benchmark_steering(prior: Density, settings: SteeringBenchmarkSettings | Non
     settings = settings or SteeringBenchmarkSettings()
     generator = torch.Generator().manual_seed(settings.seed)
     track = _sample_command_track(settings, generator)
-    state, first = steer.begin(prior, track.commands[0], generator=generator)
-    recorder = Recorder()
-    recorder.show(first, 0.0)
-    frames = round(track.times[-1] * PRIOR_FPS)
-    _, records = drive(state, track, [recorder], frames=frames)
-    motion = recorder.motion(frames)
+    motion, records = _walk(prior, track, generator)
     rows = measure_commands(motion, track)[:-1]
     kinds: dict[str, list[Row]] = {}
     for (before, after), row in zip(pairwise(track.commands), rows[1:], strict=False):
@@ -75,12 +71,8 @@ def benchmark_starts(prior: Density, characters: int = 8) -> list[Row]:
     track = CommandTrack(tuple(times), (*commands, commands[-1]))
     found: dict[int, list[Row]] = {}
     for seed in range(characters):
-        state, first = steer.begin(prior, track.commands[0], generator=torch.Generator().manual_seed(seed))
-        recorder = Recorder()
-        recorder.show(first, 0.0)
-        frames = round(times[-1] * PRIOR_FPS)
-        drive(state, track, [recorder], frames=frames)
-        for turn, row in zip(_TURNS, measure_commands(recorder.motion(frames), track)[2:-1:2], strict=True):
+        motion, _ = _walk(prior, track, torch.Generator().manual_seed(seed))
+        for turn, row in zip(_TURNS, measure_commands(motion, track)[2:-1:2], strict=True):
             found.setdefault(abs(turn), []).append(row)
     return [
         {"change": f"from a stand, turning by {turn} degrees", **_summarise_commands(rows)}
@@ -102,6 +94,16 @@ def benchmark_pursuit(prior: Density, seed: int = 0) -> list[Row]:
         found = measure(recorder.motion(), curve)
         rows.append({"change": f"live along {name}", **{key: found[key] for key in columns}})
     return rows
+
+
+def _walk(prior: Density, track: CommandTrack, generator: torch.Generator) -> tuple[Motion, list[StepRecord]]:
+    """Steer a character through a track to its last command, without a deadline."""
+    state, first = steer.begin(prior, track.commands[0], generator=generator)
+    recorder = Recorder()
+    recorder.show(first, 0.0)
+    frames = round(track.times[-1] * PRIOR_FPS)
+    _, records = drive(state, track, [recorder], frames=frames)
+    return recorder.motion(frames), records
 
 
 def _sample_command_track(settings: SteeringBenchmarkSettings, generator: torch.Generator) -> CommandTrack:

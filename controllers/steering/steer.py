@@ -41,7 +41,7 @@ KEPT_FRAMES = 11
 _PAST_TARGET_FRAMES = 60  # past targets that are kept: more than the root velocity term looks back on
 _RECENT_FRAMES = 15  # frames, half a second, over which the velocity error is measured
 _MIN_TRAVEL_SPEED = 0.3  # m/s below which the velocity has no direction
-_FAR_TURN = math.radians(75)
+_FAR_TURN = math.radians(75)  # beyond which a start may turn faster than the limits
 _KNOTS, _KNOT_SIGMA = 7, 0.8  # samples for a stuck character: noise of every feature, slow enough for a step
 _NEAREST_STARTS = 6  # initial states nearest to the requested speed, of which one is sampled
 
@@ -73,14 +73,12 @@ class SteerSettings:
     """Velocity error over the last half second, m/s, beyond which a step is first solved without contacts."""
     standing: float = 0.25
     """Mean speed over the last half second, m/s, below which a character whose target ahead is faster than it by more
-    than `stuck` is solved that way at once: both feet are planted, and half a second would pass before it counts as
-    stuck."""
+    than `stuck` is solved that way at once: it would count as stuck half a second later."""
     sigma_leaving: float = 0.1
     """Sigma of the hips' heading in such steps, radians, where it is smaller than `sigma_facing`: who has to turn for a
     start finds his first step sooner where the body turns first."""
     leaving_turn: float = 1.6
-    """Times the turn rate of `limits` at which the target of a standing character that is told to go far aside or back
-    may turn; small turns are quick without."""
+    """Times the turn rate of `limits` at which the target may turn when a standing character is told to go far aside."""
     random_starts: int = 12
     """Random warm starts of that solve, evaluated in one batch beside the evaluations; it begins at the best."""
     footing: FootContact = field(default_factory=FootContact)
@@ -96,9 +94,8 @@ class SteerSettings:
 
     def scaled_to(self, character: Character) -> "SteerSettings":
         """Return the settings for a character of this size, in metres of the prior's size."""
-        sigmas = {
-            name: getattr(self, name) / character.scale for name in ("sigma_speed", "sigma_step", "stuck", "standing")
-        }
+        names = "sigma_speed", "sigma_step", "stuck", "standing"
+        sigmas = {name: getattr(self, name) / character.scale for name in names}
         return replace(self, limits=character.limits(self.limits), footing=character.footing(self.footing), **sigmas)
 
 
@@ -224,12 +221,8 @@ def step(state: SteerState, command: Command, *, seconds: float | None = None) -
     stuck = _velocity_error(state) > settings.stuck
     if stuck:
         state = _restart_target(state)
-    targets = state.target.ahead(command, settings.limits, frames=settings.horizon, fps=PRIOR_FPS)
+    targets, leaving = _plan_targets(state, command)
     conditioned = replace(state, prior=condition_prior(state.prior, command.told)) if command.told else state
-    leaving = _is_leaving(state, targets)
-    if leaving and abs(math.remainder(command.heading - state.target.heading, 2 * math.pi)) > _FAR_TURN:
-        limits = replace(settings.limits, turn_rate=settings.leaving_turn * settings.limits.turn_rate)
-        targets = state.target.ahead(command, limits, frames=settings.horizon, fps=PRIOR_FPS)
     free = stuck or leaving
     sigma_facing = min(settings.sigma_facing, settings.sigma_leaving) if free else settings.sigma_facing
     terms = (*_build_steering_terms(state, targets, command.step_length, sigma_facing), *state.terms)
@@ -352,6 +345,17 @@ def _velocity_error(state: SteerState) -> float:
     if min(len(state.committed.joints_world) - 1, len(state.past_targets)) < _RECENT_FRAMES:
         return 0.0
     return float((_recent_velocity(state) - state.past_targets[-_RECENT_FRAMES:].mean(0)).norm())
+
+
+def _plan_targets(state: SteerState, command: Command) -> tuple[list[SteeringTarget], bool]:
+    """Return the targets of a window, and whether a standing character is told to go, who may turn faster."""
+    settings, target = state.settings, state.target
+    targets = target.ahead(command, settings.limits, frames=settings.horizon, fps=PRIOR_FPS)
+    leaving = _is_leaving(state, targets)
+    if leaving and abs(math.remainder(command.heading - target.heading, 2 * math.pi)) > _FAR_TURN:
+        limits = replace(settings.limits, turn_rate=settings.leaving_turn * settings.limits.turn_rate)
+        targets = target.ahead(command, limits, frames=settings.horizon, fps=PRIOR_FPS)
+    return targets, leaving
 
 
 def _is_leaving(state: SteerState, targets: Sequence[SteeringTarget]) -> bool:

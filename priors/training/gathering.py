@@ -8,6 +8,7 @@ from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.formats.atomic import write_text
 from priors.training.corpus import Corpus, SkippedFile, Split, join_made, keep_share, read_corpus, split_corpus
+from priors.training.mocap.made import require_made
 
 Progress = Callable[[str], None]
 """Called with one line of news."""
@@ -83,8 +84,7 @@ def gather(source: DataSource, *, progress: Progress, warn: Progress) -> tuple[C
 def _read_made(source: DataSource, folder: Path) -> Corpus:
     """Those clips of a folder that a list in it tells as made; RequestError where there are none."""
     made = read_corpus(folder, match="", cache=source.run / "cache", level=source.level)
-    if not made.made.clips:
-        raise RequestError(f"{folder} holds no clips that mapctl make has listed as made")
+    require_made(made.made, folder)
     return made
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from mapctl.errors import FileFormatError
+from mapctl.errors import FileFormatError, RequestError
 from mapctl.formats.text import read_table
 
 TABLE_NAME = "made.csv"
@@ -26,6 +26,12 @@ class Made:
     licence)`."""
     licences: frozenset[str] = frozenset()
     """Licences of the models that made them."""
+
+
+def require_made(made: Made, folder: Path) -> None:
+    """RequestError for a folder that was to hold made clips and holds none."""
+    if not made.clips:
+        raise RequestError(f"{folder} holds no clips that mapctl make has listed as made")
 
 
 def find_made(data: Path, names: Sequence[str]) -> Made:

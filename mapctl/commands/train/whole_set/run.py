@@ -15,7 +15,7 @@ from mapctl.commands.train.whole_set.workers import Say, train_jobs
 from mapctl.errors import MapctlError, RequestError
 from priors.training.bundled import weights
 from priors.training.bundled.models import SETS, BundledModel, list_models
-from priors.training.mocap.made import find_made
+from priors.training.mocap.made import find_made, require_made
 
 
 def run(command: TrainAll) -> int:
@@ -73,8 +73,7 @@ def _check_made(folder: Path, licence: str) -> None:
     """RequestError for a folder without made clips, and for clips that came under a licence that is not that of a set
     which anybody may use."""
     made = find_made(folder, [file.relative_to(folder).as_posix() for file in folder.rglob("*.bvh")])
-    if not made.clips:
-        raise RequestError(f"{folder} holds no clips that mapctl make has listed as made")
+    require_made(made, folder)
     others = sorted(made.licences - {licence})
     if others and licence == SETS["free"].licence:
         raise RequestError(
