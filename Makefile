@@ -5,7 +5,7 @@ BROWSER := .venv/.browser
 BLENDER := .venv/.blender
 VALIDATOR := .venv/.validator
 
-.PHONY: help setup demo test test-all bench check clean
+.PHONY: help setup demo test test-all bench check docs clean
 
 help:
 	@echo "make setup     create .venv and install everything (CPU build of torch where there is no GPU)"
@@ -14,6 +14,7 @@ help:
 	@echo "make test-all  every test"
 	@echo "make bench     cost of the solver on this machine"
 	@echo "make check     ruff and basedpyright"
+	@echo "make docs      the site in docs/_build/html: pages, gallery, reference"
 	@echo "make clean     remove what these commands made, .venv included"
 
 setup: $(READY)
@@ -61,6 +62,10 @@ check: $(READY)
 	$(VENV)/ruff format --check .
 	$(VENV)/basedpyright
 
+# A warning is an error: a link that leads nowhere, a page that no other names, an example that fails.
+docs: $(READY)
+	$(VENV)/python -m sphinx --fail-on-warning --keep-going -b html docs docs/_build/html
+
 clean:
-	rm -rf .venv build dist *.egg-info demo-out bench-out .pytest_cache .ruff_cache .hypothesis .benchmarks
+	rm -rf .venv docs/_build build dist *.egg-info demo-out bench-out .pytest_cache .ruff_cache .hypothesis .benchmarks
 	find mapctl priors controllers scenes tests -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -49,7 +49,7 @@ _MESSAGE_REWRITES = (
     (r" or misplaced options", " options"),
 )
 """What Python and tyro say, and what people understand."""
-_STYLE = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
+STYLE = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -92,7 +92,7 @@ def _choose(kinds: Mapping[str, type[Runnable]], words: Sequence[str], *, prog: 
     explained = io.StringIO()
     try:
         with redirect_stderr(explained):
-            return tyro.cli(choices, prog=prog, description=description, args=list(words), config=_STYLE)
+            return tyro.cli(choices, prog=prog, description=description, args=list(words), config=STYLE)
     except SystemExit as stop:
         if stop.code == 0:
             raise

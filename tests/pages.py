@@ -17,7 +17,7 @@ from tiny_infiller import save_tiny_infiller
 from tiny_prior import save_tiny_prior
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = ("README.md", *(f"docs/{page.name}" for page in sorted((ROOT / "docs").glob("*.md"))))
+PAGES = ("README.md", *(str(page.relative_to(ROOT)) for page in sorted((ROOT / "docs").rglob("*.md"))))
 
 _SMALL = {"--seconds": "1", "--count": "1", "--jobs": "1"}
 _TINY = {
@@ -129,10 +129,10 @@ def write_files(folder: Path) -> None:
     (folder / "script.csv").write_text("time_s,speed_mps,heading_deg\n0,1.2,0\n0.5,1.0,30\n1,1.0,30\n")
     (folder / "lost.csv").write_text("joint,start,stop\nLeftHand,5,15\n")
     shutil.copytree(ROOT / "docs", folder / "docs", ignore=shutil.ignore_patterns("*.png", "*.md"))
-    (folder / "docs" / "poses").mkdir()
+    (folder / "docs" / "inputs" / "poses").mkdir()
     (folder / "scenes").mkdir()
     for scene in (ROOT / "scenes").glob("*.toml"):
         shutil.copy(scene, folder / "scenes")
-    walk(120).save(folder / "docs" / "poses" / "generated_000.bvh")
-    shutil.copytree(folder / "docs" / "poses", folder / "poses")
-    shutil.copy(ROOT / "docs" / "keys.toml", folder)
+    walk(120).save(folder / "docs" / "inputs" / "poses" / "generated_000.bvh")
+    shutil.copytree(folder / "docs" / "inputs" / "poses", folder / "poses")
+    shutil.copy(ROOT / "docs" / "inputs" / "keys.toml", folder)

@@ -1,4 +1,4 @@
-"""Screenshots of the live viewer for docs/live.md and for whoever changes how it looks.
+"""Screenshots of the live viewer for docs/guides/live.md and for whoever changes how it looks.
 
     python tests/take_screenshots.py FOLDER [NAME ...]
 

@@ -40,7 +40,7 @@ class FollowSettings:
     """Contact term."""
     noise: LatentPrior = field(default_factory=lambda: LatentPrior(sigma=2.0))
     """Prior on the latent noise of the rollout. A well trained prior's own standard deviation is small: at sigma 1 the
-    same walk follows its path less well and skates more (docs/results.md)."""
+    same walk follows its path less well and skates more (docs/reference/results.md)."""
     window: HorizonSettings = field(default_factory=HorizonSettings)
     """Lengths of the receding horizon."""
     method: SingleWindowSolver = field(default_factory=LatentNoiseSolver)

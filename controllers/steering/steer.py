@@ -58,7 +58,7 @@ class SteerSettings:
     """Most evaluations of energy and gradient in a step: what one core computes while three frames are shown."""
     least_evaluations: int = 6
     """Evaluations for which the loop gives a step time, however late it is: with fewer, targets are missed
-    (docs/results.md). Never more than `evaluations`."""
+    (docs/reference/results.md). Never more than `evaluations`."""
     limits: SteeringLimits = field(default_factory=SteeringLimits)
     """How fast a steering target may change."""
     sigma_speed: float = RootVelocity.sigma_speed

@@ -69,7 +69,7 @@ class LatentNoiseSolver:
         default_factory=lambda: LbfgsSettings(max_iterations=36, relative_energy_tolerance=3e-3)
     )
     """Settings of L-BFGS in one round. A step that wins less than a 300th of the energy is the last: that spares three
-    evaluations in ten, and walks are as near their paths (docs/results.md)."""
+    evaluations in ten, and walks are as near their paths (docs/reference/results.md)."""
     budget: Budget = field(default_factory=lambda: Budget(evaluations=120))
     """Budget of one window."""
     proposal: WarmStartProposal = keep_warm_start

@@ -1,11 +1,11 @@
 """LSTM with a mixture of Gaussians over the next frame: the density of Wang et al. 2019 (section 4.1, figure 3).
 
 FC, FC, LSTM, LSTM, FC, then five Gaussians (Eq. 6-8) and two Bernoulli contact bits (section 4.3). By default it
-departs from the paper in three ways, each measured (docs/results.md): the network predicts a change added to a slightly
-shrunken copy of the current frame, which learns faster and stays bounded in free run; each component's Gaussian is
-correlated, by a unit triangular factor of its own, since a planted foot needs legs that compensate the hips; and the
-level of the noise on the input is an input too, so that predictions from clean input are not as wide as from noisy
-input. It can also be conditioned on labels of the data (gait, style).
+departs from the paper in three ways, each measured (docs/reference/results.md): the network predicts a change added
+to a slightly shrunken copy of the current frame, which learns faster and stays bounded in free run; each component's
+Gaussian is correlated, by a unit triangular factor of its own, since a planted foot needs legs that compensate the
+hips; and the level of the noise on the input is an input too, so that predictions from clean input are not as wide as
+from noisy input. It can also be conditioned on labels of the data (gait, style).
 """
 
 import copy

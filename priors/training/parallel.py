@@ -181,7 +181,7 @@ def fork_group(count: int, work: Callable[[TrainingGroup], None]) -> Iterator[Tr
         return
     _require_distributed()
     if "fork" not in multiprocessing.get_all_start_methods():
-        raise RequestError("this system cannot fork processes; start them with torchrun (docs/training.md)")
+        raise RequestError("this system cannot fork processes; start them with torchrun (docs/guides/training.md)")
     context = multiprocessing.get_context("fork")
     with tempfile.TemporaryDirectory(prefix="mapctl-") as folder:
         meeting = f"file://{Path(folder) / 'meeting'}"

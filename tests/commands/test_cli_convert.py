@@ -1,4 +1,4 @@
-"""`mapctl convert` between all formats, as a user types it, and what docs/formats.md says of them."""
+"""`mapctl convert` between all formats, as a user types it, and what docs/guides/formats.md says of them."""
 
 import re
 import shlex
@@ -22,7 +22,7 @@ from mapctl.formats import npz, usd
 from mapctl.formats.endings import USD_WRITTEN
 from mapctl.formats.growing import MotionWriter
 
-DOCS = (Path(__file__).parents[2] / "docs" / "formats.md").read_text("utf-8")
+DOCS = (Path(__file__).parents[2] / "docs" / "guides" / "formats.md").read_text("utf-8")
 needs_usd = pytest.mark.skipif(not usd.is_installed(), reason="needs usd-core: pip install 'mapctl[usd]'")
 needs_ufbx = pytest.mark.skipif(find_spec("ufbx") is None, reason="needs ufbx: pip install 'mapctl[fbx]'")
 

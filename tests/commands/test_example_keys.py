@@ -1,4 +1,4 @@
-"""docs/keys.toml as it stands, on the poses of the command that it names: nothing jumps into a key or out of it."""
+"""docs/inputs/keys.toml as it stands, on the poses that its command makes: nothing jumps into a key or out of it."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ import mapctl
 from mapctl.metrics import worst_frame
 from mapctl.skeleton import CANONICAL
 
-DOCS = Path(__file__).parents[2] / "docs"
+DOCS = Path(__file__).parents[2] / "docs" / "inputs"
 ENDS = [CANONICAL.index(name) for name in ("leftHand", "rightHand", "leftToes", "rightToes")]
 
 

@@ -13,7 +13,7 @@ from tiny_infiller import save_tiny_infiller
 import mapctl
 from mapctl import retarget
 
-DOCS = Path(__file__).parents[2] / "docs"
+DOCS = Path(__file__).parents[2] / "docs" / "inputs"
 GOOD = """
 body = "walk.bvh"
 [[key]]

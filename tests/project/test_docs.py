@@ -26,10 +26,10 @@ PYTHON = [block for page in pages.PAGES for block in pages.blocks(page, "python"
 LONG_PYTHON = {
     "README.md-python-0",
     "README.md-python-1",
-    "docs/infilling.md-python-0",
-    "docs/denoising.md-python-0",
-    "docs/adding-a-term.md-python-0",
-    "docs/adding-a-job.md-python-0",
+    "docs/explanations/infilling.md-python-0",
+    "docs/explanations/denoising.md-python-0",
+    "docs/guides/adding-a-term.md-python-0",
+    "docs/guides/adding-a-job.md-python-0",
 }
 
 
@@ -106,12 +106,12 @@ def assert_cleaned(folder, left):
 OUTCOMES = {
     "README.md-python-0": assert_filmed,
     "README.md-python-1": assert_walks_weave,
-    "docs/adding-a-term.md-python-0": assert_hand_is_raised,
-    "docs/adding-a-prior.md-python-1": assert_it_is_named,
-    "docs/adding-a-job.md-python-0": assert_it_arrives,
-    "docs/formats.md-python-0": assert_turned,
-    "docs/infilling.md-python-0": assert_keys_and_gaps_are_filled,
-    "docs/denoising.md-python-0": assert_cleaned,
+    "docs/guides/adding-a-term.md-python-0": assert_hand_is_raised,
+    "docs/guides/adding-a-prior.md-python-1": assert_it_is_named,
+    "docs/guides/adding-a-job.md-python-0": assert_it_arrives,
+    "docs/guides/formats.md-python-0": assert_turned,
+    "docs/explanations/infilling.md-python-0": assert_keys_and_gaps_are_filled,
+    "docs/explanations/denoising.md-python-0": assert_cleaned,
 }
 """What else holds of a block that ran, by its name: of the folder and of what it left."""
 

@@ -1,4 +1,4 @@
-"""docs/weights.md lists the models of both sets as they are, and nothing else."""
+"""docs/guides/weights.md lists the models of both sets as they are, and nothing else."""
 
 import json
 import re
@@ -26,7 +26,8 @@ def describe(name: str, weights: str) -> str:
 
 def test_the_table_of_models_is_that_of_the_bundled_files(monkeypatch):
     monkeypatch.delenv(weight_sets.FOLDER_VARIABLE, raising=False)
-    rows = re.findall(r"^\| `([\w-]+)` \| [^|]+ \| ([^|]+) \| ([^|]+) \|$", pages.read_page("docs/weights.md"), re.M)
+    page = pages.read_page("docs/guides/weights.md")
+    rows = re.findall(r"^\| `([\w-]+)` \| [^|]+ \| ([^|]+) \| ([^|]+) \|$", page, re.M)
     listed = {name: (full, free) for name, full, free in rows if name not in weight_sets.SETS}
     bundled = {*weight_sets.list_models("full"), *weight_sets.list_models("free")}
     wanted = {name: (describe(name, "full"), describe(name, "free")) for name in sorted(bundled)}

@@ -1,4 +1,4 @@
-"""Motions in mapctl's .npz files (docs/formats.md): written and read with numpy alone."""
+"""Motions in mapctl's .npz files (docs/guides/formats.md): written and read with numpy alone."""
 
 from dataclasses import dataclass
 from fractions import Fraction

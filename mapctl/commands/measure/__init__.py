@@ -38,7 +38,7 @@ class Measure(ModelCommand):
     """Seed of the classifier of the two folders."""
     why: bool = False
     """Of a folder beside a --reference of one: what tells the two apart, by joint, band of frequency, moment and gait
-    (docs/realism.md)."""
+    (docs/explanations/realism.md)."""
     steps: options.MaybeCount = None
     """Training steps of the classifier; 400, and with --why 2000, which make a stricter judge."""
     alone: bool = False

@@ -37,7 +37,7 @@ class TrainDensity(TunableOptions):
     of them is held out."""
     copies: options.Count = 0
     """Copies of each clip at other tempos and with other strides that training sees beside it: for a few minutes of
-    motion (docs/data.md)."""
+    motion (docs/guides/data.md)."""
     tempo: options.Number = 0.15
     """Largest change of a copy's tempo, as a share."""
     strides: options.Number = 0.1

@@ -45,7 +45,7 @@ class TrainOptions(ABC):
     """Only clips whose path below the data folder holds this regular expression."""
     cuts: options.MaybeFile = None
     """Table (CSV) of file, first and last frame: which frames are motion; `cmu` is the one for takes of CMU that comes
-    with mapctl. Each Frame_Cuts.csv in the data folder is found by itself (docs/data.md)."""
+    with mapctl. Each Frame_Cuts.csv in the data folder is found by itself (docs/guides/data.md)."""
     level: bool = False
     """Put every clip on the canonical body and a level floor: for captures whose floor slopes or whose feet rest at
     other heights, as those of CMU."""
@@ -215,7 +215,7 @@ class NetworkOptions(TrainOptions):
     """Let the network compute in bfloat16: faster where the processor has it."""
     processes: options.Count = 1
     """Processes of this machine that share each step's batch, one a core; several machines: torchrun
-    (docs/training.md)."""
+    (docs/guides/training.md)."""
 
 
 @dataclass(frozen=True)
@@ -230,7 +230,7 @@ class TunableOptions(NetworkOptions):
     """Leave out frame 0 of every clip (the T-pose of CMU takes)."""
     until_flat: bool = False
     """Train until the curve of validations is flat, then let the learning rate fall; --steps is a plan, by which gaps
-    grow, of which a half is trained at least and three times as many at most (docs/training.md)."""
+    grow, of which a half is trained at least and three times as many at most (docs/guides/training.md)."""
     flat_share: options.MaybeNumber = None
     """Flat is a curve whose error falls by less than this share over the last third of the steps; 0.02."""
     decay_from: Annotated[str | None, arg(metavar="STEP:STEPS")] = None

@@ -70,7 +70,7 @@ SETS: Mapping[str, WeightSet] = {
     ),
     "free": WeightSet(
         licence="free for any use",
-        match=r"^cmu(?!.*/(01_14|05_(0[568]|1[04-9])|07_12|09_10|14_36)\.)",  # faulty (docs/data.md)
+        match=r"^cmu(?!.*/(01_14|05_(0[568]|1[04-9])|07_12|09_10|14_36)\.)",  # faulty (docs/guides/data.md)
         locomotion=r"^cmu.*/(02_(0[1-36]|10)|05_01|06_(0\d|1[0-2])|07_(0\d|1[01])|08_\d\d|09_(0[1-69]|1[12])|10_0\d|11_01"
         r"|13_(0[7-9]|1[4-6]|26)|14_(0[45]|1[27-9]|37))\.",
         level=True,
@@ -141,7 +141,7 @@ RECIPES: Mapping[str, type[AnyRecipe]] = {
 
 def _make_models(weights: WeightSet, made: Path | None) -> tuple[BundledModel, ...]:
     """The table. Steps are a plan, where a run goes on until its curve is flat. Those of densities are told: a curve of
-    likelihoods goes on falling while free runs already drift off (docs/training.md)."""
+    likelihoods goes on falling while free runs already drift off (docs/guides/training.md)."""
     captures: dict[str, Any] = {"data": DATA, "out": RUN, "licence": weights.licence, "cuts": CMU}
     shared: dict[str, Any] = {**captures, "level": weights.level}
     until_flat: dict[str, Any] = {"match": weights.match or None, "until_flat": UntilFlat()}
