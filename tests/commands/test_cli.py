@@ -196,6 +196,16 @@ def test_demo_leaves_four_files(prior, tmp_path, monkeypatch):
     assert {path.suffix for path in (tmp_path / "demo").iterdir()} == {".bvh", ".json", ".mp4", ".png"}
 
 
+def test_a_demo_without_the_packages_of_films_leaves_motion_and_report(prior, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("mapctl.commands.shared.outputs.find_spec", lambda name: None)
+    monkeypatch.setattr("mapctl.commands.demo.run.CURVE", "line:0.5")
+    assert run("demo", "-o", tmp_path / "demo", "--prior", prior) == 0
+    assert {path.suffix for path in (tmp_path / "demo").iterdir()} == {".bvh", ".json"}
+    told = capsys.readouterr()
+    assert "films need the packages av, PIL, matplotlib: pip install 'mapctl[render]'" in told.out
+    assert told.err == ""
+
+
 def test_info_names_what_is_here(prior, capsys):
     assert run("info") == 0
     told = capsys.readouterr().out

@@ -16,23 +16,26 @@ _SIZE = (960, 540)
 
 
 def run(command: Demo) -> int:
-    """Walk, write, film, report. Without OpenGL the film shows stick figures and says what is missing.
+    """Walk, write, film, report. Without OpenGL the film shows stick figures and says what is missing; without the
+    packages of the extra `render` there is none, and a line says so.
 
     Ctrl-C ends the walk; the motion so far is written, without a film.
     """
     options.check_seed(command.seed)
     outputs.check_folder(command.out)
-    outputs.require_render("av")
+    missing = outputs.find_missing_render()
     request = parse_follow(inputs.read_curve(CURVE, None), SPEED, None)
     prior = priors.load(command.prior)
     with show_progress("walking", quiet=command.quiet) as progress:
         done = walk(prior, request, seed=command.seed, progress=progress)
     with outputs.make_folder(command.out) as folder:
-        endings = ("bvh", "json") if done.interrupted else ("bvh", "json", "mp4", "png")
+        endings = ("bvh", "json") if done.interrupted or missing else ("bvh", "json", "mp4", "png")
         files = {ending: folder / f"figure8.{ending}" for ending in endings}
         _write(command, done, files)
     if not command.quiet:
         print("\n".join([*done.summary(), f"wrote     {', '.join(map(str, files.values()))}"]))
+        if missing:
+            print(f"no film   {outputs.describe_missing_render(missing)}")
     return exit_status.INTERRUPTED if done.interrupted else 0
 
 
