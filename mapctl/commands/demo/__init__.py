@@ -11,7 +11,7 @@ from mapctl.commands.shared.command import ModelCommand
 class Demo(ModelCommand):
     """A character walks a figure-8 on the bundled prior: motion, film, contact sheet and report.
 
-    Where the extra `render` is not installed, motion and report alone.
+    Where the extra `render` is not installed, there is no film, and the sheet shows stick figures.
     """
 
     out: options.OutFolder = Path("demo-out")

@@ -60,10 +60,11 @@ def require_render(package: str) -> None:
         raise RequestError(describe_missing_render([package]))
 
 
-def find_missing_render() -> list[str]:
-    """Find the packages that are not installed of those without which there is neither a film nor a contact sheet."""
+def find_missing_render(ending: str) -> list[str]:
+    """Find the packages that are not installed of those without which there is no film of this ending, as `png`."""
     painter = "matplotlib" if find_spec("pyrender") is None else "pyrender"
-    return [package for package in ("av", "PIL", painter) if find_spec(package) is None]
+    wanted = [*(["av"] if ending == "mp4" else []), "PIL", painter]
+    return [package for package in wanted if find_spec(package) is None]
 
 
 def describe_missing_render(packages: Sequence[str]) -> str:
