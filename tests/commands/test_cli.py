@@ -200,7 +200,11 @@ def test_demo_leaves_four_files(prior, tmp_path, monkeypatch):
     ("lacking", "left", "told"),
     [
         ({"av", "pyrender"}, {".bvh", ".json", ".png"}, ".mp4: films need the package av"),
-        ({"av", "pyrender", "PIL", "matplotlib"}, {".bvh", ".json"}, ".mp4, .png: films need the packages av, PIL, mat"),
+        (
+            {"av", "pyrender", "PIL", "matplotlib"},
+            {".bvh", ".json"},
+            ".mp4, .png: films need the packages av, PIL, mat",
+        ),
     ],
 )
 def test_a_demo_without_packages_of_films_leaves_the_rest(prior, tmp_path, monkeypatch, capsys, lacking, left, told):
