@@ -2,6 +2,7 @@
 same step by their mean. One machine forks them; torchrun starts them on one machine or several.
 """
 
+import gc
 import multiprocessing
 import os
 import signal
@@ -185,6 +186,7 @@ def fork_group(count: int, work: Callable[[TrainingGroup], None]) -> Iterator[Tr
         raise RequestError(
             "this system cannot fork processes safely; start them with torchrun (docs/guides/training.md)"
         )
+    gc.collect()  # a group of an earlier run, thrown away in a child, would wait there for threads that are not forked
     context = multiprocessing.get_context("fork")
     with tempfile.TemporaryDirectory(prefix="mapctl-") as folder:
         meeting = f"file://{Path(folder) / 'meeting'}"

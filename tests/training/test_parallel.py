@@ -2,6 +2,7 @@
 differs.
 """
 
+import gc
 import json
 import multiprocessing
 import os
@@ -229,6 +230,29 @@ def test_ctrl_c_saves_a_checkpoint_of_all_processes(tmp_path, data, monkeypatch)
             train(wanted(data, tmp_path / "run", checkpoint_minutes=3.0))
     assert json.loads((tmp_path / "run" / "checkpoint.json").read_text())["step"] == 3
     assert not find_trainers()
+
+
+class Noted:
+    """Garbage that says in which process it is thrown away."""
+
+    def __init__(self, file):
+        self.file, self.itself = file, self
+
+    def __del__(self):
+        with self.file.open("a") as opened:
+            opened.write(f"{os.getpid()}\n")
+
+
+def test_what_is_thrown_away_before_processes_are_forked_is_not_thrown_away_in_them(tmp_path):
+    """The group of an earlier run would wait there forever for threads that it had."""
+    gc.disable()
+    try:
+        Noted(tmp_path / "thrown")
+        with fork_group(2, lambda group: gc.collect()):
+            pass
+    finally:
+        gc.enable()
+    assert (tmp_path / "thrown").read_text().split() == [str(os.getpid())]
 
 
 def test_nonsense_is_refused_before_anything_is_read(tmp_path, data, capsys, monkeypatch):
