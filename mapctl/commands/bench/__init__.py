@@ -73,6 +73,18 @@ class Ablation(PriorTable):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Follow(PriorTable, ComparedTable):
+    """Curves walked by densities with the solver, and by motion matching over the clips that they were trained on."""
+
+    work = "mapctl.commands.bench.follow"
+
+    data: options.MaybeDataFolder = None
+    """The folder that was trained on, for motion matching; without it that is left out."""
+    count: options.Count = 3
+    """Walks of each curve."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class FreeRun(PriorTable, ComparedTable):
     """8 random motions of 10,000 frames beside the training data."""
 
@@ -340,6 +352,7 @@ class Bench(Command):
 TABLES: dict[str, type[Table]] = {
     "speed": Speed,
     "ablation": Ablation,
+    "follow": Follow,
     "free-run": FreeRun,
     "generation": Generation,
     "why": Why,
