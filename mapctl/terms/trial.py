@@ -178,6 +178,16 @@ class Trial:
         return self._speed(torch.stack([self.step(toe) for toe in self.skeleton.indices(TOES)], dim=-2))
 
     @cached_property
+    def toe_accelerations(self) -> Float[Tensor, "batch frames 2"]:
+        """Size of the acceleration of the left and the right toe from the two frames before, m/s^2; 0 in the first
+        frames where those are not known."""
+        toes = self.joints_world[:, :, list(self.toes)]
+        past = self.before[-2:, list(self.toes)].to(toes.dtype).expand(len(toes), -1, -1, -1)
+        second = torch.diff(torch.cat([past, toes], dim=1), n=2, dim=1)
+        sizes = torch.sqrt(second.square().sum(-1) + 1e-9) * self.fps**2
+        return torch.cat([sizes.new_zeros(len(toes), toes.shape[1] - sizes.shape[1], 2), sizes], dim=1)
+
+    @cached_property
     def heel_speeds(self) -> Float[Tensor, "batch frames 2"]:
         """Speed of the left and the right heel over the ground since the frame before, m/s, likewise."""
         heels = self.heels_world
