@@ -5,7 +5,7 @@ BROWSER := .venv/.browser
 BLENDER := .venv/.blender
 VALIDATOR := .venv/.validator
 
-.PHONY: help setup demo test test-all bench check docs clean
+.PHONY: help setup demo test test-all bench check docs dist clean
 
 help:
 	@echo "make setup     create .venv and install everything (CPU build of torch where there is no GPU)"
@@ -15,6 +15,7 @@ help:
 	@echo "make bench     cost of the solver on this machine"
 	@echo "make check     ruff and basedpyright"
 	@echo "make docs      the site in docs/_build/html: pages, gallery, reference"
+	@echo "make dist      sdist and wheel in dist/, and their sizes"
 	@echo "make clean     remove what these commands made, .venv included"
 
 setup: $(READY)
@@ -65,6 +66,12 @@ check: $(READY)
 # A warning is an error: a link that leads nowhere, a page that no other names, an example that fails.
 docs: $(READY)
 	$(VENV)/python -m sphinx --fail-on-warning --keep-going -b html docs docs/_build/html
+
+# Of what is installed already, so that it needs no network.
+dist: $(READY)
+	rm -rf build dist
+	$(VENV)/python -m build --no-isolation
+	@du -h dist/*
 
 clean:
 	rm -rf .venv docs/_build build dist *.egg-info demo-out bench-out .pytest_cache .ruff_cache .hypothesis .benchmarks

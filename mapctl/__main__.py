@@ -1,5 +1,6 @@
 """`python -m mapctl`, and what the command `mapctl` starts with: quiet about a Ctrl-C from the first import on."""
 
+import io
 import sys
 
 from mapctl.runtime import garbage
@@ -8,6 +9,9 @@ from mapctl.runtime import garbage
 def main() -> int:
     """The command line with the words of the process; returns the exit status."""
     garbage.pause_collection()
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        # What goes into a file or a pipe has the system's encoding, on Windows one without most of the world's letters.
+        sys.stdout.reconfigure(errors="replace")
     try:
         from mapctl.cli import main as command_line
     except KeyboardInterrupt:

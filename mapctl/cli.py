@@ -102,7 +102,8 @@ def _choose(kinds: Mapping[str, type[Runnable]], words: Sequence[str], *, prog: 
 
 _DESCRIPTION = (
     "Human motion that does what a person asks and still looks captured: BVH in, BVH out.\n"
-    "`mapctl COMMAND --help` shows a command's options; `mapctl --version` the version."
+    "`mapctl COMMAND --help` shows a command's options; `mapctl --version` the version.\n"
+    "`example:noisy-walk` in place of a motion file is one that mapctl brings along."
 )
 
 

@@ -1,5 +1,6 @@
 """Reading and writing motions in file formats, chosen by the ending; each module owns its format's quirks."""
 
+from dataclasses import replace
 from fractions import Fraction
 from importlib import import_module
 from os import PathLike
@@ -7,7 +8,7 @@ from pathlib import Path
 from types import ModuleType
 
 from mapctl.errors import FileFormatError, RequestError
-from mapctl.formats import bvh
+from mapctl.formats import bvh, examples
 from mapctl.formats.characters.selector import parse_character_path
 from mapctl.formats.endings import USD_WRITTEN
 from mapctl.formats.missing import MissingValues
@@ -42,15 +43,16 @@ def load(
     Of a character's file it is an animation, or one frame of the rest pose where there is none; `hero.glb#ARMATURE`,
     `hero.glb#ARMATURE/ANIMATION` and `hero.glb#/ANIMATION` choose where there are several. `fps` is frames per second
     of an .amc, which does not say; RequestError with the others, which do. `metres_per_unit` wins over what is found
-    by the size of the body, in formats whose unit is not fixed. FileFormatError says what is wrong with the file, and
-    where: NaN in place of a number, too, which `load_with_missing` takes.
+    by the size of the body, in formats whose unit is not fixed. `example:NAME` is a motion that mapctl brings along.
+    FileFormatError says what is wrong with the file, and where: NaN in place of a number, too, which
+    `load_with_missing` takes.
     """
     ending = _check_readable(path)
     if fps is not None and ending != ".amc":
         raise RequestError(f"{path}: a {ending} file says its frame rate itself; only that of an .amc is asked for")
-    reader = _import_format(READERS[ending])
-    motion = reader.load(path) if fps is None else reader.load(path, fps=fps)
-    return motion if metres_per_unit is None else bvh.convert_unit(motion, metres_per_unit)
+    reader, file = _import_format(READERS[ending]), examples.resolve(path)
+    motion = reader.load(file) if fps is None else reader.load(file, fps=fps)
+    return _finish(motion, path, metres_per_unit)
 
 
 def load_rest(path: str | PathLike[str]) -> Motion | None:
@@ -69,7 +71,7 @@ def load_mesh(path: str | PathLike[str]) -> CharacterMesh:
 
 def ending_of(path: str | PathLike[str]) -> str:
     """Return a path's ending in lower case, without what it chooses of a character's file."""
-    return parse_character_path(path).file.suffix.lower()
+    return parse_character_path(examples.resolve(path)).file.suffix.lower()
 
 
 def _import_format(name: str) -> ModuleType:
@@ -88,8 +90,14 @@ def load_with_missing(
     if ending not in _MAY_LACK_VALUES:
         motion = load(path, metres_per_unit=metres_per_unit)
         return motion, MissingValues.none(motion.num_frames, motion.num_joints)
-    motion, missing = _import_format(READERS[ending]).load_with_missing(path)
-    return motion if metres_per_unit is None else bvh.convert_unit(motion, metres_per_unit), missing
+    motion, missing = _import_format(READERS[ending]).load_with_missing(examples.resolve(path))
+    return _finish(motion, path, metres_per_unit), missing
+
+
+def _finish(motion: Motion, path: str | PathLike[str], metres_per_unit: float | None) -> Motion:
+    """Convert the unit where one is given; mark examples with their licence, which BVH has no place for."""
+    motion = replace(motion, licence=examples.LICENCE) if examples.is_example(path) else motion
+    return motion if metres_per_unit is None else bvh.convert_unit(motion, metres_per_unit)
 
 
 def _check_readable(path: str | PathLike[str]) -> str:

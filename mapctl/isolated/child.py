@@ -6,6 +6,7 @@ import os
 import sys
 import warnings
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -50,11 +51,13 @@ def serve(answer: Callable[[Mapping[str, Any], Mapping[str, Array]], Found]) -> 
 
 
 def _bound_memory(count: int) -> None:
-    """Bound the address space, where the system can (not on Windows), and leave no file where it crashes."""
+    """Bound the address space, where the system can (Linux; macOS may refuse, Windows cannot), and leave no file where
+    it crashes. Without the bound, time alone ends a reader that a file leads astray."""
     if resource is None:
         return
-    resource.setrlimit(resource.RLIMIT_AS, (count, count))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    for what, limit in ((resource.RLIMIT_AS, count), (resource.RLIMIT_CORE, 0)):
+        with suppress(ValueError, OSError):
+            resource.setrlimit(what, (limit, limit))
 
 
 def _read_arrays(path: Path) -> dict[str, Array]:

@@ -17,6 +17,7 @@ from torch import Tensor
 from mapctl import formats, kinematics, rotations
 from mapctl.errors import RequestError
 from mapctl.formats.characters.source import CharacterSource
+from mapctl.formats.examples import is_example
 from mapctl.motion import Motion
 from mapctl.retarget import bone_offsets
 from mapctl.retarget.joint_matching import Match, correct_sides, match
@@ -86,7 +87,7 @@ def load_rig(name_or_path: str | PathLike[str]) -> Rig:
         return preset
     if path.suffix.lower() == ".toml":
         return read_rig_toml(path)
-    if not path.suffix:
+    if not path.suffix and not is_example(path):
         names = ", ".join(rig.name for rig in known_rigs())
         raise RequestError(f"no rig {text!r}; known rigs: {names}; or name a TOML file or a clip")
     found = to_canonical(formats.load(path))[1]

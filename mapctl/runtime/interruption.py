@@ -32,7 +32,7 @@ def raise_on_signals() -> list[int]:
         if (now := time.monotonic()) < until:
             return
         if _is_in_compiler(frame):
-            threading.Timer(_RETRY_SECONDS, os.kill, (os.getpid(), number)).start()
+            threading.Timer(_RETRY_SECONDS, _send_again, (number,)).start()
             return
         until = now + REPEAT_SECONDS
         received.append(number)
@@ -105,6 +105,14 @@ def defer_signals() -> Iterator[DeferredSignals]:
         for number, handler in held._handlers.items():
             signal.signal(number, handler)
     held.release()
+
+
+def _send_again(number: int) -> None:
+    """Send a signal to this process: to all of it, so that it wakes the main thread; on Windows that would end it."""
+    if os.name == "nt":
+        signal.raise_signal(number)
+    else:
+        os.kill(os.getpid(), number)
 
 
 def _is_in_compiler(frame: FrameType | None) -> bool:

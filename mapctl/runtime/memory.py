@@ -1,9 +1,14 @@
-"""Memory and processor time of a process, as the system tells (Linux)."""
+"""Memory and processor time of processes, as the system tells: NaN on those that do not."""
 
 import math
 import os
 import re
 from pathlib import Path
+
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None
 
 
 def measure_memory_mb(pid: int) -> float:
@@ -33,3 +38,11 @@ def measure_processor_seconds(pid: int) -> float:
         return math.nan
     user, system = fields[11:13]  # fields 14 and 15, of which the name in brackets and two more come before these
     return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
+
+
+def measure_children_seconds() -> float:
+    """Return the processor time of all child processes that have ended, seconds; NaN where unknown (Windows)."""
+    if resource is None:
+        return math.nan
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime

@@ -20,6 +20,7 @@ import torch.distributed as dist
 from torch import Tensor, nn
 
 from mapctl.errors import MapctlError, RequestError
+from mapctl.runtime import forking
 from mapctl.runtime.interruption import SIGNALS
 
 _LAUNCHED = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")  # what torchrun tells a process of itself
@@ -180,8 +181,10 @@ def fork_group(count: int, work: Callable[[TrainingGroup], None]) -> Iterator[Tr
         yield ALONE
         return
     _require_distributed()
-    if "fork" not in multiprocessing.get_all_start_methods():
-        raise RequestError("this system cannot fork processes; start them with torchrun (docs/guides/training.md)")
+    if not forking.AVAILABLE:
+        raise RequestError(
+            "this system cannot fork processes safely; start them with torchrun (docs/guides/training.md)"
+        )
     context = multiprocessing.get_context("fork")
     with tempfile.TemporaryDirectory(prefix="mapctl-") as folder:
         meeting = f"file://{Path(folder) / 'meeting'}"

@@ -1,4 +1,5 @@
-"""Pictures by pyrender without a window (EGL); works in software where there is no graphics card."""
+"""Pictures by pyrender: on Linux without a window (EGL), in software where there is no graphics card; on other systems
+in a window that is not shown, which needs a screen."""
 
 import os
 import sys
@@ -17,6 +18,8 @@ from scenes.content import Content, blend_veils
 from scenes.overlays import build_shadow
 from scenes.renderers.layers import Layer, list_layers
 
+NEEDS_NO_SCREEN = sys.platform == "linux"
+"""Whether EGL draws. macOS and Windows have none of their own."""
 _NEAR, _FAR = 0.3, 400.0
 
 
@@ -27,7 +30,7 @@ class NoGraphicsError(MapctlError):
 class OffscreenPainter:
     """Paints shaded bodies on the ground. Raises NoGraphicsError where there is no OpenGL."""
 
-    name = "pyrender (EGL)"
+    name = "pyrender (EGL)" if NEEDS_NO_SCREEN else "pyrender (hidden window)"
 
     def __init__(self):
         self._gl, self._renderer = _open_graphics()
@@ -74,7 +77,8 @@ class OffscreenPainter:
 @cache
 def _open_graphics() -> tuple[ModuleType, Any]:
     """Open pyrender and its one renderer. Deleting one cuts off all others, so none is deleted and none added."""
-    os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
+    if NEEDS_NO_SCREEN:
+        os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
     if not hasattr(np, "infty"):
         setattr(np, "infty", np.inf)  # noqa: B010 - pyrender 0.1.45 asks numpy 2 for what it dropped
     try:
@@ -87,7 +91,9 @@ def _open_graphics() -> tuple[ModuleType, Any]:
 
 
 def _list_graphics_errors() -> tuple[type[Exception], ...]:
-    """List what a missing library, driver or display raises somewhere between Python and EGL."""
+    """List what a missing library, driver or display raises somewhere between Python and EGL; of windows, anything."""
+    if not NEEDS_NO_SCREEN:
+        return (Exception,)  # each windowing system has errors of its own
     plain = (ImportError, OSError, AttributeError, AssertionError, ValueError, RuntimeError, TypeError)
     own = getattr(sys.modules.get("OpenGL.error"), "Error", None)  # nobody raises it before it is imported
     return plain if own is None else (*plain, own)

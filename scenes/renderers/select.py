@@ -7,7 +7,7 @@ from typing import Literal
 from mapctl.errors import RequestError
 from scenes.content import Painter
 from scenes.renderers import STICK_FIGURES
-from scenes.renderers.offscreen import NoGraphicsError, OffscreenPainter
+from scenes.renderers.offscreen import NEEDS_NO_SCREEN, NoGraphicsError, OffscreenPainter
 
 RendererName = Literal["auto", "egl", "stick"]
 RENDERER_VARIABLE = "MAPCTL_RENDERER"
@@ -33,7 +33,7 @@ def select_painter(name: RendererName | None = None) -> Painter:
     except NoGraphicsError as error:
         if wanted == "egl":
             raise
-        _log.warning("%s; drawing stick figures. On Debian: apt-get install %s", error, _PACKAGES)
+        _log.warning("%s; drawing stick figures. %s", error, _advise(error))
         return _make_stick_painter()
 
 
@@ -43,6 +43,13 @@ def back_end() -> str:
         return select_painter("egl").name
     except NoGraphicsError as error:
         return f"{STICK_FIGURES}: {error}"
+
+
+def _advise(error: NoGraphicsError) -> str:
+    """Say what to install."""
+    if isinstance(error.__cause__, ModuleNotFoundError):
+        return "For shaded bodies: pip install 'mapctl[render]'"
+    return f"On Debian: apt-get install {_PACKAGES}" if NEEDS_NO_SCREEN else "For shaded bodies: a screen is needed"
 
 
 def _make_stick_painter() -> Painter:

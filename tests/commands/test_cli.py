@@ -196,6 +196,30 @@ def test_demo_leaves_four_files(prior, tmp_path, monkeypatch):
     assert {path.suffix for path in (tmp_path / "demo").iterdir()} == {".bvh", ".json", ".mp4", ".png"}
 
 
+@pytest.mark.parametrize(
+    ("lacking", "left", "told"),
+    [
+        ({"av", "pyrender"}, {".bvh", ".json", ".png"}, ".mp4: films need the package av"),
+        (
+            {"av", "pyrender", "PIL", "matplotlib"},
+            {".bvh", ".json"},
+            ".mp4, .png: films need the packages av, PIL, mat",
+        ),
+    ],
+)
+def test_a_demo_without_packages_of_films_leaves_the_rest(prior, tmp_path, monkeypatch, capsys, lacking, left, told):
+    monkeypatch.setenv("MAPCTL_RENDERER", "stick")
+    monkeypatch.setattr("mapctl.commands.shared.outputs.find_spec", lambda name: None if name in lacking else name)
+    monkeypatch.setattr("mapctl.commands.demo.run.CURVE", "line:0.5")
+    monkeypatch.setattr("mapctl.commands.demo.run._SIZE", (96, 64))
+    assert run("demo", "-o", tmp_path / "demo", "--prior", prior) == 0
+    assert {path.suffix for path in (tmp_path / "demo").iterdir()} == left
+    out, err = capsys.readouterr()
+    assert f"not made  {told}" in out
+    assert "pip install 'mapctl[render]'" in out
+    assert err == ""
+
+
 def test_info_names_what_is_here(prior, capsys):
     assert run("info") == 0
     told = capsys.readouterr().out

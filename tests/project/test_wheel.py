@@ -1,5 +1,6 @@
 """The built wheel is whole: installed alone in a clean environment, it imports, runs and holds its data."""
 
+import json
 import os
 import shutil
 import subprocess
@@ -11,14 +12,17 @@ from pathlib import Path
 import pytest
 
 from mapctl import __version__
+from priors.licences import FREE
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("mapctl", "priors", "controllers", "scenes")
 DATA = (
     "mapctl/blender/addon/*.toml",
+    "mapctl/examples/*",
     "mapctl/joint_ranges/*.json",
     "mapctl/retarget/presets/*.toml",
     "priors/weights/*",
+    "priors/weights/free/*",
     "scenes/*.toml",
     "scenes/data/*",
 )
@@ -71,6 +75,11 @@ def held(wheel) -> set[str]:
         return set(archive.namelist())
 
 
+def read(wheel: Path, name: str) -> str:
+    with zipfile.ZipFile(wheel) as archive:
+        return archive.read(name).decode()
+
+
 def test_command_runs_elsewhere(clean, tmp_path):
     assert __version__ in run(clean / "mapctl", "--version", cwd=tmp_path)
     assert list(tmp_path.iterdir()) == []
@@ -94,6 +103,43 @@ def test_data_is_held(held):
     weights = {Path(name).suffix for name in held if name.startswith("priors/weights/")}
     assert {".safetensors", ".json"} <= weights
     assert any(name.startswith("scenes/") and name.endswith(".toml") for name in held)
+
+
+def test_its_example_is_found_elsewhere(clean, tmp_path):
+    run(clean / "mapctl", "convert", "example:noisy-walk", "walk.npz", cwd=tmp_path)
+    assert (tmp_path / "walk.npz").is_file()
+
+
+def test_licences_of_code_and_weights_are_told(wheel, held):
+    folder = f"mapctl-{__version__}.dist-info"
+    told = read(wheel, f"{folder}/METADATA")
+    assert "\nLicense-Expression: MIT AND CC-BY-NC-4.0 AND LicenseRef-Free-For-Any-Use\n" in told
+    files = {name.removeprefix(f"{folder}/licenses/") for name in held if name.startswith(f"{folder}/licenses/")}
+    assert files == {"LICENSE", "priors/weights/LICENSE.md", "mapctl/examples/LICENSE.md"}
+    notice = read(wheel, f"{folder}/licenses/priors/weights/LICENSE.md")
+    for word in (
+        "CC-BY-NC-4.0",
+        "LicenseRef-Free-For-Any-Use",
+        "Bandai Namco Research",
+        "arXiv 2306.08861",
+        "mocap.cs.cmu",
+    ):
+        assert word in notice
+
+
+def test_every_card_has_the_licence_of_its_set(wheel, held):
+    cards = [name for name in held if name.startswith("priors/weights/") and name.endswith(".json")]
+    assert {name.removesuffix(".json") + ".safetensors" for name in cards} <= held
+    by_set: dict[str, set[str]] = {}
+    for name in cards:
+        by_set.setdefault(str(Path(name).parent), set()).add(json.loads(read(wheel, name))["licence"])
+    assert by_set.pop("priors/weights") == {"CC BY-NC 4.0"}
+    assert by_set.pop("priors/weights/free") <= set(FREE)
+    assert by_set == {}
+
+
+def test_it_is_small(wheel):
+    assert wheel.stat().st_size < 100e6
 
 
 def test_nothing_else_is_held(held):

@@ -9,7 +9,10 @@ from mapctl.commands.shared.command import ModelCommand
 
 @dataclass(frozen=True)
 class Demo(ModelCommand):
-    """A character walks a figure-8 on the bundled prior: motion, film, contact sheet and report."""
+    """A character walks a figure-8 on the bundled prior: motion, film, contact sheet and report.
+
+    Where the extra `render` is not installed, there is no film, and the sheet shows stick figures.
+    """
 
     out: options.OutFolder = Path("demo-out")
     """Folder for figure8.bvh, .mp4, .png and .json; made if it does not exist."""

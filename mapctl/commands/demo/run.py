@@ -1,5 +1,6 @@
 """`mapctl demo`: path following on the bundled prior, from nothing to a film."""
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import priors
@@ -16,24 +17,34 @@ _SIZE = (960, 540)
 
 
 def run(command: Demo) -> int:
-    """Walk, write, film, report. Without OpenGL the film shows stick figures and says what is missing.
+    """Walk, write, film, report. Without OpenGL the film shows stick figures and says what is missing; what needs
+    packages that are not installed is left out, and a line says so.
 
     Ctrl-C ends the walk; the motion so far is written, without a film.
     """
     options.check_seed(command.seed)
     outputs.check_folder(command.out)
-    outputs.require_render("av")
+    missing = {ending: outputs.find_missing_render(ending) for ending in ("mp4", "png")}
     request = parse_follow(inputs.read_curve(CURVE, None), SPEED, None)
     prior = priors.load(command.prior)
     with show_progress("walking", quiet=command.quiet) as progress:
         done = walk(prior, request, seed=command.seed, progress=progress)
     with outputs.make_folder(command.out) as folder:
-        endings = ("bvh", "json") if done.interrupted else ("bvh", "json", "mp4", "png")
-        files = {ending: folder / f"figure8.{ending}" for ending in endings}
+        pictures = () if done.interrupted else (ending for ending, lacking in missing.items() if not lacking)
+        files = {ending: folder / f"figure8.{ending}" for ending in ("bvh", "json", *pictures)}
         _write(command, done, files)
     if not command.quiet:
         print("\n".join([*done.summary(), f"wrote     {', '.join(map(str, files.values()))}"]))
+        if any(missing.values()):
+            print(f"not made  {_describe_missing(missing)}")
     return exit_status.INTERRUPTED if done.interrupted else 0
+
+
+def _describe_missing(missing: Mapping[str, Sequence[str]]) -> str:
+    """Describe which films are left out, and what they need."""
+    endings = ", ".join(f".{ending}" for ending, lacking in missing.items() if lacking)
+    packages = list(dict.fromkeys(package for lacking in missing.values() for package in lacking))
+    return f"{endings}: {outputs.describe_missing_render(packages)}"
 
 
 def _write(command: Demo, done: Walk, files: dict[str, Path]) -> None:

@@ -15,7 +15,7 @@ class Denoise(ModelCommand):
     """Denoise a capture with noise, sliding and gaps, of any known rig: same skeleton, names, frames and rate."""
 
     source: Positional[Annotated[Path, arg(metavar="IN|FOLDER")]]
-    """A motion file; or a folder, every motion below it."""
+    """A motion file, or `example:noisy-walk`, which mapctl brings along; or a folder, every motion below it."""
     out: Annotated[Path, arg(aliases=["-o"], metavar="OUT|FOLDER")]
     """Where the clean motion goes; of a folder, another one, which gets the same names."""
     rig: options.MaybeRig = None

@@ -20,7 +20,7 @@ _UNITS = {1.0: "metres", 0.01: "centimetres", 0.001: "millimetres", 0.0254: "inc
 
 def is_clip(name: str) -> bool:
     """Return whether the name is that of a motion file, by its ending."""
-    return Path(name).suffix.lower() in formats.READERS
+    return formats.ending_of(name) in formats.READERS
 
 
 def print_clip(path: Path, rig: str | None, *, as_json: bool, picture: Path | None = None) -> None:

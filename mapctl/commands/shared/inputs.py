@@ -29,7 +29,7 @@ def count_frames(seconds: float) -> int:
 
 def read_curve(text: str, metres_per_unit: float | None) -> Curve:
     """Read the curve of a CURVE option. A missing file is reported as such, not taken for a shape."""
-    if os.sep in text and not Path(text).exists():
+    if any(mark in text for mark in (os.sep, os.altsep) if mark) and not Path(text).exists():
         raise RequestError(f"{text}: no such file")
     return curves.read(text, metres_per_unit=metres_per_unit)
 

@@ -57,7 +57,20 @@ def _check_png(path: Path, what: str) -> None:
 def require_render(package: str) -> None:
     """Raise RequestError that names the extra if a package of it is not installed."""
     if find_spec(package) is None:
-        raise RequestError(f"films need the package {package}: pip install 'mapctl[render]'")
+        raise RequestError(describe_missing_render([package]))
+
+
+def find_missing_render(ending: str) -> list[str]:
+    """Find the packages that are not installed of those without which there is no film of this ending, as `png`."""
+    painter = "matplotlib" if find_spec("pyrender") is None else "pyrender"
+    wanted = [*(["av"] if ending == "mp4" else []), "PIL", painter]
+    return [package for package in wanted if find_spec(package) is None]
+
+
+def describe_missing_render(packages: Sequence[str]) -> str:
+    """Say which packages films need, and which extra has them."""
+    noun = "the package" if len(packages) == 1 else "the packages"
+    return f"films need {noun} {', '.join(packages)}: pip install 'mapctl[render]'"
 
 
 def check_folder(folder: str | PathLike[str]) -> None:

@@ -4,8 +4,7 @@ Steps are taken at five points of a run, since what a step costs changes as gaps
 has a process of its own, so that its peak of memory is its own; one process and several take turns.
 """
 
-import resource
-import sys
+import math
 import tempfile
 import time
 from collections.abc import Sequence
@@ -21,13 +20,14 @@ from mapctl.commands.bench import Training
 from mapctl.commands.bench.output import print_rows
 from mapctl.commands.train import MODELS
 from mapctl.errors import RequestError
+from mapctl.report import peak_memory_mb
 from priors.training.gathering import gather
 from priors.training.parallel import TrainingGroup, fork_group
 from priors.training.recipe import Gathered
 from priors.training.trainer import Trainer
 
 _POINTS = (0.1, 0.3, 0.5, 0.7, 0.9)  # shares of a run at which steps are measured
-_MEGABYTE = 1e6
+_MEBIBYTE_MB = 2**20 / 1e6
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Cost:
     processor_seconds: float
     """For 100 steps, of all processes."""
     megabytes: float
-    """Peak of the first process' memory."""
+    """Peak of the first process' memory; NaN where the system does not tell (Windows)."""
 
 
 def run(command: Training) -> int:
@@ -103,9 +103,9 @@ def measure_steps(name: str, data: Path, out: Path, processes: int, steps: int) 
 
     with fork_group(processes, work) as group:
         work(group)
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    peak = peak_memory_mb()
     seconds, processor_seconds = (100 * each / (steps * len(_POINTS)) for each in found[0])
-    return Cost(seconds, processor_seconds, peak * (1 if sys.platform == "darwin" else 1024) / _MEGABYTE)
+    return Cost(seconds, processor_seconds, math.nan if peak is None else peak * _MEBIBYTE_MB)
 
 
 def _take_steps(trainer: Trainer, steps: int) -> tuple[float, float]:

@@ -5,7 +5,7 @@ import json
 import os
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
@@ -37,11 +37,13 @@ class Job:
         return is_finished(self.run)
 
     def resume(self) -> list[str]:
-        """What is typed to begin it, or to go on with it. All models share the cache of the clips."""
+        """What is typed to begin it, or to go on with it. All models share the cache of the clips, where the system
+        lets links be made (Windows asks for a right); else each makes its own."""
         if not (self.run / CACHE).exists():
             self.run.mkdir(parents=True, exist_ok=True)
             (self.run.parent / CACHE).mkdir(exist_ok=True)
-            (self.run / CACHE).symlink_to(Path("..") / CACHE, target_is_directory=True)
+            with suppress(OSError):
+                (self.run / CACHE).symlink_to(Path("..") / CACHE, target_is_directory=True)
         return [*self.words, "--resume"] if run_files.has_checkpoint(self.run) else list(self.words)
 
 

@@ -1,0 +1,99 @@
+"""Motions that mapctl brings along: `example:NAME` wherever a motion is read."""
+
+import json
+import math
+import re
+
+import make_example
+import pytest
+from helpers import run, walk
+from tiny_denoiser import save_tiny_denoiser
+
+import mapctl
+from mapctl.errors import RequestError
+from mapctl.formats import examples
+from mapctl.recording.inspection import inspect_recording
+from priors.licences import FREE
+
+NAME = "example:noisy-walk"
+
+
+def bones(motion) -> dict[str, list[float]]:
+    """Offset of each joint below the root, by name; files nest joints in an order of their own."""
+    names, offsets = motion.skeleton.names, motion.skeleton.offsets
+    return {name: [round(x, 6) for x in offset] for name, offset in zip(names[1:], offsets[1:].tolist(), strict=True)}
+
+
+def test_it_is_the_walk_that_its_page_tells_of():
+    motion = mapctl.load(NAME)
+    assert (motion.num_frames, float(motion.fps)) == (240, 30)
+    assert bones(motion) == bones(make_example.performer())
+    assert (motion.root_position[-1] - motion.root_position[0]).norm() > 3
+    file = examples.resolve(NAME)
+    assert file.stat().st_size < 300_000
+    page = (file.parent / "LICENSE.md").read_text("utf-8")
+    assert "free for any use" in page.replace("\n", " ")
+    assert {f"{name}.bvh" for name in examples.list_examples()} == set(re.findall(r"^\| `(.+?)`", page, re.M))
+
+
+def test_it_is_as_noisy_as_its_page_says():
+    """The sigma of angles is told by neighbouring frames, in which spikes do not count."""
+    found = inspect_recording(mapctl.load(NAME))
+    assert math.degrees(float(found.noise.median())) == pytest.approx(make_example.DEGREES, rel=0.1)
+    assert 100 * float(found.noise_root) == pytest.approx(make_example.CENTIMETRES, rel=0.3)
+
+
+def test_a_command_takes_it_and_tells_its_licence(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    tiny = save_tiny_denoiser(tmp_path / "tiny.safetensors")
+    assert run("denoise", NAME, "-o", "clean.bvh", "--report", "clean.json", "--denoiser", tiny) == 0
+    assert f"{examples.LICENCE} ({NAME}" in capsys.readouterr().out
+    assert json.loads((tmp_path / "clean.json").read_text())["licence"]["models"][NAME] == examples.LICENCE
+    clean = mapctl.load("clean.bvh")
+    assert clean.num_frames == 240
+    assert clean.skeleton.matches(mapctl.load(NAME).skeleton)
+
+
+def test_it_is_free_as_the_free_weights():
+    assert examples.LICENCE in FREE
+    assert mapctl.load(NAME).licence == examples.LICENCE
+
+
+def test_other_commands_and_rigs_take_it(tmp_path, capsys):
+    assert run("info", NAME, "--json") == 0
+    assert json.loads(capsys.readouterr().out)["rig"] == "mixamo"
+    assert run("convert", NAME, tmp_path / "part.npz", "--frames", "0:10") == 0
+    walk(10).save(tmp_path / "walk.bvh")
+    assert run("convert", tmp_path / "walk.bvh", tmp_path / "onto.bvh", "--rig", NAME) == 0
+    assert mapctl.load(tmp_path / "onto.bvh").skeleton.names == mapctl.load(NAME).skeleton.names
+    assert mapctl.load(tmp_path / "part.npz").licence == examples.LICENCE
+
+
+def test_an_example_that_there_is_not_is_named_in_one_line(tmp_path, capsys):
+    with pytest.raises(RequestError, match="no example 'run'; there are: noisy-walk"):
+        mapctl.load("example:run")
+    assert run("denoise", "example:run", "-o", tmp_path / "out.bvh") == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_no_result_is_written_over_it(tmp_path):
+    before = examples.resolve(NAME).read_bytes()
+    walk(10).save(tmp_path / "walk.bvh")
+    assert run("convert", tmp_path / "walk.bvh", NAME) == 2
+    assert examples.resolve(NAME).read_bytes() == before
+
+
+@pytest.mark.slow
+def test_its_script_makes_it_anew_and_denoising_brings_it_back(tmp_path):
+    """On this machine or another: rounding moves the walk by little, and seeds keep the noise."""
+    clean = make_example.make_walk(tmp_path)
+    made, shipped = make_example.spoil(clean), mapctl.load(NAME)
+    assert made.num_frames == shipped.num_frames
+    assert error(made, shipped) < 2
+    assert run("denoise", NAME, "-o", tmp_path / "clean.bvh", "--weights", "free") == 0
+    assert error(mapctl.load(tmp_path / "clean.bvh"), clean) < 0.4 * error(shipped, clean)
+
+
+def error(motion, other) -> float:
+    """Mean distance of the joints, centimetres."""
+    return 100 * float((motion.joint_positions() - other.joint_positions()).norm(dim=-1).mean())
