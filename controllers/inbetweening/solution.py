@@ -25,7 +25,7 @@ class Pick:
     """Mean energies of a frame by the names of all answers, nats."""
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class InbetweenSolution(Solution):
     """A complete motion on the given rig, at its rate, with all of its frames."""
 

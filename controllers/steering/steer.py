@@ -137,7 +137,7 @@ class Refusal:
     """Why, with numbers."""
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class SteerFrames(Solution):
     """New frames of a step, at PRIOR_FPS, in the world; the status says if a deadline cut the search short."""
 

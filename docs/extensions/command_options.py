@@ -43,7 +43,9 @@ def format_options(words: list[str]) -> Iterator[str]:
     """Lines of Markdown: what is typed first, then each option with its values, its meaning and its default."""
     parser = find_parser(words)
     name = " ".join(["mapctl", *words])
-    actions = sorted((each for each in parser._actions if each.dest != "help"), key=lambda each: bool(each.option_strings))
+    actions = sorted(
+        (each for each in parser._actions if each.dest != "help"), key=lambda each: bool(each.option_strings)
+    )
     required = [_format_usage(each) for each in actions if each.required]
     yield from ("```text", " ".join([name, *required, "[options]"]), "```", "", f"```{{program}} {name}", "```", "")
     for action in actions:

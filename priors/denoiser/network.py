@@ -234,8 +234,8 @@ def _smooth(values: Float[Tensor, "batch frames width"], sigma: float) -> Float[
     return torch.einsum("ts,bsw->btw", weight, values)
 
 
-@dataclass(frozen=True, eq=False)
-class ConvDenoiser:
+@dataclass(frozen=True, eq=False, repr=False)
+class ConvDenoiser(checkpoints.LoadedModel):
     """A trained denoiser (see mapctl.protocols.Denoiser)."""
 
     name: str

@@ -57,8 +57,8 @@ class KeyframeTimingNetwork(nn.Module):
         return torch.stack([low * seconds, seconds, high * seconds], dim=-1)
 
 
-@dataclass(frozen=True, eq=False)
-class KeyframeTiming:
+@dataclass(frozen=True, eq=False, repr=False)
+class KeyframeTiming(checkpoints.LoadedModel):
     """A fitted regression, as controllers get it."""
 
     name: str

@@ -18,8 +18,8 @@ from priors.lstm_gmm.network import LstmGmm, LstmGmmConfig, LstmState
 from priors.lstm_gmm.state_inference import infer_lstm_state
 
 
-@dataclass(frozen=True, eq=False)
-class LstmGmmDensity(Density[LstmState]):
+@dataclass(frozen=True, eq=False, repr=False)
+class LstmGmmDensity(checkpoints.LoadedModel, Density[LstmState]):
     """The network as a density; rollouts take the fast path unless `use_fast` is off."""
 
     name: str

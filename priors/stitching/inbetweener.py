@@ -38,8 +38,8 @@ _FARTHEST = 0.3  # metres of unit size from a trajectory over which steps can be
 _PARTNERS = CANONICAL.mirror_partners()
 
 
-@dataclass(frozen=True, eq=False)
-class Stitcher(Inbetweener):
+@dataclass(frozen=True, eq=False, repr=False)
+class Stitcher(checkpoints.LoadedModel, Inbetweener):
     """A trained stitcher (Ren et al. 2024)."""
 
     name: str
