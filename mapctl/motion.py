@@ -77,7 +77,8 @@ class Motion:
 
     @property
     def travelling_joint(self) -> int:
-        """Joint whose position is that of the body: the root, or the first below a root that stays still."""
+        """Index of the joint whose position is that of the body: the root, or the first below a root that stays
+        still."""
         moving = [joint for joint, values in self.moving_offsets.items() if bool((values != values[0]).any())]
         stays = bool((self.root_position == self.root_position[0]).all())
         return min(moving) if stays and moving else 0

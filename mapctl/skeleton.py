@@ -133,6 +133,8 @@ def _build_canonical() -> Skeleton:
 
 
 CANONICAL = _build_canonical()
+"""The skeleton that priors know: 21 joints with VRM's names, in the size of the performer of the bundled priors'
+data."""
 # How other rigs name sides: Hand_R, Bip01 L Hand, LeftHand, rHand, RHand, footleft.
 _FOREIGN_SIDE_NAMES = re.compile(
     r"(?i:(?:^|[^a-z0-9])(?:l|r|left|right)(?:$|[^a-z0-9]))|Left|Right|^[lrLR](?=[A-Z][a-z])|(?i:left|right)$"

@@ -43,7 +43,7 @@ class Card:
     quality: dict[str, Any] = field(default_factory=dict)
     """Measured quality and the command that printed it."""
     abilities: dict[str, float] = field(default_factory=dict)
-    """Limits of speed and turning that the data show."""
+    """Limits of speed (m/s) and turning (rad/s) that the data show, by their names in `DataLimits`."""
 
     def __str__(self) -> str:
         return f"Card: {self.kind}, {self.licence or 'without a licence'}"

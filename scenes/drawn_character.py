@@ -50,11 +50,13 @@ class DrawnMotion:
         return self.placed.notes
 
     def build_body(self, fps: Fraction, colour: Array) -> SkinnedBody:
-        """Build the body at a film's rate; `colour` is that of its bones, where these are drawn."""
+        """Build the body at a film's rate; `colour` is that of its bones (red, green, blue, 0 to 1), where these are
+        drawn."""
         return _build_body(self.mesh, self.placed, fps, colour)
 
     def build_pose(self, pose: Motion, colour: Array) -> SkinnedBody:
-        """Build the body in one frame of the giver's skeleton."""
+        """Build the body in one frame of the giver's skeleton; `colour` is that of its bones (red, green, blue, 0 to
+        1), where these are drawn."""
         return _build_body(self.mesh, self.place(pose), pose.fps, colour)
 
 

@@ -42,9 +42,9 @@ class Wish:
     asked: str
     """In numbers."""
     got: float
-    """What it came to, in `unit`."""
+    """What it came to, in the unit of `unit`."""
     limit: float
-    """Beyond which it does not hold."""
+    """Beyond which it does not hold, in the same unit."""
     unit: str
     """Unit of both."""
     at_least: bool = False

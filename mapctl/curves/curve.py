@@ -71,7 +71,7 @@ class Curve:
 
     @property
     def dims(self) -> int:
-        """2 on the ground, 3 in space."""
+        """Number of coordinates: 2 on the ground, 3 in space."""
         return self.points.shape[-1]
 
     @property

@@ -124,7 +124,8 @@ class CommandTrack:
         return list(self.times[bisect_right(self.times, before + 1e-9) : bisect_right(self.times, upto + 1e-9)])
 
     def limit_speed(self, fastest: float) -> tuple["CommandTrack", list[str]]:
-        """Limit every command to what can be held; also return a note for each number that was changed."""
+        """Limit every command to what can be held, speeds to the `fastest` (m/s); also return a note for each number
+        that was changed."""
         found = [
             command.within(fastest, when=f" at {time:g} s")
             for time, command in zip(self.times, self.commands, strict=True)

@@ -112,8 +112,11 @@ class MeasureStatistics(NamedTuple):
     """What a set of clips shows of one measure."""
 
     mean: float
+    """Mean over the clips, in the measure's unit."""
     p2: float
+    """2nd percentile, in the same unit."""
     p98: float
+    """98th percentile, in the same unit."""
 
 
 def compute_reference(motions: Iterable[Motion]) -> dict[str, MeasureStatistics]:

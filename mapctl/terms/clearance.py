@@ -26,7 +26,9 @@ class Clearance:
     share: Float[Tensor, "frames 2"] | None = None
     """Share of the height that each toe is to clear in each frame of the window, 0 to 1; None: all of it."""
     name: str = "clearance"
+    """Name in the ledger."""
     unit: str = "m"
+    """Unit of the residual."""
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Energies of both toes, nats."""

@@ -45,10 +45,13 @@ class FootContact:
     rest_height: float = TOE_REST_HEIGHT
     """Height of the toe joint while the foot is flat on the ground, metres."""
     name: str = "footing"
+    """Name in the ledger."""
     unit: str = "m/s"
+    """Unit of the residual."""
 
     def with_sigmas(self, speed: float, height: float, below: float) -> "FootContact":
-        """Return the term with these sigmas of toes, m/s and metres; those of heels change in proportion."""
+        """Return the term with these sigmas of toes, `speed` in m/s, `height` and `below` in metres; those of heels
+        change in proportion."""
         heels = self.heels and replace(
             self.heels,
             speed=self.heels.speed * speed / self.sigma_speed,
@@ -71,7 +74,7 @@ class FootContact:
         return energy + (held + 0.5 * (above.clamp(max=0) / self.heels.below).square()).sum(-1)
 
     def add_gradient(self, trial: Trial, gradient: TrialGradient) -> Float[np.ndarray, "batch frames"]:
-        """See DifferentiatedTerm."""
+        """Add the gradient of the summed energies of a float32 trial, and return the energies, nats."""
         energy = np.zeros(gradient.log_density.shape)
         kernels.add_contact(
             trial.joints_world.numpy(),

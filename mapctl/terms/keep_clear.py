@@ -24,7 +24,9 @@ class KeepClear:
     sigma: float = 0.02
     """Standard deviation of the distance by which a joint is too near, metres."""
     name: str = "clear"
+    """Name in the ledger."""
     unit: str = "m"
+    """Unit of the residual."""
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Energies of the joints that reach farthest from the body, nats."""
@@ -50,7 +52,9 @@ class KeepApart:
     sigma: float = 0.02
     """Standard deviation of the distance that is lacking, metres."""
     name: str = "apart"
+    """Name in the ledger."""
     unit: str = "m"
+    """Unit of the residual."""
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Energies, nats, summed over the others."""
@@ -70,7 +74,7 @@ class WithinReach:
     """A shoulder is near enough to a target for the hand to reach it."""
 
     shoulder: int
-    """Canonical joint from which the limb reaches."""
+    """Index of the canonical joint from which the limb reaches."""
     place: Float[Tensor, "frames 3"]
     """Target in each frame of the window, world, metres; anything finite where there is none."""
     wanted: Bool[Tensor, " frames"]
@@ -82,7 +86,9 @@ class WithinReach:
     robust: float = 0.1
     """Such distance beyond which the energy rises linearly, metres: nobody lunges for what is out of reach."""
     name: str = "within reach"
+    """Name in the ledger."""
     unit: str = "m"
+    """Unit of the residual."""
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Energies, nats."""

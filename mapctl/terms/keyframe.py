@@ -20,7 +20,9 @@ class Keyframe:
     sigma: float = 0.002
     """Standard deviation of a joint about its target along each axis, metres."""
     name: str = "keyframe"
+    """Name in the ledger."""
     unit: str = "m"
+    """Unit of the residual."""
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Energies, nats, summed over joints."""

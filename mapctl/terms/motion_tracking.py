@@ -33,7 +33,9 @@ class MotionTracking:
     effective_joints: float = 6.0
     """Number of independent joints that a body is worth: neighbours move together, so 21 are not 21 observations."""
     name: str = "closeness"
+    """Name in the ledger."""
     unit: str = "m"
+    """Unit of the residual."""
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Energies, nats."""

@@ -46,7 +46,9 @@ class Path:
     slow_seconds: float = 0.35
     """Standard deviation of the Gaussian that separates the slow offset from the sway."""
     name: str = "path"
+    """Name in the ledger."""
     unit: str = "m"
+    """Unit of the residual."""
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Energies of the sideways offset, its slow part, progress, and height in space, nats."""
@@ -61,7 +63,7 @@ class Path:
         return 0.5 * (energy + (self._low_pass_offset(trial, offsets[..., 0]) / self.sigma_slow).square())
 
     def add_gradient(self, trial: Trial, gradient: TrialGradient) -> Float[np.ndarray, "batch frames"]:
-        """See DifferentiatedTerm."""
+        """Add the gradient of the summed energies of a float32 trial, and return the energies, nats."""
         positions, energy = self._positions(trial).contiguous(), np.empty(gradient.log_density.shape)
         near, sigma = self._nearest_frame(positions), self.slow_seconds * trial.fps
         known, weights = _build_offset_smoother(

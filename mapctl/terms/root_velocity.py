@@ -38,7 +38,9 @@ class RootVelocity:
     slow_seconds: float = 0.25
     """Standard deviation of the Gaussian that removes a stride's own rise and fall of speed, seconds."""
     name: str = "travel"
+    """Name in the ledger."""
     unit: str = "m/s"
+    """Unit of the residual."""
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Energies, nats."""
@@ -51,7 +53,7 @@ class RootVelocity:
         return 0.5 * energy
 
     def add_gradient(self, trial: Trial, gradient: TrialGradient) -> Float[np.ndarray, "batch frames"]:
-        """See DifferentiatedTerm."""
+        """Add the gradient of the summed energies of a float32 trial, and return the energies, nats."""
         known, weights = _build_velocity_smoother(self, trial.before, trial.fps, trial.features.dtype)
         energy, (velocities, units, facing) = np.empty(gradient.log_density.shape), self._tables
         kernels.add_root_velocity(

@@ -22,7 +22,9 @@ class Support:
     rest_height: float = TOE_REST_HEIGHT
     """Height of the toe joint while the foot is flat on the ground, metres."""
     name: str = "support"
+    """Name in the ledger."""
     unit: str = "m/s"
+    """Unit of the residual."""
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Energies, nats."""

@@ -16,8 +16,9 @@ from torch.nn.functional import gelu
 from mapctl import kinematics, rotations
 from mapctl.errors import RequestError
 from mapctl.numerics import gaussian
+from mapctl.numerics.intervals import fill_missing
 from mapctl.pose import BodyPose
-from mapctl.recording import Capture, CaptureProposal, fill_missing
+from mapctl.recording import Capture, CaptureProposal
 from mapctl.skeleton import CANONICAL
 from priors import checkpoints
 from priors.config import NetworkConfig
