@@ -38,15 +38,15 @@ class DrawnMotion:
     """A motion put on a character, to be filmed."""
 
     mesh: CharacterMesh
-    """The character's."""
+    """Triangles of the character."""
     placed: Placed
-    """The motion on its joints."""
+    """The motion on the character's joints."""
     place: Callable[[Motion], Placed]
     """Puts further frames of the same giver on it, as poses that are asked for."""
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What could not be kept."""
+        """What of the motion could not be kept, one sentence each."""
         return self.placed.notes
 
     def build_body(self, fps: Fraction, colour: Array) -> SkinnedBody:

@@ -5,7 +5,26 @@ Whatever is not listed here may change without notice. Of what stands in several
 
 PUBLIC: dict[str, tuple[str, ...]] = {
     # motions, rigs and formats
-    "mapctl": ("CANONICAL", "Motion", "Skeleton", "load"),
+    "mapctl": (
+        "CANONICAL",
+        "Motion",
+        "Skeleton",
+        "curves",
+        "editing",
+        "errors",
+        "features",
+        "formats",
+        "inbetweening",
+        "load",
+        "metrics",
+        "motion_dna",
+        "pose",
+        "protocols",
+        "recording",
+        "report",
+        "retarget",
+        "terms",
+    ),
     "mapctl.formats": (
         "CHARACTERS",
         "READERS",
@@ -184,7 +203,7 @@ PUBLIC: dict[str, tuple[str, ...]] = {
     "mapctl.solver.gradient": ("differentiate",),
     "mapctl.solver.lbfgs": ("LbfgsResult", "LbfgsSettings", "LbfgsStatus", "minimise"),
     "mapctl.solver.swarm": ("SwarmResult", "SwarmSettings", "run_best_of_samples", "run_swarm"),
-    "controllers.common.initial_state": ("MotionStart", "select_initial_state", "start_from_state"),
+    "controllers.common.initial_state": ("MotionStart", "start_from_state"),
     "controllers.common.character": ("Character",),
     "controllers.common.canonical_clip": ("CanonicalClip",),
     "controllers.common.map_refinement": ("RefinementSettings",),
@@ -220,6 +239,7 @@ PUBLIC: dict[str, tuple[str, ...]] = {
         "skate_ratio",
     ),
     "mapctl.metrics.realism": ("Realism", "RealismSettings", "measure_realism"),
+    "mapctl.metrics.realism.classifier": ("ClassifierSettings",),
     "mapctl.report": ("build_report", "write_report"),
     # scenes and film
     "scenes": (
@@ -247,4 +267,4 @@ PUBLIC: dict[str, tuple[str, ...]] = {
         "WriteError",
     ),
 }
-"""Names by module. A public module right below a package is a name of the package, too, and need not be repeated."""
+"""Names by module, with modules that a package has as names of its own."""

@@ -20,7 +20,7 @@ class Pick:
     """Which of several answers this is."""
 
     name: str
-    """Its own."""
+    """Name of this answer."""
     energies: Mapping[str, float]
     """Mean energies of a frame by the names of all answers, nats."""
 

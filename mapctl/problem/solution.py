@@ -44,7 +44,7 @@ class Status:
         return self.outcome is Outcome.DONE
 
     def with_notes(self, notes: Sequence[str], *, infeasible: bool = False) -> "Status":
-        """The status with more to say; `infeasible` marks wishes that cannot hold."""
+        """Return the status with more to say; `infeasible` marks wishes that cannot hold."""
         outcome = Outcome.INFEASIBLE if infeasible and self.ok else self.outcome
         return replace(self, outcome=outcome, notes=(*self.notes, *notes))
 

@@ -50,7 +50,7 @@ class LbfgsSettings:
     gradient_tolerance: float = 1e-3
     """Converged where no entry of the gradient is larger, energy per unit of the unknowns."""
     relative_energy_tolerance: float = 1e-6
-    """Energy tolerance: converged where a step wins less than this share of max(|energy|, 1)."""
+    """Energy tolerance: converged where a step wins less than this share of `max(|energy|, 1)`."""
     armijo: float = 1e-4
     """Share of the slope's predicted decrease that a step must keep."""
     curvature: float = 0.9

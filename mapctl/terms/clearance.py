@@ -31,11 +31,11 @@ class Clearance:
     """Unit of the residual."""
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Energies of both toes, nats."""
+        """Return the energies of both toes, nats."""
         return 0.5 * (self._height_deficit(trial) / self.sigma).square().sum(-1)
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Height that the lower toe is lacking, metres; 0 where none is."""
+        """Return the height that the lower toe is lacking, metres; 0 where none is."""
         return self._height_deficit(trial).amax(-1)
 
     def _height_deficit(self, trial: Trial) -> Float[Tensor, "batch frames 2"]:

@@ -61,7 +61,7 @@ class FootContact:
         return replace(self, sigma_speed=speed, sigma_height=height, sigma_below=below, heels=heels)
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Energies of both feet, nats."""
+        """Return the energies of both feet, nats."""
         above = trial.toe_heights - self.rest_height
         held = _hold(trial.planted, trial.toe_speeds / self.sigma_speed, above / self.sigma_height)
         energy = (held + 0.5 * (above.clamp(max=0) / self.sigma_below).square()).sum(-1)
@@ -105,7 +105,7 @@ class FootContact:
         return energy
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Horizontal speed of the fastest planted toe or heel, m/s; 0 where none is planted."""
+        """Return the horizontal speed of the fastest planted toe or heel, m/s; 0 where none is planted."""
         fastest = (_stays(trial.planted) * trial.toe_speeds).amax(-1)
         if self.heels is None:
             return fastest

@@ -29,11 +29,11 @@ class KeepClear:
     """Unit of the residual."""
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Energies of the joints that reach farthest from the body, nats."""
+        """Return the energies of the joints that reach farthest from the body, nats."""
         return 0.5 * (self._trespass(trial) / self.sigma).square().sum(-1)
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Distance by which the joint that is nearest to an obstacle is nearer than the margin, metres."""
+        """Return the distance by which the joint that is nearest to an obstacle is nearer than the margin, metres."""
         return self._trespass(trial).amax(-1)
 
     def _trespass(self, trial: Trial) -> Float[Tensor, "batch frames joints"]:
@@ -57,11 +57,11 @@ class KeepApart:
     """Unit of the residual."""
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Energies, nats, summed over the others."""
+        """Return the energies, nats, summed over the others."""
         return 0.5 * (self._lacking(trial) / self.sigma).square().sum(1)
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Distance that is lacking to the nearest other, metres."""
+        """Return the distance that is lacking to the nearest other, metres."""
         return self._lacking(trial).amax(1)
 
     def _lacking(self, trial: Trial) -> Float[Tensor, "batch others frames"]:
@@ -91,11 +91,11 @@ class WithinReach:
     """Unit of the residual."""
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Energies, nats."""
+        """Return the energies, nats."""
         lacking = self.residual(trial) / self.robust
         return (self.robust / self.sigma) ** 2 * ((1 + lacking.square()).sqrt() - 1)
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Distance beyond reach, metres; 0 where the limb reaches."""
+        """Return the distance beyond reach, metres; 0 where the limb reaches."""
         away = trial.joints_world[..., self.shoulder, :] - self.place.to(trial.features)
         return (vectors.length(away) - self.reach).clamp_min(0) * self.wanted

@@ -23,7 +23,7 @@ class LatentPrior:
     """Unit of the residual."""
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Energies, nats: half the squared numbers of each frame over sigma squared."""
+        """Return the energies, nats: half the squared numbers of each frame over sigma squared."""
         return 0.5 * (trial.require_noise() / self.sigma).square().sum(-1)
 
     def add_gradient(self, trial: Trial, gradient: TrialGradient) -> Float[np.ndarray, "batch frames"]:
@@ -33,5 +33,5 @@ class LatentPrior:
         return energy
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Root mean square of a frame's numbers."""
+        """Return the root mean square of a frame's numbers."""
         return trial.require_noise().square().mean(-1).sqrt()

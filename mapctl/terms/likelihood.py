@@ -22,7 +22,7 @@ class Likelihood:
     """Unit of the residual."""
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Energies, nats; negative where the density is above 1."""
+        """Return the energies, nats; negative where the density is above 1."""
         return -trial.require_log_density() / self.temperature
 
     def add_gradient(self, trial: Trial, gradient: TrialGradient) -> Float[np.ndarray, "batch frames"]:
@@ -31,5 +31,5 @@ class Likelihood:
         return -trial.require_log_density().double().numpy() / self.temperature
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Minus the log density, nats."""
+        """Return minus the log density, nats."""
         return -trial.require_log_density()

@@ -38,7 +38,7 @@ class MotionTracking:
     """Unit of the residual."""
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Energies, nats."""
+        """Return the energies, nats."""
         height = LAYOUT.pick(trial.features - self.target.to(trial.features), "root_height")[..., 0]
         ground, turn = self._trajectory_error(trial)
         return 0.5 * (
@@ -49,7 +49,7 @@ class MotionTracking:
         )
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Root mean square distance of the joints from the target's, relative to the hips, metres."""
+        """Return the root mean square distance of the joints from the target's, relative to the hips, metres."""
         return self._pose(trial).mean(-1).sqrt()
 
     def _pose(self, trial: Trial) -> Float[Tensor, "batch frames joints"]:

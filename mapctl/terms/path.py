@@ -51,7 +51,7 @@ class Path:
     """Unit of the residual."""
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Energies of the sideways offset, its slow part, progress, and height in space, nats."""
+        """Return the energies of the sideways offset, its slow part, progress, and height in space, nats."""
         positions = self._positions(trial)
         near = self._nearest_frame(positions)
         # The curve is held in the gradient. Forward offsets are from the wanted point, the others from the nearest:
@@ -86,7 +86,7 @@ class Path:
         return energy
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Distance to the curve, metres."""
+        """Return the distance to the curve, metres."""
         positions = self._positions(trial)
         return vectors.length(positions - self._nearest_frame(positions).place)
 
@@ -121,7 +121,7 @@ class Path:
         return torch.addmm(known, sideways, weights)
 
     def past_sideways_offsets(self, past: Float[Tensor, "past 3"]) -> Float[Tensor, " past"]:
-        """Sideways offsets of the frames before the window, metres; their arcs are extrapolated."""
+        """Return the sideways offsets of the frames before the window, metres; their arcs are extrapolated."""
         step = self.arcs[1] - self.arcs[0] if len(self.arcs) > 1 else 0.0
         around = self.arcs[0] - step * torch.arange(len(past), 0, -1)
         positions = self._select_axes(past)

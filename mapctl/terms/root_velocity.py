@@ -43,7 +43,7 @@ class RootVelocity:
     """Unit of the residual."""
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Energies, nats."""
+        """Return the energies, nats."""
         error = self._velocity_error(trial)
         energy = (error.unsqueeze(-2) * self._units.to(error.dtype)).sum(-1).square().sum(-1)
         if self.facing is not None:
@@ -72,7 +72,7 @@ class RootVelocity:
         return energy
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Size of the low-pass velocity error, m/s."""
+        """Return the size of the low-pass velocity error, m/s."""
         return vectors.length(self._velocity_error(trial))
 
     @cached_property

@@ -33,7 +33,7 @@ class StepLength:
     """Unit of the residual."""
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Energies in the frames of touch-downs, nats; 0 in all others."""
+        """Return the energies in the frames of touch-downs, nats; 0 in all others."""
         return 0.5 * (self._length_error(trial) / self.sigma).square()
 
     def add_gradient(self, trial: Trial, gradient: TrialGradient) -> Float[np.ndarray, "batch frames"]:
@@ -52,7 +52,7 @@ class StepLength:
         return energy
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Error of the step length, metres; 0 between touch-downs."""
+        """Return the error of the step length, metres; 0 between touch-downs."""
         return self._length_error(trial).abs()
 
     def _length_error(self, trial: Trial) -> Float[Tensor, "batch frames"]:

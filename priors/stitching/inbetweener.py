@@ -65,7 +65,7 @@ class Stitcher(checkpoints.LoadedModel, Inbetweener):
         return replace(self, draws=Draws(seed, self._pick_temperature(temperature)), number=0)
 
     def numbered(self, number: int) -> "Stitcher":
-        """Return the in-betweener that proposes the draw of a number, from 0 on."""
+        """Return the in-betweener that proposes the draw of a `number`, an index from 0 on."""
         return replace(self, number=number)
 
     @torch.no_grad()
