@@ -58,7 +58,8 @@ def read_page(page: str) -> str:
 
 def blocks(page: str, language: str) -> list[Block]:
     """The fenced blocks of a language; `` for none."""
-    found = re.findall(r"^```(\w*)\n(.*?)^```", read_page(page), re.DOTALL | re.MULTILINE)
+    # Directives have fences, too: what closes one must not pass for what opens a plain block.
+    found = re.findall(r"^```(\w*|\{[^\n]*)\n(.*?)^```", read_page(page), re.DOTALL | re.MULTILINE)
     return [Block(page, n, language, text) for n, text in enumerate(text for lang, text in found if lang == language)]
 
 

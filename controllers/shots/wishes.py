@@ -40,11 +40,11 @@ class Wish:
     name: str
     """What was wished."""
     asked: str
-    """In numbers."""
+    """What was asked, in numbers."""
     got: float
-    """What it came to, in `unit`."""
+    """What it came to, in the unit of `unit`."""
     limit: float
-    """Beyond which it does not hold."""
+    """Value beyond which it does not hold, in the same unit."""
     unit: str
     """Unit of both."""
     at_least: bool = False
@@ -52,11 +52,11 @@ class Wish:
     remedy: str = ""
     """What would let it hold; empty where it does, or where nothing is known to."""
     seconds: tuple[float, float] | None = None
-    """From when to when it is wished; None is throughout."""
+    """From when to when it is wished, seconds since the first frame; None is throughout."""
 
     @property
     def holds(self) -> bool:
-        """Whether it holds."""
+        """Whether the wish holds."""
         return self.got >= self.limit if self.at_least else self.got <= self.limit
 
     @property

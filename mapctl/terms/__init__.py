@@ -30,6 +30,7 @@ ALL = (
     KeepApart,
     WithinReach,
 )
+"""Every term of mapctl itself."""
 
 __all__ = [
     "ALL",

@@ -63,10 +63,13 @@ class FootContact:
     rest_height: float = TOE_REST_HEIGHT
     """Height of the toe joint while the foot is flat on the ground, metres."""
     name: str = "footing"
+    """Name in the ledger."""
     unit: str = "m/s"
+    """Unit of the residual."""
 
     def with_sigmas(self, speed: float, height: float, below: float) -> "FootContact":
-        """Return the term with these sigmas of toes, m/s and metres; those of heels change in proportion."""
+        """Return the term with these sigmas of toes, `speed` in m/s, `height` and `below` in metres; those of heels
+        change in proportion."""
         heels = self.heels and replace(
             self.heels,
             speed=self.heels.speed * speed / self.sigma_speed,
@@ -76,7 +79,7 @@ class FootContact:
         return replace(self, sigma_speed=speed, sigma_height=height, sigma_below=below, heels=heels)
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Energies of both feet, nats."""
+        """Return the energies of both feet, nats."""
         above = trial.toe_heights - self.rest_height
         held = _hold(trial.planted, trial.toe_speeds / self.sigma_speed, above / self.sigma_height)
         energy = (held + 0.5 * (above.clamp(max=0) / self.sigma_below).square()).sum(-1)
@@ -92,7 +95,7 @@ class FootContact:
         return energy + (held + 0.5 * (above.clamp(max=0) / self.heels.below).square()).sum(-1)
 
     def add_gradient(self, trial: Trial, gradient: TrialGradient) -> Float[np.ndarray, "batch frames"]:
-        """See DifferentiatedTerm."""
+        """Add the gradient of the summed energies of a float32 trial, and return the energies, nats."""
         energy = np.zeros(gradient.log_density.shape)
         kernels.add_contact(
             trial.joints_world.numpy(),
@@ -133,7 +136,7 @@ class FootContact:
         return energy
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Horizontal speed of the fastest planted toe or heel, m/s; 0 where none is planted."""
+        """Return the horizontal speed of the fastest planted toe or heel, m/s; 0 where none is planted."""
         fastest = (_stays(trial.planted) * trial.toe_speeds).amax(-1)
         if self.heels is None:
             return fastest

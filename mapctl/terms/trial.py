@@ -53,7 +53,8 @@ class Trial:
 
     @staticmethod
     def of_features(features: Float[Tensor, "batch frames size"], *, skeleton: Skeleton = CANONICAL) -> "Trial":
-        """A motion from the origin on, with the contacts of its features and without noise or density."""
+        """Make the trial of a motion from the origin on, with the contacts of its features and without noise or
+        density."""
         origin = GroundPose(features.new_zeros(len(features), 2), features.new_zeros(len(features)))
         before = features.new_zeros(0, skeleton.num_joints, 3)
         bits = LAYOUT.pick(features, "contacts") > 0.5
@@ -65,13 +66,13 @@ class Trial:
         return (self.first_frame + torch.arange(self.features.shape[1])) / self.fps
 
     def require_noise(self) -> Float[Tensor, "batch frames width"]:
-        """The noise; MapctlError where there is none."""
+        """Return the noise; MapctlError where there is none."""
         if self.noise is None:
             raise MapctlError("this motion has no noise with a prior")
         return self.noise
 
     def require_log_density(self) -> Float[Tensor, "batch frames"]:
-        """The log density; MapctlError where no density scored the motion."""
+        """Return the log density; MapctlError where no density scored the motion."""
         if self.log_density is None:
             raise MapctlError("no density scored this motion")
         return self.log_density
@@ -124,7 +125,7 @@ class Trial:
         return self.pose.joints_and_heels(self.skeleton)
 
     def joint_world(self, name: str) -> Float[Tensor, "batch frames 3"]:
-        """World positions of one joint, metres."""
+        """Return the world positions of one joint, metres."""
         return self.joints_world[..., self.skeleton.index(name), :]
 
     @cached_property
@@ -161,7 +162,8 @@ class Trial:
         return self.before[-1:].to(self.features.dtype)
 
     def step(self, joint: int) -> Float[Tensor, "batch frames 3"]:
-        """Displacement of a joint since the frame before, metres; the first frame's needs a past, or is 0."""
+        """Return the displacement of a joint since the frame before, metres; the first frame's needs a past, or is
+        0."""
         positions = self.joints_world[..., joint, :]
         past = self.before[-1:, joint].to(positions.dtype) if len(self.before) else positions[:, :1].detach()
         return torch.diff(positions, dim=-2, prepend=past.expand(len(positions), 1, 3))

@@ -30,6 +30,11 @@ LONG_PYTHON = {
     "docs/explanations/denoising.md-python-0",
     "docs/guides/adding-a-term.md-python-0",
     "docs/guides/adding-a-job.md-python-0",
+    "docs/reference/api/jobs.md-python-0",
+    "docs/reference/api/jobs.md-python-2",
+    "docs/reference/api/measures.md-python-2",
+    "docs/reference/api/scenes.md-python-0",
+    "docs/reference/api/steering.md-python-1",
 }
 
 
