@@ -24,6 +24,28 @@ if TYPE_CHECKING:
     from mapctl.intent.keyframes import Key as Key
     from mapctl.intent.keyframes import Keys as Keys
 
+__all__ = [
+    "AutoInbetweener",
+    "DenoiseSettings",
+    "Drawing",
+    "FollowSettings",
+    "GenerateSettings",
+    "InfillSettings",
+    "Key",
+    "Keys",
+    "RolloutInbetweener",
+    "SlerpInbetweener",
+    "blend",
+    "chain",
+    "denoise",
+    "follow",
+    "generate",
+    "infill",
+    "retraced",
+    "steer",
+    "tween",
+]
+
 # A process does one job or two, and all of them take longer to import than a second of walking takes to solve.
 _HOMES = {
     "DenoiseSettings": "controllers.denoising.denoise",
@@ -53,3 +75,8 @@ def __getattr__(name: str):
         raise AttributeError(f"module 'controllers' has no attribute {name!r}")
     module = import_module(_HOMES[name])
     return module if name == "steer" else getattr(module, name)
+
+
+def __dir__() -> list[str]:
+    """Return the public names, which arrive on first use; what was imported for them is not meant for users."""
+    return __all__

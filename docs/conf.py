@@ -14,6 +14,7 @@ version = release = __version__
 
 extensions = [
     "command_options",
+    "readable_signatures",
     "myst_parser",
     "sphinx.ext.autodoc",
     "sphinx-mathjax-offline",
@@ -29,6 +30,8 @@ default_role = "code"
 autodoc_typehints_format = "short"
 autodoc_preserve_defaults = True
 autodoc_member_order = "bysource"
+autoclass_content = "both"
+maximum_signature_line_length = 100
 
 html_theme = "furo"
 html_title = "mapctl"

@@ -8,7 +8,8 @@ class MapctlError(Exception):
 
 
 class FileFormatError(MapctlError):
-    """A file that cannot be read for what it claims to be."""
+    """A file that cannot be read for what it claims to be: `path`, what is wrong, and the number of the `line`, from 1,
+    where there is one."""
 
     def __init__(self, path: str | PathLike[str], message: str, line: int | None = None):
         where = f"{path}, line {line}" if line is not None else f"{path}"

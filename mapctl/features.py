@@ -28,7 +28,7 @@ class FeatureLayout:
     """Named blocks of a feature vector, in order."""
 
     blocks: tuple[tuple[str, int], ...]
-    """Name and width of each block."""
+    """Name and width of each block, a number of features."""
 
     @cached_property
     def slices(self) -> Mapping[str, slice]:
@@ -41,12 +41,12 @@ class FeatureLayout:
 
     @property
     def size(self) -> int:
-        """Width of the whole vector."""
+        """Width of the whole vector, a number of features."""
         return sum(width for _, width in self.blocks)
 
     @property
     def continuous(self) -> int:
-        """Width without the contact bits, which are the last block."""
+        """Width without the contact bits, which are the last block, a number of features."""
         return self.size - self.blocks[-1][1]
 
     def fingerprint(self) -> str:
@@ -69,6 +69,8 @@ LAYOUT = FeatureLayout(
         ("contacts", 2),  # left and right toe planted, 0 or 1
     )
 )
+"""Features of a frame, 68 numbers: root displacement (x and z, metres) and heading change (radians) since the frame
+before, root height (metres), root tilt (rotation vector, x and z), rotation vectors of 20 joints, two contact bits."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,8 +15,10 @@ from mapctl.errors import MapctlError, RequestError
 from mapctl.runtime import saving
 from mapctl.skeleton import Skeleton, mirror_name
 
+_CHORD_SECONDS = 0.5  # between the frames whose distances are added up: sway and noise count little
 
-@dataclass(frozen=True, eq=False)
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Motion:
     """Frames of one skeleton, float64, metres, Y up."""
 
@@ -43,6 +45,21 @@ class Motion:
         if frames == 0 or self.fps <= 0:
             raise MapctlError("a motion needs at least one frame and a positive frame rate")
 
+    def __str__(self) -> str:
+        return f"Motion: {self.describe()}"
+
+    def __repr__(self) -> str:
+        return f"<{self}>"
+
+    def describe(self) -> str:
+        """Describe frames, rate, duration, joints, and the way of the body in chords of half a second, in one line."""
+        frames, joints = _count(self.num_frames, "frame"), _count(self.num_joints, "joint")
+        step = max(1, round(_CHORD_SECONDS * float(self.fps)))
+        picked = self._map_frames(lambda values: torch.cat([values[:-1:step], values[-1:]]))
+        way = picked.joint_positions()[:, self.travelling_joint].diff(dim=0).norm(dim=-1).sum()
+        seconds = f"{self.seconds:.1f}" if self.seconds >= 1 else f"{self.seconds:.2g}"
+        return f"{frames} at {float(self.fps):.5g} fps ({seconds} s), {joints}, travels {float(way):.1f} m"
+
     @property
     def num_frames(self) -> int:
         """How many frames there are."""
@@ -57,6 +74,14 @@ class Motion:
     def seconds(self) -> float:
         """Duration: frames over frame rate."""
         return float(self.num_frames / self.fps)
+
+    @property
+    def travelling_joint(self) -> int:
+        """Index of the joint whose position is that of the body: the root, or the first below a root that stays
+        still."""
+        moving = [joint for joint, values in self.moving_offsets.items() if bool((values != values[0]).any())]
+        stays = bool((self.root_position == self.root_position[0]).all())
+        return min(moving) if stays and moving else 0
 
     @cached_property
     def _world(self) -> tuple[Tensor, Tensor]:
@@ -162,6 +187,10 @@ class Motion:
             moving_offsets=moving,
             local_quat_xyzw=pick(self.local_quat_xyzw),
         )
+
+
+def _count(number: int, name: str) -> str:
+    return f"{number} {name}" if number == 1 else f"{number} {name}s"
 
 
 def join_licences(licences: Iterable[str]) -> str:

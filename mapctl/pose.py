@@ -32,7 +32,7 @@ class BodyPose:
 
     @staticmethod
     def of_features(features: Float[Tensor, "*batch frames size"], start: GroundPose) -> "BodyPose":
-        """The poses that features describe, from the ground pose of the frame before the first."""
+        """Return the poses that features describe, from the ground pose of the frame before the first."""
         ground, heading = integrate_root(features, start)
         height = LAYOUT.pick(features, "root_height")
         root = torch.cat([ground[..., :1], height, ground[..., 1:]], dim=-1)
@@ -40,14 +40,14 @@ class BodyPose:
 
     @staticmethod
     def of_features_in_place(features: Float[Tensor, "*batch frames size"]) -> "BodyPose":
-        """The poses that features describe, every frame over the origin and facing +Z."""
+        """Return the poses that features describe, every frame over the origin and facing +Z."""
         height = LAYOUT.pick(features, "root_height")
         root = torch.cat([torch.zeros_like(height), height, torch.zeros_like(height)], dim=-1)
         return BodyPose(root, torch.zeros_like(height[..., 0]), *_pick_rotations(features))
 
     @staticmethod
     def of_motion(motion: Motion) -> "BodyPose":
-        """The poses of a canonical motion, single precision."""
+        """Return the poses of a canonical motion, single precision."""
         heading, tilt = rotations.split_heading(motion.local_quat_xyzw[:, 0])
         return BodyPose(
             motion.root_position.float(),
@@ -58,12 +58,12 @@ class BodyPose:
 
     @staticmethod
     def unpack(packed: Float[Tensor, "*batch frames width"]) -> "BodyPose":
-        """The inverse of `pack`."""
+        """Invert `pack`."""
         joints = packed[..., 6:].unflatten(-1, (-1, 3))
         return BodyPose(packed[..., :3], packed[..., 3], packed[..., 4:6], joints)
 
     def pack(self) -> Float[Tensor, "*batch frames width"]:
-        """Root position, heading and angles side by side."""
+        """Return the root position, heading and angles side by side."""
         return torch.cat([self.root_position, self.heading[..., None], self.angles], dim=-1)
 
     @property
@@ -85,14 +85,14 @@ class BodyPose:
         return torch.cat([hips.unsqueeze(-2), quats[..., 1:, :]], dim=-2)
 
     def joints_world(self, skeleton: Skeleton = CANONICAL) -> Float[Tensor, "*batch frames joints 3"]:
-        """World joint positions by forward kinematics on a skeleton's bones, metres."""
+        """Return the world joint positions by forward kinematics on a skeleton's bones, metres."""
         matrices = rotations.rotation_vector_to_matrix(self.rotation_vectors)
         return self._place_in_world(kinematics.positions_from_matrices(skeleton, matrices))
 
     def joints_and_heels(
         self, skeleton: Skeleton = CANONICAL
     ) -> tuple[Float[Tensor, "*batch frames joints 3"], Float[Tensor, "*batch frames 2 3"]]:
-        """World joint positions, and those of the left and the right heel, metres."""
+        """Return the world joint positions, and those of the left and the right heel, metres."""
         matrices = rotations.rotation_vector_to_matrix(self.rotation_vectors)
         joints, turns = kinematics.chain_matrices(skeleton.offsets.to(matrices.dtype), skeleton.parents, matrices)
         feet = skeleton.indices(FEET)
@@ -108,7 +108,8 @@ class BodyPose:
     def features(
         self, before: GroundPose, contacts: Bool[Tensor, "*#batch frames 2"]
     ) -> Float[Tensor, "*batch frames size"]:
-        """Features whose integration from `before`, the ground pose of the frame before the first, leads here."""
+        """Return the features whose integration from `before`, the ground pose of the frame before the first, leads
+        here."""
         batch = self.heading.shape[:-1]
         ground = torch.cat([before.position_xz.expand(*batch, 1, 2), self.root_position[..., ::2]], dim=-2)
         heading = torch.cat([before.heading.expand(*batch, 1), self.heading], dim=-1)
@@ -118,7 +119,7 @@ class BodyPose:
         return torch.cat([step, turn, self.root_position[..., 1:2], self.angles, bits], dim=-1)
 
     def slice(self, start: int, stop: int) -> "BodyPose":
-        """Frames start to stop."""
+        """Return frames start to stop."""
         part = slice(start, stop)
         return BodyPose(
             self.root_position[..., part, :],
@@ -128,13 +129,13 @@ class BodyPose:
         )
 
     def motion(self, skeleton: Skeleton = CANONICAL, fps: Fraction = Fraction(PRIOR_FPS)) -> Motion:
-        """The unbatched poses as a motion on a skeleton of canonical joints, double precision."""
+        """Return the unbatched poses as a motion on a skeleton of canonical joints, double precision."""
         quats = rotations.make_sign_continuous(self.local_quat_xyzw.double())
         return Motion(skeleton, fps, self.root_position.double(), quats)
 
 
 def decode(features: Float[Tensor, "frames size"], start: GroundPose, *, skeleton: Skeleton = CANONICAL) -> Motion:
-    """The canonical motion at PRIOR_FPS that features describe from `start`, in double precision; inverse of
+    """Return the canonical motion at PRIOR_FPS that features describe from `start`, in double precision; inverse of
     `features.encode` at that rate.
     """
     double = GroundPose(start.position_xz.double(), start.heading.double())

@@ -120,7 +120,7 @@ class PreparedRollout(Protocol):
     def roll_out(
         self, noise: Float[Tensor, "batch frames continuous"]
     ) -> tuple[Float[Tensor, "batch frames size"], Float[Tensor, "batch frames"]]:
-        """Return features and log densities as `Density.rollout`, detached."""
+        """Return features and log densities (nats) as `Density.rollout`, detached."""
         ...
 
     @abstractmethod
@@ -138,15 +138,19 @@ class AutogradRollout(PreparedRollout):
         self._density, self._state, self._plan = density, state, plan
         self._rolled: tuple[Tensor, tuple[Tensor, Tensor]] | None = None
 
-    def roll_out(self, noise: Tensor) -> tuple[Tensor, Tensor]:
-        """See PreparedRollout."""
+    def roll_out(
+        self, noise: Float[Tensor, "batch frames continuous"]
+    ) -> tuple[Float[Tensor, "batch frames size"], Float[Tensor, "batch frames"]]:
+        """Return features and log densities (nats) as `Density.rollout`, detached."""
         noise = noise.detach().requires_grad_(True)
         features, log_density = self._density.rollout(self._state, noise, self._plan)
         self._rolled = noise, (features, log_density)
         return features.detach(), log_density.detach()
 
-    def pull_back(self, d_features: Tensor, d_log_density: Tensor) -> Tensor:
-        """See PreparedRollout."""
+    def pull_back(
+        self, d_features: Float[Tensor, "batch frames size"], d_log_density: Float[Tensor, "batch frames"]
+    ) -> Float[Tensor, "batch frames continuous"]:
+        """Return the gradient on the noise of the last `roll_out` from those on its features and log densities."""
         assert self._rolled is not None, "there is no rollout yet"
         noise, rolled = self._rolled
         depends = [(out, d) for out, d in zip(rolled, (d_features, d_log_density), strict=True) if out.requires_grad]
@@ -234,7 +238,8 @@ class Density(Protocol[State]):
     ) -> tuple[Float[Tensor, "batch frames size"], State]:
         """Draw frames one after the other, and the state after them; the same generator gives the same frames.
 
-        `temperature` scales the noise. Default: a rollout of normal noise with the likeliest discrete choices.
+        `temperature` is a factor of the noise; at 0 there is none. Default: a rollout of normal noise with the
+        likeliest discrete choices.
         """
         noise = temperature * torch.randn(state.batch, frames, LAYOUT.continuous, generator=generator)
         with torch.no_grad():
@@ -286,7 +291,8 @@ class Density(Protocol[State]):
         return self
 
     def conditioned_like_start(self, start: int) -> "Density[State]":
-        """Return the density given the labels of the clip that an initial state was taken from. Default: itself."""
+        """Return the density given the labels of the clip that an initial state, of the index `start`, was taken from.
+        Default: itself."""
         return self
 
     def conditioned_like_clip(self, name: str) -> "Density[State]":

@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from mapctl import __version__, metrics
+from mapctl import metrics
 from mapctl.curves.curve import Curve
 from mapctl.formats.atomic import write_text
 from mapctl.motion import Motion
 from mapctl.problem.solution import Solution, Status, WindowRecord
+from mapctl.version import __version__
 
 try:
     import resource

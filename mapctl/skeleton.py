@@ -14,7 +14,7 @@ from mapctl.errors import MapctlError
 from mapctl.joint_names import describe_nearest
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Skeleton:
     """A tree of joints. Joint 0 is the root and every parent precedes its children."""
 
@@ -34,6 +34,22 @@ class Skeleton:
             raise MapctlError("joint 0 must be the root and every parent must precede its children")
         if tuple(self.offsets.shape) != (len(self.names), 3):
             raise MapctlError(f"{len(self.names)} joints need offsets of shape ({len(self.names)}, 3)")
+
+    def __str__(self) -> str:
+        kind = "canonical joints" if self.names == CANONICAL.names else "joint" if self.num_joints == 1 else "joints"
+        return f"Skeleton: {self.num_joints} {kind}, root {self.names[0]}, {self._extent():.2f} m across at rest"
+
+    def __repr__(self) -> str:
+        return f"<{self}>"
+
+    def _extent(self) -> float:
+        """Return the largest extent along an axis with all rotations zero, End Sites included, metres."""
+        places = [self.offsets[0]]
+        for joint in range(1, self.num_joints):
+            places.append(places[self.parents[joint]] + self.offsets[joint])
+        ends = [places[self.index(name)] + self.offsets.new_tensor(end) for name, end in self.end_offsets.items()]
+        spread = torch.stack([*places, *ends])
+        return float((spread.amax(dim=0) - spread.amin(dim=0)).max())
 
     @property
     def num_joints(self) -> int:
@@ -117,6 +133,8 @@ def _build_canonical() -> Skeleton:
 
 
 CANONICAL = _build_canonical()
+"""The skeleton that priors know: 21 joints with VRM's names, in the size of the performer of the bundled priors'
+data."""
 # How other rigs name sides: Hand_R, Bip01 L Hand, LeftHand, rHand, RHand, footleft.
 _FOREIGN_SIDE_NAMES = re.compile(
     r"(?i:(?:^|[^a-z0-9])(?:l|r|left|right)(?:$|[^a-z0-9]))|Left|Right|^[lrLR](?=[A-Z][a-z])|(?i:left|right)$"

@@ -20,6 +20,35 @@ if TYPE_CHECKING:
     from priors.tweening.inbetweener import Tweener as Tweener
     from priors.tweening.path import ConvPathPredictor as ConvPathPredictor
 
+__all__ = [
+    "AUTO",
+    "ConvDenoiser",
+    "ConvInfiller",
+    "ConvPathPredictor",
+    "KeyframeTiming",
+    "LstmGmmDensity",
+    "LstmRefiner",
+    "PoseTransformer",
+    "Stitcher",
+    "Tweener",
+    "add_set",
+    "find_kind",
+    "has_model",
+    "load",
+    "load_choice",
+    "load_denoiser",
+    "load_inbetweener",
+    "load_infiller",
+    "load_keyframe_timing",
+    "load_path",
+    "load_refiner",
+    "load_stitcher",
+    "load_transformer",
+    "load_tweener",
+    "refiner_of",
+    "use_weights",
+]
+
 # A walk needs one of these models, and all of them take longer to import than a second of it takes to solve.
 _HOMES = {
     "ConvDenoiser": "denoiser.network",
@@ -40,6 +69,11 @@ def __getattr__(name: str):
     return getattr(_import_model(name), name)
 
 
+def __dir__() -> list[str]:
+    """Return the public names, which arrive on first use; what was imported for them is not meant for users."""
+    return __all__
+
+
 def _import_model(name: str) -> ModuleType:
     """Import the module of a model, which has its `load`."""
     return import_module(f"priors.{_HOMES[name]}")
@@ -56,12 +90,13 @@ def has_model(name: str) -> bool:
 
 
 def load(name: str) -> "LstmGmmDensity":
-    """A bundled prior by name (`locomotion`), or a trained one by its file or run folder."""
+    """Load a bundled prior by name (`locomotion`), or a trained one by its file or run folder."""
     return _import_model("LstmGmmDensity").load(name)
 
 
 def load_choice(name: str | None) -> "list[LstmGmmDensity]":
-    """The densities that a --prior leaves to choose from: for `auto` the bundled ones, else the named one, or none."""
+    """Load the densities that a --prior leaves to choose from: for `auto` the bundled ones, else the named one, or
+    none."""
     if name is None:
         return []
     return [load(each) for each in (_list_auto() if name == "auto" else (name,))]
@@ -73,25 +108,25 @@ def _list_auto() -> list[str]:
 
 
 def load_refiner(name: str) -> "LstmRefiner":
-    """A bundled refiner by name (`locomotion-refiner`), or a trained one by its file or run folder."""
+    """Load a bundled refiner by name (`locomotion-refiner`), or a trained one by its file or run folder."""
     return _import_model("LstmRefiner").load(name)
 
 
 def load_denoiser(name: str = "denoiser") -> "ConvDenoiser":
-    """The bundled denoiser, or a trained one by its file or run folder."""
+    """Load the bundled denoiser, or a trained one by its file or run folder."""
     return _import_model("ConvDenoiser").load(name)
 
 
 def load_infiller(name: str) -> "ConvInfiller":
-    """A trained infiller by its file or run folder."""
+    """Load a trained infiller by its file or run folder."""
     return _import_model("ConvInfiller").load(name)
 
 
 def load_inbetweener(
     name: str = "transformer", path: str = "path"
 ) -> "ConvInfiller | PoseTransformer | Tweener | Stitcher":
-    """The bundled pose transformer, tweener or stitcher, or a trained one, or a trained infiller, by its file or run
-    folder; CheckpointError for anything else. A tweener goes by the path predictor `path`."""
+    """Load the bundled pose transformer, tweener or stitcher, or a trained one, or a trained infiller, by its file or
+    run folder; CheckpointError for anything else. A tweener goes by the path predictor `path`."""
     kind = find_inbetweener_kind(name)
     return load_tweener(name, path) if kind == "tweener" else _INBETWEENERS[kind](name)
 
@@ -106,38 +141,38 @@ def find_inbetweener_kind(name: str) -> str:
 
 
 def find_kind(name: str) -> str:
-    """The kind of a bundled or trained model, from its card, as `mapctl train` calls it."""
+    """Find the kind of a bundled or trained model, from its card, as `mapctl train` calls it."""
     return checkpoints.read_card(checkpoints.locate(name).with_suffix(".json")).kind
 
 
 def load_transformer(name: str = "transformer") -> "PoseTransformer":
-    """The bundled pose transformer, or a trained one by its file or run folder."""
+    """Load the bundled pose transformer, or a trained one by its file or run folder."""
     return _import_model("PoseTransformer").load(name)
 
 
 def load_tweener(name: str = "tweener", path: str = "path") -> "Tweener":
-    """The bundled generator of long in-betweens, or a trained one by its file or run folder, with the path predictor
-    that it was trained with."""
+    """Load the bundled generator of long in-betweens, or a trained one by its file or run folder, with the path
+    predictor that it was trained with."""
     return _import_model("Tweener").load(name, path)
 
 
 def load_stitcher(name: str = "stitcher") -> "Stitcher":
-    """The bundled stitcher, which fills short gaps in many ways, or a trained one by its file or run folder."""
+    """Load the bundled stitcher, which fills short gaps in many ways, or a trained one by its file or run folder."""
     return _import_model("Stitcher").load(name)
 
 
 def load_path(name: str = "path") -> "ConvPathPredictor":
-    """The bundled path predictor, or a trained one by its file or run folder."""
+    """Load the bundled path predictor, or a trained one by its file or run folder."""
     return _import_model("ConvPathPredictor").load(name)
 
 
 def load_keyframe_timing(name: str = "keyframe-timing") -> "KeyframeTiming":
-    """The bundled timing of keyframes, or a trained one by its file or run folder."""
+    """Load the bundled timing of keyframes, or a trained one by its file or run folder."""
     return _import_model("KeyframeTiming").load(name)
 
 
 def refiner_of(prior: str, name: str = "auto") -> "LstmRefiner | None":
-    """The refiner of that name; for `auto` the bundled one of a bundled prior, if it has one."""
+    """Load the refiner of that name; for `auto` the bundled one of a bundled prior, if it has one."""
     if name != "auto":
         return load_refiner(name)
     own = f"{prior}-refiner"

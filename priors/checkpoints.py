@@ -22,7 +22,7 @@ from priors import licences, weight_sets
 from priors.tensor_files import write_tensors
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Card:
     """Card of a set of weights."""
 
@@ -43,12 +43,33 @@ class Card:
     quality: dict[str, Any] = field(default_factory=dict)
     """Measured quality and the command that printed it."""
     abilities: dict[str, float] = field(default_factory=dict)
-    """Limits of speed and turning that the data show."""
+    """Limits of speed (m/s) and turning (rad/s) that the data show, by their names in `DataLimits`."""
+
+    def __str__(self) -> str:
+        return f"Card: {self.kind}, {self.licence or 'without a licence'}"
+
+    def __repr__(self) -> str:
+        return f"<{self}>"
 
     @staticmethod
     def layout_fields() -> dict[str, Any]:
         """Return the two layout fields for the features of this code."""
         return {"layout": [list(block) for block in LAYOUT.blocks], "fingerprint": LAYOUT.fingerprint()}
+
+
+class LoadedModel:
+    """A model with its name and card, which print as one line: the network's weights would fill pages."""
+
+    name: str
+    """Name, file or run folder by which it was asked for."""
+    card: Card
+    """Card of the weights."""
+
+    def __str__(self) -> str:
+        return f"{type(self).__name__}: {self.name}, {self.card.licence or 'without a licence'}"
+
+    def __repr__(self) -> str:
+        return f"<{self}>"
 
 
 def save(tensors: dict[str, Tensor], card: Card, path: Path, *, half: bool = True) -> None:

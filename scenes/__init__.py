@@ -19,6 +19,18 @@ if TYPE_CHECKING:
     from scenes.scene_file import load as load
     from scenes.stage import Shot as Shot
 
+__all__ = [
+    "Actor",
+    "CameraSettings",
+    "SceneDescription",
+    "Shot",
+    "back_end",
+    "film",
+    "find_scene",
+    "list_scenes",
+    "load",
+]
+
 # Graphics libraries take seconds to import and may be missing, so public names arrive on first use.
 _HOMES = {
     "CameraSettings": "scenes.cameras",
@@ -36,6 +48,11 @@ def __getattr__(name: str):
         raise AttributeError(f"module 'scenes' has no attribute {name!r}")
     module = import_module(_HOMES[name])
     return module if _HOMES[name] == f"scenes.{name}" else getattr(module, name)
+
+
+def __dir__() -> list[str]:
+    """Return the public names, which arrive on first use; what was imported for them is not meant for users."""
+    return __all__
 
 
 def list_scenes() -> tuple[str, ...]:

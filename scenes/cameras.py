@@ -43,7 +43,7 @@ class CameraSettings:
     fov_deg: float = 32.0
     """Vertical field of view, degrees."""
     zoom: float = 1.0
-    """Zoom: closer than needed (over 1) or further away; 2 halves the distance."""
+    """Factor by which the camera is closer than needed (over 1) or further away; 2 halves the distance."""
     smooth_seconds: float = 0.6
     """Smoothing of a following camera: standard deviation of a Gaussian over time, seconds."""
 

@@ -38,23 +38,25 @@ class DrawnMotion:
     """A motion put on a character, to be filmed."""
 
     mesh: CharacterMesh
-    """The character's."""
+    """Triangles of the character."""
     placed: Placed
-    """The motion on its joints."""
+    """The motion on the character's joints."""
     place: Callable[[Motion], Placed]
     """Puts further frames of the same giver on it, as poses that are asked for."""
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What could not be kept."""
+        """What of the motion could not be kept, one sentence each."""
         return self.placed.notes
 
     def build_body(self, fps: Fraction, colour: Array) -> SkinnedBody:
-        """Build the body at a film's rate; `colour` is that of its bones, where these are drawn."""
+        """Build the body at a film's rate; `colour` is that of its bones (red, green, blue, 0 to 1), where these are
+        drawn."""
         return _build_body(self.mesh, self.placed, fps, colour)
 
     def build_pose(self, pose: Motion, colour: Array) -> SkinnedBody:
-        """Build the body in one frame of the giver's skeleton."""
+        """Build the body in one frame of the giver's skeleton; `colour` is that of its bones (red, green, blue, 0 to
+        1), where these are drawn."""
         return _build_body(self.mesh, self.place(pose), pose.fps, colour)
 
 

@@ -73,8 +73,9 @@ def film(
 def draw_strips_to(
     motions: Sequence[tuple[str, Motion]], out: PathOrText, *, size: tuple[int, int] = (1280, 720)
 ) -> None:
-    """Draw motions below each other, a row of stills at the same times of each and under its name, to a .png of this
-    width. RequestError for other endings."""
+    """Draw motions below each other, a row of stills at the same times of each and under its name, to a .png; `size` is
+    its width, pixels, and a height that is passed over: rows are as high as they come. RequestError for other
+    endings."""
     (path,) = check_outputs([out], size)
     if path.suffix.lower() != ".png":
         raise RequestError(f"motions below each other are a .png, not {path}")

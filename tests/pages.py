@@ -19,6 +19,8 @@ from tiny_prior import save_tiny_prior
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = ("README.md", *(str(page.relative_to(ROOT)) for page in sorted((ROOT / "docs").rglob("*.md"))))
 
+_NO_INPUTS = ("*.png", "*.md", "*.py", "_build", "auto_gallery", "made")
+"""What the commands of pages do not read."""
 _SMALL = {"--seconds": "1", "--count": "1", "--jobs": "1"}
 _TINY = {
     "follow": {"--prior": "prior.safetensors"},
@@ -56,7 +58,8 @@ def read_page(page: str) -> str:
 
 def blocks(page: str, language: str) -> list[Block]:
     """The fenced blocks of a language; `` for none."""
-    found = re.findall(r"^```(\w*)\n(.*?)^```", read_page(page), re.DOTALL | re.MULTILINE)
+    # Directives have fences, too: what closes one must not pass for what opens a plain block.
+    found = re.findall(r"^```(\w*|\{[^\n]*)\n(.*?)^```", read_page(page), re.DOTALL | re.MULTILINE)
     return [Block(page, n, language, text) for n, text in enumerate(text for lang, text in found if lang == language)]
 
 
@@ -128,7 +131,7 @@ def write_files(folder: Path) -> None:
     (folder / "logo.svg").write_text('<svg xmlns="http://www.w3.org/2000/svg"><path d="M0 0 L100 0 L200 100"/></svg>')
     (folder / "script.csv").write_text("time_s,speed_mps,heading_deg\n0,1.2,0\n0.5,1.0,30\n1,1.0,30\n")
     (folder / "lost.csv").write_text("joint,start,stop\nLeftHand,5,15\n")
-    shutil.copytree(ROOT / "docs", folder / "docs", ignore=shutil.ignore_patterns("*.png", "*.md"))
+    shutil.copytree(ROOT / "docs", folder / "docs", ignore=shutil.ignore_patterns(*_NO_INPUTS))
     (folder / "docs" / "inputs" / "poses").mkdir()
     (folder / "scenes").mkdir()
     for scene in (ROOT / "scenes").glob("*.toml"):

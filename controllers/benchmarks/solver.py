@@ -12,6 +12,7 @@ from controllers.following.follow import FollowSettings, build_follow_terms, fol
 from mapctl import curves
 from mapctl.curves import Curve
 from mapctl.features import LAYOUT, PRIOR_FPS
+from mapctl.intent.path import USUAL_SPEED
 from mapctl.problem.context import WindowContext
 from mapctl.problem.latent_noise import LatentNoise
 from mapctl.problem.objective import Objective
@@ -82,11 +83,18 @@ def _benchmark_follow(prior: Density, seconds: float, settings: SpeedBenchmarkSe
 
 
 def follow_to_end(
-    prior: Density, curve: Curve, seconds: float, seed: int, settings: FollowSettings, terms: Sequence[Term] = ()
+    prior: Density,
+    curve: Curve,
+    seconds: float,
+    seed: int,
+    settings: FollowSettings,
+    terms: Sequence[Term] = (),
+    *,
+    speed: float = USUAL_SPEED,
 ) -> Solution:
     """Follow a curve to its end; Ctrl-C ends the benchmark, since half a walk belongs in no table."""
     generator = torch.Generator().manual_seed(seed)
-    solution = follow(prior, curve, seconds=seconds, settings=settings, terms=terms, generator=generator)
+    solution = follow(prior, curve, seconds=seconds, speed=speed, settings=settings, terms=terms, generator=generator)
     if solution.status.outcome is Outcome.INTERRUPTED:
         raise KeyboardInterrupt
     return solution

@@ -80,7 +80,8 @@ class Character:
         """Scale a contact term to the prior's size, with the character's own rest height."""
         sigmas = (footing.sigma_speed, footing.sigma_height, footing.sigma_below)
         scaled = footing.with_sigmas(*(sigma / self.scale for sigma in sigmas))
-        return replace(scaled, rest_height=self.toe_rest_height / self.scale)
+        landing = footing.landing and footing.landing.scale(1 / self.scale)
+        return replace(scaled, landing=landing, rest_height=self.toe_rest_height / self.scale)
 
     def motion(self, motion: Motion) -> Motion:
         """Return a motion of the prior's size on the character's bones."""

@@ -1,4 +1,4 @@
-"""Infeasible requests, named with numbers: before the solve by the data's limits, after it by the path error."""
+"""Infeasible requests, named with numbers: by the data's limits, and by the path error of what was solved."""
 
 import torch
 from jaxtyping import Bool, Float

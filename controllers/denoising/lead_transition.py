@@ -16,7 +16,7 @@ from torch import Tensor
 from controllers.denoising.result import DenoiseSolution
 from mapctl import rotations
 from mapctl.motion import Motion
-from mapctl.recording.masks import ROOT, Mask, expand_masks, travelling_joint
+from mapctl.recording.masks import ROOT, Mask, expand_masks
 from mapctl.recording.noise_estimation import estimate_angle_noise
 from mapctl.recording.pose_mixing import (
     angle_between,
@@ -74,7 +74,7 @@ def find_lead_transition(motion: Motion, rigmap: RigMap) -> LeadTransition:
     count = int(unblended[0]) if len(unblended) else longest
     if count == 0:
         return none
-    part, position = slice(0, count), _travelling_position(motion, travelling_joint(motion))
+    part, position = slice(0, count), _travelling_position(motion, motion.travelling_joint)
     blended = blend_poses(lead, ahead[part], share[part])
     by_mixing, by_motion = (_squared_errors(model, observed[part]) for model in (blended, ahead[part]))
     limbs, body = torch.ones(motion.num_joints, dtype=torch.bool), hips_and_ancestors(motion, rigmap)
@@ -115,7 +115,7 @@ def restore_lead_transition(
     motion: Motion, pose: Motion, done: DenoiseSolution, transition: LeadTransition, masks: Sequence[Mask]
 ) -> Motion:
     """Return the clean motion from frame 1 on, with the pose blended into its first frames."""
-    count, last, travels = transition.stop - 1, done.motion.num_frames, travelling_joint(motion)
+    count, last, travels = transition.stop - 1, done.motion.num_frames, motion.travelling_joint
     clean, start = done.motion.slice(0, count), pose.local_quat_xyzw
     observed = rotations.make_sign_continuous(torch.cat([start, motion.local_quat_xyzw[1 : transition.stop]]))[1:]
     counts, ahead = ~expand_masks(motion, masks)[0][1 : transition.stop] & transition.joints, clean.local_quat_xyzw

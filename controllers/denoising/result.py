@@ -23,7 +23,7 @@ Part = TypeVar("Part", Artefact, DensityInterval)
 _FALLBACK_SHARE = 0.5  # share of a joint's frames from which the network counts as out of its depth
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class DenoiseSolution(Solution):
     """Clean motion on the capture's rig, at its rate, with artefacts and corrections."""
 

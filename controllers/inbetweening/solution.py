@@ -20,12 +20,12 @@ class Pick:
     """Which of several answers this is."""
 
     name: str
-    """Its own."""
+    """Name of this answer."""
     energies: Mapping[str, float]
     """Mean energies of a frame by the names of all answers, nats."""
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class InbetweenSolution(Solution):
     """A complete motion on the given rig, at its rate, with all of its frames."""
 

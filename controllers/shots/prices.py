@@ -18,7 +18,7 @@ class Price:
     wish: str
     """The wish."""
     gains: tuple[tuple[str, float, str], ...]
-    """By wish what it would gain, and its unit; what is negligible is left out."""
+    """Name of each wish, what it would gain, and the unit of that number; what is negligible is left out."""
 
     @property
     def sentence(self) -> str:

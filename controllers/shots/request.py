@@ -97,7 +97,8 @@ class PoseKey:
 
     @property
     def most(self) -> float:
-        """How far anything may be from there: `tolerance`, or the largest of them."""
+        """How far anything may be from there, metres, or degrees of a facing alone: `tolerance`, or the largest of
+        them."""
         return max(self.tolerance.values(), default=0.0) if isinstance(self.tolerance, Mapping) else self.tolerance
 
     @property

@@ -50,7 +50,7 @@ class ShotSettings:
     """How transitions between standing and walking are tried."""
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class ShotSolution(Solution):
     """A shot's motion and what became of every wish."""
 

@@ -40,11 +40,11 @@ class Wish:
     name: str
     """What was wished."""
     asked: str
-    """In numbers."""
+    """What was asked, in numbers."""
     got: float
-    """What it came to, in `unit`."""
+    """What it came to, in the unit of `unit`."""
     limit: float
-    """Beyond which it does not hold."""
+    """Value beyond which it does not hold, in the same unit."""
     unit: str
     """Unit of both."""
     at_least: bool = False
@@ -52,11 +52,11 @@ class Wish:
     remedy: str = ""
     """What would let it hold; empty where it does, or where nothing is known to."""
     seconds: tuple[float, float] | None = None
-    """From when to when it is wished; None is throughout."""
+    """From when to when it is wished, seconds since the first frame; None is throughout."""
 
     @property
     def holds(self) -> bool:
-        """Whether it holds."""
+        """Whether the wish holds."""
         return self.got >= self.limit if self.at_least else self.got <= self.limit
 
     @property
@@ -95,7 +95,7 @@ def check_wishes(request: ShotRequest, way: Way, motion: Motion, met: Sequence[M
     for reach in request.reaches:
         targets = ReachTargets.of((reach,), motion.num_frames).targets
         miss = 100 * float(compute_target_errors(positions, targets).max())
-        name = f"{', '.join(reach.places)} at {reach.seconds:g} s"
+        name = f"{', '.join(reach.places)} at {round(reach.seconds, 2):g} s"
         asked = f"held {reach.hold_seconds:g} s" if reach.hold_seconds else "there"
         limit = 100 * max(_REACH_TOLERANCE, max(map(reach.tolerance_of, reach.places)))
         remedy = _find_remedy(reach, motion) if miss > limit else ""
@@ -104,7 +104,7 @@ def check_wishes(request: ShotRequest, way: Way, motion: Motion, met: Sequence[M
         found.append(_check_pose(one, motion))
     for look in request.looks:
         worst = float(measure_look_errors(motion, look).max())
-        name = f"look at {look.seconds:g} s"
+        name = f"look at {round(look.seconds, 2):g} s"
         found.append(Wish(name, "straight", worst, _LOOK_TOLERANCE_DEG, "degrees", seconds=_span(look)))
     if request.obstacles:
         clear = 100 * float(measure_clearance(request.obstacles, positions[..., ::2]).amin())
@@ -172,7 +172,8 @@ def _check_pose(met: MetPose, motion: Motion) -> Wish:
 
 
 def _find_remedy(reach: Reach, motion: Motion) -> str:
-    """Find when the character comes within reach of the place, or by how much nearer it would have to be."""
+    """Find when the character comes within reach of the place, or by how much nearer it would have to be; nothing where
+    it is within reach at the wanted time, and something else is in the way."""
     lacking = torch.zeros(motion.num_frames, dtype=torch.float64)
     for name, place in reach.places.items():
         limb = LIMBS[name]
@@ -182,7 +183,7 @@ def _find_remedy(reach: Reach, motion: Motion) -> str:
     within = (lacking <= 0).nonzero()[:, 0]
     if len(within):
         late = (float(within[(within - wanted).abs().argmin()]) - wanted) / PRIOR_FPS
-        return f"{abs(late):.1f} s {'later' if late > 0 else 'earlier'}"
+        return f"{abs(late):.1f} s {'later' if late > 0 else 'earlier'}" if abs(late) >= 0.05 else ""
     return f"{100 * float(lacking.min()):.0f} cm nearer"
 
 

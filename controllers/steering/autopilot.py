@@ -27,8 +27,8 @@ class Autopilot:
         self._command, self._pursuit, self._goal = command, None, None
 
     def go(self, command: Command, place: tuple[float, float], within: float, facing: float | None) -> None:
-        """Be at a place, x and z in metres, in so many seconds from the next step on, facing so, and hold the command
-        from then on."""
+        """Be at a `place` (x and z, metres) `within` so many seconds from the next step on, `facing` so (radians), and
+        hold the command from then on."""
         self.command(command)
         self._goal = Arrival(place, within, facing)
 
@@ -43,20 +43,21 @@ class Autopilot:
         )
 
     def walk(self, curve: Curve, speed: float) -> None:
-        """Walk along a curve with the step length and labels of the last command; stop at the end of an open one."""
+        """Walk along a curve at a `speed` in m/s, with the step length and labels of the last command; stop at the end
+        of an open one."""
         self._pursuit, self._goal = PurePursuit(curve, speed=speed), None
         self._command = replace(self._command, arrival=None)
         if self._last is not None:
             self._pursuit.show(self._last, 0.0)
 
     def show(self, frames: SteerFrames, due: float) -> None:
-        """See Display."""
+        """Keep where the character is; when its frames are `due` (seconds of the stream) does not matter."""
         self._last = frames
         if self._pursuit is not None:
             self._pursuit.show(frames, due)
 
     def at(self, seconds: float) -> Command:
-        """See Source."""
+        """Return the command that holds now, at so many seconds of the stream."""
         if self._goal is not None:
             self._command = replace(self._command, arrival=replace(self._goal, by=seconds + self._goal.by))
             self._goal = None

@@ -83,25 +83,26 @@ class WallClock:
     """Real time since the clock was made, less the time for which it was held."""
 
     real = True
+    """Time passes by itself."""
 
     def __init__(self):
         self._began = time.perf_counter()
 
     def now(self) -> float:
-        """See Clock."""
+        """Return the time, seconds."""
         return time.perf_counter() - self._began
 
     def wait_until(self, seconds: float) -> None:
-        """See Clock."""
+        """Wait until that time; return at once if it has passed."""
         if (left := seconds - self.now()) > 0:
             time.sleep(left)
 
     def hold(self, seconds: float) -> None:
-        """See Clock."""
+        """Set the time back by so many seconds."""
         self._began += seconds
 
     def perf_counter_at(self, seconds: float) -> float:
-        """Return the value of time.perf_counter at a time of this clock, if it is not held until then."""
+        """Return the value of time.perf_counter, seconds, at a time of this clock, if it is not held until then."""
         return self._began + seconds
 
 
@@ -109,20 +110,21 @@ class StreamClock:
     """Time that passes only by waiting: as fast as the machine can, so that nothing is late."""
 
     real = False
+    """Time passes only by waiting."""
 
     def __init__(self):
         self._now = -1.0
 
     def now(self) -> float:
-        """See Clock."""
+        """Return the time, seconds; -1 before the first wait."""
         return self._now
 
     def wait_until(self, seconds: float) -> None:
-        """See Clock."""
+        """Let it be that time at once; never earlier than it is."""
         self._now = max(self._now, seconds)
 
     def hold(self, seconds: float) -> None:
-        """See Clock; nothing is late, so it is never called."""
+        """Change nothing: nothing is late, so it is never called."""
 
 
 @dataclass(frozen=True)
@@ -176,9 +178,10 @@ class Recorder:
     """A Display that keeps everything, as one motion."""
 
     pieces: list[SteerFrames] = field(default_factory=list)
+    """All that was shown, step by step."""
 
     def show(self, frames: SteerFrames, due: float) -> None:
-        """Keep the frames."""
+        """Keep the frames; when they are `due` (seconds of the stream) does not matter."""
         self.pieces.append(frames)
 
     def motion(self, frames: int | None = None) -> Motion:
@@ -192,7 +195,7 @@ class Recorder:
 
     @property
     def refusals(self) -> list[Refusal]:
-        """Return the orders that were not obeyed."""
+        """Orders that were not obeyed."""
         return [piece.refusal for piece in self.pieces if piece.refusal is not None]
 
     @property
@@ -277,7 +280,8 @@ def summarise_step_timing(
 ) -> dict[str, float | int | None]:
     """Summarise for a report: compute of each frame, late frames, evaluations, and the longest latency of a command.
 
-    The latency of a command runs from its arrival to the due time of the first frame that it could still change.
+    `arrivals` are the seconds of the stream at which commands came. The latency of a command runs from its arrival to
+    the due time of the first frame that it could still change.
     """
     each = np.repeat([1000 * r.seconds / r.frames for r in records], [r.frames for r in records])
     count = sum(record.frames for record in records)

@@ -37,7 +37,8 @@ _BASES = SharedBases()
 
 
 class CharacterProcess:
-    """A LiveCharacter (mapctl.runtime.live_protocol) in a process of its own."""
+    """A character that moves by itself in real time, in a process of its own, and takes orders at any moment: a
+    LiveCharacter (mapctl.runtime.live_protocol). No order waits."""
 
     def __init__(self, request: CharacterRequest):
         """Start the process; several start in parallel if all are made before the first `wait`."""
@@ -55,50 +56,55 @@ class CharacterProcess:
             raise RequestError(self._failed)
 
     def command(self, command: Command) -> None:
-        """See LiveCharacter."""
+        """Obey this command from now on, as far as possible (`FrameChunk.notes` tell), and follow no path."""
         self._send("command", command)
 
     @property
     def sigmas(self) -> Sequence[SigmaRange]:
-        """See LiveCharacter."""
+        """Sigmas that `tune` changes."""
         return describe_sigmas(self._request.settings)
 
     def walk(self, points: Sequence[tuple[float, float]], speed: float, *, closed: bool = False) -> None:
-        """See LiveCharacter. RequestError where the points make no curve."""
+        """Walk along a smooth curve through two or more `points` (x and z, metres) at a `speed` in m/s, then stand; on
+        and on along a closed one. RequestError where the points make no curve."""
         positions = np.array(points, dtype=np.float64).reshape(-1, 2)
         curves.through(positions, closed=closed)  # so that errors are raised here, not in the process
         self._send("walk", positions, speed, closed)
 
     def aim(self, command: Command) -> None:
-        """See LiveCharacter."""
+        """Reach, look and walk round obstacles as this command says; nothing else of it counts, and a path is kept."""
         self._send("aim", command)
 
     def go(self, command: Command, place: tuple[float, float], within: float, facing: float | None = None) -> None:
-        """See LiveCharacter. RequestError where the request has no `transitions`, and for numbers that are none."""
+        """Be at a `place` (x and z, metres) `within` so many seconds, `facing` so (radians; None as it comes there), if
+        that is possible, and obey the command from then on; a note says why not. RequestError where the request has no
+        `transitions`, and for numbers that are none."""
         if self._request.transitions is None:
             raise RequestError("this character was made without transitions, which take it to a place")
         Arrival(place, within, facing)  # so that errors are raised here, not in the process
         self._send("go", command, place, within, facing)
 
     def pause(self, paused: bool) -> None:
-        """See LiveCharacter."""
+        """Stop the clock, or let it go on."""
         self._send("pause", paused)
 
     def set_rate(self, rate: float) -> None:
-        """See LiveCharacter; at least 1/64."""
+        """Let the clock pass at a `rate` of so many seconds per second, 1/64 to 1: slow motion. RequestError for
+        others."""
         if not RATES[0] <= rate <= RATES[1]:
             raise RequestError(f"the rate of a character's clock can be {RATES[0]:g} to {RATES[1]:g}, got {rate:g}")
         self._rate = rate
         self._send("rate", rate)
 
     def tune(self, values: Mapping[str, float]) -> None:
-        """See LiveCharacter."""
+        """Use these `values` of `sigmas`, by name and in the units that are told there, from the next step on, and the
+        defaults of the others; a reset keeps them. RequestError where one is out of its range."""
         check_sigmas(self._request.settings, values)  # so that errors are raised here, not in the process
         self._sigmas = dict(values)
         self._send("tune", self._sigmas)
 
     def reset(self) -> None:
-        """See LiveCharacter. A process that has ended is started again, which takes a while."""
+        """Restart from the initial pose. A process that has ended is started again, which takes a while."""
         if self._failed:
             self.close()
             self._start()
@@ -108,7 +114,8 @@ class CharacterProcess:
             self._send("reset")
 
     def poll(self) -> list[FrameChunk]:
-        """See LiveCharacter."""
+        """Return what was delivered since the last call, oldest first; never wait. MapctlError, after the last frame,
+        if the character has ended."""
         failed, found = self._failed, list[FrameChunk]()  # in this order: frames before the end are kept
         while self._delivered:
             found.append(self._delivered.popleft())
@@ -118,7 +125,7 @@ class CharacterProcess:
 
     @property
     def pid(self) -> int | None:
-        """The process' id; None where there is none yet."""
+        """Id of the process, a number of the operating system; None where there is none yet."""
         return self._process.pid
 
     @property
@@ -140,7 +147,7 @@ class CharacterProcess:
         self.close()
 
     def close(self) -> None:
-        """See LiveCharacter."""
+        """End the character; harmless the second time."""
         self._is_closing = True
         self._send("close")
         self._process.join(2.0 if self._ready.is_set() else 0.1)  # while it loads it does not listen yet

@@ -36,11 +36,12 @@ class PurePursuit:
         return None if self.curve.closed else self.curve.length - self.arc
 
     def show(self, frames: SteerFrames, due: float) -> None:
-        """See Display."""
+        """Keep where the character is; when its frames are `due` (seconds of the stream) does not matter."""
         self.position = frames.motion.root_position[-1, ::2]
 
     def at(self, seconds: float) -> Command:
-        """See Source."""
+        """Return the command towards the point ahead of the character; how many seconds of the stream have passed does
+        not matter."""
         first, last = self.arc - _SEARCH_BACKWARD, self.arc + _SEARCH_FORWARD
         arcs = torch.linspace(first, last, _SEARCH_POINTS, dtype=torch.float64).tolist()
         distances = torch.stack([(self._point(arc) - self.position).norm() for arc in arcs])

@@ -78,7 +78,7 @@ class SteerSettings:
     """Sigma of the hips' heading in such steps, radians, where it is smaller than `sigma_facing`: who has to turn for a
     start finds his first step sooner where the body turns first."""
     leaving_turn: float = 1.6
-    """Times the turn rate of `limits` at which the target may turn when somebody who stands is to go far aside."""
+    """Factor of the turn rate of `limits` at which the target may turn when somebody who stands is to go far aside."""
     random_starts: int = 12
     """Random warm starts of that solve, evaluated in one batch beside the evaluations; it begins at the best."""
     footing: FootContact = field(default_factory=FootContact)
@@ -137,7 +137,7 @@ class Refusal:
     """Why, with numbers."""
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class SteerFrames(Solution):
     """New frames of a step, at PRIOR_FPS, in the world; the status says if a deadline cut the search short."""
 

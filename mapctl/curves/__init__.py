@@ -77,7 +77,8 @@ def line(*, length: float) -> Curve:
 
 
 def wave(*, amplitude: float, length: float) -> Curve:
-    """Make one period of a sine along +Z, first to the left; `amplitude` is half of peak to peak; metres."""
+    """Make one period of a sine along +Z, first to the left: `amplitude` (half of peak to peak) and `length`
+    in metres."""
     return _build_shape("wave", {"amplitude": amplitude, "length": length})
 
 

@@ -23,7 +23,7 @@ _REFINEMENT = 10  # a local search's second grid is this much finer
 _END_EXTENSION = 1.0  # metres of straight extension in the tables; beyond them the line goes on all the same
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Curve:
     """A dense polyline. Build one with `curves.from_points`, `curves.read` or a shape function.
 
@@ -35,6 +35,15 @@ class Curve:
     """Vertices about 1 cm apart, float64, metres: (x, z) or (x, y, z). A closed curve ends with its first."""
     closed: bool = False
     """Whether the curve ends where it starts, so that arcs wrap."""
+
+    def __str__(self) -> str:
+        kind = "closed" if self.closed else "open"
+        where = "on the ground" if self.dims == 2 else "in space"
+        start = ", ".join(f"{float(value):.2f}" for value in self.start)
+        return f"Curve: {kind}, {where}, {self.length:.2f} m from ({start})"
+
+    def __repr__(self) -> str:
+        return f"<{self}>"
 
     @cached_property
     def _arcs(self) -> Float[Tensor, "points"]:
@@ -62,7 +71,7 @@ class Curve:
 
     @property
     def dims(self) -> int:
-        """2 on the ground, 3 in space."""
+        """Number of coordinates: 2 on the ground, 3 in space."""
         return self.points.shape[-1]
 
     @property

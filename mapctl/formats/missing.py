@@ -26,7 +26,7 @@ class MissingValues:
 
     @staticmethod
     def none(frames: int, joints: int) -> "MissingValues":
-        """Return masks of a motion that lacks nothing."""
+        """Return masks of a motion with so many `frames` and `joints` (a number of them) that lacks nothing."""
         return MissingValues(*torch.zeros(2, frames, joints, dtype=torch.bool))
 
 

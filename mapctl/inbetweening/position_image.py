@@ -48,8 +48,9 @@ class PositionImage:
         known_axes: Bool[Tensor, "batch frames joints 3"] | None = None,
     ) -> "PositionImage":
         """Build an image from world positions (metres) and the hips' heading (radians), interpolated where they are not
-        known; the reference is their root. Contacts of toes that are not known may be anything finite. Where single
-        coordinates are known they are told by `known_axes`, beside the joints that are `known` whole."""
+        known; the reference is their root, and `toes` are the indices of the left and the right one. Contacts of toes
+        that are not known may be anything finite. Where single coordinates are known they are told by `known_axes`,
+        beside the joints that are `known` whole."""
         known = known & present[..., None]
         axes = known[..., None].expand(*known.shape, 3)
         if known_axes is not None:
@@ -59,13 +60,15 @@ class PositionImage:
         image = PositionImage(positions_world, bits, axes, present, ground, facing)
         return replace(image, places=image.from_world(positions_world))
 
-    def from_world(self, positions_world: Float[Tensor, "batch frames joints 3"]) -> Tensor:
-        """Transform world positions to the reference."""
+    def from_world(
+        self, positions_world: Float[Tensor, "batch frames joints 3"]
+    ) -> Float[Tensor, "batch frames joints 3"]:
+        """Transform world positions to the reference, metres."""
         offset = rotations.lift_ground(self.ground)[..., None, :]
         return rotations.rotate_about_y(positions_world - offset, -self.heading[..., None])
 
-    def to_world(self, positions: Float[Tensor, "batch frames joints 3"]) -> Tensor:
-        """Invert `from_world`."""
+    def to_world(self, positions: Float[Tensor, "batch frames joints 3"]) -> Float[Tensor, "batch frames joints 3"]:
+        """Transform positions relative to the reference to the world, metres."""
         offset = rotations.lift_ground(self.ground)[..., None, :]
         return rotations.rotate_about_y(positions, self.heading[..., None]) + offset
 

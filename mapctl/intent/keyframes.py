@@ -47,7 +47,7 @@ class Key:
     limbs: tuple[str, ...] = ()
     """Joints of the rig, hands and feet, whose positions are all that counts."""
     places: Mapping[str, WorldPosition] = field(default_factory=dict)
-    """Target positions of such joints, where the motion has them elsewhere."""
+    """Target positions of such joints in the world, metres, where the motion has them elsewhere."""
     root_only: bool | Literal["place"] = False
     """Whether only position and rotation of the hips count; of "place" only where they are over the ground."""
     half: Literal["upper", "lower"] | None = None
@@ -105,7 +105,7 @@ class Keys:
     """Keyframes of a motion, and which of each counts."""
 
     each: tuple[Key | int, ...]
-    """In any order; a number is a whole pose. One of them at least tells where the hips are."""
+    """Keys in any order; a number is the frame of a whole pose. One of them at least tells where the hips are."""
 
     @staticmethod
     def of(frames: Sequence[int], *, limbs: tuple[str, ...] = (), root_only: bool = False) -> "Keys":
@@ -119,7 +119,7 @@ class Keys:
 
     @property
     def frames(self) -> tuple[int, ...]:
-        """Keys as they were given."""
+        """Frames of the keys, in the order in which they were given."""
         return tuple(key if isinstance(key, int) else key.frame for key in self.each)
 
     def checked(self, motion: Motion) -> list[Key]:

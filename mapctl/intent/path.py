@@ -37,7 +37,7 @@ class SpeedProfile:
 
     @staticmethod
     def constant(speed: float) -> "SpeedProfile":
-        """Make a profile of one speed."""
+        """Make a profile of one `speed`, m/s."""
         return SpeedProfile((0.0,), (float(speed),))
 
     @staticmethod
@@ -52,7 +52,7 @@ class SpeedProfile:
             raise RequestError(f"a speed is a number or ARC:SPEED,ARC:SPEED, got {text!r}") from None
 
     def at(self, arc: float) -> float:
-        """Return the speed at an arc, m/s."""
+        """Return the speed, m/s, at an `arc`, metres."""
         arcs, speeds = self.arcs, self.speeds
         after = bisect.bisect_left(arcs, arc)
         if after == 0:

@@ -120,11 +120,13 @@ class CommandTrack:
         return self.commands[max(0, bisect_right(self.times, seconds + 1e-9) - 1)]
 
     def arrivals(self, before: float, upto: float) -> list[float]:
-        """Return times in (before, upto] at which a command came."""
+        """Return the times, seconds, at which a command came: later than `before`, and not later than `upto`,
+        seconds."""
         return list(self.times[bisect_right(self.times, before + 1e-9) : bisect_right(self.times, upto + 1e-9)])
 
     def limit_speed(self, fastest: float) -> tuple["CommandTrack", list[str]]:
-        """Limit every command to what can be held; also return a note for each number that was changed."""
+        """Limit every command to what can be held, speeds to the `fastest` (m/s); also return a note for each number
+        that was changed."""
         found = [
             command.within(fastest, when=f" at {time:g} s")
             for time, command in zip(self.times, self.commands, strict=True)

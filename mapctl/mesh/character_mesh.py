@@ -17,7 +17,7 @@ class CharacterMesh:
     vertices: Array
     """(n, 3) in the rest pose, metres."""
     normals: Array
-    """(n, 3) unit, likewise."""
+    """(n, 3) of length 1, one a vertex, in the rest pose."""
     faces: Array
     """(m, 3) vertex indices, counter-clockwise seen from outside."""
     rgba: Array

@@ -27,13 +27,13 @@ def measure(
 ) -> dict[str, float]:
     """Measure one motion, by name of the measure.
 
-    Always: skate_cm_s, skate_ratio, contact_speed_cm_s, planted_share, penetration_cm, float_cm,
-    heel_contact_speed_cm_s, heel_planted_share, heel_slide_max_cm and foot_turn_deg_s (canonical joints alone tell
-    where heels are, else NaN), jitter_m_s3, speed_m_s, turned_deg, turn_rate_deg_s, hips_height_m, pose_variation_cm,
-    and sway_cm: from the straight line between the walk's ends, or from the curve. With a curve also
-    path_error_{mean,p95,max}_cm, likewise path_error_low_passed_, and travelled_m; with the wanted `speed` (m/s)
-    wanted_m and progress_ratio too. `joint` names the one that follows the curve, else the hips do. MapctlError for
-    rigs whose hips, legs or feet are not found, unknown joints and motions of one frame.
+    Always: `skate_cm_s`, `skate_ratio`, `contact_speed_cm_s`, `planted_share`, `penetration_cm`, `float_cm`,
+    `heel_contact_speed_cm_s`, `heel_planted_share`, `heel_slide_max_cm` and `foot_turn_deg_s` (canonical joints alone
+    tell where heels are, else NaN), `jitter_m_s3`, `speed_m_s`, `turned_deg`, `turn_rate_deg_s`, `hips_height_m`,
+    `pose_variation_cm`, and `sway_cm`: from the straight line between the walk's ends, or from the curve. With a curve
+    also `path_error_{mean,p95,max}_cm`, `path_error_low_passed_{mean,p95,max}_cm` and `travelled_m`; with the wanted
+    `speed` (m/s) `wanted_m` and `progress_ratio` too. `joint` names the one that follows the curve, else the hips do.
+    MapctlError for rigs whose hips, legs or feet are not found, unknown joints and motions of one frame.
     """
     if motion.num_frames < 2:
         raise RequestError("measures need a motion of at least 2 frames")
@@ -112,8 +112,11 @@ class MeasureStatistics(NamedTuple):
     """What a set of clips shows of one measure."""
 
     mean: float
+    """Mean over the clips, in the measure's unit."""
     p2: float
+    """2nd percentile, in the same unit."""
     p98: float
+    """98th percentile, in the same unit."""
 
 
 def compute_reference(motions: Iterable[Motion]) -> dict[str, MeasureStatistics]:

@@ -64,8 +64,8 @@ class WindowContext:
         features: Float[Tensor, "batch frames size"],
         contacts: Bool[Tensor, "batch frames 2"],
         *,
-        noise: Tensor | None,
-        log_density: Tensor | None,
+        noise: Float[Tensor, "batch frames width"] | None,
+        log_density: Float[Tensor, "batch frames"] | None,
         heel_plan: Trial | None = None,
     ) -> Trial:
         """Build the trial of candidate features, physical units, in this context; `heel_plan` as `Trial` has it."""

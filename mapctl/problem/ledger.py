@@ -22,12 +22,19 @@ class LedgerEntry:
     """Distance of each frame from what the term wants, in `unit`."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Ledger:
     """Energy and physical residual by term and frame."""
 
     entries: tuple[LedgerEntry, ...] = ()
     """Entries, one a term."""
+
+    def __str__(self) -> str:
+        means = [f"{entry.name} {float(entry.residual.mean()):.2g} {entry.unit}" for entry in self.entries]
+        return f"Ledger: {', '.join(means) or 'no terms'}"
+
+    def __repr__(self) -> str:
+        return f"<{self}>"
 
     def join(self, other: "Ledger") -> "Ledger":
         """Join this ledger's frames with the other's after them; a term that one of them lacks is 0 there."""

@@ -101,7 +101,7 @@ class CommittedFrames:
         return Trial(last[None], self.place, contacts=bits[None], skeleton=skeleton).heels_world[0]
 
     def finite(self, count: int) -> bool:
-        """Whether the last `count` frames and their energies are numbers."""
+        """Return whether the last `count` frames and their energies are numbers."""
         checked = (self.features[-count:], *(entry.energy[-count:] for entry in self.ledger.entries))
         return all(bool(torch.isfinite(values).all()) for values in checked)
 

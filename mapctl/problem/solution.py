@@ -1,7 +1,7 @@
 """What a solve returns: the motion, a status whose text is the message, and the ledger of energies and residuals."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any
 
@@ -44,7 +44,7 @@ class Status:
         return self.outcome is Outcome.DONE
 
     def with_notes(self, notes: Sequence[str], *, infeasible: bool = False) -> "Status":
-        """The status with more to say; `infeasible` marks wishes that cannot hold."""
+        """Return the status with more to say; `infeasible` marks wishes that cannot hold."""
         outcome = Outcome.INFEASIBLE if infeasible and self.ok else self.outcome
         return replace(self, outcome=outcome, notes=(*self.notes, *notes))
 
@@ -69,7 +69,7 @@ class WindowRecord:
     """Which of several densities scored it, where there were several to choose from."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Solution:
     """A finished (or best so far) motion and how it came about."""
 
@@ -81,10 +81,18 @@ class Solution:
     """By term and frame."""
     windows: tuple[WindowRecord, ...] = ()
     """Cost of each window."""
-    features: Float[Tensor, "frames size"] | None = field(default=None, repr=False)
+    features: Float[Tensor, "frames size"] | None = None
     """The motion as the prior's features."""
     seconds: float = 0.0
     """Compute, wall clock."""
+
+    def __str__(self) -> str:
+        residuals = [f"mean residuals: {str(self.ledger).partition(': ')[2]}"] if self.ledger.entries else []
+        took = f"{self.motion.describe()}; took {self.seconds:.2g} s"
+        return "\n".join([f"{type(self).__name__}: {self.status.outcome.value}", took, *residuals, *self.notes])
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__}: {self.status.outcome.value}; {self.motion.describe()}>"
 
     @property
     def notes(self) -> tuple[str, ...]:

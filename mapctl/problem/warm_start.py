@@ -22,7 +22,9 @@ WarmStartProposal = Callable[[WindowRequest, Float[Tensor, "1 unknowns"], Meter]
 """(request, warm start over the whole window, meter) to the unknowns from which L-BFGS starts."""
 
 
-def keep_warm_start(request: WindowRequest, warm: Tensor, meter: Meter) -> Tensor:
+def keep_warm_start(
+    request: WindowRequest, warm: Float[Tensor, "1 unknowns"], meter: Meter
+) -> Float[Tensor, "1 unknowns"]:
     """Return the warm start itself."""
     return warm
 
@@ -36,7 +38,7 @@ class SteeringKnots:
     blocks: tuple[str, ...] = ("root_displacement_heading", "heading_change")
     """Feature blocks whose noise is searched."""
     spread: float = 0.7
-    """Standard deviation of draws at each knot."""
+    """Standard deviation of draws at each knot, in units of the noise, whose own is 1."""
 
     def size(self) -> int:
         """Return the number of dimensions."""
@@ -84,8 +86,10 @@ class BestOfSamples:
     space: SteeringKnots = SteeringKnots()
     """Space in which they are drawn."""
 
-    def __call__(self, request: WindowRequest, warm: Tensor, meter: Meter) -> Tensor:
-        """Propose a start; see `WarmStartProposal`."""
+    def __call__(
+        self, request: WindowRequest, warm: Float[Tensor, "1 unknowns"], meter: Meter
+    ) -> Float[Tensor, "1 unknowns"]:
+        """Return the best draw about the warm start, or that itself; the meter counts what was evaluated."""
         noise, generator = _SteeredNoise(request, warm, self.space), request.generator
         start, spread = torch.zeros(self.space.size()), self.space.spread
         found = run_best_of_samples(
@@ -103,8 +107,10 @@ class SwarmProposal:
     space: SteeringKnots = SteeringKnots()
     """Space in which they move."""
 
-    def __call__(self, request: WindowRequest, warm: Tensor, meter: Meter) -> Tensor:
-        """Propose a start; see `WarmStartProposal`."""
+    def __call__(
+        self, request: WindowRequest, warm: Float[Tensor, "1 unknowns"], meter: Meter
+    ) -> Float[Tensor, "1 unknowns"]:
+        """Return the best point of the swarm, or the warm start itself; the meter counts what was evaluated."""
         noise, generator = _SteeredNoise(request, warm, self.space), request.generator
         start, spread = torch.zeros(self.space.size()), self.space.spread
         found = run_swarm(

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mapctl.motion import Motion
 from mapctl.numerics.intervals import fill_missing, last_observed
-from mapctl.recording.masks import Mask, expand_valid_masks, travelling_joint
+from mapctl.recording.masks import Mask, expand_valid_masks
 from mapctl.recording.noise_estimation import estimate_angle_noise, estimate_position_noise
 from mapctl.recording.quaternion_signs import choose_continuous_signs
 from mapctl.recording.spike_detection import find_angle_spikes, find_position_spikes
@@ -112,7 +112,7 @@ def inspect_recording(motion: Motion, masks: Sequence[Mask] = ()) -> Inspection:
     """Look over a recording on any rig; RequestError for masks that name joints or frames it has not."""
     quats = choose_continuous_signs(motion.local_quat_xyzw)
     hidden, hidden_root = expand_valid_masks(motion, masks)
-    travels = travelling_joint(motion)
+    travels = motion.travelling_joint
     place = motion.moving_offsets[travels] if travels else motion.root_position
     frozen = _find_frozen_joints(quats, hidden, float(motion.fps))
     dropouts, dropouts_root = hidden | frozen, hidden_root

@@ -65,7 +65,7 @@ def _parse_mask(path: str | PathLike[str], line: int, names: Sequence[str], word
 def masks_from_missing(motion: Motion, missing: MissingValues) -> tuple[Mask, ...]:
     """Return masks of what a file marks as missing. A joint that travels beside the body's own travel is lost with its
     position."""
-    travels, joints = travelling_joint(motion), missing.rotations.clone()
+    travels, joints = motion.travelling_joint, missing.rotations.clone()
     below = motion.skeleton.children(0)
     if travels == 0 and len(below) == 1 and bool(missing.places[:, below[0]].all()):
         travels = below[0]  # hips under a root that stays on the ground: the body's way is not known anywhere
@@ -74,13 +74,6 @@ def masks_from_missing(motion: Motion, missing: MissingValues) -> tuple[Mask, ..
             joints[:, joint] |= missing.places[:, joint]
     lost = [Mask(motion.skeleton.names[joint], start, stop) for joint, start, stop in true_intervals(joints)]
     return (*lost, *(Mask(ROOT, start, stop) for _, start, stop in true_intervals(missing.places[:, travels, None])))
-
-
-def travelling_joint(motion: Motion) -> int:
-    """Return the joint whose position is that of the body: the root, or the first below a root that stays still."""
-    moving = [joint for joint, values in motion.moving_offsets.items() if bool((values != values[0]).any())]
-    stays = bool((motion.root_position == motion.root_position[0]).all())
-    return min(moving) if stays and moving else 0
 
 
 def expand_valid_masks(motion: Motion, masks: Sequence[Mask]) -> tuple[Tensor, Tensor]:

@@ -37,9 +37,17 @@ class Capture:
         return self.root.shape[1]
 
     @staticmethod
-    def of_motion(motion: Motion, *, seen: Tensor, seen_root: Tensor, sigma: Tensor, sigma_root: float) -> "Capture":
-        """Make a batch of one from a motion on canonical joints, single precision; `seen` is (frames, joints). The
-        signs of its quaternions must not jump between observed frames."""
+    def of_motion(
+        motion: Motion,
+        *,
+        seen: Bool[Tensor, "frames joints"],
+        seen_root: Bool[Tensor, " frames"],
+        sigma: Float[Tensor, " joints"],
+        sigma_root: float,
+    ) -> "Capture":
+        """Make a batch of one from a motion on canonical joints, single precision: what was observed, and the noise,
+        `sigma` in radians and `sigma_root` in metres. The signs of its quaternions must not jump between observed
+        frames."""
         joints = _continuous_vectors(motion.local_quat_xyzw[:, 1:])
         return Capture(
             motion.root_position.float()[None],

@@ -60,8 +60,9 @@ class Match:
     joint_of: tuple[int | None, ...]
     """For each canonical joint the rig's joint, None where it has none."""
     score: float
-    """Mean over the canonical joints: 1 for one known by name, 0.7 by its position in the tree alone, 0.4 for one that
-    a rig may lack and this one does, 0 for one that it must have; times 0.9 where left and right are exchanged."""
+    """Mean over the canonical joints, 0 to 1: 1 for one known by name, 0.7 by its position in the tree alone, 0.4 for
+    one that a rig may lack and this one does, 0 for one that it must have; times 0.9 where left and right are
+    exchanged."""
     unmapped: tuple[str, ...]
     """Joints of the rig that are no canonical one, as fingers, twists and props."""
     sides_exchanged: bool = False

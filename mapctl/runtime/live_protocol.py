@@ -24,16 +24,16 @@ class SigmaRange:
     label: str
     """Name for people."""
     unit: str
-    """Unit; empty for a plain number."""
+    """Unit of its values; empty for a plain number."""
     default: float
-    """Value that holds unless another is given."""
+    """Value that holds unless another is given, in `unit`."""
     low: float
-    """Smallest value."""
+    """Smallest value, in `unit`."""
     high: float
-    """Largest value."""
+    """Largest value, in `unit`."""
 
     def explain_refusal(self, value: float) -> str:
-        """Return a sentence that says what is allowed instead of a value."""
+        """Return a sentence that says what is allowed instead of a `value`, in the unit of the sigma."""
         unit = f" {self.unit}" if self.unit else ""
         allowed = f"it can be {self.low:.3g} to {self.high:.3g}{unit}"
         return f"The sigma of {self.name} cannot be {value:.6g}{unit}: {allowed}."
@@ -44,7 +44,7 @@ class FrameChunk:
     """Frames of one step, as plain arrays, so that they pass between processes."""
 
     due: float
-    """Value of time.perf_counter at which the first of them is to be seen."""
+    """Value of time.perf_counter, seconds, at which the first of them is to be seen."""
     seconds: float
     """Time of the stream at that moment, seconds."""
     root: Float[ndarray, "frames 3"]
@@ -72,7 +72,7 @@ class FrameChunk:
     """Seconds of the stream per second while they are shown: below 1 in slow motion."""
 
     def due_of(self, frame: int) -> float:
-        """Return the value of time.perf_counter at which a frame is to be seen."""
+        """Return the value of time.perf_counter, seconds, at which a frame is to be seen."""
         return self.due + frame / (PRIOR_FPS * self.rate)
 
     @property

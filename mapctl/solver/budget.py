@@ -77,7 +77,7 @@ class Meter:
 
     @property
     def seconds(self) -> float:
-        """Time since the meter was made."""
+        """Seconds since the meter was made."""
         return self._clock() - self._began
 
     def _late(self, count: int = 1) -> bool:

@@ -10,7 +10,7 @@ from torch import Tensor
 def differentiate(
     energy: Callable[[Float[Tensor, "batch n"]], Float[Tensor, " batch"]],
 ) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
-    """A function that gives the energies of a batch of points and their gradients (batch, n) by reverse-mode
+    """Return a function that gives the energies of a batch of points and their gradients (batch, n) by reverse-mode
     differentiation, both detached; the points are independent of each other.
     """
 

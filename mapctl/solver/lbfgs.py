@@ -48,9 +48,9 @@ class LbfgsSettings:
     max_iterations: int = 100
     """Largest number of accepted steps; beyond them a problem is out of budget."""
     gradient_tolerance: float = 1e-3
-    """Gradient tolerance: converged where no entry is larger, energy per unit of the unknowns."""
+    """Converged where no entry of the gradient is larger, energy per unit of the unknowns."""
     relative_energy_tolerance: float = 1e-6
-    """Energy tolerance: converged where a step wins less than this share of max(|energy|, 1)."""
+    """Energy tolerance: converged where a step wins less than this share of `max(|energy|, 1)`."""
     armijo: float = 1e-4
     """Share of the slope's predicted decrease that a step must keep."""
     curvature: float = 0.9
@@ -58,7 +58,7 @@ class LbfgsSettings:
     initial_step: float | None = None
     """Length of the first trial step, unit of the unknowns; None: the gradient's length, 1 at most."""
     max_step: float = math.inf
-    """Longest step, Euclidean, unit of the unknowns."""
+    """Longest step, Euclidean, in units of the unknowns."""
     max_trials: int = 12
     """Largest number of trial steps in one line search."""
 

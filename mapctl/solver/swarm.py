@@ -37,9 +37,9 @@ class SwarmSettings:
     inertia: float = 0.7298
     """Share of its velocity a particle keeps."""
     cognitive: float = 1.4962
-    """Pull toward the particle's own best point."""
+    """Pull toward the particle's own best point: largest factor of the way there, each iteration."""
     social: float = 1.4962
-    """Pull toward the best point among its neighbours."""
+    """Pull toward the best point among its neighbours: largest factor of the way there, each iteration."""
     neighbours: int | None = None
     """Number of nearest particles that share their best point, itself among them; None: all."""
 
@@ -78,7 +78,8 @@ def run_swarm(
 ) -> SwarmResult:
     """Search from `start`, which is the first particle; the others begin at samples around it, all at rest.
 
-    `spread` is the standard deviation of the samples, in units of the unknowns. The swarm stops before an iteration
+    `spread` is the standard deviation of the samples, `bounds` the least and greatest value of each, in units of the
+    unknowns. The swarm stops before an iteration
     that the meter cannot pay in full. The same generator state gives the same bits. Raises RequestError where the start
     is no vector or out of bounds, or the cost answers in another shape.
     """
@@ -112,7 +113,8 @@ def run_best_of_samples(
 ) -> SwarmResult:
     """Find the best of `count` points, evaluated at once: the start and samples around it; fewer on a short budget.
 
-    Arguments and errors as in `swarm`, which it is held against.
+    `spread` is the standard deviation of the samples, `bounds` the least and greatest value of each, in units of the
+    unknowns. Errors as of `run_swarm`, which it is held against.
     """
     if count < 1:
         raise RequestError(f"the best of how many? at least 1, got {count}")

@@ -2,7 +2,7 @@
 
 from mapctl.terms.base import Term
 from mapctl.terms.clearance import Clearance
-from mapctl.terms.foot_contact import FootContact
+from mapctl.terms.foot_contact import FootContact, LandingSigmas
 from mapctl.terms.jerk import Jerk
 from mapctl.terms.keep_clear import KeepApart, KeepClear, WithinReach
 from mapctl.terms.keyframe import Keyframe
@@ -30,6 +30,7 @@ ALL = (
     KeepApart,
     WithinReach,
 )
+"""Every term of mapctl itself."""
 
 __all__ = [
     "ALL",
@@ -39,6 +40,7 @@ __all__ = [
     "KeepApart",
     "KeepClear",
     "Keyframe",
+    "LandingSigmas",
     "LatentPrior",
     "Likelihood",
     "MotionTracking",

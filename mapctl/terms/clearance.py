@@ -26,14 +26,16 @@ class Clearance:
     share: Float[Tensor, "frames 2"] | None = None
     """Share of the height that each toe is to clear in each frame of the window, 0 to 1; None: all of it."""
     name: str = "clearance"
+    """Name in the ledger."""
     unit: str = "m"
+    """Unit of the residual."""
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Energies of both toes, nats."""
+        """Return the energies of both toes, nats."""
         return 0.5 * (self._height_deficit(trial) / self.sigma).square().sum(-1)
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Height that the lower toe is lacking, metres; 0 where none is."""
+        """Return the height that the lower toe is lacking, metres; 0 where none is."""
         return self._height_deficit(trial).amax(-1)
 
     def _height_deficit(self, trial: Trial) -> Float[Tensor, "batch frames 2"]:

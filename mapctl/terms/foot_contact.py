@@ -1,4 +1,5 @@
-"""Foot contact: planted toes and heels do not move and are on the ground (Wang et al. 2019, Eq. 18)."""
+"""Foot contact: planted toes and heels do not move and are on the ground (Wang et al. 2019, Eq. 18), and come there
+without a snap."""
 
 from dataclasses import dataclass, field, replace
 
@@ -30,6 +31,21 @@ class HeelSigmas:
 
 
 @dataclass(frozen=True)
+class LandingSigmas:
+    """How hard toes may be accelerated. Contacts are fixed while a window is solved, and hold a toe from the second of
+    its frames on: without this the first may be anywhere, and a foot can snap to its place within one frame."""
+
+    free: float = 70.0
+    """Acceleration of a toe that costs nothing, m/s^2: of mocap's walks and runs 95 % stay under 87."""
+    sigma: float = 10.0
+    """Standard deviation of what is beyond it, m/s^2."""
+
+    def scale(self, factor: float) -> "LandingSigmas":
+        """Return both times a factor, for a body of another size."""
+        return LandingSigmas(factor * self.free, factor * self.sigma)
+
+
+@dataclass(frozen=True)
 class FootContact:
     """A toe whose contact bit is set does not travel and is at its rest height, nor does a heel while the foot is flat;
     none goes below it."""
@@ -42,13 +58,18 @@ class FootContact:
     """Standard deviation of the depth of any toe below its rest height, metres."""
     heels: HeelSigmas | None = field(default_factory=HeelSigmas)
     """Sigmas of the heels; None leaves them out. They are planted by the toes' contacts and the planned pose."""
+    landing: LandingSigmas | None = field(default_factory=LandingSigmas)
+    """Sigmas of the toes' acceleration; None leaves it free, as for motion that was captured."""
     rest_height: float = TOE_REST_HEIGHT
     """Height of the toe joint while the foot is flat on the ground, metres."""
     name: str = "footing"
+    """Name in the ledger."""
     unit: str = "m/s"
+    """Unit of the residual."""
 
     def with_sigmas(self, speed: float, height: float, below: float) -> "FootContact":
-        """Return the term with these sigmas of toes, m/s and metres; those of heels change in proportion."""
+        """Return the term with these sigmas of toes, `speed` in m/s, `height` and `below` in metres; those of heels
+        change in proportion."""
         heels = self.heels and replace(
             self.heels,
             speed=self.heels.speed * speed / self.sigma_speed,
@@ -58,10 +79,13 @@ class FootContact:
         return replace(self, sigma_speed=speed, sigma_height=height, sigma_below=below, heels=heels)
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Energies of both feet, nats."""
+        """Return the energies of both feet, nats."""
         above = trial.toe_heights - self.rest_height
         held = _hold(trial.planted, trial.toe_speeds / self.sigma_speed, above / self.sigma_height)
         energy = (held + 0.5 * (above.clamp(max=0) / self.sigma_below).square()).sum(-1)
+        if self.landing is not None:
+            beyond = (trial.toe_accelerations - self.landing.free).clamp_min(0) / self.landing.sigma
+            energy = energy + 0.5 * beyond.square().sum(-1)
         if self.heels is None:
             return energy
         drops = trial.features.new_tensor(find_heel_drops(trial.skeleton))
@@ -71,7 +95,7 @@ class FootContact:
         return energy + (held + 0.5 * (above.clamp(max=0) / self.heels.below).square()).sum(-1)
 
     def add_gradient(self, trial: Trial, gradient: TrialGradient) -> Float[np.ndarray, "batch frames"]:
-        """See DifferentiatedTerm."""
+        """Add the gradient of the summed energies of a float32 trial, and return the energies, nats."""
         energy = np.zeros(gradient.log_density.shape)
         kernels.add_contact(
             trial.joints_world.numpy(),
@@ -85,6 +109,16 @@ class FootContact:
             energy,
             gradient.joints_world,
         )
+        if self.landing is not None:
+            kernels.add_landing(
+                trial.joints_world.numpy(),
+                trial.before[-2:].to(trial.features.dtype).numpy(),
+                trial.toes,
+                float(trial.fps),
+                (self.landing.free, self.landing.sigma),
+                energy,
+                gradient.joints_world,
+            )
         if self.heels is not None:
             left, right = find_heel_drops(trial.skeleton)
             kernels.add_contact(
@@ -102,7 +136,7 @@ class FootContact:
         return energy
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Horizontal speed of the fastest planted toe or heel, m/s; 0 where none is planted."""
+        """Return the horizontal speed of the fastest planted toe or heel, m/s; 0 where none is planted."""
         fastest = (_stays(trial.planted) * trial.toe_speeds).amax(-1)
         if self.heels is None:
             return fastest

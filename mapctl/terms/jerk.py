@@ -18,14 +18,17 @@ class Jerk:
     frames: int = 3
     """Number of frames that the seam reaches into the window."""
     name: str = "seam"
+    """Name in the ledger."""
     unit: str = "m/s^3"
+    """Unit of the residual."""
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Energies, nats, mean over joints; 0 beyond the seam and with fewer than three frames before the window."""
+        """Return the energies, nats, mean over joints; 0 beyond the seam and with fewer than three frames before the
+        window."""
         return 0.5 * (self._jerk(trial) / self.sigma).square().mean(-1)
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Mean jerk over joints, m/s^3."""
+        """Return the mean jerk over joints, m/s^3."""
         return self._jerk(trial).mean(-1)
 
     def _jerk(self, trial: Trial) -> Float[Tensor, "batch frames joints"]:

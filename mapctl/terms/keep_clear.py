@@ -24,14 +24,16 @@ class KeepClear:
     sigma: float = 0.02
     """Standard deviation of the distance by which a joint is too near, metres."""
     name: str = "clear"
+    """Name in the ledger."""
     unit: str = "m"
+    """Unit of the residual."""
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Energies of the joints that reach farthest from the body, nats."""
+        """Return the energies of the joints that reach farthest from the body, nats."""
         return 0.5 * (self._trespass(trial) / self.sigma).square().sum(-1)
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Distance by which the joint that is nearest to an obstacle is nearer than the margin, metres."""
+        """Return the distance by which the joint that is nearest to an obstacle is nearer than the margin, metres."""
         return self._trespass(trial).amax(-1)
 
     def _trespass(self, trial: Trial) -> Float[Tensor, "batch frames joints"]:
@@ -50,14 +52,16 @@ class KeepApart:
     sigma: float = 0.02
     """Standard deviation of the distance that is lacking, metres."""
     name: str = "apart"
+    """Name in the ledger."""
     unit: str = "m"
+    """Unit of the residual."""
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Energies, nats, summed over the others."""
+        """Return the energies, nats, summed over the others."""
         return 0.5 * (self._lacking(trial) / self.sigma).square().sum(1)
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Distance that is lacking to the nearest other, metres."""
+        """Return the distance that is lacking to the nearest other, metres."""
         return self._lacking(trial).amax(1)
 
     def _lacking(self, trial: Trial) -> Float[Tensor, "batch others frames"]:
@@ -70,7 +74,7 @@ class WithinReach:
     """A shoulder is near enough to a target for the hand to reach it."""
 
     shoulder: int
-    """Canonical joint from which the limb reaches."""
+    """Index of the canonical joint from which the limb reaches."""
     place: Float[Tensor, "frames 3"]
     """Target in each frame of the window, world, metres; anything finite where there is none."""
     wanted: Bool[Tensor, " frames"]
@@ -82,14 +86,16 @@ class WithinReach:
     robust: float = 0.1
     """Such distance beyond which the energy rises linearly, metres: nobody lunges for what is out of reach."""
     name: str = "within reach"
+    """Name in the ledger."""
     unit: str = "m"
+    """Unit of the residual."""
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Energies, nats."""
+        """Return the energies, nats."""
         lacking = self.residual(trial) / self.robust
         return (self.robust / self.sigma) ** 2 * ((1 + lacking.square()).sqrt() - 1)
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Distance beyond reach, metres; 0 where the limb reaches."""
+        """Return the distance beyond reach, metres; 0 where the limb reaches."""
         away = trial.joints_world[..., self.shoulder, :] - self.place.to(trial.features)
         return (vectors.length(away) - self.reach).clamp_min(0) * self.wanted

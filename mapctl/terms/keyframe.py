@@ -20,14 +20,16 @@ class Keyframe:
     sigma: float = 0.002
     """Standard deviation of a joint about its target along each axis, metres."""
     name: str = "keyframe"
+    """Name in the ledger."""
     unit: str = "m"
+    """Unit of the residual."""
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Energies, nats, summed over joints."""
+        """Return the energies, nats, summed over joints."""
         return 0.5 * (self._squares(trial) / self.sigma**2).sum(-1)
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Distance of the joint that is farthest from its target, metres; 0 where there is none."""
+        """Return the distance of the joint that is farthest from its target, metres; 0 where there is none."""
         return torch.sqrt(self._squares(trial).amax(-1))
 
     def _squares(self, trial: Trial) -> Float[Tensor, "batch frames joints"]:

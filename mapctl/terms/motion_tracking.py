@@ -33,10 +33,12 @@ class MotionTracking:
     effective_joints: float = 6.0
     """Number of independent joints that a body is worth: neighbours move together, so 21 are not 21 observations."""
     name: str = "closeness"
+    """Name in the ledger."""
     unit: str = "m"
+    """Unit of the residual."""
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Energies, nats."""
+        """Return the energies, nats."""
         height = LAYOUT.pick(trial.features - self.target.to(trial.features), "root_height")[..., 0]
         ground, turn = self._trajectory_error(trial)
         return 0.5 * (
@@ -47,7 +49,7 @@ class MotionTracking:
         )
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Root mean square distance of the joints from the target's, relative to the hips, metres."""
+        """Return the root mean square distance of the joints from the target's, relative to the hips, metres."""
         return self._pose(trial).mean(-1).sqrt()
 
     def _pose(self, trial: Trial) -> Float[Tensor, "batch frames joints"]:

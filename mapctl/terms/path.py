@@ -46,10 +46,12 @@ class Path:
     slow_seconds: float = 0.35
     """Standard deviation of the Gaussian that separates the slow offset from the sway."""
     name: str = "path"
+    """Name in the ledger."""
     unit: str = "m"
+    """Unit of the residual."""
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Energies of the sideways offset, its slow part, progress, and height in space, nats."""
+        """Return the energies of the sideways offset, its slow part, progress, and height in space, nats."""
         positions = self._positions(trial)
         near = self._nearest_frame(positions)
         # The curve is held in the gradient. Forward offsets are from the wanted point, the others from the nearest:
@@ -61,7 +63,7 @@ class Path:
         return 0.5 * (energy + (self._low_pass_offset(trial, offsets[..., 0]) / self.sigma_slow).square())
 
     def add_gradient(self, trial: Trial, gradient: TrialGradient) -> Float[np.ndarray, "batch frames"]:
-        """See DifferentiatedTerm."""
+        """Add the gradient of the summed energies of a float32 trial, and return the energies, nats."""
         positions, energy = self._positions(trial).contiguous(), np.empty(gradient.log_density.shape)
         near, sigma = self._nearest_frame(positions), self.slow_seconds * trial.fps
         known, weights = _build_offset_smoother(
@@ -84,7 +86,7 @@ class Path:
         return energy
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Distance to the curve, metres."""
+        """Return the distance to the curve, metres."""
         positions = self._positions(trial)
         return vectors.length(positions - self._nearest_frame(positions).place)
 
@@ -119,7 +121,7 @@ class Path:
         return torch.addmm(known, sideways, weights)
 
     def past_sideways_offsets(self, past: Float[Tensor, "past 3"]) -> Float[Tensor, " past"]:
-        """Sideways offsets of the frames before the window, metres; their arcs are extrapolated."""
+        """Return the sideways offsets of the frames before the window, metres; their arcs are extrapolated."""
         step = self.arcs[1] - self.arcs[0] if len(self.arcs) > 1 else 0.0
         around = self.arcs[0] - step * torch.arange(len(past), 0, -1)
         positions = self._select_axes(past)

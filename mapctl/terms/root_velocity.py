@@ -38,10 +38,12 @@ class RootVelocity:
     slow_seconds: float = 0.25
     """Standard deviation of the Gaussian that removes a stride's own rise and fall of speed, seconds."""
     name: str = "travel"
+    """Name in the ledger."""
     unit: str = "m/s"
+    """Unit of the residual."""
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Energies, nats."""
+        """Return the energies, nats."""
         error = self._velocity_error(trial)
         energy = (error.unsqueeze(-2) * self._units.to(error.dtype)).sum(-1).square().sum(-1)
         if self.facing is not None:
@@ -51,7 +53,7 @@ class RootVelocity:
         return 0.5 * energy
 
     def add_gradient(self, trial: Trial, gradient: TrialGradient) -> Float[np.ndarray, "batch frames"]:
-        """See DifferentiatedTerm."""
+        """Add the gradient of the summed energies of a float32 trial, and return the energies, nats."""
         known, weights = _build_velocity_smoother(self, trial.before, trial.fps, trial.features.dtype)
         energy, (velocities, units, facing) = np.empty(gradient.log_density.shape), self._tables
         kernels.add_root_velocity(
@@ -70,7 +72,7 @@ class RootVelocity:
         return energy
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Size of the low-pass velocity error, m/s."""
+        """Return the size of the low-pass velocity error, m/s."""
         return vectors.length(self._velocity_error(trial))
 
     @cached_property

@@ -28,14 +28,16 @@ class StepLength:
     sigma: float = 0.012
     """Standard deviation of a step's length, metres: small, since few frames of a window are touch-downs."""
     name: str = "steps"
+    """Name in the ledger."""
     unit: str = "m"
+    """Unit of the residual."""
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Energies in the frames of touch-downs, nats; 0 in all others."""
+        """Return the energies in the frames of touch-downs, nats; 0 in all others."""
         return 0.5 * (self._length_error(trial) / self.sigma).square()
 
     def add_gradient(self, trial: Trial, gradient: TrialGradient) -> Float[np.ndarray, "batch frames"]:
-        """See DifferentiatedTerm."""
+        """Add the gradient of the summed energies of a float32 trial, and return the energies, nats."""
         energy = np.empty(gradient.log_density.shape)
         kernels.add_step_length(
             trial.joints_world.numpy(),
@@ -50,7 +52,7 @@ class StepLength:
         return energy
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Error of the step length, metres; 0 between touch-downs."""
+        """Return the error of the step length, metres; 0 between touch-downs."""
         return self._length_error(trial).abs()
 
     def _length_error(self, trial: Trial) -> Float[Tensor, "batch frames"]:

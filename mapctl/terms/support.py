@@ -22,14 +22,16 @@ class Support:
     rest_height: float = TOE_REST_HEIGHT
     """Height of the toe joint while the foot is flat on the ground, metres."""
     name: str = "support"
+    """Name in the ledger."""
     unit: str = "m/s"
+    """Unit of the residual."""
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Energies, nats."""
+        """Return the energies, nats."""
         return 0.5 * (self._speed(trial) / self.sigma).square()
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Speed of the supporting toe over the ground, m/s; 0 in flight."""
+        """Return the speed of the supporting toe over the ground, m/s; 0 in flight."""
         return self._speed(trial)
 
     def _speed(self, trial: Trial) -> Float[Tensor, "batch frames"]:

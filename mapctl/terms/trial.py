@@ -53,7 +53,8 @@ class Trial:
 
     @staticmethod
     def of_features(features: Float[Tensor, "batch frames size"], *, skeleton: Skeleton = CANONICAL) -> "Trial":
-        """A motion from the origin on, with the contacts of its features and without noise or density."""
+        """Make the trial of a motion from the origin on, with the contacts of its features and without noise or
+        density."""
         origin = GroundPose(features.new_zeros(len(features), 2), features.new_zeros(len(features)))
         before = features.new_zeros(0, skeleton.num_joints, 3)
         bits = LAYOUT.pick(features, "contacts") > 0.5
@@ -65,13 +66,13 @@ class Trial:
         return (self.first_frame + torch.arange(self.features.shape[1])) / self.fps
 
     def require_noise(self) -> Float[Tensor, "batch frames width"]:
-        """The noise; MapctlError where there is none."""
+        """Return the noise; MapctlError where there is none."""
         if self.noise is None:
             raise MapctlError("this motion has no noise with a prior")
         return self.noise
 
     def require_log_density(self) -> Float[Tensor, "batch frames"]:
-        """The log density; MapctlError where no density scored the motion."""
+        """Return the log density; MapctlError where no density scored the motion."""
         if self.log_density is None:
             raise MapctlError("no density scored this motion")
         return self.log_density
@@ -124,7 +125,7 @@ class Trial:
         return self.pose.joints_and_heels(self.skeleton)
 
     def joint_world(self, name: str) -> Float[Tensor, "batch frames 3"]:
-        """World positions of one joint, metres."""
+        """Return the world positions of one joint, metres."""
         return self.joints_world[..., self.skeleton.index(name), :]
 
     @cached_property
@@ -161,7 +162,8 @@ class Trial:
         return self.before[-1:].to(self.features.dtype)
 
     def step(self, joint: int) -> Float[Tensor, "batch frames 3"]:
-        """Displacement of a joint since the frame before, metres; the first frame's needs a past, or is 0."""
+        """Return the displacement of a joint since the frame before, metres; the first frame's needs a past, or is
+        0."""
         positions = self.joints_world[..., joint, :]
         past = self.before[-1:, joint].to(positions.dtype) if len(self.before) else positions[:, :1].detach()
         return torch.diff(positions, dim=-2, prepend=past.expand(len(positions), 1, 3))
@@ -176,6 +178,16 @@ class Trial:
     def toe_speeds(self) -> Float[Tensor, "batch frames 2"]:
         """Speed of the left and the right toe over the ground since the frame before, m/s; its gradient exists at 0."""
         return self._speed(torch.stack([self.step(toe) for toe in self.skeleton.indices(TOES)], dim=-2))
+
+    @cached_property
+    def toe_accelerations(self) -> Float[Tensor, "batch frames 2"]:
+        """Size of the acceleration of the left and the right toe from the two frames before, m/s^2; 0 in the first
+        frames where those are not known."""
+        toes = self.joints_world[:, :, list(self.toes)]
+        past = self.before[-2:, list(self.toes)].to(toes.dtype).expand(len(toes), -1, -1, -1)
+        second = torch.diff(torch.cat([past, toes], dim=1), n=2, dim=1)
+        sizes = torch.sqrt(second.square().sum(-1) + 1e-9) * self.fps**2
+        return torch.cat([sizes.new_zeros(len(toes), toes.shape[1] - sizes.shape[1], 2), sizes], dim=1)
 
     @cached_property
     def heel_speeds(self) -> Float[Tensor, "batch frames 2"]:

@@ -16,8 +16,9 @@ from torch.nn.functional import gelu
 from mapctl import kinematics, rotations
 from mapctl.errors import RequestError
 from mapctl.numerics import gaussian
+from mapctl.numerics.intervals import fill_missing
 from mapctl.pose import BodyPose
-from mapctl.recording import Capture, CaptureProposal, fill_missing
+from mapctl.recording import Capture, CaptureProposal
 from mapctl.skeleton import CANONICAL
 from priors import checkpoints
 from priors.config import NetworkConfig
@@ -234,8 +235,8 @@ def _smooth(values: Float[Tensor, "batch frames width"], sigma: float) -> Float[
     return torch.einsum("ts,bsw->btw", weight, values)
 
 
-@dataclass(frozen=True, eq=False)
-class ConvDenoiser:
+@dataclass(frozen=True, eq=False, repr=False)
+class ConvDenoiser(checkpoints.LoadedModel):
     """A trained denoiser (see mapctl.protocols.Denoiser)."""
 
     name: str

@@ -129,8 +129,8 @@ def _count_frames_since(known: Tensor) -> Float[Tensor, "batch frames"]:
     return (frame - last).clamp(max=_MAX_FRAMES_SINCE) / _MAX_FRAMES_SINCE
 
 
-@dataclass(frozen=True, eq=False)
-class ConvInfiller(PositionInfiller):
+@dataclass(frozen=True, eq=False, repr=False)
+class ConvInfiller(checkpoints.LoadedModel, PositionInfiller):
     """A trained infiller."""
 
     name: str

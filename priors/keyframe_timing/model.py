@@ -57,21 +57,22 @@ class KeyframeTimingNetwork(nn.Module):
         return torch.stack([low * seconds, seconds, high * seconds], dim=-1)
 
 
-@dataclass(frozen=True, eq=False)
-class KeyframeTiming:
+@dataclass(frozen=True, eq=False, repr=False)
+class KeyframeTiming(checkpoints.LoadedModel):
     """A fitted regression, as controllers get it."""
 
     name: str
-    """As it was asked for."""
+    """Name under which it was loaded."""
     network: KeyframeTimingNetwork
-    """Weights."""
+    """Network with its weights."""
     card: checkpoints.Card
-    """What they are."""
+    """Card of the weights."""
 
     def estimate_seconds(
         self, features: Float[Tensor, "pairs features"], metres: Float[Tensor, " pairs"]
     ) -> Float[Tensor, "pairs 3"]:
-        """Seconds that four of five pairs take at least, that are suggested, and that they take at most."""
+        """Estimate the seconds that four of five pairs of keys take at least, that are suggested, and that they take at
+        most, by features of the pairs and how far apart they are, metres."""
         return self.network(features, metres)
 
 

@@ -18,8 +18,8 @@ from priors.lstm_gmm.network import LstmGmm, LstmGmmConfig, LstmState
 from priors.lstm_gmm.state_inference import infer_lstm_state
 
 
-@dataclass(frozen=True, eq=False)
-class LstmGmmDensity(Density[LstmState]):
+@dataclass(frozen=True, eq=False, repr=False)
+class LstmGmmDensity(checkpoints.LoadedModel, Density[LstmState]):
     """The network as a density; rollouts take the fast path unless `use_fast` is off."""
 
     name: str
@@ -91,7 +91,8 @@ class LstmGmmDensity(Density[LstmState]):
         return replace(self._with_network(self.reference.conditioned_on(full)), initial_states=picked)
 
     def conditioned_like_start(self, start: int) -> "LstmGmmDensity":
-        """Return the density given the labels of the clip that an initial state was taken from: its gait goes on."""
+        """Return the density given the labels of the clip that an initial state, of the index `start`, was taken from:
+        its gait goes on."""
         return self.conditioned_like_clip(self.initial_states.names[start])
 
     def conditioned_like_clip(self, name: str) -> "LstmGmmDensity":
@@ -135,38 +136,50 @@ class LstmGmmDensity(Density[LstmState]):
         """Find the state before a motion that makes its first frames likely (Wang et al. 2019, Eq. 26)."""
         return infer_lstm_state(self.reference, self.initial_states.state, features)
 
-    def log_prob(self, features: Tensor, state: LstmState, *, inputs: Tensor | None = None) -> Tensor:
-        """See Density."""
+    def log_prob(
+        self,
+        features: Float[Tensor, "batch frames size"],
+        state: LstmState,
+        *,
+        inputs: Float[Tensor, "batch frames size"] | None = None,
+    ) -> Float[Tensor, "batch frames"]:
+        """Compute the log density of each frame given those before it, nats, as `Density.log_prob` says."""
         return self.reference.log_prob(features, state, inputs=inputs)
 
-    def advance(self, state: LstmState, committed: Tensor) -> LstmState:
-        """See Density."""
+    def advance(self, state: LstmState, committed: Float[Tensor, "batch frames size"]) -> LstmState:
+        """Return the state after one or more further frames were seen, without gradient."""
         return self.reference.advance(state, committed)
 
     def sample(
         self, state: LstmState, frames: int, generator: torch.Generator, *, temperature: float = 1.0
-    ) -> tuple[Tensor, LstmState]:
-        """See Density."""
+    ) -> tuple[Float[Tensor, "batch frames size"], LstmState]:
+        """Draw frames one after the other, and the state after them; `temperature` is a factor of the noise."""
         return self._rollout_engine.sample(state, frames, generator, temperature=temperature)
 
-    def latents(self, features: Tensor, state: LstmState) -> tuple[DiscreteChoices, Tensor]:
-        """See Density."""
+    def latents(
+        self, features: Float[Tensor, "batch frames size"], state: LstmState
+    ) -> tuple[DiscreteChoices, Float[Tensor, "batch frames continuous"]]:
+        """Find the plan and the noise whose rollout is the features, without gradient."""
         return self.reference.latents(features, state)
 
-    def plan(self, state: LstmState, noise: Tensor) -> DiscreteChoices:
-        """See Density."""
+    def plan(self, state: LstmState, noise: Float[Tensor, "batch frames continuous"]) -> DiscreteChoices:
+        """Choose the likeliest component and contact bits of each frame along the rollout that the noise gives."""
         return self._rollout_engine.plan(state, noise)
 
-    def rollout(self, state: LstmState, noise: Tensor, plan: DiscreteChoices) -> tuple[Tensor, Tensor]:
-        """See Density."""
+    def rollout(
+        self, state: LstmState, noise: Float[Tensor, "batch frames continuous"], plan: DiscreteChoices
+    ) -> tuple[Float[Tensor, "batch frames size"], Float[Tensor, "batch frames"]]:
+        """Roll out features under a plan, and their log density, nats; both differentiable in the noise."""
         return self._rollout_engine.rollout(state, noise, plan)
 
     def prepare_rollout(self, state: LstmState, plan: DiscreteChoices) -> PreparedRollout:
-        """See Density."""
+        """Prepare the rollouts of a search: by the kernels, or by autograd."""
         return self._fast.prepare(state, plan) if self.use_fast else super().prepare_rollout(state, plan)
 
-    def plan_search(self, state: LstmState, noise: Tensor) -> tuple[DiscreteChoices, PreparedRollout]:
-        """See Density."""
+    def plan_search(
+        self, state: LstmState, noise: Float[Tensor, "batch frames continuous"]
+    ) -> tuple[DiscreteChoices, PreparedRollout]:
+        """Plan along the rollout of a search's first noise, and prepare rollouts under that plan."""
         return self._fast.plan_window(state, noise) if self.use_fast else super().plan_search(state, noise)
 
 

@@ -28,8 +28,8 @@ _MAX_WINDOW, _OVERLAP = 240, 60  # frames of the longest window, and of two wind
 _PARTNERS = CANONICAL.mirror_partners()
 
 
-@dataclass(frozen=True, eq=False)
-class PoseTransformer(Inbetweener):
+@dataclass(frozen=True, eq=False, repr=False)
+class PoseTransformer(checkpoints.LoadedModel, Inbetweener):
     """A trained pose transformer."""
 
     name: str

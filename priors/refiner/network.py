@@ -112,8 +112,8 @@ class RefinerNetwork(nn.Module):
         return torch.cat([continuous, bits], dim=-1), after
 
 
-@dataclass(frozen=True, eq=False)
-class LstmRefiner(Refiner):
+@dataclass(frozen=True, eq=False, repr=False)
+class LstmRefiner(checkpoints.LoadedModel, Refiner):
     """A trained refiner."""
 
     name: str

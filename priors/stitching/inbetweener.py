@@ -38,8 +38,8 @@ _FARTHEST = 0.3  # metres of unit size from a trajectory over which steps can be
 _PARTNERS = CANONICAL.mirror_partners()
 
 
-@dataclass(frozen=True, eq=False)
-class Stitcher(Inbetweener):
+@dataclass(frozen=True, eq=False, repr=False)
+class Stitcher(checkpoints.LoadedModel, Inbetweener):
     """A trained stitcher (Ren et al. 2024)."""
 
     name: str
@@ -60,12 +60,12 @@ class Stitcher(Inbetweener):
 
     def drawing(self, seed: int = 0, temperature: float | None = None) -> "Stitcher":
         """Return the in-betweener that proposes the first draw with a seed, and by `numbered` the others. The
-        `temperature`, the standard deviation of the noise, is a quarter more than that of the weights unless it is
-        given; a higher one makes draws differ more, and come less near to what is likely."""
+        `temperature` is the factor of the noise, a quarter more than that of the weights unless it is given; a higher
+        one makes draws differ more, and come less near to what is likely."""
         return replace(self, draws=Draws(seed, self._pick_temperature(temperature)), number=0)
 
     def numbered(self, number: int) -> "Stitcher":
-        """Return the in-betweener that proposes the draw of a number, from 0 on."""
+        """Return the in-betweener that proposes the draw of a `number`, an index from 0 on."""
         return replace(self, number=number)
 
     @torch.no_grad()
@@ -73,7 +73,7 @@ class Stitcher(Inbetweener):
         self, ends: Ends, frames: int, *, count: int, generator: torch.Generator, temperature: float | None = None
     ) -> Joined:
         """Draw so many answers to one pair of poses, `frames` from the one to the other; the first ones do not depend
-        on the count. The `temperature` is as `drawing` takes it."""
+        on the count. The `temperature` is the factor of the noise that `drawing` takes."""
         heat = self._pick_temperature(temperature)
         rows = [self._draw_chunk(ends, frames, generator, heat) for _ in range(-(-count // CHUNK))]
         return Joined(

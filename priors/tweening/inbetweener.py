@@ -42,8 +42,8 @@ mocap's, and slower less."""
 _KEY_SECONDS = 0.5  # over which what a key was missed by fades away from it
 
 
-@dataclass(frozen=True, eq=False)
-class Tweener(Inbetweener):
+@dataclass(frozen=True, eq=False, repr=False)
+class Tweener(checkpoints.LoadedModel, Inbetweener):
     """A trained generator of long in-betweens with the path predictor that it was trained with."""
 
     name: str

@@ -110,8 +110,8 @@ def _stand_on_floor(motion: LocalMotion) -> Float[Tensor, "batch frames"]:
     return TOE_REST_HEIGHT - motion.places[..., list(TOE_JOINTS), 1].amin(dim=-1)
 
 
-@dataclass(frozen=True, eq=False)
-class ConvPathPredictor(PathPredictor):
+@dataclass(frozen=True, eq=False, repr=False)
+class ConvPathPredictor(checkpoints.LoadedModel, PathPredictor):
     """A trained path predictor."""
 
     name: str

@@ -45,7 +45,7 @@ def test_every_table_has_help(name, capsys):
         (["speed", "--count", "3"], "--count 3 (see mapctl bench speed --help)"),
         (["infill"], "--data"),
         (["infill"], "mapctl bench infill --help"),
-        (["fly"], "speed, ablation, free-run"),
+        (["fly"], "speed, ablation, follow"),
         (["fly"], "(see mapctl bench --help)"),
         (["infill", "--data", "."], "does not hold the clips kept from training"),
         (["speed", "--beside", "docs"], "docs is no checkout of mapctl"),

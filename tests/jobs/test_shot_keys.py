@@ -16,7 +16,7 @@ from controllers.shots.loop import OVERLAP, close_loop
 from controllers.shots.planning.way import Way, plan_way
 from controllers.shots.prices import measure_prices
 from controllers.shots.request import Look, PoseKey, Reach, ShotRequest
-from controllers.shots.wishes import Wish, describe_fights
+from controllers.shots.wishes import Wish, check_wishes, describe_fights
 from mapctl import curves, kinematics
 from mapctl.errors import RequestError
 from mapctl.intent.path import SpeedProfile
@@ -259,3 +259,14 @@ def test_wishes_that_fight_are_named_together(walked, way):
     assert "look at 2.2 s, 25.0 degrees short" in first
     assert "3.9" not in first
     assert "cm off at that time" in first
+
+
+def test_no_remedy_is_told_where_the_place_is_in_reach_at_that_time(walked, way):
+    """Another time is none where the shoulder is near enough already: something else is in the way."""
+    shoulder = walked.joint_positions()[60, walked.skeleton.index("leftUpperArm")]
+    near = tuple(float(value) for value in shoulder + shoulder.new_tensor([0.3, -0.1, 0.1]))
+    request = ShotRequest(LINE, seconds=4.0, reaches=(Reach(1.99999, {"leftHand": near}),))
+    (reach,) = [wish for wish in check_wishes(request, way, walked) if wish.name.startswith("leftHand")]
+    assert reach.name == "leftHand at 2 s"
+    assert not reach.holds
+    assert reach.remedy == ""

@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapctl import rotations
-from mapctl.recording import Capture, fill_missing, last_observed, next_observed
+from mapctl.numerics.intervals import fill_missing, last_observed, next_observed
+from mapctl.recording import Capture
 from mapctl.skeleton import CANONICAL
 
 masks = st.lists(st.lists(st.booleans(), min_size=9, max_size=9), min_size=1, max_size=3).map(torch.tensor)

@@ -15,7 +15,7 @@ from mapctl.features import LAYOUT, GroundPose, encode
 from mapctl.metrics.feet import locate_heels
 from mapctl.rotations import rotate_ground
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, TOES
-from mapctl.terms import FootContact, Jerk, LatentPrior, Likelihood, Path
+from mapctl.terms import FootContact, Jerk, LandingSigmas, LatentPrior, Likelihood, Path
 from mapctl.terms.foot_contact import HeelSigmas
 
 each_term = pytest.mark.parametrize("name", TERMS)
@@ -296,3 +296,20 @@ def test_the_seam_sees_a_jump_at_its_start_and_nothing_beyond():
     assert float(loud[:3].min()) > 10 * float(calm.max())
     assert float(loud[3:].abs().max()) == 0
     assert float(Jerk()(replace(smooth, before=smooth.before[:2])).abs().max()) == 0
+
+
+@pytest.mark.parametrize("past", [0, 1, PAST])
+def test_a_toe_pays_for_acceleration_beyond_what_is_free(past):
+    whole = trial(1, disturbed=0.02, past=past)
+    hard, free = FootContact(heels=None, landing=LandingSigmas(20.0, 5.0)), FootContact(heels=None, landing=None)
+    toes = [CANONICAL.index("leftToes"), CANONICAL.index("rightToes")]
+    places = torch.cat([whole.before[-2:, toes], whole.joints_world[0][:, toes]])
+    sizes = (places[2:] - 2 * places[1:-1] + places[:-2]).norm(dim=-1) * 30**2
+    expected = torch.zeros(FRAMES, dtype=torch.float64)
+    expected[FRAMES - len(sizes) :] = 0.5 * (((sizes - 20).clamp(min=0) / 5) ** 2).sum(-1)
+    assert float(expected.max()) > 1, "some are harder than what is free"
+    torch.testing.assert_close((hard(whole) - free(whole))[0], expected, rtol=1e-3, atol=1e-3)
+
+
+def test_limits_of_landings_grow_with_the_body():
+    assert LandingSigmas(70.0, 10.0).scale(0.5) == LandingSigmas(35.0, 5.0)

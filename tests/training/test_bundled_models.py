@@ -21,7 +21,7 @@ from priors.training.mocap.cuts import CMU
 from priors.training.run import train
 from priors.weight_sets import STAND_INS
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "training.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "guides" / "training.md"
 FULL = list_models()
 
 

@@ -48,9 +48,7 @@ class RolloutSettings:
     """Sigma of the distance of every joint from the known frames at which a rollout arrives, metres."""
     ahead: int = 15
     """Frames after a gap that are rolled with it, of which the known ones are targets too."""
-    footing: FootContact = field(
-        default_factory=lambda: FootContact(sigma_speed=0.1, sigma_height=0.05, sigma_below=0.05, heels=None)
-    )
+    footing: FootContact = field(default_factory=lambda: FootContact(0.1, 0.05, 0.05, heels=None))
     """Contact term."""
     shortest: int = 2
     """Frames of the shortest gap that is rolled through: shorter ones leave nothing to vary."""

@@ -54,7 +54,7 @@ class Arrival:
         return replace(curve, points=bring_curve_points(curve.points, curve.points[-1], angle, place))
 
     def bring_to(self, curve: Curve, arc: float) -> "Arrival":
-        """Return the arrival moved so that it is at an arc of a curve, on its way along it."""
+        """Return the arrival moved so that it is at an `arc` (metres) of a curve, on its way along it."""
         turned = rotate_about_vertical(self.motion, float(curve.heading(arc)) - self.direction)
         return Arrival(move_to(turned, curve.ground_point(arc)))
 

@@ -73,6 +73,18 @@ class Ablation(PriorTable):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Follow(PriorTable, ComparedTable):
+    """Curves walked by densities with the solver, and by motion matching over the clips that they were trained on."""
+
+    work = "mapctl.commands.bench.follow"
+
+    data: options.MaybeDataFolder = None
+    """The folder that was trained on, for motion matching; without it that is left out."""
+    count: options.Count = 3
+    """Walks of each curve."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class FreeRun(PriorTable, ComparedTable):
     """8 random motions of 10,000 frames beside the training data."""
 
@@ -337,9 +349,31 @@ class Bench(Command):
     """Cost of the solver on this machine (`mapctl bench` alone), and what the jobs are worth: a table each."""
 
 
-TABLES: dict[str, type[Table]] = {
+@dataclass(frozen=True, kw_only=True)
+class AllTables(Command):
+    """Make every table of the documentation again, one after the other, and say which figures moved.
+
+    OUT/TABLE.json holds a table with its command, date, commit and machine, OUT/TABLE.md what a page shows of it.
+    Tables that were made by the same command at the same commit are skipped, so that an interrupted run goes on.
+    """
+
+    work = "mapctl.commands.bench.every.run"
+    single_thread = False  # each table is a process of its own, which sees to that
+
+    data: options.DataFolder
+    """The folder that the bundled models were trained on."""
+    out: options.OutFolder
+    """Folder for the tables; what it holds of an earlier run is what figures are compared with."""
+    only: Annotated[str, arg(metavar="TABLE,TABLE,...")] = ""
+    """Only these tables."""
+    again: bool = False
+    """Make tables again that are up to date."""
+
+
+TABLES: dict[str, type[Command]] = {
     "speed": Speed,
     "ablation": Ablation,
+    "follow": Follow,
     "free-run": FreeRun,
     "generation": Generation,
     "why": Why,
@@ -355,5 +389,6 @@ TABLES: dict[str, type[Table]] = {
     "timing": Timing,
     "shots": Shots,
     "training": Training,
+    "all": AllTables,
 }
 """By the name the user types; the first is what `mapctl bench` alone measures."""

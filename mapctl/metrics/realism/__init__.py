@@ -61,7 +61,7 @@ class RealismSettings:
     classifier: ClassifierSettings = field(default_factory=ClassifierSettings)
     """Settings of the network that tells the sets apart."""
     dims: int = 32
-    """Principal components of mocap's windows in which the Frechet distance is taken."""
+    """Number of principal components of mocap's windows in which the Frechet distance is taken."""
 
     def __post_init__(self):
         if self.dims < 1:
@@ -78,17 +78,19 @@ class Realism:
     """How made motion compares with mocap."""
 
     accuracy: float
-    """Balanced held-out accuracy of the network, made against mocap; 0.5 is perfect, 1 is told apart every time."""
+    """Balanced held-out accuracy of the network, made against mocap, a share: 0.5 is perfect, 1 is told apart every
+    time."""
     floor_accuracy: float
-    """Balanced held-out accuracy of the network, one half of the mocap's clips against the other."""
+    """Balanced held-out accuracy of the network, one half of the mocap's clips against the other, a share likewise."""
     preferred: float
     """Share of pairs of a made and a mocap window in which the network rather takes the made one for mocap."""
     floor_preferred: float
-    """The same for the halves of the mocap."""
+    """The same share for the halves of the mocap."""
     frechet: float
     """Frechet distance of made windows to mocap's, no unit: coordinates are in mocap's standard deviations."""
     floor_frechet: float
-    """Frechet distance between the halves, in the same coordinates; halves are smaller sets, which adds to it."""
+    """Frechet distance between the halves, in the same coordinates without unit; halves are smaller sets, which adds to
+    it."""
     made_windows: int
     """Number of windows of the made clips."""
     mocap_windows: int

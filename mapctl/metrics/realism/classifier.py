@@ -21,17 +21,18 @@ class ClassifierSettings:
     folds: int = 4
     """Number of parts of the clips; each is held out once while a network learns on the others."""
     steps: int = 400
-    """Optimiser steps of each network, so that large sets cost no more than small ones. More make a stricter judge."""
+    """Number of optimiser steps of each network, so that large sets cost no more than small ones. More make a stricter
+    judge."""
     batch: int = 64
-    """Windows a step, half from each set."""
+    """Number of windows a step, half from each set."""
     width: int = 48
-    """Channels of each convolution."""
+    """Number of channels of each convolution."""
     dropout: float = 0.3
     """Share of activations that are dropped in training."""
     learning_rate: float = 1e-3
-    """Learning rate of AdamW."""
+    """Learning rate of AdamW, a number without unit."""
     weight_decay: float = 1e-2
-    """Weight decay of AdamW."""
+    """Weight decay of AdamW, a number without unit."""
 
     def __post_init__(self):
         for name, least in (("folds", 2), ("steps", 1), ("batch", 2), ("width", 1)):

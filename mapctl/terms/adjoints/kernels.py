@@ -75,6 +75,41 @@ def add_contact(points, before, planted, pair, fps, sigmas, rest_heights, doubt,
 
 
 @entry
+def add_landing(points, before, pair, fps, sigmas, energy, d_points):
+    """Accelerations of two points beyond what is free, over a sigma; added to the energies. `before` (0 to 2 frames,
+    points, 3) comes before the window; without it the first frames have no acceleration."""
+    known, squared = len(before), fps * fps
+    for b in range(len(points)):
+        for t in range(max(0, 2 - known), points.shape[1]):
+            for side in range(2):
+                point, size = pair[side], 1e-9
+                for k in range(3):
+                    size += acceleration_of(points, before, b, t, point, k) ** 2
+                size = squared * math.sqrt(size)
+                beyond = (size - sigmas[0]) / sigmas[1]
+                if beyond <= 0.0:
+                    continue
+                energy[b, t] += 0.5 * beyond * beyond
+                for k in range(3):
+                    pull = beyond / sigmas[1] * squared * squared / size
+                    pull *= acceleration_of(points, before, b, t, point, k)
+                    d_points[b, t, point, k] += pull
+                    if t > 0:
+                        d_points[b, t - 1, point, k] -= 2.0 * pull
+                    if t > 1:
+                        d_points[b, t - 2, point, k] += pull
+
+
+@inner
+def acceleration_of(points, before, b, t, point, k):
+    """Second difference of a point along an axis, metres, from frames that are known."""
+    now, known = np.float64(points[b, t, point, k]), len(before)
+    last = np.float64(points[b, t - 1, point, k]) if t > 0 else np.float64(before[known - 1, point, k])
+    earlier = np.float64(points[b, t - 2, point, k]) if t > 1 else np.float64(before[known - 2 + t, point, k])
+    return now - 2.0 * last + earlier
+
+
+@entry
 def add_root_velocity(ground, start, known, weights, velocities, units, fps, energy, d_ground):
     """The low-pass velocity is the target's. `known` and `weights` are the smoother's part of the past and of the
     window, `units` (frames, 2, 2) the axes of the error over their sigmas."""

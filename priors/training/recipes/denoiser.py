@@ -42,7 +42,7 @@ class DenoiserSettings:
     """Weight of the joints' velocity error, cm a frame; that of the position error, cm, is 1."""
     feet: float = 0.5
     """Weight of the planted toes' error in velocity, cm a frame."""
-    angles: float = 10.0
+    angles: float = 20.0
     """Weight of the error of the angles, radians: what turns about its own bone moves no joint."""
     contacts: float = 0.5
     """Weight of the contacts' cross entropy, nats."""

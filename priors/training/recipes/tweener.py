@@ -1,7 +1,8 @@
 """Training of the generator of long in-betweens by distances (Zhou et al. 2020, sections 3.4 to 3.6, appendix C).
 
-Half of each batch are windows of one clip, whose truth is known; half are spliced of several, of which only keys and
-style are. There is no critic: what lies between keys of different clips is held by what the generator learnt in others.
+Part of each batch are windows of one clip, whose truth is known; the others (`TweenerSettings.spliced`) are spliced of
+several, of which only keys and style are. What lies between keys of different clips is held by what the generator
+learnt in windows of one, and by critics only where a run asks for them (`--critic-from`).
 """
 
 from collections.abc import Sequence

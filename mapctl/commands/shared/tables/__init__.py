@@ -27,13 +27,17 @@ def print_records(records: Sequence[Mapping[str, object]], *, title: str | None 
     print_table(columns, [[record.get(name) for name in columns] for record in records], title=title)
 
 
-def print_markdown(records: Sequence[Mapping[str, object]]) -> None:
+def format_markdown(records: Sequence[Mapping[str, object]]) -> str:
     """A table of rows by column name as Markdown has it, with three digits; what a row lacks is left empty."""
     columns = list(dict.fromkeys(name for record in records for name in record))
-    print(f"| {' | '.join(columns)} |")
-    print("|" + "---|" * len(columns))
-    for record in records:
-        print(f"| {' | '.join(_format_short(record.get(name)) for name in columns)} |")
+    rows = [[_format_short(record.get(name)) for name in columns] for record in records]
+    lines = [columns, ["---"] * len(columns), *rows]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def print_markdown(records: Sequence[Mapping[str, object]]) -> None:
+    """Print rows by column name as Markdown has a table."""
+    print(format_markdown(records), end="")
 
 
 def _format_short(value: object) -> str:

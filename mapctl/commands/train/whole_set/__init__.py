@@ -40,7 +40,8 @@ class TrainAll(Command):
     jobs: options.Count = 1
     """Models that are trained at once, each by a process of one thread: as many as there are cores pay."""
     minutes: options.Number = 360.0
-    """Of one core that a model takes at most; its learning rate is then brought to its end."""
+    """Minutes of one core that a model takes at most; its learning rate is then brought to its end. Densities have a
+    number of steps instead."""
     quiet: bool = False
     """No lines of the models' own, but for what is wrong."""
     commands: bool = False

@@ -1,0 +1,42 @@
+"""The tables of the documentation: the command that makes each."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from mapctl.errors import RequestError
+
+_DATA = "DATA"
+_PLAN = {
+    "speed": "speed",
+    "follow": "follow --data DATA --baselines free/locomotion",
+    "ablation": "ablation",
+    "steer": "steer",
+    "steer-targets": "steer --targets",
+    "generation": "generation --data DATA",
+    "why": "why --data DATA --steps 2000",
+    "free-run": "free-run",
+    "shots": "shots",
+    "denoise": "denoise --data DATA --count 30",
+    "infill": "infill --data DATA --count 30",
+    "gaps": "gaps --data DATA",
+    "transitions": "transitions --data DATA --stitcher stitcher",
+    "tween": "tween --data DATA",
+    "tweener": "tweener --data DATA",
+    "timing": "timing --data DATA",
+    "live": "live",
+}
+"""Words after `mapctl bench`, by table."""
+
+
+def list_tables(only: str) -> list[str]:
+    """List the tables that are asked for, in the plan's order; RequestError names those that there are."""
+    asked = [name.strip() for name in only.split(",") if name.strip()]
+    unknown = [name for name in asked if name not in _PLAN]
+    if unknown:
+        raise RequestError(f"there is no table {unknown[0]!r}; there are {', '.join(_PLAN)}")
+    return [name for name in _PLAN if not asked or name in asked]
+
+
+def list_words(table: str, data: Path | str = _DATA) -> Sequence[str]:
+    """List the words of a table's command after `mapctl`, with the folder of clips put in."""
+    return ["bench", *(str(data) if word == _DATA else word for word in _PLAN[table].split())]
