@@ -19,8 +19,9 @@ ALL = [(page, line) for page in pages.PAGES for line in pages.commands(page)]
 INLINE = [line for page in pages.PAGES for line in pages.inline_commands(page)]
 NOT_RUN = re.compile(r"mapctl (live|bench|demo|train all)\b|DATA|ADDRESS")
 LONG = re.compile(
-    r"mapctl (run|chain|train (refiner|.* (mocap|everything)/)|tween (docs|.*(120|LeftHand)$))|example:"
-    "|--(causal|best-of|variations|reference|jobs|root-only|suggest-timing|init)|auto|denoise .*--video|7s:8.5s"
+    r"mapctl (run|chain|train (refiner|.* (mocap|everything)/)|tween (docs|.*(120|LeftHand)$))"
+    "|--(causal|best-of|variations|reference|jobs|root-only|suggest-timing|init)|auto|denoise (.*--video|example:)"
+    "|7s:8.5s"
 )
 # Tutorials are followed step by step where the site is built (docs/extensions/followed_tutorials.py).
 PYTHON = [block for page in pages.PAGES if "tutorials" not in page for block in pages.blocks(page, "python")]
