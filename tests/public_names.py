@@ -144,6 +144,7 @@ PUBLIC: dict[str, tuple[str, ...]] = {
         "use_weights",
     ),
     "priors.checkpoints": ("Card",),
+    "priors.markov_gaussian": ("MarkovGaussian",),
     "mapctl.motion_dna": ("MotionDna", "join", "of"),
     # protocols of models
     "mapctl.protocols": (
