@@ -257,7 +257,8 @@ PUBLIC: dict[str, tuple[str, ...]] = {
     "scenes.film": ("ENDINGS", "draw_strips_to", "film"),
     "scenes.scene_file": ("SceneObstacle",),
     "scenes.drawn_character": ("DrawnCharacter", "DrawnMotion"),
-    "scenes.wishes": ("Wishes",),
+    "scenes.props": ("build_obstacle", "build_target"),
+    "scenes.wishes": ("Mark", "Wishes"),
     # errors
     "mapctl.errors": (
         "CheckpointError",
