@@ -40,9 +40,9 @@ demo: $(READY)
 	$(VENV)/mapctl demo -o demo-out
 
 # Two threads on small matrices fight each other: one is faster.
-test test-all bench: export OMP_NUM_THREADS = 1
-test test-all bench: export MKL_NUM_THREADS = 1
-test test-all bench: export OPENBLAS_NUM_THREADS = 1
+test test-all bench docs: export OMP_NUM_THREADS = 1
+test test-all bench docs: export MKL_NUM_THREADS = 1
+test test-all bench docs: export OPENBLAS_NUM_THREADS = 1
 # Test files compiled anew cost each process 20 s.
 unexport PYTHONDONTWRITEBYTECODE
 

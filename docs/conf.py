@@ -20,8 +20,30 @@ extensions = [
     "sphinx-mathjax-offline",
     "sphinx_copybutton",
     "sphinx_design",
+    "sphinx_gallery.gen_gallery",
 ]
-exclude_patterns = ["_build"]
+# The gallery's scripts become pages in auto_gallery.
+exclude_patterns = ["_build", "gallery"]
+
+sphinx_gallery_conf = {
+    "examples_dirs": "gallery",
+    "gallery_dirs": "auto_gallery",
+    # Every script runs at every build: those that use the library rot with it, whether they have changed or not.
+    "filename_pattern": "",
+    "run_stale_examples": True,
+    "within_subsection_order": "example_gallery.ReadingOrder",
+    "image_scrapers": ("example_gallery.show_pictures", "matplotlib"),
+    "reset_modules": ("matplotlib", "example_gallery.tidy_up"),
+    "reset_modules_order": "both",
+    "thumbnail_size": (320, 180),
+    "capture_repr": (),
+    # Scripts are there to be read and downloaded; the rest is clutter.
+    "download_all_examples": False,
+    "notebook_extensions": set(),
+    "min_reported_time": 3600,
+    "write_computation_times": False,
+    "show_signature": False,
+}
 
 myst_enable_extensions = ["colon_fence", "dollarmath", "deflist"]
 myst_heading_anchors = 4
@@ -35,3 +57,5 @@ maximum_signature_line_length = 100
 
 html_theme = "furo"
 html_title = "mapctl"
+html_static_path = ["static"]
+html_css_files = ["gallery.css"]

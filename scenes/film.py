@@ -1,4 +1,4 @@
-"""Films of motions: MP4, GIF, and a PNG contact sheet. Files appear whole or not at all."""
+"""Films of motions: MP4, GIF, WebP, and a PNG contact sheet. Files appear whole or not at all."""
 
 import logging
 from collections.abc import Callable, Iterator, Sequence
@@ -20,9 +20,9 @@ from scenes.content import Painter
 from scenes.renderers import STICK_FIGURES
 from scenes.renderers.select import RendererName, select_painter
 from scenes.stage import Shot, Stage
-from scenes.writers import gif_writer, mp4_writer, save_png
+from scenes.writers import gif_writer, mp4_writer, save_png, webp_writer
 
-WRITERS = {".mp4": mp4_writer, ".gif": gif_writer}
+WRITERS = {".mp4": mp4_writer, ".gif": gif_writer, ".webp": webp_writer}
 ENDINGS = (*WRITERS, ".png")
 """Endings that `film` can write."""
 _MIN_PIXELS, _MAX_PIXELS = 16, 8192
@@ -46,8 +46,8 @@ def film(
 
     `actors` are Shots, or tuples (motion, curve, colour, start seconds, wishes, drawn) of which all but the motion may
     be left out. Where stick figures are drawn a character is one of them, and a line is logged that says so. `out` is a
-    path or several, each ending in .mp4, .gif or .png (a contact sheet: ghosts along the trajectory over a row of
-    stills). Each frame of the motions is one frame of the film unless `fps` resamples them. `size` is the width and
+    path or several, each ending in .mp4, .gif, .webp or .png (a contact sheet: ghosts along the trajectory over a row
+    of stills). Each frame of the motions is one frame of the film unless `fps` resamples them. `size` is the width and
     height in pixels (MP4 rounds up to even). `props` are what stands around (`scenes.props`). `progress` is called with
     frames done and all frames. `renderer` is that of `scenes.renderers.select.select_painter`. RequestError for
     endings, sizes and paths that cannot be.

@@ -30,7 +30,7 @@ def build_obstacle(obstacle: Obstacle) -> Surface:
 
 
 def build_target(place: tuple[float, float, float]) -> Surface:
-    """Build a small ball at a place that a hand or a foot is to reach."""
+    """Build a small ball at a place (x, y, z), metres, that a hand or a foot is to reach."""
     vertices, faces = unit_sphere()
     return _make_plain(_TARGET_RADIUS * vertices + np.array(place), faces)
 

@@ -20,7 +20,7 @@ from mapctl.intent.shot_keys import ShotKey
 from mapctl.mesh import colours
 from scenes.cameras import CameraSettings
 
-_FILMS, _MOTIONS, _REPORTS = (".mp4", ".gif", ".png"), tuple(formats.WRITERS), (".json",)
+_FILMS, _MOTIONS, _REPORTS = (".mp4", ".gif", ".webp", ".png"), tuple(formats.WRITERS), (".json",)
 _ENDINGS = (*_FILMS, *_MOTIONS, *_REPORTS)
 _MAX_SECONDS = 3600.0
 _STAY = "line:1"  # of an actor without a curve, who stands at its beginning
@@ -144,7 +144,7 @@ class SceneDescription:
     actors: Annotated[tuple[Actor, ...], Field(min_length=1, max_length=100)]
     """Actors, one [[actors]] table each."""
     outputs: Annotated[tuple[str, ...], Field(min_length=1)]
-    """File names: .mp4, .gif, .png of all; .bvh, .npz, one an actor; .json for the report."""
+    """File names: .mp4, .gif, .webp, .png of all; .bvh, .npz, one an actor; .json for the report."""
     title: str = ""
     """Description for people."""
     prior: str = "locomotion"

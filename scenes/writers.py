@@ -1,11 +1,13 @@
-"""Pictures into files: MP4 (H.264), GIF and PNG."""
+"""Pictures into files: MP4 (H.264), GIF, WebP and PNG."""
 
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from fractions import Fraction
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -19,10 +21,25 @@ _QUALITY = {"crf": "19", "preset": "veryfast"}
 _BT709 = 1
 """Code of the HD colour standard in the stream's tags; players that find none guess by the picture's size."""
 _GIF_COLOURS = 255
-_GIF_FPS = 50
-"""Browsers slow down GIFs that are faster."""
-_GIF_PIXELS = 6e8
-"""A GIF is held in memory until it is written."""
+_LOOP_FPS = 50
+"""Browsers slow down loops of pictures that are faster."""
+
+
+@dataclass(frozen=True)
+class _Loop:
+    """A format of pictures that repeat for ever. All are held in memory until they are written."""
+
+    name: str
+    """Name of the format."""
+    tick: int
+    """Milliseconds in which it counts."""
+    most_pixels: int
+    """Pixels that all pictures may have together."""
+    quality: int = 0
+    """Quality, 0 to 100, where the format loses some."""
+
+
+_GIF, _WEBP = _Loop("GIF", 10, 600_000_000), _Loop("WebP", 1, 200_000_000, quality=75)
 
 
 @contextmanager
@@ -59,25 +76,47 @@ def gif_writer(path: Path, size: tuple[int, int], fps: Fraction) -> Iterator[Wri
     pictures a second only every second, third, ... is kept. RequestError when it outgrows 600 megapixels.
     """
     image = _import_package("PIL.Image")
-    stride, count, pictures = math.ceil(fps / _GIF_FPS), 0, []
+    with _loop_writer(_GIF, lambda picture, first: _quantize(image, picture, first), path, size, fps) as write:
+        yield write
+
+
+@contextmanager
+def webp_writer(path: Path, size: tuple[int, int], fps: Fraction) -> Iterator[Write]:
+    """Yield a function that adds a picture to a looping WebP, in all colours.
+
+    WebP counts in milliseconds; the delays alternate so that the whole keeps its time. Over 50 pictures a second only
+    every second, third, ... is kept. RequestError when it outgrows 200 megapixels.
+    """
+    image = _import_package("PIL.Image")
+    with _loop_writer(_WEBP, lambda picture, _: image.fromarray(picture), path, size, fps) as write:
+        yield write
+
+
+@contextmanager
+def _loop_writer(
+    form: _Loop, prepare: Callable[[Array, Any], Any], path: Path, size: tuple[int, int], fps: Fraction
+) -> Iterator[Write]:
+    """Yield a function that adds a picture, as `prepare` makes it of one and of the first that it made."""
+    stride, count, pictures = math.ceil(fps / _LOOP_FPS), 0, []
 
     def write(picture: Array) -> None:
         nonlocal count
         count += 1
         if (count - 1) % stride == 0:
-            _check_gif_size(len(pictures) + 1, size)
-            pictures.append(_quantize(image, picture, pictures[0] if pictures else None))
+            _check_loop_size(form, len(pictures) + 1, size)
+            pictures.append(prepare(picture, pictures[0] if pictures else None))
 
     yield write
-    ends = [round(100 * min((k + 1) * stride, count) / fps) for k in range(len(pictures))]
-    delays = [10 * max(stop - start, 1) for start, stop in zip([0, *ends], ends, strict=False)]
-    pictures[0].save(path, format="GIF", save_all=True, append_images=pictures[1:], duration=delays, loop=0)
+    ends = [round(1000 // form.tick * min((k + 1) * stride, count) / fps) for k in range(len(pictures))]
+    delays = [form.tick * max(stop - start, 1) for start, stop in zip([0, *ends], ends, strict=False)]
+    first, *others = pictures
+    first.save(path, form.name, save_all=True, append_images=others, duration=delays, loop=0, quality=form.quality)
 
 
-def _check_gif_size(pictures: int, size: tuple[int, int]) -> None:
-    most = int(_GIF_PIXELS) // (size[0] * size[1])
+def _check_loop_size(form: _Loop, pictures: int, size: tuple[int, int]) -> None:
+    most = form.most_pixels // (size[0] * size[1])
     if pictures > most:
-        raise RequestError(f"a GIF of {size[0]}x{size[1]} can have {most} pictures; shrink it or write an MP4")
+        raise RequestError(f"a {form.name} of {size[0]}x{size[1]} can have {most} pictures; shrink it or write an MP4")
 
 
 def _quantize(image, picture: Array, first):

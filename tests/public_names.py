@@ -144,6 +144,7 @@ PUBLIC: dict[str, tuple[str, ...]] = {
         "use_weights",
     ),
     "priors.checkpoints": ("Card",),
+    "priors.markov_gaussian": ("MarkovGaussian",),
     "mapctl.motion_dna": ("MotionDna", "join", "of"),
     # protocols of models
     "mapctl.protocols": (
@@ -256,7 +257,8 @@ PUBLIC: dict[str, tuple[str, ...]] = {
     "scenes.film": ("ENDINGS", "draw_strips_to", "film"),
     "scenes.scene_file": ("SceneObstacle",),
     "scenes.drawn_character": ("DrawnCharacter", "DrawnMotion"),
-    "scenes.wishes": ("Wishes",),
+    "scenes.props": ("build_obstacle", "build_target"),
+    "scenes.wishes": ("Mark", "Wishes"),
     # errors
     "mapctl.errors": (
         "CheckpointError",

@@ -120,22 +120,34 @@ def test_fps_resamples_and_keeps_the_duration(tmp_path):
     assert (len(frames), rate) == (7, 6)
 
 
+@pytest.mark.parametrize("ending", [".gif", ".webp"])
 @pytest.mark.parametrize(("fps", "shown"), [(30, 12), (120, 4)])
-def test_a_gif_keeps_the_motions_time(fps, shown, tmp_path):
-    film([Shot(walk(12, fps=fps))], tmp_path / "walk.gif", size=SMALL, renderer="stick")
-    with Image.open(tmp_path / "walk.gif") as gif:
+def test_a_loop_keeps_the_motions_time(fps, shown, ending, tmp_path):
+    path = tmp_path / f"walk{ending}"
+    film([Shot(walk(12, fps=fps))], path, size=SMALL, renderer="stick")
+    with Image.open(path) as loop:
         delays = []
-        for k in range(gif.n_frames):
-            gif.seek(k)
-            delays.append(gif.info["duration"])
-        assert (gif.size, gif.n_frames, gif.info["loop"]) == (SMALL, shown, 0)
+        for k in range(loop.n_frames):
+            loop.seek(k)
+            loop.load()  # without which a WebP says the delay of the picture before
+            delays.append(loop.info["duration"])
+        assert (loop.size, loop.n_frames, loop.info["loop"]) == (SMALL, shown, 0)
     assert sum(delays) == pytest.approx(1000 * 12 / fps, abs=10)
     assert min(delays) >= 20
 
 
+def test_a_webp_shows_what_was_drawn(tmp_path):
+    stage, camera = Stage([Shot(walk(12))]), CameraSettings("follow")
+    film([Shot(walk(12))], tmp_path / "walk.webp", size=(320, 180), renderer="stick", camera=camera)
+    drawn = select_painter("stick").paint(stage.views(camera, (320, 180))[5], stage.content(5))
+    with Image.open(tmp_path / "walk.webp") as webp:
+        webp.seek(5)
+        assert np.abs(np.asarray(webp.convert("RGB")).astype(int) - drawn).mean() < 4
+
+
 def test_several_outputs_come_from_one_call_and_progress_counts_frames(tmp_path):
     seen = []
-    outputs = [tmp_path / name for name in ("a.mp4", "a.gif", "a.png")]
+    outputs = [tmp_path / name for name in ("a.mp4", "a.gif", "a.webp", "a.png")]
     film([Shot(walk(4))], outputs, size=SMALL, renderer="stick", progress=lambda done, of: seen.append((done, of)))
     assert all(path.stat().st_size > 100 for path in outputs)
     assert seen == [(k, 4) for k in (1, 2, 3, 4)]
@@ -176,7 +188,11 @@ def test_feet_that_stand_are_marked_and_others_are_not():
 
 @pytest.mark.parametrize(
     ("out", "size", "words"),
-    [("a.avi", SMALL, "allowed: .mp4, .gif, .png"), ("gone/a.mp4", SMALL, "does not exist"), ("a.mp4", (4, 4), "size")],
+    [
+        ("a.avi", SMALL, "allowed: .mp4, .gif, .webp, .png"),
+        ("gone/a.mp4", SMALL, "does not exist"),
+        ("a.mp4", (4, 4), "size"),
+    ],
 )
 def test_impossible_outputs_are_refused_before_any_work(out, size, words, tmp_path):
     with pytest.raises(RequestError, match=words):

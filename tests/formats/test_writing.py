@@ -21,7 +21,7 @@ from mapctl.formats.bvh.stream import open_bvh_stream
 from priors import checkpoints
 from priors.tensor_files import write_tensors
 from priors.training import run_files
-from scenes.writers import gif_writer, mp4_writer, save_png
+from scenes.writers import gif_writer, mp4_writer, save_png, webp_writer
 
 MOTION = walk(150)
 PICTURE = np.random.default_rng(0).integers(0, 255, (240, 320, 3), dtype=np.uint8)
@@ -63,6 +63,7 @@ WRITERS = {
     "stream.bvh": _stream,
     "a.mp4": _film(mp4_writer),
     "a.gif": _film(gif_writer),
+    "a.webp": _film(webp_writer),
     "a.png": lambda path: save_png(path, PICTURE),
     "a.json": lambda path: report.write_report({"values": list(range(9000))}, path),
     "a.safetensors": lambda path: write_tensors(path, TENSORS),

@@ -35,7 +35,7 @@ class Blend(ModelCommand):
     rig: options.MaybeRig = None
     """The rig of IN, where it is not the one that would be recognised; see `mapctl info IN`."""
     video: options.MaybeFile = None
-    """Film of the given motion and the new one side by side: .mp4, .gif or .png."""
+    """Film of the given motion and the new one side by side: .mp4, .gif, .webp or .png."""
     strict: bool = False
     """Exit with status 3 where not all that was requested holds: a margin too short for the limb."""
     quiet: bool = False

@@ -40,6 +40,6 @@ class Chain(ModelCommand):
     path: options.MaybeName = None
     """The file or run folder of the path predictor that the tweener was trained with; the bundled one if not given."""
     video: options.MaybeFile = None
-    """Film of the motion: .mp4, .gif or .png."""
+    """Film of the motion: .mp4, .gif, .webp or .png."""
     quiet: bool = False
     """No summary and no progress bar."""

@@ -46,7 +46,7 @@ class Denoise(ModelCommand):
     plot: options.MaybeFile = None
     """PNG of joint angles before and after, and of the feet."""
     video: options.MaybeFile = None
-    """Film of the capture and the result side by side: .mp4, .gif or .png."""
+    """Film of the capture and the result side by side: .mp4, .gif, .webp or .png."""
     jobs: options.Count = 1
     """For a folder: number of files at once, each in a process of its own."""
     cluster: Annotated[str | None, arg(metavar="local|ADDRESS")] = None

@@ -49,7 +49,7 @@ class FollowCurve(ModelCommand):
     prices: bool = False
     """Solve again without each wish, and tell what it costs the others."""
     video: options.MaybeFile = None
-    """Film of the walk: .mp4, .gif or .png (contact sheet)."""
+    """Film of the walk: .mp4, .gif, .webp or .png (contact sheet)."""
     character: options.MaybeCharacter = None
     """File of a skinned character, as .glb or .vrm, that the film shows in place of the mannequin; the motion stays
     that of --rig."""

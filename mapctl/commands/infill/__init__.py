@@ -58,7 +58,7 @@ class Infill(ModelCommand):
     report: options.MaybeFile = None
     """JSON with the gaps, contacts, ledger, measures and compute."""
     video: options.MaybeFile = None
-    """Film of the given motion and the filled one side by side: .mp4, .gif or .png."""
+    """Film of the given motion and the filled one side by side: .mp4, .gif, .webp or .png."""
     seed: options.Count = 0
     """Seed of what rollouts sample."""
     strict: bool = False

@@ -18,7 +18,7 @@ class Render(Command):
     source: options.InFile
     """.bvh, .npz, or .amc with its .asf beside it."""
     out: options.OutFile
-    """.mp4, .gif or .png."""
+    """.mp4, .gif, .webp or .png."""
     curve: options.MaybeCurve = None
     """Curve drawn on the ground: circle:4, a CSV, an SVG (see `mapctl follow --help`)."""
     character: options.MaybeCharacter = None

@@ -71,8 +71,8 @@ class Tween(ModelCommand):
     report: options.MaybeFile = None
     """JSON with the keys, the errors at them, contacts, ledger, measures, compute and suggested timing."""
     video: options.MaybeFile = None
-    """Film of the given motion and the new one side by side: .mp4, .gif or .png. Of variations a .png: a row of stills
-    of each, under the name of its style."""
+    """Film of the given motion and the new one side by side: .mp4, .gif, .webp or .png. Of variations a .png: a row of
+    stills of each, under the name of its style."""
     strict: bool = False
     """Exit with status 3 where not all that was requested holds: keys too close in time, limbs out of reach."""
     quiet: bool = False

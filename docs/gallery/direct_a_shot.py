@@ -1,0 +1,40 @@
+"""
+Direct a shot
+=============
+
+A shot has several wishes that hold at once: here to set off from a stand, touch a ball with the left hand in passing,
+walk round a pillar that stands in the way, and come to a stop.
+"""
+
+import mapctl
+import priors
+from controllers.shots.request import Reach, ShotRequest
+from controllers.shots.shot import solve_shot
+from mapctl.curves.obstacles import Obstacle
+from scenes import CameraSettings, Shot
+from scenes.film import film
+from scenes.props import build_obstacle, build_target
+from scenes.wishes import Mark, Wishes
+
+ball, pillar = (0.4, 1.25, 1.6), Obstacle(place=(0.05, 3.3), radius=0.3)
+request = ShotRequest(
+    mapctl.curves.line(length=4.6),
+    stand_at_start=True,
+    stand_at_end=True,
+    reaches=(Reach(seconds=2.2, places={"leftHand": ball}, hold_seconds=0.2),),
+    obstacles=(pillar,),
+)
+shot = solve_shot(priors.load("locomotion"), priors.load_transformer(), request)
+
+# %%
+# Each wish, with what was asked and what came of it. Where one cannot hold, the status names what is against it.
+
+for wish in shot.wishes:
+    print(f"{wish.name} ({wish.asked}): {wish.got:.1f} {wish.unit}")
+
+# %%
+# The way (red) is led round the pillar before anything is walked. The ball shines while it is to be touched.
+
+actor = Shot(shot.motion, shot.way.curve, wishes=Wishes([Mark(build_target(ball), (2.2, 2.4))]))
+camera, props = CameraSettings(azimuth_deg=65), [build_obstacle(pillar)]
+film([actor], "reach-and-walk-round-a-pillar.webp", camera=camera, props=props, size=(480, 270), fps=15)
