@@ -14,6 +14,7 @@ version = release = __version__
 
 extensions = [
     "command_options",
+    "followed_tutorials",
     "readable_signatures",
     "myst_parser",
     "sphinx.ext.autodoc",
