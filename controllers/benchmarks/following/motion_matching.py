@@ -1,5 +1,5 @@
-"""Motion matching along a curve: what a game would use instead of a density and a solver (Clavet 2016; features and
-weights as in Holden et al. 2020, section 3).
+"""Motion matching along a curve: what a game would use instead of a density and a solver (Clavet 2016; features as in
+Holden et al. 2020, section 3, with the weights of their published demo).
 
 Capture is played; five times a second the frame whose pose is nearest to the one that is played, and whose next second
 is nearest to the curve ahead, is searched among all, and what jumps then fades (inertialisation, Bollo 2018). The root
