@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 from mapctl import report
 from mapctl.commands.shared.tables import format_markdown
@@ -117,7 +117,7 @@ def _name_rows(rows: Sequence[Mapping[str, Any]]) -> dict[str, Mapping[str, Any]
     return named
 
 
-def _is_number(value: object) -> bool:
+def _is_number(value: object) -> TypeGuard[float]:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
