@@ -36,4 +36,4 @@ camera = CameraSettings(azimuth_deg=0)
 film([shots[0], shots[4]], "without-and-with-a-swarm.webp", camera=camera, size=(480, 270), fps=15)
 
 # %%
-# The film shows seed 0. On gentle curves a swarm gains nothing, so the zero start is the default.
+# The film shows seed 0. On gentle curves a swarm gains nothing (:doc:`/reference/results`): zero start is the default.
