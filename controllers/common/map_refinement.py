@@ -43,7 +43,7 @@ _DRIFT_SIGMA_FRAMES = 3.0  # frames, sigma, over which the motion of planted toe
 class RefinementSettings:
     """Sigmas and search of MAP refinement."""
 
-    footing: FootContact = field(default_factory=lambda: FootContact(0.1, 0.03, 0.02, heels=None, landing=None))
+    footing: FootContact = field(default_factory=lambda: FootContact(0.1, 0.03, 0.02, heels=None))
     """Contact term; its rest height becomes the performer's own. Loose, since mocap's planted toes move by 6 cm/s, and
     not every floor is level."""
     jerk: Jerk | None = None

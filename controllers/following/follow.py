@@ -21,7 +21,7 @@ from mapctl.problem.solution import Outcome, Solution, Status
 from mapctl.problem.window_solvers import LatentNoiseSolver, SingleWindowSolver
 from mapctl.protocols import Density
 from mapctl.skeleton import CANONICAL, Skeleton
-from mapctl.terms import FootContact, LatentPrior, Path, Term
+from mapctl.terms import FootContact, LandingSigmas, LatentPrior, Path, Term
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class FollowSettings:
     """Sigma of the sideways offset beyond the free sway, metres."""
     path_sigma_progress: float = Path.sigma_progress
     """Sigma of the arc behind or ahead of the requested one, metres."""
-    footing: FootContact = field(default_factory=FootContact)
+    footing: FootContact = field(default_factory=lambda: FootContact(landing=LandingSigmas()))
     """Contact term."""
     noise: LatentPrior = field(default_factory=lambda: LatentPrior(sigma=2.0))
     """Prior on the latent noise of the rollout. A well trained prior's own standard deviation is small: at sigma 1 the
@@ -47,6 +47,10 @@ class FollowSettings:
     """Solver of one window."""
     joint: str = "hips"
     """Joint that follows the curve."""
+
+    def with_rest_height(self, height: float) -> "FollowSettings":
+        """Return the settings for feet whose toe joints rest so high, metres."""
+        return replace(self, footing=replace(self.footing, rest_height=height))
 
     def scaled_to(self, character: Character) -> "FollowSettings":
         """Return the settings for a character of this size, in metres of the prior's size."""

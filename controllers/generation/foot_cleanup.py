@@ -22,7 +22,7 @@ from mapctl.problem.receding_horizon import CommittedFrames, HorizonSettings, Re
 from mapctl.problem.window_solvers import GuidedNoiseSolver
 from mapctl.protocols import Density, DensityState
 from mapctl.skeleton import CANONICAL, Skeleton
-from mapctl.terms import FootContact, LatentPrior, MotionTracking, Term
+from mapctl.terms import FootContact, LandingSigmas, LatentPrior, MotionTracking, Term
 from mapctl.terms.base import ViewedTerm
 from mapctl.terms.trial import Trial
 
@@ -39,7 +39,7 @@ class FootCleanupSettings:
     """Sigma of the trajectory's deviation over the ground within a window, metres."""
     sigma_heading: float = MotionTracking.sigma_heading
     """Sigma of the heading's deviation within a window, radians."""
-    footing: FootContact = field(default_factory=lambda: FootContact(sigma_speed=0.06))
+    footing: FootContact = field(default_factory=lambda: FootContact(sigma_speed=0.06, landing=LandingSigmas()))
     """Contact term. Mocap's planted feet move a little: perfectly still ones would be distinguishable from them."""
     window: HorizonSettings = field(default_factory=HorizonSettings)
     """Lengths of the receding horizon."""

@@ -30,7 +30,7 @@ INFILL_REFINEMENT = RefinementSettings(
     unobserved_sigma_cm=2.0,
     jerk=Jerk(sigma=150.0, frames=96),
     clearance=Clearance(),
-    footing=FootContact(0.1, 0.05, 0.05, heels=None, landing=None),
+    footing=FootContact(0.1, 0.05, 0.05, heels=None),
     budget=Budget(evaluations=16),
     lbfgs=LbfgsSettings(max_iterations=16),
 )

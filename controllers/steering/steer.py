@@ -18,18 +18,17 @@ from controllers.common.character import Character
 from controllers.common.initial_state import start_from_state
 from controllers.steering.cost import StepCost
 from controllers.steering.overlay import Overlay
+from controllers.steering.relaxed_footing import RelaxedFootingFirst
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, ground_speed
 from mapctl.intent.avoidance import lead_around
 from mapctl.intent.steering import Arrival, Command, SteeringTarget
 from mapctl.intent.steering_limits import SteeringLimits
 from mapctl.pose import decode
-from mapctl.problem.context import WindowRequest
 from mapctl.problem.ledger import Ledger
 from mapctl.problem.receding_horizon import CommittedFrames, HorizonSettings, RecedingHorizonSolver
 from mapctl.problem.solution import Outcome, Solution, Status
-from mapctl.problem.warm_start import BestOfSamples, SteeringKnots
-from mapctl.problem.window_solvers import LatentNoiseSolver, SingleWindowSolver, SolvedWindow
+from mapctl.problem.window_solvers import LatentNoiseSolver, SingleWindowSolver
 from mapctl.protocols import Density
 from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.solver.budget import Budget
@@ -42,7 +41,6 @@ _PAST_TARGET_FRAMES = 60  # past targets that are kept: more than the root veloc
 _RECENT_FRAMES = 15  # frames, half a second, over which the velocity error is measured
 _MIN_TRAVEL_SPEED = 0.3  # m/s below which the velocity has no direction
 _FAR_TURN = math.radians(75)  # beyond which a start may turn faster than the limits
-_KNOTS, _KNOT_SIGMA = 7, 0.8  # samples for a stuck character: noise of every feature, slow enough for a step
 _NEAREST_STARTS = 6  # initial states nearest to the requested speed, of which one is sampled
 
 
@@ -294,7 +292,8 @@ def _solve_step(
     settings = state.settings
     method: SingleWindowSolver = _limit_evaluations(state, settings.evaluations, seconds)
     if free:
-        method = _relax_footing_first(state, terms, seconds)
+        half = _limit_evaluations(state, settings.evaluations // 2, seconds and seconds / 2)
+        method = RelaxedFootingFirst.of(half, settings.random_starts, terms, settings.footing)
     window = HorizonSettings(frames=settings.horizon, overlap=settings.horizon - settings.commit)
     solver = RecedingHorizonSolver(state.prior, window, state.character.unit_skeleton, method=method)
     frames = len(state.committed.features) + settings.commit
@@ -308,36 +307,6 @@ def _limit_evaluations(state: SteerState, evaluations: int, seconds: float | Non
     most = max(1, evaluations)
     budget = Budget(most, seconds, evaluation_seconds=state.cost.evaluation)
     return LatentNoiseSolver(rounds=1, lbfgs=LbfgsSettings(max_iterations=most), budget=budget)
-
-
-def _relax_footing_first(state: SteerState, terms: Sequence[Term], seconds: float | None) -> "_RelaxedFootingFirst":
-    """Build the solver for a stuck character: all samples, and half of the evaluations twice, as far as there is
-    time."""
-    settings, half_seconds = state.settings, seconds and seconds / 2
-    half = _limit_evaluations(state, settings.evaluations // 2, half_seconds)
-    samples = BestOfSamples(settings.random_starts, SteeringKnots(_KNOTS, tuple(LAYOUT.slices)[:-1], _KNOT_SIGMA))
-    budget = replace(half.budget, evaluations=settings.random_starts + (half.budget.evaluations or 1))
-    relaxed = replace(half, proposal=samples, budget=budget)
-    return _RelaxedFootingFirst(relaxed, half, [term for term in terms if term.name != settings.footing.name])
-
-
-@dataclass(frozen=True)
-class _RelaxedFootingFirst:
-    """Window solver that spends half on all terms but contact, from the best of some samples, and half on all terms.
-
-    A standing character has both feet planted, by contacts that are fixed while a window is solved: the contact term
-    then prevents any step. The search without it finds one, along which the prior predicts new contacts.
-    """
-
-    relaxed_method: LatentNoiseSolver
-    half: LatentNoiseSolver
-    relaxed_terms: Sequence[Term]
-
-    def __call__(self, request: WindowRequest) -> SolvedWindow:
-        request = replace(request, seconds=request.seconds / 2)
-        first = self.relaxed_method(replace(request, terms=self.relaxed_terms))
-        second = self.half(replace(request, warm_start=first.warm_start))
-        return replace(second, evaluations=first.evaluations + second.evaluations)
 
 
 def _velocity_error(state: SteerState) -> float:

@@ -58,7 +58,7 @@ class FootContact:
     """Standard deviation of the depth of any toe below its rest height, metres."""
     heels: HeelSigmas | None = field(default_factory=HeelSigmas)
     """Sigmas of the heels; None leaves them out. They are planted by the toes' contacts and the planned pose."""
-    landing: LandingSigmas | None = field(default_factory=LandingSigmas)
+    landing: LandingSigmas | None = None
     """Sigmas of the toes' acceleration; None leaves it free, as for motion that was captured."""
     rest_height: float = TOE_REST_HEIGHT
     """Height of the toe joint while the foot is flat on the ground, metres."""

@@ -18,7 +18,6 @@ from mapctl.motion import Motion
 from mapctl.problem.solution import Outcome, Solution
 from mapctl.runtime.progress import Progress
 from mapctl.skeleton import CANONICAL
-from mapctl.terms import FootContact
 from priors.lstm_gmm.density import LstmGmmDensity
 
 
@@ -89,7 +88,7 @@ def walk(
     """Solve a walk for a character of any size. Compiling or loading the fast path, once a process, is not counted."""
     prior.warm_up()
     bones = CANONICAL if character is None else character.skeleton
-    settings = None if character is None else FollowSettings(footing=FootContact(rest_height=character.toe_rest_height))
+    settings = None if character is None else FollowSettings().with_rest_height(character.toe_rest_height)
     solution = follow(
         prior,
         request.curve,

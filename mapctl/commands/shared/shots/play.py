@@ -23,7 +23,6 @@ from mapctl.motion import Motion
 from mapctl.problem.solution import Outcome
 from mapctl.protocols import Inbetweener
 from mapctl.runtime.progress import Progress
-from mapctl.terms import FootContact
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +94,7 @@ def play_shot(
     if keep_apart is not None and earlier:
         tracks = [(one.plan, one.solution.motion.root_position[:, ::2]) for one in earlier]
         plan = replace(plan, request=replace(plan.request, others=_find_others(plan, tracks, keep_apart)))
-    footing = FootContact(rest_height=plan.character.toe_rest_height)
+    follow = FollowSettings().with_rest_height(plan.character.toe_rest_height)
 
     def solve(request: ShotRequest, shown: Progress | None = None) -> ShotSolution:
         return solve_shot(
@@ -103,7 +102,7 @@ def play_shot(
             inbetweener,
             request,
             generator=torch.Generator().manual_seed(plan.actor.seed),
-            settings=ShotSettings(follow=FollowSettings(footing=footing)),
+            settings=ShotSettings(follow=follow),
             skeleton=plan.character.skeleton,
             progress=shown,
         )
