@@ -115,7 +115,7 @@ def test_models_print_one_line():
     assert len(str(tiny_tweener().card)) < 80
 
 
-@pytest.mark.parametrize("job", [controllers.follow, controllers.generate, controllers.steer.begin], ids=str)
+@pytest.mark.parametrize("job", [controllers.follow, controllers.generate, controllers.steer.begin])
 def test_help_shows_no_tensors(job):
     text = pydoc.plain(pydoc.render_doc(job))
     assert "tensor(" not in text
