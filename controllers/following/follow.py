@@ -49,7 +49,7 @@ class FollowSettings:
     """Joint that follows the curve."""
 
     def with_rest_height(self, height: float) -> "FollowSettings":
-        """Return the settings for feet whose toe joints rest so high, metres."""
+        """Return the settings for feet whose toe joints rest at this `height` over the floor, metres."""
         return replace(self, footing=replace(self.footing, rest_height=height))
 
     def scaled_to(self, character: Character) -> "FollowSettings":
