@@ -350,7 +350,7 @@ class Bench(Command):
 
 
 @dataclass(frozen=True, kw_only=True)
-class AllTables(Command):
+class AllTables(ModelCommand):
     """Make every table of the documentation again, one after the other, and say which figures moved.
 
     OUT/TABLE.json holds a table with its command, date, commit and machine, OUT/TABLE.md what a page shows of it.
@@ -358,6 +358,7 @@ class AllTables(Command):
     """
 
     work = "mapctl.commands.bench.every.run"
+    tells_licence: ClassVar[bool] = False
     single_thread = False  # each table is a process of its own, which sees to that
 
     data: options.DataFolder
@@ -370,7 +371,7 @@ class AllTables(Command):
     """Make tables again that are up to date."""
 
 
-TABLES: dict[str, type[Command]] = {
+TABLES: dict[str, type[ModelCommand]] = {
     "speed": Speed,
     "ablation": Ablation,
     "follow": Follow,

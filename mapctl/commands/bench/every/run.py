@@ -22,14 +22,15 @@ def run(command: AllTables) -> int:
     if not command.data.is_dir():
         raise RequestError(f"{command.data} is no folder of clips")
     check_folder(command.out)
+    weights = () if command.weights is None else ("--weights", command.weights)
     for number, table in enumerate(tables, start=1):
-        path, line = command.out / f"{table}.json", " ".join(["mapctl", *list_words(table)])
+        path, line = command.out / f"{table}.json", " ".join(["mapctl", *list_words(table), *weights])
         known = TableRecord.read(path)
         if known and not command.again and (known.command, known.commit) == (line, commit):
             print(f"{number}/{len(tables)} {table}: up to date")
             continue
         began = time.monotonic()
-        rows = _make(table, list_words(table, command.data))
+        rows = _make(table, [*list_words(table, command.data), *weights])
         made = TableRecord.of(line, commit, (time.monotonic() - began) / 60, rows)
         command.out.mkdir(parents=True, exist_ok=True)
         made.write(path)

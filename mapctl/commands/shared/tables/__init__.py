@@ -31,8 +31,8 @@ def format_markdown(records: Sequence[Mapping[str, object]]) -> str:
     """A table of rows by column name as Markdown has it, with three digits; what a row lacks is left empty."""
     columns = list(dict.fromkeys(name for record in records for name in record))
     rows = [[_format_short(record.get(name)) for name in columns] for record in records]
-    lines = [columns, ["---"] * len(columns), *rows]
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+    head, *body = (f"| {' | '.join(line)} |\n" for line in [columns, *rows])
+    return "".join([head, "|" + "---|" * len(columns) + "\n", *body])
 
 
 def print_markdown(records: Sequence[Mapping[str, object]]) -> None:
