@@ -100,6 +100,7 @@ def test_live_targets_are_measured(prior, monkeypatch, capsys):
     assert rows["walking on"]["toe_mps_max"] == rows["reaching in passing"]["toe_mps_max"], "legs walk on as they do"
 
 
+@pytest.mark.slow
 def test_shots_are_told_from_mocap_as_a_percentage():
     """By the real classifier, on motions that are known: those that slide are told apart, the same ones are not."""
     mocap = [walk(300).slice(start, start + 90) for start in range(0, 200, 10)]

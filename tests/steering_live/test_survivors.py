@@ -13,6 +13,7 @@ from tiny_steering import AHEAD, QUICK, begun
 from controllers.steering import loop, steer
 from controllers.steering.cost import StepCost
 from controllers.steering.loop import LoopSettings
+from controllers.steering.relaxed_footing import RelaxedFootingFirst
 from mapctl.intent.steering import Command, SteeringTarget
 from mapctl.intent.steering_limits import SteeringLimits
 from mapctl.problem.window_solvers import LatentNoiseSolver
@@ -175,5 +176,5 @@ def test_both_searches_of_who_is_stuck_share_the_windows_time(monkeypatch):
 
     monkeypatch.setattr(LatentNoiseSolver, "__call__", watched)
     terms = terms_of(1, SHORT.frames)
-    steer._RelaxedFootingFirst(METHOD, METHOD, terms)(replace(request(BEGUN, terms), seconds=8.0))
+    RelaxedFootingFirst(METHOD, METHOD, terms)(replace(request(BEGUN, terms), seconds=8.0))
     assert given == [4.0, 4.0]
