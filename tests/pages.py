@@ -3,9 +3,12 @@
 import re
 import shlex
 import shutil
+import sys
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 
+import pytest
 from acclaim import pair
 from captures import on_rig
 from character_maker import make_character_glb
@@ -35,6 +38,13 @@ _TINY = {
 }
 _NAMED_MODELS = ("--prior", "--init", "--density")
 _TRAINING = {"lstm-gmm": "--steps 2 --batch 2 --window 20 --device cpu", "refiner": "--steps 1 --batch 2 --window 10"}
+
+
+def import_extension(name: str) -> ModuleType:
+    """Import an extension of the site; the test module is skipped where the site's packages are not installed."""
+    if (folder := str(ROOT / "docs" / "extensions")) not in sys.path:
+        sys.path.append(folder)
+    return pytest.importorskip(name, reason="the site's packages are not installed")
 
 
 @dataclass(frozen=True)

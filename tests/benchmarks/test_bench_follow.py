@@ -34,9 +34,8 @@ def test_it_begins_on_the_curve_and_goes_along_it(database):
 def test_a_frame_that_is_asked_for_as_it_is_is_found(database):
     """Distances are of the same columns on both sides: a candidate's own columns have it at distance 0."""
     number = 40
-    asked = database.column_of_frame[database.frame[number]]
-    away = ((database.matched - asked) ** 2).sum(axis=1)
-    assert away[number] == 0.0
+    away, found = database.tree.query(database.columns[database.candidates[number]])
+    assert (away, found) == (0.0, number)
 
 
 def test_jumps_fade(database):

@@ -1,14 +1,11 @@
 """A page a command: each shows all options of its command, and of its sub-commands."""
 
-import sys
-
 import pages
 import pytest
 
 from mapctl.commands import COMMANDS, SUBCOMMANDS
 
-sys.path.append(str(pages.ROOT / "docs" / "extensions"))
-command_options = pytest.importorskip("command_options", reason="the site's packages are not installed")
+command_options = pages.import_extension("command_options")
 
 ALL = [[name] for name in COMMANDS if name not in SUBCOMMANDS]
 ALL += [[name, sub] for name, kinds in SUBCOMMANDS.items() for sub in kinds]

@@ -1,15 +1,13 @@
 """The site's extension for signatures: what it makes of classes and types, without a build of the site."""
 
-import sys
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
+import pages
 import pytest
-from source_files import ROOT
 
-pytest.importorskip("sphinx", reason="the site's own packages are not installed")
-sys.path.append(str(ROOT / "docs" / "extensions"))
-from readable_signatures import format_class_signature, strip_annotated
+EXTENSION = pages.import_extension("readable_signatures")
+format_class_signature, strip_annotated = EXTENSION.format_class_signature, EXTENSION.strip_annotated
 
 
 @dataclass

@@ -2,13 +2,11 @@
 picture that no step makes."""
 
 import re
-import sys
 
 import pages
 import pytest
 
-sys.path.append(str(pages.ROOT / "docs" / "extensions"))
-followed_tutorials = pytest.importorskip("followed_tutorials", reason="the site's packages are not installed")
+followed_tutorials = pages.import_extension("followed_tutorials")
 
 TUTORIALS = sorted((pages.ROOT / "docs" / "tutorials").glob("*.md"))
 

@@ -10,6 +10,7 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy
@@ -59,12 +60,11 @@ class MotionDatabase:
 
     features: Float[ndarray, "frames size"]
     """Frames of all clips in `mapctl.features.LAYOUT`."""
-    matched: Float[ndarray, "candidates columns"]
-    """Columns of the frames that may be jumped to, each group in units of its spread and times its weight."""
-    frame: ndarray
-    """Frame of each candidate, (candidates,)."""
-    column_of_frame: Float[ndarray, "frames columns"]
-    """Columns of every frame; those ahead mean nothing where a clip ends sooner."""
+    columns: Float[ndarray, "frames columns"]
+    """What frames are compared by, each group in units of its spread and times its weight; what is ahead means nothing
+    where a clip ends sooner."""
+    candidates: ndarray
+    """Frames that may be jumped to, (candidates,)."""
     scale: Float[ndarray, " columns"]
     """What a column of world units is multiplied by."""
     last: ndarray
@@ -90,12 +90,18 @@ class MotionDatabase:
         candidates = np.flatnonzero(np.arange(len(last)) + reach <= last)
         scale = _scale_groups(columns[candidates], settings)
         features = torch.cat(both).float().numpy()
-        return MotionDatabase(features, columns[candidates] * scale, candidates, columns * scale, scale, last, settings)
+        return MotionDatabase(features, columns * scale, candidates, scale, last, settings)
 
-    @property
-    def megabytes(self) -> float:
-        """Memory that playing and searching need, MB."""
-        return (self.features.nbytes + self.matched.astype(np.float32).nbytes) / 1e6
+    @cached_property
+    def tree(self) -> "scipy.spatial.KDTree":
+        """Index of the candidates by their columns."""
+        return scipy.spatial.KDTree(self.columns[self.candidates])
+
+    def look_ahead(self, curve: Curve, arc: float, ground: GroundPose, speed: float) -> Float[ndarray, " ahead"]:
+        """Describe the curve ahead of a ground pose as the last columns describe what a frame's clip does next."""
+        arcs = arc + speed * torch.tensor(self.settings.ahead, dtype=torch.float64)
+        seen = _see(curve.ground_point(arcs), curve.heading(arcs), ground.position_xz, ground.heading)
+        return seen.flatten().numpy() * self.scale[-seen.numel() :]
 
 
 def follow_by_matching(
@@ -103,7 +109,7 @@ def follow_by_matching(
 ) -> tuple[Motion, float]:
     """Follow a curve for so many seconds at a speed, m/s, from its start; returns the motion at PRIOR_FPS and the
     milliseconds that a frame took."""
-    settings, tree = database.settings, scipy.spatial.KDTree(database.matched)
+    settings, tree = database.settings, database.tree
     began = time.process_time()
     ground = GroundPose(curve.ground_point(0.0).double(), torch.tensor(curve.start_heading, dtype=torch.float64))
     playing, arc, frames = _choose_start(database, curve, ground, speed, generator), 0.0, []
@@ -113,10 +119,9 @@ def follow_by_matching(
     for number in range(round(seconds * PRIOR_FPS)):
         if number and (number % step == 0 or playing >= database.last[playing]):
             arc = float(curve.nearest(ground.position_xz[None], torch.tensor([arc]), reach=0.5)[0])
-            wanted = database.column_of_frame[playing].copy()
-            wanted[-len(settings.ahead) * 4 :] = _look_ahead(curve, arc, ground, speed, settings)
-            wanted[-len(settings.ahead) * 4 :] *= database.scale[-len(settings.ahead) * 4 :]
-            found = int(database.frame[tree.query(wanted)[1]])
+            ahead = database.look_ahead(curve, arc, ground, speed)
+            wanted = np.concatenate([database.columns[playing, : -len(ahead)], ahead])
+            found = int(database.candidates[tree.query(wanted)[1]])
             if found != playing:
                 fading = fading.jump(database.features, playing, found, settings)
                 playing = found
@@ -175,7 +180,8 @@ def _describe(clip: Float[Tensor, "frames size"], settings: MotionMatchingSettin
     motion = decode(clip.double(), origin)
     positions = motion.joint_positions()
     feet, hips = positions[:, list(_FEET)], positions[:, :1]
-    speeds = torch.cat([feet, hips], dim=1).diff(dim=0, prepend=torch.cat([feet, hips], dim=1)[:1]) * PRIOR_FPS
+    moving = torch.cat([feet, hips], dim=1)
+    speeds = moving.diff(dim=0, prepend=moving[:1]) * PRIOR_FPS
     about = feet - rotations.lift_ground(ground)[:, None]
     seen = rotations.rotate_about_y(torch.cat([about, speeds], dim=1), -heading[:, None])
     columns = [seen.flatten(1)]
@@ -192,14 +198,6 @@ def _see(
     turn = facing - heading
     seen = rotations.rotate_ground(position - ground, -heading)
     return torch.cat([seen, torch.stack([turn.sin(), turn.cos()], dim=-1)], dim=-1)
-
-
-def _look_ahead(
-    curve: Curve, arc: float, ground: GroundPose, speed: float, settings: MotionMatchingSettings
-) -> Float[ndarray, " columns"]:
-    """Describe the curve ahead as `_describe` describes what a frame's clip does next."""
-    arcs = arc + speed * torch.tensor(settings.ahead, dtype=torch.float64)
-    return _see(curve.ground_point(arcs), curve.heading(arcs), ground.position_xz, ground.heading).flatten().numpy()
 
 
 def _scale_groups(
@@ -219,8 +217,7 @@ def _choose_start(
     database: MotionDatabase, curve: Curve, ground: GroundPose, speed: float, generator: torch.Generator
 ) -> int:
     """Draw one of the frames whose next second is nearest to the curve's beginning."""
-    width = len(database.settings.ahead) * 4
-    wanted = _look_ahead(curve, 0.0, ground, speed, database.settings) * database.scale[-width:]
-    away = np.square(database.matched[:, -width:] - wanted).sum(axis=1)
-    best = np.argpartition(away, min(database.settings.starts, len(away) - 1))[: database.settings.starts]
-    return int(database.frame[best[int(torch.randint(len(best), (1,), generator=generator))]])
+    wanted, most = database.look_ahead(curve, 0.0, ground, speed), database.settings.starts
+    away = np.square(database.columns[database.candidates, -len(wanted) :] - wanted).sum(axis=1)
+    best = np.argpartition(away, min(most, len(away) - 1))[:most]
+    return int(database.candidates[best[int(torch.randint(len(best), (1,), generator=generator))]])
