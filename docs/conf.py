@@ -15,6 +15,7 @@ version = release = __version__
 extensions = [
     "command_options",
     "followed_tutorials",
+    "measured_tables",
     "readable_signatures",
     "myst_parser",
     "sphinx.ext.autodoc",
@@ -23,8 +24,8 @@ extensions = [
     "sphinx_design",
     "sphinx_gallery.gen_gallery",
 ]
-# The gallery's scripts become pages in auto_gallery.
-exclude_patterns = ["_build", "gallery"]
+# The gallery's scripts become pages in auto_gallery; what was measured stands in the pages that show it.
+exclude_patterns = ["_build", "gallery", "tables"]
 
 sphinx_gallery_conf = {
     "examples_dirs": "gallery",

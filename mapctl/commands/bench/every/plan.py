@@ -11,19 +11,25 @@ _PLAN = {
     "follow": "follow --data DATA --baselines free/locomotion",
     "ablation": "ablation",
     "steer": "steer",
+    "steer-free": "steer --prior free/locomotion",
     "steer-targets": "steer --targets",
+    "live": "live",
     "generation": "generation --data DATA",
     "why": "why --data DATA --steps 2000",
     "free-run": "free-run",
+    "free-run-general": "free-run --prior general",
     "shots": "shots",
     "denoise": "denoise --data DATA --count 30",
+    "denoise-free": "denoise --data DATA --count 30 --clips bandai --baselines free/denoiser"
+    " --inbetweener free/transformer",
     "infill": "infill --data DATA --count 30",
+    "infill-free": "infill --data DATA --clips bandai --baselines free/transformer",
     "gaps": "gaps --data DATA",
-    "transitions": "transitions --data DATA --stitcher stitcher",
+    "transitions": "transitions --data DATA --count 30 --stitcher stitcher",
+    "transitions-bare": "transitions --data DATA --count 30 --stitcher stitcher --past 1",
     "tween": "tween --data DATA",
     "tweener": "tweener --data DATA",
-    "timing": "timing --data DATA",
-    "live": "live",
+    "timing": "timing --data DATA --count 1000",
 }
 """Words after `mapctl bench`, by table."""
 
