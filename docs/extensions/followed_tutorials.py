@@ -13,7 +13,7 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
@@ -43,12 +43,13 @@ def read_steps(page: Path) -> Iterator[Step]:
     return (Step(*found) for found in _STEP.findall(page.read_text("utf-8")))
 
 
-def follow(page: Path, folder: Path) -> None:
-    """Do a page's steps in a folder; ExtensionError names the first one that fails."""
-    # Commands are typed as `mapctl`, which lies beside the interpreter that builds the site.
-    environment = dict(os.environ, PATH=os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")]))
+def follow(page: Path, folder: Path, python: str = sys.executable, env: Mapping[str, str] = os.environ) -> None:
+    """Do a page's steps in a folder, by the interpreter of an environment where mapctl is installed; ExtensionError
+    names the first one that fails."""
+    # Commands are typed as `mapctl`, which lies beside the interpreter.
+    environment = dict(env, PATH=os.pathsep.join([str(Path(python).parent), env.get("PATH", "")]))
     for number, step in enumerate(read_steps(page), start=1):
-        words = ["sh", "-eu"] if step.language == "sh" else [sys.executable, "-"]
+        words = ["sh", "-eu"] if step.language == "sh" else [python, "-"]
         done = subprocess.run(words, input=step.text, cwd=folder, env=environment, capture_output=True, text=True)
         if done.returncode != 0:
             raise ExtensionError(f"{page.name}, step {number}, ended with {done.returncode}:\n{done.stderr[-2000:]}")

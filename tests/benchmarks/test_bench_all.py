@@ -65,10 +65,6 @@ def test_a_table_is_read_as_it_was_written(tmp_path):
     record = make()
     record.write(tmp_path / "follow.json")
     assert TableRecord.read(tmp_path / "follow.json") == record
-    page = (tmp_path / "follow.md").read_text()
-    assert "**walks**" in page
-    assert "| circle:4 | ours | 1.6 | 8 |" in page
-    assert f"`mapctl bench follow`: {record.date}, commit abc, {record.machine}, 2 minutes." in page
 
 
 def test_what_is_no_table_is_refused(tmp_path):

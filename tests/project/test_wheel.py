@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -9,6 +10,7 @@ import sysconfig
 import zipfile
 from pathlib import Path
 
+import pages
 import pytest
 
 from mapctl import __version__
@@ -108,6 +110,18 @@ def test_data_is_held(held):
 def test_its_example_is_found_elsewhere(clean, tmp_path):
     run(clean / "mapctl", "convert", "example:noisy-walk", "walk.npz", cwd=tmp_path)
     assert (tmp_path / "walk.npz").is_file()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+@pytest.mark.parametrize("name", ["animator", "capture-artist", "game-engineer", "researcher"])
+def test_tutorials_can_be_followed_elsewhere(clean, tmp_path, name):
+    tutorials = pages.import_extension("followed_tutorials")
+    page = ROOT / "docs" / "tutorials" / f"{name}.md"
+    tutorials.follow(page, tmp_path, str(clean / "python"), ENVIRONMENT)
+    made = {path.name for path in tmp_path.rglob("*") if path.suffix in tutorials.PICTURES}
+    shown = set(re.findall(rf"made/{name}/([\w.-]+)", page.read_text("utf-8")))
+    assert shown <= made
 
 
 def test_licences_of_code_and_weights_are_told(wheel, held):

@@ -353,8 +353,9 @@ class Bench(Command):
 class AllTables(ModelCommand):
     """Make every table of the documentation again, one after the other, and say which figures moved.
 
-    OUT/TABLE.json holds a table with its command, date, commit and machine, OUT/TABLE.md what a page shows of it.
-    Tables that were made by the same command at the same commit are skipped, so that an interrupted run goes on.
+    OUT/TABLE.json holds a table with its command, date, commit and machine; `python docs/extensions/measured_tables.py`
+    fills the pages from them. Tables that were made by the same command at the same commit are skipped, so that an
+    interrupted run goes on.
     """
 
     work = "mapctl.commands.bench.every.run"

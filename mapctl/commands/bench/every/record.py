@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, TypeGuard
 
 from mapctl import report
-from mapctl.commands.shared.tables import format_markdown
 from mapctl.errors import FileFormatError
 from mapctl.formats.atomic import write_text
 from mapctl.version import __version__
@@ -53,20 +52,8 @@ class TableRecord:
             raise FileFormatError(path, f"not a table of mapctl bench all: {error}") from error
 
     def write(self, path: Path) -> None:
-        """Write the JSON, and the Markdown beside it, whole or not at all."""
+        """Write it as JSON, whole or not at all."""
         write_text(path, report.to_json(asdict(self)))
-        write_text(path.with_suffix(".md"), self.format())
-
-    def format(self) -> str:
-        """Format the table as Markdown: a table for each part that rows name, and where it is from."""
-        parts: dict[str, list[dict[str, Any]]] = {}
-        for row in self.rows:
-            parts.setdefault(str(row.get("part", "")), []).append({k: v for k, v in row.items() if k != "part"})
-        tables = [
-            f"**{part}**\n\n{format_markdown(rows)}" if part else format_markdown(rows) for part, rows in parts.items()
-        ]
-        source = f"`{self.command}`: {self.date}, commit {self.commit}, {self.machine}, {self.minutes:.0f} minutes."
-        return "\n".join([*tables, source, ""])
 
 
 def list_moved(old: TableRecord, new: TableRecord) -> Iterator[str]:

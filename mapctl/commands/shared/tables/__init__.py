@@ -27,17 +27,12 @@ def print_records(records: Sequence[Mapping[str, object]], *, title: str | None 
     print_table(columns, [[record.get(name) for name in columns] for record in records], title=title)
 
 
-def format_markdown(records: Sequence[Mapping[str, object]]) -> str:
-    """A table of rows by column name as Markdown has it, with three digits; what a row lacks is left empty."""
+def print_markdown(records: Sequence[Mapping[str, object]]) -> None:
+    """Print a table of rows by column name as Markdown has it, with three digits; what a row lacks is left empty."""
     columns = list(dict.fromkeys(name for record in records for name in record))
     rows = [[_format_short(record.get(name)) for name in columns] for record in records]
-    head, *body = (f"| {' | '.join(line)} |\n" for line in [columns, *rows])
-    return "".join([head, "|" + "---|" * len(columns) + "\n", *body])
-
-
-def print_markdown(records: Sequence[Mapping[str, object]]) -> None:
-    """Print rows by column name as Markdown has a table."""
-    print(format_markdown(records), end="")
+    for line in [columns, ["---"] * len(columns), *rows]:
+        print(f"| {' | '.join(line)} |")
 
 
 def _format_short(value: object) -> str:
