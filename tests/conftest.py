@@ -95,12 +95,19 @@ def data(tmp_path_factory) -> Path:
     return write_corpus(tmp_path_factory.mktemp("data"))
 
 
-@pytest.fixture
-def short_free_runs(monkeypatch):
-    """Densities in training are validated in a moment."""
-    from priors.training.quality import density
+@pytest.fixture(scope="module")
+def small_judgements() -> Iterator[None]:
+    """Models in training are judged in a moment, on few windows, where a test is not about how well they do."""
+    from priors.training.quality import density, stitcher
+    from priors.training.recipes import pose_transformer
 
-    monkeypatch.setattr(density, "measure_free_runs", partial(density.measure_free_runs, runs=2, frames=20))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(density, "measure_free_runs", partial(density.measure_free_runs, runs=2, frames=20))
+        patch.setattr(pose_transformer, "_VALIDATED_WINDOWS", 4)
+        patch.setattr(stitcher, "_WINDOWS", 4)
+        patch.setattr(stitcher, "_DRAWS", 2)
+        patch.setattr(stitcher, "TEMPERATURES", (0.5, 1.0, 2.0))
+        yield
 
 
 @pytest.fixture

@@ -14,6 +14,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
@@ -56,24 +57,31 @@ def follow(page: Path, folder: Path, python: str = sys.executable, env: Mapping[
 
 
 def follow_all(app: Sphinx) -> None:
-    """Follow the tutorials whose pictures are not up to date."""
-    tutorials = Path(app.srcdir) / "tutorials"
-    for page in sorted(tutorials.glob("*.md")):
-        if not any(read_steps(page)):
-            continue
-        made = tutorials / "made" / page.stem
-        stamp, state = made / ".followed", hashlib.sha256((page.read_text("utf-8") + __version__).encode()).hexdigest()
-        if stamp.exists() and stamp.read_text() == state:
-            continue
-        _log.info("following %s", page.name)
-        shutil.rmtree(made, ignore_errors=True)
-        made.mkdir(parents=True)
-        with TemporaryDirectory() as folder:
-            follow(page, Path(folder))
-            for picture in sorted(Path(folder).rglob("*")):
-                if picture.suffix in PICTURES:
-                    shutil.copy(picture, made / picture.name)
-        stamp.write_text(state)
+    """Follow the tutorials whose pictures are not up to date, two at a time."""
+    with ThreadPoolExecutor(max_workers=2) as pool:
+        for done in [
+            pool.submit(_make_pictures, page) for page in sorted((Path(app.srcdir) / "tutorials").glob("*.md"))
+        ]:
+            done.result()
+
+
+def _make_pictures(page: Path) -> None:
+    """Follow a tutorial unless its pictures are up to date, and keep them."""
+    if not any(read_steps(page)):
+        return
+    made = page.parent / "made" / page.stem
+    stamp, state = made / ".followed", hashlib.sha256((page.read_text("utf-8") + __version__).encode()).hexdigest()
+    if stamp.exists() and stamp.read_text() == state:
+        return
+    _log.info("following %s", page.name)
+    shutil.rmtree(made, ignore_errors=True)
+    made.mkdir(parents=True)
+    with TemporaryDirectory() as folder:
+        follow(page, Path(folder))
+        for picture in sorted(Path(folder).rglob("*")):
+            if picture.suffix in PICTURES:
+                shutil.copy(picture, made / picture.name)
+    stamp.write_text(state)
 
 
 def setup(app: Sphinx) -> dict[str, bool]:

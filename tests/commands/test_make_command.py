@@ -22,7 +22,7 @@ from mapctl.skeleton import CANONICAL
 from priors.training.bundled.models import list_models
 from priors.training.mocap.made import find_made
 
-pytestmark = pytest.mark.usefixtures("short_free_runs")
+pytestmark = pytest.mark.usefixtures("small_judgements")
 LIMITS = DataLimits(slowest=0.5, fastest=2.0, turn_rate=1.5)
 LOOSE = dict.fromkeys(CHECKED, 1e9)
 

@@ -20,8 +20,8 @@ INLINE = [line for page in pages.PAGES for line in pages.inline_commands(page)]
 NOT_RUN = re.compile(r"mapctl (live|bench|demo|train all)\b|DATA|ADDRESS")
 LONG = re.compile(
     r"mapctl (run|chain|train (refiner|.* (mocap|everything)/)|tween (docs|.*(120|LeftHand)$))"
-    "|--(causal|best-of|variations|reference|jobs|root-only|suggest-timing|init)|auto|denoise (.*--video|example:)"
-    "|7s:8.5s"
+    "|--(causal|best-of|variations|reference|jobs|root-only|suggest-timing|init|video|loop)|auto|denoise example:"
+    "|7s:8.5s|reaching.csv|--start take.bvh"
 )
 # Tutorials are followed step by step where the site is built (docs/extensions/followed_tutorials.py).
 PYTHON = [block for page in pages.PAGES if "tutorials" not in page for block in pages.blocks(page, "python")]
@@ -29,6 +29,9 @@ LONG_PYTHON = {
     "README.md-python-0",
     "docs/explanations/infilling.md-python-0",
     "docs/explanations/denoising.md-python-0",
+    "docs/explanations/tweening.md-python-0",
+    "docs/explanations/tweening.md-python-1",
+    "docs/guides/live-from-python.md-python-0",
     "docs/guides/adding-a-term.md-python-0",
     "docs/guides/adding-a-job.md-python-0",
     "docs/reference/api/jobs.md-python-0",

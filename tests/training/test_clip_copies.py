@@ -19,7 +19,7 @@ from priors.training.augmentation.pose_windows import PoseWindows
 from priors.training.corpus import Corpus, Split
 from priors.training.recipes.lstm_gmm import DensityRecipe, TrainingSettings
 
-pytestmark = pytest.mark.usefixtures("short_free_runs")
+pytestmark = pytest.mark.usefixtures("small_judgements")
 FACTORS = [(1.15, 1.0), (0.85, 1.0), (1.0, 1.1), (1.0, 0.9), (1.12, 1.08), (0.9, 0.93)]
 
 

@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from functools import partial
 
 import pytest
 from ended_models import MODELS
@@ -13,17 +12,12 @@ from tiny_stitcher import CONFIG as STITCHER
 
 from mapctl.errors import RequestError
 from priors.lstm_gmm.network import LstmGmmConfig
-from priors.training.quality import density as density_quality
 from priors.training.recipes import lstm_gmm
 from priors.training.recipes.infiller import InfillerRecipe, InfillerSettings, InfillerTrainer
 from priors.training.recipes.stitcher import StitcherSettings, StitcherTrainer
 from priors.training.run import train
 
-
-@pytest.fixture(autouse=True)
-def short_free_runs(monkeypatch):
-    whole = density_quality.measure_free_runs
-    monkeypatch.setattr(density_quality, "measure_free_runs", partial(whole, runs=2, frames=20))
+pytestmark = pytest.mark.usefixtures("small_judgements")
 
 
 def with_steps(recipe, steps, **changes):

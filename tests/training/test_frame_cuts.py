@@ -19,7 +19,7 @@ from mapctl.features import encode
 from priors.training.corpus import read_corpus
 from priors.training.mocap.cuts import TABLE_NAME, Cut, find_cuts, read_cuts
 
-pytestmark = pytest.mark.usefixtures("short_free_runs")
+pytestmark = pytest.mark.usefixtures("small_judgements")
 STYLES = {
     "Aeroplane": {"FW": (10, 200, 15), "ID": (0, 180, 20), "TR1": (12, 170, 0)},
     "Zombie": {"FW": (33, 160, 7), "SR": (8, 190, 8)},

@@ -11,7 +11,7 @@ from mapctl.features import encode
 from priors.training.corpus import Corpus
 from priors.training.mocap.holdings import measure_holdings
 
-pytestmark = pytest.mark.usefixtures("short_free_runs")
+pytestmark = pytest.mark.usefixtures("small_judgements")
 
 
 def made(*motions):

@@ -20,7 +20,7 @@ from priors.training.mocap.clips import read_clip_features
 from priors.training.mocap.cuts import Cut
 from priors.training.mocap.leveling import find_floor_slope, stand_on_canonical, turn_level
 
-pytestmark = pytest.mark.usefixtures("short_free_runs")
+pytestmark = pytest.mark.usefixtures("small_judgements")
 SMALL = Performer(size=0.9, toe_height=-0.03)
 """Whose toes rest under the floor of the file."""
 

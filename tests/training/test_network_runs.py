@@ -38,6 +38,8 @@ from priors.training.run import train
 from priors.tweening.generator import GeneratorConfig
 from priors.tweening.path import PathConfig
 
+pytestmark = pytest.mark.usefixtures("small_judgements")
+
 
 @dataclass(frozen=True)
 class Model:

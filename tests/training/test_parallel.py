@@ -12,7 +12,6 @@ import socket
 import subprocess
 import sys
 from dataclasses import replace
-from functools import partial
 
 import pytest
 import torch
@@ -25,7 +24,6 @@ from tiny_transformer import CONFIG
 from mapctl.errors import CheckpointError, MapctlError, RequestError
 from mapctl.runtime import interruption
 from priors.training.parallel import ALONE, LostProcessError, TrainingGroup, count_launched, fork_group
-from priors.training.quality import density as density_quality
 from priors.training.recipes.infiller import InfillerRecipe, InfillerSettings, InfillerTrainer
 from priors.training.recipes.pose_transformer import PoseTransformerSettings, PoseTransformerTrainer
 from priors.training.run import train
@@ -39,10 +37,7 @@ def find_trainers():
     return [child for child in multiprocessing.active_children() if "Loky" not in type(child).__name__]
 
 
-@pytest.fixture(autouse=True)
-def short_free_runs(monkeypatch):
-    whole = density_quality.measure_free_runs
-    monkeypatch.setattr(density_quality, "measure_free_runs", partial(whole, runs=2, frames=20))
+pytestmark = pytest.mark.usefixtures("small_judgements")
 
 
 def wanted(data, out, **changes):

@@ -4,7 +4,6 @@ import errno
 import os
 import shutil
 from dataclasses import replace
-from functools import partial
 
 import pytest
 import tiny_denoiser
@@ -22,7 +21,6 @@ from priors.training import recipe as recipe_module
 from priors.training import run as training_run
 from priors.training.gathering import DataSource, gather
 from priors.training.mocap import clips
-from priors.training.quality import density as density_quality
 from priors.training.recipes.denoiser import DenoiserSettings, DenoiserTrainer
 
 BALL = (
@@ -31,10 +29,7 @@ BALL = (
 ONE_FRAME = "one.bvh: features need at least two frames"
 
 
-@pytest.fixture(autouse=True)
-def short_free_runs(monkeypatch):
-    whole = density_quality.measure_free_runs
-    monkeypatch.setattr(density_quality, "measure_free_runs", partial(whole, runs=2, frames=20))
+pytestmark = pytest.mark.usefixtures("small_judgements")
 
 
 def write_walks(folder, *lengths):

@@ -24,7 +24,6 @@ from mapctl.runtime.interruption import DeferredSignals
 from priors import checkpoints, tensor_files
 from priors.training import run, run_files
 from priors.training.mocap import clips
-from priors.training.quality import density as density_quality
 from priors.training.recipes import lstm_gmm
 
 
@@ -43,12 +42,7 @@ def model(request):
     return (MODELS | VARIANTS)[request.param]
 
 
-@pytest.fixture(autouse=True, scope="module")
-def short_free_runs():
-    whole = density_quality.measure_free_runs
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(density_quality, "measure_free_runs", partial(whole, runs=2, frames=20))
-        yield
+pytestmark = pytest.mark.usefixtures("small_judgements")
 
 
 @pytest.fixture
