@@ -171,7 +171,7 @@ def begin(
     chosen = settings or SteerSettings()
     character = Character(skeleton, chosen.footing.rest_height)
     command = character.command(command)
-    starts = (condition_prior(prior, command.told) if command.told else prior).initial_states
+    starts = (condition_prior(prior, command.labels) if command.labels else prior).initial_states
     nearest = (starts.speed - command.speed).abs().argsort()[:_NEAREST_STARTS]
     pick = int(nearest[torch.randint(len(nearest), (1,), generator=generator)])
     state = starts.state.pick(torch.tensor([pick]))
@@ -201,8 +201,8 @@ def accept(prior: Density, command: Command) -> tuple[Command, list[str]]:
 
     RequestError for labels that the prior does not know.
     """
-    if command.told:
-        condition_prior(prior, command.told)
+    if command.labels:
+        condition_prior(prior, command.labels)
     return command.within(prior.limits.max_steering_speed)
 
 
@@ -220,7 +220,7 @@ def step(state: SteerState, command: Command, *, seconds: float | None = None) -
     if stuck:
         state = _restart_target(state)
     targets, leaving = _plan_targets(state, command)
-    conditioned = replace(state, prior=condition_prior(state.prior, command.told)) if command.told else state
+    conditioned = replace(state, prior=condition_prior(state.prior, command.labels)) if command.labels else state
     free = stuck or leaving
     sigma_facing = min(settings.sigma_facing, settings.sigma_leaving) if free else settings.sigma_facing
     terms = (*_build_steering_terms(state, targets, command.step_length, sigma_facing), *state.terms)

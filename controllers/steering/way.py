@@ -127,7 +127,7 @@ def _pose_candidates(state: SteerState, command: Command, order: Arrival) -> Flo
             pose.skeleton, pose.fps, pose.root_position.expand(2, -1), pose.local_quat_xyzw.expand(2, -1, -1)
         )
         return encode(still)[0][:1].float()[None]
-    prior = condition_prior(state.prior, command.told) if command.told else state.prior
+    prior = condition_prior(state.prior, command.labels) if command.labels else state.prior
     starts = prior.initial_states
     speed = command.speed / state.character.scale
     near = (starts.speed - speed).abs().argsort()[:_CANDIDATES]

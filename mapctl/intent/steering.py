@@ -51,7 +51,7 @@ class Command:
     nothing but where to begin."""
     step_length: float | None = None
     """Step length from one foot's touch-down to the other's, metres; None leaves it to the prior."""
-    told: tuple[str, ...] = ()
+    labels: tuple[str, ...] = ()
     """Labels of the prior that hold (a gait, a style: `run`, `elderly`); none leaves the motion to the other targets.
     """
     reach: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)

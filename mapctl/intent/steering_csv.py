@@ -77,7 +77,7 @@ class _Line:
     words: dict[str, str]
 
     def command(self) -> Command:
-        told = tuple(self.words[name] for name in _LABEL_COLUMNS if self.words.get(name))
+        labels = tuple(self.words[name] for name in _LABEL_COLUMNS if self.words.get(name))
         speed = self.within("speed_mps", 0, _MAX_SPEED)
         return Command(
             speed,
@@ -85,7 +85,7 @@ class _Line:
             self.angle("facing_deg"),
             self.angle("turn_deg_s"),
             self.within("step_m", 0.05, 3.0) if self.words.get("step_m") else None,
-            told,
+            labels,
             {joint: place for name, joint in _HAND_COLUMNS.items() if (place := self.place(name)) is not None},
             self.place("look"),
             arrival=self.arrival(),

@@ -36,7 +36,7 @@ class SteeringInputs:
     """Facing, degrees; None faces where it goes."""
     step_length: float | None = None
     """Step length, metres; None leaves it to the prior."""
-    told: Mapping[str, str] = field(default_factory=dict)
+    labels: Mapping[str, str] = field(default_factory=dict)
     """Chosen label by group (gait, style)."""
     hand: str | None = None
     """Hand that reaches for the target, `left` or `right`; None for neither."""
@@ -59,7 +59,7 @@ class SteeringInputs:
             math.radians(self.heading),
             facing,
             step_length=self.step_length,
-            told=tuple(self.told.values()),
+            labels=tuple(self.labels.values()),
             reach={f"{hand}Hand": place for hand, place in reach.items()},
             look_at=self.target if self.looks else self.look_at,
         )
@@ -91,11 +91,11 @@ class InputLimits:
     def changed(self, orders: SteeringInputs, changes: Mapping[str, Any]) -> tuple[SteeringInputs, list[Refusal]]:
         """Change orders by name, each limited to what can be done; what is no number changes nothing.
 
-        `told` names a label by group, AS_IT_LIKES none; groups that it does not name stay as they are.
+        `labels` names a label by group, AS_IT_LIKES none; groups that it does not name stay as they are.
         """
         found, refused = {}, list[Refusal]()
         for name, asked in changes.items():
-            held = self._label(orders.told, asked) if name == "told" else self._limit_number(orders, name, asked)
+            held = self._label(orders.labels, asked) if name == "labels" else self._limit_number(orders, name, asked)
             if (text := self._explain_refusal(name, asked, held)) is not None:
                 refused.append(Refusal(name, held, text))
             found[name] = held
@@ -110,17 +110,17 @@ class InputLimits:
         lowest, highest = self._range(name)
         return min(highest, max(lowest, float(asked)))
 
-    def _label(self, told: Mapping[str, str], asked: Any) -> dict[str, str]:
+    def _label(self, labels: Mapping[str, str], asked: Any) -> dict[str, str]:
         known = {group: (UNCONDITIONED, *labels) for group, labels in self.labels.items()}
         heard = {group: label for group, label in dict(asked).items() if label in known.get(group, ())}
-        return {group: label for group, label in {**told, **heard}.items() if label != UNCONDITIONED}
+        return {group: label for group, label in {**labels, **heard}.items() if label != UNCONDITIONED}
 
     def _range(self, name: str) -> tuple[float, float]:
         return (0.0, self.fastest) if name == "speed" else self.steps
 
     def _explain_refusal(self, name: str, asked: Any, held: Any) -> str | None:
         """Return the refusal, None where the order holds as it was asked."""
-        if name == "told":
+        if name == "labels":
             return next(
                 (
                     f"{label!r} is not a {group} that this prior knows."

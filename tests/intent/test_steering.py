@@ -125,10 +125,10 @@ def test_columns_in_any_order_with_a_facing_that_may_be_empty(read):
 def test_turning_gait_and_style_may_be_left_empty(read):
     track = read("time_s,speed_mps,heading_deg,turn_deg_s,gait,style\n0,1,0,,run,\n1,1,0,-90,, elderly\n2,1,0,,,\n")
     assert [command.turning for command in track.commands] == [None, pytest.approx(-math.pi / 2), None]
-    assert [command.told for command in track.commands] == [("run",), ("elderly",), ()]
+    assert [command.labels for command in track.commands] == [("run",), ("elderly",), ()]
     lowered, _ = track.limit_speed(0.5)
-    assert [(c.turning, c.told, c.speed) for c in lowered.commands] == [
-        (c.turning, c.told, 0.5) for c in track.commands
+    assert [(c.turning, c.labels, c.speed) for c in lowered.commands] == [
+        (c.turning, c.labels, 0.5) for c in track.commands
     ]
 
 

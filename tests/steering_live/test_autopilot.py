@@ -40,19 +40,19 @@ def at_place(pilot: Autopilot, x: float, z: float) -> None:
 def test_the_last_command_holds():
     pilot = Autopilot(Command(1.0, 0.5), SteeringLimits())
     assert pilot.at(0.0) == Command(1.0, 0.5)
-    pilot.command(Command(2.0, 1.0, told=("run",)))
-    assert pilot.at(9.0) == Command(2.0, 1.0, told=("run",))
+    pilot.command(Command(2.0, 1.0, labels=("run",)))
+    assert pilot.at(9.0) == Command(2.0, 1.0, labels=("run",))
 
 
 def test_a_path_is_walked_braked_for_and_stood_at():
-    pilot = Autopilot(Command(1.0, 0.5, told=("elderly",)), SteeringLimits(braking=2.0))
+    pilot = Autopilot(Command(1.0, 0.5, labels=("elderly",)), SteeringLimits(braking=2.0))
     at_place(pilot, 0.0, 0.0)
     pilot.walk(LINE, 1.4)
     speeds = []
     for step in range(51):
         at_place(pilot, 0.0, 0.1 * step)
         speeds.append(pilot.at(0.0).speed)
-        assert pilot.at(0.0).told == ("elderly",), "the path tells what the command told"
+        assert pilot.at(0.0).labels == ("elderly",), "the path tells what the command told"
     assert speeds[0] == 1.4
     assert all(b <= a + 1e-9 for a, b in pairwise(speeds))
     assert speeds[-1] == 0.0

@@ -50,15 +50,15 @@ def test_a_port_that_is_taken_is_said_and_another_one_serves(monkeypatch, capsys
 def test_orders_go_to_the_chosen_character_alone_and_the_panel_shows_them(show, actors):
     show.order(speed=2.0, heading=90.0)
     show.choose(1)
-    show.order(speed=0.5, facing=-90.0, told={"gait": "walk", "style": "old"})
+    show.order(speed=0.5, facing=-90.0, labels={"gait": "walk", "style": "old"})
     run(show)
     assert actors[0].heard == [("command", Command(2.0, math.pi / 2))]
-    assert actors[1].heard == [("command", Command(0.5, 0.0, -math.pi / 2, told=("walk", "old")))]
+    assert actors[1].heard == [("command", Command(0.5, 0.0, -math.pi / 2, labels=("walk", "old")))]
     panel = show._panel.steering
-    assert (panel.speed.value, panel.facing.value, panel.told["gait"].value) == (0.5, -90, "walk")
+    assert (panel.speed.value, panel.facing.value, panel.labels["gait"].value) == (0.5, -90, "walk")
     show.choose(0)
     run(show)
-    assert (panel.speed.value, panel.heading.value, panel.told["gait"].value) == (2.0, 90, "any")
+    assert (panel.speed.value, panel.heading.value, panel.labels["gait"].value) == (2.0, 90, "any")
     assert len(actors[0].heard) == 1, "to show orders is not to give them"
 
 

@@ -65,11 +65,11 @@ def test_what_can_be_is_taken_as_it_is_without_a_word():
 
 
 def test_labels_are_of_the_prior_and_of_one_group_at_a_time():
-    orders, refusals = BOUNDS.changed(SteeringInputs(), {"told": {"gait": "run"}})
-    orders, more = BOUNDS.changed(orders, {"told": {"style": "old"}})
-    assert (orders.told, refusals + more) == ({"gait": "run", "style": "old"}, [])
-    assert orders.command == Command(1.2, 0.0, told=("run", "old"))
-    orders, refusals = BOUNDS.changed(orders, {"told": {"gait": "swim", "mood": "bad"}})
-    assert orders.told == {"gait": "run", "style": "old"}
+    orders, refusals = BOUNDS.changed(SteeringInputs(), {"labels": {"gait": "run"}})
+    orders, more = BOUNDS.changed(orders, {"labels": {"style": "old"}})
+    assert (orders.labels, refusals + more) == ({"gait": "run", "style": "old"}, [])
+    assert orders.command == Command(1.2, 0.0, labels=("run", "old"))
+    orders, refusals = BOUNDS.changed(orders, {"labels": {"gait": "swim", "mood": "bad"}})
+    assert orders.labels == {"gait": "run", "style": "old"}
     assert refusals[0].text == "'swim' is not a gait that this prior knows."
-    assert BOUNDS.changed(orders, {"told": {"gait": UNCONDITIONED}})[0].told == {"style": "old"}
+    assert BOUNDS.changed(orders, {"labels": {"gait": UNCONDITIONED}})[0].labels == {"style": "old"}

@@ -148,7 +148,7 @@ def test_orders_that_cannot_be_are_brought_near_or_left_out_and_said(remote):
     assert any("the step length of 99 m was lowered to 1.2 m" in note for note in said)
     remote.command(Command(1.0, 0.0))
     collected(remote, 2.5)
-    remote.command(Command(2.0, 0.0, told=("swim",)))
+    remote.command(Command(2.0, 0.0, labels=("swim",)))
     [note] = notes(remote)
     assert "knows no" in note
     assert np.hypot(*collected(remote, 0.5)[-1].wish) == pytest.approx(1.0, abs=0.05), "the order before it holds"
@@ -223,7 +223,7 @@ def test_ctrl_c_is_not_for_it_and_when_it_hangs_it_holds_up_nobody(load, capfd):
     os.kill(made.pid, signal.SIGSTOP)
     began = time.perf_counter()
     for number in range(5000):
-        made.command(Command(1.0, number / 5000, told=("x" * 100,)))
+        made.command(Command(1.0, number / 5000, labels=("x" * 100,)))
     assert time.perf_counter() - began < 2.0
     made.close()
     assert time.perf_counter() - began < 6.0

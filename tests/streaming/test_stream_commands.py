@@ -168,7 +168,7 @@ class Source:
 @pytest.fixture
 def played():
     """A script that takes orders, and a function that gives them."""
-    lines = (Command(1.2, 0.0, turning=0.5, told=("old",), obstacles=(Obstacle((0.0, 9.0), 0.5),)), Command(2.0, 1.0))
+    lines = (Command(1.2, 0.0, turning=0.5, labels=("old",), obstacles=(Obstacle((0.0, 9.0), 0.5),)), Command(2.0, 1.0))
     source = Source()
     bounds = InputLimits(3.8, {"style": ["old"]})
     made = RemoteScript(CommandTrack((0.0, 5.0), lines), source, bounds, SteeringLimits())
@@ -184,11 +184,11 @@ def test_a_script_plays_as_it_is_until_an_order_comes(played):
     _, at, lines = played
     assert at(0.0) is lines[0]
     changed = at(1.0, ("speed", 0.5), ("hand/left", 0.1, 1.0, 3.0))
-    assert (changed.speed, changed.turning, changed.told, changed.obstacles) == (0.5, 0.5, ("old",), lines[0].obstacles)
+    assert (changed.speed, changed.turning, changed.labels, changed.obstacles) == (0.5, 0.5, ("old",), lines[0].obstacles)
     assert changed.reach == {"leftHand": (0.1, 1.0, 3.0)}
     assert at(2.0) == changed
     turned = at(3.0, ("heading", 90.0), ("style", "any"), ("disc", 1.0, 2.0, 0.5))
-    assert (turned.heading, turned.turning, turned.told) == (pytest.approx(math.pi / 2), None, ())
+    assert (turned.heading, turned.turning, turned.labels) == (pytest.approx(math.pi / 2), None, ())
     assert turned.obstacles == (*lines[0].obstacles, Obstacle((1.0, 2.0), 0.5))
     assert at(5.0) is lines[1], "the next line ends what was ordered"
 

@@ -102,7 +102,7 @@ def _to_inputs(line: Command, labels: Mapping[str, Sequence[str]]) -> SteeringIn
         math.degrees(line.heading),
         None if line.facing is None else math.degrees(line.facing),
         line.step_length,
-        {group: word for word in line.told for group, known in labels.items() if word in known},
+        {group: word for word in line.labels for group, known in labels.items() if word in known},
         reach={joint.removesuffix("Hand"): place for joint, place in line.reach.items()},
         look_at=line.look_at,
     )

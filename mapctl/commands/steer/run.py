@@ -57,7 +57,7 @@ def run(command: Steer) -> int:
     track = _add_obstacles(_read_track(command.commands), [Obstacle.parse(text) for text in command.avoid])
     character, prior = read_character(command.rig), priors.load(command.prior)
     track, lowered = track.limit_speed(prior.limits.max_steering_speed)
-    for labels in {wanted.told for wanted in track.commands if wanted.told}:
+    for labels in {wanted.labels for wanted in track.commands if wanted.labels}:
         prior.conditioned_on(labels)  # unknown labels are refused now
     stepper = _choose_stepper(command, track)
     links = _open_links(command, character, prior, track)
@@ -148,7 +148,7 @@ def _run_steering(
     generator = torch.Generator().manual_seed(command.seed)
     state, pose = steer.begin(prior, first, generator=generator, settings=settings, skeleton=character.skeleton)
     recorder.show(pose, 0.0)
-    for wanted in (first, *{wanted.told: wanted for wanted in track.commands}.values()):
+    for wanted in (first, *{wanted.labels: wanted for wanted in track.commands}.values()):
         steer.step(state, wanted)  # compiling, loading and conditioning on first use must not cost frames
     clock = WallClock() if command.realtime else StreamClock()
     with show_progress("steering", quiet=command.quiet) as progress:

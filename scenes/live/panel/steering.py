@@ -21,7 +21,7 @@ class SteeringControls:
         self.facing = gui.add_slider("Facing, degrees", -180.0, 180.0, 1.0, 0.0, disabled=True)
         self.measured = gui.add_checkbox("Measured steps", False)
         self.step_length = gui.add_slider("Step length, m", *STEP_LENGTHS, 0.05, _DEFAULT_STEP_LENGTH, disabled=True)
-        self.told = {
+        self.labels = {
             group: gui.add_dropdown(group.capitalize(), [UNCONDITIONED, *names])
             for group, names in bounds.labels.items()
         }
@@ -32,8 +32,8 @@ class SteeringControls:
         bind_control(self.facing, lambda value: typed(facing=value) if self.strafe.value else None)
         bind_control(self.measured, lambda value: typed(step_length=self.step_length.value if value else None))
         bind_control(self.step_length, lambda value: typed(step_length=value) if self.measured.value else None)
-        for group, handle in self.told.items():
-            bind_control(handle, lambda value, of=group: typed(told={of: value}))
+        for group, handle in self.labels.items():
+            bind_control(handle, lambda value, of=group: typed(labels={of: value}))
 
     def show(self, orders: SteeringInputs) -> None:
         """Put the controls where the orders are, without giving them anew."""
@@ -43,8 +43,8 @@ class SteeringControls:
             self.facing.value = round(orders.facing)
         if orders.step_length is not None:
             self.step_length.value = orders.step_length
-        for group, handle in self.told.items():
-            handle.value = orders.told.get(group, UNCONDITIONED)
+        for group, handle in self.labels.items():
+            handle.value = orders.labels.get(group, UNCONDITIONED)
         self.enable(orders)
 
     def enable(self, orders: SteeringInputs) -> None:

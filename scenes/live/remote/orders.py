@@ -115,7 +115,7 @@ class RemoteOrders(Generic[MemberT]):
         changes: dict[str, Any] = {}
         for order in orders:
             if order.word is not None:
-                changes["told"] = {**changes.get("told", {}), order.name: order.word}
+                changes["labels"] = {**changes.get("labels", {}), order.name: order.word}
             elif order.name == "stop":
                 changes["speed"] = 0.0
             else:
