@@ -14,9 +14,9 @@ so that its source reads well, too:
     <!-- end of table -->
 
 A line names a column and its heading. After `|` stands how its numbers are written: `.2` with two decimals, `%` as a
-share, `x100` times a hundred; without it they have three digits. Columns with ` / ` between them share a cell. `@where`
-keeps the rows whose text fits a regular expression as a whole, `@part` those of one part. `@sources: no` leaves out the
-line of the source, for a page that shows several tables of one record.
+share, `x100` times a hundred; without it they have three digits. Columns with ` / ` or ` to ` between them share a
+cell. `@where` keeps the rows whose text fits a regular expression as a whole, `@part` those of one part. `@sources: no`
+leaves out the line of the source, for a page that shows several tables of one record.
 
 `python docs/extensions/measured_tables.py` fills every page; the build fails where a page is not up to date.
 """
@@ -42,6 +42,8 @@ class Column(NamedTuple):
 
     names: Sequence[str]
     """Columns of the record that share its cells."""
+    between: str
+    """What stands between their values."""
     heading: str
     """What stands above it."""
     style: str
@@ -104,7 +106,8 @@ def read_spec(text: str) -> Spec:
         if not colon:
             raise ValueError(f"a line of a table is 'column: heading', got {line!r}")
         heading, _, style = rest.partition(" | ")
-        columns.append(Column(names.split(" / "), heading.strip(), style.strip()))
+        between = next((each for each in (" / ", " to ") if each in names), " ")
+        columns.append(Column(names.split(between), between, heading.strip(), style.strip()))
     return Spec(columns, where, sourced)
 
 
@@ -126,7 +129,7 @@ def _format_cell(column: Column, row: Mapping[str, Any], rows: Sequence[Mapping[
         if not any(name in each for each in rows):
             known = ", ".join(dict.fromkeys(key for each in rows for key in each))
             raise ValueError(f"{record} has no column {name!r}; it has {known}")
-    return " / ".join(cell for name in column.names if (cell := format_value(row.get(name), column.style)))
+    return column.between.join(cell for name in column.names if (cell := format_value(row.get(name), column.style)))
 
 
 def format_value(value: object, style: str) -> str:

@@ -53,12 +53,12 @@ def test_numbers_are_written_as_the_page_says(tables):
         tables,
         "error_m: m",
         "error_m / worst_m: mean / max, cm | x100 .1",
-        "apart: told apart | %",
+        "apart to apart: told apart | %",
         "@where curve: line:.*",
         "@part: walks|runs",
         "@sources: no",
     )
-    assert rows[2:] == ["| 0.0123 | 1.2 / 5.0 | 69 % |", "| 0.5 | 50.0 | 50 % |"]
+    assert rows[2:] == ["| 0.0123 | 1.2 / 5.0 | 69 % to 69 % |", "| 0.5 | 50.0 | 50 % to 50 % |"]
 
 
 def test_three_digits_without_a_style(tables):
