@@ -31,8 +31,8 @@ def print_markdown(records: Sequence[Mapping[str, object]]) -> None:
     """Print a table of rows by column name as Markdown has it, with three digits; what a row lacks is left empty."""
     columns = list(dict.fromkeys(name for record in records for name in record))
     rows = [[_format_short(record.get(name)) for name in columns] for record in records]
-    for line in [columns, ["---"] * len(columns), *rows]:
-        print(f"| {' | '.join(line)} |")
+    head, *body = (f"| {' | '.join(line)} |" for line in [columns, *rows])
+    print(head, "|" + "---|" * len(columns), *body, sep="\n")
 
 
 def _format_short(value: object) -> str:
