@@ -34,6 +34,7 @@ from sphinx.errors import ExtensionError
 DOCS = Path(__file__).resolve().parent.parent
 _COMMAND = "python docs/extensions/measured_tables.py"
 _REGION = re.compile(r"^<!-- table: (?P<name>[\w-]+)\n(?P<spec>.*?)-->\n.*?^<!-- end of table -->$", re.M | re.S)
+_BEGIN = re.compile(r"^<!-- table:", re.M)
 _RULE = re.compile(r"^@(?P<rule>where|part|sources)(?: (?P<column>\w+))?: (?P<value>.+)$")
 
 
@@ -63,6 +64,8 @@ class Spec(NamedTuple):
 
 def fill(text: str, tables: Path) -> str:
     """Fill the tables of a page's text from the records in a folder; ValueError names what a record lacks."""
+    if len(_BEGIN.findall(text)) != len(_REGION.findall(text)):
+        raise ValueError("a table has no end, or no columns")
     return _REGION.sub(lambda found: _fill_region(found, tables), text)
 
 
@@ -70,7 +73,7 @@ def list_pages(docs: Path) -> Iterator[Path]:
     """List the pages that show a record."""
     built = {"_build", "auto_gallery"}
     for page in sorted(docs.rglob("*.md")):
-        if not built & set(page.relative_to(docs).parts) and _REGION.search(page.read_text("utf-8")):
+        if not built & set(page.relative_to(docs).parts) and _BEGIN.search(page.read_text("utf-8")):
             yield page
 
 

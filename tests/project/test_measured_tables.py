@@ -95,6 +95,12 @@ def test_a_record_that_is_missing_is_named(tmp_path):
         measured_tables.fill(region("curve: along"), tmp_path)
 
 
+def test_a_table_without_an_end_is_no_table(tables):
+    text = region("curve: along").replace("<!-- end of table -->", "")
+    with pytest.raises(ValueError, match="a table has no end"):
+        measured_tables.fill(text, tables)
+
+
 def test_the_build_ends_where_a_page_is_not_up_to_date(tables, tmp_path):
     docs = tmp_path / "docs"
     docs.mkdir()
