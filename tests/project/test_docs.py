@@ -1,6 +1,6 @@
 """The pages run: every Python block as it stands, every command on small models, in a folder with the files they name.
 
-What needs a data set, a browser or another machine is read by the command line's own parser, as every command is.
+What needs a data set, a browser, ray or another machine is read by the command line's own parser, as every command is.
 """
 
 import re
@@ -17,7 +17,7 @@ from mapctl.commands import COMMANDS
 
 ALL = [(page, line) for page in pages.PAGES for line in pages.commands(page)]
 INLINE = [line for page in pages.PAGES for line in pages.inline_commands(page)]
-NOT_RUN = re.compile(r"mapctl (live|bench|demo|train all)\b|DATA|ADDRESS")
+NOT_RUN = re.compile(r"mapctl (live|bench|demo|train all)\b|DATA|--cluster")
 LONG = re.compile(
     r"mapctl (run|chain|train (refiner|.* (mocap|everything)/)|tween (docs|.*(120|LeftHand)$))"
     "|--(causal|best-of|variations|reference|jobs|root-only|suggest-timing|init|video|loop)|auto|denoise example:"
