@@ -14,7 +14,7 @@ so that its source reads well, too:
     <!-- end of table -->
 
 A line names a column and its heading. After `|` stands how its numbers are written: `.2` with two decimals, `%` as a
-share, `x100` times a hundred; without it they have three digits. Columns with ` / ` or ` to ` between them share a
+share; without it they have three digits. Columns with ` / ` or ` to ` between them share a
 cell. `@where` keeps the rows whose text fits a regular expression as a whole, `@part` those of one part. `@sources: no`
 leaves out the line of the source, for a page that shows several tables of one record.
 
@@ -143,18 +143,12 @@ def format_value(value: object, style: str) -> str:
         return "yes" if value else "no"
     if not isinstance(value, int | float):
         return str(value)
-    decimals = None
-    for word in style.split():
-        if word.startswith("x"):
-            value = value * float(word[1:])
-        elif word.startswith("."):
-            decimals = int(word[1:])
-        elif word == "%":
-            return f"{100 * value:.0f} %"
-        else:
-            raise ValueError(f"numbers are not written as {word!r}")
-    if decimals is not None:
-        return f"{value:.{decimals}f}"
+    if style == "%":
+        return f"{100 * value:.0f} %"
+    if style.startswith("."):
+        return f"{value:.{int(style[1:])}f}"
+    if style:
+        raise ValueError(f"numbers are not written as {style!r}")
     if isinstance(value, int):
         return str(value)
     return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"

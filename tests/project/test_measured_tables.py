@@ -52,13 +52,13 @@ def test_numbers_are_written_as_the_page_says(tables):
     rows = show(
         tables,
         "error_m: m",
-        "error_m / worst_m: mean / max, cm | x100 .1",
+        "error_m / worst_m: mean / max, m | .1",
         "apart to apart: told apart | %",
         "@where curve: line:.*",
         "@part: walks|runs",
         "@sources: no",
     )
-    assert rows[2:] == ["| 0.0123 | 1.2 / 5.0 | 69 % to 69 % |", "| 0.5 | 50.0 | 50 % to 50 % |"]
+    assert rows[2:] == ["| 0.0123 | 0.0 / 0.1 | 69 % to 69 % |", "| 0.5 | 0.5 | 50 % to 50 % |"]
 
 
 def test_three_digits_without_a_style(tables):
@@ -112,6 +112,11 @@ def test_the_build_ends_where_a_page_is_not_up_to_date(tables, tmp_path):
     page.write_text(page.read_text().replace("line:8", "line:9"))
     with pytest.raises(measured_tables.ExtensionError, match=r"page\.md does not show what was measured"):
         measured_tables.check_all(app)
+
+
+def test_pages_in_folders_are_found():
+    shown = {page.name for page in measured_tables.list_pages(DOCS)}
+    assert {"results.md", "denoising.md", "weights.md"} <= shown
 
 
 @pytest.mark.parametrize("page", list(measured_tables.list_pages(DOCS)), ids=lambda page: page.stem)
