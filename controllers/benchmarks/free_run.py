@@ -1,13 +1,16 @@
-"""Benchmark of long free runs of a density: whether a character stops or diverges."""
+"""Benchmark of long free runs of a density: whether a character stops or diverges, and how often its pace changes."""
 
 from collections.abc import Mapping
+from dataclasses import asdict
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from controllers.benchmarks.shared.tables import Row
 from controllers.generation.generate import GenerateSettings, initialise_generation
-from mapctl.features import LAYOUT, PRIOR_FPS, ground_speed
+from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, ground_speed, integrate_root
+from mapctl.metrics.pace_changes import PaceChanges, compute_ground_velocity, count_pace_changes
 from mapctl.metrics.states import summarise_states
 from mapctl.protocols import Density
 
@@ -18,12 +21,14 @@ def benchmark_free_run(
     """Measure long free runs at temperature 1: a row each, and one of their means beside the training `data`'s values.
 
     A character that had stopped would show in its slowest second; one that had diverged in its largest feature, in
-    standard deviations.
+    standard deviations. Changes of pace are counted over ten minutes, so that they read as whole numbers.
     """
-    rows, everything = [], []
+    rows, everything, changed = [], [], PaceChanges()
     for run in range(runs):
         features = _sample_free_run(prior, frames, seed + run)
+        changes = _count_pace_changes(features)
         everything.append(features)
+        changed += changes
         pace = ground_speed(features)
         seconds = pace[: len(pace) // PRIOR_FPS * PRIOR_FPS].unflatten(0, (-1, PRIOR_FPS)).mean(-1)
         rows.append(
@@ -33,9 +38,32 @@ def benchmark_free_run(
                 "slowest_second_m_s": float(seconds.min()),
                 "fastest_second_m_s": float(seconds.max()),
                 "largest_feature_sigma": float(_standardise_features(prior, features).abs().max()),
+                **_count_in_ten_minutes(asdict(changes), frames / PRIOR_FPS / 60),
             }
         )
-    return [*rows, {"run": "all", **summarise_states(torch.cat(everything))}, {"run": "training data", **data}]
+    together = {
+        **summarise_states(torch.cat(everything)),
+        **_count_in_ten_minutes(asdict(changed), runs * frames / PRIOR_FPS / 60),
+    }
+    return [*rows, {"run": "all", **together}, {"run": "training data", **data}]
+
+
+def summarise_held_changes(holds: Mapping[str, float]) -> dict[str, float]:
+    """Summarise the changes of pace that a card tells of its clips as this table has them; nothing of what it does not
+    tell."""
+    told = {"starts": "starts", "stops": "stops", "to_run": "changes to a run", "to_walk": "changes to a walk"}
+    counts = {name: holds[words] for name, words in told.items() if words in holds}
+    return _count_in_ten_minutes(counts, holds["minutes"]) if counts else {}
+
+
+def _count_pace_changes(features: Tensor) -> PaceChanges:
+    ground, _ = integrate_root(features.double(), GroundPose.origin(torch.float64))
+    velocity = compute_ground_velocity(ground.numpy(), PRIOR_FPS)
+    return count_pace_changes(np.linalg.norm(velocity, axis=1))
+
+
+def _count_in_ten_minutes(counts: Mapping[str, float], minutes: float) -> dict[str, float]:
+    return {f"{name}_10min": 10 * count / minutes for name, count in counts.items()}
 
 
 def _sample_free_run(prior: Density, frames: int, seed: int) -> Tensor:

@@ -1,7 +1,7 @@
 """`mapctl bench free-run`: long random motions."""
 
 import priors
-from controllers.benchmarks.free_run import benchmark_free_run
+from controllers.benchmarks.free_run import benchmark_free_run, summarise_held_changes
 from controllers.benchmarks.shared.tables import Row
 from mapctl.commands.bench import FreeRun
 from mapctl.commands.bench.baselines import list_models, measure_each
@@ -13,6 +13,7 @@ def run(table: FreeRun) -> int:
 
     def measure(name: str) -> list[Row]:
         prior = priors.load(name)
-        return benchmark_free_run(prior, prior.card.quality["data"])
+        held = summarise_held_changes(prior.card.data.get("holds", {}))
+        return benchmark_free_run(prior, prior.card.quality["data"] | held)
 
     return print_rows(table, measure_each(list_models(table.prior, table.baselines), measure))

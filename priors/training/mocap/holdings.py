@@ -1,14 +1,12 @@
 """What a corpus holds: minutes by speed, starts and stops, turns, contacts. What is not in it cannot be learnt."""
 
-from collections.abc import Sequence
-from itertools import pairwise
-
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 from scipy.ndimage import gaussian_filter1d
 
 from mapctl.features import LAYOUT, PRIOR_FPS
+from mapctl.metrics.pace_changes import PaceChanges, compute_ground_velocity, count_pace_changes
 from priors.training.corpus import Corpus
 
 SPEEDS = (0.15, 0.6, 1.1, 1.6, 2.2)
@@ -16,15 +14,15 @@ SPEEDS = (0.15, 0.6, 1.1, 1.6, 2.2)
 TURNING = 45.0
 """From this on a heading's change counts as a turn, degrees a second."""
 _SMOOTH = 0.2 * PRIOR_FPS  # frames, standard deviation, over which sway within a stride is averaged out
-_STANDS, _GOES = 0.2, 0.6  # m/s between which a start or a stop leads
 _SPOT, _WAY = 0.3, 0.5  # m/s up to which a turn is on the spot, and from which on one is under way
 
 
 def measure_holdings(corpus: Corpus) -> dict[str, float | dict[str, float]]:
     """Measure what the clips hold, by the hips' smoothed speed and heading, for a card.
 
-    Minutes in all and by speed; starts (from under 0.2 to over 0.6 m/s) and stops; seconds of turning on the spot and
-    under way, of going backwards and sideways; the share of frames in which a foot is planted.
+    Minutes in all and by speed; starts (from under 0.2 to over 0.6 m/s) and stops, changes to a run (from under 1.7 to
+    over 2.1 m/s) and to a walk; seconds of turning on the spot and under way, of going backwards and sideways; the
+    share of frames in which a foot is planted.
     """
     ground, heading = corpus.integrate_roots()
     parts = [
@@ -33,7 +31,7 @@ def measure_holdings(corpus: Corpus) -> dict[str, float | dict[str, float]]:
     ]
     speed, turn, aside = (np.concatenate([part[k] for part in parts]) for k in range(3))
     way = speed > _WAY
-    changes = [_count_changes(part[0]) for part in parts]
+    changes = sum((count_pace_changes(speeds) for speeds, _, _ in parts), PaceChanges())
     seconds = {
         "turning on the spot": (speed < _SPOT) & (turn > TURNING),
         "turning under way": way & (turn > TURNING),
@@ -43,8 +41,10 @@ def measure_holdings(corpus: Corpus) -> dict[str, float | dict[str, float]]:
     return {
         "minutes": round(len(speed) / PRIOR_FPS / 60, 2),
         "minutes by speed": _split_by_speed(speed),
-        "starts": float(sum(starts for starts, _ in changes)),
-        "stops": float(sum(stops for _, stops in changes)),
+        "starts": float(changes.starts),
+        "stops": float(changes.stops),
+        "changes to a run": float(changes.to_run),
+        "changes to a walk": float(changes.to_walk),
         **{f"seconds of {name}": round(float(chosen.sum()) / PRIOR_FPS, 1) for name, chosen in seconds.items()},
         "share of frames with a foot planted, each": round(
             float(LAYOUT.pick(corpus.features, "contacts").float().mean()), 3
@@ -66,14 +66,7 @@ def _track(
     if len(heading) < 2:
         return np.zeros(len(heading)), np.zeros(len(heading)), np.zeros(len(heading))
     smooth = gaussian_filter1d(heading, _SMOOTH, mode="nearest")
-    velocity = np.gradient(gaussian_filter1d(ground, _SMOOTH, axis=0, mode="nearest"), 1 / PRIOR_FPS, axis=0)
+    velocity = compute_ground_velocity(ground, PRIOR_FPS)
     turn = np.degrees(np.gradient(smooth, 1 / PRIOR_FPS))
     aside = np.degrees(np.arctan2(velocity[:, 0], velocity[:, 1]) - smooth)
     return np.linalg.norm(velocity, axis=1), np.abs(turn), np.abs((aside + 180) % 360 - 180)
-
-
-def _count_changes(speed: Float[ndarray, " frames"]) -> tuple[int, int]:
-    """Starts and stops of a clip."""
-    states: Sequence[bool] = [bool(value > _GOES) for value in speed if value < _STANDS or value > _GOES]
-    pairs = list(pairwise(states))
-    return pairs.count((False, True)), pairs.count((True, False))
