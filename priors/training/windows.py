@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mapctl import rotations
-from mapctl.features import LAYOUT, mirror_features
+from mapctl.features import LAYOUT, ground_speed, mirror_features
 from mapctl.inbetweening import PositionImage
 from mapctl.inbetweening.interpolation import interpolate_heading, interpolate_positions
 from mapctl.pose import BodyPose
@@ -15,6 +15,8 @@ from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors.training.corpus import Corpus, find_window_starts, number_clip_folders
 
 _CHUNK_FRAMES = 50_000  # frames
+_GOING = 0.25  # m/s that the hips of somebody who goes reach, on average over the frames around one
+_AROUND = 9  # frames, so that who shifts his weight goes nowhere
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,12 +34,15 @@ class FeatureBatch:
 class FeatureWindows:
     """Draws windows from a corpus."""
 
-    def __init__(self, corpus: Corpus, frames: int, *, evenness: float | None = None):
+    def __init__(self, corpus: Corpus, frames: int, *, evenness: float | None = None, standing_share: float = 1.0):
         """`evenness` among the corpus' top folders: 0 draws by their frames, 1 the same number from each; None draws
-        by frames without a look at folders. RequestError where no clip is as long as a window.
+        by frames without a look at folders. Of the windows in which the hips stay under 0.25 m/s only
+        `standing_share` is drawn. RequestError where no clip is as long as a window.
         """
         self.features, self.frames = corpus.features, frames
         self.starts = find_window_starts(corpus.lengths, frames)
+        if standing_share < 1:
+            self.starts = _thin_standing(self.features, self.starts, frames, standing_share)
         if evenness is not None:
             folder = number_clip_folders(corpus).repeat_interleave(torch.tensor(corpus.lengths))
             # Grouped, so that drawing a folder and then a window in it needs no table of all windows' chances.
@@ -68,6 +73,19 @@ class FeatureWindows:
                 for group, share in zip(groups.tolist(), shares.tolist(), strict=True)
             ]
         )
+
+
+def _thin_standing(
+    features: Float[Tensor, "frames size"], starts: Int[Tensor, " starts"], frames: int, share: float
+) -> Int[Tensor, " left"]:
+    """Leave this share of the windows in which nobody goes anywhere, evenly over the corpus, and all others."""
+    around = torch.full((1, 1, _AROUND), 1 / _AROUND)
+    padded = torch.nn.functional.pad(ground_speed(features)[None, None], (_AROUND // 2, _AROUND // 2), mode="replicate")
+    speed = torch.nn.functional.conv1d(padded, around)[0, 0]
+    standing = speed.unfold(0, frames, 1).amax(-1)[starts] < _GOING
+    number = standing.cumsum(0)
+    left = (share * number).ceil() > (share * (number - 1)).ceil()
+    return starts[~standing | left]
 
 
 @dataclass(frozen=True, eq=False)

@@ -42,6 +42,9 @@ class TrainDensity(TunableOptions):
     """Largest change of a copy's tempo, as a share."""
     strides: options.Number = 0.1
     """Largest change of how far a copy steps, as a share: as of a body with other legs."""
+    standing_share: options.MaybeNumber = None
+    """Share of the windows in which nobody goes anywhere that training sees, 1 by default: below it for motion that
+    mostly stands, whose density stands fast otherwise."""
     device: Annotated[Literal["auto", "cpu", "cuda"], arg(metavar="auto|cpu|cuda")] = "auto"
     """Where to compute."""
 
@@ -61,7 +64,7 @@ class TrainDensity(TunableOptions):
         copies = ClipCopies(self.copies, tempo=self.tempo, strides=self.strides)
         usual = (LstmGmmConfig(), TrainingSettings())
         config, settings = PAPER if self.paper else PLAIN if self.plain else usual
-        given = self.select_given("steps", "batch", "window", "learning_rate", "seed")
+        given = self.select_given("steps", "batch", "window", "learning_rate", "standing_share", "seed")
         return DensityRecipe(
             **common,
             config=replace(config, **shape),

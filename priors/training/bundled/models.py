@@ -47,6 +47,8 @@ class WeightSet:
     come."""
     copies: int = 0
     """Copies of each clip, at other tempos and with other strides, that the densities are trained on beside it."""
+    standing_share: float = 1.0
+    """Share of the windows in which nobody goes anywhere that the densities of walks and runs are shown."""
     window: int = TrainingSettings.window
     """Frames of the windows of densities: short ones where runs are short."""
     width: int = 256
@@ -75,6 +77,7 @@ SETS: Mapping[str, WeightSet] = {
         r"|13_(0[7-9]|1[4-6]|26)|14_(0[45]|1[27-9]|37))\.",
         level=True,
         copies=8,
+        standing_share=0.17,
         window=40,
         width=192,
         live_width=None,
@@ -151,13 +154,13 @@ def _make_models(weights: WeightSet, made: Path | None) -> tuple[BundledModel, .
     widths = {"locomotion": weights.width, "locomotion-live": weights.live_width}
     return (
         *(
-            BundledModel(name, DensityRecipe(**walks, **_density(weights, width=width, steps=weights.plan(10_000))))
+            BundledModel(
+                name, DensityRecipe(**walks, **_density(weights, width, weights.plan(10_000), walks_only=True))
+            )
             for name, width in widths.items()
             if width is not None
         ),
-        BundledModel(
-            "general", DensityRecipe(**general, **_density(weights, width=weights.width, steps=weights.plan(12_000)))
-        ),
+        BundledModel("general", DensityRecipe(**general, **_density(weights, weights.width, weights.plan(12_000)))),
         BundledModel(
             "locomotion-refiner",
             RefinerRecipe(**shared, settings=AdversarialSettings(rounds=weights.plan(3000), bfloat16=True)),
@@ -198,9 +201,15 @@ def _make_models(weights: WeightSet, made: Path | None) -> tuple[BundledModel, .
     )
 
 
-def _density(weights: WeightSet, *, width: int, steps: int) -> dict[str, Any]:
-    copies = ClipCopies(weights.copies)
-    settings = TrainingSettings(steps=steps, batch=64, window=weights.window, bfloat16=True, copies=copies)
+def _density(weights: WeightSet, width: int, steps: int, *, walks_only: bool = False) -> dict[str, Any]:
+    settings = TrainingSettings(
+        steps=steps,
+        batch=64,
+        window=weights.window,
+        bfloat16=True,
+        copies=ClipCopies(weights.copies),
+        standing_share=weights.standing_share if walks_only else 1.0,
+    )
     return {"config": LstmGmmConfig(width=width), "settings": settings}
 
 

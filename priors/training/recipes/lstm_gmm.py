@@ -63,6 +63,9 @@ class TrainingSettings:
     """Each window is mirrored left to right with probability one half."""
     copies: ClipCopies = field(default_factory=ClipCopies)
     """Copies of the clips at other tempos and with other strides, for corpora of a few minutes."""
+    standing_share: float = 1.0
+    """Share of the windows in which nobody goes anywhere that are drawn: where most of the motion stands, a density
+    that sees all of them stands fast, and is hard to steer into a walk."""
     weight_decay: float = 1e-4
     """Decoupled, for adam."""
     matching: MatchingSettings = field(default_factory=MatchingSettings)
@@ -76,6 +79,8 @@ class TrainingSettings:
 
     def __post_init__(self):
         require_at_least(self, 1, "steps", "batch", "window")
+        if not 0 < self.standing_share <= 1:
+            raise RequestError(f"the share of standing windows must be over 0 and at most 1: {self.standing_share:g}")
         for name, known in (("optimiser", ("adam", "rmsprop")), ("schedule", ("cosine", "epochs"))):
             if getattr(self, name) not in known:
                 raise RequestError(f"{name} must be {' or '.join(known)}, got {getattr(self, name)!r}")
@@ -131,7 +136,7 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
             self.network.load_state_dict(dict(init))
         self.labels = labels or Labels.none(len(corpus.lengths))
         self.clip_ends = torch.tensor(corpus.lengths).cumsum(0)
-        self.windows = FeatureWindows(corpus, settings.window + 1)
+        self.windows = FeatureWindows(corpus, settings.window + 1, standing_share=settings.standing_share)
         self._latest = corpus.features[:0]  # windows of the step under way
 
     def networks(self) -> dict[str, nn.Module]:
@@ -376,7 +381,7 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
         parts += [f"--components {self.config.components}"] if mixed else []
         parts += ["--made MADE"] if self.made else []
         parts += self.format_reading() + ["--bfloat16"] * self.settings.bfloat16
-        parts += self.format_changed(settings, "steps", "batch", "window", "learning_rate", "seed")
+        parts += self.format_changed(settings, "steps", "batch", "window", "learning_rate", "standing_share", "seed")
         parts += self.settings.copies.format_options()
         parts += self.format_processes() + self.format_ending()
         return " ".join(parts + option)
