@@ -77,7 +77,7 @@ SETS: Mapping[str, WeightSet] = {
         r"|13_(0[7-9]|1[4-6]|26)|14_(0[45]|1[27-9]|37))\.",
         level=True,
         copies=8,
-        standing_share=0.17,
+        standing_share=0.33,
         window=40,
         width=192,
         live_width=None,

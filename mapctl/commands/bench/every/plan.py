@@ -20,6 +20,7 @@ _PLAN = {
     "why": "why --data DATA --steps 2000",
     "free-run": "free-run",
     "free-run-general": "free-run --prior general",
+    "free-run-free": "free-run --prior free/locomotion",
     "shots": "shots --count 40 --data DATA",
     "shots-corners": "shots --corners --seeds 4",
     "denoise": "denoise --data DATA --count 30",
