@@ -82,6 +82,12 @@ def walk_through(places_xz, *, headings: float | Tensor = 0.0, fps=30, swing=0.5
     return Motion(CANONICAL, Fraction(fps), root, quats)
 
 
+def go_at(*speeds: float, seconds: int) -> Tensor:
+    """Features of the canonical body that goes along +Z, so many seconds at each speed, m/s."""
+    way = torch.tensor(speeds).double().repeat_interleave(30 * seconds).cumsum(0) / 30
+    return encode(walk_through(torch.stack([0 * way, way], dim=1)))[0].float()
+
+
 def _swing(phase: Tensor, seed: int) -> Tensor:
     """Rotation vectors (frames, joints, 3) of a gait, with a smooth wobble that the seed draws."""
     offset = 6.3 * torch.rand(CANONICAL.num_joints, 3, generator=generator(seed), dtype=torch.float64)

@@ -21,7 +21,7 @@ def benchmark_free_run(
     """Measure long free runs at temperature 1: a row each, and one of their means beside the training `data`'s values.
 
     A character that had stopped would show in its slowest second; one that had diverged in its largest feature, in
-    standard deviations. Changes of pace are counted over ten minutes, so that they read as whole numbers.
+    standard deviations. Changes of pace are given for ten minutes.
     """
     rows, everything, changed = [], [], PaceChanges()
     for run in range(runs):

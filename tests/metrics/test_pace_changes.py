@@ -2,11 +2,9 @@
 
 import numpy as np
 import pytest
-import torch
-from helpers import tiny_density, walk_through
+from helpers import go_at, tiny_density
 
 from controllers.benchmarks import free_run
-from mapctl.features import encode
 from mapctl.metrics.pace_changes import PaceChanges, compute_ground_velocity, count_pace_changes
 
 
@@ -49,11 +47,6 @@ def test_sway_within_a_stride_is_no_change(fps):
     within = velocity[round(fps) : -round(fps), 1]
     assert np.abs(within - 1).max() < 0.05
     assert abs(within.mean() - 1) < 0.01
-
-
-def go_at(*speeds: float, seconds: int) -> torch.Tensor:
-    way = torch.tensor(speeds).double().repeat_interleave(30 * seconds).cumsum(0) / 30
-    return encode(walk_through(torch.stack([0 * way, way], dim=1)))[0].float()
 
 
 def test_the_table_of_free_runs_counts_over_ten_minutes(monkeypatch):

@@ -2,21 +2,15 @@
 
 import pytest
 import torch
-from helpers import generator, run, walk_through, write_corpus
+from helpers import generator, go_at, run, write_corpus
 
 import priors
 from mapctl.errors import RequestError
-from mapctl.features import encode
 from priors.training.corpus import Corpus, find_window_starts
 from priors.training.recipes.lstm_gmm import TrainingSettings
 from priors.training.windows import FeatureWindows
 
 FRAMES = 20
-
-
-def go_at(*speeds: float, seconds: int) -> torch.Tensor:
-    way = torch.tensor(speeds).double().repeat_interleave(30 * seconds).cumsum(0) / 30
-    return encode(walk_through(torch.stack([0 * way, way], dim=1)))[0].float()
 
 
 @pytest.fixture(scope="module")
