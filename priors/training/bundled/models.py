@@ -155,7 +155,7 @@ def _make_models(weights: WeightSet, made: Path | None) -> tuple[BundledModel, .
     return (
         *(
             BundledModel(
-                name, DensityRecipe(**walks, **_density(weights, width, weights.plan(10_000), walks_only=True))
+                name, DensityRecipe(**walks, **_density(weights, width, weights.plan(10_000), weights.standing_share))
             )
             for name, width in widths.items()
             if width is not None
@@ -201,14 +201,14 @@ def _make_models(weights: WeightSet, made: Path | None) -> tuple[BundledModel, .
     )
 
 
-def _density(weights: WeightSet, width: int, steps: int, *, walks_only: bool = False) -> dict[str, Any]:
+def _density(weights: WeightSet, width: int, steps: int, standing_share: float = 1.0) -> dict[str, Any]:
     settings = TrainingSettings(
         steps=steps,
         batch=64,
         window=weights.window,
         bfloat16=True,
         copies=ClipCopies(weights.copies),
-        standing_share=weights.standing_share if walks_only else 1.0,
+        standing_share=standing_share,
     )
     return {"config": LstmGmmConfig(width=width), "settings": settings}
 
