@@ -110,17 +110,18 @@ class Stitcher(checkpoints.LoadedModel, Inbetweener):
     @torch.no_grad()
     def connect(
         self,
-        before: Float[Tensor, "before size"],
+        before: Float[Tensor, "*batch before size"],
         after: Float[Tensor, "batch after size"],
         place: Float[Tensor, "batch 2"],
         turn: Float[Tensor, " batch"],
         frames: int,
+        noise: torch.Generator | None = None,
     ) -> Generator[None, None, Float[Tensor, "batch frames size"]]:
-        """Make, a frame at a time, the calm ways from the last frame of `before` to the last of `after`, which are run
-        backwards, as features from the next frame on to that one, `frames` later. Seen from the first, it is at
-        `place`, metres, and its heading another by `turn`, radians. All others of these frames say how motion came here
-        and goes on."""
-        before = before[-1 - MAX_CONTEXT :].expand(len(after), -1, -1)
+        """Make, a frame at a time, the ways from the last frame of `before`, of one motion or of each, to the last of
+        `after`, which are run backwards, as features from the next frame on to that one, `frames` later. Seen from the
+        first, it is at `place`, metres, and its heading another by `turn`, radians. All others of these frames say how
+        motion came here and goes on. The ways are the calm ones, or drawn if there is `noise`."""
+        before = before[..., -1 - MAX_CONTEXT :, :].expand(len(after), -1, -1)
         after = after[:, -1 - MAX_CONTEXT :]
         context = max(before.shape[1], after.shape[1])
         sides, present = [], []
@@ -129,8 +130,11 @@ class Stitcher(checkpoints.LoadedModel, Inbetweener):
             sides.append(torch.cat([known[:, :1].expand(-1, lead, -1), known], dim=1))
             present.append((torch.arange(context) >= lead).float().expand(len(after), -1))
         ends = Ends(torch.stack(sides), torch.stack(present), place, turn)
-        calm = DrawnLatents.calm(self.network.config, len(place), count_made(self.network, frames))
-        joined = join_sides((yield from walk_stepwise(self.network, ends, frames, calm)))
+        config, made = self.network.config, count_made(self.network, frames)
+        latents = DrawnLatents.calm(config, len(place), made)
+        if noise is not None:
+            latents = DrawnLatents.sample(config, len(place), made, noise).scale(float(self.network.temperature))
+        joined = join_sides((yield from walk_stepwise(self.network, ends, frames, latents)))
         origin = GroundPose(torch.zeros_like(place), torch.zeros_like(turn))
         first, last = _stand_at(before[:, -1], origin), _stand_at(after[:, -1], GroundPose(place, turn))
         root = torch.cat([first.root_position, joined.root_position, last.root_position], dim=1)

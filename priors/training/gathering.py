@@ -1,12 +1,13 @@
 """What a training run is trained on: the corpus of a folder, split, and the files that were left out, said."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.formats.atomic import write_text
+from priors.training.augmentation.splices import Splices, add_splices
 from priors.training.corpus import Corpus, SkippedFile, Split, join_made, keep_share, read_corpus, split_corpus
 from priors.training.mocap.made import require_made
 
@@ -41,6 +42,8 @@ class DataSource:
     """Share of the training clips that are used (see `keep_share`)."""
     made: Path | None = None
     """Folder of clips that a model made, with their list (see `find_made`), which are trained on as well."""
+    splices: Splices = field(default_factory=Splices)
+    """Splices of the clips to train on, which are trained on as well."""
 
 
 def gather(source: DataSource, *, progress: Progress, warn: Progress) -> tuple[Corpus, Split]:
@@ -67,6 +70,8 @@ def gather(source: DataSource, *, progress: Progress, warn: Progress) -> tuple[C
     if source.strict and corpus.skipped:
         raise RequestError(f"--strict-data: {_list_skipped(corpus.skipped, source.data)}")
     corpus, parts = keep_share(corpus, split_corpus(corpus, source.seed), source.share, source.seed)
+    parts = replace(parts, train=add_splices(parts.train, source.splices))
+    corpus = replace(corpus, made=parts.train.made)
     if corpus.skipped:
         rest = f"; all are in {source.run / _SKIPPED_LIST}" if len(corpus.skipped) > _MOST_NAMED else ""
         of = len(corpus.names) + len(corpus.skipped)

@@ -11,12 +11,11 @@ from tiny_prior import save_tiny_prior
 
 import mapctl
 import priors
-from mapctl.commands.make import checks
 from mapctl.commands.make import run as make_run
-from mapctl.commands.make.checks import CHECKED, find_bounds, list_faults, measure_checked
 from mapctl.commands.make.scripts import draw_script
 from mapctl.commands.train.whole_set.plan import make_jobs
 from mapctl.errors import FileFormatError
+from mapctl.metrics.mocap_bounds import CHECKED, find_bounds, list_faults, measure_checked
 from mapctl.protocols import DataLimits
 from mapctl.skeleton import CANONICAL
 from priors.training.bundled.models import list_models
@@ -120,7 +119,7 @@ def test_what_fails_is_listed_and_not_kept(tmp_path, prior, capsys):
 
 
 def test_what_passes_is_kept_and_trained_on_by_name(tmp_path, prior, monkeypatch, capsys):
-    monkeypatch.setattr(make_run, "find_bounds", lambda reference: LOOSE | {"jitter_m_s3": checks.math.inf})
+    monkeypatch.setattr(make_run, "find_bounds", lambda reference: LOOSE | {"jitter_m_s3": math.inf})
     assert make(tmp_path, prior, "--seed", 5, "--quiet") == 0
     rows = table(tmp_path)
     assert [row["kept"] for row in rows] == ["yes", "yes"]

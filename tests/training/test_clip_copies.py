@@ -17,7 +17,8 @@ from mapctl.skeleton import TOE_JOINTS
 from priors.training.augmentation.clip_copies import ClipCopies, add_copies, change_strides, copy_clip
 from priors.training.augmentation.pose_windows import PoseWindows
 from priors.training.corpus import Corpus, Split
-from priors.training.recipes.lstm_gmm import DensityRecipe, TrainingSettings
+from priors.training.recipes.density.settings import TrainingSettings
+from priors.training.recipes.lstm_gmm import DensityRecipe
 
 pytestmark = pytest.mark.usefixtures("small_judgements")
 FACTORS = [(1.15, 1.0), (0.85, 1.0), (1.0, 1.1), (1.0, 0.9), (1.12, 1.08), (0.9, 0.93)]

@@ -11,7 +11,9 @@ import priors
 from priors.lstm_gmm.network import LstmGmmConfig
 from priors.training import run
 from priors.training.quality import density as density_quality
-from priors.training.recipes.lstm_gmm import DensityRecipe, DensityTrainer, TrainingSettings
+from priors.training.recipes.density.settings import TrainingSettings
+from priors.training.recipes.density.trainer import DensityTrainer
+from priors.training.recipes.lstm_gmm import DensityRecipe
 
 TINY = LstmGmmConfig(width=8, components=2)
 SETTINGS = TrainingSettings(steps=6, batch=4, window=20)

@@ -8,7 +8,8 @@ from mapctl.errors import RequestError
 from mapctl.features import LAYOUT
 from priors.lstm_gmm.network import LstmGmmConfig
 from priors.training.moment_matching import MatchingSettings, free_run_moment_loss, moment_loss
-from priors.training.recipes.lstm_gmm import DensityTrainer, TrainingSettings
+from priors.training.recipes.density.settings import TrainingSettings
+from priors.training.recipes.density.trainer import DensityTrainer
 
 SETTINGS = MatchingSettings(batch=8, context=10, wander=0, frames=10)
 

@@ -25,7 +25,9 @@ from priors.training.quality.refiner import RefinerEvaluator, compute_realism_ga
 from priors.training.recipes import denoiser as denoiser_recipe
 from priors.training.recipes import lstm_gmm as density_recipe
 from priors.training.recipes.denoiser import DenoiserRecipe, DenoiserSettings, DenoiserTrainer, compute_squared_losses
-from priors.training.recipes.lstm_gmm import DensityRecipe, DensityTrainer, TrainingSettings
+from priors.training.recipes.density.settings import TrainingSettings
+from priors.training.recipes.density.trainer import DensityTrainer
+from priors.training.recipes.lstm_gmm import DensityRecipe
 from priors.training.recipes.refiner import RefinerRecipe
 from priors.training.recipes.refining.plain import PlainRefinerRecipe, PlainRefinerSettings, PlainRefinerTrainer
 from priors.training.recipes.refining.samples import compute_root_error

@@ -20,7 +20,9 @@ from priors.training import corpus as corpora
 from priors.training.feature_statistics import compute_feature_statistics
 from priors.training.quality import density as density_quality
 from priors.training.recipes import lstm_gmm
-from priors.training.recipes.lstm_gmm import PAPER, DensityRecipe, DensityTrainer, TrainingSettings
+from priors.training.recipes.density.settings import PAPER, TrainingSettings
+from priors.training.recipes.density.trainer import DensityTrainer
+from priors.training.recipes.lstm_gmm import DensityRecipe
 from priors.training.run import train
 
 TINY = LstmGmmConfig(width=8, components=2)

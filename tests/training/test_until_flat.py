@@ -21,7 +21,7 @@ from priors.training import run
 from priors.training.ending.course import Course, UntilFlat
 from priors.training.ending.decay import Decay
 from priors.training.quality import density as density_quality
-from priors.training.recipes.lstm_gmm import DensityTrainer
+from priors.training.recipes.density.trainer import DensityTrainer
 from priors.training.recipes.path import PathRecipe, PathSettings, PathTrainer
 from priors.training.recipes.stitcher import StitcherConfig, StitcherRecipe
 from priors.training.run import train

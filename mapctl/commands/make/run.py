@@ -12,7 +12,6 @@ import priors
 from controllers.steering import steer
 from controllers.steering.loop import Recorder, drive
 from mapctl.commands.make import Make
-from mapctl.commands.make.checks import CHECKED, find_bounds, list_faults, measure_checked
 from mapctl.commands.make.scripts import draw_script
 from mapctl.commands.shared import inputs, options, outputs
 from mapctl.commands.shared.progress_bar import show_progress
@@ -21,6 +20,7 @@ from mapctl.errors import RequestError
 from mapctl.features import GroundPose
 from mapctl.formats.atomic import write_text
 from mapctl.intent.steering import CommandTrack
+from mapctl.metrics.mocap_bounds import CHECKED, find_bounds, list_faults, measure_checked
 from mapctl.motion import Motion
 from mapctl.pose import BodyPose
 from priors.lstm_gmm.density import LstmGmmDensity

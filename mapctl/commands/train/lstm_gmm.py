@@ -42,6 +42,11 @@ class TrainDensity(TunableOptions):
     """Largest change of a copy's tempo, as a share."""
     strides: options.Number = 0.1
     """Largest change of how far a copy steps, as a share: as of a body with other legs."""
+    splices: options.Count = 0
+    """Splices of the clips that are tried: pieces of two and the stitcher's way between them, so that who does one
+    thing sets off, stops or does another. Those that pass for mocap are trained on as well."""
+    stitcher: options.MaybeName = None
+    """Stitcher that makes them; the bundled one if not given."""
     standing_share: options.MaybeNumber = None
     """Share of the windows in which nobody goes anywhere that training sees, 1 by default: below it for motion that
     mostly stands, whose density stands fast otherwise."""
@@ -52,7 +57,9 @@ class TrainDensity(TunableOptions):
         """The options as the trainer takes them; RequestError for numbers that make no sense."""
         from priors.lstm_gmm.network import LstmGmmConfig
         from priors.training.augmentation.clip_copies import ClipCopies
-        from priors.training.recipes.lstm_gmm import PAPER, PLAIN, DensityRecipe, TrainingSettings
+        from priors.training.augmentation.splices import Splices
+        from priors.training.recipes.density.settings import PAPER, PLAIN, TrainingSettings
+        from priors.training.recipes.lstm_gmm import DensityRecipe
 
         common, shape = self.common(), self.select_given("width", "components")
         if self.init is not None and (self.paper or self.plain or shape):
@@ -61,6 +68,8 @@ class TrainDensity(TunableOptions):
             )
         if self.paper and self.plain:
             raise RequestError("--paper and --plain are two variants; choose one")
+        if self.stitcher is not None and self.splices == 0:
+            raise RequestError("--stitcher makes --splices N of the clips; tell how many, or leave it out")
         copies = ClipCopies(self.copies, tempo=self.tempo, strides=self.strides)
         usual = (LstmGmmConfig(), TrainingSettings())
         config, settings = PAPER if self.paper else PLAIN if self.plain else usual
@@ -72,6 +81,7 @@ class TrainDensity(TunableOptions):
             device=self.device,
             skip_first=self.skip_first,
             made=self.made,
+            splices=Splices(self.splices, self.stitcher or Splices.stitcher),
             labels=self.labels,
             init=self.init,
         )

@@ -14,9 +14,10 @@ from priors.training.ending.course import UntilFlat
 from priors.training.mocap.cuts import CMU
 from priors.training.recipe import Recipe
 from priors.training.recipes.denoiser import DenoiserRecipe, DenoiserSettings
+from priors.training.recipes.density.settings import TrainingSettings
 from priors.training.recipes.infiller import InfillerRecipe
 from priors.training.recipes.keyframe_timing import KeyframeTimingRecipe
-from priors.training.recipes.lstm_gmm import DensityRecipe, TrainingSettings
+from priors.training.recipes.lstm_gmm import DensityRecipe
 from priors.training.recipes.path import PathRecipe, PathSettings
 from priors.training.recipes.pose_transformer import PoseTransformerRecipe, PoseTransformerSettings
 from priors.training.recipes.refiner import AdversarialSettings, RefinerRecipe

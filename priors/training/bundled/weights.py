@@ -105,5 +105,8 @@ def name_needs(card: Card, needs: Mapping[str, str]) -> Card:
     if "--density" in needs:
         command = command.replace(f"--density {data['density']}", f"--density {needs['--density']}")
         data["density"] = needs["--density"]
+    if "--stitcher" in needs:
+        command = command.replace(f" --stitcher {data['stitcher']}", "")
+        data["stitcher"] = needs["--stitcher"]
     command = command.replace(" --path PATH", "") if needs.get("--path") == "path" else command
     return replace(card, data=data, training={**card.training, "command": command})

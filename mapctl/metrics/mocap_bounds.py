@@ -1,4 +1,4 @@
-"""Checks that a made clip passes where it is within the ranges of mocap: none of its worst frames is worse."""
+"""Ranges of mocap that synthesised motion is held to: none of its worst frames may be worse than in most clips."""
 
 import math
 from collections.abc import Iterable, Mapping

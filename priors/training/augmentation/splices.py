@@ -1,0 +1,207 @@
+"""Splices: pieces of two clips and the stitcher's way between them, where each clip holds one thing done.
+
+A density of such clips goes on with whatever it does: nothing shows it that who waves may walk off. Clips that begin or
+stop going, or do something else, are made by the stitcher (Ren et al. 2024) and kept where they pass for mocap.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mapctl import rotations
+from mapctl.errors import RequestError
+from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, reversed_features
+from mapctl.metrics.mocap_bounds import find_bounds, list_faults, measure_checked
+from mapctl.metrics.pace_changes import compute_ground_velocity
+from mapctl.pose import decode
+from mapctl.runtime.stepwise import StepwiseWork
+from priors.stitching.inbetweener import MAX_CONTEXT, Stitcher, load
+from priors.training.corpus import Corpus
+from priors.training.mocap.made import Made
+
+FOLDER = "spliced/"
+"""Before the names of splices in a corpus, which are those of both clips."""
+_STANDS, _GOES = 0.2, 0.6  # m/s that smoothed speed is under or over where a piece is cut
+_KINDS = ((_STANDS, _GOES), (_GOES, _STANDS), (_STANDS, _STANDS))
+"""Who sets off, who stops, who stands and does something else: by how the first piece ends and the second begins."""
+_PIECE = 45, 120  # frames of a piece
+_GAPS = range(15, 60, 5)  # frames between two: few lengths, each of which is walked at once
+_GAP_A_SPEED = 12.0  # frames by which a gap is longer for each m/s of difference
+_TURN = 0.5  # standard deviation of the turn between two pieces, radians
+_REFERENCE = 300  # clips whose measures bound those of the splices
+_AT_ONCE = 64  # splices that are walked at once
+_VELOCITY_FRAMES = 5  # frames over which the velocity at a cut is estimated
+
+
+@dataclass(frozen=True)
+class Splices:
+    """How many splices are made beside the clips, and by which stitcher."""
+
+    count: int = 0
+    """Splices that are made; those that do not pass for mocap are left out."""
+    stitcher: str = "stitcher"
+    """The bundled one, or the file or run folder of a trained one."""
+    seed: int = 1
+    """Of the cuts, and of what the stitcher draws."""
+
+    def __post_init__(self):
+        if self.count < 0:
+            raise RequestError(f"--splices must be 0 or more, got {self.count}")
+
+    def format_options(self) -> list[str]:
+        """Options of the command, for the card; none where there are no splices."""
+        named = [] if self.stitcher == Splices.stitcher else [f"--stitcher {self.stitcher}"]
+        return [f"--splices {self.count}", *named] if self.count else []
+
+
+@dataclass(frozen=True)
+class Cut:
+    """Where a splice goes from one clip to another."""
+
+    clips: tuple[int, int]
+    """Numbers of the first and the second clip."""
+    first: slice
+    """Frames of the first clip, up to the last before the gap."""
+    second: slice
+    """Frames of the second clip, from the first after the gap on."""
+    gap: int
+    """Frames between the two."""
+    turn: float
+    """Of the heading from the one to the other, radians."""
+
+
+def add_splices(corpus: Corpus, splices: Splices) -> Corpus:
+    """Return a corpus with its clips, and after them the splices of them that no measure tells from them, by names that
+    begin with FOLDER; it says who made them.
+
+    Who stands sets off, who goes stops, and who stands does something else, as often each where the clips have it; the
+    second piece begins where velocities of both lead. RequestError for a corpus in which nobody stands for a piece,
+    CheckpointError for a stitcher that is none.
+    """
+    if splices.count == 0:
+        return corpus
+    stitcher, clips = load(splices.stitcher), corpus.clips()
+    generator = torch.Generator().manual_seed(splices.seed)
+    gaps = [gap for gap in _GAPS if gap <= stitcher.longest] or [stitcher.longest]
+    cuts = draw_cuts(corpus, splices.count, gaps, generator)
+    spliced = _walk_all(clips, cuts, stitcher, generator)
+    order = torch.randperm(len(clips), generator=generator)[:_REFERENCE].tolist()
+    bounds = find_bounds(decode(clips[number], GroundPose.origin()) for number in order if len(clips[number]) > 1)
+    kept = [number for number, features in enumerate(spliced) if _passes(features, bounds)]
+    names = tuple(FOLDER + " + ".join(corpus.names[clip] for clip in cuts[number].clips) for number in kept)
+    maker, licence = Path(stitcher.name).name, stitcher.card.licence
+    told = f"splices: {len(kept)} of {splices.count} that were tried, by {maker} ({licence})"
+    made = corpus.made
+    return replace(
+        corpus,
+        names=corpus.names + names,
+        lengths=(*corpus.lengths, *(len(spliced[number]) for number in kept)),
+        features=torch.cat([corpus.features, *(spliced[number] for number in kept)]),
+        made=Made(made.clips | {*names}, (*made.told, told), made.licences | {licence}),
+    )
+
+
+def draw_cuts(corpus: Corpus, count: int, gaps: Sequence[int], generator: torch.Generator) -> list[Cut]:
+    """Draw where pieces of two clips are cut, of each kind in turn, and which of the gaps lies between; RequestError
+    for a corpus in which nobody stands for a piece."""
+    speeds = _measure_speeds(corpus)
+    ends = {bound: _find_frames(speeds, bound, lead=_PIECE[0]) for bound in (_STANDS, _GOES)}
+    beginnings = {bound: _find_frames(speeds, bound, rest=_PIECE[0]) for bound in (_STANDS, _GOES)}
+    kinds = [(a, b) for a, b in _KINDS if len(ends[a]) and len(beginnings[b])]
+    if not kinds:
+        raise RequestError(f"splices need clips of {_PIECE[0] / PRIOR_FPS:g} s in which somebody stands")
+
+    def pick(bound: Tensor) -> tuple[int, int]:
+        clip, frame = bound[int(torch.randint(len(bound), (), generator=generator))].tolist()
+        return clip, frame
+
+    cuts = []
+    for number in range(count):
+        a, b = kinds[number % len(kinds)]
+        (one, last), (other, first) = pick(ends[a]), pick(beginnings[b])
+        lengths = torch.randint(_PIECE[0], _PIECE[1] + 1, (2,), generator=generator).tolist()
+        change = abs(float(speeds[one][last] - speeds[other][first]))
+        wanted = _GAPS[0] + _GAP_A_SPEED * change + float(torch.rand((), generator=generator)) * _GAPS[0]
+        cuts.append(
+            Cut(
+                (one, other),
+                slice(max(0, last + 1 - lengths[0]), last + 1),
+                slice(first, first + lengths[1]),
+                min(gaps, key=lambda gap: abs(gap - wanted)),
+                _TURN * float(torch.randn((), generator=generator)),
+            )
+        )
+    return cuts
+
+
+def _measure_speeds(corpus: Corpus) -> list[Float[Tensor, " frames"]]:
+    """Of the hips over the ground, without the sway within a stride, m/s."""
+    parts = corpus.integrate_roots()[0].split(list(corpus.lengths))
+    return [
+        torch.from_numpy(np.linalg.norm(compute_ground_velocity(part.numpy(), PRIOR_FPS), axis=1)).float()
+        if len(part) > 1
+        else torch.zeros(len(part))
+        for part in parts
+    ]
+
+
+def _find_frames(speeds: Sequence[Tensor], bound: float, *, lead: int = 1, rest: int = 0) -> Tensor:
+    """Clip and frame of all frames at which somebody stands, or goes, as the bound says, with so many frames up to it
+    and so many after it."""
+    found = [torch.empty(0, 2, dtype=torch.long)]
+    for clip, speed in enumerate(speeds):
+        frames = torch.arange(lead - 1, max(lead - 1, len(speed) - rest))
+        frames = frames[speed[frames] < bound if bound == _STANDS else speed[frames] > bound]
+        found.append(torch.stack([torch.full_like(frames, clip), frames], dim=1))
+    return torch.cat(found)
+
+
+def _walk_all(
+    clips: Sequence[Tensor], cuts: Sequence[Cut], stitcher: Stitcher, generator: torch.Generator
+) -> list[Float[Tensor, "frames size"]]:
+    """The splices of all cuts, those with one length of gap together."""
+    spliced: dict[int, Tensor] = {}
+    for gap in sorted({cut.gap for cut in cuts}):
+        numbers = [number for number, cut in enumerate(cuts) if cut.gap == gap]
+        for begin in range(0, len(numbers), _AT_ONCE):
+            part = numbers[begin : begin + _AT_ONCE]
+            walked = _walk(clips, [cuts[number] for number in part], stitcher, generator)
+            spliced |= dict(zip(part, walked, strict=True))
+    return [spliced[number] for number in range(len(cuts))]
+
+
+def _walk(
+    clips: Sequence[Tensor], cuts: Sequence[Cut], stitcher: Stitcher, generator: torch.Generator
+) -> list[Float[Tensor, "frames size"]]:
+    """The splices of cuts with one length of gap."""
+    frames, context = cuts[0].gap + 1, MAX_CONTEXT + 2
+    first = [clips[cut.clips[0]][cut.first] for cut in cuts]
+    second = [clips[cut.clips[1]][cut.second] for cut in cuts]
+    before = torch.stack([piece[-context:] for piece in first])
+    after = torch.stack([piece[:context] for piece in second])
+    turn = torch.tensor([cut.turn for cut in cuts])
+    leaving, arriving = (
+        _average_velocity(before[:, -_VELOCITY_FRAMES:]),
+        _average_velocity(after[:, 1 : 1 + _VELOCITY_FRAMES]),
+    )
+    place = frames / 2 * (leaving + rotations.rotate_ground(arriving, turn))
+    ways = StepwiseWork(
+        stitcher.connect(before, reversed_features(after), place, turn, frames, noise=generator)
+    ).finish()
+    return [torch.cat([one, way, other[1:]]) for one, way, other in zip(first, ways, second, strict=True)]
+
+
+def _average_velocity(features: Float[Tensor, "batch frames size"]) -> Float[Tensor, "batch 2"]:
+    """Over the ground at a cut, metres a frame, in the headings of its frames."""
+    return LAYOUT.pick(features, "root_displacement_heading").mean(dim=1)
+
+
+def _passes(features: Float[Tensor, "frames size"], bounds: Mapping[str, float]) -> bool:
+    if not bool(torch.isfinite(features).all()):
+        return False
+    return not list_faults(measure_checked(decode(features, GroundPose.origin())), bounds)

@@ -1,0 +1,1 @@
+"""Settings and trainer of a density, and the variants that are compared."""

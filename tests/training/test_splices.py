@@ -1,0 +1,256 @@
+"""Splices of clips: pieces as they are, ways that lead from the one to the other, and only what passes for mocap."""
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from helpers import generator, run, walk
+from jaxtyping import Float
+from performers import Performer
+from tiny_stitcher import save_tiny_stitcher, tiny_stitcher
+from torch import Tensor
+
+import priors
+from mapctl.errors import RequestError
+from mapctl.features import LAYOUT, GroundPose, encode, integrate_root, reversed_features
+from mapctl.pose import decode
+from mapctl.runtime.stepwise import StepwiseWork
+from mapctl.skeleton import CANONICAL
+from priors.training.augmentation import splices as module
+from priors.training.augmentation.splices import FOLDER, Splices, add_splices, draw_cuts
+from priors.training.corpus import Corpus
+
+pytestmark = pytest.mark.usefixtures("small_judgements")
+GAPS = [15, 20, 25, 30, 35, 40, 45, 50, 55]
+MOCAP = {
+    "contact_speed_cm_s": 15.0,
+    "penetration_cm": 0.5,
+    "jitter_m_s3": 400.0,
+    "largest_step_cm": 21.0,
+    "largest_acceleration_m_s2": 90.0,
+    "longest_slide_s": 0.2,
+}
+"""About what 95 % of captured clips stay under."""
+ARM = CANONICAL.index("leftUpperArm")
+
+
+def of_motions(**motions):
+    clips = [encode(motion)[0].float() for motion in motions.values()]
+    return Corpus(tuple(motions), tuple(map(len, clips)), torch.cat(clips))
+
+
+def waving(frames):
+    return Performer().stands(frames, turned={ARM: torch.linspace(0, 2, frames).double().sin()})
+
+
+@pytest.fixture(scope="module")
+def corpus():
+    """One who walks, one who walks a curve, and two who stand, of whom one moves an arm."""
+    return of_motions(
+        walks=Performer().walks(150), turns=walk(150, turn_rate=0.5), stands=Performer().stands(100), waves=waving(120)
+    )
+
+
+@pytest.fixture
+def all_pass(monkeypatch):
+    """Whatever comes of it is kept."""
+    monkeypatch.setattr(module, "list_faults", lambda measures, bounds: [])
+
+
+@pytest.fixture
+def tiny(tmp_path):
+    return str(save_tiny_stitcher(tmp_path / "tiny.safetensors"))
+
+
+def find_way(spliced: Float[Tensor, "frames size"], corpus: Corpus, names: list[str]) -> tuple[int, int]:
+    """First frame of the way, and the first of the second piece, which are both found by the pieces' bits."""
+    one, other = (corpus.clips()[corpus.names.index(name)] for name in names)
+    at = next(k for k in range(len(one)) if torch.equal(one[k], spliced[0]))
+    count = next((k for k in range(len(spliced)) if at + k >= len(one) or not torch.equal(one[at + k], spliced[k])), 0)
+    end = len(spliced)
+    last = next(k for k in reversed(range(len(other))) if torch.equal(other[k], spliced[-1]))
+    while last >= 0 and torch.equal(other[last], spliced[end - 1]):
+        end, last = end - 1, last - 1
+    return count, end
+
+
+def test_pieces_are_cut_where_somebody_stands_or_goes(corpus):
+    cuts = draw_cuts(corpus, 90, GAPS, generator())
+    going = {0, 1}
+    assert [(cut.clips[0] in going, cut.clips[1] in going) for cut in cuts[:3]] == [
+        (False, True),
+        (True, False),
+        (False, False),
+    ]
+    assert [(cut.clips[0] in going, cut.clips[1] in going) for cut in cuts] == 30 * [
+        (False, True),
+        (True, False),
+        (False, False),
+    ]
+    for cut in cuts:
+        for clip, piece in zip(cut.clips, (cut.first, cut.second), strict=True):
+            assert piece.start >= 0
+            assert min(piece.stop, corpus.lengths[clip]) - piece.start >= 45
+        assert cut.gap in GAPS
+    assert {cut.clips for cut in cuts[2::3]} == {(2, 2), (2, 3), (3, 2), (3, 3)}
+    assert 0.3 < torch.tensor([cut.turn for cut in cuts]).std() < 0.7
+
+
+def test_who_changes_speed_more_gets_more_time(corpus):
+    cuts = draw_cuts(corpus, 300, GAPS, generator())
+    starts, changes = (torch.tensor([float(cut.gap) for cut in cuts[k::3]]).mean() for k in (0, 2))
+    assert 8 < starts - changes < 20  # 12 frames for each m/s; they walk at 1.2 m/s or so
+
+
+def test_nobody_who_stands_is_told():
+    with pytest.raises(RequestError, match=r"clips of 1\.5 s in which somebody stands"):
+        draw_cuts(of_motions(walks=walk(120), runs=walk(120, cadence=1.3)), 3, GAPS, generator())
+    with pytest.raises(RequestError, match=r"1\.5 s"):
+        draw_cuts(of_motions(stands=Performer().stands(40)), 3, GAPS, generator())
+
+
+def test_a_splice_is_two_pieces_and_a_way_between(corpus, tiny, all_pass):
+    spliced = add_splices(corpus, Splices(12, tiny))
+    assert spliced.names[:4] == corpus.names
+    assert len(spliced.names) == 16
+    assert torch.equal(spliced.features[: len(corpus.features)], corpus.features)
+    for name, features in list(zip(spliced.names, spliced.clips(), strict=True))[4:]:
+        assert name.startswith(FOLDER)
+        assert features.isfinite().all()
+        first, after = find_way(features, corpus, name.removeprefix(FOLDER).split(" + "))
+        assert first >= 45
+        assert len(features) - after >= 44
+        assert 14 <= after - first - 1 <= 24  # what the tiny one fills at most, and the pose at which it arrives
+        # The pose at the end of the way is the second piece's first.
+        held = slice(LAYOUT.slices["root_height"].start, LAYOUT.continuous)
+        clip = corpus.clips()[corpus.names.index(name.split(" + ")[1])]
+        number = next(k for k in range(1, len(clip)) if torch.equal(clip[k], features[after]))
+        assert (features[after - 1, held] - clip[number - 1, held]).abs().max() < 1e-4
+
+
+def test_the_second_piece_begins_where_both_velocities_lead(corpus, tiny, all_pass):
+    spliced = add_splices(corpus, Splices(30, tiny))
+    for name, features in list(zip(spliced.names, spliced.clips(), strict=True))[4:]:
+        names = name.removeprefix(FOLDER).split(" + ")
+        if names != ["stands", "walks"]:
+            continue
+        first, after = find_way(features, corpus, names)
+        ground, heading = integrate_root(features, GroundPose.origin())
+        frames = after - first
+        speed = float(LAYOUT.pick(corpus.clips()[0], "root_displacement_heading")[:, 1].mean())
+        way = ground[after - 1] - ground[first - 1]
+        # From nothing to its pace: half as far as at that pace, and along the way that it then goes.
+        assert float(way.norm()) == pytest.approx(frames / 2 * speed, rel=0.15)
+        facing = torch.stack([heading[after].sin(), heading[after].cos()])
+        assert float((way / way.norm()) @ facing) > math.cos(0.2)
+
+
+def test_the_bundled_stitcher_passes_for_mocap_and_a_wild_one_does_not(corpus, tmp_path, monkeypatch):
+    asked = []
+
+    def find(clips):
+        asked.extend(clips)
+        return MOCAP
+
+    monkeypatch.setattr(module, "find_bounds", find)  # feet that stand to the hair are not what mocap is like
+    wild = str(save_tiny_stitcher(tmp_path / "wild.safetensors", drawn=30.0))
+    assert len(add_splices(corpus, Splices(18, wild)).names) == 4
+    assert sorted(motion.num_frames for motion in asked) == sorted(corpus.lengths)
+    kept = add_splices(corpus, Splices(18))
+    assert len(kept.names) > 4 + 4
+    for features in kept.clips()[4:]:
+        places = decode(features, GroundPose.origin()).joint_positions()
+        assert torch.diff(places, dim=0).norm(dim=-1).max() < 0.25  # metres in a frame
+
+
+def test_the_seed_draws_them(corpus, tiny, all_pass):
+    one, same, other = (add_splices(corpus, Splices(6, tiny, seed=seed)) for seed in (1, 1, 2))
+    assert torch.equal(one.features, same.features)
+    assert one.names == same.names
+    assert one.names != other.names
+    assert add_splices(corpus, Splices(0, "nobody")) is corpus
+    with pytest.raises(RequestError, match="--splices must be 0 or more"):
+        Splices(-1)
+
+
+def test_who_made_them_is_told(corpus, tiny, all_pass):
+    made = add_splices(corpus, Splices(6, tiny)).made
+    assert made.told == ("splices: 6 of 6 that were tried, by tiny.safetensors (free)",)
+    assert made.licences == {"free"}
+    assert len(made.clips) <= 6
+    assert all(name.startswith(FOLDER) for name in made.clips)
+
+
+def test_ways_of_many_motions_are_those_of_each(corpus):
+    stitcher, clips = tiny_stitcher(), corpus.clips()
+    before = torch.stack([clips[0][40:55], clips[2][20:35]])
+    after = reversed_features(torch.stack([clips[3][10:25], clips[1][10:25]]))
+    place, turn = torch.tensor([[0.1, 0.5], [0.0, 0.4]]), torch.tensor([0.2, -0.1])
+    both = StepwiseWork(stitcher.connect(before, after, place, turn, 16)).finish()
+    for row in (0, 1):
+        part = slice(row, row + 1)
+        way = StepwiseWork(stitcher.connect(before[row], after[part], place[part], turn[part], 16)).finish()
+        assert torch.allclose(way[0], both[row], atol=1e-5)
+    drawn = [StepwiseWork(stitcher.connect(before, after, place, turn, 16, generator(3))).finish() for _ in range(2)]
+    assert torch.equal(*drawn)
+    assert not torch.allclose(drawn[0], both, atol=1e-3)
+
+
+@pytest.fixture
+def data(tmp_path):
+    folder = tmp_path / "data"
+    folder.mkdir()
+    for number in range(3):
+        Performer().walks(120 + number).save(folder / f"walk_{number}.bvh")
+        waving(100 + number).save(folder / f"wave_{number}.bvh")
+    return folder
+
+
+def train(data: Path, out: Path, *words: object) -> int:
+    small = ("--width", 8, "--components", 2, "--window", 20, "--batch", 3, "--device", "cpu", "--steps", 2)
+    return run("train", "lstm-gmm", "--data", data, "-o", out, *small, *words)
+
+
+def test_a_density_is_trained_on_them_and_its_card_says_so(data, tmp_path, tiny, all_pass, capsys):
+    assert train(data, tmp_path / "alone", "--quiet") == 0
+    capsys.readouterr()
+    assert train(data, tmp_path / "run", "--splices", 9, "--stitcher", tiny) == 0
+    assert "made, not captured: splices: 9 of 9 that were tried, by tiny.safetensors (free)" in capsys.readouterr().out
+    card, alone = (priors.load(str(tmp_path / name)).card for name in ("run", "alone"))
+    assert card.data["made"] == ["splices: 9 of 9 that were tried, by tiny.safetensors (free)"]
+    assert card.training["command"].endswith(f"--splices 9 --stitcher {tiny}")
+    assert card.data["held_out"] == alone.data["held_out"]
+    assert card.data["trained_on"]["clips"] == alone.data["trained_on"]["clips"] + 9
+    assert "splices" not in alone.data
+
+
+def test_clips_that_are_held_out_are_in_no_splice(data, tmp_path, tiny, all_pass):
+    seen = []
+
+    def see(corpus, splices):
+        seen.append(corpus.names)
+        return add_splices(corpus, splices)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("priors.training.gathering.add_splices", see)
+        assert train(data, tmp_path / "run", "--splices", 9, "--stitcher", tiny, "--quiet") == 0
+    held = priors.load(str(tmp_path / "run")).card.data["held_out"]
+    (names,) = seen
+    assert held
+    assert not {name for part in held.values() for name in part} & {*names}
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--stitcher", "stitcher"), "--stitcher makes --splices N of the clips"),
+        (("--splices", -1), "--splices must be 0 or more"),
+        (("--splices", 3, "--stitcher", "nobody"), "nobody"),
+        (("--splices", 3, "--match", "walk"), "in which somebody stands"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(data, tmp_path, capsys, words, said):
+    assert train(data, tmp_path / "run", *words) == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "run" / "model.safetensors").exists()
