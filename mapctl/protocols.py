@@ -2,9 +2,8 @@
 rest has defaults.
 
 Everywhere below, features are frames of `mapctl.features.LAYOUT` at PRIOR_FPS: `size` numbers, physical units (metres
-and radians, steps and turns by frame), of which the first `continuous` are real-valued and the last two are contact
-bits, 0 or 1, of the left and the right toe. Tensors are float32 on the CPU, batch first, and no batch row depends on
-another.
+and radians, steps and turns by frame): the first `continuous` are real-valued, the last two are contact bits, 0 or 1,
+of the left and the right toe. Tensors are float32 on the CPU, batch first; no batch row depends on another.
 """
 
 import math
@@ -245,6 +244,13 @@ class Density(Protocol[State]):
         with torch.no_grad():
             features, _ = self.rollout(state, noise, self.plan(state, noise))
         return features, self.advance(state, features)
+
+    def sample_planted(
+        self, state: State, frames: int, generator: torch.Generator, *, temperature: float = 1.0, sigma_speed: float
+    ) -> tuple[Float[Tensor, "batch frames size"], State]:
+        """Draw frames as `sample`, given that toes stand where their contact bits say so: each coordinate of their
+        speed is zero with an error of this sigma, m/s. Default: `sample`, for a density that cannot do that."""
+        return self.sample(state, frames, generator, temperature=temperature)
 
     def infer_state(self, features: Float[Tensor, "frames size"]) -> State:
         """Find the state (batch of one) before a motion's first frame that makes the motion likely.

@@ -7,7 +7,7 @@ the motion's own contact labels say so. All three work piece by piece.
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import reduce
+from functools import partial, reduce
 
 import torch
 from jaxtyping import Float
@@ -27,6 +27,8 @@ from mapctl.protocols import Density, DensityState, Refiner
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, Skeleton
 from mapctl.terms import Term
 
+SIGMA_PLANTED = 0.05
+"""Sigma of a planted toe's speed, m/s, with which samples slide about as mocap does; a smaller one shows."""
 _CHUNK = 600
 _GOLDEN = (5**0.5 - 1) / 2
 
@@ -44,10 +46,14 @@ class GenerateSettings:
     lets most runs fall into a walk within ten seconds, which no clip of the data does."""
     foot_cleanup: FootCleanupSettings | None = field(default_factory=FootCleanupSettings)
     """Settings of the foot clean-up; None leaves it out."""
+    sigma_planted: float | None = None
+    """Sigma of a planted toe's speed, m/s, given which frames are sampled; None samples them as they come."""
 
     def __post_init__(self):
         if not 0 <= self.temperature <= 2:
             raise RequestError(f"the temperature must lie between 0 and 2, got {self.temperature:g}")
+        if self.sigma_planted is not None and not self.sigma_planted > 0:
+            raise RequestError(f"the sigma of planted toes must be positive, got {self.sigma_planted:g}")
 
     def character(self, skeleton: Skeleton) -> Character:
         """Return the character with these bones, and the toe height at rest of the foot clean-up."""
@@ -181,7 +187,7 @@ def _start_stream(
         raise RequestError(f"seconds must be positive, got {seconds:g}")
     frames = max(2, round(seconds * PRIOR_FPS))
     prior, state, ground_pose = initialise_generation(prior, settings, clip, generator, scale=character.scale)
-    pieces = _sample_chunks(prior, state, generator, settings.temperature)
+    pieces = _sample_chunks(prior, state, generator, settings)
     if refiner is not None:
         pieces = (piece[0] for piece in refiner.stream(piece.unsqueeze(0) for piece in pieces))
     if settings.foot_cleanup is not None:
@@ -201,11 +207,14 @@ def _start_stream(
 
 
 def _sample_chunks(
-    prior: Density, state: DensityState, generator: torch.Generator, temperature: float
+    prior: Density, state: DensityState, generator: torch.Generator, settings: GenerateSettings
 ) -> Iterator[Float[Tensor, "_ size"]]:
     """Sample chunks without end."""
+    draw = prior.sample
+    if settings.sigma_planted is not None:
+        draw = partial(prior.sample_planted, sigma_speed=settings.sigma_planted)
     while True:
-        features, state = prior.sample(state, _CHUNK, generator, temperature=temperature)
+        features, state = draw(state, _CHUNK, generator, temperature=settings.temperature)
         yield features[0]
 
 

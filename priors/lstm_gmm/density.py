@@ -15,6 +15,7 @@ from priors import checkpoints
 from priors.lstm_gmm import labels as clip_labels
 from priors.lstm_gmm.fast.rollout import FastRollout
 from priors.lstm_gmm.network import LstmGmm, LstmGmmConfig, LstmState
+from priors.lstm_gmm.planting import Planting
 from priors.lstm_gmm.state_inference import infer_lstm_state
 
 
@@ -155,6 +156,13 @@ class LstmGmmDensity(checkpoints.LoadedModel, Density[LstmState]):
     ) -> tuple[Float[Tensor, "batch frames size"], LstmState]:
         """Draw frames one after the other, and the state after them; `temperature` is a factor of the noise."""
         return self._rollout_engine.sample(state, frames, generator, temperature=temperature)
+
+    def sample_planted(
+        self, state: LstmState, frames: int, generator: torch.Generator, *, temperature: float = 1.0, sigma_speed: float
+    ) -> tuple[Float[Tensor, "batch frames size"], LstmState]:
+        """Draw frames as `sample`, given that planted toes stand (see `Planting`): by the network, not the kernels."""
+        planting = Planting(sigma_speed)
+        return self.reference.sample(state, frames, generator, temperature=temperature, planting=planting)
 
     def latents(
         self, features: Float[Tensor, "batch frames size"], state: LstmState

@@ -21,6 +21,7 @@ from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, FeatureLayout
 from mapctl.protocols import DensityState, DiscreteChoices
 from priors.config import NetworkConfig, require_at_least
+from priors.lstm_gmm.planting import Planting
 
 NOISE_UNIT = 0.1
 """Level of input noise (normalised units) that is 1 in the network's condition."""
@@ -255,14 +256,27 @@ class LstmGmm(nn.Module):
         return LstmState(committed[:, -1], hidden, cell)
 
     def sample(
-        self, state: LstmState, frames: int, generator: torch.Generator, *, temperature: float = 1.0
+        self,
+        state: LstmState,
+        frames: int,
+        generator: torch.Generator,
+        *,
+        temperature: float = 1.0,
+        planting: Planting | None = None,
     ) -> tuple[Float[Tensor, "batch frames size"], LstmState]:
-        """Draw frames one after the other (section 4.1.4); temperature scales the Gaussians' sigmas."""
+        """Draw frames one after the other (section 4.1.4); temperature scales the Gaussians' sigmas, and with
+        `planting` each frame is drawn given that toes stand where its bits say so."""
         with torch.no_grad():
-            return self.draw(state, frames, generator, temperature=temperature)
+            return self.draw(state, frames, generator, temperature=temperature, planting=planting)
 
     def draw(
-        self, state: LstmState, frames: int, generator: torch.Generator, *, temperature: float = 1.0
+        self,
+        state: LstmState,
+        frames: int,
+        generator: torch.Generator,
+        *,
+        temperature: float = 1.0,
+        planting: Planting | None = None,
     ) -> tuple[Float[Tensor, "batch frames size"], LstmState]:
         """`sample`, differentiable in the weights for the components and bits that were drawn."""
         drawn, device, mixing = [], self.mean.device, self.mixing
@@ -275,6 +289,9 @@ class LstmGmm(nn.Module):
             planted = torch.sigmoid(mixture.contact_logit.detach())  # probability
             bits = torch.rand(planted.shape, generator=generator).to(device) < planted
             frame, _ = self._compose(mixture, component, noise, bits, mixing)
+            if planting is not None:
+                gaussian = self._find_gaussian(mixture, component, mixing, temperature)
+                frame = planting.condition(state.last_frame, frame, *gaussian, generator)
             state = LstmState(frame, state.hidden, state.cell)
             drawn.append(frame)
         return torch.stack(drawn, dim=1), state
@@ -354,6 +371,16 @@ class LstmGmm(nn.Module):
         signed = torch.where(contacts, mixture.contact_logit, -mixture.contact_logit)
         density = density + nn.functional.logsigmoid(signed).sum(-1)
         return torch.cat([continuous, contacts.to(continuous.dtype)], dim=-1), density
+
+    def _find_gaussian(
+        self, mixture: Mixture, component: Int[Tensor, " batch"], mixing: Tensor | None, temperature: float
+    ) -> tuple[Float[Tensor, "batch continuous"], Float[Tensor, "batch continuous continuous"]]:
+        """Mean of the chosen components and a factor of their covariance, physical units."""
+        row, size = torch.arange(len(component)), self.layout.continuous
+        sigma = temperature * torch.exp(mixture.log_sigma[row, component])
+        factor = torch.diag_embed(sigma) if mixing is None else mixing[component] * sigma[:, None]
+        mean = mixture.mean[row, component] * self.std[:size] + self.mean[:size]
+        return mean, self.std[:size, None] * factor
 
     def _target(self, features: Tensor) -> Tensor:
         size = self.layout.continuous

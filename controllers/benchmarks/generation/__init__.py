@@ -8,7 +8,7 @@ import torch
 
 from controllers.benchmarks.shared.tables import Row, average_rows
 from controllers.generation.foot_cleanup import FootCleanupSettings
-from controllers.generation.generate import GenerateSettings, generate, sample_stratified_starts
+from controllers.generation.generate import SIGMA_PLANTED, GenerateSettings, generate, sample_stratified_starts
 from mapctl.errors import RequestError
 from mapctl.metrics import measure
 from mapctl.metrics.realism import (
@@ -57,6 +57,12 @@ class Variant:
     """Refiner of the draws; None leaves it out."""
     foot_cleanup: FootCleanupSettings | None
     """Settings of the foot clean-up; None leaves it out."""
+    sigma_planted: float | None = None
+    """Sigma of a planted toe's speed, m/s, given which frames are sampled; None samples them as they come."""
+
+    def settings(self) -> GenerateSettings:
+        """Return what it is sampled with."""
+        return GenerateSettings(foot_cleanup=self.foot_cleanup, sigma_planted=self.sigma_planted)
 
 
 def benchmark_generation(
@@ -105,16 +111,18 @@ def benchmark_generation(
 def list_variants(
     prior: Density, refiner: Refiner | None, densities: Mapping[str, Density], refiners: Mapping[str, Refiner]
 ) -> list[Variant]:
-    """Each density, and the prior with each refiner, without and with footing."""
+    """Each density, and the prior with each refiner, without and with footing; densities also with planted samples."""
     ours: dict[str, Refiner | None] = {"density": None}
     ours |= {} if refiner is None else {"density, refiner": refiner}
     ours |= {f"density, {name}": each for name, each in refiners.items()}
     made = [(name, prior, each) for name, each in ours.items()]
     made += [(name, each, None) for name, each in densities.items()]
+    ways = (("", None, None), (", planted", None, SIGMA_PLANTED), (", footing", FootCleanupSettings(), None))
     return [
-        Variant(f"{name}{suffix}", density, each, footing)
+        Variant(f"{name}{suffix}", density, each, footing, planted)
         for name, density, each in made
-        for suffix, footing in (("", None), (", footing", FootCleanupSettings()))
+        for suffix, footing, planted in ways
+        if each is None or planted is None
     ]
 
 
@@ -129,7 +137,7 @@ def _time_clips(variant: Variant, settings: GenerationBenchmarkSettings) -> tupl
 def generate_clips(variant: Variant, count: int, seconds: float, seed: int) -> list[Motion]:
     """Generate so many clips of a length from initial states that cover those of the prior; the seed is that of the
     first clip."""
-    variant_settings = GenerateSettings(foot_cleanup=variant.foot_cleanup)
+    variant_settings = variant.settings()
     starts = sample_stratified_starts(variant.prior, count, torch.Generator().manual_seed(seed))
     return [
         _generate_clip(variant, replace(variant_settings, start=start), seconds, seed + number)
@@ -153,7 +161,7 @@ def _measure_diversity(variant: Variant, settings: GenerationBenchmarkSettings) 
     """Measure the average pairwise distance of samples from one initial state, mean over a few."""
     found, starts = [], len(variant.prior.initial_states.speed)
     for start in range(0, starts, max(1, starts // 4)):
-        variant_settings = replace(GenerateSettings(foot_cleanup=variant.foot_cleanup), start=start)
+        variant_settings = replace(variant.settings(), start=start)
         samples = [
             _generate_clip(variant, variant_settings, settings.sample_seconds, settings.seed + k)
             for k in range(settings.samples_per_start)

@@ -9,7 +9,7 @@ import torch
 
 from controllers.benchmarks.generation import Variant
 from controllers.benchmarks.shared.held_out import NamedClip
-from controllers.generation.generate import GenerateSettings, generate
+from controllers.generation.generate import generate
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.motion import Motion
@@ -34,7 +34,7 @@ def cut_continuation(clip: NamedClip) -> Motion:
 def continue_clips(variant: Variant, clips: Sequence[NamedClip], seed: int) -> list[Motion]:
     """Generate as many frames after the beginning of each clip as it has itself, told its labels; the seed is that of
     the first."""
-    settings, made = GenerateSettings(foot_cleanup=variant.foot_cleanup), []
+    settings, made = variant.settings(), []
     for number, clip in enumerate(clips):
         found = generate(
             variant.prior.conditioned_like_clip(clip.name),

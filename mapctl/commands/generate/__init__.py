@@ -31,13 +31,14 @@ class Generate(ModelCommand):
     style: Annotated[str | None, arg(metavar="NAME,NAME")] = None
     """Gait and style by the names of the prior's data, such as run or elderly,walk; `none` leaves the prior
     unconditioned. If not given, those of the clip that it begins from."""
-    refiner: options.Name = "auto"
-    """A bundled refiner, or the file or run folder of a trained one, before the foot clean-up. auto: the prior's own
-    where there is no foot clean-up, and none before one, which measures better alone."""
+    refiner: options.MaybeName = None
+    """A refiner between samples and foot clean-up: a bundled one, the file or run folder of a trained one, or auto, the
+    prior's own. None if not given: refined samples are told from mocap more often."""
     no_footing: bool = False
-    """Leave out the foot clean-up: many times faster, with the refiner's feet."""
+    """Leave out the foot clean-up. Without a refiner, each frame is then sampled given that toes stand where its
+    contact bits say so: feet slide about as mocap's do, and it is faster."""
     no_refine: bool = False
-    """Leave the samples as they are: no refiner, and no foot clean-up."""
+    """Leave the samples as they come: no refiner, no foot clean-up, and feet slide."""
     rig: options.OutRig = "canonical"
     """Body that moves: the canonical one, or that of a clip, on whose rig the motion is then written; or a rig by name
     or TOML file, whose joints get the canonical bones."""

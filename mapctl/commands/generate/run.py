@@ -10,7 +10,7 @@ import torch
 
 import priors
 from controllers.generation.foot_cleanup import FootCleanupSettings
-from controllers.generation.generate import GenerateSettings, sample_stratified_starts, stream
+from controllers.generation.generate import SIGMA_PLANTED, GenerateSettings, sample_stratified_starts, stream
 from mapctl import formats
 from mapctl.commands.generate import Generate
 from mapctl.commands.shared import inputs, licensing, options, outputs
@@ -32,8 +32,7 @@ def run(command: Generate) -> int:
     prior = priors.load(command.prior)
     if command.style not in (None, "none"):
         prior = prior.conditioned_on([name.strip() for name in command.style.split(",")])
-    use_refiner = command.refiner != "auto" or (command.no_footing and not command.no_refine)
-    refiner = priors.refiner_of(command.prior, command.refiner) if use_refiner else None
+    refiner = None if command.refiner is None else priors.refiner_of(command.prior, command.refiner)
     character = read_character(command.rig)
     if settings.foot_cleanup is not None:
         footing = replace(settings.foot_cleanup.footing, rest_height=character.toe_rest_height)
@@ -59,13 +58,14 @@ def _check_settings(command: Generate) -> tuple[GenerateSettings, Motion | None]
     outputs.check_folder(command.out)
     formats.check_ending(command.out / f"clip{command.to}")
     numbered = command.start is not None and command.start.lstrip("-").isdecimal()
-    if command.no_refine and command.refiner != "auto":
+    if command.no_refine and command.refiner is not None:
         raise RequestError("--refiner and --no-refine exclude each other")
     if command.no_refine and command.no_footing:
         raise RequestError("--no-refine leaves out the footing pass as well; leave --no-footing out")
     finishing = None if command.no_refine or command.no_footing else FootCleanupSettings()
     start = int(command.start) if command.start and numbered else None
-    settings = GenerateSettings(command.temperature, start, command.style is None, finishing)
+    planted = SIGMA_PLANTED if command.no_footing and command.refiner is None else None
+    settings = GenerateSettings(command.temperature, start, command.style is None, finishing, planted)
     if command.start is None or numbered:
         return settings, None
     return settings, inputs.read_motion(Path(command.start), None)
