@@ -122,7 +122,7 @@ class Why(Generation):
     """Length of each clip, with --starts own."""
     steps: Annotated[str, arg(metavar="N,N,...")] = "400,2000"
     """Training steps of the classifiers, a comparison for each; more make a stricter judge."""
-    variants: Annotated[str, arg(metavar="REGEX")] = "density(, footing)?"
+    variants: Annotated[str, arg(metavar="REGEX")] = "density(, (planted|footing))?"
     """Variants of `mapctl bench generation` whose whole name fits."""
     markdown: bool = False
     """Print rows as a page's table in Markdown holds them."""
