@@ -248,8 +248,8 @@ class Density(Protocol[State]):
     def sample_planted(
         self, state: State, frames: int, generator: torch.Generator, *, temperature: float = 1.0, sigma_speed: float
     ) -> tuple[Float[Tensor, "batch frames size"], State]:
-        """Draw frames as `sample`, given that toes stand where their contact bits say so: each coordinate of their
-        speed is zero with an error of this sigma, m/s. Default: `sample`, for a density that cannot do that."""
+        """Draw frames as `sample`, `temperature` a factor of the noise, given that toes stand where their contact bits
+        say so: their speed is zero with an error of `sigma_speed`, m/s, in each coordinate. Default: `sample`."""
         return self.sample(state, frames, generator, temperature=temperature)
 
     def infer_state(self, features: Float[Tensor, "frames size"]) -> State:

@@ -160,7 +160,8 @@ class LstmGmmDensity(checkpoints.LoadedModel, Density[LstmState]):
     def sample_planted(
         self, state: LstmState, frames: int, generator: torch.Generator, *, temperature: float = 1.0, sigma_speed: float
     ) -> tuple[Float[Tensor, "batch frames size"], LstmState]:
-        """Draw frames as `sample`, given that planted toes stand (see `Planting`): by the network, not the kernels."""
+        """Draw frames as `sample`, `temperature` a factor of the noise, given that planted toes stand (see `Planting`):
+        by the network, not the kernels. `sigma_speed` is the error of their speed in each coordinate, m/s."""
         planting = Planting(sigma_speed)
         return self.reference.sample(state, frames, generator, temperature=temperature, planting=planting)
 

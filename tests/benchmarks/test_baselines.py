@@ -124,7 +124,13 @@ def test_densities_and_refiners_are_variants_by_their_names():
     prior, other = tiny_density(), tiny_density(seed=1)
     ours, theirs = refiner_of(), refiner_of()
     found = generation.list_variants(prior, ours, {"b": other}, {"c": theirs})
-    assert [(each.name, each.prior, each.refiner, each.foot_cleanup is not None) for each in found] == [
+    planted = [each.name for each in found if each.sigma_planted is not None]
+    assert planted == ["density, planted", "b, planted"]
+    assert [
+        (each.name, each.prior, each.refiner, each.foot_cleanup is not None)
+        for each in found
+        if each.sigma_planted is None
+    ] == [
         ("density", prior, None, False),
         ("density, footing", prior, None, True),
         ("density, refiner", prior, ours, False),

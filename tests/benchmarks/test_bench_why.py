@@ -70,7 +70,7 @@ def test_variants_and_sizes_are_chosen(prior, capsys, monkeypatch):
     told = json.loads(capsys.readouterr().out)
     about = {"part": "accuracy", "clips": 8, "count": 9, "seconds": 3.0, "steps": [5, 6], "continued": False}
     assert told["bench"] == "why"
-    assert told["rows"] == [{"variant": name, **about} for name in ("density", "density, footing")]
+    assert told["rows"] == [{"variant": name, **about} for name in ("density", "density, planted", "density, footing")]
     assert run(*run_bench(prior, *sizes, "--variants", "density")) == 0
     assert [row["variant"] for row in json.loads(capsys.readouterr().out)["rows"]] == ["density"]
 
@@ -83,7 +83,7 @@ def test_variants_and_sizes_are_chosen(prior, capsys, monkeypatch):
         (["--seconds", "0"], "a length above 0 s"),
         (["--starts", "own", "--count", "3"], "at least 8 clips, got 3"),
         ([], "no unseen clip is as long as 2.5 s"),
-        (["--variants", "poem"], "no variant is called 'poem'; there are density; density, footing"),
+        (["--variants", "poem"], "no variant is called 'poem'; there are density; density, planted; density, footing"),
         (["--variants", "("], "--variants is no regular expression"),
     ],
     ids=str,

@@ -98,10 +98,12 @@ def test_generate_writes_different_clips(prior, tmp_path):
     for name, words, same in (
         ("one", (), True),
         ("raw", ("--no-refine",), False),
-        ("sliding", ("--no-footing",), False),
+        ("planted", ("--no-footing",), False),
     ):
         assert run("generate", "-o", tmp_path / name, "--seconds", 1.5, "--prior", prior, *words) == 0
         assert ((tmp_path / name / "generated_000.bvh").read_bytes() == clips[0].read_bytes()) is same
+    raw, planted = ((tmp_path / name / "generated_000.bvh").read_bytes() for name in ("raw", "planted"))
+    assert raw != planted
 
 
 def test_generate_goes_on_from_a_clip_or_a_start(walk, prior, tmp_path):
