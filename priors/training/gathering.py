@@ -70,8 +70,9 @@ def gather(source: DataSource, *, progress: Progress, warn: Progress) -> tuple[C
     if source.strict and corpus.skipped:
         raise RequestError(f"--strict-data: {_list_skipped(corpus.skipped, source.data)}")
     corpus, parts = keep_share(corpus, split_corpus(corpus, source.seed), source.share, source.seed)
-    parts = replace(parts, train=add_splices(parts.train, source.splices))
-    corpus = replace(corpus, made=parts.train.made)
+    if source.splices.count:
+        train = add_splices(replace(parts.train, made=corpus.made), source.splices)
+        corpus, parts = replace(corpus, made=train.made), replace(parts, train=train)
     if corpus.skipped:
         rest = f"; all are in {source.run / _SKIPPED_LIST}" if len(corpus.skipped) > _MOST_NAMED else ""
         of = len(corpus.names) + len(corpus.skipped)

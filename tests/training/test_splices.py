@@ -225,6 +225,18 @@ def test_a_density_is_trained_on_them_and_its_card_says_so(data, tmp_path, tiny,
     assert "splices" not in alone.data
 
 
+def test_clips_that_were_made_before_are_told_beside_them(data, tmp_path, tiny, all_pass):
+    made = tmp_path / "made"
+    made.mkdir()
+    waving(95).save(made / "made_000.bvh")
+    (made / "made.csv").write_text("file,kept,model,licence,seed,script,why not\nmade_000.bvh,yes,free,CC0,1,,\n")
+    assert train(data, tmp_path / "run", "--made", made, "--splices", 3, "--stitcher", tiny, "--quiet") == 0
+    assert priors.load(str(tmp_path / "run")).card.data["made"] == [
+        "made.csv: 1 of 1 clips, by free (CC0)",
+        "splices: 3 of 3 that were tried, by tiny.safetensors (free)",
+    ]
+
+
 def test_clips_that_are_held_out_are_in_no_splice(data, tmp_path, tiny, all_pass):
     seen = []
 
