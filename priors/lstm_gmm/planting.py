@@ -3,7 +3,8 @@
 A Gaussian whose correlations are the same in every pose cannot know how the legs make up for the hips in this one, so
 its samples slide. Given a toe's step over the floor and up, observed as zero with an error, it stays a Gaussian:
 Matheron's rule (Doucet 2010, "A note on efficient conditional simulation of Gaussian distributions", Eq. 3) turns one
-of its samples into one of the conditional. Steps are taken linearly about the mean.
+of its samples into one of the conditional. Steps are taken linearly about the mean; the mixture's component is the one
+that was drawn without them.
 """
 
 from dataclasses import dataclass
