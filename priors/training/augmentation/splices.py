@@ -140,7 +140,7 @@ def draw_cuts(corpus: Corpus, count: int, gaps: Sequence[int], generator: torch.
 
 
 def _measure_speeds(corpus: Corpus) -> list[Float[Tensor, " frames"]]:
-    """Of the hips over the ground, without the sway within a stride, m/s."""
+    """Speeds of the hips over the ground by clip, without the sway within a stride, m/s."""
     parts = corpus.integrate_roots()[0].split(list(corpus.lengths))
     return [
         torch.from_numpy(np.linalg.norm(compute_ground_velocity(part.numpy(), PRIOR_FPS), axis=1)).float()
