@@ -17,9 +17,11 @@ from mapctl.features import LAYOUT, GroundPose, encode, integrate_root, reversed
 from mapctl.pose import decode
 from mapctl.runtime.stepwise import StepwiseWork
 from mapctl.skeleton import CANONICAL
+from priors.lstm_gmm import labels
 from priors.training.augmentation import splices as module
 from priors.training.augmentation.splices import FOLDER, Splices, add_splices, draw_cuts
 from priors.training.corpus import Corpus
+from priors.training.recipes import lstm_gmm
 
 pytestmark = pytest.mark.usefixtures("small_judgements")
 GAPS = [15, 20, 25, 30, 35, 40, 45, 50, 55]
@@ -223,6 +225,24 @@ def test_a_density_is_trained_on_them_and_its_card_says_so(data, tmp_path, tiny,
     assert card.data["held_out"] == alone.data["held_out"]
     assert card.data["trained_on"]["clips"] == alone.data["trained_on"]["clips"] + 9
     assert "splices" not in alone.data
+
+
+def test_a_splice_has_no_label_and_no_start_lies_in_one(data, tmp_path, tiny, all_pass):
+    seen, read_labels = [], labels.read
+
+    def see(names, pattern):
+        seen.append((names, read := read_labels(names, pattern)))
+        return read
+
+    words = ("--splices", 9, "--stitcher", tiny, "--quiet", "--labels", "(?P<what>walk|wave)")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(lstm_gmm.labels, "read", see)
+        assert train(data, tmp_path / "run", *words) == 0
+    names, read = seen[0]
+    assert names.count("") == 9
+    assert [bool(row.any()) for row in read.held] == [name != "" for name in names]
+    card = priors.load(str(tmp_path / "run")).card
+    assert {"walk", "wave"} == {start.split("_")[0] for start in card.data["starts"]}
 
 
 def test_clips_that_were_made_before_are_told_beside_them(data, tmp_path, tiny, all_pass):

@@ -90,8 +90,9 @@ def add_splices(corpus: Corpus, splices: Splices) -> Corpus:
     gaps = [gap for gap in _GAPS if gap <= stitcher.longest] or [stitcher.longest]
     cuts = draw_cuts(corpus, splices.count, gaps, generator)
     spliced = _walk_all(clips, cuts, stitcher, generator)
-    order = torch.randperm(len(clips), generator=generator)[:_REFERENCE].tolist()
-    bounds = find_bounds(decode(clips[number], GroundPose.origin()) for number in order if len(clips[number]) > 1)
+    order = torch.randperm(len(clips), generator=generator).tolist()
+    long = [clips[number] for number in order if len(clips[number]) >= _PIECE[0]]
+    bounds = find_bounds(decode(clip, GroundPose.origin()) for clip in long[:_REFERENCE])
     kept = [number for number, features in enumerate(spliced) if _passes(features, bounds)]
     names = tuple(FOLDER + " + ".join(corpus.names[clip] for clip in cuts[number].clips) for number in kept)
     maker, licence = Path(stitcher.name).name, stitcher.card.licence
@@ -104,6 +105,16 @@ def add_splices(corpus: Corpus, splices: Splices) -> Corpus:
         features=torch.cat([corpus.features, *(spliced[number] for number in kept)]),
         made=Made(made.clips | {*names}, (*made.told, told), made.licences | {licence}),
     )
+
+
+def drop_splices(corpus: Corpus) -> Corpus:
+    """Return a corpus without its splices."""
+    return corpus.subset(number for number, name in enumerate(corpus.names) if not name.startswith(FOLDER))
+
+
+def hide_splices(names: Sequence[str]) -> list[str]:
+    """Hide the names of splices, from which labels would be read that hold for one of the two clips alone."""
+    return ["" if name.startswith(FOLDER) else name for name in names]
 
 
 def draw_cuts(corpus: Corpus, count: int, gaps: Sequence[int], generator: torch.Generator) -> list[Cut]:

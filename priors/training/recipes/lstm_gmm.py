@@ -14,7 +14,7 @@ from priors.lstm_gmm import density, labels
 from priors.lstm_gmm.network import LstmGmmConfig
 from priors.stitching import inbetweener
 from priors.training.augmentation.clip_copies import add_copies
-from priors.training.augmentation.splices import Splices
+from priors.training.augmentation.splices import Splices, drop_splices, hide_splices
 from priors.training.corpus import Corpus, Split
 from priors.training.devices import select_device
 from priors.training.gathering import DataSource, describe_selection
@@ -74,7 +74,7 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
     def make_trainer(self, parts: Split) -> DensityTrainer:
         """Make the trainer of a new network for the clips' labels, or of the initial network with its own labels."""
         corpus = add_copies(parts.train, self.settings.copies, torch.Generator().manual_seed(self.settings.seed))
-        device, known = select_device(self.device), labels.read(corpus.names, self.labels)
+        device, known = select_device(self.device), labels.read(hide_splices(corpus.names), self.labels)
         if self.init is None:
             config = replace(self.config, labels=known.names)
             return DensityTrainer(config, self.settings, corpus, device, labels=known)
@@ -123,8 +123,9 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
     def export(self, trainer: DensityTrainer, gathered: Gathered, curve: Sequence[Row]) -> Export:
         """The network with moments to start from, and what the data show to be possible."""
         model, corpus, parts = trainer.network.cpu().eval(), gathered.corpus, gathered.parts
-        known, seeded = labels.read(parts.train.names, self.labels), torch.Generator().manual_seed(self.settings.seed)
-        found = select_initial_states(model, parts.train, count=self.starts, generator=seeded, labels=known.held)
+        clips, seeded = drop_splices(parts.train), torch.Generator().manual_seed(self.settings.seed)
+        known = labels.read(clips.names, self.labels)
+        found = select_initial_states(model, clips, count=self.starts, generator=seeded, labels=known.held)
         data = {
             "clips": len(corpus.names),
             "frames": len(corpus.features),
@@ -148,7 +149,7 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
             },
             data,
             density_quality.measure_quality(model, parts),
-            asdict(measure_data_limits(parts.train)),
+            asdict(measure_data_limits(clips)),
         )
 
     def format_command(self) -> str:
