@@ -43,7 +43,7 @@ class Splices:
     """How many splices are made beside the clips, and by which stitcher."""
 
     count: int = 0
-    """Splices that are made; those that do not pass for mocap are left out."""
+    """Splices that are tried; those that do not pass for mocap are left out."""
     stitcher: str = "stitcher"
     """The bundled one, or the file or run folder of a trained one."""
     seed: int = 1
