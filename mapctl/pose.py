@@ -33,9 +33,18 @@ class BodyPose:
     @staticmethod
     def of_features(features: Float[Tensor, "*batch frames size"], start: GroundPose) -> "BodyPose":
         """Return the poses that features describe, from the ground pose of the frame before the first."""
-        ground, heading = integrate_root(features, start)
+        return BodyPose.of_features_at(features, *integrate_root(features, start))
+
+    @staticmethod
+    def of_features_at(
+        features: Float[Tensor, "*batch frames size"],
+        root_xz_world: Float[Tensor, "*batch frames 2"],
+        heading: Float[Tensor, "*batch frames"],
+    ) -> "BodyPose":
+        """Return the poses that features describe over these points of the ground, metres, facing these headings,
+        radians."""
         height = LAYOUT.pick(features, "root_height")
-        root = torch.cat([ground[..., :1], height, ground[..., 1:]], dim=-1)
+        root = torch.cat([root_xz_world[..., :1], height, root_xz_world[..., 1:]], dim=-1)
         return BodyPose(root, heading, *_pick_rotations(features))
 
     @staticmethod
@@ -94,7 +103,7 @@ class BodyPose:
     ) -> tuple[Float[Tensor, "*batch frames joints 3"], Float[Tensor, "*batch frames 2 3"]]:
         """Return the world joint positions, and those of the left and the right heel, metres."""
         matrices = rotations.rotation_vector_to_matrix(self.rotation_vectors)
-        joints, turns = kinematics.chain_matrices(skeleton.offsets.to(matrices.dtype), skeleton.parents, matrices)
+        joints, turns = kinematics.chain_matrices(skeleton.offsets.to(matrices), skeleton.parents, matrices)
         feet = skeleton.indices(FEET)
         levers = (turns[..., feet, :, :] * find_heels(skeleton).to(turns)[:, None, :]).sum(-1)
         return self._place_in_world(joints), self._place_in_world(joints[..., feet, :] + levers)

@@ -16,7 +16,7 @@ _SYSTEM_ERROR = re.compile(r"\(os error (\d+)\)")
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], *, metadata: Mapping[str, str] | None = None) -> None:
     """Write a file that appears whole or not at all; RequestError where it cannot be written, as on a full disk."""
-    contiguous = {name: tensor.contiguous() for name, tensor in tensors.items()}
+    contiguous = {name: tensor.cpu().contiguous() for name, tensor in tensors.items()}
     with atomic_path(path) as scratch:
         try:
             save_file(contiguous, scratch, metadata=dict(metadata) if metadata else None)

@@ -73,7 +73,7 @@ def positions_from_matrices(
     skeleton: Skeleton, local_matrix: Float[Tensor, "*batch joints 3 3"]
 ) -> Float[Tensor, "*batch joints 3"]:
     """Return the joint positions (metres) relative to the root at the origin, from local rotation matrices."""
-    return chain_matrices(skeleton.offsets.to(local_matrix.dtype), skeleton.parents, local_matrix)[0]
+    return chain_matrices(skeleton.offsets.to(local_matrix), skeleton.parents, local_matrix)[0]
 
 
 def chain_matrices(

@@ -1,6 +1,6 @@
 """Candidate motions as terms see them: built once per evaluation, world poses computed at most once."""
 
-from dataclasses import KW_ONLY, dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property
 
 import torch
@@ -101,10 +101,7 @@ class Trial:
     @property
     def pose(self) -> BodyPose:
         """The poses of the body in the world."""
-        height = LAYOUT.pick(self.features, "root_height")
-        root = torch.cat([self.root_xz_world[..., :1], height, self.root_xz_world[..., 1:]], dim=-1)
-        in_place = BodyPose.of_features_in_place(self.features)
-        return replace(in_place, root_position=root, heading=self.heading)
+        return BodyPose.of_features_at(self.features, self.root_xz_world, self.heading)
 
     @property
     def joints_world(self) -> Float[Tensor, "batch frames joints 3"]:

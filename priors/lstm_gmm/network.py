@@ -280,14 +280,14 @@ class LstmGmm(nn.Module):
     ) -> tuple[Float[Tensor, "batch frames size"], LstmState]:
         """`sample`, differentiable in the weights for the components and bits that were drawn."""
         drawn, device, mixing = [], self.mean.device, self.mixing
+        there, size = generator.device, self.layout.continuous
         for _ in range(frames):
             mixture, state = self._step(state)
-            # Random numbers come from the CPU's generator wherever the network is.
-            weights = mixture.log_weight.detach().exp().cpu()
+            weights = mixture.log_weight.detach().exp().to(there)
             component = torch.multinomial(weights, 1, generator=generator)[:, 0].to(device)
-            noise = temperature * torch.randn(len(weights), self.layout.continuous, generator=generator).to(device)
+            noise = temperature * torch.randn(len(weights), size, generator=generator, device=there).to(device)
             planted = torch.sigmoid(mixture.contact_logit.detach())  # probability
-            bits = torch.rand(planted.shape, generator=generator).to(device) < planted
+            bits = torch.rand(planted.shape, generator=generator, device=there).to(device) < planted
             frame, _ = self._compose(mixture, component, noise, bits, mixing)
             if planting is not None:
                 gaussian = self._find_gaussian(mixture, component, mixing, temperature)

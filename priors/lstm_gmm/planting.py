@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl.features import LAYOUT, PRIOR_FPS
-from mapctl.kinematics.fast import compute_joints_world
+from mapctl.kinematics.placement import place_joints
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 
 _CHANGE = 2e-3  # of a feature, by which steps are differentiated
@@ -68,5 +68,5 @@ class Planting:
 def _place_toes(features: Float[Tensor, "batch variants size"]) -> Float[Tensor, "batch variants 6"]:
     """Places of both toes after one frame from the origin, metres."""
     ground, heading = LAYOUT.pick(features, "root_displacement_heading"), LAYOUT.pick(features, "heading_change")
-    places = compute_joints_world(features.contiguous(), ground.contiguous(), heading[..., 0].contiguous(), CANONICAL)
+    places = place_joints(features, ground.contiguous(), heading[..., 0].contiguous(), CANONICAL)
     return places[:, :, list(TOE_JOINTS)].flatten(2)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from mapctl import rotations
 from mapctl.features import LAYOUT, GroundPose
-from mapctl.kinematics.fast import compute_joints_world
+from mapctl.kinematics.placement import place_joints
 from mapctl.runtime.stepwise import StepwiseWork
 from mapctl.skeleton import CANONICAL
 from priors.stitching.network import POSE, Gaussian, Memory, Situation, StitcherNetwork
@@ -91,7 +91,7 @@ class Sides:
     def place_joints(self) -> Float[Tensor, "sides batch made joints 3"]:
         """Place the joints, metres, seen from the first end."""
         shape = self.features.shape[:2]
-        return compute_joints_world(
+        return place_joints(
             self.features.flatten(0, 1), self.place.flatten(0, 1), self.heading.flatten(0, 1), CANONICAL
         ).unflatten(0, shape)
 

@@ -82,6 +82,10 @@ class Corpus:
         ground, heading = zip(*(integrate_root(clip, origin) for clip in self.clips()), strict=True)
         return torch.cat(ground), torch.cat(heading)
 
+    def to(self, device: str) -> "Corpus":
+        """The corpus with its features on a device of torch's."""
+        return replace(self, features=self.features.to(device))
+
     def subset(self, picked: Iterable[int]) -> "Corpus":
         """The corpus of some clips."""
         picked, clips = list(picked), self.clips()
@@ -102,6 +106,10 @@ class Split:
     """5 %, for the curve."""
     test: Corpus
     """5 %, for the measures of the card; of few clips the very part that `validation` is."""
+
+    def to(self, device: str) -> "Split":
+        """All parts on a device of torch's."""
+        return Split(self.train.to(device), self.validation.to(device), self.test.to(device))
 
 
 def split_corpus(corpus: Corpus, seed: int) -> Split:

@@ -1,6 +1,12 @@
-"""Where a network is trained: on the processor, or on a GPU that is there."""
+"""Where training computes: on processors, or on a GPU with CUDA.
+
+Inside `use_device` that is torch's default device, so what training makes is made there without being told: windows,
+networks, random numbers.
+"""
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import torch
 
@@ -18,3 +24,18 @@ def select_device(wanted: str) -> str:
     if wanted != "cpu" and devices and count_launched() is not None and local >= devices:
         raise RequestError(f"this machine has {devices} CUDA devices, too few for process {local}; use --device cpu")
     return ("cuda" if torch.cuda.is_available() else "cpu") if wanted == "auto" else wanted
+
+
+@contextmanager
+def use_device(name: str) -> Iterator[None]:
+    """Make tensors there that are not told where."""
+    if torch.get_default_device().type == torch.device(name).type:
+        yield  # as it is: a default of torch's costs each of its calls a little
+        return
+    with torch.device(name):
+        yield
+
+
+def make_generator(seed: int) -> torch.Generator:
+    """Make a generator that draws on the device in use."""
+    return torch.Generator(torch.get_default_device()).manual_seed(seed)

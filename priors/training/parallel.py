@@ -79,7 +79,7 @@ class TrainingGroup:
         """By wish, whether any process has it."""
         if self.size == 1:
             return wishes
-        flags = torch.tensor(wishes, dtype=torch.int32)
+        flags = torch.tensor(wishes, dtype=torch.int32, device="cpu")
         with _tell_loss():
             dist.all_reduce(flags, op=dist.ReduceOp.MAX)
         return tuple(bool(flag) for flag in flags.tolist())
@@ -88,7 +88,7 @@ class TrainingGroup:
         """The rows of all processes, one process' after the other's."""
         if self.size == 1:
             return rows
-        counts = torch.zeros(self.size, dtype=torch.int64)
+        counts = torch.zeros(self.size, dtype=torch.int64, device="cpu")
         counts[self.rank] = len(rows)
         parts = []
         with _tell_loss():
@@ -116,17 +116,17 @@ class TrainingGroup:
 
     def _send(self, content: bytes | None) -> None:
         with _tell_loss():
-            dist.broadcast(torch.tensor([-1 if content is None else len(content)]), 0)
+            dist.broadcast(torch.tensor([-1 if content is None else len(content)], device="cpu"), 0)
             if content:
                 dist.broadcast(torch.frombuffer(bytearray(content), dtype=torch.uint8), 0)
 
     def _receive(self) -> bytes:
-        count = torch.zeros(1, dtype=torch.int64)
+        count = torch.zeros(1, dtype=torch.int64, device="cpu")
         with _tell_loss():
             dist.broadcast(count, 0)
             if int(count) < 0:
                 raise SilentError("process 0 has failed")
-            content = torch.empty(int(count), dtype=torch.uint8)
+            content = torch.empty(int(count), dtype=torch.uint8, device="cpu")
             if len(content):
                 dist.broadcast(content, 0)
         return content.numpy().tobytes()

@@ -16,9 +16,11 @@ from mapctl.features import PRIOR_FPS
 from priors import checkpoints
 from priors.config import NetworkConfig, require_at_least
 from priors.training.corpus import Corpus, Split
+from priors.training.devices import select_device
 from priors.training.ending.course import VALIDATIONS, End, UntilFlat
 from priors.training.ending.flatness import Point
 from priors.training.gathering import DataSource, describe_selection
+from priors.training.parallel import count_launched
 from priors.training.trainer import GradientTrainer, Trainer
 
 Row = dict[str, Any]
@@ -97,6 +99,8 @@ class Recipe(ABC, Generic[C, S, T]):
     """Whether the learning rate falls to nothing at the end, which then has to be known before it comes."""
     decay_cost: ClassVar[float] = 1.0
     """How much longer a step takes in the decay of a run until its curve is flat than before it."""
+    uses_gpu: ClassVar[bool] = True
+    """Whether it can be trained on a GPU."""
     headline: ClassVar[str] = "error"
     """What `find_headline` tells: the one number that says how good a model is, smaller where it is better."""
 
@@ -138,6 +142,8 @@ class Recipe(ABC, Generic[C, S, T]):
     """Train until the curve of validations is flat; the settings' steps are then a plan."""
     minutes: float | None = None
     """Of one core, within which training ends as if it were finished."""
+    device: str = "auto"
+    """Where to compute: `cpu`, `cuda`, or `auto` for a GPU where there is one."""
 
     def __post_init__(self):
         require_at_least(self, 1, "report_steps", "validate_steps", "processes")
@@ -152,6 +158,11 @@ class Recipe(ABC, Generic[C, S, T]):
             raise RequestError(f"{self.data} is not a folder of BVH files")
         if not os.access(self.data, os.R_OK | os.X_OK):
             raise RequestError(f"{self.data} cannot be read: permission denied")
+        if self.find_device() == "cuda" and self.processes > 1 and count_launched() is None:
+            raise RequestError(
+                "several processes on GPUs are started by torchrun, one a GPU: python -m torch.distributed.run"
+                f" --nproc-per-node {self.processes} -m mapctl train {self.kind} ...; or use --device cpu"
+            )
         if self.processes > self.most_processes:
             raise RequestError(
                 f"{self.processes} processes cannot share what a {self.counter} of {self.kind} takes:"
@@ -162,6 +173,14 @@ class Recipe(ABC, Generic[C, S, T]):
                 f"minutes limit a {self.kind} only until its curve is flat (--until-flat):"
                 f" otherwise its learning rate goes by its {self.counter}s"
             )
+
+    def find_device(self) -> str:
+        """`cpu` or `cuda`; RequestError for one that this process cannot have, or on which nothing would be faster."""
+        if self.uses_gpu:
+            return select_device(self.device)
+        if self.device == "cuda":
+            raise RequestError(f"a {self.kind} is not trained on GPUs; use --device cpu")
+        return "cpu"
 
     @property
     def most_processes(self) -> int:

@@ -13,12 +13,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Generic
 
+import torch
 from torch import Tensor
 
 from mapctl.errors import RequestError
 from mapctl.runtime.interruption import DeferredSignals, defer_signals
 from priors import checkpoints
 from priors.training import parallel, run_files
+from priors.training.devices import use_device
 from priors.training.ending.course import Course
 from priors.training.gathering import Progress, gather
 from priors.training.parallel import ALONE, TrainingGroup
@@ -59,8 +61,9 @@ def train(
             progress, warn, watchers = _say_nothing, _say_nothing, ()
         gathered = _gather_together(recipe, group, progress, warn)
         watchers = [LineWatcher(progress)] if watchers is None else watchers
-        run = TrainingRun(recipe, gathered, progress, warn=warn, watchers=watchers, group=group)
-        run.go()
+        with use_device(recipe.find_device()):
+            run = TrainingRun(recipe, gathered, progress, warn=warn, watchers=watchers, group=group)
+            run.go()
         return run.export()
 
 
@@ -97,7 +100,10 @@ class TrainingRun(Generic[C, S, T]):
         group: TrainingGroup = ALONE,
     ):
         self.recipe, self.gathered, self.progress, self.group = recipe, gathered, progress, group
-        self.trainer = recipe.make_trainer(gathered.parts)
+        self.device = torch.get_default_device().type
+        self.parts = gathered.parts.to(self.device)
+        """What is trained on and measured, where it is computed."""
+        self.trainer = recipe.make_trainer(self.parts)
         self.pinned = json.loads(json.dumps(recipe.pin(self.trainer, gathered.corpus)))
         self.curve: list[Row] = []
         self.losses: list[Row] = []  # since the last report but one, where there has just been one
@@ -229,7 +235,7 @@ class TrainingRun(Generic[C, S, T]):
         recipe, trainer = self.recipe, self.trainer
         if not recipe.guards:
             trainer.check_finite()
-        row = trainer.validate(self.gathered.parts.validation)
+        row = trainer.validate(self.parts.validation)
         if recipe.guards:
             score = recipe.score(row)
             if score < min((recipe.score(before) for before in self.curve), default=math.inf) or not self.curve:
@@ -244,6 +250,7 @@ class TrainingRun(Generic[C, S, T]):
             return path
         if recipe.guards:
             self.trainer.network.load_state_dict(self.best)
+        self.trainer.move("cpu")
         made = recipe.export(self.trainer, self.gathered, self.curve)
         training = {"settings": asdict(recipe.settings), "curve": self.curve, "command": recipe.format_command()}
         card = checkpoints.Card(
@@ -276,6 +283,7 @@ class TrainingRun(Generic[C, S, T]):
             "first_steps": self.trainer.first_steps,
             "extended": self.extended,
             "processes": self.recipe.processes,
+            "device": self.device,
             "curve": self.curve,
             "losses": [_none_where_not_finite(row) for row in self.losses],
         }
@@ -336,7 +344,7 @@ class TrainingRun(Generic[C, S, T]):
             self._extend(index)
             self.course.load(out, index)
             self.trainer.load_state(tensors, int(index["step"]))
-            before = run_files.parse_processes(out, index)
+            before, device = run_files.parse_processes(out, index), str(index.get("device", "cpu"))
         except run_files.UNREADABLE_ERRORS as error:
             raise run_files.make_unreadable_error(out, error) from error
         if before != recipe.processes:
@@ -344,6 +352,8 @@ class TrainingRun(Generic[C, S, T]):
                 f"{out} was trained in {before} processes and goes on in {recipe.processes}:"
                 " the result is as good, but not the same to the bit"
             )
+        if device != self.device:
+            warn(f"{out} was trained on {device} and goes on on {self.device}: the result is as good, but another one")
 
     def _extend(self, index: dict[str, Any]) -> None:
         """Take what the checkpoint says of the number of steps; RequestError where more are done than are wanted."""

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from mapctl.errors import MapctlError
 from priors.training import run_files
 from priors.training.corpus import Corpus
+from priors.training.devices import make_generator, use_device
 from priors.training.ending.decay import Decay
 from priors.training.parallel import ALONE, TrainingGroup
 
@@ -36,7 +37,8 @@ class Trainer(ABC, Generic[Network]):
         self.decay: Decay | None = None
         """Last steps of such a run, once it is known where they begin."""
         self.group = ALONE
-        self.generator = torch.Generator().manual_seed(seed)
+        self.seed = seed
+        self.generator = make_generator(seed)
         """Draws what belongs to this process' share of a batch."""
         self.common = self.generator
         """Draws what all processes of a step have in common, as the length of its windows."""
@@ -45,7 +47,7 @@ class Trainer(ABC, Generic[Network]):
         """Train as one of a group from here on; all members are the same until then."""
         self.group = group
         if group.size > 1:
-            self.common = torch.Generator()
+            self.common = make_generator(self.seed)
             self.common.set_state(self.generator.get_state())
 
     def set_first_steps(self, steps: int) -> None:
@@ -110,12 +112,24 @@ class Trainer(ABC, Generic[Network]):
 
     def load_state(self, tensors: Mapping[str, Tensor], step: int) -> None:
         """Go on from what `state` gave, before a group is joined; KeyError or RuntimeError where it is not whole."""
-        self.common.set_state(tensors["generator"])
+        self._set_generator(tensors["generator"], step)
         for kind, network in self.networks().items():
             network.load_state_dict(run_files.select_prefixed(f"{kind}.", tensors))
         for kind, optimiser in self.optimisers().items():
             optimiser.load_state_dict(run_files.unflatten_optimiser(optimiser, kind, tensors))
         self.step = step
+
+    def move(self, device: str) -> None:
+        """Take what is learnt to a device, where it is then measured; what training draws from stays where it is."""
+        for network in self.networks().values():
+            network.to(device)
+
+    def _set_generator(self, state: Tensor, step: int) -> None:
+        """The state of another kind of device's generator says nothing here: numbers are drawn anew from this step."""
+        if state.shape == self.common.get_state().shape:
+            self.common.set_state(state)
+        else:
+            self.common.manual_seed(self.seed + step)
 
 
 class GradientTrainer(Trainer[Network]):
@@ -125,7 +139,7 @@ class GradientTrainer(Trainer[Network]):
         """`make` builds the network (see `draw_weights`)."""
         super().__init__(steps=steps, seed=seed)
         self.learning_rate = learning_rate
-        self.network = draw_weights(make, seed)
+        self.network = draw_weights(make, seed).to(torch.get_default_device())
         self._optimisers = self.make_optimisers()
 
     @abstractmethod
@@ -185,8 +199,9 @@ Drawn = TypeVar("Drawn")
 
 
 def draw_weights(make: Callable[[], Drawn], seed: int) -> Drawn:
-    """What `make` builds of torch's global generator, seeded; the caller's own numbers are left alone."""
-    with torch.random.fork_rng(devices=[]):
+    """What `make` builds of torch's global generator, seeded; the caller's own numbers are left alone. It is made on
+    the processor, so that it is the same whatever device it is then taken to."""
+    with use_device("cpu"), torch.random.fork_rng(devices=[]):
         torch.default_generator.manual_seed(seed)
         return make()
 

@@ -284,9 +284,7 @@ def test_every_option_reaches_the_trainer(model):
     )
 
 
-@pytest.mark.parametrize(
-    "words", [["--density", "mine"], ["--components", "3"], ["--device", "cpu"]], ids=lambda words: words[0]
-)
+@pytest.mark.parametrize("words", [["--density", "mine"], ["--components", "3"]], ids=lambda words: words[0])
 def test_options_of_other_models_are_unknown(model, words):
     with pytest.raises(RequestError, match=f"Unrecognized options: {words[0]}.* .see mapctl train {model.name} --help"):
         requested(model, *words)

@@ -1,7 +1,7 @@
 """`mapctl train lstm-gmm`: the options of a density."""
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import arg
 
@@ -50,8 +50,6 @@ class TrainDensity(TunableOptions):
     standing_share: options.MaybeNumber = None
     """Share of the windows in which nobody goes anywhere that training sees, 1 by default: below it for motion that
     mostly stands, whose density stands fast otherwise."""
-    device: Annotated[Literal["auto", "cpu", "cuda"], arg(metavar="auto|cpu|cuda")] = "auto"
-    """Where to compute."""
 
     def recipe(self) -> "DensityRecipe":
         """The options as the trainer takes them; RequestError for numbers that make no sense."""
@@ -78,7 +76,6 @@ class TrainDensity(TunableOptions):
             **common,
             config=replace(config, **shape),
             settings=replace(settings, bfloat16=self.bfloat16, copies=copies, **given),
-            device=self.device,
             skip_first=self.skip_first,
             made=self.made,
             splices=Splices(self.splices, self.stitcher or Splices.stitcher),

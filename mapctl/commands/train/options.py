@@ -6,7 +6,7 @@ import shlex
 import signal
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from tyro.conf import arg
 
@@ -226,6 +226,8 @@ class TunableOptions(NetworkOptions):
     """At its highest; 0.001 from scratch, less to fine-tune."""
     init: Annotated[str | None, arg(metavar="NAME")] = None
     """Begin with the weights of this model, bundled or trained, and fine-tune them."""
+    device: Annotated[Literal["auto", "cpu", "cuda"], arg(metavar="auto|cpu|cuda")] = "auto"
+    """Where to compute; auto is a GPU with CUDA where there is one."""
     skip_first: bool = False
     """Leave out frame 0 of every clip (the T-pose of CMU takes)."""
     until_flat: bool = False
@@ -249,7 +251,8 @@ class TunableOptions(NetworkOptions):
 
     def common(self) -> dict[str, Any]:
         """What every recipe takes, checked."""
-        return {**super().common(), "until_flat": self._make_rule() if self.until_flat else None}
+        rule = self._make_rule() if self.until_flat else None
+        return {**super().common(), "device": self.device, "until_flat": rule}
 
     def _make_rule(self) -> "UntilFlat":
         from priors.training.ending.course import UntilFlat

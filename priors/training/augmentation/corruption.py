@@ -146,7 +146,7 @@ def _sample_noise(settings: CorruptionSettings, draw: Draws) -> _Noise:
 
 def _angles_of_places(place: Float[Tensor, " batch"]) -> Float[Tensor, "batch joints"]:
     """Noise of a joint's angles about its parent where both bones point from one noisy place to another, radians."""
-    own = (math.sqrt(2) * place[:, None] / _bone_lengths()).clamp(max=_MAX_NOISE_RAD)
+    own = (math.sqrt(2) * place[:, None] / _bone_lengths().to(place)).clamp(max=_MAX_NOISE_RAD)
     own = own * torch.tensor([bool(CANONICAL.children(joint)) for joint in range(_JOINTS)])
     above = own[:, [max(0, parent) for parent in CANONICAL.parents]].clone()
     above[:, 0] = 0.0
@@ -173,7 +173,7 @@ def _perturb_places(
     white = torch.randn(len(rows), draw.frames, _JOINTS, 3, generator=draw.generator)
     moved = _correlate_in_time(white, noise.stays[rows]) * noise.place[rows, None, None, None]
     matrices = rotations.to_matrix(quats[rows])
-    places, world = chain_matrices(CANONICAL.offsets.float(), CANONICAL.parents, matrices)
+    places, world = chain_matrices(CANONICAL.offsets.to(matrices), CANONICAL.parents, matrices)
     world = world.clone()
     for joint in range(_JOINTS):
         if below := CANONICAL.children(joint):

@@ -118,7 +118,7 @@ class PoseWindows:
         root = torch.cat([ground[..., :1], height, ground[..., 1:]], dim=-1)
         heading = torch.lerp(self.heading[one], self.heading[other], weight)
         batch, frames = clip.shape
-        offsets = CANONICAL.offsets.float().expand(batch, -1, -1)
+        offsets = CANONICAL.offsets.to(root).expand(batch, -1, -1)
         known = KnownParts.whole(torch.ones(batch, frames, dtype=torch.bool))
         targets = torch.zeros(batch, frames, len(EFFECTORS), 3)
         return PartialMotion(root, heading, quats, self.contacts[nearest], targets, offsets, known)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mapctl.contacts.phases import compute_phases, mirror_phases, reversed_phases
 from mapctl.features import LAYOUT, GroundPose, integrate_root, mirror_features, reversed_features
-from mapctl.kinematics.fast import compute_joints_world
+from mapctl.kinematics.placement import place_joints
 from mapctl.skeleton import CANONICAL
 from priors.stitching.sides import Ends
 from priors.training.augmentation.pose_windows import WindowPicker
@@ -77,7 +77,7 @@ class Transition:
     def place_joints(self, made: int) -> Float[Tensor, "2 batch made joints 3"]:
         """Place the joints of the frames that each side is to make first, metres, seen from the first pose."""
         ground, heading = self.integrate()
-        places = compute_joints_world(self.features[:, self.between].contiguous(), ground, heading, CANONICAL)
+        places = place_joints(self.features[:, self.between], ground, heading, CANONICAL)
         return torch.stack([places[:, :made], places[:, :-1].flip(1)[:, :made]])
 
     def true_phases(self) -> Float[Tensor, "2 batch frames 4"]:
@@ -93,7 +93,9 @@ class TransitionWindows:
     def __init__(self, corpus: Corpus, *, kinds: Sequence[str], evenness: float):
         """`evenness` among kinds of clips, as `WindowPicker` takes it."""
         self.features = corpus.features
-        self.phases = torch.cat([compute_phases(LAYOUT.pick(clip, "contacts")) for clip in corpus.clips()]).float()
+        self.phases = torch.cat([compute_phases(LAYOUT.pick(clip, "contacts")) for clip in corpus.clips()]).to(
+            self.features
+        )
         self.picker = WindowPicker(corpus, kinds=kinds, evenness=evenness)
         self.starts = corpus.locate_clips()[1]
 

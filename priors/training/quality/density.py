@@ -15,6 +15,7 @@ from mapctl.pose import decode
 from mapctl.problem import density_selection
 from priors.lstm_gmm.network import LstmGmm
 from priors.training.corpus import Corpus, Split
+from priors.training.devices import make_generator
 
 _SETTLING_FRAMES = 300
 
@@ -30,7 +31,7 @@ def measure_free_runs(
     clips = [clips[i * len(clips) // runs % len(clips)] for i in range(runs)]
     state = model.start_after(torch.stack([clip[0] for clip in clips]).to(model.mean.device))
     state = model.advance(state, torch.stack([clip[1:60] for clip in clips]).to(model.mean.device))
-    features, _ = model.sample(state, frames, torch.Generator().manual_seed(seed), temperature=temperature)
+    features, _ = model.sample(state, frames, make_generator(seed), temperature=temperature)
     settled = features[:, min(_SETTLING_FRAMES, frames // 2) :].cpu()
     own, wanted = summarise_states(settled.flatten(0, 1)), summarise_states(corpus.features)
     result = {f"free_run_{name}_ratio": own[name] / wanted[name] for name in own}

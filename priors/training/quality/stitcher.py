@@ -13,6 +13,7 @@ from priors.stitching.network import StitcherNetwork
 from priors.stitching.posterior import PosteriorNetwork
 from priors.stitching.sides import Latents, count_made, walk_sides
 from priors.training.augmentation.transition_windows import Known, Transition, TransitionWindows
+from priors.training.devices import make_generator
 from priors.training.recipes.stitcher_latents import TaughtLatents, miss_calmly
 from priors.training.recipes.stitcher_losses import interpolate
 
@@ -43,7 +44,7 @@ def measure_transitions(
         for gap in VALIDATED_GAPS:
             if not _has_room(network, windows, gap):
                 continue
-            truth = windows.draw(_WINDOWS, gap + 1, known, torch.Generator().manual_seed(gap))
+            truth = windows.draw(_WINDOWS, gap + 1, known, make_generator(gap))
             places, guess = _true_places(truth)
             joined = answer(network, truth, make_calm(network, truth))
             error = (place(joined) - places).norm(dim=-1).mean()
@@ -64,7 +65,7 @@ def calibrate_temperature(network: StitcherNetwork, windows: TransitionWindows) 
     for gap in VALIDATED_GAPS[1:]:
         if not _has_room(network, windows, gap):
             continue
-        truth = windows.draw(_WINDOWS, gap + 1, Known(), torch.Generator().manual_seed(gap))
+        truth = windows.draw(_WINDOWS, gap + 1, Known(), make_generator(gap))
         places = _true_places(truth)[0]
         unit = (place(answer(network, truth, make_calm(network, truth))) - places).norm(dim=-1).mean()
         for number, temperature in enumerate(TEMPERATURES):
@@ -86,7 +87,9 @@ def make_calm(network: StitcherNetwork, truth: Transition) -> DrawnLatents:
 
 def place(joined: Joined) -> Float[Tensor, "batch frames joints 3"]:
     """Place the joints, metres, seen from the first pose."""
-    return forward_kinematics(CANONICAL.offsets.float(), CANONICAL.parents, joined.root_position, joined.quats)[0]
+    return forward_kinematics(
+        CANONICAL.offsets.to(joined.quats), CANONICAL.parents, joined.root_position, joined.quats
+    )[0]
 
 
 def _true_places(truth: Transition) -> tuple[Tensor, Tensor]:
@@ -139,7 +142,7 @@ def _draw(
     network: StitcherNetwork, truth: Transition, temperature: float
 ) -> Float[Tensor, "draws batch frames joints 3"]:
     """Draw answers; those of one temperature have the noise of those of another, scaled."""
-    generator, batch, made = torch.Generator().manual_seed(0), len(truth.features), count_made(network, truth.frames)
+    generator, batch, made = make_generator(0), len(truth.features), count_made(network, truth.frames)
     latents = [DrawnLatents.sample(network.config, batch, made, generator) for _ in range(_DRAWS)]
     return torch.stack([place(answer(network, truth, each.scale(temperature))) for each in latents])
 

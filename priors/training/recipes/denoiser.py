@@ -19,6 +19,7 @@ from priors.config import require_at_least
 from priors.denoiser.network import ANGLE_UNIT, POSITION_UNIT, DenoiserConfig, DenoiserNetwork
 from priors.training.augmentation.corruption import CorruptionSettings, corrupt, make_clean_capture
 from priors.training.corpus import Corpus, Split
+from priors.training.devices import make_generator
 from priors.training.recipe import NetworkRecipe, Row, average_logarithms
 from priors.training.trainer import GradientTrainer
 from priors.training.windows import FeatureWindows
@@ -94,7 +95,7 @@ class DenoiserTrainer(GradientTrainer[DenoiserNetwork]):
 
     def validate(self, corpus: Corpus) -> dict[str, Any]:
         """Measure the errors on 6 batches of held-out windows, corrupted identically each time."""
-        settings, generator, rows = self.settings, torch.Generator().manual_seed(0), []
+        settings, generator, rows = self.settings, make_generator(0), []
         # What is held out may have no clip as long as a window; that must not end a run after an hour.
         drawn = FeatureWindows(corpus, min(settings.window, max(corpus.lengths)), evenness=settings.evenness)
         with torch.no_grad():

@@ -15,6 +15,7 @@ from priors.infiller.network import InfillerConfig, InfillerNetwork
 from priors.infiller.transitions import FRAMES_AFTER, PAST_FRAMES
 from priors.training.augmentation.gap_masks import GapSettings, sample_observation_mask, sample_transition
 from priors.training.corpus import Corpus, Split
+from priors.training.devices import make_generator
 from priors.training.recipe import NetworkRecipe, Row, average_logarithms
 from priors.training.trainer import GradientTrainer
 from priors.training.windows import PositionWindows, Window
@@ -97,7 +98,7 @@ class InfillerTrainer(GradientTrainer[InfillerNetwork]):
         frames, row = self.settings.window, {}
         windows = PositionWindows(corpus, frames=frames, evenness=self.settings.evenness)
         for gap in [gap for gap in VALIDATED_GAPS if gap + _MARGIN_FRAMES <= frames]:
-            window = windows.draw(192, torch.Generator().manual_seed(gap))
+            window = windows.draw(192, make_generator(gap))
             middle = (frames - gap) // 2
             known = window.present[..., None].expand(-1, -1, CANONICAL.num_joints).clone()
             known[:, middle : middle + gap] = False

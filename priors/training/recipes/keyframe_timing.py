@@ -82,6 +82,7 @@ class KeyframeTimingRecipe(Recipe[KeyframeTimingConfig, KeyframeTimingSettings, 
     """What to fit a keyframe timing to, and how."""
 
     kind = "keyframe-timing"
+    uses_gpu = False
     falls = False
     headline = "half of pairs off by a factor of"
     config: KeyframeTimingConfig = field(default_factory=KeyframeTimingConfig)

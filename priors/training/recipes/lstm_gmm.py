@@ -7,7 +7,6 @@ from pathlib import Path
 
 import torch
 
-from mapctl.errors import RequestError
 from mapctl.features import LAYOUT
 from priors.config import require_at_least
 from priors.lstm_gmm import density, labels
@@ -16,11 +15,10 @@ from priors.stitching import inbetweener
 from priors.training.augmentation.clip_copies import add_copies
 from priors.training.augmentation.splices import Splices, drop_splices, hide_splices
 from priors.training.corpus import Corpus, Split
-from priors.training.devices import select_device
+from priors.training.devices import make_generator, use_device
 from priors.training.gathering import DataSource, describe_selection
 from priors.training.initial_states import measure_data_limits, select_initial_states
 from priors.training.mocap.holdings import measure_holdings
-from priors.training.parallel import count_launched
 from priors.training.quality import density as density_quality
 from priors.training.recipe import Export, Gathered, Recipe, Row, average, find_split_seed
 from priors.training.recipes.density.settings import PAPER, PLAIN, TrainingSettings
@@ -38,8 +36,6 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
     """The network."""
     settings: TrainingSettings = field(default_factory=TrainingSettings)
     """How it is trained."""
-    device: str = "auto"
-    """`auto`, `cpu` or `cuda`."""
     starts: int = 64
     """Moments of mocap that the finished prior carries."""
     made: Path | None = None
@@ -57,12 +53,6 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
 
     def check(self) -> None:
         """Before anything is read."""
-        device = select_device(self.device)
-        if device == "cuda" and self.processes > 1 and count_launched() is None:
-            raise RequestError(
-                "several processes on GPUs are started by torchrun, one a GPU: python -m torch.distributed.run"
-                f" --nproc-per-node {self.processes} -m mapctl train lstm-gmm ...; or use --device cpu"
-            )
         super().check()
         if self.splices.count:
             inbetweener.load(self.splices.stitcher)  # a wrong name shall not be told after all clips were read
@@ -73,14 +63,17 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
 
     def make_trainer(self, parts: Split) -> DensityTrainer:
         """Make the trainer of a new network for the clips' labels, or of the initial network with its own labels."""
-        corpus = add_copies(parts.train, self.settings.copies, torch.Generator().manual_seed(self.settings.seed))
-        device, known = select_device(self.device), labels.read(hide_splices(corpus.names), self.labels)
+        with use_device("cpu"):  # copies are made one after the other
+            seeded = make_generator(self.settings.seed)
+            copied = add_copies(parts.train.to("cpu"), self.settings.copies, seeded)
+        corpus = copied.to(torch.get_default_device().type)
+        known = labels.read(hide_splices(corpus.names), self.labels)
         if self.init is None:
             config = replace(self.config, labels=known.names)
-            return DensityTrainer(config, self.settings, corpus, device, labels=known)
+            return DensityTrainer(config, self.settings, corpus, labels=known)
         before = density.load(self.init).reference
         known = known.renamed(before.config.labels)
-        return DensityTrainer(before.config, self.settings, corpus, device, labels=known, init=before.state_dict())
+        return DensityTrainer(before.config, self.settings, corpus, labels=known, init=before.state_dict())
 
     def find_shape(self, trainer: DensityTrainer) -> LstmGmmConfig:
         """Return the configuration of the network that is trained."""
@@ -122,8 +115,8 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
 
     def export(self, trainer: DensityTrainer, gathered: Gathered, curve: Sequence[Row]) -> Export:
         """The network with moments to start from, and what the data show to be possible."""
-        model, corpus, parts = trainer.network.cpu().eval(), gathered.corpus, gathered.parts
-        clips, seeded = drop_splices(parts.train), torch.Generator().manual_seed(self.settings.seed)
+        model, corpus, parts = trainer.network.eval(), gathered.corpus, gathered.parts
+        clips, seeded = drop_splices(parts.train), make_generator(self.settings.seed)
         known = labels.read(clips.names, self.labels)
         found = select_initial_states(model, clips, count=self.starts, generator=seeded, labels=known.held)
         data = {

@@ -16,6 +16,7 @@ from mapctl.metrics.root_prediction import SPANS, average_displacement_errors, c
 from priors.config import require_at_least
 from priors.training.augmentation.pose_windows import PoseWindows, Variation, find_kind
 from priors.training.corpus import Corpus, Split
+from priors.training.devices import make_generator
 from priors.training.recipe import NetworkRecipe, Row, average_logarithms
 from priors.training.trainer import GradientTrainer
 from priors.tweening.path import PathConfig, PathNetwork
@@ -160,7 +161,7 @@ def measure_clip(network: PathNetwork, windows: PoseWindows, number: int) -> dic
 
 def _set_moments(network: PathNetwork, windows: PoseWindows) -> None:
     """Tell the network means and spreads of the places that it sees, of motion and its mirror image."""
-    batch = windows.draw(4000, 4, torch.Generator().manual_seed(0))
+    batch = windows.draw(4000, 4, make_generator(0))
     seen = LocalMotion.of_world(batch.world_poses()[0], batch.heading)
     places = torch.cat([seen.places, seen.mirrored().places])[..., 1:, :].flatten(0, 1)
     network.mean.copy_(places.mean(dim=0))

@@ -20,6 +20,7 @@ from priors.pose_transformer.network import QUANTILES, PoseTransformerConfig, Po
 from priors.training.augmentation.part_masks import PartSettings, sample_known_parts
 from priors.training.augmentation.pose_windows import PoseWindows, Variation, add_targets
 from priors.training.corpus import Corpus, Split
+from priors.training.devices import make_generator
 from priors.training.recipe import Export, Gathered, NetworkRecipe, Row, average_logarithms
 from priors.training.trainer import GradientTrainer, make_adam
 
@@ -146,12 +147,12 @@ class PoseTransformerTrainer(GradientTrainer[PoseTransformerNetwork]):
                 frames = past + gap + 1
                 if frames > int(windows.lengths.max()):
                     continue
-                truth = windows.draw(_VALIDATED_WINDOWS, frames, torch.Generator().manual_seed(gap))
+                truth = windows.draw(_VALIDATED_WINDOWS, frames, make_generator(gap))
                 told = torch.ones(truth.heading.shape, dtype=torch.bool)
                 told[:, past : past + gap] = False
                 error, share = measure_error(self.network, truth, KnownParts.whole(told))
                 row |= {f"error_{past}_{gap}_cm": error, f"share_{past}_{gap}": share}
-        truth = windows.draw(_VALIDATED_WINDOWS, min(60, int(windows.lengths.max())), torch.Generator().manual_seed(1))
+        truth = windows.draw(_VALIDATED_WINDOWS, min(60, int(windows.lengths.max())), make_generator(1))
         known = KnownParts.whole(torch.ones(truth.heading.shape, dtype=torch.bool))
         lost = known.rotations.clone()
         lost[..., [CANONICAL.index(name) for name in ("leftUpperArm", "leftLowerArm", "leftHand")]] = False
@@ -228,7 +229,7 @@ def measure_coverage(trainer: PoseTransformerTrainer, corpus: Corpus) -> dict[st
 
 def _measure_spread(trainer: PoseTransformerTrainer, corpus: Corpus, seed: int) -> list[Tensor]:
     """Measure by quantile the logarithm of errors over the spread."""
-    settings, generator = trainer.settings, torch.Generator().manual_seed(seed)
+    settings, generator = trainer.settings, make_generator(seed)
     windows = PoseWindows(corpus, kinds=settings.kinds, evenness=1.0)
     found: list[Tensor] = []
     for frames in _CALIBRATED_FRAMES:
@@ -347,7 +348,7 @@ def _quantile_loss(proposed: ProposedPoses, distance: Tensor, unknown: Tensor) -
 
 def _set_moments(network: PoseTransformerNetwork, windows: PoseWindows) -> None:
     """Mean and spread of rotations and places of the data and its mirror image."""
-    batch = windows.draw(4000, 4, torch.Generator().manual_seed(0))
+    batch = windows.draw(4000, 4, make_generator(0))
     both = [batch, batch.mirrored()]
     quats = torch.cat([each.quats for each in both]).flatten(0, 1)
     six = rotations.to_six(rotations.to_matrix(quats))

@@ -17,6 +17,7 @@ from priors.stitching.network import StitcherConfig, StitcherNetwork
 from priors.stitching.posterior import PosteriorNetwork
 from priors.training.augmentation.transition_windows import Known, Transition, TransitionWindows
 from priors.training.corpus import Corpus, Split
+from priors.training.devices import make_generator
 from priors.training.quality.stitcher import calibrate_temperature, measure_transitions
 from priors.training.recipe import Export, Gathered, NetworkRecipe, Row, average_logarithms
 from priors.training.recipes.stitcher_critics import CriticSettings, StitcherCritics
@@ -79,8 +80,12 @@ class StitcherTrainer(GradientTrainer[StitcherNetwork]):
         self.longest = min(config.longest, settings.window, max(corpus.lengths) - 2 * _CONTEXT - 1)
         if self.longest < _SHORTEST:
             raise RequestError(f"a stitcher needs clips of {_SHORTEST + 2 * _CONTEXT + 1} frames and more")
+        device = torch.get_default_device()
         super().__init__(
-            lambda: self._make(config), steps=settings.steps, learning_rate=settings.learning_rate, seed=settings.seed
+            lambda: self._make(config, device),
+            steps=settings.steps,
+            learning_rate=settings.learning_rate,
+            seed=settings.seed,
         )
         _set_moments(self.network, corpus)
         self.untrained = self._measure_untrained() if settings.weights.relative else {}
@@ -92,9 +97,9 @@ class StitcherTrainer(GradientTrainer[StitcherNetwork]):
         self.average = copy.deepcopy(self.network).requires_grad_(False)
         """Moving average of the weights: what is measured and exported."""
 
-    def _make(self, config: StitcherConfig) -> StitcherNetwork:
+    def _make(self, config: StitcherConfig, device: torch.device) -> StitcherNetwork:
         network = StitcherNetwork(config)
-        self.posterior = None if config.printed else PosteriorNetwork(config)
+        self.posterior = None if config.printed else PosteriorNetwork(config).to(device)
         """Sees the truth; the paper prints none."""
         return network
 
@@ -167,7 +172,7 @@ class StitcherTrainer(GradientTrainer[StitcherNetwork]):
     @torch.no_grad()
     def _measure_untrained(self) -> dict[str, float]:
         """Measure the losses that are weighed by what they are before training (the rule of Harvey et al. 2020)."""
-        generator, found = torch.Generator().manual_seed(self.settings.seed), []
+        generator, found = make_generator(self.settings.seed), []
         for _ in range(_UNTRAINED_BATCHES):
             truth = self._draw_transitions(self.longest, generator, generator)
             settings = self.settings

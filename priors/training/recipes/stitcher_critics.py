@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mapctl.kinematics.fast import compute_joints_world
+from mapctl.kinematics.placement import place_joints
 from mapctl.skeleton import CANONICAL
 from priors.stitching.sides import Ends, Sides
 from priors.training.adversaries.sliding_windows import (
@@ -53,7 +53,7 @@ class StitcherCritics:
 
     def __init__(self, settings: CriticSettings, seed: int, generator: torch.Generator):
         self.settings, self.generator = settings, generator
-        self.network = draw_weights(SlidingCritics, seed)
+        self.network = draw_weights(SlidingCritics, seed).to(torch.get_default_device())
         self.optimiser = torch.optim.Adam(self.network.parameters(), lr=settings.rate, betas=(0.5, 0.9))
         self.made: Tensor | None = None
 
@@ -103,7 +103,7 @@ def show_sides(sides: Sides, ends: Ends) -> Float[Tensor, "sides batch made rows
     at = torch.stack([zero, ends.place])[:count, :, None]
     facing = torch.stack([zero[:, 0], ends.turn])[:count, :, None]
     end = [each.flatten(0, 1).contiguous() for each in (ends.features[:count, :, -1:], at, facing)]
-    first = compute_joints_world(end[0], end[1], end[2], CANONICAL).unflatten(0, at.shape[:2])
+    first = place_joints(end[0], end[1], end[2], CANONICAL).unflatten(0, at.shape[:2])
     walked = (
         torch.cat([first, sides.place_joints()], dim=2),
         torch.cat([at, sides.place], dim=2),
@@ -122,6 +122,6 @@ def show_truth(truth: Transition, made: int) -> Float[Tensor, "sides_times_batch
     ground, heading = truth.integrate()
     hips = torch.cat([torch.zeros_like(ground[:, :1]), ground], dim=1)
     facing = torch.cat([torch.zeros_like(heading[:, :1]), heading], dim=1)
-    places = compute_joints_world(features.contiguous(), hips, facing, CANONICAL)
+    places = place_joints(features, hips, facing, CANONICAL)
     rows = show(places, hips, facing)
     return torch.cat([rows[:, :made], rows[:, -made:]])

@@ -8,9 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits as cross_entropy
 
-from mapctl.features import LAYOUT
 from mapctl.pose import BodyPose
-from mapctl.rotations import lift_ground
 from mapctl.skeleton import TOE_JOINTS
 from priors.stitching.latents import DrawnLatents
 from priors.stitching.network import PACE, POSE, StitcherNetwork
@@ -182,13 +180,7 @@ def interpolate(truth: Transition) -> tuple[BodyPose, BodyPose]:
     share = (torch.arange(1, truth.frames + 1) / truth.frames)[None, :, None]
     even = torch.lerp(first[:, None], features[:, -1:], share)
     there = ground[:, -1:] * share, heading[:, -1:] * share[..., 0]
-    return tuple(_make_body(*each) for each in ((features, ground, heading), (even, *there)))  # type: ignore[return-value]
-
-
-def _make_body(features: Tensor, ground: Tensor, heading: Tensor) -> BodyPose:
-    root = lift_ground(ground) + torch.nn.functional.pad(LAYOUT.pick(features, "root_height"), (1, 1))
-    joints = LAYOUT.pick(features, "joint_rotations").unflatten(-1, (-1, 3))
-    return BodyPose(root, heading, LAYOUT.pick(features, "root_tilt"), joints)
+    return tuple(BodyPose.of_features_at(*each) for each in ((features, ground, heading), (even, *there)))  # type: ignore[return-value]
 
 
 def _forget_backward(sides: Sides) -> Sides:

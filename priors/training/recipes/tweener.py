@@ -23,6 +23,7 @@ from priors.training.augmentation.key_parts import WHOLE
 from priors.training.augmentation.pose_windows import PoseWindows
 from priors.training.augmentation.style_poses import draw_style_poses
 from priors.training.corpus import Corpus, Split
+from priors.training.devices import make_generator
 from priors.training.quality.gap import measure_kinds
 from priors.training.recipe import Export, Gathered, NetworkRecipe, Row, average_logarithms
 from priors.training.recipes.tweener_losses import Judge, LossWeights, compute_tweener_losses
@@ -120,7 +121,7 @@ class TweenerTrainer(GradientTrainer[GeneratorNetwork]):
     """Draws sequences, hides all but their keys, and brings the generator nearer to what was between."""
 
     def __init__(self, config: GeneratorConfig, settings: TweenerSettings, corpus: Corpus, path: PathNetwork):
-        self.settings, self.path = settings, path
+        self.settings, self.path = settings, path.to(torch.get_default_device())
         self.grown = False
         """Whether gaps are as long as they get from the first step on."""
         self.shortest = _SHORTEST_WINDOW
@@ -259,7 +260,7 @@ class TweenerRecipe(NetworkRecipe[GeneratorConfig, TweenerSettings, TweenerTrain
 
 def _set_moments(network: GeneratorNetwork, windows: PoseWindows) -> None:
     """Tell the network means and spreads of the places that it sees along their heading, mirrored ones too."""
-    batch = windows.draw(4000, 4, torch.Generator().manual_seed(0))
+    batch = windows.draw(4000, 4, make_generator(0))
     local = batch.local_matrices()
     seen = see_from_hips(kinematics.positions_from_matrices(CANONICAL, local), local[..., 0, :, :])
     seen = seen + batch.root_position[..., None, :] * torch.tensor([0.0, 1.0, 0.0])

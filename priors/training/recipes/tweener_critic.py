@@ -276,6 +276,7 @@ class CriticisedTweenerRecipe(TweenerRecipe):
     """What to train the generator on with a critic, and how; the best weights of all are what is exported."""
 
     guards = ("generator", "critic", "told")
+    uses_gpu = False
     critic: CriticSettings = field(default_factory=CriticSettings)
     """When the critic joins, and how."""
 

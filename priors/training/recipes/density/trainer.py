@@ -34,16 +34,15 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
         config: LstmGmmConfig,
         settings: TrainingSettings,
         corpus: Corpus,
-        device: str = "cpu",
         *,
         labels: Labels | None = None,
         init: Mapping[str, Tensor] | None = None,
     ):
         """`labels` of the corpus' clips, the network's own; `init` holds weights and statistics to begin with."""
-        self.settings, self.device = settings, device
+        self.settings = settings
         mean, std = compute_feature_statistics(corpus.features)
         super().__init__(
-            lambda: LstmGmm(config, mean=mean, std=std).to(device),
+            lambda: LstmGmm(config, mean=mean, std=std),
             steps=settings.steps,
             learning_rate=settings.learning_rate,
             seed=settings.seed,
@@ -128,7 +127,7 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
         drawn = self.windows.draw(self.group.share(self.settings.batch), self.generator, mirror=self.settings.mirror)
         labels = self.labels.held[torch.searchsorted(self.clip_ends, drawn.first, right=True)]
         labels = torch.where(drawn.mirrored[:, None], labels[:, self.labels.mirrored], labels)
-        return drawn.features.to(self.device), self._tell_some(labels).to(self.device)
+        return drawn.features, self._tell_some(labels)
 
     def _tell_some(self, labels: Float[Tensor, "batch labels"]) -> Float[Tensor, "batch labels"]:
         """Mostly show no label or one group only, so that the network works with any subset of labels."""
@@ -145,7 +144,7 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
         inputs, level = self._add_noise(model.normalise(windows[:, :-1]), size)
         memory = model.start_after(windows[:, 0])
         condition = torch.cat([level / NOISE_UNIT, told], -1) if model.config.knows_noise else told
-        with torch.autocast(self.device, torch.bfloat16, enabled=self.settings.bfloat16):
+        with torch.autocast(windows.device.type, torch.bfloat16, enabled=self.settings.bfloat16):
             mixture, _ = model(inputs, (memory.hidden, memory.cell), condition=condition)
         target = torch.cat([model.normalise(windows[:, 1:])[..., :size], windows[:, 1:, size:]], dim=-1)
         return mixture.log_prob(target, model.whitening)
@@ -160,6 +159,6 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
             level = settings.input_noise * torch.exp(share * math.log(settings.noise_range))
         noise = torch.randn(shape[0], shape[1], size, generator=self.generator) * level
         flips = torch.rand(shape[0], shape[1], 2, generator=self.generator) < settings.bit_flips
-        bits = torch.where(flips.to(inputs.device), -inputs[..., size:], inputs[..., size:])
-        noisy = torch.cat([inputs[..., :size] + noise.to(inputs.device), bits], dim=-1)
-        return noisy, level[:, 0].to(inputs.device)
+        bits = torch.where(flips, -inputs[..., size:], inputs[..., size:])
+        noisy = torch.cat([inputs[..., :size] + noise, bits], dim=-1)
+        return noisy, level[:, 0]

@@ -33,6 +33,7 @@ class SampleRecipe(Recipe[RefinerConfig, S, T]):
 
     kind = "refiner"
     falls = False
+    uses_gpu = False
     headline = "distance from mocap"
     counter = "round"
     steps_name = "rounds"
