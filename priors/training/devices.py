@@ -26,6 +26,21 @@ def select_device(wanted: str) -> str:
     return ("cuda" if torch.cuda.is_available() else "cpu") if wanted == "auto" else wanted
 
 
+def refuse_gpu(wanted: str, kind: str) -> None:
+    """RequestError where a GPU is asked for a model that none makes faster."""
+    if wanted == "cuda":
+        raise RequestError(f"a {kind} is not trained on GPUs; use --device cpu")
+
+
+def check_processes(device: str, processes: int, kind: str) -> None:
+    """RequestError for several processes on a GPU that torchrun has not started: what CUDA runs in cannot be forked."""
+    if device == "cuda" and processes > 1 and count_launched() is None:
+        raise RequestError(
+            "several processes on GPUs are started by torchrun, one a GPU: python -m torch.distributed.run"
+            f" --nproc-per-node {processes} -m mapctl train {kind} ...; or use --device cpu"
+        )
+
+
 @contextmanager
 def use_device(name: str) -> Iterator[None]:
     """Make tensors there that are not told where."""

@@ -8,7 +8,6 @@ from dataclasses import Field, asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Generic, Protocol, TypeVar, runtime_checkable
 
-import torch
 from torch import Tensor
 
 from mapctl.errors import CheckpointError, RequestError
@@ -16,11 +15,10 @@ from mapctl.features import PRIOR_FPS
 from priors import checkpoints
 from priors.config import NetworkConfig, require_at_least
 from priors.training.corpus import Corpus, Split
-from priors.training.devices import select_device
+from priors.training.devices import check_processes, refuse_gpu, select_device
 from priors.training.ending.course import VALIDATIONS, End, UntilFlat
 from priors.training.ending.flatness import Point
 from priors.training.gathering import DataSource, describe_selection
-from priors.training.parallel import count_launched
 from priors.training.trainer import GradientTrainer, Trainer
 
 Row = dict[str, Any]
@@ -158,11 +156,7 @@ class Recipe(ABC, Generic[C, S, T]):
             raise RequestError(f"{self.data} is not a folder of BVH files")
         if not os.access(self.data, os.R_OK | os.X_OK):
             raise RequestError(f"{self.data} cannot be read: permission denied")
-        if self.find_device() == "cuda" and self.processes > 1 and count_launched() is None:
-            raise RequestError(
-                "several processes on GPUs are started by torchrun, one a GPU: python -m torch.distributed.run"
-                f" --nproc-per-node {self.processes} -m mapctl train {self.kind} ...; or use --device cpu"
-            )
+        check_processes(self.find_device(), self.processes, self.kind)
         if self.processes > self.most_processes:
             raise RequestError(
                 f"{self.processes} processes cannot share what a {self.counter} of {self.kind} takes:"
@@ -176,11 +170,9 @@ class Recipe(ABC, Generic[C, S, T]):
 
     def find_device(self) -> str:
         """`cpu` or `cuda`; RequestError for one that this process cannot have, or on which nothing would be faster."""
-        if self.uses_gpu:
-            return select_device(self.device)
-        if self.device == "cuda":
-            raise RequestError(f"a {self.kind} is not trained on GPUs; use --device cpu")
-        return "cpu"
+        if not self.uses_gpu:
+            refuse_gpu(self.device, self.kind)
+        return select_device(self.device) if self.uses_gpu else "cpu"
 
     @property
     def most_processes(self) -> int:
@@ -404,8 +396,3 @@ def average_logarithms(values: Iterable[float | None]) -> float:
 def average(rows: Sequence[Row], name: str) -> float:
     """Mean of a part of the loss."""
     return sum(row[name] for row in rows) / len(rows)
-
-
-def copy_weights(network: torch.nn.Module) -> dict[str, Tensor]:
-    """As they are now."""
-    return {name: value.clone() for name, value in network.state_dict().items()}

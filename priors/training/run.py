@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Generic
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from mapctl.errors import RequestError
 from mapctl.runtime.interruption import DeferredSignals, defer_signals
@@ -24,7 +24,7 @@ from priors.training.devices import use_device
 from priors.training.ending.course import Course
 from priors.training.gathering import Progress, gather
 from priors.training.parallel import ALONE, TrainingGroup
-from priors.training.recipe import C, Gathered, Recipe, Row, S, T, average, copy_weights
+from priors.training.recipe import C, Gathered, Recipe, Row, S, T, average
 from priors.training.record.event_files import EventFiles
 from priors.training.record.losses_file import LossesFile
 from priors.training.record.watching import LineWatcher, RunStart, Watcher
@@ -110,7 +110,7 @@ class TrainingRun(Generic[C, S, T]):
         self.extended: list[dict[str, int]] = []
         """Where the number of steps was changed: at which step, from what, to what."""
         self.stop_reason: str | None = None
-        self.best: dict[str, Tensor] = copy_weights(self.trainer.network) if recipe.guards else {}
+        self.best: dict[str, Tensor] = _copy_weights(self.trainer.network) if recipe.guards else {}
         self.course = Course(
             recipe.until_flat, recipe.minutes, self.trainer, least=recipe.least_steps(), cost=recipe.decay_cost
         )
@@ -239,7 +239,7 @@ class TrainingRun(Generic[C, S, T]):
         if recipe.guards:
             score = recipe.score(row)
             if score < min((recipe.score(before) for before in self.curve), default=math.inf) or not self.curve:
-                self.best = copy_weights(trainer.network)
+                self.best = _copy_weights(trainer.network)
             row = {**row, "score": score, **{f"training_{name}": average(self.losses, name) for name in self._watched}}
         return _none_where_not_finite(row)
 
@@ -372,6 +372,10 @@ class TrainingRun(Generic[C, S, T]):
         if recipe.steps != before:
             self.extended.append({"at": done, "from": before, "to": recipe.steps})
             self.progress(f"{recipe.steps} {recipe.counter}s in all instead of {before}")
+
+
+def _copy_weights(network: nn.Module) -> dict[str, Tensor]:
+    return {name: value.clone() for name, value in network.state_dict().items()}
 
 
 def _none_where_not_finite(row: Row) -> Row:

@@ -1,5 +1,7 @@
 """Corners and reversals of a shot by the bundled models: how far they are left, and how hard a toe is accelerated."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -7,24 +9,26 @@ import torch
 import priors
 from controllers.shots.request import ShotRequest
 from controllers.shots.shot import solve_shot
-from mapctl import curves, kinematics
+from mapctl import curves, kinematics, rotations
 from mapctl.skeleton import CANONICAL, TOES
 
 
+@pytest.mark.parametrize("seed", [1, 2])
 @pytest.mark.parametrize("last", [(2.2, 2.2), (0.0, 0.6)], ids=["right angle", "reversal"])
-def test_a_corner_is_kept_to_without_a_lunge(last):
+def test_a_corner_is_kept_to_without_a_lunge(last, seed):
     prior = priors.load("locomotion")
     curve = curves.from_points(np.array([(0.0, 0.0), (0.0, 2.2), last]), closed=False)
-    done = solve_shot(prior, priors.load_inbetweener(), ShotRequest(curve), generator=torch.Generator().manual_seed(1))
+    drawn = torch.Generator().manual_seed(seed)
+    done = solve_shot(prior, priors.load_inbetweener(), ShotRequest(curve), generator=drawn)
     assert done.status.ok, done.status.text
     hips = done.motion.root_position[:, ::2]
     off = (hips - done.way.curve.point(done.way.curve.nearest(hips, done.way.arcs))).norm(dim=-1)
-    assert float(off.max()) < (0.06 if last[0] else 0.08)
+    assert float(off.max()) < 0.075
     toes = done.motion.joint_positions()[:, list(CANONICAL.indices(TOES))]
     assert float(torch.diff(toes, n=2, dim=0).norm(dim=-1).max()) * 900 < 88, "twice that of a circle of 2 m"
-    facing = torch.rad2deg(kinematics.heading(done.motion.local_quat_xyzw[:, 0]))
-    wanted = 90.0 if last[0] else 180.0
-    assert abs(float(facing[-10:].mean().abs()) - wanted) < 30
+    facing = kinematics.heading(done.motion.local_quat_xyzw[-10:, 0])
+    wanted = math.pi / 2 if last[0] else math.pi
+    assert float(rotations.wrap_angle(facing - wanted).abs().max()) < math.radians(15)
     if not last[0]:
         assert float((done.way.speeds == 0).sum()) > 10, "it turns on the spot"
 

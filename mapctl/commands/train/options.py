@@ -251,8 +251,9 @@ class TunableOptions(NetworkOptions):
 
     def common(self) -> dict[str, Any]:
         """What every recipe takes, checked."""
+        common = super().common()
         rule = self._make_rule() if self.until_flat else None
-        return {**super().common(), "device": self.device, "until_flat": rule}
+        return {**common, "device": self.device, "until_flat": rule}
 
     def _make_rule(self) -> "UntilFlat":
         from priors.training.ending.course import UntilFlat
