@@ -76,16 +76,6 @@ def integrate_root_fast(
     )
 
 
-def compute_joints_world(
-    features: Float[Tensor, "batch frames size"],
-    root_xz_world: Float[Tensor, "batch frames 2"],
-    heading: Float[Tensor, "batch frames"],
-    skeleton: Skeleton,
-) -> Float[Tensor, "batch frames joints 3"]:
-    """Compute the world joint positions, metres, of the root where `integrate_root_fast` puts it."""
-    return compute_joints_and_heels(features, root_xz_world, heading, skeleton)[0]
-
-
 def compute_joints_and_heels(
     features: Float[Tensor, "batch frames size"],
     root_xz_world: Float[Tensor, "batch frames 2"],

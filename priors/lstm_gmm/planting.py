@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl.features import LAYOUT, PRIOR_FPS
-from mapctl.kinematics.placement import place_joints
+from mapctl.kinematics.joint_places import place_joints
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 
 _CHANGE = 2e-3  # of a feature, by which steps are differentiated

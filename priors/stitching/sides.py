@@ -15,7 +15,7 @@ from torch import Tensor
 
 from mapctl import rotations
 from mapctl.features import LAYOUT, GroundPose
-from mapctl.kinematics.placement import place_joints
+from mapctl.kinematics.joint_places import place_joints
 from mapctl.runtime.stepwise import StepwiseWork
 from mapctl.skeleton import CANONICAL
 from priors.stitching.network import POSE, Gaussian, Memory, Situation, StitcherNetwork

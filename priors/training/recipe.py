@@ -170,9 +170,10 @@ class Recipe(ABC, Generic[C, S, T]):
 
     def find_device(self) -> str:
         """`cpu` or `cuda`; RequestError for one that this process cannot have, or on which nothing would be faster."""
-        if not self.uses_gpu:
-            refuse_gpu(self.device, self.kind)
-        return select_device(self.device) if self.uses_gpu else "cpu"
+        if self.uses_gpu:
+            return select_device(self.device)
+        refuse_gpu(self.device, self.kind)
+        return "cpu"
 
     @property
     def most_processes(self) -> int:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mapctl.contacts.phases import compute_phases, mirror_phases, reversed_phases
 from mapctl.features import LAYOUT, GroundPose, integrate_root, mirror_features, reversed_features
-from mapctl.kinematics.placement import place_joints
+from mapctl.kinematics.joint_places import place_joints
 from mapctl.skeleton import CANONICAL
 from priors.stitching.sides import Ends
 from priors.training.augmentation.pose_windows import WindowPicker

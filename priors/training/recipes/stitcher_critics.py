@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mapctl.kinematics.placement import place_joints
+from mapctl.kinematics.joint_places import place_joints
 from mapctl.skeleton import CANONICAL
 from priors.stitching.sides import Ends, Sides
 from priors.training.adversaries.sliding_windows import (

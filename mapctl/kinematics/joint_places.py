@@ -19,5 +19,5 @@ def place_joints(
     Features are of single precision; all tensors lie on one device.
     """
     if features.device.type == "cpu":
-        return fast.compute_joints_world(features.contiguous(), root_xz_world, heading, skeleton)
+        return fast.compute_joints_and_heels(features, root_xz_world, heading, skeleton)[0]
     return BodyPose.of_features_at(features, root_xz_world, heading).joints_world(skeleton)
