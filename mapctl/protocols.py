@@ -272,8 +272,7 @@ class Density(Protocol[State]):
     @property
     def reference_log_density(self) -> float:
         """Log density a frame (nats, physical units, with a proposal's observation noise) below which motion is not
-        like the training data, so that the density counts less. Default: minus infinity, it always counts in full.
-        """
+        like the training data, so that the density counts less. Default: minus infinity, it always counts in full."""
         return -math.inf
 
     def with_observation_noise(self, sigma: Float[Tensor, " continuous"]) -> "Density[State]":
@@ -284,14 +283,12 @@ class Density(Protocol[State]):
 
     @property
     def labels(self) -> Mapping[str, Sequence[str]]:
-        """Values by group (gait, style) that it can be conditioned on. Default: none."""
+        """Values by group (gait, style, pace) that it can be conditioned on. Default: none."""
         return {}
 
     def conditioned_on(self, labels: Sequence[str]) -> "Density[State]":
-        """Return the density given labels of its data (`run`, `style=active`), with initial states to match.
-
-        RequestError for a label that it does not know. Default: refuse all.
-        """
+        """Return the density given labels of its data (`run`, `style=active`) beside those it is given already, with
+        initial states to match; RequestError for a label that it does not know. Default: refuse all."""
         if labels:
             raise RequestError(f"the prior {self.name!r} knows no label {labels[0]!r}, it has none")
         return self
@@ -304,6 +301,12 @@ class Density(Protocol[State]):
     def conditioned_like_clip(self, name: str) -> "Density[State]":
         """Return the density given the labels that a clip's path tells. Default: itself."""
         return self
+
+    @property
+    def pace_rates(self) -> Mapping[tuple[str, str], float]:
+        """Changes of pace a second in its data, by the pace before and after, where paces (stand, walk, run) are labels
+        `pace=...` of it. Default: none."""
+        return {}
 
     def warm_up(self) -> None:
         """Load or compile what the first use would, so that no clock counts it. Default: nothing."""
@@ -325,22 +328,19 @@ class Inbetweener(Protocol):
     @property
     def takes_partial_keys(self) -> bool:
         """Whether it makes a motion through effector targets, and through hips that are known alone in single frames.
-        Default: no; such keys are then hidden from it, and reached by the motion that it proposes without them.
-        """
+        Default: no; such keys are then hidden from it, and reached by the motion that it proposes without them."""
         return False
 
     @property
     def has_style(self) -> bool:
         """Whether it was told how to move, by motion DNA; gaps then go to it in which another would do as well.
-        Default: no.
-        """
+        Default: no."""
         return False
 
     @abstractmethod
     def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
         """Propose a motion of the query's frames without gaps; what is drawn is drawn from the generator, or from a
-        new one with seed 0. The proposal names who made it, and for each gap that this one cannot fill who did and why.
-        """
+        new one with seed 0. The proposal names who made it, and for each gap that this one leaves who did, and why."""
         ...
 
 

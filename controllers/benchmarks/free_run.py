@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from controllers.benchmarks.shared.tables import Row
-from controllers.generation.generate import GenerateSettings, initialise_generation
+from controllers.generation.generate import GenerateSettings, initialise_generation, sample_pieces
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, ground_speed, integrate_root
 from mapctl.metrics.pace_changes import PaceChanges, compute_ground_velocity, count_pace_changes
 from mapctl.metrics.states import summarise_states
@@ -69,7 +69,10 @@ def _count_in_ten_minutes(counts: Mapping[str, float], minutes: float) -> dict[s
 def _sample_free_run(prior: Density, frames: int, seed: int) -> Tensor:
     generator = torch.Generator().manual_seed(seed)
     conditioned, state, _ = initialise_generation(prior, GenerateSettings(), None, generator)
-    return conditioned.sample(state, frames, generator)[0][0]
+    pieces, sampled = sample_pieces(conditioned, state, generator, longest=frames), torch.zeros(0, LAYOUT.size)
+    while len(sampled) < frames:
+        sampled = torch.cat([sampled, next(pieces)])
+    return sampled[:frames]
 
 
 def _standardise_features(prior: Density, features: Tensor) -> Tensor:

@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial, reduce
+from itertools import repeat
 
 import torch
 from jaxtyping import Float
@@ -15,6 +16,7 @@ from torch import Tensor
 
 from controllers.common.character import Character
 from controllers.generation.foot_cleanup import FootCleanupSettings, clean_up_feet
+from controllers.generation.pace_changes import plan_paces
 from mapctl import retarget
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS, GroundPose, encode, integrate_root
@@ -43,7 +45,8 @@ class GenerateSettings:
     """Index of one of the prior's initial states; sampled by their weights if None."""
     condition_on_start: bool = True
     """Whether a prior with labels is conditioned on those of the initial state's clip (gait, style): unconditioned it
-    lets most runs fall into a walk within ten seconds, which no clip of the data does."""
+    lets most runs fall into a walk within ten seconds, which no clip of the data does. One that knows paces is told
+    them in turn, so that it sets off, stops and runs as often as its data."""
     foot_cleanup: FootCleanupSettings | None = field(default_factory=FootCleanupSettings)
     """Settings of the foot clean-up; None leaves it out."""
     sigma_planted: float | None = None
@@ -156,6 +159,34 @@ def initialise_generation(
     return prior, state, GroundPose.origin(torch.float64)
 
 
+def sample_pieces(
+    prior: Density,
+    state: DensityState,
+    generator: torch.Generator,
+    settings: GenerateSettings | None = None,
+    *,
+    longest: int = _CHUNK,
+) -> Iterator[Float[Tensor, "_ size"]]:
+    """Sample consecutive pieces of one motion, of at most `longest` frames, without end; `state` is a batch of one.
+
+    `prior` is given what `initialise_generation` gives it. If it knows paces, it is told them one after the other
+    beside that, unless `settings` leave it unconditioned.
+    """
+    settings = settings or GenerateSettings()
+    paces = plan_paces(prior, state, generator) if settings.condition_on_start else repeat((None, longest))
+    told: dict[str | None, Density] = {None: prior}
+    for pace, frames in paces:
+        if pace not in told:
+            told[pace] = prior.conditioned_on([f"pace={pace}"])
+        draw, left = told[pace].sample, frames
+        if settings.sigma_planted is not None:
+            draw = partial(told[pace].sample_planted, sigma_speed=settings.sigma_planted)
+        while left > 0:
+            features, state = draw(state, min(left, longest), generator, temperature=settings.temperature)
+            yield features[0]
+            left -= len(features[0])
+
+
 def sample_stratified_starts(prior: Density, count: int, generator: torch.Generator) -> list[int]:
     """Sample an initial state for each of several motions, stratified over the data's speeds by weight.
 
@@ -187,7 +218,7 @@ def _start_stream(
         raise RequestError(f"seconds must be positive, got {seconds:g}")
     frames = max(2, round(seconds * PRIOR_FPS))
     prior, state, ground_pose = initialise_generation(prior, settings, clip, generator, scale=character.scale)
-    pieces = _sample_chunks(prior, state, generator, settings)
+    pieces = sample_pieces(prior, state, generator, settings)
     if refiner is not None:
         pieces = (piece[0] for piece in refiner.stream(piece.unsqueeze(0) for piece in pieces))
     if settings.foot_cleanup is not None:
@@ -204,18 +235,6 @@ def _start_stream(
             record=solved.append,
         )
     return _rechunk(pieces, frames), ground_pose
-
-
-def _sample_chunks(
-    prior: Density, state: DensityState, generator: torch.Generator, settings: GenerateSettings
-) -> Iterator[Float[Tensor, "_ size"]]:
-    """Sample chunks without end."""
-    draw = prior.sample
-    if settings.sigma_planted is not None:
-        draw = partial(prior.sample_planted, sigma_speed=settings.sigma_planted)
-    while True:
-        features, state = draw(state, _CHUNK, generator, temperature=settings.temperature)
-        yield features[0]
 
 
 def _rechunk(pieces: Iterable[Float[Tensor, "_ size"]], frames: int) -> Iterator[Float[Tensor, "_ size"]]:

@@ -1,16 +1,18 @@
-"""Changes of pace: starts, stops, and changes between a walk and a run, by the hips' smoothed speed."""
+"""Paces, and changes of pace: starts, stops, and changes between a walk and a run, by the hips' smoothed speed."""
 
 from dataclasses import astuple, dataclass
-from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 from scipy.ndimage import gaussian_filter1d
 
 _SMOOTH_SECONDS = 0.2  # standard deviation of a Gaussian over which sway within a stride is averaged out
 _STANDS, _GOES = 0.2, 0.6  # m/s between which a start or a stop leads
 _WALKS, _RUNS = 1.7, 2.1  # m/s between which a change of gait leads
+
+PACES = "stand", "walk", "run"
+"""Paces from slow to fast; who goes and does not run walks."""
 
 
 @dataclass(frozen=True)
@@ -33,20 +35,42 @@ class PaceChanges:
 def compute_ground_velocity(ground: Float[ndarray, "frames 2"], fps: float) -> Float[ndarray, "frames 2"]:
     """Compute the velocity of the hips over the ground, m/s, from their x and z in metres, without the sway within a
     stride; of at least two frames."""
-    smooth = gaussian_filter1d(ground, _SMOOTH_SECONDS * fps, axis=0, mode="nearest")
-    return np.gradient(smooth, 1 / fps, axis=0)
+    # Velocities are smoothed rather than places: who runs at a clip's end does not stay there.
+    velocity = np.gradient(ground, 1 / fps, axis=0)
+    return gaussian_filter1d(velocity, _SMOOTH_SECONDS * fps, axis=0, mode="nearest")
 
 
 def count_pace_changes(speed: Float[ndarray, " frames"]) -> PaceChanges:
     """Count the changes along a motion's smoothed speed, m/s. Who hesitates without passing both bounds changes
     nothing."""
-    stops, starts = _count_crossings(speed, _STANDS, _GOES)
-    to_walk, to_run = _count_crossings(speed, _WALKS, _RUNS)
-    return PaceChanges(starts, stops, to_run, to_walk)
+    goes, runs = (_follow(speed, *bounds) for bounds in ((_STANDS, _GOES), (_WALKS, _RUNS)))
+    return PaceChanges(_count_rises(goes), _count_rises(~goes), _count_rises(runs), _count_rises(~runs))
 
 
-def _count_crossings(speed: Float[ndarray, " frames"], low: float, high: float) -> tuple[int, int]:
-    """How often it falls from over `high` to under `low`, and how often it rises the other way."""
-    fast = [bool(value > high) for value in speed if value < low or value > high]
-    pairs = list(pairwise(fast))
-    return pairs.count((True, False)), pairs.count((False, True))
+def follow_pace(speed: Float[ndarray, " frames"]) -> Int[ndarray, " frames"]:
+    """Follow the pace along a motion's smoothed speed, m/s: the index in PACES of each frame.
+
+    A pace lasts until the other bound of a change is passed, so that `count_pace_changes` counts the changes of it;
+    before the first bound that is passed, it is the one that this bound tells.
+    """
+    goes, runs = (_follow(speed, *bounds) for bounds in ((_STANDS, _GOES), (_WALKS, _RUNS)))
+    return np.where(runs, 2, goes.astype(int))
+
+
+def find_pace(speed: float) -> str:
+    """Find the pace of a mean speed, m/s, halfway between the bounds of changes."""
+    return PACES[(speed > (_STANDS + _GOES) / 2) + (speed > (_WALKS + _RUNS) / 2)]
+
+
+def _follow(speed: Float[ndarray, " frames"], low: float, high: float) -> Bool[ndarray, " frames"]:
+    """Whether it was over `high` since it was last under `low`. Before either, the first of them tells; between both
+    all along, the mean."""
+    passed = np.flatnonzero((speed < low) | (speed > high))
+    if len(passed) == 0:
+        return np.full(len(speed), len(speed) > 0 and float(np.mean(speed)) > (low + high) / 2)
+    last = np.searchsorted(passed, np.arange(len(speed)), side="right") - 1
+    return (speed > high)[passed[np.maximum(last, 0)]]
+
+
+def _count_rises(fast: Bool[ndarray, " frames"]) -> int:
+    return int(np.count_nonzero(~fast[:-1] & fast[1:]))

@@ -10,11 +10,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl.errors import RequestError
+from mapctl.metrics.pace_changes import find_pace
 from mapctl.protocols import DataLimits, Density, DiscreteChoices, InitialStates, PreparedRollout
 from priors import checkpoints
 from priors.lstm_gmm import labels as clip_labels
 from priors.lstm_gmm.fast.rollout import FastRollout
 from priors.lstm_gmm.network import LstmGmm, LstmGmmConfig, LstmState
+from priors.lstm_gmm.paces import PACE_LABELS, read_pace_rates
 from priors.lstm_gmm.planting import Planting
 from priors.lstm_gmm.state_inference import infer_lstm_state
 
@@ -80,7 +82,8 @@ class LstmGmmDensity(checkpoints.LoadedModel, Density[LstmState]):
         """
         full, starts = [self._label(name) for name in labels], self.initial_states
         known = clip_labels.read(starts.names, self.card.data.get("labels", "")).renamed(tuple(full))
-        fitting = known.held.sum(-1)
+        paces = [[f"pace={find_pace(speed)}" == label for label in full] for speed in starts.speed.tolist()]
+        fitting = (known.held + torch.tensor(paces).reshape(known.held.shape)).sum(-1)
         rows = (fitting == fitting.max()).nonzero()[:, 0]
         weight = starts.weight[rows]
         picked = InitialStates(
@@ -101,6 +104,12 @@ class LstmGmmDensity(checkpoints.LoadedModel, Density[LstmState]):
         told = clip_labels.read_name(name, self.card.data.get("labels", ""))
         known = sorted(told & {*self.reference.config.labels})
         return self._with_network(self.reference.conditioned_on(known))
+
+    @property
+    def pace_rates(self) -> dict[tuple[str, str], float]:
+        """Changes of pace a second in its data, by the pace before and after, if paces are labels of it."""
+        told = {*PACE_LABELS} <= {*self.reference.config.labels}
+        return read_pace_rates(self.card.data["holds"]) if told else {}
 
     def with_observation_noise(self, sigma: Float[Tensor, " continuous"]) -> "LstmGmmDensity":
         """Return the density of motion observed with errors of this sigma (physical units); see `LstmGmm`."""

@@ -20,7 +20,7 @@ from mapctl.errors import RequestError
 from mapctl.runtime.interruption import DeferredSignals, defer_signals
 from priors import checkpoints
 from priors.training import parallel, run_files
-from priors.training.devices import use_device
+from priors.training.devices import has_bfloat16, use_device
 from priors.training.ending.course import Course
 from priors.training.gathering import Progress, gather
 from priors.training.parallel import ALONE, TrainingGroup
@@ -59,12 +59,21 @@ def train(
     with parallel.join_launched() as group:
         if not group.leads:
             progress, warn, watchers = _say_nothing, _say_nothing, ()
+        recipe = _fit_precision(recipe, warn)
         gathered = _gather_together(recipe, group, progress, warn)
         watchers = [LineWatcher(progress)] if watchers is None else watchers
         with use_device(recipe.find_device()):
             run = TrainingRun(recipe, gathered, progress, warn=warn, watchers=watchers, group=group)
             run.go()
         return run.export()
+
+
+def _fit_precision(recipe: Recipe[Any, Any, Any], warn: Progress) -> Recipe[Any, Any, Any]:
+    """The same in float32 where bfloat16 is asked for, and the processor has none; its card then tells float32."""
+    if not getattr(recipe.settings, "bfloat16", False) or recipe.find_device() != "cpu" or has_bfloat16():
+        return recipe
+    warn("this processor does not compute in bfloat16; training computes in float32")
+    return replace(recipe, settings=replace(recipe.settings, bfloat16=False))
 
 
 def _gather_together(

@@ -5,7 +5,14 @@ import pytest
 from helpers import go_at, tiny_density
 
 from controllers.benchmarks import free_run
-from mapctl.metrics.pace_changes import PaceChanges, compute_ground_velocity, count_pace_changes
+from mapctl.metrics.pace_changes import (
+    PACES,
+    PaceChanges,
+    compute_ground_velocity,
+    count_pace_changes,
+    find_pace,
+    follow_pace,
+)
 
 
 @pytest.mark.parametrize(
@@ -66,3 +73,45 @@ def test_the_row_of_the_data_has_what_its_card_tells():
     del holds["changes to a run"]
     assert free_run.summarise_held_changes(holds) == {name: found[name] for name in found if name != "to_run_10min"}
     assert free_run.summarise_held_changes({}) == {}
+
+
+@pytest.mark.parametrize(
+    ("speeds", "expected"),
+    [
+        ([0.0, 1.2, 0.0], [0, 1, 0]),
+        ([1.2, 0.4, 0.0, 0.4, 1.2], [1, 1, 0, 0, 1]),  # who slows down walks until he stands
+        ([1.2, 1.9, 2.5, 1.9, 1.2], [1, 1, 2, 2, 1]),
+        ([3.0, 0.0], [2, 0]),
+        ([0.4, 0.0, 1.2], [0, 0, 1]),  # before the first bound, what it tells
+        ([0.4, 1.2], [1, 1]),
+        ([0.45], [1]),
+        ([0.3], [0]),
+        ([1.8], [1]),
+        ([], []),
+    ],
+)
+def test_a_pace_lasts_until_the_other_bound(speeds, expected):
+    assert follow_pace(np.repeat(np.array(speeds), 5)).tolist() == [pace for pace in expected for _ in range(5)]
+
+
+def test_what_is_counted_is_changes_of_the_pace():
+    speed = np.repeat(np.random.default_rng(1).uniform(0, 4, 300), 5)
+    pace, counted = follow_pace(speed), count_pace_changes(speed)
+    assert counted.starts == np.count_nonzero((pace[:-1] == 0) & (pace[1:] > 0))
+    assert counted.stops == np.count_nonzero((pace[:-1] > 0) & (pace[1:] == 0))
+    assert counted.to_run == np.count_nonzero((pace[:-1] < 2) & (pace[1:] == 2))
+    assert counted.to_walk == np.count_nonzero((pace[:-1] == 2) & (pace[1:] < 2))
+    assert min(counted.starts, counted.stops, counted.to_run, counted.to_walk) > 5
+
+
+def test_a_mean_speed_has_the_pace_of_a_steady_motion():
+    for speed in (0.0, 0.1, 1.0, 1.5, 2.2, 4.0):
+        assert PACES.index(find_pace(speed)) == int(follow_pace(np.full(10, speed))[-1])
+
+
+def test_who_goes_at_the_ends_of_a_clip_goes_on_at_his_pace():
+    """As clips of runs are cut: nobody stands before the first frame and after the last."""
+    way = 3.0 * np.arange(60) / 30
+    velocity = compute_ground_velocity(np.stack([0 * way, way], axis=1), 30)
+    np.testing.assert_allclose(velocity, np.tile([0.0, 3.0], (60, 1)), atol=1e-9)
+    assert count_pace_changes(np.linalg.norm(velocity, axis=1)) == PaceChanges()

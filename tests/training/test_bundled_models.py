@@ -59,7 +59,8 @@ def test_a_bundled_card_names_the_command_or_says_that_it_was_made_otherwise(nam
     card, model = checkpoints.read_card(checkpoints.locate(name).with_suffix(".json")), named(name)
     assert card.kind == model.recipe.kind
     command = re.sub(r" --decay-from \d+:\d+", "", card.training["command"])  # which tells where a clock ended a run
-    assert command == model.command or len(card.training["remark"]) > 40
+    spellings = model.command, model.command.replace(" --bfloat16", "")  # where a processor has none
+    assert command in spellings or len(card.training["remark"]) > 40
 
 
 def test_the_page_shows_each_command():

@@ -32,6 +32,9 @@ class TrainDensity(TunableOptions):
     the input that it is not told, no free runs held to the data."""
     labels: Annotated[str, arg(metavar="REGEX")] = ""
     """Named groups read labels from the clips' paths, as in '_(?P<gait>walk|run)_(?P<style>[a-z]+)_', for --style."""
+    label_pace: bool = False
+    """Make the pace a label as well: stand, walk or run, by how a window of training ends. Told one, the density
+    changes to it; random motion changes as often as the clips do."""
     made: options.MaybeDataFolder = None
     """Folder of clips that mapctl make has made, to train on as well: starts, stops and turns that the data lack. None
     of them is held out."""
@@ -80,5 +83,6 @@ class TrainDensity(TunableOptions):
             made=self.made,
             splices=Splices(self.splices, self.stitcher or Splices.stitcher),
             labels=self.labels,
+            label_pace=self.label_pace,
             init=self.init,
         )

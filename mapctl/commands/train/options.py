@@ -212,7 +212,7 @@ class NetworkOptions(TrainOptions):
     window: options.MaybeCount = None
     """Frames a window."""
     bfloat16: bool = False
-    """Let the network compute in bfloat16: faster where the processor has it."""
+    """Let the network compute in bfloat16, if the processor or GPU does: faster."""
     processes: options.Count = 1
     """Processes of this machine that share each step's batch, one a core; several machines: torchrun
     (docs/guides/training.md)."""

@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -17,12 +16,12 @@ from mapctl import rotations
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, reversed_features
 from mapctl.metrics.mocap_bounds import find_bounds, list_faults, measure_checked
-from mapctl.metrics.pace_changes import compute_ground_velocity
 from mapctl.pose import decode
 from mapctl.runtime.stepwise import StepwiseWork
 from priors.stitching.inbetweener import MAX_CONTEXT, Stitcher, load
 from priors.training.corpus import Corpus
 from priors.training.mocap.made import Made
+from priors.training.mocap.paces import measure_speeds
 
 FOLDER = "spliced/"
 """Before the names of splices in a corpus, which are those of both clips."""
@@ -120,7 +119,7 @@ def hide_splices(names: Sequence[str]) -> list[str]:
 def draw_cuts(corpus: Corpus, count: int, gaps: Sequence[int], generator: torch.Generator) -> list[Cut]:
     """Draw where pieces of two clips are cut, of each kind in turn, and which of the gaps lies between; RequestError
     for a corpus in which nobody stands for a piece."""
-    speeds = _measure_speeds(corpus)
+    speeds = measure_speeds(corpus)
     ends = {bound: _find_frames(speeds, bound, lead=_PIECE[0]) for bound in (_STANDS, _GOES)}
     beginnings = {bound: _find_frames(speeds, bound, rest=_PIECE[0]) for bound in (_STANDS, _GOES)}
     kinds = [(a, b) for a, b in _KINDS if len(ends[a]) and len(beginnings[b])]
@@ -148,17 +147,6 @@ def draw_cuts(corpus: Corpus, count: int, gaps: Sequence[int], generator: torch.
             )
         )
     return cuts
-
-
-def _measure_speeds(corpus: Corpus) -> list[Float[Tensor, " frames"]]:
-    """Speeds of the hips over the ground by clip, without the sway within a stride, m/s."""
-    parts = corpus.integrate_roots()[0].split(list(corpus.lengths))
-    return [
-        torch.from_numpy(np.linalg.norm(compute_ground_velocity(part.numpy(), PRIOR_FPS), axis=1)).float()
-        if len(part) > 1
-        else torch.zeros(len(part))
-        for part in parts
-    ]
 
 
 def _find_frames(speeds: Sequence[Tensor], bound: float, *, lead: int = 1, rest: int = 0) -> Tensor:

@@ -10,6 +10,7 @@ from priors.lstm_gmm.network import LstmGmmConfig
 from priors.pose_transformer.network import PoseTransformerConfig
 from priors.stitching.network import StitcherConfig
 from priors.training.augmentation.clip_copies import ClipCopies
+from priors.training.augmentation.splices import Splices
 from priors.training.ending.course import UntilFlat
 from priors.training.mocap.cuts import CMU
 from priors.training.recipe import Recipe
@@ -50,6 +51,10 @@ class WeightSet:
     """Copies of each clip, at other tempos and with other strides, that the densities are trained on beside it."""
     standing_share: float = 1.0
     """Share of the windows in which nobody goes anywhere that the densities of walks and runs are shown."""
+    splices: int = 0
+    """Splices of the clips that are tried for the density of everyday motion; with some, the pace is a label of it."""
+    everyday_standing: float = 1.0
+    """Share of the windows in which nobody goes anywhere that this density is shown."""
     window: int = TrainingSettings.window
     """Frames of the windows of densities: short ones where runs are short."""
     width: int = 256
@@ -70,6 +75,8 @@ SETS: Mapping[str, WeightSet] = {
         licence="CC BY-NC 4.0",
         locomotion="dataset-2_(walk|walk-turn-left|walk-turn-right|run)_",
         labels="_(?P<gait>run|walk|walk-turn-left|walk-turn-right)_(?P<style>[a-z]+)_",
+        splices=2000,
+        everyday_standing=0.25,
     ),
     "free": WeightSet(
         licence="free for any use",
@@ -153,6 +160,14 @@ def _make_models(weights: WeightSet, made: Path | None) -> tuple[BundledModel, .
     general = {**shared, "match": weights.match}  # which a density's command always tells
     walks: dict[str, Any] = {**general, "match": weights.locomotion, "labels": weights.labels, "made": made}
     widths = {"locomotion": weights.width, "locomotion-live": weights.live_width}
+    stitcher = BundledModel(
+        "stitcher",
+        StitcherRecipe(
+            **everything,
+            config=StitcherConfig(without=("d",)),
+            settings=StitcherSettings(steps=weights.plan(StitcherSettings.steps), bfloat16=True),
+        ),
+    )
     return (
         *(
             BundledModel(
@@ -161,7 +176,17 @@ def _make_models(weights: WeightSet, made: Path | None) -> tuple[BundledModel, .
             for name, width in widths.items()
             if width is not None
         ),
-        BundledModel("general", DensityRecipe(**general, **_density(weights, weights.width, weights.plan(12_000)))),
+        stitcher,
+        BundledModel(
+            "general",
+            DensityRecipe(
+                **general,
+                **_density(weights, weights.width, weights.plan(12_000), weights.everyday_standing),
+                label_pace=weights.splices > 0,
+                splices=Splices(weights.splices),
+            ),
+            needs={"--stitcher": "stitcher"} if weights.splices else {},
+        ),
         BundledModel(
             "locomotion-refiner",
             RefinerRecipe(**shared, settings=AdversarialSettings(rounds=weights.plan(3000), bfloat16=True)),
@@ -172,14 +197,6 @@ def _make_models(weights: WeightSet, made: Path | None) -> tuple[BundledModel, .
             "tweener",
             TweenerRecipe(**everything, settings=TweenerSettings(steps=weights.plan(TweenerSettings.steps))),
             needs={"--path": "path"},
-        ),
-        BundledModel(
-            "stitcher",
-            StitcherRecipe(
-                **everything,
-                config=StitcherConfig(without=("d",)),
-                settings=StitcherSettings(steps=weights.plan(StitcherSettings.steps), bfloat16=True),
-            ),
         ),
         BundledModel(
             "transformer",

@@ -7,10 +7,12 @@ from pathlib import Path
 
 import torch
 
+from mapctl.errors import RequestError
 from mapctl.features import LAYOUT
 from priors.config import require_at_least
 from priors.lstm_gmm import density, labels
 from priors.lstm_gmm.network import LstmGmmConfig
+from priors.lstm_gmm.paces import PACE_LABELS
 from priors.stitching import inbetweener
 from priors.training.augmentation.clip_copies import add_copies
 from priors.training.augmentation.splices import Splices, drop_splices, hide_splices
@@ -19,6 +21,7 @@ from priors.training.devices import make_generator, use_device
 from priors.training.gathering import DataSource, describe_selection
 from priors.training.initial_states import measure_data_limits, select_initial_states
 from priors.training.mocap.holdings import measure_holdings
+from priors.training.mocap.paces import follow_paces
 from priors.training.quality import density as density_quality
 from priors.training.recipe import Export, Gathered, Recipe, Row, average, find_split_seed
 from priors.training.recipes.density.settings import PAPER, PLAIN, TrainingSettings
@@ -44,6 +47,8 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
     """Splices of the clips, which are trained on as well."""
     labels: str = ""
     """Regular expression whose named groups read labels from a clip's path, to condition the density on."""
+    label_pace: bool = False
+    """Whether the pace is a label as well: stand, walk or run, by how a window ends."""
     init: str | None = None
     """Prior whose weights and statistics training begins with; the network is then that prior's."""
 
@@ -68,12 +73,16 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
             copied = add_copies(parts.train.to("cpu"), self.settings.copies, seeded)
         corpus = copied.to(torch.get_default_device().type)
         known = labels.read(hide_splices(corpus.names), self.labels)
+        paces = follow_paces(copied).to(corpus.features.device) if self.label_pace else None
         if self.init is None:
+            known = known.renamed((*known.names, *PACE_LABELS)) if self.label_pace else known
             config = replace(self.config, labels=known.names)
-            return DensityTrainer(config, self.settings, corpus, labels=known)
+            return DensityTrainer(config, self.settings, corpus, labels=known, paces=paces)
         before = density.load(self.init).reference
         known = known.renamed(before.config.labels)
-        return DensityTrainer(before.config, self.settings, corpus, labels=known, init=before.state_dict())
+        if self.label_pace and not {*PACE_LABELS} <= {*known.names}:
+            raise RequestError(f"the prior {self.init!r} was not trained with labels of paces; leave --label-pace out")
+        return DensityTrainer(before.config, self.settings, corpus, labels=known, paces=paces, init=before.state_dict())
 
     def find_shape(self, trainer: DensityTrainer) -> LstmGmmConfig:
         """Return the configuration of the network that is trained."""
@@ -86,6 +95,7 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
             "split seed": str(self.settings.seed if self.split is None else self.split),
             "labels": self.labels,
             "init": self.init or "",
+            **({"paces": "labels"} if self.label_pace else {}),
             **self._describe_splices(),
         }
 
@@ -150,6 +160,7 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
         option, config, settings = self._find_variant()
         parts = [f"mapctl train lstm-gmm --data DATA -o RUN --match '{self.match or ''}'"]
         parts += [f"--labels '{self.labels}'"] if self.labels else []
+        parts += ["--label-pace"] * self.label_pace
         parts += [f"--init {self.init}"] if self.init else [f"--width {self.config.width}"]
         mixed = self.init is None and self.config.components != config.components
         parts += [f"--components {self.config.components}"] if mixed else []

@@ -9,11 +9,13 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
+from torch.nn.functional import one_hot
 
 from priors.lstm_gmm.labels import Labels
 from priors.lstm_gmm.network import NOISE_UNIT, LstmGmm, LstmGmmConfig
+from priors.lstm_gmm.paces import PACE_LABELS
 from priors.training.corpus import Corpus
 from priors.training.feature_statistics import compute_feature_statistics
 from priors.training.moment_matching import free_run_moment_loss
@@ -36,9 +38,11 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
         corpus: Corpus,
         *,
         labels: Labels | None = None,
+        paces: Int[Tensor, " frames"] | None = None,
         init: Mapping[str, Tensor] | None = None,
     ):
-        """`labels` of the corpus' clips, the network's own; `init` holds weights and statistics to begin with."""
+        """`labels` of the corpus' clips, the network's own, with those of PACE_LABELS held by none; `paces` of its
+        frames, as `follow_paces` finds them, if these are told; `init` holds weights and statistics to begin with."""
         self.settings = settings
         mean, std = compute_feature_statistics(corpus.features)
         super().__init__(
@@ -50,6 +54,8 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
         if init is not None:
             self.network.load_state_dict(dict(init))
         self.labels = labels or Labels.none(len(corpus.lengths))
+        self.paces = paces
+        self._pace_labels = [] if paces is None else [self.labels.names.index(name) for name in PACE_LABELS]
         self.clip_ends = torch.tensor(corpus.lengths).cumsum(0)
         self.windows = FeatureWindows(corpus, settings.window + 1, standing_share=settings.standing_share)
         self._latest = corpus.features[:0]  # windows of the step under way
@@ -127,6 +133,10 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
         drawn = self.windows.draw(self.group.share(self.settings.batch), self.generator, mirror=self.settings.mirror)
         labels = self.labels.held[torch.searchsorted(self.clip_ends, drawn.first, right=True)]
         labels = torch.where(drawn.mirrored[:, None], labels[:, self.labels.mirrored], labels)
+        if self.paces is not None:
+            # How a window ends: told a pace that is not yet its own, the network changes to it within a window.
+            ends = self.paces[drawn.first + self.settings.window]
+            labels[:, self._pace_labels] = one_hot(ends, len(PACE_LABELS)).to(labels.dtype)
         return drawn.features, self._tell_some(labels)
 
     def _tell_some(self, labels: Float[Tensor, "batch labels"]) -> Float[Tensor, "batch labels"]:

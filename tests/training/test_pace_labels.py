@@ -1,0 +1,128 @@
+"""Paces as labels: told by how a window ends, kept by the prior, and read from what its card says of the clips."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from helpers import generator, go_at, run, tiny_density, write_corpus
+
+import priors
+from mapctl.errors import RequestError
+from priors.lstm_gmm.labels import Labels
+from priors.lstm_gmm.network import LstmGmmConfig
+from priors.lstm_gmm.paces import PACE_LABELS, read_pace_rates
+from priors.training.corpus import Corpus
+from priors.training.mocap.holdings import measure_holdings
+from priors.training.mocap.paces import follow_paces, measure_speeds
+from priors.training.recipes.density.settings import TrainingSettings
+from priors.training.recipes.density.trainer import DensityTrainer
+
+pytestmark = pytest.mark.usefixtures("small_judgements")
+WINDOW = 20
+
+
+@pytest.fixture(scope="module")
+def clips() -> Corpus:
+    """Who stands, who sets off and stops again, and who runs after a walk."""
+    parts = [go_at(0.0, seconds=4), go_at(0.0, 1.2, 0.0, seconds=3), go_at(1.2, 3.0, seconds=3)]
+    return Corpus(("a", "b_walk", "c"), tuple(map(len, parts)), torch.cat(parts))
+
+
+@pytest.fixture
+def trainer(clips):
+    names = ("gait=walk", *PACE_LABELS)
+    known = Labels(("gait=walk",), torch.tensor([[0.0], [1.0], [0.0]])).renamed(names)
+    settings = replace(TrainingSettings(), steps=1, batch=64, window=WINDOW, untold=0.0)
+    return DensityTrainer(
+        LstmGmmConfig(width=4, labels=names), settings, clips, labels=known, paces=follow_paces(clips)
+    )
+
+
+def test_paces_are_those_of_speeds(clips):
+    ground, _ = clips.integrate_roots()
+    for paces, speeds, places in zip(
+        follow_paces(clips).split(list(clips.lengths)),
+        measure_speeds(clips),
+        ground.split(list(clips.lengths)),
+        strict=True,
+    ):
+        assert len(paces) == len(speeds) == len(places)
+        step = places.diff(dim=0).norm(dim=-1) * 30
+        assert bool((step[5:-5][paces[6:-5] == 0] < 0.6).all())
+        assert bool((step[5:-5][paces[6:-5] == 2] > 1.7).all())
+    one, two, three = (set(part.tolist()) for part in follow_paces(clips).split(list(clips.lengths)))
+    assert (one, two, three) == ({0}, {0, 1}, {1, 2})
+
+
+def test_a_window_is_told_how_it_ends(trainer, clips, monkeypatch):
+    monkeypatch.setattr(trainer, "_tell_some", lambda labels: labels)
+    paces, seen = follow_paces(clips), set()
+    drawn = trainer.windows.draw(64, generator(3))
+    monkeypatch.setattr(trainer.windows, "draw", lambda *_, **__: drawn)
+    _, told = trainer._draw_windows()
+    for row, first in zip(told, drawn.first.tolist(), strict=True):
+        ends = int(paces[first + WINDOW])
+        assert row[1:].tolist() == np.eye(3)[ends].tolist()
+        seen.add((int(paces[first]), ends))
+    assert {(0, 0), (0, 1), (1, 0), (1, 2)} <= seen
+    assert bool((told[:, 0] == 1).any())
+
+
+def test_a_pace_is_hidden_like_other_labels(trainer):
+    _, told = trainer._draw_windows()
+    shown = told[:, 1:].sum(-1)
+    assert set(shown.tolist()) == {0.0, 1.0}
+    assert 0.4 < float(shown.mean()) < 0.95
+
+
+def test_rates_are_those_of_the_clips(clips):
+    holds = measure_holdings(clips)
+    minutes = holds["minutes by pace"]
+    assert sum(minutes.values()) == pytest.approx(holds["minutes"], abs=0.02)
+    rates = read_pace_rates(holds)
+    assert rates["stand", "walk"] == pytest.approx(1 / (60 * minutes["stand"]))
+    assert rates["walk", "stand"] == pytest.approx(1 / (60 * minutes["walk"]))
+    assert rates["walk", "run"] == pytest.approx(1 / (60 * minutes["walk"]))
+    assert rates["run", "walk"] == 0.0
+    nobody = holds | {"minutes by pace": {"stand": 1.0, "walk": 0.0, "run": 0.0}}
+    assert set(read_pace_rates(nobody)) == {("stand", "walk")}
+
+
+def test_a_density_that_is_trained_so_knows_paces(tmp_path, capfd):
+    data = write_corpus(tmp_path / "data")
+    words = "--match", "", "--width", 8, "--steps", 2, "--batch", 4, "--window", 12
+    assert run("train", "lstm-gmm", "--data", data, "-o", tmp_path / "run", *words, "--label-pace") == 0
+    prior = priors.load(str(tmp_path / "run"))
+    assert prior.labels == {"pace": ["stand", "walk", "run"]}
+    assert prior.pace_rates == read_pace_rates(prior.card.data["holds"])
+    assert "--label-pace" in prior.card.training["command"]
+    starts = prior.conditioned_on(["walk"]).initial_states
+    assert bool((starts.speed > 0.4).all())
+    told = prior.conditioned_on(["pace=run"]).reference.fc1.bias
+    assert not torch.equal(told, prior.reference.fc1.bias)
+    # A run that goes on with it has its labels, and one that begins without them is refused.
+    more = "--data", data, "--match", "", "--steps", 1, "--batch", 4, "--window", 12
+    assert run("train", "lstm-gmm", "-o", tmp_path / "on", *more, "--label-pace", "--init", tmp_path / "run") == 0
+    assert priors.load(str(tmp_path / "on")).labels == prior.labels
+    assert run("train", "lstm-gmm", "-o", tmp_path / "plain", *more, "--width", 8) == 0
+    assert priors.load(str(tmp_path / "plain")).pace_rates == {}
+    capfd.readouterr()
+    assert run("train", "lstm-gmm", "-o", tmp_path / "no", *more, "--label-pace", "--init", tmp_path / "plain") == 2
+    assert "was not trained with labels of paces; leave --label-pace out" in capfd.readouterr().err
+
+
+def test_starts_are_picked_by_their_speed():
+    density = tiny_density()
+    names = (*density.reference.config.labels, *PACE_LABELS)
+    network = type(density.reference)(
+        replace(density.reference.config, labels=names), mean=density.feature_mean, std=density.feature_std
+    )
+    found = replace(density.initial_states, speed=torch.tensor([0.1, 1.0, 1.2, 3.0]))
+    known = replace(density, reference=network, initial_states=found)
+    for pace, speeds in (("stand", [0.1]), ("walk", [1.0, 1.2]), ("run", [3.0])):
+        picked = known.conditioned_on([pace]).initial_states
+        torch.testing.assert_close(picked.speed, torch.tensor(speeds))
+        assert float(picked.weight.sum()) == pytest.approx(1.0)
+    with pytest.raises(RequestError, match="knows no pace 'crawl'"):
+        known.conditioned_on(["pace=crawl"])
