@@ -8,6 +8,7 @@ import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -156,6 +157,11 @@ def locate(name: str) -> Path:
     if found is None:
         raise weight_sets.explain_missing(name)
     return found
+
+
+def compute_hash(name: str) -> str:
+    """Compute a short hash of a model's weights, by which those that were made with it name it."""
+    return sha256(locate(name).read_bytes()).hexdigest()[:12]
 
 
 def note_use(name: str) -> None:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from controllers.common.character import Character
 from controllers.generation.foot_cleanup import FootCleanupSettings, clean_up_feet
-from controllers.generation.pace_changes import plan_paces
+from controllers.generation.pace_plan import plan_paces
 from mapctl import retarget
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS, GroundPose, encode, integrate_root
@@ -165,14 +165,15 @@ def sample_pieces(
     generator: torch.Generator,
     settings: GenerateSettings | None = None,
     *,
-    longest: int = _CHUNK,
+    longest: int | None = None,
 ) -> Iterator[Float[Tensor, "_ size"]]:
-    """Sample consecutive pieces of one motion, of at most `longest` frames, without end; `state` is a batch of one.
+    """Sample consecutive pieces of one motion, of at most `longest` frames (20 s if None), without end; `state` is a
+    batch of one.
 
     `prior` is given what `initialise_generation` gives it. If it knows paces, it is told them one after the other
     beside that, unless `settings` leave it unconditioned.
     """
-    settings = settings or GenerateSettings()
+    settings, longest = settings or GenerateSettings(), longest or _CHUNK
     paces = plan_paces(prior, state, generator) if settings.condition_on_start else repeat((None, longest))
     told: dict[str | None, Density] = {None: prior}
     for pace, frames in paces:

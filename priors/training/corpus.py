@@ -232,11 +232,10 @@ def read_corpus(
     reader = ClipReader(data, skip_first, find_cuts(data, cuts), level)
     key = _compute_cache_key(data, files, reader)
     stored = cache / f"corpus-{key}.safetensors"
-    corpus = _read_cache(stored)
+    corpus = read_cache(stored)
     if corpus is None or any(not isinstance(reader.read(data / file.name), str) for file in corpus.skipped):
         corpus = _read_files(files, reader, progress or (lambda done, total: None))
-        cache.mkdir(parents=True, exist_ok=True)
-        _write_cache(corpus, stored)
+        write_cache(corpus, stored)
     return replace(
         corpus,
         skipped=(*corpus.skipped, *closed),
@@ -319,8 +318,9 @@ def _read_file_stamp(file: Path) -> str:
     return f"{found.st_size} {found.st_mtime_ns}"
 
 
-def _read_cache(stored: Path) -> Corpus | None:
-    """None where there is none, or only a damaged one: the clips themselves are read again."""
+def read_cache(stored: Path) -> Corpus | None:
+    """Read a corpus that was kept: its clips, and the files that were left out. None where there is none, or only a
+    damaged one."""
     try:
         with safe_open(stored, framework="pt") as file:
             index = json.loads(file.metadata()["index"])
@@ -336,7 +336,9 @@ def _read_cache(stored: Path) -> Corpus | None:
     return corpus if whole else None
 
 
-def _write_cache(corpus: Corpus, stored: Path) -> None:
+def write_cache(corpus: Corpus, stored: Path) -> None:
+    """Keep the clips of a corpus, and the files that were left out, in a file; its folder is made if there is none."""
+    stored.parent.mkdir(parents=True, exist_ok=True)
     index = json.dumps(
         {
             "names": corpus.names,

@@ -71,7 +71,7 @@ def gather(source: DataSource, *, progress: Progress, warn: Progress) -> tuple[C
         raise RequestError(f"--strict-data: {_list_skipped(corpus.skipped, source.data)}")
     corpus, parts = keep_share(corpus, split_corpus(corpus, source.seed), source.share, source.seed)
     if source.splices.count:
-        train = add_splices(replace(parts.train, made=corpus.made), source.splices)
+        train = add_splices(replace(parts.train, made=corpus.made), source.splices, source.run / "cache")
         corpus, parts = replace(corpus, made=train.made), replace(parts, train=train)
     if corpus.skipped:
         rest = f"; all are in {source.run / _SKIPPED_LIST}" if len(corpus.skipped) > _MOST_NAMED else ""

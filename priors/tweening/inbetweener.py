@@ -242,7 +242,7 @@ def load(name: str = "tweener", path: str = "path") -> Tweener:
         network = GeneratorNetwork(GeneratorConfig.of_card(card.config))
         network.load_state_dict(tensors)
         classes = read_classes(card, network.config.style)
-    wanted, found = card.data.get("path"), path_predictor.compute_hash(path)
+    wanted, found = card.data.get("path"), checkpoints.compute_hash(path)
     if wanted != found:
         raise CheckpointError(
             f"{name} was trained with the path predictor {wanted}; {path} is {found}: name it by --path"

@@ -3,7 +3,6 @@ section 3.4 and table 5).
 """
 
 from dataclasses import dataclass
-from hashlib import sha256
 
 import torch
 from jaxtyping import Float
@@ -139,8 +138,3 @@ def load(name: str = "path") -> ConvPathPredictor:
         network = PathNetwork(PathConfig.of_card(card.config))
         network.load_state_dict(tensors)
     return ConvPathPredictor(name, network.eval().requires_grad_(False), card)
-
-
-def compute_hash(name: str = "path") -> str:
-    """Short hash of a path predictor's weights, by which a tweener's card names the one it was trained with."""
-    return sha256(checkpoints.locate(name).read_bytes()).hexdigest()[:12]

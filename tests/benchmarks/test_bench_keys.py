@@ -27,7 +27,7 @@ from mapctl.metrics.realism import ClassifierSettings, RealismSettings
 from mapctl.motion import Motion
 from mapctl.protocols import Inbetweener
 from priors import checkpoints
-from priors.tweening.path import compute_hash
+from priors.checkpoints import compute_hash
 
 RAW = InfillSettings(finish=False)
 QUICK = RealismSettings(classifier=ClassifierSettings(steps=60, width=8, batch=32), dims=8)

@@ -17,7 +17,7 @@ from mapctl.inbetweening.query import estimate_contact_logits
 from mapctl.motion import Motion
 from mapctl.protocols import Inbetweener
 from priors import checkpoints
-from priors.tweening.path import compute_hash
+from priors.checkpoints import compute_hash
 
 RAW = InfillSettings(finish=False)
 

@@ -21,7 +21,7 @@ from mapctl.metrics.spectrum import BANDS_HZ, measure_speed_by_band
 from mapctl.motion import Motion
 from mapctl.protocols import Inbetweener
 from priors import checkpoints
-from priors.tweening.path import compute_hash
+from priors.checkpoints import compute_hash
 
 RAW = InfillSettings(finish=False)
 HZ = [f"{low:g}-{high:g}_hz" for low, high in BANDS_HZ]

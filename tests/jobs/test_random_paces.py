@@ -11,7 +11,7 @@ from helpers import generator, tiny_density
 from toy_density import ToyDensity, toy_density
 
 from controllers.generation.generate import GenerateSettings, generate, sample_pieces
-from controllers.generation.pace_changes import draw_paces, plan_paces
+from controllers.generation.pace_plan import draw_paces, plan_paces
 from mapctl.features import LAYOUT
 from mapctl.protocols import LastFrameState
 

@@ -12,6 +12,7 @@ from safetensors.torch import load_file, save_file
 
 from mapctl.errors import RequestError
 from priors.training import recipe, run, trainer
+from priors.training.devices import has_bfloat16
 from priors.training.recipes import lstm_gmm
 from priors.training.run import train
 
@@ -96,3 +97,32 @@ def test_the_pretended_device_refuses_what_a_gpu_refuses():
             there + here
         with pytest.raises(TypeError, match="no array"):
             there.numpy()
+
+
+@pytest.mark.parametrize("has", [True, False])
+def test_a_processor_without_bfloat16_computes_in_float32_and_says_so(tmp_path, data, monkeypatch, has):
+    monkeypatch.setattr(run, "has_bfloat16", lambda: has)
+    made = MODELS["path"].recipe(data, tmp_path / "run", None)
+    made, told, seen = replace(made, settings=replace(made.settings, steps=2, bfloat16=True)), [], []
+    monkeypatch.setattr(run.TrainingRun, "go", lambda self: seen.append(self.recipe.settings.bfloat16))
+    monkeypatch.setattr(run.TrainingRun, "export", lambda self: self.recipe.out)
+    train(made, warn=told.append)
+    assert seen == [has]
+    assert told == ([] if has else ["this processor does not compute in bfloat16; training computes in float32"])
+
+
+def test_a_gpu_is_asked_for_bfloat16_whatever_the_processor_has(tmp_path, data, monkeypatch):
+    monkeypatch.setattr(run, "has_bfloat16", lambda: False)
+    monkeypatch.setattr(recipe, "select_device", lambda wanted: "cuda")
+    made = MODELS["path"].recipe(data, tmp_path / "run", None)
+    made = replace(made, settings=replace(made.settings, bfloat16=True))
+    assert run._fit_precision(made, pytest.fail) is made
+
+
+def test_this_processor_is_asked_once_and_trains_either_way(tmp_path, data):
+    """An LSTM in bfloat16 ends with an error of torch on processors without it."""
+    assert has_bfloat16() is has_bfloat16()
+    made = MODELS["lstm-gmm"].recipe(data, tmp_path / "run", None)
+    train(replace(made, settings=replace(made.settings, steps=2, bfloat16=True)))
+    told = json.loads((tmp_path / "run" / "model.json").read_text())["training"]["command"]
+    assert ("--bfloat16" in told) is has_bfloat16()

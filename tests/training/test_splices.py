@@ -68,13 +68,16 @@ def tiny(tmp_path):
 def find_way(spliced: Float[Tensor, "frames size"], corpus: Corpus, names: list[str]) -> tuple[int, int]:
     """First frame of the way, and the first of the second piece, which are both found by the pieces' bits."""
     one, other = (corpus.clips()[corpus.names.index(name)] for name in names)
-    at = next(k for k in range(len(one)) if torch.equal(one[k], spliced[0]))
-    count = next((k for k in range(len(spliced)) if at + k >= len(one) or not torch.equal(one[at + k], spliced[k])), 0)
-    end = len(spliced)
-    last = next(k for k in reversed(range(len(other))) if torch.equal(other[k], spliced[-1]))
-    while last >= 0 and torch.equal(other[last], spliced[end - 1]):
-        end, last = end - 1, last - 1
-    return count, end
+    # A walk's frames come again, so a piece is where the clip agrees for longest.
+    count = max(_count_equal(one[at:], spliced) for at in range(len(one)))
+    rest = max(_count_equal(other[:end].flip(0), spliced.flip(0)) for end in range(1, len(other) + 1))
+    return count, len(spliced) - rest
+
+
+def _count_equal(one: Float[Tensor, "frames size"], other: Float[Tensor, "others size"]) -> int:
+    """How many frames are the same from the first on."""
+    count = min(len(one), len(other))
+    return int((one[:count] == other[:count]).all(-1).int().cumprod(0).sum())
 
 
 def test_pieces_are_cut_where_somebody_stands_or_goes(corpus):
@@ -176,6 +179,27 @@ def test_the_seed_draws_them(corpus, tiny, all_pass):
         Splices(-1)
 
 
+def test_they_are_kept_for_a_run_that_goes_on(corpus, tmp_path, all_pass, monkeypatch):
+    one, other = (
+        str(save_tiny_stitcher(tmp_path / f"{name}.safetensors", drawn=drawn))
+        for name, drawn in (("a", 1.0), ("b", 3.0))
+    )
+    cache = tmp_path / "cache"
+    made = add_splices(corpus, Splices(4, one), cache)
+    (stored,) = cache.iterdir()
+    with monkeypatch.context() as within:
+        within.setattr(module, "_walk_all", lambda *_: pytest.fail("made anew"))
+        again = add_splices(corpus, Splices(4, one), cache)
+    assert torch.equal(again.features, made.features)
+    assert (again.names, again.lengths, again.made) == (made.names, made.lengths, made.made)
+    # Nothing else is taken for them.
+    for wanted, clips in ((Splices(5, one), corpus), (Splices(4, other), corpus), (Splices(4, one, seed=2), corpus)):
+        assert not torch.equal(add_splices(clips, wanted, cache).features, made.features)
+    assert len(list(cache.iterdir())) == 4
+    stored.write_bytes(b"damaged")
+    assert torch.equal(add_splices(corpus, Splices(4, one), cache).features, made.features)
+
+
 def test_who_made_them_is_told(corpus, tiny, all_pass):
     made = add_splices(corpus, Splices(6, tiny)).made
     assert made.told == ("splices: 6 of 6 that were tried, by tiny.safetensors (free)",)
@@ -260,9 +284,9 @@ def test_clips_that_were_made_before_are_told_beside_them(data, tmp_path, tiny, 
 def test_clips_that_are_held_out_are_in_no_splice(data, tmp_path, tiny, all_pass):
     seen = []
 
-    def see(corpus, splices):
+    def see(corpus, splices, cache):
         seen.append(corpus.names)
-        return add_splices(corpus, splices)
+        return add_splices(corpus, splices, cache)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("priors.training.gathering.add_splices", see)

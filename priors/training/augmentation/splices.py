@@ -4,8 +4,10 @@ A density of such clips goes on with whatever it does: nothing shows it that who
 stop going, or do something else, are made by the stitcher (Ren et al. 2024) and kept where they pass for mocap.
 """
 
+import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from hashlib import sha256
 from pathlib import Path
 
 import torch
@@ -18,8 +20,9 @@ from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, reversed_features
 from mapctl.metrics.mocap_bounds import find_bounds, list_faults, measure_checked
 from mapctl.pose import decode
 from mapctl.runtime.stepwise import StepwiseWork
+from priors.checkpoints import compute_hash
 from priors.stitching.inbetweener import MAX_CONTEXT, Stitcher, load
-from priors.training.corpus import Corpus
+from priors.training.corpus import Corpus, read_cache, write_cache
 from priors.training.mocap.made import Made
 from priors.training.mocap.paces import measure_speeds
 
@@ -74,9 +77,9 @@ class Cut:
     """Of the heading from the one to the other, radians."""
 
 
-def add_splices(corpus: Corpus, splices: Splices) -> Corpus:
+def add_splices(corpus: Corpus, splices: Splices, cache: Path | None = None) -> Corpus:
     """Return a corpus with its clips, and after them the splices of them that no measure tells from them, by names that
-    begin with FOLDER; it says who made them.
+    begin with FOLDER; it says who made them. In the folder `cache` they are kept: a run that is resumed reads them.
 
     Who stands sets off, who goes stops, and who stands does something else, as often each where the clips have it; the
     second piece begins where velocities of both lead. RequestError for a corpus in which nobody stands for a piece,
@@ -84,8 +87,32 @@ def add_splices(corpus: Corpus, splices: Splices) -> Corpus:
     """
     if splices.count == 0:
         return corpus
-    stitcher, clips = load(splices.stitcher), corpus.clips()
-    generator = torch.Generator().manual_seed(splices.seed)
+    stitcher, made = load(splices.stitcher), corpus.made
+    stored = cache / f"splices-{_compute_cache_key(corpus, splices)}.safetensors" if cache else None
+    kept = read_cache(stored) if stored else None
+    if kept is None:
+        kept = _make_splices(corpus, splices, stitcher)
+        if stored:
+            write_cache(kept, stored)
+    maker, licence = Path(stitcher.name).name, stitcher.card.licence
+    told = f"splices: {len(kept.names)} of {splices.count} that were tried, by {maker} ({licence})"
+    return replace(
+        corpus,
+        names=corpus.names + kept.names,
+        lengths=corpus.lengths + kept.lengths,
+        features=torch.cat([corpus.features, kept.features]),
+        made=Made(made.clips | {*kept.names}, (*made.told, told), made.licences | {licence}),
+    )
+
+
+def _compute_cache_key(corpus: Corpus, splices: Splices) -> str:
+    parts = {**corpus.identity(), **asdict(splices), "stitcher": compute_hash(splices.stitcher)}
+    return sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _make_splices(corpus: Corpus, splices: Splices, stitcher: Stitcher) -> Corpus:
+    """Make those that pass for mocap, without the clips."""
+    clips, generator = corpus.clips(), torch.Generator().manual_seed(splices.seed)
     gaps = [gap for gap in _GAPS if gap <= stitcher.longest] or [stitcher.longest]
     cuts = draw_cuts(corpus, splices.count, gaps, generator)
     spliced = _walk_all(clips, cuts, stitcher, generator)
@@ -93,16 +120,10 @@ def add_splices(corpus: Corpus, splices: Splices) -> Corpus:
     long = [clips[number] for number in order if len(clips[number]) >= _PIECE[0]]
     bounds = find_bounds(decode(clip, GroundPose.origin()) for clip in long[:_REFERENCE])
     kept = [number for number, features in enumerate(spliced) if _passes(features, bounds)]
-    names = tuple(FOLDER + " + ".join(corpus.names[clip] for clip in cuts[number].clips) for number in kept)
-    maker, licence = Path(stitcher.name).name, stitcher.card.licence
-    told = f"splices: {len(kept)} of {splices.count} that were tried, by {maker} ({licence})"
-    made = corpus.made
-    return replace(
-        corpus,
-        names=corpus.names + names,
-        lengths=(*corpus.lengths, *(len(spliced[number]) for number in kept)),
-        features=torch.cat([corpus.features, *(spliced[number] for number in kept)]),
-        made=Made(made.clips | {*names}, (*made.told, told), made.licences | {licence}),
+    return Corpus(
+        tuple(FOLDER + " + ".join(corpus.names[clip] for clip in cuts[number].clips) for number in kept),
+        tuple(len(spliced[number]) for number in kept),
+        torch.cat([corpus.features[:0], *(spliced[number] for number in kept)]),
     )
 
 

@@ -53,8 +53,8 @@ class WeightSet:
     """Share of the windows in which nobody goes anywhere that the densities of walks and runs are shown."""
     splices: int = 0
     """Splices of the clips that are tried for the density of everyday motion; with some, the pace is a label of it."""
-    everyday_standing: float = 1.0
-    """Share of the windows in which nobody goes anywhere that this density is shown."""
+    everyday_steps: int = 8000
+    """Steps of the density of everyday motion."""
     window: int = TrainingSettings.window
     """Frames of the windows of densities: short ones where runs are short."""
     width: int = 256
@@ -76,7 +76,6 @@ SETS: Mapping[str, WeightSet] = {
         locomotion="dataset-2_(walk|walk-turn-left|walk-turn-right|run)_",
         labels="_(?P<gait>run|walk|walk-turn-left|walk-turn-right)_(?P<style>[a-z]+)_",
         splices=2000,
-        everyday_standing=0.25,
     ),
     "free": WeightSet(
         licence="free for any use",
@@ -86,6 +85,7 @@ SETS: Mapping[str, WeightSet] = {
         level=True,
         copies=8,
         standing_share=0.33,
+        everyday_steps=4800,
         window=40,
         width=192,
         live_width=None,
@@ -181,7 +181,7 @@ def _make_models(weights: WeightSet, made: Path | None) -> tuple[BundledModel, .
             "general",
             DensityRecipe(
                 **general,
-                **_density(weights, weights.width, weights.plan(12_000), weights.everyday_standing),
+                **_density(weights, weights.width, weights.everyday_steps),
                 label_pace=weights.splices > 0,
                 splices=Splices(weights.splices),
             ),

@@ -236,13 +236,13 @@ class TweenerRecipe(NetworkRecipe[GeneratorConfig, TweenerSettings, TweenerTrain
 
     def pin(self, trainer: TweenerTrainer, corpus: Corpus) -> dict[str, Row]:
         """What must not change between a run's parts."""
-        return {**super().pin(trainer, corpus), "path": {"hash": path_predictor.compute_hash(self.path)}}
+        return {**super().pin(trainer, corpus), "path": {"hash": checkpoints.compute_hash(self.path)}}
 
     def export(self, trainer: TweenerTrainer, gathered: Gathered, curve: Sequence[Row]) -> Export:
         """What is written at the end: the card tells the path predictor it was trained with."""
         done = super().export(trainer, gathered, curve)
         classes = compute_classes(trainer.network, gathered.parts.train, self.labels)
-        return replace(done, data={**done.data, "path": path_predictor.compute_hash(self.path), **classes})
+        return replace(done, data={**done.data, "path": checkpoints.compute_hash(self.path), **classes})
 
     def format_shape(self) -> list[str]:
         """Options for a network that is not the usual one."""

@@ -1,4 +1,4 @@
-"""Changes of pace of random motion, drawn as often as the prior's data have them.
+"""Which paces random motion has one after the other: drawn as often as the prior's data change them.
 
 Samples of a density go on with what they do: that somebody sets off once in a minute or two is more than a network
 keeps in mind. So a density that knows paces as labels is told them, one after the other.
