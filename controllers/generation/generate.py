@@ -8,7 +8,6 @@ import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial, reduce
-from itertools import repeat
 
 import torch
 from jaxtyping import Float
@@ -174,18 +173,16 @@ def sample_pieces(
     beside that, unless `settings` leave it unconditioned.
     """
     settings, longest = settings or GenerateSettings(), longest or _CHUNK
-    paces = plan_paces(prior, state, generator) if settings.condition_on_start else repeat((None, longest))
-    told: dict[str | None, Density] = {None: prior}
-    for pace, frames in paces:
-        if pace not in told:
-            told[pace] = prior.conditioned_on([f"pace={pace}"])
-        draw, left = told[pace].sample, frames
+    paces = plan_paces(prior, state, generator) if settings.condition_on_start else None
+    while True:
+        told, count = (prior, longest) if paces is None else paces.tell(longest)
+        draw = told.sample
         if settings.sigma_planted is not None:
-            draw = partial(told[pace].sample_planted, sigma_speed=settings.sigma_planted)
-        while left > 0:
-            features, state = draw(state, min(left, longest), generator, temperature=settings.temperature)
-            yield features[0]
-            left -= len(features[0])
+            draw = partial(told.sample_planted, sigma_speed=settings.sigma_planted)
+        features, state = draw(state, count, generator, temperature=settings.temperature)
+        if paces is not None:
+            paces.see(features[0])
+        yield features[0]
 
 
 def sample_stratified_starts(prior: Density, count: int, generator: torch.Generator) -> list[int]:

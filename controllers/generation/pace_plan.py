@@ -5,14 +5,17 @@ keeps in mind. So a density that knows paces as labels is told them, one after t
 """
 
 from collections.abc import Iterator, Mapping
-from itertools import repeat
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
-from mapctl.features import PRIOR_FPS, ground_speed
+from mapctl.features import LAYOUT, PRIOR_FPS
 from mapctl.metrics.pace_changes import find_pace
 from mapctl.protocols import Density, DensityState
 
+_LOOK = 20  # frames after which is looked whether a pace has been taken on
+_MOST_EMPHATIC = 4  # times that a label is told at once
 _WITHOUT_END = 3600 * PRIOR_FPS  # frames for which a pace lasts that the data never change
 
 
@@ -32,9 +35,45 @@ def draw_paces(
         pace = list(ways)[int(torch.multinomial(torch.tensor([*ways.values()]), 1, generator=generator))]
 
 
-def plan_paces(prior: Density, state: DensityState, generator: torch.Generator) -> Iterator[tuple[str | None, int]]:
-    """Plan which paces a prior is told after a state (batch of one), and for how many frames each, without end: from
-    the pace of the state's last frame on, as often as its data change. None for a prior that knows no paces."""
+class PacePlan:
+    """Tells a prior paces one after the other, and the more emphatically the longer it does not take one on.
+
+    A label is a bias of the network's: told twice, it counts twice. Told once to set off, `general` does in 4 of 23
+    cases within 8 s; told three times over, in 18. Once it has the pace, telling it once suffices.
+    """
+
+    def __init__(self, prior: Density, paces: Iterator[tuple[str, int]]):
+        """`paces` and for how many frames each lasts, without end."""
+        self._prior, self._paces = prior, paces
+        self._pace, self._left = next(paces)
+        self._emphasis = 1
+        self._told: dict[str, list[Density]] = {}
+
+    def tell(self, longest: int) -> tuple[Density, int]:
+        """Return the prior told what is to come, and for how many frames, at most `longest`, it is to be sampled."""
+        told = self._told.setdefault(self._pace, [self._prior])  # as often as their index says
+        while len(told) <= self._emphasis:
+            told.append(told[-1].conditioned_on([f"pace={self._pace}"]))
+        return told[self._emphasis], min(self._left, longest, _LOOK)
+
+    def see(self, features: Float[Tensor, "frames size"]) -> None:
+        """Go on after what was sampled."""
+        self._left -= len(features)
+        if self._left == 0:
+            (self._pace, self._left), self._emphasis = next(self._paces), 1
+            return
+        has = find_pace(_measure_speed(features))
+        self._emphasis = 1 if has == self._pace else min(self._emphasis + 1, _MOST_EMPHATIC)
+
+
+def plan_paces(prior: Density, state: DensityState, generator: torch.Generator) -> PacePlan | None:
+    """Plan which paces a prior is told after a state (batch of one): from the pace of the state's last frame on, as
+    often as its data change. None for a prior that knows no paces."""
     if not prior.pace_rates:
-        return repeat((None, _WITHOUT_END))
-    return draw_paces(prior.pace_rates, find_pace(float(ground_speed(state.last_frame))), generator)
+        return None
+    return PacePlan(prior, draw_paces(prior.pace_rates, find_pace(_measure_speed(state.last_frame)), generator))
+
+
+def _measure_speed(features: Float[Tensor, "frames size"]) -> float:
+    """Of the way that the frames lead, m/s: without the sway of somebody who stands."""
+    return float(LAYOUT.pick(features, "root_displacement_heading").mean(0).norm()) * PRIOR_FPS

@@ -20,9 +20,11 @@ RATES = {("stand", "walk"): 0.1, ("walk", "stand"): 0.05, ("walk", "run"): 0.15,
 
 @dataclass(frozen=True, eq=False)
 class Told(ToyDensity):
-    """Samples the number of the pace that it is told in each feature, 0 where it is told none."""
+    """Takes a pace on that it is told often enough; its frames hold the number of the pace and how often it was."""
 
     pace: int = 0
+    times: int = 0
+    needed: int = 1
     rates: Mapping[tuple[str, str], float] = field(default_factory=lambda: RATES)
 
     @property
@@ -31,13 +33,18 @@ class Told(ToyDensity):
 
     def conditioned_on(self, labels):
         (label,) = labels
-        return replace(self, pace=["pace=stand", "pace=walk", "pace=run"].index(label) + 1)
+        return replace(self, pace=["pace=stand", "pace=walk", "pace=run"].index(label) + 1, times=self.times + 1)
 
     def sample(self, state, frames, generator, *, temperature=1.0):
-        features = torch.full((1, frames, LAYOUT.size), float(self.pace))
+        features = state.last_frame.expand(1, frames, -1).clone()
+        step = LAYOUT.pick(features, "root_displacement_heading")
+        if self.times >= self.needed:
+            step[..., 1] = [0.0, 0.0, 1.2, 3.0][self.pace] / 30
+        features[..., PACE], features[..., TIMES] = self.pace, self.times
         return features, LastFrameState(features[:, -1])
 
 
+PACE, TIMES = LAYOUT.continuous - 1, LAYOUT.continuous - 2
 TOY = toy_density()
 TOLD = Told(TOY.initial_states, TOY.mean, TOY.sigma)
 STANDS = LastFrameState(torch.zeros(1, LAYOUT.size))
@@ -64,29 +71,40 @@ def test_a_pace_that_never_changes_goes_on():
 
 
 def test_each_piece_is_sampled_given_its_pace():
-    plan = list(islice(plan_paces(TOLD, STANDS, generator(5)), 12))
+    plan = list(islice(draw_paces(RATES, "stand", generator(5)), 12))
     frames = sum(count for _, count in plan)
-    pieces = list(islice(sample_pieces(TOLD, STANDS, generator(5), longest=40), 200))
-    assert max(map(len, pieces)) <= 40
-    sampled = torch.cat(pieces)[:frames, 0]
+    pieces = list(islice(sample_pieces(TOLD, STANDS, generator(5), longest=15), 2000))
+    assert max(map(len, pieces)) <= 15
     numbers = {"stand": 1.0, "walk": 2.0, "run": 3.0}
     expected = torch.cat([torch.full((count,), numbers[pace]) for pace, count in plan])
     # Nothing else draws from the generator here, so the plan is the same.
-    assert torch.equal(sampled, expected[: len(sampled)])
-    assert plan[0][0] == "stand"
+    sampled = torch.cat(pieces)[:frames]
+    assert torch.equal(sampled[:, PACE], expected[: len(sampled)])
+    assert bool((sampled[:, TIMES] == 1).all())
+
+
+def test_what_is_not_taken_on_is_told_more_emphatically_and_then_no_more():
+    slow = replace(TOLD, needed=3, rates={("stand", "walk"): 5.0})
+    sampled = torch.cat(list(islice(sample_pieces(slow, STANDS, generator()), 12)))
+    after = sampled[sampled[:, PACE] == 2]
+    assert after[:80:20, TIMES].tolist() == [1.0, 2.0, 3.0, 1.0]
+    assert bool((after[60:, TIMES] == 1).all())
+    deaf = replace(slow, needed=99)
+    assert float(torch.cat(list(islice(sample_pieces(deaf, STANDS, generator()), 30)))[:, TIMES].max()) == 4
 
 
 def test_the_first_pace_is_that_of_the_start():
     frame = torch.zeros(1, LAYOUT.size)
     LAYOUT.pick(frame, "root_displacement_heading")[:, 1] = 3.0 / 30
-    assert next(plan_paces(TOLD, LastFrameState(frame), generator()))[0] == "run"
+    assert float(next(sample_pieces(TOLD, LastFrameState(frame), generator()))[0, PACE]) == 3
 
 
 def test_nothing_is_told_where_no_pace_is_known_or_wanted():
     steady = replace(TOLD, rates={})
-    assert {float(piece[0, 0]) for piece in islice(sample_pieces(steady, STANDS, generator()), 3)} == {0.0}
+    assert plan_paces(steady, STANDS, generator()) is None
+    assert {float(piece[0, PACE]) for piece in islice(sample_pieces(steady, STANDS, generator()), 3)} == {0.0}
     free = GenerateSettings(condition_on_start=False)
-    assert {float(piece[0, 0]) for piece in islice(sample_pieces(TOLD, STANDS, generator(), free), 3)} == {0.0}
+    assert {float(piece[0, PACE]) for piece in islice(sample_pieces(TOLD, STANDS, generator(), free), 3)} == {0.0}
 
 
 def test_a_density_without_paces_samples_as_in_one_go():
