@@ -15,7 +15,11 @@ from mapctl.metrics.pace_changes import find_pace
 from mapctl.protocols import Density, DensityState
 
 _LOOK = 20  # frames after which is looked whether a pace has been taken on
-_MOST_EMPHATIC = 4  # times that a label is told at once
+_MOST_EMPHATIC = {
+    "stand": 4,
+    "walk": 4,
+    "run": 2,
+}  # times that a label is told at once; a run told more flings its legs
 _WITHOUT_END = 3600 * PRIOR_FPS  # frames for which a pace lasts that the data never change
 
 
@@ -63,7 +67,7 @@ class PacePlan:
             (self._pace, self._left), self._emphasis = next(self._paces), 1
             return
         has = find_pace(_measure_speed(features))
-        self._emphasis = 1 if has == self._pace else min(self._emphasis + 1, _MOST_EMPHATIC)
+        self._emphasis = 1 if has == self._pace else min(self._emphasis + 1, _MOST_EMPHATIC[self._pace])
 
 
 def plan_paces(prior: Density, state: DensityState, generator: torch.Generator) -> PacePlan | None:
