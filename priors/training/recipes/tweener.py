@@ -17,6 +17,7 @@ from mapctl.errors import RequestError
 from mapctl.inbetweening.position_image import mirror_positions
 from mapctl.metrics.liveliness import see_from_hips
 from mapctl.skeleton import CANONICAL
+from priors import checkpoints
 from priors.config import require_at_least
 from priors.training.augmentation.key_layouts import KeySequences, KeySettings, draw_splices, draw_windows
 from priors.training.augmentation.key_parts import WHOLE
