@@ -79,5 +79,5 @@ def plan_paces(prior: Density, state: DensityState, generator: torch.Generator) 
 
 
 def _measure_speed(features: Float[Tensor, "frames size"]) -> float:
-    """Of the way that the frames lead, m/s: without the sway of somebody who stands."""
+    """Speed of the way that the frames lead, m/s: without the sway of somebody who stands."""
     return float(LAYOUT.pick(features, "root_displacement_heading").mean(0).norm()) * PRIOR_FPS
