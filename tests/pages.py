@@ -115,7 +115,7 @@ def shorten(line: str) -> list[str]:
 
 def write_files(folder: Path) -> None:
     """All that the pages' code and commands name: clips, curves, folders of clips, and small models."""
-    save_tiny_prior(folder / "prior.safetensors", labels=("run", "elderly"))
+    save_tiny_prior(folder / "prior.safetensors", labels=("run", "elderly", "walk"))
     save_tiny_denoiser(folder / "denoiser.safetensors", drawn=0.02)
     save_tiny_infiller(folder / "infiller.safetensors", drawn=0.02)
     ours = make(Make(names_of("lafan1")))

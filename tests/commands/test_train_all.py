@@ -31,14 +31,15 @@ def save_model(folder: Path, kind: str, command: str, *, error: float = 1.0, siz
     quality = {"test": test, "test_nats_per_frame": -100.0 * error}
     if kind == "refiner":
         quality = {"jitter_m_s3_ratio": 1.0, "told_apart": 0.5 + error / 10}
-    density = shlex.split(command)[shlex.split(command).index("--density") + 1] if "--density" in command else ""
+    words = shlex.split(command)
+    used = {name: words[words.index(f"--{name}") + 1] for name in ("density", "stitcher") if f"--{name}" in words}
     training = {
         "command": command,
         "settings": {"steps": 24},
         "curve": [{"step": step, "round": step, "validation_nats": 1.0 - step, **test} for step in (8, 16, 24)],
         "ended": {"steps": 24, "decay_from": 20, "reason": "the curve was flat", "minutes": 1.5},
     }
-    data = {"density": density, "held_out": {"test": list(held_out)}}
+    data = {"density": "", **used, "held_out": {"test": list(held_out)}}
     shared = {"data": data, "training": training, "quality": quality, **Card.layout_fields()}
     card = Card(kind, {}, licence="none", **shared)
     folder.mkdir(parents=True, exist_ok=True)
@@ -179,7 +180,7 @@ def test_what_is_finished_is_skipped_and_what_is_not_goes_on(tmp_path, stage, tr
 
 
 def test_interrupted_it_says_what_to_type_and_that_goes_on(tmp_path, data, stage, train_all, capsys):
-    stage.interrupting = "general"
+    stage.interrupting = "stitcher"
     assert train_all("--jobs", 2, "--match", "walk", out="my set") == 130
     told = capsys.readouterr().err
     begin, _, typed = told.partition("go on with: ")

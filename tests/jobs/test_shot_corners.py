@@ -23,7 +23,7 @@ def test_a_corner_is_kept_to_without_a_lunge(last, seed):
     assert done.status.ok, done.status.text
     hips = done.motion.root_position[:, ::2]
     off = (hips - done.way.curve.point(done.way.curve.nearest(hips, done.way.arcs))).norm(dim=-1)
-    assert float(off.max()) < 0.075
+    assert float(off.max()) < 0.1, "what the page of limits says"
     toes = done.motion.joint_positions()[:, list(CANONICAL.indices(TOES))]
     assert float(torch.diff(toes, n=2, dim=0).norm(dim=-1).max()) * 900 < 88, "twice that of a circle of 2 m"
     facing = kinematics.heading(done.motion.local_quat_xyzw[-10:, 0])

@@ -183,7 +183,8 @@ def test_others_end_at_once_when_their_minutes_are_up(name, tmp_path, data, prio
     recipe = replace(MODELS[name].recipe(data, tmp_path / "run", prior), minutes=1e-9)
     train(recipe)
     training = read_training(tmp_path / "run")
-    assert training["ended"] == {"steps": 1, "decay_from": 1, "reason": "1e-09 minutes were nearly up", "minutes": 0.0}
+    assert training["ended"].pop("minutes") < 1
+    assert training["ended"] == {"steps": 1, "decay_from": 1, "reason": "1e-09 minutes were nearly up"}
     assert training["settings"][recipe.steps_name] == 1
     assert "--steps 1" in training["command"]
     assert training["curve"][-1][recipe.counter] == 1
