@@ -3,14 +3,13 @@
 from collections.abc import Mapping
 from dataclasses import asdict
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from controllers.benchmarks.shared.tables import Row
 from controllers.generation.generate import GenerateSettings, initialise_generation, sample_pieces
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, ground_speed, integrate_root
-from mapctl.metrics.pace_changes import PaceChanges, compute_ground_velocity, count_pace_changes
+from mapctl.metrics.pace_changes import CHANGES, PaceChanges, count_pace_changes, measure_speed
 from mapctl.metrics.states import summarise_states
 from mapctl.protocols import Density
 
@@ -29,8 +28,8 @@ def benchmark_free_run(
         changes = _count_pace_changes(features)
         everything.append(features)
         changed += changes
-        pace = ground_speed(features)
-        seconds = pace[: len(pace) // PRIOR_FPS * PRIOR_FPS].unflatten(0, (-1, PRIOR_FPS)).mean(-1)
+        speed = ground_speed(features)
+        seconds = speed[: len(speed) // PRIOR_FPS * PRIOR_FPS].unflatten(0, (-1, PRIOR_FPS)).mean(-1)
         rows.append(
             {
                 "run": str(run),
@@ -51,15 +50,14 @@ def benchmark_free_run(
 def summarise_held_changes(holds: Mapping[str, float]) -> dict[str, float]:
     """Summarise the changes of pace that a card tells of its clips as this table has them; nothing of what it does not
     tell."""
-    told = {"starts": "starts", "stops": "stops", "to_run": "changes to a run", "to_walk": "changes to a walk"}
-    counts = {name: holds[words] for name, words in told.items() if words in holds}
+    told = zip(asdict(PaceChanges()), CHANGES.values(), strict=True)
+    counts = {name: holds[words] for name, words in told if words in holds}
     return _count_in_ten_minutes(counts, holds["minutes"]) if counts else {}
 
 
 def _count_pace_changes(features: Tensor) -> PaceChanges:
     ground, _ = integrate_root(features.double(), GroundPose.origin(torch.float64))
-    velocity = compute_ground_velocity(ground.numpy(), PRIOR_FPS)
-    return count_pace_changes(np.linalg.norm(velocity, axis=1))
+    return count_pace_changes(measure_speed(ground.numpy(), PRIOR_FPS))
 
 
 def _count_in_ten_minutes(counts: Mapping[str, float], minutes: float) -> dict[str, float]:
@@ -68,11 +66,14 @@ def _count_in_ten_minutes(counts: Mapping[str, float], minutes: float) -> dict[s
 
 def _sample_free_run(prior: Density, frames: int, seed: int) -> Tensor:
     generator = torch.Generator().manual_seed(seed)
-    conditioned, state, _ = initialise_generation(prior, GenerateSettings(), None, generator)
-    pieces, sampled = sample_pieces(conditioned, state, generator, longest=frames), torch.zeros(0, LAYOUT.size)
-    while len(sampled) < frames:
-        sampled = torch.cat([sampled, next(pieces)])
-    return sampled[:frames]
+    beginning = initialise_generation(prior, GenerateSettings(), None, generator)
+    sampled, count = list[Tensor](), 0
+    for piece in sample_pieces(beginning, generator, longest=frames):
+        sampled.append(piece)
+        count += len(piece)
+        if count >= frames:
+            break
+    return torch.cat(sampled)[:frames]
 
 
 def _standardise_features(prior: Density, features: Tensor) -> Tensor:

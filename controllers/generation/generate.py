@@ -15,7 +15,7 @@ from torch import Tensor
 
 from controllers.common.character import Character
 from controllers.generation.foot_cleanup import FootCleanupSettings, clean_up_feet
-from controllers.generation.pace_plan import plan_paces
+from controllers.generation.pace_plan import measure_way_speed, plan_paces
 from mapctl import retarget
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS, GroundPose, encode, integrate_root
@@ -44,8 +44,10 @@ class GenerateSettings:
     """Index of one of the prior's initial states; sampled by their weights if None."""
     condition_on_start: bool = True
     """Whether a prior with labels is conditioned on those of the initial state's clip (gait, style): unconditioned it
-    lets most runs fall into a walk within ten seconds, which no clip of the data does. One that knows paces is told
-    them in turn, so that it sets off, stops and runs as often as its data."""
+    lets most runs fall into a walk within ten seconds, which no clip of the data does."""
+    tell_paces: bool = True
+    """Whether a prior that knows paces is told one after the other, as often as its data change theirs: samples of a
+    density hardly ever change theirs unless they are told."""
     foot_cleanup: FootCleanupSettings | None = field(default_factory=FootCleanupSettings)
     """Settings of the foot clean-up; None leaves it out."""
     sigma_planted: float | None = None
@@ -130,13 +132,25 @@ def _join_pieces(whole: Solution, piece: Solution) -> Solution:
     )
 
 
+@dataclass(frozen=True)
+class Beginning:
+    """What generation goes on from."""
+
+    prior: Density
+    """The prior, conditioned on the labels of the initial state's clip if requested."""
+    state: DensityState
+    """Its state before the first frame, a batch of one."""
+    ground_pose: GroundPose
+    """The character's before the first frame, float64."""
+    speed: float
+    """Mean speed of the hips over the ground in the second before, m/s."""
+
+
 def initialise_generation(
     prior: Density, settings: GenerateSettings, clip: Motion | None, generator: torch.Generator, *, scale: float = 1.0
-) -> tuple[Density, DensityState, GroundPose]:
-    """Return the prior, conditioned if requested, its state and the ground pose (float64) before the first frame.
-
-    Begins at an initial state of its own, or unconditioned at the end of a clip; the clip's lengths are divided by
-    `scale`, the ratio of its performer's size to the prior's.
+) -> Beginning:
+    """Begin at an initial state of the prior's, or unconditioned at the end of a clip, whose lengths are divided by
+    `scale`, the ratio of its performer's size to the prior's. RequestError for a start that the prior does not have.
     """
     if clip is not None:
         canonical, _ = retarget.to_canonical(clip)
@@ -147,33 +161,34 @@ def initialise_generation(
         ground, heading = integrate_root(features, ground_pose)
         observed = features.float()
         state = replay(prior, observed[1:], prior.start_after(observed[:1]))
-        return prior, state, GroundPose(ground[-1], heading[-1])
-    count = len(prior.initial_states.speed)
+        return Beginning(
+            prior, state, GroundPose(ground[-1], heading[-1]), measure_way_speed(observed[1:][-PRIOR_FPS:])
+        )
+    speeds = prior.initial_states.speed
+    count = len(speeds)
     if settings.start is not None and not 0 <= settings.start < count:
         raise RequestError(f"the prior has starts 0 to {count - 1}, got {settings.start}")
     sampled = int(torch.multinomial(prior.initial_states.weight, 1, generator=generator))
     pick = sampled if settings.start is None else settings.start
     state = prior.initial_states.state.pick(torch.tensor([pick]))
     prior = prior.conditioned_like_start(pick) if settings.condition_on_start else prior
-    return prior, state, GroundPose.origin(torch.float64)
+    return Beginning(prior, state, GroundPose.origin(torch.float64), float(speeds[pick]))
 
 
 def sample_pieces(
-    prior: Density,
-    state: DensityState,
+    beginning: Beginning,
     generator: torch.Generator,
     settings: GenerateSettings | None = None,
     *,
     longest: int | None = None,
 ) -> Iterator[Float[Tensor, "_ size"]]:
-    """Sample consecutive pieces of one motion, of at most `longest` frames (20 s if None), without end; `state` is a
-    batch of one.
+    """Sample consecutive pieces of one motion, of at most `longest` frames (20 s if None), without end.
 
-    `prior` is given what `initialise_generation` gives it. If it knows paces, it is told them one after the other
-    beside that, unless `settings` leave it unconditioned.
+    A prior that knows paces is told them one after the other, unless `settings` say otherwise.
     """
     settings, longest = settings or GenerateSettings(), longest or _CHUNK
-    paces = plan_paces(prior, state, generator) if settings.condition_on_start else None
+    prior, state = beginning.prior, beginning.state
+    paces = plan_paces(prior, beginning.speed, generator) if settings.tell_paces else None
     while True:
         told, count = (prior, longest) if paces is None else paces.tell(longest)
         draw = told.sample
@@ -215,16 +230,16 @@ def _start_stream(
     if not 0 < seconds < float("inf"):
         raise RequestError(f"seconds must be positive, got {seconds:g}")
     frames = max(2, round(seconds * PRIOR_FPS))
-    prior, state, ground_pose = initialise_generation(prior, settings, clip, generator, scale=character.scale)
-    pieces = sample_pieces(prior, state, generator, settings)
+    beginning = initialise_generation(prior, settings, clip, generator, scale=character.scale)
+    pieces, ground_pose = sample_pieces(beginning, generator, settings), beginning.ground_pose
     if refiner is not None:
         pieces = (piece[0] for piece in refiner.stream(piece.unsqueeze(0) for piece in pieces))
     if settings.foot_cleanup is not None:
         pieces = clean_up_feet(
-            prior,
+            beginning.prior,
             pieces,
             frames=frames,
-            state=state,
+            state=beginning.state,
             generator=generator,
             ground_pose=ground_pose,
             settings=settings.foot_cleanup.scaled_to(character),

@@ -11,15 +11,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl.features import LAYOUT, PRIOR_FPS
-from mapctl.metrics.pace_changes import find_pace
-from mapctl.protocols import Density, DensityState
+from mapctl.metrics.pace_changes import find_pace, label_pace
+from mapctl.protocols import Density
 
 _LOOK = 20  # frames after which is looked whether a pace has been taken on
-_MOST_EMPHATIC = {
-    "stand": 4,
-    "walk": 4,
-    "run": 2,
-}  # times that a label is told at once; a run told more flings its legs
+# Times that a label is told at once; a run that is told more often flings its legs.
+_MOST_EMPHATIC = {"stand": 4, "walk": 4, "run": 2}
 _WITHOUT_END = 3600 * PRIOR_FPS  # frames for which a pace lasts that the data never change
 
 
@@ -42,8 +39,7 @@ def draw_paces(
 class PacePlan:
     """Tells a prior paces one after the other, and the more emphatically the longer it does not take one on.
 
-    A label is a bias of the network's: told twice, it counts twice. Told once to set off, `general` does in 4 of 23
-    cases within 8 s; told three times over, in 18. Once it has the pace, telling it once suffices.
+    A label is a bias of the network's: told twice, it counts twice. Once it has the pace, telling it once suffices.
     """
 
     def __init__(self, prior: Density, paces: Iterator[tuple[str, int]]):
@@ -57,7 +53,7 @@ class PacePlan:
         """Return the prior told what is to come, and for how many frames, at most `longest`, it is to be sampled."""
         told = self._told.setdefault(self._pace, [self._prior])  # as often as their index says
         while len(told) <= self._emphasis:
-            told.append(told[-1].conditioned_on([f"pace={self._pace}"]))
+            told.append(told[-1].conditioned_on([label_pace(self._pace)]))
         return told[self._emphasis], min(self._left, longest, _LOOK)
 
     def see(self, features: Float[Tensor, "frames size"]) -> None:
@@ -66,18 +62,18 @@ class PacePlan:
         if self._left == 0:
             (self._pace, self._left), self._emphasis = next(self._paces), 1
             return
-        has = find_pace(_measure_speed(features))
+        has = find_pace(measure_way_speed(features))
         self._emphasis = 1 if has == self._pace else min(self._emphasis + 1, _MOST_EMPHATIC[self._pace])
 
 
-def plan_paces(prior: Density, state: DensityState, generator: torch.Generator) -> PacePlan | None:
-    """Plan which paces a prior is told after a state (batch of one): from the pace of the state's last frame on, as
-    often as its data change. None for a prior that knows no paces."""
+def plan_paces(prior: Density, speed: float, generator: torch.Generator) -> PacePlan | None:
+    """Plan which paces a prior is told: from the pace of a mean `speed`, m/s, on, as often as its data change. None for
+    a prior that knows no paces."""
     if not prior.pace_rates:
         return None
-    return PacePlan(prior, draw_paces(prior.pace_rates, find_pace(_measure_speed(state.last_frame)), generator))
+    return PacePlan(prior, draw_paces(prior.pace_rates, find_pace(speed), generator))
 
 
-def _measure_speed(features: Float[Tensor, "frames size"]) -> float:
+def measure_way_speed(features: Float[Tensor, "frames size"]) -> float:
     """Speed of the way that the frames lead, m/s: without the sway of somebody who stands."""
     return float(LAYOUT.pick(features, "root_displacement_heading").mean(0).norm()) * PRIOR_FPS

@@ -8,11 +8,19 @@ from numpy import ndarray
 from scipy.ndimage import gaussian_filter1d
 
 _SMOOTH_SECONDS = 0.2  # standard deviation of a Gaussian over which sway within a stride is averaged out
-_STANDS, _GOES = 0.2, 0.6  # m/s between which a start or a stop leads
+STANDS, GOES = 0.2, 0.6
+"""Speeds between which a start or a stop leads, m/s."""
 _WALKS, _RUNS = 1.7, 2.1  # m/s between which a change of gait leads
 
 PACES = "stand", "walk", "run"
 """Paces from slow to fast; who goes and does not run walks."""
+CHANGES = {
+    ("stand", "walk"): "starts",
+    ("walk", "stand"): "stops",
+    ("walk", "run"): "changes to a run",
+    ("run", "walk"): "changes to a walk",
+}
+"""Names of the changes from one pace to the next, by both, in the order of the fields of PaceChanges."""
 
 
 @dataclass(frozen=True)
@@ -31,6 +39,15 @@ class PaceChanges:
     def __add__(self, other: "PaceChanges") -> "PaceChanges":
         return PaceChanges(*(one + another for one, another in zip(astuple(self), astuple(other), strict=True)))
 
+    def by_name(self) -> dict[str, int]:
+        """Return how often each of CHANGES happens, by its name."""
+        return dict(zip(CHANGES.values(), astuple(self), strict=True))
+
+
+def label_pace(pace: str) -> str:
+    """Return the label of a pace, `pace=walk`, for a density that is conditioned on it."""
+    return f"pace={pace}"
+
 
 def compute_ground_velocity(ground: Float[ndarray, "frames 2"], fps: float) -> Float[ndarray, "frames 2"]:
     """Compute the velocity of the hips over the ground, m/s, from their x and z in metres, without the sway within a
@@ -40,10 +57,16 @@ def compute_ground_velocity(ground: Float[ndarray, "frames 2"], fps: float) -> F
     return gaussian_filter1d(velocity, _SMOOTH_SECONDS * fps, axis=0, mode="nearest")
 
 
+def measure_speed(ground: Float[ndarray, "frames 2"], fps: float) -> Float[ndarray, " frames"]:
+    """Measure the speed of the hips over the ground, m/s, from their x and z in metres, without the sway within a
+    stride; 0 for a single frame."""
+    return np.linalg.norm(compute_ground_velocity(ground, fps), axis=1) if len(ground) > 1 else np.zeros(len(ground))
+
+
 def count_pace_changes(speed: Float[ndarray, " frames"]) -> PaceChanges:
     """Count the changes along a motion's smoothed speed, m/s. Who hesitates without passing both bounds changes
     nothing."""
-    goes, runs = (_follow(speed, *bounds) for bounds in ((_STANDS, _GOES), (_WALKS, _RUNS)))
+    goes, runs = (_follow(speed, *bounds) for bounds in ((STANDS, GOES), (_WALKS, _RUNS)))
     return PaceChanges(_count_rises(goes), _count_rises(~goes), _count_rises(runs), _count_rises(~runs))
 
 
@@ -53,13 +76,13 @@ def follow_pace(speed: Float[ndarray, " frames"]) -> Int[ndarray, " frames"]:
     A pace lasts until the other bound of a change is passed, so that `count_pace_changes` counts the changes of it;
     before the first bound that is passed, it is the one that this bound tells.
     """
-    goes, runs = (_follow(speed, *bounds) for bounds in ((_STANDS, _GOES), (_WALKS, _RUNS)))
+    goes, runs = (_follow(speed, *bounds) for bounds in ((STANDS, GOES), (_WALKS, _RUNS)))
     return np.where(runs, 2, goes.astype(int))
 
 
 def find_pace(speed: float) -> str:
     """Find the pace of a mean speed, m/s, halfway between the bounds of changes."""
-    return PACES[(speed > (_STANDS + _GOES) / 2) + (speed > (_WALKS + _RUNS) / 2)]
+    return PACES[(speed > (STANDS + GOES) / 2) + (speed > (_WALKS + _RUNS) / 2)]
 
 
 def _follow(speed: Float[ndarray, " frames"], low: float, high: float) -> Bool[ndarray, " frames"]:

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl.errors import RequestError
-from mapctl.metrics.pace_changes import find_pace
+from mapctl.metrics.pace_changes import find_pace, label_pace
 from mapctl.protocols import DataLimits, Density, DiscreteChoices, InitialStates, PreparedRollout
 from priors import checkpoints
 from priors.lstm_gmm import labels as clip_labels
@@ -82,7 +82,7 @@ class LstmGmmDensity(checkpoints.LoadedModel, Density[LstmState]):
         """
         full, starts = [self._label(name) for name in labels], self.initial_states
         known = clip_labels.read(starts.names, self.card.data.get("labels", "")).renamed(tuple(full))
-        paces = [[f"pace={find_pace(speed)}" == label for label in full] for speed in starts.speed.tolist()]
+        paces = [[label_pace(find_pace(speed)) == label for label in full] for speed in starts.speed.tolist()]
         fitting = (known.held + torch.tensor(paces).reshape(known.held.shape)).sum(-1)
         rows = (fitting == fitting.max()).nonzero()[:, 0]
         weight = starts.weight[rows]
@@ -127,11 +127,12 @@ class LstmGmmDensity(checkpoints.LoadedModel, Density[LstmState]):
         return replace(self, reference=network, unconditioned=self.unconditioned or self)
 
     def _label(self, name: str) -> str:
-        """Find the label `group=value` of a name, which may be the value alone; RequestError if there is none."""
-        known = self.reference.config.labels
-        for label in known:
-            if name in (label, label.split("=", 1)[-1]):
-                return label
+        """Find the label `group=value` of a name, which may be the value alone; RequestError unless there is one."""
+        found = [label for label in self.reference.config.labels if name in (label, label.split("=", 1)[-1])]
+        if len(found) > 1:
+            raise RequestError(f"the prior {self.name!r} knows several labels {name!r}; choose {' or '.join(found)}")
+        if found:
+            return found[0]
         group, equals, value = name.partition("=")
         if not equals or group not in self.labels:
             group, value = " or ".join(self.labels) or "label", name

@@ -7,23 +7,18 @@ Unlike gait and style they do not hold for a clip, but for a moment: the pace wi
 from collections.abc import Mapping
 from typing import Any
 
-from mapctl.metrics.pace_changes import PACES
+from mapctl.metrics.pace_changes import CHANGES, PACES, label_pace
 
-PACE_LABELS = tuple(f"pace={pace}" for pace in PACES)
+PACE_LABELS = tuple(map(label_pace, PACES))
 """Labels of PACES."""
-_CHANGES = {
-    ("stand", "walk"): "starts",
-    ("walk", "stand"): "stops",
-    ("walk", "run"): "changes to a run",
-    ("run", "walk"): "changes to a walk",
-}
 
 
 def read_pace_rates(holds: Mapping[str, Any]) -> dict[tuple[str, str], float]:
-    """Read changes a second from one pace to another, by both paces, from what a card says that its clips hold."""
+    """Read changes a second from one pace to another, by both paces, from what a card says that its clips hold. None of
+    a pace that they hold for less than the 0.3 s to which a card rounds."""
     minutes = holds["minutes by pace"]
     return {
         (before, after): holds[name] / (60 * minutes[before])
-        for (before, after), name in _CHANGES.items()
-        if minutes[before] > 0
+        for (before, after), name in CHANGES.items()
+        if minutes[before] > 0 and minutes[after] > 0
     }

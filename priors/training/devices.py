@@ -54,8 +54,11 @@ def use_device(name: str) -> Iterator[None]:
 
 @cache
 def has_bfloat16() -> bool:
-    """Whether the processor computes in bfloat16: one that does not refuses an LSTM, and takes twenty times as long for
-    products as in float32."""
+    """Whether the processor computes in bfloat16: one that does not may refuse an LSTM, and is slower than in
+    float32."""
+    capabilities = getattr(torch.cpu, "get_capabilities", dict)()  # as of torch 2.10
+    if capabilities.get("architecture") == "x86_64":
+        return any(capabilities.get(name, False) for name in ("avx512_bf16", "amx_bf16", "avx_ne_convert"))
     network, sequence = torch.nn.LSTM(8, 8, device="cpu"), torch.zeros(2, 1, 8, device="cpu")
     try:
         with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
@@ -63,6 +66,11 @@ def has_bfloat16() -> bool:
     except RuntimeError:
         return False
     return True
+
+
+def find_precision(settings: object) -> str:
+    """`bfloat16` or `float32`, as the settings of a training say, if they do."""
+    return "bfloat16" if getattr(settings, "bfloat16", False) else "float32"
 
 
 def make_generator(seed: int) -> torch.Generator:

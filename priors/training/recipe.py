@@ -217,9 +217,10 @@ class Recipe(ABC, Generic[C, S, T]):
         return {} if self.split is None else {"split seed": str(self.split)}
 
     def pin(self, trainer: T, corpus: Corpus) -> dict[str, Row]:
-        """What must not change between a run's parts. The number of steps may: a run can be extended."""
+        """What must not change between a run's parts. The number of steps may, to extend it, and the precision."""
+        fixed = asdict(self.settings).keys() - {self.steps_name, "bfloat16"}
         return {
-            "settings": {name: value for name, value in asdict(self.settings).items() if name != self.steps_name},
+            "settings": {name: value for name, value in asdict(self.settings).items() if name in fixed},
             "network": self.find_shape(trainer).as_card(),
             "data": self.describe_data(corpus),
         }

@@ -20,7 +20,7 @@ from mapctl.errors import RequestError
 from mapctl.runtime.interruption import DeferredSignals, defer_signals
 from priors import checkpoints
 from priors.training import parallel, run_files
-from priors.training.devices import has_bfloat16, use_device
+from priors.training.devices import find_precision, has_bfloat16, use_device
 from priors.training.ending.course import Course
 from priors.training.gathering import Progress, gather
 from priors.training.parallel import ALONE, TrainingGroup
@@ -70,7 +70,7 @@ def train(
 
 def _fit_precision(recipe: Recipe[Any, Any, Any], warn: Progress) -> Recipe[Any, Any, Any]:
     """The same in float32 where bfloat16 is asked for, and the processor has none; its card then tells float32."""
-    if not getattr(recipe.settings, "bfloat16", False) or recipe.find_device() != "cpu" or has_bfloat16():
+    if find_precision(recipe.settings) == "float32" or recipe.find_device() != "cpu" or has_bfloat16():
         return recipe
     warn("this processor does not compute in bfloat16; training computes in float32")
     return replace(recipe, settings=replace(recipe.settings, bfloat16=False))
@@ -293,6 +293,7 @@ class TrainingRun(Generic[C, S, T]):
             "extended": self.extended,
             "processes": self.recipe.processes,
             "device": self.device,
+            "precision": find_precision(self.recipe.settings),
             "curve": self.curve,
             "losses": [_none_where_not_finite(row) for row in self.losses],
         }
@@ -353,7 +354,8 @@ class TrainingRun(Generic[C, S, T]):
             self._extend(index)
             self.course.load(out, index)
             self.trainer.load_state(tensors, int(index["step"]))
-            before, device = run_files.parse_processes(out, index), str(index.get("device", "cpu"))
+            before = run_files.parse_processes(out, index)
+            device, precision = str(index.get("device", "cpu")), index.get("precision")
         except run_files.UNREADABLE_ERRORS as error:
             raise run_files.make_unreadable_error(out, error) from error
         if before != recipe.processes:
@@ -361,8 +363,9 @@ class TrainingRun(Generic[C, S, T]):
                 f"{out} was trained in {before} processes and goes on in {recipe.processes}:"
                 " the result is as good, but not the same to the bit"
             )
-        if device != self.device:
-            warn(f"{out} was trained on {device} and goes on on {self.device}: the result is as good, but another one")
+        for how, then, now in (("on", device, self.device), ("in", precision, find_precision(recipe.settings))):
+            if then not in (now, None):
+                warn(f"{out} was trained {how} {then} and goes on {how} {now}: the result is as good, but another one")
 
     def _extend(self, index: dict[str, Any]) -> None:
         """Take what the checkpoint says of the number of steps; RequestError where more are done than are wanted."""

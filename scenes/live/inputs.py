@@ -59,7 +59,7 @@ class SteeringInputs:
             math.radians(self.heading),
             facing,
             step_length=self.step_length,
-            labels=tuple(self.labels.values()),
+            labels=tuple(f"{group}={label}" for group, label in self.labels.items()),
             reach={f"{hand}Hand": place for hand, place in reach.items()},
             look_at=self.target if self.looks else self.look_at,
         )

@@ -161,7 +161,7 @@ def test_features_are_the_motion_and_its_contact_labels():
 def test_starts_are_drawn_by_their_weight():
     only = replace(DENSITY, initial_states=replace(DENSITY.initial_states, weight=torch.tensor([0.0, 0.0, 1.0, 0.0])))
     for seed in range(5):
-        _, state, _ = initialise_generation(only, RAW, None, generator(seed))
+        state = initialise_generation(only, RAW, None, generator(seed)).state
         assert torch.equal(state.last_frame, DENSITY.initial_states.state.last_frame[2:3])
 
 

@@ -7,12 +7,13 @@ from itertools import islice, pairwise
 
 import pytest
 import torch
-from helpers import generator, tiny_density
+from helpers import generator, tiny_density, walk
 from toy_density import ToyDensity, toy_density
 
-from controllers.generation.generate import GenerateSettings, generate, sample_pieces
+from controllers.benchmarks.free_run import benchmark_free_run
+from controllers.generation.generate import Beginning, GenerateSettings, generate, initialise_generation, sample_pieces
 from controllers.generation.pace_plan import draw_paces, plan_paces
-from mapctl.features import LAYOUT
+from mapctl.features import LAYOUT, GroundPose
 from mapctl.protocols import LastFrameState
 
 RATES = {("stand", "walk"): 0.1, ("walk", "stand"): 0.05, ("walk", "run"): 0.15, ("run", "walk"): 0.5}
@@ -25,6 +26,7 @@ class Told(ToyDensity):
     pace: int = 0
     times: int = 0
     needed: int = 1
+    sway: float = 0.0
     rates: Mapping[tuple[str, str], float] = field(default_factory=lambda: RATES)
 
     @property
@@ -40,14 +42,28 @@ class Told(ToyDensity):
         step = LAYOUT.pick(features, "root_displacement_heading")
         if self.times >= self.needed:
             step[..., 1] = [0.0, 0.0, 1.2, 3.0][self.pace] / 30
+        step[..., 0] = self.sway / 30 * torch.tensor([1.0, -1.0]).repeat(frames)[:frames]
         features[..., PACE], features[..., TIMES] = self.pace, self.times
         return features, LastFrameState(features[:, -1])
+
+    def sample_planted(self, state, frames, generator, *, temperature=1.0, sigma_speed):
+        return self.sample(state, frames, generator, temperature=temperature)
 
 
 PACE, TIMES = LAYOUT.continuous - 1, LAYOUT.continuous - 2
 TOY = toy_density()
 TOLD = Told(TOY.initial_states, TOY.mean, TOY.sigma)
 STANDS = LastFrameState(torch.zeros(1, LAYOUT.size))
+
+
+def begin(prior=TOLD, speed=0.0) -> Beginning:
+    """Who stands, or goes at this speed, m/s."""
+    return Beginning(prior, STANDS, GroundPose.origin(torch.float64), speed)
+
+
+def sample(prior, pieces, *, settings=None, speed=0.0, seed=0):
+    """So many pieces, joined."""
+    return torch.cat(list(islice(sample_pieces(begin(prior, speed), generator(seed), settings), pieces)))
 
 
 def test_paces_last_as_long_as_the_rates_say():
@@ -73,7 +89,7 @@ def test_a_pace_that_never_changes_goes_on():
 def test_each_piece_is_sampled_given_its_pace():
     plan = list(islice(draw_paces(RATES, "stand", generator(5)), 12))
     frames = sum(count for _, count in plan)
-    pieces = list(islice(sample_pieces(TOLD, STANDS, generator(5), longest=15), 2000))
+    pieces = list(islice(sample_pieces(begin(), generator(5), longest=15), 2000))
     assert max(map(len, pieces)) <= 15
     numbers = {"stand": 1.0, "walk": 2.0, "run": 3.0}
     expected = torch.cat([torch.full((count,), numbers[pace]) for pace, count in plan])
@@ -85,32 +101,59 @@ def test_each_piece_is_sampled_given_its_pace():
 
 def test_what_is_not_taken_on_is_told_more_emphatically_and_then_no_more():
     slow = replace(TOLD, needed=3, rates={("stand", "walk"): 5.0})
-    sampled = torch.cat(list(islice(sample_pieces(slow, STANDS, generator()), 12)))
+    sampled = sample(slow, 12)
     after = sampled[sampled[:, PACE] == 2]
     assert after[:80:20, TIMES].tolist() == [1.0, 2.0, 3.0, 1.0]
     assert bool((after[60:, TIMES] == 1).all())
-    deaf = replace(slow, needed=99)
-    assert float(torch.cat(list(islice(sample_pieces(deaf, STANDS, generator()), 30)))[:, TIMES].max()) == 4
+    assert float(sample(replace(slow, needed=99), 30)[:, TIMES].max()) == 4
+    runs = {("walk", "run"): 5.0}
+    ran = sample(replace(slow, needed=99, rates=runs), 30, speed=1.2)
+    assert float(ran[ran[:, PACE] == 3, TIMES].max()) == 2, "a run that is told more often flings its legs"
+
+
+def test_who_sways_stands():
+    swaying = sample(replace(TOLD, sway=2.0, rates={("stand", "walk"): 0.01}), 8)
+    assert set(swaying[:, TIMES].tolist()) == {1.0}
+
+
+def test_planted_samples_are_told_too():
+    planted = GenerateSettings(sigma_planted=0.05)
+    assert {1.0, 2.0} <= set(sample(TOLD, 400, settings=planted)[:, PACE].tolist())
 
 
 def test_the_first_pace_is_that_of_the_start():
-    frame = torch.zeros(1, LAYOUT.size)
-    LAYOUT.pick(frame, "root_displacement_heading")[:, 1] = 3.0 / 30
-    assert float(next(sample_pieces(TOLD, LastFrameState(frame), generator()))[0, PACE]) == 3
+    for speed, pace in ((0.1, 1), (1.2, 2), (3.0, 3)):
+        assert float(sample(TOLD, 1, speed=speed)[0, PACE]) == pace
+    still = replace(tiny_density(), use_fast=False)
+    slow_to_fast = replace(
+        still, initial_states=replace(still.initial_states, speed=torch.tensor([0.1, 1.0, 2.0, 3.0]))
+    )
+    for start, speed in enumerate((0.1, 1.0, 2.0, 3.0)):
+        begun = initialise_generation(slow_to_fast, GenerateSettings(start=start), None, generator())
+        assert begun.speed == pytest.approx(speed)
+    clip = walk(60)
+    step = float(clip.root_position[-31:, [0, 2]].diff(dim=0).mean(0).norm()) * 30
+    assert initialise_generation(still, GenerateSettings(), clip, generator()).speed == pytest.approx(step, rel=0.05)
+
+
+def test_free_runs_are_told():
+    (*_, together, _) = benchmark_free_run(replace(TOLD, rates=RATES), {}, runs=2, frames=3000)
+    assert together["starts_10min"] > 5
+    assert together["to_run_10min"] > 5
 
 
 def test_nothing_is_told_where_no_pace_is_known_or_wanted():
     steady = replace(TOLD, rates={})
-    assert plan_paces(steady, STANDS, generator()) is None
-    assert {float(piece[0, PACE]) for piece in islice(sample_pieces(steady, STANDS, generator()), 3)} == {0.0}
-    free = GenerateSettings(condition_on_start=False)
-    assert {float(piece[0, PACE]) for piece in islice(sample_pieces(TOLD, STANDS, generator(), free), 3)} == {0.0}
+    assert plan_paces(steady, 0.0, generator()) is None
+    assert set(sample(steady, 3)[:, PACE].tolist()) == {0.0}
+    assert set(sample(TOLD, 3, settings=GenerateSettings(tell_paces=False))[:, PACE].tolist()) == {0.0}
 
 
 def test_a_density_without_paces_samples_as_in_one_go():
     density = replace(tiny_density(), use_fast=False)
     state = density.initial_states.state.pick(torch.tensor([0]))
-    (piece,) = islice(sample_pieces(density, state, generator(4), longest=50), 1)
+    begun = Beginning(density, state, GroundPose.origin(torch.float64), 1.0)
+    (piece,) = islice(sample_pieces(begun, generator(4), longest=50), 1)
     assert torch.equal(piece, density.sample(state, 50, generator(4))[0][0])
 
 

@@ -53,7 +53,7 @@ def test_orders_go_to_the_chosen_character_alone_and_the_panel_shows_them(show, 
     show.order(speed=0.5, facing=-90.0, labels={"gait": "walk", "style": "old"})
     run(show)
     assert actors[0].heard == [("command", Command(2.0, math.pi / 2))]
-    assert actors[1].heard == [("command", Command(0.5, 0.0, -math.pi / 2, labels=("walk", "old")))]
+    assert actors[1].heard == [("command", Command(0.5, 0.0, -math.pi / 2, labels=("gait=walk", "style=old")))]
     panel = show._panel.steering
     assert (panel.speed.value, panel.facing.value, panel.labels["gait"].value) == (0.5, -90, "walk")
     show.choose(0)

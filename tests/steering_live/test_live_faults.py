@@ -244,7 +244,7 @@ def test_whatever_two_browsers_send_every_command_can_be_obeyed_and_the_recordin
     commands = [command for word, command, *_ in actors[0].heard + actors[1].heard if word == "command"]
     assert len(commands) > 30
     assert all(command.within(3.8) == (command, []) for command in commands)
-    assert {label for command in commands for label in command.labels} <= {"run", "walk", "old"}
+    assert {label for command in commands for label in command.labels} <= {"gait=run", "gait=walk", "style=old"}
     _, console = said()
     assert "Traceback" not in console
     assert "went wrong" not in console

@@ -68,7 +68,7 @@ def test_labels_are_of_the_prior_and_of_one_group_at_a_time():
     orders, refusals = BOUNDS.changed(SteeringInputs(), {"labels": {"gait": "run"}})
     orders, more = BOUNDS.changed(orders, {"labels": {"style": "old"}})
     assert (orders.labels, refusals + more) == ({"gait": "run", "style": "old"}, [])
-    assert orders.command == Command(1.2, 0.0, labels=("run", "old"))
+    assert orders.command == Command(1.2, 0.0, labels=("gait=run", "style=old"))
     orders, refusals = BOUNDS.changed(orders, {"labels": {"gait": "swim", "mood": "bad"}})
     assert orders.labels == {"gait": "run", "style": "old"}
     assert refusals[0].text == "'swim' is not a gait that this prior knows."

@@ -42,6 +42,13 @@ def test_every_model_comes_to_the_same_on_another_device(tmp_path, data, gpu, na
     assert json.loads((tmp_path / "there" / "checkpoint.json").read_text())["device"] == "lazy"
 
 
+def test_paces_are_followed_on_the_processor(tmp_path, data, gpu):
+    made = MODELS["lstm-gmm"].recipe(data, tmp_path / "run", None)
+    made = replace(made, label_pace=True, device="auto", settings=replace(made.settings, steps=2))
+    train(made)
+    assert json.loads((tmp_path / "run" / "model.json").read_text())["config"]["labels"][-1] == "pace=run"
+
+
 def test_a_run_of_one_device_goes_on_on_another_and_says_so(tmp_path, data, gpu):
     made = replace(MODELS["path"].recipe(data, tmp_path / "run", None), device="auto")
     told = []
@@ -109,6 +116,39 @@ def test_a_processor_without_bfloat16_computes_in_float32_and_says_so(tmp_path, 
     train(made, warn=told.append)
     assert seen == [has]
     assert told == ([] if has else ["this processor does not compute in bfloat16; training computes in float32"])
+
+
+@pytest.mark.parametrize("first", ["bfloat16", "float32"])
+def test_a_run_may_go_on_in_the_other_precision_and_says_so(tmp_path, data, monkeypatch, first):
+    made, told = MODELS["path"].recipe(data, tmp_path / "run", None), []
+    for resume, precision, steps in ((False, first, 2), (True, first, 3), (True, "other", 4)):
+        monkeypatch.setattr(run, "has_bfloat16", lambda: True)
+        bfloat16 = (precision == "bfloat16") if precision != "other" else first != "bfloat16"
+        train(
+            replace(made, resume=resume, settings=replace(made.settings, steps=steps, bfloat16=bfloat16)),
+            warn=told.append,
+        )
+    other = {"bfloat16": "float32", "float32": "bfloat16"}[first]
+    (line,) = told
+    assert line.endswith(f"run was trained in {first} and goes on in {other}: the result is as good, but another one")
+
+
+@pytest.mark.parametrize(
+    ("capabilities", "has"),
+    [
+        ({"avx512_f": True, "avx512_bw": True, "avx512_vl": True, "avx512_dq": True}, False),
+        ({"avx512_bf16": True}, True),
+        ({"amx_bf16": True}, True),
+        ({"avx2": True}, False),
+    ],
+)
+def test_a_processor_is_known_by_its_capabilities(monkeypatch, capabilities, has):
+    monkeypatch.setattr(
+        torch.cpu, "get_capabilities", lambda: {"architecture": "x86_64", **capabilities}, raising=False
+    )
+    has_bfloat16.cache_clear()
+    assert has_bfloat16() is has
+    has_bfloat16.cache_clear()
 
 
 def test_a_gpu_is_asked_for_bfloat16_whatever_the_processor_has(tmp_path, data, monkeypatch):

@@ -10,7 +10,7 @@ from helpers import generator, go_at, run, tiny_density, write_corpus
 import priors
 from mapctl.errors import RequestError
 from priors.lstm_gmm.labels import Labels
-from priors.lstm_gmm.network import LstmGmmConfig
+from priors.lstm_gmm.network import LstmGmm, LstmGmmConfig
 from priors.lstm_gmm.paces import PACE_LABELS, read_pace_rates
 from priors.training.corpus import Corpus
 from priors.training.mocap.holdings import measure_holdings
@@ -85,11 +85,11 @@ def test_rates_are_those_of_the_clips(clips):
     assert rates["walk", "stand"] == pytest.approx(1 / (60 * minutes["walk"]))
     assert rates["walk", "run"] == pytest.approx(1 / (60 * minutes["walk"]))
     assert rates["run", "walk"] == 0.0
-    nobody = holds | {"minutes by pace": {"stand": 1.0, "walk": 0.0, "run": 0.0}}
-    assert set(read_pace_rates(nobody)) == {("stand", "walk")}
+    nobody = holds | {"minutes by pace": {"stand": 1.0, "walk": 2.0, "run": 0.0}}
+    assert set(read_pace_rates(nobody)) == {("stand", "walk"), ("walk", "stand")}
 
 
-def test_a_density_that_is_trained_so_knows_paces(tmp_path, capfd):
+def test_a_density_that_is_trained_so_knows_paces(tmp_path, capfd, monkeypatch):
     data = write_corpus(tmp_path / "data")
     words = "--match", "", "--width", 8, "--steps", 2, "--batch", 4, "--window", 12
     assert run("train", "lstm-gmm", "--data", data, "-o", tmp_path / "run", *words, "--label-pace") == 0
@@ -102,9 +102,18 @@ def test_a_density_that_is_trained_so_knows_paces(tmp_path, capfd):
     told = prior.conditioned_on(["pace=run"]).reference.fc1.bias
     assert not torch.equal(told, prior.reference.fc1.bias)
     # A run that goes on with it has its labels, and one that begins without them is refused.
-    more = "--data", data, "--match", "", "--steps", 1, "--batch", 4, "--window", 12
-    assert run("train", "lstm-gmm", "-o", tmp_path / "on", *more, "--label-pace", "--init", tmp_path / "run") == 0
-    assert priors.load(str(tmp_path / "on")).labels == prior.labels
+    more, told = ("--data", data, "--match", "", "--steps", 1, "--batch", 4, "--window", 12), []
+    make = DensityTrainer.__init__
+
+    def see(self, *given, paces=None, **named):
+        told.append(paces is not None)
+        make(self, *given, paces=paces, **named)
+
+    monkeypatch.setattr(DensityTrainer, "__init__", see)
+    for out, words in (("on", ("--label-pace",)), ("unasked", ())):
+        assert run("train", "lstm-gmm", "-o", tmp_path / out, *more, *words, "--init", tmp_path / "run") == 0
+        assert priors.load(str(tmp_path / out)).labels == prior.labels
+    assert told == [True, True], "labels that it is told by and by would otherwise be those of before"
     assert run("train", "lstm-gmm", "-o", tmp_path / "plain", *more, "--width", 8) == 0
     assert priors.load(str(tmp_path / "plain")).pace_rates == {}
     capfd.readouterr()
@@ -112,12 +121,37 @@ def test_a_density_that_is_trained_so_knows_paces(tmp_path, capfd):
     assert "was not trained with labels of paces; leave --label-pace out" in capfd.readouterr().err
 
 
+def test_paces_join_the_labels_of_clips_and_hold_for_copies(tmp_path, capfd):
+    data = write_corpus(tmp_path / "data")
+    labels = "(?P<gait>walk)"
+    words = "--data", data, "--match", "", "--width", 8, "--steps", 2, "--batch", 4, "--window", 12
+    out = tmp_path / "run"
+    assert run("train", "lstm-gmm", "-o", out, *words, "--label-pace", "--labels", labels, "--copies", 1) == 0
+    prior = priors.load(str(out))
+    assert prior.reference.config.labels == ("gait=walk", *PACE_LABELS)
+    with pytest.raises(RequestError, match="several labels 'walk'; choose gait=walk or pace=walk"):
+        prior.conditioned_on(["walk"])
+    assert prior.conditioned_on(["pace=walk"]).labels == prior.labels
+    capfd.readouterr()
+    assert run("train", "lstm-gmm", "-o", tmp_path / "no", *words, "--label-pace", "--labels", "(?P<pace>walk)") == 2
+    assert "the group pace is that of --label-pace" in capfd.readouterr().err
+
+
+def test_a_label_that_is_told_twice_counts_twice():
+    density = tiny_density()
+    names = (*density.reference.config.labels, *PACE_LABELS)
+    config = replace(density.reference.config, labels=names)
+    known = replace(density, reference=LstmGmm(config, mean=density.feature_mean, std=density.feature_std))
+    untold, once = known.reference.fc1.bias, known.conditioned_on(["pace=run"])
+    twice = once.conditioned_on(["pace=run"])
+    torch.testing.assert_close(twice.reference.fc1.bias - untold, 2 * (once.reference.fc1.bias - untold))
+
+
 def test_starts_are_picked_by_their_speed():
     density = tiny_density()
     names = (*density.reference.config.labels, *PACE_LABELS)
-    network = type(density.reference)(
-        replace(density.reference.config, labels=names), mean=density.feature_mean, std=density.feature_std
-    )
+    config = replace(density.reference.config, labels=names)
+    network = LstmGmm(config, mean=density.feature_mean, std=density.feature_std)
     found = replace(density.initial_states, speed=torch.tensor([0.1, 1.0, 1.2, 3.0]))
     known = replace(density, reference=network, initial_states=found)
     for pace, speeds in (("stand", [0.1]), ("walk", [1.0, 1.2]), ("run", [3.0])):

@@ -193,9 +193,15 @@ def test_they_are_kept_for_a_run_that_goes_on(corpus, tmp_path, all_pass, monkey
     assert torch.equal(again.features, made.features)
     assert (again.names, again.lengths, again.made) == (made.names, made.lengths, made.made)
     # Nothing else is taken for them.
-    for wanted, clips in ((Splices(5, one), corpus), (Splices(4, other), corpus), (Splices(4, one, seed=2), corpus)):
+    some = corpus.subset(range(1, len(corpus.names)))
+    for wanted, clips in (
+        (Splices(5, one), corpus),
+        (Splices(4, other), corpus),
+        (Splices(4, one, seed=2), corpus),
+        (Splices(4, one), some),
+    ):
         assert not torch.equal(add_splices(clips, wanted, cache).features, made.features)
-    assert len(list(cache.iterdir())) == 4
+    assert len(list(cache.iterdir())) == 5
     stored.write_bytes(b"damaged")
     assert torch.equal(add_splices(corpus, Splices(4, one), cache).features, made.features)
 

@@ -29,8 +29,9 @@ class Generate(ModelCommand):
     prior: options.Name = "locomotion"
     """A bundled prior, or the file or run folder of a trained one."""
     style: Annotated[str | None, arg(metavar="NAME,NAME")] = None
-    """Gait and style by the names of the prior's data, such as run or elderly,walk; `none` leaves the prior
-    unconditioned. If not given, those of the clip that it begins from."""
+    """Gait, style and pace by the names of the prior's data, such as run or elderly,walk; `none` leaves the prior
+    unconditioned. If not given, gait and style are those of the clip that it begins from. Unless a pace is named, a
+    prior that knows paces is told one after the other."""
     refiner: options.MaybeName = None
     """A refiner between samples and foot clean-up: a bundled one, the file or run folder of a trained one, or auto, the
     prior's own. None if not given: refined samples are told from mocap more often."""

@@ -21,6 +21,7 @@ from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.formats.bvh.stream import open_bvh_stream
 from mapctl.formats.whole_stream import open_whole_stream
+from mapctl.metrics.pace_changes import PACES, label_pace
 from mapctl.motion import Motion
 
 _MAX_CLIPS = 10_000
@@ -31,7 +32,9 @@ def run(command: Generate) -> int:
     frames, settings, clip = inputs.count_frames(command.seconds), *_check_settings(command)
     prior = priors.load(command.prior)
     if command.style not in (None, "none"):
-        prior = prior.conditioned_on([name.strip() for name in command.style.split(",")])
+        names = [name.strip() for name in command.style.split(",")]
+        prior = prior.conditioned_on(names)
+        settings = replace(settings, tell_paces=not {*names} & {*PACES, *map(label_pace, PACES)})
     refiner = None if command.refiner is None else priors.refiner_of(command.prior, command.refiner)
     character = read_character(command.rig)
     if settings.foot_cleanup is not None:
@@ -65,7 +68,14 @@ def _check_settings(command: Generate) -> tuple[GenerateSettings, Motion | None]
     finishing = None if command.no_refine or command.no_footing else FootCleanupSettings()
     start = int(command.start) if command.start and numbered else None
     planted = SIGMA_PLANTED if command.no_footing and command.refiner is None else None
-    settings = GenerateSettings(command.temperature, start, command.style is None, finishing, planted)
+    settings = GenerateSettings(
+        command.temperature,
+        start,
+        condition_on_start=command.style is None,
+        tell_paces=command.style != "none",
+        foot_cleanup=finishing,
+        sigma_planted=planted,
+    )
     if command.start is None or numbered:
         return settings, None
     return settings, inputs.read_motion(Path(command.start), None)

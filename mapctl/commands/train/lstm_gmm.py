@@ -33,8 +33,8 @@ class TrainDensity(TunableOptions):
     labels: Annotated[str, arg(metavar="REGEX")] = ""
     """Named groups read labels from the clips' paths, as in '_(?P<gait>walk|run)_(?P<style>[a-z]+)_', for --style."""
     label_pace: bool = False
-    """Make the pace a label as well: stand, walk or run, by how a window of training ends. Told one, the density
-    changes to it; random motion changes as often as the clips do."""
+    """Make the pace a label as well: stand, walk or run, by how a window of training ends. Random motion
+    is then told them one after the other, as often as the clips change theirs."""
     made: options.MaybeDataFolder = None
     """Folder of clips that mapctl make has made, to train on as well: starts, stops and turns that the data lack. None
     of them is held out."""

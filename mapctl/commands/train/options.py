@@ -212,7 +212,8 @@ class NetworkOptions(TrainOptions):
     window: options.MaybeCount = None
     """Frames a window."""
     bfloat16: bool = False
-    """Let the network compute in bfloat16, if the processor or GPU does: faster."""
+    """Let the network compute in bfloat16: faster. On a processor that does not have it, training says so and computes
+    in float32."""
     processes: options.Count = 1
     """Processes of this machine that share each step's batch, one a core; several machines: torchrun
     (docs/guides/training.md)."""

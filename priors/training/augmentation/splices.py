@@ -18,6 +18,7 @@ from mapctl import rotations
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, reversed_features
 from mapctl.metrics.mocap_bounds import find_bounds, list_faults, measure_checked
+from mapctl.metrics.pace_changes import GOES, STANDS
 from mapctl.pose import decode
 from mapctl.runtime.stepwise import StepwiseWork
 from priors.checkpoints import compute_hash
@@ -28,9 +29,9 @@ from priors.training.mocap.paces import measure_speeds
 
 FOLDER = "spliced/"
 """Before the names of splices in a corpus, which are those of both clips."""
-_STANDS, _GOES = 0.2, 0.6  # m/s that smoothed speed is under or over where a piece is cut
-_KINDS = ((_STANDS, _GOES), (_GOES, _STANDS), (_STANDS, _STANDS))
-"""Who sets off, who stops, who stands and does something else: by how the first piece ends and the second begins."""
+_KINDS = ((STANDS, GOES), (GOES, STANDS), (STANDS, STANDS))
+"""Who sets off, who stops, who stands and does something else: by the smoothed speed with which the first piece ends
+and the second begins, under STANDS or over GOES."""
 _PIECE = 45, 120  # frames of a piece
 _GAPS = range(15, 60, 5)  # frames between two: few lengths, each of which is walked at once
 _GAP_A_SPEED = 12.0  # frames by which a gap is longer for each m/s of difference
@@ -141,8 +142,8 @@ def draw_cuts(corpus: Corpus, count: int, gaps: Sequence[int], generator: torch.
     """Draw where pieces of two clips are cut, of each kind in turn, and which of the gaps lies between; RequestError
     for a corpus in which nobody stands for a piece."""
     speeds = measure_speeds(corpus)
-    ends = {bound: _find_frames(speeds, bound, lead=_PIECE[0]) for bound in (_STANDS, _GOES)}
-    beginnings = {bound: _find_frames(speeds, bound, rest=_PIECE[0]) for bound in (_STANDS, _GOES)}
+    ends = {bound: _find_frames(speeds, bound, lead=_PIECE[0]) for bound in (STANDS, GOES)}
+    beginnings = {bound: _find_frames(speeds, bound, rest=_PIECE[0]) for bound in (STANDS, GOES)}
     kinds = [(a, b) for a, b in _KINDS if len(ends[a]) and len(beginnings[b])]
     if not kinds:
         raise RequestError(f"splices need clips of {_PIECE[0] / PRIOR_FPS:g} s in which somebody stands")
@@ -176,7 +177,7 @@ def _find_frames(speeds: Sequence[Tensor], bound: float, *, lead: int = 1, rest:
     found = [torch.empty(0, 2, dtype=torch.long)]
     for clip, speed in enumerate(speeds):
         frames = torch.arange(lead - 1, max(lead - 1, len(speed) - rest))
-        frames = frames[speed[frames] < bound if bound == _STANDS else speed[frames] > bound]
+        frames = frames[speed[frames] < bound if bound == STANDS else speed[frames] > bound]
         found.append(torch.stack([torch.full_like(frames, clip), frames], dim=1))
     return torch.cat(found)
 

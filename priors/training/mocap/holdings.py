@@ -6,7 +6,14 @@ from numpy import ndarray
 from scipy.ndimage import gaussian_filter1d
 
 from mapctl.features import LAYOUT, PRIOR_FPS
-from mapctl.metrics.pace_changes import PACES, PaceChanges, compute_ground_velocity, count_pace_changes, follow_pace
+from mapctl.metrics.pace_changes import (
+    PACES,
+    PaceChanges,
+    compute_ground_velocity,
+    count_pace_changes,
+    follow_pace,
+    measure_speed,
+)
 from priors.training.corpus import Corpus
 
 SPEEDS = (0.15, 0.6, 1.1, 1.6, 2.2)
@@ -43,10 +50,7 @@ def measure_holdings(corpus: Corpus) -> dict[str, float | dict[str, float]]:
         "minutes": _to_minutes(len(speed)),
         "minutes by speed": _split_by_speed(speed),
         "minutes by pace": {name: _to_minutes(count) for name, count in zip(PACES, pace, strict=True)},
-        "starts": float(changes.starts),
-        "stops": float(changes.stops),
-        "changes to a run": float(changes.to_run),
-        "changes to a walk": float(changes.to_walk),
+        **{name: float(count) for name, count in changes.by_name().items()},
         **{f"seconds of {name}": round(float(chosen.sum()) / PRIOR_FPS, 1) for name, chosen in seconds.items()},
         "share of frames with a foot planted, each": round(
             float(LAYOUT.pick(corpus.features, "contacts").float().mean()), 3
@@ -75,4 +79,4 @@ def _track(
     velocity = compute_ground_velocity(ground, PRIOR_FPS)
     turn = np.degrees(gaussian_filter1d(np.gradient(heading, 1 / PRIOR_FPS), _SMOOTH, mode="nearest"))
     aside = np.degrees(np.arctan2(velocity[:, 0], velocity[:, 1]) - smooth)
-    return np.linalg.norm(velocity, axis=1), np.abs(turn), np.abs((aside + 180) % 360 - 180)
+    return measure_speed(ground, PRIOR_FPS), np.abs(turn), np.abs((aside + 180) % 360 - 180)

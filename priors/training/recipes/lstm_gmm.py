@@ -48,13 +48,16 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
     labels: str = ""
     """Regular expression whose named groups read labels from a clip's path, to condition the density on."""
     label_pace: bool = False
-    """Whether the pace is a label as well: stand, walk or run, by how a window ends."""
+    """Whether the pace is a label as well: stand, walk or run, by how a window ends. It is where training begins with a
+    prior that knows paces."""
     init: str | None = None
     """Prior whose weights and statistics training begins with; the network is then that prior's."""
 
     def __post_init__(self):
         super().__post_init__()
         require_at_least(self, 1, "starts")
+        if self.label_pace and "(?P<pace>" in self.labels:
+            raise RequestError("the group pace is that of --label-pace; call the one of --labels by another name")
 
     def check(self) -> None:
         """Before anything is read."""
@@ -71,16 +74,18 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
         with use_device("cpu"):  # copies are made one after the other
             seeded = make_generator(self.settings.seed)
             copied = add_copies(parts.train.to("cpu"), self.settings.copies, seeded)
+            followed = follow_paces(copied)
         corpus = copied.to(torch.get_default_device().type)
-        known = labels.read(hide_splices(corpus.names), self.labels)
-        paces = follow_paces(copied).to(corpus.features.device) if self.label_pace else None
+        known, followed = labels.read(hide_splices(corpus.names), self.labels), followed.to(corpus.features.device)
         if self.init is None:
             known = known.renamed((*known.names, *PACE_LABELS)) if self.label_pace else known
-            config = replace(self.config, labels=known.names)
+            config, paces = replace(self.config, labels=known.names), followed if self.label_pace else None
             return DensityTrainer(config, self.settings, corpus, labels=known, paces=paces)
         before = density.load(self.init).reference
-        known = known.renamed(before.config.labels)
-        if self.label_pace and not {*PACE_LABELS} <= {*known.names}:
+        known, paces = known.renamed(before.config.labels), None
+        if {*PACE_LABELS} <= {*known.names}:
+            paces = followed
+        elif self.label_pace:
             raise RequestError(f"the prior {self.init!r} was not trained with labels of paces; leave --label-pace out")
         return DensityTrainer(before.config, self.settings, corpus, labels=known, paces=paces, init=before.state_dict())
 
