@@ -1,10 +1,11 @@
 """Every model that can be trained, by recipes of six steps that are judged at every other."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import pytest
 import tiny_denoiser
 import tiny_infiller
 import tiny_path
@@ -120,3 +121,11 @@ VARIANTS = {
     ),
 }
 """What those commands train with other options."""
+
+
+_QUICK = "lstm-gmm", "refiner", "path"  # trained and judged in about a second, and each by a trainer of another kind
+
+
+def list_params(names: Iterable[str]) -> list:
+    """Parameters of a test for these models: all but the quickest, one of each kind of trainer, are marked slow."""
+    return [pytest.param(name, marks=() if name in _QUICK else pytest.mark.slow, id=name) for name in names]

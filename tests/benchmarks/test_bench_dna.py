@@ -61,6 +61,7 @@ def rows_of(make, examples):
     return {row["by"]: row for row in made}
 
 
+@pytest.mark.slow
 def test_who_shows_what_is_told_wins_all_pairs_and_who_does_not_none():
     examples = choose_examples(CLIPS, 3)
     shown = {id(one.dna): one.motion for one in examples}
@@ -124,6 +125,7 @@ def test_examples_are_of_different_content_and_keys_of_who_walks_and_who_stands(
         choose_keys([clip_of("run", "a")])
 
 
+@pytest.mark.slow
 def test_the_command_measures_clips_that_the_card_holds_out(tmp_path, capsys):
     data = tmp_path / "data"
     data.mkdir()

@@ -58,6 +58,7 @@ def test_clips_too_short_to_look_ahead_are_refused():
         MotionDatabase.of([encode(walk(20))[0].float()])
 
 
+@pytest.mark.slow
 def test_the_table_has_a_row_for_each_curve_and_method(database, tmp_path):
     density = priors.load(str(save_walking_density(tmp_path / "tiny.safetensors")))
     settings = FollowBenchmarkSettings(courses=(("line:2", 1.2),), seeds=2)

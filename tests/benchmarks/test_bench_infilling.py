@@ -84,6 +84,7 @@ def test_bones_are_rigid_but_for_networks_as_they_are(rows):
     assert max(row["bones_mm"] for method, row in found.items() if "raw" not in method) < 1e-6
 
 
+@pytest.mark.slow
 def test_an_untrained_network_is_interpolation_and_no_better(clips, monkeypatch):
     """It gives back the guess that it was shown: were that the truth, it would be perfect."""
     monkeypatch.setattr(infilling, "TASKS", SOME[1:2])
@@ -161,6 +162,7 @@ def folder(tmp_path):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_the_command_compares_networks_on_the_clips_kept_from_training(folder, capsys):
     other = save_tiny_infiller(folder / "other.safetensors")
     words = [

@@ -96,6 +96,7 @@ def test_gaps_with_a_past_are_measured_from_the_last_frame_before_them():
     assert told["error_cm"] < 0.1
 
 
+@pytest.mark.slow
 def test_who_moves_as_mocap_is_taken_for_it_and_interpolation_is_not():
     motion = walk(1001, turn_rate=0.2)
     clips = [motion.slice(first, first + 100) for first in range(0, 1001 - 100, 100)]
@@ -179,6 +180,7 @@ def write_bench_data(folder, count=9):
     return words, str(saved), str(recurrent)
 
 
+@pytest.mark.slow
 def test_the_command_measures_the_parts_that_are_asked_for(tmp_path, capsys):
     words, tweener, recurrent = write_bench_data(tmp_path, count=2)
     small = ("--count", 10, "--sequences", 2, "--frames", 200, "--raw")
@@ -200,6 +202,7 @@ def test_the_command_measures_the_parts_that_are_asked_for(tmp_path, capsys):
     )
 
 
+@pytest.mark.slow
 def test_the_command_prints_rows_for_a_page(tmp_path, capsys):
     words, *_ = write_bench_data(tmp_path, count=1)
     assert run("bench", "tweener", *words, "--frames", 60, "--raw", "--part", "speed", "--markdown") == 0

@@ -36,6 +36,7 @@ class Told(Inbetweener):
         return Proposal(made, estimate_contact_logits(made), "told")
 
 
+@pytest.mark.slow
 def test_who_knows_the_motion_is_as_alive_as_mocap_and_slerp_is_not():
     motion = walk(110)
     methods = [Method("told", Told(motion), RAW), Method("slow", Told(motion, slow=True), RAW)]
@@ -75,6 +76,7 @@ def test_gaps_lie_in_the_middle_and_shorter_clips_are_taken_whole():
     assert cut_middle(motion, 200) is None
 
 
+@pytest.mark.slow
 def test_the_command_compares_in_betweeners_on_held_out_clips(tmp_path, capsys):
     data = tmp_path / "data"
     (data / "bandai").mkdir(parents=True)

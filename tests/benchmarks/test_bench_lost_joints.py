@@ -50,6 +50,7 @@ def test_only_the_lost_joints_and_what_hangs_on_them_go_to_a_mean_pose(joints):
     assert moved[:, others].max() < 1e-9
 
 
+@pytest.mark.slow
 def test_a_row_for_every_kind_and_limb_and_none_for_clips_that_are_too_short():
     rows = benchmark_missing_joints({"walks": [walk(130), walk(150, seed=3)], "short": [walk(60)]}, tiny_infiller())
     assert [(row["method"], row["clips"]) for row in rows] == [("MAP on walks", 2)] * len(MISSING_LIMBS)

@@ -52,6 +52,7 @@ def test_a_drawn_pose_is_measured_in_its_plane_and_in_space(view):
     assert measure_drawn_pose(higher, true, view) == pytest.approx((10, 10, flat), abs=1e-6)
 
 
+@pytest.mark.slow
 def test_who_knows_the_motion_meets_keys_and_who_does_not_is_told(monkeypatch):
     """Drawings of one view will do: to fit poses to them takes a second each."""
     monkeypatch.setattr(partial_keys, "VIEWS_DEG", (45,))
@@ -88,6 +89,7 @@ def test_a_key_that_is_missed_is_told(monkeypatch):
     assert [row["missed_cm"] for row in rows] == pytest.approx([30, 30], abs=0.1)
 
 
+@pytest.mark.slow
 def test_the_command_measures_held_out_clips(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(partial_keys, "VIEWS_DEG", (90,))
     whats = ["halves", "places", "drawings at 90"]

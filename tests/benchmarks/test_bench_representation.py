@@ -63,6 +63,7 @@ def test_poses_of_features_are_those_of_the_motion_seen_along_its_heading():
     assert float(torch.atan2(hands[:, 0], hands[:, 2]).std()) > 1.2  # all round: 1.8 if even
 
 
+@pytest.mark.slow
 def test_training_brings_it_near_and_a_seed_gives_the_same_network():
     places = place_poses(corpus(3).features)
     for representation in BY_NAME.values():

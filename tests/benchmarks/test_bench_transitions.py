@@ -54,6 +54,7 @@ def row_of(rows, **wanted):
     return found
 
 
+@pytest.mark.slow
 def test_every_method_has_a_row_of_every_kind_and_length(rows):
     for length in transitions.LENGTHS:
         for kind, windows in (("walks", 1), ("turns", 2), (transitions.ALL_KINDS, 3)):

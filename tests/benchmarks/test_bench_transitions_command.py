@@ -38,6 +38,7 @@ def measure(folder, capsys, *words):
     return json.loads(capsys.readouterr().out)["rows"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("past", ["1", "10", "all"])
 def test_rows_of_methods_kinds_and_lengths_on_unseen_clips(folder, capsys, past):
     rows = measure(folder, capsys, "--past", past, "--raw", "--baselines", folder / "other.safetensors")
@@ -57,6 +58,7 @@ def test_finished_rows_and_auto_if_asked(folder, capsys):
     assert {"auto", f"{folder / 'ours.safetensors'}, finished"} <= methods
 
 
+@pytest.mark.slow
 def test_a_stitcher_has_rows_of_its_calm_answer_and_its_draws(folder, capsys):
     network, card = tiny_stitcher.network(config=LONG), replace(tiny_stitcher.card(LONG), data={"held_out": HELD_OUT})
     checkpoints.save(network.state_dict(), card, folder / "stitch.safetensors")
@@ -73,6 +75,7 @@ def test_a_stitcher_has_rows_of_its_calm_answer_and_its_draws(folder, capsys):
         assert by[f"{name}, calm, raw"]["apart_cm"] > 0
 
 
+@pytest.mark.slow
 def test_what_is_told_in_the_middle_is_met_by_all(folder, capsys):
     network, card = tiny_stitcher.network(config=LONG), replace(tiny_stitcher.card(LONG), data={"held_out": HELD_OUT})
     checkpoints.save(network.state_dict(), card, folder / "told.safetensors")
@@ -90,6 +93,7 @@ def test_what_is_told_in_the_middle_is_met_by_all(folder, capsys):
         assert by[what, names[1]]["step_cm"] != by["nothing", names[1]]["step_cm"]
 
 
+@pytest.mark.slow
 def test_with_a_density_there_are_its_rollouts_and_the_best_draw_by_its_energy(folder, capsys):
     names = []
     for number in range(2):
@@ -118,6 +122,7 @@ def test_models_that_saw_the_clips_are_refused(folder, capsys, option, save):
     assert "was trained on bandai/a_walk_0.bvh" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_errors_over_the_frames_are_drawn(folder, tmp_path, capsys):
     network, card = tiny_stitcher.network(config=LONG), replace(tiny_stitcher.card(LONG), data={"held_out": HELD_OUT})
     checkpoints.save(network.state_dict(), card, folder / "curve.safetensors")

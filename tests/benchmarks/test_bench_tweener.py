@@ -65,6 +65,7 @@ def test_rows_by_kind_and_over_all_clips_alike():
     assert rows[6]["V64_cm"] == rows[0]["V64_cm"]
 
 
+@pytest.mark.slow
 def test_a_clip_walked_in_place_gets_its_way_back_from_who_knows_it():
     motion = walk(80, turn_rate=0.3)
     found = measure_walked_in_place(motion, ToldPath(motion))

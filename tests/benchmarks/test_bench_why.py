@@ -36,6 +36,7 @@ def prior(tmp_path):
     return path
 
 
+@pytest.mark.slow
 def test_each_variant_is_compared_at_each_number_of_steps(mocap):
     variants = list_variants(tiny_density(), None, {}, {})[:1]
     parts = why.benchmark_why(variants, mocap, SETTINGS)
@@ -120,6 +121,7 @@ def test_clips_gone_on_with_are_as_long_as_what_they_are_compared_with_and_are_t
     assert not other[0].root_position.equal(made[0].root_position)
 
 
+@pytest.mark.slow
 def test_pairs_are_judged_by_networks_that_saw_neither():
     windows = [torch.randn(3, 30, 12, generator=torch.Generator().manual_seed(k)) for k in range(8)]
     judges = train_judges(windows, windows[::-1], generator=torch.Generator(), settings=replace(QUICK), paired=True)

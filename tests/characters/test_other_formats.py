@@ -30,6 +30,7 @@ def pairs():
     return [(source, out) for source in (".glb", ".fbx", ".usda") for out in (".glb", ".usda") if source != out]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("source", "out"), pairs())
 def test_the_mesh_goes_with_the_motion(source, out, tmp_path):
     for package, ending in (("pxr", ".usda"), ("ufbx", ".fbx")):
@@ -63,6 +64,7 @@ def test_a_motion_of_no_character_has_the_mannequin(tmp_path):
     assert len(formats.load_mesh(tmp_path / "walk.glb").vertices) > 1000
 
 
+@pytest.mark.slow
 def test_a_character_that_is_gone_leaves_the_mannequin(tmp_path):
     pytest.importorskip("ufbx")
     make_fbx(tmp_path / "hero.fbx")

@@ -352,6 +352,7 @@ class TestWriting:
         assert find_faults(tmp_path / "walk.usda") == []
 
 
+@pytest.mark.slow
 def test_follow_from_the_command_line(tmp_path):
     path = make(tmp_path, "centimetres", ".usdc", blend_shape=True)
     out = tmp_path / "hero-walk.usda"

@@ -59,6 +59,7 @@ def test_impossible_tables(fails, words, said):
     assert said in fails("bench", *words)
 
 
+@pytest.mark.slow
 def test_speed_is_measured(prior, monkeypatch, capsys):
     short = SpeedBenchmarkSettings(repeats=1, particles=(1,), lengths=(1.0,))
     monkeypatch.setattr("mapctl.commands.bench.speed.benchmark_speed", partial(benchmark_speed, settings=short))
@@ -89,6 +90,7 @@ def test_work_is_found(kind):
         assert callable(import_module(kind.work or f"{kind.__module__}.run").run)
 
 
+@pytest.mark.slow
 def test_live_targets_are_measured(prior, monkeypatch, capsys):
     monkeypatch.setattr("controllers.benchmarks.live_targets._SECONDS", 1.5)
     assert run("bench", "steer", "--targets", "--count", 1, "--prior", prior, "--json") == 0

@@ -40,6 +40,7 @@ def kinds(stages: list[Stage]) -> list[list[type]]:
     return [[type(player.body) for player in stage.players] for stage in stages]
 
 
+@pytest.mark.slow
 def test_render_shows_it_and_a_mannequin_without(hero, staged, tmp_path, caplog):
     walk(12).save(tmp_path / "walk.bvh")
     words = ("-o", tmp_path / "x.png", "--size", "96x64")
@@ -53,6 +54,7 @@ def test_render_shows_it_and_a_mannequin_without(hero, staged, tmp_path, caplog)
     assert kinds(staged) == [[SkinnedBody], [Mannequin]]
 
 
+@pytest.mark.slow
 def test_render_takes_a_characters_own_motion_as_it_is(staged, tmp_path):
     made = make_character_glb(tmp_path / "two.glb", animations=("walk", "run"), frames=13)
     out = tmp_path / "x.png"
@@ -64,6 +66,7 @@ def test_render_takes_a_characters_own_motion_as_it_is(staged, tmp_path):
     np.testing.assert_array_equal(*others)
 
 
+@pytest.mark.slow
 def test_what_a_retargeted_motion_cannot_keep_is_told(prior, hero, staged, tmp_path, capsys, monkeypatch):
     plain = DrawnCharacter.put_on
 
@@ -85,6 +88,7 @@ def test_what_a_retargeted_motion_cannot_keep_is_told(prior, hero, staged, tmp_p
     assert capsys.readouterr().out.count("its legs are too short") == 1
 
 
+@pytest.mark.slow
 def test_follow_shows_it_and_writes_the_same_motion(prior, hero, staged, tmp_path):
     words = ("line:2", "--seconds", "1", "--prior", prior, "--quiet", "--size", "96x64")
     for name, more in (("a", ("--character", hero)), ("b", ())):
@@ -94,6 +98,7 @@ def test_follow_shows_it_and_writes_the_same_motion(prior, hero, staged, tmp_pat
     assert (tmp_path / "a.bvh").read_bytes() == (tmp_path / "b.bvh").read_bytes()
 
 
+@pytest.mark.slow
 def test_with_its_bones_the_character_keeps_to_the_curve(prior, hero, staged, tmp_path):
     words = ("line:2", "--seconds", "1", "--prior", prior, "--quiet", "--size", "96x64", "--rig", hero)
     assert run("follow", *words, "-o", tmp_path / "a.glb", "--video", tmp_path / "a.png", "--character", hero) == 0
@@ -113,6 +118,7 @@ actors = [
 """
 
 
+@pytest.mark.slow
 def test_scenes_tell_by_actor_and_the_option_for_all_others(prior, hero, staged, tmp_path):
     (tmp_path / "own").mkdir()
     make_character_glb(tmp_path / "own" / "child.glb", size=0.6)
@@ -125,6 +131,7 @@ def test_scenes_tell_by_actor_and_the_option_for_all_others(prior, hero, staged,
     assert heights[1] < 0.75 * heights[0]
 
 
+@pytest.mark.slow
 def test_a_scene_without_a_film_needs_no_character(prior, hero, staged, tmp_path, fails):
     scene = tmp_path / "scene.toml"
     scene.write_text(SCENE.format(prior=prior, outputs="'x.json'"))
@@ -148,6 +155,7 @@ def write_broken(folder):
     }
 
 
+@pytest.mark.slow
 def test_what_is_no_character_is_one_line_and_nothing_is_written(prior, tmp_path, fails, monkeypatch):
     monkeypatch.setenv("MAPCTL_RENDERER", "stick")
     for file, said in write_broken(tmp_path).items():

@@ -74,6 +74,7 @@ def test_same_seed_same_bytes(prior, tmp_path):
     assert any(written(f"{seed}.bvh", seed) != first for seed in range(5))
 
 
+@pytest.mark.slow
 def test_strict_says_when_not_all_holds(prior, tmp_path, capsys):
     """The made-up prior's data reach 2 m/s."""
     words = ("follow", "line:4", "-o", tmp_path / "a.bvh", "--seconds", 0.4, "--prior", prior)
@@ -89,6 +90,7 @@ def test_strict_says_when_not_all_holds(prior, tmp_path, capsys):
     assert run("run", tmp_path / "fast.toml", "-o", tmp_path / "scene", "--quiet", "--strict") == 3
 
 
+@pytest.mark.slow
 def test_generate_writes_different_clips(prior, tmp_path):
     assert run("generate", "-o", tmp_path / "new" / "gen", "--seconds", 1.5, "--count", 3, "--prior", prior) == 0
     clips = sorted((tmp_path / "new" / "gen").iterdir())
@@ -106,6 +108,7 @@ def test_generate_writes_different_clips(prior, tmp_path):
     assert raw != planted
 
 
+@pytest.mark.slow
 def test_generate_goes_on_from_a_clip_or_a_start(walk, prior, tmp_path):
     words = ("generate", "--seconds", 1, "--prior", prior, "--temperature", 0)
     assert run(*words, "-o", tmp_path / "clip", "--start", walk) == 0
@@ -117,6 +120,7 @@ def test_generate_goes_on_from_a_clip_or_a_start(walk, prior, tmp_path):
     assert float((ends - begins).norm()) < 0.2
 
 
+@pytest.mark.slow
 def test_long_motion_comes_in_pieces(prior, tmp_path, monkeypatch):
     """Of two seconds here: 4.5 s are three; the header was written before the last of them was drawn."""
     monkeypatch.setattr(import_module("controllers.generation.generate"), "_CHUNK", 60)
@@ -163,6 +167,7 @@ def test_measure_prints_json_and_a_table(walk, prior, capsys):
     assert "1.9 (1.2 to 2.6)" in table
 
 
+@pytest.mark.slow
 def test_render_and_follow_make_films(walk, prior, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("MAPCTL_RENDERER", "stick")
     assert run("render", walk, "-o", tmp_path / "a.png", "--size", "96x64", "--curve", "circle:3") == 0
@@ -244,6 +249,7 @@ def test_train_takes_its_options(tmp_path):
     assert paper.recipe().settings.optimiser == "rmsprop"
 
 
+@pytest.mark.slow
 def test_clips_that_are_finished_stay(prior, tmp_path, monkeypatch, capsys):
     from mapctl.formats.bvh.stream import BvhStream
 

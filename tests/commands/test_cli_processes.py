@@ -20,6 +20,7 @@ def python(*words: object, **more) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=120, **more)
 
 
+@pytest.mark.slow
 def test_help_imports_nothing_heavy():
     script = (
         "import sys\nfrom mapctl import cli\n"

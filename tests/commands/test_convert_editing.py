@@ -126,6 +126,7 @@ def test_a_rate_of_captures_is_for_captures_alone(here):
     assert [mapctl.load(f"out/{name}.npz").fps for name in ("c", "day 1/a")] == [60, 30]
 
 
+@pytest.mark.slow
 def test_a_folder_on_another_rig(here):
     assert run("convert", "takes", "out", "--rig", "mixamo", "--mirror", "--root-motion", "--quiet") == 0
     assert mapctl.load("out/c.bvh").skeleton.names[:2] == ("root", "mixamorig:Hips")
@@ -151,6 +152,7 @@ def test_what_is_there_is_done_again_only_if_asked_for(here, capsys):
     assert Path("out/c.bvh").read_text() != "mine"
 
 
+@pytest.mark.slow
 def test_more_processes_give_the_same_files(here):
     assert run("convert", "takes", "one", "--plant-feet", "--quiet") == 0
     assert run("convert", "takes", "two", "--plant-feet", "--quiet", "--jobs", 2) == 0

@@ -63,12 +63,14 @@ def test_report_mask_and_sigmas(denoise, recording, tmp_path):
     assert {("Hand_L", 10, 14), ("Hand_L", 30, 31), ("Hips", 30, 31)} <= lost
 
 
+@pytest.mark.slow
 def test_a_plot_is_a_picture(denoise, recording, tmp_path):
     pytest.importorskip("matplotlib")
     assert denoise(recording, "-o", tmp_path / "out.bvh", "--plot", tmp_path / "p.png", "--quiet") == 0
     assert (tmp_path / "p.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_causal_is_said(denoise, recording, tmp_path, capsys):
     assert denoise(recording, "-o", tmp_path / "out.bvh", "--causal", "--delay", 0.3) == 0
     assert "causal: a frame is decided at most 0.30 s after it came" in capsys.readouterr().out
@@ -81,6 +83,7 @@ def test_a_prior_joins_the_last_stage(denoise, recording, tmp_path):
     assert "likelihood" in json.loads(report.read_text())["ledger"]
 
 
+@pytest.mark.slow
 def test_auto_chooses_among_the_bundled_densities_and_says_which(denoise, recording, tmp_path, capsys):
     report = tmp_path / "r.json"
     assert denoise(recording, "-o", tmp_path / "o.bvh", "--prior", "auto", "--report", report) == 0
@@ -112,6 +115,7 @@ def folder(tmp_path):
     return place
 
 
+@pytest.mark.slow
 def test_a_folder_becomes_a_folder_of_the_same_names(denoise, folder, tmp_path, capsys):
     out, reports = tmp_path / "out", tmp_path / "reports"
     assert denoise(folder, "-o", out, "--report", reports) == 0
@@ -121,6 +125,7 @@ def test_a_folder_becomes_a_folder_of_the_same_names(denoise, folder, tmp_path, 
     assert "2 denoised" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_what_is_there_is_not_done_again_unless_asked_for(denoise, folder, tmp_path, capsys):
     out = tmp_path / "out"
     (out / "deep").mkdir(parents=True)
@@ -182,6 +187,7 @@ def test_a_full_disk_ends_a_folder_in_one_line(denoise, folder, tmp_path, monkey
     assert [path.name for path in out.rglob("*") if path.is_file()] == ["a.bvh"]
 
 
+@pytest.mark.slow
 def test_an_output_folder_inside_the_input_is_not_denoised_itself(denoise, folder, capsys):
     for _ in range(2):
         assert denoise(folder, "-o", folder / "clean", "--again") == 0

@@ -46,6 +46,7 @@ JOBS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("job", JOBS)
 def test_every_job_takes_files_and_classes(here, models, capsys, job):
     found = {}
@@ -112,6 +113,7 @@ def test_options_that_do_not_go_with_a_style_are_refused(here, capsys, job, word
     assert said in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("dna", "names"),
     [
@@ -142,6 +144,7 @@ def test_variations_are_drawn_among_styles_and_come_again(here, models, prior, c
         assert lines[1] != lines[2]
 
 
+@pytest.mark.slow
 def test_the_seed_draws_the_order_of_styles(here, models, prior, capsys):
     words = [*JOBS["tween"], *models, "--prior", prior, "--variations", 2, "--dna", "walk,style.bvh,wave-left-hand"]
     for seed in range(4):
@@ -150,6 +153,7 @@ def test_the_seed_draws_the_order_of_styles(here, models, prior, capsys):
     assert len({line.partition(" in the style of ")[2] for line in lines}) > 1
 
 
+@pytest.mark.slow
 def test_variations_are_shown_below_each_other(here, models, prior):
     words = [*JOBS["tween"], *models, "--prior", prior, "--variations", 2, "--dna", "style.bvh", "--quiet"]
     assert run("tween", *words, "--video", "four.png") == 0

@@ -82,6 +82,7 @@ def test_the_roots_place_alone_may_be_lost(infilled, clip, tmp_path, rig, root):
     assert infilled(lossy) == infilled(source, "--joints", "root position", "--gap", "20:30")
 
 
+@pytest.mark.slow
 def test_what_is_asked_for_comes_to_what_is_nan(infilled, clip, tmp_path):
     source = clip("bandai")
     both = without(source, tmp_path / "both.bvh", [("", 8, 12), ("Hand_L", 20, 30)])

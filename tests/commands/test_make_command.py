@@ -109,6 +109,7 @@ def test_what_cannot_be_measured_is_a_fault():
     ]
 
 
+@pytest.mark.slow
 def test_what_fails_is_listed_and_not_kept(tmp_path, prior, capsys):
     assert make(tmp_path, prior) == 0
     told, rows = capsys.readouterr().out, table(tmp_path)
@@ -118,6 +119,7 @@ def test_what_fails_is_listed_and_not_kept(tmp_path, prior, capsys):
     assert not list((tmp_path / "set" / "made").glob("*.bvh"))
 
 
+@pytest.mark.slow
 def test_what_passes_is_kept_and_trained_on_by_name(tmp_path, prior, monkeypatch, capsys):
     monkeypatch.setattr(make_run, "find_bounds", lambda reference: LOOSE | {"jitter_m_s3": math.inf})
     assert make(tmp_path, prior, "--seed", 5, "--quiet") == 0
@@ -139,6 +141,7 @@ def test_what_passes_is_kept_and_trained_on_by_name(tmp_path, prior, monkeypatch
     assert priors.load(str(tmp_path / "run")).card.data["made"] == [said]
 
 
+@pytest.mark.slow
 def test_made_clips_of_another_folder_are_trained_on_beside_the_data(tmp_path, capsys):
     data, made = tmp_path / "data", tmp_path / "elsewhere"
     write_corpus(data, 6)

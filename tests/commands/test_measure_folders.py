@@ -50,6 +50,7 @@ def told(capsys, *words: object) -> dict:
     return json.loads(capsys.readouterr().out)
 
 
+@pytest.mark.slow
 def test_a_folder_shows_the_means_of_its_clips(made, capsys):
     values = told(capsys, made)
     rows = [metrics.measure(walk(95, cadence=0.8 + 0.05 * k, seed=k)) for k in range(8)]
@@ -88,6 +89,7 @@ def test_the_seed_decides_alone(made, mocap, capsys):
     assert first["realism"]["frechet"] == other["realism"]["frechet"]
 
 
+@pytest.mark.slow
 def test_rigs_do_not_matter(made, tmp_path, capsys):
     """The same walks on another rig have the same measures, jitter of every joint too."""
     rigmap = retarget.identify_rig(bandai_skeleton())
@@ -133,6 +135,7 @@ def test_clips_that_cannot_be_measured_are_left_out_and_listed(tmp_path, capsys)
     assert len(lines) == 2
 
 
+@pytest.mark.slow
 def test_a_clip_too_short_for_a_window_does_not_end_the_comparison(mocap, tmp_path, capsys):
     for k in range(8):
         walk(95, cadence=0.8 + 0.05 * k, seed=k).save(tmp_path / f"{k}.bvh")
@@ -149,6 +152,7 @@ def test_a_folder_of_which_nothing_can_be_measured_is_refused(tmp_path, capsys):
     assert f"{tmp_path}: no clip can be measured; {tmp_path / 'one.bvh'}: measures need" in line
 
 
+@pytest.mark.slow
 def test_a_refusal_for_too_few_clips_says_what_was_left_out(made, tmp_path, capsys):
     bad_clips(tmp_path)
     walk(40).save(tmp_path / "a.bvh")
@@ -161,6 +165,7 @@ def test_a_folder_and_a_clip_are_not_compared(made, capsys):
     assert "a folder and a clip" in refused(capsys, made / "0.bvh", "--reference", made)
 
 
+@pytest.mark.slow
 def test_too_few_clips_are_refused(made, tmp_path, capsys):
     walk(40).save(tmp_path / "a.bvh")
     line = refused(capsys, tmp_path, "--reference", made)

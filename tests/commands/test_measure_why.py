@@ -38,6 +38,7 @@ def words(folders, name, *more):
     return ["measure", folders / name, "--reference", folders / "mocap", "--why", *more]
 
 
+@pytest.mark.slow
 def test_a_bent_head_is_named_with_clips_to_look_at(folders, capsys):
     picture = folders / "why.png"
     assert run(*words(folders, "bent", "--steps", 60, "-o", picture), "--json") == 0
@@ -56,6 +57,7 @@ def test_a_bent_head_is_named_with_clips_to_look_at(folders, capsys):
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_tables_name_what_is_more_than_chance(folders, capsys):
     assert run(*words(folders, "bent", "--steps", 60)) == 0
     told = capsys.readouterr().out
@@ -67,6 +69,7 @@ def test_tables_name_what_is_more_than_chance(folders, capsys):
     assert "head, mean pose (" in told
 
 
+@pytest.mark.slow
 def test_no_cause_is_named_where_sets_are_alike(folders, capsys):
     assert run(*words(folders, "same", "--steps", 5)) == 0
     told = capsys.readouterr().out
@@ -75,6 +78,7 @@ def test_no_cause_is_named_where_sets_are_alike(folders, capsys):
     assert not any(band in told for band in BANDS)
 
 
+@pytest.mark.slow
 def test_steps_decide_how_strict_the_judge_is(folders, capsys):
     found = []
     for steps in (2, 60):

@@ -49,6 +49,7 @@ def test_the_same_bytes_come_twice_and_quiet_says_nothing(command, tiny, source,
     assert capsys.readouterr().out == ""
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(any(find_spec(name) is None for name in ("matplotlib", "PIL")), reason="needs mapctl[render]")
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_film_is_made(command, tiny, source, tmp_path):

@@ -61,6 +61,7 @@ def test_info_tells_a_clips_rig(clip, capsys):
     assert all(word in shown for word in ("mixamo", "centimetres", "+z", "1.50", "mixamorig:LeftUpLeg", "Prop_sword"))
 
 
+@pytest.mark.slow
 def test_info_tells_a_sure_fit_and_draws_it(clip, tmp_path, capsys):
     assert run("info", clip, "-o", tmp_path / "rig.png") == 0
     assert "fit: sure\n" in capsys.readouterr().out
@@ -82,6 +83,7 @@ def odd(tmp_path):
     return path
 
 
+@pytest.mark.slow
 def test_info_tells_each_doubt_in_a_line_and_convert_notes_it(odd, tmp_path, capsys):
     reason = "leftHand is known by its place alone (joint 'a17')"
     assert run("info", odd, "--out", tmp_path / "odd.png") == 0

@@ -141,6 +141,7 @@ def cells():
             yield pytest.param(rig, command, marks=() if quick else pytest.mark.slow, id=f"{rig}-{command}")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "command"), [*cells()])
 def test_every_command_on_every_rig(name, command, rigs, walked, tmp_path, capsys):
     rig = rigs(name)

@@ -25,6 +25,7 @@ def keys(tmp_path):
     return path
 
 
+@pytest.mark.slow
 def test_follow_starts_and_ends_standing_and_tells_every_wish(keys, tmp_path, capsys):
     out, report = tmp_path / "a.bvh", tmp_path / "a.json"
     words = [
@@ -53,6 +54,7 @@ def test_follow_starts_and_ends_standing_and_tells_every_wish(keys, tmp_path, ca
     assert all({"asked", "got", "residual", "unit", "holds"} <= wish.keys() for wish in found["wishes"])
 
 
+@pytest.mark.slow
 def test_a_scene_goes_on_from_a_clip_on_its_rig_and_keeps_apart(tmp_path):
     on_rig("bandai", 70).save(tmp_path / "clip.bvh")
     (tmp_path / "scene.toml").write_text(
@@ -107,6 +109,7 @@ def test_a_key_within_an_obstacle_is_refused(tmp_path, capsys):
     assert "within the obstacle at 1, 1" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_shot_holds_a_pose_of_another_rig_and_ends_in_a_clip_and_its_wishes_have_prices(tmp_path, capsys):
     on_rig("bandai", 70).save(tmp_path / "clip.bvh")
     on_rig("cmu", 40).save(tmp_path / "pose.bvh")
@@ -127,6 +130,7 @@ def test_a_shot_holds_a_pose_of_another_rig_and_ends_in_a_clip_and_its_wishes_ha
     assert "price     for pose at 0.9 s" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_loop_leads_into_its_first_frame_at_any_rate(tmp_path):
     out = tmp_path / "a.bvh"
     assert run("follow", "circle:0.8", "-o", out, "--loop", "--fps", 100) == 0

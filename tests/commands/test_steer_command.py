@@ -55,6 +55,7 @@ def test_limits_that_cannot_be_are_refused(steer, tmp_path, capsys):
     assert not (tmp_path / "a.bvh").exists()
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_bytes(steer, tmp_path):
     found = set()
     for _ in range(2):
@@ -152,6 +153,7 @@ def test_a_short_command_has_no_steady_part():
     assert rows[1]["steady_heading_error_deg"] is None
 
 
+@pytest.mark.slow
 def test_a_wanted_step_length_is_in_the_ledger_and_the_report(steer, tmp_path, capsys):
     script = "time_s,speed_mps,heading_deg,step_m\n0,1.2,0,\n0.2,1.2,0,0.6\n0.5,1.2,0,\n"
     assert steer(script, "--report", tmp_path / "r.json") == 0
@@ -166,6 +168,7 @@ def test_steps_of_a_walk_are_measured():
     assert row["steady_step_m"] == pytest.approx(1.2 / (2 * 0.9), rel=0.15)  # two steps a stride
 
 
+@pytest.mark.slow
 def test_what_hands_and_head_are_told_and_what_is_walked_round_is_reported(steer, tmp_path, capsys):
     script = (
         "time_s,speed_mps,heading_deg,right_hand_x,right_hand_y,right_hand_z,look_x,look_y,look_z\n"
@@ -205,6 +208,7 @@ def test_a_place_is_reached_in_time_and_told(steer, tmp_path, capsys):
     assert re.search(r"^licence .*; CC BY 4\.0 \(\S+\.csv\)$", told, re.MULTILINE)
 
 
+@pytest.mark.slow
 def test_a_place_that_nobody_reaches_is_said_and_strict_fails(steer, tmp_path, capsys):
     stitcher = save_tiny_stitcher(tmp_path / "stitch.safetensors")
     script = GOTO + "0.2,1.0,40,30,0,0.7,,\n"

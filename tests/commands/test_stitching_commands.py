@@ -36,6 +36,7 @@ def test_one_transition_and_its_report(clip):
     assert float((made.root_position - given.root_position)[1:20].norm(dim=-1).max()) > 1e-4
 
 
+@pytest.mark.slow
 def test_the_first_variation_is_the_calm_one_and_the_others_are_the_same_however_many(clip):
     words = ("tween", clip, "--keyframes", "0,20", *STITCH, "--prior", "prior.safetensors", "--seed", "3")
     words = tuple(word for word in words if word != "--no-finish")
@@ -54,6 +55,7 @@ def test_one_answer_is_the_calm_one_whatever_the_seed(clip):
     assert Path("a.bvh").read_bytes() == Path("b.bvh").read_bytes()
 
 
+@pytest.mark.slow
 def test_the_best_of_some_names_its_pick(clip):
     words = ("tween", clip, "-o", "best.bvh", "--keyframes", "0,20", *STITCH, "--best-of", 3, "--report", "best.json")
     assert run(*words) == 0
@@ -87,6 +89,7 @@ def test_auto_stitches_where_a_hand_is_told(clip, capsys):
     assert "longer than the 23 frames that the stitcher fills" in told
 
 
+@pytest.mark.slow
 def test_a_stitcher_where_none_can_be_is_refused(clip, fails):
     tween = ("tween", clip, "-o", "out.bvh", "--keyframes", "0,20")
     assert fails(*tween, "--method", "transformer", "--stitcher", "own.safetensors") == (

@@ -219,6 +219,7 @@ def test_one_that_fails_ends_only_those_that_need_it(tmp_path, stage, train_all,
     assert "step" not in capsys.readouterr().out.replace("steps", "")
 
 
+@pytest.mark.slow
 def test_a_second_seed_and_both_sets_beside_each_other(tmp_path, stage, train_all, capsys):
     assert train_all() == 0
     stage.errors = {"path": 1.03, "denoiser": 1.2, "locomotion": 1.01}
@@ -343,6 +344,7 @@ def test_only_one_trains_in_a_folder(tmp_path, stage, train_all, capsys):
 TINY = ("--only", "path,keyframe-timing", "--minutes", "0.02")
 
 
+@pytest.mark.slow
 def test_processes_train_and_the_set_is_there(tmp_path, train_all, capsys):
     """As typed: models end where their minutes are up, by the commands that their cards name."""
     assert train_all(*TINY, "--jobs", 2) == 0
@@ -356,6 +358,7 @@ def test_processes_train_and_the_set_is_there(tmp_path, train_all, capsys):
     assert log.startswith("step,part,")
 
 
+@pytest.mark.slow
 def test_what_a_process_has_against_its_data_is_told(tmp_path, data, train_all, capsys):
     (tmp_path / "few").mkdir()
     text = (data / "walk-0.bvh").read_text().splitlines()

@@ -51,6 +51,7 @@ def test_keys_are_met_in_the_file(tween, source, tmp_path, method):
     assert away_cm(source, out, range(FRAMES)) > 1
 
 
+@pytest.mark.slow
 def test_a_tweener_meets_keys_in_a_style_of_another_rig_s_clip(source, tmp_path):
     predictor = save_tiny_path(tmp_path / "path.safetensors")
     trained = save_tiny_tweener(tmp_path / "tweener.safetensors", str(predictor))
@@ -66,6 +67,7 @@ def test_a_tweener_meets_keys_in_a_style_of_another_rig_s_clip(source, tmp_path)
     assert made[0] != made[1]
 
 
+@pytest.mark.slow
 def test_keys_may_be_seconds(tween, source, tmp_path):
     found = set()
     for keys in ("0,15,30,44", "0s,0.5s, 1s ,44", "44,30,0,15"):
@@ -93,6 +95,7 @@ def test_frames_keys_and_notes_are_told(tween, source, tmp_path, capsys):
     assert tween(tmp_path / "leaping.bvh", "-o", tmp_path / "out.bvh", *words, "--strict", "--quiet") == 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "what"), [([], "pose"), (["--joints", "Hand_L, Foot_R"], "limbs"), (["--root-only"], "root")]
 )

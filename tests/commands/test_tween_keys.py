@@ -86,6 +86,7 @@ def test_keys_of_every_kind_are_met_in_the_file(tween, folder, capsys):
     assert "key_timing" not in told
 
 
+@pytest.mark.slow
 def test_timing_is_suggested_and_the_given_one_made(folder, capsys):
     keys = folder / "keys" / "keys.toml"
     assert run("tween", keys, "-o", "plain.bvh", *words_of("slerp")) == 0

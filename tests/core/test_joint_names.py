@@ -110,6 +110,7 @@ def test_hands_and_feet_are_suggested_on_the_side_and_limb_that_were_asked_for(p
     assert f"the nearest is {names[meant]}" in str(refused.value)
 
 
+@pytest.mark.slow
 @given(st.sampled_from(CANONICAL.names), st.data())
 def test_suggestions_stay_on_the_side_whatever_is_mistyped(name, data):
     side, part = classify_joint(name).side, name.removeprefix("left").removeprefix("right")

@@ -111,6 +111,7 @@ def test_one_place_is_the_nearest():
     torch.testing.assert_close(track_arcs(circle, still), torch.full((5,), 3.0).double(), rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_long_walks_stay_exact():
     circle = curves.circle(radius=3.0)
     arcs = torch.linspace(0, 30 * circle.length, 6000, dtype=torch.float64)

@@ -20,6 +20,7 @@ def points_of(curve):
     return curve.point(torch.linspace(0, curve.length, 900, dtype=torch.float64))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "obstacles",
     [
@@ -41,6 +42,7 @@ def test_a_detour_is_clear_and_the_curve_itself_far_away(curve, obstacles):
     assert not detour.closed
 
 
+@pytest.mark.slow
 def test_it_passes_on_the_side_that_is_nearer():
     left = lead_around(LINE, Obstacle((-0.2, 4.5), 0.5))
     right = lead_around(LINE, Obstacle((0.2, 4.5), 0.5))
@@ -48,6 +50,7 @@ def test_it_passes_on_the_side_that_is_nearer():
     assert float(points_of(right)[:, 0].min()) < -0.6
 
 
+@pytest.mark.slow
 def test_a_side_that_a_wall_closes_is_not_taken():
     wall = Obstacle((1.6, 4.5), size=(2.4, 0.2))  # the disc alone would be passed on this side
     assert float(points_of(lead_around(LINE, Obstacle((-0.2, 4.5), 0.5), wall))[:, 0].min()) < -0.9

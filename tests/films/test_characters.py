@@ -94,6 +94,7 @@ def test_a_character_in_its_own_motion_is_where_its_file_has_it(made, name):
         np.testing.assert_allclose(vertices_of(body, frame), wanted, atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MAKES)
 def test_any_motion_is_put_on_it_as_convert_does(made, name, tmp_path):
     path, clip = made[name].path, long_walk(45)

@@ -118,6 +118,7 @@ def test_names_of_other_scripts_are_shown_by_what_the_fonts_hold():
     assert shorten("mixamorig:LeftUpLeg") == "mixamorig:LeftUpLeg"
 
 
+@pytest.mark.slow
 def test_a_picture_is_there_whole_or_not_at_all(tmp_path, monkeypatch):
     picture = picture_of(CASES["Mixamo"].motion)
     plot_rig(picture, tmp_path / "a.png")

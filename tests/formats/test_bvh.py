@@ -111,6 +111,7 @@ def content(parents, channels, frames, seed):
     return tree, values
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(files())
 def test_any_layout_is_read_as_defined_and_written_back_as_it_came(tmp_path_factory, file):

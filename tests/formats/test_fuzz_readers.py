@@ -54,12 +54,14 @@ def run_cases(samples, folder, *, seed, cases):
     return read
 
 
+@pytest.mark.slow
 def test_sound_files_are_read(samples, folder):
     assert {specimen.kind for specimen in samples} == set(READERS)
     for specimen in samples:
         assert run_case(specimen, specimen.raw, folder) == "read", specimen.name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
 def test_broken_files_are_refused_or_read_as_they_are(samples, folder, seed):
     assert 30 < run_cases(samples, folder, seed=seed, cases=250) < 230
@@ -71,6 +73,7 @@ def test_ten_thousand_broken_files(samples, folder):
     assert 1000 < run_cases(samples, folder, seed=7, cases=10_000) < 9000
 
 
+@pytest.mark.slow
 def test_real_files_are_cut_and_mutated_too(tmp_path, capsys):
     (tmp_path / "walk.bvh").write_text(GOOD)
     assert main(["--cases", "30", "--seed", "3", str(tmp_path)]) == 0

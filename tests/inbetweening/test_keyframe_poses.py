@@ -74,6 +74,7 @@ def test_hips_are_put_turned_and_lifted_and_the_pose_stays(poses, rig):
     assert torch.allclose(whole.root_position[0], plain.root_position[0], atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("body", "other"), [("bandai", "daz"), ("daz", "canonical"), ("canonical", "zup"), ("zup", "bandai")]
 )

@@ -51,6 +51,7 @@ def spoilt(motion, missing, *, off=0.3):
     return restore_observed(other, motion, missing)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rig", "fps"), RATES)
 @pytest.mark.parametrize("half", ["upper", "lower"])
 def test_a_half_is_met_to_the_bit_and_the_other_does_not_count(rig, fps, half):
@@ -133,6 +134,7 @@ def test_a_viewer_in_front_sees_the_left_hand_on_the_right():
     assert (view_axes(torch.tensor(math.radians(90.0))) @ ahead)[0] == pytest.approx(-1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("view_deg", [0, 50, 90, 180])
 def test_a_drawn_pose_comes_to_look_so(view_deg):
     """Of another pose at hand, in centimetres; in space it is about right too, though no depth is told."""
@@ -181,6 +183,7 @@ def test_drawings_from_other_sides_are_told_as_far_as_they_show():
         assert float(seen.places[frame, 0, 0]) == pytest.approx(0, abs=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rig", "fps"), [("bandai", 30), ("cmu", 120)])
 def test_drawn_keys_are_met_as_nearly_as_bones_allow(rig, fps):
     motion = on_rig(rig, round(1.5 * fps), fps=fps)
@@ -201,6 +204,7 @@ def test_drawn_keys_are_met_as_nearly_as_bones_allow(rig, fps):
     assert "missed_cm" not in rows[1]
 
 
+@pytest.mark.slow
 def test_a_drawing_of_no_body_is_said():
     motion = on_rig("canonical", LAST)
     drawn = drawing_of(motion, 30, view_deg=0).places_xy

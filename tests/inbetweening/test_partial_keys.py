@@ -79,6 +79,7 @@ def test_hips_told_at_one_frame_do_not_swing_the_body(fps, turn):
     assert (done.motion.root_position - motion.root_position)[4 * fps // 3].norm() < 1e-9
 
 
+@pytest.mark.slow
 def test_a_trajectory_is_led_to_where_a_hand_is_wanted():
     """Somebody on the way from A to B goes a little round for what lies beside the way, and faces as the way leads."""
     motion = walk(91)
@@ -90,6 +91,7 @@ def test_a_trajectory_is_led_to_where_a_hand_is_wanted():
     assert done.notes == ()
 
 
+@pytest.mark.slow
 def test_several_frames_of_one_hand_are_held_without_a_tremble():
     motion = walk(90)
     place = tuple((motion.root_position[45] + torch.tensor([0.2, 0.3, 0.4]).double()).tolist())
@@ -100,6 +102,7 @@ def test_several_frames_of_one_hand_are_held_without_a_tremble():
     assert peaks_of(made).acceleration < 80
 
 
+@pytest.mark.slow
 def test_a_hand_that_would_have_to_be_thrown_is_named_with_its_acceleration():
     motion = walk(60)
     high = tuple((motion.root_position[3] + torch.tensor([0.0, 0.9, 0.2]).double()).tolist())

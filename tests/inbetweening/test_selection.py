@@ -123,6 +123,7 @@ def test_planted_toes_are_held_and_what_is_known_stays():
     assert torch.equal(made.root_position, motion.root_position)
 
 
+@pytest.mark.slow
 def test_a_long_morph_of_somebody_who_moves_is_called_one():
     motion = walk(100)
     done = tween(motion, Keys((0, 99)), AutoInbetweener(tiny_infiller()))  # straight lines

@@ -127,6 +127,7 @@ def test_hands_and_feet_are_met_and_the_rest_is_free(rig, fps, method):
         assert missed_cm(done.motion, motion, frame, motion.skeleton.names) > 1
 
 
+@pytest.mark.slow
 def test_slerp_meets_hands_too():
     motion = on_rig("bandai", 45)
     done = made_of(motion, frames_of(30), method="slerp", limbs=("Hand_L",))
@@ -137,6 +138,7 @@ def test_slerp_meets_hands_too():
     assert away[:, feet].max() < 0.1  # a reach takes the body along, and not the feet off the floor
 
 
+@pytest.mark.slow
 def test_a_hand_whose_place_is_out_of_reach_is_said_to_miss_it():
     motion = on_rig("canonical", 45)
     root = motion.root_position.clone()
@@ -243,6 +245,7 @@ def test_places_that_are_no_numbers_are_refused():
         Key(20, places={"Hand_L": (0.0, float("nan"), 0.0)})
 
 
+@pytest.mark.slow
 def test_keys_of_several_kinds_are_met_each_in_its_own():
     motion = on_rig("bandai", 45)
     place = (0.4, 1.1, 0.5)
@@ -263,6 +266,7 @@ def test_slerp_is_the_interpolation_on_the_rig_itself():
     assert same(made, interpolate_missing(motion, keyed(motion, (0, 29))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("told", [{}, {"root_only": True}])
 def test_neighbouring_keys_that_no_hips_could_join_are_named_with_numbers(told):
     motion = on_rig("bandai", 45)

@@ -177,6 +177,7 @@ def test_a_density_that_does_not_know_the_motion_leaves_the_end_to_the_infiller(
     assert done.notes == ("a gap at the end: the motion is extended by infiller, with nothing after it to meet",)
 
 
+@pytest.mark.slow
 def test_what_leaves_nothing_to_vary_is_refused(prior):
     motion = on_rig("canonical", FRAMES)
     with pytest.raises(RequestError, match="nothing to vary"):
@@ -216,6 +217,7 @@ def test_the_best_of_one_or_of_too_few_frames_is_refused(prior):
         lowest_energy(making(motion.slice(0, 6), Keys((0, 5))), rollouts, 2, generator=generator(0))
 
 
+@pytest.mark.slow
 def test_the_best_is_one_file_and_comes_again(command, source, tmp_path, capsys):
     found = set()
     for _ in range(2):
@@ -227,6 +229,7 @@ def test_the_best_is_one_file_and_comes_again(command, source, tmp_path, capsys)
     assert "the best of 2 is from the " in " ".join(json.loads((tmp_path / "r.json").read_text())["status"]["notes"])
 
 
+@pytest.mark.slow
 def test_numbered_files_energies_and_diversity_are_told_and_come_again(command, source, tmp_path, capsys):
     found = set()
     words = ["--keyframes", "0,10,24", "--method", "infiller", "--no-finish", "--variations", 2, "--seed", 4]

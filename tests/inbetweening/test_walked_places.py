@@ -60,6 +60,7 @@ def test_what_is_no_walk_is_left_to_others(query):
     assert WalkedPlaces.of(query, FASTEST, 5) is None
 
 
+@pytest.mark.slow
 def test_auto_walks_over_places_where_a_density_does_and_says_so(tmp_path):
     motion = on_rig("bandai", 60)
     keys = Keys((Key(0, root_only="place"), Key(59, root_only="place")))

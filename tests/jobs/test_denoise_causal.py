@@ -82,6 +82,7 @@ def test_what_comes_after_the_delay_changes_nothing_that_was_given():
     assert count >= 40 - 0.3 * 30 - 4
 
 
+@pytest.mark.slow
 def test_the_noise_shrinks_and_passes_meet_without_a_jump():
     truth = on_rig("canonical", 45)
     given = noisy(truth)
@@ -98,6 +99,7 @@ def test_the_noise_shrinks_and_passes_meet_without_a_jump():
     assert all(now <= of == 45 for now, of in calls)
 
 
+@pytest.mark.slow
 def test_frames_may_come_in_any_portions():
     motion = noisy(on_rig("canonical", 60))
     given, rest = pushed(motion, at_once=25)
@@ -131,6 +133,7 @@ def test_masks_count_from_the_first_frame_of_all():
     assert max(stop for _, stop in dropouts) == 44
 
 
+@pytest.mark.slow
 def test_the_past_that_is_kept_does_not_grow():
     source = stream()
     motion = noisy(on_rig("canonical", 60))
@@ -157,6 +160,7 @@ def test_what_is_said_of_the_delay_holds_at_any_rate(fps, delay):
     assert step / fps <= max(delay / 2, 1 / fps) + 0.5 / fps
 
 
+@pytest.mark.slow
 def test_what_is_due_before_noise_can_be_told_is_said_once_and_only_then():
     done = denoise_causal(noisy(on_rig("canonical", 24)), tiny_denoiser(), settings=FAST)
     said = [note for note in done.notes if "before noise could be told" in note]

@@ -51,6 +51,7 @@ def test_it_gives_as_many_frames_as_are_asked_for(frames):
     assert bool(torch.isfinite(made).all())
 
 
+@pytest.mark.slow
 def test_how_the_pieces_are_cut_does_not_matter():
     whole = finished([clip()[1:]], 13)
     assert torch.equal(finished(list(clip()[1:].split(7)), 13), whole)

@@ -94,6 +94,7 @@ def test_denoising_takes_it_on_any_rig_and_at_any_rate(rig, fps):
     assert apart[: fps - fps // 3].max() < 0.01
 
 
+@pytest.mark.slow
 def test_the_command_takes_a_trained_one_and_live_capture_none(tmp_path, capsys):
     on_rig("daz", 60).save(tmp_path / "in.bvh")
     (tmp_path / "mask.csv").write_text("joint,start,stop\n*,20,45\n")

@@ -142,6 +142,7 @@ def test_a_density_counts_less_in_windows_that_are_out_of_its_depth():
     assert max(found[shallow]) < 1e-3
 
 
+@pytest.mark.slow
 def test_of_several_densities_the_likelier_counts_in_each_window():
     motion = walk(50)
     near = tiny_density()

@@ -96,6 +96,7 @@ def height_of(done, frame):
     return float(motion.joint_positions()[frame, CANONICAL.index("leftHand"), 1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("job", JOBS)
 def test_the_hand_is_higher_at_its_time_by_every_job(job):
     frame = round(30 * (4.0 if job == "infill, late" else SECONDS))
@@ -109,6 +110,7 @@ def test_the_hand_is_higher_at_its_time_by_every_job(job):
     assert max(far) < 0.01
 
 
+@pytest.mark.slow
 def test_terms_see_a_character_at_its_own_size():
     """Metres are the character's, whatever size the prior knows."""
     tall = Skeleton(CANONICAL.names, CANONICAL.parents, 1.5 * CANONICAL.offsets)
@@ -166,6 +168,7 @@ class FarFromOrigin:
         return trial.root_xz_world.norm(dim=-1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start", [None, WALKER], ids=["origin", "clip"])
 def test_terms_of_a_generated_motion_see_where_it_is_in_the_world(start):
     """Its windows are solved near their own origin, for precision."""

@@ -13,6 +13,7 @@ from mapctl import curves, kinematics, rotations
 from mapctl.skeleton import CANONICAL, TOES
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
 @pytest.mark.parametrize("last", [(2.2, 2.2), (0.0, 0.6)], ids=["right angle", "reversal"])
 def test_a_corner_is_kept_to_without_a_lunge(last, seed):

@@ -90,6 +90,7 @@ def test_a_key_is_met_exactly_and_the_rest_of_the_shot_stays(key, walked, way, i
     assert peaks.step * 30 < 5.5
 
 
+@pytest.mark.slow
 def test_a_rough_key_may_be_missed_by_its_tolerance_and_no_more(walked, way, inbetweener):
     key = PoseKey(2.0, crouched(), tolerance=0.12)
     made, (met,) = meet_poses(walked, (key,), way, inbetweener)
@@ -99,12 +100,14 @@ def test_a_rough_key_may_be_missed_by_its_tolerance_and_no_more(walked, way, inb
     assert 10 < measure_pose_error(made, met)[1] <= 20
 
 
+@pytest.mark.slow
 def test_a_key_may_be_met_within_its_frames(walked, way, inbetweener):
     key = PoseKey(2.0, crouched(), within_frames=8)
     _, (met,) = meet_poses(walked, (key,), way, inbetweener)
     assert abs(met.start - 60) <= 8
 
 
+@pytest.mark.slow
 def test_two_keys_close_together_are_both_met(walked, way, inbetweener):
     keys = (PoseKey(2.0, crouched()), PoseKey(2.4, facing_deg=20.0, place=(0.0, 2.5)))
     made, met = meet_poses(walked, keys, way, inbetweener)
@@ -186,6 +189,7 @@ def test_hips_go_down_for_what_is_low_and_feet_stay_where_they_were(walked):
 # Ends in a clip, loops
 
 
+@pytest.mark.slow
 def test_a_shot_ends_in_a_clips_frame_and_moves_as_the_clip_does(walked, inbetweener):
     arrival = Arrival.of(walk(120, turn_rate=0.4), 70).bring_to(LINE, 3.9)
     made = arrive(walked, arrival, inbetweener)
@@ -211,6 +215,7 @@ def test_a_clip_has_frames_after_the_one_it_is_ended_in(frame):
         Arrival.of(walk(90), frame)
 
 
+@pytest.mark.slow
 def test_a_loop_leads_from_its_last_frame_into_its_first(inbetweener):
     """One lap of a walk whose stride does not divide it."""
     frames = 127

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from fractions import Fraction
 
+import pytest
 import torch
 
 import priors
@@ -34,6 +35,7 @@ def hips(way: Way):
     return way.curve.ground_point(way.arcs)
 
 
+@pytest.mark.slow
 def test_in_a_narrow_passage_both_make_room():
     plans = meet(1.8)
     first, second = let_others_pass(plans, APART)

@@ -281,6 +281,7 @@ def test_nothing_jumps_in_a_shot(shot):
     assert peaks.acceleration < 110
 
 
+@pytest.mark.slow
 def test_a_shot_is_the_same_again(shot):
     request, done = shot
     prior = priors.load("locomotion")
@@ -301,6 +302,7 @@ def test_a_shot_that_is_interrupted_is_not_half_a_shot(monkeypatch):
         solve_shot(prior, priors.load_inbetweener(), ShotRequest(LINE, seconds=3.0))
 
 
+@pytest.mark.slow
 def test_who_reaches_far_aside_leaves_the_way_for_it_and_is_told():
     prior = priors.load("locomotion")
     reach = Reach(2.0, {"leftHand": (1.3, 0.9, 2.4)})
@@ -317,6 +319,7 @@ def test_who_reaches_far_aside_leaves_the_way_for_it_and_is_told():
     assert worst_frame.measure_peaks(ends, done.motion.root_position, 30.0).step * 30 < 5.5
 
 
+@pytest.mark.slow
 def test_a_reach_that_is_far_off_is_told_with_its_distance():
     prior = priors.load("locomotion")
     wide = Reach(1.0, {"leftHand": (1.2, 1.2, 1.2), "rightHand": (-1.2, 1.2, 1.2)})
@@ -330,6 +333,7 @@ def test_a_reach_that_is_far_off_is_told_with_its_distance():
     assert missed.remedy in done.status.text
 
 
+@pytest.mark.slow
 def test_who_goes_on_from_a_gesture_comes_to_rest_without_a_jolt():
     """Hands that were moving move on: the first steps are no harder than those within the clip and the shot."""
     prior, fps = priors.load("locomotion"), 30

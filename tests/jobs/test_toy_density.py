@@ -94,6 +94,7 @@ def test_it_is_a_prior_of_infilling_and_extends_an_end(gap):
     )
 
 
+@pytest.mark.slow
 def test_it_is_a_prior_of_tweening_and_proposes_rollouts():
     motion, keys = on_rig("bandai", 40), Keys((0, 20, 39))
     infiller = tiny_infiller(drawn=0.02)

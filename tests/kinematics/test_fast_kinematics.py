@@ -266,6 +266,7 @@ print(float(heading[0, 1]))
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "geteuid"), reason="needs POSIX permissions")
 def test_kernels_work_where_nothing_can_be_written(tmp_path):
     shutil.copytree(ROOT / "mapctl", tmp_path / "mapctl", ignore=shutil.ignore_patterns("__pycache__"))

@@ -54,6 +54,7 @@ def test_windows_are_positions_from_the_first_frame_and_velocities():
         np.testing.assert_allclose(got[number], expected, atol=1e-5)
 
 
+@pytest.mark.slow
 @settings(max_examples=15)
 @given(angle=st.floats(-3, 3), x=st.floats(-20, 20), z=st.floats(-20, 20))
 def test_windows_forget_where_a_clip_stands_and_faces(angle, x, z):
@@ -141,6 +142,7 @@ def test_a_quicker_gait_is_far_in_frechet_distance():
     assert found.frechet > 3 * found.floor_frechet
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_bits_and_leaves_torch_alone():
     first, second = windows_of(clip_set(4)), windows_of(clip_set(4, seed=1))
     torch.manual_seed(7)
@@ -154,6 +156,7 @@ def test_the_same_seed_gives_the_same_bits_and_leaves_torch_alone():
     assert classifier.compute_held_out_accuracy(first, second, generator=generator(5), settings=SMALL) == score
 
 
+@pytest.mark.slow
 def test_who_can_tell_prefers_mocap_and_who_cannot_tell_prefers_neither():
     walks = clip_set(8)
     still = [replace(clip, local_quat_xyzw=clip.local_quat_xyzw[:1].expand(61, -1, -1)) for clip in clip_set(8, seed=1)]
@@ -171,6 +174,7 @@ def test_preference_counts_pairs_and_halves_the_even_ones():
     assert classifier._share_preferred(made, mocap) == pytest.approx(wins / 6)
 
 
+@pytest.mark.slow
 def test_no_clip_is_both_learnt_and_held_out():
     """Clips marked by their own channel can be learnt by heart, which must not help on clips that were not seen."""
     marked = torch.zeros(8, 3, 30, 16)

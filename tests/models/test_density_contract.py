@@ -138,6 +138,7 @@ def test_noisy_inputs_are_seen_but_not_scored(density):
     close(density, density.log_prob(frames, state, inputs=frames), plain)
 
 
+@pytest.mark.slow
 @each_density
 def test_gradients_are_those_of_finite_differences(density):
     state, exact = warm(density), dtype_of(density) is torch.float64

@@ -135,6 +135,7 @@ def test_samples_repeat_with_the_seed_and_carry_the_state_on():
         assert relative(getattr(after, name), getattr(wanted, name)) < 1e-5
 
 
+@pytest.mark.slow
 def test_samples_are_distributed_as_the_reference():
     model, state, _ = make(12, 1)
     count = 20_000

@@ -45,6 +45,7 @@ def condition(before, mean, factor, *, bits=(1.0, 1.0), count=1, seed=0):
     return sample, Planting(SIGMA).condition(*rows, generator(seed + 1))
 
 
+@pytest.mark.slow
 def test_samples_are_those_of_the_conditional_gaussian(frames, factor):
     before, mean = frames[0], frames[1, :SIZE]
     still = before.clone()
@@ -62,6 +63,7 @@ def test_samples_are_those_of_the_conditional_gaussian(frames, factor):
     assert (torch.cov(values.T) - covariance).div(sigma[:, None] * sigma).abs().max() < 0.05
 
 
+@pytest.mark.slow
 def test_toes_stand_then_and_only_those_that_are_planted_in_both(frames, factor):
     def slide(sample):
         still = frames[0].clone()
@@ -107,6 +109,7 @@ def test_a_density_samples_so(monkeypatch):
     assert torch.allclose(cold[:, 0], mean[:, 0], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_generation_asks_for_it():
     density = tiny_density()
 

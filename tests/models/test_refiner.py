@@ -62,6 +62,7 @@ def test_the_networks_bits_are_probabilities_with_a_slope():
     assert float(slope[..., : LAYOUT.continuous].abs().max()) > 0
 
 
+@pytest.mark.slow
 @given(st.lists(st.integers(0, 13), min_size=1, max_size=12), st.integers(0, 4), st.integers(1, 9))
 @settings(max_examples=40)
 def test_pieces_of_any_sizes_give_the_whole(sizes, lookahead, piece):

@@ -22,6 +22,7 @@ def stitched(load=never):
     return StitchedInbetweener(tiny_stitcher(), load)
 
 
+@pytest.mark.slow
 def test_the_other_is_not_loaded_where_all_is_stitched():
     query = query_of(walk(90), (10, 25), (40, 60))
     made, alone = stitched().propose(query), tiny_stitcher().propose(query)
@@ -72,6 +73,7 @@ def test_what_was_stitched_is_reported():
     assert told["timing"]["finish_ms"] > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("told", "by"), [({}, "slerp"), ({"limbs": ("leftHand",)}, "stitcher"), ({"root_only": True}, "stitcher")]
 )
@@ -100,6 +102,7 @@ class SlerpPartly(SlerpInbetweener):
         return True
 
 
+@pytest.mark.slow
 def test_auto_asks_its_network_once_though_the_stitcher_leaves_much():
     """It has proposed already what is too long, or open, for the stitcher."""
 

@@ -82,6 +82,7 @@ def test_where_nothing_is_wanted_there_are_no_wishes():
     assert Wishes.of(query, GAP.start, GAP.stop) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("limb", ["leftHand", "rightFoot"])
 def test_what_is_wanted_leads_the_answer(limb):
     query = wishing(walk(60), 30, limb, (0.2, 0.25, 0.1))
@@ -93,6 +94,7 @@ def test_what_is_wanted_leads_the_answer(limb):
     assert f"{100 * miss(query, led.motion):.1f} cm off unbent" in led.attribute(query)[0].remark
 
 
+@pytest.mark.slow
 def test_then_limbs_and_the_body_bend_until_it_is_met():
     query = wishing(walk(60), 30, "leftHand", (0.1, 0.3, 0.2))
     done = fill(
@@ -106,6 +108,7 @@ def test_then_limbs_and_the_body_bend_until_it_is_met():
     assert [source.by for source in done.sources] == ["stitcher"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("limb", ["leftHand", "rightFoot"])
 def test_they_go_there_and_come_back_without_a_leap(limb):
     query = wishing(walk(60), 30, limb, (0.15, 0.2, 0.1))
@@ -135,6 +138,7 @@ def test_hips_that_are_told_are_wished_for_where_they_are_and_as_they_face():
     assert wishes.measure_farthest(joined) == pytest.approx(aside, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_a_taller_character_is_led_as_one_of_unit_size():
     query, size = wishing(walk(60), 30, "leftHand", (0.2, 0.25, 0.1)), 1.3
     motion, targets = query.motion, query.effector_targets
@@ -148,6 +152,7 @@ def test_a_taller_character_is_led_as_one_of_unit_size():
     assert float((size * one - other).abs().max()) < 1e-4
 
 
+@pytest.mark.slow
 def test_the_same_wish_elsewhere_and_turned_leads_to_the_same_motion_there():
     query = wishing(walk(60), 30, "leftHand", (0.2, 0.25, 0.1))
     turn, shift = about_y(torch.tensor(2.0)).double(), torch.tensor([7.0, 0.0, -3.0]).double()
@@ -165,6 +170,7 @@ def test_the_same_wish_elsewhere_and_turned_leads_to_the_same_motion_there():
     assert float((rotate(turn.expand(60, 21, 4), here) + shift - moved).abs().max()) < 1e-4
 
 
+@pytest.mark.slow
 def test_draws_are_led_each_from_where_it_was_and_do_not_depend_on_others():
     query, drawing = wishing(walk(60), 30, "leftHand", (0.2, 0.25, 0.1)), tiny_stitcher().drawing(seed=3)
     plain = [drawing.numbered(n).propose(replace(query, effector_targets=None)).motion for n in range(2)]
@@ -186,6 +192,7 @@ def test_hips_that_are_told_alone_are_met_and_divide_the_gap():
     assert float(steps.max()) < 0.25  # nothing leaps
 
 
+@pytest.mark.slow
 def test_a_trajectory_is_followed_and_one_that_is_far_is_the_others():
     query = query_of(walk(60), (GAP.start, GAP.stop))
     bow = 0.15 * torch.sin(torch.linspace(0, torch.pi, GAP.stop - GAP.start + 2)[1:-1]).double()
@@ -200,6 +207,7 @@ def test_a_trajectory_is_followed_and_one_that_is_far_is_the_others():
     assert "off the trajectory" in source.reason
 
 
+@pytest.mark.slow
 def test_a_trajectory_is_joined_at_both_ends_without_a_leap():
     """Moved over by nothing in the frames beside the gap, and by little in those next to them."""
     query = query_of(walk(60), (GAP.start, GAP.stop))
@@ -221,6 +229,7 @@ def test_a_trajectory_through_few_frames_is_no_matter(frames):
     assert float((made.motion.root_position - motion.root_position)[start:stop, ::2].norm(dim=-1).max()) < 0.05
 
 
+@pytest.mark.slow
 def test_a_curve_is_followed_through_the_whole_job():
     motion = walk(60)
     start, stop = (motion.root_position[frame, ::2] for frame in (GAP.start - 1, GAP.stop))

@@ -222,6 +222,7 @@ def test_gaps_are_filled_between_poses_that_stay_and_too_long_ones_are_named():
     assert float(step) < 2 * float(motion.joint_positions().diff(dim=0).norm(dim=-1).max())
 
 
+@pytest.mark.slow
 def test_one_that_draws_gives_the_same_for_the_same_seed_and_number_and_others_for_others():
     query = query_of(walk(60), (20, 40))
 

@@ -170,6 +170,7 @@ def test_auto_leaves_long_gaps_between_whole_poses_to_it_and_holds_who_stands():
     assert [source.by for source in auto.propose(still).attribute(still)] == ["standing still"]
 
 
+@pytest.mark.slow
 def test_auto_leaves_long_gaps_to_it_that_have_partial_keys_within():
     """A network that fills less would leap to the hand, or away from it."""
     motion, told = walk(200), (1, 190)

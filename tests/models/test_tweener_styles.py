@@ -47,6 +47,7 @@ def test_a_class_of_the_card_is_a_style_without_poses():
     assert all(style.poses is None for style in classes.values())
 
 
+@pytest.mark.slow
 def test_a_long_gap_is_split_by_poses_of_the_style_or_of_the_keys_and_a_note_says_so():
     query, plain = query_of(walk(600), (10, 580)), make_tweener()
     made = {}

@@ -146,6 +146,7 @@ def _send_licence(writer, load):
     writer.send(load().card.licence)
 
 
+@pytest.mark.slow
 def test_the_set_reaches_processes(folder):
     for load in (partial(priors.load, "locomotion"), partial(priors.load, "free/locomotion")):
         reader, writer = open_pipe(duplex=False)

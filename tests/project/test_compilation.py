@@ -42,6 +42,7 @@ def use_kernel(folder, *words: str) -> str:
     return done.stdout.strip()
 
 
+@pytest.mark.slow
 def test_a_kernel_is_compiled_once_and_loads_without_the_compiler(tmp_path):
     assert use_kernel(tmp_path).startswith("[(1, 1, True), (1, 1, False)] ")
     again = use_kernel(tmp_path)
@@ -50,6 +51,7 @@ def test_a_kernel_is_compiled_once_and_loads_without_the_compiler(tmp_path):
     assert again.endswith("False")
 
 
+@pytest.mark.slow
 def test_another_type_is_compiled_beside_one_on_disk(tmp_path):
     use_kernel(tmp_path)
     heard = use_kernel(tmp_path, "float")
@@ -57,6 +59,7 @@ def test_another_type_is_compiled_beside_one_on_disk(tmp_path):
     assert heard.endswith("True")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", ["nbi", "nbc"])
 def test_damaged_code_is_compiled_anew(tmp_path, ending):
     use_kernel(tmp_path)
@@ -102,6 +105,7 @@ def test_a_terminal_shows_a_bar_while_kernels_are_compiled(monkeypatch, capsys):
     assert "walking" in after
 
 
+@pytest.mark.slow
 def test_the_command_says_what_it_compiled_and_where(capsys):
     assert run("compile") == 0
     first = capsys.readouterr().out

@@ -57,6 +57,7 @@ def python(script: str) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 def test_slow_libraries_are_not_imported():
     """roma would import torch's compiler, a third of the whole time, for functions that nothing here uses."""
     packages = "mapctl, priors, controllers, scenes, mapctl.rotations, mapctl.formats, mapctl.solver.swarm, scenes.film"
@@ -64,6 +65,7 @@ def test_slow_libraries_are_not_imported():
     assert python(script) == "[]\n"
 
 
+@pytest.mark.slow
 def test_a_walk_imports_what_it_uses(tmp_path):
     """With compiled kernels on disk, which the first command sees to."""
     script = (
@@ -98,6 +100,7 @@ def test_names_that_arrive_late_are_those_that_type_checkers_see(package):
         _ = module.nothing_of_this_name
 
 
+@pytest.mark.slow
 def test_the_collector_is_off_until_a_command_has_imported():
     script = (
         "import gc, sys\nfrom mapctl import __main__\nfrom mapctl.commands.shared.command import Command\n"
@@ -118,6 +121,7 @@ def test_a_caller_without_a_collector_stays_without():
     assert python(script) == "False\n"
 
 
+@pytest.mark.slow
 def test_a_motion_made_by_hand_can_be_saved(tmp_path):
     """Nothing has imported the formats until then."""
     path = str(tmp_path / "still.npz")

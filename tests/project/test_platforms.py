@@ -79,11 +79,13 @@ def environment() -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("platform", ["win32", "darwin"])
 def test_all_modules_are_imported_without_what_a_system_lacks(platform, tmp_path):
     play(IMPORT_ALL, platform, tmp_path)
 
 
+@pytest.mark.slow
 def test_a_command_runs_without_it(tmp_path):
     walk(40).save(tmp_path / "walk.bvh")
     words = ["convert", "walk.bvh", "mirrored.npz", "--mirror"]
@@ -113,6 +115,7 @@ def posix_calls(tree: ast.Module) -> set[str]:
     return found
 
 
+@pytest.mark.slow
 def test_what_some_systems_lack_is_on_the_page():
     page = pages.read_page(PAGE)
     lists = {str(file): posix_calls(tree_of(file)) for file in PACKAGE_FILES}
@@ -207,6 +210,7 @@ def test_training_in_several_processes_names_torchrun_where_none_are_forked(monk
         pass
 
 
+@pytest.mark.slow
 def test_without_egl_a_window_is_opened_and_its_errors_are_no_crash(monkeypatch, caplog):
     class NoDisplayError(Exception):
         pass

@@ -73,6 +73,7 @@ def test_files_that_are_linked_are_there(page):
     assert [link for link in links if not (ROOT / Path(page).parent / link).exists()] == []
 
 
+@pytest.mark.slow
 def test_the_sdist_builds_tests_and_documents(sources):
     made = {"__pycache__", "_build", "auto_gallery", "made", "sg_execution_times.rst"}
     wanted = [

@@ -82,6 +82,7 @@ def read(wheel: Path, name: str) -> str:
         return archive.read(name).decode()
 
 
+@pytest.mark.slow
 def test_command_runs_elsewhere(clean, tmp_path):
     assert __version__ in run(clean / "mapctl", "--version", cwd=tmp_path)
     assert list(tmp_path.iterdir()) == []
@@ -107,6 +108,7 @@ def test_data_is_held(held):
     assert any(name.startswith("scenes/") and name.endswith(".toml") for name in held)
 
 
+@pytest.mark.slow
 def test_its_example_is_found_elsewhere(clean, tmp_path):
     run(clean / "mapctl", "convert", "example:noisy-walk", "walk.npz", cwd=tmp_path)
     assert (tmp_path / "walk.npz").is_file()

@@ -45,6 +45,7 @@ def test_strange_rigs_are_refused_or_doubtful_or_right(label):
         torch.testing.assert_close(back.joint_positions(), case.motion.joint_positions(), atol=1e-6, rtol=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["mixamo", "ue5", "smpl", "cmu-daz", "rigify", "xsens"])
 def test_names_in_disorder_are_never_a_sure_match(preset):
     order = random.Random(3)

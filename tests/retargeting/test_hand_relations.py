@@ -113,6 +113,7 @@ def test_hands_that_clap_clap(name):
     assert float((after - before)[meet].norm(dim=-1).max()) < 0.012
 
 
+@pytest.mark.slow
 def test_hands_that_clap_move_no_faster_than_the_givers():
     clip = clapping()
     for skeleton in BODIES.values():

@@ -124,6 +124,7 @@ def test_logging_is_left_alone():
     assert (list(root.handlers), root.level, logging.config.dictConfig) == (handlers, level, configure)
 
 
+@pytest.mark.slow
 def test_first_use_in_a_read_only_folder_leaves_no_trace(tmp_path: Path):
     script = """
         import logging, sys, torch

@@ -48,6 +48,7 @@ def test_a_near_place_is_reached_on_the_frame(facing):
     assert facing is None or row["facing_error_deg"] < 0.1
 
 
+@pytest.mark.slow
 def test_a_far_place_is_walked_to_first_and_steered_from_there():
     recorder, track = play((0.2, Arrival((0.3, 1.5), 2.0, 0.5)), frames=80)
     assert errors(recorder, track)["place_error_cm"] < 0.1
@@ -97,6 +98,7 @@ def test_who_cannot_goes_on_as_before():
     assert torch.equal(recorder.motion().root_position, plain.motion().root_position)
 
 
+@pytest.mark.slow
 def test_what_nobody_can_is_refused_once_with_numbers_and_changes_nothing():
     recorder, track = play((0.2, Arrival((50.0, 0.0), 0.9)), (0.5, Arrival((0.0, 0.0), 0.5)))
     told = [refusal.reason for refusal in recorder.refusals]
@@ -108,6 +110,7 @@ def test_what_nobody_can_is_refused_once_with_numbers_and_changes_nothing():
     assert torch.equal(recorder.motion().root_position, plain.motion().root_position)
 
 
+@pytest.mark.slow
 def test_another_body_comes_to_the_same_place():
     tall = Skeleton(CANONICAL.names, CANONICAL.parents, 1.3 * CANONICAL.offsets, CANONICAL.end_offsets)
     settings = begun()[0].settings
@@ -161,6 +164,7 @@ def both_targets(frames, others):
     return zip(frames.steering_targets, others.steering_targets, strict=True)
 
 
+@pytest.mark.slow
 def test_a_way_that_is_worked_out_in_slices_is_the_same():
     state, _ = begun()
     state, _ = ARRIVER(state, AHEAD)
@@ -175,6 +179,7 @@ def test_a_way_that_is_worked_out_in_slices_is_the_same():
     assert all(torch.equal(found[0], other) for other in found[1:])
 
 
+@pytest.mark.slow
 def test_a_new_order_on_the_way_plays_what_was_planned_meanwhile():
     state, _ = begun()
     state, _ = ARRIVER(state, AHEAD)

@@ -44,6 +44,7 @@ def test_the_last_command_holds():
     assert pilot.at(9.0) == Command(2.0, 1.0, labels=("run",))
 
 
+@pytest.mark.slow
 def test_a_path_is_walked_braked_for_and_stood_at():
     pilot = Autopilot(Command(1.0, 0.5, labels=("elderly",)), SteeringLimits(braking=2.0))
     at_place(pilot, 0.0, 0.0)

@@ -40,6 +40,7 @@ def test_without_time_for_an_evaluation_one_is_tried_again_some_time():
     assert cost.evaluation < 0.002
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("free", [False, True], ids=["walking", "stuck"])
 def test_steps_return_within_their_time(monkeypatch, free):
     """An evaluation takes 2 ms, the rest of a step 3 ms before the search ends and after it."""

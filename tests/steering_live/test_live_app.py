@@ -47,6 +47,7 @@ def test_a_port_that_is_taken_is_said_and_another_one_serves(monkeypatch, capsys
     assert actor.heard[-1] == ("close",)
 
 
+@pytest.mark.slow
 def test_orders_go_to_the_chosen_character_alone_and_the_panel_shows_them(show, actors):
     show.order(speed=2.0, heading=90.0)
     show.choose(1)
@@ -75,6 +76,7 @@ def test_pause_and_reset_are_for_everybody(show, actors):
     assert actors[0].heard[-2] == ("command", Command(1.2, 0.0)), "the first orders come back"
 
 
+@pytest.mark.slow
 def test_frames_stand_the_puppet_where_they_say(show, actors):
     for _ in range(40):  # it walks; how far in so many frames depends on how busy the machine is
         run(show, 30)
@@ -192,10 +194,12 @@ def test_a_recording_tells_its_licence_and_so_does_the_file_that_grows(tmp_path)
     assert formats.load(tmp_path / "x.glb").licence == "CC0 1.0 (mine)"
 
 
+@pytest.mark.slow
 def test_a_recording_can_be_a_film():
     assert encode_motion(walk(3), "mp4")[4:8] == b"ftyp"
 
 
+@pytest.mark.slow
 def test_a_recording_begins_and_ends_with_the_button(show, actors):
     show.toggle_recording(None)
     run(show, 5)

@@ -99,6 +99,7 @@ def speed_of(motion: mapctl.Motion) -> float:
     return float((way[-1] - way[0]).norm()) * float(motion.fps) / (len(way) - 1)
 
 
+@pytest.mark.slow
 def test_a_slider_and_keys_move_the_character_and_the_recording_shows_it(page, tmp_path):
     put(page, "Speed, m/s", 0)
     time.sleep(2)
@@ -146,6 +147,7 @@ def walk_path(page) -> None:
     page.get_by_role("button", name="Walk it").click()
 
 
+@pytest.mark.slow
 def test_a_drawn_path_is_walked(page, tmp_path):
     page.get_by_role("button", name="Reset").click()
     box = page.get_by_text("Draw by clicking on the ground").locator("xpath=following::input[@type='checkbox'][1]")
@@ -258,6 +260,7 @@ def test_whatever_is_typed_by_two_people_the_show_goes_on_and_the_recording_is_w
     other.close()
 
 
+@pytest.mark.slow
 def test_a_number_typed_digit_by_digit_arrives_and_one_that_cannot_be_is_said(page):
     page.get_by_role("button", name="Reset").click()
     open_tab(page, "Steer")
@@ -294,6 +297,7 @@ def shown(page) -> int:
     return int(re.search(r"of (\d+) frames", page.inner_text("body")).group(1))
 
 
+@pytest.mark.slow
 def test_pause_holds_the_frames(page):
     page.get_by_role("button", name="Pause").click()
     page.get_by_role("button", name="Go on").wait_for()

@@ -163,6 +163,7 @@ class _Done:
         pass
 
 
+@pytest.mark.slow
 def test_the_viewer_shows_a_mannequin_beside_it(hero, capsys):
     actors = [Actor(), Actor()]
     actors[1].skeleton = hero.body.leveled
@@ -188,6 +189,7 @@ def test_each_character_has_its_file_and_the_last_one_is_for_all_others(tmp_path
     assert live._read_drawn(Live(characters=3)) == [None, None, None]
 
 
+@pytest.mark.slow
 def test_a_character_moves_on_its_own_bones(prior, tmp_path):
     child = str(make_character_glb(tmp_path / "child.glb", size=0.6).path)
     command = Live(character=(child,), prior=prior)

@@ -37,6 +37,7 @@ class Full(io.FileIO):
         raise OSError(28, "No space left on device")
 
 
+@pytest.mark.slow
 def test_a_program_that_is_killed_loses_no_frame(tmp_path):
     script = RECORDS.format(tests=str(Path(__file__).parents[1]))
     with subprocess.Popen([sys.executable, "-c", script], cwd=tmp_path, stdout=subprocess.PIPE, text=True) as made:
@@ -61,6 +62,7 @@ def test_recordings_replace_none_and_go_when_they_are_kept_elsewhere(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_a_delivered_recording_leaves_no_file_and_a_lost_one_is_told(show, capsys, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     show._recorder._folder = tmp_path
@@ -82,6 +84,7 @@ def test_a_delivered_recording_leaves_no_file_and_a_lost_one_is_told(show, capsy
     assert f"what was recorded is in {tmp_path / 'mapctl.recording'}" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_disk_that_is_full_ends_the_recording_and_is_said(show, actors):
     show.toggle_recording(None)
     run(show, 3)

@@ -30,6 +30,7 @@ def said(show, capsys):
     return heard
 
 
+@pytest.mark.slow
 def test_what_is_typed_is_clamped_said_and_put_right_when_typing_ends(show, actors, said):
     panel = show._panel
     panel.steering.speed._impl.value = 99.0  # as the server has it when a browser sent it
@@ -43,6 +44,7 @@ def test_what_is_typed_is_clamped_said_and_put_right_when_typing_ends(show, acto
     assert "99" in said()[0], "it stays to be read"
 
 
+@pytest.mark.slow
 def test_a_number_typed_digit_by_digit_arrives_as_it_was_meant(show, actors, said):
     show.order(step_length=0.65)
     run(show, 1)

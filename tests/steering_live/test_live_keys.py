@@ -237,6 +237,7 @@ PLAIN = st.none() | st.floats() | st.text() | st.booleans() | st.integers()
 CONTENT = st.recursive(PLAIN, lambda inner: st.lists(inner) | st.dictionaries(NAMES, inner), max_leaves=8)
 
 
+@pytest.mark.slow
 @given(CONTENT, st.sampled_from(["keys", "pad", "layout"]))
 def test_whatever_comes_is_a_message_or_refused(content, kind):
     with suppress(RequestError):

@@ -146,6 +146,7 @@ def page(show, monkeypatch):
 DOWN = (0.0, -1.0, 0.0)
 
 
+@pytest.mark.slow
 def test_the_editor_does_what_is_dragged_and_pressed_and_says_what_cannot_be(show, page):
     editor = show.path
     assert "Drag a ball" in page()
@@ -192,6 +193,7 @@ def test_a_closed_path_is_walked_on_and_on(show, actors, page):
     assert actors[0].heard[-1] == ("walk", SQUARE, 1.2, True)
 
 
+@pytest.mark.slow
 def test_what_is_loaded_replaces_what_there_is_unless_it_is_none(show, page, monkeypatch, tmp_path):
     show.path.load("a.csv", b"0,0\n2,0\n2,2\n")
     page()

@@ -28,6 +28,7 @@ def recorded(show) -> None:
     run(show, 1)
 
 
+@pytest.mark.slow
 def test_a_film_counts_its_frames():
     work = ExportWork()
     assert encode_motion(walk(4), "gif", None, work)[:3] == b"GIF"
@@ -41,6 +42,7 @@ def test_what_is_broken_off_ends_soon_and_leaves_no_file():
     assert time.monotonic() - began < 10
 
 
+@pytest.mark.slow
 def test_a_long_file_is_written_by_another_process(monkeypatch, tmp_path):
     monkeypatch.setattr(recording_module, "_LONG_FRAMES", 3)
     written = encode_motion(walk(5), "bvh")
@@ -48,6 +50,7 @@ def test_a_long_file_is_written_by_another_process(monkeypatch, tmp_path):
     assert written == encode_motion(walk(5), "bvh")
 
 
+@pytest.mark.slow
 def test_the_page_counts_and_shows_how_far_a_file_is_and_the_last_one_can_be_had_again(show, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     controls, made = show._panel.recording, []
@@ -88,6 +91,7 @@ def test_the_page_counts_and_shows_how_far_a_file_is_and_the_last_one_can_be_had
     assert (tmp_path / "mapctl.mp4").read_bytes() == b"film"
 
 
+@pytest.mark.slow
 def test_files_are_made_in_turn_and_only_the_last_recording_is_kept(show, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     show._recorder._folder = tmp_path
@@ -111,6 +115,7 @@ class Leaver:
         raise ConnectionError("it went away")
 
 
+@pytest.mark.slow
 def test_a_browser_that_leaves_in_the_middle_loses_nothing(show, monkeypatch, tmp_path, capsys):
     monkeypatch.chdir(tmp_path)
     leaver = Leaver()

@@ -30,6 +30,7 @@ def resting(actors, monkeypatch):
         yield show, clients
 
 
+@pytest.mark.slow
 def test_without_a_browser_all_rest_at_no_cost_and_go_on_with_one(resting, actors):
     show, clients = resting
     run_for(show, 1.0)
@@ -50,6 +51,7 @@ def test_without_a_browser_all_rest_at_no_cost_and_go_on_with_one(resting, actor
     assert words(actors[1])[2:] == [("pause", True)]
 
 
+@pytest.mark.slow
 def test_who_is_paused_stays_so_when_somebody_comes(resting, actors):
     show, clients = resting
     show.toggle_pause()
@@ -71,6 +73,7 @@ def test_who_is_paused_while_nobody_looks_is_paused_for_who_comes(resting, actor
     assert words(actors[0])[-1] == ("pause", True)
 
 
+@pytest.mark.slow
 def test_a_recording_goes_on_without_a_browser(resting, actors, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)  # nobody takes the file
     show, _ = resting
@@ -100,6 +103,7 @@ class Sink:
         return []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["stream", "source"])
 def test_other_programs_are_served_without_a_browser(what, actors):
     with live_app(actors, rests=True, **{what: Sink()}) as show:

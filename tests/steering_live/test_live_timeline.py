@@ -53,6 +53,7 @@ def words(actor) -> list[tuple]:
     return [heard for heard in actor.heard if heard[0] in ("pause", "rate", "tune")]
 
 
+@pytest.mark.slow
 def test_who_looks_back_sees_what_was_and_the_characters_wait(show, actors):
     run(show, 90)
     timeline, member = show._timeline, show._cast.members[0]
@@ -98,6 +99,7 @@ def test_who_stood_before_stands_after_and_to_go_on_or_to_reset_is_to_come_back(
     assert (words(actors[0])[-1], show._timeline.cursor) == (("pause", False), None)
 
 
+@pytest.mark.slow
 def test_a_replay_ends_in_the_present(show, actors):
     run(show, 40)
     show.replay()
@@ -173,6 +175,7 @@ def test_sigmas_are_each_characters_own_and_reset_alone(show, actors):
     assert sigmas.sliders["speed"].value == 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrong", [9.0, 4.0, np.nan, np.inf, 1e300, "x", None, True])
 def test_a_sigma_that_cannot_be_is_said_and_put_right(show, actors, wrong):
     sigmas = show._sigmas

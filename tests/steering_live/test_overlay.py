@@ -74,6 +74,7 @@ def test_an_arm_sets_out_from_where_it_is():
     assert float(first.max()) < 0.0005
 
 
+@pytest.mark.slow
 def test_a_place_beyond_the_arm_is_reached_with_a_lean():
     motion = standing(3.0)
     place = near(motion, "leftHand", (0.15, -0.15, 0.52))
@@ -92,6 +93,7 @@ def test_what_is_far_or_behind_is_left_alone():
         np.testing.assert_allclose(found.joint_positions(), motion.joint_positions(), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_places_that_are_dragged_make_no_hand_jump():
     """Ten times a second the place is somewhere else, also out of reach, and the hand changes."""
     motion, generator = walk(240), np.random.default_rng(3)

@@ -46,6 +46,7 @@ def collected(remote, seconds):
     return found
 
 
+@pytest.mark.slow
 def test_a_hand_goes_to_what_is_aimed_at(remote):
     remote.command(Command(0.0, 0.0))
     remote.reset()
@@ -63,6 +64,7 @@ def test_a_hand_goes_to_what_is_aimed_at(remote):
     remote.command(Command(1.2, 0.0))
 
 
+@pytest.mark.slow
 def test_it_goes_where_it_is_sent_and_says_what_is_too_far(remote):
     remote.command(Command(0.5, 0.0))
     remote.reset()
@@ -80,6 +82,7 @@ def test_it_goes_where_it_is_sent_and_says_what_is_too_far(remote):
         remote.go(Command(0.5, 0.0), (np.nan, 0.0), 0.7)
 
 
+@pytest.mark.slow
 def test_who_was_made_without_transitions_is_sent_nowhere(load):
     made = CharacterProcess(CharacterRequest(load, Command(1.2, 0.0)))
     try:
@@ -118,6 +121,7 @@ def test_it_turns_when_told_and_walks_a_path(remote):
         remote.walk([(0.0, 0.0)], 1.0)
 
 
+@pytest.mark.slow
 def test_a_pause_stops_time_and_going_on_loses_none(remote):
     remote.command(Command(1.0, 0.0))
     before = collected(remote, 0.5)[-1]
@@ -140,6 +144,7 @@ def notes(remote, seconds=1.0):
     return [note for piece in collected(remote, seconds) for note in piece.notes]
 
 
+@pytest.mark.slow
 def test_orders_that_cannot_be_are_brought_near_or_left_out_and_said(remote):
     remote.reset()
     remote.command(Command(99.0, 1e9, step_length=99.0))
@@ -161,6 +166,7 @@ def test_what_it_cannot_load_is_said():
         broken.wait()
 
 
+@pytest.mark.slow
 def test_who_is_gone_is_said_after_all_that_came_until_then_and_comes_back_by_a_reset(load):
     lost = CharacterProcess(CharacterRequest(load, Command(1.0, 0.0)))
     lost.wait()
@@ -266,6 +272,7 @@ def test_a_worker_says_what_ends_it(load, breaking, said):
     assert re.search(said, text)
 
 
+@pytest.mark.slow
 def test_slow_motion_passes_slowly_and_is_not_late(remote):
     remote.reset()
     remote.set_rate(0.25)

@@ -50,6 +50,7 @@ def run_script(loader: str, folder) -> tuple[float, float, int]:
     return float(frames), float(memory), int(bases)
 
 
+@pytest.mark.slow
 def test_a_script_needs_no_main_guard_and_a_character_is_small(tmp_path):
     path = save_tiny_prior(tmp_path / "tiny.safetensors")
     frames, memory, bases = run_script(f"load = functools.partial(priors.load, {str(path)!r})", tmp_path)
@@ -58,6 +59,7 @@ def test_a_script_needs_no_main_guard_and_a_character_is_small(tmp_path):
     assert bases == 1
 
 
+@pytest.mark.slow
 def test_who_ends_is_started_again_from_the_same_process_or_a_new_one(tmp_path):
     load = functools.partial(priors.load, str(save_tiny_prior(tmp_path / "tiny.safetensors")))
     request = CharacterRequest(load, Command(1.0, 0.0))

@@ -70,6 +70,7 @@ def test_a_step_delivers_its_frames_with_a_forecast_and_a_ledger():
     assert float(ahead.norm()) < 0.3
 
 
+@pytest.mark.slow
 def test_the_state_does_not_grow():
     def size(state):
         done = state.committed

@@ -187,6 +187,7 @@ def test_every_frame_goes_to_the_stream_too(stage):
     assert [sum(entry[3] for entry in put if entry[1] == k) for k in (0, 1)] == [actor.frames for actor in actors]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "message",
     [
@@ -221,6 +222,7 @@ def test_a_label_that_the_prior_does_not_know_is_said(stage, capsys):
     assert capsys.readouterr().err.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_many_faults_are_few_lines(stage, capsys):
     _, _, _, send = stage
     for k in range(100):
@@ -234,6 +236,7 @@ VALUES = st.one_of(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(
     messages=st.lists(

@@ -80,6 +80,7 @@ def test_frames_come_when_they_are_due_and_are_those_that_were_put(stream, ports
     assert isinstance(stream, FrameStream)
 
 
+@pytest.mark.slow
 def test_the_stream_is_behind_by_its_delay(ports):
     stream = PoseStream(Endpoint("127.0.0.1", ports[0].getsockname()[1]), [CANONICAL], delay=0.5)
     due = start(stream)
@@ -115,6 +116,7 @@ def test_late_frames_are_counted_and_sent(stream, ports):
     assert stream.statistics.largest_lateness_ms > 3000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("paused", [False, True])
 def test_a_pause_is_no_gap(stream, ports, paused):
     due = start(stream)

@@ -54,6 +54,7 @@ def script(tmp_path) -> Path:
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("more", [(), ("--stream-root", "--stream-delay", "0")])
 def test_the_joints_of_a_script_are_rebuilt_from_its_stream(script, prior, tmp_path, capsys, more):
     port, out, report = free_ports(1), tmp_path / "out.npz", tmp_path / "report.json"
@@ -72,11 +73,13 @@ def test_the_joints_of_a_script_are_rebuilt_from_its_stream(script, prior, tmp_p
     assert f"45 frames to 127.0.0.1:{port}" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_nobody_need_listen(script, prior, tmp_path):
     words = ("steer", script, "-o", tmp_path / "a.npz", "--prior", prior, "--realtime", "--quiet")
     assert run(*words, "--stream", free_ports(1)) == 0
 
 
+@pytest.mark.slow
 def test_the_stream_has_the_size_of_the_character(script, prior, tmp_path):
     tall = mapctl.load(_tall(tmp_path))
     port, out = free_ports(1), tmp_path / "out.npz"
@@ -210,6 +213,7 @@ def test_what_a_script_cannot_obey_is_noted(played, message, said):
     assert said in made.notes[0]
 
 
+@pytest.mark.slow
 def test_orders_reach_a_script_that_is_played(script, prior, tmp_path):
     """An order beyond the limits is in the report; another process sends it all the while."""
     listen, report = free_ports(1), tmp_path / "r.json"
@@ -225,6 +229,7 @@ def test_orders_reach_a_script_that_is_played(script, prior, tmp_path):
     assert "OSC: A speed of 99 m/s was lowered to" in json.loads(report.read_text())["status"]["text"]
 
 
+@pytest.mark.slow
 def test_characters_obey_what_comes_over_osc_and_their_poses_go_out(prior, tmp_path, monkeypatch, capsys):
     """The whole of `mapctl live` but the browser: two characters in their processes, on tiny models."""
     stitcher = functools.partial(priors.load_stitcher, str(save_tiny_stitcher(tmp_path / "s.safetensors")))

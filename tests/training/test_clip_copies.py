@@ -124,6 +124,7 @@ def test_longer_strides_lower_the_hips_and_turn_no_other_joint(corpus):
     assert torch.isfinite(longer.local_quat_xyzw).all()
 
 
+@pytest.mark.slow
 def test_copies_come_after_their_clips_with_their_names_and_the_seed_draws_them(corpus):
     copies = ClipCopies(2)
     one, again, other = (add_copies(corpus, copies, generator(seed)) for seed in (1, 1, 2))
@@ -161,6 +162,7 @@ def test_training_sees_copies_and_what_is_held_out_has_none(tmp_path):
     assert torch.equal(plain.windows.features, clips.features)
 
 
+@pytest.mark.slow
 def test_the_command_takes_copies_and_resumes_with_them(tmp_path, capsys):
     data, out = write_corpus(tmp_path / "data"), tmp_path / "run"
     words = ("train", "lstm-gmm", "--data", data, "-o", out, "--width", 8, "--components", 2, "--window", 20)

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from ended_models import MODELS, VARIANTS
+from ended_models import MODELS, VARIANTS, list_params
 from helpers import run as mapctl_run
 from pretended_device import NAME, pretend_device, replace_gpu
 from safetensors.torch import load_file, save_file
@@ -28,7 +28,8 @@ def gpu(monkeypatch):
         yield
 
 
-@pytest.mark.parametrize("name", ON_GPU)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", list_params(ON_GPU))
 def test_every_model_comes_to_the_same_on_another_device(tmp_path, data, gpu, name):
     made = MODELS[name].recipe(data, tmp_path / "here", None)
     made = replace(made, settings=replace(made.settings, steps=3), validate_steps=3)
@@ -49,6 +50,7 @@ def test_paces_are_followed_on_the_processor(tmp_path, data, gpu):
     assert json.loads((tmp_path / "run" / "model.json").read_text())["config"]["labels"][-1] == "pace=run"
 
 
+@pytest.mark.slow
 def test_a_run_of_one_device_goes_on_on_another_and_says_so(tmp_path, data, gpu):
     made = replace(MODELS["path"].recipe(data, tmp_path / "run", None), device="auto")
     told = []
@@ -71,9 +73,9 @@ def test_the_state_of_another_kind_of_generator_is_not_taken(tmp_path, data):
     assert json.loads((tmp_path / "run" / "checkpoint.json").read_text())["step"] == 6
 
 
-@pytest.mark.parametrize("made", [MODELS["refiner"], MODELS["keyframe-timing"], VARIANTS["tweener with a critic"]])
-def test_models_that_a_gpu_does_not_help_are_trained_without(tmp_path, data, prior, gpu, made):
-    wanted = made.recipe(data, tmp_path / "run", prior)
+@pytest.mark.parametrize("name", list_params(["refiner", "keyframe-timing", "tweener with a critic"]))
+def test_models_that_a_gpu_does_not_help_are_trained_without(tmp_path, data, prior, gpu, name):
+    wanted = (MODELS | VARIANTS)[name].recipe(data, tmp_path / "run", prior)
     assert wanted.find_device() == "cpu"
     with pytest.raises(RequestError, match="not trained on GPUs; use --device cpu"):
         train(replace(wanted, device="cuda"))

@@ -33,6 +33,7 @@ def paper(data, out):
     )
 
 
+@pytest.mark.slow
 def test_where_the_schedule_does_not_go_by_the_total_an_extended_run_is_the_longer_run_to_the_bit(tmp_path, data):
     train(paper(data, tmp_path / "parts"))
     train(with_steps(paper(data, tmp_path / "parts"), 8, resume=True))
@@ -46,6 +47,7 @@ def test_where_the_schedule_does_not_go_by_the_total_an_extended_run_is_the_long
     assert [row for row in rows[0] if not row.startswith("4,training")] == rows[1]  # a report at the first end
 
 
+@pytest.mark.slow
 def test_the_refiner_goes_on_to_the_bit_too(tmp_path, data, prior):
     made = MODELS["refiner"].recipe(data, tmp_path / "parts", prior)
     train(with_steps(made, 4))
@@ -56,6 +58,7 @@ def test_the_refiner_goes_on_to_the_bit_too(tmp_path, data, prior):
     ).read_bytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["infiller", "keyframe-timing"])
 def test_a_finished_run_is_extended_twice_and_killed_in_between(name, tmp_path, data, prior):
     model = MODELS[name]
@@ -114,6 +117,7 @@ def test_fewer_steps_than_are_done_are_refused_and_fewer_than_were_planned_are_n
     assert json.loads((tmp_path / "run" / "checkpoint.json").read_text())["step"] == 5
 
 
+@pytest.mark.slow
 def test_a_checkpoint_of_an_older_version_is_resumed_and_extended(tmp_path, data):
     """It names the steps among the settings, and keeps no losses."""
     train(wanted(data, tmp_path / "run", 4))
@@ -132,6 +136,7 @@ def test_a_checkpoint_of_an_older_version_is_resumed_and_extended(tmp_path, data
 OLD = ("tensors", "step", "settings", "network", "data", "init", "curve")
 
 
+@pytest.mark.slow
 def test_the_command_extends_and_without_steps_keeps_them(tmp_path, data, capsys):
     words = ("train", "path", "--data", data, "-o", tmp_path / "run", "--batch", 64, "--window", 32)
     assert mapctl_run(*words, "--steps", 2) == 0

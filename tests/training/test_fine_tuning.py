@@ -19,6 +19,7 @@ TINY = LstmGmmConfig(width=8, components=2)
 SETTINGS = TrainingSettings(steps=6, batch=4, window=20)
 
 
+@pytest.mark.slow
 def test_fine_tuning_begins_with_the_priors_weights_statistics_and_labels(tmp_path, monkeypatch):
     whole = density_quality.measure_free_runs
     monkeypatch.setattr(density_quality, "measure_free_runs", partial(whole, runs=2, frames=20))

@@ -70,6 +70,7 @@ def test_the_rig_and_its_tpose_are_understood(styles):
     assert clip.skeleton.num_joints == 23
 
 
+@pytest.mark.slow
 def test_a_table_below_the_folder_holds_for_what_is_beside_it(styles, tmp_path):
     whole = read(styles, tmp_path)
     shutil.copytree(styles, tmp_path / "all" / "100STYLE")

@@ -70,6 +70,7 @@ def test_its_gradient_is_that_of_the_run_with_the_draws_held():
     assert float((gradient * direction).sum()) == pytest.approx(expected, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_descending_it_lowers_it():
     model = tiny_model().requires_grad_(True)
     optimiser = torch.optim.Adam(model.parameters(), 1e-2)

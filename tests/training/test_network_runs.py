@@ -137,7 +137,14 @@ MODELS = (
 )
 
 
-@pytest.fixture(params=MODELS, ids=lambda model: model.name)
+QUICK = "path", "denoiser"
+
+
+@pytest.fixture(
+    params=[
+        pytest.param(model, marks=() if model.name in QUICK else pytest.mark.slow, id=model.name) for model in MODELS
+    ]
+)
 def model(request):
     return request.param
 
@@ -212,6 +219,7 @@ def test_what_cannot_be_trained_on_is_refused(tmp_path, model, request_in):
     assert not (tmp_path / "run" / "checkpoint.json").exists()
 
 
+@pytest.mark.slow
 def test_a_run_may_begin_with_the_weights_of_another(tmp_path, model, request_in):
     first = train(request_in(tmp_path / "first"))
     wanted = replace(request_in(tmp_path / "second"), init=str(first))

@@ -15,7 +15,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from ended_models import MODELS, VARIANTS
+from ended_models import MODELS, VARIANTS, list_params
 from helpers import corpus, killing
 from helpers import run as mapctl_run
 from tiny_infiller import CONFIG as INFILLER
@@ -71,6 +71,7 @@ def gradient_after_a_step(group):
     return torch.cat([weight.grad.flatten() for weight in trainer.network.parameters()])
 
 
+@pytest.mark.slow
 def test_a_step_of_three_processes_has_the_mean_gradient_of_three_shares_of_a_batch():
     rows = gather_rows(gradient_after_a_step, 3)
     assert torch.equal(rows[0], rows[1])
@@ -100,6 +101,7 @@ def test_processes_share_a_batch_between_them():
     assert drawn == [2]
 
 
+@pytest.mark.slow
 def test_all_processes_draw_windows_of_one_length():
     def frames(group):
         trainer, found = make_trainer(), []
@@ -117,6 +119,7 @@ def test_all_processes_draw_windows_of_one_length():
     assert len(set(lengths[0].tolist())) > 1
 
 
+@pytest.mark.slow
 def test_a_gradient_that_only_one_process_has_counts_half_and_one_that_none_has_stays_away():
     def average(group):
         weights = [torch.nn.Parameter(torch.zeros(2)) for _ in range(3)]
@@ -130,6 +133,7 @@ def test_a_gradient_that_only_one_process_has_counts_half_and_one_that_none_has_
     assert gather_rows(average, 2).tolist() == 2 * [[1.5, 1.5, 0.5, 0.5, 3.5]]
 
 
+@pytest.mark.slow
 def test_two_processes_train_the_same_to_the_bit_each_time_also_when_killed_and_resumed(tmp_path, data):
     train(wanted(data, tmp_path / "whole"))
     train(wanted(data, tmp_path / "again"))
@@ -148,7 +152,8 @@ def test_two_processes_train_the_same_to_the_bit_each_time_also_when_killed_and_
 PARALLEL = [name for name in MODELS | VARIANTS if name not in ("keyframe-timing", "infiller", "recurrent infiller")]
 
 
-@pytest.mark.parametrize("name", PARALLEL)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", list_params(PARALLEL))
 def test_every_model_trains_in_two_processes_and_goes_on_to_the_bit(name, tmp_path, data, prior):
     model = (MODELS | VARIANTS)[name]
     recipe = replace(model.recipe(data, tmp_path / "parts", prior), processes=2, checkpoint_minutes=0.0)
@@ -160,6 +165,7 @@ def test_every_model_trains_in_two_processes_and_goes_on_to_the_bit(name, tmp_pa
         assert (tmp_path / "parts" / file).read_bytes() == (tmp_path / "whole" / file).read_bytes(), file
 
 
+@pytest.mark.slow
 def test_another_number_of_processes_goes_on_and_says_that_the_result_differs(tmp_path, data):
     with killing(InfillerTrainer, 3):
         train(wanted(data, tmp_path / "run"))
@@ -169,6 +175,7 @@ def test_another_number_of_processes_goes_on_and_says_that_the_result_differs(tm
     assert "was trained in 2 processes and goes on in 1: the result is as good, but not the same" in warnings[0]
 
 
+@pytest.mark.slow
 def test_a_run_whose_processes_had_a_batch_each_is_refused(tmp_path, data):
     with killing(InfillerTrainer, 3):
         train(wanted(data, tmp_path / "run"))
@@ -190,6 +197,7 @@ def fail_elsewhere(monkeypatch, fail):
     monkeypatch.setattr(InfillerTrainer, "losses", failing)
 
 
+@pytest.mark.slow
 def test_a_process_that_is_killed_ends_the_others_with_one_line(tmp_path, data, monkeypatch):
     fail_elsewhere(monkeypatch, lambda: os.kill(os.getpid(), signal.SIGKILL))
     with pytest.raises(
@@ -200,6 +208,7 @@ def test_a_process_that_is_killed_ends_the_others_with_one_line(tmp_path, data, 
     assert not find_trainers()
 
 
+@pytest.mark.slow
 def test_an_error_of_a_process_is_told_in_its_words(tmp_path, data, monkeypatch):
     def fail():
         raise ValueError("no such window")
@@ -209,6 +218,7 @@ def test_an_error_of_a_process_is_told_in_its_words(tmp_path, data, monkeypatch)
         train(wanted(data, tmp_path / "run", processes=3))
 
 
+@pytest.mark.slow
 def test_ctrl_c_saves_a_checkpoint_of_all_processes(tmp_path, data, monkeypatch):
     step = InfillerTrainer.train_step
 
@@ -238,6 +248,7 @@ class Noted:
             opened.write(f"{os.getpid()}\n")
 
 
+@pytest.mark.slow
 def test_what_is_thrown_away_before_processes_are_forked_is_not_thrown_away_in_them(tmp_path):
     """The group of an earlier run would wait there forever for threads that it had."""
     gc.disable()

@@ -112,6 +112,7 @@ def test_what_is_wrong_costs_its_square_in_the_networks_own_units():
     assert float(other) == pytest.approx(9 / 66, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_plain_denoiser_learns_by_squares_and_is_judged_as_ours():
     settings = replace(denoiser_recipe.PLAIN[1], steps=60, batch=6, window=24, learning_rate=3e-3)
     trainer, rows = DenoiserTrainer(replace(PLAIN, width=16), settings, corpus(1, 30)), []
@@ -151,6 +152,7 @@ class _SampledRefiner(PlainRefinerTrainer):
         super().__init__(config, settings, walks, replace(walks, features=noisy))
 
 
+@pytest.mark.slow
 def test_a_plain_refiner_comes_nearer_to_moments_at_one_rate_and_has_no_critic():
     settings = PlainRefinerSettings(rounds=60, window=20, batch=8, learning_rate=1e-2)
     trainer, rows = _SampledRefiner(settings), []
@@ -219,6 +221,7 @@ def test_the_command_of_a_card_asks_for_the_same_run(recipe, kind, words):
         assert request(typed[2], *typed[3:]) == wanted
 
 
+@pytest.mark.slow
 def test_the_command_line_trains_a_plain_denoiser_that_denoise_begins_with(tmp_path, data, capsys):
     out = tmp_path / "run"
     words = ("--steps", 2, "--batch", 2, "--window", 32, "--width", 8, "--plain", "--quiet")
@@ -233,6 +236,7 @@ def test_the_command_line_trains_a_plain_denoiser_that_denoise_begins_with(tmp_p
     assert json.loads((tmp_path / "r.json").read_text())
 
 
+@pytest.mark.slow
 def test_a_plain_refiner_is_trained_kept_at_its_best_and_loaded(tmp_path, data):
     path = save_walking_density(tmp_path / "walks.safetensors")
     config = RefinerConfig(width=6, memory=5, lookahead=1, joints=("hips", "rightToes"))

@@ -173,6 +173,7 @@ def test_a_measure_that_cannot_be_had_is_never_the_best_and_null_in_the_card(tmp
         json.loads(file.read_text(), parse_constant=pytest.fail)
 
 
+@pytest.mark.slow
 def test_it_stops_with_the_best_when_the_critic_has_won(tmp_path, request_in, scripted):
     """And a resumed run stops there too, though it was killed within the report that decides."""
     news = []
@@ -224,6 +225,7 @@ def test_scores_are_distances_from_mocap():
     assert compute_realism_gap({"a_ratio": None}) == math.inf
 
 
+@pytest.mark.slow
 def test_the_judge_measures_against_clips_kept_from_training(data, density, tmp_path):
     parts = corpora.split_corpus(corpora.read_corpus(data, match="", cache=tmp_path), 1)
     held = torch.cat([parts.validation.features, parts.test.features])
@@ -241,6 +243,7 @@ def test_the_judge_measures_against_clips_kept_from_training(data, density, tmp_
     assert first == again
 
 
+@pytest.mark.slow
 def test_resuming_is_asked_for_and_needs_the_same_recipe_network_and_data(tmp_path, data, request_in):
     out = tmp_path / "run"
     with pytest.raises(CheckpointError, match="no checkpoint to resume"):
@@ -317,6 +320,7 @@ def test_what_cannot_be_trained_on_is_refused_before_anything_is_written(tmp_pat
     assert not (tmp_path / "run" / "checkpoint.json").exists()
 
 
+@pytest.mark.slow
 def test_two_clips_are_enough_and_a_third_that_is_none_is_left_out(tmp_path, request_in):
     folder = write_corpus(tmp_path / "two", count=2, frames=100)
     (folder / "walk-broken.bvh").write_text("HIERARCHY")

@@ -364,6 +364,7 @@ def test_what_is_kept_is_the_running_mean_of_the_weights():
     assert 0 < float(kept) < 0.7 * float(latest)
 
 
+@pytest.mark.slow
 def test_moments_alone_bring_feet_and_jerk_nearer_to_the_captured():
     """Against a critic that says the same of everything."""
     trainer = trainer_of(moments=10.0, refiner_rate=1e-2)

@@ -134,6 +134,7 @@ def test_a_splice_is_two_pieces_and_a_way_between(corpus, tiny, all_pass):
         assert (features[after - 1, held] - clip[number - 1, held]).abs().max() < 1e-4
 
 
+@pytest.mark.slow
 def test_the_second_piece_begins_where_both_velocities_lead(corpus, tiny, all_pass):
     spliced = add_splices(corpus, Splices(30, tiny))
     for name, features in list(zip(spliced.names, spliced.clips(), strict=True))[4:]:
@@ -151,6 +152,7 @@ def test_the_second_piece_begins_where_both_velocities_lead(corpus, tiny, all_pa
         assert float((way / way.norm()) @ facing) > math.cos(0.2)
 
 
+@pytest.mark.slow
 def test_the_bundled_stitcher_passes_for_mocap_and_a_wild_one_does_not(corpus, tmp_path, monkeypatch):
     asked = []
 
@@ -169,6 +171,7 @@ def test_the_bundled_stitcher_passes_for_mocap_and_a_wild_one_does_not(corpus, t
         assert torch.diff(places, dim=0).norm(dim=-1).max() < 0.25  # metres in a frame
 
 
+@pytest.mark.slow
 def test_the_seed_draws_them(corpus, tiny, all_pass):
     one, same, other = (add_splices(corpus, Splices(6, tiny, seed=seed)) for seed in (1, 1, 2))
     assert torch.equal(one.features, same.features)
@@ -179,6 +182,7 @@ def test_the_seed_draws_them(corpus, tiny, all_pass):
         Splices(-1)
 
 
+@pytest.mark.slow
 def test_they_are_kept_for_a_run_that_goes_on(corpus, tmp_path, all_pass, monkeypatch):
     one, other = (
         str(save_tiny_stitcher(tmp_path / f"{name}.safetensors", drawn=drawn))
@@ -214,6 +218,7 @@ def test_who_made_them_is_told(corpus, tiny, all_pass):
     assert all(name.startswith(FOLDER) for name in made.clips)
 
 
+@pytest.mark.slow
 def test_ways_of_many_motions_are_those_of_each(corpus):
     stitcher, clips = tiny_stitcher(), corpus.clips()
     before = torch.stack([clips[0][40:55], clips[2][20:35]])
@@ -244,6 +249,7 @@ def train(data: Path, out: Path, *words: object) -> int:
     return run("train", "lstm-gmm", "--data", data, "-o", out, *small, *words)
 
 
+@pytest.mark.slow
 def test_a_density_is_trained_on_them_and_its_card_says_so(data, tmp_path, tiny, all_pass, capsys):
     assert train(data, tmp_path / "alone", "--quiet") == 0
     capsys.readouterr()
@@ -257,6 +263,7 @@ def test_a_density_is_trained_on_them_and_its_card_says_so(data, tmp_path, tiny,
     assert "splices" not in alone.data
 
 
+@pytest.mark.slow
 def test_a_splice_has_no_label_and_no_start_lies_in_one(data, tmp_path, tiny, all_pass):
     seen, read_labels = [], labels.read
 
@@ -275,6 +282,7 @@ def test_a_splice_has_no_label_and_no_start_lies_in_one(data, tmp_path, tiny, al
     assert {"walk", "wave"} == {start.split("_")[0] for start in card.data["starts"]}
 
 
+@pytest.mark.slow
 def test_clips_that_were_made_before_are_told_beside_them(data, tmp_path, tiny, all_pass):
     made = tmp_path / "made"
     made.mkdir()
@@ -287,6 +295,7 @@ def test_clips_that_were_made_before_are_told_beside_them(data, tmp_path, tiny, 
     ]
 
 
+@pytest.mark.slow
 def test_clips_that_are_held_out_are_in_no_splice(data, tmp_path, tiny, all_pass):
     seen = []
 

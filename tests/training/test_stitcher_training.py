@@ -92,6 +92,7 @@ def test_losses_of_the_two_that_contend_are_least_squares():
     assert float(compute_generator_loss(made)) == pytest.approx((1 + 4) / 2)
 
 
+@pytest.mark.slow
 def test_the_slope_is_that_of_finite_differences():
     with torch.random.fork_rng():
         torch.manual_seed(0)
@@ -108,6 +109,7 @@ def test_the_slope_is_that_of_finite_differences():
     assert float(compute_slope(critics, rows).detach()) == pytest.approx(slope, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_critics_join_after_their_share_of_the_steps_and_are_heard_after_a_head_start():
     trainer = make_trainer()
     before = [weight.clone() for weight in trainer.critics.network.parameters()]
@@ -121,6 +123,7 @@ def test_critics_join_after_their_share_of_the_steps_and_are_heard_after_a_head_
     assert [SETTINGS.critics.ramp(updates) for updates in (0, 2, 3, 4, 9)] == [0.0, 0.0, 0.5, 1.0, 1.0]
 
 
+@pytest.mark.slow
 def test_critics_learn_to_tell_what_trembles_from_what_was_captured():
     trainer, last = make_trainer(critics=CriticSettings(rate=1e-3)), 20
     truth = transitions(32)
@@ -138,6 +141,7 @@ def test_critics_learn_to_tell_what_trembles_from_what_was_captured():
     assert found["critic"] < 0.5
 
 
+@pytest.mark.slow
 def test_without_critics_there_are_none():
     trainer = make_trainer(without=("d",))
     rows = [trainer.train_step() for _ in range(5)]
@@ -194,6 +198,7 @@ def gather_from_two(work):
     return found[0]
 
 
+@pytest.mark.slow
 def test_two_processes_have_the_mean_gradient_of_their_posteriors_too():
     def find_gradients(group):
         trainer = make_trainer()
@@ -208,6 +213,7 @@ def test_two_processes_have_the_mean_gradient_of_their_posteriors_too():
     assert torch.equal(one, other)
 
 
+@pytest.mark.slow
 def test_critics_learn_alike_where_one_process_was_shown_nothing():
     def learn(group):
         trainer, truth = make_trainer(), transitions()
@@ -229,6 +235,7 @@ def make_printed(**settings):
     return StitcherTrainer(config, replace(PAPER[1], steps=10, batch=6, window=24, **settings), corpus(2, 80))
 
 
+@pytest.mark.slow
 def test_as_printed_all_are_drawn_and_compared_and_the_encoder_is_held_to_a_standard_normal():
     trainer, truth = make_printed(), transitions()
     shares, settings = trainer.settings.shares, trainer.settings.weights
@@ -243,6 +250,7 @@ def test_as_printed_all_are_drawn_and_compared_and_the_encoder_is_held_to_a_stan
     assert float(parts["own"].detach()) > 0 == float(still["own"].detach())
 
 
+@pytest.mark.slow
 def test_as_printed_losses_count_by_what_they_are_before_training():
     trainer = make_printed()
     assert set(trainer.untrained) == {"places", "state", "contacts", "stitching"}
@@ -253,6 +261,7 @@ def test_as_printed_losses_count_by_what_they_are_before_training():
     assert make_trainer().untrained == {}
 
 
+@pytest.mark.slow
 def test_as_printed_critics_learn_from_the_first_update_on():
     trainer = make_printed()
     before = [weight.clone() for weight in trainer.critics.network.parameters()]
@@ -262,6 +271,7 @@ def test_as_printed_critics_learn_from_the_first_update_on():
     assert trainer.settings.critics.ramp(0) == 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("without", [(), *((part,) for part in PARTS)])
 def test_as_printed_every_part_can_be_left_out(without):
     config = replace(tiny_stitcher.CONFIG, shared=0, own=4, printed=True, without=without)
@@ -293,6 +303,7 @@ def test_the_command_on_the_card_is_the_one_that_was_typed(words, tmp_path, monk
     assert asked[0].format_command().split()[7:] == words
 
 
+@pytest.mark.slow
 def test_the_temperature_is_the_largest_at_which_the_best_draw_is_as_near_as_any():
     """By numpy, of answers that are drawn and placed anew, in the one gap that these clips have room for."""
     network = tiny_stitcher.network(drawn=0.3)
@@ -312,6 +323,7 @@ def test_the_temperature_is_the_largest_at_which_the_best_draw_is_as_near_as_any
     assert found == max(each for each, score in scores.items() if score <= 1.01 * min(scores.values()))
 
 
+@pytest.mark.slow
 def test_a_run_writes_the_temperature_that_it_finds(tmp_path, monkeypatch):
     monkeypatch.setattr(recipe_module, "calibrate_temperature", lambda network, windows: 2.5)
     data = write_corpus(tmp_path / "data")

@@ -95,6 +95,7 @@ def test_a_perfect_proposal_costs_nothing_but_contacts():
     assert parts["loss"] == pytest.approx(clean.contacts * math.log(2), abs=0.1)
 
 
+@pytest.mark.slow
 def test_the_loss_falls_on_windows_that_it_sees_again_and_again():
     settings = DenoiserSettings(steps=50, batch=6, window=24, learning_rate=3e-3)
     trainer = DenoiserTrainer(DenoiserConfig(width=24, dilations=(1, 2)), settings, corpus(1, 30))

@@ -88,6 +88,7 @@ def test_the_network_is_told_the_datas_moments():
     assert torch.equal(trainer.network.std, std.clamp_min(0.05))
 
 
+@pytest.mark.slow
 def test_the_loss_falls_on_windows_that_it_sees_again_and_again():
     config = InfillerConfig(widths=(24, 24, 24, 24, 24))
     gaps = GapSettings(shortest=15.0, longest=15.0, spread=1.0)
@@ -111,6 +112,7 @@ def test_gaps_grow_in_the_course_of_training():
     assert errors[0] < errors[2]
 
 
+@pytest.mark.slow
 def test_validation_is_the_same_each_time_and_compares_with_the_guess():
     settings = replace(SETTINGS, window=80)
     trainer = InfillerTrainer(CONFIG, settings, corpus(1, 100))
@@ -139,6 +141,7 @@ def test_recipes_that_cannot_be_are_refused(wrong):
         replace(SETTINGS, **wrong)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("architecture", ["manifold", "recurrent"])
 def test_what_the_command_line_trains_fills_gaps(tmp_path, data, architecture):
     words = ["--steps", 2, "--batch", 2, "--window", 32, "--architecture", architecture, "--quiet"]

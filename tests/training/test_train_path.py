@@ -60,6 +60,7 @@ def test_heights_are_judged_in_centimetres(straight):
     assert float(losses["loss"]) == pytest.approx(6.0, abs=0.05)
 
 
+@pytest.mark.slow
 def test_training_brings_the_trajectory_nearer():
     trainer = PathTrainer(tiny_path.CONFIG, SETTINGS, corpus(4, 100))
     before = trainer.validate(corpus(2, 90))

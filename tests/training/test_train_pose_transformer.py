@@ -85,6 +85,7 @@ def test_lost_joints_count_as_much_as_a_gap():
     assert float(throughout["turns"]) > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("optimiser", ["muon", "adam"])
 def test_the_loss_falls_on_windows_that_it_sees_again_and_again(optimiser):
     settings = PoseTransformerSettings(
@@ -119,6 +120,7 @@ def test_muon_steps_the_matrices_of_layers_and_adam_all_else(detail):
         assert [key for key, ids in owned.items() if id(weight) in ids] == [kind], name
 
 
+@pytest.mark.slow
 def test_the_spread_learns_alone_and_is_calibrated():
     trainer = PoseTransformerTrainer(CONFIG, SETTINGS, corpus(2, 60))
     truth = windows_of(corpus(2, 60))
@@ -174,6 +176,7 @@ def test_only_a_smaller_network_with_equal_heads_is_grown():
         assert not can_grow(shape, replace(shape, **other)), other
 
 
+@pytest.mark.slow
 def test_validation_is_the_same_each_time_and_leaves_out_gaps_that_are_too_long():
     trainer = PoseTransformerTrainer(CONFIG, SETTINGS, corpus(1, 60))
     first, again = (trainer.validate(corpus(2, 60)) for _ in range(2))
@@ -183,6 +186,7 @@ def test_validation_is_the_same_each_time_and_leaves_out_gaps_that_are_too_long(
     assert first["share_10_15"] == pytest.approx(1, abs=1e-3)  # untrained
 
 
+@pytest.mark.slow
 def test_what_the_command_line_trains_fills_gaps(tmp_path, data):
     words = ["--steps", 2, "--batch", 60, "--window", 32, "--width", 25, "--plain", "--quiet"]
     assert run("train", "pose-transformer", "--data", data, "-o", tmp_path / "run", *words, "--layers", 1) == 2

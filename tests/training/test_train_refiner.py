@@ -82,6 +82,7 @@ def test_help_names_what_a_refiner_takes(capsys):
         assert word in told
 
 
+@pytest.mark.slow
 def test_a_trained_refiner_is_used_by_generate(tmp_path, monkeypatch, capsys):
     train = run.train
 

@@ -124,6 +124,7 @@ def test_keys_that_tell_less_ask_for_less(windows):
     assert float(losses_of(placed, windows, turned=0.3)["keys_cm"]) < 1e-3
 
 
+@pytest.mark.slow
 def test_training_brings_poses_nearer():
     made = corpus(4, 140)
     trainer = TweenerTrainer(tiny_tweener.CONFIG, SETTINGS, made, tiny_path.network())

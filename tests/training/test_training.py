@@ -141,6 +141,7 @@ def begun(tmp_path_factory, data):
     return out
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_with_its_own_data_only(tmp_path, data, begun):
     for name, walks in (("more", 6), ("less", 4)):
         folder = write_corpus(tmp_path / name, count=walks)

@@ -119,6 +119,7 @@ def test_a_fault_that_nobody_foresaw_leaves_one_file_out(tmp_path, data, monkeyp
     assert found.skipped == (corpora.SkippedFile("walk-1.bvh", "ZeroDivisionError: division by zero"),)
 
 
+@pytest.mark.slow
 def test_the_cache_knows_what_was_left_out_and_tries_it_again(tmp_path, mixed, monkeypatch):
     first, _, warned = gathered(mixed, tmp_path / "run")
     whole, read = clips.read_clip_features, []
@@ -172,6 +173,7 @@ def model(request, monkeypatch):
     return (request.param, *MODELS[request.param])
 
 
+@pytest.mark.slow
 def test_the_command_leaves_out_lists_and_says_it_in_the_card(tmp_path, mixed, model, capsys):
     name, words, load = model
     assert run(*train_words(name, mixed, tmp_path / "run", *words, "--match", "walk|one", "--quiet")) == 0
@@ -200,6 +202,7 @@ def test_few_clips_are_enough(tmp_path, model, lengths, capsys):
     assert int(card.data["clips"]) == len(lengths)
 
 
+@pytest.mark.slow
 def test_a_density_of_many_is_tuned_on_two(tmp_path, data):
     words = MODELS["lstm-gmm"][0]
     assert run(*train_words("lstm-gmm", data, tmp_path / "first", *words)) == 0

@@ -11,7 +11,7 @@ from dataclasses import replace
 from functools import partial
 
 import pytest
-from ended_models import MODELS, VARIANTS
+from ended_models import MODELS, VARIANTS, list_params
 from helpers import run as mapctl_run
 from safetensors import SafetensorError
 
@@ -31,13 +31,7 @@ def test_whatever_can_be_trained_is_ended_here():
     assert [*MODELS, TrainAll.model] == list(SUBCOMMANDS["train"])  # test_train_all.py ends the whole set
 
 
-LONGEST = "denoiser"  # which the infiller's recipe is like; test_network_runs.py kills and resumes it quickly
-
-
-@pytest.fixture(
-    scope="module",
-    params=[pytest.param(name, marks=pytest.mark.slow if name == LONGEST else ()) for name in MODELS | VARIANTS],
-)
+@pytest.fixture(scope="module", params=list_params(MODELS | VARIANTS))
 def model(request):
     return (MODELS | VARIANTS)[request.param]
 
@@ -107,6 +101,7 @@ def assert_same(run_folder, other):
         assert (run_folder / name).read_bytes() == (other / name).read_bytes(), name
 
 
+@pytest.mark.slow
 def test_ended_in_a_step_it_goes_on_to_the_bit(tmp_path, model, request_in, whole):
     """The step is done to its end. After the second and the last there is a judgement, which is not waited for."""
     request = request_in(tmp_path / "parts")
@@ -223,6 +218,7 @@ def train_words(data, out, *words):
     )
 
 
+@pytest.mark.slow
 def test_the_command_says_in_one_line_how_to_go_on(tmp_path, data, monkeypatch, capsys):
     out, step = tmp_path / "my run", lstm_gmm.DensityTrainer.train_step
 

@@ -62,6 +62,7 @@ class Noted(Watcher):
         self.ended += 1
 
 
+@pytest.mark.slow
 def test_the_table_of_losses_is_what_was_told(tmp_path, data):
     noted = Noted()
     train(wanted(data, tmp_path / "run"), watchers=[noted])
@@ -83,6 +84,7 @@ def test_the_table_of_losses_is_what_was_told(tmp_path, data):
     assert noted.ended == 1
 
 
+@pytest.mark.slow
 def test_rows_beyond_the_checkpoint_are_cut_and_come_again(tmp_path, data):
     train(wanted(data, tmp_path / "whole"))
     with killing(InfillerTrainer, 5):
@@ -95,6 +97,7 @@ def test_rows_beyond_the_checkpoint_are_cut_and_come_again(tmp_path, data):
     assert file.read_bytes() == (tmp_path / "whole" / "losses.csv").read_bytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damage", [None, b"", b"\xff\xfe\x00", b"step,part,loss\n1,2,3\nx,training,1\n", b"no\n"])
 def test_a_table_that_is_gone_or_damaged_begins_with_the_curve(tmp_path, data, damage):
     with killing(InfillerTrainer, 5):
@@ -204,6 +207,7 @@ def test_the_live_table_shows_total_rate_remaining_time_losses_and_validations()
     assert "2/10 steps" in shown.getvalue()
 
 
+@pytest.mark.slow
 def test_in_a_pipe_there_are_lines_and_quiet_says_nothing(tmp_path, data, capsys):
     words = ("train", "infiller", "--data", data, "--steps", 2, "--batch", 2, "--window", 40)
     assert mapctl_run(*words, "-o", tmp_path / "run") == 0
@@ -216,6 +220,7 @@ def test_in_a_pipe_there_are_lines_and_quiet_says_nothing(tmp_path, data, capsys
     assert (tmp_path / "other" / "losses.csv").read_bytes() == (tmp_path / "run" / "losses.csv").read_bytes()
 
 
+@pytest.mark.slow
 def test_a_plot_is_renewed_at_each_validation(tmp_path, data, capsys, monkeypatch):
     from mapctl.commands.train import curves as training_curves
 
@@ -229,6 +234,7 @@ def test_a_plot_is_renewed_at_each_validation(tmp_path, data, capsys, monkeypatc
     assert drawn[-1][2]["counter"] == "step"
 
 
+@pytest.mark.slow
 def test_a_run_and_a_prior_are_drawn_and_what_holds_no_losses_is_one_line(tmp_path, data, capsys, prior):
     words = ("train", "infiller", "--data", data, "--steps", 2, "--batch", 2, "--window", 40, "--quiet", "--plot")
     assert mapctl_run(*words, "-o", tmp_path / "run") == 0
@@ -256,6 +262,7 @@ def test_a_run_and_a_prior_are_drawn_and_what_holds_no_losses_is_one_line(tmp_pa
     assert not (tmp_path / "no.png").exists()
 
 
+@pytest.mark.slow
 def test_curves_of_all_sorts_are_drawn(tmp_path):
     curves = [
         Curve("loss", True, tuple(range(100)), tuple(1000.0 / (1 + step) for step in range(100))),
@@ -277,6 +284,7 @@ def test_without_matplotlib_a_plot_is_refused_before_training(tmp_path, data, ca
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 def test_tensorboard_is_not_imported_where_it_is_not_installed(tmp_path, data, monkeypatch):
     from priors.training.record import event_files
 
@@ -309,6 +317,7 @@ def test_tensorboard_reads_what_the_table_holds(tmp_path, data):
     assert [value for _, value in points] == pytest.approx([row.values["error_15_cm"] for row in rows], rel=1e-6)
 
 
+@pytest.mark.slow
 def test_watchers_end_also_where_training_fails(tmp_path, data):
     noted = Noted()
     with killing(InfillerTrainer, 3):

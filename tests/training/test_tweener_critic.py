@@ -84,6 +84,7 @@ def test_the_penalty_is_the_squared_slope():
     assert found == pytest.approx(float(slope.square().sum()) / len(rows), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_critic_learns_to_tell_made_from_captured_and_moves_the_generator(clips):
     critic = CriticSettings(begin=0, batch=8, history=16, frames=100, rate=1e-3)
     made = trainer(clips, critic, replace(SETTINGS, steps=20))
@@ -97,6 +98,7 @@ def test_a_critic_learns_to_tell_made_from_captured_and_moves_the_generator(clip
     assert 0 < row["moved_cm"] < 20
 
 
+@pytest.mark.slow
 def test_before_it_joins_training_is_by_distances_alone(clips):
     made, plain = trainer(clips), TweenerTrainer(tiny_tweener.CONFIG, SETTINGS, clips, tiny_path.network())
     for _ in range(2):
@@ -107,6 +109,7 @@ def test_before_it_joins_training_is_by_distances_alone(clips):
     assert "critic_made" not in made.validate(clips)
 
 
+@pytest.mark.slow
 def test_stopped_and_resumed_it_is_the_same(clips):
     whole, first = trainer(clips), trainer(clips)
     for _ in range(5):
@@ -120,6 +123,7 @@ def test_stopped_and_resumed_it_is_the_same(clips):
         assert torch.equal(values, second.state()[name]), name
 
 
+@pytest.mark.slow
 def test_measuring_changes_nothing(clips):
     made = trainer(clips)
     for _ in range(3):

@@ -25,6 +25,7 @@ def recipe(tmp_path_factory):
     return TweenerRecipe(data, folder / "run", config=tiny_tweener.CONFIG, settings=SETTINGS, path=predictor)
 
 
+@pytest.mark.slow
 def test_an_exported_run_knows_the_classes_of_its_training_clips(recipe):
     out = train(replace(recipe, labels=r"walk-([0-4])"), lambda line: None)
     tweener = priors.load_tweener(str(out), recipe.path)

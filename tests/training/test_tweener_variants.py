@@ -37,6 +37,7 @@ def image(clips, frames=60):
     return make_key_image(drawn.motion, drawn.told)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("changed", [{"keys": "sparse"}, {"architecture": "upsampling"}, {"architecture": "one-stage"}])
 def test_each_variant_learns(clips, changed):
     config = replace(tiny_tweener.CONFIG, **changed)

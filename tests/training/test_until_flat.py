@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import pytest
 import tiny_path
-from ended_models import MODELS
+from ended_models import MODELS, list_params
 from helpers import Killed, killing
 from helpers import run as mapctl_run
 
@@ -68,6 +68,7 @@ def test_it_ends_where_the_curve_is_flat_and_the_card_says_when_and_why(tmp_path
     assert priors.load_path(str(tmp_path / "run")).network.config == tiny_path.CONFIG
 
 
+@pytest.mark.slow
 def test_killed_anywhere_and_resumed_it_is_the_uninterrupted_run_to_the_bit(tmp_path, data):
     train(wanted(data, tmp_path / "whole"))
     begin = read_training(tmp_path / "whole")["ended"]["decay_from"]
@@ -82,6 +83,7 @@ def test_killed_anywhere_and_resumed_it_is_the_uninterrupted_run_to_the_bit(tmp_
     assert (tmp_path / "whole" / "model.safetensors").read_bytes() == before
 
 
+@pytest.mark.slow
 def test_two_processes_end_at_the_same_step_to_the_bit_also_resumed(tmp_path, data):
     train(wanted(data, tmp_path / "whole", processes=2))
     begin = read_training(tmp_path / "whole")["ended"]["decay_from"]
@@ -92,6 +94,7 @@ def test_two_processes_end_at_the_same_step_to_the_bit_also_resumed(tmp_path, da
         assert (tmp_path / "parts" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), name
 
 
+@pytest.mark.slow
 def test_the_learning_rate_stays_until_the_decay_and_then_falls(tmp_path, data, monkeypatch):
     rates, step = [], PathTrainer.train_step
 
@@ -107,6 +110,7 @@ def test_the_learning_rate_stays_until_the_decay_and_then_falls(tmp_path, data, 
     assert 0 < rates[-1] < 0.1
 
 
+@pytest.mark.slow
 def test_what_a_clock_has_decided_the_card_tells_so_that_any_run_is_the_same_to_the_bit(tmp_path, data, monkeypatch):
     """Also where it is killed after the decision: that is saved at once."""
     seconds = iter(range(10_000))
@@ -150,6 +154,7 @@ def test_the_command_of_a_card_asks_for_the_same_run(tmp_path, data):
         assert cli.parse(given.format_command()[1:]) == given
 
 
+@pytest.mark.slow
 def test_a_density_compares_free_runs_in_its_decay_and_no_sooner(data, tmp_path, monkeypatch):
     compared = []
     monkeypatch.setattr(DensityTrainer, "_add_moment_gradient", lambda self, windows: compared.append(self.step))
@@ -159,13 +164,10 @@ def test_a_density_compares_free_runs_in_its_decay_and_no_sooner(data, tmp_path,
     assert "--until-flat --decay-from 9:8" in read_training(tmp_path / "run")["command"]
 
 
-SLOW = ("stitcher", "pose-transformer")
 NETWORKS = [name for name in MODELS if name not in ("refiner", "keyframe-timing")]
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name in NETWORKS]
-)
+@pytest.mark.parametrize("name", list_params(NETWORKS))
 def test_every_network_can_be_trained_so(name, tmp_path, data, prior):
     recipe = MODELS[name].recipe(data, tmp_path / "run", prior)
     train(replace(recipe, until_flat=UntilFlat(decay_from=Decay(2, 2))))
@@ -178,6 +180,7 @@ def test_every_network_can_be_trained_so(name, tmp_path, data, prior):
     assert name in ("path", "tweener") or math.isfinite(recipe.find_card_headline(card["quality"]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["refiner", "keyframe-timing"])
 def test_others_end_at_once_when_their_minutes_are_up(name, tmp_path, data, prior):
     recipe = replace(MODELS[name].recipe(data, tmp_path / "run", prior), minutes=1e-9)
@@ -190,6 +193,7 @@ def test_others_end_at_once_when_their_minutes_are_up(name, tmp_path, data, prio
     assert training["curve"][-1][recipe.counter] == 1
 
 
+@pytest.mark.slow
 def test_what_cannot_go_together_is_refused(tmp_path, data):
     out = tmp_path / "run"
     with killing(PathTrainer, 4):
