@@ -8,6 +8,7 @@ from torch import Tensor
 
 from controllers.benchmarks.shared.tables import Row
 from controllers.generation.generate import GenerateSettings, initialise_generation, sample_pieces
+from controllers.generation.pace_plan import plan_paces
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, ground_speed, integrate_root
 from mapctl.metrics.pace_changes import CHANGES, PaceChanges, count_pace_changes, measure_speed
 from mapctl.metrics.states import summarise_states
@@ -67,8 +68,8 @@ def _count_in_ten_minutes(counts: Mapping[str, float], minutes: float) -> dict[s
 def _sample_free_run(prior: Density, frames: int, seed: int) -> Tensor:
     generator = torch.Generator().manual_seed(seed)
     beginning = initialise_generation(prior, GenerateSettings(), None, generator)
-    sampled, count = list[Tensor](), 0
-    for piece in sample_pieces(beginning, generator, longest=frames):
+    paces, sampled, count = plan_paces(beginning.prior, beginning.speed, generator), list[Tensor](), 0
+    for piece in sample_pieces(beginning, generator, paces=paces, longest=frames):
         sampled.append(piece)
         count += len(piece)
         if count >= frames:

@@ -63,12 +63,15 @@ def clean_up_feet(
     skeleton: Skeleton = CANONICAL,
     terms: Sequence[Term] = (),
     record: Callable[[CommittedFrames], None] | None = None,
+    find_prior: Callable[[int], Density] | None = None,
 ) -> Iterator[Float[Tensor, "_ size"]]:
     """Clean up the feet of the first `frames` of consecutive pieces of features, contact labels debounced.
 
     `state` and `ground_pose` (default: the origin) are the density's and the character's before the first frame, batch
-    of one. `terms` are the caller's own, the same in every window; `record` is called with each solved window. Windows
-    look ahead, so the pieces must hold `settings.window.frames` more frames than requested; RequestError otherwise.
+    of one. `terms` are the caller's own, the same in every window; `record` is called with each solved window.
+    `find_prior` finds what a frame was sampled from, counted from 0, where that is not the `prior` all along: a window
+    is solved with that of the middle of the frames that it commits. Windows look ahead, so the pieces must hold
+    `settings.window.frames` more frames than requested; RequestError otherwise.
     """
     settings, ground_pose = settings or FootCleanupSettings(), ground_pose or GroundPose.origin()
     ground_pose = GroundPose(ground_pose.position_xz.float(), ground_pose.heading.float())
@@ -82,7 +85,8 @@ def clean_up_feet(
             count = min(settings.window.frames - settings.window.overlap, left)
             window = _debounce_window_contacts(done.features, waiting[: settings.window.frames])
             caller_terms = [ViewedTerm(term, partial(_move_trial, offset=travelled)) for term in terms]
-            done = _clean_up_window(prior, done, window, count, settings, skeleton, generator, caller_terms)
+            sampled_from = prior if find_prior is None else find_prior(frames - left + count // 2)
+            done = _clean_up_window(sampled_from, done, window, count, settings, skeleton, generator, caller_terms)
             if record is not None:
                 record(done)
             yield done.features[-count:]

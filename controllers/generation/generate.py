@@ -15,7 +15,7 @@ from torch import Tensor
 
 from controllers.common.character import Character
 from controllers.generation.foot_cleanup import FootCleanupSettings, clean_up_feet
-from controllers.generation.pace_plan import measure_way_speed, plan_paces
+from controllers.generation.pace_plan import PacePlan, measure_way_speed, plan_paces
 from mapctl import retarget
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS, GroundPose, encode, integrate_root
@@ -180,15 +180,11 @@ def sample_pieces(
     generator: torch.Generator,
     settings: GenerateSettings | None = None,
     *,
-    longest: int | None = None,
+    paces: PacePlan | None = None,
+    longest: int = _CHUNK,
 ) -> Iterator[Float[Tensor, "_ size"]]:
-    """Sample consecutive pieces of one motion, of at most `longest` frames (20 s if None), without end.
-
-    A prior that knows paces is told them one after the other, unless `settings` say otherwise.
-    """
-    settings, longest = settings or GenerateSettings(), longest or _CHUNK
-    prior, state = beginning.prior, beginning.state
-    paces = plan_paces(prior, beginning.speed, generator) if settings.tell_paces else None
+    """Sample consecutive pieces of one motion, of at most `longest` frames, without end; `paces` are told meanwhile."""
+    settings, prior, state = settings or GenerateSettings(), beginning.prior, beginning.state
     while True:
         told, count = (prior, longest) if paces is None else paces.tell(longest)
         draw = told.sample
@@ -231,7 +227,8 @@ def _start_stream(
         raise RequestError(f"seconds must be positive, got {seconds:g}")
     frames = max(2, round(seconds * PRIOR_FPS))
     beginning = initialise_generation(prior, settings, clip, generator, scale=character.scale)
-    pieces, ground_pose = sample_pieces(beginning, generator, settings), beginning.ground_pose
+    paces = plan_paces(beginning.prior, beginning.speed, generator) if settings.tell_paces else None
+    pieces, ground_pose = sample_pieces(beginning, generator, settings, paces=paces), beginning.ground_pose
     if refiner is not None:
         pieces = (piece[0] for piece in refiner.stream(piece.unsqueeze(0) for piece in pieces))
     if settings.foot_cleanup is not None:
@@ -246,6 +243,7 @@ def _start_stream(
             skeleton=character.unit_skeleton,
             terms=[character.term(term) for term in terms],
             record=solved.append,
+            find_prior=None if paces is None else paces.find_told,
         )
     return _rechunk(pieces, frames), ground_pose
 

@@ -4,6 +4,7 @@ Samples of a density go on with what they do: that somebody sets off once in a m
 keeps in mind. So a density that knows paces as labels is told them, one after the other.
 """
 
+from collections import deque
 from collections.abc import Iterator, Mapping
 
 import torch
@@ -48,6 +49,9 @@ class PacePlan:
         self._pace, self._left = next(paces)
         self._emphasis = 1
         self._told: dict[str, list[Density]] = {}
+        # The frame before which each ends. What reads them is never far behind, if anything does.
+        self._pieces = deque[tuple[int, Density]](maxlen=1000)
+        self._seen = 0
 
     def tell(self, longest: int) -> tuple[Density, int]:
         """Return the prior told what is to come, and for how many frames, at most `longest`, it is to be sampled."""
@@ -58,12 +62,20 @@ class PacePlan:
 
     def see(self, features: Float[Tensor, "frames size"]) -> None:
         """Go on after what was sampled."""
+        self._seen += len(features)
+        self._pieces.append((self._seen, self._told[self._pace][self._emphasis]))
         self._left -= len(features)
         if self._left == 0:
             (self._pace, self._left), self._emphasis = next(self._paces), 1
             return
         has = find_pace(measure_way_speed(features))
         self._emphasis = 1 if has == self._pace else min(self._emphasis + 1, _MOST_EMPHATIC[self._pace])
+
+    def find_told(self, frame: int) -> Density:
+        """Find the prior as it was told when a frame was sampled, counted from 0; earlier frames are then forgotten."""
+        while self._pieces[0][0] <= frame:
+            self._pieces.popleft()
+        return self._pieces[0][1]
 
 
 def plan_paces(prior: Density, speed: float, generator: torch.Generator) -> PacePlan | None:

@@ -11,9 +11,12 @@ from helpers import generator, tiny_density, walk
 from toy_density import ToyDensity, toy_density
 
 from controllers.benchmarks.free_run import benchmark_free_run
+from controllers.generation import foot_cleanup
+from controllers.generation.foot_cleanup import FootCleanupSettings
 from controllers.generation.generate import Beginning, GenerateSettings, generate, initialise_generation, sample_pieces
-from controllers.generation.pace_plan import draw_paces, plan_paces
+from controllers.generation.pace_plan import PacePlan, draw_paces, plan_paces
 from mapctl.features import LAYOUT, GroundPose
+from mapctl.problem.receding_horizon import HorizonSettings
 from mapctl.protocols import LastFrameState
 
 RATES = {("stand", "walk"): 0.1, ("walk", "stand"): 0.05, ("walk", "run"): 0.15, ("run", "walk"): 0.5}
@@ -61,9 +64,16 @@ def begin(prior=TOLD, speed=0.0) -> Beginning:
     return Beginning(prior, STANDS, GroundPose.origin(torch.float64), speed)
 
 
-def sample(prior, pieces, *, settings=None, speed=0.0, seed=0):
+def sample_told(prior, settings=None, *, speed=0.0, seed=0, **longest):
+    """Pieces of a motion that is told paces, without end."""
+    drawn = generator(seed)
+    paces = plan_paces(prior, speed, drawn)
+    return sample_pieces(begin(prior, speed), drawn, settings, paces=paces, **longest)
+
+
+def sample(prior, pieces, **options):
     """So many pieces, joined."""
-    return torch.cat(list(islice(sample_pieces(begin(prior, speed), generator(seed), settings), pieces)))
+    return torch.cat(list(islice(sample_told(prior, **options), pieces)))
 
 
 def test_paces_last_as_long_as_the_rates_say():
@@ -89,7 +99,7 @@ def test_a_pace_that_never_changes_goes_on():
 def test_each_piece_is_sampled_given_its_pace():
     plan = list(islice(draw_paces(RATES, "stand", generator(5)), 12))
     frames = sum(count for _, count in plan)
-    pieces = list(islice(sample_pieces(begin(), generator(5), longest=15), 2000))
+    pieces = list(islice(sample_told(TOLD, seed=5, longest=15), 2000))
     assert max(map(len, pieces)) <= 15
     numbers = {"stand": 1.0, "walk": 2.0, "run": 3.0}
     expected = torch.cat([torch.full((count,), numbers[pace]) for pace, count in plan])
@@ -146,7 +156,8 @@ def test_nothing_is_told_where_no_pace_is_known_or_wanted():
     steady = replace(TOLD, rates={})
     assert plan_paces(steady, 0.0, generator()) is None
     assert set(sample(steady, 3)[:, PACE].tolist()) == {0.0}
-    assert set(sample(TOLD, 3, settings=GenerateSettings(tell_paces=False))[:, PACE].tolist()) == {0.0}
+    (piece,) = islice(sample_pieces(begin(), generator()), 1)
+    assert set(piece[:, PACE].tolist()) == {0.0}
 
 
 def test_a_density_without_paces_samples_as_in_one_go():
@@ -157,14 +168,52 @@ def test_a_density_without_paces_samples_as_in_one_go():
     assert torch.equal(piece, density.sample(state, 50, generator(4))[0][0])
 
 
-def test_generated_motion_is_told(monkeypatch):
-    density = replace(tiny_density(), use_fast=False)
-    asked = []
-    monkeypatch.setattr(
-        type(density), "pace_rates", property(lambda self: {("walk", "run"): 3.0, ("run", "walk"): 3.0})
-    )
-    monkeypatch.setattr(type(density), "conditioned_on", lambda self, labels: asked.append(labels) or self)
-    settings = GenerateSettings(foot_cleanup=None)
+@pytest.fixture
+def pacing(monkeypatch):
+    """A density that runs off and walks again all the time, and what its copies were told last."""
+    density, told = replace(tiny_density(), use_fast=False), {}
+
+    def condition(self, labels):
+        copy = replace(self)
+        told[copy] = labels[-1]
+        return copy
+
+    rates = {("walk", "run"): 3.0, ("run", "walk"): 3.0}
+    monkeypatch.setattr(type(density), "pace_rates", property(lambda self: rates))
+    monkeypatch.setattr(type(density), "conditioned_on", condition)
+    return density, told
+
+
+@pytest.mark.parametrize(("tell", "expected"), [(True, {"pace=walk", "pace=run"}), (False, set())])
+def test_generated_motion_is_told(pacing, tell, expected):
+    density, told = pacing
+    settings = GenerateSettings(foot_cleanup=None, tell_paces=tell)
     motion = generate(density, seconds=10.0, generator=generator(), settings=settings).motion
     assert motion.num_frames == 300
-    assert {label for labels in asked for label in labels} == {"pace=walk", "pace=run"}
+    assert set(told.values()) == expected
+
+
+def test_feet_are_cleaned_up_by_what_was_told(pacing, monkeypatch):
+    density, told = pacing
+    solved, sampled = [], []
+    make, see = foot_cleanup.RecedingHorizonSolver, PacePlan.see
+    monkeypatch.setattr(
+        foot_cleanup,
+        "RecedingHorizonSolver",
+        lambda prior, *more, **named: solved.append(told[prior]) or make(prior, *more, **named),
+    )
+
+    def watch(self, features):
+        sampled.extend([f"pace={self._pace}"] * len(features))
+        see(self, features)
+
+    monkeypatch.setattr(PacePlan, "see", watch)
+    window = HorizonSettings(frames=12, overlap=6)
+    generate(
+        density,
+        seconds=2.0,
+        generator=generator(),
+        settings=GenerateSettings(foot_cleanup=FootCleanupSettings(window=window)),
+    )
+    assert solved == sampled[3 : 3 + 6 * len(solved) : 6]
+    assert len(set(solved)) == 2

@@ -21,7 +21,7 @@ NOT_RUN = re.compile(r"mapctl (live|bench|demo|train all)\b|DATA|--cluster")
 LONG = re.compile(
     r"mapctl (run|chain|train (refiner|.* (mocap|everything)/)|tween (docs|.*(120|LeftHand)$))"
     "|--(causal|best-of|variations|reference|jobs|root-only|suggest-timing|init|video|loop)|auto|denoise example:"
-    "|7s:8.5s|reaching.csv|arriving.csv|--start take.bvh|--joints leftHand .*stitcher|--curve .*stitcher|--method rollouts|.webp"
+    "|7s:8.5s|reaching.csv|arriving.csv|--start take.bvh|--(joints leftHand|curve) .*stitcher|--method rollouts|.webp"
 )
 # Tutorials are followed step by step where the site is built (docs/extensions/followed_tutorials.py).
 PYTHON = [block for page in pages.PAGES if "tutorials" not in page for block in pages.blocks(page, "python")]
