@@ -108,8 +108,8 @@ class LstmGmmDensity(checkpoints.LoadedModel, Density[LstmState]):
     @property
     def pace_rates(self) -> dict[tuple[str, str], float]:
         """Changes of pace a second in its data, by the pace before and after, if paces are labels of it."""
-        told = {*PACE_LABELS} <= {*self.reference.config.labels}
-        return read_pace_rates(self.card.data["holds"]) if told else {}
+        held, told = self.card.data.get("holds", {}), {*PACE_LABELS} <= {*self.reference.config.labels}
+        return read_pace_rates(held) if told and "minutes by pace" in held else {}
 
     def with_observation_noise(self, sigma: Float[Tensor, " continuous"]) -> "LstmGmmDensity":
         """Return the density of motion observed with errors of this sigma (physical units); see `LstmGmm`."""
