@@ -27,9 +27,14 @@ needs_usd = pytest.mark.skipif(not usd.is_installed(), reason="needs usd-core: p
 needs_ufbx = pytest.mark.skipif(find_spec("ufbx") is None, reason="needs ufbx: pip install 'mapctl[fbx]'")
 
 
-def _with_marks(endings):
+def _mark(source, ending):
+    """All pairs that have .bvh among them are quick enough together."""
     needed = {".usd": needs_usd, ".fbx": needs_ufbx}
-    return [pytest.param(ending, marks=needed.get(ending[:4], ())) for ending in endings]
+    marks = [needed[part[:4]] for part in (source, ending) if part[:4] in needed]
+    return pytest.param(source, ending, marks=marks if ".bvh" in (source, ending) else [*marks, pytest.mark.slow])
+
+
+PAIRS = [_mark(source, ending) for source in formats.READERS for ending in formats.WRITERS]
 
 
 @pytest.fixture
@@ -56,8 +61,7 @@ def here(tmp_path, monkeypatch):
         yield tmp_path
 
 
-@pytest.mark.parametrize("source", _with_marks(formats.READERS))
-@pytest.mark.parametrize("ending", _with_marks(formats.WRITERS))
+@pytest.mark.parametrize(("source", "ending"), PAIRS)
 def test_any_format_to_any_format(here, capsys, source, ending):
     if ending == ".vrm" and source != ".vrm":
         assert run("convert", f"in{source}", "out.vrm") == 2

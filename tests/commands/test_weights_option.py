@@ -232,7 +232,6 @@ def test_what_the_free_set_lacks_is_refused_in_one_line(both, fails):
     assert "no 'general'" in fails("follow", "line:1", "-o", "o.bvh", "--weights", "free", "--prior", "general")
 
 
-@pytest.mark.slow
 def test_the_option_comes_before_the_scene_file_and_that_before_the_environment(both, monkeypatch):
     def used(*words):
         assert run("run", "scene.toml", "--quiet", *words) == 0

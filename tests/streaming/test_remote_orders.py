@@ -75,7 +75,7 @@ def test_the_source_is_one():
 def test_numbers_and_labels_become_one_command_for_their_character(stage):
     show, actors, _, send = stage
     send(("speed", 2.0), ("heading", 90.0), ("style", "old"), ("2/speed", 0.5), ("2/facing", -90.0))
-    assert actors[0].heard == [("command", Command(2.0, math.pi / 2, labels=("old",)))]
+    assert actors[0].heard == [("command", Command(2.0, math.pi / 2, labels=("style=old",)))]
     assert actors[1].heard == [("command", Command(0.5, 0.0, -math.pi / 2))]
     assert (show._panel.steering.speed.value, show._panel.steering.heading.value) == (2.0, 90)
     assert show._panel.steering.labels["style"].value == "old"

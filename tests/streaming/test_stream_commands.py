@@ -187,7 +187,7 @@ def test_a_script_plays_as_it_is_until_an_order_comes(played):
     _, at, lines = played
     assert at(0.0) is lines[0]
     changed = at(1.0, ("speed", 0.5), ("hand/left", 0.1, 1.0, 3.0))
-    assert (changed.speed, changed.turning, changed.labels) == (0.5, 0.5, ("old",))
+    assert (changed.speed, changed.turning, changed.labels) == (0.5, 0.5, ("style=old",))
     assert changed.obstacles == lines[0].obstacles
     assert changed.reach == {"leftHand": (0.1, 1.0, 3.0)}
     assert at(2.0) == changed
