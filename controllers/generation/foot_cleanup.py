@@ -39,8 +39,13 @@ class FootCleanupSettings:
     """Sigma of the trajectory's deviation over the ground within a window, metres."""
     sigma_heading: float = MotionTracking.sigma_heading
     """Sigma of the heading's deviation within a window, radians."""
-    footing: FootContact = field(default_factory=lambda: FootContact(sigma_speed=0.06, landing=LandingSigmas()))
-    """Contact term. Mocap's planted feet move a little: perfectly still ones would be distinguishable from them."""
+    footing: FootContact = field(
+        default_factory=lambda: FootContact(
+            sigma_speed=0.06, sigma_height=0.02, sigma_below=0.002, landing=LandingSigmas()
+        )
+    )
+    """Contact term. Mocap's planted feet move a little, and a foot rests higher at one contact than at the next, though
+    never lower than flat: feet that are perfectly still or all at one height would be distinguishable from them."""
     window: HorizonSettings = field(default_factory=HorizonSettings)
     """Lengths of the receding horizon."""
     share: float = GuidedNoiseSolver.share
