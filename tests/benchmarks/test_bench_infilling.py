@@ -62,6 +62,7 @@ def rows():
     return rows
 
 
+@pytest.mark.slow
 def test_every_task_has_every_method_and_gaps_have_more(rows):
     assert all(set(row) == COLUMNS for row in rows)
     assert all(row["clips"] == 1 for row in rows)

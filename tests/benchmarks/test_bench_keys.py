@@ -54,6 +54,7 @@ def shifted(motion: Motion, shift: torch.Tensor, joint: int | None = None):
     return propose_raw
 
 
+@pytest.mark.slow
 def test_keys_are_missed_in_joints_and_in_the_hips_by_what_they_are_missed():
     motion = walk(60)
     sequence, slerp = keyed(motion, [0, 20, 40], [0, 0, 0]), SlerpInbetweener()
@@ -139,6 +140,7 @@ def test_sequences_are_of_single_poses_of_clips_that_are_where_their_keys_say():
         HeldOutClips({"short": [walk(20)]})
 
 
+@pytest.mark.slow
 def test_time_is_told_by_part():
     sequence, motion = keyed(walk(60), [0, 20, 59], [0, 0, 0]), walk(60)
 

@@ -90,6 +90,7 @@ def test_errors_are_of_all_joints_and_poses():
     assert found.deviation == pytest.approx(math.sqrt(3.5))
 
 
+@pytest.mark.slow
 def test_the_command_trains_each_and_tells_what_the_ranges_leave_out(tmp_path, capsys):
     data = tmp_path / "data"
     data.mkdir()

@@ -59,6 +59,7 @@ def run_bench(prior, *more):
     return ["bench", "why", "--prior", prior, "--data", prior.parent, *more]
 
 
+@pytest.mark.slow
 def test_variants_and_sizes_are_chosen(prior, capsys, monkeypatch):
     def measure(variants, mocap, settings):
         about = {"clips": len(mocap), "count": settings.count, "seconds": settings.seconds, "steps": settings.steps}

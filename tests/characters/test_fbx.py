@@ -115,6 +115,7 @@ def test_a_take_without_a_range_lasts_as_its_keys(tmp_path):
     np.testing.assert_allclose(in_order(formats.load(path)), wanted, **NEAR)
 
 
+@pytest.mark.slow
 def test_takes_and_armatures_are_told_by_name(tmp_path):
     path = tmp_path / "a.fbx"
     make_fbx(path, takes=("Walk", "Run"))

@@ -127,6 +127,7 @@ def without_additions(tree):
     }
 
 
+@pytest.mark.slow
 def test_a_motion_is_added_and_all_else_stays(kind, tmp_path):
     made = make(tmp_path, kind, animations=("walk",))
     motion = follow_up(made)

@@ -138,6 +138,7 @@ class TestReading:
             wanted = viewer.joints(start + frame * rate / float(fps))
             np.testing.assert_allclose(motion.joint_positions()[frame], wanted, rtol=0, atol=1e-4)
 
+    @pytest.mark.slow
     def test_several_are_told_by_name(self, tmp_path):
         path = make(tmp_path, "plain", names=("Body", "Horse"), frames=4)
         with pytest.raises(FileFormatError, match=r"2 armatures: 'Body', 'Horse'; choose one, as hero.usda#Body"):
@@ -230,6 +231,7 @@ class TestReading:
 
 
 class TestWriting:
+    @pytest.mark.slow
     def test_another_motion_on_the_same_character(self, kind, tmp_path):
         path, out = make(tmp_path, kind), tmp_path / f"hero-walk{ENDINGS[len(kind) % 3]}"
         motion = follow_up(path)
@@ -243,6 +245,7 @@ class TestWriting:
         np.testing.assert_allclose(again.joint_positions(), motion.joint_positions(), **NEAR)
         assert find_faults(out) == find_faults(path)
 
+    @pytest.mark.slow
     def test_all_else_stays(self, kind, tmp_path):
         path, out = make(tmp_path, kind), tmp_path / "out.usda"
         follow_up(path).save(out)
@@ -293,6 +296,7 @@ class TestWriting:
         assert (ends.max(0) > places.max(0) + 0.29).all()
         assert (np.ptp(ends, axis=0) < 5.0).all()
 
+    @pytest.mark.slow
     def test_other_animations_stay_beside(self, tmp_path):
         path, out = make(tmp_path, "plain", frames=6), tmp_path / "2 steps.usda"
         follow_up(path).save(out)
@@ -312,6 +316,7 @@ class TestWriting:
         assert_same(motion, viewer)
         assert formats.load(out).fps == motion.fps
 
+    @pytest.mark.slow
     def test_layers_stay_where_the_new_file_finds_them(self, tmp_path):
         (tmp_path / "parts").mkdir()
         make_character_usd(tmp_path / "parts" / "body.usda")

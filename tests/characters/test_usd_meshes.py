@@ -40,6 +40,7 @@ def test_faces_of_any_kind(tmp_path):
     assert found.rgba[5, 0] < found.rgba[5, 2]
 
 
+@pytest.mark.slow
 def test_a_picture_is_seen_at_the_vertices(tmp_path):
     pillow = pytest.importorskip("PIL.Image")
     pillow.fromarray(np.array([[[255, 0, 0], [0, 0, 255]]], np.uint8).repeat(2, axis=0)).save(tmp_path / "a.png")

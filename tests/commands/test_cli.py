@@ -36,6 +36,7 @@ def test_every_command_has_help(name, capsys):
     assert f"mapctl {name}" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_follow_writes_motion_and_report(walk, prior):
     motion, report = mapctl.load(walk), json.loads(walk.with_suffix(".json").read_text())
     assert motion.num_frames == 60
@@ -63,6 +64,7 @@ def test_the_curve_is_walked_once_if_no_time_is_given(prior, tmp_path):
     assert mapctl.load(tmp_path / "a.npz").seconds == pytest.approx(1, abs=0.1)
 
 
+@pytest.mark.slow
 def test_same_seed_same_bytes(prior, tmp_path):
     def written(name: str, seed: int) -> bytes:
         path = tmp_path / name
@@ -283,6 +285,7 @@ def presses_ctrl_c(monkeypatch, *, after):
     monkeypatch.setattr(RecedingHorizonSolver, "solve", pressed)
 
 
+@pytest.mark.slow
 def test_an_interrupted_walk_is_written_as_far_as_it_was_solved(prior, tmp_path, monkeypatch, capsys):
     presses_ctrl_c(monkeypatch, after=20)
     files = {name: tmp_path / f"walk.{name}" for name in ("bvh", "json", "mp4")}
@@ -301,6 +304,7 @@ def test_an_interrupted_walk_is_written_as_far_as_it_was_solved(prior, tmp_path,
     )
 
 
+@pytest.mark.slow
 def test_an_interrupted_demo_and_scene_are_written_without_films(prior, tmp_path, monkeypatch):
     presses_ctrl_c(monkeypatch, after=1)
     assert run("demo", "-o", tmp_path / "demo", "--prior", prior, "--quiet") == 130

@@ -89,6 +89,7 @@ def test_a_walk_interrupted_from_outside_leaves_a_whole_file_or_none(prior, tmp_
     assert not written or 2 < mapctl.load(tmp_path / "walk.bvh").num_frames < 90_000
 
 
+@pytest.mark.slow
 def test_a_closed_pipe_is_no_error():
     """As in `mapctl measure walk.bvh | head -1`."""
     reader, writer = os.pipe()

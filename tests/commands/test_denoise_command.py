@@ -138,6 +138,7 @@ def test_what_is_there_is_not_done_again_unless_asked_for(denoise, folder, tmp_p
     assert mapctl.load(out / "deep" / "b.bvh").num_frames == 20
 
 
+@pytest.mark.slow
 def test_failures_are_listed_and_stop_no_other_file(denoise, folder, tmp_path, capsys):
     (folder / "0-broken.bvh").write_text("HIERARCHY\nnonsense")
     walk(20).save(folder / "c.npz")
@@ -152,6 +153,7 @@ def test_failures_are_listed_and_stop_no_other_file(denoise, folder, tmp_path, c
     assert not (tmp_path / "out" / "0-broken.bvh").exists()
 
 
+@pytest.mark.slow
 def test_an_interrupted_folder_says_what_is_done_and_goes_on(denoise, folder, tmp_path, monkeypatch, capsys):
     save, out = formats.save, tmp_path / "out"
 

@@ -174,6 +174,7 @@ def test_info_lists_classes_and_no_vectors(models, capsys):
     assert json.loads(capsys.readouterr().out)["data"]["classes"] == {"walk": 1, "wave-left-hand": 1}
 
 
+@pytest.mark.slow
 def test_auto_takes_the_named_tweener_in_long_gaps_and_the_transformer_elsewhere(here, models, capsys):
     """Only a walk that lasts has a long gap; its path predictor may be named with it."""
     on_rig("bandai", 240).save("long.bvh")

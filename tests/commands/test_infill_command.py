@@ -121,6 +121,7 @@ def test_gaps_at_the_ends_are_said(infill, recording, tmp_path, capsys):
     assert "a gap at the end: the motion is extended" in told
 
 
+@pytest.mark.slow
 def test_a_report_tells_the_request_and_what_was_done(infill, recording, tmp_path):
     report = tmp_path / "r.json"
     words = ["--gap", "20:30", "--report", report, "--prior", save_tiny_prior(tmp_path / "prior.safetensors")]

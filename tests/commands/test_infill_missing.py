@@ -171,6 +171,7 @@ def test_other_commands_refuse_nan_and_say_who_fills_it(clip, tmp_path, monkeypa
     assert sorted(tmp_path.iterdir()) == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("many", [False, True])
 def test_denoising_believes_no_nan(clip, tmp_path, many):
     """As if a mask said so."""

@@ -39,6 +39,7 @@ def source(tmp_path):
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", COMMANDS)
 def test_the_same_bytes_come_twice_and_quiet_says_nothing(command, tiny, source, tmp_path, capsys):
     found = set()

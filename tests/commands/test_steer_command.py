@@ -32,6 +32,7 @@ def steer(prior, tmp_path):
     return run
 
 
+@pytest.mark.slow
 def test_a_script_gives_motion_report_and_plot(steer, tmp_path, capsys):
     report, plot = tmp_path / "r.json", tmp_path / "p.png"
     assert steer(SCRIPT, "--report", report, "--plot", plot, "--seed", 3) == 0
@@ -69,6 +70,7 @@ def test_a_script_is_played_against_the_clock(steer, tmp_path):
     assert mapctl.load(tmp_path / "a.bvh").num_frames == 15
 
 
+@pytest.mark.slow
 def test_turning_and_labels_are_said_and_what_the_prior_does_not_know_is_refused(steer, tmp_path, capsys):
     script = "time_s,speed_mps,heading_deg,turn_deg_s,style\n0,1.2,0,30,{}\n0.4,1.2,0,,\n"
     assert steer(script.format(""), "--report", tmp_path / "r.json") == 0
@@ -82,6 +84,7 @@ def test_turning_and_labels_are_said_and_what_the_prior_does_not_know_is_refused
     assert not (tmp_path / "a.bvh").exists()
 
 
+@pytest.mark.slow
 def test_speeds_that_nobody_runs_are_lowered_and_said(steer, capsys):
     fast = "time_s,speed_mps,heading_deg\n0,50,0\n0.2,50,0\n"
     assert steer(fast) == 0

@@ -25,6 +25,7 @@ def clip(tmp_path, monkeypatch):
 STITCH = ("--method", "stitcher", "--stitcher", "own.safetensors", "--no-finish", "--quiet")
 
 
+@pytest.mark.slow
 def test_one_transition_and_its_report(clip):
     assert run("tween", clip, "-o", "one.bvh", "--keyframes", "0,20,39", *STITCH, "--report", "one.json") == 0
     report = json.loads(Path("one.json").read_text())
@@ -49,6 +50,7 @@ def test_the_first_variation_is_the_calm_one_and_the_others_are_the_same_however
     assert len({Path(f"many_00{number}.bvh").read_bytes() for number in range(4)}) == 4
 
 
+@pytest.mark.slow
 def test_one_answer_is_the_calm_one_whatever_the_seed(clip):
     for out, seed in (("a.bvh", 0), ("b.bvh", 5)):
         assert run("tween", clip, "-o", out, "--keyframes", "0,20", *STITCH, "--seed", seed) == 0

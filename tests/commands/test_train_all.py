@@ -202,6 +202,7 @@ def test_every_option_is_in_the_line():
     assert cli.parse(given.format_command()[1:]) == given
 
 
+@pytest.mark.slow
 def test_one_that_fails_ends_only_those_that_need_it(tmp_path, stage, train_all, capsys):
     stage.failing["locomotion"] = "no .bvh below clips matches 'dataset-2'"
     assert train_all() == 2

@@ -77,6 +77,7 @@ def test_keys_may_be_seconds(tween, source, tmp_path):
     assert len(found) == 1
 
 
+@pytest.mark.slow
 def test_frames_keys_and_notes_are_told(tween, source, tmp_path, capsys):
     motion = on_rig("bandai", FRAMES)
     (hips,) = motion.moving_offsets

@@ -60,6 +60,7 @@ def test_a_curve_that_is_clear_stays_as_it_is():
     assert lead_around(LINE, Obstacle((3.0, 4.5), 0.5)) is LINE
 
 
+@pytest.mark.slow
 def test_a_doorway_is_walked_through_in_its_middle():
     door = (Obstacle((1.25, 4.5), size=(1.5, 0.2)), Obstacle((-1.05, 4.5), size=(1.5, 0.2)))
     at_door = points_of(lead_around(LINE, *door))

@@ -34,6 +34,7 @@ def test_twice_is_not_at_all(name):
     torch.testing.assert_close(same, torch.ones_like(same), atol=1e-9, rtol=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RIGS)
 def test_every_joint_is_where_its_partner_is_in_the_mirror(name):
     motion = on_rig(name)

@@ -41,6 +41,7 @@ def test_sway_stays():
     assert float((hips - hips.mean() - sway[20:-20]).abs().max()) < 0.004
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RIGS)
 def test_with_travel_on_the_root_nothing_else_moves(name):
     motion = on_rig(name, walk(75, cadence=1.0, turn_rate=0.4))

@@ -80,6 +80,7 @@ def refined(mesh: CharacterMesh, vertices: np.ndarray) -> np.ndarray:
     return np.einsum("nc,nck->nk", fine.shares, vertices[fine.corners])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MAKES)
 def test_a_character_in_its_own_motion_is_where_its_file_has_it(made, name):
     path, viewer = made[name].path, GlbViewer(made[name].path)
@@ -110,6 +111,7 @@ def test_any_motion_is_put_on_it_as_convert_does(made, name, tmp_path):
     np.testing.assert_allclose(drawn.placed.motion.joint_positions(), expected.joint_positions(), atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MAKES)
 def test_its_soles_are_on_the_floor_while_feet_are_planted(made, name):
     clip = long_walk(90)
@@ -192,6 +194,7 @@ def test_a_film_at_another_rate_shows_the_character_there(hero):
     np.testing.assert_allclose(vertices_of(stage.players[0].body, 7), vertices_of(same, 21), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_trail_marks_and_shadow_are_the_characters_own(folder):
     clip = long_walk(90)
     made = make_character_glb(folder / "child.glb", size=0.6)
@@ -206,6 +209,7 @@ def test_trail_marks_and_shadow_are_the_characters_own(folder):
     assert len(ends) == len(radii) == len(rgb) > 10
 
 
+@pytest.mark.slow
 def test_all_of_a_character_is_in_view(folder):
     made = make_character_glb(folder / "hat.glb", hat=True)
     motion = walk(12)
@@ -221,6 +225,7 @@ def test_all_of_a_character_is_in_view(folder):
         assert (at[:, :2] < [160, 90]).all()
 
 
+@pytest.mark.slow
 def test_ghosts_are_paler_and_keep_opacity(folder):
     made = make_character_glb(folder / "hat.glb", hat=True)
     drawn = DrawnCharacter.load(made.path).put_on(walk(8))
@@ -233,6 +238,7 @@ def test_ghosts_are_paler_and_keep_opacity(folder):
     assert ghost.is_open
 
 
+@pytest.mark.slow
 def test_poses_that_are_asked_for_are_shown_with_the_mesh(hero):
     clip = long_walk(40)
     pose = replace(clip.slice(20, 21), root_position=clip.root_position[20:21] + torch.tensor([1.0, 0.0, 0.0]))
@@ -294,6 +300,7 @@ def test_one_sees_through_what_is_not_opaque_and_into_what_is_open(folder):
     assert back[2] < 90
 
 
+@pytest.mark.slow
 def test_stick_figures_say_that_they_show_no_mesh(hero, tmp_path, caplog):
     clip = walk(3)
     with caplog.at_level(logging.WARNING):

@@ -53,6 +53,7 @@ def near(picture, colour: str, tolerance: float) -> np.ndarray:
     return np.flatnonzero(alike) % picture.shape[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("renderer", RENDERERS)
 def test_an_mp4_has_every_frame_at_the_motions_rate(renderer, tmp_path):
     motion, path = walk(18, fps=24), tmp_path / "walk.mp4"
@@ -136,6 +137,7 @@ def test_a_loop_keeps_the_motions_time(fps, shown, ending, tmp_path):
     assert min(delays) >= 20
 
 
+@pytest.mark.slow
 def test_a_webp_shows_what_was_drawn(tmp_path):
     stage, camera = Stage([Shot(walk(12))]), CameraSettings("follow")
     film([Shot(walk(12))], tmp_path / "walk.webp", size=(320, 180), renderer="stick", camera=camera)
@@ -252,6 +254,7 @@ def test_the_renderer_can_be_chosen_by_the_environment(monkeypatch):
         select_painter()
 
 
+@pytest.mark.slow
 def test_motions_below_each_other_are_a_row_each_under_their_names(tmp_path):
     out = tmp_path / "rows.png"
     motions = [("one", walk(20)), ("other and third", walk(20)), ("one", walk(20))]

@@ -49,6 +49,7 @@ def test_labels_that_have_room_stay_where_their_joints_are():
     assert spread([0.5, 0.5]) == pytest.approx([0.5, 0.444])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "motion",
     [

@@ -315,6 +315,7 @@ def test_a_frame_rate_out_of_range_is_refused(fps, tmp_path):
         replace(standing(), fps=fps).save(tmp_path / "out.bvh")
 
 
+@pytest.mark.slow
 def test_a_long_capture_is_read_and_written_quickly(tmp_path):
     names = tuple(f"joint{j}" for j in range(31))
     tree = bvh_text.Hierarchy(

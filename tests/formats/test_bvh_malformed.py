@@ -141,6 +141,7 @@ def deep(joints: int) -> str:
     return f"{hierarchy}MOTION\nFrames: 1\nFrame Time: 0.1\n{row}\n"
 
 
+@pytest.mark.slow
 def test_a_hierarchy_of_3000_levels_is_refused_quickly_and_one_of_900_is_read_and_written(tmp_path):
     start = time.perf_counter()
     (tmp_path / "walk.bvh").write_text(deep(3000))

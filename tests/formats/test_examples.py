@@ -43,6 +43,7 @@ def test_it_is_as_noisy_as_its_page_says():
     assert 100 * float(found.noise_root) == pytest.approx(make_example.CENTIMETRES, rel=0.3)
 
 
+@pytest.mark.slow
 def test_a_command_takes_it_and_tells_its_licence(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     tiny = save_tiny_denoiser(tmp_path / "tiny.safetensors")

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import pytest
 import torch
 from helpers import bandai_skeleton, generator
 from methods import UNFINISHED
@@ -45,6 +46,7 @@ def test_pieces_of_a_chain_stand_on_the_first_ones_floor():
         torch.testing.assert_close(toes[piece].amin(0), torch.full((2,), TOE_REST_HEIGHT).double(), atol=0.01, rtol=0)
 
 
+@pytest.mark.slow
 def test_a_borrowed_foot_is_as_high_as_it_was():
     """The same step of somebody else comes at the same height of the foot over the floor, in scale."""
     motion, source = own_walk(), others_walk()

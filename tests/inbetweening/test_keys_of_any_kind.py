@@ -71,6 +71,7 @@ def test_a_half_is_met_to_the_bit_and_the_other_does_not_count(rig, fps, half):
     assert torch.equal(made.motion.local_quat_xyzw, again.motion.local_quat_xyzw)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rig", "fps", "method"), [*((*rate, "infiller") for rate in RATES), ("daz", 120, "slerp")])
 def test_places_alone_are_met_and_nothing_else_of_the_motion_counts(rig, fps, method):
     motion = on_rig(rig, round(1.5 * fps), fps=fps)
@@ -88,6 +89,7 @@ def test_places_alone_are_met_and_nothing_else_of_the_motion_counts(rig, fps, me
         assert float(rotations.wrap_angle(facing[0] - torch.atan2(way[0], way[1])).abs()) < 0.5
 
 
+@pytest.mark.slow
 def test_places_are_met_after_the_map_stage_and_beside_whole_poses():
     motion = on_rig("bandai", LAST)
     keys = Keys((0, Key(20, **PLACE), Key(44, half="lower")))
@@ -96,6 +98,7 @@ def test_places_are_met_after_the_map_stage_and_beside_whole_poses():
     assert made.windows
 
 
+@pytest.mark.slow
 def test_only_the_ground_is_told_by_a_place():
     """Another height and another pose in its frame change no bit."""
     motion = on_rig("canonical", LAST)

@@ -141,6 +141,7 @@ def test_the_body_moves_for_a_hand_only_where_its_arm_does_not_reach(share, move
         assert torch.equal(made.motion.local_quat_xyzw, freely.local_quat_xyzw)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("finish", [False, True], ids=["proposed", "finished"])
 def test_hands_over_the_head_are_reached_by_the_arms(finish):
     """By one that takes no such keys too: where its arms hung, the MAP stage had to lift the whole body."""

@@ -161,6 +161,7 @@ def test_an_end_is_extended_by_a_density_and_a_beginning_never(prior, frames):
     assert torch.equal(again.motion.local_quat_xyzw, made.motion.local_quat_xyzw)
 
 
+@pytest.mark.slow
 def test_a_density_that_does_not_know_the_motion_leaves_the_end_to_the_infiller(prior):
     class Stern:
         """Finds everything unlikely."""
@@ -209,6 +210,7 @@ def test_the_best_is_the_answer_of_least_energy_and_all_are_told(prior, keys):
             assert torch.equal(made.motion.local_quat_xyzw, one.solution.motion.local_quat_xyzw)
 
 
+@pytest.mark.slow
 def test_the_best_of_one_or_of_too_few_frames_is_refused(prior):
     motion, rollouts = on_rig("canonical", FRAMES), RolloutInbetweener([prior], INFILLER)
     with pytest.raises(RequestError, match="the best is of 2 to 1000, got 1"):

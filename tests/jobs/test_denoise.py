@@ -118,6 +118,7 @@ def test_what_densities_made_of_windows_is_told_in_frames_of_the_capture():
     json.dumps(done.details(), allow_nan=False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rig", RIGS)
 def test_what_masked_frames_show_does_not_leak(rig):
     truth = on_rig(rig, 120)
@@ -133,6 +134,7 @@ def test_what_masked_frames_show_does_not_leak(rig):
     assert apart_deg(out[0].local_quat_xyzw, truth.local_quat_xyzw)[50:58, joint].max() < 20
 
 
+@pytest.mark.slow
 def test_a_locked_root_above_the_hips_that_is_lost_now_and_then_changes_nothing():
     given = noisy(on_rig("bandai", 120), 2.0, 0.5)
     lost = torch.arange(120) % 3 == 1
@@ -241,6 +243,7 @@ def test_a_tpose_in_frame_0_stays(rig):
     assert "T-pose" in done.notes[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rig", "fps"), [("bandai", 30), ("daz", 60)])
 def test_a_long_capture_in_pieces_has_all_frames_and_no_jump(monkeypatch, rig, fps):
     module = import_module("controllers.denoising.denoise")  # the package has a function of this name
@@ -289,6 +292,7 @@ def test_short_captures_come_back_whole(frames, fps):
     assert cleaned(given).motion.num_frames == frames
 
 
+@pytest.mark.slow
 def test_the_noise_may_be_said():
     given = noisy(on_rig("canonical", 90))
     none = cleaned(given, settings=replace(QUICK, sigma_deg=0.0, sigma_cm=0.0))

@@ -65,6 +65,7 @@ def test_planted_toes_slow_down_and_the_motion_stays_what_it_was():
     assert float(height.abs().mean()) < 0.03
 
 
+@pytest.mark.slow
 def test_contacts_and_gaps_of_one_or_two_frames_go():
     flickering = clip()
     flickering[8, -2:] = 1 - flickering[8, -2:]

@@ -50,6 +50,7 @@ def test_it_begins_at_the_origin_facing_ahead():
     assert abs(float(heading(motion.local_quat_xyzw[0, 0]))) < 0.2
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_bytes(tmp_path):
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):
         made(seed=seed).save(tmp_path / f"{name}.bvh")
@@ -57,6 +58,7 @@ def test_the_same_seed_gives_the_same_bytes(tmp_path):
     assert a == b != c
 
 
+@pytest.mark.slow
 def test_pieces_join_to_the_motion_sampled_in_one_go(monkeypatch):
     whole = made(2.0, seed=5)
     monkeypatch.setattr(sys.modules["controllers.generation.generate"], "_CHUNK", 13)
@@ -144,12 +146,14 @@ class Raised:
             held = held[:, -2:]
 
 
+@pytest.mark.slow
 def test_a_refiner_comes_before_the_motion_is_decoded():
     plain, lifted = made(), made(refiner=Raised())
     assert lifted.num_frames == plain.num_frames
     torch.testing.assert_close(lifted.root_position[:, 1], plain.root_position[:, 1] + 0.1, atol=1e-5, rtol=0)
 
 
+@pytest.mark.slow
 def test_features_are_the_motion_and_its_contact_labels():
     motion = made(seed=2)
     features = generate(DENSITY, seconds=1.0, generator=generator(2), settings=RAW).features

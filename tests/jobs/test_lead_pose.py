@@ -63,6 +63,7 @@ def cleaned(motion: Motion, **changes):
     return denoise(motion, tiny_denoiser(), **{"settings": QUICK} | changes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1, 2])
 @pytest.mark.parametrize(("rig", "fps"), [("daz", 120), ("canonical", 60), ("daz", 60)])
 def test_no_frame_after_a_mixed_in_tpose_errs_by_far_more_than_the_others(rig, fps, seed):
@@ -78,6 +79,7 @@ def test_no_frame_after_a_mixed_in_tpose_errs_by_far_more_than_the_others(rig, f
     assert not [fault for fault in done.faults if fault.kind == "dropout" and fault.start < 8]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rig", ["bandai", "daz", "canonical"])
 def test_without_a_mixture_the_first_frames_are_motion(rig):
     truth = led(arms_down(on_rig(rig, 90)), shares=())
@@ -88,11 +90,13 @@ def test_without_a_mixture_the_first_frames_are_motion(rig):
     assert away[1:8].max() < 9
 
 
+@pytest.mark.slow
 def test_what_is_mixed_in_a_clean_capture_stays_as_it_is():
     truth = led(arms_down(on_rig("daz", 240, fps=120)))
     assert errors_cm(truth, cleaned(truth).motion)[:8].max() < 0.5
 
 
+@pytest.mark.slow
 def test_joints_that_take_another_way_from_the_pose_are_told_from_noise():
     """Euler angles that are mixed one by one leave the short way, by a bow; a spike in one frame is none."""
     truth = led(arms_down(on_rig("daz", 120, fps=120)))
@@ -149,6 +153,7 @@ def test_frames_that_the_user_masks_in_the_passage_are_told_as_lost():
     assert lost == [("lForeArm", 2)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("rest", ["straighten", "auto"])
 def test_a_tpose_is_told_under_noise_whatever_rest_the_rig_has(rest, seed):

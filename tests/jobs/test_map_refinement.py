@@ -163,6 +163,7 @@ def test_a_walk_that_is_moving_begins_so():
     assert torch.allclose((motion.root_position[0, [0, 2]] - place.position_xz), step, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_every_frame_comes_back_once_whatever_the_windows(monkeypatch):
     motion = walk(70, turn_rate=0.6)
     for frames, ahead in ((96, 24), (70, 8), (20, 8), (33, 1)):
@@ -186,6 +187,7 @@ def test_windows_meet_without_a_jump():
     assert torch.diff(out.joint_positions(), dim=0).norm(dim=-1).max() < 0.03
 
 
+@pytest.mark.slow
 def test_a_window_without_a_finite_solution_is_left_as_proposed(monkeypatch):
     motion = standing_still(50, drift=0.2)
     found = window_solvers.minimise

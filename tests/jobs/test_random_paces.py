@@ -96,6 +96,7 @@ def test_a_pace_that_never_changes_goes_on():
     assert [pace for pace, _ in islice(paces, 4)] == ["stand", "walk", "walk", "walk"]
 
 
+@pytest.mark.slow
 def test_each_piece_is_sampled_given_its_pace():
     plan = list(islice(draw_paces(RATES, "stand", generator(5)), 12))
     frames = sum(count for _, count in plan)
@@ -184,6 +185,7 @@ def pacing(monkeypatch):
     return density, told
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("tell", "expected"), [(True, {"pace=walk", "pace=run"}), (False, set())])
 def test_generated_motion_is_told(pacing, tell, expected):
     density, told = pacing

@@ -289,6 +289,7 @@ def test_a_shot_is_the_same_again(shot):
     assert torch.equal(again.motion.local_quat_xyzw, done.motion.local_quat_xyzw)
 
 
+@pytest.mark.slow
 def test_a_shot_that_is_interrupted_is_not_half_a_shot(monkeypatch):
     """What the horizon has solved by then is kept for a walk; the rest of a shot would stand still."""
     prior = priors.load("locomotion")

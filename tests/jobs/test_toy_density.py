@@ -49,6 +49,7 @@ def test_it_follows_a_curve():
     assert done.status.outcome.value == "done"
 
 
+@pytest.mark.slow
 def test_it_generates_from_its_own_states_and_from_a_clip():
     plain = GenerateSettings(foot_cleanup=None)
     made, again, other = (
@@ -74,6 +75,7 @@ def test_it_is_steered():
     assert len(said) == 1
 
 
+@pytest.mark.slow
 def test_it_is_a_prior_of_denoising():
     given = noisy(on_rig("bandai", 40))
     settings = DenoiseSettings(refinement=REFINEMENT)
@@ -83,6 +85,7 @@ def test_it_is_a_prior_of_denoising():
     assert not torch.equal(done.motion.local_quat_xyzw, plain.motion.local_quat_xyzw)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gap", [(12, 22), (30, 40)])
 def test_it_is_a_prior_of_infilling_and_extends_an_end(gap):
     motion, masks, infiller = on_rig("bandai", 40), [Mask("*", *gap)], tiny_infiller(drawn=0.02)

@@ -63,6 +63,7 @@ def test_slower_files_stay_as_they_are_and_that_is_said(fps, said):
     assert all("frames a second" in note for note in notes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [{"arms_down_deg": 40.0, "root": "Reference"}, {}, {"bones_along_x": True}])
 def test_a_file_with_z_up_has_the_measures_of_the_same_with_y_up(options, tmp_path, capsys):
     found = []

@@ -104,6 +104,7 @@ def test_path_error_is_the_distance_to_the_curve():
     assert got["path_error_max_cm"] == pytest.approx(expected.max(), abs=0.001)
 
 
+@pytest.mark.slow
 def test_the_low_pass_takes_sway_out_and_leaves_drift():
     time = np.arange(600) / 30
     for hertz, kept in ((2.0, 0.0), (0.0, 1.0)):

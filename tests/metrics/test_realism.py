@@ -186,6 +186,7 @@ def test_no_clip_is_both_learnt_and_held_out():
     assert by_heart < 0.8
 
 
+@pytest.mark.slow
 def test_too_few_or_too_short_clips_are_refused():
     clips = clip_set(8, 31)
     with pytest.raises(RequestError, match="at least 8 clips of each, made and mocap; got 7 and 8"):

@@ -58,6 +58,7 @@ def test_rollout_and_pullback_agree_with_the_reference(width, batch, components)
         assert relative(ours, theirs) < 2e-5
 
 
+@pytest.mark.slow
 def test_long_window_of_any_plan_agrees_in_energy_and_gradient():
     model, state, noise = make(40, 2, frames=100)
     generator = torch.Generator().manual_seed(1)
@@ -170,6 +171,7 @@ def test_a_plan_that_does_not_fit_is_refused():
         fast.plan(state, noise[..., :65])
 
 
+@pytest.mark.slow
 def test_exponential_is_accurate_over_its_range():
     x = np.linspace(-87, 88, 20_001, dtype=np.float32)
     wanted = np.exp(x.astype(np.float64))

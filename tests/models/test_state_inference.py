@@ -2,6 +2,7 @@
 
 from functools import cache
 
+import pytest
 import torch
 from helpers import tiny_density, walk
 
@@ -64,6 +65,7 @@ def test_without_a_search_it_is_the_best_of_the_known_ones():
     assert float(apart.min()) < 1e-5
 
 
+@pytest.mark.slow
 def test_short_motions_and_one_known_state_will_do():
     for count in (1, 2, 5):
         state = tiny().infer_state(frames()[:count])

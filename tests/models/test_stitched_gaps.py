@@ -51,6 +51,7 @@ def test_where_nothing_can_be_stitched_all_is_the_others():
     assert made.source == "slerp"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("limbs", [(), ("leftHand",)])
 def test_hands_on_the_way_are_reached(limbs):
     """Between whole poses the stitcher fills a gap with a hand told in it too."""

@@ -182,6 +182,7 @@ def test_draws_are_led_each_from_where_it_was_and_do_not_depend_on_others():
     assert torch.equal(again.local_quat_xyzw, led[1].local_quat_xyzw)
 
 
+@pytest.mark.slow
 def test_hips_that_are_told_alone_are_met_and_divide_the_gap():
     motion = walk(60, turn_rate=0.5)
     done = tween(motion, Keys.of([20, 28, 40], root_only=True), StitchedInbetweener(tiny_stitcher(), SlerpInbetweener))
@@ -220,6 +221,7 @@ def test_a_trajectory_is_joined_at_both_ends_without_a_leap():
     assert float(moved[len(moved) // 2]) > 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frames", [1, 2, 4])
 def test_a_trajectory_through_few_frames_is_no_matter(frames):
     motion, (start, stop) = walk(60), (21, 21 + frames)

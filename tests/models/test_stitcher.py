@@ -125,6 +125,7 @@ def test_only_the_poses_of_bare_ends_are_seen():
     assert torch.equal(one.quats, two.quats)
 
 
+@pytest.mark.slow
 def test_the_pace_of_the_ends_counts_where_it_is_known():
     motion = walk(60, turn_rate=0.6)
     missing = torch.zeros(60, dtype=torch.bool)
@@ -234,6 +235,7 @@ def test_one_that_draws_gives_the_same_for_the_same_seed_and_number_and_others_f
         assert float((places(1, 9) - places(*other)).abs().max()) > 1e-5
 
 
+@pytest.mark.slow
 def test_draws_are_a_quarter_wider_than_the_weights_say_unless_told_otherwise():
     query, warm = query_of(walk(60), (20, 40)), tiny_stitcher()
     warm.network.temperature.fill_(2.0)

@@ -125,6 +125,7 @@ def test_hips_go_where_the_path_predictor_sees_them_go_and_arrive():
         assert float(steps.min()) > 0
 
 
+@pytest.mark.slow
 def test_a_network_of_one_stage_leads_the_hips_whatever_the_path_predictor_says():
     motion = walk(100)
     shape = replace(CONFIG, architecture="one-stage")

@@ -102,6 +102,7 @@ def test_poses_on_the_way_are_come_near_in_place_of_what_was_before():
     assert float(moved[180:220].max()) > 1e-4
 
 
+@pytest.mark.slow
 def test_auto_gives_the_tweener_what_has_room_for_a_style_and_holds_nobody():
     query = query_of(walk(200), (1, 30), (31, 100), (101, 199))
     styled = AutoInbetweener(SlerpInbetweener(), tweener=make_tweener().styled(FAST))

@@ -59,6 +59,7 @@ def test_a_window_ends_lower_than_it_began_within_its_budget(name):
     assert not solved.trial.features.requires_grad
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [METHOD, METHODS["states"]], ids=["latents", "states"])
 def test_windows_join_without_a_seam(method):
     done, outcome = solve(21, method=method)
@@ -179,6 +180,7 @@ def broken(after):
     return density
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("after", [0, 2])
 def test_a_density_that_breaks_down_ends_the_solve_with_the_finite_frames(after):
     done, outcome = solve(20, density=broken(after))

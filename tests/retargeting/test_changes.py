@@ -130,6 +130,7 @@ def test_convert_prints_notes(files, capsys):
     assert "note: joints without a counterpart are left out: " in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_convert_keeps_the_ground(files):
     Performer(stair=0.1, upright=0.9).walks(100).save("stairs.bvh")
     risen = {}

@@ -136,6 +136,7 @@ def test_its_a_pose_and_z_up_are_understood(rest):
     assert np.rad2deg(turn_between(canonical.joint_rotations(), wanted.joint_rotations())) < 2
 
 
+@pytest.mark.slow
 def test_commands_take_it(tmp_path, capsys):
     walking(skeleton())[1].save(tmp_path / "cc.bvh")
     assert run("info", tmp_path / "cc.bvh") == 0

@@ -39,6 +39,7 @@ def errors(recorder, track):
     return row
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("facing", [None, -2.0])
 def test_a_near_place_is_reached_on_the_frame(facing):
     recorder, track = play((0.2, Arrival((0.5, 0.4), 0.9, facing)))
@@ -60,6 +61,7 @@ def test_a_far_place_is_walked_to_first_and_steered_from_there():
     assert bool(steps.isfinite().all())
 
 
+@pytest.mark.slow
 def test_a_pose_is_taken():
     pose = to_canonical(walk(40))[0].slice(17, 18)
     recorder, track = play((0.2, Arrival((0.2, 0.3), 0.9, 0.3, pose)))
@@ -76,6 +78,7 @@ def test_frames_meet_those_before_and_after_the_way():
     assert float(step[[5, 6, 7]].max()) < 3 * float(step[8:26].max())
 
 
+@pytest.mark.slow
 def test_a_new_command_on_the_way_leaves_it_at_once():
     track = CommandTrack((0.0, 0.2, 0.5), (AHEAD, replace(AHEAD, arrival=Arrival((0.5, 0.4), 0.9)), AHEAD))
     recorder = Recorder()
@@ -86,6 +89,7 @@ def test_a_new_command_on_the_way_leaves_it_at_once():
     assert recorder.pieces[-1].evaluations > 0
 
 
+@pytest.mark.slow
 def test_who_cannot_goes_on_as_before():
     """Also where the rest of the command would have been to stand."""
     stand = replace(AHEAD, speed=0.0, heading=1.0, arrival=Arrival((50.0, 0.0), 0.9))

@@ -234,6 +234,7 @@ def test_with_a_rig_a_mannequin_moves_on_its_bones_and_recordings_are_on_it(tmp_
     assert plain == [None], "canonical joints stay"
 
 
+@pytest.mark.slow
 def test_a_character_is_recorded_on_the_rig_if_there_is_one(tmp_path):
     hero, rig = make_character_glb(tmp_path / "hero.glb").path, tmp_path / "rig.bvh"
     write_rig("lafan1", rig)

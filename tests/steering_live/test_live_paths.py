@@ -72,6 +72,7 @@ def test_what_is_written_is_what_follow_reads_and_comes_back_in_few_points(close
     assert distances(again, sample_curve(path.curve)).max() <= 0.025
 
 
+@pytest.mark.slow
 def test_few_points_are_taken_as_they_are_and_many_become_fewer_as_exact_as_is_said():
     few = files.read_path("x.CSV", b"x;z\n0;0\n1,5;0\n1,5;2\n")
     assert (few.points, few.closed, few.note) == ([(0.0, 0.0), (1.5, 0.0), (1.5, 2.0)], False, "")
@@ -116,6 +117,7 @@ def test_files_that_are_no_paths_are_refused_in_a_line(name, content, said):
     assert "/tmp" not in str(refused.value)
 
 
+@pytest.mark.slow
 def test_points_that_are_far_away_are_refused_and_nothing_changes():
     path = square()
     path.move(0, -1000.0, 1000.0)

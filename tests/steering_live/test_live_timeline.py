@@ -81,6 +81,7 @@ def test_who_looks_back_sees_what_was_and_the_characters_wait(show, actors):
     assert timeline.cursor is None
 
 
+@pytest.mark.slow
 def test_who_stood_before_stands_after_and_to_go_on_or_to_reset_is_to_come_back(show, actors):
     run(show, 30)
     show.toggle_pause()

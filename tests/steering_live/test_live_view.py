@@ -188,6 +188,7 @@ def test_the_sky_meets_the_ground_and_the_ground_is_never_white(theme):
     assert (sky[0, 0].mean() < 0.3) == theme.dark
 
 
+@pytest.mark.slow
 def test_a_theme_is_chosen_and_auto_is_the_browsers(show):
     director = show._view._director
     show._view.set_theme("dark")

@@ -50,6 +50,7 @@ def misses(motion: Motion, hand: str, place) -> torch.Tensor:
     return (at - at.new_tensor(place)).norm(dim=-1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hand", ["leftHand", "rightHand"])
 @pytest.mark.parametrize("away", [(0.05, -0.1, 0.4), (0.3, 0.25, 0.1), (0.0, -0.3, 0.3), (-0.1, 0.1, 0.45)])
 def test_a_hand_comes_to_its_place_stays_and_goes_back(hand, away):
@@ -112,6 +113,7 @@ def test_places_that_are_dragged_make_no_hand_jump():
     assert float(bend.max()) < 900 * float(calm[1].norm(dim=-1).max()) + 60
 
 
+@pytest.mark.slow
 def test_a_head_looks_and_what_is_behind_is_not_looked_at():
     motion = standing(3.0)
     there, behind = (1.5, 1.4, 1.5), (0.1, 1.4, -3.0)

@@ -134,6 +134,7 @@ def test_a_pause_stops_time_and_going_on_loses_none(remote):
     assert after[-1].spare > -0.05, "the pause made nothing late"
 
 
+@pytest.mark.slow
 def test_reset_brings_it_back_to_where_it_stood(remote):
     remote.reset()
     first = next(piece for piece in collected(remote, 1.0) if len(piece.root) == 1)

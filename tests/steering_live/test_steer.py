@@ -160,6 +160,7 @@ def test_the_loop_asks_a_step_before_frames_are_due_and_shows_them_all():
     assert all(len(entry.energy) == 21 for entry in recorder.ledger.entries)
 
 
+@pytest.mark.slow
 def test_in_stream_time_nothing_is_late_and_the_result_is_always_the_same():
     motions = []
     for _ in range(2):
@@ -226,6 +227,7 @@ def test_time_stretches_where_steps_take_longer_than_their_frames_last_and_no_fr
     assert min(asked) >= -0.1 - 1e-9
 
 
+@pytest.mark.slow
 def test_a_hiccup_is_made_up_for_and_time_goes_on():
     clock = Labouring(0.04)
 

@@ -72,6 +72,7 @@ def test_the_source_is_one():
     assert isinstance(Source(), MessageSource)
 
 
+@pytest.mark.slow
 def test_numbers_and_labels_become_one_command_for_their_character(stage):
     show, actors, _, send = stage
     send(("speed", 2.0), ("heading", 90.0), ("style", "old"), ("2/speed", 0.5), ("2/facing", -90.0))

@@ -64,6 +64,7 @@ def start(stream: PoseStream) -> float:
     return time.perf_counter() + 1.0
 
 
+@pytest.mark.slow
 def test_frames_come_when_they_are_due_and_are_those_that_were_put(stream, ports):
     due = start(stream)
     for first in (3, 0, 6):  # in whatever order they are put
@@ -93,6 +94,7 @@ def test_the_stream_is_behind_by_its_delay(ports):
     assert told.late == (told.largest_lateness_ms > 500 / 30)
 
 
+@pytest.mark.slow
 def test_each_character_has_its_port_and_is_forgotten_alone(stream, ports):
     due = start(stream)
     stream.put(0, due, 0.0, ROOT[:3], QUATS[:3])
@@ -130,6 +132,7 @@ def test_a_pause_is_no_gap(stream, ports, paused):
     assert (stream.statistics.largest_gap_ms > 500) is not paused
 
 
+@pytest.mark.slow
 def test_closing_sends_what_waits(stream, ports):
     due = start(stream)
     stream.put(0, due, 0.0, ROOT[:9], QUATS[:9])
@@ -139,6 +142,7 @@ def test_closing_sends_what_waits(stream, ports):
     assert not stream._process.is_alive()
 
 
+@pytest.mark.slow
 def test_nobody_need_listen(stream, ports):
     for port in ports:
         port.close()
@@ -147,6 +151,7 @@ def test_nobody_need_listen(stream, ports):
     assert stream.statistics.frames_sent + stream.statistics.not_sent == 6
 
 
+@pytest.mark.slow
 def test_a_place_that_cannot_be_sent_to_ends_nothing():
     stream = PoseStream(Endpoint("255.255.255.255", 39539), [CANONICAL], delay=0.0)
     stream.put(0, start(stream), 0.0, ROOT[:3], QUATS[:3])

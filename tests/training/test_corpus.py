@@ -134,6 +134,7 @@ def test_a_share_of_clips_too_short_to_warm_up_on_is_refused():
         corpora.keep_share(many, parts, 0.1, 1)
 
 
+@pytest.mark.slow
 def test_a_run_on_a_share_of_the_data_says_so_and_is_measured_on_the_same_clips(tmp_path, data, fails):
     def card_of(name, *words):
         assert run("train", "keyframe-timing", "--data", str(data), "-o", str(tmp_path / name), "--quiet", *words) == 0

@@ -61,6 +61,7 @@ def test_a_run_of_one_device_goes_on_on_another_and_says_so(tmp_path, data, gpu)
     assert json.loads((tmp_path / "run" / "checkpoint.json").read_text())["step"] == 6
 
 
+@pytest.mark.slow
 def test_the_state_of_another_kind_of_generator_is_not_taken(tmp_path, data):
     made = MODELS["path"].recipe(data, tmp_path / "run", None)
     train(replace(made, settings=replace(made.settings, steps=3)))

@@ -106,6 +106,7 @@ def wanted(data, out, steps, **changes):
     return InfillerRecipe(data, out, config=INFILLER, settings=settings, checkpoint_minutes=0.0, **changes)
 
 
+@pytest.mark.slow
 def test_fewer_steps_than_are_done_are_refused_and_fewer_than_were_planned_are_not(tmp_path, data):
     with killing(InfillerTrainer, 4):
         train(wanted(data, tmp_path / "run", 6))

@@ -44,6 +44,7 @@ def test_fine_tuning_begins_with_the_priors_weights_statistics_and_labels(tmp_pa
     assert f"--init {first}" in after.card.training["command"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bfloat16", [False, True])
 def test_both_precisions_learn_and_keep_their_weights_in_float32(bfloat16):
     trainer = DensityTrainer(TINY, replace(SETTINGS, steps=400, learning_rate=5e-3, bfloat16=bfloat16), corpus())

@@ -57,6 +57,7 @@ def test_a_curve_that_settles_is_flat_soon_after_it_has(noise):
     assert np.mean([settling(step) - 1 for step in found]) < 0.03
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [0.0, 0.01])
 def test_a_curve_that_goes_on_falling_is_not(noise):
     for seed in range(4):

@@ -49,6 +49,7 @@ def table(tmp_path, *rows):
     return path
 
 
+@pytest.mark.slow
 def test_a_table_in_the_folder_is_found_and_leaves_the_motion(styles, tmp_path):
     found = read(styles, tmp_path)
     expected = {
@@ -105,6 +106,7 @@ def test_rows_name_files_their_ends_and_patterns(files, tmp_path, rows, lengths)
     assert read(files, tmp_path, cuts=table(tmp_path, *rows)).lengths == lengths
 
 
+@pytest.mark.slow
 def test_frames_are_those_of_the_file_and_the_last_is_taken(files, tmp_path):
     whole = read(files, tmp_path).clips()[1]
     part = read(files, tmp_path, cuts=table(tmp_path, "walk-1.bvh,20,59")).clips()[1]
@@ -192,6 +194,7 @@ def test_a_missing_table_is_said(files, tmp_path, capsys):
 SMALL = ("--width", 8, "--components", 2, "--window", 20, "--steps", 2, "--batch", 3, "--device", "cpu")
 
 
+@pytest.mark.slow
 def test_a_density_is_trained_on_styles(styles, tmp_path, capsys):
     out = tmp_path / "run"
     words = ("--labels", LABELS, "--licence", "CC BY 4.0, 100STYLE (Mason et al. 2022)", *SMALL)

@@ -64,6 +64,7 @@ def test_contacts_and_clips_of_a_frame():
     assert measure_holdings(one)["minutes"] == pytest.approx(len(whole.features) / 1800, abs=0.01)
 
 
+@pytest.mark.slow
 def test_the_card_of_a_density_says_it(tmp_path, capsys):
     data, out = write_corpus(tmp_path / "data"), tmp_path / "run"
     words = ("--width", 8, "--components", 2, "--window", 20, "--steps", 1, "--batch", 3, "--device", "cpu", "--quiet")

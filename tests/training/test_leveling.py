@@ -103,6 +103,7 @@ def test_features_decode_to_feet_that_stand_on_the_canonical_floor(performer):
     assert speed[both].quantile(0.98) < 0.25
 
 
+@pytest.mark.slow
 def test_a_file_is_read_so_where_it_is_asked_for(tmp_path):
     walked = sloping(SMALL.walks(120), 0.0, 0.02)
     walked.save(tmp_path / "walk.bvh")
@@ -118,6 +119,7 @@ def test_a_file_is_read_so_where_it_is_asked_for(tmp_path):
     assert len(part) == 90
 
 
+@pytest.mark.slow
 def test_the_command_takes_it_and_says_so_in_the_card(tmp_path):
     data, out = tmp_path / "data", tmp_path / "run"
     data.mkdir()

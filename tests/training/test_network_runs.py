@@ -179,6 +179,7 @@ def test_killed_and_resumed_is_the_uninterrupted_run_to_the_bit(tmp_path, model,
     assert parts == tmp_path / "parts" / "model.safetensors"
 
 
+@pytest.mark.slow
 def test_a_finished_run_loads_with_a_complete_card(tmp_path, model, request_in):
     news, out = [], tmp_path / "run"
     train(request_in(out, licence="CC0"), news.append)
@@ -193,6 +194,7 @@ def test_a_finished_run_loads_with_a_complete_card(tmp_path, model, request_in):
     assert [line.split(":")[0] for line in news if line.startswith("step")] == ["step 2/6", "step 4/6", "step 6/6"]
 
 
+@pytest.mark.slow
 def test_resuming_is_asked_for_and_needs_the_same_recipe_network_and_data(tmp_path, model, request_in):
     out = tmp_path / "run"
     with pytest.raises(CheckpointError, match="no checkpoint to resume"):
@@ -333,6 +335,7 @@ def test_the_command_of_a_card_asks_for_the_same_run(tmp_path, data, model):
     assert given.recipe() == wanted
 
 
+@pytest.mark.slow
 def test_the_command_line_trains_what_can_be_loaded(tmp_path, data, model, capsys):
     out, (words, config) = tmp_path / "run", model.shape
     assert run("train", model.name, "--data", data, "-o", out, "--steps", 2, "--batch", 2, "--window", 32, *words) == 0

@@ -71,6 +71,7 @@ def test_killed_and_resumed_is_the_uninterrupted_run_to_the_bit(tmp_path, reques
     assert parts == tmp_path / "parts" / "model.safetensors"
 
 
+@pytest.mark.slow
 def test_a_finished_run_loads_with_a_complete_card_and_only_its_files(tmp_path, request_in, density):
     news, out = [], tmp_path / "run"
     path = train(request_in(out, licence="CC0"), news.append)
@@ -154,6 +155,7 @@ def kept(path):
     return int(load_file(path)["last.bias"][0])
 
 
+@pytest.mark.slow
 def test_the_best_refiner_seen_is_exported(tmp_path, request_in, scripted):
     scripted(even, {0: 2.0, 2: 1.5, 4: 1.1, 6: 0.5})
     path = train(request_in(tmp_path / "run", validate_steps=2))
@@ -162,6 +164,7 @@ def test_the_best_refiner_seen_is_exported(tmp_path, request_in, scripted):
     assert (card.quality["round"], card.quality["score"]) == (4, pytest.approx(math.log(1.1)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bad", [math.nan, math.inf, 0.0])
 def test_a_measure_that_cannot_be_had_is_never_the_best_and_null_in_the_card(tmp_path, request_in, scripted, bad):
     scripted(even, {0: 2.0, 2: bad, 4: bad, 6: bad})
@@ -189,11 +192,13 @@ def test_it_stops_with_the_best_when_the_critic_has_won(tmp_path, request_in, sc
     assert again[-1] == news[-1]
 
 
+@pytest.mark.slow
 def test_one_report_that_is_nearly_won_does_not_stop_it(tmp_path, request_in, scripted):
     scripted(lambda number: even(number) | {"told": 0.97}, {6: 1.0})
     assert kept(train(request_in(tmp_path / "run"))) == 6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("side", ["refiner", "critic"])
 def test_it_stops_with_the_best_when_it_diverges(tmp_path, request_in, scripted, side):
     news, marked = [], {0: 2.0, 4: 1.2, 6: 1.0}
@@ -203,6 +208,7 @@ def test_it_stops_with_the_best_when_it_diverges(tmp_path, request_in, scripted,
     assert json.loads((tmp_path / "run" / "checkpoint.json").read_text())["step"] == 4
 
 
+@pytest.mark.slow
 def test_weights_that_are_not_finite_are_seen(tmp_path, request_in, monkeypatch):
     step = AdversarialTrainer.train_step
 

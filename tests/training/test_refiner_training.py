@@ -225,6 +225,7 @@ def critic_that_knows():
     return trainer.critic.state_dict()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("root", [0.0, 1e4])
 def test_the_refiner_lowers_its_loss_and_keeps_the_roots_way_where_that_weighs_much(root):
     trainer = trainer_of(replace(TINY, limit=3.0), refiner_rate=2e-2, root=root)

@@ -115,6 +115,7 @@ def test_nobody_who_stands_is_told():
         draw_cuts(of_motions(stands=Performer().stands(40)), 3, GAPS, generator())
 
 
+@pytest.mark.slow
 def test_a_splice_is_two_pieces_and_a_way_between(corpus, tiny, all_pass):
     spliced = add_splices(corpus, Splices(12, tiny))
     assert spliced.names[:4] == corpus.names

@@ -63,6 +63,7 @@ def test_shares_that_make_no_sense_are_refused(share):
         TrainingSettings(standing_share=share)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("small_judgements")
 def test_the_command_takes_it_and_the_card_tells_it(tmp_path, capsys):
     data, out = write_corpus(tmp_path / "data"), tmp_path / "run"

@@ -166,6 +166,7 @@ def test_motion_at_the_mean_is_not_judged():
     assert "critics" in told
 
 
+@pytest.mark.slow
 def test_the_nearest_of_several_draws_is_kept():
     network, truth, count = tiny_stitcher.network(drawn=1.0), transitions(8), 8
     nearest = sample_nearest(network, truth, seeded())

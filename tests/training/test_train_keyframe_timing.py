@@ -110,6 +110,7 @@ def test_a_card_of_other_features_is_refused(tmp_path, data):
         priors.load_keyframe_timing("denoiser")
 
 
+@pytest.mark.slow
 def test_what_the_command_line_fits_suggests_a_timing(tmp_path, data, capsys):
     assert run("train", "keyframe-timing", "--data", data, "-o", tmp_path / "run", "--quiet") == 0
     on_rig("bandai", 40).save(tmp_path / "in.bvh")

@@ -94,6 +94,7 @@ def test_steps_lower_the_loss(recipe):
     assert sum(losses[-5:]) < sum(losses[:5]) - 10
 
 
+@pytest.mark.slow
 def test_a_finished_run_loads_with_a_complete_card_and_only_its_files(tmp_path, data):
     out, news = tmp_path / "run", []
     path = train(request_in(out, data, licence="CC0", match="walk"), news.append)
@@ -119,6 +120,7 @@ def test_a_finished_run_loads_with_a_complete_card_and_only_its_files(tmp_path, 
     assert files == {"cache", "checkpoint.json", "losses.csv", "step-6-checkpoint.safetensors", "model.json", path.name}
 
 
+@pytest.mark.slow
 def test_resuming_is_asked_for_and_needs_the_same_recipe(tmp_path, data):
     out = tmp_path / "run"
     with pytest.raises(CheckpointError, match="no checkpoint to resume"):
@@ -224,6 +226,7 @@ def test_a_checkpoint_without_a_tensor_is_refused(tmp_path, data, begun, drop):
         train(request_in(out, data, resume=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", ["loss", "weights"])
 def test_a_run_that_diverges_stops_and_keeps_its_last_good_checkpoint(tmp_path, data, monkeypatch, how):
     out, step = tmp_path / "run", DensityTrainer.train_step
@@ -247,6 +250,7 @@ def test_a_run_that_diverges_stops_and_keeps_its_last_good_checkpoint(tmp_path, 
     assert train(request_in(out, data, resume=True)).exists()
 
 
+@pytest.mark.slow
 def test_what_is_not_finite_is_null_in_the_curve(tmp_path, data, monkeypatch):
     monkeypatch.setattr(density_quality, "measure_free_runs", lambda model, corpus: {"free_run_speed_ratio": math.inf})
     card = priors.load(str(train(request_in(tmp_path / "run", data)))).card
@@ -337,6 +341,7 @@ def test_folders_that_cannot_be_trained_on_are_refused(tmp_path, data):
     assert not (tmp_path / "run" / "checkpoint.json").exists()
 
 
+@pytest.mark.slow
 def test_the_starts_of_a_density_are_chosen_by_its_labels(tmp_path, monkeypatch):
     write_corpus(tmp_path / "data")
     asked, select = [], lstm_gmm.select_initial_states

@@ -67,6 +67,7 @@ def gathered(folder, run_folder, **changes):
     return found, news, warnings
 
 
+@pytest.mark.slow
 def test_files_that_cannot_be_used_are_left_out_and_listed(tmp_path, data, mixed):
     found, news, (warning,) = gathered(mixed, tmp_path / "run")
     whole, *_ = gathered(data, tmp_path / "whole")

@@ -113,6 +113,7 @@ def test_ended_in_a_step_it_goes_on_to_the_bit(tmp_path, model, request_in, whol
     assert_same(tmp_path / "parts", whole)
 
 
+@pytest.mark.slow
 def test_ended_in_a_judgement_it_is_judged_again(tmp_path, model, request_in, whole):
     request, judge = request_in(tmp_path / "parts"), (run.TrainingRun, "judge")
     assert ended(model, request, at=4, method=judge) == (4, 2)
@@ -121,6 +122,7 @@ def test_ended_in_a_judgement_it_is_judged_again(tmp_path, model, request_in, wh
     assert_same(tmp_path / "parts", whole)
 
 
+@pytest.mark.slow
 def test_ended_just_after_a_judgement_it_is_not_judged_again(tmp_path, model, request_in, whole):
     request = request_in(tmp_path / "parts")
 
@@ -135,6 +137,7 @@ def test_ended_just_after_a_judgement_it_is_not_judged_again(tmp_path, model, re
     assert_same(tmp_path / "parts", whole)
 
 
+@pytest.mark.slow
 def test_ended_while_it_exports_it_exports_again(tmp_path, model, request_in, whole, monkeypatch):
     interruption.raise_on_signals()
     with monkeypatch.context() as patch:
@@ -146,6 +149,7 @@ def test_ended_while_it_exports_it_exports_again(tmp_path, model, request_in, wh
     assert_same(tmp_path / "parts", whole)
 
 
+@pytest.mark.slow
 def test_signals_while_it_saves_do_not_stop_that(tmp_path, model, request_in, whole, monkeypatch):
     """However often: an impatient user, `timeout` with its two signals."""
     write = run_files.write_checkpoint
@@ -164,6 +168,7 @@ def test_signals_while_it_saves_do_not_stop_that(tmp_path, model, request_in, wh
     assert_same(tmp_path / "parts", whole)
 
 
+@pytest.mark.slow
 def test_a_second_wish_does_not_wait_and_saves_no_half_step(tmp_path, model, request_in, monkeypatch):
     monkeypatch.setattr(interruption, "REPEAT_SECONDS", -1.0)
 

@@ -167,6 +167,7 @@ def test_a_density_compares_free_runs_in_its_decay_and_no_sooner(data, tmp_path,
 NETWORKS = [name for name in MODELS if name not in ("refiner", "keyframe-timing")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list_params(NETWORKS))
 def test_every_network_can_be_trained_so(name, tmp_path, data, prior):
     recipe = MODELS[name].recipe(data, tmp_path / "run", prior)
@@ -249,6 +250,7 @@ def test_a_stitcher_is_not_flat_before_its_critics_have_joined(tmp_path):
     assert replace(plain, config=StitcherConfig(without=("d",))).least_steps() == 6000
 
 
+@pytest.mark.slow
 def test_the_settings_of_a_run_of_a_known_length_are_as_before(tmp_path, data):
     """Nothing about an end is in what such a run writes."""
     train(replace(wanted(data, tmp_path / "run"), until_flat=None, settings=replace(SETTINGS, steps=2)))
