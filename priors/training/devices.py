@@ -56,7 +56,7 @@ def use_device(name: str) -> Iterator[None]:
 def has_bfloat16() -> bool:
     """Whether the processor computes in bfloat16: one that does not may refuse an LSTM, and is slower than in
     float32."""
-    capabilities = getattr(torch.cpu, "get_capabilities", dict)()  # as of torch 2.10
+    capabilities = getattr(torch.cpu, "get_capabilities", dict)()  # younger versions of torch have it
     if capabilities.get("architecture") == "x86_64":
         return any(capabilities.get(name, False) for name in ("avx512_bf16", "amx_bf16", "avx_ne_convert"))
     network, sequence = torch.nn.LSTM(8, 8, device="cpu"), torch.zeros(2, 1, 8, device="cpu")

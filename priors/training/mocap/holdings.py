@@ -6,14 +6,7 @@ from numpy import ndarray
 from scipy.ndimage import gaussian_filter1d
 
 from mapctl.features import LAYOUT, PRIOR_FPS
-from mapctl.metrics.pace_changes import (
-    PACES,
-    PaceChanges,
-    compute_ground_velocity,
-    count_pace_changes,
-    follow_pace,
-    measure_speed,
-)
+from mapctl.metrics.pace_changes import PACES, PaceChanges, compute_ground_velocity, count_pace_changes, follow_pace
 from priors.training.corpus import Corpus
 
 SPEEDS = (0.15, 0.6, 1.1, 1.6, 2.2)
@@ -79,4 +72,4 @@ def _track(
     velocity = compute_ground_velocity(ground, PRIOR_FPS)
     turn = np.degrees(gaussian_filter1d(np.gradient(heading, 1 / PRIOR_FPS), _SMOOTH, mode="nearest"))
     aside = np.degrees(np.arctan2(velocity[:, 0], velocity[:, 1]) - smooth)
-    return measure_speed(ground, PRIOR_FPS), np.abs(turn), np.abs((aside + 180) % 360 - 180)
+    return np.linalg.norm(velocity, axis=1), np.abs(turn), np.abs((aside + 180) % 360 - 180)

@@ -74,13 +74,14 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
         with use_device("cpu"):  # copies are made one after the other
             seeded = make_generator(self.settings.seed)
             copied = add_copies(parts.train.to("cpu"), self.settings.copies, seeded)
-            followed = follow_paces(copied)
+            followed = follow_paces(copied) if self.label_pace or self.init is not None else None
         corpus = copied.to(torch.get_default_device().type)
-        known, followed = labels.read(hide_splices(corpus.names), self.labels), followed.to(corpus.features.device)
+        known = labels.read(hide_splices(corpus.names), self.labels)
+        followed = None if followed is None else followed.to(corpus.features.device)
         if self.init is None:
             known = known.renamed((*known.names, *PACE_LABELS)) if self.label_pace else known
-            config, paces = replace(self.config, labels=known.names), followed if self.label_pace else None
-            return DensityTrainer(config, self.settings, corpus, labels=known, paces=paces)
+            config = replace(self.config, labels=known.names)
+            return DensityTrainer(config, self.settings, corpus, labels=known, paces=followed)
         before = density.load(self.init).reference
         known, paces = known.renamed(before.config.labels), None
         if {*PACE_LABELS} <= {*known.names}:
