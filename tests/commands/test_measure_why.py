@@ -92,9 +92,14 @@ def test_steps_decide_how_strict_the_judge_is(folders, capsys):
 def test_what_groups_tell_alone_is_asked_for(folders, capsys, monkeypatch):
     monkeypatch.setattr(clip_sets, "SETTINGS", realism.RealismSettings(classifier=ClassifierSettings(2, 40, 32, 8)))
     assert run(*words(folders, "bent", "--steps", 60, "--alone", "--json")) == 0
-    joints = {row["name"]: row["alone"] for row in json.loads(capsys.readouterr().out)["why"]["joints"]}
-    assert joints["head"] > 0.9
-    assert joints["leftHand"] < 0.8
+    why = json.loads(capsys.readouterr().out)["why"]
+    joints = {row["name"]: row["alone"] for row in why["joints"]}
+    assert min(joints["head"], why["regions"]["trunk and head"]) > 0.9
+    assert max(joints["leftHand"], why["regions"]["legs"]) < 0.8
+    assert run(*words(folders, "bent", "--steps", 60, "--alone")) == 0
+    told = capsys.readouterr().out
+    assert "region alone" in told
+    assert "feet over the ground" in told
 
 
 @pytest.mark.parametrize(

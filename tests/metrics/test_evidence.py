@@ -282,6 +282,19 @@ def test_what_a_group_tells_alone():
     found = alone.measure_alone(
         made, clean(), windows=WINDOWS, classifier=replace(SETTINGS.classifier, steps=60), seed=1
     )
-    assert set(found) == {*parts.BANDS, *parts.JOINTS, *paths.INPUTS}
-    assert min(found["head"], found["mean pose"], found["positions"]) > 0.9
-    assert max(found["leftHand"], found["3-6 Hz"], found["hips"]) < 0.7
+    assert set(found) == {*parts.BANDS, *parts.JOINTS, *paths.INPUTS, *alone.REGIONS}
+    assert min(found["head"], found["mean pose"], found["positions"], found["trunk and head"]) > 0.9
+    assert max(found["leftHand"], found["3-6 Hz"], found["hips"], found["legs"], found["arms"]) < 0.7
+
+
+@pytest.mark.slow
+def test_feet_that_slide_are_told_over_the_ground_and_not_from_the_hips():
+    """A body that is shaken as a whole: its pose is as it was."""
+    shaken = [clip + 0.02 * torch.randn(len(clip), 1, 3, generator=generator(k)) for k, clip in enumerate(clean())]
+    settings = replace(SETTINGS.classifier, steps=60)
+    found = alone.measure_alone(
+        shaken, clean(), windows=WINDOWS, classifier=settings, seed=1, groups=alone.REGIONS, paired=True
+    )
+    assert list(found) == ["feet over the ground", "legs", "trunk and head", "arms"]
+    assert found["feet over the ground"] > 0.9
+    assert max(found["legs"], found["trunk and head"], found["arms"]) < 0.7

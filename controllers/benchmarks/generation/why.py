@@ -11,11 +11,13 @@ from controllers.benchmarks.shared.held_out import NamedClip
 from controllers.benchmarks.shared.tables import Row
 from mapctl.errors import RequestError
 from mapctl.metrics.realism import (
+    REGIONS,
     EvidenceSettings,
     Explanation,
     RealismSettings,
     canonical_positions,
     cut_windows,
+    measure_alone,
     train_judges,
 )
 from mapctl.motion import Motion
@@ -55,17 +57,28 @@ class WhyBenchmarkSettings:
 def benchmark_why(
     variants: Sequence[Variant], mocap: Sequence[NamedClip], settings: WhyBenchmarkSettings | None = None
 ) -> dict[str, list[Row]]:
-    """Explain how each variant's clips are told from mocap, by part: how often, by gait, and the shares of the evidence
-    that are more than chance.
+    """Explain how each variant's clips are told from mocap, by part: how often, how often by a region of the body alone
+    (after the steps of `settings.realism`), by gait, and the shares of the evidence that are more than chance.
 
     `mocap` is motion held out from training. RequestError for fewer than 8 clips of it.
     """
     settings = settings or WhyBenchmarkSettings()
     clips = select_long_clips(mocap) if settings.continued else list(mocap)
     real = [canonical_positions(cut_continuation(clip) if settings.continued else clip.motion) for clip in clips]
-    parts: dict[str, list[Row]] = {"accuracy": [], "gaits": [], **{name: [] for name in SHARES}}
+    parts: dict[str, list[Row]] = {"accuracy": [], "regions": [], "gaits": [], **{name: [] for name in SHARES}}
     for variant in variants:
         made = [canonical_positions(clip) for clip in _make_clips(variant, clips, settings)]
+        alone = measure_alone(
+            made,
+            real,
+            windows=settings.realism.windows,
+            classifier=settings.realism.classifier,
+            seed=settings.seed,
+            groups=REGIONS,
+            paired=settings.continued,
+        )
+        about = {"variant": variant.name, "steps": settings.realism.classifier.steps}
+        parts["regions"] += [{**about, "region": name, "told_apart": accuracy} for name, accuracy in alone.items()]
         for steps in settings.steps:
             classifier = replace(settings.realism.classifier, steps=steps)
             judges = train_judges(

@@ -19,7 +19,7 @@ from mapctl.metrics.realism.classifier import (
     judge_held_out,
 )
 from mapctl.metrics.realism.diversity import Diversity, average_pairwise_distance, measure_diversity
-from mapctl.metrics.realism.evidence.alone import GROUPS
+from mapctl.metrics.realism.evidence.alone import GROUPS, REGIONS, measure_alone
 from mapctl.metrics.realism.evidence.explanation import Explanation, explain
 from mapctl.metrics.realism.evidence.gathering import EvidenceSettings
 from mapctl.metrics.realism.frechet import Basis, frechet_distance
@@ -29,6 +29,7 @@ from mapctl.motion import Motion
 from mapctl.runtime.progress import Progress
 
 __all__ = [
+    "REGIONS",
     "ClassifierSettings",
     "Diversity",
     "EvidenceSettings",
@@ -43,6 +44,7 @@ __all__ = [
     "canonical_positions",
     "cut_windows",
     "judge_held_out",
+    "measure_alone",
     "measure_diversity",
     "measure_gait_spread",
     "measure_realism",

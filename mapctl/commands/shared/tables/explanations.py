@@ -49,6 +49,9 @@ def print_explanation(why: Mapping[str, Any]) -> None:
         named = [row for row in why[table] if row["named"]]
         if named:
             _print_shares(_TITLES[table], named[:_MOST])
+    if why["regions"]:
+        regions = [[name, 100 * accuracy] for name, accuracy in why["regions"].items()]
+        print_table(["region alone", "told apart, %"], regions)
     rows = [
         [
             row["gait"],

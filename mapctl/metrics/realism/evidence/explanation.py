@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from mapctl.metrics.realism.classifier import ClassifierSettings, HeldOutFold, average_verdicts, balanced_accuracy
-from mapctl.metrics.realism.evidence.alone import measure_alone
+from mapctl.metrics.realism.evidence.alone import REGIONS, measure_alone
 from mapctl.metrics.realism.evidence.gathering import EvidenceSettings, GatheredEvidence, gather_folds
 from mapctl.metrics.realism.evidence.kinds import BODY_PHASES, FOOT_PHASES, GAITS, classify_gaits, join_foot_phases
 from mapctl.metrics.realism.evidence.moments import Moment, is_leg, list_moments
@@ -81,6 +81,8 @@ class Explanation:
     """Shares by phase of the body's step, with the share of frames that are in it."""
     feet: list[Share]
     """Shares of lower legs, feet and toes by the phase of their own foot."""
+    regions: dict[str, float]
+    """Accuracy of networks that are given one of REGIONS alone; empty where it was not asked for."""
     gaits: list[GaitAccuracy]
     """Accuracy by gait, of gaits that either set has."""
     moments: list[Moment]
@@ -123,6 +125,7 @@ def explain(
         floor_accuracy,
         low > max(floor_accuracy, 0.5),
         **_compute_tables(sides, alone, generator),
+        regions={name: alone[name] for name in REGIONS if name in alone},
         gaits=_compare_gaits(judged, floor, sides, generator),
         moments=list_moments(sides[0], settings.moments),
     )
