@@ -10,7 +10,8 @@ from scipy.ndimage import gaussian_filter1d
 _SMOOTH_SECONDS = 0.2  # standard deviation of a Gaussian over which sway within a stride is averaged out
 STANDS, GOES = 0.2, 0.6
 """Speeds between which a start or a stop leads, m/s."""
-_WALKS, _RUNS = 1.7, 2.1  # m/s between which a change of gait leads
+WALKS, RUNS = 1.7, 2.1
+"""Speeds between which a change of gait leads, m/s."""
 
 PACES = "stand", "walk", "run"
 """Paces from slow to fast; who goes and does not run walks."""
@@ -66,7 +67,7 @@ def measure_speed(ground: Float[ndarray, "frames 2"], fps: float) -> Float[ndarr
 def count_pace_changes(speed: Float[ndarray, " frames"]) -> PaceChanges:
     """Count the changes along a motion's smoothed speed, m/s. Who hesitates without passing both bounds changes
     nothing."""
-    goes, runs = (_follow(speed, *bounds) for bounds in ((STANDS, GOES), (_WALKS, _RUNS)))
+    goes, runs = (_follow(speed, *bounds) for bounds in ((STANDS, GOES), (WALKS, RUNS)))
     return PaceChanges(_count_rises(goes), _count_rises(~goes), _count_rises(runs), _count_rises(~runs))
 
 
@@ -76,13 +77,13 @@ def follow_pace(speed: Float[ndarray, " frames"]) -> Int[ndarray, " frames"]:
     A pace lasts until the other bound of a change is passed, so that `count_pace_changes` counts the changes of it;
     before the first bound that is passed, it is the one that this bound tells.
     """
-    goes, runs = (_follow(speed, *bounds) for bounds in ((STANDS, GOES), (_WALKS, _RUNS)))
+    goes, runs = (_follow(speed, *bounds) for bounds in ((STANDS, GOES), (WALKS, RUNS)))
     return np.where(runs, 2, goes.astype(int))
 
 
 def find_pace(speed: float) -> str:
     """Find the pace of a mean speed, m/s, halfway between the bounds of changes."""
-    return PACES[(speed > (STANDS + GOES) / 2) + (speed > (_WALKS + _RUNS) / 2)]
+    return PACES[(speed > (STANDS + GOES) / 2) + (speed > (WALKS + RUNS) / 2)]
 
 
 def _follow(speed: Float[ndarray, " frames"], low: float, high: float) -> Bool[ndarray, " frames"]:

@@ -11,7 +11,7 @@ from tiny_prior import save_tiny_prior
 from controllers.benchmarks.generation import continuations, list_variants, why
 from controllers.benchmarks.shared.held_out import NamedClip
 from mapctl.errors import RequestError
-from mapctl.metrics.realism import ClassifierSettings, RealismSettings, train_judges
+from mapctl.metrics.realism import REGIONS, ClassifierSettings, RealismSettings, train_judges
 from mapctl.metrics.realism.evidence.kinds import GAITS
 from priors import checkpoints
 
@@ -48,6 +48,8 @@ def test_each_variant_is_compared_at_each_number_of_steps(mocap):
     assert {row["gait"] for row in rows} <= set(GAITS)
     assert sum(row["mocap_windows"] for row in rows) == 8 * 4
     assert strict["above_floor"]
+    assert [row["region"] for row in parts["regions"]] == [*REGIONS]
+    assert all(row["told_apart"] > 0.7 for row in parts["regions"])
     named = [row for name in why.SHARES for row in parts[name]]
     assert named
     assert {row["steps"] for row in named} == {40}

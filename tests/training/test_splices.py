@@ -1,11 +1,12 @@
 """Splices of clips: pieces as they are, ways that lead from the one to the other, and only what passes for mocap."""
 
 import math
+from collections import Counter
 from pathlib import Path
 
 import pytest
 import torch
-from helpers import generator, run, walk
+from helpers import generator, go_at, run, walk
 from jaxtyping import Float
 from performers import Performer
 from tiny_stitcher import save_tiny_stitcher, tiny_stitcher
@@ -108,9 +109,23 @@ def test_who_changes_speed_more_gets_more_time(corpus):
     assert 8 < starts - changes < 20  # 12 frames for each m/s; they walk at 1.2 m/s or so
 
 
-def test_nobody_who_stands_is_told():
-    with pytest.raises(RequestError, match=r"clips of 1\.5 s in which somebody stands"):
-        draw_cuts(of_motions(walks=walk(120), runs=walk(120, cadence=1.3)), 3, GAPS, generator())
+def test_gaits_change_twice_as_often_as_anything_else():
+    paces = [go_at(speed, seconds=3) for speed in (0.0, 1.2, 2.6)]
+    stands, walks, runs = range(3)
+    corpus = Corpus(("stands", "walks", "runs"), tuple(map(len, paces)), torch.cat(paces))
+    pairs = [cut.clips for cut in draw_cuts(corpus, 70, GAPS, generator())]
+    assert pairs[3:7] == 2 * [(walks, runs), (runs, walks)]
+    counts = Counter(pairs)
+    assert counts[stands, stands] == 10
+    assert counts[stands, walks] + counts[stands, runs] == counts[walks, stands] + counts[runs, stands] == 10
+    assert counts[walks, runs] == counts[runs, walks] == 20
+    without = corpus.subset([walks, runs])
+    assert Counter(cut.clips for cut in draw_cuts(without, 8, GAPS, generator())) == {(0, 1): 4, (1, 0): 4}
+
+
+def test_clips_without_changes_to_make_are_refused():
+    with pytest.raises(RequestError, match=r"clips of 1\.5 s in which somebody stands, or both walks and runs"):
+        draw_cuts(of_motions(walks=walk(120), quickly=walk(120, cadence=1.3)), 3, GAPS, generator())
     with pytest.raises(RequestError, match=r"1\.5 s"):
         draw_cuts(of_motions(stands=Performer().stands(40)), 3, GAPS, generator())
 
@@ -158,13 +173,15 @@ def test_the_bundled_stitcher_passes_for_mocap_and_a_wild_one_does_not(corpus, t
     asked = []
 
     def find(clips):
-        asked.extend(clips)
+        asked.append({motion.num_frames for motion in clips})
         return MOCAP
 
     monkeypatch.setattr(module, "find_bounds", find)  # feet that stand to the hair are not what mocap is like
     wild = str(save_tiny_stitcher(tmp_path / "wild.safetensors", drawn=30.0))
     assert len(add_splices(corpus, Splices(18, wild)).names) == 4
-    assert sorted(motion.num_frames for motion in asked) == sorted(corpus.lengths)
+    assert len(asked) == 3  # who sets off, who stops, who stands: each is bounded by what it is made of
+    assert {100, 120} in asked
+    assert {100, 120, 150} in asked
     kept = add_splices(corpus, Splices(18))
     assert len(kept.names) > 4 + 4
     for features in kept.clips()[4:]:

@@ -1,24 +1,26 @@
 """Splices: pieces of two clips and the stitcher's way between them, where each clip holds one thing done.
 
 A density of such clips goes on with whatever it does: nothing shows it that who waves may walk off. Clips that begin or
-stop going, or do something else, are made by the stitcher (Ren et al. 2024) and kept where they pass for mocap.
+stop going, change between a walk and a run, or do something else, are made by the stitcher (Ren et al. 2024) and kept
+where they pass for mocap.
 """
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from hashlib import sha256
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from mapctl import rotations
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, reversed_features
 from mapctl.metrics.mocap_bounds import find_bounds, list_faults, measure_checked
-from mapctl.metrics.pace_changes import GOES, STANDS
+from mapctl.metrics.pace_changes import GOES, RUNS, STANDS, WALKS
 from mapctl.pose import decode
 from mapctl.runtime.stepwise import StepwiseWork
 from priors.checkpoints import compute_hash
@@ -29,14 +31,21 @@ from priors.training.mocap.paces import measure_speeds
 
 FOLDER = "spliced/"
 """Before the names of splices in a corpus, which are those of both clips."""
-_KINDS = ((STANDS, GOES), (GOES, STANDS), (STANDS, STANDS))
-"""Who sets off, who stops, who stands and does something else: by the smoothed speed with which the first piece ends
-and the second begins, under STANDS or over GOES."""
+_STANDING, _GOING, _WALKING, _RUNNING = (0.0, STANDS), (GOES, math.inf), (GOES, WALKS), (RUNS, math.inf)
+_KINDS = (
+    (_STANDING, _GOING),
+    (_GOING, _STANDING),
+    (_STANDING, _STANDING),
+    # Twice as often: not half as many of them pass for mocap.
+    *(2 * ((_WALKING, _RUNNING), (_RUNNING, _WALKING))),
+)
+"""Who sets off, who stops, who stands and does something else, who begins to run, who slows down to a walk: the
+smoothed speeds, m/s, between which the first piece ends and the second begins."""
 _PIECE = 45, 120  # frames of a piece
 _GAPS = range(15, 60, 5)  # frames between two: few lengths, each of which is walked at once
 _GAP_A_SPEED = 12.0  # frames by which a gap is longer for each m/s of difference
 _TURN = 0.5  # standard deviation of the turn between two pieces, radians
-_REFERENCE = 300  # clips whose measures bound those of the splices
+_REFERENCE = 300  # clips whose measures bound those of the splices of one kind
 _AT_ONCE = 64  # splices that are walked at once
 _VELOCITY_FRAMES = 5  # frames over which the velocity at a cut is estimated
 
@@ -76,15 +85,17 @@ class Cut:
     """Frames between the two."""
     turn: float
     """Of the heading from the one to the other, radians."""
+    kind: tuple[tuple[float, float], tuple[float, float]]
+    """Speeds, m/s, between which the first piece ends, and between which the second begins."""
 
 
 def add_splices(corpus: Corpus, splices: Splices, cache: Path | None = None) -> Corpus:
     """Return a corpus with its clips, and after them the splices of them that no measure tells from them, by names that
     begin with FOLDER; it says who made them. In the folder `cache` they are kept: a run that is resumed reads them.
 
-    Who stands sets off, who goes stops, and who stands does something else, as often each where the clips have it; the
-    second piece begins where velocities of both lead. RequestError for a corpus in which nobody stands for a piece,
-    CheckpointError for a stitcher that is none.
+    Who stands sets off, who goes stops, and who stands does something else, as often each where the clips have it, and
+    twice as often who walks begins to run, and who runs slows down to a walk; the second piece begins where velocities
+    of both lead. RequestError for a corpus with nothing of it, CheckpointError for a stitcher that is none.
     """
     if splices.count == 0:
         return corpus
@@ -117,15 +128,20 @@ def _make_splices(corpus: Corpus, splices: Splices, stitcher: Stitcher) -> Corpu
     gaps = [gap for gap in _GAPS if gap <= stitcher.longest] or [stitcher.longest]
     cuts = draw_cuts(corpus, splices.count, gaps, generator)
     spliced = _walk_all(clips, cuts, stitcher, generator)
-    order = torch.randperm(len(clips), generator=generator).tolist()
-    long = [clips[number] for number in order if len(clips[number]) >= _PIECE[0]]
-    bounds = find_bounds(decode(clip, GroundPose.origin()) for clip in long[:_REFERENCE])
-    kept = [number for number, features in enumerate(spliced) if _passes(features, bounds)]
+    bounds = {kind: _bound(clips, [cut for cut in cuts if cut.kind == kind]) for kind in {cut.kind for cut in cuts}}
+    kept = [number for number, features in enumerate(spliced) if _passes(features, bounds[cuts[number].kind])]
     return Corpus(
         tuple(FOLDER + " + ".join(corpus.names[clip] for clip in cuts[number].clips) for number in kept),
         tuple(len(spliced[number]) for number in kept),
         torch.cat([corpus.features[:0], *(spliced[number] for number in kept)]),
     )
+
+
+def _bound(clips: Sequence[Tensor], cuts: Sequence[Cut]) -> dict[str, float]:
+    """Bound the measures of splices of one kind by the clips they are of: who runs steps further than who stands."""
+    numbers = sorted({number for cut in cuts for number in cut.clips})
+    spread = numbers[:: math.ceil(len(numbers) / _REFERENCE)]
+    return find_bounds(decode(clips[number], GroundPose.origin()) for number in spread)
 
 
 def drop_splices(corpus: Corpus) -> Corpus:
@@ -140,21 +156,23 @@ def hide_splices(names: Sequence[str]) -> list[str]:
 
 def draw_cuts(corpus: Corpus, count: int, gaps: Sequence[int], generator: torch.Generator) -> list[Cut]:
     """Draw where pieces of two clips are cut, of each kind in turn, and which of the gaps lies between; RequestError
-    for a corpus in which nobody stands for a piece."""
+    for a corpus in which nobody stands, or both walks and runs, for a piece."""
     speeds = measure_speeds(corpus)
-    ends = {bound: _find_frames(speeds, bound, lead=_PIECE[0]) for bound in (STANDS, GOES)}
-    beginnings = {bound: _find_frames(speeds, bound, rest=_PIECE[0]) for bound in (STANDS, GOES)}
+    ends = {speed: _find_frames(speeds, speed, lead=_PIECE[0]) for speed in {a for a, _ in _KINDS}}
+    beginnings = {speed: _find_frames(speeds, speed, rest=_PIECE[0]) for speed in {b for _, b in _KINDS}}
     kinds = [(a, b) for a, b in _KINDS if len(ends[a]) and len(beginnings[b])]
     if not kinds:
-        raise RequestError(f"splices need clips of {_PIECE[0] / PRIOR_FPS:g} s in which somebody stands")
+        raise RequestError(
+            f"splices need clips of {_PIECE[0] / PRIOR_FPS:g} s in which somebody stands, or both walks and runs"
+        )
 
-    def pick(bound: Tensor) -> tuple[int, int]:
-        clip, frame = bound[int(torch.randint(len(bound), (), generator=generator))].tolist()
+    def pick(frames: Tensor) -> tuple[int, int]:
+        clip, frame = frames[int(torch.randint(len(frames), (), generator=generator))].tolist()
         return clip, frame
 
     cuts = []
     for number in range(count):
-        a, b = kinds[number % len(kinds)]
+        kind = a, b = kinds[number % len(kinds)]
         (one, last), (other, first) = pick(ends[a]), pick(beginnings[b])
         lengths = torch.randint(_PIECE[0], _PIECE[1] + 1, (2,), generator=generator).tolist()
         change = abs(float(speeds[one][last] - speeds[other][first]))
@@ -166,18 +184,21 @@ def draw_cuts(corpus: Corpus, count: int, gaps: Sequence[int], generator: torch.
                 slice(first, first + lengths[1]),
                 min(gaps, key=lambda gap: abs(gap - wanted)),
                 _TURN * float(torch.randn((), generator=generator)),
+                kind,
             )
         )
     return cuts
 
 
-def _find_frames(speeds: Sequence[Tensor], bound: float, *, lead: int = 1, rest: int = 0) -> Tensor:
-    """Clip and frame of all frames at which somebody stands, or goes, as the bound says, with so many frames up to it
-    and so many after it."""
+def _find_frames(
+    speeds: Sequence[Tensor], wanted: tuple[float, float], *, lead: int = 1, rest: int = 0
+) -> Int[Tensor, "found 2"]:
+    """Clip and frame of all frames whose speed lies between those wanted, m/s, with so many frames up to it and so many
+    after it."""
     found = [torch.empty(0, 2, dtype=torch.long)]
     for clip, speed in enumerate(speeds):
         frames = torch.arange(lead - 1, max(lead - 1, len(speed) - rest))
-        frames = frames[speed[frames] < bound if bound == STANDS else speed[frames] > bound]
+        frames = frames[(wanted[0] <= speed[frames]) & (speed[frames] < wanted[1])]
         found.append(torch.stack([torch.full_like(frames, clip), frames], dim=1))
     return torch.cat(found)
 
