@@ -55,6 +55,8 @@ class WeightSet:
     """Splices of the clips that are tried for the density of everyday motion; with some, the pace is a label of it."""
     everyday_steps: int = 8000
     """Steps of the density of everyday motion."""
+    everyday_standing_share: float = 1.0
+    """Share of the windows in which nobody goes anywhere that the density of everyday motion is shown."""
     window: int = TrainingSettings.window
     """Frames of the windows of densities: short ones where runs are short."""
     width: int = 256
@@ -75,7 +77,8 @@ SETS: Mapping[str, WeightSet] = {
         licence="CC BY-NC 4.0",
         locomotion="dataset-2_(walk|walk-turn-left|walk-turn-right|run)_",
         labels="_(?P<gait>run|walk|walk-turn-left|walk-turn-right)_(?P<style>[a-z]+)_",
-        splices=2000,
+        splices=3500,
+        everyday_standing_share=0.5,
     ),
     "free": WeightSet(
         licence="free for any use",
@@ -181,7 +184,7 @@ def _make_models(weights: WeightSet, made: Path | None) -> tuple[BundledModel, .
             "general",
             DensityRecipe(
                 **general,
-                **_density(weights, weights.width, weights.everyday_steps),
+                **_density(weights, weights.width, weights.everyday_steps, weights.everyday_standing_share),
                 label_pace=weights.splices > 0,
                 splices=Splices(weights.splices),
             ),
@@ -219,7 +222,7 @@ def _make_models(weights: WeightSet, made: Path | None) -> tuple[BundledModel, .
     )
 
 
-def _density(weights: WeightSet, width: int, steps: int, standing_share: float = 1.0) -> dict[str, Any]:
+def _density(weights: WeightSet, width: int, steps: int, standing_share: float) -> dict[str, Any]:
     settings = TrainingSettings(
         steps=steps,
         batch=64,
