@@ -36,7 +36,7 @@ _KINDS = (
     (_STANDING, _GOING),
     (_GOING, _STANDING),
     (_STANDING, _STANDING),
-    # Twice as often: about half as many of them pass for mocap.
+    # Twice as often, since fewer of them pass for mocap.
     *(2 * ((_WALKING, _RUNNING), (_RUNNING, _WALKING))),
 )
 """Who sets off, who stops, who stands and does something else, who begins to run, who slows down to a walk: the
