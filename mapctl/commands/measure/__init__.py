@@ -42,7 +42,7 @@ class Measure(ModelCommand):
     steps: options.MaybeCount = None
     """Training steps of the classifier; 400, and with --why 2000, which make a stricter judge."""
     alone: bool = False
-    """With --why: also what each joint, band and region tells alone; 34 more classifiers of 400 steps."""
+    """With --why: also what each joint, band and region tells alone, by a classifier of 400 steps each."""
     out: Annotated[Path | None, arg(aliases=["-o"], metavar="FILE.png")] = None
     """With --why: a picture of it."""
     json: bool = False

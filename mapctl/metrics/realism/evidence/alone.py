@@ -1,6 +1,6 @@
 """What one group of inputs tells alone: accuracy of networks that are given nothing else."""
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import NamedTuple
 
 import torch
@@ -57,9 +57,8 @@ def measure_alone(
     """
     parts = [[cut_parts(clip, windows) for clip in clips] for clips in (made, mocap)]
     found = {}
-    for name, *sets in zip(GROUPS, *(_pick_groups(clips) for clips in parts), strict=True):
-        if name not in groups:
-            continue
+    for name in (each for each in GROUPS if each in groups):
+        sets = ([_pick_group(name, clip) for clip in clips] for clips in parts)
         generator = torch.Generator().manual_seed(seed)
         found[name] = average_verdicts(
             [*judge_folds(*sets, generator=generator, settings=classifier, paired=paired)]
@@ -68,19 +67,18 @@ def measure_alone(
     return found
 
 
-def _pick_groups(
-    clips: Sequence[Float[Tensor, "_ bands frames_and_one joints 3"]],
-) -> Iterator[list[Float[Tensor, "_ frames channels"]]]:
-    """Yield the channels of each of GROUPS, by clip."""
-    for band in range(len(BANDS)):
-        yield [join_parts(clip[:, band]) for clip in clips]
-    bones = [clip.sum(dim=1) for clip in clips]
-    for joint in range(len(JOINTS)):
-        yield [join_bone(clip[:, :, joint]) for clip in bones]
-    for kind in range(len(INPUTS)):
-        yield [join_parts(clip).unflatten(-1, (len(INPUTS), -1))[:, :, kind] for clip in bones]
-    for region in REGIONS.values():
-        yield [_join_region(clip, region) for clip in bones]
+def _pick_group(
+    name: str, clip: Float[Tensor, "_ bands frames_and_one joints 3"]
+) -> Float[Tensor, "_ frames channels"]:
+    """Return the channels of one of GROUPS of a clip."""
+    if name in BANDS:
+        return join_parts(clip[:, BANDS.index(name)])
+    bones = clip.sum(dim=1)
+    if name in JOINTS:
+        return join_bone(bones[:, :, JOINTS.index(name)])
+    if name in INPUTS:
+        return join_parts(bones).unflatten(-1, (len(INPUTS), -1))[:, :, INPUTS.index(name)]
+    return _join_region(bones, REGIONS[name])
 
 
 def _join_region(
