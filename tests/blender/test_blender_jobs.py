@@ -18,7 +18,7 @@ WRITTEN = {"clean": "denoise", "filled": "infill", "tweened": "tween", "again": 
 """Commands of the stages after the walk; of two that ran the same, the later one's files are left."""
 KINDS = [
     pytest.param(("imported", True, 24, 5), id="imported"),
-    pytest.param(("generated", True, 30, 4), id="generated"),
+    pytest.param(("generated", True, 30, 4), id="generated", marks=pytest.mark.slow),
     *(
         pytest.param((kind, False, 24, 5), id=kind, marks=pytest.mark.slow)
         for kind in ("mixamo", "metarig", "basic metarig", "generated with face")

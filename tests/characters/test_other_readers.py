@@ -33,6 +33,7 @@ def validate(*paths):
     return [sorted(m["code"] for m in found["messages"] if m["severity"] < 2) for found in json.loads(done.stdout)]
 
 
+@pytest.mark.slow
 @needs_validator
 def test_characters_are_as_valid_as_they_came(tmp_path):
     paths = []

@@ -38,11 +38,11 @@ def _stream(path):
         file.append(MOTION)
 
 
-def _film(writer):
+def _film(writer, picture=PICTURE):
     def write(path):
-        with atomic_path(path) as scratch, writer(scratch, (320, 240), Fraction(30)) as add:
+        with atomic_path(path) as scratch, writer(scratch, picture.shape[1::-1], Fraction(30)) as add:
             for _ in range(4):
-                add(PICTURE)
+                add(picture)
 
     return write
 
@@ -62,7 +62,7 @@ WRITERS = {
     "a.glb": _save,
     "stream.bvh": _stream,
     "a.mp4": _film(mp4_writer),
-    "a.gif": _film(gif_writer),
+    "a.gif": _film(gif_writer, PICTURE[::2, ::2]),  # colours of noise take long to choose
     "a.webp": _film(webp_writer),
     "a.png": lambda path: save_png(path, PICTURE),
     "a.json": lambda path: report.write_report({"values": list(range(9000))}, path),

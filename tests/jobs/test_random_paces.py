@@ -195,6 +195,7 @@ def test_generated_motion_is_told(pacing, tell, expected):
     assert set(told.values()) == expected
 
 
+@pytest.mark.slow
 def test_feet_are_cleaned_up_by_what_was_told(pacing, monkeypatch):
     density, told = pacing
     solved, sampled = [], []
