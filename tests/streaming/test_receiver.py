@@ -116,7 +116,7 @@ def test_of_a_flood_the_newest_count_and_a_look_is_short(receiver, sender):
     for _ in range(200):
         sender(costly)
     sender(b"/mapctl/stop\0\0\0\0,\0\0\0")
-    began = time.thread_time()  # of the clock others' work would count, too
+    began = time.thread_time()  # a wall clock would count other processes, too
     found = receiver.poll()
     assert time.thread_time() - began < 0.25
     assert found[-1] == Message("/mapctl/stop")

@@ -56,9 +56,11 @@ def measure_alone(
     `made` and `mocap` are `canonical_positions` of each clip, `paired` as `judge_folds` has it.
     """
     parts = [[cut_parts(clip, windows) for clip in clips] for clips in (made, mocap)]
+    bones = [[clip.sum(dim=1) for clip in clips] for clips in parts]
     found = {}
     for name in (each for each in GROUPS if each in groups):
-        sets = ([_pick_group(name, clip) for clip in clips] for clips in parts)
+        source = parts if name in BANDS else bones
+        sets = ([_pick_group(name, clip) for clip in clips] for clips in source)
         generator = torch.Generator().manual_seed(seed)
         found[name] = average_verdicts(
             [*judge_folds(*sets, generator=generator, settings=classifier, paired=paired)]
@@ -68,12 +70,11 @@ def measure_alone(
 
 
 def _pick_group(
-    name: str, clip: Float[Tensor, "_ bands frames_and_one joints 3"]
+    name: str, bones: Float[Tensor, "_ *bands frames_and_one joints 3"]
 ) -> Float[Tensor, "_ frames channels"]:
-    """Return the channels of one of GROUPS of a clip."""
+    """Return the channels of one of GROUPS of a clip: of a band from the clip's parts, of the others from their sum."""
     if name in BANDS:
-        return join_parts(clip[:, BANDS.index(name)])
-    bones = clip.sum(dim=1)
+        return join_parts(bones[:, BANDS.index(name)])
     if name in JOINTS:
         return join_bone(bones[:, :, JOINTS.index(name)])
     if name in INPUTS:
