@@ -59,8 +59,8 @@ def measure_alone(
     bones = [[clip.sum(dim=1) for clip in clips] for clips in parts]
     found = {}
     for name in (each for each in GROUPS if each in groups):
-        source = parts if name in BANDS else bones
-        sets = ([_pick_group(name, clip) for clip in clips] for clips in source)
+        pick, source = (_pick_band, parts) if name in BANDS else (_pick_joints, bones)
+        sets = ([pick(name, clip) for clip in clips] for clips in source)
         generator = torch.Generator().manual_seed(seed)
         found[name] = average_verdicts(
             [*judge_folds(*sets, generator=generator, settings=classifier, paired=paired)]
@@ -69,12 +69,15 @@ def measure_alone(
     return found
 
 
-def _pick_group(
-    name: str, bones: Float[Tensor, "_ *bands frames_and_one joints 3"]
+def _pick_band(
+    name: str, parts: Float[Tensor, "_ bands frames_and_one joints 3"]
 ) -> Float[Tensor, "_ frames channels"]:
-    """Return the channels of one of GROUPS of a clip: of a band from the clip's parts, of the others from their sum."""
-    if name in BANDS:
-        return join_parts(bones[:, BANDS.index(name)])
+    """Return the channels of one of BANDS of a clip."""
+    return join_parts(parts[:, BANDS.index(name)])
+
+
+def _pick_joints(name: str, bones: Float[Tensor, "_ frames_and_one joints 3"]) -> Float[Tensor, "_ frames channels"]:
+    """Return the channels of one of the other GROUPS, in which all bands are summed."""
     if name in JOINTS:
         return join_bone(bones[:, :, JOINTS.index(name)])
     if name in INPUTS:
