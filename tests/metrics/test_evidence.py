@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from mapctl.metrics import realism
 from mapctl.metrics.realism.evidence import alone, kinds, parts, paths
-from mapctl.metrics.realism.windows import WindowSettings
+from mapctl.metrics.realism.windows import WindowSettings, cut_windows
 from mapctl.numerics.easing import smootherstep
 from mapctl.skeleton import CANONICAL
 
@@ -273,6 +274,33 @@ def test_the_body_lands_with_either_foot():
     feet = torch.tensor([[0, 0], [0, 2], [2, 2], [0, 1], [3, 1]])
     told = [kinds.BODY_PHASES[phase] for phase in kinds.join_foot_phases(feet).tolist()]
     assert told == ["on both feet", "on one foot", "in flight", "lift", "landing"]
+
+
+def test_what_networks_of_groups_are_given(monkeypatch: pytest.MonkeyPatch):
+    """Positions are those of whole windows, and those of legs do not tell where the hips are."""
+
+    def list_given(clips: list[Tensor]) -> dict[str, Tensor]:
+        given: list[Tensor] = []
+
+        def keep(made: list[Tensor], mocap: list[Tensor], **_: object) -> list[object]:
+            given.append(torch.cat(made))
+            return []
+
+        monkeypatch.setattr(alone, "judge_folds", keep)
+        monkeypatch.setattr(alone, "average_verdicts", lambda _: SimpleNamespace(accuracy=0.5))
+        found = alone.measure_alone(
+            clips, clips, windows=WINDOWS, classifier=SETTINGS.classifier, seed=1, groups=("positions", "legs")
+        )
+        return dict(zip(found, given, strict=True))
+
+    clips = list(clean()[:2])
+    lifted = [clip + torch.linspace(0, 0.1, len(clip))[:, None, None] * torch.tensor([0.0, 1.0, 0.0]) for clip in clips]
+    still, moved = list_given(clips), list_given(lifted)
+    whole = torch.cat([cut_windows(clip, WINDOWS) for clip in clips])
+    positions = whole[..., : whole.shape[-1] // 2]
+    torch.testing.assert_close(still["positions"], positions, atol=1e-4, rtol=0, check_dtype=False)
+    assert float((moved["positions"] - still["positions"]).abs().max()) > 0.05
+    torch.testing.assert_close(moved["legs"], still["legs"], atol=1e-3, rtol=0)
 
 
 @pytest.mark.slow
