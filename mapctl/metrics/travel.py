@@ -114,9 +114,9 @@ def _find_time_reached(
     near = np.abs(velocity.speed - command.speed) < max(_NEAR_SPEED * command.speed, _NEAR_STILL)
     if command.speed > 0 and command.turning is None:
         near &= np.abs(rotations.wrap_angle(velocity.direction - command.heading)) < _NEAR_ANGLE
-    at = np.flatnonzero(part)
-    for first in at:
-        if near[first : min(first + round(_HOLD_SECONDS * fps), at[-1] + 1)].all():
+    at, held = np.flatnonzero(part), round(_HOLD_SECONDS * fps)
+    for first in at[: max(0, len(at) - held + 1)]:
+        if near[first : first + held].all():
             return float(velocity.seconds[first] - began)
     return None
 

@@ -11,6 +11,7 @@ from tiny_prior import save_tiny_prior
 from tiny_refiner import refiner_of
 
 from controllers.benchmarks import generation
+from controllers.benchmarks.shared.held_out import find_held_out
 from mapctl import cli, retarget
 from mapctl.commands import bench
 from mapctl.commands.bench import baselines
@@ -170,3 +171,10 @@ def test_a_model_has_not_seen_what_its_pattern_for_paths_leaves_out(folder):
     with pytest.raises(RequestError, match="other was trained on bandai/a_walk_0"):
         baselines.find_held_out({"ours": card, "other": seeing})
     assert baselines.find_held_out({"ours": card, "other": seeing}, "walk_1")["test"] == ["bandai/a_walk_1.bvh"]
+
+
+def test_clips_that_nothing_was_chosen_by_come_first(tmp_path):
+    names = {"validation": ["a_walk_1.bvh"], "test": ["b_walk_2.bvh"]}
+    for each in ("a_walk_1.bvh", "b_walk_2.bvh"):
+        (tmp_path / each).touch()
+    assert [path.name for path in find_held_out(tmp_path, names)] == ["b_walk_2.bvh", "a_walk_1.bvh"]

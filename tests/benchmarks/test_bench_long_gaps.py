@@ -1,6 +1,7 @@
 """The bench of long gaps: ratios of sums beside mocap, of clips that are long enough."""
 
 import json
+import math
 from dataclasses import dataclass, replace
 
 import pytest
@@ -9,11 +10,12 @@ from helpers import run, walk
 from tiny_path import save_tiny_path
 from tiny_tweener import card, network
 
-from controllers.benchmarks.tweener.gap_measures import Method, measure_key_jerk
+from controllers.benchmarks.tweener.gap_measures import GapSums, Method, measure_key_jerk
 from controllers.benchmarks.tweener.long_gaps import benchmark_long_gaps, cut_middle
 from controllers.inbetweening.pipeline import InfillSettings
 from mapctl.inbetweening import GapQuery, Proposal
 from mapctl.inbetweening.query import estimate_contact_logits
+from mapctl.metrics.liveliness import Liveliness
 from mapctl.motion import Motion
 from mapctl.protocols import Inbetweener
 from priors import checkpoints
@@ -93,3 +95,20 @@ def test_the_command_compares_in_betweeners_on_held_out_clips(tmp_path, capsys):
     ]
     assert run("bench", "tweener", "--data", data, *words[:6], "--seconds", "long") == 2
     assert "--seconds takes numbers" in capsys.readouterr().err
+
+
+def test_jerk_at_keys_is_not_that_of_frames_inside_a_gap():
+    """Third differences reach over four frames: of the first and the last four of a gap no known one is among them."""
+    motion, gap = walk(60), (10, 50)
+    for frame, at_keys in ((13, False), (46, False), (12, True), (47, True)):
+        root = motion.root_position.clone()
+        root[frame] += 0.5
+        found = measure_key_jerk(replace(motion, root_position=root), motion, gap)
+        assert (found != measure_key_jerk(motion, motion, gap)) == at_keys
+
+
+def test_toes_that_never_touch_the_floor_have_no_speed_there():
+    some = Liveliness(1.0, 1.0, 1.0, 1.0, 1.0)
+    summed = GapSums(made=some, true=some, clips=1, frames=1)
+    assert math.isnan(summed.summarise()["planted_cm_s"])
+    assert math.isnan(summed.summarise()["mocap_cm_s"])

@@ -8,9 +8,10 @@ from helpers import walk
 from tiny_transformer import tiny_transformer
 
 from controllers.benchmarks import transitions
-from controllers.benchmarks.transitions import twins
+from controllers.benchmarks.transitions import table, twins
 from controllers.inbetweening.proposers import SlerpInbetweener
 from mapctl.inbetweening.retrieval import MotionCollection
+from mapctl.metrics.realism import ClassifierSettings
 
 STD = torch.full((21, 3), 0.2)
 KINDS = {"walks": [walk(80, cadence=1.2)], "turns": [walk(120, turn_rate=0.5)], "short": [walk(30)]}
@@ -143,3 +144,19 @@ def test_the_best_by_energy_is_the_answer_with_the_least_of_it(rows):
     for length in transitions.LENGTHS:
         likeliest = row_of(rows, frames=length, kind="walks", method="shaken, best of 8 by energy")
         assert likeliest["ade_cm"] == pytest.approx(3.0, abs=0.2)
+
+
+def test_a_judge_of_gaps_has_seen_no_gap_of_the_same_clip(monkeypatch):
+    """Made and captured gaps are of the same windows: one that has seen the one knows the other."""
+    judges, train = [], table.train_judges
+    monkeypatch.setattr(table, "train_judges", lambda *sets, **how: judges.append(train(*sets, **how)) or judges[-1])
+    quick = replace(table._REALISM, classifier=ClassifierSettings(folds=2, steps=1, width=4, batch=8), dims=2)
+    monkeypatch.setattr(table, "_REALISM", quick)
+    monkeypatch.setattr(table, "LENGTHS", (30,))
+    clips = [walk(120, cadence=1 + 0.1 * number) for number in range(4)]
+    found = transitions.benchmark_transitions({"walks": clips}, {"oracle": oracle}, past=10, std=STD, baseline="oracle")
+    (told,) = judges
+    assert [len(windows) for windows in told.made] == [len(windows) for windows in told.mocap] == [2] * 4
+    for fold in told.folds:
+        assert sorted(fold.clips[0]) == sorted(fold.clips[1])
+    assert row_of(found, kind=transitions.ALL_KINDS, method="oracle")["told_apart"] == pytest.approx(0.5)

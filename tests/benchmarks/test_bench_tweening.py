@@ -1,12 +1,15 @@
 """The in-betweening bench: what it measures of made-up clips."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
+import torch
 from helpers import tiny_density, walk
 from tiny_infiller import tiny_infiller
 
 from controllers.benchmarks import tweening
+from controllers.benchmarks.shared.tables import average_rows
 
 
 @pytest.mark.parametrize("small", [True, pytest.param(False, marks=pytest.mark.slow)])
@@ -33,3 +36,25 @@ def test_rows_by_kind_task_and_method_of_the_clips_that_are_long_enough(monkeypa
         assert row["jerk_at_keys"] > 0
     assert all(math.isfinite(row["skate_cm_s"]) and row["ms_frame"] > 0 for row in rows)
     assert rows[0]["mocap_skate"] == rows[1]["mocap_skate"]
+
+
+def test_models_are_asked_for_the_same_keys_whatever_they_draw(monkeypatch):
+    asked = {0: [], 7: []}
+    for draws, keys_of in asked.items():
+
+        def answer(clip, keys, inbetweener, densities, generator, draws=draws, keys_of=keys_of):
+            torch.rand(draws, generator=generator)
+            keys_of.append(keys.frames)
+            return [SimpleNamespace(motion=clip, seconds=1.0) for _ in range(3)]
+
+        monkeypatch.setattr(tweening, "_tween_by_all_methods", answer)
+        monkeypatch.setattr(tweening, "_END_SOURCE_FRAMES", 1000)
+        monkeypatch.setattr(tweening, "TWEEN_FRAMES", 30)
+        tweening.benchmark_tweening({"walks": [walk(30)] * 3}, tiny_infiller(), [tiny_density()])
+    assert asked[0] == asked[7]
+    assert len({*asked[0]}) == 3
+
+
+def test_the_worst_frames_of_clips_are_no_means():
+    rows = [{"step_cm": 3.0, "error_cm": 3.0}, {"step_cm": 9.0, "error_cm": 9.0}, {"step_cm": math.nan, "error_cm": 0}]
+    assert average_rows(rows, worst=tweening._WORST) == {"step_cm": 9, "error_cm": 4}

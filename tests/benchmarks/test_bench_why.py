@@ -61,7 +61,7 @@ def test_each_variant_is_compared_at_each_number_of_steps(mocap):
 def test_rounded_bones_are_no_cause_and_another_body_stays_itself(mocap, grown, shared):
     clip = mocap[0].motion
     other = replace(clip, skeleton=replace(clip.skeleton, offsets=clip.skeleton.offsets * (1 + grown)))
-    put = why.put_on_generated_bones(other)
+    put = put_on_generated_bones(other)
     assert put.joint_positions().equal((clip if shared else other).joint_positions())
 
 

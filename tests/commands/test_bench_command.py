@@ -1,12 +1,14 @@
 """`mapctl bench`: a sub-command a table, each with its own options; and every command's work is found."""
 
 import json
+import math
 from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
 
 import pytest
+import torch
 from helpers import run, walk
 
 from controllers.benchmarks.shots import fulfilment
@@ -109,3 +111,15 @@ def test_shots_are_told_from_mocap_as_a_percentage():
     sliding = [replace(clip, root_position=clip.root_position[:1].expand(90, 3)) for clip in mocap]
     told, same = (fulfilment._tell_apart(motions, mocap, 0)["told_apart_pct"] for motions in (sliding, mocap))
     assert told > 90 > same
+
+
+def test_a_body_that_glides_over_the_floor_shows_a_fault():
+    """It plants no toe, and the speed of none is no number that is within a limit."""
+    still = walk(90)
+    ahead = 0.1 * torch.arange(90.0, dtype=torch.float64)[:, None] * torch.tensor([0.0, 0.0, 1.0]).double()
+    gliding = replace(still, root_position=still.root_position[:1] + ahead)
+    gliding = replace(gliding, local_quat_xyzw=still.local_quat_xyzw[:1].expand(90, -1, -1))
+    assert math.isnan(fulfilment._measure([gliding])["planted_cm_s"])
+    assert fulfilment._shows_fault(gliding)
+    assert not fulfilment._shows_fault(still)
+    assert fulfilment._measure([gliding, still])["planted_cm_s"] == fulfilment._measure([still])["planted_cm_s"]

@@ -244,3 +244,17 @@ def test_orders_that_are_none_are_refused(steer, tmp_path, capsys, line, message
 def test_a_stitcher_without_orders_is_refused(steer, capsys):
     assert steer(SCRIPT, "--stitcher", "stitcher") == 2
     assert "--stitcher makes ways to a place, and the script has no goto_x_m" in capsys.readouterr().err
+
+
+def test_a_command_is_not_reached_by_the_last_frames_of_its_time():
+    """It must hold for 0.4 s, and a walk that comes near it in the last frame before the next has not held it."""
+    motion = walk(150)
+    speed = float((motion.root_position[-1] - motion.root_position[0])[::2].norm()) / (149 / 30)
+    way = float(torch.atan2(*(motion.root_position[-1] - motion.root_position[0])[[0, 2]]))
+    wanted = Command(speed, way)
+    brief, held = (
+        measure_commands(motion, CommandTrack((0.0, 2.0, 2.0 + seconds), (Command(0.0, 0.0), wanted, wanted)))[1]
+        for seconds in (0.2, 0.6)
+    )
+    assert brief["reached_s"] is None
+    assert held["reached_s"] == 0

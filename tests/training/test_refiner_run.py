@@ -87,7 +87,8 @@ def test_a_finished_run_loads_with_a_complete_card_and_only_its_files(tmp_path, 
     for row in card.training["curve"]:
         assert {"jitter_m_s3_ratio", "score"} <= set(row)
         assert row["round"] == 0 or row["training_critic"] > 0
-    assert card.quality == min(card.training["curve"], key=compute_realism_gap)
+    assert card.quality["round"] == min(card.training["curve"], key=compute_realism_gap)["round"]
+    assert set(card.quality["test"]) == {"contact_speed_cm_s_ratio", "jitter_m_s3_ratio"}
     assert f"--density {density}" in card.training["command"]
     assert [line.split(":")[0] for line in news if line.startswith("round")] == ["round 2/6", "round 4/6", "round 6/6"]
     files = {file.name for file in out.iterdir()}
@@ -161,7 +162,22 @@ def test_the_best_refiner_seen_is_exported(tmp_path, request_in, scripted):
     path = train(request_in(tmp_path / "run", validate_steps=2))
     assert kept(path) == 4
     card = priors.load_refiner(str(path)).card
-    assert (card.quality["round"], card.quality["score"]) == (4, pytest.approx(math.log(1.1)))
+    assert card.quality == {"round": 4, "test": {"jitter_m_s3_ratio": 1.1}}
+
+
+def test_a_refiner_is_chosen_by_other_clips_than_it_is_measured_on(tmp_path, request_in, scripted, monkeypatch):
+    """By the measures of a card no refiner was chosen."""
+    scripted(even, dict.fromkeys(range(7), 1.0))
+    shown, make_judge = [], RefinerEvaluator.of
+
+    def note(raw, held, settings):
+        shown.append(held.names)
+        return make_judge(raw, held, settings)
+
+    monkeypatch.setattr(RefinerEvaluator, "of", note)
+    train(request_in(tmp_path / "run"))
+    (chosen_by,), (measured_on,) = shown
+    assert chosen_by != measured_on
 
 
 @pytest.mark.slow
@@ -233,17 +249,17 @@ def test_scores_are_distances_from_mocap():
 
 @pytest.mark.slow
 def test_the_judge_measures_against_clips_kept_from_training(data, density, tmp_path):
-    parts = corpora.split_corpus(corpora.read_corpus(data, match="", cache=tmp_path), 1)
-    held = torch.cat([parts.validation.features, parts.test.features])
-    raw = corpora.Corpus(("a", "b"), (80, 80), held)
+    clips = corpora.read_corpus(data, match="", cache=tmp_path)
+    parts = corpora.split_corpus(clips, 1)
+    raw = corpora.Corpus(("a", "b"), (80, 80), parts.validation.features.repeat(2, 1))
     quick = RealismSettings(classifier=ClassifierSettings(folds=2, steps=5, width=4, batch=8), dims=2)
     trainer = AdversarialTrainer(TINY, SETTINGS, parts.train, raw)
-    row = RefinerEvaluator.of(raw, parts, quick)(trainer.refiner)
+    row = RefinerEvaluator.of(raw, parts.validation, quick)(trainer.refiner)
     assert row["jitter_m_s3_ratio"] == pytest.approx(1, abs=1e-3)  # the very same clips
     assert row["contact_speed_cm_s_ratio"] == pytest.approx(1, abs=1e-3)
     assert "told_apart" not in row  # two clips are too few
-    many = corpora.Split(parts.train, parts.train, parts.train)
-    judge = RefinerEvaluator.of(corpora.Corpus(tuple("abcd"), (80,) * 4, held.repeat(2, 1)), many, quick)
+    made = corpora.Corpus(tuple("abcd"), (80,) * 4, parts.validation.features.repeat(4, 1))
+    judge = RefinerEvaluator.of(made, clips, quick)
     first, again = judge(trainer.refiner), judge(trainer.refiner)
     assert 0 <= first["told_apart"] <= 1
     assert first == again

@@ -82,7 +82,7 @@ def _measure_walks(walker: Walker, course: str, speed: float, seeds: int) -> Row
         peaks = measure_peaks(positions[:, _ENDS], positions[:, 0], float(motion.fps))
         worst = {"step_cm": 100 * peaks.step, "acceleration_m_s2": peaks.acceleration}
         rows.append({**{name: found[name] for name in _MEASURES}, **worst, "ms_per_frame": cost})
-    return {**average_rows(rows), **{name: max(row[name] for row in rows) for name in _WORST}}
+    return average_rows(rows, worst=_WORST)
 
 
 def _by_density(density: Density) -> Walker:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import torch
 
+from controllers.benchmarks.shared.bones import put_on_generated_bones
 from controllers.benchmarks.shared.tables import Row, average_rows
 from controllers.generation.foot_cleanup import FootCleanupSettings
 from controllers.generation.generate import SIGMA_PLANTED, GenerateSettings, generate, sample_stratified_starts
@@ -172,7 +173,8 @@ def _measure_diversity(variant: Variant, settings: GenerationBenchmarkSettings) 
 
 def _measure_realism(clips: Sequence[Motion], mocap: Sequence[Motion], settings: GenerationBenchmarkSettings) -> Row:
     generator = torch.Generator().manual_seed(settings.seed)
-    found = measure_realism(clips, mocap, generator=generator, settings=settings.realism)
+    real = [put_on_generated_bones(clip) for clip in mocap]
+    found = measure_realism(clips, real, generator=generator, settings=settings.realism)
     return {
         "told_apart": found.accuracy,
         "told_apart_floor": found.floor_accuracy,

@@ -7,6 +7,7 @@ import torch
 
 from controllers.benchmarks.generation import Variant, generate_clips
 from controllers.benchmarks.generation.continuations import continue_clips, cut_continuation, select_long_clips
+from controllers.benchmarks.shared.bones import put_on_generated_bones
 from controllers.benchmarks.shared.held_out import NamedClip
 from controllers.benchmarks.shared.tables import Row
 from mapctl.errors import RequestError
@@ -21,12 +22,10 @@ from mapctl.metrics.realism import (
     train_judges,
 )
 from mapctl.motion import Motion
-from mapctl.skeleton import CANONICAL
 
 SHARES = ("joints", "bands", "cells", "inputs", "phases", "feet")
 """Parts of the benchmark that hold shares of the evidence, as `Explanation` names them."""
 _MOST = 8  # rows of a part for each variant
-_SAME_BONES = 1e-3  # metres by which joints of one body differ between rigs at most
 
 
 @dataclass(frozen=True)
@@ -54,16 +53,6 @@ class WhyBenchmarkSettings:
             raise RequestError("the table needs a length above 0 s and steps of at least 1")
         if not self.continued and self.count < self.realism.min_clips:
             raise RequestError(f"the table needs at least {self.realism.min_clips} clips, got {self.count}")
-
-
-def put_on_generated_bones(motion: Motion) -> Motion:
-    """Return a motion on canonical joints with the bones of generated motion, where its own are within 1 mm of them.
-
-    Rigs round their bones: a few hundredths of a millimetre are enough for networks to tell which of two files a trunk
-    is of. Another body keeps its bones, since its feet would slide on these.
-    """
-    apart = (motion.skeleton.offsets - CANONICAL.offsets).norm(dim=-1).max()
-    return replace(motion, skeleton=CANONICAL) if float(apart) < _SAME_BONES else motion
 
 
 def benchmark_why(

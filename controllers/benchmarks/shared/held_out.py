@@ -46,8 +46,9 @@ class NamedClip:
 
 
 def find_held_out(data: Path, held_out: HeldOut) -> list[Path]:
-    """Find the held-out clips below the data folder; RequestError unless all are there."""
-    paths = [data / name for part in ("validation", "test") for name in held_out.get(part, ())]
+    """Find the held-out clips below the data folder, those first by which nothing was chosen in training; RequestError
+    unless all are there."""
+    paths = [data / name for part in ("test", "validation") for name in held_out.get(part, ())]
     if not paths or not all(path.is_file() for path in paths):
         missing = next((path for path in paths if not path.is_file()), "no clip at all")
         raise RequestError(f"{data} does not hold the clips kept from training: {missing}")

@@ -17,13 +17,7 @@ from controllers.benchmarks.transitions.methods import Energy, Filled, Method, S
 from controllers.benchmarks.transitions.twins import measure_twins
 from controllers.benchmarks.transitions.windows import PAST, Gap, find_gaps, put_in
 from mapctl.metrics import transitions
-from mapctl.metrics.realism import (
-    RealismSettings,
-    WindowSettings,
-    canonical_positions,
-    cut_windows,
-    measure_window_realism,
-)
+from mapctl.metrics.realism import RealismSettings, WindowSettings, canonical_positions, cut_windows, train_judges
 from mapctl.motion import Motion
 
 LENGTHS = (5, 15, 30, 45)
@@ -65,10 +59,11 @@ def benchmark_transitions(
     total = len(LENGTHS) * len(kinds) * (len(methods) + len(samplers))
     done = 0
     for length in LENGTHS:
-        cut: dict[str, list[Tensor]] = {name: [] for name in ("mocap", *names)}
+        cut: dict[str, list[Tensor]] = {name: [] for name in ("mocap", *names)}  # of each clip
         found = []
         for kind, clips in kinds.items():
-            gaps = [gap for clip in clips for gap in find_gaps(clip, length, past)]
+            by_clip = [found_in for clip in clips if (found_in := find_gaps(clip, length, past))]
+            gaps = [gap for each in by_clip for gap in each]
             if not gaps:
                 continue
             shared = {"kind": kind, "frames": length, "windows": len(gaps)}
@@ -85,7 +80,7 @@ def benchmark_transitions(
                     progress(done, total)
             for each in made:
                 found.append({**shared, "method": each.name, **each.row})
-                cut[each.name] += [_cut(motion) for motion in each.motions] if length == _REALISM_LENGTH else []
+                cut[each.name] += _cut(each.motions, by_clip) if length == _REALISM_LENGTH else []
         rows += found + _average_kinds(found, ["mocap", *names], baseline, length)
         if length == _REALISM_LENGTH:
             _add_realism(rows, cut)
@@ -215,20 +210,24 @@ def _average_kinds(found: Sequence[Row], methods: Sequence[str], baseline: str, 
     return rows
 
 
-def _cut(motion: Motion) -> Tensor:
-    """Cut a gap out, with the frame before it, for the network that tells it from mocap."""
-    part = motion.slice(PAST - 1, PAST + _REALISM_LENGTH)
-    return cut_windows(canonical_positions(part), _REALISM.windows)
+def _cut(motions: Sequence[Motion], by_clip: Sequence[Sequence[Gap]]) -> list[Tensor]:
+    """Cut gaps out, each with the frame before it, for the network that tells them from mocap: those of a clip
+    together."""
+    parts = [motion.slice(PAST - 1, PAST + _REALISM_LENGTH) for motion in motions]
+    windows = iter([cut_windows(canonical_positions(part), _REALISM.windows) for part in parts])
+    return [torch.cat([next(windows) for _ in gaps]) for gaps in by_clip]
 
 
 def _add_realism(rows: list[Row], made: Mapping[str, Sequence[Tensor]]) -> None:
+    """Tell made gaps from mocap's: no network judges gaps of a clip of which it has seen any, made or captured. Both
+    are of the same windows, and one that knows the captured gap tells the made one by what it shares with it."""
     mocap = made["mocap"]
     if len(mocap) < _REALISM.min_clips:
         return
     for row in rows:
         if row["kind"] == ALL_KINDS and row["frames"] == _REALISM_LENGTH and row["method"] != "mocap":
-            found = measure_window_realism(
-                made[row["method"]], mocap, generator=torch.Generator().manual_seed(0), settings=_REALISM
-            )
+            seeded = torch.Generator().manual_seed(0)
+            judges = train_judges(made[row["method"]], mocap, generator=seeded, settings=_REALISM, paired=True)
+            found = judges.summarise()
             row |= {"told_apart": found.accuracy, "mocap_told_apart": found.floor_accuracy, "frechet": found.frechet}
             row |= {"mocap_frechet": found.floor_frechet}

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -24,7 +25,7 @@ from mapctl import formats, kinematics, motion_dna, retarget, rotations
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.intent.keyframes import Keys
-from mapctl.metrics.feet import ToeMeasurements
+from mapctl.metrics.feet import ToeMeasurements, contact_speed
 from mapctl.motion import Motion
 from mapctl.motion_dna import MotionDna
 from mapctl.protocols import Inbetweener
@@ -156,9 +157,8 @@ class _Made:
 
     @property
     def sliding(self) -> float:
-        """Speed of planted toes, cm/s; 0 where none is."""
-        planted = self.toes.planted[1:]
-        return 100 * float(self.toes.speed[planted].mean()) if bool(planted.any()) else 0.0
+        """Speed of planted toes, cm/s; NaN where none is."""
+        return 100 * contact_speed(self.toes)
 
 
 def take_bare_poses(motion: Motion) -> Float[Tensor, "frames joints 3"]:
@@ -279,7 +279,7 @@ def _measure(told: Sequence[tuple[_Made, MotionDna]], usual: float, seconds: flo
         "speed_cm_s": [one.speed for one, _ in told],
         "spread_cm": [one.spread for one, _ in told],
     }
-    means = {name: sum(values) / len(values) for name, values in columns.items()}
+    means = {name: float(np.nanmean(values)) for name, values in columns.items()}
     flashed = 100 * sum(count < _LEAST_DWELL for count in dwell) / len(dwell)
     return means | {"dwell": float(torch.tensor(dwell).float().median()), "flashed_percent": flashed}
 

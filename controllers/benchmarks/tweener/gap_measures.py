@@ -2,6 +2,7 @@
 they are made exact.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -83,8 +84,8 @@ class GapSums:
             "spread": made.spread / max(true.spread, 1e-9),
             "jerk": made.jerk / max(true.jerk, 1e-9),
             "planted": self.planted / max(self.true_planted, 1e-9),
-            "planted_cm_s": self.sliding / max(self.planted, 1.0),
-            "mocap_cm_s": self.true_sliding / max(self.true_planted, 1.0),
+            "planted_cm_s": self.sliding / self.planted if self.planted else math.nan,
+            "mocap_cm_s": self.true_sliding / self.true_planted if self.true_planted else math.nan,
             "key_jerk": self.key_jerk / self.clips,
             "ms_frame": 1000 * self.seconds / self.frames,
         }
@@ -127,11 +128,11 @@ def compare_with_mocap(
 
 def measure_key_jerk(made: Motion, true: Motion, gap: tuple[int, int] | None = None) -> float:
     """Measure the largest jerk at the keys around a gap, over the 95th percentile of mocap's: of means over joints in
-    the world, in third differences that reach a known frame from the gap's first two frames or its last two. Without a
-    gap it is all but the first and the last frame."""
+    the world, in third differences over four frames of which some are known and some in the gap. Without a gap it is
+    all but the first and the last frame."""
     ours, theirs = (torch.diff(each.joint_positions(), n=3, dim=0).norm(dim=-1).mean(dim=-1) for each in (made, true))
     start, stop = gap or (1, made.num_frames - 1)
-    beside = {*range(start - 3, start + 1), *range(stop - 4, stop)} & set(range(len(ours)))
+    beside = {*range(start - 3, start), *range(stop - 3, stop)} & set(range(len(ours)))
     return float(ours[sorted(beside)].max() / theirs.quantile(0.95).clamp_min(1e-9))
 
 

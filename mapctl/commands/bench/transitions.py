@@ -42,6 +42,7 @@ from mapctl.pose import decode
 from mapctl.protocols import Inbetweener
 from priors.stitching.inbetweener import Stitcher
 from priors.training.corpus import read_corpus
+from priors.training.mocap.cuts import CMU
 from priors.training.transition_statistics import compute_position_std
 from scenes.plots.transitions import plot_errors
 
@@ -58,7 +59,7 @@ def run(table: Transitions) -> int:
     if table.over_time is not None:
         return print_rows(table, _measure_over_time(table, network, kinds, held_out, table.over_time))
     with TemporaryDirectory() as cache:
-        corpus = read_corpus(table.data, match="", cache=Path(cache), skip_first=True)
+        corpus = read_corpus(table.data, match="", cache=Path(cache), cuts=CMU)
     # By name: a folder with clips beside those of the training would be split otherwise.
     kept_out = {name for names in held_out.values() for name in names}
     train = corpus.subset(number for number, name in enumerate(corpus.names) if name not in kept_out)

@@ -16,7 +16,7 @@ from mapctl.pose import decode
 from priors import checkpoints
 from priors.lstm_gmm.density import LstmGmmDensity
 from priors.refiner.network import LstmRefiner, RefinerNetwork
-from priors.training.corpus import Corpus, Split
+from priors.training.corpus import Corpus
 
 _WARM_UP_FRAMES = 60  # frames of a clip that condition the density before it runs freely
 
@@ -35,9 +35,10 @@ class RefinerEvaluator:
     """Settings of the realism classifier."""
 
     @staticmethod
-    def of(raw: Corpus, parts: Split, settings: RealismSettings) -> "RefinerEvaluator":
-        """Against validation and test clips."""
-        clips = [c for part in (parts.validation, parts.test) for c in part.clips() if len(c) > settings.windows.frames]
+    def of(raw: Corpus, held: Corpus, settings: RealismSettings) -> "RefinerEvaluator":
+        """Against clips that training does not see: of those that a refiner is chosen by, or of those that are left to
+        measure the chosen one."""
+        clips = [clip for clip in held.clips() if len(clip) > settings.windows.frames]
         motions = [decode(clip, GroundPose.origin()) for clip in clips]
         windows = [cut_windows(canonical_positions(motion), settings.windows) for motion in motions]
         return RefinerEvaluator(torch.stack(raw.clips()), _average_measures(clips), windows, settings)

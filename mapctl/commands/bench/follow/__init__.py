@@ -12,6 +12,7 @@ from mapctl.commands.bench.output import print_rows
 from mapctl.commands.shared.progress_bar import show_progress
 from priors.lstm_gmm.density import LstmGmmDensity
 from priors.training.corpus import read_corpus
+from priors.training.mocap.cuts import CMU
 
 
 def run(table: Follow) -> int:
@@ -22,9 +23,16 @@ def run(table: Follow) -> int:
 
 
 def _read_database(data: Path, density: LstmGmmDensity) -> MotionDatabase:
-    """Read the clips that the density was trained on."""
+    """Read the clips that the density was trained on, as its training read them."""
     card, kept_out = density.card.data, {name for names in density.card.data["held_out"].values() for name in names}
     with TemporaryDirectory() as cache, show_progress("reading") as progress:
-        corpus = read_corpus(data, match=str(card.get("match") or ""), cache=Path(cache), progress=progress)
+        corpus = read_corpus(
+            data,
+            match=str(card.get("match") or ""),
+            cache=Path(cache),
+            cuts=CMU,
+            level="--level" in density.card.training.get("command", ""),
+            progress=progress,
+        )
     seen = corpus.subset(number for number, name in enumerate(corpus.names) if name not in kept_out)
     return MotionDatabase.of(seen.clips())

@@ -1,5 +1,6 @@
 """What every training of a refiner has in common: samples of a density to refine, and how refiners are judged."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -69,11 +70,17 @@ class SampleRecipe(Recipe[RefinerConfig, S, T]):
         return self.prior.card.data.get("split_seed", self.settings.seed)
 
     def draw_samples(self, parts: Split) -> tuple[Corpus, RefinerEvaluator]:
-        """Samples of the density to train on, and what measures a refiner by others."""
+        """Samples of the density to train on, and what chooses a refiner by others, beside the validation clips."""
+        raw, measured = self._sample(parts)
+        return raw, RefinerEvaluator.of(measured, parts.validation, self.realism)
+
+    def _sample(self, parts: Split) -> tuple[Corpus, Corpus]:
+        """Samples to train on, and others to measure."""
         generator, frames = torch.Generator().manual_seed(self.settings.seed), round(self.seconds * PRIOR_FPS)
-        raw = sample_corpus(self.prior, parts.train, self.samples, frames, generator)
-        measured = sample_corpus(self.prior, parts.train, self.judged, frames, generator)
-        return raw, RefinerEvaluator.of(measured, parts, self.realism)
+        first, second = (
+            sample_corpus(self.prior, parts.train, count, frames, generator) for count in (self.samples, self.judged)
+        )
+        return first, second
 
     def describe_data(self, corpus: Corpus) -> dict[str, str]:
         """What tells the data of this run from others'."""
@@ -89,14 +96,19 @@ class SampleRecipe(Recipe[RefinerConfig, S, T]):
         return compute_realism_gap(row)
 
     def export(self, trainer: T, gathered: Gathered, curve: Sequence[Row]) -> Export:
-        """Return the best refiner so far."""
+        """Return the best refiner so far, measured on the test clips, by which none was chosen."""
         data = {
             "density_config": self.prior.reference.config.as_card(),
             "samples": self.samples,
             **self.describe_data(gathered.corpus),
             **describe_selection(gathered.corpus),
         }
-        return Export(trainer.network.state_dict(), data, min(curve, key=compute_realism_gap))
+        best = min(curve, key=compute_realism_gap)
+        judge = RefinerEvaluator.of(self._sample(gathered.parts)[1], gathered.parts.test, self.realism)
+        # Feet that never touch the floor have no speed there, and a card holds no other numbers than finite ones.
+        test = {name: value if math.isfinite(value) else None for name, value in judge(trainer.network).items()}
+        quality = {self.counter: best[self.counter], "test": test}
+        return Export(trainer.network.state_dict(), data, quality)
 
     def format_begin(self) -> list[str]:
         """What a card's command begins with: the data and the density."""
