@@ -145,11 +145,11 @@ def list_bundled() -> list[str]:
 def locate(name: str) -> Path:
     """Locate the safetensors file of a bundled name, of a path, or of a training run's folder.
 
-    A bundled name is one of the set of weights in force, unless it says its set (see `weight_sets`); CheckpointError
-    where that set has no such model, though another one may.
+    A bundled name is one of the set of weights in force, unless it says its set (see `weight_sets`), whatever lies in
+    the current folder; CheckpointError where that set has no such model, though another one may.
     """
     path = Path(name)
-    if not weight_sets.names_set(name):
+    if not weight_sets.means_bundled(name):
         for candidate in (path, path / "model.safetensors", Path(f"{name}.safetensors")):
             if candidate.is_file() and candidate.suffix == ".safetensors":
                 return candidate
@@ -176,4 +176,4 @@ def _note_card(name: str, path: Path, card: Card) -> None:
     known = path.stem if weights == weight_sets.SETS[0] else f"{weights}/{path.stem}"
     if weights == "free":
         licences.check_free(known, card.licence, {"data": card.data, "training": card.training})
-    licences.note_licence(name if weights is None else known, card.licence)
+    licences.note_licence(name if weights is None else known, " ".join(card.licence.split()) or licences.NONE_TOLD)

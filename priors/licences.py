@@ -12,6 +12,8 @@ from priors import weight_sets
 
 FREE = ("free for any use", "CC0 1.0")
 """Licences of models of the free set: nothing is asked of who uses them."""
+NONE_TOLD = "no licence told"
+"""Of a model whose card leaves it out: like one that is not known, it is taken for stricter than all."""
 _BY_STRICTNESS = (*FREE, "CC BY 4.0", "CC BY-SA 4.0", "CC BY-NC 4.0", "CC BY-NC-SA 4.0")
 """Known licences, the strictest last. One that is not known is taken for stricter than all, since nobody can tell."""
 _ORIGINS = ("began_with", "init", "density", "refiner", "solved_by")
@@ -89,15 +91,24 @@ def check_free(name: str, licence: str, told: Mapping[str, Mapping[str, Any]]) -
         raise CheckpointError(f"{name} is not free, though it lies with the free weights: {fault}")
 
 
+def find_unfree(words: str) -> str | None:
+    """Find what says that something is not free in a text such as the path of a clip; None where nothing does."""
+    found = _NOT_FREE.search(words)
+    return None if found is None else found.group()
+
+
 def _find_fault(licence: str, told: Mapping[str, Mapping[str, Any]]) -> str | None:
     if licence not in FREE:
         return f"its licence is {licence!r}, allowed: {', '.join(FREE)}"
     for words in _list_texts(told):
-        if (found := _NOT_FREE.search(words)) is not None:
-            return f"its card names {found.group()!r} in {words[:60]!r}"
+        if (found := find_unfree(words)) is not None:
+            return f"its card names {found!r} in {words[:60]!r}"
     for line in told.get("data", {}).get("made", ()):  # as `mapctl make` lists them: who made clips, and its licence
         if not any(line.endswith(f"({free})") for free in FREE):
             return f"it was trained on clips of a model that is not free: {line}"
+    began = told.get("data", {}).get("init")
+    if isinstance(began, Mapping) and began.get("licence", FREE[0]) not in FREE:
+        return f"it began with {began.get('name')!r}, whose licence is {began['licence']!r}"
     for key, origin in _list_origins(told):
         if (fault := _find_origin_fault(origin)) is not None:
             return f"{key} is {origin!r}, {fault}"

@@ -75,10 +75,11 @@ def split_name(name: str) -> tuple[str, str]:
     return (weights, model) if slash and weights in SETS else (find_current_set(), name)
 
 
-def names_set(name: str) -> bool:
-    """Return whether a name says its set, and means a model of that set and no file or folder of that name."""
-    _weights, model = split_name(name)
-    return model != name and any(_find_model(each, model) for each in SETS)
+def means_bundled(name: str) -> bool:
+    """Return whether a name means a bundled model and no file or folder of that name: it says its set, or is that of a
+    model of the set in force. A folder of one's own is then `./locomotion`."""
+    weights, model = split_name(name)
+    return any(_find_model(each, model) for each in ((weights,) if model == name else SETS))
 
 
 def find_file(name: str) -> Path | None:
@@ -112,11 +113,12 @@ def add_set(name: str) -> str:
     set is in force there; other names, and paths, stay."""
     weights, model = split_name(name)
     bare = model == name and _find_model(weights, model) is not None
-    return f"{weights}/{name}" if bare and not _is_path(name) else name
+    return f"{weights}/{name}" if bare else name
 
 
-def _is_path(name: str) -> bool:
-    return Path(name).exists() or Path(f"{name}{_ENDING}").is_file()
+def write_path(path: Path) -> str:
+    """Write a path so that it never means a bundled model of its name."""
+    return f".{os.sep}{path}" if means_bundled(str(path)) else str(path)
 
 
 def explain_missing(name: str) -> CheckpointError:

@@ -132,7 +132,10 @@ def _format_cell(column: Column, row: Mapping[str, Any], rows: Sequence[Mapping[
         if not any(name in each for each in rows):
             known = ", ".join(dict.fromkeys(key for each in rows for key in each))
             raise ValueError(f"{record} has no column {name!r}; it has {known}")
-    return column.between.join(cell for name in column.names if (cell := format_value(row.get(name), column.style)))
+    cells = [format_value(row.get(name), column.style) for name in column.names]
+    while cells and not cells[-1]:
+        cells.pop()
+    return column.between.join(cell or "–" for cell in cells)  # or the second figure would be read as the first
 
 
 def format_value(value: object, style: str) -> str:

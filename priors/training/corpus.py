@@ -118,7 +118,7 @@ def split_corpus(corpus: Corpus, seed: int) -> Split:
     are held out.
 
     Of fewer than FEW clips none can be spared: the end of the longest is held out, a tenth of all frames and SHORTEST
-    at least, for validation and test alike. RequestError where a part has only clips too short to warm up on.
+    at least, for validation and test alike. RequestError for fewer than three clips long enough to warm up on.
     """
     numbers = range(len(corpus.names))
     captured = [number for number in numbers if corpus.names[number] not in corpus.made.clips] or list(numbers)
@@ -127,14 +127,27 @@ def split_corpus(corpus: Corpus, seed: int) -> Split:
         return _split_by_frames(corpus)
     order = torch.randperm(count, generator=torch.Generator().manual_seed(seed)).tolist()
     drawn, held = [captured[number] for number in order], max(1, round(0.05 * count))
-    parts = drawn[2 * held :] + made, drawn[:held], drawn[held : 2 * held]
-    for part in parts:
-        if (longest := max(corpus.lengths[i] for i in part)) < MIN_CLIP_FRAMES:
-            raise RequestError(
-                f"training and held-out clips must reach {MIN_CLIP_FRAMES} frames at {PRIOR_FPS} fps,"
-                f" got {longest} at most"
-            )
+    parts = [drawn[2 * held :], drawn[:held], drawn[held : 2 * held]]
+    _exchange_short(parts, corpus.lengths)
+    parts[0] += made
     return Split(*(corpus.subset(sorted(part)) for part in parts))
+
+
+def _exchange_short(parts: Sequence[list[int]], lengths: Sequence[int]) -> None:
+    """Where a part has only clips too short to warm up on, give it the first long one of a part that has several, in
+    exchange. RequestError for fewer long ones than parts."""
+    long = [[i for i in part if lengths[i] >= MIN_CLIP_FRAMES] for part in parts]
+    if sum(map(len, long)) < len(parts):
+        raise RequestError(
+            f"training, validation and test need a clip of {MIN_CLIP_FRAMES} frames at {PRIOR_FPS} fps each;"
+            f" {sum(map(len, long))} of {len(lengths)} clips are that long"
+        )
+    for part, own in zip(parts, long, strict=True):
+        if not own:
+            giver = max(range(len(parts)), key=lambda number: len(long[number]))
+            taken = long[giver].pop(0)
+            parts[giver][parts[giver].index(taken)] = part[0]
+            part[0] = taken
 
 
 def join_made(corpus: Corpus, other: Corpus) -> Corpus:

@@ -7,9 +7,11 @@ from pathlib import Path
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.formats.atomic import write_text
+from priors import checkpoints
 from priors.training.augmentation.splices import Splices, add_splices
 from priors.training.corpus import Corpus, SkippedFile, Split, join_made, keep_share, read_corpus, split_corpus
 from priors.training.mocap.made import require_made
+from priors.weight_sets import add_set, means_bundled
 
 Progress = Callable[[str], None]
 """Called with one line of news."""
@@ -118,3 +120,30 @@ def _describe_held_out(parts: Split) -> str:
     if parts.validation is not parts.test:
         return ""
     return f", without {parts.test.names[0]} (frames at {PRIOR_FPS} fps), which is held out"
+
+
+def find_split_seed(init: str | None, own: int, given: int | None = None) -> int:
+    """Find the seed by which clips were kept from the model that training begins with; `own` without one.
+
+    With another seed the run would train on what its measures hold out: RequestError where one is `given`.
+    """
+    if init is None:
+        return own if given is None else given
+    found = int(checkpoints.load(checkpoints.locate(init))[1].data.get("split_seed", own))
+    if given not in (None, found):
+        raise RequestError(f"{init} has clips kept from it by seed {found}: begin with it without --split-seed {given}")
+    return found
+
+
+def name_origin(init: str) -> str:
+    """Name the model that training begins with, for a card: a bundled one with its set; INIT where it is no other's."""
+    return add_set(init) if means_bundled(init) else "INIT"
+
+
+def describe_origin(init: str | None) -> dict[str, dict[str, str]]:
+    """For a card's data: the model that training began with, and its licence; nothing without one."""
+    if init is None:
+        return {}
+    card = checkpoints.read_card(checkpoints.locate(init).with_suffix(".json"))
+    name = add_set(init) if means_bundled(init) else Path(init).name
+    return {"init": {"name": name, "licence": card.licence}}

@@ -18,7 +18,7 @@ from priors.training.corpus import Corpus, Split
 from priors.training.devices import check_processes, refuse_gpu, select_device
 from priors.training.ending.course import VALIDATIONS, End, UntilFlat
 from priors.training.ending.flatness import Point
-from priors.training.gathering import DataSource, describe_selection
+from priors.training.gathering import DataSource, describe_origin, describe_selection, find_split_seed, name_origin
 from priors.training.trainer import GradientTrainer, Trainer
 
 Row = dict[str, Any]
@@ -123,7 +123,7 @@ class Recipe(ABC, Generic[C, S, T]):
     processes: int = 1
     """Processes that share the batch of each step: forked where there are several, unless torchrun has started them."""
     licence: str = "that of the training data"
-    """Licence of the weights, for the card."""
+    """Licence of the weights, for the card, one line."""
     skip_first: bool = False
     """Drop frame 0 of every clip (the T-pose of CMU takes)."""
     cuts: Path | None = None
@@ -203,6 +203,10 @@ class Recipe(ABC, Generic[C, S, T]):
     def split_seed(self) -> int:
         """Seed by which clips are kept from training."""
         return self.settings.seed if self.split is None else self.split
+
+    def describe_origin(self) -> Row:
+        """For a card's data: the model that training begins with, and its licence; nothing without one."""
+        return describe_origin(getattr(self, "init", None))
 
     def find_shape(self, trainer: T) -> C:
         """Return the configuration of the network that is trained."""
@@ -347,7 +351,7 @@ class NetworkRecipe(Recipe[C, S, G]):
     @property
     def split_seed(self) -> int:
         """That of the initial weights, where there are any."""
-        return find_split_seed(self.init, super().split_seed)
+        return find_split_seed(self.init, self.settings.seed, self.split)
 
     @abstractmethod
     def make_untaught(self, parts: Split) -> G:
@@ -374,19 +378,9 @@ class NetworkRecipe(Recipe[C, S, G]):
 
     def format_command(self) -> str:
         """What to type for the same run, for the card; options that are the defaults are left out."""
-        parts = ["--init INIT"] if self.init is not None else []
+        parts = [f"--init {name_origin(self.init)}"] if self.init is not None else []
         parts += ["--bfloat16"] * bool(getattr(self.settings, "bfloat16", False))
         return " ".join([super().format_command(), *parts])
-
-
-def find_split_seed(init: str | None, own: int) -> int:
-    """Find the seed by which clips were kept from the model that training begins with; `own` without one.
-
-    With another seed the run would train on what its measures hold out.
-    """
-    if init is None:
-        return own
-    return checkpoints.load(checkpoints.locate(init))[1].data.get("split_seed", own)
 
 
 def average_logarithms(values: Iterable[float | None]) -> float:

@@ -266,7 +266,7 @@ class TrainingRun(Generic[C, S, T]):
             kind=recipe.kind,
             config=recipe.find_shape(self.trainer).as_card(),
             licence=recipe.licence,
-            data={**made.data, "trained_on": self.gathered.describe_training()},
+            data={**made.data, **recipe.describe_origin(), "trained_on": self.gathered.describe_training()},
             training=training | ({"extended": self.extended} if self.extended else {}) | self.course.as_card(),
             quality=made.quality,
             abilities=made.abilities,
@@ -294,6 +294,7 @@ class TrainingRun(Generic[C, S, T]):
             "processes": self.recipe.processes,
             "device": self.device,
             "precision": find_precision(self.recipe.settings),
+            "licence": self.recipe.licence,
             "curve": self.curve,
             "losses": [_none_where_not_finite(row) for row in self.losses],
         }

@@ -95,6 +95,14 @@ def read_total_steps(run: Path) -> int | None:
         return None
 
 
+def read_licence(run: Path) -> str | None:
+    """Read the licence that the run of the folder's checkpoint was begun with; None where none is told."""
+    try:
+        return str(json.loads((run / _INDEX).read_text(encoding="utf-8"))["licence"])
+    except UNREADABLE_ERRORS:
+        return None
+
+
 def parse_curve(index: Mapping[str, Any], count: str) -> list[dict[str, Any]]:
     """The curve that an index holds; one of UNREADABLE_ERRORS unless every row says at what `count` it was measured."""
     return [{**row, count: int(row[count])} for row in index["curve"]]

@@ -2,14 +2,18 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
 from helpers import run, tiny_density, walk
 from tiny_prior import save_tiny_prior
 
+from controllers.benchmarks import generation
 from controllers.benchmarks.generation import continuations, list_variants, why
+from controllers.benchmarks.shared.bones import put_on_generated_bones
 from controllers.benchmarks.shared.held_out import NamedClip
+from controllers.benchmarks.shots import fulfilment
 from mapctl.errors import RequestError
 from mapctl.metrics.realism import REGIONS, ClassifierSettings, RealismSettings, train_judges
 from mapctl.metrics.realism.evidence.kinds import GAITS
@@ -63,6 +67,20 @@ def test_rounded_bones_are_no_cause_and_another_body_stays_itself(mocap, grown, 
     other = replace(clip, skeleton=replace(clip.skeleton, offsets=clip.skeleton.offsets * (1 + grown)))
     put = put_on_generated_bones(other)
     assert put.joint_positions().equal((clip if shared else other).joint_positions())
+
+
+@pytest.mark.parametrize("compare", ["generation", "shots"])
+def test_motion_is_compared_with_mocap_on_the_same_bones(mocap, monkeypatch, compare):
+    clips = [each.motion for each in mocap[:2]]
+    rounded = [replace(one, skeleton=replace(one.skeleton, offsets=one.skeleton.offsets * 1.0003)) for one in clips]
+    shown, found = [], SimpleNamespace(accuracy=0.5, floor_accuracy=0.5, frechet=0.0, floor_frechet=0.0)
+    module = generation if compare == "generation" else fulfilment
+    monkeypatch.setattr(module, "measure_realism", lambda made, real, **how: shown.extend(real) or found)
+    if compare == "generation":
+        generation._measure_realism(clips, rounded, generation.GenerationBenchmarkSettings())
+    else:
+        fulfilment._tell_apart(clips, rounded, 0)
+    assert [one.skeleton for one in shown] == [one.skeleton for one in clips]
 
 
 def run_bench(prior, *more):

@@ -158,11 +158,11 @@ def test_each_is_trained_by_the_command_of_the_table_with_folders_in_it(tmp_path
     out = tmp_path / "set"
     assert stage.words["path"] == shlex.split(
         f"mapctl train path --data {data} -o {out / 'path'} --cuts cmu --until-flat"
-        " --licence 'CC BY-NC 4.0' --minutes 30"
+        " --licence 'that of the training data' --minutes 30"
     )
     assert stage.words["tweener"] == shlex.split(
         f"mapctl train tweener --data {data} -o {out / 'tweener'} --cuts cmu --until-flat"
-        f" --path {out / 'path'} --licence 'CC BY-NC 4.0' --minutes 30"
+        f" --path {out / 'path'} --licence 'that of the training data' --minutes 30"
     )
     assert (out / "path" / "cache").resolve() == (out / "tweener" / "cache").resolve() == out / "cache"
 
@@ -353,7 +353,7 @@ def test_processes_train_and_the_set_is_there(tmp_path, train_all, capsys):
     card = checkpoints.read_card(tmp_path / "set" / "weights" / "path.json")
     assert "0.02 minutes were nearly up" in told
     assert card.training["command"].startswith("mapctl train path --data DATA -o RUN --cuts cmu --until-flat --decay-")
-    assert card.licence == "CC BY-NC 4.0"
+    assert card.licence == "that of the training data"
     assert 0 < card.training["ended"]["minutes"] < 0.2
     log = (tmp_path / "set" / "path" / "losses.csv").read_text()
     assert log.startswith("step,part,")

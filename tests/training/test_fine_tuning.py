@@ -41,7 +41,8 @@ def test_fine_tuning_begins_with_the_priors_weights_statistics_and_labels(tmp_pa
     for name, value in before.reference.state_dict().items():
         torch.testing.assert_close(after.reference.state_dict()[name], value, atol=2e-3, rtol=1e-3)
     assert torch.equal(after.feature_std, before.feature_std)
-    assert f"--init {first}" in after.card.training["command"]
+    assert "--init INIT" in after.card.training["command"]
+    assert after.card.data["init"] == {"name": first.name, "licence": before.card.licence}
 
 
 @pytest.mark.slow

@@ -334,7 +334,7 @@ def test_folders_that_cannot_be_trained_on_are_refused(tmp_path, data):
         train(request_in(tmp_path / "run", data, match="walk("))
     with pytest.raises(RequestError, match=r"75 frames at 30 fps, and 75 to hold out in the longest clip; got .* 80$"):
         train(request_in(tmp_path / "run", data, match="walk-0"))
-    with pytest.raises(RequestError, match="must reach 75 frames"):
+    with pytest.raises(RequestError, match="need a clip of 75 frames at 30 fps each; 0 of 5 clips"):
         train(request_in(tmp_path / "run", write_corpus(tmp_path / "short", frames=60)))
     with pytest.raises(RequestError, match="auto, cpu or cuda"):
         train(replace(request_in(tmp_path / "run", data), device="abacus"))

@@ -23,7 +23,7 @@ class Measure(ModelCommand):
     tells_licence: ClassVar[bool] = False
 
     clip: Positional[Annotated[Path, arg(metavar="CLIP|FOLDER")]]
-    """.bvh, .npz or .amc; or a folder, every one of them below it."""
+    """A motion in any format that mapctl reads; or a folder, every one below it."""
     reference: Annotated[Path | None, arg(metavar="CLIP|FOLDER")] = None
     """Another clip to print beside it; or for a folder another, unseen mocap say: adds realism and diversity."""
     curve: options.MaybeCurve = None

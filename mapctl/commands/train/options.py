@@ -2,6 +2,7 @@
 
 import math
 import os
+import re
 import shlex
 import signal
 from abc import ABC, abstractmethod
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
     from priors.training.ending.course import UntilFlat
     from priors.training.recipe import Recipe
 
+DATA_LICENCE = "that of the training data"
+"""Licence of weights for which none was told."""
 CURVES = "curves.png"
 """Of the plot in the run folder."""
 _COUNTS = ("width", "components", "steps", "batch", "window", "pairs", "processes")
@@ -66,8 +69,9 @@ class TrainOptions(ABC):
     """How much a kill may cost."""
     strict_data: bool = False
     """Refuse a folder with a file that cannot be used; if not given, such files are left out and listed."""
-    licence: Annotated[str, arg(metavar="TEXT")] = "that of the training data"
-    """Licence of the weights, for their card."""
+    licence: Annotated[str | None, arg(metavar="TEXT")] = None
+    """Licence of the weights, for their card; if not given, that of the run so far with --resume, else `that of the
+    training data`."""
     plot: bool = False
     """Draw the losses and validations so far as RUN/curves.png at each validation."""
     quiet: bool = False
@@ -88,7 +92,7 @@ class TrainOptions(ABC):
         return 0
 
     def _train(self) -> "Path":
-        recipe = self._keep_steps().recipe()
+        recipe = self._keep_told().recipe()
         from mapctl.commands.shared import outputs
 
         outputs.check_folder(self.out)
@@ -124,13 +128,14 @@ class TrainOptions(ABC):
             return exit_status.SIGNALLED + signal.SIGTERM
         return 0
 
-    def _keep_steps(self) -> "TrainOptions":
-        """A run that is resumed without --steps has as many as before."""
-        if not self.resume or self.steps is not None:
+    def _keep_told(self) -> "TrainOptions":
+        """A run that is resumed without --steps has as many as before, and without --licence the one that it had."""
+        if not self.resume:
             return self
-        from priors.training.run_files import read_total_steps
+        from priors.training.run_files import read_licence, read_total_steps
 
-        return replace(self, steps=read_total_steps(self.out))
+        steps = read_total_steps(self.out) if self.steps is None else self.steps
+        return replace(self, steps=steps, licence=read_licence(self.out) if self.licence is None else self.licence)
 
     def check(self) -> None:
         """RequestError for numbers that make no sense for any model."""
@@ -146,6 +151,7 @@ class TrainOptions(ABC):
         rate = getattr(self, "learning_rate", None)
         if rate is not None and not 0 < rate < 1:
             raise RequestError(f"the learning rate must lie between 0 and 1, got {rate:g}")
+        check_licence(self.licence)
         if not self.minutes_between_checkpoints > 0:
             raise RequestError(
                 f"minutes between checkpoints must be positive, got {self.minutes_between_checkpoints:g}"
@@ -168,7 +174,7 @@ class TrainOptions(ABC):
             "split": self.split_seed,
             "data_share": self.data_share,
             "minutes": self.minutes,
-            "licence": self.licence,
+            "licence": self.licence or DATA_LICENCE,
         }
 
     def select_given(self, *names: str, **renamed: str) -> dict[str, Any]:
@@ -253,8 +259,15 @@ class TunableOptions(NetworkOptions):
     def common(self) -> dict[str, Any]:
         """What every recipe takes, checked."""
         common = super().common()
+        if self.licence is None and self.init is not None:
+            common["licence"] = f"{DATA_LICENCE}; {self._read_licence(self.init)}"
         rule = self._make_rule() if self.until_flat else None
         return {**common, "device": self.device, "until_flat": rule}
+
+    def _read_licence(self, init: str) -> str:
+        from priors import checkpoints
+
+        return checkpoints.read_card(checkpoints.locate(init).with_suffix(".json")).licence
 
     def _make_rule(self) -> "UntilFlat":
         from priors.training.ending.course import UntilFlat
@@ -275,3 +288,17 @@ def check_share(share: float) -> None:
     """RequestError for a share of the clips that is not above 0 and at most 1."""
     if not 0 < share <= 1:
         raise RequestError(f"--data-share must be above 0 and at most 1, got {share:g}")
+
+
+def check_licence(licence: str | None) -> None:
+    """RequestError for a licence that is not one line of text: an empty one would leave the model out of every mark."""
+    if licence is not None and (not licence.strip() or len(licence.splitlines()) > 1):
+        raise RequestError(f"--licence must be one line of text, got {licence!r}")
+
+
+def check_pattern(match: str | None) -> None:
+    """RequestError for what is no regular expression."""
+    try:
+        re.compile(match or "")
+    except re.error as error:
+        raise RequestError(f"--match must be a regular expression, got {match!r} ({error})") from error

@@ -37,7 +37,9 @@ class WeightSet:
     """A set of models: its clips, the licence of its weights, and what depends on how much motion there is."""
 
     licence: str
-    """Of the weights."""
+    """Of the weights, if all of them have seen is the set's own clips."""
+    own: str
+    """Regular expression for the paths of these, by which alone they are known."""
     match: str = ""
     """Regular expression for the paths of all clips below the data folder."""
     locomotion: str = ""
@@ -75,6 +77,7 @@ class WeightSet:
 SETS: Mapping[str, WeightSet] = {
     "full": WeightSet(
         licence="CC BY-NC 4.0",
+        own=r"(^|/)dataset-[12]_|^cmu",
         locomotion="dataset-2_(walk|walk-turn-left|walk-turn-right|run)_",
         labels="_(?P<gait>run|walk|walk-turn-left|walk-turn-right)_(?P<style>[a-z]+)_",
         splices=3500,
@@ -82,6 +85,7 @@ SETS: Mapping[str, WeightSet] = {
     ),
     "free": WeightSet(
         licence="free for any use",
+        own=r"^cmu",
         match=r"^cmu(?!.*/(01_14|05_(0[568]|1[04-9])|07_12|09_10|14_36)\.)",  # faulty (docs/guides/data.md)
         locomotion=r"^cmu.*/(02_(0[1-36]|10)|05_01|06_(0\d|1[0-2])|07_(0\d|1[01])|08_\d\d|09_(0[1-69]|1[12])|10_0\d|11_01"
         r"|13_(0[7-9]|1[4-6]|26)|14_(0[45]|1[27-9]|37))\.",

@@ -18,12 +18,12 @@ from priors.training.augmentation.clip_copies import add_copies
 from priors.training.augmentation.splices import Splices, drop_splices, hide_splices
 from priors.training.corpus import Corpus, Split
 from priors.training.devices import make_generator, use_device
-from priors.training.gathering import DataSource, describe_selection
+from priors.training.gathering import DataSource, describe_selection, find_split_seed, name_origin
 from priors.training.initial_states import measure_data_limits, select_initial_states
 from priors.training.mocap.holdings import measure_holdings
 from priors.training.mocap.paces import follow_paces
 from priors.training.quality import density as density_quality
-from priors.training.recipe import Export, Gathered, Recipe, Row, average, find_split_seed
+from priors.training.recipe import Export, Gathered, Recipe, Row, average
 from priors.training.recipes.density.settings import PAPER, PLAIN, TrainingSettings
 from priors.training.recipes.density.trainer import DensityTrainer
 
@@ -127,7 +127,7 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
     @property
     def split_seed(self) -> int:
         """That of the initial weights, where there are any."""
-        return find_split_seed(self.init, super().split_seed)
+        return find_split_seed(self.init, self.settings.seed, self.split)
 
     def export(self, trainer: DensityTrainer, gathered: Gathered, curve: Sequence[Row]) -> Export:
         """The network with moments to start from, and what the data show to be possible."""
@@ -167,7 +167,7 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
         parts = [f"mapctl train lstm-gmm --data DATA -o RUN --match '{self.match or ''}'"]
         parts += [f"--labels '{self.labels}'"] if self.labels else []
         parts += ["--label-pace"] * self.label_pace
-        parts += [f"--init {self.init}"] if self.init else [f"--width {self.config.width}"]
+        parts += [f"--init {name_origin(self.init)}"] if self.init else [f"--width {self.config.width}"]
         mixed = self.init is None and self.config.components != config.components
         parts += [f"--components {self.config.components}"] if mixed else []
         parts += ["--made MADE"] if self.made else []

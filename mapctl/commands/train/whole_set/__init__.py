@@ -28,6 +28,9 @@ class TrainAll(Command):
     """Which set: of all clips (full), or of takes of the CMU database alone, with weights free for any use (free)."""
     match: Annotated[str | None, arg(metavar="REGEX")] = None
     """Clips of your own for the densities of walks and runs, by what their paths hold; those have no labels then."""
+    licence: Annotated[str | None, arg(metavar="TEXT")] = None
+    """Licence of the weights, for their cards; if not given, that of the set if all clips are the set's own, else `that
+    of the training data`."""
     made: options.MaybeDataFolder = None
     """Folder of clips that mapctl make has made, which the densities of walks and runs are trained on as well."""
     only: Annotated[str | None, arg(metavar="NAME,NAME")] = None

@@ -16,6 +16,7 @@ from mapctl.formats.atomic import write_text
 from priors.training import run_files
 from priors.training.bundled.models import DATA, MADE, RUN, BundledModel
 from priors.training.bundled.weights import is_finished
+from priors.weight_sets import write_path
 
 RECORD, LOCK, CACHE = "all.json", ".lock", "cache"
 
@@ -67,7 +68,7 @@ def _type(model: BundledModel, folders: Mapping[Path, Path | None], out: Path, m
     words = [named.get(word, word) for word in shlex.split(model.command)]
     for option, need in model.needs.items():
         at = words.index(option) if option in words else len(words)
-        words[at : at + 2] = [option, str(out / need)]
+        words[at : at + 2] = [option, write_path(out / need)]
     ends_anywhere = model.recipe.until_flat is not None or not model.recipe.falls
     limit = ("--minutes", f"{minutes:g}") if ends_anywhere else ()
     return (*words, "--licence", model.recipe.licence, *limit)

@@ -7,9 +7,10 @@ from pathlib import Path
 
 from mapctl.commands.shared import exit_status, options, outputs
 from mapctl.commands.shared.resumption import explain_end
-from mapctl.commands.train.options import check_share
+from mapctl.commands.train.options import check_licence, check_pattern, check_share
 from mapctl.commands.train.progress import print_line, warn
 from mapctl.commands.train.whole_set import TrainAll, data_scaling, summary
+from mapctl.commands.train.whole_set.licensing import license_models
 from mapctl.commands.train.whole_set.plan import Job, Record, lock_folder, make_jobs
 from mapctl.commands.train.whole_set.workers import Say, train_jobs
 from mapctl.errors import MapctlError, RequestError
@@ -26,11 +27,15 @@ def run(command: TrainAll) -> int:
     if command.check is not None:
         return _check(command.check, command.weights)
     if command.compare is not None:
+        if not 0 <= command.within < math.inf:
+            raise RequestError(f"--within must be at least 0, got {command.within:g}")
         return summary.print_comparison(*command.compare, percent=command.within)
     if command.by_motion is not None:
         return data_scaling.print_scaling(command.by_motion, command.out)
     options.check_seed(command.seed)
     check_share(command.data_share)
+    check_licence(command.licence)
+    check_pattern(command.match)
     models = list_models(
         command.weights,
         match=command.match,
@@ -53,6 +58,7 @@ def _train(command: TrainAll, chosen: Sequence[BundledModel]) -> int:
         raise RequestError(f"--jobs must be at least 1, got {command.jobs}")
     if not 0 < command.minutes < math.inf:
         raise RequestError(f"--minutes must be positive, got {command.minutes:g}")
+    chosen = license_models(command, chosen)
     if command.made is not None:
         _check_made(command.made, chosen[0].recipe.licence)
     jobs = make_jobs(chosen, command.data, command.out, command.minutes, made=command.made)
