@@ -12,6 +12,8 @@ from priors import weight_sets
 
 FREE = ("free for any use", "CC0 1.0")
 """Licences of models of the free set: nothing is asked of who uses them."""
+OF_DATA = "that of the training data"
+"""Licence of trained weights for which none was told."""
 NONE_TOLD = "no licence told"
 """Of a model whose card leaves it out: like one that is not known, it is taken for stricter than all."""
 _BY_STRICTNESS = (*FREE, "CC BY 4.0", "CC BY-SA 4.0", "CC BY-NC 4.0", "CC BY-NC-SA 4.0")

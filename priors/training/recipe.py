@@ -14,6 +14,7 @@ from mapctl.errors import CheckpointError, RequestError
 from mapctl.features import PRIOR_FPS
 from priors import checkpoints
 from priors.config import NetworkConfig, require_at_least
+from priors.licences import OF_DATA
 from priors.training.corpus import Corpus, Split
 from priors.training.devices import check_processes, refuse_gpu, select_device
 from priors.training.ending.course import VALIDATIONS, End, UntilFlat
@@ -122,7 +123,7 @@ class Recipe(ABC, Generic[C, S, T]):
     """Steps between two validations; until its curve is flat a run has its own."""
     processes: int = 1
     """Processes that share the batch of each step: forked where there are several, unless torchrun has started them."""
-    licence: str = "that of the training data"
+    licence: str = OF_DATA
     """Licence of the weights, for the card, one line."""
     skip_first: bool = False
     """Drop frame 0 of every clip (the T-pose of CMU takes)."""

@@ -12,10 +12,11 @@ from ended_models import MODELS
 
 import priors
 from mapctl import cli
-from mapctl.commands.train.options import DATA_LICENCE, TrainOptions
+from mapctl.commands.train.options import TrainOptions
 from mapctl.errors import CheckpointError, RequestError
 from priors import checkpoints
 from priors.checkpoints import Card
+from priors.licences import OF_DATA
 from priors.training.bundled.models import DATA, RECIPES, RUN, SETS, list_models
 from priors.training.bundled.weights import MOST_BYTES, copy_model, name_needs, read_finished
 from priors.training.mocap.cuts import CMU
@@ -36,7 +37,7 @@ def test_each_command_asks_for_the_recipe_of_the_table(weights, seed):
     for model in list_models(weights, seed=seed):
         given = cli.parse(shlex.split(model.command)[1:])
         assert isinstance(given, TrainOptions)
-        assert given.recipe() == replace(model.recipe, licence=DATA_LICENCE), model.name
+        assert given.recipe() == replace(model.recipe, licence=OF_DATA), model.name
 
 
 def test_all_that_is_bundled_is_in_it_after_what_it_needs():

@@ -9,7 +9,6 @@ from helpers import run, write_corpus
 
 import priors
 from mapctl import cli
-from mapctl.commands.train.options import DATA_LICENCE
 from mapctl.commands.train.whole_set.licensing import license_models
 from mapctl.errors import CheckpointError, RequestError
 from priors import checkpoints, licences, weight_sets
@@ -66,7 +65,7 @@ def test_a_model_whose_card_tells_no_licence_is_in_every_mark(tmp_path):
 
 @pytest.mark.slow
 def test_a_run_that_goes_on_keeps_its_licence(train_path):
-    assert train_path().licence == DATA_LICENCE
+    assert train_path().licence == licences.OF_DATA
     assert train_path("--licence", "CC0 1.0", out="own").licence == "CC0 1.0"
     words = ("--resume", "--steps", 2)
     assert train_path(*words, out="own").licence == "CC0 1.0"
@@ -84,7 +83,7 @@ def test_a_card_names_the_model_that_training_began_with(train_path, tmp_path, m
     tuned = train_path("--init", "path", "--learning-rate", 0.0001, out="tuned")
     assert tuned.data["init"] == {"name": "full/path", "licence": "mine alone"}
     assert "--init full/path" in tuned.training["command"]
-    assert tuned.licence == f"{DATA_LICENCE}; mine alone"
+    assert tuned.licence == f"{licences.OF_DATA}; mine alone"
     again = train_path("--init", tmp_path / "tuned", "--learning-rate", 0.0001, "--licence", "CC0 1.0", out="again")
     assert again.data["init"] == {"name": "tuned", "licence": tuned.licence}
     assert "--init INIT" in again.training["command"]
@@ -118,9 +117,9 @@ def test_a_folder_of_a_bundled_name_is_not_that_model(tmp_path, train_path, monk
     ("names", "words", "licence"),
     [
         (["cmu/02_01.bvh", "bandai-namco-2/data/dataset-2_walk_a_001.bvh"], [], "CC BY-NC 4.0"),
-        (["cmu/02_01.bvh", "mine/stroll.bvh"], [], DATA_LICENCE),
+        (["cmu/02_01.bvh", "mine/stroll.bvh"], [], licences.OF_DATA),
         (["cmu/02_01.bvh", "bandai-namco-2/data/dataset-2_walk_a_001.bvh"], ["--weights", "free"], "free for any use"),
-        (["cmu/02_01.bvh", "mine/stroll.bvh"], ["--weights", "free", "--match", "stroll"], DATA_LICENCE),
+        (["cmu/02_01.bvh", "mine/stroll.bvh"], ["--weights", "free", "--match", "stroll"], licences.OF_DATA),
         (["mine/stroll.bvh"], ["--match", "stroll", "--licence", "CC BY 4.0"], "CC BY 4.0"),
     ],
 )

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from priors.training.ending.course import UntilFlat
     from priors.training.recipe import Recipe
 
-DATA_LICENCE = "that of the training data"
-"""Licence of weights for which none was told."""
 CURVES = "curves.png"
 """Of the plot in the run folder."""
 _COUNTS = ("width", "components", "steps", "batch", "window", "pairs", "processes")
@@ -160,7 +158,7 @@ class TrainOptions(ABC):
     def common(self) -> dict[str, Any]:
         """What every recipe takes, checked."""
         self.check()
-        shared = self.select_given("processes")
+        shared = self.select_given("processes", "licence")
         return {
             **shared,
             "data": self.data,
@@ -174,7 +172,6 @@ class TrainOptions(ABC):
             "split": self.split_seed,
             "data_share": self.data_share,
             "minutes": self.minutes,
-            "licence": self.licence or DATA_LICENCE,
         }
 
     def select_given(self, *names: str, **renamed: str) -> dict[str, Any]:
@@ -260,14 +257,15 @@ class TunableOptions(NetworkOptions):
         """What every recipe takes, checked."""
         common = super().common()
         if self.licence is None and self.init is not None:
-            common["licence"] = f"{DATA_LICENCE}; {self._read_licence(self.init)}"
+            common["licence"] = self._describe_licence(self.init)
         rule = self._make_rule() if self.until_flat else None
         return {**common, "device": self.device, "until_flat": rule}
 
-    def _read_licence(self, init: str) -> str:
-        from priors import checkpoints
+    def _describe_licence(self, init: str) -> str:
+        from priors import checkpoints, licences
 
-        return checkpoints.read_card(checkpoints.locate(init).with_suffix(".json")).licence
+        card = checkpoints.read_card(checkpoints.locate(init).with_suffix(".json"))
+        return f"{licences.OF_DATA}; {card.licence}"
 
     def _make_rule(self) -> "UntilFlat":
         from priors.training.ending.course import UntilFlat

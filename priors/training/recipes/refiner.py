@@ -186,7 +186,7 @@ class AdversarialTrainer(Trainer[RefinerNetwork]):
         return {"refiner": refiner, "critic": critic, "told": told, "updates": updates}
 
     def validate(self, corpus: Corpus) -> Row:
-        """Measures of refined samples beside mocap's (see `RefinerEvaluator`, which has the clips)."""
+        """Measures of refined samples beside mocap's (see `RefinerEvaluator`, which holds validation clips)."""
         return self.evaluate(self.network)
 
     def state(self) -> dict[str, Tensor]:

@@ -5,10 +5,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from mapctl.commands.train.options import DATA_LICENCE
 from mapctl.commands.train.whole_set import TrainAll
 from mapctl.errors import RequestError
-from priors.licences import FREE, find_unfree
+from priors.licences import FREE, OF_DATA, find_unfree
 from priors.training.bundled.models import SETS, BundledModel, list_models
 
 
@@ -19,7 +18,7 @@ def license_models(command: TrainAll, models: Sequence[BundledModel]) -> list[Bu
     clips = _find_clips(command.data, list_models(command.weights, match=command.match))
     of_set = SETS[command.weights]
     own = all(re.search(of_set.own, clip) for clip in clips)
-    licence = command.licence or (of_set.licence if own else DATA_LICENCE)
+    licence = command.licence or (of_set.licence if own else OF_DATA)
     if licence in FREE:
         for clip in clips:
             if (told := find_unfree(clip)) is not None:

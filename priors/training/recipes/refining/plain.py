@@ -88,7 +88,7 @@ class PlainRefinerTrainer(GradientTrainer[RefinerNetwork]):
         return self.learning_rate
 
     def validate(self, corpus: Corpus) -> Row:
-        """Measures of refined samples beside mocap's (see `RefinerEvaluator`, which has the clips)."""
+        """Measures of refined samples beside mocap's (see `RefinerEvaluator`, which holds validation clips)."""
         row = {} if self.evaluate is None else self.evaluate(self.network)
         self.network.train()
         return row
