@@ -172,7 +172,7 @@ def _make_models(weights: WeightSet, made: Path | None) -> tuple[BundledModel, .
         StitcherRecipe(
             **everything,
             config=StitcherConfig(without=("d",)),
-            settings=StitcherSettings(steps=weights.plan(StitcherSettings.steps), bfloat16=True),
+            settings=StitcherSettings(steps=weights.plan(3000), batch=256, learning_rate=0.002, bfloat16=True),
         ),
     )
     return (
