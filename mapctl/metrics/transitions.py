@@ -49,7 +49,7 @@ def compute_npss(
     return float((distance * weight).sum() / weight.sum())
 
 
-def compute_displacement_errors(
+def compute_joint_distances(
     made: Float[Tensor, "windows frames joints 3"], truth: Float[Tensor, "windows frames joints 3"]
 ) -> tuple[float, float]:
     """Return the mean distance of joints from their true places over all frames (ADE), and in the last one; metres."""

@@ -22,8 +22,6 @@ from priors.training.mocap.clips import ClipReader
 from priors.training.mocap.cuts import find_cuts
 from priors.training.mocap.made import Made, find_made
 
-LOCOMOTION = r"dataset-2_(walk|walk-turn-left|walk-turn-right|run)_"
-"""Names of the clips that the bundled `locomotion` prior is trained on."""
 MIN_CLIPS_TO_SPLIT = 5
 """Clips under which parts of one clip are held out instead of whole clips."""
 MIN_CLIP_FRAMES = 75

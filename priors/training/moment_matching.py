@@ -20,7 +20,8 @@ from mapctl.terms.trial import Trial
 from priors.config import require_at_least
 from priors.lstm_gmm.network import LstmGmm
 
-_PAST_FRAMES = 3  # frames of context that a third difference reaches back
+PAST_FRAMES = 3
+"""Frames of context that a third difference reaches back."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,7 @@ class MatchingSettings:
     """Weight of the features' means over the second half of the runs: squared difference in standard deviations."""
 
     def __post_init__(self):
-        require_at_least(self, _PAST_FRAMES, "batch", "context", "frames")
+        require_at_least(self, PAST_FRAMES, "batch", "context", "frames")
         require_at_least(self, 1, "every")
 
 
@@ -64,16 +65,31 @@ def free_run_moment_loss(
     generator: torch.Generator,
     common: torch.Generator | None = None,
 ) -> Tensor:
-    """How far free runs are from how the windows go on; differentiable in the network's weights. `common` draws how
-    long they have run before, which processes that train together have in common; `generator` if None.
+    """How far free runs are from how the windows go on; differentiable in the network's weights (see `run_free`)."""
+    made, real = run_free(model, windows, settings, generator, common)
+    return moment_loss(made, real, settings)
+
+
+def run_free(
+    model: LstmGmm,
+    windows: Float[Tensor, "batch frames size"],
+    settings: MatchingSettings,
+    generator: torch.Generator,
+    common: torch.Generator | None = None,
+    *,
+    least: int = 0,
+) -> tuple[Float[Tensor, "runs made size"], Float[Tensor, "runs real size"]]:
+    """Free runs that begin with windows, of at least so many frames, and how the windows go on; each after the few
+    frames that differences take their past from. The runs are differentiable in the network's weights. `common` draws
+    how long they have run before, which processes that train together have in common; `generator` if None.
 
     RequestError for windows too short to hold both.
     """
     length = windows.shape[1]
     context = min(settings.context, length // 2)
     frames = min(settings.frames, length - context)
-    if context < _PAST_FRAMES:
-        raise RequestError(f"free runs are matched in windows of at least {2 * _PAST_FRAMES} frames, got {length}")
+    if context < PAST_FRAMES:
+        raise RequestError(f"free runs are matched in windows of at least {2 * PAST_FRAMES} frames, got {length}")
     windows = windows[: settings.batch]
     state = model.advance(model.start_after(windows[:, 0]), windows[:, 1:context])
     drawn = torch.randint(settings.wander + 1, (1,), generator=common or generator)
@@ -81,9 +97,9 @@ def free_run_moment_loss(
     if away > 0:
         wandered, state = model.sample(state, away, generator)
         past = torch.cat([past, wandered], 1)
-    made, _ = model.draw(state, frames, generator)
-    real = windows[:, context - _PAST_FRAMES : context + frames]
-    return moment_loss(torch.cat([past[:, -_PAST_FRAMES:], made], 1), real, settings)
+    made, _ = model.draw(state, max(frames, least), generator)
+    real = windows[:, context - PAST_FRAMES : context + frames]
+    return torch.cat([past[:, -PAST_FRAMES:], made], 1), real
 
 
 def moment_loss(
@@ -128,18 +144,18 @@ class _Moments:
         joints = trial.joints_world
         toes = joints[:, :, list(find_feet(CANONICAL))]
         steps = torch.diff(toes[..., ::2], dim=1).square().sum(-1) * trial.fps**2
-        held = (bits[:, 1:] & bits[:, :-1])[:, _PAST_FRAMES - 1 :].to(features.dtype)
+        held = (bits[:, 1:] & bits[:, :-1])[:, PAST_FRAMES - 1 :].to(features.dtype)
         lift = (toes[:, 1:, :, 1] - TOE_REST_HEIGHT).square()
         jerk = torch.sqrt(torch.diff(joints, n=3, dim=1).square().sum(-1) + 1e-12) * trial.fps**3
         return _Moments(
             feet=(
-                _masked_mean(held, steps[:, _PAST_FRAMES - 1 :]) + 1e-4,
-                _masked_mean(held, lift[:, _PAST_FRAMES - 1 :]) + 1e-5,
+                _masked_mean(held, steps[:, PAST_FRAMES - 1 :]) + 1e-4,
+                _masked_mean(held, lift[:, PAST_FRAMES - 1 :]) + 1e-5,
             ),
             jerk=jerk.mean((0, 1)) + 1.0,
-            pace=ground_speed(features[:, _PAST_FRAMES:]).mean(1) + 0.05,
-            spread=continuous[:, _PAST_FRAMES:].flatten(0, 1).std(0) + 1e-3,
-            change=torch.diff(continuous, dim=1)[:, _PAST_FRAMES - 1 :].abs().mean((0, 1)) + 1e-4,
+            pace=ground_speed(features[:, PAST_FRAMES:]).mean(1) + 0.05,
+            spread=continuous[:, PAST_FRAMES:].flatten(0, 1).std(0) + 1e-3,
+            change=torch.diff(continuous, dim=1)[:, PAST_FRAMES - 1 :].abs().mean((0, 1)) + 1e-4,
             late=continuous[:, continuous.shape[1] // 2 :].mean((0, 1)),
         )
 

@@ -70,12 +70,17 @@ class Trainer(ABC, Generic[Network]):
         return self.train_step()
 
     def differentiate(
-        self, loss: Tensor | None, weights: Iterable[nn.Parameter], told: Mapping[str, Tensor]
+        self,
+        loss: Tensor | None,
+        weights: Iterable[nn.Parameter],
+        told: Mapping[str, Tensor],
+        *,
+        retain_graph: bool = False,
     ) -> dict[str, float]:
         """Leave the loss' gradients in the weights, and return the numbers in `told`: means over the processes. A
-        process without a loss waits for those of the others."""
+        process without a loss waits for those of the others; a retained graph serves another loss as well."""
         if loss is not None:
-            loss.backward()
+            loss.backward(retain_graph=retain_graph)
         learnt = [weight for weight in weights if weight.requires_grad]
         values = self.group.average_gradients(learnt, [value.detach() for value in told.values()])
         return {name: float(value) for name, value in zip(told, values, strict=True)}

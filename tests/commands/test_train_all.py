@@ -288,10 +288,10 @@ def test_the_commands_are_printed(capsys):
         (("--data", "nowhere"), "nowhere is not a folder of BVH files"),
         (("--data", "empty"), "no .bvh below empty"),
         (("-o", "foreign"), "foreign is not empty, and was not begun by mapctl train all"),
-        (("--check", "empty"), "empty holds no set of models"),
-        (("--compare", "empty", "empty"), "empty holds no set of models"),
         (("--compare", "empty"), "--compare"),
         (("--check", "empty", "--commands"), "asked for one at a time"),
+        (("--check", "empty"), "--check and --compare print and write nothing: leave out -o"),
+        (("--compare", "one", "other"), "leave out -o"),
     ],
     ids=lambda value: "-".join(value) if isinstance(value, tuple) else "",
 )
@@ -300,6 +300,12 @@ def test_what_cannot_be_is_refused_in_one_line(fails, tmp_path, data, words, mes
     (tmp_path / "foreign").mkdir()
     (tmp_path / "foreign" / "notes.txt").write_text("mine")
     assert message in fails("train", "all", "--data", data, "-o", "new", *words)
+
+
+@pytest.mark.parametrize("words", [("--check", "empty"), ("--compare", "empty", "empty")])
+def test_a_folder_without_a_set_is_refused_in_one_line(fails, tmp_path, words):
+    (tmp_path / "empty").mkdir()
+    assert "empty holds no set of models" in fails("train", "all", *words)
 
 
 def test_folders_are_asked_for(fails):

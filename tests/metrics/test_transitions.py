@@ -99,7 +99,7 @@ def test_displacement_errors_of_a_shift():
     truth = torch.zeros(2, 5, 3, 3)
     made = truth.clone()
     made[:, -1, :, 0] = 0.1
-    mean, last = transitions.compute_displacement_errors(made, truth)
+    mean, last = transitions.compute_joint_distances(made, truth)
     assert (mean, last) == pytest.approx((0.02, 0.1))
 
 

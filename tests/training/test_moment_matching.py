@@ -117,8 +117,8 @@ def test_runs_that_wander_first_are_compared_all_the_same():
 def test_it_is_compared_every_so_many_steps():
     settings = TrainingSettings(steps=9, batch=4, window=12, matching=MatchingSettings(begin=0.0, every=4, batch=4))
     trainer, steps = DensityTrainer(LstmGmmConfig(width=8, components=1), settings, corpus()), []
-    match = trainer._add_moment_gradient
-    trainer._add_moment_gradient = lambda windows: (steps.append(trainer.step), match(windows))[1]
+    match = trainer._add_free_run_gradients
+    trainer._add_free_run_gradients = lambda windows: (steps.append(trainer.step), match(windows))[1]
     for _ in range(9):
         trainer.train_step()
     assert steps == [0, 4, 8]

@@ -228,6 +228,8 @@ def test_what_cannot_go_together_is_refused(tmp_path, data):
         (("path", "--split-seed", "-1"), "the seed must be"),
         (("lstm-gmm", "--until-flat", "--paper"), "--paper has a learning rate and a length of its own"),
         (("tweener", "--until-flat", "--critic-from", "4"), "a critic joins a run of a known length"),
+        (("lstm-gmm", "--until-flat", "--critic-steps", "4"), "a critic joins a run of a known length"),
+        (("lstm-gmm", "--steps", "8", "--critic-steps", "8"), "8 of them are not under the 8 of all"),
     ],
 )
 def test_on_the_command_line_in_one_line(fails, data, words, message):

@@ -86,7 +86,7 @@ def _measure(
         done = tween(window, keys, inbetweener, settings=InfillSettings(finish=finish)).motion
         inner = (slice(1, FRAMES), slice(None))
         errors.append(
-            transitions.compute_displacement_errors(
+            transitions.compute_joint_distances(
                 done.joint_positions()[None, *inner], window.joint_positions()[None, *inner]
             )[0]
         )

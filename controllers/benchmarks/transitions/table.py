@@ -168,7 +168,7 @@ def _compare(made: Sequence[Motion], gaps: Sequence[Gap], std: Tensor) -> Row:
             )
         )
     (positions, quats), (true_positions, true_quats) = sides
-    ade, last = transitions.compute_displacement_errors(positions, true_positions)
+    ade, last = transitions.compute_joint_distances(positions, true_positions)
     return {
         "ade_cm": 100 * ade,
         "last_cm": 100 * last,

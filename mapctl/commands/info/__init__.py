@@ -19,8 +19,9 @@ class Info(ModelCommand):
     single_thread: ClassVar[bool] = False
 
     name: Positional[Annotated[str | None, arg(metavar="NAME|CLIP")]] = None
-    """A prior whose whole card is printed, as JSON: bundled, a file, or a run folder. Or a clip (.bvh, .npz), of which
-    rig, joints, unit, axes and length are printed, and whether the fit is sure, doubtful or refused, with reasons."""
+    """A prior whose whole card is printed, as JSON: bundled, a file, or a run folder. Or a clip in
+    any format that `mapctl convert` reads, of which rig, joints, unit, axes and length are printed, and whether the fit
+    is sure, doubtful or refused, with reasons."""
     rig: options.MaybeRig = None
     """The clip's rig, where it is not the one that would be recognised."""
     out: Annotated[Path | None, arg(aliases=["-o"], metavar="FILE.png")] = None

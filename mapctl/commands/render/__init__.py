@@ -16,7 +16,7 @@ class Render(Command):
     single_thread: ClassVar[bool] = False
 
     source: options.InFile
-    """.bvh, .npz, or .amc with its .asf beside it."""
+    """.bvh, .npz, .recording, .amc with its .asf beside it, or a character's file (see `mapctl convert --help`)."""
     out: options.OutFile
     """.mp4, .gif, .webp or .png."""
     curve: options.MaybeCurve = None

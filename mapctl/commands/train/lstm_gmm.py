@@ -50,6 +50,9 @@ class TrainDensity(TunableOptions):
     thing sets off, stops or does another. Those that pass for mocap are trained on as well."""
     stitcher: options.MaybeName = None
     """Stitcher that makes them; the bundled one if not given."""
+    critic_steps: options.Count = 0
+    """Last steps in which a critic joins that tells a second of a free run from captured motion, and the density is
+    made to pass as well; what is kept is then the running mean of the weights."""
     standing_share: options.MaybeNumber = None
     """Share of the windows in which nobody goes anywhere that training sees, 1 by default: below it for motion that
     mostly stands, whose density stands fast otherwise."""
@@ -78,7 +81,13 @@ class TrainDensity(TunableOptions):
         return DensityRecipe(
             **common,
             config=replace(config, **shape),
-            settings=replace(settings, bfloat16=self.bfloat16, copies=copies, **given),
+            settings=replace(
+                settings,
+                bfloat16=self.bfloat16,
+                copies=copies,
+                critic=replace(settings.critic, steps=self.critic_steps),
+                **given,
+            ),
             skip_first=self.skip_first,
             made=self.made,
             splices=Splices(self.splices, self.stitcher or Splices.stitcher),

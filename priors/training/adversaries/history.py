@@ -24,3 +24,12 @@ class HistoryBuffer:
         mixed = torch.cat([fresh[: len(fresh) - half], self.windows[picked[:half]]])
         self.windows[picked[half : 2 * half]] = fresh[:half]
         return mixed
+
+    def keep(self, fresh: Float[Tensor, "batch frames features"], generator: torch.Generator) -> None:
+        """Put the fresh ones in the place of kept ones."""
+        picked = torch.randperm(len(self.windows), generator=generator)[: len(fresh)]
+        self.windows[picked] = fresh[: len(picked)]
+
+    def draw(self, count: int, generator: torch.Generator) -> Float[Tensor, "count frames features"]:
+        """Draw so many of the kept ones, any of them more than once."""
+        return self.windows[torch.randint(len(self.windows), (count,), generator=generator)]

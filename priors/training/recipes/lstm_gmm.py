@@ -62,6 +62,8 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
     def check(self) -> None:
         """Before anything is read."""
         super().check()
+        if self.settings.critic.steps and self.until_flat is not None:
+            raise RequestError("a critic joins a run of a known length: leave out --until-flat or --critic-steps")
         if self.splices.count:
             inbetweener.load(self.splices.stitcher)  # a wrong name shall not be told after all clips were read
 
@@ -107,7 +109,8 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
 
     def format_news(self, rows: Sequence[Row]) -> str:
         """One line on the losses of some steps."""
-        return f"{average(rows, 'loss'):.2f} nats"
+        news = f"{average(rows, 'loss'):.2f} nats"
+        return f"{news}, {average(rows, 'told'):.2f} told apart" if "told" in rows[-1] else news
 
     @classmethod
     def find_headline(cls, row: Row) -> float:
@@ -131,7 +134,7 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
 
     def export(self, trainer: DensityTrainer, gathered: Gathered, curve: Sequence[Row]) -> Export:
         """The network with moments to start from, and what the data show to be possible."""
-        model, corpus, parts = trainer.network.eval(), gathered.corpus, gathered.parts
+        model, corpus, parts = trainer.average.eval(), gathered.corpus, gathered.parts
         clips, seeded = drop_splices(parts.train), make_generator(self.settings.seed)
         known = labels.read(clips.names, self.labels)
         found = select_initial_states(model, clips, count=self.starts, generator=seeded, labels=known.held)
@@ -173,6 +176,8 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
         parts += ["--made MADE"] if self.made else []
         parts += self.format_reading() + ["--bfloat16"] * self.settings.bfloat16
         parts += self.format_changed(settings, "steps", "batch", "window", "learning_rate", "standing_share", "seed")
+        critic = self.settings.critic.steps
+        parts += [f"--critic-steps {critic}"] if critic else []
         parts += self.settings.copies.format_options() + self.splices.format_options()
         parts += self.format_processes() + self.format_ending()
         return " ".join(parts + option)

@@ -24,6 +24,8 @@ def run(command: TrainAll) -> int:
     told = (command.check, command.compare, command.by_motion)
     if command.commands + sum(each is not None for each in told) > 1:
         raise RequestError("--commands, --check, --compare and --by-motion are asked for one at a time")
+    if command.out is not None and (command.check is not None or command.compare is not None):
+        raise RequestError("--check and --compare print and write nothing: leave out -o")
     if command.check is not None:
         return _check(command.check, command.weights)
     if command.compare is not None:

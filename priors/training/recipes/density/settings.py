@@ -7,6 +7,7 @@ from priors.config import require_at_least
 from priors.lstm_gmm.network import LstmGmmConfig
 from priors.training.augmentation.clip_copies import ClipCopies
 from priors.training.moment_matching import MatchingSettings
+from priors.training.recipes.density.critic import CriticSettings
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,8 @@ class TrainingSettings:
     """Decoupled, for adam."""
     matching: MatchingSettings = field(default_factory=MatchingSettings)
     """Free runs held to the data's moments."""
+    critic: CriticSettings = field(default_factory=CriticSettings)
+    """Free runs judged by a critic."""
     untold: float = 0.5
     """Share of the windows without labels; the others show each group (gait, style) with probability 0.7."""
     bfloat16: bool = False
@@ -54,6 +57,13 @@ class TrainingSettings:
 
     def __post_init__(self):
         require_at_least(self, 1, "steps", "batch", "window")
+        if self.critic.steps >= self.steps:
+            raise RequestError(
+                f"a critic joins the last steps of a run: {self.critic.steps} of them are not under the {self.steps} of"
+                " all"
+            )
+        if self.critic.steps and self.window < self.critic.frames:
+            raise RequestError(f"the critic sees {self.critic.frames} frames; windows have {self.window}")
         if not 0 < self.standing_share <= 1:
             raise RequestError(f"the share of standing windows must be over 0 and at most 1: {self.standing_share:g}")
         for name, known in (("optimiser", ("adam", "rmsprop")), ("schedule", ("cosine", "epochs"))):

@@ -4,6 +4,7 @@ Windows of clips with noise on the inputs; loss is the negative log density of t
 comes from one generator whose state is in the checkpoint, so a resumed run continues bit for bit.
 """
 
+import copy
 import math
 from collections.abc import Mapping
 from dataclasses import replace
@@ -16,16 +17,20 @@ from torch.nn.functional import one_hot
 from priors.lstm_gmm.labels import Labels
 from priors.lstm_gmm.network import NOISE_UNIT, LstmGmm, LstmGmmConfig
 from priors.lstm_gmm.paces import PACE_LABELS
+from priors.training.adversaries.history import HistoryBuffer
 from priors.training.corpus import Corpus
 from priors.training.feature_statistics import compute_feature_statistics
-from priors.training.moment_matching import free_run_moment_loss
+from priors.training.moment_matching import moment_loss, run_free
+from priors.training.parallel import TrainingGroup
 from priors.training.quality import density as density_quality
+from priors.training.recipes.density.critic import FreeRunJudge
 from priors.training.recipes.density.settings import TrainingSettings
 from priors.training.trainer import GradientTrainer
 from priors.training.windows import FeatureWindows
 
 _KEEP_GROUP_PROBABILITY = 0.7
 _LEAST_RUNS = 4  # free runs that are compared: slow ones with slow ones, by quarters
+_UNTOLD = {"critic": 2 * math.log(2), "told": 0.5}  # of a critic that knows nothing
 
 
 class DensityTrainer(GradientTrainer[LstmGmm]):
@@ -59,10 +64,58 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
         self.clip_ends = torch.tensor(corpus.lengths).cumsum(0)
         self.windows = FeatureWindows(corpus, settings.window + 1, standing_share=settings.standing_share)
         self._latest = corpus.features[:0]  # windows of the step under way
+        self.judge: FreeRunJudge | None = None
+        self.average = self.network
+        """Moving average of the weights since the critic joined, the weights themselves without one: what is measured
+        and exported."""
+        if settings.critic.steps:
+            self.judge = FreeRunJudge(settings.critic, self.windows, mirror=settings.mirror, seed=settings.seed)
+            self.average = copy.deepcopy(self.network).requires_grad_(False)
 
     def networks(self) -> dict[str, nn.Module]:
         """All that is learnt, by its name in checkpoints."""
-        return {"model": self.network}
+        critic = {} if self.judge is None else {"average": self.average, "critic": self.judge.network}
+        return {"model": self.network, **critic}
+
+    def optimisers(self) -> dict[str, torch.optim.Optimizer]:
+        """One for each of the two that contend."""
+        return super().optimisers() | ({} if self.judge is None else {"critic-optimiser": self.judge.optimiser})
+
+    def join(self, group: TrainingGroup) -> None:
+        """Train as one of a group from here on, each with its part of what the critic has been shown."""
+        super().join(group)
+        if self.judge is not None and self.judge.history is not None:
+            self.judge.history = self.judge.history.split(group)
+
+    def state(self) -> dict[str, Tensor]:
+        """Everything that a bit-exact continuation needs, but the step."""
+        if self.judge is None or self.judge.history is None:
+            return super().state()
+        return super().state() | {"history": self.group.gather(self.judge.history.windows)}
+
+    def load_state(self, tensors: Mapping[str, Tensor], step: int) -> None:
+        """Go on from what `state` gave; KeyError or RuntimeError where it is not whole."""
+        super().load_state(tensors, step)
+        if self.judge is not None and "history" in tensors:
+            self.judge.history = HistoryBuffer(tensors["history"].to(self.windows.features.device))
+
+    def train_step(self) -> dict[str, float]:
+        """One update, and those of the critic where it has joined; `critic` is its loss, 1.39 where it knows nothing,
+        `told` the share of windows that it tells from mocap."""
+        if self.judge is not None and self._criticised == 0:
+            self._introduce(self.judge)
+        parts = super().train_step()
+        if self.judge is None:
+            return parts
+        if self.judge.history is None:
+            self.average.load_state_dict(self.network.state_dict())
+            return {**parts, **_UNTOLD}
+        parts |= self.judge.learn(self, self.settings.critic.updates)
+        keep = min(self.settings.critic.average, self._criticised / (self._criticised + 20))
+        with torch.no_grad():
+            for mean, weight in zip(self.average.parameters(), self.network.parameters(), strict=True):
+                mean.lerp_(weight, 1 - keep)
+        return parts
 
     def losses(self) -> dict[str, Tensor]:
         """Compute the losses of a newly drawn batch, nats a frame."""
@@ -76,10 +129,15 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
             nn.utils.clip_grad_value_(self.network.parameters(), settings.gradient_clip)
         else:
             nn.utils.clip_grad_norm_(self.network.parameters(), settings.gradient_clip)
+        if self.judge is not None and self._criticised >= 0:
+            if self._criticised % settings.critic.every == 0:
+                self._add_free_run_gradients(self._latest, self.judge)
+            return
         # Of a run of unknown length the last part is its decay.
-        is_late = self.decay is not None if self.steady else self.step >= matching.begin * self.first_steps
+        begin = matching.begin * (self.first_steps - settings.critic.steps)
+        is_late = self.decay is not None if self.steady else self.step >= begin
         if matching.begin < 1 and is_late and self.step % matching.every == 0:
-            self._add_moment_gradient(self._latest)
+            self._add_free_run_gradients(self._latest)
 
     def compute_learning_rate(self) -> float:
         """At the current step."""
@@ -87,10 +145,14 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
         if settings.schedule == "epochs":
             passes = self.step * settings.batch * settings.window // max(1, len(self.windows.features))
             return settings.learning_rate * 0.95**passes
+        if self.judge is not None and self._criticised >= 0:
+            with_critic = self.steps - self.first_steps + settings.critic.steps
+            return settings.critic.compute_learning_rate(self._criticised, with_critic)
         warm = min(1.0, (self.step + 1) / 200)
         if self.steady:
             return warm * settings.learning_rate * self.find_fall()
-        return warm * settings.learning_rate * 0.5 * (1 + math.cos(math.pi * min(1.0, self.step / self.steps)))
+        steps = self.steps - settings.critic.steps
+        return warm * settings.learning_rate * 0.5 * (1 + math.cos(math.pi * min(1.0, self.step / steps)))
 
     def make_optimisers(self) -> dict[str, torch.optim.Optimizer]:
         """The recipe's own."""
@@ -102,22 +164,54 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
 
     def validate(self, corpus: Corpus) -> dict[str, float]:
         """Likelihood and the health of free runs: likelihood does not predict stability."""
-        self.network.eval()
-        row = {"validation_nats": density_quality.compute_validation_nats(self.network, corpus)}
-        row |= density_quality.measure_free_runs(self.network, corpus)
-        self.network.train()
+        self.average.eval()
+        row = {"validation_nats": density_quality.compute_validation_nats(self.average, corpus)}
+        row |= density_quality.measure_free_runs(self.average, corpus)
+        self.average.train()
         return row
 
-    def _add_moment_gradient(self, windows: Tensor) -> None:
-        """Add the gradient of the free runs' mismatch, clipped on its own: neither loss drowns the other."""
+    @property
+    def _criticised(self) -> int:
+        """Steps since the critic joined; below 0 before."""
+        return self.step - self.first_steps + self.settings.critic.steps
+
+    @torch.no_grad()
+    def _introduce(self, judge: FreeRunJudge) -> None:
+        """Show the critic what the density makes, and let it learn, before the density hears it."""
+        settings = self.settings.critic
+        self.average.load_state_dict(self.network.state_dict())
+        made, count = [], self.group.share(settings.history)
+        while sum(map(len, made)) < count:
+            made.append(self._run_free(self._draw_windows()[0])[0])
+        judge.fill(torch.cat(made)[:count])
+        with torch.enable_grad():
+            judge.learn(self, settings.head_start)
+
+    def _run_free(self, windows: Tensor) -> tuple[Tensor, Tensor]:
+        """Free runs after the first windows, and how these go on."""
+        matching = self.settings.matching
+        matching = replace(matching, batch=max(_LEAST_RUNS, self.group.share(matching.batch)))
+        least = self.settings.critic.frames if self.judge is not None else 0
+        return run_free(self.network, windows, matching, self.generator, self.common, least=least)
+
+    def _add_free_run_gradients(self, windows: Tensor, judge: FreeRunJudge | None = None) -> None:
+        """Add the gradient of the free runs' mismatch, and that of what the critic says of them where it has joined,
+        each clipped on its own: no loss drowns another."""
+        made, real = self._run_free(windows)
+        moments = moment_loss(made[:, : real.shape[1]], real, self.settings.matching)
+        if judge is None:
+            self._add_gradient(moments)
+            return
+        judge.keep(made, self.generator)
+        self._add_gradient(moments, retain_graph=True)
+        self._add_gradient(judge.hear(made))
+
+    def _add_gradient(self, loss: Tensor, *, retain_graph: bool = False) -> None:
         parameters = [p for p in self.network.parameters() if p.requires_grad]
         before = [p.grad for p in parameters]
         for parameter in parameters:
             parameter.grad = None
-        matching = self.settings.matching
-        matching = replace(matching, batch=max(_LEAST_RUNS, self.group.share(matching.batch)))
-        loss = free_run_moment_loss(self.network, windows, matching, self.generator, self.common)
-        self.differentiate(loss, parameters, {})
+        self.differentiate(loss, parameters, {}, retain_graph=retain_graph)
         found = [p.grad for p in parameters]
         norm = torch.linalg.vector_norm(torch.stack([torch.linalg.vector_norm(g) for g in found if g is not None]))
         share = self.settings.gradient_clip / norm.clamp(min=self.settings.gradient_clip)

@@ -1,0 +1,158 @@
+"""A critic of the density's free runs: what it sees, what the density learns of it, and runs that resume to the bit."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers import corpus, generator, tiny_model
+
+from mapctl.errors import RequestError
+from mapctl.features import LAYOUT
+from mapctl.skeleton import CANONICAL
+from mapctl.terms.trial import Trial
+from priors.lstm_gmm.network import LstmGmmConfig
+from priors.training.adversaries import free_runs
+from priors.training.adversaries.history import HistoryBuffer
+from priors.training.moment_matching import MatchingSettings, run_free
+from priors.training.recipes.density.critic import CriticSettings
+from priors.training.recipes.density.settings import TrainingSettings
+from priors.training.recipes.density.trainer import DensityTrainer
+
+CRITIC = CriticSettings(steps=3, frames=8, head_start=2, batch=4, history=8, every=1)
+SETTINGS = TrainingSettings(steps=5, batch=4, window=20, critic=CRITIC, matching=MatchingSettings(wander=4, batch=4))
+
+
+def make_trainer(settings: TrainingSettings = SETTINGS) -> DensityTrainer:
+    return DensityTrainer(LstmGmmConfig(width=8, components=1), settings, corpus())
+
+
+def windows(frames: int = 12) -> torch.Tensor:
+    return torch.stack([clip[10 : 10 + frames] for clip in corpus().clips()])
+
+
+def test_it_sees_joints_about_the_hips_their_velocities_and_the_hips_where_the_window_began():
+    features = windows()
+    rows, joints = free_runs.show(features), Trial.of_features(features).joints_world
+    about, velocity, hips = rows.split([3 * CANONICAL.num_joints, 3 * CANONICAL.num_joints, 3], dim=-1)
+    assert rows.shape[1] == features.shape[1] - 1
+    reach = (joints - joints[:, :, :1] * torch.tensor([1.0, 0.0, 1.0]))[:, 1:].norm(dim=-1)
+    torch.testing.assert_close(about.unflatten(-1, (-1, 3)).norm(dim=-1), reach)
+    speed = 30 * torch.diff(joints, dim=1).norm(dim=-1)
+    torch.testing.assert_close(velocity.unflatten(-1, (-1, 3)).norm(dim=-1), speed, atol=1e-4, rtol=1e-4)
+    travelled = (joints[:, 1:, 0, ::2] - joints[:, :1, 0, ::2]).norm(dim=-1)
+    torch.testing.assert_close(hips[..., ::2].norm(dim=-1), travelled)
+    # Forwards is forwards, wherever the character faces.
+    steps = LAYOUT.pick(features, "root_displacement_heading")  # each in the heading of the frame before it
+    torch.testing.assert_close(hips[:, 0, ::2], steps[:, 1], atol=1e-6, rtol=1e-4)
+
+
+def test_it_learns_to_tell_two_kinds_of_windows_apart_and_its_slope_is_bounded():
+    real, made = (free_runs.show(windows(9) * scale) for scale in (1.0, 0.6))
+    critic = free_runs.FreeRunCritic(real)
+    optimiser = torch.optim.Adam(critic.parameters(), 1e-3)
+    first = free_runs.compute_critic_loss(critic(real), critic(made))
+    assert float(first.detach()) == pytest.approx(1.386, abs=0.2)
+    for _ in range(40):
+        optimiser.zero_grad()
+        loss = free_runs.compute_critic_loss(critic(real), critic(made))
+        loss.backward()
+        optimiser.step()
+    assert float(loss.detach()) < 0.5
+    slope = free_runs.compute_gradient_penalty(critic, real).detach()
+    at = critic.standardise(real)
+    way = torch.randn(at.shape, generator=generator())
+    way = 1e-3 * way / way.flatten(1).norm(dim=1)[:, None, None]
+    moved = (critic.judge(at + way) - critic.judge(at - way)).abs() / 2e-3
+    assert float(moved.detach().square().mean()) <= float(slope) * 1.01
+
+
+def test_the_history_forgets_what_is_replaced_and_draws_what_is_kept():
+    history = HistoryBuffer(torch.zeros(6, 1, 1))
+    history.keep(torch.ones(4, 1, 1), generator())
+    assert float(history.windows.sum()) == 4
+    assert {*history.draw(64, generator()).flatten().tolist()} == {0.0, 1.0}
+
+
+def test_free_runs_are_as_long_as_the_critic_needs_and_begin_with_mocap():
+    found = run_free(tiny_model(), windows(16), MatchingSettings(wander=0, frames=4), generator(), least=9)
+    assert [each.shape[1] for each in found] == [12, 7]
+    torch.testing.assert_close(found[0][:, :3], found[1][:, :3])
+
+
+def test_the_density_hears_it_in_the_last_steps_only(monkeypatch):
+    trainer, heard = make_trainer(), []
+    hear = trainer.judge.hear
+    monkeypatch.setattr(trainer.judge, "hear", lambda made: (heard.append(trainer.step), hear(made))[1])
+    rows = [trainer.take_step() for _ in range(5)]
+    assert heard == [2, 3, 4]
+    assert [row["critic"] for row in rows[:2]] == pytest.approx([1.386, 1.386], abs=1e-3)
+    assert all(row["critic"] != rows[0]["critic"] for row in rows[2:])
+
+
+def test_its_gradient_is_what_would_make_free_runs_pass():
+    trainer = make_trainer()
+    while trainer.step < 2:
+        trainer.take_step()
+    trainer._introduce(trainer.judge)
+    state = trainer.generator.get_state()
+
+    def loss() -> torch.Tensor:
+        trainer.generator.set_state(state)
+        return trainer.judge.hear(trainer._run_free(windows(21))[0])
+
+    before = loss()
+    trainer.network.zero_grad()
+    trainer._add_gradient(before)
+    with torch.no_grad():
+        for weight in trainer.network.parameters():
+            if weight.grad is not None:
+                weight -= 1e-4 * weight.grad
+    assert float(loss().detach()) < float(before.detach())
+
+
+def test_a_run_with_it_goes_on_to_the_bit():
+    whole = make_trainer()
+    for _ in range(4):
+        whole.take_step()
+    begun = make_trainer()
+    for _ in range(3):
+        begun.take_step()
+    resumed = make_trainer()
+    resumed.load_state({name: values.clone() for name, values in begun.state().items()}, 3)
+    assert resumed.take_step() == pytest.approx(begun.take_step(), rel=0, abs=0)
+    for name, values in whole.state().items():
+        assert torch.equal(values, resumed.state()[name]), name
+
+
+def test_what_is_kept_is_the_mean_of_the_weights_since_it_joined():
+    trainer = make_trainer()
+    for _ in range(2):
+        trainer.take_step()
+        assert all(map(torch.equal, trainer.average.parameters(), trainer.network.parameters()))
+    for _ in range(3):
+        trainer.take_step()
+    assert trainer.average is not trainer.network
+    assert not all(map(torch.equal, trainer.average.parameters(), trainer.network.parameters()))
+    row = trainer.validate(corpus())
+    trainer.network.load_state_dict(trainer.average.state_dict())
+    assert trainer.validate(corpus()) == row
+
+
+def test_the_learning_rate_rises_anew_and_falls_to_nothing():
+    settings = replace(SETTINGS, steps=1100, critic=replace(CRITIC, steps=100))
+    trainer, rates = make_trainer(settings), []
+    for trainer.step in (0, 500, 999, 1000, 1019, 1060, 1099):
+        rates.append(trainer.compute_learning_rate())
+    assert rates[1] > rates[2] < 1e-7
+    assert rates[4] == rates[5] == pytest.approx(3e-4)
+    assert rates[3] < 0.1 * rates[4]
+    assert rates[6] < 0.05 * rates[4]
+
+
+@pytest.mark.parametrize(
+    ("steps", "window", "message"),
+    [(5, 20, "5 of them are not under the 5"), (3, 6, "the critic sees 8 frames; windows have 6")],
+)
+def test_a_critic_that_cannot_join_is_refused(steps, window, message):
+    with pytest.raises(RequestError, match=message):
+        replace(SETTINGS, window=window, critic=replace(CRITIC, steps=steps))
