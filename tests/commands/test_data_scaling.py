@@ -89,3 +89,9 @@ def test_a_plot_for_each_model(tmp_path):
     plot_scaling([one], tmp_path / "one.png")
     plot_scaling([one, one], tmp_path / "two.png")
     assert (tmp_path / "two.png").stat().st_size > (tmp_path / "one.png").stat().st_size
+
+
+@pytest.mark.parametrize("words", [("--check", "empty"), ("--compare", "empty", "empty")])
+def test_a_folder_without_a_set_is_refused_in_one_line(fails, tmp_path, words):
+    (tmp_path / "empty").mkdir()
+    assert "empty holds no set of models" in fails("train", "all", *words)

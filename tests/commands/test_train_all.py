@@ -302,12 +302,6 @@ def test_what_cannot_be_is_refused_in_one_line(fails, tmp_path, data, words, mes
     assert message in fails("train", "all", "--data", data, "-o", "new", *words)
 
 
-@pytest.mark.parametrize("words", [("--check", "empty"), ("--compare", "empty", "empty")])
-def test_a_folder_without_a_set_is_refused_in_one_line(fails, tmp_path, words):
-    (tmp_path / "empty").mkdir()
-    assert "empty holds no set of models" in fails("train", "all", *words)
-
-
 def test_folders_are_asked_for(fails):
     assert "train all needs --data DATA and -o OUT" in fails("train", "all")
 
