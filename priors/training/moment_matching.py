@@ -58,18 +58,6 @@ class MatchingSettings:
         require_at_least(self, 1, "every")
 
 
-def free_run_moment_loss(
-    model: LstmGmm,
-    windows: Float[Tensor, "batch frames size"],
-    settings: MatchingSettings,
-    generator: torch.Generator,
-    common: torch.Generator | None = None,
-) -> Tensor:
-    """How far free runs are from how the windows go on; differentiable in the network's weights (see `run_free`)."""
-    made, real = run_free(model, windows, settings, generator, common)
-    return moment_loss(made, real, settings)
-
-
 def run_free(
     model: LstmGmm,
     windows: Float[Tensor, "batch frames size"],

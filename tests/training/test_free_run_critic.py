@@ -82,7 +82,7 @@ def test_free_runs_are_as_long_as_the_critic_needs_and_begin_with_mocap():
 def test_the_density_hears_it_in_the_last_steps_only(monkeypatch):
     trainer, heard = make_trainer(), []
     hear = trainer.judge.hear
-    monkeypatch.setattr(trainer.judge, "hear", lambda made: (heard.append(trainer.step), hear(made))[1])
+    monkeypatch.setattr(trainer.judge, "hear", lambda *run: (heard.append(trainer.step), hear(*run))[1])
     rows = [trainer.take_step() for _ in range(5)]
     assert heard == [2, 3, 4]
     assert [row["critic"] for row in rows[:2]] == pytest.approx([1.386, 1.386], abs=1e-3)
@@ -98,7 +98,7 @@ def test_its_gradient_is_what_would_make_free_runs_pass():
 
     def loss() -> torch.Tensor:
         trainer.generator.set_state(state)
-        return trainer.judge.hear(trainer._run_free(windows(21))[0])
+        return trainer.judge.hear(trainer._run_free(windows(21))[0], generator())
 
     before = loss()
     trainer.network.zero_grad()
@@ -156,3 +156,10 @@ def test_the_learning_rate_rises_anew_and_falls_to_nothing():
 def test_a_critic_that_cannot_join_is_refused(steps, window, message):
     with pytest.raises(RequestError, match=message):
         replace(SETTINGS, window=window, critic=replace(CRITIC, steps=steps))
+
+
+def test_it_joins_a_density_that_is_held_to_no_moments(monkeypatch):
+    monkeypatch.setattr("priors.training.recipes.density.trainer.moment_loss", None)
+    trainer = make_trainer(replace(SETTINGS, matching=replace(SETTINGS.matching, begin=1.0)))
+    rows = [trainer.take_step() for _ in range(3)]
+    assert rows[2]["critic"] != rows[1]["critic"]

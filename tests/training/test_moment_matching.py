@@ -7,11 +7,15 @@ from helpers import corpus, finite_difference, generator, tiny_model
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT
 from priors.lstm_gmm.network import LstmGmmConfig
-from priors.training.moment_matching import MatchingSettings, free_run_moment_loss, moment_loss
+from priors.training.moment_matching import MatchingSettings, moment_loss, run_free
 from priors.training.recipes.density.settings import TrainingSettings
 from priors.training.recipes.density.trainer import DensityTrainer
 
 SETTINGS = MatchingSettings(batch=8, context=10, wander=0, frames=10)
+
+
+def free_run_moment_loss(model, windows, settings, generator) -> torch.Tensor:
+    return moment_loss(*run_free(model, windows, settings, generator), settings)
 
 
 def windows(frames: int = 24) -> torch.Tensor:

@@ -1,8 +1,9 @@
 """The density's critic: convolutions over a second of a body's motion, seen from where it began.
 
 Ours. It sees what the network by which `mapctl measure` tells made motion from mocap does: positions and velocities in
-the ground frame of the first frame. Shown feet that hardly move magnified, as other critics are, it wins at once (97 %
-told apart after 500 steps) by the noise of single frames, which a mixture draws and no weights take away.
+the ground frame of the first frame. Feet that hardly move are not
+magnified, as for other critics: by the noise of their single frames, which a mixture draws and no weights take away, it
+wins at once.
 """
 
 import torch

@@ -76,24 +76,22 @@ class FreeRunJudge:
     def __init__(self, settings: CriticSettings, windows: FeatureWindows, *, mirror: bool, seed: int):
         """`windows` are of captured motion, and longer than what it sees."""
         self.settings, self.windows, self.mirror = settings, windows, mirror
-        seeded = torch.Generator(windows.features.device).manual_seed(seed)
-        shown = show(windows.draw(_MEASURED, seeded, mirror=mirror).features[:, : settings.frames + 1])
+        shown = self._show_captured(_MEASURED, torch.Generator(windows.features.device).manual_seed(seed))
         self.network = draw_weights(lambda: FreeRunCritic(shown.cpu()), seed).to(torch.get_default_device())
         self.optimiser = torch.optim.Adam(self.network.parameters(), lr=settings.rate, betas=(0.5, 0.99))
         self.history: HistoryBuffer | None = None
 
     def fill(self, made: Float[Tensor, "history frames size"]) -> None:
         """Begin to keep free runs for the critic to learn from, with these."""
-        self.history = HistoryBuffer(self._cut(made))
+        self.history = HistoryBuffer(self._show_end(made))
 
-    def keep(self, made: Float[Tensor, "batch frames size"], generator: torch.Generator) -> None:
-        """Keep these free runs in the place of earlier ones."""
+    def hear(self, made: Float[Tensor, "batch frames size"], generator: torch.Generator) -> Tensor:
+        """Return what the density wants to make smaller, whose gradient goes into what made the motion; and keep the
+        free runs in the place of earlier ones."""
         assert self.history is not None
-        self.history.keep(self._cut(made.detach()), generator)
-
-    def hear(self, made: Float[Tensor, "batch frames size"]) -> Tensor:
-        """Return what the density wants to make smaller; its gradient goes into what made the motion."""
-        return self.settings.weight * compute_generator_loss(self.network(self._cut(made)))
+        shown = self._show_end(made)
+        self.history.keep(shown.detach(), generator)
+        return self.settings.weight * compute_generator_loss(self.network(shown))
 
     def learn(self, trainer: Trainer[Any], updates: int) -> dict[str, float]:
         """Take updates on captured motion and what is kept; the mean loss (1.39 where nothing is known), and the mean
@@ -104,7 +102,7 @@ class FreeRunJudge:
     def _update(self, trainer: Trainer[Any]) -> dict[str, float]:
         assert self.history is not None
         count, generator = trainer.group.share(self.settings.batch), trainer.generator
-        real = self._cut(self.windows.draw(count, generator, mirror=self.mirror).features, last=False)
+        real = self._show_captured(count, generator)
         for_real, for_made = self.network(real), self.network(self.history.draw(count, generator))
         loss = compute_critic_loss(for_real, for_made)
         total = loss + self.settings.penalty * compute_gradient_penalty(self.network, real)
@@ -117,7 +115,9 @@ class FreeRunJudge:
         self.optimiser.step()
         return means
 
-    def _cut(self, features: Tensor, *, last: bool = True) -> Float[Tensor, "batch seen rows"]:
-        """Show the last frames of motion, or the first."""
-        seen = self.settings.frames + 1
-        return show(features[:, -seen:] if last else features[:, :seen])
+    def _show_captured(self, count: int, generator: torch.Generator) -> Float[Tensor, "count seen rows"]:
+        return show(self.windows.draw(count, generator, mirror=self.mirror).features[:, : self.settings.frames + 1])
+
+    def _show_end(self, made: Float[Tensor, "batch frames size"]) -> Float[Tensor, "batch seen rows"]:
+        """Show the last frames of free runs: they are farthest from mocap."""
+        return show(made[:, -self.settings.frames - 1 :])

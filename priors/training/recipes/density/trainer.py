@@ -129,9 +129,9 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
             nn.utils.clip_grad_value_(self.network.parameters(), settings.gradient_clip)
         else:
             nn.utils.clip_grad_norm_(self.network.parameters(), settings.gradient_clip)
-        if self.judge is not None and self._criticised >= 0:
+        if self._joined is not None:
             if self._criticised % settings.critic.every == 0:
-                self._add_free_run_gradients(self._latest, self.judge)
+                self._add_free_run_gradients(self._latest)
             return
         # Of a run of unknown length the last part is its decay.
         begin = matching.begin * (self.first_steps - settings.critic.steps)
@@ -145,7 +145,7 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
         if settings.schedule == "epochs":
             passes = self.step * settings.batch * settings.window // max(1, len(self.windows.features))
             return settings.learning_rate * 0.95**passes
-        if self.judge is not None and self._criticised >= 0:
+        if self._joined is not None:
             with_critic = self.steps - self.first_steps + settings.critic.steps
             return settings.critic.compute_learning_rate(self._criticised, with_critic)
         warm = min(1.0, (self.step + 1) / 200)
@@ -175,6 +175,11 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
         """Steps since the critic joined; below 0 before."""
         return self.step - self.first_steps + self.settings.critic.steps
 
+    @property
+    def _joined(self) -> FreeRunJudge | None:
+        """The critic, once it has joined."""
+        return self.judge if self._criticised >= 0 else None
+
     @torch.no_grad()
     def _introduce(self, judge: FreeRunJudge) -> None:
         """Show the critic what the density makes, and let it learn, before the density hears it."""
@@ -194,17 +199,15 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
         least = self.settings.critic.frames if self.judge is not None else 0
         return run_free(self.network, windows, matching, self.generator, self.common, least=least)
 
-    def _add_free_run_gradients(self, windows: Tensor, judge: FreeRunJudge | None = None) -> None:
+    def _add_free_run_gradients(self, windows: Tensor) -> None:
         """Add the gradient of the free runs' mismatch, and that of what the critic says of them where it has joined,
         each clipped on its own: no loss drowns another."""
-        made, real = self._run_free(windows)
-        moments = moment_loss(made[:, : real.shape[1]], real, self.settings.matching)
-        if judge is None:
-            self._add_gradient(moments)
-            return
-        judge.keep(made, self.generator)
-        self._add_gradient(moments, retain_graph=True)
-        self._add_gradient(judge.hear(made))
+        judge, (made, real) = self._joined, self._run_free(windows)
+        if self.settings.matching.begin < 1:
+            moments = moment_loss(made[:, : real.shape[1]], real, self.settings.matching)
+            self._add_gradient(moments, retain_graph=judge is not None)
+        if judge is not None:
+            self._add_gradient(judge.hear(made, self.generator))
 
     def _add_gradient(self, loss: Tensor, *, retain_graph: bool = False) -> None:
         parameters = [p for p in self.network.parameters() if p.requires_grad]
