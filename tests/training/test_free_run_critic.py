@@ -96,18 +96,37 @@ def test_its_gradient_is_what_would_make_free_runs_pass():
     trainer._introduce(trainer.judge)
     state = trainer.generator.get_state()
 
-    def loss() -> torch.Tensor:
+    def run_again() -> torch.Tensor:
         trainer.generator.set_state(state)
-        return trainer.judge.hear(trainer._run_free(windows(21))[0], generator())
+        return trainer._run_free(windows(21))[0]
 
-    before = loss()
+    def believe(made: torch.Tensor) -> float:
+        """Mean logit that free runs are captured."""
+        return float(trainer.judge.network(free_runs.show(made[:, -9:])).mean().detach())
+
+    made = run_again()
+    before = believe(made)
     trainer.network.zero_grad()
-    trainer._add_gradient(before)
+    trainer._add_gradient(trainer.judge.hear(made, generator()))
     with torch.no_grad():
         for weight in trainer.network.parameters():
             if weight.grad is not None:
                 weight -= 1e-4 * weight.grad
-    assert float(loss().detach()) < float(before.detach())
+    assert believe(run_again()) > before
+
+
+def test_it_learns_before_the_density_hears_it_and_then_in_each_step_from_what_was_heard(monkeypatch):
+    trainer, learnt = make_trainer(), []
+    update = trainer.judge._update
+    monkeypatch.setattr(trainer.judge, "_update", lambda of: (learnt.append(trainer.step), update(of))[1])
+    kept = []
+    for _ in range(5):
+        trainer.take_step()
+        kept.append(None if trainer.judge.history is None else trainer.judge.history.windows.clone())
+    assert [learnt.count(step) for step in range(2, 6)] == [2, 2, 2, 2]  # two of the head start; others after the step
+    assert kept[:2] == [None, None]
+    new = [(one != other).flatten(1).any(1).sum() for one, other in zip(kept[2:], kept[3:], strict=False)]
+    assert [int(count) for count in new] == [4, 4]
 
 
 def test_a_run_with_it_goes_on_to_the_bit():
@@ -130,9 +149,12 @@ def test_what_is_kept_is_the_mean_of_the_weights_since_it_joined():
         trainer.take_step()
         assert all(map(torch.equal, trainer.average.parameters(), trainer.network.parameters()))
     for _ in range(3):
+        before = [weight.clone() for weight in trainer.average.parameters()]
         trainer.take_step()
-    assert trainer.average is not trainer.network
-    assert not all(map(torch.equal, trainer.average.parameters(), trainer.network.parameters()))
+        done = trainer.step - 2
+        keep = done / (done + 20)
+        for mean, old, new in zip(trainer.average.parameters(), before, trainer.network.parameters(), strict=True):
+            torch.testing.assert_close(mean, keep * old + (1 - keep) * new)
     row = trainer.validate(corpus())
     trainer.network.load_state_dict(trainer.average.state_dict())
     assert trainer.validate(corpus()) == row
