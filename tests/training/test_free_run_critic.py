@@ -1,6 +1,7 @@
 """A critic of the density's free runs: what it sees, what the density learns of it, and runs that resume to the bit."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import pytest
 import torch
@@ -17,6 +18,7 @@ from priors.training.moment_matching import MatchingSettings, run_free
 from priors.training.recipes.density.critic import CriticSettings
 from priors.training.recipes.density.settings import TrainingSettings
 from priors.training.recipes.density.trainer import DensityTrainer
+from priors.training.trainer import draw_weights
 
 CRITIC = CriticSettings(steps=3, frames=8, head_start=2, batch=4, history=8, every=1)
 SETTINGS = TrainingSettings(steps=5, batch=4, window=20, critic=CRITIC, matching=MatchingSettings(wander=4, batch=4))
@@ -48,7 +50,7 @@ def test_it_sees_joints_about_the_hips_their_velocities_and_the_hips_where_the_w
 
 def test_it_learns_to_tell_two_kinds_of_windows_apart_and_its_slope_is_bounded():
     real, made = (free_runs.show(windows(9) * scale) for scale in (1.0, 0.6))
-    critic = free_runs.FreeRunCritic(real)
+    critic = draw_weights(lambda: free_runs.FreeRunCritic(real), 0)
     optimiser = torch.optim.Adam(critic.parameters(), 1e-3)
     first = free_runs.compute_critic_loss(critic(real), critic(made))
     assert float(first.detach()) == pytest.approx(1.386, abs=0.2)
@@ -125,7 +127,7 @@ def test_it_learns_before_the_density_hears_it_and_then_in_each_step_from_what_w
         kept.append(None if trainer.judge.history is None else trainer.judge.history.windows.clone())
     assert [learnt.count(step) for step in range(2, 6)] == [2, 2, 2, 2]  # two of the head start; others after the step
     assert kept[:2] == [None, None]
-    new = [(one != other).flatten(1).any(1).sum() for one, other in zip(kept[2:], kept[3:], strict=False)]
+    new = [(one != other).flatten(1).any(1).sum() for one, other in pairwise(kept[2:])]
     assert [int(count) for count in new] == [4, 4]
 
 
@@ -155,6 +157,13 @@ def test_what_is_kept_is_the_mean_of_the_weights_since_it_joined():
         keep = done / (done + 20)
         for mean, old, new in zip(trainer.average.parameters(), before, trainer.network.parameters(), strict=True):
             torch.testing.assert_close(mean, keep * old + (1 - keep) * new)
+
+
+@pytest.mark.slow  # it is validated twice
+def test_what_is_validated_is_the_mean():
+    trainer = make_trainer()
+    for _ in range(4):
+        trainer.take_step()
     row = trainer.validate(corpus())
     trainer.network.load_state_dict(trainer.average.state_dict())
     assert trainer.validate(corpus()) == row
