@@ -56,16 +56,25 @@ def find_held_out(data: Path, held_out: HeldOut) -> list[Path]:
 
 
 def load_clean_clips(data: Path, held_out: HeldOut, count: int) -> list[CleanClip]:
-    """Load about so many held-out clips, as many of each kind, without their T-poses."""
-    paths: dict[str, list[Path]] = {}
-    for path in find_held_out(data, held_out):
-        paths.setdefault(classify_clip(path.relative_to(data).as_posix()), []).append(path)
+    """Load about so many held-out clips, as many of each kind, without their T-poses: those first by which nothing was
+    chosen in training, evenly spread over each kind's, for neighbours by name are of one action and one style."""
+    paths = find_held_out(data, held_out)
+    count_each = max(1, count // len(CLIP_KINDS))
     clips = []
     for kind in CLIP_KINDS:
-        for path in paths.get(kind, [])[: max(1, count // len(CLIP_KINDS))]:
+        of_kind = [path for path in paths if classify_clip(path.relative_to(data).as_posix()) == kind]
+        tests = [path for path in of_kind if path.relative_to(data).as_posix() in held_out.get("test", ())]
+        others = [path for path in of_kind if path not in tests]
+        for path in (*pick_evenly(tests, count_each), *pick_evenly(others, count_each - len(tests))):
             motion = formats.load(path)
             clips.append(CleanClip(kind, trim_clip(motion, skip_first=begins_with_tpose(motion))))
     return clips
+
+
+def pick_evenly(paths: Sequence[Path], count: int) -> list[Path]:
+    """Pick so many evenly from the first on, or all where there are no more."""
+    count = min(count, len(paths))
+    return [paths[number * len(paths) // count] for number in range(count)]
 
 
 def load_canonical(data: Path, held_out: HeldOut, count: int, *, fps: int | None = None) -> dict[str, list[Motion]]:
