@@ -15,6 +15,7 @@ from priors.training.ending.course import UntilFlat
 from priors.training.mocap.cuts import CMU
 from priors.training.recipe import Recipe
 from priors.training.recipes.denoiser import DenoiserRecipe, DenoiserSettings
+from priors.training.recipes.density.critic import CriticSettings
 from priors.training.recipes.density.settings import TrainingSettings
 from priors.training.recipes.infiller import InfillerRecipe
 from priors.training.recipes.keyframe_timing import KeyframeTimingRecipe
@@ -53,6 +54,8 @@ class WeightSet:
     """Copies of each clip, at other tempos and with other strides, that the densities are trained on beside it."""
     standing_share: float = 1.0
     """Share of the windows in which nobody goes anywhere that the densities of walks and runs are shown."""
+    critic_steps: int = 0
+    """Last steps of the density of walks and runs, besides the planned ones, in which a critic judges its free runs."""
     splices: int = 0
     """Splices of the clips that are tried for the density of everyday motion; with some, the pace is a label of it."""
     everyday_steps: int = 8000
@@ -80,6 +83,7 @@ SETS: Mapping[str, WeightSet] = {
         own=r"(^|/)dataset-[12]_|^cmu",
         locomotion="dataset-2_(walk|walk-turn-left|walk-turn-right|run)_",
         labels="_(?P<gait>run|walk|walk-turn-left|walk-turn-right)_(?P<style>[a-z]+)_",
+        critic_steps=1500,
         splices=3500,
         everyday_standing_share=0.5,
     ),
@@ -166,7 +170,7 @@ def _make_models(weights: WeightSet, made: Path | None) -> tuple[BundledModel, .
     everything = {**shared, **until_flat}
     general = {**shared, "match": weights.match}  # which a density's command always tells
     walks: dict[str, Any] = {**general, "match": weights.locomotion, "labels": weights.labels, "made": made}
-    widths = {"locomotion": weights.width, "locomotion-live": weights.live_width}
+    walking = {"locomotion": (weights.width, weights.critic_steps), "locomotion-live": (weights.live_width, 0)}
     stitcher = BundledModel(
         "stitcher",
         StitcherRecipe(
@@ -178,9 +182,15 @@ def _make_models(weights: WeightSet, made: Path | None) -> tuple[BundledModel, .
     return (
         *(
             BundledModel(
-                name, DensityRecipe(**walks, **_density(weights, width, weights.plan(10_000), weights.standing_share))
+                name,
+                DensityRecipe(
+                    **walks,
+                    **_density(
+                        weights, width, weights.plan(10_000) + critic_steps, weights.standing_share, critic_steps
+                    ),
+                ),
             )
-            for name, width in widths.items()
+            for name, (width, critic_steps) in walking.items()
             if width is not None
         ),
         stitcher,
@@ -226,7 +236,9 @@ def _make_models(weights: WeightSet, made: Path | None) -> tuple[BundledModel, .
     )
 
 
-def _density(weights: WeightSet, width: int, steps: int, standing_share: float) -> dict[str, Any]:
+def _density(
+    weights: WeightSet, width: int, steps: int, standing_share: float, critic_steps: int = 0
+) -> dict[str, Any]:
     settings = TrainingSettings(
         steps=steps,
         batch=64,
@@ -234,6 +246,7 @@ def _density(weights: WeightSet, width: int, steps: int, standing_share: float) 
         bfloat16=True,
         copies=ClipCopies(weights.copies),
         standing_share=standing_share,
+        critic=CriticSettings(critic_steps),
     )
     return {"config": LstmGmmConfig(width=width), "settings": settings}
 
