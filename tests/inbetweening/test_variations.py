@@ -1,6 +1,7 @@
 """`mapctl tween --variations K` and `--best-of K`: several motions through the same keys, all of which meet them."""
 
 import json
+import math
 import re
 from dataclasses import replace
 from functools import partial
@@ -18,7 +19,7 @@ from controllers.common.canonical_clip import CanonicalClip
 from controllers.inbetweening.infill import infill
 from controllers.inbetweening.pipeline import InfillSettings
 from controllers.inbetweening.proposers import AutoInbetweener, RolloutInbetweener, SlerpInbetweener
-from controllers.inbetweening.proposers.rollouts import RolloutSettings
+from controllers.inbetweening.proposers.rollouts import Roller, Rollout, RolloutSettings
 from controllers.inbetweening.refine import INFILL_REFINEMENT
 from controllers.inbetweening.tween import tween
 from controllers.inbetweening.variations import lowest_energy, sample_variations
@@ -28,6 +29,7 @@ from mapctl.intent.keyframes import Keys
 from mapctl.problem.warm_start import SwarmProposal
 from mapctl.problem.window_solvers import LatentNoiseSolver
 from mapctl.recording.masks import Mask
+from mapctl.skeleton import CANONICAL
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings
 from mapctl.solver.swarm import SwarmSettings
@@ -37,6 +39,7 @@ SHORT, SHORT_KEYS = 25, (0, 10, 13, 24)
 FEW = InfillSettings(refinement=replace(INFILL_REFINEMENT, budget=Budget(evaluations=4)))
 QUICK = RolloutSettings(
     ahead=4,
+    jump=math.inf,  # a small density of drawn weights does nothing else
     method=LatentNoiseSolver(
         rounds=1,
         lbfgs=LbfgsSettings(max_iterations=4),
@@ -138,6 +141,34 @@ def test_a_rollout_changes_nothing_that_is_known_or_has_no_end():
     torch.testing.assert_close(made.local_quat_xyzw[same], gap.motion.local_quat_xyzw[same])
     assert torch.equal(bits[same], logits[same])
     assert float((made.root_position - gap.motion.root_position)[20:30].norm(dim=-1).max()) > 1e-4
+
+
+@pytest.mark.parametrize(("jumps", "by"), [(0, "tiny"), (2, "tiny"), (3, "slerp")])
+def test_a_rollout_in_which_a_leg_is_thrown_over_is_rolled_anew_or_left_to_the_fallback(jumps, by, monkeypatch):
+    motion = on_rig("canonical", FRAMES)
+    free = torch.zeros(FRAMES, dtype=torch.bool)
+    free[20:30] = True
+    gap, rolled = CanonicalClip.of(motion, MissingMask.of_frames(free, motion.num_joints)).query(), []
+
+    def roll(self, start, stop, generator, settings):
+        """The fallback's motion with a still head, and in the first so many rollouts a leg thrown over in one frame."""
+        quats = self.body.local_quat_xyzw.clone()
+        quats[start:stop, CANONICAL.index("head")] = quats[start - 1, CANONICAL.index("head")]
+        if len(rolled) < jumps:
+            quats[25, CANONICAL.index("leftUpperLeg")] = torch.tensor([1.0, 0, 0, 0], dtype=quats.dtype)
+        rolled.append(Rollout(start, replace(self.body, local_quat_xyzw=quats), self.contact_logits))
+        return rolled[-1]
+
+    monkeypatch.setattr(Roller, "roll", roll)
+    proposer = RolloutInbetweener([tiny_density()], SlerpInbetweener())
+    answer = proposer.propose(gap, generator=generator(0))
+    (source,) = answer.attribute(gap)
+    assert len(rolled) == min(jumps + 1, proposer.settings.attempts)
+    assert source.by.endswith(by)
+    assert source.reason == ("every rollout jumped" if by == "slerp" else "")
+    plain = SlerpInbetweener().propose(gap).motion.local_quat_xyzw
+    expected = plain if by == "slerp" else rolled[-1].body.local_quat_xyzw
+    torch.testing.assert_close(answer.motion.local_quat_xyzw, expected)
 
 
 @pytest.mark.parametrize("frames", [(30, 45), pytest.param((8, 45), marks=pytest.mark.slow)])

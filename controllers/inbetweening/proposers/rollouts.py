@@ -20,17 +20,20 @@ from mapctl import contacts
 from mapctl.features import LAYOUT, PRIOR_FPS
 from mapctl.inbetweening import GapQuery, Proposal
 from mapctl.inbetweening.query import GapSource
+from mapctl.metrics import worst_frame
 from mapctl.motion import Motion
 from mapctl.numerics import gaussian
 from mapctl.problem.receding_horizon import RecedingHorizonSolver
 from mapctl.problem.warm_start import SteeringKnots, SwarmProposal
 from mapctl.problem.window_solvers import LatentNoiseSolver
 from mapctl.protocols import Density, DensityState, Inbetweener
-from mapctl.skeleton import CANONICAL
+from mapctl.skeleton import CANONICAL, TOES
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings
 from mapctl.solver.swarm import SwarmSettings
 from mapctl.terms import FootContact, Keyframe, LatentPrior
+
+_ENDS = CANONICAL.indices(("leftHand", "rightHand", *TOES))  # what a leg or an arm that is thrown over moves farthest
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,11 @@ class RolloutSettings:
     """Frames of the shortest gap that is rolled through: shorter ones leave nothing to vary."""
     longest: int = 180
     """Frames of the longest gap that is rolled through; longer ones are left to the fallback."""
+    attempts: int = 3
+    """Rollouts through a gap, each from other noise, until one does not jump; then the gap is left to the fallback."""
+    jump: float = 1.5
+    """A rollout jumps where a hand or a foot steps, relative to the hips, so many times as far as anywhere in the
+    fallback's motion: an arrival that noise does not lead to is bought with a leg thrown over in one frame."""
     method: LatentNoiseSolver = field(
         default_factory=lambda: LatentNoiseSolver(
             rounds=2,
@@ -88,7 +96,8 @@ class RolloutInbetweener(Inbetweener):
 
     def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
         """Propose a different motion for each sample; gaps too short or too long are left to the fallback, and so are
-        loose keys but for places that are all that is told, which are walked over."""
+        gaps in which every attempt jumps, and loose keys but for places that are all that is told, which are walked
+        over."""
         if query.loose is not None:
             walked = PlaceWalker(tuple(self.densities)).propose(query, generator=generator)
             return walked or self.fallback.propose(query, generator=generator)
@@ -97,12 +106,15 @@ class RolloutInbetweener(Inbetweener):
             return base
         roller, others = Roller.of(query, base, self.densities), list(base.others)
         generator, settings = generator or torch.Generator().manual_seed(0), self.settings
+        largest = settings.jump * _measure_largest_step(roller.body)
         for start, stop in query.enclosed_gaps:
-            if settings.shortest <= stop - start <= settings.longest:
-                roller.accept_rollout(roller.roll(start, stop, generator, settings))
-                others.append(GapSource(start, stop, f"rollout of {roller.density.name}"))
-            else:
+            if not settings.shortest <= stop - start <= settings.longest:
                 others.append(GapSource(start, stop, base.source, f"rollouts take {settings.span}"))
+            elif (rollout := roller.roll_steadily(start, stop, generator, settings, largest)) is None:
+                others.append(GapSource(start, stop, base.source, "every rollout jumped"))
+            else:
+                roller.accept_rollout(rollout)
+                others.append(GapSource(start, stop, f"rollout of {roller.density.name}"))
         return replace(base, motion=roller.motion, contact_logits=roller.contact_logits, others=tuple(others))
 
 
@@ -146,6 +158,16 @@ class Roller:
         """The motion so far, on the character's bones."""
         return self.query.to_character(self.body)
 
+    def roll_steadily(
+        self, start: int, stop: int, generator: torch.Generator, settings: RolloutSettings, largest: float
+    ) -> Rollout | None:
+        """Roll until no hand or foot steps farther than `largest`, metres in a frame; None where all attempts do."""
+        for _ in range(settings.attempts):
+            rollout = self.roll(start, stop, generator, settings)
+            if _measure_largest_step(rollout.body.slice(start - 1, stop + 1)) <= largest:
+                return rollout
+        return None
+
     def roll(self, start: int, stop: int, generator: torch.Generator, settings: RolloutSettings) -> Rollout:
         """Roll through frames start to stop; only the density's state is advanced."""
         committed = commit_before(self.body, self.contact_logits, start, self.density, self.state, since=self.done)
@@ -184,6 +206,12 @@ class Roller:
             positions = torch.where(own_targets[..., None], targets.places[part][:last] / self.query.scale, positions)
             wanted = wanted | own_targets
         return Keyframe(positions.float(), wanted, settings.sigma_arrival)
+
+
+def _measure_largest_step(body: Motion) -> float:
+    """Measure how far a hand or a toe steps at most from one frame to the next, relative to the hips, metres."""
+    positions = body.joint_positions()
+    return worst_frame.measure_peaks(positions[:, _ENDS], positions[:, 0], PRIOR_FPS).step
 
 
 def _sample_smooth_noise(
