@@ -84,7 +84,7 @@ COMMANDS = {
     "tween file": "tween keys.toml -o keyed.bvh --inbetweener infiller.safetensors --prior tiny.safetensors",
     "tween timing": "tween walk.bvh -o timed.bvh --keyframes 0,14,29 --inbetweener infiller.safetensors"
     " --suggest-timing --method infiller --no-finish",
-    "tween variations": "tween walk.bvh -o several.bvh --keyframes 0,24 --inbetweener infiller.safetensors"
+    "tween variations": "tween walk.bvh -o several.bvh --keyframes 0,12 --inbetweener infiller.safetensors"
     " --prior tiny.safetensors --variations 2",
     "tween best": "tween walk.bvh -o best.bvh --keyframes 0,16 --inbetweener infiller.safetensors"
     " --prior tiny.safetensors --best-of 2",

@@ -9,7 +9,7 @@ from controllers.common.map_refinement import RefinementSettings
 from controllers.common.score import score
 from controllers.inbetweening.proposers.auto import AutoInbetweener
 from controllers.inbetweening.proposers.rolling import select_likeliest_density
-from controllers.inbetweening.proposers.rollouts import RolloutInbetweener
+from controllers.inbetweening.proposers.rollouts import EVERY_ROLLOUT_JUMPED, RolloutInbetweener
 from controllers.inbetweening.proposers.slerp import SlerpInbetweener
 from controllers.inbetweening.refine import INFILL_REFINEMENT
 from controllers.inbetweening.solution import InbetweenSolution, Pick
@@ -82,7 +82,7 @@ def sample_variations(
 
     The first is by one in-betweener. The others are by those that `source` draws; without, the likeliest density of
     `rollouts` is sampled and steered from key to key. Energies are by that density. RequestError for fewer than two,
-    and for keys that are too close in time to leave a choice.
+    for keys that are too close in time to leave a choice, and where no rollout gets from key to key without a jump.
     """
     if not 2 <= count <= MAX_VARIATIONS:
         raise RequestError(f"variations are 2 to {MAX_VARIATIONS}, got {count}")
@@ -91,7 +91,9 @@ def sample_variations(
     source = source or _roll_out(rollouts, density)
     found += _sample(make, source.draw, count - 1, generator, progress)
     if all(torch.equal(found[0].motion.local_quat_xyzw, other.motion.local_quat_xyzw) for other in found[1:]):
-        raise RequestError(f"no two keys have {source.room}, which leaves nothing to vary")
+        jumped = any(gap.reason == EVERY_ROLLOUT_JUMPED for other in found[1:] for gap in other.sources)
+        cause = f"{EVERY_ROLLOUT_JUMPED} between these keys" if jumped else f"no two keys have {source.room}"
+        raise RequestError(f"{cause}, which leaves nothing to vary")
     each = tuple(_score_variation(one, density, refinement) for one in found)
     return Variations(each, measure_diversity([one.motion for one in found]))
 

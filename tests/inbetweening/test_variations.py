@@ -80,8 +80,8 @@ def making(motion, keys):
     return lambda inbetweener, draws: tween(motion, keys, inbetweener, settings=FEW, generator=draws)
 
 
-def asked(motion, prior, *, count=3, seed=0, keys=KEYS, **told):
-    make, rollouts = making(motion, Keys.of(keys, **told)), RolloutInbetweener([prior], INFILLER, QUICK)
+def asked(motion, prior, *, count=3, seed=0, keys=KEYS, rolling=QUICK, **told):
+    make, rollouts = making(motion, Keys.of(keys, **told)), RolloutInbetweener([prior], INFILLER, rolling)
     first = AutoInbetweener(INFILLER, [prior])
     refinement = FEW.refinement
     return sample_variations(make, first, rollouts, count, generator=generator(seed), refinement=refinement)
@@ -216,6 +216,8 @@ def test_what_leaves_nothing_to_vary_is_refused(prior):
         asked(motion, prior, keys=tuple(range(FRAMES)))
     with pytest.raises(RequestError, match="leaves nothing to vary"):
         asked(motion.slice(0, 6), prior, keys=(0, 5))
+    with pytest.raises(RequestError, match="every rollout jumped between these keys, which leaves nothing to vary"):
+        asked(motion, prior, rolling=replace(QUICK, jump=0.0))
     for count in (1, 1001):
         with pytest.raises(RequestError, match=f"variations are 2 to 1000, got {count}"):
             asked(motion, prior, count=count)

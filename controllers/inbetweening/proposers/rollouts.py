@@ -33,6 +33,8 @@ from mapctl.solver.lbfgs import LbfgsSettings
 from mapctl.solver.swarm import SwarmSettings
 from mapctl.terms import FootContact, Keyframe, LatentPrior
 
+EVERY_ROLLOUT_JUMPED = "every rollout jumped"
+"""Why a gap is the fallback's that rollouts would take."""
 _ENDS = CANONICAL.indices(("leftHand", "rightHand", *TOES))  # what a leg or an arm that is thrown over moves farthest
 
 
@@ -111,7 +113,7 @@ class RolloutInbetweener(Inbetweener):
             if not settings.shortest <= stop - start <= settings.longest:
                 others.append(GapSource(start, stop, base.source, f"rollouts take {settings.span}"))
             elif (rollout := roller.roll_steadily(start, stop, generator, settings, largest)) is None:
-                others.append(GapSource(start, stop, base.source, "every rollout jumped"))
+                others.append(GapSource(start, stop, base.source, EVERY_ROLLOUT_JUMPED))
             else:
                 roller.accept_rollout(rollout)
                 others.append(GapSource(start, stop, f"rollout of {roller.density.name}"))
