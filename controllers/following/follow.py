@@ -38,9 +38,9 @@ class FollowSettings:
     """Sigma of the arc behind or ahead of the requested one, metres."""
     footing: FootContact = field(default_factory=lambda: FootContact(landing=LandingSigmas()))
     """Contact term."""
-    noise: LatentPrior = field(default_factory=lambda: LatentPrior(sigma=2.0))
-    """Prior on the latent noise of the rollout. A well trained prior's own standard deviation is small: at sigma 1 the
-    same walk follows its path less well and skates more (docs/reference/results.md)."""
+    noise: LatentPrior = field(default_factory=lambda: LatentPrior(sigma=3.0))
+    """Prior on the latent noise of the rollout. A well trained prior's own standard deviation is small: at sigma 2 the
+    same walk follows its path less well; at sigma 4 the prior of the free set is led where it knows nothing."""
     window: HorizonSettings = field(default_factory=HorizonSettings)
     """Lengths of the receding horizon."""
     method: SingleWindowSolver = field(default_factory=LatentNoiseSolver)

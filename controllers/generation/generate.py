@@ -43,8 +43,8 @@ class GenerateSettings:
     start: int | None = None
     """Index of one of the prior's initial states; sampled by their weights if None."""
     condition_on_start: bool = True
-    """Whether a prior with labels is conditioned on those of the initial state's clip (gait, style): unconditioned it
-    lets most runs fall into a walk within ten seconds, which no clip of the data does."""
+    """Whether a prior with labels is conditioned on those of the initial state's clip (gait, style): unconditioned,
+    one whose free runs no critic has judged lets most runs fall into a walk within ten seconds, as no clip does."""
     tell_paces: bool = True
     """Whether a prior that knows paces is told one after the other, as often as its data change theirs: samples of a
     density hardly ever change theirs unless they are told."""
