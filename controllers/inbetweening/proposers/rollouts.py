@@ -64,6 +64,9 @@ class RolloutSettings:
     jump: float = 1.5
     """A rollout jumps where a hand or a foot steps, relative to the hips, so many times as far as anywhere in the
     fallback's motion: an arrival that noise does not lead to is bought with a leg thrown over in one frame."""
+    least_jump: float = 0.12
+    """Metres in a frame that no jump stays under, however still the fallback's motion is; hands and feet of a walk step
+    as far."""
     method: LatentNoiseSolver = field(
         default_factory=lambda: LatentNoiseSolver(
             rounds=2,
@@ -108,7 +111,7 @@ class RolloutInbetweener(Inbetweener):
             return base
         roller, others = Roller.of(query, base, self.densities), list(base.others)
         generator, settings = generator or torch.Generator().manual_seed(0), self.settings
-        largest = settings.jump * _measure_largest_step(roller.body)
+        largest = max(settings.least_jump, settings.jump * _measure_largest_step(roller.body))
         for start, stop in query.enclosed_gaps:
             if not settings.shortest <= stop - start <= settings.longest:
                 others.append(GapSource(start, stop, base.source, f"rollouts take {settings.span}"))
