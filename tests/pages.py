@@ -106,6 +106,8 @@ def shorten(line: str) -> list[str]:
             tiny.clear()  # the bundled one is small, and without the MAP stage no density is asked
         if word == "--method" and words[place + 1] == "stitcher" and "--no-finish" in words:
             tiny.clear()  # likewise
+        if word == "--variations" and "--method" not in words:
+            tiny.pop("--prior", None)  # rollouts of a density that never saw a motion jump, and are left out
     if name == "measure" and "--why" in words:
         words += ["--steps", "5"]
     if name == "measure" and "--curve" not in words:
