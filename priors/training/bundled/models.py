@@ -170,7 +170,6 @@ def _make_models(weights: WeightSet, made: Path | None) -> tuple[BundledModel, .
     everything = {**shared, **until_flat}
     general = {**shared, "match": weights.match}  # which a density's command always tells
     walks: dict[str, Any] = {**general, "match": weights.locomotion, "labels": weights.labels, "made": made}
-    walking = {"locomotion": (weights.width, weights.critic_steps), "locomotion-live": (weights.live_width, 0)}
     stitcher = BundledModel(
         "stitcher",
         StitcherRecipe(
@@ -180,19 +179,7 @@ def _make_models(weights: WeightSet, made: Path | None) -> tuple[BundledModel, .
         ),
     )
     return (
-        *(
-            BundledModel(
-                name,
-                DensityRecipe(
-                    **walks,
-                    **_density(
-                        weights, width, weights.plan(10_000) + critic_steps, weights.standing_share, critic_steps
-                    ),
-                ),
-            )
-            for name, (width, critic_steps) in walking.items()
-            if width is not None
-        ),
+        *_make_densities_of_walks(weights, walks),
         stitcher,
         BundledModel(
             "general",
@@ -234,6 +221,20 @@ def _make_models(weights: WeightSet, made: Path | None) -> tuple[BundledModel, .
         ),
         BundledModel("keyframe-timing", KeyframeTimingRecipe(**shared, match=weights.match or None)),
     )
+
+
+def _make_densities_of_walks(weights: WeightSet, walks: dict[str, Any]) -> list[BundledModel]:
+    """That for everything, and a smaller one for live control where the set has one."""
+    models = []
+    for name, width, critic_steps in (
+        ("locomotion", weights.width, weights.critic_steps),
+        ("locomotion-live", weights.live_width, 0),
+    ):
+        if width is not None:
+            steps = weights.plan(10_000) + critic_steps
+            density = _density(weights, width, steps, weights.standing_share, critic_steps)
+            models.append(BundledModel(name, DensityRecipe(**walks, **density)))
+    return models
 
 
 def _density(
