@@ -28,9 +28,9 @@ def test_a_corner_is_kept_to_without_a_lunge(last, seed):
     toes = done.motion.joint_positions()[:, list(CANONICAL.indices(TOES))]
     assert float(torch.diff(toes, n=2, dim=0).norm(dim=-1).max()) * 900 < 88, "twice that of a circle of 2 m"
     wanted = math.pi / 2 if last[0] else math.pi
-    off = rotations.wrap_angle(kinematics.heading(done.motion.local_quat_xyzw[-30:, 0]) - wanted)
+    turned = rotations.wrap_angle(kinematics.heading(done.motion.local_quat_xyzw[-30:, 0]) - wanted)
     # Over a stride: at each step hips turn to and fro, by up to 17 degrees in mocap.
-    assert abs(float(off.mean())) < math.radians(15)
+    assert abs(float(turned.mean())) < math.radians(15)
     if not last[0]:
         assert float((done.way.speeds == 0).sum()) > 10, "it turns on the spot"
 

@@ -59,12 +59,13 @@ def load_clean_clips(data: Path, held_out: HeldOut, count: int) -> list[CleanCli
     """Load about so many held-out clips, as many of each kind, without their T-poses: those first by which nothing was
     chosen in training, evenly spread over each kind's, for neighbours by name are of one action and one style."""
     paths = find_held_out(data, held_out)
+    test_paths = {data / name for name in held_out.get("test", ())}
     count_each = max(1, count // len(CLIP_KINDS))
     clips = []
     for kind in CLIP_KINDS:
         of_kind = [path for path in paths if classify_clip(path.relative_to(data).as_posix()) == kind]
-        tests = [path for path in of_kind if path.relative_to(data).as_posix() in held_out.get("test", ())]
-        others = [path for path in of_kind if path not in tests]
+        tests = [path for path in of_kind if path in test_paths]
+        others = [path for path in of_kind if path not in test_paths]
         for path in (*pick_evenly(tests, count_each), *pick_evenly(others, count_each - len(tests))):
             motion = formats.load(path)
             clips.append(CleanClip(kind, trim_clip(motion, skip_first=begins_with_tpose(motion))))
