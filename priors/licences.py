@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import PurePath
 from typing import Any
 
-from mapctl.errors import CheckpointError
+from mapctl.errors import CheckpointError, RequestError
 from priors import weight_sets
 
 FREE = ("free for any use", "CC0 1.0")
@@ -91,6 +91,15 @@ def check_free(name: str, licence: str, told: Mapping[str, Mapping[str, Any]]) -
     fault = _find_fault(licence, told)
     if fault is not None:
         raise CheckpointError(f"{name} is not free, though it lies with the free weights: {fault}")
+
+
+def check_not_laxer(licence: str, origins: Licences) -> None:
+    """Raise RequestError where weights would be under a laxer licence than a model, or made motion, that they learn
+    from. One that is not known is stricter than those that ask for nothing."""
+    for name, theirs in origins.items():
+        strict = licence in FREE if _find_known(theirs) is None else _rank(licence) < _rank(theirs)
+        if strict and licence != theirs:
+            raise RequestError(f"{name} is under {theirs!r}; weights that learn from it cannot be {licence!r}")
 
 
 def find_unfree(words: str) -> str | None:

@@ -248,11 +248,17 @@ class LstmGmm(nn.Module):
         mixture, _ = self(self.normalise(before), (state.hidden, state.cell))
         return mixture.log_prob(self._target(features), self.whitening, self.blur)
 
-    def advance(self, state: LstmState, committed: Float[Tensor, "batch frames size"]) -> LstmState:
-        """Return the state after the committed frames, without gradient."""
+    def advance(
+        self,
+        state: LstmState,
+        committed: Float[Tensor, "batch frames size"],
+        *,
+        condition: Float[Tensor, "batch conditions"] | None = None,
+    ) -> LstmState:
+        """Return the state after the committed frames, without gradient; `condition` is as in `forward`."""
         before = torch.cat([state.last_frame.unsqueeze(1), committed[:, :-1]], dim=1)
         with torch.no_grad():
-            _, (hidden, cell) = self(self.normalise(before), (state.hidden, state.cell))
+            _, (hidden, cell) = self(self.normalise(before), (state.hidden, state.cell), condition=condition)
         return LstmState(committed[:, -1], hidden, cell)
 
     def sample(
@@ -263,11 +269,12 @@ class LstmGmm(nn.Module):
         *,
         temperature: float = 1.0,
         planting: Planting | None = None,
+        condition: Float[Tensor, "batch conditions"] | None = None,
     ) -> tuple[Float[Tensor, "batch frames size"], LstmState]:
-        """Draw frames one after the other (section 4.1.4); temperature scales the Gaussians' sigmas, and with
-        `planting` each frame is drawn given that toes stand where its bits say so."""
+        """Draw frames one after the other (section 4.1.4); temperature scales the Gaussians' sigmas, with `planting`
+        each frame is drawn given that toes stand where its bits say so, and `condition` is as in `forward`."""
         with torch.no_grad():
-            return self.draw(state, frames, generator, temperature=temperature, planting=planting)
+            return self.draw(state, frames, generator, temperature=temperature, planting=planting, condition=condition)
 
     def draw(
         self,
@@ -277,12 +284,13 @@ class LstmGmm(nn.Module):
         *,
         temperature: float = 1.0,
         planting: Planting | None = None,
+        condition: Float[Tensor, "batch conditions"] | None = None,
     ) -> tuple[Float[Tensor, "batch frames size"], LstmState]:
         """`sample`, differentiable in the weights for the components and bits that were drawn."""
         drawn, device, mixing = [], self.mean.device, self.mixing
         there, size = generator.device, self.layout.continuous
         for _ in range(frames):
-            mixture, state = self._step(state)
+            mixture, state = self._step(state, condition)
             weights = mixture.log_weight.detach().exp().to(there)
             component = torch.multinomial(weights, 1, generator=generator)[:, 0].to(device)
             noise = temperature * torch.randn(len(weights), size, generator=generator, device=there).to(device)
@@ -344,9 +352,9 @@ class LstmGmm(nn.Module):
             bits = self.layout.pick(features, "contacts") > 0.5
             return DiscreteChoices(component, bits), noise.gather(-2, chosen)[..., 0, :]
 
-    def _step(self, state: LstmState) -> tuple[Mixture, LstmState]:
+    def _step(self, state: LstmState, condition: Tensor | None = None) -> tuple[Mixture, LstmState]:
         inputs = self.normalise(state.last_frame).unsqueeze(1)
-        mixture, (hidden, cell) = self(inputs, (state.hidden, state.cell))
+        mixture, (hidden, cell) = self(inputs, (state.hidden, state.cell), condition=condition)
         mixture = Mixture(*(part.squeeze(1) for part in vars(mixture).values()))
         return mixture, LstmState(state.last_frame, hidden, cell)
 

@@ -8,6 +8,7 @@ from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.formats.atomic import write_text
 from priors import checkpoints
+from priors.licences import OF_DATA, check_not_laxer, find_strictest
 from priors.training.augmentation.splices import Splices, add_splices
 from priors.training.corpus import Corpus, SkippedFile, Split, join_made, keep_share, read_corpus, split_corpus
 from priors.training.mocap.made import require_made
@@ -46,13 +47,19 @@ class DataSource:
     """Folder of clips that a model made, with their list (see `find_made`), which are trained on as well."""
     splices: Splices = field(default_factory=Splices)
     """Splices of the clips to train on, which are trained on as well."""
+    licence: str = OF_DATA
+    """Licence of the weights."""
+    teachers: tuple[str, ...] = ()
+    """Models, bundled or trained, that these weights begin with or learn from."""
 
 
 def gather(source: DataSource, *, progress: Progress, warn: Progress) -> tuple[Corpus, Split]:
     """The corpus and its parts; `warn` gets a line on files that were left out, RUN/skipped.txt has them all.
 
-    RequestError where nothing is left, what is left cannot be split, or, if that is asked for, a file cannot be used.
+    RequestError where nothing is left, what is left cannot be split, or, if that is asked for, a file cannot be used;
+    and where the licence of a teacher, or of a clip that a model made, is stricter than that of the weights.
     """
+    check_not_laxer(source.licence, {name: _read_card(name).licence for name in source.teachers})
 
     def news(done: int, total: int) -> None:
         if done % 200 == 0 or done == total:
@@ -69,6 +76,8 @@ def gather(source: DataSource, *, progress: Progress, warn: Progress) -> tuple[C
     )
     if source.made is not None:
         corpus = join_made(corpus, _read_made(source, source.made))
+    if corpus.made.licences:
+        check_not_laxer(source.licence, {"a clip that a model made": find_strictest(corpus.made.licences)})
     if source.strict and corpus.skipped:
         raise RequestError(f"--strict-data: {_list_skipped(corpus.skipped, source.data)}")
     corpus, parts = keep_share(corpus, split_corpus(corpus, source.seed), source.share, source.seed)
@@ -144,6 +153,9 @@ def describe_origin(init: str | None) -> dict[str, dict[str, str]]:
     """For a card's data: the model that training began with, and its licence; nothing without one."""
     if init is None:
         return {}
-    card = checkpoints.read_card(checkpoints.locate(init).with_suffix(".json"))
     name = add_set(init) if means_bundled(init) else Path(init).name
-    return {"init": {"name": name, "licence": card.licence}}
+    return {"init": {"name": name, "licence": _read_card(init).licence}}
+
+
+def _read_card(name: str) -> checkpoints.Card:
+    return checkpoints.read_card(checkpoints.locate(name).with_suffix(".json"))

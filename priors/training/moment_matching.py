@@ -66,10 +66,12 @@ def run_free(
     common: torch.Generator | None = None,
     *,
     least: int = 0,
+    condition: Float[Tensor, "batch conditions"] | None = None,
 ) -> tuple[Float[Tensor, "runs made size"], Float[Tensor, "runs real size"]]:
     """Free runs that begin with windows, of at least so many frames, and how the windows go on; each after the few
     frames that differences take their past from. The runs are differentiable in the network's weights. `common` draws
     how long they have run before, which processes that train together have in common; `generator` if None.
+    `condition` is what the network is told of each window, as in its `forward`.
 
     RequestError for windows too short to hold both.
     """
@@ -79,13 +81,14 @@ def run_free(
     if context < PAST_FRAMES:
         raise RequestError(f"free runs are matched in windows of at least {2 * PAST_FRAMES} frames, got {length}")
     windows = windows[: settings.batch]
-    state = model.advance(model.start_after(windows[:, 0]), windows[:, 1:context])
+    told = None if condition is None else condition[: settings.batch]
+    state = model.advance(model.start_after(windows[:, 0]), windows[:, 1:context], condition=told)
     drawn = torch.randint(settings.wander + 1, (1,), generator=common or generator)
     past, away = windows[:, :context], int(drawn)
     if away > 0:
-        wandered, state = model.sample(state, away, generator)
+        wandered, state = model.sample(state, away, generator, condition=told)
         past = torch.cat([past, wandered], 1)
-    made, _ = model.draw(state, max(frames, least), generator)
+    made, _ = model.draw(state, max(frames, least), generator, condition=told)
     real = windows[:, context - PAST_FRAMES : context + frames]
     return torch.cat([past[:, -PAST_FRAMES:], made], 1), real
 

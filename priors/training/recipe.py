@@ -19,7 +19,7 @@ from priors.training.corpus import Corpus, Split
 from priors.training.devices import check_processes, refuse_gpu, select_device
 from priors.training.ending.course import VALIDATIONS, End, UntilFlat
 from priors.training.ending.flatness import Point
-from priors.training.gathering import DataSource, describe_origin, describe_selection, find_split_seed, name_origin
+from priors.training.gathering import DataSource, describe_selection, find_split_seed, name_origin
 from priors.training.trainer import GradientTrainer, Trainer
 
 Row = dict[str, Any]
@@ -198,6 +198,8 @@ class Recipe(ABC, Generic[C, S, T]):
             level=self.level,
             seed=self.split_seed,
             share=self.data_share,
+            licence=self.licence,
+            teachers=self.list_teachers(),
         )
 
     @property
@@ -205,9 +207,9 @@ class Recipe(ABC, Generic[C, S, T]):
         """Seed by which clips are kept from training."""
         return self.settings.seed if self.split is None else self.split
 
-    def describe_origin(self) -> Row:
-        """For a card's data: the model that training begins with, and its licence; nothing without one."""
-        return describe_origin(getattr(self, "init", None))
+    def list_teachers(self) -> tuple[str, ...]:
+        """Models that the weights begin with or learn from, bundled or trained."""
+        return (init,) if (init := getattr(self, "init", None)) is not None else ()
 
     def find_shape(self, trainer: T) -> C:
         """Return the configuration of the network that is trained."""

@@ -22,7 +22,7 @@ from priors import checkpoints
 from priors.training import parallel, run_files
 from priors.training.devices import find_precision, has_bfloat16, use_device
 from priors.training.ending.course import Course
-from priors.training.gathering import Progress, gather
+from priors.training.gathering import Progress, describe_origin, gather
 from priors.training.parallel import ALONE, TrainingGroup
 from priors.training.recipe import C, Gathered, Recipe, Row, S, T, average
 from priors.training.record.event_files import EventFiles
@@ -255,6 +255,7 @@ class TrainingRun(Generic[C, S, T]):
     def export(self) -> Path:
         """Write the model with its card."""
         recipe, path = self.recipe.tell_end(self.course.end), self.recipe.out / "model.safetensors"
+        init = getattr(recipe, "init", None)
         if not self.group.leads:
             return path
         if recipe.guards:
@@ -266,7 +267,7 @@ class TrainingRun(Generic[C, S, T]):
             kind=recipe.kind,
             config=recipe.find_shape(self.trainer).as_card(),
             licence=recipe.licence,
-            data={**made.data, **recipe.describe_origin(), "trained_on": self.gathered.describe_training()},
+            data={**made.data, **describe_origin(init), "trained_on": self.gathered.describe_training()},
             training=training | ({"extended": self.extended} if self.extended else {}) | self.course.as_card(),
             quality=made.quality,
             abilities=made.abilities,

@@ -1,5 +1,6 @@
 """Under which licence a trained model is, and which model it began with: as its card tells, and as marks go by."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from priors import checkpoints, licences, weight_sets
 from priors.checkpoints import Card
 from priors.training import corpus as corpora
 from priors.training.bundled.models import list_models
+from priors.training.mocap.made import COLUMNS
 
 CARD = Card("path", {}, licence="CC BY-NC 4.0", **Card.layout_fields())
 
@@ -73,7 +75,7 @@ def test_a_run_that_goes_on_keeps_its_licence(train_path):
 
 
 @pytest.mark.slow
-def test_a_card_names_the_model_that_training_began_with(train_path, tmp_path, monkeypatch):
+def test_a_card_names_the_model_that_training_began_with(train_path, tmp_path, monkeypatch, data, capsys):
     train_path("--licence", "mine alone", out="set/path")
     card = checkpoints.read_card(tmp_path / "set/path/model.json")
     (tmp_path / "set/path/model.json").rename(tmp_path / "set/path.json")
@@ -84,12 +86,63 @@ def test_a_card_names_the_model_that_training_began_with(train_path, tmp_path, m
     assert tuned.data["init"] == {"name": "full/path", "licence": "mine alone"}
     assert "--init full/path" in tuned.training["command"]
     assert tuned.licence == f"{licences.OF_DATA}; mine alone"
-    again = train_path("--init", tmp_path / "tuned", "--learning-rate", 0.0001, "--licence", "CC0 1.0", out="again")
+    again = train_path("--init", tmp_path / "tuned", "--learning-rate", 0.0001, "--licence", "my own", out="again")
     assert again.data["init"] == {"name": "tuned", "licence": tuned.licence}
     assert "--init INIT" in again.training["command"]
     told = {"data": again.data, "training": {}}
     with pytest.raises(CheckpointError, match="it began with 'tuned', whose licence is 'that of the training data"):
-        licences.check_free("free/path", again.licence, told)
+        licences.check_free("free/path", "CC0 1.0", told)
+    words = ("--data", data, "-o", tmp_path / "freed", "--init", tmp_path / "tuned", "--licence", "CC0 1.0")
+    assert run("train", "path", *words) == 2
+    assert "tuned is under 'that of the training data; mine alone'; weights that learn from it cannot be 'CC0 1.0'" in (
+        capsys.readouterr().err
+    )
+
+
+@pytest.mark.parametrize(
+    ("licence", "theirs", "refused"),
+    [
+        ("free for any use", "CC BY-NC 4.0", True),
+        ("CC BY 4.0", "CC BY-NC 4.0", True),
+        ("CC0 1.0", licences.OF_DATA, True),
+        ("CC BY-NC 4.0", "CC BY 4.0", False),
+        ("CC BY 4.0", licences.OF_DATA, False),  # whose is not known, but to who says it
+        ("a contract of 3 May", "CC BY-NC 4.0", False),
+        (licences.OF_DATA, licences.OF_DATA, False),
+        ("free for any use", "free for any use", False),
+    ],
+)
+def test_weights_are_not_freer_than_what_they_learn_from(licence, theirs, refused):
+    if not refused:
+        return licences.check_not_laxer(licence, {"that": theirs})
+    with pytest.raises(RequestError, match=f"that is under '{theirs}'"):
+        licences.check_not_laxer(licence, {"that": theirs})
+
+
+@pytest.mark.parametrize(
+    ("kind", "words", "teacher"),
+    [
+        ("lstm-gmm", ("--init", "full/general"), "full/general"),
+        ("lstm-gmm", ("--splices", 2, "--stitcher", "full/stitcher"), "full/stitcher"),
+        ("refiner", ("--density", "full/locomotion"), "full/locomotion"),
+        ("tweener", ("--path", "full/path"), "full/path"),
+        ("denoiser", ("--init", "full/denoiser"), "full/denoiser"),
+    ],
+)
+def test_nothing_free_is_learnt_from_a_model_that_is_not(tmp_path, data, capsys, kind, words, teacher):
+    words = ("--data", data, "-o", tmp_path / "run", *words, "--licence", "free for any use")
+    assert run("train", kind, *words) == 2
+    assert f"mapctl: {teacher} is under 'CC BY-NC 4.0'; weights that learn" in capsys.readouterr().err
+
+
+def test_nothing_free_sees_clips_that_a_model_made_which_is_not(tmp_path, data, capsys):
+    made = shutil.copytree(data, tmp_path / "made")
+    names = sorted(file.name for file in made.rglob("*.bvh"))
+    rows = "".join(f"{name},yes,locomotion,CC BY-NC 4.0,1,walk.toml,\n" for name in names)
+    (made / "made.csv").write_text(f"{','.join(COLUMNS)}\n{rows}")
+    words = ("--data", made, "-o", tmp_path / "run", "--licence", "CC BY 4.0")
+    assert run("train", "denoiser", *words) == 2
+    assert "a clip that a model made is under 'CC BY-NC 4.0'" in capsys.readouterr().err
 
 
 @pytest.mark.slow
@@ -118,6 +171,8 @@ def test_a_folder_of_a_bundled_name_is_not_that_model(tmp_path, train_path, monk
     [
         (["cmu/02_01.bvh", "bandai-namco-2/data/dataset-2_walk_a_001.bvh"], [], "CC BY-NC 4.0"),
         (["cmu/02_01.bvh", "mine/stroll.bvh"], [], licences.OF_DATA),
+        (["cmu_of_mine/02_01.bvh"], [], licences.OF_DATA),
+        (["cmu_of_mine/02_01.bvh"], ["--weights", "free"], licences.OF_DATA),
         (["cmu/02_01.bvh", "bandai-namco-2/data/dataset-2_walk_a_001.bvh"], ["--weights", "free"], "free for any use"),
         (["cmu/02_01.bvh", "mine/stroll.bvh"], ["--weights", "free", "--match", "stroll"], licences.OF_DATA),
         (["mine/stroll.bvh"], ["--match", "stroll", "--licence", "CC BY 4.0"], "CC BY 4.0"),
@@ -132,7 +187,7 @@ def test_a_set_has_its_licence_only_of_its_own_clips(tmp_path, names, words, lic
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("cmu-ours/dataset-2_walk_a_001.bvh", []),
+        ("cmu/dataset-2_walk_a_001.bvh", []),
         ("bandai/dataset-2_walk_a_001.bvh", ["--match", "walk", "--licence", "free for any use"]),
     ],
 )

@@ -6,6 +6,7 @@ from helpers import corpus, finite_difference, generator, tiny_model
 
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT
+from priors.lstm_gmm.labels import Labels
 from priors.lstm_gmm.network import LstmGmmConfig
 from priors.training.moment_matching import MatchingSettings, moment_loss, run_free
 from priors.training.recipes.density.settings import TrainingSettings
@@ -93,7 +94,9 @@ def test_training_runs_free_once_it_has_begun(monkeypatch):
     )
     trainer, runs = DensityTrainer(LstmGmmConfig(width=8, components=1), settings, corpus()), []
     draw = trainer.network.draw
-    monkeypatch.setattr(trainer.network, "draw", lambda *run: (runs.append(trainer.step), draw(*run))[1])
+    monkeypatch.setattr(
+        trainer.network, "draw", lambda *run, **told: (runs.append(trainer.step), draw(*run, **told))[1]
+    )
     for _ in range(4):
         trainer.train_step()
     assert runs == [2, 3]
@@ -111,18 +114,50 @@ def test_runs_that_wander_first_are_compared_all_the_same():
     far = MatchingSettings(batch=5, context=10, wander=40, frames=10)
     lengths, model = [], tiny_model()
     sample = model.sample
-    model.sample = lambda state, frames, generator: (lengths.append(frames), sample(state, frames, generator))[1]
+    model.sample = lambda state, frames, *how, **told: (lengths.append(frames), sample(state, frames, *how, **told))[1]
     values = [float(free_run_moment_loss(model, windows(), far, generator(seed))) for seed in range(6)]
     assert len(set(lengths)) > 2
     assert max(lengths) <= 40
     assert all(value > 0 for value in values)
 
 
+def labelled_trainer(**kwargs) -> DensityTrainer:
+    """One that always tells each window that it walks."""
+    settings = TrainingSettings(steps=2, batch=4, window=12, untold=0.0, matching=MatchingSettings(wander=3, **kwargs))
+    held = torch.ones(len(corpus().lengths), 1)
+    config = LstmGmmConfig(width=8, components=1, labels=("gait=walk",))
+    return DensityTrainer(config, settings, corpus(), labels=Labels(config.labels, held))
+
+
+def test_a_run_is_that_of_the_network_which_was_told_the_same():
+    trainer, seen = labelled_trainer(), windows(13)
+    told = seen.new_tensor([[1.0], [0.0]])[torch.arange(len(seen)) % 2]
+    made, _ = trainer._run_free(seen, told)
+    for label, walks in ((("gait=walk",), 1.0), ((), 0.0)):
+        fresh = labelled_trainer()
+        alone, _ = run_free(trainer.network.conditioned_on(label), seen, trainer.settings.matching, fresh.generator)
+        rows = told[:, 0] == walks
+        torch.testing.assert_close(made[rows].detach(), alone[rows].detach(), rtol=1e-4, atol=1e-5)
+
+
+def test_what_runs_show_reaches_the_labels_that_they_were_told(monkeypatch):
+    trainer = labelled_trainer(begin=0.0, every=1)
+    seen, told = trainer._draw_windows()
+    trainer.network.zero_grad()
+    trainer._add_free_run_gradients(seen, torch.ones_like(told))
+    assert float(trainer.network.condition.weight.grad[:, 1].abs().max()) > 0
+    monkeypatch.setattr(trainer, "_tell_some", torch.ones_like)
+    handed = []
+    monkeypatch.setattr(trainer, "_add_free_run_gradients", lambda *drawn: handed.append(drawn))
+    trainer.train_step()
+    assert torch.equal(handed[0][1], torch.ones(4, 1))
+
+
 def test_it_is_compared_every_so_many_steps():
     settings = TrainingSettings(steps=9, batch=4, window=12, matching=MatchingSettings(begin=0.0, every=4, batch=4))
     trainer, steps = DensityTrainer(LstmGmmConfig(width=8, components=1), settings, corpus()), []
     match = trainer._add_free_run_gradients
-    trainer._add_free_run_gradients = lambda windows: (steps.append(trainer.step), match(windows))[1]
+    trainer._add_free_run_gradients = lambda *drawn: (steps.append(trainer.step), match(*drawn))[1]
     for _ in range(9):
         trainer.train_step()
     assert steps == [0, 4, 8]

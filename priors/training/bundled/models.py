@@ -80,7 +80,7 @@ class WeightSet:
 SETS: Mapping[str, WeightSet] = {
     "full": WeightSet(
         licence="CC BY-NC 4.0",
-        own=r"(^|/)dataset-[12]_|^cmu",
+        own=r"(^|/)dataset-[12]_|^cmu/",
         locomotion="dataset-2_(walk|walk-turn-left|walk-turn-right|run)_",
         labels="_(?P<gait>run|walk|walk-turn-left|walk-turn-right)_(?P<style>[a-z]+)_",
         critic_steps=1500,
@@ -89,7 +89,7 @@ SETS: Mapping[str, WeightSet] = {
     ),
     "free": WeightSet(
         licence="free for any use",
-        own=r"^cmu",
+        own=r"^cmu/",
         match=r"^cmu(?!.*/(01_14|05_(0[568]|1[04-9])|07_12|09_10|14_36)\.)",  # faulty (docs/guides/data.md)
         locomotion=r"^cmu.*/(02_(0[1-36]|10)|05_01|06_(0\d|1[0-2])|07_(0\d|1[01])|08_\d\d|09_(0[1-69]|1[12])|10_0\d|11_01"
         r"|13_(0[7-9]|1[4-6]|26)|14_(0[45]|1[27-9]|37))\.",

@@ -92,6 +92,10 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
             raise RequestError(f"the prior {self.init!r} was not trained with labels of paces; leave --label-pace out")
         return DensityTrainer(before.config, self.settings, corpus, labels=known, paces=paces, init=before.state_dict())
 
+    def list_teachers(self) -> tuple[str, ...]:
+        """Models that the weights begin with or learn from, bundled or trained."""
+        return super().list_teachers() + ((self.splices.stitcher,) if self.splices.count else ())
+
     def find_shape(self, trainer: DensityTrainer) -> LstmGmmConfig:
         """Return the configuration of the network that is trained."""
         return trainer.network.config

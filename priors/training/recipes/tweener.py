@@ -218,6 +218,10 @@ class TweenerRecipe(NetworkRecipe[GeneratorConfig, TweenerSettings, TweenerTrain
         find_class("", self.labels)
         path_predictor.load(self.path)
 
+    def list_teachers(self) -> tuple[str, ...]:
+        """Models that the weights begin with or learn from, bundled or trained."""
+        return (*super().list_teachers(), self.path)
+
     def make_untaught(self, parts: Split) -> TweenerTrainer:
         """The trainer, its weights drawn."""
         group_clips(parts.train.names, self.labels)  # what the end of training needs

@@ -14,8 +14,9 @@ from mapctl.commands.train.whole_set.licensing import license_models
 from mapctl.commands.train.whole_set.plan import Job, Record, lock_folder, make_jobs
 from mapctl.commands.train.whole_set.workers import Say, train_jobs
 from mapctl.errors import MapctlError, RequestError
+from priors.licences import check_not_laxer, find_strictest
 from priors.training.bundled import weights
-from priors.training.bundled.models import SETS, BundledModel, list_models
+from priors.training.bundled.models import BundledModel, list_models
 from priors.training.mocap.made import find_made, require_made
 
 
@@ -78,15 +79,10 @@ def _train(command: TrainAll, chosen: Sequence[BundledModel]) -> int:
 
 
 def _check_made(folder: Path, licence: str) -> None:
-    """RequestError for a folder without made clips, and for clips that came under a licence that is not that of a set
-    which anybody may use."""
+    """RequestError for a folder without made clips, and for clips under a stricter licence than the weights."""
     made = find_made(folder, [file.relative_to(folder).as_posix() for file in folder.rglob("*.bvh")])
     require_made(made, folder)
-    others = sorted(made.licences - {licence})
-    if others and licence == SETS["free"].licence:
-        raise RequestError(
-            f"{folder} holds clips under {', '.join(others)}; weights that are {licence} must not see them"
-        )
+    check_not_laxer(licence, {f"a clip in {folder}": find_strictest(made.licences)})
 
 
 def _conclude(out: Path, jobs: Sequence[Job], failed: dict[str, str]) -> int:

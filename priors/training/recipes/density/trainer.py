@@ -63,7 +63,7 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
         self._pace_labels = [] if paces is None else [self.labels.names.index(name) for name in PACE_LABELS]
         self.clip_ends = torch.tensor(corpus.lengths).cumsum(0)
         self.windows = FeatureWindows(corpus, settings.window + 1, standing_share=settings.standing_share)
-        self._latest = corpus.features[:0]  # windows of the step under way
+        self._latest = corpus.features[:0], self.labels.held[:0]  # windows of the step under way, and their labels
         self.judge: FreeRunJudge | None = None
         self.average = self.network
         """Moving average of the weights since the critic joined, the weights themselves without one: what is measured
@@ -119,8 +119,8 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
 
     def losses(self) -> dict[str, Tensor]:
         """Compute the losses of a newly drawn batch, nats a frame."""
-        self._latest, condition = self._draw_windows()
-        return {"loss": -self._log_prob(self._latest, condition).mean()}
+        self._latest = self._draw_windows()
+        return {"loss": -self._log_prob(*self._latest).mean()}
 
     def limit_gradients(self) -> None:
         """Clip, and add the gradient of free runs where it is time for it."""
@@ -131,13 +131,13 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
             nn.utils.clip_grad_norm_(self.network.parameters(), settings.gradient_clip)
         if self._joined is not None:
             if self._criticised % settings.critic.every == 0:
-                self._add_free_run_gradients(self._latest)
+                self._add_free_run_gradients(*self._latest)
             return
         # Of a run of unknown length the last part is its decay.
         begin = matching.begin * (self.first_steps - settings.critic.steps)
         is_late = self.decay is not None if self.steady else self.step >= begin
         if matching.begin < 1 and is_late and self.step % matching.every == 0:
-            self._add_free_run_gradients(self._latest)
+            self._add_free_run_gradients(*self._latest)
 
     def compute_learning_rate(self) -> float:
         """At the current step."""
@@ -187,22 +187,23 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
         self.average.load_state_dict(self.network.state_dict())
         made, count = [], self.group.share(settings.history)
         while sum(map(len, made)) < count:
-            made.append(self._run_free(self._draw_windows()[0])[0])
+            made.append(self._run_free(*self._draw_windows())[0])
         judge.fill(torch.cat(made)[:count])
         with torch.enable_grad():
             judge.learn(self, settings.head_start)
 
-    def _run_free(self, windows: Tensor) -> tuple[Tensor, Tensor]:
-        """Free runs after the first windows, and how these go on."""
+    def _run_free(self, windows: Tensor, told: Tensor) -> tuple[Tensor, Tensor]:
+        """Free runs after the first windows, told their labels as the network is in this step, and how these go on."""
         matching = self.settings.matching
         matching = replace(matching, batch=max(_LEAST_RUNS, self.group.share(matching.batch)))
         least = self.settings.critic.frames if self.judge is not None else 0
-        return run_free(self.network, windows, matching, self.generator, self.common, least=least)
+        condition = self._make_condition(told.new_zeros(len(told), 1), told)
+        return run_free(self.network, windows, matching, self.generator, self.common, least=least, condition=condition)
 
-    def _add_free_run_gradients(self, windows: Tensor) -> None:
+    def _add_free_run_gradients(self, windows: Tensor, told: Tensor) -> None:
         """Add the gradient of the free runs' mismatch, and that of what the critic says of them where it has joined,
         each clipped on its own: no loss drowns another."""
-        judge, (made, real) = self._joined, self._run_free(windows)
+        judge, (made, real) = self._joined, self._run_free(windows, told)
         if self.settings.matching.begin < 1:
             moments = moment_loss(made[:, : real.shape[1]], real, self.settings.matching)
             self._add_gradient(moments, retain_graph=judge is not None)
@@ -250,11 +251,15 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
         model, size = self.network, self.network.layout.continuous
         inputs, level = self._add_noise(model.normalise(windows[:, :-1]), size)
         memory = model.start_after(windows[:, 0])
-        condition = torch.cat([level / NOISE_UNIT, told], -1) if model.config.knows_noise else told
+        condition = self._make_condition(level, told)
         with torch.autocast(windows.device.type, torch.bfloat16, enabled=self.settings.bfloat16):
             mixture, _ = model(inputs, (memory.hidden, memory.cell), condition=condition)
         target = torch.cat([model.normalise(windows[:, 1:])[..., :size], windows[:, 1:, size:]], dim=-1)
         return mixture.log_prob(target, model.whitening)
+
+    def _make_condition(self, level: Float[Tensor, "batch 1"], told: Tensor) -> Float[Tensor, "batch conditions"]:
+        """Make what the network is told: the level of its input's noise where it wants to know it, and labels."""
+        return torch.cat([level / NOISE_UNIT, told], -1) if self.network.config.knows_noise else told
 
     def _add_noise(self, inputs: Tensor, size: int) -> tuple[Tensor, Float[Tensor, "batch 1"]]:
         """Inputs with noise and flipped bits, and each window's level of noise."""

@@ -64,6 +64,10 @@ class SampleRecipe(Recipe[RefinerConfig, S, T]):
         """Gather the data, split as the density's, so that its held-out clips stay held out."""
         return replace(super().source(), match=self._find_match())
 
+    def list_teachers(self) -> tuple[str, ...]:
+        """Models that the weights begin with or learn from, bundled or trained."""
+        return (*super().list_teachers(), self.density)
+
     @property
     def split_seed(self) -> int:
         """That of the density, so that its held-out clips stay held out."""
