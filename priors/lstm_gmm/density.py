@@ -133,10 +133,12 @@ class LstmGmmDensity(checkpoints.LoadedModel, Density[LstmState]):
             raise RequestError(f"the prior {self.name!r} knows several labels {name!r}; choose {' or '.join(found)}")
         if found:
             return found[0]
+        if not self.labels:
+            raise RequestError(f"the prior {self.name!r} has no labels; asked for: {name!r}")
         group, equals, value = name.partition("=")
         if not equals or group not in self.labels:
-            group, value = " or ".join(self.labels) or "label", name
-        values = "; ".join(f"{kind}: {', '.join(values)}" for kind, values in self.labels.items()) or "none"
+            group, value = " or ".join(self.labels), name
+        values = "; ".join(f"{kind}: {', '.join(values)}" for kind, values in self.labels.items())
         raise RequestError(f"the prior {self.name!r} knows no {group} {value!r}, only {values}")
 
     def start_after(self, last_frame: Float[Tensor, "batch size"]) -> LstmState:
