@@ -26,8 +26,10 @@ _PLAN = {
     "denoise": "denoise --data DATA --count 30",
     "denoise-free": "denoise --data DATA --count 30 --clips bandai --baselines free/denoiser"
     " --inbetweener free/transformer",
+    "denoise-free-cmu": "denoise --data DATA --denoiser free/denoiser --inbetweener free/transformer --count 60",
     "infill": "infill --data DATA --count 30",
     "infill-free": "infill --data DATA --clips bandai --baselines free/transformer",
+    "infill-free-cmu": "infill --data DATA --inbetweener free/transformer --count 60",
     "gaps": "gaps --data DATA --count 25",
     "transitions": "transitions --data DATA --count 60 --stitcher stitcher",
     "transitions-bare": "transitions --data DATA --count 60 --stitcher stitcher --past 1",
