@@ -102,7 +102,7 @@ def _check(out: Path, of: str) -> int:
     known = {model.name for model in list_models(of)}
     lacking = sorted(known - set(summary.list_names(summary.find_weights(out))))
     if lacking:
-        print(f"not there: {', '.join(lacking)}")
+        print(f"not there: {', '.join(lacking)} (of the {of} set; --weights chooses)")
     return exit_status.NOT_SATISFIED if lacking or total > weights.MOST_BYTES else 0
 
 
