@@ -134,7 +134,7 @@ class LstmGmmDensity(checkpoints.LoadedModel, Density[LstmState]):
         if found:
             return found[0]
         if not self.labels:
-            raise RequestError(f"the prior {self.name!r} has no labels; asked for: {name!r}")
+            raise RequestError(f"the prior {self.name!r} knows no label {name!r}, it has none")
         group, equals, value = name.partition("=")
         if not equals or group not in self.labels:
             group, value = " or ".join(self.labels), name

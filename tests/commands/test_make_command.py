@@ -191,7 +191,7 @@ def test_a_free_set_sees_no_clips_of_a_model_that_is_not_free(tmp_path, capsys):
     write_corpus(tmp_path / "mocap", 2)
     words = ("train", "all", "--data", tmp_path / "mocap", "-o", tmp_path / "set", "--weights", "free", "--made")
     assert run(*words, write_list(tmp_path / "theirs", "CC BY-NC 4.0", "a.bvh")) == 2
-    assert "holds clips under CC BY-NC 4.0; weights that are free for any use" in capsys.readouterr().err
+    assert "is under 'CC BY-NC 4.0'; weights that learn from it cannot be 'free for any use'" in capsys.readouterr().err
     assert run(*words, tmp_path / "mocap") == 2
     assert "holds no clips that mapctl make has listed" in capsys.readouterr().err
     assert not (tmp_path / "set").exists()
