@@ -97,8 +97,8 @@ def check_not_laxer(licence: str, origins: Licences) -> None:
     """Raise RequestError where weights would be under a laxer licence than a model, or made motion, that they learn
     from. One that is not known is stricter than those that ask for nothing."""
     for name, theirs in origins.items():
-        strict = licence in FREE if _find_known(theirs) is None else _rank(licence) < _rank(theirs)
-        if strict and licence != theirs:
+        laxer = licence in FREE if _find_known(theirs) is None else _rank(licence) < _rank(theirs)
+        if laxer:
             raise RequestError(f"{name} is under {theirs!r}; weights that learn from it cannot be {licence!r}")
 
 
