@@ -1,5 +1,6 @@
 """Free runs held to the data's moments: the penalty is zero for the data itself, and training lowers it."""
 
+import numpy as np
 import pytest
 import torch
 from helpers import corpus, finite_difference, generator, tiny_model
@@ -8,6 +9,8 @@ from mapctl.errors import RequestError
 from mapctl.features import LAYOUT
 from priors.lstm_gmm.labels import Labels
 from priors.lstm_gmm.network import LstmGmmConfig
+from priors.lstm_gmm.paces import PACE_LABELS
+from priors.training.mocap.paces import follow_paces
 from priors.training.moment_matching import MatchingSettings, moment_loss, run_free
 from priors.training.recipes.density.settings import TrainingSettings
 from priors.training.recipes.density.trainer import DensityTrainer
@@ -122,35 +125,40 @@ def test_runs_that_wander_first_are_compared_all_the_same():
 
 
 def labelled_trainer(**kwargs) -> DensityTrainer:
-    """One that always tells each window that it walks."""
+    """One that can be told a gait and a pace."""
     settings = TrainingSettings(steps=2, batch=4, window=12, untold=0.0, matching=MatchingSettings(wander=3, **kwargs))
-    held = torch.ones(len(corpus().lengths), 1)
-    config = LstmGmmConfig(width=8, components=1, labels=("gait=walk",))
-    return DensityTrainer(config, settings, corpus(), labels=Labels(config.labels, held))
+    names = ("gait=walk", *PACE_LABELS)
+    labels = Labels(names, torch.zeros(len(corpus().lengths), len(names)))
+    config = LstmGmmConfig(width=8, components=1, labels=names)
+    return DensityTrainer(config, settings, corpus(), labels=labels, paces=follow_paces(corpus()))
 
 
-def test_a_run_is_that_of_the_network_which_was_told_the_same():
+def test_a_run_is_that_of_the_network_which_was_told_the_pace_alone():
     trainer, seen = labelled_trainer(), windows(13)
-    told = seen.new_tensor([[1.0], [0.0]])[torch.arange(len(seen)) % 2]
+    chosen = torch.arange(len(seen)) % 3
+    told = torch.cat([seen.new_ones(len(seen), 1), seen.new_tensor(np.eye(3))[chosen]], -1)
     made, _ = trainer._run_free(seen, told)
-    for label, walks in ((("gait=walk",), 1.0), ((), 0.0)):
+    for number, pace in enumerate(PACE_LABELS):
         fresh = labelled_trainer()
-        alone, _ = run_free(trainer.network.conditioned_on(label), seen, trainer.settings.matching, fresh.generator)
-        rows = told[:, 0] == walks
+        alone, _ = run_free(trainer.network.conditioned_on((pace,)), seen, trainer.settings.matching, fresh.generator)
+        rows = chosen == number
+        assert bool(rows.any())
         torch.testing.assert_close(made[rows].detach(), alone[rows].detach(), rtol=1e-4, atol=1e-5)
 
 
-def test_what_runs_show_reaches_the_labels_that_they_were_told(monkeypatch):
+def test_what_runs_show_reaches_the_paces_that_they_were_told_and_no_other_label(monkeypatch):
     trainer = labelled_trainer(begin=0.0, every=1)
     seen, told = trainer._draw_windows()
     trainer.network.zero_grad()
     trainer._add_free_run_gradients(seen, torch.ones_like(told))
-    assert float(trainer.network.condition.weight.grad[:, 1].abs().max()) > 0
+    gradient = trainer.network.condition.weight.grad[:, 1:]  # the first is the level of noise
+    assert float(gradient[:, 0].abs().max()) == 0
+    assert float(gradient[:, 1:].abs().amax(0).min()) > 0
     monkeypatch.setattr(trainer, "_tell_some", torch.ones_like)
     handed = []
     monkeypatch.setattr(trainer, "_add_free_run_gradients", lambda *drawn: handed.append(drawn))
     trainer.train_step()
-    assert torch.equal(handed[0][1], torch.ones(4, 1))
+    assert torch.equal(handed[0][1], torch.ones(4, 4))
 
 
 def test_it_is_compared_every_so_many_steps():

@@ -193,11 +193,17 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
             judge.learn(self, settings.head_start)
 
     def _run_free(self, windows: Tensor, told: Tensor) -> tuple[Tensor, Tensor]:
-        """Free runs after the first windows, told their labels as the network is in this step, and how these go on."""
+        """Free runs after the first windows, told their paces as the network is in this step, and how these go on.
+
+        A pace may change within a window. Gait and style last, and runs have them from the frames they begin with: told
+        them as well, a density of walks was no better (docs/explanations/realism.md, "What was tried on top").
+        """
         matching = self.settings.matching
         matching = replace(matching, batch=max(_LEAST_RUNS, self.group.share(matching.batch)))
         least = self.settings.critic.frames if self.judge is not None else 0
-        condition = self._make_condition(told.new_zeros(len(told), 1), told)
+        paces = torch.zeros_like(told)
+        paces[:, self._pace_labels] = told[:, self._pace_labels]
+        condition = self._make_condition(told.new_zeros(len(told), 1), paces)
         return run_free(self.network, windows, matching, self.generator, self.common, least=least, condition=condition)
 
     def _add_free_run_gradients(self, windows: Tensor, told: Tensor) -> None:
