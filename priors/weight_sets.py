@@ -116,6 +116,11 @@ def add_set(name: str) -> str:
     return f"{weights}/{name}" if bare else name
 
 
+def name_for_records(name: str) -> str:
+    """Name a model in a card or a list that others read: with its set if it is bundled, else without its folder."""
+    return add_set(name) if means_bundled(name) else Path(name).name
+
+
 def write_path(path: Path) -> str:
     """Write a path so that it never means a bundled model of its name."""
     return f".{os.sep}{path}" if means_bundled(str(path)) else str(path)

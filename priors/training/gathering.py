@@ -12,7 +12,7 @@ from priors.licences import OF_DATA, check_not_laxer, find_strictest
 from priors.training.augmentation.splices import Splices, add_splices
 from priors.training.corpus import Corpus, SkippedFile, Split, join_made, keep_share, read_corpus, split_corpus
 from priors.training.mocap.made import require_made
-from priors.weight_sets import add_set, means_bundled
+from priors.weight_sets import add_set, means_bundled, name_for_records
 
 Progress = Callable[[str], None]
 """Called with one line of news."""
@@ -153,8 +153,7 @@ def describe_origin(init: str | None) -> dict[str, dict[str, str]]:
     """For a card's data: the model that training began with, and its licence; nothing without one."""
     if init is None:
         return {}
-    name = add_set(init) if means_bundled(init) else Path(init).name
-    return {"init": {"name": name, "licence": _read_card(init).licence}}
+    return {"init": {"name": name_for_records(init), "licence": _read_card(init).licence}}
 
 
 def _read_card(name: str) -> checkpoints.Card:

@@ -84,6 +84,14 @@ def test_another_model_stands_in_where_a_set_has_none_of_its_own(folder):
     assert "locomotion-live" not in weight_sets.list_models("free")
 
 
+def test_records_name_a_model_so_that_everybody_knows_which_it_was(folder):
+    assert weight_sets.name_for_records("locomotion") == "full/locomotion"
+    assert weight_sets.name_for_records("runs/locomotion.safetensors") == "locomotion.safetensors"
+    with priors.use_weights("free"):
+        assert weight_sets.name_for_records("locomotion") == "free/locomotion"
+        assert weight_sets.name_for_records("full/locomotion") == "full/locomotion"
+
+
 def test_what_the_free_set_lacks_is_refused_though_the_full_one_has_it(folder):
     with priors.use_weights("free"):
         with pytest.raises(CheckpointError, match=r"the free weights have no 'general': they hold denoiser, .*; full/"):

@@ -3,7 +3,6 @@
 import csv
 import io
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -26,6 +25,7 @@ from mapctl.pose import BodyPose
 from priors.lstm_gmm.density import LstmGmmDensity
 from priors.training.corpus import read_corpus
 from priors.training.mocap.made import COLUMNS, TABLE_NAME
+from priors.weight_sets import name_for_records
 
 _MAX_CLIPS = 10_000
 _LEAST_SECONDS = 3.0
@@ -105,7 +105,7 @@ def _describe(
     return {
         "file": name,
         "kept": "no" if faults else "yes",
-        "model": Path(prior.name).name,
+        "model": name_for_records(prior.name),
         "licence": prior.card.licence,
         "seed": command.seed + number,
         "script": script,

@@ -42,7 +42,8 @@ def print_set(folder: Path) -> int:
     print_table(["model", "minutes of a core", "steps", "quality", "that is", "MB", "ended because"], rows)
     total = sum(model.size for model in models)
     over = "" if total <= MOST_BYTES else f", {(total - MOST_BYTES) / _MEGABYTE:.1f} MB too much"
-    print(f"{len(models)} models, {total / _MEGABYTE:.1f} MB of {MOST_BYTES / _MEGABYTE:g} MB{over}")
+    count = "1 model" if len(models) == 1 else f"{len(models)} models"
+    print(f"{count}, {total / _MEGABYTE:.1f} MB of {MOST_BYTES / _MEGABYTE:g} MB{over}")
     return total
 
 
