@@ -21,10 +21,11 @@ from priors.pose_transformer.network import PoseTransformerConfig, PoseTransform
 
 SOURCE = "transformer"
 """Name of the in-betweener in notes."""
-MAX_GAP_FRAMES = 180
-"""Frames of the longest gap that it fills; longer ones it leaves interpolated, and says so."""
+MAX_GAP_FRAMES = 240
+"""Frames of the longest gap that it fills; longer ones it leaves interpolated, and says so. Windows of training have up
+to 200 frames; beyond 240 the hips stray farther than between poses that are interpolated."""
 _CONTEXT = 24  # frames on either side of what is unknown that the network sees
-_MAX_WINDOW, _OVERLAP = 240, 60  # frames of the longest window, and of two windows that share frames
+_MAX_WINDOW, _OVERLAP = 240, 60  # frames of the longest window that no gap asks for, and that two windows share
 _PARTNERS = CANONICAL.mirror_partners()
 
 
@@ -52,11 +53,15 @@ class PoseTransformer(checkpoints.LoadedModel, Inbetweener):
         """
         origin = _find_origin(query)
         motion = self._show(_move(query, -origin))
-        poses = _average_mirrored(self._propose_windows(motion.with_mirror_image()))
+        gaps = _find_silent_gaps(query)
+        longest = max((stop - start for start, stop in gaps if stop - start <= MAX_GAP_FRAMES), default=0)
+        poses = _average_mirrored(self._propose_windows(motion.with_mirror_image(), longest))
         root = poses.root_position[0].double() * query.scale + origin
         quats = rotations.from_matrix(poses.local_matrix[0].double())
         shown, missing = query.motion, query.missing
-        too_long = _find_too_long(query)
+        too_long = torch.zeros_like(missing.root)
+        for start, stop in gaps:
+            too_long[start:stop] = stop - start > MAX_GAP_FRAMES
         # What is known keeps the query's own numbers.
         root = torch.where((missing.root & ~too_long)[:, None], root, shown.root_position)
         turned = missing.joints & ~too_long[:, None]
@@ -109,11 +114,11 @@ class PoseTransformer(checkpoints.LoadedModel, Inbetweener):
         )
         return self.network.interpolate(motion)
 
-    def _propose_windows(self, motion: PartialMotion) -> ProposedPoses:
-        """Propose window by window; where two overlap, one fades into the other."""
+    def _propose_windows(self, motion: PartialMotion, longest: int) -> ProposedPoses:
+        """Propose window by window, with room for the longest gap; where two overlap, one fades into the other."""
         frames = motion.heading.shape[1]
         joined, weights = _rows_of(motion), torch.zeros(frames)
-        for first, stop in _lay_windows(~motion.known.everything[0]):
+        for first, stop in _lay_windows(~motion.known.everything[0], max(_MAX_WINDOW, longest + 2 * _CONTEXT)):
             rows = _pack(self.network(motion.slice(first, stop)))
             fade = _fade_in(first, weights, stop)
             joined[:, first:stop] = torch.lerp(joined[:, first:stop], rows, fade[:, None])
@@ -138,17 +143,17 @@ def _move(query: GapQuery, shift: Float[Tensor, " 3"]) -> GapQuery:
     return replace(query, motion=moved, effector_targets=targets)
 
 
-def _lay_windows(unknown: Bool[Tensor, " frames"]) -> Iterator[tuple[int, int]]:
-    """Yield first frame and one past the last of windows around what is unknown."""
+def _lay_windows(unknown: Bool[Tensor, " frames"], longest: int) -> Iterator[tuple[int, int]]:
+    """Yield first frame and one past the last of windows around what is unknown, none longer than the longest."""
     frames = len(unknown)
     near = unknown.clone()
     for _, start, stop in true_intervals(unknown[:, None]):
         near[max(0, start - _CONTEXT // 2) : stop + _CONTEXT // 2] = True
     for _, start, stop in true_intervals(near[:, None]):
         first, stop = max(0, start - _CONTEXT // 2), min(frames, stop + _CONTEXT // 2)
-        while stop - first > _MAX_WINDOW:
-            yield first, first + _MAX_WINDOW
-            first += _MAX_WINDOW - _OVERLAP
+        while stop - first > longest:
+            yield first, first + longest
+            first += longest - _OVERLAP
         yield first, stop
 
 
@@ -161,17 +166,14 @@ def _fade_in(first: int, weights: Float[Tensor, " frames"], stop: int) -> Float[
     return fade
 
 
-def _find_too_long(query: GapQuery) -> Bool[Tensor, " frames"]:
-    """Return frames of gaps in which nothing is told and that are longer than the network knows."""
+def _find_silent_gaps(query: GapQuery) -> list[tuple[int, int]]:
+    """Return first frames and one past the last of gaps in which nothing is told."""
     silent = query.nothing_known
     if query.effector_targets is not None:
         silent = silent & ~query.effector_targets.wanted.any(dim=1)
     if query.keep_trajectory:
         silent = silent & ~query.missing.root
-    found = torch.zeros_like(silent)
-    for _, start, stop in true_intervals(silent[:, None]):
-        found[start:stop] = stop - start > MAX_GAP_FRAMES
-    return found
+    return [(start, stop) for _, start, stop in true_intervals(silent[:, None])]
 
 
 def _rows_of(motion: PartialMotion) -> Float[Tensor, "batch frames rows"]:

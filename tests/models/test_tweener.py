@@ -2,7 +2,7 @@
 
 import math
 import re
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import pytest
 import torch
@@ -16,13 +16,27 @@ from controllers.inbetweening.proposers import AutoInbetweener, SlerpInbetweener
 from controllers.inbetweening.proposers.auto import ChoiceSettings
 from mapctl import motion_dna, rotations
 from mapctl.errors import CheckpointError
+from mapctl.inbetweening import GapQuery, Proposal
 from mapctl.inbetweening.effector_targets import EffectorTargets
 from mapctl.inbetweening.missing import MissingMask
+from mapctl.inbetweening.query import INTERPOLATION, GapSource
+from mapctl.protocols import Inbetweener
 from mapctl.recording.masks import ALL, Mask
 from mapctl.retarget import to_canonical
 from mapctl.skeleton import CANONICAL
 from priors.tweening.generator import GeneratorNetwork
 from priors.tweening.inbetweener import calm_poses, keep_feet
+
+
+@dataclass(frozen=True, eq=False)
+class Told(Inbetweener):
+    """Proposes what it was told."""
+
+    proposal: Proposal
+    has_style: bool = False
+
+    def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
+        return self.proposal
 
 
 def query_of(motion, *gaps):
@@ -169,6 +183,24 @@ def test_auto_leaves_long_gaps_between_whole_poses_to_it_and_holds_who_stands():
     assert {source.by for source in plain.propose(query).attribute(query)} == {"slerp"}
     still = query_of(standing(200), (1, 199))
     assert [source.by for source in auto.propose(still).attribute(still)] == ["standing still"]
+
+
+def test_auto_keeps_a_long_gap_that_the_network_fills_and_in_which_the_body_moves():
+    motion = walk(200)
+    query = query_of(motion, (31, 190))
+    logits = torch.zeros(200, 2)
+    moving, still = Proposal(motion, logits, "transformer"), Proposal(query.motion, logits, "transformer")
+    unfilled = replace(moving, others=(GapSource(31, 190, INTERPOLATION, "longer than it knows"),))
+    tweened = Told(Proposal(motion, logits, "tweener"))
+
+    def find_source(network: Proposal, tweener: Inbetweener = tweened) -> list[str]:
+        auto = AutoInbetweener(Told(network), settings=ChoiceSettings(long=75), tweener=tweener)
+        return [source.by for source in auto.propose(query).attribute(query)]
+
+    assert find_source(moving) == ["transformer"]
+    assert find_source(still) == ["tweener"]
+    assert find_source(unfilled) == ["tweener"]
+    assert find_source(moving, Told(tweened.proposal, has_style=True)) == ["tweener"]
 
 
 @pytest.mark.slow

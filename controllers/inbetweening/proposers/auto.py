@@ -1,5 +1,5 @@
-"""Choice of the proposer of each gap: a network, a tweener where the gap is longer than that network fills, a stitcher
-where hands, feet or hips are told between two poses, a held pose where the body stands still.
+"""Choice of the proposer of each gap: a network, a tweener in long gaps that the network does not fill or hardly moves
+in, a stitcher where hands, feet or hips are told between two poses, a held pose where the body stands still.
 
 Rollouts of a density have no part in it: their feet slide less as proposed, but the MAP stage plants the feet of
 either, and then the pose transformer's answer is nearer to mocap in all that it fills.
@@ -15,9 +15,12 @@ from controllers.inbetweening.proposers.partial_keys import propose_through_keys
 from controllers.inbetweening.proposers.rollouts import RolloutSettings
 from controllers.inbetweening.proposers.stitched import StitchedInbetweener
 from controllers.inbetweening.proposers.walked import PlaceWalker
-from mapctl import contacts
+from mapctl import contacts, rotations
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening import GapQuery, Proposal
+from mapctl.inbetweening.query import INTERPOLATION
+from mapctl.metrics.liveliness import see_from_hips
+from mapctl.motion import Motion
 from mapctl.protocols import Density, Inbetweener
 from mapctl.skeleton import CANONICAL, TOES
 
@@ -32,7 +35,10 @@ class ChoiceSettings:
     """Lengths of gaps from which others than the network propose, and what counts as standing still."""
 
     long: int = 181
-    """Frames of the shortest gap between whole poses, with partial keys in it or none, that is a tweener's."""
+    """Frames of the shortest gap between whole poses, with partial keys in it or none, that can be a tweener's."""
+    lively: float = 0.5
+    """Speed of the body seen from its hips, over the tweener's, from which on such a gap without keys in it is the
+    network's all the same: of who walks it tells more, of others it may know nothing and blend the poses."""
     styled: int = 60
     """And where the tweener was told a style: in less than 2 s there is no room for one."""
     stitched: int = 60
@@ -93,7 +99,9 @@ class AutoInbetweener(Inbetweener):
         made = self.network.propose(query, generator=generator)
         long = [gap for gap in query.hide_partial_keys().enclosed_gaps if self._is_tweeners(query, *gap)]
         if long and self.tweener is not None:
-            made = _fill_from(propose_through_keys(query, self.tweener, generator)[0], made, query, long)
+            tweened, _ = propose_through_keys(query, self.tweener, generator)
+            long = [gap for gap in long if self.has_style or not self._keeps(query, made, tweened, gap)]
+            made = _fill_from(tweened, made, query, long)
         told = [gap for gap in query.hide_partial_keys().enclosed_gaps if self._is_stitchers(query, *gap)]
         if told and self.stitcher is not None:
             proposed = _Given(made)  # and not asked again for what the stitcher leaves
@@ -115,13 +123,19 @@ class AutoInbetweener(Inbetweener):
         shortest = self.settings.styled if self.has_style else self.settings.long
         return stop - start >= shortest and not _is_beside_part(query, start, stop)
 
+    def _keeps(self, query: GapQuery, made: Proposal, tweened: Proposal, gap: tuple[int, int]) -> bool:
+        """Return whether a gap stays the network's: it fills the whole of it, and the body moves there."""
+        by = {source.by for source in made.attribute(query) if (source.start, source.stop) == gap}
+        if INTERPOLATION in by or _has_parts_within(query, *gap):
+            return False
+        speed, other = (_measure_speed(proposal.motion, gap) for proposal in (made, tweened))
+        return speed >= self.settings.lively * other
+
     def _is_stitchers(self, query: GapQuery, start: int, stop: int) -> bool:
         """Return whether a gap is the stitcher's: short, with more told in it than the poses beside it."""
         if query.keep_trajectory or self._is_tweeners(query, start, stop) or _is_beside_part(query, start, stop):
             return False
-        within, targets = slice(start, stop), query.effector_targets
-        told = query.root_only_keys[within].any() or (targets is not None and targets.wanted[within].any())
-        return bool(told) and stop - start <= self.settings.stitched
+        return stop - start <= self.settings.stitched and _has_parts_within(query, start, stop)
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,6 +152,12 @@ def _is_beside_part(query: GapQuery, start: int, stop: int) -> bool:
     """Return whether a frame beside a gap is known in part."""
     edges = [start - 1, stop]
     return bool(query.missing.joints[edges].any() | query.missing.root[edges].any())
+
+
+def _has_parts_within(query: GapQuery, start: int, stop: int) -> bool:
+    """Return whether places of hands, feet or hips are told within a gap."""
+    within, targets = slice(start, stop), query.effector_targets
+    return bool(query.root_only_keys[within].any() or (targets is not None and targets.wanted[within].any()))
 
 
 def _is_within(gap: tuple[int, int], gaps: Sequence[tuple[int, int]]) -> bool:
@@ -167,6 +187,13 @@ def _is_standing_still(query: GapQuery, start: int, stop: int, settings: ChoiceS
         if one >= 0 and other < len(positions) and not bool(unknown[[one, other]].any()):
             speeds.append(float((positions[other] - positions[one]).norm(dim=-1).mean()) * PRIOR_FPS)
     return apart < settings.same_pose_distance and max(speeds) < settings.at_rest
+
+
+def _measure_speed(motion: Motion, gap: tuple[int, int]) -> float:
+    """Measure the mean speed of joints seen from the hips, metres a frame, in a gap and on its edges."""
+    part = motion.slice(gap[0] - 1, gap[1] + 1)
+    seen = see_from_hips(part.joint_positions(), rotations.to_matrix(part.local_quat_xyzw[:, 0]))
+    return float(seen.diff(dim=0).norm(dim=-1).mean())
 
 
 def _goes_astray(query: GapQuery, made: Proposal, gap: tuple[int, int], settings: ChoiceSettings) -> bool:
