@@ -4,17 +4,12 @@ interpolation is proposed.
 
 from collections.abc import Sequence
 
-import torch
-from jaxtyping import Float
-from torch import Tensor
-
 from controllers.inbetweening.error_estimates import ErrorEstimate, estimate_error, is_travelling
 from controllers.inbetweening.proposers.auto import STANDING_STILL
-from mapctl import rotations
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening import GapQuery, Proposal
 from mapctl.inbetweening.query import GapSource
-from mapctl.kinematics import heading
+from mapctl.metrics.liveliness import measure_path_length
 from mapctl.motion import Motion
 
 _INFILLER, _INFILLER_FRAMES = "infiller", 75
@@ -85,11 +80,8 @@ def _is_morph(query: GapQuery, made: Motion, source: GapSource) -> bool:
     """Return whether a long gap is filled by little more than an interpolation although the body moves around it."""
     if source.stop - source.start < _MIN_MORPH_FRAMES or source.by == STANDING_STILL:
         return False
-    part = slice(max(0, source.start - 1), source.stop + 1)
-    path_length, straight = (
-        _compute_path_length(each.joint_positions()[part], heading(each.local_quat_xyzw[part, 0]))
-        for each in (made, query.motion)
-    )
+    first, end = max(0, source.start - 1), min(source.stop + 1, query.motion.num_frames)
+    path_length, straight = (measure_path_length(each.slice(first, end)) for each in (made, query.motion))
     travelling = is_travelling(query.motion, max(0, source.start - 1), min(source.stop, len(query.missing.root) - 1))
     speed, straight_speed = (each * PRIOR_FPS / (source.stop - source.start) for each in (path_length, straight))
     still = straight_speed < _STILL_SPEED and _is_still_beside(query, source)
@@ -105,10 +97,3 @@ def _is_still_beside(query: GapQuery, source: GapSource) -> bool:
         if float((positions[other] - positions[one]).norm(dim=-1).mean()) * PRIOR_FPS > _STILL_SPEED:
             return False
     return True
-
-
-def _compute_path_length(positions: Float[Tensor, "frames joints 3"], facing: Float[Tensor, " frames"]) -> float:
-    """Compute the length of the joints' paths relative to the hips and their facing, mean over joints, metres."""
-    to_facing = rotations.about_y(-facing)[:, None].expand(-1, positions.shape[1], 4)
-    own = rotations.rotate(to_facing, positions - positions[:, :1])
-    return float(torch.diff(own, dim=0).norm(dim=-1).sum(dim=0).mean())

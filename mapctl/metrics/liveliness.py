@@ -11,6 +11,7 @@ from torch import Tensor
 
 from mapctl import rotations
 from mapctl.kinematics import heading_of_matrix
+from mapctl.motion import Motion
 
 _UNIT = 100.0  # cm
 
@@ -43,6 +44,12 @@ def see_from_hips(
 ) -> Float[Tensor, "*batch frames joints 3"]:
     """Return joint places from the hips along the hips' heading, metres."""
     return rotations.rotate_about_y(places - places[..., :1, :], -heading_of_matrix(hips_world_matrix)[..., None])
+
+
+def measure_path_length(motion: Motion) -> float:
+    """Measure the length of the joints' paths as seen from the hips, mean over joints, metres."""
+    seen = see_from_hips(motion.joint_positions(), rotations.to_matrix(motion.local_quat_xyzw[:, 0]))
+    return float(seen.diff(dim=0).norm(dim=-1).sum(dim=0).mean())
 
 
 def measure_liveliness(

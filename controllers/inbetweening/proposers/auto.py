@@ -15,12 +15,11 @@ from controllers.inbetweening.proposers.partial_keys import propose_through_keys
 from controllers.inbetweening.proposers.rollouts import RolloutSettings
 from controllers.inbetweening.proposers.stitched import StitchedInbetweener
 from controllers.inbetweening.proposers.walked import PlaceWalker
-from mapctl import contacts, rotations
+from mapctl import contacts
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening import GapQuery, Proposal
 from mapctl.inbetweening.query import INTERPOLATION
-from mapctl.metrics.liveliness import see_from_hips
-from mapctl.motion import Motion
+from mapctl.metrics.liveliness import measure_path_length
 from mapctl.protocols import Density, Inbetweener
 from mapctl.skeleton import CANONICAL, TOES
 
@@ -37,8 +36,8 @@ class ChoiceSettings:
     long: int = 181
     """Frames of the shortest gap between whole poses, with partial keys in it or none, that can be a tweener's."""
     lively: float = 0.5
-    """Speed of the body seen from its hips, over the tweener's, from which on such a gap without keys in it is the
-    network's all the same: of who walks it tells more, of others it may know nothing and blend the poses."""
+    """Path of the joints seen from the hips, over that of the tweener, from which on such a gap without keys in it is
+    the network's all the same: walks it fills better, where it knows nothing it hardly moves."""
     styled: int = 60
     """And where the tweener was told a style: in less than 2 s there is no room for one."""
     stitched: int = 60
@@ -128,8 +127,8 @@ class AutoInbetweener(Inbetweener):
         by = {source.by for source in made.attribute(query) if (source.start, source.stop) == gap}
         if INTERPOLATION in by or _has_parts_within(query, *gap):
             return False
-        speed, other = (_measure_speed(proposal.motion, gap) for proposal in (made, tweened))
-        return speed >= self.settings.lively * other
+        path, other = (measure_path_length(one.motion.slice(gap[0] - 1, gap[1] + 1)) for one in (made, tweened))
+        return path >= self.settings.lively * other
 
     def _is_stitchers(self, query: GapQuery, start: int, stop: int) -> bool:
         """Return whether a gap is the stitcher's: short, with more told in it than the poses beside it."""
@@ -187,13 +186,6 @@ def _is_standing_still(query: GapQuery, start: int, stop: int, settings: ChoiceS
         if one >= 0 and other < len(positions) and not bool(unknown[[one, other]].any()):
             speeds.append(float((positions[other] - positions[one]).norm(dim=-1).mean()) * PRIOR_FPS)
     return apart < settings.same_pose_distance and max(speeds) < settings.at_rest
-
-
-def _measure_speed(motion: Motion, gap: tuple[int, int]) -> float:
-    """Measure the mean speed of joints seen from the hips, metres a frame, in a gap and on its edges."""
-    part = motion.slice(gap[0] - 1, gap[1] + 1)
-    seen = see_from_hips(part.joint_positions(), rotations.to_matrix(part.local_quat_xyzw[:, 0]))
-    return float(seen.diff(dim=0).norm(dim=-1).mean())
 
 
 def _goes_astray(query: GapQuery, made: Proposal, gap: tuple[int, int], settings: ChoiceSettings) -> bool:
