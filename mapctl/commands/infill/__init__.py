@@ -29,10 +29,11 @@ class Infill(ModelCommand):
     """Only these joints are missing, canonical names or the rig's own: in the gaps, or throughout if there are none."""
     method: options.Method = "auto"
     """Method that proposes. auto: the transformer, the stitcher where hands, feet or hips are told in up to 2 s, the
-    tweener, if the set of weights has one, through gaps of more than 6 s, or a held pose where the body stands still; a
-    note on each gap names it. transformer, infiller, tweener: that network alone. stitcher: gaps of up to 2 s between
-    whole poses from both sides, led by hands, feet, hips or a trajectory told in them. rollouts: a density's rollouts,
-    wherever nothing is known. slerp: interpolation."""
+    tweener, if the set of weights has one, through gaps of more than 8 s and those of more than 6 s in which the
+    transformer hardly moves, or a held pose where the body stands still; a note on each gap names it. transformer,
+    infiller, tweener: that network alone. stitcher: gaps of up to 2 s between whole poses from both sides, led by
+    hands, feet, hips or a trajectory told in them. rollouts: a density's rollouts, wherever nothing is known. slerp:
+    interpolation."""
     dna: options.MaybeDna = None
     """Motion files of any known rig, or classes that `mapctl info tweener` lists, whose style the tweener takes: in all
     gaps with --method tweener, in those of 2 s and more without parts with auto."""
