@@ -3,14 +3,12 @@
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
 
-import numpy as np
 import torch
-from scipy.signal import butter, savgol_filter, sosfiltfilt
-from torch import Tensor
+from scipy.signal import savgol_filter
 
 from controllers.benchmarks.shared.corruptions import CONDITIONS, CorruptedClip, detect_true_contacts
+from controllers.benchmarks.shared.filters import apply_filter, design_butterworth
 from controllers.benchmarks.shared.held_out import CleanClip
 from controllers.benchmarks.shared.tables import Row, average_rows
 from controllers.denoising.denoise import denoise
@@ -21,7 +19,6 @@ from mapctl.features import PRIOR_FPS
 from mapctl.motion import Motion
 from mapctl.protocols import Denoiser, Density, Inbetweener
 from mapctl.recording.inspection import Inspection, inspect_recording
-from mapctl.recording.quaternion_signs import choose_continuous_signs
 
 STANDARD_CONDITION = "5 degrees, 2 cm, 1 % spikes"
 """Condition of the table by kind of clip."""
@@ -113,13 +110,12 @@ def tune_filters(truth: Motion, inspection: Inspection) -> tuple[float, float]:
     butterworth, savgol = [], []
     for cutoff in _CUTOFFS:
         if cutoff < fps / 2:
-            sections = butter(2, cutoff / (fps / 2), output="sos")  # forward and backward: fourth order
-            filtered = _apply_filter(motion, lambda v, s=sections: sosfiltfilt(s, v, axis=0))
+            filtered = apply_filter(motion, design_butterworth(cutoff, fps))
             butterworth.append(_mean_joint_error_cm(truth, filtered))
     for span in _SPANS:
         width = 2 * round(span * fps / 2) + 1
         if 5 <= width <= motion.num_frames:
-            filtered = _apply_filter(motion, lambda v, w=width: savgol_filter(v, w, 3, axis=0))
+            filtered = apply_filter(motion, lambda v, w=width: savgol_filter(v, w, 3, axis=0))
             savgol.append(_mean_joint_error_cm(truth, filtered))
     return min(butterworth), min(savgol)
 
@@ -132,20 +128,6 @@ def contact_f1(truth: Motion, done: DenoiseSolution) -> float:
     both = float((wanted & found).sum())
     total = float(wanted.sum() + found.sum())
     return 2 * both / total if wanted.any() else float("nan")
-
-
-def _apply_filter(motion: Motion, smooth: Callable[[np.ndarray], Any]) -> Motion:
-    def smooth_tensor(values: Tensor) -> Tensor:
-        return torch.as_tensor(np.ascontiguousarray(np.asarray(smooth(values.numpy()))))
-
-    quats = smooth_tensor(choose_continuous_signs(motion.local_quat_xyzw))
-    moving = {joint: smooth_tensor(values) for joint, values in motion.moving_offsets.items()}
-    return replace(
-        motion,
-        root_position=smooth_tensor(motion.root_position),
-        moving_offsets=moving,
-        local_quat_xyzw=torch.nn.functional.normalize(quats, dim=-1),
-    )
 
 
 def _mean_joint_error_cm(truth: Motion, other: Motion) -> float:

@@ -26,6 +26,7 @@ from mapctl.protocols import Denoiser, Density
 from mapctl.recording import Capture, artefacts
 from mapctl.recording.frequency_bands import split_bands
 from mapctl.recording.inspection import Inspection
+from mapctl.recording.lasting_noise import find_lasting_noise
 from mapctl.recording.noise_estimation import estimate_angle_noise, estimate_position_noise
 from mapctl.recording.quaternion_signs import choose_continuous_signs
 from mapctl.recording.residual_motion import restore_residual_motion
@@ -35,6 +36,8 @@ from mapctl.retarget import RigMap, to_canonical
 from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import CANONICAL, TOES, leg_length
 from mapctl.terms import Term
+
+_LASTING_ROUNDS = 4  # proposals that are asked for at most, each told of the noise that the one before has shown
 
 
 @dataclass(frozen=True)
@@ -76,6 +79,7 @@ class SegmentDenoiser:
             self.bands = split_bands(_match_quaternion_signs(raw, canonical))
         self.shown = self.bands.at_prior_rate()
         self.capture = self._build_capture(observed)
+        self.correlation = torch.ones(1, dtype=torch.float64)
 
     def run(self, densities: Sequence[Density], terms: Sequence[Term], first_frame: int) -> DenoiseSolution:
         """Propose, restore residual motion, refine, and retarget to the rig. The segment begins at frame `first_frame`
@@ -85,6 +89,7 @@ class SegmentDenoiser:
         if self.bands.exact:
             self.capture = self._redetect_spikes(proposal)
             proposal, contacts = self._propose()
+        proposal, contacts = self._propose_under_lasting_noise(proposal, contacts)
         proposal, share = self._restore_residual(proposal)
         if self.settings.anchor:
             proposal = anchor_to_contacts(proposal, debounced(contacts > 0))
@@ -222,14 +227,48 @@ class SegmentDenoiser:
         leap = find_residual_spikes(root, self.capture.sigma_root.double())[:, 0]
         return replace(self.capture, seen=~(dropouts | spikes)[None], seen_root=~(self.hidden_root | leap)[None])
 
+    def _propose_under_lasting_noise(self, proposal: Motion, contacts: Tensor) -> tuple[Motion, Tensor]:
+        """Propose anew where the residual shows noise that lasts, which is told from then on.
+
+        Of a capture at another rate, noise that was filtered leaves nothing from frame to frame; at the prior's rate it
+        leaves a little, which the network has to be told before a residual shows.
+        """
+        if self.settings.sigma_deg is not None:
+            return proposal, contacts
+        before = self.capture
+        if not self.bands.exact:
+            sigma = estimate_angle_noise(self.shown.local_quat_xyzw, before.seen[0])[None]
+            root = estimate_position_noise(self.shown.root_position, before.seen_root[0])
+            louder = torch.maximum(before.sigma, sigma.to(before.sigma))
+            self.capture = replace(before, sigma=louder, sigma_root=before.sigma_root.clamp(min=root))
+            probe, probed = self._propose()
+        else:
+            probe, probed = proposal, contacts
+        for number in range(_LASTING_ROUNDS):
+            capture, rest = self.capture, self._compute_residual_rotations(probe)
+            found = find_lasting_noise(rest, capture.seen[0], capture.sigma[0].double())
+            if found is None:
+                if number == 0:
+                    self.capture = before
+                    return proposal, contacts
+                break
+            self.correlation, factor = found.correlation, found.factor.to(capture.sigma)
+            self.capture = replace(
+                capture, sigma=factor * capture.sigma, sigma_root=factor.median() * capture.sigma_root
+            )
+            probe, probed = self._propose()
+        return probe, probed
+
     def _restore_residual(self, proposal: Motion) -> tuple[Motion, Float[Tensor, "frames joints"]]:
         """Return the proposal with its residual motion restored, and the restored share by frame and joint."""
         capture = self.capture
         angles, share = restore_residual_motion(
-            self._compute_residual_rotations(proposal), capture.seen[0], capture.sigma[0].double()
+            self._compute_residual_rotations(proposal), capture.seen[0], capture.sigma[0].double(), self.correlation
         )
         offset = (self.shown.root_position - proposal.root_position)[:, None]
-        root, _ = restore_residual_motion(offset, capture.seen_root[0][:, None], capture.sigma_root.double())
+        root, _ = restore_residual_motion(
+            offset, capture.seen_root[0][:, None], capture.sigma_root.double(), self.correlation
+        )
         quats = rotations.multiply(proposal.local_quat_xyzw, rotations.from_rotation_vector(angles))
         restored = replace(proposal, root_position=proposal.root_position + root[:, 0], local_quat_xyzw=quats)
         return restored, share

@@ -17,13 +17,18 @@ _RISK_FRAMES = 20.0  # frames, sigma, over which the risk is estimated
 _PENALTY = 0.1  # of the noise's power, that a return must gain: the risk itself is estimated with an error
 _CAUTION = 0.5  # and this share of the noise that it would bring back
 _TEMPERATURE = 0.06  # of the noise's power, between choices that are as good as equal
+_WHITE = torch.ones(1, dtype=torch.float64)
 
 
 def restore_residual_motion(
-    rest: Float[Tensor, "frames joints 3"], seen: Bool[Tensor, "frames joints"], sigma: Float[Tensor, " joints"]
+    rest: Float[Tensor, "frames joints 3"],
+    seen: Bool[Tensor, "frames joints"],
+    sigma: Float[Tensor, " joints"],
+    correlation: Float[Tensor, " lags"] = _WHITE,
 ) -> tuple[Float[Tensor, "frames joints 3"], Float[Tensor, "frames joints"]]:
     """Return what of the residual goes back, and the share of smoothing by frame and joint: 0 where the model is
-    trusted, 1 where it is not. `sigma` is the noise of each of the three numbers; where it is 0 nothing goes back."""
+    trusted, 1 where it is not. `sigma` is the noise of each of the three numbers; where it is 0 nothing goes back.
+    `correlation` is that of the noise with itself so many frames later, from 1 on; then 0."""
     known = seen.to(rest)[..., None]
     rest = rest * known
     noise = 3 * sigma.square().clamp_min(1e-12)
@@ -34,13 +39,21 @@ def restore_residual_motion(
         weight = gaussian.convolve(known, kernel, "nothing")
         wide = gaussian.convolve(rest, kernel, "nothing") / weight.clamp_min(1e-6)
         change = ((wide - rest) * known).square().sum(-1, keepdim=True)
-        own = kernel.max() / weight[..., 0].clamp_min(0.1)
+        own = _weigh_own(kernel, correlation) / weight[..., 0].clamp_min(0.1)
         risks.append(_local_mean(change, known)[..., 0] / noise + (2 + _CAUTION) * own - 1 + _PENALTY)
         smooth.append(wide)
     share = torch.softmax(-torch.stack(risks) / _TEMPERATURE, dim=0)
     back = (share[..., None] * torch.stack(smooth)).sum(dim=0)
     noisy = (sigma > 0).to(rest)
     return back * noisy[None, :, None], (1 - share[0]) * noisy
+
+
+def _weigh_own(kernel: Float[Tensor, " taps"], correlation: Float[Tensor, " lags"]) -> Tensor:
+    """How much of a frame's noise a kernel's average of the frames around it holds: tr(S C) / frames in Stein's
+    estimate for noise of covariance C."""
+    side = len(kernel) // 2
+    lags = torch.arange(-side, side + 1).abs()
+    return (kernel * torch.nn.functional.pad(correlation, (0, side + 1))[lags]).sum()
 
 
 def _local_mean(values: Float[Tensor, "frames joints 1"], known: Float[Tensor, "frames joints 1"]) -> Tensor:

@@ -5,9 +5,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
+import numpy as np
 import torch
+from scipy.signal import lfilter
 from torch import Tensor
 
+from controllers.benchmarks.shared.filters import apply_filter, design_butterworth
 from mapctl import retarget, rotations
 from mapctl.contacts import detect_contacts
 from mapctl.errors import RequestError
@@ -44,6 +47,31 @@ def add_noise(
     quats = rotations.multiply(motion.local_quat_xyzw, turns)
     offset = _sample_position_noise(motion, generator) * centimetres / 100
     return CorruptedClip(_translate_body(replace(motion, local_quat_xyzw=quats), offset))
+
+
+def add_lasting_noise(
+    motion: Motion, generator: torch.Generator, *, degrees: float, centimetres: float, seconds: float
+) -> CorruptedClip:
+    """Add coloured noise to the angles of the joints that move and to the root position: normal, of this standard
+    deviation, and correlated over a time, as of markers that shift on the skin (a stationary first-order process).
+    """
+    keep = math.exp(-1 / (seconds * float(motion.fps)))
+    moves = (motion.local_quat_xyzw != motion.local_quat_xyzw[:1]).any(dim=-1).any(dim=0)
+    angles = math.radians(degrees) * _make_lasting(_sample_angle_noise(motion, generator), keep)
+    offset = centimetres / 100 * _make_lasting(_sample_position_noise(motion, generator), keep)
+    turns = rotations.from_rotation_vector(angles * moves[None, :, None])
+    turned = replace(motion, local_quat_xyzw=rotations.multiply(motion.local_quat_xyzw, turns))
+    return CorruptedClip(_translate_body(turned, offset))
+
+
+def filter_noisy(
+    motion: Motion, generator: torch.Generator, *, degrees: float, centimetres: float, hertz: float
+) -> CorruptedClip:
+    """Add noise without spikes, and filter it away above a frequency, as capture software does before it exports:
+    Butterworth, of fourth order, forward and backward.
+    """
+    noisy = add_noise(motion, generator, degrees=degrees, centimetres=centimetres, spikes=0.0).motion
+    return CorruptedClip(apply_filter(noisy, design_butterworth(hertz, float(motion.fps))))
 
 
 def perturb_positions(motion: Motion, generator: torch.Generator, *, centimetres: float) -> CorruptedClip:
@@ -103,6 +131,8 @@ CONDITIONS: Mapping[str, CorruptionFunction] = {
         for d in (1, 3, 5, 8)
     },
     "5 cm on every joint's place": partial(perturb_positions, centimetres=5.0),
+    "5 degrees, 2 cm that last 0.1 s": partial(add_lasting_noise, degrees=5.0, centimetres=2.0, seconds=0.1),
+    "5 degrees, 2 cm, filtered at 6 Hz": partial(filter_noisy, degrees=5.0, centimetres=2.0, hertz=6.0),
     "10 % of joints lost": partial(drop_joints, share=0.1),
     "30 % of joints lost": partial(drop_joints, share=0.3),
     "an arm lost for 2 s": partial(drop_arm, seconds=2.0),
@@ -124,6 +154,12 @@ def _sample_angle_noise(motion: Motion, generator: torch.Generator) -> Tensor:
 
 def _sample_position_noise(motion: Motion, generator: torch.Generator) -> Tensor:
     return torch.randn(motion.num_frames, 3, generator=generator, dtype=torch.float64)
+
+
+def _make_lasting(white: Tensor, keep: float) -> Tensor:
+    """Correlate white noise of frames: each keeps a share of the one before, at the same deviation."""
+    scaled = np.concatenate([white[:1].numpy(), math.sqrt(1 - keep * keep) * white[1:].numpy()])
+    return torch.as_tensor(lfilter([1.0], [1.0, -keep], scaled, axis=0))
 
 
 def _translate_body(motion: Motion, offset: Tensor) -> Motion:

@@ -1,0 +1,65 @@
+"""Noise that lasts beyond a frame, found in the residual that a proposal leaves of a capture.
+
+An estimate from frame to frame takes noise of a capture that was filtered before, or whose markers shift on the skin,
+for a fraction of what it is, and the rest for motion. Beside a model's proposal it shows: motion that the model missed
+is of some joints in some moments, such noise of all joints at all times.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mapctl.numerics import gaussian
+
+_FRAMES = 45  # fewest frames that tell noise from motion
+_LOCAL_FRAMES = 12.0  # frames, sigma, over which the residual's power is averaged
+_QUIET = 0.3  # share of a joint's moments whose power counts as no more than noise
+_FEW = 0.25  # share of the joints that may be quieter than what follows asks
+_CLEAR = 1.3  # times the estimate from frame to frame, of the quiet moments, from which on noise lasts
+_LEAST = 0.004  # radians of noise: captures that pass for clean keep what they have
+_UNEVEN = 1.5  # times the estimate of loud joints over that of quiet ones, from which on it is motion
+_UNSTEADY = 2.0  # times the residual in a joint's loud moments over that in its quiet ones, from which on it is motion
+_SPREAD = 2.0  # times, at most, that a joint's noise is over its estimate more or less than that of most
+_LAGS = 18  # frames
+
+
+@dataclass(frozen=True, eq=False)
+class LastingNoise:
+    """How much more noise there is than an estimate from frame to frame tells, and how long it lasts."""
+
+    factor: Float[Tensor, " joints"]
+    """Noise over that estimate."""
+    correlation: Float[Tensor, " lags"]
+    """Correlation of the noise with itself so many frames later, from 1 on."""
+
+
+def find_lasting_noise(
+    rest: Float[Tensor, "frames joints 3"], seen: Bool[Tensor, "frames joints"], sigma: Float[Tensor, " joints"]
+) -> LastingNoise | None:
+    """Find noise that lasts in a residual. None where noise of `sigma` from frame to frame explains the quiet moments
+    of more than a few joints, where it differs among joints or comes and goes, and where there are too few frames to
+    tell. Joints without noise keep a factor of 1.
+    """
+    noisy, factor = (sigma > 0) & (seen.sum(dim=0) >= _FRAMES), torch.ones_like(sigma)
+    if len(rest) < _FRAMES or int(noisy.sum()) < 2:
+        return None
+    rest, seen, sigma = rest[:, noisy], seen[:, noisy], sigma[noisy]
+    known = seen.to(rest)[..., None]
+    kernel = gaussian.kernel(_LOCAL_FRAMES, round(2 * _LOCAL_FRAMES))
+    weight = gaussian.convolve(known, kernel, "nothing")
+    squares = gaussian.convolve(rest.square().mean(dim=-1, keepdim=True) * known, kernel, "nothing")
+    power = (squares / weight.clamp_min(1e-6))[..., 0]
+    levels = torch.tensor([0.1, _QUIET, 0.5, 0.9]).to(power)
+    least, quiet, usual, most = torch.where(seen, power, torch.nan).nanquantile(levels, dim=0).sqrt()
+    low, high = (quiet / sigma).quantile(torch.tensor([_FEW, 1 - _FEW]).to(power)).tolist()
+    if low < _CLEAR or high > _UNEVEN * low or float(quiet.quantile(_FEW)) < _LEAST:
+        return None
+    if float((most / least.clamp_min(1e-12)).median()) > _UNSTEADY:
+        return None
+    even, over = rest * known / power.clamp_min(1e-12).sqrt()[..., None], usual / sigma
+    factor[noisy] = over.clamp(min=over.median() / _SPREAD, max=over.median() * _SPREAD).clamp(min=1.0)
+    own = even.square().sum(dim=(0, 2))
+    lags = [(even[lag:] * even[: len(even) - lag]).sum(dim=(0, 2)) / own for lag in range(_LAGS)]
+    return LastingNoise(factor, torch.stack(lags).median(dim=-1).values.clamp(min=0.0))
