@@ -26,10 +26,10 @@ from mapctl.protocols import Denoiser, Density
 from mapctl.recording import Capture, artefacts
 from mapctl.recording.frequency_bands import split_bands
 from mapctl.recording.inspection import Inspection
-from mapctl.recording.lasting_noise import find_lasting_noise
+from mapctl.recording.lasting_noise import LastingNoise, find_lasting_noise
 from mapctl.recording.noise_estimation import estimate_angle_noise, estimate_position_noise
 from mapctl.recording.quaternion_signs import choose_continuous_signs
-from mapctl.recording.residual_motion import restore_residual_motion
+from mapctl.recording.residual_motion import WHITE, restore_residual_motion
 from mapctl.recording.spike_detection import find_residual_spikes
 from mapctl.recording.sure_smoothing import smooth_rotations
 from mapctl.retarget import RigMap, to_canonical
@@ -79,7 +79,7 @@ class SegmentDenoiser:
             self.bands = split_bands(_match_quaternion_signs(raw, canonical))
         self.shown = self.bands.at_prior_rate()
         self.capture = self._build_capture(observed)
-        self.correlation = torch.ones(1, dtype=torch.float64)
+        self.lasting: LastingNoise | None = None
 
     def run(self, densities: Sequence[Density], terms: Sequence[Term], first_frame: int) -> DenoiseSolution:
         """Propose, restore residual motion, refine, and retarget to the rig. The segment begins at frame `first_frame`
@@ -113,7 +113,7 @@ class SegmentDenoiser:
             refined.ledger,
             refined.windows,
             capture=inspection.motion,
-            noise=inspection.noise,
+            noise=self._estimate_whole_noise(),
             noise_root=inspection.noise_root,
             faults=found,
             contacts=refined.contacts,
@@ -144,8 +144,9 @@ class SegmentDenoiser:
         angles = torch.rad2deg(rotations.to_rotation_vector(rotation).norm(dim=-1))
         travelling = names[inspection.travels]
         distances = 100 * (inspection.place(motion) - inspection.place(inspection.motion)).norm(dim=-1)
+        noise = self._estimate_whole_noise()
         found = artefacts.list_noise(
-            names, inspection.noise, inspection.noise_root, travels=inspection.travels, frames=motion.num_frames
+            names, noise, inspection.noise_root, travels=inspection.travels, frames=motion.num_frames
         )
         found += artefacts.list_spikes(names, self._map_spikes_to_rig(), angles, "deg")
         found += artefacts.list_spikes([travelling], self._find_root_spikes(), distances[:, None], "cm")
@@ -187,6 +188,15 @@ class SegmentDenoiser:
             sigma = torch.where(sigma > 0, math.radians(settings.sigma_deg), 0.0).to(sigma)
         root = estimate_position_noise(canonical.root_position, self.observed_root)
         return sigma, root if settings.sigma_cm is None else settings.sigma_cm / 100
+
+    def _estimate_whole_noise(self) -> Float[Tensor, " rigged"]:
+        """Estimate the noise of each of a joint's angles on the rig, radians, what lasts beyond a frame included."""
+        noise = self.inspection.noise.clone()
+        if self.lasting is not None:
+            for canonical, joint in enumerate(self.rigmap.joint_of):
+                if joint is not None and self.capture.sigma[0, canonical] > noise[joint] > 0:
+                    noise[joint] = self.capture.sigma[0, canonical]
+        return noise
 
     def _build_capture(self, observed: Tensor) -> Capture:
         """Build the network's input, at its own rate."""
@@ -252,7 +262,7 @@ class SegmentDenoiser:
                     self.capture = before
                     return proposal, contacts
                 break
-            self.correlation, factor = found.correlation, found.factor.to(capture.sigma)
+            self.lasting, factor = found, found.factor.to(capture.sigma)
             self.capture = replace(
                 capture, sigma=factor * capture.sigma, sigma_root=factor.median() * capture.sigma_root
             )
@@ -261,13 +271,13 @@ class SegmentDenoiser:
 
     def _restore_residual(self, proposal: Motion) -> tuple[Motion, Float[Tensor, "frames joints"]]:
         """Return the proposal with its residual motion restored, and the restored share by frame and joint."""
-        capture = self.capture
+        capture, correlation = self.capture, WHITE if self.lasting is None else self.lasting.correlation
         angles, share = restore_residual_motion(
-            self._compute_residual_rotations(proposal), capture.seen[0], capture.sigma[0].double(), self.correlation
+            self._compute_residual_rotations(proposal), capture.seen[0], capture.sigma[0].double(), correlation
         )
         offset = (self.shown.root_position - proposal.root_position)[:, None]
         root, _ = restore_residual_motion(
-            offset, capture.seen_root[0][:, None], capture.sigma_root.double(), self.correlation
+            offset, capture.seen_root[0][:, None], capture.sigma_root.double(), correlation
         )
         quats = rotations.multiply(proposal.local_quat_xyzw, rotations.from_rotation_vector(angles))
         restored = replace(proposal, root_position=proposal.root_position + root[:, 0], local_quat_xyzw=quats)

@@ -32,7 +32,7 @@ class LastingNoise:
     factor: Float[Tensor, " joints"]
     """Noise over that estimate."""
     correlation: Float[Tensor, " lags"]
-    """Correlation of the noise with itself so many frames later, from 1 on."""
+    """Correlation of the noise with itself so many frames later, from 0 on."""
 
 
 def find_lasting_noise(

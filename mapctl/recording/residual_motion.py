@@ -1,9 +1,9 @@
 """Motion in the residual that a proposal leaves of a capture, beyond what noise explains, and its restoration.
 
-The residual between a capture and a model's proposal should be white noise of known power. Where the model is out of
-its depth the residual holds motion too, slower than the noise. How much smoothing brings that back is estimated, moment
-by moment and joint by joint, by Stein's unbiased estimate of the risk (see mapctl.recording.sure_smoothing): none,
-where the model is right; a plain low-pass filter of the capture itself, where the model knows nothing.
+The residual between a capture and a model's proposal should be noise of known power and correlation. Where the model is
+out of its depth the residual holds motion too, slower than the noise. How much smoothing brings that back is estimated,
+moment by moment and joint by joint, by Stein's unbiased estimate of the risk (see mapctl.recording.sure_smoothing):
+none, where the model is right; a plain low-pass filter of the capture itself, where the model knows nothing.
 """
 
 import torch
@@ -17,18 +17,19 @@ _RISK_FRAMES = 20.0  # frames, sigma, over which the risk is estimated
 _PENALTY = 0.1  # of the noise's power, that a return must gain: the risk itself is estimated with an error
 _CAUTION = 0.5  # and this share of the noise that it would bring back
 _TEMPERATURE = 0.06  # of the noise's power, between choices that are as good as equal
-_WHITE = torch.ones(1, dtype=torch.float64)
+WHITE = torch.ones(1, dtype=torch.float64)
+"""Correlation of white noise with itself so many frames later, from 0 on."""
 
 
 def restore_residual_motion(
     rest: Float[Tensor, "frames joints 3"],
     seen: Bool[Tensor, "frames joints"],
     sigma: Float[Tensor, " joints"],
-    correlation: Float[Tensor, " lags"] = _WHITE,
+    correlation: Float[Tensor, " lags"] = WHITE,
 ) -> tuple[Float[Tensor, "frames joints 3"], Float[Tensor, "frames joints"]]:
     """Return what of the residual goes back, and the share of smoothing by frame and joint: 0 where the model is
     trusted, 1 where it is not. `sigma` is the noise of each of the three numbers; where it is 0 nothing goes back.
-    `correlation` is that of the noise with itself so many frames later, from 1 on; then 0."""
+    `correlation` is that of the noise with itself so many frames later, from 0 on; beyond its end it is 0."""
     known = seen.to(rest)[..., None]
     rest = rest * known
     noise = 3 * sigma.square().clamp_min(1e-12)

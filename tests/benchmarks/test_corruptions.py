@@ -1,5 +1,7 @@
 """Clean captures spoilt in known ways: what the table of denoising is measured on."""
 
+import math
+
 import pytest
 import torch
 from captures import apart_deg, error_cm, on_rig
@@ -8,11 +10,14 @@ from helpers import generator
 from controllers.benchmarks.shared.corruptions import (
     CONDITIONS,
     add_drift,
+    add_lasting_noise,
     add_noise,
     detect_true_contacts,
     drop_arm,
+    filter_noisy,
     perturb_positions,
 )
+from mapctl import rotations
 from mapctl.recording.masks import expand_valid_masks
 
 
@@ -62,6 +67,31 @@ def test_noise_is_that_which_was_asked_for(motion):
     hips = 1 if motion.moving_offsets else 0
     apart = spoilt.joint_positions()[:, hips] - motion.joint_positions()[:, hips]
     assert 100 * float(apart.square().mean().sqrt()) == pytest.approx(1.5, rel=0.1)
+
+
+def turned(before, after) -> torch.Tensor:
+    return rotations.to_rotation_vector(rotations.multiply(rotations.inverse(before), after))
+
+
+def test_noise_lasts_as_long_as_was_asked_for(motion):
+    spoilt = add_lasting_noise(motion, generator(), degrees=3.0, centimetres=1.5, seconds=0.1).motion
+    moves = (motion.local_quat_xyzw != motion.local_quat_xyzw[:1]).any(dim=-1).any(dim=0)
+    noise = torch.rad2deg(turned(motion.local_quat_xyzw, spoilt.local_quat_xyzw))[:, moves]
+    assert float(noise.square().mean().sqrt()) == pytest.approx(3, rel=0.1)
+    for frames in (1, 3):
+        kept = (noise[frames:] * noise[:-frames]).mean() / noise.square().mean()
+        assert float(kept) == pytest.approx(math.exp(-frames / 3), abs=0.1)
+    hips = 1 if motion.moving_offsets else 0
+    apart = spoilt.joint_positions()[:, hips] - motion.joint_positions()[:, hips]
+    assert 100 * float(apart.square().mean().sqrt()) == pytest.approx(1.5, rel=0.35)
+
+
+def test_a_capture_that_was_filtered_holds_what_is_slow_alone(motion):
+    spoilt = filter_noisy(motion, generator(), degrees=5.0, centimetres=2.0, hertz=6.0).motion
+    noise = turned(motion.local_quat_xyzw, spoilt.local_quat_xyzw)
+    power = torch.fft.rfft(noise, dim=0).abs().square().sum(dim=(1, 2))
+    assert float(power[60:].sum() / power.sum()) < 0.02  # from 12 Hz on
+    assert float(power[5:25].sum() / power.sum()) > 0.5
 
 
 def test_misplaced_joints_keep_their_bones(motion):

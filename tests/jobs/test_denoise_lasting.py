@@ -1,0 +1,58 @@
+"""Captures whose noise lasts beyond a frame, from one end to the other, by the bundled denoiser, which knows walks."""
+
+import pytest
+import torch
+from captures import error_cm, trembling
+from helpers import bandai_skeleton, generator
+
+import priors
+from controllers.benchmarks.shared.corruptions import CONDITIONS
+from controllers.denoising.denoise import DenoiseSettings, denoise
+from controllers.generation.generate import GenerateSettings, generate
+from mapctl import retarget
+from mapctl.motion import Motion
+
+LASTING = [name for name in CONDITIONS if "last" in name or "filtered" in name]
+
+
+@pytest.fixture(scope="module")
+def denoiser():
+    return priors.load_denoiser()
+
+
+@pytest.fixture(scope="module")
+def walk():
+    """Drawn from the bundled density, as it comes."""
+    settings = GenerateSettings(foot_cleanup=None, start=0)
+    return generate(priors.load("locomotion"), seconds=4.0, generator=generator(3), settings=settings).motion
+
+
+def on_rig(motion: Motion, rig: str, fps: int) -> Motion:
+    if rig == "bandai":
+        motion = retarget.from_canonical(motion, retarget.identify_rig(bandai_skeleton()))
+    return motion.resample(fps)
+
+
+@pytest.mark.parametrize(("rig", "fps"), [("canonical", 30), ("bandai", 60), ("canonical", 120)])
+@pytest.mark.parametrize("name", LASTING)
+def test_noise_that_lasts_is_found_told_and_taken_away(denoiser, walk, rig, fps, name):
+    truth = on_rig(walk, rig, fps)
+    given = CONDITIONS[name](truth, generator(1)).motion
+    done = denoise(given, denoiser)
+    assert error_cm(truth, done.motion) < 0.7 * error_cm(truth, given)
+    told = torch.rad2deg(done.noise)
+    assert float(told[told > 0].median()) > (1.8 if fps == 30 else 0.5)
+    fixed = denoise(given, denoiser, settings=DenoiseSettings(sigma_deg=0.2, sigma_cm=0.1))
+    assert error_cm(truth, fixed.motion) > 1.2 * error_cm(truth, done.motion)  # who says how noisy it is, is believed
+
+
+@pytest.mark.parametrize("degrees", [0.0, 5.0])
+def test_white_noise_and_none_are_told_as_they_were_estimated(denoiser, walk, degrees, monkeypatch):
+    given = trembling(walk, degrees * torch.pi / 180)
+    done = denoise(given, denoiser)
+
+    def keep(self, proposal: Motion, contacts: torch.Tensor) -> tuple[Motion, torch.Tensor]:
+        return proposal, contacts
+
+    monkeypatch.setattr("controllers.denoising.segment.SegmentDenoiser._propose_under_lasting_noise", keep)
+    assert torch.equal(denoise(given, denoiser).motion.local_quat_xyzw, done.motion.local_quat_xyzw)

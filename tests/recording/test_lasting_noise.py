@@ -1,0 +1,114 @@
+"""Noise that lasts beyond a frame: found beside a proposal, told from motion that the model missed, not put back."""
+
+import math
+
+import pytest
+import torch
+from captures import DEGREE
+from helpers import generator
+from scipy.signal import butter, lfilter, sosfiltfilt
+
+from mapctl.recording.lasting_noise import find_lasting_noise
+from mapctl.recording.noise_estimation import _estimate_sigma
+from mapctl.recording.residual_motion import restore_residual_motion
+
+FRAMES, JOINTS = 300, 12
+
+
+def white(degrees: float = 5.0, frames: int = FRAMES) -> torch.Tensor:
+    return degrees * DEGREE * torch.randn(frames, JOINTS, 3, generator=generator(), dtype=torch.float64)
+
+
+def lasting(keep: float, degrees: float = 5.0, frames: int = FRAMES) -> torch.Tensor:
+    scaled = math.sqrt(1 - keep * keep) * white(degrees, frames + 100).numpy()
+    return torch.as_tensor(lfilter([1.0], [1.0, -keep], scaled, axis=0)[100:].copy())
+
+
+def filtered(hertz: float, degrees: float = 5.0) -> torch.Tensor:
+    sections = butter(2, hertz / 15, output="sos")
+    return torch.as_tensor(sosfiltfilt(sections, white(degrees).numpy(), axis=0).copy())
+
+
+def missed(degrees: float = 10.0, joints: slice = slice(None), size: float = 20.0) -> torch.Tensor:
+    """Motion of some joints about one moment."""
+    time = torch.arange(FRAMES, dtype=torch.float64)
+    burst = degrees * DEGREE * torch.exp(-0.5 * ((time - 150) / size).square())
+    rest = torch.zeros(FRAMES, JOINTS, 3, dtype=torch.float64)
+    rest[:, joints] = burst[:, None, None]
+    return rest
+
+
+def find(rest: torch.Tensor, seen: torch.Tensor | None = None):
+    """As of a capture of somebody who stands still and of whom a model misses nothing."""
+    seen = torch.ones(rest.shape[:2], dtype=torch.bool) if seen is None else seen
+    return find_lasting_noise(rest, seen, _estimate_sigma(rest, seen, differenced=0))
+
+
+@pytest.mark.parametrize("keep", [0.5, 0.72, 0.9])
+def test_its_size_and_how_long_it_lasts_are_found(keep):
+    rest = lasting(keep)
+    estimated = _estimate_sigma(rest, torch.ones(rest.shape[:2], dtype=torch.bool), differenced=0)
+    found = find(rest)
+    assert float((found.factor * estimated).median() / DEGREE) == pytest.approx(5, rel=0.15)
+    assert float(estimated.median() / DEGREE) < 4
+    assert found.correlation[:4].tolist() == pytest.approx([keep**lag for lag in range(4)], abs=0.12)
+
+
+@pytest.mark.parametrize("hertz", [3, 6])
+def test_noise_of_a_capture_that_was_filtered_before_is_found(hertz):
+    rest = filtered(hertz)
+    estimated = _estimate_sigma(rest, torch.ones(rest.shape[:2], dtype=torch.bool), differenced=0)
+    found = find(rest)
+    size = float(rest.square().mean().sqrt())
+    assert float((found.factor * estimated).median()) == pytest.approx(size, rel=0.15)
+    assert float(estimated.median()) < 0.3 * size
+
+
+@pytest.mark.parametrize(
+    "rest",
+    [
+        white(),
+        white(0.0),
+        white() + missed(),
+        white() + missed(joints=slice(0, 8), size=60.0),
+        white(0.3) + missed(20.0, joints=slice(0, 3), size=200.0),
+        lasting(0.72, degrees=0.2),
+        lasting(0.72, frames=40),
+        filtered(6, degrees=0.3),
+    ],
+    ids=["white", "none", "a moment", "some joints", "few joints", "little", "short", "little, filtered"],
+)
+def test_white_noise_motion_that_was_missed_and_what_is_too_little_are_none(rest):
+    assert find(rest) is None
+
+
+def test_a_joint_that_misses_motion_besides_is_not_taken_for_much_louder():
+    rest = lasting(0.72)
+    rest[:, 3] += 1.0 * torch.sin(torch.arange(FRAMES, dtype=torch.float64) / 5)[:, None]
+    found = find(rest)
+    assert float(found.factor[3]) <= 2 * float(found.factor.median())
+
+
+def test_what_was_not_seen_says_nothing():
+    rest, seen = lasting(0.72), torch.ones(FRAMES, JOINTS, dtype=torch.bool)
+    seen[40:90, 2], seen[:, 7] = False, False
+    wild = torch.where(seen[..., None], rest, 50.0)
+    sigma = torch.full((JOINTS,), 2 * DEGREE, dtype=torch.float64)
+    one, other = find_lasting_noise(rest, seen, sigma), find_lasting_noise(wild, seen, sigma)
+    assert torch.equal(one.factor, other.factor)
+    assert torch.equal(one.correlation, other.correlation)
+    assert float(one.factor[7]) == 1
+
+
+def test_of_noise_that_lasts_little_goes_back_where_its_correlation_is_known():
+    rest, seen = lasting(0.72), torch.ones(FRAMES, JOINTS, dtype=torch.bool)
+    sigma = torch.full((JOINTS,), 5 * DEGREE, dtype=torch.float64)
+    correlation = 0.72 ** torch.arange(18, dtype=torch.float64)
+    back, share = restore_residual_motion(rest, seen, sigma, correlation)
+    assert float(share.mean()) < 0.1
+    assert back.square().mean() < 0.05 * rest.square().mean()
+    assert float(restore_residual_motion(rest, seen, sigma)[1].mean()) > 0.8  # as if it were white
+    motion = missed(60.0)
+    back, _ = restore_residual_motion(rest + motion, seen, sigma, correlation)
+    at = slice(140, 160)
+    assert (back - motion)[at].square().mean() < 0.2 * motion[at].square().mean()
