@@ -250,7 +250,8 @@ class SegmentDenoiser:
             sigma = estimate_angle_noise(self.shown.local_quat_xyzw, before.seen[0])[None]
             root = estimate_position_noise(self.shown.root_position, before.seen_root[0])
             louder = torch.maximum(before.sigma, sigma.to(before.sigma))
-            self.capture = replace(before, sigma=louder, sigma_root=before.sigma_root.clamp(min=root))
+            root = max(root, float(before.sigma_root)) if self.settings.sigma_cm is None else float(before.sigma_root)
+            self.capture = replace(before, sigma=louder, sigma_root=torch.full_like(before.sigma_root, root))
             probe, probed = self._propose()
         else:
             probe, probed = proposal, contacts
@@ -263,9 +264,8 @@ class SegmentDenoiser:
                     return proposal, contacts
                 break
             self.lasting, factor = found, found.factor.to(capture.sigma)
-            self.capture = replace(
-                capture, sigma=factor * capture.sigma, sigma_root=factor.median() * capture.sigma_root
-            )
+            usual = factor.median() if self.settings.sigma_cm is None else 1.0
+            self.capture = replace(capture, sigma=factor * capture.sigma, sigma_root=usual * capture.sigma_root)
             probe, probed = self._propose()
         return probe, probed
 

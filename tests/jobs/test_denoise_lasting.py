@@ -11,6 +11,9 @@ from controllers.denoising.denoise import DenoiseSettings, denoise
 from controllers.generation.generate import GenerateSettings, generate
 from mapctl import retarget
 from mapctl.motion import Motion
+from mapctl.protocols import Denoiser
+from mapctl.recording import Capture
+from mapctl.recording.proposal import CaptureProposal
 
 LASTING = [name for name in CONDITIONS if "last" in name or "filtered" in name]
 
@@ -44,6 +47,28 @@ def test_noise_that_lasts_is_found_told_and_taken_away(denoiser, walk, rig, fps,
     assert float(told[told > 0].median()) > (1.8 if fps == 30 else 0.5)
     fixed = denoise(given, denoiser, settings=DenoiseSettings(sigma_deg=0.2, sigma_cm=0.1))
     assert error_cm(truth, fixed.motion) > 1.2 * error_cm(truth, done.motion)  # who says how noisy it is, is believed
+
+
+class Spy(Denoiser):
+    """Notes how noisy the hips are said to be."""
+
+    def __init__(self, denoiser: Denoiser):
+        self.denoiser, self.told = denoiser, []
+
+    def clean(self, capture: Capture) -> CaptureProposal:
+        self.told.append(float(capture.sigma_root))
+        return self.denoiser.clean(capture)
+
+
+@pytest.mark.parametrize("fps", [30, 120])
+def test_the_noise_of_the_hips_that_was_told_stays(denoiser, walk, fps):
+    given, spies = CONDITIONS[LASTING[1]](on_rig(walk, "canonical", fps), generator(1)).motion, []
+    for sigma_cm in (None, 1.0):
+        spies.append(Spy(denoiser))
+        denoise(given, spies[-1], settings=DenoiseSettings(sigma_cm=sigma_cm))
+    own, told = (spy.told for spy in spies)
+    assert own[-1] > 1.5 * own[0]
+    assert len({round(each, 9) for each in told}) == 1
 
 
 @pytest.mark.parametrize("degrees", [0.0, 5.0])
