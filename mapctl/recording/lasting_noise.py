@@ -18,6 +18,7 @@ _LOCAL_FRAMES = 12.0  # frames, sigma, over which the residual's power is averag
 _QUIET = 0.3  # share of a joint's moments whose power counts as no more than noise
 _FEW = 0.25  # share of the joints that may be quieter than what follows asks
 _CLEAR = 1.3  # times the estimate from frame to frame, of the quiet moments, from which on noise lasts
+_PLAIN, _LOUD = 1.45, 0.035  # and where the quiet moments have fewer radians: a weak model misses as much everywhere
 _LEAST = 0.004  # radians of noise: captures that pass for clean keep what they have
 _UNEVEN = 1.5  # times the estimate of loud joints over that of quiet ones, from which on it is motion
 _UNSTEADY = 2.0  # times the residual in a joint's loud moments over that in its quiet ones, from which on it is motion
@@ -54,7 +55,9 @@ def find_lasting_noise(
     levels = torch.tensor([0.1, _QUIET, 0.5, 0.9]).to(power)
     least, quiet, usual, most = torch.where(seen, power, torch.nan).nanquantile(levels, dim=0).sqrt()
     low, high = (quiet / sigma).quantile(torch.tensor([_FEW, 1 - _FEW]).to(power)).tolist()
-    if low < _CLEAR or high > _UNEVEN * low or float(quiet.quantile(_FEW)) < _LEAST:
+    level = float(quiet.quantile(_FEW))
+    clear = _CLEAR if level >= _LOUD else _PLAIN
+    if low < clear or high > _UNEVEN * low or level < _LEAST:
         return None
     if float((most / least.clamp_min(1e-12)).median()) > _UNSTEADY:
         return None
