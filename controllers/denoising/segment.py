@@ -257,7 +257,7 @@ class SegmentDenoiser:
             probe, probed = proposal, contacts
         for number in range(_LASTING_ROUNDS):
             capture, rest = self.capture, self._compute_residual_rotations(probe)
-            found = find_lasting_noise(rest, capture.seen[0], capture.sigma[0].double())
+            found = find_lasting_noise(rest, capture.seen[0], capture.sigma[0].double(), again=number > 0)
             if found is None:
                 if number == 0:
                     self.capture = before

@@ -19,6 +19,7 @@ _QUIET = 0.3  # share of a joint's moments whose power counts as no more than no
 _FEW = 0.25  # share of the joints that may be quieter than what follows asks
 _CLEAR = 1.3  # times the estimate from frame to frame, of the quiet moments, from which on noise lasts
 _PLAIN, _LOUD = 1.45, 0.035  # and where the quiet moments have fewer radians: a weak model misses as much everywhere
+_ALIKE = 0.22  # and how much joints then differ at most in how noise goes on from frame to frame
 _LEAST = 0.004  # radians of noise: captures that pass for clean keep what they have
 _UNEVEN = 1.5  # times the estimate of loud joints over that of quiet ones, from which on it is motion
 _UNSTEADY = 2.0  # times the residual in a joint's loud moments over that in its quiet ones, from which on it is motion
@@ -37,11 +38,15 @@ class LastingNoise:
 
 
 def find_lasting_noise(
-    rest: Float[Tensor, "frames joints 3"], seen: Bool[Tensor, "frames joints"], sigma: Float[Tensor, " joints"]
+    rest: Float[Tensor, "frames joints 3"],
+    seen: Bool[Tensor, "frames joints"],
+    sigma: Float[Tensor, " joints"],
+    *,
+    again: bool = False,
 ) -> LastingNoise | None:
     """Find noise that lasts in a residual. None where noise of `sigma` from frame to frame explains the quiet moments
     of more than a few joints, where it differs among joints or comes and goes, and where there are too few frames to
-    tell. Joints without noise keep a factor of 1.
+    tell. Joints without noise keep a factor of 1. `again` looks for more, where some was found and `sigma` is with it.
     """
     noisy, factor = (sigma > 0) & (seen.sum(dim=0) >= _FRAMES), torch.ones_like(sigma)
     if len(rest) < _FRAMES or int(noisy.sum()) < 2:
@@ -56,13 +61,17 @@ def find_lasting_noise(
     least, quiet, usual, most = torch.where(seen, power, torch.nan).nanquantile(levels, dim=0).sqrt()
     low, high = (quiet / sigma).quantile(torch.tensor([_FEW, 1 - _FEW]).to(power)).tolist()
     level = float(quiet.quantile(_FEW))
-    clear = _CLEAR if level >= _LOUD else _PLAIN
+    sure = again or level >= _LOUD
+    clear = _CLEAR if sure else _PLAIN
     if low < clear or high > _UNEVEN * low or level < _LEAST:
         return None
     if float((most / least.clamp_min(1e-12)).median()) > _UNSTEADY:
         return None
     even, over = rest * known / power.clamp_min(1e-12).sqrt()[..., None], usual / sigma
-    factor[noisy] = over.clamp(min=over.median() / _SPREAD, max=over.median() * _SPREAD).clamp(min=1.0)
     own = even.square().sum(dim=(0, 2))
-    lags = [(even[lag:] * even[: len(even) - lag]).sum(dim=(0, 2)) / own for lag in range(_LAGS)]
-    return LastingNoise(factor, torch.stack(lags).median(dim=-1).values.clamp(min=0.0))
+    lags = torch.stack([(even[lag:] * even[: len(even) - lag]).sum(dim=(0, 2)) / own for lag in range(_LAGS)])
+    short, long = lags[1].quantile(torch.tensor([0.1, 0.9]).to(lags)).tolist()
+    if not sure and long - short > _ALIKE:
+        return None
+    factor[noisy] = over.clamp(min=over.median() / _SPREAD, max=over.median() * _SPREAD).clamp(min=1.0)
+    return LastingNoise(factor, lags.median(dim=-1).values.clamp(min=0.0))
