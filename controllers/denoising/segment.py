@@ -106,14 +106,15 @@ class SegmentDenoiser:
         motion = retarget.from_canonical(joined, self.rigmap, self.repaired)
         within = self.bands.within
         refined = replace(refined, contacts=refined.contacts[:within], ledger=refined.ledger.slice(within))
-        inspection, found = self.inspection, self._collect_faults(motion, proposal.slice(0, within), refined)
+        inspection, noise = self.inspection, self._estimate_whole_noise()
+        found = self._collect_faults(motion, proposal.slice(0, within), refined, noise)
         return DenoiseSolution(
             motion,
             Status(Outcome.DONE),
             refined.ledger,
             refined.windows,
             capture=inspection.motion,
-            noise=self._estimate_whole_noise(),
+            noise=noise,
             noise_root=inspection.noise_root,
             faults=found,
             contacts=refined.contacts,
@@ -136,7 +137,7 @@ class SegmentDenoiser:
         return tuple(part for part in moved if part.start < part.stop)
 
     def _collect_faults(
-        self, motion: Motion, proposal: Motion, refined: RefinedMotion
+        self, motion: Motion, proposal: Motion, refined: RefinedMotion, noise: Float[Tensor, " rigged"]
     ) -> tuple[artefacts.Artefact, ...]:
         """Collect the artefacts, on the rig; `proposal` is the motion before the MAP stage."""
         inspection, names = self.inspection, motion.skeleton.names
@@ -144,7 +145,6 @@ class SegmentDenoiser:
         angles = torch.rad2deg(rotations.to_rotation_vector(rotation).norm(dim=-1))
         travelling = names[inspection.travels]
         distances = 100 * (inspection.place(motion) - inspection.place(inspection.motion)).norm(dim=-1)
-        noise = self._estimate_whole_noise()
         found = artefacts.list_noise(
             names, noise, inspection.noise_root, travels=inspection.travels, frames=motion.num_frames
         )
@@ -238,36 +238,42 @@ class SegmentDenoiser:
         return replace(self.capture, seen=~(dropouts | spikes)[None], seen_root=~(self.hidden_root | leap)[None])
 
     def _propose_under_lasting_noise(self, proposal: Motion, contacts: Tensor) -> tuple[Motion, Tensor]:
-        """Propose anew where the residual shows noise that lasts, which is told from then on.
-
-        Of a capture at another rate, noise that was filtered leaves nothing from frame to frame; at the prior's rate it
-        leaves a little, which the network has to be told before a residual shows.
-        """
+        """Propose anew where the residual shows noise that lasts, which is told from then on."""
         if self.settings.sigma_deg is not None:
             return proposal, contacts
-        before = self.capture
-        if not self.bands.exact:
-            sigma = estimate_angle_noise(self.shown.local_quat_xyzw, before.seen[0])[None]
-            root = estimate_position_noise(self.shown.root_position, before.seen_root[0])
-            louder = torch.maximum(before.sigma, sigma.to(before.sigma))
-            root = max(root, float(before.sigma_root)) if self.settings.sigma_cm is None else float(before.sigma_root)
-            self.capture = replace(before, sigma=louder, sigma_root=torch.full_like(before.sigma_root, root))
-            probe, probed = self._propose()
-        else:
-            probe, probed = proposal, contacts
-        for number in range(_LASTING_ROUNDS):
-            capture, rest = self.capture, self._compute_residual_rotations(probe)
-            found = find_lasting_noise(rest, capture.seen[0], capture.sigma[0].double(), again=number > 0)
+        before, given = self.capture, (proposal, contacts)
+        self.capture = self._estimate_at_prior_rate(before)
+        if self.capture is not before:
+            proposal, contacts = self._propose()
+        for _ in range(_LASTING_ROUNDS):
+            capture, rest = self.capture, self._compute_residual_rotations(proposal)
+            found = find_lasting_noise(rest, capture.seen[0], capture.sigma[0].double(), again=self.lasting is not None)
             if found is None:
-                if number == 0:
-                    self.capture = before
-                    return proposal, contacts
                 break
             self.lasting, factor = found, found.factor.to(capture.sigma)
             usual = factor.median() if self.settings.sigma_cm is None else 1.0
             self.capture = replace(capture, sigma=factor * capture.sigma, sigma_root=usual * capture.sigma_root)
-            probe, probed = self._propose()
-        return probe, probed
+            proposal, contacts = self._propose()
+        if self.lasting is None:
+            self.capture = before
+            return given
+        return proposal, contacts
+
+    def _estimate_at_prior_rate(self, capture: Capture) -> Capture:
+        """Return the capture with the noise estimated at the prior's rate where that is more; itself where nothing is.
+
+        At a higher rate noise that was filtered leaves nothing from frame to frame; at the prior's it leaves a little,
+        which the network has to be told before the rest shows in a residual.
+        """
+        if self.bands.exact:
+            return capture
+        sigma = estimate_angle_noise(self.shown.local_quat_xyzw, capture.seen[0])[None].to(capture.sigma)
+        if bool((sigma <= capture.sigma).all()):
+            return capture
+        root = capture.sigma_root
+        if self.settings.sigma_cm is None:
+            root = root.clamp(min=estimate_position_noise(self.shown.root_position, capture.seen_root[0]))
+        return replace(capture, sigma=torch.maximum(capture.sigma, sigma), sigma_root=root)
 
     def _restore_residual(self, proposal: Motion) -> tuple[Motion, Float[Tensor, "frames joints"]]:
         """Return the proposal with its residual motion restored, and the restored share by frame and joint."""

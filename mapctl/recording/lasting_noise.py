@@ -18,9 +18,10 @@ _LOCAL_FRAMES = 12.0  # frames, sigma, over which the residual's power is averag
 _QUIET = 0.3  # share of a joint's moments whose power counts as no more than noise
 _FEW = 0.25  # share of the joints that may be quieter than what follows asks
 _CLEAR = 1.3  # times the estimate from frame to frame, of the quiet moments, from which on noise lasts
-_PLAIN, _LOUD = 1.45, 0.035  # and where the quiet moments have fewer radians: a weak model misses as much everywhere
-_ALIKE = 0.22  # and how much joints then differ at most in how noise goes on from frame to frame
 _LEAST = 0.004  # radians of noise: captures that pass for clean keep what they have
+_LITTLE = 0.035  # radians; as little motion a weak model misses everywhere, so that less of it counts as noise only
+_CLEAR_OF_LITTLE = 1.45  # from this on, and
+_MIXED = 0.22  # where joints differ by no more in the correlation from one frame to the next: a filter is one for all
 _UNEVEN = 1.5  # times the estimate of loud joints over that of quiet ones, from which on it is motion
 _UNSTEADY = 2.0  # times the residual in a joint's loud moments over that in its quiet ones, from which on it is motion
 _SPREAD = 2.0  # times, at most, that a joint's noise is over its estimate more or less than that of most
@@ -46,7 +47,8 @@ def find_lasting_noise(
 ) -> LastingNoise | None:
     """Find noise that lasts in a residual. None where noise of `sigma` from frame to frame explains the quiet moments
     of more than a few joints, where it differs among joints or comes and goes, and where there are too few frames to
-    tell. Joints without noise keep a factor of 1. `again` looks for more, where some was found and `sigma` is with it.
+    tell. Joints without noise keep a factor of 1. `again` looks for more where some was found, `sigma` being with it:
+    little noise then has to stand out no more than much.
     """
     noisy, factor = (sigma > 0) & (seen.sum(dim=0) >= _FRAMES), torch.ones_like(sigma)
     if len(rest) < _FRAMES or int(noisy.sum()) < 2:
@@ -61,17 +63,16 @@ def find_lasting_noise(
     least, quiet, usual, most = torch.where(seen, power, torch.nan).nanquantile(levels, dim=0).sqrt()
     low, high = (quiet / sigma).quantile(torch.tensor([_FEW, 1 - _FEW]).to(power)).tolist()
     level = float(quiet.quantile(_FEW))
-    sure = again or level >= _LOUD
-    clear = _CLEAR if sure else _PLAIN
-    if low < clear or high > _UNEVEN * low or level < _LEAST:
+    little = level < _LITTLE and not again
+    if low < (_CLEAR_OF_LITTLE if little else _CLEAR) or high > _UNEVEN * low or level < _LEAST:
         return None
     if float((most / least.clamp_min(1e-12)).median()) > _UNSTEADY:
         return None
     even, over = rest * known / power.clamp_min(1e-12).sqrt()[..., None], usual / sigma
     own = even.square().sum(dim=(0, 2))
     lags = torch.stack([(even[lag:] * even[: len(even) - lag]).sum(dim=(0, 2)) / own for lag in range(_LAGS)])
-    short, long = lags[1].quantile(torch.tensor([0.1, 0.9]).to(lags)).tolist()
-    if not sure and long - short > _ALIKE:
+    shortest, longest = lags[1].quantile(torch.tensor([0.1, 0.9]).to(lags)).tolist()
+    if little and longest - shortest > _MIXED:
         return None
     factor[noisy] = over.clamp(min=over.median() / _SPREAD, max=over.median() * _SPREAD).clamp(min=1.0)
     return LastingNoise(factor, lags.median(dim=-1).values.clamp(min=0.0))

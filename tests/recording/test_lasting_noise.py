@@ -38,6 +38,20 @@ def missed(degrees: float = 10.0, joints: slice = slice(None), size: float = 20.
     return rest
 
 
+def swaying_apart(degrees: float) -> torch.Tensor:
+    """Motion that a weak model misses throughout: of every joint, slow in some and quick in others."""
+    time = torch.arange(FRAMES, dtype=torch.float64)[:, None, None] / 30
+    hertz = torch.linspace(0.4, 5.0, JOINTS, dtype=torch.float64)[None, :, None]
+    phase = 6.3 * torch.rand(1, JOINTS, 3, generator=generator(2), dtype=torch.float64)
+    return degrees * DEGREE * math.sqrt(2) * torch.sin(2 * math.pi * hertz * time + phase)
+
+
+def swelling() -> torch.Tensor:
+    """Louder and quieter by turns, by a factor of five."""
+    time = torch.arange(FRAMES, dtype=torch.float64)[:, None, None]
+    return torch.exp(0.8 * torch.sin(2 * math.pi * time / 150))
+
+
 def find(rest: torch.Tensor, seen: torch.Tensor | None = None):
     """As of a capture of somebody who stands still and of whom a model misses nothing."""
     seen = torch.ones(rest.shape[:2], dtype=torch.bool) if seen is None else seen
@@ -75,8 +89,27 @@ def test_noise_of_a_capture_that_was_filtered_before_is_found(hertz):
         lasting(0.72, degrees=0.2),
         lasting(0.72, frames=40),
         filtered(6, degrees=0.3),
+        white(0.7) + swaying_apart(1.0),
+        lasting(0.25),
+        lasting(0.48, degrees=1.5),
+        torch.where(torch.arange(JOINTS)[:, None] % 2 == 0, lasting(0.6), lasting(0.95)),
+        swelling() * filtered(3),
     ],
-    ids=["white", "none", "a moment", "some joints", "few joints", "little", "short", "little, filtered"],
+    ids=[
+        "white",
+        "none",
+        "a moment",
+        "some joints",
+        "few joints",
+        "little",
+        "short",
+        "little, filtered",
+        "all joints",
+        "nearly white",
+        "little that is near it",
+        "uneven",
+        "comes and goes",
+    ],
 )
 def test_white_noise_motion_that_was_missed_and_what_is_too_little_are_none(rest):
     assert find(rest) is None

@@ -39,14 +39,11 @@ def add_noise(
     motion: Motion, generator: torch.Generator, *, degrees: float, centimetres: float, spikes: float = 0.01
 ) -> CorruptedClip:
     """Add normal noise to every angle of the joints that move and to the root position; spikes of 40 degrees."""
-    moves = (motion.local_quat_xyzw != motion.local_quat_xyzw[:1]).any(dim=-1).any(dim=0)
     angles = math.radians(degrees) * _sample_angle_noise(motion, generator)
     hit = torch.rand(angles.shape, generator=generator, dtype=torch.float64) < spikes
     angles = angles + hit * math.radians(40) * torch.sign(_sample_angle_noise(motion, generator))
-    turns = rotations.from_rotation_vector(angles * moves[None, :, None])
-    quats = rotations.multiply(motion.local_quat_xyzw, turns)
     offset = _sample_position_noise(motion, generator) * centimetres / 100
-    return CorruptedClip(_translate_body(replace(motion, local_quat_xyzw=quats), offset))
+    return CorruptedClip(_translate_body(_turn_moving_joints(motion, angles), offset))
 
 
 def add_lasting_noise(
@@ -56,12 +53,9 @@ def add_lasting_noise(
     deviation, and correlated over a time, as of markers that shift on the skin (a stationary first-order process).
     """
     keep = math.exp(-1 / (seconds * float(motion.fps)))
-    moves = (motion.local_quat_xyzw != motion.local_quat_xyzw[:1]).any(dim=-1).any(dim=0)
     angles = math.radians(degrees) * _make_lasting(_sample_angle_noise(motion, generator), keep)
     offset = centimetres / 100 * _make_lasting(_sample_position_noise(motion, generator), keep)
-    turns = rotations.from_rotation_vector(angles * moves[None, :, None])
-    turned = replace(motion, local_quat_xyzw=rotations.multiply(motion.local_quat_xyzw, turns))
-    return CorruptedClip(_translate_body(turned, offset))
+    return CorruptedClip(_translate_body(_turn_moving_joints(motion, angles), offset))
 
 
 def filter_noisy(
@@ -160,6 +154,13 @@ def _make_lasting(white: Tensor, keep: float) -> Tensor:
     """Correlate white noise of frames: each keeps a share of the one before, at the same deviation."""
     scaled = np.concatenate([white[:1].numpy(), math.sqrt(1 - keep * keep) * white[1:].numpy()])
     return torch.as_tensor(lfilter([1.0], [1.0, -keep], scaled, axis=0))
+
+
+def _turn_moving_joints(motion: Motion, angles: Tensor) -> Motion:
+    """Turn the joints that move at all by rotation vectors, radians."""
+    moves = (motion.local_quat_xyzw != motion.local_quat_xyzw[:1]).any(dim=-1).any(dim=0)
+    turns = rotations.from_rotation_vector(angles * moves[None, :, None])
+    return replace(motion, local_quat_xyzw=rotations.multiply(motion.local_quat_xyzw, turns))
 
 
 def _translate_body(motion: Motion, offset: Tensor) -> Motion:
