@@ -5,6 +5,7 @@ for a fraction of what it is, and the rest for motion. Beside a model's proposal
 is of some joints in some moments, such noise of all joints at all times.
 """
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -17,9 +18,10 @@ _FRAMES = 45  # fewest frames that tell noise from motion
 _LOCAL_FRAMES = 12.0  # frames, sigma, over which the residual's power is averaged
 _QUIET = 0.3  # share of a joint's moments whose power counts as no more than noise
 _FEW = 0.25  # share of the joints that may be quieter than what follows asks
-_CLEAR = 1.3  # times the estimate from frame to frame, of the quiet moments, from which on noise lasts
+_CLEAR = 1.1  # times the estimate from frame to frame, of the quiet moments, from which on noise lasts,
+_MISSED = 0.022  # radians of motion that a model misses everywhere aside
 _LEAST = 0.004  # radians of noise: captures that pass for clean keep what they have
-_LITTLE = 0.035  # radians; as little motion a weak model misses everywhere, so that less of it counts as noise only
+_LITTLE = 0.04  # radians; a weak model misses as much, so that less of it counts as noise only
 _CLEAR_OF_LITTLE = 1.45  # from this on, and
 _MIXED = 0.22  # where joints differ by no more in the correlation from one frame to the next: a filter is one for all
 _UNEVEN = 1.5  # times the estimate of loud joints over that of quiet ones, from which on it is motion
@@ -48,7 +50,7 @@ def find_lasting_noise(
     """Find noise that lasts in a residual. None where noise of `sigma` from frame to frame explains the quiet moments
     of more than a few joints, where it differs among joints or comes and goes, and where there are too few frames to
     tell. Joints without noise keep a factor of 1. `again` looks for more where some was found, `sigma` being with it:
-    little noise then has to stand out no more than much.
+    nothing is then taken for motion that the model missed.
     """
     noisy, factor = (sigma > 0) & (seen.sum(dim=0) >= _FRAMES), torch.ones_like(sigma)
     if len(rest) < _FRAMES or int(noisy.sum()) < 2:
@@ -64,7 +66,7 @@ def find_lasting_noise(
     low, high = (quiet / sigma).quantile(torch.tensor([_FEW, 1 - _FEW]).to(power)).tolist()
     level = float(quiet.quantile(_FEW))
     little = level < _LITTLE and not again
-    if low < (_CLEAR_OF_LITTLE if little else _CLEAR) or high > _UNEVEN * low or level < _LEAST:
+    if low < _choose_bound(level, again) or high > _UNEVEN * low or level < _LEAST:
         return None
     if float((most / least.clamp_min(1e-12)).median()) > _UNSTEADY:
         return None
@@ -76,3 +78,12 @@ def find_lasting_noise(
         return None
     factor[noisy] = over.clamp(min=over.median() / _SPREAD, max=over.median() * _SPREAD).clamp(min=1.0)
     return LastingNoise(factor, lags.median(dim=-1).values.clamp(min=0.0))
+
+
+def _choose_bound(level: float, again: bool) -> float:
+    """Choose how many times the estimate from frame to frame the quiet moments have to hold, by what they hold."""
+    if again:
+        return _CLEAR
+    if level < _LITTLE:
+        return _CLEAR_OF_LITTLE
+    return _CLEAR / math.sqrt(1 - (_MISSED / level) ** 2)

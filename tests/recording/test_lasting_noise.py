@@ -90,6 +90,7 @@ def test_noise_of_a_capture_that_was_filtered_before_is_found(hertz):
         lasting(0.72, frames=40),
         filtered(6, degrees=0.3),
         white(0.7) + swaying_apart(1.0),
+        white(2.0) + swaying_apart(1.7),
         lasting(0.25),
         lasting(0.48, degrees=1.5),
         torch.where(torch.arange(JOINTS)[:, None] % 2 == 0, lasting(0.6), lasting(0.95)),
@@ -105,6 +106,7 @@ def test_noise_of_a_capture_that_was_filtered_before_is_found(hertz):
         "short",
         "little, filtered",
         "all joints",
+        "all joints of a noisy capture",
         "nearly white",
         "little that is near it",
         "uneven",
@@ -113,6 +115,19 @@ def test_noise_of_a_capture_that_was_filtered_before_is_found(hertz):
 )
 def test_white_noise_motion_that_was_missed_and_what_is_too_little_are_none(rest):
     assert find(rest) is None
+
+
+@pytest.mark.parametrize("degrees", [1.5, 2.8])
+def test_more_is_looked_for_more_readily_where_some_was_found(degrees):
+    rest, seen = lasting(0.72, degrees), torch.ones(FRAMES, JOINTS, dtype=torch.bool)
+    told = find(rest).factor * _estimate_sigma(rest, seen, differenced=0)
+    assert find_lasting_noise(rest, seen, told, again=True) is None
+    assert find_lasting_noise(rest, seen, told / 1.3) is None
+    found = find_lasting_noise(rest, seen, told / 1.3, again=True)
+    assert float(found.factor.median()) == pytest.approx(1.3, rel=0.1)
+    unlike = white(0.7) + swaying_apart(1.0)
+    assert find(unlike) is None
+    assert find_lasting_noise(unlike, seen, told * 0.3, again=True)
 
 
 def test_a_joint_that_misses_motion_besides_is_not_taken_for_much_louder():
