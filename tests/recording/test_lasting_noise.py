@@ -117,7 +117,15 @@ def test_white_noise_motion_that_was_missed_and_what_is_too_little_are_none(rest
     assert find(rest) is None
 
 
-@pytest.mark.parametrize("degrees", [1.5, 2.8])
+@pytest.mark.parametrize(("degrees", "is_found"), [(0.45, True), (1.5, False), (5.0, True)])
+def test_joints_that_differ_a_little_are_taken_for_motion_where_noise_is_little_and_not_that_of_a_filter(
+    degrees, is_found
+):
+    odd = torch.arange(JOINTS)[:, None] % 2 == 0
+    assert (find(torch.where(odd, lasting(0.62, degrees), lasting(0.78, degrees))) is not None) == is_found
+
+
+@pytest.mark.parametrize("degrees", [1.5, 2.5])
 def test_more_is_looked_for_more_readily_where_some_was_found(degrees):
     rest, seen = lasting(0.72, degrees), torch.ones(FRAMES, JOINTS, dtype=torch.bool)
     told = find(rest).factor * _estimate_sigma(rest, seen, differenced=0)
