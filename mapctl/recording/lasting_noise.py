@@ -26,7 +26,8 @@ _CLEAR_OF_LITTLE = 1.45  # from this on, and
 _MIXED = 0.25  # where joints differ by no more in the correlation from one frame to the next: a filter is one for all
 _UNEVEN = 1.5  # times the estimate of loud joints over that of quiet ones, from which on it is motion,
 _UNEVEN_LITTLE = 1.35  # or where there is little from this on,
-_FAINT = 0.0056  # unless so few radians are left from frame to frame as after a filter
+_FAINT = 0.0056  # unless so few radians are left from frame to frame as after a filter,
+_PLAIN = 2.6  # or there are so many times the estimate
 _UNSTEADY = 2.0  # times the residual in a joint's loud moments over that in its quiet ones, from which on it is motion
 _SPREAD = 2.0  # times, at most, that a joint's noise is over its estimate more or less than that of most
 _LAGS = 18  # frames
@@ -68,7 +69,8 @@ def find_lasting_noise(
     low, high = (quiet / sigma).quantile(torch.tensor([_FEW, 1 - _FEW]).to(power)).tolist()
     level = float(quiet.quantile(_FEW))
     little = level < _LITTLE and not again
-    uneven = _UNEVEN_LITTLE if little and float(sigma.median()) > _FAINT else _UNEVEN
+    doubtful = little and float(sigma.median()) > _FAINT and low < _PLAIN
+    uneven = _UNEVEN_LITTLE if doubtful else _UNEVEN
     if low < _choose_bound(level, again) or high > uneven * low or level < _LEAST:
         return None
     if float((most / least.clamp_min(1e-12)).median()) > _UNSTEADY:

@@ -36,7 +36,9 @@ def on_rig(motion: Motion, rig: str, fps: int) -> Motion:
     return motion.resample(fps)
 
 
-@pytest.mark.parametrize(("rig", "fps"), [("canonical", 30), ("bandai", 60), ("canonical", 120)])
+@pytest.mark.parametrize(
+    ("rig", "fps"), [("canonical", 30), ("bandai", 60), pytest.param("canonical", 120, marks=pytest.mark.slow)]
+)
 @pytest.mark.parametrize("name", LASTING)
 def test_noise_that_lasts_is_found_told_and_taken_away(denoiser, walk, rig, fps, name):
     truth = on_rig(walk, rig, fps)
@@ -49,7 +51,7 @@ def test_noise_that_lasts_is_found_told_and_taken_away(denoiser, walk, rig, fps,
     assert error_cm(truth, fixed.motion) > 1.2 * error_cm(truth, done.motion)  # who says how noisy it is, is believed
 
 
-@pytest.mark.parametrize(("rig", "fps"), [("canonical", 30), ("bandai", 60)])
+@pytest.mark.parametrize(("rig", "fps"), [pytest.param("canonical", 30, marks=pytest.mark.slow), ("bandai", 60)])
 def test_what_one_proposal_does_not_show_of_it_the_next_does(denoiser, walk, rig, fps):
     truth = on_rig(walk, rig, fps)
     given = filter_noisy(truth, generator(1), degrees=8.0, centimetres=3.2, hertz=6.0).motion
@@ -67,7 +69,7 @@ class Spy(Denoiser):
         return self.denoiser.clean(capture)
 
 
-@pytest.mark.parametrize("fps", [30, 120])
+@pytest.mark.parametrize("fps", [30, pytest.param(120, marks=pytest.mark.slow)])
 def test_the_noise_of_the_hips_that_was_told_stays(denoiser, walk, fps):
     given, spies = CONDITIONS[LASTING[1]](on_rig(walk, "canonical", fps), generator(1)).motion, []
     for sigma_cm in (None, 1.0):

@@ -22,11 +22,19 @@ LONG = re.compile(
     r"mapctl (run|chain|train (refiner|.* (mocap|everything)/)|tween (docs|.*(120|LeftHand)$))"
     "|--(causal|best-of|variations|reference|jobs|root-only|suggest-timing|init|video|loop)|auto|denoise example:"
     "|7s:8.5s|reaching.csv|arriving.csv|--start take.bvh|--(joints leftHand|curve) .*stitcher|--method rollouts|.webp"
+    "|denoise take(.*--plot|s)|generate -o many|--(joints LeftForeArm|way (0|60|20):|dna wave.bvh --method)"
+    "|--mirror --root-motion|curves.png|keyframes 20,50"
 )
 # Tutorials are followed step by step where the site is built (docs/extensions/followed_tutorials.py).
 PYTHON = [block for page in pages.PAGES if "tutorials" not in page for block in pages.blocks(page, "python")]
 LONG_PYTHON = {
     "README.md-python-0",
+    "docs/explanations/heels.md-python-0",
+    "docs/explanations/transitions.md-python-0",
+    "docs/guides/folders.md-python-0",
+    "docs/reference/api/jobs.md-python-4",
+    "docs/reference/api/solver.md-python-0",
+    "docs/reference/api/steering.md-python-2",
     "docs/explanations/infilling.md-python-0",
     "docs/explanations/denoising.md-python-0",
     "docs/explanations/tweening.md-python-0",

@@ -117,12 +117,17 @@ def test_white_noise_motion_that_was_missed_and_what_is_too_little_are_none(rest
     assert find(rest) is None
 
 
-@pytest.mark.parametrize(("degrees", "is_found"), [(0.45, True), (1.5, False), (5.0, True)])
-def test_joints_that_differ_a_little_are_taken_for_motion_where_noise_is_little_and_not_that_of_a_filter(
-    degrees, is_found
+@pytest.mark.parametrize(
+    ("keeps", "degrees", "is_found"),
+    [((0.62, 0.78), 0.45, True), ((0.62, 0.78), 1.5, False), ((0.62, 0.78), 5.0, True), ((0.86, 0.91), 2.0, True)],
+    ids=["as after a filter", "little", "much", "many times the estimate"],
+)
+def test_joints_that_differ_a_little_are_taken_for_motion_where_noise_may_be_what_a_model_misses(
+    keeps, degrees, is_found
 ):
     odd = torch.arange(JOINTS)[:, None] % 2 == 0
-    assert (find(torch.where(odd, lasting(0.62, degrees), lasting(0.78, degrees))) is not None) == is_found
+    one, other = (lasting(keep, degrees) for keep in keeps)
+    assert (find(torch.where(odd, one, other)) is not None) == is_found
 
 
 @pytest.mark.parametrize("degrees", [1.5, 2.5])
