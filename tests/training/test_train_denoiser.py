@@ -38,10 +38,18 @@ def test_clips_shorter_than_the_window_are_left_out(tmp_path, data):
         train(request)
 
 
-def test_a_width_of_nothing_is_refused():
-    given = cli.parse(["train", "denoiser", "--data", "data", "-o", "run", "--width", "0"])
+@pytest.mark.parametrize(
+    ("option", "reason"),
+    [
+        ("--width 0", "--width must be at least 1"),
+        ("--angles -1", "--angles must lie between 0 and 1000, got -1"),
+        ("--angles nan", "--angles must lie between"),
+    ],
+)
+def test_numbers_that_make_no_sense_are_refused(option, reason):
+    given = cli.parse(["train", "denoiser", "--data", "data", "-o", "run", *option.split()])
     assert isinstance(given, TrainOptions)
-    with pytest.raises(RequestError, match="--width must be at least 1"):
+    with pytest.raises(RequestError, match=reason):
         given.recipe()
 
 

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 from mapctl.commands.shared import options
 from mapctl.commands.train.options import TunableOptions
+from mapctl.errors import RequestError
 
 if TYPE_CHECKING:
     from priors.training.recipes.denoiser import DenoiserRecipe
@@ -19,9 +20,17 @@ class TrainDenoiser(TunableOptions):
 
     width: options.MaybeCount = None
     """Channels of every layer."""
+    angles: options.MaybeNumber = None
+    """Weight of the error of joint angles (radians) in the loss, beside the centimetres of places; 20 if not given."""
     plain: bool = False
     """The plainest network of the kind, to compare: attention over the frames as they are, squared errors; no dilated
     convolutions, smoothed or world inputs, and changes that do not fade with the noise."""
+
+    def check(self) -> None:
+        """RequestError for numbers that make no sense for a denoiser."""
+        super().check()
+        if self.angles is not None and not 0 <= self.angles <= 1000:
+            raise RequestError(f"--angles must lie between 0 and 1000, got {self.angles:g}")
 
     def recipe(self) -> "DenoiserRecipe":
         """The options as the trainer takes them; RequestError for numbers that make no sense."""
@@ -29,7 +38,7 @@ class TrainDenoiser(TunableOptions):
 
         common = self.common()
         config, settings = PLAIN if self.plain else (DenoiserConfig(), DenoiserSettings())
-        given = self.select_given("steps", "batch", "window", "seed", "learning_rate")
+        given = self.select_given("steps", "batch", "window", "seed", "learning_rate", "angles")
         return DenoiserRecipe(
             **common,
             config=replace(config, **self.select_given("width")),

@@ -69,6 +69,8 @@ class WeightSet:
     live_width: int | None = 160
     """Of the network of the density for live control; None where that of walks and runs serves. Trained on a few
     minutes, networks of 120, 160 and 256 lost their way along some curves."""
+    angles: float = DenoiserSettings.angles
+    """Weight of the error of joint angles in the denoiser's loss."""
     share: float = 1.0
     """Planned steps, as a share of those for hours of motion: curves of small sets are flat sooner."""
 
@@ -100,6 +102,7 @@ SETS: Mapping[str, WeightSet] = {
         window=40,
         width=192,
         live_width=None,
+        angles=10.0,
         share=0.4,
     ),
 }
@@ -216,7 +219,9 @@ def _make_models(weights: WeightSet, made: Path | None) -> tuple[BundledModel, .
             DenoiserRecipe(
                 **captures,
                 **until_flat,
-                settings=DenoiserSettings(steps=weights.plan(DenoiserSettings.steps), bfloat16=True),
+                settings=DenoiserSettings(
+                    steps=weights.plan(DenoiserSettings.steps), angles=weights.angles, bfloat16=True
+                ),
             ),
         ),
         BundledModel("keyframe-timing", KeyframeTimingRecipe(**shared, match=weights.match or None)),

@@ -127,9 +127,11 @@ class DenoiserRecipe(NetworkRecipe[DenoiserConfig, DenoiserSettings, DenoiserTra
         return average_logarithms([row.get("loss")])
 
     def format_shape(self) -> list[str]:
-        """The width, if it is another than usual, and plainness."""
-        width = [] if self.config.width == DenoiserConfig.width else [f"--width {self.config.width}"]
-        return width + ["--plain"] * self.config.plain
+        """The width and the weight of angles, if they are others than usual, and plainness."""
+        words = [] if self.config.width == DenoiserConfig.width else [f"--width {self.config.width}"]
+        if self.settings.angles != DenoiserSettings.angles:
+            words.append(f"--angles {self.settings.angles:g}")
+        return words + ["--plain"] * self.config.plain
 
 
 def draw_performers(
