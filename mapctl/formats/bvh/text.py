@@ -2,7 +2,8 @@
 
 Tolerant on syntax: case of keywords, tabs, CRLF, byte-order marks, braces anywhere, names with spaces or
 colons, missing End Sites, `Frames :`. Strict on data: every value must be there and be a finite number, or NaN where
-what is lost is asked for.
+what is lost is asked for. As many frames are read as whole rows follow, with a warning where `Frames:` says another
+number or the last row is cut off.
 """
 
 import re
@@ -16,9 +17,19 @@ from mapctl.errors import FileFormatError
 from mapctl.formats import missing
 from mapctl.formats.bvh.hierarchy import Hierarchy, Scanner, read_hierarchy
 from mapctl.formats.frame_rate import LONGEST_FRAME, SHORTEST_FRAME
-from mapctl.formats.text import LARGEST_VALUE, NUMBER, check_extent, decode, finite_number, read_bytes, shorten
+from mapctl.formats.text import (
+    LARGEST_VALUE,
+    NUMBER,
+    check_extent,
+    decode,
+    finite_number,
+    read_bytes,
+    shorten,
+    warn_once,
+)
 
 _FRAMES = re.compile(r"\s*+frames[ \t]*+:?[ \t]*+([^\s:]+)", re.IGNORECASE)
+_CUT_NUMBER = re.compile(r"[-+.0-9eEnaN]+")
 _DATUM = re.compile(r"\S+", re.ASCII)  # a no-break space parts no numbers
 _FRAME_TIME = re.compile(r"\s*+frame[ \t]*+time[ \t]*+:?[ \t]*+([^\s:]+)", re.IGNORECASE)
 
@@ -56,7 +67,7 @@ def read(path: str | PathLike[str], *, lossy: bool = False) -> BvhText:
 
 def _parse_frame_count(scanner: Scanner) -> int:
     word = scanner.match(_FRAMES, "'Frames: COUNT'")
-    if not re.fullmatch(r"[+-]?[0-9]{1,12}", word) or int(word) < 1:
+    if not re.fullmatch(r"[+]?[0-9]{1,12}", word):
         scanner.fail(f"expected a positive number of frames, got {shorten(word)}")
     return int(word)
 
@@ -72,21 +83,44 @@ def _parse_frame_time(scanner: Scanner) -> str:
 
 def _parse_values(scanner: Scanner, labels: Sequence[str], *, frames: int, frames_line: int, lossy: bool) -> np.ndarray:
     """Parse the motion block as (frames, channels), in one go; only a fault is looked for by row."""
-    expected = frames * len(labels)
-    if expected == 0:
+    width = len(labels)
+    if width == 0:
         scanner.fail("no joint has any CHANNELS, expected at least one")
+    counts, said, note = [len(row.split()) for _, row in _iterate_rows(scanner)], f"'Frames: {frames}'", ""
+    if counts and sum(counts) != frames * width:
+        if _drop_cut_row(scanner, width, may_end_in_number=len(counts) < frames or frames == 0):
+            counts.pop()
+            note = ", before one that is cut off"
+        frames, note = len(counts), f"{scanner.path}: {said} but {len(counts)} whole rows follow{note}; it reads those"
+    if not counts:
+        raise FileFormatError(scanner.path, f"{said} but no whole row follows", frames_line)
     text = scanner.text[scanner.stop :]
     try:
         values = np.fromstring(missing.normalise_nan(text) if lossy else text, sep=" ")
     except ValueError:
         values = np.empty(0)
     # NaN compares as not small. `1.5.2` was parsed as two values, so words are counted too.
-    sound = values.size == expected and bool(((np.abs(values) < LARGEST_VALUE) | (lossy & np.isnan(values))).all())
-    if sound and sum(len(row.split()) for _, row in _iterate_rows(scanner)) == expected:
-        return values.reshape(frames, len(labels))
-    raise _find_fault(scanner, labels, may_wrap=values.size == expected, lossy=lossy) or FileFormatError(
-        scanner.path, f"'Frames: {frames}' but {sum(1 for _ in _iterate_rows(scanner))} rows follow", frames_line
-    )
+    sound = values.size == sum(counts) == frames * width
+    if not sound or not ((np.abs(values) < LARGEST_VALUE) | (lossy & np.isnan(values))).all():
+        fault = _find_fault(scanner, labels, may_wrap=sum(counts) == frames * width, lossy=lossy)
+        raise fault or FileFormatError(scanner.path, f"{said} but {len(counts)} rows follow", frames_line)
+    if note:
+        warn_once(note)
+    return values.reshape(frames, width)
+
+
+def _drop_cut_row(scanner: Scanner, width: int, *, may_end_in_number: bool) -> bool:
+    """Remove the last row from the text where its writer ended within it; return whether it did."""
+    text = scanner.text.rstrip()
+    start = text.rfind("\n") + 1
+    words = text[start:].split()
+    lost = len(words) < width or (may_end_in_number and not scanner.text.endswith("\n"))
+    if not lost or len(words) > width or not _CUT_NUMBER.fullmatch(words[-1]):
+        return False
+    if any(finite_number(word) is None and not missing.is_nan(word) for word in words[:-1]):
+        return False
+    scanner.text = text[:start]
+    return True
 
 
 def _iterate_rows(scanner: Scanner) -> Iterator[tuple[int, str]]:
