@@ -1,45 +1,67 @@
-"""The length unit of a motion file that does not say: found from the size of the body."""
+"""The length unit of a motion file: declared, or found from the size of the body."""
 
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
-UNITS_IN_METRES = (1.0, 0.01, 0.0254, 0.056444, 0.001)
-"""Metre, centimetre, inch, the CMU ASF unit (inch / 0.45), millimetre; the first that fits counts."""
-LEG_METRES = (0.5, 1.4)
-"""Least and greatest length of people from hips to toes along the bones, metres."""
-REACH_METRES = (0.8, 2.2)
-"""Least and greatest length of people from the root to a leaf along the bones (hips to fingertips or toes), metres."""
+UNITS = {
+    "metres": 1.0,
+    "decimetres": 0.1,
+    "CMU ASF units": 0.056444,
+    "inches": 0.0254,
+    "centimetres": 0.01,
+    "millimetres": 0.001,
+}
+"""Units of files that declare none, metres; the ASF unit is inch / 0.45."""
+ADULT_LEG = 1.0
+"""Length of an adult from hips to toes along the bones, metres."""
+ADULT_REACH = 1.2
+"""Length of an adult from the root to the farthest leaf (head top, fingertips or toes) along the bones, metres."""
+MIN_RATIO = 1.25
+"""Ratio of the distances of two units' bodies from an adult, below which both are likely."""
 
 _TOES, _FEET, _HIPS = ("toe",), ("foot", "ankle"), ("hips", "pelvis")
 
 
-def metres_per_unit(
+@dataclass(frozen=True, eq=False)
+class FileUnit:
+    """The unit of lengths in a file, which `Motion.source` keeps."""
+
+    metres_per_unit: float
+    """Length of the unit, metres."""
+    unit_doubt: str = field(default="", kw_only=True)
+    """Why a unit found by the size of the body may be wrong, a sentence without a full stop; empty where it is sure."""
+
+
+def guess_unit(
     names: Sequence[str],
     parents: Sequence[int],
     offsets: np.ndarray,
     *,
     end_offsets: Mapping[int, Sequence[float]],
     moving: Collection[int] = (),
-) -> float:
-    """Return how many metres one unit of `offsets` (joints, 3) is, for a skeleton of about human size.
+) -> FileUnit:
+    """Return the unit of `offsets` (joints, 3) in which the body is nearest to an adult, by the ratio of lengths.
 
     Bones are measured from hips to toes; where no leg is named, from the root to the farthest leaf. `moving` joints
-    travel within their parent, so the way to them is no bone. A body of no length counts as centimetres.
+    travel within their parent, so their offset is no bone. A body of no length counts as centimetres.
     """
     lengths = np.linalg.norm(offsets, axis=1)
     lengths[[0, *moving]] = 0.0
     ends = {joint: float(np.linalg.norm(offset)) for joint, offset in end_offsets.items()}
-    size, fits = hips_to_toes_length(names, parents, lengths, ends, moving), LEG_METRES
+    size, adult, part = hips_to_toes_length(names, parents, lengths, ends, moving), ADULT_LEG, "legs are"
     if size == 0:
-        size, fits = longest_chain_length(parents, lengths, ends), REACH_METRES
+        size, adult, part = longest_chain_length(parents, lengths, ends), ADULT_REACH, "the longest chain of bones is"
     if size == 0:
-        return 0.01
-    for unit in UNITS_IN_METRES:
-        if fits[0] <= size * unit <= fits[1]:
-            return unit
-    middle = np.sqrt(fits[0] * fits[1])
-    return min(UNITS_IN_METRES, key=lambda unit: abs(np.log(size * unit / middle)))
+        return FileUnit(0.01)
+    distance = {unit: abs(np.log(size * metres / adult)) for unit, metres in UNITS.items()}
+    best, second, *_ = sorted(UNITS, key=distance.__getitem__)
+    doubt = ""
+    if distance[second] - distance[best] < np.log(MIN_RATIO):
+        lengths_text = " or ".join(f"{size * UNITS[unit]:.2f} m if its unit is {unit}" for unit in (best, second))
+        doubt = f"the unit of the file is a guess: {part} {lengths_text}; --unit sets it"
+    return FileUnit(UNITS[best], unit_doubt=doubt)
 
 
 def hips_to_toes_length(

@@ -61,6 +61,15 @@ def test_info_tells_a_clips_rig(clip, capsys):
     assert all(word in shown for word in ("mixamo", "centimetres", "+z", "1.50", "mixamorig:LeftUpLeg", "Prop_sword"))
 
 
+def test_a_body_that_travels_faster_than_people_do_has_a_doubtful_unit(clip, tmp_path, capsys):
+    motion = mapctl.load(clip)
+    travel = torch.zeros_like(motion.root_position)
+    travel[:, 1] = torch.arange(motion.num_frames) * 24.0 / float(motion.fps)
+    replace(motion, root_position=motion.root_position + travel).save(tmp_path / "fast.bvh")
+    assert run("info", tmp_path / "fast.bvh", "--json") == 0
+    assert "m/s for a second: the unit may be wrong" in json.loads(capsys.readouterr().out)["doubts"][0]
+
+
 @pytest.mark.slow
 def test_info_tells_a_sure_fit_and_draws_it(clip, tmp_path, capsys):
     assert run("info", clip, "-o", tmp_path / "rig.png") == 0

@@ -16,6 +16,7 @@ from mapctl import formats, rotations
 from mapctl.errors import MapctlError, RequestError
 from mapctl.formats import bvh
 from mapctl.formats.bvh import text as bvh_text
+from mapctl.formats.units import UNITS, guess_unit
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL
 
@@ -180,7 +181,7 @@ def test_a_name_in_an_old_encoding_goes_back_as_the_same_bytes(tmp_path):
     assert "Fuß".encode("latin-1") in (tmp_path / "out.bvh").read_bytes()
 
 
-@pytest.mark.parametrize("unit", [1.0, 0.01, 0.0254, 0.056444])
+@pytest.mark.parametrize("unit", UNITS.values(), ids=UNITS.keys())
 @pytest.mark.parametrize("named", [True, False])
 def test_unit_is_found_by_the_size_of_the_body_and_undone(unit, named, tmp_path):
     motion = standing()
@@ -201,6 +202,24 @@ def test_unit_is_found_by_the_size_of_the_body_and_undone(unit, named, tmp_path)
     back = np.array(bvh_text.read(tmp_path / "back.bvh").hierarchy.offsets)
     order = [names.index(name) for name in tree.names]
     assert np.abs(back[1:] - bones[order][1:]).max() < 1e-5 / unit
+
+
+@pytest.mark.parametrize("size", [0.14, 0.4, 0.5, 0.63, 0.8, 1.0, 1.3, 1.7, 5.0, 85.0])
+def test_a_body_of_any_size_is_read_back_at_its_size(size, tmp_path):
+    motion = standing()
+    bones, root = motion.skeleton.offsets * size, motion.root_position * size
+    motion = replace(motion, skeleton=replace(motion.skeleton, offsets=bones, end_offsets={}), root_position=root)
+    motion.save(tmp_path / "own.bvh")
+    read = bvh.load(tmp_path / "own.bvh")
+    order = [motion.skeleton.index(name) for name in read.skeleton.names]
+    torch.testing.assert_close(read.skeleton.offsets[1:], bones[order][1:], rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(read.root_position, root, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("leg", [8.0, 16.0, 25.0, 40.0, 62.0, 100.0])
+def test_a_unit_is_doubted_where_a_second_one_is_about_as_likely(leg):
+    found = guess_unit(("hips", "foot"), (-1, 0), np.array([[0, 0, 0], [0, -leg, 0]]), end_offsets={})
+    assert ("--unit" in found.unit_doubt) == (leg in (25.0, 62.0))
 
 
 def standing(frames=20, seed=0) -> Motion:

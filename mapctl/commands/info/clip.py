@@ -8,6 +8,7 @@ from mapctl.commands.shared import inputs, outputs
 from mapctl.commands.shared.tables import print_table
 from mapctl.errors import RequestError
 from mapctl.formats import bvh
+from mapctl.formats.units import UNITS
 from mapctl.motion import Motion
 from mapctl.retarget import RigMap
 from mapctl.retarget.recognition.doubts import Fit, assess_fit
@@ -15,7 +16,7 @@ from mapctl.skeleton import CANONICAL
 
 _LISTS = ("joints", "known_by", "unmapped", "doubts", "fit")
 
-_UNITS = {1.0: "metres", 0.01: "centimetres", 0.001: "millimetres", 0.0254: "inches"}
+_UNITS = {metres: name for name, metres in UNITS.items()}
 
 
 def is_clip(name: str) -> bool:

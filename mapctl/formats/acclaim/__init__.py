@@ -25,7 +25,7 @@ from mapctl.formats.bvh import euler
 from mapctl.formats.frame_rate import FASTEST, SLOWEST
 from mapctl.formats.missing import MissingValues
 from mapctl.formats.text import check_extent, read_bytes
-from mapctl.formats.units import metres_per_unit
+from mapctl.formats.units import FileUnit, guess_unit
 from mapctl.motion import Motion
 from mapctl.skeleton import Skeleton
 
@@ -64,13 +64,14 @@ def _read(path: str | PathLike[str], *, fps: Fraction | float | None, lossy: boo
     check_extent(take, len(text.values), len(asf.names))
     missing.check_any_known(take, np.isnan(text.values))
     degrees = asf.degrees if text.degrees is None else text.degrees
-    skeleton, scale = _build_skeleton(asf)
+    skeleton, unit = _build_skeleton(asf)
     places = missing.interpolate_nan(_positions(asf, text.values), np.zeros(3))
     motion = Motion(
         skeleton=skeleton,
         fps=Fraction(fps or text.fps or USUAL_FPS).limit_denominator(100_000),
-        root_position=torch.from_numpy((places + asf.root_position) * scale),
+        root_position=torch.from_numpy((places + asf.root_position) * unit.metres_per_unit),
         local_quat_xyzw=_quaternions(asf, missing.hold_last(text.values), degrees=degrees),
+        source=unit,
     )
     return motion, _find_missing(asf, np.isnan(text.values))
 
@@ -109,17 +110,18 @@ def find_paths(path: str | PathLike[str]) -> tuple[Path, Path]:
     return found[0], file
 
 
-def _build_skeleton(asf: AsfSkeleton) -> tuple[Skeleton, float]:
-    """Build joints at the bones' starts, in metres; also return the file's unit, metres."""
+def _build_skeleton(asf: AsfSkeleton) -> tuple[Skeleton, FileUnit]:
+    """Build joints at the bones' starts, in metres; also return the file's unit."""
     parents = list(asf.parents)
     offsets = np.concatenate([np.zeros((1, 3)), asf.ends[parents[1:]]])
     leaves = [bone for bone in range(1, len(parents)) if bone not in set(parents)]
-    scale = _INCH / asf.length
+    unit = FileUnit(_INCH / asf.length)
     if asf.length == 1:
         ends = {bone: asf.ends[bone].tolist() for bone in leaves}
-        scale = metres_per_unit(asf.names, parents, offsets, end_offsets=ends)
+        unit = guess_unit(asf.names, parents, offsets, end_offsets=ends)
+    scale = unit.metres_per_unit
     sites = {asf.names[bone]: tuple((asf.ends[bone] * scale).tolist()) for bone in leaves}
-    return Skeleton(asf.names, asf.parents, torch.from_numpy(offsets * scale), sites), scale
+    return Skeleton(asf.names, asf.parents, torch.from_numpy(offsets * scale), sites), unit
 
 
 def _columns(asf: AsfSkeleton, kind: str) -> list[tuple[tuple[int, ...], list[int]]]:

@@ -24,7 +24,7 @@ from mapctl.formats.bvh.hierarchy import Hierarchy
 from mapctl.formats.bvh.layout import BvhLayout
 from mapctl.formats.frame_rate import frame_rate
 from mapctl.formats.missing import MissingValues
-from mapctl.formats.units import longest_chain_length, metres_per_unit
+from mapctl.formats.units import FileUnit, guess_unit, longest_chain_length
 from mapctl.motion import Motion
 from mapctl.skeleton import Skeleton
 
@@ -54,8 +54,16 @@ def _read(text: bvh_text.BvhText) -> tuple[Motion, MissingValues]:
     tree, lost = text.hierarchy, np.isnan(text.values)
     values = _fill_missing(tree, text.values)
     _, rest, moving = _classify_translations(tree, values)
-    scale = metres_per_unit(tree.names, tree.parents, rest, end_offsets=tree.end_offsets, moving=moving)
-    layout = BvhLayout(tree, scale, frame_rate(text.frame_time), text.frame_time, text.encoding, text.values)
+    unit = guess_unit(tree.names, tree.parents, rest, end_offsets=tree.end_offsets, moving=moving)
+    layout = BvhLayout(
+        unit.metres_per_unit,
+        tree,
+        frame_rate(text.frame_time),
+        text.frame_time,
+        text.encoding,
+        text.values,
+        unit_doubt=unit.unit_doubt,
+    )
     return _build_motion(layout, values), _find_missing(tree, lost, moving)
 
 
@@ -101,13 +109,13 @@ def _find_missing(tree: Hierarchy, lost: np.ndarray, moving: Sequence[int]) -> M
 
 
 def unit_of(motion: Motion) -> float | None:
-    """Return metres per unit of the BVH file that a motion was read from; None for other motions."""
-    return motion.source.metres_per_unit if isinstance(motion.source, BvhLayout) else None
+    """Return metres per unit of the BVH or AMC file that a motion was read from; None for other motions."""
+    return motion.source.metres_per_unit if isinstance(motion.source, FileUnit) else None
 
 
 def convert_unit(motion: Motion, metres_per_unit: float) -> Motion:
-    """Return the motion as its BVH file has it if a unit is so many metres; other motions unchanged."""
-    if not isinstance(motion.source, BvhLayout) or motion.source.metres_per_unit == metres_per_unit:
+    """Return the motion as its BVH or AMC file has it if a unit is so many metres; other motions unchanged."""
+    if not isinstance(motion.source, FileUnit):
         return motion
     scale, old = metres_per_unit / motion.source.metres_per_unit, motion.skeleton
     ends = {name: (x * scale, y * scale, z * scale) for name, (x, y, z) in old.end_offsets.items()}
@@ -116,7 +124,7 @@ def convert_unit(motion: Motion, metres_per_unit: float) -> Motion:
         skeleton=Skeleton(old.names, old.parents, old.offsets * scale, ends),
         root_position=motion.root_position * scale,
         moving_offsets={joint: track * scale for joint, track in motion.moving_offsets.items()},
-        source=replace(motion.source, metres_per_unit=metres_per_unit),
+        source=replace(motion.source, metres_per_unit=metres_per_unit, unit_doubt=""),
     )
 
 
@@ -128,8 +136,9 @@ def add_root_to_layout(source: object | None, name: str) -> BvhLayout | None:
 def save(motion: Motion, path: str | PathLike[str]) -> None:
     """Write a BVH file, in the layout the motion was read in where its skeleton still has the same joints.
 
-    Else in centimetres with root OFFSET 0, six channels on the root and on joints that travel, three
-    elsewhere. A channel is added where the source's layout cannot hold the motion. Same motion, same bytes.
+    Else in centimetres, or where a body of that size would be read in another unit in metres or millimetres, with root
+    OFFSET 0, six channels on the root and on joints that travel, three elsewhere. A channel is added where the source's
+    layout cannot hold the motion. Same motion, same bytes.
     RequestError where the motion holds a NaN or the file cannot be written; then nothing is written.
     """
     check_finite(motion, path)

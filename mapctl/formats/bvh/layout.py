@@ -12,24 +12,26 @@ from mapctl.formats.bvh import euler
 from mapctl.formats.bvh.hierarchy import AXES, Hierarchy, Offset
 from mapctl.formats.frame_rate import LONGEST_FRAME, SHORTEST_FRAME
 from mapctl.formats.text import shorten
+from mapctl.formats.units import FileUnit, guess_unit
 from mapctl.motion import Motion
 from mapctl.skeleton import Skeleton
 
 POSITIONS = ("Xposition", "Yposition", "Zposition")
 ROTATIONS = ("Zrotation", "Xrotation", "Yrotation")
 """Channels of motions that came in no layout; the order most tools write."""
+WRITTEN_UNITS = (0.01, 1.0, 0.001)
+"""Units of motions that came in no layout, metres: the first in which the reader finds the body's size. Of the largest
+and the smallest unit one is right for every size."""
 STILL_METRES = 1e-6
 """What varies less than this needs no position channel."""
 
 
 @dataclass(frozen=True, eq=False)
-class BvhLayout:
+class BvhLayout(FileUnit):
     """What `Motion.source` keeps of a BVH file, so that it is written as it came."""
 
     hierarchy: Hierarchy
     """Joints with their channels and OFFSET lines, in the file's unit."""
-    metres_per_unit: float
-    """Length of the file's unit, metres."""
     fps: Fraction
     """Frames per second that the frame time was read as."""
     frame_time: str
@@ -47,7 +49,7 @@ class BvhLayout:
 
 def choose_layout(motion: Motion, path: str | PathLike[str]) -> BvhLayout:
     """Choose the layout to write a motion in; RequestError where BVH has no form for its names or frame rate."""
-    layout = _source_layout(motion) or BvhLayout(_default_hierarchy(motion), 0.01, motion.fps, "")
+    layout = _source_layout(motion) or _default_layout(motion)
     if layout.fps != motion.fps or not layout.frame_time:
         layout = replace(layout, fps=motion.fps, frame_time=_format_frame_time(motion.fps, path))
     _check_names(layout, path)
@@ -109,16 +111,28 @@ def _widen_channels(channels: tuple[str, ...], quat_xyzw: np.ndarray, *, add_pos
     return (POSITIONS if add_positions else tuple(c for c in channels if c not in turns)) + rotations
 
 
-def _default_hierarchy(motion: Motion) -> Hierarchy:
-    """Return a hierarchy in centimetres, root OFFSET 0, joints depth first as BVH nests them (the canonical order is
-    not)."""
-    skeleton = motion.skeleton
-    order = _depth_first(skeleton)
-    channels = [(POSITIONS if j == 0 or j in motion.moving_offsets else ()) + ROTATIONS for j in order]
-    offsets = [_in_unit(skeleton.offsets[j].tolist(), 0.01) if j else (0.0, 0.0, 0.0) for j in order]
+def _default_layout(motion: Motion) -> BvhLayout:
+    """Return a layout with root OFFSET 0, joints depth first as BVH nests them (the canonical order is not)."""
+    skeleton, moving = motion.skeleton, motion.moving_offsets
+    order, unit = _depth_first(skeleton), _written_unit(motion)
+    channels = [(POSITIONS if j == 0 or j in moving else ()) + ROTATIONS for j in order]
+    offsets = [_in_unit(skeleton.offsets[j].tolist(), unit) if j else (0.0, 0.0, 0.0) for j in order]
     parents = [order.index(skeleton.parents[j]) if j else -1 for j in order]
     names = tuple(skeleton.names[j] for j in order)
-    return Hierarchy(names, tuple(parents), tuple(offsets), tuple(channels), {})
+    return BvhLayout(unit, Hierarchy(names, tuple(parents), tuple(offsets), tuple(channels), {}), motion.fps, "")
+
+
+def _written_unit(motion: Motion) -> float:
+    """Return the first of WRITTEN_UNITS in which the reader finds the body's size."""
+    skeleton, offsets = motion.skeleton, motion.skeleton.offsets.detach().cpu().double().numpy()
+    for unit in WRITTEN_UNITS:
+        ends = {skeleton.index(name): _in_unit(offset, unit) for name, offset in skeleton.end_offsets.items()}
+        found = guess_unit(
+            skeleton.names, skeleton.parents, offsets / unit, end_offsets=ends, moving=motion.moving_offsets
+        )
+        if found.metres_per_unit == unit:
+            return unit
+    return WRITTEN_UNITS[0]
 
 
 def _depth_first(skeleton: Skeleton) -> list[int]:

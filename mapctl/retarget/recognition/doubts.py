@@ -6,6 +6,7 @@ from functools import partial
 
 import torch
 
+from mapctl.formats.units import FileUnit
 from mapctl.joint_names import Part, Side
 from mapctl.joint_roles import classify_joints
 from mapctl.motion import Motion
@@ -18,6 +19,7 @@ from mapctl.skeleton import mirror_name
 
 _MAX_LISTED = 4  # joints that have a line each; of more there is one line
 _MIN_FRONT = 0.3  # least triple product left x up . toes from which the toes tell the front
+_MAX_SPEED = 12.0  # m/s of the hips, median over a second, of people on foot
 _BELOW = {
     "chest": ("spine",),
     "neck": ("chest", "spine"),
@@ -75,6 +77,7 @@ def assess_fit(rigmap: RigMap, motion: Motion | None = None) -> Fit:
     clip = None if motion is None else RigPoses.of(motion, found.joint_of)
     doubts: list[Doubt] = []
     for look in (
+        partial(_check_unit, rigmap, motion),
         partial(_find_other_bodies, rigmap, clip or zero),
         partial(_find_wrong_order, rigmap),
         partial(_compare_sides, rigmap, found, zero, clip),
@@ -89,6 +92,21 @@ def assess_fit(rigmap: RigMap, motion: Motion | None = None) -> Fit:
     ):
         doubts += look()
     return Fit(tuple(doubts))
+
+
+def _check_unit(rigmap: RigMap, motion: Motion | None) -> Iterator[Doubt]:
+    """Check the unit that was found by the size of the body, and the speed that results from a unit."""
+    if motion is None:
+        return
+    if isinstance(motion.source, FileUnit) and motion.source.unit_doubt:
+        yield Doubt(motion.source.unit_doubt)
+    travel = motion.joint_positions()[:, rigmap.joints["hips"]].diff(dim=0).norm(dim=-1) * float(motion.fps)
+    second = max(1, round(float(motion.fps)))
+    if len(travel) < second:
+        return
+    fastest = float(travel.unfold(0, second, second).median(dim=-1).values.max())
+    if fastest > _MAX_SPEED:
+        yield Doubt(f"the hips travel at {fastest:.0f} m/s for a second: the unit may be wrong; --unit sets it")
 
 
 def _find_other_bodies(rigmap: RigMap, poses: RigPoses) -> Iterator[Doubt]:
