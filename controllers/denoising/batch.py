@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
@@ -10,7 +11,7 @@ from controllers.denoising.denoise import denoise
 from controllers.denoising.result import DenoiseSolution
 from controllers.denoising.segment import DenoiseSettings
 from mapctl import formats
-from mapctl.motion import join_licences
+from mapctl.motion import Motion, join_licences
 from mapctl.protocols import Denoiser, Inbetweener
 from mapctl.recording.masks import masks_from_missing
 from mapctl.retarget.rigs import Rig
@@ -33,6 +34,8 @@ class FileDenoiser:
     """Function called with each result, in that process: to write a report."""
     licence: str = ""
     """Licence of the results, beside that of each motion; for formats that keep one."""
+    on_read: Callable[[Path, Motion, Rig | None], None] | None = None
+    """Function called with each file, its motion and its rig, in that process: to print what is doubtful."""
 
     def __call__(self, job: FileJob) -> FileResult:
         """Denoise one file and write the result; errors are in what is returned, except DiskFullError."""
@@ -42,6 +45,8 @@ class FileDenoiser:
     def _denoise(self, job: FileJob) -> tuple[int, float]:
         unit = None if self.rig is None else self.rig.metres_per_unit
         motion, missing = formats.load_with_missing(job.source, metres_per_unit=unit)
+        if self.on_read is not None:
+            self.on_read(job.source, motion, self.rig)
         masks = masks_from_missing(motion, missing)
         inbetweener = None if self.load_inbetweener is None else _load_once(self.load_inbetweener)
         denoiser = _load_once(self.load)

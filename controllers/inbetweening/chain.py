@@ -17,6 +17,7 @@ from mapctl.motion import Motion
 from mapctl.protocols import Density, Inbetweener
 from mapctl.recording.masks import ALL, Mask
 from mapctl.retarget.carry import RiggedCharacter, retarget_motion
+from mapctl.retarget.rigs import Rig
 from mapctl.terms import Term
 
 _VELOCITY_FRAMES = 5  # frames over which the velocity at a piece's end is estimated
@@ -45,20 +46,22 @@ def chain(
     filling: InfillSettings | None = None,
     densities: Sequence[Density] = (),
     terms: Sequence[Term] = (),
+    rig: Rig | None = None,
 ) -> InbetweenSolution:
     """Chain pieces of clips to a motion on the first clip's rig at PRIOR_FPS. RequestError for fewer than two clips.
 
     Each piece is aligned to the one before: the trajectory goes on at its velocity for half of the gap, then at the
-    next one's. The generator samples the gaps' lengths, then is the in-betweener's.
+    next one's. The generator samples the gaps' lengths, then is the in-betweener's. `rig` is that of all clips, where
+    it is not the one that would be recognised.
     """
     settings = settings or ChainSettings()
     if len(clips) < 2:
         raise RequestError(f"a chain needs at least two clips, got {len(clips)}")
-    body, notes = RiggedCharacter.of(clips[0])[1], []
+    body, notes = RiggedCharacter.of(clips[0], rig)[1], []
     whole: Motion | None = None
     masks: list[Mask] = []
     for clip in clips:
-        piece, piece_notes = _cut_piece(clip, body, settings.piece)
+        piece, piece_notes = _cut_piece(clip, body, settings.piece, rig)
         notes += piece_notes
         if whole is None:
             whole = piece
@@ -73,14 +76,21 @@ def chain(
         ).join(piece)
     assert whole is not None, "there are clips"
     done = infill(
-        body.on_rig(whole), inbetweener, masks, settings=filling, densities=densities, terms=terms, generator=generator
+        body.on_rig(whole),
+        inbetweener,
+        masks,
+        settings=filling,
+        densities=densities,
+        terms=terms,
+        rig=rig,
+        generator=generator,
     )
     return replace(done, status=done.status.with_notes(notes))
 
 
-def _cut_piece(clip: Motion, body: RiggedCharacter, frames: int) -> tuple[Motion, tuple[str, ...]]:
+def _cut_piece(clip: Motion, body: RiggedCharacter, frames: int, rig: Rig | None) -> tuple[Motion, tuple[str, ...]]:
     """Cut frames from a clip's middle, retargeted to the body and its floor; and note what could not be kept."""
-    retargeted = retarget_motion(clip, body)
+    retargeted = retarget_motion(clip, body, rig)
     motion = retargeted.motion.resample(PRIOR_FPS)
     count = min(frames, motion.num_frames)
     start = (motion.num_frames - count) // 2

@@ -60,7 +60,7 @@ def guess_unit(
     doubt = ""
     if distance[second] - distance[best] < np.log(MIN_RATIO):
         lengths_text = " or ".join(f"{size * UNITS[unit]:.2f} m if its unit is {unit}" for unit in (best, second))
-        doubt = f"the unit of the file is a guess: {part} {lengths_text}; --unit sets it"
+        doubt = f"the unit of the file is a guess: {part} {lengths_text}"
     return FileUnit(UNITS[best], unit_doubt=doubt)
 
 

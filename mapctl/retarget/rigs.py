@@ -1,5 +1,6 @@
 """Known rigs, one TOML each: which of their joints is which canonical one, and what their T-pose is."""
 
+import math
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -15,7 +16,7 @@ from mapctl.skeleton import CANONICAL, Skeleton
 
 AXES = ("x", "y", "z", "-x", "-y", "-z")
 RESTS = ("auto", "tpose", "straighten", "frame0")
-UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
+UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 """Names of length units that a rig's TOML may use, in metres."""
 _KEYS = {"name", "about", "also", "joints", "tpose", "straighten", "end_sites", "up", "facing", "rest", "unit"}
 
@@ -120,7 +121,7 @@ def _rig_from_table(table: Mapping[str, Any]) -> Rig:
         table.get("up", "auto"),
         table.get("facing", "auto"),
         table.get("rest", "auto"),
-        _parse_unit(table.get("unit")),
+        parse_unit(table.get("unit")),
     )
 
 
@@ -131,10 +132,14 @@ def _parse_names(canonical: str, own: Any) -> tuple[str, ...]:
     return names
 
 
-def _parse_unit(unit: Any) -> float | None:
-    metres = UNITS.get(unit) if isinstance(unit, str) else unit
+def parse_unit(unit: Any) -> float | None:
+    """Parse the name of a unit, or metres per unit; None for `auto` and None; RequestError for anything else."""
     if unit in (None, "auto"):
         return None
-    if isinstance(metres, bool) or not isinstance(metres, int | float) or not 1e-6 < metres < 1e6:
-        raise RequestError(f"a rig's unit is auto, {', '.join(UNITS)} or metres per unit, got {unit!r}")
-    return float(metres)
+    try:
+        metres = UNITS[unit] if unit in UNITS else math.nan if isinstance(unit, bool) else float(unit)
+    except (TypeError, ValueError):  # a list or a table, a word
+        metres = math.nan
+    if not 1e-6 < metres < 1e6:
+        raise RequestError(f"a unit is {', '.join(UNITS)} or metres per unit, got {unit!r}")
+    return metres

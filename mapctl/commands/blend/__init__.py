@@ -11,7 +11,7 @@ from mapctl.commands.shared.command import ModelCommand
 
 
 @dataclass(frozen=True)
-class Blend(ModelCommand):
+class Blend(ModelCommand, options.RigOptions):
     """Hands or feet of a clip move as in another one for some frames: a walk that reaches or waves."""
 
     source: options.InFile
@@ -32,8 +32,6 @@ class Blend(ModelCommand):
     """Leave the proposal as it is, on rigid bones: no MAP stage plants the feet."""
     inbetweener: options.Name = "transformer"
     """A bundled in-betweener, or the file or run folder of a trained one."""
-    rig: options.MaybeRig = None
-    """The rig of IN, where it is not the one that would be recognised; see `mapctl info IN`."""
     video: options.MaybeFile = None
     """Film of the given motion and the new one side by side: .mp4, .gif, .webp or .png."""
     strict: bool = False

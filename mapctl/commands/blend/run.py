@@ -12,8 +12,9 @@ from mapctl.commands.shared.frame_syntax import parse_frame, parse_range
 def run(command: Blend) -> int:
     """Check everything, blend, write, report."""
     results.check_destinations(command.out, command.video, given=(command.source, command.other))
-    rig = inputs.read_rig(command.rig)
-    motion, other = inputs.read_motion(command.source, rig), inputs.read_motion(command.other, None)
+    rig = inputs.read_rig(command.rig, command)
+    motion = inputs.read_motion(command.source, rig, quiet=command.quiet)
+    other = inputs.read_motion(command.other, None, quiet=command.quiet)
     start, stop = parse_range(command.frames, fps=float(other.fps), frames=other.num_frames, what="range of --frames")
     names = tuple(name.strip() for name in command.joints.split(","))
     transfer = LimbTransfer(names, start, stop, parse_frame(command.at, fps=float(motion.fps)), margin=command.margin)

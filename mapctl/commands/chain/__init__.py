@@ -12,7 +12,7 @@ from mapctl.commands.shared.command import ModelCommand
 
 
 @dataclass(frozen=True)
-class Chain(ModelCommand):
+class Chain(ModelCommand, options.RigOptions):
     """One long motion through short pieces of many clips, the gaps between them filled in; on the first clip's rig."""
 
     clips: tyro.conf.Positional[Annotated[tuple[Path, ...], arg(metavar="CLIP CLIP ...")]]

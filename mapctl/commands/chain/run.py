@@ -25,19 +25,21 @@ def run(command: Chain) -> int:
         raise RequestError("--path predicts where the hips go for --method tweener; leave it out")
     dna = read_dna(command.dna, command.method)
     settings = ChainSettings(piece=command.piece, gap=_parse_gap(command))
+    rig = inputs.read_rig(command.rig, command)
     done = chain(
-        [inputs.read_motion(path, None) for path in command.clips],
+        [inputs.read_motion(path, rig, quiet=command.quiet) for path in command.clips],
         build_inbetweener(
             command.method, results.load_models(command.inbetweener, None, command.path, dna, command.stitcher)
         ),
         settings=settings,
         filling=InfillSettings(finish=not command.no_finish),
+        rig=rig,
         generator=torch.Generator().manual_seed(command.seed),
     )
     licensing.save_motion(done.motion, command.out)
     if command.video is not None:
         with show_progress("filming", quiet=command.quiet) as progress:
-            film([(to_canonical(done.motion)[0], None)], command.video, progress=progress)
+            film([(to_canonical(done.motion, rig)[0], None)], command.video, progress=progress)
     if not command.quiet:
         filled = int(done.missing.frames.sum())
         print(

@@ -11,7 +11,7 @@ from mapctl.commands.shared.command import Command
 
 
 @dataclass(frozen=True)
-class Convert(Command):
+class Convert(Command, options.ReadOptions):
     """Write a motion, or a folder of them, in another format, on another skeleton or at another frame rate, or some
     frames of it; mirrored, with planted feet, as a loop, in place, or with its travel on the root joint.
 

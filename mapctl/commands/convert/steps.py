@@ -20,7 +20,6 @@ from mapctl.metrics import feet
 from mapctl.motion import Motion
 from mapctl.retarget import as_rig, identify_rig
 from mapctl.retarget.carry import Changes, GroundMode, RiggedCharacter, retarget_motion
-from mapctl.retarget.recognition.doubts import assess_fit
 from mapctl.retarget.rigs import Rig
 
 
@@ -63,16 +62,15 @@ class Conversion:
         if command.in_place and command.root_motion:
             raise RequestError("--in-place takes the travel out and --root-motion puts it on the root; choose one")
         fps, fps_in = (None if text is None else parse_fps(text) for text in (command.fps, command.fps_in))
-        return Conversion(command, fps, fps_in, inputs.read_rig(command.source_rig), read_body(command.rig))
+        return Conversion(command, fps, fps_in, inputs.read_rig(command.source_rig, command), read_body(command.rig))
 
     def convert(self, source: Path) -> Converted:
         """Read a file and convert it."""
         command = self.command
-        done = self._cut(inputs.read_motion(source, self.source_rig, fps=self.fps_in))
+        done = self._cut(inputs.read_motion(source, self.source_rig, fps=self.fps_in, quiet=command.quiet))
         if command.rig is not None:
-            doubts = describe_doubts(done.motion, self.source_rig)
             done = transfer_to_rig(done.motion, self.body, self.source_rig, ground=command.ground)
-            done = replace(done, lines=tuple(f"note: {note}" for note in (*doubts, *done.notes)))
+            done = replace(done, lines=tuple(f"note: {note}" for note in done.notes))
         if self.fps is not None:
             done = replace(done, motion=done.motion.resample(self.fps))
         if command.mirror:
@@ -85,6 +83,9 @@ class Conversion:
             done = replace(done, motion=editing.remove_travel(done.motion, done.rig, done.cycle))
         if command.root_motion:
             done = replace(done, motion=editing.move_travel_to_root(done.motion, done.rig, done.cycle))
+        ending = (command.to or command.out.suffix).lstrip(".").lower()
+        if ending == "vrma" and not getattr(done.motion.source, "humanoid", None):  # no other rig is one that it names
+            done = replace(done, motion=retarget.to_canonical(done.motion, done.rig or self.source_rig)[0])
         return done
 
     def _cut(self, motion: Motion) -> Converted:
@@ -110,13 +111,6 @@ def parse_fps(text: str) -> Fraction:
     if not Fraction(1, 100) <= fps <= 1000:
         raise RequestError(f"the frame rate must be 0.01 to 1000, got {text}")
     return fps
-
-
-def describe_doubts(motion: Motion, rig: Rig | None) -> list[str]:
-    """Describe in one note what is doubtful about how a motion's rig is understood; empty where nothing is."""
-    doubts = assess_fit(identify_rig(motion.skeleton, rig, motion=motion), motion).doubts
-    more = f", and {len(doubts) - 1} more" if len(doubts) > 1 else ""
-    return [f"the rig of IN is doubtful: {doubt.reason}{more}; see mapctl info IN" for doubt in doubts[:1]]
 
 
 def read_body(rig: str | None) -> RiggedCharacter | None:

@@ -11,15 +11,13 @@ from mapctl.commands.shared.command import ModelCommand
 
 
 @dataclass(frozen=True)
-class Denoise(ModelCommand):
+class Denoise(ModelCommand, options.RigOptions):
     """Denoise a capture with noise, sliding and gaps, of any known rig: same skeleton, names, frames and rate."""
 
     source: Positional[Annotated[Path, arg(metavar="IN|FOLDER")]]
     """A motion file, or `example:noisy-walk`, which mapctl brings along; or a folder, every motion below it."""
     out: Annotated[Path, arg(aliases=["-o"], metavar="OUT|FOLDER")]
     """Where the clean motion goes; of a folder, another one, which gets the same names."""
-    rig: options.MaybeRig = None
-    """The rig of IN, where it is not the one that would be recognised; see `mapctl info IN`."""
     mask: options.MaybeFile = None
     """CSV with the columns joint, start, stop: frames (from 0, stop exclusive) in which a joint of the rig is missing.
     `*` is everything, `root position` the body's position. What is nan in IN is missing too."""

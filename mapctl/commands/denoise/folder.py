@@ -26,7 +26,8 @@ def run(command: Denoise, settings: DenoiseSettings) -> int:
     used = dict(licences.find_used_licences())  # what the processes use, and they do not record
     after = None if command.report is None else ReportWriter(command, command.report, used)
     licence = licensing.format_used_licences()
-    file_denoiser = FileDenoiser(load, settings, load_inbetweener, inputs.read_rig(command.rig), after, licence)
+    rig, on_read = inputs.read_rig(command.rig, command), None if command.quiet else inputs.print_doubts
+    file_denoiser = FileDenoiser(load, settings, load_inbetweener, rig, after, licence, on_read)
     if command.cluster is not None:
         ended = run_over_cluster(jobs, file_denoiser, address=command.cluster, workers=command.jobs)
     else:

@@ -42,11 +42,11 @@ def _check(command: Denoise) -> None:
 
 
 def _run_denoising(command: Denoise) -> DenoiseSolution:
-    settings, rig = read_settings(command), inputs.read_rig(command.rig)
+    settings, rig = read_settings(command), inputs.read_rig(command.rig, command)
     named_masks = () if command.mask is None else load_masks(command.mask)
     densities = priors.load_choice(command.prior)
     denoiser = priors.load_denoiser(command.denoiser)
-    motion, missing_masks, _ = inputs.read_motion_with_gaps(command.source, rig)
+    motion, missing_masks, _ = inputs.read_motion_with_gaps(command.source, rig, quiet=command.quiet)
     masks = (*named_masks, *missing_masks)
     with show_progress("denoising", quiet=command.quiet) as progress:
         if command.causal:

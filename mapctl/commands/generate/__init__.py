@@ -10,7 +10,7 @@ from mapctl.commands.shared.command import ModelCommand
 
 
 @dataclass(frozen=True)
-class Generate(ModelCommand):
+class Generate(ModelCommand, options.ReadOptions):
     """Motion sampled from a prior, of any length: OUT/generated_000.bvh, generated_001.bvh, ..."""
 
     out: options.OutFolder

@@ -23,6 +23,7 @@ from mapctl.formats.bvh.stream import open_bvh_stream
 from mapctl.formats.whole_stream import open_whole_stream
 from mapctl.metrics.pace_changes import PACES, label_pace
 from mapctl.motion import Motion
+from mapctl.retarget import to_canonical
 
 _MAX_CLIPS = 10_000
 
@@ -78,7 +79,9 @@ def _check_settings(command: Generate) -> tuple[GenerateSettings, Motion | None]
     )
     if command.start is None or numbered:
         return settings, None
-    return settings, inputs.read_motion(Path(command.start), None)
+    rig = inputs.read_rig(None, command)
+    clip = inputs.read_motion(Path(command.start), rig, quiet=command.quiet)
+    return settings, clip if rig is None else to_canonical(clip, rig)[0]
 
 
 def _sample_seeds(command: Generate) -> list[int]:

@@ -10,7 +10,7 @@ from mapctl.commands.shared.command import ModelCommand
 
 
 @dataclass(frozen=True)
-class Infill(ModelCommand):
+class Infill(ModelCommand, options.RigOptions):
     """Fill in missing frames or joints of a motion; all else stays as it was. On any known rig."""
 
     source: options.InFile
@@ -42,8 +42,6 @@ class Infill(ModelCommand):
     curve: options.MaybeCurve = None
     """Trajectory of the hips in the gaps: a CSV or SVG file, or a shape, that passes within 1 m of where each begins
     and ends."""
-    rig: options.MaybeRig = None
-    """The rig of IN, where it is not the one that would be recognised; see `mapctl info IN`."""
     inbetweener: options.MaybeName = None
     """The file or run folder of a trained transformer, infiller or tweener; the bundled one if not given. With auto a
     tweener is for long gaps, beside the bundled transformer."""

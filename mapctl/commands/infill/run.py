@@ -24,8 +24,8 @@ from mapctl.retarget.rigs import Rig
 def run(command: Infill) -> int:
     """Check everything, fill, write, report."""
     _check(command)
-    rig = inputs.read_rig(command.rig)
-    motion, marked, has_gaps = inputs.read_motion_with_gaps(command.source, rig)
+    rig = inputs.read_rig(command.rig, command)
+    motion, marked, has_gaps = inputs.read_motion_with_gaps(command.source, rig, quiet=command.quiet)
     ways = _parse_ways(command, motion)
     masks = (*marked, *_parse_masks(command, motion)) or (() if has_gaps or ways else find_gaps(motion))
     done = _run_infilling(command, motion, masks, ways, rig)

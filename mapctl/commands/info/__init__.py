@@ -11,7 +11,7 @@ from mapctl.commands.shared.command import ModelCommand
 
 
 @dataclass(frozen=True)
-class Info(ModelCommand):
+class Info(ModelCommand, options.RigOptions):
     """Bundled priors with their cards and licences, scenes, versions, rendering back end, threads; or a clip's rig."""
 
     tells_licence: ClassVar[bool] = False
@@ -22,8 +22,6 @@ class Info(ModelCommand):
     """A prior whose whole card is printed, as JSON: bundled, a file, or a run folder. Or a clip in
     any format that `mapctl convert` reads, of which rig, joints, unit, axes and length are printed, and whether the fit
     is sure, doubtful or refused, with reasons."""
-    rig: options.MaybeRig = None
-    """The clip's rig, where it is not the one that would be recognised."""
     out: Annotated[Path | None, arg(aliases=["-o"], metavar="FILE.png")] = None
     """A picture of a clip's rig: its T-pose with both names of each joint, two frames, axes, and what is doubtful. Of a
     run folder or a prior: its losses and validations over the steps."""

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from mapctl import formats, report, retarget
+from mapctl.commands.info import Info
 from mapctl.commands.shared import inputs, outputs
 from mapctl.commands.shared.tables import print_table
 from mapctl.errors import RequestError
@@ -24,14 +25,15 @@ def is_clip(name: str) -> bool:
     return formats.ending_of(name) in formats.READERS
 
 
-def print_clip(path: Path, rig: str | None, *, as_json: bool, picture: Path | None = None) -> None:
+def print_clip(path: Path, command: Info) -> None:
     """Print a clip's description, and draw it where a picture is asked for.
 
     RequestError where the rig is not recognised, naming what is missing; what can be told of the clip is printed first.
     """
+    picture, as_json = command.out, command.json
     outputs.check_picture(picture, given=path)
-    given = inputs.read_rig(rig)
-    motion = inputs.read_motion(path, given)
+    given = inputs.read_rig(command.rig, command)
+    motion = inputs.read_motion(path, given, quiet=True)
     try:
         rigmap = retarget.to_canonical(motion, given)[1]
     except RequestError as refusal:
@@ -101,6 +103,7 @@ def _print(described: dict[str, Any], *, as_json: bool) -> None:
     if described["fit"] == "doubtful":  # why a rig is refused, standard error says
         for reason in described["doubts"]:
             print(f"doubtful: {reason}")
+        print(inputs.OVERRULE)
 
 
 def _format_unit(metres: float) -> str:

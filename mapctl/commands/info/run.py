@@ -27,13 +27,13 @@ NOTICE = (
 def run(command: Info) -> int:
     """Collect and print."""
     if command.name is not None and clip.is_clip(command.name):
-        clip.print_clip(Path(command.name), command.rig, as_json=command.json, picture=command.out)
+        clip.print_clip(Path(command.name), command)
     elif command.out is not None and command.name is not None and command.rig is None:
         _plot_training(command.name, command.out)
     elif command.out is not None:
         raise RequestError("--out is a picture of a clip's rig or a run's training: mapctl info CLIP|RUN -o FILE.png")
-    elif command.rig is not None:
-        raise RequestError("--rig is of a clip: mapctl info CLIP --rig PRESET|FILE.toml|CLIP")
+    elif command.rig is not None or command.unit is not None or command.up is not None:
+        raise RequestError("--rig, --unit and --up are of a clip: mapctl info CLIP --rig PRESET|FILE.toml|CLIP")
     elif command.name is not None:
         print(report.to_json(read_prior_card(command.name)), end="")
     elif command.json:

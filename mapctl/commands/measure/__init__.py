@@ -11,7 +11,7 @@ from mapctl.commands.shared.command import ModelCommand
 
 
 @dataclass(frozen=True)
-class Measure(ModelCommand):
+class Measure(ModelCommand, options.RigOptions):
     """Path, feet, jitter and more of a motion, beside a reference clip and mocap's own values.
 
     Of a clip also its cycle, of a walk or a run one stride, or that it has none.

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from mapctl import formats, metrics
+from mapctl.commands.shared.inputs import read_motion
 from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.errors import MapctlError, RequestError
 from mapctl.features import PRIOR_FPS
@@ -16,6 +17,7 @@ from mapctl.metrics.comparison import make_comparable
 from mapctl.metrics.realism.diversity import align_to_start, measure_position_diversity
 from mapctl.metrics.realism.gait import PIECE_SECONDS
 from mapctl.motion import Motion
+from mapctl.retarget.rigs import Rig
 
 SETTINGS = realism.RealismSettings()
 """Settings of the classifier of two folders."""
@@ -39,9 +41,9 @@ class _MeasuredClip:
     """Notes on what could not be made comparable."""
 
     @staticmethod
-    def read(path: Path, *, with_windows: bool) -> "_MeasuredClip":
+    def read(path: Path, *, with_windows: bool, rig: Rig | None) -> "_MeasuredClip":
         """Read and measure a file; MapctlError for what cannot be read, measured or cut."""
-        motion, notes = make_comparable(formats.load(path))
+        motion, notes = make_comparable(read_motion(path, rig), rig)
         measures, positions, windows = metrics.measure(motion), torch.zeros(0), torch.zeros(0)
         if with_windows:
             positions = realism.canonical_positions(motion)
@@ -72,9 +74,9 @@ class ClipSet:
     """Notes on what could not be made comparable."""
 
     @staticmethod
-    def read(folder: Path, *, with_windows: bool) -> "ClipSet":
-        """Read and measure. A file that cannot be read, measured or cut into windows is left out; RequestError if none
-        can."""
+    def read(folder: Path, *, with_windows: bool, rig: Rig | None = None) -> "ClipSet":
+        """Read and measure clips of a rig. A file that cannot be read, measured or cut into windows is left out;
+        RequestError if none can."""
         paths = sorted(p for p in folder.rglob("*") if p.suffix.lower() in formats.READERS and p.is_file())
         if not paths:
             raise RequestError(f"{folder}: no {' or '.join(formats.READERS)} file in this folder or below it")
@@ -83,7 +85,7 @@ class ClipSet:
         with show_progress(f"reading {folder}") as progress:
             for number, path in enumerate(paths, start=1):
                 try:
-                    clips.append(_MeasuredClip.read(path, with_windows=with_windows))
+                    clips.append(_MeasuredClip.read(path, with_windows=with_windows, rig=rig))
                 except MapctlError as error:
                     skipped[str(path)] = str(error) if str(error).startswith(str(path)) else f"{path}: {error}"
                 if progress is not None:

@@ -5,7 +5,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from mapctl import editing, formats, metrics, report, retarget
+from mapctl import editing, metrics, report, retarget
 from mapctl.commands.measure import Measure
 from mapctl.commands.measure.clip_sets import ClipSet, compare_variability, explain_verdicts, train_judges
 from mapctl.commands.shared import inputs, options, outputs
@@ -15,6 +15,7 @@ from mapctl.curves.curve import Curve
 from mapctl.errors import CheckpointError, RequestError
 from mapctl.metrics.comparison import make_comparable
 from mapctl.motion import Motion
+from mapctl.retarget.rigs import Rig
 from priors import checkpoints
 
 _WHY_STEPS = 2000  # training steps of a classifier that is to be explained
@@ -37,27 +38,28 @@ def run(command: Measure) -> int:
 
 def _measure_clips(command: Measure) -> dict[str, Any]:
     curve = _read_curve(command)
-    whole = formats.load(command.clip)
-    clip, notes = _make_comparable(whole, command.clip)
+    rig = inputs.read_rig(command.rig, command)
+    whole = inputs.read_motion(command.clip, rig)
+    clip, notes = _make_comparable(whole, command.clip, rig)
     ours = metrics.measure(clip, curve, speed=command.speed)
     reference = {}
     if command.reference is not None:
-        other, more = _make_comparable(formats.load(command.reference), command.reference)
+        other, more = _make_comparable(inputs.read_motion(command.reference, None), command.reference)
         reference, notes = metrics.measure(other), notes + more
     return {
         "clip": str(command.clip),
         "measures": ours,
         "reference": reference,
         "mocap": _read_mocap_values(command.prior),
-        "cycle": _measure_cycle(whole),
+        "cycle": _measure_cycle(whole, rig),
         "notes": notes,
     }
 
 
-def _measure_cycle(motion: Motion) -> dict[str, Any]:
+def _measure_cycle(motion: Motion, rig: Rig | None) -> dict[str, Any]:
     """Describe the cycle of a motion of any rig, at its own rate; else say why there is none."""
     try:
-        canonical = retarget.to_canonical(motion)[0]
+        canonical = retarget.to_canonical(motion, rig)[0]
         return editing.describe_cycle(canonical, editing.find_cycle(canonical))
     except RequestError as error:
         return {"none": str(error).removeprefix("no cycle is found: ")}
@@ -92,7 +94,7 @@ def _check_folders(command: Measure, alike: bool) -> None:
 
 def _measure_folders(command: Measure) -> dict[str, Any]:
     compared = command.reference is not None
-    ours = ClipSet.read(command.clip, with_windows=compared)
+    ours = ClipSet.read(command.clip, with_windows=compared, rig=inputs.read_rig(command.rig, command))
     reference = ClipSet.read(command.reference, with_windows=True) if command.reference is not None else None
     values = {
         "clip": str(command.clip),
@@ -153,9 +155,9 @@ def _shorten(lines: Sequence[str]) -> list[str]:
     return [*lines[:_MAX_LINES], *([f"and {more} more, which --json lists"] if more > 0 else [])]
 
 
-def _make_comparable(motion: Motion, path: Path) -> tuple[Motion, list[str]]:
+def _make_comparable(motion: Motion, path: Path, rig: Rig | None = None) -> tuple[Motion, list[str]]:
     """Make a clip as mocap's values were measured, and note what could not be made so."""
-    comparable, notes = make_comparable(motion)
+    comparable, notes = make_comparable(motion, rig)
     return comparable, [f"{path}: {note}" for note in notes]
 
 

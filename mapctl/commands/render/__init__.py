@@ -10,7 +10,7 @@ from mapctl.commands.shared.command import Command
 
 
 @dataclass(frozen=True)
-class Render(Command):
+class Render(Command, options.RigOptions):
     """Film a motion: MP4, GIF, or a PNG contact sheet. Files of known rigs that have Z up are put upright."""
 
     single_thread: ClassVar[bool] = False

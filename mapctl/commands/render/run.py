@@ -1,11 +1,11 @@
 """`mapctl render`: a film of a motion."""
 
-from mapctl import formats
 from mapctl.commands.render import Render
 from mapctl.commands.shared import inputs, options, outputs
 from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.curves import Curve
 from mapctl.motion import Motion
+from mapctl.retarget.rigs import Rig
 from mapctl.retarget.upright import put_upright
 from scenes.cameras import CameraSettings
 from scenes.drawn_character import DrawnCharacter
@@ -18,7 +18,9 @@ def run(command: Render) -> int:
     size = options.parse_size(command.size)
     outputs.check_film(command.out, size)
     curve = None if command.curve is None else inputs.read_curve(command.curve, command.metres_per_unit)
-    shot, notes = _prepare_shot(formats.load(command.source), curve, command.character)
+    rig = inputs.read_rig(command.rig, command)
+    motion = inputs.read_motion(command.source, rig, quiet=command.quiet)
+    shot, notes = _prepare_shot(motion, rig, curve, command.character)
     with show_progress("filming", quiet=command.quiet) as progress:
         camera = CameraSettings(command.camera)
         film([shot], command.out, camera=camera, size=size, progress=progress)
@@ -27,10 +29,12 @@ def run(command: Render) -> int:
     return 0
 
 
-def _prepare_shot(motion: Motion, curve: Curve | None, character: str | None) -> tuple[Shot, tuple[str, ...]]:
+def _prepare_shot(
+    motion: Motion, rig: Rig | None, curve: Curve | None, character: str | None
+) -> tuple[Shot, tuple[str, ...]]:
     """Put the motion upright, or on a character; also return notes on what is not known or not kept."""
+    upright, notes = put_upright(motion, rig)
     if character is None:
-        upright, notes = put_upright(motion)
         return Shot(upright, curve), notes
-    drawn = DrawnCharacter.load(character).put_on(motion)
+    drawn = DrawnCharacter.load(character).put_on(motion if rig is None else upright)
     return Shot(motion, curve, drawn=drawn), drawn.notes

@@ -1,19 +1,26 @@
 """Readers of what options name: curves, rigs and motions."""
 
 import os
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
 from mapctl import curves, formats
+from mapctl.commands.shared.options import ReadOptions
 from mapctl.curves import Curve
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
+from mapctl.formats import bvh
+from mapctl.formats.text import warn_once
 from mapctl.motion import Motion
 from mapctl.recording.masks import Mask, masks_from_missing
-from mapctl.retarget import figure, load_rig
-from mapctl.retarget.rigs import Rig
+from mapctl.retarget import figure, identify_rig, load_rig
+from mapctl.retarget.recognition.doubts import assess_fit
+from mapctl.retarget.rigs import Rig, parse_unit
 from priors.licences import note_licence
 
+OVERRULE = "--unit, --up and --rig overrule what was guessed"
+"""How to settle a doubt."""
 MAX_FRAMES = 3_600_000
 """Frames of the longest motion in one call: 33 hours at the priors' rate."""
 
@@ -34,9 +41,14 @@ def read_curve(text: str, metres_per_unit: float | None) -> Curve:
     return curves.read(text, metres_per_unit=metres_per_unit)
 
 
-def read_rig(text: str | None) -> Rig | None:
-    """Read the rig of a --rig option: a preset, a TOML file, or that of a clip; None without the option."""
-    return None if text is None else load_rig(text)
+def read_rig(text: str | None, options: ReadOptions) -> Rig | None:
+    """Read the rig of a --rig option: a preset, a TOML file, or that of a clip; with the unit and the up axis of
+    `options`, which a rig without joints has where none is named. None without any of them."""
+    rig = None if text is None else load_rig(text)
+    if options.unit is None and options.up is None:
+        return rig
+    rig = rig or Rig("unlisted", {})
+    return replace(rig, up=options.up or rig.up, metres_per_unit=parse_unit(options.unit) or rig.metres_per_unit)
 
 
 def read_rig_clip(text: str) -> tuple[Motion, Rig | None]:
@@ -49,15 +61,40 @@ def read_rig_clip(text: str) -> tuple[Motion, Rig | None]:
     return figure.make_tpose_clip(rig), rig
 
 
-def read_motion(path: Path, rig: Rig | None, *, fps: Fraction | None = None) -> Motion:
-    """Read a motion in metres, from the rig's unit where it has one; `fps` is that of an .amc."""
+def read_motion(path: Path, rig: Rig | None, *, fps: Fraction | None = None, quiet: bool = False) -> Motion:
+    """Read a motion in metres, from the rig's unit where it has one; `fps` is that of an .amc. Print what is doubtful
+    unless `quiet`."""
     motion = formats.load(path, fps=fps, metres_per_unit=None if rig is None else rig.metres_per_unit)
-    note_licence(str(path), motion.licence)
+    _report_reading(path, motion, rig, quiet=quiet)
     return motion
 
 
-def read_motion_with_gaps(path: Path, rig: Rig | None) -> tuple[Motion, tuple[Mask, ...], bool]:
+def read_motion_with_gaps(path: Path, rig: Rig | None, *, quiet: bool) -> tuple[Motion, tuple[Mask, ...], bool]:
     """Read a motion in which missing values may be NaN; also return their masks, and whether there are any."""
     motion, missing = formats.load_with_missing(path, metres_per_unit=None if rig is None else rig.metres_per_unit)
-    note_licence(str(path), motion.licence)
+    _report_reading(path, motion, rig, quiet=quiet)
     return motion, masks_from_missing(motion, missing), bool(missing.rotations.any() or missing.places.any())
+
+
+def _report_reading(path: Path, motion: Motion, rig: Rig | None, *, quiet: bool) -> None:
+    """Note the licence of a motion that was read; print what is doubtful and a unit that is not used unless `quiet`."""
+    note_licence(str(path), motion.licence)
+    if quiet:
+        return
+    if rig is not None and rig.metres_per_unit is not None and bvh.unit_of(motion) is None:
+        warn_once(f"{path}: the file declares its unit; the one that is given is not used")
+    print_doubts(path, motion, rig)
+
+
+def print_doubts(path: Path, motion: Motion, rig: Rig | None) -> None:
+    """Print in one line on standard error what is doubtful about how a motion is understood; once for each file.
+
+    Nothing is printed where the rig is refused, which is an error of commands that need it.
+    """
+    try:
+        doubts = list(assess_fit(identify_rig(motion.skeleton, rig, motion=motion), motion).doubts)
+    except RequestError:
+        return
+    if doubts:
+        more = f" (and {len(doubts) - 1} more)" if len(doubts) > 1 else ""
+        warn_once(f"{path}: {doubts[0].reason}{more}; {OVERRULE}, see mapctl info {path}")

@@ -1,7 +1,7 @@
 """Options that several commands share: their types for tyro, and checks that need nothing heavy."""
 
 import re
-from dataclasses import asdict, fields, is_dataclass
+from dataclasses import asdict, dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -37,6 +37,26 @@ Size = Annotated[str, arg(metavar="WxH")]
 
 Method = Annotated[str, arg(metavar="auto|transformer|infiller|tweener|stitcher|rollouts|slerp")]
 OutRig = Annotated[str, arg(metavar="canonical|PRESET|FILE.toml|CLIP")]
+MaybeAxis = Annotated[Literal["x", "y", "z", "-x", "-y", "-z"] | None, arg(metavar="x|y|z|-x|-y|-z")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReadOptions:
+    """Options on how motion files are read, which overrule what would be found."""
+
+    unit: Annotated[str | None, arg(metavar="m|dm|cm|mm|in|METRES")] = None
+    """Unit of lengths in a .bvh or .amc that is read, or its length in metres; the one in which the body is nearest to
+    an adult if not given. Other formats declare theirs."""
+    up: MaybeAxis = None
+    """Axis of the motion that is read which points up; found by the body and its motion if not given."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RigOptions(ReadOptions):
+    """The same for commands that read motions of one rig."""
+
+    rig: MaybeRig = None
+    """The rig of what is read, where it is not the one that would be recognised; see `mapctl info IN`."""
 
 
 def check_seed(seed: int) -> None:

@@ -111,5 +111,5 @@ def film_comparison(before: Motion, after: Motion, video: Path | None, *, rig: R
 def build_report(name: str, command: Any, solution: Solution) -> dict[str, Any]:
     """Build the report on a job whose motion is measured as `mapctl measure` takes it, without a curve."""
     request = {key: value for key, value in options.describe_request(name, command).items() if value is not None}
-    comparable = make_comparable(solution.motion, inputs.read_rig(command.rig))[0]
+    comparable = make_comparable(solution.motion, inputs.read_rig(command.rig, command))[0]
     return add_licence(reports.build_report(solution, request=request, measures=metrics.measure(comparable)))

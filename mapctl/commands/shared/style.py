@@ -44,7 +44,7 @@ def _read_example(name: str) -> Example:
     path = Path(name)
     if not path.is_file() and path.suffix.lower() not in formats.READERS:
         return Example(name, None)
-    motion = read_motion(path, None)
+    motion = read_motion(path, None, quiet=True)
     try:
         return Example(path.name, motion_dna.of(motion))
     except RequestError as error:

@@ -10,7 +10,7 @@ from mapctl.commands.shared.command import ModelCommand
 
 
 @dataclass(frozen=True)
-class Tween(ModelCommand):
+class Tween(ModelCommand, options.RigOptions):
     """Make the motion between keyframes: frames of a clip, or poses that a file sets in time and space. On any known
     rig."""
 
@@ -45,8 +45,6 @@ class Tween(ModelCommand):
     gaps with --method tweener, in those of 2 s and more between whole poses with auto. Several are mixed."""
     no_finish: bool = False
     """Leave the proposal as it is, on rigid bones and with exact keys: no MAP stage plants the feet."""
-    rig: options.MaybeRig = None
-    """The rig of IN or of its body, where it is not the one that would be recognised; see `mapctl info`."""
     inbetweener: options.MaybeName = None
     """The file or run folder of a trained transformer, infiller or tweener; the bundled one if not given. With auto a
     tweener is for long gaps, beside the bundled transformer."""

@@ -114,10 +114,10 @@ def _check(command: Tween, given: Sequence[Path]) -> None:
 
 def _read_keyframe_clip(command: Tween, request: KeyRequest | None) -> KeyframeClip:
     """Read the motion that holds the keys, the keys, and its rig where it is known."""
-    rig = inputs.read_rig(command.rig)
+    rig = inputs.read_rig(command.rig, command)
     if request is not None:
         return _load_key_file(command, request, rig)
-    motion = inputs.read_motion(command.source, rig)
+    motion = inputs.read_motion(command.source, rig, quiet=command.quiet)
     frames = [parse_frame(word, fps=float(motion.fps)) for word in (command.keyframes or "").split(",")]
     if len(set(frames)) == 2 and (command.root_only or command.joints is not None):
         name = "--root-only" if command.root_only else "--joints"

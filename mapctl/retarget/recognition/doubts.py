@@ -106,7 +106,7 @@ def _check_unit(rigmap: RigMap, motion: Motion | None) -> Iterator[Doubt]:
         return
     fastest = float(travel.unfold(0, second, second).median(dim=-1).values.max())
     if fastest > _MAX_SPEED:
-        yield Doubt(f"the hips travel at {fastest:.0f} m/s for a second: the unit may be wrong; --unit sets it")
+        yield Doubt(f"the hips travel at {fastest:.0f} m/s for a second: the unit may be wrong")
 
 
 def _find_other_bodies(rigmap: RigMap, poses: RigPoses) -> Iterator[Doubt]:

@@ -91,7 +91,7 @@ def _compare_limbs(places: Places) -> Iterator[Doubt]:
     low = min(float(places[side + "Toes"][1]) for side in ("left", "right"))
     height = float(places["hips"][1]) - low
     if not _HIPS_METRES[0] <= height <= _HIPS_METRES[1]:
-        yield Doubt(f"hips are {height:.2f} m over the toes: the unit may be wrong; --unit sets it")
+        yield Doubt(f"hips are {height:.2f} m over the toes: the unit may be wrong")
 
 
 def _check_order(places: Places) -> Iterator[Doubt]:
