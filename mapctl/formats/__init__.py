@@ -21,15 +21,20 @@ READERS = {
     ".npz": "npz",
     ".amc": "acclaim",
     ".recording": "growing",
-    **dict.fromkeys((".glb", ".gltf", ".vrm"), "gltf"),
+    **dict.fromkeys((".glb", ".gltf", ".vrm", ".vrma"), "gltf"),
     **dict.fromkeys(_USD_ENDINGS, "usd"),
     ".fbx": "fbx",
 }
 """Endings that are read, each with its module of this package, which is imported when it is needed."""
-WRITERS = {".bvh": "bvh", ".npz": "npz", ".glb": "gltf", ".vrm": "gltf", **dict.fromkeys(USD_WRITTEN, "usd")}
+WRITERS = {
+    ".bvh": "bvh",
+    ".npz": "npz",
+    **dict.fromkeys((".glb", ".vrm", ".vrma"), "gltf"),
+    **dict.fromkeys(USD_WRITTEN, "usd"),
+}
 """Endings that are written, likewise."""
-CHARACTERS = (".glb", ".gltf", ".vrm", *_USD_ENDINGS, ".fbx")
-"""Endings of files of skinned characters, that have a rest pose of their own."""
+CHARACTERS = (".glb", ".gltf", ".vrm", ".vrma", *_USD_ENDINGS, ".fbx")
+"""Endings of files of characters, that have a rest pose of their own."""
 _MAY_LACK_VALUES = (".bvh", ".npz", ".amc")
 _ONLY_READ = (".fbx", ".gltf", ".usdz", ".amc", ".recording")
 _UNREADABLE_REASONS = {".asf": "is a skeleton alone: name its motion, a .amc beside it or subject.asf+take.amc"}

@@ -13,7 +13,7 @@ from mapctl.mesh.primitives import Array
 from mapctl.mesh.skinning import build_skin
 from mapctl.motion import Motion
 
-_FAMILIES = {".glb": "gltf", ".usd": "usd", ".fbx": "fbx"}
+_FAMILIES = {".glb": "gltf", ".vrma": "gltf", ".usd": "usd", ".fbx": "fbx"}
 _MOST_CARRIERS = 4  # joints of a vertex, as every engine takes them
 
 

@@ -1,10 +1,13 @@
-"""What is chosen of a file, names made unique, and frame rates behind key times."""
+"""What is chosen of a file, and listed; names made unique, and frame rates behind key times."""
 
+import json
 from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
 import pytest
+from character_maker import make_character_glb
+from helpers import run
 
 from mapctl.errors import FileFormatError
 from mapctl.formats.characters.key_times import sample_times
@@ -78,3 +81,19 @@ def test_keys_of_no_rate_are_read_at_thirty():
 @pytest.mark.parametrize("keys", [[], [2.0], [2.0, 2.0]])
 def test_one_key_is_one_frame(keys):
     assert len(sample_times(np.array(keys))[1]) == 1
+
+
+def test_info_lists_skeletons_and_animations(tmp_path, capsys):
+    hero = make_character_glb(tmp_path / "hero.glb", animations=("walk", "run"), frames=31).path
+    assert run("info", f"{hero}#/run", "--json") == 0
+    told = json.loads(capsys.readouterr().out)
+    skeleton = told["skeletons"][0]["name"]
+    assert told["skeletons"] == [{"name": skeleton, "read": True, "choose": f"hero.glb#{skeleton}"}]
+    assert told["animations"] == [
+        {"name": name, "seconds": pytest.approx(1.0), "read": name == "run", "choose": f"hero.glb#/{name}"}
+        for name in ("walk", "run")
+    ]
+    assert run("info", hero) == 0
+    rows = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert ["walk", "1.00", "s", "read"] in rows
+    assert ["run", "1.00", "s", "hero.glb#/run"] in rows

@@ -149,6 +149,61 @@ def test_it_is_a_rig(tmp_path):
     motion.save(tmp_path / "b.bvh")
 
 
+def test_indices_of_a_mesh_that_point_at_nothing_are_one_warning(tmp_path, capsys):
+    """As 3ds Max writes them: -1 for corners without a texture coordinate."""
+    path = tmp_path / "a.fbx"
+    made = make_fbx(path)
+    layer = """
+        LayerElementUV: 0 {
+            MappingInformationType: "ByPolygonVertex"
+            ReferenceInformationType: "IndexToDirect"
+            UV: *2 { a: 0,0
+            }
+            UVIndex: *COUNT { a: INDICES
+            }
+        }
+        Layer: 0 {
+            LayerElement:  {
+                Type: "LayerElementUV"
+                TypedIndex: 0
+            }
+        }"""
+    found = re.search(r"\t\tPolygonVertexIndex: \*(\d+) .*?}\n?", path.read_text(), re.DOTALL)
+    assert found is not None
+    count = int(found[1])
+    layer = layer.replace("COUNT", str(count)).replace("INDICES", ",".join(["-1", *["0"] * (count - 1)]))
+    path.write_text(path.read_text().replace(found[0], f"{found[0].rstrip()}{layer}\n"))
+    np.testing.assert_allclose(in_order(formats.load(path)), made.places, **NEAR)
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1
+    assert f"{path}: 1 index of its meshes points at nothing" in err
+    np.testing.assert_allclose(formats.load_mesh(path).vertices, made.vertices, **NEAR)
+
+
+@pytest.mark.parametrize("scale", ["-1,-1,-1", "1,1,-1"])
+def test_a_last_joint_may_mirror(scale, tmp_path):
+    path = tmp_path / "a.fbx"
+    made = make_fbx(path, skin=False)
+    plain = formats.load(path)
+    start, end = path.read_text().split('"Model::leftToes"')
+    place = end.index('\t\t\tP: "PreRotation"')
+    path.write_text(
+        f'{start}"Model::leftToes"{end[:place]}\t\t\tP: "Lcl Scaling", "Lcl Scaling", "", "A",{scale}\n{end[place:]}'
+    )
+    motion = formats.load(path)
+    np.testing.assert_allclose(in_order(motion), made.places, **NEAR)
+    np.testing.assert_allclose((motion.joint_rotations() * plain.joint_rotations()).sum(-1).abs(), 1.0, **NEAR)
+
+
+def test_animations_and_armatures_are_listed(tmp_path, capsys):
+    path = tmp_path / "a.fbx"
+    make_fbx(path, takes=("Walk", "Run"), skin=False)
+    source = formats.load(path).source
+    assert source.animations == {"Walk": pytest.approx(5 / 30), "Run": pytest.approx(5 / 30)}
+    assert source.armatures == ["Armature"]
+    assert "reads 'Walk', the first of 2 animations; choose another as 'a.fbx#/Run'" in capsys.readouterr().err
+
+
 STOP = '"LocalStop", "KTime", "Time", "",'
 SCALING = '"Lcl Scaling", "", "A",'
 BAD = {

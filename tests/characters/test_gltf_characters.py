@@ -114,6 +114,40 @@ def test_animations_are_read(kind, interpolation, tmp_path):
     assert other.source.animation == "other"
 
 
+@pytest.mark.parametrize("mirror", [(-1, -1, -1), (1, 1, -1)])
+def test_a_last_joint_that_mirrors_is_read_and_written(mirror, tmp_path):
+    made = make(tmp_path, "metres", animations=("walk",), leaves="none")
+    plain, toes = formats.load(made.path), made.nodes[made.names.index(made.joint["leftToes"])]
+    edit_glb(made.path, lambda tree: tree["nodes"][toes].update(scale=list(mirror)))
+    motion = formats.load(made.path)
+    torch.testing.assert_close(motion.joint_positions(), plain.joint_positions(), rtol=0, atol=1e-6)
+    same = (motion.joint_rotations() * plain.joint_rotations()).sum(-1).abs()
+    torch.testing.assert_close(same, torch.ones_like(same), rtol=0, atol=1e-6)
+    motion.save(tmp_path / "new.glb")
+    old, new = GlbViewer(made.path), GlbViewer(tmp_path / "new.glb")
+    for frame in (0, 11, 30):
+        np.testing.assert_allclose(new.world(toes, 0, frame / 30), old.world(toes, 0, frame / 30), atol=1e-5)
+
+
+def test_of_several_animations_the_one_that_is_read_is_named(tmp_path, capsys):
+    path = make(tmp_path, "metres", animations=("walk", "run")).path
+    motion = formats.load(path)
+    assert capsys.readouterr().err == (
+        f"mapctl: {path}: reads 'walk', the first of 2 animations; choose another as 'hero.glb#/run'\n"
+    )
+    assert motion.source.animations == {"walk": pytest.approx(1.0), "run": pytest.approx(1.0)}
+    assert list(motion.source.armatures) == [motion.source.armature]
+    formats.load(f"{path}#/run")
+    formats.load_rest(path)
+    assert capsys.readouterr().err == ""
+
+
+def test_an_animation_that_is_broken_and_not_read_is_passed_over(tmp_path):
+    path = make(tmp_path, "metres", animations=("walk", "run")).path
+    edit_glb(path, lambda tree: [sampler.update(input=9999) for sampler in tree["animations"][1]["samplers"]])
+    assert list(formats.load(path).source.animations) == ["walk"]
+
+
 def follow_up(made, frames=20):
     """A walk on the character that was made."""
     body = RiggedCharacter.of(figure.load_standing_character(made.path))[1]

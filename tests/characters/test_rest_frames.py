@@ -100,10 +100,10 @@ def test_end_sites_are_offsets_from_their_joint():
     ],
 )
 def test_uneven_scale_is_told_with_its_joint(linear, why):
-    worlds = np.tile(np.eye(4), (2, 1, 1))
+    worlds = np.tile(np.eye(4), (3, 1, 1))
     worlds[1, :3, :3] = linear
     with pytest.raises(UnevenScaleError, match=f"joint b: .*{why}"):
-        RestFrames.of(("a", "b"), (-1, 0), worlds, np.eye(4))
+        RestFrames.of(("a", "b", "c"), (-1, 0, 1), worlds, np.eye(4))
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -136,3 +136,18 @@ def test_aligned_frames_are_told():
     worlds = np.tile(np.eye(4), (2, 1, 1))
     assert RestFrames.of(("a", "b"), (-1, 0), worlds, np.eye(4)).are_aligned
     assert not example(0)[0].are_aligned
+
+
+@pytest.mark.parametrize("mirror", [(-1, -1, -1), (1, 1, -1), (-0.5, 0.5, 0.5)])
+def test_a_last_joint_may_mirror(mirror):
+    """Its scale does not change how it turns, and takes its mesh along."""
+    frames, _, worlds = example(3)
+    scaled = np.diag([*mirror, 1.0])
+    rest, moved = frames.matrices(), worlds.copy()
+    rest[4], moved[:, 4] = rest[4] @ scaled, moved[:, 4] @ scaled
+    found = RestFrames.of(NAMES, PARENTS, rest, frames.outer)
+    np.testing.assert_allclose(found.matrices(), rest, atol=1e-12)
+    told, wanted = (f.to_motion(w, Fraction(30), f.skeleton({}), None) for f, w in ((found, moved), (frames, worlds)))
+    np.testing.assert_allclose(told.joint_positions(), wanted.joint_positions(), atol=1e-12)
+    same = (told.joint_rotations() * wanted.joint_rotations()).sum(-1).abs()
+    np.testing.assert_allclose(same, 1.0, atol=1e-12)

@@ -119,6 +119,24 @@ class TestReading:
         assert formats.load(path).num_frames == 1
         assert formats.load(path).source.animation is None
 
+    def test_a_last_joint_may_mirror(self, tmp_path):
+        path = make(tmp_path, "plain", frames=9)
+        plain = formats.load(path)
+        stage = Usd.Stage.Open(str(path))
+        skeleton = UsdSkel.Skeleton(next(prim for prim in stage.Traverse() if prim.IsA(UsdSkel.Skeleton)))
+        mirror, toes = Gf.Matrix4d(Gf.Vec4d(1, 1, -1, 1)), JOINTS.index("leftToes")
+        for attribute in (skeleton.GetRestTransformsAttr(), skeleton.GetBindTransformsAttr()):
+            matrices = attribute.Get()
+            matrices[toes] = mirror * matrices[toes]
+            attribute.Set(matrices)
+        stage.Save()
+        motion = formats.load(path)
+        np.testing.assert_allclose(motion.joint_positions(), plain.joint_positions(), **NEAR)
+        np.testing.assert_allclose(motion.joint_rotations(), plain.joint_rotations(), **NEAR)
+        motion.save(tmp_path / "new.usda")
+        again = formats.load(tmp_path / "new.usda")
+        np.testing.assert_allclose(again.joint_rotations(), motion.joint_rotations(), **NEAR)
+
     @pytest.mark.parametrize(
         ("rate", "step", "start", "fps", "frames"),
         [

@@ -22,13 +22,14 @@ class Convert(Command, options.ReadOptions):
 
     source: Positional[Annotated[Path, arg(metavar="IN|FOLDER")]]
     """.bvh, .npz, .recording, or .amc: its skeleton is the .asf of the same name, else the only one in the folder, else
-    named as in subject.asf+take.amc. Of a character (.glb, .gltf, .vrm, .usda, .usdc, .usd, .usdz, .fbx) its first
-    animation, else one frame of its rest pose; hero.glb#ARMATURE, hero.glb#ARMATURE/ANIMATION and hero.glb#/ANIMATION
-    choose others. Or a folder, every motion below it."""
+    named as in subject.asf+take.amc. Of a character (.glb, .gltf, .vrm, .vrma, .usda, .usdc, .usd, .usdz, .fbx) its
+    first animation, else one frame of its rest pose; hero.glb#ARMATURE, hero.glb#ARMATURE/ANIMATION and
+    hero.glb#/ANIMATION choose others. Or a folder, every motion below it."""
     out: Positional[Annotated[Path, arg(metavar="OUT|FOLDER")]]
     """.bvh, .npz, or with a skinned body .glb, .usda, .usdc or .usd: that of the character in IN or in --rig, where it
-    came from such a file, else a mannequin. A .vrm is written of a VRM character only. Of a folder another one, which
-    gets the same names."""
+    came from such a file, else a mannequin. A .vrm is written of a VRM character only. A .vrma holds motion
+    alone: of the bones of a VRM, or of any rig's canonical joints. Of a folder another one, which gets the same
+    names."""
     to: Annotated[str | None, arg(metavar=".ENDING")] = None
     """For a folder: the ending of all results, as .glb; their own if not given, or .bvh."""
     rig: Annotated[str | None, arg(metavar="canonical|PRESET|FILE.toml|CLIP")] = None

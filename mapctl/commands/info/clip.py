@@ -9,13 +9,14 @@ from mapctl.commands.shared import inputs, outputs
 from mapctl.commands.shared.tables import print_table
 from mapctl.errors import RequestError
 from mapctl.formats import bvh
+from mapctl.formats.characters.source import CharacterSource
 from mapctl.formats.units import UNITS
 from mapctl.motion import Motion
 from mapctl.retarget import RigMap
 from mapctl.retarget.recognition.doubts import Fit, assess_fit
 from mapctl.skeleton import CANONICAL
 
-_LISTS = ("joints", "known_by", "unmapped", "doubts", "fit")
+_LISTS = ("joints", "known_by", "unmapped", "doubts", "fit", "skeletons", "animations")
 
 _UNITS = {metres: name for name, metres in UNITS.items()}
 
@@ -81,6 +82,21 @@ def _describe_file(motion: Motion) -> dict[str, Any]:
         "frames": motion.num_frames,
         "fps": float(motion.fps),
         "seconds": motion.seconds,
+        **(_describe_choices(motion.source) if isinstance(motion.source, CharacterSource) else {}),
+    }
+
+
+def _describe_choices(source: CharacterSource) -> dict[str, Any]:
+    """Describe the skeletons and animations of a character's file, which of them were read, and how each is chosen."""
+    file, own = source.path.name, source.armature if len(source.armatures) > 1 else ""
+    return {
+        "skeletons": [
+            {"name": name, "read": name == source.armature, "choose": f"{file}#{name}"} for name in source.armatures
+        ],
+        "animations": [
+            {"name": name, "seconds": seconds, "read": name == source.animation, "choose": f"{file}#{own}/{name}"}
+            for name, seconds in source.animations.items()
+        ],
     }
 
 
@@ -96,6 +112,17 @@ def _print(described: dict[str, Any], *, as_json: bool) -> None:
         shown["up"] = f"+{described['up']}" if len(described["up"]) == 1 else described["up"]
     del shown["metres_per_unit"]
     print_table(["clip", ""], [[key.replace("_", " "), str(value)] for key, value in shown.items()])
+    for kind in ("skeletons", "animations"):
+        rows = [
+            [
+                one["name"],
+                f"{one['seconds']:.2f} s" if "seconds" in one else "",
+                "read" if one["read"] else one["choose"],
+            ]
+            for one in described.get(kind, ())
+        ]
+        if rows:
+            print_table([kind, "", "read, or chosen by"], rows)
     if described["joints"]:
         print_table(["canonical", "joint of the rig"], [[c, own] for c, own in described["joints"].items()])
     print(f"not canonical ({len(described['unmapped'])}): {', '.join(described['unmapped']) or 'none'}")

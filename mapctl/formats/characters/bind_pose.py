@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from mapctl.formats.characters.rest_frames import UnevenScaleError, split_scale
+from mapctl.formats.characters.rest_frames import UnevenScaleError, split_scales
 
 Array = np.ndarray
 _BONE_SHARE = 0.02  # of a bone's length by which it may differ between bind pose and nodes
@@ -23,7 +23,7 @@ def complete_bind_pose(parents: tuple[int, ...], bound: Mapping[int, Array], wor
             if abs(length - usual) > _BONE_SHARE * max(usual, 0.02):
                 return None
     try:
-        scales = [split_scale(matrix)[1] / split_scale(world)[1] for matrix, world in zip(done, worlds, strict=True)]
+        scales = split_scales(parents, done)[1] / split_scales(parents, worlds)[1]
     except UnevenScaleError:
         return None
     return done if np.allclose(scales, 1.0, rtol=1e-2) else None

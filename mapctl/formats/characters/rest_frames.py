@@ -22,7 +22,10 @@ STILL_METRES = 1e-5
 
 
 class UnevenScaleError(ValueError):
-    """A matrix stretches by different factors along its axes, mirrors, or shears; `args[0]` says which."""
+    """A matrix stretches by different factors along its axes, mirrors, or shears; `args[0]` says which, `joint` of
+    which joint, where it is one of several."""
+
+    joint: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,19 +41,17 @@ class RestFrames:
     quat_xyzw: Array
     """(joints, 4) world rotations at rest."""
     scales: Array
-    """(joints,) metres of the world by unit of the joint's frame."""
+    """(joints,) metres of the world by unit of the joint's frame; negative for a last joint that mirrors."""
     outer: Array
     """(4, 4) what takes the frame that the root is in to the world: placement, up axis and unit of the file."""
 
     @staticmethod
     def of(names: tuple[str, ...], parents: tuple[int, ...], worlds: Array, outer: Array) -> "RestFrames":
         """Take them from world matrices (joints, 4, 4) at rest. UnevenScaleError names a joint that is stretched."""
-        turns, scales = np.empty((len(names), 3, 3)), np.empty(len(names))
-        for joint, name in enumerate(names):
-            try:
-                turns[joint], scales[joint] = split_scale(worlds[joint])
-            except UnevenScaleError as error:
-                raise UnevenScaleError(f"joint {name}: {error}") from None
+        try:
+            turns, scales = split_scales(parents, worlds)
+        except UnevenScaleError as error:
+            raise UnevenScaleError(f"joint {names[error.joint]}: {error}") from None
         split_scale(outer)
         quats = rotations.from_matrix(torch.from_numpy(turns)).numpy()
         return RestFrames(names, parents, worlds[:, :3, 3].copy(), quats, scales, outer)
@@ -86,7 +87,7 @@ class RestFrames:
 
     def to_motion(self, worlds: Array, fps: Fraction, skeleton: Skeleton, source: object) -> Motion:
         """Return the motion of world matrices (frames, joints, 4, 4) in the file's joint frames."""
-        turns = torch.from_numpy(nearest_rotations(worlds[..., :3, :3]))
+        turns = torch.from_numpy(nearest_rotations(np.sign(self.scales)[:, None, None] * worlds[..., :3, :3]))
         world = rotations.multiply(
             rotations.from_matrix(turns),
             rotations.inverse(torch.from_numpy(self.quat_xyzw)).expand(*worlds.shape[:2], 4),
@@ -119,12 +120,30 @@ class RestFrames:
         return moved.numpy(), rotations.make_sign_continuous(turned).numpy()
 
 
-def split_scale(matrix: Array) -> tuple[Array, float]:
+def split_scales(parents: tuple[int, ...], worlds: Array) -> tuple[Array, Array]:
+    """Return rotations (joints, 3, 3) and scales (joints,) of world matrices (joints, 4, 4).
+
+    UnevenScaleError as of `split_scale`; but last joints, in whose frames no other is, may mirror.
+    """
+    turns, scales = np.empty((len(parents), 3, 3)), np.empty(len(parents))
+    for joint, matrix in enumerate(worlds):
+        try:
+            turns[joint], scales[joint] = split_scale(matrix, may_mirror=joint not in parents)
+        except UnevenScaleError as error:
+            error.joint = joint
+            raise
+    return turns, scales
+
+
+def split_scale(matrix: Array, *, may_mirror: bool = False) -> tuple[Array, float]:
     """Return rotation (3, 3) and scale of a (4, 4) matrix that turns and scales alike along all axes.
 
-    UnevenScaleError where it does not: where it stretches, mirrors or shears by more than a thousandth.
+    UnevenScaleError where it does not: where it stretches, mirrors or shears by more than a thousandth. One that
+    `may_mirror` has a negative scale where it does.
     """
-    linear = matrix[:3, :3]
+    linear, sign = matrix[:3, :3], 1.0
+    if may_mirror and np.linalg.det(linear) < 0:
+        linear, sign = -linear, -1.0
     lengths = np.linalg.norm(linear, axis=0)
     scale = float(np.cbrt(abs(np.linalg.det(linear))))
     if not scale > 1e-9:
@@ -135,7 +154,7 @@ def split_scale(matrix: Array) -> tuple[Array, float]:
         linear.T @ linear, scale**2 * np.eye(3), atol=2e-3 * scale**2
     ):
         raise UnevenScaleError(f"its scale is not the same along all axes ({', '.join(f'{x:.4g}' for x in lengths)})")
-    return nearest_rotations(linear), scale
+    return nearest_rotations(linear), sign * scale
 
 
 def nearest_rotations(linear: Array) -> Array:

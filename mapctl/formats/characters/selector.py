@@ -1,12 +1,13 @@
 """Which armature and animation of a file is meant: FILE#ARMATURE, FILE#ARMATURE/ANIMATION or FILE#/ANIMATION."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 
 from mapctl.errors import FileFormatError
+from mapctl.formats.text import warn_once
 from mapctl.isolated.naming import find_name
 
 
@@ -41,3 +42,12 @@ def choose_name(path: Path, names: Sequence[str], wanted: str | None, what: str,
         return find_name(path.name, names, wanted, what, several=several)
     except LookupError as error:
         raise FileFormatError(path, error.args[0]) from None
+
+
+def note_animation(chosen: CharacterPath, names: Collection[str], read: str | None) -> None:
+    """Log which of an armature's animations was read, where there are others and the path chooses none."""
+    others = [name for name in names if name != read]
+    if chosen.animation is None and others:
+        what = "its rest pose, none" if read is None else f"{read!r}, the first"
+        another = f"{chosen.file.name}#{chosen.armature or ''}/{others[0]}"
+        warn_once(f"{chosen.file}: reads {what} of {len(names)} animations; choose another as {another!r}")

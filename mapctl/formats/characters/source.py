@@ -1,6 +1,6 @@
 """What `Motion.source` keeps of a character's file, so that the character is written with the motion."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
@@ -31,6 +31,10 @@ class CharacterSource:
     """Name of the animation that the motion was read from; None for the rest pose."""
     humanoid: Mapping[str, str] = field(default_factory=dict)
     """Joint name by canonical name, where the file itself says which is which (VRM)."""
+    armatures: Sequence[str] = ()
+    """Names of all armatures in the file."""
+    animations: Mapping[str, float] = field(default_factory=dict)
+    """Seconds by name of the file's animations of this armature; empty where its rest pose was asked for."""
 
     @property
     def has_new_root(self) -> bool:

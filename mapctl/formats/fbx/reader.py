@@ -10,9 +10,9 @@ from mapctl.errors import FileFormatError
 from mapctl.formats.characters.bind_pose import complete_bind_pose
 from mapctl.formats.characters.extracted import build_mesh, check_size, compose_transforms, frame_rate_of, place_joints
 from mapctl.formats.characters.rest_frames import RestFrames, UnevenScaleError
-from mapctl.formats.characters.selector import CharacterPath, parse_character_path
+from mapctl.formats.characters.selector import CharacterPath, note_animation, parse_character_path
 from mapctl.formats.characters.source import CharacterSource, stamp_file
-from mapctl.formats.text import MAX_POSES, check_ordinary
+from mapctl.formats.text import MAX_POSES, check_ordinary, warn_once
 from mapctl.isolated.parts import unpack_parts
 from mapctl.isolated.process import Answer, ask
 from mapctl.mesh.character_mesh import CharacterMesh
@@ -37,6 +37,7 @@ def load(path: str | PathLike[str]) -> Motion:
     """
     chosen, found = _ask(path, "motion")
     frames, skeleton = _read_skeleton(chosen, found)
+    note_animation(chosen, found.said["animations"], found.said.get("animation"))
     if "local" not in found.arrays:
         return _rest_motion(chosen, found, frames, skeleton)
     outer = np.eye(4) + np.zeros((1, 4, 4))
@@ -45,7 +46,7 @@ def load(path: str | PathLike[str]) -> Motion:
     local = compose_transforms(chosen.file, found.arrays["local"])
     worlds = place_joints(chosen.file, frames.parents, local, outer)
     fps = frame_rate_of(found.said["rate"])
-    return frames.to_motion(worlds, fps, skeleton, _source(chosen, found, frames, found.said["animation"]))
+    return frames.to_motion(worlds, fps, skeleton, _source(chosen, found, frames))
 
 
 def load_rest(path: str | PathLike[str]) -> Motion:
@@ -69,7 +70,12 @@ def _ask(path: str | PathLike[str], wanted: str) -> tuple[CharacterPath, Answer]
         raise FileFormatError(chosen.file, "FBX needs the package ufbx: pip install 'mapctl[fbx]'")
     check_ordinary(chosen.file)
     request = {"armature": chosen.armature, "animation": chosen.animation, "wanted": wanted, "most_poses": MAX_POSES}
-    return chosen, ask("fbx", chosen.file, request)
+    found = ask("fbx", chosen.file, request)
+    count = found.said["bad_indices"]
+    if count:
+        what = f"{count} ind{'ex' if count == 1 else 'ices'} of its meshes point{'s' if count == 1 else ''} at nothing"
+        warn_once(f"{chosen.file}: {what}, so the mesh may look wrong; joints and motion are as the file says")
+    return chosen, found
 
 
 def _read_skeleton(chosen: CharacterPath, found: Answer) -> tuple[RestFrames, Skeleton]:
@@ -99,9 +105,18 @@ def _read_skeleton(chosen: CharacterPath, found: Answer) -> tuple[RestFrames, Sk
 
 
 def _rest_motion(chosen: CharacterPath, found: Answer, frames: RestFrames, skeleton: Skeleton) -> Motion:
-    return frames.to_motion(frames.matrices()[None], _REST_FPS, skeleton, _source(chosen, found, frames, None))
+    return frames.to_motion(frames.matrices()[None], _REST_FPS, skeleton, _source(chosen, found, frames))
 
 
-def _source(chosen: CharacterPath, found: Answer, frames: RestFrames, animation: str | None) -> CharacterSource:
-    stamp = stamp_file(chosen.file)
-    return CharacterSource(chosen.file.resolve(), found.said["armature"], stamp, frames, frames.names, animation)
+def _source(chosen: CharacterPath, found: Answer, frames: RestFrames) -> CharacterSource:
+    said = found.said
+    return CharacterSource(
+        chosen.file.resolve(),
+        said["armature"],
+        stamp_file(chosen.file),
+        frames,
+        frames.names,
+        said.get("animation"),
+        armatures=said["armatures"],
+        animations=said.get("animations", {}),
+    )

@@ -1,6 +1,7 @@
 """Animations of a glTF document, read at the frames of one rate."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -39,6 +40,20 @@ class Track:
 def name_animations(gltf: GltfFile) -> list[str]:
     """Return the names of a file's animations, unique, in its order."""
     return make_unique([a.name or f"animation_{k}" for k, a in enumerate(gltf.document.animations)])
+
+
+def time_animations(gltf: GltfFile, nodes: Sequence[int]) -> dict[str, float]:
+    """Return the seconds that each animation lasts that moves these nodes, by name, without those whose key times
+    cannot be read."""
+    found = {}
+    for name, animation in zip(name_animations(gltf), gltf.document.animations, strict=True):
+        own = [c.sampler for c in animation.channels if c.target.node in nodes and c.target.path in _WIDTHS]
+        with suppress(FileFormatError, IndexError):
+            inputs = {animation.samplers[sampler].input for sampler in own}
+            ends = [read_accessor(gltf, times, "SCALAR")[[0, -1], 0].tolist() for times in inputs]
+            if ends:
+                found[name] = max(end for _, end in ends) - min(start for start, _ in ends)
+    return found
 
 
 def read_tracks(gltf: GltfFile, animation: int, nodes: Sequence[int]) -> list[Track]:

@@ -1,7 +1,8 @@
-"""Which nodes of a glTF document are a character's joints: those of its skins, and what connects them."""
+"""Which nodes of a glTF document are a character's joints: those of its skins, else of its humanoid, else those that an
+animation moves; and what connects them."""
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from mapctl.formats.characters.rest_frames import RestFrames, UnevenScaleError, 
 from mapctl.formats.gltf.accessors import read_accessor
 from mapctl.formats.gltf.container import GltfFile
 from mapctl.formats.gltf.schema import Node
-from mapctl.formats.gltf.vrm import is_vrm, read_humanoid
+from mapctl.formats.gltf.vrm import is_vrm, read_bones, select_canonical
 
 Array = np.ndarray
 _MAX_JOINTS = 4096
@@ -20,7 +21,7 @@ _MAX_JOINTS = 4096
 
 @dataclass(frozen=True, eq=False)
 class Armature:
-    """A connected tree of nodes that carries the skins of one character."""
+    """A connected tree of nodes that are one character's joints."""
 
     name: str
     """Name by which it is chosen."""
@@ -32,15 +33,17 @@ class Armature:
     """Skins that it carries."""
     ends: dict[int, int]
     """Node that is the End Site of a last joint, by that joint's index among `nodes`."""
+    all_names: Sequence[str] = ()
+    """Names of all armatures of the file."""
 
 
 def find_armatures(gltf: GltfFile) -> list[Armature]:
-    """Find the armatures of a file; FileFormatError where it has no skin, or its nodes are no tree."""
-    document = gltf.document
-    if not document.skins:
-        raise FileFormatError(gltf.path, "has no skin, so nothing in it says which nodes are a character's joints")
+    """Find the armatures of a file; FileFormatError where nothing says which nodes are joints, or they are no tree."""
+    document, animated = gltf.document, _animated_nodes(gltf)
     tree = NodeTree(gltf)
     groups: list[tuple[set[int], list[int]]] = []
+    if not document.skins:
+        groups = [(joints, []) for joints in _find_bare_joints(gltf, tree, animated)]
     for number, skin in enumerate(document.skins):
         tree.check_nodes(skin.joints, f"skins[{number}].joints")
         if len(skin.joints) > _MAX_JOINTS:
@@ -52,10 +55,9 @@ def find_armatures(gltf: GltfFile) -> list[Armature]:
         groups = [group for group in groups if group not in near]
         groups.append((joints.union(*(g[0] for g in near)), sorted({number, *(s for g in near for s in g[1])})))
     groups.sort(key=lambda group: group[1])
-    animated = _animated_nodes(gltf)
     found = [_build_armature(gltf, tree, joints, skins, animated) for joints, skins in groups]
     names = make_unique([armature.name for armature in found])
-    return [Armature(name, a.nodes, a.parents, a.skins, a.ends) for name, a in zip(names, found, strict=True)]
+    return [replace(armature, name=name, all_names=names) for name, armature in zip(names, found, strict=True)]
 
 
 def read_rest_frames(gltf: GltfFile, armature: Armature) -> RestFrames:
@@ -78,7 +80,7 @@ def read_rest_frames(gltf: GltfFile, armature: Armature) -> RestFrames:
 def read_humanoid_names(gltf: GltfFile, armature: Armature, names: tuple[str, ...]) -> dict[str, str]:
     """Return joint names by canonical name as a VRM file says them; empty for other files."""
     at = {node: name for node, name in zip(armature.nodes, names, strict=True)}
-    return {canonical: at[node] for canonical, node in read_humanoid(gltf).items() if node in at}
+    return select_canonical({bone: at[node] for bone, node in read_bones(gltf).items() if node in at})
 
 
 def node_matrix(node: Node) -> Array:
@@ -174,10 +176,29 @@ def _animated_nodes(gltf: GltfFile) -> set[int]:
     return {target.node for target in channels if target.node is not None and target.path != "weights"}
 
 
+def _find_bare_joints(gltf: GltfFile, tree: NodeTree, animated: set[int]) -> list[set[int]]:
+    """Find the joints of the characters of a file without a skin: the humanoid's, else of each tree those that an
+    animation moves, and those below them that carry others."""
+    bones = set(read_bones(gltf).values())
+    tree.check_nodes(bones, "the humanoid's bones")
+    if bones:
+        return [bones]
+    if not animated:
+        what = "has no skin, no humanoid and no animation, so nothing in it says which nodes are a character's joints"
+        raise FileFormatError(gltf.path, what)
+    tree.check_nodes(animated, "an animation")
+    tops: dict[int, list[int]] = {}
+    for node in sorted(animated):
+        tops.setdefault(tree.line(node)[-1], []).append(node)
+    bodies = [moved for moved in tops.values() if len(moved) > 1] or list(tops.values())
+    walks = [(set(moved), tree.walk(tree.connect(moved)[0])) for moved in bodies]
+    return [{n for n in below if n in moved or gltf.document.nodes[n].children} for moved, below in walks]
+
+
 def _build_armature(gltf: GltfFile, tree: NodeTree, joints: set[int], skins: list[int], animated: set[int]) -> Armature:
     """Build the tree of a group's joints; its root is the topmost node above them that any animation moves."""
     document = gltf.document
-    said = set(read_humanoid(gltf).values())
+    said = set(read_bones(gltf).values())
     tree.check_nodes(said, "the humanoid's bones")
     own = tree.connect(joints)
     below = set(tree.walk(own[0]))
@@ -202,7 +223,8 @@ def _armature_name(gltf: GltfFile, tree: NodeTree, root: int, skins: list[int]) 
     """Name an armature by its first skin, else by the node above its root, as exporters do, else by its root."""
     nodes = gltf.document.nodes
     above = tree.parent.get(root)
-    named = [gltf.document.skins[skins[0]].name, "" if above is None else nodes[above].name, nodes[root].name]
+    skin = gltf.document.skins[skins[0]].name if skins else ""
+    named = [skin, "" if above is None else nodes[above].name, nodes[root].name]
     return next((name for name in named if name), f"armature_{root}")
 
 

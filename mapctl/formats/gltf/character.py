@@ -11,7 +11,7 @@ import torch
 
 from mapctl import rotations
 from mapctl.formats.atomic import write_pieces
-from mapctl.formats.characters.rest_frames import split_scale
+from mapctl.formats.characters.rest_frames import compose_matrices, split_scale
 from mapctl.formats.characters.source import CharacterSource
 from mapctl.formats.gltf.animations import name_animations
 from mapctl.formats.gltf.container import GltfFile, compose_glb, read_file, read_neighbour
@@ -128,6 +128,8 @@ def _build_animation(
     for joint, node in enumerate(nodes):
         own = tree["nodes"][node]
         _use_parts(own)
+        if source.frames.scales[joint] < 0:
+            turned[:, joint] = _beside_own_scale(own, turned[:, joint])
         for path, values in (("translation", moved[:, joint]), ("rotation", turned[:, joint])):
             constant = bool((np.ptp(values, axis=0) < _STILL).all())
             usual = np.array(own.get(path, (0.0, 0.0, 0.0) if path == "translation" else (0.0, 0.0, 0.0, 1.0)))
@@ -155,12 +157,22 @@ def _add_node_above(tree: dict[str, Any], node: int, name: str) -> int:
     return added
 
 
+def _beside_own_scale(node: dict[str, Any], turned: Array) -> Array:
+    """Return rotations (frames, 4) that go with the scale of a node that mirrors, along whichever axes, of those that
+    go with one of -1 along all."""
+    own = torch.tensor(node.get("rotation", (0.0, 0.0, 0.0, 1.0)), dtype=torch.float64)
+    matrix = compose_matrices(np.zeros(3), own.numpy(), np.array(node["scale"]))
+    rest = rotations.from_matrix(torch.from_numpy(split_scale(matrix, may_mirror=True)[0]))
+    change = rotations.multiply(rotations.inverse(rest), own)
+    return rotations.multiply(torch.from_numpy(turned), change.expand(len(turned), 4)).numpy()
+
+
 def _use_parts(node: dict[str, Any]) -> None:
     """Replace a node's matrix, which no animation may move, by translation, rotation and scale."""
     if "matrix" not in node:
         return
     matrix = np.array(node.pop("matrix"), np.float64).reshape(4, 4).T
-    turn, scale = split_scale(matrix)
+    turn, scale = split_scale(matrix, may_mirror=True)
     node["translation"] = matrix[:3, 3].tolist()
     node["rotation"] = rotations.from_matrix(torch.from_numpy(turn)).tolist()
     node["scale"] = [scale] * 3

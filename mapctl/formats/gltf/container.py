@@ -17,8 +17,6 @@ from mapctl.errors import FileFormatError
 from mapctl.formats.gltf.schema import Document, describe_fault
 from mapctl.formats.text import MAX_FILE_BYTES, check_ordinary, shorten
 
-ENDINGS = (".glb", ".gltf", ".vrm")
-"""Endings of files that are read here."""
 _MAX_JSON_BYTES = 64 * 2**20
 _HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
 _MAX_DEPTH_ERROR = "is nested too deeply"

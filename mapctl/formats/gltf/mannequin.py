@@ -4,6 +4,7 @@ Metres, Y up, as glTF wants. Joints are nodes with their file's names; a joint t
 translation track, every joint a rotation track at the motion's own frames.
 """
 
+from collections.abc import Mapping
 from os import PathLike
 from typing import Any
 
@@ -12,6 +13,7 @@ import pygltflib
 
 from mapctl.errors import RequestError
 from mapctl.formats.atomic import write_bytes
+from mapctl.formats.gltf import vrm
 from mapctl.formats.gltf.schema import LICENCE
 from mapctl.formats.skinned import SkinnedBody, build_skinned_body
 from mapctl.motion import Motion
@@ -53,16 +55,42 @@ def save(motion: Motion, path: str | PathLike[str]) -> None:
     write_bytes(path, to_bytes(motion, path=path))
 
 
-def to_bytes(motion: Motion, *, path: str | PathLike[str] = "a .glb file") -> bytes:
-    """Return the content of the file; `path` is what an error names."""
+def to_bytes(
+    motion: Motion,
+    *,
+    path: str | PathLike[str] = "a .glb file",
+    bones: Mapping[str, int] | None = None,
+    root_at_rest: list[float] | None = None,
+) -> bytes:
+    """Return the content of the file; `path` is what an error names.
+
+    With `bones`, the joint by VRM's name of a bone, it is a VRM animation, without the mannequin; `root_at_rest` is
+    then the position of the root in the T-pose, metres.
+    """
     if not (motion.root_position.isfinite().all() and motion.local_quat_xyzw.isfinite().all()):
         raise RequestError(f"cannot write {path}: the motion is not finite")
     told: dict[str, Any] = {"copyright": motion.licence, "extras": {LICENCE: motion.licence}} if motion.licence else {}
     document = pygltflib.GLTF2(asset=pygltflib.Asset(version="2.0", generator=f"mapctl {__version__}", **told))
     buffer = _Buffer(document)
-    joints = motion.num_joints
     document.nodes = _build_nodes(motion)
-    body = build_skinned_body(motion)
+    tops = [0]
+    if bones is None:
+        tops.append(_add_body(motion, document, buffer))
+    else:
+        document.nodes[0].translation = root_at_rest
+        document.extensionsUsed = [vrm.ANIMATION]
+        humanoid = {"humanBones": {bone: {"node": node} for bone, node in bones.items()}}
+        document.extensions = {vrm.ANIMATION: {"specVersion": "1.0", "humanoid": humanoid}}
+    document.scene, document.scenes = 0, [pygltflib.Scene(nodes=tops)]
+    document.animations = [_build_animation(motion, buffer)]
+    document.buffers = [pygltflib.Buffer(byteLength=len(buffer.blob))]
+    document.set_binary_blob(bytes(buffer.blob))
+    return b"".join(document.save_to_bytes())
+
+
+def _add_body(motion: Motion, document: pygltflib.GLTF2, buffer: _Buffer) -> int:
+    """Add the skinned mesh of the motion's body; return its node."""
+    joints, body = motion.num_joints, build_skinned_body(motion)
     document.meshes = [_build_mesh(body, buffer)]
     inverse = np.tile(np.eye(4, dtype=np.float32), (joints, 1, 1))
     inverse[:, 3, :3] = -body.rest  # column-major: the translation is the last row here
@@ -72,9 +100,6 @@ def to_bytes(motion: Motion, *, path: str | PathLike[str] = "a .glb file") -> by
         )
     ]
     document.nodes.append(pygltflib.Node(name="mannequin", mesh=0, skin=0))
-    document.scenes = [pygltflib.Scene(nodes=[0, len(document.nodes) - 1])]
-    document.scene = 0
-    document.animations = [_build_animation(motion, buffer)]
     document.materials = [
         pygltflib.Material(
             name="mannequin",
@@ -83,9 +108,7 @@ def to_bytes(motion: Motion, *, path: str | PathLike[str] = "a .glb file") -> by
             ),
         )
     ]
-    document.buffers = [pygltflib.Buffer(byteLength=len(buffer.blob))]
-    document.set_binary_blob(bytes(buffer.blob))
-    return b"".join(document.save_to_bytes())
+    return len(document.nodes) - 1
 
 
 def _build_nodes(motion: Motion) -> list[pygltflib.Node]:

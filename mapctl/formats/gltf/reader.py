@@ -1,4 +1,4 @@
-"""glTF and VRM in: a skinned character's joints, its rest pose, and an animation where the file has one."""
+"""glTF, VRM and VRM animations in: a character's joints, its rest pose, and an animation where the file has one."""
 
 from dataclasses import replace
 from fractions import Fraction
@@ -6,9 +6,9 @@ from os import PathLike
 
 from mapctl.errors import FileFormatError
 from mapctl.formats.characters.rest_frames import RestFrames, chain_matrices
-from mapctl.formats.characters.selector import CharacterPath, choose_name, parse_character_path
+from mapctl.formats.characters.selector import CharacterPath, choose_name, note_animation, parse_character_path
 from mapctl.formats.characters.source import CharacterSource, stamp_file
-from mapctl.formats.gltf.animations import name_animations, read_tracks, sample_local_matrices
+from mapctl.formats.gltf.animations import name_animations, read_tracks, sample_local_matrices, time_animations
 from mapctl.formats.gltf.armatures import Armature, find_armatures, node_matrix, read_humanoid_names, read_rest_frames
 from mapctl.formats.gltf.container import GltfFile, read_file
 from mapctl.motion import Motion
@@ -18,7 +18,7 @@ _REST_FPS = Fraction(30)
 
 
 def load(path: str | PathLike[str]) -> Motion:
-    """Read an animation of a skinned character from a .glb, .gltf or .vrm file; one frame of its rest pose where it has
+    """Read an animation of a character from a .glb, .gltf, .vrm or .vrma file; one frame of its rest pose where it has
     none.
 
     `path` may end as `#ARMATURE`, `#ARMATURE/ANIMATION` or `#/ANIMATION`; by default the file's first animation that
@@ -31,10 +31,11 @@ def load(path: str | PathLike[str]) -> Motion:
     if found is None:
         return _rest_motion(gltf, armature, frames, skeleton)
     name, tracks = found
+    source = replace(_source(gltf, armature, frames, name), animations=time_animations(gltf, armature.nodes))
+    note_animation(chosen, source.animations, name)
     fps, local = sample_local_matrices(gltf, armature.nodes, tracks)
     worlds = chain_matrices(armature.parents, local, frames.outer)
-    motion = frames.to_motion(worlds, fps, skeleton, _source(gltf, armature, frames, name))
-    return replace(motion, licence=gltf.document.asset.licence)
+    return replace(frames.to_motion(worlds, fps, skeleton, source), licence=gltf.document.asset.licence)
 
 
 def load_rest(path: str | PathLike[str]) -> Motion:
@@ -87,7 +88,13 @@ def _rest_motion(gltf: GltfFile, armature: Armature, frames: RestFrames, skeleto
 
 
 def _source(gltf: GltfFile, armature: Armature, frames: RestFrames, animation: str | None) -> CharacterSource:
-    humanoid = read_humanoid_names(gltf, armature, frames.names)
     return CharacterSource(
-        gltf.path.resolve(), armature.name, stamp_file(gltf.path), frames, armature.nodes, animation, humanoid
+        gltf.path.resolve(),
+        armature.name,
+        stamp_file(gltf.path),
+        frames,
+        armature.nodes,
+        animation,
+        read_humanoid_names(gltf, armature, frames.names),
+        armature.all_names,
     )

@@ -1,5 +1,6 @@
-"""VRM 0 and 1: which node of a file is which bone of a humanoid, as the file itself says."""
+"""VRM 0 and 1, and VRM animations: which node of a file is which bone of a humanoid, as the file itself says."""
 
+from collections.abc import Mapping
 from typing import Annotated
 
 from pydantic import BaseModel, Field, ValidationError
@@ -37,27 +38,33 @@ class _Vrm1(BaseModel):
     humanoid: _Humanoid1 = _Humanoid1()
 
 
+ANIMATION = "VRMC_vrm_animation"
+"""Extension of a file that holds the animation of a humanoid alone."""
+_EXTENSIONS = "VRMC_vrm", ANIMATION
+
+
 def is_vrm(gltf: GltfFile) -> bool:
-    """Return whether the file is a VRM character, 0 or 1, whatever its ending."""
-    return any(name in gltf.document.extensions for name in ("VRM", "VRMC_vrm"))
+    """Return whether the file is a VRM character, 0 or 1, or a VRM animation, whatever its ending."""
+    return any(name in gltf.document.extensions for name in ("VRM", *_EXTENSIONS))
 
 
-def read_humanoid(gltf: GltfFile) -> dict[str, int]:
-    """Return the node of each canonical joint that the file names; empty for files that are no VRM.
-
-    VRM's `upperChest`, which carries the arms, is the canonical chest where a file has one.
-    """
+def read_bones(gltf: GltfFile) -> dict[str, int]:
+    """Return the node of each bone of the humanoid, by VRM's name; empty for files that are no VRM."""
     extensions = gltf.document.extensions
     try:
-        if "VRMC_vrm" in extensions:
-            bones = _Vrm1.model_validate(extensions["VRMC_vrm"]).humanoid.humanBones
-            nodes = {name: bone.node for name, bone in bones.items()}
-        elif "VRM" in extensions:
-            nodes = {bone.bone: bone.node for bone in _Vrm0.model_validate(extensions["VRM"]).humanoid.humanBones}
-        else:
-            return {}
+        for name in _EXTENSIONS:
+            if name in extensions:
+                bones = _Vrm1.model_validate(extensions[name]).humanoid.humanBones
+                return {bone: found.node for bone, found in bones.items()}
+        if "VRM" in extensions:
+            return {bone.bone: bone.node for bone in _Vrm0.model_validate(extensions["VRM"]).humanoid.humanBones}
     except ValidationError as error:
         raise FileFormatError(gltf.path, f"its VRM humanoid: {describe_fault(error)}") from None
-    if "upperChest" in nodes:
-        nodes["chest"] = nodes["upperChest"]
-    return {name: node for name, node in nodes.items() if name in CANONICAL.names}
+    return {}
+
+
+def select_canonical(bones: Mapping[str, str]) -> dict[str, str]:
+    """Return what is given by bone for the canonical joints alone. VRM's `upperChest`, which carries the arms, is the
+    canonical chest where a file has one."""
+    chest = {"chest": bones["upperChest"]} if "upperChest" in bones else {}
+    return {name: own for name, own in {**bones, **chest}.items() if name in CANONICAL.names}

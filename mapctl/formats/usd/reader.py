@@ -12,8 +12,8 @@ from mapctl.formats.characters.bind_pose import complete_bind_pose
 from mapctl.formats.characters.extracted import build_mesh, check_size, compose_transforms, frame_rate_of, place_joints
 from mapctl.formats.characters.key_times import sample_times
 from mapctl.formats.characters.names import make_unique
-from mapctl.formats.characters.rest_frames import RestFrames, UnevenScaleError, split_scale
-from mapctl.formats.characters.selector import CharacterPath, parse_character_path
+from mapctl.formats.characters.rest_frames import RestFrames, UnevenScaleError, split_scale, split_scales
+from mapctl.formats.characters.selector import CharacterPath, note_animation, parse_character_path
 from mapctl.formats.characters.source import CharacterSource, stamp_file
 from mapctl.formats.text import MAX_FILE_BYTES, MAX_POSES, check_extent, check_ordinary
 from mapctl.formats.usd.installed import is_installed
@@ -38,6 +38,7 @@ def load(path: str | PathLike[str]) -> Motion:
     """
     chosen, found = _ask(path, "motion")
     frames = _read_frames(chosen, found)
+    note_animation(chosen, found.said["animations"], found.said.get("animation"))
     if "local" not in found.arrays:
         return _rest_motion(chosen, found, frames)
     seconds, local, outers = (found.arrays[name] for name in ("seconds", "local", "outers"))
@@ -49,7 +50,7 @@ def load(path: str | PathLike[str]) -> Motion:
     if len(frames.names) > local.shape[1]:
         local = np.concatenate([np.tile(np.eye(4), (len(times), 1, 1, 1)), local], axis=1)
     worlds = place_joints(chosen.file, frames.parents, local, outers)
-    source = _source(chosen, found, frames, found.said["animation"])
+    source = _source(chosen, found, frames)
     return frames.to_motion(worlds, fps, frames.skeleton({}), source)
 
 
@@ -151,8 +152,7 @@ def _choose_rest(chosen: CharacterPath, parents: tuple[int, ...], tables: dict[s
         if found is not None:
             return found
     try:
-        for matrix in bound:
-            split_scale(matrix)
+        split_scales(parents, bound)
     except UnevenScaleError:
         return rest
     return bound
@@ -170,13 +170,21 @@ def _split(chosen: CharacterPath, matrices: Array) -> Array:
 
 
 def _rest_motion(chosen: CharacterPath, found: Answer, frames: RestFrames) -> Motion:
-    source = _source(chosen, found, frames, None)
+    source = _source(chosen, found, frames)
     return frames.to_motion(frames.matrices()[None], _REST_FPS, frames.skeleton({}), source)
 
 
-def _source(chosen: CharacterPath, found: Answer, frames: RestFrames, animation: str | None) -> CharacterSource:
+def _source(chosen: CharacterPath, found: Answer, frames: RestFrames) -> CharacterSource:
     """Return where the motion is from; its nodes are PRIM.JOINT, of a root that was added PRIM alone."""
-    prim, joints = found.said["path"], found.said["joints"]
-    nodes = [prim] * (len(frames.names) - len(joints)) + [f"{prim}.{joint}" for joint in joints]
-    stamp = stamp_file(chosen.file)
-    return CharacterSource(chosen.file.resolve(), found.said["armature"], stamp, frames, tuple(nodes), animation)
+    said = found.said
+    nodes = [said["path"]] * (len(frames.names) - len(said["joints"])) + [f"{said['path']}.{j}" for j in said["joints"]]
+    return CharacterSource(
+        chosen.file.resolve(),
+        said["armature"],
+        stamp_file(chosen.file),
+        frames,
+        tuple(nodes),
+        said.get("animation"),
+        armatures=said["armatures"],
+        animations=said.get("animations", {}),
+    )

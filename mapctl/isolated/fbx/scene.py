@@ -24,7 +24,7 @@ def open_scene(path: str, *, with_mesh: bool) -> ufbx.Scene:
             target_unit_meters=1.0,
             space_conversion=ufbx.SpaceConversion.ADJUST_TRANSFORMS,
             inherit_mode_handling=ufbx.InheritModeHandling.COMPENSATE,
-            index_error_handling=ufbx.IndexErrorHandling.ABORT_LOADING,
+            index_error_handling=ufbx.IndexErrorHandling.CLAMP,
             load_external_files=False,
             ignore_embedded=not with_mesh,
             generate_missing_normals=False,
@@ -43,6 +43,11 @@ def open_scene(path: str, *, with_mesh: bool) -> ufbx.Scene:
         raise Refusal(f"is FBX {version / 1000:g}, read are {OLDEST / 1000:g} to 7.7")
     _keep_elements(scene)
     return scene
+
+
+def count_bad_indices(scene: ufbx.Scene) -> int:
+    """Return how many indices of meshes pointed at nothing, and are those of the nearest entry now."""
+    return sum(found.count for found in scene.metadata.warnings if found.type == ufbx.WarningType.INDEX_CLAMPED)
 
 
 def walk(node: ufbx.Node) -> Iterator[ufbx.Node]:

@@ -29,24 +29,38 @@ class Take:
     """(frames or 1, nodes above the root, 10) likewise, the outermost first."""
 
 
+def time_takes(scene: ufbx.Scene, armature: Armature) -> dict[str, float]:
+    """Return the seconds that each animation lasts that moves the armature, by name."""
+    own = _own_elements(armature)
+    spans = {name: _find_range(stack, own) for name, stack in _name_takes(scene).items() if _moved_nodes(stack) & own}
+    return {name: end - begin for name, (begin, end) in spans.items()}
+
+
 def read_take(scene: ufbx.Scene, armature: Armature, wanted: str | None, most_poses: int) -> Take | None:
     """Read the wanted animation, or the first that moves the armature; None where none does."""
-    stacks = list(scene.anim_stacks)
-    names = make_unique([stack.name or f"take_{k}" for k, stack in enumerate(stacks)])
-    outer = line_of(armature.nodes[0])[:0:-1]
-    own = {node.element_id for node in [*armature.nodes, *outer]}
+    takes, own = _name_takes(scene), _own_elements(armature)
     if wanted is not None:
         try:
-            number = find_name("", names, wanted, "animation", several=True)
+            find_name("", list(takes), wanted, "animation", several=True)
         except LookupError as error:
             raise Refusal(error.args[0]) from None
-        if not _moved_nodes(stacks[number]) & own:
+        if not _moved_nodes(takes[wanted]) & own:
             raise Refusal(f"animation {wanted!r} does not move {armature.name!r}")
-        return _sample(scene, stacks[number], names[number], armature, outer, most_poses)
-    for stack, name in zip(stacks, names, strict=True):
+        return _sample(scene, takes[wanted], wanted, armature, most_poses)
+    for name, stack in takes.items():
         if _moved_nodes(stack) & own:
-            return _sample(scene, stack, name, armature, outer, most_poses)
+            return _sample(scene, stack, name, armature, most_poses)
     return None
+
+
+def _name_takes(scene: ufbx.Scene) -> dict[str, ufbx.AnimStack]:
+    stacks = list(scene.anim_stacks)
+    return dict(zip(make_unique([stack.name or f"take_{k}" for k, stack in enumerate(stacks)]), stacks, strict=True))
+
+
+def _own_elements(armature: Armature) -> set[int]:
+    """Return the elements of an armature's nodes and of all above them."""
+    return {node.element_id for node in [*armature.nodes, *line_of(armature.nodes[0])]}
 
 
 def _moved_nodes(stack: ufbx.AnimStack) -> set[int]:
@@ -60,12 +74,11 @@ def _moved_nodes(stack: ufbx.AnimStack) -> set[int]:
     }
 
 
-def _sample(
-    scene: ufbx.Scene, stack: ufbx.AnimStack, name: str, armature: Armature, outer: list[ufbx.Node], most_poses: int
-) -> Take:
+def _sample(scene: ufbx.Scene, stack: ufbx.AnimStack, name: str, armature: Armature, most_poses: int) -> Take:
+    outer = line_of(armature.nodes[0])[:0:-1]
     rate = scene.settings.frames_per_second
     rate = rate if np.isfinite(rate) and 0.01 <= rate <= 1e5 else _USUAL_RATE
-    begin, end = _find_range(stack, {node.element_id for node in [*armature.nodes, *outer]})
+    begin, end = _find_range(stack, _own_elements(armature))
     if not (np.isfinite(begin) and np.isfinite(end)) or end < begin:
         raise Refusal(f"animation {name!r} lasts from {begin:g} to {end:g} s")
     count = np.floor((end - begin) * rate + _EARLY_SHARE) + 1

@@ -51,6 +51,17 @@ def read_animation(stage: Usd.Stage, skeleton: SkeletonPrim, wanted: str | None,
     return _sample(stage, skeleton, prims[number], names[number], most_poses)
 
 
+def time_animations(stage: Usd.Stage, skeleton: SkeletonPrim) -> dict[str, float]:
+    """Return the seconds that each animation of a skeleton lasts, by name."""
+    names, prims, _ = name_animations(stage, skeleton)
+    spans = [[code for attribute in _attributes_of(prim) for code in attribute.GetTimeSamples()] for prim in prims]
+    per_second = stage.GetTimeCodesPerSecond() or 1.0
+    return {
+        name: (max(codes, default=0.0) - min(codes, default=0.0)) / per_second
+        for name, codes in zip(names, spans, strict=True)
+    }
+
+
 def animated_placement(prim: Usd.Prim) -> list[float]:
     """Return the time codes at which the placement of a prim, or of what it is in, changes; none where it does not."""
     times: set[float] = set()
@@ -66,9 +77,13 @@ def _animated_joints(prim: Usd.Prim) -> set[str]:
     return {str(joint) for joint in read_value(UsdSkel.Animation(prim).GetJointsAttr()) or ()}
 
 
+def _attributes_of(prim: Usd.Prim) -> list[Usd.Attribute]:
+    animation = UsdSkel.Animation(prim)
+    return [animation.GetTranslationsAttr(), animation.GetRotationsAttr(), animation.GetScalesAttr()]
+
+
 def _sample(stage: Usd.Stage, skeleton: SkeletonPrim, prim: Usd.Prim, name: str, most_poses: int) -> Animation:
-    animation, what = UsdSkel.Animation(prim), f"animation {name!r}"
-    attributes = [animation.GetTranslationsAttr(), animation.GetRotationsAttr(), animation.GetScalesAttr()]
+    animation, attributes, what = UsdSkel.Animation(prim), _attributes_of(prim), f"animation {name!r}"
     codes = {code for attribute in attributes for code in attribute.GetTimeSamples()}
     placed = animated_placement(skeleton.prim)
     per_second = stage.GetTimeCodesPerSecond()
@@ -127,7 +142,8 @@ def rest_parts(skeleton: SkeletonPrim) -> Array:
         above = [np.eye(4) if parent < 0 else skeleton.bind[parent] for parent in skeleton.parents]
         matrices = np.linalg.pinv(np.array(above)) @ skeleton.bind
     scales = np.linalg.norm(matrices[:, :3, :3], axis=1)
-    turns = matrices[:, :3, :3] / np.where(scales > 1e-12, scales, 1.0)[:, None, :]
+    scales *= np.where(np.linalg.det(matrices[:, :3, :3]) < 0, -1.0, 1.0)[:, None]
+    turns = matrices[:, :3, :3] / np.where(abs(scales) > 1e-12, scales, 1.0)[:, None, :]
     return np.concatenate([matrices[:, :3, 3], to_quaternions(turns), scales], axis=1)
 
 

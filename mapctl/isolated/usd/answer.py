@@ -12,11 +12,11 @@ from pxr import Tf, Usd
 
 from mapctl.isolated.child import Array, Found, Refusal
 from mapctl.isolated.parts import pack_parts
-from mapctl.isolated.usd.animations import read_animation
+from mapctl.isolated.usd.animations import read_animation, time_animations
 from mapctl.isolated.usd.layers import first_reason, open_stage
 from mapctl.isolated.usd.mesh import read_parts
 from mapctl.isolated.usd.output import write_character
-from mapctl.isolated.usd.skeletons import SkeletonPrim, choose_skeleton, stage_to_world, world_of
+from mapctl.isolated.usd.skeletons import SkeletonPrim, choose_skeleton, find_skeletons, stage_to_world, world_of
 
 
 def answer(request: Mapping[str, Any], given: Mapping[str, Array]) -> Found:
@@ -36,6 +36,7 @@ def _answer(request: Mapping[str, Any], given: Mapping[str, Array]) -> Found:
     name, skeleton = choose_skeleton(stage, Path(path).name, request["armature"])
     said, tables = _describe(stage, name, skeleton)
     if wanted == "motion":
+        said["animations"] = time_animations(stage, skeleton)
         found = read_animation(stage, skeleton, request["animation"], request["most_poses"])
         if found is not None:
             said |= {"animation": found.name, "per_second": stage.GetTimeCodesPerSecond()}
@@ -54,6 +55,7 @@ def _describe(stage: Usd.Stage, name: str, skeleton: SkeletonPrim) -> Found:
             tables[kind] = np.ascontiguousarray(table)
     said = {
         "armature": name,
+        "armatures": find_skeletons(stage)[0],
         "path": str(skeleton.prim.GetPath()),
         "joints": skeleton.joints,
         "names": skeleton.names,
