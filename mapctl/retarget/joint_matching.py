@@ -238,9 +238,10 @@ def _check_match(skeleton: Skeleton, found: Mapping[str, int], score: float) -> 
     missing = [name for name in REQUIRED if name not in found]
     if not missing and score >= MIN_SCORE:
         return
-    what = f"no joint for {', '.join(missing)}" if missing else "too few joints are known by name"
+    lacking = ", ".join(missing or (name for name in CANONICAL.names if name not in found))
+    what = f"no joint is found for {lacking}" + ("" if missing else ", and the names of the others are no body parts")
     names, rigs = abbreviate_names(skeleton.names), ", ".join(rig.name for rig in known_rigs())
     raise RequestError(
-        f"cannot tell this rig: {what} (score {score:.2f}, {MIN_SCORE} is needed); "
-        f"its joints are {names}; known rigs: {rigs}; a TOML file can name its joints"
+        f"the rig is not recognised: {what}; its joints are {names}; "
+        f"known rigs: {rigs}; a TOML file can name its joints"
     )

@@ -74,7 +74,7 @@ def test_a_file_of_the_name_of_a_class_is_the_file(here, models, capsys):
         ("wavelefthand", "the nearest class is wave-left-hand"),
         ("no.bvh", "no.bvh: no such file"),
         ("style.bvh,,walk", "with a comma between two"),
-        ("odd.bvh", "odd.bvh tells no style: cannot tell this rig"),
+        ("odd.bvh", "odd.bvh tells no style: the rig is not recognised"),
         ("none.bvh", "none.bvh, line "),
     ],
 )

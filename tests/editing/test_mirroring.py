@@ -148,5 +148,5 @@ def test_a_file_keeps_its_layout(tmp_path):
 
 def test_an_unknown_rig_is_refused():
     skeleton = Skeleton(("a", "b"), (-1, 0), torch.ones(2, 3).double())
-    with pytest.raises(mapctl.errors.RequestError, match="cannot tell this rig"):
+    with pytest.raises(mapctl.errors.RequestError, match="the rig is not recognised: no joint is found for "):
         editing.mirror(random_motion(skeleton))
