@@ -92,21 +92,30 @@ def _tpose_positions() -> Float[Tensor, "joints 3"]:
 
 def _build_skeleton(rig: Rig) -> Skeleton:
     """Build the joints that the rig names, depth first, as files nest them."""
-    places, order = _tpose_positions(), [joint for joint in _depth_first(0) if CANONICAL.names[joint] in rig.joints]
+    order = [joint for joint in _depth_first(0) if CANONICAL.names[joint] in rig.joints]
+    places = dict(enumerate(_tpose_positions()))
     frames = {joint: _joint_frame(rig, CANONICAL.names[joint]) for joint in order}
     above = {joint: _named_ancestor(joint, rig) for joint in order}
-    offsets = [places[0] if p is None else frames[p].T @ (places[j] - places[p]) for j, p in above.items()]
-    own = [rig.joints[CANONICAL.names[joint]] for joint in order]
+    own = {joint: rig.joints[CANONICAL.names[joint]] for joint in order}
+    spine, chest = CANONICAL.index("spine"), CANONICAL.index("chest")
+    if above.get(chest) == spine:
+        between = range(CANONICAL.num_joints, CANONICAL.num_joints + len(rig.trunk))
+        for number, joint in enumerate(between, start=1):
+            own[joint], above[joint], frames[joint] = rig.trunk[number - 1], above[chest], frames[spine]
+            places[joint] = torch.lerp(places[spine], places[chest], number / (len(between) + 1))
+            order.insert(order.index(chest), joint)
+            above[chest] = joint
+    offsets = [places[0] if (p := above[j]) is None else frames[p].T @ (places[j] - places[p]) for j in order]
     ends: dict[str, Tensor] = {}
-    for joint, name in zip(order, own, strict=True):
-        below = CANONICAL.children(joint)
+    for joint, name in own.items():
+        below = CANONICAL.children(joint) if joint < CANONICAL.num_joints else [chest]
         if not below:
             ends[name] = frames[joint].T @ torch.tensor(CANONICAL.end_offsets[CANONICAL.names[joint]]).double()
         elif all(CANONICAL.names[child] not in rig.joints for child in below):
             ends[name] = frames[joint].T @ (places[below[0]] - places[joint])
-    parents = tuple(-1 if p is None else order.index(p) for p in above.values())
+    parents = tuple(-1 if (p := above[joint]) is None else order.index(p) for joint in order)
     tips = {name: (float(x), float(y), float(z)) for name, (x, y, z) in ends.items()}
-    return Skeleton(tuple(own), parents, torch.stack(offsets), tips)
+    return Skeleton(tuple(own[joint] for joint in order), parents, torch.stack(offsets), tips)
 
 
 def _depth_first(joint: int) -> list[int]:

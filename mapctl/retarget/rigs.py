@@ -18,7 +18,7 @@ AXES = ("x", "y", "z", "-x", "-y", "-z")
 RESTS = ("auto", "tpose", "straighten", "frame0")
 UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 """Names of length units that a rig's TOML may use, in metres."""
-_KEYS = {"name", "about", "also", "joints", "tpose", "straighten", "end_sites", "up", "facing", "rest", "unit"}
+_KEYS = {"name", "about", "also", "trunk", "joints", "tpose", "straighten", "end_sites", "up", "facing", "rest", "unit"}
 
 
 @dataclass(frozen=True)
@@ -50,6 +50,8 @@ class Rig:
     limbs straightened), `frame0` (the clip begins with one), or `auto` (a table or list above, else what fits)."""
     metres_per_unit: float | None = None
     """Length of the file's unit, metres; None to find it by the size of the body."""
+    trunk: tuple[str, ...] = ()
+    """Joints between spine and chest, upwards."""
 
     def __post_init__(self):
         for key, value, allowed in (("up", self.up, AXES), ("facing", self.facing, AXES), ("rest", self.rest, RESTS)):
@@ -122,6 +124,7 @@ def _rig_from_table(table: Mapping[str, Any]) -> Rig:
         table.get("facing", "auto"),
         table.get("rest", "auto"),
         parse_unit(table.get("unit")),
+        trunk=tuple(table.get("trunk", ())),
     )
 
 

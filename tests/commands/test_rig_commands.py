@@ -246,7 +246,7 @@ def test_rigs_by_name_or_file_get_the_canonical_bones(job, told_rig, prior, tmp_
     assert run(job, *jobs[job], "--rig", told_rig, *quiet) == 0
     rig = retarget.load_rig(told_rig)
     made = mapctl.load(tmp_path / ("generated_000.bvh" if job == "generate" else "a.bvh"))
-    assert set(made.skeleton.names) == set(rig.joints.values())
+    assert set(made.skeleton.names) == {*rig.joints.values(), *rig.trunk}
     canonical, rigmap = retarget.to_canonical(made, rig)
     own = [joint for joint in range(1, CANONICAL.num_joints) if CANONICAL.names[joint] in rig.joints]
     lengths = CANONICAL.offsets.norm(dim=-1)
@@ -395,3 +395,17 @@ def test_who_has_no_legs_is_refused():
     stump = Skeleton(CANONICAL.names, CANONICAL.parents, CANONICAL.offsets * 0.0)
     with pytest.raises(RequestError, match="legs of a human's length"):
         Character(stump, 0.0)
+
+
+@pytest.mark.parametrize("preset", [rig.name for rig in rigs.known_rigs() if rig.trunk])
+def test_a_skeleton_made_of_a_preset_has_its_joints_between_spine_and_chest(preset):
+    rig = rigs.find_preset(preset)
+    standing = figure.make_tpose_clip(rig)
+    joint, below = standing.skeleton.index(rig.joints["chest"]), []
+    while standing.skeleton.names[joint] != rig.joints["spine"]:
+        joint = standing.skeleton.parents[joint]
+        below.insert(0, standing.skeleton.names[joint])
+    assert below == [rig.joints["spine"], *rig.trunk]
+    plain = figure.make_tpose_clip(replace(rig, trunk=()))
+    head = [clip.joint_positions()[0, clip.skeleton.index(rig.joints["head"])] for clip in (standing, plain)]
+    torch.testing.assert_close(*head)

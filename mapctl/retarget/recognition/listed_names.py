@@ -91,7 +91,7 @@ def _index_plain_names(names: tuple[str, ...]) -> dict[str, int]:
 def _measure_fit(rig: Rig, found: Mapping[str, int], skeleton: Skeleton, plain: set[str]) -> float:
     """Measure how well a rig explains a skeleton: the joints it names, and below one joint each what distinguishes
     relatives."""
-    extra = {normalise_name(name) for name in rig.also}
+    extra = {normalise_name(name) for name in (*rig.also, *rig.trunk)}
     explained = len(found) + len(extra & plain - {normalise_name(skeleton.names[j]) for j in found.values()})
     lacking = len(rig.joints) - len(found) + len(extra - plain)
     # Fingers and props beyond what a preset lists do not count against it; what it lists and the rig lacks does.
