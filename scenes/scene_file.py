@@ -49,6 +49,9 @@ class Actor:
     """Seed of everything random about this actor."""
     colour: str | None = None
     """Torso colour: a name from `mapctl.mesh.colours.ACTORS` or `#rrggbb`; each actor's own if not given."""
+    rig: Annotated[str, Field(min_length=1)] | None = None
+    """Body that moves, on whose rig the motion is written: a clip or a TOML file, relative to the scene file, or a rig
+    by name; that of --rig if not given."""
     character: Annotated[str, Field(min_length=1)] | None = None
     """File of a skinned character that is drawn, relative to the scene file; the mannequin if not given."""
     speed_by_time: tuple[tuple[Seconds0, Annotated[float, Field(ge=0, le=20)]], ...] | None = None

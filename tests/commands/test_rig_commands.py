@@ -332,6 +332,22 @@ def test_motion_is_written_on_the_clips_rig(job, clip, prior, tmp_path):
     assert 0.8 < float(canonical.root_position[:, 1].mean()) / SIZE < 1.0
 
 
+@pytest.mark.slow
+def test_actors_of_a_scene_have_rigs_of_their_own(clip, prior, tmp_path):
+    (tmp_path / "own").mkdir()
+    mapctl.load(clip).save(tmp_path / "own" / "tall.bvh")
+    rigs_of = {"a": "rig = 'own/tall.bvh'", "b": "rig = 'xsens'", "c": ""}
+    actors = [f"{{curve = 'line:2', seconds = 0.4, name = '{name}', {rig}}}" for name, rig in rigs_of.items()]
+    scene = f"prior = '{prior}'\nactors = [{', '.join(actors)}]\noutputs = ['a.bvh']\n"
+    (tmp_path / "s.toml").write_text(scene.replace(", }", "}"))
+    assert run("run", tmp_path / "s.toml", "-o", tmp_path, "--rig", "mixamo", "--quiet") == 0
+    made = [mapctl.load(tmp_path / f"a-{name}.bvh").skeleton for name in rigs_of]
+    assert made[0].matches(mapctl.load(clip).skeleton, 1e-4)
+    assert ("Chest4" in made[1].names, "mixamorig:Spine1" in made[2].names) == (True, True)
+    (tmp_path / "s.toml").write_text(scene.replace(", }", "}").replace("xsens", "nobody"))
+    assert run("run", tmp_path / "s.toml", "-o", tmp_path, "--quiet") == 2
+
+
 def test_the_canonical_body_is_not_scaled_at_all():
     assert Character().scale == 1.0
     assert Character().unit_skeleton is CANONICAL

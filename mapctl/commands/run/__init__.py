@@ -19,8 +19,8 @@ class RunScene(ModelCommand):
     out: options.OutFolder = Path()
     """Folder for the scene's outputs; made if it does not exist."""
     rig: options.OutRig = "canonical"
-    """Body of the actors: the canonical one, or that of a clip, on whose rig they are written; or a rig by name
-    or TOML file, whose joints get the canonical bones."""
+    """Body of the actors whose `rig` the scene file does not give: the canonical one, or that of a clip, on whose rig
+    they are written; or a rig by name or TOML file, whose joints get the canonical bones."""
     character: options.MaybeCharacter = None
     """File of a skinned character, as .glb or .vrm, that films show in place of the mannequin, for every actor whose
     `character` the scene file does not tell."""

@@ -43,15 +43,16 @@ def run(command: RunScene) -> int:
 
 
 def _run_scene(command: RunScene, path: Path, scene: SceneDescription, curves: Sequence[Curve]) -> int:
-    character, prior = read_character(command.rig), priors.load(scene.prior)
+    characters, prior = _read_characters(command, scene, path), priors.load(scene.prior)
     plans = [
-        _plan(scene, actor, curve, prior, character, path) for actor, curve in zip(scene.actors, curves, strict=True)
+        _plan(scene, actor, curve, prior, character, path)
+        for actor, curve, character in zip(scene.actors, curves, characters, strict=True)
     ]
     drawn = _read_drawn(command, scene, path)
     outputs.check_folder(command.out)
     for film_path in scene.films(command.out):
         outputs.require_render("av" if film_path.suffix.lower() == ".mp4" else "PIL")
-    walks, interrupted = _solve(command, scene, plans, prior, character)
+    walks, interrupted = _solve(command, scene, plans, prior, characters)
     with outputs.make_folder(command.out):
         _write(command, scene, walks, films=() if interrupted else scene.films(command.out), drawn=drawn)
     if interrupted:
@@ -73,6 +74,16 @@ def _plan(
         raise FileFormatError(path, f"{actor.name}: {error}") from error
 
 
+def _read_characters(command: RunScene, scene: SceneDescription, path: Path) -> list[Character]:
+    """Read the body of each actor: on its own rig, else on that of the option."""
+    own = [
+        actor.rig if actor.rig is None or not Path(actor.rig).suffix else str(path.parent / actor.rig)
+        for actor in scene.actors
+    ]
+    read = {rig: read_character(rig or command.rig) for rig in dict.fromkeys(own)}
+    return [read[rig] for rig in own]
+
+
 def _read_drawn(command: RunScene, scene: SceneDescription, path: Path) -> Drawn:
     """Read each actor's character once, of those that are filmed: the scene file's own, else that of the option."""
     if not scene.films(command.out):
@@ -91,7 +102,7 @@ def _solve(
     scene: SceneDescription,
     plans: Sequence[PathRequest | ShotPlan],
     prior: LstmGmmDensity,
-    character: Character,
+    characters: Sequence[Character],
 ) -> tuple[list[Walk | PlayedShot], bool]:
     """Solve for the first actors, for all unless Ctrl-C came, and return whether it did."""
     done: list[Walk | PlayedShot] = []
@@ -99,7 +110,7 @@ def _solve(
     if scene.keep_apart is not None:
         plans = let_others_pass([plan for plan in plans if isinstance(plan, ShotPlan)], scene.keep_apart)
     inbetweener = priors.load_inbetweener() if shots else None
-    for actor, plan in zip(scene.actors, plans, strict=True):
+    for actor, plan, character in zip(scene.actors, plans, characters, strict=True):
         try:
             with show_progress(actor.name, quiet=command.quiet) as progress:
                 if isinstance(plan, PathRequest) or inbetweener is None:
