@@ -176,8 +176,18 @@ def test_indices_of_a_mesh_that_point_at_nothing_are_one_warning(tmp_path, capsy
     np.testing.assert_allclose(in_order(formats.load(path)), made.places, **NEAR)
     err = capsys.readouterr().err
     assert err.count("\n") == 1
-    assert f"{path}: 1 index of its meshes points at nothing" in err
+    assert f"{path}: 1 of its meshes' indices point at nothing" in err
     np.testing.assert_allclose(formats.load_mesh(path).vertices, made.vertices, **NEAR)
+
+
+def test_motion_is_read_where_a_mesh_is_broken(tmp_path, capsys):
+    path = tmp_path / "a.fbx"
+    made = make_fbx(path)
+    path.write_text(re.sub(r"(Vertices: \*\d+ \{\s*a: )[^,]*,", r"\1", path.read_text(), count=1))
+    np.testing.assert_allclose(in_order(formats.load(path)), made.places, **NEAR)
+    assert capsys.readouterr().err == f"mapctl: {path}: its meshes are broken; its joints and motion are read\n"
+    with pytest.raises(FileFormatError, match="is no sound FBX file"):
+        formats.load_mesh(path)
 
 
 @pytest.mark.parametrize("scale", ["-1,-1,-1", "1,1,-1"])

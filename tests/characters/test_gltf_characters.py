@@ -148,6 +148,18 @@ def test_an_animation_that_is_broken_and_not_read_is_passed_over(tmp_path):
     assert list(formats.load(path).source.animations) == ["walk"]
 
 
+def test_motion_is_read_where_a_material_is_broken(tmp_path, capsys):
+    path = make(tmp_path, "metres", animations=("walk",)).path
+    plain = formats.load(path)
+    edit_glb(path, lambda tree: tree["materials"][0].update(pbrMetallicRoughness={"baseColorTexture": {"index": -1}}))
+    torch.testing.assert_close(formats.load(path).joint_positions(), plain.joint_positions())
+    err = capsys.readouterr().err
+    assert err.startswith(f"mapctl: {path}: materials[0].pbrMetallicRoughness.baseColorTexture.index: ")
+    assert err.endswith("; its joints and motion are read, its mesh is not\n")
+    with pytest.raises(FileFormatError, match="carries no triangles"):
+        formats.load_mesh(path)
+
+
 def follow_up(made, frames=20):
     """A walk on the character that was made."""
     body = RiggedCharacter.of(figure.load_standing_character(made.path))[1]

@@ -130,5 +130,5 @@ def test_bones_that_travel_are_noted(tmp_path, capsys):
 
 
 def test_a_motion_whose_bones_are_not_known_is_refused(tmp_path):
-    with pytest.raises(RequestError, match=r"a \.vrma needs a motion that says which joint is which bone"):
+    with pytest.raises(RequestError, match=r"a \.vrma needs the motion of a VRM or of canonical joints"):
         formats.load(make(tmp_path, "mixamo").path).save(tmp_path / "out.vrma")

@@ -71,10 +71,8 @@ def _ask(path: str | PathLike[str], wanted: str) -> tuple[CharacterPath, Answer]
     check_ordinary(chosen.file)
     request = {"armature": chosen.armature, "animation": chosen.animation, "wanted": wanted, "most_poses": MAX_POSES}
     found = ask("fbx", chosen.file, request)
-    count = found.said["bad_indices"]
-    if count:
-        what = f"{count} ind{'ex' if count == 1 else 'ices'} of its meshes point{'s' if count == 1 else ''} at nothing"
-        warn_once(f"{chosen.file}: {what}, so the mesh may look wrong; joints and motion are as the file says")
+    if found.said["mesh_fault"]:
+        warn_once(f"{chosen.file}: {found.said['mesh_fault']}; its joints and motion are read")
     return chosen, found
 
 

@@ -180,7 +180,7 @@ def _find_bare_joints(gltf: GltfFile, tree: NodeTree, animated: set[int]) -> lis
     """Find the joints of the characters of a file without a skin: the humanoid's, else of each tree those that an
     animation moves, and those below them that carry others."""
     bones = set(read_bones(gltf).values())
-    tree.check_nodes(bones, "the humanoid's bones")
+    tree.check_nodes(bones, "the humanoid")
     if bones:
         return [bones]
     if not animated:
@@ -199,7 +199,7 @@ def _build_armature(gltf: GltfFile, tree: NodeTree, joints: set[int], skins: lis
     """Build the tree of a group's joints; its root is the topmost node above them that any animation moves."""
     document = gltf.document
     said = set(read_bones(gltf).values())
-    tree.check_nodes(said, "the humanoid's bones")
+    tree.check_nodes(said, "the humanoid")
     own = tree.connect(joints)
     below = set(tree.walk(own[0]))
     wanted = set(tree.connect([*own, *(said & below)]))

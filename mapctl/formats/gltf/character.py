@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from mapctl import rotations
+from mapctl.errors import FileFormatError
 from mapctl.formats.atomic import write_pieces
 from mapctl.formats.characters.rest_frames import compose_matrices, split_scale
 from mapctl.formats.characters.source import CharacterSource
@@ -66,13 +67,15 @@ def _gather(gltf: GltfFile) -> "tuple[dict[str, Any], list[bytes | memoryview]]"
         pieces += [data[:length], bytes(-length % 4)]
         starts.append(size)
         size += length + -length % 4
-    for view in tree.get("bufferViews", []):
+    for number, view in enumerate(tree.get("bufferViews", [])):
+        if view["buffer"] >= len(starts):
+            raise FileFormatError(gltf.path, f"bufferViews[{number}] is of buffer {view['buffer']} of {len(starts)}")
         if starts[view["buffer"]]:
             view["byteOffset"] = view.get("byteOffset", 0) + starts[view["buffer"]]
         view["buffer"] = 0
     if tree.get("buffers"):
         tree["buffers"] = [{key: value for key, value in tree["buffers"][0].items() if key != "uri"}]
-    for image in tree.get("images", []):
+    for image in tree["images"] if gltf.document.images else ():
         if "uri" in image:
             size = _embed_image(gltf, tree, image, pieces, size)
     return tree, [piece for piece in pieces if len(piece)]

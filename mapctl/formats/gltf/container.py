@@ -15,11 +15,12 @@ from pydantic import ValidationError
 
 from mapctl.errors import FileFormatError
 from mapctl.formats.gltf.schema import Document, describe_fault
-from mapctl.formats.text import MAX_FILE_BYTES, check_ordinary, shorten
+from mapctl.formats.text import MAX_FILE_BYTES, check_ordinary, shorten, warn_once
 
 _MAX_JSON_BYTES = 64 * 2**20
 _HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
 _MAX_DEPTH_ERROR = "is nested too deeply"
+_DRAWN = ("meshes", "materials", "textures", "images")
 _COMPRESSED = {
     "KHR_draco_mesh_compression": "Draco",
     "EXT_meshopt_compression": "meshopt",
@@ -56,10 +57,7 @@ def read_file(path: str | PathLike[str]) -> GltfFile:
     else:
         raise FileFormatError(file, f"is no binary glTF: it begins with {bytes(whole[:4])!r}, not b'glTF'")
     tree = _parse_json(file, text)
-    try:
-        document = Document.model_validate(tree)
-    except ValidationError as error:
-        raise FileFormatError(file, describe_fault(error)) from None
+    document = _check_document(file, tree)
     if not document.asset.version.startswith("2."):
         raise FileFormatError(file, f"is glTF {shorten(document.asset.version)}, expected 2.0")
     _refuse_compression(file, document)
@@ -147,6 +145,17 @@ def _parse_json(file: Path, text: memoryview) -> dict[str, Any]:
     if not isinstance(tree, dict):
         raise FileFormatError(file, "its JSON is no object")
     return tree
+
+
+def _check_document(file: Path, tree: dict[str, Any]) -> Document:
+    """Return the checked document: without all that is drawn where a fault is only there, with a warning."""
+    try:
+        return Document.model_validate(tree)
+    except ValidationError as error:
+        if not all(fault["loc"][:1] and fault["loc"][0] in _DRAWN for fault in error.errors()):
+            raise FileFormatError(file, describe_fault(error)) from None
+        warn_once(f"{file}: {describe_fault(error)}; its joints and motion are read, its mesh is not")
+        return Document.model_validate({key: value for key, value in tree.items() if key not in _DRAWN})
 
 
 def _refuse_compression(file: Path, document: Document) -> None:

@@ -29,8 +29,8 @@ def save(motion: Motion, path: str | PathLike[str]) -> None:
     """Write the motion of a VRM character's bones, or of the canonical joints. RequestError for other motions."""
     bones = _find_bones(motion)
     if "hips" not in bones:
-        why = "says which joint is which bone: a VRM, a VRM animation, or canonical joints (--rig canonical)"
-        raise RequestError(f"cannot write {path}: a .vrma needs a motion that {why}")
+        needed = "needs the motion of a VRM or of canonical joints; `mapctl convert` makes one of any other file"
+        raise RequestError(f"cannot write {path}: a .vrma {needed}")
     body, hips = _select_bones(motion, bones, path)
     of_joint = {joint: bone for bone, joint in bones.items()}
     order = {of_joint[motion.skeleton.index(name)]: node for node, name in enumerate(body.skeleton.names)}

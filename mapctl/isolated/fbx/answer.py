@@ -10,7 +10,7 @@ import ufbx
 from mapctl.isolated.child import Array, Found, Refusal
 from mapctl.isolated.fbx.armatures import Armature, find_armatures, read_bind_poses
 from mapctl.isolated.fbx.mesh import read_parts
-from mapctl.isolated.fbx.scene import above, count_bad_indices, open_scene, to_matrix
+from mapctl.isolated.fbx.scene import above, open_scene, to_matrix
 from mapctl.isolated.fbx.takes import read_take, time_takes
 from mapctl.isolated.naming import find_name
 from mapctl.isolated.parts import pack_parts
@@ -20,7 +20,7 @@ def answer(request: Mapping[str, Any], given: Mapping[str, Array]) -> Found:
     """Answer a request: `armature` and `animation` are what was chosen or None; `wanted` is `rest`, `motion` or `mesh`;
     `most_poses` is the greatest number of frames times joints."""
     path, wanted = request["path"], request["wanted"]
-    scene = open_scene(path, with_mesh=wanted == "mesh")
+    scene, fault = open_scene(path, with_mesh=wanted == "mesh")
     armatures = find_armatures(scene)
     names = [armature.name for armature in armatures]
     try:
@@ -28,7 +28,7 @@ def answer(request: Mapping[str, Any], given: Mapping[str, Array]) -> Found:
     except LookupError as error:
         raise Refusal(error.args[0]) from None
     said, tables = _describe(scene, armature)
-    said |= {"bad_indices": count_bad_indices(scene), "armatures": names}
+    said |= {"armatures": names, "mesh_fault": fault}
     if wanted == "motion":
         said["animations"] = time_takes(scene, armature)
         take = read_take(scene, armature, request["animation"], request["most_poses"])

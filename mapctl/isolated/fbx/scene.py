@@ -14,10 +14,31 @@ NEWEST, OLDEST = 7799, 3000
 _MAX_ELEMENTS = 2**20
 
 
-def open_scene(path: str, *, with_mesh: bool) -> ufbx.Scene:
-    """Read a file. Refusal where it is no FBX, broken, encrypted or of another version."""
+def open_scene(path: str, *, with_mesh: bool) -> tuple[ufbx.Scene, str]:
+    """Read a file; also return what is wrong with its meshes, empty where nothing is.
+
+    Refusal where it is no FBX, broken (but in its meshes, unless these are asked for), encrypted or of another version.
+    """
+    fault = ""
     try:
-        scene = ufbx.load_file(
+        scene = _load(path, ignore_embedded=not with_mesh)
+    except Refusal:
+        if with_mesh:
+            raise
+        scene, fault = _load(path, ignore_embedded=True, ignore_geometry=True), "its meshes are broken"
+    version = scene.metadata.version
+    if not OLDEST <= version <= NEWEST:
+        raise Refusal(f"is FBX {version / 1000:g}, read are {OLDEST / 1000:g} to 7.7")
+    count = sum(found.count for found in scene.metadata.warnings if found.type == ufbx.WarningType.INDEX_CLAMPED)
+    if count:
+        fault = f"{count} of its meshes' indices point at nothing, so they may look wrong"
+    _keep_elements(scene)
+    return scene, fault
+
+
+def _load(path: str, *, ignore_embedded: bool, ignore_geometry: bool = False) -> ufbx.Scene:
+    try:
+        return ufbx.load_file(
             path,
             file_format=ufbx.FileFormat.FBX,
             target_axes=ufbx.axes_right_handed_y_up,
@@ -26,7 +47,8 @@ def open_scene(path: str, *, with_mesh: bool) -> ufbx.Scene:
             inherit_mode_handling=ufbx.InheritModeHandling.COMPENSATE,
             index_error_handling=ufbx.IndexErrorHandling.CLAMP,
             load_external_files=False,
-            ignore_embedded=not with_mesh,
+            ignore_embedded=ignore_embedded,
+            ignore_geometry=ignore_geometry,
             generate_missing_normals=False,
             node_depth_limit=1024,
         )
@@ -38,16 +60,6 @@ def open_scene(path: str, *, with_mesh: bool) -> ufbx.Scene:
         raise MemoryError from None
     except ufbx.UfbxError as error:
         raise Refusal(f"is no sound FBX file: {_reason(error)}") from None
-    version = scene.metadata.version
-    if not OLDEST <= version <= NEWEST:
-        raise Refusal(f"is FBX {version / 1000:g}, read are {OLDEST / 1000:g} to 7.7")
-    _keep_elements(scene)
-    return scene
-
-
-def count_bad_indices(scene: ufbx.Scene) -> int:
-    """Return how many indices of meshes pointed at nothing, and are those of the nearest entry now."""
-    return sum(found.count for found in scene.metadata.warnings if found.type == ufbx.WarningType.INDEX_CLAMPED)
 
 
 def walk(node: ufbx.Node) -> Iterator[ufbx.Node]:
