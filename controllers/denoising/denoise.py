@@ -15,6 +15,7 @@ from controllers.denoising.lead_pose import has_lead_pose, restore_lead_pose
 from controllers.denoising.lead_transition import find_lead_transition
 from controllers.denoising.lost_parts import LostPartFiller
 from controllers.denoising.result import DenoiseSolution, join_segments
+from controllers.denoising.rigid_bones import hold_rigid_bones
 from controllers.denoising.segment import DenoiseSettings, SegmentDenoiser
 from mapctl.features import PRIOR_FPS
 from mapctl.motion import Motion
@@ -62,10 +63,14 @@ def denoise(
     `denoiser` proposes (see priors.load_denoiser), and `inbetweener`, if there is one, what is lost for longer (see
     LostPartFiller). Of `densities` the likeliest adds its likelihood to each window of the MAP stage; `terms` are the
     caller's own, which see the time since the capture's first frame. A T-pose in frame 0, as many captures begin with,
-    stays. A long capture is cleaned in segments that crossfade, so memory beyond the capture's own does not grow with
-    it. `progress` is called with frames done and all frames.
+    stays. Offsets of bones that vary only by noise are held at their medians. A long capture is cleaned in segments
+    that crossfade, so memory beyond the capture's own does not grow with it. `progress` is called with frames done and
+    all frames.
     """
-    settings = settings or DenoiseSettings()
+    settings, capture = settings or DenoiseSettings(), motion
+    stretched = ()
+    if capture.num_frames >= MIN_DENOISE_FRAMES:
+        motion, stretched = hold_rigid_bones(capture)
     denoiser = denoiser if inbetweener is None else LostPartFiller(denoiser, inbetweener)
     masks = resolve_joint_names(motion, masks, rig)
     expand_valid_masks(motion, masks)  # checked whole: for a segment they are cut to its frames
@@ -94,7 +99,13 @@ def denoise(
         if progress is not None:
             progress(lead + stop, motion.num_frames)
     done = replace(join_segments(pieces), capture=motion.slice(lead, motion.num_frames), rig=rig)
-    return (restore_lead_pose(motion, done, rigmap, transition, masks) if transition else done).assess()
+    done = restore_lead_pose(motion, done, rigmap, transition, masks) if transition else done
+    if stretched:
+        note = f"offsets of {len(stretched)} bones vary only by noise: they are held at their medians"
+        status = replace(done.status, notes=(note, *done.notes))
+        capture = capture.slice(motion.num_frames - done.motion.num_frames, motion.num_frames)
+        done = replace(done, capture=capture, faults=(*stretched, *done.faults), status=status)
+    return done.assess()
 
 
 def begins_with_tpose(motion: Motion, rig: Rig | None = None) -> bool:

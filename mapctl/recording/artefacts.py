@@ -27,9 +27,10 @@ class Artefact:
     stop: int
     """One past the last frame."""
     kind: str
-    """noise, spike, dropout, slide or float."""
+    """noise, spike, dropout, slide, float, or stretch: an offset of a bone that varies only by noise."""
     amount: float
-    """Noise's sigma, height of a spike or of a floating toe, distance of a slide; 0 for a dropout."""
+    """Noise's sigma, height of a spike or of a floating toe, distance of a slide, largest error of an offset; 0 for a
+    dropout."""
     unit: str
     """Unit of the amount."""
 

@@ -8,11 +8,13 @@ from importlib import import_module
 import pytest
 import torch
 from captures import apart_deg, error_cm, noisy, on_rig, shaken
+from helpers import generator
 from tiny_denoiser import QUICK, tiny_denoiser
 
 import mapctl
 from controllers.denoising.denoise import DenoiseSettings, begins_with_tpose, denoise
 from controllers.denoising.result import crossfade, join_segments
+from controllers.denoising.rigid_bones import hold_rigid_bones
 from mapctl import retarget, rotations
 from mapctl.errors import RequestError
 from mapctl.motion import Motion
@@ -64,6 +66,52 @@ def test_a_clean_capture_changes_by_less_than_half_a_centimetre(rig, fps, drawn)
     truth = on_rig(rig, 3 * fps, fps=fps)
     done = denoise(truth, tiny_denoiser(drawn=drawn), settings=QUICK)
     assert error_cm(truth, done.motion) < 0.5
+
+
+STRETCH = {
+    "noise": (lambda track: track + 0.01 * torch.randn(track.shape, generator=generator()).double(), True),
+    "a frame of zeros": (lambda track: track.index_fill(0, torch.tensor([40]), 0.0), True),
+    "lost for long": (lambda track: track.index_fill(0, torch.arange(30, 60), 0.0), True),
+    "slow": (lambda track: track * (1 + 0.1 * torch.linspace(0, 6, len(track)).sin()[:, None]), False),
+    "slow under noise": (
+        lambda track: (
+            track * (1 + 0.1 * torch.linspace(0, 6, len(track)).sin()[:, None])
+            + 0.01 * torch.randn(track.shape, generator=generator()).double()
+        ),
+        False,
+    ),
+    "squashed for four frames": (lambda track: track.index_copy(0, torch.arange(4) + 40, 0.7 * track[:4]), False),
+}
+
+
+@pytest.mark.parametrize("kind", STRETCH)
+def test_offsets_that_vary_only_by_noise_are_held_and_stretching_ones_stay(kind):
+    change, rigid = STRETCH[kind]
+    truth = on_rig("bandai", 120)
+    joint = truth.skeleton.index("LowerLeg_L")
+    still = truth.skeleton.offsets[joint].expand(120, 3).clone()
+    given = replace(truth, moving_offsets={**truth.moving_offsets, joint: change(still)})
+    held, faults = hold_rigid_bones(given)
+    assert [fault.joint for fault in faults] == ["LowerLeg_L"] * rigid
+    track = held.moving_offsets[joint]
+    if rigid:
+        torch.testing.assert_close(track, still, atol=0.004, rtol=0)
+        assert bool((track == track[0]).all())
+    else:
+        assert torch.equal(track, given.moving_offsets[joint])
+    assert torch.equal(held.moving_offsets[1], given.moving_offsets[1])  # the hips travel
+
+
+def test_bones_of_a_capture_with_noisy_offsets_are_rigid_afterwards():
+    truth = on_rig("bandai", 60)
+    noise = 0.01 * torch.randn(60, truth.num_joints, 3, generator=generator()).double()
+    moving = {joint: truth.skeleton.offsets[joint] + noise[:, joint] for joint in range(2, truth.num_joints)}
+    given = replace(truth, moving_offsets={**truth.moving_offsets, **moving})
+    done = cleaned(given)
+    assert error_cm(truth, done.motion) < 0.3 * error_cm(truth, given)
+    assert done.correction()[0].mean() > 1.0
+    assert any("vary only by noise" in note for note in done.notes)
+    assert {fault.joint for fault in done.faults if fault.kind == "stretch"} == set(truth.skeleton.names[2:])
 
 
 def test_a_network_that_is_wrong_does_little_harm():
