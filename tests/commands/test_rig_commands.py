@@ -17,8 +17,6 @@ from controllers.following.follow import FollowSettings
 from controllers.generation.generate import GenerateSettings, generate
 from controllers.steering import steer
 from mapctl import curves, retarget
-from mapctl.commands import COMMANDS
-from mapctl.commands.shared.options import ReadOptions
 from mapctl.errors import RequestError
 from mapctl.intent.steering import Command
 from mapctl.problem.receding_horizon import HorizonSettings
@@ -61,53 +59,6 @@ def test_info_tells_a_clips_rig(clip, capsys):
     assert run("info", clip) == 0
     shown = capsys.readouterr().out
     assert all(word in shown for word in ("mixamo", "centimetres", "+z", "1.50", "mixamorig:LeftUpLeg", "Prop_sword"))
-
-
-def test_a_body_that_travels_faster_than_people_do_has_a_doubtful_unit(clip, tmp_path, capsys):
-    motion = mapctl.load(clip)
-    travel = torch.zeros_like(motion.root_position)
-    travel[:, 1] = torch.arange(motion.num_frames) * 24.0 / float(motion.fps)
-    replace(motion, root_position=motion.root_position + travel).save(tmp_path / "fast.bvh")
-    assert run("info", tmp_path / "fast.bvh", "--json") == 0
-    assert "m/s for a second: the unit may be wrong" in json.loads(capsys.readouterr().out)["doubts"][0]
-
-
-@pytest.mark.parametrize("unit", ["in", "0.0254"])
-def test_a_given_unit_is_obeyed_by_every_command(clip, unit, tmp_path, capsys):
-    assert run("convert", clip, tmp_path / "out.npz", "--unit", unit) == 0
-    own, converted = mapctl.load(clip), mapctl.load(tmp_path / "out.npz")
-    torch.testing.assert_close(converted.root_position, own.root_position * 2.54)
-    assert run("convert", tmp_path / "out.npz", tmp_path / "again.npz", "--unit", unit) == 0
-    assert "the file declares its unit" in capsys.readouterr().err
-    torch.testing.assert_close(mapctl.load(tmp_path / "again.npz").root_position, converted.root_position)
-    heights = []
-    for options in ((), ("--unit", unit)):
-        assert run("measure", clip, "--json", *options) == 0
-        heights.append(json.loads(capsys.readouterr().out)["measures"]["hips_height_m"])
-    assert heights[1] == pytest.approx(2.54 * heights[0], rel=1e-3)
-    assert run("convert", clip, tmp_path / "out.npz", "--unit", "ell") == 2
-    assert "a unit is m, dm, cm, mm, in or metres per unit, got 'ell'" in capsys.readouterr().err
-
-
-def test_a_given_up_axis_is_obeyed(clip, capsys):
-    assert run("info", clip, "--json", "--up", "-x") == 0
-    assert json.loads(capsys.readouterr().out)["up"] == "-x"
-
-
-def test_every_command_that_reads_motions_can_be_given_their_unit_and_up_axis():
-    reading = {name for name, kind in COMMANDS.items() if issubclass(kind, ReadOptions)}
-    assert reading == {
-        "blend",
-        "chain",
-        "convert",
-        "denoise",
-        "generate",
-        "infill",
-        "info",
-        "measure",
-        "render",
-        "tween",
-    }
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ from mapctl.commands.shared.command import ModelCommand
 
 
 @dataclass(frozen=True)
-class FollowCurve(ModelCommand):
+class FollowCurve(ModelCommand, options.ReadOptions):
     """A character walks a curve: BVH and, if asked for, a film and a report."""
 
     curve: Positional[options.CurveText]

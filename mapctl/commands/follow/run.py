@@ -44,7 +44,7 @@ def _follow(command: FollowCurve) -> int:
     curve = inputs.read_curve(command.curve, command.metres_per_unit)
     request = parse_follow(curve, command.speed, command.seconds)
     drawn = read_drawn_character(command.character)
-    character, prior = read_character(command.rig), priors.load(command.prior)
+    character, prior = read_character(command.rig, command), priors.load(command.prior)
     cornering = command.speed is None and turns_sharply(curve)
     if cornering or _wishes_more(command):
         from mapctl.commands.follow import shot

@@ -35,7 +35,9 @@ def plan(command: FollowCurve, curve: Curve, prior: LstmGmmDensity, character: C
         raise RequestError(f"--{actor.fault}")
     obstacles = [Obstacle.parse(text) for text in command.avoid]
     fps = None if command.fps is None else Fraction(command.fps).limit_denominator(100_000)
-    return plan_shot(actor, curve, prior, character=character, folder=Path(), obstacles=obstacles, fps=fps)
+    return plan_shot(
+        actor, curve, prior, character=character, folder=Path(), options=command, obstacles=obstacles, fps=fps
+    )
 
 
 def play(planned: ShotPlan, *, prices: bool, progress: Progress | None) -> PlayedShot:

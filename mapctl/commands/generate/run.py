@@ -37,7 +37,7 @@ def run(command: Generate) -> int:
         prior = prior.conditioned_on(names)
         settings = replace(settings, tell_paces=not {*names} & {*PACES, *map(label_pace, PACES)})
     refiner = None if command.refiner is None else priors.refiner_of(command.prior, command.refiner)
-    character = read_character(command.rig)
+    character = read_character(command.rig, command)
     if settings.foot_cleanup is not None:
         footing = replace(settings.foot_cleanup.footing, rest_height=character.toe_rest_height)
         settings = replace(settings, foot_cleanup=replace(settings.foot_cleanup, footing=footing))
@@ -79,8 +79,7 @@ def _check_settings(command: Generate) -> tuple[GenerateSettings, Motion | None]
     )
     if command.start is None or numbered:
         return settings, None
-    rig = inputs.read_rig(None, command)
-    clip = inputs.read_motion(Path(command.start), rig, quiet=command.quiet)
+    clip, rig = inputs.read_clip(Path(command.start), command)
     return settings, clip if rig is None else to_canonical(clip, rig)[0]
 
 

@@ -10,7 +10,7 @@ from mapctl.commands.shared.command import ModelCommand
 
 
 @dataclass(frozen=True)
-class Live(ModelCommand):
+class Live(ModelCommand, options.ReadOptions):
     """Steer characters in a browser on this machine: sliders, keys, drawn paths, recording."""
 
     port: Annotated[int, arg(metavar="P")] = 8080

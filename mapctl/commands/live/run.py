@@ -127,7 +127,7 @@ def _read_drawn(command: Live) -> list[DrawnCharacter | None]:
 
 def _read_bodies(command: Live, drawn: Sequence[DrawnCharacter | None]) -> list[Character]:
     """Read the body of each character: of its own file, else of --rig."""
-    rig = read_character(command.rig)
+    rig = read_character(command.rig, command)
     return [rig if one is None else as_character(one.body) for one in drawn]
 
 
@@ -137,7 +137,7 @@ def _choose_recorded_rigs(
     """Choose for each character what puts its recording on --rig; None where it stays as it is."""
     if command.rig == "canonical":
         return [None] * len(bodies)
-    rig = read_rigged(command.rig)
+    rig = read_rigged(command.rig, command)
 
     def carry(motion: Motion) -> Motion:
         return rig.on_rig(retarget_motion(motion, rig).motion)

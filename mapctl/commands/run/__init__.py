@@ -11,7 +11,7 @@ from mapctl.commands.shared.command import ModelCommand
 
 
 @dataclass(frozen=True)
-class RunScene(ModelCommand):
+class RunScene(ModelCommand, options.ReadOptions):
     """A scripted scene of several actors, from a TOML file or a ready one by name."""
 
     scene: Positional[Annotated[str, arg(metavar="SCENE.toml")]]

@@ -45,7 +45,7 @@ def run(command: RunScene) -> int:
 def _run_scene(command: RunScene, path: Path, scene: SceneDescription, curves: Sequence[Curve]) -> int:
     characters, prior = _read_characters(command, scene, path), priors.load(scene.prior)
     plans = [
-        _plan(scene, actor, curve, prior, character, path)
+        _plan(command, scene, actor, curve, prior, character, path)
         for actor, curve, character in zip(scene.actors, curves, characters, strict=True)
     ]
     drawn = _read_drawn(command, scene, path)
@@ -61,7 +61,13 @@ def _run_scene(command: RunScene, path: Path, scene: SceneDescription, curves: S
 
 
 def _plan(
-    scene: SceneDescription, actor: Actor, curve: Curve, prior: LstmGmmDensity, character: Character, path: Path
+    command: RunScene,
+    scene: SceneDescription,
+    actor: Actor,
+    curve: Curve,
+    prior: LstmGmmDensity,
+    character: Character,
+    path: Path,
 ) -> PathRequest | ShotPlan:
     """Plan what an actor does: a walk along its curve, or a shot where it is to do more."""
     cornering = actor.speed is None and turns_sharply(curve)
@@ -69,7 +75,9 @@ def _plan(
         return parse_follow(curve, actor.speed, actor.seconds)
     obstacles = [obstacle.build() for obstacle in scene.obstacles]
     try:
-        return plan_shot(actor, curve, prior, character=character, folder=path.parent, obstacles=obstacles)
+        return plan_shot(
+            actor, curve, prior, character=character, folder=path.parent, options=command, obstacles=obstacles
+        )
     except RequestError as error:
         raise FileFormatError(path, f"{actor.name}: {error}") from error
 
@@ -80,7 +88,7 @@ def _read_characters(command: RunScene, scene: SceneDescription, path: Path) -> 
         actor.rig if actor.rig is None or not Path(actor.rig).suffix else str(path.parent / actor.rig)
         for actor in scene.actors
     ]
-    read = {rig: read_character(rig or command.rig) for rig in dict.fromkeys(own)}
+    read = {rig: read_character(rig or command.rig, command) for rig in dict.fromkeys(own)}
     return [read[rig] for rig in own]
 
 

@@ -7,24 +7,25 @@ from typing import TYPE_CHECKING
 
 from controllers.common.character import Character
 from mapctl.commands.shared import inputs
+from mapctl.commands.shared.options import ReadOptions
 
 if TYPE_CHECKING:
     from mapctl.retarget.carry import RiggedCharacter
     from scenes.drawn_character import DrawnCharacter
 
 
-def read_character(text: str) -> Character:
+def read_character(text: str, options: ReadOptions | None = None) -> Character:
     """Read the character: canonical, of a clip's skeleton, or with canonical bones on a preset's joints."""
     if text == "canonical":
         return Character()
-    return as_character(read_rigged(text))
+    return as_character(read_rigged(text, options))
 
 
-def read_rigged(text: str) -> "RiggedCharacter":
+def read_rigged(text: str, options: ReadOptions | None = None) -> "RiggedCharacter":
     """Read the rig and stance of a clip, a preset or a rig file."""
     from mapctl.retarget.carry import RiggedCharacter
 
-    return RiggedCharacter.of(*inputs.read_rig_clip(text))[1]
+    return RiggedCharacter.of(*inputs.read_rig_clip(text, options))[1]
 
 
 def as_character(body: "RiggedCharacter") -> Character:

@@ -51,12 +51,15 @@ def read_rig(text: str | None, options: ReadOptions) -> Rig | None:
     return replace(rig, up=options.up or rig.up, metres_per_unit=parse_unit(options.unit) or rig.metres_per_unit)
 
 
-def read_rig_clip(text: str) -> tuple[Motion, Rig | None]:
+def read_rig_clip(text: str, options: ReadOptions | None = None) -> tuple[Motion, Rig | None]:
     """Read the clip whose skeleton a --rig option names: a file, of a character standing in its rest pose; or a T-pose
-    on the joints of a preset or a TOML file, and its rig."""
+    on the joints of a preset or a TOML file. Also return its rig, where it is given."""
     if formats.ending_of(text) in formats.READERS:
-        standing = figure.load_standing_character(text)
-        return (formats.load(text) if standing is None else standing), None
+        rig = None if options is None else read_rig(None, options)
+        clip = figure.load_standing_character(text) or formats.load(text, metres_per_unit=rig and rig.metres_per_unit)
+        if not getattr(options, "quiet", False):
+            print_doubts(Path(text), clip, rig)
+        return clip, rig
     rig = load_rig(text)
     return figure.make_tpose_clip(rig), rig
 
@@ -67,6 +70,12 @@ def read_motion(path: Path, rig: Rig | None, *, fps: Fraction | None = None, qui
     motion = formats.load(path, fps=fps, metres_per_unit=None if rig is None else rig.metres_per_unit)
     _report_reading(path, motion, rig, quiet=quiet)
     return motion
+
+
+def read_clip(path: Path, options: ReadOptions) -> tuple[Motion, Rig | None]:
+    """Read a motion, and return its rig where `options` state anything of it."""
+    rig = read_rig(None, options)
+    return read_motion(path, rig, quiet=getattr(options, "quiet", False)), rig
 
 
 def read_motion_with_gaps(path: Path, rig: Rig | None, *, quiet: bool) -> tuple[Motion, tuple[Mask, ...], bool]:

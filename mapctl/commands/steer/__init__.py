@@ -15,7 +15,7 @@ _TURN_RATE_DEG = round(math.degrees(SteeringLimits.turn_rate), 1)
 
 
 @dataclass(frozen=True)
-class Steer(ModelCommand):
+class Steer(ModelCommand, options.ReadOptions):
     """A character follows a script of speeds and directions, as in live steering."""
 
     commands: Positional[Annotated[Path, arg(metavar="COMMANDS.csv")]]

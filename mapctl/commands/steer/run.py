@@ -55,7 +55,7 @@ def run(command: Steer) -> int:
     """Check everything, steer, write, report. Ctrl-C ends the script early; the motion so far is written."""
     _check(command)
     track = _add_obstacles(_read_track(command.commands), [Obstacle.parse(text) for text in command.avoid])
-    character, prior = read_character(command.rig), priors.load(command.prior)
+    character, prior = read_character(command.rig, command), priors.load(command.prior)
     track, lowered = track.limit_speed(prior.limits.max_steering_speed)
     for labels in {wanted.labels for wanted in track.commands if wanted.labels}:
         prior.conditioned_on(labels)  # unknown labels are refused now

@@ -10,7 +10,8 @@ from controllers.shots.clips.arrival import Arrival
 from controllers.shots.clips.lead import Lead
 from controllers.shots.request import Look, PoseKey, Reach, ShotRequest
 from controllers.shots.rest_pose import build_rest_pose
-from mapctl.commands.shared.inputs import read_motion
+from mapctl.commands.shared.inputs import read_clip
+from mapctl.commands.shared.options import ReadOptions
 from mapctl.curves import Curve
 from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import RequestError
@@ -47,12 +48,13 @@ def plan_shot(
     *,
     character: Character,
     folder: Path,
+    options: ReadOptions,
     obstacles: Sequence[Obstacle] = (),
     fps: Fraction | None = None,
 ) -> ShotPlan:
     """Plan an actor's shot; a clip that it goes on from or ends in is read, and gives it its body and its rate.
     RequestError for wishes that do not fit each other, and for labels that the prior does not know."""
-    body = _Body.of(actor, character, folder, prior)
+    body = _Body.of(actor, character, folder, options, prior)
     character, placed = body.character, actor.offset is not None or actor.turn_deg is not None
     lead, arrival = None, None
     if actor.start_clip is not None:
@@ -131,6 +133,8 @@ class _Body:
     """Of the motion that is made."""
     folder: Path
     """That files are relative to."""
+    options: ReadOptions
+    """How files are read."""
     prior: LstmGmmDensity
     """Whose walkers the canonical body stands like."""
     clips: dict[str, Motion] = field(default_factory=dict)
@@ -139,19 +143,19 @@ class _Body:
     """As retargeting takes it, once it is needed."""
 
     @staticmethod
-    def of(actor: Actor, character: Character, folder: Path, prior: LstmGmmDensity) -> "_Body":
+    def of(actor: Actor, character: Character, folder: Path, options: ReadOptions, prior: LstmGmmDensity) -> "_Body":
         """That of the clip that an actor goes on from or ends in, else the character's."""
-        found = _Body(character, Fraction(PRIOR_FPS), folder, prior)
+        found = _Body(character, Fraction(PRIOR_FPS), folder, options, prior)
         own = actor.start_clip or actor.end_clip
         if own is None:
             return found
         name = own[0]
-        clip = read_motion(folder / name, None)
+        clip, rig = read_clip(folder / name, options)
         if character.rigmap is not None and not clip.skeleton.matches(character.rigmap.rig_skeleton):
             raise RequestError(
                 f"{name} is of another rig than the character; what goes on from a clip or ends in one is on its rig"
             )
-        canonical, body = RiggedCharacter.of(clip)
+        canonical, body = RiggedCharacter.of(clip, rig)
         found.character = Character(canonical.skeleton, float(body.stance.toe_height.mean()), body.rigmap, body.source)
         found.rate, found.rigged, found.clips[name] = clip.fps, body, canonical
         return found
@@ -160,13 +164,13 @@ class _Body:
         """Return a clip on canonical joints with this body's bones; RequestError, which names it, for one whose joints
         cannot be identified."""
         if name not in self.clips:
-            clip = read_motion(self.folder / name, None)
+            clip, rig = read_clip(self.folder / name, self.options)
             if self.rigged is None:
                 skeleton, height = self.character.skeleton, self.character.toe_rest_height
                 standing = self.character.on_rig(build_rest_pose(self.prior, skeleton, height))
                 self.rigged = RiggedCharacter.of(standing)[1]
             try:
-                self.clips[name] = retarget_motion(clip, self.rigged).motion
+                self.clips[name] = retarget_motion(clip, self.rigged, rig).motion
             except RequestError as error:
                 raise RequestError(f"{name}: {error}") from error
         return self.clips[name]
