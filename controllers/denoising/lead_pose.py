@@ -25,7 +25,7 @@ from mapctl.recording.artefacts import Artefact
 from mapctl.recording.masks import Mask, expand_masks
 from mapctl.recording.pose_mixing import angle_between, linear_fit_weights
 from mapctl.retarget import RigMap, from_canonical
-from mapctl.retarget.pose_axes import RigPoses
+from mapctl.retarget.rig_poses import RigPoses
 from mapctl.skeleton import CANONICAL, LIMBS
 
 _TPOSE_TOLERANCE, _REST_TOLERANCE = math.radians(40), math.radians(35)  # limb of a noisy frame to that of the pose
@@ -94,7 +94,7 @@ def _resembles_tpose(canonical: Motion) -> bool:
         ("leftUpperLeg", "leftFoot", -up),
         ("rightUpperLeg", "rightFoot", -up),
     )
-    directions = [(first.place(stop)[0] - first.place(start)[0], axis) for start, stop, axis in expected]
+    directions = [(first.position(stop)[0] - first.position(start)[0], axis) for start, stop, axis in expected]
     return all(
         float(direction @ axis) > math.cos(_TPOSE_TOLERANCE) * float(direction.norm()) for direction, axis in directions
     )

@@ -5,7 +5,6 @@ and at any time: canonical world rotation = U * rig's world rotation * inverse(B
 that Y is up. The canonical motion keeps the performer's own bone lengths; only the frames change.
 """
 
-import math
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -21,20 +20,11 @@ from mapctl.formats.examples import is_example
 from mapctl.motion import Motion
 from mapctl.retarget import bone_offsets
 from mapctl.retarget.joint_matching import Match, correct_sides, match
-from mapctl.retarget.pose_axes import RigPoses, find_up_axis
 from mapctl.retarget.recognition.body_plan import goes_on_four_legs
-from mapctl.retarget.reference_pose import (
-    TPose,
-    align_bone,
-    classify_reference_pose,
-    find_rest_facing,
-    find_tpose,
-    upright_rotation,
-)
+from mapctl.retarget.reference_pose import find_tpose, is_canonical_tpose
+from mapctl.retarget.rig_poses import RigPoses
 from mapctl.retarget.rigs import Rig, find_preset, known_rigs, read_rig_toml
 from mapctl.skeleton import CANONICAL, Skeleton
-
-_MAX_BONE_ANGLE = math.radians(60)  # between a limb's bone in a table's T-pose and its canonical direction
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +54,9 @@ class RigMap:
     rest: str = "neither"
     """What the pose with all rotations zero is: T, A or neither."""
     tpose_from: str = "table"
-    """Where the T-pose was found: table, rest pose, or frame 0."""
+    """Where the T-pose was found: table, rest pose, frame 0, or motion."""
+    tpose_doubt: str = ""
+    """Why the T-pose may be wrong, a sentence without a full stop; empty where it agrees with the clip."""
     hips_travel: bool = True
     """Whether hips below the root have an animated offset; else the root carries them."""
 
@@ -97,25 +89,46 @@ def load_rig(name_or_path: str | PathLike[str]) -> Rig:
 def identify_rig(skeleton: Skeleton, rig: Rig | None = None, *, motion: Motion | None = None) -> RigMap:
     """Identify the rig's joints, its T-pose and its bones; RequestError where its joints cannot be identified.
 
-    What `rig` states is taken as it is; else presets are tried, and then names, tree and positions (see
-    mapctl.retarget.joint_matching). A `motion` of the skeleton shows the up axis, how knees bend, and whether it begins
-    with a T-pose, where the pose with all rotations zero does not.
+    What `rig` states is taken as it is; where it names no joints, they are recognised: by presets, and then by names,
+    tree and positions (see mapctl.retarget.joint_matching). A `motion` of the skeleton shows the up axis, the sides and
+    how knees and elbows bend, and with that whether the T-pose of a preset or of the file is one.
     """
     character = _character_of(motion)
     if character is not None and rig is None and character.humanoid:
         rig = Rig("vrm", character.humanoid, about="VRM: the file itself says which joint is which.")
     found = match(skeleton, rig)
-    if rig is None:
+    if rig is None or not rig.joints:
         _check_body_plan(found, skeleton, motion)
-    # A preset's table tells of the rig's own joint frames, which are not those that a character's motion has.
-    foreign = character is not None and not character.frames.are_aligned and found.rig in known_rigs()
-    listed = None if foreign else _map_by_table(found, skeleton, motion)
-    if listed is not None:
-        return _set_hips_travel(listed, motion)
-    found = correct_sides(found, skeleton, motion)
+    stated = rig is not None and bool(rig.joints) and rig not in known_rigs()
+    if not stated:
+        found = correct_sides(found, skeleton, motion)
+    if character is not None and not character.frames.are_aligned and found.rig in known_rigs():
+        # A preset's table is of the rig's own joint frames, which are not those that a character's motion has.
+        found = replace(found, rig=replace(found.rig, tpose={}))
     zero = RigPoses.zero(skeleton, found.joint_of)
     clip = None if motion is None else RigPoses.of(motion, found.joint_of)
-    return _set_hips_travel(_build_rig_map(found, skeleton, find_tpose(zero, clip, rig=found.rig)), motion)
+    # The canonical names in a T-pose are the canonical body, whatever it does.
+    stated = stated or (found.rig.name == "canonical" and is_canonical_tpose(zero))
+    tpose = find_tpose(zero, clip, rig=found.rig, stated=stated, up=None if character is None else "y")
+    rigmap = RigMap(
+        found.rig,
+        skeleton,
+        found.joint_of,
+        tpose.quat_xyzw,
+        bone_offsets.measure_bones(skeleton, found.joint_of, tpose.quat_xyzw, tpose.idle_quat_xyzw),
+        tpose.upright_quat_xyzw,
+        tpose.idle_quat_xyzw,
+        found,
+        tpose.up,
+        tpose.facing,
+        tpose.rest,
+        tpose.found,
+        tpose.doubt,
+    )
+    if motion is None:
+        return rigmap
+    # A character's rest pose shows no travel; a root on the floor is to stay there, not to rise and sink with the hips.
+    return replace(rigmap, hips_travel=_hips_joint(rigmap) in motion.moving_offsets or character is not None)
 
 
 def _character_of(motion: Motion | None) -> CharacterSource | None:
@@ -142,74 +155,15 @@ def as_rig(rigmap: RigMap) -> Rig:
     """
     tpose = zip(CANONICAL.names, rigmap.tpose_quat_xyzw, strict=True)
     axes = {c: rotations.to_matrix(quat).T.tolist() for c, quat in tpose if c in rigmap.joints}
+    names, idle = rigmap.rig_skeleton.names, rigmap.idle_quat_xyzw
     return replace(
         rigmap.rig,
         joints=rigmap.joint_names,
         aliases={},
-        straighten=(),
         tpose={c: {"x": x, "y": y} for c, (x, y, _) in axes.items()},
+        idle={} if idle is None else dict(zip(names, idle.tolist(), strict=True)),
         up=rigmap.up,
         rest="tpose",
-    )
-
-
-def _set_hips_travel(rigmap: RigMap, motion: Motion | None) -> RigMap:
-    """Return the map with whether the hips travel below the root; without a motion they may."""
-    if motion is None:
-        return rigmap
-    # A character's rest pose shows no travel; a root on the floor is to stay there, not to rise and sink with the hips.
-    shown = _hips_joint(rigmap) in motion.moving_offsets
-    return replace(rigmap, hips_travel=shown or _character_of(motion) is not None)
-
-
-def _map_by_table(found: Match, skeleton: Skeleton, motion: Motion | None) -> RigMap | None:
-    """Map a rig by the T-pose in its table; None where it has none, or its limbs would not lie as in one."""
-    rig, joint_of = found.rig, found.joint_of
-    if not rig.has_tpose:
-        return None
-    quats = _table_tpose(rig, skeleton, joint_of)
-    zero = RigPoses.zero(skeleton, joint_of)
-    clip = None if motion is None else RigPoses.of(motion, joint_of)
-    up = find_up_axis(zero, clip) if rig.up == "auto" else rig.up
-    idle = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).expand(skeleton.num_joints, 4)
-    rest = classify_reference_pose(zero, torch.eye(3, dtype=torch.float64))
-    listed = _build_rig_map(
-        found, skeleton, TPose(quats, idle, upright_rotation(up), up, find_rest_facing(zero), rest, "table")
-    )
-    if rig.rest == "tpose" and rig.name != "canonical":  # what a user asks for is done
-        return listed
-    return listed if (rest == "T" or not rig.straighten) and _is_canonical_pose(listed.skeleton) else None
-
-
-def _build_rig_map(found: Match, skeleton: Skeleton, tpose: TPose) -> RigMap:
-    measured = bone_offsets.measure_bones(skeleton, found.joint_of, tpose.quat_xyzw, tpose.idle_quat_xyzw)
-    return RigMap(
-        found.rig,
-        skeleton,
-        found.joint_of,
-        tpose.quat_xyzw,
-        measured,
-        tpose.upright_quat_xyzw,
-        tpose.idle_quat_xyzw,
-        found,
-        tpose.up,
-        tpose.facing,
-        tpose.rest,
-        tpose.found,
-    )
-
-
-def _is_canonical_pose(skeleton: Skeleton) -> bool:
-    """Return whether limbs point about as in the T-pose, each from its own side of an upright trunk."""
-    names = [side + part for side in ("left", "right") for part in ("LowerArm", "Hand", "LowerLeg", "Foot")]
-    own, usual = skeleton.offsets, CANONICAL.offsets
-    pairs = [(own[CANONICAL.index(name)], usual[CANONICAL.index(name)]) for name in names]
-    trunk = [CANONICAL.index(name) for name in ("spine", "chest", "neck")]
-    pairs.append((own[trunk].sum(0), usual[trunk].sum(0)))
-    legs = [CANONICAL.index(side + "UpperLeg") for side in ("left", "right")]
-    pairs.append((own[legs[0]] - own[legs[1]], usual[legs[0]] - usual[legs[1]]))
-    return all(
-        float(bone @ wanted) >= math.cos(_MAX_BONE_ANGLE) * float(bone.norm() * wanted.norm()) for bone, wanted in pairs
     )
 
 
@@ -316,36 +270,6 @@ def _hips_joint(rigmap: RigMap) -> int:
     if joint is None:
         raise RequestError(f"the rig {rigmap.rig.name} names no hips")
     return joint
-
-
-def _table_tpose(rig: Rig, skeleton: Skeleton, joint_of: tuple[int | None, ...]) -> Tensor:
-    quats = []
-    for index, name in enumerate(CANONICAL.names):
-        axes = rig.tpose.get(name)
-        matrix = frame_from_axes(axes["x"], axes["y"]) if axes else torch.eye(3, dtype=torch.float64)
-        if name in rig.straighten:
-            matrix = _straighten_bone(index, skeleton, joint_of)
-        quats.append(rotations.from_matrix(matrix))
-    return torch.stack(quats)
-
-
-def frame_from_axes(x: list[float], y: list[float]) -> Float[Tensor, "3 3"]:
-    """Return the rotation whose first two columns point along x and (as nearly as they are square) y."""
-    first = torch.nn.functional.normalize(torch.tensor(x, dtype=torch.float64), dim=0)
-    second = torch.tensor(y, dtype=torch.float64)
-    second = torch.nn.functional.normalize(second - first * (first @ second), dim=0)
-    return torch.stack([first, second, torch.linalg.cross(first, second)], dim=1)
-
-
-def _straighten_bone(index: int, skeleton: Skeleton, joint_of: tuple[int | None, ...]) -> Tensor:
-    """Return the smallest rotation that lays the joint's bone along its canonical direction."""
-    child = CANONICAL.children(index)[0]
-    rig_child = joint_of[child]
-    if rig_child is None:
-        raise RequestError(f"cannot straighten {CANONICAL.names[index]}: the rig has no joint after it")
-    bone = torch.nn.functional.normalize(skeleton.offsets[rig_child], dim=0)
-    aim = torch.nn.functional.normalize(CANONICAL.offsets[child], dim=0)
-    return align_bone(bone, aim)
 
 
 def canonical_joints(motion: Motion, rig: Rig | None = None) -> dict[str, int]:

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl import rotations
-from mapctl.retarget.pose_axes import JointOf, next_joint
+from mapctl.retarget.rig_poses import JointOf, next_joint
 from mapctl.skeleton import CANONICAL, Skeleton
 
 _END_SITES = ("Toes", "Hand", "head")  # joints whose position an End Site of the joint above may give

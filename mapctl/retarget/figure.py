@@ -14,8 +14,8 @@ from mapctl.errors import MapctlError, RequestError
 from mapctl.formats.bvh import layout as bvh_layout
 from mapctl.motion import Motion
 from mapctl.retarget.joint_matching import REQUIRED
-from mapctl.retarget.pose_axes import RigPoses
-from mapctl.retarget.reference_pose import axis_vector, upright_rotation
+from mapctl.retarget.reference_pose import axis_vector, frame_from_axes, upright_rotation
+from mapctl.retarget.rig_poses import RigPoses
 from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import CANONICAL, TOE_JOINTS, TOE_REST_HEIGHT, Skeleton
 
@@ -134,7 +134,7 @@ def _joint_frame(rig: Rig, name: str) -> Float[Tensor, "3 3"]:
     """Return the rotation of a joint's frame in the T-pose, with Y up: by the table, or by the file's axes."""
     axes = rig.tpose.get(name)
     if axes:
-        return retarget.frame_from_axes(axes["x"], axes["y"])
+        return frame_from_axes(axes["x"], axes["y"])
     if rig.tpose:
         return torch.eye(3, dtype=torch.float64)
     return _file_to_world(rig)

@@ -13,9 +13,10 @@ from mapctl.joint_names import Part, Role, Side, abbreviate_names, describe_near
 from mapctl.joint_roles import classify_joints, find_hips
 from mapctl.motion import Motion
 from mapctl.retarget import topology
-from mapctl.retarget.pose_axes import RigPoses, are_sides_swapped
+from mapctl.retarget.anatomy import are_sides_swapped
 from mapctl.retarget.recognition.listed_names import Listed, find_listed_rig, match_by_rig
 from mapctl.retarget.recognition.other_side import find_by_other_side
+from mapctl.retarget.rig_poses import RigPoses
 from mapctl.retarget.rigs import Rig, known_rigs
 from mapctl.skeleton import CANONICAL, Skeleton, mirror_name
 
@@ -74,17 +75,18 @@ class Match:
 
 
 def match(skeleton: Skeleton, rig: Rig | None = None) -> Match:
-    """Match a skeleton by a given rig, by the presets, or by what it looks like; sides are as named.
+    """Match a skeleton by the joints of a given rig, else by the presets, or by what it looks like; sides are as named.
 
     RequestError where a score of MIN_SCORE is not reached or a joint of REQUIRED is not found, naming what is missing.
     """
-    listed = find_listed_rig(skeleton, REQUIRED) if rig is None else Listed(rig, match_by_rig(rig, skeleton))
+    given = rig if rig is not None and rig.joints else None
+    listed = find_listed_rig(skeleton, REQUIRED) if given is None else Listed(given, match_by_rig(given, skeleton))
     chosen, found = (listed.rig, dict(listed.joints)) if listed else (None, {})
-    if rig is not None:
-        _check_given(rig, found, skeleton)
+    if given is not None:
+        _check_given(given, found, skeleton)
     known = dict.fromkeys(found, KnownBy.LIST)
     complete = all(name in found for name in REQUIRED)
-    if chosen is None or not complete or (rig is None and not chosen.fits(skeleton)):
+    if chosen is None or not complete or (given is None and not chosen.fits(skeleton)):
         found, known = _complete_match(skeleton, found)
     absent = _ABSENT if all(name in found for name in REQUIRED) else 0.0
     worth = [_CREDIT[known[c]] if c in known else 0.0 if c in REQUIRED else absent for c in CANONICAL.names]
@@ -92,6 +94,8 @@ def match(skeleton: Skeleton, rig: Rig | None = None) -> Match:
     _check_match(skeleton, found, score)
     if chosen is None:
         chosen = Rig("unlisted", {name: skeleton.names[joint] for name, joint in found.items()})
+    if rig is not None and given is None:
+        chosen = chosen.with_fields_of(rig)
     joint_of, rivals = tuple(found.get(name) for name in CANONICAL.names), listed.rivals if listed else ()
     return Match(chosen, joint_of, score, _unmapped(skeleton, found), known_by=known, rivals=rivals)
 

@@ -1,20 +1,25 @@
-"""The T-pose of any rig: the rotation of each joint in it, from a table, or found from a pose that is near it.
+"""The T-pose of any rig: the world rotation of each joint in it, from the readings that its file and its table offer.
 
-All rotations zero, or a clip's first frame, is the pose to begin from. It is rotated upright and to face +Z; then each
-limb is laid along its canonical direction by the shortest arc, from the body outward. Feet keep their orientation.
+A table, a standing pose with all rotations zero and a first frame that is a T-pose are readings; each is held against
+how the body of a clip is built and bends (`anatomy`), and the first that fits is taken. Where none does, or there is
+none, anatomy is the T-pose. A standing pose is rotated upright and to face +Z; then each limb is laid along its
+canonical direction by the shortest arc: each joint of a T-pose from its own orientation, those of an A-pose with the
+limb above. Feet keep their orientation; hands go with the arm.
 """
 
 import math
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mapctl import rotations
-from mapctl.retarget.pose_axes import RigPoses, find_up_axis, unit_vectors
+from mapctl import kinematics, rotations
+from mapctl.retarget.anatomy import CORE, estimate_frames, find_up_axis
+from mapctl.retarget.rig_poses import RigPoses, unit_vectors
 from mapctl.retarget.rigs import Rig
-from mapctl.skeleton import CANONICAL, TOE_JOINTS, TOE_REST_HEIGHT
+from mapctl.skeleton import CANONICAL
 
 _LIMBS = ("UpperArm", "LowerArm", "UpperLeg", "LowerLeg")
 _SNAP = math.radians(20)  # a rest pose whose up or facing is this near an axis has it along that axis
@@ -23,9 +28,7 @@ _TRUNK_TOLERANCE = math.radians(40)  # trunk and shoulders keep their own shape 
 _LEVEL, _HANGING = math.radians(25), math.radians(100)
 _LEG_TOLERANCE = math.radians(35)  # between the legs of a standing rest pose and the vertical
 _EXACT_TPOSE_ANGLE = math.radians(15)  # of arms and legs in a frame that is a T-pose on purpose
-_MIN_HINGE_BEND = 0.2  # radians: least mean bend of a joint from which its hinge axis is estimated
-_MIN_TWIST = math.radians(60)  # least twist that is corrected
-_QUARTER_TURN = math.pi / 2  # rigs are built in quarter turns
+_UNROTATED = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
 _VECTORS = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
@@ -46,29 +49,112 @@ class TPose:
     rest: str
     """What the pose with all rotations zero is: T, A or neither."""
     found: str
-    """Where the T-pose comes from: table, rest pose, or frame 0."""
+    """Where the T-pose comes from: table, rest pose, frame 0, or motion."""
+    doubt: str = ""
+    """Why it may be wrong, a sentence without a full stop; empty where it agrees with the clip."""
 
 
-def find_tpose(zero: RigPoses, clip: RigPoses | None, *, rig: Rig) -> TPose:
-    """Find the T-pose of a rig whose table has none; axes that the rig sets are taken, not searched for."""
-    up = find_up_axis(zero, clip) if rig.up == "auto" else rig.up
-    upright = upright_rotation(up)
-    base, found, facing = zero, "rest pose", None if rig.facing == "auto" else axis_vector(rig.facing)
+def find_tpose(zero: RigPoses, clip: RigPoses | None, *, rig: Rig, stated: bool, up: str | None = None) -> TPose:
+    """Find the T-pose of a rig. What a user `stated` about it is taken as it is; what a preset has is evidence.
+
+    `up` is the up axis that the file declares; one that the rig sets wins.
+    """
+    facing = None if rig.facing == "auto" else axis_vector(rig.facing)
     front = _facing_rotation(zero, facing)
     rest = classify_reference_pose(zero, front)
+    up = rig.up if rig.up != "auto" else up or _find_up(zero, clip, rest)
+    upright = upright_rotation(up)
+    shown = None if rest == "neither" else nearest_axis_name(front[2])
+    readings = list(_list_readings(zero, clip, rig, stated, rest, front, up))
+
+    def choose(found: str, quats: Tensor, idle: Tensor, doubt: str = "") -> TPose:
+        return TPose(quats, idle, upright, up, shown or "unknown", rest, found, doubt)
+
+    if clip is None:
+        quats, idle, found = (*readings, (_lay_out_tpose(zero, front), _unrotated(zero), "rest pose"))[0]
+        return choose(found, quats, idle)
+    anatomy, refused = estimate_frames(clip, upright), ""
+    for quats, idle, found in readings:
+        contradicted = anatomy.find_contradictions(quats)
+        doubt = f"{_describe_angles(contradicted)} off in the {found} by how the body moves" if contradicted else ""
+        if stated and (rig.tpose or rig.rest != "auto"):
+            return choose(found, quats, idle, doubt)
+        if not contradicted.keys() & CORE:
+            doubt = doubt and f"{doubt}, which is followed for the arm"
+            return choose(found, anatomy.correct(quats, contradicted), idle, doubt)
+        refused = refused or doubt
+    frames = anatomy.correct(
+        torch.zeros(CANONICAL.num_joints, 4, dtype=torch.float64), dict.fromkeys(CANONICAL.names, 0.0)
+    )
+    doubt = refused and f"{refused}, which is followed"
+    if not anatomy.is_certain:
+        doubt = "no pose of the file is a T- or A-pose and knees hardly bend: how limbs are twisted is a guess"
+    elif not anatomy.in_quarter_turns:
+        doubt = doubt or "no pose of the file is a T- or A-pose: joint frames are estimated by how the body moves"
+    return choose("motion", frames, _mean_locals(clip), doubt)
+
+
+def _describe_angles(angles: Mapping[str, float]) -> str:
+    """Describe up to three joints and the largest of their angles, radians: `hips, chest and 4 more are 90 degrees`."""
+    names, more = [*angles][:3], len(angles) - 3
+    joints = ", ".join(names) + (f" and {more} more" if more > 0 else "")
+    return f"{joints} {'is' if len(angles) == 1 else 'are'} {math.degrees(max(angles.values())):.0f} degrees"
+
+
+def _list_readings(
+    zero: RigPoses, clip: RigPoses | None, rig: Rig, stated: bool, rest: str, front: Tensor, up: str
+) -> Iterator[tuple[Tensor, Tensor, str]]:
+    """Yield T-poses by rotations of canonical joints, idle rotations of the rig's, and where they come from."""
+    laid_out = _lay_out_tpose(zero, front) if rest != "neither" or rig.rest == "straighten" else None
+    # A preset's table is of files as its program writes them; one whose rest pose is another has other joint frames.
+    if rig.has_tpose and (stated or rest == "neither" or is_canonical_tpose(zero)):
+        yield _read_table(rig, laid_out), _idle_rotations(rig, zero), "table"
+    if laid_out is not None:
+        yield laid_out, _unrotated(zero), "rest pose"
     if clip is not None and rig.rest in ("auto", "frame0"):
         first = clip.first()
-        turned = _first_frame_rotation(first, axis_vector(up))
-        if rig.rest == "frame0" or (rest == "neither" and is_tpose(first, turned)):
-            base, front, found = first, turned, "frame 0"
-    stands = classify_reference_pose(base, front) != "neither"
-    if clip is None or stands:
-        quats = _lay_out_tpose(base, front, stands, pitch=None, twists={})
-    else:
-        quats = _untwist_tpose(base, front, clip, upright)
-    return TPose(
-        quats, _local_rotations(base), upright, up, nearest_axis_name(_facing_rotation(zero, facing)[2]), rest, found
-    )
+        turned = _body_frame(first.left()[0], axis_vector(up))
+        if rig.rest == "frame0" or is_tpose(first, turned):
+            yield _lay_out_tpose(first, turned), _mean_locals(first), "frame 0"
+
+
+def _read_table(rig: Rig, laid_out: Tensor | None) -> Float[Tensor, "joints 4"]:
+    """Return the world rotations of a rig's joints in the T-pose of its table; of joints that it leaves out, in the
+    rest pose laid out as one, or unrotated where all rotations zero are to be the T-pose or no pose."""
+    quats = _UNROTATED.repeat(CANONICAL.num_joints, 1)
+    if laid_out is not None and rig.rest != "tpose":
+        quats = laid_out.clone()
+    for name, axes in rig.tpose.items():
+        quats[CANONICAL.index(name)] = rotations.from_matrix(frame_from_axes(axes["x"], axes["y"]))
+    return quats
+
+
+def frame_from_axes(x: list[float], y: list[float]) -> Float[Tensor, "3 3"]:
+    """Return the rotation whose first two columns point along x and (as nearly as they are square) y."""
+    first = torch.nn.functional.normalize(torch.tensor(x, dtype=torch.float64), dim=0)
+    second = torch.tensor(y, dtype=torch.float64)
+    second = torch.nn.functional.normalize(second - first * (first @ second), dim=0)
+    return torch.stack([first, second, torch.linalg.cross(first, second)], dim=1)
+
+
+def _idle_rotations(rig: Rig, zero: RigPoses) -> Float[Tensor, "rigged 4"]:
+    idle = _unrotated(zero)
+    for joint, name in enumerate(zero.skeleton.names):
+        if name in rig.idle:
+            idle[joint] = torch.tensor(rig.idle[name], dtype=torch.float64)
+    return idle
+
+
+def _find_up(zero: RigPoses, clip: RigPoses | None, rest: str) -> str:
+    """Find the up axis by the clip and a standing rest pose; without a clip, Z where the rest pose has it, else Y."""
+    if clip is None:
+        return "z" if nearest_axis_name(zero.up()[0]) == "z" else "y"
+    return find_up_axis(clip, None if rest == "neither" else zero.up()[0])
+
+
+def is_canonical_tpose(zero: RigPoses) -> bool:
+    """Return whether the pose with all rotations zero is a T-pose with Y up that faces +Z."""
+    return classify_reference_pose(zero, torch.eye(3, dtype=torch.float64)) == "T"
 
 
 def classify_reference_pose(poses: RigPoses, front: Float[Tensor, "3 3"]) -> str:
@@ -113,11 +199,6 @@ def axis_vector(axis: str) -> Float[Tensor, "3"]:
     return torch.tensor(_VECTORS[axis[-1]], dtype=torch.float64) * (-1 if axis.startswith("-") else 1)
 
 
-def find_rest_facing(zero: RigPoses) -> str:
-    """Find the axis that the pose with all rotations zero faces; `unknown` if it is along none."""
-    return nearest_axis_name(_facing_rotation(zero, None)[2])
-
-
 def nearest_axis_name(direction: Float[Tensor, "3"]) -> str:
     """Return the axis that a unit vector points along; `unknown` if it is none."""
     largest = int(direction.abs().argmax())
@@ -132,11 +213,6 @@ def _facing_rotation(zero: RigPoses, facing: Tensor | None) -> Float[Tensor, "3 
     if facing is not None and float(facing @ up) < 0.5:
         left = torch.linalg.cross(up, facing)
     return _body_frame(_snap_to_axis(left), up)
-
-
-def _first_frame_rotation(first: RigPoses, up: Tensor) -> Float[Tensor, "3 3"]:
-    """Return the rotation of a clip's first frame to face +Z; its up axis is the world's."""
-    return _body_frame(first.left()[0], up)
 
 
 def _body_frame(left: Tensor, up: Tensor) -> Float[Tensor, "3 3"]:
@@ -154,43 +230,28 @@ def _bone_direction(poses: RigPoses, name: str, front: Tensor) -> Float[Tensor, 
     return torch.zeros(3, dtype=torch.float64) if bone is None else unit_vectors(front @ bone[0])
 
 
-def _lay_out_tpose(
-    base: RigPoses, front: Tensor, stands: bool, *, pitch: float | None, twists: dict[str, float]
-) -> Float[Tensor, "joints 4"]:
-    """Return the world rotation of each canonical joint's rig joint once the base pose is laid out as a T-pose."""
+def _lay_out_tpose(base: RigPoses, front: Tensor) -> Float[Tensor, "joints 4"]:
+    """Return the world rotation of each canonical joint's rig joint once a standing pose is laid out as a T-pose."""
     turns: list[Tensor] = []
+    is_t = classify_reference_pose(base, front) == "T"
     for index, name in enumerate(CANONICAL.names):
         part = name.removeprefix("left").removeprefix("right")
-        above = turns[CANONICAL.parents[index]] if index else front
-        if part in ("Foot", "Toes"):
-            turns.append(front if stands else _lay_out_foot(base, name, above, pitch))
-            continue
-        bone, aim = _bone_direction(base, name, above), _canonical_direction(index)
+        if index == 0 or part in ("Foot", "Toes") or (is_t and part != "Hand"):
+            turn = front
+        else:
+            turn = turns[CANONICAL.parents[index]]
+        bone, aim = _bone_direction(base, name, turn), _canonical_direction(index)
         apart = float(torch.arccos((bone @ aim).clamp(-1, 1)))
-        aligned = part in _LIMBS or (part != "Hand" and apart > _TRUNK_TOLERANCE)
+        aligned = part in _LIMBS or (part not in ("Hand", "Foot", "Toes") and apart > _TRUNK_TOLERANCE)
         if aligned and aim.norm() > 0 and bone.norm() > 0 and base.has(name):
-            above = align_bone(bone, aim) @ above
-        if name in twists:
-            above = rotations.rotation_vector_to_matrix(aim * twists[name]) @ above
-        turns.append(above)
+            turn = align_bone(bone, aim) @ turn
+        turns.append(turn)
     still = [rotations.from_matrix(turn) for turn in turns]
     joints = [
         base.orientations[0, joint] if joint is not None else still[0].new_tensor([0, 0, 0, 1])
         for joint in base.joint_of
     ]
     return torch.stack([rotations.multiply(turn, own) for turn, own in zip(still, joints, strict=True)])
-
-
-def _lay_out_foot(base: RigPoses, name: str, above: Tensor, pitch: float | None) -> Tensor:
-    """Lay a foot flat on the floor, or toes level, where the base pose is not a standing one."""
-    bone, toes = base.bone(name), name.endswith("Toes")
-    if toes and bone is None:
-        bone = base.bone(name.replace("Toes", "Foot"))
-    if bone is None:
-        return above
-    slope = 0.0 if toes else _canonical_foot_pitch() if pitch is None else pitch
-    aim = torch.tensor([0.0, -math.sin(slope), math.cos(slope)], dtype=torch.float64)
-    return align_bone(unit_vectors(above @ bone[0]), aim) @ above
 
 
 def _canonical_direction(index: int) -> Float[Tensor, "3"]:
@@ -201,100 +262,13 @@ def _canonical_direction(index: int) -> Float[Tensor, "3"]:
     return unit_vectors(CANONICAL.offsets[CANONICAL.children(index)[0]])
 
 
-def _canonical_foot_pitch() -> float:
-    _, y, z = CANONICAL.offsets[TOE_JOINTS[0]].tolist()
-    return math.atan2(-y, z)
+def _unrotated(poses: RigPoses) -> Float[Tensor, "rigged 4"]:
+    return _UNROTATED.repeat(poses.skeleton.num_joints, 1)
 
 
-def _estimate_foot_pitch(clip: RigPoses | None, upright: Tensor | None) -> float | None:
-    """Estimate the pitch of the foot's bone below level while the foot is flat, radians, from how much lower than the
-    ankle the toe gets over the clip; None where the clip does not show it."""
-    if clip is None or not clip.has("leftToes", "rightToes", "leftFoot", "rightFoot") or len(clip.positions) < 10:
-        return None
-    up = axis_vector("y") if upright is None else rotations.rotate(rotations.inverse(upright), axis_vector("y"))
-    found = []
-    for side in ("left", "right"):
-        ankle, toes = clip.place(side + "Foot"), clip.place(side + "Toes")
-        drop = float((ankle @ up).quantile(0.05) - (toes @ up).quantile(0.05))
-        length = float((toes - ankle).norm(dim=-1).mean())
-        if length < TOE_REST_HEIGHT / 2:
-            return None
-        found.append(math.asin(max(-1.0, min(1.0, drop / length))))
-    slope = sum(found) / 2
-    return slope if 0 < slope < math.radians(70) else None
-
-
-def _untwist_tpose(base: RigPoses, front: Tensor, clip: RigPoses, upright: Tensor | None) -> Float[Tensor, "joints 4"]:
-    """Return the T-pose of a rig whose zero pose is none: bones determine all but the twist of joints about them.
-
-    Over a clip the trunk's joints are hardly twisted, knees bend backward and elbows forward: what contradicts that is
-    corrected, from the hips outward.
-    """
-    pitch, twists = _estimate_foot_pitch(clip, upright), {}
-    for name in (
-        "spine",
-        "chest",
-        "neck",
-        "head",
-        *(side + part for side in ("left", "right") for part in ("Shoulder", "UpperArm", "UpperLeg")),
-    ):
-        quats = _lay_out_tpose(base, front, stands=False, pitch=pitch, twists=twists)
-        if clip.has(name):
-            hinged = name.endswith(("Arm", "Leg"))
-            angle = _hinge_error(clip, name, quats, upright) if hinged else None
-            angle = _mean_twist(clip, name, quats, upright) if angle is None else angle
-            if abs(angle) > _MIN_TWIST:
-                twists[name] = _QUARTER_TURN * round(angle / _QUARTER_TURN)
-    return _lay_out_tpose(base, front, stands=False, pitch=pitch, twists=twists)
-
-
-def _mean_twist(clip: RigPoses, name: str, quats: Tensor, upright: Tensor | None) -> float:
-    """Return the rotation about a joint's bone, radians, that removes its mean twist against the joint above."""
-    index = CANONICAL.index(name)
-    above = CANONICAL.parents[index]
-    while above > 0 and clip.joint_of[above] is None:
-        above = CANONICAL.parents[above]
-    turns = _canonical_rotations(clip, CANONICAL.names[above], quats, upright)
-    local = rotations.multiply(rotations.inverse(turns), _canonical_rotations(clip, name, quats, upright))
-    bone = _canonical_direction(index)
-    bone = axis_vector("y") if bone.norm() == 0 else bone
-    twist = 2 * torch.atan2(local[:, :3] @ bone, local[:, 3])
-    return float(torch.atan2(torch.sin(twist).mean(), torch.cos(twist).mean()))
-
-
-def _hinge_error(clip: RigPoses, name: str, quats: Tensor, upright: Tensor | None) -> float | None:
-    """Return the rotation about an upper limb's bone, radians, by which the joint below bends as people's do; None if
-    it hardly bends."""
-    below = name.replace("Upper", "Lower")
-    left = 1.0 if name.startswith("left") else -1.0
-    wanted = axis_vector("x") if name.endswith("Leg") else -left * axis_vector("y")
-    upper, lower = (_canonical_rotations(clip, joint, quats, upright) for joint in (name, below))
-    bend = rotations.to_rotation_vector(rotations.multiply(rotations.inverse(upper), lower)).mean(0)
-    bone = _canonical_direction(CANONICAL.index(name))
-    bend = bend - bone * (bend @ bone)
-    if float(bend.norm()) < _MIN_HINGE_BEND:
-        return None
-    return float(torch.atan2(torch.linalg.cross(bend, wanted) @ bone, bend @ wanted))
-
-
-def _canonical_rotations(clip: RigPoses, name: str, quats: Tensor, upright: Tensor | None) -> Float[Tensor, "poses 4"]:
-    """Return the world rotations of a canonical joint over a clip."""
-    index, frames = CANONICAL.index(name), len(clip.orientations)
-    joint = clip.joint_of[index]
-    assert joint is not None
-    turns = rotations.multiply(clip.orientations[:, joint], rotations.inverse(quats[index]).expand(frames, 4))
-    return turns if upright is None else rotations.multiply(upright.expand(frames, 4), turns)
-
-
-def _local_rotations(base: RigPoses) -> Float[Tensor, "rigged 4"]:
-    """Return the local rotations of the base pose."""
-    parents, turns = base.skeleton.parents, base.orientations[0]
-    return torch.stack(
-        [
-            turns[j] if p < 0 else rotations.multiply(rotations.inverse(turns[p]), turns[j])
-            for j, p in enumerate(parents)
-        ]
-    )
+def _mean_locals(clip: RigPoses) -> Float[Tensor, "rigged 4"]:
+    """Return the mean local rotations of a clip, which joints between canonical ones have in its body's T-pose."""
+    return rotations.average(kinematics.local_from_world(clip.skeleton.parents, clip.orientations))
 
 
 def align_bone(start: Float[Tensor, "3"], stop: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:

@@ -1,16 +1,19 @@
 """Known rigs, one TOML each: which of their joints is which canonical one, and what their T-pose is."""
 
 import math
-import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from functools import cache
-from importlib.resources import files
+from importlib.resources import as_file, files
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field
 
 from mapctl.errors import FileFormatError, RequestError
-from mapctl.formats.text import read_bytes
+from mapctl.formats import toml
+from mapctl.formats.text import shorten
 from mapctl.joint_names import describe_nearest
 from mapctl.skeleton import CANONICAL, Skeleton
 
@@ -18,7 +21,6 @@ AXES = ("x", "y", "z", "-x", "-y", "-z")
 RESTS = ("auto", "tpose", "straighten", "frame0")
 UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 """Names of length units that a rig's TOML may use, in metres."""
-_KEYS = {"name", "about", "also", "trunk", "joints", "tpose", "straighten", "end_sites", "up", "facing", "rest", "unit"}
 
 
 @dataclass(frozen=True)
@@ -30,9 +32,11 @@ class Rig:
     joints: Mapping[str, str]
     """Canonical joint name to the rig's own."""
     tpose: Mapping[str, Mapping[str, list[float]]] = field(default_factory=dict)
-    """Canonical joint name to where the joint's local x and y axes point in the T-pose; the zero pose if absent."""
-    straighten: tuple[str, ...] = ()
-    """Canonical joints whose bone is rotated to its canonical direction in the T-pose."""
+    """Canonical joint name to where the joint's local x and y axes point in the T-pose; others as the rest pose has
+    them."""
+    idle: Mapping[str, list[float]] = field(default_factory=dict)
+    """Local rotation (xyzw) in the T-pose by the rig's own joint; joints that are canonical ones or left out have
+    none."""
     end_sites: tuple[str, ...] = ()
     """Canonical joints that the rig has only as the End Site of their canonical parent."""
     about: str = ""
@@ -47,7 +51,7 @@ class Rig:
     """Axis of the file that the rest pose faces: one of AXES; `auto` to find it."""
     rest: str = "auto"
     """Where the T-pose comes from: `tpose` (all rotations zero is one, as it is), `straighten` (all zero, with the
-    limbs straightened), `frame0` (the clip begins with one), or `auto` (a table or list above, else what fits)."""
+    limbs straightened), `frame0` (the clip begins with one), or `auto` (the table above, else what fits)."""
     metres_per_unit: float | None = None
     """Length of the file's unit, metres; None to find it by the size of the body."""
     trunk: tuple[str, ...] = ()
@@ -57,15 +61,20 @@ class Rig:
         for key, value, allowed in (("up", self.up, AXES), ("facing", self.facing, AXES), ("rest", self.rest, RESTS)):
             if value not in {"auto", *allowed}:
                 raise RequestError(f"rig {self.name}: {key} is one of auto, {', '.join(allowed)}, got {value!r}")
-        strange = [name for name in (*self.joints, *self.tpose, *self.straighten) if name not in CANONICAL.names]
+        strange = [name for name in (*self.joints, *self.tpose) if name not in CANONICAL.names]
         if strange:
             near = describe_nearest(strange[0], CANONICAL.names)
-            raise RequestError(f"rig {self.name}: no canonical joint {strange[0]!r}; {near}")
+            raise RequestError(f"rig {self.name}: no canonical joint {shorten(strange[0])}; {near}")
 
     @property
     def has_tpose(self) -> bool:
         """Whether the T-pose is given, so that it need not be found."""
-        return bool(self.tpose or self.straighten or self.rest == "tpose") and self.rest in ("auto", "tpose")
+        return bool(self.tpose or self.rest == "tpose") and self.rest in ("auto", "tpose")
+
+    def with_fields_of(self, other: "Rig") -> "Rig":
+        """Return the rig with up axis, facing, rest pose and unit of another one, where that one has them."""
+        own = {name: getattr(other, name) for name in ("up", "facing", "rest", "metres_per_unit")}
+        return replace(self, **{name: value for name, value in own.items() if value not in ("auto", None)})
 
     def fits(self, skeleton: Skeleton) -> bool:
         """Return whether the skeleton has every joint that the rig names, spelled as the rig does."""
@@ -81,11 +90,8 @@ def known_rigs() -> tuple[Rig, ...]:
         rest="tpose",
         about="The canonical skeleton: VRM names, a T-pose with all rotations zero.",
     )
-    paths = sorted(
-        (p for p in files("mapctl.retarget").joinpath("presets").iterdir() if p.name.endswith(".toml")),
-        key=lambda p: p.name,
-    )
-    return canonical, *(_rig_from_table(tomllib.loads(path.read_text("utf-8"))) for path in paths)
+    with as_file(files("mapctl.retarget").joinpath("presets")) as folder:
+        return canonical, *(read_rig_toml(path) for path in sorted(folder.glob("*.toml")))
 
 
 def find_preset(name: str) -> Rig | None:
@@ -96,43 +102,59 @@ def find_preset(name: str) -> Rig | None:
 def read_rig_toml(path: Path) -> Rig:
     """Read a rig from a TOML file; FileFormatError says what is wrong with it."""
     try:
-        return _rig_from_table({"name": path.stem, **tomllib.loads(read_bytes(path).decode("utf-8"))})
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise FileFormatError(path, f"is no TOML: {error}") from None
+        found = toml.read(path, _RigFile, what="rig file", unknown=_list_allowed_keys)
+        return found.build(path.stem)
     except RequestError as error:
         raise FileFormatError(path, str(error)) from None
 
 
-def _rig_from_table(table: Mapping[str, Any]) -> Rig:
-    strange = sorted(table.keys() - _KEYS)
-    if strange:
-        raise RequestError(f"a rig has no {strange[0]!r}; it may have {', '.join(sorted(_KEYS))}")
-    joints = table.get("joints", {})
-    if not isinstance(joints, dict):
-        raise RequestError("a rig's joints are a table of canonical names and the rig's own")
-    names = {canonical: _parse_names(canonical, own) for canonical, own in joints.items()}
-    return Rig(
-        table["name"],
-        {canonical: own[0] for canonical, own in names.items()},
-        table.get("tpose", {}),
-        tuple(table.get("straighten", ())),
-        tuple(table.get("end_sites", ())),
-        table.get("about", ""),
-        {canonical: own[1:] for canonical, own in names.items() if len(own) > 1},
-        tuple(table.get("also", ())),
-        table.get("up", "auto"),
-        table.get("facing", "auto"),
-        table.get("rest", "auto"),
-        parse_unit(table.get("unit")),
-        trunk=tuple(table.get("trunk", ())),
-    )
+@dataclass(frozen=True)
+class _Axes:
+    """Where a joint's local x and y axes point in the T-pose."""
+
+    __pydantic_config__ = toml.STRICT
+
+    x: tuple[float, float, float]
+    y: tuple[float, float, float]
+
+    def __post_init__(self):
+        if not 1e-6 < np.linalg.norm(np.cross(self.x, self.y)) < 1e6:
+            raise RequestError(f"tpose: x and y must be two directions, got {self.x} and {self.y}")
 
 
-def _parse_names(canonical: str, own: Any) -> tuple[str, ...]:
-    names = (own,) if isinstance(own, str) else tuple(own) if isinstance(own, list) else ()
-    if not names or not all(isinstance(name, str) for name in names):
-        raise RequestError(f"{canonical} is the rig's name for it, or a list of names, got {own!r}")
-    return names
+@dataclass(frozen=True)
+class _RigFile:
+    """Contents of a rig file: fields of `Rig`; a joint may have several names, one a version of the rig."""
+
+    __pydantic_config__ = toml.STRICT
+
+    name: str = ""
+    about: str = ""
+    also: tuple[str, ...] = ()
+    trunk: tuple[str, ...] = ()
+    joints: Mapping[str, str | Annotated[tuple[str, ...], Field(min_length=1)]] = field(default_factory=dict)
+    tpose: Mapping[str, _Axes] = field(default_factory=dict)
+    end_sites: tuple[str, ...] = ()
+    up: str = "auto"
+    facing: str = "auto"
+    rest: str = "auto"
+    unit: float | str = "auto"
+
+    def build(self, name: str) -> Rig:
+        """Return the rig, of this name if it has none of its own."""
+        names = {joint: (own,) if isinstance(own, str) else own for joint, own in self.joints.items()}
+        return Rig(
+            name=self.name or name,
+            joints={joint: own[0] for joint, own in names.items()},
+            aliases={joint: own[1:] for joint, own in names.items() if len(own) > 1},
+            tpose={joint: {"x": [*axes.x], "y": [*axes.y]} for joint, axes in self.tpose.items()},
+            metres_per_unit=parse_unit(self.unit),
+            **{key: getattr(self, key) for key in ("about", "also", "trunk", "end_sites", "up", "facing", "rest")},
+        )
+
+
+def _list_allowed_keys(_: object) -> str:
+    return f"allowed: {', '.join(item.name for item in fields(_RigFile))}"
 
 
 def parse_unit(unit: Any) -> float | None:

@@ -14,9 +14,9 @@ from mapctl import retarget
 from mapctl.errors import RequestError
 from mapctl.retarget import rigs
 from mapctl.retarget.joint_matching import KnownBy
-from mapctl.retarget.pose_axes import RigPoses
 from mapctl.retarget.recognition import body_plan
 from mapctl.retarget.recognition.doubts import Fit, assess_fit
+from mapctl.retarget.rig_poses import RigPoses
 from mapctl.skeleton import CANONICAL
 
 

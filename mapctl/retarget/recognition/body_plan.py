@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl.retarget import topology
-from mapctl.retarget.pose_axes import RigPoses, unit_vectors
+from mapctl.retarget.rig_poses import RigPoses, unit_vectors
 from mapctl.skeleton import Skeleton
 
 _ANIMAL = re.compile(

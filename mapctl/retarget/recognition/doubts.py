@@ -11,14 +11,14 @@ from mapctl.joint_names import Part, Side
 from mapctl.joint_roles import classify_joints
 from mapctl.motion import Motion
 from mapctl.retarget import RigMap
+from mapctl.retarget.anatomy import MIN_FRONT, measure_front
 from mapctl.retarget.joint_matching import HELPER_NAME, KnownBy, Match
-from mapctl.retarget.pose_axes import RigPoses
 from mapctl.retarget.recognition import body_plan, proportions
 from mapctl.retarget.recognition.doubt import Doubt
+from mapctl.retarget.rig_poses import RigPoses
 from mapctl.skeleton import mirror_name
 
 _MAX_LISTED = 4  # joints that have a line each; of more there is one line
-_MIN_FRONT = 0.3  # least triple product left x up . toes from which the toes tell the front
 _MAX_SPEED = 12.0  # m/s of the hips, median over a second, of people on foot
 _BELOW = {
     "chest": ("spine",),
@@ -148,16 +148,16 @@ def _compare_sides(rigmap: RigMap, found: Match, zero: RigPoses, clip: RigPoses 
             yield Doubt(f"{name} is {_quote(rigmap, rigmap.joints[name])}, a name of the other side", (name,))
     if _are_arms_turned(zero if clip is None else clip):
         yield Doubt("the left arm is on the side of the right leg", ("leftUpperArm", "rightUpperArm"))
-    front = max(abs(float(poses.handedness().median())) for poses in (zero, clip or zero))
-    if not named and front < _MIN_FRONT:
+    front = max(abs(float(measure_front(poses).mean())) for poses in (zero, clip or zero))
+    if not named and front < MIN_FRONT:
         yield Doubt("nothing tells the front: no names of sides, no toes; left may be right", ())
 
 
 def _are_arms_turned(poses: RigPoses) -> bool:
     """Return whether the left arm is on the side of the right leg, in most poses."""
-    arms = poses.place("leftUpperArm") - poses.place("rightUpperArm")
-    legs = poses.place("leftUpperLeg") - poses.place("rightUpperLeg")
-    return float(torch.nn.functional.cosine_similarity(arms, legs, dim=-1).median()) < -_MIN_FRONT
+    arms = poses.position("leftUpperArm") - poses.position("rightUpperArm")
+    legs = poses.position("leftUpperLeg") - poses.position("rightUpperLeg")
+    return float(torch.nn.functional.cosine_similarity(arms, legs, dim=-1).median()) < -MIN_FRONT
 
 
 def _list_rivals(rigmap: RigMap, found: Match) -> Iterator[Doubt]:

@@ -1,18 +1,16 @@
 """Whether the bones of an understood rig are those of a person: lengths, both sides alike, order of the trunk, size."""
 
-import math
 from collections.abc import Iterator
 from itertools import pairwise
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from mapctl import rotations
 from mapctl.retarget import RigMap
-from mapctl.retarget.pose_axes import RigPoses
 from mapctl.retarget.recognition import body_plan
 from mapctl.retarget.recognition.doubt import Doubt
+from mapctl.retarget.rig_poses import RigPoses
 from mapctl.skeleton import CANONICAL, Skeleton
 
 _HALVES = (0.5, 2.0)  # of an upper limb's bone by the lower one
@@ -24,7 +22,6 @@ _HIPS_METRES = (0.4, 1.6)  # metres of the hips over the toes, of people
 _MAX_SINK = 0.03  # metres that a joint of the trunk may be under the one before
 _NO_BONE = 0.01  # metres of a bone that is none
 _UPRIGHT = 0.5  # cosine between a body and the vertical, below which it lies
-_MIN_BEND = math.radians(6)  # mean bend of knees over a clip from which it tells how legs are twisted
 
 Places = dict[str, Float[Tensor, "3"]]
 """Positions in the T-pose by canonical name, metres, Y up, facing +Z."""
@@ -40,7 +37,7 @@ def check_bones(skeleton: Skeleton) -> Iterator[Doubt]:
 
 
 def check_poses(rigmap: RigMap, clip: RigPoses | None) -> Iterator[Doubt]:
-    """Check what a clip shows: an upright body, and knees that bend where the rest pose is no T- or A-pose."""
+    """Check what a clip shows: an upright body, and a T-pose that agrees with it."""
     if clip is None:
         return
     up = clip.up()
@@ -50,8 +47,8 @@ def check_poses(rigmap: RigMap, clip: RigPoses | None) -> Iterator[Doubt]:
         yield Doubt("hands stand beside the feet under a level trunk in the whole clip: this may be an animal")
     elif float(up[:, 1].median()) < _UPRIGHT:
         yield Doubt(f"the body lies or hangs upside down in most frames if {rigmap.up} is up")
-    if rigmap.rest == "neither" and rigmap.tpose_from == "rest pose" and _mean_bend(clip) < _MIN_BEND:
-        yield Doubt("the rest pose is no T- or A-pose and knees hardly bend: how limbs are twisted is a guess")
+    if rigmap.tpose_doubt:
+        yield Doubt(rigmap.tpose_doubt)
 
 
 def _compare_halves(skeleton: Skeleton) -> Iterator[Doubt]:
@@ -120,14 +117,3 @@ def _length(skeleton: Skeleton, name: str) -> float:
 
 def _way(places: Places, *names: str) -> float:
     return sum(float((places[b] - places[a]).norm()) for a, b in pairwise(names))
-
-
-def _mean_bend(clip: RigPoses) -> float:
-    """Return the mean angle by which knees are bent, radians."""
-    bends = []
-    for side in ("left", "right"):
-        upper, lower = clip.bone(side + "UpperLeg"), clip.bone(side + "LowerLeg")
-        if upper is not None and lower is not None:
-            cosine = torch.nn.functional.cosine_similarity(upper, lower, dim=-1)
-            bends.append(float(torch.arccos(cosine.clamp(-1, 1)).mean()))
-    return max(bends, default=0.0)

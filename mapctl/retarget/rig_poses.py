@@ -1,4 +1,4 @@
-"""The up, forward and left axes that a pose of an unknown rig shows by its joints' positions."""
+"""Poses of a rig whose joints are matched: positions and rotations by canonical joint, and the body's own axes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,8 +13,7 @@ from mapctl.skeleton import CANONICAL, Skeleton
 
 SAMPLES = 200
 """Number of frames of a clip that are looked at, spread over it."""
-_UPRIGHT_COSINE = 0.8  # least cosine between the vertical axis and an upright body
-_MIN_HANDEDNESS = 0.3  # least triple product left x up . toes from which the facing is inferred
+_APART = 1e-3  # metres between two joints below which they are one
 
 JointOf = Sequence[int | None]
 """For each canonical joint the rig's joint, or None."""
@@ -58,11 +57,27 @@ class RigPoses:
         """Return whether the rig has all these canonical joints."""
         return all(self.joint_of[CANONICAL.index(name)] is not None for name in names)
 
-    def place(self, name: str) -> Float[Tensor, "poses 3"]:
-        """Return the position of a canonical joint that the rig has, metres."""
+    def joint(self, name: str) -> int:
+        """Return the rig's joint of a canonical one that it has."""
         joint = self.joint_of[CANONICAL.index(name)]
         assert joint is not None
-        return self.positions[:, joint]
+        return joint
+
+    def position(self, name: str) -> Float[Tensor, "poses 3"]:
+        """Return the position of a canonical joint that the rig has, metres."""
+        return self.positions[:, self.joint(name)]
+
+    def matched_positions(self) -> Float[Tensor, "poses matched 3"]:
+        """Return the positions of all joints that are canonical ones, metres."""
+        return self.positions[:, [joint for joint in self.joint_of if joint is not None]]
+
+    def middle(self, part: str) -> Float[Tensor, "poses 3"]:
+        """Return the point halfway between the left and the right joint of a part, metres."""
+        return (self.position("left" + part) + self.position("right" + part)) / 2
+
+    def across(self, part: str) -> Float[Tensor, "poses 3"]:
+        """Return the vector from the right joint of a part to the left, metres."""
+        return self.position("left" + part) - self.position("right" + part)
 
     def end(self, name: str) -> Float[Tensor, "poses 3"] | None:
         """Return the position of the End Site of a canonical joint, metres, if there is one of some length."""
@@ -75,21 +90,24 @@ class RigPoses:
 
     def up(self) -> Float[Tensor, "poses 3"]:
         """Return the unit vector from the thighs to the upper arms."""
-        high = self.place("leftUpperArm") + self.place("rightUpperArm")
-        return unit_vectors(high - self.place("leftUpperLeg") - self.place("rightUpperLeg"))
+        return unit_vectors(self.middle("UpperArm") - self.middle("UpperLeg"))
 
     def left(self) -> Float[Tensor, "poses 3"]:
-        """Return the unit vector from the right thigh to the left, square to `up`; by the upper arms where thighs are
-        one."""
-        across = self.place("leftUpperLeg") - self.place("rightUpperLeg")
-        arms = self.place("leftUpperArm") - self.place("rightUpperArm")
-        across = torch.where(across.norm(dim=-1, keepdim=True) > 1e-3, across, arms)
+        """Return the unit vector along the hip line to the left, square to `up`."""
+        across = self.hip_line()
         return unit_vectors(across - self.up() * (across * self.up()).sum(-1, keepdim=True))
 
-    def toes(self) -> Float[Tensor, "poses 3"]:
-        """Return the unit vector from the feet to the toes or the feet's End Sites; zero where there are none."""
-        feet = [self.bone(side + "Foot") for side in ("left", "right")]
-        return unit_vectors(sum((foot for foot in feet if foot is not None), torch.zeros_like(self.positions[:, 0])))
+    def hip_line(self) -> Float[Tensor, "poses 3"]:
+        """Return the vector from the right thigh to the left, metres; by the upper arms where both thighs are at one
+        point."""
+        across = self.across("UpperLeg")
+        return across if float(across.norm(dim=-1).mean()) > _APART else self.across("UpperArm")
+
+    def shoulder_line(self) -> Float[Tensor, "poses 3"]:
+        """Return the vector from the right shoulder to the left, metres; by the upper arms, which move more, where the
+        rig has no shoulders or both are at one point."""
+        across = self.across("Shoulder") if self.has("leftShoulder", "rightShoulder") else self.across("UpperArm")
+        return across if float(across.norm(dim=-1).mean()) > _APART else self.across("UpperArm")
 
     def bone(self, name: str) -> Float[Tensor, "poses 3"] | None:
         """Return the vector, metres, from a canonical joint to the next one of its limb or trunk that the rig has, or
@@ -99,13 +117,8 @@ class RigPoses:
         following = next_joint(name)
         while following is not None and not self.has(following):
             following = next_joint(following)
-        stop = self.end(name) if following is None else self.place(following)
-        return None if stop is None else stop - self.place(name)
-
-    def handedness(self) -> Float[Tensor, " poses"]:
-        """Return the triple product left x up . toes: 1 where sides are as named, -1 where they are exchanged."""
-        toes, up = self.toes(), self.up()
-        return (torch.linalg.cross(self.left(), up) * toes).sum(-1)
+        stop = self.end(name) if following is None else self.position(following)
+        return None if stop is None else stop - self.position(name)
 
 
 def next_joint(name: str) -> str | None:
@@ -115,29 +128,6 @@ def next_joint(name: str) -> str | None:
         return below.get(name)
     children = CANONICAL.children(CANONICAL.index(name))
     return CANONICAL.names[children[0]] if children else None
-
-
-def are_sides_swapped(zero: RigPoses, clip: RigPoses | None) -> bool:
-    """Return whether the joints named left are on the right, judged by the direction of the toes."""
-    rest = float(zero.handedness()[0])
-    if abs(rest) > _MIN_HANDEDNESS:
-        return rest < 0
-    return clip is not None and float(clip.handedness().median()) < -_MIN_HANDEDNESS
-
-
-def find_up_axis(zero: RigPoses, clip: RigPoses | None) -> str:
-    """Find the up axis, Y or Z, by the body in the clip, else in the zero pose; Y where neither is conclusive.
-
-    A clip overrules the zero pose only if the body is upright along the other axis in all of its frames, since people
-    lie down, too.
-    """
-    rest = "z" if float(zero.up()[0, 2]) > _UPRIGHT_COSINE else "y"
-    if clip is None:
-        return rest
-    tall = clip.up()
-    if rest == "y":
-        return "z" if float(tall[:, 2].min()) > 0.5 and float(tall[:, 2].mean()) > _UPRIGHT_COSINE else "y"
-    return "y" if float(tall[:, 1].min()) > 0.5 and float(tall[:, 1].mean()) > _UPRIGHT_COSINE else "z"
 
 
 def unit_vectors(vectors: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:

@@ -1,0 +1,333 @@
+"""Joint frames, up axis and sides of a body from its anatomy: where its joints are over a clip, and how they bend.
+
+Each joint's frame follows from two directions whose canonical counterparts are known: the bone, and a second one across
+it (hip line, shoulder line, hinge axis of a knee or elbow). Both are averaged over the clip in the joint's own frame,
+so the result does not depend on how a file orients its joint axes, nor on what its pose with all rotations zero is.
+"""
+
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mapctl import rotations
+from mapctl.retarget.rig_poses import RigPoses, unit_vectors
+from mapctl.skeleton import CANONICAL
+
+CONTRADICTION = math.radians(75)
+"""Angle between two readings of a joint from which one of them is wrong. Rigs orient joints in quarter turns; hinge
+axes of real rigs are up to 53 degrees off their T-pose's (MakeHuman's knees, MocapNET's elbows)."""
+CORE = ("hips", "chest", *(side + part for side in ("left", "right") for part in ("UpperLeg", "LowerLeg")))
+"""Joints that positions and knees determine beyond doubt: a T-pose that contradicts one of them is none."""
+_ARM = ("Shoulder", "UpperArm", "LowerArm", "Hand")
+_MIN_BEND = 0.1  # mean sine of the angle at a knee or elbow from which its hinge axis is known
+_HINGE_SHARE = 0.7  # of all bending that is about the hinge axis, from which there is one
+_STRAIGHT_POWER = 20  # legs count by this power of their extension: 0.67 at 98 %, 0.12 at 90 %, 0.01 at 80 %
+_SPINE_WEIGHT = 0.05  # of the bone above the hips against legs
+_ROUNDING = math.radians(15)  # between an axis and a direction that it is taken for, in all of CORE
+_PITCH_WEIGHT = 0.02  # of the canonical foot's pitch against the share of frames in which a foot stands
+_MAX_PITCH = math.radians(70)  # of the bone of a flat foot: an End Site may be straight under the ankle
+_REST_WEIGHT = 1.25  # of a standing rest pose against an upright trunk; hanging arms weigh half as much as the trunk
+_Y_UP_WEIGHT = 0.25  # of what most files have
+_NO_LINE = 1e-3  # metres between two joints below which they are one
+_X, _Y, _Z = torch.eye(3, dtype=torch.float64)
+_SIDES = (("left", 1.0), ("right", -1.0))
+
+Vectors = Float[Tensor, "poses 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class Anatomy:
+    """Joint frames of a clip's body as positions and bends determine them."""
+
+    frames: Mapping[str, Float[Tensor, "3 3"]]
+    """World rotation of the rig's joint in the canonical T-pose (Y up, facing +Z), by canonical joint."""
+    certain: Mapping[str, Float[Tensor, "3 3"]]
+    """Those of the joints that rigid offsets and bends determine within CONTRADICTION, the hips by the spine."""
+    in_quarter_turns: bool
+    """Whether joint axes are along the canonical ones, so that frames are exact but for the feet's pitch."""
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether both legs bend enough to show how they are twisted."""
+        return {"leftUpperLeg", "rightUpperLeg"} <= self.certain.keys()
+
+    def find_contradictions(self, tpose: Float[Tensor, "joints 4"]) -> dict[str, float]:
+        """Return the joints whose world rotation (xyzw) in a T-pose is off by more than CONTRADICTION, each with the
+        angle in radians."""
+        angles = {}
+        for name, frame in self.certain.items():
+            back = rotations.from_matrix(frame.T)
+            turn = rotations.to_rotation_vector(rotations.multiply(back, tpose[CANONICAL.index(name)]))
+            if float(turn.norm()) > CONTRADICTION:
+                angles[name] = float(turn.norm())
+        return angles
+
+    def correct(self, tpose: Float[Tensor, "joints 4"], names: Iterable[str]) -> Float[Tensor, "joints 4"]:
+        """Return a T-pose with these joints as the clip shows them, and the arms that they are of from the upper arm
+        on, whose rolls belong together."""
+        fixed = tpose.clone()
+        turned = {part for name in names for part in (name, *_list_rest_of_arm(name))}
+        for name in turned & self.frames.keys():
+            fixed[CANONICAL.index(name)] = rotations.from_matrix(self.frames[name])
+        return fixed
+
+
+def _list_rest_of_arm(name: str) -> list[str]:
+    return [side + part for side, _ in _SIDES if name == side + "UpperArm" for part in _ARM[1:]]
+
+
+@dataclass
+class _Builder:
+    """Frames found so far, and the rotations that they give the canonical joints over the clip."""
+
+    clip: RigPoses
+    turns: Float[Tensor, "poses rigged 3 3"]
+    in_quarter_turns: bool = False
+    """Whether joint axes lie along the canonical ones, so that directions are rounded to them."""
+    frames: dict[str, Tensor] = field(default_factory=dict)
+    directions: dict[str, tuple[Tensor, Tensor]] = field(default_factory=dict)
+    """The two directions in each joint's own frame."""
+
+    def average(self, name: str, vectors: Vectors) -> Float[Tensor, "3"]:
+        """Average world vectors in the own frame of a canonical joint's rig joint."""
+        return torch.einsum("tji,tj->ti", self.turns[:, self.clip.joint(name)], vectors).mean(0)
+
+    def axis(self, name: str, axis: Tensor) -> Vectors:
+        """Return where an axis of a canonical joint that has a frame points in the world, over the clip."""
+        return self.turns[:, self.clip.joint(name)] @ (self.frames[name].T @ axis)
+
+    def is_hinge(self, name: str, normals: Vectors) -> bool:
+        """Return whether the limb bends far enough and about one axis of its upper joint; `normals` are those of its
+        plane, of the length of the bend's sine."""
+        bend = float(self.average(name, normals).norm())
+        return bend > max(_MIN_BEND, _HINGE_SHARE * float(normals.norm(dim=-1).mean()))
+
+    def orient(self, name: str, first: Vectors, aim: Tensor, second: Vectors, aim_second: Tensor) -> None:
+        """Give a joint the frame in which the first direction is its canonical one, and the second as nearly so as
+        that allows."""
+        one, two = unit_vectors(self.average(name, first)), unit_vectors(self.average(name, second))
+        self.directions[name] = one, two
+        if self.in_quarter_turns:
+            one = _nearest_axis(one)
+            two = _nearest_axis(two - one * (one @ two))
+        self.frames[name] = _orthonormal(aim, aim_second) @ _orthonormal(one, two).T
+
+    def continue_frame(self, name: str, above: str, aim: Tensor) -> None:
+        """Give the end of a limb the frame of the joint above where its bone points about along `aim` in that: rigs
+        built in quarter turns are straight with its rotation zero, while its mean is how the body holds it."""
+        if not self.in_quarter_turns or not self.clip.has(above):
+            return
+        if float(self.frames[above] @ self.directions[name][0] @ aim) > math.cos(CONTRADICTION):
+            self.frames[name] = self.frames[above]
+
+
+def estimate_frames(clip: RigPoses, upright: Float[Tensor, "4"] | None) -> Anatomy:
+    """Estimate the frames of all joints that the rig has; `upright` takes the file's world to one with Y up.
+
+    Where the axes of all joints of CORE are near the canonical ones, the rig is built in quarter turns, and its joints
+    are rounded to them.
+    """
+    turns = rotations.to_matrix(clip.orientations)
+    found, certain = _orient_joints(_Builder(clip, turns), upright)
+    if all(_is_near_axis(direction) for name in CORE for direction in found.directions.get(name, ())):
+        found, _ = _orient_joints(_Builder(clip, turns, in_quarter_turns=True), upright)
+    return Anatomy(found.frames, certain, found.in_quarter_turns)
+
+
+def _orient_joints(found: _Builder, upright: Tensor | None) -> tuple[_Builder, dict[str, Tensor]]:
+    """Orient all joints; also return the frames of those that are certain."""
+    clip, pitch = found.clip, _estimate_foot_pitch(found.clip, upright)
+    # Files disagree by 33 degrees about where the spine is over the hips: enough to tell which pelvis is wrong.
+    found.orient("hips", clip.hip_line(), _X, clip.position("spine") - clip.middle("UpperLeg"), _Y)
+    certain = {"hips": found.frames["hips"]}
+    known = [*_orient_trunk(found)]
+    for side, sign in _SIDES:
+        known += [*_orient_arm(found, side, sign), *_orient_leg(found, side, pitch)]
+    return found, certain | {name: found.frames[name] for name in known}
+
+
+def _orient_trunk(found: _Builder) -> Iterator[str]:
+    clip = found.clip
+    found.orient("hips", clip.hip_line(), _X, _pelvis_up(clip), _Y)
+    top = "chest" if clip.has("chest") else "spine"
+    if top == "chest":
+        found.orient("chest", clip.shoulder_line(), _X, _bone_or(clip, "chest", clip.up()), _Y)
+        yield "chest"
+    across = found.axis("hips", _X) + (found.axis("chest", _X) if top == "chest" else clip.shoulder_line())
+    found.orient("spine", _bone_or(clip, "spine", clip.up()), _Y, across, _X)
+    for name in ("neck", "head"):
+        if clip.has(name):
+            found.orient(name, _bone_or(clip, name, found.axis(top, _Y)), _Y, found.axis(top, _X), _X)
+    if clip.has("head"):
+        found.continue_frame("head", "neck", _Y)
+
+
+def _orient_arm(found: _Builder, side: str, sign: float) -> Iterator[str]:
+    """Orient the joints of an arm: bones lie along x, the elbow bends toward +z."""
+    clip, above = found.clip, "chest" if found.clip.has("chest") else "spine"
+    shoulder, upper, lower, hand = (side + part for part in _ARM)
+    if clip.has(shoulder):
+        found.orient(
+            shoulder, _bone_or(clip, shoulder, sign * found.axis(above, _X)), sign * _X, found.axis(above, _Y), _Y
+        )
+        above = shoulder
+        yield shoulder
+    arm = _bone(clip, upper)
+    forearm = _bone_or(clip, lower, arm)
+    hinge = -sign * torch.linalg.cross(arm, forearm)
+    bends = found.is_hinge(upper, hinge)
+    # An arm that stays straight has no more twist against the body than the shortest arc from the T-pose gives it.
+    arc = rotations.between_vectors(sign * found.axis(above, _X), arm)
+    found.orient(upper, arm, sign * _X, hinge if bends else rotations.rotate(arc, found.axis(above, _Y)), _Y)
+    found.orient(lower, forearm, sign * _X, hinge if bends else found.axis(upper, _Y), _Y)
+    if clip.has(hand):
+        found.orient(hand, _bone_or(clip, hand, forearm), sign * _X, found.axis(lower, _Y), _Y)
+        found.continue_frame(hand, lower, sign * _X)
+    if bends:
+        yield upper
+
+
+def _orient_leg(found: _Builder, side: str, pitch: float) -> Iterator[str]:
+    """Orient the joints of a leg: bones lie along -y, the knee bends toward -z, the foot is as when it is flat."""
+    clip = found.clip
+    upper, lower, foot, toes = (side + part for part in ("UpperLeg", "LowerLeg", "Foot", "Toes"))
+    thigh, shin = _bone(clip, upper), _bone(clip, lower)
+    hinge = torch.linalg.cross(thigh, shin)
+    bends = found.is_hinge(upper, hinge)
+    hinge = hinge if bends else found.axis("hips", _X)
+    found.orient(upper, thigh, -_Y, hinge, _X)
+    found.orient(lower, shin, -_Y, hinge, _X)
+    if bends:
+        yield from (upper, lower)
+    bone = clip.bone(foot)
+    if bone is None:  # nothing but the shin shows where the foot points
+        found.orient(foot, shin, -_Y, found.axis(lower, _X), _X)
+    else:
+        flat = torch.tensor([0.0, -math.sin(pitch), math.cos(pitch)], dtype=torch.float64)
+        across = found.axis(lower, _X)
+        found.orient(foot, bone, flat, across, _X)
+        if found.in_quarter_turns and not _is_near_axis(found.directions[foot][0]):
+            # The foot's axes are along its sole, not along its bone.
+            bone = unit_vectors(bone)
+            level = math.cos(pitch) * bone + math.sin(pitch) * torch.linalg.cross(bone, unit_vectors(across))
+            found.orient(foot, level, _Z, across, _X)
+    if clip.has(toes):
+        found.orient(toes, found.axis(foot, _X), _X, found.axis(foot, _Y), _Y)
+
+
+def _pelvis_up(clip: RigPoses) -> Vectors:
+    """Return the pelvis's up direction, weighted: against the legs where both are stretched, else along the spine."""
+    (left, first), (right, second) = (_leg_extension(clip, side) for side, _ in _SIDES)
+    return _SPINE_WEIGHT * unit_vectors(clip.position("spine") - clip.middle("UpperLeg")) - first * second * (
+        left + right
+    )
+
+
+def _leg_extension(clip: RigPoses, side: str) -> tuple[Vectors, Float[Tensor, "poses 1"]]:
+    """Return the unit vector from hip to ankle, and how stretched the leg is: about 1 where it stands, 0 where not."""
+    hip, knee, ankle = (clip.position(side + part) for part in ("UpperLeg", "LowerLeg", "Foot"))
+    length = (knee - hip).norm(dim=-1) + (ankle - knee).norm(dim=-1)
+    extension = (ankle - hip).norm(dim=-1) / length.clamp_min(1e-9)
+    return unit_vectors(ankle - hip), (extension**_STRAIGHT_POWER)[:, None]
+
+
+def _estimate_foot_pitch(clip: RigPoses, upright: Tensor | None) -> float:
+    """Estimate how far the bones of the feet point below level while they are flat, radians: the mean over frames,
+    weighted by how stretched the leg and how low the ankle is; the canonical feet's where no frame counts."""
+    _, y, z = unit_vectors(CANONICAL.offsets[CANONICAL.index("leftToes")]).tolist()
+    up = _Y if upright is None else rotations.rotate(rotations.inverse(upright), _Y)
+    total, weights = math.atan2(-y, z) * _PITCH_WEIGHT, _PITCH_WEIGHT
+    for side, _ in _SIDES:
+        bone = clip.bone(side + "Foot")
+        if bone is None:
+            continue
+        ankle = clip.position(side + "Foot") @ up
+        over = (ankle - ankle.quantile(0.1)).clamp_min(0) / (0.1 * float(bone.norm(dim=-1).mean()) + 1e-9)
+        weight = torch.exp(-over) * _leg_extension(clip, side)[1][:, 0]
+        pitch = torch.asin((unit_vectors(bone) @ -up).clamp(-1, 1))
+        total, weights = total + float((weight * pitch).mean()), weights + float(weight.mean())
+    return min(max(total / weights, 0.0), _MAX_PITCH)
+
+
+def _bone(clip: RigPoses, name: str) -> Vectors:
+    """Return the direction of the bone of a joint that every rig has."""
+    bone = clip.bone(name)
+    assert bone is not None
+    return unit_vectors(bone)
+
+
+def _bone_or(clip: RigPoses, name: str, otherwise: Vectors) -> Vectors:
+    """Return the direction of a joint's bone, or another one where it has none of some length."""
+    bone = clip.bone(name)
+    return otherwise if bone is None or float(bone.norm(dim=-1).mean()) < _NO_LINE else unit_vectors(bone)
+
+
+def _is_near_axis(direction: Tensor) -> bool:
+    return float(direction.abs().max()) > math.cos(_ROUNDING)
+
+
+def _nearest_axis(direction: Tensor) -> Float[Tensor, "3"]:
+    """Return the axis, with its sign, that a direction is nearest to."""
+    largest = int(direction.abs().argmax())
+    return torch.eye(3, dtype=direction.dtype)[largest] * direction[largest].sign()
+
+
+def _orthonormal(first: Tensor, second: Tensor) -> Float[Tensor, "3 3"]:
+    """Return the right-handed frame whose first column is along `first` and whose second is nearest to `second`."""
+    first = unit_vectors(first)
+    second = unit_vectors(second - first * (first @ second))
+    if float(second.norm()) < 0.5:  # parallel: any direction across is as good
+        across = torch.eye(3, dtype=first.dtype)[int(first.abs().argmin())]
+        second = unit_vectors(across - first * (first @ across))
+    return torch.stack([first, second, torch.linalg.cross(first, second)], dim=1)
+
+
+def find_up_axis(clip: RigPoses, rest_up: Tensor | None) -> str:
+    """Find the axis of the file's world that is up, one of `x y z -x -y -z`; Y where no other is plainly better.
+
+    The trunk stands along it and arms hang against it, a standing rest pose (`rest_up`) has it, and the body's lowest
+    point stays at 0 along it. A crawl's trunk lies along another axis in all of its frames; its arms, its rest pose and
+    the floor outvote that.
+    """
+    positions, arms = clip.matched_positions(), unit_vectors(clip.middle("LowerArm") - clip.middle("UpperArm"))
+    height = 2 * float((clip.middle("UpperArm") - clip.middle("UpperLeg")).norm(dim=-1).mean()) + 1e-9
+    upright = (clip.up() - 0.5 * arms).mean(0) + (0.0 if rest_up is None else _REST_WEIGHT * rest_up)
+
+    def score(axis: str) -> float:
+        index, sign = "xyz".index(axis[-1]), -1.0 if axis.startswith("-") else 1.0
+        floor = float((sign * positions[..., index]).amin(dim=1).square().mean().sqrt()) / height
+        return sign * float(upright[index]) - min(floor, 1.0) + (_Y_UP_WEIGHT if axis == "y" else 0.0)
+
+    return max(("y", "z", "x", "-y", "-z", "-x"), key=score)
+
+
+def measure_front(poses: RigPoses) -> Float[Tensor, " poses"]:
+    """Measure whether what is named left is on the left, by pose: positive where toes point to the body's front and
+    knees bend away from it, about -1 where sides are exchanged, near 0 where a pose shows neither."""
+    left, up = poses.left(), poses.up()
+    front, votes = torch.linalg.cross(left, up), torch.zeros_like(left[:, 0])
+    for side, _ in _SIDES:
+        thigh, shin = _bone(poses, side + "UpperLeg"), _bone(poses, side + "LowerLeg")
+        votes = votes + (torch.linalg.cross(thigh, shin) * left).sum(-1)
+        bone = poses.bone(side + "Foot")
+        if bone is not None:  # a foot that goes on along the shin shows no front
+            toes = unit_vectors(bone)
+            toes = toes - shin * (toes * shin).sum(-1, keepdim=True)
+            votes = votes + (toes * front).sum(-1)
+    return votes / 2
+
+
+def are_sides_swapped(zero: RigPoses, clip: RigPoses | None) -> bool:
+    """Return whether the joints named left are on the right: by the clip where it shows the body's front, else by the
+    pose with all rotations zero."""
+    shown = [float(measure_front(poses).mean()) for poses in (clip, zero) if poses is not None]
+    sure = [vote for vote in shown if abs(vote) > MIN_FRONT]
+    return bool(sure) and sure[0] < 0
+
+
+MIN_FRONT = 0.3
+"""Least mean of `measure_front` from which it counts."""
