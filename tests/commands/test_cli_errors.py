@@ -31,9 +31,9 @@ DEEP = (
 MOTIONS = {
     "empty": b"",
     "binary": bytes(range(256)) * 40,
-    "cut": (HEAD + ROW + "0 90 0").encode(),
+    "cut": (HEAD + "0 90 0").encode(),
     "nan": (HEAD + ROW + ROW.replace("90", "nan")).encode(),
-    "counts": (HEAD + ROW).encode(),
+    "counts": (HEAD + "0 90 0\n" + ROW).encode(),
     "words": (HEAD + ROW + ROW.replace("90", "high")).encode(),
     "deep": DEEP.encode(),
 }
