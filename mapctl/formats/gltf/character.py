@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from mapctl import rotations
-from mapctl.errors import FileFormatError
+from mapctl.errors import RequestError
 from mapctl.formats.atomic import write_pieces
 from mapctl.formats.characters.rest_frames import compose_matrices, split_scale
 from mapctl.formats.characters.source import CharacterSource
@@ -69,7 +69,7 @@ def _gather(gltf: GltfFile) -> "tuple[dict[str, Any], list[bytes | memoryview]]"
         size += length + -length % 4
     for number, view in enumerate(tree.get("bufferViews", [])):
         if view["buffer"] >= len(starts):
-            raise FileFormatError(gltf.path, f"bufferViews[{number}] is of buffer {view['buffer']} of {len(starts)}")
+            raise RequestError(f"{gltf.path}: bufferViews[{number}] is of buffer {view['buffer']} of {len(starts)}")
         if starts[view["buffer"]]:
             view["byteOffset"] = view.get("byteOffset", 0) + starts[view["buffer"]]
         view["buffer"] = 0
