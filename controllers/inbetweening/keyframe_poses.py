@@ -2,7 +2,7 @@
 body's rig where they come from another.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
@@ -38,12 +38,15 @@ class KeyframeClip:
     """The body's rig, where it is known."""
 
 
-def build_keyframe_clip(request: KeyRequest, rig: Rig | None = None) -> KeyframeClip:
+def build_keyframe_clip(
+    request: KeyRequest, rig: Rig | None = None, on_read: Callable[[Path, Motion, Rig | None], None] | None = None
+) -> KeyframeClip:
     """Build the motion and the keys of a request. RequestError, which names the key, for poses and joints that do not
-    exist; `rig` is the body's where it is not the one that would be recognised.
+    exist; `rig` is the body's where it is not the one that would be recognised. `on_read` is called with each file that
+    is read, its motion and its rig.
     """
     first = next((number for number, key in enumerate(request.key) if key.pose is not None), 0)
-    reader = _PoseReader(rig)
+    reader = _PoseReader(rig, on_read)
     with _prefix_errors("body" if request.body is not None else f"key[{first}].pose"):
         body = reader.body(request.body or request.key[first].pose or "")
     fps = Fraction(request.fps).limit_denominator(100_000)
@@ -82,6 +85,8 @@ class _PoseReader:
 
     rig: Rig | None
     """Rig of the body."""
+    on_read: Callable[[Path, Motion, Rig | None], None] | None
+    """Function called with each file, its motion and its rig."""
     clips: dict[str, _LoadedClip] = field(default_factory=dict)
     """Loaded clips by path."""
 
@@ -92,18 +97,23 @@ class _PoseReader:
 
     def body(self, path: str) -> _LoadedClip:
         """Load the body's own file, on its rig where one is given."""
-        unit = None if self.rig is None else self.rig.metres_per_unit
-        clip = formats.load(Path(path), metres_per_unit=unit)
+        clip = self._load(path, self.rig)
         self.clips[path] = _LoadedClip(path, clip, *RiggedCharacter.of(clip, self.rig))
         return self.clips[path]
 
     def pose(self, path: str, body: _LoadedClip) -> _LoadedClip:
         """Load a clip, retargeted to the body; the rig of another skeleton must be recognised."""
         if path not in self.clips:
-            clip = formats.load(Path(path))
+            clip = self._load(path, None)
             moved = retarget_motion(clip, body.target_body).motion
             self.clips[path] = _LoadedClip(path, clip, moved, body.target_body)
         return self.clips[path]
+
+    def _load(self, path: str, rig: Rig | None) -> Motion:
+        clip = formats.load(Path(path), metres_per_unit=None if rig is None else rig.metres_per_unit)
+        if self.on_read is not None:
+            self.on_read(Path(path), clip, rig)
+        return clip
 
 
 def _build_key(key: KeyEntry, frame: int, rigmap: RigMap, number: int) -> Key:

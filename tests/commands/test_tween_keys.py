@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
+import torch
 from captures import on_rig
 from helpers import run, walk
 from methods import words_of
@@ -87,6 +88,14 @@ def test_keys_of_every_kind_are_met_in_the_file(tween, folder, capsys):
 
 
 @pytest.mark.slow
+def test_the_unit_of_a_body_is_obeyed_and_doubts_about_poses_are_printed(folder, capsys):
+    keys = folder / "keys" / "keys.toml"
+    assert run("tween", keys, "-o", "a.npz", "--unit", "in", "--method", "slerp") == 0
+    assert f"{folder / 'keys' / 'walk.bvh'}: hips are 2." in capsys.readouterr().err
+    bones = [mapctl.load(path).skeleton.offsets for path in ("a.npz", folder / "keys" / "walk.bvh")]
+    torch.testing.assert_close(bones[0], 2.54 * bones[1])
+
+
 def test_timing_is_suggested_and_the_given_one_made(folder, capsys):
     keys = folder / "keys" / "keys.toml"
     assert run("tween", keys, "-o", "plain.bvh", *words_of("slerp")) == 0

@@ -130,7 +130,7 @@ def _read_keyframe_clip(command: Tween, request: KeyRequest | None) -> KeyframeC
 
 def _load_key_file(command: Tween, request: KeyRequest, rig: Rig | None) -> KeyframeClip:
     try:
-        clip = build_keyframe_clip(request, rig)
+        clip = build_keyframe_clip(request, rig, None if command.quiet else inputs.print_doubts)
     except RequestError as error:
         raise FileFormatError(command.source, str(error)) from error
     licences.note_licence(str(command.source), clip.motion.licence)
