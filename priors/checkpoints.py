@@ -5,27 +5,60 @@ the measured quality. A card that does not fit the code is refused with both lay
 """
 
 import json
-from collections.abc import Iterator
+import re
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypeVar
 
-from safetensors import SafetensorError
+import torch
+from pydantic import AfterValidator, BaseModel, ConfigDict, TypeAdapter, ValidationError
 from safetensors.torch import load_file
-from torch import Tensor
+from torch import Tensor, nn
+from torch.overrides import TorchFunctionMode
 
 from mapctl.errors import CheckpointError, RequestError
 from mapctl.features import LAYOUT
+from mapctl.formats import toml
 from mapctl.formats.atomic import atomic_path
+from mapctl.formats.text import one_line, shorten
 from priors import licences, weight_sets
 from priors.tensor_files import write_tensors
+
+N = TypeVar("N", bound=nn.Module)
+
+
+class _MotionClass(BaseModel):
+    clips: int
+    vector: str
+
+
+class _TrainingData(BaseModel):
+    """What is read again of a card's `data`; the rest is for people."""
+
+    model_config = ConfigDict(strict=True)
+
+    starts: list[str] = []
+    labels: re.Pattern[str] = re.compile("")
+    holds: dict[str, Any] = {}
+    held_out: dict[str, list[str]] = {}
+    match: str = ""
+    made: list[str] = []
+    classes: dict[str, _MotionClass] = {}
+
+
+def _check_data(data: dict[str, Any]) -> dict[str, Any]:
+    _TrainingData.model_validate(data)
+    return data
 
 
 @dataclass(frozen=True, repr=False)
 class Card:
     """Card of a set of weights."""
+
+    __pydantic_config__ = toml.STRICT
 
     kind: str
     """Kind of network: `lstm-gmm` and so on."""
@@ -37,7 +70,7 @@ class Card:
     """Fingerprint of the feature layout."""
     licence: str
     """Licence of the weights."""
-    data: dict[str, Any] = field(default_factory=dict)
+    data: Annotated[dict[str, Any], AfterValidator(_check_data)] = field(default_factory=dict)
     """Training data: clips, frames, attribution, split seed."""
     training: dict[str, Any] = field(default_factory=dict)
     """Recipe, seed, steps, command and curve."""
@@ -105,10 +138,12 @@ def load(path: Path) -> tuple[dict[str, Tensor], Card]:
         ours = [list(block) for block in LAYOUT.blocks]
         raise CheckpointError(f"{path}: its features are {card.layout}, this code's are {ours}")
     try:
-        tensors = load_file(path)
-    except (OSError, SafetensorError) as error:
-        raise CheckpointError(f"{path}: no readable safetensors file ({error})") from error
-    return {name: t.float() if t.is_floating_point() else t for name, t in tensors.items()}, card
+        tensors = {name: t.float() if t.is_floating_point() else t for name, t in load_file(path).items()}
+    except Exception as error:  # of a forged header the library raises whatever it meets, KeyError and the like
+        raise CheckpointError(f"{path}: no readable safetensors file ({one_line(error)})") from error
+    if wrong := [name for name, tensor in tensors.items() if not tensor.isfinite().all()]:
+        raise CheckpointError(f"{path}: the tensor {shorten(wrong[0])} is not finite")
+    return tensors, card
 
 
 @contextmanager
@@ -121,19 +156,44 @@ def open_checkpoint(name: str, kind: str, *, called: str | None = None) -> Itera
     path = locate(name)
     tensors, card = load(path)
     if card.kind != kind:
-        raise CheckpointError(f"{path}: a {card.kind} is no {called or kind}")
+        raise CheckpointError(f"{path}: a {card.kind[:40]} is no {called or kind}")
     _note_card(name, path, card)
     try:
         yield tensors, card
-    except (KeyError, TypeError, RuntimeError, RequestError) as error:
-        raise CheckpointError(f"{path}: its tensors do not fit its card ({' '.join(str(error).split())})") from error
+    except (ArithmeticError, LookupError, TypeError, ValueError, RuntimeError, RequestError) as error:
+        raise CheckpointError(f"{path}: its tensors do not fit its card ({one_line(error, 300)})") from error
+
+
+def build_network(make: Callable[..., N], config: Any, tensors: dict[str, Tensor], **statistics: Tensor) -> N:
+    """Make a network of this shape and give it the tensors, to be used as it is; RuntimeError where they do not fit.
+
+    That is found on the meta device, before a card's numbers take memory.
+    """
+    with torch.device("meta"), _WithoutDraws():
+        make(config, **statistics).load_state_dict(tensors, assign=True)
+    network = make(config, **statistics)
+    network.load_state_dict(tensors)
+    return network.eval().requires_grad_(False)
+
+
+class _WithoutDraws(TorchFunctionMode):
+    """Leave initial weights undrawn: on the meta device that, as powers and torch.eye, imports torch's compiler, which
+    takes a second."""
+
+    def __torch_function__(
+        self, func: Callable[..., Any], types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        is_draw = getattr(func, "__module__", None) == nn.init.__name__
+        return kwargs["tensor"] if is_draw and kwargs else func(*args, **kwargs or {})
 
 
 def read_card(path: Path) -> Card:
     """Read the card alone."""
     try:
-        return Card(**json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError) as error:
+        return TypeAdapter(Card).validate_json(path.read_bytes(), strict=True)
+    except ValidationError as error:
+        raise CheckpointError(f"{path}: no readable card ({toml.describe_fault(error)})") from error
+    except OSError as error:
         raise CheckpointError(f"{path}: no readable card ({error})") from error
 
 

@@ -1,17 +1,24 @@
 """What shapes of networks and recipes share: conversion to a card's JSON and back, and a check of counts."""
 
+import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from typing import Any, TypeVar
 
+from pydantic import TypeAdapter, ValidationError
+
 from mapctl.errors import RequestError
+from mapctl.formats import toml
 
 C = TypeVar("C", bound="NetworkConfig")
+_MAX_COUNT, _MAX_ENTRIES = 4096, 64  # of a shape that a card describes
 
 
 @dataclass(frozen=True)
 class NetworkConfig:
     """Shape of a network. Its subclasses are frozen dataclasses whose fields all have defaults."""
+
+    __pydantic_config__ = toml.STRICT
 
     def as_card(self) -> dict[str, Any]:
         """Convert to a card's JSON, which knows no tuples."""
@@ -19,9 +26,16 @@ class NetworkConfig:
 
     @classmethod
     def of_card(cls: type[C], config: Mapping[str, Any]) -> C:
-        """Invert `as_card`; KeyError or TypeError for fields that are not these."""
-        tuples = [field.name for field in fields(cls) if isinstance(field.default, tuple)]
-        return cls(**{**config, **{name: tuple(config[name]) for name in tuples}})
+        """Invert `as_card`; RequestError for fields that are not these, of another type or absurdly large."""
+        try:
+            found = TypeAdapter(cls).validate_json(json.dumps(config), strict=True)
+        except ValidationError as error:
+            raise RequestError(toml.describe_fault(error)) from error
+        for name, value in vars(found).items():
+            entries = value if isinstance(value, tuple) else (value,)
+            if len(entries) > _MAX_ENTRIES or any(isinstance(each, int) and each > _MAX_COUNT for each in entries):
+                raise RequestError(f"{name} is beyond {_MAX_ENTRIES} entries of up to {_MAX_COUNT}")
+        return found
 
 
 def require_at_least(settings: Any, least: int, *names: str) -> None:

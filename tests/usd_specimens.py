@@ -13,9 +13,10 @@ _KINDS: tuple[dict[str, Any], ...] = (
 
 
 def make_usd_specimens(folder: Path) -> Iterator[tuple[str, bytes]]:
-    """Names and contents of text and binary files."""
+    """Names and contents of text and binary files and packages."""
     if find_spec("pxr") is None:
         return
+    from pxr import UsdUtils
     from usd_maker import make_character_usd
 
     for number, look in enumerate(_KINDS):
@@ -23,3 +24,6 @@ def make_usd_specimens(folder: Path) -> Iterator[tuple[str, bytes]]:
             path = folder / f"made-{number}.{ending}"
             make_character_usd(path, **look, parts=("shoes",))
             yield path.name, path.read_bytes()
+        package = folder / f"made-{number}.usdz"
+        UsdUtils.CreateNewUsdzPackage(str(path), str(package))
+        yield package.name, package.read_bytes()

@@ -55,6 +55,12 @@ def shorten(word: str, limit: int = 40) -> str:
     return ascii(word if len(word) <= limit else word[: limit - 3] + "...")
 
 
+def one_line(error: Exception, limit: int = 160) -> str:
+    """Shorten a library's message to one printable line: some quote pieces of the file."""
+    text = " ".join(str(error).split())
+    return text if text.isprintable() and len(text) <= limit else shorten(text, limit)
+
+
 @lru_cache(maxsize=256)
 def warn_once(message: str) -> None:
     """Log one line on standard error on what was read otherwise than the file says; once."""

@@ -265,6 +265,7 @@ def load(name: str) -> ConvDenoiser:
     """Load the bundled denoiser by name, or one by its file or run folder; CheckpointError if there is none."""
     with checkpoints.open_checkpoint(name, "denoiser") as (tensors, card):
         # Older cards do not tell what was not there yet; what is left out takes its default.
-        network = DenoiserNetwork(DenoiserConfig.of_card({"sees_world": False} | card.config))
-        network.load_state_dict(tensors)
-    return ConvDenoiser(name, network.eval().requires_grad_(False), card)
+        network = checkpoints.build_network(
+            DenoiserNetwork, DenoiserConfig.of_card({"sees_world": False} | card.config), tensors
+        )
+    return ConvDenoiser(name, network, card)

@@ -166,6 +166,5 @@ class ConvInfiller(checkpoints.LoadedModel, PositionInfiller):
 def load(name: str) -> ConvInfiller:
     """Load a trained infiller by its file or run folder; CheckpointError for anything else."""
     with checkpoints.open_checkpoint(name, "infiller") as (tensors, card):
-        network = InfillerNetwork(InfillerConfig.of_card(card.config))
-        network.load_state_dict(tensors)
-    return ConvInfiller(name, network.eval().requires_grad_(False), card)
+        network = checkpoints.build_network(InfillerNetwork, InfillerConfig.of_card(card.config), tensors)
+    return ConvInfiller(name, network, card)

@@ -79,6 +79,5 @@ class KeyframeTiming(checkpoints.LoadedModel):
 def load(name: str) -> KeyframeTiming:
     """The bundled timing by name, or a trained one by its file or run folder; CheckpointError if there is none."""
     with checkpoints.open_checkpoint(name, "keyframe-timing", called="keyframe timing") as (tensors, card):
-        network = KeyframeTimingNetwork(KeyframeTimingConfig.of_card(card.config))
-        network.load_state_dict(tensors)
-    return KeyframeTiming(name, network.eval(), card)
+        network = checkpoints.build_network(KeyframeTimingNetwork, KeyframeTimingConfig.of_card(card.config), tensors)
+    return KeyframeTiming(name, network, card)

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl.errors import RequestError
+from mapctl.features import LAYOUT
 from mapctl.metrics.pace_changes import find_pace, label_pace
 from mapctl.protocols import DataLimits, Density, DiscreteChoices, InitialStates, PreparedRollout
 from priors import checkpoints
@@ -213,7 +214,12 @@ def load(name: str) -> LstmGmmDensity:
             tuple(card.data["starts"]),
             tensors.pop("starts.weight"),
         )
-        limits = DataLimits(**card.abilities)
-        model = LstmGmm(LstmGmmConfig.of_card(card.config), mean=tensors["mean"], std=tensors["std"])
-        model.load_state_dict(tensors)
-    return LstmGmmDensity(name, model.eval().requires_grad_(False), starts, limits, card)
+        config, count = LstmGmmConfig.of_card(card.config), len(starts.names)
+        shapes = [(count, LAYOUT.size), *[(2, count, config.width)] * 2, (count,), (count,)]
+        if not count or [tuple(t.shape) for t in (*vars(starts.state).values(), starts.speed, starts.weight)] != shapes:
+            raise RequestError(f"its initial states are not those of {count} clips")
+        statistics = {part: tensors[part] for part in ("mean", "std")}
+        model = checkpoints.build_network(LstmGmm, config, tensors, **statistics)
+        density = LstmGmmDensity(name, model, starts, DataLimits(**card.abilities), card)
+        _ = density.pace_rates, density.reference_log_density  # raise what is wrong with the card's figures
+    return density

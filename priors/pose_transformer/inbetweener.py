@@ -219,6 +219,5 @@ def load(name: str = "transformer") -> PoseTransformer:
     else.
     """
     with checkpoints.open_checkpoint(name, "pose-transformer") as (tensors, card):
-        network = PoseTransformerNetwork(PoseTransformerConfig.of_card(card.config))
-        network.load_state_dict(tensors)
-    return PoseTransformer(name, network.eval().requires_grad_(False), card)
+        network = checkpoints.build_network(PoseTransformerNetwork, PoseTransformerConfig.of_card(card.config), tensors)
+    return PoseTransformer(name, network, card)

@@ -156,6 +156,5 @@ def load(name: str) -> LstmRefiner:
     """Load a bundled refiner by name, or a trained one by its file or run folder; CheckpointError if there is none."""
     with checkpoints.open_checkpoint(name, "refiner") as (tensors, card):
         statistics = {part: tensors[part] for part in ("mean", "std", "reach_mean", "reach_std")}
-        network = RefinerNetwork(RefinerConfig.of_card(card.config), **statistics)
-        network.load_state_dict(tensors)
-    return LstmRefiner(name, network.eval().requires_grad_(False), card)
+        network = checkpoints.build_network(RefinerNetwork, RefinerConfig.of_card(card.config), tensors, **statistics)
+    return LstmRefiner(name, network, card)

@@ -310,6 +310,5 @@ def _list_partly_known(query: GapQuery) -> list[GapSource]:
 def load(name: str = "stitcher") -> Stitcher:
     """Load the bundled stitcher, or a trained one by its file or run folder; CheckpointError for anything else."""
     with checkpoints.open_checkpoint(name, "stitcher") as (tensors, card):
-        network = StitcherNetwork(StitcherConfig.of_card(card.config))
-        network.load_state_dict(tensors)
-    return Stitcher(name, network.eval().requires_grad_(False), card)
+        network = checkpoints.build_network(StitcherNetwork, StitcherConfig.of_card(card.config), tensors)
+    return Stitcher(name, network, card)

@@ -218,7 +218,7 @@ class StitcherNetwork(nn.Module):
         self.register_buffer("std", torch.ones(LAYOUT.size))
         self.register_buffer("change", torch.ones(LAYOUT.size))
         self.register_buffer("temperature", torch.ones(()))  # standard deviation of the noise of draws
-        waves = _WAVE_BASE ** (-torch.arange(0, last, 2) / last)
+        waves = _WAVE_BASE ** (-torch.arange(0, last, 2, device="cpu") / last)
         self.register_buffer("waves", waves, persistent=False)
 
     def embed(self, now: Situation) -> Float[Tensor, "2 batch seen"]:

@@ -143,7 +143,7 @@ class GeneratorNetwork(nn.Module):
         # Hips upright and joints about the middle of their ranges, until training.
         nn.init.normal_(self.last.weight, std=0.1 / math.sqrt(3 * self.config.up_widths[-1]))
         middle = torch.zeros(rows)
-        middle[:6] = rotations.to_six(torch.eye(3))
+        middle[:6] = rotations.to_six(torch.eye(3, device="cpu"))
         self.last.bias = nn.Parameter(middle)
 
     def forward(self, image: PositionImage, style: Float[Tensor, "batch style"]) -> GeneratedPoses:

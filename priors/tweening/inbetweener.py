@@ -239,13 +239,11 @@ def load(name: str = "tweener", path: str = "path") -> Tweener:
     """Load the bundled tweener, or a trained one by its file or run folder, with the path predictor that it was trained
     with; CheckpointError for anything else, and for another path predictor."""
     with checkpoints.open_checkpoint(name, "tweener") as (tensors, card):
-        network = GeneratorNetwork(GeneratorConfig.of_card(card.config))
-        network.load_state_dict(tensors)
+        network = checkpoints.build_network(GeneratorNetwork, GeneratorConfig.of_card(card.config), tensors)
         classes = read_classes(card, network.config.style)
     wanted, found = card.data.get("path"), checkpoints.compute_hash(path)
     if wanted != found:
         raise CheckpointError(
             f"{name} was trained with the path predictor {wanted}; {path} is {found}: name it by --path"
         )
-    network = network.eval().requires_grad_(False)
     return Tweener(name, network, path_predictor.load(path), card, classes=classes)

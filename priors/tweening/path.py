@@ -135,6 +135,5 @@ def load(name: str = "path") -> ConvPathPredictor:
     """Load the bundled path predictor, or a trained one by its file or run folder; CheckpointError for anything
     else."""
     with checkpoints.open_checkpoint(name, "path") as (tensors, card):
-        network = PathNetwork(PathConfig.of_card(card.config))
-        network.load_state_dict(tensors)
-    return ConvPathPredictor(name, network.eval().requires_grad_(False), card)
+        network = checkpoints.build_network(PathNetwork, PathConfig.of_card(card.config), tensors)
+    return ConvPathPredictor(name, network, card)

@@ -34,6 +34,8 @@ BROKEN = {
     "glTF 1": (lambda t, m: t["asset"].update(version="1.0"), "is glTF '1.0', expected 2.0"),
     "loop": (lambda t, m: t["nodes"][hips_of(m)].setdefault("children", []).append(0), "below itself"),
     "two parents": (lambda t, m: t["nodes"][0]["children"].append(hips_of(m) + 1), "has two parents"),
+    "number as text": (lambda t, m: t["nodes"][0].update(translation=[0, "0", 0]), r"translation\[1\]: .* number"),
+    "half a letter": (lambda t, m: t["nodes"][0].update(name="\ud800"), "its JSON cannot be read"),
     "joint beyond": (lambda t, m: t["skins"][0]["joints"].append(999), "names node 999"),
 }
 

@@ -21,7 +21,7 @@ OUT = "outputs = ['a.mp4']\n"
 WRONG = {
     "not TOML": ("actors = [", "not TOML"),
     "not text": (b"\xff\xfe\x00", "UTF-8"),
-    "empty": ("", "actors: this key is needed"),
+    "empty": ("", "the file is empty"),
     "no actors": (OUT + "actors = []", "actors: "),
     "no outputs": (ACTOR, "outputs: this key is needed"),
     "unknown key": (OUT + "colour = 'red'\n" + ACTOR, "colour: there is no such key; allowed: actors,"),
@@ -85,7 +85,7 @@ def test_what_is_wrong_is_said_in_one_line_with_file_and_key(case, tmp_path):
 
 
 def test_a_missing_scene_is_a_format_error(tmp_path):
-    with pytest.raises(FileFormatError, match="No such file"):
+    with pytest.raises(FileFormatError, match="no such file"):
         load(tmp_path / "gone.toml")
 
 

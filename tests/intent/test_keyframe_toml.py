@@ -48,7 +48,7 @@ def test_all_keys_of_a_table_are_read(tmp_path):
         (TWO.replace("pose =", "poze =", 1), "key[0].poze: there is no such key; the nearest is pose; allowed: "),
         (f"fsp = 30\n{TWO}", "fsp: there is no such key; the nearest is fps; allowed: "),
         (f"{TWO}root = true", "key[1].root: there is no such key; the nearest is "),
-        ("", "key: this key is needed"),
+        ("fps = 30", "key: this key is needed"),
         ("[[key]]\nframe = 0\npose = 'a.bvh'", "in-betweening needs at least two keys, got 1"),
         ("key = []", "in-betweening needs at least two keys, got 0"),
         ("[key]\nframe = 0", "key: "),

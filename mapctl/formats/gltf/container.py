@@ -137,7 +137,10 @@ def _parse_json(file: Path, text: memoryview) -> dict[str, Any]:
         raise ValueError(f"{word} is no number of JSON")
 
     try:
-        tree = json.loads(bytes(text).decode("utf-8-sig"), parse_constant=refuse)
+        plain = bytes(text).decode("utf-8-sig")
+        tree = json.loads(plain, parse_constant=refuse)
+        if "\\ud" in plain.lower():  # half of a surrogate pair is no text, and cannot be written again
+            json.dumps(tree, ensure_ascii=False).encode()
     except RecursionError:
         raise FileFormatError(file, f"its JSON {_MAX_DEPTH_ERROR}") from None
     except ValueError as error:  # also UnicodeDecodeError and JSONDecodeError

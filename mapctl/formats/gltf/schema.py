@@ -6,7 +6,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 Index = Annotated[int, Field(ge=0, strict=True)]
 Size = Annotated[int, Field(ge=0, le=2**40, strict=True)]
-Number = Annotated[float, Field(ge=-1e30, le=1e30, allow_inf_nan=False)]
+Number = Annotated[float, Field(ge=-1e30, le=1e30, allow_inf_nan=False, strict=True)]
 Vector = tuple[Number, Number, Number]
 Quaternion = tuple[Number, Number, Number, Number]
 Matrix = Annotated[list[Number], Field(min_length=16, max_length=16)]
