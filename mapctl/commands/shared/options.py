@@ -74,9 +74,10 @@ def parse_size(text: str) -> tuple[int, int]:
 
 
 def describe_request(name: str, command: Any) -> dict[str, Any]:
-    """Describe a command and its options as a report shows them."""
+    """Describe a command and its options as a report shows them; how files are read only where that is given."""
     values = {field.name: getattr(command, field.name) for field in fields(command)}
-    return {"command": name} | {key: _describe_value(value) for key, value in values.items()}
+    unset = {field.name for field in fields(RigOptions) if values.get(field.name) is None}
+    return {"command": name} | {key: _describe_value(value) for key, value in values.items() if key not in unset}
 
 
 def _describe_value(value: Any) -> Any:
