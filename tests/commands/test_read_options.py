@@ -49,7 +49,8 @@ def test_a_given_unit_is_obeyed_by_every_command(clip, unit, tmp_path, capsys):
 
 def test_a_given_up_axis_is_obeyed(clip, capsys):
     assert run("info", clip, "--json", "--up", "-x") == 0
-    assert json.loads(capsys.readouterr().out)["up"] == "-x"
+    told = json.loads(capsys.readouterr().out)
+    assert (told["up"], told["rig"], len(told["joints"])) == ("-x", "mixamo", 21)  # its joints are recognised as before
 
 
 def test_every_command_that_reads_motions_can_be_given_their_unit_and_up_axis():
