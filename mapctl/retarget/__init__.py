@@ -96,7 +96,7 @@ def identify_rig(skeleton: Skeleton, rig: Rig | None = None, *, motion: Motion |
     character = _character_of(motion)
     if character is not None and rig is None and character.humanoid:
         rig = Rig("vrm", character.humanoid, about="VRM: the file itself says which joint is which.")
-    found = match(skeleton, rig)
+    found = match(skeleton, rig, motion=motion)
     if rig is None or not rig.joints:
         _check_body_plan(found, skeleton, motion)
     stated = rig is not None and bool(rig.joints) and rig not in known_rigs()

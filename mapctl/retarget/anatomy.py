@@ -60,10 +60,9 @@ class Anatomy:
         angle in radians."""
         angles = {}
         for name, frame in self.certain.items():
-            back = rotations.from_matrix(frame.T)
-            turn = rotations.to_rotation_vector(rotations.multiply(back, tpose[CANONICAL.index(name)]))
-            if float(turn.norm()) > CONTRADICTION:
-                angles[name] = float(turn.norm())
+            angle = _angle_between(frame, rotations.to_matrix(tpose[CANONICAL.index(name)]))
+            if angle > CONTRADICTION:
+                angles[name] = angle
         return angles
 
     def correct(self, tpose: Float[Tensor, "joints 4"], names: Iterable[str]) -> Float[Tensor, "joints 4"]:
@@ -89,8 +88,8 @@ class _Builder:
     in_quarter_turns: bool = False
     """Whether joint axes lie along the canonical ones, so that directions are rounded to them."""
     frames: dict[str, Tensor] = field(default_factory=dict)
-    directions: dict[str, tuple[Tensor, Tensor]] = field(default_factory=dict)
-    """The two directions in each joint's own frame."""
+    measured: dict[str, Tensor] = field(default_factory=dict)
+    """The same frames before they are rounded."""
 
     def average(self, name: str, vectors: Vectors) -> Float[Tensor, "3"]:
         """Average world vectors in the own frame of a canonical joint's rig joint."""
@@ -110,19 +109,18 @@ class _Builder:
         """Give a joint the frame in which the first direction is its canonical one, and the second as nearly so as
         that allows."""
         one, two = unit_vectors(self.average(name, first)), unit_vectors(self.average(name, second))
-        self.directions[name] = one, two
+        target = _orthonormal(aim, aim_second)
+        self.measured[name] = self.frames[name] = target @ _orthonormal(one, two).T
         if self.in_quarter_turns:
             one = _nearest_axis(one)
-            two = _nearest_axis(two - one * (one @ two))
-        self.frames[name] = _orthonormal(aim, aim_second) @ _orthonormal(one, two).T
+            self.frames[name] = target @ _orthonormal(one, _nearest_axis(two - one * (one @ two))).T
 
-    def continue_frame(self, name: str, above: str, aim: Tensor) -> None:
-        """Give the end of a limb the frame of the joint above where its bone points about along `aim` in that: rigs
+    def continue_frame(self, name: str, above: str) -> None:
+        """Give the end of a limb the frame of the joint above where that is near enough, else the measured one: rigs
         built in quarter turns are straight with its rotation zero, while its mean is how the body holds it."""
-        if not self.in_quarter_turns or not self.clip.has(above):
-            return
-        if float(self.frames[above] @ self.directions[name][0] @ aim) > math.cos(CONTRADICTION):
-            self.frames[name] = self.frames[above]
+        if self.in_quarter_turns and self.clip.has(above):
+            near = _angle_between(self.measured[name], self.frames[above]) < CONTRADICTION
+            self.frames[name] = self.frames[above] if near else self.measured[name]
 
 
 def estimate_frames(clip: RigPoses, upright: Float[Tensor, "4"] | None) -> Anatomy:
@@ -133,7 +131,7 @@ def estimate_frames(clip: RigPoses, upright: Float[Tensor, "4"] | None) -> Anato
     """
     turns = rotations.to_matrix(clip.orientations)
     found, certain = _orient_joints(_Builder(clip, turns), upright)
-    if all(_is_near_axis(direction) for name in CORE for direction in found.directions.get(name, ())):
+    if all(_is_near_quarter_turn(found.frames[name]) for name in CORE if clip.has(name)):
         found, _ = _orient_joints(_Builder(clip, turns, in_quarter_turns=True), upright)
     return Anatomy(found.frames, certain, found.in_quarter_turns)
 
@@ -163,7 +161,7 @@ def _orient_trunk(found: _Builder) -> Iterator[str]:
         if clip.has(name):
             found.orient(name, _bone_or(clip, name, found.axis(top, _Y)), _Y, found.axis(top, _X), _X)
     if clip.has("head"):
-        found.continue_frame("head", "neck", _Y)
+        found.continue_frame("head", "neck")
 
 
 def _orient_arm(found: _Builder, side: str, sign: float) -> Iterator[str]:
@@ -186,7 +184,7 @@ def _orient_arm(found: _Builder, side: str, sign: float) -> Iterator[str]:
     found.orient(lower, forearm, sign * _X, hinge if bends else found.axis(upper, _Y), _Y)
     if clip.has(hand):
         found.orient(hand, _bone_or(clip, hand, forearm), sign * _X, found.axis(lower, _Y), _Y)
-        found.continue_frame(hand, lower, sign * _X)
+        found.continue_frame(hand, lower)
     if bends:
         yield upper
 
@@ -210,7 +208,7 @@ def _orient_leg(found: _Builder, side: str, pitch: float) -> Iterator[str]:
         flat = torch.tensor([0.0, -math.sin(pitch), math.cos(pitch)], dtype=torch.float64)
         across = found.axis(lower, _X)
         found.orient(foot, bone, flat, across, _X)
-        if found.in_quarter_turns and not _is_near_axis(found.directions[foot][0]):
+        if found.in_quarter_turns and _angle_between(found.frames[foot], found.measured[foot]) > _ROUNDING:
             # The foot's axes are along its sole, not along its bone.
             bone = unit_vectors(bone)
             level = math.cos(pitch) * bone + math.sin(pitch) * torch.linalg.cross(bone, unit_vectors(across))
@@ -266,8 +264,14 @@ def _bone_or(clip: RigPoses, name: str, otherwise: Vectors) -> Vectors:
     return otherwise if bone is None or float(bone.norm(dim=-1).mean()) < _NO_LINE else unit_vectors(bone)
 
 
-def _is_near_axis(direction: Tensor) -> bool:
-    return float(direction.abs().max()) > math.cos(_ROUNDING)
+def _is_near_quarter_turn(frame: Tensor) -> bool:
+    rounded = torch.stack([_nearest_axis(axis) for axis in frame])
+    return _angle_between(frame, rounded) < _ROUNDING
+
+
+def _angle_between(first: Tensor, second: Tensor) -> float:
+    """Return the angle of the rotation between two frames, radians."""
+    return float(torch.arccos(((torch.trace(first.T @ second) - 1) / 2).clamp(-1, 1)))
 
 
 def _nearest_axis(direction: Tensor) -> Float[Tensor, "3"]:

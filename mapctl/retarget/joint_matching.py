@@ -74,10 +74,10 @@ class Match:
     """Other listed rigs that fit as well and take another joint for a canonical one: each with that canonical name."""
 
 
-def match(skeleton: Skeleton, rig: Rig | None = None) -> Match:
+def match(skeleton: Skeleton, rig: Rig | None = None, *, motion: Motion | None = None) -> Match:
     """Match a skeleton by the joints of a given rig, else by the presets, or by what it looks like; sides are as named.
 
-    RequestError where a score of MIN_SCORE is not reached or a joint of REQUIRED is not found, naming what is missing.
+    A `motion` shows which arm is on which leg's side where names do not. RequestError where a score of MIN_SCORE is not reached or a joint of REQUIRED is not found, naming what is missing.
     """
     given = rig if rig is not None and rig.joints else None
     listed = find_listed_rig(skeleton, REQUIRED) if given is None else Listed(given, match_by_rig(given, skeleton))
@@ -87,7 +87,7 @@ def match(skeleton: Skeleton, rig: Rig | None = None) -> Match:
     known = dict.fromkeys(found, KnownBy.LIST)
     complete = all(name in found for name in REQUIRED)
     if chosen is None or not complete or (given is None and not chosen.fits(skeleton)):
-        found, known = _complete_match(skeleton, found)
+        found, known = _complete_match(skeleton, found, motion)
     absent = _ABSENT if all(name in found for name in REQUIRED) else 0.0
     worth = [_CREDIT[known[c]] if c in known else 0.0 if c in REQUIRED else absent for c in CANONICAL.names]
     score = sum(worth) / len(worth)
@@ -114,7 +114,9 @@ def correct_sides(found: Match, skeleton: Skeleton, motion: Motion | None) -> Ma
     return replace(found, joint_of=joint_of, score=score, sides_exchanged=named, known_by=known)
 
 
-def _complete_match(skeleton: Skeleton, given: Mapping[str, int]) -> tuple[dict[str, int], dict[str, KnownBy]]:
+def _complete_match(
+    skeleton: Skeleton, given: Mapping[str, int], motion: Motion | None
+) -> tuple[dict[str, int], dict[str, KnownBy]]:
     """Match joints by the words in their names, completed by the tree; also return what each is known by."""
     found = dict(given)
     for name, joint in _match_by_words(skeleton, given.get("hips")).items():
@@ -123,7 +125,7 @@ def _complete_match(skeleton: Skeleton, given: Mapping[str, int]) -> tuple[dict[
     known = {name: KnownBy.LIST if name in given else KnownBy.WORDS for name in found}
     beside = find_by_other_side(skeleton, found)
     found, known = found | beside, known | dict.fromkeys(beside, KnownBy.PLACE)
-    by_tree = _assign_sides(topology.match_by_tree(skeleton), classify_joints(skeleton), skeleton)
+    by_tree = _assign_sides(topology.match_by_tree(skeleton), classify_joints(skeleton), skeleton, motion)
     for name, joint in by_tree.items():
         helper = HELPER_NAME.search(skeleton.names[joint])
         if name not in found and joint not in found.values() and not helper:
@@ -192,24 +194,25 @@ def _match_limb_by_words(roles: list[Role], side: Side) -> dict[str, int]:
     return {side.value + part: joints[0] for part, joints in parts.items() if joints}
 
 
-def _assign_sides(by_tree: Mapping[str, int], roles: tuple[Role, ...], skeleton: Skeleton) -> Mapping[str, int]:
+def _assign_sides(
+    by_tree: Mapping[str, int], roles: tuple[Role, ...], skeleton: Skeleton, motion: Motion | None
+) -> Mapping[str, int]:
     """Put limbs found by the tree alone on the side that their joints' names or else their positions show.
 
-    Without names, left is +X: where the rest pose faces elsewhere, the toes show it (see `correct_sides`).
+    Without names the legs' sides are arbitrary (see `correct_sides`) and the arms are on theirs.
     """
     if not by_tree:
         return by_tree
-    positions = RigPoses.zero(skeleton, (None,) * CANONICAL.num_joints).positions[0]
+    unmatched = (None,) * CANONICAL.num_joints
+    poses = RigPoses.zero(skeleton, unmatched) if motion is None else RigPoses.of(motion, unmatched)
     left = None
     for limb in (("UpperLeg", "LowerLeg", "Foot", "Toes"), ("UpperArm", "LowerArm", "Hand", "Shoulder")):
         votes = 0
         for side, other in (("left", "right"), ("right", "left")):
-            said = [roles[by_tree[side + part]].side.value for part in limb if side + part in by_tree]
-            votes += said.count(side) - said.count(other)
-        across = positions[by_tree["left" + limb[0]]] - positions[by_tree["right" + limb[0]]]
-        if left is None:
-            left = across * across[across.abs().argmax()].sign()
-        if votes < 0 or (votes == 0 and float(across @ left) < 0):
+            sides = [roles[by_tree[side + part]].side.value for part in limb if side + part in by_tree]
+            votes += sides.count(side) - sides.count(other)
+        across = poses.positions[:, by_tree["left" + limb[0]]] - poses.positions[:, by_tree["right" + limb[0]]]
+        if votes < 0 or (votes == 0 and left is not None and float((across * left).sum()) < 0):
             names = {side + part for side in ("left", "right") for part in limb}
             by_tree = {mirror_name(name) if name in names else name: joint for name, joint in by_tree.items()}
             across = -across

@@ -1,0 +1,133 @@
+"""Rigs read by anatomy: the same motion in other joint frames, units, worlds and names is the same motion.
+
+The example that the package brings along is one clip; with MAPCTL_MOTION=FOLDER all BVH files below that folder are
+others (captures are no part of the project).
+"""
+
+import math
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from helpers import turn_between
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+import mapctl
+from mapctl import kinematics, retarget, rotations
+from mapctl.errors import RequestError
+from mapctl.formats.bvh import layout
+from mapctl.motion import Motion
+from mapctl.retarget.anatomy import estimate_frames, find_up_axis, measure_front
+from mapctl.retarget.recognition.doubts import assess_fit
+from mapctl.retarget.reference_pose import find_tpose, upright_rotation
+from mapctl.retarget.rig_poses import RigPoses
+from mapctl.retarget.rigs import UNITS
+from mapctl.retarget.upright import put_upright
+from mapctl.skeleton import CANONICAL, Skeleton
+
+FOLDER = os.environ.get("MAPCTL_MOTION")
+FILES = ["example:noisy-walk", *(sorted(map(str, Path(FOLDER).rglob("*.bvh"))) if FOLDER else ())]
+LONGEST = 1500
+UPS = ("y", "z", "x", "-y")
+KNOWN_TO_DIFFER = {"hips", "spine", "Shoulder", "neck", "head", "LowerArm", "Hand", "Foot", "Toes"}
+"""Joints whose T-pose is a matter of a file's convention, by up to 60 degrees (hands); the others' is anatomy."""
+_LIMIT_DEG = {"chest": 12, "UpperArm": 50, "UpperLeg": 25, "LowerLeg": 25}
+
+
+def load(path: str) -> Motion:
+    """The clip with Y up and without its first frame, which may be a T-pose that the rest of it is not."""
+    motion, _ = put_upright(mapctl.load(path))
+    return motion.slice(1, min(motion.num_frames, LONGEST))
+
+
+def reframe(motion: Motion, frames: Tensor, *, up: str = "y", names: tuple[str, ...] | None = None) -> Motion:
+    """The same motion of a skeleton whose joint j has its axes turned by frames[j] (xyzw), in a world with another up
+    axis, under other names."""
+    skeleton, count = motion.skeleton, motion.num_frames
+    turn = upright_rotation(up)
+    turn = torch.tensor([0.0, 0, 0, 1]).double() if turn is None else rotations.inverse(turn)
+    names, parents = names or skeleton.names, [max(parent, 0) for parent in skeleton.parents]
+    back = rotations.inverse(frames)
+    world = rotations.multiply(turn.expand(count, skeleton.num_joints, 4), motion.joint_rotations())
+    ends = {
+        names[skeleton.index(name)]: tuple(
+            rotations.rotate(back[skeleton.index(name)], torch.tensor(end).double()).tolist()
+        )
+        for name, end in skeleton.end_offsets.items()
+    }
+    return Motion(
+        Skeleton(names, skeleton.parents, rotations.rotate(back[parents], skeleton.offsets), ends),
+        motion.fps,
+        rotations.rotate(turn.expand(count, 4), motion.root_position),
+        kinematics.local_from_world(skeleton.parents, rotations.multiply(world, frames.expand(count, -1, -1))),
+        {
+            joint: rotations.rotate(back[skeleton.parents[joint]].expand(count, 4), offset)
+            for joint, offset in motion.moving_offsets.items()
+        },
+    )
+
+
+def random_frames(motion: Motion, seed: int) -> Tensor:
+    return torch.from_numpy(Rotation.random(motion.skeleton.num_joints, random_state=seed).as_quat())
+
+
+def turned_deg(one: Motion, other: Motion) -> Tensor:
+    """Angle between the rotations of each canonical joint, median over the frames, degrees."""
+    apart = rotations.multiply(rotations.inverse(one.joint_rotations()), other.joint_rotations())
+    return torch.rad2deg(rotations.to_rotation_vector(apart).norm(dim=-1).median(dim=0).values)
+
+
+@pytest.mark.parametrize("path", FILES)
+@settings(max_examples=6, deadline=None, derandomize=True)
+@given(
+    seed=st.integers(0, 10**6),
+    up=st.sampled_from(UPS),
+    unit=st.sampled_from([*UNITS]),
+    naming=st.sampled_from(["own", "prefixed", "none"]),
+)
+def test_any_joint_frames_world_unit_and_names_are_the_same_motion(path, tmp_path_factory, seed, up, unit, naming):
+    motion = load(path)
+    wanted, rigmap = retarget.to_canonical(reframe(motion, random_frames(motion, 0)))
+    own = motion.skeleton.names
+    names = {
+        "own": own,
+        "prefixed": tuple(f"hero:{name}" for name in own),
+        "none": tuple(f"j{n}" for n in range(len(own))),
+    }
+    strange = reframe(motion, random_frames(motion, seed), up=up, names=names[naming])
+    file = tmp_path_factory.mktemp("reframed") / "strange.bvh"
+    source = replace(layout.choose_layout(strange, file), metres_per_unit=UNITS[unit])
+    replace(strange, source=source).save(file)
+    read = mapctl.load(file)
+    try:
+        found, again = retarget.to_canonical(read)
+    except RequestError:
+        assert naming == "none"  # refused in a line: never read wrongly
+        return
+    if naming == "none" and again.joint_of != rigmap.joint_of:
+        assert assess_fit(again, read).verdict == "doubtful"
+        return
+    assert again.up == up
+    scale = found.root_position.norm() / wanted.root_position.norm()
+    assert float(scale) == pytest.approx(1, rel=1e-3)
+    assert float(turned_deg(wanted, found).max()) < 3
+    apart = (wanted.joint_positions() - found.joint_positions()).norm(dim=-1)
+    assert float(apart.max()) < 0.01
+
+
+@pytest.mark.parametrize("path", FILES)
+def test_a_tpose_of_the_file_and_anatomy_agree(path):
+    motion = load(path)
+    wanted, rigmap = retarget.to_canonical(mapctl.load(path).slice(0, min(motion.num_frames + 1, LONGEST)))
+    if rigmap.tpose_from == "motion" or rigmap.tpose_doubt:
+        pytest.skip("the file has no T-pose to compare with")
+    found, again = retarget.to_canonical(reframe(motion, random_frames(motion, 1)), retarget.Rig("unlisted", {}))
+    assert again.tpose_from == "motion"
+    for name, angle in zip(CANONICAL.names, turned_deg(wanted.slice(1, motion.num_frames + 1), found), strict=True):
+        limit = _LIMIT_DEG.get(name.removeprefix("left").removeprefix("right"))
+        assert limit is None or float(angle) < limit, name
