@@ -77,7 +77,8 @@ class Match:
 def match(skeleton: Skeleton, rig: Rig | None = None, *, motion: Motion | None = None) -> Match:
     """Match a skeleton by the joints of a given rig, else by the presets, or by what it looks like; sides are as named.
 
-    A `motion` shows which arm is on which leg's side where names do not. RequestError where a score of MIN_SCORE is not reached or a joint of REQUIRED is not found, naming what is missing.
+    A `motion` shows which arm is on which leg's side where names do not. RequestError where a score of MIN_SCORE is not
+    reached or a joint of REQUIRED is not found, naming what is missing.
     """
     given = rig if rig is not None and rig.joints else None
     listed = find_listed_rig(skeleton, REQUIRED) if given is None else Listed(given, match_by_rig(given, skeleton))

@@ -108,17 +108,20 @@ def read_rig_toml(path: Path) -> Rig:
         raise FileFormatError(path, str(error)) from None
 
 
+_Component = Annotated[float, Field(ge=-1e3, le=1e3)]
+
+
 @dataclass(frozen=True)
 class _Axes:
     """Where a joint's local x and y axes point in the T-pose."""
 
     __pydantic_config__ = toml.STRICT
 
-    x: tuple[float, float, float]
-    y: tuple[float, float, float]
+    x: tuple[_Component, _Component, _Component]
+    y: tuple[_Component, _Component, _Component]
 
     def __post_init__(self):
-        if not 1e-6 < np.linalg.norm(np.cross(self.x, self.y)) < 1e6:
+        if np.linalg.norm(np.cross(self.x, self.y)) < 1e-6:
             raise RequestError(f"tpose: x and y must be two directions, got {self.x} and {self.y}")
 
 

@@ -7,11 +7,11 @@ others (captures are no part of the project).
 import math
 import os
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 
 import pytest
 import torch
-from helpers import turn_between
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -22,21 +22,20 @@ from mapctl import kinematics, retarget, rotations
 from mapctl.errors import RequestError
 from mapctl.formats.bvh import layout
 from mapctl.motion import Motion
-from mapctl.retarget.anatomy import estimate_frames, find_up_axis, measure_front
+from mapctl.retarget.anatomy import are_sides_swapped, find_up_axis
 from mapctl.retarget.recognition.doubts import assess_fit
 from mapctl.retarget.reference_pose import find_tpose, upright_rotation
 from mapctl.retarget.rig_poses import RigPoses
 from mapctl.retarget.rigs import UNITS
 from mapctl.retarget.upright import put_upright
-from mapctl.skeleton import CANONICAL, Skeleton
+from mapctl.skeleton import CANONICAL, Skeleton, mirror_name
 
 FOLDER = os.environ.get("MAPCTL_MOTION")
 FILES = ["example:noisy-walk", *(sorted(map(str, Path(FOLDER).rglob("*.bvh"))) if FOLDER else ())]
 LONGEST = 1500
 UPS = ("y", "z", "x", "-y")
-KNOWN_TO_DIFFER = {"hips", "spine", "Shoulder", "neck", "head", "LowerArm", "Hand", "Foot", "Toes"}
-"""Joints whose T-pose is a matter of a file's convention, by up to 60 degrees (hands); the others' is anatomy."""
-_LIMIT_DEG = {"chest": 12, "UpperArm": 50, "UpperLeg": 25, "LowerLeg": 25}
+LIMIT_DEG = {"hips": 25, "chest": 12, "UpperArm": 50, "UpperLeg": 25, "LowerLeg": 25}
+"""How far the T-poses of real files are off anatomy; others, up to 60 degrees for hands, are a file's convention."""
 
 
 def load(path: str) -> Motion:
@@ -129,5 +128,67 @@ def test_a_tpose_of_the_file_and_anatomy_agree(path):
     found, again = retarget.to_canonical(reframe(motion, random_frames(motion, 1)), retarget.Rig("unlisted", {}))
     assert again.tpose_from == "motion"
     for name, angle in zip(CANONICAL.names, turned_deg(wanted.slice(1, motion.num_frames + 1), found), strict=True):
-        limit = _LIMIT_DEG.get(name.removeprefix("left").removeprefix("right"))
+        limit = LIMIT_DEG.get(name.removeprefix("left").removeprefix("right"))
         assert limit is None or float(angle) < limit, name
+
+
+def roll_left(axes: dict, part: str, parts: tuple[str, ...]) -> dict:
+    """A table's axes of a joint of these parts on the left, rolled by half a turn about the bone (arms: x, legs: y)."""
+    if part not in {"left" + name for name in parts}:
+        return axes
+    turn = Rotation.from_rotvec([math.pi, 0, 0] if "Arm" in parts[0] else [0, math.pi, 0])
+    return {axis: turn.apply(vector).tolist() for axis, vector in axes.items()}
+
+
+@pytest.mark.parametrize("parts", [("UpperArm", "LowerArm", "Hand"), ("UpperLeg", "LowerLeg")], ids=["arm", "leg"])
+def test_a_table_with_a_rolled_limb_is_overruled_and_a_users_is_doubted(parts):
+    """As LaFAN1's arms were, by half a turn."""
+    motion = load(FILES[0])
+    wanted, rigmap = retarget.to_canonical(motion)
+    stated = retarget.as_rig(rigmap)
+    rolled = replace(stated, tpose={name: roll_left(axes, name, parts) for name, axes in stated.tpose.items()})
+    zero, clip = (RigPoses.of(m, rigmap.joint_of) for m in (zero_pose(motion), motion))
+    preset = find_tpose(zero, clip, rig=replace(rolled, rest="auto"), stated=False)
+    turned = rotations.multiply(rotations.inverse(rigmap.tpose_quat_xyzw), preset.quat_xyzw)
+    assert float(rotations.to_rotation_vector(turned).norm(dim=-1).max()) < math.radians(50)
+    assert "degrees off" in preset.doubt or preset.found != "table"
+    found, again = retarget.to_canonical(motion, rolled)
+    assert float(turned_deg(wanted, found).max()) == pytest.approx(180, abs=1)
+    assert f"left{parts[0]}" in again.tpose_doubt
+    assert again.tpose_doubt in {doubt.reason for doubt in assess_fit(again, motion).doubts}
+
+
+def zero_pose(motion: Motion) -> Motion:
+    still = torch.tensor([0.0, 0, 0, 1]).double().expand(1, motion.num_joints, 4).clone()
+    return replace(motion.slice(0, 1), local_quat_xyzw=still)
+
+
+@pytest.mark.parametrize("up", UPS)
+def test_a_body_on_hands_and_feet_stays_there(up):
+    """A plank that faces down, its head toward +Z, without a step: hands and toes are on the floor."""
+    down = torch.tensor([0.0, 0, 0, 1]).double().repeat(30, CANONICAL.num_joints, 1)
+    down[:, 0] = rotations.from_rotation_vector(torch.tensor([math.pi / 2, 0.0, 0.0]).double())
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        turn = torch.tensor([0.0, -sign * math.pi / 2, 0.0]).double()
+        down[:, CANONICAL.index(side + "UpperArm")] = rotations.from_rotation_vector(turn)
+    plank = Motion(CANONICAL, Fraction(30), torch.tensor([0.0, 0.55, 0.0]).double().repeat(30, 1), down)
+    strange = reframe(plank, torch.tensor([0.0, 0, 0, 1]).double().repeat(CANONICAL.num_joints, 1), up=up)
+    clip = RigPoses.of(strange, range(CANONICAL.num_joints))
+    rest = RigPoses.zero(CANONICAL, range(CANONICAL.num_joints)).up()[0]
+    turn = upright_rotation(up)
+    rest = rest if turn is None else rotations.rotate(rotations.inverse(turn), rest)
+    assert find_up_axis(clip, rest) == up
+
+
+@pytest.mark.parametrize("exchanged", [False, True])
+def test_sides_are_by_knees_where_feet_show_no_front(exchanged):
+    """Feet that go on along the shin, as those of markerless rigs: only the knees bend one way."""
+    motion, _ = retarget.to_canonical(load(FILES[0]))
+    joints = [mirror_name(name) if exchanged else name for name in CANONICAL.names]
+    joint_of = [CANONICAL.index(name) for name in joints]
+    for side in ("left", "right"):
+        foot, toes = CANONICAL.index(side + "Foot"), CANONICAL.index(side + "Toes")
+        motion.local_quat_xyzw[:, foot] = torch.tensor([0.0, 0, 0, 1]).double()
+        motion.skeleton.offsets[toes] = torch.tensor([0.0, -0.1, 0.0]).double()
+    clip = RigPoses.of(replace(motion), joint_of)
+    assert are_sides_swapped(RigPoses.zero(motion.skeleton, joint_of), clip) is exchanged
