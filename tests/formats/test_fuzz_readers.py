@@ -275,6 +275,7 @@ def test_toml_of_any_depth_and_length_is_refused_in_short(tmp_path, read, text, 
         ("[tpose]\nhips = { x = [1, 0, 0] }", r"tpose.hips.y: this key is needed"),
         ("[tpose]\nhips = { x = [1, 0, 0], y = [2, 0, 0] }", "x and y must be two directions"),
         ("[tpose]\nhips = { x = [1, 0], y = [0, 1, 0] }", r"tpose.hips.x\[2\]"),
+        ("[tpose]\nhips = { x = [1e300, 0, 0], y = [0, 1, 0] }", r"tpose.hips.x\[0\]: .* less than or equal to 1000"),
         ("name = 3", "name: input should be a valid string"),
     ],
 )
