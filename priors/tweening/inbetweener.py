@@ -244,6 +244,6 @@ def load(name: str = "tweener", path: str = "path") -> Tweener:
     wanted, found = card.data.get("path"), checkpoints.compute_hash(path)
     if wanted != found:
         raise CheckpointError(
-            f"{name} was trained with the path predictor {wanted}; {path} is {found}: name it by --path"
+            f"{name} was trained with the path predictor {str(wanted)[:12]}; {path} is {found}: name it by --path"
         )
     return Tweener(name, network, path_predictor.load(path), card, classes=classes)
