@@ -345,7 +345,11 @@ _BYTES: tuple[Mutation, ...] = (
     _on_piece(lambda piece, random: b"\0" + piece),
     _on_lines(lambda lines, at, random: lines[: at + 1] + lines[at:]),
     _on_lines(lambda lines, at, random: lines[:at] + lines[at + 1 :]),
-    _on_lines(lambda lines, at, random: lines[:at] + lines[at : at + 1] * 3000 + lines[at:]),
+    _on_lines(
+        lambda lines, at, random: (
+            lines[:at] + lines[at : at + 1] * min(3000, 10**6 // (len(lines[at]) + 1)) + lines[at:]
+        )
+    ),
     _on_lines(_move),
     _on_lines(_shuffle),
     _on_lines(_soup),
