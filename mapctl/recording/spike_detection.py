@@ -18,6 +18,7 @@ _RESIDUAL_SIGMAS, _RESIDUAL_DEG = (
     4.8,
     3.0,
 )  # of a spike in the residual: one in 5,000 of normal noise is as far from its median
+_MISS_FACTOR = 2.0  # of the ninth decile of a joint's residual; of white noise that is 5 sigmas, too
 _STEP_FACTOR = (
     2.0  # and so many times the usual way between frames about there: the turning point of a fast kick is none
 )
@@ -46,17 +47,29 @@ def find_residual_spikes(
     rest: Float[Tensor, "frames joints 3"], sigma: Float[Tensor, " joints"]
 ) -> Bool[Tensor, "frames joints"]:
     """Find spikes in the residual of a capture beside a model of it: rotation vectors, radians. Without the motion
-    itself a spike stands out more clearly; `sigma` is the noise of each of the three numbers."""
-    middle = _running_median(rest.flatten(1)).unflatten(1, rest.shape[1:])
-    return (rest - middle).norm(dim=-1) > _RESIDUAL_SIGMAS * sigma + math.radians(_RESIDUAL_DEG)
+    itself a spike stands out more clearly; `sigma` is the noise of each of the three numbers. What a joint has in one
+    frame of ten is no spike: the model misses that joint's motion."""
+    away = (rest - _running_median(rest.flatten(1)).unflatten(1, rest.shape[1:])).norm(dim=-1)
+    if len(away) == 0:
+        return away > 0
+    return away > torch.maximum(
+        _RESIDUAL_SIGMAS * sigma + math.radians(_RESIDUAL_DEG), _MISS_FACTOR * away.quantile(0.9, dim=0)
+    )
 
 
 def _running_median(values: Float[Tensor, "frames width"]) -> Float[Tensor, "frames width"]:
     """Return the running median over `_MEDIAN_FRAMES`; the ends are mirrored, since repeated, an outermost frame that
-    spikes would be its own median."""
+    spikes would be its own median. Where an outermost frame is nearer to the line through the next two, it is that
+    line: a joint that swings through the first frame does not turn there."""
     side, last = _MEDIAN_FRAMES // 2, len(values) - 1
     frame = last - (last - torch.arange(-side, len(values) + side).abs()).abs()
-    return values[frame.clamp_min(0)].unfold(0, _MEDIAN_FRAMES, 1).median(dim=-1).values
+    middle = values[frame.clamp_min(0)].unfold(0, _MEDIAN_FRAMES, 1).median(dim=-1).values
+    if len(values) >= _MEDIAN_FRAMES:
+        for end, near, far in ((0, 1, 2), (-1, -2, -3)):
+            line = 2 * values[near] - values[far]
+            nearer = (values[end] - line).abs() < (values[end] - middle[end]).abs()
+            middle[end] = torch.where(nearer, line, middle[end])
+    return middle
 
 
 def _mean_step(steps: Float[Tensor, "steps joints"]) -> Float[Tensor, "frames joints"]:

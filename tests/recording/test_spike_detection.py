@@ -102,3 +102,22 @@ def test_a_model_that_is_wrong_for_a_while_makes_no_leaps():
     time = torch.arange(200, dtype=torch.float64)
     rest = (0.8 * torch.sin(2 * math.pi * time / 40))[:, None, None].expand(200, 2, 3)
     assert not find_residual_spikes(rest, sigmas(3, 2)).any()
+
+
+@pytest.mark.parametrize("end", [0, -1])
+def test_a_joint_that_swings_through_an_outermost_frame_does_not_spike_there(end):
+    """A knee that swings by 25 degrees between the first two frames of a run, and ever less later."""
+    angle = (-torch.arange(40, dtype=torch.float64) / 2).exp()[:, None, None] * torch.tensor([math.radians(65), 0, 0])
+    swing = angle if end == 0 else angle.flip(0)
+    still = torch.zeros(1, dtype=torch.float64)
+    assert not find_angle_spikes(quat_xyzw(swing), still)[end].any()
+    swing[end] += torch.tensor([0.0, math.radians(90), 0.0])
+    assert find_angle_spikes(quat_xyzw(swing), still)[end].all()
+
+
+def test_what_a_joint_has_in_many_frames_beside_a_model_is_missed_motion():
+    rest = torch.zeros(100, 1, 3, dtype=torch.float64)
+    rest[::50] = math.radians(15)
+    assert find_residual_spikes(rest, torch.zeros(1)).sum() == 2
+    rest[::6] = math.radians(15)
+    assert not find_residual_spikes(rest, torch.zeros(1)).any()
