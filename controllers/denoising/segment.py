@@ -37,6 +37,7 @@ from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import CANONICAL, TOES, leg_length
 from mapctl.terms import Term
 
+_LEAST_NOISE = math.radians(1)  # of a joint in whose residual spikes are looked for
 _LASTING_ROUNDS = 4  # proposals that are asked for at most, each told of the noise that the one before has shown
 
 
@@ -230,9 +231,14 @@ class SegmentDenoiser:
         return motion, cleaned.contact_logits[0]
 
     def _redetect_spikes(self, proposal: Motion) -> Capture:
-        """Detect spikes again in the residual beside the proposal: fast motion mistaken for one is observed again."""
+        """Detect spikes again in the residual beside the proposal: fast motion mistaken for one is observed again.
+
+        A joint without noise shows its spikes by itself; what its residual has is motion that the proposal misses.
+        """
         dropouts = ~_map_mask_to_canonical(~self.inspection.lost, self.rigmap)
-        spikes = find_residual_spikes(self._compute_residual_rotations(proposal), self.capture.sigma[0].double())
+        sigma = self.capture.sigma[0].double()
+        spikes = find_residual_spikes(self._compute_residual_rotations(proposal), sigma)
+        spikes &= (sigma > _LEAST_NOISE) | ~self.capture.seen[0]
         root = (self.shown.root_position - proposal.root_position)[:, None]
         leap = find_residual_spikes(root, self.capture.sigma_root.double())[:, 0]
         return replace(self.capture, seen=~(dropouts | spikes)[None], seen_root=~(self.hidden_root | leap)[None])

@@ -18,7 +18,6 @@ _RESIDUAL_SIGMAS, _RESIDUAL_DEG = (
     4.8,
     3.0,
 )  # of a spike in the residual: one in 5,000 of normal noise is as far from its median
-_MISS_FACTOR = 2.0  # of the ninth decile of a joint's residual; of white noise that is 5 sigmas, too
 _STEP_FACTOR = (
     2.0  # and so many times the usual way between frames about there: the turning point of a fast kick is none
 )
@@ -29,7 +28,7 @@ def find_angle_spikes(
 ) -> Bool[Tensor, "frames joints"]:
     """Find which joints spike in which frames; `sigma` is the noise of each angle, radians."""
     quats = choose_continuous_signs(quats)
-    middle = torch.nn.functional.normalize(_running_median(quats.flatten(1)).unflatten(1, quats.shape[1:]), dim=-1)
+    middle = torch.nn.functional.normalize(_running_median(quats), dim=-1)
     away = _rotation_distance(middle, quats)
     usual = _mean_step(_rotation_distance(middle[:-1], middle[1:]))
     return away > (MIN_SPIKE_SIGMAS * sigma).clamp_min(math.radians(MIN_SPIKE_DEG)) + _STEP_FACTOR * usual
@@ -37,7 +36,7 @@ def find_angle_spikes(
 
 def find_position_spikes(places: Float[Tensor, "frames 3"], sigma: float) -> Bool[Tensor, " frames"]:
     """Find the frames in which the position spikes; metres."""
-    middle = _running_median(places)
+    middle = _running_median(places[:, None])[:, 0]
     away = (places - middle).norm(dim=-1)
     usual = _mean_step(torch.diff(middle, dim=0).norm(dim=-1)[:, None])[:, 0]
     return away > max(MIN_SPIKE_SIGMAS * sigma, MIN_SPIKE_DEG / 100) + _STEP_FACTOR * usual
@@ -47,17 +46,11 @@ def find_residual_spikes(
     rest: Float[Tensor, "frames joints 3"], sigma: Float[Tensor, " joints"]
 ) -> Bool[Tensor, "frames joints"]:
     """Find spikes in the residual of a capture beside a model of it: rotation vectors, radians. Without the motion
-    itself a spike stands out more clearly; `sigma` is the noise of each of the three numbers. What a joint has in one
-    frame of ten is no spike: the model misses that joint's motion."""
-    away = (rest - _running_median(rest.flatten(1)).unflatten(1, rest.shape[1:])).norm(dim=-1)
-    if len(away) == 0:
-        return away > 0
-    return away > torch.maximum(
-        _RESIDUAL_SIGMAS * sigma + math.radians(_RESIDUAL_DEG), _MISS_FACTOR * away.quantile(0.9, dim=0)
-    )
+    itself a spike stands out more clearly; `sigma` is the noise of each of the three numbers."""
+    return (rest - _running_median(rest)).norm(dim=-1) > _RESIDUAL_SIGMAS * sigma + math.radians(_RESIDUAL_DEG)
 
 
-def _running_median(values: Float[Tensor, "frames width"]) -> Float[Tensor, "frames width"]:
+def _running_median(values: Float[Tensor, "frames joints width"]) -> Float[Tensor, "frames joints width"]:
     """Return the running median over `_MEDIAN_FRAMES`; the ends are mirrored, since repeated, an outermost frame that
     spikes would be its own median. Where an outermost frame is nearer to the line through the next two, it is that
     line: a joint that swings through the first frame does not turn there."""
@@ -67,8 +60,8 @@ def _running_median(values: Float[Tensor, "frames width"]) -> Float[Tensor, "fra
     if len(values) >= _MEDIAN_FRAMES:
         for end, near, far in ((0, 1, 2), (-1, -2, -3)):
             line = 2 * values[near] - values[far]
-            nearer = (values[end] - line).abs() < (values[end] - middle[end]).abs()
-            middle[end] = torch.where(nearer, line, middle[end])
+            nearer = (values[end] - line).norm(dim=-1) < (values[end] - middle[end]).norm(dim=-1)
+            middle[end] = torch.where(nearer[:, None], line, middle[end])
     return middle
 
 

@@ -166,7 +166,7 @@ def test_the_example_runs_on_a_clip_of_its_name(models, tiny, folder, method):
         (GOOD.replace("pose_frame = 20", "pose_frame = 45"), [], "the frame 45 is not one of the pose's 0:45"),
         (GOOD.replace("frame = 22", "frame = 40"), [], "key[3]: key[2] is at frame 40 already"),
         (GOOD.replace("[0.3, 1.5]", "[0.3, nan]"), [], "key[3].place[1]: "),
-        ("", [], "key: this key is needed"),
+        ("", [], "the file is empty"),
         (GOOD, ["--keyframes", "0,9"], "--keyframes is for motion files; "),
         (GOOD, ["--joints", "Hand_L"], "--joints is for motion files; "),
         (GOOD, ["--root-only"], "--root-only is for motion files; "),

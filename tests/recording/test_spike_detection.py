@@ -113,11 +113,3 @@ def test_a_joint_that_swings_through_an_outermost_frame_does_not_spike_there(end
     assert not find_angle_spikes(quat_xyzw(swing), still)[end].any()
     swing[end] += torch.tensor([0.0, math.radians(90), 0.0])
     assert find_angle_spikes(quat_xyzw(swing), still)[end].all()
-
-
-def test_what_a_joint_has_in_many_frames_beside_a_model_is_missed_motion():
-    rest = torch.zeros(100, 1, 3, dtype=torch.float64)
-    rest[::50] = math.radians(15)
-    assert find_residual_spikes(rest, torch.zeros(1)).sum() == 2
-    rest[::6] = math.radians(15)
-    assert not find_residual_spikes(rest, torch.zeros(1)).any()

@@ -67,7 +67,7 @@ def test_a_cache_of_other_rig_tables_or_contact_thresholds_is_not_taken(tmp_path
     corpora.read_corpus(data, match="walk-[0-2]", cache=tmp_path)
     table, contacts = corpora.rigs.known_rigs(), corpora.ContactSettings
     for what, other in (
-        ("rigs.known_rigs", lambda: (*table[:-1], replace(table[-1], straighten=("leftHand",)))),
+        ("rigs.known_rigs", lambda: (*table[:-1], replace(table[-1], rest="straighten"))),
         ("ContactSettings", partial(contacts, slow=0.4)),
     ):
         with monkeypatch.context() as patch:
