@@ -22,10 +22,9 @@ def rest_rotations(rigmap: RigMap) -> Float[Tensor, "joints 4"]:
     canonical = {joint: rigmap.tpose_quat_xyzw[c] for c, joint in enumerate(rigmap.joint_of) if joint is not None}
     found: list[Tensor] = []
     for joint, parent in enumerate(skeleton.parents):
-        idle = still if rigmap.idle_quat_xyzw is None else rigmap.idle_quat_xyzw[joint]
         root = still if rigmap.upright_quat_xyzw is None else rigmap.upright_quat_xyzw
         above = found[parent] if parent >= 0 else root
-        found.append(canonical.get(joint, rotations.multiply(above, idle)))
+        found.append(canonical.get(joint, rotations.multiply(above, rigmap.idle_quat_xyzw[joint])))
     return torch.stack(found)
 
 

@@ -4,8 +4,8 @@ from mapctl import retarget
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.motion import Motion
+from mapctl.retarget import UNKNOWN_RIG_NOTE
 from mapctl.retarget.rigs import Rig
-from mapctl.retarget.upright import UNKNOWN_RIG_NOTE
 
 _RATE_TOLERANCE = 0.02  # share of the reference's rate within which measures are the same, as of 29.97 frames a second
 

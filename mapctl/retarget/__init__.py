@@ -19,16 +19,16 @@ from mapctl.formats.characters.source import CharacterSource
 from mapctl.formats.examples import is_example
 from mapctl.motion import Motion
 from mapctl.retarget import bone_offsets
+from mapctl.retarget.body_plan import goes_on_four_legs
 from mapctl.retarget.joint_matching import Match, correct_sides, match
-from mapctl.retarget.recognition.body_plan import goes_on_four_legs
-from mapctl.retarget.reference_pose import find_tpose, is_canonical_tpose
+from mapctl.retarget.reference_pose import TPose, find_tpose, is_canonical_tpose
 from mapctl.retarget.rig_poses import RigPoses
 from mapctl.retarget.rigs import Rig, find_preset, known_rigs, read_rig_toml
 from mapctl.skeleton import CANONICAL, Skeleton
 
 
-@dataclass(frozen=True, eq=False)
-class RigMap:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RigMap(TPose):
     """How one skeleton of a rig maps to canonical joints."""
 
     rig: Rig
@@ -37,26 +37,10 @@ class RigMap:
     """The rig's own skeleton."""
     joint_of: tuple[int | None, ...]
     """For each canonical joint the rig's joint, None where the rig has only an End Site or nothing."""
-    tpose_quat_xyzw: Float[Tensor, "joints 4"]
-    """B: world rotation (xyzw) of each canonical joint's rig joint in the T-pose, in a world with Y up."""
     skeleton: Skeleton
     """Canonical names and tree with this performer's bones."""
-    upright_quat_xyzw: Float[Tensor, "4"] | None = None
-    """U: rotation from the file's world to one with Y up, xyzw; None where Y is up already."""
-    idle_quat_xyzw: Float[Tensor, "rigged 4"] | None = None
-    """Local rotations at rest of joints that are no canonical one; None where they are all zero."""
-    match: Match | None = None
+    match: Match
     """Which of the rig's joints is which, and how sure that is."""
-    up: str = "y"
-    """Axis of the file's world that points up."""
-    facing: str = "z"
-    """Axis of the file that the pose with all rotations zero faces; `unknown` where it is along none."""
-    rest: str = "neither"
-    """What the pose with all rotations zero is: T, A or neither."""
-    tpose_from: str = "table"
-    """Where the T-pose was found: table, rest pose, frame 0, or motion."""
-    tpose_doubt: str = ""
-    """Why the T-pose may be wrong, a sentence without a full stop; empty where it agrees with the clip."""
     hips_travel: bool = True
     """Whether hips below the root have an animated offset; else the root carries them."""
 
@@ -111,19 +95,12 @@ def identify_rig(skeleton: Skeleton, rig: Rig | None = None, *, motion: Motion |
     stated = stated or (found.rig.name == "canonical" and is_canonical_tpose(zero))
     tpose = find_tpose(zero, clip, rig=found.rig, stated=stated, up=None if character is None else "y")
     rigmap = RigMap(
-        found.rig,
-        skeleton,
-        found.joint_of,
-        tpose.quat_xyzw,
-        bone_offsets.measure_bones(skeleton, found.joint_of, tpose.quat_xyzw, tpose.idle_quat_xyzw),
-        tpose.upright_quat_xyzw,
-        tpose.idle_quat_xyzw,
-        found,
-        tpose.up,
-        tpose.facing,
-        tpose.rest,
-        tpose.found,
-        tpose.doubt,
+        **vars(tpose),
+        rig=found.rig,
+        rig_skeleton=skeleton,
+        joint_of=found.joint_of,
+        skeleton=bone_offsets.measure_bones(skeleton, found.joint_of, tpose.tpose_quat_xyzw, tpose.idle_quat_xyzw),
+        match=found,
     )
     if motion is None:
         return rigmap
@@ -155,13 +132,12 @@ def as_rig(rigmap: RigMap) -> Rig:
     """
     tpose = zip(CANONICAL.names, rigmap.tpose_quat_xyzw, strict=True)
     axes = {c: rotations.to_matrix(quat).T.tolist() for c, quat in tpose if c in rigmap.joints}
-    names, idle = rigmap.rig_skeleton.names, rigmap.idle_quat_xyzw
     return replace(
         rigmap.rig,
         joints=rigmap.joint_names,
         aliases={},
         tpose={c: {"x": x, "y": y} for c, (x, y, _) in axes.items()},
-        idle={} if idle is None else dict(zip(names, idle.tolist(), strict=True)),
+        idle=dict(zip(rigmap.rig_skeleton.names, rigmap.idle_quat_xyzw.tolist(), strict=True)),
         up=rigmap.up,
         rest="tpose",
     )
@@ -210,10 +186,7 @@ def from_canonical(motion: Motion, rigmap: RigMap, original: Motion | None = Non
     """
     skeleton, frames = rigmap.rig_skeleton, motion.num_frames
     kept = original is not None and original.num_frames == frames
-    still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
-    rest = still.expand(frames, skeleton.num_joints, 4)
-    if rigmap.idle_quat_xyzw is not None:
-        rest = rigmap.idle_quat_xyzw.expand(frames, skeleton.num_joints, 4)
+    rest = rigmap.idle_quat_xyzw.expand(frames, skeleton.num_joints, 4)
     own = original.local_quat_xyzw if original is not None and kept else rest
     hips, wanted = _to_file_world(motion, rigmap)
     local, world = [], []
@@ -278,3 +251,23 @@ def canonical_joints(motion: Motion, rig: Rig | None = None) -> dict[str, int]:
         return identify_rig(motion.skeleton, rig, motion=motion).joints
     except RequestError:
         return {}
+
+
+UNKNOWN_RIG_NOTE = "the rig is not known, and so not which way is up: taken as it is, with Y up"
+"""Note on a motion that cannot be put upright."""
+
+
+def put_upright(motion: Motion, rig: Rig | None = None) -> tuple[Motion, tuple[str, ...]]:
+    """Put a motion on its own rig upright, with Y up; also return a note where the rig is not known.
+
+    Unchanged where Y is up already, or nothing is known.
+    """
+    try:
+        turn = identify_rig(motion.skeleton, rig, motion=motion).upright_quat_xyzw
+    except RequestError:
+        return motion, (UNKNOWN_RIG_NOTE,)
+    if turn is None:
+        return motion, ()
+    every, local = turn.expand(motion.num_frames, 4), motion.local_quat_xyzw.clone()
+    local[:, 0] = rotations.multiply(every, local[:, 0])
+    return replace(motion, root_position=rotations.rotate(every, motion.root_position), local_quat_xyzw=local), ()

@@ -1,23 +1,23 @@
 """Which joint of any rig is which canonical one: by listed names, by the words in names, and by the tree.
 
-Sides are checked by the positions of the joints where toes show the facing of the body.
+Sides are checked by how the body of a clip is built and bends.
 """
 
 import re
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from functools import lru_cache
 
 from mapctl.errors import RequestError
-from mapctl.joint_names import Part, Role, Side, abbreviate_names, describe_nearest
+from mapctl.joint_names import Part, Role, Side, abbreviate_names, describe_nearest, normalise_name
 from mapctl.joint_roles import classify_joints, find_hips
 from mapctl.motion import Motion
-from mapctl.retarget import topology
 from mapctl.retarget.anatomy import are_sides_swapped
-from mapctl.retarget.recognition.listed_names import Listed, find_listed_rig, match_by_rig
-from mapctl.retarget.recognition.other_side import find_by_other_side
 from mapctl.retarget.rig_poses import RigPoses
 from mapctl.retarget.rigs import Rig, known_rigs
+from mapctl.retarget.topology import descendants, find_by_other_side, match_by_tree
 from mapctl.skeleton import CANONICAL, Skeleton, mirror_name
 
 MIN_SCORE = 0.6
@@ -30,6 +30,10 @@ REQUIRED = (
 """Canonical joints that a rig must have; the others are put in between or at the end where it lacks them."""
 
 _ABSENT, _SWAPPED = 0.4, 0.9
+_ARMS_ON_CHEST = 0.5  # joints that a chest from which the shoulders hang is worth
+_NEAR = 0.05  # joints by which a rig may fit less well and still be as near
+_MIN_PREFIXED = 5  # joints whose names begin alike, from which this is a prefix
+_BEGINNING = re.compile(r"[^_:|.\- ]+[_:|.\- ](?=.)")  # of a name, up to its first separator
 HELPER_NAME = re.compile(
     r"twist|roll|\bik|ik_|_ik|pole|ctrl|control|nub|_end|\bend|site|tip|prop|weapon|aim|target|"
     r"helper|corrective|attach|socket|skirt|hair|cloth|breast|bust|捩|ＩＫ",
@@ -81,7 +85,7 @@ def match(skeleton: Skeleton, rig: Rig | None = None, *, motion: Motion | None =
     reached or a joint of REQUIRED is not found, naming what is missing.
     """
     given = rig if rig is not None and rig.joints else None
-    listed = find_listed_rig(skeleton, REQUIRED) if given is None else Listed(given, match_by_rig(given, skeleton))
+    listed = _find_listed_rig(skeleton) if given is None else _Listed(given, _match_by_rig(given, skeleton))
     chosen, found = (listed.rig, dict(listed.joints)) if listed else (None, {})
     if given is not None:
         _check_given(given, found, skeleton)
@@ -115,6 +119,96 @@ def correct_sides(found: Match, skeleton: Skeleton, motion: Motion | None) -> Ma
     return replace(found, joint_of=joint_of, score=score, sides_exchanged=named, known_by=known)
 
 
+@dataclass(frozen=True)
+class _Listed:
+    """The listed rig that fits a skeleton best."""
+
+    rig: Rig
+    """The rig."""
+    joints: Mapping[str, int]
+    """The skeleton's joint by canonical name."""
+    rivals: tuple[tuple[str, str], ...] = ()
+    """Other listed rigs that fit as well and take another joint for some canonical one: each with that canonical
+    name."""
+
+
+def _find_listed_rig(skeleton: Skeleton) -> _Listed | None:
+    """Find the listed rig that explains most of the skeleton, if one has all joints of REQUIRED."""
+    fits: list[tuple[float, Rig, dict[str, int]]] = []
+    plain = {normalise_name(name) for name in skeleton.names}
+    for rig in known_rigs():
+        found = _match_by_rig(rig, skeleton)
+        complete = all(name in found for name in REQUIRED)
+        if not complete or (rig.name == "canonical" and not rig.fits(skeleton)):
+            continue
+        fits.append((_measure_fit(rig, found, skeleton, plain), rig, found))
+    if not fits:
+        return None
+    best, rig, joints = max(fits, key=lambda fit: fit[0])
+    near = [(other.name, found) for fit, other, found in fits if fit >= best - _NEAR]
+    differing = [(name, [c for c in joints if found.get(c, joints[c]) != joints[c]]) for name, found in near]
+    return _Listed(rig, joints, tuple((name, canonical[0]) for name, canonical in differing if canonical))
+
+
+def _match_by_rig(rig: Rig, skeleton: Skeleton) -> dict[str, int]:
+    """Match joints by a rig's names, in the version that fits best; spelling and prefixes count where they must."""
+    exact = {name: joint for joint, name in enumerate(skeleton.names)}
+    plain = _index_plain_names(skeleton.names)
+    listed = {c: (own, *rig.aliases.get(c, ())) for c, own in rig.joints.items()}
+    joint_of = {name: exact.get(name, plain.get(normalise_name(name))) for names in listed.values() for name in names}
+
+    best: dict[str, int] = {}
+    versions = 1 + max((len(others) for others in rig.aliases.values()), default=0)
+    for version in range(versions):
+        found: dict[str, int] = {}
+        for first in (True, False):
+            for canonical, names in listed.items():
+                tried = [names[min(version, len(names) - 1)]] if first else names
+                hits = [hit for hit in map(joint_of.get, tried) if hit is not None and hit not in found.values()]
+                if hits and canonical not in found:
+                    found[canonical] = hits[0]
+        if len(found) > len(best):
+            best = found
+    return best
+
+
+def without_shared_prefix(names: Sequence[str]) -> list[str]:
+    """Return the names without what most of them begin with, up to a separator: `Skeleton0_Hips` is `Hips`."""
+    beginnings = [match[0] for match in map(_BEGINNING.match, names) if match]
+    (most, count), *_ = Counter(beginnings).most_common(1) or [("", 0)]
+    if count <= max(_MIN_PREFIXED, len(names) / 2):
+        return list(names)
+    return without_shared_prefix([name.removeprefix(most) for name in names])
+
+
+@lru_cache(maxsize=8)
+def _index_plain_names(names: tuple[str, ...]) -> dict[str, int]:
+    """Return the joint by normalised name, with and without a prefix that joints share; whole names come first."""
+    found: dict[str, int] = {}
+    for spelled in (names, without_shared_prefix(names)):
+        for joint, name in enumerate(spelled):
+            found.setdefault(normalise_name(name), joint)
+    return found
+
+
+def _measure_fit(rig: Rig, found: Mapping[str, int], skeleton: Skeleton, plain: set[str]) -> float:
+    """Measure how well a rig explains a skeleton: the joints it names, and below one joint each what distinguishes
+    relatives."""
+    extra = {normalise_name(name) for name in (*rig.also, *rig.trunk)}
+    explained = len(found) + len(extra & plain - {normalise_name(skeleton.names[j]) for j in found.values()})
+    lacking = len(rig.joints) - len(found) + len(extra - plain)
+    # Fingers and props beyond what a preset lists do not count against it; what it lists and the rig lacks does.
+    spelled = sum(skeleton.names[joint] in (rig.joints[c], *rig.aliases.get(c, ())) for c, joint in found.items())
+    carried = _ARMS_ON_CHEST * _arms_hang_from_chest(found, skeleton)
+    return len(found) + explained / (explained + lacking) + spelled / len(found) + carried
+
+
+def _arms_hang_from_chest(found: Mapping[str, int], skeleton: Skeleton) -> bool:
+    """Return whether the chest is the joint from which the shoulders, or else the upper arms, hang."""
+    arms = [found.get(side + "Shoulder", found.get(side + "UpperArm")) for side in ("left", "right")]
+    return all(arm is not None and skeleton.parents[arm] == found.get("chest") for arm in arms)
+
+
 def _complete_match(
     skeleton: Skeleton, given: Mapping[str, int], motion: Motion | None
 ) -> tuple[dict[str, int], dict[str, KnownBy]]:
@@ -126,7 +220,7 @@ def _complete_match(
     known = {name: KnownBy.LIST if name in given else KnownBy.WORDS for name in found}
     beside = find_by_other_side(skeleton, found)
     found, known = found | beside, known | dict.fromkeys(beside, KnownBy.PLACE)
-    by_tree = _assign_sides(topology.match_by_tree(skeleton), classify_joints(skeleton), skeleton, motion)
+    by_tree = _assign_sides(match_by_tree(skeleton), classify_joints(skeleton), skeleton, motion)
     for name, joint in by_tree.items():
         helper = HELPER_NAME.search(skeleton.names[joint])
         if name not in found and joint not in found.values() and not helper:
@@ -143,9 +237,9 @@ def _match_by_words(skeleton: Skeleton, hips: int | None) -> dict[str, int]:
             return {}
     found = {"hips": hips}
     told = classify_joints(skeleton)
-    inside = _descendants(skeleton, hips)
+    inside = descendants(skeleton, {hips})
     if skeleton.parents[hips] >= 0 and not any(told[joint].part is Part.UPPER_ARM for joint in inside):
-        inside = _descendants(skeleton, skeleton.parents[hips])  # a trunk beside the hips, as MMD has it
+        inside = descendants(skeleton, {skeleton.parents[hips]})  # a trunk beside the hips, as MMD has it
     roles = [
         r if j in inside and not HELPER_NAME.search(skeleton.names[j]) else Role(Side.MIDDLE, Part.OTHER)
         for j, r in enumerate(told)
@@ -154,7 +248,7 @@ def _match_by_words(skeleton: Skeleton, hips: int | None) -> dict[str, int]:
         found |= _match_limb_by_words(roles, side)
     arms = [found[name] for name in ("leftUpperArm", "rightUpperArm") if name in found]
     trunk = [j for j, r in enumerate(roles) if r == Role(Side.MIDDLE, Part.TORSO)]
-    holding = [j for j in trunk if arms and all(arm in _descendants(skeleton, j) for arm in arms)] or trunk
+    holding = [j for j in trunk if arms and all(arm in descendants(skeleton, {j}) for arm in arms)] or trunk
     if holding:
         found["spine"] = holding[0]
     if len(holding) > 1:
@@ -219,15 +313,6 @@ def _assign_sides(
             across = -across
         left = across
     return by_tree
-
-
-def _descendants(skeleton: Skeleton, joint: int) -> set[int]:
-    """Return the joint and all below it."""
-    found = {joint}
-    for child, parent in enumerate(skeleton.parents):
-        if parent in found:
-            found.add(child)
-    return found
 
 
 def _unmapped(skeleton: Skeleton, found: Mapping[str, int]) -> tuple[str, ...]:

@@ -32,26 +32,26 @@ _UNROTATED = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
 _VECTORS = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class TPose:
     """The pose of the rig that corresponds to the canonical skeleton's rest pose."""
 
-    quat_xyzw: Float[Tensor, "joints 4"]
-    """World rotation of each canonical joint's rig joint, in a world with Y up."""
+    tpose_quat_xyzw: Float[Tensor, "joints 4"]
+    """B: world rotation (xyzw) of each canonical joint's rig joint in the T-pose, in a world with Y up."""
     idle_quat_xyzw: Float[Tensor, "rigged 4"]
-    """Local rotations of the rig's joints at rest, used for joints without a canonical counterpart."""
+    """Local rotations in the T-pose of joints that are no canonical one; those of others do not count."""
     upright_quat_xyzw: Float[Tensor, "4"] | None
-    """Rotation that takes the file's world to Y up, xyzw; None where it is."""
+    """U: rotation from the file's world to one with Y up, xyzw; None where Y is up already."""
     up: str
     """Axis of the file's world that points up."""
     facing: str
-    """Axis of the file that the rest pose faces; `unknown` where it faces along none."""
+    """Axis of the file that the pose with all rotations zero faces; `unknown` where it is along none."""
     rest: str
     """What the pose with all rotations zero is: T, A or neither."""
-    found: str
-    """Where the T-pose comes from: table, rest pose, frame 0, or motion."""
-    doubt: str = ""
-    """Why it may be wrong, a sentence without a full stop; empty where it agrees with the clip."""
+    tpose_from: str
+    """Where the T-pose was found: table, rest pose, frame 0, or motion."""
+    tpose_doubt: str = ""
+    """Why the T-pose may be wrong, a sentence without a full stop; empty where it agrees with the clip."""
 
 
 def find_tpose(zero: RigPoses, clip: RigPoses | None, *, rig: Rig, stated: bool, up: str | None = None) -> TPose:
@@ -64,11 +64,19 @@ def find_tpose(zero: RigPoses, clip: RigPoses | None, *, rig: Rig, stated: bool,
     rest = classify_reference_pose(zero, front)
     up = rig.up if rig.up != "auto" else up or _find_up(zero, clip, rest)
     upright = upright_rotation(up)
-    shown = None if rest == "neither" else nearest_axis_name(front[2])
     readings = list(_list_readings(zero, clip, rig, stated, rest, front, up))
 
     def choose(found: str, quats: Tensor, idle: Tensor, doubt: str = "") -> TPose:
-        return TPose(quats, idle, upright, up, shown or "unknown", rest, found, doubt)
+        return TPose(
+            tpose_quat_xyzw=quats,
+            idle_quat_xyzw=idle,
+            upright_quat_xyzw=upright,
+            up=up,
+            facing="unknown" if rest == "neither" else nearest_axis_name(front[2]),
+            rest=rest,
+            tpose_from=found,
+            tpose_doubt=doubt,
+        )
 
     if clip is None:
         quats, idle, found = (*readings, (_lay_out_tpose(zero, front), _unrotated(zero), "rest pose"))[0]
@@ -181,7 +189,7 @@ def classify_reference_pose(poses: RigPoses, front: Float[Tensor, "3 3"]) -> str
 
 def upright_rotation(up: str) -> Float[Tensor, "4"] | None:
     """Return the rotation from a world with this up axis to one with Y up; None where it is Y already."""
-    return None if up == "y" else rotations.from_matrix(align_bone(axis_vector(up), axis_vector("y")))
+    return None if up == "y" else rotations.between_vectors(axis_vector(up), axis_vector("y"))
 
 
 def is_tpose(poses: RigPoses, front: Float[Tensor, "3 3"]) -> bool:
@@ -244,7 +252,7 @@ def _lay_out_tpose(base: RigPoses, front: Tensor) -> Float[Tensor, "joints 4"]:
         apart = float(torch.arccos((bone @ aim).clamp(-1, 1)))
         aligned = part in _LIMBS or (part not in ("Hand", "Foot", "Toes") and apart > _TRUNK_TOLERANCE)
         if aligned and aim.norm() > 0 and bone.norm() > 0 and base.has(name):
-            turn = align_bone(bone, aim) @ turn
+            turn = rotations.to_matrix(rotations.between_vectors(bone, aim)) @ turn
         turns.append(turn)
     still = [rotations.from_matrix(turn) for turn in turns]
     joints = [
@@ -269,19 +277,3 @@ def _unrotated(poses: RigPoses) -> Float[Tensor, "rigged 4"]:
 def _mean_locals(clip: RigPoses) -> Float[Tensor, "rigged 4"]:
     """Return the mean local rotations of a clip, which joints between canonical ones have in its body's T-pose."""
     return rotations.average(kinematics.local_from_world(clip.skeleton.parents, clip.orientations))
-
-
-def align_bone(start: Float[Tensor, "3"], stop: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
-    """Return the shortest rotation between unit vectors; of about opposite ones, the half turn about +Z if it is one.
-
-    Unlike `rotations.between_vectors`, it keeps the other axes of rigs whose bones all lie along one local axis: a
-    thigh that points up is rotated down sideways, not through a somersault, and its knee still bends backward.
-    """
-    axis, cosine = torch.linalg.cross(start, stop), start @ stop
-    if cosine < 0 and axis.norm() < 0.1:
-        across = axis_vector("z") if float(start[2].abs()) < 0.7 else axis_vector("y")
-        half = torch.nn.functional.normalize(across - start * (across @ start), dim=0)
-        over = rotations.rotation_vector_to_matrix(half * math.pi)
-        return align_bone(over @ start, stop) @ over
-    sine = axis.norm().clamp_min(1e-12)
-    return rotations.rotation_vector_to_matrix(axis / sine * torch.atan2(sine, cosine))

@@ -1,14 +1,15 @@
-"""Which joint is which by the tree alone: legs and a trunk hang from the hips, arms and a head from the trunk."""
+"""Which joint is which by the tree: legs and a trunk hang from the hips, arms and a head from the trunk."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from itertools import product
 
 import torch
 
-from mapctl.skeleton import Skeleton
+from mapctl.skeleton import CANONICAL, Skeleton, mirror_name
 
 _MAX_LENGTH_RATIO = 1.2  # ratio of the lengths of two bones of one pair
 _MIN_REACH_SHARE = 0.25  # of the reach of the joint that they hang from, below which two branches are no limbs
+_MAX_SIDE_RATIO = 1.6  # of the lengths of two bones of one pair; performers are not the same on both sides
 
 LimbPair = tuple[list[int], list[int]]
 """The joints of the two limbs of a pair, side by side, from the body outward."""
@@ -43,7 +44,7 @@ def _name_body_joints(tree: "_JointTree", hips: int, legs: LimbPair, chest: int,
     for side, leg, arm in zip(("left", "right"), legs, arms, strict=True):
         found |= tree.limb(leg, [side + part for part in ("", "UpperLeg", "LowerLeg", "Foot", "Toes")])
         found |= tree.limb(arm, [side + part for part in ("Shoulder", "UpperArm", "LowerArm", "Hand", "")])
-    trunk = tree.path(hips, chest)
+    trunk = path_below(tree.skeleton, hips, chest)
     if trunk:
         found["spine"] = trunk[0]
     if len(trunk) > 1:
@@ -59,7 +60,7 @@ class _JointTree:
     """Children, bone lengths and reaches of a skeleton's joints; a reach is the length of the longest chain below."""
 
     def __init__(self, skeleton: Skeleton):
-        self.parents = skeleton.parents
+        self.skeleton = skeleton
         self.children = [skeleton.children(joint) for joint in range(skeleton.num_joints)]
         self.length = skeleton.offsets.norm(dim=-1).tolist()
         ends = {skeleton.index(name): torch.tensor(site).norm().item() for name, site in skeleton.end_offsets.items()}
@@ -111,17 +112,64 @@ class _JointTree:
             found.extend(self.children[above])
         return found
 
-    def path(self, above: int, joint: int) -> list[int]:
-        """Return the joints below `above` on the chain to a joint, and that joint."""
-        path = []
-        while joint != above:
-            path.append(joint)
-            joint = self.parents[joint]
-        return path[::-1]
-
     def limb(self, path: list[int], names: list[str]) -> dict[str, int]:
         """Name a limb's joints: the second and third begin its two longest bones; a bare side is no name."""
         both = [self.length[path[k + 1]] + self.length[path[k + 2]] for k in range(len(path) - 2)]
         upper = max(range(len(both)), key=both.__getitem__)
         placed = {name: upper + k - 1 for k, name in enumerate(names)}
         return {name: path[at] for name, at in placed.items() if len(name) > 5 and 0 <= at < len(path)}
+
+
+def find_by_other_side(skeleton: Skeleton, found: Mapping[str, int]) -> dict[str, int]:
+    """Find canonical joints that only the other side has so far, from the hips outward."""
+    more: dict[str, int] = {}
+    for name in CANONICAL.names:
+        known = {**found, **more}
+        above = CANONICAL.names[CANONICAL.parents[CANONICAL.index(name)]] if name != "hips" else name
+        needed = (mirror_name(name), above, mirror_name(above))
+        if name in known or mirror_name(name) == name or not all(one in known for one in needed):
+            continue
+        path = path_below(skeleton, known[mirror_name(above)], known[mirror_name(name)])
+        ends = _follow(skeleton, known[above], path, {*known.values()}) if path else []
+        below = [
+            known[CANONICAL.names[j]]
+            for j in descendants(CANONICAL, {CANONICAL.index(name)})
+            if CANONICAL.names[j] in known
+        ]
+        fitting = [end for end in ends if all(path_below(skeleton, end, joint) for joint in below)]
+        if fitting:
+            size = len(descendants(skeleton, {known[mirror_name(name)]}))
+            more[name] = min(fitting, key=lambda end: abs(len(descendants(skeleton, {end})) - size))
+    return more
+
+
+def _follow(skeleton: Skeleton, start: int, path: list[int], taken: set[int]) -> list[int]:
+    """Return the joints below `start` to which bones lead that are as long as those of a path on the other side."""
+    ends = [start]
+    for joint in path:
+        length = float(skeleton.offsets[joint].norm())
+        ends = [child for end in ends for child in skeleton.children(end) if _are_alike(skeleton, child, length)]
+    return [end for end in ends if end not in taken]
+
+
+def _are_alike(skeleton: Skeleton, joint: int, length: float) -> bool:
+    short, long = sorted((float(skeleton.offsets[joint].norm()), length))
+    return long <= _MAX_SIDE_RATIO * short + 1e-6
+
+
+def descendants(skeleton: Skeleton, joints: Collection[int]) -> set[int]:
+    """Return joints and all below them."""
+    found = set(joints)
+    for child, parent in enumerate(skeleton.parents):
+        if parent in found:
+            found.add(child)
+    return found
+
+
+def path_below(skeleton: Skeleton, above: int, joint: int) -> list[int]:
+    """Return the joints below `above` down to a joint, and that joint; none where it does not hang from it."""
+    path = []
+    while joint >= 0 and joint != above:
+        path.append(joint)
+        joint = skeleton.parents[joint]
+    return path[::-1] if joint == above else []

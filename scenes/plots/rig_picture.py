@@ -20,7 +20,7 @@ from mapctl import kinematics, retarget, rotations
 from mapctl.formats.atomic import atomic_path
 from mapctl.motion import Motion
 from mapctl.retarget import RigMap
-from mapctl.retarget.recognition.doubts import Fit
+from mapctl.retarget.doubts import Fit
 from mapctl.skeleton import CANONICAL
 from scenes.plots.label_columns import Label, draw_columns, font_families, printable
 

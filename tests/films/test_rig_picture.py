@@ -14,7 +14,7 @@ from rig_trees import TREES
 from strange_rigs import CASES
 
 from mapctl import retarget
-from mapctl.retarget.recognition.doubts import assess_fit
+from mapctl.retarget.doubts import assess_fit
 from mapctl.skeleton import CANONICAL
 from scenes.plots import rig_picture
 from scenes.plots.label_columns import printable, shorten, spread

@@ -15,7 +15,7 @@ from rig_maker import Make, make, names_of, person
 from mapctl import metrics
 from mapctl.metrics.comparison import make_comparable
 from mapctl.motion import Motion
-from mapctl.retarget.upright import UNKNOWN_RIG_NOTE, put_upright
+from mapctl.retarget import UNKNOWN_RIG_NOTE, put_upright
 from mapctl.skeleton import Skeleton
 
 TREMOR = math.radians(0.3)

@@ -22,12 +22,12 @@ from mapctl import kinematics, retarget, rotations
 from mapctl.errors import RequestError
 from mapctl.formats.bvh import layout
 from mapctl.motion import Motion
+from mapctl.retarget import put_upright
 from mapctl.retarget.anatomy import are_sides_swapped, find_up_axis
-from mapctl.retarget.recognition.doubts import assess_fit
+from mapctl.retarget.doubts import assess_fit
 from mapctl.retarget.reference_pose import find_tpose, upright_rotation
 from mapctl.retarget.rig_poses import RigPoses
 from mapctl.retarget.rigs import UNITS
-from mapctl.retarget.upright import put_upright
 from mapctl.skeleton import CANONICAL, Skeleton, mirror_name
 
 FOLDER = os.environ.get("MAPCTL_MOTION")
@@ -149,9 +149,9 @@ def test_a_table_with_a_rolled_limb_is_overruled_and_a_users_is_doubted(parts):
     rolled = replace(stated, tpose={name: roll_left(axes, name, parts) for name, axes in stated.tpose.items()})
     zero, clip = (RigPoses.of(m, rigmap.joint_of) for m in (zero_pose(motion), motion))
     preset = find_tpose(zero, clip, rig=replace(rolled, rest="auto"), stated=False)
-    turned = rotations.multiply(rotations.inverse(rigmap.tpose_quat_xyzw), preset.quat_xyzw)
+    turned = rotations.multiply(rotations.inverse(rigmap.tpose_quat_xyzw), preset.tpose_quat_xyzw)
     assert float(rotations.to_rotation_vector(turned).norm(dim=-1).max()) < math.radians(50)
-    assert "degrees off" in preset.doubt or preset.found != "table"
+    assert "degrees off" in preset.tpose_doubt or preset.tpose_from != "table"
     found, again = retarget.to_canonical(motion, rolled)
     assert float(turned_deg(wanted, found).max()) == pytest.approx(180, abs=1)
     assert f"left{parts[0]}" in again.tpose_doubt

@@ -12,10 +12,9 @@ from strange_rigs import CASES, DOUBTFUL, REFUSED, SURE, renamed, rigged, stretc
 
 from mapctl import retarget
 from mapctl.errors import RequestError
-from mapctl.retarget import rigs
+from mapctl.retarget import body_plan, rigs
+from mapctl.retarget.doubts import Fit, assess_fit
 from mapctl.retarget.joint_matching import KnownBy
-from mapctl.retarget.recognition import body_plan
-from mapctl.retarget.recognition.doubts import Fit, assess_fit
 from mapctl.retarget.rig_poses import RigPoses
 from mapctl.skeleton import CANONICAL
 
@@ -122,7 +121,7 @@ def test_a_name_of_another_part_contradicts_a_place():
 def test_presets_that_fit_as_well_and_take_another_joint_are_named(monkeypatch):
     mixamo = retarget.load_rig("mixamo")
     twin = replace(mixamo, name="twin", joints={**mixamo.joints, "chest": "mixamorig:Spine1"}, aliases={})
-    monkeypatch.setattr("mapctl.retarget.recognition.listed_names.known_rigs", lambda: (mixamo, twin))
+    monkeypatch.setattr("mapctl.retarget.joint_matching.known_rigs", lambda: (mixamo, twin))
     names = names_of("mixamo")
     # With the shoulders on neither of the two, nothing decides between them.
     wish = Make(names, between={"chest": ("mixamorig:Spine1",)}, extras=False)

@@ -10,7 +10,6 @@ from helpers import bandai_skeleton, cmu_skeleton, random_motion, turn_between, 
 from mapctl import retarget
 from mapctl.errors import RequestError
 from mapctl.motion import Motion
-from mapctl.retarget.reference_pose import align_bone
 from mapctl.skeleton import CANONICAL, Skeleton
 
 SKELETONS = {"bandai-namco": bandai_skeleton(), "cmu-daz": cmu_skeleton(), "canonical": CANONICAL}
@@ -143,13 +142,3 @@ def test_what_is_no_body_is_refused_with_what_is_missing_and_the_known_rigs():
     strange = Skeleton(("bone_1", "bone_2"), (-1, 0), torch.zeros(2, 3).double())
     with pytest.raises(RequestError, match=r"hips, spine.*bone_1, bone_2.*canonical, .*bandai-namco,.* cmu-daz"):
         retarget.identify_rig(strange)
-
-
-@pytest.mark.parametrize("start", [[1.0, 0, 0], [0, 1.0, 0], [0, 0, -1.0], [0.6, 0, 0.8], [0.36, 0.48, 0.8]])
-def test_an_aligned_bone_lies_along_its_direction_even_the_opposite(start):
-    start = torch.nn.functional.normalize(torch.tensor(start).double(), dim=0)
-    for stop in (-start, start, start.roll(1), torch.nn.functional.normalize(-start + 1e-7 * start.roll(1), dim=0)):
-        matrix = align_bone(start, stop)
-        torch.testing.assert_close(matrix @ start, stop, atol=1e-9, rtol=0)
-        torch.testing.assert_close(matrix @ matrix.T, torch.eye(3).double(), atol=1e-9, rtol=0)
-        assert float(torch.linalg.det(matrix)) == pytest.approx(1)

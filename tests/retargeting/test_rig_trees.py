@@ -11,8 +11,8 @@ from rig_trees import TREES
 
 from mapctl import retarget
 from mapctl.retarget import figure, rigs
-from mapctl.retarget.recognition.doubts import assess_fit
-from mapctl.retarget.recognition.listed_names import without_shared_prefix
+from mapctl.retarget.doubts import assess_fit
+from mapctl.retarget.joint_matching import without_shared_prefix
 from mapctl.skeleton import CANONICAL
 
 NEW = sorted({preset for preset, _ in TREES} - {"xsens", "rokoko", "vrm"})

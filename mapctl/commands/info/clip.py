@@ -13,7 +13,7 @@ from mapctl.formats.characters.source import CharacterSource
 from mapctl.formats.units import UNITS
 from mapctl.motion import Motion
 from mapctl.retarget import RigMap
-from mapctl.retarget.recognition.doubts import Fit, assess_fit
+from mapctl.retarget.doubts import Fit, assess_fit
 from mapctl.skeleton import CANONICAL
 
 _LISTS = ("joints", "known_by", "unmapped", "doubts", "fit", "skeletons", "animations")
@@ -58,18 +58,18 @@ def describe_clip(path: Path, motion: Motion, rigmap: RigMap, fit: Fit) -> dict[
         "file": str(path),
         "rig": rigmap.rig.name,
         "about": rigmap.rig.about,
-        "score": 1.0 if found is None else round(found.score, 3),
+        "score": round(found.score, 3),
         "fit": fit.verdict,
         "doubts": [doubt.reason for doubt in fit.doubts],
-        "sides_exchanged": found is not None and found.sides_exchanged,
+        "sides_exchanged": found.sides_exchanged,
         "rest_pose": rigmap.rest,
         "tpose_from": rigmap.tpose_from,
         "up": rigmap.up,
         "facing": rigmap.facing,
         **_describe_file(motion),
         "joints": joints,
-        "known_by": {} if found is None else {c: how.value for c, how in found.known_by.items() if joints[c]},
-        "unmapped": [] if found is None else list(found.unmapped),
+        "known_by": {c: how.value for c, how in found.known_by.items() if joints[c]},
+        "unmapped": list(found.unmapped),
     }
 
 

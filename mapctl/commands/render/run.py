@@ -5,8 +5,8 @@ from mapctl.commands.shared import inputs, options, outputs
 from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.curves import Curve
 from mapctl.motion import Motion
+from mapctl.retarget import put_upright
 from mapctl.retarget.rigs import Rig
-from mapctl.retarget.upright import put_upright
 from scenes.cameras import CameraSettings
 from scenes.drawn_character import DrawnCharacter
 from scenes.film import film

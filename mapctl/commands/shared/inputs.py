@@ -15,7 +15,7 @@ from mapctl.formats.text import warn_once
 from mapctl.motion import Motion
 from mapctl.recording.masks import Mask, masks_from_missing
 from mapctl.retarget import figure, identify_rig, load_rig
-from mapctl.retarget.recognition.doubts import assess_fit
+from mapctl.retarget.doubts import assess_fit
 from mapctl.retarget.rigs import Rig, parse_unit
 from priors.licences import note_licence
 

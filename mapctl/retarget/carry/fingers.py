@@ -61,8 +61,7 @@ def _find_rest(rigmap: RigMap) -> list[tuple[Tensor, Tensor]]:
     canonical = {joint: rigmap.tpose_quat_xyzw[c] for c, joint in enumerate(rigmap.joint_of) if joint is not None}
     world, found = [], []
     for joint, parent in enumerate(rigmap.rig_skeleton.parents):
-        idle = still if rigmap.idle_quat_xyzw is None else rigmap.idle_quat_xyzw[joint]
-        above = still if parent < 0 else world[parent]
+        idle, above = rigmap.idle_quat_xyzw[joint], still if parent < 0 else world[parent]
         found.append((above, idle))
         world.append(canonical[joint] if joint in canonical else rotations.multiply(above, idle))
     return found

@@ -69,9 +69,8 @@ def find_carriers(rigmap: RigMap) -> Array:
     """Return by joint of a rig the joint with which it moves as one: itself if it is a canonical one, or rests in
     another pose than the file's; else that of its parent, as fingers move with their hand."""
     parents, moving = rigmap.rig_skeleton.parents, set(rigmap.joints.values())
-    if rigmap.idle_quat_xyzw is not None:
-        still = rigmap.idle_quat_xyzw[:, 3].abs() > 1 - 1e-9
-        moving |= {joint for joint in range(len(parents)) if not still[joint]}
+    still = rigmap.idle_quat_xyzw[:, 3].abs() > 1 - 1e-9
+    moving |= {joint for joint in range(len(parents)) if not still[joint]}
     found: list[int] = []
     for joint, parent in enumerate(parents):
         found.append(joint if joint in moving or parent < 0 else found[parent])

@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mapctl.retarget import topology
 from mapctl.retarget.rig_poses import RigPoses, unit_vectors
+from mapctl.retarget.topology import descendants, find_limb_pairs, match_by_tree
 from mapctl.skeleton import Skeleton
 
 _ANIMAL = re.compile(
@@ -53,7 +53,7 @@ def find_second_body(poses: RigPoses, joints: Mapping[str, int]) -> int | None:
     parents = (-1, *(place.get(skeleton.parents[joint], 0) for joint in rest))
     offsets = torch.cat([torch.zeros(1, 3, dtype=skeleton.offsets.dtype), skeleton.offsets[rest]])
     ends = {name: end for name, end in skeleton.end_offsets.items() if skeleton.index(name) in place}
-    other = topology.match_by_tree(Skeleton(("", *(skeleton.names[j] for j in rest)), parents, offsets, ends))
+    other = match_by_tree(Skeleton(("", *(skeleton.names[j] for j in rest)), parents, offsets, ends))
     if "hips" not in other or other["hips"] == 0:
         return None
     hips = rest[other["hips"] - 1]
@@ -64,11 +64,11 @@ def find_second_body(poses: RigPoses, joints: Mapping[str, int]) -> int | None:
 def find_further_limbs(skeleton: Skeleton, joints: Mapping[str, int]) -> tuple[int, int] | None:
     """Find a pair of limbs as long as the arms that hangs from the trunk beside arms and legs; None where none does."""
     trunk = [joints[name] for name in ("hips", "spine", "chest", "neck") if name in joints]
-    inside = {joint for joint in _descendants(skeleton, {joints["hips"]}) if _descendants(skeleton, {joint}) & {*trunk}}
+    inside = {joint for joint in descendants(skeleton, {joints["hips"]}) if descendants(skeleton, {joint}) & {*trunk}}
     limbs = {joint for name, joint in joints.items() if joint not in trunk and name != "head"}
     for joint in sorted({*trunk, *inside}):
-        for first, second in topology.find_limb_pairs(skeleton, joint, at_least=_LIMB_SHARE * _arm(skeleton, joints)):
-            if not _descendants(skeleton, {first, second}) & limbs:
+        for first, second in find_limb_pairs(skeleton, joint, at_least=_LIMB_SHARE * _arm(skeleton, joints)):
+            if not descendants(skeleton, {first, second}) & limbs:
                 return first, second
     return None
 
@@ -83,21 +83,12 @@ def _arm(skeleton: Skeleton, joints: Mapping[str, int]) -> float:
 
 def _outside(skeleton: Skeleton, joints: set[int]) -> list[int]:
     """Return the joints that are neither these nor above or below one of them."""
-    near = _descendants(skeleton, joints)
+    near = descendants(skeleton, joints)
     for joint in joints:
         while joint >= 0:
             near.add(joint)
             joint = skeleton.parents[joint]
     return [joint for joint in range(skeleton.num_joints) if joint not in near]
-
-
-def _descendants(skeleton: Skeleton, joints: set[int]) -> set[int]:
-    """Return the joints and all below them."""
-    found = set(joints)
-    for child, parent in enumerate(skeleton.parents):
-        if parent in found:
-            found.add(child)
-    return found
 
 
 def _is_on_all_fours(poses: RigPoses) -> Bool[Tensor, " poses"]:

@@ -1,22 +1,28 @@
-"""What is doubtful about how a rig was understood: each reason in a sentence, with the joints that it is about."""
+"""What is doubtful about how a rig was understood: each reason in a sentence, with the joints that it is about.
+
+Names, tree and bones are those of one two-legged person, and the T-pose agrees with the clip.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
+from mapctl import rotations
 from mapctl.formats.units import FileUnit
 from mapctl.joint_names import Part, Side
 from mapctl.joint_roles import classify_joints
 from mapctl.motion import Motion
 from mapctl.retarget import RigMap
 from mapctl.retarget.anatomy import MIN_FRONT, measure_front
+from mapctl.retarget.body_plan import find_further_limbs, find_second_body, stays_on_all_fours
 from mapctl.retarget.joint_matching import HELPER_NAME, KnownBy, Match
-from mapctl.retarget.recognition import body_plan, proportions
-from mapctl.retarget.recognition.doubt import Doubt
 from mapctl.retarget.rig_poses import RigPoses
-from mapctl.skeleton import mirror_name
+from mapctl.skeleton import CANONICAL, Skeleton, mirror_name
 
 _MAX_LISTED = 4  # joints that have a line each; of more there is one line
 _MAX_SPEED = 12.0  # m/s of the hips, median over a second, of people on foot
@@ -48,6 +54,28 @@ _PARTS = {
     "Foot": {Part.FOOT},
     "Toes": {Part.TOES, Part.FOOT},
 }
+_HALVES = (0.5, 2.0)  # of an upper limb's bone by the lower one
+_SIDE_RATIO = 1.2  # of a bone by that of the other side
+_MIN_DIFFERENCE = 0.02  # metres by which bones of both sides differ at least, to differ
+_ARM_BY_LEG = (0.35, 1.4)
+_TRUNK_BY_LEG = (0.25, 1.4)
+_HIPS_METRES = (0.4, 1.6)  # metres of the hips over the toes, of people
+_MAX_SINK = 0.03  # metres that a joint of the trunk may be under the one before
+_NO_BONE = 0.01  # metres of a bone that is none
+_UPRIGHT = 0.5  # cosine between a body and the vertical, below which it lies
+
+Places = dict[str, Float[Tensor, "3"]]
+"""Positions in the T-pose by canonical name, metres, Y up, facing +Z."""
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """A reason to doubt that a rig was understood."""
+
+    reason: str
+    """The reason, a sentence without a full stop."""
+    joints: tuple[str, ...] = ()
+    """Canonical joints that it is about; empty where it is about the whole body."""
 
 
 @dataclass(frozen=True)
@@ -71,8 +99,6 @@ class Fit:
 def assess_fit(rigmap: RigMap, motion: Motion | None = None) -> Fit:
     """Assess how sure it is that a rig was understood, by its names, its tree, its bones and a motion of it."""
     found = rigmap.match
-    if found is None:
-        return Fit(())
     zero = RigPoses.zero(rigmap.rig_skeleton, found.joint_of)
     clip = None if motion is None else RigPoses.of(motion, found.joint_of)
     doubts: list[Doubt] = []
@@ -87,8 +113,8 @@ def assess_fit(rigmap: RigMap, motion: Motion | None = None) -> Fit:
         partial(_find_skipped_joints, rigmap, found),
         partial(_compare_knowledge, rigmap, found),
         partial(_find_single_sides, rigmap),
-        partial(proportions.check_bones, rigmap.skeleton),
-        partial(proportions.check_poses, rigmap, clip),
+        partial(_check_bones, rigmap.skeleton),
+        partial(_check_poses, rigmap, clip),
     ):
         doubts += look()
     return Fit(tuple(doubts))
@@ -111,12 +137,12 @@ def _check_unit(rigmap: RigMap, motion: Motion | None) -> Iterator[Doubt]:
 
 def _find_other_bodies(rigmap: RigMap, poses: RigPoses) -> Iterator[Doubt]:
     """Find a second body in the file, and a second pair of arms on this one."""
-    other = body_plan.find_second_body(poses, rigmap.joints)
+    other = find_second_body(poses, rigmap.joints)
     if other is not None:
         yield Doubt(f"another body is in the file, with hips {_quote(rigmap, other)}; only one is used", ("hips",))
-    if rigmap.match is not None and all(how is KnownBy.LIST for how in rigmap.match.known_by.values()):
+    if all(how is KnownBy.LIST for how in rigmap.match.known_by.values()):
         return
-    pair = body_plan.find_further_limbs(rigmap.rig_skeleton, rigmap.joints)
+    pair = find_further_limbs(rigmap.rig_skeleton, rigmap.joints)
     if pair is not None:
         names = " and ".join(_quote(rigmap, joint) for joint in pair)
         yield Doubt(f"a further pair of limbs hangs from the trunk: {names}", ("leftUpperArm", "rightUpperArm"))
@@ -260,3 +286,95 @@ def _split(name: str) -> tuple[str, str]:
 
 def _quote(rigmap: RigMap, joint: int) -> str:
     return repr(rigmap.rig_skeleton.names[joint])
+
+
+def _check_bones(skeleton: Skeleton) -> Iterator[Doubt]:
+    """Check the bones of canonical joints, as they are in the T-pose that was found."""
+    places = _tpose_places(skeleton)
+    yield from _compare_halves(skeleton)
+    yield from _compare_side_lengths(skeleton)
+    yield from _compare_limbs(places)
+    yield from _check_order(places)
+
+
+def _check_poses(rigmap: RigMap, clip: RigPoses | None) -> Iterator[Doubt]:
+    """Check what a clip shows: an upright body, and a T-pose that agrees with it."""
+    if clip is None:
+        return
+    up = clip.up()
+    if rigmap.upright_quat_xyzw is not None:
+        up = rotations.rotate(rigmap.upright_quat_xyzw.expand(len(up), 4), up)
+    if stays_on_all_fours(clip):
+        yield Doubt("hands stand beside the feet under a level trunk in the whole clip: this may be an animal")
+    elif float(up[:, 1].median()) < _UPRIGHT:
+        yield Doubt(f"the body lies or hangs upside down in most frames if {rigmap.up} is up")
+    if rigmap.tpose_doubt:
+        yield Doubt(rigmap.tpose_doubt)
+
+
+def _compare_halves(skeleton: Skeleton) -> Iterator[Doubt]:
+    for side in ("left", "right"):
+        for limb, upper, lower in (("arm", "LowerArm", "Hand"), ("leg", "LowerLeg", "Foot")):
+            halves = _length(skeleton, side + upper), _length(skeleton, side + lower)
+            joints = (side + upper, side + lower)
+            if min(halves) < _NO_BONE:
+                yield Doubt(f"{joints[halves.index(min(halves))]} is in the place of the joint above it", joints)
+            elif not _HALVES[0] <= halves[0] / halves[1] <= _HALVES[1]:
+                centimetres = " and ".join(f"{100 * half:.0f} cm" for half in halves)
+                yield Doubt(f"the {side} {limb} has halves of {centimetres}", joints)
+
+
+def _compare_side_lengths(skeleton: Skeleton) -> Iterator[Doubt]:
+    for name in CANONICAL.names:
+        if name.startswith("left") and not name.endswith(("Toes", "Shoulder")):
+            other = name.replace("left", "right")
+            own, theirs = _length(skeleton, name), _length(skeleton, other)
+            short, long = sorted((own, theirs))
+            if long > _SIDE_RATIO * short and long - short > _MIN_DIFFERENCE:
+                said = f"{100 * own:.0f} and {100 * theirs:.0f} cm"
+                yield Doubt(f"the bones to {name} and {other} differ: {said}", (name, other))
+
+
+def _compare_limbs(places: Places) -> Iterator[Doubt]:
+    legs = [_way(places, side + "UpperLeg", side + "LowerLeg", side + "Foot") for side in ("left", "right")]
+    arms = [_way(places, side + "UpperArm", side + "LowerArm", side + "Hand") for side in ("left", "right")]
+    leg, arm = sum(legs) / 2, sum(arms) / 2
+    if leg < _NO_BONE:
+        return
+    trunk = float(((places["leftUpperArm"] + places["rightUpperArm"]) / 2 - places["hips"]).norm())
+    for name, own, allowed in (("arms", arm, _ARM_BY_LEG), ("trunk", trunk, _TRUNK_BY_LEG)):
+        if not allowed[0] <= own / leg <= allowed[1]:
+            verb = "are" if name == "arms" else "is"
+            yield Doubt(f"{name} {verb} {100 * own:.0f} cm long and legs {100 * leg:.0f} cm")
+    low = min(float(places[side + "Toes"][1]) for side in ("left", "right"))
+    height = float(places["hips"][1]) - low
+    if not _HIPS_METRES[0] <= height <= _HIPS_METRES[1]:
+        yield Doubt(f"hips are {height:.2f} m over the toes: the unit may be wrong")
+
+
+def _check_order(places: Places) -> Iterator[Doubt]:
+    """Check that the trunk goes up, shoulders are over the hips, and left is on the left."""
+    trunk = [name for name in ("hips", "spine", "chest", "neck", "head") if name in places]
+    for below, above in pairwise(trunk):
+        if float(places[above][1] - places[below][1]) < -_MAX_SINK:
+            yield Doubt(f"{above} is below {below} in the T-pose", (below, above))
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        if float(places[side + "UpperArm"][1]) < float(places["hips"][1]):
+            yield Doubt(f"{side}UpperArm is below the hips in the T-pose", (side + "UpperArm",))
+        for part in ("UpperArm", "UpperLeg"):
+            if sign * float(places[side + part][0] - places["hips"][0]) < -_NO_BONE:
+                yield Doubt(f"{side + part} is on the other side of the hips", (side + part,))
+
+
+def _tpose_places(skeleton: Skeleton) -> Places:
+    positions = RigPoses.zero(skeleton, range(CANONICAL.num_joints)).positions[0]
+    return dict(zip(CANONICAL.names, positions, strict=True))
+
+
+def _length(skeleton: Skeleton, name: str) -> float:
+    """Return the length of the bone that leads to a canonical joint, metres."""
+    return float(skeleton.offsets[CANONICAL.index(name)].norm())
+
+
+def _way(places: Places, *names: str) -> float:
+    return sum(float((places[b] - places[a]).norm()) for a, b in pairwise(names))
