@@ -93,7 +93,8 @@ def identify_rig(skeleton: Skeleton, rig: Rig | None = None, *, motion: Motion |
     clip = None if motion is None else RigPoses.of(motion, found.joint_of)
     # The canonical names in a T-pose are the canonical body, whatever it does.
     stated = stated or (found.rig.name == "canonical" and is_canonical_tpose(zero))
-    tpose = find_tpose(zero, clip, rig=found.rig, stated=stated, up=None if character is None else "y")
+    up, own = (None, None) if character is None else ("y", torch.from_numpy(character.frames.quat_xyzw))
+    tpose = find_tpose(zero, clip, rig=found.rig, stated=stated, up=up, own=own)
     rigmap = RigMap(
         **vars(tpose),
         rig=found.rig,

@@ -123,17 +123,26 @@ class _Builder:
             self.frames[name] = self.frames[above] if near else self.measured[name]
 
 
-def estimate_frames(clip: RigPoses, upright: Float[Tensor, "4"] | None) -> Anatomy:
+def estimate_frames(
+    clip: RigPoses, upright: Float[Tensor, "4"] | None, own: Float[Tensor, "rigged 4"] | None = None
+) -> Anatomy:
     """Estimate the frames of all joints that the rig has; `upright` takes the file's world to one with Y up.
 
     Where the axes of all joints of CORE are near the canonical ones, the rig is built in quarter turns, and its joints
-    are rounded to them.
+    are rounded to them. `own` is the rotation (xyzw) of each joint's own axes in the file against those of the poses.
     """
+    axes = None if own is None else rotations.to_matrix(own)
     turns = rotations.to_matrix(clip.orientations)
+    turns = turns if axes is None else turns @ axes
     found, certain = _orient_joints(_Builder(clip, turns), upright)
     if all(_is_near_quarter_turn(found.frames[name]) for name in CORE if clip.has(name)):
         found, _ = _orient_joints(_Builder(clip, turns, in_quarter_turns=True), upright)
-    return Anatomy(found.frames, certain, found.in_quarter_turns)
+    frames = found.frames
+    if axes is not None:
+        frames, certain = (
+            {name: frame @ axes[clip.joint(name)].T for name, frame in some.items()} for some in (frames, certain)
+        )
+    return Anatomy(frames, certain, found.in_quarter_turns)
 
 
 def _orient_joints(found: _Builder, upright: Tensor | None) -> tuple[_Builder, dict[str, Tensor]]:

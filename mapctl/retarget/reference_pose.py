@@ -54,10 +54,19 @@ class TPose:
     """Why the T-pose may be wrong, a sentence without a full stop; empty where it agrees with the clip."""
 
 
-def find_tpose(zero: RigPoses, clip: RigPoses | None, *, rig: Rig, stated: bool, up: str | None = None) -> TPose:
+def find_tpose(
+    zero: RigPoses,
+    clip: RigPoses | None,
+    *,
+    rig: Rig,
+    stated: bool,
+    up: str | None = None,
+    own: Float[Tensor, "rigged 4"] | None = None,
+) -> TPose:
     """Find the T-pose of a rig. What a user `stated` about it is taken as it is; what a preset has is evidence.
 
-    `up` is the up axis that the file declares; one that the rig sets wins.
+    `up` is the up axis that the file declares; one that the rig sets wins. `own` is the rotation (xyzw) of each joint's
+    axes in the file against those of the poses.
     """
     facing = None if rig.facing == "auto" else axis_vector(rig.facing)
     front = _facing_rotation(zero, facing)
@@ -81,7 +90,7 @@ def find_tpose(zero: RigPoses, clip: RigPoses | None, *, rig: Rig, stated: bool,
     if clip is None:
         quats, idle, found = (*readings, (_lay_out_tpose(zero, front), _unrotated(zero), "rest pose"))[0]
         return choose(found, quats, idle)
-    anatomy, refused = estimate_frames(clip, upright), ""
+    anatomy, refused = estimate_frames(clip, upright, own), ""
     for quats, idle, found in readings:
         contradicted = anatomy.find_contradictions(quats)
         doubt = f"{_describe_angles(contradicted)} off in the {found} by how the body moves" if contradicted else ""
