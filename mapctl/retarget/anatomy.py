@@ -32,6 +32,7 @@ _PITCH_WEIGHT = 0.02  # of the canonical foot's pitch against the share of frame
 _MAX_PITCH = math.radians(70)  # of the bone of a flat foot: an End Site may be straight under the ankle
 _REST_WEIGHT = 1.25  # of a standing rest pose against an upright trunk; hanging arms weigh half as much as the trunk
 _Y_UP_WEIGHT = 0.25  # of what most files have
+_STANDING = 0.8  # cosine between the thighs and the body's down in a pose that stands
 _NO_LINE = 1e-3  # metres between two joints below which they are one
 _X, _Y, _Z = torch.eye(3, dtype=torch.float64)
 _SIDES = (("left", 1.0), ("right", -1.0))
@@ -336,8 +337,10 @@ def measure_front(poses: RigPoses) -> Float[Tensor, " poses"]:
 
 def are_sides_swapped(zero: RigPoses, clip: RigPoses | None) -> bool:
     """Return whether the joints named left are on the right: by the clip where it shows the body's front, else by the
-    pose with all rotations zero."""
-    shown = [float(measure_front(poses).mean()) for poses in (clip, zero) if poses is not None]
+    pose with all rotations zero where that has legs below the trunk."""
+    thighs = unit_vectors(_bone(zero, "leftUpperLeg") + _bone(zero, "rightUpperLeg"))
+    stands = float((thighs * zero.up()).sum()) < -_STANDING
+    shown = [float(measure_front(poses).mean()) for poses in (clip, zero if stands else None) if poses is not None]
     sure = [vote for vote in shown if abs(vote) > MIN_FRONT]
     return bool(sure) and sure[0] < 0
 
