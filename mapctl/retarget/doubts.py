@@ -107,7 +107,6 @@ def assess_fit(rigmap: RigMap, motion: Motion | None = None) -> Fit:
         partial(_find_other_bodies, rigmap, clip or zero),
         partial(_find_wrong_order, rigmap),
         partial(_compare_sides, rigmap, found, zero, clip),
-        partial(_list_rivals, rigmap, found),
         partial(_list_joints_by_place, rigmap, found),
         partial(_compare_words, rigmap, found),
         partial(_find_skipped_joints, rigmap, found),
@@ -184,13 +183,6 @@ def _are_arms_turned(poses: RigPoses) -> bool:
     arms = poses.position("leftUpperArm") - poses.position("rightUpperArm")
     legs = poses.position("leftUpperLeg") - poses.position("rightUpperLeg")
     return float(torch.nn.functional.cosine_similarity(arms, legs, dim=-1).median()) < -MIN_FRONT
-
-
-def _list_rivals(rigmap: RigMap, found: Match) -> Iterator[Doubt]:
-    """List presets that fit as well as the one that was taken."""
-    for rival, name in found.rivals:
-        own = _quote(rigmap, rigmap.joints[name])
-        yield Doubt(f"the rig {rival} fits as well, and has another joint than {own} for {name}", (name,))
 
 
 def _list_joints_by_place(rigmap: RigMap, found: Match) -> Iterator[Doubt]:

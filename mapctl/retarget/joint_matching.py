@@ -31,7 +31,6 @@ REQUIRED = (
 
 _ABSENT, _SWAPPED = 0.4, 0.9
 _ARMS_ON_CHEST = 0.5  # joints that a chest from which the shoulders hang is worth
-_NEAR = 0.05  # joints by which a rig may fit less well and still be as near
 _MIN_PREFIXED = 5  # joints whose names begin alike, from which this is a prefix
 _BEGINNING = re.compile(r"[^_:|.\- ]+[_:|.\- ](?=.)")  # of a name, up to its first separator
 HELPER_NAME = re.compile(
@@ -74,8 +73,6 @@ class Match:
     """Whether joints named left are on the right."""
     known_by: Mapping[str, KnownBy] = field(default_factory=dict)
     """What each canonical joint that the rig has is known by."""
-    rivals: tuple[tuple[str, str], ...] = ()
-    """Other listed rigs that fit as well and take another joint for a canonical one: each with that canonical name."""
 
 
 def match(skeleton: Skeleton, rig: Rig | None = None, *, motion: Motion | None = None) -> Match:
@@ -85,8 +82,7 @@ def match(skeleton: Skeleton, rig: Rig | None = None, *, motion: Motion | None =
     reached or a joint of REQUIRED is not found, naming what is missing.
     """
     given = rig if rig is not None and rig.joints else None
-    listed = _find_listed_rig(skeleton) if given is None else _Listed(given, _match_by_rig(given, skeleton))
-    chosen, found = (listed.rig, dict(listed.joints)) if listed else (None, {})
+    chosen, found = _find_listed_rig(skeleton) if given is None else (given, _match_by_rig(given, skeleton))
     if given is not None:
         _check_given(given, found, skeleton)
     known = dict.fromkeys(found, KnownBy.LIST)
@@ -101,8 +97,9 @@ def match(skeleton: Skeleton, rig: Rig | None = None, *, motion: Motion | None =
         chosen = Rig("unlisted", {name: skeleton.names[joint] for name, joint in found.items()})
     if rig is not None and given is None:
         chosen = chosen.with_fields_of(rig)
-    joint_of, rivals = tuple(found.get(name) for name in CANONICAL.names), listed.rivals if listed else ()
-    return Match(chosen, joint_of, score, _unmapped(skeleton, found), known_by=known, rivals=rivals)
+    joint_of = tuple(found.get(name) for name in CANONICAL.names)
+    unmapped = tuple(name for joint, name in enumerate(skeleton.names) if joint not in found.values())
+    return Match(chosen, joint_of, score, unmapped, known_by=known)
 
 
 def correct_sides(found: Match, skeleton: Skeleton, motion: Motion | None) -> Match:
@@ -119,35 +116,16 @@ def correct_sides(found: Match, skeleton: Skeleton, motion: Motion | None) -> Ma
     return replace(found, joint_of=joint_of, score=score, sides_exchanged=named, known_by=known)
 
 
-@dataclass(frozen=True)
-class _Listed:
-    """The listed rig that fits a skeleton best."""
-
-    rig: Rig
-    """The rig."""
-    joints: Mapping[str, int]
-    """The skeleton's joint by canonical name."""
-    rivals: tuple[tuple[str, str], ...] = ()
-    """Other listed rigs that fit as well and take another joint for some canonical one: each with that canonical
-    name."""
-
-
-def _find_listed_rig(skeleton: Skeleton) -> _Listed | None:
-    """Find the listed rig that explains most of the skeleton, if one has all joints of REQUIRED."""
+def _find_listed_rig(skeleton: Skeleton) -> tuple[Rig | None, dict[str, int]]:
+    """Find the listed rig that explains most of the skeleton, if one has all joints of REQUIRED, and its joints."""
     fits: list[tuple[float, Rig, dict[str, int]]] = []
     plain = {normalise_name(name) for name in skeleton.names}
     for rig in known_rigs():
         found = _match_by_rig(rig, skeleton)
         complete = all(name in found for name in REQUIRED)
-        if not complete or (rig.name == "canonical" and not rig.fits(skeleton)):
-            continue
-        fits.append((_measure_fit(rig, found, skeleton, plain), rig, found))
-    if not fits:
-        return None
-    best, rig, joints = max(fits, key=lambda fit: fit[0])
-    near = [(other.name, found) for fit, other, found in fits if fit >= best - _NEAR]
-    differing = [(name, [c for c in joints if found.get(c, joints[c]) != joints[c]]) for name, found in near]
-    return _Listed(rig, joints, tuple((name, canonical[0]) for name, canonical in differing if canonical))
+        if complete and (rig.name != "canonical" or rig.fits(skeleton)):
+            fits.append((_measure_fit(rig, found, skeleton, plain), rig, found))
+    return max(fits, key=lambda fit: fit[0])[1:] if fits else (None, {})
 
 
 def _match_by_rig(rig: Rig, skeleton: Skeleton) -> dict[str, int]:
@@ -313,11 +291,6 @@ def _assign_sides(
             across = -across
         left = across
     return by_tree
-
-
-def _unmapped(skeleton: Skeleton, found: Mapping[str, int]) -> tuple[str, ...]:
-    used = set(found.values())
-    return tuple(name for joint, name in enumerate(skeleton.names) if joint not in used)
 
 
 def _check_given(rig: Rig, found: Mapping[str, int], skeleton: Skeleton) -> None:

@@ -118,19 +118,6 @@ def test_a_name_of_another_part_contradicts_a_place():
     assert verdict == REFUSED or "whose name is that of a" in why
 
 
-def test_presets_that_fit_as_well_and_take_another_joint_are_named(monkeypatch):
-    mixamo = retarget.load_rig("mixamo")
-    twin = replace(mixamo, name="twin", joints={**mixamo.joints, "chest": "mixamorig:Spine1"}, aliases={})
-    monkeypatch.setattr("mapctl.retarget.joint_matching.known_rigs", lambda: (mixamo, twin))
-    names = names_of("mixamo")
-    # With the shoulders on neither of the two, nothing decides between them.
-    wish = Make(names, between={"chest": ("mixamorig:Spine1",)}, extras=False)
-    wish = replace(wish, hanging={"leftShoulder": names["neck"], "rightShoulder": names["neck"]})
-    verdict, why, _ = judge(make(wish).motion(person(1.0, 10)))
-    assert verdict == DOUBTFUL
-    assert "the rig twin fits as well, and has another joint than 'mixamorig:Spine2' for chest" in why
-
-
 def test_a_clip_without_bent_knees_leaves_the_twist_of_limbs_open():
     made = make(Make(names_of("mixamo"), bones_along_x=True))
     stiff = replace(person(1.0, 20), local_quat_xyzw=torch.tensor([0.0, 0, 0, 1]).double().expand(20, 21, 4).clone())
