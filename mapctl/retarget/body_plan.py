@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl.retarget.rig_poses import RigPoses, unit_vectors
-from mapctl.retarget.topology import descendants, find_limb_pairs, match_by_tree
+from mapctl.retarget.topology import ancestors, descendants, find_limb_pairs, match_by_tree, path_below
 from mapctl.skeleton import Skeleton
 
 _ANIMAL = re.compile(
@@ -48,7 +48,8 @@ def find_second_body(poses: RigPoses, joints: Mapping[str, int]) -> int | None:
     A second set of joints in the same place, as the controls of a rig are, is no other body.
     """
     skeleton = poses.skeleton
-    rest = _outside(skeleton, set(joints.values()))
+    near = descendants(skeleton, joints.values()) | ancestors(skeleton, joints.values())
+    rest = [joint for joint in range(skeleton.num_joints) if joint not in near]
     place = {joint: number for number, joint in enumerate([-1, *rest])}
     parents = (-1, *(place.get(skeleton.parents[joint], 0) for joint in rest))
     offsets = torch.cat([torch.zeros(1, 3, dtype=skeleton.offsets.dtype), skeleton.offsets[rest]])
@@ -66,29 +67,13 @@ def find_further_limbs(skeleton: Skeleton, joints: Mapping[str, int]) -> tuple[i
     trunk = [joints[name] for name in ("hips", "spine", "chest", "neck") if name in joints]
     inside = {joint for joint in descendants(skeleton, {joints["hips"]}) if descendants(skeleton, {joint}) & {*trunk}}
     limbs = {joint for name, joint in joints.items() if joint not in trunk and name != "head"}
+    arm = path_below(skeleton, joints["leftUpperArm"], joints.get("leftHand", joints["leftLowerArm"]))
+    length = float(skeleton.offsets[arm].norm(dim=-1).sum())
     for joint in sorted({*trunk, *inside}):
-        for first, second in find_limb_pairs(skeleton, joint, at_least=_LIMB_SHARE * _arm(skeleton, joints)):
+        for first, second in find_limb_pairs(skeleton, joint, at_least=_LIMB_SHARE * length):
             if not descendants(skeleton, {first, second}) & limbs:
                 return first, second
     return None
-
-
-def _arm(skeleton: Skeleton, joints: Mapping[str, int]) -> float:
-    """Return the length of the left arm, metres."""
-    length, joint = 0.0, joints.get("leftHand", joints["leftLowerArm"])
-    while joint not in (joints["leftUpperArm"], -1):
-        length, joint = length + float(skeleton.offsets[joint].norm()), skeleton.parents[joint]
-    return length
-
-
-def _outside(skeleton: Skeleton, joints: set[int]) -> list[int]:
-    """Return the joints that are neither these nor above or below one of them."""
-    near = descendants(skeleton, joints)
-    for joint in joints:
-        while joint >= 0:
-            near.add(joint)
-            joint = skeleton.parents[joint]
-    return [joint for joint in range(skeleton.num_joints) if joint not in near]
 
 
 def _is_on_all_fours(poses: RigPoses) -> Bool[Tensor, " poses"]:

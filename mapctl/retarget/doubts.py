@@ -5,12 +5,9 @@ Names, tree and bones are those of one two-legged person, and the T-pose agrees 
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
 from itertools import pairwise
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from mapctl import rotations
 from mapctl.formats.units import FileUnit
@@ -20,9 +17,11 @@ from mapctl.motion import Motion
 from mapctl.retarget import RigMap
 from mapctl.retarget.anatomy import MIN_FRONT, measure_front
 from mapctl.retarget.body_plan import find_further_limbs, find_second_body, stays_on_all_fours
-from mapctl.retarget.joint_matching import HELPER_NAME, KnownBy, Match
+from mapctl.retarget.joint_matching import HELPER_NAME, KnownBy
 from mapctl.retarget.rig_poses import RigPoses
-from mapctl.skeleton import CANONICAL, Skeleton, mirror_name
+from mapctl.retarget.stance import SIDES
+from mapctl.retarget.topology import path_below
+from mapctl.skeleton import CANONICAL, LIMBS, Skeleton, mirror_name
 
 _MAX_LISTED = 4  # joints that have a line each; of more there is one line
 _MAX_SPEED = 12.0  # m/s of the hips, median over a second, of people on foot
@@ -64,9 +63,6 @@ _MAX_SINK = 0.03  # metres that a joint of the trunk may be under the one before
 _NO_BONE = 0.01  # metres of a bone that is none
 _UPRIGHT = 0.5  # cosine between a body and the vertical, below which it lies
 
-Places = dict[str, Float[Tensor, "3"]]
-"""Positions in the T-pose by canonical name, metres, Y up, facing +Z."""
-
 
 @dataclass(frozen=True)
 class Doubt:
@@ -98,25 +94,27 @@ class Fit:
 
 def assess_fit(rigmap: RigMap, motion: Motion | None = None) -> Fit:
     """Assess how sure it is that a rig was understood, by its names, its tree, its bones and a motion of it."""
-    found = rigmap.match
-    zero = RigPoses.zero(rigmap.rig_skeleton, found.joint_of)
-    clip = None if motion is None else RigPoses.of(motion, found.joint_of)
-    doubts: list[Doubt] = []
-    for look in (
-        partial(_check_unit, rigmap, motion),
-        partial(_find_other_bodies, rigmap, clip or zero),
-        partial(_find_wrong_order, rigmap),
-        partial(_compare_sides, rigmap, found, zero, clip),
-        partial(_list_joints_by_place, rigmap, found),
-        partial(_compare_words, rigmap, found),
-        partial(_find_skipped_joints, rigmap, found),
-        partial(_compare_knowledge, rigmap, found),
-        partial(_find_single_sides, rigmap),
-        partial(_check_bones, rigmap.skeleton),
-        partial(_check_poses, rigmap, clip),
-    ):
-        doubts += look()
-    return Fit(tuple(doubts))
+    zero = RigPoses.zero(rigmap.rig_skeleton, rigmap.joint_of)
+    clip = None if motion is None else RigPoses.of(motion, rigmap.joint_of)
+    body = RigPoses.zero(rigmap.skeleton)
+    return Fit(
+        (
+            *_check_unit(rigmap, motion),
+            *_find_other_bodies(rigmap, clip or zero),
+            *_find_wrong_order(rigmap),
+            *_compare_sides(rigmap, zero, clip),
+            *_list_joints_by_place(rigmap),
+            *_compare_words(rigmap),
+            *_find_skipped_joints(rigmap),
+            *_compare_knowledge(rigmap),
+            *_find_single_sides(rigmap),
+            *_compare_halves(rigmap.skeleton),
+            *_compare_side_lengths(rigmap.skeleton),
+            *_compare_limbs(body),
+            *_check_order(body),
+            *_check_poses(rigmap, clip),
+        )
+    )
 
 
 def _check_unit(rigmap: RigMap, motion: Motion | None) -> Iterator[Doubt]:
@@ -149,45 +147,39 @@ def _find_other_bodies(rigmap: RigMap, poses: RigPoses) -> Iterator[Doubt]:
 
 def _find_wrong_order(rigmap: RigMap) -> Iterator[Doubt]:
     """Find joints of a limb or of the trunk that do not hang from the one before."""
-    joints, parents = rigmap.joints, rigmap.rig_skeleton.parents
+    joints = rigmap.joints
     for name, joint in joints.items():
         side, part = _split(name)
         above = next((side + upper for upper in _BELOW.get(part, ()) if side + upper in joints), None)
-        while above is not None and joint >= 0 and joint != joints[above]:
-            joint = parents[joint]
-        if above is not None and joint < 0:
-            own, upper = _quote(rigmap, joints[name]), _quote(rigmap, joints[above])
+        if above is not None and not path_below(rigmap.rig_skeleton, joints[above], joint):
+            own, upper = _quote(rigmap, joint), _quote(rigmap, joints[above])
             yield Doubt(f"{name} {own} does not hang from {above} {upper}", (name,))
 
 
-def _compare_sides(rigmap: RigMap, found: Match, zero: RigPoses, clip: RigPoses | None) -> Iterator[Doubt]:
+def _compare_sides(rigmap: RigMap, zero: RigPoses, clip: RigPoses | None) -> Iterator[Doubt]:
     """Compare the sides that names tell with each other and with where the toes point."""
-    if found.sides_exchanged:
+    exchanged = rigmap.match.sides_exchanged
+    if exchanged:
         yield Doubt("joints called left are on the right, by where the toes point; places win over names", ())
     roles = classify_joints(rigmap.rig_skeleton)
     named = [name for name, joint in rigmap.joints.items() if roles[joint].side is not Side.MIDDLE]
     for name in named:
         told = roles[rigmap.joints[name]].side.value
-        told = told if not found.sides_exchanged else mirror_name(told)
+        told = mirror_name(told) if exchanged else told
         if not name.startswith(told):
             yield Doubt(f"{name} is {_quote(rigmap, rigmap.joints[name])}, a name of the other side", (name,))
-    if _are_arms_turned(zero if clip is None else clip):
+    poses = clip or zero
+    turned = torch.nn.functional.cosine_similarity(poses.across("UpperArm"), poses.across("UpperLeg"), dim=-1)
+    if float(turned.median()) < -MIN_FRONT:
         yield Doubt("the left arm is on the side of the right leg", ("leftUpperArm", "rightUpperArm"))
-    front = max(abs(float(measure_front(poses).mean())) for poses in (zero, clip or zero))
+    front = max(abs(float(measure_front(poses).mean())) for poses in (zero, poses))
     if not named and front < MIN_FRONT:
         yield Doubt("nothing tells the front: no names of sides, no toes; left may be right", ())
 
 
-def _are_arms_turned(poses: RigPoses) -> bool:
-    """Return whether the left arm is on the side of the right leg, in most poses."""
-    arms = poses.position("leftUpperArm") - poses.position("rightUpperArm")
-    legs = poses.position("leftUpperLeg") - poses.position("rightUpperLeg")
-    return float(torch.nn.functional.cosine_similarity(arms, legs, dim=-1).median()) < -MIN_FRONT
-
-
-def _list_joints_by_place(rigmap: RigMap, found: Match) -> Iterator[Doubt]:
+def _list_joints_by_place(rigmap: RigMap) -> Iterator[Doubt]:
     """List the joints whose names tell nothing."""
-    placed = [name for name, how in found.known_by.items() if how is KnownBy.PLACE and name in rigmap.joints]
+    placed = _list_placed(rigmap)
     if len(placed) <= _MAX_LISTED:
         for name in placed:
             yield Doubt(f"{name} is known by its place alone (joint {_quote(rigmap, rigmap.joints[name])})", (name,))
@@ -197,26 +189,28 @@ def _list_joints_by_place(rigmap: RigMap, found: Match) -> Iterator[Doubt]:
     yield Doubt(f"{len(placed)} joints are known by their places alone: {listed} and {more} more", tuple(placed))
 
 
-def _compare_words(rigmap: RigMap, found: Match) -> Iterator[Doubt]:
-    """Compare what the name of a joint says with what its place made it."""
+def _list_placed(rigmap: RigMap) -> list[str]:
+    return [name for name, how in rigmap.match.known_by.items() if how is KnownBy.PLACE]
+
+
+def _compare_words(rigmap: RigMap) -> Iterator[Doubt]:
+    """Compare the part in the name of a joint with what its place made it."""
     roles = classify_joints(rigmap.rig_skeleton)
-    for name, how in found.known_by.items():
-        joint = rigmap.joints.get(name)
-        if how is not KnownBy.PLACE or joint is None:
-            continue
+    for name in _list_placed(rigmap):
+        joint = rigmap.joints[name]
         part = roles[joint].part
         if part is not Part.OTHER and part not in _PARTS[_split(name)[1]]:
             yield Doubt(f"{name} is {_quote(rigmap, joint)}, whose name is that of a {part.value}", (name,))
 
 
-def _find_skipped_joints(rigmap: RigMap, found: Match) -> Iterator[Doubt]:
+def _find_skipped_joints(rigmap: RigMap) -> Iterator[Doubt]:
     """Find joints between the chest and the arms, or within a limb of which no list knows the next joint."""
     told: set[int] = set()
     for name, joint in rigmap.joints.items():
         side, part = _split(name)
         first = part == "Shoulder" or (part == "UpperArm" and side + "Shoulder" not in rigmap.joints)
         above = "chest" if first else side + _BELOW[part][0] if part in _LIMBS else None
-        if above not in rigmap.joints or (above != "chest" and found.known_by.get(name) is KnownBy.LIST):
+        if above not in rigmap.joints or (above != "chest" and rigmap.match.known_by[name] is KnownBy.LIST):
             continue
         between = _joints_between(rigmap, rigmap.joints[above], joint)
         if between and between[0] not in told:
@@ -227,31 +221,27 @@ def _find_skipped_joints(rigmap: RigMap, found: Match) -> Iterator[Doubt]:
 
 def _joints_between(rigmap: RigMap, above: int, joint: int) -> list[int]:
     """Return the joints between two of which one hangs from the other, but for twists and other helpers."""
-    names, parents, between = rigmap.rig_skeleton.names, rigmap.rig_skeleton.parents, []
-    joint = parents[joint]
-    while joint >= 0 and joint != above:
-        between.append(joint)
-        joint = parents[joint]
-    matched = rigmap.joints.values()
-    return [one for one in between if joint == above and one not in matched and not HELPER_NAME.search(names[one])]
+    names, matched = rigmap.rig_skeleton.names, rigmap.joints.values()
+    between = path_below(rigmap.rig_skeleton, above, joint)[-2::-1]
+    return [one for one in between if one not in matched and not HELPER_NAME.search(names[one])]
 
 
-def _compare_knowledge(rigmap: RigMap, found: Match) -> Iterator[Doubt]:
+def _compare_knowledge(rigmap: RigMap) -> Iterator[Doubt]:
     """Compare what both sides are known by: one version of a list, or words alone."""
     for name in rigmap.joints:
         other = mirror_name(name)
-        version, usual = _version(rigmap, found, name), _version(rigmap, found, other)
+        version, usual = _version(rigmap, name), _version(rigmap, other)
         if other in rigmap.joints and version is not None and usual is not None and version > usual:
             own, theirs = _quote(rigmap, rigmap.joints[name]), _quote(rigmap, rigmap.joints[other])
             yield Doubt(f"{name} is {own} and {other} is {theirs}, which is named otherwise", (name,))
 
 
-def _version(rigmap: RigMap, found: Match, name: str) -> int | None:
+def _version(rigmap: RigMap, name: str) -> int | None:
     """Return the version of the rig's list that has the name of a joint, or one more than any where words tell it;
     None where it is spelled otherwise or known by its place."""
-    rig, how = found.rig, found.known_by.get(name)
+    rig, how = rigmap.rig, rigmap.match.known_by.get(name)
     listed = (rig.joints.get(name), *rig.aliases.get(name, ()))
-    if how is KnownBy.WORDS and rig.aliases.keys() | rig.joints.keys() >= {name}:
+    if how is KnownBy.WORDS and name in rig.joints:
         return len(listed)
     own = rigmap.joint_names.get(name)
     return listed.index(own) if how is KnownBy.LIST and own in listed else None
@@ -278,15 +268,6 @@ def _split(name: str) -> tuple[str, str]:
 
 def _quote(rigmap: RigMap, joint: int) -> str:
     return repr(rigmap.rig_skeleton.names[joint])
-
-
-def _check_bones(skeleton: Skeleton) -> Iterator[Doubt]:
-    """Check the bones of canonical joints, as they are in the T-pose that was found."""
-    places = _tpose_places(skeleton)
-    yield from _compare_halves(skeleton)
-    yield from _compare_side_lengths(skeleton)
-    yield from _compare_limbs(places)
-    yield from _check_order(places)
 
 
 def _check_poses(rigmap: RigMap, clip: RigPoses | None) -> Iterator[Doubt]:
@@ -327,46 +308,33 @@ def _compare_side_lengths(skeleton: Skeleton) -> Iterator[Doubt]:
                 yield Doubt(f"the bones to {name} and {other} differ: {said}", (name, other))
 
 
-def _compare_limbs(places: Places) -> Iterator[Doubt]:
-    legs = [_way(places, side + "UpperLeg", side + "LowerLeg", side + "Foot") for side in ("left", "right")]
-    arms = [_way(places, side + "UpperArm", side + "LowerArm", side + "Hand") for side in ("left", "right")]
-    leg, arm = sum(legs) / 2, sum(arms) / 2
+def _compare_limbs(body: RigPoses) -> Iterator[Doubt]:
+    leg, arm = (sum(LIMBS[side + end].length(body.skeleton) for side in SIDES) / 2 for end in ("Foot", "Hand"))
     if leg < _NO_BONE:
         return
-    trunk = float(((places["leftUpperArm"] + places["rightUpperArm"]) / 2 - places["hips"]).norm())
+    trunk = float((body.middle("UpperArm") - body.position("hips")).norm())
     for name, own, allowed in (("arms", arm, _ARM_BY_LEG), ("trunk", trunk, _TRUNK_BY_LEG)):
         if not allowed[0] <= own / leg <= allowed[1]:
             verb = "are" if name == "arms" else "is"
             yield Doubt(f"{name} {verb} {100 * own:.0f} cm long and legs {100 * leg:.0f} cm")
-    low = min(float(places[side + "Toes"][1]) for side in ("left", "right"))
-    height = float(places["hips"][1]) - low
+    height = max(float((body.position("hips") - body.position(side + "Toes"))[0, 1]) for side in SIDES)
     if not _HIPS_METRES[0] <= height <= _HIPS_METRES[1]:
         yield Doubt(f"hips are {height:.2f} m over the toes: the unit may be wrong")
 
 
-def _check_order(places: Places) -> Iterator[Doubt]:
+def _check_order(body: RigPoses) -> Iterator[Doubt]:
     """Check that the trunk goes up, shoulders are over the hips, and left is on the left."""
-    trunk = [name for name in ("hips", "spine", "chest", "neck", "head") if name in places]
-    for below, above in pairwise(trunk):
-        if float(places[above][1] - places[below][1]) < -_MAX_SINK:
+    for below, above in pairwise(("hips", "spine", "chest", "neck", "head")):
+        if float((body.position(above) - body.position(below))[0, 1]) < -_MAX_SINK:
             yield Doubt(f"{above} is below {below} in the T-pose", (below, above))
-    for side, sign in (("left", 1.0), ("right", -1.0)):
-        if float(places[side + "UpperArm"][1]) < float(places["hips"][1]):
+    for side, sign in zip(SIDES, (1.0, -1.0), strict=True):
+        if float((body.position(side + "UpperArm") - body.position("hips"))[0, 1]) < 0:
             yield Doubt(f"{side}UpperArm is below the hips in the T-pose", (side + "UpperArm",))
         for part in ("UpperArm", "UpperLeg"):
-            if sign * float(places[side + part][0] - places["hips"][0]) < -_NO_BONE:
+            if sign * float((body.position(side + part) - body.position("hips"))[0, 0]) < -_NO_BONE:
                 yield Doubt(f"{side + part} is on the other side of the hips", (side + part,))
-
-
-def _tpose_places(skeleton: Skeleton) -> Places:
-    positions = RigPoses.zero(skeleton, range(CANONICAL.num_joints)).positions[0]
-    return dict(zip(CANONICAL.names, positions, strict=True))
 
 
 def _length(skeleton: Skeleton, name: str) -> float:
     """Return the length of the bone that leads to a canonical joint, metres."""
     return float(skeleton.offsets[CANONICAL.index(name)].norm())
-
-
-def _way(places: Places, *names: str) -> float:
-    return sum(float((places[b] - places[a]).norm()) for a, b in pairwise(names))

@@ -17,6 +17,8 @@ from mapctl.retarget.joint_matching import REQUIRED
 from mapctl.retarget.reference_pose import axis_vector, frame_from_axes, upright_rotation
 from mapctl.retarget.rig_poses import RigPoses
 from mapctl.retarget.rigs import Rig
+from mapctl.retarget.stance import SIDES
+from mapctl.retarget.topology import descendants
 from mapctl.skeleton import CANONICAL, TOE_JOINTS, TOE_REST_HEIGHT, Skeleton
 
 _FPS, _FRAMES = Fraction(30), 30
@@ -69,10 +71,7 @@ def _sole_height(rest: Motion, path: str | PathLike[str]) -> float:
         rigmap = retarget.identify_rig(rest.skeleton, motion=rest)
     except MapctlError:  # without triangles or a known rig there are no soles
         return 0.0
-    below = {rigmap.joints[side + "Foot"] for side in ("left", "right")}
-    for joint, parent in enumerate(rest.skeleton.parents):
-        if parent in below:
-            below.add(joint)
+    below = descendants(rest.skeleton, [rigmap.joints[side + "Foot"] for side in SIDES])
     main = np.take_along_axis(mesh.joints, mesh.weights.argmax(axis=1)[:, None], axis=1)[:, 0]
     heights = mesh.vertices[np.isin(main, sorted(below)), 1]
     return float(heights.min()) if len(heights) else 0.0
@@ -80,20 +79,15 @@ def _sole_height(rest: Motion, path: str | PathLike[str]) -> float:
 
 def _canonical_tpose() -> Motion:
     root = torch.zeros(_FRAMES, 3, dtype=torch.float64)
-    root[:, 1] = TOE_REST_HEIGHT - _tpose_positions()[TOE_JOINTS[0], 1]
+    root[:, 1] = TOE_REST_HEIGHT - RigPoses.zero(CANONICAL).positions[0, TOE_JOINTS[0], 1]
     still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
     return Motion(CANONICAL, _FPS, root, still.expand(_FRAMES, CANONICAL.num_joints, 4).clone())
-
-
-def _tpose_positions() -> Float[Tensor, "joints 3"]:
-    """Return canonical joint positions in the T-pose, from the hips, metres."""
-    return RigPoses.zero(CANONICAL, range(CANONICAL.num_joints)).positions[0]
 
 
 def _build_skeleton(rig: Rig) -> Skeleton:
     """Build the joints that the rig names, depth first, as files nest them."""
     order = [joint for joint in _depth_first(0) if CANONICAL.names[joint] in rig.joints]
-    places = dict(enumerate(_tpose_positions()))
+    places = dict(enumerate(RigPoses.zero(CANONICAL).positions[0]))
     frames = {joint: _joint_frame(rig, CANONICAL.names[joint]) for joint in order}
     above = {joint: _named_ancestor(joint, rig) for joint in order}
     own = {joint: rig.joints[CANONICAL.names[joint]] for joint in order}

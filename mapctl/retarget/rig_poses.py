@@ -33,8 +33,8 @@ class RigPoses:
     """Index of the rig's joint for each canonical joint, or None."""
 
     @staticmethod
-    def zero(skeleton: Skeleton, joint_of: JointOf) -> "RigPoses":
-        """Return the pose with all rotations zero."""
+    def zero(skeleton: Skeleton, joint_of: JointOf = range(CANONICAL.num_joints)) -> "RigPoses":
+        """Return the pose with all rotations zero; of canonical joints where none are named."""
         still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).expand(1, skeleton.num_joints, 4)
         root = torch.zeros(1, 3, dtype=torch.float64)
         return RigPoses(

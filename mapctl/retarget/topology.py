@@ -95,8 +95,7 @@ class _JointTree:
 
     def are_alike(self, first: int, second: int) -> bool:
         """Return whether two bones are of about the same length."""
-        short, long = sorted((self.length[first], self.length[second]))
-        return long <= _MAX_LENGTH_RATIO * short + 1e-6
+        return are_alike(self.length[first], self.length[second], _MAX_LENGTH_RATIO)
 
     def chain(self, joint: int) -> list[int]:
         """Return the joints from this one to the farthest leaf."""
@@ -120,6 +119,12 @@ class _JointTree:
         return {name: path[at] for name, at in placed.items() if len(name) > 5 and 0 <= at < len(path)}
 
 
+def are_alike(first: float, second: float, ratio: float) -> bool:
+    """Return whether two lengths, metres, differ by no more than a ratio."""
+    short, long = sorted((first, second))
+    return long <= ratio * short + 1e-6
+
+
 def find_by_other_side(skeleton: Skeleton, found: Mapping[str, int]) -> dict[str, int]:
     """Find canonical joints that only the other side has so far, from the hips outward."""
     more: dict[str, int] = {}
@@ -131,11 +136,8 @@ def find_by_other_side(skeleton: Skeleton, found: Mapping[str, int]) -> dict[str
             continue
         path = path_below(skeleton, known[mirror_name(above)], known[mirror_name(name)])
         ends = _follow(skeleton, known[above], path, {*known.values()}) if path else []
-        below = [
-            known[CANONICAL.names[j]]
-            for j in descendants(CANONICAL, {CANONICAL.index(name)})
-            if CANONICAL.names[j] in known
-        ]
+        parts = {CANONICAL.names[joint] for joint in descendants(CANONICAL, {CANONICAL.index(name)})}
+        below = [known[part] for part in parts & known.keys()]
         fitting = [end for end in ends if all(path_below(skeleton, end, joint) for joint in below)]
         if fitting:
             size = len(descendants(skeleton, {known[mirror_name(name)]}))
@@ -145,16 +147,11 @@ def find_by_other_side(skeleton: Skeleton, found: Mapping[str, int]) -> dict[str
 
 def _follow(skeleton: Skeleton, start: int, path: list[int], taken: set[int]) -> list[int]:
     """Return the joints below `start` to which bones lead that are as long as those of a path on the other side."""
-    ends = [start]
+    ends, lengths = [start], skeleton.offsets.norm(dim=-1).tolist()
     for joint in path:
-        length = float(skeleton.offsets[joint].norm())
-        ends = [child for end in ends for child in skeleton.children(end) if _are_alike(skeleton, child, length)]
+        below = [child for end in ends for child in skeleton.children(end)]
+        ends = [child for child in below if are_alike(lengths[joint], lengths[child], _MAX_SIDE_RATIO)]
     return [end for end in ends if end not in taken]
-
-
-def _are_alike(skeleton: Skeleton, joint: int, length: float) -> bool:
-    short, long = sorted((float(skeleton.offsets[joint].norm()), length))
-    return long <= _MAX_SIDE_RATIO * short + 1e-6
 
 
 def descendants(skeleton: Skeleton, joints: Collection[int]) -> set[int]:
@@ -163,6 +160,15 @@ def descendants(skeleton: Skeleton, joints: Collection[int]) -> set[int]:
     for child, parent in enumerate(skeleton.parents):
         if parent in found:
             found.add(child)
+    return found
+
+
+def ancestors(skeleton: Skeleton, joints: Collection[int]) -> set[int]:
+    """Return joints and all above them."""
+    found = set(joints)
+    for child in reversed(range(1, skeleton.num_joints)):
+        if child in found:
+            found.add(skeleton.parents[child])
     return found
 
 

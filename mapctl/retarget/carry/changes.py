@@ -13,6 +13,7 @@ from mapctl.motion import Motion
 from mapctl.retarget import RigMap
 from mapctl.retarget.carry.character import FEET
 from mapctl.retarget.carry.hands import HandTargets
+from mapctl.retarget.topology import ancestors
 from mapctl.skeleton import leg_length
 
 _FOOT_METRES = 0.005  # metres that a foot misses its target by before it is worth a line
@@ -125,11 +126,7 @@ def measure_changes(
 def list_unmatched_joints(clip: Motion, giver: RigMap, matched: Collection[int]) -> tuple[str, ...]:
     """List the joints of a clip that move and are not `matched`, nor is or hangs from them any canonical joint: what
     their turns do is lost."""
-    led_by, parents = {*giver.joints.values(), *matched}, clip.skeleton.parents
-    for joint in sorted(led_by, reverse=True):
-        while parents[joint] >= 0:
-            joint = parents[joint]
-            led_by.add(joint)
+    led_by = ancestors(clip.skeleton, [*giver.joints.values(), *matched])
     dots = (clip.local_quat_xyzw * clip.local_quat_xyzw[:1]).sum(-1).abs().amin(dim=0).clamp(max=1.0)
     moves = 2 * torch.acos(dots) > _MOVES_RADIANS
     return tuple(name for j, name in enumerate(clip.skeleton.names) if j not in led_by and bool(moves[j]))
