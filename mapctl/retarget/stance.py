@@ -17,6 +17,9 @@ from mapctl.retarget import RigMap
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, Skeleton, leg_length
 
 SIDES = ("left", "right")
+HIP_JOINTS, SHINS, FEET, TOES = (
+    [CANONICAL.index(side + part) for side in SIDES] for part in ("UpperLeg", "LowerLeg", "Foot", "Toes")
+)
 _MAX_FLOOR_OFFSET = 0.15  # of the leg: where toes rest further from 0, the floor is not at 0
 _MIN_FLOOR_OFFSET = 0.03  # metres that toes rest higher than bones say, which no toe joint's own height explains
 MAX_TOE_SINK = 0.008
@@ -83,7 +86,7 @@ class Stance:
         points down against the T-pose is more likely on tip-toe, and is accepted up to a few degrees only.
         """
         rest = Stance.at_rest(rigmap.skeleton)
-        toes = clip.joint_positions()[:, _side_joints("Toes")]
+        toes = clip.joint_positions()[:, TOES]
         seen, leg = contacts.estimate_floor_heights(toes), leg_length(rigmap.skeleton)
         if float((seen[0] - seen[1]).abs()) > _MAX_TOE_DIFFERENCE * leg:
             seen = seen.min().expand(2)
@@ -98,15 +101,15 @@ class Stance:
 
     def leveled(self, motion: Motion) -> Motion:
         """Return the same movement with a T-pose whose feet are flat: no joint moves, joint frames of feet rotate."""
-        return _rotate_foot_frames(motion, rotations.from_rotation_vector(_about_x(-self.tilt)))
+        return _rotate_foot_frames(motion, -self.tilt)
 
     def restore_foot_tilt(self, motion: Motion) -> Motion:
         """Undo `leveled`."""
-        return _rotate_foot_frames(motion, rotations.from_rotation_vector(_about_x(self.tilt)))
+        return _rotate_foot_frames(motion, self.tilt)
 
     def leveled_map(self, rigmap: RigMap) -> RigMap:
         """Return the map between the rig and canonical joints whose T-pose has its feet flat."""
-        turns = _expand_to_joints(rotations.from_rotation_vector(_about_x(-self.tilt)))
+        turns = _rotations_about_x(-self.tilt)
         tpose = rotations.multiply(turns, rigmap.tpose_quat_xyzw)
         return replace(rigmap, tpose_quat_xyzw=tpose, skeleton=_rotate_bones(rigmap.skeleton, turns))
 
@@ -114,23 +117,16 @@ class Stance:
 def level_feet(clip: Motion) -> Motion:
     """Return the same movement (canonical joints) with joint frames of feet and toes that are aligned with the world
     while the foot is flat on the floor, as the clip shows it (see `Stance.of`); no joint moves."""
-    toes = clip.joint_positions()[:, _side_joints("Toes")]
+    toes = clip.joint_positions()[:, TOES]
     tilt = _estimate_tilt(clip, _detect_flat_feet(clip, contacts.detect_contacts(toes, clip.fps)))
-    return _rotate_foot_frames(clip, rotations.from_rotation_vector(_about_x(-tilt)))
+    return _rotate_foot_frames(clip, -tilt)
 
 
-def _side_joints(part: str) -> list[int]:
-    return [CANONICAL.index(side + part) for side in SIDES]
-
-
-def _about_x(angle: Float[Tensor, "2 2"]) -> Float[Tensor, "2 2 3"]:
-    return torch.stack([angle, torch.zeros_like(angle), torch.zeros_like(angle)], dim=-1)
-
-
-def _expand_to_joints(turns: Float[Tensor, "2 2 4"]) -> Float[Tensor, "joints 4"]:
-    """Put rotations of feet and toes among those of all joints, which have none."""
+def _rotations_about_x(pitch: Float[Tensor, "2 2"]) -> Float[Tensor, "joints 4"]:
+    """Return rotations of feet and toes by these angles among those of all joints, which have none."""
+    turns = rotations.from_rotation_vector(pitch[..., None] * torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64))
     still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).repeat(CANONICAL.num_joints, 1)
-    still[_side_joints("Foot")], still[_side_joints("Toes")] = turns[:, 0], turns[:, 1]
+    still[FEET], still[TOES] = turns[:, 0], turns[:, 1]
     return still
 
 
@@ -146,9 +142,9 @@ def _rotate_bones(skeleton: Skeleton, turns: Float[Tensor, "joints 4"]) -> Skele
     return replace(skeleton, offsets=offsets, end_offsets=ends)
 
 
-def _rotate_foot_frames(motion: Motion, turns: Float[Tensor, "2 2 4"]) -> Motion:
+def _rotate_foot_frames(motion: Motion, pitch: Float[Tensor, "2 2"]) -> Motion:
     """Change the joint frames of feet and toes: what is in them is rotated, and they are rotated back."""
-    by_joint = _expand_to_joints(turns)
+    by_joint = _rotations_about_x(pitch)
     world = rotations.multiply(motion.joint_rotations(), rotations.inverse(by_joint).expand_as(motion.local_quat_xyzw))
     local = rotations.make_sign_continuous(kinematics.local_from_world(CANONICAL.parents, world))
     return replace(motion, skeleton=_rotate_bones(motion.skeleton, by_joint), local_quat_xyzw=local)
@@ -156,7 +152,7 @@ def _rotate_foot_frames(motion: Motion, turns: Float[Tensor, "2 2 4"]) -> Motion
 
 def _detect_flat_feet(clip: Motion, planted: Bool[Tensor, "frames 2"]) -> Bool[Tensor, "frames 2"]:
     """Detect where feet lie flat; nowhere for a side that hardly ever does."""
-    ankles = clip.joint_positions()[:, _side_joints("Foot"), 1]
+    ankles = clip.joint_positions()[:, FEET, 1]
     flat = torch.zeros_like(planted)
     for k in range(2):
         if bool(planted[:, k].any()):
@@ -169,7 +165,7 @@ def _estimate_tilt(clip: Motion, flat: Bool[Tensor, "frames 2"]) -> Float[Tensor
     """Estimate the tilt of foot and toes by side, radians: its median over the frames in which the foot is flat; 0 for
     a side that has none."""
     forward = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    turns = clip.joint_rotations()[:, [*_side_joints("Foot"), *_side_joints("Toes")]].reshape(-1, 2, 2, 4)
+    turns = clip.joint_rotations()[:, [*FEET, *TOES]].reshape(-1, 2, 2, 4)
     up = torch.asin(rotations.rotate(turns, forward.expand(*turns.shape[:3], 3))[..., 1].clamp(-1, 1))
     found = [up[flat[:, k], :, k].median(dim=0).values for k in range(2) if flat[:, k].any()]
     if not found:

@@ -17,8 +17,9 @@ from mapctl.commands.shared import character
 from mapctl.formats.bvh.layout import BvhLayout
 from mapctl.motion import Motion
 from mapctl.retarget.carry import RiggedCharacter, retarget_motion
-from mapctl.retarget.carry.hips import fit_hips, leg_extension
+from mapctl.retarget.carry.character import LEGS, limb_extension
 from mapctl.retarget.carry.holding import soft_clamp
+from mapctl.retarget.carry.legs import fit_hips
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, leg_length
 
 USUAL = Performer()
@@ -124,7 +125,7 @@ def test_hips_follow_the_feet_of_straight_legs_both_ways(lower):
         clip = Performer(upright=upright).stands() if upright > 0.9 else crouching()
         places = clip.joint_positions()[:, FEET].clone()
         places[..., 1] -= lower
-        fitted = fit_hips(clip, places, leg_extension(clip))
+        fitted = fit_hips(clip, places, limb_extension(clip, LEGS))
         ankles[upright] = float((clip.root_position - fitted.root_position)[:, 1].mean())
     assert ankles[0.995] == pytest.approx(lower, abs=0.002)
     assert ankles[0.85] == pytest.approx(0.0, abs=0.002)

@@ -14,12 +14,11 @@ from mapctl.errors import RequestError
 from mapctl.motion import Motion
 from mapctl.retarget import as_rig, to_canonical
 from mapctl.retarget.carry.changes import Changes, RetargetedMotion, list_unmatched_joints, measure_changes
-from mapctl.retarget.carry.character import RiggedCharacter
-from mapctl.retarget.carry.feet import find_ankle_targets, reach_ankle_targets
+from mapctl.retarget.carry.character import LEGS, RiggedCharacter, limb_extension
 from mapctl.retarget.carry.fingers import carry_fingers, match_fingers
 from mapctl.retarget.carry.ground import find_ground
 from mapctl.retarget.carry.hands import keep_hand_relations
-from mapctl.retarget.carry.hips import fit_hips, leg_extension, lower_hips, transfer_root
+from mapctl.retarget.carry.legs import find_ankle_targets, fit_hips, lower_hips, reach_ankle_targets, transfer_root
 from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import leg_length
 
@@ -63,8 +62,8 @@ def retarget_canonical(
     higher = 1 - scale if keeps else 0.0
     moved = transfer_root(own, giver, body, scale, higher * found.under_hips(float(own.fps)))
     ankles = find_ankle_targets(own, moved, giver.stance, body.stance, found, scale=scale, raised=higher * found.height)
-    fitted = fit_hips(moved, ankles, leg_extension(own))
-    lowered = lower_hips(fitted, ankles, leg_extension(own))
+    straight = limb_extension(own, LEGS)
+    lowered = lower_hips(fit_hips(moved, ankles, straight), ankles, straight)
     legs = reach_ankle_targets(lowered, ankles)
     done, reached = keep_hand_relations(own, legs, giver.stance, scale=scale)
     changes = measure_changes(

@@ -11,8 +11,8 @@ from torch import Tensor
 from mapctl.joint_names import abbreviate_names
 from mapctl.motion import Motion
 from mapctl.retarget import RigMap
-from mapctl.retarget.carry.character import FEET
 from mapctl.retarget.carry.hands import HandTargets
+from mapctl.retarget.stance import FEET
 from mapctl.retarget.topology import ancestors
 from mapctl.skeleton import leg_length
 
@@ -61,26 +61,14 @@ class Changes:
     @property
     def notes(self) -> tuple[str, ...]:
         """Return sentences about what could not be kept; empty where all is."""
-        return tuple(filter(None, (self._note_feet(), self._note_hands(), self._note_hips(), self._note_joints())))
-
-    def _note_feet(self) -> str:
-        off = self.feet_missed
-        return (
-            _note_miss("the legs are too short for some of the way: feet are", off, _FOOT_METRES) if off.frames else ""
+        feet, hands, dip, names = self.feet_missed, self.hands_missed, self.hips_lowered_m, self.unmatched_joints
+        found = (
+            (feet.frames, _note_miss("the legs are too short for some of the way: feet are", feet, _FOOT_METRES)),
+            (hands.frames, _note_miss("the arms are too short for some of it: hands are", hands, _HAND_METRES)),
+            (dip >= _DIP_METRES, f"the hips are up to {100 * dip:.1f} cm lower than in scale, so that the feet reach"),
+            (names, f"joints without a counterpart are left out: {abbreviate_names(names)}"),
         )
-
-    def _note_hands(self) -> str:
-        off = self.hands_missed
-        return _note_miss("the arms are too short for some of it: hands are", off, _HAND_METRES) if off.frames else ""
-
-    def _note_hips(self) -> str:
-        if self.hips_lowered_m < _DIP_METRES:
-            return ""
-        return f"the hips are up to {100 * self.hips_lowered_m:.1f} cm lower than in scale, so that the feet reach"
-
-    def _note_joints(self) -> str:
-        names = self.unmatched_joints
-        return f"joints without a counterpart are left out: {abbreviate_names(names)}" if names else ""
+        return tuple(note for counts, note in found if counts)
 
 
 @dataclass(frozen=True, eq=False)

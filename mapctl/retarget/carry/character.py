@@ -1,9 +1,10 @@
-"""The character that motion is put on, and the canonical joints of legs and arms by side."""
+"""The character that motion is put on, and the lengths of its legs and arms."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -12,11 +13,9 @@ from mapctl.motion import Motion
 from mapctl.retarget import RigMap, from_canonical, to_canonical
 from mapctl.retarget.rigs import Rig
 from mapctl.retarget.stance import SIDES, Stance
-from mapctl.skeleton import CANONICAL, Skeleton
+from mapctl.skeleton import LIMBS, Limb, Skeleton
 
-HIP_JOINTS, SHINS, FEET, TOES = (
-    [CANONICAL.index(side + part) for side in SIDES] for part in ("UpperLeg", "LowerLeg", "Foot", "Toes")
-)
+LEGS, ARMS = ([LIMBS[side + end] for side in SIDES] for end in ("Foot", "Hand"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,3 +67,15 @@ class RiggedCharacter:
         for joint, turns in (fingers or {}).items():
             local[:, joint] = rotations.make_sign_continuous(turns)
         return replace(made, local_quat_xyzw=local, source=self.source)
+
+
+def limb_lengths(skeleton: Skeleton, limbs: Sequence[Limb]) -> Float[Tensor, " limbs"]:
+    """Return the lengths of stretched limbs of canonical joints, metres."""
+    return torch.tensor([limb.length(skeleton) for limb in limbs], dtype=torch.float64)
+
+
+def limb_extension(own: Motion, limbs: Sequence[Limb]) -> Float[Tensor, "frames limbs"]:
+    """Return how straight limbs are: from the first joint to the effector over both bones' length."""
+    places = own.joint_positions()
+    reach = places[:, [limb.end for limb in limbs]] - places[:, [limb.upper for limb in limbs]]
+    return reach.norm(dim=-1) / limb_lengths(own.skeleton, limbs)

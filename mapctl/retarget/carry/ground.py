@@ -9,9 +9,8 @@ from torch import Tensor
 
 from mapctl import contacts, rotations
 from mapctl.motion import Motion
-from mapctl.retarget.carry.character import FEET, HIP_JOINTS, TOES
 from mapctl.retarget.carry.holding import Spans, hold_through, low_pass, mean_by_span, merge_contacts
-from mapctl.retarget.stance import Stance
+from mapctl.retarget.stance import FEET, HIP_JOINTS, TOES, Stance
 from mapctl.skeleton import leg_length
 
 # Who stands higher than the floor stands still on a level foot for a while, with the hips well over it.

@@ -17,12 +17,11 @@ from mapctl.kinematics import inverse
 from mapctl.motion import Motion
 from mapctl.numerics.easing import smootherstep
 from mapctl.retarget.carry import segments
+from mapctl.retarget.carry.character import ARMS, limb_extension
 from mapctl.retarget.carry.holding import envelope, hold_through, low_pass, mean_by_span, merge_contacts, soft_clamp
-from mapctl.retarget.stance import SIDES, Stance
-from mapctl.skeleton import LIMBS
+from mapctl.retarget.stance import Stance
 
-_ARMS = [LIMBS[side + "Hand"] for side in SIDES]
-_HANDS = [arm.end for arm in _ARMS]
+_HANDS = [arm.end for arm in ARMS]
 _POINTS = (0.08, 0.15)  # metres from the wrist to palm and finger tips along the hand, of the canonical body
 _PALM_THICKNESS = 0.03  # metres from the middle of a hand to what it touches, of the canonical body
 _TOUCH_METRES, _FAR_METRES = 0.02, 0.16  # metres off a surface within which a hand touches, and from which it is free
@@ -35,10 +34,8 @@ _SPEED_SECONDS = 0.1  # seconds over which that speed is smoothed
 _SHARPNESS = 0.05  # how much less a segment counts that is a little farther than the nearest
 _ROUNDS = 3  # times that hands are placed, since each arm is something that the other hand is near
 _EASE_WEIGHT = 0.02  # strength from which the arm is solved for entirely
-_FREE_EXTENSION, _MOST_EXTENSION = (
-    0.98,
-    0.998,
-)  # of the arm: how straight one may be whatever the giver's is, and at most
+# Of the arm: how straight one may be whatever the giver's is, and at most.
+_FREE_EXTENSION, _MOST_EXTENSION = 0.98, 0.998
 _SOFT_MARGIN = 0.06  # of the arm, before the most that it may be, over which it gives in
 _HELD_SPEED = 0.25  # m/s below which a hand on the floor stands on it
 _LEAST_STRENGTH = 0.5  # of a relation, from which a hand that does not get there is worth a line
@@ -108,7 +105,7 @@ def keep_hand_relations(own: Motion, moved: Motion, giver: Stance, *, scale: flo
         still = torch.zeros(own.num_frames, 2, dtype=torch.float64)
         return moved, HandTargets(still[..., None].expand(-1, -1, 3), still)
     at_floor = _floor_offsets(own, moved, relations, giver, scale=scale)
-    straight = _arm_extension(own)
+    straight = limb_extension(own, ARMS)
     done, before = moved, moved.joint_positions()[:, _HANDS]
     offset = missed = torch.zeros_like(before)
     for _ in range(_ROUNDS):
@@ -161,7 +158,7 @@ def _stays(near: segments.Near, fps: float) -> Float[Tensor, "frames points segm
 def _let_hang(own: Motion) -> Float[Tensor, "frames points segments"]:
     """Return how much points may be bound to each segment, 0 to 1: not to the own arm, and hardly to trunk and thigh
     while the arm is straight: it hangs there, and its hand is not put anywhere."""
-    straight = (_arm_extension(own) - _HANGS_FROM) / (_HANGS_TO - _HANGS_FROM)
+    straight = (limb_extension(own, ARMS) - _HANGS_FROM) / (_HANGS_TO - _HANGS_FROM)
     layout = segments.layout()
     of_hand = (1 - smootherstep(straight)[..., None] * layout.beside.double()) * (~layout.is_arm).double()
     return of_hand.repeat_interleave(len(_POINTS), dim=1)
@@ -232,13 +229,6 @@ def _offset_hands(
     return offset + shares * missing[:, None]
 
 
-def _arm_extension(own: Motion) -> Float[Tensor, "frames 2"]:
-    """Return how straight arms are: shoulder to wrist over both bones' length."""
-    places = own.joint_positions()
-    far = torch.stack([places[:, arm.end] - places[:, arm.upper] for arm in _ARMS], dim=1).norm(dim=-1)
-    return far / torch.tensor([arm.length(own.skeleton) for arm in _ARMS], dtype=torch.float64)
-
-
 def _reach(
     moved: Motion,
     offset: Float[Tensor, "frames 2 3"],
@@ -249,7 +239,7 @@ def _reach(
     `straight`, or than most; where relations are weak, hardly."""
     places, world = moved.joint_positions(), moved.joint_rotations()
     ease, turned = smootherstep(strength / _EASE_WEIGHT), world.clone()
-    for k, arm in enumerate(_ARMS):
+    for k, arm in enumerate(ARMS):
         to_hand = places[:, arm.end] - places[:, arm.upper]
         most = straight[:, k, None].clamp(_FREE_EXTENSION, _MOST_EXTENSION) * arm.length(moved.skeleton)
         direction = _keep_in_reach(to_hand, to_hand + offset[:, k], most)

@@ -16,9 +16,9 @@ from mapctl.features import LAYOUT, encode
 from mapctl.inbetweening.partial_motion import PartialMotion
 from mapctl.motion import Motion
 from mapctl.pose import BodyPose
-from mapctl.retarget.carry.character import FEET, TOES
-from mapctl.retarget.carry.feet import reach_ankle_targets
-from mapctl.retarget.carry.hips import fit_hips, leg_extension, lower_hips
+from mapctl.retarget.carry.character import LEGS, limb_extension
+from mapctl.retarget.carry.legs import fit_hips, lower_hips, reach_ankle_targets
+from mapctl.retarget.stance import FEET, TOES
 from mapctl.rotations import to_rotation_vector
 from priors.training.augmentation.pose_windows import PoseWindows
 from priors.training.corpus import Corpus
@@ -94,7 +94,7 @@ def change_strides(motion: Motion, factor: float) -> Motion:
     places, scale = motion.joint_positions(), motion.root_position.new_tensor([factor, 1.0, factor])
     # From the toe joints on, which stand while the heel rises.
     ankles = scale * places[:, TOES] + places[:, FEET] - places[:, TOES]
-    stretch = leg_extension(motion)
+    stretch = limb_extension(motion, LEGS)
     moved = replace(motion, root_position=scale * motion.root_position)
     moved = lower_hips(fit_hips(moved, ankles, stretch), ankles, stretch)
     return reach_ankle_targets(moved, ankles)
