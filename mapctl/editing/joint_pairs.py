@@ -6,26 +6,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mapctl import kinematics, rotations
+from mapctl import kinematics
 from mapctl.joint_names import Side, normalise_name, split_side
 from mapctl.retarget import RigMap
 from mapctl.skeleton import mirror_name
 
 _NEAR = 0.02  # metres within which a joint without a side in its name is the mirror image of another at rest
-
-
-def rest_rotations(rigmap: RigMap) -> Float[Tensor, "joints 4"]:
-    """Return the world rotations (xyzw) of the rig's joints in the T-pose, with Y up; joints that are no canonical one
-    rest in their parents."""
-    skeleton = rigmap.rig_skeleton
-    still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
-    canonical = {joint: rigmap.tpose_quat_xyzw[c] for c, joint in enumerate(rigmap.joint_of) if joint is not None}
-    found: list[Tensor] = []
-    for joint, parent in enumerate(skeleton.parents):
-        root = still if rigmap.upright_quat_xyzw is None else rigmap.upright_quat_xyzw
-        above = found[parent] if parent >= 0 else root
-        found.append(canonical.get(joint, rotations.multiply(above, rigmap.idle_quat_xyzw[joint])))
-    return torch.stack(found)
 
 
 def pair_joints(rigmap: RigMap) -> list[int | None]:
@@ -86,7 +72,7 @@ def _pair_by_place(joint: int, found: dict[int, int], rigmap: RigMap, places: Fl
 
 def _rest_positions(rigmap: RigMap) -> Float[Tensor, "joints 3"]:
     """Return the joints' places in the T-pose, metres, from the middle of the hips."""
-    skeleton, world = rigmap.rig_skeleton, rest_rotations(rigmap)
+    skeleton, world = rigmap.rig_skeleton, rigmap.rest_quat_xyzw
     local = kinematics.local_from_world(skeleton.parents, world[None])
     places = kinematics.forward_kinematics(skeleton.offsets, skeleton.parents, torch.zeros(1, 3).double(), local)[0][0]
     return places - places[rigmap.joints["hips"]]

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl import kinematics, rotations
-from mapctl.editing.joint_pairs import pair_joints, rest_rotations
+from mapctl.editing.joint_pairs import pair_joints
 from mapctl.editing.legs import place_ankles
 from mapctl.editing.rigged_motion import RiggedMotion
 from mapctl.motion import Motion
@@ -43,7 +43,7 @@ def mirror(motion: Motion, rig: Rig | None = None) -> Motion:
 def _mirror_joints(rigged: RiggedMotion) -> Motion:
     """Mirror all rotations, travelling joints and the place of the hips. Joints without a partner keep their own local
     rotation."""
-    motion, partners, rest = rigged.motion, pair_joints(rigged.rigmap), rest_rotations(rigged.rigmap)
+    motion, partners, rest = rigged.motion, pair_joints(rigged.rigmap), rigged.rigmap.rest_quat_xyzw
     turned = _mirror_rotations(motion.joint_rotations(), partners, rest)
     local = kinematics.local_from_world(motion.skeleton.parents, turned)
     alone = [joint for joint, partner in enumerate(partners) if partner is None]

@@ -13,7 +13,6 @@ from torch import Tensor
 
 from mapctl import rotations
 from mapctl.editing.ground_transform import GroundTransform, move_by_share
-from mapctl.editing.joint_pairs import rest_rotations
 from mapctl.editing.rigged_motion import RiggedMotion
 from mapctl.editing.root_joint import add_root, set_root_track
 from mapctl.motion import Motion
@@ -63,7 +62,7 @@ def move_travel_to_root(motion: Motion, rig: Rig | None = None, cycle: GroundTra
         rest = rotations.about_y(torch.zeros(()).double()) if up is None else up
         put = _put_on_root(add_root(rigged.motion), travel, rest)
     else:
-        put = _put_on_root(rigged.motion, travel, rest_rotations(rigged.rigmap)[0])
+        put = _put_on_root(rigged.motion, travel, rigged.rigmap.rest_quat_xyzw[0])
     like = add_root(motion) if rigged.hips == 0 else motion
     return rigged.with_motion(put).in_file_world(like)
 

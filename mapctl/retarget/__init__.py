@@ -54,6 +54,11 @@ class RigMap(TPose):
         """The rig's own joint name by canonical name, of those that the rig has."""
         return {c: self.rig_skeleton.names[joint] for c, joint in self.joints.items()}
 
+    @property
+    def rest_quat_xyzw(self) -> Float[Tensor, "rigged 4"]:
+        """World rotations (xyzw) of the rig's joints in the T-pose, with Y up."""
+        return bone_offsets.rest_rotations(self.rig_skeleton, self.joint_of, self)
+
 
 def load_rig(name_or_path: str | PathLike[str]) -> Rig:
     """Load a preset by its name, a rig from a TOML file, or the rig of a clip; RequestError if it is none of them."""
@@ -100,7 +105,7 @@ def identify_rig(skeleton: Skeleton, rig: Rig | None = None, *, motion: Motion |
         rig=found.rig,
         rig_skeleton=skeleton,
         joint_of=found.joint_of,
-        skeleton=bone_offsets.measure_bones(skeleton, found.joint_of, tpose.tpose_quat_xyzw, tpose.idle_quat_xyzw),
+        skeleton=bone_offsets.measure_bones(skeleton, found.joint_of, tpose),
         match=found,
     )
     if motion is None:

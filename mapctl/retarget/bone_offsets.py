@@ -7,30 +7,34 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl import rotations
+from mapctl.retarget.reference_pose import UNROTATED, TPose
 from mapctl.retarget.rig_poses import JointOf, next_joint
 from mapctl.skeleton import CANONICAL, Skeleton
 
 _END_SITES = ("Toes", "Hand", "head")  # joints whose position an End Site of the joint above may give
 
 
-def measure_bones(
-    skeleton: Skeleton, joint_of: JointOf, tpose: Float[Tensor, "joints 4"], idle: Float[Tensor, "rigged 4"]
-) -> Skeleton:
+def rest_rotations(skeleton: Skeleton, joint_of: JointOf, tpose: TPose) -> Float[Tensor, "rigged 4"]:
+    """Return the world rotations (xyzw) of a rig's joints in the T-pose, with Y up; joints that are no canonical one
+    rest in their parents."""
+    canonical = {joint: tpose.tpose_quat_xyzw[c] for c, joint in enumerate(joint_of) if joint is not None}
+    root = UNROTATED if tpose.upright_quat_xyzw is None else tpose.upright_quat_xyzw
+    found: list[Tensor] = []
+    for joint, parent in enumerate(skeleton.parents):
+        above = found[parent] if parent >= 0 else root
+        found.append(canonical.get(joint, rotations.multiply(above, tpose.idle_quat_xyzw[joint])))
+    return torch.stack(found)
+
+
+def measure_bones(skeleton: Skeleton, joint_of: JointOf, tpose: TPose) -> Skeleton:
     """Measure a rig's bones on the canonical skeleton, metres.
 
-    `tpose` holds world rotations by canonical joint, `idle` the local ones of joints that are no canonical one. A joint
-    that the rig lacks is put where the End Site of the joint above is, between its neighbours, or, at the end of a
-    limb, as far on as the canonical one in scale.
+    A joint that the rig lacks is put where the End Site of the joint above is, between its neighbours, or, at the end
+    of a limb, as far on as the canonical one in scale.
     """
-    canonical_of = {joint: c for c, joint in enumerate(joint_of) if joint is not None}
-    place, turn = [torch.zeros(3, dtype=torch.float64)], []
-    for joint, parent in enumerate(skeleton.parents):
-        if parent >= 0:
-            place.append(place[parent] + rotations.rotate(turn[parent], skeleton.offsets[joint]))
-        if joint in canonical_of:
-            turn.append(tpose[canonical_of[joint]])
-        else:
-            turn.append(rotations.multiply(turn[parent], idle[joint]) if parent >= 0 else idle[joint])
+    turn, place = rest_rotations(skeleton, joint_of, tpose), [torch.zeros(3, dtype=torch.float64)]
+    for joint, parent in enumerate(skeleton.parents[1:], start=1):
+        place.append(place[parent] + rotations.rotate(turn[parent], skeleton.offsets[joint]))
     ends = {}
     for name, site in skeleton.end_offsets.items():
         joint = skeleton.index(name)

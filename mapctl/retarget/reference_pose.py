@@ -28,7 +28,7 @@ _TRUNK_TOLERANCE = math.radians(40)  # trunk and shoulders keep their own shape 
 _LEVEL, _HANGING = math.radians(25), math.radians(100)
 _LEG_TOLERANCE = math.radians(35)  # between the legs of a standing rest pose and the vertical
 _EXACT_TPOSE_ANGLE = math.radians(15)  # of arms and legs in a frame that is a T-pose on purpose
-_UNROTATED = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
+UNROTATED = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
 _VECTORS = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
@@ -138,7 +138,7 @@ def _list_readings(
 def _read_table(rig: Rig, laid_out: Tensor | None) -> Float[Tensor, "joints 4"]:
     """Return the world rotations of a rig's joints in the T-pose of its table; of joints that it leaves out, in the
     rest pose laid out as one, or unrotated where all rotations zero are to be the T-pose or no pose."""
-    quats = _UNROTATED.repeat(CANONICAL.num_joints, 1)
+    quats = UNROTATED.repeat(CANONICAL.num_joints, 1)
     if laid_out is not None and rig.rest != "tpose":
         quats = laid_out.clone()
     for name, axes in rig.tpose.items():
@@ -280,7 +280,7 @@ def _canonical_direction(index: int) -> Float[Tensor, "3"]:
 
 
 def _unrotated(poses: RigPoses) -> Float[Tensor, "rigged 4"]:
-    return _UNROTATED.repeat(poses.skeleton.num_joints, 1)
+    return UNROTATED.repeat(poses.skeleton.num_joints, 1)
 
 
 def _mean_locals(clip: RigPoses) -> Float[Tensor, "rigged 4"]:

@@ -4,7 +4,6 @@ import re
 from collections import defaultdict
 from collections.abc import Mapping
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -33,10 +32,11 @@ def carry_fingers(clip: Motion, giver: RigMap, body: RigMap) -> Mapping[int, Flo
     In the T-poses of both rigs, fingers are taken to point the same way.
     """
     pairs = match_fingers(giver.rig_skeleton, body.rig_skeleton)
-    ours, theirs = (_find_rest(rigmap) for rigmap in (body, giver))
+    ours, theirs = body.rest_quat_xyzw, giver.rest_quat_xyzw
     found = {}
     for joint, other in pairs.items():
-        (rest, idle), (their_rest, their_idle) = ours[joint], theirs[other]
+        rest, their_rest = ours[body.rig_skeleton.parents[joint]], theirs[giver.rig_skeleton.parents[other]]
+        idle, their_idle = body.idle_quat_xyzw[joint], giver.idle_quat_xyzw[other]
         # From the parent's frame in one T-pose to that in the other; each rotation is what it adds to rest.
         turn = rotations.multiply(rotations.inverse(rest), their_rest).expand(clip.num_frames, 4)
         added = rotations.multiply(clip.local_quat_xyzw[:, other], rotations.inverse(their_idle).expand_as(turn))
@@ -53,15 +53,3 @@ def _list_fingers(skeleton: Skeleton) -> dict[Finger, int]:
             word = finger[0].lower()
             chains[role.side, _SAME.get(word, word)].append(joint)
     return {(*chain, k): joint for chain, joints in chains.items() for k, joint in enumerate(joints)}
-
-
-def _find_rest(rigmap: RigMap) -> list[tuple[Tensor, Tensor]]:
-    """Return by joint of a rig its parent's world rotation in the T-pose, and its own local one at rest (xyzw)."""
-    still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
-    canonical = {joint: rigmap.tpose_quat_xyzw[c] for c, joint in enumerate(rigmap.joint_of) if joint is not None}
-    world, found = [], []
-    for joint, parent in enumerate(rigmap.rig_skeleton.parents):
-        idle, above = rigmap.idle_quat_xyzw[joint], still if parent < 0 else world[parent]
-        found.append((above, idle))
-        world.append(canonical[joint] if joint in canonical else rotations.multiply(above, idle))
-    return found
