@@ -48,7 +48,7 @@ def load(
     Of a character's file it is an animation, or one frame of the rest pose where there is none; `hero.glb#ARMATURE`,
     `hero.glb#ARMATURE/ANIMATION` and `hero.glb#/ANIMATION` choose where there are several. `fps` is frames per second
     of an .amc, which does not say; RequestError with the others, which do. `metres_per_unit` wins over what is found
-    by the size of the body, in formats whose unit is not fixed. `example:NAME` is a motion that mapctl brings along.
+    by the size of the body, and over what the file declares. `example:NAME` is a motion that mapctl brings along.
     FileFormatError says what is wrong with the file, and where: NaN in place of a number, too, which
     `load_with_missing` takes.
     """

@@ -10,7 +10,6 @@ from mapctl.commands.shared.options import ReadOptions
 from mapctl.curves import Curve
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
-from mapctl.formats import bvh
 from mapctl.formats.text import warn_once
 from mapctl.motion import Motion
 from mapctl.recording.masks import Mask, masks_from_missing
@@ -86,12 +85,10 @@ def read_motion_with_gaps(path: Path, rig: Rig | None, *, quiet: bool) -> tuple[
 
 
 def _report_reading(path: Path, motion: Motion, rig: Rig | None, *, quiet: bool) -> None:
-    """Note the licence of a motion that was read; print what is doubtful and a unit that is not used unless `quiet`."""
+    """Note the licence of a motion that was read; print what is doubtful unless `quiet`."""
     note_licence(str(path), motion.licence)
     if quiet:
         return
-    if rig is not None and rig.metres_per_unit is not None and bvh.unit_of(motion) is None:
-        warn_once(f"{path}: the file declares its unit; the one that is given is not used")
     print_doubts(path, motion, rig)
 
 

@@ -45,8 +45,8 @@ class ReadOptions:
     """Options on how motion files are read, which overrule what would be found."""
 
     unit: Annotated[str | None, arg(metavar="m|dm|cm|mm|in|METRES")] = None
-    """Unit of lengths in a .bvh or .amc that is read, or its length in metres; the one in which the body is nearest to
-    an adult if not given. Other formats declare theirs."""
+    """Unit of lengths in the file that is read, or its length in metres; if not given, the one that the file declares
+    or, in a .bvh or .amc, in which the body is nearest to an adult."""
     up: MaybeAxis = None
     """Axis of the motion that is read which points up; found by the body and its motion if not given."""
 

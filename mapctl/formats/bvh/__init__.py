@@ -114,17 +114,25 @@ def unit_of(motion: Motion) -> float | None:
 
 
 def convert_unit(motion: Motion, metres_per_unit: float) -> Motion:
-    """Return the motion as its BVH or AMC file has it if a unit is so many metres; other motions unchanged."""
-    if not isinstance(motion.source, FileUnit):
+    """Return the motion as its file has it if a unit of the file is so many metres, whatever the file declares.
+
+    A character of another size than its file's is none of that file any more.
+    """
+    source, old = motion.source, motion.skeleton
+    scale = metres_per_unit / getattr(source, "metres_per_unit", 1.0)
+    if isinstance(source, FileUnit):
+        source = replace(source, metres_per_unit=metres_per_unit, unit_doubt="")
+    elif scale == 1:
         return motion
-    scale, old = metres_per_unit / motion.source.metres_per_unit, motion.skeleton
+    else:
+        source = None
     ends = {name: (x * scale, y * scale, z * scale) for name, (x, y, z) in old.end_offsets.items()}
     return replace(
         motion,
         skeleton=Skeleton(old.names, old.parents, old.offsets * scale, ends),
         root_position=motion.root_position * scale,
         moving_offsets={joint: track * scale for joint, track in motion.moving_offsets.items()},
-        source=replace(motion.source, metres_per_unit=metres_per_unit, unit_doubt=""),
+        source=source,
     )
 
 

@@ -29,6 +29,8 @@ class CharacterSource:
     """By joint what the file calls it: the index of a node, the path of a prim; `NEW_NODE` for one that it lacks."""
     animation: str | None = None
     """Name of the animation that the motion was read from; None for the rest pose."""
+    metres_per_unit: float = field(default=1.0, kw_only=True)
+    """Length of the unit that the file declares, metres."""
     humanoid: Mapping[str, str] = field(default_factory=dict)
     """Joint name by canonical name, where the file itself says which is which (VRM)."""
     armatures: Sequence[str] = ()

@@ -117,4 +117,5 @@ def _source(chosen: CharacterPath, found: Answer, frames: RestFrames) -> Charact
         said.get("animation"),
         armatures=said["armatures"],
         animations=said.get("animations", {}),
+        metres_per_unit=said["metres_per_unit"],
     )

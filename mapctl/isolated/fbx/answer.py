@@ -55,6 +55,7 @@ def _describe(scene: ufbx.Scene, armature: Armature) -> Found:
         tables["ends"] = np.array([to_matrix(node.node_to_parent)[:3, 3] for node in armature.ends.values()])
     said = {
         "armature": armature.name,
+        "metres_per_unit": scene.settings.original_unit_meters,
         "names": armature.names,
         "parents": armature.parents,
         "end_joints": list(armature.ends),

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pxr import Tf, Usd
+from pxr import Tf, Usd, UsdGeom
 
 from mapctl.isolated.child import Array, Found, Refusal
 from mapctl.isolated.parts import pack_parts
@@ -55,6 +55,7 @@ def _describe(stage: Usd.Stage, name: str, skeleton: SkeletonPrim) -> Found:
             tables[kind] = np.ascontiguousarray(table)
     said = {
         "armature": name,
+        "metres_per_unit": UsdGeom.GetStageMetersPerUnit(stage),
         "armatures": find_skeletons(stage)[0],
         "path": str(skeleton.prim.GetPath()),
         "joints": skeleton.joints,
