@@ -18,10 +18,9 @@ from mapctl.errors import RequestError
 from mapctl.formats.characters.source import CharacterSource
 from mapctl.formats.examples import is_example
 from mapctl.motion import Motion
-from mapctl.retarget import bone_offsets
 from mapctl.retarget.body_plan import goes_on_four_legs
 from mapctl.retarget.joint_matching import Match, correct_sides, match
-from mapctl.retarget.reference_pose import TPose, find_tpose, is_canonical_tpose
+from mapctl.retarget.reference_pose import TPose, find_tpose, is_canonical_tpose, measure_bones, rest_rotations
 from mapctl.retarget.rig_poses import RigPoses
 from mapctl.retarget.rigs import Rig, find_preset, known_rigs, read_rig_toml
 from mapctl.skeleton import CANONICAL, Skeleton
@@ -57,7 +56,7 @@ class RigMap(TPose):
     @property
     def rest_quat_xyzw(self) -> Float[Tensor, "rigged 4"]:
         """World rotations (xyzw) of the rig's joints in the T-pose, with Y up."""
-        return bone_offsets.rest_rotations(self.rig_skeleton, self.joint_of, self)
+        return rest_rotations(self.rig_skeleton, self.joint_of, self)
 
 
 def load_rig(name_or_path: str | PathLike[str]) -> Rig:
@@ -82,20 +81,26 @@ def identify_rig(skeleton: Skeleton, rig: Rig | None = None, *, motion: Motion |
     tree and positions (see mapctl.retarget.joint_matching). A `motion` of the skeleton shows the up axis, the sides and
     how knees and elbows bend, and with that whether the T-pose of a preset or of the file is one.
     """
-    character = _character_of(motion)
+    source = None if motion is None else motion.source
+    character = source if isinstance(source, CharacterSource) else None
     if character is not None and rig is None and character.humanoid:
         rig = Rig("vrm", character.humanoid, about="VRM: the file itself says which joint is which.")
     found = match(skeleton, rig, motion=motion)
-    if rig is None or not rig.joints:
-        _check_body_plan(found, skeleton, motion)
+    zero = RigPoses.zero(skeleton, found.joint_of)
+    clip = None if motion is None else RigPoses.of(motion, found.joint_of)
+    if (rig is None or not rig.joints) and goes_on_four_legs(skeleton, zero, clip):
+        raise RequestError(
+            "this is a body on four legs, by the names of its joints or by its pose with all rotations zero; "
+            "--rig with a TOML file that names the joints of a person takes it all the same"
+        )
     stated = rig is not None and bool(rig.joints) and rig not in known_rigs()
     if not stated:
-        found = correct_sides(found, skeleton, motion)
+        found = correct_sides(found, zero, clip)
+        zero = replace(zero, joint_of=found.joint_of)
+        clip = clip and replace(clip, joint_of=found.joint_of)
     if character is not None and not character.frames.are_aligned and found.rig in known_rigs():
         # A preset's table is of the rig's own joint frames, which are not those that a character's motion has.
         found = replace(found, rig=replace(found.rig, tpose={}))
-    zero = RigPoses.zero(skeleton, found.joint_of)
-    clip = None if motion is None else RigPoses.of(motion, found.joint_of)
     # The canonical names in a T-pose are the canonical body, whatever it does.
     stated = stated or (found.rig.name == "canonical" and is_canonical_tpose(zero))
     up, own = (None, None) if character is None else ("y", torch.from_numpy(character.frames.quat_xyzw))
@@ -105,30 +110,13 @@ def identify_rig(skeleton: Skeleton, rig: Rig | None = None, *, motion: Motion |
         rig=found.rig,
         rig_skeleton=skeleton,
         joint_of=found.joint_of,
-        skeleton=bone_offsets.measure_bones(skeleton, found.joint_of, tpose),
+        skeleton=measure_bones(skeleton, found.joint_of, tpose),
         match=found,
     )
     if motion is None:
         return rigmap
     # A character's rest pose shows no travel; a root on the floor is to stay there, not to rise and sink with the hips.
-    return replace(rigmap, hips_travel=_hips_joint(rigmap) in motion.moving_offsets or character is not None)
-
-
-def _character_of(motion: Motion | None) -> CharacterSource | None:
-    """Return the character whose file the motion came from."""
-    source = None if motion is None else motion.source
-    return source if isinstance(source, CharacterSource) else None
-
-
-def _check_body_plan(found: Match, skeleton: Skeleton, motion: Motion | None) -> None:
-    """Raise RequestError for a four-legged body."""
-    zero = RigPoses.zero(skeleton, found.joint_of)
-    clip = None if motion is None else RigPoses.of(motion, found.joint_of)
-    if goes_on_four_legs(skeleton, zero, clip):
-        raise RequestError(
-            "this is a body on four legs, by the names of its joints or by its pose with all rotations zero; "
-            "--rig with a TOML file that names the joints of a person takes it all the same"
-        )
+    return replace(rigmap, hips_travel=rigmap.joints["hips"] in motion.moving_offsets or character is not None)
 
 
 def as_rig(rigmap: RigMap) -> Rig:
@@ -163,7 +151,7 @@ def to_canonical(motion: Motion, rig: Rig | None = None) -> tuple[Motion, RigMap
         else:
             picked.append(rotations.multiply(world[:, joint], rotations.inverse(tpose).expand(len(world), 4)))
     local = kinematics.local_from_world(CANONICAL.parents, torch.stack(picked, dim=1))
-    hips = motion.joint_positions()[:, _hips_joint(rigmap)]
+    hips = motion.joint_positions()[:, rigmap.joints["hips"]]
     upright = rigmap.upright_quat_xyzw
     if upright is not None:  # all other joints rotate with the hips
         local[:, 0] = rotations.multiply(upright.expand(len(world), 4), local[:, 0])
@@ -228,7 +216,7 @@ def _to_file_world(motion: Motion, rigmap: RigMap) -> tuple[Tensor, dict[int, Te
 
 def _place_hips(on_rig: Motion, rigmap: RigMap, hips: Tensor, original: Motion | None) -> Motion:
     """Move the hips to target positions: by the root itself, or by their offset below it where that is animated."""
-    joint = _hips_joint(rigmap)
+    joint = rigmap.joints["hips"]
     if joint == 0:
         moving = original.moving_offsets if original is not None else {}
         return replace(on_rig, root_position=hips, moving_offsets=moving)
@@ -242,13 +230,6 @@ def _place_hips(on_rig: Motion, rigmap: RigMap, hips: Tensor, original: Motion |
     turn, place = on_rig.joint_rotations()[:, parent], on_rig.joint_positions()[:, parent]
     offset = rotations.rotate(rotations.inverse(turn), hips - place)
     return replace(on_rig, moving_offsets={**on_rig.moving_offsets, joint: offset})
-
-
-def _hips_joint(rigmap: RigMap) -> int:
-    joint = rigmap.joint_of[0]
-    if joint is None:
-        raise RequestError(f"the rig {rigmap.rig.name} names no hips")
-    return joint
 
 
 def canonical_joints(motion: Motion, rig: Rig | None = None) -> dict[str, int]:

@@ -35,7 +35,8 @@ _Y_UP_WEIGHT = 0.25  # of what most files have
 _STANDING = 0.8  # cosine between the thighs and the body's down in a pose that stands
 _NO_LINE = 1e-3  # metres between two joints below which they are one
 _X, _Y, _Z = torch.eye(3, dtype=torch.float64)
-_SIDES = (("left", 1.0), ("right", -1.0))
+SIGNS = (("left", 1.0), ("right", -1.0))
+"""Signs of x on each side of the body."""
 
 Vectors = Float[Tensor, "poses 3"]
 
@@ -77,7 +78,7 @@ class Anatomy:
 
 
 def _list_rest_of_arm(name: str) -> list[str]:
-    return [side + part for side, _ in _SIDES if name == side + "UpperArm" for part in _ARM[1:]]
+    return [side + part for side, _ in SIGNS if name == side + "UpperArm" for part in _ARM[1:]]
 
 
 @dataclass
@@ -110,11 +111,11 @@ class _Builder:
         """Give a joint the frame in which the first direction is its canonical one, and the second as nearly so as
         that allows."""
         one, two = unit_vectors(self.average(name, first)), unit_vectors(self.average(name, second))
-        target = _orthonormal(aim, aim_second)
-        self.measured[name] = self.frames[name] = target @ _orthonormal(one, two).T
+        target = orthonormal_frame(aim, aim_second)
+        self.measured[name] = self.frames[name] = target @ orthonormal_frame(one, two).T
         if self.in_quarter_turns:
             one = _nearest_axis(one)
-            self.frames[name] = target @ _orthonormal(one, _nearest_axis(two - one * (one @ two))).T
+            self.frames[name] = target @ orthonormal_frame(one, _nearest_axis(two - one * (one @ two))).T
 
     def continue_frame(self, name: str, above: str) -> None:
         """Give the end of a limb the frame of the joint above where that is near enough, else the measured one: rigs
@@ -153,7 +154,7 @@ def _orient_joints(found: _Builder, upright: Tensor | None) -> tuple[_Builder, d
     found.orient("hips", clip.hip_line(), _X, clip.position("spine") - clip.middle("UpperLeg"), _Y)
     certain = {"hips": found.frames["hips"]}
     known = [*_orient_trunk(found)]
-    for side, sign in _SIDES:
+    for side, sign in SIGNS:
         known += [*_orient_arm(found, side, sign), *_orient_leg(found, side, pitch)]
     return found, certain | {name: found.frames[name] for name in known}
 
@@ -229,7 +230,7 @@ def _orient_leg(found: _Builder, side: str, pitch: float) -> Iterator[str]:
 
 def _pelvis_up(clip: RigPoses) -> Vectors:
     """Return the pelvis's up direction, weighted: against the legs where both are stretched, else along the spine."""
-    (left, first), (right, second) = (_leg_extension(clip, side) for side, _ in _SIDES)
+    (left, first), (right, second) = (_leg_extension(clip, side) for side, _ in SIGNS)
     return _SPINE_WEIGHT * unit_vectors(clip.position("spine") - clip.middle("UpperLeg")) - first * second * (
         left + right
     )
@@ -249,7 +250,7 @@ def _estimate_foot_pitch(clip: RigPoses, upright: Tensor | None) -> float:
     _, y, z = unit_vectors(CANONICAL.offsets[CANONICAL.index("leftToes")]).tolist()
     up = _Y if upright is None else rotations.rotate(rotations.inverse(upright), _Y)
     total, weights = math.atan2(-y, z) * _PITCH_WEIGHT, _PITCH_WEIGHT
-    for side, _ in _SIDES:
+    for side, _ in SIGNS:
         bone = clip.bone(side + "Foot")
         if bone is None:
             continue
@@ -290,7 +291,7 @@ def _nearest_axis(direction: Tensor) -> Float[Tensor, "3"]:
     return torch.eye(3, dtype=direction.dtype)[largest] * direction[largest].sign()
 
 
-def _orthonormal(first: Tensor, second: Tensor) -> Float[Tensor, "3 3"]:
+def orthonormal_frame(first: Tensor, second: Tensor) -> Float[Tensor, "3 3"]:
     """Return the right-handed frame whose first column is along `first` and whose second is nearest to `second`."""
     first = unit_vectors(first)
     second = unit_vectors(second - first * (first @ second))
@@ -307,7 +308,8 @@ def find_up_axis(clip: RigPoses, rest_up: Tensor | None) -> str:
     point stays at 0 along it. A crawl's trunk lies along another axis in all of its frames; its arms, its rest pose and
     the floor outvote that.
     """
-    positions, arms = clip.matched_positions(), unit_vectors(clip.middle("LowerArm") - clip.middle("UpperArm"))
+    positions = clip.positions[:, [joint for joint in clip.joint_of if joint is not None]]
+    arms = unit_vectors(clip.middle("LowerArm") - clip.middle("UpperArm"))
     height = 2 * float((clip.middle("UpperArm") - clip.middle("UpperLeg")).norm(dim=-1).mean()) + 1e-9
     upright = (clip.up() - 0.5 * arms).mean(0) + (0.0 if rest_up is None else _REST_WEIGHT * rest_up)
 
@@ -324,7 +326,7 @@ def measure_front(poses: RigPoses) -> Float[Tensor, " poses"]:
     knees bend away from it, about -1 where sides are exchanged, near 0 where a pose shows neither."""
     left, up = poses.left(), poses.up()
     front, votes = torch.linalg.cross(left, up), torch.zeros_like(left[:, 0])
-    for side, _ in _SIDES:
+    for side, _ in SIGNS:
         thigh, shin = _bone(poses, side + "UpperLeg"), _bone(poses, side + "LowerLeg")
         votes = votes + (torch.linalg.cross(thigh, shin) * left).sum(-1)
         bone = poses.bone(side + "Foot")

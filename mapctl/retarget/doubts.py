@@ -15,7 +15,7 @@ from mapctl.joint_names import Part, Side
 from mapctl.joint_roles import classify_joints
 from mapctl.motion import Motion
 from mapctl.retarget import RigMap
-from mapctl.retarget.anatomy import MIN_FRONT, measure_front
+from mapctl.retarget.anatomy import MIN_FRONT, SIGNS, measure_front
 from mapctl.retarget.body_plan import find_further_limbs, find_second_body, stays_on_all_fours
 from mapctl.retarget.joint_matching import HELPER_NAME, KnownBy
 from mapctl.retarget.rig_poses import RigPoses
@@ -327,7 +327,7 @@ def _check_order(body: RigPoses) -> Iterator[Doubt]:
     for below, above in pairwise(("hips", "spine", "chest", "neck", "head")):
         if float((body.position(above) - body.position(below))[0, 1]) < -_MAX_SINK:
             yield Doubt(f"{above} is below {below} in the T-pose", (below, above))
-    for side, sign in zip(SIDES, (1.0, -1.0), strict=True):
+    for side, sign in SIGNS:
         if float((body.position(side + "UpperArm") - body.position("hips"))[0, 1]) < 0:
             yield Doubt(f"{side}UpperArm is below the hips in the T-pose", (side + "UpperArm",))
         for part in ("UpperArm", "UpperLeg"):

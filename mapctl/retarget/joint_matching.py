@@ -102,16 +102,14 @@ def match(skeleton: Skeleton, rig: Rig | None = None, *, motion: Motion | None =
     return Match(chosen, joint_of, score, unmapped, known_by=known)
 
 
-def correct_sides(found: Match, skeleton: Skeleton, motion: Motion | None) -> Match:
+def correct_sides(found: Match, zero: RigPoses, clip: RigPoses | None) -> Match:
     """Exchange left and right in the match if the rig's names contradict the positions of its joints."""
-    zero = RigPoses.zero(skeleton, found.joint_of)
-    clip = None if motion is None else RigPoses.of(motion, found.joint_of)
     if not are_sides_swapped(zero, clip):
         return found
     partner = [CANONICAL.index(mirror_name(name)) for name in CANONICAL.names]
     joint_of = tuple(found.joint_of[other] for other in partner)
     known = {mirror_name(name): how for name, how in found.known_by.items()}
-    named = any(r.side is not Side.MIDDLE for j, r in enumerate(classify_joints(skeleton)) if j in found.joint_of)
+    named = any(r.side is not Side.MIDDLE for j, r in enumerate(classify_joints(zero.skeleton)) if j in found.joint_of)
     score = found.score * (_SWAPPED if named else 1.0)
     return replace(found, joint_of=joint_of, score=score, sides_exchanged=named, known_by=known)
 
@@ -254,17 +252,9 @@ def _match_limb_by_words(roles: list[Role], side: Side) -> dict[str, int]:
         arm, elbow = arm[:1], arm[1:]
     if not arm and shoulder:
         shoulder, arm = shoulder[:-1], shoulder[-1:]  # a shoulder, an elbow and a wrist
-    parts = {
-        "UpperLeg": upper,
-        "LowerLeg": lower,
-        "Foot": foot,
-        "Toes": toes,
-        "Shoulder": shoulder,
-        "UpperArm": arm,
-        "LowerArm": elbow,
-        "Hand": named(Part.HAND),
-    }
-    return {side.value + part: joints[0] for part, joints in parts.items() if joints}
+    names = ("UpperLeg", "LowerLeg", "Foot", "Toes", "Shoulder", "UpperArm", "LowerArm", "Hand")
+    joints = (upper, lower, foot, toes, shoulder, arm, elbow, named(Part.HAND))
+    return {side.value + name: found[0] for name, found in zip(names, joints, strict=True) if found}
 
 
 def _assign_sides(

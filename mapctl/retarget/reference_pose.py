@@ -1,4 +1,4 @@
-"""The T-pose of any rig: the world rotation of each joint in it, from the readings that its file and its table offer.
+"""The T-pose of any rig, from the readings that its file and its table offer, and the performer's bones in it.
 
 A table, a standing pose with all rotations zero and a first frame that is a T-pose are readings; each is held against
 how the body of a clip is built and bends (`anatomy`), and the first that fits is taken. Where none does, or there is
@@ -10,16 +10,17 @@ limb above. Feet keep their orientation; hands go with the arm.
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from mapctl import kinematics, rotations
-from mapctl.retarget.anatomy import CORE, estimate_frames, find_up_axis
-from mapctl.retarget.rig_poses import RigPoses, unit_vectors
+from mapctl.retarget.anatomy import CORE, SIGNS, estimate_frames, find_up_axis, orthonormal_frame
+from mapctl.retarget.rig_poses import JointOf, RigPoses, next_joint, unit_vectors
 from mapctl.retarget.rigs import Rig
-from mapctl.skeleton import CANONICAL
+from mapctl.skeleton import CANONICAL, Skeleton
 
 _LIMBS = ("UpperArm", "LowerArm", "UpperLeg", "LowerLeg")
 _SNAP = math.radians(20)  # a rest pose whose up or facing is this near an axis has it along that axis
@@ -29,6 +30,7 @@ _LEVEL, _HANGING = math.radians(25), math.radians(100)
 _LEG_TOLERANCE = math.radians(35)  # between the legs of a standing rest pose and the vertical
 _EXACT_TPOSE_ANGLE = math.radians(15)  # of arms and legs in a frame that is a T-pose on purpose
 UNROTATED = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
+_END_SITES = ("Toes", "Hand", "head")  # joints whose position an End Site of the joint above may give
 _VECTORS = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
@@ -75,40 +77,34 @@ def find_tpose(
     upright = upright_rotation(up)
     readings = list(_list_readings(zero, clip, rig, stated, rest, front, up))
 
-    def choose(found: str, quats: Tensor, idle: Tensor, doubt: str = "") -> TPose:
-        return TPose(
-            tpose_quat_xyzw=quats,
-            idle_quat_xyzw=idle,
-            upright_quat_xyzw=upright,
-            up=up,
-            facing="unknown" if rest == "neither" else nearest_axis_name(front[2]),
-            rest=rest,
-            tpose_from=found,
-            tpose_doubt=doubt,
-        )
-
+    choose = partial(
+        TPose,
+        upright_quat_xyzw=upright,
+        up=up,
+        facing="unknown" if rest == "neither" else nearest_axis_name(front[2]),
+        rest=rest,
+    )
     if clip is None:
-        quats, idle, found = (*readings, (_lay_out_tpose(zero, front), _unrotated(zero), "rest pose"))[0]
-        return choose(found, quats, idle)
+        quats, idle, found = (*readings, (_lay_out_tpose(zero, front), _idle_rotations(rig, zero), "rest pose"))[0]
+        return choose(tpose_quat_xyzw=quats, idle_quat_xyzw=idle, tpose_from=found)
     anatomy, refused = estimate_frames(clip, upright, own), ""
     for quats, idle, found in readings:
         contradicted = anatomy.find_contradictions(quats)
         doubt = f"{_describe_angles(contradicted)} off in the {found} by how the body moves" if contradicted else ""
         if stated and (rig.tpose or rig.rest != "auto"):
-            return choose(found, quats, idle, doubt)
+            return choose(tpose_quat_xyzw=quats, idle_quat_xyzw=idle, tpose_from=found, tpose_doubt=doubt)
         if not contradicted.keys() & CORE:
             doubt = doubt and f"{doubt}, which is followed for the arm"
-            return choose(found, anatomy.correct(quats, contradicted), idle, doubt)
+            quats = anatomy.correct(quats, contradicted)
+            return choose(tpose_quat_xyzw=quats, idle_quat_xyzw=idle, tpose_from=found, tpose_doubt=doubt)
         refused = refused or doubt
-    frames = anatomy.correct(
-        torch.zeros(CANONICAL.num_joints, 4, dtype=torch.float64), dict.fromkeys(CANONICAL.names, 0.0)
-    )
+    frames = anatomy.correct(torch.zeros(CANONICAL.num_joints, 4, dtype=torch.float64), CANONICAL.names)
     doubt = refused and f"{refused}, which is followed"
     if not anatomy.is_certain:
         doubt = "no pose of the file is a T- or A-pose and knees hardly bend: how limbs are twisted is a guess"
     elif not anatomy.in_quarter_turns:
         doubt = doubt or "no pose of the file is a T- or A-pose: joint frames are estimated by how the body moves"
-    return choose("motion", frames, _mean_locals(clip), doubt)
+    return choose(tpose_quat_xyzw=frames, idle_quat_xyzw=_mean_locals(clip), tpose_from="motion", tpose_doubt=doubt)
 
 
 def _describe_angles(angles: Mapping[str, float]) -> str:
@@ -127,7 +123,7 @@ def _list_readings(
     if rig.has_tpose and (stated or rest == "neither" or is_canonical_tpose(zero)):
         yield _read_table(rig, laid_out), _idle_rotations(rig, zero), "table"
     if laid_out is not None:
-        yield laid_out, _unrotated(zero), "rest pose"
+        yield laid_out, _idle_rotations(rig, zero), "rest pose"
     if clip is not None and rig.rest in ("auto", "frame0"):
         first = clip.first()
         turned = _body_frame(first.left()[0], axis_vector(up))
@@ -148,14 +144,11 @@ def _read_table(rig: Rig, laid_out: Tensor | None) -> Float[Tensor, "joints 4"]:
 
 def frame_from_axes(x: list[float], y: list[float]) -> Float[Tensor, "3 3"]:
     """Return the rotation whose first two columns point along x and (as nearly as they are square) y."""
-    first = torch.nn.functional.normalize(torch.tensor(x, dtype=torch.float64), dim=0)
-    second = torch.tensor(y, dtype=torch.float64)
-    second = torch.nn.functional.normalize(second - first * (first @ second), dim=0)
-    return torch.stack([first, second, torch.linalg.cross(first, second)], dim=1)
+    return orthonormal_frame(torch.tensor(x, dtype=torch.float64), torch.tensor(y, dtype=torch.float64))
 
 
 def _idle_rotations(rig: Rig, zero: RigPoses) -> Float[Tensor, "rigged 4"]:
-    idle = _unrotated(zero)
+    idle = UNROTATED.repeat(zero.skeleton.num_joints, 1)
     for joint, name in enumerate(zero.skeleton.names):
         if name in rig.idle:
             idle[joint] = torch.tensor(rig.idle[name], dtype=torch.float64)
@@ -179,14 +172,9 @@ def classify_reference_pose(poses: RigPoses, front: Float[Tensor, "3 3"]) -> str
 
     `front` rotates it to be upright and face +Z.
     """
-    arms = [
-        (_bone_direction(poses, side + part, front), sign)
-        for side, sign in (("left", 1.0), ("right", -1.0))
-        for part in ("UpperArm", "LowerArm")
-    ]
-    legs = [
-        _bone_direction(poses, side + part, front) for side in ("left", "right") for part in ("UpperLeg", "LowerLeg")
-    ]
+    limbs = [(side + half, sign) for side, sign in SIGNS for half in ("Upper", "Lower")]
+    arms = [(_bone_direction(poses, limb + "Arm", front), sign) for limb, sign in limbs]
+    legs = [_bone_direction(poses, limb + "Leg", front) for limb, _ in limbs]
     if any(float(-leg[1]) < math.cos(_LEG_TOLERANCE) for leg in legs):
         return "neither"
     arms = [(arm, sign) for arm, sign in arms if float(arm.norm()) > 0]
@@ -203,7 +191,7 @@ def upright_rotation(up: str) -> Float[Tensor, "4"] | None:
 
 def is_tpose(poses: RigPoses, front: Float[Tensor, "3 3"]) -> bool:
     """Return whether the first pose is a T-pose that captures begin with: all straight, arms level, legs vertical."""
-    for side, sign in (("left", 1.0), ("right", -1.0)):
+    for side, sign in SIGNS:
         for part, aim in (("Arm", axis_vector("x") * sign), ("Leg", -axis_vector("y"))):
             bones = [_bone_direction(poses, f"{side}{half}{part}", front) for half in ("Upper", "Lower")]
             if any(float(bone @ aim) < math.cos(_EXACT_TPOSE_ANGLE) for bone in bones):
@@ -233,7 +221,7 @@ def _facing_rotation(zero: RigPoses, facing: Tensor | None) -> Float[Tensor, "3 
 
 
 def _body_frame(left: Tensor, up: Tensor) -> Float[Tensor, "3 3"]:
-    left = torch.nn.functional.normalize(left - up * (left @ up), dim=0)
+    left = unit_vectors(left - up * (left @ up))
     return torch.stack([left, up, torch.linalg.cross(left, up)])
 
 
@@ -263,11 +251,8 @@ def _lay_out_tpose(base: RigPoses, front: Tensor) -> Float[Tensor, "joints 4"]:
         if aligned and aim.norm() > 0 and bone.norm() > 0 and base.has(name):
             turn = rotations.to_matrix(rotations.between_vectors(bone, aim)) @ turn
         turns.append(turn)
-    still = [rotations.from_matrix(turn) for turn in turns]
-    joints = [
-        base.orientations[0, joint] if joint is not None else still[0].new_tensor([0, 0, 0, 1])
-        for joint in base.joint_of
-    ]
+    joints = [UNROTATED if joint is None else base.orientations[0, joint] for joint in base.joint_of]
+    still = (rotations.from_matrix(turn) for turn in turns)
     return torch.stack([rotations.multiply(turn, own) for turn, own in zip(still, joints, strict=True)])
 
 
@@ -279,10 +264,74 @@ def _canonical_direction(index: int) -> Float[Tensor, "3"]:
     return unit_vectors(CANONICAL.offsets[CANONICAL.children(index)[0]])
 
 
-def _unrotated(poses: RigPoses) -> Float[Tensor, "rigged 4"]:
-    return UNROTATED.repeat(poses.skeleton.num_joints, 1)
-
-
 def _mean_locals(clip: RigPoses) -> Float[Tensor, "rigged 4"]:
     """Return the mean local rotations of a clip, which joints between canonical ones have in its body's T-pose."""
     return rotations.average(kinematics.local_from_world(clip.skeleton.parents, clip.orientations))
+
+
+def rest_rotations(skeleton: Skeleton, joint_of: JointOf, tpose: TPose) -> Float[Tensor, "rigged 4"]:
+    """Return the world rotations (xyzw) of a rig's joints in the T-pose, with Y up; joints that are no canonical one
+    rest in their parents."""
+    canonical = {joint: tpose.tpose_quat_xyzw[c] for c, joint in enumerate(joint_of) if joint is not None}
+    root = UNROTATED if tpose.upright_quat_xyzw is None else tpose.upright_quat_xyzw
+    found: list[Tensor] = []
+    for joint, parent in enumerate(skeleton.parents):
+        above = found[parent] if parent >= 0 else root
+        found.append(canonical.get(joint, rotations.multiply(above, tpose.idle_quat_xyzw[joint])))
+    return torch.stack(found)
+
+
+def measure_bones(skeleton: Skeleton, joint_of: JointOf, tpose: TPose) -> Skeleton:
+    """Measure a rig's bones on the canonical skeleton, metres.
+
+    A joint that the rig lacks is put where the End Site of the joint above is, between its neighbours, or, at the end
+    of a limb, as far on as the canonical one in scale.
+    """
+    turn, place = rest_rotations(skeleton, joint_of, tpose), [torch.zeros(3, dtype=torch.float64)]
+    for joint, parent in enumerate(skeleton.parents[1:], start=1):
+        place.append(place[parent] + rotations.rotate(turn[parent], skeleton.offsets[joint]))
+    ends = {}
+    for name, site in skeleton.end_offsets.items():
+        joint = skeleton.index(name)
+        ends[joint] = rotations.rotate(turn[joint], torch.tensor(site, dtype=torch.float64))
+    known = {c: place[joint] for c, joint in enumerate(joint_of) if joint is not None}
+    spots: list[Tensor] = []
+    for c in range(CANONICAL.num_joints):
+        spots.append(known[c] if c in known else _estimate_position(c, joint_of, spots, known, ends))
+    places = torch.stack(spots)
+    offsets = torch.cat([torch.zeros(1, 3, dtype=torch.float64), places[1:] - places[list(CANONICAL.parents[1:])]])
+    tips = {
+        CANONICAL.names[c]: _to_triple(ends[j])
+        for c, j in enumerate(joint_of)
+        if j is not None and j in ends and not CANONICAL.children(c)
+    }
+    return Skeleton(CANONICAL.names, CANONICAL.parents, offsets, tips)
+
+
+def _estimate_position(
+    c: int, joint_of: JointOf, spots: list[Tensor], known: Mapping[int, Tensor], ends: Mapping[int, Tensor]
+) -> Float[Tensor, "3"]:
+    """Estimate the position of a joint that the rig lacks, metres."""
+    name, parent = CANONICAL.names[c], CANONICAL.parents[c]
+    above, own = joint_of[parent], float(CANONICAL.offsets[c].norm())
+    if name.endswith(_END_SITES) and above is not None and above in ends:
+        return spots[parent] + ends[above]
+    length, following = own, next_joint(name)
+    while following is not None:
+        length += float(CANONICAL.offsets[CANONICAL.index(following)].norm())
+        if CANONICAL.index(following) in known:
+            return spots[parent] + (known[CANONICAL.index(following)] - spots[parent]) * (own / length)
+        following = next_joint(following)
+    return spots[parent] + CANONICAL.offsets[c] * _estimate_scale(spots)
+
+
+def _estimate_scale(spots: list[Tensor]) -> float:
+    """Estimate the performer's size relative to the canonical skeleton from the reach of the joints so far."""
+    own = sum(float((spot - spots[CANONICAL.parents[c]]).norm()) for c, spot in enumerate(spots) if c)
+    usual = float(CANONICAL.offsets[1 : len(spots)].norm(dim=-1).sum())
+    return own / usual if own > 0 and usual > 0 else 1.0
+
+
+def _to_triple(vector: Tensor) -> tuple[float, float, float]:
+    x, y, z = vector.tolist()
+    return x, y, z

@@ -67,10 +67,6 @@ class RigPoses:
         """Return the position of a canonical joint that the rig has, metres."""
         return self.positions[:, self.joint(name)]
 
-    def matched_positions(self) -> Float[Tensor, "poses matched 3"]:
-        """Return the positions of all joints that are canonical ones, metres."""
-        return self.positions[:, [joint for joint in self.joint_of if joint is not None]]
-
     def middle(self, part: str) -> Float[Tensor, "poses 3"]:
         """Return the point halfway between the left and the right joint of a part, metres."""
         return (self.position("left" + part) + self.position("right" + part)) / 2
