@@ -14,9 +14,8 @@ from scipy.spatial.transform import Rotation
 
 import mapctl
 from mapctl.motion import Motion
-from mapctl.retarget.carry import RiggedCharacter, retarget_motion
+from mapctl.retarget.carry import RiggedCharacter, match_fingers, retarget_motion
 from mapctl.retarget.carry.changes import Changes, Miss
-from mapctl.retarget.carry.fingers import match_fingers
 from mapctl.skeleton import Skeleton
 
 MIXAMO, UE5 = (make(Make(names_of(name), arms_down_deg=down)) for name, down in (("mixamo", 0.0), ("ue5", 45.0)))

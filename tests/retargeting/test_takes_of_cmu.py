@@ -16,7 +16,7 @@ from rig_maker import Make, make, names_of
 import mapctl
 from mapctl.motion import Motion
 from mapctl.retarget.carry import RiggedCharacter, retarget_motion
-from mapctl.retarget.carry.ground import find_ground
+from mapctl.retarget.carry.legs import find_ground
 
 FOLDER = Path(os.environ.get("MAPCTL_CMU", ""))
 TAKES = ("02_01", "02_02", "02_03")

@@ -7,25 +7,33 @@ where they were relative to these. Two-bone inverse kinematics brings legs and a
 in Gleicher 1998, but joint by joint instead of by spacetime optimisation.)
 """
 
+import re
+from collections import defaultdict
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Literal, get_args
 
+from jaxtyping import Float
+from torch import Tensor
+
+from mapctl import rotations
 from mapctl.errors import RequestError
+from mapctl.joint_names import Part, Side, classify_joint
 from mapctl.motion import Motion
-from mapctl.retarget import as_rig, to_canonical
+from mapctl.retarget import RigMap, as_rig, to_canonical
+from mapctl.retarget.carry import legs
 from mapctl.retarget.carry.changes import Changes, RetargetedMotion, list_unmatched_joints, measure_changes
 from mapctl.retarget.carry.character import LEGS, RiggedCharacter, limb_extension
-from mapctl.retarget.carry.fingers import carry_fingers, match_fingers
-from mapctl.retarget.carry.ground import find_ground
 from mapctl.retarget.carry.hands import keep_hand_relations
-from mapctl.retarget.carry.legs import find_ankle_targets, fit_hips, lower_hips, reach_ankle_targets, transfer_root
 from mapctl.retarget.rigs import Rig
-from mapctl.skeleton import leg_length
+from mapctl.skeleton import Skeleton, leg_length
 
 __all__ = ["Changes", "GroundMode", "RetargetedMotion", "RiggedCharacter", "retarget_canonical", "retarget_motion"]
 
 GroundMode = Literal["fit", "keep"]
 """Whether what feet stand on, as stairs, is scaled with the body (`fit`) or as high as it was, in metres (`keep`)."""
+_FINGERS = re.compile(r"thumb|index|mid|ring|pinky|little", re.IGNORECASE)
+_SAME = {"little": "pinky"}
 
 
 def retarget_motion(
@@ -43,7 +51,7 @@ def retarget_motion(
     found = retarget_canonical(canonical, giver, body, ground=ground)
     fingers = match_fingers(clip.skeleton, body.rigmap.rig_skeleton)
     unmatched = list_unmatched_joints(clip, giver.rigmap, fingers.values())
-    carried = carry_fingers(clip, giver.rigmap, body.rigmap)
+    carried = _carry_fingers(clip, giver.rigmap, body.rigmap, fingers)
     return replace(found, changes=replace(found.changes, unmatched_joints=unmatched), fingers=carried)
 
 
@@ -58,15 +66,52 @@ def retarget_canonical(
     giver = replace(giver, stance=giver.stance.keep_floor()) if keeps else giver
     own = giver.stance.leveled(motion)
     scale = leg_length(body.leveled) / leg_length(own.skeleton)
-    found = find_ground(own, giver.stance)
+    found = legs.find_ground(own, giver.stance)
     higher = 1 - scale if keeps else 0.0
-    moved = transfer_root(own, giver, body, scale, higher * found.under_hips(float(own.fps)))
-    ankles = find_ankle_targets(own, moved, giver.stance, body.stance, found, scale=scale, raised=higher * found.height)
+    moved = legs.transfer_root(own, giver, body, scale, higher * found.under_hips(float(own.fps)))
+    ankles = legs.find_ankle_targets(
+        own, moved, giver.stance, body.stance, found, scale=scale, raised=higher * found.height
+    )
     straight = limb_extension(own, LEGS)
-    lowered = lower_hips(fit_hips(moved, ankles, straight), ankles, straight)
-    legs = reach_ankle_targets(lowered, ankles)
-    done, reached = keep_hand_relations(own, legs, giver.stance, scale=scale)
+    lowered = legs.lower_hips(legs.fit_hips(moved, ankles, straight), ankles, straight)
+    standing = legs.reach_ankle_targets(lowered, ankles)
+    done, hands = keep_hand_relations(own, standing, giver.stance, scale=scale)
     changes = measure_changes(
-        motion, done, ankles, reached, dip=moved.root_position - lowered.root_position, tilt=giver.stance.tilt
+        motion, done, ankles, hands, dip=moved.root_position - lowered.root_position, tilt=giver.stance.tilt
     )
     return RetargetedMotion(body.stance.restore_foot_tilt(done), changes)
+
+
+def match_fingers(giver: Skeleton, body: Skeleton) -> dict[int, int]:
+    """Match finger joints by side, finger and place along it: a joint of the giver by joint of the body."""
+    theirs = _list_fingers(giver)
+    return {joint: theirs[finger] for finger, joint in _list_fingers(body).items() if finger in theirs}
+
+
+def _carry_fingers(
+    clip: Motion, giver: RigMap, body: RigMap, pairs: Mapping[int, int]
+) -> Mapping[int, Float[Tensor, "frames 4"]]:
+    """Return the local rotations (xyzw) of the body's finger joints that turn as the giver's do, by joint of its rig;
+    in the T-poses of both rigs, fingers are taken to point along the same direction."""
+    ours, theirs = body.rest_quat_xyzw, giver.rest_quat_xyzw
+    found = {}
+    for joint, other in pairs.items():
+        rest, their_rest = ours[body.rig_skeleton.parents[joint]], theirs[giver.rig_skeleton.parents[other]]
+        idle, their_idle = body.idle_quat_xyzw[joint], giver.idle_quat_xyzw[other]
+        # From the parent's frame in one T-pose to that in the other; each rotation is what it adds to rest.
+        turn = rotations.multiply(rotations.inverse(rest), their_rest).expand(clip.num_frames, 4)
+        added = rotations.multiply(clip.local_quat_xyzw[:, other], rotations.inverse(their_idle).expand_as(turn))
+        added = rotations.multiply(rotations.multiply(turn, added), rotations.inverse(turn))
+        found[joint] = rotations.multiply(added, idle.expand_as(turn))
+    return found
+
+
+def _list_fingers(skeleton: Skeleton) -> dict[tuple[Side, str, int], int]:
+    """List finger joints by side, finger and number along it, from 0."""
+    chains: dict[tuple[Side, str], list[int]] = defaultdict(list)
+    for joint, name in enumerate(skeleton.names):
+        role, finger = classify_joint(name), _FINGERS.search(name)
+        if role.part is Part.FINGER and role.side is not Side.MIDDLE and finger:
+            word = finger[0].lower()
+            chains[role.side, _SAME.get(word, word)].append(joint)
+    return {(*chain, k): joint for chain, joints in chains.items() for k, joint in enumerate(joints)}

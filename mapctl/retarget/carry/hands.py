@@ -1,12 +1,13 @@
 """Hands near the body, each other or the floor: where they are relative to these is kept on other bones.
 
-A hand has two points, palm and finger tips. For each segment of the giver's body (see `segments`) that a point is near,
-the same place on the receiving body is where that point should be, and all these places are averaged, the nearest
-counting most; beside them the place that rotations alone lead to, the more the farther the hand is from everything.
-Places relative to a body's surface are kept in the manner of Molla et al. 2018.
+A body is rounded segments between joints, a hand two points, palm and finger tips. For each segment of the giver's body
+that a point is near, the same place on the receiving body is where that point should be, and all these places are
+averaged, the nearest counting most; beside them the place that rotations alone lead to, the more the farther the hand
+is from everything. Places relative to a body's surface are kept in the manner of Molla et al. 2018.
 """
 
 from dataclasses import dataclass, replace
+from functools import cache
 
 import torch
 from jaxtyping import Bool, Float
@@ -16,10 +17,10 @@ from mapctl import contacts, kinematics, rotations
 from mapctl.kinematics import inverse
 from mapctl.motion import Motion
 from mapctl.numerics.easing import smootherstep
-from mapctl.retarget.carry import segments
 from mapctl.retarget.carry.character import ARMS, limb_extension
 from mapctl.retarget.carry.holding import envelope, hold_through, low_pass, mean_by_span, merge_contacts, soft_clamp
-from mapctl.retarget.stance import Stance
+from mapctl.retarget.stance import SIDES, Stance
+from mapctl.skeleton import CANONICAL, Skeleton, leg_length
 
 _HANDS = [arm.end for arm in ARMS]
 _POINTS = (0.08, 0.15)  # metres from the wrist to palm and finger tips along the hand, of the canonical body
@@ -39,6 +40,70 @@ _FREE_EXTENSION, _MOST_EXTENSION = 0.98, 0.998
 _SOFT_MARGIN = 0.06  # of the arm, before the most that it may be, over which it gives in
 _HELD_SPEED = 0.25  # m/s below which a hand on the floor stands on it
 _LEAST_STRENGTH = 0.5  # of a relation, from which a hand that does not get there is worth a line
+# From joint, to joint, half widths at both ends in metres for the canonical body: of the trunk along x and z, of limbs
+# all around. The head ends at a point of its own.
+_TRUNK = (
+    ("hips", "spine", (0.135, 0.095), (0.125, 0.090)),
+    ("spine", "chest", (0.125, 0.090), (0.135, 0.098)),
+    ("chest", "neck", (0.135, 0.098), (0.075, 0.060)),
+    ("neck", "head", (0.050, 0.050), (0.050, 0.050)),
+    ("head", "", (0.078, 0.095), (0.078, 0.095)),
+)
+_LIMBS = (
+    ("Shoulder", "UpperArm", 0.055, 0.055),
+    ("UpperLeg", "LowerLeg", 0.080, 0.057),
+    ("LowerLeg", "Foot", 0.050, 0.036),
+    ("Foot", "Toes", 0.040, 0.035),
+)
+_ARMS = (("UpperArm", "LowerArm", 0.046, 0.040), ("LowerArm", "Hand", 0.037, 0.028))
+_HEAD_TIP = (0.0, 0.12, 0.0)  # metres from the head joint to the middle of the skull's top, of the canonical body
+_END_SHARE = 0.15  # of a segment, before its ends, over which points stop being beside it
+
+
+@dataclass(frozen=True, eq=False)
+class _Layout:
+    """Which segments a body has."""
+
+    start: tuple[int, ...]
+    """Canonical joint at which each begins, which also turns it."""
+    stop: tuple[int, ...]
+    """Canonical joint at which it ends; its start again for the head, which ends at a point of its own."""
+    widths: Float[Tensor, "segments 2 3"]
+    """Half widths along the axes of the start's frame at both ends, metres, of the canonical body."""
+    is_arm: Bool[Tensor, "2 segments"]
+    """Whether each belongs to the arm of a side: left, right."""
+    beside: Bool[Tensor, "2 segments"]
+    """Whether each is beside the arm of a side while that hangs: trunk and thigh."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Segments:
+    """The segments of one body in every frame."""
+
+    begin: Float[Tensor, "frames segments 3"]
+    """World position at which each begins, metres."""
+    end: Float[Tensor, "frames segments 3"]
+    """World position at which each ends, metres."""
+    quat_xyzw: Float[Tensor, "frames segments 4"]
+    """Rotation of each in the world."""
+    widths: Float[Tensor, "segments 2 3"]
+    """Half widths along its own axes at both ends, metres."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Near:
+    """Where points are on each segment: the same place may be found on another body."""
+
+    share: Float[Tensor, "frames points segments 1"]
+    """Share of the way along the segment's axis to the place nearest to the point."""
+    aside: Float[Tensor, "frames points segments 3"]
+    """From there to the point, in half widths, along the segment's own axes."""
+    away: Float[Tensor, "frames points segments 3"]
+    """From the surface to the point, metres, along the segment's own axes; 0 within the body."""
+    distance: Float[Tensor, "frames points segments"]
+    """From the surface to the point, metres; negative within the body."""
+    local: Float[Tensor, "frames points segments 3"]
+    """From where the segment begins to the point, metres, along the segment's own axes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +120,7 @@ class HandTargets:
 class _Relations:
     """What the giver's hands are near; the points of both hands one after another, left first."""
 
-    near: segments.Near
+    near: _Near
     """To the segments of its body."""
     weight: Float[Tensor, "frames points segments"]
     """How much each counts, 0 to 1."""
@@ -118,9 +183,9 @@ def keep_hand_relations(own: Motion, moved: Motion, giver: Stance, *, scale: flo
 
 
 def _find_relations(own: Motion, giver: Stance) -> _Relations:
-    size, fps, body = segments.girth(own.skeleton), float(own.fps), segments.place_segments(own)
+    size, fps, body = _girth(own.skeleton), float(own.fps), _place_segments(own)
     points, thick = _hand_points(own, size), size * _PALM_THICKNESS
-    near = segments.find_nearest(points, body)
+    near = _find_nearest(points, body)
     say = _let_hang(own)
     far = torch.lerp(near.distance.new_tensor(_SLIDE_METRES), near.distance.new_tensor(_FAR_METRES), _stays(near, fps))
     weight, touch = (say * _weigh(near.distance - thick, reach) for reach in (far, _SLIDE_METRES))
@@ -146,7 +211,7 @@ def _weigh(
     return 1 - smootherstep((distance - _TOUCH_METRES) / (far - _TOUCH_METRES))
 
 
-def _stays(near: segments.Near, fps: float) -> Float[Tensor, "frames points segments"]:
+def _stays(near: _Near, fps: float) -> Float[Tensor, "frames points segments"]:
     """Return how much points stay where they are beside a segment, 0 to 1: a hand that swings past is not put there."""
     if len(near.local) < 2:
         return torch.ones_like(near.distance)
@@ -159,8 +224,8 @@ def _let_hang(own: Motion) -> Float[Tensor, "frames points segments"]:
     """Return how much points may be bound to each segment, 0 to 1: not to the own arm, and hardly to trunk and thigh
     while the arm is straight: it hangs there, and its hand is not put anywhere."""
     straight = (limb_extension(own, ARMS) - _HANGS_FROM) / (_HANGS_TO - _HANGS_FROM)
-    layout = segments.layout()
-    of_hand = (1 - smootherstep(straight)[..., None] * layout.beside.double()) * (~layout.is_arm).double()
+    found = _layout()
+    of_hand = (1 - smootherstep(straight)[..., None] * found.beside.double()) * (~found.is_arm).double()
     return of_hand.repeat_interleave(len(_POINTS), dim=1)
 
 
@@ -192,8 +257,8 @@ def _floor_offsets(
 ) -> Float[Tensor, "frames points 3"]:
     """Return offsets that bring points as high over the floor as the giver's, metres, and hold over the ground what
     stands on it."""
-    size = segments.girth(moved.skeleton)
-    points, given = _hand_points(moved, size), scale * _hand_points(own, segments.girth(own.skeleton))
+    size = _girth(moved.skeleton)
+    points, given = _hand_points(moved, size), scale * _hand_points(own, _girth(own.skeleton))
     offsets = torch.zeros_like(points)
     offsets[..., 1] = relations.floor_height + giver.floor + size * _PALM_THICKNESS - points[..., 1]
     for k, spans in enumerate(merge_contacts(relations.planted, given, float(own.fps))):
@@ -212,10 +277,10 @@ def _offset_hands(
 ) -> Float[Tensor, "frames 2 3"]:
     """Return where hands should be from where rotations alone lead, metres; `done` shows where the other arm is, and
     `missed` by what hands that are together could not get there."""
-    points = _hand_points(moved, segments.girth(moved.skeleton))
-    body = segments.place_segments(done)
-    toward = segments.place_nearest(relations.near, body) - points[:, :, None]
-    slide = segments.find_slide(relations.near, body)
+    points = _hand_points(moved, _girth(moved.skeleton))
+    body = _place_segments(done)
+    toward = _place_nearest(relations.near, body) - points[:, :, None]
+    slide = _find_slide(relations.near, body)
     along = (1 - relations.touch[..., None]) * (toward * slide).sum(-1, keepdim=True)
     offsets = torch.cat([toward - along * slide, at_floor[:, :, None]], dim=2).unflatten(1, (2, -1)).flatten(2, 3)
     weight, say = relations.by_hand()
@@ -258,3 +323,77 @@ def _keep_in_reach(
     was, far = before.norm(dim=-1, keepdim=True), wanted.norm(dim=-1, keepdim=True)
     near = torch.minimum(far, torch.maximum(soft_clamp(far, most, _SOFT_MARGIN), was))
     return wanted * (near / far.clamp_min(1e-9))
+
+
+@cache
+def _layout() -> _Layout:
+    """Return the segments of the canonical body."""
+    rows = [(start, stop or start, [(x, x, z), (u, u, w)]) for start, stop, (x, z), (u, w) in _TRUNK]
+    for name in SIDES:
+        rows += [
+            (name + start, name + stop, [(first,) * 3, (last,) * 3]) for start, stop, first, last in (*_LIMBS, *_ARMS)
+        ]
+    start, stop, widths = zip(*rows, strict=True)
+    arms, beside = (
+        torch.tensor([[name in {side + part for part in parts} for name in start] for side in SIDES])
+        for parts in (("UpperArm", "LowerArm"), ("UpperLeg",))
+    )
+    trunk = torch.tensor([name in ("hips", "spine", "chest") for name in start])
+    begin, end = (tuple(CANONICAL.indices(names)) for names in (start, stop))
+    return _Layout(begin, end, torch.tensor(widths, dtype=torch.float64), arms, beside | trunk)
+
+
+def _girth(skeleton: Skeleton) -> float:
+    """Return how thick a body of canonical joints is against the canonical one: as it is taller from ankles to neck."""
+    trunk = [CANONICAL.index(name) for name in ("spine", "chest", "neck")]
+    tall, usual = (leg_length(s) + float(s.offsets[trunk].norm(dim=-1).sum()) for s in (skeleton, CANONICAL))
+    return tall / usual
+
+
+def _place_segments(motion: Motion) -> _Segments:
+    """Place the segments of a body in every frame of a motion of canonical joints."""
+    found, size = _layout(), _girth(motion.skeleton)
+    places, turns = motion.joint_positions(), motion.joint_rotations()
+    begin, end = places[:, list(found.start)], places[:, list(found.stop)].clone()
+    for k, (start, stop) in enumerate(zip(found.start, found.stop, strict=True)):
+        if start == stop:
+            tip = size * torch.tensor(_HEAD_TIP, dtype=torch.float64)
+            end[:, k] = begin[:, k] + rotations.rotate(turns[:, start], tip.expand(len(places), 3))
+    return _Segments(begin, end, turns[:, list(found.start)], size * found.widths)
+
+
+def _find_nearest(points: Float[Tensor, "frames points 3"], body: _Segments) -> _Near:
+    """Find where points are on each segment of a body."""
+    axis = (body.end - body.begin)[:, None]
+    way = points[:, :, None] - body.begin[:, None]
+    share = (way * axis).sum(-1, keepdim=True) / axis.square().sum(-1, keepdim=True).clamp_min(1e-9)
+    share = share.clamp(0, 1)
+    turns = rotations.inverse(body.quat_xyzw)[:, None].expand(*share.shape[:3], 4)
+    local = rotations.rotate(turns, way)
+    aside = local - rotations.rotate(turns, share * axis)
+    aside_widths = aside / _width_at(body, share)
+    round_off = aside_widths.norm(dim=-1, keepdim=True)
+    away = aside * (1 - 1 / round_off.clamp_min(1))
+    depth = (aside.norm(dim=-1) / round_off[..., 0].clamp_min(1e-6)) * (round_off[..., 0] - 1)
+    return _Near(share, aside_widths / round_off.clamp_min(1), away, depth, local)
+
+
+def _place_nearest(near: _Near, body: _Segments) -> Float[Tensor, "frames points segments 3"]:
+    """Return world positions of the same places on another body, metres: as far along each segment and about it, and as
+    many metres off its surface."""
+    axis = (body.end - body.begin)[:, None]
+    turns = body.quat_xyzw[:, None].expand(*near.share.shape[:3], 4)
+    aside = rotations.rotate(turns, near.aside * _width_at(body, near.share) + near.away)
+    return body.begin[:, None] + near.share * axis + aside
+
+
+def _find_slide(near: _Near, body: _Segments) -> Float[Tensor, "frames points segments 3"]:
+    """Return the directions along which points beside a segment may slide without coming nearer or going farther: its
+    axis, of length 1 in the middle and 0 toward its ends, where there is no such direction."""
+    axis = torch.nn.functional.normalize(body.end - body.begin, dim=-1)[:, None]
+    inside = smootherstep(near.share / _END_SHARE) * smootherstep((1 - near.share) / _END_SHARE)
+    return inside * axis
+
+
+def _width_at(body: _Segments, share: Tensor) -> Float[Tensor, "frames points segments 3"]:
+    return torch.lerp(body.widths[:, 0], body.widths[:, 1], share)
