@@ -6,7 +6,7 @@ so the result does not depend on how a file orients its joint axes, nor on what 
 """
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 
 import torch
@@ -60,25 +60,18 @@ class Anatomy:
     def find_contradictions(self, tpose: Float[Tensor, "joints 4"]) -> dict[str, float]:
         """Return the joints whose world rotation (xyzw) in a T-pose is off by more than CONTRADICTION, each with the
         angle in radians."""
-        angles = {}
-        for name, frame in self.certain.items():
-            angle = _angle_between(frame, rotations.to_matrix(tpose[CANONICAL.index(name)]))
-            if angle > CONTRADICTION:
-                angles[name] = angle
-        return angles
+        quats = {name: tpose[CANONICAL.index(name)] for name in self.certain}
+        angles = {name: _angle_between(self.certain[name], rotations.to_matrix(quat)) for name, quat in quats.items()}
+        return {name: angle for name, angle in angles.items() if angle > CONTRADICTION}
 
-    def correct(self, tpose: Float[Tensor, "joints 4"], names: Iterable[str]) -> Float[Tensor, "joints 4"]:
+    def correct(self, tpose: Float[Tensor, "joints 4"], names: Collection[str]) -> Float[Tensor, "joints 4"]:
         """Return a T-pose with these joints as the clip shows them, and the arms that they are of from the upper arm
         on, whose rolls belong together."""
         fixed = tpose.clone()
-        turned = {part for name in names for part in (name, *_list_rest_of_arm(name))}
-        for name in turned & self.frames.keys():
+        arms = [name.removesuffix(_ARM[1]) + part for name in names if name.endswith(_ARM[1]) for part in _ARM[2:]]
+        for name in {*names, *arms} & self.frames.keys():
             fixed[CANONICAL.index(name)] = rotations.from_matrix(self.frames[name])
         return fixed
-
-
-def _list_rest_of_arm(name: str) -> list[str]:
-    return [side + part for side, _ in SIGNS if name == side + "UpperArm" for part in _ARM[1:]]
 
 
 @dataclass
@@ -151,7 +144,7 @@ def _orient_joints(found: _Builder, upright: Tensor | None) -> tuple[_Builder, d
     """Orient all joints; also return the frames of those that are certain."""
     clip, pitch = found.clip, _estimate_foot_pitch(found.clip, upright)
     # Files disagree by 33 degrees about where the spine is over the hips: enough to tell which pelvis is wrong.
-    found.orient("hips", clip.hip_line(), _X, clip.position("spine") - clip.middle("UpperLeg"), _Y)
+    found.orient("hips", clip.side_line("UpperLeg"), _X, clip.position("spine") - clip.middle("UpperLeg"), _Y)
     certain = {"hips": found.frames["hips"]}
     known = [*_orient_trunk(found)]
     for side, sign in SIGNS:
@@ -161,12 +154,12 @@ def _orient_joints(found: _Builder, upright: Tensor | None) -> tuple[_Builder, d
 
 def _orient_trunk(found: _Builder) -> Iterator[str]:
     clip = found.clip
-    found.orient("hips", clip.hip_line(), _X, _pelvis_up(clip), _Y)
+    found.orient("hips", clip.side_line("UpperLeg"), _X, _pelvis_up(clip), _Y)
     top = "chest" if clip.has("chest") else "spine"
     if top == "chest":
-        found.orient("chest", clip.shoulder_line(), _X, _bone_or(clip, "chest", clip.up()), _Y)
+        found.orient("chest", clip.side_line("Shoulder"), _X, _bone_or(clip, "chest", clip.up()), _Y)
         yield "chest"
-    across = found.axis("hips", _X) + (found.axis("chest", _X) if top == "chest" else clip.shoulder_line())
+    across = found.axis("hips", _X) + (found.axis("chest", _X) if top == "chest" else clip.side_line("Shoulder"))
     found.orient("spine", _bone_or(clip, "spine", clip.up()), _Y, across, _X)
     for name in ("neck", "head"):
         if clip.has(name):

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl.retarget.rig_poses import RigPoses, unit_vectors
-from mapctl.retarget.topology import ancestors, descendants, find_limb_pairs, match_by_tree, path_below
+from mapctl.retarget.topology import JointTree, ancestors, descendants, match_by_tree, path_below
 from mapctl.skeleton import Skeleton
 
 _ANIMAL = re.compile(
@@ -68,11 +68,12 @@ def find_further_limbs(skeleton: Skeleton, joints: Mapping[str, int]) -> tuple[i
     inside = {joint for joint in descendants(skeleton, {joints["hips"]}) if descendants(skeleton, {joint}) & {*trunk}}
     limbs = {joint for name, joint in joints.items() if joint not in trunk and name != "head"}
     arm = path_below(skeleton, joints["leftUpperArm"], joints.get("leftHand", joints["leftLowerArm"]))
-    length = float(skeleton.offsets[arm].norm(dim=-1).sum())
+    tree, least = JointTree(skeleton), _LIMB_SHARE * float(skeleton.offsets[arm].norm(dim=-1).sum())
     for joint in sorted({*trunk, *inside}):
-        for first, second in find_limb_pairs(skeleton, joint, at_least=_LIMB_SHARE * length):
-            if not descendants(skeleton, {first, second}) & limbs:
-                return first, second
+        for first, second in tree.find_limb_pairs(joint):
+            long = sum(tree.length[below] for below in first[1:]) >= least
+            if long and not descendants(skeleton, {first[0], second[0]}) & limbs:
+                return first[0], second[0]
     return None
 
 

@@ -25,18 +25,6 @@ from mapctl.skeleton import CANONICAL, LIMBS, Skeleton, mirror_name
 
 _MAX_LISTED = 4  # joints that have a line each; of more there is one line
 _MAX_SPEED = 12.0  # m/s of the hips, median over a second, of people on foot
-_BELOW = {
-    "chest": ("spine",),
-    "neck": ("chest", "spine"),
-    "head": ("neck", "chest", "spine"),
-    "UpperArm": ("Shoulder",),
-    "LowerArm": ("UpperArm",),
-    "Hand": ("LowerArm",),
-    "LowerLeg": ("UpperLeg",),
-    "Foot": ("LowerLeg",),
-    "Toes": ("Foot",),
-}
-"""What each part hangs from: the first that a rig has."""
 _LIMBS = ("LowerArm", "Hand", "LowerLeg", "Foot")
 _PARTS = {
     "hips": {Part.HIPS},
@@ -149,11 +137,19 @@ def _find_wrong_order(rigmap: RigMap) -> Iterator[Doubt]:
     """Find joints of a limb or of the trunk that do not hang from the one before."""
     joints = rigmap.joints
     for name, joint in joints.items():
-        side, part = _split(name)
-        above = next((side + upper for upper in _BELOW.get(part, ()) if side + upper in joints), None)
+        above = _find_above(rigmap, name)
         if above is not None and not path_below(rigmap.rig_skeleton, joints[above], joint):
             own, upper = _quote(rigmap, joint), _quote(rigmap, joints[above])
             yield Doubt(f"{name} {own} does not hang from {above} {upper}", (name,))
+
+
+def _find_above(rigmap: RigMap, name: str) -> str | None:
+    """Return the joint that a canonical one is to hang from in its limb, or in the trunk over the hips: the first that
+    the rig has; None where there is none."""
+    above = CANONICAL.names[CANONICAL.parents[CANONICAL.index(name)]] if name != "hips" else name
+    if above == "hips" or _split(above)[0] != _split(name)[0]:
+        return None
+    return above if above in rigmap.joints else _find_above(rigmap, above)
 
 
 def _compare_sides(rigmap: RigMap, zero: RigPoses, clip: RigPoses | None) -> Iterator[Doubt]:
@@ -209,7 +205,7 @@ def _find_skipped_joints(rigmap: RigMap) -> Iterator[Doubt]:
     for name, joint in rigmap.joints.items():
         side, part = _split(name)
         first = part == "Shoulder" or (part == "UpperArm" and side + "Shoulder" not in rigmap.joints)
-        above = "chest" if first else side + _BELOW[part][0] if part in _LIMBS else None
+        above = "chest" if first else _find_above(rigmap, name) if part in _LIMBS else None
         if above not in rigmap.joints or (above != "chest" and rigmap.match.known_by[name] is KnownBy.LIST):
             continue
         between = _joints_between(rigmap, rigmap.joints[above], joint)

@@ -90,19 +90,13 @@ class RigPoses:
 
     def left(self) -> Float[Tensor, "poses 3"]:
         """Return the unit vector along the hip line to the left, square to `up`."""
-        across = self.hip_line()
+        across = self.side_line("UpperLeg")
         return unit_vectors(across - self.up() * (across * self.up()).sum(-1, keepdim=True))
 
-    def hip_line(self) -> Float[Tensor, "poses 3"]:
-        """Return the vector from the right thigh to the left, metres; by the upper arms where both thighs are at one
-        point."""
-        across = self.across("UpperLeg")
-        return across if float(across.norm(dim=-1).mean()) > _APART else self.across("UpperArm")
-
-    def shoulder_line(self) -> Float[Tensor, "poses 3"]:
-        """Return the vector from the right shoulder to the left, metres; by the upper arms, which move more, where the
-        rig has no shoulders or both are at one point."""
-        across = self.across("Shoulder") if self.has("leftShoulder", "rightShoulder") else self.across("UpperArm")
+    def side_line(self, part: str) -> Float[Tensor, "poses 3"]:
+        """Return the vector from the right joint of a part to the left, metres; by the upper arms where the rig has no
+        such joints, as shoulders, or both are at one point."""
+        across = self.across(part) if self.has("left" + part, "right" + part) else self.across("UpperArm")
         return across if float(across.norm(dim=-1).mean()) > _APART else self.across("UpperArm")
 
     def bone(self, name: str) -> Float[Tensor, "poses 3"] | None:

@@ -101,8 +101,9 @@ def find_preset(name: str) -> Rig | None:
 
 def read_rig_toml(path: Path) -> Rig:
     """Read a rig from a TOML file; FileFormatError says what is wrong with it."""
+    keys = ", ".join(item.name for item in fields(_RigFile))
     try:
-        found = toml.read(path, _RigFile, what="rig file", unknown=_list_allowed_keys)
+        found = toml.read(path, _RigFile, what="rig file", unknown=lambda _: f"allowed: {keys}")
         return found.build(path.stem)
     except RequestError as error:
         raise FileFormatError(path, str(error)) from None
@@ -154,10 +155,6 @@ class _RigFile:
             metres_per_unit=parse_unit(self.unit),
             **{key: getattr(self, key) for key in ("about", "also", "trunk", "end_sites", "up", "facing", "rest")},
         )
-
-
-def _list_allowed_keys(_: object) -> str:
-    return f"allowed: {', '.join(item.name for item in fields(_RigFile))}"
 
 
 def parse_unit(unit: Any) -> float | None:

@@ -90,7 +90,7 @@ class Stance:
         seen, leg = contacts.estimate_floor_heights(toes), leg_length(rigmap.skeleton)
         if float((seen[0] - seen[1]).abs()) > _MAX_TOE_DIFFERENCE * leg:
             seen = seen.min().expand(2)
-        flat = _detect_flat_feet(clip, contacts.detect_contacts(toes, clip.fps))
+        flat = _detect_flat_feet(clip)
         tilt = _estimate_tilt(clip, flat)
         laid = torch.stack([toes[flat[:, k], k, 1].median() if flat[:, k].any() else seen[k] for k in range(2)])
         laid = laid.clamp(seen, seen + _MAX_TOE_DEPTH)
@@ -117,9 +117,7 @@ class Stance:
 def level_feet(clip: Motion) -> Motion:
     """Return the same movement (canonical joints) with joint frames of feet and toes that are aligned with the world
     while the foot is flat on the floor, as the clip shows it (see `Stance.of`); no joint moves."""
-    toes = clip.joint_positions()[:, TOES]
-    tilt = _estimate_tilt(clip, _detect_flat_feet(clip, contacts.detect_contacts(toes, clip.fps)))
-    return _rotate_foot_frames(clip, -tilt)
+    return _rotate_foot_frames(clip, -_estimate_tilt(clip, _detect_flat_feet(clip)))
 
 
 def _rotations_about_x(pitch: Float[Tensor, "2 2"]) -> Float[Tensor, "joints 4"]:
@@ -150,8 +148,9 @@ def _rotate_foot_frames(motion: Motion, pitch: Float[Tensor, "2 2"]) -> Motion:
     return replace(motion, skeleton=_rotate_bones(motion.skeleton, by_joint), local_quat_xyzw=local)
 
 
-def _detect_flat_feet(clip: Motion, planted: Bool[Tensor, "frames 2"]) -> Bool[Tensor, "frames 2"]:
+def _detect_flat_feet(clip: Motion) -> Bool[Tensor, "frames 2"]:
     """Detect where feet lie flat; nowhere for a side that hardly ever does."""
+    planted = contacts.detect_contacts(clip.joint_positions()[:, TOES], clip.fps)
     ankles = clip.joint_positions()[:, FEET, 1]
     flat = torch.zeros_like(planted)
     for k in range(2):

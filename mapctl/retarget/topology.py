@@ -20,7 +20,7 @@ def match_by_tree(skeleton: Skeleton) -> Mapping[str, int]:
 
     Sides are arbitrary: which limb of a pair is the left one has to be decided by names or positions.
     """
-    tree = _JointTree(skeleton)
+    tree = JointTree(skeleton)
     for hips in range(skeleton.num_joints):
         for legs in tree.find_limb_pairs(hips):
             others = [child for child in tree.children[hips] if child not in (legs[0][0], legs[1][0])]
@@ -32,14 +32,7 @@ def match_by_tree(skeleton: Skeleton) -> Mapping[str, int]:
     return {}
 
 
-def find_limb_pairs(skeleton: Skeleton, joint: int, *, at_least: float) -> list[tuple[int, int]]:
-    """Find the first joints of each pair of limbs of at least this length, metres, that hangs from a joint."""
-    tree = _JointTree(skeleton)
-    pairs = tree.find_limb_pairs(joint)
-    return [(a[0], b[0]) for a, b in pairs if sum(tree.length[below] for below in a[1:]) >= at_least]
-
-
-def _name_body_joints(tree: "_JointTree", hips: int, legs: LimbPair, chest: int, arms: LimbPair) -> Mapping[str, int]:
+def _name_body_joints(tree: "JointTree", hips: int, legs: LimbPair, chest: int, arms: LimbPair) -> Mapping[str, int]:
     found = {"hips": hips}
     for side, leg, arm in zip(("left", "right"), legs, arms, strict=True):
         found |= tree.limb(leg, [side + part for part in ("", "UpperLeg", "LowerLeg", "Foot", "Toes")])
@@ -56,7 +49,7 @@ def _name_body_joints(tree: "_JointTree", hips: int, legs: LimbPair, chest: int,
     return found
 
 
-class _JointTree:
+class JointTree:
     """Children, bone lengths and reaches of a skeleton's joints; a reach is the length of the longest chain below."""
 
     def __init__(self, skeleton: Skeleton):

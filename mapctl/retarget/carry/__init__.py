@@ -69,9 +69,8 @@ def retarget_canonical(
     found = legs.find_ground(own, giver.stance)
     higher = 1 - scale if keeps else 0.0
     moved = legs.transfer_root(own, giver, body, scale, higher * found.under_hips(float(own.fps)))
-    ankles = legs.find_ankle_targets(
-        own, moved, giver.stance, body.stance, found, scale=scale, raised=higher * found.height
-    )
+    raised = higher * found.height
+    ankles = legs.find_ankle_targets(own, moved, giver.stance, body.stance, found, scale=scale, raised=raised)
     straight = limb_extension(own, LEGS)
     lowered = legs.lower_hips(legs.fit_hips(moved, ankles, straight), ankles, straight)
     standing = legs.reach_ankle_targets(lowered, ankles)

@@ -1,6 +1,7 @@
 """Where hips and feet go on the receiving body: the giver's trajectories in scale, as legs and ground ask for.
 
-What the giver's feet stand on is the floor, or what is higher, as stairs and platforms. Toes are as far over their own rest height as the giver's, standing ones where the giver's stand.
+What the giver's feet stand on is the floor, or what is higher, as stairs and platforms. Toes are as far over their own
+rest height as the giver's, standing ones where the giver's stand.
 """
 
 import math
