@@ -52,11 +52,6 @@ class Anatomy:
     in_quarter_turns: bool
     """Whether joint axes are along the canonical ones, so that frames are exact but for the feet's pitch."""
 
-    @property
-    def is_certain(self) -> bool:
-        """Whether both legs bend enough to show how they are twisted."""
-        return {"leftUpperLeg", "rightUpperLeg"} <= self.certain.keys()
-
     def find_contradictions(self, tpose: Float[Tensor, "joints 4"]) -> dict[str, float]:
         """Return the joints whose world rotation (xyzw) in a T-pose is off by more than CONTRADICTION, each with the
         angle in radians."""
@@ -157,13 +152,13 @@ def _orient_trunk(found: _Builder) -> Iterator[str]:
     found.orient("hips", clip.side_line("UpperLeg"), _X, _pelvis_up(clip), _Y)
     top = "chest" if clip.has("chest") else "spine"
     if top == "chest":
-        found.orient("chest", clip.side_line("Shoulder"), _X, _bone_or(clip, "chest", clip.up()), _Y)
+        found.orient("chest", clip.side_line("Shoulder"), _X, _bone(clip, "chest", clip.up()), _Y)
         yield "chest"
     across = found.axis("hips", _X) + (found.axis("chest", _X) if top == "chest" else clip.side_line("Shoulder"))
-    found.orient("spine", _bone_or(clip, "spine", clip.up()), _Y, across, _X)
+    found.orient("spine", _bone(clip, "spine", clip.up()), _Y, across, _X)
     for name in ("neck", "head"):
         if clip.has(name):
-            found.orient(name, _bone_or(clip, name, found.axis(top, _Y)), _Y, found.axis(top, _X), _X)
+            found.orient(name, _bone(clip, name, found.axis(top, _Y)), _Y, found.axis(top, _X), _X)
     if clip.has("head"):
         found.continue_frame("head", "neck")
 
@@ -174,12 +169,12 @@ def _orient_arm(found: _Builder, side: str, sign: float) -> Iterator[str]:
     shoulder, upper, lower, hand = (side + part for part in _ARM)
     if clip.has(shoulder):
         found.orient(
-            shoulder, _bone_or(clip, shoulder, sign * found.axis(above, _X)), sign * _X, found.axis(above, _Y), _Y
+            shoulder, _bone(clip, shoulder, sign * found.axis(above, _X)), sign * _X, found.axis(above, _Y), _Y
         )
         above = shoulder
         yield shoulder
     arm = _bone(clip, upper)
-    forearm = _bone_or(clip, lower, arm)
+    forearm = _bone(clip, lower, arm)
     hinge = -sign * torch.linalg.cross(arm, forearm)
     bends = found.is_hinge(upper, hinge)
     # An arm that stays straight has no more twist against the body than the shortest arc from the T-pose gives it.
@@ -187,7 +182,7 @@ def _orient_arm(found: _Builder, side: str, sign: float) -> Iterator[str]:
     found.orient(upper, arm, sign * _X, hinge if bends else rotations.rotate(arc, found.axis(above, _Y)), _Y)
     found.orient(lower, forearm, sign * _X, hinge if bends else found.axis(upper, _Y), _Y)
     if clip.has(hand):
-        found.orient(hand, _bone_or(clip, hand, forearm), sign * _X, found.axis(lower, _Y), _Y)
+        found.orient(hand, _bone(clip, hand, forearm), sign * _X, found.axis(lower, _Y), _Y)
         found.continue_frame(hand, lower)
     if bends:
         yield upper
@@ -255,17 +250,13 @@ def _estimate_foot_pitch(clip: RigPoses, upright: Tensor | None) -> float:
     return min(max(total / weights, 0.0), _MAX_PITCH)
 
 
-def _bone(clip: RigPoses, name: str) -> Vectors:
-    """Return the direction of the bone of a joint that every rig has."""
+def _bone(clip: RigPoses, name: str, otherwise: Vectors | None = None) -> Vectors:
+    """Return the direction of a joint's bone, or the other one where it has none of some length."""
     bone = clip.bone(name)
+    if otherwise is not None and (bone is None or float(bone.norm(dim=-1).mean()) < _NO_LINE):
+        return otherwise
     assert bone is not None
     return unit_vectors(bone)
-
-
-def _bone_or(clip: RigPoses, name: str, otherwise: Vectors) -> Vectors:
-    """Return the direction of a joint's bone, or another one where it has none of some length."""
-    bone = clip.bone(name)
-    return otherwise if bone is None or float(bone.norm(dim=-1).mean()) < _NO_LINE else unit_vectors(bone)
 
 
 def _is_near_quarter_turn(frame: Tensor) -> bool:

@@ -200,26 +200,22 @@ def _compare_words(rigmap: RigMap) -> Iterator[Doubt]:
 
 
 def _find_skipped_joints(rigmap: RigMap) -> Iterator[Doubt]:
-    """Find joints between the chest and the arms, or within a limb of which no list knows the next joint."""
+    """Find joints but twists and other helpers between chest and arms, or within a limb of which no list knows the next
+    joint."""
     told: set[int] = set()
+    names, matched = rigmap.rig_skeleton.names, rigmap.joints.values()
     for name, joint in rigmap.joints.items():
         side, part = _split(name)
         first = part == "Shoulder" or (part == "UpperArm" and side + "Shoulder" not in rigmap.joints)
         above = "chest" if first else _find_above(rigmap, name) if part in _LIMBS else None
         if above not in rigmap.joints or (above != "chest" and rigmap.match.known_by[name] is KnownBy.LIST):
             continue
-        between = _joints_between(rigmap, rigmap.joints[above], joint)
+        between = path_below(rigmap.rig_skeleton, rigmap.joints[above], joint)[-2::-1]
+        between = [one for one in between if one not in matched and not HELPER_NAME.search(names[one])]
         if between and between[0] not in told:
             own, skipped = _quote(rigmap, rigmap.joints[above]), _quote(rigmap, between[0])
             yield Doubt(f"between {above} {own} and {name} {_quote(rigmap, joint)} is {skipped}", (above, name))
         told |= {*between}
-
-
-def _joints_between(rigmap: RigMap, above: int, joint: int) -> list[int]:
-    """Return the joints between two of which one hangs from the other, but for twists and other helpers."""
-    names, matched = rigmap.rig_skeleton.names, rigmap.joints.values()
-    between = path_below(rigmap.rig_skeleton, above, joint)[-2::-1]
-    return [one for one in between if one not in matched and not HELPER_NAME.search(names[one])]
 
 
 def _compare_knowledge(rigmap: RigMap) -> Iterator[Doubt]:

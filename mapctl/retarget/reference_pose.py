@@ -9,7 +9,7 @@ limb above. Feet keep their orientation; hands go with the arm.
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
@@ -100,7 +100,7 @@ def find_tpose(
         refused = refused or doubt
     frames = anatomy.correct(torch.zeros(CANONICAL.num_joints, 4, dtype=torch.float64), CANONICAL.names)
     doubt = refused and f"{refused}, which is followed"
-    if not anatomy.is_certain:
+    if not anatomy.certain.keys() >= {"leftUpperLeg", "rightUpperLeg"}:
         doubt = "no pose of the file is a T- or A-pose and knees hardly bend: how limbs are twisted is a guess"
     elif not anatomy.in_quarter_turns:
         doubt = doubt or "no pose of the file is a T- or A-pose: joint frames are estimated by how the body moves"
@@ -125,7 +125,7 @@ def _list_readings(
     if laid_out is not None:
         yield laid_out, _idle_rotations(rig, zero), "rest pose"
     if clip is not None and rig.rest in ("auto", "frame0"):
-        first = clip.first()
+        first = replace(clip, positions=clip.positions[:1], orientations=clip.orientations[:1])
         turned = _body_frame(first.left()[0], axis_vector(up))
         if rig.rest == "frame0" or is_tpose(first, turned):
             yield _lay_out_tpose(first, turned), _mean_locals(first), "frame 0"
@@ -245,7 +245,8 @@ def _lay_out_tpose(base: RigPoses, front: Tensor) -> Float[Tensor, "joints 4"]:
             turn = front
         else:
             turn = turns[CANONICAL.parents[index]]
-        bone, aim = _bone_direction(base, name, turn), _canonical_direction(index)
+        following, bone = next_joint(name), _bone_direction(base, name, turn)
+        aim = unit_vectors(CANONICAL.offsets[CANONICAL.index(following)]) if following else torch.zeros_like(bone)
         apart = float(torch.arccos((bone @ aim).clamp(-1, 1)))
         aligned = part in _LIMBS or (part not in ("Hand", "Foot", "Toes") and apart > _TRUNK_TOLERANCE)
         if aligned and aim.norm() > 0 and bone.norm() > 0 and base.has(name):
@@ -254,14 +255,6 @@ def _lay_out_tpose(base: RigPoses, front: Tensor) -> Float[Tensor, "joints 4"]:
     joints = [UNROTATED if joint is None else base.orientations[0, joint] for joint in base.joint_of]
     still = (rotations.from_matrix(turn) for turn in turns)
     return torch.stack([rotations.multiply(turn, own) for turn, own in zip(still, joints, strict=True)])
-
-
-def _canonical_direction(index: int) -> Float[Tensor, "3"]:
-    """Return the direction of the bone that begins at a canonical joint; zero for hips and for the ends of limbs."""
-    name = CANONICAL.names[index]
-    if name == "hips" or not CANONICAL.children(index):
-        return torch.zeros(3, dtype=torch.float64)
-    return unit_vectors(CANONICAL.offsets[CANONICAL.children(index)[0]])
 
 
 def _mean_locals(clip: RigPoses) -> Float[Tensor, "rigged 4"]:
@@ -300,11 +293,11 @@ def measure_bones(skeleton: Skeleton, joint_of: JointOf, tpose: TPose) -> Skelet
         spots.append(known[c] if c in known else _estimate_position(c, joint_of, spots, known, ends))
     places = torch.stack(spots)
     offsets = torch.cat([torch.zeros(1, 3, dtype=torch.float64), places[1:] - places[list(CANONICAL.parents[1:])]])
-    tips = {
-        CANONICAL.names[c]: _to_triple(ends[j])
-        for c, j in enumerate(joint_of)
-        if j is not None and j in ends and not CANONICAL.children(c)
-    }
+    tips = {}
+    for c, joint in enumerate(joint_of):
+        if joint in ends and not CANONICAL.children(c):
+            x, y, z = ends[joint].tolist()
+            tips[CANONICAL.names[c]] = (x, y, z)
     return Skeleton(CANONICAL.names, CANONICAL.parents, offsets, tips)
 
 
@@ -330,8 +323,3 @@ def _estimate_scale(spots: list[Tensor]) -> float:
     own = sum(float((spot - spots[CANONICAL.parents[c]]).norm()) for c, spot in enumerate(spots) if c)
     usual = float(CANONICAL.offsets[1 : len(spots)].norm(dim=-1).sum())
     return own / usual if own > 0 and usual > 0 else 1.0
-
-
-def _to_triple(vector: Tensor) -> tuple[float, float, float]:
-    x, y, z = vector.tolist()
-    return x, y, z

@@ -49,10 +49,6 @@ class RigPoses:
             motion.joint_positions()[picked], motion.joint_rotations()[picked], motion.skeleton, tuple(joint_of)
         )
 
-    def first(self) -> "RigPoses":
-        """Return the first pose alone."""
-        return RigPoses(self.positions[:1], self.orientations[:1], self.skeleton, self.joint_of)
-
     def has(self, *names: str) -> bool:
         """Return whether the rig has all these canonical joints."""
         return all(self.joint_of[CANONICAL.index(name)] is not None for name in names)

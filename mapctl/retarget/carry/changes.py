@@ -19,7 +19,6 @@ from mapctl.skeleton import leg_length
 _FOOT_METRES = 0.005  # metres that a foot misses its target by before it is worth a line
 _HAND_METRES = 0.01  # metres that a hand does
 _DIP_METRES = 0.05  # metres that hips go lower than in scale before it is worth a line
-_TILT_DEG = 15.0  # degrees that a T-pose's foot is wrong by before it is worth a line
 _MOVES_RADIANS = math.radians(1.0)  # angle within which a joint does not move
 
 
