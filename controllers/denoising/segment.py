@@ -30,14 +30,13 @@ from mapctl.recording.lasting_noise import LastingNoise, find_lasting_noise
 from mapctl.recording.noise_estimation import estimate_angle_noise, estimate_position_noise
 from mapctl.recording.quaternion_signs import choose_continuous_signs
 from mapctl.recording.residual_motion import WHITE, restore_residual_motion
-from mapctl.recording.spike_detection import find_residual_spikes
+from mapctl.recording.spike_detection import LEAST_NOISE, find_residual_spikes
 from mapctl.recording.sure_smoothing import smooth_rotations
 from mapctl.retarget import RigMap, to_canonical
 from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import CANONICAL, TOES, leg_length
 from mapctl.terms import Term
 
-_LEAST_NOISE = math.radians(1)  # of a joint in whose residual spikes are looked for
 _LASTING_ROUNDS = 4  # proposals that are asked for at most, each told of the noise that the one before has shown
 
 
@@ -238,7 +237,7 @@ class SegmentDenoiser:
         dropouts = ~_map_mask_to_canonical(~self.inspection.lost, self.rigmap)
         sigma = self.capture.sigma[0].double()
         spikes = find_residual_spikes(self._compute_residual_rotations(proposal), sigma)
-        spikes &= (sigma > _LEAST_NOISE) | ~self.capture.seen[0]
+        spikes &= (sigma > LEAST_NOISE) | ~self.capture.seen[0]
         root = (self.shown.root_position - proposal.root_position)[:, None]
         leap = find_residual_spikes(root, self.capture.sigma_root.double())[:, 0]
         return replace(self.capture, seen=~(dropouts | spikes)[None], seen_root=~(self.hidden_root | leap)[None])

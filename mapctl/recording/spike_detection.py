@@ -14,6 +14,8 @@ MIN_SPIKE_SIGMAS = 5.0
 """Least distance of a spike from the median of its surroundings, in sigmas of the noise."""
 MIN_SPIKE_DEG = 12.0
 """Least height of a spike, degrees, or as many centimetres: less is left to what treats noise."""
+LEAST_NOISE = math.radians(1.0)
+"""Noise of a joint below which it is taken for one without."""
 _RESIDUAL_SIGMAS, _RESIDUAL_DEG = (
     4.8,
     3.0,
@@ -28,7 +30,8 @@ def find_angle_spikes(
 ) -> Bool[Tensor, "frames joints"]:
     """Find which joints spike in which frames; `sigma` is the noise of each angle, radians."""
     quats = choose_continuous_signs(quats)
-    middle = torch.nn.functional.normalize(_running_median(quats), dim=-1)
+    middle = _running_median(quats.flatten(1)).unflatten(1, quats.shape[1:])
+    middle = torch.nn.functional.normalize(_continue_at_ends(middle, quats, sigma < LEAST_NOISE), dim=-1)
     away = _rotation_distance(middle, quats)
     usual = _mean_step(_rotation_distance(middle[:-1], middle[1:]))
     return away > (MIN_SPIKE_SIGMAS * sigma).clamp_min(math.radians(MIN_SPIKE_DEG)) + _STEP_FACTOR * usual
@@ -36,7 +39,7 @@ def find_angle_spikes(
 
 def find_position_spikes(places: Float[Tensor, "frames 3"], sigma: float) -> Bool[Tensor, " frames"]:
     """Find the frames in which the position spikes; metres."""
-    middle = _running_median(places[:, None])[:, 0]
+    middle = _running_median(places)
     away = (places - middle).norm(dim=-1)
     usual = _mean_step(torch.diff(middle, dim=0).norm(dim=-1)[:, None])[:, 0]
     return away > max(MIN_SPIKE_SIGMAS * sigma, MIN_SPIKE_DEG / 100) + _STEP_FACTOR * usual
@@ -47,21 +50,29 @@ def find_residual_spikes(
 ) -> Bool[Tensor, "frames joints"]:
     """Find spikes in the residual of a capture beside a model of it: rotation vectors, radians. Without the motion
     itself a spike stands out more clearly; `sigma` is the noise of each of the three numbers."""
-    return (rest - _running_median(rest)).norm(dim=-1) > _RESIDUAL_SIGMAS * sigma + math.radians(_RESIDUAL_DEG)
+    return (rest - _running_median(rest.flatten(1)).unflatten(1, rest.shape[1:])).norm(
+        dim=-1
+    ) > _RESIDUAL_SIGMAS * sigma + math.radians(_RESIDUAL_DEG)
 
 
-def _running_median(values: Float[Tensor, "frames joints width"]) -> Float[Tensor, "frames joints width"]:
+def _running_median(values: Float[Tensor, "frames width"]) -> Float[Tensor, "frames width"]:
     """Return the running median over `_MEDIAN_FRAMES`; the ends are mirrored, since repeated, an outermost frame that
-    spikes would be its own median. Where an outermost frame is nearer to the line through the next two, it is that
-    line: a joint that swings through the first frame does not turn there."""
+    spikes would be its own median."""
     side, last = _MEDIAN_FRAMES // 2, len(values) - 1
     frame = last - (last - torch.arange(-side, len(values) + side).abs()).abs()
-    middle = values[frame.clamp_min(0)].unfold(0, _MEDIAN_FRAMES, 1).median(dim=-1).values
-    if len(values) >= _MEDIAN_FRAMES:
+    return values[frame.clamp_min(0)].unfold(0, _MEDIAN_FRAMES, 1).median(dim=-1).values
+
+
+def _continue_at_ends(
+    middle: Float[Tensor, "frames joints 4"], quats: Float[Tensor, "frames joints 4"], clean: Bool[Tensor, " joints"]
+) -> Float[Tensor, "frames joints 4"]:
+    """Return medians that go on along the line through the next two frames where an outermost frame is nearer to that:
+    a joint that swings through the first frame does not turn there. With noise the line is too uncertain."""
+    if len(quats) >= _MEDIAN_FRAMES:
         for end, near, far in ((0, 1, 2), (-1, -2, -3)):
-            line = 2 * values[near] - values[far]
-            nearer = (values[end] - line).norm(dim=-1) < (values[end] - middle[end]).norm(dim=-1)
-            middle[end] = torch.where(nearer[:, None], line, middle[end])
+            line = 2 * quats[near] - quats[far]
+            nearer = (quats[end] - line).norm(dim=-1) < (quats[end] - middle[end]).norm(dim=-1)
+            middle[end] = torch.where((nearer & clean)[:, None], line, middle[end])
     return middle
 
 

@@ -23,7 +23,9 @@ axes of real rigs are up to 53 degrees off their T-pose's (MakeHuman's knees, Mo
 CORE = ("hips", "chest", *(side + part for side in ("left", "right") for part in ("UpperLeg", "LowerLeg")))
 """Joints that positions and knees determine beyond doubt: a T-pose that contradicts one of them is none."""
 _ARM = ("Shoulder", "UpperArm", "LowerArm", "Hand")
-_MIN_BEND = 0.1  # mean sine of the angle at a knee or elbow from which its hinge axis is known
+_MIN_BEND = 0.15  # mean sine of the angle at a knee or elbow from which its hinge axis is known: knees of people who
+# stand are up to 7 degrees past straight
+_HEAD_UP = 0.5  # least mean cosine between the chest's up axis and a head's End Site that is the top of the head
 _HINGE_SHARE = 0.7  # of all bending that is about the hinge axis, from which there is one
 _STRAIGHT_POWER = 20  # legs count by this power of their extension: 0.67 at 98 %, 0.12 at 90 %, 0.01 at 80 %
 _SPINE_WEIGHT = 0.05  # of the bone above the hips against legs
@@ -158,7 +160,9 @@ def _orient_trunk(found: _Builder) -> Iterator[str]:
     found.orient("spine", _bone(clip, "spine", clip.up()), _Y, across, _X)
     for name in ("neck", "head"):
         if clip.has(name):
-            found.orient(name, _bone(clip, name, found.axis(top, _Y)), _Y, found.axis(top, _X), _X)
+            up, bone = found.axis(top, _Y), _bone(clip, name, found.axis(top, _Y))
+            bone = bone if float((bone * up).sum(-1).mean()) > _HEAD_UP else up
+            found.orient(name, bone, _Y, found.axis(top, _X), _X)
     if clip.has("head"):
         found.continue_frame("head", "neck")
 

@@ -19,6 +19,7 @@ _ANIMAL = re.compile(
 _MIN_ANIMAL = 2  # joints named as an animal's, from which it is one
 _SQUARE = 0.5  # cosine between trunk and legs, below which the trunk lies across them
 _ALONG = 0.7  # cosine between arms and legs, above which the arms stand beside the legs
+_DEPTH = 0.7  # of the feet under the hips, from which hands are on the ground as well
 _STANDS = -0.7  # cosine between trunk and legs, below which somebody stands upright
 _MOST = 0.95  # share of a clip's frames on all fours that shows it, where the rest pose does not
 _APART = 0.1  # metres between the hips of two bodies
@@ -78,8 +79,13 @@ def find_further_limbs(skeleton: Skeleton, joints: Mapping[str, int]) -> tuple[i
 
 
 def _is_on_all_fours(poses: RigPoses) -> Bool[Tensor, " poses"]:
+    """Return whether the trunk lies across parallel arms and legs, and the hands are about as far down as the feet,
+    which those of a crouching person are not."""
     legs, arms = _limbs(poses, "Leg"), _limbs(poses, "Arm")
-    return (_trunk_against_legs(poses).abs() < _SQUARE) & ((legs * arms).sum(-1) > _ALONG)
+    front = "Hand" if poses.has("leftHand", "rightHand") else "LowerArm"
+    depth = [((poses.middle(part) - poses.middle("UpperLeg")) * legs).sum(-1) for part in (front, "Foot")]
+    square = (_trunk_against_legs(poses).abs() < _SQUARE) & ((legs * arms).sum(-1) > _ALONG)
+    return square & (depth[0] > _DEPTH * depth[1])
 
 
 def _trunk_against_legs(poses: RigPoses) -> Float[Tensor, " poses"]:
