@@ -1,7 +1,9 @@
 """What is doubtful about how a rig is understood: never a wrong match that is sure, and no doubt about the listed."""
 
+import math
 import random
 from dataclasses import replace
+from fractions import Fraction
 
 import pytest
 import torch
@@ -10,8 +12,9 @@ from rig_maker import Make, make, names_of, person
 from rig_trees import TREES
 from strange_rigs import CASES, DOUBTFUL, REFUSED, SURE, renamed, rigged, stretched, swap, with_joints
 
-from mapctl import retarget
+from mapctl import retarget, rotations
 from mapctl.errors import RequestError
+from mapctl.motion import Motion
 from mapctl.retarget import body_plan, rigs
 from mapctl.retarget.doubts import Fit, assess_fit
 from mapctl.retarget.joint_matching import KnownBy
@@ -216,3 +219,27 @@ def test_an_animal_is_told_by_its_paws_in_any_pose():
     assert not body_plan.goes_on_four_legs(made.skeleton, standing, None)
     paws = renamed(made.motion(person(1.0, 2)), lambda name: name.replace("Hand", "Paw")).skeleton
     assert body_plan.goes_on_four_legs(paws, standing, None)
+
+
+@pytest.mark.parametrize(("knee_deg", "four"), [(40.0, False), (0.0, True)])
+def test_a_crouch_with_hanging_arms_is_no_walk_on_four_legs(knee_deg, four):
+    """A level trunk and arms straight down: a person's hands stay over the floor, where an animal stands on them."""
+    pose = torch.tensor([0.0, 0, 0, 1]).double().repeat(1, CANONICAL.num_joints, 1)
+
+    def bend(name, axis, degrees):
+        vector = torch.zeros(3, dtype=torch.float64)
+        vector[axis] = math.radians(degrees)
+        pose[0, CANONICAL.index(name)] = rotations.from_rotation_vector(vector)
+
+    bend("hips", 0, 85)
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        bend(side + "UpperArm", 1, -90 * sign)
+        bend(side + "UpperLeg", 0, -85 - knee_deg / 2)
+        bend(side + "LowerLeg", 0, knee_deg)
+    arms = 1.0 if not four else 1.6
+    offsets = CANONICAL.offsets.clone()
+    offsets[CANONICAL.indices([side + part for side in ("left", "right") for part in ("LowerArm", "Hand")])] *= arms
+    body = replace(CANONICAL, offsets=offsets)
+    motion = Motion(body, Fraction(30), torch.zeros(1, 3, dtype=torch.float64), pose)
+    poses = RigPoses.of(motion, range(CANONICAL.num_joints))
+    assert body_plan.goes_on_four_legs(body, poses, None) is four
