@@ -153,16 +153,16 @@ def _find_above(rigmap: RigMap, name: str) -> str | None:
 
 
 def _compare_sides(rigmap: RigMap, zero: RigPoses, clip: RigPoses | None) -> Iterator[Doubt]:
-    """Compare the sides that names tell with each other and with where the toes point."""
+    """Compare the sides that names have with each other and with those that toes and knees show."""
     exchanged = rigmap.match.sides_exchanged
     if exchanged:
-        yield Doubt("joints called left are on the right, by where the toes point; places win over names", ())
+        yield Doubt("joints called left are on the right, by toes and knees; positions outweigh names", ())
     roles = classify_joints(rigmap.rig_skeleton)
     named = [name for name, joint in rigmap.joints.items() if roles[joint].side is not Side.MIDDLE]
     for name in named:
-        told = roles[rigmap.joints[name]].side.value
-        told = mirror_name(told) if exchanged else told
-        if not name.startswith(told):
+        side = roles[rigmap.joints[name]].side.value
+        side = mirror_name(side) if exchanged else side
+        if not name.startswith(side):
             yield Doubt(f"{name} is {_quote(rigmap, rigmap.joints[name])}, a name of the other side", (name,))
     poses = clip or zero
     turned = torch.nn.functional.cosine_similarity(poses.across("UpperArm"), poses.across("UpperLeg"), dim=-1)
@@ -170,19 +170,24 @@ def _compare_sides(rigmap: RigMap, zero: RigPoses, clip: RigPoses | None) -> Ite
         yield Doubt("the left arm is on the side of the right leg", ("leftUpperArm", "rightUpperArm"))
     front = max(abs(float(measure_front(poses).mean())) for poses in (zero, poses))
     if not named and front < MIN_FRONT:
-        yield Doubt("nothing tells the front: no names of sides, no toes; left may be right", ())
+        yield Doubt("nothing shows the front: no names of sides, no toes; left may be right", ())
 
 
 def _list_joints_by_place(rigmap: RigMap) -> Iterator[Doubt]:
-    """List the joints whose names tell nothing."""
+    """List the joints whose names show neither side nor part."""
     placed = _list_placed(rigmap)
     if len(placed) <= _MAX_LISTED:
         for name in placed:
-            yield Doubt(f"{name} is known by its place alone (joint {_quote(rigmap, rigmap.joints[name])})", (name,))
+            yield Doubt(
+                f"{name} is known by its position in the tree alone (joint {_quote(rigmap, rigmap.joints[name])})",
+                (name,),
+            )
         return
     listed = ", ".join(f"{name} ({_quote(rigmap, rigmap.joints[name])})" for name in placed[:_MAX_LISTED])
     more = len(placed) - _MAX_LISTED
-    yield Doubt(f"{len(placed)} joints are known by their places alone: {listed} and {more} more", tuple(placed))
+    yield Doubt(
+        f"{len(placed)} joints are known by their positions in the tree alone: {listed} and {more} more", tuple(placed)
+    )
 
 
 def _list_placed(rigmap: RigMap) -> list[str]:
@@ -190,7 +195,7 @@ def _list_placed(rigmap: RigMap) -> list[str]:
 
 
 def _compare_words(rigmap: RigMap) -> Iterator[Doubt]:
-    """Compare the part in the name of a joint with what its place made it."""
+    """Compare the part in the name of a joint with its position in the tree."""
     roles = classify_joints(rigmap.rig_skeleton)
     for name in _list_placed(rigmap):
         joint = rigmap.joints[name]
@@ -202,7 +207,7 @@ def _compare_words(rigmap: RigMap) -> Iterator[Doubt]:
 def _find_skipped_joints(rigmap: RigMap) -> Iterator[Doubt]:
     """Find joints but twists and other helpers between chest and arms, or within a limb of which no list knows the next
     joint."""
-    told: set[int] = set()
+    listed: set[int] = set()
     names, matched = rigmap.rig_skeleton.names, rigmap.joints.values()
     for name, joint in rigmap.joints.items():
         side, part = _split(name)
@@ -212,10 +217,10 @@ def _find_skipped_joints(rigmap: RigMap) -> Iterator[Doubt]:
             continue
         between = path_below(rigmap.rig_skeleton, rigmap.joints[above], joint)[-2::-1]
         between = [one for one in between if one not in matched and not HELPER_NAME.search(names[one])]
-        if between and between[0] not in told:
+        if between and between[0] not in listed:
             own, skipped = _quote(rigmap, rigmap.joints[above]), _quote(rigmap, between[0])
             yield Doubt(f"between {above} {own} and {name} {_quote(rigmap, joint)} is {skipped}", (above, name))
-        told |= {*between}
+        listed |= {*between}
 
 
 def _compare_knowledge(rigmap: RigMap) -> Iterator[Doubt]:
@@ -283,7 +288,7 @@ def _compare_halves(skeleton: Skeleton) -> Iterator[Doubt]:
             halves = _length(skeleton, side + upper), _length(skeleton, side + lower)
             joints = (side + upper, side + lower)
             if min(halves) < _NO_BONE:
-                yield Doubt(f"{joints[halves.index(min(halves))]} is in the place of the joint above it", joints)
+                yield Doubt(f"{joints[halves.index(min(halves))]} is at the position of the joint above it", joints)
             elif not _HALVES[0] <= halves[0] / halves[1] <= _HALVES[1]:
                 centimetres = " and ".join(f"{100 * half:.0f} cm" for half in halves)
                 yield Doubt(f"the {side} {limb} has halves of {centimetres}", joints)

@@ -82,7 +82,7 @@ def test_a_joint_without_a_name_is_found_by_the_other_side(tree, name):
     wish = replace(TREES[tree], names={**TREES[tree].names, name: "a17"}, extras=False, arms_down_deg=30)
     verdict, why, rigmap = judge(make(wish).motion(person(1.0, 30)))
     assert (verdict, rigmap.joint_names[name]) == (DOUBTFUL, "a17")
-    assert f"{name} is known by its place alone (joint 'a17')" in why
+    assert f"{name} is known by its position in the tree alone (joint 'a17')" in why
 
 
 @pytest.mark.parametrize("preset", [rig.name for rig in rigs.known_rigs() if rig.name != "metahuman"])
@@ -198,7 +198,7 @@ REASONS = {
     "which is named otherwise": lambda: make(
         replace(TREES["metahuman", "body and face"], names={**names_of("metahuman"), "leftHand": "a17"}, extras=False)
     ).motion(person(1.0, 10)),
-    "nothing tells the front": lambda: rigged(
+    "nothing shows the front": lambda: rigged(
         {c: f"b{n}" for n, c in enumerate(CANONICAL.names) if "Toes" not in c}, extras=False, end_sites=False
     )[0],
     "trunk is": _stretched_trunk,
