@@ -148,9 +148,7 @@ def _cases() -> dict[str, Strange]:
         "Mixamo": Strange(walk, (SURE,), truth, rig="mixamo"),
         "Chinese": Strange(*_told(rigged(CHINESE), SURE)),
         "Japanese": Strange(*_told(rigged(JAPANESE, arms_down_deg=40), SURE)),
-        "no words": Strange(
-            *_told(rigged(NONSENSE), DOUBTFUL), reason="21 joints are known by their positions in the tree alone"
-        ),
+        "no words": Strange(*_told(rigged(NONSENSE), DOUBTFUL), reason="21 joints are known by their positions alone"),
         "numbers": Strange(
             *_told(rigged({c: str(n) for n, c in enumerate(CANONICAL.names)}, arms_down_deg=20), DOUBTFUL)
         ),
@@ -163,10 +161,10 @@ def _cases() -> dict[str, Strange]:
         ),
         "one name lost": Strange(
             *_told(rigged(mixamo | {"leftHand": "a17"}), DOUBTFUL),
-            reason="leftHand is known by its position in the tree alone (joint 'a17')",
+            reason="leftHand is known by its position alone (joint 'a17')",
         ),
         "an elbow without a name": Strange(
-            *_told(rigged(mixamo | {"leftLowerArm": "a17"}), DOUBTFUL), reason="leftLowerArm is known by its place"
+            *_told(rigged(mixamo | {"leftLowerArm": "a17"}), DOUBTFUL), reason="leftLowerArm is known by its position"
         ),
         "no head": Strange(
             *_told(rigged({c: o for c, o in mixamo.items() if c not in ("head", "neck")}), DOUBTFUL),

@@ -178,16 +178,11 @@ def _list_joints_by_place(rigmap: RigMap) -> Iterator[Doubt]:
     placed = _list_placed(rigmap)
     if len(placed) <= _MAX_LISTED:
         for name in placed:
-            yield Doubt(
-                f"{name} is known by its position in the tree alone (joint {_quote(rigmap, rigmap.joints[name])})",
-                (name,),
-            )
+            yield Doubt(f"{name} is known by its position alone (joint {_quote(rigmap, rigmap.joints[name])})", (name,))
         return
     listed = ", ".join(f"{name} ({_quote(rigmap, rigmap.joints[name])})" for name in placed[:_MAX_LISTED])
     more = len(placed) - _MAX_LISTED
-    yield Doubt(
-        f"{len(placed)} joints are known by their positions in the tree alone: {listed} and {more} more", tuple(placed)
-    )
+    yield Doubt(f"{len(placed)} joints are known by their positions alone: {listed} and {more} more", tuple(placed))
 
 
 def _list_placed(rigmap: RigMap) -> list[str]:

@@ -85,7 +85,7 @@ def odd(tmp_path):
 
 @pytest.mark.slow
 def test_info_prints_every_doubt_and_other_commands_the_first_once(odd, tmp_path, capsys):
-    reason = "leftHand is known by its position in the tree alone (joint 'a17')"
+    reason = "leftHand is known by its position alone (joint 'a17')"
     overrule = "--unit, --up and --rig overrule what was guessed"
     assert run("info", odd, "--out", tmp_path / "odd.png") == 0
     assert f"fit: doubtful\ndoubtful: {reason}\n{overrule}\n" in capsys.readouterr().out

@@ -82,7 +82,7 @@ def test_doubts_are_told_by_number_beside_their_joints():
     picture = picture_of(CASES["one name lost"].motion)
     words = [text.get_text() for text in drawn(picture)[1]]
     assert "leftHand [1]" in words
-    assert "[1] leftHand is known by its position in the tree alone (joint 'a17')" in words
+    assert "[1] leftHand is known by its position alone (joint 'a17')" in words
     assert "fit: doubtful" in words
     assert "rightHand" in words
 
