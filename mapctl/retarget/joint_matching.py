@@ -34,7 +34,7 @@ _ARMS_ON_CHEST = 0.5  # joints that a chest from which the shoulders hang is wor
 _MIN_PREFIXED = 5  # joints whose names begin alike, from which this is a prefix
 _BEGINNING = re.compile(r"[^_:|.\- ]+[_:|.\- ](?=.)")  # of a name, up to its first separator
 HELPER_NAME = re.compile(
-    r"^__|twist|roll|\bik|ik_|_ik|pole|ctrl|control|nub|_end|\bend|site|tip|prop|weapon|aim|target|"
+    r"(?:^|[:|])__|twist|roll|\bik|ik_|_ik|pole|ctrl|control|nub|_end|\bend|site|tip|prop|weapon|aim|target|"
     r"helper|corrective|attach|socket|skirt|hair|cloth|breast|bust|捩|ＩＫ",
     re.IGNORECASE,
 )
