@@ -21,7 +21,7 @@ from mapctl.inbetweening.missing import MissingMask, interpolate_missing
 from mapctl.intent.keyframes import Key, Keys
 from mapctl.motion import Motion
 from mapctl.protocols import Density, Inbetweener
-from mapctl.retarget import RigMap, as_rig, to_canonical
+from mapctl.retarget import RigMap, as_rig, identify_rig, to_canonical
 from mapctl.retarget.rigs import Rig
 from mapctl.terms import Term
 
@@ -73,7 +73,14 @@ def keyframe_motion(wanted: Sequence[Key], motion: Motion, rig: Rig | None) -> t
     # Where keys tell no rotation at all, the rig is known by the pose at any of them.
     free[[key.frame for key in wanted if key.shown] or [wanted[0].frame]] = False
     shown = interpolate_missing(motion, MissingMask.of_frames(free, motion.num_joints))
-    return *to_canonical(shown, rig), shown
+    canonical, rigmap = to_canonical(shown, rig)
+    unseen = missing_between_keys(wanted, motion, rigmap).joints.all(dim=0)
+    if rigmap.tpose_doubt and bool(unseen.any()):  # joints that no key gives are no evidence of how the rig is built
+        rested = shown.local_quat_xyzw.clone()
+        rested[:, unseen] = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=rested.dtype)
+        known = identify_rig(motion.skeleton, rig, motion=replace(shown, local_quat_xyzw=rested))
+        canonical, rigmap = to_canonical(shown, known)
+    return canonical, rigmap, shown
 
 
 def measure_keyframe_errors(made: Motion, source: Motion, keys: Keys, rig: Rig | None = None) -> list[dict[str, Any]]:

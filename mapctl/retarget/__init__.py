@@ -137,12 +137,12 @@ def as_rig(rigmap: RigMap) -> Rig:
     )
 
 
-def to_canonical(motion: Motion, rig: Rig | None = None) -> tuple[Motion, RigMap]:
+def to_canonical(motion: Motion, rig: Rig | RigMap | None = None) -> tuple[Motion, RigMap]:
     """Return the motion in canonical joint frames with the performer's own bones, and the map that leads back.
 
-    `rig` wins over what would be recognised (see `identify_rig`).
+    `rig` wins over what would be recognised (see `identify_rig`); a map is taken as it is.
     """
-    rigmap = identify_rig(motion.skeleton, rig, motion=motion)
+    rigmap = rig if isinstance(rig, RigMap) else identify_rig(motion.skeleton, rig, motion=motion)
     world = motion.joint_rotations()
     picked = []
     for name, joint, tpose in zip(CANONICAL.names, rigmap.joint_of, rigmap.tpose_quat_xyzw, strict=True):
