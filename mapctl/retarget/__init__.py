@@ -100,9 +100,9 @@ def identify_rig(skeleton: Skeleton, rig: Rig | None = None, *, motion: Motion |
         clip = clip and replace(clip, joint_of=found.joint_of)
     if character is not None and not character.frames.are_aligned and found.rig in known_rigs():
         # A preset's table is of the rig's own joint frames, which are not those that a character's motion has.
-        found = replace(found, rig=replace(found.rig, tpose={}))
+        found = replace(found, rig=replace(found.rig, tpose={}, rest="auto"))
     # The canonical names in a T-pose are the canonical body, whatever it does.
-    stated = stated or (found.rig.name == "canonical" and is_canonical_tpose(zero))
+    stated = stated or (found.rig.name == "canonical" and found.rig.rest == "tpose" and is_canonical_tpose(zero))
     up, own = (None, None) if character is None else ("y", torch.from_numpy(character.frames.quat_xyzw))
     tpose = find_tpose(zero, clip, rig=found.rig, stated=stated, up=up, own=own)
     rigmap = RigMap(
