@@ -37,6 +37,7 @@ ANGLE_UNIT, POSITION_UNIT = 0.3, 0.02
 """One unit of inputs and of outputs, about their standard deviation: radians, metres."""
 _VELOCITY_UNIT = 0.05  # metres a frame
 _HIPS_HEIGHT = 0.85  # metres: height of the canonical skeleton's hips while it walks
+_SPREAD_SHIFT = -3.5  # logarithm of the spread, radians or metres, that training begins with
 _CHUNK_FRAMES, _MARGIN_FRAMES = 512, 64  # frames cleaned at once, and beside them
 
 
@@ -82,14 +83,19 @@ class DenoiserNetwork(nn.Module):
         self.last = nn.Linear(config.width, sum(_OUTPUT_BLOCKS))
         nn.init.zeros_(self.last.weight)
         nn.init.zeros_(self.last.bias)
+        self.spread = nn.Linear(config.width, 1 + CANONICAL.num_joints)
+        nn.init.zeros_(self.spread.weight)
+        nn.init.constant_(self.spread.bias, _SPREAD_SHIFT)
 
     def forward(self, capture: Capture) -> CaptureProposal:
         """Propose a motion, frames that were not observed at all included."""
         view, config = _CaptureView(capture), self.config
         inputs = view.observed() if config.plain else view.inputs(sees_world=config.sees_world)
         with torch.autocast(inputs.device.type, torch.bfloat16, enabled=self.reduced_precision):
-            change = self.last(self.plain(inputs) if config.plain else self._convolve(inputs)).to(inputs.dtype)
-        return view.added(change) if config.plain else view.changed(change)
+            hidden = self.plain(inputs) if config.plain else self._convolve(inputs)
+            change, spread = self.last(hidden).to(inputs.dtype), self.spread(hidden.detach()).to(inputs.dtype)
+        pose, contacts = view.added(change) if config.plain else view.changed(change)
+        return CaptureProposal(pose, contacts, spread)
 
     @property
     def piece_frames(self) -> tuple[int, int]:
@@ -194,7 +200,7 @@ class _CaptureView:
         both = torch.cat([six, places / ANGLE_UNIT], dim=-1)
         return [both, _smooth(both, _SMOOTHING_SIGMA)]
 
-    def changed(self, change: Float[Tensor, "batch frames outputs"]) -> CaptureProposal:
+    def changed(self, change: Float[Tensor, "batch frames outputs"]) -> tuple[BodyPose, Tensor]:
         """Apply a change to the smoothed observation, as far as noise or gaps allow one."""
         angles, turn, off, contacts = change.split(_OUTPUT_BLOCKS, dim=-1)
         # What was not observed is on a straight line already: it is smoothed as far as what it lies between is noisy.
@@ -204,19 +210,18 @@ class _CaptureView:
             _smooth(self.turn, _SMOOTHING_SIGMA) - self.turn + ANGLE_UNIT * turn
         )
         off = self.off + self.root_noise_share * (_smooth(self.off, _SMOOTHING_SIGMA) - self.off + POSITION_UNIT * off)
-        return self._propose(angles, turn, off, contacts)
+        return self._unpack(angles, turn, off), contacts
 
-    def added(self, change: Float[Tensor, "batch frames outputs"]) -> CaptureProposal:
+    def added(self, change: Float[Tensor, "batch frames outputs"]) -> tuple[BodyPose, Tensor]:
         """Add a change to the observation, whatever its noise."""
         angles, turn, off, contacts = change.split(_OUTPUT_BLOCKS, dim=-1)
-        return self._propose(
-            self.angles + ANGLE_UNIT * angles, self.turn + ANGLE_UNIT * turn, self.off + POSITION_UNIT * off, contacts
-        )
+        added = self.angles + ANGLE_UNIT * angles, self.turn + ANGLE_UNIT * turn, self.off + POSITION_UNIT * off
+        return self._unpack(*added), contacts
 
-    def _propose(self, angles: Tensor, turn: Tensor, off: Tensor, contacts: Tensor) -> CaptureProposal:
+    def _unpack(self, angles: Tensor, turn: Tensor, off: Tensor) -> BodyPose:
         root = self.slow_root + rotations.rotate_about_y(off, self.slow_heading)
         packed = torch.cat([root, (self.slow_heading + turn[..., 0])[..., None], angles], dim=-1)
-        return CaptureProposal(BodyPose.unpack(packed), contacts)
+        return BodyPose.unpack(packed)
 
 
 def _spread_over_angles(joints: Float[Tensor, "batch frames joints"]) -> Float[Tensor, "batch frames angles"]:
@@ -254,11 +259,12 @@ class ConvDenoiser(checkpoints.LoadedModel):
             with torch.no_grad():
                 cleaned = self.network(capture.slice(first, stop))
             kept = slice(start - first, start - first + count)
-            pieces.append([value[:, kept] for value in (cleaned.pose.pack(), cleaned.contact_logits)])
-        packed, contacts = (torch.cat(values, dim=1) for values in zip(*pieces, strict=True))
+            values = (cleaned.pose.pack(), cleaned.contact_logits, cleaned.log_spread)
+            pieces.append([value[:, kept] for value in values])
+        packed, contacts, spread = (torch.cat(values, dim=1) for values in zip(*pieces, strict=True))
         pose = BodyPose.unpack(packed)
         # Each piece counts whole turns from its own beginning.
-        return CaptureProposal(replace(pose, heading=rotations.unwrap_angle(pose.heading)), contacts)
+        return CaptureProposal(replace(pose, heading=rotations.unwrap_angle(pose.heading)), contacts, spread)
 
 
 def load(name: str) -> ConvDenoiser:

@@ -373,7 +373,7 @@ class NetworkRecipe(Recipe[C, S, G]):
         if card.kind != self.kind or type(self.config).of_card(card.config) != self.config:
             wanted = f"{self.kind} of {self.config.as_card()}"
             raise CheckpointError(f"{name} holds: {card.kind} of {card.config}; wanted: {wanted}")
-        return tensors
+        return trainer.network.state_dict() | tensors  # layers that the other lacks begin as drawn
 
     def pin(self, trainer: G, corpus: Corpus) -> dict[str, Row]:
         """What must not change between a run's parts."""

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -14,6 +14,7 @@ from mapctl.features import LAYOUT
 from mapctl.inbetweening.partial_motion import EFFECTORS, KnownParts, PartialMotion, mirror_quats
 from mapctl.pose import BodyPose
 from mapctl.skeleton import CANONICAL
+from priors.training.augmentation.unfamiliar_poses import PoseVariation, keep_still, vary_poses
 from priors.training.corpus import Corpus
 
 _CHUNK_FRAMES = 50_000  # frames
@@ -29,14 +30,16 @@ _VARIED = (
 
 @dataclass(frozen=True)
 class Variation:
-    """How bodies and tempos vary. Legs keep their length, the unit of all others."""
+    """How bodies, tempos and poses vary. Legs keep their length, the unit of all others."""
 
     tempo: float = 0.1
     """Largest change of tempo, as a share."""
     bones: float = 0.15
     """Largest change of the widths of shoulders and hips and of the lengths of trunk, forearms and hands."""
     share: float = 0.5
-    """Share of windows that vary."""
+    """Share of windows whose tempo, and share whose bones vary."""
+    poses: PoseVariation = field(default_factory=PoseVariation)
+    """How far poses leave those of the clips."""
 
 
 class WindowPicker:
@@ -93,7 +96,7 @@ class PoseWindows:
         window = choose_rows(mirrored, window.mirrored(), window)
         if variation is None:
             return window
-        return _reshape_bodies(window, variation, generator)
+        return _leave_poses(_reshape_bodies(window, variation, generator), variation.poses, generator)
 
     def at(
         self, clip: Int[Tensor, " batch"], first: Int[Tensor, " batch"], frames: int, tempo: Float[Tensor, " batch"]
@@ -154,6 +157,14 @@ def _reshape_bodies(window: PartialMotion, variation: Variation, generator: torc
         factors[:, CANONICAL.indices(joints), :axes] = factor[:, None, None]
     chosen = (torch.rand(batch, generator=generator) < variation.share)[:, None, None]
     return replace(window, offsets=torch.where(chosen, window.offsets * factors, window.offsets))
+
+
+def _leave_poses(window: PartialMotion, variation: PoseVariation, generator: torch.Generator) -> PartialMotion:
+    """Turn joints, tilt and lower bodies."""
+    root = window.root_position.clone()
+    heading, quats, root[..., 1] = vary_poses(window.heading, window.quats, root[..., 1], variation, generator)
+    varied = replace(window, root_position=root, heading=heading, quats=quats)
+    return replace(varied, contacts=keep_still(window.contacts, varied.world_poses()[0]))
 
 
 def add_targets(motion: PartialMotion) -> PartialMotion:

@@ -13,11 +13,12 @@ from mapctl import rotations
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT
 from mapctl.pose import BodyPose
-from mapctl.recording import Capture
+from mapctl.recording import Capture, CaptureProposal
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors.config import require_at_least
 from priors.denoiser.network import ANGLE_UNIT, POSITION_UNIT, DenoiserConfig, DenoiserNetwork
 from priors.training.augmentation.corruption import CorruptionSettings, corrupt, make_clean_capture
+from priors.training.augmentation.unfamiliar_poses import PoseVariation, vary_features
 from priors.training.corpus import Corpus, Split
 from priors.training.devices import make_generator
 from priors.training.recipe import NetworkRecipe, Row, average_logarithms
@@ -52,6 +53,10 @@ class DenoiserSettings:
     calibration_deg: float = 5.0
     """Spread of a rig's joint frames about the canonical ones, in half of the windows: other rigs find theirs in
     other ways."""
+    poses: PoseVariation = field(default_factory=PoseVariation)
+    """How far poses leave those of the clips."""
+    spread: float = 0.1
+    """Weight of the negative log-likelihood of the errors, which only the spread's own layer learns from."""
     corruption: CorruptionSettings = field(default_factory=CorruptionSettings)
     """How windows are spoilt."""
     squared: bool = False
@@ -137,7 +142,7 @@ class DenoiserRecipe(NetworkRecipe[DenoiserConfig, DenoiserSettings, DenoiserTra
 def draw_performers(
     windows: FeatureWindows, settings: DenoiserSettings, generator: torch.Generator, *, batch: int | None = None
 ) -> Float[Tensor, "batch window size"]:
-    """Windows of performers a little larger or smaller, on rigs calibrated a little differently."""
+    """Windows of performers a little larger or smaller, on rigs calibrated a little differently, in varied poses."""
     batch = batch or settings.batch
     features = windows.draw(batch, generator).features.clone()
     size = torch.exp(settings.corruption.size * torch.randn(batch, 1, 1, generator=generator))
@@ -146,7 +151,7 @@ def draw_performers(
     features[..., LAYOUT.slices["joint_rotations"]] = _perturb_joint_frames(
         features, settings.calibration_deg, generator
     )
-    return features
+    return vary_features(features, settings.poses, generator)
 
 
 def _perturb_joint_frames(
@@ -189,13 +194,24 @@ def compute_denoiser_losses(
         + settings.angles * turned
         + settings.contacts * contacts
     )
+    spread = _compute_spread_loss(cleaned, _pack(clean))
     return {
-        "loss": loss,
+        "loss": loss + settings.spread * spread,
         "error_cm": place,
         "feet_cm_frame": feet,
         "angles_deg": torch.rad2deg(turned),
         "contacts_nats": contacts,
+        "spread_nats": spread,
     }
+
+
+def _compute_spread_loss(cleaned: CaptureProposal, wanted: Float[Tensor, "batch frames width"]) -> Tensor:
+    """Compute the negative log-likelihood of errors under normal distributions of the proposed spreads: of the hips'
+    position, of their rotation, and of each other joint's."""
+    error = (cleaned.pose.pack() - wanted).detach().square()
+    joints = torch.cat([error[..., None, 3:6], error[..., 6:].unflatten(-1, (-1, 3))], dim=-2).mean(dim=-1)
+    power = torch.cat([error[..., :3].mean(dim=-1, keepdim=True), joints], dim=-1)
+    return (0.5 * power * torch.exp(-2 * cleaned.log_spread) + cleaned.log_spread).mean()
 
 
 def compute_squared_losses(
@@ -208,7 +224,9 @@ def compute_squared_losses(
     error = cleaned.pose.pack() - _pack(clean)
     squares = torch.cat([error[..., :3] / POSITION_UNIT, error[..., 3:] / ANGLE_UNIT], dim=-1).square().mean()
     contacts = cross_entropy(cleaned.contact_logits.float(), LAYOUT.pick(windows, "contacts"))
-    return {"loss": squares + settings.contacts * contacts, "squares": squares, "contacts_nats": contacts}
+    spread = _compute_spread_loss(cleaned, _pack(clean))
+    loss = squares + settings.contacts * contacts + settings.spread * spread
+    return {"loss": loss, "squares": squares, "contacts_nats": contacts}
 
 
 def _pack_angles(clean: Capture) -> Float[Tensor, "batch frames angles"]:

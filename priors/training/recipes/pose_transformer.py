@@ -19,6 +19,7 @@ from priors.pose_transformer.growing import can_grow, grow
 from priors.pose_transformer.network import QUANTILES, PoseTransformerConfig, PoseTransformerNetwork, ProposedPoses
 from priors.training.augmentation.part_masks import PartSettings, sample_known_parts
 from priors.training.augmentation.pose_windows import PoseWindows, Variation, add_targets
+from priors.training.augmentation.unfamiliar_poses import PoseVariation
 from priors.training.corpus import Corpus, Split
 from priors.training.devices import make_generator
 from priors.training.recipe import Export, Gathered, NetworkRecipe, Row, average_logarithms
@@ -28,6 +29,7 @@ VALIDATED_GAPS = (5, 15, 30, 45, 60, 120)
 """Gaps that are validated, frames."""
 _SHORTEST_WINDOW = 8  # frames
 _VALIDATED_WINDOWS = 128
+_UNFAMILIAR, _UNFAMILIAR_GAPS = Variation(poses=PoseVariation(share=1.0)), (5, 15, 30)
 _CALIBRATED_FRAMES = (10, 20, 40, 60, 90)
 _MIN_STD_ROTATION, _MIN_STD_POSITION = 0.1, 0.05
 
@@ -58,6 +60,9 @@ class PoseTransformerSettings:
     """Weight of the planted toes' steps, metres a frame."""
     contacts: float = 0.05
     """Weight of the contacts' cross entropy, nats."""
+    harm: float = 10.0
+    """Weight of the distance by which joints are farther from their true positions than interpolation puts them, metres:
+    an error beyond interpolation's counts twice."""
     spread: float = 1.0
     """Weight of the quantile loss of the spread, which only its own layers learn from."""
     ease: float = 0.4
@@ -88,7 +93,7 @@ TWO_STAGE = (
     PoseTransformerSettings(
         window=72,
         parts=PartSettings(joints=0.0, keys=0.0, several=0.0, bare=0.5, context=11, open=0.0, parts=0.0, reaching=0.0),
-        variation=Variation(share=0.0),
+        variation=Variation(share=0.0, poses=PoseVariation(share=0.0, tilted=0.0)),
     ),
 )
 """The two-stage transformer of Qin et al. 2022, of about the stitcher's weights, trained on the stitcher's question
@@ -139,7 +144,7 @@ class PoseTransformerTrainer(GradientTrainer[PoseTransformerNetwork]):
     @torch.no_grad()
     def validate(self, corpus: Corpus) -> dict[str, Any]:
         """Error of gaps in unseen windows after 10 frames and after one, before one frame, cm and share of the
-        interpolation's; and of lost arms."""
+        interpolation's; the same in unfamiliar poses; and of lost arms."""
         windows = PoseWindows(corpus, kinds=self.settings.kinds, evenness=1.0)
         row: dict[str, Any] = {}
         for past in (10, 1):
@@ -152,6 +157,12 @@ class PoseTransformerTrainer(GradientTrainer[PoseTransformerNetwork]):
                 told[:, past : past + gap] = False
                 error, share = measure_error(self.network, truth, KnownParts.whole(told))
                 row |= {f"error_{past}_{gap}_cm": error, f"share_{past}_{gap}": share}
+        for gap in _UNFAMILIAR_GAPS:
+            truth = windows.draw(_VALIDATED_WINDOWS, 11 + gap, make_generator(gap), variation=_UNFAMILIAR)
+            told = torch.ones(truth.heading.shape, dtype=torch.bool)
+            told[:, 10 : 10 + gap] = False
+            error, share = measure_error(self.network, truth, KnownParts.whole(told))
+            row |= {f"error_unfamiliar_{gap}_cm": error, f"share_unfamiliar_{gap}": share}
         truth = windows.draw(_VALIDATED_WINDOWS, min(60, int(windows.lengths.max())), make_generator(1))
         known = KnownParts.whole(torch.ones(truth.heading.shape, dtype=torch.bool))
         lost = known.rotations.clone()
@@ -212,7 +223,8 @@ class PoseTransformerRecipe(NetworkRecipe[PoseTransformerConfig, PoseTransformer
 
 @torch.no_grad()
 def calibrate_spread(trainer: PoseTransformerTrainer, corpus: Corpus) -> None:
-    """Shift the spreads' logarithms so that over unseen windows as many errors lie within them as they say."""
+    """Shift the spreads' logarithms so that over unseen windows, in varied poses, as many errors lie within them as
+    they say."""
     over = _measure_spread(trainer, corpus, seed=1)
     shift = [float(each.quantile(share)) for share, each in zip(QUANTILES, over, strict=True)]
     trainer.network.spread_shift += torch.tensor(shift)
@@ -234,7 +246,7 @@ def _measure_spread(trainer: PoseTransformerTrainer, corpus: Corpus, seed: int) 
     found: list[Tensor] = []
     for frames in _CALIBRATED_FRAMES:
         if frames <= int(windows.lengths.max()):
-            truth = add_targets(windows.draw(_VALIDATED_WINDOWS, frames, generator))
+            truth = add_targets(windows.draw(_VALIDATED_WINDOWS, frames, generator, variation=settings.variation))
             shown = hide(trainer.network, sample_known_parts(truth, settings.parts, generator))
             proposed = trainer.network(shown)
             distance = (proposed.poses(truth.offsets)[0] - truth.world_poses()[0]).norm(dim=-1)
@@ -307,8 +319,11 @@ def _compare(
     nats = cross_entropy(proposed.contacts, truth.contacts, reduction="none")
     contacts = (nats * unsure).sum() / unsure.sum().clamp_min(1)
     spread = _quantile_loss(proposed, distance.detach(), unknown)
+    simple = ((guess - wanted).norm(dim=-1) * unknown).sum(dim=(1, 2)) / count
+    harm = (places - simple).clamp_min(0.0)
     terms = (
         settings.places * places
+        + settings.harm * harm
         + settings.pace * pace
         + settings.turns * turns
         + settings.hips * hips
@@ -318,7 +333,8 @@ def _compare(
     return {
         "loss": loss,
         "places_cm": 100 * places.mean(),
-        "share": (places / ((guess - wanted).norm(dim=-1) * unknown).sum(dim=(1, 2)).clamp_min(1e-3) * count).mean(),
+        "share": (places / simple.clamp_min(1e-3)).mean(),
+        "worse": (harm > 0.0015 + 0.05 * simple).float().mean(),
         "pace_cm": 100 * pace.mean(),
         "turns": turns.mean(),
         "feet_cm": 100 * feet.mean(),
