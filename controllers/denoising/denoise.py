@@ -1,8 +1,8 @@
 """Denoise a capture on any rig (Wang et al. 2019, section 5.4): inspection, a proposal, and the MAP stage about it.
 
-A network trained on all kinds of motion proposes; residual motion that noise does not explain is restored, so that out
-of its depth it is no worse than a low-pass filter; the MAP stage plants the feet. The result is on the capture's own
-rig, at its own rate, with all of its frames.
+A network trained on all kinds of motion proposes; its proposal is fused with the capture by the noise that the capture
+itself shows, so that on unfamiliar motion the result is a filter of the capture; the MAP stage plants the feet. The
+result is on the capture's own rig, at its own rate, with all of its frames.
 """
 
 import time
@@ -145,6 +145,7 @@ def _denoise_segment(
             faults=(),
             contacts=torch.zeros(motion.num_frames, 2, dtype=torch.bool),
             proposal_share=torch.zeros(motion.num_frames, CANONICAL.num_joints),
+            error=torch.zeros(motion.num_frames, CANONICAL.num_joints),
         )
     done = SegmentDenoiser(inspection, denoiser, settings, rig).run(densities, terms, round(seconds * PRIOR_FPS))
     return replace(done, seconds=time.perf_counter() - began)

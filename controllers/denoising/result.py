@@ -39,6 +39,8 @@ class DenoiseSolution(Solution):
     """Contacts of the left and the right toe, at PRIOR_FPS."""
     proposal_share: Float[Tensor, "frames canonical"]
     """By frame at PRIOR_FPS and canonical joint: 1 where the proposal was used, 0 where the smoothed capture was."""
+    error: Float[Tensor, "frames canonical"]
+    """Estimated error that remains in each of a joint's angles, in the same frames, radians (standard deviation)."""
     rig: Rig | None = None
     """The rig as it was identified."""
     density_intervals: tuple[DensityInterval, ...] = ()
@@ -63,6 +65,7 @@ class DenoiseSolution(Solution):
             faults=tuple(faults),
             contacts=self.contacts[part],
             proposal_share=self.proposal_share[part],
+            error=self.error[part],
             density_intervals=tuple(shift_frames(_clip_to_frames(self.density_intervals, start, stop), -start)),
             ledger=self.ledger.pick(part),
         )
@@ -75,6 +78,7 @@ class DenoiseSolution(Solution):
             "rig": None if self.rig is None else self.rig.name,
             "noise_deg": dict(zip(names, torch.rad2deg(self.noise).tolist(), strict=True)),
             "noise_root_cm": 100 * self.noise_root,
+            "error_deg": dict(zip(CANONICAL.names, torch.rad2deg(self.error.mean(dim=0)).tolist(), strict=True)),
             "faults": [vars(fault) for fault in self.faults],
             "correction_cm": dict(zip(names, moved.tolist(), strict=True)),
             "correction_deg": dict(zip(names, turned.tolist(), strict=True)),
@@ -152,6 +156,7 @@ def _append_segment(whole: DenoiseSolution, piece: DenoiseSolution, start: int) 
         faults=faults,
         contacts=torch.cat([whole.contacts[:kept], piece.contacts[skipped:]]),
         proposal_share=torch.cat([whole.proposal_share[:kept], piece.proposal_share[skipped:]]),
+        error=torch.cat([whole.error[:kept], piece.error[skipped:]]),
         ledger=whole.ledger.slice(kept).join(piece.ledger.pick(slice(skipped, None))),
         seconds=whole.seconds + piece.seconds,
         windows=whole.windows + piece.windows,

@@ -1,8 +1,9 @@
-"""Denoising of one segment of a capture: proposal, residual motion, MAP stage, and retargeting to its rig."""
+"""Denoising of one segment of a capture: proposal, fusion with the capture, MAP stage, and retargeting to its rig."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from fractions import Fraction
 
 import torch
 from jaxtyping import Bool, Float
@@ -19,25 +20,23 @@ from controllers.denoising.result import DenoiseSolution
 from mapctl import retarget, rotations
 from mapctl.contacts import debounced
 from mapctl.errors import RequestError
+from mapctl.features import PRIOR_FPS
 from mapctl.motion import Motion
 from mapctl.problem.density_selection import DensityInterval
 from mapctl.problem.solution import Outcome, Status
 from mapctl.protocols import Denoiser, Density
 from mapctl.recording import Capture, artefacts
-from mapctl.recording.frequency_bands import split_bands
+from mapctl.recording.frequency_bands import upsample
+from mapctl.recording.fusion import fuse_positions, fuse_rotations, measure_kept_noise, smooth_columns
 from mapctl.recording.inspection import Inspection
-from mapctl.recording.lasting_noise import LastingNoise, find_lasting_noise
 from mapctl.recording.noise_estimation import estimate_angle_noise, estimate_position_noise
 from mapctl.recording.quaternion_signs import choose_continuous_signs
-from mapctl.recording.residual_motion import WHITE, restore_residual_motion
-from mapctl.recording.spike_detection import LEAST_NOISE, find_residual_spikes
-from mapctl.recording.sure_smoothing import smooth_rotations
 from mapctl.retarget import RigMap, to_canonical
 from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import CANONICAL, TOES, leg_length
 from mapctl.terms import Term
 
-_LASTING_ROUNDS = 4  # proposals that are asked for at most, each told of the noise that the one before has shown
+_LOW_PASS = 0.4  # of the rate of the frames that the denoiser sees: what is faster would be folded into them
 
 
 @dataclass(frozen=True)
@@ -65,67 +64,55 @@ class SegmentDenoiser:
 
     def __init__(self, inspection: Inspection, denoiser: Denoiser, settings: DenoiseSettings, rig: Rig | None = None):
         self.inspection, self.denoiser, self.settings = inspection, denoiser, settings
+        self.fps = float(inspection.motion.fps)
         self.repaired = _smooth_noncanonical_joints(inspection, rig)
         canonical, self.rigmap = to_canonical(self.repaired, rig)
-        canonical = replace(canonical, local_quat_xyzw=choose_continuous_signs(canonical.local_quat_xyzw))
-        observed = _map_mask_to_canonical(inspection.known, self.rigmap)
-        self.hidden_root = inspection.dropouts_root | ~_are_hip_ancestors_observed(~inspection.lost, self.rigmap)
-        self.observed_root = inspection.seen_root & _are_hip_ancestors_observed(inspection.known, self.rigmap)
-        self.sigma, self.sigma_root = self._estimate_noise(canonical, observed)
-        self.bands = split_bands(canonical)
-        if self.bands.exact:
-            # Nothing is filtered: the network gets the raw frames, and a mask of those to ignore.
-            raw = to_canonical(inspection.with_locked_joints(), rig)[0]
-            self.bands = split_bands(_match_quaternion_signs(raw, canonical))
-        self.shown = self.bands.at_prior_rate()
-        self.capture = self._build_capture(observed)
-        self.lasting: LastingNoise | None = None
+        self.canonical = replace(canonical, local_quat_xyzw=choose_continuous_signs(canonical.local_quat_xyzw))
+        self.seen = _map_mask_to_canonical(inspection.known, self.rigmap)
+        self.seen_root = inspection.seen_root & _are_hip_ancestors_observed(inspection.known, self.rigmap)
+        self.sigma, self.sigma_root = self._estimate_noise()
 
     def run(self, densities: Sequence[Density], terms: Sequence[Term], first_frame: int) -> DenoiseSolution:
-        """Propose, restore residual motion, refine, and retarget to the rig. The segment begins at frame `first_frame`
+        """Propose, fuse with the capture, refine, and retarget to the rig. The segment begins at frame `first_frame`
         of the whole capture, at PRIOR_FPS, which is the time that terms see.
         """
         proposal, contacts = self._propose()
-        if self.bands.exact:
-            self.capture = self._redetect_spikes(proposal)
-            proposal, contacts = self._propose()
-        proposal, contacts = self._propose_under_lasting_noise(proposal, contacts)
-        proposal, share = self._restore_residual(proposal)
-        if self.settings.anchor:
-            proposal = anchor_to_contacts(proposal, debounced(contacts > 0))
+        fused, share, error = self._fuse(proposal)
+        shown = fused.resample(PRIOR_FPS)
+        at = (torch.arange(shown.num_frames) * self.fps / PRIOR_FPS).round().long().clamp(max=fused.num_frames - 1)
+        contacts = contacts[at]
+        start = anchor_to_contacts(shown, debounced(contacts > 0)) if self.settings.anchor else shown
         refined = refine(
-            proposal,
+            start,
             contacts,
-            self.capture,
+            Capture.of_motion(
+                shown, seen=self.seen[at], seen_root=self.seen_root[at], sigma=self.sigma, sigma_root=self.sigma_root
+            ),
             self.settings.refinement,
             densities=densities,
             terms=terms,
             first_frame=first_frame,
         )
-        joined = self.bands.recombine(self.shown, refined.motion, self.sigma, self.sigma_root)
-        motion = retarget.from_canonical(joined, self.rigmap, self.repaired)
-        within = self.bands.within
-        refined = replace(refined, contacts=refined.contacts[:within], ledger=refined.ledger.slice(within))
-        inspection, noise = self.inspection, self._estimate_whole_noise()
-        found = self._collect_faults(motion, proposal.slice(0, within), refined, noise)
+        motion = retarget.from_canonical(self._change(fused, shown, refined.motion), self.rigmap, self.repaired)
+        inspection = self.inspection
         return DenoiseSolution(
             motion,
             Status(Outcome.DONE),
             refined.ledger,
             refined.windows,
             capture=inspection.motion,
-            noise=noise,
+            noise=inspection.noise,
             noise_root=inspection.noise_root,
-            faults=found,
+            faults=self._collect_faults(motion, shown, refined),
             contacts=refined.contacts,
-            proposal_share=1 - share[:within],
-            density_intervals=self._convert_to_capture_rate(refined.density_intervals),
+            proposal_share=share[at],
+            error=error[at],
+            density_intervals=self._convert_to_capture_rate(refined.density_intervals, shown.num_frames),
         )
 
-    def _convert_to_capture_rate(self, parts: Sequence[DensityInterval]) -> tuple[DensityInterval, ...]:
-        """Convert intervals to frames of the capture; the last ends with it."""
-        frames, shown = self.inspection.motion.num_frames, self.shown.num_frames
-        ratio = float(self.inspection.motion.fps) / float(self.shown.fps)
+    def _convert_to_capture_rate(self, parts: Sequence[DensityInterval], shown: int) -> tuple[DensityInterval, ...]:
+        """Convert intervals of `shown` frames at PRIOR_FPS to frames of the capture; the last ends with it."""
+        frames, ratio = self.inspection.motion.num_frames, self.fps / PRIOR_FPS
         moved = [
             replace(
                 part,
@@ -136,174 +123,101 @@ class SegmentDenoiser:
         ]
         return tuple(part for part in moved if part.start < part.stop)
 
-    def _collect_faults(
-        self, motion: Motion, proposal: Motion, refined: RefinedMotion, noise: Float[Tensor, " rigged"]
-    ) -> tuple[artefacts.Artefact, ...]:
-        """Collect the artefacts, on the rig; `proposal` is the motion before the MAP stage."""
+    def _collect_faults(self, motion: Motion, shown: Motion, refined: RefinedMotion) -> tuple[artefacts.Artefact, ...]:
+        """Collect the artefacts, on the rig; `shown` is the motion before the MAP stage."""
         inspection, names = self.inspection, motion.skeleton.names
         rotation = rotations.multiply(rotations.inverse(inspection.motion.local_quat_xyzw), motion.local_quat_xyzw)
         angles = torch.rad2deg(rotations.to_rotation_vector(rotation).norm(dim=-1))
         travelling = names[inspection.travels]
         distances = 100 * (inspection.place(motion) - inspection.place(inspection.motion)).norm(dim=-1)
         found = artefacts.list_noise(
-            names, noise, inspection.noise_root, travels=inspection.travels, frames=motion.num_frames
+            names, inspection.noise, inspection.noise_root, travels=inspection.travels, frames=motion.num_frames
         )
-        found += artefacts.list_spikes(names, self._map_spikes_to_rig(), angles, "deg")
-        found += artefacts.list_spikes([travelling], self._find_root_spikes(), distances[:, None], "cm")
+        found += artefacts.list_spikes(names, inspection.spikes, angles, "deg")
+        found += artefacts.list_spikes([travelling], inspection.spikes_root[:, None], distances[:, None], "cm")
         found += artefacts.list_dropouts(names, inspection.dropouts)
-        toes = proposal.skeleton.indices(TOES)
+        toes = shown.skeleton.indices(TOES)
         feet = [self.rigmap.joint_of[toe] for toe in toes]
         known = [names[foot] if foot is not None else TOES[side] for side, foot in enumerate(feet)]
-        ratio = float(motion.fps) / float(self.shown.fps)
-        height = estimate_rest_height(proposal, refined.contacts)
+        height = estimate_rest_height(shown, refined.contacts)
         steps = artefacts.list_foot_artefacts(
-            known, proposal.joint_positions()[:, toes], refined.contacts, rest_height=height, fps=float(self.shown.fps)
+            known, shown.joint_positions()[:, toes], refined.contacts, rest_height=height, fps=PRIOR_FPS
         )
+        ratio = self.fps / PRIOR_FPS
         return (*found, *(replace(f, start=round(f.start * ratio), stop=round(f.stop * ratio)) for f in steps))
 
-    def _map_spikes_to_rig(self) -> Bool[Tensor, "frames joints"]:
-        """Return spikes by joint of the rig, as redetected beside the proposal where that was done."""
-        spikes = self.inspection.spikes.clone()
-        if self.bands.exact:
-            detected = ~self.capture.seen[0]
-            for canonical, joint in enumerate(self.rigmap.joint_of):
-                if joint is not None:
-                    spikes[:, joint] = detected[:, canonical] & ~self.inspection.dropouts[:, joint]
-        return spikes
-
-    def _find_root_spikes(self) -> Bool[Tensor, "frames 1"]:
-        """Find frames in which the root position is a spike."""
-        if not self.bands.exact:
-            return self.inspection.spikes_root[:, None]
-        return (~self.capture.seen_root[0] & ~self.hidden_root)[:, None]
-
-    def _estimate_noise(self, canonical: Motion, observed: Tensor) -> tuple[Float[Tensor, " joints"], float]:
-        """Estimate the noise of canonical joints' angles (radians) and the hips' position (metres), at the capture's
-        rate.
-        """
+    def _estimate_noise(self) -> tuple[Float[Tensor, " joints"], float]:
+        """Estimate the noise of canonical joints' angles (radians) and the hips' position (metres)."""
         settings = self.settings
-        sigma = estimate_angle_noise(canonical.local_quat_xyzw, observed)
+        sigma = estimate_angle_noise(self.canonical.local_quat_xyzw, self.seen)
         if settings.sigma_deg is not None:
             # Joints that never move have no noise either: they are locked, or the rig has none there.
             sigma = torch.where(sigma > 0, math.radians(settings.sigma_deg), 0.0).to(sigma)
-        root = estimate_position_noise(canonical.root_position, self.observed_root)
+        root = estimate_position_noise(self.canonical.root_position, self.seen_root)
         return sigma, root if settings.sigma_cm is None else settings.sigma_cm / 100
 
-    def _estimate_whole_noise(self) -> Float[Tensor, " rigged"]:
-        """Estimate the noise of each of a joint's angles on the rig, radians, what lasts beyond a frame included."""
-        noise = self.inspection.noise.clone()
-        if self.lasting is not None:
-            for canonical, joint in enumerate(self.rigmap.joint_of):
-                if joint is not None and self.capture.sigma[0, canonical] > noise[joint] > 0:
-                    noise[joint] = self.capture.sigma[0, canonical]
-        return noise
-
-    def _build_capture(self, observed: Tensor) -> Capture:
-        """Build the network's input, at its own rate."""
-        root = self.observed_root[:, None]
-        sigma = self.bands.noise_at_prior_rate(self.sigma)
-        sigma_root = self.bands.noise_at_prior_rate(torch.tensor(self.sigma_root))
-        return Capture.of_motion(
-            self.shown,
-            seen=self._resample_mask(observed),
-            seen_root=self._resample_mask(root)[:, 0],
-            sigma=sigma,
-            sigma_root=float(sigma_root),
-        )
-
-    def _resample_mask(self, observed: Bool[Tensor, "frames columns"]) -> Bool[Tensor, "shown columns"]:
-        """Resample a mask to the prior's rate: observed where at least half of the frames around it are."""
-        ratio = float(self.inspection.motion.fps) / float(self.shown.fps)
-        side = max(0, round((ratio - 1) / 2))
-        padded = torch.nn.functional.pad(observed.double().T[:, None], (side, side), mode="replicate")
-        share = torch.nn.functional.avg_pool1d(padded, 2 * side + 1, stride=1)[:, 0].T
-        at = (torch.arange(self.shown.num_frames) * ratio).round().long().clamp(max=len(observed) - 1)
-        return share[at] >= 0.5
-
     def _propose(self) -> tuple[Motion, Float[Tensor, "frames 2"]]:
-        """Return the network's motion on the performer's bones, and contact logits."""
+        """Propose the motion on the performer's bones, and contact logits, at the capture's rate.
+
+        The denoiser sees every nth frame of the capture without what is too fast for that, or at low rates its frames
+        with unobserved ones between them, so that no noise is interpolated: whole steps that come nearest to PRIOR_FPS.
+        """
         scale = leg_length(CANONICAL) / leg_length(self.rigmap.skeleton)
-        unit_capture = replace(self.capture, root=self.capture.root * scale, sigma_root=self.capture.sigma_root * scale)
-        cleaned = self.denoiser.clean(unit_capture)
-        quats = rotations.make_sign_continuous(cleaned.pose.local_quat_xyzw[0].double())
-        motion = Motion(self.rigmap.skeleton, self.shown.fps, cleaned.pose.root_position[0].double() / scale, quats)
-        return motion, cleaned.contact_logits[0]
-
-    def _redetect_spikes(self, proposal: Motion) -> Capture:
-        """Detect spikes again in the residual beside the proposal: fast motion mistaken for one is observed again.
-
-        A joint without noise shows its spikes by itself; what its residual has is motion that the proposal misses.
-        """
-        dropouts = ~_map_mask_to_canonical(~self.inspection.lost, self.rigmap)
-        sigma = self.capture.sigma[0].double()
-        spikes = find_residual_spikes(self._compute_residual_rotations(proposal), sigma)
-        spikes &= (sigma > LEAST_NOISE) | ~self.capture.seen[0]
-        root = (self.shown.root_position - proposal.root_position)[:, None]
-        leap = find_residual_spikes(root, self.capture.sigma_root.double())[:, 0]
-        return replace(self.capture, seen=~(dropouts | spikes)[None], seen_root=~(self.hidden_root | leap)[None])
-
-    def _propose_under_lasting_noise(self, proposal: Motion, contacts: Tensor) -> tuple[Motion, Tensor]:
-        """Propose anew where the residual shows noise that lasts, which is told from then on."""
-        if self.settings.sigma_deg is not None:
-            return proposal, contacts
-        before, given = self.capture, (proposal, contacts)
-        self.capture = self._estimate_at_prior_rate(before)
-        if self.capture is not before:
-            proposal, contacts = self._propose()
-        for _ in range(_LASTING_ROUNDS):
-            capture, rest = self.capture, self._compute_residual_rotations(proposal)
-            found = find_lasting_noise(rest, capture.seen[0], capture.sigma[0].double(), again=self.lasting is not None)
-            if found is None:
-                break
-            self.lasting, factor = found, found.factor.to(capture.sigma)
-            usual = factor.median() if self.settings.sigma_cm is None else 1.0
-            self.capture = replace(capture, sigma=factor * capture.sigma, sigma_root=usual * capture.sigma_root)
-            proposal, contacts = self._propose()
-        if self.lasting is None:
-            self.capture = before
-            return given
-        return proposal, contacts
-
-    def _estimate_at_prior_rate(self, capture: Capture) -> Capture:
-        """Return the capture with the noise estimated at the prior's rate where that is more; itself where nothing is.
-
-        At a higher rate noise that was filtered leaves nothing from frame to frame; at the prior's it leaves a little,
-        which the network has to be told before the rest shows in a residual.
-        """
-        if self.bands.exact:
-            return capture
-        sigma = estimate_angle_noise(self.shown.local_quat_xyzw, capture.seen[0])[None].to(capture.sigma)
-        if bool((sigma <= capture.sigma).all()):
-            return capture
-        root = capture.sigma_root
-        if self.settings.sigma_cm is None:
-            root = root.clamp(min=estimate_position_noise(self.shown.root_position, capture.seen_root[0]))
-        return replace(capture, sigma=torch.maximum(capture.sigma, sigma), sigma_root=root)
-
-    def _restore_residual(self, proposal: Motion) -> tuple[Motion, Float[Tensor, "frames joints"]]:
-        """Return the proposal with its residual motion restored, and the restored share by frame and joint."""
-        capture, correlation = self.capture, WHITE if self.lasting is None else self.lasting.correlation
-        angles, share = restore_residual_motion(
-            self._compute_residual_rotations(proposal), capture.seen[0], capture.sigma[0].double(), correlation
+        step, between = max(1, round(self.fps / PRIOR_FPS)), max(1, round(PRIOR_FPS / self.fps))
+        quats, root = self.canonical.local_quat_xyzw, self.canonical.root_position
+        seen, seen_root, kept = self.seen, self.seen_root, 1.0
+        if step > 1:
+            hertz = _LOW_PASS * self.fps / step
+            quats = smooth_columns(quats, seen.double(), hertz, self.fps)
+            quats = torch.nn.functional.normalize(quats, dim=-1)
+            root = smooth_columns(root[:, None], seen_root.double()[:, None], hertz, self.fps)[:, 0]
+            kept = measure_kept_noise(hertz, self.fps)
+        last = self.canonical.num_frames - 1
+        frames = torch.arange(0, last + step, step).repeat_interleave(between).clamp(max=last)
+        observed = (torch.arange(len(frames)) % between == 0)[:, None]
+        thin = Motion(self.canonical.skeleton, Fraction(PRIOR_FPS), scale * root[frames], quats[frames])
+        capture = Capture.of_motion(
+            thin,
+            seen=seen[frames] & observed,
+            seen_root=seen_root[frames] & observed[:, 0],
+            sigma=kept**0.5 * self.sigma,
+            sigma_root=kept**0.5 * scale * self.sigma_root,
         )
-        offset = (self.shown.root_position - proposal.root_position)[:, None]
-        root, _ = restore_residual_motion(
-            offset, capture.seen_root[0][:, None], capture.sigma_root.double(), correlation
+        cleaned = self.denoiser.clean(capture)
+        seconds = torch.arange(len(frames), dtype=torch.float64) * step / between / self.fps
+
+        def follow(values: Tensor) -> Tensor:
+            if step == 1:
+                return values[::between]
+            return upsample(values, seconds, fps=self.fps, frames=last + 1)
+
+        quats = follow(rotations.make_sign_continuous(cleaned.pose.local_quat_xyzw[0].double()))
+        quats = torch.nn.functional.normalize(quats, dim=-1)
+        root = follow(cleaned.pose.root_position[0].double()) / scale
+        return Motion(self.rigmap.skeleton, self.canonical.fps, root, quats), follow(cleaned.contact_logits[0])
+
+    def _fuse(self, proposal: Motion) -> tuple[Motion, Float[Tensor, "frames joints"], Float[Tensor, "frames joints"]]:
+        """Fuse the proposal with the capture; also the share of the proposal, and the error, radians, that remains."""
+        turned = fuse_rotations(
+            proposal.local_quat_xyzw, self.canonical.local_quat_xyzw, self.seen, self.sigma, self.fps
         )
-        quats = rotations.multiply(proposal.local_quat_xyzw, rotations.from_rotation_vector(angles))
-        restored = replace(proposal, root_position=proposal.root_position + root[:, 0], local_quat_xyzw=quats)
-        return restored, share
+        moved = fuse_positions(
+            proposal.root_position, self.canonical.root_position, self.seen_root, self.sigma_root, self.fps
+        )
+        quats = rotations.make_sign_continuous(turned.values)
+        fused = replace(proposal, root_position=moved.values[:, 0], local_quat_xyzw=quats)
+        return fused, turned.share, turned.error
 
-    def _compute_residual_rotations(self, proposal: Motion) -> Float[Tensor, "frames joints 3"]:
-        """Compute the rotation vectors from the proposal to the capture, radians."""
-        residual = rotations.multiply(rotations.inverse(proposal.local_quat_xyzw), self.shown.local_quat_xyzw)
-        return rotations.to_rotation_vector(residual)
-
-
-def _match_quaternion_signs(motion: Motion, other: Motion) -> Motion:
-    """Give quaternions the signs of another motion's, so that unobserved frames flip no sign after them."""
-    dots = (motion.local_quat_xyzw * other.local_quat_xyzw).sum(dim=-1, keepdim=True)
-    return replace(motion, local_quat_xyzw=torch.where(dots < 0, -1.0, 1.0) * motion.local_quat_xyzw)
+    def _change(self, fused: Motion, shown: Motion, refined: Motion) -> Motion:
+        """Change a motion at the capture's rate as the MAP stage changed it at PRIOR_FPS."""
+        turned = rotations.multiply(rotations.inverse(shown.local_quat_xyzw), refined.local_quat_xyzw)
+        seconds = torch.arange(shown.num_frames, dtype=torch.float64) / PRIOR_FPS
+        angles, moved = (
+            upsample(change, seconds, fps=self.fps, frames=fused.num_frames)
+            for change in (rotations.to_rotation_vector(turned), refined.root_position - shown.root_position)
+        )
+        quats = rotations.multiply(fused.local_quat_xyzw, rotations.from_rotation_vector(angles))
+        return replace(fused, root_position=fused.root_position + moved, local_quat_xyzw=quats)
 
 
 def _smooth_noncanonical_joints(inspection: Inspection, rig: Rig | None) -> Motion:
@@ -314,7 +228,8 @@ def _smooth_noncanonical_joints(inspection: Inspection, rig: Rig | None) -> Moti
     if not others:
         return motion
     quats = motion.local_quat_xyzw.clone()
-    quats[:, others] = smooth_rotations(quats[:, others], inspection.noise[others])
+    sigma, seen = inspection.noise[others], inspection.seen[:, others]
+    quats[:, others] = fuse_rotations(None, quats[:, others], seen, sigma, float(motion.fps)).values
     return replace(motion, local_quat_xyzw=quats)
 
 

@@ -1,0 +1,213 @@
+"""Fusion of a capture and a model's proposal: as near to the capture as its noise allows, as near to the proposal as
+the capture bears it out.
+
+The residual between capture and proposal is noise of known power and the proposal's error. Candidates for the true
+motion are the proposal itself, the proposal with its residual smoothed (where it is wrong slowly), and the capture
+alone, smoothed (where it knows nothing). Stein's unbiased estimate of the risk (Stein 1981) weighs them, joint by joint
+and moment by moment, without any knowledge of the truth. The smoother minimises the squared distance to what was
+observed and squared third differences (Whittaker 1923; Eilers 2003): for a stationary signal a Butterworth filter of
+third order run forwards and backwards, but with ends and gaps of its own.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from scipy.linalg import solveh_banded
+from torch import Tensor
+
+from mapctl import rotations
+from mapctl.numerics import gaussian
+from mapctl.recording.quaternion_signs import choose_continuous_signs
+
+_ORDER = 3  # of the differences that the smoother penalises
+_HERTZ = (0.7, 1.0, 1.5, 2.0, 3.0, 4.5, 6.5, 10.0)  # half-power frequencies of the smoothers
+_RISK_SECONDS = (1.33, 0.25)  # sigma, over which the risk is averaged: of a style first, then of a kick
+_CAUTION = 1.5  # standard errors of a risk, which is itself an estimate, that a candidate beside the proposal must gain
+_SELECTION = 1.0  # of the noise that such a candidate keeps, counted once more, since it is the best of many
+_TEMPERATURE = 0.06  # of the noise's power: candidates that are as good as equal are averaged
+_LEAST_WEIGHT = 1e-9  # of an unobserved frame, so that the system of a column without any has a solution
+
+
+@dataclass(frozen=True, eq=False)
+class Fused:
+    """Estimate of the true motion of some columns: joints' rotations, or positions."""
+
+    values: Float[Tensor, "frames columns width"]
+    """Quaternions (xyzw), or positions in metres."""
+    share: Float[Tensor, "frames columns"]
+    """Weight of the proposal itself: 1 where the capture bears it out, 0 where the capture corrects or replaces it."""
+    error: Float[Tensor, "frames columns"]
+    """Estimated error: standard deviation of each of the three numbers, radians or metres."""
+
+
+def fuse_rotations(
+    proposal: Float[Tensor, "frames joints 4"] | None,
+    capture: Float[Tensor, "frames joints 4"],
+    seen: Bool[Tensor, "frames joints"],
+    sigma: Float[Tensor, " joints"],
+    fps: float,
+) -> Fused:
+    """Estimate rotations (xyzw) from a capture with noise `sigma` of each angle, radians, and a proposal at its rate,
+    if there is one. Joints without noise keep what was observed."""
+    capture = choose_continuous_signs(capture)
+    weights = seen.double()
+    smooth = [_normalise(smooth_columns(capture, weights, hertz, fps)) for hertz in _list_cutoffs(fps)]
+    about = smooth[0] if proposal is None else proposal
+    held, share, error = proposal is not None, None, None
+    for seconds in _RISK_SECONDS:
+        residual = _relative_vector(about, capture)
+        alone = [_relative_vector(about, each) for each in smooth]
+        vector, trust, error = _estimate(residual, alone, weights, sigma, fps, seconds, holds_proposal=held)
+        about = rotations.multiply(about, rotations.from_rotation_vector(vector))
+        held, share = True, trust if share is None else share * trust
+    return Fused(about, share, error)
+
+
+def fuse_positions(
+    proposal: Float[Tensor, "frames 3"] | None,
+    capture: Float[Tensor, "frames 3"],
+    seen: Bool[Tensor, " frames"],
+    sigma: float,
+    fps: float,
+) -> Fused:
+    """Estimate positions, metres, from a capture with noise `sigma` of each coordinate, and a proposal, if there is
+    one."""
+    weights = seen.double()[:, None]
+    smooth = [smooth_columns(capture[:, None], weights, hertz, fps) for hertz in _list_cutoffs(fps)]
+    about = smooth[0] if proposal is None else proposal[:, None]
+    level = torch.tensor([sigma], dtype=torch.float64)
+    held, share, error = proposal is not None, None, None
+    for seconds in _RISK_SECONDS:
+        residual, alone = capture[:, None] - about, [each - about for each in smooth]
+        vector, trust, error = _estimate(residual, alone, weights, level, fps, seconds, holds_proposal=held)
+        about = about + vector
+        held, share = True, trust if share is None else share * trust
+    return Fused(about, share, error)
+
+
+def smooth_columns(
+    values: Float[Tensor, "frames columns width"], weights: Float[Tensor, "frames columns"], hertz: float, fps: float
+) -> Float[Tensor, "frames columns width"]:
+    """Smooth columns of numbers with a half-power frequency; frames of weight 0 are filled in."""
+    frames = len(values)
+    if frames <= _ORDER:
+        return values
+    stiffness = (2 * math.sin(math.pi * hertz / fps)) ** (-2 * _ORDER) * _difference_bands(frames)
+    out, columns = np.empty(values.shape), weights.numpy()
+    for column, given in enumerate(values.double().numpy().swapaxes(0, 1)):
+        weight = columns[:, column]
+        system = stiffness.copy()
+        system[-1] += np.maximum(weight, _LEAST_WEIGHT)
+        out[:, column] = solveh_banded(system, weight[:, None] * given)
+    return torch.from_numpy(out)
+
+
+def measure_kept_noise(hertz: float, fps: float) -> float:
+    """Measure the share of white noise's power that a smoother leaves, far from the ends: the mean square of its
+    response."""
+    turn = torch.linspace(0, math.pi, 2001, dtype=torch.float64)
+    response = 1 / (1 + (torch.sin(turn / 2) / math.sin(math.pi * hertz / fps)) ** (2 * _ORDER))
+    return float(response.square().mean())
+
+
+def _estimate(
+    residual: Float[Tensor, "frames columns 3"],
+    alone: list[Float[Tensor, "frames columns 3"]],
+    weights: Float[Tensor, "frames columns"],
+    sigma: Float[Tensor, " columns"],
+    fps: float,
+    seconds: float,
+    *,
+    holds_proposal: bool,
+) -> tuple[Float[Tensor, "frames columns 3"], Float[Tensor, "frames columns"], Float[Tensor, "frames columns"]]:
+    """Estimate the truth beside the proposal; also the weight of the proposal itself, and the estimated error.
+
+    `residual` is the capture beside the proposal, `alone` the smoothed capture beside it; risks are averaged over
+    `seconds` (sigma).
+    """
+    power = (3 * sigma.square()).clamp_min(1e-12)
+    ones = torch.ones_like(weights)
+    near = _average(weights, ones, fps, seconds).clamp_min(_LEAST_WEIGHT)
+    # The last is the capture itself: what no smoother can follow, as a kick, is no noise.
+    candidates, owns = [residual], [ones]
+    for hertz, smooth in zip(_list_cutoffs(fps), alone, strict=True):
+        own = _weigh_own(len(residual), hertz, fps)[:, None] / _average_within(weights, hertz, fps)
+        back = [smooth_columns(residual * weights[..., None], weights, hertz, fps)] if holds_proposal else []
+        candidates, owns = [*back, smooth, *candidates], [*[own] * len(back), own, *owns]
+    changes = [(candidate - residual).square().sum(dim=-1) * weights for candidate in candidates]
+    frames = min(len(residual), 2 * math.sqrt(math.pi) * seconds * fps)
+    doubt = _CAUTION * math.sqrt(2 / (3 * frames))
+    costs = [(2 + _SELECTION * holds_proposal) * own - 1 + doubt * holds_proposal for own in owns]
+    if holds_proposal:
+        candidates = [torch.zeros_like(residual), *candidates]
+        changes, costs = [residual.square().sum(dim=-1) * weights, *changes], [-ones, *costs]
+    risks = torch.stack(
+        [_average(change, near, fps, seconds) / power + cost for change, cost in zip(changes, costs, strict=True)]
+    )
+    share = torch.softmax(-risks / _TEMPERATURE, dim=0)
+    vector = (share[..., None] * torch.stack(candidates)).sum(dim=0)
+    error = sigma * (share * risks).sum(dim=0).clamp(0.0, 1.0).sqrt()
+    # Without noise the capture is the truth where it was observed.
+    exact = (sigma == 0) & (weights > 0)
+    held = share[0] * (holds_proposal & ~exact)
+    return torch.where(exact[..., None], residual, vector), held, error
+
+
+def _list_cutoffs(fps: float) -> list[float]:
+    """List the half-power frequencies that a rate can hold, Hz."""
+    return [hertz for hertz in _HERTZ if hertz < 0.45 * fps]
+
+
+def _average(
+    values: Float[Tensor, "frames columns"], weight: Float[Tensor, "frames columns"], fps: float, seconds: float
+) -> Float[Tensor, "frames columns"]:
+    """Average values over so many seconds (sigma), over an average weight."""
+    taps = gaussian.gaussian_kernel(seconds, fps)
+    ones = gaussian.convolve(torch.ones_like(values), taps, "nothing")
+    return gaussian.convolve(values, taps, "nothing") / ones / weight
+
+
+def _average_within(weights: Float[Tensor, "frames columns"], hertz: float, fps: float) -> Tensor:
+    """Average the weights of the frames that a smoother sees: in a gap it knows little."""
+    taps = gaussian.gaussian_kernel(1 / (2 * math.pi * hertz), fps)
+    ones = gaussian.convolve(torch.ones_like(weights), taps, "nothing")
+    return (gaussian.convolve(weights, taps, "nothing") / ones).clamp_min(1e-3)
+
+
+@lru_cache(maxsize=8)
+def _difference_bands(frames: int) -> Float[np.ndarray, "bands frames"]:
+    """Return the upper bands of the quadratic form of summed squared differences of `_ORDER`."""
+    signs = [math.comb(_ORDER, index) * (-1) ** index for index in range(_ORDER + 1)]
+    bands = np.zeros((_ORDER + 1, frames))
+    for one in range(_ORDER + 1):
+        for other in range(one + 1):
+            bands[_ORDER - (one - other), one : frames - _ORDER + one] += signs[one] * signs[other]
+    return bands
+
+
+@lru_cache(maxsize=64)
+def _weigh_own(frames: int, hertz: float, fps: float) -> Float[Tensor, " frames"]:
+    """Return how much a frame counts in its own smoothed value, which is most at the ends: the diagonal of the
+    smoother's matrix, whose middle is the same in all long captures."""
+    side = min(frames, math.ceil(3 * fps / hertz))
+    every = torch.eye(side, dtype=torch.float64)[:, None]
+    diagonal = smooth_columns(every, torch.ones(side, 1, dtype=torch.float64), hertz, fps)[:, 0].diagonal()
+    if side == frames:
+        return diagonal
+    half = side // 2
+    own = diagonal[half].repeat(frames)
+    own[:half], own[frames - half :] = diagonal[:half], diagonal[side - half :]
+    return own
+
+
+def _relative_vector(start: Tensor, stop: Tensor) -> Float[Tensor, "frames columns 3"]:
+    """Return rotation vectors from one to the other, in the first's frame, radians."""
+    return rotations.to_rotation_vector(rotations.multiply(rotations.inverse(start), stop))
+
+
+def _normalise(quats: Float[Tensor, "frames joints 4"]) -> Float[Tensor, "frames joints 4"]:
+    return torch.nn.functional.normalize(quats, dim=-1)
