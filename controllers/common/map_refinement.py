@@ -16,6 +16,7 @@ from torch import Tensor
 
 from mapctl import rotations
 from mapctl.contacts import debounced
+from mapctl.contacts.supports import compute_rest_log_probability, fit_supports
 from mapctl.features import LAYOUT, GroundPose
 from mapctl.inbetweening.effector_targets import EffectorTargets
 from mapctl.motion import Motion
@@ -35,7 +36,6 @@ from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings
 from mapctl.terms import Clearance, FootContact, Jerk, Keyframe, LatentPrior, Term
 
-_LEVEL_FLOOR = 0.04  # metres from the rest height within which nine of ten toes rest on a level floor
 _DRIFT_SIGMA_FRAMES = 3.0  # frames, sigma, over which the motion of planted toes is averaged
 
 
@@ -44,8 +44,8 @@ class RefinementSettings:
     """Sigmas and search of MAP refinement."""
 
     footing: FootContact = field(default_factory=lambda: FootContact(0.1, 0.03, 0.02, heels=None))
-    """Contact term; its rest height becomes the performer's own. Loose, since mocap's planted toes move by 6 cm/s, and
-    not every floor is level."""
+    """Contact term; toes rest on the supports that the contacts show. Loose, since mocap's planted toes move by 6
+    cm/s."""
     jerk: Jerk | None = None
     """Jerk term, over as many frames of each window as it says; None leaves it out."""
     clearance: Clearance | None = None
@@ -85,6 +85,8 @@ class RefinedMotion:
     """Motion at the prior's rate."""
     contacts: Bool[Tensor, "frames 2"]
     """Contacts of the left and the right toe."""
+    supports: Float[Tensor, "frames 2"]
+    """Height at which each toe rests, metres, before the refinement (see `fit_supports`)."""
     ledger: Ledger
     """Energy and residual by term and frame."""
     windows: tuple[WindowRecord, ...]
@@ -113,17 +115,18 @@ def refine(
     first_frame: int = 0,
     trust: Float[Tensor, "frames joints"] | None = None,
 ) -> RefinedMotion:
-    """Refine a proposal with these contact logits; `capture` holds the observation mask and the noise. `targets` are
+    """Refine a proposal with these contact logits, which count as far as the toes rest (see
+    `compute_rest_log_probability`); `capture` holds the observation mask and the noise. `targets` are
     positions that joints are to reach, `terms` join the others in every window and see the first frame of the proposal
     as `first_frame` of the whole motion. `trust` multiplies the sigmas of what was not observed, by joint: where the
     proposal is surer than usual it is below 1.
 
     In each window the density counts under which the proposal is likeliest, and less where it is out of its depth.
     """
-    planted = debounced(contacts > 0)
     pose = BodyPose.of_motion(proposal)
     start = _extrapolate_backward(pose)
-    sigma = _compute_proposal_sigma(capture, settings, trust)
+    root, angle = _compute_proposal_sigma(capture, settings, trust)
+    planted, supports = _find_contacts(proposal, contacts, root, angle, settings.smooth)
     ensemble = DensityEnsemble(
         [density.with_observation_noise(density_selection.proposal_sigma()) for density in densities]
     )
@@ -132,7 +135,14 @@ def refine(
         HorizonSettings(settings.frames, settings.ahead, settings.past, beyond_end=False),
         proposal.skeleton,
         method=PoseOffsetSolver(
-            pose, planted, sigma, settings.smooth, settings.temperature, settings.lbfgs, settings.budget, first_frame
+            pose,
+            planted,
+            _pack_sigma(root, angle),
+            settings.smooth,
+            settings.temperature,
+            settings.lbfgs,
+            settings.budget,
+            first_frame,
         ),
     )
     # The densities begin in states that make the first window's proposal likely.
@@ -140,25 +150,30 @@ def refine(
     states = ensemble.infer_state(pose.slice(0, first.stop).features(start, planted[first]))
     before = torch.zeros(0, proposal.num_joints, 3)
     done = CommittedFrames(states, start, torch.zeros(0, LAYOUT.size), before, discarded=first_frame)
-    terms_of = _lay_terms(_fit_to_floor(settings, proposal, planted, capture), capture, targets, terms)
+    terms_of = _lay_terms(settings, supports, capture, targets, terms)
     done, outcome = solver.solve(done, terms_of, proposal.num_frames, generator=torch.Generator())
     if outcome is Outcome.INTERRUPTED:
         raise KeyboardInterrupt
     motion = decode(done.features, start, skeleton=proposal.skeleton)
-    return RefinedMotion(motion, planted, done.ledger, done.windows)
+    return RefinedMotion(motion, planted, supports, done.ledger, done.windows)
 
 
 def _lay_terms(
-    settings: RefinementSettings, capture: Capture, targets: EffectorTargets | None, caller_terms: Sequence[Term]
+    settings: RefinementSettings,
+    supports: Float[Tensor, "frames 2"],
+    capture: Capture,
+    targets: EffectorTargets | None,
+    caller_terms: Sequence[Term],
 ) -> TermsOf:
     """Lay the terms of each window."""
     clearing = _ramp_from_observed(_find_observed_toes(capture), settings.clearance_ramp)
 
     def terms_of(first: int, frames: int) -> list[Term]:
         part = slice(first, first + frames)
-        terms: list[Term] = [LatentPrior(1.0), settings.footing, *caller_terms]
+        footing = replace(settings.footing, supports=supports[part])
+        terms: list[Term] = [LatentPrior(1.0), footing, *caller_terms]
         if settings.clearance is not None:
-            terms.append(replace(settings.clearance, share=clearing[part]))
+            terms.append(replace(settings.clearance, rest_height=supports[part], share=clearing[part]))
         if settings.jerk is not None:
             terms.append(settings.jerk)
         if targets is not None:
@@ -195,41 +210,41 @@ def anchor_to_contacts(motion: Motion, contacts: Bool[Tensor, "frames 2"]) -> Mo
     return replace(motion, root_position=motion.root_position - offset)
 
 
-def estimate_rest_height(motion: Motion, contacts: Bool[Tensor, "frames 2"]) -> float:
-    """Estimate the height of the performer's planted toes, metres; of low ones where none is planted."""
-    toes = motion.skeleton.indices(TOES)
-    heights = motion.joint_positions()[:, toes, 1]
-    planted = heights[contacts]
-    return float(planted.median() if len(planted) else heights.quantile(0.05))
+def estimate_rest_height(motion: Motion, contacts: Bool[Tensor, "frames 2"]) -> Float[Tensor, "frames 2"]:
+    """Estimate the height at which each toe of a canonical motion rests in each frame, metres."""
+    return fit_supports(motion.joint_positions()[:, motion.skeleton.indices(TOES)], contacts)
 
 
-def _fit_to_floor(
-    settings: RefinementSettings, proposal: Motion, planted: Bool[Tensor, "frames 2"], capture: Capture
-) -> RefinementSettings:
-    """Fit contacts and clearance to the performer's rest height, and to a floor that observed toes show not to be
-    level: heights count for less there, or who climbs would be lifted off the lower step.
-    """
-    rest_height = estimate_rest_height(proposal, planted)
-    toes = proposal.joint_positions()[:, proposal.skeleton.indices(TOES), 1]
-    observed = _find_observed_toes(capture)
-    away = torch.cat([(toes - rest_height).abs()[planted & observed], (rest_height - toes).clamp_min(0)[observed]])
-    uneven = max(0.0, float(away.quantile(0.9)) - _LEVEL_FLOOR) if len(away) else 0.0
-    footing, clearance = settings.footing, settings.clearance
-    footing = replace(
-        footing,
-        rest_height=rest_height,
-        sigma_height=math.hypot(footing.sigma_height, uneven),
-        sigma_below=math.hypot(footing.sigma_below, uneven),
-    )
-    if clearance is not None:
-        clearance = replace(clearance, rest_height=rest_height, sigma=math.hypot(clearance.sigma, uneven))
-    return replace(settings, footing=footing, clearance=clearance)
+def _find_contacts(
+    proposal: Motion,
+    logits: Float[Tensor, "frames 2"],
+    root: Float[Tensor, "frames 1"],
+    angle: Float[Tensor, "frames joints"],
+    smooth: float,
+) -> tuple[Bool[Tensor, "frames 2"], Float[Tensor, "frames 2"]]:
+    """Find contacts, likely by the logits and by the toes' rest both, and supports, metres. Errors of the proposal are
+    normal with these sigmas of root and angles, and smooth over so many frames."""
+    positions = proposal.joint_positions()
+    toes, noise = positions[:, proposal.skeleton.indices(TOES)], []
+    for joint in proposal.skeleton.indices(TOES):
+        variance, above = root.square().expand(-1, 3), proposal.skeleton.parents[joint]
+        while above >= 0:
+            lever = (positions[:, joint] - positions[:, above]).square()
+            variance = variance + angle[:, above, None].square() * (lever.sum(dim=-1, keepdim=True) - lever)
+            above = proposal.skeleton.parents[above]
+        noise.append(variance)
+    variance = torch.stack(noise, dim=1)
+    # The derivative of errors with the correlation exp(-t^2 / 4 smooth^2).
+    speed_noise = variance.mean(dim=-1).sqrt() * float(proposal.fps) / (math.sqrt(2) * smooth)
+    resting = compute_rest_log_probability(toes, positions[:, 0], float(proposal.fps), speed_noise)
+    planted = debounced(torch.nn.functional.logsigmoid(logits) + resting > math.log(0.5))
+    return planted, fit_supports(toes, planted, variance[..., 1].sqrt())
 
 
 def _compute_proposal_sigma(
     capture: Capture, settings: RefinementSettings, trust: Float[Tensor, "frames joints"] | None
-) -> Float[Tensor, "frames width"]:
-    """Compute the sigmas of root, heading and angles by frame (see `BodyPose.pack`)."""
+) -> tuple[Float[Tensor, "frames 1"], Float[Tensor, "frames joints"]]:
+    """Compute the sigmas of the root's coordinates, metres, and of joints' angles, radians, by frame."""
     ramp, ramp_root = (
         _ramp_from_observed(observed, settings.uncertainty_ramp)
         for observed in (capture.seen[0], capture.seen_root[0][:, None])
@@ -239,10 +254,15 @@ def _compute_proposal_sigma(
     angle = torch.where(capture.seen[0], settings.share * capture.sigma[0], unobserved).clamp_min(1e-4)
     unobserved_root = settings.unobserved_sigma_cm / 100 * ramp_root[:, 0] * factor[:, 0]
     root = torch.where(capture.seen_root[0], settings.share * capture.sigma_root[0], unobserved_root)
-    hips = angle[:, :1]
     # Feet are planted even in a capture without noise, if only by half a millimetre.
-    root = root.clamp_min(5e-4)[:, None]
-    return torch.cat([root.expand(-1, 3), hips.expand(-1, 3), angle[:, 1:].repeat_interleave(3, dim=-1)], dim=-1)
+    return root.clamp_min(5e-4)[:, None], angle
+
+
+def _pack_sigma(
+    root: Float[Tensor, "frames 1"], angle: Float[Tensor, "frames joints"]
+) -> Float[Tensor, "frames width"]:
+    """Lay the sigmas out as `BodyPose.pack` does."""
+    return torch.cat([root.expand(-1, 3), angle.repeat_interleave(3, dim=-1)], dim=-1)
 
 
 def _find_observed_toes(capture: Capture) -> Bool[Tensor, "frames 2"]:

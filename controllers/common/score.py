@@ -44,8 +44,8 @@ def score(
     state = replay(blurred, features[:_PRECEDING_FRAMES], blurred.infer_state(features))
     with torch.no_grad():
         log_density = blurred.log_prob(shown, state)
-    height = estimate_rest_height(canonical, bits)
-    terms: list[Term] = [Likelihood(settings.temperature), replace(settings.footing, rest_height=height)]
+    height = estimate_rest_height(canonical, bits)[_PRECEDING_FRAMES:]
+    terms: list[Term] = [Likelihood(settings.temperature), replace(settings.footing, supports=height)]
     terms.append(replace(settings.clearance or Clearance(), rest_height=height))
     terms.append(Support(rest_height=height))
     terms.append(settings.jerk or Jerk(sigma=50.0, frames=len(features)))

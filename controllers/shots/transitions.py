@@ -93,8 +93,8 @@ def compute_artefact_cost(motion: Motion, planted: Bool[Tensor, "frames 2"], gap
     start, stop = gap[0] - 1, gap[1] + 1
     positions, fps = motion.joint_positions()[start:stop], float(motion.fps)
     toes, hips = positions[:, _TOES], positions[:, 0]
-    height = estimate_rest_height(motion, contacts.debounced(planted))
-    above, speeds = toes[1:, :, 1] - height, torch.diff(toes[..., ::2], dim=0).norm(dim=-1) * fps
+    height = estimate_rest_height(motion, contacts.debounced(planted))[start:stop]
+    above, speeds = (toes[..., 1] - height)[1:], torch.diff(toes[..., ::2], dim=0).norm(dim=-1) * fps
     slide = float(contacts.support_speed(above, speeds).mean())
     skate = float((speeds * (1 - above / _SKATE_HEIGHT).clamp(0, 1)).mean())
     ground = hips[:, ::2]

@@ -12,7 +12,7 @@ from mapctl.numerics.intervals import true_intervals
 NOISE_DEG, NOISE_CM = 0.5, 0.2
 """Least noise that is listed, degrees and centimetres: optical capture has as much."""
 _SKATE_SPEED = 0.2  # m/s that a planted toe moves by, over some frames, before it is said to slide
-_FLOAT_HEIGHT = 0.03  # metres that it is above its rest height
+_FLOAT_HEIGHT = 0.03  # metres that it is above its support
 _MIN_FRAMES = 3  # frames of either
 
 
@@ -70,21 +70,22 @@ def list_foot_artefacts(
     toes: Float[Tensor, "frames 2 3"],
     planted: Bool[Tensor, "frames 2"],
     *,
-    rest_height: float,
+    rest_height: Float[Tensor, "frames 2"],
     fps: float,
 ) -> list[Artefact]:
-    """List planted toes that slide, and planted toes in the air; world positions, metres, at any rate."""
+    """List planted toes that slide, and planted toes over the height that they rest at; world positions, metres, at any
+    rate."""
     steps = torch.diff(toes[..., ::2], dim=0, prepend=toes[:1, :, ::2]).norm(dim=-1)
     slides = planted & (steps * fps > _SKATE_SPEED)
-    floats = planted & (toes[..., 1] > rest_height + _FLOAT_HEIGHT)
+    height = toes[..., 1] - rest_height
+    floats = planted & (height > _FLOAT_HEIGHT)
     found = [
         Artefact(names[foot], start, stop, "slide", 100 * float(steps[start:stop, foot].sum()), "cm")
         for foot, start, stop in true_intervals(slides)
         if stop - start >= _MIN_FRAMES
     ]
-    height = 100 * (toes[..., 1] - rest_height)
     return found + [
-        Artefact(names[foot], start, stop, "float", float(height[start:stop, foot].max()), "cm")
+        Artefact(names[foot], start, stop, "float", 100 * float(height[start:stop, foot].max()), "cm")
         for foot, start, stop in true_intervals(floats)
         if stop - start >= _MIN_FRAMES
     ]

@@ -21,8 +21,8 @@ class Clearance:
     """Speed over the ground from which all of `height` is wanted, m/s; below, in proportion."""
     sigma: float = 0.015
     """Standard deviation of the height that is lacking, metres."""
-    rest_height: float = TOE_REST_HEIGHT
-    """Height of the toe joint while the foot is flat on the ground, metres."""
+    rest_height: float | Float[Tensor, "frames 2"] = TOE_REST_HEIGHT
+    """Height of the toe joint while the foot is flat on the ground, metres; of each toe's in each frame, if not one."""
     share: Float[Tensor, "frames 2"] | None = None
     """Share of the height that each toe is to clear in each frame of the window, 0 to 1; None: all of it."""
     name: str = "clearance"

@@ -63,6 +63,8 @@ class FootContact:
     """Sigmas of the toes' acceleration; None leaves it free, as for motion that was captured."""
     rest_height: float = TOE_REST_HEIGHT
     """Height of the toe joint while the foot is flat on the ground, metres."""
+    supports: Float[Tensor, "frames 2"] | None = None
+    """Height at which each toe rests in each frame of the window, metres; None: `rest_height`."""
     name: str = "footing"
     """Name in the ledger."""
     unit: str = "m/s"
@@ -81,7 +83,7 @@ class FootContact:
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Return the energies of both feet, nats."""
-        above = trial.toe_heights - self.rest_height
+        above = trial.toe_heights - self._rest_heights
         held = _hold(trial.planted, trial.toe_speeds / self.sigma_speed, above / self.sigma_height)
         energy = (held + 0.5 * (above.clamp(max=0) / self.sigma_below).square()).sum(-1)
         if self.landing is not None:
@@ -90,7 +92,7 @@ class FootContact:
         if self.heels is None:
             return energy
         drops = trial.features.new_tensor(find_heel_drops(trial.skeleton))
-        above = trial.heels_world[..., 1] - (self.rest_height - drops)
+        above = trial.heels_world[..., 1] - (self._rest_heights - drops)
         held = _hold(trial.heels_planted, trial.heel_speeds / self.heels.speed, above / self.heels.height)
         held = self.heels.doubt * torch.log1p(held / self.heels.doubt)
         return energy + (held + 0.5 * (above.clamp(max=0) / self.heels.below).square()).sum(-1)
@@ -98,6 +100,8 @@ class FootContact:
     def add_gradient(self, trial: Trial, gradient: TrialGradient) -> Float[np.ndarray, "batch frames"]:
         """Add the gradient of the summed energies of a float32 trial, and return the energies, nats."""
         energy = np.zeros(gradient.log_density.shape)
+        resting = np.empty((trial.features.shape[1], 2))
+        resting[:] = self._rest_heights
         kernels.add_contact(
             trial.joints_world.numpy(),
             trial.last_before.numpy(),
@@ -105,7 +109,7 @@ class FootContact:
             trial.toes,
             float(trial.fps),
             (self.sigma_speed, self.sigma_height, self.sigma_below),
-            (self.rest_height, self.rest_height),
+            resting,
             0.0,
             energy,
             gradient.joints_world,
@@ -121,7 +125,6 @@ class FootContact:
                 gradient.joints_world,
             )
         if self.heels is not None:
-            left, right = find_heel_drops(trial.skeleton)
             kernels.add_contact(
                 trial.heels_world.numpy(),
                 trial.heels_before[-1:].to(trial.features.dtype).numpy(),
@@ -129,12 +132,16 @@ class FootContact:
                 (0, 1),
                 float(trial.fps),
                 (self.heels.speed, self.heels.height, self.heels.below),
-                (self.rest_height - left, self.rest_height - right),
+                resting - find_heel_drops(trial.skeleton),
                 float(self.heels.doubt),
                 energy,
                 gradient.heels_world,
             )
         return energy
+
+    @property
+    def _rest_heights(self) -> float | Float[Tensor, "frames 2"]:
+        return self.rest_height if self.supports is None else self.supports
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Return the horizontal speed of the fastest planted toe or heel, m/s; 0 where none is planted."""

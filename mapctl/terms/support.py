@@ -13,14 +13,14 @@ from mapctl.skeleton import TOE_REST_HEIGHT
 from mapctl.terms.trial import Trial
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Support:
     """The slowest of the toes near the ground, which supports the body, does not travel; flight costs nothing."""
 
     sigma: float = 0.1
     """Standard deviation of that toe's speed over the ground, m/s; mocap's planted toes move at 0.05."""
-    rest_height: float = TOE_REST_HEIGHT
-    """Height of the toe joint while the foot is flat on the ground, metres."""
+    rest_height: float | Float[Tensor, "frames 2"] = TOE_REST_HEIGHT
+    """Height of the toe joint while the foot is flat on the ground, metres; of each toe's in each frame, if not one."""
     name: str = "support"
     """Name in the ledger."""
     unit: str = "m/s"

@@ -9,7 +9,6 @@ from helpers import random_motion, tiny_density, walk
 from methods import UNFINISHED, by_method
 from tiny_infiller import tiny_infiller
 
-from controllers.common import map_refinement
 from controllers.inbetweening.infill import infill
 from controllers.inbetweening.proposers import SlerpInbetweener
 from mapctl import retarget, rotations
@@ -236,8 +235,8 @@ def test_the_summary_tells_gaps_and_cost():
     assert told["frame_ms"] == pytest.approx(1000 * done.seconds / 13)
 
 
-def test_who_stands_with_a_foot_on_a_step_is_not_lifted_off_the_floor(monkeypatch):
-    motion, moved = walk(60), []
+def test_who_stands_with_a_foot_on_a_step_is_not_lifted_off_the_floor():
+    motion = walk(60)
     quats = motion.local_quat_xyzw[:1].expand(60, -1, -1).clone()
     bend = torch.tensor(1.2, dtype=torch.float64)
     quats[:, CANONICAL.index("leftUpperLeg")] = rotations.from_rotation_vector(torch.stack([-bend, 0 * bend, 0 * bend]))
@@ -245,8 +244,5 @@ def test_who_stands_with_a_foot_on_a_step_is_not_lifted_off_the_floor(monkeypatc
     still = replace(motion, local_quat_xyzw=quats, root_position=motion.root_position[:1].expand(60, -1).clone())
     toes = still.joint_positions()[0, list(TOE_JOINTS), 1]
     assert toes[0] - toes[1] > 0.2
-    for level in (0.04, 9.0):  # a floor that is believed to be level lifts the hips
-        monkeypatch.setattr(map_refinement, "_LEVEL_FLOOR", level)
-        done = infill(still, SlerpInbetweener(), [Mask(ALL, 20, 40)]).motion
-        moved.append(float((done.root_position - still.root_position).norm(dim=-1).max()))
-    assert moved[0] < 0.015 < 0.05 < moved[1]
+    done = infill(still, SlerpInbetweener(), [Mask(ALL, 20, 40)]).motion
+    assert (done.root_position - still.root_position).norm(dim=-1).max() < 0.015

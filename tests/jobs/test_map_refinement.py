@@ -8,7 +8,7 @@ import torch
 from helpers import finite_difference, generator, tiny_density, walk
 
 from controllers.common import map_refinement
-from controllers.common.map_refinement import RefinementSettings, estimate_rest_height, refine
+from controllers.common.map_refinement import RefinementSettings, refine
 from mapctl import rotations
 from mapctl.contacts import debounced
 from mapctl.features import PRIOR_FPS, GroundPose
@@ -21,7 +21,7 @@ from mapctl.problem.density_selection import DensityEnsemble
 from mapctl.problem.objective import Objective
 from mapctl.problem.pose_offsets import PoseOffsets
 from mapctl.recording import Capture
-from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, TOES
+from mapctl.skeleton import CANONICAL, TOES
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings
 from mapctl.terms import Clearance, FootContact, LatentPrior
@@ -226,11 +226,30 @@ def test_long_contacts_stay():
     assert torch.equal(debounced(bits), bits)
 
 
-def test_the_rest_height_is_that_of_planted_toes():
-    motion = walk(90)
-    planted = motion.joint_positions()[:, TOE, 1] < TOE_REST_HEIGHT + 0.01
-    assert estimate_rest_height(motion, planted) == pytest.approx(TOE_REST_HEIGHT, abs=0.01)
-    assert estimate_rest_height(motion, torch.zeros_like(planted)) == pytest.approx(TOE_REST_HEIGHT, abs=0.01)
+def test_a_body_that_lies_stays_however_sure_the_contacts():
+    motion = walk(60)
+    down = rotations.from_rotation_vector(torch.tensor([-math.pi / 2, 0.0, 0.0]).double())
+    quats = motion.local_quat_xyzw.clone()
+    quats[:, 0] = rotations.multiply(down, quats[:, 0])
+    lying = replace(motion, root_position=rotations.rotate(down, motion.root_position), local_quat_xyzw=quats)
+    stood = refine(lying, odds(motion), told(motion), QUICK)
+    assert not stood.contacts.any()
+    assert (stood.motion.joint_positions() - lying.joint_positions()).norm(dim=-1).max() < 0.002
+
+
+def test_feet_stay_on_the_box_that_they_rest_on():
+    """Up in the middle of the take, by 48 cm in half a second: toes are not pulled towards the floor, nor is that."""
+    motion = standing_still(90, drift=0.05)
+    rise = 0.48 * ((torch.arange(90) - 40) / 15).clamp(0, 1).double()
+    motion = replace(motion, root_position=motion.root_position + rise[:, None] * torch.tensor([0.0, 1.0, 0.0]))
+    stood = refine(motion, odds(motion), told(motion), QUICK)
+    assert stood.contacts[:38].all()
+    assert stood.contacts[58:].all()
+    assert not stood.contacts[43:54].any()
+    heights = motion.joint_positions()[:, TOE, 1]
+    apart = (stood.motion.joint_positions()[:, TOE, 1] - heights).abs()
+    assert apart[torch.cat([torch.arange(38), torch.arange(58, 90)])].max() < 0.015
+    assert torch.allclose(stood.supports[-1] - stood.supports[0], torch.tensor(0.48).double(), atol=0.001)
 
 
 def test_toes_that_slide_unseen_are_lifted_and_those_that_were_seen_are_not():

@@ -16,8 +16,8 @@ PROCESSES = {"joblib", "joblib.Parallel", "joblib.delayed"}  # of an unpickler, 
 MAX_LINES = 400
 FLOORS = {
     "mapctl": (
-        "blender contacts isolated joint_ranges mesh numerics solver",
-        "kinematics",
+        "blender isolated joint_ranges mesh numerics solver",
+        "contacts kinematics",
         "formats",
         "curves retarget",
         "editing intent motion_dna recording terms",

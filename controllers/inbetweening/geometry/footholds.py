@@ -15,7 +15,11 @@ _STANCE_FADE_SECONDS = 0.12  # over which a swinging foot's correction fades awa
 
 
 def hold_planted(
-    motion: Motion, planted: Bool[Tensor, "frames 2"], *, free: Bool[Tensor, " frames"], rest_height: float
+    motion: Motion,
+    planted: Bool[Tensor, "frames 2"],
+    *,
+    free: Bool[Tensor, " frames"],
+    rest_height: Float[Tensor, "frames 2"],
 ) -> Motion:
     """Hold the toes (left, right) of a canonical motion at one position during each contact, in frames that are free.
 
@@ -28,7 +32,7 @@ def hold_planted(
         offset = torch.zeros_like(positions[:, toe])
         for _, start, stop in true_intervals(planted[:, foot, None]):
             part = slice(start, stop)
-            offset[part] = _compute_stance_offset(positions[part, toe], ~free[part], rest_height)
+            offset[part] = _compute_stance_offset(positions[part, toe], ~free[part], rest_height[part, foot])
         firm = ~free | planted[:, foot]
         goals[:, CANONICAL.parents[toe]] += interpolate_offsets(
             offset, firm, seconds=_STANCE_FADE_SECONDS, fps=float(motion.fps)
@@ -38,11 +42,11 @@ def hold_planted(
 
 
 def _compute_stance_offset(
-    positions: Float[Tensor, "contact 3"], anchored: Bool[Tensor, " contact"], rest_height: float
+    positions: Float[Tensor, "contact 3"], anchored: Bool[Tensor, " contact"], rest_height: Float[Tensor, " contact"]
 ) -> Float[Tensor, "contact 3"]:
     """Compute the offsets from a contact's positions to the anchored ones, interpolated linearly, or to their mean."""
     if bool(anchored.any()):
         return fill_missing(positions[None], anchored[None])[0] - positions
     middle = positions.mean(dim=0)
-    middle[1] = rest_height
+    middle[1] = rest_height.mean()
     return middle - positions

@@ -45,14 +45,15 @@ def step_of(joints, before, b, t, joint, k):
 def add_contact(points, before, planted, pair, fps, sigmas, rest_heights, doubt, energy, d_points):
     """Two planted points rest and are on the ground, neither is below it; added to the energies. `before` (0 or 1,
     points, 3) is the last frame before the window, `planted` (batch, 1 + frames, 2) begins there; `pair` are their
-    columns, `sigmas` are speed, height and depth. From `doubt` nats on a contact counts less and less; 0 for never."""
+    columns, `sigmas` are speed, height and depth, `rest_heights` is (frames, 2). From `doubt` nats on a contact counts
+    less and less; 0 for never."""
     travel, height = (fps / sigmas[0]) ** 2, 1.0 / sigmas[1] ** 2
     below = 1.0 / sigmas[2] ** 2
     for b in range(len(points)):
         for t in range(points.shape[1]):
             for side in range(2):
                 point = pair[side]
-                above = np.float64(points[b, t, point, 1]) - rest_heights[side]
+                above = np.float64(points[b, t, point, 1]) - rest_heights[t, side]
                 if above < 0.0:
                     energy[b, t] += 0.5 * below * above * above
                     d_points[b, t, point, 1] += below * above
