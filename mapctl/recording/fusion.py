@@ -10,6 +10,7 @@ third order run forwards and backwards, but with ends and gaps of its own.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -20,6 +21,7 @@ from scipy.linalg import solveh_banded
 from torch import Tensor
 
 from mapctl import rotations
+from mapctl.features import PRIOR_FPS
 from mapctl.numerics import gaussian
 from mapctl.recording.quaternion_signs import choose_continuous_signs
 
@@ -57,14 +59,13 @@ def fuse_rotations(
     weights = seen.double()
     smooth = [_normalise(smooth_columns(capture, weights, hertz, fps)) for hertz in _list_cutoffs(fps)]
     about = smooth[0] if proposal is None else proposal
-    held, share, error = proposal is not None, None, None
-    for seconds in _RISK_SECONDS:
-        residual = _relative_vector(about, capture)
-        alone = [_relative_vector(about, each) for each in smooth]
-        vector, trust, error = _estimate(residual, alone, weights, sigma, fps, seconds, holds_proposal=held)
-        about = rotations.multiply(about, rotations.from_rotation_vector(vector))
-        held, share = True, trust if share is None else share * trust
-    return Fused(about, share, error)
+
+    def move(about: Tensor, seconds: float, held: bool) -> tuple[Tensor, Tensor, Tensor]:
+        residual, others = _relative_vector(about, capture), [_relative_vector(about, each) for each in smooth]
+        vector, share, error = _estimate(residual, others, weights, sigma, fps, seconds, holds_proposal=held)
+        return rotations.multiply(about, rotations.from_rotation_vector(vector)), share, error
+
+    return _fuse(move, about, held=proposal is not None)
 
 
 def fuse_positions(
@@ -80,13 +81,23 @@ def fuse_positions(
     smooth = [smooth_columns(capture[:, None], weights, hertz, fps) for hertz in _list_cutoffs(fps)]
     about = smooth[0] if proposal is None else proposal[:, None]
     level = torch.tensor([sigma], dtype=torch.float64)
-    held, share, error = proposal is not None, None, None
-    for seconds in _RISK_SECONDS:
-        residual, alone = capture[:, None] - about, [each - about for each in smooth]
-        vector, trust, error = _estimate(residual, alone, weights, level, fps, seconds, holds_proposal=held)
-        about = about + vector
-        held, share = True, trust if share is None else share * trust
-    return Fused(about, share, error)
+
+    def move(about: Tensor, seconds: float, held: bool) -> tuple[Tensor, Tensor, Tensor]:
+        others = [each - about for each in smooth]
+        vector, share, error = _estimate(
+            capture[:, None] - about, others, weights, level, fps, seconds, holds_proposal=held
+        )
+        return about + vector, share, error
+
+    return _fuse(move, about, held=proposal is not None)
+
+
+def _fuse(move: Callable[[Tensor, float, bool], tuple[Tensor, Tensor, Tensor]], about: Tensor, *, held: bool) -> Fused:
+    """Fuse over seconds first, then over moments about that: what the capture shows of a kick alone is seen there. The
+    error is that of the first: beside what follows the capture, the capture seems to have less noise."""
+    about, share, error = move(about, _RISK_SECONDS[0], held)
+    about, again, _ = move(about, _RISK_SECONDS[1], True)
+    return Fused(about, share * again, error)
 
 
 def smooth_columns(
@@ -138,17 +149,20 @@ def _estimate(
         own = _weigh_own(len(residual), hertz, fps)[:, None] / _average_within(weights, hertz, fps)
         back = [smooth_columns(residual * weights[..., None], weights, hertz, fps)] if holds_proposal else []
         candidates, owns = [*back, smooth, *candidates], [*[own] * len(back), own, *owns]
+    # Risks differ by what is slower than the prior's rate alone: a faster camera has more frames of the same.
+    finer = max(1.0, fps / PRIOR_FPS)
+    frames = min(len(residual), 2 * math.sqrt(math.pi) * seconds * fps) / finer
+    doubt = _CAUTION * math.sqrt(2 / (3 * frames)) / finer
+    penalties = [_SELECTION * own + doubt for own in owns]
+    if not holds_proposal:
+        penalties = [torch.zeros_like(own) for own in owns]
+    else:
+        nothing = torch.zeros_like(ones)
+        candidates, owns, penalties = [torch.zeros_like(residual), *candidates], [nothing, *owns], [nothing, *penalties]
     changes = [(candidate - residual).square().sum(dim=-1) * weights for candidate in candidates]
-    frames = min(len(residual), 2 * math.sqrt(math.pi) * seconds * fps)
-    doubt = _CAUTION * math.sqrt(2 / (3 * frames))
-    costs = [(2 + _SELECTION * holds_proposal) * own - 1 + doubt * holds_proposal for own in owns]
-    if holds_proposal:
-        candidates = [torch.zeros_like(residual), *candidates]
-        changes, costs = [residual.square().sum(dim=-1) * weights, *changes], [-ones, *costs]
-    risks = torch.stack(
-        [_average(change, near, fps, seconds) / power + cost for change, cost in zip(changes, costs, strict=True)]
-    )
-    share = torch.softmax(-risks / _TEMPERATURE, dim=0)
+    risks = torch.stack([_average(change, near, fps, seconds) for change in changes]) / power
+    risks = risks + 2 * torch.stack(owns) - 1
+    share = torch.softmax(-(risks + torch.stack(penalties)) * finer / _TEMPERATURE, dim=0)
     vector = (share[..., None] * torch.stack(candidates)).sum(dim=0)
     error = sigma * (share * risks).sum(dim=0).clamp(0.0, 1.0).sqrt()
     # Without noise the capture is the truth where it was observed.
