@@ -197,7 +197,8 @@ def _cover_steps(
     motion: Motion, step: int, moving: Bool[Tensor, "lags frames"], lags: range
 ) -> Bool[Tensor, "lags frames"]:
     """Return which pairs have a contact of each foot and a swing of each between them."""
-    planted = find_contacts(motion.joint_positions()[:, list(TOE_JOINTS)], float(motion.fps))[::step]
+    positions = motion.joint_positions()
+    planted = find_contacts(positions[:, list(TOE_JOINTS)], positions[:, 0], float(motion.fps))[::step]
     counts = torch.nn.functional.pad(planted.long().cumsum(dim=0), (0, 0, 1, 0))
     lag, frames = torch.tensor(list(lags))[:, None], torch.arange(moving.shape[1])
     between = counts[(frames + lag).clamp(max=len(planted))] - counts[frames]

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl import contacts
+from mapctl.contacts.supports import compute_rest_log_probability, fit_supports
 from mapctl.editing.ground_transform import GroundTransform, move_by_share, repeat_over_ground
 from mapctl.editing.legs import place_ankles
 from mapctl.editing.rigged_motion import RiggedMotion
@@ -48,11 +49,11 @@ def plant_feet(
 ) -> Motion:
     """Hold planted toes still and on the floor, on the motion's own rig at its own rate.
 
-    A toe is planted where it is low and slow (see `mapctl.contacts`), noise smoothed away; then it stays where it is on
-    average during that contact, at the height of its floor. Thighs and shins bring it there, feet keep their
-    orientation, and hips go down where a leg is too short. All other local rotations stay to the bit. `cycle` is the
-    travel of a loop, which stays one. `rig` wins over what would be recognised; RequestError where the rig's joints
-    cannot be identified.
+    A toe is planted where it rests and carries the body (see `mapctl.contacts.supports`), noise smoothed away; then it
+    stays where it is on average during that contact, at the height of its support. Thighs and shins bring it there,
+    feet keep their orientation, and hips go down where a leg is too short. All other local rotations stay to the bit.
+    `cycle` is the travel of a loop, which stays one. `rig` wins over what would be recognised; RequestError where the
+    rig's joints cannot be identified.
     """
     rigged = RiggedMotion.of(motion, rig)
     if cycle is None:
@@ -66,7 +67,7 @@ def plant_feet(
 
 def _plant(rigged: RiggedMotion, settings: FootingSettings) -> Motion:
     toes, fps = rigged.positions("Toes"), float(rigged.motion.fps)
-    planted = find_contacts(toes, fps, settings)
+    planted = find_contacts(toes, rigged.position("hips"), fps, settings)
     if not bool(planted.any()):
         return rigged.motion
     corrections = correct_toes(toes, toes, planted, fps, settings)
@@ -75,14 +76,20 @@ def _plant(rigged: RiggedMotion, settings: FootingSettings) -> Motion:
 
 
 def find_contacts(
-    toes: Float[Tensor, "frames 2 3"], fps: float, settings: FootingSettings = FootingSettings()
+    toes: Float[Tensor, "frames 2 3"],
+    hips: Float[Tensor, "frames 3"],
+    fps: float,
+    settings: FootingSettings = FootingSettings(),
 ) -> Bool[Tensor, "frames 2"]:
     """Find in which frames each toe is planted; contacts that noise alone parts are one. Positions in metres."""
     sigma = _choose_smoothing(toes, fps, settings)
     smooth = _smooth(toes, sigma)
-    planted = contacts.detect_contacts(smooth, fps)
+    noise = torch.tensor([[settings.noise_speed]])
+    resting = compute_rest_log_probability(smooth, hips, fps, noise)
     if sigma <= settings.smooth_seconds[0] * fps:  # hardly any noise: what is seen as it is counts too
-        planted |= contacts.detect_contacts(toes, fps)
+        resting = resting.maximum(compute_rest_log_probability(toes, hips, fps, noise))
+    shortest = max(1, round(contacts.ContactSettings().shortest * fps))
+    planted = contacts.remove_short_runs(resting > math.log(0.5), shortest)
     for foot, start, stop in list(true_intervals(~planted)):
         inside = start > 0 and stop < len(planted)
         if inside and stop - start < settings.merge_seconds * fps:
@@ -110,11 +117,10 @@ def correct_toes(
 def _correct_heights(
     toes: Float[Tensor, "frames 2 3"], planted: Bool[Tensor, "frames 2"], fps: float, settings: FootingSettings
 ) -> Float[Tensor, "frames 2"]:
-    """Return corrections that put planted toes at the height of their floor, and let no toe go lower. The ends of a
+    """Return corrections that put planted toes at the height of their support, and let no toe go lower. The ends of a
     contact, in which a toe is on its way down or up, are left to what is between."""
-    heights = toes[..., 1]
-    smooth = _smooth(heights, _choose_smoothing(toes, fps, settings))
-    rest = torch.quantile(smooth, contacts.ContactSettings().floor_percentile / 100, dim=0)
+    smooth = _smooth(toes, _choose_smoothing(toes, fps, settings))
+    rest, heights, smooth = fit_supports(smooth, planted), toes[..., 1], smooth[..., 1]
     firm = heights < rest
     for foot, start, stop in true_intervals(planted):
         usual = smooth[start:stop, foot].median()

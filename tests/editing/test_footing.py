@@ -25,7 +25,8 @@ def sliding(frames: int = 75, fps: int = 30):
 
 
 def contacts_of(motion):
-    return find_contacts(RiggedMotion.of(motion).positions("Toes"), float(motion.fps))
+    rigged = RiggedMotion.of(motion)
+    return find_contacts(rigged.positions("Toes"), rigged.position("hips"), float(motion.fps))
 
 
 @pytest.mark.parametrize("name", RIGS)
@@ -56,7 +57,7 @@ def test_contacts_at_one_place_are_one_and_elsewhere_two():
     toes = torch.zeros(60, 2, 3, dtype=torch.float64)
     toes[27:30, :, 1] = 0.06
     toes[30:, 1, 0] = 0.2
-    planted = find_contacts(toes, 30.0)
+    planted = find_contacts(toes, toes.mean(dim=1) + torch.tensor([0.0, 0.9, 0.0]).double(), 30.0)
     assert bool(planted[:, 0].all())
     assert not bool(planted[28, 1])
 
@@ -103,6 +104,18 @@ def test_who_never_stands_is_left_alone():
     motion = walk(30)
     flying = replace(motion, root_position=motion.root_position + torch.arange(30).double()[:, None] * 0.5)
     assert torch.equal(editing.plant_feet(flying).local_quat_xyzw, motion.local_quat_xyzw)
+
+
+def test_feet_on_a_box_are_still_and_stay_up():
+    """A walk that goes on 48 cm higher: feet there slide no more than on the floor, and rest as high as they did."""
+    motion = sliding(150)
+    rise = 0.48 * ((torch.arange(150) - 70) / 10).clamp(0, 1).double()
+    high = replace(motion, root_position=motion.root_position + torch.stack([0 * rise, rise, 0 * rise], dim=-1))
+    planted, done = contacts_of(high), editing.plant_feet(high)
+    assert bool(planted[90:].any())
+    assert toe_speed(done, planted) < 0.002
+    heights = [RiggedMotion.of(each).positions("Toes")[..., 1] for each in (high, done)]
+    assert float((heights[1] - heights[0])[planted].abs().max()) < 0.02
 
 
 def test_a_loop_stays_one_with_feet_that_are_still_over_its_seam():

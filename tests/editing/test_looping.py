@@ -108,7 +108,7 @@ def test_planted_feet_move_as_they_did():
     toes = [motion.skeleton.index(side + "Toes") for side in ("left", "right")]
     own, closed = (m.joint_positions()[:, toes] for m in (motion, loop.motion))
     cut = slice(loop.cycle.start, loop.cycle.stop)
-    planted = find_contacts(own, 30)[cut]
+    planted = find_contacts(own, motion.joint_positions()[:, 0], 30)[cut]
     stays = planted[1:] & planted[:-1]
     assert bool(stays.any())
     assert float((closed.diff(dim=0) - own[cut].diff(dim=0)).norm(dim=-1)[stays].max()) < 1e-4
