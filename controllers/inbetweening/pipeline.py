@@ -15,6 +15,7 @@ from controllers.inbetweening.geometry.root_path import move_root_along_curve, m
 from controllers.inbetweening.proposers.loose_keys import hold_loose_keys, meet_places, note_drawings, show_drawn_poses
 from controllers.inbetweening.proposers.partial_keys import propose_through_keys
 from controllers.inbetweening.refine import INFILL_REFINEMENT, refine_gaps
+from controllers.inbetweening.shrinkage import shrink
 from controllers.inbetweening.solution import InbetweenSolution
 from mapctl import contacts
 from mapctl.curves.curve import Curve
@@ -80,13 +81,13 @@ def fill(
     query = clip.query(effector_targets=targets, keep_trajectory=curve is not None, loose=loose)
     asked, query = query, show_drawn_poses(query, inbetweener, generator)
     answer, reached = propose_through_keys(query, inbetweener, generator)
-    answer = meet_places(answer, query)
+    answer = meet_places(shrink(answer, query, inbetweener.rough, generator), query)
     proposed = time.perf_counter()
     made, ledger, windows = answer.motion, Ledger(), ()
     if settings.finish:
         firm = replace(query, missing=hold_loose_keys(query))
         made, ledger, windows = refine_gaps(answer, firm, reached, settings.refinement, densities, terms)
-    done, unreached = _reach_targets(clip, clip.back(made, query), targets)
+    done, unreached = _reach_targets(clip, clip.back(made, asked), targets)
     done = _meet_places(clip, done, loose)
     status = (
         Status(Outcome.DONE).with_notes(_note_open_ends(clip, answer, loose)).with_notes(note_drawings(made, asked))

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mapctl import contacts
+from mapctl import contacts, rotations
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening.effector_targets import EffectorTargets
 from mapctl.inbetweening.loose_keys import LooseKeys
@@ -141,6 +141,16 @@ class Proposal:
         return replace(
             self, motion=replace(self.motion, root_position=root, local_quat_xyzw=quats), contact_logits=logits
         )
+
+    def lerp(self, other: "Proposal", weight: float, frames: slice) -> "Proposal":
+        """Return this proposal with so much weight in some frames, and another one for the rest."""
+        motion, logits = self.motion, self.contact_logits.clone()
+        quats, root = motion.local_quat_xyzw.clone(), motion.root_position.clone()
+        theirs, share = other.motion.local_quat_xyzw[frames], torch.full(quats[frames].shape[:2], weight).to(quats)
+        quats[frames] = rotations.slerp(theirs, quats[frames], share)
+        root[frames] = torch.lerp(other.motion.root_position[frames], root[frames], weight)
+        logits[frames] = torch.lerp(other.contact_logits[frames].to(logits), logits[frames], weight)
+        return replace(self, motion=replace(motion, local_quat_xyzw=quats, root_position=root), contact_logits=logits)
 
     def attribute(self, query: GapQuery) -> tuple[GapSource, ...]:
         """Name the source of each gap with known frames on both sides, and of the others' gaps, in temporal order."""

@@ -1,8 +1,11 @@
-"""What a motion lacks, and straight lines across it."""
+"""What a motion lacks, and lines across it."""
+
+from dataclasses import replace
 
 import pytest
 import torch
 from captures import apart_deg, on_rig
+from helpers import walk
 from scipy.spatial.transform import Rotation, Slerp
 
 from mapctl import retarget
@@ -30,9 +33,11 @@ def interpolated(quats, start, stop):
 
 @pytest.mark.parametrize("rig", RIGS)
 @pytest.mark.parametrize(("start", "stop"), [(20, 40), (20, 21), (1, 49)])
-def test_a_gap_is_crossed_by_slerp_and_straight_lines(rig, start, stop):
+def test_a_gap_between_single_frames_is_crossed_by_slerp_and_straight_lines(rig, start, stop):
     motion = on_rig(rig, 50)
-    made = interpolate_missing(motion, lost_of(motion, Mask(ALL, start, stop)))
+    lost = torch.ones(50, dtype=torch.bool)
+    lost[[start - 1, stop]] = False
+    made = interpolate_missing(motion, MissingMask.of_frames(lost, motion.num_joints))
     wanted = interpolated(motion.local_quat_xyzw, start, stop)
     assert apart_deg(made.local_quat_xyzw[start:stop], wanted).max() < 1e-5
     pairs = [(made.root_position, motion.root_position)]
@@ -41,6 +46,48 @@ def test_a_gap_is_crossed_by_slerp_and_straight_lines(rig, start, stop):
     for found, given in pairs:
         line = (1 - weight) * given[start - 1] + weight * given[stop]
         assert torch.allclose(found[start:stop], line, atol=1e-12)
+
+
+def swung(seconds, fps):
+    """A leap: the hips in a parabola, an arm that swings with constant acceleration."""
+    time = torch.arange(round(seconds * fps)).double() / fps
+    motion = walk(len(time), fps=fps)
+    root, quats = torch.zeros(len(time), 3).double(), torch.zeros(len(time), motion.num_joints, 4).double()
+    root[:, 1], quats[..., 3] = 1 + 3 * time - 4.9 * time**2, 1.0
+    angle = 2 * time + 6 * time**2
+    arm = motion.skeleton.index("leftUpperArm")
+    quats[:, arm, 0], quats[:, arm, 3] = (angle / 2).sin(), (angle / 2).cos()
+    return replace(motion, root_position=root, local_quat_xyzw=quats)
+
+
+@pytest.mark.parametrize("fps", [30, 60, 120])
+@pytest.mark.parametrize(("after", "left"), [(1, 0.7), (10, 0.35)])
+def test_a_short_gap_goes_on_at_the_velocities_beside_it(fps, after, left):
+    """Of what slerp misses; with one frame after the gap only the velocity before it is known."""
+    motion = swung(1.5, fps)
+    start = stop = motion.num_frames // 3
+    stop += round(0.2 * fps)
+    motion = motion.slice(0, stop + after)
+    truth, made = motion.joint_positions(), interpolate_missing(motion, lost_of(motion, Mask(ALL, start, stop)))
+    lost = torch.ones(stop + after, dtype=torch.bool)
+    lost[[start - 1, stop]] = False
+    straight = interpolate_missing(motion, MissingMask.of_frames(lost, motion.num_joints))
+
+    def error(found):
+        return (found.joint_positions() - truth)[start:stop].norm(dim=-1).mean()
+
+    assert error(made) < left * error(straight)
+    seam = torch.diff(made.joint_positions()[start - 2 : start + 1], n=2, dim=0).norm(dim=-1).max()
+    assert seam < 0.5 * torch.diff(straight.joint_positions()[start - 1 : start + 1], dim=0).norm(dim=-1).max()
+
+
+def test_velocities_do_not_last_through_a_long_gap():
+    motion = swung(4.0, 30)
+    made = interpolate_missing(motion, lost_of(motion, Mask(ALL, 20, 110)))
+    line = torch.lerp(
+        motion.root_position[19], motion.root_position[110], torch.linspace(0, 1, 92)[1:-1, None].double()
+    )
+    assert (made.root_position[20:110] - line).norm(dim=-1).max() < 0.1 * abs(float(motion.root_position[110, 1]))
 
 
 @pytest.mark.parametrize("rig", RIGS)
