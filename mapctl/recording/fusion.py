@@ -26,9 +26,10 @@ from mapctl.numerics import gaussian
 from mapctl.recording.quaternion_signs import choose_continuous_signs
 
 _ORDER = 3  # of the differences that the smoother penalises
-_HERTZ = (0.7, 1.0, 1.5, 2.0, 3.0, 4.5, 6.5, 10.0)  # half-power frequencies of the smoothers
-_RISK_SECONDS = (1.33, 0.25)  # sigma, over which the risk is averaged: of a style first, then of a kick
-_CAUTION = 1.5  # standard errors of a risk, which is itself an estimate, that a candidate beside the proposal must gain
+_HERTZ = (0.7, 1.0, 1.5, 2.0, 3.0, 4.5, 6.5, 10.0, 15.0, 22.0, 33.0)  # half-power frequencies of the smoothers
+_SCALES = ((1.33, 1.5), (0.25, 3.0))
+"""Seconds (sigma) over which a risk is averaged, of a style first and then of a kick, and how many of the risk's
+standard errors a candidate beside the proposal must gain: there are many more moments in which to be wrong."""
 _SELECTION = 1.0  # of the noise that such a candidate keeps, counted once more, since it is the best of many
 _TEMPERATURE = 0.06  # of the noise's power: candidates that are as good as equal are averaged
 _LEAST_WEIGHT = 1e-9  # of an unobserved frame, so that the system of a column without any has a solution
@@ -60,9 +61,9 @@ def fuse_rotations(
     smooth = [_normalise(smooth_columns(capture, weights, hertz, fps)) for hertz in _list_cutoffs(fps)]
     about = smooth[0] if proposal is None else proposal
 
-    def move(about: Tensor, seconds: float, held: bool) -> tuple[Tensor, Tensor, Tensor]:
+    def move(about: Tensor, scale: tuple[float, float], held: bool) -> tuple[Tensor, Tensor, Tensor]:
         residual, others = _relative_vector(about, capture), [_relative_vector(about, each) for each in smooth]
-        vector, share, error = _estimate(residual, others, weights, sigma, fps, seconds, holds_proposal=held)
+        vector, share, error = _estimate(residual, others, weights, sigma, fps, scale, holds_proposal=held)
         return rotations.multiply(about, rotations.from_rotation_vector(vector)), share, error
 
     return _fuse(move, about, held=proposal is not None)
@@ -82,21 +83,23 @@ def fuse_positions(
     about = smooth[0] if proposal is None else proposal[:, None]
     level = torch.tensor([sigma], dtype=torch.float64)
 
-    def move(about: Tensor, seconds: float, held: bool) -> tuple[Tensor, Tensor, Tensor]:
+    def move(about: Tensor, scale: tuple[float, float], held: bool) -> tuple[Tensor, Tensor, Tensor]:
         others = [each - about for each in smooth]
         vector, share, error = _estimate(
-            capture[:, None] - about, others, weights, level, fps, seconds, holds_proposal=held
+            capture[:, None] - about, others, weights, level, fps, scale, holds_proposal=held
         )
         return about + vector, share, error
 
     return _fuse(move, about, held=proposal is not None)
 
 
-def _fuse(move: Callable[[Tensor, float, bool], tuple[Tensor, Tensor, Tensor]], about: Tensor, *, held: bool) -> Fused:
+def _fuse(
+    move: Callable[[Tensor, tuple[float, float], bool], tuple[Tensor, Tensor, Tensor]], about: Tensor, *, held: bool
+) -> Fused:
     """Fuse over seconds first, then over moments about that: what the capture shows of a kick alone is seen there. The
     error is that of the first: beside what follows the capture, the capture seems to have less noise."""
-    about, share, error = move(about, _RISK_SECONDS[0], held)
-    about, again, _ = move(about, _RISK_SECONDS[1], True)
+    about, share, error = move(about, _SCALES[0], held)
+    about, again, _ = move(about, _SCALES[1], True)
     return Fused(about, share * again, error)
 
 
@@ -131,15 +134,16 @@ def _estimate(
     weights: Float[Tensor, "frames columns"],
     sigma: Float[Tensor, " columns"],
     fps: float,
-    seconds: float,
+    scale: tuple[float, float],
     *,
     holds_proposal: bool,
 ) -> tuple[Float[Tensor, "frames columns 3"], Float[Tensor, "frames columns"], Float[Tensor, "frames columns"]]:
     """Estimate the truth beside the proposal; also the weight of the proposal itself, and the estimated error.
 
     `residual` is the capture beside the proposal, `alone` the smoothed capture beside it; risks are averaged over
-    `seconds` (sigma).
+    a time that `scale` gives.
     """
+    seconds, caution = scale
     power = (3 * sigma.square()).clamp_min(1e-12)
     ones = torch.ones_like(weights)
     near = _average(weights, ones, fps, seconds).clamp_min(_LEAST_WEIGHT)
@@ -152,7 +156,7 @@ def _estimate(
     # Risks differ by what is slower than the prior's rate alone: a faster camera has more frames of the same.
     finer = max(1.0, fps / PRIOR_FPS)
     frames = min(len(residual), 2 * math.sqrt(math.pi) * seconds * fps) / finer
-    doubt = _CAUTION * math.sqrt(2 / (3 * frames)) / finer
+    doubt = caution * math.sqrt(2 / (3 * frames)) / finer
     penalties = [_SELECTION * own + doubt for own in owns]
     if not holds_proposal:
         penalties = [torch.zeros_like(own) for own in owns]

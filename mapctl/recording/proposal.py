@@ -16,6 +16,6 @@ class CaptureProposal:
     """Poses of every frame, batched."""
     contact_logits: Float[Tensor, "batch frames 2"]
     """Log odds that the left and the right toe are planted."""
-    log_spread: Float[Tensor, "batch frames 1+joints"]
+    log_spread: Float[Tensor, "batch frames columns"]
     """Logarithm of the standard deviation of the proposal's error: of each coordinate of the hips' position, metres,
     then of each of a joint's three angles, radians, the hips' first."""

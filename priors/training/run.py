@@ -261,6 +261,7 @@ class TrainingRun(Generic[C, S, T]):
         if recipe.guards:
             self.trainer.network.load_state_dict(self.best)
         self.trainer.move("cpu")
+        recipe.finish(self.trainer)
         made = recipe.export(self.trainer, self.gathered, self.curve)
         training = {"settings": asdict(recipe.settings), "curve": self.curve, "command": recipe.format_command()}
         card = checkpoints.Card(

@@ -13,6 +13,7 @@ from mapctl.errors import RequestError
 from mapctl.features import LAYOUT
 from priors.denoiser.network import DenoiserConfig
 from priors.training.augmentation.corruption import CorruptionSettings
+from priors.training.augmentation.unfamiliar_poses import PoseVariation
 from priors.training.corpus import Corpus
 from priors.training.recipes.denoiser import (
     DenoiserRecipe,
@@ -25,6 +26,7 @@ from priors.training.run import train
 from priors.training.windows import FeatureWindows
 
 TINY = DenoiserConfig(width=8, dilations=(1, 2))
+FAMILIAR = PoseVariation(share=0.0, tilted=0.0)
 SETTINGS = DenoiserSettings(steps=6, batch=3, window=16)
 
 
@@ -54,7 +56,7 @@ def test_numbers_that_make_no_sense_are_refused(option, reason):
 
 
 def test_windows_are_clips_mirrored_half_of_the_time():
-    plain = replace(SETTINGS, calibration_deg=0.0, batch=64, corruption=CorruptionSettings(size=0.0))
+    plain = replace(SETTINGS, calibration_deg=0.0, poses=FAMILIAR, batch=64, corruption=CorruptionSettings(size=0.0))
     whole = corpus(2, 40)
     drawn = drawn_of(whole, plain)
     assert drawn.shape == (64, 16, LAYOUT.size)
@@ -72,7 +74,7 @@ def test_small_folders_are_drawn_more_often_where_evenness_asks_for_it():
     )
 
     def share(evenness):
-        windows = drawn_of(uneven, replace(SETTINGS, batch=600, evenness=evenness))
+        windows = drawn_of(uneven, replace(SETTINGS, poses=FAMILIAR, batch=600, evenness=evenness))
         return float((windows[:, 0, LAYOUT.slices["root_height"]] > 50).double().mean())
 
     assert share(0.0) == pytest.approx(0.1, abs=0.05)
@@ -82,7 +84,9 @@ def test_small_folders_are_drawn_more_often_where_evenness_asks_for_it():
 def test_a_rig_calibrated_otherwise_stands_as_still(monkeypatch):
     """Joint frames turned by a constant: what does not move still does not, the hips' place stays."""
     still = corpus(1, 16).features[:1].expand(16, -1).contiguous()
-    settings = replace(SETTINGS, batch=20, calibration_deg=10.0, corruption=CorruptionSettings(size=0.0))
+    settings = replace(
+        SETTINGS, poses=FAMILIAR, batch=20, calibration_deg=10.0, corruption=CorruptionSettings(size=0.0)
+    )
     drawn = drawn_of(Corpus(("a",), (16,), still), settings)
     joints = LAYOUT.pick(drawn, "joint_rotations")
     assert torch.diff(joints, dim=1).abs().max() < 1e-5
@@ -100,7 +104,8 @@ def test_a_perfect_proposal_costs_nothing_but_contacts():
     assert parts["error_cm"] < 0.05
     assert parts["angles_deg"] < 0.01
     assert parts["contacts_nats"] == pytest.approx(math.log(2), rel=1e-3)  # untrained it does not know
-    assert parts["loss"] == pytest.approx(clean.contacts * math.log(2), abs=0.1)
+    contacts, spread = clean.contacts * parts["contacts_nats"], clean.spread * parts["spread_nats"]
+    assert parts["loss"] == pytest.approx(float(contacts + spread), abs=0.1)
 
 
 @pytest.mark.slow
@@ -119,7 +124,7 @@ def test_validation_is_the_same_each_time():
     trainer = DenoiserTrainer(TINY, SETTINGS, corpus(1, 30))
     first, again = (trainer.validate(corpus(2, 30)) for _ in range(2))
     assert first == again
-    assert set(first) == {"loss", "error_cm", "feet_cm_frame", "angles_deg", "contacts_nats"}
+    assert set(first) == {"loss", "error_cm", "feet_cm_frame", "angles_deg", "contacts_nats", "spread_nats"}
 
 
 def test_in_bfloat16_it_trains_too():

@@ -230,6 +230,9 @@ class TunableOptions(NetworkOptions):
     """At its highest; 0.001 from scratch, less to fine-tune."""
     init: Annotated[str | None, arg(metavar="NAME")] = None
     """Begin with the weights of this model, bundled or trained, and fine-tune them."""
+    init_share: Annotated[float, arg(metavar="NUMBER")] = 0.0
+    """Share of the weights of --init in the ones that are written, the rest being the fine-tuned ones': 0.7 keeps most
+    of what the initial model knew (Wortsman et al. 2022)."""
     device: Annotated[Literal["auto", "cpu", "cuda"], arg(metavar="auto|cpu|cuda")] = "auto"
     """Where to compute; auto is a GPU with CUDA where there is one."""
     skip_first: bool = False
@@ -250,6 +253,8 @@ class TunableOptions(NetworkOptions):
             raise RequestError("--flat-share and --decay-from are for --until-flat")
         if self.until_flat and getattr(self, "paper", False):
             raise RequestError("--paper has a learning rate and a length of its own: leave out --until-flat")
+        if not 0 <= self.init_share < 1 or (self.init_share and self.init is None):
+            raise RequestError(f"--init-share must be from 0 to below 1, and needs --init; got {self.init_share:g}")
         if self.flat_share is not None and not 0 < self.flat_share < 1:
             raise RequestError(f"--flat-share must lie between 0 and 1, got {self.flat_share:g}")
 
@@ -259,7 +264,8 @@ class TunableOptions(NetworkOptions):
         if self.licence is None and self.init is not None:
             common["licence"] = self._describe_licence(self.init)
         rule = self._make_rule() if self.until_flat else None
-        return {**common, "device": self.device, "until_flat": rule}
+        blend = {"init_share": self.init_share} if self.init_share else {}
+        return {**common, **blend, "device": self.device, "until_flat": rule}
 
     def _describe_licence(self, init: str) -> str:
         from priors import checkpoints, licences

@@ -82,7 +82,7 @@ def vary_features(
     vectors = rotations.to_rotation_vector(quats)
     varied = BodyPose(root, heading, vectors[..., 0, ::2], vectors[..., 1:, :])
     planted = keep_still(LAYOUT.pick(features, "contacts"), varied.joints_world())
-    return varied.features(GroundPose.origin(), planted)
+    return varied.features(GroundPose.origin(), planted > 0)
 
 
 def keep_still(

@@ -61,8 +61,8 @@ class PoseTransformerSettings:
     contacts: float = 0.05
     """Weight of the contacts' cross entropy, nats."""
     harm: float = 10.0
-    """Weight of the distance by which joints are farther from their true positions than interpolation puts them, metres:
-    an error beyond interpolation's counts twice."""
+    """Weight of the distance, metres, by which joints are farther from their true positions than interpolation puts
+    them: an error beyond interpolation's counts twice."""
     spread: float = 1.0
     """Weight of the quantile loss of the spread, which only its own layers learn from."""
     ease: float = 0.4
