@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 import torch
 
 from controllers.benchmarks.shared.tables import Row
-from controllers.inbetweening.error_estimates import is_travelling
+from controllers.inbetweening.gap_notes import is_travelling
 from controllers.inbetweening.pipeline import fill
 from controllers.inbetweening.proposers import AutoInbetweener
 from mapctl.features import PRIOR_FPS

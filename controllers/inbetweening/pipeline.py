@@ -16,6 +16,7 @@ from controllers.inbetweening.proposers.loose_keys import hold_loose_keys, meet_
 from controllers.inbetweening.proposers.partial_keys import propose_through_keys
 from controllers.inbetweening.refine import INFILL_REFINEMENT, refine_gaps
 from controllers.inbetweening.shrinkage import shrink
+from controllers.inbetweening.simpler import take_simpler
 from controllers.inbetweening.solution import InbetweenSolution
 from mapctl import contacts
 from mapctl.curves.curve import Curve
@@ -88,11 +89,13 @@ def fill(
         firm = replace(query, missing=hold_loose_keys(query))
         made, ledger, windows = refine_gaps(answer, firm, reached, settings.refinement, densities, terms)
     done, unreached = _reach_targets(clip, clip.back(made, asked), targets)
-    done = _meet_places(clip, done, loose)
+    done, abrupt = _meet_places(clip, done, loose), ()
+    if targets is None and loose is None and curve is None:
+        done, abrupt = take_simpler(done, clip.restore_observed(clip.interpolated), missing)
     status = (
         Status(Outcome.DONE).with_notes(_note_open_ends(clip, answer, loose)).with_notes(note_drawings(made, asked))
     )
-    status = status.with_notes(unreached, infeasible=bool(unreached))
+    status = status.with_notes(abrupt).with_notes(unreached, infeasible=bool(unreached))
     return InbetweenSolution(
         done,
         status,

@@ -23,7 +23,7 @@ from mapctl.numerics.intervals import true_intervals
 from mapctl.protocols import Inbetweener
 
 _SHARPNESS = 1.75  # s above: over unseen clips and their copies in varied poses the error is flat from 1.5 to 2.5
-_TEST_NOISE = 1.0  # variance of a test's logarithm over that between clips, over the same
+_TEST_NOISE = 0.5  # variance of a test's logarithm over that between clips, over the same
 _RESOLUTION = 2e-6  # square metres: no error is known better than to 1.4 mm
 _STRAIGHT_ERROR, _SPLINE_ERROR = 0.030, 0.019
 """Mean squared error of straight lines over that of the velocities beside a gap times its duration, in gaps of any

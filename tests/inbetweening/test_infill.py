@@ -127,7 +127,7 @@ def test_a_true_proposal_gives_the_true_motion_back(rig, fps):
         filled(motion, *masks, method=method, infiller=Oracle(motion)).motion for method in ("infiller", "slerp")
     )
     # Places do not tell how a collarbone or a shin is turned about itself, and a rig's joints beside them show it.
-    assert error_cm(made, motion) < 0.2 * error_cm(lines, motion)
+    assert error_cm(made, motion) < 0.3 * error_cm(lines, motion)
     frames = lost_of(motion, masks).frames
     off = (made.joint_positions() - motion.joint_positions())[frames].norm(dim=-1)
     assert off.mean() < 0.01

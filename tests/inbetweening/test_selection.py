@@ -8,7 +8,6 @@ from helpers import tiny_density, walk
 from tiny_infiller import tiny_infiller
 
 from controllers.common.canonical_clip import CanonicalClip
-from controllers.inbetweening.error_estimates import estimate_error
 from controllers.inbetweening.geometry.footholds import hold_planted
 from controllers.inbetweening.proposers.auto import STANDING_STILL, AutoInbetweener
 from controllers.inbetweening.tween import tween
@@ -130,20 +129,3 @@ def test_a_long_morph_of_somebody_who_moves_is_called_one():
     (note,) = done.gap_notes
     assert "a still morph" in note
     assert "longer than the" in note
-
-
-def test_what_was_never_measured_is_not_called_sure():
-    for by in ("slerp", "infiller", STANDING_STILL):
-        assert estimate_error(by, 30, travelling=True, in_context=True) is None
-    assert estimate_error("rollout of locomotion", 30, travelling=False, in_context=True) is None
-
-
-@pytest.mark.parametrize("by", ["rollout of locomotion", "density general"])
-@pytest.mark.parametrize(("going", "beside"), [(True, True), (True, False), (False, False)])
-def test_longer_gaps_are_no_surer_and_what_few_clips_told_is_said(by, going, beside):
-    sures = [estimate_error(by, frames, travelling=going, in_context=beside) for frames in (5, 15, 60, 200, 1000)]
-    assert sures[0].percentile_90_cm <= sures[-1].percentile_90_cm
-    assert sures[-2] == sures[-1]
-    for sure in sures:
-        assert sure.median_cm <= sure.percentile_90_cm
-        assert ("only" in sure.text) == (sure.clips < 5)
