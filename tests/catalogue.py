@@ -78,6 +78,7 @@ TERMS: dict[str, Term] = {
     "footing": FootContact(),
     "footing of landings": FootContact(9.0, 9.0, 9.0, heels=None, landing=LandingSigmas(10.0, 20.0)),
     "footing of heels": FootContact(9.0, 9.0, 9.0, heels=HeelSigmas(0.2, 0.05, 0.02, doubt=3.0)),
+    "footing on supports": FootContact(supports=torch.linspace(0, 0.3, 2 * FRAMES).view(FRAMES, 2)),
     "steps": StepLength(0.6),
     "support": Support(rest_height=0.08),
     "clearance": Clearance(height=0.2, share=torch.linspace(0.5, 1, 2 * FRAMES).view(FRAMES, 2)),
