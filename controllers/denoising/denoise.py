@@ -148,4 +148,12 @@ def _denoise_segment(
             error=torch.zeros(motion.num_frames, CANONICAL.num_joints),
         )
     done = SegmentDenoiser(inspection, denoiser, settings, rig).run(densities, terms, round(seconds * PRIOR_FPS))
+    if not terms and _measure_roughness(done.motion) > _measure_roughness(motion):
+        note = f"frames from {seconds:.1f} s on would become rougher than they are: they were not changed"
+        done = replace(done, motion=motion, status=replace(done.status, notes=(*done.status.notes, note)))
     return replace(done, seconds=time.perf_counter() - began)
+
+
+def _measure_roughness(motion: Motion) -> float:
+    """Measure the mean third difference of joints' positions, metres: what noise adds most to."""
+    return float(motion.joint_positions().diff(n=3, dim=0).norm(dim=-1).mean()) if motion.num_frames > 3 else 0.0

@@ -100,6 +100,12 @@ class DenoiseSolution(Solution):
         angle = torch.rad2deg(rotations.to_rotation_vector(rotation).norm(dim=-1))
         return 100 * moved.mean(dim=0), angle.mean(dim=0)
 
+    def find_largest_move(self) -> tuple[str, int, float]:
+        """Find the joint of the rig and the frame that were moved most, and by how many centimetres."""
+        moved = 100 * (self.motion.joint_positions() - self.capture.joint_positions()).norm(dim=-1)
+        frame, joint = divmod(int(moved.argmax()), moved.shape[1])
+        return self.motion.skeleton.names[joint], frame, float(moved[frame, joint])
+
     def list_contact_frames(self) -> dict[str, list[list[int]]]:
         """List by foot the first frame and one past the last of each contact, in frames of the capture."""
         scale = float(self.motion.fps) / PRIOR_FPS

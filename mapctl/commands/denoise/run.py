@@ -1,5 +1,7 @@
 """`mapctl denoise`: a noisy capture is denoised, on its own rig."""
 
+import math
+
 import priors
 from controllers.denoising.causal import denoise_causal
 from controllers.denoising.denoise import DenoiseSettings, denoise
@@ -11,9 +13,11 @@ from mapctl.commands.shared.exit_status import conclude
 from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.errors import RequestError
 from mapctl.recording.masks import load_masks
+from mapctl.skeleton import CANONICAL
 from scenes.plots.denoising import plot
 
 _MAX_NAMED = 6
+_LOW_SHARE = 0.5  # share of the frames with the proposal as it is below which a joint is named
 _LOW_WEIGHT = 0.5  # weight of a density below which a window is listed
 _DEFAULT_DELAY = 0.2  # seconds
 
@@ -29,7 +33,7 @@ def run(command: Denoise) -> int:
         report.write_report(results.build_report("denoise", command, done), command.report)
     _draw_pictures(command, done)
     if not command.quiet:
-        _tell(command, done)
+        _print_summary(command, done)
     return conclude(done.status, strict=command.strict)
 
 
@@ -83,16 +87,27 @@ def _draw_pictures(command: Denoise, done: DenoiseSolution) -> None:
     results.film_comparison(done.capture, done.motion, command.video, rig=done.rig, quiet=command.quiet)
 
 
-def _tell(command: Denoise, done: DenoiseSolution) -> None:
-    moved = float(done.correction()[0].mean())
+def _print_summary(command: Denoise, done: DenoiseSolution) -> None:
+    moved, (joint, frame, most) = float(done.correction()[0].mean()), done.find_largest_move()
     print(
         f"{command.out}: {done.motion.num_frames} frames at {float(done.motion.fps):.6g} a second; joints moved by"
-        f" {moved:.1f} cm on average; {done.frame_ms:.1f} ms a frame"
+        f" {moved:.1f} cm on average, most {joint} in frame {frame}, {most:.1f} cm; {done.frame_ms:.1f} ms a frame"
     )
-    for line in format_faults(done):
+    for line in (*format_certainty(done), *format_faults(done)):
         print(line)
     for note in (*done.notes, *format_densities(done)):
         print(note)
+
+
+def format_certainty(done: DenoiseSolution) -> list[str]:
+    """Format the expected error of the joints' angles, and how far the model's proposal was used."""
+    if not any(fault.kind == "noise" for fault in done.faults):
+        return []
+    error, used = math.degrees(float(done.error.square().mean().sqrt())), done.proposal_share.mean(dim=0)
+    line = f"expected error: {error:.1f} degrees a joint; the model's proposal as it is in {float(used.mean()):.0%}"
+    order = used.argsort().tolist()
+    rare = [CANONICAL.names[joint] for joint in order if used[joint] < _LOW_SHARE][:_MAX_NAMED]
+    return [line + (f", least in {', '.join(rare)}: there the capture corrects it, or is filtered" if rare else "")]
 
 
 def format_faults(done: DenoiseSolution) -> list[str]:
