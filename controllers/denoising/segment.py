@@ -9,13 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from controllers.common.map_refinement import (
-    RefinedMotion,
-    RefinementSettings,
-    anchor_to_contacts,
-    estimate_rest_height,
-    refine,
-)
+from controllers.common.map_refinement import RefinedMotion, RefinementSettings, anchor_to_contacts, refine
 from controllers.denoising.result import DenoiseSolution
 from mapctl import retarget, rotations
 from mapctl.contacts import debounced
@@ -139,9 +133,8 @@ class SegmentDenoiser:
         toes = shown.skeleton.indices(TOES)
         feet = [self.rigmap.joint_of[toe] for toe in toes]
         known = [names[foot] if foot is not None else TOES[side] for side, foot in enumerate(feet)]
-        height = estimate_rest_height(shown, refined.contacts)
         steps = artefacts.list_foot_artefacts(
-            known, shown.joint_positions()[:, toes], refined.contacts, rest_height=height, fps=PRIOR_FPS
+            known, shown.joint_positions()[:, toes], refined.contacts, rest_height=refined.supports, fps=PRIOR_FPS
         )
         ratio = self.fps / PRIOR_FPS
         return (*found, *(replace(f, start=round(f.start * ratio), stop=round(f.stop * ratio)) for f in steps))
