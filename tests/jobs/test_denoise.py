@@ -66,6 +66,27 @@ def test_a_clean_capture_changes_by_less_than_half_a_centimetre(rig, fps, drawn)
     truth = on_rig(rig, 3 * fps, fps=fps)
     done = denoise(truth, tiny_denoiser(drawn=drawn), settings=QUICK)
     assert error_cm(truth, done.motion) < 0.5
+    assert roughness(done.motion) <= roughness(truth)
+
+
+def roughness(motion):
+    """Mean third difference of joints, metres."""
+    return float(motion.joint_positions().diff(n=3, dim=0).norm(dim=-1).mean())
+
+
+@pytest.mark.parametrize("fps", [24, 25, 29.97, 60, 240])
+def test_any_rate_is_as_good_as_the_priors_own(fps):
+    """Errors and toes' acceleration beside those of the same motion with as much noise a second at 30 fps."""
+
+    def measure(rate):
+        truth = on_rig("daz", round(4 * rate), fps=rate)
+        done = cleaned(noisy(truth, 5.0 * (rate / 30) ** 0.5))
+        toes = done.motion.joint_positions()[:, [truth.skeleton.index(name) for name in ("lFoot", "rFoot")]]
+        return error_cm(truth, done.motion), float(toes.diff(n=2, dim=0).norm(dim=-1).mean()) * rate**2
+
+    (error, acceleration), (usual_error, usual_acceleration) = measure(fps), measure(30)
+    assert error < 1.15 * usual_error
+    assert acceleration < 1.5 * usual_acceleration
 
 
 STRETCH = {
