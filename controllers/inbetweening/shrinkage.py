@@ -54,6 +54,8 @@ def shrink(
     """Shrink a proposal with a spread towards the query's motion in gaps with known frames on both sides of which
     nothing else is asked; the spread becomes that of the answer. The in-betweener, which proposed, is tested."""
     views = {gap: _View.of(query, gap) for gap in _find_gaps(proposal, query)}
+    simple_errors = {gap: error for gap, view in views.items() if (error := view.expect_simple_error(query, gap))}
+    views = {gap: views[gap] for gap in simple_errors}
     if proposal.spread is None or not views:
         return proposal
     tests, hidden = {gap: _lay_tests(query.missing, gap) for gap in views}, query.missing
@@ -67,10 +69,9 @@ def shrink(
     for gap, view in views.items():
         surprises = [view.measure_surprise(query, tried, judged) for _, judged in tests[gap]]
         own = view.expect_error(proposal, gap) * math.exp(sum(surprises) / (len(surprises) + _TEST_NOISE))
-        simple_own = view.expect_simple_error(query, proposal, gap)
-        weight = 1 / (1 + (own / simple_own) ** _SHARPNESS)
+        weight = 1 / (1 + (own / simple_errors[gap]) ** _SHARPNESS)
         done = done.lerp(simple, weight, gap.part)
-        size = math.sqrt((1 - weight) ** 2 * simple_own + weight**2 * own)
+        size = math.sqrt((1 - weight) ** 2 * simple_errors[gap] + weight**2 * own)
         shape = spread[gap.part].log().mean(dim=-1, keepdim=True).exp()
         shape = shape / shape[:, view.shown].mean()
         spread[gap.part] = size * shape * torch.tensor([_MEDIAN, _PERCENTILE_90])
@@ -117,9 +118,9 @@ class _View:
         assert proposal.spread is not None, "only proposals with a spread are judged"
         return float(proposal.spread[frames.part][:, self.shown].prod(dim=-1).mean()) + _RESOLUTION
 
-    def expect_simple_error(self, query: GapQuery, proposal: Proposal, gap: _Frames) -> float:
-        """Compute the mean squared error of interpolation that the velocities beside a gap let expect, square metres.
-        Without any, the square of its distance from a proposal is the sum of both errors (James and Stein 1961)."""
+    def expect_simple_error(self, query: GapQuery, gap: _Frames) -> float | None:
+        """Compute the mean squared error of interpolation that the velocities beside a gap let expect, square metres;
+        None without any: bare poses are no evidence against a proposal."""
         positions, known, length = self.compute_positions(query.motion), ~query.missing.frames, len(gap) + 1
         straight = (positions[gap.stop] - positions[gap.start - 1]) / length
         excess = [
@@ -128,8 +129,7 @@ class _View:
             if 0 < last < len(known) and bool(known[last - 1 : last + 1].all())
         ]
         if not excess:
-            apart = _compute_mean_square(self.compute_positions(proposal.motion), positions, gap)
-            return max(apart - self.expect_error(proposal, gap), _RESOLUTION)
+            return None
         share = float(compute_velocity_share(length, fps=float(PRIOR_FPS)))
         bent = _STRAIGHT_ERROR - _SPLINE_ERROR * share**2
         return bent * length**2 * sum(excess) / len(excess) + _RESOLUTION

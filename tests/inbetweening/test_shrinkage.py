@@ -113,17 +113,14 @@ def test_one_trial_tests_all_gaps():
     assert Guess.asked == [25, 25 + 2 * 25]
 
 
-def test_keys_without_velocities_leave_the_network_its_motion():
-    """Nothing but its own claim stands against it."""
-    motion = walk(61)
-    lost = [Mask(ALL, 1, 60)]
-    sure, unsure = (fill(motion, Guess(motion, 0.0, claim), *lost) for claim in (0.01, 5.0))
-    simple = error(straight(motion, *lost), motion, slice(1, 60))
-    assert error(sure.motion, motion, slice(1, 60)) < 0.15 * simple
-    assert error(unsure.motion, motion, slice(1, 60)) > 0.9 * simple
+def test_bare_poses_are_no_evidence_against_the_network():
+    motion, lost = walk(61), Mask(ALL, 1, 60)
+    made = fill(motion, Guess(motion, 0.0, 5.0), lost)
+    simple = error(straight(motion, lost), motion, slice(1, 60))
+    assert error(made.motion, motion, slice(1, 60)) < 0.05 * simple
 
 
-@pytest.mark.parametrize(("leap", "taken"), [(0.5, True), (0.002, False)])
+@pytest.mark.parametrize(("leap", "taken"), [(0.5, True), (0.02, False)])
 @pytest.mark.parametrize("at", [40, 47])
 def test_an_answer_that_leaps_where_the_clip_does_not_is_not_taken(at, leap, taken):
     motion = walk(90)
