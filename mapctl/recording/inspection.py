@@ -9,14 +9,15 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl.motion import Motion
-from mapctl.numerics.intervals import fill_missing, last_observed
-from mapctl.recording.masks import Mask, expand_valid_masks
+from mapctl.numerics.intervals import fill_missing, last_observed, true_intervals
+from mapctl.recording.artefacts import Artefact
+from mapctl.recording.frozen_frames import find_held_frames
+from mapctl.recording.masks import ALL, Mask, expand_valid_masks
 from mapctl.recording.noise_estimation import estimate_angle_noise, estimate_position_noise
 from mapctl.recording.quaternion_signs import choose_continuous_signs
-from mapctl.recording.spike_detection import find_angle_spikes, find_position_spikes
+from mapctl.recording.spike_detection import BODY, RESOLUTION, ROTATIONS, find_angle_spikes, find_position_spikes
 
 _LOCKED_CHANGE = 1e-6  # of a quaternion, that rounding leaves of a joint which never moves
-_FROZEN_SECONDS = 0.1  # that a joint which moves otherwise does not move at all
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +40,10 @@ class Inspection:
     """Noise sigma of each coordinate of the root, metres."""
     travels: int
     """Index of the joint that travels: the root, or the one below it that is moved instead."""
+    frozen: Bool[Tensor, " frames"]
+    """Whether the whole body is held, or zero, while it moves; all joints are dropouts there."""
+    faults: tuple[Artefact, ...] = ()
+    """Faults of the whole body, with their kinds."""
 
     @property
     def seen(self) -> Bool[Tensor, "frames joints"]:
@@ -82,6 +87,7 @@ class Inspection:
             dropouts=self.dropouts[part],
             spikes_root=self.spikes_root[part],
             dropouts_root=self.dropouts_root[part],
+            frozen=self.frozen[part],
         )
 
     def with_locked_joints(self) -> Motion:
@@ -114,38 +120,31 @@ def inspect_recording(motion: Motion, masks: Sequence[Mask] = ()) -> Inspection:
     hidden, hidden_root = expand_valid_masks(motion, masks)
     travels = motion.travelling_joint
     place = motion.moving_offsets[travels] if travels else motion.root_position
-    frozen = _find_frozen_joints(quats, hidden, float(motion.fps))
-    dropouts, dropouts_root = hidden | frozen, hidden_root
-    noise, noise_root = estimate_angle_noise(quats, ~dropouts), estimate_position_noise(place, ~dropouts_root)
-    spikes = find_angle_spikes(quats, noise) & ~dropouts
-    spikes_root = find_position_spikes(place, noise_root) & ~dropouts_root
+    spikes, spikes_root = find_angle_spikes(quats, ~hidden), find_position_spikes(place, ~hidden_root)
+    held, frozen = _find_held_frames(quats, place, hidden | spikes, hidden_root | spikes_root)
+    dropouts, dropouts_root = hidden | held[:, :-1] | frozen[:, None], hidden_root | frozen
+    # What is found to be false explains no other frame.
+    spikes, spikes_root = find_angle_spikes(quats, ~dropouts), find_position_spikes(place, ~dropouts_root)
     # Each spike corrupts the differences of the frames around it.
     noise = estimate_angle_noise(quats, ~(dropouts | spikes))
     noise_root = estimate_position_noise(place, ~(dropouts_root | spikes_root))
-    return Inspection(motion, spikes, dropouts, spikes_root, dropouts_root, noise, noise_root, travels)
+    faults = tuple(Artefact(ALL, start, stop, "frozen", 0.0, "") for _, start, stop in true_intervals(frozen[:, None]))
+    return Inspection(motion, spikes, dropouts, spikes_root, dropouts_root, noise, noise_root, travels, frozen, faults)
 
 
-def _find_frozen_joints(
-    quats: Float[Tensor, "frames joints 4"], hidden: Bool[Tensor, "frames joints"], fps: float
-) -> Bool[Tensor, "frames joints"]:
-    """Find runs in which nothing of a joint's rotation changes, not even by rounding, of joints that move most of the
-    time that they are not hidden.
-
-    A whole body that stands still is a paused recording, or a stand: it is left alone.
-    """
-    still = (quats[1:] == quats[:-1]).all(dim=-1)
-    if len(still) == 0:
-        return torch.zeros(quats.shape[:2], dtype=torch.bool)
-    told = ~(hidden[1:] | hidden[:-1])
-    moves = (~still & told).sum(dim=0) > 0.5 * told.sum(dim=0)
-    still = still & moves & (still.double().mean(dim=1, keepdim=True) < 0.8)
-    shortest = max(2, round(_FROZEN_SECONDS * fps))
-    if len(still) < shortest:
-        return torch.zeros(quats.shape[:2], dtype=torch.bool)
-    whole = still.T.unfold(-1, shortest, 1).all(dim=-1)
-    spread = torch.nn.functional.pad(whole, (shortest - 1, shortest - 1)).unfold(-1, shortest, 1).any(dim=-1).T
-    # The frame before the run is the last that was true.
-    return torch.cat([torch.zeros_like(spread[:1]), spread])
+def _find_held_frames(
+    quats: Float[Tensor, "frames joints 4"],
+    place: Float[Tensor, "frames 3"],
+    hidden: Bool[Tensor, "frames joints"],
+    hidden_root: Bool[Tensor, " frames"],
+) -> tuple[Bool[Tensor, "frames tracks"], Bool[Tensor, " frames"]]:
+    """Find held and zero frames of the joints, and of the position as the last track."""
+    position = torch.nn.functional.pad(place, (0, 1))[:, None]
+    values = torch.cat([2 * quats, position], dim=1)
+    volumes = quats.new_tensor([ROTATIONS] * quats.shape[1] + [BODY])
+    moving = (quats != quats[:1]).any(dim=-1).any(dim=0)
+    zero = (quats[:, moving, :3] == 0).all(dim=-1).all(dim=-1) & moving.any()
+    return find_held_frames(values, torch.cat([hidden, hidden_root[:, None]], dim=1), zero, RESOLUTION, volumes)
 
 
 def _hold_last_observed(quats: Tensor, seen: Tensor) -> Tensor:

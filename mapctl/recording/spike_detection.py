@@ -1,4 +1,4 @@
-"""Detection of spikes: single frames, or two in a row, that lie far from all around them."""
+"""Detection of spikes: single frames, or two in a row, that the frames around them do not explain."""
 
 import math
 
@@ -6,53 +6,98 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from mapctl.numerics.intervals import true_intervals
+from mapctl.recording.local_regression import predict_frames
 from mapctl.recording.quaternion_signs import choose_continuous_signs
 
 _MEDIAN_FRAMES = 5  # frames of the running median: bursts of up to two are detected
-_STEP_FRAMES = 6  # frames on either side that tell how fast a joint is moving
-MIN_SPIKE_SIGMAS = 5.0
-"""Least distance of a spike from the median of its surroundings, in sigmas of the noise."""
-MIN_SPIKE_DEG = 12.0
-"""Least height of a spike, degrees, or as many centimetres: less is left to what treats noise."""
-LEAST_NOISE = math.radians(1.0)
-"""Noise of a joint below which it is taken for one without."""
-_RESIDUAL_SIGMAS, _RESIDUAL_DEG = (
-    4.8,
-    3.0,
-)  # of a spike in the residual: one in 5,000 of normal noise is as far from its median
-_STEP_FACTOR = (
-    2.0  # and so many times the usual way between frames about there: the turning point of a fast kick is none
-)
+_CANDIDATE_RATIO, _CANDIDATE_FRAMES = 3.0, 13  # distance from the median, by its median over so many frames
+_SHARE = 0.01  # share of a track's frames expected to spike
+ROTATIONS = 4 / 3 * math.pi * math.pi**3
+"""Volume of all rotation vectors, among which a false rotation may be any."""
+BODY = 4 / 3 * math.pi * 2.0**3
+"""Volume about a body, cubic metres, within which its false position lies."""
+RESOLUTION = 1e-5
+"""Radians and metres below which nothing differs: files have as few digits."""
+_ROUNDS = 5
 
 
 def find_angle_spikes(
-    quats: Float[Tensor, "frames joints 4"], sigma: Float[Tensor, " joints"]
+    quats: Float[Tensor, "frames joints 4"],
+    seen: Bool[Tensor, "frames joints"],
+    resolution: Float[Tensor, " joints"] | None = None,
 ) -> Bool[Tensor, "frames joints"]:
-    """Find which joints spike in which frames; `sigma` is the noise of each angle, radians."""
-    quats = choose_continuous_signs(quats)
-    middle = _running_median(quats.flatten(1)).unflatten(1, quats.shape[1:])
-    middle = torch.nn.functional.normalize(_continue_at_ends(middle, quats, sigma < LEAST_NOISE), dim=-1)
-    away = _rotation_distance(middle, quats)
-    usual = _mean_step(_rotation_distance(middle[:-1], middle[1:]))
-    return away > (MIN_SPIKE_SIGMAS * sigma).clamp_min(math.radians(MIN_SPIKE_DEG)) + _STEP_FACTOR * usual
+    """Find which joints spike in which frames that are seen; `resolution` is the least noise of each angle, radians."""
+    vectors = 2 * choose_continuous_signs(quats)
+    return _find_spikes(vectors, seen, resolution, math.log(_SHARE / ROTATIONS))
 
 
-def find_position_spikes(places: Float[Tensor, "frames 3"], sigma: float) -> Bool[Tensor, " frames"]:
+def find_position_spikes(places: Float[Tensor, "frames 3"], seen: Bool[Tensor, " frames"]) -> Bool[Tensor, " frames"]:
     """Find the frames in which the position spikes; metres."""
-    middle = _running_median(places)
-    away = (places - middle).norm(dim=-1)
-    usual = _mean_step(torch.diff(middle, dim=0).norm(dim=-1)[:, None])[:, 0]
-    return away > max(MIN_SPIKE_SIGMAS * sigma, MIN_SPIKE_DEG / 100) + _STEP_FACTOR * usual
+    return _find_spikes(places[:, None], seen[:, None], None, math.log(_SHARE / BODY))[:, 0]
 
 
-def find_residual_spikes(
-    rest: Float[Tensor, "frames joints 3"], sigma: Float[Tensor, " joints"]
-) -> Bool[Tensor, "frames joints"]:
-    """Find spikes in the residual of a capture beside a model of it: rotation vectors, radians. Without the motion
-    itself a spike stands out more clearly; `sigma` is the noise of each of the three numbers."""
-    return (rest - _running_median(rest.flatten(1)).unflatten(1, rest.shape[1:])).norm(
-        dim=-1
-    ) > _RESIDUAL_SIGMAS * sigma + math.radians(_RESIDUAL_DEG)
+def _find_spikes(
+    values: Float[Tensor, "frames tracks width"],
+    seen: Bool[Tensor, "frames tracks"],
+    resolution: Float[Tensor, " tracks"] | None,
+    log_density: float,
+) -> Bool[Tensor, "frames tracks"]:
+    """Find the candidates that are likelier anywhere at all, `log_density`, than where their neighbours lead.
+
+    Neighbours that spike explain nothing: first no candidate counts as a neighbour, then all that were none.
+    """
+    least = values.new_full((values.shape[1],), RESOLUTION)
+    least = least if resolution is None else torch.maximum(least, resolution)
+    candidates = _find_candidates(values) & seen
+    spikes = candidates.clone()
+    changed = candidates.any(dim=0)
+    for _ in range(_ROUNDS):
+        if not changed.any():
+            break
+        open_ = changed.nonzero()[:, 0]
+        prediction = predict_frames(values[:, open_], (seen & ~spikes)[:, open_], least[open_])
+        found = candidates[:, open_] & (prediction.log_density() < log_density)
+        changed[open_] = (found != spikes[:, open_]).any(dim=0) & found.any(dim=0)
+        spikes[:, open_] = found
+    for track, start, stop in true_intervals(spikes):
+        if stop - start > _MEDIAN_FRAMES // 2 or not _is_rough(values[:, track], ~spikes[:, track], start, stop):
+            spikes[start:stop, track] = False
+    return spikes
+
+
+def _is_rough(values: Float[Tensor, "frames width"], kept: Bool[Tensor, " frames"], start: int, stop: int) -> bool:
+    """Return whether frames `start` to `stop` stand out further than what is left without them.
+
+    Amid a track they lie further from the line between the kept frames beside them than these turn there. At an end,
+    which is seen from one side, they lie further from the line through the next two than any other frame does.
+    """
+    before, after = kept[:start].nonzero()[-2:, 0], stop + kept[stop:].nonzero()[:2, 0]
+    if len(before) == 2 and len(after) == 2:
+        near = torch.stack([before[1], after[0]])
+        slopes = [_slope(values, pair) for pair in (before, near, after)]
+        away = torch.arange(start, stop)[:, None] - near[0]
+        leap = (values[start:stop] - values[near[0]] - away * slopes[1]).norm(dim=-1).amax()
+        return bool(leap > max((slopes[1] - slopes[0]).norm(), (slopes[2] - slopes[1]).norm()))
+    rest = values[kept]
+    if len(rest) < _MEDIAN_FRAMES:
+        return False
+    near, far, end = (rest[0], rest[1], values[start]) if start == 0 else (rest[-1], rest[-2], values[stop - 1])
+    return bool((end - (2 * near - far)).norm() > torch.diff(rest, n=2, dim=0).norm(dim=-1).amax())
+
+
+def _slope(values: Float[Tensor, "frames width"], pair: Tensor) -> Float[Tensor, " width"]:
+    """Return the change a frame between two frames."""
+    first, second = pair.tolist()
+    return (values[second] - values[first]) / (second - first)
+
+
+def _find_candidates(values: Float[Tensor, "frames tracks width"]) -> Bool[Tensor, "frames tracks"]:
+    """Find frames further from the running median than most about them; more than can spike."""
+    away = (values - _running_median(values.flatten(1)).unflatten(1, values.shape[1:])).norm(dim=-1)
+    side = min(_CANDIDATE_FRAMES // 2, len(away) - 1)
+    usual = torch.nn.functional.pad(away.T, (side, side), mode="reflect").unfold(-1, 2 * side + 1, 1).median(dim=-1)
+    return away > _CANDIDATE_RATIO * usual.values.T + RESOLUTION
 
 
 def _running_median(values: Float[Tensor, "frames width"]) -> Float[Tensor, "frames width"]:
@@ -61,30 +106,3 @@ def _running_median(values: Float[Tensor, "frames width"]) -> Float[Tensor, "fra
     side, last = _MEDIAN_FRAMES // 2, len(values) - 1
     frame = last - (last - torch.arange(-side, len(values) + side).abs()).abs()
     return values[frame.clamp_min(0)].unfold(0, _MEDIAN_FRAMES, 1).median(dim=-1).values
-
-
-def _continue_at_ends(
-    middle: Float[Tensor, "frames joints 4"], quats: Float[Tensor, "frames joints 4"], clean: Bool[Tensor, " joints"]
-) -> Float[Tensor, "frames joints 4"]:
-    """Return medians that go on along the line through the next two frames where an outermost frame is nearer to that:
-    a joint that swings through the first frame does not turn there. With noise the line is too uncertain."""
-    if len(quats) >= _MEDIAN_FRAMES:
-        for end, near, far in ((0, 1, 2), (-1, -2, -3)):
-            line = 2 * quats[near] - quats[far]
-            nearer = (quats[end] - line).norm(dim=-1) < (quats[end] - middle[end]).norm(dim=-1)
-            middle[end] = torch.where((nearer & clean)[:, None], line, middle[end])
-    return middle
-
-
-def _mean_step(steps: Float[Tensor, "steps joints"]) -> Float[Tensor, "frames joints"]:
-    """Return the mean step between frames about each frame, of the medians."""
-    if len(steps) == 0:
-        return steps.new_zeros(1, steps.shape[1])
-    padded = torch.nn.functional.pad(steps.T, (_STEP_FRAMES, _STEP_FRAMES - 1), mode="replicate")
-    return torch.nn.functional.pad(padded.unfold(-1, 2 * _STEP_FRAMES, 1).mean(-1), (0, 1), mode="replicate").T
-
-
-def _rotation_distance(start: Float[Tensor, "frames joints 4"], stop: Float[Tensor, "frames joints 4"]) -> Tensor:
-    """Return the angle between two rotations, radians."""
-    dots = (start * stop).sum(-1).abs().clamp(max=1)
-    return 2 * torch.arccos(dots)

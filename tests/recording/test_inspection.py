@@ -1,12 +1,14 @@
 """A recording is looked over: what stands still, what leaps, where its body is."""
 
 from dataclasses import replace
+from fractions import Fraction
 
 import pytest
 import torch
 from captures import DEGREE, apart_deg, on_rig, shaken, trembling
 
 from mapctl import rotations
+from mapctl.motion import Motion
 from mapctl.recording.inspection import inspect_recording
 from mapctl.recording.masks import ROOT, Mask
 
@@ -37,22 +39,28 @@ def test_a_joint_that_stands_still_is_found_and_only_that(motion):
     assert not found.spikes.any()
 
 
-def test_a_run_to_the_end_is_found_too(motion):
-    joint = moving_joint(motion)
-    found = inspect_recording(with_quats(motion, slice(100, 120), joint, motion.local_quat_xyzw[100, joint]))
+def test_what_no_longer_trembles_with_the_rest_is_found_to_the_end(motion):
+    joint, noisy = moving_joint(motion), trembling(motion, 2 * DEGREE)
+    found = inspect_recording(with_quats(noisy, slice(100, 120), joint, noisy.local_quat_xyzw[100, joint]))
     assert found.dropouts.nonzero().tolist() == [[frame, joint] for frame in range(101, 120)]
 
 
-def test_two_frames_alike_are_no_loss(motion):
-    joint = moving_joint(motion)
-    assert not inspect_recording(with_quats(motion, 41, joint, motion.local_quat_xyzw[40, joint])).dropouts.any()
-
-
-def test_a_whole_body_that_stands_still_is_no_loss(motion):
-    quats = motion.local_quat_xyzw.clone()
-    quats[40:60] = quats[40]
-    found = inspect_recording(replace(motion, local_quat_xyzw=quats))
-    assert not found.dropouts.any()
+@pytest.mark.parametrize("whole", [False, True])
+def test_what_comes_to_rest_and_leaves_it_again_is_no_loss(whole):
+    """A joint, or the whole body, slows down, stands perfectly still for a second, and speeds up."""
+    frames, skeleton = torch.arange(180, dtype=torch.float64), on_rig("canonical", 8).skeleton
+    ramp = (((frames - 90).abs() - 15) / 30).clamp(0, 1)
+    time = (ramp.square() * (3 - 2 * ramp)).cumsum(0) / 30
+    phase = torch.linspace(0, 20, skeleton.num_joints * 3, dtype=torch.float64).reshape(-1, 3)
+    own = time if whole else frames / 30
+    angles = 0.4 * torch.sin(4 * own[:, None, None] + phase)
+    angles[:, 5] = 0.4 * torch.sin(4 * time[:, None] + phase[5])
+    root = own[:, None] * torch.tensor([0.1, 0.0, 1.0], dtype=torch.float64)
+    rested = Motion(skeleton, Fraction(30), root, rotations.from_rotation_vector(angles))
+    assert (rested.local_quat_xyzw[80:100, 5] == rested.local_quat_xyzw[90, 5]).all()
+    found = inspect_recording(rested)
+    assert found.seen.all()
+    assert found.seen_root.all()
 
 
 def test_a_joint_that_never_moves_is_no_loss(motion):

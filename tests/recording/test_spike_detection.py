@@ -54,8 +54,9 @@ def test_noise_alone_is_no_spike():
         assert find_angle_spikes(shaken(swaying(500), degrees * DEGREE)).sum() <= 1
 
 
-def test_small_leaps_are_left_to_what_treats_noise():
-    assert not find_angle_spikes(turned(swaying(100), [50], 2, 8)).any()
+def test_small_spikes_are_found_where_there_is_no_noise_and_left_to_what_treats_noise():
+    assert find_angle_spikes(turned(swaying(100), [50], 2, 8)).nonzero().tolist() == [[50, 2]]
+    assert not find_angle_spikes(turned(shaken(swaying(100), 4 * DEGREE), [50], 2, 8)).any()
 
 
 @pytest.mark.parametrize("fps", [30, 60, 120])
@@ -80,7 +81,8 @@ def test_leaps_of_a_place_are_found_and_a_sprint_is_not():
     assert not find_position_spikes(place).any()
     place[[30, 70, 71]] += torch.tensor([0.0, 1.5, 0.0])
     assert find_position_spikes(place).nonzero()[:, 0].tolist() == [30, 70, 71]
-    assert not find_position_spikes(place, 0.5).any()  # as large as this noise is
+    noise = 0.5 * torch.randn(place.shape, generator=generator(3), dtype=torch.float64)
+    assert not find_position_spikes(place.double() + noise).any()  # as large as this noise is
 
 
 @pytest.mark.parametrize("frames", [1, 2, 3, 4, 5])
@@ -88,6 +90,14 @@ def test_short_recordings_do_not_break_it(frames):
     quats = swaying(frames)
     assert find_angle_spikes(quats).shape == (frames, 6)
     assert find_position_spikes(torch.zeros(frames, 3, dtype=torch.float64)).shape == (frames,)
+
+
+@pytest.mark.parametrize("clamped", [False, True])
+def test_a_frame_is_not_replaced_by_what_is_rougher(clamped):
+    """A joint that swings and from one frame to the next stops, at its limit or for good."""
+    angle = (0.1 * torch.arange(90, dtype=torch.float64)).clamp(max=4.5).sin() if clamped else None
+    angle = (0.03 * torch.arange(90, dtype=torch.float64)).clamp(max=1.8) if angle is None else angle.abs()
+    assert not find_angle_spikes(quat_xyzw(angle[:, None, None] * torch.tensor([1.0, 0.2, 0.0]))).any()
 
 
 @pytest.mark.parametrize("end", [0, -1])
