@@ -150,7 +150,9 @@ def _estimate(
     # The last is the capture itself: what no smoother can follow, as a kick, is no noise.
     candidates, owns = [residual], [ones]
     for hertz, smooth in zip(_list_cutoffs(fps), alone, strict=True):
-        own = _weigh_own(len(residual), hertz, fps)[:, None] / _average_within(weights, hertz, fps)
+        # Averaged as the change is, or the outermost frame, which a smoother follows most, were the proposal's alone.
+        own = _average(_weigh_own(len(residual), hertz, fps)[:, None], ones[:, :1], fps, seconds)
+        own = own / _average_within(weights, hertz, fps)
         back = [smooth_columns(residual * weights[..., None], weights, hertz, fps)] if holds_proposal else []
         candidates, owns = [*back, smooth, *candidates], [*[own] * len(back), own, *owns]
     # Risks differ by what is slower than the prior's rate alone: a faster camera has more frames of the same.
