@@ -31,6 +31,7 @@ from mapctl.recording.masks import (
     trim_masks_before,
     write_back_masked,
 )
+from mapctl.recording.swap_detection import exchange_swapped_limbs
 from mapctl.retarget import as_rig, to_canonical
 from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import CANONICAL
@@ -73,10 +74,11 @@ def denoise(
         motion, stretched = hold_rigid_bones(capture)
     denoiser = denoiser if inbetweener is None else LostPartFiller(denoiser, inbetweener)
     masks = resolve_joint_names(motion, masks, rig)
-    expand_valid_masks(motion, masks)  # checked whole: for a segment they are cut to its frames
+    hidden, _ = expand_valid_masks(motion, masks)  # checked whole: for a segment they are cut to its frames
     # Identified once: a segment may lack the frames that show the rig's T-pose.
     beginning, rigmap = to_canonical(_slice_beginning(motion), rig)
     rig = as_rig(rigmap)
+    motion, swapped = exchange_swapped_limbs(motion, rigmap, hidden)
     lead = 1 if has_lead_pose(_slice_beginning(motion), beginning, rigmap) else 0
     transition = find_lead_transition(motion, rigmap) if lead else None
     all_masks = (*masks, *(transition.masks(motion.skeleton.names) if transition else ()))
@@ -100,11 +102,15 @@ def denoise(
             progress(lead + stop, motion.num_frames)
     done = replace(join_segments(pieces), capture=motion.slice(lead, motion.num_frames), rig=rig)
     done = restore_lead_pose(motion, done, rigmap, transition, masks) if transition else done
-    if stretched:
-        note = f"offsets of {len(stretched)} bones vary only by noise: they are held at their medians"
-        status = replace(done.status, notes=(note, *done.notes))
-        capture = capture.slice(motion.num_frames - done.motion.num_frames, motion.num_frames)
-        done = replace(done, capture=capture, faults=(*stretched, *done.faults), status=status)
+    if stretched or swapped:
+        held = f"offsets of {len(stretched)} bones vary only by noise: they are held at their medians"
+        exchanged = f"left and right limbs are swapped {len(swapped)} times: they are exchanged back"
+        notes = (*[held] * bool(stretched), *[exchanged] * bool(swapped), *done.notes)
+        cut = motion.num_frames - done.motion.num_frames
+        swapped = tuple(replace(fault, start=fault.start - cut, stop=fault.stop - cut) for fault in swapped)
+        status = replace(done.status, notes=notes)
+        capture = capture.slice(cut, motion.num_frames)
+        done = replace(done, capture=capture, faults=(*stretched, *swapped, *done.faults), status=status)
     return done.assess()
 
 

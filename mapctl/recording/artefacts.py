@@ -27,10 +27,11 @@ class Artefact:
     stop: int
     """One past the last frame."""
     kind: str
-    """noise, spike, dropout, slide, float, or stretch: an offset of a bone that varies only by noise."""
+    """noise, spike, dropout, frozen, slide, float, swap: left and right limb exchanged, or stretch: an offset of a bone
+    that varies only by noise."""
     amount: float
-    """Noise's sigma, height of a spike or of a floating toe, distance of a slide, largest error of an offset; 0 for a
-    dropout."""
+    """Noise's sigma, height of a spike or of a floating toe, distance of a slide, largest error of an offset, largest
+    turn of a swap; 0 for a dropout and frozen frames."""
     unit: str
     """Unit of the amount."""
 

@@ -13,9 +13,9 @@ from mapctl.numerics.intervals import fill_missing, last_observed, true_interval
 from mapctl.recording.artefacts import Artefact
 from mapctl.recording.frozen_frames import find_held_frames
 from mapctl.recording.masks import ALL, Mask, expand_valid_masks
-from mapctl.recording.noise_estimation import estimate_angle_noise, estimate_position_noise
+from mapctl.recording.noise_estimation import RESOLUTION, estimate_angle_noise, estimate_position_noise
 from mapctl.recording.quaternion_signs import choose_continuous_signs
-from mapctl.recording.spike_detection import BODY, RESOLUTION, ROTATIONS, find_angle_spikes, find_position_spikes
+from mapctl.recording.spike_detection import BODY, ROTATIONS, find_angle_spikes, find_position_spikes
 
 _LOCKED_CHANGE = 1e-6  # of a quaternion, that rounding leaves of a joint which never moves
 

@@ -13,6 +13,8 @@ from torch import Tensor
 from mapctl import rotations
 from mapctl.recording.quaternion_signs import average_over_time
 
+RESOLUTION = 1e-5
+"""Radians and metres below which nothing differs: files have as few digits."""
 # Orders of the differences, with the fewest runs of frames that each needs; the first that has them counts. Runs that
 # many losses leave are few and short: a rough estimate by the last order is better than none.
 _ORDERS = {4: 12, 3: 12, 2: 4}
@@ -28,7 +30,7 @@ def estimate_angle_noise(
 
     Between two frames a joint turns by what it moved and by the difference of their noise. Where that is large, such
     turns end at half a turn and their differences tell too little: what each frame is away from the mean of those
-    around it takes their place.
+    around it takes their place. Angles that are rounded to a step err uniformly by half of it, however still they seem.
     """
     steps = rotations.to_rotation_vector(rotations.multiply(rotations.inverse(quats[:-1]), quats[1:]))
     sigma = _estimate_sigma(steps, seen, differenced=1)
@@ -37,7 +39,24 @@ def estimate_angle_noise(
         sigma[large] = torch.maximum(sigma[large], _estimate_about_mean(quats[:, large], seen[:, large]))
     known = sigma[(sigma > 0) & sigma.isfinite()]
     usual = known.median() if len(known) else sigma.new_zeros(())
-    return torch.where(sigma.isnan(), usual, sigma)
+    rounded = _find_step(steps.norm(dim=-1), seen) / math.sqrt(12)
+    return torch.maximum(torch.where(sigma.isnan(), usual, sigma), rounded)
+
+
+def _find_step(turns: Float[Tensor, "steps joints"], seen: Bool[Tensor, "frames joints"]) -> Float[Tensor, " joints"]:
+    """Find the step to which a joint's angles are rounded, radians; 0 where they are not.
+
+    One angle that changes by a step turns the joint by just that, whatever the order of its angles: of the turns
+    between two rests, most are equal, and none is smaller.
+    """
+    if len(turns) < 3:
+        return turns.new_zeros(turns.shape[1])
+    rests = turns < RESOLUTION
+    alone = rests[:-2] & ~rests[1:-1] & rests[2:] & _observed_windows(seen, 4)
+    sizes = torch.where(alone, turns[1:-1], math.nan)
+    step = torch.where(alone, sizes, math.inf).amin(dim=0)
+    rounded = (sizes.nanmedian(dim=0).values - step < RESOLUTION) & (alone.sum(dim=0) > 2)
+    return torch.where(rounded, step, 0.0)
 
 
 def _estimate_about_mean(

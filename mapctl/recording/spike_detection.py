@@ -8,17 +8,17 @@ from torch import Tensor
 
 from mapctl.numerics.intervals import true_intervals
 from mapctl.recording.local_regression import predict_frames
+from mapctl.recording.noise_estimation import RESOLUTION
 from mapctl.recording.quaternion_signs import choose_continuous_signs
 
 _MEDIAN_FRAMES = 5  # frames of the running median: bursts of up to two are detected
 _CANDIDATE_RATIO, _CANDIDATE_FRAMES = 3.0, 13  # distance from the median, by its median over so many frames
-_SHARE = 0.01  # share of a track's frames expected to spike
+SHARE = 0.01
+"""Share of a track's frames expected to spike."""
 ROTATIONS = 4 / 3 * math.pi * math.pi**3
 """Volume of all rotation vectors, among which a false rotation may be any."""
 BODY = 4 / 3 * math.pi * 2.0**3
 """Volume about a body, cubic metres, within which its false position lies."""
-RESOLUTION = 1e-5
-"""Radians and metres below which nothing differs: files have as few digits."""
 _ROUNDS = 5
 
 
@@ -29,12 +29,12 @@ def find_angle_spikes(
 ) -> Bool[Tensor, "frames joints"]:
     """Find which joints spike in which frames that are seen; `resolution` is the least noise of each angle, radians."""
     vectors = 2 * choose_continuous_signs(quats)
-    return _find_spikes(vectors, seen, resolution, math.log(_SHARE / ROTATIONS))
+    return _find_spikes(vectors, seen, resolution, math.log(SHARE / ROTATIONS))
 
 
 def find_position_spikes(places: Float[Tensor, "frames 3"], seen: Bool[Tensor, " frames"]) -> Bool[Tensor, " frames"]:
     """Find the frames in which the position spikes; metres."""
-    return _find_spikes(places[:, None], seen[:, None], None, math.log(_SHARE / BODY))[:, 0]
+    return _find_spikes(places[:, None], seen[:, None], None, math.log(SHARE / BODY))[:, 0]
 
 
 def _find_spikes(

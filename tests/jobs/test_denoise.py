@@ -28,6 +28,7 @@ def cleaned(motion, **changes):
     return denoise(motion, tiny_denoiser(), **{"settings": QUICK} | changes)
 
 
+LEGS = [[f"{part}_{side}" for part in ("UpperLeg", "LowerLeg", "Foot", "Toes")] for side in "LR"]
 OTHERS = [("bandai", 24), ("daz", 25), ("canonical", 31), ("canonical", 60), ("daz", 120)]
 
 
@@ -133,6 +134,20 @@ def test_bones_of_a_capture_with_noisy_offsets_are_rigid_afterwards():
     assert done.correction()[0].mean() > 1.0
     assert any("vary only by noise" in note for note in done.notes)
     assert {fault.joint for fault in done.faults if fault.kind == "stretch"} == set(truth.skeleton.names[2:])
+
+
+def test_legs_of_a_capture_that_are_swapped_are_exchanged_back():
+    truth = on_rig("bandai", 90)
+    legs = [[j for j, name in enumerate(truth.skeleton.names) if name in wanted] for wanted in LEGS]
+    quats = truth.local_quat_xyzw.clone()
+    quats[40:42, legs[0] + legs[1]] = quats[40:42, legs[1] + legs[0]]
+    given = replace(truth, local_quat_xyzw=quats)
+    done = cleaned(given)
+    assert done.capture is given or torch.equal(done.capture.local_quat_xyzw, quats)
+    assert [(f.start, f.stop) for f in done.faults if f.kind == "swap"] == [(40, 42)]
+    assert any("exchanged back" in note for note in done.notes)
+    apart = (done.motion.joint_positions() - truth.joint_positions()).norm(dim=-1)[38:44]
+    assert apart.max() < 0.05 < 0.2 < (given.joint_positions() - truth.joint_positions()).norm(dim=-1).max()
 
 
 def test_a_network_that_is_wrong_does_little_harm():

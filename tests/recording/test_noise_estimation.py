@@ -7,6 +7,7 @@ import torch
 from captures import DEGREE, shaken, swaying
 from helpers import generator
 
+from mapctl import rotations
 from mapctl.recording.noise_estimation import estimate_angle_noise, estimate_position_noise
 
 
@@ -53,6 +54,17 @@ def test_smooth_motion_without_noise_has_none():
 def test_a_joint_that_never_moves_has_none():
     still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).expand(100, 2, 4)
     assert estimate_angle_noise(still, all_seen(still)).tolist() == [0, 0]
+
+
+@pytest.mark.parametrize("order", ["ZXY", "XYZ"])
+@pytest.mark.parametrize("degrees", [1, 2])
+def test_angles_rounded_to_a_step_err_uniformly_by_it(degrees, order):
+    """Joints that move by less than a step a frame rest for most frames, and are no less noisy for that."""
+    quats, axes = swaying(400, fps=240), rotations.euler_axes([order] * 6)
+    angles = rotations.to_euler(rotations.to_matrix(quats), axes) / (degrees * DEGREE)
+    rounded = rotations.from_matrix(rotations.from_euler(angles.round() * degrees * DEGREE, axes))
+    assert told_deg(rounded).tolist() == pytest.approx([degrees / math.sqrt(12)] * 6, rel=1e-6)
+    assert told_deg(quats).max() < 0.05
 
 
 def test_spikes_do_not_upset_it():
