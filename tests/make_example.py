@@ -1,6 +1,6 @@
 """Makes the motion that mapctl brings along, `example:noisy-walk`: python tests/make_example.py FILE.bvh
 
-A made-up performer walks an S on the free weights, and the corruption of `mapctl bench denoise` spoils it. Nothing of
+A synthetic performer walks an S on the free weights, and noise of a known size is added (`corruptions.py`). Nothing of
 it comes from a capture or from the full weights, so that it is free for any use. Seeds are fixed; on another processor
 rounding may differ, and so the walk by a little.
 """
@@ -11,9 +11,9 @@ from fractions import Fraction
 from pathlib import Path
 
 import torch
+from corruptions import add_noise
 
 import mapctl
-from controllers.benchmarks.shared.corruptions import add_noise
 from mapctl import cli
 from mapctl.motion import Motion
 from mapctl.skeleton import Skeleton
@@ -73,7 +73,7 @@ def make_walk(folder: Path) -> Motion:
 def spoil(walk: Motion) -> Motion:
     """The walk with noise."""
     generator = torch.Generator().manual_seed(SEED)
-    return add_noise(walk, generator, degrees=DEGREES, centimetres=CENTIMETRES, spikes=SPIKES).motion
+    return add_noise(walk, generator, degrees=DEGREES, centimetres=CENTIMETRES, spikes=SPIKES)
 
 
 def main(out: Path) -> None:

@@ -154,7 +154,8 @@ def _denoise_segment(
             error=torch.zeros(motion.num_frames, CANONICAL.num_joints),
         )
     done = SegmentDenoiser(inspection, denoiser, settings, rig).run(densities, terms, round(seconds * PRIOR_FPS))
-    if not terms and _measure_roughness(done.motion) > _measure_roughness(motion):
+    whole = bool(inspection.known.all() and inspection.seen_root.all()) and not terms
+    if whole and _measure_roughness(done.motion) > _measure_roughness(motion):
         note = f"frames from {seconds:.1f} s on would become rougher than they are: they were not changed"
         done = replace(done, motion=motion, status=replace(done.status, notes=(*done.status.notes, note)))
     return replace(done, seconds=time.perf_counter() - began)

@@ -32,6 +32,7 @@ _SCALES = ((1.33, 1.5), (0.25, 3.0))
 standard errors a candidate beside the proposal must gain: there are many more moments in which to be wrong."""
 _SELECTION = 1.0  # of the noise that such a candidate keeps, counted once more, since it is the best of many
 _TEMPERATURE = 0.06  # of the noise's power: candidates that are as good as equal are averaged
+_LEAST_SEEN = 0.1  # of the frames that a smoother averages
 _LEAST_WEIGHT = 1e-9  # of an unobserved frame, so that the system of a column without any has a solution
 
 
@@ -148,11 +149,11 @@ def _estimate(
     ones = torch.ones_like(weights)
     near = _average(weights, ones, fps, seconds).clamp_min(_LEAST_WEIGHT)
     # The last is the capture itself: what no smoother can follow, as a kick, is no noise.
-    candidates, owns = [residual], [ones]
+    candidates, owns = [residual], [_require_seen(ones, weights, holds_proposal)]
     for hertz, smooth in zip(_list_cutoffs(fps), alone, strict=True):
         # Averaged as the change is, or the outermost frame, which a smoother follows most, were the proposal's alone.
         own = _average(_weigh_own(len(residual), hertz, fps)[:, None], ones[:, :1], fps, seconds)
-        own = own / _average_within(weights, hertz, fps)
+        own = _require_seen(own, _average_within(weights, hertz, fps), holds_proposal)
         back = [smooth_columns(residual * weights[..., None], weights, hertz, fps)] if holds_proposal else []
         candidates, owns = [*back, smooth, *candidates], [*[own] * len(back), own, *owns]
     # Risks differ by what is slower than the prior's rate alone: a faster camera has more frames of the same.
@@ -170,7 +171,7 @@ def _estimate(
     risks = risks + 2 * torch.stack(owns) - 1
     share = torch.softmax(-(risks + torch.stack(penalties)) * finer / _TEMPERATURE, dim=0)
     vector = (share[..., None] * torch.stack(candidates)).sum(dim=0)
-    error = sigma * (share * risks).sum(dim=0).clamp(0.0, 1.0).sqrt()
+    error = sigma * torch.where(share > 0, share * risks, 0.0).sum(dim=0).clamp(0.0, 1.0).sqrt()
     # Without noise the capture is the truth where it was observed.
     exact = (sigma == 0) & (weights > 0)
     held = share[0] * (holds_proposal & ~exact)
@@ -193,9 +194,16 @@ def _average(
 
 def _average_within(weights: Float[Tensor, "frames columns"], hertz: float, fps: float) -> Tensor:
     """Average the weights of the frames that a smoother sees: in a gap it knows little."""
-    taps = gaussian.gaussian_kernel(1 / (2 * math.pi * hertz), fps)
+    taps = gaussian.gaussian_kernel(1 / (4 * math.pi * hertz), fps)
     ones = gaussian.convolve(torch.ones_like(weights), taps, "nothing")
-    return (gaussian.convolve(weights, taps, "nothing") / ones).clamp_min(1e-3)
+    return gaussian.convolve(weights, taps, "nothing") / ones
+
+
+def _require_seen(own: Tensor, seen: Float[Tensor, "frames columns"], holds_proposal: bool) -> Tensor:
+    """Raise the noise that a smoother keeps where it sees few frames; where it sees hardly any, in a long gap, only a
+    proposal remains, if there is one."""
+    raised = own / seen.clamp_min(_LEAST_SEEN)
+    return raised.masked_fill(seen < _LEAST_SEEN, math.inf) if holds_proposal else raised
 
 
 @lru_cache(maxsize=8)

@@ -4,7 +4,6 @@ import json
 from dataclasses import replace
 
 import pytest
-import tiny_denoiser
 import tiny_transformer
 from helpers import run, tiny_density, walk
 from tiny_prior import save_tiny_prior
@@ -23,7 +22,7 @@ HELD_OUT = {"validation": ["bandai/a_walk_0.bvh"], "test": ["bandai/a_walk_1.bvh
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Two clips, two denoisers and two in-betweeners that did not see them, and one of each that did."""
+    """Two clips, two in-betweeners that did not see them, and one that did."""
     path = tmp_path_factory.mktemp("baselines")
     for number in range(2):
         motion = walk(60, seed=number)
@@ -31,10 +30,8 @@ def folder(tmp_path_factory):
         clip.parent.mkdir(parents=True, exist_ok=True)
         retarget.from_canonical(motion, retarget.identify_rig(motion.skeleton)).save(clip)
     for name, drawn, held_out in (("ours", 0.0, HELD_OUT), ("plain", 0.3, HELD_OUT), ("seeing", 0.0, {})):
-        for kind in (tiny_denoiser, tiny_transformer):
-            card = replace(kind.card(), data={"held_out": held_out})
-            kind_name = kind.__name__.removeprefix("tiny_")
-            checkpoints.save(kind.network(drawn=drawn).state_dict(), card, path / f"{name}-{kind_name}.safetensors")
+        card = replace(tiny_transformer.card(), data={"held_out": held_out})
+        checkpoints.save(tiny_transformer.network(drawn=drawn).state_dict(), card, path / f"{name}.safetensors")
     return path
 
 
@@ -59,7 +56,7 @@ def test_models_are_named_once():
             baselines.list_models("ours", twice)
 
 
-_WITH_DATA = ("generation", "why", "denoise", "infill", "tween", "gaps")
+_WITH_DATA = ("generation", "why", "infill", "tween", "gaps")
 
 
 @pytest.mark.parametrize("table", ["free-run", "steer", "shots", *_WITH_DATA])
@@ -70,39 +67,22 @@ def test_tables_take_others_beside_their_own(table):
     assert vars(given)["baselines"] == "one,two"
 
 
-def words_of(folder, table, kind):
-    option = "--denoiser" if kind == "denoiser" else "--inbetweener"
-    return ["bench", table, "--data", folder / "data", option, folder / f"ours-{kind}.safetensors"]
+def words_of(folder, table):
+    return ["bench", table, "--data", folder / "data", "--inbetweener", folder / "ours.safetensors"]
 
 
-@pytest.mark.parametrize(
-    ("table", "kind"), [("denoise", "denoiser"), ("infill", "transformer"), ("tween", "transformer")], ids=str
-)
-def test_clips_that_another_model_has_seen_are_refused(folder, fails, table, kind):
-    seeing = folder / f"seeing-{kind}.safetensors"
-    said = fails(*words_of(folder, table, kind), "--baselines", seeing)
+@pytest.mark.parametrize("table", ["infill", "tween"])
+def test_clips_that_another_model_has_seen_are_refused(folder, fails, table):
+    seeing = folder / "seeing.safetensors"
+    said = fails(*words_of(folder, table), "--baselines", seeing)
     assert f"{seeing} was trained on bandai/a_walk_0.bvh" in said
-
-
-def test_denoisers_are_in_one_table(folder, capsys, monkeypatch):
-    def measure(clips, denoiser, *, inbetweener, densities, progress):
-        return [{"what": what, "clips": len(clips), "name": denoiser.name} for what in ("spikes", "gaps")]
-
-    monkeypatch.setattr("mapctl.commands.bench.denoise.benchmark_denoising", measure)
-    ours, plain = (str(folder / f"{name}-denoiser.safetensors") for name in ("ours", "plain"))
-    assert run(*words_of(folder, "denoise", "denoiser"), "--baselines", plain, "--json") == 0
-    rows = json.loads(capsys.readouterr().out)["rows"]
-    assert [(row["what"], row["model"]) for row in rows] == [
-        (what, name) for what in ("spikes", "gaps") for name in (ours, plain)
-    ]
-    assert all(row["name"] == row["model"] and row["clips"] == 2 for row in rows)
 
 
 def test_infillers_need_one_that_they_are_compared_with(folder, fails):
     from tiny_infiller import save_tiny_infiller
 
     save_tiny_infiller(folder / "infiller.safetensors", drawn=0.1)
-    said = fails(*words_of(folder, "infill", "transformer"), "--baselines", folder / "infiller.safetensors")
+    said = fails(*words_of(folder, "infill"), "--baselines", folder / "infiller.safetensors")
     assert "name it by --infiller" in said
 
 
@@ -110,8 +90,8 @@ def test_inbetweeners_are_in_the_tables_by_kind(folder, capsys, monkeypatch):
     place = "mapctl.commands.bench.infill"
     monkeypatch.setattr(f"{place}.benchmark_infilling_by_kind", lambda kinds, network: [{"what": network.name}])
     monkeypatch.setattr(f"{place}.benchmark_missing_joints", lambda kinds, network: [{"what": "lost joints"}])
-    ours, plain = (str(folder / f"{name}-transformer.safetensors") for name in ("ours", "plain"))
-    assert run(*words_of(folder, "infill", "transformer"), "--baselines", plain, "--json") == 0
+    ours, plain = (str(folder / f"{name}.safetensors") for name in ("ours", "plain"))
+    assert run(*words_of(folder, "infill"), "--baselines", plain, "--json") == 0
     rows = json.loads(capsys.readouterr().out)["rows"]
     assert [(row["model"], row["what"]) for row in rows] == [
         (ours, ours),
@@ -155,16 +135,16 @@ def test_free_runs_of_two_densities(tmp_path, capsys, monkeypatch):
 
 
 def test_clips_are_those_whose_paths_hold_a_pattern(folder, fails):
-    cards = {"ours": checkpoints.read_card(folder / "ours-denoiser.json")}
+    cards = {"ours": checkpoints.read_card(folder / "ours.json")}
     assert baselines.find_held_out(cards, "_1") == {"validation": [], "test": ["bandai/a_walk_1.bvh"]}
     assert baselines.find_held_out(cards) == HELD_OUT
-    words = words_of(folder, "denoise", "denoiser")
+    words = words_of(folder, "infill")
     assert "none of the clips that were kept for measuring has a path with 'cmu'" in fails(*words, "--clips", "cmu")
     assert "--clips is no regular expression" in fails(*words, "--clips", "(")
 
 
 def test_a_model_has_not_seen_what_its_pattern_for_paths_leaves_out(folder):
-    card = checkpoints.read_card(folder / "ours-denoiser.json")
+    card = checkpoints.read_card(folder / "ours.json")
     other = replace(card, data={"match": "^cmu", "held_out": {}})
     assert baselines.find_held_out({"ours": card, "other": other}) == HELD_OUT
     seeing = replace(card, data={"match": "walk_0", "held_out": {}})

@@ -27,8 +27,8 @@ def test_speed_is_meant_where_no_table_is_named(words):
 
 
 def test_tables_have_options_of_their_own():
-    found = cli.parse(["bench", "denoise", "--data", "mocap", "--count", "10", "--prior", "auto"])
-    assert found == bench.Denoise(data=Path("mocap"), count=10, prior="auto")
+    found = cli.parse(["bench", "tween", "--data", "mocap", "--count", "10", "--prior", "general"])
+    assert found == bench.Tween(data=Path("mocap"), count=10, prior="general")
     assert cli.parse(["bench", "live", "--minutes", "2"]) == bench.Live(minutes=2.0)
     assert cli.parse(["bench", "gaps", "--data", "mocap"]) == bench.Gaps(data=Path("mocap"))
 

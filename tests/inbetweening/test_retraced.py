@@ -133,7 +133,7 @@ def test_a_gap_of_its_own_keeps_the_trajectory_that_is_proposed_with_it():
     given = told_by(motion, stretch=1.5)
     done = retraced(motion, given, masks, inbetweener=SlerpInbetweener(), settings=UNFINISHED).motion
     straight = torch.lerp(motion.root_position[9], motion.root_position[40], 16 / 31)
-    torch.testing.assert_close(done.root_position[25, ::2], straight[::2], atol=0.02, rtol=0)
+    torch.testing.assert_close(done.root_position[25, ::2], straight[::2], atol=0.04, rtol=0)
 
 
 def test_map_plants_the_feet_and_leaves_what_is_known():

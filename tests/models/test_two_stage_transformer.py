@@ -11,7 +11,6 @@ import priors
 from mapctl import cli
 from mapctl.inbetweening.partial_motion import KnownParts
 from priors import checkpoints
-from priors.pose_transformer.growing import can_grow
 from priors.pose_transformer.inbetweener import PoseTransformer
 from priors.pose_transformer.network import _Layer, _rotary_phases
 from priors.training.augmentation.pose_windows import PoseWindows, add_targets
@@ -97,7 +96,6 @@ def test_two_stages_are_saved_and_loaded(tmp_path):
     loaded = priors.load_inbetweener(str(path))
     assert isinstance(loaded, PoseTransformer)
     assert loaded.network.config == TWO
-    assert not can_grow(CONFIG, TWO)
 
 
 def test_its_weights_are_about_as_many_as_a_stitchers():

@@ -2,7 +2,6 @@
 
 import ast
 import re
-from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -33,12 +32,6 @@ def docstrings() -> Iterator[tuple[str, str]]:
     """Every one with its place."""
     for place, node in nodes(ast.Module, ast.ClassDef, *FUNCTIONS):
         yield place, ast.get_docstring(node) or ""  # pyright: ignore[reportArgumentType]
-
-
-def crowded_folders() -> Iterable[str]:
-    """Folders of more modules than one looks over; each command is a file."""
-    count = Counter(file.parent for file in PACKAGE_FILES if file.name != "__init__.py")
-    return [f"{folder}: {number}" for folder, number in count.items() if number > MAX_MODULES and folder != COMMANDS]
 
 
 def late_imports() -> Iterable[str]:
@@ -164,7 +157,6 @@ def lines_out_of_format() -> Iterable[str]:
 
 
 CEILINGS = {
-    crowded_folders: 0,
     late_imports: 10,
     modules_in_cycles: 0,
     docstrings_that_begin_with_of: 0,

@@ -116,7 +116,7 @@ def test_the_build_ends_where_a_page_is_not_up_to_date(tables, tmp_path):
 
 def test_pages_in_folders_are_found():
     shown = {page.name for page in measured_tables.list_pages(DOCS)}
-    assert {"results.md", "denoising.md", "weights.md"} <= shown
+    assert {"results.md", "infilling.md", "weights.md"} <= shown
 
 
 @pytest.mark.parametrize("page", list(measured_tables.list_pages(DOCS)), ids=lambda page: page.stem)

@@ -81,8 +81,15 @@ def test_what_is_bundled_was_trained_as_the_recipe_is_now(folder, model):
     """But for numbers of less precision, and for settings that are newer than the model and of no effect on it."""
     card = checkpoints.read_card(checkpoints.locate(folder + model.name).with_suffix(".json"))
     settings = json.loads(json.dumps(asdict(model.recipe.settings)))
+    free = {"bfloat16"} | ({"steps", "learning_rate"} if "--init-share" in card.training["command"] else set())
     for name, value in card.training["settings"].items():
-        assert value == settings[name] or name == "bfloat16", name
+        now = settings[name]
+        same = (
+            value.items() <= now.items()
+            if isinstance(value, dict) and not card.training.get("remark")
+            else value == now
+        )
+        assert same or name in free, name
 
 
 def test_the_page_shows_each_command():

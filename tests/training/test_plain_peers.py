@@ -97,7 +97,7 @@ def test_a_long_capture_is_cleaned_in_pieces_of_which_each_is_as_long_as_a_windo
 
 
 def test_what_is_wrong_costs_its_square_in_the_networks_own_units():
-    settings, windows = replace(denoiser_recipe.PLAIN[1], corruption=QUIET), corpus(1, 30).features[None]
+    settings, windows = replace(denoiser_recipe.PLAIN[1], corruption=QUIET, spread=0.0), corpus(1, 30).features[None]
     network = plain_network()
     right = compute_squared_losses(network, windows, settings, generator())
     assert right["squares"] < 1e-6

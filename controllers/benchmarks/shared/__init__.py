@@ -1,1 +1,1 @@
-"""Clips, corruptions and table rows that several benchmarks share."""
+"""Clips and table rows that several benchmarks share."""

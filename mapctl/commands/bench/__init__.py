@@ -163,20 +163,6 @@ class Live(PriorTable):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Denoise(MocapTable, ComparedTable):
-    """Clips that training did not see, corrupted in several ways, beside filters tuned on the truth."""
-
-    work = "mapctl.commands.bench.denoise"
-
-    denoiser: options.Name = "denoiser"
-    """The bundled denoiser, or the file or run folder of a trained one."""
-    inbetweener: options.Name = "transformer"
-    """For joints that are lost: the bundled transformer, or the file or run folder of another in-betweener."""
-    prior: options.MaybeName = None
-    """As `mapctl denoise` takes it."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class Infill(MocapTable):
     """Clips that training did not see, with pieces taken out."""
 
@@ -381,7 +367,6 @@ TABLES: dict[str, type[ModelCommand]] = {
     "why": Why,
     "steer": Steer,
     "live": Live,
-    "denoise": Denoise,
     "infill": Infill,
     "tween": Tween,
     "tweener": Tweener,

@@ -15,6 +15,7 @@ from mapctl.inbetweening.root_trajectory import LocalMotion
 from mapctl.metrics.root_prediction import SPANS, average_displacement_errors, compute_displacement_errors
 from priors.config import require_at_least
 from priors.training.augmentation.pose_windows import PoseWindows, Variation, find_kind
+from priors.training.augmentation.unfamiliar_poses import PoseVariation
 from priors.training.corpus import Corpus, Split
 from priors.training.devices import make_generator
 from priors.training.recipe import NetworkRecipe, Row, average_logarithms
@@ -46,7 +47,7 @@ class PathSettings:
     """How evenly windows are drawn from kinds of clips: 0 by their frames, 1 the same number from each."""
     kinds: tuple[str, ...] = ("walk-turn", "walk", "run|dash", "^cmu")
     """Kinds, as patterns of names; clips of none of these are another kind."""
-    variation: Variation = field(default_factory=Variation)
+    variation: Variation = field(default_factory=lambda: Variation(poses=PoseVariation(share=0.0, tilted=0.0)))
     """How bodies and tempos vary."""
     bfloat16: bool = False
     """The network computes in bfloat16; weights and loss stay in float32."""

@@ -10,12 +10,10 @@ from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits as cross_entropy
 
 from mapctl import rotations
-from mapctl.errors import CheckpointError, RequestError
+from mapctl.errors import RequestError
 from mapctl.inbetweening.partial_motion import KnownParts, PartialMotion
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
-from priors import checkpoints
 from priors.config import require_at_least
-from priors.pose_transformer.growing import can_grow, grow
 from priors.pose_transformer.network import QUANTILES, PoseTransformerConfig, PoseTransformerNetwork, ProposedPoses
 from priors.training.augmentation.part_masks import PartSettings, sample_known_parts
 from priors.training.augmentation.pose_windows import PoseWindows, Variation, add_targets
@@ -185,16 +183,6 @@ class PoseTransformerRecipe(NetworkRecipe[PoseTransformerConfig, PoseTransformer
     def make_untaught(self, parts: Split) -> PoseTransformerTrainer:
         """The trainer, its weights drawn."""
         return PoseTransformerTrainer(self.config, self.settings, parts.train)
-
-    def read_initial_weights(self, name: str, trainer: PoseTransformerTrainer) -> dict[str, Tensor]:
-        """Another pose transformer's weights, grown where it is smaller."""
-        tensors, card = checkpoints.load(checkpoints.locate(name))
-        if card.kind == self.kind:
-            small = PoseTransformerConfig(**card.config)
-            if can_grow(small, self.config):
-                return grow(tensors, small, trainer.network)
-        wanted = f"{self.kind} of {self.config.as_card()}, or a smaller one with heads as wide"
-        raise CheckpointError(f"{name} holds: {card.kind} of {card.config}; wanted: {wanted}")
 
     @classmethod
     def find_headline(cls, row: Row) -> float:

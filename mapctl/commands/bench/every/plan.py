@@ -23,10 +23,6 @@ _PLAN = {
     "free-run-free": "free-run --prior free/locomotion",
     "shots": "shots --count 40 --data DATA",
     "shots-corners": "shots --corners --seeds 4",
-    "denoise": "denoise --data DATA --count 30",
-    "denoise-free": "denoise --data DATA --count 30 --clips bandai --baselines free/denoiser"
-    " --inbetweener free/transformer",
-    "denoise-free-cmu": "denoise --data DATA --denoiser free/denoiser --inbetweener free/transformer --count 60",
     "infill": "infill --data DATA --count 30",
     "infill-free": "infill --data DATA --clips bandai --baselines free/transformer",
     "infill-free-cmu": "infill --data DATA --inbetweener free/transformer --count 60",
