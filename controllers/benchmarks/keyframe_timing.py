@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import torch
 
-from controllers.benchmarks.infilling import scale_to_canonical_bones
+from controllers.benchmarks.shared.bones import scale_to_canonical_bones
 from controllers.benchmarks.shared.tables import Row
 from mapctl.inbetweening.pose_pairs import TRAVELLING_DISTANCE, TimingModel, sample_pose_pairs
 from mapctl.motion import Motion

@@ -16,7 +16,7 @@ from mapctl.inbetweening.missing import MissingMask, interpolate_missing, restor
 from mapctl.inbetweening.query import GapQuery
 from mapctl.inbetweening.seam_blending import blend_seams_in_positions, blend_seams_in_rotations
 from mapctl.motion import Motion
-from mapctl.recording.frequency_bands import upsample
+from mapctl.recording.splines import transfer_change
 from mapctl.retarget import RigMap, from_canonical, to_canonical
 from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import CANONICAL
@@ -85,29 +85,11 @@ class CanonicalClip:
         """
         filled = self.interpolated
         if made is not query.motion or query.keep_trajectory or query.loose is not None:
-            changed = self._apply_change(made, query)
-            filled = from_canonical(changed, self.rigmap, self.interpolated)
+            at_prior_rate = self.canonical.fps == PRIOR_FPS
+            own = made if at_prior_rate else transfer_change(self.canonical, query.motion, made, query.seconds)
+            filled = from_canonical(own, self.rigmap, self.interpolated)
             filled = self._blend_seams(restore_observed(filled, self.interpolated, self.missing))
         return self.restore_observed(filled)
-
-    def _apply_change(self, made: Motion, query: GapQuery) -> Motion:
-        """Change the canonical clip, at its own rate, as an answer changes the query's motion: frames beside a gap, and
-        how the interpolation leaves them, stay as captured, whatever the rate."""
-        if self.canonical.fps == PRIOR_FPS:
-            return made
-        shown, canonical, fps, frames = (
-            query.motion,
-            self.canonical,
-            float(self.canonical.fps),
-            self.missing.root.shape[0],
-        )
-        turns = rotations.to_rotation_vector(
-            rotations.multiply(rotations.inverse(shown.local_quat_xyzw), made.local_quat_xyzw)
-        )
-        turns = upsample(turns, query.seconds, fps=fps, frames=frames)
-        moved = upsample(made.root_position - shown.root_position, query.seconds, fps=fps, frames=frames)
-        quats = rotations.multiply(canonical.local_quat_xyzw, rotations.from_rotation_vector(turns))
-        return replace(canonical, root_position=canonical.root_position + moved, local_quat_xyzw=quats)
 
     def restore_observed(self, motion: Motion) -> Motion:
         """Return the original with its missing values from a motion on its rig."""

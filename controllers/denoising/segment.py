@@ -20,11 +20,11 @@ from mapctl.problem.density_selection import DensityInterval
 from mapctl.problem.solution import Outcome, Status
 from mapctl.protocols import Denoiser, Density
 from mapctl.recording import Capture, artefacts
-from mapctl.recording.frequency_bands import upsample
 from mapctl.recording.fusion import fuse_positions, fuse_rotations, measure_kept_noise, smooth_columns
 from mapctl.recording.inspection import Inspection
 from mapctl.recording.noise_estimation import estimate_angle_noise, estimate_position_noise
 from mapctl.recording.quaternion_signs import choose_continuous_signs
+from mapctl.recording.splines import transfer_change, upsample
 from mapctl.retarget import RigMap, to_canonical
 from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import CANONICAL, TOES, leg_length
@@ -70,8 +70,9 @@ class SegmentDenoiser:
         """Propose, fuse with the capture, refine, and retarget to the rig. The segment begins at frame `first_frame`
         of the whole capture, at PRIOR_FPS, which is the time that terms see.
         """
-        proposal, contacts = self._propose()
+        proposal, contacts, spread = self._propose()
         fused, share, error = self._fuse(proposal)
+        error = torch.where(self.seen, error, spread)  # where nothing was observed, the model's own estimate
         shown = fused.resample(PRIOR_FPS)
         at = (torch.arange(shown.num_frames) * self.fps / PRIOR_FPS).round().long().clamp(max=fused.num_frames - 1)
         contacts = contacts[at]
@@ -87,7 +88,9 @@ class SegmentDenoiser:
             terms=terms,
             first_frame=first_frame,
         )
-        motion = retarget.from_canonical(self._change(fused, shown, refined.motion), self.rigmap, self.repaired)
+        seconds = torch.arange(shown.num_frames, dtype=torch.float64) / PRIOR_FPS
+        changed = transfer_change(fused, shown, refined.motion, seconds)
+        motion = retarget.from_canonical(changed, self.rigmap, self.repaired)
         inspection = self.inspection
         return DenoiseSolution(
             motion,
@@ -129,7 +132,8 @@ class SegmentDenoiser:
         )
         found += artefacts.list_spikes(names, inspection.spikes, angles, "deg")
         found += artefacts.list_spikes([travelling], inspection.spikes_root[:, None], distances[:, None], "cm")
-        found += artefacts.list_dropouts(names, inspection.dropouts)
+        found += inspection.faults
+        found += artefacts.list_dropouts(names, inspection.dropouts & ~inspection.frozen[:, None])
         toes = shown.skeleton.indices(TOES)
         feet = [self.rigmap.joint_of[toe] for toe in toes]
         known = [names[foot] if foot is not None else TOES[side] for side, foot in enumerate(feet)]
@@ -149,8 +153,9 @@ class SegmentDenoiser:
         root = estimate_position_noise(self.canonical.root_position, self.seen_root)
         return sigma, root if settings.sigma_cm is None else settings.sigma_cm / 100
 
-    def _propose(self) -> tuple[Motion, Float[Tensor, "frames 2"]]:
-        """Propose the motion on the performer's bones, and contact logits, at the capture's rate.
+    def _propose(self) -> tuple[Motion, Float[Tensor, "frames 2"], Float[Tensor, "frames joints"]]:
+        """Propose the motion on the performer's bones, contact logits, and the expected error of each of a joint's
+        angles, radians, at the capture's rate.
 
         The denoiser sees every nth frame of the capture without what is too fast for that, or at low rates its frames
         with unobserved ones between them, so that no noise is interpolated: whole steps that come nearest to PRIOR_FPS.
@@ -187,7 +192,8 @@ class SegmentDenoiser:
         quats = follow(rotations.make_sign_continuous(cleaned.pose.local_quat_xyzw[0].double()))
         quats = torch.nn.functional.normalize(quats, dim=-1)
         root = follow(cleaned.pose.root_position[0].double()) / scale
-        return Motion(self.rigmap.skeleton, self.canonical.fps, root, quats), follow(cleaned.contact_logits[0])
+        motion = Motion(self.rigmap.skeleton, self.canonical.fps, root, quats)
+        return motion, follow(cleaned.contact_logits[0]), follow(cleaned.log_spread[0, :, 1:].double()).exp()
 
     def _fuse(self, proposal: Motion) -> tuple[Motion, Float[Tensor, "frames joints"], Float[Tensor, "frames joints"]]:
         """Fuse the proposal with the capture; also the share of the proposal, and the error, radians, that remains."""
@@ -200,17 +206,6 @@ class SegmentDenoiser:
         quats = rotations.make_sign_continuous(turned.values)
         fused = replace(proposal, root_position=moved.values[:, 0], local_quat_xyzw=quats)
         return fused, turned.share, turned.error
-
-    def _change(self, fused: Motion, shown: Motion, refined: Motion) -> Motion:
-        """Change a motion at the capture's rate as the MAP stage changed it at PRIOR_FPS."""
-        turned = rotations.multiply(rotations.inverse(shown.local_quat_xyzw), refined.local_quat_xyzw)
-        seconds = torch.arange(shown.num_frames, dtype=torch.float64) / PRIOR_FPS
-        angles, moved = (
-            upsample(change, seconds, fps=self.fps, frames=fused.num_frames)
-            for change in (rotations.to_rotation_vector(turned), refined.root_position - shown.root_position)
-        )
-        quats = rotations.multiply(fused.local_quat_xyzw, rotations.from_rotation_vector(angles))
-        return replace(fused, root_position=fused.root_position + moved, local_quat_xyzw=quats)
 
 
 def _smooth_noncanonical_joints(inspection: Inspection, rig: Rig | None) -> Motion:

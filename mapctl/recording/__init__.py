@@ -1,4 +1,4 @@
-"""Recordings of motion: their masks, artefacts, noise, spikes and gaps, and how they are split into frequency bands."""
+"""Recordings of motion: their masks, artefacts, noise, spikes and gaps, and their fusion with a proposal."""
 
 from mapctl.recording.proposal import CaptureProposal
 from mapctl.recording.recording import Capture

@@ -90,12 +90,6 @@ class Inspection:
             frozen=self.frozen[part],
         )
 
-    def with_locked_joints(self) -> Motion:
-        """Return the recording, its locked joints as they are elsewhere in frames in which they are not observed."""
-        motion = self.motion
-        held = _hold_last_observed(motion.local_quat_xyzw, self.seen)
-        return replace(motion, local_quat_xyzw=torch.where(self.locked[:, None], held, motion.local_quat_xyzw))
-
     def repaired(self) -> Motion:
         """Return the recording with artefacts filled in, interpolated from the frames around them."""
         motion, seen = self.motion, self.seen

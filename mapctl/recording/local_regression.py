@@ -92,8 +92,8 @@ def _predict(
     lags = torch.arange(-side, side + 1, dtype=values.dtype) / side
     powers = lags ** torch.arange(2 * degree + 1)[:, None]
     powers[:, side] = 0  # the frame itself is left out
-    values = values - values.mean(dim=0)
-    known = seen.to(values)
+    centre, known = values.mean(dim=0), seen.to(values)
+    values = values - centre
     moments = _sum_over_lags(known, powers)
     shown = values * known[..., None]
     sums = torch.stack([_sum_over_lags(shown[..., axis], powers[: degree + 1]) for axis in range(shown.shape[-1])], -1)
@@ -107,7 +107,7 @@ def _predict(
     # A moment of rest is no reason to expect none of the motion that the track has otherwise.
     usual = torch.where(seen & (total > 0), shrunk, math.nan).nanmedian(dim=0).values.nan_to_num(0.0)
     scale = (torch.maximum(shrunk, usual) * (1 + inverse[..., 0, 0].clamp_min(0))).sqrt()
-    return Prediction(mean, (values - mean).norm(dim=-1), shrunk.sqrt(), scale, total)
+    return Prediction(mean + centre, (values - mean).norm(dim=-1), shrunk.sqrt(), scale, total)
 
 
 def _sum_over_lags(

@@ -32,9 +32,11 @@ def find_angle_spikes(
     return _find_spikes(vectors, seen, resolution, math.log(SHARE / ROTATIONS))
 
 
-def find_position_spikes(places: Float[Tensor, "frames 3"], seen: Bool[Tensor, " frames"]) -> Bool[Tensor, " frames"]:
+def find_position_spikes(
+    positions: Float[Tensor, "frames 3"], seen: Bool[Tensor, " frames"]
+) -> Bool[Tensor, " frames"]:
     """Find the frames in which the position spikes; metres."""
-    return _find_spikes(places[:, None], seen[:, None], None, math.log(SHARE / BODY))[:, 0]
+    return _find_spikes(positions[:, None], seen[:, None], None, math.log(SHARE / BODY))[:, 0]
 
 
 def _find_spikes(

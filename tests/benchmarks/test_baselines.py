@@ -56,7 +56,7 @@ def test_models_are_named_once():
             baselines.list_models("ours", twice)
 
 
-_WITH_DATA = ("generation", "why", "infill", "tween", "gaps")
+_WITH_DATA = ("generation", "why", "tween")
 
 
 @pytest.mark.parametrize("table", ["free-run", "steer", "shots", *_WITH_DATA])
@@ -71,34 +71,20 @@ def words_of(folder, table):
     return ["bench", table, "--data", folder / "data", "--inbetweener", folder / "ours.safetensors"]
 
 
-@pytest.mark.parametrize("table", ["infill", "tween"])
+@pytest.mark.parametrize("table", ["tween"])
 def test_clips_that_another_model_has_seen_are_refused(folder, fails, table):
     seeing = folder / "seeing.safetensors"
     said = fails(*words_of(folder, table), "--baselines", seeing)
     assert f"{seeing} was trained on bandai/a_walk_0.bvh" in said
 
 
-def test_infillers_need_one_that_they_are_compared_with(folder, fails):
-    from tiny_infiller import save_tiny_infiller
-
-    save_tiny_infiller(folder / "infiller.safetensors", drawn=0.1)
-    said = fails(*words_of(folder, "infill"), "--baselines", folder / "infiller.safetensors")
-    assert "name it by --infiller" in said
-
-
-def test_inbetweeners_are_in_the_tables_by_kind(folder, capsys, monkeypatch):
-    place = "mapctl.commands.bench.infill"
-    monkeypatch.setattr(f"{place}.benchmark_infilling_by_kind", lambda kinds, network: [{"what": network.name}])
-    monkeypatch.setattr(f"{place}.benchmark_missing_joints", lambda kinds, network: [{"what": "lost joints"}])
+def test_inbetweeners_are_in_one_table(folder, capsys, monkeypatch):
+    place = "mapctl.commands.bench.tween.benchmark_tweening"
+    monkeypatch.setattr(place, lambda kinds, network, densities, progress: [{"what": network.name}])
     ours, plain = (str(folder / f"{name}.safetensors") for name in ("ours", "plain"))
-    assert run(*words_of(folder, "infill"), "--baselines", plain, "--json") == 0
+    assert run(*words_of(folder, "tween"), "--baselines", plain, "--json") == 0
     rows = json.loads(capsys.readouterr().out)["rows"]
-    assert [(row["model"], row["what"]) for row in rows] == [
-        (ours, ours),
-        (plain, plain),
-        (ours, "lost joints"),
-        (plain, "lost joints"),
-    ]
+    assert [(row["model"], row["what"]) for row in rows] == [(ours, ours), (plain, plain)]
 
 
 def test_densities_and_refiners_are_variants_by_their_names():
@@ -138,7 +124,7 @@ def test_clips_are_those_whose_paths_hold_a_pattern(folder, fails):
     cards = {"ours": checkpoints.read_card(folder / "ours.json")}
     assert baselines.find_held_out(cards, "_1") == {"validation": [], "test": ["bandai/a_walk_1.bvh"]}
     assert baselines.find_held_out(cards) == HELD_OUT
-    words = words_of(folder, "infill")
+    words = words_of(folder, "tween")
     assert "none of the clips that were kept for measuring has a path with 'cmu'" in fails(*words, "--clips", "cmu")
     assert "--clips is no regular expression" in fails(*words, "--clips", "(")
 

@@ -30,7 +30,6 @@ def test_tables_have_options_of_their_own():
     found = cli.parse(["bench", "tween", "--data", "mocap", "--count", "10", "--prior", "general"])
     assert found == bench.Tween(data=Path("mocap"), count=10, prior="general")
     assert cli.parse(["bench", "live", "--minutes", "2"]) == bench.Live(minutes=2.0)
-    assert cli.parse(["bench", "gaps", "--data", "mocap"]) == bench.Gaps(data=Path("mocap"))
 
 
 @pytest.mark.parametrize("name", bench.TABLES)
@@ -45,11 +44,11 @@ def test_every_table_has_help(name, capsys):
     ("words", "said"),
     [
         (["speed", "--count", "3"], "--count 3 (see mapctl bench speed --help)"),
-        (["infill"], "--data"),
-        (["infill"], "mapctl bench infill --help"),
+        (["tween"], "--data"),
+        (["tween"], "mapctl bench tween --help"),
         (["fly"], "speed, ablation, follow"),
         (["fly"], "(see mapctl bench --help)"),
-        (["infill", "--data", "."], "does not hold the clips kept from training"),
+        (["tween", "--data", "."], "does not hold the clips kept from training"),
         (["speed", "--beside", "docs"], "docs is no checkout of mapctl"),
         (["speed", "--beside", "docs", "--turns", "0"], "--turns must be 1 or more"),
         (["live", "--minutes", "0"], "--minutes must be more than 0"),

@@ -37,10 +37,10 @@ def folder(tmp_path_factory):
 def test_outputs_are_what_they_were(command, folder, monkeypatch):
     monkeypatch.chdir(folder)
     if command == "measure" and not golden.Path("follow.bvh").exists():
-        golden.run_command("follow")
+        golden.run_command(golden.COMMANDS["follow"])
     kept = json.loads(golden.FILE.read_text())
     to_the_bit = kept["machine"] == golden.kind_of_machine()
-    found = golden.run_command(command)
+    found = golden.run_command(golden.COMMANDS[command])
     assert golden.differences(found, kept["outputs"][command], to_the_bit=to_the_bit) == []
 
 

@@ -84,7 +84,6 @@ def test_a_joint_that_never_moves_is_known_where_it_is_masked(motion):
     assert found.locked[joint]
     assert found.known[:, joint].all()
     assert not found.lost.any()
-    assert apart_deg(found.with_locked_joints().local_quat_xyzw, still.local_quat_xyzw).max() < 1e-5
 
 
 def test_a_joint_that_moves_is_lost_where_it_is_masked(motion):
@@ -93,7 +92,6 @@ def test_a_joint_that_moves_is_lost_where_it_is_masked(motion):
     found = inspect_recording(wild, masks)
     assert not found.locked[joint]
     assert torch.equal(found.lost, found.dropouts)
-    assert torch.equal(found.with_locked_joints().local_quat_xyzw[:, joint], wild.local_quat_xyzw[:, joint])
 
 
 def test_a_clean_recording_is_believed(motion):

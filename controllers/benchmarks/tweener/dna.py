@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from controllers.benchmarks.infilling import scale_to_canonical_bones
+from controllers.benchmarks.shared.bones import scale_to_canonical_bones
 from controllers.benchmarks.shared.held_out import HeldOut, find_held_out
 from controllers.benchmarks.shared.tables import Row
 from controllers.denoising.denoise import begins_with_tpose

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import torch
 
-from controllers.benchmarks.infilling import scale_to_canonical_bones
+from controllers.benchmarks.shared.bones import scale_to_canonical_bones
 from controllers.benchmarks.shared.tables import Row
 from controllers.benchmarks.tweener.gap_measures import GapSums, Method, measure_gap, query_gaps
 from controllers.inbetweening.pipeline import InfillSettings

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import torch
 
-from controllers.benchmarks.infilling import scale_to_canonical_bones
+from controllers.benchmarks.shared.bones import scale_to_canonical_bones
 from controllers.benchmarks.shared.tables import Row
 from controllers.benchmarks.tweener.gap_measures import GapSums, Method, measure_gap
 from controllers.inbetweening.pipeline import InfillSettings

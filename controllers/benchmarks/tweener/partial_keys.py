@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from controllers.benchmarks.infilling import scale_to_canonical_bones, slice_middle
+from controllers.benchmarks.shared.bones import scale_to_canonical_bones, slice_middle
 from controllers.benchmarks.shared.tables import Row
 from controllers.benchmarks.tweener.gap_measures import GapSums, Method, compare_with_mocap, measure_gap
 from controllers.inbetweening.pipeline import InfillSettings

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from controllers.benchmarks.infilling import scale_to_canonical_bones
+from controllers.benchmarks.shared.bones import scale_to_canonical_bones
 from controllers.benchmarks.shared.tables import Row
 from controllers.inbetweening.proposers.retraced import predict_trajectory
 from mapctl.inbetweening.root_trajectory import LocalMotion, RootTrajectory

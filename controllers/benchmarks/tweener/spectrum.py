@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from controllers.benchmarks.infilling import scale_to_canonical_bones
+from controllers.benchmarks.shared.bones import scale_to_canonical_bones
 from controllers.benchmarks.shared.tables import Row
 from controllers.benchmarks.tweener.gap_measures import Method
 from controllers.benchmarks.tweener.long_gaps import cut_middle

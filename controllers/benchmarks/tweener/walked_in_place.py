@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import torch
 
-from controllers.benchmarks.infilling import scale_to_canonical_bones
+from controllers.benchmarks.shared.bones import scale_to_canonical_bones
 from controllers.benchmarks.shared.tables import Row
 from controllers.inbetweening.infill import retraced
 from mapctl.features import PRIOR_FPS

@@ -163,20 +163,6 @@ class Live(PriorTable):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Infill(MocapTable):
-    """Clips that training did not see, with pieces taken out."""
-
-    work = "mapctl.commands.bench.infill"
-
-    infiller: options.MaybeName = None
-    """A trained infiller, its file or run folder, for the tables of Kaufmann et al. 2020; without one they are left
-    out."""
-    baselines: Annotated[str, arg(metavar="RUN,RUN,...")] = ""
-    """Other models to compare, bundled or trained: infillers in those tables, as they are, and other in-betweeners in
-    the tables by kind of clip."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class Tween(MocapTable, ComparedTable):
     """Clips that training did not see, of which keys are left, and such clips without their ends."""
 
@@ -238,13 +224,6 @@ class Representation(Table):
     """Seed of what is held out, weights, poses and headings."""
     cache: options.MaybeDataFolder = None
     """Folder of a training run's clips as features (RUN/cache), which take minutes to read."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Gaps(Tween):
-    """Such clips without frames in their middle: how far the answers are from the truth, by who gave them."""
-
-    work = "mapctl.commands.bench.gaps"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -367,11 +346,9 @@ TABLES: dict[str, type[ModelCommand]] = {
     "why": Why,
     "steer": Steer,
     "live": Live,
-    "infill": Infill,
     "tween": Tween,
     "tweener": Tweener,
     "representation": Representation,
-    "gaps": Gaps,
     "transitions": Transitions,
     "timing": Timing,
     "shots": Shots,

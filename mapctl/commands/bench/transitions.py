@@ -7,7 +7,7 @@ from tempfile import TemporaryDirectory
 import torch
 
 import priors
-from controllers.benchmarks.infilling import scale_to_canonical_bones
+from controllers.benchmarks.shared.bones import scale_to_canonical_bones
 from controllers.benchmarks.shared.held_out import load_canonical
 from controllers.benchmarks.shared.tables import Row
 from controllers.benchmarks.transitions import (

@@ -1,7 +1,5 @@
 """`mapctl bench tween`: motion through a few keys, and ends extended."""
 
-from collections.abc import Callable
-
 import priors
 from controllers.benchmarks.shared.held_out import load_canonical
 from controllers.benchmarks.shared.tables import Row
@@ -14,18 +12,13 @@ from mapctl.features import PRIOR_FPS
 
 
 def run(table: Tween) -> int:
-    """Measure and print."""
-    return compare_inbetweeners(table, "tween", benchmark_tweening)
-
-
-def compare_inbetweeners(table: Tween, title: str, benchmark: Callable[..., list[Row]]) -> int:
-    """Measure the in-betweeners of a table on the same clips, canonical and at the prior's rate, and print the rows."""
+    """Measure the in-betweeners on the same clips, canonical and at the prior's rate, and print the rows."""
     inbetweeners = {name: priors.load_inbetweener(name) for name in list_models(table.inbetweener, table.baselines)}
     held_out = find_held_out({name: each.card for name, each in inbetweeners.items()}, table.clips)
     kinds, densities = load_canonical(table.data, held_out, table.count, fps=PRIOR_FPS), priors.load_choice(table.prior)
 
     def measure(name: str) -> list[Row]:
-        with show_progress(title) as progress:
-            return benchmark(kinds, inbetweeners[name], densities, progress=progress)
+        with show_progress("tween") as progress:
+            return benchmark_tweening(kinds, inbetweeners[name], densities, progress=progress)
 
     return print_rows(table, measure_each(list(inbetweeners), measure))

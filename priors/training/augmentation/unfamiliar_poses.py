@@ -86,9 +86,9 @@ def vary_features(
 
 
 def keep_still(
-    contacts: Float[Tensor, "batch frames 2"], places: Float[Tensor, "batch frames joints 3"]
+    contacts: Float[Tensor, "batch frames 2"], positions: Float[Tensor, "batch frames joints 3"]
 ) -> Float[Tensor, "batch frames 2"]:
     """Keep contacts of toes that still do not travel; world positions, metres."""
-    toes = places[..., list(TOE_JOINTS), ::2]
+    toes = positions[..., list(TOE_JOINTS), ::2]
     speed = torch.diff(toes, dim=1, prepend=toes[:, :1]).norm(dim=-1) * PRIOR_FPS
     return contacts * (speed < ContactSettings.slow)

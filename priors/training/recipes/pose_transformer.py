@@ -151,15 +151,15 @@ class PoseTransformerTrainer(GradientTrainer[PoseTransformerNetwork]):
                 if frames > int(windows.lengths.max()):
                     continue
                 truth = windows.draw(_VALIDATED_WINDOWS, frames, make_generator(gap))
-                told = torch.ones(truth.heading.shape, dtype=torch.bool)
-                told[:, past : past + gap] = False
-                error, share = measure_error(self.network, truth, KnownParts.whole(told))
+                observed = torch.ones(truth.heading.shape, dtype=torch.bool)
+                observed[:, past : past + gap] = False
+                error, share = measure_error(self.network, truth, KnownParts.whole(observed))
                 row |= {f"error_{past}_{gap}_cm": error, f"share_{past}_{gap}": share}
         for gap in _UNFAMILIAR_GAPS:
             truth = windows.draw(_VALIDATED_WINDOWS, 11 + gap, make_generator(gap), variation=_UNFAMILIAR)
-            told = torch.ones(truth.heading.shape, dtype=torch.bool)
-            told[:, 10 : 10 + gap] = False
-            error, share = measure_error(self.network, truth, KnownParts.whole(told))
+            observed = torch.ones(truth.heading.shape, dtype=torch.bool)
+            observed[:, 10 : 10 + gap] = False
+            error, share = measure_error(self.network, truth, KnownParts.whole(observed))
             row |= {f"error_unfamiliar_{gap}_cm": error, f"share_unfamiliar_{gap}": share}
         truth = windows.draw(_VALIDATED_WINDOWS, min(60, int(windows.lengths.max())), make_generator(1))
         known = KnownParts.whole(torch.ones(truth.heading.shape, dtype=torch.bool))
@@ -200,7 +200,7 @@ class PoseTransformerRecipe(NetworkRecipe[PoseTransformerConfig, PoseTransformer
         changed = [getattr(self.config, name) != getattr(usual, name) for name in ("width", "layers", "detail")]
         if self.config == TWO_STAGE[0]:
             return ["--two-stage"]
-        return [word for word, told in zip(words, changed, strict=True) if told] + ["--plain"] * plain
+        return [word for word, shown in zip(words, changed, strict=True) if shown] + ["--plain"] * plain
 
     def export(self, trainer: PoseTransformerTrainer, gathered: Gathered, curve: Sequence[Row]) -> Export:
         """Calibrate how sure it is on the validation clips, and measure that on the test clips."""

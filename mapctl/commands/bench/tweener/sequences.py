@@ -6,7 +6,7 @@ from fractions import Fraction
 
 import torch
 
-from controllers.benchmarks.infilling import scale_to_canonical_bones
+from controllers.benchmarks.shared.bones import scale_to_canonical_bones
 from controllers.benchmarks.tweener.spliced_keys import KeySequence
 from mapctl import rotations
 from mapctl.errors import RequestError

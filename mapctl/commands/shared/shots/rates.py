@@ -8,7 +8,7 @@ import torch
 from controllers.shots.request import ShotRequest
 from controllers.shots.shot import ShotSolution
 from mapctl.motion import Motion
-from mapctl.recording.frequency_bands import resample_by_splines
+from mapctl.recording.splines import resample_by_splines
 
 _BESIDE = 6  # frames after the last
 

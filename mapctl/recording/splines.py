@@ -1,4 +1,4 @@
-"""Motion at other rates, by splines: straight lines between the prior's frames would be kinks."""
+"""Motion and its changes at other rates, by splines: straight lines between the prior's frames would be kinks."""
 
 from dataclasses import replace
 from fractions import Fraction
@@ -30,3 +30,15 @@ def resample_by_splines(motion: Motion, seconds: Float[Tensor, " shown"], *, fps
     quats = upsample(quats, seconds, fps=float(fps), frames=frames)
     root = upsample(motion.root_position.double(), seconds, fps=float(fps), frames=frames)
     return replace(motion, fps=fps, root_position=root, local_quat_xyzw=torch.nn.functional.normalize(quats, dim=-1))
+
+
+def transfer_change(motion: Motion, before: Motion, after: Motion, seconds: Float[Tensor, " shown"]) -> Motion:
+    """Change a motion as another, whose frames are at rising times, was changed: what did not change stays as it was
+    at the motion's own rate."""
+    turned = rotations.multiply(rotations.inverse(before.local_quat_xyzw), after.local_quat_xyzw)
+    angles, moved = (
+        upsample(change, seconds, fps=float(motion.fps), frames=motion.num_frames)
+        for change in (rotations.to_rotation_vector(turned), after.root_position - before.root_position)
+    )
+    quats = rotations.multiply(motion.local_quat_xyzw, rotations.from_rotation_vector(angles))
+    return replace(motion, root_position=motion.root_position + moved, local_quat_xyzw=quats)
