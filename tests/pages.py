@@ -108,8 +108,6 @@ def shorten(line: str) -> list[str]:
             tiny.clear()  # likewise
         if word == "--variations" and "--method" not in words:
             tiny.pop("--prior", None)  # rollouts of a density that never saw a motion jump, and are left out
-    if name == "measure" and "--why" in words:
-        words += ["--steps", "5"]
     if name == "measure" and "--curve" not in words:
         tiny.clear()
     return [*words, *(part for option in tiny.items() for part in option)]

@@ -56,7 +56,7 @@ def test_models_are_named_once():
             baselines.list_models("ours", twice)
 
 
-_WITH_DATA = ("generation", "why", "tween")
+_WITH_DATA = ("generation", "tween")
 
 
 @pytest.mark.parametrize("table", ["free-run", "steer", "shots", *_WITH_DATA])

@@ -108,27 +108,6 @@ class Generation(PriorTable, ComparedTable):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Why(Generation):
-    """What gives such motion away: joints, bands of frequency, moments of the step and gaits that classifiers go by."""
-
-    work = "mapctl.commands.bench.generation.why"
-
-    starts: Annotated[Literal["unseen", "own"], arg(metavar="unseen|own")] = "unseen"
-    """Where clips begin: each unseen clip is gone on with after its first 40 frames and compared with how it goes on
-    itself, so that both sets hold the same styles; or --count clips begin at the density's own starts."""
-    count: options.Count = 48
-    """Clips of each variant, with --starts own."""
-    seconds: options.Number = 10.0
-    """Length of each clip, with --starts own."""
-    steps: Annotated[str, arg(metavar="N,N,...")] = "400,2000"
-    """Training steps of the classifiers, a comparison for each; more make a stricter judge."""
-    variants: Annotated[str, arg(metavar="REGEX")] = "density(, (planted|footing))?"
-    """Variants of `mapctl bench generation` whose whole name fits."""
-    markdown: bool = False
-    """Print rows as a page's table in Markdown holds them."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class Steer(PriorTable, ComparedTable):
     """Random commands: which are reached, and how soon; or places to reach in passing, and discs to walk round."""
 
@@ -343,7 +322,6 @@ TABLES: dict[str, type[ModelCommand]] = {
     "follow": Follow,
     "free-run": FreeRun,
     "generation": Generation,
-    "why": Why,
     "steer": Steer,
     "live": Live,
     "tween": Tween,

@@ -36,14 +36,5 @@ class Measure(ModelCommand, options.RigOptions):
     """Prior whose card has mocap's values."""
     seed: options.Count = 0
     """Seed of the classifier of the two folders."""
-    why: bool = False
-    """Of a folder beside a --reference of one: what tells the two apart, by joint, band of frequency, moment and gait
-    (docs/explanations/realism.md)."""
-    steps: options.MaybeCount = None
-    """Training steps of the classifier; 400, and with --why 2000, which make a stricter judge."""
-    alone: bool = False
-    """With --why: also what each joint, band and region tells alone, by a classifier of 400 steps each."""
-    out: Annotated[Path | None, arg(aliases=["-o"], metavar="FILE.png")] = None
-    """With --why: a picture of it."""
     json: bool = False
     """Print JSON instead of a table."""

@@ -1,7 +1,7 @@
 """Folders of clips as sets to compare: read whole, with the files listed that cannot be used."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -116,9 +116,8 @@ class ClipSet:
         return measure_position_diversity(torch.stack(pieces))
 
 
-def train_judges(ours: ClipSet, reference: ClipSet, *, seed: int, steps: int | None) -> realism.Judges:
-    """Train networks that tell ours from the reference's, so many steps each or as many as by default; RequestError,
-    which says what is left to do, for too few clips."""
+def train_judges(ours: ClipSet, reference: ClipSet, *, seed: int) -> realism.Judges:
+    """Train networks that distinguish ours from the reference's; RequestError for too few clips."""
     fewest = SETTINGS.min_clips
     for clips in (ours, reference):
         if len(clips.motions) < fewest:
@@ -126,27 +125,10 @@ def train_judges(ours: ClipSet, reference: ClipSet, *, seed: int, steps: int | N
                 f"{clips.folder}: {len(clips.motions)} clips; a comparison needs at least {fewest} in each folder"
                 f"{_describe_skipped(clips)} (without --reference a folder of any size is measured)"
             )
-    classifier = SETTINGS.classifier if steps is None else replace(SETTINGS.classifier, steps=steps)
     generator = torch.Generator().manual_seed(seed)
     with show_progress("telling apart") as progress:
         return realism.train_judges(
-            ours.windows,
-            reference.windows,
-            generator=generator,
-            settings=replace(SETTINGS, classifier=classifier),
-            progress=progress,
-        )
-
-
-def explain_verdicts(
-    judges: realism.Judges, ours: ClipSet, reference: ClipSet, *, seed: int, alone: bool
-) -> realism.Explanation:
-    """Explain what the networks go by; with `alone` also what each group tells alone."""
-    settings = realism.EvidenceSettings(alone_steps=SETTINGS.classifier.steps if alone else 0)
-    generator = torch.Generator().manual_seed(seed)
-    with show_progress("finding out why") as progress:
-        return judges.explain(
-            ours.positions, reference.positions, generator=generator, settings=settings, progress=progress
+            ours.windows, reference.windows, generator=generator, settings=SETTINGS, progress=progress
         )
 
 

@@ -7,10 +7,9 @@ from typing import Any
 
 from mapctl import editing, metrics, report, retarget
 from mapctl.commands.measure import Measure
-from mapctl.commands.measure.clip_sets import ClipSet, compare_variability, explain_verdicts, train_judges
-from mapctl.commands.shared import inputs, options, outputs
+from mapctl.commands.measure.clip_sets import ClipSet, compare_variability, train_judges
+from mapctl.commands.shared import inputs, options
 from mapctl.commands.shared.tables import format_cell, print_table
-from mapctl.commands.shared.tables.explanations import print_explanation, summarise_explanation
 from mapctl.curves.curve import Curve
 from mapctl.errors import CheckpointError, RequestError
 from mapctl.metrics.comparison import make_comparable
@@ -18,14 +17,12 @@ from mapctl.motion import Motion
 from mapctl.retarget.rigs import Rig
 from priors import checkpoints
 
-_WHY_STEPS = 2000  # training steps of a classifier that is to be explained
 _MAX_LINES = 12  # of notes and clips that are left out
 
 
 def run(command: Measure) -> int:
     """Measure and print."""
     folders = [path.is_dir() for path in options.collect_paths(command.clip, command.reference)]
-    _check_why(command, all(folders) and command.reference is not None)
     if any(folders):
         _check_folders(command, all(folders))
     values = _measure_folders(command) if any(folders) else _measure_clips(command)
@@ -73,17 +70,6 @@ def _read_curve(command: Measure) -> Curve | None:
     return None if command.curve is None else inputs.read_curve(command.curve, command.metres_per_unit)
 
 
-def _check_why(command: Measure, two_folders: bool) -> None:
-    """RequestError for options that need others, a number of steps that is none, and a picture that cannot be made."""
-    if command.steps is not None and command.steps < 1:
-        raise RequestError(f"--steps must be at least 1, got {command.steps}")
-    if not command.why and (command.out is not None or command.alone):
-        raise RequestError("--out and --alone are about --why; add it")
-    if (command.why or command.steps is not None) and not two_folders:
-        raise RequestError("--why and --steps are about two folders that are compared; name a folder and a --reference")
-    outputs.check_picture(command.out, given=command.clip)
-
-
 def _check_folders(command: Measure, alike: bool) -> None:
     options.check_seed(command.seed)
     if not alike:
@@ -109,21 +95,12 @@ def _measure_folders(command: Measure) -> dict[str, Any]:
 
 
 def _compare_folders(command: Measure, ours: ClipSet, reference: ClipSet) -> dict[str, Any]:
-    steps = command.steps or (_WHY_STEPS if command.why else None)
-    judges = train_judges(ours, reference, seed=command.seed, steps=steps)
-    values = {
+    judges = train_judges(ours, reference, seed=command.seed)
+    return {
         "reference_clips": len(reference.motions),
         "realism": asdict(judges.summarise()),
         "spread": compare_variability(ours, reference),
     }
-    if not command.why:
-        return values
-    explanation = explain_verdicts(judges, ours, reference, seed=command.seed, alone=command.alone)
-    if command.out is not None:
-        from scenes.plots.evidence import plot_explanation  # matplotlib is heavy, and an extra
-
-        plot_explanation(explanation, command.out)
-    return values | {"why": summarise_explanation(explanation, ours.names)}
 
 
 def _print_tables(values: Mapping[str, Any]) -> None:
@@ -141,8 +118,6 @@ def _print_tables(values: Mapping[str, Any]) -> None:
         rows = [[name, *row.values()] for name, row in values["spread"].items()]
         title = "how widely the clips spread (in pieces of 3 s)"
         print_table(["spread", "ours", "reference", "ratio"], rows, title=title)
-    if "why" in values:
-        print_explanation(values["why"])
     if "cycle" in values:
         print(_describe_cycle(values["cycle"]))
     for line in _shorten([*(f"left out {reason}" for reason in values.get("skipped", {}).values()), *values["notes"]]):

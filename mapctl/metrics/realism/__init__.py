@@ -19,9 +19,6 @@ from mapctl.metrics.realism.classifier import (
     judge_held_out,
 )
 from mapctl.metrics.realism.diversity import Diversity, average_pairwise_distance, measure_diversity
-from mapctl.metrics.realism.evidence.alone import GROUPS, REGIONS, measure_alone
-from mapctl.metrics.realism.evidence.explanation import Explanation, explain
-from mapctl.metrics.realism.evidence.gathering import EvidenceSettings
 from mapctl.metrics.realism.frechet import Basis, frechet_distance
 from mapctl.metrics.realism.gait import GaitSpread, measure_gait_spread, spread_ratios
 from mapctl.metrics.realism.windows import WindowSettings, canonical_positions, cut_windows
@@ -29,11 +26,8 @@ from mapctl.motion import Motion
 from mapctl.runtime.progress import Progress
 
 __all__ = [
-    "REGIONS",
     "ClassifierSettings",
     "Diversity",
-    "EvidenceSettings",
-    "Explanation",
     "GaitSpread",
     "HeldOutVerdict",
     "Judges",
@@ -44,7 +38,6 @@ __all__ = [
     "canonical_positions",
     "cut_windows",
     "judge_held_out",
-    "measure_alone",
     "measure_diversity",
     "measure_gait_spread",
     "measure_realism",
@@ -163,31 +156,6 @@ class Judges:
             frechet_distance(points[2], points[3]),
             made_windows=len(points[0]),
             mocap_windows=len(points[1]),
-        )
-
-    def explain(
-        self,
-        made: Sequence[Tensor],
-        mocap: Sequence[Tensor],
-        *,
-        generator: torch.Generator,
-        settings: EvidenceSettings | None = None,
-        progress: Progress | None = None,
-    ) -> Explanation:
-        """Explain what the networks go by; `made` and `mocap` are the `canonical_positions` of the same clips."""
-        settings = settings or EvidenceSettings()
-        alone = len(GROUPS) if settings.alone_steps else 0
-        return explain(
-            self.folds,
-            self.floor_folds,
-            made,
-            mocap,
-            self.halves,
-            classifier=self.settings.classifier,
-            windows=self.settings.windows,
-            settings=settings,
-            generator=generator,
-            tick=_make_tick(progress, self.settings.classifier.folds + alone),
         )
 
 

@@ -17,7 +17,6 @@ _PLAN = {
     "live": "live --find-most --minutes 0.34",
     "live-orders": "live --orders 3 --minutes 5",
     "generation": "generation --data DATA",
-    "why": "why --data DATA --steps 2000",
     "free-run": "free-run",
     "free-run-general": "free-run --prior general",
     "free-run-free": "free-run --prior free/locomotion",

@@ -1,1 +1,0 @@
-"""What the networks of the realism measure go by: joints, bands of frequency, inputs, moments and gaits."""
