@@ -1,12 +1,10 @@
-"""Rotation maths, once for the whole project; quaternions are xyzw, angles radians.
+"""Rotations of batches, differentiable: quaternions (xyzw), matrices, rotation vectors, Euler angles; radians.
 
-Built on roma, whose first derivatives are exact at the identity and near pi. What roma lacks and a character needs
-is here: the split of a rotation into heading and tilt, rotations about the vertical, and shortest arcs.
+First derivatives are exact at the identity and near pi, where sin(x) / x and its inverse are taken from their series.
 """
 
 import math
 from collections.abc import Sequence
-from functools import partial
 from typing import TypeVar
 
 import numpy as np
@@ -14,19 +12,107 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from mapctl.numerics.light_roma import roma
-
 Angle = TypeVar("Angle", float, np.ndarray, Tensor)
+_TINY_ANGLE = 1e-6
 
-multiply = roma.quat_product
-inverse = roma.quat_conjugation
-rotate = roma.quat_action
-from_rotation_vector = roma.rotvec_to_unitquat
-to_rotation_vector = roma.unitquat_to_rotvec  # the short one, whatever the quaternion's sign
-to_long_rotation_vector = partial(roma.unitquat_to_rotvec, shortest_arc=False)  # as the quaternion's sign says
-to_matrix = roma.unitquat_to_rotmat
-from_matrix = roma.rotmat_to_unitquat
-rotation_vector_to_matrix = roma.rotvec_to_rotmat
+
+def multiply(
+    first_xyzw: Float[Tensor, "*#batch 4"], second_xyzw: Float[Tensor, "*#batch 4"]
+) -> Float[Tensor, "*batch 4"]:
+    """Return the product of quaternions: the second rotation, then the first."""
+    p, q = torch.broadcast_tensors(first_xyzw, second_xyzw)
+    p_vector, q_vector, p_real, q_real = p[..., :3], q[..., :3], p[..., 3], q[..., 3]
+    vector = p_real[..., None] * q_vector + q_real[..., None] * p_vector + torch.cross(p_vector, q_vector, dim=-1)
+    real = p_real * q_real - (p_vector * q_vector).sum(dim=-1)
+    return torch.cat((vector, real[..., None]), dim=-1)
+
+
+def inverse(quat_xyzw: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
+    """Return the inverse of unit quaternions, their conjugate."""
+    conjugate = quat_xyzw.clone()
+    conjugate[..., :3] *= -1
+    return conjugate
+
+
+def rotate(quat_xyzw: Float[Tensor, "*#batch 4"], vector: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*batch 3"]:
+    """Rotate vectors by quaternions of any length but zero."""
+    back = inverse(quat_xyzw) / (quat_xyzw**2).sum(dim=-1, keepdim=True)
+    pure = torch.cat((vector, vector.new_zeros(*vector.shape[:-1], 1, dtype=quat_xyzw.dtype)), dim=-1)
+    return multiply(quat_xyzw, multiply(pure, back))[..., :3]
+
+
+def from_rotation_vector(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4"]:
+    """Return the quaternions of rotation vectors."""
+    flat = vector.reshape(-1, 3)
+    angle = flat.norm(dim=-1)
+    half = angle / 2
+    small = half < _small_angle(half)
+    ratio = torch.where(small, 1 - half**2 / 6 + half**4 / 120, torch.sin(half) / torch.where(small, 1.0, half))
+    quat = torch.cat(((ratio / 2.0)[:, None] * flat, torch.cos(angle / 2)[:, None]), dim=-1)
+    return quat.reshape(*vector.shape[:-1], 4)
+
+
+def to_rotation_vector(quat_xyzw: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3"]:
+    """Return the shortest rotation vectors, whatever the signs of the unit quaternions."""
+    sign = (quat_xyzw[..., 3:] > 0).to(quat_xyzw.dtype) * 2.0 - 1.0
+    return to_long_rotation_vector(quat_xyzw * sign)
+
+
+def to_long_rotation_vector(quat_xyzw: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3"]:
+    """Return rotation vectors, longer than pi where the real part of a unit quaternion is negative; undefined for a
+    real part of -1."""
+    flat = quat_xyzw.reshape(-1, 4)
+    half = torch.atan2(flat[:, :3].norm(dim=1), flat[:, 3])
+    small = half.abs() < _small_angle(half)
+    ratio = torch.where(small, 1 + half**2 / 6 + 7 * half**4 / 360, half / torch.where(small, 1.0, torch.sin(half)))
+    return ((2.0 * ratio)[:, None] * flat[:, :3]).reshape(*quat_xyzw.shape[:-1], 3)
+
+
+def _small_angle(angle: Tensor) -> float:
+    """Return the angle below which the series of sin(x) / x has a better derivative than the quotient: the
+    series leaves out terms in x^4, the quotient loses eps / x^2 by cancellation."""
+    return 2.0 * torch.finfo(angle.dtype).eps ** (1 / 6)
+
+
+def to_matrix(quat_xyzw: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
+    """Return the matrices of unit quaternions."""
+    x, y, z, w = quat_xyzw.unbind(dim=-1)
+    xx, yy, zz, ww = x * x, y * y, z * z, w * w
+    xy, zw, xz, yw, yz, xw = x * y, z * w, x * z, y * w, y * z, x * w
+    first = (xx - yy - zz + ww, 2 * (xy - zw), 2 * (xz + yw))
+    second = (2 * (xy + zw), -xx + yy - zz + ww, 2 * (yz - xw))
+    third = (2 * (xz - yw), 2 * (yz + xw), -xx - yy + zz + ww)
+    return torch.stack((*first, *second, *third), dim=-1).reshape(*quat_xyzw.shape[:-1], 3, 3)
+
+
+def from_matrix(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
+    """Return the unit quaternions of rotation matrices: of four multiples of it, each by one of its components, that by
+    the largest (Markley 2008)."""
+    (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in matrix.unbind(-2))
+    by_x = (1 + a - e - i, d + b, g + c, h - f)
+    by_y = (b + d, 1 + e - i - a, h + f, c - g)
+    by_z = (c + g, f + h, 1 + i - a - e, d - b)
+    by_w = (h - f, c - g, d - b, 1 + a + e + i)
+    multiples = torch.stack((*by_x, *by_y, *by_z, *by_w), dim=-1).unflatten(-1, (4, 4))
+    largest = multiples.diagonal(dim1=-2, dim2=-1).argmax(dim=-1)
+    chosen = torch.gather(multiples, -2, largest[..., None, None].expand(*largest.shape, 1, 4))[..., 0, :]
+    return chosen / chosen.norm(dim=-1, keepdim=True)
+
+
+def rotation_vector_to_matrix(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Return the matrices of rotation vectors, by Rodrigues' formula, or to first order where the angle is tiny."""
+    flat = vector.reshape(-1, 3)
+    angle = flat.norm(dim=-1)
+    x, y, z = (flat / angle[..., None].clamp_min(_TINY_ANGLE)).unbind(dim=-1)
+    sine, rest = torch.sin(angle), 1 - torch.cos(angle)
+    xs, ys, zs = x * sine, y * sine, z * sine
+    xy, xz, yz = x * y * rest, x * z * rest, y * z * rest
+    xx, yy, zz = x**2 * rest, y**2 * rest, z**2 * rest
+    whole = (1 - yy - zz, xy - zs, xz + ys, xy + zs, 1 - xx - zz, yz - xs, xz - ys, yz + xs, 1 - xx - yy)
+    (x, y, z), one = flat.unbind(dim=-1), torch.ones_like(angle)
+    first_order = (one, -z, y, z, one, -x, -y, x, one)
+    found = torch.where((angle < _TINY_ANGLE)[:, None], torch.stack(first_order, -1), torch.stack(whole, -1))
+    return found.reshape(*vector.shape[:-1], 3, 3)
 
 
 def about_y(angle: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 4"]:

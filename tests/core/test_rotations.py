@@ -30,6 +30,20 @@ def test_products_actions_and_matrices_are_scipys():
     np.testing.assert_allclose(rotations.to_matrix(a), ours.as_matrix(), atol=1e-12)
     np.testing.assert_allclose(rotations.to_rotation_vector(a), ours.as_rotvec(), atol=1e-9)
     assert turn_between(rotations.from_matrix(rotations.to_matrix(a)), a) < 1e-7
+    vectors = torch.from_numpy(ours.as_rotvec())
+    np.testing.assert_allclose(rotations.rotation_vector_to_matrix(vectors), ours.as_matrix(), atol=1e-12)
+    assert turn_between(rotations.from_rotation_vector(vectors), a) < 1e-7
+
+
+@pytest.mark.parametrize("shape", [(), (3,), (2, 3)])
+def test_gradients_of_products_and_matrices_are_differences(shape):
+    quats = [torch.from_numpy(Rotation.random(rng=s).as_quat()).expand(*shape, 4).clone() for s in (1, 2)]
+    first, second = (quat.requires_grad_(True) for quat in quats)
+    vector = torch.randn(*shape, 3, generator=generator(), dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(rotations.multiply, (first, second))
+    assert torch.autograd.gradcheck(rotations.rotate, (first, vector))
+    assert torch.autograd.gradcheck(lambda q: rotations.from_matrix(rotations.to_matrix(q)), (first,))
+    assert torch.autograd.gradcheck(rotations.to_long_rotation_vector, (first,))
 
 
 def test_rotation_vectors_are_the_short_ones_whatever_the_sign():

@@ -59,7 +59,6 @@ def python(script: str) -> str:
 
 @pytest.mark.slow
 def test_slow_libraries_are_not_imported():
-    """roma would import torch's compiler, a third of the whole time, for functions that nothing here uses."""
     packages = "mapctl, priors, controllers, scenes, mapctl.rotations, mapctl.formats, mapctl.solver.swarm, scenes.film"
     script = f"import sys, {packages}\nprint([name for name in {LATE} if name in sys.modules])"
     assert python(script) == "[]\n"
