@@ -37,10 +37,6 @@ class Steer(ModelCommand, options.ReadOptions):
     """Let the root travel over the ground in the stream, and not the hips."""
     stream_delay: options.Number = 0.1
     """Seconds by which the stream is behind, so that a frame that is computed late is not sent late."""
-    listen: options.MaybeEndpoint = None
-    """With --realtime: where orders come from over OSC, as /mapctl/speed 1.4 (docs/guides/streaming.md); each changes
-    what the last line of the script said, until the next line. A port alone is on this machine, and nobody else can
-    send there; 0.0.0.0:PORT hears everybody."""
     prior: options.Name = "locomotion-live"
     """A bundled prior, or the file or run folder of a trained one."""
     stitcher: options.MaybeName = None

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -20,16 +20,16 @@ from controllers.steering.loop import (
     StreamClock,
     WallClock,
     drive,
+    find_second_zero,
     summarise_step_timing,
 )
+from controllers.steering.steer import SteerFrames
 from mapctl import formats, metrics, report
 from mapctl.commands.shared import inputs, licensing, options, outputs, streaming
 from mapctl.commands.shared.character import read_character
 from mapctl.commands.shared.exit_status import conclude
 from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.commands.steer import Steer
-from mapctl.commands.steer.links import Links
-from mapctl.commands.steer.remote import RemoteScript
 from mapctl.curves.obstacles import Obstacle, measure_clearance
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
@@ -43,8 +43,10 @@ from mapctl.problem.solution import Outcome, Solution, Status
 from mapctl.terms import FootContact
 from priors.licences import note_licence
 from priors.lstm_gmm.density import LstmGmmDensity
-from scenes.live.inputs import InputLimits
 from scenes.plots.steering import plot
+
+if TYPE_CHECKING:
+    from mapctl.streaming.sender import PoseStream
 
 _PLACE_WORDS = {"leftHand": "left hand", "rightHand": "right hand"}
 _AFTER_SECONDS = 1.0  # for which a motion goes on after the last place was reached
@@ -60,19 +62,19 @@ def run(command: Steer) -> int:
     for labels in {wanted.labels for wanted in track.commands if wanted.labels}:
         prior.conditioned_on(labels)  # unknown labels are refused now
     stepper = _choose_stepper(command, track)
-    links = _open_links(command, character, prior, track)
+    stream = streaming.open_stream(_stream(command), [character.skeleton])
     try:
-        recorder, records, frames = _run_steering(command, prior, track, character, stepper, links)
+        recorder, records, frames = _run_steering(command, prior, track, character, stepper, stream)
     finally:
-        links.close()
+        if stream is not None:
+            stream.close()
     motion = recorder.motion(frames)
     licensing.save_motion(character.on_rig(motion), command.out)
     arrivals = [time for time in track.times[1:] if time < motion.seconds]
     timing: dict[str, Any] = {**summarise_step_timing(records, arrivals), "peak_memory_mb": report.peak_memory_mb()}
-    if links.stream is not None:
-        timing["stream"] = asdict(links.stream.statistics)
-    heard = [] if links.script is None else links.script.notes
-    done = _conclude_steering(motion, recorder, [*lowered, *heard], timing, interrupted=motion.num_frames < frames)
+    if stream is not None:
+        timing["stream"] = asdict(stream.statistics)
+    done = _conclude_steering(motion, recorder, lowered, timing, interrupted=motion.num_frames < frames)
     refused = [refusal.order for refusal in recorder.refusals]
     found = _build_report(command, done, track, prior, timing, refused)
     if command.report is not None:
@@ -81,7 +83,7 @@ def run(command: Steer) -> int:
         plot(motion, track, command.plot)
     if not command.quiet:
         files = options.collect_paths(command.out, command.report, command.plot)
-        streamed = None if links.stream is None else streaming.summarise(links.stream)
+        streamed = None if stream is None else streaming.summarise(stream)
         print("\n".join(_format_summary(found, files, streamed)))
     return conclude(done.status, strict=command.strict)
 
@@ -92,20 +94,13 @@ def _check(command: Steer) -> None:
     formats.check_ending(command.out)
     outputs.check_files(options.collect_paths(command.out, command.report, command.plot))
     outputs.check_plot(command.plot)
-    if (command.stream is not None or command.listen is not None) and not command.realtime:
-        raise RequestError("--stream and --listen go by the clock, which needs --realtime; give both")
-    streaming.check(_stream(command), command.listen)
+    if command.stream is not None and not command.realtime:
+        raise RequestError("--stream goes by the clock, which needs --realtime; give both")
+    streaming.check(_stream(command))
 
 
 def _stream(command: Steer) -> streaming.StreamOptions:
     return streaming.StreamOptions(command.stream, command.stream_root, command.stream_delay)
-
-
-def _open_links(command: Steer, character: Character, prior: LstmGmmDensity, track: CommandTrack) -> Links:
-    receiver = streaming.open_receiver(command.listen)
-    bounds = InputLimits(prior.limits.max_steering_speed, prior.labels)
-    script = None if receiver is None else RemoteScript(track, receiver, bounds, _limits(command))
-    return Links(streaming.open_stream(_stream(command), [character.skeleton]), receiver, script)
 
 
 def _limits(command: Steer) -> SteeringLimits:
@@ -131,7 +126,7 @@ def _add_obstacles(track: CommandTrack, obstacles: Sequence[Obstacle]) -> Comman
 
 def _choose_stepper(command: Steer, track: CommandTrack) -> Stepper:
     """Choose who makes the next frames: with a stitcher where the script has orders to be somewhere."""
-    if command.listen is not None or any(wanted.arrival is not None for wanted in track.commands):
+    if any(wanted.arrival is not None for wanted in track.commands):
         return Arriver(priors.load_stitcher(command.stitcher or "stitcher"))
     if command.stitcher is not None:
         raise RequestError("--stitcher makes ways to a place, and the script has no goto_x_m; leave it out")
@@ -139,7 +134,12 @@ def _choose_stepper(command: Steer, track: CommandTrack) -> Stepper:
 
 
 def _run_steering(
-    command: Steer, prior: LstmGmmDensity, track: CommandTrack, character: Character, stepper: Stepper, links: Links
+    command: Steer,
+    prior: LstmGmmDensity,
+    track: CommandTrack,
+    character: Character,
+    stepper: Stepper,
+    stream: "PoseStream | None",
 ) -> tuple[Recorder, list[StepRecord], int]:
     first, recorder = track.commands[0], Recorder()
     frames = inputs.count_frames(_find_end(track))
@@ -152,11 +152,13 @@ def _run_steering(
         steer.step(state, wanted)  # compiling, loading and conditioning on first use must not cost frames
     clock = WallClock() if command.realtime else StreamClock()
     with show_progress("steering", quiet=command.quiet) as progress:
-        displays: list[Display] = [recorder, *links.displays(clock, state, pose, frames=frames)]
+        displays: list[Display] = [recorder]
+        if stream is not None and isinstance(clock, WallClock):
+            displays.append(_StreamDisplay(stream, clock, frames, find_second_zero(clock, state)))
+            displays[-1].show(pose, 0.0)
         if progress is not None:
             displays.append(_ProgressDisplay(progress, frames))
-        source = links.script or track
-        _, records = drive(state, source, displays, frames=frames, clock=clock, stepper=stepper)
+        _, records = drive(state, track, displays, frames=frames, clock=clock, stepper=stepper)
     return recorder, records, frames
 
 
@@ -203,6 +205,22 @@ def _build_report(
     arrivals = measure_arrivals(done.motion, track, refused)
     found |= {"commands": measure_commands(done.motion, track)} | ({"arrivals": arrivals} if arrivals else {})
     return licensing.add_licence(found)
+
+
+@dataclass(frozen=True)
+class _StreamDisplay:
+    """A Display that has frames sent when they are due."""
+
+    stream: "PoseStream"
+    clock: WallClock
+    frames: int  # of the script; later ones are not sent
+    zero: float  # the clock's time at the stream's second 0
+
+    def show(self, frames: SteerFrames, due: float) -> None:
+        left = self.frames - round(due * float(frames.motion.fps))
+        if left > 0:
+            root, quats = frames.motion.root_position[:left], frames.motion.local_quat_xyzw[:left]
+            self.stream.put(0, self.clock.perf_counter_at(self.zero + due), due, root.numpy(), quats.numpy())
 
 
 @dataclass(frozen=True)
