@@ -19,7 +19,7 @@ from typing import Annotated, Any
 import tyro
 
 from mapctl import __version__
-from mapctl.commands import COMMANDS, IMPLIED, SUBCOMMANDS, Runnable
+from mapctl.commands import COMMANDS, SUBCOMMANDS, Runnable
 from mapctl.commands.shared import exit_status
 from mapctl.errors import MapctlError, RequestError
 from mapctl.runtime import interruption
@@ -81,9 +81,6 @@ def parse(words: Sequence[str]) -> Runnable:
     name, *others = words or [""]
     if name not in SUBCOMMANDS:
         return _choose(COMMANDS, words, prog="mapctl", description=_DESCRIPTION)
-    unnamed = not others or (others[0].startswith("-") and others[0] not in ("-h", "--help"))
-    if unnamed and name in IMPLIED:
-        others = [IMPLIED[name], *others]
     return _choose(SUBCOMMANDS[name], others, prog=f"mapctl {name}", description=COMMANDS[name].__doc__ or "")
 
 

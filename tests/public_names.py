@@ -121,7 +121,6 @@ PUBLIC: dict[str, tuple[str, ...]] = {
     "mapctl.problem.receding_horizon": ("CommittedFrames", "HorizonSettings", "RecedingHorizonSolver", "replay"),
     "mapctl.problem.context": ("WindowContext", "WindowRequest"),
     "mapctl.problem.window_solvers": ("GuidedNoiseSolver", "LatentNoiseSolver", "SingleWindowSolver", "SolvedWindow"),
-    "mapctl.problem.feature_states": ("FeatureStateSolver",),
     "mapctl.problem.pose_offsets": ("PoseOffsetSolver",),
     "mapctl.problem.warm_start": ("BestOfSamples", "SteeringKnots", "SwarmProposal", "keep_warm_start"),
     "mapctl.problem.density_selection": ("DensityChoice", "DensityEnsemble"),

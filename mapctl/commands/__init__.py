@@ -8,7 +8,7 @@ when it runs, by `mapctl.commands.shared.command` alone.
 from collections.abc import Mapping
 from typing import Protocol, runtime_checkable
 
-from mapctl.commands.bench import TABLES, Bench
+from mapctl.commands.bench import Bench
 from mapctl.commands.blend import Blend
 from mapctl.commands.blender_addon import BlenderAddon
 from mapctl.commands.chain import Chain
@@ -62,7 +62,5 @@ COMMANDS: dict[str, type[Runnable]] = {
     "bench": Bench,
 }
 """Sub-commands by the name the user types, in the order of the help."""
-SUBCOMMANDS: dict[str, Mapping[str, type[Runnable]]] = {"bench": TABLES, "train": KINDS}
+SUBCOMMANDS: dict[str, Mapping[str, type[Runnable]]] = {"train": KINDS}
 """The sub-commands of commands that have some."""
-IMPLIED = {"bench": next(iter(TABLES))}
-"""Default of the sub-commands, by command."""

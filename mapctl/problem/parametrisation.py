@@ -1,10 +1,9 @@
 """Parametrisation of a window: the vector of unknowns from which a trial is built. Only unknowns are scaled; all else
 is in physical units.
 
-There are three. `LatentNoise`: the noise of a rollout, x = mu_k + sigma_k d, with components and contact bits fixed.
-`FeatureStates`: the features themselves in normalised units, scored with teacher forcing (Wang et al. 2019, Eq. 14-16).
-`PoseOffsets`: offsets of root and joint angles about a proposed motion, in sigmas. Latent noise converges several times
-faster than feature states: `mapctl bench ablation` reruns the comparison.
+There are two. `LatentNoise`: the noise of a rollout, x = mu_k + sigma_k d, with components and contact bits fixed. It
+converges several times faster than the features themselves, scored with teacher forcing (Wang et al. 2019, Eq. 14-16).
+`PoseOffsets`: offsets of root and joint angles about a proposed motion, in sigmas.
 """
 
 from typing import Protocol, runtime_checkable

@@ -23,7 +23,6 @@ from controllers.steering.process import CharacterProcess
 from mapctl import formats
 from mapctl.cli import parse
 from mapctl.commands import COMMANDS
-from mapctl.commands.bench import TABLES
 from mapctl.commands.denoise import Denoise
 from mapctl.commands.denoise.folder import ReportWriter
 from mapctl.commands.live import Live
@@ -159,10 +158,8 @@ def test_measure_and_compile_work_with_the_free_weights_alone(alone, capsys):
 
 
 def test_all_commands_that_take_bundled_models_have_the_option():
-    without = {"bench", "train", "render", "convert", "blender-addon"}  # tables of bench have it
+    without = {"train", "render", "convert", "blender-addon"}
     assert {name for name, kind in COMMANDS.items() if not issubclass(kind, ModelCommand)} == without
-    assert all(issubclass(table, ModelCommand) for table in TABLES.values())
-    assert not any(table.tells_licence for table in TABLES.values())  # JSON is theirs alone
     assert getattr(parse(["bench", "--weights", "free"]), "weights", None) == "free"
 
 

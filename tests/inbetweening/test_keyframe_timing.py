@@ -1,23 +1,18 @@
 """Suggested timing: what it depends on, what it does not, and what the fit and the bench make of pairs of poses."""
 
-import json
 from dataclasses import replace
 
 import pytest
 import torch
 from captures import on_rig
-from helpers import generator, moved, random_motion, run, walk, walks
-from tiny_infiller import card, network
+from helpers import generator, moved, random_motion, walk
 
 import priors
-from controllers.benchmarks.keyframe_timing import benchmark_keyframe_timing
 from controllers.inbetweening import keyframe_timing
-from mapctl import retarget
 from mapctl.errors import RequestError
 from mapctl.inbetweening.missing import MissingMask, restore_observed
 from mapctl.inbetweening.pose_pairs import PAIR_FEATURES, compute_pair_features, sample_pose_pairs
 from mapctl.intent.keyframes import Key, Keys
-from priors import checkpoints
 
 KEYS = Keys((0, 20, 50, 89))
 
@@ -119,39 +114,3 @@ def test_pairs_are_as_long_as_asked_for_and_clips_that_are_too_short_give_none()
     assert pairs.features.shape == (10, len(PAIR_FEATURES))
     with pytest.raises(RequestError, match=r"no clip is longer than 0\.5 s"):
         sample_pose_pairs([walk(10)], generator(), count=5, shortest=0.5, longest=1.0)
-
-
-class KnowsTheTruth:
-    """Of the pairs that the bench draws."""
-
-    def __init__(self, clips):
-        self.pairs = sample_pose_pairs(clips, torch.Generator().manual_seed(0), count=5, shortest=0.5, longest=3.0)
-
-    def estimate_seconds(self, features, metres):
-        return self.pairs.seconds[:, None].expand(-1, 3)
-
-
-def test_the_bench_compares_with_what_poses_do_not_tell():
-    """Who knows the truth is right everywhere."""
-    rows = benchmark_keyframe_timing(walks(3, 90), priors.load_keyframe_timing())
-    methods = ["suggested", "one speed for all", "one duration for all"]
-    assert [(row["pairs"], row["method"]) for row in rows] == [(p, m) for p in ("on the way", "all") for m in methods]
-    for row in benchmark_keyframe_timing(walks(3, 90), KnowsTheTruth(walks(3, 90))):
-        assert row["count"] == 15
-        if row["method"] == "suggested":
-            assert (row["lower_quartile"], row["median"], row["upper_quartile"], row["half_off_by"]) == (1, 1, 1, 1)
-        assert row["lower_quartile"] <= row["median"] <= row["upper_quartile"]
-
-
-def test_the_bench_takes_clips_that_were_kept_from_training(tmp_path, capsys):
-    path = tmp_path / "data" / "bandai" / "a_walk_0.bvh"
-    path.parent.mkdir(parents=True)
-    walk_made = walk(60)
-    retarget.from_canonical(walk_made, retarget.identify_rig(walk_made.skeleton)).save(path)
-    told = replace(card(), data={"held_out": {"validation": [], "test": ["bandai/a_walk_0.bvh"]}})
-    checkpoints.save(network().state_dict(), told, tmp_path / "ours.safetensors")
-    words = ["--inbetweener", tmp_path / "ours.safetensors", "--data", tmp_path / "data", "--json"]
-    assert run("bench", "timing", *words) == 0
-    assert {row["method"] for row in json.loads(capsys.readouterr().out)["rows"]} >= {"suggested"}
-    assert run("bench", "timing", "--inbetweener", tmp_path / "ours.safetensors") == 2
-    assert "Missing from mapctl bench timing: --data DIR" in capsys.readouterr().err

@@ -10,7 +10,6 @@ import torch
 from helpers import generator, tiny_density, walk
 from toy_density import ToyDensity, toy_density
 
-from controllers.benchmarks.free_run import benchmark_free_run
 from controllers.generation import foot_cleanup
 from controllers.generation.foot_cleanup import FootCleanupSettings
 from controllers.generation.generate import Beginning, GenerateSettings, generate, initialise_generation, sample_pieces
@@ -145,12 +144,6 @@ def test_the_first_pace_is_that_of_the_start():
     clip = walk(60)._map_frames(lambda values: values[[*[0] * 30, *range(60)]])  # stands, and sets off
     step = float(clip.root_position[-31:, [0, 2]].diff(dim=0).mean(0).norm()) * 30
     assert initialise_generation(still, GenerateSettings(), clip, generator()).speed == pytest.approx(step, rel=0.05)
-
-
-def test_free_runs_are_told():
-    (*_, together, _) = benchmark_free_run(replace(TOLD, rates=RATES), {}, runs=2, frames=3000)
-    assert together["starts_10min"] > 5
-    assert together["to_run_10min"] > 5
 
 
 def test_nothing_is_told_where_no_pace_is_known_or_wanted():

@@ -2,9 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers import go_at, tiny_density
 
-from controllers.benchmarks import free_run
 from mapctl.metrics.pace_changes import (
     PACES,
     PaceChanges,
@@ -54,25 +52,6 @@ def test_sway_within_a_stride_is_no_change(fps):
     within = velocity[round(fps) : -round(fps), 1]
     assert np.abs(within - 1).max() < 0.05
     assert abs(within.mean() - 1) < 0.01
-
-
-def test_the_table_of_free_runs_counts_over_ten_minutes(monkeypatch):
-    features = go_at(0.0, 1.2, 3.0, 1.2, seconds=10)
-    monkeypatch.setattr(free_run, "_sample_free_run", lambda prior, frames, seed: features)
-    *_, together, data = free_run.benchmark_free_run(tiny_density(), {"speed": 1.0}, runs=2, frames=len(features))
-    minutes = len(features) / 30 / 60
-    names = ("starts", "stops", "to_run", "to_walk")
-    assert [together[f"{name}_10min"] * minutes / 10 for name in names] == pytest.approx([1, 0, 1, 1])
-    assert data == {"run": "training data", "speed": 1.0}
-
-
-def test_the_row_of_the_data_has_what_its_card_tells():
-    holds = {"minutes": 5.0, "starts": 3.0, "stops": 2.0, "changes to a run": 1.0, "changes to a walk": 0.0}
-    found = free_run.summarise_held_changes(holds)
-    assert found == {"starts_10min": 6.0, "stops_10min": 4.0, "to_run_10min": 2.0, "to_walk_10min": 0.0}
-    del holds["changes to a run"]
-    assert free_run.summarise_held_changes(holds) == {name: found[name] for name in found if name != "to_run_10min"}
-    assert free_run.summarise_held_changes({}) == {}
 
 
 @pytest.mark.parametrize(

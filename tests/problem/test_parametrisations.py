@@ -8,7 +8,6 @@ from helpers import corpus, finite_difference, generator, noise, tiny_density, w
 from mapctl.features import LAYOUT, GroundPose
 from mapctl.pose import BodyPose
 from mapctl.problem.context import WindowContext
-from mapctl.problem.feature_states import FeatureStates
 from mapctl.problem.latent_noise import LatentNoise
 from mapctl.problem.objective import Objective
 from mapctl.problem.parametrisation import Parametrisation
@@ -35,13 +34,6 @@ def context(density):
 
 DENSITY = excited()
 CONTEXT = context(DENSITY)
-
-
-def states():
-    """The states' unknowns around a stretch of a walk."""
-    features = corpus().clips()[0][None, 30 : 30 + FRAMES].double()
-    bits = LAYOUT.pick(features, "contacts") > 0.5
-    return features, FeatureStates(CONTEXT, DENSITY.feature_std[:SIZE], DENSITY.feature_mean[:SIZE], bits)
 
 
 def slope(function, at, direction):
@@ -72,38 +64,9 @@ def test_one_plan_serves_many_candidates():
         torch.testing.assert_close(together.features[row], alone.features[0])
 
 
-def test_states_build_their_own_features_and_teacher_forced_density():
-    features, variables = states()
-    trial = variables.build(variables.from_features(features))
-    torch.testing.assert_close(trial.features, features, atol=1e-9, rtol=0)
-    torch.testing.assert_close(trial.log_density, DENSITY.log_prob(features, CONTEXT.state))
-    assert float(trial.noise.abs().max()) == 0
-
-
-def test_the_input_noise_of_states_is_in_units_of_the_papers_sigma():
-    features, variables = states()
-    unknowns = variables.from_features(features)
-    half = unknowns.shape[1] // 2
-    unknowns[:, half:] = noise(1, FRAMES, dtype=torch.float64).flatten(1)
-    trial = variables.build(unknowns)
-    seen = features.clone()
-    seen[..., :SIZE] += 0.05 * DENSITY.feature_std[:SIZE] * unknowns[:, half:].unflatten(-1, (FRAMES, SIZE))
-    torch.testing.assert_close(trial.features, features, atol=1e-9, rtol=0)
-    torch.testing.assert_close(trial.log_density, DENSITY.log_prob(features, CONTEXT.state, inputs=seen))
-
-
-@pytest.mark.parametrize("kind", ["latents", "states"])
-def test_the_gradient_through_the_whole_chain_is_that_of_finite_differences(kind):
-    if kind == "latents":
-        unknowns = 0.5 * noise(2, FRAMES, dtype=torch.float64).flatten(1)
-        objective = Objective(
-            LatentNoise.from_unknowns(CONTEXT, unknowns).build, (LatentPrior(), FootContact(), Jerk())
-        )
-    else:
-        features, variables = states()
-        unknowns = variables.from_features(features)
-        unknowns = unknowns + 0.1 * torch.randn(unknowns.shape, generator=generator(), dtype=torch.float64)
-        objective = Objective(variables.build, (Likelihood(), LatentPrior(), FootContact()))
+def test_the_gradient_through_the_whole_chain_is_that_of_finite_differences():
+    unknowns = 0.5 * noise(2, FRAMES, dtype=torch.float64).flatten(1)
+    objective = Objective(LatentNoise.from_unknowns(CONTEXT, unknowns).build, (LatentPrior(), FootContact(), Jerk()))
     energy, gradient = objective.energy_and_gradient(unknowns)
     direction = torch.randn(unknowns.shape, generator=generator(4), dtype=torch.float64)
     difference = finite_difference(lambda x: objective.energy(x).sum(), unknowns, direction)
@@ -129,8 +92,8 @@ def test_the_ledger_adds_up_to_the_energy_and_names_every_term():
 
 
 def offsets():
-    """Offsets about the same stretch of a walk."""
-    features, _ = states()
+    """Offsets about a stretch of a walk."""
+    features = corpus().clips()[0][None, 30 : 30 + FRAMES].double()
     pose = BodyPose.of_features(features[0], CONTEXT.place)
     bits = LAYOUT.pick(features[0], "contacts") > 0.5
     return PoseOffsets(CONTEXT, pose, bits, torch.full(pose.pack().shape, 0.03, dtype=torch.float64))
@@ -139,10 +102,8 @@ def offsets():
 def parametrisations():
     """Each kind by its name, with unknowns of the stretch of the walk."""
     zero = torch.zeros(1, FRAMES * SIZE, dtype=torch.float64)
-    features, variables = states()
     return {
         "latent noise": (LatentNoise.from_unknowns(CONTEXT, zero), zero),
-        "feature states": (variables, variables.from_features(features)),
         "pose offsets": (offsets(), torch.zeros(1, offsets().sigma.numel(), dtype=torch.float64)),
     }
 

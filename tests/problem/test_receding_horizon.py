@@ -15,7 +15,6 @@ from mapctl.features import LAYOUT, GroundPose, integrate_root
 from mapctl.kinematics import heading
 from mapctl.metrics.feet import locate_heels
 from mapctl.pose import decode
-from mapctl.problem.feature_states import FeatureStateSolver
 from mapctl.problem.latent_noise import LatentNoise
 from mapctl.problem.objective import Objective
 from mapctl.problem.receding_horizon import HorizonSettings, replay
@@ -39,11 +38,6 @@ METHODS = {
     "zero start": METHOD,
     "best of": replace(METHOD, proposal=BestOfSamples(count=4)),
     "swarm": replace(METHOD, proposal=SwarmProposal(SwarmSettings(particles=4, iterations=1))),
-    "states": FeatureStateSolver(
-        DENSITY.feature_std[: LAYOUT.continuous],
-        DENSITY.feature_mean[: LAYOUT.continuous],
-        budget=Budget(evaluations=12),
-    ),
 }
 
 
@@ -60,9 +54,8 @@ def test_a_window_ends_lower_than_it_began_within_its_budget(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", [METHOD, METHODS["states"]], ids=["latents", "states"])
-def test_windows_join_without_a_seam(method):
-    done, outcome = solve(21, method=method)
+def test_windows_join_without_a_seam():
+    done, outcome = solve(21)
     assert outcome is Outcome.DONE
     assert len(done.features) == 21
     assert [record.frames for record in done.windows] == [6, 6, 6, 2]
@@ -283,8 +276,7 @@ def test_heels_that_no_term_asks_for_are_not_derived(monkeypatch):
         assert len(derived) == times
 
 
-@pytest.mark.parametrize("method", [METHOD, METHODS["states"]], ids=["latents", "states"])
-def test_a_windows_heel_contacts_are_fixed_while_it_is_solved(method):
+def test_a_windows_heel_contacts_are_fixed_while_it_is_solved():
     seen: list[Trial] = []
 
     class Look(LatentPrior):
@@ -296,8 +288,8 @@ def test_a_windows_heel_contacts_are_fixed_while_it_is_solved(method):
             seen.append(trial)
             return super().add_gradient(trial, gradient)
 
-    once = replace(METHOD, rounds=1) if method is METHOD else method
-    solver(once).solve_window(BEGUN, [Look(), *terms_of(1, SHORT.frames)[1:]], SHORT.frames, generator=generator(0))
+    terms = [Look(), *terms_of(1, SHORT.frames)[1:]]
+    solver(replace(METHOD, rounds=1)).solve_window(BEGUN, terms, SHORT.frames, generator=generator(0))
     assert len(seen) > 3
     assert len({tuple(trial.heels_planted.flatten().tolist()) for trial in seen}) == 1
     first = replace(seen[0], heel_plan=None)

@@ -24,7 +24,7 @@ FLOORS = {
         "metrics streaming",
         "commands",
     ),
-    "controllers": ("common", "following", "denoising generation inbetweening steering", "shots", "benchmarks"),
+    "controllers": ("common", "following", "denoising generation inbetweening steering", "shots"),
 }
 """Rooms from the ground up: each imports only from those on lower floors, and its own."""
 

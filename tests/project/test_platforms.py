@@ -5,7 +5,6 @@ shows that nothing here asks for it; it does not show that the other system work
 """
 
 import ast
-import math
 import os
 import re
 import signal
@@ -19,13 +18,12 @@ import pytest
 from helpers import walk
 from source_files import PACKAGE_FILES, ROOT, tree_of
 
-from mapctl.commands.bench.versions import alternate
 from mapctl.commands.shared import inputs
 from mapctl.commands.train.whole_set.plan import CACHE, Job
 from mapctl.errors import RequestError, WriteError
 from mapctl.formats import atomic
 from mapctl.isolated import child
-from mapctl.runtime import forking, interruption, memory
+from mapctl.runtime import forking, interruption
 from priors.training import parallel
 from priors.training.bundled.models import list_models
 from scenes.renderers import offscreen, select
@@ -158,15 +156,6 @@ def test_a_reader_without_bounds_on_memory_reads(monkeypatch):
     monkeypatch.setattr(child, "resource", SimpleNamespace(RLIMIT_AS=1, RLIMIT_CORE=2, setrlimit=refuse))
     child._bound_memory(1 << 30)
     assert asked == [1, 2]
-
-
-def test_times_of_starting_are_of_the_clock_where_the_system_tells_no_other(monkeypatch):
-    monkeypatch.setattr(memory, "resource", None)
-    assert math.isnan(memory.measure_children_seconds())
-    monkeypatch.setattr(alternate, "subprocess", SimpleNamespace(run=lambda *_, **__: SimpleNamespace(returncode=0)))
-    ticks = iter((5.0, 7.5))
-    monkeypatch.setattr(alternate, "time", SimpleNamespace(perf_counter=lambda: next(ticks)))
-    assert alternate._time_start_up(ROOT) == 2500
 
 
 def test_a_signal_that_is_sent_again_does_not_end_a_process_of_windows(monkeypatch):

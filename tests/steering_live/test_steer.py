@@ -10,8 +10,6 @@ from tiny_prior import save_tiny_prior
 from tiny_steering import AHEAD, DENSITY, QUICK, begun
 
 import priors
-from controllers.benchmarks import steering as steering_bench
-from controllers.benchmarks.steering import SteeringBenchmarkSettings, benchmark_steering
 from controllers.steering import steer
 from controllers.steering.loop import (
     LoopSettings,
@@ -27,7 +25,6 @@ from mapctl import curves
 from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import RequestError
 from mapctl.intent.steering import Command, CommandTrack
-from mapctl.metrics.travel import measure_commands
 from mapctl.skeleton import CANONICAL, Skeleton
 
 
@@ -298,36 +295,6 @@ def test_latency_runs_from_the_arrival_to_the_first_frame_that_could_change():
     assert summarise_step_timing(records)["command_latency_s"] == pytest.approx(0.2)
     assert summarise_step_timing(records)["frame_ms_p50"] == pytest.approx(20)
     assert summarise_step_timing(records)["evaluations_per_frame"] == pytest.approx(4 / 3)
-
-
-@pytest.mark.slow
-def test_the_bench_sorts_changes_by_kind_and_counts_them_all():
-    rows = benchmark_steering(DENSITY, SteeringBenchmarkSettings(commands=6, shortest=0.2, longest=0.3, seed=2))
-    *kinds, whole = rows
-    assert whole["change"] == "all"
-    assert sum(row["commands"] for row in kinds) == whole["commands"] == 6
-    assert all(0 <= row["reached"] <= row["commands"] for row in rows)
-    assert whole["frame_ms_p50"] > 0
-
-
-@pytest.mark.slow
-def test_the_bench_of_starts_measures_the_commands_to_go_by_how_far_they_turn(monkeypatch):
-    monkeypatch.setattr(steering_bench, "_STAND_SECONDS", 0.2)
-    monkeypatch.setattr(steering_bench, "_GO_SECONDS", 0.4)
-    measured = []
-
-    def watched(motion, track):
-        rows = measure_commands(motion, track)
-        measured.extend(rows[2:-1:2])
-        return rows
-
-    monkeypatch.setattr(steering_bench, "measure_commands", watched)
-    rows = steering_bench.benchmark_starts(DENSITY, characters=2)
-    assert [(row["change"].split()[-2], row["commands"]) for row in rows] == [
-        *(("0", 2), ("60", 4), ("120", 4), ("180", 2))
-    ]
-    assert {row["speed_mps"] for row in measured} == {1.2}
-    assert [round(row["heading_deg"]) for row in measured[:6]] == [0, 60, 180, 360, 240, 180]
 
 
 def test_pursuit_heads_for_the_curve_ahead_of_the_character():

@@ -1,1 +1,0 @@
-"""Clips and table rows that several benchmarks share."""

@@ -1,1 +1,0 @@
-"""`mapctl bench all`: every table of the documentation, made again and compared with what it was."""

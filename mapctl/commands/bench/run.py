@@ -1,0 +1,120 @@
+"""Measure and print what the solver and walks cost; one thread, no model is judged here (see `tests/benchmarks`)."""
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+
+import priors
+from controllers.common.initial_state import select_initial_state
+from controllers.following.follow import FollowSettings, build_follow_terms, follow
+from controllers.steering import steer
+from mapctl import curves, report
+from mapctl.commands.bench import Bench
+from mapctl.commands.shared.tables import print_table
+from mapctl.features import LAYOUT, PRIOR_FPS
+from mapctl.intent.steering import Command
+from mapctl.problem.context import WindowContext
+from mapctl.problem.latent_noise import LatentNoise
+from mapctl.problem.objective import Objective
+from mapctl.problem.solution import Outcome
+from mapctl.protocols import Density
+from mapctl.skeleton import CANONICAL
+
+Row = dict[str, object]
+_SPEED = 1.2  # m/s of every walk
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Size of the measurements."""
+
+    repeats: int = 40
+    """Number of timed evaluations; the fastest counts, since other work on the machine only adds."""
+    candidates: tuple[int, ...] = (1, 4, 16, 32)
+    """Batch sizes."""
+    seconds: tuple[float, ...] = (4.0, 8.0, 16.0)
+    """Lengths of walks: cost grows linearly with them."""
+    steps: int = 40
+    """Steps of steering."""
+
+
+SIZES = Sizes()
+
+
+def run(command: Bench) -> int:
+    """Measure, and print a table or JSON."""
+    prior, live = priors.load(command.prior), priors.load(command.live)
+    rows = [_measure_evaluation(prior, count, SIZES.repeats) for count in SIZES.candidates]
+    rows += [_measure_follow(prior, seconds) for seconds in SIZES.seconds]
+    rows.append(_measure_steer(live, SIZES.steps))
+    if command.json:
+        print(report.to_json({"bench": "speed", "versions": report.package_versions(), "rows": rows}), end="")
+    else:
+        columns = list(dict.fromkeys(name for row in rows for name in row))
+        print_table(columns, [[row.get(name) for name in columns] for row in rows], title="cost, one thread")
+    return 0
+
+
+def _measure_evaluation(prior: Density, count: int, repeats: int) -> Row:
+    """Time energy and gradient of one window on the fast path and on the torch reference."""
+    fast, slow = (_time_evaluation(each, count, repeats) for each in (prior, prior.without_kernels()))
+    return {
+        "what": f"energy and gradient, 34 frames, {count} candidates",
+        "fast_ms": fast,
+        "reference_ms": slow,
+        "times_faster": slow / fast,
+        "fast_ms_per_candidate": fast / count,
+    }
+
+
+def _time_evaluation(prior: Density, count: int, repeats: int) -> float:
+    curve, settings = curves.circle(radius=4.0), FollowSettings()
+    frames = settings.window.frames
+    arcs = torch.arange(2 * frames, dtype=torch.float64) * _SPEED / PRIOR_FPS
+    terms_of = build_follow_terms(curve, arcs, settings)
+    generator = torch.Generator().manual_seed(0)
+    start = select_initial_state(
+        prior, curve, arcs, terms_of, skeleton=CANONICAL, fps=PRIOR_FPS, generator=generator
+    ).committed
+    context = WindowContext(prior, start.state, start.place, start.joints_world, frames)
+    unknowns = 0.1 * torch.randn(count, frames * LAYOUT.continuous, generator=generator)
+    objective = Objective(LatentNoise.from_unknowns(context, unknowns).build, terms_of(1, frames))
+    return 1000 * _time_fastest(lambda: objective.energy_and_gradient(unknowns), repeats)
+
+
+def _time_fastest(run: Callable[[], object], repeats: int) -> float:
+    run()
+    times = []
+    for _ in range(repeats):
+        began = time.perf_counter()
+        run()
+        times.append(time.perf_counter() - began)
+    return min(times)
+
+
+def _measure_follow(prior: Density, seconds: float) -> Row:
+    began = time.process_time()
+    generator = torch.Generator().manual_seed(0)
+    solution = follow(prior, curves.circle(radius=4.0), seconds=seconds, speed=_SPEED, generator=generator)
+    if solution.status.outcome is Outcome.INTERRUPTED:
+        raise KeyboardInterrupt
+    windows = solution.windows
+    return {
+        "what": f"follow a circle for {seconds:g} s",
+        "ms_per_frame": 1000 * (time.process_time() - began) / solution.motion.num_frames,
+        "evaluations_per_window": sum(window.evaluations for window in windows) / len(windows),
+    }
+
+
+def _measure_steer(prior: Density, steps: int) -> Row:
+    state, _ = steer.begin(prior, Command(_SPEED, 0.0), generator=torch.Generator().manual_seed(0))
+    for _ in range(5):
+        state, _ = steer.step(state, Command(_SPEED, 0.0))
+    began, frames = time.process_time(), 0
+    for number in range(steps):
+        state, new = steer.step(state, Command(_SPEED, 0.3 * math.sin(number / 20)))
+        frames += new.motion.num_frames
+    return {"what": "steer", "ms_per_frame": 1000 * (time.process_time() - began) / frames}

@@ -1,1 +1,0 @@
-"""Two versions of mapctl timed in alternation: what is done in each, and how they take turns."""
