@@ -15,7 +15,6 @@ version = release = __version__
 extensions = [
     "command_options",
     "followed_tutorials",
-    "measured_tables",
     "readable_signatures",
     "myst_parser",
     "sphinx.ext.autodoc",
@@ -24,8 +23,7 @@ extensions = [
     "sphinx_design",
     "sphinx_gallery.gen_gallery",
 ]
-# The gallery's scripts become pages in auto_gallery; what was measured stands in the pages that show it.
-exclude_patterns = ["_build", "gallery", "tables"]
+exclude_patterns = ["_build", "gallery"]  # the scripts become pages in auto_gallery
 
 sphinx_gallery_conf = {
     "examples_dirs": "gallery",

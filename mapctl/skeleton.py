@@ -176,7 +176,7 @@ _FOOT_LENGTH = math.hypot(0.0749, 0.0906)  # metres, from the canonical foot joi
 def find_heels(skeleton: Skeleton) -> Float[Tensor, "2 3"]:
     """Find the left and the right heel in the frames of the foot joints, metres, float64; canonical names.
 
-    On walks, turns and runs of mocap it stands still while the foot is flat (docs/explanations/heels.md).
+    On walks, turns and runs of mocap it stands still while the foot is flat.
     """
     return HeelPoint().offset(skeleton.offsets[skeleton.indices(TOES)].double())
 

@@ -145,7 +145,6 @@ PUBLIC: dict[str, tuple[str, ...]] = {
         "HeelMeasurements",
         "ToeMeasurements",
         "contact_speed",
-        "count_derived_heels",
         "float_height",
         "penetration",
         "planted_share",

@@ -1,7 +1,7 @@
 """Heel contacts, derived from those of the toes and the poses.
 
 A heel stands where its toe is planted and the foot is flat, and for a moment between its strike and the toe's.
-Detection on heels finds hardly more (docs/explanations/heels.md), so features hold the contacts of toes alone.
+Detection on heels finds hardly more, so features hold the contacts of toes alone.
 """
 
 from dataclasses import dataclass

@@ -6,7 +6,7 @@ The floor is the clip's own: the 5th percentile of each toe's height.
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl import contacts, rotations
@@ -127,14 +127,6 @@ class HeelMeasurements:
         """Return the mean rate at which feet turn about the vertical while toe and heel are planted, rad/s; NaN if none
         is."""
         return float((self.yaw.diff(dim=0).abs() * self.fps)[self._stays].mean())
-
-
-def count_derived_heels(motion: Motion) -> Int[Tensor, "2 2"]:
-    """Count frames of both heels by whether detection on the heel itself finds it planted (rows: no, yes) and whether
-    it is by the toe and the pose (columns); canonical joints."""
-    _, heels, derived = _derive_heels(motion)
-    detected = contacts.detect_contacts(heels, float(motion.fps))
-    return torch.bincount((2 * detected + 1 * derived).flatten(), minlength=4).view(2, 2)
 
 
 def _derive_heels(

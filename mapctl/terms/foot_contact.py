@@ -20,7 +20,7 @@ class HeelSigmas:
 
     speed: float = 0.1
     """Standard deviation of the horizontal speed of a planted heel, m/s. Half of it holds heels better still, but toes,
-    paths and jitter pay for that (docs/explanations/heels.md)."""
+    paths and jitter pay for that."""
     height: float = 0.02
     """Standard deviation of the height of a planted heel about its rest height, metres."""
     below: float = 0.01

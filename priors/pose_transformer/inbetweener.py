@@ -23,7 +23,7 @@ SOURCE = "transformer"
 """Name of the in-betweener in notes."""
 MAX_GAP_FRAMES = 240
 """Frames of the longest gap that it fills; longer ones it leaves interpolated, and says so. Windows of training have up
-to 200 frames; beyond 240 the hips stray farther than a tweener's (docs/reference/experiments.md)."""
+to 200 frames; beyond 240 the hips stray farther than a tweener's."""
 _CONTEXT = 24  # frames on either side of what is unknown that the network sees
 _MAX_WINDOW, _OVERLAP = 240, 60  # frames of the longest window that no gap asks for, and that two windows share
 _PARTNERS = CANONICAL.mirror_partners()

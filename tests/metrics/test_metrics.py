@@ -257,16 +257,3 @@ def test_a_clip_that_never_stands_and_an_unknown_rig_have_no_heels():
     clip = walk(40)
     foreign = replace(clip, skeleton=replace(clip.skeleton, names=("pelvis", *clip.skeleton.names[1:])))
     assert all(math.isnan(measure(foreign)[name]) for name in (*names, "heel_planted_share"))
-
-
-def test_derived_heels_are_counted_beside_detected_ones():
-    clip = walk(90)
-    toes, heels = clip.joint_positions()[:, TOES], feet.locate_heels(feet.level_feet(clip))
-    drops = torch.tensor(find_heel_drops(feet.level_feet(clip).skeleton))
-    derived = derive_heel_contacts(detect_contacts(toes, 30), toes, heels, drops, 30.0)
-    detected = detect_contacts(heels, 30)
-    counts = feet.count_derived_heels(clip)
-    for row, found in enumerate((~detected, detected)):
-        for column, made in enumerate((~derived, derived)):
-            assert int(counts[row, column]) == int((found & made).sum())
-    assert int(counts[1, 1]) > 10 * int(counts[0, 1] + counts[1, 0]) > 0

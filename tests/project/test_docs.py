@@ -29,16 +29,16 @@ LONG = re.compile(
 PYTHON = [block for page in pages.PAGES if "tutorials" not in page for block in pages.blocks(page, "python")]
 LONG_PYTHON = {
     "README.md-python-0",
-    "docs/explanations/heels.md-python-0",
-    "docs/explanations/transitions.md-python-0",
+    "docs/explanations/realism.md-python-0",
+    "docs/guides/keyframes.md-python-1",
     "docs/guides/folders.md-python-0",
     "docs/reference/api/jobs.md-python-4",
     "docs/reference/api/solver.md-python-0",
     "docs/reference/api/steering.md-python-2",
-    "docs/explanations/infilling.md-python-0",
+    "docs/guides/keyframes.md-python-0",
     "docs/explanations/denoising.md-python-0",
-    "docs/explanations/tweening.md-python-0",
-    "docs/explanations/tweening.md-python-1",
+    "docs/guides/keyframes.md-python-2",
+    "docs/guides/keyframes.md-python-3",
     "docs/guides/live-from-python.md-python-0",
     "docs/guides/adding-a-term.md-python-0",
     "docs/guides/adding-a-job.md-python-0",
@@ -122,7 +122,7 @@ OUTCOMES = {
     "docs/guides/adding-a-prior.md-python-1": assert_it_is_named,
     "docs/guides/adding-a-job.md-python-0": assert_it_arrives,
     "docs/guides/formats.md-python-0": assert_turned,
-    "docs/explanations/infilling.md-python-0": assert_keys_and_gaps_are_filled,
+    "docs/guides/keyframes.md-python-0": assert_keys_and_gaps_are_filled,
     "docs/explanations/denoising.md-python-0": assert_cleaned,
 }
 """What else holds of a block that ran, by its name: of the folder and of what it left."""

@@ -18,7 +18,7 @@ class Tween(ModelCommand, options.RigOptions):
     """A motion file; or a TOML file of [[key]] tables: a frame or seconds, a pose (a motion file and a pose_frame of
     it), a place = [x, z], height and facing_deg of the hips, and joints, reach, half = "upper" or "lower", or root_only
     = true or "place" where not all of it counts; or a drawing (a CSV of joint,x,y) and view_deg
-    (docs/explanations/infilling.md, docs/explanations/tweening.md)."""
+    (docs/guides/keyframes.md)."""
     out: options.OutFile
     """Where the motion goes: as long as IN, or until the last key."""
     keyframes: Annotated[str | None, arg(metavar="F,F,...")] = None

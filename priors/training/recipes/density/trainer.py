@@ -196,7 +196,7 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
         """Free runs after the first windows, told their paces as the network is in this step, and how these go on.
 
         A pace may change within a window. Gait and style last, and runs have them from the frames they begin with: told
-        them as well, a density of walks was no better (docs/explanations/realism.md, "What was tried on top").
+        them as well, a density of walks was no better.
         """
         matching = self.settings.matching
         matching = replace(matching, batch=max(_LEAST_RUNS, self.group.share(matching.batch)))
