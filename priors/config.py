@@ -3,7 +3,7 @@
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -19,6 +19,8 @@ class NetworkConfig:
     """Shape of a network. Its subclasses are frozen dataclasses whose fields all have defaults."""
 
     __pydantic_config__ = toml.STRICT
+    FIXED: ClassVar[Mapping[str, Any]] = {}
+    """Entries of cards that are no choice: the only value that each may have."""
 
     def as_card(self) -> dict[str, Any]:
         """Convert to a card's JSON, which knows no tuples."""
@@ -27,8 +29,9 @@ class NetworkConfig:
     @classmethod
     def of_card(cls: type[C], config: Mapping[str, Any]) -> C:
         """Invert `as_card`; RequestError for fields that are not these, of another type or absurdly large."""
+        free = {name: value for name, value in config.items() if cls.FIXED.get(name, ...) != value}
         try:
-            found = TypeAdapter(cls).validate_json(json.dumps(config), strict=True)
+            found = TypeAdapter(cls).validate_json(json.dumps(free), strict=True)
         except ValidationError as error:
             raise RequestError(toml.describe_fault(error)) from error
         for name, value in vars(found).items():

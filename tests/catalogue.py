@@ -6,7 +6,6 @@ from dataclasses import replace
 import torch
 from helpers import generator, tiny_density, tiny_model, walk
 from linear_inbetweener import LinearInbetweener
-from tiny_infiller import CONFIG as TINY_INFILLER
 from tiny_infiller import tiny_infiller
 from tiny_refiner import refiner_of
 from tiny_stitcher import tiny_stitcher
@@ -176,7 +175,6 @@ _QUICK = RolloutSettings(
 INBETWEENERS: dict[str, Inbetweener] = {
     "transformer": tiny_transformer(drawn=0.05),
     "infiller": tiny_infiller(drawn=0.02),
-    "recurrent infiller": tiny_infiller(drawn=0.02, config=replace(TINY_INFILLER, architecture="recurrent")),
     "slerp": SlerpInbetweener(),
     "rollouts": RolloutInbetweener([tiny_density()], SlerpInbetweener(), _QUICK),
     "auto": AutoInbetweener(tiny_infiller(drawn=0.02), [tiny_density()]),

@@ -113,13 +113,7 @@ MODELS = {
     "stitcher": Model(stitcher.StitcherTrainer, _windowed(stitcher.StitcherRecipe, tiny_stitcher.CONFIG)),
 }
 """By the names of their commands."""
-VARIANTS = {
-    "tweener with a critic": Model(tweener_critic.CriticisedTrainer, _criticised),
-    "recurrent infiller": Model(
-        infiller.InfillerTrainer,
-        _windowed(infiller.InfillerRecipe, replace(tiny_infiller.CONFIG, architecture="recurrent")),
-    ),
-}
+VARIANTS = {"tweener with a critic": Model(tweener_critic.CriticisedTrainer, _criticised)}
 """What those commands train with other options."""
 
 

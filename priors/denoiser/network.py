@@ -7,6 +7,7 @@ sigma.
 """
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -22,12 +23,10 @@ from mapctl.recording import Capture, CaptureProposal
 from mapctl.skeleton import CANONICAL
 from priors import checkpoints
 from priors.config import NetworkConfig
-from priors.denoiser import plain
 
 _NON_ROOT_JOINTS = CANONICAL.num_joints - 1
 _ANGLE_CHANNELS = 2 + 3 * _NON_ROOT_JOINTS  # tilt and rotation vectors
 _INPUT_CHANNELS = 2 * _ANGLE_CHANNELS + 2 + 1 + 6 + 3 + 2 * (CANONICAL.num_joints + 1)
-_OBSERVED_CHANNELS = _ANGLE_CHANNELS + 2 + 3 + 3 + 2 * (CANONICAL.num_joints + 1)  # as they are alone
 _WORLD_CHANNELS = 2 * (6 + 3) * CANONICAL.num_joints  # world rotations and places, observed and smoothed
 _OUTPUT_BLOCKS = (_ANGLE_CHANNELS, 1, 3, 2)  # angles, turn, place beside the slow one, contacts
 
@@ -45,6 +44,8 @@ _CHUNK_FRAMES, _MARGIN_FRAMES = 512, 64  # frames cleaned at once, and beside th
 class DenoiserConfig(NetworkConfig):
     """Shape of the network."""
 
+    FIXED: ClassVar = {"plain": False}
+
     width: int = 192
     """Channels of the hidden layers."""
     kernel: int = 5
@@ -54,32 +55,24 @@ class DenoiserConfig(NetworkConfig):
     sees_world: bool = True
     """Whether joints' world rotations and places are inputs beside their angles: noise of places, which makes a joint's
     angles err against its parent's, is independent there, and feet that slide can be seen."""
-    plain: bool = False
-    """Whether it is the plain peer (see priors.denoiser.plain), of which the width alone is told here: it sees what was
-    observed, neither smoothed nor in the world, and what it adds does not fade with the noise."""
 
     def __post_init__(self):
         if self.width < 1 or self.kernel < 1 or self.kernel % 2 == 0 or min(self.dilations, default=0) < 1:
             raise RequestError(f"a denoiser needs a positive width, an odd kernel and positive dilations, got {self}")
-        if self.plain and self.width % plain.HEADS:
-            raise RequestError(f"the width of a plain denoiser must be a multiple of {plain.HEADS}, got {self.width}")
 
 
 class DenoiserNetwork(nn.Module):
-    """Capture in, proposal out; untrained, it smooths, or changes nothing where it is plain."""
+    """Capture in, proposal out; untrained, it smooths."""
 
     def __init__(self, config: DenoiserConfig, *, bfloat16: bool = False):
         """Compute convolutions in bfloat16 if so asked; what they are given and give back is not."""
         super().__init__()
         self.config, self.reduced_precision = config, bfloat16
-        if config.plain:
-            self.plain = plain.PlainLayers(_OBSERVED_CHANNELS, config.width)
-        else:
-            channels = _INPUT_CHANNELS + (_WORLD_CHANNELS if config.sees_world else 0)
-            self.first = nn.Conv1d(channels, config.width, config.kernel, padding=config.kernel // 2)
-            self.blocks = nn.ModuleList(
-                _ResidualBlock(config.width, config.kernel, dilation) for dilation in config.dilations
-            )
+        channels = _INPUT_CHANNELS + (_WORLD_CHANNELS if config.sees_world else 0)
+        self.first = nn.Conv1d(channels, config.width, config.kernel, padding=config.kernel // 2)
+        self.blocks = nn.ModuleList(
+            _ResidualBlock(config.width, config.kernel, dilation) for dilation in config.dilations
+        )
         self.last = nn.Linear(config.width, sum(_OUTPUT_BLOCKS))
         nn.init.zeros_(self.last.weight)
         nn.init.zeros_(self.last.bias)
@@ -89,18 +82,13 @@ class DenoiserNetwork(nn.Module):
 
     def forward(self, capture: Capture) -> CaptureProposal:
         """Propose a motion, frames that were not observed at all included."""
-        view, config = _CaptureView(capture), self.config
-        inputs = view.observed() if config.plain else view.inputs(sees_world=config.sees_world)
+        view = _CaptureView(capture)
+        inputs = view.inputs(sees_world=self.config.sees_world)
         with torch.autocast(inputs.device.type, torch.bfloat16, enabled=self.reduced_precision):
-            hidden = self.plain(inputs) if config.plain else self._convolve(inputs)
+            hidden = self._convolve(inputs)
             change, spread = self.last(hidden).to(inputs.dtype), self.spread(hidden.detach()).to(inputs.dtype)
-        pose, contacts = view.added(change) if config.plain else view.changed(change)
+        pose, contacts = view.changed(change)
         return CaptureProposal(pose, contacts, spread)
-
-    @property
-    def piece_frames(self) -> tuple[int, int]:
-        """Frames of a long capture that are cleaned at once, and beside them."""
-        return (plain.PIECE_FRAMES, plain.MARGIN_FRAMES) if self.config.plain else (_CHUNK_FRAMES, _MARGIN_FRAMES)
 
     def _convolve(self, inputs: Float[Tensor, "batch frames inputs"]) -> Float[Tensor, "batch frames width"]:
         hidden = self.first(inputs.transpose(1, 2))
@@ -169,11 +157,6 @@ class _CaptureView:
             dim=-1,
         )
 
-    def observed(self) -> Float[Tensor, "batch frames inputs"]:
-        """Encode the capture as it is in units of about one."""
-        own = (self.angles / ANGLE_UNIT, self.turn / ANGLE_UNIT, self.off / POSITION_UNIT)
-        return torch.cat([*own, *self._slow_way(), *self._certainty()], dim=-1)
-
     def _slow_way(self) -> list[Float[Tensor, "batch frames inputs"]]:
         """Encode how the slow frame of the hips turns and travels, and its height."""
         rate = _difference_frames(self.slow_heading[..., None])
@@ -212,12 +195,6 @@ class _CaptureView:
         off = self.off + self.root_noise_share * (_smooth(self.off, _SMOOTHING_SIGMA) - self.off + POSITION_UNIT * off)
         return self._unpack(angles, turn, off), contacts
 
-    def added(self, change: Float[Tensor, "batch frames outputs"]) -> tuple[BodyPose, Tensor]:
-        """Add a change to the observation, whatever its noise."""
-        angles, turn, off, contacts = change.split(_OUTPUT_BLOCKS, dim=-1)
-        added = self.angles + ANGLE_UNIT * angles, self.turn + ANGLE_UNIT * turn, self.off + POSITION_UNIT * off
-        return self._unpack(*added), contacts
-
     def _unpack(self, angles: Tensor, turn: Tensor, off: Tensor) -> BodyPose:
         root = self.slow_root + rotations.rotate_about_y(off, self.slow_heading)
         packed = torch.cat([root, (self.slow_heading + turn[..., 0])[..., None], angles], dim=-1)
@@ -253,7 +230,7 @@ class ConvDenoiser(checkpoints.LoadedModel):
 
     def clean(self, capture: Capture) -> CaptureProposal:
         """Propose the motion of a capture of any length, piece by piece, each with a margin that it shares."""
-        pieces, (count, margin) = [], self.network.piece_frames
+        pieces, count, margin = [], _CHUNK_FRAMES, _MARGIN_FRAMES
         for start in range(0, capture.frames, count):
             first, stop = max(0, start - margin), min(capture.frames, start + count + margin)
             with torch.no_grad():

@@ -1,20 +1,18 @@
-"""Networks that fill position images: those of Kaufmann et al. 2020, its baselines, and ours.
+"""Networks that fill position images: that of Kaufmann et al. 2020, and ours.
 
-All are given an image as rows over time, and give the rows of the whole motion. That of Kaufmann et al. 2020, section
-3.2, treats them as a picture, with filters over rows and frames, and makes the motion anew. Ours has the same five
+Both are given an image as rows over time, and return the rows of the whole motion. That of Kaufmann et al. 2020,
+section 3.2, treats them as a picture, with filters over rows and frames, and makes the motion anew. Ours has five
 encoding and five decoding units, but its filters run over time alone and see all rows at once; it is given the mask of
-known joints, keeps these, changes linear interpolation in the gaps, and passes details across by skips. The recurrent
-one is in `transitions.py`.
+known joints, keeps these, changes linear interpolation in the gaps, and passes details across by skips.
 """
 
-from collections.abc import Callable
 from typing import Literal
 
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn.functional import leaky_relu, max_pool1d, max_pool2d, relu
+from torch.nn.functional import leaky_relu, max_pool1d, max_pool2d
 
-Architecture = Literal["skips", "image", "vanilla", "manifold", "recurrent"]
+Architecture = Literal["skips", "image"]
 _LEAK = 0.2
 
 
@@ -68,60 +66,29 @@ class _ResidualUnit(nn.Module):
 
 
 class ImageAutoencoder(nn.Module):
-    """The autoencoder of Kaufmann et al. 2020: 3x3 filters over rows and frames, pooling, strided de-convolutions; or
-    its vanilla baseline, with a single strided convolution in each unit."""
+    """The autoencoder of Kaufmann et al. 2020: 3x3 filters over rows and frames, pooling, strided de-convolutions."""
 
-    def __init__(self, widths: tuple[int, ...], *, vanilla: bool):
+    def __init__(self, widths: tuple[int, ...]):
         super().__init__()
-        self.vanilla = vanilla
         ins = (1, *widths[:-1])
-        stride = 2 if vanilla else 1
-        self.down = nn.ModuleList(
-            nn.Conv2d(a, b, 3, padding=1, stride=stride) for a, b in zip(ins, widths, strict=True)
-        )
-        self.down_two = nn.ModuleList() if vanilla else nn.ModuleList(nn.Conv2d(b, b, 3, padding=1) for b in widths)
-        outs = tuple(reversed(ins))
-        self.up = nn.ModuleList(
-            nn.ConvTranspose2d(b, b if not vanilla else a, 2, stride=2)
-            for b, a in zip(reversed(widths), outs, strict=True)
-        )
-        self.up_two = (
-            nn.ModuleList()
-            if vanilla
-            else nn.ModuleList(nn.Conv2d(b, a, 3, padding=1) for b, a in zip(reversed(widths), outs, strict=True))
-        )
+        self.down = nn.ModuleList(nn.Conv2d(a, b, 3, padding=1) for a, b in zip(ins, widths, strict=True))
+        self.down_two = nn.ModuleList(nn.Conv2d(b, b, 3, padding=1) for b in widths)
+        ups = list(zip(reversed(widths), reversed(ins), strict=True))
+        self.up = nn.ModuleList(nn.ConvTranspose2d(b, b, 2, stride=2) for b, _ in ups)
+        self.up_two = nn.ModuleList(nn.Conv2d(b, a, 3, padding=1) for b, a in ups)
         _initialise_glorot(self)
 
     def forward(self, rows: Float[Tensor, "batch rows frames"]) -> Float[Tensor, "batch rows frames"]:
         """Return the rows anew."""
         hidden, sizes = rows[:, None], []
-        for level, layer in enumerate(self.down):
+        for one, two in zip(self.down, self.down_two, strict=True):
             sizes.append(hidden.shape[-2:])
-            hidden = leaky_relu(layer(hidden), _LEAK)
-            if not self.vanilla:
-                hidden = max_pool2d(leaky_relu(self.down_two[level](hidden), _LEAK), 2, ceil_mode=True)
-        for level, (layer, size) in enumerate(zip(self.up, reversed(sizes), strict=True)):
-            last = level == len(self.up) - 1
-            hidden = layer(hidden)[..., : size[0], : size[1]]
-            if not self.vanilla:
-                hidden = self.up_two[level](leaky_relu(hidden, _LEAK))
-            hidden = hidden if last else leaky_relu(hidden, _LEAK)
+            hidden = leaky_relu(two(leaky_relu(one(hidden), _LEAK)), _LEAK)
+            hidden = max_pool2d(hidden, 2, ceil_mode=True)
+        for level, (one, two, size) in enumerate(zip(self.up, self.up_two, reversed(sizes), strict=True)):
+            hidden = two(leaky_relu(one(hidden)[..., : size[0], : size[1]], _LEAK))
+            hidden = hidden if level == len(self.up) - 1 else leaky_relu(hidden, _LEAK)
         return hidden[:, 0]
-
-
-class HoldenManifold(nn.Module):
-    """One layer over time, the motion manifold of Holden et al. 2016 (second baseline of Kaufmann et al. 2020)."""
-
-    def __init__(self, rows: int, width: int = 256, kernel: int = 25):
-        super().__init__()
-        self.encode = nn.Conv1d(rows, width, kernel, padding=kernel // 2)
-        self.decode = nn.Conv1d(width, rows, kernel, padding=kernel // 2)
-        _initialise_glorot(self)
-
-    def forward(self, rows: Float[Tensor, "batch rows frames"]) -> Float[Tensor, "batch rows frames"]:
-        """Return the rows anew."""
-        hidden = max_pool1d(relu(self.encode(rows)), 2, ceil_mode=True)
-        return self.decode(hidden.repeat_interleave(2, dim=-1)[..., : rows.shape[-1]])
 
 
 def _initialise_zero(layer: nn.Module) -> None:
@@ -142,10 +109,3 @@ def _initialise_glorot(network: nn.Module) -> None:
 PAPER_WIDTHS = (32, 64, 128, 256, 256)
 """Channels of each unit, so that a sample of 240 frames becomes its 3 x 8 x 256 (Kaufmann et al. 2020, section
 3.2)."""
-
-AUTOENCODERS: dict[str, Callable[[int], nn.Module]] = {
-    "image": lambda rows: ImageAutoencoder(PAPER_WIDTHS, vanilla=False),
-    "vanilla": lambda rows: ImageAutoencoder(PAPER_WIDTHS, vanilla=True),
-    "manifold": HoldenManifold,
-}
-"""Networks that make all rows anew, by name: from the number of rows."""

@@ -1,5 +1,4 @@
-"""The infiller: a network that proposes missing frames and joints of a motion (Kaufmann et al. 2020), and the recurrent
-one that fills gaps alone (Harvey and Pal 2018)."""
+"""The infiller: a network that proposes missing frames and joints of a motion (Kaufmann et al. 2020)."""
 
 from dataclasses import dataclass
 
@@ -11,14 +10,11 @@ from mapctl import rotations
 from mapctl.errors import RequestError
 from mapctl.inbetweening import PositionImage, ProposedPositions
 from mapctl.inbetweening.position_image import mirror_positions
-from mapctl.inbetweening.position_proposal import make_position_image
-from mapctl.inbetweening.query import GapQuery
 from mapctl.protocols import PositionInfiller
 from mapctl.skeleton import CANONICAL
 from priors import checkpoints
 from priors.config import NetworkConfig
-from priors.infiller.architectures import AUTOENCODERS, Architecture, TemporalUNet
-from priors.infiller.transitions import TransitionNetwork, fill_transitions
+from priors.infiller.architectures import PAPER_WIDTHS, Architecture, ImageAutoencoder, TemporalUNet
 
 _JOINTS = CANONICAL.num_joints
 _POSITION_ROWS, _REFERENCE_ROWS, _CONTACT_ROWS = 3 * _JOINTS, 3, 2
@@ -27,7 +23,6 @@ IMAGE_ROWS = _POSITION_ROWS + _REFERENCE_ROWS + _CONTACT_ROWS
 _MASK_ROWS = _JOINTS + 1 + 2  # known, present, frames since and until any joint is known
 _VELOCITY_UNIT, _HEADING_UNIT = 0.05, 0.05  # one unit of the reference's velocities: metres and radians a frame
 _MAX_FRAMES_SINCE = 60  # frames beyond which it is all one how far a known frame is
-_KEEPERS = ("skips", "recurrent")  # networks that keep what is known
 
 
 @dataclass(frozen=True)
@@ -35,17 +30,13 @@ class InfillerConfig(NetworkConfig):
     """Shape of the network."""
 
     architecture: Architecture = "skips"
-    """Architecture: `skips` is ours, `image` that of Kaufmann et al. 2020, `vanilla` and `manifold` its baselines,
-    `recurrent` that of Harvey and Pal 2018."""
+    """Architecture: `skips` is ours, which keeps what is known, `image` that of Kaufmann et al. 2020."""
     widths: tuple[int, ...] = (128, 160, 192, 256, 256)
-    """Channels of the units of `skips`; the last is the memory of `recurrent`, the others' are fixed."""
+    """Channels of the units of `skips`; those of `image` are fixed."""
     kernel: int = 3
     """Width of a convolution of `skips`, frames."""
 
     def __post_init__(self):
-        if self.architecture not in (*_KEEPERS, *AUTOENCODERS):
-            known = ", ".join((*_KEEPERS, *AUTOENCODERS))
-            raise RequestError(f"no infiller architecture {self.architecture!r}; there are {known}")
         if min(self.widths, default=0) < 1 or self.kernel < 1 or self.kernel % 2 == 0:
             raise RequestError(f"an infiller needs positive widths and an odd kernel, got {self}")
 
@@ -62,22 +53,17 @@ class InfillerNetwork(nn.Module):
         self.config, self.reduced_precision = config, bfloat16
         self.register_buffer("mean", torch.zeros(_JOINTS, 3))
         self.register_buffer("std", torch.ones(_JOINTS, 3))
-        self.keeps_observed = config.architecture in _KEEPERS
-        self.recurrent = config.architecture == "recurrent"
-        if self.recurrent:
-            self.net = TransitionNetwork(config.widths[-1])
-        elif self.keeps_observed:
+        self.keeps_observed = config.architecture == "skips"
+        if self.keeps_observed:
             self.net = TemporalUNet(
                 IMAGE_ROWS + _MASK_ROWS, _POSITION_ROWS + _CONTACT_ROWS, config.widths, config.kernel
             )
         else:
-            self.net = AUTOENCODERS[config.architecture](IMAGE_ROWS)
+            self.net = ImageAutoencoder(PAPER_WIDTHS)
 
     def forward(self, image: PositionImage) -> ProposedPositions:
         """Fill an image; ours keeps known positions to the bit, an autoencoder makes all anew (Kaufmann et al. 2020,
         section 4.2)."""
-        if self.recurrent:
-            return self.roll_out(image)
         shown = self._show(image)
         rows = self._rows(image, shown)
         rows = torch.cat([rows, _encode_masks(image)], dim=-1) if self.keeps_observed else rows
@@ -90,14 +76,6 @@ class InfillerNetwork(nn.Module):
         if not self.keeps_observed:
             return ProposedPositions(self.mean + change, contacts)
         return ProposedPositions(torch.where(image.known[..., None], image.places, shown + change), contacts)
-
-    def roll_out(self, image: PositionImage, *, keep: bool = True) -> ProposedPositions:
-        """Fill the gaps of an image frame by frame, by a recurrent network; without `keep` the first frames behind them
-        are not as they are known but as the network would go on."""
-        assert isinstance(self.net, TransitionNetwork)
-        with torch.autocast(image.places.device.type, torch.bfloat16, enabled=self.reduced_precision):
-            places, contacts = fill_transitions(self.net, image, self._show(image), keep=keep)
-        return ProposedPositions(places, contacts)
 
     def _show(self, image: PositionImage) -> Float[Tensor, "batch frames joints 3"]:
         """Return the image's places, with joints that are never known at their mean."""
@@ -142,25 +120,13 @@ class ConvInfiller(checkpoints.LoadedModel, PositionInfiller):
 
     @torch.no_grad()
     def complete(self, image: PositionImage) -> ProposedPositions:
-        """Propose the whole motion, of any length: the mean of the outputs for it and for its mirror image, but of a
-        recurrent network what it makes, since the mean of two ways of going on is none."""
-        if self.network.recurrent:
-            return self.network(image)
+        """Propose the whole motion, of any length: the mean of the outputs for it and for its mirror image."""
         one, other = self.network(image), self.network(image.mirrored())
         places = (one.places + mirror_positions(other.places)) / 2
         contacts = (one.contacts + other.contacts.flip(-1)) / 2
         return ProposedPositions(
             torch.where(image.known[..., None] & self.network.keeps_observed, image.places, places), contacts
         )
-
-    @torch.no_grad()
-    def propose_raw(self, query: GapQuery) -> Float[Tensor, "frames joints 3"]:
-        """Propose positions, world, metres at unit size, as a recurrent network makes them: behind a gap its first
-        frames are where it arrives, not where it should. ValueError for other networks, which keep what is known."""
-        if not self.network.recurrent:
-            raise ValueError(f"{self.name}: a network that is no recurrent one has no arrival of its own")
-        image = make_position_image(query)
-        return image.to_world(self.network.roll_out(image, keep=False).places)[0].double()
 
 
 def load(name: str) -> ConvInfiller:

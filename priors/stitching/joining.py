@@ -53,8 +53,6 @@ def join_sides(sides: Sides) -> Joined:
     apart = (pairs[0].joints_world() - pairs[1].joints_world()).norm(dim=-1).mean(dim=(1, 2))
     miss = (pairs[1].root_position - pairs[0].root_position)[:, 0, ::2]
     twist = rotations.wrap_angle(pairs[1].heading - pairs[0].heading)[:, 0]
-    if sides.alone:
-        return _follow_one(sides, bodies[0], apart)
     rows = []
     for side, body in enumerate(bodies):
         frame = torch.arange(1, made + 1) if side == 0 else torch.arange(made, 0, -1)
@@ -68,11 +66,6 @@ def join_sides(sides: Sides) -> Joined:
         rows.append((root + offset, quats, sides.logits[side][:, order]))
     root, quats, logits = (_blend(one, other, between, first, last) for one, other in zip(*rows, strict=True))
     return Joined(root, quats, logits, apart)
-
-
-def _follow_one(sides: Sides, body: BodyPose, apart: Tensor) -> Joined:
-    """Follow the forward side alone: without the bi-directional scheme nothing is stitched."""
-    return Joined(body.root_position, body.local_quat_xyzw, sides.logits[0], apart)
 
 
 def _place_body(sides: Sides, side: int) -> BodyPose:

@@ -28,9 +28,6 @@ from mapctl.features import LAYOUT
 from priors.config import NetworkConfig
 from priors.stitching.layers import SIDES, SidedExperts, SidedLayers, SidedLstm
 
-PARTS = ("bs", "sl", "li", "ba", "pm", "d", "lstm")
-"""Parts that can be left out, as in table 6: the bi-directional scheme, stitching loss, latent interpolation,
-bi-directional aligning, phase modulation, critics, the encoder's LSTM."""
 PHASES = 4
 """Numbers of the two toes' phases."""
 POSE = slice(LAYOUT.slices["root_height"].start, LAYOUT.continuous)
@@ -73,14 +70,13 @@ class StitcherConfig(NetworkConfig):
     longest: int = 61
     """Frames from one pose to the other in the longest transition."""
     without: tuple[str, ...] = ()
-    """Parts that are left out (see PARTS)."""
+    """Parts that are left out of training: `d`, the critics, or none."""
     printed: bool = False
     """The scheme as the paper prints it, at these widths."""
 
     def __post_init__(self):
-        unknown = [part for part in self.without if part not in PARTS]
-        if unknown:
-            raise RequestError(f"a stitcher has no part {unknown[0]!r}; parts are {', '.join(PARTS)}")
+        if self.without not in ((), ("d",)):
+            raise RequestError(f"a stitcher is trained without ('d',) or without nothing, (); got {self.without}")
         if self.embedding[-1] % 2 or self.longest < 2:
             raise RequestError("a stitcher's embedding is even, and its longest transition of 2 frames at least")
         if self.printed and self.shared:
@@ -192,17 +188,13 @@ class StitcherNetwork(nn.Module):
         self.state = SidedLayers(_STATE, *config.embedding)
         self.offset = SidedLayers(_OFFSET, *config.embedding)
         self.target = SidedLayers(_STATE, *config.embedding)
-        self.lstm = "lstm" not in config.without
-        self.encoder = (
-            SidedLstm(seen, config.encoder) if self.lstm else SidedLayers(seen, 2 * config.encoder, config.encoder)
-        )
+        self.encoder = SidedLstm(seen, config.encoder)
         self.now = SidedLayers(config.encoder, config.head, 2 * config.own)
         self.arrived = SidedLayers(config.encoder, config.head, 2 * config.own)
         self.decoder = SidedLstm(config.told + config.shared + config.own, config.decoder)
-        experts = 1 if "pm" in config.without else config.experts
-        self.experts = SidedExperts(experts, (config.decoder + config.shared, *config.expert, LAYOUT.size))
+        self.experts = SidedExperts(config.experts, (config.decoder + config.shared, *config.expert, LAYOUT.size))
         self.carry = nn.Parameter(torch.zeros(2, SIDES, 1, POSE.stop))
-        self.gate = SidedLayers(PHASES, *config.gate, experts)
+        self.gate = SidedLayers(PHASES, *config.gate, config.experts)
         self.first_phase = SidedLayers(seen, config.phase, PHASES)
         self.next_phase = SidedLayers(LAYOUT.size + PHASES, config.phase, config.phase, PHASES)
         if config.shared:
@@ -255,15 +247,7 @@ class StitcherNetwork(nn.Module):
     ) -> tuple[Float[Tensor, "2 batch width"], tuple[Tensor, Tensor], Gaussian]:
         """Encode a frame at which a side has `arrived` by some share; also returns the LSTM's memory and the prior's
         distribution of the frame's latent: that of now, and by this share that on arrival (Eq. 1)."""
-        if not self.lstm:
-            output = self.encoder(seen)
-            memory_after = memory.encoder
-        else:
-            output, cell = self.encoder(seen, memory.encoder)
-            memory_after = (output, cell)
-        prior = Gaussian.of(self.now(output))
-        if "li" in self.config.without:
-            return output, memory_after, prior
+        output, cell = self.encoder(seen, memory.encoder)
         # As if it were there: the target in place of the current frame, from the memory before this frame.
         there = self.embed(
             Situation(
@@ -278,8 +262,8 @@ class StitcherNetwork(nn.Module):
                 torch.zeros_like(now.left),
             )
         )
-        arrival = self.encoder(there, memory.encoder)[0] if self.lstm else self.encoder(there)
-        return output, memory_after, prior.blend(Gaussian.of(self.arrived(arrival)), arrived)
+        arrival = Gaussian.of(self.arrived(self.encoder(there, memory.encoder)[0]))
+        return output, (output, cell), Gaussian.of(self.now(output)).blend(arrival, arrived)
 
     def decode(
         self,

@@ -77,8 +77,6 @@ class Sides:
     """Of the experts."""
     at_ends: Float[Tensor, "sides batch 4"]
     """Phases of the ends themselves."""
-    alone: bool = False
-    """Whether the forward side walks the whole way, and the other counts nothing: without the bi-directional scheme."""
     spread: bool = True
     """Whether what the sides disagree on in place is spread over the whole way, before the overlap is blended."""
 
@@ -99,8 +97,6 @@ class Sides:
 def count_made(network: StitcherNetwork, frames: int) -> int:
     """Count the frames that each side of a transition makes: up to the middle and K beyond it, an eighth of the
     transition and 6 at most, which the paper leaves open; one at least is made by both."""
-    if "bs" in network.config.without:
-        return frames - 1
     beyond = min(round(frames / _OVERLAP_SHARE), _MOST_OVERLAP)
     return min(max(frames // 2 + beyond, (frames + 1) // 2), frames - 1)
 
@@ -130,8 +126,8 @@ def walk_stepwise(network: StitcherNetwork, ends: Ends, frames: int, latents: La
     features, logits, places, headings, phases, shares = (
         torch.stack(column, dim=2) for column in zip(*rows, strict=True)
     )
-    alone, spread = "bs" in network.config.without, not network.config.printed
-    return Sides(frames, features, logits, places, headings, phases, shares, memory.phase, alone, spread)
+    spread = not network.config.printed
+    return Sides(frames, features, logits, places, headings, phases, shares, memory.phase, spread)
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,7 +169,7 @@ class _Walker:
         also returns the contacts' logits and the experts' shares."""
         network, memory, paced = self.network, standing.memory, standing.paced
         here = standing.now, standing.change, paced
-        aligned = left >= 1 and "ba" not in network.config.without
+        aligned = left >= 1
         target, target_at = (here, standing.at) if aligned else (_pick_end(self.ends), self.far_at)
         situation = _look(here, standing.at, target, target_at, float(left if aligned else self.frames - step))
         seen = network.embed(situation)

@@ -1,25 +1,16 @@
-"""Classes of motion for trained weights: `python -m priors.tweening.class_vectors --data DATA --weights RUN`.
-
-It reads the clips that training saw and writes what the style encoder makes of each class into the card, as the end of
-`mapctl train tweener` does.
-"""
+"""Vectors of the classes of motion that training saw, as the style encoder makes them, for the card of a tweener."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import torch
-import tyro
 
 from mapctl import motion_dna, rotations
 from mapctl.errors import RequestError
-from mapctl.formats.atomic import write_text
 from mapctl.motion_dna import MotionDna
 from mapctl.pose import BodyPose
-from priors import checkpoints
-from priors.training.corpus import Corpus, read_corpus
-from priors.tweening.generator import GeneratorConfig, GeneratorNetwork
+from priors.training.corpus import Corpus
+from priors.tweening.generator import GeneratorNetwork
 from priors.tweening.styles import LABELS, encode_classes, find_class
 
 CLIPS_OF_CLASS = 24
@@ -61,31 +52,3 @@ def _spread(count: int) -> list[int]:
 def _take_poses(features: torch.Tensor) -> MotionDna:
     pose = BodyPose.of_features_in_place(features)
     return motion_dna.of_rotations(rotations.from_rotation_vector(pose.rotation_vectors))
-
-
-def main(data: Path, weights: str, *, labels: str = LABELS, skip_first: bool = True, cache: Path | None = None) -> None:
-    """Write the classes into the card of trained weights, over those that it holds.
-
-    Args:
-        data: Folder of .bvh files that was trained on.
-        weights: File or run folder of the tweener.
-        labels: Regular expression whose first group in a clip's name is its class.
-        skip_first: Leave out frame 0 of every clip (the T-pose of CMU takes).
-        cache: Folder for the clips as features, which take minutes to read; beside the weights if not given.
-    """
-    path = checkpoints.locate(weights)
-    with checkpoints.open_checkpoint(weights, "tweener") as (tensors, card):
-        network = GeneratorNetwork(GeneratorConfig.of_card(card.config))
-        network.load_state_dict(tensors)
-    held_out = {name for part in card.data.get("held_out", {}).values() for name in part}
-    kept = path.parent / "cache" if cache is None else cache
-    corpus = read_corpus(data, match=card.data.get("match", ""), cache=kept, skip_first=skip_first)
-    seen = [number for number, name in enumerate(corpus.names) if name not in held_out]
-    classes = compute_classes(network.eval(), corpus.subset(seen), labels)
-    card = replace(card, data={**card.data, **classes})
-    file = path.with_suffix(".json")
-    write_text(file, checkpoints.encode_json(vars(card), file, indent=1))
-
-
-if __name__ == "__main__":
-    tyro.cli(main)

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -33,14 +34,11 @@ _DOWN_RATIOS = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
 _UP_RATIOS = ((1.4, 1.6), (2.2, 2.8), (3.6, 4.6), (5.8, 7.2), (8.8, 10.6), (12.6, 14.8))
 
 
-KEY_INPUTS, ARCHITECTURES = ("dense", "sparse"), ("two-stage", "one-stage", "upsampling")
-_ROOT_ROWS = 3  # of a generator that makes the hips' way: ahead of the reference, beside it, and height
-_ROOT_UNIT, _HIPS_HEIGHT = 0.3, 0.9  # metres
-
-
 @dataclass(frozen=True)
 class GeneratorConfig(NetworkConfig):
     """Shape of the network."""
+
+    FIXED: ClassVar = {"keys": "dense", "architecture": "two-stage"}
 
     widths: tuple[int, ...] = (96, 128, 192, 256, 288, 288)
     """Channels of the encoder's layers, each of which halves the frames."""
@@ -52,15 +50,7 @@ class GeneratorConfig(NetworkConfig):
     """Whether the decoder's stages also see the style, and what the encoder was given at their rate, which the paper's
     do not."""
 
-    keys: str = "dense"
-    """`dense` copies the nearest key into every frame; `sparse` tells keys in their own frames alone (figure 7)."""
-    architecture: str = "two-stage"
-    """`two-stage`, which leaves the hips' way to the path predictor; `one-stage` makes it itself, and `upsampling`
-    repeats frames instead of transposing convolutions (figure 8)."""
-
     def __post_init__(self):
-        if self.keys not in KEY_INPUTS or self.architecture not in ARCHITECTURES:
-            raise RequestError(f"a generator has keys of {KEY_INPUTS} and is one of {ARCHITECTURES}, got {self}")
         if len(self.widths) != _STAGES or len(self.up_widths) != _STAGES or min(*self.widths, *self.up_widths) < 1:
             raise RequestError(f"a generator needs {_STAGES} positive widths down and as many up, got {self}")
         if self.style < 1:
@@ -79,8 +69,6 @@ class GeneratedPoses:
     """Rotations and places from the hips, seen along the reference's heading."""
     responses: tuple[Tensor, ...]
     """What its convolutions gave, for batch regularisation."""
-    root: Float[Tensor, "batch frames 3"] | None = None
-    """Where the hips are seen from the reference, metres, if the generator makes their way itself."""
 
     def turn_to_world(self, image: PositionImage) -> ConstrainedPose:
         """Turn the poses from along the reference of the image that they were made for to the world's axes."""
@@ -128,8 +116,7 @@ class GeneratorNetwork(nn.Module):
             ResidualConv(channels, kernel=4, stride=2, padding=1, ratio=ratio)
             for channels, ratio in zip(zip((INPUT_ROWS, *widths[:-1]), widths, strict=True), _DOWN_RATIOS, strict=True)
         )
-        repeated = self.config.architecture == "upsampling"
-        self.decoder = nn.ModuleList(_make_decoder(widths[-1] + style, self.config.up_widths, repeated=repeated))
+        self.decoder = nn.ModuleList(_make_decoder(widths[-1] + style, self.config.up_widths))
         seen = reversed((INPUT_ROWS, *widths[:-1]))
         self.skips = nn.ModuleList(
             nn.Conv1d(ins, outs, 1) for ins, outs in zip(seen, self.config.up_widths, strict=True) if self.config.skips
@@ -137,12 +124,11 @@ class GeneratorNetwork(nn.Module):
         # Through the middle alone a style has to pass what the keys dictate, and is soon left aside.
         self.styles = nn.ModuleList(nn.Linear(style, outs) for outs in self.config.up_widths if self.config.skips)
         # Without a PReLU, which would halve the angles on one side.
-        rows = POSE_ROWS + (_ROOT_ROWS if self.config.architecture == "one-stage" else 0)
-        self.last = nn.Conv1d(self.config.up_widths[-1], rows, 3, padding=1)
+        self.last = nn.Conv1d(self.config.up_widths[-1], POSE_ROWS, 3, padding=1)
         self.kinematics = RangeConstrainedKinematics()
         # Hips upright and joints about the middle of their ranges, until training.
         nn.init.normal_(self.last.weight, std=0.1 / math.sqrt(3 * self.config.up_widths[-1]))
-        middle = torch.zeros(rows)
+        middle = torch.zeros(POSE_ROWS)
         middle[:6] = rotations.to_six(torch.eye(3, device="cpu"))
         self.last.bias = nn.Parameter(middle)
 
@@ -150,9 +136,7 @@ class GeneratorNetwork(nn.Module):
         """Generate poses of every frame of an image, of any length; `style` is what the style encoder gives, or 0."""
         rows = self.encode_rows(image).transpose(1, 2)
         made, responses = self.generate(rows, style)
-        pose, way = made.transpose(1, 2).split([POSE_ROWS, made.shape[1] - POSE_ROWS], dim=-1)
-        root = _ROOT_UNIT * way + way.new_tensor([0.0, _HIPS_HEIGHT, 0.0]) if way.shape[-1] else None
-        return GeneratedPoses(self.kinematics(pose), responses, root)
+        return GeneratedPoses(self.kinematics(made.transpose(1, 2)), responses)
 
     def generate(
         self, rows: Float[Tensor, "batch rows frames"], style: Float[Tensor, "batch style"]
@@ -180,10 +164,8 @@ class GeneratorNetwork(nn.Module):
         """Encode the dense input of section 3.5, seen from the reference, in about unit size."""
         copied, away = image.copy_nearest()
         told = torch.isfinite(away)
-        sparse = self.config.keys == "sparse"
-        places = torch.where(image.known_axes if sparse else told, (copied - self.mean) / self.std, 0.0)
-        distances = image.known_axes.to(places) if sparse else _scale_frames(away)
-        times = _encode_times(image) * (not sparse)
+        places = torch.where(told, (copied - self.mean) / self.std, 0.0)
+        distances, times = _scale_frames(away), _encode_times(image)
         step = torch.diff(image.ground, dim=1, prepend=image.ground[:, :1])
         step = rotations.rotate_ground(step, -image.heading) / _VELOCITY_UNIT
         turn = torch.diff(image.heading, dim=1, prepend=image.heading[:, :1])[..., None] / _HEADING_UNIT
@@ -214,14 +196,12 @@ def regularise_batch(responses: tuple[Tensor, ...]) -> Float[Tensor, ""]:
     return total
 
 
-def _make_decoder(inputs: int, widths: tuple[int, ...], *, repeated: bool) -> list[ResidualConv]:
+def _make_decoder(inputs: int, widths: tuple[int, ...]) -> list[ResidualConv]:
     layers = [ResidualConv((inputs, widths[0]), kernel=1, padding=0, ratio=1.0)]
     before = widths[0]
     for width, (plain, doubling) in zip(widths, _UP_RATIOS, strict=True):
         layers.append(ResidualConv((before, width), kernel=3, padding=1, ratio=plain))
-        doubled = ResidualConv(
-            (width, width), kernel=4, stride=2, padding=1, ratio=doubling, transposed=True, repeated=repeated
-        )
+        doubled = ResidualConv((width, width), kernel=4, stride=2, padding=1, ratio=doubling, transposed=True)
         layers.append(doubled)
         before = width
     return layers

@@ -93,11 +93,11 @@ class Tweener(checkpoints.LoadedModel, Inbetweener):
         """
         shown, missing, splits = query.motion, query.missing, list(find_splits(query))
         told = self._tell_poses(query, splits)
-        made, way, origin = self._make(query, told)
+        made, origin = self._make(query, told)
         met = interpolate_turns(made, shown.local_quat_xyzw, ~missing.joints, seconds=_KEY_SECONDS, fps=PRIOR_FPS)
         quats = torch.where(missing.joints[..., None], met, shown.local_quat_xyzw)
         body = query.to_unit_size(replace(shown, local_quat_xyzw=rotations.make_sign_continuous(quats)))
-        body, logits = self._lead(body, query, way, origin)
+        body, logits = self._lead(body, query, origin)
         motion = query.to_character(body)
         root = torch.where(missing.root[:, None], motion.root_position, shown.root_position)
         motion = replace(motion, root_position=root)
@@ -109,16 +109,15 @@ class Tweener(checkpoints.LoadedModel, Inbetweener):
 
     def _make(
         self, query: GapQuery, told: Mapping[int, Float[Tensor, "joints 3"]]
-    ) -> tuple[Float[Tensor, "frames joints 4"], Float[Tensor, "frames 3"] | None, Float[Tensor, " 3"]]:
-        """Make rotations of all frames, near what is known and near poses that are told by frame, metres, world; also
-        returns the hips' way if the network makes that itself, from where its origin is, and that."""
+    ) -> tuple[Float[Tensor, "frames joints 4"], Float[Tensor, " 3"]]:
+        """Make rotations of all frames, near what is known and near poses that are given by frame, metres, world; also
+        return the origin that these are seen from."""
         image, origin = _show(query, told)
         style = torch.zeros(self.network.config.style) if self.style is None else self.style.vector
         wide = image.extended(_MARGIN)
         made, inside = self.network(wide, style[None]), slice(_MARGIN, -_MARGIN)
         local = made.turn_to_world(wide).local_matrix[0, inside]
-        way = None if made.root is None else wide.to_world(made.root[..., None, :])[0, inside, 0].double()
-        return calm_poses(rotations.from_matrix(local.double())), way, origin
+        return calm_poses(rotations.from_matrix(local.double())), origin
 
     def _tell_poses(self, query: GapQuery, splits: Sequence[Split]) -> dict[int, Float[Tensor, "joints 3"]]:
         """Choose the poses that split gaps, by frame, at their places in a motion of unit size, metres, world."""
@@ -142,14 +141,6 @@ class Tweener(checkpoints.LoadedModel, Inbetweener):
             reason += f"split at {times} s by poses of {by}" if times else "give more keys"
             yield GapSource(split.start, split.stop, self.source, reason)
 
-    @torch.no_grad()
-    def propose_raw(self, query: GapQuery) -> Float[Tensor, "frames joints 3"]:
-        """Propose positions, world, metres at unit size, as the networks make them: keys are missed as they miss them,
-        and the way leads from the first frame on without looking at any (Zhou et al. 2020, table 4)."""
-        made, way, _ = self._make(query, self._tell_poses(query, list(find_splits(query))))
-        body = query.to_unit_size(replace(query.motion, local_quat_xyzw=made))
-        return replace(body, root_position=self._walk(body)[0] if way is None else way).joint_positions()
-
     def _walk(self, body: Motion) -> tuple[Float[Tensor, "frames 3"], Float[Tensor, "frames 2"]]:
         """Lead the hips by how the body moves, from the origin on, metres at unit size; also the contacts' logits."""
         facing = heading(body.local_quat_xyzw[:, 0])
@@ -159,12 +150,11 @@ class Tweener(checkpoints.LoadedModel, Inbetweener):
         return predicted.integrate(facing.float()[None])[0].double(), predicted.contacts[0]
 
     def _lead(
-        self, body: Motion, query: GapQuery, way: Float[Tensor, "frames 3"] | None, origin: Float[Tensor, " 3"]
+        self, body: Motion, query: GapQuery, origin: Float[Tensor, " 3"]
     ) -> tuple[Motion, Float[Tensor, "frames 2"]]:
-        """Lead the hips by how the body moves, or on a way that was made with it, from known place to known place, at
-        unit size; also returns the contacts' logits."""
-        walked, logits = self._walk(body)
-        way = walked if way is None else way
+        """Lead the hips by how the body moves, from known position to known position, at unit size; also return the
+        contacts' logits."""
+        way, logits = self._walk(body)
         loose = None if query.loose is None else _shift(query.loose.scaled(1 / query.scale), -origin)
         led = lead_over_keys(way, body.root_position - origin, query.missing.root, loose)
         told = ~query.missing.root if loose is None else ~query.missing.root | loose.placed

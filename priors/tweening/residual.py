@@ -26,25 +26,19 @@ class ResidualConv(nn.Module):
         padding: int,
         ratio: float,
         transposed: bool = False,
-        repeated: bool = False,
     ):
-        """From so many channels to so many; `transposed` lengthens by the stride instead of shortening, and if frames
-        are `repeated` it does so before a plain convolution of three."""
+        """From so many channels to so many; `transposed` lengthens by the stride instead of shortening."""
         super().__init__()
         ins, outs = channels
-        if repeated:
-            self.conv, kernel = nn.Conv1d(ins, outs, 3, padding=1), 3
-        else:
-            make = nn.ConvTranspose1d if transposed else nn.Conv1d
-            self.conv = make(ins, outs, kernel, stride=stride, padding=padding)
-        self.repeated = repeated
+        make = nn.ConvTranspose1d if transposed else nn.Conv1d
+        self.conv = make(ins, outs, kernel, stride=stride, padding=padding)
         self.scale, self.shift = nn.Parameter(torch.ones(outs, 1)), nn.Parameter(torch.zeros(outs, 1))
         self.activation = nn.PReLU(outs)
         self.stride, self.transposed, self.share = stride, transposed, 1 / ratio
         across = nn.Identity() if ins == outs else nn.Conv1d(ins, outs, 1, bias=False)
         self.across = across if ratio > 1 else None
         # An output frame of a transposed convolution is reached by every stride-th tap alone.
-        _initialise(self.conv, ins * kernel // (stride if transposed and not repeated else 1))
+        _initialise(self.conv, ins * kernel // (stride if transposed else 1))
         if isinstance(self.across, nn.Conv1d):
             _initialise(self.across, ins)
 
@@ -53,7 +47,7 @@ class ResidualConv(nn.Module):
     ) -> Float[Tensor, "batch outs out_frames"]:
         """Return the mix of residual and shortcut; what the convolution alone gives, which batch regularisation looks
         at (Eq. 9), is added to `responses`."""
-        response = self.conv(self._resample(frames) if self.repeated else frames)
+        response = self.conv(frames)
         if responses is not None:
             responses.append(response)
         residual = self.activation(self.scale * response + self.shift)

@@ -17,7 +17,7 @@ from priors import checkpoints
 from priors.infiller.network import InfillerConfig
 
 JOINTS = CANONICAL.num_joints
-ARCHITECTURES = ("skips", "image", "vanilla", "manifold", "recurrent")
+ARCHITECTURES = ("skips", "image")
 DRAWN = 0.2
 
 
@@ -72,11 +72,10 @@ def test_known_places_stay_to_the_bit():
     assert (proposed.places != image.places).any()
 
 
-def test_autoencoders_make_everything_anew():
+def test_the_autoencoder_makes_everything_anew():
     image = holed()
-    for architecture in ("image", "vanilla", "manifold"):
-        proposed = network(drawn=DRAWN, config=of(architecture))(image)
-        assert (proposed.places[image.known] != image.places[image.known]).any()
+    proposed = network(drawn=DRAWN, config=of("image"))(image)
+    assert (proposed.places[image.known] != image.places[image.known]).any()
 
 
 @pytest.mark.parametrize("architecture", ARCHITECTURES)
@@ -178,7 +177,7 @@ def test_what_is_no_infiller_is_refused(tmp_path):
         {"kernel": 5},
         {"kernel": 4},
         {"depth": 3},
-        {"architecture": "manifold"},
+        {"architecture": "image"},
         {"architecture": "gpt"},
     ],
 )

@@ -18,7 +18,7 @@ from priors.stitching.draws import Draws
 from priors.stitching.inbetweener import see_ends
 from priors.stitching.joining import join_sides
 from priors.stitching.latents import DrawnLatents
-from priors.stitching.network import PARTS, POSE, StitcherNetwork
+from priors.stitching.network import POSE, StitcherNetwork
 from priors.stitching.sides import _Walker, count_made, reverse_sense, walk_sides
 
 PRINTED = replace(CONFIG, shared=0, own=4, printed=True)
@@ -50,9 +50,8 @@ def test_untaught_it_interpolates_places_evenly(frames):
 
 
 @each_length
-@pytest.mark.parametrize("without", [(), *((part,) for part in PARTS)])
-def test_every_length_is_made_with_and_without_each_part(frames, without):
-    config = replace(CONFIG, without=without)
+def test_every_length_is_made(frames):
+    config = CONFIG
     made = count_made(network(config), frames)
     ends = bare(walk(60), 11, 10 + frames)
     drawn = DrawnLatents.sample(config, 1, made, torch.Generator().manual_seed(1))
@@ -203,11 +202,6 @@ def test_the_first_draws_do_not_depend_on_the_count_and_differ():
     assert torch.equal(few.quats, many.quats[:3])
     assert len(many.quats) == 11
     assert float((many.quats[0] - many.quats[9]).abs().max()) > 1e-4
-
-
-def test_an_unknown_part_is_refused():
-    with pytest.raises(RequestError, match="a stitcher has no part 'gan'; parts are bs, sl"):
-        replace(CONFIG, without=("gan",))
 
 
 def test_gaps_are_filled_between_poses_that_stay_and_too_long_ones_are_named():

@@ -5,14 +5,10 @@ import json
 import pytest
 import tiny_tweener
 import torch
-from helpers import corpus, generator, write_corpus
-from tiny_path import save_tiny_path
+from helpers import corpus, generator
 
-import priors
 from mapctl.errors import CheckpointError, RequestError
 from mapctl.motion_dna import MotionDna
-from priors import checkpoints
-from priors.tweening import class_vectors
 from priors.tweening.class_vectors import collect_dna, compute_classes, group_clips
 from priors.tweening.styles import Style, count_clips, draw_style, encode_classes, find_class, pick_class, read_classes
 
@@ -105,14 +101,3 @@ def test_styles_are_drawn_one_after_the_other_then_by_parts():
     assert len(drawn(0, of=styles[:1]).poses) == 3  # one file: never all of it, which is the first variation
     with pytest.raises(RequestError, match="the class b alone leaves nothing to vary"):
         drawn(0, of=styles[1:2])
-
-
-def test_classes_are_written_into_the_card_of_trained_weights(tmp_path, monkeypatch):
-    data, predictor = write_corpus(tmp_path / "data", 3), str(save_tiny_path(tmp_path / "path.safetensors"))
-    file = tiny_tweener.save_tiny_tweener(tmp_path / "t.safetensors", predictor)
-    card = checkpoints.read_card(file.with_suffix(".json"))
-    card.data["held_out"] = {"validation": ["walk-1.bvh"], "test": []}
-    file.with_suffix(".json").write_text(checkpoints.encode_json(vars(card), file))
-    assert priors.load_tweener(str(file), predictor).classes == {}
-    class_vectors.main(data, str(file), labels=r"walk-(\d)")
-    assert list(priors.load_tweener(str(file), predictor).classes) == ["0", "2"]

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import pytest
 import torch
 from helpers import walk
-from tiny_path import ToldPath, save_tiny_path, tiny_path
-from tiny_tweener import CONFIG, save_tiny_tweener, tiny_tweener
+from tiny_path import ToldPath, save_tiny_path
+from tiny_tweener import save_tiny_tweener, tiny_tweener
 
 import priors
 from controllers.common.canonical_clip import CanonicalClip
@@ -24,7 +24,6 @@ from mapctl.protocols import Inbetweener
 from mapctl.recording.masks import ALL, Mask
 from mapctl.retarget import to_canonical
 from mapctl.skeleton import CANONICAL
-from priors.tweening.generator import GeneratorNetwork
 from priors.tweening.inbetweener import calm_poses, keep_feet
 
 
@@ -137,22 +136,6 @@ def test_hips_go_where_the_path_predictor_sees_them_go_and_arrive():
         assert float(away.max()) < 0.1  # the made body faces elsewhere than the walk's
         steps = torch.diff(made.root_position[:, 2])
         assert float(steps.min()) > 0
-
-
-@pytest.mark.slow
-def test_a_network_of_one_stage_leads_the_hips_whatever_the_path_predictor_says():
-    motion = walk(100)
-    shape = replace(CONFIG, architecture="one-stage")
-    one_stage = GeneratorNetwork(shape).eval().requires_grad_(False)
-    apart = []
-    for network in (None, one_stage):
-        found = []
-        for path in (ToldPath(motion), tiny_path()):
-            tweener = tiny_tweener(path=path)
-            tweener = tweener if network is None else replace(tweener, network=network)
-            found.append(tweener.propose(query_of(motion, (1, 99))).motion.root_position)
-        apart.append(float((found[0] - found[1]).abs().max()))
-    assert apart[1] < 1e-9 < 1e-3 < apart[0]
 
 
 def test_who_stands_and_whom_the_path_lets_stand_does_not_slide():

@@ -87,16 +87,7 @@ MODELS = (
         tiny_infiller.CONFIG,
         replace(tiny_infiller.CONFIG, kernel=5),
         InfillerSettings(),
-        (("--architecture", "manifold"), InfillerConfig(architecture="manifold")),
-    ),
-    Model(
-        InfillerRecipe,
-        InfillerTrainer,
-        priors.load_infiller,
-        replace(tiny_infiller.CONFIG, architecture="recurrent"),
-        replace(tiny_infiller.CONFIG, architecture="recurrent", kernel=5),
-        InfillerSettings(),
-        (("--architecture", "recurrent"), InfillerConfig(architecture="recurrent")),
+        (("--architecture", "image"), InfillerConfig(architecture="image")),
     ),
     Model(
         PoseTransformerRecipe,
@@ -132,7 +123,7 @@ MODELS = (
         tiny_stitcher.CONFIG,
         replace(tiny_stitcher.CONFIG, encoder=6),
         StitcherSettings(),
-        (("--without", "ba,lstm"), StitcherConfig(without=("ba", "lstm"))),
+        (("--without", "d"), StitcherConfig(without=("d",))),
     ),
 )
 

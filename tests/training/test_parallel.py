@@ -149,7 +149,7 @@ def test_two_processes_train_the_same_to_the_bit_each_time_also_when_killed_and_
     assert not find_trainers()
 
 
-PARALLEL = [name for name in MODELS | VARIANTS if name not in ("keyframe-timing", "infiller", "recurrent infiller")]
+PARALLEL = [name for name in MODELS | VARIANTS if name not in ("keyframe-timing", "infiller")]
 
 
 @pytest.mark.slow

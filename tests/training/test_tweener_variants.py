@@ -16,7 +16,6 @@ from priors.training.augmentation.pose_windows import PoseWindows
 from priors.training.recipes.tweener import PAPER, TweenerSettings, TweenerTrainer
 from priors.training.recipes.tweener_critic import CriticisedTrainer, CriticisedTweenerRecipe, CriticSettings
 from priors.tweening import generator as networks
-from priors.tweening.generator import GeneratorNetwork
 from priors.tweening.keys import make_key_image
 
 SETTINGS = TweenerSettings(steps=15, batch=200, learning_rate=1e-2, layout=KeySettings(longest=60.0))
@@ -35,56 +34,6 @@ def image(clips, frames=60):
     windows = PoseWindows(clips, kinds=(), evenness=1.0)
     drawn = draw_windows(windows, 2, frames, SETTINGS.layout, progress=1.0, tempo=0.0, generator=generator())
     return make_key_image(drawn.motion, drawn.told)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("changed", [{"keys": "sparse"}, {"architecture": "upsampling"}, {"architecture": "one-stage"}])
-def test_each_variant_learns(clips, changed):
-    config = replace(tiny_tweener.CONFIG, **changed)
-    trainer = TweenerTrainer(config, SETTINGS, clips, tiny_path.network())
-    losses = [trainer.train_step()["loss"] for _ in range(SETTINGS.steps)]
-    assert sum(losses[-3:]) < 0.7 * sum(losses[:3])
-
-
-def test_sparse_keys_tell_nothing_in_other_frames(clips):
-    given = image(clips)
-    dense, sparse = (
-        GeneratorNetwork(replace(tiny_tweener.CONFIG, keys=keys)).encode_rows(given) for keys in ("dense", "sparse")
-    )
-    free = ~given.known_axes.flatten(2).any(dim=-1)
-    places = slice(0, 63)
-    assert float(sparse[free][:, places].abs().max()) == 0
-    assert float(dense[free][:, places].abs().max()) > 0
-    assert torch.equal(sparse[~free][:, places], dense[~free][:, places] * given.known_axes[~free].flatten(1))
-
-
-def test_one_stage_makes_the_hips_way_and_two_stages_do_not(clips):
-    given, style = image(clips), torch.zeros(2, tiny_tweener.CONFIG.style)
-    one = GeneratorNetwork(replace(tiny_tweener.CONFIG, architecture="one-stage"))(given, style)
-    assert one.root is not None
-    assert one.root.shape == (2, 60, 3)
-    assert GeneratorNetwork(tiny_tweener.CONFIG)(given, style).root is None
-
-
-def test_repeated_frames_have_no_mosaic():
-    torch.manual_seed(0)
-    rows = torch.ones(1, networks.INPUT_ROWS, 512)
-    style = torch.zeros(1, tiny_tweener.CONFIG.style)
-    found = {}
-    for architecture in ("two-stage", "upsampling"):
-        network = GeneratorNetwork(replace(tiny_tweener.CONFIG, architecture=architecture, skips=False))
-        made = network.generate(rows, style)[0][..., 192:320]
-        found[architecture] = float(torch.diff(made.detach()).abs().mean())
-    assert found["upsampling"] < 0.01 * found["two-stage"]
-
-
-def test_options_make_the_variants():
-    assert recipe(keys="sparse").config.keys == "sparse"
-    assert recipe(architecture="one-stage").config.architecture == "one-stage"
-    assert not recipe(plain=True).config.skips
-    assert (
-        "--keys sparse --architecture upsampling" in recipe(keys="sparse", architecture="upsampling").format_command()
-    )
 
 
 def test_paper_has_its_sizes_losses_optimiser_and_critic():

@@ -22,9 +22,6 @@ class TrainDenoiser(TunableOptions):
     """Channels of every layer."""
     angles: options.MaybeNumber = None
     """Weight of the error of joint angles (radians) in the loss, beside the centimetres of places; 20 if not given."""
-    plain: bool = False
-    """The plainest network of the kind, to compare: attention over the frames as they are, squared errors; no dilated
-    convolutions, smoothed or world inputs, and changes that do not fade with the noise."""
 
     def check(self) -> None:
         """RequestError for numbers that make no sense for a denoiser."""
@@ -34,15 +31,14 @@ class TrainDenoiser(TunableOptions):
 
     def recipe(self) -> "DenoiserRecipe":
         """The options as the trainer takes them; RequestError for numbers that make no sense."""
-        from priors.training.recipes.denoiser import PLAIN, DenoiserConfig, DenoiserRecipe, DenoiserSettings
+        from priors.training.recipes.denoiser import DenoiserConfig, DenoiserRecipe, DenoiserSettings
 
         common = self.common()
-        config, settings = PLAIN if self.plain else (DenoiserConfig(), DenoiserSettings())
         given = self.select_given("steps", "batch", "window", "seed", "learning_rate", "angles")
         return DenoiserRecipe(
             **common,
-            config=replace(config, **self.select_given("width")),
-            settings=replace(settings, bfloat16=self.bfloat16, **given),
+            config=replace(DenoiserConfig(), **self.select_given("width")),
+            settings=replace(DenoiserSettings(), bfloat16=self.bfloat16, **given),
             skip_first=self.skip_first,
             init=self.init,
         )

@@ -10,7 +10,7 @@ from mapctl.commands.train.options import TunableOptions
 if TYPE_CHECKING:
     from priors.training.recipes.infiller import InfillerRecipe
 
-_Architectures = Literal["skips", "image", "vanilla", "manifold", "recurrent"]
+_Architectures = Literal["skips", "image"]
 
 
 @dataclass(frozen=True)
@@ -20,9 +20,8 @@ class TrainInfiller(TunableOptions):
     model = "infiller"
     used_by = "use it with --method infiller --inbetweener"
 
-    architecture: Annotated[_Architectures | None, arg(metavar="skips|image|vanilla|manifold|recurrent")] = None
-    """skips is ours, image the paper's, vanilla and manifold its baselines; recurrent goes from frame to frame, after
-    Harvey and Pal 2018."""
+    architecture: Annotated[_Architectures | None, arg(metavar="skips|image")] = None
+    """skips is ours, image the paper's."""
 
     def recipe(self) -> "InfillerRecipe":
         """The options as the trainer takes them; RequestError for numbers that make no sense."""

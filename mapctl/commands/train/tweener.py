@@ -1,7 +1,7 @@
 """`mapctl train tweener`: the options of the generator of long in-betweens."""
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import arg
 
@@ -31,13 +31,6 @@ class TrainTweener(TunableOptions):
     if not given, Bandai Namco's content, else the folder or the file's name without a number."""
     plain: bool = False
     """The network without the connections past its narrow middle, as in the paper, to compare."""
-    keys: Annotated[Literal["dense", "sparse"], arg(metavar="dense|sparse")] = "dense"
-    """Whether every frame gets a copy of the nearest key, or keys are told in their own frames alone, to compare."""
-    architecture: Annotated[
-        Literal["two-stage", "one-stage", "upsampling"], arg(metavar="two-stage|one-stage|upsampling")
-    ] = "two-stage"
-    """two-stage leaves the hips' way to the path predictor; one-stage makes it itself, and upsampling repeats frames
-    instead of transposing convolutions, to compare."""
 
     def recipe(self) -> "TweenerRecipe":
         """The options as the trainer takes them; RequestError for numbers that make no sense."""
@@ -50,7 +43,7 @@ class TrainTweener(TunableOptions):
         skips = config.skips and not self.plain
         everything = {
             **common,
-            "config": replace(config, skips=skips, keys=self.keys, architecture=self.architecture),
+            "config": replace(config, skips=skips),
             "settings": settings,
             "skip_first": self.skip_first,
             "init": self.init,

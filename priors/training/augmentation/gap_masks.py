@@ -38,8 +38,6 @@ class GapSettings:
     """Share of windows with gaps, in which some joints stay known for some frames."""
     dropout: float = 0.2
     """Share of windows with lost joints that drop them frame by frame, half of them at most."""
-    short_past: float = 0.2
-    """Share of windows for a recurrent network that begin less than its usual past before the gap."""
 
     def interpolate_mean_length(self, progress: float) -> float:
         """Return the mean length of a gap, frames, at a `progress` of training from 0 to 1."""
@@ -64,27 +62,6 @@ def sample_observation_mask(
     lost = ~known.any(dim=2).any(dim=1)
     first = present & (present.long().cumsum(dim=1) == 1)
     return known | (lost[:, None] & first)[..., None]
-
-
-def sample_transition(
-    present: Bool[Tensor, "batch frames"],
-    settings: GapSettings,
-    *,
-    progress: float,
-    generator: torch.Generator,
-    past: int,
-    after: int,
-) -> Bool[Tensor, "batch frames joints"]:
-    """Draw one gap in each window with room for it, of up to twice the mean length, with so many frames `past` before
-    it (fewer in a share `short_past` of windows) and `after` behind it; other windows are known whole."""
-    draw = Draws(generator, *present.shape)
-    first, frames = present.to(torch.uint8).argmax(dim=1), present.sum(dim=1)
-    before = torch.where(draw.uniform() < settings.short_past, 1 + (draw.uniform() * past).floor(), float(past))
-    longest = (frames - before - after).clamp(max=2 * settings.interpolate_mean_length(progress))
-    length = (2 + draw.uniform() * (longest - 1)).floor()
-    spare = torch.where(before < past, 0.0, frames - before - after - length)
-    lost = draw.mark(first + before + (draw.uniform() * (spare + 1)).floor(), length)
-    return (present & ~(lost & (longest >= 2)[:, None]))[..., None].expand(*present.shape, _JOINTS)
 
 
 def _sample_interval(draw: Draws, length: Float[Tensor, " batch"]) -> Bool[Tensor, "batch frames"]:

@@ -16,7 +16,7 @@ from mapctl.pose import BodyPose
 from mapctl.recording import Capture, CaptureProposal
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors.config import require_at_least
-from priors.denoiser.network import ANGLE_UNIT, POSITION_UNIT, DenoiserConfig, DenoiserNetwork
+from priors.denoiser.network import DenoiserConfig, DenoiserNetwork
 from priors.training.augmentation.corruption import CorruptionSettings, corrupt, make_clean_capture
 from priors.training.augmentation.unfamiliar_poses import PoseVariation, vary_features
 from priors.training.corpus import Corpus, Split
@@ -59,8 +59,6 @@ class DenoiserSettings:
     """Weight of the negative log-likelihood of the errors, which only the spread's own layer learns from."""
     corruption: CorruptionSettings = field(default_factory=CorruptionSettings)
     """How windows are spoilt."""
-    squared: bool = False
-    """Squared error of the angles and of the hips' place instead of errors in cm, beside the contacts."""
     bfloat16: bool = False
     """The network computes in bfloat16; weights and loss stay in float32."""
     seed: int = 1
@@ -70,10 +68,6 @@ class DenoiserSettings:
         require_at_least(self, 1, "steps", "batch")
         if self.window < 16:
             raise RequestError(f"window must be at least 16 frames, got {self.window}")
-
-
-PLAIN = (DenoiserConfig(plain=True), DenoiserSettings(squared=True))
-"""The plain peer, on the same windows, spoilt in the same ways."""
 
 
 class DenoiserTrainer(GradientTrainer[DenoiserNetwork]):
@@ -95,7 +89,6 @@ class DenoiserTrainer(GradientTrainer[DenoiserNetwork]):
         windows = draw_performers(
             self.windows, self.settings, self.generator, batch=self.group.share(self.settings.batch)
         )
-        compute = compute_squared_losses if self.settings.squared else compute_denoiser_losses
         return compute(self.network, windows, self.settings, self.generator)
 
     def validate(self, corpus: Corpus) -> dict[str, Any]:
@@ -132,11 +125,11 @@ class DenoiserRecipe(NetworkRecipe[DenoiserConfig, DenoiserSettings, DenoiserTra
         return average_logarithms([row.get("loss")])
 
     def format_shape(self) -> list[str]:
-        """The width and the weight of angles, if they are others than usual, and plainness."""
+        """The width and the weight of angles, if they are others than usual."""
         words = [] if self.config.width == DenoiserConfig.width else [f"--width {self.config.width}"]
         if self.settings.angles != DenoiserSettings.angles:
             words.append(f"--angles {self.settings.angles:g}")
-        return words + ["--plain"] * self.config.plain
+        return words
 
 
 def draw_performers(
@@ -212,21 +205,6 @@ def _compute_spread_loss(cleaned: CaptureProposal, wanted: Float[Tensor, "batch 
     joints = torch.cat([error[..., None, 3:6], error[..., 6:].unflatten(-1, (-1, 3))], dim=-2).mean(dim=-1)
     power = torch.cat([error[..., :3].mean(dim=-1, keepdim=True), joints], dim=-1)
     return (0.5 * power * torch.exp(-2 * cleaned.log_spread) + cleaned.log_spread).mean()
-
-
-def compute_squared_losses(
-    network: DenoiserNetwork, windows: Tensor, settings: DenoiserSettings, generator: torch.Generator
-) -> dict[str, Tensor]:
-    """The plain loss: the mean squared error of all numbers of a pose in the network's own units, and the contacts'
-    cross entropy, nats."""
-    clean = make_clean_capture(windows)
-    cleaned = network(corrupt(clean, settings.corruption, generator))
-    error = cleaned.pose.pack() - _pack(clean)
-    squares = torch.cat([error[..., :3] / POSITION_UNIT, error[..., 3:] / ANGLE_UNIT], dim=-1).square().mean()
-    contacts = cross_entropy(cleaned.contact_logits.float(), LAYOUT.pick(windows, "contacts"))
-    spread = _compute_spread_loss(cleaned, _pack(clean))
-    loss = squares + settings.contacts * contacts + settings.spread * spread
-    return {"loss": loss, "squares": squares, "contacts_nats": contacts}
 
 
 def _pack_angles(clean: Capture) -> Float[Tensor, "batch frames angles"]:

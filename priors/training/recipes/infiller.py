@@ -12,8 +12,7 @@ from mapctl.errors import RequestError
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors.config import require_at_least
 from priors.infiller.network import InfillerConfig, InfillerNetwork
-from priors.infiller.transitions import FRAMES_AFTER, PAST_FRAMES
-from priors.training.augmentation.gap_masks import GapSettings, sample_observation_mask, sample_transition
+from priors.training.augmentation.gap_masks import GapSettings, sample_observation_mask
 from priors.training.corpus import Corpus, Split
 from priors.training.devices import make_generator
 from priors.training.recipe import NetworkRecipe, Row, average_logarithms
@@ -81,12 +80,7 @@ class InfillerTrainer(GradientTrainer[InfillerNetwork]):
         """Compute the losses of a newly drawn batch."""
         window, progress = self._draw(), self.step / self.first_steps
         gaps, generator = self.settings.gaps, self.generator
-        if self.network.recurrent:
-            known = sample_transition(
-                window.present, gaps, progress=progress, generator=generator, past=PAST_FRAMES, after=FRAMES_AFTER
-            )
-        else:
-            known = sample_observation_mask(window.present, gaps, progress=progress, generator=generator)
+        known = sample_observation_mask(window.present, gaps, progress=progress, generator=generator)
         return compute_infiller_losses(self.network, window, known, self.settings)
 
     def _draw(self) -> Window:

@@ -250,7 +250,7 @@ class StitcherRecipe(NetworkRecipe[StitcherConfig, StitcherSettings, StitcherTra
     def format_shape(self) -> list[str]:
         """The parts that are left out."""
         parts = ["--paper"] if self.config.printed else []
-        return parts + ([f"--without {','.join(self.config.without)}"] if self.config.without else [])
+        return parts + ["--without d"] * bool(self.config.without)
 
 
 PAPER = (

@@ -117,7 +117,6 @@ def sample_nearest(network: StitcherNetwork, truth: Transition, generator: torch
         return noise
     repeated = truth.rows(every)
     sides = walk_sides(network, repeated.ends(), truth.frames, noise)
-    sides_counted = 1 if sides.alone else 2
-    away = (sides.place_joints() - repeated.place_joints(made))[:sides_counted].norm(dim=-1)
+    away = (sides.place_joints() - repeated.place_joints(made)).norm(dim=-1)
     best = away.mean(dim=(0, 2, 3)).unflatten(0, (tries, count)).argmin(dim=0)
     return noise.rows(best * count + torch.arange(count))

@@ -1,7 +1,7 @@
 """What a stitcher is taught: the true way between two poses, and that its sides meet."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
@@ -105,8 +105,6 @@ def find_stitcher_losses(
         wanted, missed = truth.truth(), miss_calmly(network, truth.rows(row[:informed]))
         latents = TaughtLatents(posterior, (wanted - network.mean) / network.std, missed, noise)
     sides = walk_sides(network, known, truth.frames, latents)
-    if sides.alone:
-        sides = _forget_backward(sides)
     parts, distance, slip = _compare(network, truth, sides, compared, ease)
     parts |= latents.diverge()
     # A mean is smooth, and is to be: only what stands for one of many ways is to pass for one.
@@ -151,7 +149,7 @@ def _compare(
         "state": (ease * (off[..., PACE].mean(dim=-1) + off[..., POSE].mean(dim=-1)).mean(dim=(0, 2))).mean(),
         "contacts": cross_entropy(sides.logits[:, :compared], true[..., POSE.stop :]),
         "feet": (steps * planted).sum() / planted.sum().clamp_min(1),
-        "stitching": torch.zeros(()) if sides.alone else measure_apart(places, truth.frames).mean(),
+        "stitching": measure_apart(places, truth.frames).mean(),
         "phase": (phases - truth.true_phases()[:count, :compared, :made]).abs().mean(),
     }
     return parts, distance, slip
@@ -181,12 +179,6 @@ def interpolate(truth: Transition) -> tuple[BodyPose, BodyPose]:
     even = torch.lerp(first[:, None], features[:, -1:], share)
     there = ground[:, -1:] * share, heading[:, -1:] * share[..., 0]
     return tuple(BodyPose.of_features_at(*each) for each in ((features, ground, heading), (even, *there)))  # type: ignore[return-value]
-
-
-def _forget_backward(sides: Sides) -> Sides:
-    """Keep the forward side alone."""
-    names = ("features", "logits", "place", "heading", "phases", "shares", "at_ends")
-    return replace(sides, **{name: getattr(sides, name)[:1] for name in names})
 
 
 def _measure_length(vectors: Tensor) -> Tensor:

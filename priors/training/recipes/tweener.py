@@ -251,10 +251,7 @@ class TweenerRecipe(NetworkRecipe[GeneratorConfig, TweenerSettings, TweenerTrain
 
     def format_shape(self) -> list[str]:
         """Options for a network that is not the usual one."""
-        usual, shape = GeneratorConfig(), ["--plain"] * (not self.config.skips)
-        for name in ("keys", "architecture"):
-            if (given := getattr(self.config, name)) != getattr(usual, name):
-                shape += [f"--{name} {given}"]
+        shape = ["--plain"] * (not self.config.skips)
         return ["--paper"] if self.config.widths == generator.PAPER.widths else shape
 
     def format_command(self) -> str:

@@ -114,8 +114,6 @@ def compute_tweener_losses(
     }
     trajectory = path(LocalMotion.of_world(made.places[some], heading[some]))
     way = trajectory.integrate(heading[some])
-    if made_poses.root is not None:
-        way = image.to_world(made_poses.root[..., None, :])[..., 0, :][some]
     terms |= _compute_path_terms(trajectory, way, sequences, some, weights)
     without_root = see_without_root(made.places, made.local_matrix[..., 0, :, :])
     apart = torch.cdist(style_poses.flatten(-2), without_root.flatten(-2)) / len(CANONICAL.names) ** 0.5
