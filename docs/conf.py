@@ -1,5 +1,6 @@
 """How Sphinx builds the site: `make docs`."""
 
+import dataclasses
 import sys
 from pathlib import Path
 
@@ -15,7 +16,6 @@ version = release = __version__
 extensions = [
     "command_options",
     "followed_tutorials",
-    "readable_signatures",
     "myst_parser",
     "sphinx.ext.autodoc",
     "sphinx-mathjax-offline",
@@ -59,3 +59,18 @@ html_theme = "furo"
 html_title = "mapctl"
 html_static_path = ["static"]
 html_css_files = ["gallery.css"]
+
+
+def shorten_signature(app, what, name, obj, options, signature, returned):
+    """Show the names of a dataclass's fields, whose types and defaults stand below; a protocol is not called."""
+    if what == "class" and getattr(obj, "_is_protocol", False):
+        return "", returned
+    if what == "class" and dataclasses.is_dataclass(obj):
+        names = [each.name for each in dataclasses.fields(obj) if each.init and not each.name.startswith("_")]
+        return f"({', '.join(names)})", returned
+    return signature, returned
+
+
+def setup(app):
+    """Connect to autodoc."""
+    app.connect("autodoc-process-signature", shorten_signature)

@@ -1,13 +1,6 @@
-"""Directives that read the commands of mapctl: `command-list`, a table of them, and `command-options`, one's options.
+"""Directives that read the command line: `command-list`, a table of all commands, and `command-options WORDS`, the
+description and options of a command (`follow`) or sub-command (`train lstm-gmm`)."""
 
-    ```{command-options} train lstm-gmm
-    ```
-
-The words name a command and, where it has some, its sub-command, whose description comes first. Options become entries
-of Sphinx' `option`, so that other pages can refer to them, and the search finds them.
-"""
-
-import argparse
 import re
 import warnings
 from collections.abc import Iterable, Iterator
@@ -25,12 +18,13 @@ _DEFAULT = re.compile(r"\s*\((default: (?P<value>.*)|required)\)\s*$", re.DOTALL
 
 
 class MarkdownDirective(SphinxDirective):
-    """A directive whose content is written by it, as Markdown that the page's own parser reads."""
+    """A directive whose lines the page's own parser reads."""
 
     def parse(self, lines: Iterable[str]) -> list[nodes.Node]:
-        """Parse lines as if they stood where the directive stands."""
-        text, container = "\n".join(lines), nodes.container()
-        self.state.nested_parse(StringList(text.splitlines(), source=self.name), self.content_offset, container)
+        """Parse lines as if they stood in the page."""
+        container = nodes.container()
+        text = StringList("\n".join(lines).splitlines(), source=self.name)
+        self.state.nested_parse(text, self.content_offset, container)
         return container.children
 
 
@@ -39,9 +33,7 @@ class CommandList(MarkdownDirective):
 
     def run(self) -> list[nodes.Node]:
         """Parse the table."""
-        rows = (
-            f"| [{name}]({name}.md) | {describe(kind).split('. ')[0].rstrip('.')} |" for name, kind in COMMANDS.items()
-        )
+        rows = (f"| [{name}]({name}.md) | {_describe(kind).split('. ')[0]} |" for name, kind in COMMANDS.items())
         return self.parse(["| command | what it does |", "|---|---|", *rows])
 
 
@@ -53,63 +45,40 @@ class CommandOptions(MarkdownDirective):
 
     def run(self) -> list[nodes.Node]:
         """Parse the entries."""
-        return self.parse(format_options(self.arguments[0].split()))
+        return self.parse(_format_options(self.arguments[0].split()))
 
 
-def describe(kind: type) -> str:
-    """The docstring of a command, in one line."""
+def _describe(kind: type) -> str:
     return " ".join((kind.__doc__ or "").split())
 
 
-def format_options(words: list[str]) -> Iterator[str]:
-    """Lines of Markdown: what is typed, then each option with its values, its meaning and its default."""
-    if len(words) > 1:
-        yield from (describe(find_kind(words)), "")
-    parser = find_parser(words)
+def _format_options(words: list[str]) -> Iterator[str]:
+    kind = COMMANDS[words[0]] if len(words) == 1 else SUBCOMMANDS[words[0]][words[1]]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # tyro has no other interface to its options
+        parser = tyro.extras.get_parser(kind, config=STYLE)
+    actions = [each for each in parser._actions if each.dest != "help"]
+    actions.sort(key=lambda each: bool(each.option_strings))
     name = " ".join(["mapctl", *words])
-    actions = sorted(
-        (each for each in parser._actions if each.dest != "help"), key=lambda each: bool(each.option_strings)
-    )
-    required = [_format_usage(each) for each in actions if each.required]
+    required = [" ".join(filter(None, [*each.option_strings[:1], _value(each)])) for each in actions if each.required]
+    if len(words) > 1:
+        yield from (_describe(kind), "")
     yield from ("```text", " ".join([name, *required, "[options]"]), "```", "", f"```{{program}} {name}", "```", "")
     for action in actions:
-        yield from _format_action(action)
+        found = _DEFAULT.search(action.help or "")
+        names = ", ".join(f"{each} {_value(action)}".strip() for each in action.option_strings)
+        yield f"````{{option}} {names or _value(action)}"
+        yield " ".join(_DEFAULT.sub("", action.help or "").split())
+        if found and found["value"] not in (None, "None", "", "False", "()"):
+            yield f"Default: `{found['value']}`."
+        yield from ("````", "")
 
 
-def find_kind(words: list[str]) -> type:
-    """The options class of a command or of its sub-command; KeyError where there is none."""
-    return COMMANDS[words[0]] if len(words) == 1 else SUBCOMMANDS[words[0]][words[1]]
-
-
-def find_parser(words: list[str]) -> argparse.ArgumentParser:
-    """The parser of a command; KeyError where there is none of these words."""
-    with warnings.catch_warnings():
-        # There is no other way yet to ask tyro for its options.
-        warnings.simplefilter("ignore", DeprecationWarning)
-        return tyro.extras.get_parser(find_kind(words), config=STYLE)
-
-
-def _format_usage(action: argparse.Action) -> str:
-    value = _format_value(action)
-    return " ".join(filter(None, [action.option_strings[0], value])) if action.option_strings else value
-
-
-def _format_value(action: argparse.Action) -> str:
+def _value(action) -> str:
     if action.nargs == 0:
         return ""
     metavar = action.metavar or action.dest
     return metavar if isinstance(metavar, str) else " ".join(metavar)
-
-
-def _format_action(action: argparse.Action) -> Iterator[str]:
-    value, text = _format_value(action), action.help or ""
-    found = _DEFAULT.search(text)
-    default = found["value"] if found else None
-    yield f"````{{option}} {', '.join(f'{each} {value}'.strip() for each in action.option_strings) or value}"
-    yield " ".join(_DEFAULT.sub("", text).split())
-    if default not in (None, "None", "", "False", "()"):
-        yield f"Default: `{default}`."
-    yield from ("````", "")
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
