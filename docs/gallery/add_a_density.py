@@ -2,7 +2,7 @@
 Add a density of one's own
 ==========================
 
-A density says how likely the next frame is, given those before. Here it is a matrix times the last frame, plus noise:
+A density is the probability of the next frame given those before. Here it is a matrix times the last frame, plus noise:
 fitted by least squares to two minutes of walks, already a prior that every job takes.
 """
 

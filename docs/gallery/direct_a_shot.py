@@ -2,7 +2,7 @@
 Direct a shot
 =============
 
-A shot has several wishes that hold at once: here to set off from a stand, touch a ball with the left hand in passing,
+A shot has several requests that hold at once: here to set off from a stand, touch a ball with the left hand in passing,
 walk round a pillar that stands in the way, and come to a stop.
 """
 
@@ -27,7 +27,7 @@ request = ShotRequest(
 shot = solve_shot(priors.load("locomotion"), priors.load_transformer(), request)
 
 # %%
-# Each wish, with what was asked and what came of it. Where one cannot hold, the status names what is against it.
+# Each request with its target and its result. Where one cannot hold, the status names what conflicts with it.
 
 for wish in shot.wishes:
     print(f"{wish.name} ({wish.asked}): {wish.got:.1f} {wish.unit}")

@@ -26,7 +26,7 @@ camera = CameraSettings(azimuth_deg=-20)
 film([Shot(walk.motion, curve)], "walk-along-a-curve.webp", camera=camera, size=(480, 270), fps=15)
 
 # %%
-# Every wish is a term of one energy, and the ledger tells in physical units how well each is met: metres beside the
+# Every request is a term of one energy, and the ledger has its residual in physical units: metres beside the
 # curve, and metres per second at which planted feet slide.
 
 for name, term in walk.ledger.summary().items():

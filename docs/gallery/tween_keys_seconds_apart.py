@@ -2,7 +2,7 @@
 Fill seconds between two keys
 =============================
 
-Two poses seven seconds apart say little of what lies between them. Motion DNA says more: a few poses of another clip,
+Two poses seven seconds apart hardly determine what lies between them. Motion DNA adds a few poses of another clip,
 whose style the tweener takes on. Here the same two keys are filled under the DNA of raised hands, and of a run.
 """
 
@@ -33,7 +33,7 @@ for place, (name, colour) in enumerate({"raise-up-left": "#4c78a8", "run_masculi
     shots.append(Shot(replace(made, root_position=aside), colour=colour))
 
 # %%
-# The first and the last pose are the same, to the bit. Blue walks like one who raises the hands, red like a runner.
+# The first and the last pose are the same, to the bit. Blue walks with raised hands, red like a runner.
 
 camera = CameraSettings("follow")
 film(shots, "the-same-keys-under-two-motion-dnas.webp", camera=camera, size=(400, 225), fps=10)
