@@ -96,7 +96,7 @@ COMMANDS = {
     "chain": "chain walk.bvh other.bvh -o chained.bvh --piece 12 --gap 6:8 --inbetweener infiller.safetensors",
     "convert": "convert walk.bvh canonical.npz --rig canonical",
     "convert rate": "convert walk.bvh slower.glb --fps 24",
-    "measure": "measure follow.bvh --curve wave:0.5x2 --reference walk.bvh --prior tiny.safetensors --json",
+    "measure": "measure follow.bvh --curve wave:0.5x2 --reference walk.bvh --json",
     "info clip": "info walk.bvh --json",
     "train lstm-gmm": "train lstm-gmm --data data -o lstm --steps 3 --batch 4 --window 20 --width 8 --seed 2",
     "train denoiser": "train denoiser --data data -o denoiser --steps 2 --batch 2 --window 32 --seed 2",

@@ -94,7 +94,7 @@ def shorten(line: str) -> list[str]:
         words = [*words, *_TRAINING[words[1]].split()]
     elif name == "follow" and not {"--seconds", "--loop"} & {*words}:
         words += ["--seconds", "1"]
-    if name == "render" or (name == "follow" and "--video" in words):
+    if name == "render":
         words += ["--size", "96x64"]
     for place, word in enumerate(words[:-1]):
         if word in _NAMED_MODELS:

@@ -56,7 +56,6 @@ PUBLIC: dict[str, tuple[str, ...]] = {
     "controllers.inbetweening.proposers": ("METHODS", "ModelLoaders", "StitchedInbetweener", "build_inbetweener"),
     "controllers.shots.shot": ("ShotSettings", "ShotSolution", "solve_shot"),
     "controllers.shots.wishes": ("Wish",),
-    "controllers.shots.prices": ("Price",),
     "mapctl.problem.solution": ("Outcome", "Solution", "Status", "WindowRecord"),
     "mapctl.problem.ledger": ("Ledger", "LedgerEntry"),
     # steering

@@ -23,7 +23,6 @@ from controllers.shots.keys.posing import MetPose, as_reaches, meet_poses, pose_
 from controllers.shots.keys.reaching import ReachTargets, settle_reaches
 from controllers.shots.loop import OVERLAP, close_loop
 from controllers.shots.planning.way import Way, plan_way
-from controllers.shots.prices import Price
 from controllers.shots.repair import repair_jumps
 from controllers.shots.request import Reach, ShotRequest
 from controllers.shots.rest_pose import build_rest_pose
@@ -62,13 +61,10 @@ class ShotSolution(Solution):
     """What is reached for, keys' own hands and feet too, at the times at which it was."""
     met: tuple[MetPose, ...] = ()
     """Keys of poses, places and facings, as they were met."""
-    prices: tuple[Price, ...] = ()
-    """What each wish costs the others, where that was measured."""
 
     def details(self) -> dict:
-        """Return the wishes, and their prices where these were measured."""
-        rows = {"wishes": [wish.as_row() for wish in self.wishes]}
-        return rows | {"prices": [price.as_row() for price in self.prices]} if self.prices else rows
+        """Return the wishes."""
+        return {"wishes": [wish.as_row() for wish in self.wishes]}
 
 
 def solve_shot(

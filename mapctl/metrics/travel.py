@@ -1,7 +1,6 @@
 """Command tracking of a steered character: speed and direction of its slow velocity against the commands."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -146,11 +145,3 @@ def _measure_steady_errors(
     off = math.degrees(float(rotations.wrap_angle(math.atan2(step[0], step[1]) - command.heading)))
     found["steady_speed_mps"] = float(np.linalg.norm(step))
     return found | {"steady_heading_error_deg": off if command.speed > 0 else None}
-
-
-def sample_commands(track: CommandTrack, seconds: Sequence[float]) -> tuple[list[float], list[float]]:
-    """Sample the commanded speed (m/s) and heading (radians; NaN while it is to turn on and on) at each time."""
-    commands = [track.at(time) for time in seconds]
-    return [command.speed for command in commands], [
-        command.heading if command.turning is None else math.nan for command in commands
-    ]

@@ -99,15 +99,9 @@ def test_generate_writes_different_clips(prior, tmp_path):
     assert [clip.name for clip in clips] == [f"generated_00{k}.bvh" for k in range(3)]
     assert {mapctl.load(clip).num_frames for clip in clips} == {45}
     assert len({clip.read_bytes() for clip in clips}) == 3
-    for name, words, same in (
-        ("one", (), True),
-        ("raw", ("--no-refine",), False),
-        ("planted", ("--no-footing",), False),
-    ):
+    for name, words, same in (("one", (), True), ("planted", ("--no-footing",), False)):
         assert run("generate", "-o", tmp_path / name, "--seconds", 1.5, "--prior", prior, *words) == 0
         assert ((tmp_path / name / "generated_000.bvh").read_bytes() == clips[0].read_bytes()) is same
-    raw, planted = ((tmp_path / name / "generated_000.bvh").read_bytes() for name in ("raw", "planted"))
-    assert raw != planted
 
 
 @pytest.mark.slow
@@ -173,7 +167,7 @@ def test_measure_prints_json_and_a_table(walk, prior, capsys):
 def test_render_and_follow_make_films(walk, prior, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("MAPCTL_RENDERER", "stick")
     assert run("render", walk, "-o", tmp_path / "a.png", "--size", "96x64", "--curve", "circle:3") == 0
-    words = ("follow", "line:1", "--seconds", 0.2, "--prior", prior, "--size", "64x48")
+    words = ("follow", "line:1", "--seconds", 0.2, "--prior", prior)
     assert run(*words, "-o", tmp_path / "b.bvh", "--video", tmp_path / "b.mp4") == 0
     assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
     assert (tmp_path / "b.mp4").read_bytes()[4:8] == b"ftyp"

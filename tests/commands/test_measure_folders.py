@@ -81,14 +81,6 @@ def test_two_folders_are_compared(made, mocap, capsys):
     assert all(name in table for name in (*values["spread"], "told apart, %", "Frechet distance", "floor"))
 
 
-@pytest.mark.slow  # of what it decides: test_realism.py
-def test_the_seed_decides_alone(made, mocap, capsys):
-    first, again, other = (told(capsys, made, "--reference", mocap, "--seed", seed) for seed in (1, 1, 2))
-    assert first == again
-    assert first["realism"]["accuracy"] != other["realism"]["accuracy"]
-    assert first["realism"]["frechet"] == other["realism"]["frechet"]
-
-
 @pytest.mark.slow
 def test_rigs_do_not_matter(made, tmp_path, capsys):
     """The same walks on another rig have the same measures, jitter of every joint too."""
@@ -174,4 +166,3 @@ def test_too_few_clips_are_refused(made, tmp_path, capsys):
 
 def test_options_of_one_clip_are_refused(made, capsys):
     assert "for one clip" in refused(capsys, made, "--curve", "circle:3")
-    assert "seed" in refused(capsys, made, "--seed", -1)

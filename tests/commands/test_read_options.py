@@ -59,7 +59,7 @@ def test_every_command_that_reads_motions_can_be_given_their_unit_and_up_axis():
 
 
 def test_the_unit_is_that_of_a_body_too(clip, prior, tmp_path):
-    words = ("--seconds", 0.4, "--prior", prior, "--no-refine", "--quiet", "--to", ".npz")
+    words = ("--seconds", 0.4, "--prior", prior, "--no-footing", "--quiet", "--to", ".npz")
     assert run("generate", "-o", tmp_path, *words, "--rig", clip, "--unit", "in") == 0
     bones = [mapctl.load(path).skeleton.offsets for path in (tmp_path / "generated_000.npz", clip)]
     torch.testing.assert_close(bones[0][1:], 2.54 * bones[1][1:], atol=1e-4, rtol=0)

@@ -265,7 +265,7 @@ def words_of(folder, prior):
     return {
         "follow": ("line:2", "-o", folder / "a.bvh", "--seconds", 0.4, "--prior", prior),
         "steer": (folder / "c.csv", "-o", folder / "a.bvh", "--prior", prior),
-        "generate": ("-o", folder, "--seconds", 0.4, "--prior", prior, "--no-refine"),
+        "generate": ("-o", folder, "--seconds", 0.4, "--prior", prior, "--no-footing"),
         "run": (folder / "s.toml", "-o", folder),
     }
 

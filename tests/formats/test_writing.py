@@ -166,7 +166,7 @@ def _no_space(*words, **options):
 def test_a_command_says_it_in_one_line(tmp_path, prior, monkeypatch, capsys, request):
     monkeypatch.chdir(tmp_path)
     request.getfixturevalue("small_disk")
-    assert run("generate", "--seconds", 20, "-o", "new/folder", "--prior", prior, "--no-refine", "--quiet") == 2
+    assert run("generate", "--seconds", 20, "-o", "new/folder", "--prior", prior, "--no-footing", "--quiet") == 2
     told = capsys.readouterr()
     place = Path("new/folder/generated_000.bvh")
     assert (told.out, told.err) == ("", f"mapctl: cannot write {place}: File too large\n")

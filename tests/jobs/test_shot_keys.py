@@ -14,8 +14,7 @@ from controllers.shots.keys.posing import as_reaches, measure_pose_error, meet_p
 from controllers.shots.keys.reaching import ReachTargets, settle_reaches
 from controllers.shots.loop import OVERLAP, close_loop
 from controllers.shots.planning.way import Way, plan_way
-from controllers.shots.prices import measure_prices
-from controllers.shots.request import Look, PoseKey, Reach, ShotRequest
+from controllers.shots.request import PoseKey, Reach, ShotRequest
 from controllers.shots.wishes import Wish, check_wishes, describe_fights
 from mapctl import curves, kinematics
 from mapctl.errors import RequestError
@@ -230,25 +229,6 @@ def test_a_loop_leads_from_its_last_frame_into_its_first(inbetweener):
     # A lap that is cut off has 197 m/s^2 where it begins again; laps put together without one made anew have 116.
     assert hardest(made) < 35 < 100 < hardest(long.slice(0, frames))
     torch.testing.assert_close(made.root_position[60:], long.root_position[60:frames])
-
-
-# What wishes cost
-
-
-def test_what_a_wish_costs_is_what_others_gain_without_it():
-    request = ShotRequest(
-        LINE, seconds=4.0, looks=(Look(1.0, (0, 1, 9)),), poses=(PoseKey(2.0, facing_deg=9.0),), stand_at_end=True
-    )
-
-    def solve(without: ShotRequest) -> tuple[Wish, ...]:
-        off = 1.0 + 6.0 * bool(without.poses)
-        still = Wish("stand at the end", "still", 2.0, 6.0, "cm/s")
-        return (Wish("path", "on the curve", off, 15.0, "cm"), still)
-
-    prices = measure_prices(solve, request, solve(request))
-    by_name = {price.wish: price.gains for price in prices}
-    assert by_name == {"look at 1 s": (), "pose at 2 s": (("path", 6.0, "cm"),), "stand at the end": ()}
-    assert "path 6.0 cm" in prices[0].sentence
 
 
 def test_wishes_that_fight_are_named_together(walked, way):

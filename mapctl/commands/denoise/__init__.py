@@ -21,10 +21,6 @@ class Denoise(ModelCommand, options.RigOptions):
     mask: options.MaybeFile = None
     """CSV with the columns joint, start, stop: frames (from 0, stop exclusive) in which a joint of the rig is missing.
     `*` is everything, `root position` the body's position. What is nan in IN is missing too."""
-    sigma_deg: options.MaybeNumber = None
-    """Noise of every joint's angles, degrees; estimated from the capture, joint by joint, if not given."""
-    sigma_cm: options.MaybeNumber = None
-    """Noise of the position of the hips, centimetres; estimated from the capture if not given."""
     anchor: bool = False
     """Correct the trajectory so that planted feet do not travel, for captures in which the body drifts against them."""
     causal: bool = False
@@ -41,8 +37,6 @@ class Denoise(ModelCommand, options.RigOptions):
     window, the bundled one under which the motion is likelier. None if not given, which measures as well."""
     report: options.MaybeFile = None
     """JSON with the faults found, corrections, contacts, ledger; of a folder, a folder of them."""
-    plot: options.MaybeFile = None
-    """PNG of joint angles before and after, and of the feet."""
     video: options.MaybeFile = None
     """Film of the capture and the result side by side: .mp4, .gif, .webp or .png."""
     jobs: options.Count = 1

@@ -38,7 +38,7 @@ def run(command: Denoise, settings: DenoiseSettings) -> int:
 
 def collect_jobs(command: Denoise) -> tuple[list[FileJob], int]:
     """Collect the jobs, and the number of files done already; RequestError for options that folders do not take."""
-    for name in ("mask", "plot", "video", "prior", "causal", "strict"):
+    for name in ("mask", "video", "prior", "causal", "strict"):
         if getattr(command, name):
             raise RequestError(f"--{name} is for single files; {command.source} is a folder")
     if command.jobs < 1:

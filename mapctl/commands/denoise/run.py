@@ -8,13 +8,12 @@ from controllers.denoising.denoise import DenoiseSettings, denoise
 from controllers.denoising.result import DenoiseSolution
 from mapctl import report
 from mapctl.commands.denoise import Denoise, folder
-from mapctl.commands.shared import inputs, licensing, outputs, results
+from mapctl.commands.shared import inputs, licensing, results
 from mapctl.commands.shared.exit_status import conclude
 from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.errors import RequestError
 from mapctl.recording.masks import load_masks
 from mapctl.skeleton import CANONICAL
-from scenes.plots.denoising import plot
 
 _MAX_NAMED = 6
 _LOW_SHARE = 0.5  # share of the frames with the proposal as it is below which a joint is named
@@ -31,7 +30,7 @@ def run(command: Denoise) -> int:
     licensing.save_motion(done.motion, command.out)
     if command.report is not None:
         report.write_report(results.build_report("denoise", command, done), command.report)
-    _draw_pictures(command, done)
+    results.film_comparison(done.capture, done.motion, command.video, rig=done.rig, quiet=command.quiet)
     if not command.quiet:
         _print_summary(command, done)
     return conclude(done.status, strict=command.strict)
@@ -41,8 +40,7 @@ def _check(command: Denoise) -> None:
     for name, idle in (("cluster", command.cluster is None), ("again", not command.again), ("jobs", command.jobs == 1)):
         if not idle:
             raise RequestError(f"--{name} is for folders; {command.source} is a file")
-    results.check_destinations(command.out, command.video, command.report, command.plot, given=(command.source,))
-    outputs.check_plot(command.plot)
+    results.check_destinations(command.out, command.video, command.report, given=(command.source,))
 
 
 def _run_denoising(command: Denoise) -> DenoiseSolution:
@@ -78,13 +76,7 @@ def read_settings(command: Denoise) -> DenoiseSettings:
         raise RequestError("--causal leaves what is lost to the denoiser; leave --inbetweener out")
     if command.delay is not None and not command.causal:
         raise RequestError("--delay is how far --causal may look ahead; leave it out, or ask for both")
-    return DenoiseSettings(sigma_deg=command.sigma_deg, sigma_cm=command.sigma_cm, anchor=command.anchor)
-
-
-def _draw_pictures(command: Denoise, done: DenoiseSolution) -> None:
-    if command.plot is not None:
-        plot(done.capture, done.motion, command.plot, rig=done.rig)
-    results.film_comparison(done.capture, done.motion, command.video, rig=done.rig, quiet=command.quiet)
+    return DenoiseSettings(anchor=command.anchor)
 
 
 def _print_summary(command: Denoise, done: DenoiseSolution) -> None:

@@ -46,17 +46,8 @@ class FollowCurve(ModelCommand, options.ReadOptions):
     """Style of the motion, of those that the prior knows."""
     fps: options.MaybeNumber = None
     """Frame rate of the motion; 30, or that of the clip it goes on from, if not given."""
-    prices: bool = False
-    """Solve again without each wish, and tell what it costs the others."""
     video: options.MaybeFile = None
     """Film of the walk: .mp4, .gif, .webp or .png (contact sheet)."""
-    character: options.MaybeCharacter = None
-    """File of a skinned character, as .glb or .vrm, that the film shows in place of the mannequin; the motion stays
-    that of --rig."""
-    camera: Annotated[options.CameraKind | None, arg(metavar="follow|fixed|top")] = None
-    """Camera of the film; follow if not given."""
-    size: options.MaybeSize = None
-    """Width and height of the film, pixels; 1280x720 if not given."""
     report: options.MaybeFile = None
     """JSON with the request, status, ledger, measures and timing."""
     metres_per_unit: options.MaybeNumber = None

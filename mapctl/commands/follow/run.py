@@ -10,7 +10,7 @@ import priors
 from mapctl import formats, report
 from mapctl.commands.follow import FollowCurve
 from mapctl.commands.shared import inputs, licensing, options, outputs
-from mapctl.commands.shared.character import read_character, read_drawn_character
+from mapctl.commands.shared.character import read_character
 from mapctl.commands.shared.exit_status import conclude
 from mapctl.commands.shared.path_walk import Walk, parse_follow, walk
 from mapctl.commands.shared.progress_bar import show_progress
@@ -19,9 +19,8 @@ from mapctl.intent.cornering import turns_sharply
 
 if TYPE_CHECKING:
     from mapctl.commands.shared.shots.play import PlayedShot
-    from scenes.drawn_character import DrawnCharacter
 
-_SIZE = "1280x720"
+_SIZE = (1280, 720)
 
 
 def run(command: FollowCurve) -> int:
@@ -43,20 +42,20 @@ def _find_weights(command: FollowCurve) -> str | None:
 def _follow(command: FollowCurve) -> int:
     curve = inputs.read_curve(command.curve, command.metres_per_unit)
     request = parse_follow(curve, command.speed, command.seconds)
-    drawn = read_drawn_character(command.character)
     character, prior = read_character(command.rig, command), priors.load(command.prior)
     cornering = command.speed is None and turns_sharply(curve)
     if cornering or _wishes_more(command):
         from mapctl.commands.follow import shot
+        from mapctl.commands.shared.shots.play import play_shot
 
         planned = shot.plan(command, curve, prior, character)
         with show_progress("walking", quiet=command.quiet) as progress:
-            done = shot.play(planned, prices=command.prices, progress=progress)
+            done = play_shot(planned, [], priors.load_inbetweener(), progress=progress)
     else:
         with show_progress("walking", quiet=command.quiet) as progress:
             done = walk(prior, request, seed=command.seed, progress=progress, character=character)
     video = None if done.interrupted else command.video
-    _write(command, done, video, drawn)
+    _write(command, done, video)
     if not command.quiet:
         files = ", ".join(map(str, options.collect_paths(command.out, video, command.report)))
         print("\n".join([*done.summary(), f"wrote     {files}"]))
@@ -66,9 +65,7 @@ def _follow(command: FollowCurve) -> int:
 def _wishes_more(command: FollowCurve) -> bool:
     """Return whether more is wished than to walk along a curve."""
     told = command.keys is not None or command.gait or command.style or command.fps is not None
-    return bool(
-        told or command.avoid or command.start != "walk" or command.end != "walk" or command.loop or command.prices
-    )
+    return bool(told or command.avoid or command.start != "walk" or command.end != "walk" or command.loop)
 
 
 def _check(command: FollowCurve) -> None:
@@ -77,31 +74,21 @@ def _check(command: FollowCurve) -> None:
         raise RequestError(f"--fps must be 1 to 1000, got {command.fps:g}")
     formats.check_ending(command.out)
     outputs.check_files(options.collect_paths(command.out, command.video, command.report))
-    for name in ("camera", "size", "character"):
-        if command.video is None and getattr(command, name) is not None:
-            raise RequestError(f"--{name} is of the film, and --video asks for none")
     if command.video is not None:
-        outputs.check_film(command.video, options.parse_size(command.size or _SIZE))
+        outputs.check_film(command.video, _SIZE)
 
 
-def _write(
-    command: FollowCurve, done: "Walk | PlayedShot", video: Path | None, character: "DrawnCharacter | None"
-) -> None:
+def _write(command: FollowCurve, done: "Walk | PlayedShot", video: Path | None) -> None:
     licensing.save_motion(done.on_rig, command.out)
     if command.report is not None:
         report.write_report(done.report(options.describe_request("follow", command)), command.report)
     if video is not None:
-        _film(command, done, video, character)
+        _film(command, done, video)
 
 
-def _film(command: FollowCurve, done: "Walk | PlayedShot", video: Path, character: "DrawnCharacter | None") -> None:
-    from mapctl.commands.shared.shots.stage import build_obstacles, print_notes, stage_actor
-    from scenes.cameras import CameraSettings
+def _film(command: FollowCurve, done: "Walk | PlayedShot", video: Path) -> None:
+    from mapctl.commands.shared.shots.stage import build_obstacles, stage_actor
     from scenes.film import film
 
-    actors, camera = [stage_actor(done, character=character)], CameraSettings(command.camera or "follow")
     with show_progress("filming", quiet=command.quiet) as progress:
-        size = options.parse_size(command.size or _SIZE)
-        film(actors, video, camera=camera, size=size, props=build_obstacles([done]), progress=progress)
-    if not command.quiet:
-        print_notes(actors)
+        film([stage_actor(done)], video, size=_SIZE, props=build_obstacles([done]), progress=progress)

@@ -3,16 +3,13 @@
 from fractions import Fraction
 from pathlib import Path
 
-import priors
 from controllers.common.character import Character
 from mapctl.commands.follow import FollowCurve
 from mapctl.commands.shared.shots.plan import ShotPlan, plan_shot
-from mapctl.commands.shared.shots.play import PlayedShot, play_shot
 from mapctl.curves import Curve
 from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import RequestError
 from mapctl.intent.shot_keys import read_shot_keys
-from mapctl.runtime.progress import Progress
 from priors.lstm_gmm.density import LstmGmmDensity
 from scenes.scene_file import Actor
 
@@ -38,8 +35,3 @@ def plan(command: FollowCurve, curve: Curve, prior: LstmGmmDensity, character: C
     return plan_shot(
         actor, curve, prior, character=character, folder=Path(), options=command, obstacles=obstacles, fps=fps
     )
-
-
-def play(planned: ShotPlan, *, prices: bool, progress: Progress | None) -> PlayedShot:
-    """Play the shot; with its `prices`, what each wish costs the others."""
-    return play_shot(planned, [], priors.load_inbetweener(), prices=prices, progress=progress)

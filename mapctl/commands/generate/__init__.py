@@ -38,8 +38,6 @@ class Generate(ModelCommand, options.ReadOptions):
     no_footing: bool = False
     """Leave out the foot clean-up. Without a refiner, each frame is then sampled given that toes stand where its
     contact bits say so: feet slide about as mocap's do, and it is faster."""
-    no_refine: bool = False
-    """Leave the samples as they come: no refiner, no foot clean-up, and feet slide."""
     rig: options.OutRig = "canonical"
     """Body that moves: the canonical one, or that of a clip, on whose rig the motion is then written; or a rig by name
     or TOML file, whose joints get the canonical bones."""

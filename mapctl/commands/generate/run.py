@@ -62,11 +62,7 @@ def _check_settings(command: Generate) -> tuple[GenerateSettings, Motion | None]
     outputs.check_folder(command.out)
     formats.check_ending(command.out / f"clip{command.to}")
     numbered = command.start is not None and command.start.lstrip("-").isdecimal()
-    if command.no_refine and command.refiner is not None:
-        raise RequestError("--refiner and --no-refine exclude each other")
-    if command.no_refine and command.no_footing:
-        raise RequestError("--no-refine leaves out the footing pass as well; leave --no-footing out")
-    finishing = None if command.no_refine or command.no_footing else FootCleanupSettings()
+    finishing = None if command.no_footing else FootCleanupSettings()
     start = int(command.start) if command.start and numbered else None
     planted = SIGMA_PLANTED if command.no_footing and command.refiner is None else None
     settings = GenerateSettings(

@@ -32,9 +32,5 @@ class Measure(ModelCommand, options.RigOptions):
     """Requested speed, m/s: adds the progress along the curve."""
     metres_per_unit: options.MaybeNumber = None
     """Scale of a CSV or SVG file."""
-    prior: options.Name = "locomotion"
-    """Prior whose card has mocap's values."""
-    seed: options.Count = 0
-    """Seed of the classifier of the two folders."""
     json: bool = False
     """Print JSON instead of a table."""

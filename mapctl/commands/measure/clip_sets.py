@@ -116,7 +116,7 @@ class ClipSet:
         return measure_position_diversity(torch.stack(pieces))
 
 
-def train_judges(ours: ClipSet, reference: ClipSet, *, seed: int) -> realism.Judges:
+def train_judges(ours: ClipSet, reference: ClipSet) -> realism.Judges:
     """Train networks that distinguish ours from the reference's; RequestError for too few clips."""
     fewest = SETTINGS.min_clips
     for clips in (ours, reference):
@@ -125,7 +125,7 @@ def train_judges(ours: ClipSet, reference: ClipSet, *, seed: int) -> realism.Jud
                 f"{clips.folder}: {len(clips.motions)} clips; a comparison needs at least {fewest} in each folder"
                 f"{_describe_skipped(clips)} (without --reference a folder of any size is measured)"
             )
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     with show_progress("telling apart") as progress:
         return realism.train_judges(
             ours.windows, reference.windows, generator=generator, settings=SETTINGS, progress=progress

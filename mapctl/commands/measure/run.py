@@ -47,7 +47,7 @@ def _measure_clips(command: Measure) -> dict[str, Any]:
         "clip": str(command.clip),
         "measures": ours,
         "reference": reference,
-        "mocap": _read_mocap_values(command.prior),
+        "mocap": _read_mocap_values(),
         "cycle": _measure_cycle(whole, rig),
         "notes": notes,
     }
@@ -71,7 +71,6 @@ def _read_curve(command: Measure) -> Curve | None:
 
 
 def _check_folders(command: Measure, alike: bool) -> None:
-    options.check_seed(command.seed)
     if not alike:
         raise RequestError(f"{command.clip} and {command.reference}: a folder and a clip; name two of one kind")
     if any(option is not None for option in (command.curve, command.speed, command.metres_per_unit)):
@@ -87,7 +86,7 @@ def _measure_folders(command: Measure) -> dict[str, Any]:
         "clips": len(ours.motions),
         "measures": ours.means,
         "reference": {} if reference is None else reference.means,
-        "mocap": _read_mocap_values(command.prior),
+        "mocap": _read_mocap_values(),
         "notes": ours.notes + (() if reference is None else reference.notes),
         "skipped": ours.skipped | ({} if reference is None else reference.skipped),
     }
@@ -95,7 +94,7 @@ def _measure_folders(command: Measure) -> dict[str, Any]:
 
 
 def _compare_folders(command: Measure, ours: ClipSet, reference: ClipSet) -> dict[str, Any]:
-    judges = train_judges(ours, reference, seed=command.seed)
+    judges = train_judges(ours, reference)
     return {
         "reference_clips": len(reference.motions),
         "realism": asdict(judges.summarise()),
@@ -161,10 +160,12 @@ def _print_realism(realism: Mapping[str, Any]) -> None:
     print_table(columns, rows, title=f"{counts}; 50 % cannot be told apart")
 
 
-def _read_mocap_values(prior: str) -> Mapping[str, Any]:
-    """Read mocap's values from the prior's card; none where there is no such prior."""
+def _read_mocap_values() -> Mapping[str, Any]:
+    """Read mocap's values from the card of the bundled prior; none where there is none."""
     try:
-        return report.reference_measures(checkpoints.read_card(checkpoints.locate(prior).with_suffix(".json")).quality)
+        return report.reference_measures(
+            checkpoints.read_card(checkpoints.locate("locomotion").with_suffix(".json")).quality
+        )
     except CheckpointError:
         return {}
 

@@ -21,11 +21,6 @@ class RunScene(ModelCommand, options.ReadOptions):
     rig: options.OutRig = "canonical"
     """Body of the actors whose `rig` the scene file does not give: the canonical one, or that of a clip, on whose rig
     they are written; or a rig by name or TOML file, whose joints get the canonical bones."""
-    character: options.MaybeCharacter = None
-    """File of a skinned character, as .glb or .vrm, that films show in place of the mannequin, for every actor whose
-    `character` the scene file does not tell."""
-    prices: bool = False
-    """Solve every actor's shot again without each of its wishes, and tell what it costs the others."""
     strict: bool = False
     """Exit with status 3 where not all that was asked of every actor holds."""
     quiet: bool = False

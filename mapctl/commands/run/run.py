@@ -93,14 +93,10 @@ def _read_characters(command: RunScene, scene: SceneDescription, path: Path) -> 
 
 
 def _read_drawn(command: RunScene, scene: SceneDescription, path: Path) -> Drawn:
-    """Read each actor's character once, of those that are filmed: the scene file's own, else that of the option."""
+    """Read each character of the scene file once, if there is a film."""
     if not scene.films(command.out):
-        if command.character is not None:
-            raise RequestError(f"--character is of the film, and {path} asks for none")
         return [None] * len(scene.actors)
-    named = [
-        command.character if actor.character is None else str(path.parent / actor.character) for actor in scene.actors
-    ]
+    named = [None if actor.character is None else str(path.parent / actor.character) for actor in scene.actors]
     read = {file: read_drawn_character(file) for file in dict.fromkeys(named)}
     return [read[file] for file in named]
 
@@ -126,14 +122,7 @@ def _solve(
                     done.append(walk(prior, plan, seed=actor.seed, progress=progress, character=character))
                 else:
                     earlier = [one for one in done if isinstance(one, PlayedShot)]
-                    made = play_shot(
-                        plan,
-                        earlier,
-                        inbetweener,
-                        keep_apart=scene.keep_apart,
-                        prices=command.prices,
-                        progress=progress,
-                    )
+                    made = play_shot(plan, earlier, inbetweener, keep_apart=scene.keep_apart, progress=progress)
                     done.append(made)
         except KeyboardInterrupt:
             if not done:

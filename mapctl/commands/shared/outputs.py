@@ -33,25 +33,14 @@ def check_film(path: Path, size: tuple[int, int]) -> None:
     require_render("av" if path.suffix.lower() == ".mp4" else "PIL")
 
 
-def check_plot(path: Path | None) -> None:
-    """Raise RequestError where a requested --plot cannot be made: another ending than .png, or no matplotlib."""
-    if path is None:
-        return
-    _check_png(path, "--plot")
-
-
 def check_picture(path: Path | None, *, given: Path) -> None:
     """Raise RequestError where a requested picture cannot be made of a given file, or would be written over it."""
     if path is None:
         return
-    _check_png(path, "--out")
-    check_files([path], given=[given])
-
-
-def _check_png(path: Path, what: str) -> None:
     if path.suffix.lower() != ".png":
-        raise RequestError(f"{what} writes .png, not {path.suffix or 'a file without ending'}")
+        raise RequestError(f"--out writes .png, not {path.suffix or 'a file without ending'}")
     require_render("matplotlib")
+    check_files([path], given=[given])
 
 
 def require_render(package: str) -> None:

@@ -57,8 +57,6 @@ class Steer(ModelCommand, options.ReadOptions):
     """Largest turn rate of the target direction, degrees/s."""
     report: options.MaybeFile = None
     """JSON with each command's response, timing, ledger and measures."""
-    plot: options.MaybeFile = None
-    """PNG of target and actual speed and direction over time."""
     strict: bool = False
     """Exit with status 3 where not all that was requested holds: a speed was lowered to what the prior can do, or a
     frame was late."""

@@ -43,7 +43,6 @@ from mapctl.problem.solution import Outcome, Solution, Status
 from mapctl.terms import FootContact
 from priors.licences import note_licence
 from priors.lstm_gmm.density import LstmGmmDensity
-from scenes.plots.steering import plot
 
 if TYPE_CHECKING:
     from mapctl.streaming.sender import PoseStream
@@ -79,10 +78,8 @@ def run(command: Steer) -> int:
     found = _build_report(command, done, track, prior, timing, refused)
     if command.report is not None:
         report.write_report(found, command.report)
-    if command.plot is not None:
-        plot(motion, track, command.plot)
     if not command.quiet:
-        files = options.collect_paths(command.out, command.report, command.plot)
+        files = options.collect_paths(command.out, command.report)
         streamed = None if stream is None else streaming.summarise(stream)
         print("\n".join(_format_summary(found, files, streamed)))
     return conclude(done.status, strict=command.strict)
@@ -92,8 +89,7 @@ def _check(command: Steer) -> None:
     options.check_seed(command.seed)
     _limits(command)
     formats.check_ending(command.out)
-    outputs.check_files(options.collect_paths(command.out, command.report, command.plot))
-    outputs.check_plot(command.plot)
+    outputs.check_files(options.collect_paths(command.out, command.report))
     if command.stream is not None and not command.realtime:
         raise RequestError("--stream goes by the clock, which needs --realtime; give both")
     streaming.check(_stream(command))

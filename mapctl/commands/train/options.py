@@ -95,7 +95,7 @@ class TrainOptions(ABC):
 
         outputs.check_folder(self.out)
         if self.plot:
-            outputs.check_plot(self.out / CURVES)
+            outputs.require_render("matplotlib")
         if self.single_thread or recipe.processes > 1:
             use_single_thread()
         from mapctl.commands.train import progress

@@ -89,7 +89,7 @@ class DenoiserTrainer(GradientTrainer[DenoiserNetwork]):
         windows = draw_performers(
             self.windows, self.settings, self.generator, batch=self.group.share(self.settings.batch)
         )
-        return compute(self.network, windows, self.settings, self.generator)
+        return compute_denoiser_losses(self.network, windows, self.settings, self.generator)
 
     def validate(self, corpus: Corpus) -> dict[str, Any]:
         """Measure the errors on 6 batches of held-out windows, corrupted identically each time."""

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from controllers.following.follow import FollowSettings
 from controllers.shots.planning.way import APART_MARGIN, Way, plan_way
-from controllers.shots.prices import measure_prices
 from controllers.shots.request import Others, ShotRequest
 from controllers.shots.shot import ShotSettings, ShotSolution, solve_shot
 from mapctl import report
@@ -73,7 +72,6 @@ class PlayedShot:
         return [
             f"motion    {motion.num_frames} frames, {motion.seconds:.1f} s",
             *wishes,
-            *(f"price     {price.sentence}" for price in self.solution.prices),
             f"cost      {1000 * self.solution.seconds / motion.num_frames:.1f} ms a frame",
             f"status    {self.solution.status.text}",
         ]
@@ -85,32 +83,24 @@ def play_shot(
     inbetweener: Inbetweener,
     *,
     keep_apart: float | None = None,
-    prices: bool = False,
     progress: Progress | None = None,
 ) -> PlayedShot:
-    """Solve an actor's shot; who was solved earlier is walked around. For `prices` it is solved again without each
-    wish."""
+    """Solve an actor's shot; characters that were solved earlier are walked around."""
     plan.prior.warm_up()
     if keep_apart is not None and earlier:
         tracks = [(one.plan, one.solution.motion.root_position[:, ::2]) for one in earlier]
         plan = replace(plan, request=replace(plan.request, others=_find_others(plan, tracks, keep_apart)))
     follow = FollowSettings().with_rest_height(plan.character.toe_rest_height)
 
-    def solve(request: ShotRequest, shown: Progress | None = None) -> ShotSolution:
-        return solve_shot(
-            plan.prior,
-            inbetweener,
-            request,
-            generator=torch.Generator().manual_seed(plan.actor.seed),
-            settings=ShotSettings(follow=follow),
-            skeleton=plan.character.skeleton,
-            progress=shown,
-        )
-
-    solution = solve(plan.request, progress)
-    if prices:
-        found = measure_prices(lambda request: solve(request).wishes, plan.request, solution.wishes)
-        solution = replace(solution, prices=found)
+    solution = solve_shot(
+        plan.prior,
+        inbetweener,
+        plan.request,
+        generator=torch.Generator().manual_seed(plan.actor.seed),
+        settings=ShotSettings(follow=follow),
+        skeleton=plan.character.skeleton,
+        progress=progress,
+    )
     return PlayedShot(plan, solution)
 
 
