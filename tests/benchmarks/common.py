@@ -6,16 +6,20 @@ were held out are taken alone.
 """
 
 import argparse
+import os
+import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from datetime import date
 from pathlib import Path
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-sys.path.insert(0, str(Path(__file__).parents[1]))  # for `corruptions`
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE.parent))  # for `corruptions`
 
 import mapctl
 from mapctl import retarget
@@ -170,12 +174,18 @@ def average(values: Iterator[float] | Sequence[float]) -> float:
 
 
 def print_table(rows: Sequence[Row], circles: Sequence[Circle]) -> None:
-    """Print rows as a Markdown table, and below it how many clips of each folder were used and skipped."""
+    """Print rows as a Markdown table; below it how many clips of each folder were used and skipped, and provenance."""
     columns = list(dict.fromkeys(name for row in rows for name in row))
     lines = [columns, ["---"] * len(columns), *([_format(row.get(name)) for name in columns] for row in rows)]
     print("\n".join(f"| {' | '.join(line)} |" for line in lines))
     used = (f"{circle.name} {len(circle.clips)} clips, {circle.skipped} skipped" for circle in circles)
+    asked = " ".join([Path(sys.argv[0]).name, *(Path(word).name for word in sys.argv[1:])])
+    commit = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False, cwd=HERE
+    )
+    accelerator = torch.cuda.get_device_name() if torch.cuda.is_available() else "no GPU"
     print(f"\n{'; '.join(used)}.")
+    print(f"`{asked}`, {date.today()}, commit {commit.stdout.strip()}, {os.cpu_count()} cores, {accelerator}.")
 
 
 def _format(value: object) -> str:

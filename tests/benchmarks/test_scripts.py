@@ -25,4 +25,4 @@ def test_a_script_prints_one_table(data, name, capsys):
     lines = capsys.readouterr().out.splitlines()
     assert sum(line.startswith("| ---") for line in lines) == 1
     assert len({line.count("|") for line in lines if line.startswith("|")}) == 1
-    assert "2 clips, 0 skipped" in lines[-1]
+    assert "2 clips, 0 skipped" in lines[-2]
