@@ -1,8 +1,12 @@
 """How Sphinx builds the site: `make docs`."""
 
 import dataclasses
+import re
 import sys
 from pathlib import Path
+
+from docutils import nodes
+from sphinx import addnodes
 
 from mapctl import __version__
 
@@ -71,6 +75,15 @@ def shorten_signature(app, what, name, obj, options, signature, returned):
     return signature, returned
 
 
+def strip_bounds(app, tree):
+    """Show a bounded number's type without pydantic's description of the bounds."""
+    for node in list(tree.findall(addnodes.desc_annotation)):
+        text = re.sub(r"Annotated\[(.+?), FieldInfo\(.*?metadata=\[.*?\]\)\]", r"\1", node.astext())
+        if text != node.astext():
+            node.children = [nodes.Text(text)]
+
+
 def setup(app):
     """Connect to autodoc."""
     app.connect("autodoc-process-signature", shorten_signature)
+    app.connect("doctree-read", strip_bounds)
