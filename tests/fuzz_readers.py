@@ -70,7 +70,7 @@ class Reader:
 def _motion_reader(ending: str) -> Reader:
     module = formats.READERS[ending]
     make = {".gltf": make_gltf}.get(ending, partial(make_motions, ending=ending))
-    container = {"npz": "npz", "growing": "recording", "gltf": "glb", "fbx": "binary", "usd": "binary"}
+    container = {"npz": "npz", "gltf": "glb", "fbx": "binary", "usd": "binary"}
     return Reader(
         f"x{ending}",
         check_npz if ending == ".npz" else check_motion_file,

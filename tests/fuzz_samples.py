@@ -22,7 +22,6 @@ from usd_specimens import make_usd_specimens
 
 from mapctl import formats
 from mapctl.errors import RequestError
-from mapctl.formats import growing
 from mapctl.skeleton import CANONICAL
 
 _ROOT = Path(__file__).resolve().parents[1]
@@ -65,10 +64,7 @@ def make_motions(folder: Path, *, ending: str) -> Iterator[tuple[str, bytes]]:
         (*(formats.load(pair(3, seed=k).write(folder)) for k in (0, 1)), random_motion(CANONICAL, 3))
     ):
         path = folder / f"x{ending}"
-        if ending == ".recording":
-            with path.open("wb", buffering=0) as file:
-                growing.MotionWriter(file).add(motion)
-        elif ending in formats.WRITERS:
+        if ending in formats.WRITERS:
             with suppress(RequestError):  # a .vrm needs a character, a .vrma bones by name
                 motion.save(path)
         if path.exists():

@@ -233,14 +233,6 @@ def _with_odd_floats(binary: bytes, kind: str, random: Random) -> bytes:
     return floats.tobytes() + binary[len(binary) // 4 * 4 :]
 
 
-def _forge_recording(raw: bytes, random: Random) -> bytes:
-    """Break the archive of the first frame, within its length."""
-    start = raw.index(b"\n") + 1
-    (size,) = struct.unpack_from("<I", raw, start)
-    head = _forge_npz(raw[start + 4 : start + 4 + size], random)
-    return raw[:start] + struct.pack("<I", len(head)) + head + raw[start + 4 + size :]
-
-
 def _change_bytes(raw: bytes, random: Random) -> bytes:
     """Replace a few bytes, so that most of a binary file is still read."""
     changed = bytearray(raw)
@@ -255,7 +247,6 @@ CONTAINERS: dict[str, Mutation] = {
     "glb": _forge_glb,
     "safetensors": _forge_safetensors,
     "npz": _forge_npz,
-    "recording": _forge_recording,
     "binary": _change_bytes,
 }
 """Mutations of the values of a file, by its container."""

@@ -78,7 +78,7 @@ PUBLIC: dict[str, tuple[str, ...]] = {
     "controllers.steering.autopilot": ("Autopilot",),
     "controllers.steering.pure_pursuit": ("PurePursuit",),
     "controllers.steering.process": read_own("controllers.steering.process"),
-    "mapctl.runtime.live_protocol": ("FrameChunk", "SigmaRange"),
+    "mapctl.runtime.live_protocol": ("FrameChunk",),
     "mapctl.streaming.messages": ("Message",),
     "mapctl.streaming.receiver": ("read_messages",),
     "mapctl.streaming.vmc": ("FrameAssembler", "VmcFrame", "encode_frame"),

@@ -1,4 +1,4 @@
-"""A stage without a browser: characters that note what they are told, and the loop for a while."""
+"""The live viewer without a browser: characters that note what they are sent, and the loop for a while."""
 
 import time
 from collections.abc import Iterator
@@ -8,23 +8,22 @@ import numpy as np
 from helpers import walk
 
 from mapctl.errors import RequestError
-from mapctl.runtime.live_protocol import FrameChunk, SigmaRange
+from mapctl.runtime.live_protocol import FrameChunk
 from mapctl.skeleton import CANONICAL
 from scenes.live.app import LiveApp
-from scenes.live.inputs import SteeringInputs
+from scenes.live.character import CharacterLook
 
 
 def delivered(first: int = 0, count: int = 3, *, spare: float = 0.02) -> FrameChunk:
     """Some frames of a walk, due now."""
     motion = walk(90).slice(first, first + count)
-    joints = motion.joint_positions().numpy()
     return FrameChunk(
         time.perf_counter(),
         first / 30,
         motion.root_position.numpy(),
         motion.local_quat_xyzw.numpy(),
         np.tile([1.0, 0.0], (count, 1)),
-        joints,
+        motion.joint_positions().numpy(),
         (0.0, 1.2),
         {"noise": 1.0, "travel": 0.5},
         spare,
@@ -34,10 +33,9 @@ def delivered(first: int = 0, count: int = 3, *, spare: float = 0.02) -> FrameCh
 
 
 class Actor:
-    """A LiveCharacter that notes what it is told."""
+    """A LiveCharacter that notes what it is sent."""
 
     skeleton = CANONICAL
-    sigmas = (SigmaRange("speed", "Speed", "m/s", 0.1, 0.01, 1.0), SigmaRange("noise", "Noise", "", 2.0, 0.5, 8.0))
 
     def __init__(self):
         self.heard: list[tuple] = []
@@ -57,14 +55,6 @@ class Actor:
             raise RequestError("a curve needs two points")
         self.heard.append(("walk", points, speed, *[True] * closed))
 
-    def set_rate(self, rate):
-        self.heard.append(("rate", rate))
-
-    def tune(self, values):
-        if any(value > 1 for value in values.values()):
-            raise RequestError(self.sigmas[0].explain_refusal(max(values.values())))
-        self.heard.append(("tune", values))
-
     def pause(self, paused):
         self.heard.append(("pause", paused))
 
@@ -80,10 +70,11 @@ class Actor:
 
 
 @contextmanager
-def live_app(actors: list[Actor], **more) -> Iterator[LiveApp]:
+def live_app(actors: list[Actor], looks: list[CharacterLook] | None = None, **more) -> Iterator[LiveApp]:
     """The viewer of these characters; `more` as LiveApp takes it."""
     labels = {"gait": ["run", "walk"], "style": ["old"]}
-    show = LiveApp(actors, [SteeringInputs() for _ in actors], port=8090, fastest=3.8, labels=labels, **more)
+    looks = looks or [CharacterLook() for _ in actors]
+    show = LiveApp(actors, looks, port=8090, fastest=3.8, labels=labels, **more)
     try:
         yield show
     finally:

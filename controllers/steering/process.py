@@ -9,7 +9,7 @@ import math
 import queue
 import threading
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from typing import Any
@@ -17,15 +17,13 @@ from typing import Any
 import numpy as np
 
 from controllers.steering.process_worker import CharacterRequest, prepare_models, run_worker
-from controllers.steering.sigmas import check_sigmas, describe_sigmas
 from mapctl import curves
 from mapctl.errors import MapctlError, RequestError
 from mapctl.intent.steering import Arrival, Command
 from mapctl.runtime.forking import ForkedProcess, SharedBases, can_fork_for
-from mapctl.runtime.live_protocol import FrameChunk, SigmaRange
+from mapctl.runtime.live_protocol import FrameChunk
 from mapctl.runtime.memory import measure_memory_mb
 from mapctl.runtime.processes import open_pipe, send_queued, spawn
-from mapctl.runtime.stream_time import RATES
 from mapctl.skeleton import Skeleton
 
 __all__ = ["CharacterProcess", "CharacterRequest"]
@@ -44,7 +42,6 @@ class CharacterProcess:
         """Start the process; several start in parallel if all are made before the first `wait`."""
         self._request = request
         self.skeleton: Skeleton = request.skeleton
-        self._rate, self._sigmas = 1.0, dict[str, float]()
         self._start()
 
     def wait(self) -> None:
@@ -58,11 +55,6 @@ class CharacterProcess:
     def command(self, command: Command) -> None:
         """Obey this command from now on, as far as possible (`FrameChunk.notes` tell), and follow no path."""
         self._send("command", command)
-
-    @property
-    def sigmas(self) -> Sequence[SigmaRange]:
-        """Sigmas that `tune` changes."""
-        return describe_sigmas(self._request.settings)
 
     def walk(self, points: Sequence[tuple[float, float]], speed: float, *, closed: bool = False) -> None:
         """Walk along a smooth curve through two or more `points` (x and z, metres) at a `speed` in m/s, then stand; on
@@ -88,28 +80,11 @@ class CharacterProcess:
         """Stop the clock, or let it go on."""
         self._send("pause", paused)
 
-    def set_rate(self, rate: float) -> None:
-        """Let the clock pass at a `rate` of so many seconds per second, 1/64 to 1: slow motion. RequestError for
-        others."""
-        if not RATES[0] <= rate <= RATES[1]:
-            raise RequestError(f"the rate of a character's clock can be {RATES[0]:g} to {RATES[1]:g}, got {rate:g}")
-        self._rate = rate
-        self._send("rate", rate)
-
-    def tune(self, values: Mapping[str, float]) -> None:
-        """Use these `values` of `sigmas`, by name and in the units that are told there, from the next step on, and the
-        defaults of the others; a reset keeps them. RequestError where one is out of its range."""
-        check_sigmas(self._request.settings, values)  # so that errors are raised here, not in the process
-        self._sigmas = dict(values)
-        self._send("tune", self._sigmas)
-
     def reset(self) -> None:
         """Restart from the initial pose. A process that has ended is started again, which takes a while."""
         if self._failed:
             self.close()
             self._start()
-            self._send("rate", self._rate)
-            self._send("tune", self._sigmas)
         else:
             self._send("reset")
 

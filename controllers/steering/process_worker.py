@@ -16,7 +16,6 @@ from controllers.steering import steer
 from controllers.steering.arrival import Arriver
 from controllers.steering.autopilot import Autopilot
 from controllers.steering.loop import find_second_zero, iterate_steps
-from controllers.steering.sigmas import TunedStepper
 from controllers.steering.steer import SteerFrames, SteerSettings
 from mapctl import curves
 from mapctl.errors import MapctlError
@@ -24,7 +23,6 @@ from mapctl.features import PRIOR_FPS
 from mapctl.intent.steering import Arrival, Command
 from mapctl.protocols import Density
 from mapctl.runtime.live_protocol import FrameChunk
-from mapctl.runtime.stream_time import StreamTime
 from mapctl.skeleton import CANONICAL, Skeleton
 
 _WARM_UP_STEPS = 3  # steps before the clock starts, which compile and load what is needed
@@ -70,22 +68,23 @@ class ProcessClock:
 
     real = True
 
-    def __init__(self, connection: Connection, pilot: Autopilot, prior: Density, stepper: TunedStepper):
-        self._connection, self._pilot, self._prior, self._stepper = connection, pilot, prior, stepper
+    def __init__(self, connection: Connection, pilot: Autopilot, prior: Density):
+        self._connection, self._pilot, self._prior = connection, pilot, prior
         self.again = False
         self._began = 0.0  # time of the stream's second 0
-        self._time = StreamTime()
+        self._behind = 0.0  # seconds by which the clock is behind time.perf_counter: pauses, and what was held
+        self._paused_at: float | None = None  # value of time.perf_counter
         self._held = 0.0  # seconds by which the next frames are late
         self._notes: list[str] = []
 
     def now(self) -> float:
-        """See Clock: time.perf_counter less the pauses, and slower in slow motion."""
-        return self._time.now()
+        """See Clock: time.perf_counter less the pauses."""
+        return (time.perf_counter() if self._paused_at is None else self._paused_at) - self._behind
 
     def wait_until(self, seconds: float) -> None:
         """See Clock."""
         while True:
-            left = self._time.wait_seconds(seconds)
+            left = max(0.0, seconds - self.now()) if self._paused_at is None else None
             if self._connection.poll(left):
                 self._handle_order()
             elif left is not None:
@@ -93,17 +92,17 @@ class ProcessClock:
 
     def hold(self, seconds: float) -> None:
         """See Clock: like a pause."""
-        self._time.hold(seconds)
-        self._held += seconds / self._time.rate
+        self._behind += seconds
+        self._held += seconds
 
     def show(self, frames: SteerFrames, due: float) -> None:
         """See Display."""
         self._pilot.show(frames, due)
         if frames.refusal is not None:
             self._notes.append(frames.refusal.reason)
-        at = self._time.perf_counter_at(self._began + due)
+        at = self._began + due + self._behind
         spare = at - time.perf_counter() - self._held
-        chunk = _to_frame_chunk(frames, due, at=at, spare=spare, notes=tuple(self._notes), rate=self._time.rate)
+        chunk = _to_frame_chunk(frames, due, at=at, spare=spare, notes=tuple(self._notes))
         self._connection.send(("frames", chunk))
         self._held = 0.0
         self._notes.clear()
@@ -113,6 +112,12 @@ class ProcessClock:
         self.again = False
         self._began = find_second_zero(self, state)
         self.show(frames, 0.0)
+
+    def _pause(self, paused: bool) -> None:
+        now = time.perf_counter()
+        if self._paused_at is not None:
+            self._behind += now - self._paused_at
+        self._paused_at = now if paused else None
 
     def _handle_order(self) -> None:
         try:
@@ -130,11 +135,7 @@ class ProcessClock:
         if word == "reset":
             self.again = True
         elif word == "pause":
-            self._time.pause(*content)
-        elif word == "rate":
-            self._time.set_rate(*content)
-        elif word == "tune":
-            self._stepper.tune(*content)
+            self._pause(*content)
         elif word == "aim":
             self._pilot.aim(*content)
         elif word == "go":
@@ -194,8 +195,7 @@ def _run_character(connection: Connection, models: CharacterModels | None, reque
     first, _ = steer.accept(prior, request.first)
     pilot = Autopilot(first, request.settings.limits)
     stepper = steer.step if models.transitions is None else Arriver(models.transitions)
-    tuned = TunedStepper(stepper, request.settings)
-    clock = ProcessClock(connection, pilot, prior, tuned)
+    clock = ProcessClock(connection, pilot, prior)
     for number in itertools.count():
         state, pose = steer.begin(
             prior, first, generator=generator, at=request.at, settings=request.settings, skeleton=request.skeleton
@@ -206,7 +206,7 @@ def _run_character(connection: Connection, models: CharacterModels | None, reque
             connection.send(("ready", None))
         _wait_for_turn(request.settings.commit / PRIOR_FPS)
         clock.begin(state, pose)
-        for _ in iterate_steps(state, pilot, [clock], clock=clock, stepper=tuned):
+        for _ in iterate_steps(state, pilot, [clock], clock=clock, stepper=stepper):
             if clock.again:
                 break
         pilot.stay()
@@ -228,7 +228,7 @@ def _warm_up(state: steer.SteerState, first: Command, models: CharacterModels) -
 
 
 def _to_frame_chunk(
-    frames: SteerFrames, seconds: float, *, at: float, spare: float, notes: tuple[str, ...], rate: float
+    frames: SteerFrames, seconds: float, *, at: float, spare: float, notes: tuple[str, ...]
 ) -> FrameChunk:
     energies = {entry.name: float(entry.energy.mean()) for entry in frames.ledger.entries}
     return FrameChunk(
@@ -244,5 +244,4 @@ def _to_frame_chunk(
         frames.seconds,
         frames.evaluations,
         notes,
-        rate,
     )

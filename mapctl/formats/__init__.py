@@ -20,7 +20,6 @@ READERS = {
     ".bvh": "bvh",
     ".npz": "npz",
     ".amc": "acclaim",
-    ".recording": "growing",
     **dict.fromkeys((".glb", ".gltf", ".vrm", ".vrma"), "gltf"),
     **dict.fromkeys(_USD_ENDINGS, "usd"),
     ".fbx": "fbx",
@@ -36,7 +35,7 @@ WRITERS = {
 CHARACTERS = (".glb", ".gltf", ".vrm", ".vrma", *_USD_ENDINGS, ".fbx")
 """Endings of files of characters, that have a rest pose of their own."""
 _MAY_LACK_VALUES = (".bvh", ".npz", ".amc")
-_ONLY_READ = (".fbx", ".gltf", ".usdz", ".amc", ".recording")
+_ONLY_READ = (".fbx", ".gltf", ".usdz", ".amc")
 _UNREADABLE_REASONS = {".asf": "is a skeleton alone: name its motion, a .amc beside it or subject.asf+take.amc"}
 
 

@@ -15,30 +15,6 @@ from mapctl.motion import Motion
 from mapctl.skeleton import Skeleton
 
 
-@dataclass(frozen=True)
-class SigmaRange:
-    """A sigma of a character that can be changed while it moves."""
-
-    name: str
-    """Name in `LiveCharacter.tune`."""
-    label: str
-    """Name for people."""
-    unit: str
-    """Unit of its values; empty for a plain number."""
-    default: float
-    """Value that holds unless another is given, in `unit`."""
-    low: float
-    """Smallest value, in `unit`."""
-    high: float
-    """Largest value, in `unit`."""
-
-    def explain_refusal(self, value: float) -> str:
-        """Return a sentence that says what is allowed instead of a `value`, in the unit of the sigma."""
-        unit = f" {self.unit}" if self.unit else ""
-        allowed = f"it can be {self.low:.3g} to {self.high:.3g}{unit}"
-        return f"The sigma of {self.name} cannot be {value:.6g}{unit}: {allowed}."
-
-
 @dataclass(frozen=True, eq=False)
 class FrameChunk:
     """Frames of one step, as plain arrays, so that they pass between processes."""
@@ -68,17 +44,15 @@ class FrameChunk:
     """Evaluations of energy and gradient in the step."""
     notes: tuple[str, ...] = ()
     """Notes on commands since the last step that could not be obeyed, or not as given."""
-    rate: float = 1.0
-    """Seconds of the stream per second while they are shown: below 1 in slow motion."""
 
     def due_of(self, frame: int) -> float:
         """Return the value of time.perf_counter, seconds, at which a frame is to be seen."""
-        return self.due + frame / (PRIOR_FPS * self.rate)
+        return self.due + frame / PRIOR_FPS
 
     @property
     def late_frames(self) -> int:
         """Number of frames that came after they were due."""
-        return sum(self.spare + k / (PRIOR_FPS * self.rate) < 0 for k in range(len(self.root)))
+        return sum(self.spare + k / PRIOR_FPS < 0 for k in range(len(self.root)))
 
     def motion(self, skeleton: Skeleton) -> Motion:
         """Return the frames as a motion of that skeleton."""
@@ -91,11 +65,6 @@ class LiveCharacter(Protocol):
 
     skeleton: Skeleton
     """Skeleton of the character."""
-
-    @property
-    def sigmas(self) -> Sequence[SigmaRange]:
-        """Sigmas that `tune` changes."""
-        ...
 
     def command(self, command: Command) -> None:
         """Obey this command from now on, as far as possible (`FrameChunk.notes` tell), and follow no path."""
@@ -117,15 +86,6 @@ class LiveCharacter(Protocol):
 
     def pause(self, paused: bool) -> None:
         """Stop the clock, or let it go on."""
-        ...
-
-    def set_rate(self, rate: float) -> None:
-        """Let the clock pass at so many seconds per second, at most 1: slow motion. RequestError where it cannot."""
-        ...
-
-    def tune(self, values: Mapping[str, float]) -> None:
-        """Use these of `sigmas` from the next step on, by name, and the defaults of the others; a reset keeps them.
-        RequestError where one is out of its range."""
         ...
 
     def reset(self) -> None:

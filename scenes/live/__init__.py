@@ -1,4 +1,4 @@
-"""The live viewer: characters in a browser, driven by sliders, keys and drawn paths (viser).
+"""The live viewer: characters in a browser, driven by keys, gamepads, sliders and drawn paths (viser).
 
-It knows a LiveCharacter (mapctl.runtime.live_protocol) and nothing of how one is steered.
+It drives a LiveCharacter (mapctl.runtime.live_protocol), however that is steered.
 """

@@ -1,400 +1,358 @@
-"""The live show: characters, controls and drawings together, and the loop that keeps them moving."""
+"""The live viewer: characters, page and panel together, and the loop that keeps them moving."""
 
-import io
 import math
 import queue
+import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stdout, suppress
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import viser
 
 from mapctl.curves.obstacles import Obstacle
-from mapctl.errors import MapctlError
-from mapctl.motion import Motion
+from mapctl.errors import MapctlError, RequestError
 from mapctl.runtime.live_protocol import LiveCharacter
 from mapctl.streaming.protocols import FrameStream, MessageSource
-from scenes.drawn_character import DrawnCharacter
-from scenes.live import ground
-from scenes.live.access import ServerErrorReporter, restrict_to_own_pages
-from scenes.live.actor import LiveActor
-from scenes.live.cast import Cast, make_members
-from scenes.live.export.recorder import Recorder
-from scenes.live.going import GoThere
-from scenes.live.inputs import InputLimits, Refusal, SteeringInputs
-from scenes.live.notifications import Notifications
-from scenes.live.page.channel import PageChannel
-from scenes.live.panel.controls import ControlPanel
-from scenes.live.panel.layout import PanelLayout, Tab
-from scenes.live.panel.sigmas import SigmaControls
-from scenes.live.paths.editor import PathEditor
-from scenes.live.paths.handles import Ray
-from scenes.live.readouts import Readouts
-from scenes.live.recording import FORMATS, RecordingDelivery, encode_with_fallback, save_without_replacing
-from scenes.live.remote.orders import RemoteOrders
-from scenes.live.target_orders import LiveTargets
-from scenes.live.timeline.controls import TimelineControls
-from scenes.live.timeline.timeline import Timeline
-from scenes.live.view.themes import THEMES
-from scenes.live.view.watching import Watchers
-from scenes.live.viewing import Viewing
+from scenes.live.camera import CameraMode, WorldView
+from scenes.live.character import CharacterLook, ShownCharacter
+from scenes.live.driving import HELP, KEYS, Driving, DrivingOutputs, KeyAction
+from scenes.live.ground import add_scenery, intersect_ground, parse_ray
+from scenes.live.inputs import InputLimits
+from scenes.live.page import HOST, PageChannel, open_server
+from scenes.live.panel import Panel
+from scenes.live.paths import PathEditor, Ray, write_csv
+from scenes.live.recording import FORMATS, Recorder, encode_motion, join_chunks, write_new
+from scenes.live.remote import RemoteCommands
+from scenes.live.targets import LiveTargets
+from scenes.live.timeline import Timeline
 
-HOST = "127.0.0.1"
-"""Nobody but this machine can connect."""
 _TICK = 1 / 60
-_REST_SECONDS = 1.0  # after which a loop that rests looks about
-_READOUT_TICKS = 15  # ticks
-_TYPING_SECONDS = 1.0  # seconds after the last key in a field before it is put right
+_HOUSEKEEPING_TICKS = 15
+_TYPING_SECONDS = 1.0  # after the last key in a field before it shows what holds
+_REPEAT_SECONDS = 10.0  # before the same note is shown again
+_NOTE_SECONDS = 8.0  # for which a note is shown
+_DEFAULT_SPEED = 1.2  # m/s of a path for a character that stands
 _WORLD = "/world"
 
 
 class LiveApp:
-    """The live viewer of one loop. What users do is queued and runs on the loop's thread; an error there is shown in
-    the page and on the console, and ends nothing else.
+    """The live viewer. What users do is queued and runs on the loop's thread; an error there is shown in the page and
+    on the console, and ends nothing else. Methods are for that thread, but for `enqueue`.
     """
 
     def __init__(
         self,
         characters: Sequence[LiveCharacter],
-        orders: Sequence[SteeringInputs],
+        looks: Sequence[CharacterLook],
         *,
         port: int,
         fastest: float,
         labels: Mapping[str, Sequence[str]],
         stream: FrameStream | None = None,
         source: MessageSource | None = None,
-        drawn: Sequence[DrawnCharacter | None] = (),
-        rigs: Sequence[Callable[[Motion], Motion] | None] = (),
-        theme: str = THEMES[0],
-        rests: bool = False,
-        recordings: Path | None = None,
-        licence: str = "",
     ):
-        """Open the page. `fastest` is the prior's, m/s; `labels` are the prior's, by group.
+        """Open the page. `looks` are by character; `fastest` is the prior's speed, m/s, and `labels` are its, by group.
 
-        Frames also go to `stream`, and orders also come from `source`; whoever made these closes them. `drawn` are the
-        meshes by character; where there is none a mannequin is shown. `rigs` put a character's motion on the joints on
-        which it is recorded, where these are not the drawn character's. `theme` is one of THEMES. With `rests`
-        everybody stops while no browser shows them, nothing is recorded, and there is neither `stream` nor `source`.
-        Recordings, under the `licence`, grow in the folder `recordings`, where there is one, and survive a crash there.
+        Frames also go to `stream`, and commands also come from `source`; the caller closes these.
         """
-        channel = PageChannel()
-        self.server = _open_server(port, channel)
-        self._bounds = InputLimits(math.floor(10 * fastest) / 10, labels)
-        scene, gui = self.server.scene, self.server.gui
-        self._layout = PanelLayout(gui)
-        self._notices = Notifications(self.server)
-        self._quiet = ServerErrorReporter(self.server.get_event_loop(), self._notices.console)
-        scene.set_up_direction("+y")
-        members = make_members(scene, _WORLD, characters, orders, drawn=drawn, rigs=rigs, licence=licence)
-        self._todo: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        channel = PageChannel(KEYS, HELP)
+        self.server = open_server(port, channel)
+        self.limits = InputLimits(math.floor(10 * fastest) / 10, labels)
+        self.is_paused = False
+        self._paused_at = 0.0
+        self._began = 0.0
+        self._queue: queue.SimpleQueue[Callable[[], Any]] = queue.SimpleQueue()
+        self._noted: dict[str, float] = {}
         self._typed_at: float | None = None
-        self._gauges = Readouts(gui)
-        self._cast = Cast(members, self._notices, self._gauges, stream)
-        self.targets = LiveTargets(scene, _WORLD, members, lambda: self._cast.chosen, self.enqueue)
-        self._view = Viewing(
-            self.server,
-            _WORLD,
-            self,
-            self._cast,
-            channel,
-            self._notices,
-            fastest=self._bounds.fastest,
-            theme=theme,
-            enqueue=self.enqueue,
-        )
-        self.path = PathEditor(scene, _WORLD, locate=self._find_ground, enqueue=self.enqueue)
-        self._recorder = Recorder(lambda: self._cast.chosen, RecordingDelivery(self.server, self._notices), recordings)
-        self._panel = self._build_panel(gui, len(characters), theme)
-        self._view.attach(self._panel.viewing)
-        self._panel.show(members[0].orders)
-        self._timeline = Timeline(members, self.set_paused)
-        with self._layout.open(Tab.PLAY):
-            self._times = TimelineControls(gui, self)
-        self._remote = None if source is None else RemoteOrders(source, self, members, groups=list(labels))
-        with self._layout.open(Tab.PATH):
-            self._going = GoThere(gui, scene, _WORLD)
-        with self._layout.open(Tab.TERMS):
-            self._sigmas = SigmaControls(gui, members, lambda: self._cast.chosen, self.enqueue)
-            self._gauges.add_plots()
-        self._watchers = Watchers(self.server, wake=lambda: self.enqueue(lambda: None))
-        self._may_rest = rests and stream is None and source is None
-        scene.on_click()(lambda event: self._draw_at(event.ray_origin, event.ray_direction))
-
-    def _build_panel(self, gui: viser.GuiApi, characters: int, theme: str) -> ControlPanel:
-        return ControlPanel(
-            gui,
-            self._layout,
-            self,
-            self.targets,
-            self._view,
-            self.path,
-            self,
-            characters=characters,
-            bounds=self._bounds,
-            below=self._notices.below,
-            mode=self._view.mode,
-            theme=theme,
-        )
+        self._channel, self._stream = channel, stream
+        scene = self.server.scene
+        scene.set_up_direction("+y")
+        self.view = WorldView(self.server, _WORLD, add_scenery(self.server, _WORLD), characters=len(characters))
+        self.characters = [
+            ShownCharacter(scene, _WORLD, number, *one)
+            for number, one in enumerate(zip(characters, looks, strict=True))
+        ]
+        self.chosen = self.characters[0]
+        self.targets = LiveTargets(scene, _WORLD, self.characters, lambda: self.chosen, self.enqueue)
+        self.path = PathEditor(scene, _WORLD, locate=self._find_ground, enqueue=self.enqueue, on_change=self._show_path)
+        self.recorder = Recorder(self.server, self.notify)
+        self.timeline = Timeline(self.characters, self._set_paused)
+        self.panel = Panel(self.server.gui, self, characters=len(characters))
+        self.panel.show_inputs(self.chosen.inputs)
+        outputs = DrivingOutputs(self._drive, self._act, self.view.chase.orbit, self.view.find_heading, self.notify)
+        self.driving = Driving(outputs, self.limits.fastest, min(1.2, self.limits.fastest))
+        self._remote = None if source is None else RemoteCommands(source, self, self._print)
+        scene.on_click()(lambda event: self.enqueue(lambda: self.click(event.ray_origin, event.ray_direction)))
+        self.server.on_client_connect(lambda client: self.enqueue(lambda: self.show_all([client])))
 
     @property
     def url(self) -> str:
-        """Where the page is. The port is another than asked for if that one was taken."""
+        """Address of the page; the port is another than asked for if that one was taken."""
         return f"http://{HOST}:{self.server.get_port()}"
 
     def run(self, stop: Callable[[], bool] = lambda: False) -> None:
         """Run until `stop()` is true or Ctrl-C."""
-        self._cast.begin(time.perf_counter())
+        self._began = time.perf_counter()
         for tick in range(2**62):
             if stop():
                 return
-            began = time.perf_counter()
-            while not self._todo.empty():
-                self._notices.run_safely(self._todo.get())
-            if self._remote is not None:
-                self._notices.run_safely(self._remote.obey)
-            self._cast.rest(self._may_rest and self._watchers.are_away(began) and not self._cast.is_recorded)
+            now = time.perf_counter()
+            while not self._queue.empty():
+                self._run_safely(self._queue.get())
             with self.server.atomic():
-                self._notices.run_safely(lambda now=began: self._show_due(now))
-            if tick % _READOUT_TICKS == 0 or self._cast.rests:
-                self._notices.run_safely(lambda now=began: self._run_housekeeping(now))
-            self._wait(_TICK - (time.perf_counter() - began))
+                self._run_safely(lambda now=now: self._step(now))
+            if tick % _HOUSEKEEPING_TICKS == 0:
+                self._run_safely(lambda now=now: self._run_housekeeping(now))
+            time.sleep(max(0.0, _TICK - (time.perf_counter() - now)))
 
-    def _wait(self, seconds: float) -> None:
-        """Wait for the next moment at which something is to be done: where everybody rests, until somebody asks."""
-        if not self._cast.rests:
-            time.sleep(max(0.0, seconds))
+    def enqueue(self, action: Callable[[], Any]) -> None:
+        """Run an action on the loop's thread; from any thread."""
+        self._queue.put(action)
+
+    def notify(self, title: str, text: str) -> None:
+        """Show a note in every browser and on the console; the same once in a while only."""
+        now = time.perf_counter()
+        self._noted = {note: at for note, at in self._noted.items() if now - at < _REPEAT_SECONDS}
+        text = " ".join(text.split())
+        if self._noted.setdefault(f"{title} {text}", now) != now:
             return
-        with suppress(queue.Empty):
-            self._notices.run_safely(self._todo.get(timeout=_REST_SECONDS))
+        self._print(f"{title}: {text}")
+        for client in list(self.server.get_clients().values()):
+            with suppress(Exception):  # it may have gone just now
+                client.add_notification(title, text, auto_close_seconds=_NOTE_SECONDS)
 
     def save_recordings(self, folder: Path) -> list[Path]:
         """Write what is being recorded, as BVH files that replace none."""
-        pending = [member.recording for member in self._cast.members if member.recording and member.recording.frames]
-        for member in self._cast.members:
-            member.recording = None
         saved = []
-        for recording in pending:
-            made = encode_with_fallback(recording.motion(), FORMATS[0], recording.drawn)
-            saved.append(save_without_replacing(made, folder))
-            recording.discard()
+        for character in self.characters:
+            chunks, character.recorded = character.recorded, None
+            if chunks:
+                content = encode_motion(join_chunks(character, chunks), FORMATS[0])
+                saved.append(write_new(folder / f"mapctl.{FORMATS[0]}", content))
         return saved
 
     def close(self) -> None:
-        """End characters and page."""
-        self._recorder.close()
-        self._cast.close()
-        self._quiet.close()
-        with redirect_stdout(io.StringIO()):
+        """End characters and page; a file that is being made is finished first."""
+        self.recorder.wait()
+        for character in self.characters:
+            character.character.close()
+        with redirect_stdout(StringIO()):
             self.server.stop()
 
-    def order(self, **changes: Any) -> None:
-        """Change the chosen character's orders, and show them; it leaves its path."""
+    # Steering
 
-        def ordered() -> None:
-            self._apply_order(self._cast.chosen, changes)
-            self._panel.show(self._cast.chosen.orders)
+    def change(self, character: ShownCharacter, changes: Mapping[str, Any]) -> list[str]:
+        """Change a character's inputs by name, within the limits, and have it obey; it leaves its path. Returns what
+        could not be done as it was asked."""
+        notes = self._apply(character, changes)
+        self._show_inputs(character)
+        return notes
 
-        self.enqueue(ordered)
+    def change_from_panel(self, **changes: Any) -> None:
+        """Change the chosen character's inputs from a control, which may still be typed into."""
+        self._apply(self.chosen, changes)
+        if "speed" in changes and self.chosen.inputs.speed > 0:
+            self.driving.walk_speed = self.chosen.inputs.speed
+        self.panel.enable(self.chosen.inputs)
+        self._typed_at = time.perf_counter()
 
-    def typed(self, **changes: Any) -> None:
-        """Change orders from a control, which already shows them and may still be typed into."""
-
-        def ordered() -> None:
-            self._apply_order(self._cast.chosen, changes)
-            if "speed" in changes and self._cast.chosen.orders.speed > 0:
-                self._view.driving.walk_speed = self._cast.chosen.orders.speed
-            self._panel.enable(self._cast.chosen.orders)
-            self._typed_at = time.perf_counter()
-
-        self.enqueue(ordered)
-
-    def nudge(self, **by: float) -> None:
-        """Add to the chosen character's speed (m/s) or heading (degrees), as far as it goes."""
-
-        def ordered() -> None:
-            orders = self._cast.chosen.orders
-            wanted = {name: getattr(orders, name) + step for name, step in by.items()}
-            if "speed" in wanted:
-                wanted["speed"] = min(self._bounds.fastest, max(0.0, wanted["speed"]))
-            if "heading" in wanted:
-                wanted["heading"] = math.remainder(wanted["heading"], 360)
-            self._apply_order(self._cast.chosen, wanted)
-            self._panel.show(self._cast.chosen.orders)
-
-        self.enqueue(ordered)
-
-    def choose(self, character: int) -> None:
-        """Choose the character whose orders are shown and changed from now on."""
-
-        def chosen() -> None:
-            self._cast.choose(character)
-            self._panel.show(self._cast.chosen.orders)
-            self.targets.show()
-            self._sigmas.show()
-            self._label_recording()
-
-        self.enqueue(chosen)
-
-    def toggle_pause(self) -> None:
-        """Stop everybody, or go on."""
-        self.enqueue(lambda: self.set_paused(not self._cast.is_paused))
-
-    def set_paused(self, paused: bool) -> None:
-        """See RemoteStage."""
-        self._panel.play.paused.label = "Go on" if paused else "Pause"
-        self._cast.set_paused(paused)
-        self._timeline.set_paused(paused)
-
-    def reset(self) -> None:
-        """Restart all characters."""
-        self.enqueue(self.restart)
-
-    def restart(self) -> None:
-        """See RemoteStage."""
-        self._timeline.return_to_present()
-        self._cast.restart(self.targets.obstacles)
-        self._panel.show(self._cast.chosen.orders)
-        self.targets.show()
-
-    def set_rate(self, rate: float) -> None:
-        """See TimelineActions."""
-
-        def slowed() -> None:
-            self._timeline.clock.set_rate(rate)
-            self._cast.set_rate(rate)
-
-        self.enqueue(slowed)
-
-    def look_back(self, seconds: float) -> None:
-        """See TimelineActions."""
-        self.enqueue(lambda: self._timeline.look_back(seconds))
-
-    def replay(self) -> None:
-        """See TimelineActions."""
-        self.enqueue(self._timeline.replay)
-
-    def return_to_present(self) -> None:
-        """See TimelineActions."""
-        self.enqueue(self._timeline.return_to_present)
-
-    def walk_path(self) -> None:
-        """Let the chosen character walk the drawn path."""
-
-        def walked() -> None:
-            try:
-                self.walk(self._cast.chosen, self.path.path.points, closed=self.path.path.is_closed)
-            except MapctlError as error:
-                self._notices.event("No path to walk", str(error), console=False)
-
-        self.enqueue(walked)
-
-    def walk(self, member: LiveActor, points: Sequence[tuple[float, float]], *, closed: bool = False) -> None:
-        """See RemoteStage."""
-        member.character.walk(list(points), member.orders.speed or 1.2, closed=closed)
-
-    def change(self, member: LiveActor, changes: Mapping[str, Any]) -> list[Refusal]:
-        """See RemoteStage."""
-        refusals = self._apply_order(member, changes)
-        self._show_orders(member)
-        return refusals
-
-    def aim(self, member: LiveActor) -> None:
-        """See RemoteStage."""
-        member.aim(self.targets.obstacles)
-        self._show_orders(member)
-
-    def go(self, member: LiveActor, place: tuple[float, float], within: float, facing: float | None) -> None:
-        """See RemoteStage."""
-        member.go(place, within, facing, self.targets.obstacles, stand=False)
-        self._going.mark(place)
+    def aim(self, character: ShownCharacter) -> None:
+        """Have a character reach for and look at its inputs' targets."""
+        character.aim(self.targets.obstacles)
+        self._show_inputs(character)
 
     def set_disc(self, disc: Obstacle | None) -> None:
-        """See RemoteStage."""
+        """Have all characters walk round a disc, or round nothing."""
         self.targets.set_disc(disc)
-        self._panel.reaching.disc.value = disc is not None
+        self.panel.disc.value = disc is not None
+
+    def choose(self, number: int) -> None:
+        """Choose the character, from 0, whose inputs are shown and changed from now on."""
+        self.chosen = self.characters[number]
+        self.view.chase.switch(self.chosen.position)
+        self._show_inputs(self.chosen)
+
+    def set_paused(self, paused: bool) -> None:
+        """Stop all characters, or let them go on, which shows the present."""
+        if not paused:
+            self.timeline.leave()
+        self._set_paused(paused)
+
+    def restart(self) -> None:
+        """Restart all characters with their first inputs."""
+        self.timeline.return_to_present()
+        for number, character in enumerate(self.characters):
+            self._run_safely(lambda one=character: one.reset(self.targets.obstacles))
+            if self._stream is not None:
+                self._stream.forget(number)
+        self._show_inputs(self.chosen)
+
+    def walk(self, character: ShownCharacter, points: Sequence[tuple[float, float]], *, closed: bool = False) -> None:
+        """Have a character walk along points, x and z in metres. RequestError where they make no path."""
+        character.character.walk(list(points), character.inputs.speed or _DEFAULT_SPEED, closed=closed)
+
+    def click(self, ray_origin: Any, ray_direction: Any) -> None:
+        """Send the chosen character where a click meets the ground, or add a point to the path there."""
+        ray = self.view.to_world_ray(parse_ray(ray_origin, ray_direction))
+        point, journey = intersect_ground(ray), self.panel.read_journey()
+        if point is None:
+            return
+        if journey is not None:
+            within, facing, stands = journey
+            if stands:
+                self.change(self.chosen, {"speed": 0.0})
+            self.targets.go(self.chosen, point, within, None if facing is None else math.radians(facing))
+        elif self.panel.draw.value is True:
+            self.path.add(*point, ray)
+
+    # Path
+
+    def walk_path(self) -> None:
+        """Have the chosen character walk the drawn path."""
+        self.walk(self.chosen, self.path.path.points, closed=self.path.path.is_closed)
+
+    def close_path(self, closed: bool) -> None:
+        """Close the path to a loop, or open it."""
+        self.path.path.is_closed = closed
+        self.path.edit(lambda: None)
+
+    def download_path(self, client: viser.ClientHandle | None) -> None:
+        """Give a browser the path as a CSV file."""
+        curve = self.path.path.curve
+        if curve is None:
+            raise RequestError("a path needs 2 points or more")
+        if client is not None:
+            client.send_file_download("mapctl-path.csv", write_csv(curve), save_immediately=True)
+
+    # Recording and the past
 
     def toggle_recording(self, client: viser.ClientHandle | None) -> None:
         """Begin to record the chosen character, or end and give that browser the file."""
-
-        def toggled() -> None:
-            self._recorder.toggle(self._panel.recording.chosen_ending, client)
-            self._label_recording()
-
-        self.enqueue(toggled)
+        self.recorder.toggle(self.chosen, self.panel.chosen_ending, client)
 
     def save_again(self, client: viser.ClientHandle | None) -> None:
-        """See RecordActions."""
-        self.enqueue(lambda: self._recorder.save_again(self._panel.recording.chosen_ending, client))
+        """Give a browser the last recording once more."""
+        self.recorder.save_last(self.panel.chosen_ending, client)
 
-    def cancel_export(self) -> None:
-        """See RecordActions."""
-        self._recorder.cancel()
+    def look_back(self, seconds: float) -> None:
+        """Show what was so many seconds ago."""
+        self.timeline.look_back(seconds, paused=self.is_paused)
 
-    def enqueue(self, action: Callable[[], None]) -> None:
-        """Enqueue what a browser asks for on its own thread, for the loop."""
-        self._todo.put(action)
+    def replay(self) -> None:
+        """Play from the shown moment, or from as far back as there is, to the present."""
+        self.timeline.replay(time.perf_counter(), paused=self.is_paused)
 
-    def _show_orders(self, member: LiveActor) -> None:
-        if member is self._cast.chosen:
-            self._panel.show(member.orders)
-            self.targets.show()
+    # View
 
-    def _apply_order(self, member: LiveActor, changes: Mapping[str, Any]) -> list[Refusal]:
-        member.orders, refusals = self._bounds.changed(member.orders, changes)
-        for name in changes:
-            self._notices.held(name, getattr(member.orders, name))
-        self._notices.show_refusals(refusals)
-        member.command(self.targets.obstacles)
-        return refusals
+    def set_camera(self, mode: CameraMode) -> None:
+        """Have the camera turn with the chosen character, follow it, or stay."""
+        self.view.chase.mode = mode
 
-    def _show_due(self, now: float) -> None:
-        self._timeline.stand(still=self._cast.is_still)
-        self._timeline.proceed(now)
-        self._cast.show(now, self._timeline.clock.now())
-        self._view.step(now)
+    def show_all(self, clients: list[viser.ClientHandle] | None = None) -> None:
+        """Bring all characters into the view of these browsers, of all by default."""
+        self.view.show_all(np.array([character.position for character in self.characters]), clients)
+
+    def show_marks(self, visible: bool) -> None:
+        """Show or hide arrows and trails."""
+        for character in self.characters:
+            character.trajectories.show_all(visible)
+
+    # The loop's own
+
+    def _step(self, now: float) -> None:
+        for page, state in self._channel.poll():
+            self.driving.hear(page, state)
+        self.driving.step(now)
+        if self._remote is not None:
+            self._remote.obey()
+        for number, character in enumerate(self.characters):
+            self._run_safely(lambda one=character, k=number: self._receive(one, k, now))
+            if not self.is_paused:
+                self._run_safely(lambda one=character: one.show_due(now))
+        self.timeline.step(now)
+        self.view.step(now, self.chosen.position, self.chosen.facing)
+
+    def _receive(self, character: ShownCharacter, number: int, now: float) -> None:
+        try:
+            chunks = character.receive(now)
+        except MapctlError as error:
+            self.notify(character.name.capitalize(), f"it has ended: {error}. Reset restarts it")
+            return
+        for chunk in chunks:
+            if self._stream is not None and chunk.due >= self._began:  # what was due before could only come late
+                self._stream.put(number, chunk.due, chunk.seconds, chunk.root, chunk.quats)
+            for note in chunk.notes:
+                self.notify(character.name.capitalize(), note)
 
     def _run_housekeeping(self, now: float) -> None:
-        """Do what need not be done every time."""
-        self._gauges.show()
-        self._times.show(self._timeline)
-        self._label_recording()
-        self._sigmas.settle(now)
-        self._notices.expire_refusal(now)
-        if self._remote is not None and (said := self._remote.report(now)) is not None:
-            self._notices.console(said)
+        self.panel.show_state(self.chosen, self.recorder, self.timeline)
         if self._typed_at is not None and now - self._typed_at > _TYPING_SECONDS:
             self._typed_at = None
-            self._panel.show(self._cast.chosen.orders)
-        self._cast.report_pace(now)
-        self._view.keep(now)
+            self.panel.show_inputs(self.chosen.inputs)
 
-    def _draw_at(self, ray_origin: Any, ray_direction: Any) -> None:
-        """Send the chosen character where a click meets the ground, or add a point to the path there: the ray's origin
-        and direction, three numbers each, checked for that."""
+    def _apply(self, character: ShownCharacter, changes: Mapping[str, Any]) -> list[str]:
+        character.inputs, notes = self.limits.change(character.inputs, changes)
+        self.panel.show_refusal(notes)
+        character.command(self.targets.obstacles)
+        return notes
 
-        def added() -> None:
-            ray = self._view.locate_ray(ground.parse_ray(ray_origin, ray_direction))
-            place = ground.intersect_ground(*ray)
-            if place is None:
-                return
-            if self._going.send(self._cast.chosen, place, self.targets.obstacles):
-                self._panel.show(self._cast.chosen.orders)
-            elif self._panel.path.draw.value:
-                self.path.place(*place, ray)
+    def _show_inputs(self, character: ShownCharacter) -> None:
+        if character is self.chosen:
+            self.panel.show_inputs(character.inputs)
+            self.targets.show()
 
-        self.enqueue(added)
+    def _show_path(self, note: str) -> None:
+        self.panel.closed.value = self.path.path.is_closed
+        self.panel.path.content = "\n\n".join(filter(None, (self.path.describe(), note)))
+
+    def _set_paused(self, paused: bool) -> None:
+        if paused == self.is_paused:
+            return
+        now, self.is_paused = time.perf_counter(), paused
+        self.panel.paused.label = "Resume" if paused else "Pause"
+        seconds, self._paused_at = 0.0 if paused else now - self._paused_at, now
+        if self._stream is not None:
+            self._stream.pause()
+        for character in self.characters:
+            self._run_safely(lambda one=character: one.pause(paused, seconds))
+
+    def _drive(self, speed: float, heading: float | None) -> None:
+        self.change(self.chosen, {"speed": speed} | ({} if heading is None else {"heading": heading}))
+
+    def _act(self, action: KeyAction) -> None:
+        inputs, characters = self.chosen.inputs, self.characters
+        actions: dict[KeyAction, Callable[[], Any]] = {
+            KeyAction.STAND: lambda: self.change(self.chosen, {"speed": 0.0}),
+            KeyAction.TURN_AROUND: lambda: self.change(self.chosen, {"heading": inputs.heading + 180.0}),
+            KeyAction.PAUSE: lambda: self.set_paused(not self.is_paused),
+            KeyAction.RESET: self.restart,
+            KeyAction.WALK_PATH: self.walk_path,
+            KeyAction.CAMERA: self._take_next_camera,
+            KeyAction.SHOW_ALL: self.show_all,
+            KeyAction.NEXT: lambda: self.choose((characters.index(self.chosen) + 1) % len(characters)),
+            KeyAction.HELP: lambda: None,  # the page's own
+        }
+        self._run_safely(actions[action])
+
+    def _take_next_camera(self) -> None:
+        self.panel.camera.value = self.view.next_mode().value
 
     def _find_ground(self, ray: Ray) -> tuple[float, float] | None:
-        """Find where a ray meets the ground of the world, x and z in metres."""
-        return ground.intersect_ground(*self._view.locate_ray(ground.parse_ray(*ray)))
+        """Find where a ray as a browser sent it meets the ground of the world, x and z in metres."""
+        return intersect_ground(self.view.to_world_ray(parse_ray(*ray)))
 
-    def _label_recording(self) -> None:
-        self._panel.recording.show(self._recorder)
+    def _run_safely(self, action: Callable[[], Any]) -> None:
+        """Run an action; report whatever goes wrong, and go on."""
+        try:
+            action()
+        except MapctlError as error:
+            self.notify("Not done", str(error))
+        except Exception as error:
+            self.notify("Something went wrong", f"{type(error).__name__}: {error}"[:200])
 
-
-def _open_server(port: int, channel: PageChannel) -> viser.ViserServer:
-    with redirect_stdout(io.StringIO()), restrict_to_own_pages(channel):  # viser greets in a box of its own
-        return viser.ViserServer(host=HOST, port=port, label="mapctl live", verbose=False)
+    def _print(self, text: str) -> None:
+        print(f"mapctl: {text}", file=sys.stderr, flush=True)

@@ -1,4 +1,4 @@
-"""Orders of a character and their limits: numbers and words of a page are checked here as they arrive."""
+"""Steering inputs of one character and their limits: what the page and other programs send is checked here."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -12,69 +12,47 @@ from mapctl.numerics.checks import is_number
 
 UNCONDITIONED = "any"
 """The choice that gives a prior no label."""
-Place = tuple[float, float, float]
 HANDS = ("left", "right")
-"""Hands that reach for a target."""
 DISC_RADII = (0.2, 2.0)
 """Smallest and largest disc to walk round, metres."""
 WITHIN = (0.5, 10.0)
-"""Shortest and longest time in which somebody can be sent anywhere, seconds."""
-_MAX_COORDINATE = 1e4  # metres from the origin beyond which nobody looks
-_NUMBER_FIELDS = ("speed", "heading", "facing", "step_length")
-_WORDS_AND_UNITS = {"speed": ("speed", "m/s"), "step_length": ("step length", "m")}
+"""Shortest and longest time in which a character can be sent to a position, seconds."""
+Point = tuple[float, float, float]
+_MAX_COORDINATE = 1e4  # metres from the origin
+_UNITS = {"speed": "m/s", "step_length": "m", "heading": "degrees", "facing": "degrees"}
 
 
 @dataclass(frozen=True)
 class SteeringInputs:
-    """Orders of one character, as the panel shows them."""
+    """What one character is asked for, as the panel shows it."""
 
     speed: float = 1.2
     """Speed, m/s."""
     heading: float = 0.0
     """Direction of travel, degrees; 0 is +Z, 90 is +X."""
     facing: float | None = None
-    """Facing, degrees; None faces where it goes."""
+    """Facing, degrees; None faces the direction of travel."""
     step_length: float | None = None
     """Step length, metres; None leaves it to the prior."""
     labels: Mapping[str, str] = field(default_factory=dict)
     """Chosen label by group (gait, style)."""
-    hand: str | None = None
-    """Hand that reaches for the target, `left` or `right`; None for neither."""
-    looks: bool = False
-    """Whether the head looks at the target."""
-    target: tuple[float, float, float] | None = None
-    """Place of the target in the world, metres; None until there is one."""
-    reach: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
-    """Places that hands reach for because a program said so, metres, by `left` and `right`; the target comes before."""
-    look_at: tuple[float, float, float] | None = None
-    """Place that the head looks at because a program said so; likewise."""
+    reach: Mapping[str, Point] = field(default_factory=dict)
+    """Targets of hands in the world, metres, by `left` and `right`."""
+    look_at: Point | None = None
+    """Target of the head in the world, metres."""
 
     @property
     def command(self) -> Command:
         """Command for a LiveCharacter."""
-        facing = None if self.facing is None else math.radians(self.facing)
-        reach = {**self.reach, **({self.hand: self.target} if self.hand and self.target else {})}
         return Command(
             self.speed,
             math.radians(self.heading),
-            facing,
+            None if self.facing is None else math.radians(self.facing),
             step_length=self.step_length,
             labels=tuple(f"{group}={label}" for group, label in self.labels.items()),
-            reach={f"{hand}Hand": place for hand, place in reach.items()},
-            look_at=self.target if self.looks else self.look_at,
+            reach={f"{hand}Hand": point for hand, point in self.reach.items()},
+            look_at=self.look_at,
         )
-
-
-@dataclass(frozen=True)
-class Refusal:
-    """A note for whoever asked for what cannot be done."""
-
-    name: str
-    """Name of the order."""
-    held: Any
-    """Value that holds instead."""
-    text: str
-    """Sentence with what is allowed."""
 
 
 @dataclass(frozen=True)
@@ -84,68 +62,55 @@ class InputLimits:
     fastest: float
     """Fastest speed, m/s."""
     labels: Mapping[str, Sequence[str]]
-    """Labels that the prior knows, by group."""
-    steps: tuple[float, float] = STEP_LENGTHS
-    """Shortest and longest step, metres."""
+    """Labels of the prior, by group."""
 
-    def changed(self, orders: SteeringInputs, changes: Mapping[str, Any]) -> tuple[SteeringInputs, list[Refusal]]:
-        """Change orders by name, each limited to what can be done; what is no number changes nothing.
+    def change(self, inputs: SteeringInputs, changes: Mapping[str, Any]) -> tuple[SteeringInputs, list[str]]:
+        """Change inputs by name, each limited to what is possible; also return a sentence for each that was limited.
 
-        `labels` names a label by group, AS_IT_LIKES none; groups that it does not name stay as they are.
+        A value that is not a finite number changes nothing. `labels` holds a label by group, UNCONDITIONED for none.
         """
-        found, refused = {}, list[Refusal]()
+        found, notes = {}, list[str]()
         for name, asked in changes.items():
-            held = self._label(orders.labels, asked) if name == "labels" else self._limit_number(orders, name, asked)
-            if (text := self._explain_refusal(name, asked, held)) is not None:
-                refused.append(Refusal(name, held, text))
-            found[name] = held
-        return replace(orders, **found), refused
-
-    def _limit_number(self, orders: SteeringInputs, name: str, asked: Any) -> float | None:
-        if name not in _NUMBER_FIELDS or not is_number(asked):
-            may_be_none = name in ("facing", "step_length") and asked is None
-            return None if may_be_none else getattr(orders, name)
-        if name in ("heading", "facing"):
-            return float(asked) if abs(asked) <= 180 else math.remainder(asked, 360)
-        lowest, highest = self._range(name)
-        return min(highest, max(lowest, float(asked)))
-
-    def _label(self, labels: Mapping[str, str], asked: Any) -> dict[str, str]:
-        known = {group: (UNCONDITIONED, *labels) for group, labels in self.labels.items()}
-        heard = {group: label for group, label in dict(asked).items() if label in known.get(group, ())}
-        return {group: label for group, label in {**labels, **heard}.items() if label != UNCONDITIONED}
+            if name == "labels":
+                found[name], unknown = self._change_labels(inputs.labels, asked)
+                notes += [f"{label!r} is not a {group} of this prior." for group, label in unknown.items()]
+            elif asked is None and name in ("facing", "step_length"):
+                found[name] = None
+            elif is_number(asked):
+                found[name] = self._limit(name, float(asked))
+                if name in ("speed", "step_length") and found[name] != asked:
+                    low, high = self._range(name)
+                    words, unit = name.replace("_", " "), _UNITS[name]
+                    notes.append(f"A {words} of {asked:g} {unit} is out of range: {low:g} to {high:g} {unit}.")
+            else:
+                notes.append(f"{str(asked)[:20]!r} is not a {name.replace('_', ' ')} in {_UNITS[name]}.")
+        return replace(inputs, **found), notes
 
     def _range(self, name: str) -> tuple[float, float]:
-        return (0.0, self.fastest) if name == "speed" else self.steps
+        return (0.0, self.fastest) if name == "speed" else STEP_LENGTHS
 
-    def _explain_refusal(self, name: str, asked: Any, held: Any) -> str | None:
-        """Return the refusal, None where the order holds as it was asked."""
-        if name == "labels":
-            return next(
-                (
-                    f"{label!r} is not a {group} that this prior knows."
-                    for group, label in dict(asked).items()
-                    if held.get(group, UNCONDITIONED) != label
-                ),
-                None,
-            )
-        if asked == held:
-            return None
-        if not is_number(asked):
-            held = "none" if held is None else f"{held:g}"
-            return f"{name.replace('_', ' ').capitalize()}: {str(asked)[:20]!r} is no number; {held} holds."
-        if name not in _WORDS_AND_UNITS:
-            return f"A {name} of {asked:g} degrees is the same as {held:g}."
-        words, unit = _WORDS_AND_UNITS[name]
+    def _limit(self, name: str, value: float) -> float:
+        if name in ("heading", "facing"):
+            return value if abs(value) <= 180 else math.remainder(value, 360)
         low, high = self._range(name)
-        way = "raised" if held > asked else "lowered"
-        return f"A {words} of {asked:g} {unit} was {way} to {held:g}: it can be {low:g} to {high:g} {unit}."
+        return min(high, max(low, value))
+
+    def _change_labels(
+        self, labels: Mapping[str, str], asked: Mapping[str, str]
+    ) -> tuple[dict[str, str], dict[str, str]]:
+        known = {
+            group: label
+            for group, label in asked.items()
+            if group in self.labels and label in (UNCONDITIONED, *self.labels[group])
+        }
+        changed = {group: label for group, label in {**labels, **known}.items() if label != UNCONDITIONED}
+        return changed, {group: label for group, label in asked.items() if group not in known}
 
 
-def parse_place(place: object) -> Place | None:
-    """Return a place that a browser or another program sent, metres; None where it is none near the stage."""
+def parse_point(value: object) -> Point | None:
+    """Return a position that a browser or another program sent, metres; None unless it is finite and near."""
     try:
-        found = np.array(place, dtype=np.float64)
+        found = np.array(value, dtype=np.float64)
     except (TypeError, ValueError):
         return None
     if found.shape != (3,) or not np.isfinite(found).all() or np.abs(found).max() > _MAX_COORDINATE:

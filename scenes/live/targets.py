@@ -1,96 +1,159 @@
-"""What users drag in the live viewer: the place that a hand reaches or the head looks at, and a disc to walk round."""
+"""What users drag: a target that hands reach and the head looks at, and a disc that all characters walk round."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import viser
 
 from mapctl.curves.obstacles import Obstacle
 from mapctl.mesh import colours
+from mapctl.numerics.checks import is_number
+from scenes.live.character import ShownCharacter
 from scenes.live.ground import to_rgb_bytes
-from scenes.live.inputs import Place, parse_place
+from scenes.live.inputs import DISC_RADII, Point, SteeringInputs, parse_point
 
-_HANDLE_SIZE, _BALL_RADIUS = 0.25, 0.045  # metres
+_HANDLE_SIZE, _BALL_RADIUS, _GOAL_RADIUS = 0.25, 0.045, 0.08  # metres
 _DISC_HEIGHT, _DISC_COLOUR = 0.35, (185, 170, 156)
 _TARGET_AHEAD, _TARGET_ASIDE, _TARGET_HEIGHT = 0.45, 0.3, 1.2  # metres from a character, where a target appears
 _DISC_AHEAD = 2.5
 
 
-class DraggableTarget:
-    """A ball with a handle, to be dragged in all directions."""
+class LiveTargets:
+    """A target for each character, of which the chosen one's is shown, and a disc for all of them.
 
-    def __init__(self, scene: viser.SceneApi, name: str, moved: Callable[[Place], None]):
-        """Add it, hidden; `moved` hears where it was dragged, on a browser's own time."""
-        self._handle = scene.add_transform_controls(
-            name, _HANDLE_SIZE, disable_rotations=True, depth_test=False, visible=False
+    Its methods are for the loop's thread; `enqueue` runs there what browsers drag.
+    """
+
+    def __init__(
+        self,
+        scene: viser.SceneApi,
+        world: str,
+        characters: Sequence[ShownCharacter],
+        chosen: Callable[[], ShownCharacter],
+        enqueue: Callable[[Callable[[], None]], None],
+    ):
+        """Add the handles below the node `world`, hidden."""
+        self._scene, self._world, self._characters, self._chosen = scene, world, characters, chosen
+        self.obstacles: tuple[Obstacle, ...] = ()
+        self.target = scene.add_transform_controls(
+            f"{world}/target", _HANDLE_SIZE, disable_rotations=True, depth_test=False, visible=False
         )
-        scene.add_icosphere(f"{name}/ball", _BALL_RADIUS, color=to_rgb_bytes(colours.TARGET))
-        _report_drags(self._handle, moved)
-
-    def show(self, place: Place | None) -> None:
-        """Show it at a place in the world, metres, or hide it."""
-        self._handle.visible = place is not None
-        if place is not None:
-            self._handle.position = place
-
-
-class DraggableDisc:
-    """A disc on the ground with a handle, to be dragged over it."""
-
-    def __init__(self, scene: viser.SceneApi, name: str, moved: Callable[[Place], None]):
-        """Add it, hidden; see DraggableTarget."""
-        self._scene, self._name = scene, name
-        self._handle = scene.add_transform_controls(
-            name,
+        scene.add_icosphere(f"{world}/target/ball", _BALL_RADIUS, color=to_rgb_bytes(colours.TARGET))
+        self.disc = scene.add_transform_controls(
+            f"{world}/disc",
             2 * _HANDLE_SIZE,
             disable_rotations=True,
             active_axes=(True, False, True),
             depth_test=False,
             visible=False,
         )
-        self._radius = 0.0
-        _report_drags(self._handle, moved)
+        self._goal = scene.add_icosphere(
+            f"{world}/goal", _GOAL_RADIUS, color=to_rgb_bytes(colours.TARGET), visible=False
+        )
+        _on_drag(self.target, lambda point: enqueue(lambda: self.move_target(point)))
+        _on_drag(self.disc, lambda point: enqueue(lambda: self.move_disc(point)))
 
-    def show(self, obstacle: Obstacle | None) -> None:
-        """Show it as it is, or hide it."""
-        self._handle.visible = obstacle is not None
-        if obstacle is None or obstacle.radius is None:
-            return
-        self._handle.position = (obstacle.place[0], _DISC_HEIGHT, obstacle.place[1])
-        if self._radius != obstacle.radius:
-            self._radius = obstacle.radius
-            self._scene.add_cylinder(
-                f"{self._name}/solid",
-                self._radius,
-                _DISC_HEIGHT,
-                color=_DISC_COLOUR,
-                opacity=0.8,
-                wxyz=(math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0),
-                position=(0.0, -_DISC_HEIGHT / 2, 0.0),
-            )
+    def reach(self, hand: str | None) -> None:
+        """Have the chosen character reach for the target with a hand, or with none."""
+        inputs = self._chosen().inputs
+        self._aim(replace(inputs, reach={hand: self._find_target(hand)} if hand else {}))
+
+    def look(self, looks: bool) -> None:
+        """Have the chosen character look at the target, or not."""
+        self._aim(replace(self._chosen().inputs, look_at=self._find_target(None) if looks else None))
+
+    def move_target(self, point: Point) -> None:
+        """Move the chosen character's target, metres."""
+        inputs = self._chosen().inputs
+        reach = dict.fromkeys(inputs.reach, point)
+        self._aim(replace(inputs, reach=reach, look_at=inputs.look_at and point))
+
+    def bring(self) -> None:
+        """Put target and disc before the chosen character."""
+        if self.obstacles:
+            self.set_disc(self._disc_ahead(self.obstacles[0].radius or DISC_RADII[0]))
+        hand = next(iter(self._chosen().inputs.reach), None)
+        self.move_target(self._target_ahead(hand))
+
+    def show(self) -> None:
+        """Show the chosen character's target where it has one."""
+        inputs = self._chosen().inputs
+        point = next(iter(inputs.reach.values()), inputs.look_at)
+        self.target.visible = point is not None
+        if point is not None:
+            self.target.position = point
+
+    def put_disc(self, radius: float | None) -> None:
+        """Put a disc of a radius, metres, where there is one already or ahead of the chosen character; None removes
+        it."""
+        if radius is None:
+            self.set_disc(None)
+        elif is_number(radius) and DISC_RADII[0] <= radius <= DISC_RADII[1]:
+            ahead = self.obstacles[0] if self.obstacles else self._disc_ahead(radius)
+            self.set_disc(replace(ahead, radius=radius))
+
+    def move_disc(self, point: Point) -> None:
+        """Move the disc, metres."""
+        if self.obstacles:
+            self.set_disc(replace(self.obstacles[0], place=(point[0], point[2])))
+
+    def set_disc(self, disc: Obstacle | None) -> None:
+        """Have all characters walk round a disc, or round nothing."""
+        before, self.obstacles = self.obstacles, () if disc is None else (disc,)
+        self.disc.visible = disc is not None
+        if disc is not None and disc.radius is not None:
+            self.disc.position = (disc.place[0], _DISC_HEIGHT, disc.place[1])
+            if not before or before[0].radius != disc.radius:
+                self._scene.add_cylinder(
+                    f"{self._world}/disc/solid",
+                    disc.radius,
+                    _DISC_HEIGHT,
+                    color=_DISC_COLOUR,
+                    opacity=0.8,
+                    wxyz=(math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0),
+                    position=(0.0, -_DISC_HEIGHT / 2, 0.0),
+                )
+        for character in self._characters:
+            character.aim(self.obstacles)
+
+    def go(self, character: ShownCharacter, position: tuple[float, float], within: float, facing: float | None) -> None:
+        """Send a character to a position, x and z in metres, in so many seconds, facing so, radians, and mark it."""
+        character.go(position, within, facing, self.obstacles)
+        self._goal.position, self._goal.visible = (position[0], 0.0, position[1]), True
+
+    def _aim(self, inputs: SteeringInputs) -> None:
+        character = self._chosen()
+        character.inputs = inputs
+        character.aim(self.obstacles)
+        self.show()
+
+    def _find_target(self, hand: str | None) -> Point:
+        inputs = self._chosen().inputs
+        return next(iter(inputs.reach.values()), inputs.look_at) or self._target_ahead(hand)
+
+    def _target_ahead(self, hand: str | None) -> Point:
+        """Return a point before the chosen character, on the hand's side."""
+        ahead, left = self._axes()
+        side = {"left": 1.0, "right": -1.0}.get(hand or "", 0.0)
+        x, z = self._chosen().position + _TARGET_AHEAD * ahead + side * _TARGET_ASIDE * left
+        return float(x), _TARGET_HEIGHT, float(z)
+
+    def _disc_ahead(self, radius: float) -> Obstacle:
+        x, z = self._chosen().position + _DISC_AHEAD * self._axes()[0]
+        return Obstacle((float(x), float(z)), radius)
+
+    def _axes(self) -> tuple[np.ndarray, np.ndarray]:
+        heading = math.radians(self._chosen().inputs.heading)
+        ahead = np.array([math.sin(heading), math.cos(heading)])
+        return ahead, np.array([ahead[1], -ahead[0]])
 
 
-def place_before(place: np.ndarray, heading_deg: float, *, hand: str | None) -> Place:
-    """Return where a target appears for a character at `place` (x and z, metres): before it, on the hand's side."""
-    ahead = np.array([math.sin(math.radians(heading_deg)), math.cos(math.radians(heading_deg))])
-    left = np.array([ahead[1], -ahead[0]])
-    side = {"left": 1.0, "right": -1.0}.get(hand or "", 0.0)
-    x, z = np.asarray(place, dtype=np.float64) + _TARGET_AHEAD * ahead + side * _TARGET_ASIDE * left
-    return float(x), _TARGET_HEIGHT, float(z)
-
-
-def disc_before(place: np.ndarray, heading_deg: float, radius: float) -> Obstacle:
-    """Return the disc that appears in the way of a character at `place` (x and z, metres)."""
-    x, z = np.asarray(place, dtype=np.float64)
-    angle = math.radians(heading_deg)
-    return Obstacle((float(x + _DISC_AHEAD * math.sin(angle)), float(z + _DISC_AHEAD * math.cos(angle))), radius)
-
-
-def _report_drags(handle: viser.TransformControlsHandle, moved: Callable[[Place], None]) -> None:
-    """Say where a user drags a handle; not where the show itself puts it. A coroutine, so that drags stay in order."""
+def _on_drag(handle: viser.TransformControlsHandle, moved: Callable[[Point], None]) -> None:
+    """Act where a user drags a handle, not where the server moves it. A coroutine, so that drags stay in order."""
 
     @handle.on_update
     async def _(event: viser.TransformControlsEvent) -> None:
-        if event.client_id is not None and (place := parse_place(handle.position)) is not None:
-            moved(place)
+        if event.client_id is not None and (point := parse_point(handle.position)) is not None:
+            moved(point)

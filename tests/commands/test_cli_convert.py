@@ -20,7 +20,6 @@ import mapctl
 from mapctl import cli, formats, retarget
 from mapctl.formats import npz, usd
 from mapctl.formats.endings import USD_WRITTEN
-from mapctl.formats.growing import MotionWriter
 
 DOCS = (Path(__file__).parents[2] / "docs" / "guides" / "formats.md").read_text("utf-8")
 needs_usd = pytest.mark.skipif(not usd.is_installed(), reason="needs usd-core: pip install 'mapctl[usd]'")
@@ -44,8 +43,6 @@ def here(tmp_path, monkeypatch):
     motion = walk(6)
     motion.save("in.bvh")
     motion.save("in.npz")
-    with Path("in.recording").open("wb") as growing:
-        MotionWriter(growing).add(motion)
     pair(6).write(tmp_path, subject="01", take="in")
     motion.save("in.glb")
     make_character_glb("in.gltf", animations=("walk",), frames=6)

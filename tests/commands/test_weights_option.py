@@ -167,7 +167,7 @@ def test_the_live_page_tells_the_licence_of_what_its_characters_load(alone, monk
     """The process of a character is left out."""
     asked = []
     monkeypatch.setattr(live, "_start_characters", lambda *_: [Actor()])
-    monkeypatch.setattr(LiveApp, "__init__", lambda show, *_, **named: asked.append(named["licence"]))
+    monkeypatch.setattr(LiveApp, "__init__", lambda show, characters, looks, **_: asked.append(looks[0].licence))
     monkeypatch.setattr(LiveApp, "url", "http://127.0.0.1:8080", raising=False)
     monkeypatch.setattr(LiveApp, "run", lambda show: (_ for _ in ()).throw(KeyboardInterrupt))
     monkeypatch.setattr(LiveApp, "save_recordings", lambda *_: [])

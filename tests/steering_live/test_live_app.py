@@ -1,27 +1,33 @@
-"""The live viewer without a browser: what controls do to characters, what is shown, recorded and drawn."""
+"""The live viewer without a browser: what users do reaches the characters, errors end nothing, the past is shown."""
 
 import math
 import socket
 
 import numpy as np
 import pytest
-import trimesh
 from helpers import run as run_command
 from helpers import walk
-from stage import Actor, delivered, run
+from stage import Actor, delivered, live_app, run
 
 from mapctl import formats
 from mapctl.commands.live import run as live
 from mapctl.curves.obstacles import Obstacle
-from mapctl.errors import RequestError
+from mapctl.errors import MapctlError, RequestError
 from mapctl.intent.steering import Command
 from mapctl.runtime.live_protocol import LiveCharacter
-from mapctl.skeleton import CANONICAL
-from scenes.live import ground
 from scenes.live.app import LiveApp
-from scenes.live.readouts import Readouts
-from scenes.live.recording import Recording, encode_motion
-from scenes.live.view.chase import CameraMode
+from scenes.live.camera import CameraMode
+from scenes.live.character import CharacterLook
+from scenes.live.driving import KeyAction
+from scenes.live.ground import intersect_ground
+from scenes.live.page import Gamepad, PageState
+from scenes.live.recording import FORMATS, encode_motion, join_chunks, write_new
+
+DOWN = (0.0, -1.0, 0.0)
+
+
+def words(actor: Actor, *kinds: str) -> list[tuple]:
+    return [heard for heard in actor.heard if heard[0] in kinds]
 
 
 def test_it_listens_on_this_machine_only(show):
@@ -30,8 +36,7 @@ def test_it_listens_on_this_machine_only(show):
     assert isinstance(Actor(), LiveCharacter)
 
 
-def test_a_port_that_is_taken_is_said_and_another_one_serves(monkeypatch, capsys, prior):
-    """As `mapctl live` does it; the process of a character is left out."""
+def test_a_port_that_is_taken_is_named_and_another_one_serves(monkeypatch, capsys, prior):
     actor = Actor()
     monkeypatch.setattr(live, "_start_characters", lambda *_: [actor])
     monkeypatch.setattr(LiveApp, "run", lambda show: (_ for _ in ()).throw(KeyboardInterrupt))
@@ -47,206 +52,295 @@ def test_a_port_that_is_taken_is_said_and_another_one_serves(monkeypatch, capsys
     assert actor.heard[-1] == ("close",)
 
 
-@pytest.mark.slow
-def test_orders_go_to_the_chosen_character_alone_and_the_panel_shows_them(show, actors):
-    show.order(speed=2.0, heading=90.0)
+def test_inputs_go_to_the_chosen_character_alone_and_the_panel_shows_them(show, actors):
+    show.change(show.chosen, {"speed": 2.0, "heading": 90.0})
     show.choose(1)
-    show.order(speed=0.5, facing=-90.0, labels={"gait": "walk", "style": "old"})
-    run(show)
+    show.change(show.chosen, {"speed": 0.5, "facing": -90.0, "labels": {"gait": "walk", "style": "old"}})
     assert actors[0].heard == [("command", Command(2.0, math.pi / 2))]
     assert actors[1].heard == [("command", Command(0.5, 0.0, -math.pi / 2, labels=("gait=walk", "style=old")))]
-    panel = show._panel.steering
+    panel = show.panel
     assert (panel.speed.value, panel.facing.value, panel.labels["gait"].value) == (0.5, -90, "walk")
     show.choose(0)
-    run(show)
     assert (panel.speed.value, panel.heading.value, panel.labels["gait"].value) == (2.0, 90, "any")
-    assert len(actors[0].heard) == 1, "to show orders is not to give them"
+    assert len(actors[0].heard) == 1, "to show inputs is not to send them"
 
 
-def test_pause_and_reset_are_for_everybody(show, actors):
-    show.toggle_pause()
+def test_what_is_typed_is_limited_explained_and_corrected_when_typing_ends(show, actors):
+    field = show.panel.step_length
+    for text in ("0", "0.8", "99"):
+        field._impl.value = float(text)  # as the server has it when a browser sent it
+        show.change_from_panel(step_length=float(text))
+        assert field.value == float(text), "nothing is put into the field while it is typed into"
+        assert ("0.3 to 1.2 m" in show.panel.refusal.content) == (text != "0.8")
+    assert [order.step_length for _, order in actors[0].heard] == [0.3, 0.8, 1.2]
+    show._run_housekeeping(show._typed_at + 2)
+    assert field.value == 1.2
+
+
+def test_pause_and_reset_are_for_all_characters(show, actors):
+    show.set_paused(True)
+    assert show.panel.paused.label == "Resume"
     run(show, 2)
-    assert show._panel.play.paused.label == "Go on"
-    show.toggle_pause()
-    show.order(speed=3.0)
-    show.reset()
-    run(show, 2)
+    assert show.chosen.past == []
+    show.set_paused(False)
+    show.change(show.chosen, {"speed": 3.0})
+    show.restart()
     for actor in actors:
         assert [word for word, *_ in actor.heard if word != "command"] == ["pause", "pause", "reset"]
-    assert actors[0].heard[-2] == ("command", Command(1.2, 0.0)), "the first orders come back"
+    assert actors[0].heard[-2] == ("command", Command(1.2, 0.0)), "the first inputs come back"
 
 
-@pytest.mark.slow
-def test_frames_stand_the_puppet_where_they_say(show, actors):
-    for _ in range(40):  # it walks; how far in so many frames depends on how busy the machine is
-        run(show, 30)
-        if np.hypot(*show._cast.members[0].place) > 0.1:
-            break
-    frame = show._cast.members[0].place
-    assert np.hypot(*frame) > 0.1
-    world = show._view._director._world
-    assert np.dot(world.position[[0, 2]], frame) < 0, "the world goes past the camera"
-    show._view.set_camera(CameraMode.FREE)
+def test_frames_are_shown_where_they_say_and_the_world_moves_past_the_camera(show):
+    chunk = delivered(60)
+    show.chosen.character.poll = lambda: [chunk]
+    run(show, 3)
+    position = show.chosen.position
+    assert position.tolist() in chunk.root[:, ::2].tolist()
+    assert np.dot(show.view._world.position[[0, 2]], position) < 0
+    assert "frames late" in show.chosen.describe_status()
+    show.set_camera(CameraMode.FREE)
+    before = np.array(show.view._world.position)
+    run(show, 5)
+    np.testing.assert_array_equal(show.view._world.position, before)
+    assert show.chosen.trajectories._past.visible
+    show.show_marks(False)
+    assert not show.chosen.trajectories._node.visible
+
+
+def test_keys_and_sticks_reach_the_character(show, actors):
+    show.driving.hear(0, PageState(keys={"KeyX", "KeyN"}))
+    show.driving.hear(0, PageState(pad=Gamepad(axes=(0, -1, 0, 0), buttons=(0,) * 17)))
+    show.driving.step(0.0)
+    assert actors[1].heard[-1][1].speed == 1.2
+    show.driving.hear(0, None)
+    show.driving.step(0.1)
+    assert actors[1].heard[-1][1].speed == 0.0
+    for action in KeyAction:
+        show._act(action)
+    show.change(show.chosen, {"heading": 100.0})
+    show._act(KeyAction.TURN_AROUND)
+    assert show.chosen.inputs.heading == -80.0
+
+
+def test_a_drawn_path_is_walked_and_a_missing_one_is_named(show, actors, capsys):
     run(show, 1)
-    before = np.array(world.position)
-    run(show, 30)
-    np.testing.assert_array_equal(world.position, before)
-
-
-def test_a_drawn_path_is_given_to_walk_and_none_is_said(show, actors):
+    show._run_safely(show.walk_path)
+    assert "Not done: a curve needs two points" in capsys.readouterr().err
+    show.set_camera(CameraMode.FREE)
+    show.panel.draw.value = True
+    rays = [(show.view.chase.to_view(np.array([x, 2.0, z])), DOWN) for x, z in ((0.0, 0.0), (1.0, 1.0), (1.0, 3.0))]
+    for one in rays:
+        show.click(*one)
+    show._run_safely(lambda: show.click(None, DOWN))
+    show.close_path(True)
     show.walk_path()
-    run(show, 1)
-    assert actors[0].heard == []
-    for place in ((0.0, 0.0), (1.0, 1.0), (1.0, 3.0)):
-        show.path.place(*place)
-    show.walk_path()
-    show.path.clear()
-    run(show, 1)
-    assert actors[0].heard == [("walk", [(0.0, 0.0), (1.0, 1.0), (1.0, 3.0)], 1.2)]
-    assert show.path.path.points == []
+    _, points, speed, closed = actors[0].heard[-1]
+    np.testing.assert_allclose(points, [(0, 0), (1, 1), (1, 3)], atol=1e-9)
+    assert (speed, closed) == (1.2, True)
+    assert show._find_ground(rays[1]) == pytest.approx((1.0, 1.0))
+
+
+def test_a_click_sends_the_chosen_character_there(show, actors):
+    panel = show.panel
+    panel.go.value, panel.within.value = True, 1.5
+    show.click((1.0, 5.0, 2.0), DOWN)
+    _, command, position, within, facing = actors[0].heard[-1]
+    assert (position, within, facing) == (pytest.approx((1.0, 2.0)), 1.5, None)
+    assert command.speed > 0
+    panel.turns.value, panel.turn.value, panel.then.value = True, 90.0, "stand"
+    show.click((1.0, 5.0, 2.0), DOWN)
+    _, command, _, _, facing = actors[0].heard[-1]
+    assert (command.speed, facing, panel.speed.value) == (0.0, pytest.approx(math.pi / 2), 0.0)
+    panel.within.value = math.nan
+    show.click((9.0, 5.0, 9.0), DOWN)
+    assert actors[0].heard[-1][2] == pytest.approx((1.0, 2.0)), "no slider gives that"
 
 
 def test_a_target_appears_is_dragged_and_belongs_to_its_character(show, actors):
-    show.targets.aim(hand="left")
-    run(show, 1)
+    targets, point = show.targets, (1.0, 1.1, 2.0)
+    targets.reach("left")
     word, first = actors[0].heard[-1]
-    assert word == "aim"
-    assert set(first.reach) == {"leftHand"}
-    assert show.targets._target._handle.visible
-    show.targets.aim(target=(1.0, 1.1, 2.0))
-    show.targets.aim(looks=True)
-    run(show, 1)
-    assert actors[0].heard[-1][1].reach == {"leftHand": (1.0, 1.1, 2.0)}
-    assert actors[0].heard[-1][1].look_at == (1.0, 1.1, 2.0)
-    assert actors[1].heard == []
+    assert (word, set(first.reach)) == ("aim", {"leftHand"})
+    assert targets.target.visible
+    targets.move_target(point)
+    targets.look(True)
+    assert (actors[0].heard[-1][1].reach, actors[0].heard[-1][1].look_at) == ({"leftHand": point}, point)
     show.choose(1)
-    run(show, 1)
-    assert not show.targets._target._handle.visible
+    assert not targets.target.visible
+    assert actors[1].heard == []
     show.choose(0)
-    show.order(speed=2.0)
-    run(show, 1)
-    assert actors[0].heard[-1] == (
-        "command",
-        Command(2.0, 0.0, reach={"leftHand": (1.0, 1.1, 2.0)}, look_at=(1.0, 1.1, 2.0)),
-    )
+    show.change(show.chosen, {"speed": 2.0})
+    assert actors[0].heard[-1] == ("command", Command(2.0, 0.0, reach={"leftHand": point}, look_at=point))
+    targets.bring()
+    assert show.chosen.inputs.look_at != point
+    targets.reach(None)
+    targets.look(False)
+    assert actors[0].heard[-1][1] == Command(2.0, 0.0)
 
 
-def test_a_disc_is_for_everybody_and_is_dragged_and_taken_away(show, actors):
-    show.targets.put_disc(0.5)
-    run(show, 1)
+def test_a_disc_is_for_all_characters(show, actors):
+    targets = show.targets
+    targets.put_disc(0.5)
     assert [actor.heard[-1][1].obstacles[0].radius for actor in actors] == [0.5, 0.5]
-    assert show.targets._disc._handle.visible
-    show.targets._move_disc((1.0, 0.0, 4.0))
-    show.targets.put_disc(0.8)
-    run(show, 1)
+    targets.move_disc((1.0, 0.0, 4.0))
+    targets.put_disc(0.8)
+    for wrong in (math.inf, -1.0, True):
+        targets.put_disc(wrong)
     assert actors[1].heard[-1][1].obstacles == (Obstacle((1.0, 4.0), 0.8),)
-    show.targets.put_disc(None)
-    run(show, 1)
+    targets.put_disc(None)
     assert actors[0].heard[-1][1].obstacles == ()
-    assert not show.targets._disc._handle.visible
+    assert not targets.disc.visible
 
 
-def test_what_no_page_of_ours_sends_changes_no_target(show, actors):
-    show.targets.aim(hand="left", target=(0.0, 1.0, 2.0))
-    show.targets.put_disc(0.5)
+@pytest.mark.parametrize("where", ["poll", "command", "reset", "pause"])
+def test_an_error_in_one_character_ends_no_other_and_no_recording(show, actors, capsys, monkeypatch, where):
+    def broken(*given):
+        raise ZeroDivisionError("oh\nno")
+
+    for character in show.characters:
+        character.recorded = []
+    run(show, 3)
+    monkeypatch.setattr(actors[0], where, broken)
+    show.enqueue(lambda: [show.change(one, {"speed": 2.0}) for one in show.characters])
+    show.enqueue(lambda: show.change(show.characters[1], {"speed": 2.0}))
+    show.enqueue(lambda: show.set_paused(True))
+    show.enqueue(lambda: show.set_paused(False))
+    show.enqueue(show.restart)
+    run(show, 10)
+    assert capsys.readouterr().err == "mapctl: Something went wrong: ZeroDivisionError: oh no\n"
+    assert {word for word, *_ in actors[1].heard} == {"command", "pause", "reset"}
+    assert len(show.characters[1].recorded) == 13
+
+
+def test_a_character_that_has_ended_is_named_keeps_its_recording_and_comes_back(show, actors, capsys, monkeypatch):
+    def gone():
+        raise MapctlError("it crashed")
+
+    show.chosen.recorded = []
+    run(show, 3)
+    with monkeypatch.context() as patched:
+        patched.setattr(actors[0], "poll", gone)
+        run(show, 3)
+    assert "it crashed" in show.chosen.describe_status()
+    assert capsys.readouterr().err == "mapctl: Character 1: it has ended: it crashed. Reset restarts it\n"
+    assert (len(show.chosen.recorded), actors[1].frames) == (3, 18)
+    show.restart()
+    run(show, 3)
+    assert len(show.chosen.recorded) == 6
+    assert "frames late" in show.chosen.describe_status()
+
+
+def test_a_machine_that_is_too_slow_is_said_so(show, actors, monkeypatch):
+    monkeypatch.setattr(actors[0], "poll", lambda: [delivered(0, spare=-0.2)])
+    run(show, 12)
+    assert "too slow: 100 % of frames come late" in show.chosen.describe_status()
+    assert "too slow" not in show.characters[1].describe_status()
+
+
+def test_looking_back_shows_what_was_while_the_characters_wait(show, actors):
+    run(show, 30)
+    character = show.chosen
+    frames = len(character.past)
+    assert frames > 20
+    show.look_back(0.5)
+    run(show, 2)
+    assert [words(actor, "pause") for actor in actors] == [[("pause", True)]] * 2
+    past = character.past[frames - 1 - 15]
+    np.testing.assert_array_equal(character.position, past.chunk.root[past.frame, ::2])
+    assert "Past, 0.5 s ago" in show.timeline.describe()
+    show.look_back(1e9)
+    run(show, 16)
+    assert show.timeline.seconds_back == pytest.approx(frames / 30)
+    assert show.panel.back.value == pytest.approx(-frames / 30, abs=0.06)
+    show.timeline.return_to_present()
+    assert words(actors[0], "pause")[-1] == ("pause", False)
+    newest = character.past[-1]
+    np.testing.assert_array_equal(character.position, newest.chunk.root[newest.frame, ::2])
+
+
+def test_paused_characters_stay_so_and_resume_or_reset_show_the_present(show, actors):
+    run(show, 10)
+    show.set_paused(True)
+    show.look_back(0.1)
+    show.timeline.return_to_present()
+    assert words(actors[0], "pause") == [("pause", True)]
+    show.look_back(0.1)
+    show.set_paused(False)
+    assert (words(actors[0], "pause")[-1], show.timeline.seconds_back) == (("pause", False), None)
+    show.look_back(0.1)
+    show.restart()
+    assert actors[0].heard[-1] == ("reset",)
+    assert (words(actors[0], "pause")[-1], show.timeline.seconds_back) == (("pause", False), None)
+
+
+def test_a_replay_ends_in_the_present(show, actors):
+    run(show, 10)
+    show.timeline.replay(100.0, paused=False)
+    show.timeline.step(100.1)
+    assert "Replay" in show.timeline.describe()
+    assert show.timeline.seconds_back == pytest.approx(len(show.chosen.past) / 30 - 0.1)
+    show.timeline.step(200.0)
+    assert (show.timeline.seconds_back, show.is_paused) == (None, False)
+
+
+def test_the_past_is_bounded(show, monkeypatch):
+    monkeypatch.setattr("scenes.live.character.KEPT_SECONDS", 0.5)
+    run(show, 20)
+    assert len(show.chosen.past) == 15
+
+
+def test_a_pause_makes_nothing_late(show):
     run(show, 1)
-    heard = actors[0].heard[-1]
-    for wrong in ({"hand": "third"}, {"target": (math.nan, 0.0, 0.0)}, {"target": "x"}, {"looks": 3}):
-        show.targets.aim(**wrong)
-    for radius in (math.inf, -1.0, True):
-        show.targets.put_disc(radius)
-    run(show, 1)
-    assert actors[0].heard[-1] == heard
+    character = show.chosen
+    character._waiting.clear()
+    character.character.poll = lambda: [delivered()]
+    chunk = character.receive(0.0)[0]
+    character.pause(False, 2.0)
+    assert character._waiting[0].due == pytest.approx(chunk.due + 2.0)
 
 
-def test_rays_meet_the_ground():
-    assert ground.intersect_ground(np.array([0.0, 2, 0]), np.array([0.0, -1, 1])) == (0.0, 2.0)
-    assert ground.intersect_ground(np.array([0.0, 2, 0]), np.array([0.0, 0, 1])) is None
-    assert ground.intersect_ground(np.array([0.0, 2, 0]), np.array([0.0, 1, 1])) is None
-    assert ground.intersect_ground(np.array([0.0, 2, 0]), np.array([0.0, -0.01, 1])) is None, "200 m away"
-
-
-@pytest.mark.parametrize("ending", ["bvh", "glb"])
-def test_a_recording_is_the_motion_that_was_shown(ending, tmp_path):
-    recording = Recording(CANONICAL)
+@pytest.mark.parametrize("ending", FORMATS)
+def test_a_recording_is_the_motion_that_was_shown(show, tmp_path, monkeypatch, ending):
+    monkeypatch.chdir(tmp_path)
+    show.panel.ending.value = ending
     with pytest.raises(RequestError, match="nothing was recorded"):
-        recording.motion()
-    for first in range(0, 30, 3):
-        recording.add(delivered(first))
-    motion, whole = recording.motion(), walk(90).slice(0, 30)
-    np.testing.assert_allclose(motion.joint_positions(), whole.joint_positions(), atol=1e-9)
-    path = tmp_path / f"x.{ending}"
-    path.write_bytes(encode_motion(motion, ending))
-    if ending == "bvh":
-        read = formats.load(path)
-        order = [read.skeleton.index(name) for name in CANONICAL.names]  # a BVH lists joints depth first
-        np.testing.assert_allclose(read.joint_positions()[:, order], whole.joint_positions(), atol=1e-5)
-    else:
-        assert len(trimesh.load(path).geometry) == 1
+        show.save_again(None)
+    show.toggle_recording(None)
+    show._run_housekeeping(0.0)
+    assert show.panel.record.label == "Stop and save"
+    run(show, 5)
+    show._run_housekeeping(0.0)
+    assert show.panel.recorded.content == "● **0:00.5, 15 frames**"
+    show.toggle_recording(None)
+    show.recorder.wait()
+    recorded = formats.load(tmp_path / f"mapctl.{ending}")
+    whole = walk(90).slice(0, 15)
+    order = [recorded.skeleton.index(name) for name in whole.skeleton.names]
+    np.testing.assert_allclose(recorded.joint_positions()[:, order], whole.joint_positions(), atol=1e-4)
+    show.save_again(None)
+    show.recorder.wait()
+    assert (tmp_path / f"mapctl-2.{ending}").read_bytes() == (tmp_path / f"mapctl.{ending}").read_bytes()
 
 
-def test_a_recording_tells_its_licence_and_so_does_the_file_that_grows(tmp_path):
-    recording = Recording(CANONICAL, folder=tmp_path, on_rig=lambda motion: walk(3), licence="CC0 1.0 (mine)")
-    recording.add(delivered(0))
-    assert formats.load(tmp_path / "mapctl.recording").licence == "CC0 1.0 (mine)"
-    assert recording.motion().licence == "CC0 1.0 (mine)"
-    (tmp_path / "x.glb").write_bytes(encode_motion(recording.motion(), "glb"))
+def test_a_recording_that_goes_on_when_all_ends_is_saved(show, tmp_path):
+    assert show.save_recordings(tmp_path) == []
+    show.toggle_recording(None)
+    run(show, 5)
+    [path] = show.save_recordings(tmp_path)
+    assert (path.name, formats.load(path).num_frames) == ("mapctl.bvh", 15)
+    assert show.save_recordings(tmp_path) == []
+    assert write_new(path, b"x").name == "mapctl-2.bvh"
+
+
+def test_a_recording_keeps_its_licence_on_any_rig(actors, tmp_path):
+    look = CharacterLook(on_rig=lambda motion: walk(3), licence="CC0 1.0 (mine)")
+    with live_app(actors, [look, CharacterLook()]) as show:
+        motion = join_chunks(show.chosen, [delivered()])
+    (tmp_path / "x.glb").write_bytes(encode_motion(motion, "glb"))
     assert formats.load(tmp_path / "x.glb").licence == "CC0 1.0 (mine)"
 
 
-@pytest.mark.slow
-def test_a_recording_can_be_a_film():
-    assert encode_motion(walk(3), "mp4")[4:8] == b"ftyp"
-
-
-@pytest.mark.slow
-def test_a_recording_begins_and_ends_with_the_button(show, actors):
-    show.toggle_recording(None)
-    run(show, 5)
-    assert show._panel.recording.record.label == "Stop and save"
-    recording = show._cast.members[0].recording
-    assert recording.frames == 15
-    show.toggle_recording(None)
-    run(show, 2)
-    assert show._panel.recording.record.label == "Record"
-    assert recording.frames == 15
-    assert show._cast.members[1].recording is None
-
-
-def test_gauges_count_late_frames_and_know_the_speed(show):
-    gauges = Readouts(show.server.gui)
-    gauges.add_plots()
-    for first in range(0, 30, 3):
-        gauges.add(delivered(first, spare=-0.04 if first == 27 else 0.01), 30)
-    gauges.show()
-    assert (gauges.frames, gauges.late) == (30, 2)
-    way = walk(90).root_position[:30, ::2]
-    assert gauges.speed == pytest.approx(float((way[29] - way[14]).norm()) * 2, rel=1e-6)
-    assert "2 of 30 frames late" in gauges._text.content
-    assert [len(plot.data) for plot in gauges._plots] == [3, 3]
-
-
-def test_a_click_sends_the_chosen_one_there(show, actors):
-    show._draw_at((1.0, 5.0, 2.0), (0.0, -1.0, 0.0))
-    run(show, 1)
-    assert not [heard for heard in actors[0].heard if heard[0] == "go"]  # clicks are for nothing yet
-    show._going.on.value, show._going.within.value = True, 1.5
-    show._draw_at((1.0, 5.0, 2.0), (0.0, -1.0, 0.0))
-    run(show, 1)
-    _, command, place, within, facing = actors[0].heard[-1]
-    assert (place, within, facing) == (pytest.approx((1.0, 2.0)), 1.5, None)
-    assert command.speed > 0
-    show._going.faces.value, show._going.facing.value, show._going.then.value = True, 90.0, "stand"
-    show._draw_at((1.0, 5.0, 2.0), (0.0, -1.0, 0.0))
-    run(show, 1)
-    _, command, _, _, facing = actors[0].heard[-1]
-    assert (command.speed, facing) == (0.0, pytest.approx(math.pi / 2))
-    assert show._panel.steering.speed.value == 0.0
-
-
-@pytest.mark.parametrize("wrong", [0.0, math.nan, 1e300])
-def test_times_that_no_slider_gives_send_nobody(show, actors, wrong):
-    show._going.on.value, show._going.within.value = True, wrong
-    show._draw_at((1.0, 5.0, 2.0), (0.0, -1.0, 0.0))
-    run(show, 1)
-    assert not [heard for heard in actors[0].heard if heard[0] == "go"]
+def test_rays_meet_the_ground():
+    assert intersect_ground(np.array([[0.0, 2, 0], [0.0, -1, 1]])) == (0.0, 2.0)
+    for direction in ([0.0, 0, 1], [0.0, 1, 1], [0.0, -0.01, 1]):
+        assert intersect_ground(np.array([[0.0, 2, 0], direction])) is None

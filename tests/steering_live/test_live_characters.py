@@ -4,6 +4,7 @@ import time
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,18 +14,16 @@ from character_maker import make_character_glb
 from glb_viewer import GlbViewer
 from helpers import walk
 from rig_maker import Make, make, names_of
-from stage import Actor, delivered, run
+from stage import Actor, delivered, live_app, run
 
 from mapctl import formats, rotations
 from mapctl.commands.live import Live
 from mapctl.commands.live import run as live
 from mapctl.motion import Motion
 from scenes.drawn_character import DrawnCharacter
-from scenes.live.app import LiveApp
-from scenes.live.bodies.colour_groups import part_by_colour
-from scenes.live.bodies.skinned import LiveCharacterBody, find_carriers
-from scenes.live.inputs import SteeringInputs
-from scenes.live.recording import Recording, encode_motion
+from scenes.live.bodies import SkinnedBody, find_carriers, group_by_colour
+from scenes.live.character import CharacterLook, ShownCharacter
+from scenes.live.recording import encode_motion, join_chunks
 
 
 @dataclass
@@ -87,7 +86,7 @@ def on_its_bones(hero, frames: int = 30):
 
 def test_the_browser_draws_the_mesh_where_films_do(hero):
     scene = Scene()
-    body = LiveCharacterBody(scene, "/hero", hero)
+    body = SkinnedBody(scene, "/hero", hero)
     motion = on_its_bones(hero)
     poses = body.prepare(motion)
     assert len(poses) == 30
@@ -113,7 +112,7 @@ def test_fingers_go_with_their_hand_and_need_no_bone(hero):
 
 
 def test_colours_are_few_and_near_the_meshs(hero):
-    groups = part_by_colour(hero.mesh, 12)
+    groups = group_by_colour(hero.mesh, 12)
     assert len(groups) <= 12
     assert sum(len(group.faces) for group in groups) == len(hero.mesh.faces)
     apart = [np.abs(hero.mesh.rgba[group.faces].mean(axis=1) - group.rgba).max() for group in groups]
@@ -123,17 +122,21 @@ def test_colours_are_few_and_near_the_meshs(hero):
         assert np.abs(shown - np.array(wanted) / 255).max(axis=1).min() < 0.08, "stripes of the shirt"
     opacities = {round(float(group.rgba[3]), 3) for group in groups}
     assert opacities == ({0.5, 1.0} if (hero.mesh.rgba[:, 3] < 1).any() else {1.0})
-    assert len(part_by_colour(replace(hero.mesh, rgba=np.ones_like(hero.mesh.rgba)), 12)) == 1
+    assert len(group_by_colour(replace(hero.mesh, rgba=np.ones_like(hero.mesh.rgba)), 12)) == 1
+
+
+def recorded(look: CharacterLook, skeleton, frames: int) -> Motion:
+    """What is recorded of so many frames that were delivered on these bones."""
+    character = ShownCharacter.__new__(ShownCharacter)
+    character.character, character.look = SimpleNamespace(skeleton=skeleton), look
+    return join_chunks(character, [delivered(first) for first in range(0, frames, 3)])
 
 
 @pytest.mark.parametrize("ending", ["glb", "bvh"])
 def test_a_recording_is_of_the_character(hero, ending, tmp_path):
-    recording = Recording(hero.body.leveled, hero)
-    for first in range(0, 12, 3):
-        recording.add(delivered(first))
-    motion, path = recording.motion(), tmp_path / f"recorded.{ending}"
+    motion, path = recorded(CharacterLook(hero), hero.body.leveled, 12), tmp_path / f"recorded.{ending}"
     assert motion.skeleton.names == hero.standing.skeleton.names
-    path.write_bytes(encode_motion(motion, ending, hero))
+    path.write_bytes(encode_motion(motion, ending))
     if ending == "glb":
         own = on_its_bones(hero, 90).slice(0, 12)
         placed = hero.put_on(own).placed.motion
@@ -143,42 +146,16 @@ def test_a_recording_is_of_the_character(hero, ending, tmp_path):
         np.testing.assert_allclose(vertices[: len(skinned)], skinned, atol=1e-4)
 
 
-def test_a_recording_as_a_film_shows_it(hero, monkeypatch):
-    asked = []
-    monkeypatch.setattr("scenes.live.recording._render_film", lambda *words: asked.append(words))
-    monkeypatch.setattr("scenes.live.recording.spawn", lambda work, *words: _Done(work, *words))
-    with pytest.raises(Exception, match="could not be drawn"):
-        encode_motion(hero.standing, "mp4", hero)
-    assert asked[0][2] == hero.path
-
-
-class _Done:
-    def __init__(self, work, *words):
-        work(*words)
-
-    def is_alive(self) -> bool:
-        return False
-
-    def join(self):
-        pass
-
-
 @pytest.mark.slow
 def test_the_viewer_shows_a_mannequin_beside_it(hero, capsys):
     actors = [Actor(), Actor()]
     actors[1].skeleton = hero.body.leveled
-    labels = {"gait": ["walk"], "style": ["old"]}
-    show = LiveApp(
-        actors, [SteeringInputs() for _ in actors], port=8090, fastest=3.8, labels=labels, drawn=[None, hero]
-    )
-    try:
+    with live_app(actors, [CharacterLook(), CharacterLook(hero)]) as show:
         run(show, 12)
         mesh = show.server.scene.get_handle_by_name("/world/character2/skin0")
         assert show.server.scene.get_handle_by_name("/world/character1/skin0") is None
         assert any(np.abs(bone.position).max() > 0.1 for bone in mesh.bones)
         assert capsys.readouterr() == ("", "")
-    finally:
-        show.close()
 
 
 def test_each_character_has_its_file_and_the_last_one_is_for_all_others(tmp_path):
@@ -227,9 +204,10 @@ def test_with_a_rig_a_mannequin_moves_on_its_bones_and_recordings_are_on_it(tmp_
     rigs = live._choose_recorded_rigs(command, drawn, bodies)
     assert drawn == [None, None]
     assert bodies[0].scale == pytest.approx(0.8, abs=0.07)
-    recording = Recording(bodies[0].skeleton, on_rig=rigs[0])
-    recording.add(delivered(0, 6))
-    assert recording.motion().skeleton.names == formats.load(file).skeleton.names
+    assert (
+        recorded(CharacterLook(on_rig=rigs[0]), bodies[0].skeleton, 6).skeleton.names
+        == formats.load(file).skeleton.names
+    )
     plain = live._choose_recorded_rigs(Live(), [None], [bodies[0]])
     assert plain == [None], "canonical joints stay"
 
@@ -242,8 +220,7 @@ def test_a_character_is_recorded_on_the_rig_if_there_is_one(tmp_path):
     drawn = live._read_drawn(command)
     bodies = live._read_bodies(command, drawn)
     assert bodies[0].skeleton.matches(drawn[0].body.leveled), "it moves on its own bones"
-    recording = Recording(bodies[0].skeleton, drawn[0], on_rig=live._choose_recorded_rigs(command, drawn, bodies)[0])
-    recording.add(delivered(0, 6))
-    motion = recording.motion()
+    (on_rig,) = live._choose_recorded_rigs(command, drawn, bodies)
+    motion = recorded(CharacterLook(drawn[0], on_rig), bodies[0].skeleton, 6)
     assert motion.skeleton.names == formats.load(rig).skeleton.names
     assert float(motion.joint_positions()[0, 0, 1]) < float(delivered(0).root[0, 1]), "of its size"

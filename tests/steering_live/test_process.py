@@ -271,24 +271,3 @@ def test_a_worker_says_what_ends_it(load, breaking, said):
     word, text = sent_by(*Pipe(), breaking(load))[-1]
     assert word == "failed"
     assert re.search(said, text)
-
-
-@pytest.mark.slow
-def test_slow_motion_passes_slowly_and_is_not_late(remote):
-    remote.reset()
-    remote.set_rate(0.25)
-    remote.tune({"noise": 1.0})
-    collected(remote, 1.0)
-    pieces = collected(remote, 2.0)
-    frames = sum(len(piece.root) for piece in pieces)
-    assert 9 <= frames <= 21, "two seconds at a quarter of 30 frames a second"
-    assert {piece.rate for piece in pieces} == {0.25}
-    assert pieces[-1].due - pieces[-2].due == pytest.approx(0.4, abs=0.01)
-    assert sum(piece.late_frames for piece in pieces) == 0
-    for wrong in (0.0, -1.0, 2.0, np.nan):
-        with pytest.raises(RequestError, match="can be"):
-            remote.set_rate(wrong)
-    with pytest.raises(RequestError, match="sigma of noise"):
-        remote.tune({"noise": 1000.0})
-    remote.set_rate(1.0)
-    remote.tune({})

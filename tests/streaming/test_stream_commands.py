@@ -169,7 +169,7 @@ def test_characters_obey_what_comes_over_osc_and_their_poses_go_out(prior, tmp_p
             play.asked, play.target = len(second.frames), second.joints()[-1, shoulder] + [0.3, 0.2, 0.1]
             client.send_message("/mapctl/2/hand/left", play.target.tolist())
             wait(show, 2.0)
-            play.held = [member.orders for member in show._cast.members]
+            play.held = [character.inputs for character in show.characters]
             raise KeyboardInterrupt
 
         loop = LiveApp.run

@@ -1,7 +1,7 @@
 """`mapctl live`: characters in the browser, steered live."""
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated
 
 from tyro.conf import UseAppendAction, arg
 
@@ -27,8 +27,6 @@ class Live(ModelCommand, options.ReadOptions):
     """A bundled prior, or the file or run folder of a trained one."""
     seed: options.Count = 0
     """Seed of the first poses."""
-    theme: Literal["light", "dark", "auto"] = "auto"
-    """Colours of the page; auto are those that the browser prefers."""
     stream: options.MaybeEndpoint = None
     """Where poses go over the VMC protocol (most programs receive at port 39539): a port alone is on this machine. The
     second character's poses go to the next port, and so on."""

@@ -22,7 +22,7 @@ from mapctl.terms import FootContact
 from priors import checkpoints
 from scenes.drawn_character import DrawnCharacter
 from scenes.live.app import LiveApp
-from scenes.live.inputs import SteeringInputs
+from scenes.live.character import CharacterLook
 
 if TYPE_CHECKING:
     from mapctl.streaming.receiver import OscReceiver
@@ -57,7 +57,7 @@ def _serve(command: Live, receiver: "OscReceiver | None") -> int:
     except KeyboardInterrupt:
         print()
         for path in show.save_recordings(Path.cwd()):
-            print(f"the recording that was going on is in {path.name}")
+            print(f"the recording is in {path.name}")
     finally:
         show.close()
         if stream is not None:
@@ -69,8 +69,9 @@ def _serve(command: Live, receiver: "OscReceiver | None") -> int:
 def _open_app(command: Live, receiver: "OscReceiver | None") -> "tuple[LiveApp, PoseStream | None]":
     prior, drawn = priors.load(command.prior), _read_drawn(command)
     checkpoints.note_use(_STITCHER)  # the characters' processes load it
-    bodies = _read_bodies(command, drawn)
-    orders = [SteeringInputs() for _ in range(command.characters)]
+    bodies, licence = _read_bodies(command, drawn), licensing.format_used_licences()
+    rigs = _choose_recorded_rigs(command, drawn, bodies)
+    looks = [CharacterLook(*one, licence) for one in zip(drawn, rigs, strict=True)]
     with reraise_ctrl_c():
         characters = _start_characters(command, bodies)
     try:
@@ -78,18 +79,12 @@ def _open_app(command: Live, receiver: "OscReceiver | None") -> "tuple[LiveApp, 
         stream = streaming.open_stream(_stream(command), skeletons)
         show = LiveApp(
             characters,
-            orders,
+            looks,
             port=command.port,
             fastest=prior.limits.max_steering_speed,
             labels=prior.labels,
             stream=stream,
             source=receiver,
-            drawn=drawn,
-            rigs=_choose_recorded_rigs(command, drawn, bodies),
-            theme=command.theme,
-            rests=True,
-            recordings=Path.cwd(),
-            licence=licensing.format_used_licences(),
         )
         return show, stream
     except BaseException:

@@ -1,0 +1,177 @@
+"""The web page: a viser server for pages of its own origin only, with a script that sends held keys and gamepads.
+
+A browser lets every page that it shows connect to a WebSocket on this machine, and states the page's origin in
+`Origin`; `Host` exposes a foreign name that was made to resolve to this machine (DNS rebinding). viser checks neither.
+"""
+
+import gzip
+import http
+import io
+import itertools
+import json
+import logging
+import math
+import queue
+from collections.abc import Awaitable, Callable, Sequence
+from contextlib import redirect_stdout
+from importlib.resources import files
+from typing import Annotated, Any
+
+import pydantic
+import viser
+from websockets.asyncio import server as websockets_server
+from websockets.datastructures import Headers
+from websockets.exceptions import ConnectionClosed
+from websockets.http11 import Request, Response
+
+HOST = "127.0.0.1"
+"""The only address that the server binds to."""
+_NAMES = (HOST, "localhost")
+_PATH = "/mapctl/page"  # of the script's socket
+_MAX_MESSAGE = 2000  # characters
+_NOT_FRAMED = {"Content-Security-Policy": "frame-ancestors 'none'", "X-Frame-Options": "DENY"}
+_REFUSAL = b"Only the page of mapctl live itself may do that.\n"
+
+_Share = Annotated[float, pydantic.Field(ge=-1.5, le=1.5, allow_inf_nan=False)]
+
+
+class Gamepad(pydantic.BaseModel, frozen=True, extra="forbid"):
+    """Sticks and buttons in the order of the browser's standard mapping."""
+
+    axes: tuple[_Share, _Share, _Share, _Share]
+    """Sticks, -1 to 1: left one right and down, right one right and down."""
+    buttons: Annotated[tuple[_Share, ...], pydantic.Field(min_length=17, max_length=17)]
+    """How far each button is pressed, 0 to 1."""
+
+
+class PageState(pydantic.BaseModel, frozen=True, extra="forbid"):
+    """What is held on a page; its script sends all of it whenever it changes."""
+
+    keys: Annotated[frozenset[str], pydantic.Field(max_length=16)] = frozenset()
+    """Held keys, as KeyboardEvent.code names them."""
+    pad: Gamepad | None = None
+    """Gamepad, if there is one."""
+    viewer: Annotated[int, pydantic.Field(ge=0)] | None = None
+    """Number of viser's client in this page."""
+
+
+class PageChannel:
+    """Socket of the page's script: takes the states of pages on the server's thread for the loop's."""
+
+    def __init__(self, keys: Sequence[str], help_rows: Sequence[tuple[str, str]]):
+        """Send `keys` (KeyboardEvent.code); list `help_rows` on the page: keys and what they do."""
+        self._attributes = {"data-keys": " ".join(keys), "data-help": json.dumps(help_rows)}
+        self._arrived: queue.SimpleQueue[tuple[int, PageState | None]] = queue.SimpleQueue()
+        self._numbers = itertools.count()
+
+    def poll(self) -> list[tuple[int, PageState | None]]:
+        """Return the states since the last call by number of the page; None for a page that is gone."""
+        found = []
+        while not self._arrived.empty():
+            found.append(self._arrived.get())
+        return found
+
+    async def serve(self, connection: Any) -> None:
+        """Take the states of one page until it goes; messages that are none are ignored."""
+        number = next(self._numbers)
+        try:
+            async for text in connection:
+                if (state := parse_state(text)) is not None:
+                    self._arrived.put((number, state))
+        except ConnectionClosed:
+            pass
+        finally:
+            self._arrived.put((number, None))
+
+    def insert_script(self, body: bytes, encoding: str | None) -> bytes:
+        """Insert the script into viser's page, before viser's own."""
+        page = gzip.decompress(body) if encoding == "gzip" else body
+        script = files("scenes.live").joinpath("page.js").read_text("utf-8")
+        attributes = " ".join(f"{name}='{_escape(value)}'" for name, value in self._attributes.items())
+        page = page.replace(b"<head>", f"<head><script {attributes}>{script}</script>".encode(), 1)
+        return gzip.compress(page, 6) if encoding == "gzip" else page
+
+
+def parse_state(text: object) -> PageState | None:
+    """Parse a message of the script; None where it is not one."""
+    if not isinstance(text, str) or len(text) > _MAX_MESSAGE:
+        return None
+    try:
+        return PageState.model_validate_json(text)
+    except pydantic.ValidationError:
+        return None
+
+
+def open_server(port: int, channel: PageChannel) -> viser.ViserServer:
+    """Start viser's server on HOST, at `port` or the next free one; it refuses all but its own pages (status 403).
+
+    viser passes websockets neither `origins` nor a `process_request` of ours, so `serve` is replaced while it starts.
+    """
+    logging.getLogger("websockets.server").setLevel(logging.CRITICAL)  # tracebacks of browsers that went away
+    serve = websockets_server.serve
+
+    def guarded(handler: Any, host: str, port: int, *, process_request: Any, **options: Any) -> Any:
+        answer = _guard_requests(process_request, port, channel)
+        return serve(_share_connections(handler, channel), host, port, process_request=answer, **options)
+
+    websockets_server.serve = guarded
+    try:
+        with redirect_stdout(io.StringIO()):  # viser prints a banner
+            server = viser.ViserServer(host=HOST, port=port, label="mapctl live", verbose=False)
+    finally:
+        websockets_server.serve = serve
+    server.on_client_connect(_mark_page)
+    return server
+
+
+def is_own_page(headers: Headers, port: int) -> bool:
+    """Return whether a request is from a page of this server: `Host` is this server, and so is `Origin`, which may be
+    missing unless the request is for a WebSocket."""
+    hosts = [f"{name}:{port}" for name in _NAMES]
+    asked, origins = headers.get_all("Host"), headers.get_all("Origin")
+    if len(asked) != 1 or asked[0].lower() not in hosts:
+        return False
+    if not origins:
+        return not headers.get_all("Upgrade")
+    return len(origins) == 1 and origins[0].lower() in [f"http://{host}" for host in hosts]
+
+
+def _share_connections(
+    handler: Callable[[Any], Awaitable[None]], channel: PageChannel
+) -> Callable[[Any], Awaitable[None]]:
+    async def handled(connection: Any) -> None:
+        await (channel.serve if connection.request.path == _PATH else handler)(connection)
+
+    return handled
+
+
+def _guard_requests(answer: Callable[[Any, Request], Response | None], port: int, channel: PageChannel) -> Any:
+    written: dict[str | None, bytes] = {}  # viser's page with the script, by encoding
+
+    def answered(connection: Any, request: Request) -> Response | None:
+        if not is_own_page(request.headers, port):
+            about = Headers({"Content-Length": str(len(_REFUSAL)), "Content-Type": "text/plain"})
+            return Response(http.HTTPStatus.FORBIDDEN, "Forbidden", about, _REFUSAL)
+        response = answer(connection, request)
+        if response is None:
+            return None
+        response.headers.update(_NOT_FRAMED)
+        if response.status_code == http.HTTPStatus.OK and request.path.partition("?")[0] in ("/", "/index.html"):
+            encoding = response.headers.get("Content-Encoding")
+            if encoding not in written:
+                written[encoding] = channel.insert_script(bytes(response.body), encoding)
+            response.body = written[encoding]
+            del response.headers["Content-Length"]
+            response.headers["Content-Length"] = str(len(response.body))
+        return response
+
+    return answered
+
+
+async def _mark_page(client: viser.ClientHandle) -> None:
+    """Give the page's script the number of viser's client."""
+    client.gui.add_html(f'<i hidden data-mapctl-viewer="{client.client_id}"></i>', order=-math.inf)
+
+
+def _escape(text: str) -> str:
+    return text.replace("&", "&amp;").replace("'", "&#39;").replace("<", "&lt;")

@@ -1,1 +1,0 @@
-"""The panel of the live viewer: tabs in an order, and the controls in them."""

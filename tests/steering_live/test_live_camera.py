@@ -1,0 +1,144 @@
+"""The camera of the live viewer follows smoothly and frames all characters; arrows point along their trajectory."""
+
+import math
+
+import numpy as np
+import pytest
+import viser
+from hypothesis import given
+from hypothesis import strategies as st
+
+from scenes.cameras import View, look_at
+from scenes.live.camera import _FOV, CameraMode, ChaseCamera, facing_of, frame_characters, turn_about_up
+from scenes.live.ground import build_arrow, build_tail
+
+
+@pytest.mark.parametrize("size", [(400, 620), (940, 760), (1580, 1080)])
+@pytest.mark.parametrize(("count", "least"), [(1, 0.25), (4, 0.1)])
+def test_all_characters_are_in_view_from_behind_and_large_enough(size, count, least):
+    positions = np.stack([1.5 * (np.arange(count) - (count - 1) / 2), np.zeros(count)], axis=-1)
+    eye, target = frame_characters(positions, size[0] / size[1])
+    assert eye[2] < -2, "characters begin facing +Z"
+    assert eye[1] > 1
+    view = View(look_at(eye, target), _FOV, *size)
+    middles = []
+    for x, z in positions:
+        corners = np.array([[x + dx, y, z + dz] for dx in (-0.4, 0.4) for y in (0, 1.8) for dz in (-0.5, 0.5)])
+        flat = view.project(corners)[:, :2]
+        assert (flat > 0).all()
+        assert (flat < size).all()
+        assert np.ptp(flat[:, 1]) > least * min(size)
+        middles.append(flat[:, 0].mean())
+    assert np.abs(np.diff(sorted(middles))).min(initial=np.inf) > 20, "none hides behind another"
+
+
+def follow(chase: ChaseCamera, seconds: float, speed: float, heading: float, *, sway: float = 0.0) -> np.ndarray:
+    """Walk on from where the camera is; the errors of its position, (frames,) metres."""
+    position, missed = chase._last.copy(), []
+    for k in range(round(60 * seconds)):
+        position = position + speed / 60 * np.array([math.sin(heading), math.cos(heading)])
+        chase.step(1 / 60, position, heading + sway * math.sin(2 * math.pi * k / 60))
+        missed.append(float(np.linalg.norm(chase.position - position)))
+    return np.array(missed)
+
+
+@pytest.fixture
+def chase() -> ChaseCamera:
+    camera = ChaseCamera()
+    camera.jump(np.zeros(2), 0.0)
+    return camera
+
+
+def test_it_does_not_lag_at_an_even_pace_and_moves_softly(chase):
+    missed = follow(chase, 4, 2.0, 0.0)
+    assert missed.max() < 0.3
+    assert missed[-1] < 0.04
+
+
+def test_it_turns_behind_the_character_without_overshooting_or_rocking_with_the_stride(chase):
+    yaws = []
+    for _ in range(60):
+        follow(chase, 0.1, 1.2, math.pi / 2)
+        yaws.append(chase.yaw)
+    steps = np.diff(yaws)
+    assert -1e-6 < steps.min() <= steps.max() < math.radians(12), "at most 120 degrees a second, never back"
+    assert chase.yaw == pytest.approx(math.pi / 2, abs=0.02)
+    rocked = []
+    for _ in range(40):
+        follow(chase, 0.1, 1.2, math.pi / 2, sway=math.radians(12))
+        rocked.append(chase.yaw)
+    assert np.ptp(rocked[20:]) < math.radians(3)
+
+
+def test_a_character_that_walks_at_the_camera_does_not_swing_it_round(chase):
+    follow(chase, 1.0, 1.2, math.pi - 0.02)
+    assert abs(chase.yaw) < math.radians(10)
+
+
+def test_following_does_not_turn_and_staying_does_not_move(chase):
+    chase.mode = CameraMode.FOLLOW
+    follow(chase, 2, 1.2, 1.0)
+    assert chase.yaw == 0.0
+    assert np.linalg.norm(chase.position) > 1.5
+    chase.orbit(0.3)
+    assert chase.yaw == 0.3
+    chase.mode = CameraMode.FREE
+    at = chase.position.copy()
+    follow(chase, 1, 1.2, 1.0)
+    np.testing.assert_array_equal(chase.position, at)
+
+
+def test_a_jump_is_followed_at_once_and_another_character_is_glided_to(chase):
+    chase.step(1 / 60, np.array([5.0, 0.0]), 1.0)
+    np.testing.assert_allclose(chase.position, [5, 0], atol=0.1)
+    chase.switch(np.array([9.0, 0.0]))
+    chase.step(1 / 60, np.array([9.0, 0.0]), 1.0)
+    assert chase.position[0] < 5.5
+    for _ in range(240):
+        chase.step(1 / 60, np.array([9.0, 0.0]), 1.0)
+    np.testing.assert_allclose(chase.position, [9, 0], atol=0.01)
+
+
+@given(st.floats(-7, 7), st.tuples(st.floats(-50, 50), st.floats(-50, 50)))
+def test_views_and_world_are_inverse_and_a_chased_character_looks_away(yaw, position):
+    chase = ChaseCamera()
+    chase.jump(np.array(position), yaw)
+    points = np.array([[1.0, 2.0, 3.0], [-4.0, 0.0, 2.0]])
+    np.testing.assert_allclose(chase.to_world(chase.to_view(points)), points, atol=1e-9)
+    ahead = chase.to_view(np.array(position)[[0, 0, 1]] * [1, 0, 1] + [math.sin(yaw), 0, math.cos(yaw)])
+    np.testing.assert_allclose(ahead, [0, 0, 1], atol=1e-9)
+
+
+def test_the_node_of_the_world_is_where_the_camera_shows_points(show):
+    chase, points = show.view.chase, np.array([[1.0, 2.0, 3.0], [-4.0, 0.0, 2.0]])
+    chase.mode = CameraMode.FREE
+    chase.position, chase.yaw = np.array([2.0, -1.0]), 0.7
+    show.view.step(0.0, np.zeros(2), 0.0)
+    node = show.view._world
+    shown = viser.transforms.SO3(np.array(node.wxyz)).apply(points) + node.position
+    np.testing.assert_allclose(shown, chase.to_view(points), atol=1e-4)
+    look = np.asarray(show.server.initial_camera.look_at) - np.asarray(show.server.initial_camera.position)
+    away = chase.direction_to_world(look)
+    heading = show.view.find_heading((0.0, 1.0), None)
+    assert heading == pytest.approx(math.degrees(math.atan2(away[0], away[2])))
+
+
+def test_facing_is_that_of_the_hips():
+    for angle in (-2.0, 0.3, 3.0):
+        assert facing_of(np.array([0.0, math.sin(angle / 2), 0.0, math.cos(angle / 2)])) == pytest.approx(angle)
+        turned = turn_about_up(np.array([0.0, 0, 1]), angle)
+        np.testing.assert_allclose(turned[[0, 2]], [math.sin(angle), math.cos(angle)])
+
+
+def test_an_arrow_points_along_its_trajectory_and_a_tail_begins_as_a_point():
+    way = np.stack([np.linspace(0, 1, 30), np.zeros(30)], axis=-1)
+    edges = build_arrow(way, 0.1)
+    np.testing.assert_allclose(edges[-2:], [[1, 0], [1, 0]], atol=1e-9)
+    widths = np.linalg.norm(edges[::2] - edges[1::2], axis=1)
+    assert widths[:-2] == pytest.approx(0.1)
+    assert widths[-2] > 0.2
+    tail = build_tail(way)
+    np.testing.assert_allclose(tail[:2], 0, atol=1e-9)
+    assert np.linalg.norm(tail[-2] - tail[-1]) > 0.02
+    assert build_arrow(way * 0.01, 0.1) is None
+    assert build_tail(way[:1]) is None
