@@ -9,8 +9,6 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -68,23 +66,11 @@ class Live:
 
 
 @contextmanager
-def open_chromium(*, idle: bool = False) -> Iterator[Any]:
-    """A browser that draws without a graphics card; an idle one draws in the time that nobody else needs, as on a
-    machine with such a card, where it would otherwise go before all others."""
+def open_chromium() -> Iterator[Any]:
+    """A browser that draws without a graphics card."""
     from playwright.sync_api import sync_playwright
 
-    with sync_playwright() as drivers, TemporaryDirectory() as folder:
-        program = CHROMIUM if not idle else _write_idle_chromium(Path(folder))
-        opened = drivers.chromium.launch(executable_path=program, args=SWITCHES)
+    with sync_playwright() as drivers:
+        opened = drivers.chromium.launch(executable_path=CHROMIUM, args=SWITCHES)
         yield opened
         opened.close()
-
-
-def _write_idle_chromium(folder: Path) -> Path:
-    """Chromium raises the priority of the process that draws where it may, which this class of processes ignores. Of
-    sessions, whose shares are even on some systems whatever their processes' priority, its own is told to be small."""
-    path = folder / "idle-chromium"
-    share = "echo 19 > /proc/self/autogroup"
-    path.write_text(f'#!/bin/sh\n({share}) 2> /dev/null\nexec chrt --idle 0 "{CHROMIUM}" "$@"\n')
-    path.chmod(0o755)
-    return path

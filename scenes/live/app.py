@@ -80,7 +80,7 @@ class LiveApp:
         self.targets = LiveTargets(scene, _WORLD, self.characters, lambda: self.chosen, self.enqueue)
         self.path = PathEditor(scene, _WORLD, locate=self._find_ground, enqueue=self.enqueue, on_change=self._show_path)
         self.recorder = Recorder(self.server, self.notify)
-        self.timeline = Timeline(self.characters, self._set_paused)
+        self.timeline = Timeline(self.characters, self._set_paused, lambda: self.is_paused)
         self.panel = Panel(self.server.gui, self, characters=len(characters))
         self.panel.show_inputs(self.chosen.inputs)
         outputs = DrivingOutputs(self._drive, self._act, self.view.chase.orbit, self.view.find_heading, self.notify)
@@ -215,11 +215,6 @@ class LiveApp:
         """Have the chosen character walk the drawn path."""
         self.walk(self.chosen, self.path.path.points, closed=self.path.path.is_closed)
 
-    def close_path(self, closed: bool) -> None:
-        """Close the path to a loop, or open it."""
-        self.path.path.is_closed = closed
-        self.path.edit(lambda: None)
-
     def download_path(self, client: viser.ClientHandle | None) -> None:
         """Give a browser the path as a CSV file."""
         curve = self.path.path.curve
@@ -227,24 +222,6 @@ class LiveApp:
             raise RequestError("a path needs 2 points or more")
         if client is not None:
             client.send_file_download("mapctl-path.csv", write_csv(curve), save_immediately=True)
-
-    # Recording and the past
-
-    def toggle_recording(self, client: viser.ClientHandle | None) -> None:
-        """Begin to record the chosen character, or end and give that browser the file."""
-        self.recorder.toggle(self.chosen, self.panel.chosen_ending, client)
-
-    def save_again(self, client: viser.ClientHandle | None) -> None:
-        """Give a browser the last recording once more."""
-        self.recorder.save_last(self.panel.chosen_ending, client)
-
-    def look_back(self, seconds: float) -> None:
-        """Show what was so many seconds ago."""
-        self.timeline.look_back(seconds, paused=self.is_paused)
-
-    def replay(self) -> None:
-        """Play from the shown moment, or from as far back as there is, to the present."""
-        self.timeline.replay(time.perf_counter(), paused=self.is_paused)
 
     # View
 

@@ -74,14 +74,14 @@ class InputLimits:
             if name == "labels":
                 found[name], unknown = self._change_labels(inputs.labels, asked)
                 notes += [f"{label!r} is not a {group} of this prior." for group, label in unknown.items()]
-            elif asked is None and name in ("facing", "step_length"):
-                found[name] = None
             elif is_number(asked):
                 found[name] = self._limit(name, float(asked))
                 if name in ("speed", "step_length") and found[name] != asked:
                     low, high = self._range(name)
                     words, unit = name.replace("_", " "), _UNITS[name]
                     notes.append(f"A {words} of {asked:g} {unit} is out of range: {low:g} to {high:g} {unit}.")
+            elif asked is None and name in ("facing", "step_length"):
+                found[name] = None
             else:
                 notes.append(f"{str(asked)[:20]!r} is not a {name.replace('_', ' ')} in {_UNITS[name]}.")
         return replace(inputs, **found), notes

@@ -78,7 +78,7 @@ class Panel:
         self.draw = gui.add_checkbox("Draw by clicking on the ground", False, hint=paths.HELP)
         self.closed = gui.add_checkbox("Closed to a loop", False, hint="a closed path is walked again and again")
         self.path = gui.add_markdown(paths.HELP)
-        self._on_change(self.closed, lambda value: app.close_path(value is True))
+        self._on_change(self.closed, lambda value: app.path.close(value is True))
         self._add_button("Walk it", lambda client: app.walk_path(), icon=viser.Icon.ROUTE)
         self._add_button("Clear", lambda client: app.path.clear(), icon=viser.Icon.ERASER)
         hint = "x,z in metres, as mapctl follow reads it"
@@ -111,14 +111,24 @@ class Panel:
     def _add_playing(self) -> None:
         gui, app = self._gui, self._app
         self.ending = gui.add_dropdown("File", list(FORMATS), hint="mapctl render makes a film of it")
-        self.record = self._add_button("Record", app.toggle_recording, color="red", icon=viser.Icon.PLAYER_RECORD)
+        self.record = self._add_button(
+            "Record",
+            lambda client: app.recorder.toggle(app.chosen, self.chosen_ending, client),
+            color="red",
+            icon=viser.Icon.PLAYER_RECORD,
+        )
         self.recorded = gui.add_markdown("")
-        self._add_button("Save again", app.save_again, icon=viser.Icon.DOWNLOAD, hint="the last recording")
+        self._add_button(
+            "Save again",
+            lambda client: app.recorder.save_last(self.chosen_ending, client),
+            icon=viser.Icon.DOWNLOAD,
+            hint="the last recording",
+        )
         hint = "the characters stop while you look at the past"
         self.back = gui.add_slider("Look back, s", -KEPT_SECONDS, 0.0, 0.1, 0.0, hint=hint)
         self.timeline = gui.add_markdown("")
-        self._on_change(self.back, lambda value: app.look_back(-value) if is_number(value) else None)
-        self._add_button("Replay", lambda client: app.replay(), icon=viser.Icon.PLAYER_PLAY)
+        self._on_change(self.back, lambda value: app.timeline.look_back(-value) if is_number(value) else None)
+        self._add_button("Replay", lambda client: app.timeline.replay(), icon=viser.Icon.PLAYER_PLAY)
         self._add_button(
             "Back to live", lambda client: app.timeline.return_to_present(), icon=viser.Icon.PLAYER_TRACK_NEXT
         )

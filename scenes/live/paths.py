@@ -228,6 +228,11 @@ class PathEditor:
         if not hits_ball(self.path.points, ray):
             self.edit(lambda: self.path.add(x, z))
 
+    def close(self, closed: bool) -> None:
+        """Close the path to a loop, or open it."""
+        self.path.is_closed = closed
+        self.edit(lambda: None)
+
     def clear(self) -> None:
         """Remove all points."""
         self.path = PathPoints()

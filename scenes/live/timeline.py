@@ -1,5 +1,6 @@
 """The last two minutes: a frame of the past that is shown instead of the present, and replay."""
 
+import time
 from collections.abc import Callable, Sequence
 
 from mapctl.features import PRIOR_FPS
@@ -10,9 +11,11 @@ class Timeline:
     """Looking back stops the characters, so that none moves on unseen; returning lets them go on, unless they were
     paused before."""
 
-    def __init__(self, characters: Sequence[ShownCharacter], pause: Callable[[bool], None]):
+    def __init__(
+        self, characters: Sequence[ShownCharacter], pause: Callable[[bool], None], is_paused: Callable[[], bool]
+    ):
         """`pause` stops all characters, or lets them go on."""
-        self._characters, self._pause = characters, pause
+        self._characters, self._pause, self._is_paused = characters, pause, is_paused
         self.seconds_back: float | None = None
         """How far back the shown moment is; None for the present."""
         self._replayed: float | None = None  # value of time.perf_counter up to which was replayed
@@ -23,19 +26,18 @@ class Timeline:
         """How far back one can look, seconds."""
         return max(len(character.past) for character in self._characters) / PRIOR_FPS
 
-    def look_back(self, seconds: float, *, paused: bool) -> None:
-        """Show what was so many seconds ago, or the oldest frame; `paused` says whether the characters stand now."""
+    def look_back(self, seconds: float) -> None:
+        """Show what was so many seconds ago, or the oldest frame."""
         if self.seconds_back is None:
-            self._goes_on = not paused
+            self._goes_on = not self._is_paused()
             self._pause(True)
         self._replayed = None
         self.seconds_back = min(max(0.0, seconds), self.kept_seconds)
 
-    def replay(self, now: float, *, paused: bool) -> None:
-        """Play from the shown moment, or from as far back as there is, to the present; `now` is a value of
-        time.perf_counter."""
-        self.look_back(self.seconds_back or self.kept_seconds, paused=paused)
-        self._replayed = now
+    def replay(self) -> None:
+        """Play from the shown moment, or from as far back as there is, to the present."""
+        self.look_back(self.seconds_back or self.kept_seconds)
+        self._replayed = time.perf_counter()
 
     def return_to_present(self) -> None:
         """Show the present again; characters go on if they went before."""

@@ -3,7 +3,7 @@
 Imported late, where it is needed: matplotlib may not be installed.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from os import PathLike
@@ -14,6 +14,7 @@ import matplotlib
 import numpy as np
 import torch
 from jaxtyping import Float
+from matplotlib import font_manager
 from matplotlib.figure import Figure
 
 from mapctl import kinematics, retarget, rotations
@@ -22,13 +23,18 @@ from mapctl.motion import Motion
 from mapctl.retarget import RigMap
 from mapctl.retarget.doubts import Fit
 from mapctl.skeleton import CANONICAL
-from scenes.plots.label_columns import Label, draw_columns, font_families, printable
 
 _SIZE, _DPI = (16.0, 9.6), 100  # inches
 _LEFT, _RIGHT, _MIDDLE, _UNMATCHED, _DOUBT = "#4c78a8", "#f58518", "#333333", "#b5b5b5", "#d62728"
 _MAX_LINES = 5  # of reasons under the picture
 _MARGIN, _HEADROOM = 0.12, 0.2  # metres about a body, and over it in the T-pose
 _MAX_LINE = 112  # characters of a line of reasons
+
+# Labels stand in two columns beside the body, each with a line to its point, none over another.
+_MAX_NAME = 24  # characters of a name
+_GAP = 0.056  # of the height of the axes between two labels
+_TOP, _BOTTOM = 0.965, 0.035  # of the height of the axes
+_HAN_FONTS = ("Noto Sans CJK JP", "Noto Sans CJK SC", "IPAexGothic", "IPAGothic", "WenQuanYi Zen Hei", "Yu Gothic")
 
 Places = Float[np.ndarray, "joints 3"]
 """Positions of the rig's own joints, metres: Y up, facing +Z."""
@@ -95,6 +101,24 @@ class RigPicture:
             places = rotations.rotate(upright.expand(len(places), 4), places)
         places = places - places[self.rigmap.joints["hips"]] * places.new_tensor([1.0, 0.0, 1.0])
         return rotations.rotate_about_y(places, torch.full((len(places),), -heading, dtype=places.dtype)).numpy()
+
+
+@dataclass(frozen=True)
+class Label:
+    """A label with two lines."""
+
+    title: str
+    """Its first line."""
+    name: str
+    """Its second line, smaller."""
+    colour: str
+    """Colour of its first line."""
+    leader: str
+    """Colour of the line to its point."""
+    point: tuple[float, float]
+    """What it is the label of, in data coordinates."""
+    on_right: bool
+    """Whether it stands in the right column."""
 
 
 def plot_rig(picture: RigPicture, path: str | PathLike[str]) -> None:
@@ -247,3 +271,63 @@ def _write_key(figure: Any, picture: RigPicture) -> None:
     for (word, colour), x in zip(words, (0.79, 0.825, 0.87, 0.925), strict=True):
         figure.text(x, 0.128, word, fontsize=10, color=colour, weight="bold", va="center")
     figure.text(0.79, 0.103, f"no canonical joint ({others})", fontsize=10, color="#999999", va="center")
+
+
+def draw_columns(axes: Any, labels: Sequence[Label]) -> None:
+    """Draw labels at both edges of the axes, in the order of the heights of their points."""
+    for on_right in (False, True):
+        own = sorted((label for label in labels if label.on_right == on_right), key=_rank)
+        for label, height in zip(own, spread([_to_height(axes, label) for label in own]), strict=True):
+            _draw_label(axes, label, height)
+
+
+def _rank(label: Label) -> tuple[float, float]:
+    """Return what orders labels from the top: of points at one height the innermost first, so that no lines cross."""
+    return -round(label.point[1], 2), abs(label.point[0])
+
+
+def spread(heights: Sequence[float]) -> list[float]:
+    """Move heights, highest first, apart to at least the gap between two labels, within the axes, and as little as
+    that takes."""
+    gap = min(_GAP, (_TOP - _BOTTOM) / max(len(heights) - 1, 1))
+    placed, top = [], _TOP
+    for number, height in enumerate(heights):
+        least = _BOTTOM + gap * (len(heights) - 1 - number)
+        placed.append(max(min(height, top), least))
+        top = placed[-1] - gap
+    return placed
+
+
+def font_families(text: str) -> list[str]:
+    """Return the fonts for a text: with one that has its Chinese and Japanese characters, where one is installed."""
+    known = {font.name for font in font_manager.fontManager.ttflist}
+    return ["DejaVu Sans", *(font for font in _HAN_FONTS if font in known and not text.isascii())]
+
+
+def printable(name: str) -> str:
+    """Return a name as the fonts at hand can show it: other characters as their code."""
+    fonts = [font_manager.get_font(font_manager.findfont(family)) for family in font_families(name)]
+    shown = "".join(c if any(font.get_char_index(ord(c)) for font in fonts) else f"\\u{ord(c):04x}" for c in name)
+    return shown
+
+
+def shorten(name: str) -> str:
+    """Shorten a long name in its middle."""
+    return name if len(name) <= _MAX_NAME else name[: _MAX_NAME // 2] + "..." + name[3 - _MAX_NAME // 2 :]
+
+
+def _to_height(axes: Any, label: Label) -> float:
+    low, high = axes.get_ylim()
+    return (label.point[1] - low) / (high - low)
+
+
+def _draw_label(axes: Any, label: Label, height: float) -> None:
+    low, high = axes.get_xlim()
+    bottom, top = axes.get_ylim()
+    edge, align = (0.995, "right") if label.on_right else (0.005, "left")
+    corner = 0.815 if label.on_right else 0.185
+    place = dict(transform=axes.transAxes, ha=align, zorder=6)
+    axes.text(edge, height + 0.003, label.title, fontsize=9.5, weight="bold", color=label.colour, va="bottom", **place)
+    axes.text(edge, height, shorten(printable(label.name)), fontsize=8.5, color="#555555", va="top", **place)
+    x, y = low + corner * (high - low), bottom + height * (top - bottom)
+    axes.plot([x, label.point[0]], [y, label.point[1]], color=label.leader, linewidth=0.7, alpha=0.6, zorder=1.5)

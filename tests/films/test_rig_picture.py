@@ -17,8 +17,7 @@ from mapctl import retarget
 from mapctl.retarget.doubts import assess_fit
 from mapctl.skeleton import CANONICAL
 from scenes.plots import rig_picture
-from scenes.plots.label_columns import printable, shorten, spread
-from scenes.plots.rig_picture import RigPicture, plot_rig
+from scenes.plots.rig_picture import RigPicture, plot_rig, printable, shorten, spread
 
 
 def picture_of(motion):

@@ -16,7 +16,7 @@ from mapctl.mesh.anatomy import Anatomy
 from mapctl.mesh.mannequin import Mannequin
 from mapctl.mesh.primitives import RoundedBoxes, Surface, frame_along, merge_surfaces, unit_sphere
 from mapctl.skeleton import CANONICAL, Skeleton
-from scenes.renderers.lighting import shade
+from scenes.renderers.layers import shade
 
 GREY = colours.rgb("slate")
 LIMBS = ("Shoulder", "Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot", "ToeBase")

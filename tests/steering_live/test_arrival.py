@@ -10,11 +10,10 @@ from tiny_steering import AHEAD, DENSITY, begun
 from tiny_stitcher import tiny_stitcher
 
 from controllers.steering import steer
-from controllers.steering.arrival import Approach, Arriver
+from controllers.steering.arrival import Arriver
 from controllers.steering.loop import Recorder, StreamClock, drive
-from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
-from mapctl.intent.steering import Arrival, Command, CommandTrack
+from mapctl.intent.steering import Arrival, CommandTrack
 from mapctl.metrics.arrivals import measure_arrivals
 from mapctl.retarget import to_canonical
 from mapctl.skeleton import CANONICAL, Skeleton
@@ -70,38 +69,6 @@ def test_a_pose_is_taken():
     assert row["place_error_cm"] < 0.1
 
 
-def test_frames_meet_those_before_and_after_the_way():
-    """The way begins where the walk was, and the walk goes on where the way ended."""
-    recorder, _ = play((0.2, Arrival((0.2, 0.5), 0.9)))
-    joints = recorder.motion().joint_positions()
-    step = joints.diff(dim=0).norm(dim=-1).amax(dim=-1)
-    assert float(step[[5, 6, 7]].max()) < 3 * float(step[8:26].max())
-
-
-@pytest.mark.slow
-def test_a_new_command_on_the_way_leaves_it_at_once():
-    track = CommandTrack((0.0, 0.2, 0.5), (AHEAD, replace(AHEAD, arrival=Arrival((0.5, 0.4), 0.9)), AHEAD))
-    recorder = Recorder()
-    state, first = begun()
-    recorder.show(first, 0.0)
-    state, _ = drive(state, track, [recorder], frames=40, clock=StreamClock(), stepper=ARRIVER)
-    assert state.approach.order is None
-    assert recorder.pieces[-1].evaluations > 0
-
-
-@pytest.mark.slow
-def test_who_cannot_goes_on_as_before():
-    """Also where the rest of the command would have been to stand."""
-    stand = replace(AHEAD, speed=0.0, heading=1.0, arrival=Arrival((50.0, 0.0), 0.9))
-    track, recorder = CommandTrack((0.0, 0.2), (AHEAD, stand)), Recorder()
-    state, first = begun()
-    recorder.show(first, 0.0)
-    drive(state, track, [recorder], frames=40, clock=StreamClock(), stepper=ARRIVER)
-    plain, _ = play(frames=40)
-    assert len(recorder.refusals) == 1
-    assert torch.equal(recorder.motion().root_position, plain.motion().root_position)
-
-
 @pytest.mark.slow
 def test_what_nobody_can_is_refused_once_with_numbers_and_changes_nothing():
     recorder, track = play((0.2, Arrival((50.0, 0.0), 0.9)), (0.5, Arrival((0.0, 0.0), 0.5)))
@@ -121,51 +88,6 @@ def test_another_body_comes_to_the_same_place():
     state = steer.begin(DENSITY, AHEAD, generator=torch.Generator().manual_seed(0), settings=settings, skeleton=tall)
     recorder, track = play((0.2, Arrival((0.5, 0.4), 0.9, 1.0)), state=state)
     assert errors(recorder, track)["place_error_cm"] < 0.1
-
-
-def test_steps_are_pure():
-    state, _ = begun()
-    command = replace(AHEAD, arrival=Arrival((0.3, 0.4), 0.6))
-    one, two = (ARRIVER(state, command) for _ in range(2))
-    assert torch.equal(one[1].motion.root_position, two[1].motion.root_position)
-    assert isinstance(one[0].approach, Approach)
-    assert one[0].frames == 1 + state.settings.commit
-    assert round(PRIOR_FPS) == 30
-
-
-@pytest.mark.parametrize("wrong", [math.nan, math.inf])
-def test_an_order_has_finite_numbers(wrong):
-    for order in (((wrong, 0.0), 1.0, None), ((0.0, 0.0), wrong, None), ((0.0, 0.0), 1.0, wrong)):
-        with pytest.raises(RequestError, match="finite"):
-            Arrival(*order)
-
-
-def test_a_command_without_an_order_is_steered_as_ever():
-    state, _ = begun()
-    one, two = steer.step(state, AHEAD), ARRIVER(state, AHEAD)
-    assert torch.equal(one[1].motion.root_position, two[1].motion.root_position)
-    assert Command(1.0, 0.0).arrival is None
-
-
-def test_the_first_step_is_steered_towards_the_place_and_plays_while_the_way_is_worked_out():
-    state, _ = begun()
-    for _ in range(2):
-        state, _ = ARRIVER(state, AHEAD)
-    by, here = state.frames / PRIOR_FPS + 0.6, state.committed.place.position_xz.tolist()
-    plain = ARRIVER(state, AHEAD)[1]
-    for side in (-0.4, 0.4):
-        order = replace(AHEAD, arrival=Arrival((here[0] + side, here[1] + 0.4), by))
-        after, frames = ARRIVER(state, order)
-        assert frames.evaluations > 0
-        assert after.approach.rest is not None
-        turned = [target.heading - other.heading for target, other in both_targets(frames, plain)]
-        assert all(math.copysign(1, side) * turn > 0.01 for turn in turned)
-        assert not torch.equal(frames.motion.root_position, plain.motion.root_position)
-        assert after.settings == state.settings
-
-
-def both_targets(frames, others):
-    return zip(frames.steering_targets, others.steering_targets, strict=True)
 
 
 @pytest.mark.slow
@@ -199,19 +121,3 @@ def test_a_new_order_on_the_way_plays_what_was_planned_meanwhile():
         now, frames = ARRIVER(now, second)
     assert math.dist(frames.motion.root_position[-1, ::2].tolist(), place) < 1e-3
     assert on.frames < now.frames
-
-
-def test_nobody_hurries_for_what_was_forecast():
-    """Behind the character and as fast as it can: nothing is shown first that leads the other way."""
-    state, _ = begun()
-    for _ in range(3):
-        state, _ = ARRIVER(state, AHEAD)
-    here, most = state.committed.place.position_xz.tolist(), state.prior.limits.max_steering_speed
-    frames = 8
-    place = (here[0], here[1] - 0.97 * most * frames / PRIOR_FPS)
-    order = replace(AHEAD, arrival=Arrival(place, (state.frames - 1 + frames) / PRIOR_FPS))
-    after, shown = ARRIVER(state, order)
-    assert shown.refusal is None
-    assert after.approach.rest is None  # all of it is planned already
-    speeds = torch.cat([shown.motion.root_position[:, ::2]]).diff(dim=0).norm(dim=-1) * PRIOR_FPS
-    assert float(speeds.mean()) < 2 * most

@@ -1,6 +1,5 @@
 """Who drives: the last command, or a drawn path until it ends."""
 
-import math
 from itertools import pairwise
 
 import pytest
@@ -37,13 +36,6 @@ def at_place(pilot: Autopilot, x: float, z: float) -> None:
     )
 
 
-def test_the_last_command_holds():
-    pilot = Autopilot(Command(1.0, 0.5), SteeringLimits())
-    assert pilot.at(0.0) == Command(1.0, 0.5)
-    pilot.command(Command(2.0, 1.0, labels=("run",)))
-    assert pilot.at(9.0) == Command(2.0, 1.0, labels=("run",))
-
-
 @pytest.mark.slow
 def test_a_path_is_walked_braked_for_and_stood_at():
     pilot = Autopilot(Command(1.0, 0.5, labels=("elderly",)), SteeringLimits(braking=2.0))
@@ -58,14 +50,6 @@ def test_a_path_is_walked_braked_for_and_stood_at():
     assert all(b <= a + 1e-9 for a, b in pairwise(speeds))
     assert speeds[-1] == 0.0
     assert pilot.at(0.0).heading == pytest.approx(0.0, abs=0.1)
-
-
-def test_a_command_takes_the_character_off_its_path():
-    pilot = Autopilot(Command(1.0, 0.0), SteeringLimits())
-    at_place(pilot, 0.0, 0.0)
-    pilot.walk(LINE, 1.4)
-    pilot.command(Command(0.5, math.pi))
-    assert pilot.at(0.0) == Command(0.5, math.pi)
 
 
 def test_a_closed_path_goes_round_and_round():

@@ -33,13 +33,6 @@ def test_a_search_that_was_cut_tells_what_comes_after_it():
     assert cost.learn(0.001, 10, search=None, cut_short=False).rest == cost.rest
 
 
-def test_without_time_for_an_evaluation_one_is_tried_again_some_time():
-    cost = StepCost(1.0)
-    for _ in range(60):
-        cost = cost.learn(0.005, 0, search=0.001, cut_short=True)
-    assert cost.evaluation < 0.002
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("free", [False, True], ids=["walking", "stuck"])
 def test_steps_return_within_their_time(monkeypatch, free):

@@ -132,7 +132,7 @@ def test_a_drawn_path_is_walked_and_a_missing_one_is_named(show, actors, capsys)
     for one in rays:
         show.click(*one)
     show._run_safely(lambda: show.click(None, DOWN))
-    show.close_path(True)
+    show.path.close(True)
     show.walk_path()
     _, points, speed, closed = actors[0].heard[-1]
     np.testing.assert_allclose(points, [(0, 0), (1, 1), (1, 3)], atol=1e-9)
@@ -242,13 +242,13 @@ def test_looking_back_shows_what_was_while_the_characters_wait(show, actors):
     character = show.chosen
     frames = len(character.past)
     assert frames > 20
-    show.look_back(0.5)
+    show.timeline.look_back(0.5)
     run(show, 2)
     assert [words(actor, "pause") for actor in actors] == [[("pause", True)]] * 2
     past = character.past[frames - 1 - 15]
     np.testing.assert_array_equal(character.position, past.chunk.root[past.frame, ::2])
     assert "Past, 0.5 s ago" in show.timeline.describe()
-    show.look_back(1e9)
+    show.timeline.look_back(1e9)
     run(show, 16)
     assert show.timeline.seconds_back == pytest.approx(frames / 30)
     assert show.panel.back.value == pytest.approx(-frames / 30, abs=0.06)
@@ -261,13 +261,13 @@ def test_looking_back_shows_what_was_while_the_characters_wait(show, actors):
 def test_paused_characters_stay_so_and_resume_or_reset_show_the_present(show, actors):
     run(show, 10)
     show.set_paused(True)
-    show.look_back(0.1)
+    show.timeline.look_back(0.1)
     show.timeline.return_to_present()
     assert words(actors[0], "pause") == [("pause", True)]
-    show.look_back(0.1)
+    show.timeline.look_back(0.1)
     show.set_paused(False)
     assert (words(actors[0], "pause")[-1], show.timeline.seconds_back) == (("pause", False), None)
-    show.look_back(0.1)
+    show.timeline.look_back(0.1)
     show.restart()
     assert actors[0].heard[-1] == ("reset",)
     assert (words(actors[0], "pause")[-1], show.timeline.seconds_back) == (("pause", False), None)
@@ -275,11 +275,12 @@ def test_paused_characters_stay_so_and_resume_or_reset_show_the_present(show, ac
 
 def test_a_replay_ends_in_the_present(show, actors):
     run(show, 10)
-    show.timeline.replay(100.0, paused=False)
-    show.timeline.step(100.1)
+    show.timeline.replay()
+    began = show.timeline._replayed
+    show.timeline.step(began + 0.1)
     assert "Replay" in show.timeline.describe()
     assert show.timeline.seconds_back == pytest.approx(len(show.chosen.past) / 30 - 0.1)
-    show.timeline.step(200.0)
+    show.timeline.step(began + 100.0)
     assert (show.timeline.seconds_back, show.is_paused) == (None, False)
 
 
@@ -304,27 +305,27 @@ def test_a_recording_is_the_motion_that_was_shown(show, tmp_path, monkeypatch, e
     monkeypatch.chdir(tmp_path)
     show.panel.ending.value = ending
     with pytest.raises(RequestError, match="nothing was recorded"):
-        show.save_again(None)
-    show.toggle_recording(None)
+        show.recorder.save_last("bvh", None)
+    show.recorder.toggle(show.chosen, ending, None)
     show._run_housekeeping(0.0)
     assert show.panel.record.label == "Stop and save"
     run(show, 5)
     show._run_housekeeping(0.0)
     assert show.panel.recorded.content == "● **0:00.5, 15 frames**"
-    show.toggle_recording(None)
+    show.recorder.toggle(show.chosen, show.panel.chosen_ending, None)
     show.recorder.wait()
     recorded = formats.load(tmp_path / f"mapctl.{ending}")
     whole = walk(90).slice(0, 15)
     order = [recorded.skeleton.index(name) for name in whole.skeleton.names]
     np.testing.assert_allclose(recorded.joint_positions()[:, order], whole.joint_positions(), atol=1e-4)
-    show.save_again(None)
+    show.recorder.save_last(ending, None)
     show.recorder.wait()
     assert (tmp_path / f"mapctl-2.{ending}").read_bytes() == (tmp_path / f"mapctl.{ending}").read_bytes()
 
 
 def test_a_recording_that_goes_on_when_all_ends_is_saved(show, tmp_path):
     assert show.save_recordings(tmp_path) == []
-    show.toggle_recording(None)
+    show.recorder.toggle(show.chosen, "bvh", None)
     run(show, 5)
     [path] = show.save_recordings(tmp_path)
     assert (path.name, formats.load(path).num_frames) == ("mapctl.bvh", 15)

@@ -8,7 +8,6 @@ import time
 
 import pytest
 import viser
-from character_maker import make_character_glb
 from live_browser import CHROMIUM, COUNTED, SIZE, Live, open_chromium
 
 import mapctl
@@ -237,40 +236,6 @@ def test_whatever_is_typed_and_whoever_connects_it_goes_on_and_the_recording_is_
     assert shows(page, "Speed, m/s", 0.7), "it still obeys"
 
 
-@pytest.mark.slow
-def test_two_browsers_see_the_same_and_one_may_go_and_come_back(page, browser, live):
-    other = browser.new_page(viewport=SIZE)
-    other.goto(live.url)
-    other.get_by_text(COUNTED).wait_for(timeout=60_000)
-    put(page, "Speed, m/s", 0.7)
-    assert shows(other, "Speed, m/s", 0.7)
-    other.close()
-    again = browser.new_page(viewport=SIZE)
-    again.goto(live.url)
-    again.get_by_text(COUNTED).wait_for(timeout=60_000)
-    assert shows(again, "Speed, m/s", 0.7)
-    again.close()
-
-
 def shown(page) -> int:
     """Frames that were shown since the last reset, as the page says."""
     return int(re.search(r"of (\d+) frames", page.inner_text("body")).group(1))
-
-
-@pytest.mark.slow
-def test_a_character_is_shown_and_walks(browser, prior, tmp_path):
-    hero = make_character_glb(tmp_path / "hero.glb").path
-    show, faults = Live("--prior", prior, "--character", hero), list[str]()
-    page = browser.new_page(viewport=SIZE, accept_downloads=True)
-    try:
-        page.on("pageerror", lambda error: faults.append(str(error)))
-        page.goto(show.url)
-        page.get_by_text(COUNTED).wait_for(timeout=60_000)
-        put(page, "Speed, m/s", 1.2)
-        walked = recorded(page, tmp_path, 3)
-        assert walked.skeleton.names[0] == "mixamorig:Hips"
-        assert speed_of(walked) > 0.3
-    finally:
-        page.close()
-        assert show.end() == 0
-    assert faults == []

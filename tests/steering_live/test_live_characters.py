@@ -14,14 +14,14 @@ from character_maker import make_character_glb
 from glb_viewer import GlbViewer
 from helpers import walk
 from rig_maker import Make, make, names_of
-from stage import Actor, delivered, live_app, run
+from stage import delivered
 
 from mapctl import formats, rotations
 from mapctl.commands.live import Live
 from mapctl.commands.live import run as live
 from mapctl.motion import Motion
 from scenes.drawn_character import DrawnCharacter
-from scenes.live.bodies import SkinnedBody, find_carriers, group_by_colour
+from scenes.live.bodies import SkinnedBody
 from scenes.live.character import CharacterLook, ShownCharacter
 from scenes.live.recording import encode_motion, join_chunks
 
@@ -100,31 +100,6 @@ def test_the_browser_draws_the_mesh_where_films_do(hero):
         np.testing.assert_allclose(np.sort(drawn.round(4), axis=0), wanted, atol=2e-4)
 
 
-def test_fingers_go_with_their_hand_and_need_no_bone(hero):
-    rigmap = hero.body.leveled_map
-    names, carriers = rigmap.rig_skeleton.names, find_carriers(rigmap)
-    by_name = {names[joint]: names[carrier] for joint, carrier in enumerate(carriers)}
-    finger = next(name for name in names if "Index1" in name or name == "index_01_l")
-    side = "left" if finger.endswith("_l") or "Left" in finger else "right"
-    assert by_name[finger] == rigmap.joint_names[f"{side}Hand"]
-    assert by_name[rigmap.joint_names["leftToes"]] == rigmap.joint_names["leftToes"]
-    assert len(set(carriers)) <= 22
-
-
-def test_colours_are_few_and_near_the_meshs(hero):
-    groups = group_by_colour(hero.mesh, 12)
-    assert len(groups) <= 12
-    assert sum(len(group.faces) for group in groups) == len(hero.mesh.faces)
-    apart = [np.abs(hero.mesh.rgba[group.faces].mean(axis=1) - group.rgba).max() for group in groups]
-    assert max(apart) < 0.35
-    shown = np.array([group.rgba[:3] for group in groups])
-    for wanted in ([200, 20, 30], [255, 255, 255]):
-        assert np.abs(shown - np.array(wanted) / 255).max(axis=1).min() < 0.08, "stripes of the shirt"
-    opacities = {round(float(group.rgba[3]), 3) for group in groups}
-    assert opacities == ({0.5, 1.0} if (hero.mesh.rgba[:, 3] < 1).any() else {1.0})
-    assert len(group_by_colour(replace(hero.mesh, rgba=np.ones_like(hero.mesh.rgba)), 12)) == 1
-
-
 def recorded(look: CharacterLook, skeleton, frames: int) -> Motion:
     """What is recorded of so many frames that were delivered on these bones."""
     character = ShownCharacter.__new__(ShownCharacter)
@@ -144,18 +119,6 @@ def test_a_recording_is_of_the_character(hero, ending, tmp_path):
         vertices, _ = hero.mesh.pose(placed.joint_positions()[5].numpy(), turns)
         skinned = GlbViewer(path).skinned(0, 5 / 30)
         np.testing.assert_allclose(vertices[: len(skinned)], skinned, atol=1e-4)
-
-
-@pytest.mark.slow
-def test_the_viewer_shows_a_mannequin_beside_it(hero, capsys):
-    actors = [Actor(), Actor()]
-    actors[1].skeleton = hero.body.leveled
-    with live_app(actors, [CharacterLook(), CharacterLook(hero)]) as show:
-        run(show, 12)
-        mesh = show.server.scene.get_handle_by_name("/world/character2/skin0")
-        assert show.server.scene.get_handle_by_name("/world/character1/skin0") is None
-        assert any(np.abs(bone.position).max() > 0.1 for bone in mesh.bones)
-        assert capsys.readouterr() == ("", "")
 
 
 def test_each_character_has_its_file_and_the_last_one_is_for_all_others(tmp_path):
@@ -210,17 +173,3 @@ def test_with_a_rig_a_mannequin_moves_on_its_bones_and_recordings_are_on_it(tmp_
     )
     plain = live._choose_recorded_rigs(Live(), [None], [bodies[0]])
     assert plain == [None], "canonical joints stay"
-
-
-@pytest.mark.slow
-def test_a_character_is_recorded_on_the_rig_if_there_is_one(tmp_path):
-    hero, rig = make_character_glb(tmp_path / "hero.glb").path, tmp_path / "rig.bvh"
-    write_rig("lafan1", rig)
-    command = Live(rig=str(rig), character=(str(hero),))
-    drawn = live._read_drawn(command)
-    bodies = live._read_bodies(command, drawn)
-    assert bodies[0].skeleton.matches(drawn[0].body.leveled), "it moves on its own bones"
-    (on_rig,) = live._choose_recorded_rigs(command, drawn, bodies)
-    motion = recorded(CharacterLook(drawn[0], on_rig), bodies[0].skeleton, 6)
-    assert motion.skeleton.names == formats.load(rig).skeleton.names
-    assert float(motion.joint_positions()[0, 0, 1]) < float(delivered(0).root[0, 1]), "of its size"

@@ -138,7 +138,7 @@ def test_the_editor_does_what_is_dragged_and_explains_what_is_impossible(show, m
         editor._drag(1, phase, ((x, 2.0, -1.0), DOWN))
     text()
     assert editor.path.points[1] == (3.5, -1.0), "where a drag ends the mouse may be anywhere"
-    show.close_path(True)
+    editor.close(True)
     for phase, x in (("start", -1.0), ("update", -1.2), ("end", -1.2)):
         editor._insert(3, phase, ((x, 2.0, 1.0), DOWN))
     assert text().startswith("5 points")

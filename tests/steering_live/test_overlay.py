@@ -66,26 +66,6 @@ def test_a_hand_comes_to_its_place_stays_and_goes_back(hand, away):
     np.testing.assert_allclose(found.joint_positions()[:, feet], motion.joint_positions()[:120, feet], atol=1e-9)
 
 
-def test_an_arm_sets_out_from_where_it_is():
-    """Elbows too: inverse kinematics would bend them a little otherwise than the walk does, at once."""
-    motion = standing(1.0)
-    place = near(motion, "leftHand", (0.3, 0.1, 0.2))
-    found = steered(motion, lambda seconds: Command(0.0, 0.0, reach={"leftHand": place}))
-    first = (found.joint_positions() - motion.joint_positions())[0].norm(dim=-1)
-    assert float(first.max()) < 0.0005
-
-
-@pytest.mark.slow
-def test_a_place_beyond_the_arm_is_reached_with_a_lean():
-    motion = standing(3.0)
-    place = near(motion, "leftHand", (0.15, -0.15, 0.52))
-    found = steered(motion, lambda seconds: Command(0.0, 0.0, reach={"leftHand": place}))
-    assert float(misses(found, "leftHand", place)[-1]) < 0.01
-    chest = CANONICAL.index("leftShoulder")
-    moved = (found.joint_positions() - motion.joint_positions())[-1, chest].norm()
-    assert float(moved) > 0.03, "the trunk leans"
-
-
 def test_what_is_far_or_behind_is_left_alone():
     motion = standing(2.0)
     for away in ((0.0, 0.0, 1.6), (0.0, -0.1, -0.45)):

@@ -1,9 +1,7 @@
 """A character in a process of its own: it moves, obeys, pauses, begins anew, and says why it cannot."""
 
 import functools
-import os
 import re
-import signal
 import time
 from itertools import pairwise
 from multiprocessing import Pipe
@@ -14,7 +12,6 @@ from tiny_prior import save_tiny_prior
 from tiny_stitcher import save_tiny_stitcher
 
 import priors
-from controllers.steering import process
 from controllers.steering.process import CharacterProcess, CharacterRequest
 from controllers.steering.process_worker import run_worker
 from mapctl.errors import MapctlError, RequestError
@@ -82,17 +79,6 @@ def test_it_goes_where_it_is_sent_and_says_what_is_too_far(remote):
         remote.go(Command(0.5, 0.0), (np.nan, 0.0), 0.7)
 
 
-@pytest.mark.slow
-def test_who_was_made_without_transitions_is_sent_nowhere(load):
-    made = CharacterProcess(CharacterRequest(load, Command(1.2, 0.0)))
-    try:
-        with pytest.raises(RequestError, match="without transitions"):
-            made.go(Command(1.0, 0.0), (1.0, 1.0), 1.0)
-    finally:
-        made.wait()
-        made.close()
-
-
 def test_it_is_a_live_character_that_walks_in_time(remote):
     assert isinstance(remote, LiveCharacter)
     remote.reset()
@@ -134,13 +120,6 @@ def test_a_pause_stops_time_and_going_on_loses_none(remote):
     assert after[-1].spare > -0.05, "the pause made nothing late"
 
 
-@pytest.mark.slow
-def test_reset_brings_it_back_to_where_it_stood(remote):
-    remote.reset()
-    first = next(piece for piece in collected(remote, 1.0) if len(piece.root) == 1)
-    np.testing.assert_allclose(first.root[0, ::2], [3.0, -1.0], atol=1e-5)
-
-
 def notes(remote, seconds=1.0):
     return [note for piece in collected(remote, seconds) for note in piece.notes]
 
@@ -158,13 +137,6 @@ def test_orders_that_cannot_be_are_brought_near_or_left_out_and_said(remote):
     [note] = notes(remote)
     assert "knows no" in note
     assert np.hypot(*collected(remote, 0.5)[-1].wish) == pytest.approx(1.0, abs=0.05), "the order before it holds"
-
-
-@pytest.mark.slow  # in this process: test_a_worker_says_what_ends_it
-def test_what_it_cannot_load_is_said():
-    broken = CharacterProcess(CharacterRequest(functools.partial(priors.load, "nobody"), Command(1.0, 0.0)))
-    with pytest.raises(RequestError, match="no prior 'nobody'"):
-        broken.wait()
 
 
 @pytest.mark.slow
@@ -204,37 +176,6 @@ class Trap:
 
 def trapped(load, left=10):
     return Trap(load, left)
-
-
-@pytest.mark.slow  # in this process: test_a_worker_says_what_ends_it
-def test_an_error_that_nobody_thought_of_is_told_in_a_line(load, capfd):
-    broken = CharacterProcess(CharacterRequest(functools.partial(trapped, load), Command(1.0, 0.0)))
-    broken.wait()
-    with pytest.raises(
-        MapctlError, match=r"^a character's process ended: ZeroDivisionError: .*\(plan_search, line \d+\)$"
-    ):
-        collected(broken, 5.0)
-    broken.close()
-    assert "Traceback" not in "".join(capfd.readouterr())
-
-
-@pytest.mark.slow  # it starts a process of its own, as test_who_is_gone does
-def test_ctrl_c_is_not_for_it_and_when_it_hangs_it_holds_up_nobody(load, capfd):
-    made = CharacterProcess(CharacterRequest(load, Command(1.0, 0.0)))
-    for _ in range(20):  # while it imports
-        os.kill(process._BASES._bases[made._base].pid, signal.SIGINT)
-        time.sleep(0.05)
-    made.wait()
-    os.kill(made.pid, signal.SIGINT)
-    assert len(collected(made, 0.5)) > 2
-    os.kill(made.pid, signal.SIGSTOP)
-    began = time.perf_counter()
-    for number in range(5000):
-        made.command(Command(1.0, number / 5000, labels=("x" * 100,)))
-    assert time.perf_counter() - began < 2.0
-    made.close()
-    assert time.perf_counter() - began < 6.0
-    assert "Traceback" not in "".join(capfd.readouterr())
 
 
 def sent_by(here, there, load):

@@ -1,10 +1,8 @@
-"""Characters that share a process' memory: from a script as it stands, small, and started again by themselves."""
+"""Characters that share a process' memory are started again by themselves, and take turns."""
 
 import functools
 import os
 import signal
-import subprocess
-import sys
 import time
 
 import pytest
@@ -17,46 +15,6 @@ from mapctl.intent.steering import Command
 from mapctl.runtime import forking
 
 pytestmark = pytest.mark.skipif(not forking.AVAILABLE, reason="processes are forked on Linux only")
-
-SCRIPT = """
-import functools, os, time
-import priors
-from controllers.steering.process import CharacterProcess, CharacterRequest
-from mapctl.intent.steering import Command
-from mapctl.runtime.memory import measure_own_memory_mb
-{loader}
-crowd = [CharacterProcess(CharacterRequest(load, Command(1.2, 0.0), seed)) for seed in range(3)]
-for one in crowd:
-    one.wait()
-time.sleep(1.5)
-frames = [sum(len(chunk.root) for chunk in one.poll()) for one in crowd]
-print(min(frames), max(measure_own_memory_mb(one.pid) for one in crowd), len({{one.base_pid for one in crowd}}))
-for one in crowd:
-    one.close()
-"""
-
-
-def run_script(loader: str, folder) -> tuple[float, float, int]:
-    done = subprocess.run(
-        [sys.executable, "-c", SCRIPT.format(loader=loader)],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        cwd=folder,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-    )
-    assert done.returncode == 0, done.stderr
-    frames, memory, bases = done.stdout.split()
-    return float(frames), float(memory), int(bases)
-
-
-@pytest.mark.slow
-def test_a_script_needs_no_main_guard_and_a_character_is_small(tmp_path):
-    path = save_tiny_prior(tmp_path / "tiny.safetensors")
-    frames, memory, bases = run_script(f"load = functools.partial(priors.load, {str(path)!r})", tmp_path)
-    assert frames >= 3
-    assert memory < 60  # MB: alone it would be 350
-    assert bases == 1
 
 
 @pytest.mark.slow

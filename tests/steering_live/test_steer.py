@@ -11,20 +11,12 @@ from tiny_steering import AHEAD, DENSITY, QUICK, begun
 
 import priors
 from controllers.steering import steer
-from controllers.steering.loop import (
-    LoopSettings,
-    Recorder,
-    StepRecord,
-    StreamClock,
-    WallClock,
-    drive,
-    summarise_step_timing,
-)
+from controllers.steering.loop import Recorder, StepRecord, StreamClock, drive, summarise_step_timing
 from controllers.steering.pure_pursuit import PurePursuit
 from mapctl import curves
 from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import RequestError
-from mapctl.intent.steering import Command, CommandTrack
+from mapctl.intent.steering import Command
 from mapctl.skeleton import CANONICAL, Skeleton
 
 
@@ -35,12 +27,6 @@ def steered(steps, command=AHEAD, **how):
         state, piece = steer.step(state, command)
         pieces.append(piece)
     return state, pieces
-
-
-def test_it_begins_at_the_origin_facing_along_the_command():
-    _, first = begun(Command(1.0, math.pi / 2))
-    assert first.motion.num_frames == 1
-    torch.testing.assert_close(first.motion.root_position[0, ::2].float(), torch.zeros(2), atol=1e-6, rtol=0)
 
 
 def test_a_step_is_pure_and_the_same_to_the_bit():
@@ -67,19 +53,6 @@ def test_a_step_delivers_its_frames_with_a_forecast_and_a_ledger():
     assert float(ahead.norm()) < 0.3
 
 
-@pytest.mark.slow
-def test_the_state_does_not_grow():
-    def size(state):
-        done = state.committed
-        return done.features.shape, done.joints_world.shape, state.past_targets.shape, len(done.windows)
-
-    early, _ = steered(25)
-    late = early
-    for _ in range(15):
-        late, _ = steer.step(late, AHEAD)
-    assert size(early) == size(late)
-
-
 @pytest.mark.parametrize("least", [0, 2])
 def test_without_time_it_still_delivers_and_says_so(least):
     state, _ = begun(settings=replace(QUICK, least_evaluations=least))
@@ -87,14 +60,6 @@ def test_without_time_it_still_delivers_and_says_so(least):
     assert piece.motion.num_frames == 3
     assert piece.evaluations == 0
     assert piece.notes == ("the deadline came after 0 of 4 evaluations",)
-    assert bool(torch.isfinite(piece.motion.local_quat_xyzw).all())
-
-
-def test_who_is_stuck_without_time_is_not_searched():
-    state, _ = steered(8)
-    stuck = replace(state, settings=replace(QUICK, stuck=-1.0, random_starts=5))
-    _, piece = steer.step(stuck, AHEAD, seconds=0.0)
-    assert piece.evaluations == 0
     assert bool(torch.isfinite(piece.motion.local_quat_xyzw).all())
 
 
@@ -127,12 +92,6 @@ def test_a_command_tells_the_prior_for_as_long_as_it_holds(tmp_path):
         steer.step(state, replace(AHEAD, labels=("swim",)))
 
 
-@pytest.mark.parametrize("wrong", [{"commit": 0}, {"commit": 8}, {"evaluations": 0}, {"least_evaluations": -1}])
-def test_settings_that_cannot_be_are_refused(wrong):
-    with pytest.raises(RequestError, match="1 <= commit < horizon"):
-        replace(QUICK, **wrong)
-
-
 class Heard:
     """A source that writes down when it was asked."""
 
@@ -155,34 +114,6 @@ def test_the_loop_asks_a_step_before_frames_are_due_and_shows_them_all():
     assert source.times == pytest.approx([k / 10 + 1 / 30 - 0.1 for k in range(7)])
     assert [record.due for record in records] == pytest.approx([k / 10 + 1 / 30 for k in range(7)])
     assert all(len(entry.energy) == 21 for entry in recorder.ledger.entries)
-
-
-@pytest.mark.slow
-def test_in_stream_time_nothing_is_late_and_the_result_is_always_the_same():
-    motions = []
-    for _ in range(2):
-        state, recorder = begun()[0], Recorder()
-        _, records = drive(state, CommandTrack((0.0, 0.5), (AHEAD, Command(0.5, 1.0))), [recorder], frames=30)
-        assert summarise_step_timing(records)["late_frames"] == 0
-        motions.append(recorder.motion().local_quat_xyzw)
-    assert torch.equal(*motions)
-
-
-class Slow(StreamClock):
-    """Half a second passes whenever the time is asked."""
-
-    real = True
-
-    def now(self):
-        self._now += 0.5
-        return self._now
-
-
-def test_what_comes_too_late_is_counted_and_the_search_is_given_up():
-    state, _ = begun()
-    _, records = drive(state, Heard(), [], frames=7, clock=Slow())
-    cost = summarise_step_timing(records)
-    assert cost["late_frames"] == 6
 
 
 class Labouring(StreamClock):
@@ -224,21 +155,6 @@ def test_time_stretches_where_steps_take_longer_than_their_frames_last_and_no_fr
     assert min(asked) >= -0.1 - 1e-9
 
 
-@pytest.mark.slow
-def test_a_hiccup_is_made_up_for_and_time_goes_on():
-    clock = Labouring(0.04)
-
-    class Source:
-        def at(self, seconds):
-            clock.seconds = 0.14 if 1.0 < seconds < 1.1 else 0.04
-            return clock.at(seconds)
-
-    _, records = drive(begun()[0], Source(), [], frames=90, clock=clock)
-    assert clock.held == 0.0
-    assert sum(record.late_frames > 0 for record in records) == 1
-    assert records[-1].asked == pytest.approx(records[-1].due - 0.1)
-
-
 def test_steps_that_others_hold_up_are_to_end_earlier():
     clock, allowed = Labouring(0.0), []
 
@@ -252,29 +168,6 @@ def test_steps_that_others_hold_up_are_to_end_earlier():
     assert allowed[0] == pytest.approx(0.085)
     assert spare[0] == pytest.approx(0.003)
     assert min(spare[3:]) > 0.009
-
-
-def test_how_much_earlier_has_an_end_and_is_forgotten():
-    settings, margin = LoopSettings(), 0.015
-    for _ in range(100):
-        margin = settings.adapt_margin(margin, -0.2)
-    assert margin == settings.most_margin
-    for _ in range(600):
-        margin = settings.adapt_margin(margin, margin)
-    assert margin == settings.margin
-    assert LoopSettings(margin=0.2).adapt_margin(0.2, 0.0) == 0.2
-
-
-def test_against_the_wall_clock_it_takes_as_long_as_it_shows():
-    clock = WallClock()
-    drive(begun()[0], Heard(), [], frames=16, clock=clock)
-    assert clock.now() >= 0.4
-
-
-def test_it_stops_when_told():
-    shown = Recorder()
-    drive(begun()[0], Heard(), [shown], frames=300, stop=lambda: len(shown.pieces) == 2)
-    assert len(shown.pieces) == 2
 
 
 def test_ctrl_c_keeps_what_was_shown():
@@ -306,13 +199,6 @@ def test_pursuit_heads_for_the_curve_ahead_of_the_character():
     pursuit.show(first, 0.0)
     assert pursuit.at(0.1).heading == pytest.approx(-math.pi / 4, abs=0.02)
     assert pursuit.arc == pytest.approx(0.3, abs=0.01)
-
-
-def test_pursuit_is_both_ends_of_a_loop():
-    pursuit = PurePursuit(curves.circle(radius=2), speed=1.0)
-    state, _ = begun(pursuit.first)
-    _, records = drive(state, pursuit, [pursuit], frames=10)
-    assert len(records) == 3
 
 
 def test_obstacles_lead_the_direction_round_and_hold_joints_off():
