@@ -13,7 +13,7 @@ help:
 	@echo "make test      the quick tests"
 	@echo "make test-all  every test"
 	@echo "make bench     cost of the solver on this machine"
-	@echo "make check     ruff and basedpyright"
+	@echo "make check     ruff, basedpyright, import-linter"
 	@echo "make docs      the site in docs/_build/html: pages, gallery, reference"
 	@echo "make dist      sdist and wheel in dist/, and their sizes"
 	@echo "make clean     remove what these commands made, .venv included"
@@ -62,6 +62,7 @@ check: $(READY)
 	$(VENV)/ruff check .
 	$(VENV)/ruff format --check .
 	$(VENV)/basedpyright
+	$(VENV)/lint-imports --no-cache --no-logo
 
 # A warning is an error: a link that leads nowhere, a page that no other names, an example that fails.
 docs: $(READY)
@@ -74,5 +75,5 @@ dist: $(READY)
 	@du -h dist/*
 
 clean:
-	rm -rf .venv docs/_build build dist *.egg-info demo-out bench-out .pytest_cache .ruff_cache .hypothesis .benchmarks
+	rm -rf .venv docs/_build build dist *.egg-info demo-out bench-out .pytest_cache .ruff_cache .hypothesis
 	find mapctl priors controllers scenes tests -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -42,22 +42,16 @@ HAN = {
 """The same in Chinese and Japanese."""
 
 
-@pytest.mark.parametrize(
-    ("name", "side", "part"),
-    [(name, *key) for table in (NAMES, HAN) for key, names in table.items() for name in names.split()],
-)
-def test_role_of_every_way_to_name_it(name, side, part):
-    assert classify_joint(name) == Role(side, part)
+@pytest.mark.parametrize("table", [NAMES, HAN], ids=["latin", "han"])
+def test_role_of_every_way_to_name_it(table):
+    for (side, part), names in table.items():
+        assert {name: classify_joint(name) for name in names.split()} == dict.fromkeys(names.split(), Role(side, part))
 
 
 def test_the_other_sides_joint_is_the_same_part_of_the_other_side():
     other = {Side.LEFT: Side.RIGHT, Side.RIGHT: Side.LEFT, Side.MIDDLE: Side.MIDDLE}
     for name in CANONICAL.names:
         assert classify_joint(mirror_name(name)) == Role(other[classify_joint(name).side], classify_joint(name).part)
-
-
-def test_no_canonical_joint_is_unknown():
-    assert Part.OTHER not in {r.part for r in classify_joints(CANONICAL)}
 
 
 def test_a_shoulder_below_a_collar_is_the_upper_arm_and_a_hip_without_thigh_the_upper_leg():

@@ -2,13 +2,11 @@
 
 from dataclasses import replace
 
-import pytest
 import torch
 from captures import on_rig
 from helpers import walk
 
 from mapctl import motion_dna, rotations
-from mapctl.errors import RequestError
 
 
 def test_poses_are_those_of_the_motion_apart_in_time():
@@ -25,13 +23,6 @@ def test_poses_are_those_of_the_motion_apart_in_time():
     torch.testing.assert_close(dna.poses, still.joint_positions()[chosen].float())
 
 
-def test_the_fastest_frames_come_first():
-    motion = walk(100)
-    quats = motion.local_quat_xyzw[:1].repeat(100, 1, 1)
-    quats[60:] = rotations.multiply(quats[60:], rotations.about_y(torch.tensor(0.5).double()).expand(40, 21, 4))
-    assert int(motion_dna.choose_frames(quats, 1)) in (59, 60)
-
-
 def test_where_the_hips_are_and_face_does_not_matter():
     motion = walk(60)
     quats = motion.local_quat_xyzw.clone()
@@ -44,19 +35,6 @@ def test_another_rig_s_poses_are_of_the_canonical_size():
     own, other = (motion_dna.of(on_rig(rig, 60), 4).poses for rig in ("canonical", "daz"))
     assert own.shape == other.shape
     assert float((own - other).norm(dim=-1).max()) < 0.25
-
-
-def test_a_short_motion_has_as_many_poses_as_frames_at_most():
-    assert len(motion_dna.of(walk(3), 8).poses) == 3
-    both = motion_dna.join([motion_dna.of(walk(60), 3), motion_dna.of(walk(60), 2)])
-    assert len(both.poses) == 5
-
-
-def test_nothing_is_no_style():
-    with pytest.raises(RequestError, match="at least one pose"):
-        motion_dna.of(walk(20), 0)
-    with pytest.raises(RequestError, match="at least one motion"):
-        motion_dna.join([])
 
 
 def test_a_t_pose_before_a_take_is_none_of_its_poses():

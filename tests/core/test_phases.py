@@ -9,7 +9,7 @@ from helpers import CADENCE, walk
 
 from mapctl.contacts.phases import REACH, compute_phases, mirror_phases, reversed_phases
 from mapctl.errors import RequestError
-from mapctl.features import LAYOUT, encode, mirror_features, reversed_features
+from mapctl.features import LAYOUT, encode, reversed_features
 
 PERIODS = [(30, 0.6), (33, 0.6), (22, 0.35), (40, 0.65)]
 each_gait = pytest.mark.parametrize(("period", "duty"), PERIODS)
@@ -58,16 +58,6 @@ def test_the_phase_is_0_amid_the_stance_and_180_amid_the_swing(period, duty):
     assert apart(np.interp(swing, frame, angle), 180) < 8
 
 
-@each_gait
-def test_toes_of_a_walk_are_half_a_period_apart(period, duty):
-    angle = angles(compute_phases(steps(8 * period, period, duty)))[2 * period : 6 * period]
-    # an odd period has no half in whole frames, and a stance runs ahead where the other's swing runs behind
-    assert abs(apart(angle[:, 0], angle[:, 1]).mean() - 180) < 25
-    shift = period // 2
-    if period % 2 == 0:
-        assert apart(angle[shift:, 1], angle[:-shift, 0]).max() < 5
-
-
 def test_the_procedural_walk_steps_at_its_cadence():
     for cadence in (0.8 * CADENCE, CADENCE):
         planted = LAYOUT.pick(encode(walk(240, turn_rate=0.4, cadence=cadence))[0], "contacts")
@@ -113,14 +103,6 @@ def test_in_a_window_cut_out_they_differ_near_its_ends_alone(period, duty):
     assert error[20:-20].max() < 10
 
 
-def test_backwards_the_phase_runs_the_other_way():
-    planted = steps(150, 30, 0.6, begin=7.0)
-    there, back = compute_phases(planted), compute_phases(planted.flip(0))
-    torch.testing.assert_close(back, there.flip(0) * torch.tensor([1.0, -1, 1, -1]).double(), atol=1e-9, rtol=0)
-    assert (np.diff(angles(back)[REACH:-REACH], axis=0) > 0).all()  # it is a walk, too
-    assert (np.diff(angles(reversed_phases(there))[REACH:-REACH], axis=0) > 0).all()
-
-
 def test_beside_reversed_features_they_are_reversed_phases():
     features = encode(walk(240, turn_rate=0.4))[0]
     there, back = (compute_phases(LAYOUT.pick(each, "contacts")) for each in (features, reversed_features(features)))
@@ -131,24 +113,6 @@ def test_beside_reversed_features_they_are_reversed_phases():
     batch = torch.stack([there, mirror_phases(there)])
     assert torch.equal(reversed_phases(batch)[0], found)
     torch.testing.assert_close(reversed_phases(found)[1:], there[1:])
-
-
-def test_mirroring_exchanges_the_toes():
-    features = encode(walk(120, turn_rate=0.4))[0]
-    there = compute_phases(LAYOUT.pick(features, "contacts"))
-    mirrored = compute_phases(LAYOUT.pick(mirror_features(features), "contacts"))
-    torch.testing.assert_close(mirror_phases(there), mirrored, atol=1e-12, rtol=0)
-    assert torch.equal(mirrored, there[:, [2, 3, 0, 1]])
-    assert not torch.equal(mirrored, there)
-
-
-def test_the_same_contacts_give_the_same_bytes_whatever_their_type():
-    planted = steps(100, 30, 0.6)
-    once = compute_phases(planted)
-    assert torch.equal(compute_phases(planted), once)
-    assert torch.equal(compute_phases(planted.float()), once)
-    assert once.dtype == torch.float64
-    assert once.shape == (100, 4)
 
 
 @pytest.mark.parametrize("wrong", [torch.zeros(0, 2), torch.tensor([[0.0, math.nan], [1.0, 1.0]])])

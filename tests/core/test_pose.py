@@ -6,7 +6,7 @@ from captures import apart_deg
 from helpers import finite_difference, generator, moved, walk
 
 from mapctl.features import LAYOUT, GroundPose, encode
-from mapctl.pose import BodyPose, decode
+from mapctl.pose import BodyPose
 from mapctl.skeleton import CANONICAL, Skeleton
 
 TALL = Skeleton(CANONICAL.names, CANONICAL.parents, 1.3 * CANONICAL.offsets)
@@ -50,31 +50,6 @@ def test_features_are_those_of_encode(motion):
     difference = (found - wanted).abs()
     difference[0, LAYOUT.slices["heading_change"]] %= 2 * torch.pi
     assert difference.max() < 1e-4
-
-
-def test_decode_is_the_inverse_of_encode(motion):
-    features, before = encode(motion)
-    again = decode(features, before)
-    assert (again.joint_positions() - motion.joint_positions()).abs().max() < 1e-9
-
-
-def test_in_place_it_is_the_same_body_at_the_origin(motion):
-    features, before = encode(motion)
-    there, here = BodyPose.of_features(features, before), BodyPose.of_features_in_place(features)
-    assert torch.equal(here.root_position[:, 1], there.root_position[:, 1])
-    assert not here.root_position[:, ::2].any()
-    assert not here.heading.any()
-    assert torch.equal(here.rotation_vectors, there.rotation_vectors)
-
-
-def test_packing_slicing_and_batches(motion):
-    pose = BodyPose.of_motion(motion)
-    batch = BodyPose.unpack(pose.pack().expand(2, 3, -1, -1))
-    assert batch.joints_world().shape == (2, 3, 40, CANONICAL.num_joints, 3)
-    assert torch.equal(batch.joints_world()[1, 2], pose.joints_world())
-    assert torch.equal(batch.slice(5, 9).pack()[0, 0], pose.pack()[5:9])
-    assert torch.equal(batch.local_quat_xyzw[1, 1], pose.local_quat_xyzw)
-    assert torch.equal(BodyPose.unpack(pose.pack()).angles, pose.angles)
 
 
 def test_gradients_of_joint_positions_are_finite_differences(motion):

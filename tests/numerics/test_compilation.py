@@ -1,14 +1,10 @@
-"""Compiling kernels: who hears of it, what is kept, and the command that does it ahead."""
+"""Compiled kernels: what is kept on disk, and the command that compiles ahead."""
 
 import os
 import subprocess
 import sys
 
 import pytest
-from helpers import run
-
-from mapctl.commands.shared.progress_bar import show_progress
-from mapctl.numerics import compilation
 
 KERNEL = """
 import sys
@@ -67,52 +63,6 @@ def test_damaged_code_is_compiled_anew(tmp_path, ending):
         file.write_bytes(b"")
     assert use_kernel(tmp_path).startswith("[(1, 1, True), (1, 1, False)] ")
     assert use_kernel(tmp_path).startswith("[] ")
-
-
-def test_progress_lines_say_when_kernels_are_compiled(monkeypatch, capsys):
-    monkeypatch.setenv("MAPCTL_PROGRESS", "1")
-    with show_progress("walking") as progress:
-        compilation.announce(3, 7, begins=True)
-        compilation.announce(3, 7, begins=False)
-        progress(1, 2)
-    compilation.announce(4, 7, begins=True)
-    told = capsys.readouterr().err.splitlines()
-    assert told == [
-        "progress 2/7 compiling kernels, once",
-        "progress 3/7 compiling kernels, once",
-        "progress 1/2 walking",
-    ]
-
-
-@pytest.mark.parametrize("quiet", [False, True])
-def test_a_pipe_hears_nothing_of_kernels(quiet, capsys):
-    with show_progress("walking", quiet=quiet):
-        compilation.announce(1, 7, begins=True)
-    assert capsys.readouterr() == ("", "")
-
-
-def test_a_terminal_shows_a_bar_while_kernels_are_compiled(monkeypatch, capsys):
-    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
-    monkeypatch.setenv("TERM", "xterm")
-    with show_progress("walking"):
-        compilation.announce(3, 7, begins=True)
-        before = capsys.readouterr().err
-        compilation.announce(3, 7, begins=False)
-        after = capsys.readouterr().err
-    assert "compiling kernels, once" in before
-    assert "2/7" in before
-    assert "compiling" not in after.splitlines()[-1]
-    assert "walking" in after
-
-
-@pytest.mark.slow
-def test_the_command_says_what_it_compiled_and_where(capsys):
-    assert run("compile") == 0
-    first = capsys.readouterr().out
-    assert run("compile", "--quiet") == 0
-    assert capsys.readouterr().out == ""
-    assert first.startswith("kernels   ")
-    assert "kept in   /" in first
 
 
 @pytest.mark.slow
