@@ -43,12 +43,6 @@ def test_jobs_end_by_themselves_in_the_interface(facts):
     assert told == [[["INFO"], "new action: mixamoAction clean"]]
     assert notes == ["timer", "end", None]
     assert facts["modal failure"] == [["CANCELLED"], [[["ERROR"], "nobody walks here"]]]
-    assert facts["panel after a failure"][-1] == "nobody walks here"
-
-
-def test_what_is_wrong_at_once_is_told_at_once(facts):
-    message = "mixamo has no action: choose one in the Action Editor"
-    assert facts["failure at once"] == [[], [[["ERROR"], message]], True]
 
 
 def test_panel_has_every_operator(facts):

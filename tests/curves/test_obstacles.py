@@ -1,7 +1,5 @@
 """Discs and boxes on the ground: how far points are from them, against sampled outlines."""
 
-import math
-
 import pytest
 import torch
 from helpers import generator
@@ -48,25 +46,7 @@ def test_clearance_is_that_of_the_nearest_and_infinite_without_any():
     assert bool(measure_clearance((), points).isinf().all())
 
 
-def test_gradients_lead_away():
-    point = torch.tensor([0.5, -1.0], requires_grad=True)
-    SHAPES["disc"].distance(point).backward()
-    assert point.grad is not None
-    assert math.isclose(float(point.grad.norm()), 1.0, rel_tol=1e-5)
-
-
 @pytest.mark.parametrize("text", ["1,2", "a,b,c", "1,2,3,4", "0,0,0", "0,0,-1", "0,0,nan"])
 def test_what_is_no_disc_is_refused(text):
     with pytest.raises(RequestError):
         Obstacle.parse(text)
-
-
-def test_a_disc_is_parsed():
-    assert Obstacle.parse("0.5,-2,0.3") == Obstacle((0.5, -2.0), 0.3)
-
-
-def test_an_obstacle_is_a_disc_or_a_box():
-    with pytest.raises(RequestError, match="one of them"):
-        Obstacle((0, 0))
-    with pytest.raises(RequestError, match="one of them"):
-        Obstacle((0, 0), 1.0, (1.0, 1.0))

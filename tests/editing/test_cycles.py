@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers import generator, walk
+from helpers import walk
 
 from mapctl import editing, rotations
 from mapctl.errors import RequestError
@@ -46,16 +46,6 @@ def test_standing_before_and_after_is_no_cycle_of_a_walk():
     assert cycle.stop <= 155
 
 
-def test_a_limp_is_told_from_an_even_walk():
-    motion = walk(120, cadence=1.0)
-    knee = motion.skeleton.index("leftLowerLeg")
-    local = motion.local_quat_xyzw.clone()
-    local[:, knee] = rotations.from_rotation_vector(torch.tensor([0.5, 0.0, 0.0]).double()).expand(120, 4)
-    limp = replace(motion, local_quat_xyzw=local)
-    even, uneven = (editing.describe_cycle(m, editing.find_cycle(m))["asymmetry_cm"] for m in (motion, limp))
-    assert uneven > 1.5 * even
-
-
 def test_a_body_on_the_spot_has_a_cycle_that_is_no_gait():
     motion = walk(150, cadence=0.5)
     still = replace(motion, root_position=motion.root_position * torch.tensor([0.0, 1.0, 0.0]).double())
@@ -76,13 +66,6 @@ def test_what_never_comes_back_is_refused_with_what_comes_nearest():
     root = motion.root_position + torch.stack([0 * shift, 0 * shift, shift], dim=-1)
     with pytest.raises(RequestError, match=r"frames \d+ and \d+ come nearest, .* [\d.]+ cm apart; [\d.]+ are allowed"):
         editing.find_cycle(replace(motion, local_quat_xyzw=local, root_position=root))
-
-
-def test_noise_has_none():
-    motion = stand(90)
-    noise = 0.5 * torch.randn(90, 21, 3, generator=generator(), dtype=torch.float64)
-    with pytest.raises(RequestError, match="no cycle is found"):
-        editing.find_cycle(replace(motion, local_quat_xyzw=rotations.from_rotation_vector(noise)))
 
 
 @pytest.mark.parametrize("frames", [1, 2, 5, 12])

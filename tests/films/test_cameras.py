@@ -26,13 +26,6 @@ def test_look_at_is_rigid_and_puts_the_target_in_the_middle(seed):
     assert depth == pytest.approx(np.linalg.norm(eye - target))
 
 
-def test_look_at_straight_down_has_z_downwards():
-    pose = look_at(np.array([0.0, 5, 0]), np.zeros(3))
-    view = View(pose, 0.8, 100, 100)
-    assert view.project(np.array([1.0, 0, 0]))[0] > 50
-    assert view.project(np.array([0.0, 0, 1]))[1] > 50
-
-
 @given(st.integers(0, 1000), st.sampled_from(["fixed", "top"]), st.floats(-180, 180), st.floats(0.4, 3.0))
 def test_fit_sees_everything_and_touches_two_opposite_edges(seed, kind, azimuth, aspect):
     points, fov = cloud(seed), 0.6
@@ -73,15 +66,6 @@ def test_a_following_camera_moves_and_a_fixed_one_does_not():
     assert np.ptp(eyes["fixed"], axis=0).max() == np.ptp(eyes["top"], axis=0).max() == 0
     assert 8 < np.ptp(eyes["follow"][:, 0]) <= 10
     assert np.ptp(eyes["follow"][:, 1:], axis=0).max() < 1e-9
-
-
-def test_zoom_shows_things_larger():
-    points = cloud(3)[None]
-    sizes = []
-    for zoom in (1.0, 2.0):
-        view = compute_views(CameraSettings(zoom=zoom), points, points[:, 0], fps=30.0, size=(160, 90))[0]
-        sizes.append(np.linalg.norm(view.pose[:3, 3] - points[0].mean(axis=0)))
-    assert sizes[1] < 0.75 * sizes[0]
 
 
 @pytest.mark.parametrize(

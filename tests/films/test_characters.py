@@ -1,36 +1,31 @@
 """Characters in films: their mesh is where the file's matrices have it, stands on the floor, and is in the picture."""
 
-import logging
 from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
 import pytest
-import torch
 from character_maker import make_character_glb
 from glb_viewer import GlbViewer
-from helpers import random_motion, turn_between
+from helpers import random_motion
 from helpers import walk as long_walk
 from scenes_walks import walk
 
 from mapctl import formats
 from mapctl.contacts import detect_contacts
-from mapctl.errors import FileFormatError, MapctlError, RequestError
+from mapctl.errors import FileFormatError, MapctlError
 from mapctl.mesh import colours
 from mapctl.mesh.character_mesh import CharacterMesh
 from mapctl.mesh.mannequin import Mannequin
 from mapctl.mesh.skinned_body import SkinnedBody
-from mapctl.retarget import to_canonical
 from mapctl.retarget.carry import RiggedCharacter, retarget_motion
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from scenes.cameras import CameraSettings
 from scenes.content import Figure
 from scenes.drawn_character import DrawnCharacter
-from scenes.film import film
 from scenes.renderers import offscreen
 from scenes.renderers.select import select_painter
 from scenes.stage import Shot, Stage
-from scenes.wishes import Wishes
 
 GREY = colours.rgb("slate")
 MAKES = {
@@ -123,25 +118,6 @@ def test_its_soles_are_on_the_floor_while_feet_are_planted(made, name):
     assert np.abs(lowest[planted]).mean() < 0.015
 
 
-def test_normals_are_unit_and_point_outside_after_posing(hero):
-    body = hero.put_on(long_walk(20)).build_body(Fraction(30), GREY)
-    surface = body.surface(11)
-    np.testing.assert_allclose(np.linalg.norm(surface.normals, axis=1), 1, atol=1e-5)
-    corners = surface.vertices[surface.faces]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    outward = np.einsum("fi,fi->f", across, surface.normals[surface.faces].mean(axis=1))
-    assert (outward > 0)[np.linalg.norm(across, axis=1) > 1e-6].mean() > 0.97
-
-
-def test_far_from_the_origin_it_is_as_exact(hero):
-    clip = hero.put_on(long_walk(5)).placed.motion
-    away = replace(clip, root_position=clip.root_position + torch.tensor([4000.0, 0.0, -3000.0]))
-    near, far = (
-        SkinnedBody(hero.mesh, motion, Mannequin(to_canonical(motion)[0], GREY)).surface(3) for motion in (clip, away)
-    )
-    np.testing.assert_allclose(far.vertices - [4000.0, 0.0, -3000.0], near.vertices, atol=1e-5)
-
-
 def test_a_motion_with_the_characters_bones_keeps_them_as_they_are(hero):
     """As `follow --rig hero.glb` solves: what the solver placed is drawn, to the micrometre."""
     solved = random_motion(hero.body.leveled, 6, seed=3)
@@ -153,36 +129,12 @@ def test_a_motion_with_the_characters_bones_keeps_them_as_they_are(hero):
     assert drawn.placed.bones is solved
 
 
-def test_a_creature_is_drawn_in_its_own_motion_and_takes_no_other(folder):
-    names = {joint: f"part{number}" for number, joint in enumerate(make_character_glb(folder / "x.glb").joint)}
-    made = make_character_glb(folder / "creature.glb", names=names, animations=("walk",))
-    creature, motion = DrawnCharacter.load(made.path), formats.load(made.path)
-    chain = replace(motion.skeleton, parents=(-1, *range(motion.num_joints - 1)))
-    strange = DrawnCharacter("creature.glb", creature.mesh, replace(creature.standing, skeleton=chain))
-    own = replace(motion, skeleton=chain)
-    body = strange.put_on(own).build_body(Fraction(30), GREY)
-    assert np.isfinite(vertices_of(body, 5)).all()
-    with pytest.raises(RequestError, match=r"^creature.glb: "):
-        strange.check_rig()
-    with pytest.raises(RequestError):
-        strange.put_on(walk())
-
-
 def test_what_is_no_character_is_refused(tmp_path):
     walk().save(tmp_path / "walk.bvh")
     with pytest.raises(FileFormatError, match=r"is no character's file"):
         DrawnCharacter.load(tmp_path / "walk.bvh")
     with pytest.raises(MapctlError):
         DrawnCharacter.load(tmp_path / "missing.glb")
-
-
-def test_mesh_and_motion_must_fit(hero):
-    clip = walk(4)
-    with pytest.raises(MapctlError, match="4 frames got 21 joints and 4 frames"):
-        SkinnedBody(hero.mesh, clip, Mannequin(clip, GREY))
-    placed = hero.put_on(clip).placed
-    with pytest.raises(MapctlError, match="and 3 frames got"):
-        SkinnedBody(hero.mesh, placed.motion, Mannequin(placed.bones.slice(0, 3), GREY))
 
 
 def test_a_film_at_another_rate_shows_the_character_there(hero):
@@ -192,21 +144,6 @@ def test_a_film_at_another_rate_shows_the_character_there(hero):
     assert stage.num_frames == 20
     same = drawn.build_body(Fraction(30), GREY)
     np.testing.assert_allclose(vertices_of(stage.players[0].body, 7), vertices_of(same, 21), atol=1e-6)
-
-
-@pytest.mark.slow
-def test_trail_marks_and_shadow_are_the_characters_own(folder):
-    clip = long_walk(90)
-    made = make_character_glb(folder / "child.glb", size=0.6)
-    drawn = DrawnCharacter.load(made.path).put_on(clip)
-    plain, dressed = Stage([Shot(clip)]), Stage([Shot(clip, drawn=drawn)])
-    ways = [stage.players[0].trail.vertices[:, 2].max() for stage in (plain, dressed)]
-    assert 0.5 < ways[1] / ways[0] < 0.75, "a child goes less far"
-    hips = dressed.players[0].body.anatomy.hips_world
-    assert hips[:, 1].mean() == pytest.approx(0.6 * 0.97, abs=0.05)
-    assert dressed.players[0].planted.mean() == pytest.approx(plain.players[0].planted.mean(), abs=0.15)
-    ends, radii, rgb = dressed.players[0].body.sticks(40)
-    assert len(ends) == len(radii) == len(rgb) > 10
 
 
 @pytest.mark.slow
@@ -223,35 +160,6 @@ def test_all_of_a_character_is_in_view(folder):
         at = view.project(vertices_of(body, frame))
         assert (at[:, :2] > 0).all()
         assert (at[:, :2] < [160, 90]).all()
-
-
-@pytest.mark.slow
-def test_ghosts_are_paler_and_keep_opacity(folder):
-    made = make_character_glb(folder / "hat.glb", hat=True)
-    drawn = DrawnCharacter.load(made.path).put_on(walk(8))
-    body = drawn.build_body(Fraction(12), GREY)
-    plain, ghost = Figure(body, 3).surface(), Figure(body, 3, fade=0.5).surface()
-    background = colours.rgb(colours.BACKGROUND)
-    np.testing.assert_allclose(ghost.rgba[:, :3], (plain.rgba[:, :3] + background) / 2, atol=1e-6)
-    np.testing.assert_array_equal(ghost.rgba[:, 3], plain.rgba[:, 3])
-    assert set(plain.rgba[:, 3]) == {0.5, 1.0}
-    assert ghost.is_open
-
-
-@pytest.mark.slow
-def test_poses_that_are_asked_for_are_shown_with_the_mesh(hero):
-    clip = long_walk(40)
-    pose = replace(clip.slice(20, 21), root_position=clip.root_position[20:21] + torch.tensor([1.0, 0.0, 0.0]))
-    drawn = hero.put_on(clip)
-    stage = Stage([Shot(clip, wishes=Wishes(poses=[pose]), drawn=drawn)])
-    (veil,) = stage.content(0).veils
-    there, here = veil.surface(), stage.players[0].body.surface(20)
-    assert len(there.vertices) == len(here.vertices)
-    apart = (there.vertices - here.vertices).mean(axis=0)
-    scale = drawn.placed.bones.root_position[39, 2] / clip.root_position[39, 2]
-    np.testing.assert_allclose(apart, [float(scale), 0.0, 0.0], atol=0.06)
-    bodies = [drawn.placed.bones.joint_rotations()[20], drawn.place(pose).bones.joint_rotations()[0]]
-    assert turn_between(bodies[0][CANONICAL.index("leftLowerArm")], bodies[1][CANONICAL.index("leftLowerArm")]) < 1e-6
 
 
 @needs_graphics
@@ -298,16 +206,3 @@ def test_one_sees_through_what_is_not_opaque_and_into_what_is_open(folder):
     assert front[2] > 60
     assert back[0] > 100, "from behind too"
     assert back[2] < 90
-
-
-@pytest.mark.slow
-def test_stick_figures_say_that_they_show_no_mesh(hero, tmp_path, caplog):
-    clip = walk(3)
-    with caplog.at_level(logging.WARNING):
-        film([Shot(clip, drawn=hero.put_on(clip))], tmp_path / "x.png", size=(96, 64), renderer="stick")
-    assert [record.message for record in caplog.records] == [
-        "stick figures show no mesh: characters are drawn by their bones"
-    ]
-    caplog.clear()
-    film([Shot(clip)], tmp_path / "y.png", size=(96, 64), renderer="stick")
-    assert caplog.records == []

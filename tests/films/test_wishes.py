@@ -1,36 +1,19 @@
 """What actors are asked for, in films: marks are strong at their time, poses are bodies that one sees through."""
 
-import math
 from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
 import pytest
-import torch
 from helpers import moved
-from helpers import walk as walk_ahead
 from scenes_walks import walk
 
-import priors
-from controllers.common.character import Character
-from controllers.shots.keys.posing import MetPose
-from controllers.shots.planning.way import plan_way
-from controllers.shots.request import Look, PoseKey, Reach, ShotRequest
-from controllers.shots.shot import ShotSolution
-from mapctl import curves
-from mapctl.commands.shared.shots.plan import ShotPlan
-from mapctl.commands.shared.shots.play import PlayedShot
-from mapctl.commands.shared.shots.stage import build_obstacles, stage_actor
-from mapctl.curves.obstacles import Obstacle
 from mapctl.mesh import colours
-from mapctl.problem.ledger import Ledger
-from mapctl.problem.solution import Outcome, Status
 from scenes.cameras import CameraSettings
 from scenes.content import Content
-from scenes.props import build_hips_mark, build_look_mark, build_target
+from scenes.props import build_target
 from scenes.renderers import offscreen
 from scenes.renderers.select import select_painter
-from scenes.scene_file import Actor
 from scenes.stage import Shot, Stage
 from scenes.wishes import Mark, Wishes
 
@@ -89,41 +72,3 @@ def test_a_pose_is_as_high_as_the_actors_body_in_it():
     apart = np.linalg.norm(figure.surface().vertices - own.vertices, axis=1)
     assert apart.max() < 0.03
     assert apart.min() > 0.005, "around it"
-
-
-def test_a_place_has_an_arrow_where_it_tells_a_facing():
-    place = np.array([1.0, 2.0])
-    disc, arrow = build_hips_mark(place, None), build_hips_mark(place, math.pi / 2)
-    assert np.abs(disc.vertices[:, [0, 2]] - place).max() < 0.2
-    tip = arrow.vertices[arrow.vertices[:, 0].argmax()]
-    assert tip[[0, 2]] == pytest.approx([1.48, 2.0], abs=0.01)
-    assert len(arrow.faces) > len(disc.faces)
-    assert build_look_mark((1.0, 2.0, 3.0)).vertices.mean(axis=0) == pytest.approx([1.0, 2.0, 3.0])
-
-
-def test_a_shot_on_stage_shows_all_that_it_was_asked_for():
-    motion, crouched = walk_ahead(90), walk_ahead(1)
-    keys = (PoseKey(1.0, crouched), PoseKey(2.0, facing_deg=40.0), PoseKey(2.5, crouched, root_only=True))
-    frames = zip(keys, (32, 60, 75), strict=True)
-    met = tuple(MetPose(key, motion.slice(at, at + 1), at, at + 4) for key, at in frames)
-    wall = Obstacle((3.0, 3.0), 0.3)
-    request = ShotRequest(curves.line(length=3), looks=(Look(0.5, (2.0, 1.0, 2.0), 0.2),), obstacles=(wall,))
-    reaches = (Reach(1.5, {"leftHand": (0.4, 1.2, 1.5), "rightHand": (-0.4, 1.2, 1.5)}, 0.5),)
-    plan = ShotPlan(Actor(curve="line:3"), request, priors.load("locomotion"), Character(), Fraction(30))
-    solution = ShotSolution(motion, Status(Outcome.DONE), Ledger(), way=plan_way(request), reaches=reaches, met=met)
-    done = PlayedShot(plan, solution)
-    shot = stage_actor(done, colour="teal", start_seconds=2.0)
-    assert (shot.colour, shot.start_seconds, shot.motion) == ("teal", 2.0, motion)
-    assert [mark.seconds for mark in shot.wishes.marks] == [
-        (1.5, 2.0),
-        (1.5, 2.0),
-        (0.5, 0.7),
-        pytest.approx((2.0, 2.1)),
-        pytest.approx((2.5, 2.6)),
-    ]
-    assert shot.wishes.marks[1].surface.vertices.mean(axis=0) == pytest.approx([-0.4, 1.2, 1.5])
-    hips = motion.root_position[60, ::2]
-    assert np.abs(shot.wishes.marks[3].surface.vertices[:25, [0, 2]].mean(axis=0) - hips.numpy()).max() < 0.02
-    (pose,) = shot.wishes.poses
-    torch.testing.assert_close(pose.root_position, motion.root_position[32:33])
-    assert len(build_obstacles([done, done])) == 1, "each obstacle once"

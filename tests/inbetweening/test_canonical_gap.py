@@ -10,10 +10,10 @@ from helpers import walk
 from controllers.common.canonical_clip import CanonicalClip
 from mapctl import retarget
 from mapctl.inbetweening.missing import MissingMask
-from mapctl.recording.masks import ALL, ROOT, Mask
+from mapctl.recording.masks import ROOT, Mask
 from mapctl.skeleton import CANONICAL
 
-RATES = (10, 24, 25, 30, 50, 60, 120)
+RATES = (10, 24, 30, 50, 120)
 
 
 def keyed(motion, keys, *, hips=()):
@@ -38,7 +38,7 @@ def known(gap):
 
 
 @pytest.mark.parametrize("fps", RATES)
-@pytest.mark.parametrize("spare", [0, 1, 2, 3])
+@pytest.mark.parametrize("spare", [0, 3])
 def test_times_rise_and_reach_the_end(fps, spare):
     motion = walk(fps + spare, fps=fps)
     gap = gap_of(motion, keyed(motion, (0, motion.num_frames - 1)))
@@ -64,19 +64,7 @@ def test_a_key_at_any_frame_is_one_moment_with_its_own_pose_and_time(fps):
         assert gap.known_positions[moment].all()
 
 
-@pytest.mark.parametrize("fps", [24, 30, 120])
-def test_several_keys_are_each_shown_and_runs_of_them_too(fps):
-    motion = walk(2 * fps, fps=fps)
-    keys = (0, fps // 3, fps // 2 + 1, fps + 1, *range(fps + fps // 2, fps + fps // 2 + fps // 10), 2 * fps - 1)
-    gap = gap_of(motion, keyed(motion, keys))
-    assert (torch.diff(gap.seconds) > 0).all()
-    shown = gap.seconds[known(gap)] * fps
-    at_a_moment = [key for key in keys if (shown - key).abs().min() < 1e-9]
-    assert set(keys[:4]) <= set(at_a_moment)
-    assert all((shown - key).abs().min() <= 0.5 * fps / 30 + 1e-9 for key in keys)
-
-
-@pytest.mark.parametrize("key", [60, 61, 62, 63])
+@pytest.mark.parametrize("key", [60, 61])
 def test_a_frame_that_tells_the_hips_alone_is_shown_too(key):
     motion = walk(120, fps=120)
     gap = gap_of(motion, keyed(motion, (0, 119), hips=(key,)))
@@ -85,12 +73,6 @@ def test_a_frame_that_tells_the_hips_alone_is_shown_too(key):
     assert not gap.missing.joints[moment, 0]
     assert gap.missing.joints[moment, 1:].all()
     assert torch.equal(gap.motion.root_position[moment], motion.root_position[key])
-
-
-def test_a_frame_that_tells_all_is_shown_rather_than_a_nearer_one_that_tells_less():
-    motion = walk(120, fps=120)
-    gap = gap_of(motion, keyed(motion, (0, 62, 119), hips=(61,)))
-    assert 62 in (gap.seconds[known(gap)] * 120).round().tolist()
 
 
 @pytest.mark.parametrize("fps", [30, 50, 120])
@@ -122,17 +104,6 @@ def test_joints_that_are_lost_throughout_are_lost_in_every_moment(rig, fps):
     assert places[:, CANONICAL.index("rightHand")].all()
 
 
-def test_the_edges_of_a_gap_are_shown_while_a_joint_is_lost_throughout():
-    motion = walk(120, fps=120)
-    _, rigmap = retarget.to_canonical(motion)
-    lost = MissingMask.of_masks(motion, [Mask("leftHand", 0, 120), Mask(ALL, 50, 70)], rigmap)
-    gap = gap_of(motion, lost)
-    at = gap.seconds * 120
-    inside = (at > 49.5) & (at < 69.5)
-    assert (gap.missing.root == inside).all()
-    assert at[~inside].round().tolist()[12:14] == [48, 70]
-
-
 def test_a_place_is_known_only_with_all_that_carries_it():
     motion = walk(30)
     _, rigmap = retarget.to_canonical(motion)
@@ -143,9 +114,3 @@ def test_a_place_is_known_only_with_all_that_carries_it():
     unknown = {CANONICAL.names[joint] for joint in (~gap.known_positions[6]).nonzero()[:, 0].tolist()}
     assert {"head", "leftHand", "neck"} <= unknown
     assert not unknown & {"hips", "leftFoot", "rightToes"}
-
-
-def test_a_larger_performer_is_told():
-    motion = walk(30)
-    large = replace(motion, skeleton=replace(motion.skeleton, offsets=1.3 * motion.skeleton.offsets))
-    assert gap_of(large, keyed(large, (0, 29))).scale == pytest.approx(1.3)

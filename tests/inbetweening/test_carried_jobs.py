@@ -1,7 +1,5 @@
 """The jobs that bring motion of one rig to another all stand it on the other's floor."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 from helpers import bandai_skeleton, generator
@@ -55,14 +53,3 @@ def test_a_borrowed_foot_is_as_high_as_it_was():
     done = blend(motion, source, borrowed, SlerpInbetweener(), settings=UNFINISHED)
     before, after = (retarget.to_canonical(m)[0].joint_positions()[40:60, FEET[0]] for m in (motion, done.motion))
     torch.testing.assert_close(after, before, atol=0.015, rtol=0)
-
-
-def test_a_clip_of_the_same_rig_is_blended_as_it_is():
-    motion = own_walk()
-    name = foot_of(motion)
-    lifted = replace(motion, root_position=motion.root_position + 0.2)
-    done = blend(
-        motion, lifted, LimbTransfer((name,), start=40, stop=60, at=40), SlerpInbetweener(), settings=UNFINISHED
-    )
-    before, after = (retarget.to_canonical(m)[0].joint_positions()[40:60, FEET[0]] for m in (motion, done.motion))
-    torch.testing.assert_close(after, before, atol=1e-4, rtol=0)

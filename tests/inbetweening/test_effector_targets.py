@@ -1,13 +1,9 @@
 """Places that hands and feet are wanted at: met to the hair, nothing else moved, smoothly there and back."""
 
-from dataclasses import replace
-
 import pytest
 import torch
-from captures import apart_deg
 from helpers import generator, quat_xyzw, walk
 
-from mapctl.errors import RequestError
 from mapctl.inbetweening.effector_targets import EffectorTargets, compute_target_errors, reach_effector_targets
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL, LIMBS
@@ -93,13 +89,6 @@ def test_only_the_limb_turns_and_only_where_it_is_free(limb):
     assert torch.equal(made.root_position, motion.root_position)
 
 
-def test_a_place_in_a_frame_that_is_not_free_is_let_be():
-    motion, free = walk(40), torch.zeros(40, dtype=torch.bool)
-    free[10:20] = True
-    made = reach_effector_targets(motion, at(motion, {(30, "leftHand"): nearer(motion, 30, "leftHand")}), free)
-    assert torch.equal(made.local_quat_xyzw, motion.local_quat_xyzw)
-
-
 @pytest.mark.parametrize("fps", [30, 120])
 def test_a_limb_goes_there_and_back_smoothly(fps):
     """Far away nothing is left of the offset, and no step is a leap."""
@@ -182,32 +171,6 @@ def test_a_bent_limb_stays_in_its_plane():
     assert float(after[0]) > 2 * float(after[2])
 
 
-def test_a_place_where_the_limb_is_turns_nothing():
-    motion = walk(31)
-    made = reach_effector_targets(
-        motion, at(motion, {(15, "leftFoot"): place_of(motion, 15, "leftFoot")}), all_free(motion)
-    )
-    assert apart_deg(made.local_quat_xyzw, motion.local_quat_xyzw).max() < 1e-6
-
-
-@pytest.mark.parametrize("frames", [1, 2, 3, 4])
-def test_motions_of_a_few_frames_are_met_too(frames):
-    motion = walk(frames)
-    targets = at(motion, {(frames - 1, "leftHand"): nearer(motion, frames - 1, "leftHand")})
-    assert (
-        compute_target_errors(
-            reach_effector_targets(motion, targets, all_free(motion)).joint_positions(), targets
-        ).max()
-        < HAIR
-    )
-
-
-@pytest.mark.parametrize("joint", ["hips", "head", "leftLowerArm", "rightToes"])
-def test_joints_that_are_no_hand_or_foot_are_refused(joint):
-    with pytest.raises(RequestError, match=f"effector targets are for leftHand, .*; {joint} has none"):
-        reach_effector_targets(walk(5), at(walk(5), {(2, joint): torch.zeros(3).double()}), all_free(walk(5)))
-
-
 @pytest.mark.parametrize("fps", [24, 30, 120])
 def test_every_wanted_place_is_shown_at_the_moment_nearest_to_it(fps):
     motion = walk(2 * fps, fps=fps)
@@ -220,22 +183,3 @@ def test_every_wanted_place_is_shown_at_the_moment_nearest_to_it(fps):
         (moment,) = (shown.places[:, hand, 0] == frame).nonzero()[:, 0].tolist()
         assert shown.wanted[moment, hand]
         assert abs(moments[moment] - frame / fps) <= (moments - frame / fps).abs().min() + 1e-12
-
-
-def test_at_the_same_moments_the_same_places_are_shown():
-    motion = walk(30)
-    targets = at(motion, {(7, "leftHand"): torch.ones(3).double(), (9, "rightFoot"): torch.zeros(3).double()})
-    shown = targets.shown(torch.arange(30).double() / 30, fps=30)
-    assert torch.equal(shown.wanted, targets.wanted)
-    assert torch.equal(shown.places, targets.places)
-
-
-def test_what_stands_where_no_place_is_wanted_does_not_matter():
-    motion = walk(40)
-    targets = at(motion, {(20, "leftHand"): nearer(motion, 20, "leftHand")})
-    wild = replace(targets, places=torch.where(targets.wanted[..., None], targets.places, 50.0))
-    made, other = (reach_effector_targets(motion, each, all_free(motion)) for each in (targets, wild))
-    assert torch.equal(made.local_quat_xyzw, other.local_quat_xyzw)
-    assert torch.equal(
-        compute_target_errors(motion.joint_positions(), targets), compute_target_errors(motion.joint_positions(), wild)
-    )

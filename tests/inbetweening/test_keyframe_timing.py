@@ -11,8 +11,8 @@ import priors
 from controllers.inbetweening import keyframe_timing
 from mapctl.errors import RequestError
 from mapctl.inbetweening.missing import MissingMask, restore_observed
-from mapctl.inbetweening.pose_pairs import PAIR_FEATURES, compute_pair_features, sample_pose_pairs
-from mapctl.intent.keyframes import Key, Keys
+from mapctl.inbetweening.pose_pairs import PAIR_FEATURES, sample_pose_pairs
+from mapctl.intent.keyframes import Keys
 
 KEYS = Keys((0, 20, 50, 89))
 
@@ -87,23 +87,6 @@ def test_a_timing_that_nobody_would_take_is_named_with_numbers(metres, verdict):
     assert f"mocap mostly takes {interval.usual[0]} to {interval.usual[1]} frames" in interval.reason
     assert interval.summary()["reason"] == interval.reason
     assert interval.given_speed == pytest.approx(interval.metres * 30 / 31)
-
-
-def test_about_in_place_no_speed_is_told():
-    (interval,) = suggest_intervals(walk(40), Keys((0, 3)))
-    assert "about in place (0." in interval.reason
-    assert "m/s" not in interval.reason
-
-
-def test_keys_that_tell_less_than_a_pose_lie_within():
-    keys = Keys((0, Key(20, limbs=("leftHand",)), 50, Key(70, root_only=True), 89))
-    assert frames(suggest_intervals(walk(90), keys)) == frames(suggest_intervals(walk(90), Keys((0, 50, 89))))
-
-
-def test_features_have_names():
-    features = compute_pair_features(walk(20), torch.tensor([0, 3]), torch.tensor([9, 19]))
-    assert features.shape == (2, len(PAIR_FEATURES))
-    assert features.isfinite().all()
 
 
 def test_pairs_are_as_long_as_asked_for_and_clips_that_are_too_short_give_none():

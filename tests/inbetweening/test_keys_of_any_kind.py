@@ -15,7 +15,7 @@ from controllers.inbetweening.geometry.drawn_poses import fit_drawings, measure_
 from controllers.inbetweening.keyframes import missing_between_keys
 from controllers.inbetweening.tween import measure_keyframe_errors, tween
 from mapctl import rotations
-from mapctl.inbetweening.loose_keys import LooseKeys, estimate_size, lead_over_places, view_axes
+from mapctl.inbetweening.loose_keys import LooseKeys, view_axes
 from mapctl.inbetweening.missing import restore_observed
 from mapctl.intent.keyframes import Drawing, Key, Keys
 from mapctl.kinematics import heading
@@ -90,15 +90,6 @@ def test_places_alone_are_met_and_nothing_else_of_the_motion_counts(rig, fps, me
 
 
 @pytest.mark.slow
-def test_places_are_met_after_the_map_stage_and_beside_whole_poses():
-    motion = on_rig("bandai", LAST)
-    keys = Keys((0, Key(20, **PLACE), Key(44, half="lower")))
-    made = tween(motion, keys, tiny_tweener())
-    assert all(row["missed_cm"] < 0.1 for row in measure_keyframe_errors(made.motion, motion, keys))
-    assert made.windows
-
-
-@pytest.mark.slow
 def test_only_the_ground_is_told_by_a_place():
     """Another height and another pose in its frame change no bit."""
     motion = on_rig("canonical", LAST)
@@ -111,20 +102,6 @@ def test_only_the_ground_is_told_by_a_place():
     first, second = (tween(each, keys, tiny_tweener(), settings=UNFINISHED).motion for each in (motion, other))
     assert torch.equal(first.root_position, second.root_position)
     assert torch.equal(first.local_quat_xyzw, second.local_quat_xyzw)
-
-
-def test_the_way_leads_straight_and_looks_along_itself_where_no_heading_is_told():
-    ground = torch.zeros(1, 9, 2).double()
-    ground[0, 4], ground[0, 8] = torch.tensor([0.0, 2.0]), torch.tensor([2.0, 2.0])
-    placed = torch.zeros(1, 9, dtype=torch.bool)
-    placed[0, [0, 4, 8]] = True
-    never = torch.zeros_like(placed)
-    way, facing = lead_over_places(ground, torch.full((1, 9), 9.0).double(), placed=placed, faced=never)
-    assert way[0, [2, 6]].tolist() == [[0.0, 1.0], [1.0, 2.0]]
-    assert torch.rad2deg(facing[0, [0, 2, 4, 8]]).tolist() == pytest.approx([0, 22.5, 45, 90])
-    told = never.clone()
-    told[0, 3] = True
-    assert (lead_over_places(ground, torch.full((1, 9), 1.0).double(), placed=placed, faced=told)[1] == 1.0).all()
 
 
 def test_a_viewer_in_front_sees_the_left_hand_on_the_right():
@@ -158,34 +135,6 @@ def test_a_drawn_pose_comes_to_look_so(view_deg):
     assert float((seen - wanted).norm(dim=-1).mean()) < 0.08
 
 
-def test_a_drawing_shows_by_its_bones_how_large_it_is():
-    arm = CANONICAL.indices(("leftUpperArm", "leftLowerArm", "leftHand"))
-    flat = torch.tensor([[0.0, 0.0], [24.33, 0.0], [24.33, 11.0]]).double()  # the lower arm leads half away
-    assert estimate_size(flat, arm, CANONICAL) == pytest.approx(0.01, rel=1e-3)
-
-
-def test_drawings_from_other_sides_are_told_as_far_as_they_show():
-    motion = on_rig("canonical", LAST)
-    loose = LooseKeys.none(LAST, CANONICAL.num_joints)
-    for frame, view in ((5, 30.0), (15, 210.0), (25, 120.0)):
-        loose.view[frame], loose.drawn[frame] = math.radians(view), True
-        drawn = drawing_of(motion, frame, view_deg=view, unit=1.0).places_xy
-        loose.sketch[frame] = torch.tensor([drawn[name] for name in CANONICAL.names])
-    seen = loose.see_from_one_side(motion.skeleton)
-    assert seen.view == pytest.approx(math.radians(30))
-    assert seen.known[5, :, :2].all()
-    assert seen.known[15, :, :2].all()
-    assert seen.known[25, :, 1].all()
-    assert not seen.known[25, :, 0].any()
-    assert not seen.known[..., 2].any()
-    axes = view_axes(torch.tensor(math.radians(30)).double())
-    for frame in (5, 15):
-        wanted = (motion.joint_positions()[frame] - motion.root_position[frame]) @ axes.mT
-        away = seen.places[frame, :, :2] - wanted
-        assert float((away - away.mean(dim=0)).abs().max()) < 0.06
-        assert float(seen.places[frame, 0, 0]) == pytest.approx(0, abs=1e-9)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("rig", "fps"), [("bandai", 30), ("cmu", 120)])
 def test_drawn_keys_are_met_as_nearly_as_bones_allow(rig, fps):
@@ -205,28 +154,3 @@ def test_drawn_keys_are_met_as_nearly_as_bones_allow(rig, fps):
     assert max(row["drawn_cm"] for row in rows) < 3
     assert rows[0]["missed_cm"] < 1e-6
     assert "missed_cm" not in rows[1]
-
-
-@pytest.mark.slow
-def test_a_drawing_of_no_body_is_said():
-    motion = on_rig("canonical", LAST)
-    drawn = drawing_of(motion, 30, view_deg=0).places_xy
-    places = dict(zip(CANONICAL.names, reversed(drawn.values()), strict=True))
-    done = tween(motion, Keys((0, Key(30, drawing=Drawing(places)), 44)), tiny_tweener(), settings=UNFINISHED)
-    assert any(note.startswith("at 1.00 s joints stay ") for note in done.notes)
-
-
-def test_a_joint_beyond_its_range_is_named_with_degrees_and_stays():
-    motion = on_rig("canonical", LAST)
-    knee = CANONICAL.index("leftLowerLeg")
-    quats = motion.local_quat_xyzw.clone()
-    quats[44, knee] = rotations.from_rotation_vector(torch.tensor([-0.8, 0.0, 0.0]).double())
-    bent = replace(motion, local_quat_xyzw=quats)
-    done = tween(bent, Keys((0, Key(44, half="lower"))), tiny_tweener(), settings=UNFINISHED)
-    assert any(
-        note.startswith("leftLowerLeg is ") and "degrees beyond its range in the key at frame 44" in note
-        for note in done.notes
-    )
-    assert torch.equal(done.motion.local_quat_xyzw[44, knee], quats[44, knee])
-    free = tween(bent, Keys((0, Key(44, half="upper"))), tiny_tweener(), settings=UNFINISHED)
-    assert not any("leftLowerLeg" in note for note in free.notes)

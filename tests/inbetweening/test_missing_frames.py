@@ -110,24 +110,6 @@ def test_what_is_known_stays_to_the_bit(rig):
             assert torch.equal(made.moving_offsets[joint][~lost.root], values[~lost.root])
 
 
-@pytest.mark.parametrize("rig", RIGS)
-def test_put_back_takes_what_is_lost_from_the_other_motion(rig):
-    motion, other = on_rig(rig, 50), on_rig(rig, 50, seed=3)
-    lost = lost_of(motion, Mask(ALL, 12, 20))
-    whole = restore_observed(other, motion, lost)
-    assert torch.equal(whole.local_quat_xyzw[12:20], other.local_quat_xyzw[12:20])
-    assert torch.equal(whole.joint_positions()[12:20], other.joint_positions()[12:20])
-    assert whole.source is motion.source
-
-
-def test_what_stands_in_the_gap_does_not_matter():
-    motion, other = on_rig("bandai", 50), on_rig("bandai", 50, seed=3)
-    lost = lost_of(motion, Mask(ALL, 12, 20), Mask("Hand_L", 0, 50))
-    first, second = interpolate_missing(motion, lost), interpolate_missing(restore_observed(other, motion, lost), lost)
-    assert torch.equal(first.local_quat_xyzw, second.local_quat_xyzw)
-    assert torch.equal(first.joint_positions(), second.joint_positions())
-
-
 def names_of(motion, lost):
     """Of joints that are lost in any frame."""
     return {name for name, gone in zip(motion.skeleton.names, lost.joints.any(dim=0).tolist(), strict=True) if gone}
@@ -154,28 +136,6 @@ def test_a_lost_place_takes_the_rotation_that_put_it_there_along(joint, taken):
     assert lost.joints[5:9].sum() == 4 * len(taken)
     assert lost.frames.nonzero()[:, 0].tolist() == [5, 6, 7, 8]
     assert not lost.root.any()
-
-
-@pytest.mark.parametrize(
-    ("rig", "joint", "taken"),
-    [
-        ("bandai", "Hand_L", {"Hand_L", "LowerArm_L"}),
-        ("daz", "lHand", {"lHand", "lForeArm"}),
-        ("daz", "lThumb1", {"lThumb1"}),
-    ],
-)
-def test_on_other_rigs_too(rig, joint, taken):
-    motion = on_rig(rig, 30)
-    assert names_of(motion, lost_of(motion, Mask(joint, 5, 9))) == taken
-
-
-def test_the_place_of_the_root_can_be_lost_alone():
-    motion = on_rig("bandai", 30)
-    lost = lost_of(motion, Mask(ROOT, 5, 9))
-    assert not lost.joints.any()
-    assert lost.root.nonzero()[:, 0].tolist() == [5, 6, 7, 8]
-    part = lost.slice(8, 12)
-    assert part.frames.tolist() == [True, False, False, False]
 
 
 def test_joints_that_are_never_known_rest():

@@ -80,18 +80,6 @@ def test_hips_told_at_one_frame_do_not_swing_the_body(fps, turn):
 
 
 @pytest.mark.slow
-def test_a_trajectory_is_led_to_where_a_hand_is_wanted():
-    """Somebody on the way from A to B goes a little round for what lies beside the way, and faces as the way leads."""
-    motion = walk(91)
-    middle = motion.root_position[45] + torch.tensor([1.2, 0.2, 0.0]).double()
-    done = asked(motion, (0, Key(45, places={"leftHand": tuple(middle.tolist())}), 90))
-    aside = done.motion.root_position[:, 0]
-    assert aside[45] > 0.3
-    assert torch.diff(aside).abs().max() < 0.08
-    assert done.notes == ()
-
-
-@pytest.mark.slow
 def test_several_frames_of_one_hand_are_held_without_a_tremble():
     motion = walk(90)
     place = tuple((motion.root_position[45] + torch.tensor([0.2, 0.3, 0.4]).double()).tolist())
@@ -100,14 +88,6 @@ def test_several_frames_of_one_hand_are_held_without_a_tremble():
     places = made.joint_positions()[40:51, CANONICAL.index("leftHand")]
     assert (places - torch.tensor(place).double()).norm(dim=-1).max() < 0.002
     assert peaks_of(made).acceleration < 80
-
-
-@pytest.mark.slow
-def test_a_hand_that_would_have_to_be_thrown_is_named_with_its_acceleration():
-    motion = walk(60)
-    high = tuple((motion.root_position[3] + torch.tensor([0.0, 0.9, 0.2]).double()).tolist())
-    done = asked(motion, (0, Key(3, places={"leftHand": high}), 59))
-    assert any("leftHand goes " in note and "m/s^2; mocap's hardly ever reach 130" in note for note in done.notes)
 
 
 class Told(LinearInbetweener):

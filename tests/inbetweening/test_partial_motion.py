@@ -2,13 +2,11 @@
 
 from dataclasses import replace
 
-import pytest
 import torch
 from captures import on_rig
 
 from mapctl import rotations
 from mapctl.inbetweening.interpolation import interpolate_positions
-from mapctl.inbetweening.missing import MissingMask
 from mapctl.inbetweening.partial_motion import (
     EFFECTORS,
     KnownParts,
@@ -16,7 +14,6 @@ from mapctl.inbetweening.partial_motion import (
     interpolate_partial_motion,
     mirror_quats,
 )
-from mapctl.inbetweening.query import GapQuery
 from mapctl.skeleton import CANONICAL, LIMBS
 
 FRAMES = 40
@@ -80,16 +77,6 @@ def test_what_is_known_in_no_frame_is_the_mean_pose_s():
     assert not made.heading.any()
 
 
-def test_a_rough_path_is_followed():
-    known = gap()
-    path = ~known.ground
-    motion = partial_motion(known)
-    way = torch.stack([torch.linspace(0, 3, FRAMES), torch.zeros(FRAMES), torch.linspace(1, 2, FRAMES)], -1).double()
-    motion = replace(motion, root_position=torch.where(path[..., None], way, motion.root_position))
-    made = interpolate_partial_motion(replace(motion, known=replace(known, path=path)), MEAN, 0.9)
-    torch.testing.assert_close(made.root_position[path][:, ::2], way[None][path][:, ::2])
-
-
 def test_unknown_limbs_bend_to_their_targets_and_known_ones_do_not():
     told = torch.zeros(1, FRAMES, len(EFFECTORS), dtype=torch.bool)
     hand, foot = EFFECTORS.index(CANONICAL.index("leftHand")), EFFECTORS.index(CANONICAL.index("rightFoot"))
@@ -107,33 +94,6 @@ def test_unknown_limbs_bend_to_their_targets_and_known_ones_do_not():
     others = torch.ones(FRAMES, CANONICAL.num_joints, dtype=torch.bool)
     others[10:25, [limb.lower, limb.end]] = False
     torch.testing.assert_close(made[0][others], places[0][others], atol=1e-9, rtol=0)
-
-
-def test_known_positions_are_those_of_a_query():
-    masks = torch.rand(FRAMES, CANONICAL.num_joints, generator=torch.Generator().manual_seed(0)) < 0.1
-    root = torch.rand(FRAMES, generator=torch.Generator().manual_seed(1)) < 0.3
-    motion = on_rig("canonical", FRAMES)
-    query = GapQuery(motion, MissingMask(masks, root), torch.arange(FRAMES) / 30.0)
-    told = replace(
-        KnownParts.whole(torch.ones(1, FRAMES, dtype=torch.bool)),
-        rotations=~masks[None],
-        heading=~masks[None, :, 0],
-        ground=~root[None],
-        height=~root[None],
-    )
-    # A query calls hips known only with their rotation.
-    assert torch.equal(told.positions[0, :, 1:], query.known_positions[:, 1:])
-    assert torch.equal(told.everything[0], ~query.missing.frames)
-
-
-@pytest.mark.parametrize("what", ["quats", "targets", "offsets", "contacts"])
-def test_mirrored_twice_is_the_same(what):
-    random = torch.Generator().manual_seed(2)
-    motion = partial_motion(gap())
-    motion = replace(motion, targets=torch.randn(motion.targets.shape, generator=random))
-    twice = motion.mirrored().mirrored()
-    torch.testing.assert_close(getattr(twice, what), getattr(motion, what))
-    assert all(torch.equal(getattr(twice.known, name), known) for name, known in vars(motion.known).items())
 
 
 def test_a_mirrored_motion_has_mirrored_places():

@@ -79,30 +79,6 @@ def test_a_leap_of_a_rotation_at_the_edges_is_closed(start, stop, fps):
     assert turning_bends(closed).max() < 0.2 * turning_bends(leapt).max()
 
 
-def test_what_is_far_from_an_edge_keeps_its_shape():
-    put, truth = gap(200, 400, 600), way(30.0, 600)
-    closed = blend_seams_in_positions(truth + 0.1 * put[:, None], put, fps=30.0)
-    offset = (closed - truth)[260:340]
-    assert (offset - offset.mean(dim=0)).norm(dim=-1).max() < 0.03
-
-
-def test_several_gaps_are_closed_each_for_itself():
-    put = gap(20, 40) | gap(70, 80)
-    leapt = way() + put[:, None] * torch.tensor([0.2, 0.0, -0.1])
-    both = blend_seams_in_positions(leapt, put, fps=30.0)
-    assert bends(both).max() < 0.2 * bends(leapt).max()
-
-
-def test_joints_are_closed_each_for_itself():
-    quats, other = swaying(FRAMES, 3), swaying(FRAMES, 3, seed=9)
-    put = torch.stack([gap(40, 70), gap(40, 70), gap(10, 12)], dim=1)
-    mixed = torch.where(put[..., None], other, quats)
-    together = blend_seams_in_rotations(mixed, put, fps=30.0)
-    for joint in range(3):
-        alone = blend_seams_in_rotations(mixed[:, [joint]], put[:, [joint]], fps=30.0)
-        assert torch.allclose(together[:, [joint]], alone, atol=1e-12)
-
-
 def test_signs_of_quaternions_do_not_matter():
     quats, put = swaying(FRAMES, 1), gap(40, 70)[:, None]
     signs = torch.where(torch.rand(FRAMES, 1, 1, generator=generator()) < 0.5, -1.0, 1.0)
@@ -117,17 +93,3 @@ def test_motions_of_a_few_frames_break_nothing(frames, whole):
     values = torch.randn(frames, 3, generator=generator(), dtype=torch.float64)
     assert blend_seams_in_positions(values, put, fps=30.0).isfinite().all()
     assert blend_seams_in_rotations(swaying(frames, 1), put[:, None], fps=30.0).isfinite().all()
-
-
-def test_a_gap_without_edges_is_left_as_it_is():
-    everything = gap(0, FRAMES)
-    assert torch.equal(blend_seams_in_positions(way(), everything, fps=30.0), way())
-
-
-def test_nothing_put_in_changes_nothing():
-    nothing = gap(0, 0)
-    assert torch.equal(blend_seams_in_positions(way(), nothing, fps=30.0), way())
-    assert torch.equal(
-        blend_seams_in_rotations(swaying(FRAMES, 2), nothing[:, None].expand(-1, 2), fps=30.0),
-        rotations.make_sign_continuous(swaying(FRAMES, 2)),
-    )

@@ -100,11 +100,6 @@ def test_who_stands_may_gesture_but_not_wander(sway, frames, by):
     assert (float(moved.max()) > 0.3) == (by == "network")
 
 
-def test_nobody_is_held_who_was_told_a_way():
-    query, answer = chosen(still(92), 1, 91, network=Network(sway=0.5), keep_trajectory=True)
-    assert [source.by for source in answer.attribute(query)] == ["network"]
-
-
 def test_planted_toes_are_held_and_what_is_known_stays():
     """A walk that slides aside: toes stand where they first stood, or in the middle of where they slid."""
     motion = walk(60)
@@ -120,12 +115,3 @@ def test_planted_toes_are_held_and_what_is_known_stays():
     assert speeds[1][12:][held].mean() < 0.002  # where legs are stretched, toes go along a little
     assert torch.equal(made.local_quat_xyzw[:12], motion.local_quat_xyzw[:12])
     assert torch.equal(made.root_position, motion.root_position)
-
-
-@pytest.mark.slow
-def test_a_long_morph_of_somebody_who_moves_is_called_one():
-    motion = walk(100)
-    done = tween(motion, Keys((0, 99)), AutoInbetweener(tiny_infiller()))  # straight lines
-    (note,) = done.gap_notes
-    assert "a still morph" in note
-    assert "longer than the" in note

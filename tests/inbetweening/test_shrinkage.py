@@ -106,13 +106,6 @@ def test_a_lost_arm_that_both_ends_hold_still_does_not_drop(fps):
     assert 100 * error(made.motion, motion, gap) < 0.5
 
 
-def test_one_trial_tests_all_gaps():
-    motion, guess = walk(200), Guess(walk(200), 0.0, 0.02)
-    Guess.asked.clear()
-    fill(motion, guess, Mask(ALL, 40, 50), Mask(ALL, 120, 135))
-    assert Guess.asked == [25, 25 + 2 * 25]
-
-
 def test_bare_poses_are_no_evidence_against_the_network():
     motion, lost = walk(61), Mask(ALL, 1, 60)
     made = fill(motion, Guess(motion, 0.0, 5.0), lost)

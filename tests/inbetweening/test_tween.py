@@ -4,15 +4,13 @@ from dataclasses import replace
 
 import pytest
 import torch
-from captures import apart_deg, on_rig
+from captures import on_rig
 from helpers import random_motion, walk
 from methods import UNFINISHED, by_method
 from rig_maker import Make, make, names_of
 from tiny_infiller import tiny_infiller
 
-from controllers.inbetweening.proposers import SlerpInbetweener
-from controllers.inbetweening.tween import measure_keyframe_errors, tween
-from mapctl import retarget
+from controllers.inbetweening.tween import tween
 from mapctl.errors import RequestError
 from mapctl.inbetweening.missing import MissingMask, interpolate_missing, restore_observed
 from mapctl.intent.keyframes import Drawing, Key, Keys
@@ -128,17 +126,6 @@ def test_hands_and_feet_are_met_and_the_rest_is_free(rig, fps, method):
 
 
 @pytest.mark.slow
-def test_slerp_meets_hands_too():
-    motion = on_rig("bandai", 45)
-    done = made_of(motion, frames_of(30), method="slerp", limbs=("Hand_L",))
-    assert max(missed_cm(done.motion, motion, frame, ("Hand_L",)) for frame in frames_of(30)) < 0.1
-    plain = interpolate_missing(motion, keyed(motion, (0, 44)))
-    away = (done.motion.joint_positions() - plain.joint_positions()).norm(dim=-1)
-    feet = [motion.skeleton.index(name) for name in ("Foot_L", "Foot_R")]
-    assert away[:, feet].max() < 0.1  # a reach takes the body along, and not the feet off the floor
-
-
-@pytest.mark.slow
 def test_a_hand_whose_place_is_out_of_reach_is_said_to_miss_it():
     motion = on_rig("canonical", 45)
     root = motion.root_position.clone()
@@ -183,40 +170,14 @@ def test_keys_may_be_one_frame_apart(fps, keys):
     assert_met(made_of(motion, keys).motion, motion, keys)
 
 
-def test_beyond_the_first_and_the_last_key_the_motion_goes_on():
-    motion = on_rig("canonical", 45)
-    made = made_of(motion, (10, 20, 34)).motion
-    assert_met(made, motion, (10, 20, 34))
-    steps = torch.diff(made.joint_positions(), dim=0).norm(dim=-1).amax(dim=1)
-    assert steps.max() < 0.5
-
-
-def test_keys_come_in_any_order_and_may_be_repeated():
-    motion = on_rig("bandai", 45)
-    assert same(*(made_of(motion, keys).motion for keys in ((0, 16, 33, 44), (33, 0, 44, 16, 33, 0))))
-
-
-@pytest.mark.slow  # the command does: test_motion_commands.py
-def test_the_same_comes_twice():
-    motion = on_rig("daz", 45)
-    first, second = (made_of(motion, frames_of(30), method="auto", limbs=LIMBS["daz"]).motion for _ in range(2))
-    assert same(first, second)
-
-
 @pytest.mark.parametrize(
     ("keys", "message"),
     [
         (Keys((0,)), "at least two keys, got 1"),
-        (Keys((7, 7, 7)), "at least two keys, got 1"),
-        (Keys(()), "at least two keys, got 0"),
         (Keys((0, 45)), "the key 45 is not one of the motion's frames 0:45"),
-        (Keys((-1, 5)), "the key -1 is not one of the motion's frames 0:45"),
         (Keys.of((0, 20, 44), limbs=("Hnad_L",)), "no hand or foot 'Hnad_L'; the nearest is Hand_L"),
-        (Keys.of((0, 20, 44), limbs=("Foot_R", "foott_l")), "no hand or foot 'foott_l'; the nearest is Foot_L"),
-        (Keys.of((0, 20, 44), limbs=("Head",)), "no hand or foot 'Head'; the nearest is Hand_"),
         (Keys((0, 20, Key(20, limbs=("Hand_L",)), 44)), "two different keys are at frame 20"),
         (Keys((Key(0, limbs=("Foot_R",)), Key(44, limbs=("Hand_L",)))), "no key tells where the hips are"),
-        (Keys((Key(0, drawing=DRAWN), Key(44, drawing=DRAWN))), "no key tells where the hips are"),
         (
             Keys((0, Key(44, drawing=Drawing({"hips": (0, 0), "haed": (0, 1)})))),
             "no joint 'haed' .*the nearest is Head",
@@ -225,24 +186,11 @@ def test_the_same_comes_twice():
             Keys((0, Key(44, drawing=Drawing({"Hand_L": (0, 0), "leftHand": (0, 1)})))),
             "'leftHand' is drawn twice, by its own name and by the canonical one",
         ),
-        (Keys((0, Key(20, places={"Hnad_L": (0.0, 1.0, 0.0)}), 44)), "no hand or foot 'Hnad_L'; the nearest is Hand_L"),
     ],
 )
 def test_keys_that_cannot_be_are_refused(keys, message):
     with pytest.raises(RequestError, match=message):
         tween(on_rig("bandai", 45), keys, tiny_infiller())
-
-
-def test_keys_of_two_kinds_at_once_are_refused():
-    with pytest.raises(RequestError, match="two kinds; choose one"):
-        Keys.of((0, 20, 44), limbs=("Hand_L",), root_only=True)
-    with pytest.raises(RequestError, match="two kinds; choose one"):
-        Key(20, places={"Hand_L": (0.0, 1.0, 0.0)}, root_only=True)
-
-
-def test_places_that_are_no_numbers_are_refused():
-    with pytest.raises(RequestError, match="the place of Hand_L at frame 20 is no three numbers"):
-        Key(20, places={"Hand_L": (0.0, float("nan"), 0.0)})
 
 
 @pytest.mark.slow
@@ -260,27 +208,6 @@ def test_keys_of_several_kinds_are_met_each_in_its_own():
     assert missed_cm(made, motion, 30, motion.skeleton.names) > 1
 
 
-def test_slerp_is_the_interpolation_on_the_rig_itself():
-    motion = on_rig("canonical", 30)
-    made = tween(motion, Keys((0, 29)), SlerpInbetweener(), settings=UNFINISHED).motion
-    assert same(made, interpolate_missing(motion, keyed(motion, (0, 29))))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("told", [{}, {"root_only": True}])
-def test_neighbouring_keys_that_no_hips_could_join_are_named_with_numbers(told):
-    motion = on_rig("bandai", 45)
-    hips = motion.skeleton.index("Hips")
-    moved = motion.moving_offsets[hips].clone()
-    moved[21:] += torch.tensor([1.5, 0.0, 0.0]).double()
-    leaping = replace(motion, moving_offsets={hips: moved})
-    apart = float((leaping.joint_positions()[21] - leaping.joint_positions()[20])[hips].norm())
-    done = made_of(leaping, (0, 20, 21, 44), **told)
-    assert done.notes == (f"the hips need {30 * apart:.1f} m/s between frames 20 and 21, faster than anyone runs",)
-    assert made_of(leaping, (0, 18, 24, 44), **told).notes == ()
-    assert made_of(leaping, (0, 20, 21, 44), limbs=("Hand_L",)).notes[:1] != done.notes
-
-
 @pytest.mark.parametrize(
     ("joint", "told", "said"),
     [("UpperArm_L", {}, True), ("UpperArm_L", {"root_only": True}, False), ("Hips", {"root_only": True}, True)],
@@ -295,40 +222,3 @@ def test_neighbouring_keys_that_no_joint_could_join_are_named_with_numbers(joint
     done = made_of(replace(motion, local_quat_xyzw=quats), (0, 20, 21, 44), **told)
     expected = (f"{joint} needs 45 rad/s between frames 20 and 21, faster than joints turn",)
     assert tuple(note for note in done.notes if "as abrupt as" not in note) == (expected if said else ())
-
-
-def test_keys_of_a_walk_need_nothing_that_nobody_does():
-    motion = on_rig("canonical", 45)
-    assert made_of(motion, range(0, 45, 4)).notes == ()
-
-
-@pytest.mark.parametrize("rig", RIGS)
-def test_errors_at_keys_are_told_for_what_they_tell(rig):
-    motion, frames = on_rig(rig, 45), frames_of(30)
-    told = {"pose": {}, "limbs": {"limbs": LIMBS[rig]}, "root": {"root_only": True}}
-    for what, kind in told.items():
-        keys = Keys.of(frames, **kind)
-        rows = measure_keyframe_errors(motion, motion, keys)
-        assert [row["frame"] for row in rows] == list(frames)
-        assert [row["what"] for row in rows] == ["pose", what, what, "pose"]
-        assert max(row["missed_cm"] for row in rows) == 0
-        assert [("missed_deg" in row) for row in rows] == [True, what != "limbs", what != "limbs", True]
-        wrong = spoilt(motion, (0, 44))
-        rows = measure_keyframe_errors(wrong, motion, keys)
-        picked = {"pose": motion.skeleton.names, "limbs": LIMBS[rig], "root": (HIPS[rig],)}[what]
-        assert rows[1]["missed_cm"] == pytest.approx(missed_cm(wrong, motion, frames[1], picked))
-        assert rows[1]["missed_cm"] > 1
-        if what == "root":
-            hips = motion.skeleton.index(HIPS[rig])
-            turned = apart_deg(wrong.joint_rotations(), motion.joint_rotations())[frames[1], hips]
-            assert rows[1]["missed_deg"] == pytest.approx(float(turned), rel=1e-6)
-
-
-def test_places_on_the_rig_are_those_of_its_own_joints():
-    motion = on_rig("daz", 20)
-    canonical, rigmap = retarget.to_canonical(motion)
-    places = retarget.rig_joint_positions(motion, rigmap)
-    for name, own in (("leftHand", "lHand"), ("hips", "hip")):
-        joint = canonical.skeleton.index(name)
-        assert torch.equal(places[:, joint], motion.joint_positions()[:, motion.skeleton.index(own)])
-    assert not places[:, canonical.skeleton.index("leftToes")].any()  # it has none

@@ -1,19 +1,16 @@
 """`mapctl tween --variations K` and `--best-of K`: several motions through the same keys, all of which meet them."""
 
-import json
 import math
 import re
 from dataclasses import replace
-from functools import partial
 
 import pytest
 import torch
 from captures import on_rig
-from helpers import generator, run, tiny_density
-from tiny_infiller import save_tiny_infiller, tiny_infiller
+from helpers import generator, tiny_density
+from tiny_infiller import tiny_infiller
 from tiny_prior import save_tiny_prior
 
-import mapctl
 import priors
 from controllers.common.canonical_clip import CanonicalClip
 from controllers.inbetweening.infill import infill
@@ -67,12 +64,6 @@ def source(tmp_path_factory):
     return path
 
 
-@pytest.fixture
-def command(tmp_path_factory, prior_file):
-    infiller = save_tiny_infiller(tmp_path_factory.mktemp("infiller") / "tiny.safetensors", drawn=0.02)
-    return lambda *words: run("tween", *words, "--inbetweener", infiller, "--prior", prior_file)
-
-
 INFILLER = tiny_infiller(drawn=0.02)
 
 
@@ -102,28 +93,6 @@ def test_every_variation_meets_the_keys_to_the_bit_and_no_two_are_the_same(prior
     assert min(apart) > 0.005
     assert found.diversity.world_cm > 0.1
     assert all(torch.isfinite(torch.tensor(one.energy)) for one in found.each)
-
-
-@pytest.mark.slow
-def test_the_first_is_what_one_would_be_and_more_do_not_change_those_before(prior):
-    motion, of = on_rig("canonical", SHORT), partial(asked, prior=prior, keys=SHORT_KEYS)
-    alone = tween(motion, Keys(SHORT_KEYS), AutoInbetweener(INFILLER), settings=FEW).motion
-    two, three = (of(motion, count=count).each for count in (2, 3))
-    assert torch.equal(two[0].solution.motion.local_quat_xyzw, alone.local_quat_xyzw)
-    for one, other in zip(two, three[:2], strict=True):
-        assert torch.equal(one.solution.motion.local_quat_xyzw, other.solution.motion.local_quat_xyzw)
-        assert one.energy == other.energy
-    reseeded = of(motion, count=2, seed=1).each
-    assert not torch.equal(two[1].solution.motion.local_quat_xyzw, reseeded[1].solution.motion.local_quat_xyzw)
-
-
-@pytest.mark.slow  # of one motion: test_tween.py
-def test_limbs_are_still_where_they_are_wanted(prior):
-    motion, keys = on_rig("bandai", SHORT), SHORT_KEYS
-    hand = motion.skeleton.index("Hand_L")
-    for one in asked(motion, prior, keys=keys, limbs=("Hand_L",)).each:
-        away = (one.solution.motion.joint_positions() - motion.joint_positions())[list(keys), hand].norm(dim=-1)
-        assert float(away.max()) < 1e-3
 
 
 def test_a_rollout_changes_nothing_that_is_known_or_has_no_end():
@@ -218,23 +187,6 @@ def test_an_end_is_extended_by_a_density_and_a_beginning_never(prior, frames):
 
 
 @pytest.mark.slow
-def test_a_density_that_does_not_know_the_motion_leaves_the_end_to_the_infiller(prior):
-    class Stern:
-        """Finds everything unlikely."""
-
-        name, reference_log_density = "stern", 1e9
-
-        def __getattr__(self, name):
-            return getattr(prior, name)
-
-        def with_observation_noise(self, sigma):
-            return self
-
-    done = infill(on_rig("canonical", FRAMES), AutoInbetweener(tiny_infiller(), [Stern()]), [Mask("*", 30, 45)])
-    assert done.notes == ("a gap at the end: the motion is extended by infiller, with nothing after it to meet",)
-
-
-@pytest.mark.slow
 def test_what_leaves_nothing_to_vary_is_refused(prior):
     motion = on_rig("canonical", FRAMES)
     with pytest.raises(RequestError, match="nothing to vary"):
@@ -266,78 +218,3 @@ def test_the_best_is_the_answer_of_least_energy_and_all_are_told(prior, keys):
         assert float(told[name]) == pytest.approx(one.energy, abs=0.06)
         if name == winner:
             assert torch.equal(made.motion.local_quat_xyzw, one.solution.motion.local_quat_xyzw)
-
-
-@pytest.mark.slow
-def test_the_best_of_one_or_of_too_few_frames_is_refused(prior):
-    motion, rollouts = on_rig("canonical", FRAMES), RolloutInbetweener([prior], INFILLER)
-    with pytest.raises(RequestError, match="the best is of 2 to 1000, got 1"):
-        lowest_energy(making(motion, Keys(KEYS)), rollouts, 1, generator=generator(0))
-    with pytest.raises(RequestError, match="leaves nothing to vary"):
-        lowest_energy(making(motion.slice(0, 6), Keys((0, 5))), rollouts, 2, generator=generator(0))
-
-
-@pytest.mark.slow
-def test_the_best_is_one_file_and_comes_again(command, source, tmp_path, capsys):
-    found = set()
-    for _ in range(2):
-        words = ["-o", tmp_path / "out.bvh", "--keyframes", "0,12,24", "--best-of", 2, "--report", tmp_path / "r.json"]
-        assert command(source, *words) == 0
-        found.add((tmp_path / "out.bvh").read_bytes())
-    assert len(found) == 1
-    assert "the best of 2 is from the " in capsys.readouterr().out
-    assert "the best of 2 is from the " in " ".join(json.loads((tmp_path / "r.json").read_text())["status"]["notes"])
-
-
-@pytest.mark.slow
-def test_numbered_files_energies_and_diversity_are_told_and_come_again(command, source, tmp_path, capsys):
-    found = set()
-    words = ["--keyframes", "0,10,24", "--method", "infiller", "--no-finish", "--variations", 2, "--seed", 4]
-    for _ in range(2):
-        assert command(source, "-o", tmp_path / "out.bvh", *words, "--report", tmp_path / "r.json") == 0
-        found.add(tuple((tmp_path / f"out_00{number}.bvh").read_bytes() for number in range(2)))
-    assert len(found) == 1
-    (files,) = found
-    assert files[0] != files[1]
-    assert not (tmp_path / "out.bvh").exists()
-    lines = capsys.readouterr().out.splitlines()[:3]
-    assert lines[0].startswith(f"{tmp_path / 'out_000.bvh'}: 25 frames through 3 keys; energy ")
-    assert lines[1].startswith(f"{tmp_path / 'out_001.bvh'}: ")
-    assert lines[2].startswith("2 variations, on average ")
-    told = json.loads((tmp_path / "r.json").read_text())
-    assert told["request"]["seed"] == 4
-    assert set(told["diversity"]) == {"world_cm", "root_aligned_cm"}
-    assert [row["file"] for row in told["variations"]] == [str(tmp_path / f"out_00{number}.bvh") for number in range(2)]
-    for row in told["variations"]:
-        assert f"{row['energy_nats']:.1f} nats" in " ".join(lines)
-        assert {"likelihood", "footing", "clearance", "seam"} <= set(row["energy"])
-        assert max(key["missed_cm"] for key in row["keys"]) < 1e-3
-        assert "skate_cm_s" in row["measures"]
-        assert mapctl.load(row["file"]).num_frames == SHORT
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["--variations", 0], "--variations must be 1 to 1000, got 0"),
-        (["--variations", 1001], "--variations must be 1 to 1000, got 1001"),
-        (["--variations", 2, "--seed", -1], "seed"),
-        (["--seed", 1], "--seed is of what is drawn"),
-        (["--seed", 1, "--best-of", 2], "--seed is of what is drawn"),
-        (["--best-of", 0], "--best-of must be 1 to 1000, got 0"),
-        (["--best-of", 3, "--variations", 2], "choose one"),
-        (["--best-of", 3, "--method", "slerp"], "one answer only"),
-        (["--variations", 2, "--suggest-timing"], "--suggest-timing tells of one answer"),
-        (["--variations", 2, "--method", "slerp"], "one answer only"),
-        (["--variations", 2, "--video", "v.mp4"], "--video of several answers is a .png"),
-        (["--variations", 2, "--report", "out_001.bvh"], "asked for twice"),
-    ],
-    ids=str,
-)
-def test_what_cannot_be_is_said_and_nothing_is_written(command, source, tmp_path, monkeypatch, capsys, words, said):
-    monkeypatch.chdir(tmp_path)
-    assert command(source, "-o", "out.bvh", "--keyframes", "0,12,24", *words) == 2
-    told = capsys.readouterr()
-    assert (told.out, told.err.count("\n")) == ("", 1)
-    assert said in told.err
-    assert list(tmp_path.iterdir()) == []

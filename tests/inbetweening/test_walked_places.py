@@ -39,13 +39,6 @@ def test_the_curve_is_at_every_place_in_its_frame_and_goes_on():
     torch.testing.assert_close(found, torch.tensor(WAY).double(), atol=0.02, rtol=0)
 
 
-def test_a_place_that_is_come_by_twice_is_told_apart_by_time():
-    way = ((0.0, 0.0), (0.0, 1.5), (1.0, 0.75), (-0.5, 0.7))  # crosses its beginning
-    walked = WalkedPlaces.of(query_of(way=way), 2 * FASTEST, 5)
-    found = walked.curve.ground_point(walked.arcs[list(FRAMES)])
-    torch.testing.assert_close(found, torch.tensor(way).double(), atol=0.02, rtol=0)
-
-
 @pytest.mark.parametrize(
     "query",
     [

@@ -3,9 +3,8 @@
 import pytest
 import torch
 from captures import on_rig
-from helpers import generator, walk
+from helpers import walk
 
-from mapctl.errors import RequestError
 from mapctl.inbetweening.effector_targets import EffectorTargets
 from mapctl.inbetweening.whole_body import reach_targets
 from mapctl.retarget import to_canonical
@@ -108,29 +107,3 @@ def test_what_no_body_reaches_is_pointed_at_and_stays_finite():
     assert made.joint_positions().isfinite().all()
     arm = (made.joint_positions()[1, HAND] - made.joint_positions()[1, SHOULDER]).norm()
     assert arm > 0.46  # stretched
-
-
-def test_neighbouring_frames_reach_alike():
-    motion = walk(30)
-    places = motion.joint_positions().clone()
-    wanted = torch.zeros(30, JOINTS, dtype=torch.bool)
-    wanted[10:20, HAND] = True
-    places[10:20, HAND] += torch.tensor([0.1, 0.5, 0.3]).double()
-    made, _ = reach(motion, EffectorTargets(places, wanted), stray=0.02)
-    steps = torch.diff((made.joint_positions() - motion.joint_positions())[10:20], dim=0).norm(dim=-1)
-    assert steps.max() < 0.03
-
-
-@pytest.mark.parametrize("joint", ["hips", "head", "rightToes"])
-def test_joints_that_end_no_limb_are_refused(joint):
-    motion = walk(3)
-    with pytest.raises(RequestError, match=f"{joint} has none"):
-        reach(motion, asked(motion, 1, CANONICAL.index(joint), torch.zeros(3).double()))
-
-
-def test_nothing_wanted_changes_nothing():
-    motion = walk(4)
-    nothing = EffectorTargets(
-        torch.randn(4, JOINTS, 3, generator=generator(0)).double(), torch.zeros(4, JOINTS, dtype=torch.bool)
-    )
-    assert reach(motion, nothing)[0] is motion

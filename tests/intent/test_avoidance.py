@@ -46,12 +46,6 @@ def test_a_point_gets_past_and_goes_on_as_wanted(obstacles):
     assert np.abs(np.arctan2(last[:, 0], last[:, 1])).max() < 0.05
 
 
-def test_it_keeps_to_the_side_that_it_has_chosen():
-    way = walked((Obstacle((0.0, 3.0), 0.8),))
-    side = np.sign(way[np.abs(way[:, 0]) > 0.05, 0])
-    assert len(set(side)) == 1
-
-
 def test_who_is_on_the_way_past_one_side_is_led_past_it():
     ahead = (Obstacle((0.0, 2.0), 0.5),)
     for heading in (0.5, -0.5):

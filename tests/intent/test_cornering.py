@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import torch
 
 from mapctl import curves
 from mapctl.intent.cornering import find_reversals, slow_for_corners, turns_sharply
@@ -34,11 +33,6 @@ def test_a_corner_is_slowed_for_in_time_and_left_again(degrees):
     assert np.abs(np.diff(squares)).max() / (2 * 0.05) < 0.95, "braking and setting off, m/s^2"
 
 
-def test_who_is_slow_already_does_not_slow_down():
-    slow = SpeedProfile.constant(0.65)
-    assert slow_for_corners(polygon((0, 0), (0, 4), (4, 4)), slow) is slow
-
-
 def test_a_loop_slows_down_for_the_corner_at_its_beginning():
     square = polygon((0, 0), (0, 4), (4, 4), (4, 0), (0, 0), closed=True)
     profile = slow_for_corners(square, USUAL)
@@ -47,25 +41,8 @@ def test_a_loop_slows_down_for_the_corner_at_its_beginning():
     assert profile.at(square.length - 0.3) < 1.15
 
 
-def test_a_loop_slows_down_at_its_end_for_a_corner_soon_after_its_beginning():
-    square = polygon((0, 3.6), (0, 4), (4, 4), (4, 0), (0, 0), (0, 3.6), closed=True)
-    profile = slow_for_corners(square, USUAL)
-    assert profile.at(0.4) < 0.8
-    speeds = np.array(profile.speeds)
-    around = np.concatenate([speeds, speeds[1:]])
-    assert np.diff(around**2).max() < 2 * 0.9 * 0.0501
-    assert np.diff(around**2).min() > -2 * 0.9 * 0.0501
-
-
 def test_reversals_are_found_where_they_are_and_hairpins_are_none():
     there = find_reversals(polygon((0, 0), (0, 4), (0, 1), (2, 1)))
     assert there == pytest.approx([4.0], abs=0.05)
     assert find_reversals(polygon((0, 0), (0, 4), (0.5, 4), (0.5, 0))) == []
     assert find_reversals(curves.read("figure8:1.5")) == []
-
-
-def test_profiles_with_many_arcs_are_linear_between_them():
-    profile = SpeedProfile((0.0, 1.0, 4.0), (1.0, 2.0, 0.5))
-    at = torch.tensor([-1.0, 0.0, 0.25, 1.0, 2.0, 4.0, 9.0])
-    expected = np.interp(at.numpy(), profile.arcs, profile.speeds)
-    assert [profile.at(float(arc)) for arc in at] == pytest.approx(expected.tolist())

@@ -1,12 +1,10 @@
 """Drawings of poses as CSV files, and what is said of those that are none."""
 
-import math
-
 import pytest
 
-from mapctl.errors import FileFormatError, RequestError
+from mapctl.errors import FileFormatError
 from mapctl.intent.drawing_csv import read_drawing
-from mapctl.intent.keyframes import Drawing, Key
+from mapctl.intent.keyframes import Drawing
 
 
 def test_joints_are_read_by_column_in_any_unit(tmp_path):
@@ -20,12 +18,8 @@ def test_joints_are_read_by_column_in_any_unit(tmp_path):
         ("joint,x,y\n", "the drawing has no joints"),
         ("joint,x\nhead,1\n", "line 1: found the columns 'joint,x', expected joint,x,y"),
         ("joint,x,y\nhead,1,2\nhips,nan,0\n", "line 3: x must be a finite number, got 'nan'"),
-        ("joint,x,y\nhead,1,inf\n", "line 2: y must be a finite number, got 'inf'"),
-        ("joint,x,y\nhead,1,high\n", "line 2: y must be a finite number, got 'high'"),
         ("joint,x,y\nhead,1\n", "line 2: found 2 values where 3 belong"),
         ("joint,x,y\nhead,1,2\nhead,1,3\n", "line 3: each line names a joint, each once, got 'head'"),
-        ("joint,x,y\nhead,1,2\nhips,1,2\n", "the drawing has all joints at one point"),
-        ("joint,x,y\nhead,1,2\n", "the drawing has all joints at one point"),
         ("", "the file is empty"),
     ],
 )
@@ -35,19 +29,3 @@ def test_what_is_no_drawing_is_said_with_its_line(tmp_path, text, said):
         read_drawing(tmp_path / "pose.csv")
     assert said in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("make", "said"),
-    [
-        (lambda: Drawing({}), "has no joints"),
-        (lambda: Drawing({"hips": (0, math.nan), "head": (0, 1)}), "which is no two finite numbers"),
-        (lambda: Drawing({"hips": (0, 0), "head": (0, 1)}, math.inf), "seen from a heading in degrees"),
-        (lambda: Key(0, half="upper", root_only="place"), "half and root_only are 2 kinds"),
-        (lambda: Key(0, drawing=Drawing({"hips": (0, 0), "head": (0, 1)}), limbs=("leftHand",)), "or hands and feet"),
-        (lambda: Key(0, placed=True), "placed is about keys with a drawing"),
-    ],
-)
-def test_keys_and_drawings_are_checked_however_they_are_made(make, said):
-    with pytest.raises(RequestError, match=said):
-        make()

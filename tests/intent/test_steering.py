@@ -136,22 +136,13 @@ def test_turning_gait_and_style_may_be_left_empty(read):
     ("text", "line", "message"),
     [
         ("", None, "the file is empty"),
-        ("\n\n", 1, "has no column time_s, speed_mps, heading_deg"),
         ("time_s,heading_deg\n0,1\n", 1, "has no column speed_mps"),
-        ("time_s,speed_mps,heading_deg,mood\n0,1,0,run\n", 1, "found the columns"),
-        ("time_s,speed_mps,heading_deg,turn_deg_s\n0,1,0,fast\n", 2, "turn_deg_s must be a number"),
         ("time_s,speed_mps,heading_deg,time_s\n0,1,0,1\n", 1, "each once"),
         ("time_s,speed_mps,heading_deg\n", None, "holds no commands"),
         ("time_s,speed_mps,heading_deg\n0,1\n", 2, "found 2 values where 3 belong"),
         ("time_s,speed_mps,heading_deg\n0,nan,0\n", 2, "speed_mps must be a number, got"),
-        ("time_s,speed_mps,heading_deg\n0,1,inf\n", 2, "heading_deg must be a number"),
-        ("time_s,speed_mps,heading_deg\n0,fast,0\n", 2, "speed_mps must be a number, got"),
-        ("time_s,speed_mps,heading_deg\n0,-1,0\n", 2, "between 0 and 1000"),
         ("time_s,speed_mps,heading_deg\n2,1,0\n1,1,0\n", 3, "time_s must rise, got 1 after 2"),
-        ("time_s,speed_mps,heading_deg\n-1,1,0\n", 2, "time_s must lie"),
         ("time_s,speed_mps,heading_deg,look_x,look_y\n0,1,0,1,2\n", 2, "look needs look_x, look_y, look_z"),
-        (f"time_s,speed_mps,heading_deg,{HAND}\n0,1,0,1,,2\n", 2, "left_hand needs left_hand_x"),
-        (f"time_s,speed_mps,heading_deg,{HAND}\n0,1,0,1,2,x\n", 2, "left_hand_z must be a number"),
         (f"time_s,speed_mps,heading_deg,{HAND}\n0,1,0,1,2,1e5\n", 2, "left_hand_z must lie"),
     ],
 )
@@ -165,8 +156,3 @@ def test_places_hold_for_their_line_alone(read):
     track = read(f"time_s,speed_mps,heading_deg,{HAND},look_x,look_y,look_z\n0,1,0,0.4,1.2,3,,,\n1,1,0,,,,0,1,2\n")
     assert [command.reach for command in track.commands] == [{"leftHand": (0.4, 1.2, 3.0)}, {}]
     assert [command.look_at for command in track.commands] == [None, (0.0, 1.0, 2.0)]
-
-
-def test_a_binary_file_is_no_script(read):
-    with pytest.raises(FileFormatError, match="not a text file"):
-        read("time_s\xff", encoding="latin-1")

@@ -11,15 +11,13 @@ from captures import apart_deg, error_cm, noisy, on_rig, shaken
 from helpers import generator
 from tiny_denoiser import QUICK, tiny_denoiser
 
-import mapctl
-from controllers.denoising.denoise import DenoiseSettings, begins_with_tpose, denoise
-from controllers.denoising.result import crossfade, join_segments
+from controllers.denoising.denoise import begins_with_tpose, denoise
+from controllers.denoising.result import join_segments
 from controllers.denoising.rigid_bones import hold_rigid_bones
 from mapctl import retarget, rotations
 from mapctl.errors import RequestError
-from mapctl.motion import Motion
 from mapctl.recording.masks import ALL, ROOT, Mask
-from mapctl.skeleton import CANONICAL, Skeleton
+from mapctl.skeleton import CANONICAL
 
 RIGS = ("canonical", "bandai", "daz")
 
@@ -29,7 +27,7 @@ def cleaned(motion, **changes):
 
 
 LEGS = [[f"{part}_{side}" for part in ("UpperLeg", "LowerLeg", "Foot", "Toes")] for side in "LR"]
-OTHERS = [("bandai", 24), ("daz", 25), ("canonical", 31), ("canonical", 60), ("daz", 120)]
+OTHERS = [("bandai", 24), ("daz", 120)]
 
 
 @pytest.mark.parametrize(("rig", "fps"), [*((rig, 30) for rig in RIGS), *OTHERS])
@@ -48,19 +46,6 @@ def test_noise_shrinks_and_rig_frames_and_rate_stay(rig, fps):
     assert len(done.proposal_share) == len(done.contacts)
 
 
-@pytest.mark.parametrize("rig", RIGS)
-def test_joints_that_the_canonical_skeleton_lacks_are_smoothed_too(rig):
-    truth = on_rig(rig)
-    given = noisy(truth)
-    done = cleaned(given)
-    used = set(retarget.identify_rig(truth.skeleton).joint_of)
-    for joint in set(range(truth.num_joints)) - used:
-        before, after = (
-            apart_deg(truth.local_quat_xyzw[:, joint], m.local_quat_xyzw[:, joint]).mean() for m in (given, done.motion)
-        )
-        assert after < 0.7 * before or before < 1e-4
-
-
 @pytest.mark.parametrize("drawn", [0.0, 0.3])
 @pytest.mark.parametrize(("rig", "fps"), [("canonical", 30), ("bandai", 30), ("daz", 120)])
 def test_a_clean_capture_changes_by_less_than_half_a_centimetre(rig, fps, drawn):
@@ -75,7 +60,7 @@ def roughness(motion):
     return float(motion.joint_positions().diff(n=3, dim=0).norm(dim=-1).mean())
 
 
-@pytest.mark.parametrize("fps", [24, 25, 29.97, 60, 240])
+@pytest.mark.parametrize("fps", [24, 29.97, 240])
 def test_any_rate_is_as_good_as_the_priors_own(fps):
     """Errors and toes' acceleration beside those of the same motion with as much noise a second at 30 fps."""
 
@@ -159,23 +144,6 @@ def test_a_network_that_is_wrong_does_little_harm():
     assert done.proposal_share.mean() < 0.9
 
 
-def test_the_same_capture_gives_the_same():
-    given = noisy(on_rig("daz", 60))
-    first, again = cleaned(given), cleaned(given)
-    assert torch.equal(first.motion.local_quat_xyzw, again.motion.local_quat_xyzw)
-    assert torch.equal(first.motion.root_position, again.motion.root_position)
-
-
-def test_the_layout_of_the_file_stays(tmp_path):
-    given = noisy(on_rig("bandai", 60))
-    given.save(tmp_path / "in.bvh")
-    read = mapctl.load(tmp_path / "in.bvh")
-    cleaned(read).motion.save(tmp_path / "out.bvh")
-    before, after = ((tmp_path / name).read_text().split("MOTION")[0] for name in ("in.bvh", "out.bvh"))
-    assert before == after
-    assert mapctl.load(tmp_path / "out.bvh").num_frames == 60
-
-
 def test_the_density_joins_where_one_is_given():
     from helpers import tiny_density
 
@@ -183,23 +151,6 @@ def test_the_density_joins_where_one_is_given():
     done = cleaned(given, densities=[tiny_density()])
     assert "likelihood" in {entry.name for entry in done.ledger.entries}
     assert done.motion.num_frames == 40
-
-
-def test_what_densities_made_of_windows_is_told_in_frames_of_the_capture():
-    from helpers import tiny_density
-
-    done = cleaned(noisy(on_rig("daz", 361, fps=120)), densities=[tiny_density()])
-    assert (done.density_intervals[0].start, done.density_intervals[-1].stop) == (0, 361)
-    first, second = done.slice(0, 100), done.slice(100, 361)
-    assert (first.density_intervals[-1].stop, second.density_intervals[0].start, second.density_intervals[-1].stop) == (
-        100,
-        0,
-        261,
-    )
-    parts = join_segments([(first, 0), (second, 100)]).density_intervals
-    assert [part.start for part in parts[1:]] == [part.stop for part in parts[:-1]]
-    assert (parts[0].start, parts[-1].stop) == (0, 361)
-    json.dumps(done.details(), allow_nan=False)
 
 
 @pytest.mark.slow
@@ -216,18 +167,6 @@ def test_what_masked_frames_show_does_not_leak(rig):
     assert apart_deg(out[0].local_quat_xyzw, out[1].local_quat_xyzw).max() < 1e-3
     assert error_cm(truth, out[0]) < 3
     assert apart_deg(out[0].local_quat_xyzw, truth.local_quat_xyzw)[50:58, joint].max() < 20
-
-
-@pytest.mark.slow
-def test_a_locked_root_above_the_hips_that_is_lost_now_and_then_changes_nothing():
-    given = noisy(on_rig("bandai", 120), 2.0, 0.5)
-    lost = torch.arange(120) % 3 == 1
-    quats = given.local_quat_xyzw.clone()
-    assert not (quats[1:, 0] - quats[:1, 0]).any()
-    quats[lost, 0] = shaken(given.local_quat_xyzw, 2.0)[lost, 0]
-    masks = [Mask(given.skeleton.names[0], frame, frame + 1) for frame in lost.nonzero()[:, 0].tolist()]
-    done, whole = cleaned(replace(given, local_quat_xyzw=quats), masks=masks), cleaned(given)
-    assert error_cm(whole.motion, done.motion) < 1e-3
 
 
 @pytest.mark.parametrize("rig", RIGS)
@@ -290,14 +229,6 @@ def test_planted_faults_are_listed_where_they_are():
     assert apart_deg(done.motion.local_quat_xyzw, truth.local_quat_xyzw)[40, arm] < 12
 
 
-def test_a_summary_is_plain_numbers():
-    for given in (noisy(on_rig("bandai", 60)), on_rig("canonical", 5)):
-        told = cleaned(given).details()
-        again = json.loads(json.dumps(told, allow_nan=False))
-        assert set(again["noise_deg"]) == set(given.skeleton.names) == set(again["correction_cm"])
-        assert set(again["contacts"]) == {"left", "right"}
-
-
 @pytest.mark.parametrize("rig", RIGS)
 def test_a_tpose_in_frame_0_stays(rig):
     truth = on_rig(rig, 60)
@@ -352,7 +283,7 @@ def test_a_long_capture_in_pieces_has_all_frames_and_no_jump(monkeypatch, rig, f
     json.dumps(done.details(), allow_nan=False)
 
 
-@pytest.mark.parametrize(("fps", "frames"), [(60, 120), (120, 240), (120, 238), (25, 51)])
+@pytest.mark.parametrize(("fps", "frames"), [(60, 120), (120, 238)])
 def test_the_last_frames_are_as_clean_as_the_others(fps, frames):
     """Also where they fall between those that the network is shown."""
     truth = on_rig("canonical", frames, fps=fps)
@@ -374,38 +305,6 @@ def test_too_short_a_capture_is_unchanged_and_says_so(frames):
 def test_short_captures_come_back_whole(frames, fps):
     given = noisy(on_rig("daz", 30, fps=fps)).slice(0, frames)
     assert cleaned(given).motion.num_frames == frames
-
-
-@pytest.mark.slow
-def test_the_noise_may_be_said():
-    given = noisy(on_rig("canonical", 90))
-    none = cleaned(given, settings=replace(QUICK, sigma_deg=0.0, sigma_cm=0.0))
-    assert error_cm(given, none.motion) < 0.5
-    much = cleaned(given, settings=replace(QUICK, sigma_deg=20.0, sigma_cm=10.0))
-    assert error_cm(given, much.motion) > error_cm(given, cleaned(given).motion)
-    for wrong in ({"sigma_deg": -1.0}, {"sigma_cm": 101.0}, {"sigma_deg": math.nan}):
-        with pytest.raises(RequestError, match="must lie between 0 and 100"):
-            DenoiseSettings(**wrong)
-
-
-def test_unknown_rigs_are_refused():
-    whole = on_rig("canonical", 20)
-    chain = Skeleton(("a", "b", "c"), (-1, 0, 1), whole.skeleton.offsets[:3])
-    motion = Motion(chain, whole.fps, whole.root_position, whole.local_quat_xyzw[:, :3])
-    with pytest.raises(RequestError):
-        cleaned(motion)
-
-
-@pytest.mark.parametrize("rig", ["canonical", "bandai"])
-def test_pieces_fade_into_each_other(rig):
-    truth = on_rig(rig, 60)
-    before, after = noisy(truth, seed=1).slice(0, 40), noisy(truth, seed=2).slice(30, 60)
-    mixed = crossfade(before, after, 10)
-    assert mixed.num_frames == 60
-    assert apart_deg(mixed.local_quat_xyzw[:31], before.local_quat_xyzw[:31]).max() < 1e-4
-    assert apart_deg(mixed.local_quat_xyzw[39:], after.local_quat_xyzw[9:]).max() < 1e-4
-    assert crossfade(truth.slice(0, 20), truth.slice(20, 60), 0).num_frames == 60
-    assert error_cm(crossfade(truth.slice(0, 40), truth.slice(25, 60), 15), truth) < 1e-4
 
 
 def test_a_part_of_a_result_is_of_those_frames():

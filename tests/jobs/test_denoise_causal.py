@@ -10,7 +10,6 @@ from tiny_denoiser import QUICK, tiny_denoiser
 
 from controllers.common.map_refinement import RefinementSettings
 from controllers.denoising.causal import CausalDenoiser, CausalSettings, denoise_causal
-from mapctl.errors import RequestError
 from mapctl.motion import Motion
 from mapctl.recording.masks import Mask
 from mapctl.solver.budget import Budget
@@ -99,21 +98,10 @@ def test_the_noise_shrinks_and_passes_meet_without_a_jump():
     assert all(now <= of == 45 for now, of in calls)
 
 
-@pytest.mark.slow
-def test_frames_may_come_in_any_portions():
-    motion = noisy(on_rig("canonical", 60))
-    given, rest = pushed(motion, at_once=25)
-    assert sum(done.motion.num_frames for done, _ in given) + rest.motion.num_frames == 60
-
-
 @pytest.mark.parametrize("frames", [1, 3, 7])
 def test_a_capture_that_is_over_at_once_comes_back(frames):
     motion = noisy(on_rig("bandai", 20)).slice(0, frames)
     assert denoise_causal(motion, tiny_denoiser(), settings=FAST).motion.num_frames == frames
-
-
-def test_nothing_pushed_gives_nothing():
-    assert stream().finish() is None
 
 
 @pytest.mark.slow
@@ -133,24 +121,8 @@ def test_masks_count_from_the_first_frame_of_all():
     assert max(stop for _, stop in dropouts) == 44
 
 
-@pytest.mark.slow
-def test_the_past_that_is_kept_does_not_grow():
-    source = stream()
-    motion = noisy(on_rig("canonical", 60))
-    for first in range(0, 60, 5):
-        source.push(motion.slice(first, first + 5))
-        assert source._past is not None
-        assert source._past.num_frames <= (0.6 + 0.2 + 0.1) * 30 + 5
-
-
-@pytest.mark.parametrize("delay", [0.0, -1.0, 0.01, 6.0, math.nan])
-def test_delays_that_make_no_sense_are_refused(delay):
-    with pytest.raises(RequestError, match="the delay must be"):
-        CausalSettings(delay=delay)
-
-
-@pytest.mark.parametrize("fps", [24, 25, 29.97, 30, 60, 90, 120])
-@pytest.mark.parametrize("delay", [1 / 30, 0.1, 0.2, 0.5])
+@pytest.mark.parametrize("fps", [24, 29.97, 120])
+@pytest.mark.parametrize("delay", [1 / 30, 0.2])
 def test_what_is_said_of_the_delay_holds_at_any_rate(fps, delay):
     causal = CausalSettings(delay=delay)
     most, step = causal.compute_delay_frames(fps)
@@ -158,15 +130,6 @@ def test_what_is_said_of_the_delay_holds_at_any_rate(fps, delay):
     assert most / fps <= delay + 1e-9 < (most + 1) / fps + 1e-9
     assert step >= 1
     assert step / fps <= max(delay / 2, 1 / fps) + 0.5 / fps
-
-
-@pytest.mark.slow
-def test_what_is_due_before_noise_can_be_told_is_said_once_and_only_then():
-    done = denoise_causal(noisy(on_rig("canonical", 24)), tiny_denoiser(), settings=FAST)
-    said = [note for note in done.notes if "before noise could be told" in note]
-    assert said == ["frames 0:3 were due before noise could be told from motion: they were not changed"]
-    later = denoise_causal(noisy(on_rig("canonical", 24)), tiny_denoiser(), settings=FAST, delay=0.4)
-    assert not any("before noise could be told" in note for note in later.notes)
 
 
 @pytest.mark.slow

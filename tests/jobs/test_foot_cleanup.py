@@ -7,7 +7,6 @@ import torch
 from helpers import corpus, generator, tiny_density, tiny_model
 
 from controllers.generation.foot_cleanup import FootCleanupSettings, clean_up_feet
-from mapctl.contacts import remove_short_runs
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, GroundPose
 from mapctl.problem.context import WindowContext, WindowRequest
@@ -51,29 +50,12 @@ def test_it_gives_as_many_frames_as_are_asked_for(frames):
     assert bool(torch.isfinite(made).all())
 
 
-@pytest.mark.slow
-def test_how_the_pieces_are_cut_does_not_matter():
-    whole = finished([clip()[1:]], 13)
-    assert torch.equal(finished(list(clip()[1:].split(7)), 13), whole)
-
-
 def test_planted_toes_slow_down_and_the_motion_stays_what_it_was():
     before = clip()[1:31]
     after = finished([clip()[1:]], 30)
     assert toe_speed(after) < 0.6 * toe_speed(before)
     height = LAYOUT.pick(after - before, "root_height")
     assert float(height.abs().mean()) < 0.03
-
-
-@pytest.mark.slow
-def test_contacts_and_gaps_of_one_or_two_frames_go():
-    flickering = clip()
-    flickering[8, -2:] = 1 - flickering[8, -2:]
-    flickering[15:17, -1] = 1 - flickering[15:17, -1]
-    bits = LAYOUT.pick(finished([flickering[1:]], 24), "contacts") > 0.5
-    inner = bits[:-4]
-    assert torch.equal(remove_short_runs(inner, 3)[3:-3], inner[3:-3])
-    assert torch.equal(~remove_short_runs(~inner, 3)[3:-3], inner[3:-3])
 
 
 def test_too_few_frames_to_look_ahead_are_refused():

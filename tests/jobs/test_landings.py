@@ -10,20 +10,9 @@ import controllers
 import priors
 from controllers.common.character import Character
 from controllers.following.follow import FollowSettings
-from controllers.generation.foot_cleanup import FootCleanupSettings
 from mapctl import curves
 from mapctl.metrics.worst_frame import measure_peaks
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, TOES
-from mapctl.terms import LandingSigmas
-
-
-def test_walks_and_clean_up_limit_how_toes_land():
-    assert FollowSettings().footing.landing == FootCleanupSettings().footing.landing == LandingSigmas()
-
-
-def test_other_feet_keep_the_limit():
-    settings = FollowSettings()
-    assert settings.with_rest_height(0.06) == replace(settings, footing=replace(settings.footing, rest_height=0.06))
 
 
 def test_a_body_of_twice_the_size_may_accelerate_twice_as_hard():

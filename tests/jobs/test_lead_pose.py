@@ -5,14 +5,13 @@ from dataclasses import replace
 
 import pytest
 import torch
-from captures import apart_deg, noisy, on_rig, shaken
+from captures import noisy, on_rig, shaken
 from tiny_denoiser import QUICK, tiny_denoiser
 
 from controllers.denoising.denoise import begins_with_tpose, denoise
 from controllers.denoising.lead_transition import find_lead_transition
 from mapctl import retarget, rotations
 from mapctl.motion import Motion
-from mapctl.recording.masks import Mask
 from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import CANONICAL
 
@@ -64,8 +63,8 @@ def cleaned(motion: Motion, **changes):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1, 2])
-@pytest.mark.parametrize(("rig", "fps"), [("daz", 120), ("canonical", 60), ("daz", 60)])
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize(("rig", "fps"), [("daz", 120), ("canonical", 60)])
 def test_no_frame_after_a_mixed_in_tpose_errs_by_far_more_than_the_others(rig, fps, seed):
     truth = led(arms_down(on_rig(rig, 2 * fps, fps=fps, seed=seed)))
     given = noisy(truth, 5.0, 1.0, seed=seed)
@@ -88,33 +87,6 @@ def test_without_a_mixture_the_first_frames_are_motion(rig):
     done = cleaned(given)
     away = errors_cm(truth, done.motion)
     assert away[1:8].max() < 9
-
-
-@pytest.mark.slow
-def test_what_is_mixed_in_a_clean_capture_stays_as_it_is():
-    truth = led(arms_down(on_rig("daz", 240, fps=120)))
-    assert errors_cm(truth, cleaned(truth).motion)[:8].max() < 0.5
-
-
-@pytest.mark.slow
-def test_joints_that_take_another_way_from_the_pose_are_told_from_noise():
-    """Euler angles that are mixed one by one leave the short way, by a bow; a spike in one frame is none."""
-    truth = led(arms_down(on_rig("daz", 120, fps=120)))
-    arm, other = (truth.skeleton.index(name) for name in ("lShldr", "rForeArm"))
-    quats = truth.local_quat_xyzw.clone()
-    for frame, share in enumerate(SHARES, start=1):
-        bow = torch.tensor([0.0, 0.0, 4 * share * (1 - share) * math.radians(40)], dtype=torch.float64)
-        quats[frame, arm] = rotations.multiply(quats[frame, arm], rotations.from_rotation_vector(bow))
-    truth = replace(truth, local_quat_xyzw=quats)
-    given = noisy(truth, 3.0, 0.5, seed=2)
-    spiked = given.local_quat_xyzw.clone()
-    spiked[2, other] = rotations.multiply(
-        spiked[2, other], rotations.from_rotation_vector(torch.tensor([0.0, 0.9, 0.0], dtype=torch.float64))
-    )
-    done = cleaned(replace(given, local_quat_xyzw=spiked)).motion
-    away = apart_deg(done.local_quat_xyzw, truth.local_quat_xyzw)
-    assert away[1:5, arm].max() < 16
-    assert away[2, other] < 20
 
 
 def test_where_the_body_is_may_be_mixed_too():
@@ -146,15 +118,8 @@ def test_where_the_body_is_is_not_taken_for_mixed_because_of_noise():
     assert sum(found) <= 1
 
 
-def test_frames_that_the_user_masks_in_the_passage_are_told_as_lost():
-    given = noisy(led(arms_down(on_rig("daz", 120, fps=120))), 3.0, 0.5)
-    done = cleaned(given, masks=[Mask("lForeArm", 2, 4)])
-    lost = [(fault.joint, fault.start) for fault in done.faults if fault.kind == "dropout"]
-    assert lost == [("lForeArm", 2)]
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("rest", ["straighten", "auto"])
 def test_a_tpose_is_told_under_noise_whatever_rest_the_rig_has(rest, seed):
     """Also where the rig's own T-pose is found from the motion, noise and all."""

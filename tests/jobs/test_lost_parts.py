@@ -5,9 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 from captures import on_rig
-from helpers import run, walk
+from helpers import walk
 from tiny_denoiser import QUICK, tiny_denoiser
-from tiny_transformer import save_tiny_transformer
 
 from controllers.denoising.denoise import denoise
 from controllers.denoising.lost_parts import LostPartFiller
@@ -92,18 +91,3 @@ def test_denoising_takes_it_on_any_rig_and_at_any_rate(rig, fps):
     apart = 1 - (marked.local_quat_xyzw * plain.local_quat_xyzw).sum(dim=-1).abs()
     assert apart[fps + fps // 6 : 2 * fps - fps // 6, joint].min() > 0.01
     assert apart[: fps - fps // 3].max() < 0.01
-
-
-@pytest.mark.slow
-def test_the_command_takes_a_trained_one_and_live_capture_none(tmp_path, capsys):
-    on_rig("daz", 60).save(tmp_path / "in.bvh")
-    (tmp_path / "mask.csv").write_text("joint,start,stop\n*,20,45\n")
-    trained = save_tiny_transformer(tmp_path / "tiny.safetensors", drawn=0.05)
-    words = [tmp_path / "in.bvh", "--mask", tmp_path / "mask.csv", "--quiet"]
-    assert run("denoise", *words, "-o", tmp_path / "a.bvh") == 0
-    assert run("denoise", *words, "-o", tmp_path / "b.bvh", "--inbetweener", trained) == 0
-    assert (tmp_path / "a.bvh").read_bytes() != (tmp_path / "b.bvh").read_bytes()
-    assert run("denoise", *words, "-o", tmp_path / "c.bvh", "--inbetweener", "denoiser") == 2
-    assert "a denoiser is no in-betweener" in capsys.readouterr().err
-    assert run("denoise", *words, "-o", tmp_path / "c.bvh", "--inbetweener", trained, "--causal") == 2
-    assert "leave --inbetweener out" in capsys.readouterr().err

@@ -7,7 +7,6 @@ import pytest
 import torch
 from helpers import finite_difference, generator, tiny_density, walk
 
-from controllers.common import map_refinement
 from controllers.common.map_refinement import RefinementSettings, refine
 from mapctl import rotations
 from mapctl.contacts import debounced
@@ -15,7 +14,7 @@ from mapctl.features import PRIOR_FPS, GroundPose
 from mapctl.motion import Motion
 from mapctl.numerics.intervals import true_intervals
 from mapctl.pose import BodyPose
-from mapctl.problem import density_selection, window_solvers
+from mapctl.problem import window_solvers
 from mapctl.problem.context import WindowContext
 from mapctl.problem.density_selection import DensityEnsemble
 from mapctl.problem.objective import Objective
@@ -104,13 +103,6 @@ def test_planted_toes_that_slide_slow_down_and_joints_stay_near():
     assert stood.contacts.all()
 
 
-def test_feet_in_the_air_may_move():
-    motion = standing_still(60, drift=0.2)
-    stood = refine(motion, odds(motion, -5.0, -5.0), told(motion), QUICK)
-    assert not stood.contacts.any()
-    assert (stood.motion.joint_positions() - motion.joint_positions()).norm(dim=-1).max() < 0.01
-
-
 def test_a_capture_without_noise_stays_but_for_half_millimetres():
     motion = walk(60)
     stood = refine(motion, odds(motion), told(motion, degrees=0.0, centimetres=0.0), QUICK)
@@ -140,27 +132,6 @@ def test_a_density_counts_less_in_windows_that_are_out_of_its_depth():
         found[density] = {part.weight for part in stood.density_intervals}
     assert found[deep] == {1.0}
     assert max(found[shallow]) < 1e-3
-
-
-@pytest.mark.slow
-def test_of_several_densities_the_likelier_counts_in_each_window():
-    motion = walk(50)
-    near = tiny_density()
-    far = replace(
-        near, name="far", reference=near.reference.with_observation_noise(100 * density_selection.proposal_sigma())
-    )
-    stood = refine(motion, odds(motion), told(motion), replace(QUICK, frames=30, ahead=10), densities=[far, near])
-    for part in stood.density_intervals:
-        assert part.prior == max(part.nats, key=lambda name: part.nats[name])
-        assert set(part.nats) == {"tiny", "far"}
-
-
-def test_a_walk_that_is_moving_begins_so():
-    """The density is not shown a first frame that stands: its step is the second's."""
-    motion = walk(30)
-    place = map_refinement._extrapolate_backward(BodyPose.of_motion(motion))
-    step = motion.root_position[1, [0, 2]] - motion.root_position[0, [0, 2]]
-    assert torch.allclose((motion.root_position[0, [0, 2]] - place.position_xz), step, atol=1e-4)
 
 
 @pytest.mark.slow
@@ -217,13 +188,6 @@ def test_no_contact_and_no_gap_in_one_is_short():
         for mask in (found, ~found):
             assert all(stop - start >= 3 for _, start, stop in true_intervals(mask))
         assert torch.equal(debounced(found), found)
-
-
-def test_long_contacts_stay():
-    bits = torch.zeros(30, 2, dtype=torch.bool)
-    bits[3:9, 0] = True
-    bits[20:, 1] = True
-    assert torch.equal(debounced(bits), bits)
 
 
 def test_a_body_that_lies_stays_however_sure_the_contacts():

@@ -11,7 +11,6 @@ from methods import UNFINISHED
 from tiny_denoiser import tiny_denoiser
 from toy_density import toy_density
 
-from controllers.common.character import Character
 from controllers.denoising.denoise import denoise
 from controllers.following.follow import follow
 from controllers.generation.generate import GenerateSettings, generate
@@ -26,7 +25,6 @@ from mapctl.intent.keyframes import Keys
 from mapctl.intent.steering import Command
 from mapctl.recording.masks import ALL, Mask
 from mapctl.skeleton import CANONICAL, Skeleton
-from mapctl.terms import Term
 
 TOY, SECONDS = toy_density(), 0.6
 STEER = steer.SteerSettings(horizon=10, commit=5, evaluations=20)
@@ -123,35 +121,6 @@ def test_terms_see_a_character_at_its_own_size():
     (entry,) = [entry for entry in done.ledger.entries if entry.name == "hand height"]
     assert entry.unit == "m"
     assert float(entry.residual.max()) == pytest.approx(before + 0.03 - height_of(done, 18), abs=2e-3)
-
-
-def test_the_view_of_a_trial_at_another_size_is_to_scale():
-    character = Character(Skeleton(CANONICAL.names, CANONICAL.parents, 1.5 * CANONICAL.offsets), 0.06)
-    seen: list[Term] = []
-
-    @dataclass(frozen=True)
-    class Look:
-        name: str = "look"
-        unit: str = "m"
-
-        def __call__(self, trial):
-            seen.append(trial)
-            return trial.joints_world[..., 0, 1] * 0
-
-        def residual(self, trial):
-            return self(trial)
-
-    from catalogue import trial
-
-    small = replace(trial(2, dtype=torch.float64), skeleton=character.unit_skeleton, heel_contacts=None)
-    character.term(Look())(small)
-    (large,) = seen
-    torch.testing.assert_close(large.joints_world, character.scale * small.joints_world)
-    torch.testing.assert_close(large.before, character.scale * small.before)
-    torch.testing.assert_close(large.heels_world, character.scale * small.heels_world)
-    torch.testing.assert_close(large.heels_before, character.scale * small.heels_before)
-    assert torch.equal(large.heels_planted, small.heels_planted)
-    assert 0 < int(small.heels_planted.sum()) < small.heels_planted.numel()
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,9 @@ import torch
 from helpers import generator, tiny_density, walk
 from toy_density import ToyDensity, toy_density
 
-from controllers.generation import foot_cleanup
-from controllers.generation.foot_cleanup import FootCleanupSettings
 from controllers.generation.generate import Beginning, GenerateSettings, generate, initialise_generation, sample_pieces
-from controllers.generation.pace_plan import PacePlan, draw_paces, plan_paces
+from controllers.generation.pace_plan import draw_paces, plan_paces
 from mapctl.features import LAYOUT, GroundPose
-from mapctl.problem.receding_horizon import HorizonSettings
 from mapctl.protocols import LastFrameState
 
 RATES = {("stand", "walk"): 0.1, ("walk", "stand"): 0.05, ("walk", "run"): 0.15, ("run", "walk"): 0.5}
@@ -90,11 +87,6 @@ def test_paces_last_as_long_as_the_rates_say():
     assert changes["walk", "run"] / changes["walk", "stand"] == pytest.approx(3.0, rel=0.15)
 
 
-def test_a_pace_that_never_changes_goes_on():
-    paces = draw_paces({("stand", "walk"): 1.0, ("walk", "stand"): 0.0}, "stand", generator())
-    assert [pace for pace, _ in islice(paces, 4)] == ["stand", "walk", "walk", "walk"]
-
-
 @pytest.mark.slow
 def test_each_piece_is_sampled_given_its_pace():
     plan = list(islice(draw_paces(RATES, "stand", generator(5)), 12))
@@ -121,16 +113,6 @@ def test_what_is_not_taken_on_is_told_more_emphatically_and_then_no_more():
     assert float(ran[ran[:, PACE] == 3, TIMES].max()) == 2, "a run that is told more often flings its legs"
 
 
-def test_who_sways_stands():
-    swaying = sample(replace(TOLD, sway=2.0, rates={("stand", "walk"): 0.01}), 8)
-    assert set(swaying[:, TIMES].tolist()) == {1.0}
-
-
-def test_planted_samples_are_told_too():
-    planted = GenerateSettings(sigma_planted=0.05)
-    assert {1.0, 2.0} <= set(sample(TOLD, 400, settings=planted)[:, PACE].tolist())
-
-
 def test_the_first_pace_is_that_of_the_start():
     for speed, pace in ((0.1, 1), (1.2, 2), (3.0, 3)):
         assert float(sample(TOLD, 1, speed=speed)[0, PACE]) == pace
@@ -144,14 +126,6 @@ def test_the_first_pace_is_that_of_the_start():
     clip = walk(60)._map_frames(lambda values: values[[*[0] * 30, *range(60)]])  # stands, and sets off
     step = float(clip.root_position[-31:, [0, 2]].diff(dim=0).mean(0).norm()) * 30
     assert initialise_generation(still, GenerateSettings(), clip, generator()).speed == pytest.approx(step, rel=0.05)
-
-
-def test_nothing_is_told_where_no_pace_is_known_or_wanted():
-    steady = replace(TOLD, rates={})
-    assert plan_paces(steady, 0.0, generator()) is None
-    assert set(sample(steady, 3)[:, PACE].tolist()) == {0.0}
-    (piece,) = islice(sample_pieces(begin(), generator()), 1)
-    assert set(piece[:, PACE].tolist()) == {0.0}
 
 
 def test_a_density_without_paces_samples_as_in_one_go():
@@ -186,30 +160,3 @@ def test_generated_motion_is_told(pacing, tell, expected):
     motion = generate(density, seconds=10.0, generator=generator(), settings=settings).motion
     assert motion.num_frames == 300
     assert set(told.values()) == expected
-
-
-@pytest.mark.slow
-def test_feet_are_cleaned_up_by_what_was_told(pacing, monkeypatch):
-    density, told = pacing
-    solved, sampled = [], []
-    make, see = foot_cleanup.RecedingHorizonSolver, PacePlan.see
-    monkeypatch.setattr(
-        foot_cleanup,
-        "RecedingHorizonSolver",
-        lambda prior, *more, **named: solved.append(told[prior]) or make(prior, *more, **named),
-    )
-
-    def watch(self, features):
-        sampled.extend([f"pace={self._pace}"] * len(features))
-        see(self, features)
-
-    monkeypatch.setattr(PacePlan, "see", watch)
-    window = HorizonSettings(frames=12, overlap=6)
-    generate(
-        density,
-        seconds=2.0,
-        generator=generator(),
-        settings=GenerateSettings(foot_cleanup=FootCleanupSettings(window=window)),
-    )
-    assert solved == sampled[3 : 3 + 6 * len(solved) : 6]
-    assert len(set(solved)) == 2

@@ -15,7 +15,7 @@ from controllers.shots.keys.reaching import ReachTargets, settle_reaches
 from controllers.shots.loop import OVERLAP, close_loop
 from controllers.shots.planning.way import Way, plan_way
 from controllers.shots.request import PoseKey, Reach, ShotRequest
-from controllers.shots.wishes import Wish, check_wishes, describe_fights
+from controllers.shots.wishes import Wish, describe_fights
 from mapctl import curves, kinematics
 from mapctl.errors import RequestError
 from mapctl.intent.path import SpeedProfile
@@ -106,13 +106,6 @@ def test_a_key_may_be_met_within_its_frames(walked, way, inbetweener):
     assert abs(met.start - 60) <= 8
 
 
-@pytest.mark.slow
-def test_two_keys_close_together_are_both_met(walked, way, inbetweener):
-    keys = (PoseKey(2.0, crouched()), PoseKey(2.4, facing_deg=20.0, place=(0.0, 2.5)))
-    made, met = meet_poses(walked, keys, way, inbetweener)
-    assert max(measure_pose_error(made, one)[0] for one in met) < 0.001
-
-
 def test_limbs_of_a_pose_become_reaches_to_where_they_are_in_it(walked, way):
     key = PoseKey(2.0, crouched(), joints=("leftHand",), place=(0.2, 2.2), facing_deg=0.0)
     (reach,) = as_reaches((key,), way, walked.slice(0, 1))
@@ -200,20 +193,6 @@ def test_a_shot_ends_in_a_clips_frame_and_moves_as_the_clip_does(walked, inbetwe
     torch.testing.assert_close(made.root_position[:60], walked.root_position[:60])
 
 
-def test_a_curve_is_brought_to_where_a_clip_is():
-    arrival = Arrival.of(walk(90, turn_rate=0.5), 50)
-    brought = arrival.bring_curve(curves.wave(amplitude=0.5, length=4))
-    torch.testing.assert_close(brought.points[-1], arrival.motion.root_position[0, ::2])
-    tangent = brought.tangent(brought.length)
-    assert abs(math.remainder(math.atan2(*tangent.tolist()) - arrival.direction, 2 * math.pi)) < 0.02
-
-
-@pytest.mark.parametrize("frame", [-1, 88, 200])
-def test_a_clip_has_frames_after_the_one_it_is_ended_in(frame):
-    with pytest.raises(RequestError, match="0:88"):
-        Arrival.of(walk(90), frame)
-
-
 @pytest.mark.slow
 def test_a_loop_leads_from_its_last_frame_into_its_first(inbetweener):
     """One lap of a walk whose stride does not divide it."""
@@ -244,14 +223,3 @@ def test_wishes_that_fight_are_named_together(walked, way):
     assert "look at 2.2 s, 25.0 degrees short" in first
     assert "3.9" not in first
     assert "cm off at that time" in first
-
-
-def test_no_remedy_is_told_where_the_place_is_in_reach_at_that_time(walked, way):
-    """Another time is none where the shoulder is near enough already: something else is in the way."""
-    shoulder = walked.joint_positions()[60, walked.skeleton.index("leftUpperArm")]
-    near = tuple(float(value) for value in shoulder + shoulder.new_tensor([0.3, -0.1, 0.1]))
-    request = ShotRequest(LINE, seconds=4.0, reaches=(Reach(1.99999, {"leftHand": near}),))
-    (reach,) = [wish for wish in check_wishes(request, way, walked) if wish.name.startswith("leftHand")]
-    assert reach.name == "leftHand at 2 s"
-    assert not reach.holds
-    assert reach.remedy == ""

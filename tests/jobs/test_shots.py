@@ -10,12 +10,11 @@ from helpers import walk
 
 import priors
 from controllers.common.character import Character
-from controllers.shots import walking
 from controllers.shots.clips.lead import Lead
 from controllers.shots.keys.looking import look_where_hands_reach, measure_look_errors, turn_heads
 from controllers.shots.keys.reaching import ReachTargets
-from controllers.shots.planning.timeline import Span, StandingEnds, lay_timeline, limit_timed_speeds, plan_speeds
-from controllers.shots.planning.way import cut_curve, plan_way
+from controllers.shots.planning.timeline import StandingEnds, lay_timeline, plan_speeds
+from controllers.shots.planning.way import plan_way
 from controllers.shots.request import Look, Others, Reach, ShotRequest
 from controllers.shots.rest_pose import build_rest_pose
 from controllers.shots.shot import solve_shot
@@ -46,11 +45,6 @@ def test_a_character_stands_walks_and_stands_again():
     assert (spans[0].start, spans[-1].stop) == (0, 270)
 
 
-def test_who_never_stands_walks_throughout_and_who_never_walks_stands():
-    assert lay_timeline(torch.full((90,), 0.9), slowest=0.5) == [Span("walk", 0, 90)]
-    assert lay_timeline(torch.zeros(90), slowest=0.5) == [Span("stand", 0, 90)]
-
-
 def test_what_is_too_short_for_a_walk_is_a_step_between_two_standings():
     speeds = torch.zeros(120)
     speeds[50:60] = 0.8
@@ -69,25 +63,6 @@ def test_speeds_rise_from_standing_and_end_at_the_curves_end(seconds):
         assert len(speeds) == round(30 * seconds)
 
 
-def test_a_walk_that_has_no_time_for_its_curve_still_stops_in_time():
-    speeds = plan_speeds(SpeedProfile.constant(1.2), 30.0, 30, STANDING, seconds=4.0, most=10_000)
-    assert bool((speeds[-28:] < 0.05).all())
-    assert 1.0 < float(speeds.sum()) / 30 < 3.5
-
-
-def test_too_many_frames_are_refused():
-    with pytest.raises(RequestError, match="frames allowed"):
-        plan_speeds(SpeedProfile.constant(0.1), 1000.0, 30, STANDING, seconds=None, most=3000)
-
-
-def test_timed_speeds_that_do_not_stand_are_made_to():
-    speeds = limit_timed_speeds(torch.full((150,), 1.2, dtype=torch.float64), 30, STANDING)
-    assert bool((speeds[:15] == 0).all())
-    assert bool((speeds[-30:] == 0).all())
-    told = TimedSpeed.parse(((0, 0), (1, 1.2), (4, 0))).at(150, 30)
-    torch.testing.assert_close(limit_timed_speeds(told, 30, STANDING), told)
-
-
 # Where
 
 
@@ -101,19 +76,6 @@ def test_a_way_past_somebody_who_comes_the_other_way_keeps_apart_when_they_meet(
     assert float((there - towards[: len(there)]).norm(dim=-1).min()) > 0.6
     alone = plan_way(replace(request, others=None))
     assert float((alone.curve.point(alone.arcs) - towards[: len(alone.arcs)]).norm(dim=-1).min()) < 0.2
-
-
-def test_a_wall_leaves_the_curve_and_a_note():
-    way = plan_way(ShotRequest(LINE, obstacles=(Obstacle((0.0, 1.5), size=(30.0, 0.2)),)))
-    assert way.note is not None
-    assert way.curve is LINE
-
-
-def test_a_piece_of_a_curve_begins_where_it_is_cut():
-    circle = curves.circle(radius=2)
-    piece = cut_curve(circle, 1.0, 3.5)
-    assert piece.length == pytest.approx(2.5, abs=1e-3)
-    torch.testing.assert_close(piece.point(1.0), circle.point(2.0), atol=1e-3, rtol=0)
 
 
 # Bad wishes
@@ -144,11 +106,6 @@ def test_what_no_arm_reaches_is_refused_with_its_distance(place):
         solve_shot(priors.load("locomotion"), priors.load_inbetweener(), request)
 
 
-def test_only_hands_and_feet_reach():
-    with pytest.raises(RequestError, match="head"):
-        Reach(1.0, {"head": (0, 1, 1)})
-
-
 # Going on from a clip
 
 
@@ -171,12 +128,6 @@ def test_a_curve_is_brought_to_a_lead_or_the_lead_to_the_curve():
     assert abs(math.remainder(moved.direction - curve.start_heading, 2 * math.pi)) < 1e-6
     steps = [each.motion.root_position.diff(dim=0).norm(dim=-1) for each in (lead, moved)]
     torch.testing.assert_close(*steps)
-
-
-@pytest.mark.parametrize("frame", [0, 1, 90, 200])
-def test_a_clip_has_frames_before_the_one_it_is_gone_on_from(frame):
-    with pytest.raises(RequestError, match="2:90"):
-        Lead.of(walk(90), frame)
 
 
 def test_a_walk_begins_in_the_leads_last_pose():
@@ -212,15 +163,6 @@ def test_a_head_looks_where_it_is_told_and_back_without_a_jump():
     torch.testing.assert_close(turned.joint_rotations()[same, head], motion.joint_rotations()[same, head])
     one, other = turned.joint_rotations()[:-1, head], turned.joint_rotations()[1:, head]
     assert float(torch.rad2deg(2 * (one * other).sum(-1).abs().clamp(max=1).acos()).max()) < 12  # a frame
-
-
-def test_a_head_does_not_turn_farther_than_necks_do():
-    motion = walk(120)
-    behind = Look(2.0, (0.0, 1.4, -20.0))
-    turned = turn_heads(motion, (behind,))
-    chest, head = (turned.joint_rotations()[60, CANONICAL.index(name)] for name in ("chest", "head"))
-    assert float(torch.rad2deg(2 * (chest * head).sum().abs().clamp(max=1).acos())) < 110
-    assert float(measure_look_errors(turned, behind)) > 20
 
 
 def test_targets_beyond_reach_are_brought_within_it():
@@ -282,28 +224,6 @@ def test_nothing_jumps_in_a_shot(shot):
 
 
 @pytest.mark.slow
-def test_a_shot_is_the_same_again(shot):
-    request, done = shot
-    prior = priors.load("locomotion")
-    again = solve_shot(prior, priors.load_inbetweener(), request, generator=torch.Generator().manual_seed(1))
-    assert torch.equal(again.motion.local_quat_xyzw, done.motion.local_quat_xyzw)
-
-
-@pytest.mark.slow
-def test_a_shot_that_is_interrupted_is_not_half_a_shot(monkeypatch):
-    """What the horizon has solved by then is kept for a walk; the rest of a shot would stand still."""
-    prior = priors.load("locomotion")
-
-    def stop(*_):
-        raise KeyboardInterrupt
-
-    solve = walking.walk_arcs
-    monkeypatch.setattr(walking, "walk_arcs", lambda *args, **words: solve(*args, **words, progress=stop))
-    with pytest.raises(KeyboardInterrupt):
-        solve_shot(prior, priors.load_inbetweener(), ShotRequest(LINE, seconds=3.0))
-
-
-@pytest.mark.slow
 def test_who_reaches_far_aside_leaves_the_way_for_it_and_is_told():
     prior = priors.load("locomotion")
     reach = Reach(2.0, {"leftHand": (1.3, 0.9, 2.4)})
@@ -318,20 +238,6 @@ def test_who_reaches_far_aside_leaves_the_way_for_it_and_is_told():
     assert float(hips[[0, -1]].abs().max()) < 0.1
     ends = done.motion.joint_positions()[:, list(CANONICAL.indices(("leftHand", "rightHand", *TOES)))]
     assert worst_frame.measure_peaks(ends, done.motion.root_position, 30.0).step * 30 < 5.5
-
-
-@pytest.mark.slow
-def test_a_reach_that_is_far_off_is_told_with_its_distance():
-    prior = priors.load("locomotion")
-    wide = Reach(1.0, {"leftHand": (1.2, 1.2, 1.2), "rightHand": (-1.2, 1.2, 1.2)})
-    request = ShotRequest(curves.line(length=2.5), seconds=2.0, reaches=(wide,))
-    done = solve_shot(prior, priors.load_inbetweener(), request)
-    assert not done.status.ok
-    assert "leftHand, rightHand at 1 s" in done.status.text
-    missed = next(wish for wish in done.wishes if wish.name.startswith("leftHand"))
-    assert missed.residual > 20
-    assert missed.remedy.endswith("cm nearer")
-    assert missed.remedy in done.status.text
 
 
 @pytest.mark.slow

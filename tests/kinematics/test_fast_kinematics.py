@@ -4,7 +4,6 @@ import os
 import shutil
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path as FilePath
 
 import pytest
@@ -145,11 +144,6 @@ def test_any_tree_and_bones():
     agree(body_of, skeleton=Skeleton(CANONICAL.names, parents, offsets))
 
 
-def test_features_with_strides_agree():
-    wide = torch.randn(3, LAYOUT.size, FRAMES, generator=generator(10)).double().transpose(1, 2)
-    agree(everything_of, features=wide)
-
-
 def test_gradients_are_those_of_finite_differences():
     whole, step = trial(1), 1e-3
     value = everything_of(whole)
@@ -159,23 +153,6 @@ def test_gradients_are_those_of_finite_differences():
     ends = [everything_of(trial(1, features=(whole.features + sign * step * way).detach())) for sign in (1, -1)]
     slope = float(((ends[0] - ends[1]).detach().double() * weights).sum()) / (2 * step)
     assert float((gradient * way).sum()) == pytest.approx(slope, rel=1e-3)
-
-
-def test_the_body_is_left_alone_while_only_the_root_is_asked_for(monkeypatch):
-    monkeypatch.setattr(fast, "compute_joints_and_heels", None)
-    whole = trial()
-    assert TERMS["path of the hips"](whole).shape == (3, FRAMES)
-    with pytest.raises(TypeError):
-        TERMS["footing"](whole)
-
-
-def test_the_torch_code_serves_what_the_kernels_do_not():
-    whole = trial()
-    wanting = GroundPose(whole.start.position_xz.requires_grad_(), whole.start.heading)
-    assert not replace(whole, start=wanting)._use_kernels
-    (gradient,) = torch.autograd.grad(replace(whole, start=wanting).joints_world.sum(), wanting.position_xz)
-    torch.testing.assert_close(gradient, torch.full((2,), 3.0 * FRAMES * CANONICAL.num_joints))
-    assert not trial(dtype=torch.float64)._use_kernels
 
 
 def test_the_same_candidates_give_the_same_bytes_alone_and_in_a_batch():
@@ -229,15 +206,6 @@ def test_the_wanted_place_lies_straight_on_from_the_nearest(name):
 
 
 @each_curve
-def test_single_precision_finds_the_same(name):
-    curve = CURVES[name]
-    points, arcs = beside(curve, dtype=torch.float32)
-    narrow, wide = (find_local_frames(curve, part, arcs, reach=0.6) for part in (points, points.double()))
-    torch.testing.assert_close(narrow.place, wide.place.float())
-    torch.testing.assert_close(narrow.axes, wide.axes.float())
-
-
-@each_curve
 def test_what_is_not_a_number_stays_so_and_harms_nobody_else(name):
     curve = CURVES[name]
     points, arcs = beside(curve, count=20)
@@ -247,14 +215,6 @@ def test_what_is_not_a_number_stays_so_and_harms_nobody_else(name):
     assert bool(torch.isnan(found.place[:, [7, 9]]).all())
     rest = [t for t in range(20) if t not in (3, 7, 9)]
     torch.testing.assert_close(found.axes[:, rest], clean.axes[:, rest], atol=0, rtol=0)
-
-
-def test_the_paths_memory_of_a_window_does_not_outlive_it():
-    term, whole = TERMS["path of the hips"], trial()
-    first = term(whole).detach()
-    moved = replace(whole, before=whole.before + 0.1)
-    assert float((term(moved).detach() - first).abs().max()) > 1e-3
-    assert torch.equal(term(whole), first)
 
 
 COMPILED = """

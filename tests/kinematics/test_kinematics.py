@@ -37,27 +37,6 @@ def test_positions_and_rotations_are_the_product_of_transforms(skeleton):
         np.testing.assert_allclose(rotations.to_matrix(motion.joint_rotations()[frame]), world[:, :3, :3], atol=1e-9)
 
 
-def test_any_batch_shape_gives_the_same_as_one_by_one():
-    motion = random_motion(CANONICAL, 6)
-    places, turns = kinematics.forward_kinematics(
-        CANONICAL.offsets,
-        CANONICAL.parents,
-        motion.root_position.reshape(2, 3, 3),
-        motion.local_quat_xyzw.reshape(2, 3, -1, 4),
-    )
-    torch.testing.assert_close(places.flatten(0, 1), motion.joint_positions())
-    torch.testing.assert_close(turns.flatten(0, 1), motion.joint_rotations())
-
-
-def test_moving_bones_may_have_the_batch_shape():
-    motion = random_motion(BRANCHED, 4)
-    offsets = BRANCHED.offsets.expand(4, 5, 3) * torch.tensor([1.0, 2.0, 0.5, 1.0]).double()[:, None, None]
-    places, _ = kinematics.forward_kinematics(offsets, BRANCHED.parents, motion.root_position, motion.local_quat_xyzw)
-    stretched = Skeleton(BRANCHED.names, BRANCHED.parents, offsets[1])
-    expected = by_matrices(stretched, motion.root_position[1], motion.local_quat_xyzw[1])[:, :3, 3]
-    np.testing.assert_allclose(places[1], expected, atol=1e-9)
-
-
 def test_local_rotations_come_back_from_the_world():
     motion = random_motion(CANONICAL)
     local = kinematics.local_from_world(CANONICAL.parents, motion.joint_rotations())
@@ -125,9 +104,3 @@ def test_the_canonical_skeleton_stands_as_the_conventions_say():
 def test_trees_that_are_none_are_refused(names, parents, rows):
     with pytest.raises(MapctlError):
         Skeleton(names, parents, torch.zeros(rows, 3, dtype=torch.float64))
-
-
-def test_an_unknown_joint_is_answered_with_the_known_ones():
-    with pytest.raises(MapctlError, match="no joint 'tail'; the nearest is a, then "):
-        BRANCHED.index("tail")
-    assert BRANCHED.children(0) == [1, 2]

@@ -1,22 +1,16 @@
 """The mannequin: solids with the right volume, on any rig, that move, turn and grow with the skeleton."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-import torch
 from helpers import moved
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes_walks import renamed, scaled, walk
 
-from mapctl.joint_names import Part, Side
 from mapctl.mesh import colours
-from mapctl.mesh.anatomy import Anatomy
 from mapctl.mesh.mannequin import Mannequin
-from mapctl.mesh.primitives import RoundedBoxes, Surface, frame_along, merge_surfaces, unit_sphere
-from mapctl.skeleton import CANONICAL, Skeleton
-from scenes.renderers.layers import shade
+from mapctl.mesh.primitives import RoundedBoxes, Surface, frame_along
+from mapctl.skeleton import CANONICAL
 
 GREY = colours.rgb("slate")
 LIMBS = ("Shoulder", "Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot", "ToeBase")
@@ -61,20 +55,6 @@ def test_a_capsules_skin_lies_a_radius_from_its_axis_and_its_normals_point_away_
     assert surface.normals == pytest.approx(away / 0.1)
 
 
-def test_every_vertex_of_the_ball_has_an_octant():
-    points, faces = unit_sphere()
-    assert np.abs(points).min() > 1e-3
-    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()  # closed
-
-
-def test_merged_faces_still_point_at_their_own_vertices():
-    parts = [one((0, 0.4, 0), (0.1, 0.1)), one((0.1, 0.4, 0.2), (0.1, 0.2))]
-    whole = merge_surfaces(parts)
-    corners = np.concatenate([p.vertices[p.faces] for p in parts])
-    assert np.array_equal(whole.vertices[whole.faces], corners)
-
-
 def test_a_body_moves_and_turns_with_its_motion():
     motion, frame = walk(), 5
     there = moved(motion, turn=0.7, shift=(2.0, -1.0))
@@ -91,14 +71,6 @@ def test_a_body_is_as_large_as_its_bones(factor):
     assert larger == pytest.approx(skin * factor, abs=1e-9)
 
 
-def test_the_mirrored_motions_body_is_the_mirror_image():
-    motion = walk()
-    box, other = (Mannequin(m, GREY).surface(4).vertices for m in (motion, motion.mirror()))
-    for corner in (np.min, np.max):
-        assert corner(box[:, 1:], axis=0) == pytest.approx(corner(other[:, 1:], axis=0), abs=2e-3)
-    assert box[:, 0].max() == pytest.approx(-other[:, 0].min(), abs=2e-3)
-
-
 def test_left_is_blue_and_right_is_orange_and_the_torso_is_the_actors():
     skin = Mannequin(walk(), colours.rgb("green")).surface(0)
     hands = {side: skin.rgba[np.argmax(sign * skin.vertices[:, 0]), :3] for side, sign in (("left", 1), ("right", -1))}
@@ -110,11 +82,6 @@ def test_left_is_blue_and_right_is_orange_and_the_torso_is_the_actors():
 
 def test_soles_stand_on_the_ground_in_the_upright_pose():
     assert Mannequin(walk(), GREY).surface(0).vertices[:, 1].min() == pytest.approx(0.0, abs=0.01)
-
-
-def test_head_faces_as_the_body_does():
-    axes = Anatomy(walk()).head_axes
-    assert axes == pytest.approx(np.eye(3), abs=1e-6)
 
 
 def test_another_rigs_names_give_the_same_body():
@@ -134,25 +101,3 @@ def test_unknown_names_get_thin_capsules():
 @pytest.mark.parametrize("frames", [1, 2])
 def test_the_shortest_motions_have_bodies(frames):
     assert np.isfinite(Mannequin(walk(frames), GREY).surface(frames - 1).vertices).all()
-
-
-def test_feet_are_found_with_their_heights_over_the_sole():
-    feet = Anatomy(walk()).feet
-    assert [foot.side for foot in feet] == [Side.LEFT, Side.RIGHT]
-    assert feet[0].heights == pytest.approx((0.1174, 0.0425), abs=0.01)
-
-
-def test_a_rig_without_end_sites_is_given_hands_toes_and_a_crown():
-    motion = walk()
-    bones = motion.skeleton
-    points = Anatomy(replace(motion, skeleton=Skeleton(bones.names, bones.parents, bones.offsets))).points
-    tips = [points.roles[k].part for k in range(motion.num_joints, len(points.parents))]
-    assert sorted(tips, key=str) == sorted([Part.HEAD, Part.HAND, Part.HAND, Part.TOES, Part.TOES], key=str)
-
-
-def test_light_from_above_shades_the_underside():
-    surface = one((0, 0, 0), (0.5, 0.5))
-    lit = shade(surface, np.array([0.0, 1.0, 5.0]))[:, :3].sum(axis=1)
-    top, bottom = lit[np.argmax(surface.vertices[:, 1])], lit[np.argmin(surface.vertices[:, 1])]
-    assert top > 1.3 * bottom
-    assert torch.tensor(lit).isfinite().all()

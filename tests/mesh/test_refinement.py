@@ -44,26 +44,6 @@ def test_a_picture_is_shown_to_the_cell_and_edges_are_shared():
     assert (met == 1).sum() == 4 * round((met == 1).sum() / 4), "as many at every side of the outline"
 
 
-def test_a_plain_or_linear_colour_needs_no_finer_triangles():
-    def ramp(corners, shares):
-        at = np.einsum("nc,nck->nk", shares, SQUARE[corners])
-        return np.column_stack([at * 10, np.ones(len(at))])
-
-    assert not choose_cell(SQUARE, FACES, ramp)[0].any()
-
-
-def test_cells_grow_until_they_are_few():
-    far = SQUARE * 20
-
-    def noise(corners, shares):
-        at = np.einsum("nc,nck->nk", shares, far[corners])
-        return np.column_stack([np.repeat(np.sin(1e4 * at.sum(axis=1))[:, None] > 0, 3, axis=1), np.ones(len(at))])
-
-    _, cell = choose_cell(far, FACES, noise, most=20)
-    wrong = np.ones(2, bool)
-    assert len(refine(far, FACES, wrong, cell, noise).faces) <= 20
-
-
 def test_a_character_shows_its_picture_more_sharply_than_its_vertices(tmp_path):
     made = make_character_glb(tmp_path / "hero.glb")
     mesh, shirt = formats.load_mesh(made.path), made.parts[0]

@@ -8,7 +8,6 @@ import torch
 from catalogue import DENSITIES, FRAMES, PAST, TERMS, excite, trial
 from helpers import generator, tiny_density, tiny_model, walk
 
-from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, encode, integrate_root
 from mapctl.kinematics.fast import WorldPoses
 from mapctl.problem.context import WindowContext
@@ -16,7 +15,7 @@ from mapctl.problem.latent_noise import LatentNoise
 from mapctl.problem.objective import Objective
 from mapctl.problem.parametrisation import AdjointParametrisation
 from mapctl.skeleton import CANONICAL
-from mapctl.terms import Jerk, LatentPrior
+from mapctl.terms import LatentPrior
 from mapctl.terms.adjoints.gradient import TrialGradient
 from mapctl.terms.base import DifferentiatedTerm
 from priors.lstm_gmm.fast import half
@@ -54,11 +53,6 @@ def assert_near(ours, theirs, share=1e-4):
     assert np.linalg.norm(np.asarray(ours) - theirs) <= share * np.linalg.norm(theirs) + 1e-9
 
 
-def test_the_terms_of_steering_and_following_have_gradients_of_their_own():
-    kinds = {type(term).__name__ for term in BY_HAND.values()}
-    assert kinds == {"LatentPrior", "Likelihood", "FootContact", "Path", "RootVelocity", "StepLength"}
-
-
 @pytest.mark.parametrize("name", BY_HAND)
 @pytest.mark.parametrize(("batch", "past", "seed"), [(1, PAST, 0), (3, PAST, 1), (2, 0, 2), (4, 1, 3)])
 def test_a_gradient_is_that_of_autograd(name, batch, past, seed):
@@ -70,19 +64,6 @@ def test_a_gradient_is_that_of_autograd(name, batch, past, seed):
     assert_near(energy, wanted)
     for part, other in zip(ours, theirs, strict=True):
         assert_near(part, other)
-
-
-@pytest.mark.parametrize("name", BY_HAND)
-def test_a_gradient_is_added_to_what_is_there(name):
-    whole = trial(2, dtype=torch.float32)
-    poses = WorldPoses.compute(whole.features, whole.start, whole.skeleton)
-    whole = replace(whole, world_poses=poses)
-    once, twice = TrialGradient.zeros(whole), TrialGradient.zeros(whole)
-    BY_HAND[name].add_gradient(whole, once)
-    for _ in range(2):
-        BY_HAND[name].add_gradient(whole, twice)
-    for part, doubled in zip(vars(once).values(), vars(twice).values(), strict=True):
-        np.testing.assert_allclose(doubled, 2 * part, rtol=1e-5, atol=1e-5)
 
 
 def context(density):
@@ -145,17 +126,6 @@ def test_double_precision_is_left_to_autograd():
     assert energy.dtype == gradient.dtype == torch.float64
 
 
-def test_a_term_at_fault_is_named():
-    class Broken(Jerk):
-        def __call__(self, trial):
-            return super().__call__(trial) * float("nan")
-
-    noise = torch.zeros(1, FRAMES * LAYOUT.continuous)
-    unknowns = LatentNoise.from_unknowns(context(DENSITIES["kernels"]), noise)
-    with pytest.raises(RequestError, match="'broken' gave an energy that is not finite"):
-        Objective.of(unknowns, [LatentPrior(), Broken(name="broken")]).energy_and_gradient(noise)
-
-
 def half_network(**shape) -> LstmGmm:
     """A network whose weights half precision holds."""
     network = tiny_model(dtype=torch.float32, **shape)
@@ -181,11 +151,3 @@ def test_half_precision_changes_nothing(batch, monkeypatch):
         assert (replace(density)._fast._weights.lstm.dtype == np.uint16) is halves
     for ours, theirs in zip(*found, strict=True):
         assert_near(ours, theirs.numpy(), 1e-5)
-
-
-def test_weights_that_half_precision_rounds_stay_as_they_are():
-    network = half_network()
-    with torch.no_grad():
-        network.fc3.weight[0, 0] = 0.1
-    packed = replace(tiny_density(), reference=network, use_fast=True)._fast._weights
-    assert packed.fc3.dtype == packed.lstm.dtype == np.float32

@@ -6,15 +6,12 @@ from functools import cache
 
 import pytest
 import torch
-from helpers import corpus, generator, tiny_density, walk
+from helpers import generator, tiny_density, walk
 from toy_density import ToyDensity, toy_density
 
-import priors
-from mapctl.errors import MapctlError, RequestError
 from mapctl.features import LAYOUT, encode
 from mapctl.problem import density_selection
 from mapctl.rotations import from_rotation_vector, multiply
-from priors.training.quality.density import compute_window_nats
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,31 +54,6 @@ def test_densities_are_compared_in_physical_units():
     assert found == pytest.approx({"wide": 0.0, "narrow": -10 + LAYOUT.continuous * math.log(2)}, rel=1e-5)
 
 
-def test_other_units_of_the_network_change_nothing():
-    """A Gaussian density is the same whatever its normalisation: here a network of which only that is left."""
-
-    @dataclass(frozen=True, eq=False)
-    class Gaussian(Flat):
-        def log_prob(self, features, state, *, inputs=None):
-            size = LAYOUT.continuous
-            white = features[..., :size] / self.feature_std[:size]
-            spread = 0.1 / self.feature_std[:size]  # of the same physical density
-            return (-0.5 * (white / spread).square() - spread.log()).sum(-1)
-
-    densities = [flat(f"{std}", 0.0, std, kind=Gaussian) for std in (0.5, 3.0)]
-    nats = density_selection.select_density_for_motion(densities, walk(20)).nats
-    assert nats["0.5"] == pytest.approx(nats["3.0"], rel=1e-5)
-
-
-def test_any_rate_will_do_and_too_little_is_refused():
-    densities = [flat("a", 1.0), flat("b", 2.0)]
-    assert density_selection.select_density_for_motion(densities, walk(40, fps=120)).density.name == "b"
-    with pytest.raises(MapctlError, match="at least two frames"):
-        density_selection.select_density_for_motion(densities, walk(2, fps=120))
-    with pytest.raises(RequestError, match="no density"):
-        density_selection.select_density_for_motion([], walk(20))
-
-
 def test_a_density_without_a_finite_answer_is_never_chosen():
     choice = density_selection.select_density_for_motion([flat("lost", math.nan), flat("bad", -1e4)], walk(20))
     assert choice.density.name == "bad"
@@ -94,11 +66,6 @@ def test_the_weight_falls_with_what_is_lacking(lacking, weight):
     assert density_selection.select_density_for_motion(
         [flat("a", 0.0, usual=lacking)], walk(20)
     ).weight == pytest.approx(weight)
-
-
-def test_a_card_that_does_not_say_what_is_usual_leaves_the_weight():
-    assert tiny().reference_log_density == -math.inf
-    assert density_selection.select_density_for_motion([tiny()], walk(20)).weight == 1.0
 
 
 def test_the_motion_it_knows_is_likelier_than_a_twisted_one():
@@ -143,23 +110,3 @@ def test_a_blurred_density_is_that_of_a_sum():
         signed = torch.where(features[:, 1:, size:] > 0.5, mixture.contact_logit, -mixture.contact_logit)
         wanted = wanted + torch.nn.functional.logsigmoid(signed).sum(-1)
     assert torch.allclose(density.with_observation_noise(spread).log_prob(features[:, 1:], state), wanted, rtol=1e-4)
-
-
-def test_what_windows_of_its_own_data_reach_is_below_their_mean():
-    found = compute_window_nats(tiny().reference, [corpus(4, 120)])
-    assert found["p2"] <= found["mean"]
-    name, walked = (
-        tiny().name,
-        density_selection.select_density_for_motion(
-            [tiny().with_observation_noise(density_selection.proposal_sigma())], walk(100)
-        ),
-    )
-    assert abs(walked.nats[name] - found["mean"]) < 30
-
-
-def test_what_a_prior_option_leaves_to_choose_from():
-    assert priors.load_choice(None) == []
-    assert [density.name for density in priors.load_choice("locomotion-live")] == ["locomotion-live"]
-    bundled = priors.load_choice("auto")
-    assert [density.name for density in bundled] == ["locomotion", "general"]
-    assert all(100 < density.reference_log_density < density.card.quality["windows"]["mean"] for density in bundled)

@@ -12,7 +12,6 @@ from mapctl.problem.latent_noise import LatentNoise
 from mapctl.problem.objective import Objective
 from mapctl.problem.parametrisation import Parametrisation
 from mapctl.problem.pose_offsets import PoseOffsets
-from mapctl.protocols import DiscreteChoices
 from mapctl.terms import FootContact, Jerk, LatentPrior, Likelihood
 
 FRAMES, SIZE = 7, LAYOUT.continuous
@@ -52,16 +51,6 @@ def test_latents_build_the_rollout_of_their_plan():
     assert torch.equal(trial.contacts, LAYOUT.pick(features, "contacts") > 0.5)
     assert trial.start is CONTEXT.place
     assert trial.before is CONTEXT.before
-
-
-def test_one_plan_serves_many_candidates():
-    draws = noise(3, FRAMES, dtype=torch.float64)
-    plan = LatentNoise.from_unknowns(CONTEXT, draws[:1].flatten(1)).plan
-    together = LatentNoise(CONTEXT, plan).build(draws.flatten(1))
-    assert isinstance(plan, DiscreteChoices)
-    for row in range(3):
-        alone = LatentNoise(CONTEXT, plan).build(draws[row : row + 1].flatten(1))
-        torch.testing.assert_close(together.features[row], alone.features[0])
 
 
 def test_the_gradient_through_the_whole_chain_is_that_of_finite_differences():

@@ -9,7 +9,7 @@ from captures import DEGREE, apart_deg, vectors
 from helpers import generator, quat_xyzw
 
 from mapctl import rotations
-from mapctl.recording.fusion import fuse_positions, fuse_rotations, measure_kept_noise, smooth_columns
+from mapctl.recording.fusion import fuse_positions, fuse_rotations, smooth_columns
 
 JOINTS, SIGMA = 4, 5 * DEGREE
 LEVEL = torch.full((JOINTS,), SIGMA, dtype=torch.float64)
@@ -62,12 +62,6 @@ def test_the_smoother_keeps_half_the_power_at_its_frequency_and_parabolas_to_the
     middle = slice(200, 1000)
     assert float(smooth[middle, 0].std() / columns[middle, 0].std()) == pytest.approx(0.5, abs=0.01)
     torch.testing.assert_close(smooth[:, 1], columns[:, 1], atol=1e-5, rtol=0)
-
-
-def test_the_noise_that_a_smoother_keeps_is_measured():
-    white = torch.randn(6000, 1, 3, generator=generator()).double()
-    smooth = smooth_columns(white, torch.ones(6000, 1, dtype=torch.float64), 4.0, 30.0)
-    assert float(smooth.square().mean()) == pytest.approx(measure_kept_noise(4.0, 30.0), rel=0.05)
 
 
 PROPOSALS = {
@@ -124,14 +118,6 @@ def test_without_noise_the_capture_is_the_truth_and_gaps_are_the_proposals():
     fused = fuse_rotations(proposal, wanted, seen, 0 * LEVEL, 30.0)
     assert float(apart_deg(fused.values, wanted)[seen].max()) < 1e-6
     assert float(apart_deg(fused.values, wanted).max()) < 0.2  # as far beside the truth as the residual on both sides
-
-
-def test_unobserved_frames_count_for_nothing():
-    wanted = truth(30.0)
-    seen = torch.rand(wanted.shape[:2], generator=generator()) > 0.1
-    given = [torch.where(seen[..., None], shake(wanted), other) for other in (wanted, turn(wanted, 170.0))]
-    one, other = (fuse_rotations(turn(wanted, 5.0), each, seen, LEVEL, 30.0).values for each in given)
-    assert float(apart_deg(one, other).max()) < 1e-4
 
 
 @pytest.mark.parametrize("proposal", [True, False])

@@ -35,15 +35,6 @@ def test_a_body_that_freezes_and_goes_on_elsewhere_has_a_gap_there(rig, fps):
     assert find_gaps(motion) == (Mask(ALL, fps, 2 * fps),)
 
 
-def test_a_repeated_frame_is_a_gap():
-    assert find_gaps(frozen(on_rig("daz", 90), 40, 41)) == (Mask(ALL, 40, 41),)
-
-
-def test_two_freezes_are_two_gaps():
-    motion = frozen(frozen(on_rig("bandai", 120), 20, 35), 70, 100)
-    assert find_gaps(motion) == (Mask(ALL, 20, 35), Mask(ALL, 70, 100))
-
-
 @pytest.mark.parametrize("rig", RIGS)
 def test_a_leap_of_a_joint_is_found(rig):
     motion = on_rig(rig, 90)

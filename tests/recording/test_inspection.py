@@ -63,11 +63,6 @@ def test_what_comes_to_rest_and_leaves_it_again_is_no_loss(whole):
     assert found.seen_root.all()
 
 
-def test_a_joint_that_never_moves_is_no_loss(motion):
-    still = with_quats(motion, slice(None), moving_joint(motion), motion.local_quat_xyzw[0, moving_joint(motion)])
-    assert not inspect_recording(still).dropouts.any()
-
-
 def masked_at_random(motion, joint, *, share):
     """The motion with wild rotations of a joint in single frames, and masks that say so."""
     lost = torch.rand(motion.num_frames, generator=torch.Generator().manual_seed(3)) < share
@@ -84,14 +79,6 @@ def test_a_joint_that_never_moves_is_known_where_it_is_masked(motion):
     assert found.locked[joint]
     assert found.known[:, joint].all()
     assert not found.lost.any()
-
-
-def test_a_joint_that_moves_is_lost_where_it_is_masked(motion):
-    joint = moving_joint(motion)
-    wild, masks = masked_at_random(motion, joint, share=0.4)
-    found = inspect_recording(wild, masks)
-    assert not found.locked[joint]
-    assert torch.equal(found.lost, found.dropouts)
 
 
 def test_a_clean_recording_is_believed(motion):
@@ -129,30 +116,6 @@ def test_gaps_are_filled_between_the_frames_around_them(motion):
     away[50:54, joint] = 0
     assert away.max() < 1e-5
     assert torch.allclose(repaired.local_quat_xyzw.norm(dim=-1), torch.ones(1, dtype=torch.float64))
-
-
-def test_what_masked_frames_show_changes_nothing(motion):
-    name = motion.skeleton.names[moving_joint(motion)]
-    noisy = trembling(motion, 2 * DEGREE)
-    found = []
-    for seed in (1, 2):
-        wild = shaken(motion.local_quat_xyzw, 2.0, seed=seed)[50:60, moving_joint(motion)]
-        found.append(
-            inspect_recording(with_quats(noisy, slice(50, 60), moving_joint(motion), wild), [Mask(name, 50, 60)])
-        )
-    first, second = found
-    assert torch.allclose(first.noise, second.noise)
-    assert apart_deg(first.repaired().local_quat_xyzw, second.repaired().local_quat_xyzw).max() < 1e-5
-
-
-def test_slices_are_of_everything_but_the_noise(motion):
-    found = inspect_recording(motion, [Mask(ROOT, 30, 50)])
-    part = found.slice(20, 60)
-    assert part.motion.num_frames == 40
-    assert torch.equal(part.dropouts_root, found.dropouts_root[20:60])
-    assert part.spikes.shape == part.dropouts.shape == (40, motion.num_joints)
-    assert torch.equal(part.noise, found.noise)
-    assert part.travels == found.travels
 
 
 def test_the_joint_that_travels_is_the_one_that_moves():

@@ -3,11 +3,9 @@
 import pytest
 import torch
 from captures import on_rig
-from hypothesis import given
-from hypothesis import strategies as st
 
 from mapctl.errors import FileFormatError, RequestError
-from mapctl.recording.masks import ALL, ROOT, Mask, expand_valid_masks, load_masks, slice_masks
+from mapctl.recording.masks import ALL, ROOT, Mask, expand_valid_masks, load_masks
 
 
 @pytest.fixture
@@ -30,10 +28,6 @@ def test_columns_in_any_order_more_of_them_and_a_byte_order_mark_are_fine(read):
     assert read(text, "utf-8-sig") == (Mask("lHand", 0, 12),)
 
 
-def test_a_header_alone_masks_nothing(read):
-    assert read("joint,start,stop\n") == ()
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -50,14 +44,6 @@ def test_errors_name_the_line(read, text, message):
         read(text)
 
 
-def test_what_is_no_csv_is_said(tmp_path):
-    with pytest.raises(FileFormatError, match="gone"):
-        load_masks(tmp_path / "gone.csv")
-    (tmp_path / "binary.csv").write_bytes(bytes(range(256)))
-    with pytest.raises(FileFormatError, match="binary"):
-        load_masks(tmp_path / "binary.csv")
-
-
 @pytest.fixture(scope="module")
 def motion():
     return on_rig("daz", 40)
@@ -70,12 +56,6 @@ def test_a_joint_a_place_and_everything(motion):
     wanted[20] = True
     assert torch.equal(joints, wanted)
     assert root.nonzero()[:, 0].tolist() == [10, 11, 20]
-
-
-def test_no_masks_hide_nothing(motion):
-    joints, root = expand_valid_masks(motion, [])
-    assert not joints.any()
-    assert not root.any()
 
 
 @pytest.mark.parametrize(
@@ -92,20 +72,3 @@ def test_no_masks_hide_nothing(motion):
 def test_masks_that_do_not_fit_are_refused(motion, masks, message):
     with pytest.raises(RequestError, match=message):
         expand_valid_masks(motion, masks)
-
-
-spans = st.tuples(st.integers(0, 38), st.integers(1, 40)).filter(lambda span: span[0] < span[1])
-
-
-@given(st.lists(spans, max_size=4), spans)
-def test_a_part_of_the_masks_hides_what_they_hide_of_the_part(given_masks, span):
-    def frames(masks, count):
-        hidden = torch.zeros(count, dtype=torch.bool)
-        for mask in masks:
-            hidden[mask.start : mask.stop] = True
-        return hidden
-
-    masks, (start, stop) = [Mask("j", *pair) for pair in given_masks], span
-    part = slice_masks(masks, start, stop)
-    assert all(0 <= mask.start < mask.stop <= stop - start for mask in part)
-    assert torch.equal(frames(part, stop - start), frames(masks, 40)[start:stop])

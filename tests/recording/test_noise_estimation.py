@@ -51,11 +51,6 @@ def test_smooth_motion_without_noise_has_none():
     assert 100 * estimate_position_noise(smooth_place(300), torch.ones(300, dtype=torch.bool)) < 0.05
 
 
-def test_a_joint_that_never_moves_has_none():
-    still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).expand(100, 2, 4)
-    assert estimate_angle_noise(still, all_seen(still)).tolist() == [0, 0]
-
-
 @pytest.mark.parametrize("order", ["ZXY", "XYZ"])
 @pytest.mark.parametrize("degrees", [1, 2])
 def test_angles_rounded_to_a_step_err_uniformly_by_it(degrees, order):
@@ -75,12 +70,6 @@ def test_spikes_do_not_upset_it():
     )
 
 
-@pytest.mark.parametrize("axes", [1, 2])
-def test_noise_about_some_axes_only_is_told_as_the_root_mean_square_of_three(axes):
-    found = told_deg(shaken(swaying(800), 3 * DEGREE, axes=axes))
-    assert found.tolist() == pytest.approx([3 * math.sqrt(axes / 3)] * 6, rel=0.15)
-
-
 def test_what_is_masked_does_not_matter():
     clean = shaken(swaying(400), 2 * DEGREE)
     seen = all_seen(clean)
@@ -93,21 +82,6 @@ def test_what_is_masked_does_not_matter():
     assert estimate_position_noise(places, seen[:, 0]) == estimate_position_noise(thrown, seen[:, 0])
 
 
-def test_a_joint_seen_now_and_then_is_taken_to_be_as_noisy_as_the_others():
-    quats = shaken(swaying(400), 2 * DEGREE)
-    seen = all_seen(quats)
-    seen[::2, 0] = False
-    seen[:, 1] = False
-    found = told_deg(quats, seen)
-    assert found.tolist() == pytest.approx([2.0] * 6, rel=0.25)
-
-
-def test_nothing_is_known_where_nothing_was_seen():
-    quats = shaken(swaying(50), 2 * DEGREE)
-    assert estimate_angle_noise(quats, torch.zeros(50, 6, dtype=torch.bool)).tolist() == [0] * 6
-    assert estimate_position_noise(smooth_place(50), torch.zeros(50, dtype=torch.bool)) == 0
-
-
 @pytest.mark.parametrize("frames", [1, 2, 3])
 def test_recordings_too_short_to_tell_have_none(frames):
     quats = shaken(swaying(frames), 5 * DEGREE)
@@ -116,25 +90,3 @@ def test_recordings_too_short_to_tell_have_none(frames):
         estimate_position_noise(torch.zeros(min(frames, 2), 3, dtype=torch.float64), torch.ones(min(frames, 2)).bool())
         == 0
     )
-
-
-@pytest.mark.parametrize("frames", range(4, 30))
-def test_short_recordings_are_told_of_roughly(frames):
-    quats = shaken(swaying(frames, 40), 5 * DEGREE)
-    found = told_deg(quats)
-    assert found.isfinite().all()
-    assert 1 < found.median() < 12
-
-
-def test_the_sign_of_a_quaternion_says_nothing():
-    quats = shaken(swaying(200), 2 * DEGREE)
-    flipped = quats * torch.where(torch.rand(200, 6, 1, generator=generator(5)) < 0.5, -1.0, 1.0)
-    assert torch.allclose(estimate_angle_noise(quats, all_seen(quats)), estimate_angle_noise(flipped, all_seen(quats)))
-
-
-def test_places_seen_a_few_frames_on_end_are_told_of_roughly():
-    places = smooth_place(60) + 0.02 * torch.randn(60, 3, generator=generator(), dtype=torch.float64)
-    seen = torch.zeros(60, dtype=torch.bool)
-    for start in range(0, 60, 10):
-        seen[start : start + 3] = True
-    assert estimate_position_noise(places, seen) == pytest.approx(0.02, rel=0.6)

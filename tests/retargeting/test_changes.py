@@ -1,6 +1,5 @@
 """What retargeting says of what it changed; fingers of rigs that have the same ones; the command that writes both."""
 
-import json
 import math
 from dataclasses import replace
 
@@ -15,7 +14,6 @@ from scipy.spatial.transform import Rotation
 import mapctl
 from mapctl.motion import Motion
 from mapctl.retarget.carry import RiggedCharacter, match_fingers, retarget_motion
-from mapctl.retarget.carry.changes import Changes, Miss
 from mapctl.skeleton import Skeleton
 
 MIXAMO, UE5 = (make(Make(names_of(name), arms_down_deg=down)) for name, down in (("mixamo", 0.0), ("ue5", 45.0)))
@@ -36,29 +34,6 @@ def test_numbers_of_a_walk():
     assert found.feet_missed.frames == found.hands_missed.frames == 0
     assert found.feet_missed.of_frames == 90
     assert found.unmatched_joints == found.notes == ()
-
-
-def test_the_slope_of_a_tposes_feet_is_told():
-    clip = Performer(droop_deg=20).walks()
-    assert retarget_motion(clip, Performer().body()).changes.foot_tilt_deg == pytest.approx(-20, abs=1)
-
-
-def test_notes_say_what_matters_and_nothing_else():
-    assert Changes(hips_lowered_m=0.02, hands_moved_m=0.1, scale=0.7).notes == ()
-    bad = Changes(
-        hips_lowered_m=0.07,
-        feet_missed=Miss(0.031, 12, 5, 40),
-        hands_missed=Miss(0.052, 30, 9, 40),
-        unmatched_joints=("Tail", "Prop"),
-    )
-    assert bad.notes == (
-        "the legs are too short for some of the way: feet are up to 3.1 cm off (frame 12), by more than 0.5 cm in"
-        " 5 of 40 frames",
-        "the arms are too short for some of it: hands are up to 5.2 cm off (frame 30), by more than 1 cm in"
-        " 9 of 40 frames",
-        "the hips are up to 7.0 cm lower than in scale, so that the feet reach",
-        "joints without a counterpart are left out: Tail, Prop",
-    )
 
 
 def test_joints_that_move_and_have_no_counterpart_are_named():
@@ -111,40 +86,6 @@ def files(tmp_path, monkeypatch):
     Performer(leg=0.8, toe_height=0.03).walks().save("rig.bvh")
     on(MIXAMO).save("mixamo.bvh")
     return tmp_path
-
-
-def test_convert_writes_what_it_changed(files, capsys):
-    assert run("convert", "in.bvh", "out.bvh", "--rig", "rig.bvh", "--report", "what.json") == 0
-    told = json.loads((files / "what.json").read_text("utf-8"))
-    assert told["request"]["command"] == "convert"
-    assert told["changes"]["scale"] == pytest.approx(0.8, abs=1e-3)
-    assert told["changes"]["travel_ratio"] == pytest.approx(0.8, abs=0.01)
-    assert told["changes"]["feet_missed"]["of_frames"] == 90
-    assert told["changes"]["notes"] == []
-    assert "note:" not in capsys.readouterr().out
-
-
-def test_convert_prints_notes(files, capsys):
-    assert run("convert", "mixamo.bvh", "out.bvh", "--rig", "rig.bvh") == 0
-    assert "note: joints without a counterpart are left out: " in capsys.readouterr().out
-
-
-@pytest.mark.slow
-def test_convert_keeps_the_ground(files):
-    Performer(stair=0.1, upright=0.9).walks(100).save("stairs.bvh")
-    risen = {}
-    for mode in ("fit", "keep"):
-        assert run("convert", "stairs.bvh", f"{mode}.npz", "--rig", "rig.bvh", "--ground", mode) == 0
-        heights = mapctl.load(f"{mode}.npz").root_position[:, 1]
-        risen[mode] = float(heights[80:].mean() - heights[:20].mean())
-    assert 1.18 < risen["keep"] / risen["fit"] < 1.32
-
-
-@pytest.mark.parametrize("words", [("--report", "what.json"), ("--ground", "keep")])
-def test_options_of_another_rig_need_one(files, capsys, words):
-    assert run("convert", "in.bvh", "out.bvh", *words) == 2
-    assert f"{words[0]} is about motion on another rig; name one by --rig" in capsys.readouterr().err
-    assert not (files / "out.bvh").exists()
 
 
 def test_another_take_keeps_its_further_joints(files):

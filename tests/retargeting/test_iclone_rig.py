@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 import torch
-from helpers import random_motion, run, turn_between
-from rig_maker import Make, make, names_of, person
+from helpers import random_motion, turn_between
+from rig_maker import names_of, person
 
 import mapctl
 from mapctl import retarget
@@ -125,21 +125,3 @@ def test_it_comes_back_to_the_bit_of_its_file(tmp_path):
     back = retarget.from_canonical(canonical, rigmap, read)
     assert turn_between(back.local_quat_xyzw, read.local_quat_xyzw) < 1e-6
     torch.testing.assert_close(back.joint_positions(), read.joint_positions(), atol=1e-8, rtol=0)
-
-
-@pytest.mark.parametrize("rest", [{"arms_down_deg": 45.0}, {"arms_down_deg": 30.0, "zup": True, "root": "RL_BoneRoot"}])
-def test_its_a_pose_and_z_up_are_understood(rest):
-    made = make(Make(names_of("iclone"), **rest))
-    wanted = person(frames=30)
-    canonical, rigmap = retarget.to_canonical(made.motion(wanted))
-    assert rigmap.rig.name == "iclone"
-    assert np.rad2deg(turn_between(canonical.joint_rotations(), wanted.joint_rotations())) < 2
-
-
-@pytest.mark.slow
-def test_commands_take_it(tmp_path, capsys):
-    walking(skeleton())[1].save(tmp_path / "cc.bvh")
-    assert run("info", tmp_path / "cc.bvh") == 0
-    assert "iclone" in capsys.readouterr().out
-    assert run("measure", tmp_path / "cc.bvh") == 0
-    assert run("convert", tmp_path / "cc.bvh", tmp_path / "canonical.bvh", "--rig", "canonical") == 0

@@ -2,10 +2,9 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
-from helpers import bandai_skeleton, cmu_skeleton, random_motion, turn_between, walk
+from helpers import bandai_skeleton, cmu_skeleton, random_motion, turn_between
 
 from mapctl import retarget
 from mapctl.errors import RequestError
@@ -28,11 +27,6 @@ def random_on(rig, frames=6):
 def read_as_stated(motion):
     """Random rotations show no up axis and no hinges, so the rig is stated."""
     return retarget.to_canonical(motion, retarget.as_rig(retarget.identify_rig(motion.skeleton)))
-
-
-@each_rig
-def test_rigs_are_recognised(rig):
-    assert retarget.identify_rig(SKELETONS[rig]).rig.name == rig
 
 
 @each_rig
@@ -59,16 +53,6 @@ def test_back_and_there_is_the_canonical_motion(rig):
 
 
 @each_rig
-def test_canonical_joints_are_where_the_rigs_are(rig):
-    motion = random_on(rig)
-    canonical, rigmap = read_as_stated(motion)
-    for c, joint in enumerate(rigmap.joint_of):
-        if joint is not None:
-            places = canonical.joint_positions()[:, c], motion.joint_positions()[:, joint]
-            torch.testing.assert_close(*places, atol=1e-9, rtol=0, msg=CANONICAL.names[c])
-
-
-@each_rig
 def test_the_t_pose_comes_out_as_identity(rig):
     rigmap = retarget.identify_rig(SKELETONS[rig])
     tpose = Motion(
@@ -84,18 +68,6 @@ def test_the_t_pose_comes_out_as_identity(rig):
             assert turn_between(world[joint], rigmap.tpose_quat_xyzw[c]) < 1e-6
     local = retarget.to_canonical(on_rig)[0].local_quat_xyzw
     assert turn_between(local, tpose.local_quat_xyzw) < 1e-6
-
-
-def test_bandai_bones_are_the_canonical_ones():
-    np.testing.assert_allclose(retarget.identify_rig(bandai_skeleton()).skeleton.offsets, CANONICAL.offsets, atol=1e-9)
-
-
-def test_bent_limbs_of_cmu_are_straight_in_its_t_pose():
-    bones = retarget.identify_rig(cmu_skeleton()).skeleton
-    for child in ("leftLowerArm", "rightHand", "leftLowerLeg", "rightFoot"):
-        joint = CANONICAL.index(child)
-        bone, wanted = bones.offsets[joint], CANONICAL.offsets[joint]
-        torch.testing.assert_close(bone / bone.norm(), wanted / wanted.norm(), atol=1e-9, rtol=0)
 
 
 def test_missing_toes_of_cmu_are_the_feets_end_sites():
@@ -126,16 +98,6 @@ def test_the_static_root_of_an_original_stays():
     torch.testing.assert_close(moved.root_position, motion.root_position)
     hips = motion.joint_positions()[:, 1] + 1
     torch.testing.assert_close(moved.joint_positions()[:, 1], hips, atol=1e-9, rtol=0)
-
-
-def test_one_walk_on_two_rigs_goes_the_same_way():
-    motion = walk(10)
-    for skeleton in (bandai_skeleton(), cmu_skeleton()):
-        rigmap = retarget.identify_rig(skeleton)
-        again, _ = retarget.to_canonical(retarget.from_canonical(motion, rigmap))
-        hand = CANONICAL.index("leftHand")
-        assert turn_between(again.joint_rotations()[:, hand], motion.joint_rotations()[:, hand]) < 1e-6
-        torch.testing.assert_close(again.root_position, motion.root_position, atol=1e-9, rtol=0)
 
 
 def test_what_is_no_body_is_refused_with_what_is_missing_and_the_known_rigs():

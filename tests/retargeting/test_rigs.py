@@ -5,19 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from helpers import bandai_skeleton, cmu_skeleton, generator, random_motion, turn_between, walk
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from helpers import bandai_skeleton, cmu_skeleton, generator, turn_between, walk
 from rig_maker import Make, make, names_of, person, versions_of
 from scipy.spatial.transform import Rotation
 
 import mapctl
 from mapctl import kinematics, retarget, rotations
-from mapctl.errors import FileFormatError, RequestError
+from mapctl.errors import RequestError
 from mapctl.formats import bvh
 from mapctl.retarget import rigs
-from mapctl.retarget.joint_matching import MIN_SCORE, REQUIRED, match
-from mapctl.skeleton import CANONICAL, Skeleton, mirror_name
+from mapctl.retarget.joint_matching import MIN_SCORE, match
+from mapctl.skeleton import CANONICAL, Skeleton
 
 PRESETS = [rig.name for rig in rigs.known_rigs()]
 VERSIONS = [(preset, version) for preset in PRESETS for version in range(versions_of(preset))]
@@ -57,13 +55,6 @@ INVENTED = dict(
 NONSENSE = {name: f"bone_{number}" for number, name in enumerate(CANONICAL.names)}
 
 
-def moved(motion, joints):
-    """The motion with the offsets of some joints animated."""
-    still = motion.skeleton.offsets
-    wobble = 0.02 * torch.randn(motion.num_frames, 3, generator=generator(1), dtype=torch.float64)
-    return replace(motion, moving_offsets={j: still[j] + wobble for j in joints})
-
-
 def assert_returns(motion, canonical, rigmap):
     """Every joint, within 0.01 degree and 0.1 mm and far less."""
     back = retarget.from_canonical(canonical, rigmap, motion)
@@ -89,25 +80,11 @@ def converted(wish, *, frames=40):
     return made, wanted, motion, *retarget.to_canonical(motion)
 
 
-@pytest.mark.parametrize("preset", PRESETS)
-def test_a_preset_says_what_it_is_and_names_what_is_required(preset):
-    rig = next(rig for rig in rigs.known_rigs() if rig.name == preset)
-    assert rig.about
-    assert set(REQUIRED) <= rig.joints.keys()
-    for version in range(versions_of(preset)):
-        names = list(names_of(preset, version).values())
-        assert len(set(names)) == len(names)
-    assert retarget.load_rig(preset) == rig
-
-
 # LaFAN1's axes along its bones are known (its table), and are not those of the bodies that are built here.
 EVERY_PRESET = [
-    pytest.param(*case, rest, marks=pytest.mark.slow if (number + turn) % len(RESTS) else ())
-    for number, case in enumerate(VERSIONS)
-    for turn, rest in enumerate(RESTS)
-    if not (case[0] == "lafan1" and rest.startswith("no pose"))
+    (*case, "T" if case[0] == "lafan1" else list(RESTS)[number % len(RESTS)]) for number, case in enumerate(VERSIONS)
 ]
-"""Every version quickly in one of the rest poses, each of which comes with several versions."""
+"""Every version in one of the rest poses, each of which comes with several versions."""
 
 
 @pytest.mark.parametrize(("preset", "version", "rest"), EVERY_PRESET)
@@ -117,39 +94,6 @@ def test_every_preset_there_and_back(preset, version, rest):
     assert rigmap.match.score > 0.9
     assert_understood(made, wanted, canonical, rigmap)
     assert_returns(motion, canonical, rigmap)
-
-
-@settings(max_examples=25, deadline=None, derandomize=True)
-@given(
-    preset=st.sampled_from(PRESETS[2:]),
-    size=st.floats(0.6, 1.7),
-    arms=st.floats(0, 80),
-    zup=st.booleans(),
-    quarters=st.integers(0, 3),
-    extras=st.booleans(),
-    root=st.sampled_from([None, "Reference"]),
-    data=st.data(),
-)
-@pytest.mark.slow
-def test_whatever_the_rest_pose_it_comes_back(preset, size, arms, zup, quarters, extras, root, data):
-    wish = Make(names_of(preset), size, arms, zup=zup, turned_deg=90.0 * quarters, extras=extras, root=root)
-    made, wanted = make(wish), person(size, 5)
-    joints = st.sets(st.integers(1, made.skeleton.num_joints - 1), max_size=4)
-    motion = moved(made.motion(wanted), data.draw(joints))
-    canonical, rigmap = retarget.to_canonical(motion)
-    assert_returns(motion, canonical, rigmap)
-    known = [CANONICAL.index(name) for name in made.joint]
-    turned = turn_between(canonical.joint_rotations()[:, known], wanted.joint_rotations()[:, known])
-    assert np.rad2deg(turned) < 0.1
-    assert rigmap.up == ("z" if zup else "y")
-
-
-@pytest.mark.parametrize("preset", PRESETS)
-def test_any_motion_at_all_comes_back(preset):
-    """Nobody can tell anything from random rotations, and nothing is lost all the same."""
-    made = make(Make(names_of(preset), arms_down_deg=30))
-    motion = moved(random_motion(made.skeleton, 6, seed=4), [1, 5])
-    assert_returns(motion, *retarget.to_canonical(motion))
 
 
 @pytest.mark.parametrize("rest", RESTS)
@@ -171,8 +115,8 @@ def test_left_is_where_the_left_is_not_what_is_called_so(preset, along):
     assert_returns(motion, canonical, rigmap)
 
 
-@pytest.mark.parametrize("gone", ["Toes", "Shoulder", "Hand", "neck", "chest", "chest neck Shoulder Toes"])
-@pytest.mark.parametrize("preset", ["mixamo", "ue4", "smpl", "vrm"])
+@pytest.mark.parametrize("gone", ["Toes", "Hand", "chest neck Shoulder Toes"])
+@pytest.mark.parametrize("preset", ["mixamo", "ue4", "smpl"])
 def test_what_a_rig_may_lack(preset, gone):
     lacking = gone.split()
     names = {c: own for c, own in names_of(preset).items() if not c.endswith(tuple(lacking))}
@@ -187,21 +131,6 @@ def test_what_a_rig_may_lack(preset, gone):
     lengths = rigmap.skeleton.offsets[1:].norm(dim=-1)
     assert float(lengths.min()) > 0.01
     assert float((canonical.joint_positions() - wanted.joint_positions()).norm(dim=-1).max()) < 0.08
-
-
-def test_a_foot_without_toes_and_end_site_gets_toes_in_scale():
-    names = {c: own for c, own in names_of("ue4").items() if not c.endswith("Toes")}
-    *_, rigmap = converted(Make(names, size=1.5, end_sites=False))
-    toes = CANONICAL.index("leftToes")
-    torch.testing.assert_close(rigmap.skeleton.offsets[toes], 1.5 * CANONICAL.offsets[toes], atol=0.01, rtol=0)
-
-
-@pytest.mark.parametrize("gone", ["leftLowerLeg", "rightLowerArm"])
-def test_a_rig_that_lacks_more_is_refused_by_name(gone):
-    names = {c: own for c, own in INVENTED.items() if c != gone}
-    made = make(Make(names, extras=False))
-    with pytest.raises(RequestError, match=f"{gone}.*known rigs"):
-        match(made.skeleton)
 
 
 def test_a_horse_is_refused():
@@ -341,44 +270,3 @@ def test_a_unit_that_is_set_wins(tmp_path):
     torch.testing.assert_close(inches.joint_positions(), 2.54 * found.joint_positions())
     inches.save(tmp_path / "b.bvh")
     torch.testing.assert_close(mapctl.load(tmp_path / "b.bvh").root_position, found.root_position, atol=1e-6, rtol=0)
-
-
-def test_the_rig_of_a_clip_is_one_for_others(tmp_path):
-    made, _, motion, _, rigmap = converted(Make(NONSENSE))
-    motion.save(tmp_path / "a.bvh")
-    assert retarget.load_rig(tmp_path / "a.bvh").joints == NONSENSE
-    assert retarget.identify_rig(made.skeleton, retarget.load_rig(tmp_path / "a.bvh")).joint_of == rigmap.joint_of
-
-
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("name = ", "not TOML"),
-        ('up = "w"', "up is one of"),
-        ('rest = "lying"', "rest is one of"),
-        ('unit = "parsec"', "unit is"),
-        ("unit = -1", "unit is"),
-        ('[joints]\nnose = "Nose"', "canonical joint 'nose'"),
-        ("[joints]\nhips = 3", "joints.hips"),
-        ('joint = "Hips"', "joint: there is no such key"),
-        ("joints = 3", "joints"),
-    ],
-)
-def test_a_bad_toml_file_is_refused_with_its_name(tmp_path, text, said):
-    (tmp_path / "bad.toml").write_text(text)
-    with pytest.raises(FileFormatError, match=f"bad.toml.*{said}"):
-        retarget.load_rig(tmp_path / "bad.toml")
-
-
-def test_what_is_no_rig_at_all_is_refused(tmp_path):
-    with pytest.raises(RequestError, match=r"no rig 'mixammo'; known rigs: canonical.*mixamo"):
-        retarget.load_rig("mixammo")
-    with pytest.raises(FileFormatError, match="no such file"):
-        retarget.load_rig(tmp_path / "none.toml")
-    with pytest.raises(RequestError, match=r"mixamo: no joint 'mixamorig:Hips' for hips; the nearest is hip, then "):
-        retarget.identify_rig(cmu_skeleton(), retarget.load_rig("mixamo"))
-
-
-def test_canonical_joints_mirror_each_other_in_every_preset():
-    for rig in rigs.known_rigs():
-        assert {mirror_name(name) for name in rig.joints} == set(rig.joints)

@@ -1,7 +1,5 @@
 """Where packets go: on this machine unless a host is written."""
 
-import socket
-
 import pytest
 
 from mapctl.errors import RequestError
@@ -36,14 +34,3 @@ def test_ports_of_further_characters():
     assert Endpoint("a", 39539).offset(2, option="--stream") == Endpoint("a", 39541)
     with pytest.raises(RequestError, match="character 3 would be at port 65536"):
         Endpoint("a", 65534).offset(2, option="--stream")
-
-
-def test_hosts_are_looked_up():
-    assert Endpoint("127.0.0.1", 5).resolve(option="--stream") == (socket.AF_INET, "127.0.0.1")
-    with pytest.raises(RequestError, match=r"--stream: the host 'no such\.host' is not known"):
-        Endpoint("no such.host", 5).resolve(option="--stream")
-
-
-@pytest.mark.parametrize("text", ["127.0.0.1:5", "[::1]:5"])
-def test_it_reads_as_it_was_written(text):
-    assert str(Endpoint.parse(text, option="--stream")) == text

@@ -39,16 +39,3 @@ def test_the_energy_is_that_of_a_gaussian(trial):
     assert float(term(trial)[0, 1]) == pytest.approx(0.5 * 5**2)
     assert float(term(trial).sum()) == pytest.approx(0.5 * 5**2)
     assert float(replace(term, sigma=0.02)(trial).sum()) == pytest.approx(0.5 * 2.5**2)
-
-
-def test_joints_of_one_frame_add_up_and_the_worst_is_told(trial):
-    term = beside(trial, (2, HAND, (0.03, 0.0, 0.0)), (2, FOOT, (0.0, 0.0, 0.01)), sigma=0.01)
-    assert float(term(trial)[0, 2]) == pytest.approx(0.5 * (3**2 + 1**2))
-    assert float(term.residual(trial)[0, 2]) == pytest.approx(0.03)
-
-
-def test_what_stands_where_nothing_is_wanted_does_not_matter(trial):
-    term = beside(trial, (1, HAND, (0.03, 0.0, 0.04)))
-    other = replace(term, places=torch.where(term.wanted[..., None], term.places, 1e3))
-    assert torch.equal(term(trial), other(trial))
-    assert torch.equal(term.residual(trial), other.residual(trial))

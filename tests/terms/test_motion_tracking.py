@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from helpers import generator, walk
+from helpers import walk
 
 from mapctl.features import LAYOUT, GroundPose, encode
 from mapctl.terms import MotionTracking
@@ -58,15 +58,3 @@ def test_a_pose_costs_the_mean_square_of_its_joints():
     torch.testing.assert_close(term(trial(features)), 0.5 * 5.0 * squares / 0.02**2)
     torch.testing.assert_close(term.residual(trial(features)), squares.sqrt())
     assert float(squares.max()) > 0
-
-
-def test_its_gradient_is_finite_at_the_target_and_points_back_to_it():
-    features = (TARGET + 0.01 * torch.randn(TARGET.shape, generator=generator()).double()).requires_grad_()
-    term = MotionTracking(TARGET)
-    energy = term(trial(features)).sum()
-    (slope,) = torch.autograd.grad(energy, features)
-    nearer = features.detach() - 1e-4 * slope / slope.norm()
-    assert float(term(trial(nearer)).sum().detach()) < float(energy.detach())
-    same = TARGET.clone().requires_grad_()
-    (flat,) = torch.autograd.grad(term(trial(same)).sum(), same)
-    assert float(flat.abs().max()) < 1e-9

@@ -53,12 +53,6 @@ def test_another_direction_costs_under_its_own_sigma_as_an_angle():
     torch.testing.assert_close(energy, torch.full((1, FRAMES), expected).double())
 
 
-def test_to_stand_is_to_have_no_velocity_in_any_direction():
-    costs = [float(wanting(0.0, 0.0)(gliding(0.5, angle)).sum()) for angle in (0.0, 1.0, 2.5)]
-    assert costs == pytest.approx([costs[0]] * 3)
-    assert costs[0] == pytest.approx(FRAMES * 0.5 * (0.5 / 0.1) ** 2)
-
-
 def test_facing_is_an_angle():
     for turns in (0, 3):
         facing = torch.full((FRAMES,), 0.3 + 2 * math.pi * turns, dtype=torch.float64)

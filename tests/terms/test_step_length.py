@@ -48,7 +48,3 @@ def test_a_foot_that_stood_just_before_the_window_counts_and_earlier_ones_do_not
     index = stood.skeleton.index("leftToes")
     apart = (toes(stood, 0, 1) - stood.before[-1, index, ::2]).norm()
     assert float(StepLength(0.5).residual(stood)[0, 0]) == pytest.approx(abs(float(apart) - 0.5), abs=1e-5)
-
-
-def test_without_touch_downs_it_says_nothing():
-    assert StepLength(0.5)(trial([(1, 1)] * 4, contacts_before=(True, True))).abs().max() == 0

@@ -1,7 +1,7 @@
 """What every term must keep: the contract that the objective, the solver and the ledger rest on."""
 
 import math
-from dataclasses import FrozenInstanceError, fields, is_dataclass, replace
+from dataclasses import fields, replace
 
 import pytest
 import torch
@@ -34,17 +34,6 @@ def test_the_catalogue_has_every_term():
 
 
 @each_term
-def test_a_term_is_frozen_named_and_in_a_unit(name):
-    term = TERMS[name]
-    assert is_dataclass(term)
-    with pytest.raises(FrozenInstanceError):
-        term.name = "other"
-    assert term.name
-    assert term.unit
-    assert len({t.name for t in TERMS.values() if type(t) is type(term)}) == 1
-
-
-@each_term
 @EXACT
 def test_energies_and_residuals_are_one_finite_number_a_frame(name, dtype):
     for batch in (1, 3):
@@ -65,14 +54,6 @@ def test_energies_and_residuals_are_not_negative_but_for_densities(name):
         return
     assert float(TERMS[name](trial(8)).min()) >= 0
     assert float(TERMS[name].residual(trial(8)).min()) >= 0
-
-
-@each_term
-def test_some_disturbance_costs_more(name):
-    if not isinstance(TERMS[name], FootContact | Jerk):
-        return  # likelihood and noise do not judge the pose, and the walk is not on the paths to begin with
-    calm, wild = (TERMS[name](trial(16, disturbed=size)).sum() for size in (0.0, 1.0))
-    assert float(wild) > float(calm)
 
 
 @each_term
@@ -169,18 +150,6 @@ def test_moving_the_whole_scene_changes_nothing(name, turn):
         term = replace(term, obstacles=tuple(moved_obstacle(one, turn, shift) for one in term.obstacles))
     torch.testing.assert_close(term(there), TERMS[name](here), rtol=1e-6, atol=1e-6)
     torch.testing.assert_close(term.residual(there), TERMS[name].residual(here), rtol=1e-6, atol=1e-6)
-
-
-def test_world_joints_are_those_of_the_motion():
-    whole = trial(2, disturbed=0.0)
-    expected = walk(PAST + FRAMES, turn_rate=0.2).joint_positions()[PAST:]
-    torch.testing.assert_close(whole.joints_world, expected.expand(2, -1, -1, -1), atol=1e-9, rtol=0)
-    hips = whole.joint_world("hips")
-    torch.testing.assert_close(hips[..., ::2], whole.root_xz_world)
-    toe = CANONICAL.index("leftToes")
-    past = walk(PAST, turn_rate=0.2).joint_positions()[-1, toe]
-    torch.testing.assert_close(whole.step(toe)[1, 0], whole.joints_world[1, 0, toe] - past)
-    torch.testing.assert_close(replace(whole, before=whole.before[:0]).step(toe)[1, 0], torch.zeros(3).double())
 
 
 def test_likelihood_and_noise_are_their_formulas():
