@@ -1,7 +1,7 @@
 """People of any bones who walk with feet that stand to the hair, by trigonometry and without the code under test."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from fractions import Fraction
 
 import torch
@@ -9,10 +9,9 @@ from helpers import quat_xyzw
 from jaxtyping import Float
 from torch import Tensor
 
-from mapctl import retarget, rotations
+from mapctl import rotations
 from mapctl.motion import Motion
 from mapctl.retarget.carry import RiggedCharacter
-from mapctl.retarget.stance import Stance
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, Skeleton, leg_length
 
 SIDES = ("left", "right")
@@ -111,20 +110,6 @@ class Performer:
             ankles[:, k] = toes - rotations.rotate(_about_x(pitch), flat.expand(frames, 3))
             pitches.append(pitch)
         return root, ankles, torch.stack(pitches, dim=1)
-
-
-def stance_of(motion: Motion) -> Stance:
-    """Of a canonical clip."""
-    return Stance.of(motion, retarget.identify_rig(motion.skeleton))
-
-
-def tip_toed(motion: Motion, radians: float) -> Motion:
-    """The same with feet that point down all the time."""
-    local = motion.local_quat_xyzw.clone()
-    down = _about_x(torch.full((motion.num_frames,), radians, dtype=torch.float64))
-    for foot in FEET:
-        local[:, foot] = rotations.multiply(local[:, foot], down)
-    return replace(motion, local_quat_xyzw=local)
 
 
 def _leg_angles(

@@ -111,6 +111,16 @@ TREES: dict[tuple[str, str], Make] = {
         between={"chest": ("spine_02.x",)},
         further=ends("thigh_twist.{s}", lr, "UpperLeg") | ends("index1.{s} thumb1.{s}", lr),
     ),
+    ("iclone", "Character Creator"): Make(
+        names_of("iclone"),
+        root="RL_BoneRoot",
+        between=both("UpperLeg: CC_Base_Pelvis", LR)
+        | {"chest": ("CC_Base_Spine01",), "head": ("CC_Base_NeckTwist02",)},
+        further=ends("CC_Base_{s}_Thumb1 CC_Base_{s}_Index1", LR)
+        | ends("CC_Base_{s}_ThighTwist01 CC_Base_{s}_ThighTwist02", LR, "UpperLeg")
+        | ends("CC_Base_{s}_KneeShareBone CC_Base_{s}_CalfTwist01", LR, "LowerLeg")
+        | ends("CC_Base_{s}_ForearmTwist01 CC_Base_{s}_ElbowShareBone", LR, "LowerArm"),
+    ),
     ("deepmotion", "default"): Make(names_of("deepmotion"), between={"chest": ("spine1_JNT",)}),
     ("humanik", "Character1"): Make(
         names_of("humanik"),

@@ -14,8 +14,7 @@ from mapctl.retarget.doubts import assess_fit
 from mapctl.skeleton import CANONICAL
 
 
-@pytest.mark.parametrize("arms", [0, 40], ids=["T", "A"])
-@pytest.mark.parametrize(("preset", "version"), TREES)
+@pytest.mark.parametrize(("preset", "version", "arms"), [(*tree, 40 * (k % 2)) for k, tree in enumerate(TREES)])
 def test_a_rig_as_a_program_writes_it_is_known_and_comes_back(preset, version, arms):
     wish = replace(TREES[preset, version], arms_down_deg=arms, extras=False)
     made, wanted = make(wish), person(1.0, 30)

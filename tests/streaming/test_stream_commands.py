@@ -9,13 +9,11 @@ import subprocess
 import sys
 import time
 from contextlib import closing
-from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import run, walk
+from helpers import run
 from listening import engine, free_ports
 from pythonosc.udp_client import SimpleUDPClient
 from tiny_stitcher import save_tiny_stitcher
@@ -24,14 +22,12 @@ import mapctl
 import priors
 from controllers.steering.process import CharacterProcess, CharacterRequest
 from mapctl.commands.live import run as live
-from mapctl.commands.shared import streaming
 from mapctl.intent.steering import Command
 from mapctl.skeleton import CANONICAL
 from scenes.live.app import LiveApp
 
 ROOT = Path(__file__).resolve().parents[2]
 SCRIPT = "time_s,speed_mps,heading_deg\n0,1.2,0\n0.5,1.0,40\n1.5,1.0,40\n"
-LONG_SCRIPT = "time_s,speed_mps,heading_deg\n0,1.2,0\n5,1.0,60\n10,2.0,-40\n20,0.5,90\n25,0,90\n30,0,90\n"
 ALLOWED = 1 / 30  # seconds: of a frame's own time
 
 
@@ -67,33 +63,6 @@ def test_the_joints_of_a_script_are_rebuilt_from_its_stream(script, prior, tmp_p
     assert f"45 frames to 127.0.0.1:{port}" in capsys.readouterr().out
 
 
-@pytest.mark.slow
-def test_nobody_need_listen(script, prior, tmp_path):
-    words = ("steer", script, "-o", tmp_path / "a.npz", "--prior", prior, "--realtime", "--quiet")
-    assert run(*words, "--stream", free_ports(1)) == 0
-
-
-@pytest.mark.slow
-def test_the_stream_has_the_size_of_the_character(script, prior, tmp_path):
-    tall = mapctl.load(_tall(tmp_path))
-    port, out = free_ports(1), tmp_path / "out.npz"
-    with engine(port) as listener:
-        words = ("steer", script, "-o", out, "--prior", prior, "--realtime", "--quiet", "--rig", tmp_path / "tall.npz")
-        assert run(*words, "--stream", port) == 0
-        listener.wait(45)
-    assert np.abs(listener.joints() - joints_of(out)).max() < 0.001
-    bones = np.linalg.norm(listener.frames[-1].bone_positions[1:], axis=-1)
-    np.testing.assert_allclose(bones, tall.skeleton.offsets[1:].norm(dim=-1), rtol=1e-5)
-
-
-def _tall(folder: Path) -> Path:
-    motion = walk(60)
-    skeleton = replace(motion.skeleton, offsets=motion.skeleton.offsets * 1.25)
-    path = folder / "tall.npz"
-    replace(motion, skeleton=skeleton, root_position=motion.root_position * 1.25).save(path)
-    return path
-
-
 @pytest.fixture
 def other():
     """The port that another program holds."""
@@ -119,27 +88,8 @@ def test_a_script_cannot_be_streamed_so(fails, tmp_path, prior, words, said):
     assert said in fails("steer", "c.csv", "-o", "a.bvh", "--prior", prior, *words)
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (("--stream", "65530", "--characters", "8"), "character 7 would be at port 65536"),
-        (("--stream", "4000", "--characters", "2", "--listen", "4001"), "is where --stream sends poses to"),
-        (("--listen", "192.0.2.1:4000"), "cannot listen on 192.0.2.1:4000"),
-        (("--listen", "x"), "--listen must be HOST:PORT"),
-    ],
-)
-def test_characters_cannot_be_streamed_so(fails, words, said):
-    assert said in fails("live", *words)
-
-
 def test_a_port_that_is_taken_is_one_line(fails, other):
     assert f"port {other} of 127.0.0.1 is in use by another program" in fails("live", "--listen", other)
-
-
-@pytest.mark.parametrize("option", ["--stream", "--listen"])
-def test_a_missing_package_is_named(fails, monkeypatch, option):
-    monkeypatch.setattr(streaming, "find_spec", lambda name: None if name == "pythonosc" else find_spec(name))
-    assert "pip install 'mapctl[stream]'" in fails("live", option, "39539")
 
 
 @pytest.mark.slow
@@ -195,21 +145,6 @@ def start_command(*words: object) -> subprocess.Popen:
     return subprocess.Popen(
         [sys.executable, "-m", "mapctl", *map(str, words)], env=environment, stdout=subprocess.PIPE, text=True
     )
-
-
-@pytest.mark.slow
-def test_thirty_seconds_of_a_script_come_whole_and_none_late(tmp_path):
-    """On a machine with a core to spare; the bundled prior."""
-    (tmp_path / "c.csv").write_text(LONG_SCRIPT)
-    port, out, report = free_ports(1), tmp_path / "out.npz", tmp_path / "r.json"
-    with engine(port) as listener:
-        words = ("steer", tmp_path / "c.csv", "-o", out, "--realtime", "--quiet", "--report", report)
-        assert start_command(*words, "--stream", port).wait(150) == 0
-        listener.wait(900)
-    assert np.abs(listener.joints() - joints_of(out)).max() < 0.001
-    assert listener.lateness().max() < ALLOWED
-    assert np.diff(listener.times).max() < 2 * ALLOWED
-    assert json.loads(report.read_text())["timing"]["stream"]["late"] == 0
 
 
 @pytest.mark.slow

@@ -17,10 +17,6 @@ from mapctl.streaming.messages import Message
 from mapctl.streaming.receiver import read_messages
 from mapctl.streaming.sender import pack
 
-HUMAN_BODY_BONES = (
-    "Hips LeftUpperLeg RightUpperLeg LeftLowerLeg RightLowerLeg LeftFoot RightFoot Spine Chest Neck Head LeftShoulder "
-    "RightShoulder LeftUpperArm RightUpperArm LeftLowerArm RightLowerArm LeftHand RightHand LeftToes RightToes"
-)
 PARENTS = {
     "Spine": "Hips",
     "Chest": "Spine",
@@ -76,17 +72,6 @@ def test_joints_come_back(seed, root_travels):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_rotations_are_the_mirror_image_by_matrices(seed):
-    motion, messages = frame(seed)
-    for joint, message in enumerate(m for m in messages if m.address == vmc.BONE):
-        ours = Rotation.from_quat(motion.local_quat_xyzw[0, joint].numpy()).as_matrix()
-        theirs = Rotation.from_quat(message.arguments[4:8]).as_matrix()
-        np.testing.assert_allclose(theirs, FLIP @ ours @ FLIP, atol=1e-12)
-        if joint:
-            np.testing.assert_allclose(message.arguments[1:4], FLIP @ motion.skeleton.offsets[joint].numpy())
-
-
-@pytest.mark.parametrize("seed", range(5))
 def test_a_left_handed_program_rebuilds_the_body(seed):
     """By its own tree and by scipy: whatever shares no code with the project."""
     motion, messages = frame(seed)
@@ -103,13 +88,6 @@ def test_a_left_handed_program_rebuilds_the_body(seed):
         np.testing.assert_allclose(FLIP @ world(name)[0], motion.joint_positions()[0, joint], atol=3e-6)
 
 
-def test_bones_are_those_of_unity():
-    assert sorted(vmc.BONE_NAMES) == sorted(HUMAN_BODY_BONES.split())
-    assert {name: vmc.BONE_NAMES[p] for name, p in zip(vmc.BONE_NAMES, CANONICAL.parents, strict=True) if p >= 0} == (
-        PARENTS
-    )
-
-
 def test_the_t_pose_has_no_rotation_and_its_left_hand_at_minus_x():
     still = np.tile([0.0, 0.0, 0.0, 1.0], (21, 1))
     messages = vmc.encode_frame(CANONICAL, np.array([0.0, 0.9, 0.0]), still, 0.0)
@@ -117,13 +95,6 @@ def test_the_t_pose_has_no_rotation_and_its_left_hand_at_minus_x():
     assert {tuple(np.abs(values[3:])) for values in bones.values()} == {(0.0, 0.0, 0.0, 1.0)}
     assert bones["LeftUpperArm"][0] < 0 < bones["RightUpperArm"][0]
     assert bones["LeftToes"][2] > 0
-
-
-def test_a_turn_to_the_left_is_negative_about_the_vertical_of_a_left_handed_space():
-    quats = np.tile([0.0, 0.0, 0.0, 1.0], (21, 1))
-    quats[0] = [0.0, math.sin(math.pi / 4), 0.0, math.cos(math.pi / 4)]  # from +Z toward +X, its left
-    hips = next(m for m in vmc.encode_frame(CANONICAL, np.zeros(3), quats, 0.0) if m.address == vmc.BONE)
-    np.testing.assert_allclose(hips.arguments[4:], [0, -math.sin(math.pi / 4), 0, math.cos(math.pi / 4)])
 
 
 def test_hips_travel_or_the_root_does():
@@ -136,18 +107,6 @@ def test_hips_travel_or_the_root_does():
     np.testing.assert_allclose(by_hips[1].arguments[1:4], mirrored)
     np.testing.assert_allclose(by_root[0].arguments[1:4], mirrored * [1, 0, 1])
     np.testing.assert_allclose(by_root[1].arguments[1:4], mirrored * [0, 1, 0])
-
-
-def test_packets_are_small_typed_as_the_protocol_says_and_end_with_the_time():
-    _, messages = frame(0)
-    packets = pack(messages)
-    assert max(map(len, packets)) <= 1200
-    assert len(packets) == 2
-    whole = b"".join(packets)
-    assert whole.count(b",sfffffff\0") == 22
-    assert whole.count(b",iii\0") == whole.count(b",f\0\0") == 1
-    assert [m.address for m in messages[-2:]] == [vmc.OK, vmc.TIME]
-    assert messages[-2].arguments == (1, 3, 0)
 
 
 def test_a_frame_with_a_lost_packet_is_left_out():
@@ -173,17 +132,4 @@ def test_a_frame_with_a_lost_packet_is_left_out():
 def test_what_is_no_pose_is_passed_over(message):
     motion, messages = frame(1)
     (found,) = assembled([*messages[:-1], message, *messages[-1:]])
-    np.testing.assert_allclose(found.joint_positions(), motion.joint_positions()[0], atol=1e-12)
-
-
-@pytest.mark.parametrize("arguments", [(), ("now",), (math.nan,), (None,)])
-def test_a_frame_without_a_time_is_none(arguments):
-    _, messages = frame(1)
-    assert assembled([*messages[:-1], Message(vmc.TIME, arguments)]) == []
-
-
-def test_arguments_of_later_versions_mean_nothing():
-    motion, messages = frame(2)
-    root = Message(vmc.ROOT, (*messages[0].arguments, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0))
-    (found,) = assembled([root, *messages[1:]])
     np.testing.assert_allclose(found.joint_positions(), motion.joint_positions()[0], atol=1e-12)
