@@ -56,12 +56,12 @@ def exchanged_back(motion):
 @pytest.mark.parametrize("raw", [False, True], ids=["from the T-pose", "in the file"])
 @pytest.mark.parametrize("swap", SWAPS)
 @pytest.mark.parametrize("rig", RIGS)
-def test_swapped_limbs_are_found_and_exchanged_back(rig, swap, raw, degrees=3):
+def test_swapped_limbs_are_found_and_exchanged_back(rig, swap, raw):
     parts, frames = SWAPS[swap]
-    walked = trembling(walk(120, turn_rate=0.3), degrees * DEGREE)
+    walked = trembling(walk(120, turn_rate=0.3), 3 * DEGREE)
     truth = RIGS[rig](walked)
     given = swapped(truth, parts, frames) if raw else RIGS[rig](swapped(walked, parts, frames))
-    if largest_distance(given, truth) < 0.03 + 0.1 * (degrees > 0):
+    if largest_distance(given, truth) < 0.13:
         return  # raw rotations of this rig's arms are alike on both sides: nothing to see
     found, faults = exchanged_back(given)
     assert {(fault.start, fault.stop) for fault in faults} == set(frames)
