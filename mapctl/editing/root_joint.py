@@ -9,7 +9,7 @@ from torch import Tensor
 
 from mapctl import rotations
 from mapctl.formats import bvh
-from mapctl.formats.characters.source import add_root_to_character
+from mapctl.formats.character import add_root_to_character
 from mapctl.motion import Motion
 from mapctl.skeleton import Skeleton
 

@@ -6,15 +6,19 @@ from importlib import import_module
 from os import PathLike
 from pathlib import Path
 from types import ModuleType
+from typing import TYPE_CHECKING
 
 from mapctl.errors import FileFormatError, RequestError
-from mapctl.formats import bvh, examples
-from mapctl.formats.characters.selector import parse_character_path
-from mapctl.formats.endings import USD_WRITTEN
-from mapctl.formats.missing import MissingValues
-from mapctl.mesh.character_mesh import CharacterMesh
-from mapctl.motion import Motion
+from mapctl.formats import examples
+from mapctl.formats.parts import parse_character_path
 
+if TYPE_CHECKING:  # readers in a sandbox import this package without torch
+    from mapctl.formats.missing import MissingValues
+    from mapctl.mesh.character_mesh import CharacterMesh
+    from mapctl.motion import Motion
+
+USD_WRITTEN = (".usda", ".usdc", ".usd")
+"""Endings of USD files that are written."""
 _USD_ENDINGS = (*USD_WRITTEN, ".usdz")
 READERS = {
     ".bvh": "bvh",
@@ -41,7 +45,7 @@ _UNREADABLE_REASONS = {".asf": "is a skeleton alone: name its motion, a .amc bes
 
 def load(
     path: str | PathLike[str], *, fps: Fraction | float | None = None, metres_per_unit: float | None = None
-) -> Motion:
+) -> "Motion":
     """Read a motion from a file of `READERS`, an .amc with the .asf beside it (see `acclaim.load`).
 
     Of a character's file it is an animation, or one frame of the rest pose where there is none; `hero.glb#ARMATURE`,
@@ -59,13 +63,13 @@ def load(
     return _finish(motion, path, metres_per_unit)
 
 
-def load_rest(path: str | PathLike[str]) -> Motion | None:
+def load_rest(path: str | PathLike[str]) -> "Motion | None":
     """Read one frame of a character's rest pose; None for files that have none but their motion."""
     ending = _check_readable(path)
     return _import_format(READERS[ending]).load_rest(path) if ending in CHARACTERS else None
 
 
-def load_mesh(path: str | PathLike[str]) -> CharacterMesh:
+def load_mesh(path: str | PathLike[str]) -> "CharacterMesh":
     """Read the triangles of a character's file, in its rest pose; FileFormatError where it has none."""
     ending = _check_readable(path)
     if ending not in CHARACTERS:
@@ -84,7 +88,7 @@ def _import_format(name: str) -> ModuleType:
 
 def load_with_missing(
     path: str | PathLike[str], *, metres_per_unit: float | None = None
-) -> tuple[Motion, MissingValues]:
+) -> "tuple[Motion, MissingValues]":
     """Read a motion as `load` does, from a file that may have NaN for missing values; also return where they are.
 
     The motion is finite: missing rotations repeat the last known one, missing positions are interpolated linearly.
@@ -93,15 +97,15 @@ def load_with_missing(
     ending = _check_readable(path)
     if ending not in _MAY_LACK_VALUES:
         motion = load(path, metres_per_unit=metres_per_unit)
-        return motion, MissingValues.none(motion.num_frames, motion.num_joints)
+        return motion, _import_format("missing").MissingValues.none(motion.num_frames, motion.num_joints)
     motion, missing = _import_format(READERS[ending]).load_with_missing(examples.resolve(path))
     return _finish(motion, path, metres_per_unit), missing
 
 
-def _finish(motion: Motion, path: str | PathLike[str], metres_per_unit: float | None) -> Motion:
+def _finish(motion: "Motion", path: str | PathLike[str], metres_per_unit: float | None) -> "Motion":
     """Convert the unit where one is given; mark examples with their licence, which BVH has no place for."""
     motion = replace(motion, licence=examples.LICENCE) if examples.is_example(path) else motion
-    return motion if metres_per_unit is None else bvh.convert_unit(motion, metres_per_unit)
+    return motion if metres_per_unit is None else _import_format("bvh").convert_unit(motion, metres_per_unit)
 
 
 def _check_readable(path: str | PathLike[str]) -> str:
@@ -113,7 +117,7 @@ def _check_readable(path: str | PathLike[str]) -> str:
     return ending
 
 
-def save(motion: Motion, path: str | PathLike[str]) -> None:
+def save(motion: "Motion", path: str | PathLike[str]) -> None:
     """Write a motion in a format of `WRITERS`, whole or not at all. RequestError if it cannot be written there."""
     check_ending(path)
     _import_format(WRITERS[Path(path).suffix.lower()]).save(motion, path)

@@ -6,8 +6,8 @@ from importlib import import_module
 import numpy as np
 
 from mapctl.errors import MapctlError
-from mapctl.formats.characters.source import CharacterSource, ending_family
-from mapctl.isolated.pictures import decode_srgb
+from mapctl.formats.character import CharacterSource, ending_family
+from mapctl.formats.parts import decode_srgb
 from mapctl.mesh.character_mesh import CharacterMesh
 from mapctl.mesh.primitives import Array
 from mapctl.mesh.skinning import build_skin

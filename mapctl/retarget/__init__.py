@@ -15,7 +15,7 @@ from torch import Tensor
 
 from mapctl import formats, kinematics, rotations
 from mapctl.errors import RequestError
-from mapctl.formats.characters.source import CharacterSource
+from mapctl.formats.character import CharacterSource
 from mapctl.formats.examples import is_example
 from mapctl.motion import Motion
 from mapctl.retarget.body_plan import goes_on_four_legs

@@ -10,9 +10,9 @@ from character_maker import make_character_glb
 from helpers import run
 
 from mapctl.errors import FileFormatError
-from mapctl.formats.characters.key_times import sample_times
-from mapctl.formats.characters.names import make_unique
-from mapctl.formats.characters.selector import CharacterPath, choose_name, parse_character_path
+from mapctl.formats.character import sample_times
+from mapctl.formats.character import make_unique
+from mapctl.formats.character import CharacterPath, choose_name, parse_character_path
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from scipy.interpolate import CubicHermiteSpline
 import mapctl
 from mapctl import editing, formats, retarget, rotations
 from mapctl.errors import FileFormatError, RequestError
-from mapctl.formats.characters.source import CharacterSource
+from mapctl.formats.character import CharacterSource
 from mapctl.formats.gltf.animations import Track, sample_track
 from mapctl.retarget import figure
 from mapctl.retarget.carry import RiggedCharacter, retarget_motion

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from mapctl.formats.characters.rest_frames import (
+from mapctl.formats.character import (
     RestFrames,
     UnevenScaleError,
     chain_matrices,

@@ -13,7 +13,7 @@ from helpers import random_motion, walk
 
 from mapctl import formats
 from mapctl.errors import FileFormatError, RequestError
-from mapctl.formats.characters.source import CharacterSource
+from mapctl.formats.character import CharacterSource
 from mapctl.skeleton import CANONICAL
 
 EXTENSION = "VRMC_vrm_animation"

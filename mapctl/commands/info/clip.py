@@ -9,7 +9,7 @@ from mapctl.commands.shared import inputs, outputs
 from mapctl.commands.shared.tables import print_table
 from mapctl.errors import RequestError
 from mapctl.formats import bvh
-from mapctl.formats.characters.source import CharacterSource
+from mapctl.formats.character import CharacterSource
 from mapctl.formats.units import UNITS
 from mapctl.motion import Motion
 from mapctl.retarget import RigMap

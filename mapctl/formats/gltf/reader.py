@@ -1,22 +1,151 @@
-"""glTF, VRM and VRM animations in: a character's joints, its rest pose, and an animation where the file has one."""
+"""glTF, VRM and VRM animations in: which nodes are a character's joints, their rest pose, and an animation of them."""
 
-from dataclasses import replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from os import PathLike
 
+import numpy as np
+import torch
+
+from mapctl import rotations
 from mapctl.errors import FileFormatError
-from mapctl.formats.characters.rest_frames import RestFrames, chain_matrices
-from mapctl.formats.characters.selector import CharacterPath, choose_name, note_animation, parse_character_path
-from mapctl.formats.characters.source import CharacterSource, stamp_file
-from mapctl.formats.gltf.animations import name_animations, read_tracks, sample_local_matrices, time_animations
-from mapctl.formats.gltf.armatures import Armature, find_armatures, node_matrix, read_humanoid_names, read_rest_frames
-from mapctl.formats.gltf.container import GltfFile, read_file
+from mapctl.formats.character import (
+    CharacterSource,
+    RestFrames,
+    UnevenScaleError,
+    chain_matrices,
+    choose_name,
+    complete_bind_pose,
+    compose_matrices,
+    note_animation,
+    sample_times,
+    stamp_file,
+)
+from mapctl.formats.gltf.document import GltfFile, Json, read_accessor, read_file, refuse_malformed
+from mapctl.formats.parts import CharacterPath, make_unique, parse_character_path
+from mapctl.formats.text import check_extent
 from mapctl.motion import Motion
-from mapctl.skeleton import Skeleton
+from mapctl.skeleton import CANONICAL, Skeleton
 
+Array = np.ndarray
+LICENCE = "licence"
+"""Key of the asset's extras under which mapctl writes the licence of a motion."""
+_MAX_JOINTS = 4096
+_WIDTHS = {"translation": "VEC3", "rotation": "VEC4", "scale": "VEC3"}
 _REST_FPS = Fraction(30)
+ANIMATION = "VRMC_vrm_animation"
+"""Extension of a file that holds the animation of a humanoid alone."""
+_EXTENSIONS = "VRMC_vrm", ANIMATION
 
 
+@dataclass(frozen=True, eq=False)
+class Armature:
+    """A connected tree of nodes that are one character's joints."""
+
+    name: str
+    """Name by which it is chosen."""
+    nodes: tuple[int, ...]
+    """Its nodes, parents first; the first is the root."""
+    parents: tuple[int, ...]
+    """Index among `nodes` of each one's parent, -1 for the root."""
+    skins: tuple[int, ...]
+    """Skins that it carries."""
+    ends: dict[int, int]
+    """Node that is the End Site of a last joint, by that joint's index among `nodes`."""
+    all_names: Sequence[str] = ()
+    """Names of all armatures of the file."""
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """Keys of one property of a node."""
+
+    node: int
+    path: str
+    """translation, rotation or scale."""
+    times: Array
+    """(keys,) seconds, increasing."""
+    values: Array
+    """(keys, 3 or 4), or (3 keys, 3 or 4) with tangents for cubic splines."""
+    interpolation: str
+
+
+class NodeTree:
+    """Parents of nodes; FileFormatError where a node has two, is not there, or is below itself."""
+
+    def __init__(self, gltf: GltfFile):
+        self.gltf, nodes = gltf, gltf.all("nodes")
+        self.parent: dict[int, int] = {}
+        for number, node in enumerate(nodes):
+            children = node.get("children", ())
+            self.check_nodes(children, f"nodes[{number}].children")
+            for child in children:
+                if child in self.parent:
+                    raise FileFormatError(
+                        gltf.path, f"nodes[{child}] has two parents, {self.parent[child]} and {number}"
+                    )
+                self.parent[child] = number
+        self._check_loops()
+
+    def check_nodes(self, nodes: Iterable[int], what: str) -> None:
+        """Raise FileFormatError unless all of these nodes are there."""
+        count = len(self.gltf.all("nodes"))
+        for node in nodes:
+            if not 0 <= node < count:
+                raise FileFormatError(self.gltf.path, f"{what} names node {node}, there are {count}")
+
+    def _check_loops(self) -> None:
+        reached: set[int] = set()
+        for start in range(len(self.gltf.all("nodes"))):
+            trail, node = {start}, self.parent.get(start)
+            while node is not None and node not in reached:
+                if node in trail:
+                    raise FileFormatError(self.gltf.path, f"nodes[{node}] is below itself")
+                trail.add(node)
+                node = self.parent.get(node)
+            reached |= trail
+
+    def line(self, node: int) -> list[int]:
+        """Return a node and all above it, up to the scene."""
+        found = [node]
+        while found[-1] in self.parent:
+            found.append(self.parent[found[-1]])
+            if len(found) > _MAX_JOINTS:
+                raise FileFormatError(self.gltf.path, f"nodes[{node}] lies deeper than {_MAX_JOINTS} others")
+        return found
+
+    def connect(self, nodes: Iterable[int]) -> list[int]:
+        """Return these nodes, what lies between them, and their common root, parents first."""
+        lines = [self.line(node)[::-1] for node in set(nodes)]
+        common = lines[0]
+        for line in lines[1:]:
+            same = [a == b for a, b in zip(common, line, strict=False)]
+            common = common[: same.index(False) if False in same else len(same)]
+        if not common:
+            raise FileFormatError(self.gltf.path, "joints of one skin have no common node above them")
+        depth = len(common) - 1
+        wanted = {node for line in lines for node in line[depth:]}
+        return [node for node in self.walk(common[-1]) if node in wanted]
+
+    def walk(self, root: int) -> Iterator[int]:
+        """Go through a node and all below it, parents first, depth first."""
+        waiting = [root]
+        while waiting:
+            node = waiting.pop()
+            yield node
+            waiting += reversed(self.gltf.get("nodes", node).get("children", ()))
+
+    def outer_matrix(self, root: int) -> Array:
+        """Return what takes the frame that a node is in to the scene, (4, 4)."""
+        matrix = np.eye(4)
+        for node in reversed(self.line(root)[1:]):
+            matrix = matrix @ node_matrix(self.gltf.get("nodes", node))
+        return matrix
+
+
+@refuse_malformed
 def load(path: str | PathLike[str]) -> Motion:
     """Read an animation of a character from a .glb, .gltf, .vrm or .vrma file; one frame of its rest pose where it has
     none.
@@ -35,9 +164,10 @@ def load(path: str | PathLike[str]) -> Motion:
     note_animation(chosen, source.animations, name)
     fps, local = sample_local_matrices(gltf, armature.nodes, tracks)
     worlds = chain_matrices(armature.parents, local, frames.outer)
-    return replace(frames.to_motion(worlds, fps, skeleton, source), licence=gltf.document.asset.licence)
+    return replace(frames.to_motion(worlds, fps, skeleton, source), licence=_read_licence(gltf))
 
 
+@refuse_malformed
 def load_rest(path: str | PathLike[str]) -> Motion:
     """Read one frame of a character's rest pose, as `load` reads its animation."""
     _, gltf, armature = open_character(path)
@@ -58,10 +188,10 @@ def read_skeleton(gltf: GltfFile, armature: Armature) -> tuple[RestFrames, Skele
     frames = read_rest_frames(gltf, armature)
     worlds = frames.matrices()
     ends = {
-        joint: (worlds[joint] @ node_matrix(gltf.document.nodes[node]))[:3, 3] for joint, node in armature.ends.items()
+        joint: (worlds[joint] @ node_matrix(gltf.get("nodes", node)))[:3, 3] for joint, node in armature.ends.items()
     }
     skeleton = frames.skeleton(ends)
-    if float(skeleton.offsets.abs().max()) > 1e6:
+    if not float(skeleton.offsets.abs().max()) <= 1e6:
         raise FileFormatError(gltf.path, f"armature {armature.name!r} is larger than 1000 km")
     return frames, skeleton
 
@@ -82,6 +212,13 @@ def _find_animation(gltf: GltfFile, armature: Armature, chosen: CharacterPath):
     return None
 
 
+def _read_licence(gltf: GltfFile) -> str:
+    """Return the licence of a file's motion; empty where it has none."""
+    extras = gltf.tree["asset"].get("extras")
+    found = extras.get(LICENCE) if isinstance(extras, dict) else None
+    return found if isinstance(found, str) else ""
+
+
 def _rest_motion(gltf: GltfFile, armature: Armature, frames: RestFrames, skeleton: Skeleton) -> Motion:
     source = _source(gltf, armature, frames, None)
     return frames.to_motion(frames.matrices()[None], _REST_FPS, skeleton, source)
@@ -98,3 +235,304 @@ def _source(gltf: GltfFile, armature: Armature, frames: RestFrames, animation: s
         read_humanoid_names(gltf, armature, frames.names),
         armature.all_names,
     )
+
+
+def find_armatures(gltf: GltfFile) -> list[Armature]:
+    """Find the armatures of a file; FileFormatError where nothing says which nodes are joints, or they are no tree."""
+    skins, animated, tree = gltf.all("skins"), _animated_nodes(gltf), NodeTree(gltf)
+    groups: list[tuple[set[int], list[int]]] = []
+    if not skins:
+        groups = [(joints, []) for joints in _find_bare_joints(gltf, tree, animated)]
+    for number, skin in enumerate(skins):
+        tree.check_nodes(skin["joints"], f"skins[{number}].joints")
+        if len(skin["joints"]) > _MAX_JOINTS:
+            raise FileFormatError(
+                gltf.path, f"skins[{number}] has {len(skin['joints'])} joints, allowed are {_MAX_JOINTS}"
+            )
+        joints = set(tree.connect(skin["joints"]))
+        near = [group for group in groups if group[0] & joints or _share_line(tree, group[0], joints)]
+        groups = [group for group in groups if group not in near]
+        groups.append((joints.union(*(g[0] for g in near)), sorted({number, *(s for g in near for s in g[1])})))
+    groups.sort(key=lambda group: group[1])
+    found = [_build_armature(gltf, tree, joints, skins, animated) for joints, skins in groups]
+    names = make_unique([armature.name for armature in found])
+    return [replace(armature, name=name, all_names=names) for name, armature in zip(names, found, strict=True)]
+
+
+def read_rest_frames(gltf: GltfFile, armature: Armature) -> RestFrames:
+    """Read the rest pose: the one in which the skins are bound where all of them say one and bones are as long as the
+    nodes' (VRM files: always the nodes'); else the nodes'. FileFormatError for uneven scale."""
+    tree = NodeTree(gltf)
+    names = tuple(make_unique([str(gltf.get("nodes", node).get("name") or f"node_{node}") for node in armature.nodes]))
+    local = np.stack([node_matrix(gltf.get("nodes", node)) for node in armature.nodes])
+    outer = tree.outer_matrix(armature.nodes[0])
+    worlds = chain_matrices(armature.parents, local, outer)
+    try:
+        frames = RestFrames.of(names, armature.parents, worlds, outer)
+    except UnevenScaleError as error:
+        what = f"armature {armature.name!r}: {error.args[0]}; apply it and export again"
+        raise FileFormatError(gltf.path, what) from None
+    bound = None if is_vrm(gltf) else _bind_worlds(gltf, armature, worlds, outer)
+    return frames if bound is None else RestFrames.of(names, armature.parents, bound, outer)
+
+
+def read_humanoid_names(gltf: GltfFile, armature: Armature, names: tuple[str, ...]) -> dict[str, str]:
+    """Return joint names by canonical name as a VRM file says them; empty for other files."""
+    at = {node: name for node, name in zip(armature.nodes, names, strict=True)}
+    return select_canonical({bone: at[node] for bone, node in read_bones(gltf).items() if node in at})
+
+
+def read_inverse_binds(gltf: GltfFile, skin: int) -> Array | None:
+    """Return the matrices (joints, 4, 4) from a skin's vertices to its joints' frames; None where it has none."""
+    entry = gltf.get("skins", skin)
+    if entry.get("inverseBindMatrices") is None:
+        return None
+    inverse = read_accessor(gltf, entry["inverseBindMatrices"], "MAT4").reshape(-1, 4, 4).transpose(0, 2, 1)
+    count = len(entry["joints"])
+    if len(inverse) < count:
+        raise FileFormatError(gltf.path, f"skins[{skin}] has {count} joints and {len(inverse)} inverse bind matrices")
+    return inverse[:count]
+
+
+def node_matrix(node: Json) -> Array:
+    """Return what takes a node's frame to its parent's, (4, 4)."""
+    if node.get("matrix") is not None:
+        return np.array(node["matrix"], np.float64).reshape(4, 4).T
+    place, turn, scale = node_parts(node)
+    length = np.linalg.norm(turn)
+    turn = turn / length if length > 1e-9 else np.array([0.0, 0.0, 0.0, 1.0])
+    return compose_matrices(place, turn, scale)
+
+
+def node_parts(node: Json) -> tuple[Array, Array, Array]:
+    """Return translation (3,), rotation xyzw (4,) and scale (3,) of a node without a matrix."""
+    usual = {"translation": (0.0, 0.0, 0.0), "rotation": (0.0, 0.0, 0.0, 1.0), "scale": (1.0, 1.0, 1.0)}
+    place, turn, scale = (np.array(node.get(key, value), np.float64) for key, value in usual.items())
+    if (place.shape, turn.shape, scale.shape) != ((3,), (4,), (3,)):
+        raise ValueError("a node's translation and scale have 3 numbers, its rotation 4")
+    return place, turn, scale
+
+
+def _share_line(tree: NodeTree, first: set[int], second: set[int]) -> bool:
+    """Return whether one set of joints hangs below the other: a hat's skin below the head's joint."""
+    tops = [min(nodes, key=lambda node: len(tree.line(node))) for nodes in (first, second)]
+    return bool(set(tree.line(tops[0])) & second or set(tree.line(tops[1])) & first)
+
+
+def _animated_nodes(gltf: GltfFile) -> set[int]:
+    targets = [c["target"] for animation in gltf.all("animations") for c in animation.get("channels", ())]
+    return {target["node"] for target in targets if target.get("node") is not None and target["path"] != "weights"}
+
+
+def _find_bare_joints(gltf: GltfFile, tree: NodeTree, animated: set[int]) -> list[set[int]]:
+    """Find the joints of the characters of a file without a skin: the humanoid's, else of each tree those that an
+    animation moves, and those below them that carry others."""
+    bones = set(read_bones(gltf).values())
+    tree.check_nodes(bones, "the humanoid")
+    if bones:
+        return [bones]
+    if not animated:
+        what = "has no skin, no humanoid and no animation, so nothing in it says which nodes are a character's joints"
+        raise FileFormatError(gltf.path, what)
+    tree.check_nodes(animated, "an animation")
+    tops: dict[int, list[int]] = {}
+    for node in sorted(animated):
+        tops.setdefault(tree.line(node)[-1], []).append(node)
+    bodies = [moved for moved in tops.values() if len(moved) > 1] or list(tops.values())
+    walks = [(set(moved), tree.walk(tree.connect(moved)[0])) for moved in bodies]
+    return [{n for n in below if n in moved or gltf.get("nodes", n).get("children")} for moved, below in walks]
+
+
+def _build_armature(gltf: GltfFile, tree: NodeTree, joints: set[int], skins: list[int], animated: set[int]) -> Armature:
+    """Build the tree of a group's joints; its root is the topmost node above them that any animation moves."""
+    nodes = gltf.all("nodes")
+    said = set(read_bones(gltf).values())
+    tree.check_nodes(said, "the humanoid")
+    own = tree.connect(joints)
+    below = set(tree.walk(own[0]))
+    wanted = set(tree.connect([*own, *(said & below)]))
+    moved = [node for node in tree.line(own[0])[1:] if node in animated]
+    if moved:
+        wanted |= {node for node in tree.line(own[0]) if moved[-1] in tree.line(node)}
+    order = [node for node in tree.walk(moved[-1] if moved else own[0]) if node in wanted]
+    if len(order) > _MAX_JOINTS:
+        raise FileFormatError(gltf.path, f"an armature has {len(order)} joints, allowed are {_MAX_JOINTS}")
+    place = {node: index for index, node in enumerate(order)}
+    parents = tuple(-1 if node == order[0] else place[tree.parent[node]] for node in order)
+    ends = {}
+    for node in order:
+        children = nodes[node].get("children", ())
+        tips = [child for child in children if child not in place and nodes[child].get("mesh") is None]
+        if len(tips) == 1 and not any(child in place for child in children):
+            ends[place[node]] = tips[0]
+    return Armature(_armature_name(gltf, tree, order[0], skins), tuple(order), parents, tuple(skins), ends)
+
+
+def _armature_name(gltf: GltfFile, tree: NodeTree, root: int, skins: list[int]) -> str:
+    """Name an armature by its first skin, else by the node above its root, as exporters do, else by its root."""
+    nodes, above = gltf.all("nodes"), tree.parent.get(root)
+    named = [gltf.get("skins", skin) for skin in skins[:1]] + [nodes[k] for k in (above, root) if k is not None]
+    return next((str(one["name"]) for one in named if one.get("name")), f"armature_{root}")
+
+
+def _bind_worlds(gltf: GltfFile, armature: Armature, worlds: Array, outer: Array) -> Array | None:
+    """Return world matrices (joints, 4, 4) of the pose in which the skins are bound, as far as they agree with the
+    nodes' bones; None where they do not, or are not said.
+
+    Bind matrices are in the space of the vertices: that of the scene, or that of what is above the root.
+    """
+    place = {node: index for index, node in enumerate(armature.nodes)}
+    bound: dict[int, Array] = {}
+    for number in armature.skins:
+        inverse = read_inverse_binds(gltf, number)
+        if inverse is None:
+            return None
+        for node, matrix in zip(gltf.get("skins", number)["joints"], inverse, strict=True):
+            try:
+                bound.setdefault(place[node], np.linalg.inv(matrix))
+            except np.linalg.LinAlgError:
+                raise FileFormatError(
+                    gltf.path, f"skins[{number}]: the bind matrix of joint {node} is singular"
+                ) from None
+    for space in (np.eye(4), outer):
+        found = complete_bind_pose(armature.parents, {joint: space @ matrix for joint, matrix in bound.items()}, worlds)
+        if found is not None:
+            return found
+    return None
+
+
+def name_animations(gltf: GltfFile) -> list[str]:
+    """Return the names of a file's animations, unique, in its order."""
+    return make_unique([str(a.get("name") or f"animation_{k}") for k, a in enumerate(gltf.all("animations"))])
+
+
+def time_animations(gltf: GltfFile, nodes: Sequence[int]) -> dict[str, float]:
+    """Return the seconds that each animation lasts that moves these nodes, by name, without those whose key times
+    cannot be read."""
+    found = {}
+    for name, animation in zip(name_animations(gltf), gltf.all("animations"), strict=True):
+        with suppress(FileFormatError, IndexError, KeyError):
+            targets = [(channel["sampler"], channel["target"]) for channel in animation.get("channels", ())]
+            own = [k for k, target in targets if target.get("node") in nodes and target["path"] in _WIDTHS]
+            inputs = {animation["samplers"][sampler]["input"] for sampler in own}
+            ends = [read_accessor(gltf, times, "SCALAR")[[0, -1], 0].tolist() for times in inputs]
+            if ends:
+                found[name] = max(end for _, end in ends) - min(start for start, _ in ends)
+    return found
+
+
+def read_tracks(gltf: GltfFile, animation: int, nodes: Sequence[int]) -> list[Track]:
+    """Read the tracks of these nodes in an animation; empty where it moves none of them."""
+    found, wanted = [], set(nodes)
+    entry = gltf.get("animations", animation)
+    samplers = entry.get("samplers", [])
+    for number, channel in enumerate(entry.get("channels", ())):
+        node, path = channel["target"].get("node"), channel["target"]["path"]
+        if node not in wanted or path not in _WIDTHS:
+            continue
+        sampler = channel["sampler"]
+        if not 0 <= sampler < len(samplers):
+            what = f"animations[{animation}].channels[{number}] names sampler {sampler}"
+            raise FileFormatError(gltf.path, f"{what}, there are {len(samplers)}")
+        found.append(_read_track(gltf, node, path, samplers[sampler], f"animations[{animation}].samplers[{sampler}]"))
+    return found
+
+
+def sample_local_matrices(gltf: GltfFile, nodes: Sequence[int], tracks: Sequence[Track]) -> tuple[Fraction, Array]:
+    """Return frames per second, and local matrices (frames, nodes, 4, 4) at its frames, from the first key to the last.
+
+    FileFormatError where there would be too many.
+    """
+    keys = np.concatenate([track.times for track in tracks])
+    span = float(keys.max() - keys.min())
+    check_extent(gltf.path, int(span), 1)
+    fps, times = sample_times(keys)
+    check_extent(gltf.path, len(times), len(nodes))
+    by_node: dict[int, list[Track]] = {}
+    for track in tracks:
+        by_node.setdefault(track.node, []).append(track)
+    matrices = np.empty((len(times), len(nodes), 4, 4))
+    for place, node in enumerate(nodes):
+        own = gltf.get("nodes", node)
+        matrices[:, place] = _sample_node(own, by_node[node], times) if node in by_node else node_matrix(own)
+    return fps, matrices
+
+
+def _read_track(gltf: GltfFile, node: int, path: str, sampler: Json, what: str) -> Track:
+    interpolation = sampler.get("interpolation", "LINEAR")
+    if interpolation not in ("LINEAR", "STEP", "CUBICSPLINE"):
+        raise FileFormatError(gltf.path, f"{what}: no interpolation of glTF is {interpolation!r}")
+    times = read_accessor(gltf, sampler["input"], "SCALAR")[:, 0].astype(np.float64)
+    values = read_accessor(gltf, sampler["output"], _WIDTHS[path]).astype(np.float64)
+    keys = len(times) * (3 if interpolation == "CUBICSPLINE" else 1)
+    if len(values) != keys:
+        raise FileFormatError(gltf.path, f"{what} has {len(times)} key times and {len(values)} values, expected {keys}")
+    if (np.diff(times) < 0).any() or times[0] < 0 or times[-1] > 1e6:
+        raise FileFormatError(gltf.path, f"{what}: key times must increase, from 0 to a million seconds")
+    if path == "rotation" and interpolation != "CUBICSPLINE":
+        lengths = np.linalg.norm(values, axis=1)
+        if (abs(lengths - 1) > 0.1).any():
+            raise FileFormatError(gltf.path, f"{what}: a rotation is no unit quaternion")
+        values = values / lengths[:, None]
+    return Track(node, path, times, values, interpolation)
+
+
+def _sample_node(node: Json, tracks: Sequence[Track], times: Array) -> Array:
+    usual = zip(("translation", "rotation", "scale"), node_parts(node), strict=True)
+    parts = {path: np.tile(values, (len(times), 1)) for path, values in usual}
+    for track in tracks:
+        parts[track.path] = sample_track(track, times)
+    lengths = np.linalg.norm(parts["rotation"], axis=1, keepdims=True)
+    turns = np.where(lengths > 1e-9, parts["rotation"] / np.maximum(lengths, 1e-9), np.array([0.0, 0.0, 0.0, 1.0]))
+    return compose_matrices(parts["translation"], turns, parts["scale"])
+
+
+def sample_track(track: Track, times: Array) -> Array:
+    """Return a track's values (times, 3 or 4) at times, seconds; before its first and after its last key it holds."""
+    keys = track.times
+    if len(keys) == 1:
+        return np.tile(track.values[1 if track.interpolation == "CUBICSPLINE" else 0], (len(times), 1))
+    low = np.clip(np.searchsorted(keys, times, side="right") - 1, 0, len(keys) - 2)
+    gap = np.maximum(keys[low + 1] - keys[low], 1e-12)
+    share = np.clip((times - keys[low]) / gap, 0.0, 1.0)
+    if track.interpolation == "CUBICSPLINE":
+        return _sample_spline(track.values.reshape(len(keys), 3, -1), low, gap, share)
+    before, after = track.values[low], track.values[low + 1]
+    if track.interpolation == "STEP":
+        return np.where((share >= 1.0)[:, None], after, before)
+    if track.path == "rotation":
+        turns = rotations.slerp(*(torch.from_numpy(values) for values in (before, after, share)))
+        return turns.numpy()
+    return before + (after - before) * share[:, None]
+
+
+def _sample_spline(keys: Array, low: Array, gap: Array, share: Array) -> Array:
+    """Read cubic Hermite splines; `keys` (keys, 3, width) are in-tangent, value and out-tangent."""
+    t, gap = share[:, None], gap[:, None]
+    before, after = keys[low, 1], keys[low + 1, 1]
+    leave, arrive = keys[low, 2] * gap, keys[low + 1, 0] * gap
+    rise, bend = t * t * (3 - 2 * t), t * (1 - t)
+    return before + (after - before) * rise + bend * ((1 - t) * leave - t * arrive)
+
+
+def is_vrm(gltf: GltfFile) -> bool:
+    """Return whether the file is a VRM character, 0 or 1, or a VRM animation, whatever its ending."""
+    return any(name in gltf.tree.get("extensions", {}) for name in ("VRM", *_EXTENSIONS))
+
+
+def read_bones(gltf: GltfFile) -> dict[str, int]:
+    """Return the node of each bone of the humanoid, by VRM's name; empty for files that are no VRM."""
+    extensions = gltf.tree.get("extensions", {})
+    for name in _EXTENSIONS:
+        if name in extensions:
+            bones = extensions[name].get("humanoid", {}).get("humanBones", {})
+            return {bone: found["node"] for bone, found in bones.items()}
+    bones = extensions.get("VRM", {}).get("humanoid", {}).get("humanBones", [])
+    return {bone["bone"]: bone["node"] for bone in bones}
+
+
+def select_canonical(bones: Mapping[str, str]) -> dict[str, str]:
+    """Return what is given by bone for the canonical joints alone. VRM's `upperChest`, which carries the arms, is the
+    canonical chest where a file has one."""
+    chest = {"chest": bones["upperChest"]} if "upperChest" in bones else {}
+    return {name: own for name, own in {**bones, **chest}.items() if name in CANONICAL.names}

@@ -1,0 +1,109 @@
+"""FBX in, by the package ufbx: characters and captures, as rigs and as clips. FBX is not written."""
+
+from fractions import Fraction
+from importlib.util import find_spec
+from os import PathLike
+
+import numpy as np
+
+from mapctl.errors import FileFormatError
+from mapctl.formats import sandbox
+from mapctl.formats.character import (
+    RestFrames,
+    UnevenScaleError,
+    build_mesh,
+    check_size,
+    complete_bind_pose,
+    compose_transforms,
+    describe_source,
+    frame_rate_of,
+    note_animation,
+    place_joints,
+)
+from mapctl.formats.parts import CharacterPath, parse_character_path
+from mapctl.formats.text import MAX_POSES, check_ordinary, warn_once
+from mapctl.mesh.character_mesh import CharacterMesh
+from mapctl.motion import Motion
+from mapctl.skeleton import Skeleton
+
+_REST_FPS = Fraction(30)
+
+
+def is_installed() -> bool:
+    """Return whether the package is installed."""
+    return find_spec("ufbx") is not None
+
+
+def load(path: str | PathLike[str]) -> Motion:
+    """Read an animation of an .fbx file; one frame of the rest pose where it has none.
+
+    `path` may end as `#ARMATURE`, `#ARMATURE/ANIMATION` or `#/ANIMATION`; by default the file's first animation that
+    moves the armature is read, and a file of several armatures is refused, naming them. Joint frames are aligned with
+    the world in the rest pose. FileFormatError says what is wrong with the file.
+    """
+    chosen, found = _read(path, "motion")
+    frames, skeleton = _read_skeleton(chosen, found)
+    note_animation(chosen, found.animations, found.animation)
+    if found.take is None:
+        return _rest_motion(chosen, found, frames, skeleton)
+    outer = np.eye(4) + np.zeros((1, 4, 4))
+    for one in np.moveaxis(compose_transforms(chosen.file, found.take.above), 1, 0):
+        outer = outer @ one
+    local = compose_transforms(chosen.file, found.take.local)
+    worlds = place_joints(chosen.file, frames.parents, local, outer)
+    source = describe_source(chosen, found, frames, frames.names)
+    return frames.to_motion(worlds, frame_rate_of(found.take.rate), skeleton, source)
+
+
+def load_rest(path: str | PathLike[str]) -> Motion:
+    """Read one frame of the rest pose, as `load` reads an animation."""
+    chosen, found = _read(path, "rest")
+    return _rest_motion(chosen, found, *_read_skeleton(chosen, found))
+
+
+def load_mesh(path: str | PathLike[str]) -> CharacterMesh:
+    """Read the mesh of a character: what its skins carry, and what hangs on its joints rigidly. `path` chooses as in
+    `load`. FileFormatError where the file has no triangles for the armature, or they are broken."""
+    chosen, found = _read(path, "mesh")
+    return build_mesh(chosen.file, found.armature, found.parts, _read_skeleton(chosen, found)[0])
+
+
+def _read(path: str | PathLike[str], wanted: str):
+    """Return what the path chooses, and the `fbx_scene.FbxCharacter` of it."""
+    chosen = parse_character_path(path)
+    if not is_installed():
+        raise FileFormatError(chosen.file, "FBX needs the package ufbx: pip install 'mapctl[fbx]'")
+    check_ordinary(chosen.file)
+    from mapctl.formats.fbx_scene import read_character
+
+    options = {"armature": chosen.armature, "animation": chosen.animation, "wanted": wanted}
+    found = sandbox.call(read_character, chosen.file, most_poses=MAX_POSES, **options)
+    if found.fault:
+        warn_once(f"{chosen.file}: {found.fault}; its joints and motion are read")
+    return chosen, found
+
+
+def _read_skeleton(chosen: CharacterPath, found) -> tuple[RestFrames, Skeleton]:
+    """Read the rest frames: the pose in which skins are bound where bones are as long as the nodes', else the nodes';
+    and the skeleton that is aligned with the world in them."""
+    parents, worlds = tuple(found.parents), found.worlds
+    check_size(chosen.file, worlds)
+    for bound in found.bound:
+        check_size(chosen.file, np.stack(list(bound.values())))
+        complete = complete_bind_pose(parents, bound, found.worlds)
+        if complete is not None:
+            worlds = complete
+            break
+    try:
+        frames = RestFrames.of(tuple(found.names), parents, worlds, found.outer)
+    except UnevenScaleError as error:
+        what = f"armature {found.armature!r}: {error.args[0]}; apply it and export again"
+        raise FileFormatError(chosen.file, what) from None
+    rests = frames.matrices()
+    tips = {joint: (rests[joint] @ np.append(end, 1.0))[:3] for joint, end in found.ends.items()}
+    return frames, frames.skeleton(tips)
+
+
+def _rest_motion(chosen: CharacterPath, found, frames: RestFrames, skeleton: Skeleton) -> Motion:
+    source = describe_source(chosen, found, frames, frames.names)
+    return frames.to_motion(frames.matrices()[None], _REST_FPS, skeleton, source)

@@ -1,0 +1,848 @@
+"""USD files by the package usd-core: skeletons, animations, triangles as arrays; and characters written.
+
+Without torch, for `mapctl.formats.sandbox`.
+"""
+
+# The package loads its modules at run time and declares no types.
+# pyright: reportAttributeAccessIssue=false
+
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from pxr import Ar, Gf, Sdf, Tf, Usd, UsdGeom, UsdShade, UsdSkel, UsdUtils, Vt
+
+from mapctl.formats.parts import (
+    FoundCharacter,
+    MeshPart,
+    decode_picture,
+    encode_srgb,
+    find_name,
+    make_unique,
+    mean_at_vertices,
+    sample_picture,
+    split_polygons,
+    strongest,
+)
+from mapctl.formats.sandbox import Refusal
+
+Array = np.ndarray
+_MAX_LAYERS = 1000
+_REASON = re.compile(r"in file \S+ : '(.+?)'?\s*$", re.MULTILINE)
+ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
+"""Endings of USD files."""
+MAX_JOINTS = 4096
+"""Most joints of a skeleton."""
+_TO_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+_GREY = (0.8, 0.8, 0.8, 1.0)
+_MAX_PICTURE_BYTES = 2**28
+_MAX_CORNERS = 2**25
+_MARGIN = 0.3
+"""Metres around the joints within which the body is."""
+
+
+@dataclass(eq=False, kw_only=True)
+class UsdCharacter(FoundCharacter):
+    """A character of a USD stage."""
+
+    path: str
+    """Path of the skeleton's prim."""
+    joints: list[str]
+    """Paths of the joints in the skeleton."""
+    outer: Array
+    """(4, 4) what takes the skeleton's space to the world of metres and Y up."""
+    stage: Array
+    """(4, 4) what takes the stage's space there."""
+    bind: Array | None
+    """As of `SkeletonPrim`."""
+    rest: Array | None
+    """As of `SkeletonPrim`."""
+    per_second: float
+    """Time codes per second."""
+    poses: "Animation | None" = None
+    """The animation."""
+
+
+def read_character(
+    path: str, *, armature: str | None, animation: str | None, wanted: str, most_poses: int, most_bytes: int
+) -> UsdCharacter:
+    """Read a skeleton, and `wanted` besides: `rest` nothing, `motion` its animation, of at most so many frames times
+    joints, `mesh` its triangles; layers have at most `most_bytes`. Refusal says why not."""
+    try:
+        stage = open_stage(path, most_bytes)
+        name, skeleton = choose_skeleton(stage, Path(path).name, armature)
+        found = UsdCharacter(
+            armature=name,
+            armatures=find_skeletons(stage)[0],
+            names=skeleton.names,
+            parents=skeleton.parents,
+            metres_per_unit=UsdGeom.GetStageMetersPerUnit(stage),
+            path=str(skeleton.prim.GetPath()),
+            joints=skeleton.joints,
+            outer=world_of(skeleton.prim, Usd.TimeCode.EarliestTime()),
+            stage=stage_to_world(stage),
+            bind=skeleton.bind,
+            rest=skeleton.rest,
+            per_second=stage.GetTimeCodesPerSecond(),
+        )
+        if wanted == "motion":
+            found.animations = time_animations(stage, skeleton)
+            found.poses = read_animation(stage, skeleton, animation, most_poses)
+            found.animation = found.poses and found.poses.name
+        if wanted == "mesh":
+            found.parts = read_parts(stage, skeleton, Path(path).resolve().parent)
+        return found
+    except (Tf.ErrorException, UnicodeDecodeError) as error:
+        raise Refusal(f"is no sound USD file: {first_reason(error)}") from None
+
+
+def open_stage(path: str, most_bytes: int) -> Usd.Stage:
+    """Open a file with all that it refers to. Refusal where it is broken, or names layers that are not there, lie
+    elsewhere, or are larger than `most_bytes`."""
+    root = open_layer(path)
+    check_layers(root, Path(path).resolve().parent, most_bytes)
+    try:
+        stage = Usd.Stage.Open(root)
+    except Tf.ErrorException as error:
+        raise Refusal(f"cannot be put together: {first_reason(error)}") from None
+    if not stage:
+        raise Refusal("cannot be put together")
+    return stage
+
+
+def open_layer(path: str) -> Sdf.Layer:
+    """Open one layer; Refusal with USD's own reason where it is broken."""
+    try:
+        layer = Sdf.Layer.FindOrOpen(path)
+    except Tf.ErrorException as error:
+        raise Refusal(f"is no sound USD file: {first_reason(error)}") from None
+    if not layer:
+        raise Refusal("is no sound USD file")
+    return layer
+
+
+def check_layers(root: Sdf.Layer, folder: Path, most_bytes: int) -> None:
+    """Refuse layers that the root layer names, or those name, unless they are sound files in the folder."""
+    waiting, seen = [root], {root.identifier}
+    while waiting:
+        layer = waiting.pop()
+        for name in sorted(_named_layers(layer)):
+            full = layer.ComputeAbsolutePath(name)
+            if full in seen:
+                continue
+            seen.add(full)
+            if len(seen) > _MAX_LAYERS:
+                raise Refusal(f"is made of more than {_MAX_LAYERS} layers")
+            _check_file(name, full, folder, most_bytes)
+            if "#" not in name:
+                waiting.append(open_layer(full))
+
+
+def is_inside(full: str, folder: Path) -> bool:
+    """Return whether a resolved asset path is a file in the folder or below, or within such a package."""
+    outer = Ar.SplitPackageRelativePathOuter(full)[0]
+    return "://" not in outer and Path(outer).resolve().is_relative_to(folder)
+
+
+def first_reason(error: Exception) -> str:
+    """Return the reason that USD's many lines of an error hold, in short."""
+    found = _REASON.search(str(error))
+    text = found[1] if found else str(error)
+    return " ".join(text.split())[:160] or "no reason given"
+
+
+def _named_layers(layer: Sdf.Layer) -> set[str]:
+    """Return the layers that a layer names: those it is composed of, and those of value clips."""
+    found = {name for name in layer.GetCompositionAssetDependencies() if name}
+    copied = Sdf.Layer.CreateAnonymous(".usda")
+    copied.TransferContent(layer)
+
+    def note(name: str) -> str:
+        if name.lower().endswith(ENDINGS):
+            found.add(name)
+        return name
+
+    UsdUtils.ModifyAssetPaths(copied, note)
+    return found
+
+
+def _check_file(name: str, full: str, folder: Path, most_bytes: int) -> None:
+    if not is_inside(full, folder):
+        raise Refusal(f"names {name!r}, which is not in its folder; such files are not read")
+    if "#" in name:  # the pattern of value clips, which USD looks for where it leads
+        return
+    outer, inner = Ar.SplitPackageRelativePathOuter(full)
+    file = Path(outer)
+    if not file.is_file() or (inner and not Ar.GetResolver().Resolve(full)):
+        raise Refusal(f"names {name!r}, which is not there")
+    if file.stat().st_size > most_bytes:
+        raise Refusal(f"names {name!r}, which has {file.stat().st_size >> 20} MiB, allowed are {most_bytes >> 20}")
+
+
+# pyright: reportAttributeAccessIssue=false
+
+
+@dataclass(frozen=True, eq=False)
+class SkeletonPrim:
+    """A UsdSkel.Skeleton, read."""
+
+    prim: Usd.Prim
+    """The prim."""
+    joints: list[str]
+    """Paths of its joints."""
+    names: list[str]
+    """Names of its joints, unique."""
+    parents: list[int]
+    """Index of each joint's parent, -1 where it has none."""
+    bind: Array | None
+    """(joints, 4, 4) of the pose in which skins are bound, in the skeleton's space; None where it says none."""
+    rest: Array | None
+    """(joints, 4, 4) of the pose of joints that nothing moves, in their parents' frames; None where it says none."""
+
+
+def find_skeletons(stage: Usd.Stage) -> tuple[list[str], list[Usd.Prim]]:
+    """Find the skeletons of a stage, those in instances too, with unique names. Refusal where there is none."""
+    prims = [prim for prim in walk(stage) if prim.IsA(UsdSkel.Skeleton)]
+    if not prims:
+        raise Refusal("has no Skeleton (UsdSkel), so nothing in it says what a character's joints are")
+    return make_unique([prim.GetName() for prim in prims]), prims
+
+
+def choose_skeleton(stage: Usd.Stage, file: str, wanted: str | None) -> tuple[str, SkeletonPrim]:
+    """Return the wanted or only skeleton and its name; Refusal names them where there are several."""
+    names, prims = find_skeletons(stage)
+    try:
+        number = find_name(file, names, wanted, "armature", several=False)
+    except LookupError as error:
+        raise Refusal(error.args[0]) from None
+    return names[number], read_skeleton(prims[number])
+
+
+def walk(stage: Usd.Stage) -> Usd.PrimRange:
+    """Go through the prims of a stage, those in instances too."""
+    return Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies())
+
+
+def read_skeleton(prim: Usd.Prim) -> SkeletonPrim:
+    """Read a skeleton's joints and poses. Refusal where they are no tree, or its tables do not fit together."""
+    skeleton, where = UsdSkel.Skeleton(prim), f"skeleton {prim.GetName()!r}"
+    joints = [str(joint) for joint in read_value(skeleton.GetJointsAttr()) or ()]
+    if not joints:
+        raise Refusal(f"{where} has no joints")
+    if len(joints) > MAX_JOINTS:
+        raise Refusal(f"{where} has {len(joints)} joints, allowed are {MAX_JOINTS}")
+    parents = _find_parents(joints, where)
+    said = [str(name) for name in read_value(skeleton.GetJointNamesAttr()) or ()]
+    bind = _read_matrices(skeleton.GetBindTransformsAttr(), len(joints), where)
+    rest = _read_matrices(skeleton.GetRestTransformsAttr(), len(joints), where)
+    if bind is None and rest is None:
+        raise Refusal(f"{where} has neither bindTransforms nor restTransforms")
+    return SkeletonPrim(prim, joints, _name_joints(joints, said), parents, bind, rest)
+
+
+def world_of(prim: Usd.Prim, time: Usd.TimeCode) -> Array:
+    """Return what takes a prim's space to the world of Y up and metres at a time, (4, 4)."""
+    stage = prim.GetStage()
+    matrix = np.array(UsdGeom.XformCache(time).GetLocalToWorldTransform(prim)).T
+    return stage_to_world(stage) @ matrix
+
+
+def stage_to_world(stage: Usd.Stage) -> Array:
+    """Return what takes the stage's up axis and unit to Y up and metres, (4, 4)."""
+    unit = UsdGeom.GetStageMetersPerUnit(stage)
+    if not (np.isfinite(unit) and 1e-9 < unit < 1e9):
+        raise Refusal(f"metersPerUnit is {unit:g}")
+    turn = _TO_Y_UP if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z else np.eye(4)
+    return np.diag([unit, unit, unit, 1.0]) @ turn
+
+
+def read_value(attribute: Usd.Attribute, time: Usd.TimeCode | None = None):
+    """Return an attribute's value at a time, else its default or earliest one; None where it has none that is known."""
+    try:
+        value = attribute.Get(Usd.TimeCode.EarliestTime() if time is None else time)
+    except Tf.ErrorException:
+        return None
+    return None if isinstance(value, Sdf.UnregisteredValue) else value
+
+
+def _find_parents(joints: list[str], where: str) -> list[int]:
+    """Return each joint's nearest one above it in its path, which must come before it."""
+    place = {joint: number for number, joint in enumerate(joints)}
+    if len(place) < len(joints):
+        raise Refusal(f"{where} names a joint twice")
+    parents = []
+    for number, joint in enumerate(joints):
+        words = joint.split("/")
+        above = ("/".join(words[:length]) for length in range(len(words) - 1, 0, -1))
+        parent = next((place[path] for path in above if path in place), -1)
+        if parent >= number:
+            raise Refusal(f"{where}: joint {joint!r} comes before the joint above it")
+        parents.append(parent)
+    return parents
+
+
+def _name_joints(joints: list[str], said: list[str]) -> list[str]:
+    """Return the names that the skeleton gives its joints, else the last words of their paths where these are unique,
+    else the paths."""
+    if len(said) == len(joints) and len(set(said)) == len(said) and all(said):
+        return said
+    leaves = [joint.rpartition("/")[2] for joint in joints]
+    return leaves if len(set(leaves)) == len(leaves) else joints
+
+
+def _read_matrices(attribute: Usd.Attribute, count: int, where: str) -> Array | None:
+    value = read_value(attribute)
+    if value is None or not len(value):
+        return None
+    if len(value) != count:
+        raise Refusal(f"{where} has {count} joints and {len(value)} {attribute.GetName()}")
+    matrices = np.array(value, np.float64).reshape(count, 4, 4).transpose(0, 2, 1)
+    if not np.isfinite(matrices).all():
+        raise Refusal(f"{where}: {attribute.GetName()} holds numbers that are not finite")
+    return matrices
+
+
+# pyright: reportAttributeAccessIssue=false
+
+
+@dataclass(frozen=True, eq=False)
+class Animation:
+    """Poses of a skeleton at the times at which any of its samples lies."""
+
+    name: str
+    """Name by which it is chosen."""
+    seconds: Array
+    """(keys,) times of the samples, from time code 0 on."""
+    local: Array
+    """(keys, joints, 10) in the parents' frames: translation, rotation xyzw, scale."""
+    outer: Array
+    """(keys or 1, 4, 4) what takes the skeleton's space to the world."""
+
+
+def name_animations(stage: Usd.Stage, skeleton: SkeletonPrim) -> tuple[list[str], list[Usd.Prim], bool]:
+    """Return the animations that fit a skeleton, with unique names, and whether the first is bound to it."""
+    bound = UsdSkel.BindingAPI(skeleton.prim).GetInheritedAnimationSource()
+    own = set(skeleton.joints)
+    found = [bound] if bound and bound.IsA(UsdSkel.Animation) else []
+    for prim in walk(stage):
+        if prim.IsA(UsdSkel.Animation) and prim not in found and _animated_joints(prim) & own:
+            found.append(prim)
+    return make_unique([prim.GetName() for prim in found]), found, bool(bound and found[:1] == [bound])
+
+
+def read_animation(stage: Usd.Stage, skeleton: SkeletonPrim, wanted: str | None, most_poses: int) -> Animation | None:
+    """Read the wanted animation, or the one that is bound to the skeleton; None where none is."""
+    names, prims, bound = name_animations(stage, skeleton)
+    if wanted is None and not bound:
+        return None
+    try:
+        number = find_name("", names, wanted, "animation", several=True)
+    except LookupError as error:
+        raise Refusal(error.args[0]) from None
+    return _sample(stage, skeleton, prims[number], names[number], most_poses)
+
+
+def time_animations(stage: Usd.Stage, skeleton: SkeletonPrim) -> dict[str, float]:
+    """Return the seconds that each animation of a skeleton lasts, by name."""
+    names, prims, _ = name_animations(stage, skeleton)
+    spans = [[code for attribute in _attributes_of(prim) for code in attribute.GetTimeSamples()] for prim in prims]
+    per_second = stage.GetTimeCodesPerSecond() or 1.0
+    return {
+        name: (max(codes, default=0.0) - min(codes, default=0.0)) / per_second
+        for name, codes in zip(names, spans, strict=True)
+    }
+
+
+def animated_placement(prim: Usd.Prim) -> list[float]:
+    """Return the time codes at which the placement of a prim, or of what it is in, changes; none where it does not."""
+    times: set[float] = set()
+    while prim and not prim.IsPseudoRoot():
+        form = UsdGeom.Xformable(prim)
+        if form and form.TransformMightBeTimeVarying():
+            times.update(form.GetTimeSamples())
+        prim = prim.GetParent()
+    return sorted(times)
+
+
+def _animated_joints(prim: Usd.Prim) -> set[str]:
+    return {str(joint) for joint in read_value(UsdSkel.Animation(prim).GetJointsAttr()) or ()}
+
+
+def _attributes_of(prim: Usd.Prim) -> list[Usd.Attribute]:
+    animation = UsdSkel.Animation(prim)
+    return [animation.GetTranslationsAttr(), animation.GetRotationsAttr(), animation.GetScalesAttr()]
+
+
+def _sample(stage: Usd.Stage, skeleton: SkeletonPrim, prim: Usd.Prim, name: str, most_poses: int) -> Animation:
+    animation, attributes, what = UsdSkel.Animation(prim), _attributes_of(prim), f"animation {name!r}"
+    codes = {code for attribute in attributes for code in attribute.GetTimeSamples()}
+    placed = animated_placement(skeleton.prim)
+    per_second = stage.GetTimeCodesPerSecond()
+    if not (np.isfinite(per_second) and 1e-3 <= per_second <= 1e6):
+        raise Refusal(f"timeCodesPerSecond is {per_second:g}")
+    codes |= set(placed)
+    if codes and not np.isfinite(sum(codes)):
+        raise Refusal(f"{what} has times that are not finite")
+    _check_extent(len(codes), len(skeleton.joints), most_poses)
+    if placed:
+        span = range(int(np.ceil(min(codes))), int(min(np.floor(max(codes)), min(codes) + most_poses)) + 1)
+        _check_extent(len(span), len(skeleton.joints), most_poses)
+        codes |= {float(code) for code in span}
+    times = np.array(sorted(codes) or [0.0])
+    local = _sample_joints(skeleton, animation, attributes, times, what)
+    outer = [world_of(skeleton.prim, Usd.TimeCode(time)) for time in (times.tolist() if placed else times[:1].tolist())]
+    return Animation(name, times / per_second, local, np.array(outer))
+
+
+def _sample_joints(
+    skeleton: SkeletonPrim, animation: UsdSkel.Animation, attributes: list[Usd.Attribute], times: Array, what: str
+) -> Array:
+    """Return the skeleton's joints (keys, joints, 10); those that the animation leaves out are at rest."""
+    moved = [str(joint) for joint in read_value(animation.GetJointsAttr()) or ()]
+    place = {joint: number for number, joint in enumerate(skeleton.joints)}
+    here = [number for number, joint in enumerate(moved) if joint in place]
+    there = [place[moved[number]] for number in here]
+    if not here:
+        raise Refusal(f"{what} moves none of the skeleton's joints")
+    local = np.tile(rest_parts(skeleton), (len(times), 1, 1))
+    for attribute, columns in zip(attributes, (slice(0, 3), slice(3, 7), slice(7, 10)), strict=True):
+        varies = len(attribute.GetTimeSamples()) > 1
+        for key, time in enumerate(times.tolist() if varies else times[:1].tolist()):
+            table = _read_table(attribute, time, len(moved), what)
+            if table is not None:
+                local[key if varies else slice(None), there, columns] = table[here]
+    return local
+
+
+def _read_table(attribute: Usd.Attribute, time: float, count: int, what: str) -> Array | None:
+    """Return the values of all animated joints at a time; None where there are none."""
+    value = read_value(attribute, Usd.TimeCode(time))
+    if value is None or not len(value):
+        return None
+    if len(value) != count:
+        raise Refusal(f"{what} has {count} joints and {len(value)} {attribute.GetName()}")
+    return np.array(value, np.float64).reshape(count, -1)
+
+
+def rest_parts(skeleton: SkeletonPrim) -> Array:
+    """Return translation, rotation xyzw and scale (joints, 10) of the pose of joints that nothing moves: that which the
+    skeleton says, else the one in which skins are bound."""
+    matrices = skeleton.rest
+    if matrices is None:
+        assert skeleton.bind is not None
+        above = [np.eye(4) if parent < 0 else skeleton.bind[parent] for parent in skeleton.parents]
+        matrices = np.linalg.pinv(np.array(above)) @ skeleton.bind
+    scales = np.linalg.norm(matrices[:, :3, :3], axis=1)
+    scales *= np.where(np.linalg.det(matrices[:, :3, :3]) < 0, -1.0, 1.0)[:, None]
+    turns = matrices[:, :3, :3] / np.where(abs(scales) > 1e-12, scales, 1.0)[:, None, :]
+    return np.concatenate([matrices[:, :3, 3], to_quaternions(turns), scales], axis=1)
+
+
+def to_quaternions(turns: Array) -> Array:
+    """Return quaternions xyzw (n, 4) of rotations (n, 3, 3): eigenvectors of the greatest eigenvalue of a symmetric
+    matrix that is built of them (Bar-Itzhack, 2000), which also serves for matrices that are nearly rotations."""
+    (a, b, c), (d, e, f), (g, h, i) = (turns[:, k].T for k in range(3))
+    rows = [[a - e - i, b + d, c + g, h - f], [b + d, e - a - i, f + h, c - g]]
+    rows += [[c + g, f + h, i - a - e, d - b], [h - f, c - g, d - b, a + e + i]]
+    symmetric = np.array(rows).transpose(2, 0, 1)
+    return np.linalg.eigh(symmetric)[1][:, :, -1]
+
+
+# pyright: reportAttributeAccessIssue=false
+
+
+def corner_colours(mesh: UsdGeom.Mesh, counts: Array, vertices: Array, folder: Path) -> Array:
+    """Return sRGB and opacity (corners, 4), 0 to 1, of a mesh's corners, of which face k has `counts[k]` and corner k
+    is at vertex `vertices[k]`."""
+    rgba = np.tile(np.array(_GREY), (len(vertices), 1))
+    own = _corner_values(mesh, "displayColor", 3, counts, vertices)
+    if own is not None:
+        rgba[:, :3] = encode_srgb(own)
+    uv = _corner_values(mesh, "st", 2, counts, vertices)
+    for material, here in _find_materials(mesh, counts):
+        colours = _material_colours(material, None if uv is None else uv[here], folder)
+        if colours is not None:
+            rgba[here] = colours
+    return rgba.clip(0.0, 1.0)
+
+
+def _corner_values(mesh: UsdGeom.Mesh, name: str, width: int, counts: Array, vertices: Array) -> Array | None:
+    """Return a primvar's values at the corners; None where it has none, or not as many as it must."""
+    primvar = UsdGeom.PrimvarsAPI(mesh).FindPrimvarWithInheritance(name)
+    if not primvar or not primvar.HasValue():
+        return None
+    try:
+        value = primvar.ComputeFlattened(Usd.TimeCode.EarliestTime())
+        table = np.array(value, np.float64).reshape(-1, width)
+    except (Tf.ErrorException, ValueError, TypeError):
+        return None
+    kind = primvar.GetInterpolation()
+    if kind == UsdGeom.Tokens.constant:
+        index = np.zeros(len(vertices), np.int64)
+    elif kind == UsdGeom.Tokens.uniform:
+        index = np.repeat(np.arange(len(counts)), counts)
+    else:
+        index = np.arange(len(vertices)) if kind == UsdGeom.Tokens.faceVarying else vertices
+    usable = len(table) > index.max(initial=0) and np.isfinite(table).all()
+    return table[index] if usable else None
+
+
+def _find_materials(mesh: UsdGeom.Mesh, counts: Array) -> list[tuple[UsdShade.Material, Array]]:
+    """Return materials and which corners (corners,) they are on: the mesh's own first, then those of its parts."""
+    found = []
+    whole = UsdShade.MaterialBindingAPI(mesh.GetPrim()).ComputeBoundMaterial()[0]
+    if whole:
+        found.append((whole, np.ones(int(counts.sum()), bool)))
+    for subset in UsdGeom.Subset.GetAllGeomSubsets(mesh):
+        material = UsdShade.MaterialBindingAPI(subset.GetPrim()).ComputeBoundMaterial()[0]
+        faces = np.array(read_value(subset.GetIndicesAttr()) or [], np.int64)
+        if material and subset.GetElementTypeAttr().Get() == UsdGeom.Tokens.face:
+            of = np.zeros(len(counts), bool)
+            of[faces[(faces >= 0) & (faces < len(counts))]] = True
+            found.append((material, np.repeat(of, counts)))
+    return found
+
+
+def _material_colours(material: UsdShade.Material, uv: Array | None, folder: Path) -> Array | None:
+    """Return one colour, or one for every corner; None for materials of other kinds."""
+    shader = UsdShade.Shader(material.ComputeSurfaceSource()[0])
+    if not shader or shader.GetIdAttr().Get() != "UsdPreviewSurface":
+        return None
+    entry = shader.GetInput("diffuseColor")
+    if not entry:
+        return np.array([*encode_srgb(np.full(3, 0.18)), 1.0])
+    for attribute in UsdShade.Utils.GetValueProducingAttributes(entry):
+        source = UsdShade.Shader(attribute.GetPrim())
+        if source and source.GetIdAttr().Get() == "UsdUVTexture":
+            picture = None if uv is None else _read_picture(source, folder)
+            return None if picture is None or uv is None else sample_picture(picture, uv * (1, -1) + (0, 1))
+        value = read_value(attribute)
+        if value is not None and np.shape(value) == (3,):
+            return np.array([*encode_srgb(np.array(value, np.float64)), 1.0])
+    return None
+
+
+def _read_picture(source: UsdShade.Shader, folder: Path) -> Array | None:
+    entry = source.GetInput("file")
+    value = read_value(entry.GetAttr()) if entry else None
+    full = getattr(value, "resolvedPath", "")
+    if not full or not is_inside(full, folder):
+        return None
+    asset = Ar.GetResolver().OpenAsset(Ar.ResolvedPath(full))
+    if not asset or asset.GetSize() > _MAX_PICTURE_BYTES:
+        return None
+    with asset:
+        return decode_picture(bytes(asset.GetBuffer()))
+
+
+# pyright: reportAttributeAccessIssue=false
+
+
+def read_parts(stage: Usd.Stage, skeleton: SkeletonPrim, folder: Path) -> list[MeshPart]:
+    """Read the meshes that are bound to a skeleton; pictures lie in `folder` or below."""
+    cache = UsdSkel.Cache()
+    found: list[MeshPart] = []
+    for prim in walk(stage):
+        if not prim.IsA(UsdSkel.Root):
+            continue
+        root = UsdSkel.Root(prim)
+        try:
+            cache.Populate(root, Usd.TraverseInstanceProxies())
+            bindings = cache.ComputeSkelBindings(root, Usd.TraverseInstanceProxies())
+        except Tf.ErrorException:
+            continue
+        for binding in bindings:
+            if binding.GetSkeleton().GetPrim() == skeleton.prim:
+                for query in binding.GetSkinningTargets():
+                    part = _read_mesh(query, skeleton, folder)
+                    found += [] if part is None else [part]
+    return found
+
+
+def _read_mesh(query: UsdSkel.SkinningQuery, skeleton: SkeletonPrim, folder: Path) -> MeshPart | None:
+    """Read a mesh; None for what is none, is not to be seen, or has no skin."""
+    prim = query.GetPrim()
+    mesh = UsdGeom.Mesh(prim)
+    if not mesh or not query.HasJointInfluences() or not _is_seen(mesh):
+        return None
+    what = f"mesh {prim.GetName()!r}"
+    points = _read_array(mesh.GetPointsAttr(), 3, np.float64)
+    counts = _read_array(mesh.GetFaceVertexCountsAttr(), 1, np.int64)[:, 0]
+    vertices = _read_array(mesh.GetFaceVertexIndicesAttr(), 1, np.int64)[:, 0]
+    _check_topology(points, counts, vertices, what)
+    holes = np.zeros(len(counts), bool)
+    skipped = _read_array(mesh.GetHoleIndicesAttr(), 1, np.int64)[:, 0]
+    holes[skipped[(skipped >= 0) & (skipped < len(counts))]] = True
+    corners, _ = split_polygons(counts, holes)
+    faces = vertices[corners].reshape(-1, 3)
+    if str(read_value(mesh.GetOrientationAttr()) or "") == UsdGeom.Tokens.leftHanded:
+        faces = faces[:, ::-1]
+    joints, matrices = _read_palette(query, skeleton)
+    rows, shares = _read_carriers(query, len(points), what)
+    if rows.max(initial=0) >= len(joints) or rows.min(initial=0) < 0:
+        raise Refusal(f"{what} names joint {rows.max()} of {len(joints)}")
+    rgba = mean_at_vertices(corner_colours(mesh, counts, vertices, folder), vertices, len(points))
+    return MeshPart(points, faces, rgba, joints, matrices, rows, shares)
+
+
+def _is_seen(mesh: UsdGeom.Mesh) -> bool:
+    seen = mesh.ComputeVisibility(Usd.TimeCode.EarliestTime()) != UsdGeom.Tokens.invisible
+    return seen and mesh.ComputePurpose() in (UsdGeom.Tokens.default_, UsdGeom.Tokens.render)
+
+
+def _check_topology(points: Array, counts: Array, vertices: Array, what: str) -> None:
+    if len(vertices) > _MAX_CORNERS:
+        raise Refusal(f"{what} has {len(vertices)} corners, allowed are {_MAX_CORNERS}")
+    if counts.min(initial=0) < 0 or counts.sum() != len(vertices):
+        raise Refusal(f"{what}: faceVertexCounts say {counts.sum()} corners, there are {len(vertices)}")
+    if len(vertices) and (vertices.min() < 0 or vertices.max() >= len(points)):
+        raise Refusal(f"{what} names vertex {vertices.max()} of {len(points)}")
+
+
+def _read_palette(query: UsdSkel.SkinningQuery, skeleton: SkeletonPrim) -> tuple[Array, Array]:
+    """Return joints (m,) of the skeleton in the mesh's order, and what takes the mesh to their frames (m, 4, 4)."""
+    order = query.GetJointOrder()
+    place = {joint: number for number, joint in enumerate(skeleton.joints)}
+    names = skeleton.joints if order is None else [str(joint) for joint in order]
+    joints = np.array([place.get(name, 0) for name in names])
+    geometry = np.array(query.GetGeomBindTransform() or Gf.Matrix4d(1.0)).T
+    bind = bind_matrices(skeleton)
+    return joints, np.linalg.pinv(bind[joints]) @ geometry
+
+
+def bind_matrices(skeleton: SkeletonPrim) -> Array:
+    """Return (joints, 4, 4) of the pose in which skins are bound, else of that of joints that nothing moves, in the
+    skeleton's space."""
+    if skeleton.bind is not None:
+        return skeleton.bind
+    assert skeleton.rest is not None
+    worlds = np.empty_like(skeleton.rest)
+    for joint, parent in enumerate(skeleton.parents):
+        worlds[joint] = skeleton.rest[joint] if parent < 0 else worlds[parent] @ skeleton.rest[joint]
+    return worlds
+
+
+def _read_carriers(query: UsdSkel.SkinningQuery, count: int, what: str) -> tuple[Array, Array]:
+    """Return by vertex the indices in the mesh's joints and their shares, (n, k) each."""
+    try:
+        influences = query.ComputeJointInfluences(Usd.TimeCode.EarliestTime())
+    except Tf.ErrorException:
+        influences = None
+    if not influences:
+        raise Refusal(f"{what} has no sound skel:jointIndices and skel:jointWeights")
+    indices, weights = (np.array(table) for table in influences)
+    width = query.GetNumInfluencesPerComponent()
+    if query.IsRigidlyDeformed():
+        indices, weights = np.tile(indices[:width], count), np.tile(weights[:width], count)
+    if width < 1 or len(indices) != count * width or len(weights) != count * width:
+        raise Refusal(f"{what} has {count} vertices, and {len(indices)} joint indices of {width} each")
+    return strongest(np.repeat(np.arange(count), width), indices.astype(np.int64), weights.astype(np.float64), count)
+
+
+def _read_array(attribute: Usd.Attribute, width: int, dtype: type) -> Array:
+    value = read_value(attribute)
+    return np.array([] if value is None else value, dtype).reshape(-1, width)
+
+
+# The package loads its modules at run time and declares no types.
+# pyright: reportAttributeAccessIssue=false
+
+
+def _check_extent(frames: int, joints: int, most: int) -> None:
+    if frames * joints > most:
+        raise Refusal(f"{frames} frames of {joints} joints, allowed are {most} in all")
+
+
+@dataclass(eq=False, kw_only=True)
+class NewMotion:
+    """A motion of a skeleton, to be written."""
+
+    skeleton: str
+    """Path of the skeleton's prim."""
+    animation: str | None
+    """Name of the animation that it was read from."""
+    stem: str
+    """Name of a new one."""
+    rate: float
+    """Frames per second."""
+    translations: Array
+    """(frames, joints, 3) of the skeleton's joints in the file's order, in their parents' frames."""
+    rotations: Array
+    """(frames, joints, 4) xyzw."""
+    scales: Array
+    """(joints, 3)"""
+    places: Array
+    """(frames, joints, 3) in the world, metres."""
+    outer: Array
+    """(4, 4) what takes the skeleton's space to the world, as it was read."""
+
+
+def write_character(path: str, *, motion: NewMotion, scratch: str, folder: str, most_bytes: int) -> str:
+    """Write a character's file with a motion to `scratch`, which is for a `folder`; all else of it stays as it is.
+    Return why that cannot be, empty where it was written."""
+    try:
+        stage = open_stage(path, most_bytes)
+    except (Tf.ErrorException, UnicodeDecodeError) as error:
+        raise Refusal(f"is no sound USD file: {first_reason(error)}") from None
+    try:
+        _copy_stage(stage, scratch, Path(folder).resolve())
+        made = Usd.Stage.Open(scratch)
+        _add_motion(made, motion)
+        return "" if made.GetRootLayer().Save() else "USD does not say why"
+    except (Tf.ErrorException, RuntimeError) as error:
+        return first_reason(error)
+
+
+def _copy_stage(stage: Usd.Stage, scratch: str, folder: Path) -> None:
+    """Copy the file's root layer; of a package, and where other layers are not in the new file's folder, all of them in
+    one, as USD composes them."""
+    root = stage.GetRootLayer()
+    used = [layer.realPath for layer in stage.GetUsedLayers() if layer.realPath and layer != root]
+    packed = root.realPath.lower().endswith(".usdz")
+    apart = packed or any(not is_inside(name, folder) for name in used)
+    copied = stage.Flatten(False) if apart else Sdf.Layer.CreateAnonymous(".usda")
+    if not apart:
+        copied.TransferContent(root)
+    if apart or Path(root.realPath).resolve().parent != folder:
+        UsdUtils.ModifyAssetPaths(copied, lambda name: _move_path(name, root, folder))
+    copied.Export(scratch)
+
+
+def _move_path(name: str, root: Sdf.Layer, folder: Path) -> str:
+    """Return how a file in another folder names what this one names."""
+    full = root.ComputeAbsolutePath(name) if name else ""
+    outer, inner = Ar.SplitPackageRelativePathOuter(full)
+    if not full or not Path(outer).is_file():
+        return name
+    moved = Path(os.path.relpath(Path(outer).resolve(), folder)).as_posix()
+    moved = moved if moved.startswith("..") else f"./{moved}"
+    return Ar.JoinPackageRelativePath([moved, inner]) if inner else moved
+
+
+def _add_motion(stage: Usd.Stage, motion: NewMotion) -> None:
+    prim = stage.GetPrimAtPath(motion.skeleton)
+    if not prim or not prim.IsA(UsdSkel.Skeleton):
+        raise Refusal(f"has no Skeleton {motion.skeleton}")
+    skeleton = read_skeleton(_as_own(stage, prim))
+    replaced = _find_replaced(stage, skeleton, motion.animation)
+    codes = _set_times(stage, replaced, len(motion.translations), motion.rate)
+    moved, turned, scales = _place_roots(skeleton, motion, codes)
+    path = skeleton.prim.GetPath().AppendChild(_free_name(skeleton.prim, motion.stem))
+    made = UsdSkel.Animation.Define(stage, path) if replaced is None else UsdSkel.Animation(_as_own(stage, replaced))
+    made.CreateJointsAttr(skeleton.joints)
+    _write_values(made, moved, turned, scales, codes)
+    binding = UsdSkel.BindingAPI.Apply(skeleton.prim)
+    binding.CreateAnimationSourceRel().SetTargets([made.GetPath()])
+    _set_extent(skeleton.prim, motion.places)
+
+
+def _as_own(stage: Usd.Stage, prim: Usd.Prim) -> Usd.Prim:
+    """Return a prim that can be changed: what it shares with other instances is made its own."""
+    path = prim.GetPath()
+    for above in path.GetPrefixes():
+        one = stage.GetPrimAtPath(above)
+        if one.IsInstance():
+            one.SetInstanceable(False)
+    return stage.GetPrimAtPath(path)
+
+
+def _find_replaced(stage: Usd.Stage, skeleton: SkeletonPrim, name: str | None) -> Usd.Prim | None:
+    """Return the animation that the motion was read from; None where it was read from none."""
+    if name is None:
+        return None
+    names, prims, _ = name_animations(stage, skeleton)
+    return prims[names.index(name)] if name in names else None
+
+
+def _set_times(stage: Usd.Stage, replaced: Usd.Prim | None, frames: int, rate: float) -> Array:
+    """Set the stage's first and last time, and return the time code of every frame.
+
+    There is one time code a frame from 0, and their rate is the motion's, unless something else in the stage moves:
+    then the stage keeps its rate, so that this goes on as fast as before.
+    """
+    start, step = 0.0, 1.0
+    if _others_move(stage, replaced):
+        start = stage.GetStartTimeCode() if stage.HasAuthoredTimeCodeRange() else 0.0
+        step = stage.GetTimeCodesPerSecond() / rate
+    else:
+        stage.SetTimeCodesPerSecond(rate)
+        stage.SetFramesPerSecond(rate)
+    codes = start + np.arange(frames) * step
+    stage.SetStartTimeCode(float(codes[0]))
+    stage.SetEndTimeCode(float(codes[-1]))
+    return codes
+
+
+def _others_move(stage: Usd.Stage, replaced: Usd.Prim | None) -> bool:
+    return any(
+        attribute.ValueMightBeTimeVarying()
+        for prim in walk(stage)
+        if replaced is None or prim.GetPath() != replaced.GetPath()
+        for attribute in prim.GetAttributes()
+    )
+
+
+def _place_roots(skeleton: SkeletonPrim, motion: NewMotion, codes: Array) -> tuple[Array, Array, Array]:
+    """Return translations (frames, joints, 3), rotations (frames, joints, 4) and scales (joints, 3), with those of the
+    roots in the skeleton's space as its placement is at each time."""
+    moved, turned, scales = motion.translations.copy(), motion.rotations.copy(), motion.scales.copy()
+    if not animated_placement(skeleton.prim):
+        return moved, turned, scales
+    roots = [joint for joint, parent in enumerate(skeleton.parents) if parent < 0]
+    for frame, code in enumerate(codes.tolist()):
+        change = np.linalg.pinv(world_of(skeleton.prim, Usd.TimeCode(code))) @ motion.outer
+        turn = change[:3, :3] / np.cbrt(abs(np.linalg.det(change[:3, :3])))
+        moved[frame, roots] = moved[frame, roots] @ change[:3, :3].T + change[:3, 3]
+        turned[frame, roots] = multiply_quaternions(to_quaternions(turn[None])[0], turned[frame, roots])
+    for frame in range(1, len(codes)):
+        flipped = (turned[frame] * turned[frame - 1]).sum(-1) < 0
+        turned[frame, flipped] *= -1
+    return moved, turned, scales
+
+
+def multiply_quaternions(first: Array, second: Array) -> Array:
+    """Return products xyzw (n, 4) of one quaternion (4,) and several (n, 4): those' rotations, then the first's."""
+    x, w = first[:3], first[3]
+    y, v = second[:, :3], second[:, 3:]
+    return np.concatenate([w * y + v * x + np.cross(x, y), w * v - (y @ x)[:, None]], axis=1)
+
+
+def _free_name(prim: Usd.Prim, stem: str) -> str:
+    plain = re.sub(r"\W", "_", stem, flags=re.ASCII) or "motion"
+    plain = f"_{plain}" if plain[0].isdigit() else plain
+    taken = {child.GetName() for child in prim.GetAllChildren()}
+    names = [plain, *(f"{plain}_{number}" for number in range(2, len(taken) + 3))]
+    return next(name for name in names if name not in taken)
+
+
+def _write_values(made: UsdSkel.Animation, moved: Array, turned: Array, scales: Array, codes: Array) -> None:
+    attributes = made.CreateTranslationsAttr(), made.CreateRotationsAttr(), made.CreateScalesAttr()
+    for attribute in attributes:
+        attribute.Clear()
+    attributes[2].Set(Vt.Vec3hArray.FromNumpy(np.ascontiguousarray(scales, np.float16)))
+    moved, turned = np.ascontiguousarray(moved, np.float32), np.ascontiguousarray(turned, np.float32)
+    times = codes.tolist()
+    for frame, code in enumerate(times):
+        attributes[1].Set(Vt.QuatfArray.FromNumpy(turned[frame]), code)
+        attributes[0].Set(Vt.Vec3fArray.FromNumpy(moved[frame]), code)
+
+
+def _set_extent(prim: Usd.Prim, places: Array) -> None:
+    """Set the extent of the SkelRoot that a skeleton is in, if it says one; viewers draw nothing beyond it."""
+    while prim and not prim.IsA(UsdSkel.Root):
+        prim = prim.GetParent()
+    extent = UsdGeom.Boundable(prim).GetExtentAttr() if prim else None
+    if not extent or read_value(extent) is None:
+        return
+    corners = np.array([places.min(axis=(0, 1)) - _MARGIN, places.max(axis=(0, 1)) + _MARGIN])
+    grid = np.array(np.meshgrid(*corners.T)).reshape(3, -1)
+    back = np.linalg.pinv(world_of(prim, Usd.TimeCode.EarliestTime()))
+    own = (back[:3, :3] @ grid + back[:3, 3:]).T
+    extent.Clear()
+    extent.Set(Vt.Vec3fArray.FromNumpy(np.array([own.min(0), own.max(0)], np.float32)))
+
+
+# The package loads its modules at run time and declares no types.
+# pyright: reportAttributeAccessIssue=false

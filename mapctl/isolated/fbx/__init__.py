@@ -1,1 +1,0 @@
-"""FBX files by the package ufbx."""

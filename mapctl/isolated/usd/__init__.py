@@ -1,1 +1,0 @@
-"""USD files by the package usd-core."""
