@@ -1,9 +1,9 @@
 """FBX files by the package ufbx: joints, takes and triangles as arrays, for `mapctl.formats.sandbox`, without torch."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 import ufbx
@@ -24,7 +24,6 @@ from mapctl.formats.parts import (
 from mapctl.formats.sandbox import Refusal
 
 Array = np.ndarray
-Element = TypeVar("Element")
 NEWEST, OLDEST = 7799, 3000
 """Versions of FBX (7400 is 7.4) that are read."""
 _MAX_ELEMENTS = 2**20
@@ -140,7 +139,7 @@ def _load(path: str, *, ignore_embedded: bool, ignore_geometry: bool = False) ->
         raise Refusal(f"is no sound FBX file: {_reason(error)}") from None
 
 
-def each(elements: Iterable[Element]) -> list[Element]:
+def each(elements: Any) -> list[Any]:
     """Return a scene's list as Python's, whose items then live as long as the process: ufbx 0.0.5 hands out what it has
     in lists without counting the reference, so that it would be freed while it is in use."""
     found = list(elements)

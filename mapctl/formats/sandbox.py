@@ -41,7 +41,7 @@ def call(reader: Callable[..., Any], path: str | PathLike[str], **options: Any) 
     FileFormatError where it raises Refusal, crashes, takes too long or needs too much memory.
     """
     seconds = SECONDS + SECONDS_PER_MEBIBYTE * Path(path).stat().st_size / 2**20
-    request = pickle.dumps((MEMORY_BYTES, reader, str(Path(path).absolute()), options))
+    request = pickle.dumps(MEMORY_BYTES) + pickle.dumps((reader, str(Path(path).absolute()), options))
     words = [sys.executable, "-P", "-c", "from mapctl.formats import sandbox; sandbox.serve()"]
     try:
         done = subprocess.run(words, input=request, capture_output=True, timeout=seconds, env=_environment())
@@ -67,11 +67,12 @@ def serve() -> None:
     last steps: what is broken in a file may break them."""
     answer = os.dup(1)
     os.dup2(2, 1)  # what libraries print is no answer
-    memory, reader, path, options = pickle.loads(sys.stdin.buffer.read())
+    memory = pickle.load(sys.stdin.buffer)
     if resource is not None:  # Windows has no such bounds, macOS may refuse them: time alone ends the reader there
         for what, limit in ((resource.RLIMIT_AS, memory), (resource.RLIMIT_CORE, 0)):
             with suppress(ValueError, OSError):
                 resource.setrlimit(what, (limit, limit))
+    reader, path, options = pickle.load(sys.stdin.buffer)
     gc.disable()
     warnings.simplefilter("ignore")  # numbers that are not finite are looked for once they are read
     try:

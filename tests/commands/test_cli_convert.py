@@ -12,14 +12,13 @@ import numpy as np
 import pytest
 from acclaim import pair
 from character_maker import make_character_glb
+from direct_readers import read_directly
 from fbx_maker import make_fbx
-from forked_readers import fork_readers
 from helpers import run, walk
 
 import mapctl
 from mapctl import cli, formats, retarget
-from mapctl.formats import npz, usd
-from mapctl.formats.endings import USD_WRITTEN
+from mapctl.formats import USD_WRITTEN, npz, usd
 
 DOCS = (Path(__file__).parents[2] / "docs" / "guides" / "formats.md").read_text("utf-8")
 needs_usd = pytest.mark.skipif(not usd.is_installed(), reason="needs usd-core: pip install 'mapctl[usd]'")
@@ -56,7 +55,7 @@ def here(tmp_path, monkeypatch):
         for ending in USD_WRITTEN:
             motion.save(f"in{ending}")
         assert UsdUtils.CreateNewUsdzPackage("in.usdc", "in.usdz")
-    with fork_readers():
+    with read_directly():
         yield tmp_path
 
 

@@ -1,134 +1,453 @@
-"""GLB out: what a viewer computes from the file is where the body is."""
+"""glTF, VRM and VRM animations: read as rigs and clips, and written back, as a viewer of their own sees them."""
 
 import json
-import struct
+import shutil
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
-from helpers import random_motion
+import torch
+from character_maker import make_character_glb
+from forged_characters import edit_glb, split_glb
+from glb_viewer import GlbViewer
+from helpers import random_motion, walk
 
-from mapctl import rotations
-from mapctl.errors import RequestError
-from mapctl.formats.gltf import mannequin
-from mapctl.mesh.skinning import at_rest, build_skin
+import mapctl
+from mapctl import editing, formats, retarget, rotations
+from mapctl.errors import FileFormatError, RequestError
+from mapctl.formats.character import CharacterSource
+from mapctl.mesh.skinning import build_skin
+from mapctl.retarget import figure
+from mapctl.retarget.carry import RiggedCharacter, retarget_motion
 from mapctl.skeleton import CANONICAL
 
-_TYPES = {5126: np.float32, 5123: np.uint16, 5125: np.uint32}
-_WIDTH = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+KINDS = {
+    "mixamo": {},
+    "posed-nodes": {"pose": "T", "node_pose": "bent"},
+    "matrices": {"matrices": True, "pose": "A"},
+    "unreal": {"names": "unreal", "root": "root", "leaves": "none", "pose": "A"},
+    "metres": {"armature_scale": 1.0, "zup_armature": False, "names": "readyplayer"},
+    "two-skins": {"second_skin": True, "hat": True, "extra_nodes": True},
+    "compact": {"compact": True, "morphs": 2, "size": 1.3},
+    "vrm": {"names": "vrm", "armature_scale": 1.0, "zup_armature": False},
+    "vrm0": {"names": "vrm0", "armature_scale": 1.0, "zup_armature": False, "size": 0.8},
+}
 
 
-class Viewer:
-    """A glTF reader of a few lines, by the specification: JSON chunk, binary chunk, skinning."""
-
-    def __init__(self, data: bytes):
-        magic, version, length = struct.unpack("<4sII", data[:12])
-        assert (magic, version, length) == (b"glTF", 2, len(data))
-        size, kind = struct.unpack("<I4s", data[12:20])
-        assert kind == b"JSON"
-        self.tree = json.loads(data[20 : 20 + size])
-        self.blob = data[20 + size + 8 :]
-
-    def array(self, index):
-        accessor = self.tree["accessors"][index]
-        view = self.tree["bufferViews"][accessor["bufferView"]]
-        count = accessor["count"] * _WIDTH[accessor["type"]]
-        raw = np.frombuffer(self.blob, _TYPES[accessor["componentType"]], count, view.get("byteOffset", 0))
-        table = raw.reshape(accessor["count"], -1)
-        np.testing.assert_allclose(table.min(0), accessor["min"], atol=1e-6)
-        np.testing.assert_allclose(table.max(0), accessor["max"], atol=1e-6)
-        return table.astype(np.float64)
-
-    def worlds(self, frame):
-        """4x4 matrices of the nodes in a frame."""
-        nodes = self.tree["nodes"]
-        place = {k: np.array(n.get("translation") or (0, 0, 0), float) for k, n in enumerate(nodes)}
-        turn = dict.fromkeys(place, np.array([0, 0, 0, 1.0]))
-        animation = self.tree["animations"][0]
-        for channel in animation["channels"]:
-            values = self.array(animation["samplers"][channel["sampler"]]["output"])[frame]
-            (place if channel["target"]["path"] == "translation" else turn)[channel["target"]["node"]] = values
-        found = {}
-
-        def visit(node, above):
-            local = np.eye(4)
-            x, y, z, w = turn[node]
-            local[:3, :3] = np.eye(3) + 2 * np.array(
-                [
-                    [-y * y - z * z, x * y - z * w, x * z + y * w],
-                    [x * y + z * w, -x * x - z * z, y * z - x * w],
-                    [x * z - y * w, y * z + x * w, -x * x - y * y],
-                ]
-            )
-            local[:3, 3] = place[node]
-            found[node] = above @ local
-            for child in nodes[node].get("children") or ():
-                visit(child, found[node])
-
-        for top in self.tree["scenes"][0]["nodes"]:
-            visit(top, np.eye(4))
-        return found
-
-    def skinned(self, frame):
-        """(n, 3) vertices of the mesh in a frame."""
-        attributes = self.tree["meshes"][0]["primitives"][0]["attributes"]
-        worlds, told = self.worlds(frame), self.tree["skins"][0]
-        inverse = self.array(told["inverseBindMatrices"]).reshape(-1, 4, 4).transpose(0, 2, 1)
-        matrices = np.stack([worlds[j] @ inverse[k] for k, j in enumerate(told["joints"])])
-        places = np.column_stack([self.array(attributes["POSITION"]), np.ones(len(self.array(attributes["POSITION"])))])
-        joints, weights = self.array(attributes["JOINTS_0"]).astype(int), self.array(attributes["WEIGHTS_0"])
-        assert np.allclose(weights.sum(1), 1)
-        return np.einsum("nk,nkij,nj->ni", weights, matrices[joints], places)[:, :3]
+POSITIONS = dict(rtol=0, atol=2e-6)
 
 
-@pytest.fixture(scope="module")
-def motion():
-    return random_motion(CANONICAL, 12, seed=4)
+def make(folder, kind, **more):
+    ending = ".vrm" if kind.startswith("vrm") else ".glb"
+    return make_character_glb(folder / f"hero{ending}", **(KINDS[kind] | more))
 
 
-def test_joints_and_skin_are_where_the_motion_says(motion):
-    viewer = Viewer(mannequin.to_bytes(motion))
-    body, turns = build_skin(motion), motion.joint_rotations()
-    matrices, places = rotations.to_matrix(turns).numpy(), motion.joint_positions().numpy()
-    for frame in (0, 7, 11):
-        worlds = viewer.worlds(frame)
-        for joint, name in enumerate(CANONICAL.names):
-            assert viewer.tree["nodes"][joint]["name"] == name
-            np.testing.assert_allclose(worlds[joint][:3, 3], places[frame, joint], atol=2e-6)
-        expected = np.einsum("nij,nj->ni", matrices[frame, body.joint], body.vertices) + places[frame, body.joint]
-        np.testing.assert_allclose(viewer.skinned(frame), expected, atol=5e-6)
+def walk_of(made):
+    """The animation's joints and skinned vertices over its frames, by the viewer."""
+    viewer = GlbViewer(made.path)
+    number = viewer.animation(made.animations[0])
+    return viewer, number
 
 
-def test_quaternions_are_unit_and_do_not_jump_in_sign(motion):
-    viewer = Viewer(mannequin.to_bytes(motion))
-    animation = viewer.tree["animations"][0]
-    times = viewer.array(animation["samplers"][0]["input"])[:, 0]
-    np.testing.assert_allclose(times, np.arange(12) / float(motion.fps), atol=1e-6)
-    for channel in animation["channels"]:
-        if channel["target"]["path"] == "rotation":
-            quats = viewer.array(animation["samplers"][channel["sampler"]]["output"])
-            assert np.allclose(np.linalg.norm(quats, axis=1), 1, atol=1e-6)
-            assert (np.sum(quats[1:] * quats[:-1], axis=1) >= 0).all()
+@pytest.fixture(params=KINDS)
+def kind(request):
+    return request.param
 
 
-def test_same_motion_same_bytes(motion, tmp_path):
-    motion.save(tmp_path / "a.glb")
-    assert (tmp_path / "a.glb").read_bytes() == mannequin.to_bytes(motion)
+def test_the_rest_pose_is_the_bound_one(kind, tmp_path):
+    made = make(tmp_path, kind)
+    rest = formats.load_rest(made.path)
+    at = [rest.skeleton.index(name) for name in made.names if name in rest.skeleton.names]
+    told = [k for k, name in enumerate(made.names) if name in rest.skeleton.names]
+    assert len(told) >= 22
+    np.testing.assert_allclose(rest.joint_positions()[0, at].numpy(), made.positions[told], **POSITIONS)
+    assert float(rest.local_quat_xyzw[..., 3].abs().min()) == pytest.approx(1.0)
 
 
-def test_nan_is_refused(motion, tmp_path):
-    broken = replace(motion, root_position=motion.root_position * float("nan"))
-    with pytest.raises(RequestError, match="no finite position"):
-        broken.save(tmp_path / "x.glb")
+def test_joints_are_recognised(kind, tmp_path):
+    made = make(tmp_path, kind)
+    rest = formats.load_rest(made.path)
+    canonical, rigmap = retarget.to_canonical(rest)
+    wanted = {joint: name for joint, name in made.joint.items() if joint in CANONICAL.names}
+    assert rigmap.joint_names == wanted
+    assert rigmap.up == "y"
+    assert rigmap.facing == ("-z" if kind == "vrm0" else "z")
+    # standing in the T-pose: hands far to their sides, at shoulder height where the file says T
+    left = canonical.skeleton.offsets[CANONICAL.index("leftLowerArm")]
+    torch.testing.assert_close(left / left.norm(), torch.tensor([1.0, 0, 0]).double(), atol=1e-6, rtol=0)
+    assert rigmap.rest == ("A" if KINDS[kind].get("pose") == "A" else "T")
+
+
+def test_meshes_are_where_a_viewer_draws_them(kind, tmp_path):
+    made = make(tmp_path, kind, animations=("walk",))
+    motion, mesh = formats.load(made.path), formats.load_mesh(made.path)
+    viewer, number = walk_of(made)
+    skinned = len(made.vertices)
+    np.testing.assert_allclose(mesh.vertices[:skinned], made.vertices, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(mesh.weights.sum(axis=1), 1.0, atol=1e-9)
+    assert len(mesh.vertices) == skinned + (8 if KINDS[kind].get("hat") else 0)
+    for frame in (0, 11, motion.num_frames - 1):
+        turns = rotations.to_matrix(motion.joint_rotations()[frame]).numpy()
+        vertices, normals = mesh.pose(motion.joint_positions()[frame].numpy(), turns)
+        wanted = viewer.skinned(number, frame / 30)
+        near = 1e-5 if kind != "posed-nodes" else 2e-5
+        np.testing.assert_allclose(vertices[:skinned], wanted, rtol=0, atol=near)
+        np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("interpolation", ["LINEAR", "STEP", "CUBICSPLINE"])
+@pytest.mark.parametrize("kind", ["mixamo", "posed-nodes"])
+def test_animations_are_read(kind, interpolation, tmp_path):
+    made = make(tmp_path, kind, animations=("walk", "other"), interpolation=interpolation)
+    motion = formats.load(made.path)
+    viewer, number = walk_of(made)
+    assert (motion.fps, motion.num_frames) == (30, 31)
+    for frame in range(0, 31, 6):
+        for name, node in zip(made.names, made.nodes, strict=True):
+            if name in motion.skeleton.names:
+                place = motion.joint_positions()[frame, motion.skeleton.index(name)].numpy()
+                np.testing.assert_allclose(place, viewer.world(node, number, frame / 30)[:3, 3], rtol=0, atol=5e-6)
+    other = formats.load(f"{made.path}#/other")
+    assert float((other.joint_positions() - motion.joint_positions()).abs().max()) > 0.01
+    assert isinstance(other.source, CharacterSource)
+    assert other.source.animation == "other"
+
+
+@pytest.mark.parametrize("mirror", [(1, 1, -1)])
+def test_a_last_joint_that_mirrors_is_read_and_written(mirror, tmp_path):
+    made = make(tmp_path, "metres", animations=("walk",), leaves="none")
+    plain, toes = formats.load(made.path), made.nodes[made.names.index(made.joint["leftToes"])]
+    edit_glb(made.path, lambda tree: tree["nodes"][toes].update(scale=list(mirror)))
+    motion = formats.load(made.path)
+    torch.testing.assert_close(motion.joint_positions(), plain.joint_positions(), rtol=0, atol=1e-6)
+    same = (motion.joint_rotations() * plain.joint_rotations()).sum(-1).abs()
+    torch.testing.assert_close(same, torch.ones_like(same), rtol=0, atol=1e-6)
+    motion.save(tmp_path / "new.glb")
+    old, new = GlbViewer(made.path), GlbViewer(tmp_path / "new.glb")
+    for frame in (0, 11, 30):
+        np.testing.assert_allclose(new.world(toes, 0, frame / 30), old.world(toes, 0, frame / 30), atol=1e-5)
+
+
+def test_of_several_animations_the_one_that_is_read_is_named(tmp_path, capsys):
+    path = make(tmp_path, "metres", animations=("walk", "run")).path
+    motion = formats.load(path)
+    assert capsys.readouterr().err == (
+        f"mapctl: {path}: reads 'walk', the first of 2 animations; choose another as 'hero.glb#/run'\n"
+    )
+    assert motion.source.animations == {"walk": pytest.approx(1.0), "run": pytest.approx(1.0)}
+    assert list(motion.source.armatures) == [motion.source.armature]
+    formats.load(f"{path}#/run")
+    formats.load_rest(path)
+    assert capsys.readouterr().err == ""
+
+
+def follow_up(made, frames=20):
+    """A walk on the character that was made."""
+    body = RiggedCharacter.of(figure.load_standing_character(made.path))[1]
+    return body.on_rig(retarget_motion(walk(frames), body).motion)
+
+
+def without_additions(tree):
+    """All of a document but what an animation adds."""
+    return {
+        key: value for key, value in tree.items() if key not in ("animations", "accessors", "bufferViews", "buffers")
+    }
+
+
+@pytest.mark.slow
+def test_a_motion_is_added_and_all_else_stays(kind, tmp_path):
+    made = make(tmp_path, kind, animations=("walk",))
+    motion = follow_up(made)
+    out = tmp_path / f"new{made.path.suffix}"
+    motion.save(out)
+    (old, before), (new, after) = split_glb(made.path.read_bytes()), split_glb(out.read_bytes())
+    assert after[: len(before)] == before
+    if not KINDS[kind].get("matrices"):
+        assert without_additions(old) == without_additions(new)
+    for part in ("accessors", "bufferViews"):
+        assert new[part][: len(old[part])] == old[part]
+    assert [animation["name"] for animation in new["animations"]] == ["new", "walk"]
+    viewer = GlbViewer(out)
+    for frame in (0, 7, 19):
+        for name in motion.skeleton.names:
+            joint = motion.skeleton.index(name)
+            node = int(motion.source.nodes[joint])
+            place = motion.joint_positions()[frame, joint].numpy()
+            np.testing.assert_allclose(viewer.world(node, 0, frame / 30)[:3, 3], place, rtol=0, atol=1e-5)
+    again = formats.load(out)
+    np.testing.assert_allclose(again.joint_positions().numpy(), motion.joint_positions().numpy(), rtol=0, atol=1e-5)
+
+
+def test_a_vrm_rests_as_its_nodes_stand(tmp_path):
+    made = make(tmp_path, "vrm", pose="bent", node_pose="T")
+    rest, viewer = formats.load_rest(made.path), GlbViewer(made.path)
+    for name, node in zip(made.names, made.nodes, strict=True):
+        if name in rest.skeleton.names:
+            place = rest.joint_positions()[0, rest.skeleton.index(name)].numpy()
+            np.testing.assert_allclose(place, viewer.world(node)[:3, 3], **POSITIONS)
+
+
+def test_one_animation_is_replaced_where_it_was_the_one(tmp_path):
+    made = make(tmp_path, "mixamo", animations=("walk", "wave"))
+    motion = mapctl.load(f"{made.path}#/wave").slice(3, 20)
+    motion.save(tmp_path / "cut.glb")
+    tree, _ = split_glb((tmp_path / "cut.glb").read_bytes())
+    assert [animation["name"] for animation in tree["animations"]] == ["cut", "walk"]
+    again = formats.load(tmp_path / "cut.glb")
+    np.testing.assert_allclose(again.joint_positions().numpy(), motion.joint_positions().numpy(), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["matrices", "vrm"])
+def test_a_root_joint_is_added_to_the_character(kind, tmp_path):
+    made = make(tmp_path, kind, animations=() if kind == "matrices" else ("walk",))
+    motion = follow_up(made)
+    rooted = editing.move_travel_to_root(motion)
+    out = tmp_path / f"rooted{made.path.suffix}"
+    rooted.save(out)
+    again = formats.load(out)
+    assert again.skeleton.names == rooted.skeleton.names == ("root", *motion.skeleton.names)
+    np.testing.assert_allclose(
+        again.joint_positions()[:, 1:].numpy(), motion.joint_positions().numpy(), rtol=0, atol=2e-5
+    )
+    np.testing.assert_allclose(again.joint_positions()[:, 0].numpy(), rooted.joint_positions()[:, 0].numpy(), atol=2e-5)
+    viewer, old = GlbViewer(out), GlbViewer(made.path)
+    assert len(viewer.nodes) == len(old.nodes) + 1
+    np.testing.assert_allclose(viewer.skinned(), old.skinned(), atol=1e-6)  # the character as it stands is the same
+    turns = rotations.to_matrix(motion.joint_rotations()[7]).numpy()
+    wanted, _ = formats.load_mesh(made.path).pose(motion.joint_positions()[7].numpy(), turns)
+    np.testing.assert_allclose(viewer.skinned(0, 7 / 30), wanted[: len(made.vertices)], rtol=0, atol=2e-5)
+
+
+def test_other_files_are_put_into_the_one(tmp_path):
+    (tmp_path / "in").mkdir()
+    made = make_character_glb(tmp_path / "in" / "hero.gltf")
+    motion = follow_up(made)
+    motion.save(tmp_path / "out.glb")
+    shutil.rmtree(tmp_path / "in")
+    tree, binary = split_glb((tmp_path / "out.glb").read_bytes())
+    assert "uri" not in json.dumps(tree)
+    view = tree["bufferViews"][tree["images"][0]["bufferView"]]
+    assert binary[view["byteOffset"] :][:4] == b"\x89PNG"
+    mesh = formats.load_mesh(tmp_path / "out.glb")
+    assert len(mesh.vertices) == len(made.vertices)
+    assert len(np.unique(mesh.rgba.round(2), axis=0)) > 3
+
+
+def test_a_character_may_be_written_over_its_own_file(tmp_path):
+    made = make(tmp_path, "mixamo")
+    motion = follow_up(made)
+    motion.save(made.path)
+    np.testing.assert_allclose(
+        formats.load(made.path).joint_positions().numpy(), motion.joint_positions().numpy(), rtol=0, atol=1e-5
+    )
+    with pytest.raises(RequestError, match="has changed since it was read"):
+        motion.save(tmp_path / "late.glb")
+    assert not (tmp_path / "late.glb").exists()
+
+
+def test_a_vrm_needs_a_character(tmp_path):
+    with pytest.raises(RequestError, match=r"a \.vrm needs a character"):
+        random_motion(CANONICAL).save(tmp_path / "x.vrm")
     assert not list(tmp_path.iterdir())
 
 
-def test_skin_at_rest_stands_on_the_ground_as_large_as_a_person():
-    rest = at_rest()
-    body, places = build_skin(rest), rest.joint_positions()[0].numpy()
-    world = body.vertices + places[body.joint]  # nothing is turned at rest
-    assert -0.02 < world[:, 1].min() < 0.03
-    assert 1.3 < world[:, 1].max() < 2.0
-    assert np.allclose(np.linalg.norm(body.normals, axis=1), 1)
-    assert set(body.joint) <= set(range(CANONICAL.num_joints))
-    assert (body.joint[body.faces] == body.joint[body.faces[:, :1]]).all(), "a triangle hangs on one joint"
+EXTENSION = "VRMC_vrm_animation"
+
+
+SIDES = ("left", "right")
+
+
+REQUIRED = {"hips", "spine", "head"} | {
+    side + part for side in SIDES for part in ("UpperArm", "LowerArm", "Hand", "UpperLeg", "LowerLeg", "Foot")
+}
+"""Bones that a VRM humanoid must have."""
+
+
+def make_animated(folder, kind, **more):
+    path = folder / ("hero.vrm" if kind.startswith("vrm") else "hero.glb")
+    usual = {"armature_scale": 1.0, "zup_armature": False, "animations": ("walk", "run"), "frames": 20}
+    return make_character_glb(path, names=kind, **(usual | more))
+
+
+def strip(path):
+    """Remove what is drawn from a file: skins, meshes and their looks."""
+
+    def change(tree):
+        for unused in ("skins", "meshes", "materials", "textures", "images"):
+            tree.pop(unused, None)
+        for node in tree["nodes"]:
+            node.pop("mesh", None)
+            node.pop("skin", None)
+
+    edit_glb(path, change)
+
+
+def places_of(motion, names):
+    return motion.joint_positions()[:, [motion.skeleton.index(name) for name in names]]
+
+
+@pytest.mark.parametrize("kind", ["vrm", "vrm0", "mixamo", "unreal", "vrma"])
+def test_files_without_a_skin_are_read(kind, tmp_path):
+    made = make_animated(tmp_path, "vrm" if kind == "vrma" else kind, leaves="nodes")
+    whole = formats.load(made.path)
+    strip(made.path)
+    path = made.path
+    if kind == "vrma":
+        edit_glb(path, lambda tree: tree.update(extensions={EXTENSION: tree["extensions"]["VRMC_vrm"]}))
+        path = path.rename(tmp_path / "hero.vrma")
+    bare = formats.load(path)
+    assert (bare.num_frames, bare.fps) == (whole.num_frames, whole.fps)
+    names = [name for name in whole.skeleton.names if name in bare.skeleton.names]
+    assert len(names) >= 21
+    torch.testing.assert_close(places_of(bare, names), places_of(whole, names), rtol=0, atol=1e-5)
+    assert bare.source.humanoid == whole.source.humanoid
+    assert formats.load_rest(path).num_frames == 1
+
+
+def test_a_bare_file_without_an_animation_is_refused(tmp_path):
+    made = make_animated(tmp_path, "mixamo", animations=())
+    strip(made.path)
+    with pytest.raises(FileFormatError, match="has no skin, no humanoid and no animation"):
+        formats.load(made.path)
+
+
+@pytest.mark.parametrize("kind", ["canonical", "vrm", "vrm0"])
+def test_a_vrma_is_read_back(kind, tmp_path):
+    out = tmp_path / "out.vrma"
+    if kind == "canonical":
+        motion = walk(20)
+    else:
+        whole = formats.load(make_animated(tmp_path, kind).path)
+        motion = replace(random_motion(whole.skeleton, 20), source=whole.source)
+    motion.save(out)
+    again = formats.load(out)
+    assert (again.fps, again.num_frames) == (motion.fps, motion.num_frames)
+    wanted = places_of(motion, again.skeleton.names)
+    if kind == "vrm0":  # it faces -Z, a VRM animation +Z
+        wanted = wanted * torch.tensor([-1.0, 1.0, -1.0])
+    torch.testing.assert_close(again.joint_positions(), wanted, rtol=0, atol=1e-5)
+    assert isinstance(again.source, CharacterSource)
+    joints = {name: name for name in CANONICAL.names} if kind == "canonical" else motion.source.humanoid
+    assert again.source.humanoid == joints
+    again.save(tmp_path / "again.vrma")
+    torch.testing.assert_close(
+        formats.load(tmp_path / "again.vrma").joint_positions(), again.joint_positions(), rtol=0, atol=1e-5
+    )
+
+
+@pytest.mark.parametrize("kind", ["canonical", "vrm", "vrm0"])
+def test_a_vrma_is_as_its_specification_says(kind, tmp_path):
+    out = tmp_path / "out.vrma"
+    (walk(5) if kind == "canonical" else formats.load(make_animated(tmp_path, kind).path)).save(out)
+    tree, _ = split_glb(out.read_bytes())
+    assert tree["extensionsUsed"] == [EXTENSION]
+    said = tree["extensions"][EXTENSION]
+    assert said["specVersion"] == "1.0"
+    bones = {bone: found["node"] for bone, found in said["humanoid"]["humanBones"].items()}
+    assert bones.keys() >= REQUIRED
+    assert not {"leftEye", "rightEye"} & bones.keys()
+    assert not {"meshes", "skins", "materials"} & tree.keys()
+    targets = [channel["target"] for channel in tree["animations"][0]["channels"]]
+    assert {target["path"] for target in targets} == {"translation", "rotation"}
+    assert [target["node"] for target in targets if target["path"] == "translation"] == [bones["hips"]]
+    assert not any("scale" in node or "rotation" in node for node in tree["nodes"])
+    viewer = GlbViewer(out)
+    at = {bone: viewer.world(node)[:3, 3] for bone, node in bones.items()}
+    assert min(place[1] for place in at.values()) > -1e-6
+    for side, sign in zip(SIDES, (1, -1), strict=True):
+        assert sign * at[f"{side}UpperLeg"][0] > 0.03
+        for inner, outer in pairwise(f"{side}{part}" for part in ("UpperArm", "LowerArm", "Hand")):
+            along = at[outer] - at[inner]
+            np.testing.assert_allclose(along / np.linalg.norm(along), (sign, 0, 0), atol=0.1)
+        assert at[f"{side}Toes"][2] > at[f"{side}Foot"][2]
+
+
+def test_bones_that_travel_are_noted(tmp_path, capsys):
+    track = torch.full((5, 3), 0.3, dtype=torch.float64)
+    replace(walk(5), moving_offsets={CANONICAL.index("leftHand"): track}).save(tmp_path / "out.vrma")
+    assert "only the hips of a .vrma travel" in capsys.readouterr().err
+
+
+def test_a_motion_whose_bones_are_not_known_is_refused(tmp_path):
+    with pytest.raises(RequestError, match=r"a \.vrma needs the motion of a VRM or of canonical joints"):
+        formats.load(make_animated(tmp_path, "mixamo").path).save(tmp_path / "out.vrma")
+
+
+def test_the_mannequin_moves_as_the_motion(tmp_path):
+    motion = random_motion(CANONICAL, 12, seed=4)
+    motion.save(tmp_path / "a.glb")
+    viewer, body = GlbViewer(tmp_path / "a.glb"), build_skin(motion)
+    matrices, places = rotations.to_matrix(motion.joint_rotations()).numpy(), motion.joint_positions().numpy()
+    for frame in (0, 7, 11):
+        for joint, name in enumerate(CANONICAL.names):
+            world = viewer.world(viewer.node(name), 0, frame / 30)
+            np.testing.assert_allclose(world[:3, 3], places[frame, joint], atol=2e-6)
+        expected = np.einsum("nij,nj->ni", matrices[frame, body.joint], body.vertices) + places[frame, body.joint]
+        np.testing.assert_allclose(viewer.skinned(0, frame / 30), expected, atol=5e-6)
+
+
+def hips_of(made):
+    return made.nodes[made.names.index("mixamorig:Hips")]
+
+
+BROKEN = {
+    "no skin": (lambda t, m: t.pop("skins"), "has no skin"),
+    "non-uniform scale": (lambda t, m: t["nodes"][0].update(scale=[0.01, 0.02, 0.01]), "not the same along all axes"),
+    "negative scale": (lambda t, m: t["nodes"][0].update(scale=[-0.01, 0.01, 0.01]), "negative, which mirrors"),
+    "no scale": (lambda t, m: t["nodes"][0].update(scale=[0, 0, 0]), "zero"),
+    "draco": (lambda t, m: t.update(extensionsRequired=["KHR_draco_mesh_compression"]), "compressed .Draco"),
+    "meshopt": (lambda t, m: t.update(extensionsRequired=["EXT_meshopt_compression"]), "compressed .meshopt"),
+    "missing buffer": (lambda t, m: t["buffers"][0].update(byteLength=2**28), "should have 268435456 bytes, there are"),
+    "file that is not there": (lambda t, m: t["buffers"][0].update(uri="gone.bin"), "'gone.bin', which is not there"),
+    "file elsewhere": (lambda t, m: t["buffers"][0].update(uri="../x.bin"), "'../x.bin', which is not in its folder"),
+    "absolute file": (lambda t, m: t["buffers"][0].update(uri="/etc/passwd"), "which is not in its folder"),
+    "web address": (lambda t, m: t["buffers"][0].update(uri="https://host/x.bin"), "which is not in its folder"),
+    "glTF 1": (lambda t, m: t["asset"].update(version="1.0"), "is glTF '1.0', expected 2.0"),
+    "loop": (lambda t, m: t["nodes"][hips_of(m)].setdefault("children", []).append(0), "below itself"),
+    "two parents": (lambda t, m: t["nodes"][0]["children"].append(hips_of(m) + 1), "has two parents"),
+    "words": (lambda t, m: t["nodes"][0].update(translation=[0, "x", 0]), "is no sound glTF file: ValueError"),
+    "no list": (lambda t, m: t.update(skins=7), "is no sound glTF file: TypeError"),
+    "accessor beyond": (lambda t, m: t["skins"][0].update(inverseBindMatrices=999), r"has no accessors\[999\]"),
+    "half a letter": (lambda t, m: t["nodes"][0].update(name="\ud800"), "its JSON cannot be read"),
+    "joint beyond": (lambda t, m: t["skins"][0]["joints"].append(999), "names node 999"),
+}
+
+
+@pytest.mark.parametrize("fault", BROKEN)
+def test_faults_are_told_in_a_line(fault, tmp_path):
+    made = make(tmp_path, "mixamo")
+    change, told = BROKEN[fault]
+    edit_glb(made.path, lambda tree: change(tree, made))
+    with pytest.raises(FileFormatError, match=told) as caught:
+        formats.load(made.path)
+    assert "\n" not in str(caught.value)
+    assert str(made.path) in str(caught.value)
+
+
+def test_a_cut_file_is_told(tmp_path):
+    made = make(tmp_path, "mixamo")
+    raw = made.path.read_bytes()
+    for length in (3, 11, 19, 100, len(raw) - 1):
+        made.path.write_bytes(raw[:length])
+        with pytest.raises(FileFormatError):
+            formats.load(made.path)
+
+
+def test_neighbours_within_the_folder_are_read(tmp_path):
+    made = make_character_glb(tmp_path / "hero.gltf")
+    (tmp_path / "below").mkdir()
+    tree = json.loads(made.path.read_text())
+    name = tree["buffers"][0]["uri"]
+    (tmp_path / name).rename(tmp_path / "below" / "the data.bin")
+    tree["buffers"][0]["uri"] = "below/the%20data.bin"
+    made.path.write_text(json.dumps(tree))
+    assert formats.load_rest(made.path).num_joints > 20
+    link = tmp_path / "out.bin"
+    outside = tmp_path.parent / f"{tmp_path.name}.bin"
+    shutil.move(tmp_path / "below" / "the data.bin", outside)
+    link.symlink_to(outside)
+    tree["buffers"][0]["uri"] = "out.bin"
+    made.path.write_text(json.dumps(tree))
+    with pytest.raises(FileFormatError, match="not in its folder"):
+        formats.load(made.path)
