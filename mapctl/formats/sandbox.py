@@ -48,7 +48,7 @@ def call(reader: Callable[..., Any], path: str | PathLike[str], **options: Any) 
     except subprocess.TimeoutExpired:
         raise FileFormatError(path, f"cannot be read within {seconds:.0f} seconds") from None
     if done.returncode == 0:
-        outcome, content = pickle.loads(done.stdout)
+        outcome, content = pickle.loads(done.stdout)  # noqa: S301 - of our own reader
         if outcome == "refused":
             raise FileFormatError(path, _one_line(content))
         return content
@@ -67,12 +67,12 @@ def serve() -> None:
     last steps: what is broken in a file may break them."""
     answer = os.dup(1)
     os.dup2(2, 1)  # what libraries print is no answer
-    memory = pickle.load(sys.stdin.buffer)
+    memory = pickle.load(sys.stdin.buffer)  # noqa: S301 - of our own process
     if resource is not None:  # Windows has no such bounds, macOS may refuse them: time alone ends the reader there
         for what, limit in ((resource.RLIMIT_AS, memory), (resource.RLIMIT_CORE, 0)):
             with suppress(ValueError, OSError):
                 resource.setrlimit(what, (limit, limit))
-    reader, path, options = pickle.load(sys.stdin.buffer)
+    reader, path, options = pickle.load(sys.stdin.buffer)  # noqa: S301
     gc.disable()
     warnings.simplefilter("ignore")  # numbers that are not finite are looked for once they are read
     try:
