@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import PurePath
 from typing import Any
 
-from mapctl.errors import CheckpointError, RequestError
+from mapctl.errors import CheckpointError
 from priors import weight_sets
 
 FREE = ("free for any use", "CC0 1.0")
@@ -93,15 +93,6 @@ def check_free(name: str, licence: str, told: Mapping[str, Mapping[str, Any]]) -
         raise CheckpointError(f"{name} is not free, though it lies with the free weights: {fault}")
 
 
-def check_not_laxer(licence: str, origins: Licences) -> None:
-    """Raise RequestError where weights would be under a laxer licence than a model, or made motion, that they learn
-    from. One that is not known is stricter than those that ask for nothing."""
-    for name, theirs in origins.items():
-        laxer = licence in FREE if _find_known(theirs) is None else _rank(licence) < _rank(theirs)
-        if laxer:
-            raise RequestError(f"{name} is under {theirs!r}; weights that learn from it cannot be {licence!r}")
-
-
 def find_unfree(words: str) -> str | None:
     """Find what says that something is not free in a text such as the path of a clip; None where nothing does."""
     found = _NOT_FREE.search(words)
@@ -114,7 +105,7 @@ def _find_fault(licence: str, told: Mapping[str, Mapping[str, Any]]) -> str | No
     for words in _list_texts(told):
         if (found := find_unfree(words)) is not None:
             return f"its card names {found!r} in {words[:60]!r}"
-    for line in told.get("data", {}).get("made", ()):  # as `mapctl make` lists them: who made clips, and its licence
+    for line in told.get("data", {}).get("made", ()):  # splices: how many, and the stitcher's licence
         if not any(line.endswith(f"({free})") for free in FREE):
             return f"it was trained on clips of a model that is not free: {line}"
     began = told.get("data", {}).get("init")

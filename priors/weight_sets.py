@@ -121,11 +121,6 @@ def name_for_records(name: str) -> str:
     return add_set(name) if means_bundled(name) else Path(name).name
 
 
-def write_path(path: Path) -> str:
-    """Write a path so that it never means a bundled model of its name."""
-    return f".{os.sep}{path}" if means_bundled(str(path)) else str(path)
-
-
 def explain_missing(name: str) -> CheckpointError:
     """Explain that a name is neither a file nor bundled, and what there is."""
     weights, model = split_name(name)

@@ -21,7 +21,6 @@ from mapctl.commands.generate import Generate
 from mapctl.commands.infill import Infill
 from mapctl.commands.info import Info
 from mapctl.commands.live import Live
-from mapctl.commands.make import Make
 from mapctl.commands.measure import Measure
 from mapctl.commands.render import Render
 from mapctl.commands.run import RunScene
@@ -54,7 +53,6 @@ COMMANDS: dict[str, type[Runnable]] = {
     "render": Render,
     "convert": Convert,
     "measure": Measure,
-    "make": Make,
     "train": Train,
     "info": Info,
     "compile": CompileKernels,

@@ -54,6 +54,10 @@ class LstmGmmConfig(NetworkConfig):
         require_at_least(self, 1, "width", "components")
 
 
+PAPER = LstmGmmConfig(width=500, components=5, retain=0.0, correlated=False, knows_noise=False)
+"""The network of Wang et al. 2019, section 4.1."""
+
+
 @dataclass(frozen=True, eq=False)
 class LstmState(DensityState):
     """Memory of the density: the last frame and the state of both LSTM layers."""

@@ -63,6 +63,12 @@ class RefinerConfig(NetworkConfig):
             raise RequestError(f"a refiner needs end effectors among {', '.join(CANONICAL.names)}, got {self.joints}")
 
 
+PAPER = RefinerConfig(
+    width=500, memory=1000, lookahead=0, limit=1e6, joints=("head", "leftHand", "rightHand", "leftToes", "rightToes")
+)
+"""The network of Wang et al. 2019, section 4.2."""
+
+
 class RefinerNetwork(nn.Module):
     """Features in and out in physical units; statistics inside. Untrained, it returns what it was given."""
 

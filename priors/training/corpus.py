@@ -4,7 +4,7 @@ import json
 import os
 import re
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
 
@@ -20,7 +20,6 @@ from mapctl.retarget import rigs
 from priors.tensor_files import write_tensors
 from priors.training.mocap.clips import ClipReader
 from priors.training.mocap.cuts import find_cuts
-from priors.training.mocap.made import Made, find_made
 
 MIN_CLIPS_TO_SPLIT = 5
 """Clips under which parts of one clip are held out instead of whole clips."""
@@ -52,8 +51,6 @@ class Corpus:
     """Files of the same folder that are not among the clips."""
     cuts: tuple[str, ...] = ()
     """For each table of frames that was used, its name and of how many of the clips it takes a part."""
-    made: Made = field(default_factory=Made)
-    """Which of the clips are no mocap but made, and by which model."""
 
     def identity(self) -> dict[str, str]:
         """What tells this corpus from others: its size, and short hashes of names, lengths and features."""
@@ -64,6 +61,16 @@ class Corpus:
         }
         size = {"clips": str(len(self.names)), "frames": str(len(self.features))}
         return size | {name: sha256(content).hexdigest()[:12] for name, content in hashed.items()}
+
+    def describe_selection(self) -> dict[str, dict[str, str] | list[str]]:
+        """Describe the files that were left out and why, and the tables that say which frames are motion, for a card;
+        nothing where there are none."""
+        found: dict[str, dict[str, str] | list[str]] = {}
+        if self.skipped:
+            found["skipped"] = {file.name: file.reason for file in self.skipped}
+        if self.cuts:
+            found["cuts"] = list(self.cuts)
+        return found
 
     def clips(self) -> list[Float[Tensor, "frames size"]]:
         """The features of each clip."""
@@ -111,23 +118,19 @@ class Split:
 
 
 def split_corpus(corpus: Corpus, seed: int) -> Split:
-    """By clip, 90/5/5, drawn with the seed; a small corpus keeps at least one clip in each part. Clips that a model
-    made are trained on, unless there are no others: nothing is measured on them, and they do not change which others
-    are held out.
+    """Split by clip, 90/5/5, drawn with the seed; a small corpus keeps at least one clip in each part.
 
-    Of fewer than FEW clips none can be spared: the end of the longest is held out, a tenth of all frames and SHORTEST
-    at least, for validation and test alike. RequestError for fewer than three clips long enough to warm up on.
+    Of fewer than MIN_CLIPS_TO_SPLIT clips none can be spared: the end of the longest is held out, a tenth of all frames
+    and MIN_CLIP_FRAMES at least, for validation and test alike. RequestError for fewer than three clips long enough to
+    warm up on.
     """
-    numbers = range(len(corpus.names))
-    captured = [number for number in numbers if corpus.names[number] not in corpus.made.clips] or list(numbers)
-    made, count = sorted({*numbers} - {*captured}), len(captured)
+    count = len(corpus.names)
     if count < MIN_CLIPS_TO_SPLIT:
         return _split_by_frames(corpus)
-    order = torch.randperm(count, generator=torch.Generator().manual_seed(seed)).tolist()
-    drawn, held = [captured[number] for number in order], max(1, round(0.05 * count))
+    drawn = torch.randperm(count, generator=torch.Generator().manual_seed(seed)).tolist()
+    held = max(1, round(0.05 * count))
     parts = [drawn[2 * held :], drawn[:held], drawn[held : 2 * held]]
     _exchange_short(parts, corpus.lengths)
-    parts[0] += made
     return Split(*(corpus.subset(sorted(part)) for part in parts))
 
 
@@ -146,50 +149,6 @@ def _exchange_short(parts: Sequence[list[int]], lengths: Sequence[int]) -> None:
             taken = long[giver].pop(0)
             parts[giver][parts[giver].index(taken)] = part[0]
             part[0] = taken
-
-
-def join_made(corpus: Corpus, other: Corpus) -> Corpus:
-    """Join to a corpus those clips of another one that a model made, under names below `made/`."""
-    numbers = [number for number, name in enumerate(other.names) if name in other.made.clips]
-    chosen, held = other.subset(numbers), {*corpus.names}
-    names = tuple(f"made/{name}" for name in chosen.names)
-    if held & {*names}:
-        raise RequestError(f"the data hold clips named {min(held & {*names})} and the like already")
-    told = (*corpus.made.told, *other.made.told)
-    made = Made(corpus.made.clips | {*names}, told, corpus.made.licences | other.made.licences)
-    return replace(
-        corpus,
-        names=corpus.names + names,
-        lengths=corpus.lengths + chosen.lengths,
-        features=torch.cat([corpus.features, chosen.features]),
-        made=made,
-    )
-
-
-def keep_share(corpus: Corpus, parts: Split, share: float, seed: int) -> tuple[Corpus, Split]:
-    """Keep a share of the clips that are trained on, and all that are held out, so that models of less motion are
-    measured on the same clips.
-
-    Clips are drawn with the seed, and those of a smaller share are among those of a larger one. At least one is kept;
-    RequestError for a share that is not above 0 and at most 1, and where only clips are left that are too short to warm
-    up on.
-    """
-    if not 0 < share <= 1:
-        raise RequestError(f"the share of the data must be above 0 and at most 1, got {share:g}")
-    if share == 1:
-        return corpus, parts
-    count = len(parts.train.names)
-    order = torch.randperm(count, generator=torch.Generator().manual_seed(seed)).tolist()
-    train = parts.train.subset(sorted(order[: max(1, round(share * count))]))
-    if (longest := max(train.lengths)) < MIN_CLIP_FRAMES:
-        raise RequestError(
-            f"{share:g} of the clips to train on are {len(train.names)}, of {longest} frames at {PRIOR_FPS} fps at"
-            f" most; one must reach {MIN_CLIP_FRAMES}"
-        )
-    dropped = set(parts.train.names) - set(train.names)
-    kept = corpus.subset(number for number, name in enumerate(corpus.names) if name not in dropped)
-    said = replace(kept, skipped=corpus.skipped, cuts=corpus.cuts, made=corpus.made)
-    return said, replace(parts, train=train)
 
 
 def _split_by_frames(corpus: Corpus) -> Split:
@@ -247,12 +206,7 @@ def read_corpus(
     if corpus is None or any(not isinstance(reader.read(data / file.name), str) for file in corpus.skipped):
         corpus = _read_files(files, reader, progress or (lambda done, total: None))
         write_cache(corpus, stored)
-    return replace(
-        corpus,
-        skipped=(*corpus.skipped, *closed),
-        cuts=reader.cuts.describe(corpus.names),
-        made=find_made(data, corpus.names),
-    )
+    return replace(corpus, skipped=(*corpus.skipped, *closed), cuts=reader.cuts.describe(corpus.names))
 
 
 def _list_files(data: Path) -> tuple[list[Path], list[SkippedFile]]:

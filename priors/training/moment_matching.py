@@ -63,15 +63,13 @@ def run_free(
     windows: Float[Tensor, "batch frames size"],
     settings: MatchingSettings,
     generator: torch.Generator,
-    common: torch.Generator | None = None,
     *,
     least: int = 0,
     condition: Float[Tensor, "batch conditions"] | None = None,
 ) -> tuple[Float[Tensor, "runs made size"], Float[Tensor, "runs real size"]]:
     """Free runs that begin with windows, of at least so many frames, and how the windows go on; each after the few
-    frames that differences take their past from. The runs are differentiable in the network's weights. `common` draws
-    how long they have run before, which processes that train together have in common; `generator` if None.
-    `condition` is what the network is told of each window, as in its `forward`.
+    frames that differences take their past from. The runs are differentiable in the network's weights. `condition` is
+    given to the network for each window, as in its `forward`.
 
     RequestError for windows too short to hold both.
     """
@@ -83,7 +81,7 @@ def run_free(
     windows = windows[: settings.batch]
     told = None if condition is None else condition[: settings.batch]
     state = model.advance(model.start_after(windows[:, 0]), windows[:, 1:context], condition=told)
-    drawn = torch.randint(settings.wander + 1, (1,), generator=common or generator)
+    drawn = torch.randint(settings.wander + 1, (1,), generator=generator)
     past, away = windows[:, :context], int(drawn)
     if away > 0:
         wandered, state = model.sample(state, away, generator, condition=told)

@@ -1,10 +1,10 @@
-"""What a training run needs: data and settings. A model's own recipe says what is learnt, judged and described."""
+"""What a training run needs: data and settings. A model's own recipe says what is trained, measured and written."""
 
 import math
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import Field, asdict, dataclass, field, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import Field, asdict, dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Generic, Protocol, TypeVar, runtime_checkable
 
@@ -12,23 +12,29 @@ from torch import Tensor
 
 from mapctl.errors import CheckpointError, RequestError
 from mapctl.features import PRIOR_FPS
+from mapctl.formats.atomic import write_text
 from priors import checkpoints
 from priors.config import NetworkConfig, require_at_least
 from priors.licences import OF_DATA
-from priors.training.corpus import Corpus, Split
-from priors.training.devices import check_processes, refuse_gpu, select_device
-from priors.training.ending.course import VALIDATIONS, End, UntilFlat
-from priors.training.ending.flatness import Point
-from priors.training.gathering import DataSource, describe_selection, find_split_seed, name_origin
+from priors.training.corpus import Corpus, Split, read_corpus, split_corpus
+from priors.training.devices import select_device
 from priors.training.trainer import GradientTrainer, Trainer
+from priors.weight_sets import name_for_records
 
 Row = dict[str, Any]
 """Losses of a step, or measures of held-out clips; in a curve None replaces what is not finite."""
+Progress = Callable[[str], None]
+"""Called with one line of news."""
+_MOST_NAMED = 5  # files that a warning names
+
+
+def ignore_line(line: str) -> None:
+    """Take a line of news, and do nothing with it."""
 
 
 @runtime_checkable
 class Settings(Protocol):
-    """How a model is trained: a frozen dataclass with at least a seed."""
+    """How a model is trained: a frozen dataclass with at least these."""
 
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
 
@@ -37,8 +43,11 @@ class Settings(Protocol):
         """Seed of everything random, including the split of the clips."""
         ...
 
+    @property
+    def steps(self) -> int:
+        """Steps in all."""
+        ...
 
-_TOLD = ("steps", "batch", "window", "pairs", "learning_rate", "seed")  # settings that are options of the command
 
 C = TypeVar("C", bound=NetworkConfig)
 S = TypeVar("S", bound=Settings)
@@ -56,18 +65,18 @@ class Gathered:
     """The same, by what they are for."""
 
     def held_out(self) -> dict[str, list[str]]:
-        """For a card: the clips that training does not see."""
+        """Return the clips that training does not see, for a card."""
         return {"validation": list(self.parts.validation.names), "test": list(self.parts.test.names)}
 
     def describe_training(self) -> dict[str, float]:
-        """For a card: how much motion training sees."""
+        """Describe how much motion training sees, for a card."""
         train = self.parts.train
         return {"clips": len(train.names), "minutes": round(len(train.features) / PRIOR_FPS / 60, 2)}
 
 
 @dataclass(frozen=True)
 class Export:
-    """What a finished run writes, beside what every card tells."""
+    """What a finished run writes, beside what every card holds."""
 
     tensors: Mapping[str, Tensor]
     """By name."""
@@ -87,269 +96,160 @@ class Recipe(ABC, Generic[C, S, T]):
 
     kind: ClassVar[str]
     """Name of the kind of model, in its card and on the command line."""
-    counter: ClassVar[str] = "step"
-    """What one step of its trainer is called."""
-    steps_name: ClassVar[str] = "steps"
-    """Setting that tells how many there are in all."""
-    guards: ClassVar[tuple[str, ...]] = ()
-    """Losses by which training may end by itself (see `find_stop_reason`). Where there are any, they are saved with the
-    checkpoints, and the best weights so far (see `score`) are exported instead of the last."""
-    falls: ClassVar[bool] = True
-    """Whether the learning rate falls to nothing at the end, which then has to be known before it comes."""
-    decay_cost: ClassVar[float] = 1.0
-    """How much longer a step takes in the decay of a run until its curve is flat than before it."""
+    keeps_best: ClassVar[bool] = False
+    """Whether the weights of the best validation (see `score`) are exported even without `patience`."""
     uses_gpu: ClassVar[bool] = True
     """Whether it can be trained on a GPU."""
-    headline: ClassVar[str] = "error"
-    """What `find_headline` tells: the one number that says how good a model is, smaller where it is better."""
 
     data: Path
     """Folder of BVH files, searched below."""
     out: Path
-    """Run folder: checkpoint, curve, finished model."""
+    """Run folder: checkpoint, losses, finished model."""
     config: C
     """The network."""
     settings: S
     """How it is trained."""
     match: str | None = None
     """Regular expression that a file's path below `data` must contain."""
-    resume: bool = False
-    """Continue from the run folder's last checkpoint."""
-    checkpoint_minutes: float = 3.0
-    """Between checkpoints."""
-    report_steps: int = 100
-    """Between lines of news."""
-    validate_steps: int = 1000
-    """Steps between two validations; until its curve is flat a run has its own."""
-    processes: int = 1
-    """Processes that share the batch of each step: forked where there are several, unless torchrun has started them."""
-    licence: str = OF_DATA
-    """Licence of the weights, for the card, one line."""
     skip_first: bool = False
     """Drop frame 0 of every clip (the T-pose of CMU takes)."""
     cuts: Path | None = None
     """Table of the frames of each file that are motion; those named `Frame_Cuts.csv` in the folder are found."""
     level: bool = False
     """Put every clip on the canonical body and a level floor."""
-    strict_data: bool = False
-    """Refuse a folder with a file that cannot be used, rather than leave the file out."""
-    split: int | None = None
-    """Seed by which clips are kept from training, where it is not that of all that is random."""
-    data_share: float = 1.0
-    """Share of the clips to train on that are used; the clips that are held out stay the same."""
-    until_flat: UntilFlat | None = None
-    """Train until the curve of validations is flat; the settings' steps are then a plan."""
-    minutes: float | None = None
-    """Of one core, within which training ends as if it were finished."""
+    licence: str = OF_DATA
+    """Licence of the weights, for the card, one line."""
+    resume: bool = False
+    """Continue from the run folder's last checkpoint."""
+    patience: int = 0
+    """Validations without a better one after which training ends, with the best weights; 0 trains all steps."""
+    checkpoint_minutes: float = 3.0
+    """Between checkpoints."""
+    report_steps: int = 100
+    """Steps of whose losses the log holds the means."""
+    validate_steps: int = 1000
+    """Steps between two validations."""
     device: str = "auto"
     """Where to compute: `cpu`, `cuda`, or `auto` for a GPU where there is one."""
 
     def __post_init__(self):
-        require_at_least(self, 1, "report_steps", "validate_steps", "processes")
+        require_at_least(self, 1, "report_steps", "validate_steps")
+        require_at_least(self, 0, "patience")
 
     @abstractmethod
     def make_trainer(self, parts: Split) -> T:
-        """As it is before the first step."""
+        """Make the trainer as it is before the first step."""
+
+    @abstractmethod
+    def score(self, row: Row) -> float:
+        """Return the one number among measures of held-out clips that says how good a model is, smaller where it is
+        better; NaN without one."""
 
     def check(self) -> None:
-        """Before anything is read."""
+        """Raise RequestError for what cannot be, before anything is read."""
         if not self.data.is_dir():
             raise RequestError(f"{self.data} is not a folder of BVH files")
         if not os.access(self.data, os.R_OK | os.X_OK):
             raise RequestError(f"{self.data} cannot be read: permission denied")
-        check_processes(self.find_device(), self.processes, self.kind)
-        if self.processes > self.most_processes:
-            raise RequestError(
-                f"{self.processes} processes cannot share what a {self.counter} of {self.kind} takes:"
-                f" {self.most_processes} at most"
-            )
-        if self.minutes is not None and self.falls and self.until_flat is None:
-            raise RequestError(
-                f"minutes limit a {self.kind} only until its curve is flat (--until-flat):"
-                f" otherwise its learning rate goes by its {self.counter}s"
-            )
+        self.find_device()
 
     def find_device(self) -> str:
-        """`cpu` or `cuda`; RequestError for one that this process cannot have, or on which nothing would be faster."""
-        if self.uses_gpu:
-            return select_device(self.device)
-        refuse_gpu(self.device, self.kind)
-        return "cpu"
-
-    @property
-    def most_processes(self) -> int:
-        """How many processes can share a step."""
-        return int(getattr(self.settings, "batch", 1))
-
-    @property
-    def steps(self) -> int:
-        """Steps in all, as the settings call them."""
-        return int(getattr(self.settings, self.steps_name))
-
-    def source(self) -> DataSource:
-        """Where motion comes from."""
-        return DataSource(
-            self.data,
-            self.out,
-            self.match or "",
-            self.skip_first,
-            self.strict_data,
-            cuts=self.cuts,
-            level=self.level,
-            seed=self.split_seed,
-            share=self.data_share,
-            licence=self.licence,
-            teachers=self.list_teachers(),
-        )
+        """Return `cpu` or `cuda`; RequestError for one that this machine or model cannot have."""
+        if not self.uses_gpu and self.device == "cuda":
+            raise RequestError(f"a {self.kind} is not trained on GPUs; use --device cpu")
+        return select_device(self.device) if self.uses_gpu else "cpu"
 
     @property
     def split_seed(self) -> int:
-        """Seed by which clips are kept from training."""
-        return self.settings.seed if self.split is None else self.split
+        """Seed by which clips are kept from training: that of the initial weights, where there are any, or the run
+        would train on what their measures hold out."""
+        init = getattr(self, "init", None)
+        return self.settings.seed if init is None else int(_read_card(init).data.get("split_seed", self.settings.seed))
 
-    def list_teachers(self) -> tuple[str, ...]:
-        """Models that the weights begin with or learn from, bundled or trained."""
-        return (init,) if (init := getattr(self, "init", None)) is not None else ()
+    @property
+    def chosen(self) -> str:
+        """Regular expression for the clips."""
+        return self.match or ""
+
+    def gather(self, progress: Progress, warn: Progress) -> Gathered:
+        """Read the clips and split them; `warn` gets a line on files that were left out, RUN/skipped.txt has them all.
+
+        RequestError where nothing is left, or what is left cannot be split.
+        """
+
+        def report(done: int, total: int) -> None:
+            if done % 200 == 0 or done == total:
+                progress(f"read {done} of {total} clips")
+
+        cache, cuts = self.out / "cache", self.cuts
+        corpus = read_corpus(
+            self.data,
+            match=self.chosen,
+            cache=cache,
+            skip_first=self.skip_first,
+            cuts=cuts,
+            level=self.level,
+            progress=report,
+        )
+        if corpus.skipped:
+            reasons = [f"{self.data / file.name}: {file.reason}" for file in corpus.skipped]
+            count, more = len(reasons) + len(corpus.names), len(reasons) - _MOST_NAMED
+            rest = f"; and {more} more, all in {self.out / 'skipped.txt'}" if more > 0 else ""
+            warn(f"left out {len(reasons)} of {count} files: {'; '.join(reasons[:_MOST_NAMED])}{rest}")
+            write_text(self.out / "skipped.txt", "".join(f"{file.name}: {file.reason}\n" for file in corpus.skipped))
+        for line in corpus.cuts:
+            progress(f"frames by {line}")
+        parts = split_corpus(corpus, self.split_seed)
+        size = f"{len(corpus.names)} clips, {len(corpus.features)} frames"
+        held = f", without {parts.test.names[0]}, which is held out" if parts.validation is parts.test else ""
+        progress(f"{size}; training on {len(parts.train.names)}{held}")
+        return Gathered(corpus, parts)
 
     def find_shape(self, trainer: T) -> C:
         """Return the configuration of the network that is trained."""
         return self.config
 
-    def describe_data(self, corpus: Corpus) -> dict[str, str]:
-        """What tells the data of this run from others'."""
-        return corpus.identity() | self.describe_split()
-
-    def describe_split(self) -> dict[str, str]:
-        """The seed by which clips are kept from training, where it was told."""
-        return {} if self.split is None else {"split seed": str(self.split)}
-
-    def pin(self, trainer: T, corpus: Corpus) -> dict[str, Row]:
-        """What must not change between a run's parts. The number of steps may, to extend it, and the precision."""
-        fixed = asdict(self.settings).keys() - {self.steps_name, "bfloat16"}
+    def describe_run(self, trainer: T, corpus: Corpus) -> dict[str, Row]:
+        """Describe what must not change between a run's parts. The number of steps may, and the precision."""
+        settings = {name: v for name, v in asdict(self.settings).items() if name not in ("steps", "bfloat16")}
         return {
-            "settings": {name: value for name, value in asdict(self.settings).items() if name in fixed},
+            "settings": settings,
             "network": self.find_shape(trainer).as_card(),
-            "data": self.describe_data(corpus),
+            "data": corpus.identity() | {"split seed": self.split_seed},
         }
 
-    def format_news(self, rows: Sequence[Row]) -> str:
-        """One line on the losses of some steps."""
-        return ", ".join(f"{name} {average(rows, name):.3f}" for name in rows[0])
+    def describe_origin(self) -> dict[str, dict[str, str]]:
+        """Describe the model that training began with, and its licence, for a card's data; nothing without one."""
+        init = getattr(self, "init", None)
+        return {} if init is None else {"init": {"name": name_for_records(init), "licence": _read_card(init).licence}}
+
+    def describe_data(self, gathered: Gathered) -> Row:
+        """Describe what training saw, for a card."""
+        corpus = gathered.corpus
+        return {
+            **corpus.identity(),
+            **corpus.describe_selection(),
+            "match": self.chosen,
+            "split_seed": self.split_seed,
+            "held_out": gathered.held_out(),
+        }
 
     def find_stop_reason(self, trainer: T, rows: Sequence[Row]) -> str | None:
-        """Why to stop after these losses since the last line of news, if there is a reason."""
+        """Return why to stop after these losses since the last report, if there is a reason."""
         return None
-
-    def score(self, row: Row) -> float:
-        """How far measures are from what is wanted."""
-        return 0.0
-
-    @property
-    def validation_steps(self) -> int:
-        """Steps between two validations: of a run until its curve is flat so many that the curve can be judged."""
-        return self.validate_steps if self.until_flat is None else max(1, self.steps // VALIDATIONS)
-
-    def least_steps(self) -> int:
-        """Steps before which no curve is flat: until then something grows or joins."""
-        return self.steps // 2
-
-    def tell_end(self, end: End | None) -> "Recipe[C, S, T]":
-        """The recipe by which any other run ends where this one did: it tells what a clock has decided."""
-        if end is None or not end.by_clock:
-            return self
-        if self.until_flat is not None:
-            return replace(self, until_flat=replace(self.until_flat, decay_from=end.decay))
-        return replace(self, settings=replace(self.settings, **{self.steps_name: end.decay.end}))
-
-    @classmethod
-    def find_headline(cls, row: Row) -> float:
-        """Find the one number among measures of held-out clips that says how good a model is; NaN without one."""
-        return math.nan
-
-    @classmethod
-    def find_card_headline(cls, quality: Row) -> float:
-        """Find it in the quality that a card tells: that of the test clips, where there is no other."""
-        return cls.find_headline(quality.get("test", quality))
-
-    @classmethod
-    def find_log_error(cls, row: Row) -> float:
-        """The logarithm of the error that a row of measures tells: 0.01 less is one percent better."""
-        return cls.as_log_error(cls.find_headline(row))
-
-    @classmethod
-    def as_log_error(cls, value: float) -> float:
-        """The same of the one number that `find_headline` tells."""
-        return math.log(value) if 0 < value < math.inf else math.nan
-
-    def find_points(self, curve: Sequence[Row]) -> list[Point]:
-        """The curve of validations as it is looked at for being flat."""
-        points = [(int(row[self.counter]), self.find_log_error(row)) for row in curve]
-        return [point for point in points if math.isfinite(point[1])]
 
     def finish(self, trainer: T) -> None:
         """Change the weights once more, before they are measured and written."""
 
     def export(self, trainer: T, gathered: Gathered, curve: Sequence[Row]) -> Export:
-        """What is written at the end."""
-        corpus = gathered.corpus
-        data = {
-            **self.describe_data(corpus),
-            **describe_selection(corpus),
-            "match": self.match or "",
-            "split_seed": self.split_seed,
-            "held_out": gathered.held_out(),
-        }
-        return Export(trainer.network.state_dict(), data, {"test": trainer.validate(gathered.parts.test)})
-
-    def format_shape(self) -> list[str]:
-        """Options of the command that the network's shape needs; those that are the defaults are left out."""
-        return []
-
-    def usual_settings(self) -> S:
-        """Settings of which the command needs no options."""
-        return type(self.settings)()
-
-    def format_command(self) -> str:
-        """What to type for the same run, for the card; options that are the defaults are left out."""
-        told = [name for name in _TOLD if hasattr(self.settings, name)]
-        parts = [f"mapctl train {self.kind} --data DATA -o RUN"]
-        parts += [f"--match '{self.match}'"] if self.match else []
-        parts += self.format_reading() + self.format_shape()
-        parts += self.format_changed(self.usual_settings(), *told)
-        return " ".join(parts + self.format_processes() + self.format_ending())
-
-    def format_ending(self) -> list[str]:
-        """The options for a split of its own, and for a run until its curve is flat."""
-        parts = [] if self.split is None else [f"--split-seed {self.split}"]
-        if self.until_flat is None:
-            return parts
-        share, given = self.until_flat.share, self.until_flat.decay_from
-        parts += ["--until-flat"] if share == UntilFlat.share else [f"--until-flat --flat-share {share:g}"]
-        return parts + ([] if given is None else [f"--decay-from {given}"])
-
-    def format_reading(self) -> list[str]:
-        """The options for how clips are read, where they are not the defaults."""
-        parts = ["--skip-first"] * self.skip_first + ["--level"] * self.level
-        parts += [] if self.data_share == 1 else [f"--data-share {self.data_share:g}"]
-        return parts + ([f"--cuts {self.cuts.name}"] if self.cuts else [])
-
-    def format_processes(self) -> list[str]:
-        """The option for several processes, where there were any."""
-        return [f"--processes {self.processes}"] if self.processes > 1 else []
-
-    def format_changed(self, usual: Any, *names: str, **renamed: str) -> list[str]:
-        """Options for settings that are not the `usual` ones; `renamed` are those whose option is called otherwise."""
-        options = {name: name for name in names} | renamed
-        return [
-            f"--{option.replace('_', '-')} {getattr(self.settings, name)}"
-            for name, option in options.items()
-            if getattr(self.settings, name) != getattr(usual, name)
-        ]
+        """Return what is written at the end."""
+        quality = {"test": trainer.validate(gathered.parts.test)}
+        return Export(trainer.exported.state_dict(), self.describe_data(gathered), quality)
 
 
 @dataclass(frozen=True)
 class NetworkRecipe(Recipe[C, S, G]):
-    """Recipe of one network on the usual card, which may start from another network's weights."""
+    """Recipe of one network, which may start from another network's weights."""
 
     init: str | None = None
     """Begin with the weights of this model, bundled or trained."""
@@ -357,24 +257,19 @@ class NetworkRecipe(Recipe[C, S, G]):
     """Share of those weights in the ones that are written: the mean of both is often better on familiar and on
     unfamiliar data than either (Wortsman et al. 2022)."""
 
-    @property
-    def split_seed(self) -> int:
-        """That of the initial weights, where there are any."""
-        return find_split_seed(self.init, self.settings.seed, self.split)
-
     @abstractmethod
-    def make_untaught(self, parts: Split) -> G:
-        """The trainer, its weights drawn."""
+    def draw_trainer(self, parts: Split) -> G:
+        """Make the trainer with drawn weights."""
 
     def make_trainer(self, parts: Split) -> G:
-        """As it is before the first step."""
-        trainer = self.make_untaught(parts)
+        """Make the trainer as it is before the first step."""
+        trainer = self.draw_trainer(parts)
         if self.init is not None and not self.resume:
             trainer.network.load_state_dict(self.read_initial_weights(self.init, trainer))
         return trainer
 
     def read_initial_weights(self, name: str, trainer: G) -> dict[str, Tensor]:
-        """Another model's weights for this trainer's network; CheckpointError if they are not of its shape."""
+        """Read another model's weights for this trainer's network; CheckpointError if they are not of its shape."""
         tensors, card = checkpoints.load(checkpoints.locate(name))
         if card.kind != self.kind or type(self.config).of_card(card.config) != self.config:
             wanted = f"{self.kind} of {self.config.as_card()}"
@@ -382,23 +277,16 @@ class NetworkRecipe(Recipe[C, S, G]):
         return trainer.network.state_dict() | tensors  # layers that the other lacks begin as drawn
 
     def finish(self, trainer: G) -> None:
-        """Bring the weights towards the initial ones, as far as those have a share."""
+        """Move the weights towards the initial ones, as far as those have a share."""
         if self.init is not None and self.init_share:
             before = self.read_initial_weights(self.init, trainer)
             for name, value in trainer.network.state_dict().items():
                 if value.is_floating_point():
                     value.lerp_(before[name].to(value), self.init_share)
 
-    def pin(self, trainer: G, corpus: Corpus) -> dict[str, Row]:
-        """What must not change between a run's parts."""
-        return {**super().pin(trainer, corpus), "init": {"name": self.init}}
-
-    def format_command(self) -> str:
-        """What to type for the same run, for the card; options that are the defaults are left out."""
-        parts = [f"--init {name_origin(self.init)}"] if self.init is not None else []
-        parts += [f"--init-share {self.init_share:g}"] if self.init_share else []
-        parts += ["--bfloat16"] * bool(getattr(self.settings, "bfloat16", False))
-        return " ".join([super().format_command(), *parts])
+    def describe_run(self, trainer: G, corpus: Corpus) -> dict[str, Row]:
+        """Describe what must not change between a run's parts."""
+        return {**super().describe_run(trainer, corpus), "init": {"name": self.init}}
 
 
 def average_logarithms(values: Iterable[float | None]) -> float:
@@ -407,6 +295,5 @@ def average_logarithms(values: Iterable[float | None]) -> float:
     return math.exp(sum(logs) / len(logs)) if logs else math.nan
 
 
-def average(rows: Sequence[Row], name: str) -> float:
-    """Mean of a part of the loss."""
-    return sum(row[name] for row in rows) / len(rows)
+def _read_card(name: str) -> checkpoints.Card:
+    return checkpoints.read_card(checkpoints.locate(name).with_suffix(".json"))

@@ -1,392 +1,328 @@
-"""A training run: from a recipe to a run folder with a checkpoint, a curve and a loadable model with its card.
+"""The training loop of every model: steps, validations, early stopping, checkpoints, and at the end weights and card.
 
-One loop for every model: updates, validations and checkpoints, and an end at any moment that loses nothing. Where
-several processes train together, each runs this loop; the first one validates, writes and speaks.
+A run folder holds `checkpoint.safetensors`, from which training resumes, `losses.csv` and `tensorboard/`, the features
+of the clips in `cache/`, and at the end `model.safetensors` with its card, `model.json`.
 """
 
+import csv
+import io
 import json
 import math
+import signal
+import threading
 import time
-from collections.abc import Sequence
-from dataclasses import asdict, replace
-from functools import partial
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict
+from importlib.util import find_spec
 from pathlib import Path
+from types import FrameType
 from typing import Any, Generic
 
 import torch
+from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
-from mapctl.errors import RequestError
-from mapctl.runtime.interruption import DeferredSignals, defer_signals
+from mapctl.errors import CheckpointError, RequestError
+from mapctl.formats.atomic import check_folder, write_text
 from priors import checkpoints
-from priors.training import parallel, run_files
-from priors.training.devices import find_precision, has_bfloat16, use_device
-from priors.training.ending.course import Course
-from priors.training.gathering import Progress, describe_origin, gather
-from priors.training.parallel import ALONE, TrainingGroup
-from priors.training.recipe import C, Gathered, Recipe, Row, S, T, average
-from priors.training.record.event_files import EventFiles
-from priors.training.record.losses_file import LossesFile
-from priors.training.record.watching import LineWatcher, RunStart, Watcher
+from priors.tensor_files import write_tensors
+from priors.training.devices import use_device
+from priors.training.recipe import C, Gathered, Progress, Recipe, Row, S, T, ignore_line
+from priors.training.trainer import select_prefixed
+
+CHECKPOINT, LOSSES, EVENTS = "checkpoint.safetensors", "losses.csv", "tensorboard"
+"""Files and folder of a run folder."""
+TRAINING, VALIDATION = "training", "validation"
+"""What the column `part` of LOSSES holds: mean losses since the last report, or measures of held-out clips."""
+_FIRST_LINE_SECONDS, _LINE_SECONDS = 5.0, 30.0  # to the first line on the losses, and from line to line
+_SAME_SIGNAL_SECONDS = 1.0  # `timeout` and job schedulers send a signal twice
+_UNREADABLE = (OSError, ValueError, KeyError, TypeError, AttributeError, IndexError, RuntimeError, SafetensorError)
 
 
-def _say_nothing(line: str) -> None:
-    pass
+def train(recipe: Recipe[Any, Any, Any], progress: Progress = ignore_line, *, warn: Progress = ignore_line) -> Path:
+    """Train to the end of the recipe, or until validation no longer improves, and write RUN/model.safetensors; return
+    its path. `progress` gets lines on losses and validations, `warn` one on files that cannot be used.
 
-
-def train(
-    recipe: Recipe[Any, Any, Any],
-    progress: Progress = _say_nothing,
-    *,
-    warn: Progress = _say_nothing,
-    watchers: Sequence[Watcher] | None = None,
-) -> Path:
-    """Train to the end of the recipe, or until its guard stops it, and write RUN/model.safetensors; returns its path.
-    `warn` is told of files that cannot be used. `watchers` are told each step; unless they are given, `progress` gets a
-    line at each report.
-
-    Several processes, forked here (`recipe.processes`) or started by torchrun, share the batch of each step. Ctrl-C and
-    SIGTERM save a checkpoint and go on as KeyboardInterrupt. Interrupted or killed and resumed, a run gives the same
-    weights bit for bit on one machine with as many processes. MapctlError where training diverges and no guard sees it,
-    or a process ends; the last checkpoint then stays as it was.
+    Ctrl-C and SIGTERM save a checkpoint and go on as KeyboardInterrupt. MapctlError where training diverges; the last
+    checkpoint then stays as it was.
     """
-    launched = parallel.count_launched()
-    if launched is not None:
-        if recipe.processes not in (1, launched):
-            raise RequestError(f"torchrun has started {launched} processes; leave out --processes")
-        recipe = replace(recipe, processes=launched)
     recipe.check()
-    with parallel.join_launched() as group:
-        if not group.leads:
-            progress, warn, watchers = _say_nothing, _say_nothing, ()
-        recipe = _fit_precision(recipe, warn)
-        gathered = _gather_together(recipe, group, progress, warn)
-        watchers = [LineWatcher(progress)] if watchers is None else watchers
-        with use_device(recipe.find_device()):
-            run = TrainingRun(recipe, gathered, progress, warn=warn, watchers=watchers, group=group)
-            run.go()
+    check_folder(recipe.out)
+    present = (recipe.out / CHECKPOINT).exists()
+    if recipe.resume and not present:
+        raise CheckpointError(f"{recipe.out} holds no checkpoint to resume from")
+    if present and not recipe.resume:
+        raise RequestError(f"{recipe.out} already holds a run; pass --resume to continue it, or choose another folder")
+    gathered = recipe.gather(progress, warn)
+    with use_device(recipe.find_device()):
+        run = TrainingRun(recipe, gathered, progress)
+        run.go()
         return run.export()
 
 
-def _fit_precision(recipe: Recipe[Any, Any, Any], warn: Progress) -> Recipe[Any, Any, Any]:
-    """The same in float32 where bfloat16 is asked for, and the processor has none; its card then tells float32."""
-    if find_precision(recipe.settings) == "float32" or recipe.find_device() != "cpu" or has_bfloat16():
-        return recipe
-    warn("this processor does not compute in bfloat16; training computes in float32")
-    return replace(recipe, settings=replace(recipe.settings, bfloat16=False))
-
-
-def _gather_together(
-    recipe: Recipe[Any, Any, Any], group: TrainingGroup, progress: Progress, warn: Progress
-) -> Gathered:
-    """The first process checks the folder and reads the clips; the others then take them from its cache, or, on another
-    machine, read them themselves."""
-    found: list[Gathered] = []
-
-    def read() -> bytes:
-        if group.leads:
-            run_files.check_run_folder(recipe.out, resume=recipe.resume)
-        found.append(Gathered(*gather(recipe.source(), progress=progress, warn=warn)))
-        return b""
-
-    group.do_first(read)
-    if not group.leads:
-        read()
-    return found[0]
+def read_index(run: Path) -> dict[str, Any]:
+    """Read what the checkpoint of a run folder holds beside its tensors; CheckpointError where there is none."""
+    return _read_checkpoint(run)[0]
 
 
 class TrainingRun(Generic[C, S, T]):
-    """A trainer, its curve and its checkpoints. Everything that a continuation needs is in what it saves."""
+    """A trainer, its curve of validations and its checkpoints."""
 
-    def __init__(
-        self,
-        recipe: Recipe[C, S, T],
-        gathered: Gathered,
-        progress: Progress,
-        *,
-        warn: Progress = _say_nothing,
-        watchers: Sequence[Watcher] = (),
-        group: TrainingGroup = ALONE,
-    ):
-        self.recipe, self.gathered, self.progress, self.group = recipe, gathered, progress, group
-        self.device = torch.get_default_device().type
-        self.parts = gathered.parts.to(self.device)
-        """What is trained on and measured, where it is computed."""
+    def __init__(self, recipe: Recipe[C, S, T], gathered: Gathered, progress: Progress = ignore_line):
+        self.recipe, self.gathered, self.progress = recipe, gathered, progress
+        self.parts = gathered.parts.to(torch.get_default_device().type)
         self.trainer = recipe.make_trainer(self.parts)
-        self.pinned = json.loads(json.dumps(recipe.pin(self.trainer, gathered.corpus)))
+        self.identity = json.loads(json.dumps(recipe.describe_run(self.trainer, gathered.corpus)))
         self.curve: list[Row] = []
-        self.losses: list[Row] = []  # since the last report but one, where there has just been one
-        self.extended: list[dict[str, int]] = []
-        """Where the number of steps was changed: at which step, from what, to what."""
+        self.losses: list[Row] = []  # since the last report
+        self.keeps_best = recipe.keeps_best or recipe.patience > 0
+        self.best = _copy_weights(self.trainer.exported) if self.keeps_best else {}
         self.stop_reason: str | None = None
-        self.best: dict[str, Tensor] = _copy_weights(self.trainer.network) if recipe.guards else {}
-        self.course = Course(
-            recipe.until_flat, recipe.minutes, self.trainer, least=recipe.least_steps(), cost=recipe.decay_cost
-        )
-        self._check_together()
-        self._table = LossesFile(recipe.out, recipe.counter)
-        self.watchers: list[Watcher] = [self._table, EventFiles(recipe.out), *watchers] if group.leads else []
         if recipe.resume:
-            self._load(warn)
-            progress(f"resumed at {recipe.counter} {self.trainer.step}")
-        if group.leads:
-            recipe.out.mkdir(parents=True, exist_ok=True)
-            self._table.cut(self.trainer.step, self.curve)
-
-    @property
-    def finished(self) -> bool:
-        """At the end of the recipe, or where its guard has stopped it."""
-        return self.stop_reason is not None or self.trainer.step >= self.trainer.steps
-
-    @property
-    def evaluation_due(self) -> bool:
-        """Whether the weights as they are have still to be measured: every so many steps and at the end, and, where the
-        best are kept, before the first step."""
-        if self.recipe.guards and not self.curve:
-            return True
-        step, measured = self.trainer.step, self.curve[-1][self.recipe.counter] if self.curve else 0
-        due = step >= self.trainer.steps or step % self.recipe.validation_steps == 0
-        return due and step > measured and self.stop_reason is None
+            self._load()
+            progress(f"resumed at step {self.trainer.step}")
+        self.log = Log(recipe.out, self.trainer.step)
 
     def go(self) -> None:
-        """To the end of the run. Ctrl-C or SIGTERM waits for the step under way, breaks a judgement off, saves a
-        checkpoint and goes on as KeyboardInterrupt; sent again after a second, it does not wait for the step, and the
-        last checkpoint is the one before.
-        """
-        if self.group.size > 1:
-            self._train_in(self.group)
-            return
-        with parallel.fork_group(self.recipe.processes, self._train_in) as group:
-            self._train_in(group)
-        self.group = self.trainer.group = ALONE
-
-    def _train_in(self, group: TrainingGroup) -> None:
-        """As one process of a group, of which only the first tells anybody."""
-        self.group = group
-        self.trainer.join(group)
-        if not group.leads:
-            self.watchers, self.progress = [], _say_nothing
-        recipe = self.recipe
-        start = RunStart(
-            recipe.kind,
-            recipe.counter,
-            self.trainer.step,
-            self.trainer.steps,
-            recipe.validation_steps,
-            recipe.format_news,
-        )
-        try:
-            for watcher in self.watchers:
-                watcher.begin(start)
-            self._loop()
-        finally:
-            for watcher in self.watchers:
-                watcher.end()
-
-    def _loop(self) -> None:
+        """Train to the end of the run; see `train`."""
         saved, unsaved = time.monotonic(), False
-        with defer_signals() as held:
-            if self.trainer.step == 0:  # there is nothing yet that an evaluation could be of use for
-                self._stop_if_wanted(held, *self.group.agree(held.wanted is not None))
+        pace = _Pace(self.trainer.step)
+        with hold_interruption() as received:
             while True:
-                if self.evaluation_due:
-                    self._evaluate(held)
+                if self._validation_due():
+                    self.validate()
                     unsaved = self.trainer.step > 0
-                late = self.group.leads and time.monotonic() - saved > 60 * self.recipe.checkpoint_minutes
-                up = self.group.leads and self.course.overdue
-                overdue, wanted, up = self.group.agree(late, held.wanted is not None, up)
-                if self._decide_end(up):  # a clock does not decide twice at the same step: it is saved at once
-                    if self.evaluation_due:
-                        self._evaluate(held)
-                    overdue = True
-                if unsaved and (self.finished or overdue or wanted):
-                    self._save_undisturbed(held)
+                ended = self.stop_reason is not None or self.trainer.step >= self.trainer.steps
+                overdue = time.monotonic() - saved > 60 * self.recipe.checkpoint_minutes
+                if unsaved and (ended or overdue or received):
+                    self.save()
                     saved, unsaved = time.monotonic(), False
-                self._stop_if_wanted(held, wanted)
-                if self.finished:
-                    return
-                self.update()
+                if ended or received:
+                    break
+                self.step(pace)
                 unsaved = True
+        self.log.close()
 
-    def _decide_end(self, overdue: bool) -> bool:
-        """Whether it is decided now when the run ends."""
-        end = self.course.decide(self.recipe.find_points(self.curve), overdue=overdue, group=self.group)
-        if end is None:
-            return False
-        self.progress(f"{end.reason}: training ends at {self.recipe.counter} {self.trainer.steps}")
-        for watcher in self.watchers:
-            watcher.see_end(self.trainer.steps)
-        return True
-
-    def _stop_if_wanted(self, held: DeferredSignals, wanted: bool) -> None:
-        if wanted:
-            held.release()
-            raise KeyboardInterrupt  # of a process that another one told
-
-    def update(self) -> None:
-        """One step, of which half is of no use."""
+    def step(self, pace: "_Pace | None" = None) -> None:
+        """Take one step, and report on the last ones where it is time."""
         recipe, trainer = self.recipe, self.trainer
-        if trainer.step % recipe.report_steps == 0:
-            self.losses = []
-        self.losses.append(trainer.take_step())
-        for watcher in self.watchers:
-            watcher.see_step(trainer.step, self.losses[-1])
-        if trainer.step >= trainer.steps or trainer.step % recipe.report_steps == 0:
-            means = _none_where_not_finite({name: _average_known(self.losses, name) for name in self.losses[-1]})
-            for watcher in self.watchers:
-                watcher.see_losses(trainer.step, means)
+        row = trainer.train_step()
+        self.losses.append(row)
+        last = trainer.step >= trainer.steps
+        if pace is not None and (line := pace.format_line(row, trainer.step, trainer.steps)):
+            self.progress(line)
         self.stop_reason = recipe.find_stop_reason(trainer, self.losses)
         if self.stop_reason is not None:
-            self.progress(f"{self.stop_reason}: training ends with the best {recipe.kind} seen")
+            self.progress(f"{self.stop_reason}: training ends with the best weights so far")
+        if last or trainer.step % recipe.report_steps == 0:
+            self.log.write(trainer.step, TRAINING, _average(self.losses))
+            self.losses = []
 
-    def judge(self) -> Row:
-        """Measure the weights as they are. It may be broken off and begun again: until its end it changes nothing."""
+    def validate(self) -> None:
+        """Measure the weights as they are, and stop where `patience` validations have brought nothing better."""
         recipe, trainer = self.recipe, self.trainer
-        if not recipe.guards:
+        if not self.keeps_best:
             trainer.check_finite()
-        row = trainer.validate(self.parts.validation)
-        if recipe.guards:
-            score = recipe.score(row)
-            if score < min((recipe.score(before) for before in self.curve), default=math.inf) or not self.curve:
-                self.best = _copy_weights(trainer.network)
-            row = {**row, "score": score, **{f"training_{name}": average(self.losses, name) for name in self._watched}}
-        return _none_where_not_finite(row)
+        row = _none_where_not_finite(trainer.validate(self.parts.validation))
+        scores = [_rank(recipe.score(each)) for each in [*self.curve, row]]
+        if self.keeps_best and all(scores[-1] < before for before in scores[:-1]):
+            self.best = _copy_weights(trainer.exported)
+        self.curve.append({"step": trainer.step, **row})
+        self.log.write(trainer.step, VALIDATION, row)
+        measures = ", ".join(f"{name} {'-' if value is None else f'{value:.4g}'}" for name, value in row.items())
+        self.progress(f"validation at step {trainer.step}: {measures}")
+        stale = len(scores) - 1 - min(range(len(scores)), key=scores.__getitem__)
+        if recipe.patience and stale >= recipe.patience:
+            self.stop_reason = f"no better in {recipe.patience} validations"
+            self.progress(f"{self.stop_reason}: training ends with the best weights so far")
+
+    def save(self) -> None:
+        """Write a checkpoint, unless training was stopped, since what is resumed comes to the same end; MapctlError
+        where the weights are not finite."""
+        if self.stop_reason is not None:
+            return
+        if not self.keeps_best:
+            self.trainer.check_finite()
+        index = {
+            "step": self.trainer.step,
+            "steps": self.trainer.steps,
+            "licence": self.recipe.licence,
+            "identity": self.identity,
+            "curve": self.curve,
+        }
+        tensors = self.trainer.state() | {f"best.{name}": value for name, value in self.best.items()}
+        write_tensors(self.recipe.out / CHECKPOINT, tensors, metadata={"run": json.dumps(index)})
 
     def export(self) -> Path:
         """Write the model with its card."""
-        recipe, path = self.recipe.tell_end(self.course.end), self.recipe.out / "model.safetensors"
-        init = getattr(recipe, "init", None)
-        if not self.group.leads:
-            return path
-        if recipe.guards:
-            self.trainer.network.load_state_dict(self.best)
-        self.trainer.move("cpu")
+        recipe, path = self.recipe, self.recipe.out / "model.safetensors"
+        if self.keeps_best:
+            self.trainer.exported.load_state_dict(self.best)
+        for network in self.trainer.networks().values():
+            network.to("cpu")
         recipe.finish(self.trainer)
-        made = recipe.export(self.trainer, self.gathered, self.curve)
-        training = {"settings": asdict(recipe.settings), "curve": self.curve, "command": recipe.format_command()}
+        exported = recipe.export(self.trainer, self.gathered, self.curve)
+        ended = {} if self.stop_reason is None else {"ended": f"step {self.trainer.step}: {self.stop_reason}"}
         card = checkpoints.Card(
             kind=recipe.kind,
             config=recipe.find_shape(self.trainer).as_card(),
             licence=recipe.licence,
-            data={**made.data, **describe_origin(init), "trained_on": self.gathered.describe_training()},
-            training=training | ({"extended": self.extended} if self.extended else {}) | self.course.as_card(),
-            quality=made.quality,
-            abilities=made.abilities,
+            data={**exported.data, **recipe.describe_origin(), "trained_on": self.gathered.describe_training()},
+            training={"settings": asdict(recipe.settings), "curve": self.curve, **ended},
+            quality=exported.quality,
+            abilities=exported.abilities,
             **checkpoints.Card.layout_fields(),
         )
-        checkpoints.save(dict(made.tensors), card, path, half=made.half)
+        checkpoints.save(dict(exported.tensors), card, path, half=exported.half)
         return path
 
-    def save(self) -> None:
-        """A checkpoint. None where the guard has stopped training, since what is resumed there comes to the same end;
-        MapctlError, and none, where the weights are no numbers.
-        """
-        if self.stop_reason is not None:
-            return
-        tensors = self.trainer.state()
-        self.group.do_first(partial(self._write_checkpoint, tensors))
+    def _validation_due(self) -> bool:
+        """Whether the weights have still to be measured: every so many steps and at the end, and, where a recipe keeps
+        the best, before the first step."""
+        if self.recipe.keeps_best and not self.curve:
+            return True
+        step, measured = self.trainer.step, self.curve[-1]["step"] if self.curve else 0
+        due = step >= self.trainer.steps or step % self.recipe.validate_steps == 0
+        return due and step > measured and self.stop_reason is None
 
-    def _write_checkpoint(self, tensors: dict[str, Tensor]) -> bytes:
-        index = {
-            **self.pinned,
-            **self.course.as_index(),
-            "steps": self.recipe.steps if self.trainer.steady else self.trainer.steps,
-            "first_steps": self.trainer.first_steps,
-            "extended": self.extended,
-            "processes": self.recipe.processes,
-            "device": self.device,
-            "precision": find_precision(self.recipe.settings),
-            "licence": self.recipe.licence,
-            "curve": self.curve,
-            "losses": [_none_where_not_finite(row) for row in self.losses],
-        }
-        if self.recipe.guards:
-            tensors = tensors | {f"best.{name}": value for name, value in self.best.items()}
-        else:
-            self.trainer.check_finite()
-        run_files.write_checkpoint(self.recipe.out, step=self.trainer.step, tensors=tensors, index=index)
-        return b""
-
-    @property
-    def _watched(self) -> tuple[str, ...]:
-        """Losses that there are already."""
-        return self.recipe.guards if self.losses else ()
-
-    def _evaluate(self, held: DeferredSignals) -> None:
-        """The first process judges, and all add the row to their curves."""
-        told = self.group.do_first(partial(self._judge_or_break_off, held))
-        if not told:
-            if self.trainer.step > 0:
-                self._save_undisturbed(held)
-            raise KeyboardInterrupt
-        row = json.loads(told)
-        self.curve.append({self.recipe.counter: self.trainer.step, **row})
-        self.course.mark_validation()
-        for watcher in self.watchers:
-            watcher.see_validation(self.trainer.step, row)
-
-    def _judge_or_break_off(self, held: DeferredSignals) -> bytes:
-        """The row; nothing where a signal breaks it off."""
+    def _load(self) -> None:
+        index, tensors = _read_checkpoint(self.recipe.out)
         try:
-            with held.let_through():
-                return json.dumps(self.judge()).encode()
-        except KeyboardInterrupt:
-            return b""
-
-    def _save_undisturbed(self, held: DeferredSignals) -> None:
-        with held.defer_all():
-            self.save()
-
-    def _check_together(self) -> None:
-        """RequestError where processes on several machines have read other clips."""
-        own = json.dumps(self.pinned, sort_keys=True).encode()
-        (differs,) = self.group.agree(self.group.do_first(lambda: own) != own)
-        if differs:
-            raise RequestError("the processes do not train the same: data and options must be alike on all machines")
-
-    def _load(self, warn: Progress) -> None:
-        out, recipe = self.recipe.out, self.recipe
-        try:
-            index, tensors = run_files.share_checkpoint(out, self.group)
-            for part, now in self.pinned.items():
-                run_files.check_unchanged(out, part, then=index[part], now=now)
-            self.curve = run_files.parse_curve(index, recipe.counter)
-            self.losses = run_files.parse_losses(index, recipe.guards)
-            if recipe.guards:
-                self.best = {name: tensors[f"best.{name}"] for name in self.best}
-            self._extend(index)
-            self.course.load(out, index)
+            for part, now in self.identity.items():
+                then = index["identity"][part]
+                changed = [f"{key}: {then.get(key)} then, {now[key]} now" for key in now if then.get(key) != now[key]]
+                if changed:
+                    told = "; ".join(changed)
+                    raise CheckpointError(f"{self.recipe.out}: the run was begun with other {part} ({told})")
+            self.curve = [{**row, "step": int(row["step"])} for row in index["curve"]]
+            if self.keeps_best:
+                self.best = select_prefixed("best.", tensors)
             self.trainer.load_state(tensors, int(index["step"]))
-            before = run_files.parse_processes(out, index)
-            device, precision = str(index.get("device", "cpu")), index.get("precision")
-        except run_files.UNREADABLE_ERRORS as error:
-            raise run_files.make_unreadable_error(out, error) from error
-        if before != recipe.processes:
-            warn(
-                f"{out} was trained in {before} processes and goes on in {recipe.processes}:"
-                " the result is as good, but not the same to the bit"
-            )
-        for how, then, now in (("on", device, self.device), ("in", precision, find_precision(recipe.settings))):
-            if then not in (now, None):
-                warn(f"{out} was trained {how} {then} and goes on {how} {now}: the result is as good, but another one")
+        except _UNREADABLE as error:
+            raise _make_unreadable_error(self.recipe.out, error) from error
+        if self.trainer.step > self.trainer.steps:
+            done, wanted = self.trainer.step, self.trainer.steps
+            raise RequestError(f"{self.recipe.out}: {done} steps are done; --steps must be at least that, got {wanted}")
 
-    def _extend(self, index: dict[str, Any]) -> None:
-        """Take what the checkpoint says of the number of steps; RequestError where more are done than are wanted."""
-        recipe, done = self.recipe, int(index["step"])
-        before = int(index.get("steps") or index["settings"][recipe.steps_name])
-        self.extended = [dict(row) for row in index.get("extended", [])]
-        self.trainer.set_first_steps(int(index.get("first_steps", before)))
-        if recipe.until_flat is not None:
-            if recipe.steps != before:
-                raise RequestError(f"{recipe.out}: a run until its curve is flat keeps its --steps {before}")
-            return
-        if recipe.steps < done:
-            raise RequestError(
-                f"{recipe.out}: {done} {recipe.counter}s are done; --steps must be at least that, got {recipe.steps}"
-            )
-        if recipe.steps != before:
-            self.extended.append({"at": done, "from": before, "to": recipe.steps})
-            self.progress(f"{recipe.steps} {recipe.counter}s in all instead of {before}")
+
+class Log:
+    """Mean losses and measures of held-out clips, as RUN/losses.csv and, where it is installed, for TensorBoard."""
+
+    def __init__(self, run: Path, step: int):
+        """Rows beyond `step`, at which the run goes on, are dropped: they come again."""
+        self._path, self._rows = run / LOSSES, _read_rows(run / LOSSES, step)
+        self._events: Any = None
+        if find_spec("tensorboard") is not None:
+            from torch.utils.tensorboard.writer import SummaryWriter  # an optional extra, slow to import
+
+            self._events = SummaryWriter(str(run / EVENTS), purge_step=step + 1 if step else None)
+
+    def write(self, step: int, part: str, values: Mapping[str, Any]) -> None:
+        """Add a row; values that are not finite numbers are left out."""
+        finite = {name: v for name, v in values.items() if isinstance(v, int | float) and math.isfinite(v)}
+        self._rows.append({"step": str(step), "part": part, **{name: f"{v:.9g}" for name, v in finite.items()}})
+        text = io.StringIO()
+        columns = dict.fromkeys(name for row in self._rows for name in row)
+        table = csv.DictWriter(text, list(columns), lineterminator="\n")
+        table.writeheader()
+        table.writerows(self._rows)
+        write_text(self._path, text.getvalue())
+        if self._events is not None:
+            for name, value in finite.items():
+                self._events.add_scalar(f"{part}/{name}", value, step)
+            self._events.flush()
+
+    def close(self) -> None:
+        """Close the event files."""
+        if self._events is not None:
+            self._events.close()
+
+
+@contextmanager
+def hold_interruption() -> Iterator[list[int]]:
+    """Collect SIGINT and SIGTERM within, so that a step ends before training does; afterwards the first is sent again.
+    One that comes a second after another interrupts at once. In other threads than the main one nothing is held."""
+    received: list[int] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield received
+        return
+    first = math.inf
+
+    def note(number: int, frame: FrameType | None) -> None:
+        nonlocal first
+        if received and time.monotonic() > first + _SAME_SIGNAL_SECONDS:
+            raise KeyboardInterrupt
+        if not received:
+            first = time.monotonic()
+            received.append(number)
+
+    handlers = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield received
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+    if received:
+        signal.raise_signal(received[0])
+
+
+class _Pace:
+    """Says by the clock how far a run has come."""
+
+    def __init__(self, step: int):
+        self._rows: list[Row] = []
+        self._step, self._began = step, time.monotonic()
+        self._due = self._began + _FIRST_LINE_SECONDS
+
+    def format_line(self, row: Row, step: int, steps: int) -> str | None:
+        """Format the mean losses since the last line, the rate and the time left; None before it is time."""
+        self._rows.append(row)
+        now = time.monotonic()
+        if now < self._due and step < steps:
+            return None
+        rate = (step - self._step) / max(1e-9, now - self._began)
+        left = round((steps - step) / rate)
+        losses = ", ".join(f"{name} {value:.3f}" for name, value in _average(self._rows).items())
+        self._rows, self._due = [], now + _LINE_SECONDS
+        clock = f"{left // 3600}:{left // 60 % 60:02d}:{left % 60:02d}"
+        return f"step {step}/{steps}: {losses}, {rate:.3g} steps/s, {clock} left"
+
+
+def _average(rows: Sequence[Row]) -> Row:
+    """Mean of each loss over the rows that have it."""
+    names = dict.fromkeys(name for row in rows for name in row)
+    found = {name: [row[name] for row in rows if name in row] for name in names}
+    return {name: sum(values) / len(values) for name, values in found.items()}
+
+
+def _read_rows(path: Path, step: int) -> list[dict[str, str]]:
+    """Read the rows of a table up to a step; none where it is gone or damaged."""
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            rows = [{name: cell for name, cell in row.items() if cell} for row in csv.DictReader(file)]
+        return [row for row in rows if int(row["step"]) <= step] if step else []
+    except (OSError, ValueError, KeyError, TypeError, csv.Error):
+        return []
+
+
+def _read_checkpoint(run: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Read index and tensors; CheckpointError where they cannot be read."""
+    try:
+        with safe_open(run / CHECKPOINT, framework="pt") as file:
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            index = json.loads(file.metadata()["run"])
+            return {**index, "step": int(index["step"])}, tensors
+    except _UNREADABLE as error:
+        raise _make_unreadable_error(run, error) from error
+
+
+def _make_unreadable_error(run: Path, error: Exception) -> CheckpointError:
+    return CheckpointError(f"{run}: no readable checkpoint ({' '.join(f'{type(error).__name__}: {error}'.split())})")
+
+
+def _rank(score: float) -> float:
+    return math.inf if math.isnan(score) else score
 
 
 def _copy_weights(network: nn.Module) -> dict[str, Tensor]:
@@ -395,7 +331,3 @@ def _copy_weights(network: nn.Module) -> dict[str, Tensor]:
 
 def _none_where_not_finite(row: Row) -> Row:
     return {name: value if math.isfinite(value) else None for name, value in row.items()}
-
-
-def _average_known(rows: Sequence[Row], name: str) -> float:
-    return average([row for row in rows if name in row], name)

@@ -8,10 +8,8 @@ import pytest
 from helpers import run
 
 import mapctl
-from mapctl import cli
 from mapctl.commands import COMMANDS
 from mapctl.commands.shared.options import parse_size
-from mapctl.commands.train.options import TrainOptions
 
 
 @pytest.fixture(scope="session")
@@ -230,19 +228,6 @@ def test_info_names_what_is_here(prior, capsys):
         assert word in told
     assert run("info", prior) == 0
     assert json.loads(capsys.readouterr().out)["kind"] == "lstm-gmm"
-
-
-def test_train_takes_its_options(tmp_path):
-    words = ["train", "lstm-gmm", "--data", str(tmp_path), "-o", "run", "--width", "64", "--steps", "7", "--seed", "3"]
-    command = cli.parse([*words, "--match", "walk", "--device", "cpu", "--minutes-between-checkpoints", "0.5"])
-    assert isinstance(command, TrainOptions)
-    request = command.recipe()
-    assert (request.config.width, request.settings.steps, request.settings.seed) == (64, 7, 3)
-    assert (request.match, request.device, request.checkpoint_minutes) == ("walk", "cpu", 0.5)
-    paper = cli.parse([*words, "--paper"])
-    assert isinstance(paper, TrainOptions)
-    assert (paper.recipe().config.retain, paper.recipe().config.width) == (0.0, 64)
-    assert paper.recipe().settings.optimiser == "rmsprop"
 
 
 @pytest.mark.slow

@@ -20,7 +20,6 @@ from mapctl.formats.atomic import atomic_path, write_bytes
 from mapctl.formats.bvh.stream import open_bvh_stream
 from priors import checkpoints
 from priors.tensor_files import write_tensors
-from priors.training import run_files
 from scenes.writers import gif_writer, mp4_writer, save_png, webp_writer
 
 MOTION = walk(150)
@@ -52,10 +51,6 @@ def _card(path):
     checkpoints.save(density.reference.state_dict() | TENSORS, density.card, path)
 
 
-def _checkpoint(path):
-    run_files.write_checkpoint(path.parent, step=1, tensors=TENSORS, index={"curve": []})
-
-
 WRITERS = {
     "a.bvh": _save,
     "a.npz": _save,
@@ -68,7 +63,6 @@ WRITERS = {
     "a.json": lambda path: report.write_report({"values": list(range(9000))}, path),
     "a.safetensors": lambda path: write_tensors(path, TENSORS),
     "model.safetensors": _card,
-    "step-1-checkpoint.safetensors": _checkpoint,
 } | ({"a.usda": _save, "a.usdc": _save} if usd.is_installed() else {})
 
 
@@ -154,8 +148,6 @@ def test_a_card_that_finds_no_room_takes_the_weights_with_it(tmp_path, monkeypat
     monkeypatch.setattr(Path, "write_text", _no_space)
     with pytest.raises(WriteError, match=r"model\.json: No space left on device"):
         checkpoints.save(density.reference.state_dict(), density.card, tmp_path / "model.safetensors")
-    with pytest.raises(WriteError, match=r"checkpoint\.json: No space left on device"):
-        run_files.write_checkpoint(tmp_path, step=1, tensors=TENSORS, index={"curve": []})
     assert list(tmp_path.iterdir()) == []
 
 

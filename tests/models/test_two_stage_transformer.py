@@ -4,17 +4,16 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers import corpus, run
+from helpers import corpus
 from tiny_transformer import CONFIG, card, network
 
 import priors
-from mapctl import cli
 from mapctl.inbetweening.partial_motion import KnownParts
 from priors import checkpoints
 from priors.pose_transformer.inbetweener import PoseTransformer
 from priors.pose_transformer.network import _Layer, _rotary_phases
 from priors.training.augmentation.pose_windows import PoseWindows, add_targets
-from priors.training.recipes.pose_transformer import TWO_STAGE, PoseTransformerSettings, compute_losses, hide
+from priors.training.recipes.pose_transformer import PoseTransformerSettings, compute_losses, hide
 
 TWO = replace(CONFIG, detail=2)
 
@@ -96,26 +95,3 @@ def test_two_stages_are_saved_and_loaded(tmp_path):
     loaded = priors.load_inbetweener(str(path))
     assert isinstance(loaded, PoseTransformer)
     assert loaded.network.config == TWO
-
-
-def test_its_weights_are_about_as_many_as_a_stitchers():
-    count = sum(weight.numel() for weight in network(config=TWO_STAGE[0]).parameters())
-    assert 3.5e6 < count < 4.5e6
-
-
-@pytest.mark.parametrize("option", [("--width", "64"), ("--layers", "2"), ("--detail", "2"), ("--plain",)])
-def test_a_shape_of_its_own_takes_no_other(option, tmp_path, capsys):
-    words = ["train", "pose-transformer", "--data", tmp_path, "-o", tmp_path / "run", "--two-stage", *option]
-    assert run(*words) == 2
-    assert "--two-stage has a shape of its own" in capsys.readouterr().err
-
-
-def test_a_second_stage_is_an_option_and_part_of_the_command(tmp_path):
-    words = ["train", "pose-transformer", "--data", str(tmp_path), "-o", str(tmp_path / "run"), "--layers", "3"]
-    recipe = cli.parse([*words, "--detail", "2"]).recipe()
-    assert (recipe.config.layers, recipe.config.detail) == (3, 2)
-    assert recipe.usual_settings() == recipe.settings == PoseTransformerSettings()
-    assert "--layers 3 --detail 2" in recipe.format_command()
-    peer = cli.parse([*words[:6], "--two-stage"]).recipe()
-    assert peer.settings == TWO_STAGE[1]
-    assert "--two-stage" in peer.format_command()

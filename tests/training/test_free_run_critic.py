@@ -12,12 +12,11 @@ from mapctl.features import LAYOUT
 from mapctl.skeleton import CANONICAL
 from mapctl.terms.trial import Trial
 from priors.lstm_gmm.network import LstmGmmConfig
-from priors.training.adversaries import free_runs
-from priors.training.adversaries.history import HistoryBuffer
+from priors.training.history import HistoryBuffer
 from priors.training.moment_matching import MatchingSettings, run_free
-from priors.training.recipes.density.critic import CriticSettings
-from priors.training.recipes.density.settings import TrainingSettings
-from priors.training.recipes.density.trainer import DensityTrainer
+from priors.training.recipes import density_critic as free_runs
+from priors.training.recipes.density_critic import CriticSettings
+from priors.training.recipes.lstm_gmm import DensityTrainer, TrainingSettings
 from priors.training.trainer import draw_weights
 
 CRITIC = CriticSettings(steps=3, frames=8, head_start=2, batch=4, history=8, every=1)
@@ -83,9 +82,9 @@ def test_free_runs_are_as_long_as_the_critic_needs_and_begin_with_mocap():
 
 def test_the_density_hears_it_in_the_last_steps_only(monkeypatch):
     trainer, heard = make_trainer(), []
-    hear = trainer.judge.hear
-    monkeypatch.setattr(trainer.judge, "hear", lambda *run: (heard.append(trainer.step), hear(*run))[1])
-    rows = [trainer.take_step() for _ in range(5)]
+    score = trainer.judge.score
+    monkeypatch.setattr(trainer.judge, "score", lambda *run: (heard.append(trainer.step), score(*run))[1])
+    rows = [trainer.train_step() for _ in range(5)]
     assert heard == [2, 3, 4]
     assert [row["critic"] for row in rows[:2]] == pytest.approx([1.386, 1.386], abs=1e-3)
     assert all(row["critic"] != rows[0]["critic"] for row in rows[2:])
@@ -94,7 +93,7 @@ def test_the_density_hears_it_in_the_last_steps_only(monkeypatch):
 def test_its_gradient_is_what_would_make_free_runs_pass():
     trainer = make_trainer()
     while trainer.step < 2:
-        trainer.take_step()
+        trainer.train_step()
     trainer._introduce(trainer.judge)
     state = trainer.generator.get_state()
 
@@ -109,7 +108,7 @@ def test_its_gradient_is_what_would_make_free_runs_pass():
     made = run_again()
     before = believe(made)
     trainer.network.zero_grad()
-    trainer._add_gradient(trainer.judge.hear(made, generator()))
+    trainer._add_gradient(trainer.judge.score(made, generator()))
     with torch.no_grad():
         for weight in trainer.network.parameters():
             if weight.grad is not None:
@@ -120,10 +119,10 @@ def test_its_gradient_is_what_would_make_free_runs_pass():
 def test_it_learns_before_the_density_hears_it_and_then_in_each_step_from_what_was_heard(monkeypatch):
     trainer, learnt = make_trainer(), []
     update = trainer.judge._update
-    monkeypatch.setattr(trainer.judge, "_update", lambda of: (learnt.append(trainer.step), update(of))[1])
+    monkeypatch.setattr(trainer.judge, "_update", lambda *of: (learnt.append(trainer.step), update(*of))[1])
     kept = []
     for _ in range(5):
-        trainer.take_step()
+        trainer.train_step()
         kept.append(None if trainer.judge.history is None else trainer.judge.history.windows.clone())
     assert [learnt.count(step) for step in range(2, 6)] == [2, 2, 2, 2]  # two of the head start; others after the step
     assert kept[:2] == [None, None]
@@ -134,13 +133,13 @@ def test_it_learns_before_the_density_hears_it_and_then_in_each_step_from_what_w
 def test_a_run_with_it_goes_on_to_the_bit():
     whole = make_trainer()
     for _ in range(4):
-        whole.take_step()
+        whole.train_step()
     begun = make_trainer()
     for _ in range(3):
-        begun.take_step()
+        begun.train_step()
     resumed = make_trainer()
     resumed.load_state({name: values.clone() for name, values in begun.state().items()}, 3)
-    assert resumed.take_step() == pytest.approx(begun.take_step(), rel=0, abs=0)
+    assert resumed.train_step() == pytest.approx(begun.train_step(), rel=0, abs=0)
     for name, values in whole.state().items():
         assert torch.equal(values, resumed.state()[name]), name
 
@@ -148,11 +147,11 @@ def test_a_run_with_it_goes_on_to_the_bit():
 def test_what_is_kept_is_the_mean_of_the_weights_since_it_joined():
     trainer = make_trainer()
     for _ in range(2):
-        trainer.take_step()
+        trainer.train_step()
         assert all(map(torch.equal, trainer.average.parameters(), trainer.network.parameters()))
     for _ in range(3):
         before = [weight.clone() for weight in trainer.average.parameters()]
-        trainer.take_step()
+        trainer.train_step()
         done = trainer.step - 2
         keep = done / (done + 20)
         for mean, old, new in zip(trainer.average.parameters(), before, trainer.network.parameters(), strict=True):
@@ -163,7 +162,7 @@ def test_what_is_kept_is_the_mean_of_the_weights_since_it_joined():
 def test_what_is_validated_is_the_mean():
     trainer = make_trainer()
     for _ in range(4):
-        trainer.take_step()
+        trainer.train_step()
     row = trainer.validate(corpus())
     trainer.network.load_state_dict(trainer.average.state_dict())
     assert trainer.validate(corpus()) == row
@@ -190,7 +189,7 @@ def test_a_critic_that_cannot_join_is_refused(steps, window, message):
 
 
 def test_it_joins_a_density_that_is_held_to_no_moments(monkeypatch):
-    monkeypatch.setattr("priors.training.recipes.density.trainer.moment_loss", None)
+    monkeypatch.setattr("priors.training.recipes.lstm_gmm.moment_loss", None)
     trainer = make_trainer(replace(SETTINGS, matching=replace(SETTINGS.matching, begin=1.0)))
-    rows = [trainer.take_step() for _ in range(3)]
+    rows = [trainer.train_step() for _ in range(3)]
     assert rows[2]["critic"] != rows[1]["critic"]

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from mapctl.numerics.intervals import true_intervals
 from mapctl.skeleton import CANONICAL
-from priors.training.augmentation.gap_masks import GapSettings, sample_observation_mask, sample_transition
+from priors.training.augmentation.gap_masks import GapSettings, sample_observation_mask
 
 BATCH, FRAMES = 400, 120
 GAPS = GapSettings(keys=0.0, joints=0.0, partial=0.0, several=1)
@@ -130,34 +130,3 @@ def test_the_same_seed_draws_the_same_gaps():
 def test_windows_differ_from_each_other():
     known = drawn(GapSettings(joints=0.0), 0.5)
     assert len({window.numpy().tobytes() for window in known}) > 0.9 * BATCH
-
-
-def transitions(present, progress=1.0):
-    return sample_transition(present, GAPS, progress=progress, generator=generator(), past=20, after=2)
-
-
-def test_a_transition_is_one_gap_with_a_past_and_two_frames_behind_it():
-    present = torch.ones(BATCH, FRAMES, dtype=torch.bool)
-    present[:, :5] = False
-    known = transitions(present)
-    lost = (~known & present[..., None]).all(dim=2)
-    assert torch.equal(lost, (~known & present[..., None]).any(dim=2))
-    gaps = [list(true_intervals(row[:, None])) for row in lost]
-    assert all(len(found) == 1 for found in gaps)
-    starts, stops = (torch.tensor([found[0][part] for found in gaps]) for part in (1, 2))
-    assert int(stops.max()) <= FRAMES - 2
-    assert int((stops - starts).max()) > 80
-    assert int((stops - starts).min()) >= 2
-    past = starts - 5
-    assert int(past.min()) == 1
-    assert float((past < 20).float().mean()) == pytest.approx(0.2, abs=0.06)
-    begun = transitions(present, progress=0.0)
-    assert int((~begun & present[..., None]).any(dim=2).sum(dim=1).max()) <= 10
-
-
-def test_windows_without_room_for_a_transition_are_known_whole():
-    present = torch.zeros(BATCH, FRAMES, dtype=torch.bool)
-    present[:, 10:15] = True
-    lost = (~transitions(present) & present[..., None]).any(dim=2)
-    assert set(lost.nonzero()[:, 1].tolist()) == {11, 12}  # after a past of one frame there is room
-    assert int(lost.any(dim=1).sum()) < 0.1 * BATCH

@@ -12,8 +12,7 @@ from priors.lstm_gmm.network import LstmGmmConfig
 from priors.lstm_gmm.paces import PACE_LABELS
 from priors.training.mocap.paces import follow_paces
 from priors.training.moment_matching import MatchingSettings, moment_loss, run_free
-from priors.training.recipes.density.settings import TrainingSettings
-from priors.training.recipes.density.trainer import DensityTrainer
+from priors.training.recipes.lstm_gmm import DensityTrainer, TrainingSettings
 
 SETTINGS = MatchingSettings(batch=8, context=10, wander=0, frames=10)
 

@@ -13,10 +13,8 @@ from priors.lstm_gmm.labels import Labels
 from priors.lstm_gmm.network import LstmGmm, LstmGmmConfig
 from priors.lstm_gmm.paces import PACE_LABELS, read_pace_rates
 from priors.training.corpus import Corpus
-from priors.training.mocap.holdings import measure_holdings
-from priors.training.mocap.paces import follow_paces, measure_speeds
-from priors.training.recipes.density.settings import TrainingSettings
-from priors.training.recipes.density.trainer import DensityTrainer
+from priors.training.mocap.paces import follow_paces, measure_pace_changes, measure_speeds
+from priors.training.recipes.lstm_gmm import DensityTrainer, TrainingSettings
 
 pytestmark = pytest.mark.usefixtures("small_judgements")
 WINDOW = 20
@@ -77,9 +75,9 @@ def test_a_pace_is_hidden_like_other_labels(trainer):
 
 
 def test_rates_are_those_of_the_clips(clips):
-    holds = measure_holdings(clips)
+    holds = measure_pace_changes(clips)
     minutes = holds["minutes by pace"]
-    assert sum(minutes.values()) == pytest.approx(holds["minutes"], abs=0.02)
+    assert sum(minutes.values()) == pytest.approx(len(clips.features) / 1800, abs=0.02)
     rates = read_pace_rates(holds)
     assert rates["stand", "walk"] == pytest.approx(1 / (60 * minutes["stand"]))
     assert rates["walk", "stand"] == pytest.approx(1 / (60 * minutes["walk"]))
@@ -96,7 +94,6 @@ def test_a_density_that_is_trained_so_knows_paces(tmp_path, capfd, monkeypatch):
     prior = priors.load(str(tmp_path / "run"))
     assert prior.labels == {"pace": ["stand", "walk", "run"]}
     assert prior.pace_rates == read_pace_rates(prior.card.data["holds"])
-    assert "--label-pace" in prior.card.training["command"]
     starts = prior.conditioned_on(["walk"]).initial_states
     assert bool((starts.speed > 0.4).all())
     told = prior.conditioned_on(["pace=run"]).reference.fc1.bias

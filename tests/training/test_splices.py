@@ -228,14 +228,6 @@ def test_they_are_kept_for_a_run_that_goes_on(corpus, tmp_path, all_pass, monkey
     assert torch.equal(add_splices(corpus, Splices(4, one), cache).features, made.features)
 
 
-def test_who_made_them_is_told(corpus, tiny, all_pass):
-    made = add_splices(corpus, Splices(6, tiny)).made
-    assert made.told == ("splices: 6 of 6 that were tried, by tiny.safetensors (free)",)
-    assert made.licences == {"free"}
-    assert len(made.clips) <= 6
-    assert all(name.startswith(FOLDER) for name in made.clips)
-
-
 @pytest.mark.slow
 def test_ways_of_many_motions_are_those_of_each(corpus):
     stitcher, clips = tiny_stitcher(), corpus.clips()
@@ -272,10 +264,9 @@ def test_a_density_is_trained_on_them_and_its_card_says_so(data, tmp_path, tiny,
     assert train(data, tmp_path / "alone", "--quiet") == 0
     capsys.readouterr()
     assert train(data, tmp_path / "run", "--splices", 9, "--stitcher", tiny) == 0
-    assert "made, not captured: splices: 9 of 9 that were tried, by tiny.safetensors (free)" in capsys.readouterr().out
+    assert "9 of 9 splices pass for mocap" in capsys.readouterr().out
     card, alone = (priors.load(str(tmp_path / name)).card for name in ("run", "alone"))
-    assert card.data["made"] == ["splices: 9 of 9 that were tried, by tiny.safetensors (free)"]
-    assert card.training["command"].endswith(f"--splices 9 --stitcher {tiny}")
+    assert (card.data["splices"], card.data["stitcher"]) == ("9", str(tiny))
     assert card.data["held_out"] == alone.data["held_out"]
     assert card.data["trained_on"]["clips"] == alone.data["trained_on"]["clips"] + 9
     assert "splices" not in alone.data
@@ -301,19 +292,6 @@ def test_a_splice_has_no_label_and_no_start_lies_in_one(data, tmp_path, tiny, al
 
 
 @pytest.mark.slow
-def test_clips_that_were_made_before_are_told_beside_them(data, tmp_path, tiny, all_pass):
-    made = tmp_path / "made"
-    made.mkdir()
-    waving(95).save(made / "made_000.bvh")
-    (made / "made.csv").write_text("file,kept,model,licence,seed,script,why not\nmade_000.bvh,yes,free,CC0,1,,\n")
-    assert train(data, tmp_path / "run", "--made", made, "--splices", 3, "--stitcher", tiny, "--quiet") == 0
-    assert priors.load(str(tmp_path / "run")).card.data["made"] == [
-        "made.csv: 1 of 1 clips, by free (CC0)",
-        "splices: 3 of 3 that were tried, by tiny.safetensors (free)",
-    ]
-
-
-@pytest.mark.slow
 def test_clips_that_are_held_out_are_in_no_splice(data, tmp_path, tiny, all_pass):
     seen = []
 
@@ -322,24 +300,9 @@ def test_clips_that_are_held_out_are_in_no_splice(data, tmp_path, tiny, all_pass
         return add_splices(corpus, splices, cache)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("priors.training.gathering.add_splices", see)
+        patch.setattr("priors.training.recipes.lstm_gmm.add_splices", see)
         assert train(data, tmp_path / "run", "--splices", 9, "--stitcher", tiny, "--quiet") == 0
     held = priors.load(str(tmp_path / "run")).card.data["held_out"]
     (names,) = seen
     assert held
     assert not {name for part in held.values() for name in part} & {*names}
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (("--stitcher", "stitcher"), "--stitcher makes --splices N of the clips"),
-        (("--splices", -1), "--splices must be 0 or more"),
-        (("--splices", 3, "--stitcher", "nobody"), "nobody"),
-        (("--splices", 3, "--match", "walk"), "in which somebody stands"),
-    ],
-)
-def test_what_makes_no_sense_is_refused(data, tmp_path, capsys, words, said):
-    assert train(data, tmp_path / "run", *words) == 2
-    assert said in capsys.readouterr().err
-    assert not (tmp_path / "run" / "model.safetensors").exists()

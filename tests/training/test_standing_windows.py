@@ -7,7 +7,7 @@ from helpers import generator, go_at, run, write_corpus
 import priors
 from mapctl.errors import RequestError
 from priors.training.corpus import Corpus, find_window_starts
-from priors.training.recipes.density.settings import TrainingSettings
+from priors.training.recipes.lstm_gmm import TrainingSettings
 from priors.training.windows import FeatureWindows
 
 FRAMES = 20

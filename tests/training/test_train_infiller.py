@@ -1,4 +1,4 @@
-"""What `mapctl train infiller` is made of; its runs are tested in test_network_runs."""
+"""What `mapctl train infiller` is made of; its runs are tested in test_runs."""
 
 import math
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""What `mapctl train path` is made of; its runs are tested in test_network_runs."""
+"""What `mapctl train path` is made of; its runs are tested in test_runs."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""What `mapctl train pose-transformer` is made of; its runs are tested in test_network_runs."""
+"""What `mapctl train pose-transformer` is made of; its runs are tested in test_runs."""
 
 import math
 from dataclasses import replace
@@ -85,15 +85,9 @@ def test_lost_joints_count_as_much_as_a_gap():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("optimiser", ["muon", "adam"])
-def test_the_loss_falls_on_windows_that_it_sees_again_and_again(optimiser):
+def test_the_loss_falls_on_windows_that_it_sees_again_and_again():
     settings = PoseTransformerSettings(
-        steps=60,
-        batch=120,
-        window=32,
-        learning_rate=5e-3,
-        optimiser=optimiser,
-        variation=replace(SETTINGS.variation, share=0.0),
+        steps=60, batch=120, window=32, learning_rate=5e-3, variation=replace(SETTINGS.variation, share=0.0)
     )
     trainer, rows = (
         PoseTransformerTrainer(PoseTransformerConfig(width=48, layers=2, heads=2), settings, corpus(1, 60)),
@@ -130,8 +124,8 @@ def test_the_spread_learns_alone_and_is_calibrated():
     }
     assert touched
     assert all(name.startswith("spread.") for name in touched)
-    calibrate_spread(trainer, corpus(2, 60))
-    covered = measure_coverage(trainer, corpus(2, 60))
+    calibrate_spread(trainer, corpus(2, 80))
+    covered = measure_coverage(trainer, corpus(2, 80))
     assert covered["within_50%"] == pytest.approx(0.5, abs=0.12)
     assert covered["within_90%"] == pytest.approx(0.9, abs=0.08)
 
@@ -148,7 +142,7 @@ def test_validation_is_the_same_each_time_and_leaves_out_gaps_that_are_too_long(
 
 @pytest.mark.slow
 def test_what_the_command_line_trains_fills_gaps(tmp_path, data):
-    words = ["--steps", 2, "--batch", 60, "--window", 32, "--width", 25, "--plain", "--quiet"]
+    words = ["--steps", 2, "--batch", 60, "--window", 32, "--width", 25, "--quiet"]
     assert run("train", "pose-transformer", "--data", data, "-o", tmp_path / "run", *words, "--layers", 1) == 2
     words[words.index(25)] = 16
     assert run("train", "pose-transformer", "--data", data, "-o", tmp_path / "run", *words, "--layers", 1) == 0
@@ -166,5 +160,5 @@ def test_a_run_that_goes_on_from_a_model_keeps_out_what_was_kept_from_that(recip
     held = checkpoints.Card("any", {}, licence="none", data={"split_seed": 7}, **checkpoints.Card.layout_fields())
     checkpoints.save({"one": torch.zeros(1)}, held, tmp_path / "init.safetensors")
     made = recipe(data=tmp_path, out=tmp_path / "run", init=str(tmp_path / "init.safetensors"))
-    assert made.source().seed == made.split_seed == 7
-    assert replace(made, init=None).source().seed == made.settings.seed
+    assert made.split_seed == 7
+    assert replace(made, init=None).split_seed == made.settings.seed

@@ -8,11 +8,9 @@ from helpers import write_corpus
 from tiny_path import save_tiny_path
 
 import priors
-from mapctl.commands.train.tweener import TrainTweener
 from mapctl.errors import RequestError
 from priors.training.recipes.tweener import TweenerRecipe, TweenerSettings
 from priors.training.run import train
-from priors.tweening.styles import LABELS
 
 SETTINGS = replace(TweenerSettings(), steps=1, batch=3, window=32)
 
@@ -32,7 +30,6 @@ def test_an_exported_run_knows_the_classes_of_its_training_clips(recipe):
     held_out = {name for part in tweener.card.data["held_out"].values() for name in part}
     seen = {f"{number}" for number in range(5) if f"walk-{number}.bvh" not in held_out}
     assert set(tweener.classes) == seen
-    assert "--labels 'walk-([0-4])'" in tweener.card.training["command"]
 
 
 def test_labels_that_cannot_be_are_refused_before_training(recipe):
@@ -40,10 +37,3 @@ def test_labels_that_cannot_be_are_refused_before_training(recipe):
         with pytest.raises(RequestError, match=said):
             train(replace(recipe, labels=labels, out=recipe.out / "other"), lambda line: None)
         assert not list(recipe.out.glob("other/*checkpoint*"))
-
-
-def test_the_option_is_the_recipe_s(recipe):
-    told = TrainTweener(data=recipe.data, out=recipe.out, labels="(x)", path=recipe.path).recipe()
-    assert told.labels == "(x)"
-    assert TrainTweener(data=recipe.data, out=recipe.out, path=recipe.path).recipe().labels == LABELS
-    assert "--labels" not in recipe.format_command()

@@ -23,7 +23,6 @@ class Info(ModelCommand, options.RigOptions):
     any format that `mapctl convert` reads, of which rig, joints, unit, axes and length are printed, and whether the fit
     is sure, doubtful or refused, with reasons."""
     out: Annotated[Path | None, arg(aliases=["-o"], metavar="FILE.png")] = None
-    """A picture of a clip's rig: its T-pose with both names of each joint, two frames, axes, and what is doubtful. Of a
-    run folder or a prior: its losses and validations over the steps."""
+    """A picture of a clip's rig: its T-pose with both names of each joint, two frames, axes, and what is doubtful."""
     json: bool = False
     """Print JSON instead of tables."""

@@ -10,7 +10,6 @@ import torch
 import scenes
 from mapctl import report
 from mapctl.commands.info import Info, clip
-from mapctl.commands.shared import outputs
 from mapctl.commands.shared.tables import print_table
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
@@ -28,10 +27,8 @@ def run(command: Info) -> int:
     """Collect and print."""
     if command.name is not None and clip.is_clip(command.name):
         clip.print_clip(Path(command.name), command)
-    elif command.out is not None and command.name is not None and command.rig is None:
-        _plot_training(command.name, command.out)
     elif command.out is not None:
-        raise RequestError("--out is a picture of a clip's rig or a run's training: mapctl info CLIP|RUN -o FILE.png")
+        raise RequestError("--out is a picture of a clip's rig: mapctl info CLIP -o FILE.png")
     elif command.rig is not None or command.unit is not None or command.up is not None:
         raise RequestError("--rig, --unit and --up are of a clip: mapctl info CLIP --rig PRESET|FILE.toml|CLIP")
     elif command.name is not None:
@@ -47,15 +44,6 @@ def run(command: Info) -> int:
     else:
         _print_tables()
     return 0
-
-
-def _plot_training(name: str, path: Path) -> None:
-    """Draw how a run or prior was trained, and say what was written."""
-    outputs.check_picture(path, given=Path(name))
-    from mapctl.commands.train.curves import plot_run
-
-    count = plot_run(name, path)
-    print(f"wrote {path} ({count} curves)")
 
 
 def _print_tables() -> None:

@@ -44,13 +44,6 @@ class ClipCopies:
             if not 0 <= getattr(self, name) <= _MOST:
                 raise RequestError(f"--{name} must lie between 0 and {_MOST}, got {getattr(self, name):g}")
 
-    def format_options(self) -> list[str]:
-        """Options of the command, for the card; none where there are no copies."""
-        usual = ClipCopies()
-        changed = [name for name in ("tempo", "strides") if getattr(self, name) != getattr(usual, name)]
-        options = [f"--copies {self.count}", *(f"--{name} {getattr(self, name):g}" for name in changed)]
-        return options if self.count else []
-
 
 def add_copies(corpus: Corpus, copies: ClipCopies, generator: torch.Generator) -> Corpus:
     """Return a corpus with its clips, and after them so many copies of each, under the same names."""
@@ -65,7 +58,7 @@ def add_copies(corpus: Corpus, copies: ClipCopies, generator: torch.Generator) -
             if corpus.lengths[number] > 1 + tempo:
                 clips.append(copy_clip(windows, number, tempo=tempo, strides=strides))
                 names.append(name)
-    return Corpus(tuple(names), tuple(map(len, clips)), torch.cat(clips), corpus.skipped, corpus.cuts, corpus.made)
+    return Corpus(tuple(names), tuple(map(len, clips)), torch.cat(clips), corpus.skipped, corpus.cuts)
 
 
 def copy_clip(windows: PoseWindows, number: int, *, tempo: float, strides: float) -> Float[Tensor, "frames size"]:

@@ -26,7 +26,6 @@ from mapctl.runtime.stepwise import StepwiseWork
 from priors.checkpoints import compute_hash
 from priors.stitching.inbetweener import MAX_CONTEXT, Stitcher, load
 from priors.training.corpus import Corpus, read_cache, write_cache
-from priors.training.mocap.made import Made
 from priors.training.mocap.paces import measure_speeds
 
 FOLDER = "spliced/"
@@ -65,11 +64,6 @@ class Splices:
         if self.count < 0:
             raise RequestError(f"--splices must be 0 or more, got {self.count}")
 
-    def format_options(self) -> list[str]:
-        """Options of the command, for the card; none where there are no splices."""
-        named = [] if self.stitcher == Splices.stitcher else [f"--stitcher {self.stitcher}"]
-        return [f"--splices {self.count}", *named] if self.count else []
-
 
 @dataclass(frozen=True)
 class Cut:
@@ -91,7 +85,7 @@ class Cut:
 
 def add_splices(corpus: Corpus, splices: Splices, cache: Path | None = None) -> Corpus:
     """Return a corpus with its clips, and after them the splices of them that no measure tells from them, by names that
-    begin with FOLDER; it says who made them. In the folder `cache` they are kept: a run that is resumed reads them.
+    begin with FOLDER. In the folder `cache` they are kept: a run that is resumed reads them.
 
     Who stands sets off, who goes stops, and who stands does something else, as often each where the clips have it, and
     twice as often who walks begins to run, and who runs slows down to a walk; the second piece begins where velocities
@@ -99,21 +93,18 @@ def add_splices(corpus: Corpus, splices: Splices, cache: Path | None = None) -> 
     """
     if splices.count == 0:
         return corpus
-    stitcher, made = load(splices.stitcher), corpus.made
+    stitcher = load(splices.stitcher)
     stored = cache / f"splices-{_compute_cache_key(corpus, splices)}.safetensors" if cache else None
     kept = read_cache(stored) if stored else None
     if kept is None:
         kept = _make_splices(corpus, splices, stitcher)
         if stored:
             write_cache(kept, stored)
-    maker, licence = Path(stitcher.name).name, stitcher.card.licence
-    told = f"splices: {len(kept.names)} of {splices.count} that were tried, by {maker} ({licence})"
     return replace(
         corpus,
         names=corpus.names + kept.names,
         lengths=corpus.lengths + kept.lengths,
         features=torch.cat([corpus.features, kept.features]),
-        made=Made(made.clips | {*kept.names}, (*made.told, told), made.licences | {licence}),
     )
 
 

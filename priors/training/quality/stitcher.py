@@ -29,7 +29,7 @@ _ACTIVE = 0.01  # variance of a posterior's mean from which on a dimension is in
 
 @torch.no_grad()
 def measure_transitions(
-    network: StitcherNetwork, posterior: PosteriorNetwork | None, windows: TransitionWindows
+    network: StitcherNetwork, posterior: PosteriorNetwork, windows: TransitionWindows
 ) -> dict[str, float]:
     """Measure the calm answer to two bare poses, and to a pose after 10 frames, as shares of the interpolation's mean
     distance of joints; and in a gap of 30 frames what the latents do, draws at the weights' temperature.
@@ -100,7 +100,7 @@ def _true_places(truth: Transition) -> tuple[Tensor, Tensor]:
 
 
 def _measure_draws(
-    network: StitcherNetwork, posterior: PosteriorNetwork | None, truth: Transition, places: Tensor
+    network: StitcherNetwork, posterior: PosteriorNetwork, truth: Transition, places: Tensor
 ) -> dict[str, float]:
     calm = place(answer(network, truth, make_calm(network, truth)))
     draws = _draw(network, truth, float(network.temperature))
@@ -114,7 +114,7 @@ def _measure_draws(
         "jitter": float(_measure_acceleration(draws[0]) / _measure_acceleration(places)),
         "calm_jitter": float(_measure_acceleration(calm) / _measure_acceleration(places)),
         "expert_least": float(shares.mean(dim=(0, 1, 2)).amin()),
-    } | ({} if posterior is None else _measure_posterior(network, posterior, truth, places))
+    } | _measure_posterior(network, posterior, truth, places)
 
 
 def _measure_posterior(

@@ -86,9 +86,7 @@ class DenoiserTrainer(GradientTrainer[DenoiserNetwork]):
 
     def losses(self) -> dict[str, Tensor]:
         """Compute the losses of a newly drawn batch."""
-        windows = draw_performers(
-            self.windows, self.settings, self.generator, batch=self.group.share(self.settings.batch)
-        )
+        windows = draw_performers(self.windows, self.settings, self.generator, batch=self.settings.batch)
         return compute_denoiser_losses(self.network, windows, self.settings, self.generator)
 
     def validate(self, corpus: Corpus) -> dict[str, Any]:
@@ -109,27 +107,18 @@ class DenoiserRecipe(NetworkRecipe[DenoiserConfig, DenoiserSettings, DenoiserTra
     """What to train a denoiser on, and how."""
 
     kind = "denoiser"
-    headline = "loss, cm and weighted angles, feet, contacts"
     config: DenoiserConfig = field(default_factory=DenoiserConfig)
     """The network."""
     settings: DenoiserSettings = field(default_factory=DenoiserSettings)
     """How it is trained."""
 
-    def make_untaught(self, parts: Split) -> DenoiserTrainer:
-        """The trainer, its weights drawn."""
+    def draw_trainer(self, parts: Split) -> DenoiserTrainer:
+        """Make the trainer with drawn weights."""
         return DenoiserTrainer(self.config, self.settings, parts.train)
 
-    @classmethod
-    def find_headline(cls, row: Row) -> float:
+    def score(self, row: Row) -> float:
         """The loss of unseen windows."""
         return average_logarithms([row.get("loss")])
-
-    def format_shape(self) -> list[str]:
-        """The width and the weight of angles, if they are others than usual."""
-        words = [] if self.config.width == DenoiserConfig.width else [f"--width {self.config.width}"]
-        if self.settings.angles != DenoiserSettings.angles:
-            words.append(f"--angles {self.settings.angles:g}")
-        return words
 
 
 def draw_performers(

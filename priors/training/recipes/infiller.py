@@ -78,13 +78,13 @@ class InfillerTrainer(GradientTrainer[InfillerNetwork]):
 
     def losses(self) -> dict[str, Tensor]:
         """Compute the losses of a newly drawn batch."""
-        window, progress = self._draw(), self.step / self.first_steps
+        window, progress = self._draw(), self.step / self.steps
         gaps, generator = self.settings.gaps, self.generator
         known = sample_observation_mask(window.present, gaps, progress=progress, generator=generator)
         return compute_infiller_losses(self.network, window, known, self.settings)
 
     def _draw(self) -> Window:
-        return self.windows.draw(self.group.share(self.settings.batch), self.generator)
+        return self.windows.draw(self.settings.batch, self.generator)
 
     @torch.no_grad()
     def validate(self, corpus: Corpus) -> dict[str, Any]:
@@ -110,26 +110,19 @@ class InfillerRecipe(NetworkRecipe[InfillerConfig, InfillerSettings, InfillerTra
     """What to train an infiller on, and how."""
 
     kind = "infiller"
-    headline = "error over the guess's"
     config: InfillerConfig = field(default_factory=InfillerConfig)
     """The network."""
     settings: InfillerSettings = field(default_factory=InfillerSettings)
     """How it is trained."""
 
-    def make_untaught(self, parts: Split) -> InfillerTrainer:
-        """The trainer, its weights drawn."""
+    def draw_trainer(self, parts: Split) -> InfillerTrainer:
+        """Make the trainer with drawn weights."""
         return InfillerTrainer(self.config, self.settings, parts.train)
 
-    @classmethod
-    def find_headline(cls, row: Row) -> float:
+    def score(self, row: Row) -> float:
         """Error of gaps in unseen windows over that of the guess, geometric mean over their lengths."""
         gaps = [gap for gap in VALIDATED_GAPS if row.get(f"guess_{gap}_cm") and row.get(f"error_{gap}_cm")]
         return average_logarithms(row[f"error_{gap}_cm"] / row[f"guess_{gap}_cm"] for gap in gaps)
-
-    def format_shape(self) -> list[str]:
-        """The architecture, if it is another than usual."""
-        usual = InfillerConfig.architecture
-        return [] if self.config.architecture == usual else [f"--architecture {self.config.architecture}"]
 
 
 def compute_infiller_losses(

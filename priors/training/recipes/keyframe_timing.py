@@ -83,8 +83,6 @@ class KeyframeTimingRecipe(Recipe[KeyframeTimingConfig, KeyframeTimingSettings, 
 
     kind = "keyframe-timing"
     uses_gpu = False
-    falls = False
-    headline = "half of pairs off by a factor of"
     config: KeyframeTimingConfig = field(default_factory=KeyframeTimingConfig)
     """The regression."""
     settings: KeyframeTimingSettings = field(default_factory=KeyframeTimingSettings)
@@ -94,8 +92,7 @@ class KeyframeTimingRecipe(Recipe[KeyframeTimingConfig, KeyframeTimingSettings, 
         """With the pairs of poses that it is fitted to."""
         return KeyframeTimingTrainer(self.config, self.settings, parts.train)
 
-    @classmethod
-    def find_headline(cls, row: Row) -> float:
+    def score(self, row: Row) -> float:
         """The factor by which half of unseen pairs are off at most."""
         return average_logarithms([row.get("half_off_by")])
 

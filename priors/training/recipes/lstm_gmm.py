@@ -1,31 +1,329 @@
-"""What the LSTM-GMM is trained on, and what of it is written (Wang et al. 2019)."""
+"""Training of the LSTM-GMM: Wang et al. 2019, section 4.1.3, with departures.
 
+Windows of clips with noise on the inputs; loss is the negative log density of the next frame (Eq. 8).
+"""
+
+import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
 
 import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+from torch.nn.functional import one_hot
 
 from mapctl.errors import RequestError
-from mapctl.features import LAYOUT
 from priors.config import require_at_least
 from priors.lstm_gmm import density, labels
-from priors.lstm_gmm.network import LstmGmmConfig
+from priors.lstm_gmm.labels import Labels
+from priors.lstm_gmm.network import NOISE_UNIT, LstmGmm, LstmGmmConfig
 from priors.lstm_gmm.paces import PACE_LABELS
 from priors.stitching import inbetweener
-from priors.training.augmentation.clip_copies import add_copies
-from priors.training.augmentation.splices import Splices, drop_splices, hide_splices
+from priors.training.augmentation.clip_copies import ClipCopies, add_copies
+from priors.training.augmentation.splices import Splices, add_splices, drop_splices, hide_splices
 from priors.training.corpus import Corpus, Split
 from priors.training.devices import make_generator, use_device
-from priors.training.gathering import DataSource, describe_selection, find_split_seed, name_origin
+from priors.training.feature_statistics import compute_feature_statistics
+from priors.training.history import HistoryBuffer
 from priors.training.initial_states import measure_data_limits, select_initial_states
-from priors.training.mocap.holdings import measure_holdings
-from priors.training.mocap.paces import follow_paces
+from priors.training.mocap.paces import follow_paces, measure_pace_changes
+from priors.training.moment_matching import MatchingSettings, moment_loss, run_free
 from priors.training.quality import density as density_quality
-from priors.training.recipe import Export, Gathered, Recipe, Row, average
-from priors.training.recipes.density.settings import PAPER, PLAIN, TrainingSettings
-from priors.training.recipes.density.trainer import DensityTrainer
+from priors.training.recipe import Export, Gathered, Progress, Recipe, Row
+from priors.training.recipes.density_critic import CriticSettings, FreeRunJudge
+from priors.training.trainer import GradientTrainer
+from priors.training.windows import FeatureWindows
+
+_KEEP_GROUP_PROBABILITY = 0.7
+_LEAST_RUNS = 4  # free runs that are compared: slow ones with slow ones, by quarters
+_UNTOLD = {"critic": 2 * math.log(2), "told": 0.5}  # of a critic that knows nothing
+
+
+@dataclass(frozen=True)
+class TrainingSettings:
+    """How a density is trained."""
+
+    steps: int = 20_000
+    """Optimiser steps in all."""
+    batch: int = 128
+    """Windows a step."""
+    window: int = 50
+    """Frames a window."""
+    learning_rate: float = 1e-3
+    """At the start."""
+    gradient_clip: float = 5.0
+    """The gradient's norm is clipped to this."""
+    input_noise: float = 0.05
+    """Standard deviation of the noise on normalised inputs (section 4.1.3)."""
+    noise_range: float = 4.0
+    """Each window draws its noise level log-uniformly between `input_noise` and this many times it; 1 is the paper.
+    A network that knows the level is shown all levels down to none, low ones more often."""
+    bit_flips: float = 0.02
+    """Share of input contact bits that are flipped."""
+    copies: ClipCopies = field(default_factory=ClipCopies)
+    """Copies of the clips at other tempos and with other strides, for corpora of a few minutes."""
+    standing_share: float = 1.0
+    """Share of the windows in which nobody goes anywhere that are drawn: where most of the motion stands, a density
+    that sees all of them stands fast, and is hard to steer into a walk."""
+    weight_decay: float = 1e-4
+    """Decoupled."""
+    matching: MatchingSettings = field(default_factory=MatchingSettings)
+    """Free runs held to the data's moments."""
+    critic: CriticSettings = field(default_factory=CriticSettings)
+    """Free runs judged by a critic."""
+    untold: float = 0.5
+    """Share of the windows without labels; the others show each group (gait, style) with probability 0.7."""
+    bfloat16: bool = False
+    """The network computes in bfloat16, weights and loss stay in float32: faster where the processor has it."""
+    seed: int = 1
+    """Seed of weights, windows and noise."""
+
+    def __post_init__(self):
+        require_at_least(self, 1, "steps", "batch", "window")
+        if self.critic.steps >= self.steps:
+            raise RequestError(
+                f"a critic joins the last steps of a run: {self.critic.steps} of them are not under the {self.steps} of"
+                " all"
+            )
+        if self.critic.steps and self.window < self.critic.frames:
+            raise RequestError(f"the critic sees {self.critic.frames} frames; windows have {self.window}")
+        if not 0 < self.standing_share <= 1:
+            raise RequestError(f"the share of standing windows must be over 0 and at most 1: {self.standing_share:g}")
+
+
+class DensityTrainer(GradientTrainer[LstmGmm]):
+    """Draws windows, spoils the inputs, and makes the frames after them likelier."""
+
+    def __init__(
+        self,
+        config: LstmGmmConfig,
+        settings: TrainingSettings,
+        corpus: Corpus,
+        *,
+        labels: Labels | None = None,
+        paces: Int[Tensor, " frames"] | None = None,
+        init: Mapping[str, Tensor] | None = None,
+    ):
+        """`labels` of the corpus' clips, the network's own, with those of PACE_LABELS held by none; `paces` of its
+        frames, as `follow_paces` finds them, if these are told; `init` holds weights and statistics to begin with."""
+        self.settings = settings
+        mean, std = compute_feature_statistics(corpus.features)
+        super().__init__(
+            lambda: LstmGmm(config, mean=mean, std=std),
+            steps=settings.steps,
+            learning_rate=settings.learning_rate,
+            seed=settings.seed,
+        )
+        if init is not None:
+            self.network.load_state_dict(dict(init))
+        self.labels = labels or Labels.none(len(corpus.lengths))
+        self.paces = paces
+        self._pace_labels = [] if paces is None else [self.labels.names.index(name) for name in PACE_LABELS]
+        self.clip_ends = torch.tensor(corpus.lengths).cumsum(0)
+        self.windows = FeatureWindows(corpus, settings.window + 1, standing_share=settings.standing_share)
+        self._latest = corpus.features[:0], self.labels.held[:0]  # windows of the step under way, and their labels
+        self.judge: FreeRunJudge | None = None
+        self.average = self.network
+        """Moving average of the weights since the critic joined, the weights themselves without one."""
+        if settings.critic.steps:
+            self.judge = FreeRunJudge(settings.critic, self.windows, seed=settings.seed)
+            self.average = copy.deepcopy(self.network).requires_grad_(False)
+
+    @property
+    def exported(self) -> LstmGmm:
+        """The moving average of the weights."""
+        return self.average
+
+    def networks(self) -> dict[str, nn.Module]:
+        """All that is learnt, by its name in checkpoints."""
+        critic = {} if self.judge is None else {"average": self.average, "critic": self.judge.network}
+        return {"model": self.network, **critic}
+
+    def optimisers(self) -> dict[str, torch.optim.Optimizer]:
+        """One for each of the two that contend."""
+        return super().optimisers() | ({} if self.judge is None else {"critic-optimiser": self.judge.optimiser})
+
+    def state(self) -> dict[str, Tensor]:
+        """Return everything that a continuation needs, but the step."""
+        if self.judge is None or self.judge.history is None:
+            return super().state()
+        return super().state() | {"history": self.judge.history.windows}
+
+    def load_state(self, tensors: Mapping[str, Tensor], step: int) -> None:
+        """Go on from what `state` returned; KeyError or RuntimeError where it is not whole."""
+        super().load_state(tensors, step)
+        if self.judge is not None and "history" in tensors:
+            self.judge.history = HistoryBuffer(tensors["history"].to(self.windows.features.device))
+
+    def train_step(self) -> dict[str, float]:
+        """One update, and those of the critic where it has joined; `critic` is its loss, 1.39 where it knows nothing,
+        `told` the share of windows that it tells from mocap."""
+        if self.judge is not None and self._criticised == 0:
+            self._introduce(self.judge)
+        parts = super().train_step()
+        if self.judge is None:
+            return parts
+        if self.judge.history is None:
+            self.average.load_state_dict(self.network.state_dict())
+            return {**parts, **_UNTOLD}
+        parts |= self.judge.learn(self.step, self.settings.critic.updates, self.generator)
+        keep = min(self.settings.critic.average, self._criticised / (self._criticised + 20))
+        with torch.no_grad():
+            for mean, weight in zip(self.average.parameters(), self.network.parameters(), strict=True):
+                mean.lerp_(weight, 1 - keep)
+        return parts
+
+    def losses(self) -> dict[str, Tensor]:
+        """Compute the losses of a newly drawn batch, nats a frame."""
+        self._latest = self._draw_windows()
+        return {"loss": -self._log_prob(*self._latest).mean()}
+
+    def limit_gradients(self) -> None:
+        """Clip, and add the gradient of free runs where it is time for it."""
+        settings, matching = self.settings, self.settings.matching
+        nn.utils.clip_grad_norm_(self.network.parameters(), settings.gradient_clip)
+        if self._joined is not None:
+            if self._criticised % settings.critic.every == 0:
+                self._add_free_run_gradients(*self._latest)
+            return
+        begin = matching.begin * (self.steps - settings.critic.steps)
+        if matching.begin < 1 and self.step >= begin and self.step % matching.every == 0:
+            self._add_free_run_gradients(*self._latest)
+
+    def compute_learning_rate(self) -> float:
+        """Compute that of the current step."""
+        settings = self.settings
+        if self._joined is not None:
+            return settings.critic.compute_learning_rate(self._criticised, settings.critic.steps)
+        steps = self.steps - settings.critic.steps
+        warm = min(1.0, (self.step + 1) / 200)
+        return warm * settings.learning_rate * 0.5 * (1 + math.cos(math.pi * min(1.0, self.step / steps)))
+
+    def make_optimisers(self) -> dict[str, torch.optim.Optimizer]:
+        """Make AdamW with the settings' weight decay."""
+        settings, weights = self.settings, self.network.parameters()
+        adam = torch.optim.AdamW(weights, lr=settings.learning_rate, weight_decay=settings.weight_decay)
+        return {"optimiser": adam}
+
+    def validate(self, corpus: Corpus) -> dict[str, float]:
+        """Likelihood and the health of free runs: likelihood does not predict stability."""
+        self.average.eval()
+        row = {"validation_nats": density_quality.compute_validation_nats(self.average, corpus)}
+        row |= density_quality.measure_free_runs(self.average, corpus)
+        self.average.train()
+        return row
+
+    @property
+    def _criticised(self) -> int:
+        """Steps since the critic joined; below 0 before."""
+        return self.step - self.steps + self.settings.critic.steps
+
+    @property
+    def _joined(self) -> FreeRunJudge | None:
+        """The critic, once it has joined."""
+        return self.judge if self._criticised >= 0 else None
+
+    @torch.no_grad()
+    def _introduce(self, judge: FreeRunJudge) -> None:
+        """Show the critic what the density makes, and let it learn, before the density hears it."""
+        settings = self.settings.critic
+        self.average.load_state_dict(self.network.state_dict())
+        made, count = [], settings.history
+        while sum(map(len, made)) < count:
+            made.append(self._run_free(*self._draw_windows())[0])
+        judge.fill(torch.cat(made)[:count])
+        with torch.enable_grad():
+            judge.learn(self.step, settings.head_start, self.generator)
+
+    def _run_free(self, windows: Tensor, told: Tensor) -> tuple[Tensor, Tensor]:
+        """Free runs after the first windows, told their paces as the network is in this step, and how these go on.
+
+        A pace may change within a window. Gait and style last, and runs have them from the frames they begin with: told
+        them as well, a density of walks was no better.
+        """
+        matching = self.settings.matching
+        matching = replace(matching, batch=max(_LEAST_RUNS, matching.batch))
+        least = self.settings.critic.frames if self.judge is not None else 0
+        paces = torch.zeros_like(told)
+        paces[:, self._pace_labels] = told[:, self._pace_labels]
+        condition = self._make_condition(told.new_zeros(len(told), 1), paces)
+        return run_free(self.network, windows, matching, self.generator, least=least, condition=condition)
+
+    def _add_free_run_gradients(self, windows: Tensor, told: Tensor) -> None:
+        """Add the gradient of the free runs' mismatch, and that of what the critic says of them where it has joined,
+        each clipped on its own: no loss drowns another."""
+        judge, (made, real) = self._joined, self._run_free(windows, told)
+        if self.settings.matching.begin < 1:
+            moments = moment_loss(made[:, : real.shape[1]], real, self.settings.matching)
+            self._add_gradient(moments, retain_graph=judge is not None)
+        if judge is not None:
+            self._add_gradient(judge.score(made, self.generator))
+
+    def _add_gradient(self, loss: Tensor, *, retain_graph: bool = False) -> None:
+        parameters = [p for p in self.network.parameters() if p.requires_grad]
+        before = [p.grad for p in parameters]
+        for parameter in parameters:
+            parameter.grad = None
+        loss.backward(retain_graph=retain_graph)
+        found = [p.grad for p in parameters]
+        norm = torch.linalg.vector_norm(torch.stack([torch.linalg.vector_norm(g) for g in found if g is not None]))
+        share = self.settings.gradient_clip / norm.clamp(min=self.settings.gradient_clip)
+        # A free run that left the data's range says nothing.
+        share = share if bool(torch.isfinite(norm)) else None
+        for parameter, gradient, own in zip(parameters, found, before, strict=True):
+            parameter.grad = own
+            if gradient is not None and share is not None:
+                parameter.grad = share * gradient if own is None else own + share * gradient
+
+    def _draw_windows(self) -> tuple[Float[Tensor, "batch window_and_one size"], Float[Tensor, "batch labels"]]:
+        """Windows of clips with the labels that the network is shown."""
+        drawn = self.windows.draw(self.settings.batch, self.generator)
+        labels = self.labels.held[torch.searchsorted(self.clip_ends, drawn.first, right=True)]
+        labels = torch.where(drawn.mirrored[:, None], labels[:, self.labels.mirrored], labels)
+        if self.paces is not None:
+            # How a window ends: told a pace that is not yet its own, the network changes to it within a window.
+            ends = self.paces[drawn.first + self.settings.window]
+            labels[:, self._pace_labels] = one_hot(ends, len(PACE_LABELS)).to(labels.dtype)
+        return drawn.features, self._tell_some(labels)
+
+    def _tell_some(self, labels: Float[Tensor, "batch labels"]) -> Float[Tensor, "batch labels"]:
+        """Mostly show no label or one group only, so that the network works with any subset of labels."""
+        if not self.labels.names:
+            return labels
+        groups = self.labels.groups
+        told = torch.rand(len(labels), len(groups), generator=self.generator) < _KEEP_GROUP_PROBABILITY
+        told &= torch.rand(len(labels), 1, generator=self.generator) >= self.settings.untold
+        return labels * (told.to(labels.dtype) @ groups)
+
+    def _log_prob(self, windows: Tensor, told: Tensor) -> Tensor:
+        """Log density of frames 1.. given noisy frames 0..: noise is on the inputs only (section 4.1.3)."""
+        model, size = self.network, self.network.layout.continuous
+        inputs, level = self._add_noise(model.normalise(windows[:, :-1]), size)
+        memory = model.start_after(windows[:, 0])
+        condition = self._make_condition(level, told)
+        with torch.autocast(windows.device.type, torch.bfloat16, enabled=self.settings.bfloat16):
+            mixture, _ = model(inputs, (memory.hidden, memory.cell), condition=condition)
+        target = torch.cat([model.normalise(windows[:, 1:])[..., :size], windows[:, 1:, size:]], dim=-1)
+        return mixture.log_prob(target, model.whitening)
+
+    def _make_condition(self, level: Float[Tensor, "batch 1"], told: Tensor) -> Float[Tensor, "batch conditions"]:
+        """Make what the network is told: the level of its input's noise where it wants to know it, and labels."""
+        return torch.cat([level / NOISE_UNIT, told], -1) if self.network.config.knows_noise else told
+
+    def _add_noise(self, inputs: Tensor, size: int) -> tuple[Tensor, Float[Tensor, "batch 1"]]:
+        """Inputs with noise and flipped bits, and each window's level of noise."""
+        settings, shape = self.settings, inputs.shape
+        share = torch.rand(shape[0], 1, 1, generator=self.generator)
+        if self.network.config.knows_noise:
+            level = settings.input_noise * settings.noise_range * share.square()
+        else:
+            level = settings.input_noise * torch.exp(share * math.log(settings.noise_range))
+        noise = torch.randn(shape[0], shape[1], size, generator=self.generator) * level
+        flips = torch.rand(shape[0], shape[1], 2, generator=self.generator) < settings.bit_flips
+        bits = torch.where(flips, -inputs[..., size:], inputs[..., size:])
+        noisy = torch.cat([inputs[..., :size] + noise, bits], dim=-1)
+        return noisy, level[:, 0]
 
 
 @dataclass(frozen=True)
@@ -33,16 +331,12 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
     """What to train a density on, and how."""
 
     kind = "lstm-gmm"
-    headline = "nats a frame"
-    decay_cost = 1.4  # free runs are compared
     config: LstmGmmConfig = field(default_factory=LstmGmmConfig)
     """The network."""
     settings: TrainingSettings = field(default_factory=TrainingSettings)
     """How it is trained."""
     starts: int = 64
     """Moments of mocap that the finished prior carries."""
-    made: Path | None = None
-    """Folder of clips that `mapctl make` made, which are trained on as well."""
     splices: Splices = field(default_factory=Splices)
     """Splices of the clips, which are trained on as well."""
     labels: str = ""
@@ -62,14 +356,18 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
     def check(self) -> None:
         """Before anything is read."""
         super().check()
-        if self.settings.critic.steps and self.until_flat is not None:
-            raise RequestError("a critic joins a run of a known length: leave out --until-flat or --critic-steps")
         if self.splices.count:
             inbetweener.load(self.splices.stitcher)  # a wrong name shall not be told after all clips were read
 
-    def source(self) -> DataSource:
-        """Where motion comes from."""
-        return replace(super().source(), made=self.made, splices=replace(self.splices, seed=self.settings.seed))
+    def gather(self, progress: Progress, warn: Progress) -> Gathered:
+        """Read and split the clips, and add their splices to those that are trained on."""
+        gathered = super().gather(progress, warn)
+        splices = replace(self.splices, seed=self.settings.seed)
+        parts = replace(gathered.parts, train=add_splices(gathered.parts.train, splices, self.out / "cache"))
+        if splices.count:
+            kept = len(parts.train.names) - len(gathered.parts.train.names)
+            progress(f"{kept} of {splices.count} splices pass for mocap")
+        return Gathered(gathered.corpus, parts)
 
     def make_trainer(self, parts: Split) -> DensityTrainer:
         """Make the trainer of a new network for the clips' labels, or of the initial network with its own labels."""
@@ -92,49 +390,20 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
             raise RequestError(f"the prior {self.init!r} was not trained with labels of paces; leave --label-pace out")
         return DensityTrainer(before.config, self.settings, corpus, labels=known, paces=paces, init=before.state_dict())
 
-    def list_teachers(self) -> tuple[str, ...]:
-        """Models that the weights begin with or learn from, bundled or trained."""
-        return super().list_teachers() + ((self.splices.stitcher,) if self.splices.count else ())
-
     def find_shape(self, trainer: DensityTrainer) -> LstmGmmConfig:
         """Return the configuration of the network that is trained."""
         return trainer.network.config
 
-    def describe_data(self, corpus: Corpus) -> dict[str, str]:
-        """What tells the data of this run from others'."""
-        return corpus.identity() | {
-            "match": self.match or "",
-            "split seed": str(self.settings.seed if self.split is None else self.split),
-            "labels": self.labels,
-            "init": self.init or "",
-            **({"paces": "labels"} if self.label_pace else {}),
-            **self._describe_splices(),
-        }
+    def describe_run(self, trainer: DensityTrainer, corpus: Corpus) -> dict[str, Row]:
+        """Describe what must not change between a run's parts."""
+        own = {"match": self.chosen, "labels": self.labels, "init": self.init or "", "paces": self.label_pace}
+        found = super().describe_run(trainer, corpus)
+        return {**found, "data": found["data"] | own | self._describe_splices()}
 
-    def format_news(self, rows: Sequence[Row]) -> str:
-        """One line on the losses of some steps."""
-        news = f"{average(rows, 'loss'):.2f} nats"
-        return f"{news}, {average(rows, 'told'):.2f} told apart" if "told" in rows[-1] else news
-
-    @classmethod
-    def find_headline(cls, row: Row) -> float:
-        """Negative log density of unseen clips, nats a frame."""
-        return _number(row.get("validation_nats"))
-
-    @classmethod
-    def find_card_headline(cls, quality: Row) -> float:
-        """Find it in the quality that a card tells."""
-        return _number(quality.get("test_nats_per_frame"))
-
-    @classmethod
-    def as_log_error(cls, value: float) -> float:
-        """Nats by the numbers of a frame: the logarithm of how far each is off, up to a constant."""
-        return value / LAYOUT.continuous
-
-    @property
-    def split_seed(self) -> int:
-        """That of the initial weights, where there are any."""
-        return find_split_seed(self.init, self.settings.seed, self.split)
+    def score(self, row: Row) -> float:
+        """Return the negative log density of unseen clips, nats a frame."""
+        found = row.get("validation_nats")
+        return math.nan if found is None else found
 
     def export(self, trainer: DensityTrainer, gathered: Gathered, curve: Sequence[Row]) -> Export:
         """The network with moments to start from, and what the data show to be possible."""
@@ -145,9 +414,9 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
         data = {
             "clips": len(corpus.names),
             "frames": len(corpus.features),
-            **describe_selection(corpus),
-            "holds": measure_holdings(corpus),
-            "match": self.match or "",
+            **corpus.describe_selection(),
+            "holds": measure_pace_changes(corpus),
+            "match": self.chosen,
             "labels": self.labels,
             **self._describe_splices(),
             "split_seed": self.split_seed,
@@ -168,37 +437,7 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
             asdict(measure_data_limits(clips)),
         )
 
-    def format_command(self) -> str:
-        """What to type for the same run, for the card; options that are the defaults are left out."""
-        option, config, settings = self._find_variant()
-        parts = [f"mapctl train lstm-gmm --data DATA -o RUN --match '{self.match or ''}'"]
-        parts += [f"--labels '{self.labels}'"] if self.labels else []
-        parts += ["--label-pace"] * self.label_pace
-        parts += [f"--init {name_origin(self.init)}"] if self.init else [f"--width {self.config.width}"]
-        mixed = self.init is None and self.config.components != config.components
-        parts += [f"--components {self.config.components}"] if mixed else []
-        parts += ["--made MADE"] if self.made else []
-        parts += self.format_reading() + ["--bfloat16"] * self.settings.bfloat16
-        parts += self.format_changed(settings, "steps", "batch", "window", "learning_rate", "standing_share", "seed")
-        critic = self.settings.critic.steps
-        parts += [f"--critic-steps {critic}"] if critic else []
-        parts += self.settings.copies.format_options() + self.splices.format_options()
-        parts += self.format_processes() + self.format_ending()
-        return " ".join(parts + option)
-
     def _describe_splices(self) -> dict[str, str]:
         """How many were tried, and by which stitcher; nothing where there are none."""
         splices = self.splices
         return {"splices": str(splices.count), "stitcher": splices.stitcher} if splices.count else {}
-
-    def _find_variant(self) -> tuple[list[str], LstmGmmConfig, TrainingSettings]:
-        """The option of the variant that this is one of, and what the command takes with it alone."""
-        for option, (config, settings) in (("--paper", PAPER), ("--plain", PLAIN)):
-            shape = {"width": self.config.width, "components": self.config.components, "labels": self.config.labels}
-            if self.init is None and replace(config, **shape) == self.config:
-                return [option], config, settings
-        return [], LstmGmmConfig(), TrainingSettings()
-
-
-def _number(value: float | None) -> float:
-    return math.nan if value is None else float(value)

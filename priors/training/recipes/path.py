@@ -78,8 +78,8 @@ class PathTrainer(GradientTrainer[PathNetwork]):
     def losses(self) -> dict[str, Tensor]:
         """Compute the losses of a newly drawn batch."""
         spare = max(0, self.longest - _SHORTEST_WINDOW)
-        frames = min(self.longest, _SHORTEST_WINDOW + int(torch.randint(spare + 1, (), generator=self.common)))
-        batch = self.group.share(max(1, self.settings.batch // frames))
+        frames = min(self.longest, _SHORTEST_WINDOW + int(torch.randint(spare + 1, (), generator=self.generator)))
+        batch = max(1, self.settings.batch // frames)
         motion = self.windows.draw(batch, frames, self.generator, variation=self.settings.variation)
         return compute_path_losses(self.network, motion, self.settings)
 
@@ -106,24 +106,18 @@ class PathRecipe(NetworkRecipe[PathConfig, PathSettings, PathTrainer]):
     """What to train a path predictor on, and how."""
 
     kind = "path"
-    headline = "error, cm"
     config: PathConfig = field(default_factory=PathConfig)
     """The network."""
     settings: PathSettings = field(default_factory=PathSettings)
     """How it is trained."""
 
-    def make_untaught(self, parts: Split) -> PathTrainer:
-        """The trainer, its weights drawn."""
+    def draw_trainer(self, parts: Split) -> PathTrainer:
+        """Make the trainer with drawn weights."""
         return PathTrainer(self.config, self.settings, parts.train)
 
-    @classmethod
-    def find_headline(cls, row: Row) -> float:
+    def score(self, row: Row) -> float:
         """Errors over unseen clips, cm, geometric mean over spans and the height."""
         return average_logarithms(row.get(f"all_{name}_cm") for name in _VALIDATED)
-
-    def format_shape(self) -> list[str]:
-        """The width, if it is another than usual."""
-        return [] if self.config.width == PathConfig.width else [f"--width {self.config.width}"]
 
 
 def compute_path_losses(network: PathNetwork, motion: PartialMotion, settings: PathSettings) -> dict[str, Tensor]:

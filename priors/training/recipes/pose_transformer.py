@@ -44,8 +44,6 @@ class PoseTransformerSettings:
     """Frames of the longest window; the shortest have 8, and as many are drawn of each octave."""
     learning_rate: float = 1.5e-3
     """At its highest; it falls to nothing along a cosine."""
-    optimiser: str = "muon"
-    """Muon for the layers' matrices, or adam for all."""
     places: float = 10.0
     """Weight of the mean distance of joints from their true places, metres."""
     pace: float = 20.0
@@ -80,22 +78,8 @@ class PoseTransformerSettings:
 
     def __post_init__(self):
         require_at_least(self, 1, "steps", "batch")
-        if self.optimiser not in ("muon", "adam"):
-            raise RequestError(f"optimiser must be muon or adam, got {self.optimiser!r}")
         if self.window < 2 * _SHORTEST_WINDOW:
             raise RequestError(f"window must be at least {2 * _SHORTEST_WINDOW} frames, got {self.window}")
-
-
-TWO_STAGE = (
-    PoseTransformerConfig(width=192, layers=4, kernel=0, detail=4),
-    PoseTransformerSettings(
-        window=72,
-        parts=PartSettings(joints=0.0, keys=0.0, several=0.0, bare=0.5, context=11, open=0.0, parts=0.0, reaching=0.0),
-        variation=Variation(share=0.0, poses=PoseVariation(share=0.0, tilted=0.0)),
-    ),
-)
-"""The two-stage transformer of Qin et al. 2022, of about the stitcher's weights, trained on the stitcher's question
-alone: gaps of up to 70 frames between whole poses with up to 10 frames on either side."""
 
 
 class PoseTransformerTrainer(GradientTrainer[PoseTransformerNetwork]):
@@ -117,8 +101,6 @@ class PoseTransformerTrainer(GradientTrainer[PoseTransformerNetwork]):
         """Matrices of the layers by Muon (Jordan et al. 2024), at the step size that makes one learning rate serve both
         (Liu et al. 2025); all else by AdamW."""
         weights = dict(self.network.named_parameters())
-        if self.settings.optimiser == "adam":
-            return {"optimiser": make_adam(weights.values(), self.learning_rate)}
         matrices = {name for name, weight in weights.items() if ".layers." in f".{name}" and weight.ndim == 2}
         muon = torch.optim.Muon(
             [weights[name] for name in weights if name in matrices],
@@ -132,9 +114,9 @@ class PoseTransformerTrainer(GradientTrainer[PoseTransformerNetwork]):
     def losses(self) -> dict[str, Tensor]:
         """Compute the losses of a newly drawn batch."""
         settings = self.settings
-        share = float(torch.rand((), generator=self.common))
+        share = float(torch.rand((), generator=self.generator))
         frames = round(_SHORTEST_WINDOW * (self.longest / _SHORTEST_WINDOW) ** share)
-        batch = self.group.share(max(1, settings.batch // frames))
+        batch = max(1, settings.batch // frames)
         truth = add_targets(self.windows.draw(batch, frames, self.generator, variation=settings.variation))
         hidden = sample_known_parts(truth, settings.parts, self.generator)
         return compute_losses(self.network, truth, hidden, settings)
@@ -174,33 +156,18 @@ class PoseTransformerRecipe(NetworkRecipe[PoseTransformerConfig, PoseTransformer
     """What to train a pose transformer on, and how."""
 
     kind = "pose-transformer"
-    headline = "error over interpolation's"
     config: PoseTransformerConfig = field(default_factory=PoseTransformerConfig)
     """The network."""
     settings: PoseTransformerSettings = field(default_factory=PoseTransformerSettings)
     """How it is trained."""
 
-    def make_untaught(self, parts: Split) -> PoseTransformerTrainer:
-        """The trainer, its weights drawn."""
+    def draw_trainer(self, parts: Split) -> PoseTransformerTrainer:
+        """Make the trainer with drawn weights."""
         return PoseTransformerTrainer(self.config, self.settings, parts.train)
 
-    @classmethod
-    def find_headline(cls, row: Row) -> float:
+    def score(self, row: Row) -> float:
         """Error of unseen windows over the interpolation's, geometric mean over gaps and lost arms."""
         return average_logarithms(value for name, value in row.items() if name.startswith("share_"))
-
-    def usual_settings(self) -> PoseTransformerSettings:
-        """Those of the two-stage peer, where it is trained."""
-        return TWO_STAGE[1] if self.config == TWO_STAGE[0] else PoseTransformerSettings()
-
-    def format_shape(self) -> list[str]:
-        """Width, layers and plainness, where they are not the usual ones."""
-        usual, plain = PoseTransformerConfig(), self.config.kernel == 0 and self.settings.optimiser == "adam"
-        words = [f"--{name} {getattr(self.config, name)}" for name in ("width", "layers", "detail")]
-        changed = [getattr(self.config, name) != getattr(usual, name) for name in ("width", "layers", "detail")]
-        if self.config == TWO_STAGE[0]:
-            return ["--two-stage"]
-        return [word for word, shown in zip(words, changed, strict=True) if shown] + ["--plain"] * plain
 
     def export(self, trainer: PoseTransformerTrainer, gathered: Gathered, curve: Sequence[Row]) -> Export:
         """Calibrate how sure it is on the validation clips, and measure that on the test clips."""

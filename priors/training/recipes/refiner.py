@@ -1,8 +1,10 @@
 """Adversarial training of the refiner: Wang et al. 2019, sections 4.2.1 and 4.2.2, with departures kept as settings."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import torch
 from jaxtyping import Float
@@ -10,29 +12,34 @@ from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits as cross_entropy
 
 from mapctl.errors import RequestError
+from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, integrate_root
+from mapctl.metrics.realism import RealismSettings
 from priors.config import require_at_least
+from priors.lstm_gmm import density
+from priors.lstm_gmm.density import LstmGmmDensity
+from priors.refiner.end_effectors import compute_end_effectors, count_channels
 from priors.refiner.network import RefinerConfig, RefinerNetwork
-from priors.training.adversaries.end_effectors import Critic
-from priors.training.adversaries.guard import find_winner
-from priors.training.adversaries.history import HistoryBuffer
-from priors.training.adversaries.statistics import compute_statistics
-from priors.training.corpus import Corpus, Split
-from priors.training.moment_matching import moment_loss
-from priors.training.parallel import TrainingGroup
-from priors.training.recipe import Row, average
-from priors.training.recipes.refining.samples import REFINER_MOMENTS, SampleRecipe, compute_root_error
+from priors.training.corpus import Corpus, Split, find_window_starts
+from priors.training.history import HistoryBuffer
+from priors.training.moment_matching import MatchingSettings, moment_loss
+from priors.training.quality.refiner import RefinerEvaluator, compute_realism_gap, sample_corpus
+from priors.training.recipe import Export, Gathered, Recipe, Row
 from priors.training.trainer import Trainer, draw_weights
 from priors.training.windows import FeatureWindows
 
 _MIN_MOMENT_FRAMES = 8  # frames of a window that moments can be had of
+_MOMENTS = MatchingSettings(feet=0.25, jerk=2.0, pace=0.0, spread=0.5, drift=0.0)  # as pieces of a window show them
+_CRITIC_WON = 0.98  # share that the critic classifies correctly, over a report, from which it has won
+_BETAS = (0.5, 0.9)
+_FOOT_JOINTS = ("leftFoot", "leftToes", "rightFoot", "rightToes")
 
 
 @dataclass(frozen=True)
 class AdversarialSettings:
     """How a refiner is trained."""
 
-    rounds: int = 4000
-    """Rounds after the warm-up: some updates of the refiner, then one of the critic."""
+    steps: int = 4000
+    """Rounds after the warm-up: some updates of the refiner, then some of the critic."""
     window: int = 48
     """Frames that the critic sees."""
     batch: int = 32
@@ -55,9 +62,7 @@ class AdversarialSettings:
     history: int = 320
     """Refined windows kept for the critic."""
     root: float = 20.0
-    """Weight of the squared distance between the roots' ways before and after (Eq. 13), per m^2."""
-    optimiser: str = "adam"
-    """`adam`, or the paper's `rmsprop`."""
+    """Weight of the squared distance between the root trajectories before and after (Eq. 13), per m^2."""
     refiner_rate: float = 1e-4
     """Learning rate (the paper's 0.002)."""
     critic_rate: float = 5e-4
@@ -79,7 +84,7 @@ class AdversarialSettings:
     """Seed of weights, windows and noise."""
 
     def __post_init__(self):
-        require_at_least(self, 1, "rounds", "batch", "refiner_updates", "critic_updates", "most_updates")
+        require_at_least(self, 1, "steps", "batch", "refiner_updates", "critic_updates", "most_updates")
         if self.window < (least := 2 * self.critic_around + 2):
             raise RequestError(f"window must be at least {least}, got {self.window}: the critic needs them to see one")
         if self.history < self.batch or self.batch < 2:
@@ -90,34 +95,6 @@ class AdversarialSettings:
             )
         if not 0 <= self.average < 1:
             raise RequestError(f"average must lie in [0, 1), got {self.average:g}")
-        if self.optimiser not in ("adam", "rmsprop"):
-            raise RequestError(f"optimiser must be adam or rmsprop, got {self.optimiser!r}")
-
-
-PAPER = (
-    RefinerConfig(
-        width=500,
-        memory=1000,
-        lookahead=0,
-        limit=1e6,
-        joints=("head", "leftHand", "rightHand", "leftToes", "rightToes"),
-    ),
-    AdversarialSettings(
-        rounds=2000,
-        optimiser="rmsprop",
-        refiner_rate=2e-3,
-        critic_rate=5e-3,
-        critic_width=500,
-        head_start=0,
-        critic_updates=1,
-        refiner_updates=5,
-        critic_around=0,
-        critic_slow=0.0,
-        moments=0.0,
-        average=0.0,
-    ),
-)
-"""The variant as the paper prints it; it does not say how long it trained."""
 
 
 class AdversarialTrainer(Trainer[RefinerNetwork]):
@@ -132,23 +109,18 @@ class AdversarialTrainer(Trainer[RefinerNetwork]):
         evaluate: Callable[[RefinerNetwork], Row] = lambda network: {},
     ):
         """`corpus` is captured, `raw` sampled from the density that is to be refined; `evaluate` measures a refiner."""
-        super().__init__(steps=settings.rounds, seed=settings.seed)
+        super().__init__(steps=settings.steps, seed=settings.seed)
         self.settings, self.updates, self.evaluate = settings, settings.refiner_updates, evaluate
         statistics = compute_statistics(corpus, config, settings.window)
         self.refiner, self.critic = draw_weights(lambda: _make_sides(config, settings, statistics), settings.seed)
         self.network = deepcopy(self.refiner).requires_grad_(False)
         self.captured = FeatureWindows(corpus, settings.window)
         self.raw = FeatureWindows(raw, settings.window + self.refiner.before + config.lookahead)
-        self.refiner_optimiser = self._make_optimiser(self.refiner, settings.refiner_rate)
-        self.critic_optimiser = self._make_optimiser(self.critic, settings.critic_rate)
+        self.refiner_optimiser = torch.optim.Adam(self.refiner.parameters(), lr=settings.refiner_rate, betas=_BETAS)
+        self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), lr=settings.critic_rate, betas=_BETAS)
         with torch.no_grad():
             first = [self.refiner(self._draw(self.raw))[0] for _ in range(-(-settings.history // settings.batch))]
         self.history = HistoryBuffer(torch.cat(first)[: settings.history])
-
-    def join(self, group: TrainingGroup) -> None:
-        """Train as one of a group from here on, each with its part of the history."""
-        super().join(group)
-        self.history = self.history.split(group)
 
     def networks(self) -> dict[str, nn.Module]:
         """All that is learnt, by its name in checkpoints."""
@@ -190,15 +162,15 @@ class AdversarialTrainer(Trainer[RefinerNetwork]):
         return self.evaluate(self.network)
 
     def state(self) -> dict[str, Tensor]:
-        """Everything that a bit-exact continuation needs."""
-        counts = torch.tensor([self.step, self.updates])
-        return {**super().state(), "history": self.group.gather(self.history.windows), "counts": counts}
+        """Return everything that a continuation needs, but the step."""
+        updates = torch.tensor(self.updates)
+        return {**super().state(), "history": self.history.windows, "updates": updates}
 
     def load_state(self, tensors: Mapping[str, Tensor], step: int) -> None:
-        """Go on from what `state` gave; KeyError or RuntimeError where it is not whole."""
+        """Go on from what `state` returned; KeyError or RuntimeError where it is not whole."""
         super().load_state(tensors, step)
         self.history = HistoryBuffer(tensors["history"])
-        _, self.updates = tensors["counts"].tolist()
+        self.updates = int(tensors["updates"])
 
     def _refine(self) -> float:
         """One update of the refiner (Eq. 13), and of its running mean."""
@@ -211,12 +183,12 @@ class AdversarialTrainer(Trainer[RefinerNetwork]):
         total = loss + self.settings.root * compute_root_error(raw[:, self.refiner.before :], refined)
         if self.settings.moments > 0:
             captured = self._draw(self.captured)
-            total = total + self.settings.moments * moment_loss(refined, captured, REFINER_MOMENTS)
-        told = self._step(self.refiner_optimiser, self.refiner, total, {"loss": loss})
+            total = total + self.settings.moments * moment_loss(refined, captured, _MOMENTS)
+        self._step(self.refiner_optimiser, self.refiner, total)
         with torch.no_grad():
             for mean, latest in zip(self.network.parameters(), self.refiner.parameters(), strict=True):
                 mean.lerp_(latest, 1 - self.settings.average)
-        return told["loss"]
+        return float(loss.detach())
 
     def _criticise(self) -> tuple[float, float]:
         """One update of the critic (Eq. 10) on captured windows, fresh refined ones and kept ones."""
@@ -229,71 +201,178 @@ class AdversarialTrainer(Trainer[RefinerNetwork]):
         truth = torch.cat([torch.ones(len(odds) - len(made)), torch.zeros(len(made))])
         loss = cross_entropy(odds, truth[:, None].expand_as(odds))
         right = ((odds.mean(1) > 0) == (truth > 0.5)).float().mean()
-        told = self._step(self.critic_optimiser, self.critic, loss, {"loss": loss, "right": right})
-        return told["loss"], told["right"]
+        self._step(self.critic_optimiser, self.critic, loss)
+        return float(loss.detach()), float(right)
 
-    def _step(
-        self, optimiser: torch.optim.Optimizer, model: nn.Module, loss: Tensor, told: Mapping[str, Tensor]
-    ) -> dict[str, float]:
+    def _step(self, optimiser: torch.optim.Optimizer, model: nn.Module, loss: Tensor) -> None:
         for each in self.optimisers().values():
             each.zero_grad(set_to_none=True)
-        means = self.differentiate(loss, model.parameters(), told)
+        loss.backward()
         nn.utils.clip_grad_norm_(model.parameters(), 5.0)
         optimiser.step()
-        return means
 
     def _autocast(self) -> torch.autocast:
         return torch.autocast("cpu", torch.bfloat16, enabled=self.settings.bfloat16)
 
     def _draw(self, windows: FeatureWindows) -> Float[Tensor, "batch frames size"]:
-        return windows.draw(self.group.share(self.settings.batch), self.generator).features
-
-    def _make_optimiser(self, model: nn.Module, rate: float) -> torch.optim.Optimizer:
-        if self.settings.optimiser == "rmsprop":
-            return torch.optim.RMSprop(model.parameters(), lr=rate, alpha=0.9)
-        return torch.optim.Adam(model.parameters(), lr=rate, betas=(0.5, 0.9))
+        return windows.draw(self.settings.batch, self.generator).features
 
 
 @dataclass(frozen=True)
-class RefinerRecipe(SampleRecipe[AdversarialSettings, AdversarialTrainer]):
+class RefinerRecipe(Recipe[RefinerConfig, AdversarialSettings, AdversarialTrainer]):
     """What to train a refiner on, and how.
 
-    A guard watches held-out samples: the best refiner seen is kept, and training stops and restores it where one side
-    wins.
+    The best refiner by held-out samples is kept, and training stops where one side wins.
     """
 
-    guards = ("refiner", "critic", "told")
+    kind = "refiner"
+    keeps_best = True
+    uses_gpu = False
     config: RefinerConfig = field(default_factory=RefinerConfig)
     """The network."""
     settings: AdversarialSettings = field(default_factory=AdversarialSettings)
     """How it is trained."""
+    match: str | None = None
+    """Regular expression for the clips; the density's own if None."""
+    report_steps: int = 50
+    """Rounds of whose losses the log holds the means."""
+    validate_steps: int = 300
+    """Rounds between measures of held-out samples."""
+    density: str = "locomotion"
+    """Prior whose samples are refined."""
+    samples: int = 300
+    """Motions of `seconds` drawn from the density to train on."""
+    seconds: float = 10.0
+    """Duration of each sampled motion, s."""
+    judged: int = 24
+    """Motions drawn to be measured, and held-out clips at least, if there are as many."""
+    realism: RealismSettings = field(default_factory=RealismSettings)
+    """Settings of the classifier that separates samples from mocap."""
+
+    @cached_property
+    def prior(self) -> LstmGmmDensity:
+        """The density, loaded."""
+        return density.load(self.density)
 
     @property
-    def most_processes(self) -> int:
-        """How many processes can share a round: half of what each takes goes into its history."""
-        return self.settings.batch // 2
+    def chosen(self) -> str:
+        """Regular expression for the clips."""
+        return self.prior.card.data.get("match", "") if self.match is None else self.match
+
+    @property
+    def split_seed(self) -> int:
+        """Seed of the density's split, so that its held-out clips stay held out."""
+        return self.prior.card.data.get("split_seed", self.settings.seed)
 
     def make_trainer(self, parts: Split) -> AdversarialTrainer:
-        """With samples of the density, to train on and to be measured."""
-        return AdversarialTrainer(self.config, self.settings, parts.train, *self.draw_samples(parts))
+        """Make the trainer with samples of the density, to train on and to be measured."""
+        raw, measured = self._sample(parts)
+        judge = RefinerEvaluator.of(measured, parts.validation, self.realism)
+        return AdversarialTrainer(self.config, self.settings, parts.train, raw, judge)
 
-    def format_news(self, rows: Sequence[Row]) -> str:
-        """One line on the losses of some rounds."""
-        refiner, critic, told = (average(rows, name) for name in self.guards)
-        return f"refiner {refiner:.3f}, critic {critic:.3f} nats, {told:.2f} told apart, {rows[-1]['updates']} updates"
+    def _sample(self, parts: Split) -> tuple[Corpus, Corpus]:
+        """Sample motions to train on, and others to measure."""
+        generator, frames = torch.Generator().manual_seed(self.settings.seed), round(self.seconds * PRIOR_FPS)
+        first, second = (
+            sample_corpus(self.prior, parts.train, count, frames, generator) for count in (self.samples, self.judged)
+        )
+        return first, second
+
+    def score(self, row: Row) -> float:
+        """Measure how far foot speed, jitter and classifier accuracy are from mocap's."""
+        return compute_realism_gap(row)
 
     def find_stop_reason(self, trainer: AdversarialTrainer, rows: Sequence[Row]) -> str | None:
-        """Why to stop after these losses since the last line of news, if there is a reason."""
-        where = f"{self.counter} {trainer.step}"
-        return find_winner(rows, losses=("refiner", "critic"), least=self.report_steps, step=where)
+        """Return why to stop after these losses since the last report: a loss is not finite, or the critic classifies
+        nearly all correctly."""
+        if not all(math.isfinite(rows[-1][name]) for name in ("refiner", "critic")):
+            return f"training diverged at step {trainer.step}"
+        if len(rows) >= self.report_steps and sum(row["told"] for row in rows) / len(rows) > _CRITIC_WON:
+            return "the critic has won"
+        return None
 
-    def format_command(self) -> str:
-        """What to type for the same run, for the card; options that are the defaults are left out."""
-        paper, parts = self.config == PAPER[0], self.format_begin()
-        usual = PAPER[1] if paper else AdversarialSettings()
-        parts += self.format_changed(usual, "batch", "window", "seed", rounds="steps")
-        parts += ["--bfloat16"] * self.settings.bfloat16 + ["--paper"] * paper
-        return " ".join(parts + self.format_processes() + self.format_ending())
+    def describe_run(self, trainer: AdversarialTrainer, corpus: Corpus) -> dict[str, Row]:
+        """Describe what must not change between a run's parts."""
+        found = super().describe_run(trainer, corpus)
+        return {**found, "data": found["data"] | {"density": self.density, "match": self.chosen}}
+
+    def export(self, trainer: AdversarialTrainer, gathered: Gathered, curve: Sequence[Row]) -> Export:
+        """Return the best refiner so far, measured on the test clips, by which none was chosen."""
+        data = {
+            "density": self.density,
+            "density_config": self.prior.reference.config.as_card(),
+            "samples": self.samples,
+            **self.describe_data(gathered),
+        }
+        best = min(curve, key=compute_realism_gap)
+        judge = RefinerEvaluator.of(self._sample(gathered.parts)[1], gathered.parts.test, self.realism)
+        # Feet that never touch the floor have no speed there, and a card holds no other numbers than finite ones.
+        test = {name: value if math.isfinite(value) else None for name, value in judge(trainer.network).items()}
+        return Export(trainer.network.state_dict(), data, {"step": best["step"], "test": test})
+
+
+class Critic(nn.Module):
+    """Tells captured windows from refined ones by end effectors and contact bits."""
+
+    reach_mean: Tensor
+    reach_std: Tensor
+
+    def __init__(
+        self, joints: Sequence[str], *, width: int, around: int, slow: float, reach_mean: Tensor, reach_std: Tensor
+    ):
+        """`width` units in the first layer and in each direction of the LSTM; the first layer sees `around` frames on
+        either side of its own, and feet's ground speeds under `slow` (m/s) magnified, unless that is 0.
+        """
+        super().__init__()
+        self.joints = tuple(joints)
+        self.register_buffer("reach_mean", reach_mean.clone())
+        self.register_buffer("reach_std", reach_std.clone())
+        self.slow = slow
+        self.magnified_columns = [
+            len(joints) + number for number, name in enumerate(joints) if slow > 0 and name in _FOOT_JOINTS
+        ]
+        seen = count_channels(joints) + 2 * len(self.magnified_columns) + 2
+        self.first = nn.Conv1d(seen, width, 2 * around + 1)
+        self.lstm = nn.LSTM(width, width, batch_first=True, bidirectional=True)
+        self.last = nn.Linear(2 * width, 1)
+
+    def forward(self, features: Float[Tensor, "batch frames size"]) -> Float[Tensor, "batch judged"]:
+        """Logits, frame by frame, that a window was captured; for the frames that have enough on either side."""
+        ends = compute_end_effectors(features, self.joints)
+        seen = [(ends - self.reach_mean) / self.reach_std, 2 * LAYOUT.pick(features, "contacts")[:, 1:] - 1]
+        if self.magnified_columns:
+            # A foot that slides by 10 cm/s is a twentieth of the spread of feet's speeds, and what every viewer sees.
+            ground = ends.unflatten(-1, (-1, 3))[:, :, self.magnified_columns, ::2]
+            seen.append(0.5 * torch.asinh(ground / self.slow).flatten(2))
+        seen = torch.cat(seen, dim=-1).transpose(1, 2)
+        hidden, _ = self.lstm(torch.nn.functional.leaky_relu(self.first(seen), 0.2).transpose(1, 2))
+        return self.last(hidden)[..., 0]
+
+
+def compute_root_error(before: Tensor, after: Tensor) -> Tensor:
+    """Mean squared distance of root trajectories and heights (Wang et al. 2019, Eq. 13), m^2; `before` may go on
+    longer."""
+    before = before[:, : after.shape[1]]
+    origin = GroundPose(before.new_zeros(len(before), 2), before.new_zeros(len(before)))
+    ground = integrate_root(before, origin)[0] - integrate_root(after, origin)[0]
+    height = LAYOUT.pick(before, "root_height") - LAYOUT.pick(after, "root_height")
+    return (ground.square().sum(-1) + height[..., 0].square()).mean()
+
+
+def compute_statistics(corpus: Corpus, config: RefinerConfig, window: int) -> dict[str, Tensor]:
+    """Mean and spread of features and end effectors over captured clips, with floors that keep held joints in hand."""
+    features = corpus.features
+    mean, std = features.mean(0), features.std(0).clamp(min=0.002)
+    bits = LAYOUT.slices["contacts"]
+    mean[bits], std[bits] = 0.5, 0.5
+    starts = find_window_starts(corpus.lengths, window)[:: max(1, window)]
+    reach = torch.cat(
+        [
+            compute_end_effectors(features[rows[:, None] + torch.arange(window)], config.joints).flatten(0, 1)
+            for rows in starts.split(512)
+        ]
+    )
+    return {"mean": mean, "std": std, "reach_mean": reach.mean(0), "reach_std": reach.std(0).clamp(min=0.01)}
 
 
 def _make_sides(

@@ -2,7 +2,6 @@
 
 import copy
 from collections.abc import Sequence
-from contextlib import AbstractContextManager
 from dataclasses import astuple, dataclass, field, replace
 from typing import Any
 
@@ -15,12 +14,10 @@ from priors.config import require_at_least
 from priors.stitching.layers import multiply_in_bfloat16
 from priors.stitching.network import StitcherConfig, StitcherNetwork
 from priors.stitching.posterior import PosteriorNetwork
-from priors.training.augmentation.transition_windows import Known, Transition, TransitionWindows
+from priors.training.augmentation.transition_windows import Known, TransitionWindows
 from priors.training.corpus import Corpus, Split
-from priors.training.devices import make_generator
 from priors.training.quality.stitcher import calibrate_temperature, measure_transitions
 from priors.training.recipe import Export, Gathered, NetworkRecipe, Row, average_logarithms
-from priors.training.recipes.stitcher_critics import CriticSettings, StitcherCritics
 from priors.training.recipes.stitcher_losses import LossWeights, Shares, find_stitcher_losses
 from priors.training.trainer import GradientTrainer
 
@@ -29,7 +26,6 @@ _LEAST_WINDOW = 16  # frames of the longest transition
 _CONTEXT = 10  # frames told before or after, at most
 _LENGTH_GROWTH = 0.5  # share of training in which transitions become longer
 _AVERAGE = 0.999
-_RELATIVE, _UNTRAINED_BATCHES = ("places", "state", "contacts", "stitching"), 8
 _LEAST_SPREAD = 0.05  # of a feature, of the typical one of its block
 
 
@@ -49,8 +45,6 @@ class StitcherSettings:
     """Where the transitions' latents come from."""
     weights: LossWeights = field(default_factory=LossWeights)
     """Of what is learnt."""
-    critics: CriticSettings = field(default_factory=CriticSettings)
-    """When critics join, unless the network is without them."""
     evenness: float = 0.85
     """How evenly windows are drawn from kinds of clips: 0 by their frames, 1 the same number from each."""
     kinds: tuple[str, ...] = ("walk-turn", "walk", "run|dash", "^cmu")
@@ -88,19 +82,13 @@ class StitcherTrainer(GradientTrainer[StitcherNetwork]):
             seed=settings.seed,
         )
         _set_moments(self.network, corpus)
-        self.untrained = self._measure_untrained() if settings.weights.relative else {}
-        """What some losses are divided by."""
-        self.critics = (
-            None if "d" in config.without else StitcherCritics(settings.critics, settings.seed, self.generator)
-        )
-        self._truth: Transition | None = None
         self.average = copy.deepcopy(self.network).requires_grad_(False)
         """Moving average of the weights: what is measured and exported."""
 
     def _make(self, config: StitcherConfig, device: torch.device) -> StitcherNetwork:
         network = StitcherNetwork(config)
-        self.posterior = None if config.printed else PosteriorNetwork(config).to(device)
-        """Sees the truth; the paper prints none."""
+        self.posterior = PosteriorNetwork(config).to(device)
+        """Sees the truth."""
         return network
 
     def make_optimisers(self) -> dict[str, torch.optim.Optimizer]:
@@ -109,45 +97,33 @@ class StitcherTrainer(GradientTrainer[StitcherNetwork]):
 
     def weights(self) -> list[nn.Parameter]:
         """Those of the posterior too."""
-        return [*super().weights(), *([] if self.posterior is None else self.posterior.parameters())]
+        return [*super().weights(), *self.posterior.parameters()]
 
     def networks(self) -> dict[str, nn.Module]:
         """All that is learnt, by its name in checkpoints."""
-        critics = None if self.critics is None else self.critics.network
-        others = {"posterior": self.posterior, "average": self.average, "critics": critics}
-        return super().networks() | {name: network for name, network in others.items() if network is not None}
+        return super().networks() | {"posterior": self.posterior, "average": self.average}
 
-    def optimisers(self) -> dict[str, torch.optim.Optimizer]:
-        """One for each of the two that contend."""
-        return super().optimisers() | ({} if self.critics is None else {"critics-optimiser": self.critics.optimiser})
+    @property
+    def exported(self) -> StitcherNetwork:
+        """The moving average of the weights."""
+        return self.average
 
     def losses(self) -> dict[str, Tensor]:
         """Compute the losses of a newly drawn batch."""
-        settings, done = self.settings, 1.0 if self.grown else self.step / self.first_steps
+        settings, done = self.settings, 1.0 if self.grown else self.step / self.steps
         longest = _FIRST_LONGEST + max(0, self.longest - _FIRST_LONGEST) * min(1.0, done / _LENGTH_GROWTH)
         longest = max(_SHORTEST, min(round(longest), self.longest))
-        truth = self._draw_transitions(longest, self.generator, self.common)
-        weights, judge = settings.weights, None
-        if self.critics is not None and self._criticised >= 0:
-            self._truth, judge = truth, self.critics.hear
-            weights = replace(weights, critics=weights.critics * settings.critics.ramp(self._criticised))
-        with self._in_bfloat16():
-            parts, told = find_stitcher_losses(
-                self.network, self.posterior, truth, settings.shares, weights.ease, self.generator, judge
+        frames = int(torch.randint(_SHORTEST, longest + 1, (), generator=self.generator))
+        truth = self.windows.draw(settings.batch, frames, _draw_known(self.generator), self.generator)
+        with multiply_in_bfloat16(self.network, self.posterior, wanted=settings.bfloat16):
+            parts, errors = find_stitcher_losses(
+                self.network, self.posterior, truth, settings.shares, settings.weights.ease, self.generator
             )
-        return {"loss": weights.weigh(parts, self.untrained), **told}
+        return {"loss": settings.weights.weigh(parts), **errors}
 
     def train_step(self) -> dict[str, float]:
-        """Take one update, and one of the critics where they have joined, and bring the average nearer.
-
-        `critics` is what the stitcher wants to make smaller, `critic` the critics' own loss, 1 where they know nothing.
-        """
+        """Take one update, and bring the average nearer."""
         parts = super().train_step()
-        if self.critics is not None:
-            parts = {"critics": 0.0, **parts, "critic": 1.0, "told": 0.5}
-            if self._truth is not None:
-                parts |= self.critics.learn(self._truth, self)
-                self._truth = None
         keep = min(_AVERAGE, (1 + self.step) / (10 + self.step))
         with torch.no_grad():
             for mean, weight in zip(self.average.parameters(), self.network.parameters(), strict=True):
@@ -159,34 +135,6 @@ class StitcherTrainer(GradientTrainer[StitcherNetwork]):
         """Measure transitions of unseen clips."""
         windows = TransitionWindows(corpus, kinds=self.settings.kinds, evenness=1.0)
         return measure_transitions(self.average, self.posterior, windows)
-
-    @property
-    def _criticised(self) -> int:
-        """Updates since the critics joined; below 0 before."""
-        return self.step - round(self.settings.critics.begin * self.first_steps)
-
-    def _draw_transitions(self, longest: int, generator: torch.Generator, common: torch.Generator) -> Transition:
-        frames = int(torch.randint(_SHORTEST, longest + 1, (), generator=common))
-        return self.windows.draw(self.group.share(self.settings.batch), frames, _draw_known(common), generator)
-
-    @torch.no_grad()
-    def _measure_untrained(self) -> dict[str, float]:
-        """Measure the losses that are weighed by what they are before training (the rule of Harvey et al. 2020)."""
-        generator, found = make_generator(self.settings.seed), []
-        for _ in range(_UNTRAINED_BATCHES):
-            truth = self._draw_transitions(self.longest, generator, generator)
-            settings = self.settings
-            found.append(
-                find_stitcher_losses(
-                    self.network, self.posterior, truth, settings.shares, settings.weights.ease, generator
-                )[0]
-            )
-        means = {name: sum(float(parts[name]) for parts in found) / len(found) for name in _RELATIVE}
-        return {name: mean for name, mean in means.items() if mean > 0}  # what is left out is nothing
-
-    def _in_bfloat16(self) -> AbstractContextManager[None]:
-        networks = [network for network in (self.network, self.posterior) if network is not None]
-        return multiply_in_bfloat16(*networks, wanted=self.settings.bfloat16)
 
 
 def _draw_known(generator: torch.Generator) -> Known:
@@ -205,14 +153,13 @@ class StitcherRecipe(NetworkRecipe[StitcherConfig, StitcherSettings, StitcherTra
     """What to train a stitcher on, and how."""
 
     kind = "stitcher"
-    headline = "error over interpolation's"
     config: StitcherConfig = field(default_factory=StitcherConfig)
     """The networks."""
     settings: StitcherSettings = field(default_factory=StitcherSettings)
     """How they are trained."""
 
-    def make_untaught(self, parts: Split) -> StitcherTrainer:
-        """The trainer, its weights drawn."""
+    def draw_trainer(self, parts: Split) -> StitcherTrainer:
+        """Make the trainer with drawn weights."""
         trainer = StitcherTrainer(self.config, self.settings, parts.train)
         # Who begins with weights of a run has seen them grow.
         trainer.grown = self.init is not None
@@ -230,42 +177,10 @@ class StitcherRecipe(NetworkRecipe[StitcherConfig, StitcherSettings, StitcherTra
         trainer.average.temperature.fill_(calibrate_temperature(trainer.average, windows))
         return replace(super().export(trainer, gathered, curve), tensors=trainer.average.state_dict())
 
-    def least_steps(self) -> int:
-        """Until the critics have joined, if there are any."""
-        if "d" in self.config.without:
-            return super().least_steps()
-        critics = self.settings.critics
-        return max(super().least_steps(), round(critics.begin * self.steps) + 2 * critics.head_start)
-
-    @classmethod
-    def find_headline(cls, row: Row) -> float:
+    def score(self, row: Row) -> float:
         """Error of the calm answer to unseen transitions over the interpolation's, geometric mean over lengths, after a
         pose and after ten frames."""
         return average_logarithms(value for name, value in row.items() if name.startswith(("bare_", "past_")))
-
-    def usual_settings(self) -> StitcherSettings:
-        """The paper's, where its scheme is trained."""
-        return PAPER[1] if self.config.printed else StitcherSettings()
-
-    def format_shape(self) -> list[str]:
-        """The parts that are left out."""
-        parts = ["--paper"] if self.config.printed else []
-        return parts + ["--without d"] * bool(self.config.without)
-
-
-PAPER = (
-    StitcherConfig(shared=0, own=16, printed=True),
-    StitcherSettings(
-        steps=58_000,
-        batch=32,
-        learning_rate=1e-4,
-        weights=LossWeights(
-            places=0.5, pace=0.0, state=1.0, contacts=0.1, feet=0.0, stitching=0.5, own=1.0, ease=0.0, relative=True
-        ),
-        critics=CriticSettings(begin=0.0, head_start=0, penalty=0.0, noise=0.0),
-    ),
-)
-"""Scheme, losses, weights and batches as Ren et al. 2024 print them (sections 3.2 to 4.3), at our widths."""
 
 
 def _set_moments(network: StitcherNetwork, corpus: Corpus) -> None:

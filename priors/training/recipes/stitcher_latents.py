@@ -76,24 +76,6 @@ class TaughtLatents:
         self.means.append(mean)
 
 
-@dataclass(frozen=True, eq=False)
-class PrintedLatents(DrawnLatents):
-    """Drawn from the prior, which is held to a standard normal distribution: what the paper prints as its encoder."""
-
-    nats: list[Tensor] = field(default_factory=list)
-    """Mean divergence over rows, of each call: in turn of the side that steps, the forward one first."""
-
-    def own(self, prior: Gaussian, encoded: Float[Tensor, "2 batch width"], step: int) -> Float[Tensor, "2 batch own"]:
-        """A frame's, of both sides."""
-        standard = Gaussian(torch.zeros_like(prior.mean), torch.zeros_like(prior.mean))
-        self.nats.append(prior.diverge(standard)[len(self.nats) % 2].sum(dim=-1).mean())
-        return super().own(prior, encoded, step)
-
-    def diverge(self) -> dict[str, Tensor]:
-        """Return the divergence, nats a frame, by the name of its weight."""
-        return {"own": torch.stack(self.nats).mean()}
-
-
 @torch.no_grad()
 def miss_calmly(network: StitcherNetwork, truth: Transition) -> Float[Tensor, "2 batch made size"]:
     """Return what the calm answer to the ends of transitions misses of the truth, in units of the features' spread."""

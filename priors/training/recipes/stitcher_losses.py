@@ -1,10 +1,10 @@
 """What a stitcher is taught: the true way between two poses, and that its sides meet."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits as cross_entropy
 
@@ -13,9 +13,9 @@ from mapctl.skeleton import TOE_JOINTS
 from priors.stitching.latents import DrawnLatents
 from priors.stitching.network import PACE, POSE, StitcherNetwork
 from priors.stitching.posterior import PosteriorNetwork
-from priors.stitching.sides import Ends, Sides, count_made, walk_sides
+from priors.stitching.sides import Sides, count_made, walk_sides
 from priors.training.augmentation.transition_windows import Transition
-from priors.training.recipes.stitcher_latents import PrintedLatents, TaughtLatents, miss_calmly, sample_nearest
+from priors.training.recipes.stitcher_latents import TaughtLatents, miss_calmly, sample_nearest
 
 _EASE_METRES = 0.05
 
@@ -41,21 +41,15 @@ class LossWeights:
     prior: float = 0.02
     """Divergence of that posterior, as it is, from its prior, which is to learn it, nats."""
     own: float = 0.02
-    """Divergence of the frames' latents from their prior, nats a transition; as printed of the prior from a standard
-    normal distribution, nats a frame."""
+    """Divergence of the frames' latents from their prior, nats a transition."""
     phase: float = 0.3
     """Absolute error of the phases."""
-    critics: float = 0.1
-    """What critics say of motion with latents that are not at the mean, where there are critics."""
     ease: float = 0.4
     """Power of the interpolation's error by which windows count less; 0 lets all count the same."""
-    relative: bool = False
-    """Whether places, poses, contacts and the stitching are divided by what they are of an untrained network."""
 
-    def weigh(self, parts: Mapping[str, Tensor], untrained: Mapping[str, float]) -> Tensor:
+    def weigh(self, parts: Mapping[str, Tensor]) -> Tensor:
         """Return the loss."""
-        terms = [getattr(self, name) / untrained.get(name, 1.0) * value for name, value in parts.items()]
-        return torch.stack(terms).sum()
+        return torch.stack([getattr(self, name) * value for name, value in parts.items()]).sum()
 
 
 @dataclass(frozen=True)
@@ -80,35 +74,25 @@ class Shares:
 
 def find_stitcher_losses(
     network: StitcherNetwork,
-    posterior: PosteriorNetwork | None,
+    posterior: PosteriorNetwork,
     truth: Transition,
     shares: Shares,
     ease: float,
     generator: torch.Generator,
-    judge: Callable[[Sides, Ends, Bool[Tensor, " batch"]], Tensor] | None = None,
 ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Find the losses by the names of their weights, and in plain units the errors that they are made of.
-
-    Without a posterior all latents are drawn (as printed), and all rows are compared with the truth. `judge` says what
-    critics say of some rows.
-    """
-    batch, known = len(truth.features), truth.ends()
-    informed, calm, compared = (0, 0, batch) if posterior is None else shares.count(batch)
+    """Find the losses by the names of their weights, and in plain units the errors that they are made of."""
+    batch = len(truth.features)
+    informed, calm, compared = shares.count(batch)
     row = torch.arange(batch)
-    at_mean = (row >= informed) & (row < calm)
-    noise = DrawnLatents.sample(network.config, batch, count_made(network, truth.frames), generator).still(at_mean)
-    if posterior is None:
-        latents = PrintedLatents(noise.shared, noise.slow)
-    else:
-        nearest = row[calm:compared]
-        noise = noise.put(nearest, sample_nearest(network, truth.rows(nearest), generator))
-        wanted, missed = truth.truth(), miss_calmly(network, truth.rows(row[:informed]))
-        latents = TaughtLatents(posterior, (wanted - network.mean) / network.std, missed, noise)
-    sides = walk_sides(network, known, truth.frames, latents)
+    noise = DrawnLatents.sample(network.config, batch, count_made(network, truth.frames), generator)
+    noise = noise.still((row >= informed) & (row < calm))
+    nearest = row[calm:compared]
+    noise = noise.put(nearest, sample_nearest(network, truth.rows(nearest), generator))
+    wanted, missed = truth.truth(), miss_calmly(network, truth.rows(row[:informed]))
+    latents = TaughtLatents(posterior, (wanted - network.mean) / network.std, missed, noise)
+    sides = walk_sides(network, truth.ends(), truth.frames, latents)
     parts, distance, slip = _compare(network, truth, sides, compared, ease)
     parts |= latents.diverge()
-    # A mean is smooth, and is to be: only what stands for one of many ways is to pass for one.
-    parts |= {} if judge is None else {"critics": judge(sides, known, ~at_mean)}
     told = {
         "places_cm": 100 * distance[:, :informed].mean() if informed else torch.zeros(()),
         "calm_cm": 100 * distance[:, informed:calm].mean() if calm > informed else torch.zeros(()),
@@ -118,11 +102,11 @@ def find_stitcher_losses(
         "contacts": parts["contacts"],
         "feet_cm": 100 * parts["feet"],
         "apart_cm": 100 * parts["stitching"],
-        "shared_nats": parts.get("prior", torch.zeros(())),
+        "shared_nats": parts["prior"],
         "own_nats": parts["own"],
         "phase": parts["phase"],
     }
-    return parts, told | {name: parts[name] for name in ("critics",) if name in parts}
+    return parts, told
 
 
 def _compare(
@@ -130,11 +114,11 @@ def _compare(
 ) -> tuple[dict[str, Tensor], Float[Tensor, "sides compared made joints"], Float[Tensor, "sides compared made joints"]]:
     """Compare the first rows with the truth, and let all of them meet and stand; also return the distances of joints
     from their true places, and the errors of their steps, metres."""
-    count, _, made = sides.features.shape[:3]
-    true, places = truth.truth()[:count, :compared, :made], sides.place_joints()
+    made = sides.features.shape[2]
+    true, places = truth.truth()[:, :compared, :made], sides.place_joints()
     # Windows that interpolation nearly solves count for more, or the network learns to fidget where nobody moves.
     ease = weigh_windows(truth, power)[:compared]
-    wrong = places[:, :compared] - truth.place_joints(made)[:count, :compared]
+    wrong = places[:, :compared] - truth.place_joints(made)[:, :compared]
     distance = _measure_length(wrong)
     slip = _measure_length(torch.diff(wrong, dim=2, prepend=torch.zeros_like(wrong[:, :, :1])))
     off = ((sides.features[:, :compared] - true) / network.std).abs()
@@ -142,7 +126,7 @@ def _compare(
     # Who was drawn is compared with no truth: toes that its own sides call planted are to stand.
     stand = torch.cat([true[..., POSE.stop :], sides.features[:, compared:, :, POSE.stop :].detach()], dim=1)
     planted = stand[:, :, 1:] * stand[:, :, :-1]
-    phases = torch.cat([sides.at_ends[:count, :, None], sides.phases[:, :, : made - 1]], dim=2)[:, :compared]
+    phases = torch.cat([sides.at_ends[:, :, None], sides.phases[:, :, : made - 1]], dim=2)[:, :compared]
     parts = {
         "places": (ease * distance.mean(dim=(0, 2, 3))).mean(),
         "pace": (ease * slip.mean(dim=(0, 2, 3))).mean(),
@@ -150,7 +134,7 @@ def _compare(
         "contacts": cross_entropy(sides.logits[:, :compared], true[..., POSE.stop :]),
         "feet": (steps * planted).sum() / planted.sum().clamp_min(1),
         "stitching": measure_apart(places, truth.frames).mean(),
-        "phase": (phases - truth.true_phases()[:count, :compared, :made]).abs().mean(),
+        "phase": (phases - truth.true_phases()[:, :compared, :made]).abs().mean(),
     }
     return parts, distance, slip
 

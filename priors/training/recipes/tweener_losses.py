@@ -2,7 +2,6 @@
 section 3.6), from which its recipe takes one sum.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -28,8 +27,6 @@ _PATH_SPANS = (1, 8, 32, 96)
 _SOME = 3  # of so many sequences one has its way predicted and its rotations compared: they cost as much as all else
 _ACTIVITY_FRAMES = 32  # over which joints' speeds and accelerations are averaged
 _DNA_GAP = 90  # frames, 3 s, for each of which a gap has a pose of the style (Eq. 12)
-Judge = Callable[[LocalMotion, RootTrajectory], Tensor]
-"""What adds to the loss of motion that was made, and of the way that the path predictor tells of it."""
 _METRES = ("places", "pace", "activity", "feet", "keys", "path", "root", "style", "dwell")
 
 
@@ -64,10 +61,6 @@ class LossWeights:
     """Weight of batch regularisation (Eq. 9)."""
     half: float = 60.0
     """Frames from the nearest key at which what a performer did counts half."""
-    far: float = 0.0
-    """What it counts at least, however far the nearest key is."""
-    squares: bool = False
-    """Whether keys, the style's poses and the way count by their distances' squares, as in the paper."""
 
 
 def see_without_root(
@@ -84,13 +77,11 @@ def compute_tweener_losses(
     style_poses: Float[Tensor, "batch poses joints 3"],
     styled: Bool[Tensor, " batch"],
     weights: LossWeights,
-    judge: Judge | None = None,
 ) -> dict[str, Tensor]:
     """The loss, and in plain units the errors it is made of.
 
     Where a performer's poses between keys are known they count the less the farther the nearest key is, since more and
-    more other motions would do as well. A `judge` adds what it makes of the motion, in which given keys have replaced
-    the made ones.
+    more other motions would do as well.
     """
     motion, known = sequences.motion, sequences.known
     image = make_key_image(motion, sequences.told)
@@ -110,22 +101,17 @@ def compute_tweener_losses(
         "pace": shown.pace(_between(weight)),
         "activity": shown.activity(sequences.truthful),
         "feet": shown.feet(motion, _between(weight)),
-        "keys": shown.keys(sequences.told, squares=weights.squares) + 0.1 * _average(turned, whole),
+        "keys": shown.keys(sequences.told) + 0.1 * _average(turned, whole),
     }
     trajectory = path(LocalMotion.of_world(made.places[some], heading[some]))
     way = trajectory.integrate(heading[some])
     terms |= _compute_path_terms(trajectory, way, sequences, some, weights)
     without_root = see_without_root(made.places, made.local_matrix[..., 0, :, :])
     apart = torch.cdist(style_poses.flatten(-2), without_root.flatten(-2)) / len(CANONICAL.names) ** 0.5
-    apart = apart.square() if weights.squares else apart
     terms["style"] = _compute_style_error(apart, styled)
     terms["dwell"] = _compute_dwell_error(apart, known, styled)
     terms["regularisation"] = regularise_batch(tuple(each[some] for each in made_poses.responses))
     loss = torch.stack([getattr(weights, name) * value for name, value in terms.items()]).sum()
-    if judge is not None:
-        places = torch.where(whole[..., None, None] > 0, _turn_to_world(wanted, image)[some], made.places[some])
-        facing = torch.where(whole > 0, motion.heading[some], heading[some])
-        loss = loss + judge(LocalMotion.of_world(places, facing), trajectory)
     told = {f"{name}_cm": 100 * terms[name] for name in _METRES}
     return {"loss": loss, **told, **{name: terms[name] for name in ("turns", "contacts", "regularisation")}}
 
@@ -156,10 +142,10 @@ class _Errors:
             error = error + _average(off, counts)
         return error
 
-    def keys(self, told: ToldParts, *, squares: bool) -> Tensor:
+    def keys(self, told: ToldParts) -> Tensor:
         """Compare the coordinates that keys tell of joints but the hips, from which they are seen."""
         joints = told.axes[..., 1:, :].any(dim=-1).float()
-        return _average(_measure((self.off * told.axes)[..., 1:, :], squares=squares), joints)
+        return _average(_length((self.off * told.axes)[..., 1:, :]), joints)
 
     def feet(self, motion: PartialMotion, weight: Tensor) -> Tensor:
         planted = motion.contacts[:, 1:] * motion.contacts[:, :-1]
@@ -185,7 +171,7 @@ def _compute_path_terms(
     nats = cross_entropy(trajectory.contacts, contacts, reduction="none").mean(dim=-1)
     return {
         "path": torch.stack(errors).mean() + height,
-        "root": (_measure(off, squares=weights.squares) * share).sum(dim=1).mean(),
+        "root": (_length(off) * share).sum(dim=1).mean(),
         "contacts": _average(nats, _weigh_frames(known, weights) * truthful),
     }
 
@@ -216,7 +202,7 @@ def _weigh_frames(known: Bool[Tensor, "batch frames"], weights: LossWeights) -> 
     """1 at a key, less the farther the nearest is."""
     frame = torch.arange(known.shape[1])
     away = torch.minimum((frame - last_observed(known)).abs(), (next_observed(known) - frame).abs())
-    return (1 / (1 + away / weights.half)).clamp_min(weights.far)
+    return 1 / (1 + away / weights.half)
 
 
 def _turn_to_world(places: Tensor, image: PositionImage) -> Tensor:
@@ -234,10 +220,6 @@ def _between(weight: Float[Tensor, "batch frames"]) -> Tensor:
 
 def _average(values: Tensor, weight: Tensor) -> Tensor:
     return (values * weight).sum() / weight.sum().clamp_min(1e-6)
-
-
-def _measure(vectors: Tensor, *, squares: bool) -> Tensor:
-    return vectors.square().sum(dim=-1) if squares else _length(vectors)
 
 
 def _length(vectors: Tensor) -> Tensor:

@@ -4,18 +4,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from priors.training.parallel import TrainingGroup
-
 
 class HistoryBuffer:
     """Windows that earlier weights made, so that the critic does not forget faults that it once knew."""
 
     def __init__(self, windows: Float[Tensor, "size frames features"]):
         self.windows = windows.clone()
-
-    def split(self, group: TrainingGroup) -> "HistoryBuffer":
-        """What one process of a group keeps of it; `group.gather` joins the parts."""
-        return HistoryBuffer(self.windows.tensor_split(group.size)[group.rank])
 
     def mix(self, fresh: Float[Tensor, "batch frames features"], generator: torch.Generator) -> Tensor:
         """Half a batch of the fresh ones, half of kept ones; then the fresh half takes the place of kept ones."""

@@ -1,4 +1,4 @@
-"""Every model that can be trained, by recipes of six steps that are judged at every other."""
+"""Every model that can be trained, by recipes of six steps that are validated at every other."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
@@ -25,13 +25,12 @@ from priors.training.recipes import (
     refiner,
     stitcher,
     tweener,
-    tweener_critic,
 )
 
 
 @dataclass(frozen=True)
 class Model:
-    """A model, and a recipe of six steps that are judged at every other."""
+    """A model, and a recipe of six steps that are validated at every other."""
 
     trainer: type
     recipe: Callable[[Path, Path, str], Any]
@@ -53,7 +52,7 @@ def _density(data, out, prior):
 
 def _refiner(data, out, prior):
     settings = refiner.AdversarialSettings(
-        rounds=6,
+        steps=6,
         window=10,
         batch=4,
         warm_up=1,
@@ -91,13 +90,6 @@ def _timing(data, out, prior):
     return keyframe_timing.KeyframeTimingRecipe(data, out, settings=settings, validate_steps=2)
 
 
-def _criticised(data, out, prior):
-    usual = tweener_critic.CriticisedTweenerRecipe(data, out, config=tiny_tweener.CONFIG, validate_steps=2)
-    settings = replace(usual.settings, steps=6, batch=300)
-    critic = tweener_critic.CriticSettings(begin=1, batch=2, history=4, frames=60)
-    return replace(usual, settings=settings, critic=critic, report_steps=2)
-
-
 MODELS = {
     "lstm-gmm": Model(lstm_gmm.DensityTrainer, _density),
     "refiner": Model(refiner.AdversarialTrainer, _refiner),
@@ -113,11 +105,9 @@ MODELS = {
     "stitcher": Model(stitcher.StitcherTrainer, _windowed(stitcher.StitcherRecipe, tiny_stitcher.CONFIG)),
 }
 """By the names of their commands."""
-VARIANTS = {"tweener with a critic": Model(tweener_critic.CriticisedTrainer, _criticised)}
-"""What those commands train with other options."""
 
 
-_QUICK = "lstm-gmm", "refiner", "path"  # trained and judged in about a second, and each by a trainer of another kind
+_QUICK = "lstm-gmm", "refiner", "path"  # trained and validated in about a second, and each by a trainer of another kind
 
 
 def list_params(names: Iterable[str]) -> list:

@@ -1,1 +1,0 @@
-"""Settings and trainer of a density, and the variants that are compared."""

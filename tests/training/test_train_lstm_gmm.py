@@ -1,0 +1,82 @@
+"""Training of a density: its windows, its statistics, and what it learns."""
+
+from dataclasses import replace
+from functools import partial
+
+import pytest
+import torch
+from helpers import corpus, walk, write_corpus
+
+from mapctl.features import LAYOUT, encode, mirror_features
+from mapctl.metrics.states import summarise_states
+from priors.lstm_gmm.network import PAPER, LstmGmmConfig
+from priors.training.feature_statistics import compute_feature_statistics
+from priors.training.quality import density as density_quality
+from priors.training.recipes import lstm_gmm
+from priors.training.recipes.lstm_gmm import DensityRecipe, DensityTrainer, TrainingSettings
+from priors.training.run import train
+
+TINY = LstmGmmConfig(width=8, components=2)
+MEASURE = density_quality.measure_free_runs
+SETTINGS = TrainingSettings(steps=6, batch=4, window=20)
+
+
+@pytest.mark.parametrize("recipe", ["ours", "paper"])
+def test_steps_lower_the_loss(recipe):
+    config = TINY if recipe == "ours" else replace(PAPER, width=8)
+    settings = replace(SETTINGS, steps=400, batch=8, learning_rate=5e-3)
+    trainer = DensityTrainer(config, settings, corpus())
+    losses = [trainer.train_step()["loss"] for _ in range(60)]
+    assert sum(losses[-5:]) < sum(losses[:5]) - 10
+
+
+def test_a_trainer_leaves_the_callers_random_numbers_alone():
+    torch.manual_seed(5)
+    expected = torch.rand(3)
+    torch.manual_seed(5)
+    first = DensityTrainer(TINY, SETTINGS, corpus())
+    assert torch.equal(torch.rand(3), expected)
+    second = DensityTrainer(TINY, SETTINGS, corpus())
+    assert torch.equal(first.network.fc1.weight, second.network.fc1.weight)
+
+
+def test_each_window_is_mirrored_with_even_odds():
+    trainer = DensityTrainer(TINY, replace(SETTINGS, batch=1), corpus())
+    trainer.windows.starts = trainer.windows.starts[:1]
+    plain = trainer.windows.features[: SETTINGS.window + 1]
+    drawn = [trainer._draw_windows()[0][0] for _ in range(200)]
+    mirrored = sum(torch.equal(window, mirror_features(plain)) for window in drawn)
+    assert mirrored + sum(torch.equal(window, plain) for window in drawn) == 200
+    assert 70 < mirrored < 130
+
+
+def test_statistics_are_symmetric_and_floored():
+    mean, std = compute_feature_statistics(corpus().features)
+    torch.testing.assert_close(mirror_features(mean[None])[0], mean, atol=1e-5, rtol=0)
+    assert float(std.min()) >= 0.001
+    assert bool((mean[LAYOUT.continuous :] == 0.5).all())
+    assert bool((std[LAYOUT.continuous :] == 0.5).all())
+
+
+def test_free_runs_are_compared_with_the_data():
+    data = corpus()
+    found = MEASURE(DensityTrainer(TINY, SETTINGS, data).network, data, runs=4, frames=40)
+    assert found["free_run_finite"] == 1
+    assert found["free_run_speed_ratio"] == pytest.approx(1, abs=0.3)
+    assert found["free_run_height_ratio"] == pytest.approx(1, abs=0.1)
+    summary = summarise_states(encode(walk(60))[0].float())
+    assert summary["speed"] == pytest.approx(1.24, abs=0.02)
+
+
+@pytest.mark.slow
+def test_the_starts_of_a_density_are_chosen_by_its_labels(tmp_path, monkeypatch):
+    write_corpus(tmp_path / "data")
+    asked, select = [], lstm_gmm.select_initial_states
+    monkeypatch.setattr(
+        lstm_gmm, "select_initial_states", lambda *given, **named: asked.append(named) or select(*given, **named)
+    )
+    monkeypatch.setattr(density_quality, "measure_free_runs", partial(MEASURE, runs=2, frames=20))
+    labels = r"(?P<clip>\d)\.bvh"
+    train(DensityRecipe(tmp_path / "data", tmp_path / "run", config=TINY, settings=SETTINGS, starts=4, labels=labels))
+    (given,) = asked
+    assert given["labels"].tolist() == torch.eye(len(given["labels"])).tolist()
