@@ -5,7 +5,6 @@ Times cross between processes as values of time.perf_counter, which all processe
 """
 
 import functools
-import math
 import queue
 import threading
 from collections import deque
@@ -22,7 +21,6 @@ from mapctl.errors import MapctlError, RequestError
 from mapctl.intent.steering import Arrival, Command
 from mapctl.runtime.forking import ForkedProcess, SharedBases, can_fork_for
 from mapctl.runtime.live_protocol import FrameChunk
-from mapctl.runtime.memory import measure_memory_mb
 from mapctl.runtime.processes import open_pipe, send_queued, spawn
 from mapctl.skeleton import Skeleton
 
@@ -102,16 +100,6 @@ class CharacterProcess:
     def pid(self) -> int | None:
         """Id of the process, a number of the operating system; None where there is none yet."""
         return self._process.pid
-
-    @property
-    def base_pid(self) -> int | None:
-        """Id of the process that it was forked from, which others may share; None where it loaded by itself."""
-        return None if self._base is None else _BASES.pid(self._base)
-
-    def memory_mb(self) -> float:
-        """Return the memory of the process, MB, of which what it shares with others counts for a part (Linux' PSS);
-        NaN where the system does not report it."""
-        return math.nan if self.pid is None else measure_memory_mb(self.pid)
 
     def __enter__(self) -> "CharacterProcess":
         """Return it; it is closed at the end of a with block."""

@@ -230,7 +230,6 @@ def _warm_up(state: steer.SteerState, first: Command, models: CharacterModels) -
 def _to_frame_chunk(
     frames: SteerFrames, seconds: float, *, at: float, spare: float, notes: tuple[str, ...]
 ) -> FrameChunk:
-    energies = {entry.name: float(entry.energy.mean()) for entry in frames.ledger.entries}
     return FrameChunk(
         at,
         seconds,
@@ -239,9 +238,7 @@ def _to_frame_chunk(
         frames.contacts.numpy(),
         frames.forecast.numpy(),
         frames.steering_targets[-1].velocity,
-        energies,
         spare,
         frames.seconds,
-        frames.evaluations,
         notes,
     )

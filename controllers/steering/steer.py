@@ -16,19 +16,19 @@ from torch import Tensor
 
 from controllers.common.character import Character
 from controllers.common.initial_state import start_from_state
-from controllers.steering.cost import StepCost
 from controllers.steering.overlay import Overlay
-from controllers.steering.relaxed_footing import RelaxedFootingFirst
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, ground_speed
 from mapctl.intent.avoidance import lead_around
 from mapctl.intent.steering import Arrival, Command, SteeringTarget
 from mapctl.intent.steering_limits import SteeringLimits
 from mapctl.pose import decode
+from mapctl.problem.context import WindowRequest
 from mapctl.problem.ledger import Ledger
 from mapctl.problem.receding_horizon import CommittedFrames, HorizonSettings, RecedingHorizonSolver
 from mapctl.problem.solution import Outcome, Solution, Status
-from mapctl.problem.window_solvers import LatentNoiseSolver, SingleWindowSolver
+from mapctl.problem.warm_start import BestOfSamples, SteeringKnots
+from mapctl.problem.window_solvers import LatentNoiseSolver, SingleWindowSolver, SolvedWindow
 from mapctl.protocols import Density
 from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.solver.budget import Budget
@@ -42,6 +42,10 @@ _RECENT_FRAMES = 15  # frames, half a second, over which the velocity error is m
 _MIN_TRAVEL_SPEED = 0.3  # m/s below which the velocity has no direction
 _FAR_TURN = math.radians(75)  # beyond which a start may turn faster than the limits
 _NEAREST_STARTS = 6  # initial states nearest to the requested speed, of which one is sampled
+_RISE, _FALL = 0.1, 0.4  # share of the last step in what is expected: another process makes steps longer, none shorter
+_FORGET = 0.9  # of an evaluation's time after a step that had none to make: else there would never be one again
+_LONGEST_REST = 0.02  # seconds: a rest beyond it was interrupted by another process
+_KNOTS, _KNOT_SIGMA = 7, 0.8  # samples: noise of every feature, slow enough for a step
 
 
 @dataclass(frozen=True)
@@ -95,6 +99,33 @@ class SteerSettings:
         names = "sigma_speed", "sigma_step", "stuck", "standing"
         sigmas = {name: getattr(self, name) / character.scale for name in names}
         return replace(self, limits=character.limits(self.limits), footing=character.footing(self.footing), **sigmas)
+
+
+@dataclass(frozen=True)
+class StepCost:
+    """Times of a step."""
+
+    evaluation: float = 0.003
+    """Seconds of an evaluation, its share of all else in a step included."""
+    rest: float = 0.005
+    """Seconds of a step before its search begins and after it ends."""
+
+    def limit_search(self, seconds: float) -> float:
+        """Return the seconds after which the search of a step of so many seconds must end."""
+        return max(0.0, seconds - self.rest)
+
+    def needed_seconds(self, evaluations: int) -> float:
+        """Return the seconds of a step that makes so many evaluations."""
+        return self.rest + evaluations * self.evaluation
+
+    def learn(self, seconds: float, evaluations: int, *, search: float | None, cut_short: bool) -> "StepCost":
+        """Return the cost as known after a step of so many seconds, whose search had `search` seconds, None without
+        a limit, and ended by that limit if it was cut short."""
+        one = _expect(self.evaluation, seconds / evaluations) if evaluations else _FORGET * self.evaluation
+        rest = self.rest
+        if cut_short and search is not None:
+            rest = min(_LONGEST_REST, _expect(rest, max(0.0, seconds - search)))
+        return StepCost(one, rest)
 
 
 @dataclass(frozen=True, eq=False)
@@ -367,3 +398,39 @@ def _build_steering_terms(
     )
     terms = settings.noise, velocity, settings.footing
     return (*terms, StepLength(step_length, sigma=settings.sigma_step)) if step_length else terms
+
+
+@dataclass(frozen=True)
+class RelaxedFootingFirst:
+    """Window solver that spends half on all terms but contacts, from the best of some samples, and half on all terms.
+
+    A standing character has both feet planted, by contacts that are fixed while a window is solved: the contact term
+    then prevents any step. The search without it finds one, along which the prior predicts new contacts.
+    """
+
+    relaxed_method: LatentNoiseSolver
+    """Solver of the first half."""
+    half: LatentNoiseSolver
+    """Solver of the second half."""
+    relaxed_terms: Sequence[Term]
+    """Terms of the first half."""
+
+    @staticmethod
+    def of(half: LatentNoiseSolver, samples: int, terms: Sequence[Term], footing: FootContact) -> "RelaxedFootingFirst":
+        """Build it from the solver of one half; the first draws so many samples beside its own evaluations."""
+        space = SteeringKnots(_KNOTS, tuple(LAYOUT.slices)[:-1], _KNOT_SIGMA)
+        budget = replace(half.budget, evaluations=samples + (half.budget.evaluations or 1))
+        relaxed = replace(half, proposal=BestOfSamples(samples, space), budget=budget)
+        others = [term for term in terms if term.name != footing.name]
+        return RelaxedFootingFirst(relaxed, half, others)
+
+    def __call__(self, request: WindowRequest) -> SolvedWindow:
+        """Solve the window; either half has half of the time."""
+        request = replace(request, seconds=request.seconds / 2)
+        first = self.relaxed_method(replace(request, terms=self.relaxed_terms))
+        second = self.half(replace(request, warm_start=first.warm_start))
+        return replace(second, evaluations=first.evaluations + second.evaluations)
+
+
+def _expect(known: float, last: float) -> float:
+    return known + (_RISE if last > known else _FALL) * (last - known)

@@ -1,6 +1,6 @@
 """The protocol between a character that is steered live and its viewer; neither knows the other."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Protocol, runtime_checkable
@@ -33,15 +33,11 @@ class FrameChunk:
     """World joint positions of the forecast frames, metres."""
     wish: tuple[float, float]
     """Target velocity of the last frame, x and z, m/s."""
-    energies: Mapping[str, float]
-    """Mean nats a frame by term, of the new frames."""
     spare: float
     """Lateness, seconds from when the first frame was due to its delivery; negative where it came early. Frames that
     came very late are due anew, as soon as they are there."""
     compute_seconds: float
     """Compute time of the step, seconds."""
-    evaluations: int
-    """Evaluations of energy and gradient in the step."""
     notes: tuple[str, ...] = ()
     """Notes on commands since the last step that could not be obeyed, or not as given."""
 

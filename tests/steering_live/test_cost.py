@@ -9,7 +9,7 @@ import pytest
 from test_steer import AHEAD, QUICK, begun
 
 from controllers.steering import steer
-from controllers.steering.cost import StepCost
+from controllers.steering.steer import StepCost
 from mapctl.problem import window_solvers
 from mapctl.problem.objective import Objective
 from mapctl.solver.budget import Meter

@@ -88,7 +88,6 @@ def test_it_is_a_live_character_that_walks_in_time(remote):
     assert 50 <= frames <= 70
     assert all(b.due > a.due for a, b in pairwise(pieces))
     assert all(np.isfinite(piece.quats).all() for piece in pieces)
-    assert set(pieces[-1].energies) == {"noise", "travel", "footing"}
     motion = pieces[-1].motion(remote.skeleton)
     assert motion.joint_positions().shape == (3, 21, 3)
     assert pieces[-1].root[-1, 2] > pieces[0].root[0, 2], "it goes along +z"
@@ -143,7 +142,6 @@ def test_orders_that_cannot_be_are_brought_near_or_left_out_and_said(remote):
 def test_who_is_gone_is_said_after_all_that_came_until_then_and_comes_back_by_a_reset(load):
     lost = CharacterProcess(CharacterRequest(load, Command(1.0, 0.0)))
     lost.wait()
-    assert lost.memory_mb() > 10
     time.sleep(0.5)
     lost._process.kill()
     lost._process.join()

@@ -9,7 +9,7 @@ import pytest
 from tiny_prior import save_tiny_prior
 
 import priors
-from controllers.steering import process_worker
+from controllers.steering import process, process_worker
 from controllers.steering.process import CharacterProcess, CharacterRequest
 from mapctl.intent.steering import Command
 from mapctl.runtime import forking
@@ -25,7 +25,7 @@ def test_who_ends_is_started_again_from_the_same_process_or_a_new_one(tmp_path):
         lost.wait()
         other.wait()
         first = lost.pid
-        os.kill(lost.base_pid, signal.SIGKILL)
+        os.kill(process._BASES.pid(lost._base), signal.SIGKILL)
         os.kill(first, signal.SIGKILL)
         until = time.perf_counter() + 10
         while not lost._failed and time.perf_counter() < until:
