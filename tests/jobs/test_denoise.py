@@ -59,7 +59,7 @@ def roughness(motion):
     return float(motion.joint_positions().diff(n=3, dim=0).norm(dim=-1).mean())
 
 
-@pytest.mark.parametrize("fps", [24, 29.97, 240])
+@pytest.mark.parametrize("fps", [24, pytest.param(240, marks=pytest.mark.slow)])
 def test_any_rate_is_as_good_as_the_priors_own(fps):
     """Errors and toes' acceleration beside those of the same motion with as much noise a second at 30 fps."""
 

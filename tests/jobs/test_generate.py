@@ -30,7 +30,7 @@ def made(seconds=1.0, *, seed=0, settings=RAW, **wishes):
     return generate(DENSITY, seconds=seconds, generator=generator(seed), settings=settings, **wishes).motion
 
 
-@pytest.mark.parametrize(("seconds", "frames"), [(1.0, 30), (0.5, 15), (0.001, 2), (1.51, 45)])
+@pytest.mark.parametrize(("seconds", "frames"), [(0.5, 15), (0.001, 2), (1.51, 45)])
 def test_it_is_as_long_as_asked(seconds, frames):
     motion = made(seconds)
     assert (motion.num_frames, motion.fps) == (frames, 30)

@@ -27,7 +27,8 @@ PEOPLE = {
     "drooping T-pose": Performer(size=0.9, droop_deg=20, foot=(-0.05, 0.12), toe_height=0.03),
     "below the floor": Performer(size=1.03, toe_height=-0.03),
 }
-PAIRS = [("usual", name) for name in PEOPLE] + [(name, "usual") for name in PEOPLE] + [("tall", "drooping T-pose")]
+PAIRS = [("usual", "tall"), ("short legs", "usual"), ("usual", "long flat foot"), ("drooping T-pose", "usual")]
+PAIRS += [("usual", "below the floor"), ("tall", "drooping T-pose")]
 
 
 FLAT = Performer(leg=1.1, foot=(-0.06, 0.15), toe_height=0.02)

@@ -139,6 +139,12 @@ def test_first_step_far_too_short_costs_little_and_is_not_taken_for_the_end(name
         assert result.evaluations[0] <= usual.evaluations[0] * 1.25 + extra
 
 
+def test_little_won_by_a_guessed_step_is_not_the_end():
+    options = LbfgsSettings(initial_step=1e-9, max_trials=1)
+    result = minimise(with_gradient(quadratic(10, 3)), rows(1, 1, 1), settings=options)
+    assert result.energy[0] < 1e-4
+
+
 def test_problems_in_a_batch_are_those_alone_to_the_bit():
     # Of very different size, starts and lengths; one ends at once, one is never finite.
     scales = torch.tensor([1.0, 1e-4, 1e6, 1.0, 1.0], dtype=torch.float64)

@@ -19,7 +19,6 @@ from mapctl.terms import FootContact, Jerk, LandingSigmas, LatentPrior, Likeliho
 from mapctl.terms.foot_contact import HeelSigmas
 
 each_term = pytest.mark.parametrize("name", TERMS)
-EXACT = pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 
 
 def rows(whole, picked):
@@ -34,17 +33,13 @@ def test_the_catalogue_has_every_term():
 
 
 @each_term
-@EXACT
-def test_energies_and_residuals_are_one_finite_number_a_frame(name, dtype):
-    for batch in (1, 3):
-        for past in (0, 1, PAST):
-            for values in (
-                TERMS[name](trial(batch, dtype=dtype, past=past)),
-                TERMS[name].residual(trial(batch, dtype=dtype, past=past)),
-            ):
-                assert values.shape == (batch, FRAMES)
-                assert values.dtype == dtype
-                assert bool(torch.isfinite(values).all())
+def test_energies_and_residuals_are_one_finite_number_a_frame(name):
+    for batch, past, dtype in ((1, 0, torch.float64), (3, 1, torch.float32), (3, PAST, torch.float64)):
+        whole = trial(batch, dtype=dtype, past=past)
+        for values in (TERMS[name](whole), TERMS[name].residual(whole)):
+            assert values.shape == (batch, FRAMES)
+            assert values.dtype == dtype
+            assert bool(torch.isfinite(values).all())
 
 
 @each_term
@@ -57,9 +52,8 @@ def test_energies_and_residuals_are_not_negative_but_for_densities(name):
 
 
 @each_term
-@pytest.mark.parametrize("past", [0, PAST])
-def test_candidates_know_nothing_of_each_other(name, past):
-    whole, term = trial(4, past=past), TERMS[name]
+def test_candidates_know_nothing_of_each_other(name):
+    whole, term = trial(4), TERMS[name]
     for row in range(4):
         alone = rows(whole, slice(row, row + 1))
         torch.testing.assert_close(term(whole)[row], term(alone)[0], atol=1e-9, rtol=1e-9)
@@ -114,9 +108,8 @@ def moved_obstacle(obstacle, turn, shift):
 
 
 @each_term
-@pytest.mark.parametrize("turn", [0.9, -2.5])
-def test_moving_the_whole_scene_changes_nothing(name, turn):
-    here, term, shift = trial(), TERMS[name], (3.0, -2.0)
+def test_moving_the_whole_scene_changes_nothing(name):
+    here, term, shift, turn = trial(), TERMS[name], (3.0, -2.0), -2.5
     angle = torch.tensor(turn, dtype=torch.float64)
     place = GroundPose(
         rotate_ground(here.start.position_xz, angle) + torch.tensor(shift).double(), here.start.heading + turn
