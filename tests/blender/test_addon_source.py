@@ -137,7 +137,3 @@ def test_mapctl_is_found_by_path_by_preference_and_by_python(source, tmp_path, m
 def test_other_programs_are_refused(source, tmp_path, said, told):
     with pytest.raises(source("problem").AddonError, match=told):
         source("process").find_command(write_program(tmp_path, f"print('{said}')"))
-
-
-def test_this_version_is_accepted(source):
-    assert source("process").read_version((sys.executable, "-m", "mapctl")) >= source("process").OLDEST

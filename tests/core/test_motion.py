@@ -6,7 +6,7 @@ import pytest
 import torch
 from helpers import bandai_skeleton, generator, quat_xyzw, random_motion, turn_between, walk
 
-from mapctl.errors import MapctlError, RequestError
+from mapctl.errors import MapctlError
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL, Skeleton
 
@@ -46,12 +46,6 @@ def test_unlike_motions_are_not_joined(other):
     longer = Skeleton(CANONICAL.names, CANONICAL.parents, CANONICAL.offsets * (1.1 if other == "skeleton" else 1))
     with pytest.raises(MapctlError, match="one skeleton and frame rate"):
         motion.join(random_motion(longer, 3, fps=fps))
-
-
-@pytest.mark.parametrize(("start", "stop"), [(-1, 3), (2, 2), (3, 2), (0, 7)])
-def test_slices_beyond_the_frames_are_refused(start, stop):
-    with pytest.raises(RequestError, match=f"frames {start}:{stop} are not within 0:6"):
-        travelling().slice(start, stop)
 
 
 def test_twice_the_rate_keeps_every_frame_and_puts_one_midway():

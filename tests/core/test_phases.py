@@ -88,21 +88,6 @@ def test_standing_before_and_after_steps_has_none_and_it_fades_without_a_leap():
     assert float(phases.diff(dim=0).abs().max()) < 0.6  # 1.7 of amplitude at 12 degrees a frame is 0.4
 
 
-@each_gait
-def test_in_a_window_cut_out_they_differ_near_its_ends_alone(period, duty):
-    """What the docstring says of the ends, over all ways to cut."""
-    whole = compute_phases(steps(12 * period, period, duty))
-    wrong = []
-    for begin in range(4 * period, 5 * period):
-        cut = slice(begin, begin + 3 * REACH)
-        found = compute_phases(steps(12 * period, period, duty)[cut])
-        wrong.append(apart(angles(found), angles(whole[cut]))[:, 0])
-    error = np.sqrt(np.square(wrong).mean(axis=0))
-    assert error[0] < 65
-    assert error[5:-5].max() < 27
-    assert error[20:-20].max() < 10
-
-
 def test_beside_reversed_features_they_are_reversed_phases():
     features = encode(walk(240, turn_rate=0.4))[0]
     there, back = (compute_phases(LAYOUT.pick(each, "contacts")) for each in (features, reversed_features(features)))

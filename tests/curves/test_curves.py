@@ -95,20 +95,6 @@ def test_a_curve_through_points_passes_them_smoothly_and_few_points_are_a_line()
         curves.through(points[2:4])
 
 
-def test_a_smooth_curve_through_a_few_points_can_be_closed():
-    corners = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0]])
-    loop = curves.through(corners, closed=True)
-    assert loop.closed
-    assert loop.length == pytest.approx(2 * np.pi * np.sqrt(2), rel=0.02)
-    at = loop.nearest(torch.from_numpy(corners))
-    assert float((loop.point(at) - torch.from_numpy(corners)).norm(dim=-1).max()) < 1e-3
-    ahead = float(loop.heading(loop.length - 0.001) - loop.heading(0.001))
-    assert abs(np.arctan2(np.sin(ahead), np.cos(ahead))) < 0.1, "it is as smooth where it closes"
-    same = curves.through(np.concatenate([corners, corners[:1]]), closed=True)
-    assert same.length == pytest.approx(loop.length, rel=1e-6)
-    assert curves.through(corners[:2], closed=True).length == pytest.approx(4.0)
-
-
 def test_an_open_curve_goes_on_straight():
     curve = curves.s(length=4.0)
     for end, sign in ((0.0, -1.0), (curve.length, 1.0)):

@@ -5,7 +5,7 @@ from fractions import Fraction
 
 import pytest
 import torch
-from helpers import run, walk
+from helpers import walk
 from methods import UNFINISHED
 from tiny_infiller import tiny_infiller
 
@@ -60,16 +60,6 @@ def test_frames_are_the_other_clips_own(own, other, asked):
     assert asked["frames"].tolist() == list(range(2 * own, 2 * own + round(0.5 * own)))
     wanted = 0.5 + torch.arange(len(asked["frames"]), dtype=torch.float64) / own
     torch.testing.assert_close(asked["seconds"], wanted, atol=1e-3, rtol=0)
-
-
-def test_ranges_beyond_the_other_clip_are_refused_in_its_frames(tmp_path, capsys):
-    walk(40).save(tmp_path / "in.bvh")
-    waving(120, 1.0).save(tmp_path / "other.bvh")
-    paths = (tmp_path / "in.bvh", "--from", tmp_path / "other.bvh", "-o", tmp_path / "out.bvh", "--joints", "leftHand")
-    assert run("blend", *paths, "--frames", "100:121", "--at", "3") == 2
-    assert "the range of --frames 100:121 must begin before it ends" in capsys.readouterr().err
-    assert run("blend", *paths, "--frames", "20:120", "--at", "30") == 2  # 25 frames of IN from its 30th of 40
-    assert "frames 30:55 are not within the motion's 0:40" in capsys.readouterr().err
 
 
 ENDS = [CANONICAL.index(name) for name in ("leftHand", "rightHand", "leftToes", "rightToes")]

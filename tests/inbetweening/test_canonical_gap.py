@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from captures import apart_deg, on_rig
+from captures import apart_deg
 from helpers import walk
 
 from controllers.common.canonical_clip import CanonicalClip
@@ -73,35 +73,6 @@ def test_a_frame_that_tells_the_hips_alone_is_shown_too(key):
     assert not gap.missing.joints[moment, 0]
     assert gap.missing.joints[moment, 1:].all()
     assert torch.equal(gap.motion.root_position[moment], motion.root_position[key])
-
-
-@pytest.mark.parametrize("fps", [30, 50, 120])
-def test_where_nothing_is_lost_it_is_the_motion_at_the_priors_rate(fps):
-    motion = walk(fps, fps=fps)
-    gap = gap_of(motion, keyed(motion, range(fps)))
-    whole = motion.resample(30)
-    frames = slice(0, whole.num_frames)
-    assert torch.equal(gap.motion.root_position[frames], whole.root_position)
-    assert torch.allclose(gap.seconds[frames], torch.arange(whole.num_frames).double() / 30)
-    assert known(gap) == list(range(gap.motion.num_frames))
-
-
-@pytest.mark.parametrize("fps", [30, 120])
-@pytest.mark.parametrize("rig", ["canonical", "daz"])
-def test_joints_that_are_lost_throughout_are_lost_in_every_moment(rig, fps):
-    motion = on_rig(rig, fps, fps=fps)
-    _, rigmap = retarget.to_canonical(motion)
-    hand = {"canonical": "leftHand", "daz": "lHand"}[rig]
-    lost = MissingMask.of_masks(motion, [Mask(hand, 0, fps)], rigmap)
-    gap = CanonicalClip.of(motion, lost).query()
-    assert known(gap) == []
-    taken = {CANONICAL.names[joint] for joint in gap.missing.joints.all(dim=0).nonzero()[:, 0].tolist()}
-    assert taken == {"leftHand", "leftLowerArm"}
-    assert gap.missing.joints.any(dim=0).sum() == 2
-    assert not gap.missing.root.any()
-    places = gap.known_positions
-    assert not places[:, CANONICAL.index("leftHand")].any()
-    assert places[:, CANONICAL.index("rightHand")].all()
 
 
 def test_a_place_is_known_only_with_all_that_carries_it():

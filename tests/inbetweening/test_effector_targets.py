@@ -104,22 +104,6 @@ def test_a_limb_goes_there_and_back_smoothly(fps):
     assert torch.diff(offset, n=2, dim=0).norm(dim=-1).max() * fps**2 < 120 * peak
 
 
-@pytest.mark.parametrize("count", [2, 15])
-def test_runs_of_places_are_met_in_every_frame(count):
-    motion = walk(60)
-    frames = range(20, 20 + count)
-    start = nearer(motion, 20, "rightHand")
-    targets = at(
-        motion,
-        {
-            (frame, "rightHand"): start + place_of(motion, frame, "chest") - place_of(motion, 20, "chest")
-            for frame in frames
-        },
-    )
-    made = reach_effector_targets(motion, targets, all_free(motion))
-    assert compute_target_errors(made.joint_positions(), targets).max() < HAIR
-
-
 @pytest.mark.parametrize("limb", LIMBS)
 def test_out_of_reach_the_limb_is_straight_and_points_there_and_is_said_to_miss(limb):
     motion = walk(31)
@@ -169,17 +153,3 @@ def test_a_bent_limb_stays_in_its_plane():
     assert float(after.norm()) > float(before.norm()) > 0.05
     assert float(after @ before) == pytest.approx(float(after.norm() * before.norm()), rel=1e-9)
     assert float(after[0]) > 2 * float(after[2])
-
-
-@pytest.mark.parametrize("fps", [24, 30, 120])
-def test_every_wanted_place_is_shown_at_the_moment_nearest_to_it(fps):
-    motion = walk(2 * fps, fps=fps)
-    frames = [1, fps // 2, fps // 2 + 5, fps, 2 * fps - 1]
-    targets = at(motion, {(frame, "leftHand"): torch.full((3,), float(frame)).double() for frame in frames})
-    moments = torch.arange(60).double() / 30
-    shown, hand = targets.shown(moments, fps=fps), CANONICAL.index("leftHand")
-    assert int(shown.wanted.sum()) == len(frames)
-    for frame in frames:
-        (moment,) = (shown.places[:, hand, 0] == frame).nonzero()[:, 0].tolist()
-        assert shown.wanted[moment, hand]
-        assert abs(moments[moment] - frame / fps) <= (moments - frame / fps).abs().min() + 1e-12

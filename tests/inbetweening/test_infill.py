@@ -161,15 +161,6 @@ def test_gaps_at_the_beginning_and_the_end_are_extended_into_and_said(method):
     assert [note.partition(":")[0] for note in done.notes][:2] == ["a gap at the beginning", "a gap at the end"]
 
 
-@pytest.mark.parametrize("fps", [24, 120])
-@pytest.mark.parametrize("gap", [(0.5, 0.52), (0.0, 0.1), (0.9, 1.0)])
-def test_gaps_of_a_few_frames_anywhere_break_nothing(fps, gap):
-    motion = on_rig("canonical", fps, fps=fps)
-    start = min(fps - 1, round(gap[0] * fps))
-    mask = Mask(ALL, start, max(start + 1, round(gap[1] * fps)))
-    assert_known_stays(motion, filled(motion, mask, drawn=0.0).motion, [mask])
-
-
 @pytest.mark.parametrize(("frames", "method"), [(2, "infiller"), (3, "infiller"), (5, "slerp"), (3, "auto")])
 def test_motions_of_a_few_frames_break_nothing(frames, method):
     motion = on_rig("canonical", frames)

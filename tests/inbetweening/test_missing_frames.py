@@ -138,15 +138,6 @@ def test_a_lost_place_takes_the_rotation_that_put_it_there_along(joint, taken):
     assert not lost.root.any()
 
 
-def test_joints_that_are_never_known_rest():
-    motion = on_rig("canonical", 30)
-    lost = lost_of(motion, Mask("leftHand", 0, 30))
-    made = interpolate_missing(motion, lost)
-    rest = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
-    for name in ("leftHand", "leftLowerArm"):
-        assert torch.equal(made.local_quat_xyzw[:, motion.skeleton.index(name)], rest.expand(30, 4))
-
-
 @pytest.mark.parametrize(
     ("masks", "message"),
     [

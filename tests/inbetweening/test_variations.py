@@ -20,7 +20,6 @@ from controllers.inbetweening.proposers.rollouts import Roller, Rollout, Rollout
 from controllers.inbetweening.refine import INFILL_REFINEMENT
 from controllers.inbetweening.tween import tween
 from controllers.inbetweening.variations import lowest_energy, sample_variations
-from mapctl import rotations
 from mapctl.errors import RequestError
 from mapctl.inbetweening.missing import MissingMask
 from mapctl.intent.keyframes import Keys
@@ -139,30 +138,6 @@ def test_a_rollout_in_which_a_leg_is_thrown_over_is_rolled_anew_or_left_to_the_f
     plain = SlerpInbetweener().propose(gap).motion.local_quat_xyzw
     expected = plain if by == "slerp" else rolled[-1].body.local_quat_xyzw
     torch.testing.assert_close(answer.motion.local_quat_xyzw, expected)
-
-
-def test_beside_a_still_answer_a_rollout_may_step_as_a_walk_does(monkeypatch):
-    still = on_rig("canonical", FRAMES)
-    still = replace(
-        still,
-        root_position=still.root_position[:1].expand(FRAMES, 3),
-        local_quat_xyzw=still.local_quat_xyzw[:1].expand(FRAMES, -1, 4),
-    )
-    free = torch.zeros(FRAMES, dtype=torch.bool)
-    free[20:30] = True
-    gap = CanonicalClip.of(still, MissingMask.of_frames(free, still.num_joints)).query()
-
-    def roll(self, start, stop, generator, settings):
-        """A shoulder that swings by a tenth of a radian in one frame: a hand steps 5 cm."""
-        quats = self.body.local_quat_xyzw.clone()
-        arm = CANONICAL.index("leftUpperArm")
-        swung = rotations.from_rotation_vector(torch.tensor([0.0, 0.1, 0.0], dtype=quats.dtype))
-        quats[25:28, arm] = rotations.multiply(swung.expand(3, 4), quats[25:28, arm])
-        return Rollout(start, replace(self.body, local_quat_xyzw=quats), self.contact_logits)
-
-    monkeypatch.setattr(Roller, "roll", roll)
-    answer = RolloutInbetweener([tiny_density()], SlerpInbetweener()).propose(gap, generator=generator(0))
-    assert [source.by for source in answer.attribute(gap)] == ["rollout of tiny"]
 
 
 @pytest.mark.parametrize("frames", [(30, 45), pytest.param((8, 45), marks=pytest.mark.slow)])

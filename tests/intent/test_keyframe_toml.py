@@ -7,9 +7,6 @@ from mapctl.intent.keyframe_toml import KeyEntry, read_keys
 
 TWO = '[[key]]\nframe = 0\npose = "a.bvh"\n[[key]]\nframe = 30\npose = "b.bvh"\n'
 
-LIMB = "reach = { leftHand = [0, 1, 0] }"
-DRAWINGS = 'body = "c.bvh"\n[[key]]\nframe = 0\ndrawing = "d.csv"\n[[key]]\nframe = 30\ndrawing = "d.csv"\n'
-
 
 def written(tmp_path, text):
     path = tmp_path / "keys.toml"
@@ -70,13 +67,3 @@ def test_what_is_wrong_is_said_with_its_place(tmp_path, text, said):
         read_keys(path)
     assert str(caught.value).startswith(f"{path}: {said}")
     assert "\n" not in str(caught.value)
-
-
-def test_keys_that_are_not_whole_are_read_and_none_need_be(tmp_path):
-    text = DRAWINGS.replace("frame = 30", "frame = 30\nplace = [1, 2]\nview_deg = -90")
-    more = '[[key]]\nseconds = 0.5\nroot_only = "place"\nplace = [0, 1]\n[[key]]\nseconds = 2\nhalf = "lower"\n'
-    request = read_keys(written(tmp_path, text + more))
-    assert [key.tells_place for key in request.key] == [False, True, True, True]
-    assert [key.needs_pose for key in request.key] == [False, False, False, True]
-    assert (request.key[1].drawing, request.key[1].view_deg) == (str(tmp_path / "d.csv"), -90)
-    assert str(tmp_path / "d.csv") in request.files

@@ -1,14 +1,13 @@
 """Following a curve with an untrained density: the contract of the job, not the quality of the walk."""
 
 import math
-from dataclasses import replace
 
 import pytest
 import torch
 from helpers import generator, tiny_density
 
 import controllers
-from controllers.common.feasibility import check_path, check_tracking
+from controllers.common.feasibility import check_path
 from controllers.common.initial_state import select_initial_state
 from controllers.following.follow import FollowSettings, build_follow_terms
 from mapctl import curves
@@ -155,19 +154,6 @@ def test_a_curve_too_short_for_the_seconds_is_slowed_down_or_named():
     assert closed.fitted(30) == (closed, None)
 
 
-def test_leaving_the_curve_is_told_with_the_distance_and_the_time():
-    motion = follow(curves.line(length=3), seconds=1.0).motion
-    beside = motion.root_position.clone()
-    beside[:, 0] = 0.14
-    line = curves.line(length=3)
-    assert check_tracking(replace(motion, root_position=beside), line, "hips") == []
-    beside[12:19, 0] = 0.4
-    told = check_tracking(replace(motion, root_position=beside), line, "hips")
-    assert told == ["the curve is left by up to 40 cm between 0.4 and 0.6 s"]
-    beside[25:, 0] = 0.3  # another stretch, not so bad
-    assert check_tracking(replace(motion, root_position=beside), line, "hips") == told
-
-
 def test_the_start_is_one_of_the_best_by_the_wishes_speed():
     arcs = 0.04 * torch.arange(60, dtype=torch.float64)
     curve = curves.circle(radius=2)
@@ -177,14 +163,6 @@ def test_the_start_is_one_of_the_best_by_the_wishes_speed():
     stood = found.before_first.displace(found.committed.features[0, :2], found.committed.features[0, 2])
     torch.testing.assert_close(stood.position_xz, found.committed.place.position_xz, atol=1e-6, rtol=0)
     torch.testing.assert_close(stood.heading, found.committed.place.heading)
-
-
-@pytest.mark.parametrize(
-    ("text", "at", "speed"),
-    [("1.2", 7.0, 1.2), ("0:1.0,4:2.0", 2.0, 1.5), ("0:1.0,4:2.0", 9.0, 2.0), ("1:3,2:1", 0.0, 3.0)],
-)
-def test_speed_profiles_are_linear_between_their_arcs(text, at, speed):
-    assert SpeedProfile.parse(text).at(at) == pytest.approx(speed)
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers import finite_difference, generator, tiny_density, walk
+from helpers import generator, tiny_density, walk
 
 from controllers.common.map_refinement import RefinementSettings, refine
 from mapctl import rotations
@@ -17,13 +17,12 @@ from mapctl.pose import BodyPose
 from mapctl.problem import window_solvers
 from mapctl.problem.context import WindowContext
 from mapctl.problem.density_selection import DensityEnsemble
-from mapctl.problem.objective import Objective
 from mapctl.problem.pose_offsets import PoseOffsets
 from mapctl.recording import Capture
 from mapctl.skeleton import CANONICAL, TOES
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings
-from mapctl.terms import Clearance, FootContact, LatentPrior
+from mapctl.terms import Clearance
 
 TOE = CANONICAL.indices(TOES)
 QUICK = RefinementSettings(lbfgs=LbfgsSettings(max_iterations=20), budget=Budget(evaluations=20))
@@ -62,17 +61,6 @@ def offsets_of(motion, contacts, dtype=torch.float32, sigma=0.05):
     return PoseOffsets(context, pose, contacts, torch.full(pose.pack().shape, sigma, dtype=dtype))
 
 
-def test_without_unknowns_the_poses_are_the_guides():
-    motion = walk(20, turn_rate=1.0)
-    poses = offsets_of(motion, torch.ones(20, 2, dtype=torch.bool), torch.float64)
-    trial = poses.build(torch.zeros(2, poses.sigma.numel(), dtype=torch.float64))
-    assert trial.joints_world.shape == (2, 20, CANONICAL.num_joints, 3)
-    assert (trial.joints_world[1] - motion.joint_positions()).abs().max() < 1e-5
-    heading, _ = rotations.split_heading(motion.local_quat_xyzw[:, 0])
-    assert (trial.heading[0] - rotations.unwrap_angle(heading)).abs().max() < 1e-5
-    assert trial.contacts.all()
-
-
 def test_unknowns_of_unit_variance_move_poses_by_their_sigma_and_smoothly():
     poses = offsets_of(walk(60), torch.zeros(60, 2, dtype=torch.bool), torch.float64)
     white = torch.randn(150, poses.sigma.numel(), generator=generator(), dtype=torch.float64)
@@ -80,18 +68,6 @@ def test_unknowns_of_unit_variance_move_poses_by_their_sigma_and_smoothly():
     assert float(heights.square().mean().sqrt()) == pytest.approx(0.05, rel=0.1)
     step = torch.diff(heights, dim=1).square().mean().sqrt()
     assert step < 0.6 * heights.square().mean().sqrt()  # white ones would differ by 1.4 times
-
-
-def test_the_gradient_is_that_of_finite_differences():
-    motion = walk(12, turn_rate=0.5)
-    poses = offsets_of(motion, torch.tensor([True, False]).expand(12, 2).contiguous(), torch.float64)
-    objective = Objective(poses.build, [LatentPrior(1.0), FootContact(sigma_speed=0.1, sigma_height=0.03)])
-    at = 0.3 * torch.randn(1, poses.sigma.numel(), generator=generator(1), dtype=torch.float64)
-    _, gradient = objective.energy_and_gradient(at)
-    for seed in range(3):
-        direction = torch.randn(at.shape, generator=generator(seed), dtype=torch.float64)
-        wanted = finite_difference(lambda x: objective.energy(x).sum(), at, direction)
-        assert float((gradient * direction).sum()) == pytest.approx(wanted, rel=1e-5)
 
 
 def test_planted_toes_that_slide_slow_down_and_joints_stay_near():

@@ -10,12 +10,11 @@ from helpers import walk
 import priors
 from controllers.shots.clips.arrival import Arrival, arrive
 from controllers.shots.keys.approaching import go_down
-from controllers.shots.keys.posing import as_reaches, measure_pose_error, meet_poses
+from controllers.shots.keys.posing import measure_pose_error, meet_poses
 from controllers.shots.keys.reaching import ReachTargets, settle_reaches
 from controllers.shots.loop import OVERLAP, close_loop
 from controllers.shots.planning.way import Way, plan_way
 from controllers.shots.request import PoseKey, Reach, ShotRequest
-from controllers.shots.wishes import Wish, describe_fights
 from mapctl import curves, kinematics
 from mapctl.errors import RequestError
 from mapctl.intent.path import SpeedProfile
@@ -104,14 +103,6 @@ def test_a_key_may_be_met_within_its_frames(walked, way, inbetweener):
     key = PoseKey(2.0, crouched(), within_frames=8)
     _, (met,) = meet_poses(walked, (key,), way, inbetweener)
     assert abs(met.start - 60) <= 8
-
-
-def test_limbs_of_a_pose_become_reaches_to_where_they_are_in_it(walked, way):
-    key = PoseKey(2.0, crouched(), joints=("leftHand",), place=(0.2, 2.2), facing_deg=0.0)
-    (reach,) = as_reaches((key,), way, walked.slice(0, 1))
-    hips = crouched().joint_positions()[0]
-    expected = hips[CANONICAL.index("leftHand")] - hips[0] + torch.tensor([0.2, float(hips[0, 1]), 2.2]).double()
-    torch.testing.assert_close(torch.tensor(reach.places["leftHand"]).double(), expected, atol=1e-6, rtol=0)
 
 
 @pytest.mark.parametrize(
@@ -208,18 +199,3 @@ def test_a_loop_leads_from_its_last_frame_into_its_first(inbetweener):
     # A lap that is cut off has 197 m/s^2 where it begins again; laps put together without one made anew have 116.
     assert hardest(made) < 35 < 100 < hardest(long.slice(0, frames))
     torch.testing.assert_close(made.root_position[60:], long.root_position[60:frames])
-
-
-def test_wishes_that_fight_are_named_together(walked, way):
-    wishes = (
-        Wish("leftHand at 2 s", "there", 14.0, 1.0, "cm", remedy="0.4 s later", seconds=(2.0, 2.0)),
-        Wish("look at 2.2 s", "straight", 40.0, 15.0, "degrees", seconds=(2.2, 2.2)),
-        Wish("look at 3.9 s", "straight", 40.0, 15.0, "degrees", seconds=(3.9, 3.9)),
-        Wish("path", "on the curve", 1.0, 15.0, "cm"),
-    )
-    first = describe_fights(wishes, way, walked)[0]
-    assert "leftHand at 2 s" in first
-    assert "13.0 cm short (0.4 s later would do)" in first
-    assert "look at 2.2 s, 25.0 degrees short" in first
-    assert "3.9" not in first
-    assert "cm off at that time" in first

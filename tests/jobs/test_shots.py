@@ -9,10 +9,8 @@ import torch
 from helpers import walk
 
 import priors
-from controllers.common.character import Character
 from controllers.shots.clips.lead import Lead
-from controllers.shots.keys.looking import look_where_hands_reach, measure_look_errors, turn_heads
-from controllers.shots.keys.reaching import ReachTargets
+from controllers.shots.keys.looking import measure_look_errors, turn_heads
 from controllers.shots.planning.timeline import StandingEnds, lay_timeline, plan_speeds
 from controllers.shots.planning.way import plan_way
 from controllers.shots.request import Look, Others, Reach, ShotRequest
@@ -23,7 +21,6 @@ from mapctl.curves.obstacles import Obstacle, measure_clearance
 from mapctl.errors import RequestError
 from mapctl.intent.path import SpeedProfile
 from mapctl.intent.timed_speed import TimedSpeed
-from mapctl.kinematics.head_turning import measure_look_angle
 from mapctl.metrics import worst_frame
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, TOES
 
@@ -109,14 +106,6 @@ def test_what_no_arm_reaches_is_refused_with_its_distance(place):
 # Going on from a clip
 
 
-def test_a_lead_ends_in_its_frame_at_the_densitys_rate():
-    clip = walk(200, fps=120)
-    lead = Lead.of(clip, 150)
-    assert lead.motion.fps == 30
-    torch.testing.assert_close(lead.motion.root_position[-1], clip.root_position[150])
-    torch.testing.assert_close(lead.motion.root_position[-2], clip.root_position[146])
-
-
 def test_a_curve_is_brought_to_a_lead_or_the_lead_to_the_curve():
     lead = Lead.of(walk(90, turn_rate=0.5), 80)
     brought = lead.bring_curve(curves.wave(amplitude=0.5, length=4))
@@ -128,14 +117,6 @@ def test_a_curve_is_brought_to_a_lead_or_the_lead_to_the_curve():
     assert abs(math.remainder(moved.direction - curve.start_heading, 2 * math.pi)) < 1e-6
     steps = [each.motion.root_position.diff(dim=0).norm(dim=-1) for each in (lead, moved)]
     torch.testing.assert_close(*steps)
-
-
-def test_a_walk_begins_in_the_leads_last_pose():
-    prior, lead = priors.load("locomotion"), Lead.of(walk(90), 70)
-    start = lead.start(prior, Character())
-    torch.testing.assert_close(
-        start.committed.joints_world[0].double(), lead.last_pose.joint_positions()[0], atol=1e-3, rtol=0
-    )
 
 
 # Poses
@@ -163,18 +144,6 @@ def test_a_head_looks_where_it_is_told_and_back_without_a_jump():
     torch.testing.assert_close(turned.joint_rotations()[same, head], motion.joint_rotations()[same, head])
     one, other = turned.joint_rotations()[:-1, head], turned.joint_rotations()[1:, head]
     assert float(torch.rad2deg(2 * (one * other).sum(-1).abs().clamp(max=1).acos()).max()) < 12  # a frame
-
-
-def test_targets_beyond_reach_are_brought_within_it():
-    motion = walk(60)
-    shoulder = motion.joint_positions()[30, CANONICAL.index("leftUpperArm")]
-    far = ReachTargets.of((Reach(1.0, {"leftHand": tuple((shoulder + torch.tensor([2.0, 0, 0])).tolist())}, 0.2),), 60)
-    near = far.within_reach(motion).targets
-    hand = CANONICAL.index("leftHand")
-    assert int(near.wanted[:, hand].sum()) == 1
-    at = int(near.wanted[:, hand].nonzero())
-    shoulder = motion.joint_positions()[at, CANONICAL.index("leftUpperArm")]
-    assert 0.3 < float((near.places[at, hand] - shoulder).norm()) < 0.75
 
 
 # All at once
@@ -261,20 +230,3 @@ def test_who_goes_on_from_a_gesture_comes_to_rest_without_a_jolt():
     assert float(bent[24:32].max()) < 1.2 * max(float(bent[:24].max()), float(bent[40:].max()))
     moved = torch.diff(places[28:36], dim=0).norm(dim=-1).amax() * fps
     assert float(moved) > 0.5, "it does not freeze"
-
-
-def test_a_head_glances_at_what_a_hand_reaches_for_and_not_where_it_looks_already():
-    rest = build_rest_pose(priors.load("locomotion"), CANONICAL, TOE_REST_HEIGHT)
-    motion = replace(
-        rest, root_position=rest.root_position.expand(90, 3), local_quat_xyzw=rest.local_quat_xyzw.expand(90, -1, -1)
-    )
-    place, free = (0.6, 1.0, 0.5), torch.zeros(90, dtype=torch.bool)
-    reach = Reach(1.5, {"leftHand": place})
-    away = torch.tensor([place], dtype=torch.float64)
-    before = measure_look_angle(motion, away)
-    glanced = measure_look_angle(look_where_hands_reach(motion, [reach], [], free), away)
-    assert float(glanced[45]) < 0.4 * float(before[45])
-    assert float((glanced - before)[[0, -1]].abs().max()) < 1e-9
-    for looks, posed in (([Look(1.5, (0.0, 1.5, 3.0))], free), ([], ~free)):
-        kept = measure_look_angle(look_where_hands_reach(motion, [reach], looks, posed), away)
-        assert float((kept - before).abs().max()) < 1e-9

@@ -11,9 +11,6 @@ from toy_density import toy_density
 from controllers.common.map_refinement import RefinementSettings
 from controllers.denoising.denoise import DenoiseSettings, denoise
 from controllers.following.follow import FollowSettings, follow
-from controllers.generation.foot_cleanup import FootCleanupSettings
-from controllers.generation.generate import GenerateSettings, generate
-from controllers.inbetweening.infill import infill
 from controllers.inbetweening.pipeline import InfillSettings
 from controllers.inbetweening.proposers import AutoInbetweener, RolloutInbetweener
 from controllers.inbetweening.proposers.rollouts import RolloutSettings
@@ -24,7 +21,6 @@ from mapctl.intent.keyframes import Keys
 from mapctl.intent.steering import Command
 from mapctl.problem.receding_horizon import HorizonSettings
 from mapctl.problem.window_solvers import LatentNoiseSolver
-from mapctl.recording.masks import Mask
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings
 
@@ -49,20 +45,6 @@ def test_it_follows_a_curve():
     assert done.status.outcome.value == "done"
 
 
-@pytest.mark.slow
-def test_it_generates_from_its_own_states_and_from_a_clip():
-    plain = GenerateSettings(foot_cleanup=None)
-    made, again, other = (
-        generate(TOY, seconds=2, settings=plain, generator=generator(seed)).motion for seed in (1, 1, 2)
-    )
-    check(made, 60)
-    assert torch.equal(again.root_position, made.root_position)
-    assert not torch.equal(other.root_position, made.root_position)
-    cleaning = GenerateSettings(foot_cleanup=FootCleanupSettings(window=WINDOW))
-    walker = on_rig("bandai", 30)
-    check(generate(TOY, seconds=0.4, settings=cleaning, generator=generator(), start_clip=walker).motion, 12)
-
-
 def test_it_is_steered():
     settings = steer.SteerSettings(horizon=8, commit=3, evaluations=10, least_evaluations=2)
     command = Command(1.2, 0.5)
@@ -83,18 +65,6 @@ def test_it_is_a_prior_of_denoising():
     check(done.motion, 40)
     assert "likelihood" in [entry.name for entry in done.ledger.entries]
     assert not torch.equal(done.motion.local_quat_xyzw, plain.motion.local_quat_xyzw)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("gap", [(12, 22), (30, 40)])
-def test_it_is_a_prior_of_infilling_and_extends_an_end(gap):
-    motion, masks, infiller = on_rig("bandai", 40), [Mask("*", *gap)], tiny_infiller(drawn=0.02)
-    done = infill(motion, AutoInbetweener(infiller, [TOY]), masks, settings=FILLING, densities=[TOY])
-    check(done.motion, 40)
-    assert "likelihood" in [entry.name for entry in done.ledger.entries]
-    assert not torch.equal(
-        done.motion.local_quat_xyzw, infill(motion, infiller, masks, settings=FILLING).motion.local_quat_xyzw
-    )
 
 
 @pytest.mark.slow

@@ -205,18 +205,6 @@ def test_the_wanted_place_lies_straight_on_from_the_nearest(name):
     torch.testing.assert_close(curve.point(arcs - apart[..., 1]), found.place, atol=1e-9, rtol=0)
 
 
-@each_curve
-def test_what_is_not_a_number_stays_so_and_harms_nobody_else(name):
-    curve = CURVES[name]
-    points, arcs = beside(curve, count=20)
-    clean = find_local_frames(curve, points, arcs, reach=0.6)
-    points[0, 3], arcs[7], arcs[9] = torch.nan, torch.inf, torch.nan
-    found = find_local_frames(curve, points, arcs, reach=0.6)
-    assert bool(torch.isnan(found.place[:, [7, 9]]).all())
-    rest = [t for t in range(20) if t not in (3, 7, 9)]
-    torch.testing.assert_close(found.axes[:, rest], clean.axes[:, rest], atol=0, rtol=0)
-
-
 COMPILED = """
 import torch
 from mapctl.features import GroundPose

@@ -96,8 +96,3 @@ def test_unknown_names_get_thin_capsules():
     body = Mannequin(strange, GREY)
     assert body.bones.radius.max() < 0.03
     assert np.isfinite(body.surface(0).vertices).all()
-
-
-@pytest.mark.parametrize("frames", [1, 2])
-def test_the_shortest_motions_have_bodies(frames):
-    assert np.isfinite(Mannequin(walk(frames), GREY).surface(frames - 1).vertices).all()

@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import pytest
 import torch
-from helpers import corpus, generator, tiny_density
+from helpers import generator, tiny_density
 from tiny_horizon import ARCS, BEGUN, CURVE, DENSITY, METHOD, SHORT, context, request, solver, terms_of
 
 from mapctl import rotations
@@ -16,7 +16,6 @@ from mapctl.metrics.feet import locate_heels
 from mapctl.pose import decode
 from mapctl.problem.latent_noise import LatentNoise
 from mapctl.problem.objective import Objective
-from mapctl.problem.receding_horizon import replay
 from mapctl.problem.solution import Outcome
 from mapctl.problem.warm_start import BestOfSamples, SwarmProposal
 from mapctl.problem.window_solvers import LatentNoiseSolver
@@ -25,7 +24,6 @@ from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings
 from mapctl.solver.swarm import SwarmSettings
 from mapctl.terms import LatentPrior, Likelihood
-from mapctl.terms.trial import Trial
 
 
 def solve(frames=20, *, method=METHOD, density=DENSITY, seed=0, **limits):
@@ -220,15 +218,6 @@ def test_windows_may_end_with_the_motion(frames, laid):
     assert (found, done) == (laid, frames)
 
 
-def test_a_replay_goes_on_from_a_state_or_from_the_likeliest():
-    features = corpus().clips()[0][:30]
-    whole = replay(DENSITY, features)
-    part = replay(DENSITY, features[:12])
-    on = replay(DENSITY, features, part, since=12)
-    for name in ("last_frame", "hidden", "cell"):
-        torch.testing.assert_close(getattr(on, name), getattr(whole, name))
-
-
 def test_a_window_knows_the_heels_of_the_frame_before():
     done, _ = solve(11)
     (heels,) = done.locate_heels(CANONICAL)
@@ -240,25 +229,3 @@ def test_a_window_knows_the_heels_of_the_frame_before():
     torch.testing.assert_close(heels.double() - done.joints_world[-1, feet].double(), wanted, atol=1e-5, rtol=0)
     assert len(replace(done, features=done.features[:0]).locate_heels(CANONICAL)) == 0
     assert len(replace(done, joints_world=done.joints_world[:0]).locate_heels(CANONICAL)) == 0
-
-
-def test_a_windows_heel_contacts_are_fixed_while_it_is_solved():
-    seen: list[Trial] = []
-
-    class Look(LatentPrior):
-        def __call__(self, trial):
-            seen.append(trial)
-            return super().__call__(trial)
-
-        def add_gradient(self, trial, gradient):
-            seen.append(trial)
-            return super().add_gradient(trial, gradient)
-
-    terms = [Look(), *terms_of(1, SHORT.frames)[1:]]
-    solver(replace(METHOD, rounds=1)).solve_window(BEGUN, terms, SHORT.frames, generator=generator(0))
-    assert len(seen) > 3
-    assert len({tuple(trial.heels_planted.flatten().tolist()) for trial in seen}) == 1
-    first = replace(seen[0], heel_plan=None)
-    assert torch.equal(first.heels_planted, seen[-1].heels_planted)
-    assert any(not torch.equal(replace(trial, heel_plan=None).heels_planted, first.heels_planted) for trial in seen)
-    assert all(trial.heel_plan is not None and len(trial.heels_before) == 1 for trial in seen)

@@ -63,24 +63,6 @@ def test_what_comes_to_rest_and_leaves_it_again_is_no_loss(whole):
     assert found.seen_root.all()
 
 
-def masked_at_random(motion, joint, *, share):
-    """The motion with wild rotations of a joint in single frames, and masks that say so."""
-    lost = torch.rand(motion.num_frames, generator=torch.Generator().manual_seed(3)) < share
-    wild = with_quats(motion, lost, joint, shaken(motion.local_quat_xyzw, 2.0)[lost, joint])
-    return wild, [Mask(motion.skeleton.names[joint], frame, frame + 1) for frame in lost.nonzero()[:, 0].tolist()]
-
-
-def test_a_joint_that_never_moves_is_known_where_it_is_masked(motion):
-    joint = moving_joint(motion)
-    still = with_quats(motion, slice(None), joint, motion.local_quat_xyzw[40, joint])
-    wild, masks = masked_at_random(still, joint, share=0.4)
-    found = inspect_recording(wild, masks)
-    assert found.dropouts.sum() == len(masks)
-    assert found.locked[joint]
-    assert found.known[:, joint].all()
-    assert not found.lost.any()
-
-
 def test_a_clean_recording_is_believed(motion):
     found = inspect_recording(motion)
     assert found.seen.all()

@@ -9,7 +9,6 @@ from stage import Actor, live_app, run
 from mapctl.curves.obstacles import Obstacle
 from mapctl.intent.steering import Command
 from mapctl.streaming.messages import Message
-from mapctl.streaming.protocols import MessageSource
 
 
 class Source:
@@ -63,10 +62,6 @@ def words(actor: Actor) -> list[str]:
     return [word for word, *_ in actor.heard]
 
 
-def test_the_source_is_one():
-    assert isinstance(Source(), MessageSource)
-
-
 @pytest.mark.slow
 def test_numbers_and_labels_become_one_command_for_their_character(stage):
     show, actors, _, send = stage
@@ -82,16 +77,6 @@ def test_numbers_and_labels_become_one_command_for_their_character(stage):
     assert actors[0].heard[-1] == ("command", Command(0.0, math.pi / 2))
     send(("stop",), ("speed", 1.0))
     assert actors[0].heard[-1][1].speed == 1.0, "the last of what came counts"
-
-
-@pytest.mark.parametrize(
-    ("name", "asked", "held"), [("speed", 1e30, 3.8), ("speed", -5.0, 0.0), ("step_length", 99.0, 1.2)]
-)
-def test_numbers_are_brought_to_the_nearest_that_can_be_and_it_is_said(stage, capsys, name, asked, held):
-    _, actors, _, send = stage
-    send((name, asked))
-    assert getattr(actors[0].heard[-1][1], name) == held
-    assert "mapctl: OSC: A s" in capsys.readouterr().err
 
 
 def test_hands_reach_together_and_let_go_alone(stage):
@@ -179,10 +164,3 @@ def test_what_cannot_be_is_said_and_changes_nothing(stage, capsys, message):
     assert show.chosen.inputs == before
     assert {word for actor in actors for word in words(actor)} <= {"aim"}, "the same as before is aimed at"
     assert capsys.readouterr().err.startswith("mapctl: OSC: ")
-
-
-def test_packets_that_make_no_sense_are_named(stage, capsys):
-    show, _, _, _ = stage
-    show._remote._source.dropped, show._remote._source.fault = 3, "a packet that is no OSC"
-    run(show, 2)
-    assert capsys.readouterr().err == "mapctl: OSC: a packet that is no OSC\n"
