@@ -3,17 +3,21 @@
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from fractions import Fraction
 from os import PathLike, fspath
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
+from mapctl import retarget
 from mapctl.errors import RequestError
 from mapctl.formats import atomic
 from mapctl.mesh.primitives import Array, Surface
 from mapctl.motion import Motion
+from mapctl.retarget.rigs import Rig
 from scenes.cameras import CameraSettings
 from scenes.contact_sheet import draw_contact_sheet, draw_strips
 from scenes.content import Painter
@@ -26,6 +30,7 @@ WRITERS = {".mp4": mp4_writer, ".gif": gif_writer, ".webp": webp_writer}
 ENDINGS = (*WRITERS, ".png")
 """Endings that `film` can write."""
 _MIN_PIXELS, _MAX_PIXELS = 16, 8192
+_SIDE_OFFSET = 1.4  # metres between two characters side by side
 _log = logging.getLogger("mapctl.scenes")
 
 PathOrText = str | PathLike[str]
@@ -68,6 +73,21 @@ def film(
         for path in sheets:
             save_png(path, picture)
     return paths
+
+
+def film_side_by_side(
+    capture: Motion,
+    clean: Motion,
+    path: PathOrText,
+    *,
+    rig: Rig | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> None:
+    """Film a capture, grey, and the result beside it."""
+    before, after = (retarget.to_canonical(motion, rig)[0] for motion in (capture, clean))
+    aside = torch.tensor([_SIDE_OFFSET, 0.0, 0.0], dtype=torch.float64)
+    beside = replace(before, root_position=before.root_position + aside)
+    film([(after, None), (beside, None, "#999999")], path, progress=progress)
 
 
 def draw_strips_to(

@@ -11,8 +11,7 @@ from scenes.content import Content
 from scenes.props import build_target
 from scenes.renderers import offscreen
 from scenes.renderers.select import select_painter
-from scenes.stage import Shot, Stage
-from scenes.wishes import Mark, Wishes
+from scenes.stage import Mark, Shot, Stage, Wishes
 
 
 def test_a_mark_is_strong_at_its_time_and_faint_at_others():

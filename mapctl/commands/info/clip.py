@@ -44,7 +44,7 @@ def print_clip(path: Path, command: Info) -> None:
     fit = assess_fit(rigmap, motion)
     _print(describe_clip(path, motion, rigmap, fit), as_json=as_json)
     if picture is not None:
-        from scenes.plots import rig_picture
+        from scenes import rig_picture
 
         rig_picture.plot_rig(rig_picture.RigPicture(rigmap, motion, fit, path.name), picture)
 

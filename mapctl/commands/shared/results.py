@@ -21,7 +21,7 @@ from mapctl.problem.solution import Solution
 from mapctl.protocols import Inbetweener
 from mapctl.retarget.rigs import Rig
 from priors.stitching.inbetweener import Stitcher
-from scenes.plots.denoising import film_side_by_side
+from scenes.film import film_side_by_side
 
 _SIZE = (1280, 720)
 

@@ -10,8 +10,7 @@ from mapctl.commands.shared.shots.play import PlayedShot
 from mapctl.mesh.primitives import Surface
 from scenes.drawn_character import DrawnCharacter
 from scenes.props import build_hips_mark, build_look_mark, build_obstacle, build_target
-from scenes.stage import Shot
-from scenes.wishes import Mark, Wishes
+from scenes.stage import Mark, Shot, Wishes
 
 
 def stage_actor(
