@@ -3,7 +3,6 @@
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from mapctl.runtime import saving
 from mapctl.version import __version__ as __version__
 
 if TYPE_CHECKING:
@@ -69,8 +68,6 @@ _HOMES = {
     "retarget": "mapctl.retarget",
     "terms": "mapctl.terms",
 }
-
-saving.register_writer(lambda motion, path: import_module("mapctl.formats").save(motion, path))
 
 
 def __getattr__(name: str):

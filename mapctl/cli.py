@@ -10,10 +10,12 @@ import os
 import re
 import signal
 import sys
+import time
 from collections.abc import Mapping, Sequence
 from contextlib import redirect_stderr
 from functools import reduce
 from operator import or_
+from types import FrameType
 from typing import Annotated, Any
 
 import tyro
@@ -22,7 +24,6 @@ from mapctl import __version__
 from mapctl.commands import COMMANDS, SUBCOMMANDS, Runnable
 from mapctl.commands.shared import exit_status
 from mapctl.errors import MapctlError, RequestError
-from mapctl.runtime import interruption
 
 _EXTRAS = {
     "render": {"pyrender", "trimesh", "OpenGL", "av", "PIL", "matplotlib"},
@@ -54,7 +55,7 @@ STYLE = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run `mapctl` with the given words (those of the process if None); returns the exit status."""
-    received = interruption.raise_on_signals() if argv is None else []
+    received = _raise_on_signals() if argv is None else []
     words = list(sys.argv[1:] if argv is None else argv)
     try:
         status = _print_version() if words == ["--version"] else parse(words).run()
@@ -140,6 +141,26 @@ def _describe_missing_package(module: str) -> str:
         if package in packages:
             return f"this needs the package {package}: pip install 'mapctl[{extra}]'"
     return f"this needs the package {package}, which is not installed"
+
+
+def _raise_on_signals() -> list[int]:
+    """Raise KeyboardInterrupt from here on at Ctrl-C, SIGTERM and a terminal that closes; the list gets their numbers.
+    Schedulers and impatient fingers send a signal twice: what comes within a second is one. Ignored ones stay so."""
+    received: list[int] = []
+    until = 0.0
+
+    def stop(number: int, _: FrameType | None) -> None:
+        nonlocal until
+        if time.monotonic() >= until:
+            until = time.monotonic() + 1.0
+            received.append(number)
+            raise KeyboardInterrupt
+
+    for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+        number = getattr(signal, name, None)  # Windows has no SIGHUP
+        if number is not None and signal.getsignal(number) not in (signal.SIG_IGN, None):
+            signal.signal(number, stop)
+    return received
 
 
 def _print_error(message: str, status: int) -> int:

@@ -4,6 +4,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property
+from importlib import import_module
 from os import PathLike
 
 import torch
@@ -12,7 +13,6 @@ from torch import Tensor
 
 from mapctl import kinematics, rotations
 from mapctl.errors import MapctlError, RequestError
-from mapctl.runtime import saving
 from mapctl.skeleton import Skeleton, mirror_name
 
 _CHORD_SECONDS = 0.5  # between the frames whose distances are added up: sway and noise count little
@@ -173,7 +173,7 @@ class Motion:
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the motion in the format that the path's ending names."""
-        saving.save(self, path)
+        import_module("mapctl.formats").save(self, path)
 
     def _offset(self, joint: int) -> Float[Tensor, "frames 3"]:
         """Return a joint's offset in every frame, animated or not."""

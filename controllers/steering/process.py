@@ -4,24 +4,20 @@ Neither a web server nor another character then delays its steps: each has its o
 Times cross between processes as values of time.perf_counter, which all processes of a machine share.
 """
 
-import functools
 import queue
 import threading
 from collections import deque
 from collections.abc import Sequence
-from multiprocessing.connection import Connection
-from multiprocessing.context import SpawnProcess
 from typing import Any
 
 import numpy as np
 
-from controllers.steering.process_worker import CharacterRequest, prepare_models, run_worker
+from controllers.steering.process_worker import CharacterRequest, run_worker
 from mapctl import curves
 from mapctl.errors import MapctlError, RequestError
 from mapctl.intent.steering import Arrival, Command
-from mapctl.runtime.forking import ForkedProcess, SharedBases, can_fork_for
 from mapctl.runtime.live_protocol import FrameChunk
-from mapctl.runtime.processes import open_pipe, send_queued, spawn
+from mapctl.runtime.processes import open_pipe, preload, send_queued, spawn
 from mapctl.skeleton import Skeleton
 
 __all__ = ["CharacterProcess", "CharacterRequest"]
@@ -29,7 +25,8 @@ __all__ = ["CharacterProcess", "CharacterRequest"]
 _READY_SECONDS = 120.0
 _MAX_QUEUED_STEPS = 3000  # steps that are kept for a caller that does not poll: five minutes
 _PROCESS_ENDED = "a character's process ended by itself"
-_BASES = SharedBases()
+
+preload("controllers.steering.process_worker")
 
 
 class CharacterProcess:
@@ -111,7 +108,6 @@ class CharacterProcess:
 
     def close(self) -> None:
         """End the character; harmless the second time."""
-        self._is_closing = True
         self._send("close")
         self._process.join(2.0 if self._ready.is_set() else 0.1)  # while it loads it does not listen yet
         if self._process.is_alive():
@@ -119,48 +115,26 @@ class CharacterProcess:
         self._orders.put(None)
         self._receiver.join(1.0)  # it reads to the end, which is now
         self._ours.close()
-        if self._base is not None:
-            _BASES.release(self._base)
-            self._base = None
 
     def _start(self) -> None:
         self._delivered: deque[FrameChunk] = deque(maxlen=_MAX_QUEUED_STEPS)
         self._orders: queue.SimpleQueue[tuple[Any, ...] | None] = queue.SimpleQueue()
-        self._ready, self._failed, self._is_closing = threading.Event(), "", False
-        self._base: bytes | None = None
-        self._ours, self._process = self._fork() or self._spawn()
+        self._ready, self._failed = threading.Event(), ""
+        self._ours, theirs = open_pipe()
+        with theirs:
+            self._process = spawn(run_worker, theirs, self._request)
         # A full pipe would block the character, so it is emptied whether or not the caller polls; and a character that
         # does not read its orders does not block the caller.
         self._receiver = threading.Thread(target=self._receive, daemon=True)
         self._receiver.start()
 
-    def _fork(self) -> tuple[Connection, ForkedProcess] | None:
-        """Start as the copy of a process that has loaded the same; None where that is impossible."""
-        request = self._request
-        prepare = functools.partial(prepare_models, request.load, request.transitions)
-        if not can_fork_for(prepare, request):
-            return None
-        self._base, base = _BASES.use(prepare, run_worker)
-        try:
-            return base.start(request)
-        except OSError:  # it has ended since
-            return None
-
-    def _spawn(self) -> tuple[Connection, SpawnProcess]:
-        """Start as a process that loads by itself."""
-        ours, theirs = open_pipe()
-        with theirs:
-            return ours, spawn(run_worker, theirs, None, self._request)
-
     def _send(self, *message: Any) -> None:
         self._orders.put(message)
 
     def _receive(self) -> None:
-        begun = False
         try:
             while True:
                 word, content = self._ours.recv()
-                begun = True
                 if word == "started":
                     threading.Thread(target=send_queued, args=(self._ours, self._orders), daemon=True).start()
                     continue
@@ -170,10 +144,5 @@ class CharacterProcess:
                     self._failed = content
                 self._ready.set()
         except (EOFError, OSError):
-            if isinstance(self._process, ForkedProcess) and not (begun or self._is_closing):  # nobody could be forked
-                self._ours.close()
-                self._ours, self._process = self._spawn()
-                self._receive()
-                return
             self._failed = self._failed or _PROCESS_ENDED
             self._ready.set()

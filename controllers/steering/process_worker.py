@@ -49,16 +49,6 @@ class CharacterRequest:
     """Loader of who makes the way to a place, called there too; without one the character can be sent nowhere."""
 
 
-@dataclass(frozen=True, eq=False)
-class CharacterModels:
-    """What characters share."""
-
-    density: Density
-    """Density of their motion."""
-    transitions: Any | None = None
-    """Who makes the way to a place."""
-
-
 class ParentClosed(Exception):
     """The parent process closed the connection, or has ended."""
 
@@ -152,31 +142,13 @@ class ProcessClock:
             self._pilot.command(command)
 
 
-def prepare_models(load: Callable[[], Any], transitions: Callable[[], Any] | None) -> CharacterModels | None:
-    """Load what characters share, and steer a little, which compiles and loads the rest; None where that is impossible.
-
-    A character that gets nothing loads by itself, and says what is wrong.
-    """
-    torch.set_num_threads(1)
-    try:
-        models = CharacterModels(load(), None if transitions is None else transitions())
-        first = Command(1.2, 0.0)
-        _warm_up(steer.begin(models.density, first, generator=torch.Generator().manual_seed(0))[0], first, models)
-    except Exception:
-        return None
-    return models
-
-
-def run_worker(connection: Connection, models: CharacterModels | None, request: CharacterRequest) -> None:
-    """Steer until the parent closes the connection; anything else that ends it is sent to the parent, in a line.
-
-    Without `models` they are loaded here.
-    """
+def run_worker(connection: Connection, request: CharacterRequest) -> None:
+    """Steer until the parent closes the connection; anything else that ends it is sent to the parent, in a line."""
     torch.set_num_threads(1)
     with suppress(ParentClosed, BrokenPipeError):
         try:
             connection.send(("started", os.getpid()))
-            _run_character(connection, models, request)
+            _run_character(connection, request)
         except ParentClosed:  # a requested end is no failure to report
             return
         except MapctlError as error:
@@ -187,22 +159,18 @@ def run_worker(connection: Connection, models: CharacterModels | None, request: 
             connection.send(("failed", f"a character's process ended: {what} ({last.name}, line {last.lineno})"))
 
 
-def _run_character(connection: Connection, models: CharacterModels | None, request: CharacterRequest) -> None:
-    warm = models is not None
-    if models is None:
-        models = CharacterModels(request.load(), None if request.transitions is None else request.transitions())
-    prior, generator = models.density, torch.Generator().manual_seed(request.seed)
-    first, _ = steer.accept(prior, request.first)
+def _run_character(connection: Connection, request: CharacterRequest) -> None:
+    prior, transitions = request.load(), None if request.transitions is None else request.transitions()
+    first, generator = steer.accept(prior, request.first)[0], torch.Generator().manual_seed(request.seed)
     pilot = Autopilot(first, request.settings.limits)
-    stepper = steer.step if models.transitions is None else Arriver(models.transitions)
+    stepper = steer.step if transitions is None else Arriver(transitions)
     clock = ProcessClock(connection, pilot, prior)
     for number in itertools.count():
         state, pose = steer.begin(
             prior, first, generator=generator, at=request.at, settings=request.settings, skeleton=request.skeleton
         )
         if number == 0:
-            if not warm:
-                _warm_up(state, first, models)
+            _warm_up(state, first, transitions)
             connection.send(("ready", None))
         _wait_for_turn(request.settings.commit / PRIOR_FPS)
         clock.begin(state, pose)
@@ -220,11 +188,11 @@ def _wait_for_turn(seconds: float) -> None:
     time.sleep(seconds * ((turn - time.perf_counter() / seconds) % 1))
 
 
-def _warm_up(state: steer.SteerState, first: Command, models: CharacterModels) -> None:
+def _warm_up(state: steer.SteerState, first: Command, transitions: Any | None) -> None:
     for _ in range(_WARM_UP_STEPS):
         steer.step(state, first)
-    if models.transitions is not None:
-        Arriver(models.transitions)(state, replace(first, arrival=Arrival((0.0, 0.0), 1.0)))
+    if transitions is not None:
+        Arriver(transitions)(state, replace(first, arrival=Arrival((0.0, 0.0), 1.0)))
 
 
 def _to_frame_chunk(

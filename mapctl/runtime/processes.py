@@ -1,27 +1,29 @@
-"""Processes beside this one, and Ctrl-C, which comes to all of them."""
+"""Processes beside this one. They end with it, and Ctrl-C is for this one alone."""
 
 import multiprocessing
 import queue
 import signal
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from multiprocessing import resource_tracker
+import sys
+from collections.abc import Callable
+from contextlib import suppress
 from multiprocessing.connection import Connection
-from multiprocessing.context import SpawnProcess
-from types import FrameType
+from multiprocessing.process import BaseProcess
 from typing import Any
 
+_CONTEXT = multiprocessing.get_context("forkserver" if sys.platform == "linux" else "spawn")
 
-def spawn(target: Callable[..., None], *arguments: Any) -> SpawnProcess:
-    """Start a process that runs `target`, and ends when this one does. Ctrl-C is for the parent, not for it.
 
-    A terminal sends Ctrl-C to all of its processes. One that is still importing would say so with a traceback, long
-    before `target` could look away; so it is born with the signal blocked, which no import undoes.
-    """
-    process = multiprocessing.get_context("spawn").Process(target=target, args=arguments, daemon=True)
-    with defer_ctrl_c():
-        process.start()
+def preload(*modules: str) -> None:
+    """Have these modules imported once for all processes that are started here, where the system can fork them."""
+    if sys.platform == "linux":
+        _CONTEXT.set_forkserver_preload([*modules])
+
+
+def spawn(target: Callable[..., None], *arguments: Any) -> BaseProcess:
+    """Start a process that runs `target`, and ends when this one does. Both are sent there, so that they must be
+    importable by name, and a script needs its `if __name__ == "__main__"`."""
+    process: BaseProcess = _CONTEXT.Process(target=_run, args=(target, *arguments), daemon=True)
+    process.start()
     return process
 
 
@@ -38,50 +40,7 @@ def send_queued(connection: Connection, messages: "queue.SimpleQueue[Any]") -> N
             connection.send(message)
 
 
-@contextmanager
-def reraise_ctrl_c() -> Iterator[None]:
-    """Raise at the end a Ctrl-C that something within swallows.
-
-    Some packages catch everything while they are imported, and Python itself while it collects garbage.
-    """
-    handler, heard = signal.getsignal(signal.SIGINT), list[int]()
-    if not callable(handler) or threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def hear(number: int, frame: FrameType | None) -> None:
-        heard.append(number)
-        handler(number, frame)
-
-    signal.signal(signal.SIGINT, hear)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, handler)
-    if heard:
-        raise KeyboardInterrupt
-
-
-@contextmanager
-def defer_ctrl_c() -> Iterator[None]:
-    """Defer a Ctrl-C to the end; a process that is started within never hears of one.
-
-    The signal's mask is inherited by who is started. It does not keep Python from interrupting the main thread where
-    another thread gets the signal, which would leave somebody half started, so the handler waits too.
-    """
-    if not hasattr(signal, "pthread_sigmask"):  # Windows
-        yield
-        return
-    resource_tracker.ensure_running()  # starting this helper of multiprocessing's would end the blocking
-    heard, handler, is_main = [], signal.getsignal(signal.SIGINT), threading.current_thread() is threading.main_thread()
-    if is_main:
-        signal.signal(signal.SIGINT, lambda *_: heard.append(True))
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        if is_main:
-            signal.signal(signal.SIGINT, handler)
-        if heard:
-            signal.raise_signal(signal.SIGINT)
+def _run(target: Callable[..., None], *arguments: Any) -> None:
+    """Run the target in the new process. A terminal sends Ctrl-C to all of its processes."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    target(*arguments)

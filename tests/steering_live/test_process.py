@@ -178,7 +178,7 @@ def trapped(load, left=10):
 
 def sent_by(here, there, load):
     """All messages of a worker in this process, until it ends."""
-    run_worker(there, None, CharacterRequest(load, Command(1.0, 0.0)))
+    run_worker(there, CharacterRequest(load, Command(1.0, 0.0)))
     messages = []
     while here.poll():
         messages.append(here.recv())

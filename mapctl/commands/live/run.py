@@ -17,7 +17,6 @@ from mapctl.errors import RequestError
 from mapctl.intent.steering import Command
 from mapctl.motion import Motion
 from mapctl.retarget.carry import retarget_motion
-from mapctl.runtime.processes import reraise_ctrl_c
 from mapctl.terms import FootContact
 from priors import checkpoints
 from scenes.drawn_character import DrawnCharacter
@@ -45,8 +44,7 @@ def run(command: Live) -> int:
 
 
 def _serve(command: Live, receiver: "OscReceiver | None") -> int:
-    with reraise_ctrl_c():
-        show, stream = _open_app(command, receiver)
+    show, stream = _open_app(command, receiver)
     try:
         if not show.url.endswith(f":{command.port}"):
             print(f"port {command.port} is in use")
@@ -72,8 +70,7 @@ def _open_app(command: Live, receiver: "OscReceiver | None") -> "tuple[LiveApp, 
     bodies, licence = _read_bodies(command, drawn), licensing.format_used_licences()
     rigs = _choose_recorded_rigs(command, drawn, bodies)
     looks = [CharacterLook(*one, licence) for one in zip(drawn, rigs, strict=True)]
-    with reraise_ctrl_c():
-        characters = _start_characters(command, bodies)
+    characters = _start_characters(command, bodies)
     try:
         skeletons = [character.skeleton for character in characters]
         stream = streaming.open_stream(_stream(command), skeletons)

@@ -1,12 +1,12 @@
 """Base of sub-commands: options that are cheap to import, and work that is imported when it runs."""
 
+import gc
 from dataclasses import dataclass
 from importlib import import_module
 from typing import ClassVar
 
 from mapctl.commands.shared import options
 from mapctl.commands.shared.threads import use_single_thread
-from mapctl.runtime import garbage
 
 
 class Command:
@@ -22,7 +22,9 @@ class Command:
         if self.single_thread:
             use_single_thread()
         work = import_module(self.work or f"{type(self).__module__}.run")
-        garbage.resume_collection()
+        if not gc.isenabled():
+            gc.freeze()
+            gc.enable()
         return work.run(self)
 
 
