@@ -31,7 +31,7 @@ class FrameChunk:
     """Left and right toe planted, 1 or 0."""
     forecast: Float[ndarray, "ahead joints 3"]
     """World joint positions of the forecast frames, metres."""
-    wish: tuple[float, float]
+    target_velocity: tuple[float, float]
     """Target velocity of the last frame, x and z, m/s."""
     spare: float
     """Lateness, seconds from when the first frame was due to its delivery; negative where it came early. Frames that
@@ -77,7 +77,7 @@ class LiveCharacter(Protocol):
 
     def go(self, command: Command, place: tuple[float, float], within: float, facing: float | None = None) -> None:
         """Be at a place (x and z, metres) in so many seconds, facing so (radians; None as it comes there), if that is
-        possible, and obey the command from then on; a note says why not."""
+        possible, and obey the command from then on; a note gives the reason if not."""
         ...
 
     def pause(self, paused: bool) -> None:

@@ -36,7 +36,9 @@ class OscReceiver:
             raise RequestError(_explain_bind_error(endpoint, error)) from error
         self._socket.setblocking(False)
         self.dropped = 0
+        """Number of packets that were no messages, so far."""
         self.fault = ""
+        """What was wrong with the last of them."""
         logging.getLogger().addFilter(_is_from_elsewhere)
 
     def poll(self) -> list[Message]:

@@ -68,7 +68,8 @@ class PoseStream:
         root: Float[ndarray, "frames 3"],
         quats: Float[ndarray, "frames joints 4"],
     ) -> None:
-        """See FrameStream; frames follow each other at PRIOR_FPS."""
+        """Send frames of a character, at PRIOR_FPS, the first at `due` (a value of time.perf_counter); `seconds` is the
+        stream's time of the first, `root` the hips in the world, metres, and `quats` local rotations, xyzw."""
         if self._queue.qsize() > _MAX_QUEUED:
             return
         skeleton = self._skeletons[character]
@@ -78,11 +79,11 @@ class PoseStream:
             self._queue.put(("put", character, due + at + self._delay, pack(messages)))
 
     def forget(self, character: int) -> None:
-        """See FrameStream."""
+        """Send nothing of a character that has not been sent: it restarts."""
         self._queue.put(("forget", character))
 
     def pause(self) -> None:
-        """See FrameStream."""
+        """Count the time until the next frames as a pause."""
         self._queue.put(("pause",))
 
     def close(self) -> None:

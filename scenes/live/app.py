@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stdout, suppress
 from io import StringIO
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import viser
@@ -16,7 +16,6 @@ import viser
 from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import MapctlError, RequestError
 from mapctl.runtime.live_protocol import LiveCharacter
-from mapctl.streaming.protocols import FrameStream, MessageSource
 from scenes.live.camera import CameraMode, WorldView
 from scenes.live.character import CharacterLook, ShownCharacter
 from scenes.live.driving import HELP, KEYS, Driving, DrivingOutputs, KeyAction
@@ -29,6 +28,10 @@ from scenes.live.recording import FORMATS, Recorder, encode_motion, join_chunks,
 from scenes.live.remote import RemoteCommands
 from scenes.live.targets import LiveTargets
 from scenes.live.timeline import Timeline
+
+if TYPE_CHECKING:  # python-osc may not be installed
+    from mapctl.streaming.receiver import OscReceiver
+    from mapctl.streaming.sender import PoseStream
 
 _TICK = 1 / 60
 _HOUSEKEEPING_TICKS = 15
@@ -52,8 +55,8 @@ class LiveApp:
         port: int,
         fastest: float,
         labels: Mapping[str, Sequence[str]],
-        stream: FrameStream | None = None,
-        source: MessageSource | None = None,
+        stream: "PoseStream | None" = None,
+        source: "OscReceiver | None" = None,
     ):
         """Open the page. `looks` are by character; `fastest` is the prior's speed, m/s, and `labels` are its, by group.
 

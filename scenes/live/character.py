@@ -153,7 +153,7 @@ class ShownCharacter:
         is_slow = frames > PRIOR_FPS / 2 and late >= _LATE_SHARE * frames
         warning = f"  \n⚠️ This machine is too slow: {100 * late / frames:.0f} % of frames come late" if is_slow else ""
         return (
-            f"**{speed:.2f} m/s**, target {np.hypot(*chunk.wish):.2f}  \n"
+            f"**{speed:.2f} m/s**, target {np.hypot(*chunk.target_velocity):.2f}  \n"
             f"{cost:.1f} ms a frame · {self.late_frames} of {self.frames} frames late{warning}"
         )
 
@@ -186,4 +186,4 @@ class ShownCharacter:
             positions = np.array([one.chunk.root[one.frame, ::2] for one in trail])
             jumps = np.flatnonzero(np.linalg.norm(np.diff(positions, axis=0), axis=1) > 0.5)  # by a reset
             first = int(jumps[-1]) + 1 if len(jumps) else 0
-            self.trajectories.update(chunk.wish, positions[first:], shown.plan)
+            self.trajectories.update(chunk.target_velocity, positions[first:], shown.plan)

@@ -162,8 +162,8 @@ class Driving:
 
 def find_direction(codes: Set[str]) -> tuple[float, float] | None:
     """Return the unit direction of held keys, to the right and away; None where they ask for none."""
-    ways = {DIRECTIONS[code] for code in codes if code in DIRECTIONS}
-    right, away = sum(way[0] for way in ways), sum(way[1] for way in ways)
+    held = {DIRECTIONS[code] for code in codes if code in DIRECTIONS}
+    right, away = sum(one[0] for one in held), sum(one[1] for one in held)
     length = math.hypot(right, away)
     return None if length == 0 else (right / length, away / length)
 

@@ -1,10 +1,11 @@
 """The web page: a viser server for pages of its own origin only, with a script that sends held keys and gamepads.
 
 A browser lets every page that it shows connect to a WebSocket on this machine, and states the page's origin in
-`Origin`; `Host` exposes a foreign name that was made to resolve to this machine (DNS rebinding). viser checks neither.
+`Origin`; `Host` exposes a foreign name that resolves to this machine (DNS rebinding). viser checks neither.
 """
 
 import gzip
+import html
 import http
 import io
 import itertools
@@ -87,7 +88,7 @@ class PageChannel:
         """Insert the script into viser's page, before viser's own."""
         page = gzip.decompress(body) if encoding == "gzip" else body
         script = files("scenes.live").joinpath("page.js").read_text("utf-8")
-        attributes = " ".join(f"{name}='{_escape(value)}'" for name, value in self._attributes.items())
+        attributes = " ".join(f"{name}='{html.escape(value)}'" for name, value in self._attributes.items())
         page = page.replace(b"<head>", f"<head><script {attributes}>{script}</script>".encode(), 1)
         return gzip.compress(page, 6) if encoding == "gzip" else page
 
@@ -171,7 +172,3 @@ def _guard_requests(answer: Callable[[Any, Request], Response | None], port: int
 async def _mark_page(client: viser.ClientHandle) -> None:
     """Give the page's script the number of viser's client."""
     client.gui.add_html(f'<i hidden data-mapctl-viewer="{client.client_id}"></i>', order=-math.inf)
-
-
-def _escape(text: str) -> str:
-    return text.replace("&", "&amp;").replace("'", "&#39;").replace("<", "&lt;")

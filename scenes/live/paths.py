@@ -128,7 +128,7 @@ def write_csv(curve: Curve) -> bytes:
 
 def read_path(name: str, content: bytes) -> tuple[PathPoints, str]:
     """Read a table or drawing that a browser sent as a file of this name; also return a note where its many points
-    became fewer. MapctlError says what is wrong, without this machine's paths."""
+    became fewer. MapctlError names the fault, without this machine's paths."""
     if len(content) > _MAX_BYTES:
         raise RequestError(f"the file has {len(content) / 2**20:.0f} MiB; a path has at most {_MAX_BYTES // 2**20}")
     ending = PurePosixPath(name).suffix.lower()

@@ -9,21 +9,21 @@ from typing import TYPE_CHECKING, Any
 from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import MapctlError, RequestError
 from mapctl.streaming.orders import HANDS, Order, keep_latest, read_order
-from mapctl.streaming.protocols import MessageSource
 from scenes.live.character import ShownCharacter
 from scenes.live.inputs import DISC_RADII, WITHIN, parse_point
 
 if TYPE_CHECKING:
+    from mapctl.streaming.receiver import OscReceiver
     from scenes.live.app import LiveApp
 
-_DEFAULT_WITHIN = 2.0  # seconds in which a character is sent to a position, unless the command says
+_DEFAULT_WITHIN = 2.0  # seconds in which a character is sent to a position, unless the command has a time
 _NOTE_SECONDS = 2.0  # between two lines on the console, however many commands there are
 
 
 class RemoteCommands:
     """Reads what other programs send, and has it obeyed: of several commands of a kind the last that came."""
 
-    def __init__(self, source: MessageSource, app: "LiveApp", notify: Callable[[str], None]):
+    def __init__(self, source: "OscReceiver", app: "LiveApp", notify: Callable[[str], None]):
         """`notify` prints a line."""
         self._source, self._app, self._notify = source, app, notify
         self._noted_at, self._dropped = -math.inf, 0

@@ -97,11 +97,11 @@ def test_it_is_a_live_character_that_walks_in_time(remote):
 def test_it_turns_when_told_and_walks_a_path(remote):
     remote.command(Command(1.2, np.pi / 2))
     last = collected(remote, 2.5)[-1]
-    assert np.argmax(np.abs(last.wish)) == 0, "the wish is along x"
-    assert last.wish[0] == pytest.approx(1.2, abs=0.05)
+    assert np.argmax(np.abs(last.target_velocity)) == 0, "the wish is along x"
+    assert last.target_velocity[0] == pytest.approx(1.2, abs=0.05)
     here = last.root[-1]
     remote.walk([(here[0], here[2]), (here[0], here[2] - 1), (here[0], here[2] - 9)], 1.0)
-    assert collected(remote, 2.0)[-1].wish[1] < -0.3
+    assert collected(remote, 2.0)[-1].target_velocity[1] < -0.3
     with pytest.raises(RequestError):
         remote.walk([(0.0, 0.0)], 1.0)
 
@@ -135,7 +135,9 @@ def test_orders_that_cannot_be_are_brought_near_or_left_out_and_said(remote):
     remote.command(Command(2.0, 0.0, labels=("swim",)))
     [note] = notes(remote)
     assert "knows no" in note
-    assert np.hypot(*collected(remote, 0.5)[-1].wish) == pytest.approx(1.0, abs=0.05), "the order before it holds"
+    assert np.hypot(*collected(remote, 0.5)[-1].target_velocity) == pytest.approx(1.0, abs=0.05), (
+        "the order before it holds"
+    )
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from mapctl.streaming.messages import Message
 
 
 class Source:
-    """A MessageSource that a test fills."""
+    """An OscReceiver that a test fills."""
 
     def __init__(self):
         self.waiting: list[Message] = []
@@ -24,7 +24,7 @@ class Source:
 
 
 class Stream:
-    """A FrameStream that notes what it gets."""
+    """A PoseStream that notes what it gets."""
 
     def __init__(self):
         self.heard: list[tuple] = []

@@ -35,5 +35,5 @@ class Live(ModelCommand, options.ReadOptions):
     stream_delay: options.Number = 0.1
     """Seconds by which the stream is behind, so that a frame that is computed late is not sent late."""
     listen: options.MaybeEndpoint = None
-    """Where orders come from over OSC, as /mapctl/speed 1.4 (docs/guides/streaming.md): a port alone is on this
-    machine, and nobody else can send there; 0.0.0.0:PORT hears everybody."""
+    """Where commands come from over OSC, as /mapctl/speed 1.4 (docs/guides/streaming.md): a port alone takes those of
+    this machine; 0.0.0.0:PORT takes those of every machine."""
