@@ -21,8 +21,8 @@ from typing import Annotated, Any
 import tyro
 
 from mapctl import __version__
-from mapctl.commands import COMMANDS, SUBCOMMANDS, Runnable
-from mapctl.commands.shared import exit_status
+from mapctl.commands import COMMANDS, MANY_THREADS, SUBCOMMANDS, Runnable
+from mapctl.commands.shared.command import INTERRUPTED, INVALID, SIGNALLED, UNREAD, use_single_thread
 from mapctl.errors import MapctlError, RequestError
 
 _EXTRAS = {
@@ -60,41 +60,49 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         status = _print_version() if words == ["--version"] else parse(words).run()
         sys.stdout.flush()
-        if status == exit_status.INTERRUPTED:
+        if status == INTERRUPTED:
             status = _report_interruption(received, "what was solved until then is written")
     except MapctlError as error:
-        status = _print_error(str(error), exit_status.INVALID)
+        status = _print_error(str(error), INVALID)
     except KeyboardInterrupt as stop:
         status = _report_interruption(received, str(stop))
     except ModuleNotFoundError as error:
-        status = _print_error(_describe_missing_package(error.name or str(error)), exit_status.INVALID)
+        status = _print_error(_describe_missing_package(error.name or str(error)), INVALID)
     except BrokenPipeError:
         _discard_output()
-        status = exit_status.UNREAD
+        status = UNREAD
     except OSError as error:
         _discard_output()
-        status = _print_error(f"{error.filename or 'input or output'}: {error.strerror or error}", exit_status.INVALID)
+        status = _print_error(f"{error.filename or 'input or output'}: {error.strerror or error}", INVALID)
     return status
 
 
 def parse(words: Sequence[str]) -> Runnable:
     """The command that the words ask for. RequestError where there is none; SystemExit after --help."""
     name, *others = words or [""]
-    if name not in SUBCOMMANDS:
-        return _choose(COMMANDS, words, prog="mapctl", description=_DESCRIPTION)
-    return _choose(SUBCOMMANDS[name], others, prog=f"mapctl {name}", description=COMMANDS[name].__doc__ or "")
+    if name not in COMMANDS:
+        return _read_options(_join(COMMANDS), words, "mapctl", _DESCRIPTION)
+    if name not in MANY_THREADS:
+        use_single_thread()
+    command = COMMANDS[name]
+    kind = _join(SUBCOMMANDS[name]) if name in SUBCOMMANDS else command
+    return _read_options(kind, others, f"mapctl {name}", command.__doc__ or "")
 
 
-def _choose(kinds: Mapping[str, type[Runnable]], words: Sequence[str], *, prog: str, description: str) -> Runnable:
-    choices: Any = reduce(or_, (_subcommand(name, kind) for name, kind in kinds.items()))
+def _join(kinds: Mapping[str, type[Runnable]]) -> Any:
+    return reduce(or_, (_subcommand(name, kind) for name, kind in kinds.items()))
+
+
+def _read_options(kind: Any, words: Sequence[str], prog: str, description: str) -> Runnable:
     explained = io.StringIO()
     try:
         with redirect_stderr(explained):
-            return tyro.cli(choices, prog=prog, description=description, args=list(words), config=STYLE)
+            return tyro.cli(kind, prog=prog, description=description, args=list(words), config=STYLE)
     except SystemExit as stop:
         if stop.code == 0:
             raise
-        helped = " ".join([prog, *(word for word in words[:1] if word in kinds), "--help"])
+        known = prog != "mapctl" and words and words[0] in SUBCOMMANDS.get(prog.split()[1], {})
+        helped = f"{prog} {words[0]} --help" if known else f"{prog} --help"
         raise RequestError(f"{_shorten_usage_error(explained.getvalue())} (see {helped})") from None
 
 
@@ -172,7 +180,7 @@ def _report_interruption(received: Sequence[int], kept: str) -> int:
     """Say that work was ended, and what there is of it; without a signal it was Ctrl-C."""
     number = received[-1] if received else signal.SIGINT
     how = "interrupted" if number == signal.SIGINT else "terminated"
-    return _print_error("; ".join(filter(None, (how, kept))), exit_status.SIGNALLED + number)
+    return _print_error("; ".join(filter(None, (how, kept))), SIGNALLED + number)
 
 
 def _discard_output() -> None:

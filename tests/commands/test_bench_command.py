@@ -1,14 +1,11 @@
 """`mapctl bench`: cost of the solver, of following and of steering."""
 
 import json
-from importlib import import_module
 
 import pytest
 from helpers import run
 
-from mapctl.commands import COMMANDS
 from mapctl.commands.bench import run as bench
-from mapctl.commands.shared.command import Command
 
 
 @pytest.mark.slow
@@ -20,8 +17,3 @@ def test_cost_is_measured(prior, monkeypatch, capsys):
     assert evaluation["times_faster"] > 0
     assert follow["ms_per_frame"] > 0
     assert steer["ms_per_frame"] > 0
-
-
-@pytest.mark.parametrize("kind", [kind for kind in COMMANDS.values() if issubclass(kind, Command)])
-def test_work_is_found(kind):
-    assert callable(import_module(kind.work or f"{kind.__module__}.run").run)

@@ -147,18 +147,17 @@ def test_convert_changes_the_rig(walk, tmp_path, rig):
     assert float((before.joint_positions() - after.joint_positions()).abs().max()) < 1e-5
 
 
-def test_measure_prints_json_and_a_table(walk, prior, capsys):
-    words = ("measure", walk, "--curve", "circle:3", "--speed", 1.2, "--reference", walk, "--prior", prior)
+def test_measure_prints_json_and_a_table(walk, capsys):
+    words = ("measure", walk, "--curve", "circle:3", "--speed", 1.2, "--reference", walk)
     assert run(*words, "--json") == 0
     told = json.loads(capsys.readouterr().out)
     report = json.loads(walk.with_suffix(".json").read_text())
     assert told["measures"]["path_error_mean_cm"] == pytest.approx(report["measures"]["path_error_mean_cm"], abs=0.01)
     assert told["reference"]["speed_m_s"] == told["measures"]["speed_m_s"]
-    assert told["mocap"]["sway_cm"] == {"mean": 1.9, "p2": 1.2, "p98": 2.6}
+    assert {"mean", "p2", "p98"} == set(told["mocap"]["sway_cm"])
     assert run(*words) == 0
     table = capsys.readouterr().out
     assert all(name in table for name in told["measures"])
-    assert "1.9 (1.2 to 2.6)" in table
 
 
 @pytest.mark.slow
@@ -191,8 +190,8 @@ def test_run_plays_a_scene(prior, tmp_path, monkeypatch):
 
 def test_demo_leaves_four_files(prior, tmp_path, monkeypatch):
     monkeypatch.setenv("MAPCTL_RENDERER", "stick")
-    monkeypatch.setattr("mapctl.commands.demo.run.CURVE", "line:0.5")
-    monkeypatch.setattr("mapctl.commands.demo.run._SIZE", (96, 64))
+    monkeypatch.setattr("mapctl.commands.demo.CURVE", "line:0.5")
+    monkeypatch.setattr("mapctl.commands.demo._SIZE", (96, 64))
     assert run("demo", "-o", tmp_path / "demo", "--prior", prior, "--quiet") == 0
     assert {path.suffix for path in (tmp_path / "demo").iterdir()} == {".bvh", ".json", ".mp4", ".png"}
 
@@ -211,8 +210,8 @@ def test_demo_leaves_four_files(prior, tmp_path, monkeypatch):
 def test_a_demo_without_packages_of_films_leaves_the_rest(prior, tmp_path, monkeypatch, capsys, lacking, left, told):
     monkeypatch.setenv("MAPCTL_RENDERER", "stick")
     monkeypatch.setattr("mapctl.commands.shared.outputs.find_spec", lambda name: None if name in lacking else name)
-    monkeypatch.setattr("mapctl.commands.demo.run.CURVE", "line:0.5")
-    monkeypatch.setattr("mapctl.commands.demo.run._SIZE", (96, 64))
+    monkeypatch.setattr("mapctl.commands.demo.CURVE", "line:0.5")
+    monkeypatch.setattr("mapctl.commands.demo._SIZE", (96, 64))
     assert run("demo", "-o", tmp_path / "demo", "--prior", prior) == 0
     assert {path.suffix for path in (tmp_path / "demo").iterdir()} == left
     out, err = capsys.readouterr()

@@ -12,7 +12,7 @@ from helpers import run, walk
 
 import mapctl
 from mapctl import editing
-from mapctl.commands.convert import folder as convert_folder
+from mapctl.commands import convert as convert_folder
 from mapctl.editing.rigged_motion import RiggedMotion
 
 EDITS = ["--mirror", "--loop", "--plant-feet"]

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mapctl.commands.shared.frame_syntax import parse_frame, parse_range, parse_ranges
+from mapctl.commands.shared.options import parse_frame, parse_range, parse_ranges
 from mapctl.errors import RequestError
 
 frame = st.integers(0, 999_999_999)

@@ -4,7 +4,7 @@ import pytest
 from helpers import run
 from tiny_prior import save_tiny_prior
 
-from mapctl.commands.generate import run as generate_run
+from mapctl.commands import generate as generate_run
 from priors.lstm_gmm.paces import PACE_LABELS
 
 

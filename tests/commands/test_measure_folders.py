@@ -6,7 +6,7 @@ import pytest
 from helpers import bandai_skeleton, walk
 
 from mapctl import cli, metrics, retarget
-from mapctl.commands.measure import clip_sets
+from mapctl.commands import measure
 from mapctl.metrics import realism
 from mapctl.metrics.realism import ClassifierSettings
 
@@ -15,7 +15,7 @@ from mapctl.metrics.realism import ClassifierSettings
 def quick(monkeypatch):
     """A small network and few steps."""
     small = ClassifierSettings(steps=5, width=4)
-    monkeypatch.setattr(clip_sets, "SETTINGS", realism.RealismSettings(classifier=small))
+    monkeypatch.setattr(measure, "SETTINGS", realism.RealismSettings(classifier=small))
 
 
 @pytest.fixture(scope="module")

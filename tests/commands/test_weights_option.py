@@ -23,12 +23,11 @@ from controllers.steering.process import CharacterProcess
 from mapctl import formats
 from mapctl.cli import parse
 from mapctl.commands import COMMANDS
-from mapctl.commands.denoise import Denoise
-from mapctl.commands.denoise.folder import ReportWriter
+from mapctl.commands.denoise import Denoise, ReportWriter
 from mapctl.commands.live import Live
 from mapctl.commands.live import run as live
-from mapctl.commands.shared.character import read_character
 from mapctl.commands.shared.command import ModelCommand
+from mapctl.commands.shared.inputs import read_character
 from mapctl.runtime.file_jobs import FileJob
 from priors import weight_sets
 from scenes.live.app import LiveApp
@@ -145,8 +144,8 @@ def test_commands_work_with_the_free_weights_alone(alone, capsys, name):
 
 @pytest.mark.slow
 def test_the_demo_works_with_the_free_weights_alone(alone, monkeypatch):
-    monkeypatch.setattr("mapctl.commands.demo.run.CURVE", "line:0.5")
-    monkeypatch.setattr("mapctl.commands.demo.run._SIZE", (96, 64))
+    monkeypatch.setattr("mapctl.commands.demo.CURVE", "line:0.5")
+    monkeypatch.setattr("mapctl.commands.demo._SIZE", (96, 64))
     assert run("demo", "-o", "demo", "--weights", "free", "--quiet") == 0
     assert licence_of(alone / "demo" / "figure8.json")["models"] == {"free/locomotion": FREE}
 

@@ -11,8 +11,7 @@ from controllers.common.character import Character
 from controllers.shots.planning.way import Way, plan_way
 from controllers.shots.request import Others, ShotRequest
 from mapctl import curves
-from mapctl.commands.shared.shots.plan import ShotPlan
-from mapctl.commands.shared.shots.play import let_others_pass
+from mapctl.commands.shared.shots import ShotPlan, let_others_pass
 from mapctl.curves.obstacles import Obstacle
 from scenes.scene_file import Actor
 

@@ -110,7 +110,7 @@ def test_upright_motions_keep_their_rig_and_every_distance(root):
 def test_render_films_the_upright_motion(tmp_path, monkeypatch):
     make(Make(names_of("mixamo"), zup=True)).motion(person(frames=20)).save(tmp_path / "z.bvh")
     shown = []
-    monkeypatch.setattr("mapctl.commands.render.run.film", lambda actors, *_, **__: shown.extend(actors))
+    monkeypatch.setattr("mapctl.commands.render.film", lambda actors, *_, **__: shown.extend(actors))
     assert run("render", tmp_path / "z.bvh", "-o", tmp_path / "z.png") == 0
     places = shown[0][0].joint_positions()
     assert float(places[..., 1].max()) > 1.2

@@ -12,7 +12,7 @@ from rig_maker import Make, make, names_of
 
 import mapctl
 from mapctl import contacts, retarget, rotations
-from mapctl.commands.shared import character
+from mapctl.commands.shared import inputs
 from mapctl.motion import Motion
 from mapctl.retarget.carry import RiggedCharacter, retarget_motion
 from mapctl.retarget.carry.character import LEGS, limb_extension
@@ -205,7 +205,7 @@ def test_a_person_of_a_rig_has_flat_feet_and_the_clips_floor(tmp_path):
     clip = replace(_lafan_like(), source=None)
     clip = replace(clip, root_position=clip.root_position - torch.tensor([0.0, 0.04, 0.0]).double())
     clip.save(tmp_path / "rig.bvh")
-    person = character.read_character(str(tmp_path / "rig.bvh"))
+    person = inputs.read_character(str(tmp_path / "rig.bvh"))
     own = retarget.to_canonical(mapctl.load(tmp_path / "rig.bvh"))[0]
     assert person.toe_rest_height == pytest.approx(float(low_toes(own).mean()), abs=1e-6)
     assert person.toe_rest_height < -0.005

@@ -11,8 +11,8 @@ from controllers.common.character import Character
 from controllers.steering.process import CharacterProcess, CharacterRequest
 from controllers.steering.steer import SteerSettings
 from mapctl.commands.live import Live
-from mapctl.commands.shared import licensing, options, streaming
-from mapctl.commands.shared.character import as_character, read_character, read_drawn_character, read_rigged
+from mapctl.commands.shared import options, outputs, streaming
+from mapctl.commands.shared.inputs import as_character, read_character, read_drawn_character, read_rigged
 from mapctl.errors import RequestError
 from mapctl.intent.steering import Command
 from mapctl.motion import Motion
@@ -67,7 +67,7 @@ def _serve(command: Live, receiver: "OscReceiver | None") -> int:
 def _open_app(command: Live, receiver: "OscReceiver | None") -> "tuple[LiveApp, PoseStream | None]":
     prior, drawn = priors.load(command.prior), _read_drawn(command)
     checkpoints.note_use(_STITCHER)  # the characters' processes load it
-    bodies, licence = _read_bodies(command, drawn), licensing.format_used_licences()
+    bodies, licence = _read_bodies(command, drawn), outputs.format_used_licences()
     rigs = _choose_recorded_rigs(command, drawn, bodies)
     looks = [CharacterLook(*one, licence) for one in zip(drawn, rigs, strict=True)]
     characters = _start_characters(command, bodies)

@@ -1,31 +1,61 @@
-"""Base of sub-commands: options that are cheap to import, and work that is imported when it runs."""
+"""What all sub-commands share: threads, exit statuses, weights and the licence of the result."""
 
 import gc
+import os
 from dataclasses import dataclass
 from importlib import import_module
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from mapctl.commands.shared import options
-from mapctl.commands.shared.threads import use_single_thread
+
+if TYPE_CHECKING:
+    from mapctl.problem.solution import Status
+
+
+def use_single_thread() -> None:
+    """Compute with one thread: on matrices this small two fight each other. Takes full effect before numpy is first
+    imported."""
+    for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+    import torch
+
+    torch.set_num_threads(1)
+
+
+UNREAD = 1
+"""The output was not read: a broken pipe."""
+INVALID = 2
+"""The input or the command is wrong, or a disk is full."""
+NOT_SATISFIED = 3
+"""Done, but not all that was requested holds."""
+SIGNALLED = 128
+"""Ended by a signal, whose number is added."""
+INTERRUPTED = 130
+"""Ctrl-C; what was solved until then is written, films are not."""
+
+
+def conclude(status: "Status", *, strict: bool) -> int:
+    """Return the exit status of a command whose solve ended so; strict ones fail where not all that was asked holds."""
+    from mapctl.problem.solution import Outcome  # not needed for --help
+
+    if status.outcome is Outcome.INTERRUPTED:
+        return INTERRUPTED
+    return NOT_SATISFIED if strict and not status.ok else 0
 
 
 class Command:
-    """Base of the frozen dataclasses of options. A command's package holds them; its module `run` does the work."""
-
-    work: ClassVar[str] = ""
-    """Module whose `run` takes the options, where it is not `run` beside them."""
-    single_thread: ClassVar[bool] = True
-    """Whether one thread computes. One is fastest: on matrices this small two fight each other."""
+    """Base of the frozen dataclasses of options. The function `run` beside them, or a package's module `run`, does the
+    work."""
 
     def run(self) -> int:
         """Do the work and return the exit status; MapctlError for what is wrong with the request."""
-        if self.single_thread:
-            use_single_thread()
-        work = import_module(self.work or f"{type(self).__module__}.run")
+        module = import_module(type(self).__module__)
+        work = getattr(module, "run", None)
+        work = work if callable(work) else import_module(f"{module.__name__}.run").run
         if not gc.isenabled():
             gc.freeze()
             gc.enable()
-        return work.run(self)
+        return work(self)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,7 +4,9 @@ import os
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from controllers.common.character import Character
 from mapctl import curves, formats
 from mapctl.commands.shared.options import ReadOptions
 from mapctl.curves import Curve
@@ -17,6 +19,10 @@ from mapctl.retarget import figure, identify_rig, load_rig
 from mapctl.retarget.doubts import assess_fit
 from mapctl.retarget.rigs import Rig, parse_unit
 from priors.licences import note_licence
+
+if TYPE_CHECKING:
+    from mapctl.retarget.carry import RiggedCharacter
+    from scenes.drawn_character import DrawnCharacter
 
 OVERRULE = "--unit, --up and --rig overrule what was guessed"
 """How to settle a doubt."""
@@ -104,3 +110,36 @@ def print_doubts(path: Path, motion: Motion, rig: Rig | None) -> None:
     if doubts:
         more = f" (and {len(doubts) - 1} more)" if len(doubts) > 1 else ""
         warn_once(f"{path}: {doubts[0].reason}{more}; {OVERRULE}, see mapctl info {path}")
+
+
+def read_character(text: str, options: ReadOptions | None = None) -> Character:
+    """Read the character: canonical, of a clip's skeleton, or with canonical bones on a preset's joints."""
+    if text == "canonical":
+        return Character()
+    return as_character(read_rigged(text, options))
+
+
+def read_rigged(text: str, options: ReadOptions | None = None) -> "RiggedCharacter":
+    """Read the rig and stance of a clip, a preset or a rig file."""
+    from mapctl.retarget.carry import RiggedCharacter
+
+    return RiggedCharacter.of(*read_rig_clip(text, options))[1]
+
+
+def as_character(body: "RiggedCharacter") -> Character:
+    """Return the body of a rig as one that is moved by controllers."""
+    return Character(body.leveled, float(body.stance.toe_height.mean()), body.leveled_map, body.source)
+
+
+def read_drawn_character(text: str | None) -> "DrawnCharacter | None":
+    """Read the character of a --character option, on which any motion can be put; None without the option.
+
+    FileFormatError for files without one, RequestError where its joints cannot be identified.
+    """
+    if text is None:
+        return None
+    from scenes.drawn_character import DrawnCharacter
+
+    character = DrawnCharacter.load(text)
+    character.check_rig()
+    return character

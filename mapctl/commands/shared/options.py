@@ -1,7 +1,9 @@
 """Options that several commands share: their types for tyro, and checks that need nothing heavy."""
 
 import re
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, is_dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -92,3 +94,34 @@ def _describe_value(value: Any) -> Any:
 def collect_paths(*paths: Path | None) -> list[Path]:
     """Collect the paths that are given."""
     return [path for path in paths if path is not None]
+
+
+_FRAME = re.compile(r"(\d{1,9})|(\d{1,9}(?:\.\d{0,9})?|\.\d{1,9})s")
+
+
+def parse_frame(text: str, *, fps: float) -> int:
+    """Parse `45` or `1.5s` as a frame of a motion of that rate; RequestError for anything else."""
+    found = _FRAME.fullmatch(text.strip())
+    if found is None:
+        raise RequestError(f"a frame is a whole number from 0, or seconds as in 1.5s; got {text!r}")
+    return int(found[1]) if found[1] is not None else round(float(found[2]) * fps)
+
+
+def parse_range(text: str, *, fps: float, frames: int, what: str = "gap") -> tuple[int, int]:
+    """Parse `60:120` or `2s:4s` as first frame and one past the last; RequestError unless they are in the motion."""
+    start, colon, stop = text.partition(":")
+    if not colon:
+        raise RequestError(f"a {what} is A:B, frames or seconds as in 60:120 or 2s:4s; got {text!r}")
+    first, last = parse_frame(start, fps=fps), parse_frame(stop, fps=fps)
+    if not first < last <= frames:
+        raise RequestError(f"the {what} {text} must begin before it ends, within the motion's frames 0:{frames}")
+    return first, last
+
+
+def parse_ranges(texts: Sequence[str], *, fps: float, frames: int, what: str = "gap") -> list[tuple[int, int]]:
+    """Parse several ranges, sorted by time; RequestError for two that overlap."""
+    ranges = sorted(parse_range(text, fps=fps, frames=frames, what=what) for text in texts)
+    for (start, stop), (after, end) in pairwise(ranges):
+        if after < stop:
+            raise RequestError(f"the {what}s {start}:{stop} and {after}:{end} overlap; make them one")
+    return ranges

@@ -1,14 +1,19 @@
 """Checks of output files and folders before any long work, so that a typing error does not cost an hour."""
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from importlib.util import find_spec
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
+from mapctl import formats
 from mapctl.errors import RequestError
 from mapctl.formats import atomic
+from mapctl.motion import Motion
+from priors import licences
 
 
 def check_files(paths: Sequence[Path], *, given: Sequence[Path] = ()) -> None:
@@ -78,3 +83,24 @@ def make_folder(folder: Path) -> Iterator[Path]:
         for path in missing:
             with suppress(OSError):
                 path.rmdir()
+
+
+def add_licence(report: Mapping[str, Any]) -> dict[str, Any]:
+    """Add to a report the licences of the models that were used, the strictest first."""
+    return {**report, **licences.describe_licences(licences.find_used_licences())}
+
+
+def format_used_licences() -> str:
+    """Format the licences of what was used so far for a file: without the folders of models and motions."""
+    return licences.format_licences(licences.shorten_names(licences.find_used_licences()))
+
+
+def mark_motion(motion: Motion) -> Motion:
+    """Mark a motion with the licences of what was used so far, where anything was."""
+    told = format_used_licences()
+    return replace(motion, licence=told) if told else motion
+
+
+def save_motion(motion: Motion, path: Path) -> None:
+    """Write a motion with the licences of what it was made with, in formats that keep them."""
+    formats.save(mark_motion(motion), path)

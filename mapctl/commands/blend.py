@@ -1,0 +1,62 @@
+"""`mapctl blend`: a hand or foot of one clip moves as in another for some frames."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import arg
+
+import priors
+from controllers.inbetweening.blend import LimbTransfer, blend
+from controllers.inbetweening.pipeline import InfillSettings
+from mapctl.commands.shared import inputs, options, outputs, results
+from mapctl.commands.shared.command import ModelCommand, conclude
+from mapctl.commands.shared.options import parse_frame, parse_range
+
+
+@dataclass(frozen=True)
+class Blend(ModelCommand, options.RigOptions):
+    """Hands or feet of a clip move as in another one for some frames: a walk that reaches or waves."""
+
+    source: options.InFile
+    """A motion file."""
+    other: Annotated[Path, arg(name="from", metavar="CLIP")]
+    """The other clip, of any known rig; resampled to IN's frame rate."""
+    joints: Annotated[str, arg(metavar="NAME,NAME")]
+    """Hands and feet, by the names of IN's rig or the canonical ones."""
+    frames: Annotated[str, arg(metavar="A:B")]
+    """Frames of the other clip, at its own rate, or seconds as in 2s:2.5s."""
+    at: Annotated[str, arg(metavar="FRAME")]
+    """First frame in IN, or seconds as in 1.5s."""
+    out: options.OutFile
+    """Where the motion goes."""
+    margin: options.MaybeNumber = None
+    """Seconds before and after in which the limb goes there and back; by its distance if not given."""
+    no_finish: bool = False
+    """Leave the proposal as it is, on rigid bones: no MAP stage plants the feet."""
+    inbetweener: options.Name = "transformer"
+    """A bundled in-betweener, or the file or run folder of a trained one."""
+    video: options.MaybeFile = None
+    """Film of the given motion and the new one side by side: .mp4, .gif, .webp or .png."""
+    strict: bool = False
+    """Exit with status 3 where not all that was requested holds: a margin too short for the limb."""
+    quiet: bool = False
+    """No summary and no progress bar."""
+
+
+def run(command: Blend) -> int:
+    """Check everything, blend, write, report."""
+    results.check_destinations(command.out, command.video, given=(command.source, command.other))
+    rig = inputs.read_rig(command.rig, command)
+    motion = inputs.read_motion(command.source, rig, quiet=command.quiet)
+    other = inputs.read_motion(command.other, None, quiet=command.quiet)
+    start, stop = parse_range(command.frames, fps=float(other.fps), frames=other.num_frames, what="range of --frames")
+    names = tuple(name.strip() for name in command.joints.split(","))
+    transfer = LimbTransfer(names, start, stop, parse_frame(command.at, fps=float(motion.fps)), margin=command.margin)
+    settings = InfillSettings(finish=not command.no_finish)
+    done = blend(motion, other, transfer, priors.load_inbetweener(command.inbetweener), settings=settings, rig=rig)
+    outputs.save_motion(done.motion, command.out)
+    results.film_comparison(motion, done.motion, command.video, rig=rig, quiet=command.quiet)
+    if not command.quiet:
+        print("\n".join((f"{command.out}: {done.motion.num_frames} frames", *done.notes)))
+    return conclude(done.status, strict=command.strict)

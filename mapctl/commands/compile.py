@@ -1,0 +1,60 @@
+"""`mapctl compile`: everything that is compiled once, now."""
+
+import os
+import time
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+
+import priors
+from controllers.steering import steer
+from mapctl import curves
+from mapctl.commands.shared.command import ModelCommand
+from mapctl.commands.shared.progress_bar import show_progress
+from mapctl.commands.shared.shots import parse_follow, walk
+from mapctl.intent.steering import Command
+from mapctl.numerics import compilation, jit
+
+
+@dataclass(frozen=True)
+class CompileKernels(ModelCommand):
+    """Compile the kernels and keep them on disk, so that the first motion does not wait for it; best after an
+    installation."""
+
+    tells_licence: ClassVar[bool] = False
+
+    quiet: bool = False
+    """No summary and no progress bar."""
+
+
+def run(command: CompileKernels) -> int:
+    """Move a character for a moment in every way that has kernels of its own, which compiles those not yet on disk."""
+    made: list[int] = []
+
+    def note(number: int, total: int, begins: bool) -> None:
+        if not begins:
+            made.append(number)
+
+    start = time.perf_counter()
+    with compilation.tell(note), show_progress("trying kernels", quiet=command.quiet):
+        _use_kernels()
+    if not command.quiet:
+        print(f"kernels   {len(made)} compiled, {time.perf_counter() - start:.1f} s")
+        print(f"kept in   {_describe_place(jit.find_folders())}")
+    return 0
+
+
+def _use_kernels() -> None:
+    prior, generator = priors.load("locomotion"), torch.Generator().manual_seed(0)
+    walk(prior, parse_follow(curves.line(length=1.0), None, 0.1), seed=0)
+    ahead = Command(1.0, 0.0)
+    state, _ = steer.begin(prior, ahead, generator=generator)
+    steer.step(state, ahead)
+    prior.sample(prior.initial_states.state.pick(torch.tensor([0])), 1, generator)
+
+
+def _describe_place(folders: set[str]) -> str:
+    if not folders:
+        return "no folder: none can be written to; name one in NUMBA_CACHE_DIR"
+    return os.path.commonpath(folders)

@@ -1,0 +1,138 @@
+"""`mapctl generate`: motion sampled from a prior, of any length."""
+
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import torch
+from tyro.conf import arg
+
+import priors
+from controllers.generation.foot_cleanup import FootCleanupSettings
+from controllers.generation.generate import SIGMA_PLANTED, GenerateSettings, sample_stratified_starts, stream
+from mapctl import formats
+from mapctl.commands.shared import inputs, options, outputs
+from mapctl.commands.shared.command import ModelCommand
+from mapctl.commands.shared.inputs import read_character
+from mapctl.commands.shared.progress_bar import explain_progress, show_progress
+from mapctl.errors import RequestError
+from mapctl.features import PRIOR_FPS
+from mapctl.formats.bvh.stream import open_bvh_stream
+from mapctl.formats.whole_stream import open_whole_stream
+from mapctl.metrics.pace_changes import PACES, label_pace
+from mapctl.motion import Motion
+from mapctl.retarget import to_canonical
+
+
+@dataclass(frozen=True)
+class Generate(ModelCommand, options.ReadOptions):
+    """Motion sampled from a prior, of any length: OUT/generated_000.bvh, generated_001.bvh, ..."""
+
+    out: options.OutFolder
+    """Folder for the clips; made if it does not exist."""
+    seconds: options.Number
+    """Length of each clip."""
+    count: options.Count = 1
+    """Number of clips."""
+    seed: options.Count = 0
+    """Seed of everything random; each clip gets its own seed from it. Initial states are stratified over the data's
+    speeds."""
+    temperature: options.Number = 1.0
+    """Temperature of the samples, 0 to 2: 0 is the prior's mean, 1 the prior itself."""
+    start: Annotated[str | None, arg(metavar="CLIP|INDEX")] = None
+    """A clip (.bvh, .npz, .amc) to go on from, or the index of an initial state for all; sampled if not given."""
+    prior: options.Name = "locomotion"
+    """A bundled prior, or the file or run folder of a trained one."""
+    style: Annotated[str | None, arg(metavar="NAME,NAME")] = None
+    """Gait, style and pace by the names of the prior's data, such as run or elderly,walk; `none` leaves the prior
+    unconditioned. If not given, gait and style are those of the clip that it begins from. Unless a pace is named, a
+    prior that knows paces is told one after the other."""
+    refiner: options.MaybeName = None
+    """A refiner between samples and foot clean-up: a bundled one, the file or run folder of a trained one, or auto, the
+    prior's own. None if not given: refined samples are told from mocap more often."""
+    no_footing: bool = False
+    """Leave out the foot clean-up. Without a refiner, each frame is then sampled given that toes stand where its
+    contact bits say so: feet slide about as mocap's do, and it is faster."""
+    rig: options.OutRig = "canonical"
+    """Body that moves: the canonical one, or that of a clip, on whose rig the motion is then written; or a rig by name
+    or TOML file, whose joints get the canonical bones."""
+    to: Annotated[str, arg(metavar=".bvh|.npz|.glb|...")] = ".bvh"
+    """Format of the clips by its ending; a character of --rig is written with them where the ending is its own.
+    Only .bvh is written as it is sampled, the others take memory for the whole clip."""
+    quiet: bool = False
+    """No lines on the clips and no progress bar."""
+
+
+_MAX_CLIPS = 10_000
+
+
+def run(command: Generate) -> int:
+    """Check everything, then write clip after clip; clips that are finished stay if it is interrupted."""
+    frames, settings, clip = inputs.count_frames(command.seconds), *_check_settings(command)
+    prior = priors.load(command.prior)
+    if command.style not in (None, "none"):
+        names = [name.strip() for name in command.style.split(",")]
+        prior = prior.conditioned_on(names)
+        settings = replace(settings, tell_paces=not {*names} & {*PACES, *map(label_pace, PACES)})
+    refiner = None if command.refiner is None else priors.refiner_of(command.prior, command.refiner)
+    character = read_character(command.rig, command)
+    if settings.foot_cleanup is not None:
+        footing = replace(settings.foot_cleanup.footing, rest_height=character.toe_rest_height)
+        settings = replace(settings, foot_cleanup=replace(settings.foot_cleanup, footing=footing))
+    draw = partial(
+        stream, prior, seconds=command.seconds, start_clip=clip, refiner=refiner, skeleton=character.skeleton
+    )
+    starts = sample_stratified_starts(prior, command.count, torch.Generator().manual_seed(command.seed))
+    with outputs.make_folder(command.out) as folder, explain_progress(command.count, "clips") as finished:
+        for number, seed in enumerate(_sample_seeds(command)):
+            own = settings if settings.start is not None else replace(settings, start=starts[number])
+            pieces = draw(generator=torch.Generator().manual_seed(seed), settings=own)
+            motions = (outputs.mark_motion(character.on_rig(piece.motion)) for piece in pieces)
+            _write(command, motions, folder / f"generated_{number:03d}{command.to}", frames)
+            finished(number + 1)
+    return 0
+
+
+def _check_settings(command: Generate) -> tuple[GenerateSettings, Motion | None]:
+    options.check_seed(command.seed)
+    if not 1 <= command.count <= _MAX_CLIPS:
+        raise RequestError(f"the count must be 1 to {_MAX_CLIPS}, got {command.count}")
+    outputs.check_folder(command.out)
+    formats.check_ending(command.out / f"clip{command.to}")
+    numbered = command.start is not None and command.start.lstrip("-").isdecimal()
+    finishing = None if command.no_footing else FootCleanupSettings()
+    start = int(command.start) if command.start and numbered else None
+    planted = SIGMA_PLANTED if command.no_footing and command.refiner is None else None
+    settings = GenerateSettings(
+        command.temperature,
+        start,
+        condition_on_start=command.style is None,
+        tell_paces=command.style != "none",
+        foot_cleanup=finishing,
+        sigma_planted=planted,
+    )
+    if command.start is None or numbered:
+        return settings, None
+    clip, rig = inputs.read_clip(Path(command.start), command)
+    return settings, clip if rig is None else to_canonical(clip, rig)[0]
+
+
+def _sample_seeds(command: Generate) -> list[int]:
+    """Sample a seed for each clip; the first ones do not depend on the count."""
+    generator = torch.Generator().manual_seed(command.seed)
+    return torch.randint(2**62, (command.count,), generator=generator).tolist()
+
+
+def _write(command: Generate, pieces: Iterable[Motion], path: Path, frames: int) -> None:
+    began, open_stream = time.perf_counter(), open_bvh_stream if command.to == ".bvh" else open_whole_stream
+    with show_progress(path.name, quiet=command.quiet) as progress, open_stream(path, frames) as file:
+        for piece in pieces:
+            file.append(piece)
+            if progress is not None:
+                progress(file.written, frames)
+    if not command.quiet:
+        rate = frames / (time.perf_counter() - began)
+        print(f"{path}: {frames} frames, {frames / PRIOR_FPS:.1f} s, drawn at {rate:.0f} frames a second")

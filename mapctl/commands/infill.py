@@ -1,0 +1,180 @@
+"""`mapctl infill`: missing frames and joints of a motion are filled in."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import torch
+from tyro.conf import UseAppendAction, arg
+
+import priors
+from controllers.inbetweening.infill import InbetweenSolution, InfillSettings, infill, retraced
+from controllers.inbetweening.proposers import build_inbetweener
+from mapctl import report
+from mapctl.commands.shared import inputs, options, outputs, results
+from mapctl.commands.shared.command import ModelCommand, conclude
+from mapctl.commands.shared.options import parse_ranges
+from mapctl.commands.shared.results import read_dna
+from mapctl.errors import RequestError
+from mapctl.motion import Motion
+from mapctl.protocols import Inbetweener
+from mapctl.recording.gap_detection import find_gaps
+from mapctl.recording.masks import ALL, ROOT, Mask
+from mapctl.retarget.rigs import Rig
+
+
+@dataclass(frozen=True)
+class Infill(ModelCommand, options.RigOptions):
+    """Fill in missing frames or joints of a motion; all else stays as it was. On any known rig."""
+
+    source: options.InFile
+    """A motion file."""
+    out: options.OutFile
+    """Where the filled motion goes."""
+    gap: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="A:B")] = ()
+    """Frames from A up to B (exclusive), or seconds as in 2s:4s; may be given several times. Their values are ignored.
+    What is nan in IN is missing as well; where nothing is, and there are no gaps and joints, frozen and leaping frames
+    are detected."""
+    way: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="A:B")] = ()
+    """Frames from A up to B (exclusive), or seconds, in which the place of the hips is lost and told by how the body
+    moves: treadmills, drifting sensors, poses from video. May be given several times, alone or with gaps, whose poses
+    are filled first; all frames may be lost so."""
+    joints: Annotated[str | None, arg(metavar="NAME,NAME")] = None
+    """Only these joints are missing, canonical names or the rig's own: in the gaps, or throughout if there are none."""
+    method: options.Method = "auto"
+    """Method that proposes. auto: the transformer, the stitcher where hands, feet or hips are told in up to 2 s, the
+    tweener, if the set of weights has one, through gaps of more than 8 s and those of more than 6 s in which the
+    transformer hardly moves, or a held pose where the body stands still; a note on each gap names it. transformer,
+    infiller, tweener: that network alone. stitcher: gaps of up to 2 s between whole poses from both sides, led by
+    hands, feet, hips or a trajectory told in them. rollouts: a density's rollouts, wherever nothing is known. slerp:
+    interpolation."""
+    dna: options.MaybeDna = None
+    """Motion files of any known rig, or classes that `mapctl info tweener` lists, whose style the tweener takes: in all
+    gaps with --method tweener, in those of 2 s and more without parts with auto."""
+    no_finish: bool = False
+    """Leave the proposal as it is, on rigid bones and with exact keys: no MAP stage plants the feet."""
+    curve: options.MaybeCurve = None
+    """Trajectory of the hips in the gaps: a CSV or SVG file, or a shape, that passes within 1 m of where each begins
+    and ends."""
+    inbetweener: options.MaybeName = None
+    """The file or run folder of a trained transformer, infiller or tweener; the bundled one if not given. With auto a
+    tweener is for long gaps, beside the bundled transformer."""
+    stitcher: options.MaybeName = None
+    """The file or run folder of a trained stitcher for --method stitcher, where --inbetweener fills what it leaves, and
+    for auto; the bundled one if not given."""
+    path: options.MaybeName = None
+    """For --way and the tweener: the file or run folder of a trained path predictor; the bundled one if not given."""
+    prior: options.MaybeName = None
+    """A density whose likelihood joins the MAP stage: a bundled one, a file or a run folder; `auto` takes, window by
+    window, the bundled one under which the motion is likelier. It extrapolates a gap at the end (`auto` if none is
+    named), where the frames before are likely under it."""
+    report: options.MaybeFile = None
+    """JSON with the gaps, contacts, ledger, measures and compute."""
+    video: options.MaybeFile = None
+    """Film of the given motion and the filled one side by side: .mp4, .gif, .webp or .png."""
+    seed: options.Count = 0
+    """Seed of what rollouts sample."""
+    strict: bool = False
+    """Exit with status 3 where not all that was requested holds."""
+    quiet: bool = False
+    """No summary and no progress bar."""
+
+
+def run(command: Infill) -> int:
+    """Check everything, fill, write, report."""
+    _check(command)
+    rig = inputs.read_rig(command.rig, command)
+    motion, marked, has_gaps = inputs.read_motion_with_gaps(command.source, rig, quiet=command.quiet)
+    ways = _parse_ways(command, motion)
+    masks = (*marked, *_parse_masks(command, motion)) or (() if has_gaps or ways else find_gaps(motion))
+    done = _run_infilling(command, motion, masks, ways, rig)
+    outputs.save_motion(done.motion, command.out)
+    if command.report is not None:
+        report.write_report(results.build_report("infill", command, done), command.report)
+    results.film_comparison(motion, done.motion, command.video, rig=rig, quiet=command.quiet)
+    if not command.quiet:
+        _tell(command, done)
+    return conclude(done.status, strict=command.strict)
+
+
+def _check(command: Infill) -> None:
+    options.check_seed(command.seed)
+    if command.way and command.curve is not None:
+        raise RequestError("--way and --curve both say where the hips go; choose one")
+    if command.path is not None and not command.way and not results.takes_path(command.method, command.inbetweener):
+        raise RequestError("--path predicts the hips' place for --way and for --method tweener; leave it out")
+    if command.curve is not None and command.method in ("slerp", "rollouts"):
+        raise RequestError(f"--curve needs the steps that a network makes; leave --method {command.method} out")
+    if command.curve is not None and command.dna is not None:
+        raise RequestError("--dna says how to move and --curve where; only one of them can be had, leave the other out")
+    finish, prior = not command.no_finish, command.prior
+    results.check_method(
+        command.method, finish=finish, prior=prior, inbetweener=command.inbetweener, stitcher=command.stitcher
+    )
+    results.check_destinations(command.out, command.video, command.report, given=(command.source,))
+
+
+def _parse_masks(command: Infill, motion: Motion) -> Sequence[Mask]:
+    """Parse the masks of the options; RequestError for impossible ones."""
+    if not command.gap and command.joints is None:
+        return ()
+    gaps = parse_ranges(command.gap, fps=float(motion.fps), frames=motion.num_frames) or [(0, motion.num_frames)]
+    names = [ALL] if command.joints is None else [name.strip() for name in command.joints.split(",")]
+    return [Mask(name, start, stop) for start, stop in gaps for name in names]
+
+
+def _parse_ways(command: Infill, motion: Motion) -> Sequence[Mask]:
+    """Parse the frames in which the hips' place is lost; RequestError for impossible ones."""
+    ways = parse_ranges(command.way, fps=float(motion.fps), frames=motion.num_frames, what="way")
+    return [Mask(ROOT, start, stop) for start, stop in ways]
+
+
+def _run_infilling(
+    command: Infill, motion: Motion, masks: Sequence[Mask], ways: Sequence[Mask], rig: Rig | None
+) -> InbetweenSolution:
+    settings, densities = InfillSettings(finish=not command.no_finish), priors.load_choice(command.prior)
+    generator = torch.Generator().manual_seed(command.seed)
+    if ways:
+        return retraced(
+            motion,
+            priors.load_path(command.path or "path"),
+            (*masks, *ways),
+            # Where no pose is missing the network that would propose them need not be there.
+            inbetweener=_build_inbetweener(command) if any(mask.joint != ROOT for mask in masks) else None,
+            settings=settings,
+            densities=densities,
+            rig=rig,
+            generator=generator,
+        )
+    return infill(
+        motion,
+        _build_inbetweener(command),
+        masks,
+        settings=settings,
+        densities=densities,
+        rig=rig,
+        curve=None if command.curve is None else inputs.read_curve(command.curve, None),
+        generator=generator,
+    )
+
+
+def _build_inbetweener(command: Infill) -> Inbetweener:
+    dna = read_dna(command.dna, command.method)
+    return build_inbetweener(
+        command.method, results.load_models(command.inbetweener, command.prior, command.path, dna, command.stitcher)
+    )
+
+
+def _tell(command: Infill, done: InbetweenSolution) -> None:
+    gaps = ", ".join(
+        f"{gap['start']}:{gap['stop']} ({gap['joints']} joints)"
+        if gap["joints"]
+        else f"{gap['start']}:{gap['stop']} (the hips' place)"
+        for gap in done.list_gaps()
+    )
+    print(
+        f"{command.out}: {done.motion.num_frames} frames at {float(done.motion.fps):.6g} a second; filled {gaps};"
+        f" {done.frame_ms:.1f} ms a filled frame"
+    )
+    for note in (*done.notes, *done.gap_notes):
+        print(note)

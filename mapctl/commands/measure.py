@@ -1,0 +1,350 @@
+"""`mapctl measure`: the measures of a motion, or of a folder of them, beside those of a reference and of mocap."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any, ClassVar
+
+import torch
+from torch import Tensor
+from tyro.conf import Positional, arg
+
+from mapctl import editing, formats, metrics, report, retarget
+from mapctl.commands.shared import inputs, options
+from mapctl.commands.shared.command import ModelCommand
+from mapctl.commands.shared.inputs import read_motion
+from mapctl.commands.shared.progress_bar import show_progress
+from mapctl.commands.shared.tables import format_cell, print_table
+from mapctl.curves.curve import Curve
+from mapctl.errors import CheckpointError, MapctlError, RequestError
+from mapctl.features import PRIOR_FPS
+from mapctl.metrics import realism
+from mapctl.metrics.comparison import make_comparable
+from mapctl.metrics.realism.diversity import align_to_start, measure_position_diversity
+from mapctl.metrics.realism.gait import PIECE_SECONDS
+from mapctl.motion import Motion
+from mapctl.retarget.rigs import Rig
+from priors import checkpoints
+
+
+@dataclass(frozen=True)
+class Measure(ModelCommand, options.RigOptions):
+    """Path, feet, jitter and more of a motion, beside a reference clip and mocap's own values.
+
+    Of a clip also its cycle, of a walk or a run one stride, or that it has none.
+    All are measured as mocap's values were: on canonical joints with Y up, at 30 frames a second if there are more. Of
+    a folder the means over its clips; beside a folder of mocap also whether the two can be told apart. Clips of a
+    folder that cannot be measured are left out and listed.
+    """
+
+    tells_licence: ClassVar[bool] = False
+
+    clip: Positional[Annotated[Path, arg(metavar="CLIP|FOLDER")]]
+    """A motion in any format that mapctl reads; or a folder, every one below it."""
+    reference: Annotated[Path | None, arg(metavar="CLIP|FOLDER")] = None
+    """Another clip to print beside it; or for a folder another, unseen mocap say: adds realism and diversity."""
+    curve: options.MaybeCurve = None
+    """Curve that it was to follow: circle:4, a CSV, an SVG (see `mapctl follow --help`)."""
+    speed: options.MaybeNumber = None
+    """Requested speed, m/s: adds the progress along the curve."""
+    metres_per_unit: options.MaybeNumber = None
+    """Scale of a CSV or SVG file."""
+    json: bool = False
+    """Print JSON instead of a table."""
+
+
+_MAX_LINES = 12  # of notes and clips that are left out
+
+
+SETTINGS = realism.RealismSettings()
+"""Settings of the classifier of two folders."""
+
+
+@dataclass(frozen=True, eq=False)
+class _MeasuredClip:
+    """One measured file of a folder."""
+
+    path: Path
+    """The file."""
+    motion: Motion
+    """Motion made comparable."""
+    measures: dict[str, float]
+    """Measures by name."""
+    positions: Tensor
+    """Positions of canonical joints, (frames, joints, 3), metres; empty unless read with windows."""
+    windows: Tensor
+    """Windows, (windows, frames, channels); empty unless read with windows."""
+    notes: list[str]
+    """Notes on what could not be made comparable."""
+
+    @staticmethod
+    def read(path: Path, *, with_windows: bool, rig: Rig | None) -> "_MeasuredClip":
+        """Read and measure a file; MapctlError for what cannot be read, measured or cut."""
+        motion, notes = make_comparable(read_motion(path, rig), rig)
+        measures, positions, windows = metrics.measure(motion), torch.zeros(0), torch.zeros(0)
+        if with_windows:
+            positions = realism.canonical_positions(motion)
+            windows = realism.cut_windows(positions, SETTINGS.windows)
+        return _MeasuredClip(path, motion, measures, positions, windows, [f"{path}: {note}" for note in notes])
+
+
+@dataclass(frozen=True, eq=False)
+class ClipSet:
+    """Every clip below a folder, in the order of their paths."""
+
+    folder: Path
+    """Folder of the clips."""
+    names: list[str]
+    """Path of each clip below the folder."""
+    motions: list[Motion]
+    """Motions on canonical joints and at 30 frames/s at most, so that sets on different rigs compare (see
+    `metrics.comparison`)."""
+    means: dict[str, float]
+    """Mean of each measure over the clips that can give it."""
+    positions: list[Tensor]
+    """Canonical joints of each clip, (frames, joints, 3); none unless read with windows."""
+    windows: list[Tensor]
+    """Windows of each clip, (windows, frames, channels); none unless read with windows."""
+    skipped: dict[str, str]
+    """Reasons by file that was left out, each a sentence that begins with the file."""
+    notes: tuple[str, ...] = ()
+    """Notes on what could not be made comparable."""
+
+    @staticmethod
+    def read(folder: Path, *, with_windows: bool, rig: Rig | None = None) -> "ClipSet":
+        """Read and measure clips of a rig. A file that cannot be read, measured or cut into windows is left out;
+        RequestError if none can."""
+        paths = sorted(p for p in folder.rglob("*") if p.suffix.lower() in formats.READERS and p.is_file())
+        if not paths:
+            raise RequestError(f"{folder}: no {' or '.join(formats.READERS)} file in this folder or below it")
+        clips: list[_MeasuredClip] = []
+        skipped: dict[str, str] = {}
+        with show_progress(f"reading {folder}") as progress:
+            for number, path in enumerate(paths, start=1):
+                try:
+                    clips.append(_MeasuredClip.read(path, with_windows=with_windows, rig=rig))
+                except MapctlError as error:
+                    skipped[str(path)] = str(error) if str(error).startswith(str(path)) else f"{path}: {error}"
+                if progress is not None:
+                    progress(number, len(paths))
+        if not clips:
+            raise RequestError(f"{folder}: no clip can be measured; {next(iter(skipped.values()))}")
+        positions, windows = [c.positions for c in clips if with_windows], [c.windows for c in clips if with_windows]
+        return ClipSet(
+            folder,
+            [clip.path.relative_to(folder).as_posix() for clip in clips],
+            [clip.motion for clip in clips],
+            _average_measures([clip.measures for clip in clips]),
+            positions,
+            windows,
+            skipped,
+            tuple(note for clip in clips for note in clip.notes),
+        )
+
+    def diversity(self) -> realism.Diversity:
+        """Measure the diversity of the first 3 s of the clips; NaN for fewer than two clips of 3 s.
+
+        Each clip is aligned to its own start, so that sets with different starts can be compared.
+        """
+        frames = round(PIECE_SECONDS * PRIOR_FPS)
+        pieces = [align_to_start(clip)[:frames] for clip in self.positions if len(clip) >= frames]
+        if len(pieces) < 2:
+            return realism.Diversity(math.nan, math.nan)
+        return measure_position_diversity(torch.stack(pieces))
+
+
+def train_judges(ours: ClipSet, reference: ClipSet) -> realism.Judges:
+    """Train networks that distinguish ours from the reference's; RequestError for too few clips."""
+    fewest = SETTINGS.min_clips
+    for clips in (ours, reference):
+        if len(clips.motions) < fewest:
+            raise RequestError(
+                f"{clips.folder}: {len(clips.motions)} clips; a comparison needs at least {fewest} in each folder"
+                f"{_describe_skipped(clips)} (without --reference a folder of any size is measured)"
+            )
+    generator = torch.Generator().manual_seed(0)
+    with show_progress("telling apart") as progress:
+        return realism.train_judges(
+            ours.windows, reference.windows, generator=generator, settings=SETTINGS, progress=progress
+        )
+
+
+def compare_variability(ours: ClipSet, reference: ClipSet) -> dict[str, dict[str, float]]:
+    """Compare ours and the reference's by measure: standard deviations of gait, average pairwise distances."""
+    sides = []
+    for clips in (ours, reference):
+        gait = {f"std_of_{name}": spread.std for name, spread in realism.measure_gait_spread(clips.motions).items()}
+        diversity = clips.diversity()
+        sides.append(gait | {f"pairwise_distance_{name}": value for name, value in diversity._asdict().items()})
+    mine, theirs = sides
+    return {
+        name: {"ours": value, "reference": theirs[name], "ratio": value / theirs[name] if theirs[name] else math.nan}
+        for name, value in mine.items()
+    }
+
+
+def _describe_skipped(clips: ClipSet) -> str:
+    first = next(iter(clips.skipped.values()), None)
+    return "" if first is None else f", and {len(clips.skipped)} cannot be measured: {first}"
+
+
+def _average_measures(rows: list[dict[str, float]]) -> dict[str, float]:
+    """Average each measure over the clips that can give it, which are not NaN."""
+    return {name: float(torch.tensor([row[name] for row in rows], dtype=torch.float64).nanmean()) for name in rows[0]}
+
+
+def run(command: Measure) -> int:
+    """Measure and print."""
+    folders = [path.is_dir() for path in options.collect_paths(command.clip, command.reference)]
+    if any(folders):
+        _check_folders(command, all(folders))
+    values = _measure_folders(command) if any(folders) else _measure_clips(command)
+    if command.json:
+        print(report.to_json(values), end="")
+    else:
+        _print_tables(values)
+    return 0
+
+
+def _measure_clips(command: Measure) -> dict[str, Any]:
+    curve = _read_curve(command)
+    rig = inputs.read_rig(command.rig, command)
+    whole = inputs.read_motion(command.clip, rig)
+    clip, notes = _make_comparable(whole, command.clip, rig)
+    ours = metrics.measure(clip, curve, speed=command.speed)
+    reference = {}
+    if command.reference is not None:
+        other, more = _make_comparable(inputs.read_motion(command.reference, None), command.reference)
+        reference, notes = metrics.measure(other), notes + more
+    return {
+        "clip": str(command.clip),
+        "measures": ours,
+        "reference": reference,
+        "mocap": _read_mocap_values(),
+        "cycle": _measure_cycle(whole, rig),
+        "notes": notes,
+    }
+
+
+def _measure_cycle(motion: Motion, rig: Rig | None) -> dict[str, Any]:
+    """Describe the cycle of a motion of any rig, at its own rate; else say why there is none."""
+    try:
+        canonical = retarget.to_canonical(motion, rig)[0]
+        return editing.describe_cycle(canonical, editing.find_cycle(canonical))
+    except RequestError as error:
+        return {"none": str(error).removeprefix("no cycle is found: ")}
+
+
+def _read_curve(command: Measure) -> Curve | None:
+    if command.speed is not None and not 0 < command.speed < float("inf"):
+        raise RequestError(f"speed must be positive, got {command.speed:g} m/s")
+    if command.curve is None and (command.speed is not None or command.metres_per_unit is not None):
+        raise RequestError("--speed and --metres-per-unit are about a curve; name it with --curve")
+    return None if command.curve is None else inputs.read_curve(command.curve, command.metres_per_unit)
+
+
+def _check_folders(command: Measure, alike: bool) -> None:
+    if not alike:
+        raise RequestError(f"{command.clip} and {command.reference}: a folder and a clip; name two of one kind")
+    if any(option is not None for option in (command.curve, command.speed, command.metres_per_unit)):
+        raise RequestError(f"{command.clip} is a folder; --curve, --speed and --metres-per-unit are for one clip")
+
+
+def _measure_folders(command: Measure) -> dict[str, Any]:
+    compared = command.reference is not None
+    ours = ClipSet.read(command.clip, with_windows=compared, rig=inputs.read_rig(command.rig, command))
+    reference = ClipSet.read(command.reference, with_windows=True) if command.reference is not None else None
+    values = {
+        "clip": str(command.clip),
+        "clips": len(ours.motions),
+        "measures": ours.means,
+        "reference": {} if reference is None else reference.means,
+        "mocap": _read_mocap_values(),
+        "notes": ours.notes + (() if reference is None else reference.notes),
+        "skipped": ours.skipped | ({} if reference is None else reference.skipped),
+    }
+    return values if reference is None else values | _compare_folders(command, ours, reference)
+
+
+def _compare_folders(command: Measure, ours: ClipSet, reference: ClipSet) -> dict[str, Any]:
+    judges = train_judges(ours, reference)
+    return {
+        "reference_clips": len(reference.motions),
+        "realism": asdict(judges.summarise()),
+        "spread": compare_variability(ours, reference),
+    }
+
+
+def _print_tables(values: Mapping[str, Any]) -> None:
+    """Print measures, and realism and spread where there are any, each as a table."""
+    reference, mocap = values["reference"], values["mocap"]
+    rows = [
+        [name, value, reference.get(name), _format_range(mocap.get(name))] for name, value in values["measures"].items()
+    ]
+    title = None if "clips" not in values else f"means over {values['clips']} clips"
+    if "reference_clips" in values:
+        title = f"{title}, and over {values['reference_clips']} of the reference"
+    print_table(["measure", "ours", "reference", "mocap (2 to 98 %)"], rows, title=title)
+    if "realism" in values:
+        _print_realism(values["realism"])
+        rows = [[name, *row.values()] for name, row in values["spread"].items()]
+        title = "how widely the clips spread (in pieces of 3 s)"
+        print_table(["spread", "ours", "reference", "ratio"], rows, title=title)
+    if "cycle" in values:
+        print(_describe_cycle(values["cycle"]))
+    for line in _shorten([*(f"left out {reason}" for reason in values.get("skipped", {}).values()), *values["notes"]]):
+        print(line)
+
+
+def _shorten(lines: Sequence[str]) -> list[str]:
+    """Shorten a list of lines to the first ones and the number of the others."""
+    more = len(lines) - _MAX_LINES
+    return [*lines[:_MAX_LINES], *([f"and {more} more, which --json lists"] if more > 0 else [])]
+
+
+def _make_comparable(motion: Motion, path: Path, rig: Rig | None = None) -> tuple[Motion, list[str]]:
+    """Make a clip as mocap's values were measured, and note what could not be made so."""
+    comparable, notes = make_comparable(motion, rig)
+    return comparable, [f"{path}: {note}" for note in notes]
+
+
+def _describe_cycle(cycle: Mapping[str, Any]) -> str:
+    if "none" in cycle:
+        return f"cycle: none, {cycle['none']}"
+    about = (
+        f"cycle: frames {cycle['start']}:{cycle['stop']}, {cycle['frames']} frames, {cycle['seconds']:.2f} s, with"
+        f" ends {cycle['mismatch_cm']:.1f} cm apart"
+    )
+    if not cycle["gait"]:
+        return about
+    return (
+        f"{about}; {cycle['steps_per_minute']:.0f} steps a minute, stride {cycle['stride_m']:.2f} m; right foot"
+        f" {cycle['right_after_left']:.2f} of a cycle after the left, mirrored {cycle['asymmetry_cm']:.1f} cm off"
+    )
+
+
+def _print_realism(realism: Mapping[str, Any]) -> None:
+    counts = f"{realism['made_windows']} and {realism['mocap_windows']} windows of one second"
+    rows = [
+        ["told apart, %", *(100 * realism[name] for name in ("accuracy", "floor_accuracy"))],
+        ["Frechet distance", realism["frechet"], realism["floor_frechet"]],
+    ]
+    columns = ["realism", "ours against the reference", "halves of the reference (floor)"]
+    print_table(columns, rows, title=f"{counts}; 50 % cannot be told apart")
+
+
+def _read_mocap_values() -> Mapping[str, Any]:
+    """Read mocap's values from the card of the bundled prior; none where there is none."""
+    try:
+        return report.reference_measures(
+            checkpoints.read_card(checkpoints.locate("locomotion").with_suffix(".json")).quality
+        )
+    except CheckpointError:
+        return {}
+
+
+def _format_range(values: Mapping[str, float] | None) -> str | None:
+    if values is None:
+        return None
+    return f"{format_cell(values['mean'])} ({format_cell(values['p2'])} to {format_cell(values['p98'])})"

@@ -1,0 +1,485 @@
+"""Solved walks along curves with their measures and cost, for follow, run and demo."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from fractions import Fraction
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from controllers.common.character import Character
+from controllers.following.follow import FollowSettings, follow
+from controllers.shots.clips.arrival import Arrival
+from controllers.shots.clips.lead import Lead
+from controllers.shots.keys.posing import MetPose
+from controllers.shots.planning.way import APART_MARGIN, Way, plan_way
+from controllers.shots.request import Look, Others, PoseKey, Reach, ShotRequest
+from controllers.shots.rest_pose import build_rest_pose
+from controllers.shots.shot import ShotSettings, ShotSolution, solve_shot
+from mapctl import kinematics, report
+from mapctl.commands.shared.inputs import read_clip
+from mapctl.commands.shared.options import ReadOptions
+from mapctl.commands.shared.outputs import add_licence
+from mapctl.curves import Curve
+from mapctl.curves.obstacles import Obstacle
+from mapctl.errors import RequestError
+from mapctl.features import PRIOR_FPS
+from mapctl.intent.path import USUAL_SPEED, PathRequest, SpeedProfile
+from mapctl.intent.shot_keys import ShotKey
+from mapctl.intent.timed_speed import TimedSpeed
+from mapctl.mesh.primitives import Surface
+from mapctl.motion import Motion
+from mapctl.problem.solution import Outcome, Solution
+from mapctl.protocols import Inbetweener
+from mapctl.recording.splines import resample_by_splines
+from mapctl.retarget.carry import RiggedCharacter, retarget_motion
+from mapctl.runtime.progress import Progress
+from mapctl.skeleton import CANONICAL
+from priors.lstm_gmm.density import LstmGmmDensity
+from scenes.drawn_character import DrawnCharacter
+from scenes.props import build_hips_mark, build_look_mark, build_obstacle, build_target
+from scenes.scene_file import Actor
+from scenes.stage import Shot
+from scenes.wishes import Mark, Wishes
+
+
+@dataclass(frozen=True, eq=False)
+class Walk:
+    """A solved walk."""
+
+    request: PathRequest
+    """Request for the walk."""
+    prior: LstmGmmDensity
+    """Density of the character's motion."""
+    seed: int
+    """Seed of everything random."""
+    solution: Solution
+    """Solution of the request."""
+    character: Character | None = None
+    """Character that walks, where that is not the canonical body."""
+
+    @property
+    def on_rig(self) -> Motion:
+        """Motion on the requested rig."""
+        motion = self.solution.motion
+        return motion if self.character is None else self.character.on_rig(motion)
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether Ctrl-C ended the solve, so that this is the first part of the walk."""
+        return self.solution.status.outcome is Outcome.INTERRUPTED
+
+    @cached_property
+    def measures(self) -> Mapping[str, float]:
+        """Measures of the motion against the curve and the requested arc along it."""
+        motion = self.solution.motion
+        wanted = float(self.request.arcs(motion.num_frames, float(motion.fps))[-1])
+        return report.measure_path(motion, self.request.curve, wanted_m=wanted)
+
+    def report(self, request: Mapping[str, Any]) -> dict[str, Any]:
+        """Build the report of this walk; `request` is what the user wrote."""
+        card = self.prior.card
+        prior = {"name": self.prior.name, "licence": card.licence, "quality": card.quality}
+        told = report.build_report(self.solution, request=request, measures=self.measures, seed=self.seed, prior=prior)
+        return add_licence(told)
+
+    def summary(self) -> list[str]:
+        """Format a few lines for the user."""
+        m = {name: "-" if value != value else f"{value:.1f}" for name, value in self.measures.items()}
+        cost = report.summarise_timing(self.solution.windows, seconds=self.solution.seconds)
+        motion, speed, planted = (self.solution.motion, self.measures["speed_m_s"], self.measures["planted_share"])
+        return [
+            f"motion    {motion.num_frames} frames, {motion.seconds:.1f} s, {speed:.2f} m/s",
+            f"path      error {m['path_error_mean_cm']} cm mean, {m['path_error_max_cm']} max; sway {m['sway_cm']} cm",
+            f"progress  {m['travelled_m']} of {m['wanted_m']} m",
+            f"feet      planted {planted:.0%} of the time, then moving {m['contact_speed_cm_s']} cm/s",
+            f"cost      {cost['frame_ms_p50']:.1f} ms a frame (p99 {cost['frame_ms_p99']:.1f}), "
+            f"{cost['evaluations_per_frame']:.1f} evaluations a frame, threads: {cost['threads']}",
+            f"status    {self.solution.status.text}",
+        ]
+
+
+def walk(
+    prior: LstmGmmDensity,
+    request: PathRequest,
+    *,
+    seed: int,
+    progress: Progress | None = None,
+    character: Character | None = None,
+) -> Walk:
+    """Solve a walk for a character of any size. Compiling or loading the fast path, once a process, is not counted."""
+    prior.warm_up()
+    bones = CANONICAL if character is None else character.skeleton
+    settings = None if character is None else FollowSettings().with_rest_height(character.toe_rest_height)
+    solution = follow(
+        prior,
+        request.curve,
+        seconds=request.seconds,
+        speed=request.profile,
+        generator=torch.Generator().manual_seed(seed),
+        progress=progress,
+        skeleton=bones,
+        settings=settings,
+    )
+    return Walk(request, prior, seed, solution, character)
+
+
+def parse_follow(curve: Curve, speed: str | float | None, seconds: float | None) -> PathRequest:
+    """Parse and check a request: RequestError for speeds and durations that make no sense or take too long."""
+    profile = SpeedProfile.parse(str(USUAL_SPEED if speed is None else speed))
+    request = PathRequest(curve, profile, seconds)
+    request.frames(PRIOR_FPS)
+    return request
+
+
+@dataclass(frozen=True, eq=False)
+class ShotPlan:
+    """What an actor is asked to do, and on what body."""
+
+    actor: Actor
+    """The actor's table."""
+    request: ShotRequest
+    """Its wishes."""
+    prior: LstmGmmDensity
+    """Density of its walks."""
+    character: Character
+    """Its body."""
+    fps: Fraction
+    """Rate of its motion."""
+
+
+def plan_shot(
+    actor: Actor,
+    curve: Curve,
+    prior: LstmGmmDensity,
+    *,
+    character: Character,
+    folder: Path,
+    options: ReadOptions,
+    obstacles: Sequence[Obstacle] = (),
+    fps: Fraction | None = None,
+) -> ShotPlan:
+    """Plan an actor's shot; a clip that it goes on from or ends in is read, and gives it its body and its rate.
+    RequestError for wishes that do not fit each other, and for labels that the prior does not know."""
+    body = _Body.of(actor, character, folder, options, prior)
+    character, placed = body.character, actor.offset is not None or actor.turn_deg is not None
+    lead, arrival = None, None
+    if actor.start_clip is not None:
+        lead = Lead.of(body.read(actor.start_clip[0]), actor.start_clip[1])
+        if placed:
+            lead = lead.bring_to(curve)
+        else:
+            curve = lead.bring_curve(curve)
+    if actor.end_clip is not None:
+        arrival = Arrival.of(body.read(actor.end_clip[0]), actor.end_clip[1])
+        if lead is None and not placed and not curve.closed:
+            curve = arrival.bring_curve(curve)
+    rate = body.rate if fps is None else fps
+    keys = [
+        (key.at_seconds(float(rate)), round(key.within_frames * PRIOR_FPS / float(rate)), key) for key in actor.keys
+    ]
+    request = ShotRequest(
+        curve,
+        _read_speed(actor, curve),
+        actor.seconds,
+        lead=lead,
+        stand_at_start=actor.start == "stand",
+        stand_at_end=actor.end == "stand",
+        arrival=arrival,
+        loop=actor.loop,
+        reaches=tuple(
+            Reach(when, key.reach, key.hold_seconds, key.tolerance, within) for when, within, key in keys if key.reach
+        ),
+        looks=tuple(Look(when, key.look_at, key.hold_seconds) for when, _, key in keys if key.look_at is not None),
+        poses=tuple(_build_pose_key(body, key, when, within) for when, within, key in keys if key.tells_hips),
+        obstacles=tuple(obstacles),
+    )
+    labels = [f"{group}={value}" for group, value in (("gait", actor.gait), ("style", actor.style)) if value]
+    return ShotPlan(actor, request, prior.conditioned_on(labels) if labels else prior, character, rate)
+
+
+def _read_speed(actor: Actor, curve: Curve) -> SpeedProfile | TimedSpeed:
+    if actor.speed_by_time is not None:
+        speed = TimedSpeed.parse(actor.speed_by_time)
+        if actor.curve is not None and not any(speed.speeds):
+            raise RequestError(f"the speed is zero throughout, with a curve of {curve.length:.1f} m to go")
+        return speed
+    if actor.curve is None:
+        return TimedSpeed((0.0,), (0.0,))
+    return SpeedProfile.parse(str(USUAL_SPEED if actor.speed is None else actor.speed))
+
+
+def _build_pose_key(body: "_Body", key: ShotKey, seconds: float, within: int) -> PoseKey:
+    pose = None
+    if key.pose is not None:
+        clip = body.read(key.pose)
+        if key.pose_frame >= clip.num_frames:
+            raise RequestError(f"{key.pose} has the frames 0:{clip.num_frames}, and a key wants its {key.pose_frame}")
+        pose = clip.slice(key.pose_frame, key.pose_frame + 1)
+    return PoseKey(
+        seconds,
+        pose,
+        key.place,
+        key.height,
+        key.facing_deg,
+        key.joints,
+        key.root_only,
+        key.hold_seconds,
+        key.tolerance,
+        within,
+    )
+
+
+@dataclass(eq=False)
+class _Body:
+    """The character's body, and clips put on it."""
+
+    character: Character
+    """It."""
+    rate: Fraction
+    """Of the motion that is made."""
+    folder: Path
+    """That files are relative to."""
+    options: ReadOptions
+    """How files are read."""
+    prior: LstmGmmDensity
+    """Whose walkers the canonical body stands like."""
+    clips: dict[str, Motion] = field(default_factory=dict)
+    """Clips that were read, on canonical joints with the body's bones, by name."""
+    rigged: RiggedCharacter | None = None
+    """As retargeting takes it, once it is needed."""
+
+    @staticmethod
+    def of(actor: Actor, character: Character, folder: Path, options: ReadOptions, prior: LstmGmmDensity) -> "_Body":
+        """That of the clip that an actor goes on from or ends in, else the character's."""
+        found = _Body(character, Fraction(PRIOR_FPS), folder, options, prior)
+        own = actor.start_clip or actor.end_clip
+        if own is None:
+            return found
+        name = own[0]
+        clip, rig = read_clip(folder / name, options)
+        if character.rigmap is not None and not clip.skeleton.matches(character.rigmap.rig_skeleton):
+            raise RequestError(
+                f"{name} is of another rig than the character; what goes on from a clip or ends in one is on its rig"
+            )
+        canonical, body = RiggedCharacter.of(clip, rig)
+        found.character = Character(canonical.skeleton, float(body.stance.toe_height.mean()), body.rigmap, body.source)
+        found.rate, found.rigged, found.clips[name] = clip.fps, body, canonical
+        return found
+
+    def read(self, name: str) -> Motion:
+        """Return a clip on canonical joints with this body's bones; RequestError, which names it, for one whose joints
+        cannot be identified."""
+        if name not in self.clips:
+            clip, rig = read_clip(self.folder / name, self.options)
+            if self.rigged is None:
+                skeleton, height = self.character.skeleton, self.character.toe_rest_height
+                standing = self.character.on_rig(build_rest_pose(self.prior, skeleton, height))
+                self.rigged = RiggedCharacter.of(standing)[1]
+            try:
+                self.clips[name] = retarget_motion(clip, self.rigged, rig).motion
+            except RequestError as error:
+                raise RequestError(f"{name}: {error}") from error
+        return self.clips[name]
+
+
+_BESIDE = 6  # frames after the last
+
+
+def resample_shot(solution: ShotSolution, request: ShotRequest, fps: Fraction) -> Motion:
+    """Resample a shot's motion, a higher rate by splines: through the frames of a clip that it goes on from or ends in,
+    and for a loop through its own, so that its last frame leads into its first at that rate."""
+    motion = solution.motion
+    before, after = request.lead.past if request.lead is not None else None, _find_after(solution, request)
+    frames = round(motion.num_frames * fps / motion.fps) if request.loop else None
+    frames = frames or int((motion.num_frames - 1) * fps / motion.fps) + 1
+    whole = _join([before, motion, after])
+    if fps <= motion.fps:
+        return _join([motion, after]).resample(fps).slice(0, frames)
+    first = 0 if before is None else before.num_frames
+    seconds = (torch.arange(whole.num_frames, dtype=torch.float64) - first) / float(motion.fps)
+    return resample_by_splines(whole, seconds, fps=fps, frames=frames)
+
+
+def _find_after(solution: ShotSolution, request: ShotRequest) -> Motion | None:
+    """Find the frames after the last, which is the first of a clip, or leads into the shot's first."""
+    if request.loop:
+        return solution.motion.slice(0, _BESIDE)
+    if request.arrival is None:
+        return None
+    arrival = request.arrival.bring_to(solution.way.curve, float(solution.way.arcs[-1])).motion
+    return arrival.slice(1, min(arrival.num_frames, 1 + _BESIDE))
+
+
+def _join(parts: list[Motion | None]) -> Motion:
+    there = [replace(part, moving_offsets={}) for part in parts if part is not None]
+    whole = there[0]
+    for part in there[1:]:
+        whole = whole.join(part)
+    return whole
+
+
+@dataclass(frozen=True, eq=False)
+class PlayedShot:
+    """A solved shot of one actor."""
+
+    plan: ShotPlan
+    """What was asked."""
+    solution: ShotSolution
+    """What came of it, on canonical joints at PRIOR_FPS."""
+
+    @property
+    def request(self) -> ShotRequest:
+        """Request of the shot."""
+        return self.plan.request
+
+    @property
+    def on_rig(self) -> Motion:
+        """Motion on the actor's rig, at its rate."""
+        return self.plan.character.on_rig(resample_shot(self.solution, self.request, self.plan.fps))
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether Ctrl-C ended the solve."""
+        return self.solution.status.outcome is Outcome.INTERRUPTED
+
+    @cached_property
+    def measures(self) -> Mapping[str, float]:
+        """Measures of the motion against the way that was planned."""
+        way = self.solution.way
+        return report.measure_path(self.solution.motion, way.curve, wanted_m=float(way.arcs[-1]))
+
+    def report(self, request: Mapping[str, Any]) -> dict[str, Any]:
+        """Build the report of this shot; `request` is what the user wrote."""
+        card = self.plan.prior.card
+        prior = {"name": self.plan.prior.name, "licence": card.licence, "quality": card.quality}
+        seed = self.plan.actor.seed
+        told = report.build_report(self.solution, request=request, measures=self.measures, seed=seed, prior=prior)
+        return add_licence(told)
+
+    def summary(self) -> list[str]:
+        """Format a few lines for the user."""
+        motion = self.solution.motion
+        wishes = [
+            f"wish      {wish.name} ({wish.asked}): {wish.got:.1f} {wish.unit}" + ("" if wish.holds else ", NOT HELD")
+            for wish in self.solution.wishes
+        ]
+        return [
+            f"motion    {motion.num_frames} frames, {motion.seconds:.1f} s",
+            *wishes,
+            f"cost      {1000 * self.solution.seconds / motion.num_frames:.1f} ms a frame",
+            f"status    {self.solution.status.text}",
+        ]
+
+
+def play_shot(
+    plan: ShotPlan,
+    earlier: Sequence[PlayedShot],
+    inbetweener: Inbetweener,
+    *,
+    keep_apart: float | None = None,
+    progress: Progress | None = None,
+) -> PlayedShot:
+    """Solve an actor's shot; characters that were solved earlier are walked around."""
+    plan.prior.warm_up()
+    if keep_apart is not None and earlier:
+        tracks = [(one.plan, one.solution.motion.root_position[:, ::2]) for one in earlier]
+        plan = replace(plan, request=replace(plan.request, others=_find_others(plan, tracks, keep_apart)))
+    follow = FollowSettings().with_rest_height(plan.character.toe_rest_height)
+
+    solution = solve_shot(
+        plan.prior,
+        inbetweener,
+        plan.request,
+        generator=torch.Generator().manual_seed(plan.actor.seed),
+        settings=ShotSettings(follow=follow),
+        skeleton=plan.character.skeleton,
+        progress=progress,
+    )
+    return PlayedShot(plan, solution)
+
+
+def let_others_pass(plans: Sequence[ShotPlan], keep_apart: float) -> list[ShotPlan]:
+    """Return plans in which who is solved first leaves room for later ones that would find no way past: each gives way
+    by half. Somebody who has to keep apart from earlier ones does not make room for later ones too."""
+    given, tracks = list(plans), list[tuple[ShotPlan, Float[Tensor, "frames 2"]]]()
+    for plan in plans:
+        others = _find_others(plan, tracks, keep_apart) if tracks else None
+        way = plan_way(replace(plan.request, others=others))
+        if way.note is not None and others is not None:
+            alone = plan_way(plan.request)
+            if alone.note is None:
+                room = _find_others(given[0], [(plan, _walk_along(alone))], (keep_apart - APART_MARGIN) / 2)
+                given[0] = replace(given[0], request=replace(given[0].request, others=replace(room, courtesy=True)))
+                way = alone
+        tracks.append((plan, _walk_along(way)))
+    return given
+
+
+def _walk_along(way: Way) -> Float[Tensor, "frames 2"]:
+    return way.curve.ground_point(way.arcs)
+
+
+def _find_others(
+    plan: ShotPlan, tracks: Sequence[tuple[ShotPlan, Float[Tensor, "frames 2"]]], distance: float
+) -> Others:
+    """Collect the others' hips from the actor's first frame on; who has not begun stands in the first pose, who has
+    ended in the last."""
+    hips = []
+    longest = max(len(track) for _, track in tracks)
+    for one, track in tracks:
+        late = round((plan.actor.start_seconds - one.actor.start_seconds) * PRIOR_FPS)
+        frames = torch.arange(late, late + longest + abs(late)).clamp(0, len(track) - 1)
+        hips.append(track[frames])
+    count = min(len(each) for each in hips)
+    return Others(torch.stack([each[:count] for each in hips]), distance)
+
+
+def stage_actor(
+    done: Walk | PlayedShot,
+    *,
+    colour: str | None = None,
+    start_seconds: float = 0.0,
+    character: DrawnCharacter | None = None,
+) -> Shot:
+    """Put what an actor did on a stage, and what it was asked for: targets, places to look at, places and facings of
+    the hips, and whole poses. It is drawn as a character if there is one."""
+    wishes = _collect_wishes(done) if isinstance(done, PlayedShot) else Wishes()
+    motion = done.solution.motion
+    drawn = None if character is None else character.put_on(motion)
+    return Shot(motion, done.request.curve, colour, start_seconds, wishes, drawn)
+
+
+def print_notes(shots: Sequence[Shot]) -> None:
+    """Print what could not be kept of motions that are drawn on characters."""
+    for note in dict.fromkeys(note for shot in shots if shot.drawn is not None for note in shot.drawn.notes):
+        print(f"note      the character that is drawn: {note}")
+
+
+def build_obstacles(done: Sequence[Walk | PlayedShot]) -> list[Surface]:
+    """Build every obstacle of some actors once."""
+    shots = [one.request for one in done if isinstance(one, PlayedShot)]
+    return [build_obstacle(each) for each in dict.fromkeys(each for request in shots for each in request.obstacles)]
+
+
+def _collect_wishes(done: PlayedShot) -> Wishes:
+    solution = done.solution
+    marks = [
+        Mark(build_target(place), _find_span(reach)) for reach in solution.reaches for place in reach.places.values()
+    ]
+    marks += [Mark(build_look_mark(look.place), _find_span(look)) for look in done.request.looks]
+    marks += [_mark_hips(met) for met in solution.met if not met.key.tells_body]
+    return Wishes(marks, [met.wanted for met in solution.met if met.key.tells_body])
+
+
+def _mark_hips(met: MetPose) -> Mark:
+    heading = float(kinematics.heading(met.wanted.local_quat_xyzw[0, 0])) if met.key.tells_facing else None
+    return Mark(build_hips_mark(met.wanted.root_position[0, ::2].numpy(), heading), met.seconds)
+
+
+def _find_span(key: Reach | Look) -> tuple[float, float]:
+    return key.seconds, key.seconds + key.hold_seconds

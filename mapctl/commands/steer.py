@@ -1,0 +1,332 @@
+"""`mapctl steer`: a script of commands is replayed, as live steering would answer it."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import torch
+from tyro.conf import Positional, UseAppendAction, arg
+
+import priors
+from controllers.common.character import Character
+from controllers.steering import steer
+from controllers.steering.arrival import Arriver
+from controllers.steering.loop import (
+    Display,
+    Recorder,
+    Stepper,
+    StepRecord,
+    StreamClock,
+    WallClock,
+    drive,
+    find_second_zero,
+    summarise_step_timing,
+)
+from controllers.steering.steer import SteerFrames
+from mapctl import formats, metrics, report
+from mapctl.commands.shared import inputs, options, outputs, streaming
+from mapctl.commands.shared.command import ModelCommand, conclude
+from mapctl.commands.shared.inputs import read_character
+from mapctl.commands.shared.progress_bar import show_progress
+from mapctl.curves.obstacles import Obstacle, measure_clearance
+from mapctl.errors import RequestError
+from mapctl.features import PRIOR_FPS
+from mapctl.intent.steering import Arrival, CommandTrack
+from mapctl.intent.steering_csv import read_commands
+from mapctl.intent.steering_limits import SteeringLimits
+from mapctl.metrics.arrivals import measure_arrivals
+from mapctl.metrics.travel import measure_commands
+from mapctl.motion import Motion, join_licences
+from mapctl.problem.solution import Outcome, Solution, Status
+from mapctl.terms import FootContact
+from priors.licences import note_licence
+from priors.lstm_gmm.density import LstmGmmDensity
+
+if TYPE_CHECKING:
+    from mapctl.streaming.sender import PoseStream
+
+_TURN_RATE_DEG = round(math.degrees(SteeringLimits.turn_rate), 1)
+
+
+@dataclass(frozen=True)
+class Steer(ModelCommand, options.ReadOptions):
+    """A character follows a script of speeds and directions, as in live steering."""
+
+    commands: Positional[Annotated[Path, arg(metavar="COMMANDS.csv")]]
+    """CSV with the columns time_s, speed_mps, heading_deg (0 is +Z, 90 is +X); and, where wanted, facing_deg for
+    strafing, turn_deg_s to turn continuously, step_m for a step length, gait and style as the prior knows them,
+    left_hand_x, left_hand_y, left_hand_z (and right_hand_, look_) for a place in metres that a hand reaches or that is
+    looked at. goto_x_m, goto_z_m, within_s, and where wanted goto_facing_deg and pose (FILE:FRAME), say where the hips
+    are to be first, and within how many seconds: the rest of the line holds from then on. The last line's time is the
+    end, or a second after the last place is reached."""
+    out: options.OutFile
+    """Where the motion goes: .bvh, .npz, .glb or .usda."""
+    realtime: bool = False
+    """Play against the wall clock: every step has a deadline and brings the best found by then. On a machine that
+    cannot keep up the script's time runs slower than the clock's, and the summary says so."""
+    stream: options.MaybeEndpoint = None
+    """With --realtime: where poses go over the VMC protocol, each frame when it is due (most programs receive at port
+    39539). A port alone is on this machine."""
+    stream_root: bool = False
+    """Let the root travel over the ground in the stream, and not the hips."""
+    stream_delay: options.Number = 0.1
+    """Seconds by which the stream is behind, so that a frame that is computed late is not sent late."""
+    prior: options.Name = "locomotion-live"
+    """A bundled prior, or the file or run folder of a trained one."""
+    stitcher: options.MaybeName = None
+    """For goto_x_m: the file or run folder of a trained stitcher, which makes the end of the way; the bundled one if
+    not given."""
+    rig: options.OutRig = "canonical"
+    """Body that moves: the canonical one, or that of a clip, on whose rig the motion is then written; or a rig by name
+    or TOML file, whose joints get the canonical bones."""
+    avoid: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="X,Z,RADIUS")] = ()
+    """A disc on the ground to walk around, metres; may be given several times."""
+    seed: options.Count = 0
+    """Seed of the first pose."""
+    acceleration: options.Number = SteeringLimits.acceleration
+    """Largest acceleration of the target speed, m/s^2."""
+    braking: options.Number = SteeringLimits.braking
+    """Largest deceleration of the target speed, m/s^2."""
+    turn_rate: options.Number = _TURN_RATE_DEG
+    """Largest turn rate of the target direction, degrees/s."""
+    report: options.MaybeFile = None
+    """JSON with each command's response, timing, ledger and measures."""
+    strict: bool = False
+    """Exit with status 3 where not all that was requested holds: a speed was lowered to what the prior can do, or a
+    frame was late."""
+    quiet: bool = False
+    """No summary and no progress bar."""
+
+
+_PLACE_WORDS = {"leftHand": "left hand", "rightHand": "right hand"}
+_AFTER_SECONDS = 1.0  # for which a motion goes on after the last place was reached
+_LAST_COMMAND_SECONDS = 3.0  # seconds for which a script of a single command is played
+
+
+def run(command: Steer) -> int:
+    """Check everything, steer, write, report. Ctrl-C ends the script early; the motion so far is written."""
+    _check(command)
+    track = _add_obstacles(_read_track(command.commands), [Obstacle.parse(text) for text in command.avoid])
+    character, prior = read_character(command.rig, command), priors.load(command.prior)
+    track, lowered = track.limit_speed(prior.limits.max_steering_speed)
+    for labels in {wanted.labels for wanted in track.commands if wanted.labels}:
+        prior.conditioned_on(labels)  # unknown labels are refused now
+    stepper = _choose_stepper(command, track)
+    stream = streaming.open_stream(_stream(command), [character.skeleton])
+    try:
+        recorder, records, frames = _run_steering(command, prior, track, character, stepper, stream)
+    finally:
+        if stream is not None:
+            stream.close()
+    motion = recorder.motion(frames)
+    outputs.save_motion(character.on_rig(motion), command.out)
+    arrivals = [time for time in track.times[1:] if time < motion.seconds]
+    timing: dict[str, Any] = {**summarise_step_timing(records, arrivals), "peak_memory_mb": report.peak_memory_mb()}
+    if stream is not None:
+        timing["stream"] = asdict(stream.statistics)
+    done = _conclude_steering(motion, recorder, lowered, timing, interrupted=motion.num_frames < frames)
+    refused = [refusal.order for refusal in recorder.refusals]
+    found = _build_report(command, done, track, prior, timing, refused)
+    if command.report is not None:
+        report.write_report(found, command.report)
+    if not command.quiet:
+        files = options.collect_paths(command.out, command.report)
+        streamed = None if stream is None else streaming.summarise(stream)
+        print("\n".join(_format_summary(found, files, streamed)))
+    return conclude(done.status, strict=command.strict)
+
+
+def _check(command: Steer) -> None:
+    options.check_seed(command.seed)
+    _limits(command)
+    formats.check_ending(command.out)
+    outputs.check_files(options.collect_paths(command.out, command.report))
+    if command.stream is not None and not command.realtime:
+        raise RequestError("--stream goes by the clock, which needs --realtime; give both")
+    streaming.check(_stream(command))
+
+
+def _stream(command: Steer) -> streaming.StreamOptions:
+    return streaming.StreamOptions(command.stream, command.stream_root, command.stream_delay)
+
+
+def _limits(command: Steer) -> SteeringLimits:
+    return SteeringLimits(command.acceleration, command.braking, math.radians(command.turn_rate))
+
+
+def _read_track(path: Path) -> CommandTrack:
+    """Read the script, and note the licences of the motions whose poses it names."""
+    track = read_commands(path)
+    arrivals = [wanted.arrival for wanted in track.commands if wanted.arrival is not None]
+    poses = [arrival.pose for arrival in arrivals if arrival.pose is not None]
+    note_licence(str(path), join_licences(pose.licence for pose in poses))
+    return track
+
+
+def _add_obstacles(track: CommandTrack, obstacles: Sequence[Obstacle]) -> CommandTrack:
+    """Return a track whose commands lead round obstacles; RequestError where one begins within one."""
+    clear = float(measure_clearance(tuple(obstacles), torch.zeros(2, dtype=torch.float64)))
+    if clear < 0:
+        raise RequestError(f"the character starts at 0,0, {100 * -clear:.0f} cm within an obstacle")
+    return CommandTrack(track.times, tuple(replace(one, obstacles=tuple(obstacles)) for one in track.commands))
+
+
+def _choose_stepper(command: Steer, track: CommandTrack) -> Stepper:
+    """Choose who makes the next frames: with a stitcher where the script has orders to be somewhere."""
+    if any(wanted.arrival is not None for wanted in track.commands):
+        return Arriver(priors.load_stitcher(command.stitcher or "stitcher"))
+    if command.stitcher is not None:
+        raise RequestError("--stitcher makes ways to a place, and the script has no goto_x_m; leave it out")
+    return steer.step
+
+
+def _run_steering(
+    command: Steer,
+    prior: LstmGmmDensity,
+    track: CommandTrack,
+    character: Character,
+    stepper: Stepper,
+    stream: "PoseStream | None",
+) -> tuple[Recorder, list[StepRecord], int]:
+    first, recorder = track.commands[0], Recorder()
+    frames = inputs.count_frames(_find_end(track))
+    footing = FootContact(rest_height=character.toe_rest_height)
+    settings = steer.SteerSettings(limits=_limits(command), footing=footing)
+    generator = torch.Generator().manual_seed(command.seed)
+    state, pose = steer.begin(prior, first, generator=generator, settings=settings, skeleton=character.skeleton)
+    recorder.show(pose, 0.0)
+    for wanted in (first, *{wanted.labels: wanted for wanted in track.commands}.values()):
+        steer.step(state, wanted)  # compiling, loading and conditioning on first use must not cost frames
+    clock = WallClock() if command.realtime else StreamClock()
+    with show_progress("steering", quiet=command.quiet) as progress:
+        displays: list[Display] = [recorder]
+        if stream is not None and isinstance(clock, WallClock):
+            displays.append(_StreamDisplay(stream, clock, frames, find_second_zero(clock, state)))
+            displays[-1].show(pose, 0.0)
+        if progress is not None:
+            displays.append(_ProgressDisplay(progress, frames))
+        _, records = drive(state, track, displays, frames=frames, clock=clock, stepper=stepper)
+    return recorder, records, frames
+
+
+def _find_end(track: CommandTrack) -> float:
+    """Find the second at which a script ends: when its last command comes, which says no more than that if it is not
+    the only one; an order to be somewhere is carried out, and what comes after it shown for a while."""
+    by = max((command.arrival.by for command in track.commands if command.arrival is not None), default=0.0)
+    alone = track.times[0] + _LAST_COMMAND_SECONDS if len(track.times) == 1 else 0.0
+    return max(track.times[-1], alone, by + _AFTER_SECONDS if by >= track.times[-1] else 0.0)
+
+
+def _conclude_steering(
+    motion: Motion, recorder: Recorder, lowered: Sequence[str], timing: Mapping[str, Any], *, interrupted: bool
+) -> Solution:
+    """Sum up all steps; lowered commands and late frames make the status infeasible."""
+    late, sent_late = timing["late_frames"], timing.get("stream", {}).get("late", 0)
+    notes = [
+        *lowered,
+        *(refusal.reason for refusal in recorder.refusals),
+        *([f"{late} frames came after they were due"] if late else []),
+        *([f"{sent_late} frames were sent late"] if sent_late else []),
+    ]
+    status = Status(Outcome.INTERRUPTED if interrupted else Outcome.DONE).with_notes(notes, infeasible=bool(notes))
+    return Solution(motion, status, recorder.ledger, seconds=sum(piece.seconds for piece in recorder.pieces))
+
+
+def _build_report(
+    command: Steer,
+    done: Solution,
+    track: CommandTrack,
+    prior: LstmGmmDensity,
+    timing: Mapping[str, Any],
+    refused: Sequence[Arrival],
+) -> dict[str, Any]:
+    card = prior.card
+    found = report.build_report(
+        done,
+        request=options.describe_request("steer", command),
+        measures=metrics.measure(done.motion),
+        seed=command.seed,
+        prior={"name": prior.name, "licence": card.licence, "quality": card.quality},
+        timing=timing,
+    )
+    arrivals = measure_arrivals(done.motion, track, refused)
+    found |= {"commands": measure_commands(done.motion, track)} | ({"arrivals": arrivals} if arrivals else {})
+    return outputs.add_licence(found)
+
+
+@dataclass(frozen=True)
+class _StreamDisplay:
+    """A Display that has frames sent when they are due."""
+
+    stream: "PoseStream"
+    clock: WallClock
+    frames: int  # of the script; later ones are not sent
+    zero: float  # the clock's time at the stream's second 0
+
+    def show(self, frames: SteerFrames, due: float) -> None:
+        left = self.frames - round(due * float(frames.motion.fps))
+        if left > 0:
+            root, quats = frames.motion.root_position[:left], frames.motion.local_quat_xyzw[:left]
+            self.stream.put(0, self.clock.perf_counter_at(self.zero + due), due, root.numpy(), quats.numpy())
+
+
+@dataclass(frozen=True)
+class _ProgressDisplay:
+    """A Display that moves a progress bar."""
+
+    progress: Any
+    frames: int
+
+    def show(self, frames: Any, due: float) -> None:
+        self.progress(min(self.frames, round(due * PRIOR_FPS) + frames.motion.num_frames), self.frames)
+
+
+def _format_place(row: Mapping[str, Any], name: str, words: str) -> str:
+    """Say how near a hand came to its place, and for how long it was there; nothing where none was wanted."""
+    nearest = row.get(f"{name}_nearest_cm")
+    if nearest is None:
+        return ""
+    held = row[f"{name}_held_s"]
+    return f", {words} there for {held:.1f} s" if held else f", {words} {nearest:.0f} cm short"
+
+
+def _format_arrival(row: Mapping[str, Any]) -> str:
+    """Say how near a place was reached, and its facing and pose where they were wanted."""
+    facing, pose = row["facing_error_deg"], row["pose_error_cm"]
+    turned = "" if facing is None else f", {facing:.2f} degrees off"
+    posed = "" if pose is None else f", joints {pose:.1f} cm off the pose"
+    where = f"{row['goto_x_m']:g}, {row['goto_z_m']:g} m"
+    return f"{row['by_s']:6.1f} s  at {where}: {row['place_error_cm']:.2f} cm off{turned}{posed}"
+
+
+def _format_summary(found: Mapping[str, Any], files: Sequence[Path], streamed: str | None) -> list[str]:
+    lines = []
+    for row in found["commands"][:-1]:
+        reached = "not reached" if row["reached_s"] is None else f"reached after {row['reached_s']:.1f} s"
+        steady = "" if row["steady_speed_mps"] is None else f", then {row['steady_speed_mps']:.2f} m/s"
+        off, rate = row["steady_heading_error_deg"], row["steady_turn_deg_s"]
+        turned = "" if off is None else f", {off:+.1f} degrees off"
+        turned += "" if rate is None else f", turning {rate:.0f} degrees/s"
+        turned += "" if row["steady_step_m"] is None else f", steps of {row['steady_step_m']:.2f} m"
+        looked = row.get("look_nearest_deg")
+        places = "" if looked is None else f", head {looked:.0f} degrees off what it looks at"
+        places += "".join(_format_place(row, name, words) for name, words in _PLACE_WORDS.items())
+        turn = row["turn_deg_s"]
+        direction = f"to {row['heading_deg']:.0f} degrees" if turn is None else f"turning {turn:.0f} degrees/s"
+        lines.append(
+            f"{row['time_s']:6.1f} s  {row['speed_mps']:.2f} m/s {direction}: {reached}{steady}{turned}{places}"
+        )
+    lines += [_format_arrival(row) for row in found.get("arrivals", ())]
+    cost, latency = found["timing"], found["timing"]["command_latency_s"]
+    waited = "" if latency is None else f"; a command waits {latency:.2f} s at most"
+    slow = f"; too slow here: time stood still for {cost['held_s']:.1f} s" if cost["held_s"] else ""
+    return [
+        *lines,
+        f"cost      {cost['frame_ms_p50']:.1f} ms a frame (p99 {cost['frame_ms_p99']:.1f}), "
+        f"{cost['late_frames']} late, {cost['evaluations_per_frame']:.1f} evaluations a frame{waited}{slow}",
+        *([] if streamed is None else [streamed]),
+        f"status    {found['status']['text']}",
+        f"wrote     {', '.join(map(str, files))}",
+    ]
