@@ -17,7 +17,7 @@ from mapctl.commands.shared.tables import print_table
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.formats import bvh
-from mapctl.formats.characters.source import CharacterSource
+from mapctl.formats.character import CharacterSource
 from mapctl.formats.units import UNITS
 from mapctl.motion import Motion
 from mapctl.retarget import RigMap
@@ -39,8 +39,7 @@ class Info(ModelCommand, options.RigOptions):
     any format that `mapctl convert` reads, of which rig, joints, unit, axes and length are printed, and whether the fit
     is sure, doubtful or refused, with reasons."""
     out: Annotated[Path | None, arg(aliases=["-o"], metavar="FILE.png")] = None
-    """A picture of a clip's rig: its T-pose with both names of each joint, two frames, axes, and what is doubtful. Of a
-    run folder or a prior: its losses and validations over the steps."""
+    """A picture of a clip's rig: its T-pose with both names of each joint, two frames, axes, and what is doubtful."""
     json: bool = False
     """Print JSON instead of tables."""
 
@@ -55,10 +54,8 @@ def run(command: Info) -> int:
     """Collect and print."""
     if command.name is not None and is_clip(command.name):
         print_clip(Path(command.name), command)
-    elif command.out is not None and command.name is not None and command.rig is None:
-        _plot_training(command.name, command.out)
     elif command.out is not None:
-        raise RequestError("--out is a picture of a clip's rig or a run's training: mapctl info CLIP|RUN -o FILE.png")
+        raise RequestError("--out is a picture of a clip's rig: mapctl info CLIP -o FILE.png")
     elif command.rig is not None or command.unit is not None or command.up is not None:
         raise RequestError("--rig, --unit and --up are of a clip: mapctl info CLIP --rig PRESET|FILE.toml|CLIP")
     elif command.name is not None:
@@ -74,15 +71,6 @@ def run(command: Info) -> int:
     else:
         _print_tables()
     return 0
-
-
-def _plot_training(name: str, path: Path) -> None:
-    """Draw how a run or prior was trained, and say what was written."""
-    outputs.check_picture(path, given=Path(name))
-    from mapctl.commands.train.curves import plot_run
-
-    count = plot_run(name, path)
-    print(f"wrote {path} ({count} curves)")
 
 
 def _print_tables() -> None:
@@ -199,7 +187,7 @@ def print_clip(path: Path, command: Info) -> None:
     fit = assess_fit(rigmap, motion)
     _print(describe_clip(path, motion, rigmap, fit), as_json=as_json)
     if picture is not None:
-        from scenes.plots import rig_picture
+        from scenes import rig_picture
 
         rig_picture.plot_rig(rig_picture.RigPicture(rigmap, motion, fit, path.name), picture)
 

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 from tyro.conf import arg, subcommand
 
 from mapctl.commands.shared import options
-from mapctl.commands.shared.resumption import explain_end
-from mapctl.commands.shared.threads import use_single_thread
+from mapctl.commands.shared.command import use_single_thread
+from mapctl.commands.shared.progress_bar import explain_end
 from mapctl.errors import CheckpointError, RequestError
 
 if TYPE_CHECKING:

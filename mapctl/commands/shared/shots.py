@@ -43,8 +43,7 @@ from priors.lstm_gmm.density import LstmGmmDensity
 from scenes.drawn_character import DrawnCharacter
 from scenes.props import build_hips_mark, build_look_mark, build_obstacle, build_target
 from scenes.scene_file import Actor
-from scenes.stage import Shot
-from scenes.wishes import Mark, Wishes
+from scenes.stage import Mark, Shot, Wishes
 
 
 @dataclass(frozen=True, eq=False)
