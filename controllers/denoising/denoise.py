@@ -7,21 +7,26 @@ result is on the capture's own rig, at its own rate, with all of its frames.
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
 
-from controllers.denoising.lead_pose import has_lead_pose, restore_lead_pose
-from controllers.denoising.lead_transition import find_lead_transition
-from controllers.denoising.lost_parts import LostPartFiller
+from controllers.denoising.lead_pose import find_lead_transition, has_lead_pose, restore_lead_pose
 from controllers.denoising.result import DenoiseSolution, join_segments
-from controllers.denoising.rigid_bones import hold_rigid_bones
 from controllers.denoising.segment import DenoiseSettings, SegmentDenoiser
 from mapctl.features import PRIOR_FPS
+from mapctl.inbetweening import GapQuery
+from mapctl.inbetweening.missing import MissingMask
 from mapctl.motion import Motion
+from mapctl.numerics.intervals import true_intervals
+from mapctl.pose import BodyPose
 from mapctl.problem.ledger import Ledger
 from mapctl.problem.solution import Outcome, Status
 from mapctl.protocols import Denoiser, Density, Inbetweener
+from mapctl.recording import Capture, CaptureProposal
+from mapctl.recording.artefacts import NOISE_CM, Artefact
 from mapctl.recording.inspection import inspect_recording
 from mapctl.recording.masks import (
     Mask,
@@ -31,11 +36,91 @@ from mapctl.recording.masks import (
     trim_masks_before,
     write_back_masked,
 )
+from mapctl.recording.noise_estimation import estimate_position_noise
 from mapctl.recording.swap_detection import exchange_swapped_limbs
 from mapctl.retarget import as_rig, to_canonical
 from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import CANONICAL
 from mapctl.terms import Term
+
+_LOST_FRAMES = 8
+"""Fewest consecutive frames without a joint that an in-betweener fills; shorter ones are the denoiser's own."""
+
+
+@dataclass(frozen=True, eq=False)
+class LostPartFiller(Denoiser):
+    """A denoiser that leaves what is lost for longer to an in-betweener, which is shown all else denoised."""
+
+    denoiser: Denoiser
+    """Proposes what was observed, or lost for a moment."""
+    inbetweener: Inbetweener
+    """Proposes what was lost for longer."""
+
+    def clean(self, capture: Capture) -> CaptureProposal:
+        """Propose a motion of the capture's frames, on canonical bones at PRIOR_FPS.
+
+        The denoiser's own answer stands for a batch of several captures, and where everything is lost throughout.
+        """
+        found = self.denoiser.clean(capture)
+        lost = MissingMask(_find_lost(~capture.seen[0]), _find_lost(~capture.seen_root[0][:, None])[:, 0])
+        if len(capture.root) != 1 or not (lost.joints.any() or lost.root.any()) or lost.joints.all():
+            return found
+        motion = BodyPose(**{name: values[0] for name, values in vars(found.pose).items()}).motion()
+        seconds = torch.arange(motion.num_frames, dtype=torch.float64) / PRIOR_FPS
+        proposed = self.inbetweener.propose(GapQuery(motion, lost, seconds)).motion
+        root = torch.where(lost.root[:, None], proposed.root_position, motion.root_position)
+        quats = torch.where(lost.joints[..., None], proposed.local_quat_xyzw, motion.local_quat_xyzw)
+        pose = BodyPose.of_motion(replace(motion, root_position=root, local_quat_xyzw=quats))
+        return replace(found, pose=BodyPose(**{name: values[None] for name, values in vars(pose).items()}))
+
+
+def _find_lost(unseen: Bool[Tensor, "frames columns"]) -> Bool[Tensor, "frames columns"]:
+    lost = torch.zeros_like(unseen)
+    for column, start, stop in true_intervals(unseen):
+        lost[start:stop, column] = stop - start >= _LOST_FRAMES
+    return lost
+
+
+_NO_TRAVEL = 1e-3  # metres by which a rigid bone may vary where no noise is measured
+_SPIKE_SIGMAS, _DRIFT_SIGMAS = 5.0, 5.0  # noise of one frame, and of a block's median, that a rigid bone may show
+_SPIKE_SECONDS, _BLOCK_SECONDS = 1 / 30, 0.5
+_MEDIAN_NOISE = 1.2533  # standard deviation of a median by that of a mean
+
+
+def hold_rigid_bones(motion: Motion) -> tuple[Motion, tuple[Artefact, ...]]:
+    """Return the motion with the median offset of every joint whose offset varies only by noise, and these as faults.
+
+    The joint that travels stays, and so does one whose offset drifts or differs for more than a frame, as in rigs that
+    stretch. An offset of zero counts as lost.
+    """
+    moving, faults = dict(motion.moving_offsets), []
+    for joint, track in motion.moving_offsets.items():
+        held = None if joint == motion.travelling_joint else _find_rigid_offset(track, float(motion.fps))
+        if held is None:
+            continue
+        moving[joint] = held.expand_as(track)
+        amount = 100 * float((track - held).norm(dim=-1).max())
+        if amount >= NOISE_CM:
+            faults.append(Artefact(motion.skeleton.names[joint], 0, motion.num_frames, "stretch", amount, "cm"))
+    return replace(motion, moving_offsets=moving), tuple(faults)
+
+
+def _find_rigid_offset(track: Float[Tensor, "frames 3"], fps: float) -> Float[Tensor, "3"] | None:
+    """Return the median of an offset that varies only by noise, of frames in which it is not zero; None for others."""
+    known = track.any(dim=-1)
+    if not known.any():
+        return None
+    median = track[known].median(dim=0).values
+    away = torch.where(known[:, None], track - median, 0.0)
+    noise = torch.tensor([estimate_position_noise(track[:, [axis] * 3], known) for axis in range(3)]).to(track)
+    apart = (away.abs() > (_SPIKE_SIGMAS * noise).clamp_min(_NO_TRAVEL)).any(dim=-1, keepdim=True)
+    if any(stop - start > max(1, round(_SPIKE_SECONDS * fps)) for _, start, stop in true_intervals(apart)):
+        return None
+    size = max(1, min(len(track), round(_BLOCK_SECONDS * fps)))
+    drift = away.unfold(0, size, size).median(dim=-1).values.abs()
+    allowed = _DRIFT_SIGMAS * _MEDIAN_NOISE * noise / size**0.5
+    return None if (drift > allowed.clamp_min(_NO_TRAVEL)).any() else median
+
 
 __all__ = ["DenoiseSettings", "DenoiseSolution", "begins_with_tpose", "denoise"]
 

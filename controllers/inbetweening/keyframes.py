@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from controllers.inbetweening.geometry.drawn_poses import measure_drawing_error
+from controllers.inbetweening.drawn_poses import measure_drawing_error
 from mapctl import rotations
 from mapctl.errors import RequestError
 from mapctl.inbetweening.effector_targets import EffectorTargets

@@ -7,32 +7,275 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
 
 from controllers.common.canonical_clip import CanonicalClip
 from controllers.common.map_refinement import RefinementSettings
-from controllers.inbetweening.gap_notes import compose_gap_notes
-from controllers.inbetweening.geometry.root_path import move_root_along_curve, move_root_over_places
-from controllers.inbetweening.proposers.loose_keys import hold_loose_keys, meet_places, note_drawings, show_drawn_poses
+from controllers.inbetweening.drawn_poses import fit_drawings, measure_drawing_error
+from controllers.inbetweening.proposers.auto import STANDING_STILL
 from controllers.inbetweening.proposers.partial_keys import propose_through_keys
 from controllers.inbetweening.refine import INFILL_REFINEMENT, refine_gaps
 from controllers.inbetweening.shrinkage import shrink
-from controllers.inbetweening.simpler import take_simpler
 from controllers.inbetweening.solution import InbetweenSolution
-from mapctl import contacts
+from mapctl import contacts, rotations
 from mapctl.curves.curve import Curve
 from mapctl.errors import RequestError
-from mapctl.inbetweening import Proposal
+from mapctl.features import PRIOR_FPS
+from mapctl.inbetweening import GapQuery, Proposal
 from mapctl.inbetweening.effector_targets import EffectorTargets, compute_target_errors, reach_effector_targets
-from mapctl.inbetweening.loose_keys import LooseKeys
-from mapctl.inbetweening.missing import MissingMask
+from mapctl.inbetweening.loose_keys import LooseKeys, estimate_standing_height, lead_over_places
+from mapctl.inbetweening.missing import MissingMask, interpolate_missing, restore_observed
+from mapctl.inbetweening.path_closing import lead_over_keys
+from mapctl.inbetweening.query import GapSource
+from mapctl.kinematics import heading
+from mapctl.metrics.liveliness import measure_path_length
 from mapctl.motion import Motion
+from mapctl.numerics.intervals import true_intervals
 from mapctl.numerics.smooth_offsets import interpolate_offsets
 from mapctl.problem.ledger import Ledger
 from mapctl.problem.solution import Outcome, Status
 from mapctl.protocols import Density, Inbetweener
 from mapctl.retarget import as_rig, from_canonical, rig_joint_positions, to_canonical
 from mapctl.retarget.rigs import Rig
+from mapctl.skeleton import CANONICAL, leg_length
 from mapctl.terms import Term
+
+_INFILLER, _INFILLER_FRAMES = "infiller", 75
+"""Name of the source whose longest gaps in training were of so many frames: their mean length and a deviation."""
+_TRAVELLING_SPEED = 0.35  # m/s of hips with canonical legs, from one end of a gap to the other: a body that travels
+_MORPH_RATIO, _MIN_MORPH_FRAMES = 1.3, 45
+"""Largest ratio of a morph's path to the straight one, and fewest frames: an interpolation instead of a motion."""
+_STILL_SPEED = 0.12  # m/s of the joints below which a body is still: there is no motion to miss
+
+
+def compose_gap_notes(query: GapQuery, made: Motion, answer: Proposal, *, fps: float) -> tuple[str, ...]:
+    """Compose a line for each gap of a proposal, in frames of the motion at `fps`; gaps without remarks share one by
+    proposer.
+    """
+    sources = answer.attribute(query)
+    lines: list[str] = []
+    plain: dict[str, list[GapSource]] = {}
+    for source in sources:
+        remarks = _describe_gap(query, made, source)
+        if not remarks and source.by == answer.source:
+            plain.setdefault(source.by, []).append(source)
+        else:
+            lines.append(_join_remarks([source], query, answer, remarks, fps))
+    return (*lines, *(_join_remarks(each, query, answer, [], fps) for each in plain.values()))
+
+
+def _join_remarks(
+    sources: Sequence[GapSource], query: GapQuery, answer: Proposal, remarks: Sequence[str], fps: float
+) -> str:
+    """Join the frames, the proposer, the error estimate (of the gap with the largest), and further remarks."""
+    where = ", ".join(_format_frames(query, source, fps) for source in sources)
+    found = [answer.spread[one.start : one.stop] for one in sources if answer.spread is not None]
+    sure = []
+    if found and sources[0].by == answer.source:
+        median, percentile_90 = max(
+            (100 * each.mean(dim=(0, 1)) for each in found), key=lambda one: float(one[1])
+        ).tolist()
+        sure = [
+            f"by its own estimate joints within {median:.1f} cm of the truth in half of cases and within"
+            f" {percentile_90:.1f} cm in nine of ten"
+        ]
+    return f"frames {where}: {', '.join([sources[0].by, *sure, *remarks])}"
+
+
+def _format_frames(query: GapQuery, source: GapSource, fps: float) -> str:
+    """Format a gap in frames of the motion's own rate."""
+    first = 0 if source.start == 0 else round(float(query.seconds[source.start - 1]) * fps) + 1
+    last = len(query.seconds) - 1
+    stop = round(float(query.seconds[min(source.stop, last)]) * fps)
+    return f"{first}:{stop + (source.stop > last)}"
+
+
+def _describe_gap(query: GapQuery, made: Motion, source: GapSource) -> list[str]:
+    """List remarks on one gap beyond its proposer and error estimate."""
+    remarks, seconds = [*filter(None, (source.reason, source.remark))], (source.stop - source.start) / PRIOR_FPS
+    if source.stop - source.start > _INFILLER_FRAMES and source.by == _INFILLER:
+        remarks.append(f"and {seconds:.1f} s are longer than the {_INFILLER_FRAMES / PRIOR_FPS:.0f} s that it knows")
+    if _is_morph(query, made, source):
+        remarks.append("a still morph: it goes hardly further than straight from one pose to the other; give more keys")
+    return remarks
+
+
+def is_travelling(motion: Motion, start: int, stop: int) -> bool:
+    """Return whether the body (canonical joints) travels in a gap, faster than a shift of weight."""
+    distance = float((motion.root_position[stop] - motion.root_position[start])[::2].norm())
+    fastest_still = _TRAVELLING_SPEED * (stop - start) / float(motion.fps)
+    return distance * leg_length(CANONICAL) / leg_length(motion.skeleton) > fastest_still
+
+
+def _is_morph(query: GapQuery, made: Motion, source: GapSource) -> bool:
+    """Return whether a long gap is filled by little more than an interpolation although the body moves around it."""
+    if source.stop - source.start < _MIN_MORPH_FRAMES or source.by == STANDING_STILL:
+        return False
+    first, end = max(0, source.start - 1), min(source.stop + 1, query.motion.num_frames)
+    path_length, straight = (measure_path_length(each.slice(first, end)) for each in (made, query.motion))
+    travelling = is_travelling(query.motion, max(0, source.start - 1), min(source.stop, len(query.missing.root) - 1))
+    speed, straight_speed = (each * PRIOR_FPS / (source.stop - source.start) for each in (path_length, straight))
+    still = straight_speed < _STILL_SPEED and _is_still_beside(query, source)
+    return speed < max(_STILL_SPEED, _MORPH_RATIO * straight_speed) and (travelling or not still)
+
+
+def _is_still_beside(query: GapQuery, source: GapSource) -> bool:
+    """Return whether known frames beside a gap, if there are any, hardly move."""
+    positions = query.motion.joint_positions()
+    for one, other in ((source.start - 2, source.start - 1), (source.stop, source.stop + 1)):
+        if one < 0 or other >= len(positions) or bool(query.missing.root[[one, other]].any()):
+            continue
+        if float((positions[other] - positions[one]).norm(dim=-1).mean()) * PRIOR_FPS > _STILL_SPEED:
+            return False
+    return True
+
+
+_MAX_EDGE_DISTANCE = 1.0  # metres from a gap's edge to the curve
+
+
+def move_root_along_curve(motion: Motion, missing: Bool[Tensor, " frames"], curve: Curve) -> Motion:
+    """Move and orient the hips of a canonical motion along the curve, at constant speed, in frames in which they are
+    missing.
+
+    The offset from the curve is interpolated from one edge of a gap to the other. RequestError for a gap that begins or
+    ends far from the curve.
+    """
+    if curve.dims != 2:
+        raise RequestError("the hips follow a curve on the ground, of x and z")
+    root, quats = motion.root_position.clone(), motion.local_quat_xyzw.clone()
+    facing = heading(quats[:, 0])
+    for _, start, stop in true_intervals(missing[:, None]):
+        edges = [frame for frame in (start - 1, stop) if 0 <= frame < motion.num_frames]
+        if len(edges) == 1:
+            raise RequestError(f"the gap {start}:{stop} has one edge only: a curve needs both")
+        arcs = curve.nearest(root[edges][:, ::2])
+        offsets = root[edges][:, ::2] - curve.point(arcs)
+        if (far := float(offsets.norm(dim=-1).max())) > _MAX_EDGE_DISTANCE:
+            raise RequestError(
+                f"the gap {start}:{stop} begins or ends {far:.1f} m beside the curve;"
+                f" {_MAX_EDGE_DISTANCE:g} m is the most"
+            )
+        share = (torch.arange(start, stop) - (start - 1)).double() / (stop - start + 1)
+        first, last = arcs
+        if curve.closed and last < first:
+            last = last + curve.length
+        at = first + share * (last - first)
+        position = curve.point(at) + _interpolate_edges(offsets, share)
+        turns = curve.heading(torch.stack([first, last])) - facing[edges]
+        turn = curve.heading(at) - _interpolate_edges(rotations.wrap_angle(turns)[:, None], share)[:, 0]
+        root[start:stop, 0], root[start:stop, 2] = position[:, 0], position[:, 1]
+        own = rotations.about_y(turn - heading(quats[start:stop, 0]))
+        quats[start:stop, 0] = rotations.multiply(own, quats[start:stop, 0])
+    return replace(motion, root_position=root, local_quat_xyzw=rotations.make_sign_continuous(quats))
+
+
+def _interpolate_edges(
+    ends: Float[Tensor, "2 width"], share: Float[Tensor, " frames"]
+) -> Float[Tensor, "frames width"]:
+    return torch.lerp(ends[0], ends[1], share[:, None])
+
+
+def move_root_over_places(
+    motion: Motion, missing_root: Bool[Tensor, " frames"], missing_hips: Bool[Tensor, " frames"], loose: LooseKeys
+) -> Motion:
+    """Move the hips of a canonical motion over the places of loose keys where their position is missing, and turn them
+    along that way where no frame tells their rotation. At a height that no frame tells they stand."""
+    root, quats = motion.root_position.clone(), motion.local_quat_xyzw.clone()
+    ground = torch.where(loose.placed[:, None], loose.ground, root[:, ::2])
+    facing = heading(quats[:, 0])
+    way, looked = lead_over_places(
+        ground[None], facing[None], placed=(loose.placed | ~missing_root)[None], faced=~missing_hips[None]
+    )
+    root[:, ::2] = torch.where(missing_root[:, None], way[0], root[:, ::2])
+    if bool(missing_root.all()):
+        root[:, 1] = estimate_standing_height(motion.skeleton)
+    turn = torch.where(missing_hips, looked[0] - facing, 0.0)
+    quats[:, 0] = rotations.multiply(rotations.about_y(turn), quats[:, 0])
+    return replace(motion, root_position=root, local_quat_xyzw=quats)
+
+
+_MOST = 130.0  # m/s^2 of a joint over 1/30 s: one frame in a thousand of mocap's has more
+
+
+def take_simpler(made: Motion, simple: Motion, missing: MissingMask) -> tuple[Motion, tuple[str, ...]]:
+    """Take the simple answer in gaps whose result, beside the known frames or between them, is accelerated more than
+    anything in the clip, than mocap and than the simple one; also return a note of each. Both motions are equal where
+    nothing is missing."""
+    lost, step = missing.frames, max(1, round(float(made.fps) / PRIOR_FPS))
+    if made.num_frames < 2 * step + 1 or not bool(lost.any()):
+        return made, ()
+    known = ~lost.unfold(0, 2 * step + 1, 1).any(dim=-1)
+    bends, simple_bends = _compute_accelerations(made, step), _compute_accelerations(simple, step)
+    limit, poor = max([_MOST, *bends[known].tolist()]), torch.zeros_like(lost)
+    notes = []
+    for _, start, stop in true_intervals(lost[:, None]):
+        rows = slice(max(0, start - 2 * step), min(len(bends), stop))
+        strain, other = (float(each[rows].max()) / limit for each in (bends, simple_bends))
+        if strain > max(1.0, other):
+            poor[start:stop] = True
+            notes.append(
+                f"frames {start}:{stop}: interpolation; the result was {strain:.1f} times as abrupt as any capture"
+            )
+    taken = MissingMask(missing.joints & poor[:, None], missing.root & poor)
+    return restore_observed(simple, made, taken), tuple(notes)
+
+
+def _compute_accelerations(motion: Motion, step: int) -> Float[Tensor, " bends"]:
+    """Compute the largest acceleration of any joint about each frame, m/s^2, over so many frames before and after."""
+    positions = motion.joint_positions()
+    bends = positions[2 * step :] - 2 * positions[step:-step] + positions[: -2 * step]
+    return bends.norm(dim=-1).amax(dim=-1) * (float(motion.fps) / step) ** 2
+
+
+_REPORTED_PLACE_ERROR = 0.03  # metres from where a joint is drawn, on average, beyond which there is a note
+
+
+def show_drawn_poses(query: GapQuery, inbetweener: Inbetweener, generator: torch.Generator) -> GapQuery:
+    """Return a query that has poses instead of drawings, fitted about what an in-betweener proposes; their place stays
+    open where it is not told."""
+    loose = query.loose
+    if loose is None or not bool(loose.drawn.any()):
+        return query
+    first = inbetweener.propose(query, generator=generator).motion
+    fitted = fit_drawings(first, loose, faced=not bool(query.missing.joints[:, 0].all()))
+    drawn = loose.drawings
+    root, quats = query.motion.root_position.clone(), query.motion.local_quat_xyzw.clone()
+    quats[drawn], root[drawn, 1] = fitted.local_quat_xyzw[drawn], fitted.root_position[drawn, 1]
+    missing = MissingMask(query.missing.joints & ~drawn[:, None], query.missing.root)
+    shown = interpolate_missing(replace(query.motion, local_quat_xyzw=quats), missing)
+    places = replace(loose, drawn=torch.zeros_like(loose.drawn))
+    return replace(query, motion=replace(shown, root_position=root), missing=missing, loose=places)
+
+
+def meet_places(proposal: Proposal, query: GapQuery) -> Proposal:
+    """Lead the hips of a proposal over the places of loose keys."""
+    if query.loose is None or not bool(query.loose.placed.any()):
+        return proposal
+    motion, known, lost = proposal.motion, query.motion.root_position, query.missing.root
+    root = lead_over_keys(motion.root_position, known, lost, query.loose)
+    return replace(proposal, motion=replace(motion, root_position=root))
+
+
+def hold_loose_keys(query: GapQuery) -> MissingMask:
+    """Return what is missing when the hips stay at their places, over the ground and as high as proposed."""
+    missing = query.missing
+    return missing if query.loose is None else MissingMask(missing.joints, missing.root & ~query.loose.placed)
+
+
+def note_drawings(motion: Motion, query: GapQuery) -> tuple[str, ...]:
+    """Note drawings of a query that a motion does not look like."""
+    if query.loose is None:
+        return ()
+    places, frames = motion.joint_positions(), query.loose.drawings.nonzero()[:, 0].tolist()
+    missed = {frame: measure_drawing_error(places[frame], query.loose, frame) for frame in frames}
+    return tuple(
+        f"at {float(query.seconds[frame]):.2f} s joints stay {100 * error:.0f} cm from where they are drawn, on"
+        " average: bones do not look so"
+        for frame, error in missed.items()
+        if error > _REPORTED_PLACE_ERROR
+    )
+
 
 _REPORTED_ERROR = 0.001  # metres from a target beyond which there is a note
 _REACH_TOLERANCE = 1e-4  # metres from a target within which it is reached

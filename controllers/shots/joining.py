@@ -13,8 +13,8 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from controllers.shots.planning.timeline import Span
 from controllers.shots.transitions import Transition, join_across, measure_transition_cost
+from controllers.shots.way import Span
 from mapctl.motion import Motion
 from mapctl.protocols import Inbetweener
 from mapctl.solver.swarm import SwarmSettings, run_swarm

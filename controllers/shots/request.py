@@ -9,8 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from controllers.shots.clips.arrival import Arrival
-from controllers.shots.clips.lead import Lead
+from controllers.shots.clip_ends import Arrival, Lead
 from mapctl.curves import Curve
 from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import RequestError

@@ -10,30 +10,108 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
 
 from controllers.common.character import Character
 from controllers.following.follow import FollowSettings
 from controllers.inbetweening.pipeline import fill
-from controllers.shots.clips.arrival import arrive
-from controllers.shots.clips.lead import go_on
+from controllers.shots.clip_ends import arrive, go_on
 from controllers.shots.joining import JoinSettings, Piece, join_pieces
-from controllers.shots.keys.approaching import check_reaches, go_down, lean_way
 from controllers.shots.keys.looking import look_where_hands_reach, turn_heads
 from controllers.shots.keys.posing import MetPose, as_reaches, meet_poses, pose_frames
-from controllers.shots.keys.reaching import ReachTargets, settle_reaches
-from controllers.shots.loop import OVERLAP, close_loop
-from controllers.shots.planning.way import Way, plan_way
-from controllers.shots.repair import repair_jumps
+from controllers.shots.keys.reaching import ReachTargets, check_reaches, go_down, lean_way, settle_reaches
 from controllers.shots.request import Reach, ShotRequest
 from controllers.shots.rest_pose import build_rest_pose
+from controllers.shots.transitions import Filling, choose_filling
 from controllers.shots.walking import walk_pieces
+from controllers.shots.way import Way, plan_way
 from controllers.shots.wishes import Wish, check_wishes, describe_fights
+from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening.missing import MissingMask
 from mapctl.motion import Motion
 from mapctl.problem.ledger import Ledger
 from mapctl.problem.solution import Outcome, Solution, Status
 from mapctl.protocols import Density, Inbetweener
-from mapctl.skeleton import CANONICAL, Skeleton
+from mapctl.skeleton import CANONICAL, TOES, Skeleton
+
+OVERLAP = 54
+"""Frames, at PRIOR_FPS, that a walk goes on for after once around."""
+_EARLIEST, _LATEST = 16, 44  # frames after the first at which laps may be joined: about a stride
+_TRIED = 3  # of the best of them
+_WIDTHS = (3, 6, 10)  # frames on either side that are tried
+
+
+def close_loop(motion: Motion, frames: int, inbetweener: Inbetweener) -> Motion:
+    """Return one lap of so many frames of a walk that goes on for OVERLAP more: its second lap's first frames, and then
+    the first lap's from where both are most alike."""
+    here, later = _describe(motion, 0), _describe(motion, frames)
+    count = min(len(here), len(later))
+    unlike = (here[:count] - later[:count]).norm(dim=-1)
+    order = unlike[_EARLIEST:_LATEST].argsort()[:_TRIED] + _EARLIEST
+    tried = [_join(motion, frames, int(seam), width) for seam in order for width in _WIDTHS]
+    chosen = tried[choose_filling(tried, inbetweener)]
+    return fill(chosen.motion, chosen.missing, inbetweener).motion
+
+
+def _describe(motion: Motion, start: int) -> Float[Tensor, "frames numbers"]:
+    """Return places of joints and their steps, by frame from a first one on."""
+    places = motion.joint_positions()[start:].flatten(1)
+    steps = torch.diff(places, dim=0)
+    return torch.cat([places[1:], 3.0 * steps], dim=-1)
+
+
+def _join(motion: Motion, frames: int, seam: int, width: int) -> Filling:
+    source = torch.arange(frames)
+    source[:seam] += frames
+    missing = torch.zeros(frames, dtype=torch.bool)
+    missing[seam - width : seam + width] = True
+    joined = replace(motion, root_position=motion.root_position[source], local_quat_xyzw=motion.local_quat_xyzw[source])
+    mask = MissingMask.of_frames(missing, motion.num_joints)
+    return Filling(joined, mask, (seam - width, seam + width))
+
+
+_ENDS = list(CANONICAL.indices(("leftHand", "rightHand", *TOES)))
+_JUMP_SPEED = 3.0  # m/s about the hips
+_JUMP_RATIO = 1.6  # of the speed two frames earlier and later: limbs that swing fast do so for longer
+_AROUND = 6  # frames before and after a jump
+
+
+def repair_jumps(motion: Motion, inbetweener: Inbetweener, *, past: Motion | None = None) -> Motion:
+    """Make frames around jumps anew, where that is calmer; the first and the last frame stay. `past` are the frames
+    before the first, where there are any."""
+    if past is not None:
+        whole = repair_jumps(past.join(motion), inbetweener)
+        return replace(
+            motion,
+            root_position=torch.cat([motion.root_position[:1], whole.root_position[past.num_frames + 1 :]]),
+            local_quat_xyzw=torch.cat([motion.local_quat_xyzw[:1], whole.local_quat_xyzw[past.num_frames + 1 :]]),
+        )
+    jumps = find_jumps(motion)
+    missing = torch.zeros(motion.num_frames, dtype=torch.bool)
+    for frame in jumps.nonzero()[:, 0].tolist():
+        missing[max(1, frame - _AROUND) : frame + _AROUND + 2] = True
+    missing[-1] = False
+    if not bool(missing.any()):
+        return motion
+    made = fill(motion, MissingMask.of_frames(missing, motion.num_joints), inbetweener).motion
+    return made if _find_peak(made) < _find_peak(motion) else motion
+
+
+def _find_peak(motion: Motion) -> float:
+    """Find the largest second difference of hands and toes, metres: fast limbs that were no jump are made no better."""
+    return float(torch.diff(motion.joint_positions()[:, _ENDS], n=2, dim=0).norm(dim=-1).max())
+
+
+def find_jumps(motion: Motion) -> Bool[Tensor, " steps"]:
+    """Find the steps from one frame to the next in which a hand or a toe moves much faster than shortly before and
+    after."""
+    places = motion.joint_positions()
+    speed = torch.diff(places[:, _ENDS] - places[:, :1], dim=0).norm(dim=-1) * PRIOR_FPS
+    beside = torch.full_like(speed, torch.inf)  # at the ends nothing shows what was before, or comes after
+    beside[2:-2] = torch.maximum(speed[:-4], speed[4:])
+    return ((speed > _JUMP_SPEED) & (speed > _JUMP_RATIO * beside)).any(dim=1)
+
 
 _CORNER_STEP, _CORNER_CURVATURE = 0.1, 1.5
 # metres between the places where a way's curvature is looked at, and the 1/m from which on it is a corner

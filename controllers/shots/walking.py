@@ -11,9 +11,8 @@ from controllers.common.character import Character
 from controllers.following.follow import FollowSettings, walk_arcs
 from controllers.shots.joining import TAIL, Piece, spread_over
 from controllers.shots.keys.reaching import ReachTargets
-from controllers.shots.planning.timeline import Span, lay_timeline
-from controllers.shots.planning.way import Way, cut_curve
 from controllers.shots.request import ShotRequest
+from controllers.shots.way import Span, Way, cut_curve, lay_timeline
 from mapctl.errors import MapctlError
 from mapctl.features import PRIOR_FPS
 from mapctl.kinematics.placing import move_to, rotate_about_vertical

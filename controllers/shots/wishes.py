@@ -11,8 +11,8 @@ from torch import Tensor
 from controllers.shots.keys.looking import measure_look_errors
 from controllers.shots.keys.posing import MetPose, measure_pose_error
 from controllers.shots.keys.reaching import STRETCHED_SHARE, ReachTargets
-from controllers.shots.planning.way import Way
 from controllers.shots.request import Look, PoseKey, Reach, ShotRequest
+from controllers.shots.way import Way
 from mapctl.curves.obstacles import measure_clearance
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening.effector_targets import compute_target_errors

@@ -15,9 +15,9 @@ from common import Row, average, load_circles, parse, print_table, seeded
 
 import controllers
 import priors
-from controllers.shots.planning.way import plan_way
 from controllers.shots.request import Look, Reach, ShotRequest
 from controllers.shots.shot import ShotSolution, solve_shot
+from controllers.shots.way import plan_way
 from mapctl import curves
 from mapctl.curves.obstacles import Obstacle, measure_clearance
 from mapctl.errors import RequestError

@@ -8,8 +8,8 @@ from helpers import tiny_density, walk
 from tiny_infiller import tiny_infiller
 
 from controllers.common.canonical_clip import CanonicalClip
-from controllers.inbetweening.geometry.footholds import hold_planted
 from controllers.inbetweening.proposers.auto import STANDING_STILL, AutoInbetweener
+from controllers.inbetweening.proposers.rollouts import hold_planted
 from controllers.inbetweening.tween import tween
 from mapctl import contacts, rotations
 from mapctl.inbetweening import Proposal

@@ -9,7 +9,7 @@ import torch
 from helpers import walk
 
 from controllers.inbetweening.infill import InfillSettings, infill
-from controllers.inbetweening.simpler import take_simpler
+from controllers.inbetweening.pipeline import take_simpler
 from mapctl import rotations
 from mapctl.inbetweening import GapQuery, Proposal
 from mapctl.inbetweening.missing import MissingMask, interpolate_missing

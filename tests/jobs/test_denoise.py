@@ -11,9 +11,8 @@ from captures import apart_deg, error_cm, noisy, on_rig, shaken
 from helpers import generator
 from tiny_denoiser import QUICK, tiny_denoiser
 
-from controllers.denoising.denoise import begins_with_tpose, denoise
+from controllers.denoising.denoise import begins_with_tpose, denoise, hold_rigid_bones
 from controllers.denoising.result import join_segments
-from controllers.denoising.rigid_bones import hold_rigid_bones
 from mapctl import retarget, rotations
 from mapctl.recording.masks import ALL, ROOT, Mask
 from mapctl.skeleton import CANONICAL

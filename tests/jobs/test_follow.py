@@ -7,9 +7,8 @@ import torch
 from helpers import generator, tiny_density
 
 import controllers
-from controllers.common.feasibility import check_path
 from controllers.common.initial_state import select_initial_state
-from controllers.following.follow import FollowSettings, build_follow_terms
+from controllers.following.follow import FollowSettings, build_follow_terms, check_path
 from mapctl import curves
 from mapctl.errors import RequestError
 from mapctl.features import encode

@@ -8,8 +8,7 @@ from captures import on_rig
 from helpers import walk
 from tiny_denoiser import QUICK, tiny_denoiser
 
-from controllers.denoising.denoise import denoise
-from controllers.denoising.lost_parts import LostPartFiller
+from controllers.denoising.denoise import LostPartFiller, denoise
 from mapctl.inbetweening import Proposal
 from mapctl.protocols import Inbetweener
 from mapctl.recording import Capture

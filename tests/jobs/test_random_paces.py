@@ -10,8 +10,15 @@ import torch
 from helpers import generator, tiny_density, walk
 from toy_density import ToyDensity, toy_density
 
-from controllers.generation.generate import Beginning, GenerateSettings, generate, initialise_generation, sample_pieces
-from controllers.generation.pace_plan import draw_paces, plan_paces
+from controllers.generation.generate import (
+    Beginning,
+    GenerateSettings,
+    draw_paces,
+    generate,
+    initialise_generation,
+    plan_paces,
+    sample_pieces,
+)
 from mapctl.features import LAYOUT, GroundPose
 from mapctl.protocols import LastFrameState
 

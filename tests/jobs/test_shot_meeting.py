@@ -8,8 +8,8 @@ import torch
 
 import priors
 from controllers.common.character import Character
-from controllers.shots.planning.way import Way, plan_way
 from controllers.shots.request import Others, ShotRequest
+from controllers.shots.way import Way, plan_way
 from mapctl import curves
 from mapctl.commands.shared.shots import ShotPlan, let_others_pass
 from mapctl.curves.obstacles import Obstacle

@@ -9,13 +9,12 @@ import torch
 from helpers import walk
 
 import priors
-from controllers.shots.clips.lead import Lead
+from controllers.shots.clip_ends import Lead
 from controllers.shots.keys.looking import measure_look_errors, turn_heads
-from controllers.shots.planning.timeline import StandingEnds, lay_timeline, plan_speeds
-from controllers.shots.planning.way import plan_way
 from controllers.shots.request import Look, Others, Reach, ShotRequest
 from controllers.shots.rest_pose import build_rest_pose
 from controllers.shots.shot import solve_shot
+from controllers.shots.way import StandingEnds, lay_timeline, plan_speeds, plan_way
 from mapctl import curves, rotations
 from mapctl.curves.obstacles import Obstacle, measure_clearance
 from mapctl.errors import RequestError

@@ -10,9 +10,8 @@ from dataclasses import dataclass, field, replace
 
 import torch
 
-from controllers.inbetweening.proposers.extrapolation import extrapolate_end
 from controllers.inbetweening.proposers.partial_keys import propose_through_keys
-from controllers.inbetweening.proposers.rollouts import RolloutSettings
+from controllers.inbetweening.proposers.rollouts import RolloutSettings, extrapolate_end
 from controllers.inbetweening.proposers.stitched import StitchedInbetweener
 from controllers.inbetweening.proposers.walked import PlaceWalker
 from mapctl import contacts

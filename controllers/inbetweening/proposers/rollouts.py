@@ -5,33 +5,156 @@ A swarm searches latent noise of the root that leads to the next known frames, t
 that is left at arrival is distributed over the gap.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from controllers.common.map_refinement import estimate_rest_height
-from controllers.inbetweening.geometry.footholds import hold_planted
-from controllers.inbetweening.proposers.rolling import commit_before, insert_rollout, select_likeliest_density
 from controllers.inbetweening.proposers.walked import PlaceWalker
-from mapctl import contacts
-from mapctl.features import LAYOUT, PRIOR_FPS
+from mapctl import contacts, rotations
+from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode, integrate_root
 from mapctl.inbetweening import GapQuery, Proposal
 from mapctl.inbetweening.query import GapSource
+from mapctl.inbetweening.seam_blending import blend_seams_in_positions, blend_seams_in_rotations
+from mapctl.inbetweening.whole_body import bend_limbs
 from mapctl.metrics import worst_frame
 from mapctl.motion import Motion
 from mapctl.numerics import gaussian
-from mapctl.problem.receding_horizon import RecedingHorizonSolver
-from mapctl.problem.warm_start import SteeringKnots, SwarmProposal
-from mapctl.problem.window_solvers import LatentNoiseSolver
+from mapctl.numerics.intervals import fill_missing, true_intervals
+from mapctl.numerics.smooth_offsets import interpolate_offsets
+from mapctl.pose import decode
+from mapctl.problem import density_selection
+from mapctl.problem.receding_horizon import CommittedFrames, RecedingHorizonSolver, replay
+from mapctl.problem.warm_start import SteeringKnots, SwarmProposal, keep_warm_start
+from mapctl.problem.window_solvers import LatentNoiseSolver, SolvedWindow
 from mapctl.protocols import Density, DensityState, Inbetweener
-from mapctl.skeleton import CANONICAL, TOES
+from mapctl.skeleton import CANONICAL, TOE_JOINTS, TOES
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings
 from mapctl.solver.swarm import SwarmSettings
 from mapctl.terms import FootContact, Keyframe, LatentPrior
+
+_TOES = list(TOE_JOINTS)
+_STANCE_FADE_SECONDS = 0.12  # over which a swinging foot's correction fades away from its contacts
+
+
+def hold_planted(
+    motion: Motion,
+    planted: Bool[Tensor, "frames 2"],
+    *,
+    free: Bool[Tensor, " frames"],
+    rest_height: Float[Tensor, "frames 2"],
+) -> Motion:
+    """Hold the toes (left, right) of a canonical motion at one position during each contact, in frames that are free.
+
+    A contact that begins or ends in frames that are not free keeps its position there; others are held at the mean of
+    their positions, at `rest_height` (metres). Between contacts the correction fades. Hips and the feet's orientations
+    stay.
+    """
+    positions, goals = motion.joint_positions(), motion.joint_positions().clone()
+    for foot, toe in enumerate(_TOES):
+        offset = torch.zeros_like(positions[:, toe])
+        for _, start, stop in true_intervals(planted[:, foot, None]):
+            part = slice(start, stop)
+            offset[part] = _compute_stance_offset(positions[part, toe], ~free[part], rest_height[part, foot])
+        firm = ~free | planted[:, foot]
+        goals[:, CANONICAL.parents[toe]] += interpolate_offsets(
+            offset, firm, seconds=_STANCE_FADE_SECONDS, fps=float(motion.fps)
+        )
+    turning = free[:, None].expand(-1, CANONICAL.num_joints)
+    return bend_limbs(motion, motion, goals, torch.zeros_like(turning), turning)
+
+
+def _compute_stance_offset(
+    positions: Float[Tensor, "contact 3"], anchored: Bool[Tensor, " contact"], rest_height: Float[Tensor, " contact"]
+) -> Float[Tensor, "contact 3"]:
+    """Compute the offsets from a contact's positions to the anchored ones, interpolated linearly, or to their mean."""
+    if bool(anchored.any()):
+        return fill_missing(positions[None], anchored[None])[0] - positions
+    middle = positions.mean(dim=0)
+    middle[1] = rest_height.mean()
+    return middle - positions
+
+
+_PAST_FRAMES = 3  # frames before a gap that terms look back on
+
+
+def select_likeliest_density(densities: Sequence[Density], motion: Motion) -> Density:
+    """Select the density under which a canonical motion, with a proposal's observation noise, is likeliest."""
+    if len(densities) == 1:
+        return densities[0]
+    blurred = [density.with_observation_noise(density_selection.proposal_sigma()) for density in densities]
+    return densities[blurred.index(density_selection.select_density_for_motion(blurred, motion).density)]
+
+
+def commit_before(
+    body: Motion,
+    contact_logits: Float[Tensor, "frames 2"],
+    start: int,
+    density: Density,
+    state: DensityState | None = None,
+    *,
+    since: int = 0,
+) -> CommittedFrames:
+    """Commit a motion's frames before a gap, with their contacts, single precision; a density's `state` is advanced
+    from frame `since` on.
+    """
+    features, before = encode(body.slice(0, max(2, start)))
+    ground, heading = integrate_root(features, before)
+    features[:, LAYOUT.slices["contacts"]] = (contact_logits[: len(features)] > 0).to(features)
+    features = features[:start].float()
+    ground_pose = GroundPose(ground[start - 1].float(), heading[start - 1].float())
+    past = body.slice(max(0, start - _PAST_FRAMES), start).joint_positions().float()
+    advanced = state if state is not None and since >= start else replay(density, features, state, since=since)
+    return CommittedFrames(advanced, ground_pose, features, past)
+
+
+def insert_rollout(
+    body: Motion,
+    contact_logits: Float[Tensor, "frames 2"],
+    window: SolvedWindow,
+    ground_pose: GroundPose,
+    gap: tuple[int, int],
+) -> tuple[Motion, Float[Tensor, "frames 2"]]:
+    """Insert a rollout in its gap, corrected so that it arrives at the frame after it, if there is one; also return the
+    contact logits.
+    """
+    start, stop = gap
+    made = decode(window.trial.features[0], GroundPose(ground_pose.position_xz.double(), ground_pose.heading.double()))
+    count, planted = stop - start, window.trial.contacts[0]
+    root, quats, logits = body.root_position.clone(), body.local_quat_xyzw.clone(), contact_logits.clone()
+    root[start:stop], quats[start:stop] = made.root_position[:count], made.local_quat_xyzw[:count]
+    if count < len(made.root_position):
+        there, here = body.slice(stop, stop + 1), made.slice(count, count + 1)
+        root[start:stop], quats[start:stop] = _arrive(here, there, root[start:stop], quats[start:stop])
+    new = torch.zeros(len(root), dtype=torch.bool)
+    new[start:stop] = True
+    root = blend_seams_in_positions(root, new, fps=PRIOR_FPS)
+    quats = blend_seams_in_rotations(quats, new[:, None].expand(-1, CANONICAL.num_joints), fps=PRIOR_FPS)
+    logits[start:stop] = contacts.to_logits(planted[:count]).to(logits)
+    return replace(body, root_position=root, local_quat_xyzw=quats), logits
+
+
+def _arrive(
+    here: Motion, there: Motion, root: Float[Tensor, "frames 3"], quats: Float[Tensor, "frames joints 4"]
+) -> tuple[Float[Tensor, "frames 3"], Float[Tensor, "frames joints 4"]]:
+    """Spread what a rollout arrives `here` instead of `there` over all its frames: none of it in the two frames before,
+    all of it in two after, so that it leaves and arrives at its own pace."""
+    turn = rotations.to_rotation_vector(
+        rotations.multiply(rotations.inverse(here.local_quat_xyzw), there.local_quat_xyzw)
+    )
+    firm = torch.ones(len(root) + 4, dtype=torch.bool)
+    firm[2:-2] = False
+    miss = root.new_zeros(len(firm), 3 + 3 * quats.shape[1])
+    miss[-2:] = torch.cat([there.root_position - here.root_position, turn.flatten(1)], dim=1)
+    offsets = interpolate_offsets(miss, firm, seconds=math.inf, fps=PRIOR_FPS)[2:-2]
+    turns = rotations.from_rotation_vector(offsets[:, 3:].unflatten(1, (-1, 3)))
+    return root + offsets[:, :3], rotations.multiply(quats, turns)
+
 
 EVERY_ROLLOUT_JUMPED = "every rollout jumped"
 """Why a gap is the fallback's that rollouts would take."""
@@ -225,3 +348,36 @@ def _sample_smooth_noise(
     """Sample noise that changes slowly."""
     white = torch.randn(frames, LAYOUT.continuous, generator=generator)
     return settings.temperature * gaussian.unit_variance_matrix(frames, settings.slow, white.dtype) @ white
+
+
+_MIN_KNOWN_FRAMES = 5  # fewest frames from which a motion is extrapolated
+
+
+def extrapolate_end(
+    query: GapQuery, proposal: Proposal, densities: Sequence[Density], settings: RolloutSettings
+) -> Proposal:
+    """Extrapolate a proposal from the last known frame to its end, if nothing is known there.
+
+    It stays unchanged where the first density (that of locomotion) does not find the frames before as likely as its own
+    data: densities then stop or turn away. None runs backwards, so a beginning stays as well.
+    """
+    missing, stop = query.nothing_known, query.motion.num_frames
+    start = stop - int(missing.flip(0).long().cumprod(0).sum())
+    # Only frames since the gap before count, not what fills that.
+    since = int(missing[:start].nonzero()[-1]) + 1 if bool(missing[:start].any()) else 0
+    if start == stop or start - since < _MIN_KNOWN_FRAMES or not densities:
+        return proposal
+    body, logits = query.to_unit_size(proposal.motion), proposal.contact_logits
+    known = body.slice(since, start)
+    blurred = densities[0].with_observation_noise(density_selection.proposal_sigma())
+    if density_selection.select_density_for_motion([blurred], known).weight < 1:
+        return proposal
+    density = select_likeliest_density(densities, known)
+    solver = RecedingHorizonSolver(density, method=replace(settings.method, proposal=keep_warm_start))
+    for first in range(start, stop, settings.longest):
+        committed, count = commit_before(body, logits, first, density), min(settings.longest, stop - first)
+        terms = (LatentPrior(settings.sigma_noise), settings.footing)
+        window = solver.solve_window(committed, terms, count, generator=torch.Generator())
+        body, logits = insert_rollout(body, logits, window, committed.place, (first, first + count))
+    source = GapSource(start, stop, f"density {density.name}")
+    return replace(proposal, motion=query.to_character(body), contact_logits=logits, others=(*proposal.others, source))

@@ -8,9 +8,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from controllers.inbetweening.pipeline import fill
-from controllers.shots.planning.way import Way
 from controllers.shots.request import PoseKey, Reach
 from controllers.shots.transitions import Filling, choose_filling
+from controllers.shots.way import Way
 from mapctl import kinematics, rotations
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening.missing import MissingMask

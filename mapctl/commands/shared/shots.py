@@ -13,13 +13,12 @@ from torch import Tensor
 
 from controllers.common.character import Character
 from controllers.following.follow import FollowSettings, follow
-from controllers.shots.clips.arrival import Arrival
-from controllers.shots.clips.lead import Lead
+from controllers.shots.clip_ends import Arrival, Lead
 from controllers.shots.keys.posing import MetPose
-from controllers.shots.planning.way import APART_MARGIN, Way, plan_way
 from controllers.shots.request import Look, Others, PoseKey, Reach, ShotRequest
 from controllers.shots.rest_pose import build_rest_pose
 from controllers.shots.shot import ShotSettings, ShotSolution, solve_shot
+from controllers.shots.way import APART_MARGIN, Way, plan_way
 from mapctl import kinematics, report
 from mapctl.commands.shared.inputs import read_clip
 from mapctl.commands.shared.options import ReadOptions
