@@ -19,7 +19,7 @@ from torch import Tensor
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT
 from mapctl.inbetweening import GapQuery, PositionImage, Proposal, ProposedPositions
-from mapctl.inbetweening.position_proposal import propose_from_positions
+from mapctl.inbetweening.position_image import propose_from_positions
 from mapctl.inbetweening.root_trajectory import LocalMotion, RootTrajectory
 from mapctl.recording import Capture, CaptureProposal
 

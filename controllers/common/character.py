@@ -11,8 +11,7 @@ from mapctl import retarget
 from mapctl.curves import Curve
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT
-from mapctl.intent.steering import Command
-from mapctl.intent.steering_limits import SteeringLimits
+from mapctl.intent.steering import Command, SteeringLimits
 from mapctl.motion import Motion
 from mapctl.problem.ledger import Ledger
 from mapctl.protocols import DataLimits

@@ -15,8 +15,7 @@ from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.intent.keyframes import WorldPosition
-from mapctl.intent.path import SpeedProfile
-from mapctl.intent.timed_speed import TimedSpeed
+from mapctl.intent.path import SpeedProfile, TimedSpeed
 from mapctl.motion import Motion
 from mapctl.skeleton import LIMBS
 

@@ -18,8 +18,7 @@ from mapctl.curves.obstacles import measure_clearance
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.intent.cornering import find_reversals, slow_for_corners
-from mapctl.intent.path import PathRequest, SpeedProfile
-from mapctl.intent.timed_speed import TimedSpeed, integrate_speeds
+from mapctl.intent.path import PathRequest, SpeedProfile, TimedSpeed, integrate_speeds
 from mapctl.numerics import vectors
 from mapctl.numerics.intervals import true_intervals
 

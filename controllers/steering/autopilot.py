@@ -10,8 +10,7 @@ import torch
 
 from controllers.steering.steer import SteerFrames
 from mapctl.curves.curve import Curve
-from mapctl.intent.steering import Arrival, Command
-from mapctl.intent.steering_limits import SteeringLimits
+from mapctl.intent.steering import Arrival, Command, SteeringLimits
 
 _ARRIVAL_DISTANCE = 0.15  # metres before the end of a path at which the character stops
 _SEARCH_BACKWARD, _SEARCH_FORWARD = 0.1, 0.5  # metres around the last nearest arc in which the next is searched

@@ -20,8 +20,7 @@ from controllers.steering.overlay import Overlay
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, ground_speed
 from mapctl.intent.avoidance import lead_around
-from mapctl.intent.steering import Arrival, Command, SteeringTarget
-from mapctl.intent.steering_limits import SteeringLimits
+from mapctl.intent.steering import Arrival, Command, SteeringLimits, SteeringTarget
 from mapctl.pose import decode
 from mapctl.problem.context import WindowRequest
 from mapctl.problem.ledger import Ledger

@@ -18,7 +18,7 @@ from mapctl.commands.shared.results import read_dna
 from mapctl.errors import RequestError
 from mapctl.motion import Motion
 from mapctl.protocols import Inbetweener
-from mapctl.recording.gap_detection import find_gaps
+from mapctl.recording.inspection import find_gaps
 from mapctl.recording.masks import ALL, ROOT, Mask
 from mapctl.retarget.rigs import Rig
 

@@ -2,14 +2,28 @@
 
 import math
 from os import PathLike
+from pathlib import Path
 
 import numpy as np
 from numpy import ndarray
 
 from mapctl.curves.polyline import MAX_LENGTH, MAX_POINTS
-from mapctl.curves.texts import read_text
 from mapctl.errors import FileFormatError
-from mapctl.formats.text import shorten
+from mapctl.formats.text import read_bytes, shorten
+
+
+def read_text(path: str | PathLike[str], limit: int, expected: str) -> str:
+    """Read the file's text, of `limit` bytes at most; FileFormatError for what is no text, with what was expected."""
+    if Path(path).is_file() and Path(path).stat().st_size > limit:
+        raise FileFormatError(path, f"is larger than {limit // 2**20} MiB, too large for a curve")
+    try:
+        text = read_bytes(path).decode("utf-8-sig")
+    except UnicodeDecodeError:
+        text = "\0"
+    if "\0" in text:
+        raise FileFormatError(path, f"is not a text file; expected {expected}")
+    return text
+
 
 MAX_CSV_BYTES = 64 * 2**20
 """Largest table that is read."""

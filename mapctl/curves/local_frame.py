@@ -4,6 +4,7 @@ Same positions and directions as `Curve.nearest`, `Curve.point`, `Curve.tangent`
 specification; a term that asks for all of them at every evaluation asks here.
 """
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -12,7 +13,114 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mapctl.curves import Curve, local_frame_kernels
+from mapctl.curves import Curve
+from mapctl.numerics.jit import make_jit_decorators
+
+entry, inner = make_jit_decorators("contract", "nsz")
+
+_ARC_LIMIT = 1e9  # metres; beyond it, and for arcs that are no numbers, there is no segment to count
+
+
+@inner
+def find_segment(curve, arc):
+    """Find the segment of an arc, counted on through the laps of a closed curve, and the lap's first arc."""
+    count, lap = len(curve.directions), 0.0
+    if curve.closed:
+        lap = math.floor(arc / curve.length)
+    within, first, beyond = arc - lap * curve.length, 0, count
+    while beyond - first > 1:
+        middle = (first + beyond) // 2
+        if curve.knots[middle] <= within:
+            first = middle
+        else:
+            beyond = middle
+    return np.int64(lap) * count + first
+
+
+@inner
+def evaluate_position(curve, arc, place):
+    """Evaluate the position on the curve at an arc: straight on beyond open ends."""
+    segment = find_segment(curve, arc)
+    lap, index = segment // len(curve.directions), segment % len(curve.directions)
+    along = arc - lap * curve.length - curve.knots[index]
+    for k in range(len(place)):
+        place[k] = curve.corners[index, k] + along * curve.directions[index, k]
+
+
+@inner
+def find_nearest_arc(curve, point, around, reach):
+    """Find the arc of the position nearest to a point on the segments within reach of `around`; NaN if the point is."""
+    best, found, count = math.inf, math.nan, len(curve.directions)
+    for segment in range(find_segment(curve, around - reach), find_segment(curve, around + reach) + 1):
+        lap, index = segment // count, segment % count
+        along, apart = 0.0, 0.0
+        for k in range(len(point)):
+            along += (point[k] - curve.corners[index, k]) * curve.directions[index, k]
+        if curve.closed or index > 0:  # the pieces beyond open ends have no end
+            along = max(along, 0.0)
+        if curve.closed or index < count - 1:
+            along = min(along, curve.knots[index + 1] - curve.knots[index])
+        for k in range(len(point)):
+            off = curve.corners[index, k] + along * curve.directions[index, k] - point[k]
+            apart += off * off
+        if apart < best:
+            best, found = apart, lap * curve.length + curve.knots[index] + along
+    return found
+
+
+@inner
+def evaluate_axes(curve, arc, ahead, behind, axes):
+    """Evaluate rows: left on the ground, forward (a chord's direction), in space upward but for what lies forward.
+
+    `ahead` and `behind` (dims) are scratch.
+    """
+    last = len(ahead) - 1
+    evaluate_position(curve, arc + curve.half_base, ahead)
+    evaluate_position(curve, arc - curve.half_base, behind)
+    length = 0.0
+    for k in range(last + 1):
+        ahead[k] -= behind[k]
+        length += ahead[k] * ahead[k]
+    length = math.sqrt(length)
+    if length < 1e-6:  # where a curve turns back on itself the chord vanishes
+        segment, length = find_segment(curve, arc) % len(curve.directions), 0.0
+        for k in range(last + 1):
+            ahead[k] = curve.directions[segment, k]
+            length += ahead[k] * ahead[k]
+        length = math.sqrt(length)
+    for k in range(last + 1):
+        ahead[k] /= length
+    ground = max(math.sqrt(ahead[0] * ahead[0] + ahead[last] * ahead[last]), 1e-9)
+    for k in range(last + 1):
+        axes[0, k], axes[1, k] = 0.0, ahead[k]
+    axes[0, 0], axes[0, last] = ahead[last] / ground, -ahead[0] / ground
+    if last == 2:
+        for k in range(3):
+            axes[2, k] = -ahead[1] * ahead[k]
+        axes[2, 1] += 1.0
+
+
+@entry
+def fill_local_frames(curve, points, around, reach, places, axes, straightened):
+    """Fill local frames of points (batch, frames, dims) near arcs `around` (frames); see `local_frame.LocalFrame`."""
+    if curve.closed:
+        reach = min(reach, 0.5 * curve.length)  # a lap has every position once
+    dims = points.shape[2]
+    place, frame, scratch = np.empty(dims), np.empty((dims, dims)), np.empty((2, dims))
+    for b in range(len(points)):
+        for t in range(len(around)):
+            arc = math.nan
+            if abs(around[t]) < _ARC_LIMIT:
+                arc = find_nearest_arc(curve, points[b, t], around[t], reach)
+                arc = arc if math.isfinite(arc) else around[t]
+                evaluate_position(curve, arc, place)
+                evaluate_axes(curve, arc, scratch[0], scratch[1], frame)
+            for k in range(dims):
+                known = math.isfinite(arc)
+                places[b, t, k] = place[k] if known else math.nan
+                straightened[b, t, k] = place[k] + (around[t] - arc) * frame[1, k] if known else math.nan
+                for row in range(dims):
+                    axes[b, t, row, k] = frame[row, k] if known else math.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +155,7 @@ def find_local_frames(
     known = points.detach().contiguous()
     near = LocalFrame(torch.empty_like(known), known.new_empty(*known.shape, curve.dims), torch.empty_like(known))
     filled = (near.place.numpy(), near.axes.numpy(), near.tangent_extension.numpy())
-    local_frame_kernels.fill_local_frames(_build_tables(curve), known.numpy(), arcs, reach, *filled)
+    fill_local_frames(_build_tables(curve), known.numpy(), arcs, reach, *filled)
     return near
 
 

@@ -10,8 +10,8 @@ from numpy import ndarray
 from svgpathtools import Line
 from svgpathtools.document import CONVERSIONS, CONVERT_ONLY_PATHS, Document
 
+from mapctl.curves.csv_file import read_text
 from mapctl.curves.polyline import MAX_LENGTH, MAX_POINTS
-from mapctl.curves.texts import read_text
 from mapctl.errors import FileFormatError
 
 MAX_SVG_BYTES, MAX_SVG_SEGMENTS = 2 * 2**20, 30_000

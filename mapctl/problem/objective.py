@@ -9,7 +9,7 @@ other terms join them by autograd on the trial. Nothing here knows a network, an
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -18,11 +18,36 @@ from torch import Tensor
 
 from mapctl.errors import RequestError
 from mapctl.problem.ledger import Ledger, LedgerEntry
-from mapctl.problem.parametrisation import AdjointParametrisation, Parametrisation
 from mapctl.solver.gradient import differentiate
 from mapctl.terms.adjoints.gradient import TrialGradient
 from mapctl.terms.base import DifferentiatedTerm, Term
 from mapctl.terms.trial import Trial
+
+
+@runtime_checkable
+class Parametrisation(Protocol):
+    """Unknowns of one window, batch first. Where a search over them starts is for the window's solver to say."""
+
+    def build(self, unknowns: Float[Tensor, "batch unknowns"]) -> Trial:
+        """Build the trial of each candidate; differentiable."""
+        ...
+
+    def warm_start(self, unknowns: Float[Tensor, "1 unknowns"]) -> Float[Tensor, "frames width"]:
+        """Return by frame what the solver of a window that overlaps this one may start from."""
+        ...
+
+
+@runtime_checkable
+class AdjointParametrisation(Parametrisation, Protocol):
+    """A parametrisation that differentiates what it builds by hand, without torch's graph."""
+
+    def build_detached(self, unknowns: Float[Tensor, "batch unknowns"]) -> Trial | None:
+        """Build the trials of `build` without a graph, with their world poses; None where autograd must serve."""
+        ...
+
+    def pull_back(self, trial: Trial, gradient: TrialGradient) -> Float[Tensor, "batch unknowns"]:
+        """Return the gradient on the unknowns of the trial that was built last."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)

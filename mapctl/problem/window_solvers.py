@@ -12,8 +12,7 @@ from mapctl.problem.context import WindowRequest
 from mapctl.problem.density_selection import DensityChoice
 from mapctl.problem.latent_noise import LatentNoise
 from mapctl.problem.ledger import Ledger
-from mapctl.problem.objective import Objective
-from mapctl.problem.parametrisation import Parametrisation
+from mapctl.problem.objective import Objective, Parametrisation
 from mapctl.problem.warm_start import WarmStartProposal, keep_warm_start
 from mapctl.solver.budget import Budget, Meter
 from mapctl.solver.lbfgs import LbfgsResult, LbfgsSettings, minimise

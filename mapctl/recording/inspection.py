@@ -8,11 +8,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from mapctl.errors import RequestError
 from mapctl.motion import Motion
 from mapctl.numerics.intervals import fill_missing, last_observed, true_intervals
 from mapctl.recording.artefacts import Artefact
 from mapctl.recording.frozen_frames import find_held_frames
-from mapctl.recording.masks import ALL, Mask, expand_valid_masks
+from mapctl.recording.masks import ALL, ROOT, Mask, expand_valid_masks
 from mapctl.recording.noise_estimation import RESOLUTION, estimate_angle_noise, estimate_position_noise
 from mapctl.recording.quaternion_signs import choose_continuous_signs
 from mapctl.recording.spike_detection import BODY, ROTATIONS, find_angle_spikes, find_position_spikes
@@ -145,3 +146,19 @@ def _hold_last_observed(quats: Tensor, seen: Tensor) -> Tensor:
     """Hold the last observed rotation where nothing is observed: signs are then chosen between frames that count."""
     nearest = last_observed(seen.T).T
     return torch.take_along_dim(quats, nearest[..., None], dim=0)
+
+
+def find_gaps(motion: Motion) -> tuple[Mask, ...]:
+    """Find the gaps of a motion that no mask gives; RequestError if there are none."""
+    examined = inspect_recording(motion)
+    frozen, names = examined.frozen, motion.skeleton.names
+    masks = [Mask(ALL, start, stop) for _, start, stop in true_intervals(frozen[:, None])]
+    wrong = ~examined.seen & ~frozen[:, None]
+    masks += [Mask(names[joint], start, stop) for joint, start, stop in true_intervals(wrong)]
+    lost = ~examined.seen_root & ~frozen
+    masks += [Mask(ROOT, start, stop) for _, start, stop in true_intervals(lost[:, None])]
+    if not masks:
+        raise RequestError(
+            "no frame is frozen and none leaps: say which frames are missing (--gap A:B) or which joints"
+        )
+    return tuple(masks)

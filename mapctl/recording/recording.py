@@ -10,6 +10,7 @@ from torch import Tensor
 from mapctl import rotations
 from mapctl.motion import Motion
 from mapctl.numerics.intervals import fill_missing, fill_missing_angle
+from mapctl.pose import BodyPose
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,3 +89,16 @@ def _continuous_vectors(quats: Float[Tensor, "frames joints 4"]) -> Float[Tensor
     """Return rotation vectors without a jump at a half turn, short ones in most frames, if signs are continuous."""
     sign = torch.where(quats[..., 3].mean(dim=0, keepdim=True) < 0, -1.0, 1.0)
     return rotations.to_long_rotation_vector(quats * sign[..., None])
+
+
+@dataclass(frozen=True, eq=False)
+class CaptureProposal:
+    """The motion behind a batch of captures, as a denoiser sees it, and its contacts."""
+
+    pose: BodyPose
+    """Poses of every frame, batched."""
+    contact_logits: Float[Tensor, "batch frames 2"]
+    """Log odds that the left and the right toe are planted."""
+    log_spread: Float[Tensor, "batch frames columns"]
+    """Logarithm of the standard deviation of the proposal's error: of each coordinate of the hips' position, metres,
+    then of each of a joint's three angles, radians, the hips' first."""

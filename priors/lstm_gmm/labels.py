@@ -1,14 +1,16 @@
 """Labels of clips (gait, style), read from their names: what a density can be conditioned on."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from mapctl.errors import RequestError
+from mapctl.metrics.pace_changes import CHANGES, PACES, label_pace
 
 _OTHER_SIDE = {"left": "right", "right": "left"}
 
@@ -77,3 +79,18 @@ def _parse_match(match: re.Match[str] | None) -> set[str]:
     if match is None:
         return set()
     return {f"{group}={value}" for group, value in match.groupdict().items() if value}
+
+
+PACE_LABELS = tuple(map(label_pace, PACES))
+"""Labels of PACES."""
+
+
+def read_pace_rates(holds: Mapping[str, Any]) -> dict[tuple[str, str], float]:
+    """Read changes a second from one pace to another, by both paces, from what a card says that its clips hold. None of
+    a pace that they hold for less than the 0.3 s to which a card rounds."""
+    minutes = holds["minutes by pace"]
+    return {
+        (before, after): holds[name] / (60 * minutes[before])
+        for (before, after), name in CHANGES.items()
+        if minutes[before] > 0 and minutes[after] > 0
+    }

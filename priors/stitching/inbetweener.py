@@ -1,30 +1,194 @@
 """The stitcher as an in-betweener: short gaps between whole poses, in as many ways as are drawn."""
 
-from collections.abc import Generator
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Generator
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mapctl import contacts, rotations
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode, mirror_features, reversed_features
 from mapctl.inbetweening import GapQuery, Proposal
 from mapctl.inbetweening.query import INTERPOLATION, GapSource
+from mapctl.kinematics import forward_kinematics, heading
 from mapctl.motion import Motion
+from mapctl.numerics.gaussian import averaging_matrix
 from mapctl.numerics.intervals import true_intervals
 from mapctl.pose import BodyPose
 from mapctl.protocols import Inbetweener
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors import checkpoints
-from priors.stitching.draws import CHUNK, Draws
-from priors.stitching.fitting import fit_shared
 from priors.stitching.joining import Joined, join_sides
 from priors.stitching.latents import DrawnLatents
 from priors.stitching.network import StitcherConfig, StitcherNetwork
 from priors.stitching.sides import Ends, count_made, walk_sides, walk_stepwise
-from priors.stitching.wishes import Wishes
+
+CHUNK = 16
+"""Draws at once: batches of one size are rounded alike, so that the first draws do not depend on the count."""
+_LARGEST_SEED = 2**63
+
+
+@dataclass(eq=False)
+class Draws:
+    """Answers that are drawn, to as many pairs of poses as are asked for."""
+
+    seed: int
+    """Of the noise; each pair of poses has noise of its own."""
+    temperature: float = 1.0
+    """Standard deviation of the noise."""
+    dropped: int = 0
+    """Draws so far that were not finite, which nobody is given."""
+    chunks: dict[tuple[bytes, int, int], Joined] = field(default_factory=dict)
+    """Those made, by the ends, the frames from one to the other and the number of the chunk."""
+
+    def seed_chunk(self, start: int, chunk: int) -> torch.Generator:
+        """Return the generator of a chunk's noise, for the ends of a gap that starts at a frame."""
+        seed = (self.seed + 1_000_003 * start + 7_919 * chunk) % _LARGEST_SEED
+        return torch.Generator().manual_seed(seed)
+
+    def pick(
+        self, ends: Ends, start: int, frames: int, number: int, make: Callable[[torch.Generator, float], Joined]
+    ) -> Joined | None:
+        """Return the draw of a number for the ends of a gap that starts at a frame, made by `make` with the chunk that
+        it is in if it is not there; the next finite one where it is not finite, and None where the whole chunk is not.
+        """
+        chunk, row = divmod(number, CHUNK)
+        told = b"".join(part.numpy().tobytes() for part in (ends.features, ends.present, ends.place, ends.turn))
+        if (made := self.chunks.get((told, frames, chunk))) is None:
+            made = make(self.seed_chunk(start, chunk), self.temperature)
+            self.chunks[told, frames, chunk] = made
+            self.dropped += int((~made.finite).sum())
+        good = made.finite.roll(-row).nonzero()
+        return made.row((row + int(good[0])) % CHUNK) if len(good) else None
+
+
+_ROUNDS, _DIFFERENCE = 2, 0.25  # the second in standard deviations of the prior
+_SHARES = (0.25, 0.5, 0.75, 1.0, 1.25)  # of a step
+
+
+def fit_shared(
+    make: Callable[[Float[Tensor, "batch shared"]], Joined],
+    measure: Callable[[Joined], Float[Tensor, "batch residuals"]],
+    centre: Float[Tensor, " shared"],
+    spread: float,
+) -> Joined:
+    """Fit what both sides share, in standard deviations of the network's prior, to residuals in theirs.
+
+    The energy counts distances from the `centre` in units of `spread`. Returns the motion with the least energy of all
+    that were made, as a batch of one: that of the centre where no step helps, or where nothing finite is near it.
+    """
+    best, fitted = centre, make(centre[None])
+    for _ in range(_ROUNDS):
+        residuals = measure(make(torch.cat([best[None], best + _DIFFERENCE * torch.eye(len(best))])))
+        here = residuals[0]
+        jacobian = spread * ((residuals[1:] - here) / _DIFFERENCE).T
+        away = (best - centre) / spread
+        system = jacobian @ jacobian.T + torch.eye(len(here))
+        # Of  |r + J d|^2 + |a + d|^2  the least is at  d = -a - J' (J J' + 1)^-1 (r - J a).
+        step = -away - jacobian.T @ torch.linalg.solve(system, here - jacobian @ away)
+        tried = best + spread * torch.tensor((0.0, *_SHARES))[:, None] * step
+        if not bool(tried.isfinite().all()):
+            break
+        made = make(tried)
+        energy = measure(made).square().sum(dim=1) + ((tried - centre) / spread).square().sum(dim=1)
+        least = int(torch.where(energy.isfinite() & made.finite, energy, torch.inf).argmin())
+        best, fitted = tried[least], made.row(least)
+    return fitted
+
+
+_SIGMA_HAND, _SIGMA = 0.1, 0.02
+"""Metres of a hand, and of a foot, the hips or a trajectory: what bends away without the rest of the body. Arms bend by
+themselves: with less for hands the rest of the body comes farther from mocap that they were taken from."""
+_HANDS = CANONICAL.indices(("leftHand", "rightHand"))
+_FACING_ARM = 0.3  # metres by which a radian counts of how the hips face
+_SWAY_FRAMES = 5.0  # frames at PRIOR_FPS, sigma, of the average in which the hips follow a trajectory
+_TRAJECTORY_STRIDE = 6  # frames from one residual of a trajectory to the next
+
+
+@dataclass(frozen=True, eq=False)
+class Wishes:
+    """Wishes about the frames of one gap, on the canonical skeleton, seen from the pose before it."""
+
+    places: Float[Tensor, "frames joints 3"]
+    """Positions that joints are to have, metres."""
+    wanted: Bool[Tensor, "frames joints"]
+    """Whether a joint is to have one."""
+    facing: Float[Tensor, " faced"]
+    """Headings that the hips are to have, radians."""
+    faced: Int[Tensor, " faced"]
+    """Frames in which they are to have them."""
+    trajectory: Float[Tensor, "frames 2"] | None
+    """Ground positions that the hips are to follow, metres; they may sway about them."""
+
+    @staticmethod
+    def of(query: GapQuery, start: int, stop: int) -> "Wishes | None":
+        """See what a query tells between frames that are known on both sides; None where that is nothing."""
+        part, targets = slice(start, stop), query.effector_targets
+        hips = query.root_only_keys[part]
+        told = query.keep_trajectory or bool(hips.any()) or (targets is not None and bool(targets.wanted[part].any()))
+        if not told:
+            return None
+        body = query.to_unit_size(query.motion)
+        facing = heading(body.local_quat_xyzw[start - 1, 0])
+        origin = body.root_position[start - 1] * torch.tensor([1.0, 0.0, 1.0]).double()
+
+        def see(positions: Tensor) -> Tensor:
+            return rotations.rotate_about_y(positions - origin, -facing.expand(positions.shape[:-1]))
+
+        places = torch.zeros(stop - start, CANONICAL.num_joints, 3)
+        wanted = torch.zeros(places.shape[:2], dtype=torch.bool)
+        root = see(body.root_position[part]).float()
+        if targets is not None:
+            places, wanted = see(targets.places[part] / query.scale).float(), targets.wanted[part].clone()
+        places[:, 0], wanted[:, 0] = root, hips
+        turned = rotations.wrap_angle(heading(body.local_quat_xyzw[part, 0]) - facing).float()
+        faced = hips.nonzero()[:, 0]
+        return Wishes(places, wanted, turned[faced], faced, root[:, ::2] if query.keep_trajectory else None)
+
+    def measure(self, joined: Joined) -> Float[Tensor, "batch residuals"]:
+        """Measure by how much motions miss each wish along each axis, in standard deviations."""
+        places, facing, trajectory = self._measure(joined)
+        hands = torch.isin(self.wanted.nonzero()[:, 1], torch.tensor(_HANDS))
+        sigma = torch.where(hands, _SIGMA_HAND, _SIGMA)[:, None]
+        parts = (places / sigma, facing / _SIGMA, trajectory / _SIGMA)
+        return torch.cat([part.flatten(1) for part in parts], dim=1)
+
+    def measure_farthest(self, joined: Joined) -> float:
+        """Measure the largest distance of one motion to a wish, metres."""
+        return max((float(part[0].norm(dim=-1).max()) for part in self._measure(joined) if part.numel()), default=0.0)
+
+    def lay_along(self, joined: Joined) -> Joined:
+        """Move motions along the trajectory, if there is one."""
+        if self.trajectory is None:
+            return joined
+        root = joined.root_position - rotations.lift_ground(self._follow(joined.root_position, self.trajectory))
+        return Joined(root, joined.quats, joined.contacts, joined.apart)
+
+    def _measure(
+        self, joined: Joined
+    ) -> tuple[Float[Tensor, "batch places 3"], Float[Tensor, "batch faced 1"], Float[Tensor, "batch points 2"]]:
+        """Measure by how much motions miss places, headings and points of the trajectory, metres."""
+        root = joined.root_position
+        positions, _ = forward_kinematics(CANONICAL.offsets.to(root), CANONICAL.parents, root, joined.quats)
+        turned = rotations.wrap_angle(heading(joined.quats[:, self.faced, 0]) - self.facing)
+        off = root[:, :0, ::2] if self.trajectory is None else self._follow(root, self.trajectory)
+        points = off[:, _TRAJECTORY_STRIDE // 2 :: _TRAJECTORY_STRIDE]
+        return (positions - self.places)[:, self.wanted], _FACING_ARM * turned[..., None], points
+
+    @staticmethod
+    def _follow(
+        root: Float[Tensor, "batch frames 3"], trajectory: Float[Tensor, "frames 2"]
+    ) -> Float[Tensor, "batch frames 2"]:
+        """Measure how far the hips, averaged over their sway, are off the trajectory: by nothing in the frames before
+        and after, which are known."""
+        off = torch.nn.functional.pad(root[..., ::2] - trajectory, (0, 0, 1, 1))
+        # Beyond the known frames it goes on turned round, so that its average there is nothing, too.
+        turned, count = -off[:, 1:-1].flip(1), len(trajectory)
+        whole = torch.cat([turned, off, turned], dim=1)
+        return averaging_matrix(whole.shape[1], _SWAY_FRAMES, off.dtype)[count + 1 : 2 * count + 1] @ whole
+
 
 SOURCE = "stitcher"
 """Name of the in-betweener in notes."""

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mapctl import contacts, rotations
+from mapctl import contacts, kinematics, rotations
 from mapctl.errors import CheckpointError
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening import GapQuery, PositionImage, Proposal
@@ -19,17 +19,89 @@ from mapctl.inbetweening.whole_body import bend_limbs
 from mapctl.kinematics import heading
 from mapctl.motion import Motion
 from mapctl.motion_dna import MotionDna
+from mapctl.numerics.intervals import true_intervals
 from mapctl.numerics.smooth_offsets import interpolate_turns, smooth_between
 from mapctl.protocols import Inbetweener, PathPredictor
-from mapctl.skeleton import CANONICAL, TOE_JOINTS
+from mapctl.skeleton import CANONICAL, TOE_JOINTS, TOE_REST_HEIGHT
 from priors import checkpoints
 from priors.tweening import path as path_predictor
 from priors.tweening.generator import MAX_KEY_FRAMES, GeneratorConfig, GeneratorNetwork
 from priors.tweening.keys import see_contacts
-from priors.tweening.partial_keys import show_loose_keys
-from priors.tweening.splitting import Split, find_splits, place_poses, show_edges
 from priors.tweening.styles import Style, read_classes
 from priors.tweening.walked_way import bend_motion
+
+
+def show_loose_keys(image: PositionImage, loose: LooseKeys) -> PositionImage:
+    """Show places over the ground, over which the reference of an image of one motion leads, and drawings in frames of
+    which nothing else is known: from where the first of these is seen the reference then looks back, without turning.
+    """
+    axes, places = image.known_axes.clone(), image.places
+    axes[0, loose.placed, 0, 0] = axes[0, loose.placed, 0, 2] = True
+    seen = loose.see_from_one_side(CANONICAL)
+    if seen is None:
+        return replace(image, known_axes=axes)
+    turned = replace(image, heading=torch.full_like(image.heading, seen.view))
+    places = turned.from_world(image.to_world(places))
+    open_frames = ~image.known[0].any(dim=-1) & loose.drawings
+    shown = seen.known & open_frames[:, None, None]
+    axes[0] |= shown
+    places = torch.where(shown, seen.places.to(places), places[0])[None]
+    return replace(turned, places=places, known_axes=axes)
+
+
+PART_FRAMES = MAX_KEY_FRAMES // 2
+"""Frames of the longest part of a gap that is split."""
+
+
+@dataclass(frozen=True, eq=False)
+class Split:
+    """A gap that is longer than the network sees, and frames in it at which poses are told."""
+
+    start: int
+    """First frame of the gap."""
+    stop: int
+    """One past its last."""
+
+    @property
+    def frames(self) -> list[int]:
+        """Frames at which poses are told, evenly from edge to edge."""
+        parts = -(-(self.stop - self.start) // PART_FRAMES)
+        return [self.start + round(part * (self.stop - self.start) / parts) for part in range(1, parts)]
+
+
+def find_splits(query: GapQuery) -> Iterator[Split]:
+    """Yield the gaps in which nothing is known and that are longer than the network sees."""
+    for _, start, stop in true_intervals(query.nothing_known[:, None]):
+        if stop - start > MAX_KEY_FRAMES:
+            yield Split(start, stop)
+
+
+def show_edges(query: GapQuery, split: Split) -> Float[Tensor, "poses joints 3"]:
+    """Return the whole poses next to a gap, the one after it first, as motion DNA has them: metres from the hips,
+    without the hips' rotation, of unit size. None where no pose is whole."""
+    whole = (~query.missing.frames).nonzero()[:, 0]
+    after, before = whole[whole >= split.stop], whole[whole < split.start]
+    beside = torch.cat([after[:1], before[-1:]])
+    upright = query.motion.local_quat_xyzw[beside].clone()
+    upright[:, 0] = upright.new_tensor([0.0, 0.0, 0.0, 1.0])
+    return kinematics.positions_from_matrices(CANONICAL, rotations.to_matrix(upright)).float()
+
+
+def place_poses(
+    poses: Float[Tensor, "poses joints 3"], body: Motion, frames: Sequence[int]
+) -> Float[Tensor, "frames joints 3"]:
+    """Place poses in these frames of a body that is led from key to key, turned to its heading there, the lower
+    toe on the floor; spread over all of them, or one after the other and all over again if there are fewer. Metres,
+    world."""
+    count, there_are = len(frames), len(poses)
+    picked = [one * there_are // count if count < there_are else one % there_are for one in range(count)]
+    chosen = poses[picked].double()
+    facing = heading(body.local_quat_xyzw[frames, 0])
+    turned = rotations.rotate_about_y(chosen, facing[:, None])
+    ground = body.root_position[frames] * torch.tensor([1.0, 0.0, 1.0]).double()
+    lift = TOE_REST_HEIGHT - turned[:, list(TOE_JOINTS), 1].amin(dim=1)
+    return turned + ground[:, None] + lift[:, None, None] * torch.tensor([0.0, 1.0, 0.0]).double()
+
 
 SOURCE = "tweener"
 """Name of the in-betweener in notes."""

@@ -22,7 +22,7 @@ from mapctl import curves
 from mapctl.curves.obstacles import Obstacle, measure_clearance
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
-from mapctl.intent.timed_speed import TimedSpeed
+from mapctl.intent.path import TimedSpeed
 from mapctl.metrics import measure, worst_frame
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL, TOES

@@ -8,7 +8,7 @@ from helpers import walk
 from rigs_to_edit import RIGS, longer_shin, on_rig, soft_knees
 
 from mapctl import editing, retarget
-from mapctl.editing.joint_pairs import pair_joints
+from mapctl.editing.mirroring import pair_joints
 from mapctl.editing.rigged_motion import RiggedMotion
 from mapctl.skeleton import CANONICAL, Skeleton
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from mapctl.errors import RequestError
-from mapctl.intent.timed_speed import TimedSpeed
+from mapctl.intent.path import TimedSpeed
 
 
 def test_arcs_are_the_integral_of_speeds():

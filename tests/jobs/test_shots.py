@@ -18,8 +18,7 @@ from controllers.shots.way import StandingEnds, lay_timeline, plan_speeds, plan_
 from mapctl import curves, rotations
 from mapctl.curves.obstacles import Obstacle, measure_clearance
 from mapctl.errors import RequestError
-from mapctl.intent.path import SpeedProfile
-from mapctl.intent.timed_speed import TimedSpeed
+from mapctl.intent.path import SpeedProfile, TimedSpeed
 from mapctl.metrics import worst_frame
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, TOES
 

@@ -8,8 +8,8 @@ from helpers import tiny_density, walk
 
 from mapctl.features import encode
 from mapctl.solver.budget import Budget
+from priors.lstm_gmm.density import StateInferenceSettings, infer_lstm_state
 from priors.lstm_gmm.network import LstmState
-from priors.lstm_gmm.state_inference import StateInferenceSettings, infer_lstm_state
 
 
 @cache

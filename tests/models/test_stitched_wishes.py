@@ -21,9 +21,8 @@ from mapctl.kinematics import heading
 from mapctl.metrics import worst_frame
 from mapctl.rotations import about_y, multiply, rotate
 from mapctl.skeleton import CANONICAL
-from priors.stitching.fitting import fit_shared
+from priors.stitching.inbetweener import Wishes, fit_shared
 from priors.stitching.joining import Joined
-from priors.stitching.wishes import Wishes
 
 RAW = InfillSettings(finish=False)
 GAP = slice(21, 40)

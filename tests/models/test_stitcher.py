@@ -14,8 +14,7 @@ from mapctl.features import GroundPose, encode, mirror_features, reversed_featur
 from mapctl.inbetweening.missing import MissingMask
 from mapctl.recording.masks import ALL, Mask
 from mapctl.retarget import to_canonical
-from priors.stitching.draws import Draws
-from priors.stitching.inbetweener import see_ends
+from priors.stitching.inbetweener import Draws, see_ends
 from priors.stitching.joining import join_sides
 from priors.stitching.latents import DrawnLatents
 from priors.stitching.network import POSE, StitcherNetwork

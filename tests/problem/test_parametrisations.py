@@ -9,8 +9,7 @@ from mapctl.features import LAYOUT, GroundPose
 from mapctl.pose import BodyPose
 from mapctl.problem.context import WindowContext
 from mapctl.problem.latent_noise import LatentNoise
-from mapctl.problem.objective import Objective
-from mapctl.problem.parametrisation import Parametrisation
+from mapctl.problem.objective import Objective, Parametrisation
 from mapctl.problem.pose_offsets import PoseOffsets
 from mapctl.terms import FootContact, Jerk, LatentPrior, Likelihood
 

@@ -9,7 +9,7 @@ from helpers import quat_xyzw
 
 from mapctl import rotations
 from mapctl.errors import RequestError
-from mapctl.recording.gap_detection import find_gaps
+from mapctl.recording.inspection import find_gaps
 from mapctl.recording.masks import ALL, ROOT, Mask
 
 RIGS = ("canonical", "bandai", "daz")

@@ -10,8 +10,7 @@ from controllers.steering.autopilot import Autopilot
 from controllers.steering.steer import SteerFrames
 from mapctl import curves
 from mapctl.curves.obstacles import Obstacle
-from mapctl.intent.steering import Command
-from mapctl.intent.steering_limits import SteeringLimits
+from mapctl.intent.steering import Command, SteeringLimits
 from mapctl.motion import Motion
 from mapctl.problem.ledger import Ledger
 from mapctl.problem.solution import Outcome, Status

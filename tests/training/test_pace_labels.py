@@ -9,9 +9,8 @@ from helpers import generator, go_at, run, tiny_density, write_corpus
 
 import priors
 from mapctl.errors import RequestError
-from priors.lstm_gmm.labels import Labels
+from priors.lstm_gmm.labels import PACE_LABELS, Labels, read_pace_rates
 from priors.lstm_gmm.network import LstmGmm, LstmGmmConfig
-from priors.lstm_gmm.paces import PACE_LABELS, read_pace_rates
 from priors.training.corpus import Corpus
 from priors.training.mocap.paces import follow_paces, measure_pace_changes, measure_speeds
 from priors.training.recipes.lstm_gmm import DensityTrainer, TrainingSettings

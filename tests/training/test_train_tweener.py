@@ -17,8 +17,7 @@ from priors.training.augmentation.style_poses import draw_style_poses
 from priors.training.quality.gap import measure_gap
 from priors.training.recipes.tweener import TweenerSettings, TweenerTrainer
 from priors.training.recipes.tweener_losses import LossWeights, compute_tweener_losses
-from priors.tweening.generator import GeneratedPoses, GeneratorNetwork
-from priors.tweening.range_constrained import ConstrainedPose
+from priors.tweening.generator import ConstrainedPose, GeneratedPoses, GeneratorNetwork
 
 SETTINGS = TweenerSettings(steps=30, batch=96, learning_rate=1e-2, layout=KeySettings(longest=60.0))
 ERRORS = ("places_cm", "pace_cm", "feet_cm", "keys_cm", "turns")

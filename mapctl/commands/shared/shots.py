@@ -27,9 +27,8 @@ from mapctl.curves import Curve
 from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
-from mapctl.intent.path import USUAL_SPEED, PathRequest, SpeedProfile
+from mapctl.intent.path import USUAL_SPEED, PathRequest, SpeedProfile, TimedSpeed
 from mapctl.intent.shot_keys import ShotKey
-from mapctl.intent.timed_speed import TimedSpeed
 from mapctl.mesh.primitives import Surface
 from mapctl.motion import Motion
 from mapctl.problem.solution import Outcome, Solution

@@ -14,8 +14,7 @@ import math
 import numpy as np
 
 from mapctl.numerics.jit import make_jit_decorators
-from priors.lstm_gmm.fast.half import widen
-from priors.lstm_gmm.fast.layout import GIVEN, LIKELIEST, SAMPLED
+from priors.lstm_gmm.fast.layout import GIVEN, LIKELIEST, SAMPLED, widen
 
 _ZERO, _HALF, _ONE, _TWO, _FOUR = (np.float32(value) for value in (0, 0.5, 1, 2, 4))
 _LOG2E, _LN2_HIGH, _LN2_LOW = np.float32(1.44269504), np.float32(0.693359375), np.float32(-2.12194440e-4)

@@ -4,15 +4,60 @@ Sizes are padded with zeros so that no loop of the kernels has a remainder: widt
 particles to multiples of 4 where there are several. A padded unit stays exactly 0 and so changes nothing.
 """
 
-from typing import NamedTuple
+import platform
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
+import llvmlite.binding as llvm
 import numpy as np
 import torch
+from llvmlite import ir
+from numba import config, types
+from numba.extending import intrinsic
 from numpy.typing import NDArray
 from torch import Tensor
 
-from priors.lstm_gmm.fast import half
 from priors.lstm_gmm.network import LstmGmm
+
+
+def _type_widening(typing_context: Any, value: Any) -> Any:
+    if value == types.float32:
+        return types.float32(types.float32), lambda context, builder, signature, given: given[0]
+    if value == types.uint16:
+        return types.float32(types.uint16), _convert_half
+    return None
+
+
+def _convert_half(context: Any, builder: Any, signature: Any, given: Sequence[Any]) -> Any:
+    return builder.fpext(builder.bitcast(given[0], ir.HalfType()), ir.FloatType())
+
+
+widen: Any = intrinsic(_type_widening)
+"""For kernels: a weight as float32, from float32 or from the bits (uint16) of a half-precision number."""
+
+
+def converts_half() -> bool:
+    """Return whether the processor that kernels are compiled for converts half precision by an instruction."""
+    settings: Any = config
+    if settings.CPU_NAME == "generic":
+        return False
+    if platform.machine().lower() in ("arm64", "aarch64"):
+        return True
+    if settings.CPU_FEATURES is not None:
+        return "+f16c" in settings.CPU_FEATURES
+    return bool(llvm.get_host_cpu_features().get("f16c", False))
+
+
+def is_half(weights: np.ndarray) -> bool:
+    """Return whether half precision holds every weight exactly."""
+    with np.errstate(over="ignore"):
+        return bool(np.array_equal(weights.astype(np.float16).astype(np.float32), weights))
+
+
+def to_half_bits(weights: np.ndarray) -> np.ndarray:
+    """Return the bits (uint16) of the weights in half precision."""
+    return weights.astype(np.float16).view(np.uint16)
+
 
 Array = NDArray[np.float32]
 
@@ -26,7 +71,7 @@ WIDTH_STEP, BATCH_STEP, ROW_STEP = 16, 4, 4
 class Layers(NamedTuple):
     """The network's weights; transposed for the pullback; or its biases, with the last axis gone.
 
-    Weights are float32, or uint16 where half precision holds them all (`half.to_half_bits`); biases are float32. Axes
+    Weights are float32, or uint16 where half precision holds them all (`to_half_bits`); biases are float32. Axes
     are padded: Z features, W units, H rows of the head, which are means, log sigmas, weights, contact logits.
     """
 
@@ -148,8 +193,8 @@ def pack_weights(model: LstmGmm) -> Layers:
         fc3=_pad_matrix(_to_numpy(model.fc3.weight), width, width),
         head=_pack_head(model, _to_numpy(model.out.weight), width),
     )
-    if half.converts_half() and all(half.is_half(weight) for weight in weights):
-        return Layers(*(half.to_half_bits(weight) for weight in weights))
+    if converts_half() and all(is_half(weight) for weight in weights):
+        return Layers(*(to_half_bits(weight) for weight in weights))
     return weights
 
 

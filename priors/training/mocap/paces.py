@@ -25,7 +25,7 @@ def follow_paces(corpus: Corpus) -> Int[Tensor, " frames"]:
 
 def measure_pace_changes(corpus: Corpus) -> dict[str, Any]:
     """Measure minutes by pace (stand, walk, run) and how often the clips change from one pace to another, for a card
-    (see `priors.lstm_gmm.paces`)."""
+    (see `priors.lstm_gmm.labels`)."""
     parts = corpus.integrate_roots()[0].split(list(corpus.lengths))
     speeds = [measure_speed(part.double().numpy(), PRIOR_FPS) for part in parts]
     pace = np.bincount(np.concatenate([follow_pace(speed) for speed in speeds]), minlength=len(PACES))

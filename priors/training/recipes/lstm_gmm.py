@@ -16,9 +16,8 @@ from torch.nn.functional import one_hot
 from mapctl.errors import RequestError
 from priors.config import require_at_least
 from priors.lstm_gmm import density, labels
-from priors.lstm_gmm.labels import Labels
+from priors.lstm_gmm.labels import PACE_LABELS, Labels
 from priors.lstm_gmm.network import NOISE_UNIT, LstmGmm, LstmGmmConfig
-from priors.lstm_gmm.paces import PACE_LABELS
 from priors.stitching import inbetweener
 from priors.training.augmentation.clip_copies import ClipCopies, add_copies
 from priors.training.augmentation.splices import Splices, add_splices, drop_splices, hide_splices
