@@ -78,16 +78,11 @@ def add_metarig():
     return bpy.context.object
 
 
-def add_basic_metarig():
-    """Rigify's basic human metarig, which has no fingers and no face."""
+def add_generated():
+    """Add the rig that Rigify generates from its basic human metarig, which has no fingers and no face."""
     bpy.ops.preferences.addon_enable(module="rigify")
     bpy.ops.object.armature_basic_human_metarig_add()
-    return bpy.context.object
-
-
-def add_generated(*, basic: bool = True):
-    """The rig that Rigify makes of a metarig."""
-    meta = add_basic_metarig() if basic else add_metarig()
+    meta = bpy.context.object
     bpy.ops.pose.rigify_generate()
     (rig,) = (each for each in bpy.data.objects if each.type == "ARMATURE" and each != meta)
     meta.hide_set(True)

@@ -12,12 +12,9 @@ import numpy as np
 
 KIND, MODELS, FPS, STAGES = sys.argv[3:7]
 MAKERS = {
-    "mixamo": lambda: armatures.add_mixamo(imported=False),
     "imported": lambda: armatures.add_mixamo(imported=True),
     "metarig": armatures.add_metarig,
-    "basic metarig": armatures.add_basic_metarig,
-    "generated": lambda: armatures.add_generated(basic=True),
-    "generated with face": lambda: armatures.add_generated(basic=False),
+    "generated": armatures.add_generated,
 }
 KEYS = (1, 9, 17, 25)
 FRAMES = range(1, 26)
