@@ -152,6 +152,13 @@ def test_lost_joints_are_filled_and_no_other(rig):
         assert 1 <= int(moved.sum()) <= 2
 
 
+def test_what_is_known_keeps_even_the_signs_of_its_quaternions():
+    motion = on_rig("bandai", 45)
+    motion.local_quat_xyzw[30:] *= -1
+    made = filled(motion, Mask(ALL, 15, 25)).motion
+    assert torch.equal(made.local_quat_xyzw[25:], motion.local_quat_xyzw[25:])
+
+
 @pytest.mark.parametrize("method", ["infiller", "auto"])
 def test_gaps_at_the_beginning_and_the_end_are_extended_into_and_said(method):
     motion = on_rig("bandai", 50)
