@@ -34,6 +34,8 @@ class TrainOptions(ABC):
     """Kind of model, as the command line calls it."""
     recipe_class: ClassVar[str]
     """Module and class of its recipe."""
+    network: ClassVar[str] = ""
+    """Module of its network and of the paper's."""
     used_by: ClassVar[str]
     """How commands take what was trained."""
     single_thread: ClassVar[bool] = True
@@ -95,7 +97,8 @@ class TrainOptions(ABC):
 
     def find_parts(self, kind: Any) -> dict[str, Any]:
         """Return the network's shape and the settings that the options change."""
-        return {field.name: field.default_factory() for field in fields(kind) if field.name in ("config", "settings")}
+        found = {field.name: field.default_factory() for field in fields(kind) if field.name in ("config", "settings")}
+        return found | ({"config": import_module(self.network).PAPER} if getattr(self, "paper", False) else {})
 
     def collect(self) -> dict[str, Any]:
         """Collect the options by the names of the recipe's fields, its settings' and its network's; None is not
@@ -188,6 +191,7 @@ class TrainDensity(TunableOptions):
 
     model = "lstm-gmm"
     recipe_class = "lstm_gmm:DensityRecipe"
+    network = "priors.lstm_gmm.network"
     used_by = "use it with --prior"
     single_thread = False
 
@@ -233,7 +237,6 @@ class TrainDensity(TunableOptions):
 
     def find_parts(self, kind: Any) -> dict[str, Any]:
         """Return the network's shape and the settings that the options change."""
-        from priors.lstm_gmm import network
         from priors.training.augmentation.clip_copies import ClipCopies
 
         parts = super().find_parts(kind)
@@ -242,7 +245,7 @@ class TrainDensity(TunableOptions):
         critic = replace(settings.critic, steps=self.critic_steps)
         # Set together, since the critic's steps are checked against all.
         settings = replace(settings, steps=self.steps or settings.steps, copies=copies, critic=critic)
-        return {"config": network.PAPER if self.paper else parts["config"], "settings": settings}
+        return {**parts, "settings": settings}
 
     def collect(self) -> dict[str, Any]:
         """Collect the options; copies and splices have settings of their own."""
@@ -259,6 +262,7 @@ class TrainRefiner(NetworkOptions):
 
     model = "refiner"
     recipe_class = "refiner:RefinerRecipe"
+    network = "priors.refiner.network"
     used_by = "use it with --refiner"
 
     match: Annotated[str | None, arg(metavar="REGEX")] = None
@@ -268,12 +272,6 @@ class TrainRefiner(NetworkOptions):
     """The prior whose samples it refines."""
     paper: bool = False
     """The network of Wang et al. 2019; other options still hold."""
-
-    def find_parts(self, kind: Any) -> dict[str, Any]:
-        """Return the network's shape and the settings that the options change."""
-        from priors.refiner import network
-
-        return super().find_parts(kind) | ({"config": network.PAPER} if self.paper else {})
 
 
 @dataclass(frozen=True)
@@ -360,6 +358,7 @@ class TrainTweener(TunableOptions):
 
     model = "tweener"
     recipe_class = "tweener:TweenerRecipe"
+    network = "priors.tweening.generator"
     used_by = "use it with mapctl tween --method tweener --inbetweener"
 
     path: options.MaybeName = None
@@ -371,12 +370,6 @@ class TrainTweener(TunableOptions):
     """Class of a clip by its path below the data folder, for `mapctl tween --dna NAME`: what the first group matches;
     if not given, Bandai Namco's content, else the folder or the file's name without a number."""
 
-    def find_parts(self, kind: Any) -> dict[str, Any]:
-        """Return the network's shape and the settings that the options change."""
-        from priors.tweening import generator
-
-        return super().find_parts(kind) | ({"config": generator.PAPER} if self.paper else {})
-
 
 @dataclass(frozen=True)
 class TrainStitcher(TunableOptions):
@@ -385,7 +378,11 @@ class TrainStitcher(TunableOptions):
 
     model = "stitcher"
     recipe_class = "stitcher:StitcherRecipe"
+    network = "priors.stitching.network"
     used_by = "use it with --stitcher"
+
+    paper: bool = False
+    """The scheme of Ren et al. 2024, at our widths; other options still hold."""
 
 
 KINDS: Mapping[str, type[TrainOptions]] = {

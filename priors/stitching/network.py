@@ -18,6 +18,7 @@ by the phase makes the next frame. Departures from what is printed; with `Stitch
 """
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -47,6 +48,8 @@ _LEAST_LOG_SIGMA, _MOST_LOG_SIGMA = -5.0, 1.0
 class StitcherConfig(NetworkConfig):
     """Shape of one side's networks; the other's is the same."""
 
+    FIXED: ClassVar = {"without": ["d"]}
+
     embedding: tuple[int, ...] = (192, 192, 96)
     """Layers of the encoders of state, offset and target; the last is even."""
     encoder: int = 192
@@ -69,14 +72,10 @@ class StitcherConfig(NetworkConfig):
     """Width of the two hidden layers of the phase's networks."""
     longest: int = 61
     """Frames from one pose to the other in the longest transition."""
-    without: tuple[str, ...] = ()
-    """Parts that are left out of training: `d`, the critics, or none."""
     printed: bool = False
     """The scheme as the paper prints it, at these widths."""
 
     def __post_init__(self):
-        if self.without not in ((), ("d",)):
-            raise RequestError(f"a stitcher is trained without ('d',) or without nothing, (); got {self.without}")
         if self.embedding[-1] % 2 or self.longest < 2:
             raise RequestError("a stitcher's embedding is even, and its longest transition of 2 frames at least")
         if self.printed and self.shared:
@@ -87,6 +86,10 @@ class StitcherConfig(NetworkConfig):
         """Numbers that the decoder is given beside the latent: the embeddings and what the encoder made of them, or as
         printed the embeddings of state and target."""
         return 2 * self.embedding[-1] if self.printed else 3 * self.embedding[-1] + self.encoder
+
+
+PAPER = StitcherConfig(shared=0, own=16, printed=True)
+"""The scheme of Ren et al. 2024, at our widths."""
 
 
 @dataclass(frozen=True, eq=False)

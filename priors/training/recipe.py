@@ -251,19 +251,23 @@ class Recipe(ABC, Generic[C, S, T]):
 class NetworkRecipe(Recipe[C, S, G]):
     """Recipe of one network, which may start from another network's weights."""
 
+    trainer_class: ClassVar[Callable[..., Any]]
+    """Makes the trainer of a network's shape, settings and clips."""
+
     init: str | None = None
     """Begin with the weights of this model, bundled or trained."""
     init_share: float = 0.0
     """Share of those weights in the ones that are written: the mean of both is often better on familiar and on
     unfamiliar data than either (Wortsman et al. 2022)."""
 
-    @abstractmethod
     def draw_trainer(self, parts: Split) -> G:
         """Make the trainer with drawn weights."""
+        return self.trainer_class(self.config, self.settings, parts.train)
 
     def make_trainer(self, parts: Split) -> G:
         """Make the trainer as it is before the first step."""
         trainer = self.draw_trainer(parts)
+        trainer.grown = self.init is not None
         if self.init is not None and not self.resume:
             trainer.network.load_state_dict(self.read_initial_weights(self.init, trainer))
         return trainer

@@ -84,12 +84,17 @@ class Trainer(ABC, Generic[Network]):
 class GradientTrainer(Trainer[Network]):
     """One network, one loss: AdamW, unless another is made; the learning rate rises, then falls along a cosine."""
 
-    def __init__(self, make: Callable[[], Network], *, steps: int, learning_rate: float, seed: int):
-        """`make` builds the network (see `draw_weights`)."""
-        super().__init__(steps=steps, seed=seed)
-        self.learning_rate = learning_rate
-        self.network = draw_weights(make, seed).to(torch.get_default_device())
+    def __init__(self, make: Callable[[], Network], settings: Any):
+        """`make` builds the network (see `draw_weights`); settings have steps, a learning rate and a seed."""
+        super().__init__(steps=settings.steps, seed=settings.seed)
+        self.settings, self.learning_rate, self.grown = settings, settings.learning_rate, False
+        self.network = draw_weights(make, settings.seed).to(torch.get_default_device())
         self._optimisers = self.make_optimisers()
+
+    @property
+    def progress(self) -> float:
+        """Share of training that is done, by which tasks become harder; 1 where the weights began as trained ones."""
+        return 1.0 if self.grown else self.step / self.steps
 
     @abstractmethod
     def losses(self) -> dict[str, Tensor]:

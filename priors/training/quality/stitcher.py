@@ -10,11 +10,9 @@ from mapctl.skeleton import CANONICAL
 from priors.stitching.joining import Joined, join_sides
 from priors.stitching.latents import DrawnLatents
 from priors.stitching.network import StitcherNetwork
-from priors.stitching.posterior import PosteriorNetwork
 from priors.stitching.sides import Latents, count_made, walk_sides
 from priors.training.augmentation.transition_windows import Known, Transition, TransitionWindows
 from priors.training.devices import make_generator
-from priors.training.recipes.stitcher_latents import TaughtLatents, miss_calmly
 from priors.training.recipes.stitcher_losses import interpolate
 
 VALIDATED_GAPS = (5, 15, 30, 45)
@@ -24,20 +22,13 @@ TEMPERATURES = (0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0, 2.25, 2.5, 2.75, 3.0)
 _WINDOWS, _DRAWS = 96, 8
 _DRAWN_GAP = 30
 _AS_NEAR = 1.01  # of the least error of the best draw
-_ACTIVE = 0.01  # variance of a posterior's mean from which on a dimension is in use
 
 
 @torch.no_grad()
-def measure_transitions(
-    network: StitcherNetwork, posterior: PosteriorNetwork, windows: TransitionWindows
-) -> dict[str, float]:
+def measure_transitions(network: StitcherNetwork, windows: TransitionWindows) -> dict[str, float]:
     """Measure the calm answer to two bare poses, and to a pose after 10 frames, as shares of the interpolation's mean
-    distance of joints; and in a gap of 30 frames what the latents do, draws at the weights' temperature.
-
-    Distances are in cm: `apart` of the sides before they are joined, `spread` of 8 draws from each other. `calm`,
-    `informed`, `draw` and `best` are errors of an answer with latents at the prior's mean, with the posterior's, of one
-    draw and of the best of 8; `jitter` is the mean acceleration over mocap's; `active` counts latent dimensions, `nats`
-    a transition's divergence.
+    distance of joints; and in a gap of 30 frames, in cm, errors of one draw and of the best of 8, and how far draws are
+    apart. `apart` is the distance of the sides before they are joined, cm.
     """
     row: dict[str, float] = {}
     for name, known in (("bare", Known()), ("past", Known(before=10))):
@@ -52,7 +43,7 @@ def measure_transitions(
             if known == Known():
                 row[f"apart_{gap}_cm"] = 100 * float(joined.apart.mean())
             if known == Known() and gap == _DRAWN_GAP:
-                row |= _measure_draws(network, posterior, truth, places)
+                row |= _measure_draws(network, truth, places)
     return row
 
 
@@ -99,38 +90,14 @@ def _true_places(truth: Transition) -> tuple[Tensor, Tensor]:
     return true, guess
 
 
-def _measure_draws(
-    network: StitcherNetwork, posterior: PosteriorNetwork, truth: Transition, places: Tensor
-) -> dict[str, float]:
-    calm = place(answer(network, truth, make_calm(network, truth)))
+def _measure_draws(network: StitcherNetwork, truth: Transition, places: Tensor) -> dict[str, float]:
     draws = _draw(network, truth, float(network.temperature))
     errors = (draws - places).norm(dim=-1).mean(dim=(2, 3))
-    shares = walk_sides(network, truth.ends(), truth.frames, make_calm(network, truth)).shares
+    pairs = [(one - other).norm(dim=-1).mean() for number, one in enumerate(draws) for other in draws[:number]]
     return {
-        "calm_cm": 100 * float((calm - places).norm(dim=-1).mean()),
         "draw_cm": 100 * float(errors[0].mean()),
         "best_cm": 100 * float(errors.amin(dim=0).mean()),
-        "spread_cm": 100 * float(_measure_spread(draws)),
-        "jitter": float(_measure_acceleration(draws[0]) / _measure_acceleration(places)),
-        "calm_jitter": float(_measure_acceleration(calm) / _measure_acceleration(places)),
-        "expert_least": float(shares.mean(dim=(0, 1, 2)).amin()),
-    } | _measure_posterior(network, posterior, truth, places)
-
-
-def _measure_posterior(
-    network: StitcherNetwork, posterior: PosteriorNetwork, truth: Transition, places: Tensor
-) -> dict[str, float]:
-    latents = TaughtLatents(
-        posterior, (truth.truth() - network.mean) / network.std, miss_calmly(network, truth), make_calm(network, truth)
-    )
-    informed = place(answer(network, truth, latents))
-    active = [(means.var(dim=0) > _ACTIVE).sum() for means in (latents.means[0], torch.cat(latents.means[1:]))]
-    return {
-        "informed_cm": 100 * float((informed - places).norm(dim=-1).mean()),
-        "active_shared": float(active[0]),
-        "active_own": float(active[1]),
-        "shared_nats": float(latents.count_nats()[0].sum(dim=1).mean()),
-        "own_nats": float(latents.count_nats()[1].sum(dim=1).mean()),
+        "spread_cm": 100 * float(torch.stack(pairs).mean()),
     }
 
 
@@ -145,13 +112,3 @@ def _draw(
     generator, batch, made = make_generator(0), len(truth.features), count_made(network, truth.frames)
     latents = [DrawnLatents.sample(network.config, batch, made, generator) for _ in range(_DRAWS)]
     return torch.stack([place(answer(network, truth, each.scale(temperature))) for each in latents])
-
-
-def _measure_spread(draws: Float[Tensor, "draws batch frames joints 3"]) -> Tensor:
-    """Mean distance of draws from each other."""
-    pairs = [(one - other).norm(dim=-1).mean() for number, one in enumerate(draws) for other in draws[:number]]
-    return torch.stack(pairs).mean()
-
-
-def _measure_acceleration(places: Float[Tensor, "batch frames joints 3"]) -> Tensor:
-    return torch.diff(places, n=2, dim=1).norm(dim=-1).mean()

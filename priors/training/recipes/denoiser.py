@@ -19,7 +19,7 @@ from priors.config import require_at_least
 from priors.denoiser.network import DenoiserConfig, DenoiserNetwork
 from priors.training.augmentation.corruption import CorruptionSettings, corrupt, make_clean_capture
 from priors.training.augmentation.unfamiliar_poses import PoseVariation, vary_features
-from priors.training.corpus import Corpus, Split
+from priors.training.corpus import Corpus
 from priors.training.devices import make_generator
 from priors.training.recipe import NetworkRecipe, Row, average_logarithms
 from priors.training.trainer import GradientTrainer
@@ -75,14 +75,8 @@ class DenoiserTrainer(GradientTrainer[DenoiserNetwork]):
 
     def __init__(self, config: DenoiserConfig, settings: DenoiserSettings, corpus: Corpus):
         """RequestError where no clip is as long as a window."""
-        self.settings = settings
         self.windows = FeatureWindows(corpus, settings.window, evenness=settings.evenness)
-        super().__init__(
-            lambda: DenoiserNetwork(config, bfloat16=settings.bfloat16),
-            steps=settings.steps,
-            learning_rate=settings.learning_rate,
-            seed=settings.seed,
-        )
+        super().__init__(lambda: DenoiserNetwork(config, bfloat16=settings.bfloat16), settings)
 
     def losses(self) -> dict[str, Tensor]:
         """Compute the losses of a newly drawn batch."""
@@ -107,14 +101,11 @@ class DenoiserRecipe(NetworkRecipe[DenoiserConfig, DenoiserSettings, DenoiserTra
     """What to train a denoiser on, and how."""
 
     kind = "denoiser"
+    trainer_class = DenoiserTrainer
     config: DenoiserConfig = field(default_factory=DenoiserConfig)
     """The network."""
     settings: DenoiserSettings = field(default_factory=DenoiserSettings)
     """How it is trained."""
-
-    def draw_trainer(self, parts: Split) -> DenoiserTrainer:
-        """Make the trainer with drawn weights."""
-        return DenoiserTrainer(self.config, self.settings, parts.train)
 
     def score(self, row: Row) -> float:
         """The loss of unseen windows."""

@@ -13,7 +13,7 @@ from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors.config import require_at_least
 from priors.infiller.network import InfillerConfig, InfillerNetwork
 from priors.training.augmentation.gap_masks import GapSettings, sample_observation_mask
-from priors.training.corpus import Corpus, Split
+from priors.training.corpus import Corpus
 from priors.training.devices import make_generator
 from priors.training.recipe import NetworkRecipe, Row, average_logarithms
 from priors.training.trainer import GradientTrainer
@@ -64,14 +64,8 @@ class InfillerTrainer(GradientTrainer[InfillerNetwork]):
     """Draws windows, cuts gaps into them, and brings the network nearer to filling them."""
 
     def __init__(self, config: InfillerConfig, settings: InfillerSettings, corpus: Corpus):
-        self.settings = settings
         self.windows = PositionWindows(corpus, frames=settings.window, evenness=settings.evenness)
-        super().__init__(
-            lambda: InfillerNetwork(config, bfloat16=settings.bfloat16),
-            steps=settings.steps,
-            learning_rate=settings.learning_rate,
-            seed=settings.seed,
-        )
+        super().__init__(lambda: InfillerNetwork(config, bfloat16=settings.bfloat16), settings)
         mean, std = self.windows.moments()
         self.network.mean.copy_(mean)
         self.network.std.copy_(std.clamp_min(_MIN_STD))
@@ -110,14 +104,11 @@ class InfillerRecipe(NetworkRecipe[InfillerConfig, InfillerSettings, InfillerTra
     """What to train an infiller on, and how."""
 
     kind = "infiller"
+    trainer_class = InfillerTrainer
     config: InfillerConfig = field(default_factory=InfillerConfig)
     """The network."""
     settings: InfillerSettings = field(default_factory=InfillerSettings)
     """How it is trained."""
-
-    def draw_trainer(self, parts: Split) -> InfillerTrainer:
-        """Make the trainer with drawn weights."""
-        return InfillerTrainer(self.config, self.settings, parts.train)
 
     def score(self, row: Row) -> float:
         """Error of gaps in unseen windows over that of the guess, geometric mean over their lengths."""

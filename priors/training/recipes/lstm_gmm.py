@@ -106,14 +106,8 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
     ):
         """`labels` of the corpus' clips, the network's own, with those of PACE_LABELS held by none; `paces` of its
         frames, as `follow_paces` finds them, if these are told; `init` holds weights and statistics to begin with."""
-        self.settings = settings
         mean, std = compute_feature_statistics(corpus.features)
-        super().__init__(
-            lambda: LstmGmm(config, mean=mean, std=std),
-            steps=settings.steps,
-            learning_rate=settings.learning_rate,
-            seed=settings.seed,
-        )
+        super().__init__(lambda: LstmGmm(config, mean=mean, std=std), settings)
         if init is not None:
             self.network.load_state_dict(dict(init))
         self.labels = labels or Labels.none(len(corpus.lengths))

@@ -16,7 +16,7 @@ from mapctl.metrics.root_prediction import SPANS, average_displacement_errors, c
 from priors.config import require_at_least
 from priors.training.augmentation.pose_windows import PoseWindows, Variation, find_kind
 from priors.training.augmentation.unfamiliar_poses import PoseVariation
-from priors.training.corpus import Corpus, Split
+from priors.training.corpus import Corpus
 from priors.training.devices import make_generator
 from priors.training.recipe import NetworkRecipe, Row, average_logarithms
 from priors.training.trainer import GradientTrainer
@@ -63,16 +63,10 @@ class PathTrainer(GradientTrainer[PathNetwork]):
     """Draws windows, and brings the trajectory that the network predicts of them nearer to their own."""
 
     def __init__(self, config: PathConfig, settings: PathSettings, corpus: Corpus):
-        self.settings = settings
         self.windows = PoseWindows(corpus, kinds=settings.kinds, evenness=settings.evenness)
         # A window at the fastest tempo must fit into the longest clip.
         self.longest = min(settings.window, int(int(self.windows.lengths.max()) / (1 + settings.variation.tempo)) - 1)
-        super().__init__(
-            lambda: PathNetwork(config, bfloat16=settings.bfloat16),
-            steps=settings.steps,
-            learning_rate=settings.learning_rate,
-            seed=settings.seed,
-        )
+        super().__init__(lambda: PathNetwork(config, bfloat16=settings.bfloat16), settings)
         _set_moments(self.network, self.windows)
 
     def losses(self) -> dict[str, Tensor]:
@@ -106,14 +100,11 @@ class PathRecipe(NetworkRecipe[PathConfig, PathSettings, PathTrainer]):
     """What to train a path predictor on, and how."""
 
     kind = "path"
+    trainer_class = PathTrainer
     config: PathConfig = field(default_factory=PathConfig)
     """The network."""
     settings: PathSettings = field(default_factory=PathSettings)
     """How it is trained."""
-
-    def draw_trainer(self, parts: Split) -> PathTrainer:
-        """Make the trainer with drawn weights."""
-        return PathTrainer(self.config, self.settings, parts.train)
 
     def score(self, row: Row) -> float:
         """Errors over unseen clips, cm, geometric mean over spans and the height."""

@@ -18,7 +18,7 @@ from priors.pose_transformer.network import QUANTILES, PoseTransformerConfig, Po
 from priors.training.augmentation.part_masks import PartSettings, sample_known_parts
 from priors.training.augmentation.pose_windows import PoseWindows, Variation, add_targets
 from priors.training.augmentation.unfamiliar_poses import PoseVariation
-from priors.training.corpus import Corpus, Split
+from priors.training.corpus import Corpus
 from priors.training.devices import make_generator
 from priors.training.recipe import Export, Gathered, NetworkRecipe, Row, average_logarithms
 from priors.training.trainer import GradientTrainer, make_adam
@@ -86,15 +86,9 @@ class PoseTransformerTrainer(GradientTrainer[PoseTransformerNetwork]):
     """Draws windows, hides parts of them, and brings the network nearer to proposing them."""
 
     def __init__(self, config: PoseTransformerConfig, settings: PoseTransformerSettings, corpus: Corpus):
-        self.settings = settings
         self.windows = PoseWindows(corpus, kinds=settings.kinds, evenness=settings.evenness)
         self.longest = min(settings.window, int(self.windows.lengths.max()) * 9 // 10 - 1)
-        super().__init__(
-            lambda: PoseTransformerNetwork(config, bfloat16=settings.bfloat16),
-            steps=settings.steps,
-            learning_rate=settings.learning_rate,
-            seed=settings.seed,
-        )
+        super().__init__(lambda: PoseTransformerNetwork(config, bfloat16=settings.bfloat16), settings)
         _set_moments(self.network, self.windows)
 
     def make_optimisers(self) -> dict[str, torch.optim.Optimizer]:
@@ -156,14 +150,11 @@ class PoseTransformerRecipe(NetworkRecipe[PoseTransformerConfig, PoseTransformer
     """What to train a pose transformer on, and how."""
 
     kind = "pose-transformer"
+    trainer_class = PoseTransformerTrainer
     config: PoseTransformerConfig = field(default_factory=PoseTransformerConfig)
     """The network."""
     settings: PoseTransformerSettings = field(default_factory=PoseTransformerSettings)
     """How it is trained."""
-
-    def draw_trainer(self, parts: Split) -> PoseTransformerTrainer:
-        """Make the trainer with drawn weights."""
-        return PoseTransformerTrainer(self.config, self.settings, parts.train)
 
     def score(self, row: Row) -> float:
         """Error of unseen windows over the interpolation's, geometric mean over gaps and lost arms."""

@@ -67,20 +67,12 @@ class StitcherTrainer(GradientTrainer[StitcherNetwork]):
     """Draws transitions, hides what is between their ends, and brings both sides nearer to it."""
 
     def __init__(self, config: StitcherConfig, settings: StitcherSettings, corpus: Corpus):
-        self.settings = settings
-        self.grown = False
-        """Whether transitions are as long as they get from the first step on."""
         self.windows = TransitionWindows(corpus, kinds=settings.kinds, evenness=settings.evenness)
         self.longest = min(config.longest, settings.window, max(corpus.lengths) - 2 * _CONTEXT - 1)
         if self.longest < _SHORTEST:
             raise RequestError(f"a stitcher needs clips of {_SHORTEST + 2 * _CONTEXT + 1} frames and more")
         device = torch.get_default_device()
-        super().__init__(
-            lambda: self._make(config, device),
-            steps=settings.steps,
-            learning_rate=settings.learning_rate,
-            seed=settings.seed,
-        )
+        super().__init__(lambda: self._make(config, device), settings)
         _set_moments(self.network, corpus)
         self.average = copy.deepcopy(self.network).requires_grad_(False)
         """Moving average of the weights: what is measured and exported."""
@@ -110,8 +102,8 @@ class StitcherTrainer(GradientTrainer[StitcherNetwork]):
 
     def losses(self) -> dict[str, Tensor]:
         """Compute the losses of a newly drawn batch."""
-        settings, done = self.settings, 1.0 if self.grown else self.step / self.steps
-        longest = _FIRST_LONGEST + max(0, self.longest - _FIRST_LONGEST) * min(1.0, done / _LENGTH_GROWTH)
+        settings = self.settings
+        longest = _FIRST_LONGEST + max(0, self.longest - _FIRST_LONGEST) * min(1.0, self.progress / _LENGTH_GROWTH)
         longest = max(_SHORTEST, min(round(longest), self.longest))
         frames = int(torch.randint(_SHORTEST, longest + 1, (), generator=self.generator))
         truth = self.windows.draw(settings.batch, frames, _draw_known(self.generator), self.generator)
@@ -134,7 +126,7 @@ class StitcherTrainer(GradientTrainer[StitcherNetwork]):
     def validate(self, corpus: Corpus) -> dict[str, Any]:
         """Measure transitions of unseen clips."""
         windows = TransitionWindows(corpus, kinds=self.settings.kinds, evenness=1.0)
-        return measure_transitions(self.average, self.posterior, windows)
+        return measure_transitions(self.average, windows)
 
 
 def _draw_known(generator: torch.Generator) -> Known:
@@ -153,17 +145,11 @@ class StitcherRecipe(NetworkRecipe[StitcherConfig, StitcherSettings, StitcherTra
     """What to train a stitcher on, and how."""
 
     kind = "stitcher"
+    trainer_class = StitcherTrainer
     config: StitcherConfig = field(default_factory=StitcherConfig)
     """The networks."""
     settings: StitcherSettings = field(default_factory=StitcherSettings)
     """How they are trained."""
-
-    def draw_trainer(self, parts: Split) -> StitcherTrainer:
-        """Make the trainer with drawn weights."""
-        trainer = StitcherTrainer(self.config, self.settings, parts.train)
-        # Who begins with weights of a run has seen them grow.
-        trainer.grown = self.init is not None
-        return trainer
 
     def make_trainer(self, parts: Split) -> StitcherTrainer:
         """As it is before the first step."""

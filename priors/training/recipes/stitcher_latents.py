@@ -33,19 +33,17 @@ class TaughtLatents:
     """Divergences from the prior by row and dimension, the transition's first and then those of frames."""
     cost: Tensor = field(default_factory=lambda: torch.zeros(()))
     """The transition's divergence from a standard normal distribution, by row and dimension."""
-    means: list[Tensor] = field(default_factory=list)
-    """Means of the posterior: the transition's, and then those of frames."""
 
     def share(self, prior: Gaussian, seen: Float[Tensor, "2 batch seen"]) -> Float[Tensor, "batch shared"]:
         """What both sides share over the transition."""
         count = self.missed.shape[1]
         if not count:
-            self._count(self.noise.shared[:0], self.noise.shared[:0])
+            self.nats.append(self.noise.shared[:0])
             return self.noise.share(prior, seen)
         told = self.posterior.tell_shared(self.missed)
         self.cost = told.diverge(Gaussian(torch.zeros_like(told.mean), torch.zeros_like(told.mean)))
         # Held to a prior that sees the ends, the posterior would learn to tell nothing but these.
-        self._count(told.detach().diverge(prior.row(slice(count))), told.mean)
+        self.nats.append(told.detach().diverge(prior.row(slice(count))))
         noise = self.noise.shared
         return torch.cat([told.draw(noise[:count]), prior.row(slice(count, None)).draw(noise[count:])])
 
@@ -54,26 +52,19 @@ class TaughtLatents:
         last = self.truth.shape[2] - 1
         ahead = [min(step + number, last) for number in range(SEEN_FUTURE)]
         told = self.posterior.tell_own(self.truth[:, :, ahead], encoded)
-        self._count(told.diverge(prior).mean(dim=0), told.mean[0])
+        self.nats.append(told.diverge(prior).mean(dim=0))
         noise = self.noise.slow[:, :, step]
         informed = torch.arange(noise.shape[1]) < self.missed.shape[1]
         return torch.where(informed[:, None], told.draw(noise), prior.draw(noise))
-
-    def count_nats(self) -> tuple[Float[Tensor, "informed shared"], Float[Tensor, "batch own"]]:
-        """Count those of what is shared, and sum those of all frames."""
-        return self.nats[0], torch.stack(self.nats[1:]).sum(dim=0)
 
     def diverge(self) -> dict[str, Tensor]:
         """Return the divergences that are learnt, nats a transition, by the names of their weights."""
         count = self.missed.shape[1]
         if not count:
             return {name: torch.zeros(()) for name in ("shared", "prior", "own")}
-        prior, own = (each[:count].mean(dim=0).sum() for each in self.count_nats())
+        shared, frames = self.nats[0], torch.stack(self.nats[1:]).sum(dim=0)
+        prior, own = (each[:count].mean(dim=0).sum() for each in (shared, frames))
         return {"shared": self.cost.mean(dim=0).sum(), "prior": prior, "own": own}
-
-    def _count(self, nats: Tensor, mean: Tensor) -> None:
-        self.nats.append(nats)
-        self.means.append(mean)
 
 
 @torch.no_grad()

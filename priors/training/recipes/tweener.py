@@ -81,18 +81,11 @@ class TweenerTrainer(GradientTrainer[GeneratorNetwork]):
     """Draws sequences, hides all but their keys, and brings the generator nearer to what was between."""
 
     def __init__(self, config: GeneratorConfig, settings: TweenerSettings, corpus: Corpus, path: PathNetwork):
-        self.settings, self.path = settings, path.to(torch.get_default_device())
-        self.grown = False
-        """Whether gaps are as long as they get from the first step on."""
+        self.path = path.to(torch.get_default_device())
         self.windows = PoseWindows(corpus, kinds=settings.kinds, evenness=settings.evenness)
         fits = int(int(self.windows.lengths.max()) / (1 + settings.tempo)) - 1
         self.longest = min(settings.window, fits)
-        super().__init__(
-            lambda: GeneratorNetwork(config, bfloat16=settings.bfloat16),
-            steps=settings.steps,
-            learning_rate=settings.learning_rate,
-            seed=settings.seed,
-        )
+        super().__init__(lambda: GeneratorNetwork(config, bfloat16=settings.bfloat16), settings)
         _set_moments(self.network, self.windows)
 
     def make_optimisers(self) -> dict[str, torch.optim.Optimizer]:
@@ -102,7 +95,7 @@ class TweenerTrainer(GradientTrainer[GeneratorNetwork]):
     def losses(self) -> dict[str, Tensor]:
         """Compute the losses of a newly drawn batch."""
         settings = self.settings
-        progress = 1.0 if self.grown else self.step / self.steps
+        progress = self.progress
         reach = round(1.25 * settings.layout.longest_at(progress))
         shortest = min(_SHORTEST_WINDOW, self.longest)
         frames = self._draw_frames(shortest, min(self.longest, shortest + reach))
@@ -164,10 +157,7 @@ class TweenerRecipe(NetworkRecipe[GeneratorConfig, TweenerSettings, TweenerTrain
         group_clips(parts.train.names, self.labels)  # what the end of training needs
         network = path_predictor.load(self.path).network
         network.reduced_precision = self.settings.bfloat16
-        trainer = TweenerTrainer(self.config, self.settings, parts.train, network)
-        # Who begins with weights of a run has seen them grow.
-        trainer.grown = self.init is not None
-        return trainer
+        return TweenerTrainer(self.config, self.settings, parts.train, network)
 
     def score(self, row: Row) -> float:
         """Error of unseen gaps over slerp's, geometric mean over kinds of clips."""

@@ -10,8 +10,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool1d
 from torch.nn.functional import binary_cross_entropy_with_logits as cross_entropy
 
-from mapctl import kinematics, rotations
-from mapctl.inbetweening import PositionImage
+from mapctl import kinematics
 from mapctl.inbetweening.partial_motion import PartialMotion
 from mapctl.inbetweening.root_trajectory import LocalMotion, RootTrajectory
 from mapctl.metrics.root_prediction import compute_displacement_errors
@@ -203,10 +202,6 @@ def _weigh_frames(known: Bool[Tensor, "batch frames"], weights: LossWeights) -> 
     frame = torch.arange(known.shape[1])
     away = torch.minimum((frame - last_observed(known)).abs(), (next_observed(known) - frame).abs())
     return 1 / (1 + away / weights.half)
-
-
-def _turn_to_world(places: Tensor, image: PositionImage) -> Tensor:
-    return rotations.rotate_about_y(places, image.heading[..., None])
 
 
 def _average_seconds(values: Float[Tensor, "batch frames columns"]) -> Float[Tensor, "batch seconds columns"]:
