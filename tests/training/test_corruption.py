@@ -10,7 +10,7 @@ from helpers import corpus, generator
 from mapctl import rotations
 from mapctl.features import LAYOUT
 from mapctl.kinematics import chain_matrices
-from mapctl.recording.noise_estimation import estimate_angle_noise, estimate_position_noise
+from mapctl.recording.noise_estimation import estimate_position_noise
 from mapctl.skeleton import CANONICAL
 from priors.training.augmentation import corruption
 from priors.training.augmentation.corruption import CorruptionSettings, corrupt, make_clean_capture
@@ -68,15 +68,6 @@ def test_where_nothing_is_asked_for_nothing_changes(clean):
     assert not same.sigma_root.any()
 
 
-def test_shapes_stay_and_the_clean_one_is_not_touched(clean):
-    before = clean.root.clone(), clean.joints.clone(), clean.seen.clone()
-    other = spoilt(clean, CorruptionSettings())
-    for name in ("root", "hips", "joints", "seen_root", "seen", "sigma_root", "sigma"):
-        assert getattr(other, name).shape == getattr(clean, name).shape
-        assert getattr(other, name).isfinite().all()
-    assert all(map(torch.equal, before, (clean.root, clean.joints, clean.seen)))
-
-
 def test_a_seed_draws_the_same_and_another_something_else(clean):
     first, again, other = (spoilt(clean, CorruptionSettings(), seed) for seed in (3, 3, 4))
     for name in ("root", "hips", "joints", "seen_root", "seen", "sigma_root", "sigma"):
@@ -95,19 +86,6 @@ def test_the_sigmas_told_are_those_of_the_noise(clean):
     assert apart.mean() == pytest.approx(1, abs=0.05)
     assert (noisy.sigma_root >= 0.0099).all()
     assert (noisy.sigma_root <= 0.0501).all()
-
-
-def test_what_the_network_is_told_is_a_little_wrong(clean):
-    exact, told = spoilt(clean, PLAIN), spoilt(clean, replace(PLAIN, told=0.2))
-    assert torch.equal(exact.joints, told.joints)
-    error = torch.log(told.sigma / exact.sigma)
-    assert float(error.std()) == pytest.approx(0.2, rel=0.1)
-
-
-def test_even_noise_is_the_same_of_all_joints_and_uneven_is_not(clean):
-    assert (spoilt(clean, PLAIN).sigma.std(dim=1) < 1e-6).all()
-    uneven = spoilt(clean, replace(PLAIN, uneven=0.5)).sigma.log().std(dim=1)
-    assert 0.2 < (uneven > 0.1).double().mean() < 0.8
 
 
 def bone_directions(capture):
@@ -132,17 +110,6 @@ def test_bones_point_from_one_noisy_place_to_the_next(clean):
         assert float(off) == pytest.approx(2 * 0.01 / length, rel=0.06)  # root of 2 for either of two directions
     thigh, shin = now["leftUpperLeg"] - was["leftUpperLeg"], now["leftLowerLeg"] - was["leftLowerLeg"]
     assert float((thigh * shin).sum(-1).mean()) < 0, "the knee is at the end of one and the beginning of the other"
-
-
-def test_the_sigma_told_of_noisy_places_is_what_an_estimate_finds(clean):
-    noisy = spoilt(clean, replace(PLAIN, markers=1.0, marker_cm=(0.5, 1.0)))
-    assert torch.allclose(noisy.sigma_root, (noisy.root - clean.root).std(dim=(1, 2)), rtol=0.25)
-    quats = torch.cat([noisy.hips[:, :, None], rotations.from_rotation_vector(noisy.joints)], dim=2).double()
-    every = torch.ones(FRAMES, JOINTS, dtype=torch.bool)
-    found = torch.stack([estimate_angle_noise(one, every) for one in quats[:8]])
-    share = (found / noisy.sigma[:8]).mean(dim=0)
-    assert ((share > 0.55) & (share < 1.3)).all(), share
-    assert noisy.sigma[0, CANONICAL.index("leftFoot")] > 1.2 * noisy.sigma[0, CANONICAL.index("leftUpperLeg")]
 
 
 def test_noise_that_lasts_is_told_as_an_estimate_from_frame_to_frame_would_tell_it():
@@ -183,15 +150,6 @@ def test_spikes_that_are_found_are_masked(clean):
         assert other.seen[~high].double().mean() > 0.995  # two axes may undo each other
 
 
-def test_dropouts_lose_joints_and_change_nothing(clean):
-    other = spoilt(clean, replace(NOTHING, dropout=0.4))
-    lost = (~other.seen).double().mean(dim=(1, 2))
-    assert 0 < (lost > 0).double().mean() < 0.6
-    assert lost.max() < 0.45
-    assert other.seen_root.all()
-    assert turned_deg(clean, other).abs().max() < 0.1
-
-
 def test_limbs_are_lost_together_and_for_one_while(clean):
     other = spoilt(clean, replace(NOTHING, limb=1.0))
     for window in ~other.seen:
@@ -201,16 +159,3 @@ def test_limbs_are_lost_together_and_for_one_while(clean):
         assert torch.equal(window[:, list(joints)], frames[:, None].expand(-1, len(joints)))
         assert (torch.diff(frames.int()) == 1).sum() <= 1
         assert (torch.diff(frames.int()) == -1).sum() <= 1
-
-
-def test_gaps_lose_everything_for_one_while(clean):
-    other = spoilt(clean, replace(NOTHING, gap=1.0))
-    assert (~other.seen_root).any(dim=1).double().mean() > 0.9
-    assert other.seen_root.any(dim=1).all()
-    assert torch.equal(other.seen.all(dim=-1), other.seen_root)
-    assert torch.equal(other.seen.any(dim=-1), other.seen_root)
-
-
-def test_limbs_name_each_joint_once():
-    assert all(len(set(limb)) == len(limb) for limb in LIMBS)
-    assert all(0 < joint < JOINTS for limb in LIMBS for joint in limb)

@@ -1,6 +1,5 @@
 """Which frames of a file are motion: tables, found and given; rows that make no sense; sets of users, trained on."""
 
-import json
 import re
 import shutil
 from pathlib import Path
@@ -9,11 +8,7 @@ import mocap_folders
 import pytest
 import torch
 from helpers import run, walk, write_corpus
-from rig_maker import make
 
-import mapctl
-import priors
-from mapctl import retarget
 from mapctl.errors import FileFormatError
 from mapctl.features import encode
 from priors.training.corpus import read_corpus
@@ -62,13 +57,6 @@ def test_a_table_in_the_folder_is_found_and_leaves_the_motion(styles, tmp_path):
         torch.testing.assert_close(clip, expected[name].float(), atol=2e-5, rtol=0)
     assert found.cuts == ("Frame_Cuts.csv: 5 of 5 clips",)
     assert found.skipped == ()
-
-
-def test_the_rig_and_its_tpose_are_understood(styles):
-    clip = mapctl.load(styles / "Zombie" / "Zombie_FW.bvh")
-    rigmap = retarget.identify_rig(clip.skeleton, motion=clip)
-    assert (rigmap.rig.name, rigmap.rest, clip.fps, clip.num_frames) == ("xsens", "T", 60, 200)
-    assert clip.skeleton.num_joints == 23
 
 
 @pytest.mark.slow
@@ -129,11 +117,6 @@ def test_takes_of_cmu_have_a_table_that_comes_with_mapctl(files, tmp_path, monke
     assert read(files, tmp_path, cuts=Path("cmu")).lengths[0] == 40
 
 
-def test_the_cache_knows_the_cuts(files, tmp_path):
-    for row, length in (("", 80), ("walk-0,5,44", 40), ("", 80), ("walk-0,5,45", 41)):
-        assert read(files, tmp_path, cuts=table(tmp_path, row) if row else None).lengths[0] == length
-
-
 def test_a_cut_that_a_file_is_too_short_for_leaves_the_file_out_and_says_so(files, tmp_path):
     found = read(files, tmp_path, cuts=table(tmp_path, "walk-0,5,80", "walk-1,79,", "walk-2,0,79"))
     assert found.names == ("walk-2.bvh",)
@@ -192,50 +175,3 @@ def test_a_missing_table_is_said(files, tmp_path, capsys):
 
 
 SMALL = ("--width", 8, "--components", 2, "--window", 20, "--steps", 2, "--batch", 3, "--device", "cpu")
-
-
-@pytest.mark.slow
-def test_a_density_is_trained_on_styles(styles, tmp_path, capsys):
-    out = tmp_path / "run"
-    words = ("--labels", LABELS, "--licence", "CC BY 4.0, 100STYLE (Mason et al. 2022)", *SMALL)
-    assert run("train", "lstm-gmm", "--data", styles, "-o", out, *words) == 0
-    told = capsys.readouterr().out
-    assert "frames by Frame_Cuts.csv: 5 of 5 clips" in told
-    card = priors.load(str(out)).card
-    assert card.licence == "CC BY 4.0, 100STYLE (Mason et al. 2022)"
-    assert card.data["cuts"] == ["Frame_Cuts.csv: 5 of 5 clips"]
-    known = {"FW", "ID", "SR", "TR1", "Aeroplane", "Zombie"}
-    told = [label.split("=") for label in card.config["labels"]]
-    assert {group for group, _ in told} == {"gait", "style"}
-    assert {value for _, value in told} <= known
-    assert run("info", out) == 0
-    assert "100STYLE (Mason et al. 2022)" in capsys.readouterr().out
-
-
-def test_a_density_is_trained_on_takes_of_the_other_set(tmp_path, capsys):
-    data = mocap_folders.write_takes(
-        tmp_path / "lafan", {"walk1_subject1": 180, "run2_subject4": 160, "dance1_subject1": 90}
-    )
-    (tmp_path / "cuts.csv").write_text("file,first,last\nwalk1_subject1,20,\n")
-    labels = r"(?P<gait>[a-z]+)\d+_subject(?P<subject>\d+)"
-    words = ("--match", "walk|run", "--labels", labels, "--cuts", tmp_path / "cuts.csv", "--licence", "CC BY-NC-ND 4.0")
-    assert run("train", "lstm-gmm", "--data", data, "-o", tmp_path / "run", *words, *SMALL) == 0
-    card = priors.load(str(tmp_path / "run")).card
-    assert (card.licence, card.data["clips"], card.data["frames"]) == ("CC BY-NC-ND 4.0", 2, 320)
-    assert set(card.config["labels"]) == {"gait=run", "gait=walk", "subject=1", "subject=4"}
-    assert "--cuts cuts.csv" in json.dumps(vars(card))
-    rigmap = retarget.identify_rig(make(mocap_folders.LAFAN_RIG).skeleton)
-    assert rigmap.rig.name == "lafan1"
-    capsys.readouterr()
-
-
-@pytest.mark.parametrize("fps", [30, 60, 120])
-def test_any_rate_gives_the_same_features(tmp_path, fps):
-    seconds = 2
-    folder = mocap_folders.write_styles(
-        tmp_path / "set", {"Plain": {"FW": (fps // 2, seconds * fps, fps // 3)}}, fps=fps
-    )
-    found = read(folder, tmp_path)
-    expected = encode(walk(seconds * 30))[0].float()
-    assert found.lengths == (60,)
-    torch.testing.assert_close(found.features[:, :-2], expected[:, :-2], atol=1e-4, rtol=0)

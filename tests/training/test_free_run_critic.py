@@ -5,15 +5,14 @@ from itertools import pairwise
 
 import pytest
 import torch
-from helpers import corpus, generator, tiny_model
+from helpers import corpus, generator
 
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT
 from mapctl.skeleton import CANONICAL
 from mapctl.terms.trial import Trial
 from priors.lstm_gmm.network import LstmGmmConfig
-from priors.training.history import HistoryBuffer
-from priors.training.moment_matching import MatchingSettings, run_free
+from priors.training.moment_matching import MatchingSettings
 from priors.training.recipes import density_critic as free_runs
 from priors.training.recipes.density_critic import CriticSettings
 from priors.training.recipes.lstm_gmm import DensityTrainer, TrainingSettings
@@ -67,19 +66,6 @@ def test_it_learns_to_tell_two_kinds_of_windows_apart_and_its_slope_is_bounded()
     assert float(moved.detach().square().mean()) <= float(slope) * 1.01
 
 
-def test_the_history_forgets_what_is_replaced_and_draws_what_is_kept():
-    history = HistoryBuffer(torch.zeros(6, 1, 1))
-    history.keep(torch.ones(4, 1, 1), generator())
-    assert float(history.windows.sum()) == 4
-    assert {*history.draw(64, generator()).flatten().tolist()} == {0.0, 1.0}
-
-
-def test_free_runs_are_as_long_as_the_critic_needs_and_begin_with_mocap():
-    found = run_free(tiny_model(), windows(16), MatchingSettings(wander=0, frames=4), generator(), least=9)
-    assert [each.shape[1] for each in found] == [12, 7]
-    torch.testing.assert_close(found[0][:, :3], found[1][:, :3])
-
-
 def test_the_density_hears_it_in_the_last_steps_only(monkeypatch):
     trainer, heard = make_trainer(), []
     score = trainer.judge.score
@@ -130,20 +116,6 @@ def test_it_learns_before_the_density_hears_it_and_then_in_each_step_from_what_w
     assert [int(count) for count in new] == [4, 4]
 
 
-def test_a_run_with_it_goes_on_to_the_bit():
-    whole = make_trainer()
-    for _ in range(4):
-        whole.train_step()
-    begun = make_trainer()
-    for _ in range(3):
-        begun.train_step()
-    resumed = make_trainer()
-    resumed.load_state({name: values.clone() for name, values in begun.state().items()}, 3)
-    assert resumed.train_step() == pytest.approx(begun.train_step(), rel=0, abs=0)
-    for name, values in whole.state().items():
-        assert torch.equal(values, resumed.state()[name]), name
-
-
 def test_what_is_kept_is_the_mean_of_the_weights_since_it_joined():
     trainer = make_trainer()
     for _ in range(2):
@@ -156,16 +128,6 @@ def test_what_is_kept_is_the_mean_of_the_weights_since_it_joined():
         keep = done / (done + 20)
         for mean, old, new in zip(trainer.average.parameters(), before, trainer.network.parameters(), strict=True):
             torch.testing.assert_close(mean, keep * old + (1 - keep) * new)
-
-
-@pytest.mark.slow  # it is validated twice
-def test_what_is_validated_is_the_mean():
-    trainer = make_trainer()
-    for _ in range(4):
-        trainer.train_step()
-    row = trainer.validate(corpus())
-    trainer.network.load_state_dict(trainer.average.state_dict())
-    assert trainer.validate(corpus()) == row
 
 
 def test_the_learning_rate_rises_anew_and_falls_to_nothing():
@@ -186,10 +148,3 @@ def test_the_learning_rate_rises_anew_and_falls_to_nothing():
 def test_a_critic_that_cannot_join_is_refused(steps, window, message):
     with pytest.raises(RequestError, match=message):
         replace(SETTINGS, window=window, critic=replace(CRITIC, steps=steps))
-
-
-def test_it_joins_a_density_that_is_held_to_no_moments(monkeypatch):
-    monkeypatch.setattr("priors.training.recipes.lstm_gmm.moment_loss", None)
-    trainer = make_trainer(replace(SETTINGS, matching=replace(SETTINGS.matching, begin=1.0)))
-    rows = [trainer.train_step() for _ in range(3)]
-    assert rows[2]["critic"] != rows[1]["critic"]

@@ -84,18 +84,6 @@ def test_a_reference_looks_along_its_way_where_no_heading_is_told():
     assert way[0, 20, 0] == pytest.approx(float(way[0, 40, 0]) / 2, abs=1e-5)
 
 
-def test_a_reference_takes_the_mean_direction_at_a_corner():
-    ground = torch.zeros(1, FRAMES, 2)
-    ground[0, 40:, 0], ground[0, FRAMES - 1] = 1.0, torch.tensor([1.0, 1.0])
-    _, facing = lead_reference(ground, torch.zeros(1, FRAMES), places_only([0, 40, FRAMES - 1]))
-    assert facing[0, [0, 40, -1]].tolist() == pytest.approx([math.pi / 2, math.pi / 4, 0.0], abs=1e-5)
-
-
-def test_who_stays_in_one_place_looks_ahead():
-    _, facing = lead_reference(torch.ones(1, FRAMES, 2), torch.ones(1, FRAMES), places_only([0, 40]))
-    assert bool((facing == 0).all())
-
-
 def test_headings_that_are_told_lead_and_a_view_does_not_turn():
     some = places_only([0, 40, FRAMES - 1])
     some.heading[0, 40] = True

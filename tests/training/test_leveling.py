@@ -5,17 +5,15 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers import moved, quat_xyzw, run
+from helpers import moved, quat_xyzw
 from performers import Performer
 
-import priors
 from mapctl import retarget, rotations
 from mapctl.contacts import detect_contacts
-from mapctl.features import LAYOUT, GroundPose, encode
+from mapctl.features import GroundPose, encode
 from mapctl.motion import Motion
 from mapctl.pose import BodyPose
 from mapctl.skeleton import CANONICAL, TOE_JOINTS, TOE_REST_HEIGHT
-from priors.training.corpus import read_corpus
 from priors.training.mocap.clips import read_clip_features
 from priors.training.mocap.cuts import Cut
 from priors.training.mocap.leveling import find_floor_slope, stand_on_canonical, turn_level
@@ -81,11 +79,6 @@ def test_toes_that_stand_on_no_plane_tell_no_slope():
     assert find_floor_slope(replace(rough, root_position=root)).tolist() == [0, 0]
 
 
-def test_on_a_level_floor_none_is_found():
-    assert find_floor_slope(SMALL.walks(120)).norm() < 1e-3
-    assert find_floor_slope(SMALL.stands(60)).norm() < 1e-6
-
-
 @pytest.mark.parametrize("performer", [SMALL, Performer(size=1.2, leg=0.9, toe_height=0.1), Performer(leg=1.1)])
 def test_features_decode_to_feet_that_stand_on_the_canonical_floor(performer):
     walked = sloping(performer.walks(120), 0.0, 0.02)
@@ -117,17 +110,3 @@ def test_a_file_is_read_so_where_it_is_asked_for(tmp_path):
     assert rests[1] == pytest.approx(TOE_REST_HEIGHT, abs=0.005)
     part = read_clip_features(tmp_path / "walk.bvh", cut=Cut(10, 100), level=True)
     assert len(part) == 90
-
-
-@pytest.mark.slow
-def test_the_command_takes_it_and_says_so_in_the_card(tmp_path):
-    data, out = tmp_path / "data", tmp_path / "run"
-    data.mkdir()
-    sloping(SMALL.walks(160), 0.0, 0.02).save(data / "walk.bvh")
-    plain = read_corpus(data, match="", cache=out / "cache")
-    words = ("--width", 8, "--components", 2, "--window", 20, "--steps", 1, "--batch", 3, "--device", "cpu", "--quiet")
-    assert run("train", "lstm-gmm", "--data", data, "-o", out, *words, "--level") == 0
-    prior = priors.load(str(out))
-    assert "--level" in prior.card.training["command"]
-    height = LAYOUT.slices["root_height"]
-    assert float(prior.reference.mean[height]) > float(plain.features[:, height].mean()) + 0.1

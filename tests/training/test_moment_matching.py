@@ -5,7 +5,6 @@ import pytest
 import torch
 from helpers import corpus, finite_difference, generator, tiny_model
 
-from mapctl.errors import RequestError
 from mapctl.features import LAYOUT
 from priors.lstm_gmm.labels import PACE_LABELS, Labels
 from priors.lstm_gmm.network import LstmGmmConfig
@@ -76,19 +75,6 @@ def test_its_gradient_is_that_of_the_run_with_the_draws_held():
     assert float((gradient * direction).sum()) == pytest.approx(expected, rel=1e-4)
 
 
-@pytest.mark.slow
-def test_descending_it_lowers_it():
-    model = tiny_model().requires_grad_(True)
-    optimiser = torch.optim.Adam(model.parameters(), 1e-2)
-    losses = []
-    for _ in range(25):
-        optimiser.zero_grad()
-        losses.append(free_run_moment_loss(model, windows(), SETTINGS, generator()))
-        losses[-1].backward()
-        optimiser.step()
-    assert losses[-1].item() < 0.6 * losses[0].item()
-
-
 def test_training_runs_free_once_it_has_begun(monkeypatch):
     settings = TrainingSettings(
         steps=4, batch=4, window=12, matching=MatchingSettings(begin=0.5, every=1, wander=0, batch=4)
@@ -101,14 +87,6 @@ def test_training_runs_free_once_it_has_begun(monkeypatch):
     for _ in range(4):
         trainer.train_step()
     assert runs == [2, 3]
-
-
-def test_windows_too_short_for_a_run_are_refused():
-    trainer = DensityTrainer(
-        LstmGmmConfig(width=8, components=1), TrainingSettings(steps=1, batch=2, window=4), corpus()
-    )
-    with pytest.raises(RequestError, match="at least 6 frames, got 5"):
-        free_run_moment_loss(trainer.network, windows(5), SETTINGS, generator())
 
 
 def test_runs_that_wander_first_are_compared_all_the_same():
@@ -157,13 +135,3 @@ def test_what_runs_show_reaches_the_paces_that_they_were_told_and_no_other_label
     monkeypatch.setattr(trainer, "_add_free_run_gradients", lambda *drawn: handed.append(drawn))
     trainer.train_step()
     assert torch.equal(handed[0][1], torch.ones(4, 4))
-
-
-def test_it_is_compared_every_so_many_steps():
-    settings = TrainingSettings(steps=9, batch=4, window=12, matching=MatchingSettings(begin=0.0, every=4, batch=4))
-    trainer, steps = DensityTrainer(LstmGmmConfig(width=8, components=1), settings, corpus()), []
-    match = trainer._add_free_run_gradients
-    trainer._add_free_run_gradients = lambda *drawn: (steps.append(trainer.step), match(*drawn))[1]
-    for _ in range(9):
-        trainer.train_step()
-    assert steps == [0, 4, 8]

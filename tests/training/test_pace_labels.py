@@ -66,13 +66,6 @@ def test_a_window_is_told_how_it_ends(trainer, clips, monkeypatch):
     assert bool((told[:, 0] == 1).any())
 
 
-def test_a_pace_is_hidden_like_other_labels(trainer):
-    _, told = trainer._draw_windows()
-    shown = told[:, 1:].sum(-1)
-    assert set(shown.tolist()) == {0.0, 1.0}
-    assert 0.4 < float(shown.mean()) < 0.95
-
-
 def test_rates_are_those_of_the_clips(clips):
     holds = measure_pace_changes(clips)
     minutes = holds["minutes by pace"]
@@ -115,32 +108,6 @@ def test_a_density_that_is_trained_so_knows_paces(tmp_path, capfd, monkeypatch):
     capfd.readouterr()
     assert run("train", "lstm-gmm", "-o", tmp_path / "no", *more, "--label-pace", "--init", tmp_path / "plain") == 2
     assert "was not trained with labels of paces; leave --label-pace out" in capfd.readouterr().err
-
-
-def test_paces_join_the_labels_of_clips_and_hold_for_copies(tmp_path, capfd):
-    data = write_corpus(tmp_path / "data")
-    labels = "(?P<gait>walk)"
-    words = "--data", data, "--match", "", "--width", 8, "--steps", 2, "--batch", 4, "--window", 12
-    out = tmp_path / "run"
-    assert run("train", "lstm-gmm", "-o", out, *words, "--label-pace", "--labels", labels, "--copies", 1) == 0
-    prior = priors.load(str(out))
-    assert prior.reference.config.labels == ("gait=walk", *PACE_LABELS)
-    with pytest.raises(RequestError, match="several labels 'walk'; choose gait=walk or pace=walk"):
-        prior.conditioned_on(["walk"])
-    assert prior.conditioned_on(["pace=walk"]).labels == prior.labels
-    capfd.readouterr()
-    assert run("train", "lstm-gmm", "-o", tmp_path / "no", *words, "--label-pace", "--labels", "(?P<pace>walk)") == 2
-    assert "the group pace is that of --label-pace" in capfd.readouterr().err
-
-
-def test_a_label_that_is_told_twice_counts_twice():
-    density = tiny_density()
-    names = (*density.reference.config.labels, *PACE_LABELS)
-    config = replace(density.reference.config, labels=names)
-    known = replace(density, reference=LstmGmm(config, mean=density.feature_mean, std=density.feature_std))
-    untold, once = known.reference.fc1.bias, known.conditioned_on(["pace=run"])
-    twice = once.conditioned_on(["pace=run"])
-    torch.testing.assert_close(twice.reference.fc1.bias - untold, 2 * (once.reference.fc1.bias - untold))
 
 
 def test_starts_are_picked_by_their_speed():

@@ -138,12 +138,6 @@ def test_it_stops_with_the_best_when_the_critic_has_won(tmp_path, request_in, sc
 
 
 @pytest.mark.slow
-def test_one_report_that_is_nearly_won_does_not_stop_it(tmp_path, request_in, scripted):
-    scripted(lambda number: even(number) | {"told": 0.97}, {6: 1.0})
-    assert kept(train(request_in(tmp_path / "run"))) == 6
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("side", ["refiner", "critic"])
 def test_it_stops_with_the_best_when_it_diverges(tmp_path, request_in, scripted, side):
     news, marked = [], {0: 2.0, 4: 1.2, 6: 1.0}

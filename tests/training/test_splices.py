@@ -1,6 +1,5 @@
 """Splices of clips: pieces as they are, ways that lead from the one to the other, and only what passes for mocap."""
 
-import math
 from collections import Counter
 from pathlib import Path
 
@@ -9,14 +8,13 @@ import torch
 from helpers import generator, go_at, run, walk
 from jaxtyping import Float
 from performers import Performer
-from tiny_stitcher import save_tiny_stitcher, tiny_stitcher
+from tiny_stitcher import save_tiny_stitcher
 from torch import Tensor
 
 import priors
 from mapctl.errors import RequestError
-from mapctl.features import LAYOUT, GroundPose, encode, integrate_root, reversed_features
+from mapctl.features import LAYOUT, GroundPose, encode
 from mapctl.pose import decode
-from mapctl.runtime.stepwise import StepwiseWork
 from mapctl.skeleton import CANONICAL
 from priors.lstm_gmm import labels
 from priors.training.augmentation import splices as module
@@ -103,12 +101,6 @@ def test_pieces_are_cut_where_somebody_stands_or_goes(corpus):
     assert 0.3 < torch.tensor([cut.turn for cut in cuts]).std() < 0.7
 
 
-def test_who_changes_speed_more_gets_more_time(corpus):
-    cuts = draw_cuts(corpus, 300, GAPS, generator())
-    starts, changes = (torch.tensor([float(cut.gap) for cut in cuts[k::3]]).mean() for k in (0, 2))
-    assert 8 < starts - changes < 20  # 12 frames for each m/s; they walk at 1.2 m/s or so
-
-
 def test_gaits_change_twice_as_often_as_anything_else():
     paces = [go_at(speed, seconds=3) for speed in (0.0, 1.2, 2.6)]
     stands, walks, runs = range(3)
@@ -151,24 +143,6 @@ def test_a_splice_is_two_pieces_and_a_way_between(corpus, tiny, all_pass):
 
 
 @pytest.mark.slow
-def test_the_second_piece_begins_where_both_velocities_lead(corpus, tiny, all_pass):
-    spliced = add_splices(corpus, Splices(30, tiny))
-    for name, features in list(zip(spliced.names, spliced.clips(), strict=True))[4:]:
-        names = name.removeprefix(FOLDER).split(" + ")
-        if names != ["stands", "walks"]:
-            continue
-        first, after = find_way(features, corpus, names)
-        ground, heading = integrate_root(features, GroundPose.origin())
-        frames = after - first
-        speed = float(LAYOUT.pick(corpus.clips()[0], "root_displacement_heading")[:, 1].mean())
-        way = ground[after - 1] - ground[first - 1]
-        # From nothing to its pace: half as far as at that pace, and along the way that it then goes.
-        assert float(way.norm()) == pytest.approx(frames / 2 * speed, rel=0.15)
-        facing = torch.stack([heading[after].sin(), heading[after].cos()])
-        assert float((way / way.norm()) @ facing) > math.cos(0.2)
-
-
-@pytest.mark.slow
 def test_the_bundled_stitcher_passes_for_mocap_and_a_wild_one_does_not(corpus, tmp_path, monkeypatch):
     asked = []
 
@@ -187,17 +161,6 @@ def test_the_bundled_stitcher_passes_for_mocap_and_a_wild_one_does_not(corpus, t
     for features in kept.clips()[4:]:
         places = decode(features, GroundPose.origin()).joint_positions()
         assert torch.diff(places, dim=0).norm(dim=-1).max() < 0.25  # metres in a frame
-
-
-@pytest.mark.slow
-def test_the_seed_draws_them(corpus, tiny, all_pass):
-    one, same, other = (add_splices(corpus, Splices(6, tiny, seed=seed)) for seed in (1, 1, 2))
-    assert torch.equal(one.features, same.features)
-    assert one.names == same.names
-    assert one.names != other.names
-    assert add_splices(corpus, Splices(0, "nobody")) is corpus
-    with pytest.raises(RequestError, match="--splices must be 0 or more"):
-        Splices(-1)
 
 
 @pytest.mark.slow
@@ -226,22 +189,6 @@ def test_they_are_kept_for_a_run_that_goes_on(corpus, tmp_path, all_pass, monkey
     assert len(list(cache.iterdir())) == 5
     stored.write_bytes(b"damaged")
     assert torch.equal(add_splices(corpus, Splices(4, one), cache).features, made.features)
-
-
-@pytest.mark.slow
-def test_ways_of_many_motions_are_those_of_each(corpus):
-    stitcher, clips = tiny_stitcher(), corpus.clips()
-    before = torch.stack([clips[0][40:55], clips[2][20:35]])
-    after = reversed_features(torch.stack([clips[3][10:25], clips[1][10:25]]))
-    place, turn = torch.tensor([[0.1, 0.5], [0.0, 0.4]]), torch.tensor([0.2, -0.1])
-    both = StepwiseWork(stitcher.connect(before, after, place, turn, 16)).finish()
-    for row in (0, 1):
-        part = slice(row, row + 1)
-        way = StepwiseWork(stitcher.connect(before[row], after[part], place[part], turn[part], 16)).finish()
-        assert torch.allclose(way[0], both[row], atol=1e-5)
-    drawn = [StepwiseWork(stitcher.connect(before, after, place, turn, 16, generator(3))).finish() for _ in range(2)]
-    assert torch.equal(*drawn)
-    assert not torch.allclose(drawn[0], both, atol=1e-3)
 
 
 @pytest.fixture

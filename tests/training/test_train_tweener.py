@@ -9,7 +9,6 @@ import torch
 from helpers import corpus, generator
 
 from mapctl import kinematics, rotations
-from mapctl.metrics.liveliness import measure_liveliness, see_from_hips
 from mapctl.skeleton import CANONICAL
 from priors.training.augmentation.key_layouts import KeySettings, draw_splices, draw_windows
 from priors.training.augmentation.pose_windows import PoseWindows
@@ -142,19 +141,3 @@ def test_slerp_between_two_poses_is_measured_beside_what_is_made(windows):
     assert found["made"].speed == pytest.approx(found["true"].speed, rel=1e-3)
     assert found["slerp"].error > 0.5 * found["slerp"].count
     assert found["slerp"].jerk < 0.2 * found["true"].jerk
-
-
-def test_who_stands_still_is_not_alive(windows):
-    motion = windows.at(torch.tensor([0]), torch.zeros(1, dtype=torch.long), 60, torch.ones(1))
-    local = motion.local_matrices()
-    true = see_from_hips(kinematics.positions_from_matrices(CANONICAL, local), local[..., 0, :, :])[0]
-    inside = torch.ones(60, dtype=torch.bool)
-    inside[[0, -1]] = False
-    still = measure_liveliness(true[30].expand_as(true), true, inside)
-    assert still.speed == still.jerk == 0
-    assert still.spread < 1e-3 * still.error
-    twice = measure_liveliness(2 * true, 2 * true, inside)
-    alone = measure_liveliness(true, true, inside)
-    assert twice.speed == pytest.approx(2 * alone.speed)
-    assert twice.jerk == pytest.approx(2 * alone.jerk, rel=1e-4)
-    assert (alone + alone).spread == 2 * alone.spread

@@ -1,20 +1,16 @@
 """What training does with files that cannot be used, and with very few clips."""
 
-import errno
-import os
 import shutil
 
 import pytest
 import tiny_denoiser
 import torch
-from helpers import bandai_skeleton, corpus, run, walks
+from helpers import bandai_skeleton, corpus, walks
 
 import priors
 from mapctl import retarget
 from mapctl.errors import RequestError
 from priors.training import corpus as corpora
-from priors.training import recipe as recipe_module
-from priors.training.mocap import clips
 from priors.training.recipes.denoiser import DenoiserSettings, DenoiserTrainer
 from priors.training.recipes.lstm_gmm import DensityRecipe
 
@@ -85,41 +81,6 @@ def test_a_folder_of_nothing_else_is_refused(tmp_path, mixed):
     assert not (tmp_path / "run").exists()
 
 
-def test_a_fault_that_nobody_foresaw_leaves_one_file_out(tmp_path, data, monkeypatch):
-    whole = clips.read_clip_features
-
-    def odd(file, **told):
-        return 1 / 0 if file.name == "walk-1.bvh" else whole(file, **told)
-
-    monkeypatch.setattr(clips, "read_clip_features", odd)
-    found, _, _ = gathered(data, tmp_path / "run")
-    assert found.skipped == (corpora.SkippedFile("walk-1.bvh", "ZeroDivisionError: division by zero"),)
-
-
-@pytest.mark.slow
-def test_the_cache_knows_what_was_left_out_and_tries_it_again(tmp_path, mixed, monkeypatch):
-    first, _, warned = gathered(mixed, tmp_path / "run")
-    whole, read = clips.read_clip_features, []
-
-    def counted(file, **told):
-        read.append(file.name)
-        return whole(file, **told)
-
-    monkeypatch.setattr(clips, "read_clip_features", counted)
-    again, _, warned_again = gathered(mixed, tmp_path / "run")
-    assert (again.skipped, warned_again) == (first.skipped, warned)
-    assert set(read) == set(BAD)
-
-    def mended(file, **told):
-        return whole(mixed / "walk-1.bvh" if file.name == "lost.bvh" else file, **told)
-
-    monkeypatch.setattr(
-        clips, "read_clip_features", mended
-    )  # a drive that is there again: the files' dates are the same
-    after, _, _ = gathered(mixed, tmp_path / "run")
-    assert [name for name in after.names if name not in first.names] == ["lost.bvh"]
-
-
 MODELS = {
     "lstm-gmm": (("--width", 8, "--components", 2, "--window", 20, "--device", "cpu"), priors.load),
     "denoiser": ((), priors.load_denoiser),
@@ -150,33 +111,7 @@ def test_too_little_is_refused_with_what_would_do(lengths, got):
         corpora.split_corpus(few, 1)
 
 
-def test_five_clips_are_held_out_whole():
-    parts = corpora.split_corpus(corpus(5), 1)
-    assert [len(part.names) for part in (parts.train, parts.validation, parts.test)] == [3, 1, 1]
-
-
 def test_a_window_longer_than_what_is_held_out_does_not_end_a_run():
     settings = DenoiserSettings(steps=1, batch=2, window=90)
     trainer = DenoiserTrainer(tiny_denoiser.CONFIG, settings, corpus(2, 100))
     assert trainer.validate(corpus(1, 80))["error_cm"] > 0
-
-
-def test_folders_that_cannot_be_looked_into_are_named(tmp_path, data, monkeypatch):
-    """Without the permissions of the one who runs this test, which may be everyone's."""
-    whole = os.walk
-
-    def closed(top, onerror):
-        onerror(PermissionError(errno.EACCES, "Permission denied", str(data / "private")))
-        return whole(top, onerror=onerror)
-
-    monkeypatch.setattr(corpora.os, "walk", closed)
-    found, _, (warning,) = gathered(data, tmp_path / "run")
-    assert len(found.names) == 5
-    assert warning == f"left out 1 of 6 files: {data / 'private'}: Permission denied"
-    (tmp_path / "empty").mkdir()
-    monkeypatch.setattr(corpora.os, "walk", lambda top, onerror: whole(top, onerror=onerror))
-    with pytest.raises(RequestError, match=f"^no .bvh below {tmp_path / 'empty'}$"):
-        gathered(tmp_path / "empty", tmp_path / "run")
-    monkeypatch.setattr(recipe_module.os, "access", lambda path, mode: False)
-    assert run("train", "infiller", "--data", data, "-o", tmp_path / "none", "--steps", 1) == 2
-    assert not (tmp_path / "none").exists()

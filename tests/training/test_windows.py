@@ -1,6 +1,5 @@
 """Windows of joint positions: those of the motions whose features the corpus holds."""
 
-import math
 from fractions import Fraction
 
 import pytest
@@ -93,49 +92,12 @@ def test_draws_are_whole_windows_of_long_clips_and_whole_clips_in_windows():
     assert begins.max() > 16
 
 
-def test_draws_are_the_seeds():
-    windows = PositionWindows(corpus(3, 60), frames=24, evenness=0.5)
-    first, again, other = (windows.draw(8, generator(seed)) for seed in (0, 0, 1))
-    for name in ("places", "heading", "contacts", "present"):
-        assert torch.equal(getattr(first, name), getattr(again, name))
-    assert not torch.equal(first.places, other.places)
-
-
-def test_half_of_the_windows_are_mirrored():
-    clip = corpus(1, 40)
-    windows = PositionWindows(clip, frames=40, evenness=0.0)
-    turns = windows.draw(200, generator()).places[:, -1, 0, 0]
-    sides = torch.sign(turns)
-    assert 0.35 < (sides > 0).double().mean() < 0.65
-
-
 def test_moments_are_those_of_the_clips_and_their_mirror_images():
     windows = PositionWindows(corpus(3, 60), frames=24, evenness=0.0)
     both = torch.cat([windows.local, windows.local[:, SWAP] * torch.tensor([-1.0, 1.0, 1.0])])
     mean, std = windows.moments()
     assert torch.allclose(mean, both.mean(dim=0), atol=1e-5)
     assert torch.allclose(std, both.std(dim=0, unbiased=False), atol=1e-4)
-
-
-def test_small_folders_are_drawn_more_often_where_evenness_asks_for_it():
-    one = corpus(1, 60).features
-    high = one[:30].clone()
-    high[:, LAYOUT.slices["root_height"]] += 50
-    uneven = Corpus(("big/a", "big/b", "big/c", "small/d"), (60, 60, 60, 30), torch.cat([one, one, one, high]))
-
-    def share(evenness):
-        drawn = PositionWindows(uneven, frames=30, evenness=evenness).draw(600, generator())
-        return float((drawn.places[:, 0, 0, 1] > 25).double().mean())
-
-    assert share(0.0) == pytest.approx(1 / 7, abs=0.05)
-    assert share(1.0) == pytest.approx(0.5, abs=0.07)
-
-
-def test_the_heading_goes_on_beyond_a_half_turn():
-    """Whole turns are the data's own: what is drawn does not jump."""
-    windows = PositionWindows(corpus(1, 100), frames=100, evenness=0.0)
-    found = windows.at(torch.tensor([0]), torch.tensor([0]), mirrored=torch.tensor([False]))
-    assert torch.diff(found.heading).abs().max() < math.pi / 4
 
 
 def test_the_guess_in_a_gap_is_the_one_that_filling_starts_from():
