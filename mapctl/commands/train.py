@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields, replace
 from functools import reduce
 from importlib import import_module
 from operator import or_
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, cast
 
 from tyro.conf import arg, subcommand
 
@@ -97,7 +97,8 @@ class TrainOptions(ABC):
 
     def find_parts(self, kind: Any) -> dict[str, Any]:
         """Return the network's shape and the settings that the options change."""
-        found = {field.name: field.default_factory() for field in fields(kind) if field.name in ("config", "settings")}
+        usual = {field.name: field for field in fields(kind)}
+        found = {name: cast(Any, usual[name].default_factory)() for name in ("config", "settings")}
         return found | ({"config": import_module(self.network).PAPER} if getattr(self, "paper", False) else {})
 
     def collect(self) -> dict[str, Any]:

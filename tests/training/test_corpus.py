@@ -10,7 +10,6 @@ from helpers import corpus
 from mapctl.errors import MapctlError, RequestError
 from mapctl.features import LAYOUT
 from priors.training import corpus as corpora
-from priors.training.mocap import clips
 
 
 def test_a_clip_that_cannot_be_used_is_named(tmp_path):
@@ -42,7 +41,7 @@ def test_the_corpus_is_the_features_of_the_clips_and_is_read_once(tmp_path, data
     assert read.names == ("walk-0.bvh", "walk-1.bvh", "walk-2.bvh")
     expected = corpus(3, frames=80)
     torch.testing.assert_close(read.features, expected.features, atol=1e-5, rtol=1e-5)
-    monkeypatch.setattr(clips, "read_clip_features", None)  # nothing can be read
+    monkeypatch.setattr(corpora, "read_clip_features", None)  # nothing can be read
     again = corpora.read_corpus(data, match="walk-[0-2]", cache=tmp_path)
     assert torch.equal(again.features, read.features)
     assert (again.names, again.lengths) == (read.names, read.lengths)
@@ -70,7 +69,7 @@ def test_a_cache_of_other_rig_tables_or_contact_thresholds_is_not_taken(tmp_path
     ):
         with monkeypatch.context() as patch:
             patch.setattr(f"priors.training.corpus.{what}", other)
-            patch.setattr(clips, "read_clip_features", None)
+            patch.setattr(corpora, "read_clip_features", None)
             with pytest.raises(RequestError, match="none of the 3"):
                 corpora.read_corpus(data, match="walk-[0-2]", cache=tmp_path)
 

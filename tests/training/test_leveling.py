@@ -14,7 +14,7 @@ from mapctl.features import GroundPose, encode
 from mapctl.motion import Motion
 from mapctl.pose import BodyPose
 from mapctl.skeleton import CANONICAL, TOE_JOINTS, TOE_REST_HEIGHT
-from priors.training.mocap.clips import read_clip_features
+from priors.training.corpus import read_clip_features
 from priors.training.mocap.cuts import Cut
 from priors.training.mocap.leveling import find_floor_slope, stand_on_canonical, turn_level
 

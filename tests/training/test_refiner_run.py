@@ -13,8 +13,14 @@ import priors
 from mapctl.metrics.realism import ClassifierSettings, RealismSettings
 from priors.refiner.network import RefinerConfig
 from priors.training import corpus as corpora
-from priors.training.quality.refiner import RefinerEvaluator, compute_realism_gap, sample_corpus
-from priors.training.recipes.refiner import AdversarialSettings, AdversarialTrainer, RefinerRecipe
+from priors.training.recipes.refiner import (
+    AdversarialSettings,
+    AdversarialTrainer,
+    RefinerEvaluator,
+    RefinerRecipe,
+    compute_realism_gap,
+    sample_corpus,
+)
 from priors.training.run import train
 
 TINY = RefinerConfig(width=6, memory=5, lookahead=1, joints=("hips", "rightToes"))

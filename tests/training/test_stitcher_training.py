@@ -17,8 +17,7 @@ from priors.training.augmentation.transition_windows import Known, Transition, T
 from priors.training.quality.stitcher import TEMPERATURES, calibrate_temperature, place
 from priors.training.recipes import stitcher as recipe_module
 from priors.training.recipes.stitcher import StitcherRecipe, StitcherSettings
-from priors.training.recipes.stitcher_latents import TRIES, sample_nearest
-from priors.training.recipes.stitcher_losses import Shares, interpolate
+from priors.training.recipes.stitcher_losses import TRIES, Shares, interpolate, sample_nearest
 from priors.training.run import train
 
 SETTINGS = StitcherSettings(steps=10, batch=6, window=24)

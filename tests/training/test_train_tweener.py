@@ -12,9 +12,7 @@ from mapctl import kinematics, rotations
 from mapctl.skeleton import CANONICAL
 from priors.training.augmentation.key_layouts import KeySettings, draw_splices, draw_windows
 from priors.training.augmentation.pose_windows import PoseWindows
-from priors.training.augmentation.style_poses import draw_style_poses
-from priors.training.quality.gap import measure_gap
-from priors.training.recipes.tweener import TweenerSettings, TweenerTrainer
+from priors.training.recipes.tweener import TweenerSettings, TweenerTrainer, draw_style_poses, measure_gap
 from priors.training.recipes.tweener_losses import LossWeights, compute_tweener_losses
 from priors.tweening.generator import ConstrainedPose, GeneratedPoses, GeneratorNetwork
 

@@ -10,32 +10,37 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
-from mapctl import kinematics
+from mapctl import kinematics, rotations
+from mapctl.inbetweening.partial_motion import KnownParts, PartialMotion, interpolate_partial_motion
 from mapctl.inbetweening.position_image import mirror_positions
-from mapctl.metrics.liveliness import see_from_hips
+from mapctl.metrics.liveliness import NOTHING, Liveliness, measure_liveliness, see_from_hips
 from mapctl.skeleton import CANONICAL
 from priors import checkpoints
 from priors.config import require_at_least
 from priors.training.augmentation.key_layouts import KeySequences, KeySettings, draw_splices, draw_windows
-from priors.training.augmentation.pose_windows import PoseWindows
-from priors.training.augmentation.style_poses import draw_style_poses
+from priors.training.augmentation.pose_windows import PoseWindows, find_kind
 from priors.training.corpus import Corpus, Split
 from priors.training.devices import make_generator
-from priors.training.quality.gap import measure_kinds
 from priors.training.recipe import Export, Gathered, NetworkRecipe, Row, average_logarithms
 from priors.training.recipes.tweener_losses import LossWeights, compute_tweener_losses
 from priors.training.trainer import GradientTrainer
 from priors.tweening import path as path_predictor
 from priors.tweening.class_vectors import compute_classes, group_clips
 from priors.tweening.generator import GeneratorConfig, GeneratorNetwork
+from priors.tweening.keys import ToldParts, make_key_image
 from priors.tweening.path import PathNetwork
 from priors.tweening.styles import LABELS, find_class
 
 _SHORTEST_WINDOW, _LEAST_WINDOW = 64, 32  # frames
 _MIN_STD = 0.05  # metres
 _FOREIGN_STYLES = 0.7  # share of styles of spliced sequences that are of another clip
+_STYLE_POSES = 2, 8
+_VALIDATED_FRAMES = 192  # of the gap that is validated, 6.4 s; of shorter clips all but the ends
+_SHORTEST_VALIDATED = 90
+_VALIDATED_OF_KIND = 24
 
 
 @dataclass(frozen=True)
@@ -185,3 +190,74 @@ def _set_moments(network: GeneratorNetwork, windows: PoseWindows) -> None:
     places = torch.cat([seen, mirror_positions(seen)]).flatten(0, 1)
     network.mean.copy_(places.mean(dim=0))
     network.std.copy_(places.std(dim=0).clamp_min(_MIN_STD))
+
+
+def draw_style_poses(
+    windows: PoseWindows, sequences: KeySequences, foreign: float, generator: torch.Generator
+) -> Float[Tensor, "batch poses joints 3"]:
+    """Draw poses anywhere in each sequence, or, of this share of them, in another clip: places from the hips, metres,
+    without the hips' rotation."""
+    batch, frames = sequences.clip.shape
+    few, many = _STYLE_POSES
+    count = int(torch.randint(few, many + 1, (), generator=generator))
+    at = torch.randint(frames, (batch, count), generator=generator)
+    own = torch.take_along_dim(sequences.motion.quats, at[..., None, None], dim=1)
+    one = torch.ones(batch, dtype=torch.long)
+    clip = windows.picker.pick(one, generator)[0][:, None].expand(-1, count)
+    time = (torch.rand(batch, count, generator=generator) * windows.lengths[clip]).floor().double()
+    other = torch.rand(batch, generator=generator) < foreign
+    local = rotations.to_matrix(torch.where(other[:, None, None, None], windows.gather(clip, time).quats, own))
+    local[..., 0, :, :] = torch.eye(3)
+    return kinematics.positions_from_matrices(CANONICAL, local)
+
+
+@torch.no_grad()
+def measure_kinds(network: GeneratorNetwork, corpus: Corpus, kinds: Sequence[str]) -> dict[str, Any]:
+    """By kind of clips with one long gap between two poses: error beside slerp's, cm, and speed, spread and jerk over
+    mocap's, of sums."""
+    windows = PoseWindows(corpus, kinds=kinds, evenness=1.0)
+    kind_of = [find_kind(name, kinds) for name in corpus.names]
+    row: dict[str, Any] = {}
+    for kind, name in enumerate([*kinds, "other"]):
+        found = [number for number, each in enumerate(kind_of) if each == kind]
+        found = [one for one in found if int(windows.lengths[one]) >= _SHORTEST_VALIDATED + 2]
+        if found:
+            row |= {f"{name}_{what}": value for what, value in _measure_clips(network, windows, found).items()}
+    return row
+
+
+def _measure_clips(network: GeneratorNetwork, windows: PoseWindows, clips: Sequence[int]) -> dict[str, float]:
+    sums = {"made": NOTHING, "slerp": NOTHING, "true": NOTHING}
+    for number in clips[:_VALIDATED_OF_KIND]:
+        frames = min(_VALIDATED_FRAMES + 2, int(windows.lengths[number]))
+        motion = windows.at(torch.tensor([number]), torch.zeros(1, dtype=torch.long), frames, torch.ones(1))
+        for name, found in measure_gap(network, motion).items():
+            sums[name] += found
+    made, slerp, true = (sums[name] for name in ("made", "slerp", "true"))
+    return {
+        "error_cm": made.error / made.count,
+        "slerp_cm": slerp.error / slerp.count,
+        "speed": made.speed / true.speed,
+        "spread": made.spread / true.spread,
+        "jerk": made.jerk / true.jerk,
+    }
+
+
+@torch.no_grad()
+def measure_gap(network: GeneratorNetwork, motion: PartialMotion) -> dict[str, Liveliness]:
+    """Measure what is made between the first and the last pose of one motion, beside slerp and the truth."""
+    known = torch.zeros(motion.heading.shape, dtype=torch.bool)
+    known[:, [0, -1]] = True
+    image = make_key_image(motion, ToldParts.whole(known))
+    made = network(image, torch.zeros(1, network.config.style)).turn_to_world(image)
+    local = motion.local_matrices()
+    true = see_from_hips(kinematics.positions_from_matrices(CANONICAL, local), local[..., 0, :, :])[0]
+    shown = replace(motion, known=KnownParts.whole(known))
+    guess = interpolate_partial_motion(shown, motion.quats[0, 0], 0.0).local_matrices()
+    slerp = see_from_hips(kinematics.positions_from_matrices(CANONICAL, guess), guess[..., 0, :, :])[0]
+    mine = see_from_hips(made.places, made.local_matrix[..., 0, :, :])[0]
+    inside = ~known[0]
+    return {
+        name: measure_liveliness(seen, true, inside)
+        for name, seen in (("made", mine), ("slerp", slerp), ("true", true))
+    }
