@@ -22,10 +22,9 @@ from controllers.denoising.denoise import DenoiseSettings
 from controllers.steering.process import CharacterProcess
 from mapctl import formats
 from mapctl.cli import parse
-from mapctl.commands import COMMANDS
+from mapctl.commands import COMMANDS, live
 from mapctl.commands.denoise import Denoise, ReportWriter
 from mapctl.commands.live import Live
-from mapctl.commands.live import run as live
 from mapctl.commands.shared.command import ModelCommand
 from mapctl.commands.shared.inputs import read_character
 from mapctl.runtime.file_jobs import FileJob

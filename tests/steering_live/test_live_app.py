@@ -10,7 +10,7 @@ from helpers import walk
 from stage import Actor, delivered, live_app, run
 
 from mapctl import formats
-from mapctl.commands.live import run as live
+from mapctl.commands import live
 from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import MapctlError, RequestError
 from mapctl.intent.steering import Command

@@ -17,8 +17,8 @@ from rig_maker import Make, make, names_of
 from stage import delivered
 
 from mapctl import formats, rotations
+from mapctl.commands import live
 from mapctl.commands.live import Live
-from mapctl.commands.live import run as live
 from mapctl.motion import Motion
 from scenes.drawn_character import DrawnCharacter
 from scenes.live.bodies import SkinnedBody

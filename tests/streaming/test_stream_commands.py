@@ -21,7 +21,7 @@ from tiny_stitcher import save_tiny_stitcher
 import mapctl
 import priors
 from controllers.steering.process import CharacterProcess, CharacterRequest
-from mapctl.commands.live import run as live
+from mapctl.commands import live
 from mapctl.intent.steering import Command
 from mapctl.skeleton import CANONICAL
 from scenes.live.app import LiveApp

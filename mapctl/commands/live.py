@@ -2,16 +2,19 @@
 
 import functools
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import UseAppendAction, arg
 
 import priors
 from controllers.common.character import Character
 from controllers.steering.process import CharacterProcess, CharacterRequest
 from controllers.steering.steer import SteerSettings
-from mapctl.commands.live import Live
 from mapctl.commands.shared import options, outputs, streaming
+from mapctl.commands.shared.command import ModelCommand
 from mapctl.commands.shared.inputs import as_character, read_character, read_drawn_character, read_rigged
 from mapctl.errors import RequestError
 from mapctl.intent.steering import Command
@@ -20,16 +23,45 @@ from mapctl.retarget.carry import retarget_motion
 from mapctl.terms import FootContact
 from priors import checkpoints
 from scenes.drawn_character import DrawnCharacter
-from scenes.live.app import LiveApp
-from scenes.live.character import CharacterLook
 
 if TYPE_CHECKING:
     from mapctl.streaming.receiver import OscReceiver
     from mapctl.streaming.sender import PoseStream
+    from scenes.live.app import LiveApp
 
 _MAX_CHARACTERS = 16
 _STITCHER = "stitcher"
 _START_SPACING = 1.5  # metres between characters where they begin
+
+
+@dataclass(frozen=True)
+class Live(ModelCommand, options.ReadOptions):
+    """Steer characters in a browser on this machine: sliders, keys, drawn paths, recording."""
+
+    port: Annotated[int, arg(metavar="P")] = 8080
+    """Port of the page, on 127.0.0.1 only; the next free port if this one is taken."""
+    characters: options.Count = 1
+    """Number of characters, side by side; each computes on a core of its own as long as there are cores."""
+    character: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="CHARACTER")] = ()
+    """File of a skinned character, as .glb or .vrm, that is shown with its own mesh and moves on its own bones; may be
+    given several times, for the first character, the second and so on, and the last one for all others."""
+    rig: options.OutRig = "canonical"
+    """Joints and bones on which characters move, shown as mannequins: canonical, or those of a clip, a preset or a rig
+    file. Recordings are on them, of a --character too, which is retargeted when it is saved."""
+    prior: options.Name = "locomotion-live"
+    """A bundled prior, or the file or run folder of a trained one."""
+    seed: options.Count = 0
+    """Seed of the first poses."""
+    stream: options.MaybeEndpoint = None
+    """Where poses go over the VMC protocol (most programs receive at port 39539): a port alone is on this machine. The
+    second character's poses go to the next port, and so on."""
+    stream_root: bool = False
+    """Let the root travel over the ground in the stream, and not the hips."""
+    stream_delay: options.Number = 0.1
+    """Seconds by which the stream is behind, so that a frame that is computed late is not sent late."""
+    listen: options.MaybeEndpoint = None
+    """Where commands come from over OSC, as /mapctl/speed 1.4 (docs/guides/streaming.md): a port alone takes those of
+    this machine; 0.0.0.0:PORT takes those of every machine."""
 
 
 def run(command: Live) -> int:
@@ -65,6 +97,9 @@ def _serve(command: Live, receiver: "OscReceiver | None") -> int:
 
 
 def _open_app(command: Live, receiver: "OscReceiver | None") -> "tuple[LiveApp, PoseStream | None]":
+    from scenes.live.app import LiveApp
+    from scenes.live.character import CharacterLook
+
     prior, drawn = priors.load(command.prior), _read_drawn(command)
     checkpoints.note_use(_STITCHER)  # the characters' processes load it
     bodies, licence = _read_bodies(command, drawn), outputs.format_used_licences()
