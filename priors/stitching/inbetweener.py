@@ -74,7 +74,7 @@ def fit_shared(
     centre: Float[Tensor, " shared"],
     spread: float,
 ) -> Joined:
-    """Fit what both sides share, in standard deviations of the network's prior, to residuals in theirs, by Gauss-Newton;
+    """Fit what both sides share, in standard deviations of the prior, to residuals in theirs, by Gauss-Newton;
     with a sample as the centre, randomise-then-optimise (Bardsley et al. 2014).
 
     The energy counts distances from the `centre` in units of `spread`. Returns the motion with the least energy of all
