@@ -18,8 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parent))  # for `corruptions`
+sys.path.insert(0, str(Path(__file__).parents[1]))  # for `corruptions`
 
 import mapctl
 from mapctl import retarget
@@ -180,12 +179,10 @@ def print_table(rows: Sequence[Row], circles: Sequence[Circle]) -> None:
     print("\n".join(f"| {' | '.join(line)} |" for line in lines))
     used = (f"{circle.name} {len(circle.clips)} clips, {circle.skipped} skipped" for circle in circles)
     asked = " ".join([Path(sys.argv[0]).name, *(Path(word).name for word in sys.argv[1:])])
-    commit = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False, cwd=HERE
-    )
-    accelerator = torch.cuda.get_device_name() if torch.cuda.is_available() else "no GPU"
+    find_commit = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
+    commit = subprocess.run(find_commit, capture_output=True, text=True, check=False).stdout.strip()
     print(f"\n{'; '.join(used)}.")
-    print(f"`{asked}`, {date.today()}, commit {commit.stdout.strip()}, {os.cpu_count()} cores, {accelerator}.")
+    print(f"`{asked}`, {date.today()}, commit {commit}, {os.cpu_count()} cores, no GPU.")
 
 
 def _format(value: object) -> str:
