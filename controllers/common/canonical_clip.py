@@ -16,7 +16,7 @@ from mapctl.inbetweening.missing import MissingMask, interpolate_missing, restor
 from mapctl.inbetweening.query import GapQuery
 from mapctl.inbetweening.seam_blending import blend_seams_in_positions, blend_seams_in_rotations
 from mapctl.motion import Motion
-from mapctl.recording.splines import transfer_change
+from mapctl.recording.fusion import transfer_change
 from mapctl.retarget import RigMap, from_canonical, to_canonical
 from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import CANONICAL

@@ -26,8 +26,7 @@ from mapctl.problem.ledger import Ledger
 from mapctl.problem.solution import Outcome, Status
 from mapctl.protocols import Denoiser, Density, Inbetweener
 from mapctl.recording import Capture, CaptureProposal
-from mapctl.recording.artefacts import NOISE_CM, Artefact
-from mapctl.recording.inspection import inspect_recording
+from mapctl.recording.inspection import NOISE_CM, Artefact, inspect_recording
 from mapctl.recording.masks import (
     Mask,
     expand_valid_masks,

@@ -15,7 +15,7 @@ from torch import Tensor
 from controllers.denoising.result import DenoiseSolution, shift_frames
 from mapctl import rotations
 from mapctl.motion import Motion
-from mapctl.recording.artefacts import Artefact
+from mapctl.recording.inspection import Artefact
 from mapctl.recording.masks import ROOT, Mask, expand_masks
 from mapctl.recording.noise_estimation import estimate_angle_noise
 from mapctl.recording.pose_mixing import (

@@ -15,7 +15,7 @@ from mapctl.motion import Motion
 from mapctl.numerics.intervals import true_intervals
 from mapctl.problem.density_selection import DensityInterval
 from mapctl.problem.solution import Outcome, Solution
-from mapctl.recording.artefacts import Artefact
+from mapctl.recording.inspection import Artefact
 from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import CANONICAL
 

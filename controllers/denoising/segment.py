@@ -19,12 +19,17 @@ from mapctl.motion import Motion
 from mapctl.problem.density_selection import DensityInterval
 from mapctl.problem.solution import Outcome, Status
 from mapctl.protocols import Denoiser, Density
-from mapctl.recording import Capture, artefacts
-from mapctl.recording.fusion import fuse_positions, fuse_rotations, measure_kept_noise, smooth_columns
+from mapctl.recording import Capture, inspection
+from mapctl.recording.fusion import (
+    fuse_positions,
+    fuse_rotations,
+    measure_kept_noise,
+    smooth_columns,
+    transfer_change,
+    upsample,
+)
 from mapctl.recording.inspection import Inspection
-from mapctl.recording.noise_estimation import estimate_angle_noise, estimate_position_noise
-from mapctl.recording.quaternion_signs import choose_continuous_signs
-from mapctl.recording.splines import transfer_change, upsample
+from mapctl.recording.noise_estimation import choose_continuous_signs, estimate_angle_noise, estimate_position_noise
 from mapctl.retarget import RigMap, to_canonical
 from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import CANONICAL, TOES, leg_length
@@ -120,24 +125,24 @@ class SegmentDenoiser:
         ]
         return tuple(part for part in moved if part.start < part.stop)
 
-    def _collect_faults(self, motion: Motion, shown: Motion, refined: RefinedMotion) -> tuple[artefacts.Artefact, ...]:
+    def _collect_faults(self, motion: Motion, shown: Motion, refined: RefinedMotion) -> tuple[inspection.Artefact, ...]:
         """Collect the artefacts, on the rig; `shown` is the motion before the MAP stage."""
         inspection, names = self.inspection, motion.skeleton.names
         rotation = rotations.multiply(rotations.inverse(inspection.motion.local_quat_xyzw), motion.local_quat_xyzw)
         angles = torch.rad2deg(rotations.to_rotation_vector(rotation).norm(dim=-1))
         travelling = names[inspection.travels]
         distances = 100 * (inspection.place(motion) - inspection.place(inspection.motion)).norm(dim=-1)
-        found = artefacts.list_noise(
+        found = inspection.list_noise(
             names, inspection.noise, inspection.noise_root, travels=inspection.travels, frames=motion.num_frames
         )
-        found += artefacts.list_spikes(names, inspection.spikes, angles, "deg")
-        found += artefacts.list_spikes([travelling], inspection.spikes_root[:, None], distances[:, None], "cm")
+        found += inspection.list_spikes(names, inspection.spikes, angles, "deg")
+        found += inspection.list_spikes([travelling], inspection.spikes_root[:, None], distances[:, None], "cm")
         found += inspection.faults
-        found += artefacts.list_dropouts(names, inspection.dropouts & ~inspection.frozen[:, None])
+        found += inspection.list_dropouts(names, inspection.dropouts & ~inspection.frozen[:, None])
         toes = shown.skeleton.indices(TOES)
         feet = [self.rigmap.joint_of[toe] for toe in toes]
         known = [names[foot] if foot is not None else TOES[side] for side, foot in enumerate(feet)]
-        steps = artefacts.list_foot_artefacts(
+        steps = inspection.list_foot_artefacts(
             known, shown.joint_positions()[:, toes], refined.contacts, rest_height=refined.supports, fps=PRIOR_FPS
         )
         ratio = self.fps / PRIOR_FPS

@@ -15,11 +15,9 @@ from torch import Tensor
 
 from mapctl import rotations
 from mapctl.motion import Motion
-from mapctl.recording.artefacts import Artefact
-from mapctl.recording.local_regression import predict_frames
-from mapctl.recording.noise_estimation import RESOLUTION
-from mapctl.recording.quaternion_signs import choose_continuous_signs
-from mapctl.recording.spike_detection import ROTATIONS, SHARE
+from mapctl.recording.faults import ROTATIONS, SHARE, predict_frames
+from mapctl.recording.inspection import Artefact
+from mapctl.recording.noise_estimation import RESOLUTION, choose_continuous_signs
 from mapctl.retarget import RigMap
 
 _MOST_FRAMES = 4  # of a run: what differs for longer may be a turn of the body

@@ -10,7 +10,7 @@ from helpers import walk
 from mapctl.contacts import detect_contacts
 from mapctl.contacts.supports import compute_rest_log_probability, fit_supports
 from mapctl.numerics.intervals import true_intervals
-from mapctl.recording.artefacts import list_foot_artefacts
+from mapctl.recording.inspection import list_foot_artefacts
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, TOES
 
 POSITIONS = walk(330).joint_positions()

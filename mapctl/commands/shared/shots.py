@@ -33,7 +33,7 @@ from mapctl.mesh.primitives import Surface
 from mapctl.motion import Motion
 from mapctl.problem.solution import Outcome, Solution
 from mapctl.protocols import Inbetweener
-from mapctl.recording.splines import resample_by_splines
+from mapctl.recording.fusion import resample_by_splines
 from mapctl.retarget.carry import RiggedCharacter, retarget_motion
 from mapctl.runtime.progress import Progress
 from mapctl.skeleton import CANONICAL
