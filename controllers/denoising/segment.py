@@ -19,7 +19,7 @@ from mapctl.motion import Motion
 from mapctl.problem.density_selection import DensityInterval
 from mapctl.problem.solution import Outcome, Status
 from mapctl.protocols import Denoiser, Density
-from mapctl.recording import Capture, inspection
+from mapctl.recording import Capture
 from mapctl.recording.fusion import (
     fuse_positions,
     fuse_rotations,
@@ -28,7 +28,14 @@ from mapctl.recording.fusion import (
     transfer_change,
     upsample,
 )
-from mapctl.recording.inspection import Inspection
+from mapctl.recording.inspection import (
+    Artefact,
+    Inspection,
+    list_dropouts,
+    list_foot_artefacts,
+    list_noise,
+    list_spikes,
+)
 from mapctl.recording.noise_estimation import choose_continuous_signs, estimate_angle_noise, estimate_position_noise
 from mapctl.retarget import RigMap, to_canonical
 from mapctl.retarget.rigs import Rig
@@ -125,24 +132,24 @@ class SegmentDenoiser:
         ]
         return tuple(part for part in moved if part.start < part.stop)
 
-    def _collect_faults(self, motion: Motion, shown: Motion, refined: RefinedMotion) -> tuple[inspection.Artefact, ...]:
+    def _collect_faults(self, motion: Motion, shown: Motion, refined: RefinedMotion) -> tuple[Artefact, ...]:
         """Collect the artefacts, on the rig; `shown` is the motion before the MAP stage."""
         inspection, names = self.inspection, motion.skeleton.names
         rotation = rotations.multiply(rotations.inverse(inspection.motion.local_quat_xyzw), motion.local_quat_xyzw)
         angles = torch.rad2deg(rotations.to_rotation_vector(rotation).norm(dim=-1))
         travelling = names[inspection.travels]
         distances = 100 * (inspection.place(motion) - inspection.place(inspection.motion)).norm(dim=-1)
-        found = inspection.list_noise(
+        found = list_noise(
             names, inspection.noise, inspection.noise_root, travels=inspection.travels, frames=motion.num_frames
         )
-        found += inspection.list_spikes(names, inspection.spikes, angles, "deg")
-        found += inspection.list_spikes([travelling], inspection.spikes_root[:, None], distances[:, None], "cm")
+        found += list_spikes(names, inspection.spikes, angles, "deg")
+        found += list_spikes([travelling], inspection.spikes_root[:, None], distances[:, None], "cm")
         found += inspection.faults
-        found += inspection.list_dropouts(names, inspection.dropouts & ~inspection.frozen[:, None])
+        found += list_dropouts(names, inspection.dropouts & ~inspection.frozen[:, None])
         toes = shown.skeleton.indices(TOES)
         feet = [self.rigmap.joint_of[toe] for toe in toes]
         known = [names[foot] if foot is not None else TOES[side] for side, foot in enumerate(feet)]
-        steps = inspection.list_foot_artefacts(
+        steps = list_foot_artefacts(
             known, shown.joint_positions()[:, toes], refined.contacts, rest_height=refined.supports, fps=PRIOR_FPS
         )
         ratio = self.fps / PRIOR_FPS
