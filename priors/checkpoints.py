@@ -197,11 +197,6 @@ def read_card(path: Path) -> Card:
         raise CheckpointError(f"{path}: no readable card ({error})") from error
 
 
-def list_bundled() -> list[str]:
-    """List names of the priors that come with the package, in the set of weights that is in force."""
-    return weight_sets.list_models()
-
-
 def locate(name: str) -> Path:
     """Locate the safetensors file of a bundled name, of a path, or of a training run's folder.
 
@@ -234,6 +229,6 @@ def _note_card(name: str, path: Path, card: Card) -> None:
     """Note a model's licence; CheckpointError where it lies in the free set and is not free."""
     weights = weight_sets.find_set_of(path)
     known = path.stem if weights == weight_sets.SETS[0] else f"{weights}/{path.stem}"
-    if weights == "free":
-        licences.check_free(known, card.licence, {"data": card.data, "training": card.training})
+    if weights == "free" and card.licence not in licences.FREE:
+        raise CheckpointError(f"{known} lies with the free weights, and its licence is {card.licence!r}")
     licences.note_licence(name if weights is None else known, " ".join(card.licence.split()) or licences.NONE_TOLD)

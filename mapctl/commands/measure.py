@@ -154,8 +154,8 @@ class ClipSet:
         return measure_position_diversity(torch.stack(pieces))
 
 
-def train_judges(ours: ClipSet, reference: ClipSet) -> realism.Judges:
-    """Train networks that distinguish ours from the reference's; RequestError for too few clips."""
+def measure_realism(ours: ClipSet, reference: ClipSet) -> realism.Realism:
+    """Measure how well a network distinguishes ours from the reference's; RequestError for too few clips."""
     fewest = SETTINGS.min_clips
     for clips in (ours, reference):
         if len(clips.motions) < fewest:
@@ -165,7 +165,7 @@ def train_judges(ours: ClipSet, reference: ClipSet) -> realism.Judges:
             )
     generator = torch.Generator().manual_seed(0)
     with show_progress("telling apart") as progress:
-        return realism.train_judges(
+        return realism.measure_window_realism(
             ours.windows, reference.windows, generator=generator, settings=SETTINGS, progress=progress
         )
 
@@ -268,10 +268,9 @@ def _measure_folders(command: Measure) -> dict[str, Any]:
 
 
 def _compare_folders(command: Measure, ours: ClipSet, reference: ClipSet) -> dict[str, Any]:
-    judges = train_judges(ours, reference)
     return {
         "reference_clips": len(reference.motions),
-        "realism": asdict(judges.summarise()),
+        "realism": asdict(measure_realism(ours, reference)),
         "spread": compare_variability(ours, reference),
     }
 

@@ -1,6 +1,5 @@
 """A motion on its own rig, put upright, with which of its joints are canonical ones."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -113,8 +112,3 @@ def keep_numbers(motion: Motion, like: Motion) -> Motion:
 def _keep(own: Float[Tensor, "frames 3"], other: Float[Tensor, "frames 3"]) -> Float[Tensor, "frames 3"]:
     same = (own - other).abs().amax(dim=-1, keepdim=True) < _SAME
     return torch.where(same, other, own)
-
-
-def pick_names(parts: Sequence[str]) -> list[str]:
-    """Return the canonical names of parts of both sides: of `Foot`, `leftFoot` and `rightFoot`."""
-    return [side + part for part in parts for side in SIDES]

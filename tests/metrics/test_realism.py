@@ -157,24 +157,6 @@ def test_the_same_seed_gives_the_same_bits_and_leaves_torch_alone():
 
 
 @pytest.mark.slow
-def test_who_can_tell_prefers_mocap_and_who_cannot_tell_prefers_neither():
-    walks = clip_set(8)
-    still = [replace(clip, local_quat_xyzw=clip.local_quat_xyzw[:1].expand(61, -1, -1)) for clip in clip_set(8, seed=1)]
-    told = classifier.judge_held_out(windows_of(still), windows_of(walks), generator=generator(5), settings=SMALL)
-    assert told.accuracy > 0.9
-    assert told.preferred < 0.1
-    same = windows_of(walks)
-    alike = classifier.judge_held_out(same, same, generator=generator(5), settings=SMALL)
-    assert 0.2 < alike.preferred < 0.8
-
-
-def test_preference_counts_pairs_and_halves_the_even_ones():
-    made, mocap = torch.tensor([0.0, 2.0, 5.0]), torch.tensor([1.0, 2.0])
-    wins = sum((one < other) + 0.5 * (one == other) for one in made.tolist() for other in mocap.tolist())
-    assert classifier._share_preferred(made, mocap) == pytest.approx(wins / 6)
-
-
-@pytest.mark.slow
 def test_no_clip_is_both_learnt_and_held_out():
     """Clips marked by their own channel can be learnt by heart, which must not help on clips that were not seen."""
     marked = torch.zeros(8, 3, 30, 16)
@@ -279,9 +261,9 @@ def test_gait_spread_measures_what_the_walks_were_made_with():
 def test_spread_is_compared_in_pieces_of_one_length():
     """Doubling every clip's length leaves pieces as they are, so the ratio is one however long clips are."""
     short, long = ([walk(frames, cadence=c) for c in (0.7, 0.9, 1.1)] for frames in (90, 180))
-    ratios = realism.spread_ratios(realism.measure_gait_spread(long), realism.measure_gait_spread(short))
+    long_std, short_std = (realism.measure_gait_spread(clips)["speed_m_s"].std for clips in (long, short))
     # three values twice against three values once: their standard deviations differ by sqrt(2/3 / (5/6))
-    assert ratios["speed_m_s"] == pytest.approx(math.sqrt((2 * 2) / 5), rel=1e-3)
+    assert long_std / short_std == pytest.approx(math.sqrt((2 * 2) / 5), rel=1e-3)
 
 
 def test_clips_shorter_than_a_piece_add_nothing():
@@ -290,7 +272,6 @@ def test_clips_shorter_than_a_piece_add_nothing():
     none = realism.measure_gait_spread([walk(80)])
     assert none["speed_m_s"].pieces == 0
     assert math.isnan(none["speed_m_s"].std)
-    assert math.isnan(realism.spread_ratios(none, both)["speed_m_s"])
     with pytest.raises(RequestError, match="needs clips and a length"):
         realism.measure_gait_spread([])
     with pytest.raises(RequestError, match="got 1 and 0 s"):

@@ -10,17 +10,10 @@ import torch
 from torch import Tensor
 
 from mapctl.errors import RequestError
-from mapctl.metrics.realism.classifier import (
-    ClassifierSettings,
-    HeldOutFold,
-    HeldOutVerdict,
-    average_verdicts,
-    judge_folds,
-    judge_held_out,
-)
+from mapctl.metrics.realism.classifier import ClassifierSettings, compute_held_out_accuracy
 from mapctl.metrics.realism.diversity import Diversity, average_pairwise_distance, measure_diversity
 from mapctl.metrics.realism.frechet import Basis, frechet_distance
-from mapctl.metrics.realism.gait import GaitSpread, measure_gait_spread, spread_ratios
+from mapctl.metrics.realism.gait import GaitSpread, measure_gait_spread
 from mapctl.metrics.realism.windows import WindowSettings, canonical_positions, cut_windows
 from mapctl.motion import Motion
 from mapctl.runtime.progress import Progress
@@ -29,21 +22,16 @@ __all__ = [
     "ClassifierSettings",
     "Diversity",
     "GaitSpread",
-    "HeldOutVerdict",
-    "Judges",
     "Realism",
     "RealismSettings",
     "WindowSettings",
     "average_pairwise_distance",
     "canonical_positions",
     "cut_windows",
-    "judge_held_out",
     "measure_diversity",
     "measure_gait_spread",
     "measure_realism",
     "measure_window_realism",
-    "spread_ratios",
-    "train_judges",
 ]
 
 
@@ -77,10 +65,6 @@ class Realism:
     time."""
     floor_accuracy: float
     """Balanced held-out accuracy of the network, one half of the mocap's clips against the other, a share likewise."""
-    preferred: float
-    """Share of pairs of a made and a mocap window in which the network rather takes the made one for mocap."""
-    floor_preferred: float
-    """The same share for the halves of the mocap."""
     frechet: float
     """Frechet distance of made windows to mocap's, no unit: coordinates are in mocap's standard deviations."""
     floor_frechet: float
@@ -121,70 +105,26 @@ def measure_window_realism(
     progress: Progress | None = None,
 ) -> Realism:
     """Measure realism from `cut_windows` of each clip, (windows, frames, channels); RequestError for too few clips."""
-    return train_judges(made, mocap, generator=generator, settings=settings, progress=progress).summarise()
-
-
-@dataclass(frozen=True, eq=False)
-class Judges:
-    """Networks trained to tell made windows from mocap's, and one half of mocap's clips from the other."""
-
-    made: Sequence[Tensor]
-    """Windows of each made clip, (windows, frames, channels)."""
-    mocap: Sequence[Tensor]
-    """Windows of each mocap clip."""
-    halves: tuple[list[int], list[int]]
-    """Indices of the mocap clips in either half."""
-    folds: Sequence[HeldOutFold]
-    """Networks that tell made (first) from mocap."""
-    floor_folds: Sequence[HeldOutFold]
-    """Networks that tell the halves apart."""
-    settings: RealismSettings
-    """Settings of their training."""
-
-    def summarise(self) -> Realism:
-        """Compute the figures of realism."""
-        verdict, floor = average_verdicts(self.folds), average_verdicts(self.floor_folds)
-        halves = [[self.mocap[i] for i in half] for half in self.halves]
-        basis = Basis.of(torch.cat(list(self.mocap)), self.settings.dims)
-        points = [basis.project(torch.cat(list(clips))) for clips in (self.made, self.mocap, *halves)]
-        return Realism(
-            verdict.accuracy,
-            floor.accuracy,
-            verdict.preferred,
-            floor.preferred,
-            frechet_distance(points[0], points[1]),
-            frechet_distance(points[2], points[3]),
-            made_windows=len(points[0]),
-            mocap_windows=len(points[1]),
-        )
-
-
-def train_judges(
-    made: Sequence[Tensor],
-    mocap: Sequence[Tensor],
-    *,
-    generator: torch.Generator,
-    settings: RealismSettings = RealismSettings(),
-    paired: bool = False,
-    progress: Progress | None = None,
-) -> Judges:
-    """Train networks on `cut_windows` of each clip, (windows, frames, channels). `paired`: made and mocap clips of the
-    same number belong together, and no network sees one of those that it judges the other of. RequestError for too few
-    clips, and for pairs of which one is missing."""
     _check_counts(len(made), len(mocap), settings)
     seeds = torch.randint(2**62, (2,), generator=generator).tolist()
     shuffled, ours = (torch.Generator().manual_seed(seed) for seed in seeds)
     order = torch.randperm(len(mocap), generator=shuffled).tolist()
-    halves = order[::2], order[1::2]
+    halves = [[mocap[i] for i in half] for half in (order[::2], order[1::2])]
     tick = _make_tick(progress, 2 * settings.classifier.folds)
-    folds: list[list[HeldOutFold]] = []
-    first, second = ([mocap[i] for i in half] for half in halves)
-    for sets, drawn, held in (((first, second), shuffled, False), ((made, mocap), ours, paired)):
-        folds.append([])
-        for fold in judge_folds(*sets, generator=drawn, settings=settings.classifier, paired=held):
-            folds[-1].append(fold)
-            tick()
-    return Judges(made, mocap, halves, folds[1], folds[0], settings)
+    floor, accuracy = (
+        compute_held_out_accuracy(*sets, generator=drawn, settings=settings.classifier, tick=tick)
+        for sets, drawn in ((halves, shuffled), ((made, mocap), ours))
+    )
+    basis = Basis.of(torch.cat(list(mocap)), settings.dims)
+    points = [basis.project(torch.cat(list(clips))) for clips in (made, mocap, *halves)]
+    return Realism(
+        accuracy,
+        floor,
+        frechet_distance(points[0], points[1]),
+        frechet_distance(points[2], points[3]),
+        made_windows=len(points[0]),
+        mocap_windows=len(points[1]),
+    )
 
 
 def _check_counts(made: int, mocap: int, settings: RealismSettings) -> None:

@@ -40,17 +40,6 @@ class ClassifierSettings:
                 raise RequestError(f"{name} must be at least {least}, got {getattr(self, name)}")
 
 
-@dataclass(frozen=True)
-class HeldOutVerdict:
-    """What networks say of clips that their training did not see, mean over folds."""
-
-    accuracy: float
-    """Balanced accuracy, 0 to 1: the mean over both sets."""
-    preferred: float
-    """Share of pairs, one window of either set, in which the network gives that of the first set the higher probability
-    of being of the second; 0.5 where it cannot tell."""
-
-
 def compute_held_out_accuracy(
     first: Sequence[Float[Tensor, "_ frames channels"]],
     second: Sequence[Float[Tensor, "_ frames channels"]],
@@ -59,80 +48,25 @@ def compute_held_out_accuracy(
     settings: ClassifierSettings = ClassifierSettings(),
     tick: Callable[[], None] = lambda: None,
 ) -> float:
-    """Compute the accuracy of `judge_held_out`."""
-    return judge_held_out(first, second, generator=generator, settings=settings, tick=tick).accuracy
+    """Compute the balanced accuracy, 0 to 1, of networks on clips that their training did not see, mean over folds.
 
-
-def judge_held_out(
-    first: Sequence[Float[Tensor, "_ frames channels"]],
-    second: Sequence[Float[Tensor, "_ frames channels"]],
-    *,
-    generator: torch.Generator,
-    settings: ClassifierSettings = ClassifierSettings(),
-    tick: Callable[[], None] = lambda: None,
-) -> HeldOutVerdict:
-    """Let networks learn to tell two sets apart, and judge clips that they did not see: the mean of `judge_folds`.
-
-    `tick` is called after each fold. RequestError for sets of fewer clips than folds.
-    """
-    folds = []
-    for fold in judge_folds(first, second, generator=generator, settings=settings):
-        folds.append(fold)
-        tick()
-    return average_verdicts(folds)
-
-
-@dataclass(frozen=True, eq=False)
-class HeldOutFold:
-    """A network, and what it says of the clips that were held out from its training."""
-
-    network: nn.Module
-    """Network in evaluation mode: windows (batch, frames, channels) to logits, positive for the first set."""
-    clips: tuple[list[int], list[int]]
-    """Indices of the held-out clips in the first and in the second set."""
-    logits: tuple[Float[Tensor, " first"], Float[Tensor, " second"]]
-    """Logits of these clips' windows, clip after clip."""
-
-
-def judge_folds(
-    first: Sequence[Float[Tensor, "_ frames channels"]],
-    second: Sequence[Float[Tensor, "_ frames channels"]],
-    *,
-    generator: torch.Generator,
-    settings: ClassifierSettings = ClassifierSettings(),
-    paired: bool = False,
-) -> Iterator[HeldOutFold]:
-    """Train a network for each fold, and yield it with its logits of the clips that it did not see.
-
-    Each set is a list of clips' windows. Folds are by clip, for windows of one clip overlap; where the sets are
-    `paired`, clips of the same number in both are in the same fold, so that nothing is learnt of one from the other.
-    The same generator state gives the same bits; torch's global generator and thread count are left as they were.
-    RequestError for sets of fewer clips than folds, and for pairs of which one is missing.
+    Each set is a list of clips' windows. Folds are by clip, for windows of one clip overlap; `tick` is called after
+    each. The same generator state gives the same bits; torch's global generator and thread count are left as they were.
+    RequestError for sets of fewer clips than folds.
     """
     if min(len(first), len(second)) < settings.folds:
         raise RequestError(f"{settings.folds} folds need as many clips in each set, got {len(first)} and {len(second)}")
-    if paired and len(first) != len(second):
-        raise RequestError(f"pairs need as many clips in each set, got {len(first)} and {len(second)}")
     sets = [(clips, torch.randperm(len(clips), generator=generator).tolist()) for clips in (first, second)]
-    if paired:
-        sets[1] = (second, sets[0][1])
+    total = 0.0
     for fold in range(settings.folds):
         others = [k for k in range(settings.folds) if k != fold]
         training = [torch.cat([clips[i] for k in others for i in order[k :: settings.folds]]) for clips, order in sets]
         held_out = [torch.cat([clips[i] for i in order[fold :: settings.folds]]) for clips, order in sets]
         with _isolate_torch(generator):
             network = _train_network(training, settings)
-            told = [score(network, windows) for windows in held_out]
-        first_clips, second_clips = (order[fold :: settings.folds] for _, order in sets)
-        yield HeldOutFold(network, (first_clips, second_clips), (told[0], told[1]))
-
-
-def average_verdicts(folds: Sequence[HeldOutFold]) -> HeldOutVerdict:
-    """Average what networks say of the clips that they did not see over folds."""
-    accuracy, preferred = (
-        sum(measure(*fold.logits) for fold in folds) / len(folds) for measure in (balanced_accuracy, _share_preferred)
-    )
-    return HeldOutVerdict(accuracy, preferred)
+            total += balanced_accuracy(*(score(network, windows) for windows in held_out))
+        tick()
+    return total / settings.folds
 
 
 @contextmanager
@@ -195,11 +129,3 @@ def score(network: nn.Module, windows: Float[Tensor, "windows frames channels"])
 def balanced_accuracy(first: Float[Tensor, " first"], second: Float[Tensor, " second"]) -> float:
     """Return the mean over both sets of the share of windows whose logit names their own set."""
     return (float((first > 0).double().mean()) + 1 - float((second > 0).double().mean())) / 2
-
-
-def _share_preferred(first: Float[Tensor, " first"], second: Float[Tensor, " second"]) -> float:
-    """Count pairs in which the first window's logit of the first set is the lower one; even ones are half."""
-    ordered, _ = second.sort()
-    above = len(second) - torch.searchsorted(ordered, first, right=True)
-    even = torch.searchsorted(ordered, first, right=True) - torch.searchsorted(ordered, first)
-    return float((above + 0.5 * even).double().mean()) / len(second)

@@ -1,6 +1,6 @@
 """Range of gait in a set of clips: step length, speed and turning of pieces of one length."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -47,11 +47,6 @@ def measure_gait_spread(motions: Sequence[Motion], *, seconds: float = PIECE_SEC
         raise RequestError(f"a gait needs clips and a length in seconds, got {len(motions)} and {seconds:g} s")
     pieces = [_measure_clip_gait(motion, seconds) for motion in motions]
     return {name: _summarise_pieces(torch.cat([clip[name] for clip in pieces])) for name in pieces[0]}
-
-
-def spread_ratios(made: Mapping[str, GaitSpread], data: Mapping[str, GaitSpread]) -> dict[str, float]:
-    """Return how widely one set spreads for each unit of the other's spread; NaN where either is unknown or 0."""
-    return {name: spread.std / data[name].std if data[name].std else float("nan") for name, spread in made.items()}
 
 
 def _summarise_pieces(values: Float[Tensor, "pieces"]) -> GaitSpread:
