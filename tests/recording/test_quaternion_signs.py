@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from mapctl import rotations
-from mapctl.recording.noise_estimation import estimate_angle_noise
-from mapctl.recording.noise_estimation import average_over_time, choose_continuous_signs
+from mapctl.recording.noise_estimation import average_over_time, choose_continuous_signs, estimate_angle_noise
 
 
 def swing(frames: int = 400, joints: int = 3) -> torch.Tensor:
