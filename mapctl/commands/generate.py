@@ -3,7 +3,7 @@
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import partial, reduce
 from pathlib import Path
 from typing import Annotated
 
@@ -20,8 +20,6 @@ from mapctl.commands.shared.inputs import read_character
 from mapctl.commands.shared.progress_bar import explain_progress, show_progress
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
-from mapctl.formats.bvh.stream import open_bvh_stream
-from mapctl.formats.whole_stream import open_whole_stream
 from mapctl.metrics.pace_changes import PACES, label_pace
 from mapctl.motion import Motion
 from mapctl.retarget import to_canonical
@@ -127,12 +125,13 @@ def _sample_seeds(command: Generate) -> list[int]:
 
 
 def _write(command: Generate, pieces: Iterable[Motion], path: Path, frames: int) -> None:
-    began, open_stream = time.perf_counter(), open_bvh_stream if command.to == ".bvh" else open_whole_stream
-    with show_progress(path.name, quiet=command.quiet) as progress, open_stream(path, frames) as file:
+    began, done = time.perf_counter(), list[Motion]()
+    with show_progress(path.name, quiet=command.quiet) as progress:
         for piece in pieces:
-            file.append(piece)
+            done.append(piece)
             if progress is not None:
-                progress(file.written, frames)
+                progress(sum(one.num_frames for one in done), frames)
+        reduce(Motion.join, done).save(path)
     if not command.quiet:
         rate = frames / (time.perf_counter() - began)
         print(f"{path}: {frames} frames, {frames / PRIOR_FPS:.1f} s, drawn at {rate:.0f} frames a second")

@@ -10,6 +10,7 @@ from helpers import run
 import mapctl
 from mapctl.commands import COMMANDS
 from mapctl.commands.shared.options import parse_size
+from mapctl.motion import Motion
 
 
 @pytest.fixture(scope="session")
@@ -231,16 +232,14 @@ def test_info_names_what_is_here(prior, capsys):
 
 @pytest.mark.slow
 def test_clips_that_are_finished_stay(prior, tmp_path, monkeypatch, capsys):
-    from mapctl.formats.bvh.stream import BvhStream
+    save = Motion.save
 
-    append = BvhStream.append
-
-    def interrupted(stream, piece):
-        if Path(stream.path).name == "generated_002.bvh":
+    def interrupted(motion, path):
+        if Path(path).name == "generated_002.bvh":
             raise KeyboardInterrupt
-        append(stream, piece)
+        save(motion, path)
 
-    monkeypatch.setattr(BvhStream, "append", interrupted)
+    monkeypatch.setattr(Motion, "save", interrupted)
     words = ("generate", "-o", tmp_path / "gen", "--seconds", 1, "--count", 4, "--prior", prior)
     assert run(*words, "--quiet") == 130
     assert capsys.readouterr().err == "mapctl: interrupted; 2 of 4 clips are finished\n"

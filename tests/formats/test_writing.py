@@ -17,7 +17,6 @@ from mapctl import formats, report
 from mapctl.errors import WriteError
 from mapctl.formats import usd
 from mapctl.formats.atomic import atomic_path, write_bytes
-from mapctl.formats.bvh.stream import open_bvh_stream
 from priors import checkpoints
 from priors.tensor_files import write_tensors
 from scenes.writers import gif_writer, mp4_writer, save_png, webp_writer
@@ -29,12 +28,6 @@ TENSORS = {"a": torch.zeros(200, 200)}
 
 def _save(path):
     formats.save(MOTION, path)
-
-
-def _stream(path):
-    with open_bvh_stream(path, 2 * MOTION.num_frames) as file:
-        file.append(MOTION)
-        file.append(MOTION)
 
 
 def _film(writer, picture=PICTURE):
@@ -55,7 +48,6 @@ WRITERS = {
     "a.bvh": _save,
     "a.npz": _save,
     "a.glb": _save,
-    "stream.bvh": _stream,
     "a.mp4": _film(mp4_writer),
     "a.gif": _film(gif_writer, PICTURE[::2, ::2]),  # colours of noise take long to choose
     "a.webp": _film(webp_writer),
