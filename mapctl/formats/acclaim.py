@@ -1,0 +1,592 @@
+"""Acclaim captures to Motion: an ASF skeleton and an AMC take. A joint at the start of every bone has its rotation.
+
+In an ASF a bone's rotation turns the bone itself, about an own frame C that is fixed in the parent's: the turn is
+C R inverse(C). So in the rest pose every joint frame is aligned with the world, a joint's offset is its parent bone
+from start to end, and the last bones' ends are End Sites. Bones of the root start at the root.
+
+An ASF is sections that begin with a colon. `#` starts a comment; commas and brackets are blanks. What this library has
+no use for (masses, limits, documentation) is passed over; everything that places a joint must be there and sound.
+Source: Acclaim Skeleton File Definition V1.10 (M. Schafer, 1994), and Vicon's notes on it for angles and root.
+
+In an AMC a frame is a line with its number and a line for each bone with the values that the skeleton's `dof` names. A
+bone that a frame leaves out keeps its last values, at first those of the rest pose; not in a file that is
+`:FULLY-SPECIFIED`, where only bones that it never names may be missing.
+"""
+
+from array import array
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+from math import nan
+from os import PathLike, fspath
+from pathlib import Path
+from typing import NoReturn
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mapctl import rotations
+from mapctl.errors import FileFormatError, RequestError
+from mapctl.formats import missing
+from mapctl.formats.bvh import euler
+from mapctl.formats.frame_rate import FASTEST, SLOWEST
+from mapctl.formats.missing import MissingValues
+from mapctl.formats.text import MAX_POSES, NUMBER, check_extent, decode, finite_number, read_bytes, shorten
+from mapctl.formats.units import FileUnit, guess_unit
+from mapctl.motion import Motion
+from mapctl.skeleton import Skeleton
+
+USUAL_FPS = Fraction(120)
+"""Frames per second of a file that does not say: those of the CMU database."""
+_INCH = 0.0254
+"""Metres."""
+MAX_BONES = 1000
+"""Most bones that are read; a body with fingers has about 60."""
+_SECTIONS = frozenset((":version", ":name", ":units", ":documentation", ":root", ":bonedata", ":hierarchy", ":skin"))
+_IGNORED = frozenset(("id", "bodymass", "cofmass", "limits"))
+_ALLOWED_KEYS = "name, direction, length, axis, dof, limits or end"
+_AXES = {"x": 0, "y": 1, "z": 2}
+_UNIT_ERROR = 0.01
+"""How far a direction's length may be from one: files round to a few digits."""
+
+Row = tuple[int, list[str]]
+"""Line number, from 1, and the words of a line."""
+_KEYWORDS = (
+    ":fully-specified",
+    ":force-all-joints-be-in-file",
+    ":degrees",
+    ":radians",
+    ":samples-per-second",
+    ":asf-file",
+    ":asf-path",
+    ":frame-range",
+)
+
+
+@dataclass(frozen=True, eq=False)
+class AsfSkeleton:
+    """Bones, the root first and every parent before its children. Lengths are in the file's unit."""
+
+    names: tuple[str, ...]
+    """Bone names as written; the first is `root`."""
+    parents: tuple[int, ...]
+    """Index of each bone's parent; -1 for the root."""
+    ends: np.ndarray
+    """(bones, 3) from each bone's start to its end at rest, in world axes; zero for the root."""
+    axis_quat_xyzw: np.ndarray
+    """(bones, 4) rotation of the frame that a bone's angles are about, at rest; for the root its pre-set rotation."""
+    channels: tuple[tuple[str, ...], ...]
+    """What an AMC line holds of each bone, as `tx` or `rz`; empty for a bone that never rotates."""
+    root_position: np.ndarray
+    """(3,) added to the root's position in every frame, file unit."""
+    length: float
+    """`length` of :units: so many units to the inch; 1 is no information."""
+    degrees: bool
+    """Whether angles are in degrees."""
+
+
+@dataclass(frozen=True, eq=False)
+class AmcText:
+    """Content of an AMC file."""
+
+    values: np.ndarray
+    """(frames, channels) in the order of the skeleton's bones and channels, file units."""
+    degrees: bool | None
+    """Whether angles are in degrees; None where the file does not say."""
+    fps: Fraction | None
+    """Frames per second; None where the file does not say, as most do not."""
+
+
+def load(path: str | PathLike[str], *, fps: Fraction | float | None = None) -> Motion:
+    """Read `take.amc` with the skeleton beside it, or `subject.asf+take.amc`.
+
+    Without a name the skeleton is the .asf of the same stem, else the only one in the folder. `fps` is frames per
+    second, over what the file says; else `USUAL_FPS`. Lengths are in metres by the ASF's `length`, or where that is 1
+    by the size of the body. FileFormatError says what is wrong, in which line.
+    """
+    return _read(path, fps=fps, lossy=False)[0]
+
+
+def load_with_missing(
+    path: str | PathLike[str], *, fps: Fraction | float | None = None
+) -> tuple[Motion, MissingValues]:
+    """Read a take in which some values are NaN, and which they are; FileFormatError where all of them are."""
+    return _read(path, fps=fps, lossy=True)
+
+
+def _read(path: str | PathLike[str], *, fps: Fraction | float | None, lossy: bool) -> tuple[Motion, MissingValues]:
+    if fps is not None and not SLOWEST <= fps <= FASTEST:
+        raise RequestError(f"the frame rate must be {SLOWEST:g} to {FASTEST:g}, got {float(fps):g}")
+    try:
+        subject, take = find_paths(path)
+    except OSError as error:  # as a name that is too long, or a folder that may not be listed
+        raise FileFormatError(path, f"cannot be read: {error.strerror or error}") from error
+    asf = read_asf(subject)
+    text = read_amc(take, asf, lossy=lossy)
+    check_extent(take, len(text.values), len(asf.names))
+    missing.check_any_known(take, np.isnan(text.values))
+    degrees = asf.degrees if text.degrees is None else text.degrees
+    skeleton, unit = _build_skeleton(asf)
+    places = missing.interpolate_nan(_positions(asf, text.values), np.zeros(3))
+    motion = Motion(
+        skeleton=skeleton,
+        fps=Fraction(fps or text.fps or USUAL_FPS).limit_denominator(100_000),
+        root_position=torch.from_numpy((places + asf.root_position) * unit.metres_per_unit),
+        local_quat_xyzw=_quaternions(asf, missing.hold_last(text.values), degrees=degrees),
+        source=unit,
+    )
+    return motion, _find_missing(asf, np.isnan(text.values))
+
+
+def _find_missing(asf: AsfSkeleton, lost: np.ndarray) -> MissingValues:
+    """Find the missing values by bone; a bone without channels is missing where all channels are."""
+    whole = lost.all(axis=1)
+    turns = [lost[:, columns].any(axis=1) | whole for _, columns in _columns(asf, "r")]
+    places = np.zeros((len(lost), len(turns)), dtype=bool)
+    places[:, 0] = lost[:, _columns(asf, "t")[0][1]].any(axis=1)
+    return MissingValues(torch.from_numpy(np.stack(turns, axis=1)), torch.from_numpy(places))
+
+
+def find_paths(path: str | PathLike[str]) -> tuple[Path, Path]:
+    """Find the skeleton's and the motion's file. FileFormatError names the candidates where the first is not clear.
+
+    In `folder/subject.asf+take.amc` the take lies in the same folder unless it names one; `subject.asf+.amc` are two
+    files of one stem.
+    """
+    text, file = fspath(path), Path(path)
+    cut = text.lower().find(".asf+")
+    if cut >= 0 and not file.exists():
+        subject, take = Path(text[: cut + 4]), Path(text[cut + 5 :])
+        if take.name.lower() == ".amc":
+            take = take.with_name(subject.stem + take.name)
+        return subject, take if len(take.parts) > 1 else subject.parent / take
+    if not file.is_file():
+        read_bytes(file)  # raises what is wrong with it
+    near = sorted(other for other in file.parent.iterdir() if other.suffix.lower() == ".asf" and other.is_file())
+    same = [other for other in near if other.stem == file.stem]
+    found = same or near
+    if len(found) != 1:
+        names = ", ".join(other.name for other in found[:8]) or "none"
+        wanted = f"name one as {found[0].name if found else 'subject.asf'}+{file.name}"
+        raise FileFormatError(path, f"needs the skeleton of its subject, an .asf; beside it: {names}; {wanted}")
+    return found[0], file
+
+
+def _build_skeleton(asf: AsfSkeleton) -> tuple[Skeleton, FileUnit]:
+    """Build joints at the bones' starts, in metres; also return the file's unit."""
+    parents = list(asf.parents)
+    offsets = np.concatenate([np.zeros((1, 3)), asf.ends[parents[1:]]])
+    leaves = [bone for bone in range(1, len(parents)) if bone not in set(parents)]
+    unit = FileUnit(_INCH / asf.length)
+    if asf.length == 1:
+        ends = {bone: asf.ends[bone].tolist() for bone in leaves}
+        unit = guess_unit(asf.names, parents, offsets, end_offsets=ends)
+    scale = unit.metres_per_unit
+    sites = {asf.names[bone]: tuple((asf.ends[bone] * scale).tolist()) for bone in leaves}
+    return Skeleton(asf.names, asf.parents, torch.from_numpy(offsets * scale), sites), unit
+
+
+def _columns(asf: AsfSkeleton, kind: str) -> list[tuple[tuple[int, ...], list[int]]]:
+    """Return by bone the axes of its channels of a kind, `t` or `r`, in file order, and their columns."""
+    found, start = [], 0
+    for channels in asf.channels:
+        wanted = [(channel, start + place) for place, channel in enumerate(channels) if channel[0] == kind]
+        found.append((tuple("xyz".index(channel[1]) for channel, _ in wanted), [column for _, column in wanted]))
+        start += len(channels)
+    return found
+
+
+def _positions(asf: AsfSkeleton, values: np.ndarray) -> np.ndarray:
+    """Return root positions (frames, 3), file unit."""
+    positions = np.zeros((len(values), 3))
+    axes, columns = _columns(asf, "t")[0]
+    positions[:, list(axes)] = values[:, columns]
+    return positions
+
+
+def _quaternions(asf: AsfSkeleton, values: np.ndarray, *, degrees: bool) -> Float[Tensor, "frames joints 4"]:
+    """Return the local rotations C R inverse(C), continuous in sign over time."""
+    turns = np.empty((len(values), len(asf.names), 4))
+    for bone, (axes, columns) in enumerate(_columns(asf, "r")):
+        angles = values[:, columns[::-1]]
+        # About fixed axes the first named rotation comes first; about moving ones, last.
+        turns[:, bone] = euler.to_quat_xyzw(np.deg2rad(angles) if degrees else angles, _reverse_axes(axes))
+    frame = torch.from_numpy(asf.axis_quat_xyzw).expand(len(values), -1, 4)
+    about = rotations.multiply(rotations.multiply(frame, torch.from_numpy(turns)), rotations.inverse(frame))
+    return rotations.make_sign_continuous(about)
+
+
+def _reverse_axes(axes: Sequence[int]) -> tuple[int, ...]:
+    return tuple(axes[::-1])
+
+
+def read_asf(path: str | PathLike[str]) -> AsfSkeleton:
+    """Read an ASF file. FileFormatError names the line and what was expected there."""
+    return _AsfReader(path).read(decode(path, read_bytes(path), "ASF text")[0])
+
+
+def rows(text: str) -> Iterator[Row]:
+    """Return the lines of ASF or AMC text that hold words, without comments; commas and brackets are blanks."""
+    for number, line in enumerate(text.split("\n"), start=1):
+        if words := line.partition("#")[0].translate(_BLANKS).split():
+            yield number, words
+
+
+_BLANKS = str.maketrans(",()", "   ")
+
+
+@dataclass
+class _Bone:
+    """A bone as far as it has been read."""
+
+    line: int
+    name: str = ""
+    direction: np.ndarray | None = None
+    length: float | None = None
+    axis: np.ndarray = field(default_factory=lambda: np.array([0.0, 0.0, 0.0, 1.0]))
+    channels: tuple[str, ...] = ()
+
+
+class _AsfReader:
+    def __init__(self, path: str | PathLike[str]):
+        self.path = path
+        self.degrees, self.length = True, 1.0
+
+    def fail(self, message: str, line: int | None) -> NoReturn:
+        raise FileFormatError(self.path, message, line)
+
+    def read(self, text: str) -> AsfSkeleton:
+        sections = self._sections(text)
+        for name in (":root", ":bonedata", ":hierarchy"):
+            if name not in sections:
+                self.fail(f"has no section {name}", text.count("\n") + 1)
+        self._units(sections.get(":units", []))
+        root, position = self._root(sections[":root"])
+        bones = [root, *self._bones(sections[":bonedata"])]
+        index = self._index(bones)
+        order, parents = self._tree(bones, index, sections[":hierarchy"])
+        place = {bone: number for number, bone in enumerate(order)}
+        kept = [bones[bone] for bone in order]
+        return AsfSkeleton(
+            names=tuple(bone.name for bone in kept),
+            parents=tuple(place[parents[bone]] if bone else -1 for bone in order),
+            ends=np.array([self._end(bone) for bone in kept]),
+            axis_quat_xyzw=np.array([bone.axis for bone in kept]),
+            channels=tuple(bone.channels for bone in kept),
+            root_position=position,
+            length=self.length,
+            degrees=self.degrees,
+        )
+
+    def _sections(self, text: str) -> dict[str, list[Row]]:
+        """Return rows by section; words behind a section's name, as in `:name body`, are its first row."""
+        found: dict[str, list[Row]] = {}
+        current: list[Row] | None = None
+        for line, words in rows(text):
+            name = words[0].lower()
+            if name.startswith(":"):
+                if name not in _SECTIONS:
+                    self.fail(f"unknown section {shorten(words[0])}, allowed: {', '.join(sorted(_SECTIONS))}", line)
+                if name in found:
+                    self.fail(f"a second section {name}", line)
+                current = found.setdefault(name, [])
+                words = words[1:]
+            if current is None:
+                self.fail(f"expected a section as :version or :root, got {shorten(words[0])}", line)
+            if words:
+                current.append((line, words))
+        return found
+
+    def _units(self, section: Sequence[Row]) -> None:
+        for line, words in section:
+            key, value = words[0].lower(), words[1].lower() if len(words) == 2 else ""
+            if key == "length":
+                self.length = self._numbers(words[:2], line, 1)[0]  # some add the unit's name
+                if not 1e-3 <= self.length <= 1e3:
+                    self.fail(f"expected a length unit from 0.001 to 1000, got {self.length:g}", line)
+            elif key == "angle":
+                if value not in ("deg", "rad"):
+                    self.fail(f"expected 'angle deg' or 'angle rad', got {shorten(' '.join(words))}", line)
+                self.degrees = value == "deg"
+            elif key != "mass":
+                self.fail(f"expected mass, length or angle, got {shorten(words[0])}", line)
+
+    def _root(self, section: Sequence[Row]) -> tuple[_Bone, np.ndarray]:
+        """Read the root and its pre-set position."""
+        root = _Bone(section[0][0] if section else 0, "root")
+        told: dict[str, tuple[int, list[str]]] = {}
+        for line, words in section:
+            key = words[0].lower()
+            if key not in ("order", "axis", "position", "orientation") or key in told:
+                self.fail(f"expected order, axis, position and orientation once each, got {shorten(words[0])}", line)
+            told[key] = line, words
+        if "order" not in told:
+            self.fail("the root has no order, as TX TY TZ RX RY RZ", section[-1][0] if section else None)
+        line, words = told["order"]
+        root.channels = self._channels(words, line, allowed="tr")
+        if not root.channels:
+            self.fail("expected the root's order as TX TY TZ RX RY RZ, got nothing", line)
+        axes = self._axis_order(told["axis"][1][-1], told["axis"][0]) if "axis" in told else (0, 1, 2)
+        if "orientation" in told:
+            line, words = told["orientation"]
+            root.axis = self._fixed_axes_quat(self._numbers(words, line, 3), axes)
+        if "position" not in told:
+            return root, np.zeros(3)
+        line, words = told["position"]
+        return root, np.array(self._numbers(words, line, 3))
+
+    def _bones(self, section: Sequence[Row]) -> Iterator[_Bone]:
+        bone, seen, after_limits = None, set(), False
+        for line, words in section:
+            key = words[0].lower()
+            if key == "begin" and bone is None:
+                bone, seen = _Bone(line), set()
+            elif bone is None:
+                self.fail(f"expected begin, got {shorten(words[0])}", line)
+            elif key == "end":
+                yield self._check_complete(bone, line)
+                bone = None
+            elif not (after_limits and _is_limit(words[0])):
+                if key in seen:
+                    self.fail(f"a second {key} in a bone", line)
+                seen.add(key)
+                self._take(bone, key, words, line)
+                after_limits = key == "limits"
+        if bone is not None:
+            self.fail(f"the bone of line {bone.line} has no end", section[-1][0])
+
+    def _take(self, bone: _Bone, key: str, words: list[str], line: int) -> None:
+        """Read one line of a bone."""
+        if key == "name":
+            if len(words) != 2:
+                self.fail(f"expected one name, got {shorten(' '.join(words[1:]))}", line)
+            bone.name = words[1]
+        elif key == "direction":
+            bone.direction = self._direction(words, line)
+        elif key == "length":
+            bone.length = self._numbers(words, line, 1)[0]
+            if bone.length < 0:
+                self.fail(f"expected a length of 0 or more, got {bone.length:g}", line)
+        elif key == "axis":
+            if len(words) != 5:
+                self.fail(f"expected three angles and an order as XYZ, got {len(words) - 1} words", line)
+            bone.axis = self._fixed_axes_quat(self._numbers(words[:4], line, 3), self._axis_order(words[4], line))
+        elif key == "dof":
+            bone.channels = self._channels(words, line, allowed="r")
+        elif key not in _IGNORED:
+            self.fail(f"expected {_ALLOWED_KEYS}, got {shorten(words[0])}", line)
+
+    def _check_complete(self, bone: _Bone, line: int) -> _Bone:
+        lacks = [
+            key
+            for key, value in (("name", bone.name or None), ("direction", bone.direction), ("length", bone.length))
+            if value is None
+        ]
+        if lacks:
+            self.fail(f"the bone of line {bone.line} has no {' and no '.join(lacks)}", line)
+        return bone
+
+    def _index(self, bones: Sequence[_Bone]) -> dict[str, int]:
+        """Index bones by name in lower case, as files are not strict about it."""
+        found: dict[str, int] = {}
+        for number, bone in enumerate(bones):
+            if bone.name.lower() in found:
+                self.fail(f"a second bone named {shorten(bone.name)}, names must be unique", bone.line)
+            if number > MAX_BONES:
+                self.fail(f"more than {MAX_BONES} bones, which is the most allowed", bone.line)
+            found[bone.name.lower()] = number
+        return found
+
+    def _tree(self, bones: Sequence[_Bone], index: dict[str, int], section: Sequence[Row]):
+        """Sort bones depth first in file order; also return the parent of each. The numbers are those of `bones`."""
+        parents, children = {}, {}
+        for line, words in section:
+            if words[0].lower() in ("begin", "end") and len(words) == 1:
+                continue
+            for word in words:
+                if word.lower() not in index:
+                    self.fail(f"no bone {shorten(word)} in :bonedata", line)
+            above, *below = (index[word.lower()] for word in words)
+            for bone in below:
+                if bone == 0 or bone in parents:
+                    self.fail(f"{shorten(bones[bone].name)} has a second parent", line)
+                parents[bone] = above
+                children.setdefault(above, []).append(bone)
+        order, waiting = [], [0]
+        while waiting:
+            order.append(waiting.pop())
+            waiting += reversed(children.get(order[-1], []))
+        for number in sorted(set(range(len(bones))) - set(order))[:1]:
+            bone = bones[number]
+            self.fail(f"the bone {shorten(bone.name)} does not hang on the root in :hierarchy", bone.line)
+        return order, parents
+
+    def _end(self, bone: _Bone) -> np.ndarray:
+        return np.zeros(3) if bone.direction is None or bone.length is None else bone.direction * bone.length
+
+    def _direction(self, words: list[str], line: int) -> np.ndarray:
+        vector = np.array(self._numbers(words, line, 3))
+        norm = float(np.linalg.norm(vector))
+        if norm and abs(norm - 1) > _UNIT_ERROR:
+            self.fail(f"expected a direction of length 1, got one of {norm:g}", line)
+        return vector
+
+    def _channels(self, words: list[str], line: int, *, allowed: str) -> tuple[str, ...]:
+        channels = tuple(word.lower() for word in words[1:])
+        known = {kind + axis for kind in allowed for axis in _AXES}
+        if set(channels) - known or len(set(channels)) < len(channels):
+            wanted = " ".join(sorted(known, reverse=allowed != "r"))
+            self.fail(f"expected of {wanted} each at most once, got {shorten(' '.join(words[1:]))}", line)
+        return channels
+
+    def _axis_order(self, word: str, line: int) -> tuple[int, ...]:
+        if sorted(word.lower()) != ["x", "y", "z"]:
+            self.fail(f"expected an axis order as XYZ, got {shorten(word)}", line)
+        return tuple(_AXES[letter] for letter in word.lower())
+
+    def _fixed_axes_quat(self, angles: Sequence[float], axes: tuple[int, ...]) -> np.ndarray:
+        """Return the quaternion of three rotations about fixed axes: `angles` about x, y and z in the order that `axes`
+        says."""
+        radians = np.deg2rad(angles) if self.degrees else np.array(angles)
+        return euler.to_quat_xyzw(radians[list(axes[::-1])], axes[::-1])
+
+    def _numbers(self, words: list[str], line: int, count: int) -> list[float]:
+        """Parse the words after the first as numbers."""
+        values = [finite_number(word) for word in words[1:]]
+        if len(values) != count or None in values:
+            got = shorten(" ".join(words[1:]) or "nothing")
+            self.fail(f"expected for {words[0].lower()} {count} of {NUMBER}, got {got}", line)
+        return [value for value in values if value is not None]
+
+
+def _is_limit(word: str) -> bool:
+    """Return whether a line holds further limits: it begins with a number, which may be infinite."""
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def read_amc(path: str | PathLike[str], skeleton: AsfSkeleton, *, lossy: bool = False) -> AmcText:
+    """Read a take of the skeleton. FileFormatError names the line and what was expected there.
+
+    A `lossy` one may hold NaN among its values, but not only NaN.
+    """
+    reader = _AmcReader(path, skeleton, lossy)
+    reader.read(rows(decode(path, read_bytes(path), "AMC text")[0]))
+    values = np.frombuffer(reader.values).reshape(reader.frames, reader.width)
+    return AmcText(values, reader.degrees, reader.fps)
+
+
+@dataclass
+class _AmcReader:
+    path: str | PathLike[str]
+    skeleton: AsfSkeleton
+    lossy: bool = False
+    degrees: bool | None = None
+    fps: Fraction | None = None
+    full: bool = False
+    frames: int = 0
+    """Number of frames begun so far."""
+    number: int = 0
+    """Number of the current frame, as the file counts."""
+    line: int = 0
+    """Line at which the current frame began."""
+    values: array = field(default_factory=lambda: array("d"))
+    seen: set[int] = field(default_factory=set)
+    """Bones of the current frame so far."""
+    expected_bones: set[int] = field(default_factory=set)
+    """Bones of the first frame; in a fully specified file those of all."""
+
+    def __post_init__(self):
+        counts = [len(channels) for channels in self.skeleton.channels]
+        starts = np.cumsum([0, *counts])[:-1].tolist()
+        self.width = sum(counts)
+        names = [name.lower() for name in self.skeleton.names]
+        self.columns = dict(zip(names, zip(range(len(names)), starts, counts, strict=True), strict=True))
+        self.row = array("d", bytes(8 * self.width))
+
+    def fail(self, message: str, line: int) -> NoReturn:
+        raise FileFormatError(self.path, message, line)
+
+    def read(self, lines: Iterator[Row]) -> None:
+        line = 1
+        for line, words in lines:
+            if words[0].startswith(":"):
+                self._keyword(words, line)
+            elif len(words) == 1 and words[0].isdecimal() and words[0].isascii():
+                self._finish()
+                self._begin(words[0], line)
+            else:
+                self._bone(words, line)
+        if not self.frames:
+            self.fail("holds no frame, expected a line with the number 1", line)
+        self._finish()
+
+    def _keyword(self, words: Sequence[str], line: int) -> None:
+        word = words[0].lower()
+        if word not in _KEYWORDS or self.frames:
+            allowed = "a frame's number or a bone" if self.frames else f"one of {', '.join(_KEYWORDS)}"
+            self.fail(f"expected {allowed}, got {shorten(words[0])}", line)
+        if word in (":degrees", ":radians"):
+            if self.degrees is not None:
+                self.fail("a second word on the unit of angles", line)
+            self.degrees = word == ":degrees"
+        elif word == ":samples-per-second":
+            self.fps = self._rate(words, line)
+        elif word == ":fully-specified":
+            self.full = True
+
+    def _rate(self, words: Sequence[str], line: int) -> Fraction:
+        value = finite_number(words[1]) if len(words) == 2 else None
+        if value is None or not SLOWEST <= value <= FASTEST:
+            got = shorten(" ".join(words[1:]))
+            self.fail(f"expected {SLOWEST:g} to {FASTEST:g} samples a second, got {got}", line)
+        return Fraction(value).limit_denominator(100_000)
+
+    def _begin(self, word: str, line: int) -> None:
+        number = int(word) if len(word) <= 9 else -1
+        if number < 0 or (self.frames and number != self.number + 1):
+            expected = f"frame {self.number + 1} after frame {self.number}" if self.frames else "a frame's number"
+            self.fail(f"expected {expected}, got {shorten(word)}", line)
+        self.frames, self.number, self.line, self.seen = self.frames + 1, number, line, set()
+        if self.frames * max(self.width, len(self.columns)) > MAX_POSES:
+            self.fail(f"more than {MAX_POSES} values, which is the most allowed", line)
+
+    def _bone(self, words: Sequence[str], line: int) -> None:
+        if not self.frames:
+            self.fail(f"expected the number of the first frame, got {shorten(words[0])}", line)
+        if words[0].lower() not in self.columns:
+            self.fail(f"the skeleton has no bone {shorten(words[0])}", line)
+        bone, start, count = self.columns[words[0].lower()]
+        if bone in self.seen:
+            self.fail(f"a second line for {shorten(words[0])} in frame {self.number}", line)
+        if len(words) - 1 != count:
+            self.fail(f"{shorten(words[0])} has {len(words) - 1} values, expected {count}", line)
+        for column, word in enumerate(words[1:], start):
+            value = nan if self.lossy and missing.is_nan(word) else finite_number(word)
+            if value is None:
+                channel = self.skeleton.channels[bone][column - start]
+                got = f"{shorten(word)}{missing.missing_hint(word)}"
+                self.fail(f"{shorten(words[0])} {channel}: expected {NUMBER}, got {got}", line)
+            self.row[column] = value
+        self.seen.add(bone)
+
+    def _finish(self) -> None:
+        """Keep the frame that has been read, if any."""
+        if not self.frames:
+            return
+        if 0 not in self.seen:
+            self.fail(f"frame {self.number} has no line for the root", self.line)
+        if self.frames == 1:
+            self.expected_bones = self.seen
+        if self.full and self.seen != self.expected_bones:
+            bone = self.skeleton.names[min(self.seen ^ self.expected_bones)]
+            self.fail(
+                f"not every frame up to {self.number} holds {shorten(bone)}, but the file says it is fully specified",
+                self.line,
+            )
+        self.values.extend(self.row)
