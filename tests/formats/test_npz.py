@@ -2,7 +2,6 @@
 
 import io
 import os
-from dataclasses import replace
 from fractions import Fraction
 
 import hypothesis.strategies as st
@@ -66,12 +65,6 @@ CHANGES = {
     "missing": ({"parents": None, "fps": None}, "lacks the keys parents, fps"),
     "other version": ({"format": np.array("mapctl-motion-9")}, "format is 'mapctl-motion-9'"),
     "fewer joints": ({"local_quat_xyzw": QUAT[:, :20]}, r"local_quat_xyzw .* expected .*\(5, 21, 4\)"),
-    "fewer frames": ({"local_quat_xyzw": QUAT[:4]}, r"local_quat_xyzw .* expected .*\(5, 21, 4\)"),
-    "whole numbers": ({"offsets": np.zeros((21, 3), int)}, "offsets has int64"),
-    "nan": (
-        {"root_position_world": np.full((5, 3), np.nan)},
-        r"root_position_world at \[0, 0\]: expected a finite number",
-    ),
     "no rotation": ({"local_quat_xyzw": QUAT * 0}, "no unit quaternion"),
     "no frames": (
         {
@@ -82,13 +75,10 @@ CHANGES = {
         "at least one frame",
     ),
     "no rate": ({"fps": np.array([30, 0])}, "does not hold a motion"),
-    "negative rate": ({"fps": np.array([-30, 1])}, "-30 frames per second, allowed are"),
     "not a tree": ({"parents": np.full(21, 3)}, "joint 0 must be the root"),
     "same names": ({"names": np.array([*CANONICAL.names[:20], "hips"]), "end_names": np.array(["hips"] * 5)}, "unique"),
     "stray end": ({"end_names": np.array(["a", "b", "c", "d", "e"])}, "joints of the skeleton"),
-    "stray joint": ({"moving_joints": np.array([77])}, "joints of the skeleton"),
     "objects": ({"names": np.array([object()] * 21)}, "not a sound .npz archive"),
-    "one number": ({"root_position_world": np.array(1.0)}, "root_position_world"),
 }
 
 
@@ -99,11 +89,6 @@ def test_an_archive_that_is_no_motion_is_refused(case, tmp_path):
     with pytest.raises(FileFormatError, match=words) as caught:
         formats.load(tmp_path / "walk.npz")
     assert "\n" not in str(caught.value)
-
-
-def test_the_unchanged_archive_is_sound(tmp_path):
-    (tmp_path / "walk.npz").write_bytes(archive(example()))
-    assert formats.load(tmp_path / "walk.npz").num_frames == 5
 
 
 def test_pickled_objects_are_never_run(tmp_path):
@@ -124,28 +109,6 @@ def test_an_archive_that_unpacks_too_large_is_refused_before_it_is(tmp_path, mon
         formats.load(tmp_path / "walk.npz")
 
 
-def test_cut_and_mutated_archives_are_read_or_refused(tmp_path):
-    whole, random, refused = archive(example()), np.random.default_rng(0), 0
-    path = tmp_path / "walk.npz"
-    for _ in range(100):
-        raw = bytearray(whole[: random.integers(1, len(whole))] if random.random() < 0.3 else whole)
-        for place in random.integers(0, len(raw), 3):
-            raw[place] = random.integers(256)
-        path.write_bytes(raw)
-        try:
-            formats.load(path)
-        except FileFormatError:
-            refused += 1
-    assert refused > 50
-
-
-def test_a_motion_that_is_not_finite_is_refused_and_nothing_is_left(tmp_path):
-    bad = replace(example(), root_position=torch.full((5, 3), torch.nan, dtype=torch.float64))
-    with pytest.raises(RequestError, match="root_position_world is not finite"):
-        bad.save(tmp_path / "walk.npz")
-    assert not list(tmp_path.iterdir())
-
-
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
 def test_an_interrupted_output_leaves_the_old_file_and_nothing_else(error, tmp_path):
     path = tmp_path / "report.json"
@@ -161,12 +124,6 @@ def test_an_interrupted_output_leaves_the_old_file_and_nothing_else(error, tmp_p
         stop()
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
-
-
-def test_a_full_disk_is_a_request_error_and_leaves_nothing(tmp_path):
-    with pytest.raises(RequestError, match=r"walk\.mp4: No space left"), atomic_path(tmp_path / "walk.mp4"):
-        raise OSError(28, "No space left on device")
-    assert not list(tmp_path.iterdir())
 
 
 def test_places_that_cannot_be_written_are_named(tmp_path):

@@ -48,14 +48,6 @@ def test_a_kernel_is_compiled_once_and_loads_without_the_compiler(tmp_path):
 
 
 @pytest.mark.slow
-def test_another_type_is_compiled_beside_one_on_disk(tmp_path):
-    use_kernel(tmp_path)
-    heard = use_kernel(tmp_path, "float")
-    assert heard.startswith("[(2, 2, True), (2, 2, False)] ")
-    assert heard.endswith("True")
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("ending", ["nbi", "nbc"])
 def test_damaged_code_is_compiled_anew(tmp_path, ending):
     use_kernel(tmp_path)
