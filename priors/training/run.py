@@ -193,12 +193,13 @@ class TrainingRun(Generic[C, S, T]):
                 then = index["identity"][part]
                 changed = [f"{key}: {then.get(key)} then, {now[key]} now" for key in now if then.get(key) != now[key]]
                 if changed:
-                    told = "; ".join(changed)
-                    raise CheckpointError(f"{self.recipe.out}: the run was begun with other {part} ({told})")
+                    raise CheckpointError(
+                        f"{self.recipe.out}: the run was begun with other {part} ({'; '.join(changed)})"
+                    )
             self.curve = [{**row, "step": int(row["step"])} for row in index["curve"]]
-            if self.keeps_best:
-                self.best = select_prefixed("best.", tensors)
             self.trainer.load_state(tensors, int(index["step"]))
+            if self.keeps_best:  # a run that was begun without patience kept none
+                self.best = select_prefixed("best.", tensors) or _copy_weights(self.trainer.exported)
         except _UNREADABLE as error:
             raise _make_unreadable_error(self.recipe.out, error) from error
         if self.trainer.step > self.trainer.steps:

@@ -70,7 +70,7 @@ def test_the_command_takes_it_and_the_card_tells_it(tmp_path, capsys):
     words = ("train", "lstm-gmm", "--data", data, "-o", out, "--width", 8, "--components", 2, "--window", 20)
     words = (*words, "--batch", 3, "--device", "cpu", "--quiet")
     assert run(*words, "--steps", 1, "--standing-share", 0.3) == 0
-    assert "--standing-share 0.3" in priors.load(str(out)).card.training["command"]
+    assert priors.load(str(out)).card.training["settings"]["standing_share"] == 0.3
     assert run(*words, "--steps", 2, "--resume") == 2  # drawn from other windows
     assert "standing" in capsys.readouterr().err
     assert run(*words, "--steps", 2, "--resume", "--standing-share", 0.3) == 0
