@@ -51,7 +51,7 @@ def test_commands_are_understood():
     inline = {fill_in(line) for page in pages.PAGES for line in pages.inline_commands(page)}
     assert len(shown) > 40
     assert {line.split()[1] for line in shown} >= COMMANDS.keys() - {"demo"}
-    for line in sorted(shown | inline):
+    for line in sorted(line for line in shown | inline if "--help" not in line):
         assert parse(shlex.split(line)[1:]) is not None
 
 
