@@ -1,9 +1,5 @@
 """`mapctl convert` between all formats, as a user types it, and what docs/guides/formats.md says of them."""
 
-import re
-import shlex
-import subprocess
-import sys
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -17,10 +13,9 @@ from fbx_maker import make_fbx
 from helpers import run, walk
 
 import mapctl
-from mapctl import cli, formats, retarget
+from mapctl import formats, retarget
 from mapctl.formats import USD_WRITTEN, npz, usd
 
-DOCS = (Path(__file__).parents[2] / "docs" / "guides" / "formats.md").read_text("utf-8")
 needs_usd = pytest.mark.skipif(not usd.is_installed(), reason="needs usd-core: pip install 'mapctl[usd]'")
 needs_ufbx = pytest.mark.skipif(find_spec("ufbx") is None, reason="needs ufbx: pip install 'mapctl[fbx]'")
 
@@ -159,25 +154,6 @@ def test_a_missing_package_is_named(here, capsys, monkeypatch):
     assert "cannot write out.usda: USD needs the package usd-core: pip install 'mapctl[usd]'" in capsys.readouterr().err
 
 
-@pytest.mark.slow  # another process starts in test_cli_errors.py and in test_cli_processes.py
-def test_as_installed(here):
-    done = subprocess.run(
-        [sys.executable, "-m", "mapctl.cli", "convert", "in.amc", "out.bvh"],
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert done.returncode == 0, done.stderr
-    assert mapctl.load("out.bvh").num_frames == 6
-
-
-def test_help_names_every_format(capsys):
-    with pytest.raises(SystemExit):
-        run("convert", "--help")
-    told = capsys.readouterr().out
-    assert all(ending in told for ending in (*formats.READERS, *formats.WRITERS, ".asf"))
-
-
 @pytest.mark.parametrize(
     "words", ["--rig canonical", "--rig mixamo", "--root-motion", "--fps 20", "--mirror", "--in-place"]
 )
@@ -185,34 +161,3 @@ def test_a_licence_outlives_what_is_done_to_the_motion(here, words):
     formats.save(replace(walk(40), licence="CC BY 4.0 (somebody)"), "given.npz")
     assert run("convert", "given.npz", "out.npz", *words.split()) == 0
     assert mapctl.load("out.npz").licence == "CC BY 4.0 (somebody)"
-
-
-def test_the_page_names_every_format_and_key():
-    rows = dict(re.findall(r"^\| (`\.[^|]*) \| (yes|no) \| ", DOCS, re.MULTILINE))
-    read = {ending for cell, yes in rows.items() if yes == "yes" for ending in re.findall(r"`(\.\w+)`", cell)}
-    assert read - {".asf"} == set(formats.READERS)
-    written = {
-        e
-        for cell, yes in re.findall(r"^\| (`\.[^|]*) \| \w+ \| (yes|no)", DOCS, re.MULTILINE)
-        if yes == "yes"
-        for e in re.findall(r"`(\.\w+)`", cell)
-    }
-    assert written == set(formats.WRITERS)
-    assert re.findall(r"^\| `(\w+)` \| ", DOCS, re.MULTILINE) == list(
-        npz.to_arrays(replace(walk(2), licence="CC0 1.0"))
-    )
-
-
-def test_commands_of_the_page_are_understood():
-    lines = [line.split("#")[0] for line in DOCS.splitlines() if line.startswith("mapctl ")]
-    assert len(lines) == 7
-    for line in lines:
-        assert cli.parse(shlex.split(line)[1:]) is not None
-
-
-def test_the_pages_example_turns_the_walk(here):
-    (code,) = re.findall(r"```python\n(.*?)```", DOCS, re.DOTALL)
-    Path("in.npz").rename("walk.npz")
-    exec(compile(code, "formats.md", "exec"), {})
-    before, after = (mapctl.load(name).joint_positions().numpy() for name in ("walk.npz", "turned.npz"))
-    np.testing.assert_allclose(after, before * (-1, 1, -1), atol=1e-12)

@@ -48,12 +48,6 @@ def test_all_go_together(here, capsys, chosen, travel):
     assert (float((hips[-1] - hips[0]).norm()) < 0.2) == (travel == "--in-place")
 
 
-def test_the_command_does_what_the_functions_do(here):
-    assert run("convert", "in.bvh", "out.npz", "--mirror", "--in-place") == 0
-    wanted = editing.remove_travel(editing.mirror(mapctl.load("in.bvh")))
-    torch.testing.assert_close(mapctl.load("out.npz").joint_positions(), wanted.joint_positions(), atol=1e-9, rtol=0)
-
-
 def test_a_loop_is_a_whole_number_of_frames_at_the_wanted_rate(here, capsys):
     assert run("convert", "in.bvh", "out.npz", "--loop", "--in-place", "--fps", "24") == 0
     motion = mapctl.load("out.npz")
@@ -98,15 +92,6 @@ def test_what_cannot_be_done_is_refused_in_a_line(here, capsys, options, said):
     assert not Path("out.bvh").exists()
 
 
-def test_no_cycle_says_what_comes_nearest(here, capsys):
-    motion = walk(90)
-    shift = torch.linspace(0, 4, 90).double() ** 2
-    moved = motion.root_position + torch.stack([shift, 0 * shift, 0 * shift], dim=-1)
-    mapctl.Motion(motion.skeleton, motion.fps, moved, motion.local_quat_xyzw).save("away.bvh")
-    assert run("convert", "away.bvh", "out.bvh", "--loop") == 2
-    assert "come nearest, with joints and velocities" in capsys.readouterr().err
-
-
 def test_a_folder_becomes_a_folder_with_the_same_names(here, capsys):
     assert run("convert", "takes", "out", "--to", "npz", "--mirror") == 0
     found = sorted(str(path.relative_to("out")) for path in Path("out").rglob("*.*"))
@@ -119,11 +104,6 @@ def test_a_folder_becomes_a_folder_with_the_same_names(here, capsys):
 def test_without_an_ending_files_keep_their_own(here):
     assert run("convert", "takes", "out", "--quiet") == 0
     assert sorted(path.name for path in Path("out").rglob("*.*")) == ["a.bvh", "b.npz", "c.bvh"]
-
-
-def test_a_rate_of_captures_is_for_captures_alone(here):
-    assert run("convert", "takes", "out", "--to", ".npz", "--fps-in", "60", "--quiet") == 0
-    assert [mapctl.load(f"out/{name}.npz").fps for name in ("c", "day 1/a")] == [60, 30]
 
 
 @pytest.mark.slow
@@ -222,9 +202,3 @@ def test_measure_names_the_cycle(here, capsys):
     told = json.loads(capsys.readouterr().out)["cycle"]
     assert told["frames"] == 30
     assert told["gait"]
-
-
-def test_measure_says_that_there_is_none(here, capsys):
-    walk(8).save("short.bvh")
-    assert run("measure", "short.bvh") == 0
-    assert "cycle: none, 0.27 s are too short for one" in capsys.readouterr().out

@@ -75,27 +75,6 @@ def test_a_prior_joins_the_last_stage(denoise, recording, tmp_path):
     assert "likelihood" in json.loads(report.read_text())["ledger"]
 
 
-@pytest.mark.slow
-def test_auto_chooses_among_the_bundled_densities_and_says_which(denoise, recording, tmp_path, capsys):
-    report = tmp_path / "r.json"
-    assert denoise(recording, "-o", tmp_path / "o.bvh", "--prior", "auto", "--report", report) == 0
-    (window,) = json.loads(report.read_text())["densities"]
-    assert (window["start"], window["stop"]) == (0, 40)
-    assert set(window["nats"]) == {"locomotion", "general"}
-    assert window["prior"] == max(window["nats"], key=window["nats"].get)
-    assert 0 < window["weight"] <= 1
-    told = capsys.readouterr().out
-    assert f"{window['prior']} {window['nats'][window['prior']]:.0f} nats a frame, used in 40" in told
-
-
-def test_where_a_prior_is_out_of_its_depth_is_said(denoise, recording, tmp_path, capsys):
-    prior = save_tiny_prior(tmp_path / "prior.safetensors")
-    card = prior.with_suffix(".json")
-    card.write_text(json.dumps(json.loads(card.read_text()) | {"quality": {"windows": {"p2": 1e5}}}))
-    assert denoise(recording, "-o", tmp_path / "o.bvh", "--prior", prior) == 0
-    assert "prior out of its depth, so that it counts for less than half: frames 0:40" in capsys.readouterr().out
-
-
 @pytest.fixture
 def folder(tmp_path):
     """Two captures of which one lies deeper, and a file that is none."""
@@ -203,12 +182,6 @@ def test_a_cluster_of_this_machine_gives_the_same_files(denoise, folder, tmp_pat
     assert denoise(folder, "-o", tmp_path / "two", "--cluster", "local", "--jobs", 2, "--quiet") == 0
     for name in ("a.bvh", "deep/b.bvh"):
         assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
-
-
-@pytest.mark.skipif(find_spec("ray") is not None, reason="ray is there")
-def test_a_cluster_without_ray_is_refused(denoise, folder, tmp_path, capsys):
-    assert denoise(folder, "-o", tmp_path / "out", "--cluster", "local") == 2
-    assert "pip install 'mapctl[cluster]'" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -60,13 +60,6 @@ def test_every_job_takes_files_and_classes(here, models, capsys, job):
     assert len(set(found.values())) == 4
 
 
-def test_a_file_of_the_name_of_a_class_is_the_file(here, models, capsys):
-    Path("walk").write_text("no motion")
-    assert run("tween", *JOBS["tween"], *models, "--dna", "walk") == 2
-    assert "walk" in (told := capsys.readouterr().err)
-    assert "class" not in told
-
-
 @pytest.mark.parametrize("job", JOBS)
 @pytest.mark.parametrize(
     ("dna", "said"),
@@ -142,36 +135,6 @@ def test_variations_are_drawn_among_styles_and_come_again(here, models, prior, c
             assert style.startswith(name.partition(",")[0])
     if dna is not None and "," in dna:
         assert lines[1] != lines[2]
-
-
-@pytest.mark.slow
-def test_the_seed_draws_the_order_of_styles(here, models, prior, capsys):
-    words = [*JOBS["tween"], *models, "--prior", prior, "--variations", 2, "--dna", "walk,style.bvh,wave-left-hand"]
-    for seed in range(4):
-        assert run("tween", *words, "--seed", seed) == 0
-    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("out_001")]
-    assert len({line.partition(" in the style of ")[2] for line in lines}) > 1
-
-
-@pytest.mark.slow
-def test_variations_are_shown_below_each_other(here, models, prior):
-    words = [*JOBS["tween"], *models, "--prior", prior, "--variations", 2, "--dna", "style.bvh", "--quiet"]
-    assert run("tween", *words, "--video", "four.png") == 0
-    assert Path("four.png").stat().st_size > 1000
-    assert run("tween", *words, "--video", "four.gif") == 2
-
-
-def test_weights_without_classes_have_no_variations_to_draw(here, prior, tmp_path, capsys):
-    predictor = save_tiny_path(tmp_path / "path.safetensors")
-    trained = save_tiny_tweener(tmp_path / "tweener.safetensors", str(predictor))
-    words = ["--method", "tweener", "--inbetweener", trained, "--path", predictor, "--prior", prior]
-    assert run("tween", *JOBS["tween"], *words, "--variations", 2) == 2
-    assert "knows no classes of motion to draw variations from" in capsys.readouterr().err
-
-
-def test_info_lists_classes_and_no_vectors(models, capsys):
-    assert run("info", models[3], "--json") == 0
-    assert json.loads(capsys.readouterr().out)["data"]["classes"] == {"walk": 1, "wave-left-hand": 1}
 
 
 @pytest.mark.slow

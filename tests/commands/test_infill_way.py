@@ -42,11 +42,6 @@ def test_only_the_hips_place_changes_and_only_there(clip, path, tmp_path, finish
     assert 1 <= changed.any(axis=0).sum() <= 3
 
 
-def test_the_summary_says_that_it_is_the_place_alone(clip, path, tmp_path, capsys):
-    assert run("infill", clip, "-o", tmp_path / "out.bvh", "--way", "1s:1.5s", "--path", path, "--no-finish") == 0
-    assert "filled 30:45 (the hips' place);" in capsys.readouterr().out
-
-
 def test_ways_and_gaps_go_together_and_are_told(clip, path, tmp_path, capsys):
     infiller = save_tiny_infiller(tmp_path / "infiller.safetensors", drawn=0.2)
     report, out = tmp_path / "r.json", tmp_path / "out.bvh"

@@ -5,16 +5,12 @@ from pathlib import Path
 
 import pytest
 from captures import on_rig
-from helpers import run, walk
-from methods import words_of
+from helpers import run
 from tiny_denoiser import save_tiny_denoiser
 from tiny_infiller import save_tiny_infiller
 from tiny_prior import save_tiny_prior
 
-import mapctl
-
 WORDS = {"denoise": [], "infill": ["--gap", "5:9"], "tween": ["--keyframes", "0,5,11"]}
-PLAIN = {"infill": [*WORDS["infill"], *words_of("slerp")], "tween": [*WORDS["tween"], *words_of("slerp")]}
 """Without a network."""
 NETWORK = {"denoise": "--denoiser", "infill": "--inbetweener", "tween": "--inbetweener"}
 COMMANDS = sorted(WORDS)
@@ -57,22 +53,6 @@ def test_a_film_is_made(command, tiny, source, tmp_path):
     words = [*WORDS[command], *tiny[command], "--video", tmp_path / "v.png", "--quiet"]
     assert run(command, source, "-o", tmp_path / "out.bvh", *words) == 0
     assert (tmp_path / "v.png").read_bytes().startswith(b"\x89PNG")
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_other_formats_come_and_go(command, tiny, tmp_path):
-    walk(12).save(tmp_path / "in.npz")
-    for out in ("out.glb", "out.bvh", "out.npz"):
-        words = PLAIN.get(command) or tiny[command]
-        assert run(command, tmp_path / "in.npz", "-o", tmp_path / out, *words, "--quiet") == 0
-    assert mapctl.load(tmp_path / "out.npz").num_frames == 12
-    assert (tmp_path / "out.glb").stat().st_size > 0
-
-
-@pytest.mark.parametrize("command", sorted(PLAIN))
-def test_straight_lines_need_no_network(command, source, tmp_path):
-    assert run(command, source, "-o", tmp_path / "out.bvh", *PLAIN[command], "--quiet") == 0
-    assert (tmp_path / "out.bvh").exists()
 
 
 @pytest.mark.parametrize("command", COMMANDS)

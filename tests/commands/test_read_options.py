@@ -9,8 +9,6 @@ from helpers import run
 from rig_maker import Make, make, names_of, person
 
 import mapctl
-from mapctl.commands import COMMANDS
-from mapctl.commands.shared.options import ReadOptions
 
 
 @pytest.fixture(scope="module")
@@ -51,11 +49,6 @@ def test_a_given_up_axis_is_obeyed(clip, capsys):
     assert run("info", clip, "--json", "--up", "-x") == 0
     told = json.loads(capsys.readouterr().out)
     assert (told["up"], told["rig"], len(told["joints"])) == ("-x", "mixamo", 21)  # its joints are recognised as before
-
-
-def test_every_command_that_reads_motions_can_be_given_their_unit_and_up_axis():
-    reading = {name for name, kind in COMMANDS.items() if issubclass(kind, ReadOptions)}
-    assert reading == {*COMMANDS} - {"bench", "blender-addon", "compile", "demo", "make", "train"}
 
 
 def test_the_unit_is_that_of_a_body_too(clip, prior, tmp_path):

@@ -9,7 +9,6 @@ from helpers import run
 from methods import words_of
 from tiny_infiller import save_tiny_infiller
 from tiny_path import save_tiny_path
-from tiny_prior import save_tiny_prior
 from tiny_tweener import save_tiny_tweener
 
 import mapctl
@@ -68,16 +67,6 @@ def test_a_tweener_meets_keys_in_a_style_of_another_rig_s_clip(source, tmp_path)
 
 
 @pytest.mark.slow
-def test_keys_may_be_seconds(tween, source, tmp_path):
-    found = set()
-    for keys in ("0,15,30,44", "0s,0.5s, 1s ,44", "44,30,0,15"):
-        words = ["--keyframes", keys, *words_of("infiller"), "--quiet"]
-        assert tween(source, "-o", tmp_path / "out.bvh", *words) == 0
-        found.add((tmp_path / "out.bvh").read_bytes())
-    assert len(found) == 1
-
-
-@pytest.mark.slow
 def test_frames_keys_and_notes_are_told(tween, source, tmp_path, capsys):
     motion = on_rig("bandai", FRAMES)
     (hips,) = motion.moving_offsets
@@ -112,14 +101,6 @@ def test_a_report_tells_every_key_and_how_far_it_is_missed(tween, source, tmp_pa
     assert (told["request"]["keyframes"], told["request"]["method"]) == ("0,16,33,44", "infiller")
     assert {"mapctl", "versions", "motion", "gaps", "ledger", "seconds", "frame_ms", "status"} <= set(told)
     assert "skate_cm_s" in told["measures"]
-
-
-@pytest.mark.slow
-def test_the_ledger_tells_the_keyframe_term_and_a_density(tween, source, tmp_path):
-    report, prior = tmp_path / "r.json", save_tiny_prior(tmp_path / "prior.safetensors")
-    words = ["--keyframes", "0,20,44", "--joints", "Hand_L", "--report", report, "--prior", prior, "--quiet"]
-    assert tween(source, "-o", tmp_path / "out.bvh", *words) == 0
-    assert {"footing", "keyframe", "likelihood"} <= set(json.loads(report.read_text())["ledger"])
 
 
 @pytest.mark.parametrize(

@@ -111,26 +111,6 @@ def test_timing_is_suggested_and_the_given_one_made(folder, capsys):
     assert "m/s" in told
 
 
-def test_timing_is_suggested_for_frames_of_a_clip_too(folder, capsys):
-    words = ["-o", "out.bvh", "--keyframes", "0,3,44", *words_of("slerp"), "--suggest-timing"]
-    assert run("tween", folder / "keys" / "walk.bvh", *words) == 0
-    *_, first, second, licence = [line for line in capsys.readouterr().out.splitlines() if line.strip()]
-    assert first.split()[:3] == ["0", "3", "3"]
-    assert second.split()[:3] == ["3", "44", "41"]
-    assert licence == "licence   CC BY-NC 4.0 (keyframe-timing)"
-
-
-@pytest.mark.parametrize("method", [pytest.param("auto", marks=pytest.mark.slow), "infiller", "slerp"])
-def test_the_same_bytes_come_twice_and_quiet_says_nothing(models, folder, capsys, method):
-    found = set()
-    for _ in range(2):
-        words = ["--suggest-timing", "--quiet", "--method", method, *models[method]]
-        assert run("tween", folder / "keys" / "keys.toml", "-o", "out.bvh", *words) == 0
-        found.add(Path("out.bvh").read_bytes())
-    assert len(found) == 1
-    assert capsys.readouterr().out == ""
-
-
 @pytest.mark.parametrize("more", [[], ["--report", "keys/walk.bvh", "-o", "out.bvh"]])
 def test_a_file_that_keys_name_is_not_written_over(tween, folder, capsys, monkeypatch, more):
     monkeypatch.chdir(folder)
@@ -251,17 +231,3 @@ def test_what_is_wrong_with_parts_is_said_in_a_line(tween, folder, capsys, keys,
     assert said in told.err
     assert not Path("out.bvh").exists()
     assert not Path("r.json").exists()
-
-
-def test_a_drawing_is_not_written_over(tween, folder, capsys):
-    (folder / "keys" / "keys.toml").write_text(PARTS)
-    (folder / "keys" / "pose.csv").write_text(DRAWING)
-    assert tween(folder / "keys" / "keys.toml", "-o", "out.bvh", "--report", folder / "keys" / "pose.csv") == 2
-    assert "would be written over what it is made from" in capsys.readouterr().err
-
-
-def test_timing_is_not_suggested_where_no_two_keys_are_whole(tween, folder, capsys):
-    (folder / "keys" / "keys.toml").write_text(PARTS)
-    (folder / "keys" / "pose.csv").write_text(DRAWING)
-    assert tween(folder / "keys" / "keys.toml", "-o", "out.bvh", "--suggest-timing") == 2
-    assert "timing is suggested between whole poses; the keys have 0, it takes two" in capsys.readouterr().err

@@ -3,31 +3,18 @@
 import json
 import os
 import shutil
-import signal
-import subprocess
-import sys
 from dataclasses import replace
-from functools import partial
 
-import numpy as np
 import pytest
 from helpers import run, walk
 from stage import Actor
-from tiny_weights import FREE, change_card, save_tiny_weights
+from tiny_weights import FREE, save_tiny_weights
 
 import mapctl
-import priors
-from controllers.denoising.batch import FileDenoiser
-from controllers.denoising.denoise import DenoiseSettings
-from controllers.steering.process import CharacterProcess
 from mapctl import formats
 from mapctl.cli import parse
 from mapctl.commands import COMMANDS, live
-from mapctl.commands.denoise import Denoise, ReportWriter
-from mapctl.commands.live import Live
 from mapctl.commands.shared.command import ModelCommand
-from mapctl.commands.shared.inputs import read_character
-from mapctl.runtime.file_jobs import FileJob
 from priors import weight_sets
 from scenes.live.app import LiveApp
 
@@ -141,20 +128,6 @@ def test_commands_work_with_the_free_weights_alone(alone, capsys, name):
     assert weight_sets.VARIABLE not in os.environ
 
 
-@pytest.mark.slow
-def test_the_demo_works_with_the_free_weights_alone(alone, monkeypatch):
-    monkeypatch.setattr("mapctl.commands.demo.CURVE", "line:0.5")
-    monkeypatch.setattr("mapctl.commands.demo._SIZE", (96, 64))
-    assert run("demo", "-o", "demo", "--weights", "free", "--quiet") == 0
-    assert licence_of(alone / "demo" / "figure8.json")["models"] == {"free/locomotion": FREE}
-
-
-def test_measure_and_compile_work_with_the_free_weights_alone(alone, capsys):
-    assert run("measure", "in.bvh", "--weights", "free", "--json") == 0
-    assert "sway_cm" in json.loads(capsys.readouterr().out)["mocap"]
-    assert run("compile", "--weights", "free") == 0
-
-
 def test_all_commands_that_take_bundled_models_have_the_option():
     without = {"train", "render", "convert", "blender-addon"}
     assert {name for name, kind in COMMANDS.items() if not issubclass(kind, ModelCommand)} == without
@@ -174,39 +147,6 @@ def test_the_live_page_tells_the_licence_of_what_its_characters_load(alone, monk
     told = f"{FREE} (free/locomotion, free/stitcher)"
     assert asked == [told]
     assert f"licence   {told}" in capsys.readouterr().out
-
-
-def test_characters_of_the_live_page_load_the_free_weights(alone, monkeypatch):
-    requests = []
-
-    class Process(CharacterProcess):
-        """None at all."""
-
-        def __init__(self, request):
-            requests.append(request)
-
-        def wait(self):
-            pass
-
-    monkeypatch.setattr(live, "CharacterProcess", Process)
-    with priors.use_weights("free"):
-        live._start_characters(Live(), [read_character("canonical")])
-    (request,) = requests
-    assert request.load().card.licence == request.transitions().card.licence == FREE  # not in force here any more
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(sys.platform != "linux", reason="sends Ctrl-C")
-def test_live_works_with_the_free_weights_alone(alone):
-    command = [sys.executable, "-m", "mapctl", "live", "--port", "8195", "--characters", "2", "--weights", "free"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as show:
-        assert show.stdout is not None
-        try:
-            next(line for line in show.stdout if line.startswith("open "))
-        finally:
-            show.send_signal(signal.SIGINT)
-        assert f"licence   {FREE} (free/locomotion, free/stitcher)" in show.stdout.read()
-    assert show.returncode == 0
 
 
 @pytest.mark.parametrize("words", [words for words, _ in JOBS.values()], ids=list(JOBS))
@@ -244,15 +184,6 @@ def test_the_option_comes_before_the_scene_file_and_that_before_the_environment(
     assert used("--weights", "full") == {"locomotion"}
 
 
-def test_a_key_file_may_name_the_weights(both):
-    words = ("tween", "keys.toml", "-o", "o.npz", "--no-finish", "--quiet", "--report", "o.json")
-    (both / "keys.toml").write_text(f'weights = "free"\n{KEYS}')
-    assert run(*words) == 0
-    assert licence_of(both / "o.json")["models"]["free/transformer"] == FREE
-    assert run(*words, "--weights", "full") == 0
-    assert licence_of(both / "o.json")["models"]["transformer"] == NOT_FREE
-
-
 def test_the_keys_of_a_shot_may_name_the_weights(both):
     words = (
         "follow",
@@ -287,13 +218,6 @@ def test_weights_that_do_not_exist_are_refused_in_one_line(both, fails, monkeypa
     assert "MAPCTL_WEIGHTS must be free or full, got 'libre'" in fails(*words)
 
 
-def test_a_card_that_is_not_free_is_refused_in_one_line(both, fails):
-    change_card(both / "weights" / "free" / "locomotion.json", training={"began_with": "full/locomotion"})
-    told = fails("follow", "line:1", "-o", "out.bvh", "--weights", "free")
-    assert "free/locomotion is not free" in told
-    assert "began_with is 'full/locomotion', a model of the full weights" in told
-
-
 def test_the_strictest_of_all_models_is_the_licence(both, capsys):
     assert run("denoise", "in.bvh", "-o", "out.glb", "--denoiser", "free/denoiser", "--report", "out.json") == 0
     assert f"licence   {NOT_FREE} (transformer); {FREE} (free/denoiser)" in capsys.readouterr().out
@@ -314,67 +238,9 @@ def test_a_motion_keeps_its_licence_from_file_to_file(both, capsys, ending):
     assert mapctl.load("copy.glb").licence == line
 
 
-def test_a_clip_that_is_blended_brings_its_licence(both, capsys):
-    assert run("follow", "line:1", "-o", "walk.npz", "--quiet") == 0
-    words = JOBS["blend"][0].replace("other.bvh", "walk.npz").split()
-    assert run(*words, "--weights", "free") == 0
-    assert f"licence   {NOT_FREE} (walk.npz); {FREE} (free/transformer)" in capsys.readouterr().out
-
-
 def mark(folder, source):
     """Write a clip as `given.npz`, marked as if a model of the full set had made it."""
     formats.save(replace(mapctl.load(folder / source), licence=f"{NOT_FREE} (somebody)"), folder / "given.npz")
-
-
-@pytest.mark.parametrize(
-    ("words", "named"),
-    [
-        ("tween keys.toml -o out.npz --no-finish", "keys.toml"),
-        ("tween other.bvh -o out.npz --keyframes 0,12 --no-finish --method tweener --dna given.npz", "given.npz"),
-        pytest.param("follow line:1 -o out.npz --start given.npz:10", "given.npz", marks=pytest.mark.slow),
-        ("generate -o made --seconds 0.5 --no-footing --to .npz --start given.npz", "given.npz"),
-    ],
-)
-def test_whatever_else_is_given_brings_its_licence(both, capsys, words, named):
-    mark(both, "in.bvh")
-    (both / "keys.toml").write_text(KEYS.replace('pose = "in.bvh"\npose_frame', 'pose = "given.npz"\npose_frame'))
-    assert run(*words.split(), "--weights", "free") == 0
-    assert f"licence   {NOT_FREE} ({named}); {FREE} (" in capsys.readouterr().out
-
-
-def test_a_file_of_a_folder_brings_its_licence(both):
-    mark(both, "in.bvh")
-    command = Denoise(both, both / "clean", report=both / "told")
-    job = FileJob(both / "given.npz", both / "clean" / "given.npz")
-    after = ReportWriter(command, both / "told", {"free/denoiser": FREE})
-    load = partial(priors.load_denoiser, "free/denoiser")
-    FileDenoiser(load, DenoiseSettings(), after=after, licence=f"{FREE} (free/denoiser)")(job)
-    used = {"free/denoiser": FREE, str(both / "given.npz"): NOT_FREE}
-    assert licence_of(both / "told" / "given.json") == {"strictest": NOT_FREE, "models": used}
-    assert mapctl.load(job.out).licence == f"{FREE} (free/denoiser); {NOT_FREE} (somebody)"
-
-
-def test_a_command_that_makes_no_motion_tells_no_licence(both, capsys):
-    assert run("compile") == 0
-    told = capsys.readouterr().out
-    assert "kernels" in told
-    assert "licence" not in told
-
-
-def test_a_file_without_models_has_no_licence(both):
-    walk(10).save(both / "a.npz")
-    with np.load(both / "a.npz") as arrays:
-        assert "licence" not in arrays
-    walk(10).save(both / "a.glb")
-    assert mapctl.load("a.npz").licence == mapctl.load("a.glb").licence == ""
-    assert b"copyright" not in (both / "a.glb").read_bytes()
-
-
-def test_a_bvh_is_the_same_whatever_its_licence(both):
-    assert run("follow", "line:1", "-o", "a.bvh", "--quiet") == 0
-    assert run("follow", "line:1", "-o", "a.npz", "--quiet") == 0
-    formats.save(mapctl.load("a.npz"), "b.bvh")
-    assert (both / "a.bvh").read_bytes() == (both / "b.bvh").read_bytes()
 
 
 def test_info_lists_both_sets(both, capsys):

@@ -47,13 +47,6 @@ def test_faster_files_are_measured_at_the_rate_of_mocaps_values(fps, folder, tmp
     assert values["notes"] == []
 
 
-def test_a_reference_clip_is_brought_to_the_same_rate(tmp_path, capsys):
-    trembling_walk(30).save(tmp_path / "a.bvh")
-    trembling_walk(120).save(tmp_path / "b.bvh")
-    values = told(capsys, tmp_path / "a.bvh", "--reference", tmp_path / "b.bvh")
-    assert values["reference"]["jitter_m_s3"] == pytest.approx(values["measures"]["jitter_m_s3"], rel=0.1)
-
-
 @pytest.mark.parametrize(("fps", "said"), [(Fraction(30000, 1001), False), (Fraction(24), True), (Fraction(15), True)])
 def test_slower_files_stay_as_they_are_and_that_is_said(fps, said):
     motion = replace(walk(60), fps=fps)
@@ -105,13 +98,3 @@ def test_upright_motions_keep_their_rig_and_every_distance(root):
     np.testing.assert_allclose(now, torch.stack([was[..., 0], was[..., 2], -was[..., 1]], -1), atol=1e-9)
     again, _ = put_upright(upright)
     np.testing.assert_allclose(again.joint_positions(), now, atol=1e-12)
-
-
-def test_render_films_the_upright_motion(tmp_path, monkeypatch):
-    make(Make(names_of("mixamo"), zup=True)).motion(person(frames=20)).save(tmp_path / "z.bvh")
-    shown = []
-    monkeypatch.setattr("mapctl.commands.render.film", lambda actors, *_, **__: shown.extend(actors))
-    assert run("render", tmp_path / "z.bvh", "-o", tmp_path / "z.png") == 0
-    places = shown[0][0].joint_positions()
-    assert float(places[..., 1].max()) > 1.2
-    assert float((places[..., 2].amax(1) - places[..., 2].amin(1)).max()) < 1.2

@@ -51,19 +51,6 @@ def test_a_mirrored_turn_is_the_other_turn():
     assert only_left.mirrored == list(range(len(only_left.names)))
 
 
-@pytest.mark.parametrize(
-    ("pattern", "message"), [("(", "regular expression"), ("walk", "named groups"), ("(?P<gait>swim)", "match no clip")]
-)
-def test_patterns_that_read_nothing_are_refused(pattern, message):
-    with pytest.raises(RequestError, match=message):
-        labels.read(CLIPS, pattern)
-
-
-def test_labels_renamed_keep_what_both_know():
-    renamed = labels.read(CLIPS, PATTERN).renamed(("style=old", "style=new"))
-    assert renamed.held.tolist() == [[0, 0], [0, 0], [1, 0], [1, 0], [0, 0]]
-
-
 def told_network() -> LstmGmm:
     mean, std = compute_feature_statistics(corpus().features)
     torch.manual_seed(0)
@@ -125,21 +112,6 @@ def test_a_told_density_begins_where_the_labels_hold():
     plan = density.plan(state, noise)
     told, untold = (some.rollout(state, noise, plan)[0] for some in (old_runner, density))
     assert not torch.allclose(told, untold)
-
-
-@pytest.mark.parametrize(
-    ("name", "said"),
-    [
-        ("swim", "prior 'named' knows no gait or style 'swim', only gait: run; style: old"),
-        ("gait=swim", "prior 'named' knows no gait 'swim', only gait: run; style: old"),
-        ("style=run", "prior 'named' knows no style 'run', only gait: run"),
-        ("mood=sad", "prior 'named' knows no gait or style 'mood=sad', only gait: run"),
-    ],
-)
-def test_what_is_not_known_is_called_what_it_may_be(name, said):
-    with pytest.raises(RequestError) as refused:
-        labelled_density().conditioned_on([name])
-    assert said in str(refused.value)
 
 
 def test_the_fast_path_is_told_too():

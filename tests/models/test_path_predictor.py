@@ -61,13 +61,6 @@ def test_a_motion_s_length_does_not_change_what_is_far_from_its_end():
     assert network(part).height.shape == (1, 303)
 
 
-@pytest.mark.parametrize("frames", [2, 15, 16, 17, 40])
-def test_motions_of_any_length_are_told(frames):
-    found = tiny_path.tiny_path().predict(local_motion(frames))
-    assert found.steps_heading.shape == (1, frames, 2)
-    assert bool(outputs(found).isfinite().all())
-
-
 def test_where_a_walk_is_and_whither_it_goes_changes_nothing():
     motion, predictor = walk(60, turn_rate=0.5), tiny_path.tiny_path()
     turn = rotations.about_y(torch.tensor(2.0, dtype=torch.float64)).expand(60, 4)

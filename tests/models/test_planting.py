@@ -5,8 +5,6 @@ import torch
 from helpers import generator, tiny_density, walk
 from torch import Tensor
 
-from controllers.generation.generate import GenerateSettings, generate
-from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode
 from mapctl.pose import BodyPose
 from mapctl.skeleton import TOE_JOINTS
@@ -83,16 +81,6 @@ def test_toes_stand_then_and_only_those_that_are_planted_in_both(frames, factor)
     assert torch.equal(untouched, found)
 
 
-def test_a_batch_row_does_not_depend_on_another(frames, factor):
-    mean = frames[1, :SIZE]
-    before = torch.stack([frames[0], frames[0].clone()])
-    before[1, SIZE:] = 0.0
-    sample = torch.cat([mean, torch.ones(2)]).expand(2, -1)
-    found = Planting(SIGMA).condition(before, sample, mean.expand(2, -1), factor.expand(2, -1, -1), generator())
-    assert torch.equal(found[1], sample[1])
-    assert not torch.equal(found[0], sample[0])
-
-
 def test_a_density_samples_so(monkeypatch):
     density = tiny_density()
     state = density.initial_states.state.pick(torch.tensor([0]))
@@ -107,16 +95,3 @@ def test_a_density_samples_so(monkeypatch):
         for planting in (Planting(SIGMA), None)
     )
     assert torch.allclose(cold[:, 0], mean[:, 0], atol=1e-6)
-
-
-@pytest.mark.slow
-def test_generation_asks_for_it():
-    density = tiny_density()
-
-    def made(sigma):
-        settings = GenerateSettings(foot_cleanup=None, sigma_planted=sigma)
-        return generate(density, seconds=1, generator=generator(), settings=settings).features
-
-    assert not torch.equal(made(0.05), made(None))
-    with pytest.raises(RequestError, match="sigma of planted toes must be positive, got 0"):
-        made(0.0)

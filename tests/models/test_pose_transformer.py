@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from captures import on_rig
-from tiny_transformer import network, save_tiny_transformer, tiny_transformer
+from tiny_transformer import save_tiny_transformer, tiny_transformer
 
 import priors
 from controllers.common.canonical_clip import CanonicalClip
@@ -15,13 +15,11 @@ from mapctl.inbetweening import GapQuery
 from mapctl.inbetweening.effector_targets import EffectorTargets
 from mapctl.inbetweening.missing import MissingMask
 from mapctl.inbetweening.partial_motion import KnownParts, interpolate_partial_motion
-from mapctl.kinematics import heading
 from mapctl.motion import Motion
 from mapctl.recording.masks import ALL, Mask
 from mapctl.retarget import to_canonical
 from mapctl.skeleton import CANONICAL
 from priors.pose_transformer import inbetweener as module
-from priors.pose_transformer.network import PoseTransformerConfig
 
 FRAMES = 50
 DRAWN = tiny_transformer(drawn=0.05)
@@ -182,15 +180,6 @@ def test_hips_keep_the_heading_or_the_tilt_that_is_known(faced, tilted):
     assert (float(tilt_off.max()) < 1e-5) == tilted
 
 
-def test_six_numbers_are_a_rotation_and_back():
-    turn = rotations.rotation_vector_to_matrix(torch.randn(40, 3, generator=torch.Generator().manual_seed(0)))
-    torch.testing.assert_close(rotations.from_six(rotations.to_six(turn)), turn, atol=1e-6, rtol=0)
-    scaled = torch.cat(
-        [2 * rotations.to_six(turn)[:, :3], rotations.to_six(turn)[:, 3:] + 0.3 * rotations.to_six(turn)[:, :3]], dim=-1
-    )
-    torch.testing.assert_close(rotations.from_six(scaled), turn, atol=1e-6, rtol=0)
-
-
 def test_weights_load_by_file_and_others_are_refused(tmp_path):
     path = save_tiny_transformer(tmp_path / "mine.safetensors", drawn=0.05)
     loaded = priors.load_inbetweener(str(path))
@@ -201,22 +190,3 @@ def test_weights_load_by_file_and_others_are_refused(tmp_path):
     (tmp_path / "mine.json").write_text((tmp_path / "mine.json").read_text().replace('"width": 16', '"width": 32'))
     with pytest.raises(CheckpointError, match="do not fit"):
         priors.load_transformer(str(path))
-
-
-@pytest.mark.parametrize("bad", [{"width": 10, "heads": 4}, {"layers": 0}, {"kernel": 4}])
-def test_shapes_that_cannot_be_are_refused(bad):
-    with pytest.raises(Exception, match="pose transformer"):
-        PoseTransformerConfig(**bad)
-
-
-def test_the_heading_is_the_canonical_one():
-    """The network's own heading of a matrix is that of mapctl.kinematics."""
-    quats = torch.nn.functional.normalize(torch.randn(50, 4, generator=torch.Generator().manual_seed(1)), dim=-1)
-    from priors.pose_transformer.network import _heading_of
-
-    error = rotations.wrap_angle(_heading_of(rotations.to_matrix(quats)) - heading(quats))
-    assert float(error.abs().max()) < 1e-4
-
-
-def test_the_network_of_the_tests_is_deterministic():
-    assert torch.equal(network(drawn=0.1, seed=3).head.weight, network(drawn=0.1, seed=3).head.weight)

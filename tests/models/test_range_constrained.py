@@ -45,15 +45,3 @@ def test_the_hips_turn_freely(layer):
     given = rows(2)
     given[:, :6] = rotations.to_six(wanted)
     torch.testing.assert_close(layer(given).local_matrix[:, 0], wanted, atol=1e-12, rtol=0)
-
-
-@pytest.mark.slow
-def test_its_gradients_are_those_of_finite_differences(layer):
-    given = rows(2, spread=0.7, seed=3).requires_grad_(True)
-    assert torch.autograd.gradcheck(lambda each: layer(each).places, given, atol=1e-6)
-    assert torch.autograd.gradcheck(lambda each: layer(each).local_matrix, given, atol=1e-6)
-
-
-def test_it_holds_no_weights_and_nothing_to_save(layer):
-    assert list(layer.parameters()) == []
-    assert layer.state_dict() == {}

@@ -2,7 +2,6 @@
 
 from functools import cache
 
-import pytest
 import torch
 from helpers import tiny_density, walk
 
@@ -51,31 +50,8 @@ def test_the_first_frames_are_likelier_than_after_an_empty_memory_or_any_known_o
         assert nats(found, first) - prior(found) > nats(other, first) - prior(other)
 
 
-def test_the_same_frames_give_the_same_state():
-    one, other = (tiny().infer_state(frames()) for _ in range(2))
-    assert torch.equal(one.hidden, other.hidden)
-    assert torch.equal(one.cell, other.cell)
-    assert torch.equal(one.last_frame, frames()[:1])
-
-
 def test_without_a_search_it_is_the_best_of_the_known_ones():
     known = tiny().initial_states.state
     found = infer_lstm_state(tiny().reference, known, frames(), StateInferenceSettings(budget=Budget(evaluations=1)))
     apart = (known.hidden - found.hidden).abs().amax(dim=(0, 2))
     assert float(apart.min()) < 1e-5
-
-
-@pytest.mark.slow
-def test_short_motions_and_one_known_state_will_do():
-    for count in (1, 2, 5):
-        state = tiny().infer_state(frames()[:count])
-        assert state.batch == 1
-        assert bool(torch.isfinite(state.cell).all())
-    one = tiny().initial_states.state.pick(torch.tensor([0]))
-    assert bool(torch.isfinite(infer_lstm_state(tiny().reference, one, frames()).hidden).all())
-
-
-def test_only_the_first_frames_count():
-    later = frames().clone()
-    later[10:] += 1.0
-    assert torch.equal(tiny().infer_state(later).hidden, tiny().infer_state(frames()).hidden)

@@ -76,11 +76,6 @@ def test_the_fit_is_that_of_least_squares(spread):
     assert energy(found) == pytest.approx(energy(best), rel=0.02)
 
 
-def test_where_nothing_is_wanted_there_are_no_wishes():
-    query = query_of(walk(60), (GAP.start, GAP.stop))
-    assert Wishes.of(query, GAP.start, GAP.stop) is None
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("limb", ["leftHand", "rightFoot"])
 def test_what_is_wanted_leads_the_answer(limb):
@@ -170,18 +165,6 @@ def test_the_same_wish_elsewhere_and_turned_leads_to_the_same_motion_there():
 
 
 @pytest.mark.slow
-def test_draws_are_led_each_from_where_it_was_and_do_not_depend_on_others():
-    query, drawing = wishing(walk(60), 30, "leftHand", (0.2, 0.25, 0.1)), tiny_stitcher().drawing(seed=3)
-    plain = [drawing.numbered(n).propose(replace(query, effector_targets=None)).motion for n in range(2)]
-    led = [drawing.numbered(n).propose(query).motion for n in (1, 0)][::-1]
-    for one, other in zip(led, plain, strict=True):
-        assert miss(query, one) < miss(query, other)
-    assert float((led[0].joint_positions() - led[1].joint_positions())[GAP].norm(dim=-1).max()) > 0.01
-    again = tiny_stitcher().drawing(seed=3).numbered(1).propose(query).motion
-    assert torch.equal(again.local_quat_xyzw, led[1].local_quat_xyzw)
-
-
-@pytest.mark.slow
 def test_hips_that_are_told_alone_are_met_and_divide_the_gap():
     motion = walk(60, turn_rate=0.5)
     done = tween(motion, Keys.of([20, 28, 40], root_only=True), StitchedInbetweener(tiny_stitcher(), SlerpInbetweener))
@@ -218,16 +201,6 @@ def test_a_trajectory_is_joined_at_both_ends_without_a_leap():
     moved = (tiny_stitcher().propose(led).motion.root_position - plain)[GAP.start - 1 : GAP.stop + 1, 0]
     assert float(moved.diff().abs().max()) < 0.03
     assert float(moved[len(moved) // 2]) > 0.1
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("frames", [1, 2, 4])
-def test_a_trajectory_through_few_frames_is_no_matter(frames):
-    motion, (start, stop) = walk(60), (21, 21 + frames)
-    led = replace(query_of(motion, (start, stop)), keep_trajectory=True)
-    made = tiny_stitcher().propose(led)
-    assert [source.by for source in made.attribute(led)] == ["stitcher"]
-    assert float((made.motion.root_position - motion.root_position)[start:stop, ::2].norm(dim=-1).max()) < 0.05
 
 
 @pytest.mark.slow

@@ -9,7 +9,6 @@ from tiny_stitcher import CONFIG, network, tiny_stitcher
 
 from controllers.common.canonical_clip import CanonicalClip
 from mapctl import rotations
-from mapctl.errors import RequestError
 from mapctl.features import GroundPose, encode, mirror_features, reversed_features
 from mapctl.inbetweening.missing import MissingMask
 from mapctl.recording.masks import ALL, Mask
@@ -105,11 +104,6 @@ def test_the_share_of_the_distribution_on_arrival_is_as_printed_or_by_the_way_to
     assert [printed._arrive(step, 0) for step in (0, 4, 7, 8, 9)] == [0.0, 4 / 8, 7 / 8, 8 / 10, 9 / 10]
 
 
-def test_as_printed_nothing_is_shared():
-    with pytest.raises(RequestError, match="share nothing"):
-        replace(CONFIG, printed=True)
-
-
 def test_only_the_poses_of_bare_ends_are_seen():
     motion = walk(60, turn_rate=0.6)
     missing = torch.ones(60, dtype=torch.bool)
@@ -134,16 +128,6 @@ def test_the_pace_of_the_ends_counts_where_it_is_known():
     assert bool((unknown.paced == 0).all())
     one, two = (tiny_stitcher().answer(each, 20).root_position for each in (known, unknown))
     assert float((one - two).abs().max()) > 1e-5
-
-
-def test_context_of_one_side_alone_leaves_the_other_as_it_was():
-    motion = walk(60)
-    missing = torch.ones(60, dtype=torch.bool)
-    missing[[7, 8, 9, 10, 30]] = False
-    ends = see_ends(motion, missing, 11, 30)
-    assert ends.present[:, 0].tolist() == [[1, 1, 1, 1], [0, 0, 0, 1]]
-    assert ends.paced[:, 0].tolist() == [1, 0]
-    torch.testing.assert_close(ends.features[0, 0, 1:], encode(motion)[0][8:11].float(), atol=1e-5, rtol=0)
 
 
 def test_the_backward_side_reads_the_motion_run_backwards():
@@ -226,24 +210,6 @@ def test_one_that_draws_gives_the_same_for_the_same_seed_and_number_and_others_f
     assert torch.equal(places(1, 9), places(1, 9))
     for other in ((1, 0), (1, 8), (2, 9)):
         assert float((places(1, 9) - places(*other)).abs().max()) > 1e-5
-
-
-@pytest.mark.slow
-def test_draws_are_a_quarter_wider_than_the_weights_say_unless_told_otherwise():
-    query, warm = query_of(walk(60), (20, 40)), tiny_stitcher()
-    warm.network.temperature.fill_(2.0)
-    plain, told = warm.drawing(1), tiny_stitcher().drawing(1, temperature=2.5)
-    one, other = (each.propose(query).motion.root_position for each in (plain, told))
-    assert torch.equal(one, other)
-    assert not torch.equal(one, tiny_stitcher().drawing(1).propose(query).motion.root_position)
-
-
-def test_draws_for_one_gap_are_not_taken_for_another():
-    drawing, gap = tiny_stitcher().drawing(1), (20, 40)
-    one, two = (drawing.propose(query_of(each, gap)) for each in (walk(60), walk(60, turn_rate=0.5)))
-    fresh = tiny_stitcher().drawing(1).propose(query_of(walk(60, turn_rate=0.5), gap))
-    assert torch.equal(two.motion.root_position, fresh.motion.root_position)
-    assert not torch.equal(one.motion.root_position, two.motion.root_position)
 
 
 def test_draws_that_are_not_finite_are_dropped_and_counted():

@@ -7,7 +7,6 @@ import torch
 from helpers import generator, walk
 
 from mapctl import joint_ranges, rotations
-from mapctl.errors import RequestError
 from mapctl.inbetweening import PositionImage
 from mapctl.inbetweening.interpolation import interpolate_heading, interpolate_positions
 from mapctl.kinematics import heading
@@ -172,10 +171,3 @@ def test_batch_regularisation_is_nil_for_unit_responses_and_grows_with_mean_and_
     assert float(regularise_batch((unit * 2.0, unit))) == pytest.approx(0.4805, rel=1e-3)
     responses = network().generate(torch.randn(2, INPUT_ROWS, 128, generator=generator()), torch.zeros(2, 5))[1]
     assert len(responses) == 6 + 13
-
-
-def test_impossible_shapes_are_refused():
-    with pytest.raises(RequestError, match="6 positive widths"):
-        GeneratorConfig(widths=(8, 8))
-    with pytest.raises(RequestError, match="at least one number"):
-        GeneratorConfig(style=0)

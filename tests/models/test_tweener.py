@@ -14,7 +14,7 @@ import priors
 from controllers.common.canonical_clip import CanonicalClip
 from controllers.inbetweening.proposers import AutoInbetweener, SlerpInbetweener
 from controllers.inbetweening.proposers.auto import ChoiceSettings
-from mapctl import motion_dna, rotations
+from mapctl import rotations
 from mapctl.errors import CheckpointError
 from mapctl.inbetweening import GapQuery, Proposal
 from mapctl.inbetweening.effector_targets import EffectorTargets
@@ -223,15 +223,6 @@ def test_it_goes_with_the_path_predictor_that_it_was_trained_with(tmp_path):
     assert priors.load_inbetweener(saved, predictor).card.kind == "tweener"
     with pytest.raises(CheckpointError, match="trained with the path predictor"):
         priors.load_tweener(saved, "path")
-
-
-def test_a_style_changes_what_is_made_and_keeps_the_keys():
-    query, plain = query_of(walk(120), (1, 119)), tiny_tweener()
-    styled = plain.styled(motion_dna.of(walk(90, cadence=1.4, seed=5)))
-    one, other = (each.propose(query).motion for each in (plain, styled))
-    apart = (one.local_quat_xyzw - other.local_quat_xyzw).abs().amax(dim=(1, 2))
-    assert float(apart[30:90].max()) > 1e-3
-    assert float(apart[[0, 119]].max()) == 0
 
 
 def test_poses_that_flicker_from_frame_to_frame_are_calmed_and_slow_ones_are_not():

@@ -3,7 +3,6 @@
 import os
 import re
 import shutil
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -11,7 +10,6 @@ from tiny_weights import FREE, MODELS, change_card, save_tiny_weights
 
 import priors
 from mapctl.errors import CheckpointError, RequestError
-from mapctl.runtime.processes import open_pipe, spawn
 from priors import checkpoints, licences, weight_sets
 
 NOT_FREE = "CC BY-NC 4.0"
@@ -85,14 +83,6 @@ def test_another_model_stands_in_where_a_set_has_none_of_its_own(folder):
     assert "locomotion-live" not in weight_sets.list_models("free")
 
 
-def test_records_name_a_model_so_that_everybody_knows_which_it_was(folder):
-    assert weight_sets.name_for_records("locomotion") == "full/locomotion"
-    assert weight_sets.name_for_records("runs/locomotion.safetensors") == "locomotion.safetensors"
-    with priors.use_weights("free"):
-        assert weight_sets.name_for_records("locomotion") == "free/locomotion"
-        assert weight_sets.name_for_records("full/locomotion") == "full/locomotion"
-
-
 def test_what_the_free_set_lacks_is_refused_though_the_full_one_has_it(folder):
     with priors.use_weights("free"):
         with pytest.raises(CheckpointError, match=r"the free weights have no 'general': they hold denoiser, .*; full/"):
@@ -151,21 +141,6 @@ def test_names_for_other_processes_say_their_set(folder):
         assert priors.add_set("runs/mine") == "runs/mine"
 
 
-def _send_licence(writer, load):
-    writer.send(load().card.licence)
-
-
-@pytest.mark.slow
-def test_the_set_reaches_processes(folder):
-    for load in (partial(priors.load, "locomotion"), partial(priors.load, "free/locomotion")):
-        reader, writer = open_pipe(duplex=False)
-        with reader, writer, priors.use_weights("free"):
-            process = spawn(_send_licence, writer, load)
-            assert reader.poll(60)
-            assert reader.recv() == FREE
-            process.join()
-
-
 def test_a_card_that_is_not_free_is_refused_in_the_free_set(folder):
     change_card(folder / "free" / "locomotion.json", licence=NOT_FREE)
     with pytest.raises(CheckpointError, match=r"^free/locomotion lies with the free weights, and its licence is"):
@@ -210,23 +185,3 @@ def test_what_is_loaded_is_recorded_with_its_licence(folder):
 )
 def test_the_strictest_licence(held, strictest):
     assert licences.find_strictest(held) == strictest
-
-
-@pytest.mark.parametrize(
-    ("told", "noted"),
-    [
-        (f"{NOT_FREE} (locomotion)", NOT_FREE),
-        (f"{FREE} (a); {NOT_FREE} (b, c)", NOT_FREE),
-        (f"{FREE} (a); mine (b)", f"{FREE} (a); mine (b)"),
-        ("mine", "mine"),
-    ],
-)
-def test_a_motion_that_is_joined_counts_as_its_strictest_part(told, noted):
-    with licences.record_licences() as used:
-        licences.note_licence("walk.npz", told)
-    assert used == {"walk.npz": noted}
-
-
-def test_a_file_does_not_tell_where_models_lay(folder):
-    used = {"runs/secret/mine": "b", "free/locomotion": FREE, "C:walk.glb": FREE}
-    assert licences.shorten_names(used) == {"mine": "b", "free/locomotion": FREE, "C:walk.glb": FREE}
