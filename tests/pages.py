@@ -1,6 +1,7 @@
 """The pages of README.md and docs/, the code and the commands that they show, and the files that the code names."""
 
 import re
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -66,3 +67,9 @@ def write_files(folder: Path) -> None:
         walk(150, seed=seed, cadence=0.8 + 0.05 * seed).save(folder / f"{name}.bvh")
     for name in ("takes", "clips"):
         write_corpus(folder / name, count=3 if name == "takes" else 8, frames=100)
+    (folder / "drawn.csv").write_text("x,z\n" + "".join(f"{0.1 * (k % 3)},{0.5 * k}\n" for k in range(20)))
+    (folder / "script.csv").write_text("time_s,speed_mps,heading_deg\n0,1.2,0\n0.5,1.0,30\n1,1.0,30\n")
+    (folder / "lost.csv").write_text("joint,start,stop\nLeftHand,5,15\n")
+    (folder / "poses").mkdir()
+    walk(120).save(folder / "poses" / "generated_000.bvh")
+    shutil.copy(ROOT / "docs" / "inputs" / "keys.toml", folder)
