@@ -72,7 +72,7 @@ def main(words: list[str] | None = None) -> None:
                 found = measure_realism(motions, clips, generator=seeded(given.seed), settings=settings)
                 row = {
                     **row,
-                    "told apart": f"{found.accuracy:.0%}",
+                    "accuracy": f"{found.accuracy:.0%}",
                     "floor": f"{found.floor_accuracy:.0%}",
                     "Frechet": found.frechet,
                     "its floor": found.floor_frechet,
