@@ -61,14 +61,26 @@ def compose_gap_notes(query: GapQuery, made: Motion, answer: Proposal, *, fps: f
         if not remarks and source.by == answer.source:
             plain.setdefault(source.by, []).append(source)
         else:
-            lines.append(_join_remarks([source], query, remarks, fps))
-    return (*lines, *(_join_remarks(each, query, [], fps) for each in plain.values()))
+            lines.append(_join_remarks([source], query, answer, remarks, fps))
+    return (*lines, *(_join_remarks(each, query, answer, [], fps) for each in plain.values()))
 
 
-def _join_remarks(sources: Sequence[GapSource], query: GapQuery, remarks: Sequence[str], fps: float) -> str:
-    """Join the frames, the proposer, and further remarks."""
+def _join_remarks(
+    sources: Sequence[GapSource], query: GapQuery, answer: Proposal, remarks: Sequence[str], fps: float
+) -> str:
+    """Join the frames, the proposer, the error estimate (of the gap with the largest), and further remarks."""
     where = ", ".join(_format_frames(query, source, fps) for source in sources)
-    return f"frames {where}: {', '.join([sources[0].by, *remarks])}"
+    found = [answer.spread[one.start : one.stop] for one in sources if answer.spread is not None]
+    sure = []
+    if found and sources[0].by == answer.source:
+        median, percentile_90 = max(
+            (100 * each.mean(dim=(0, 1)) for each in found), key=lambda one: float(one[1])
+        ).tolist()
+        sure = [
+            f"by its own estimate joints within {median:.1f} cm of the truth in half of cases and within"
+            f" {percentile_90:.1f} cm in nine of ten"
+        ]
+    return f"frames {where}: {', '.join([sources[0].by, *sure, *remarks])}"
 
 
 def _format_frames(query: GapQuery, source: GapSource, fps: float) -> str:
@@ -80,7 +92,7 @@ def _format_frames(query: GapQuery, source: GapSource, fps: float) -> str:
 
 
 def _describe_gap(query: GapQuery, made: Motion, source: GapSource) -> list[str]:
-    """List remarks on one gap beyond its proposer."""
+    """List remarks on one gap beyond its proposer and error estimate."""
     remarks, seconds = [*filter(None, (source.reason, source.remark))], (source.stop - source.start) / PRIOR_FPS
     if source.stop - source.start > _INFILLER_FRAMES and source.by == _INFILLER:
         remarks.append(f"and {seconds:.1f} s are longer than the {_INFILLER_FRAMES / PRIOR_FPS:.0f} s that it knows")

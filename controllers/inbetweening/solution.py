@@ -42,7 +42,7 @@ class InbetweenSolution(Solution):
     pick: Pick | None = None
     """Which of several answers this is; None where one alone was made."""
     gap_notes: tuple[str, ...] = ()
-    """A note on each of these gaps: proposer, remarks."""
+    """A note on each of these gaps: proposer, error estimate, remarks."""
 
     @property
     def frame_ms(self) -> float:

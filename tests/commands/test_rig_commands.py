@@ -121,7 +121,7 @@ def test_info_tells_of_a_refused_clip_what_can_be_told(tmp_path, capsys):
         (["odd.bvh", "-o", "rig.jpg"], "--out writes .png, not .jpg"),
         (["odd.bvh", "-o", "rig"], "--out writes .png, not a file without ending"),
         (["odd.bvh", "-o", "none/rig.png"], "none"),
-        (["-o", "rig.png"], "a picture of a clip's rig or a run's training: mapctl info CLIP|RUN -o FILE.png"),
+        (["-o", "rig.png"], "a picture of a clip's rig: mapctl info CLIP -o FILE.png"),
         (["missing.bvh", "-o", "rig.png"], "no such file"),
     ],
 )
