@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from priors.infiller.network import ConvInfiller as ConvInfiller
     from priors.keyframe_timing.model import KeyframeTiming as KeyframeTiming
     from priors.lstm_gmm.density import LstmGmmDensity as LstmGmmDensity
-    from priors.pose_transformer.inbetweener import PoseTransformer as PoseTransformer
+    from priors.pose_transformer.network import PoseTransformer as PoseTransformer
     from priors.refiner.network import LstmRefiner as LstmRefiner
     from priors.stitching.inbetweener import Stitcher as Stitcher
     from priors.tweening.inbetweener import Tweener as Tweener
@@ -55,7 +55,7 @@ _HOMES = {
     "ConvInfiller": "infiller.network",
     "KeyframeTiming": "keyframe_timing.model",
     "LstmGmmDensity": "lstm_gmm.density",
-    "PoseTransformer": "pose_transformer.inbetweener",
+    "PoseTransformer": "pose_transformer.network",
     "LstmRefiner": "refiner.network",
     "Stitcher": "stitching.inbetweener",
     "Tweener": "tweening.inbetweener",

@@ -5,8 +5,9 @@ the measured quality. A card that does not fit the code is refused with both lay
 """
 
 import json
+import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from hashlib import sha256
@@ -15,7 +16,8 @@ from typing import Annotated, Any, TypeVar
 
 import torch
 from pydantic import AfterValidator, BaseModel, ConfigDict, TypeAdapter, ValidationError
-from safetensors.torch import load_file
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
@@ -25,7 +27,21 @@ from mapctl.formats import toml
 from mapctl.formats.atomic import atomic_path
 from mapctl.formats.text import one_line, shorten
 from priors import licences, weight_sets
-from priors.tensor_files import write_tensors
+
+_SYSTEM_ERROR = re.compile(r"\(os error (\d+)\)")
+
+
+def write_tensors(path: Path, tensors: Mapping[str, Tensor], *, metadata: Mapping[str, str] | None = None) -> None:
+    """Write a file that appears whole or not at all; RequestError where it cannot be written, as on a full disk."""
+    contiguous = {name: tensor.cpu().contiguous() for name, tensor in tensors.items()}
+    with atomic_path(path) as scratch:
+        try:
+            save_file(contiguous, scratch, metadata=dict(metadata) if metadata else None)
+        except SafetensorError as error:
+            # The library's own kind of error, which says in words what the system's says by number.
+            found = _SYSTEM_ERROR.search(str(error))
+            raise OSError(int(found[1]), os.strerror(int(found[1]))) if found else OSError(str(error)) from error
+
 
 N = TypeVar("N", bound=nn.Module)
 

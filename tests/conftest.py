@@ -98,11 +98,10 @@ def data(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def small_judgements() -> Iterator[None]:
     """Models in training are judged in a moment, on few windows, where a test is not about how well they do."""
-    from priors.training.quality import density, stitcher
-    from priors.training.recipes import pose_transformer
+    from priors.training.recipes import lstm_gmm, pose_transformer, stitcher
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(density, "measure_free_runs", partial(density.measure_free_runs, runs=2, frames=20))
+        patch.setattr(lstm_gmm, "measure_free_runs", partial(lstm_gmm.measure_free_runs, runs=2, frames=20))
         patch.setattr(pose_transformer, "_VALIDATED_WINDOWS", 4)
         patch.setattr(stitcher, "_WINDOWS", 4)
         patch.setattr(stitcher, "_DRAWS", 2)

@@ -20,8 +20,7 @@ from priors import checkpoints
 from priors.lstm_gmm import labels as clip_labels
 from priors.lstm_gmm.fast.rollout import FastRollout
 from priors.lstm_gmm.labels import PACE_LABELS, read_pace_rates
-from priors.lstm_gmm.network import LstmGmm, LstmGmmConfig, LstmState
-from priors.lstm_gmm.planting import Planting
+from priors.lstm_gmm.network import LstmGmm, LstmGmmConfig, LstmState, Planting
 
 _MIN_STD = 0.05  # least standard deviation of a unit of the memory: some hardly vary in the data
 

@@ -4,22 +4,48 @@
 State and end effectors through a layer, an LSTM and a layer give what is added to the state. Two departures: the first
 layer also sees some frames ahead, since tremble cannot be told from motion without what follows; and the residual is
 bounded, so that no input can make it explode. Contact bits are in its input and in its output (section 4.3).
+
+Positions and velocities of chosen joints, differentiable: inputs of the refiner and its critic beside the state.
+
+Wang et al. 2019, section 4.2.1: the density's features say little of where hands and feet end up, and that is where a
+viewer looks. By the one forward kinematics of the project.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from mapctl import rotations
 from mapctl.errors import RequestError
-from mapctl.features import LAYOUT
+from mapctl.features import LAYOUT, PRIOR_FPS
 from mapctl.protocols import Refiner
 from mapctl.skeleton import CANONICAL
+from mapctl.terms.trial import Trial
 from priors import checkpoints
 from priors.config import NetworkConfig
-from priors.refiner.end_effectors import compute_end_effectors, count_channels
+
+
+def compute_end_effectors(
+    features: Float[Tensor, "batch frames size"], joints: Sequence[str]
+) -> Float[Tensor, "batch later channels"]:
+    """Compute for each frame but the first: positions (m) relative to the hips' ground point and heading, then
+    velocities (m/s) over the ground from the frame before, in the same heading frame, so that a planted foot has none.
+    """
+    trial = Trial.of_features(features)
+    world = trial.joints_world[..., [CANONICAL.index(name) for name in joints], :]
+    velocity = torch.diff(world, dim=1) * PRIOR_FPS
+    position = world[:, 1:] - rotations.lift_ground(trial.root_xz_world[:, 1:, None])
+    vectors = torch.cat([position, velocity], dim=2)
+    return rotations.rotate_about_y(vectors, -trial.heading[:, 1:, None]).flatten(2)
+
+
+def count_channels(joints: Sequence[str]) -> int:
+    """Count the width of `compute_end_effectors`."""
+    return 6 * len(joints)
+
 
 END_EFFECTORS = (
     "hips",

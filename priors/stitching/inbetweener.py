@@ -20,10 +20,8 @@ from mapctl.pose import BodyPose
 from mapctl.protocols import Inbetweener
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors import checkpoints
-from priors.stitching.joining import Joined, join_sides
-from priors.stitching.latents import DrawnLatents
-from priors.stitching.network import StitcherConfig, StitcherNetwork
-from priors.stitching.sides import Ends, count_made, walk_sides, walk_stepwise
+from priors.stitching.network import DrawnLatents, StitcherConfig, StitcherNetwork
+from priors.stitching.sides import Ends, Joined, count_made, join_sides, walk_sides, walk_stepwise
 
 CHUNK = 16
 """Draws at once: batches of one size are rounded alike, so that the first draws do not depend on the count."""

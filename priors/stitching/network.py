@@ -15,19 +15,133 @@ by the phase makes the next frame. Departures from what is printed; with `Stitch
 - Both sides step at once, and arrival counts by the way to the target in force (see `priors.stitching.sides`).
 - Widths make 2 million weights a generator, not 13.4. Features of `mapctl.features` (68), of frames and of changes,
   replace root positions and quaternions, and the head has as many numbers, not 88.
+
+Layers of which there are two, the forward and the backward side's, computed in one call.
+
+The sides share no weights; tensors have a leading axis of two, forward first.
+
+The posterior of a transition's latent, which sees the truth: in training alone, and in no file of weights.
+
+Ren et al. 2024 have none: their encoder (section 3.3) sees the ends, and nothing of what comes between.
 """
 
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import ClassVar
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
+from torch.nn.functional import elu
 
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT
 from priors.config import NetworkConfig
-from priors.stitching.layers import SIDES, SidedExperts, SidedLayers, SidedLstm
+
+SIDES = 2
+"""Forward and backward."""
+
+
+class SidedLinear(nn.Module):
+    """An affine layer a side."""
+
+    def __init__(self, inputs: int, outputs: int):
+        super().__init__()
+        bound = 1 / math.sqrt(inputs)
+        self.weight = nn.Parameter(torch.empty(SIDES, inputs, outputs).uniform_(-bound, bound))
+        self.bias = nn.Parameter(torch.zeros(SIDES, 1, outputs))
+        self._rounded: Tensor | None = None
+
+    def forward(self, x: Float[Tensor, "2 batch inputs"]) -> Float[Tensor, "2 batch outputs"]:
+        """Return the outputs of each side."""
+        if self._rounded is None:
+            return torch.baddbmm(self.bias, x, self.weight)
+        return self.bias + torch.bmm(x.bfloat16(), self._rounded).float()
+
+    @contextmanager
+    def round_weights(self) -> Iterator[None]:
+        """Multiply in bfloat16; weights are rounded once for all frames that are made meanwhile."""
+        self._rounded = self.weight.bfloat16()
+        try:
+            yield
+        finally:
+            self._rounded = None
+
+
+@contextmanager
+def multiply_in_bfloat16(*networks: nn.Module, wanted: bool = True) -> Iterator[None]:
+    """Let all such layers of these networks multiply in bfloat16 meanwhile, if it is wanted."""
+    with ExitStack() as stack:
+        for layer in (layer for network in networks for layer in network.modules()):
+            if wanted and isinstance(layer, SidedLinear):
+                stack.enter_context(layer.round_weights())
+        yield
+
+
+class SidedLayers(nn.Module):
+    """Affine layers with ELU between them."""
+
+    def __init__(self, *widths: int):
+        super().__init__()
+        self.layers = nn.ModuleList(SidedLinear(one, other) for one, other in pairwise(widths))
+
+    def forward(self, x: Float[Tensor, "2 batch inputs"]) -> Float[Tensor, "2 batch outputs"]:
+        """Return the outputs of each side."""
+        for number, layer in enumerate(self.layers):
+            x = layer(elu(x) if number else x)
+        return x
+
+    def shrink_last(self, share: float) -> None:
+        """Shrink what the last layer makes at first."""
+        with torch.no_grad():
+            list(self.layers.parameters())[-2].mul_(share)
+
+
+class SidedLstm(nn.Module):
+    """A cell of an LSTM a side (Hochreiter and Schmidhuber 1997), its forget gate open at first."""
+
+    def __init__(self, inputs: int, width: int):
+        super().__init__()
+        self.width, self.gates = width, SidedLinear(inputs + width, 4 * width)
+        with torch.no_grad():
+            self.gates.bias[..., width : 2 * width] = 1.0
+
+    def forward(
+        self, x: Float[Tensor, "2 batch inputs"], state: tuple[Tensor, Tensor]
+    ) -> tuple[Float[Tensor, "2 batch width"], Float[Tensor, "2 batch width"]]:
+        """Return the output and the cell after this frame."""
+        output, cell = state
+        enter, forget, leave, new = self.gates(torch.cat([x, output], dim=-1)).chunk(4, dim=-1)
+        cell = torch.sigmoid(forget) * cell + torch.sigmoid(enter) * torch.tanh(new)
+        return torch.sigmoid(leave) * torch.tanh(cell), cell
+
+
+class SidedExperts(nn.Module):
+    """Affine layers whose weights are a blend of several experts' (Zhang et al. 2018); blending what the experts make
+    before each nonlinearity is the same."""
+
+    def __init__(self, experts: int, widths: Sequence[int]):
+        super().__init__()
+        self.experts = experts
+        self.layers = nn.ModuleList(SidedLinear(one, experts * other) for one, other in pairwise(widths))
+
+    def forward(
+        self, x: Float[Tensor, "2 batch inputs"], share: Float[Tensor, "2 batch experts"]
+    ) -> Float[Tensor, "2 batch outputs"]:
+        """Return the outputs of each side, for the experts' shares."""
+        for number, layer in enumerate(self.layers):
+            each = layer(elu(x) if number else x).unflatten(-1, (self.experts, -1))
+            x = (share[..., None] * each).sum(dim=-2)
+        return x
+
+    def shrink_last(self, share: float) -> None:
+        """Shrink what the last layer makes at first."""
+        with torch.no_grad():
+            list(self.layers.parameters())[-2].mul_(share)
+
 
 PHASES = 4
 """Numbers of the two toes' phases."""
@@ -335,3 +449,100 @@ class StitcherNetwork(nn.Module):
         """Return sinusoids of the frames to arrival, no more than the longest transition."""
         angle = left.clamp_max(float(self.config.longest))[..., None] * self.waves
         return torch.stack([angle.sin(), angle.cos()], dim=-1).flatten(-2)
+
+
+_WIDTH = 128
+_MOMENTS = 8  # at which a side is looked at, its ends among them
+_LEAST_SIGMA = 0.3  # of what is shared: more than a nat and a quarter of each number is not told
+
+
+class PosteriorNetwork(nn.Module):
+    """Distributions of what both sides share, and of each frame's latent."""
+
+    def __init__(self, config: StitcherConfig):
+        super().__init__()
+        self.frame = nn.Sequential(nn.Linear(LAYOUT.size, _WIDTH), nn.ELU(), nn.Linear(_WIDTH, _WIDTH), nn.ELU())
+        self.whole = nn.Sequential(
+            nn.Linear(SIDES * (_MOMENTS + 1) * _WIDTH, 2 * _WIDTH), nn.ELU(), nn.Linear(2 * _WIDTH, 2 * config.shared)
+        )
+        self.next = SidedLayers(SEEN_FUTURE * LAYOUT.size + config.encoder, 2 * _WIDTH, 2 * config.own)
+
+    def tell_shared(self, missed: Float[Tensor, "2 batch made size"]) -> Gaussian:
+        """Tell it from what the calm answer of both sides misses of the truth, in units of the features' spread.
+
+        So it tells what the two ends do not. Over the batch each number's mean has unit variance, so that what is told
+        cannot fade away (Zhu et al. 2020, "A batch normalized inference network keeps the KL vanishing away").
+        """
+        frames = self.frame(missed)
+        at = torch.linspace(0, frames.shape[2] - 1, _MOMENTS).round().long()
+        parts = torch.cat([frames.mean(dim=2, keepdim=True), frames[:, :, at]], dim=2)
+        mean, raw = self.whole(parts.transpose(0, 1).flatten(1)).chunk(2, dim=-1)
+        mean = (mean - mean.mean(dim=0)) / (mean.var(dim=0, correction=0) + 1e-5).sqrt()
+        return Gaussian(mean, (_LEAST_SIGMA + (1 - _LEAST_SIGMA) * torch.sigmoid(raw)).log())
+
+    def tell_own(
+        self, ahead: Float[Tensor, "2 batch frames size"], encoded: Float[Tensor, "2 batch width"]
+    ) -> Gaussian:
+        """Tell a frame's from the true frames ahead, normalised, in each side's sense of time."""
+        return Gaussian.of(self.next(torch.cat([ahead.flatten(-2), encoded], dim=-1)))
+
+
+_MEMORY = 0.7165  # exp(-1/3): what a frame's noise keeps of the frame before, so that it changes over three frames
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnLatents:
+    """Latents made of noise that was drawn before; with zeros the calm answer, at the mean."""
+
+    shared: Float[Tensor, "batch shared"]
+    """Standard normal."""
+    slow: Float[Tensor, "2 batch made own"]
+    """Of unit variance, slow over frames."""
+
+    @staticmethod
+    def calm(config: StitcherConfig, batch: int, made: int) -> "DrawnLatents":
+        """At the mean."""
+        return DrawnLatents(torch.zeros(batch, config.shared), torch.zeros(2, batch, made, config.own))
+
+    @staticmethod
+    def sample(config: StitcherConfig, batch: int, made: int, generator: torch.Generator) -> "DrawnLatents":
+        """Drawn."""
+        noise = torch.randn(batch, config.shared, generator=generator)
+        memory = 0.0 if config.printed else _MEMORY
+        return DrawnLatents(noise, _draw_noise(batch, made, config.own, memory, generator))
+
+    def still(self, rows: Bool[Tensor, " batch"]) -> "DrawnLatents":
+        """Return the same with some rows at the mean."""
+        drawn = (~rows).float()
+        return DrawnLatents(self.shared * drawn[:, None], self.slow * drawn[:, None, None])
+
+    def scale(self, temperature: float) -> "DrawnLatents":
+        """Return the same with noise of another standard deviation."""
+        return DrawnLatents(temperature * self.shared, temperature * self.slow)
+
+    def rows(self, index: Int[Tensor, " rows"]) -> "DrawnLatents":
+        """Return some rows."""
+        return DrawnLatents(self.shared[index], self.slow[:, index])
+
+    def put(self, index: Int[Tensor, " rows"], other: "DrawnLatents") -> "DrawnLatents":
+        """Return the same with other latents in some rows."""
+        return DrawnLatents(self.shared.index_copy(0, index, other.shared), self.slow.index_copy(1, index, other.slow))
+
+    def share(self, prior: Gaussian, seen: Float[Tensor, "2 batch seen"]) -> Float[Tensor, "batch shared"]:
+        """What both sides share over the transition."""
+        return prior.draw(self.shared)
+
+    def own(self, prior: Gaussian, encoded: Float[Tensor, "2 batch width"], step: int) -> Float[Tensor, "2 batch own"]:
+        """A frame's, of both sides."""
+        return prior.draw(self.slow[:, :, step])
+
+
+def _draw_noise(
+    batch: int, frames: int, numbers: int, memory: float, generator: torch.Generator
+) -> Float[Tensor, "2 batch frames numbers"]:
+    """Draw noise of unit variance for both sides of which a frame keeps a share of the frame before."""
+    white = torch.randn(2, batch, frames, numbers, generator=generator)
+    slow = [white[:, :, 0]]
+    for frame in range(1, frames):
+        slow.append(memory * slow[-1] + (1 - memory**2) ** 0.5 * white[:, :, frame])
+    return torch.stack(slow, dim=2)

@@ -17,8 +17,7 @@ from priors import checkpoints
 from priors.config import NetworkConfig, require_at_least
 from priors.licences import OF_DATA
 from priors.training.corpus import Corpus, Split, read_corpus, split_corpus
-from priors.training.devices import select_device
-from priors.training.trainer import GradientTrainer, Trainer
+from priors.training.trainer import GradientTrainer, Trainer, select_device
 from priors.weight_sets import name_for_records
 
 Row = dict[str, Any]

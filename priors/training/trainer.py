@@ -1,16 +1,47 @@
-"""A network and how it takes one step of training."""
+"""A network and how it takes one step of training.
+
+Where training computes: on processors, or on a GPU with CUDA.
+
+Inside `use_device` that is torch's default device, so that windows, networks and random numbers are made there.
+"""
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any, Generic, TypeVar
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
-from mapctl.errors import MapctlError
+from mapctl.errors import MapctlError, RequestError
 from priors.training.corpus import Corpus
-from priors.training.devices import make_generator, use_device
+
+
+def select_device(wanted: str) -> str:
+    """Return the device of `auto`, `cpu` or `cuda`; RequestError where this machine has none."""
+    if wanted not in ("auto", "cpu", "cuda"):
+        raise RequestError(f"device must be auto, cpu or cuda, got {wanted!r}")
+    if wanted == "cuda" and not torch.cuda.is_available():
+        raise RequestError("this machine has no CUDA device; use --device cpu")
+    return ("cuda" if torch.cuda.is_available() else "cpu") if wanted == "auto" else wanted
+
+
+@contextmanager
+def use_device(name: str) -> Iterator[None]:
+    """Make tensors on this device unless another is given."""
+    if torch.get_default_device().type == torch.device(name).type:
+        yield  # as it is: a default of torch's costs each of its calls a little
+        return
+    with torch.device(name):
+        yield
+
+
+def make_generator(seed: int) -> torch.Generator:
+    """Make a generator that draws on the device in use."""
+    return torch.Generator(torch.get_default_device()).manual_seed(seed)
+
 
 Network = TypeVar("Network", bound=nn.Module)
 Drawn = TypeVar("Drawn")
@@ -168,3 +199,27 @@ def warmup_cosine(step: int, steps: int) -> float:
 def select_prefixed(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Select those whose names begin so, without it."""
     return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}
+
+
+class HistoryBuffer:
+    """Windows that earlier weights made, so that the critic does not forget faults that it once knew."""
+
+    def __init__(self, windows: Float[Tensor, "size frames features"]):
+        self.windows = windows.clone()
+
+    def mix(self, fresh: Float[Tensor, "batch frames features"], generator: torch.Generator) -> Tensor:
+        """Half a batch of the fresh ones, half of kept ones; then the fresh half takes the place of kept ones."""
+        half = len(fresh) // 2
+        picked = torch.randperm(len(self.windows), generator=generator)
+        mixed = torch.cat([fresh[: len(fresh) - half], self.windows[picked[:half]]])
+        self.windows[picked[half : 2 * half]] = fresh[:half]
+        return mixed
+
+    def keep(self, fresh: Float[Tensor, "batch frames features"], generator: torch.Generator) -> None:
+        """Put the fresh ones in the place of kept ones."""
+        picked = torch.randperm(len(self.windows), generator=generator)[: len(fresh)]
+        self.windows[picked] = fresh[: len(picked)]
+
+    def draw(self, count: int, generator: torch.Generator) -> Float[Tensor, "count frames features"]:
+        """Draw so many of the kept ones, any of them more than once."""
+        return self.windows[torch.randint(len(self.windows), (count,), generator=generator)]

@@ -26,9 +26,8 @@ from mapctl.skeleton import CANONICAL, TOE_JOINTS, TOE_REST_HEIGHT
 from priors import checkpoints
 from priors.tweening import path as path_predictor
 from priors.tweening.generator import MAX_KEY_FRAMES, GeneratorConfig, GeneratorNetwork
-from priors.tweening.keys import see_contacts
+from priors.tweening.keys import bend_motion, see_contacts
 from priors.tweening.styles import Style, read_classes
-from priors.tweening.walked_way import bend_motion
 
 
 def show_loose_keys(image: PositionImage, loose: LooseKeys) -> PositionImage:

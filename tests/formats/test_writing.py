@@ -18,7 +18,7 @@ from mapctl.errors import WriteError
 from mapctl.formats import usd
 from mapctl.formats.atomic import atomic_path, write_bytes
 from priors import checkpoints
-from priors.tensor_files import write_tensors
+from priors.checkpoints import write_tensors
 from scenes.writers import gif_writer, mp4_writer, save_png, webp_writer
 
 MOTION = walk(150)

@@ -8,7 +8,7 @@ from torch import Tensor
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode
 from mapctl.pose import BodyPose
 from mapctl.skeleton import TOE_JOINTS
-from priors.lstm_gmm.planting import Planting
+from priors.lstm_gmm.network import Planting
 
 SIZE = LAYOUT.continuous
 SIGMA = 0.06

@@ -22,7 +22,7 @@ from mapctl.metrics import worst_frame
 from mapctl.rotations import about_y, multiply, rotate
 from mapctl.skeleton import CANONICAL
 from priors.stitching.inbetweener import Wishes, fit_shared
-from priors.stitching.joining import Joined
+from priors.stitching.sides import Joined
 
 RAW = InfillSettings(finish=False)
 GAP = slice(21, 40)

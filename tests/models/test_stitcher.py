@@ -14,10 +14,8 @@ from mapctl.inbetweening.missing import MissingMask
 from mapctl.recording.masks import ALL, Mask
 from mapctl.retarget import to_canonical
 from priors.stitching.inbetweener import Draws, see_ends
-from priors.stitching.joining import join_sides
-from priors.stitching.latents import DrawnLatents
-from priors.stitching.network import POSE, StitcherNetwork
-from priors.stitching.sides import _Walker, count_made, reverse_sense, walk_sides
+from priors.stitching.network import POSE, DrawnLatents, StitcherNetwork
+from priors.stitching.sides import _Walker, count_made, join_sides, reverse_sense, walk_sides
 
 PRINTED = replace(CONFIG, shared=0, own=4, printed=True)
 each_length = pytest.mark.parametrize("frames", [2, 3, 4, 5, 8, 15, 24])

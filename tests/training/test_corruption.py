@@ -13,8 +13,7 @@ from mapctl.kinematics import chain_matrices
 from mapctl.recording.noise_estimation import estimate_position_noise
 from mapctl.skeleton import CANONICAL
 from priors.training.augmentation import corruption
-from priors.training.augmentation.corruption import CorruptionSettings, corrupt, make_clean_capture
-from priors.training.augmentation.draws import LIMBS
+from priors.training.augmentation.corruption import LIMBS, CorruptionSettings, corrupt, make_clean_capture
 
 JOINTS = CANONICAL.num_joints
 NOTHING = CorruptionSettings(

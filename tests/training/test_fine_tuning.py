@@ -10,7 +10,7 @@ from helpers import corpus, write_corpus
 import priors
 from priors.lstm_gmm.network import LstmGmmConfig
 from priors.training import run
-from priors.training.quality import density as density_quality
+from priors.training.recipes import lstm_gmm
 from priors.training.recipes.lstm_gmm import DensityRecipe, DensityTrainer, TrainingSettings
 
 TINY = LstmGmmConfig(width=8, components=2)
@@ -19,8 +19,8 @@ SETTINGS = TrainingSettings(steps=6, batch=4, window=20)
 
 @pytest.mark.slow
 def test_fine_tuning_begins_with_the_priors_weights_statistics_and_labels(tmp_path, monkeypatch):
-    whole = density_quality.measure_free_runs
-    monkeypatch.setattr(density_quality, "measure_free_runs", partial(whole, runs=2, frames=20))
+    whole = lstm_gmm.measure_free_runs
+    monkeypatch.setattr(lstm_gmm, "measure_free_runs", partial(whole, runs=2, frames=20))
     request = DensityRecipe(
         write_corpus(tmp_path / "data"),
         tmp_path / "first",

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from mapctl.numerics.intervals import true_intervals
 from mapctl.skeleton import CANONICAL
-from priors.training.augmentation.gap_masks import GapSettings, sample_observation_mask
+from priors.training.recipes.infiller import GapSettings, sample_observation_mask
 
 BATCH, FRAMES = 400, 120
 GAPS = GapSettings(keys=0.0, joints=0.0, partial=0.0, several=1)

@@ -8,8 +8,7 @@ import torch
 from helpers import corpus, generator
 
 from mapctl.skeleton import CANONICAL
-from priors.training.augmentation.key_layouts import KeySettings, draw_windows
-from priors.training.augmentation.key_parts import WHOLE, tell_parts
+from priors.training.augmentation.key_layouts import WHOLE, KeySettings, draw_windows, tell_parts
 from priors.training.augmentation.pose_windows import PoseWindows
 from priors.tweening.keys import ToldParts, lead_reference, make_key_image
 

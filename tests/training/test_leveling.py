@@ -14,9 +14,8 @@ from mapctl.features import GroundPose, encode
 from mapctl.motion import Motion
 from mapctl.pose import BodyPose
 from mapctl.skeleton import CANONICAL, TOE_JOINTS, TOE_REST_HEIGHT
-from priors.training.corpus import read_clip_features
+from priors.training.corpus import find_floor_slope, read_clip_features, stand_on_canonical, turn_level
 from priors.training.mocap.cuts import Cut
-from priors.training.mocap.leveling import find_floor_slope, stand_on_canonical, turn_level
 
 pytestmark = pytest.mark.usefixtures("small_judgements")
 SMALL = Performer(size=0.9, toe_height=-0.03)

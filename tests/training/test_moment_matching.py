@@ -8,7 +8,7 @@ from helpers import corpus, finite_difference, generator, tiny_model
 from mapctl.features import LAYOUT
 from priors.lstm_gmm.labels import PACE_LABELS, Labels
 from priors.lstm_gmm.network import LstmGmmConfig
-from priors.training.mocap.paces import follow_paces
+from priors.training.corpus import follow_paces
 from priors.training.moment_matching import MatchingSettings, moment_loss, run_free
 from priors.training.recipes.lstm_gmm import DensityTrainer, TrainingSettings
 

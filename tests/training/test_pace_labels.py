@@ -11,8 +11,7 @@ import priors
 from mapctl.errors import RequestError
 from priors.lstm_gmm.labels import PACE_LABELS, Labels, read_pace_rates
 from priors.lstm_gmm.network import LstmGmm, LstmGmmConfig
-from priors.training.corpus import Corpus
-from priors.training.mocap.paces import follow_paces, measure_pace_changes, measure_speeds
+from priors.training.corpus import Corpus, follow_paces, measure_pace_changes, measure_speeds
 from priors.training.recipes.lstm_gmm import DensityTrainer, TrainingSettings
 
 pytestmark = pytest.mark.usefixtures("small_judgements")

@@ -11,11 +11,10 @@ from torch.nn.functional import logsigmoid
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, GroundPose, encode
 from mapctl.pose import decode
-from priors.refiner.end_effectors import count_channels
-from priors.refiner.network import RefinerConfig
+from priors.refiner.network import RefinerConfig, count_channels
 from priors.training.corpus import Corpus
-from priors.training.history import HistoryBuffer
 from priors.training.recipes.refiner import AdversarialSettings, AdversarialTrainer, Critic, compute_root_error
+from priors.training.trainer import HistoryBuffer
 
 TINY = RefinerConfig(width=8, memory=6, lookahead=1, joints=("hips", "leftHand", "rightToes"))
 SHORT = {"steps": 5, "window": 12, "batch": 4, "warm_up": 2, "head_start": 0, "critic_updates": 1, "history": 10}

@@ -10,14 +10,21 @@ from helpers import corpus, write_corpus
 
 import priors
 from mapctl.errors import RequestError
-from priors.stitching.joining import join_sides
-from priors.stitching.latents import DrawnLatents
-from priors.stitching.sides import count_made, walk_sides
+from priors.stitching.network import DrawnLatents
+from priors.stitching.sides import count_made, join_sides, walk_sides
 from priors.training.augmentation.transition_windows import Known, Transition, TransitionWindows
-from priors.training.quality.stitcher import TEMPERATURES, calibrate_temperature, place
 from priors.training.recipes import stitcher as recipe_module
-from priors.training.recipes.stitcher import StitcherRecipe, StitcherSettings
-from priors.training.recipes.stitcher_losses import TRIES, Shares, interpolate, sample_nearest
+from priors.training.recipes.stitcher import (
+    TEMPERATURES,
+    TRIES,
+    Shares,
+    StitcherRecipe,
+    StitcherSettings,
+    calibrate_temperature,
+    interpolate,
+    place,
+    sample_nearest,
+)
 from priors.training.run import train
 
 SETTINGS = StitcherSettings(steps=10, batch=6, window=24)

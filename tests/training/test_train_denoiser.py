@@ -10,7 +10,7 @@ from helpers import corpus, generator
 from mapctl.features import LAYOUT
 from priors.denoiser.network import DenoiserConfig
 from priors.training.augmentation.corruption import CorruptionSettings
-from priors.training.augmentation.unfamiliar_poses import PoseVariation
+from priors.training.augmentation.pose_windows import PoseVariation
 from priors.training.corpus import Corpus
 from priors.training.recipes.denoiser import DenoiserSettings, DenoiserTrainer, compute_denoiser_losses, draw_performers
 from priors.training.windows import FeatureWindows

@@ -12,8 +12,7 @@ from tiny_infiller import CONFIG, network
 import mapctl
 from mapctl.skeleton import CANONICAL
 from priors.infiller.network import InfillerConfig
-from priors.training.augmentation.gap_masks import GapSettings
-from priors.training.recipes.infiller import InfillerSettings, InfillerTrainer, compute_infiller_losses
+from priors.training.recipes.infiller import GapSettings, InfillerSettings, InfillerTrainer, compute_infiller_losses
 from priors.training.windows import PositionWindows
 
 SETTINGS = InfillerSettings(steps=6, batch=4, window=32)

@@ -10,14 +10,12 @@ from helpers import corpus, walk, write_corpus
 from mapctl.features import LAYOUT, encode, mirror_features
 from mapctl.metrics.states import summarise_states
 from priors.lstm_gmm.network import PAPER, LstmGmmConfig
-from priors.training.feature_statistics import compute_feature_statistics
-from priors.training.quality import density as density_quality
 from priors.training.recipes import lstm_gmm
-from priors.training.recipes.lstm_gmm import DensityRecipe, DensityTrainer, TrainingSettings
+from priors.training.recipes.lstm_gmm import DensityRecipe, DensityTrainer, TrainingSettings, compute_feature_statistics
 from priors.training.run import train
 
 TINY = LstmGmmConfig(width=8, components=2)
-MEASURE = density_quality.measure_free_runs
+MEASURE = lstm_gmm.measure_free_runs
 SETTINGS = TrainingSettings(steps=6, batch=4, window=20)
 
 
@@ -75,7 +73,7 @@ def test_the_starts_of_a_density_are_chosen_by_its_labels(tmp_path, monkeypatch)
     monkeypatch.setattr(
         lstm_gmm, "select_initial_states", lambda *given, **named: asked.append(named) or select(*given, **named)
     )
-    monkeypatch.setattr(density_quality, "measure_free_runs", partial(MEASURE, runs=2, frames=20))
+    monkeypatch.setattr(lstm_gmm, "measure_free_runs", partial(MEASURE, runs=2, frames=20))
     labels = r"(?P<clip>\d)\.bvh"
     train(DensityRecipe(tmp_path / "data", tmp_path / "run", config=TINY, settings=SETTINGS, starts=4, labels=labels))
     (given,) = asked

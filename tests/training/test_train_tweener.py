@@ -12,8 +12,14 @@ from mapctl import kinematics, rotations
 from mapctl.skeleton import CANONICAL
 from priors.training.augmentation.key_layouts import KeySettings, draw_splices, draw_windows
 from priors.training.augmentation.pose_windows import PoseWindows
-from priors.training.recipes.tweener import TweenerSettings, TweenerTrainer, draw_style_poses, measure_gap
-from priors.training.recipes.tweener_losses import LossWeights, compute_tweener_losses
+from priors.training.recipes.tweener import (
+    LossWeights,
+    TweenerSettings,
+    TweenerTrainer,
+    compute_tweener_losses,
+    draw_style_poses,
+    measure_gap,
+)
 from priors.tweening.generator import ConstrainedPose, GeneratedPoses, GeneratorNetwork
 
 SETTINGS = TweenerSettings(steps=30, batch=96, learning_rate=1e-2, layout=KeySettings(longest=60.0))

@@ -25,8 +25,7 @@ from mapctl.pose import decode
 from mapctl.runtime.stepwise import StepwiseWork
 from priors.checkpoints import compute_hash
 from priors.stitching.inbetweener import MAX_CONTEXT, Stitcher, load
-from priors.training.corpus import Corpus, read_cache, write_cache
-from priors.training.mocap.paces import measure_speeds
+from priors.training.corpus import Corpus, measure_speeds, read_cache, write_cache
 
 FOLDER = "spliced/"
 """Before the names of splices in a corpus, which are those of both clips."""

@@ -18,11 +18,10 @@ from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors.config import require_at_least
 from priors.denoiser.network import DenoiserConfig, DenoiserNetwork
 from priors.training.augmentation.corruption import CorruptionSettings, corrupt, make_clean_capture
-from priors.training.augmentation.unfamiliar_poses import PoseVariation, vary_features
+from priors.training.augmentation.pose_windows import PoseVariation, vary_features
 from priors.training.corpus import Corpus
-from priors.training.devices import make_generator
 from priors.training.recipe import NetworkRecipe, Row, average_logarithms
-from priors.training.trainer import GradientTrainer
+from priors.training.trainer import GradientTrainer, make_generator
 from priors.training.windows import FeatureWindows
 
 _TOES = list(TOE_JOINTS)

@@ -21,8 +21,7 @@ from mapctl.features import PRIOR_FPS
 from mapctl.skeleton import CANONICAL
 from mapctl.terms.trial import Trial
 from priors.config import require_at_least
-from priors.training.history import HistoryBuffer
-from priors.training.trainer import draw_weights, make_divergence_error
+from priors.training.trainer import HistoryBuffer, draw_weights, make_divergence_error
 from priors.training.windows import FeatureWindows
 
 _WIDTH = 128

@@ -1,12 +1,16 @@
 """Training of the LSTM-GMM: Wang et al. 2019, section 4.1.3, with departures.
 
 Windows of clips with noise on the inputs; loss is the negative log density of the next frame (Eq. 8).
+
+What a density is worth on held-out clips: likelihood, and whether, sampled for long, it stays a person
+moving as the data do.
 """
 
 import copy
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -14,6 +18,11 @@ from torch import Tensor, nn
 from torch.nn.functional import one_hot
 
 from mapctl.errors import RequestError
+from mapctl.features import LAYOUT, GroundPose, ground_speed, mirror_features
+from mapctl.metrics import compute_reference
+from mapctl.metrics.states import summarise_states
+from mapctl.pose import decode
+from mapctl.problem import density_selection
 from priors.config import require_at_least
 from priors.lstm_gmm import density, labels
 from priors.lstm_gmm.labels import PACE_LABELS, Labels
@@ -21,18 +30,98 @@ from priors.lstm_gmm.network import NOISE_UNIT, LstmGmm, LstmGmmConfig
 from priors.stitching import inbetweener
 from priors.training.augmentation.clip_copies import ClipCopies, add_copies
 from priors.training.augmentation.splices import Splices, add_splices, drop_splices, hide_splices
-from priors.training.corpus import Corpus, Split
-from priors.training.devices import make_generator, use_device
-from priors.training.feature_statistics import compute_feature_statistics
-from priors.training.history import HistoryBuffer
+from priors.training.corpus import Corpus, Split, follow_paces, measure_pace_changes
 from priors.training.initial_states import measure_data_limits, select_initial_states
-from priors.training.mocap.paces import follow_paces, measure_pace_changes
 from priors.training.moment_matching import MatchingSettings, moment_loss, run_free
-from priors.training.quality import density as density_quality
 from priors.training.recipe import Export, Gathered, Progress, Recipe, Row
 from priors.training.recipes.density_critic import CriticSettings, FreeRunJudge
-from priors.training.trainer import GradientTrainer
+from priors.training.trainer import GradientTrainer, HistoryBuffer, make_generator, use_device
 from priors.training.windows import FeatureWindows
+
+_SETTLING_FRAMES = 300
+
+
+def measure_free_runs(
+    model: LstmGmm, corpus: Corpus, *, runs: int = 8, frames: int = 1500, temperature: float = 1.0, seed: int = 0
+) -> dict[str, float]:
+    """Speed, height and pose variation of free runs, each as a ratio to the corpus, and the slowest run's last speed.
+
+    Runs begin after the first two seconds of clips; their first ten seconds are not counted.
+    """
+    clips = [clip for clip in corpus.clips() if len(clip) > 60]
+    clips = [clips[i * len(clips) // runs % len(clips)] for i in range(runs)]
+    state = model.start_after(torch.stack([clip[0] for clip in clips]).to(model.mean.device))
+    state = model.advance(state, torch.stack([clip[1:60] for clip in clips]).to(model.mean.device))
+    features, _ = model.sample(state, frames, make_generator(seed), temperature=temperature)
+    settled = features[:, min(_SETTLING_FRAMES, frames // 2) :].cpu()
+    own, wanted = summarise_states(settled.flatten(0, 1)), summarise_states(corpus.features)
+    result = {f"free_run_{name}_ratio": own[name] / wanted[name] for name in own}
+    result["free_run_slowest_m_s"] = float(ground_speed(settled[:, -150:]).mean(-1).min())
+    result["free_run_finite"] = float(torch.isfinite(features).all())
+    return result
+
+
+def measure_quality(model: LstmGmm, parts: Split) -> dict[str, Any]:
+    """Measure the quality of a finished network, for its card."""
+    return {
+        "test_nats_per_frame": compute_validation_nats(model, parts.test),
+        "windows": compute_window_nats(model, (parts.validation, parts.test)),
+        "mocap": _measure_mocap(parts),
+        "data": summarise_states(parts.train.features),
+    }
+
+
+def _measure_mocap(parts: Split) -> dict[str, dict[str, float]]:
+    """What the clips kept from training show in every measure: mean, 2nd and 98th percentile (NaN left out)."""
+    held = [decode(clip, GroundPose.origin()) for part in (parts.validation, parts.test) for clip in part.clips()]
+    table = {name: spread._asdict() for name, spread in compute_reference(held).items()}
+    return {name: row for name, row in table.items() if not math.isnan(row["mean"])}
+
+
+def compute_validation_nats(model: LstmGmm, corpus: Corpus, frames: int = 100) -> float:
+    """Mean negative log density a frame over the first frames of every clip, clean inputs, from an empty memory."""
+    total, count = 0.0, 0
+    with torch.no_grad():
+        for clip in corpus.clips():
+            clip = clip[:frames].unsqueeze(0).to(model.mean.device)
+            nats = -model.log_prob(clip[:, 1:], model.start_after(clip[:, 0]))
+            total, count = total + nats.sum().item(), count + nats.numel()
+    return total / count
+
+
+def compute_window_nats(model: LstmGmm, corpora: Iterable[Corpus]) -> dict[str, float]:
+    """Log density a frame, physical units, of motion as wrong as a proposal is: mean over windows, and the value that
+    98 % of them reach. By it a density's trust is told (see mapctl.problem.density_selection); clips begin with an
+    empty memory.
+    """
+    blurred, found = model.cpu().with_observation_noise(density_selection.proposal_sigma()), []
+    with torch.no_grad():
+        for clip in (clip for corpus in corpora for clip in corpus.clips() if len(clip) > 1):
+            nats = blurred.log_prob(clip[None, 1:], blurred.start_after(clip[:1]))[0]
+            parts = density_selection.to_physical_log_density(nats, blurred.std).split(
+                density_selection.SELECTION_WINDOW
+            )
+            found += [
+                part.mean() for part in parts if len(part) == density_selection.SELECTION_WINDOW or len(parts) == 1
+            ]
+    values = torch.stack(found)
+    return {"mean": float(values.mean()), "p2": float(values.quantile(0.02))}
+
+
+def compute_feature_statistics(features: Float[Tensor, "frames size"]) -> tuple[Tensor, Tensor]:
+    """Mean and standard deviation of features and their mirror image; floors keep held joints from exploding.
+
+    Rotations are held to at least 0.01 rad (0.6 degrees), displacements to 1 mm; contact bits map to -1 and 1.
+    """
+    both = torch.cat([features, mirror_features(features)])
+    mean, std = both.mean(0), both.std(0)
+    floor = torch.full_like(std, 0.01)
+    floor[LAYOUT.slices["root_displacement_heading"]] = 0.001
+    floor[LAYOUT.slices["heading_change"]] = 0.002
+    for values in (mean, floor, std):
+        values[LAYOUT.slices["contacts"]] = 0.5
+    return mean, torch.maximum(std, floor)
+
 
 _KEEP_GROUP_PROBABILITY = 0.7
 _LEAST_RUNS = 4  # free runs that are compared: slow ones with slow ones, by quarters
@@ -202,8 +291,8 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
     def validate(self, corpus: Corpus) -> dict[str, float]:
         """Likelihood and the health of free runs: likelihood does not predict stability."""
         self.average.eval()
-        row = {"validation_nats": density_quality.compute_validation_nats(self.average, corpus)}
-        row |= density_quality.measure_free_runs(self.average, corpus)
+        row = {"validation_nats": compute_validation_nats(self.average, corpus)}
+        row |= measure_free_runs(self.average, corpus)
         self.average.train()
         return row
 
@@ -426,7 +515,7 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
                 "starts.weight": found.weight,
             },
             data,
-            density_quality.measure_quality(model, parts),
+            measure_quality(model, parts),
             asdict(measure_data_limits(clips)),
         )
 

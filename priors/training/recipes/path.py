@@ -14,12 +14,10 @@ from mapctl.inbetweening.partial_motion import PartialMotion
 from mapctl.inbetweening.root_trajectory import LocalMotion
 from mapctl.metrics.root_prediction import SPANS, average_displacement_errors, compute_displacement_errors
 from priors.config import require_at_least
-from priors.training.augmentation.pose_windows import PoseWindows, Variation, find_kind
-from priors.training.augmentation.unfamiliar_poses import PoseVariation
+from priors.training.augmentation.pose_windows import PoseVariation, PoseWindows, Variation, find_kind
 from priors.training.corpus import Corpus
-from priors.training.devices import make_generator
 from priors.training.recipe import NetworkRecipe, Row, average_logarithms
-from priors.training.trainer import GradientTrainer
+from priors.training.trainer import GradientTrainer, make_generator
 from priors.tweening.path import PathConfig, PathNetwork
 
 _VALIDATED = ("V1", "V8", "V32", "V64", "Y")

@@ -1,25 +1,376 @@
-"""Training of the stitcher: both ways between two poses of mocap, longer and longer ones."""
+"""Training of the stitcher: both ways between two poses of mocap, longer and longer ones.
+
+What a stitcher does between poses of unseen clips: how near it comes, how far its sides are apart, and how its
+answers differ.
+"""
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, field, replace
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn.functional import binary_cross_entropy_with_logits as cross_entropy
 
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, mirror_features
+from mapctl.kinematics import forward_kinematics
+from mapctl.pose import BodyPose
+from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors.config import require_at_least
-from priors.stitching.layers import multiply_in_bfloat16
-from priors.stitching.network import StitcherConfig, StitcherNetwork
-from priors.stitching.posterior import PosteriorNetwork
-from priors.training.augmentation.transition_windows import Known, TransitionWindows
+from priors.stitching.network import (
+    PACE,
+    POSE,
+    SEEN_FUTURE,
+    DrawnLatents,
+    Gaussian,
+    PosteriorNetwork,
+    StitcherConfig,
+    StitcherNetwork,
+    multiply_in_bfloat16,
+)
+from priors.stitching.sides import Joined, Latents, Sides, count_made, join_sides, walk_sides
+from priors.training.augmentation.transition_windows import Known, Transition, TransitionWindows
 from priors.training.corpus import Corpus, Split
-from priors.training.quality.stitcher import calibrate_temperature, measure_transitions
 from priors.training.recipe import Export, Gathered, NetworkRecipe, Row, average_logarithms
-from priors.training.recipes.stitcher_losses import LossWeights, Shares, find_stitcher_losses
-from priors.training.trainer import GradientTrainer
+from priors.training.trainer import GradientTrainer, make_generator
+
+_EASE_METRES = 0.05
+
+
+TRIES = 4
+"""Draws of which the nearest is taught."""
+
+
+@dataclass(eq=False)
+class TaughtLatents:
+    """The posterior's latents, which has seen the truth, in the first rows of a batch, and what noise becomes in the
+    rest."""
+
+    posterior: PosteriorNetwork
+    """Sees the truth."""
+    truth: Float[Tensor, "2 batch frames size"]
+    """Normalised features from each end's next frame to the other end."""
+    missed: Float[Tensor, "2 informed made size"]
+    """What the calm answer misses of it, in the first rows, which are given the posterior's."""
+    noise: DrawnLatents
+    """Of all rows; zeros at the mean."""
+    nats: list[Tensor] = field(default_factory=list)
+    """Divergences from the prior by row and dimension, the transition's first and then those of frames."""
+    cost: Tensor = field(default_factory=lambda: torch.zeros(()))
+    """The transition's divergence from a standard normal distribution, by row and dimension."""
+
+    def share(self, prior: Gaussian, seen: Float[Tensor, "2 batch seen"]) -> Float[Tensor, "batch shared"]:
+        """What both sides share over the transition."""
+        count = self.missed.shape[1]
+        if not count:
+            self.nats.append(self.noise.shared[:0])
+            return self.noise.share(prior, seen)
+        told = self.posterior.tell_shared(self.missed)
+        self.cost = told.diverge(Gaussian(torch.zeros_like(told.mean), torch.zeros_like(told.mean)))
+        # Held to a prior that sees the ends, the posterior would learn to tell nothing but these.
+        self.nats.append(told.detach().diverge(prior.row(slice(count))))
+        noise = self.noise.shared
+        return torch.cat([told.draw(noise[:count]), prior.row(slice(count, None)).draw(noise[count:])])
+
+    def own(self, prior: Gaussian, encoded: Float[Tensor, "2 batch width"], step: int) -> Float[Tensor, "2 batch own"]:
+        """A frame's, of both sides."""
+        last = self.truth.shape[2] - 1
+        ahead = [min(step + number, last) for number in range(SEEN_FUTURE)]
+        told = self.posterior.tell_own(self.truth[:, :, ahead], encoded)
+        self.nats.append(told.diverge(prior).mean(dim=0))
+        noise = self.noise.slow[:, :, step]
+        informed = torch.arange(noise.shape[1]) < self.missed.shape[1]
+        return torch.where(informed[:, None], told.draw(noise), prior.draw(noise))
+
+    def diverge(self) -> dict[str, Tensor]:
+        """Return the divergences that are learnt, nats a transition, by the names of their weights."""
+        count = self.missed.shape[1]
+        if not count:
+            return {name: torch.zeros(()) for name in ("shared", "prior", "own")}
+        shared, frames = self.nats[0], torch.stack(self.nats[1:]).sum(dim=0)
+        prior, own = (each[:count].mean(dim=0).sum() for each in (shared, frames))
+        return {"shared": self.cost.mean(dim=0).sum(), "prior": prior, "own": own}
+
+
+@torch.no_grad()
+def miss_calmly(network: StitcherNetwork, truth: Transition) -> Float[Tensor, "2 batch made size"]:
+    """Return what the calm answer to the ends of transitions misses of the truth, in units of the features' spread."""
+    count, made = len(truth.features), count_made(network, truth.frames)
+    if not count:
+        return network.mean.new_zeros(2, 0, made, len(network.mean))
+    calm = DrawnLatents.calm(network.config, count, made)
+    found = walk_sides(network, truth.ends(), truth.frames, calm).features
+    return (truth.truth()[:, :, :made] - found) / network.std
+
+
+@torch.no_grad()
+def sample_nearest(network: StitcherNetwork, truth: Transition, generator: torch.Generator) -> DrawnLatents:
+    """Sample several latents for each of some transitions, and return those whose answers have joints nearest to the
+    truth."""
+    count, made = len(truth.features), count_made(network, truth.frames)
+    tries = TRIES if count else 0
+    every = torch.arange(count).repeat(tries)
+    noise = DrawnLatents.sample(network.config, len(every), made, generator)
+    if not tries:
+        return noise
+    repeated = truth.rows(every)
+    sides = walk_sides(network, repeated.ends(), truth.frames, noise)
+    away = (sides.place_joints() - repeated.place_joints(made)).norm(dim=-1)
+    best = away.mean(dim=(0, 2, 3)).unflatten(0, (tries, count)).argmin(dim=0)
+    return noise.rows(best * count + torch.arange(count))
+
+
+@dataclass(frozen=True)
+class LossWeights:
+    """Weights of what is learnt; each loss is divided by its mean before training where `relative`."""
+
+    places: float = 10.0
+    """Mean distance of joints from their true places, metres (the paper's FK loss, Eq. 7)."""
+    pace: float = 20.0
+    """Error of joints' steps, metres a frame."""
+    state: float = 0.5
+    """Absolute error of steps, turns and poses, in units of their spread (Eq. 6)."""
+    contacts: float = 0.1
+    """Cross entropy of the contacts, nats."""
+    feet: float = 5.0
+    """Steps of toes that are planted, metres a frame."""
+    stitching: float = 5.0
+    """Mean distance of the two sides' joints where they overlap, metres (Eq. 4)."""
+    shared: float = 0.001
+    """Divergence of the posterior of what both sides share from a standard normal distribution, nats."""
+    prior: float = 0.02
+    """Divergence of that posterior, as it is, from its prior, which is to learn it, nats."""
+    own: float = 0.02
+    """Divergence of the frames' latents from their prior, nats a transition."""
+    phase: float = 0.3
+    """Absolute error of the phases."""
+    ease: float = 0.4
+    """Power of the interpolation's error by which windows count less; 0 lets all count the same."""
+
+    def weigh(self, parts: Mapping[str, Tensor]) -> Tensor:
+        """Return the loss."""
+        return torch.stack([getattr(self, name) * value for name, value in parts.items()]).sum()
+
+
+@dataclass(frozen=True)
+class Shares:
+    """Shares of a batch by where latents come from; the rest has draws from the prior, which have only to meet."""
+
+    informed: float = 0.4
+    """From the posterior, which has seen the truth."""
+    calm: float = 0.3
+    """The prior's mean."""
+    nearest: float = 0.2
+    """The one of several draws from the prior that comes nearest to the truth (the variety loss of Gupta et al. 2018,
+    "Social GAN"): so draws are taught to come near to all that may be meant, where the posterior teaches what a latent
+    is to say."""
+
+    def count(self, batch: int) -> tuple[int, int, int]:
+        """Return the rows at which the first three end."""
+        told = self.informed, self.informed + self.calm, self.informed + self.calm + self.nearest
+        informed, calm, nearest = (round(batch * share) for share in told)
+        return informed, calm, nearest
+
+
+def find_stitcher_losses(
+    network: StitcherNetwork,
+    posterior: PosteriorNetwork,
+    truth: Transition,
+    shares: Shares,
+    ease: float,
+    generator: torch.Generator,
+) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Find the losses by the names of their weights, and in plain units the errors that they are made of."""
+    batch = len(truth.features)
+    informed, calm, compared = shares.count(batch)
+    row = torch.arange(batch)
+    noise = DrawnLatents.sample(network.config, batch, count_made(network, truth.frames), generator)
+    noise = noise.still((row >= informed) & (row < calm))
+    nearest = row[calm:compared]
+    noise = noise.put(nearest, sample_nearest(network, truth.rows(nearest), generator))
+    wanted, missed = truth.truth(), miss_calmly(network, truth.rows(row[:informed]))
+    latents = TaughtLatents(posterior, (wanted - network.mean) / network.std, missed, noise)
+    sides = walk_sides(network, truth.ends(), truth.frames, latents)
+    parts, distance, slip = _compare(network, truth, sides, compared, ease)
+    parts |= latents.diverge()
+    told = {
+        "places_cm": 100 * distance[:, :informed].mean() if informed else torch.zeros(()),
+        "calm_cm": 100 * distance[:, informed:calm].mean() if calm > informed else torch.zeros(()),
+        "nearest_cm": 100 * distance[:, calm:].mean() if compared > calm else torch.zeros(()),
+        "pace_cm": 100 * slip.mean(),
+        "state": parts["state"],
+        "contacts": parts["contacts"],
+        "feet_cm": 100 * parts["feet"],
+        "apart_cm": 100 * parts["stitching"],
+        "shared_nats": parts["prior"],
+        "own_nats": parts["own"],
+        "phase": parts["phase"],
+    }
+    return parts, told
+
+
+def _compare(
+    network: StitcherNetwork, truth: Transition, sides: Sides, compared: int, power: float
+) -> tuple[dict[str, Tensor], Float[Tensor, "sides compared made joints"], Float[Tensor, "sides compared made joints"]]:
+    """Compare the first rows with the truth, and let all of them meet and stand; also return the distances of joints
+    from their true places, and the errors of their steps, metres."""
+    made = sides.features.shape[2]
+    true, places = truth.truth()[:, :compared, :made], sides.place_joints()
+    # Windows that interpolation nearly solves count for more, or the network learns to fidget where nobody moves.
+    ease = weigh_windows(truth, power)[:compared]
+    wrong = places[:, :compared] - truth.place_joints(made)[:, :compared]
+    distance = _measure_length(wrong)
+    slip = _measure_length(torch.diff(wrong, dim=2, prepend=torch.zeros_like(wrong[:, :, :1])))
+    off = ((sides.features[:, :compared] - true) / network.std).abs()
+    steps = _measure_length(torch.diff(places[..., list(TOE_JOINTS), :], dim=2))
+    # Who was drawn is compared with no truth: toes that its own sides call planted are to stand.
+    stand = torch.cat([true[..., POSE.stop :], sides.features[:, compared:, :, POSE.stop :].detach()], dim=1)
+    planted = stand[:, :, 1:] * stand[:, :, :-1]
+    phases = torch.cat([sides.at_ends[:, :, None], sides.phases[:, :, : made - 1]], dim=2)[:, :compared]
+    parts = {
+        "places": (ease * distance.mean(dim=(0, 2, 3))).mean(),
+        "pace": (ease * slip.mean(dim=(0, 2, 3))).mean(),
+        "state": (ease * (off[..., PACE].mean(dim=-1) + off[..., POSE].mean(dim=-1)).mean(dim=(0, 2))).mean(),
+        "contacts": cross_entropy(sides.logits[:, :compared], true[..., POSE.stop :]),
+        "feet": (steps * planted).sum() / planted.sum().clamp_min(1),
+        "stitching": measure_apart(places, truth.frames).mean(),
+        "phase": (phases - truth.true_phases()[:, :compared, :made]).abs().mean(),
+    }
+    return parts, distance, slip
+
+
+def measure_apart(places: Float[Tensor, "2 batch made joints 3"], frames: int) -> Float[Tensor, "batch overlap"]:
+    """Measure the mean distance of the sides' joints in the frames that both made, metres."""
+    made = places.shape[2]
+    first = frames - made
+    return _measure_length(places[0, :, first - 1 :] - places[1, :, first - 1 :].flip(1)).mean(dim=-1)
+
+
+@torch.no_grad()
+def weigh_windows(truth: Transition, power: float) -> Float[Tensor, " batch"]:
+    """Weigh transitions by a power of the mean error of the interpolation: 1 at 5 cm."""
+    body, guess = interpolate(truth)
+    error = (body.joints_world() - guess.joints_world()).norm(dim=-1).mean(dim=(1, 2))
+    return ((_EASE_METRES + 0.01) / (error + 0.01)) ** power
+
+
+def interpolate(truth: Transition) -> tuple[BodyPose, BodyPose]:
+    """Return the true poses after the first up to the second, and those interpolated between the two."""
+    ground, heading = truth.integrate()
+    features = truth.features[:, truth.between]
+    first = truth.features[:, truth.lead]
+    share = (torch.arange(1, truth.frames + 1) / truth.frames)[None, :, None]
+    even = torch.lerp(first[:, None], features[:, -1:], share)
+    there = ground[:, -1:] * share, heading[:, -1:] * share[..., 0]
+    return tuple(BodyPose.of_features_at(*each) for each in ((features, ground, heading), (even, *there)))  # type: ignore[return-value]
+
+
+def _measure_length(vectors: Tensor) -> Tensor:
+    """Norm whose gradient is finite at zero."""
+    return (vectors.square().sum(dim=-1) + 1e-10).sqrt()
+
+
+VALIDATED_GAPS = (5, 15, 30, 45)
+"""Frames between the two poses."""
+TEMPERATURES = (0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0, 2.25, 2.5, 2.75, 3.0)
+"""Of draws, that are tried."""
+_WINDOWS, _DRAWS = 96, 8
+_DRAWN_GAP = 30
+_AS_NEAR = 1.01  # of the least error of the best draw
+
+
+@torch.no_grad()
+def measure_transitions(network: StitcherNetwork, windows: TransitionWindows) -> dict[str, float]:
+    """Measure the calm answer to two bare poses, and to a pose after 10 frames, as shares of the interpolation's mean
+    distance of joints; and in a gap of 30 frames, in cm, errors of one draw and of the best of 8, and how far draws are
+    apart. `apart` is the distance of the sides before they are joined, cm.
+    """
+    row: dict[str, float] = {}
+    for name, known in (("bare", Known()), ("past", Known(before=10))):
+        for gap in VALIDATED_GAPS:
+            if not _has_room(network, windows, gap):
+                continue
+            truth = windows.draw(_WINDOWS, gap + 1, known, make_generator(gap))
+            places, guess = _true_places(truth)
+            joined = answer(network, truth, make_calm(network, truth))
+            error = (place(joined) - places).norm(dim=-1).mean()
+            row[f"{name}_{gap}"] = float(error / (guess - places).norm(dim=-1).mean())
+            if known == Known():
+                row[f"apart_{gap}_cm"] = 100 * float(joined.apart.mean())
+            if known == Known() and gap == _DRAWN_GAP:
+                row |= _measure_draws(network, truth, places)
+    return row
+
+
+@torch.no_grad()
+def calibrate_temperature(network: StitcherNetwork, windows: TransitionWindows) -> float:
+    """Return the largest standard deviation of draws' noise with which the best of eight still comes as near to the
+    truth as with any, within a hundredth: as different as can be without wandering off. In gaps between bare poses,
+    which count by their calm answer's error."""
+    scores = torch.zeros(len(TEMPERATURES))
+    for gap in VALIDATED_GAPS[1:]:
+        if not _has_room(network, windows, gap):
+            continue
+        truth = windows.draw(_WINDOWS, gap + 1, Known(), make_generator(gap))
+        places = _true_places(truth)[0]
+        unit = (place(answer(network, truth, make_calm(network, truth))) - places).norm(dim=-1).mean()
+        for number, temperature in enumerate(TEMPERATURES):
+            errors = (_draw(network, truth, temperature) - places).norm(dim=-1).mean(dim=(2, 3))
+            scores[number] += errors.amin(dim=0).mean() / unit
+    return TEMPERATURES[int((scores <= _AS_NEAR * scores.min()).nonzero().max())]
+
+
+def answer(network: StitcherNetwork, truth: Transition, latents: Latents) -> Joined:
+    """Return what a stitcher makes of the ends of transitions."""
+    ends = truth.ends()
+    return join_sides(walk_sides(network, ends, truth.frames, latents))
+
+
+def make_calm(network: StitcherNetwork, truth: Transition) -> DrawnLatents:
+    """Make latents at the mean."""
+    return DrawnLatents.calm(network.config, len(truth.features), count_made(network, truth.frames))
+
+
+def place(joined: Joined) -> Float[Tensor, "batch frames joints 3"]:
+    """Place the joints, metres, seen from the first pose."""
+    return forward_kinematics(
+        CANONICAL.offsets.to(joined.quats), CANONICAL.parents, joined.root_position, joined.quats
+    )[0]
+
+
+def _true_places(truth: Transition) -> tuple[Tensor, Tensor]:
+    """Places of joints between the poses, true and interpolated."""
+    bodies = interpolate(truth)
+    true, guess = (body.joints_world()[:, :-1] for body in bodies)
+    return true, guess
+
+
+def _measure_draws(network: StitcherNetwork, truth: Transition, places: Tensor) -> dict[str, float]:
+    draws = _draw(network, truth, float(network.temperature))
+    errors = (draws - places).norm(dim=-1).mean(dim=(2, 3))
+    pairs = [(one - other).norm(dim=-1).mean() for number, one in enumerate(draws) for other in draws[:number]]
+    return {
+        "draw_cm": 100 * float(errors[0].mean()),
+        "best_cm": 100 * float(errors.amin(dim=0).mean()),
+        "spread_cm": 100 * float(torch.stack(pairs).mean()),
+    }
+
+
+def _has_room(network: StitcherNetwork, windows: TransitionWindows, gap: int) -> bool:
+    return gap + 13 <= max(windows.picker.lengths.tolist()) and gap + 1 <= network.config.longest
+
+
+def _draw(
+    network: StitcherNetwork, truth: Transition, temperature: float
+) -> Float[Tensor, "draws batch frames joints 3"]:
+    """Draw answers; those of one temperature have the noise of those of another, scaled."""
+    generator, batch, made = make_generator(0), len(truth.features), count_made(network, truth.frames)
+    latents = [DrawnLatents.sample(network.config, batch, made, generator) for _ in range(_DRAWS)]
+    return torch.stack([place(answer(network, truth, each.scale(temperature))) for each in latents])
+
 
 _SHORTEST, _FIRST_LONGEST = 2, 8  # frames from pose to pose
 _LEAST_WINDOW = 16  # frames of the longest transition

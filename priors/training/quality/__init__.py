@@ -1,1 +1,0 @@
-"""What models in training are measured by."""
