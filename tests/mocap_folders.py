@@ -50,12 +50,3 @@ def write_styles(folder: Path, styles: dict[str, dict[str, tuple[int, int, int]]
         lines.append(",".join(cells))
     (folder / "Frame_Cuts.csv").write_text("\r\n".join(lines) + "\r\n")
     return folder
-
-
-def write_takes(folder: Path, lengths: dict[str, int]) -> Path:
-    """Takes of the other set, by their names, of so many frames at 30 a second."""
-    folder.mkdir(parents=True, exist_ok=True)
-    made = make(LAFAN_RIG)
-    for number, (name, frames) in enumerate(lengths.items()):
-        made.motion(walk(frames, turn_rate=0.2 * number, seed=number)).save(folder / f"{name}.bvh")
-    return folder

@@ -15,7 +15,6 @@ from mapctl.protocols import Denoiser
 from mapctl.recording import Capture
 from mapctl.skeleton import CANONICAL
 from priors.denoiser import network as denoiser
-from priors.denoiser.network import DenoiserConfig
 
 JOINTS = CANONICAL.num_joints
 
@@ -156,13 +155,6 @@ def test_a_long_capture_in_pieces_is_one_pass(monkeypatch):
     assert pieces.pose.heading[0, -1] - pieces.pose.heading[0, 0] > 2 * 2 * math.pi
 
 
-def test_rotations_of_a_proposal_are_its_heading_tilt_and_joints():
-    cleaned = network()(capture(20))
-    motion = walk(20, turn_rate=0.8)
-    dots = (cleaned.pose.local_quat_xyzw[0].double() * motion.local_quat_xyzw).sum(-1).abs()
-    assert (dots > 1 - 1e-5).all()
-
-
 def test_a_saved_denoiser_loads_as_it_was(tmp_path):
     path = save_tiny_denoiser(tmp_path / "run" / "model.safetensors", drawn=0.3)
     wanted = network(drawn=0.3)
@@ -174,8 +166,3 @@ def test_a_saved_denoiser_loads_as_it_was(tmp_path):
         assert torch.allclose(
             loaded.clean(noisy).pose.angles, wanted(noisy).pose.angles, atol=1e-3
         )  # float16 in the file
-
-
-def test_the_card_gives_the_shape_back():
-    config = DenoiserConfig(width=5, kernel=3, dilations=(1, 7))
-    assert DenoiserConfig.of_card(config.as_card()) == config

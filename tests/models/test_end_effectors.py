@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from helpers import corpus, finite_difference, generator
+from helpers import corpus, generator
 from scipy.spatial.transform import Rotation
 
 from mapctl.features import LAYOUT, GroundPose
@@ -60,23 +60,6 @@ def test_a_frame_depends_on_itself_and_the_one_before_only():
     for block in ("root_displacement_heading", "heading_change"):
         moved[:, 0, LAYOUT.slices[block]] += 0.7
     torch.testing.assert_close(compute_end_effectors(moved, JOINTS), found, atol=1e-9, rtol=0)
-
-
-def test_the_gradient_is_the_slope():
-    features = clip(8)[None]
-    shape = compute_end_effectors(features, JOINTS).shape
-    weight = torch.randn(shape, generator=generator(1), dtype=torch.float64)
-
-    def value(at):
-        return (weight * compute_end_effectors(at, JOINTS)).sum()
-
-    at = features.clone().requires_grad_()
-    (slope,) = torch.autograd.grad(value(at), at)
-    for seed in range(4):
-        direction = torch.randn(features.shape, generator=generator(seed), dtype=torch.float64)
-        direction[..., LAYOUT.continuous :] = 0
-        expected = finite_difference(value, features, direction)
-        assert float((slope * direction).sum()) == pytest.approx(expected, rel=1e-6)
 
 
 def test_the_fast_paths_gradient_is_the_same():

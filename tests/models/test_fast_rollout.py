@@ -1,13 +1,9 @@
 """The fast path against its specification, the torch reference, and against finite differences of that."""
 
-import numpy as np
 import pytest
 import torch
-from numba import njit
 
-from mapctl.numerics import compilation, jit
 from mapctl.protocols import DiscreteChoices
-from priors.lstm_gmm.fast import kernels
 from priors.lstm_gmm.fast.rollout import FastRollout
 from priors.lstm_gmm.network import LstmGmm, LstmGmmConfig, LstmState
 
@@ -157,46 +153,3 @@ def test_not_a_number_is_not_hidden():
     assert torch.isfinite(features[0, :4]).all()
     assert torch.isnan(features[0, 4, 7])
     assert torch.isnan(density[0, 4])
-
-
-def test_a_plan_that_does_not_fit_is_refused():
-    model, state, noise = make(16, 1)
-    fast = FastRollout(model)
-    plan = fast.plan(state, noise)
-    with pytest.raises(ValueError, match="outside 0 to 4"):
-        fast.rollout(state, noise, DiscreteChoices(plan.component + 5, plan.contacts))
-    with pytest.raises(ValueError, match="particles and frames"):
-        fast.rollout(state, noise[:, :5], plan)
-    with pytest.raises(ValueError, match="65 values a frame"):
-        fast.plan(state, noise[..., :65])
-
-
-@pytest.mark.slow
-def test_exponential_is_accurate_over_its_range():
-    x = np.linspace(-87, 88, 20_001, dtype=np.float32)
-    wanted = np.exp(x.astype(np.float64))
-    exp, tanh = kernels.exp, kernels.tanh
-
-    @njit
-    def both(values, exponentials, tangents):
-        for i in range(len(values)):
-            exponentials[i], tangents[i] = exp(values[i]), tanh(values[i])
-
-    exponentials, tangents = np.empty_like(x), np.empty_like(x)
-    both(x, exponentials, tangents)
-    assert np.abs(exponentials / wanted - 1).max() < 4e-7
-    assert np.abs(tangents - np.tanh(x.astype(np.float64))).max() < 3e-7
-    both(np.zeros(1, np.float32), exponentials, tangents)
-    assert tangents[0] == 0.0  # padded units rest on it
-
-
-def test_kernels_compile_where_nothing_can_be_kept(monkeypatch):
-    def nowhere_to_write(function):
-        raise RuntimeError("cannot cache function: no locator available")
-
-    monkeypatch.setattr(jit, "KernelCache", nowhere_to_write)
-    entry, _ = jit.make_jit_decorators("contract")
-    heard = []
-    with compilation.tell(lambda number, total, begins: heard.append(begins)):
-        assert entry(lambda x: x + 1)(1) == 2
-    assert heard == [True, False]

@@ -10,7 +10,6 @@ from tiny_infiller import CONFIG, network, save_tiny_infiller, shown, tiny_infil
 import priors
 from mapctl.inbetweening.position_image import mirror_positions
 from mapctl.skeleton import CANONICAL
-from priors.infiller.network import InfillerConfig
 
 JOINTS = CANONICAL.num_joints
 ARCHITECTURES = ("skips", "image")
@@ -102,9 +101,3 @@ def test_a_saved_infiller_loads_as_it_was(tmp_path):
         loaded = priors.load_infiller(str(name))
         assert (loaded.name, loaded.network.config, loaded.card.kind) == (str(name), CONFIG, "infiller")
         assert torch.allclose(loaded.complete(holed()).places, wanted.places, atol=1e-3)  # float16 in the file
-
-
-@pytest.mark.parametrize("architecture", ARCHITECTURES)
-def test_the_card_gives_the_shape_back(architecture):
-    config = InfillerConfig(architecture, (4, 5, 6), 5)
-    assert InfillerConfig.of_card(config.as_card()) == config

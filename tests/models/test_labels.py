@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 from helpers import corpus, generator
@@ -87,17 +86,6 @@ def labelled_density() -> LstmGmmDensity:
     pattern = r"_(?P<gait>run)?(walk)?_(?P<style>old)?"
     card = Card("lstm-gmm", model.config.as_card(), licence="none", data={"labels": pattern}, **Card.layout_fields())
     return LstmGmmDensity("named", model, found, DataLimits(0.5, 1.5, 1.0), card, use_fast=False)
-
-
-def test_conditioned_copies_read_the_same_packed_weights():
-    density = replace(labelled_density(), use_fast=True)
-    run, old = (density.conditioned_on([name]) for name in ("run", "old"))
-    assert run._fast._weights is old._fast._weights is density._fast._weights
-    assert not np.array_equal(run._fast._biases.fc1, old._fast._biases.fc1)
-    blurred = run.with_observation_noise(torch.full((66,), 0.1))
-    assert blurred._fast._weights is density._fast._weights
-    other = replace(run, reference=told_network().float())  # another network has its own
-    assert other._fast._weights is not density._fast._weights
 
 
 def test_a_told_density_begins_where_the_labels_hold():

@@ -3,12 +3,11 @@
 import pytest
 import torch
 from catalogue import NETWORKS
-from helpers import corpus, generator, noise, tiny_density, tiny_model
+from helpers import corpus, generator, noise
 from torch.distributions import Bernoulli, Categorical, Independent, MixtureSameFamily, MultivariateNormal
 
 from mapctl.features import LAYOUT
 from mapctl.protocols import DiscreteChoices
-from priors.lstm_gmm.network import LstmState
 
 SIZE = LAYOUT.continuous
 each_network = pytest.mark.parametrize("kind", NETWORKS)
@@ -104,18 +103,6 @@ def test_noise_is_the_standardised_error_of_the_chosen_component(kind):
     assert torch.equal(frames[..., SIZE:] > 0.5, plan.contacts)
 
 
-def test_without_a_say_of_the_network_the_mean_is_the_clamped_share_of_the_last_frame():
-    network = tiny_model(dtype=torch.float64)
-    with torch.no_grad():
-        network.out.weight.zero_()
-        network.out.bias.zero_()
-    previous = network.mean + network.std * torch.linspace(-9, 9, LAYOUT.size).double()
-    plan = DiscreteChoices(torch.zeros(1, 1, dtype=torch.long), torch.zeros(1, 1, 2, dtype=torch.bool))
-    frames, _ = network.rollout(network.start_after(previous[None]), torch.zeros(1, 1, SIZE).double(), plan)
-    expected = 0.9 * torch.linspace(-9, 9, LAYOUT.size).double().clamp(-5, 5)
-    torch.testing.assert_close(network.normalise(frames)[0, 0, :SIZE], expected[:SIZE])
-
-
 @each_network
 def test_draws_follow_the_mixture(kind):
     network = NETWORKS[kind]
@@ -149,16 +136,3 @@ def test_long_free_runs_stay_finite():
     network = NETWORKS["several"]
     drawn, _ = network.sample(warm(network), 300, generator(), temperature=2.0)
     assert bool(torch.isfinite(drawn).all())
-
-
-def test_a_loaded_density_offers_what_its_network_does():
-    density = tiny_density()
-    state = density.initial_states.state.pick(torch.tensor([0, 2]))
-    draws = noise(2, 4)
-    plan = density.plan(state, draws)
-    frames, scores = density.rollout(state, draws, plan)
-    torch.testing.assert_close((frames, scores), density.reference.rollout(state, draws, plan))
-    after = density.advance(state, frames)
-    assert isinstance(after, LstmState)
-    torch.testing.assert_close(after.last_frame, frames[:, -1])
-    assert density.log_prob(frames, state).shape == (2, 4)

@@ -1,6 +1,5 @@
 """The path predictor: its layers, what it sees, and what it does not."""
 
-import math
 from dataclasses import replace
 
 import pytest
@@ -16,7 +15,7 @@ from mapctl.kinematics import heading
 from mapctl.protocols import PathPredictor
 from priors import checkpoints
 from priors.tweening import path
-from priors.tweening.path import PathConfig, PathNetwork
+from priors.tweening.path import PathConfig
 from priors.tweening.residual import ResidualConv
 
 
@@ -29,28 +28,6 @@ def local_motion(frames=90, **options):
 
 def outputs(trajectory: RootTrajectory):
     return torch.cat([trajectory.steps_heading, trajectory.height[..., None], trajectory.contacts], dim=-1)
-
-
-def test_weights_are_as_many_as_planned_and_as_the_paper_s_table():
-    """Three quarters of a million, and what steps beside places and feet to stand on add; in the paper 2.9 million."""
-    counts = [sum(each.numel() for each in PathNetwork(PathConfig(width=width)).parameters()) for width in (64, 128)]
-    assert counts[0] == pytest.approx(0.8e6, rel=0.05)
-    assert counts[1] == pytest.approx(3.0e6, rel=0.05)
-
-
-def test_a_frame_sees_123_to_138_frames_on_either_side():
-    """By its place within a stride; the frame before the first seen one is that from which its step is taken."""
-    network = tiny_path.network()
-    places = torch.randn(1, 400, 21, 3, generator=generator()) * 0.2
-    places.requires_grad_(True)
-    seen = LocalMotion(places, torch.zeros(1, 400), torch.ones(1, 400, dtype=torch.bool))
-    spans = []
-    for frame in range(192, 208):  # of one stride
-        (gradient,) = torch.autograd.grad(outputs(network(seen))[0, frame].sum(), places)
-        touched = gradient.abs().sum(dim=(0, 2, 3)).nonzero()[:, 0]
-        spans.append((frame - int(touched.min()), int(touched.max()) - frame))
-    assert min(min(span) for span in spans) >= 122
-    assert max(max(span) for span in spans) == 138
 
 
 def test_a_motion_s_length_does_not_change_what_is_far_from_its_end():
@@ -87,19 +64,6 @@ def test_a_mirrored_walk_goes_the_mirrored_way():
     assert float(
         (outputs(predictor.network(seen.mirrored()).mirrored()) - outputs(predictor.network(seen))).abs().max()
     )
-
-
-def test_who_stands_is_told_no_steps_but_what_the_network_corrects():
-    """Of a body that does not move every anchored step is nil."""
-    motion = walk(40)
-    still = LocalMotion.of_world(motion.joint_positions().float()[None, :1].expand(1, 40, 21, 3), torch.zeros(1, 40))
-    network = tiny_path.network()
-    network.last.weight.zero_()
-    network.last.bias.zero_()
-    found = network(still)
-    assert float(found.steps_heading.abs().max()) < 1e-7
-    toe = motion.joint_positions()[0, [15, 20], 1].min()
-    assert float(found.height[0, 0]) == pytest.approx(float(motion.root_position[0, 1] - toe) + 0.0425, abs=0.2)
 
 
 def test_absent_frames_are_as_if_there_were_nothing():
@@ -148,14 +112,6 @@ def test_a_residual_layer_keeps_the_variance_and_halves_or_doubles_the_length(tr
     share = 1 / ratio
     wanted = share + (1 - share) * (1.0 if transposed else 0.5)
     assert float(made.var()) == pytest.approx(wanted, rel=0.2)
-
-
-def test_a_residual_layer_adds_its_shortcut_once():
-    layer = ResidualConv((3, 3), kernel=3, padding=1, ratio=4.0)
-    torch.nn.init.zeros_(layer.conv.weight)
-    given = torch.randn(1, 3, 5, generator=generator())
-    torch.testing.assert_close(layer(given), math.sqrt(0.75) * given)
-    assert ResidualConv((3, 3), kernel=3, padding=1, ratio=1.0).across is None
 
 
 def test_it_is_saved_and_loaded_and_no_other_kind_is(tmp_path):

@@ -117,32 +117,6 @@ def test_a_gap_longer_than_it_knows_is_left_and_said():
     assert apart(answer.motion.slice(15, 20), query.motion.slice(15, 20)) > 0.005
 
 
-def test_windows_of_a_long_motion_fade_into_each_other():
-    """A limb that is lost throughout is proposed in windows; no step is larger than within one window."""
-    frames = 2 * module._MAX_WINDOW
-    query = query_of([Mask("leftLowerArm", 0, frames), Mask("leftHand", 0, frames)], frames=frames)
-    made = DRAWN.propose(query).motion
-    hand = made.joint_positions()[:, CANONICAL.index("leftHand")] - made.root_position
-    steps = torch.diff(hand, dim=0).norm(dim=-1)
-    assert float(steps.max()) < 3 * float(steps[:100].max())
-    windows = list(module._lay_windows(query.missing.frames, module._MAX_WINDOW))
-    assert windows[0] == (0, module._MAX_WINDOW)
-    assert windows[-1][1] == frames
-
-
-def test_a_gap_is_seen_whole_from_both_of_its_edges(monkeypatch):
-    start, stop = 40, 40 + module.MAX_GAP_FRAMES
-    query, seen = query_of([Mask(ALL, start, stop)], frames=stop + 40), []
-    forward = DRAWN.network.forward
-    monkeypatch.setattr(
-        DRAWN.network, "forward", lambda shown: (seen.append(shown.heading.shape[1]), forward(shown))[1]
-    )
-    answer = DRAWN.propose(query)
-    assert [source.by for source in answer.attribute(query)] == ["transformer"]
-    assert seen == [module.MAX_GAP_FRAMES + 2 * module._CONTEXT]
-    assert apart(answer.motion.slice(start, stop), query.motion.slice(start, stop)) > 0.01
-
-
 def test_a_target_of_a_hand_changes_the_frames_beside_it_too():
     query = query_of(GAP)
     hand = CANONICAL.index("leftHand")

@@ -101,20 +101,3 @@ class SlerpPartly(SlerpInbetweener):
     @property
     def takes_partial_keys(self):
         return True
-
-
-@pytest.mark.slow
-def test_auto_asks_its_network_once_though_the_stitcher_leaves_much():
-    """It has proposed already what is too long, or open, for the stitcher."""
-
-    class Counting(SlerpPartly):
-        asked = 0
-
-        def propose(self, query, *, generator=None):
-            Counting.asked += 1
-            return super().propose(query, generator=generator)
-
-    keys, motion = (20, Key(30, limbs=("leftHand",)), 40, 100, Key(150, limbs=("leftHand",)), 190), walk(200)
-    done = tween(motion, Keys(keys), AutoInbetweener(Counting(), stitcher=tiny_stitcher), settings=RAW)
-    assert {source.by for source in done.sources} == {"stitcher", "slerp"}
-    assert Counting.asked == 1

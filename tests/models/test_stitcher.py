@@ -9,13 +9,13 @@ from tiny_stitcher import CONFIG, network, tiny_stitcher
 
 from controllers.common.canonical_clip import CanonicalClip
 from mapctl import rotations
-from mapctl.features import GroundPose, encode, mirror_features, reversed_features
+from mapctl.features import mirror_features
 from mapctl.inbetweening.missing import MissingMask
 from mapctl.recording.masks import ALL, Mask
 from mapctl.retarget import to_canonical
 from priors.stitching.inbetweener import Draws, see_ends
-from priors.stitching.network import POSE, DrawnLatents, StitcherNetwork
-from priors.stitching.sides import _Walker, count_made, join_sides, reverse_sense, walk_sides
+from priors.stitching.network import DrawnLatents
+from priors.stitching.sides import count_made, join_sides, walk_sides
 
 PRINTED = replace(CONFIG, shared=0, own=4, printed=True)
 each_length = pytest.mark.parametrize("frames", [2, 3, 4, 5, 8, 15, 24])
@@ -46,60 +46,14 @@ def test_untaught_it_interpolates_places_evenly(frames):
 
 
 @each_length
-def test_every_length_is_made(frames):
-    config = CONFIG
+@pytest.mark.parametrize("config", [CONFIG, PRINTED], ids=["at once", "in turn"])
+def test_every_length_is_made(frames, config):
     made = count_made(network(config), frames)
     ends = bare(walk(60), 11, 10 + frames)
     drawn = DrawnLatents.sample(config, 1, made, torch.Generator().manual_seed(1))
     joined = join_sides(walk_sides(network(config), ends, frames, drawn))
     assert joined.quats.shape == (1, frames - 1, 21, 4)
     assert all(bool(getattr(joined, name).isfinite().all()) for name in ("root_position", "quats", "contacts", "apart"))
-
-
-@each_length
-def test_every_length_is_made_as_printed(frames):
-    ends = bare(walk(60), 11, 10 + frames)
-    drawn = DrawnLatents.sample(PRINTED, 1, count_made(network(PRINTED), frames), torch.Generator().manual_seed(1))
-    joined = join_sides(walk_sides(network(PRINTED), ends, frames, drawn))
-    assert joined.quats.shape == (1, frames - 1, 21, 4)
-    assert all(bool(getattr(joined, name).isfinite().all()) for name in ("root_position", "quats", "contacts"))
-
-
-@pytest.mark.parametrize("config", [CONFIG, PRINTED], ids=["at once", "in turn"])
-def test_sides_go_to_each_others_frames_before_or_after_these_are_made(config, monkeypatch):
-    seen, step, frames = [], _Walker.step, 12
-
-    def spy(walker, standing, number, left):
-        after, row = step(walker, standing, number, left)
-        seen.append((standing, number, left, after))
-        return after, row
-
-    monkeypatch.setattr(_Walker, "step", spy)
-    made = count_made(network(config), frames)
-    latents = DrawnLatents.sample(config, 1, made, torch.Generator().manual_seed(1))
-    sides = walk_sides(network(config), bare(walk(60), 11, 10 + frames), frames, latents)
-    calls = 2 if config.printed else 1
-    assert [each[1:3] for each in seen] == [
-        (n // calls, frames - 2 * (n // calls) - n % calls) for n in range(calls * made)
-    ]
-    for number in range(calls == 2 and made):
-        there, back = seen[2 * number][3], seen[2 * number + 1]
-        # The backward side sees the forward side's new frame, and itself where it was.
-        assert torch.equal(back[0].now[0], there.now[0])
-        assert torch.equal(back[0].now[1], seen[2 * number][0].now[1])
-        assert torch.equal(back[0].memory.decoder[0][1], seen[2 * number][0].memory.decoder[0][1])
-        assert torch.equal(sides.features[0, :, number], there.now[0])
-        assert torch.equal(sides.features[1, :, number], back[3].now[1])
-
-
-def test_the_share_of_the_distribution_on_arrival_is_as_printed_or_by_the_way_to_the_target():
-    ends, latents = bare(walk(60), 11, 26), DrawnLatents.calm(CONFIG, 1, 1)
-    at = GroundPose(ends.place, ends.turn)
-    ours, printed = (
-        _Walker(network(config), ends, 16, latents, torch.zeros(1, config.shared), at) for config in (CONFIG, PRINTED)
-    )
-    assert [ours._arrive(step, 16 - 2 * step) for step in (0, 4, 7)] == [0.0, 4 / 12, 7 / 9]
-    assert [printed._arrive(step, 0) for step in (0, 4, 7, 8, 9)] == [0.0, 4 / 8, 7 / 8, 8 / 10, 9 / 10]
 
 
 def test_only_the_poses_of_bare_ends_are_seen():
@@ -126,28 +80,6 @@ def test_the_pace_of_the_ends_counts_where_it_is_known():
     assert bool((unknown.paced == 0).all())
     one, two = (tiny_stitcher().answer(each, 20).root_position for each in (known, unknown))
     assert float((one - two).abs().max()) > 1e-5
-
-
-def test_the_backward_side_reads_the_motion_run_backwards():
-    features = encode(walk(30, turn_rate=0.8))[0]
-    back = reversed_features(features)
-    # What led to a frame leads on from there for who comes the other way.
-    pace = slice(0, 3)
-    torch.testing.assert_close(reverse_sense(features)[1:, pace], back.flip(0)[:-1, pace], atol=1e-9, rtol=0)
-
-
-def test_each_side_reads_how_the_other_end_moves_on_in_its_own_sense_of_time(monkeypatch):
-    seen, embed = [], StitcherNetwork.embed
-    monkeypatch.setattr(StitcherNetwork, "embed", lambda self, now: (seen.append(now), embed(self, now))[1])
-    motion = walk(60, turn_rate=0.6)
-    missing = torch.zeros(60, dtype=torch.bool)
-    missing[11:30] = True
-    tiny_stitcher().answer(see_ends(motion, missing, 11, 30), 20)
-    ends, poses = seen[0], encode(motion)[0][:, POSE].float()
-    for side, (own, other) in enumerate((((10, 9), (30, 31)), ((30, 31), (10, 9)))):
-        came, goes = poses[own[0]] - poses[own[1]], poses[other[1]] - poses[other[0]]
-        torch.testing.assert_close(ends.change[side, 0], came, atol=1e-5, rtol=0)
-        torch.testing.assert_close(ends.target_change[side, 0], goes, atol=1e-5, rtol=0)
 
 
 def test_the_answer_moves_and_turns_with_its_ends():

@@ -8,7 +8,6 @@ from helpers import corpus
 from tiny_transformer import CONFIG, network
 
 from mapctl.inbetweening.partial_motion import KnownParts
-from priors.pose_transformer.network import _Layer, _rotary_phases
 from priors.training.augmentation.pose_windows import PoseWindows, add_targets
 from priors.training.recipes.pose_transformer import hide
 
@@ -61,19 +60,3 @@ def test_the_second_stage_adds_to_what_the_first_proposes(hide_parts):
     corrected = made(hide(made, hidden))
     torch.testing.assert_close(corrected.rough.local_matrix, proposed.rough.local_matrix)
     assert float((corrected.local_matrix - proposed.local_matrix)[:, 10:20].abs().max()) > 0.01
-
-
-def test_a_stage_that_looks_at_some_frames_learns_nothing_from_the_others():
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        layer = _Layer(replace(CONFIG, kernel=0)).requires_grad_(False)
-    tokens, phases = (
-        torch.randn(2, 12, 16, generator=torch.Generator().manual_seed(0)),
-        _rotary_phases(12, 8, torch.device("cpu")),
-    )
-    seen = torch.ones(2, 12, dtype=torch.bool)
-    seen[:, 4:8] = False
-    others = torch.where(seen[..., None], tokens, -tokens)
-    one, other = (layer(each, phases, seen)[seen] for each in (tokens, others))
-    torch.testing.assert_close(one, other)
-    assert float((layer(tokens, phases)[seen] - layer(others, phases)[seen]).abs().max()) > 1e-3

@@ -53,12 +53,6 @@ def test_names_mean_the_models_of_the_set_in_force(folder, monkeypatch):
     assert checkpoints.locate("locomotion") == full
 
 
-def test_the_set_is_restored_after_an_error(folder):
-    with pytest.raises(ZeroDivisionError), priors.use_weights("free"):
-        raise ZeroDivisionError
-    assert weight_sets.VARIABLE not in os.environ
-
-
 def test_a_set_that_does_not_exist_is_refused(folder, monkeypatch):
     with pytest.raises(RequestError, match="must be free or full, got 'libre'"), priors.use_weights("libre"):
         pass
@@ -130,15 +124,6 @@ def test_a_prior_gets_the_refiner_of_its_own_set(folder):
         refiner = priors.refiner_of("locomotion")
         assert refiner is not None
         assert refiner.card.licence == FREE
-
-
-def test_names_for_other_processes_say_their_set(folder):
-    assert priors.add_set("locomotion") == "full/locomotion"
-    with priors.use_weights("free"):
-        assert priors.add_set("locomotion") == "free/locomotion"
-        assert priors.add_set("free/locomotion") == "free/locomotion"
-        assert priors.add_set("full/locomotion") == "full/locomotion"
-        assert priors.add_set("runs/mine") == "runs/mine"
 
 
 def test_a_card_that_is_not_free_is_refused_in_the_free_set(folder):

@@ -10,9 +10,7 @@ from helpers import corpus, generator
 from mapctl import rotations
 from mapctl.features import LAYOUT
 from mapctl.kinematics import chain_matrices
-from mapctl.recording.noise_estimation import estimate_position_noise
 from mapctl.skeleton import CANONICAL
-from priors.training.augmentation import corruption
 from priors.training.augmentation.corruption import LIMBS, CorruptionSettings, corrupt, make_clean_capture
 
 JOINTS = CANONICAL.num_joints
@@ -109,21 +107,6 @@ def test_bones_point_from_one_noisy_place_to_the_next(clean):
         assert float(off) == pytest.approx(2 * 0.01 / length, rel=0.06)  # root of 2 for either of two directions
     thigh, shin = now["leftUpperLeg"] - was["leftUpperLeg"], now["leftLowerLeg"] - was["leftLowerLeg"]
     assert float((thigh * shin).sum(-1).mean()) < 0, "the knee is at the end of one and the beginning of the other"
-
-
-def test_noise_that_lasts_is_told_as_an_estimate_from_frame_to_frame_would_tell_it():
-    stays = torch.tensor([0.0, 0.5, 0.9])
-    share = corruption._estimated_share(stays)
-    assert float(share[0]) == pytest.approx(1)
-    noise = corruption._correlate_in_time(torch.randn(3, 20_000, 1, 3, generator=generator(0)), stays)[:, 200:]
-    seen = torch.ones(noise.shape[1], dtype=torch.bool)
-    found = [estimate_position_noise(one[:, 0].double(), seen) for one in noise]
-    assert found == pytest.approx(share.tolist(), rel=0.05)
-    one = make_clean_capture(corpus().features[None, :FRAMES])
-    settings = replace(PLAIN, correlated=1.0, angle_deg=(5.0, 5.0))
-    told, untold = (corrupt(one, replace(settings, untold=share), generator(1)) for share in (0.0, 1.0))
-    assert torch.equal(told.joints, untold.joints)
-    assert (untold.sigma < 0.95 * told.sigma).all()
 
 
 def test_lasting_noise_has_the_same_spread_and_lasts(clean):

@@ -1,7 +1,6 @@
 """Which frames of a file are motion: tables, found and given; rows that make no sense; sets of users, trained on."""
 
 import re
-import shutil
 from pathlib import Path
 
 import mocap_folders
@@ -59,18 +58,6 @@ def test_a_table_in_the_folder_is_found_and_leaves_the_motion(styles, tmp_path):
     assert found.skipped == ()
 
 
-@pytest.mark.slow
-def test_a_table_below_the_folder_holds_for_what_is_beside_it(styles, tmp_path):
-    whole = read(styles, tmp_path)
-    shutil.copytree(styles, tmp_path / "all" / "100STYLE")
-    shutil.copy(styles / "Aeroplane" / "Aeroplane_FW.bvh", tmp_path / "all")
-    found = read(tmp_path / "all", tmp_path)
-    lengths = dict(zip(found.names, found.lengths, strict=True))
-    assert lengths.pop("Aeroplane_FW.bvh") == 113
-    assert tuple(lengths.values()) == whole.lengths
-    assert found.cuts == ("100STYLE/Frame_Cuts.csv: 5 of 6 clips",)
-
-
 def test_a_given_table_counts_before_one_that_is_found(styles, tmp_path):
     found = read(styles, tmp_path, cuts=table(tmp_path, "Zombie_FW.bvh,33,92", "Aeroplane/Aeroplane_ID,0,"))
     lengths = dict(zip(found.names, found.lengths, strict=True))
@@ -92,15 +79,6 @@ def test_a_given_table_counts_before_one_that_is_found(styles, tmp_path):
 )
 def test_rows_name_files_their_ends_and_patterns(files, tmp_path, rows, lengths):
     assert read(files, tmp_path, cuts=table(tmp_path, *rows)).lengths == lengths
-
-
-@pytest.mark.slow
-def test_frames_are_those_of_the_file_and_the_last_is_taken(files, tmp_path):
-    whole = read(files, tmp_path).clips()[1]
-    part = read(files, tmp_path, cuts=table(tmp_path, "walk-1.bvh,20,59")).clips()[1]
-    torch.testing.assert_close(part[1:, :-2], whole[21:60, :-2], atol=1e-5, rtol=0)
-    later = read(files, tmp_path, cuts=table(tmp_path, "walk-1.bvh,20,60")).clips()[1]
-    assert len(later) == len(part) + 1
 
 
 def test_skip_first_drops_frame_0_where_a_cut_keeps_it(files, tmp_path):
@@ -166,12 +144,6 @@ def test_a_table_of_styles_says_which_clips_there_are(tmp_path):
     assert found.find("New_FW.BVH") == Cut(0, 60, "Frame_Cuts.csv, line 3,")
     assert found.find("New_ID.bvh") == Cut(7, None, "Frame_Cuts.csv, line 3,")
     assert found.find("New_FWD.bvh") is None
-
-
-def test_a_missing_table_is_said(files, tmp_path, capsys):
-    words = ("train", "path", "--data", files, "-o", tmp_path / "run", "--cuts", tmp_path / "none.csv")
-    assert run(*words) == 2
-    assert capsys.readouterr().err == f"mapctl: {tmp_path / 'none.csv'}: no such file\n"
 
 
 SMALL = ("--width", 8, "--components", 2, "--window", 20, "--steps", 2, "--batch", 3, "--device", "cpu")

@@ -1,7 +1,6 @@
 """A critic of the density's free runs: what it sees, what the density learns of it, and runs that resume to the bit."""
 
 from dataclasses import replace
-from itertools import pairwise
 
 import pytest
 import torch
@@ -102,20 +101,6 @@ def test_its_gradient_is_what_would_make_free_runs_pass():
     assert believe(run_again()) > before
 
 
-def test_it_learns_before_the_density_hears_it_and_then_in_each_step_from_what_was_heard(monkeypatch):
-    trainer, learnt = make_trainer(), []
-    update = trainer.judge._update
-    monkeypatch.setattr(trainer.judge, "_update", lambda *of: (learnt.append(trainer.step), update(*of))[1])
-    kept = []
-    for _ in range(5):
-        trainer.train_step()
-        kept.append(None if trainer.judge.history is None else trainer.judge.history.windows.clone())
-    assert [learnt.count(step) for step in range(2, 6)] == [2, 2, 2, 2]  # two of the head start; others after the step
-    assert kept[:2] == [None, None]
-    new = [(one != other).flatten(1).any(1).sum() for one, other in pairwise(kept[2:])]
-    assert [int(count) for count in new] == [4, 4]
-
-
 def test_what_is_kept_is_the_mean_of_the_weights_since_it_joined():
     trainer = make_trainer()
     for _ in range(2):
@@ -128,17 +113,6 @@ def test_what_is_kept_is_the_mean_of_the_weights_since_it_joined():
         keep = done / (done + 20)
         for mean, old, new in zip(trainer.average.parameters(), before, trainer.network.parameters(), strict=True):
             torch.testing.assert_close(mean, keep * old + (1 - keep) * new)
-
-
-def test_the_learning_rate_rises_anew_and_falls_to_nothing():
-    settings = replace(SETTINGS, steps=1100, critic=replace(CRITIC, steps=100))
-    trainer, rates = make_trainer(settings), []
-    for trainer.step in (0, 500, 999, 1000, 1019, 1060, 1099):
-        rates.append(trainer.compute_learning_rate())
-    assert rates[1] > rates[2] < 1e-7
-    assert rates[4] == rates[5] == pytest.approx(3e-4)
-    assert rates[3] < 0.1 * rates[4]
-    assert rates[6] < 0.05 * rates[4]
 
 
 @pytest.mark.parametrize(

@@ -78,9 +78,3 @@ def test_fewer_starts_than_combinations_go_to_those_with_most_frames():
     found = select_initial_states(tiny_network(), data, count=2, generator=generator(), labels=labels)
     assert labels[[data.names.index(name) for name in found.names]].sum(0).tolist() == [1, 1, 0]
     assert sorted(found.weight.tolist()) == pytest.approx([6 / 15, 9 / 15])  # by speeds
-
-
-def test_a_single_start_is_the_one_of_middling_speed():
-    data = corpus(5)
-    found = select_initial_states(tiny_network(), data, count=1, generator=generator())
-    assert found.names == (data.names[2],)

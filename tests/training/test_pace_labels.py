@@ -5,12 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from helpers import generator, go_at, run, tiny_density, write_corpus
+from helpers import generator, go_at, run, write_corpus
 
 import priors
-from mapctl.errors import RequestError
 from priors.lstm_gmm.labels import PACE_LABELS, Labels, read_pace_rates
-from priors.lstm_gmm.network import LstmGmm, LstmGmmConfig
+from priors.lstm_gmm.network import LstmGmmConfig
 from priors.training.corpus import Corpus, follow_paces, measure_pace_changes, measure_speeds
 from priors.training.recipes.lstm_gmm import DensityTrainer, TrainingSettings
 
@@ -107,18 +106,3 @@ def test_a_density_that_is_trained_so_knows_paces(tmp_path, capfd, monkeypatch):
     capfd.readouterr()
     assert run("train", "lstm-gmm", "-o", tmp_path / "no", *more, "--label-pace", "--init", tmp_path / "plain") == 2
     assert "was not trained with labels of paces; leave --label-pace out" in capfd.readouterr().err
-
-
-def test_starts_are_picked_by_their_speed():
-    density = tiny_density()
-    names = (*density.reference.config.labels, *PACE_LABELS)
-    config = replace(density.reference.config, labels=names)
-    network = LstmGmm(config, mean=density.feature_mean, std=density.feature_std)
-    found = replace(density.initial_states, speed=torch.tensor([0.1, 1.0, 1.2, 3.0]))
-    known = replace(density, reference=network, initial_states=found)
-    for pace, speeds in (("stand", [0.1]), ("walk", [1.0, 1.2]), ("run", [3.0])):
-        picked = known.conditioned_on([pace]).initial_states
-        torch.testing.assert_close(picked.speed, torch.tensor(speeds))
-        assert float(picked.weight.sum()) == pytest.approx(1.0)
-    with pytest.raises(RequestError, match="knows no pace 'crawl'"):
-        known.conditioned_on(["pace=crawl"])

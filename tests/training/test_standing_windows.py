@@ -38,14 +38,6 @@ def test_the_share_of_standing_windows_is_drawn_and_all_that_go(stands, share):
     assert bool((left.diff() > 0).all())
 
 
-def test_they_are_left_evenly_and_the_walk_keeps_its_beginning(stands):
-    left = FeatureWindows(stands, FRAMES, standing_share=0.2).starts
-    of_the_stand = left[left < stands.lengths[0] - FRAMES]
-    assert int(of_the_stand.diff().max()) == 5
-    starting = stands.lengths[0] + 4 * 30  # the first frame that goes
-    assert set(range(starting - FRAMES // 2, starting + FRAMES)) <= set(left.tolist())
-
-
 def test_without_a_share_nothing_is_another(stands):
     plain, told = FeatureWindows(stands, FRAMES), FeatureWindows(stands, FRAMES, standing_share=1.0)
     assert torch.equal(plain.starts, told.starts)

@@ -57,11 +57,6 @@ def test_the_nearest_of_several_draws_is_kept():
     assert float((every.amax(dim=0) - every.amin(dim=0)).min()) > 1e-4
 
 
-def test_of_no_transitions_none_is_kept():
-    nothing = sample_nearest(tiny_stitcher.network(), transitions().rows(torch.arange(0)), seeded())
-    assert nothing.shared.shape[0] == nothing.slow.shape[1] == 0
-
-
 @pytest.mark.slow
 def test_the_temperature_is_the_largest_at_which_the_best_draw_is_as_near_as_any():
     """By numpy, of answers that are drawn and placed anew, in the one gap that these clips have room for."""

@@ -90,18 +90,6 @@ def test_the_loss_falls_on_windows_that_it_sees_again_and_again():
     assert all(math.isfinite(value) for row in rows for value in row.values())
 
 
-@pytest.mark.parametrize("detail", [0, 2])
-def test_muon_steps_the_matrices_of_layers_and_adam_all_else(detail):
-    trainer = PoseTransformerTrainer(replace(CONFIG, detail=detail), SETTINGS, corpus(1, 60))
-    owned = {
-        name: {id(weight) for group in optimiser.param_groups for weight in group["params"]}
-        for name, optimiser in trainer.optimisers().items()
-    }
-    for name, weight in trainer.network.named_parameters():
-        kind = "muon" if "layers." in name and weight.ndim == 2 else "optimiser"
-        assert [key for key, ids in owned.items() if id(weight) in ids] == [kind], name
-
-
 @pytest.mark.slow
 def test_the_spread_learns_alone_and_is_calibrated():
     trainer = PoseTransformerTrainer(CONFIG, SETTINGS, corpus(2, 60))

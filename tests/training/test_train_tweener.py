@@ -89,33 +89,6 @@ def test_between_keys_of_different_clips_only_keys_and_style_count(windows):
     assert float(one["loss"]) == pytest.approx(float(two["loss"]), rel=1e-4)
 
 
-def test_a_style_s_poses_must_be_made_somewhere_and_kept(windows):
-    layout = KeySettings(longest=200.0)
-    sequences = draw_splices(windows, 2, 600, layout, progress=1.0, generator=generator())
-    foreign = losses_of(sequences, windows, foreign=1.0)
-    assert 0.01 < float(losses_of(sequences, windows)["style_cm"]) < 0.8 * float(foreign["style_cm"]) < 15
-    assert 0.01 < float(foreign["dwell_cm"]) < float(foreign["style_cm"])
-
-
-def test_who_moves_less_than_a_performer_is_not_active_whatever_the_phase(windows):
-    sequences = one_window(windows)
-    later = replace(sequences.motion, quats=sequences.motion.quats.roll(2, dims=1))
-    frozen = replace(sequences.motion, quats=sequences.motion.quats[:, 50:51].expand_as(sequences.motion.quats))
-    shifted, still = (
-        compute_tweener_losses(
-            Told(each),
-            tiny_path.network(),
-            sequences,
-            draw_style_poses(windows, sequences, 0.0, generator()),
-            torch.zeros(3, dtype=torch.bool),
-            LossWeights(),
-        )
-        for each in (later, frozen)
-    )
-    assert float(shifted["activity_cm"]) < 0.3 * float(still["activity_cm"])
-    assert float(shifted["pace_cm"]) > 0.3 * float(still["pace_cm"])
-
-
 def test_keys_that_tell_less_ask_for_less(windows):
     sequences = one_window(windows)
     none = torch.zeros(21, 3, dtype=torch.bool)

@@ -66,26 +66,3 @@ def test_what_is_told_stays_and_a_way_turned_elsewhere_is_the_same_one():
         wanted = rotations.rotate_ground(bent, torch.tensor(turn).double().expand(1, FRAMES))
         assert torch.allclose(other, wanted, atol=1e-9)
         assert torch.allclose(facing_other, turned + turn, atol=1e-9)
-
-
-def test_of_several_sequences_and_keys_each_gap_bends_by_itself():
-    way, facing, told = lead((3.0, 5.0), -10.0, 60.0)
-    bent, turned = bend_way(way, facing, told)
-    both = torch.cat([way, torch.zeros_like(way)]), torch.cat([facing, facing]), torch.cat([told, told])
-    assert torch.equal(bend_way(*both)[0][:1], bent)
-    assert torch.equal(bend_way(*both)[0][1:], torch.zeros_like(way))
-    twice = [torch.cat([each, each[:, 1:]], dim=1) for each in (facing, told)]
-    there_and_on = torch.cat([way, way[:, -1:] + way[:, 1:]], dim=1)
-    first = bend_way(there_and_on, *twice)
-    assert torch.equal(first[0][:, :FRAMES], bent)
-    assert torch.equal(first[1][:, :FRAMES], turned)
-    nothing = bend_way(way, facing, torch.zeros_like(told))
-    assert torch.equal(nothing[0], way)
-
-
-def test_a_little_more_time_or_turn_bends_a_little_more():
-    most = 0.0
-    for degrees in torch.linspace(60, 100, 41).tolist():
-        one, other = (bend_way(*lead((0.0, 5.0), -each, each))[0] for each in (degrees, degrees + 0.1))
-        most = max(most, float((one - other).norm(dim=-1).max()))
-    assert 0 < most < 0.05

@@ -2,7 +2,6 @@
 
 from fractions import Fraction
 
-import pytest
 import torch
 from helpers import corpus, generator, walks
 from scipy.spatial.transform import Rotation
@@ -71,17 +70,6 @@ def test_a_mirrored_window_is_the_window_in_a_mirror():
     assert (without_heading(local, mirrored.heading[1]) - wanted).norm(dim=-1).max() < 1e-4
 
 
-@pytest.mark.parametrize("first", [-10, 0, 25])
-def test_frames_that_the_clip_lacks_are_flagged(first):
-    windows = PositionWindows(corpus(2, 40), frames=60, evenness=0.0)
-    found = windows.at(torch.tensor([1]), torch.tensor([first]), mirrored=torch.tensor([False]))
-    frame = torch.arange(60) + first
-    assert torch.equal(found.present[0], (frame >= 0) & (frame < 40))
-    assert found.places.isfinite().all()
-    image = found.image(torch.ones(1, 60, CANONICAL.num_joints, dtype=torch.bool))
-    assert not image.known[0, ~found.present[0]].any()
-
-
 def test_draws_are_whole_windows_of_long_clips_and_whole_clips_in_windows():
     windows = PositionWindows(Corpus(("a", "b"), (90, 40), corpus(1, 130).features), frames=60, evenness=1.0)
     found = windows.draw(100, generator())
@@ -90,14 +78,6 @@ def test_draws_are_whole_windows_of_long_clips_and_whole_clips_in_windows():
     begins = found.present[counts == 40].to(torch.uint8).argmax(dim=1)
     assert begins.min() < 4
     assert begins.max() > 16
-
-
-def test_moments_are_those_of_the_clips_and_their_mirror_images():
-    windows = PositionWindows(corpus(3, 60), frames=24, evenness=0.0)
-    both = torch.cat([windows.local, windows.local[:, SWAP] * torch.tensor([-1.0, 1.0, 1.0])])
-    mean, std = windows.moments()
-    assert torch.allclose(mean, both.mean(dim=0), atol=1e-5)
-    assert torch.allclose(std, both.std(dim=0, unbiased=False), atol=1e-4)
 
 
 def test_the_guess_in_a_gap_is_the_one_that_filling_starts_from():
