@@ -1,10 +1,12 @@
 """Films of motions: MP4, GIF, WebP, and a PNG contact sheet. Files appear whole or not at all."""
 
 import logging
+import math
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
-from dataclasses import replace
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
 from fractions import Fraction
+from importlib import import_module
 from os import PathLike, fspath
 from pathlib import Path
 from typing import Any
@@ -15,16 +17,246 @@ import torch
 from mapctl import retarget
 from mapctl.errors import RequestError
 from mapctl.formats import atomic
+from mapctl.mesh import colours
 from mapctl.mesh.primitives import Array, Surface
 from mapctl.motion import Motion
 from mapctl.retarget.rigs import Rig
 from scenes.cameras import CameraSettings
-from scenes.contact_sheet import draw_contact_sheet, draw_strips
 from scenes.content import Painter
 from scenes.renderers import STICK_FIGURES
 from scenes.renderers.select import RendererName, select_painter
 from scenes.stage import Shot, Stage
-from scenes.writers import gif_writer, mp4_writer, save_png, webp_writer
+
+Write = Callable[[Array], None]
+_QUALITY = {"crf": "19", "preset": "veryfast"}
+_BT709 = 1
+"""Code of the HD colour standard in the stream's tags; players that find none guess by the picture's size."""
+_GIF_COLOURS = 255
+_LOOP_FPS = 50
+"""Browsers slow down loops of pictures that are faster."""
+
+
+@dataclass(frozen=True)
+class _Loop:
+    """A format of pictures that repeat for ever. All are held in memory until they are written."""
+
+    name: str
+    """Name of the format."""
+    tick: int
+    """Milliseconds in which it counts."""
+    most_pixels: int
+    """Pixels that all pictures may have together."""
+    quality: int = 0
+    """Quality, 0 to 100, where the format loses some."""
+
+
+_GIF, _WEBP = _Loop("GIF", 10, 600_000_000), _Loop("WebP", 1, 200_000_000, quality=75)
+
+
+@contextmanager
+def mp4_writer(path: Path, size: tuple[int, int], fps: Fraction) -> Iterator[Write]:
+    """Yield a function that adds a picture (height, width, 3) uint8 to an H.264 film every player can show.
+
+    4:2:0 colour needs even sides, so odd ones get one more row or column like their last.
+    """
+    av = _import_package("av")
+    # The encoder logs what it does on standard error by default.
+    av.logging.set_level(av.logging.ERROR)
+    width, height = (side + side % 2 for side in size)
+    with av.open(str(path), "w", format="mp4", options={"movflags": "faststart"}) as container:
+        stream = container.add_stream("libx264", rate=fps, options=_QUALITY)
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        context = stream.codec_context
+        context.thread_count = 1
+        context.colorspace = context.color_primaries = context.color_trc = _BT709
+
+        def write(picture: Array) -> None:
+            edges = ((0, height - picture.shape[0]), (0, width - picture.shape[1]), (0, 0))
+            frame = av.VideoFrame.from_ndarray(np.pad(picture, edges, mode="edge"), format="rgb24")
+            container.mux(stream.encode(frame.reformat(format="yuv420p", dst_colorspace="ITU709")))
+
+        yield write
+        container.mux(stream.encode())
+
+
+@contextmanager
+def gif_writer(path: Path, size: tuple[int, int], fps: Fraction) -> Iterator[Write]:
+    """Yield a function that adds a picture to a looping GIF. All share one palette.
+
+    GIF counts in hundredths of a second; the delays alternate so that the whole keeps its time. Over 50
+    pictures a second only every second, third, ... is kept. RequestError when it outgrows 600 megapixels.
+    """
+    image = _import_package("PIL.Image")
+    with _loop_writer(_GIF, lambda picture, first: _quantize(image, picture, first), path, size, fps) as write:
+        yield write
+
+
+@contextmanager
+def webp_writer(path: Path, size: tuple[int, int], fps: Fraction) -> Iterator[Write]:
+    """Yield a function that adds a picture to a looping WebP, in all colours.
+
+    WebP counts in milliseconds; the delays alternate so that the whole keeps its time. Over 50 pictures a second only
+    every second, third, ... is kept. RequestError when it outgrows 200 megapixels.
+    """
+    image = _import_package("PIL.Image")
+    with _loop_writer(_WEBP, lambda picture, _: image.fromarray(picture), path, size, fps) as write:
+        yield write
+
+
+@contextmanager
+def _loop_writer(
+    form: _Loop, prepare: Callable[[Array, Any], Any], path: Path, size: tuple[int, int], fps: Fraction
+) -> Iterator[Write]:
+    """Yield a function that adds a picture, as `prepare` makes it of one and of the first that it made."""
+    stride, count, pictures = math.ceil(fps / _LOOP_FPS), 0, []
+
+    def write(picture: Array) -> None:
+        nonlocal count
+        count += 1
+        if (count - 1) % stride == 0:
+            _check_loop_size(form, len(pictures) + 1, size)
+            pictures.append(prepare(picture, pictures[0] if pictures else None))
+
+    yield write
+    ends = [round(1000 // form.tick * min((k + 1) * stride, count) / fps) for k in range(len(pictures))]
+    delays = [form.tick * max(stop - start, 1) for start, stop in zip([0, *ends], ends, strict=False)]
+    first, *others = pictures
+    first.save(path, form.name, save_all=True, append_images=others, duration=delays, loop=0, quality=form.quality)
+
+
+def _check_loop_size(form: _Loop, pictures: int, size: tuple[int, int]) -> None:
+    most = form.most_pixels // (size[0] * size[1])
+    if pictures > most:
+        raise RequestError(f"a {form.name} of {size[0]}x{size[1]} can have {most} pictures; shrink it or write an MP4")
+
+
+def _quantize(image, picture: Array, first):
+    """Quantise with the palette of the first picture, or for the first with one of its own."""
+    whole, plain = image.fromarray(picture), image.Dither.NONE
+    if first is None:
+        sample = image.fromarray(np.concatenate([picture, _make_swatches(picture.shape[1], picture.shape[0] // 12)]))
+        first = sample.quantize(_GIF_COLOURS, method=image.Quantize.MAXCOVERAGE, dither=plain)
+    return whole.quantize(palette=first, dither=plain)
+
+
+def _make_swatches(width: int, height: int) -> Array:
+    """Make (4 * ceil(height / 4), width, 3): colours in light and shade that the first picture may lack."""
+    shown = (colours.LEFT, colours.RIGHT, colours.TARGET, colours.TRAIL)
+    light = np.linspace(0.55, 1.0, width)[:, None]
+    rows = np.stack([colours.rgb(colour) * light * 255 for colour in shown])
+    return np.repeat(rows.astype(np.uint8), math.ceil(height / len(shown)), axis=0)
+
+
+def save_png(path: Path, picture: Array) -> None:
+    """Write one picture (height, width, 3) uint8, whole or not at all."""
+    image = _import_package("PIL.Image")
+    with atomic.atomic_path(path) as scratch:
+        image.fromarray(picture).save(scratch, format="PNG", optimize=True)
+
+
+def _import_package(name: str):
+    try:
+        return import_module(name)
+    except ImportError as error:
+        raise RequestError(f"films need {name.split('.')[0]} ({error}): pip install 'mapctl[render]'") from error
+
+
+_GAP = 0.008
+"""Margin between pictures, as a share of the width."""
+_GHOST_STRIDE = 1.0
+"""Distance between ghosts, about, metres."""
+_STRIP_STILLS, _STRIP_SHAPE = 9, 1.3
+"""Stills of a strip, and the height of each over its width."""
+_MAX_GHOSTS = 16
+"""Number of ghosts of all actors together, but at least four each."""
+
+
+@dataclass(frozen=True)
+class StillRow:
+    """Layout of the stills."""
+
+    count: int
+    """Number of stills beside each other."""
+    height_over_width: float
+    """Height of one over its width."""
+    kind: str
+    """Kind of the stills' camera (see CameraSettings)."""
+
+
+def draw_contact_sheet(stage: Stage, brush: Painter, camera: CameraSettings, size: tuple[int, int]) -> Array:
+    """Draw the sheet, (height, width, 3) uint8 of the given width; the ghosts' picture has `size`, the stills come
+    below."""
+    wide = replace(camera, kind="top" if camera.kind == "top" else "fixed")
+    top = brush.paint(stage.views(wide, size)[0], stage.compose_ghosts(_choose_ghost_frames(stage)))
+    row = _choose_row(stage, camera, size)
+    gap = max(2, round(_GAP * size[0]))
+    width = (size[0] - (row.count - 1) * gap) // row.count
+    height = max(1, round(width * row.height_over_width))
+    sheet = np.full((size[1] + gap + height, size[0], 3), 255, np.uint8)
+    sheet[: size[1]] = top
+    views = stage.views(replace(camera, kind=row.kind), (width, height))
+    for k, moment in enumerate(_space_evenly(stage.num_frames - 1, row.count)):
+        left = round(k * (size[0] - width) / (row.count - 1))
+        still = _add_label(brush.paint(views[moment], stage.content(moment)), f"{moment / float(stage.fps):.1f} s")
+        sheet[size[1] + gap :, left : left + width] = still
+    return sheet
+
+
+def draw_strips(
+    strips: Sequence[tuple[str, Stage]], brush: Painter, camera: CameraSettings, size: tuple[int, int]
+) -> Array:
+    """Draw a row of stills of each stage, at the same shares of its time, below each other and under its name: (height,
+    width, 3) uint8 of the given width, all rows together as high as they come."""
+    gap = max(2, round(_GAP * size[0]))
+    width = (size[0] - (_STRIP_STILLS - 1) * gap) // _STRIP_STILLS
+    height = round(width * _STRIP_SHAPE)
+    sheet = np.full((len(strips) * (height + gap) - gap, size[0], 3), 255, np.uint8)
+    for row, (name, stage) in enumerate(strips):
+        views, top = stage.views(camera, (width, height)), row * (height + gap)
+        for k, moment in enumerate(_space_evenly(stage.num_frames - 1, _STRIP_STILLS)):
+            left, label = k * (width + gap), f"{moment / float(stage.fps):.1f} s"
+            picture = _add_label(
+                brush.paint(views[moment], stage.content(moment)), label if k else name.replace(" and ", "\n")
+            )
+            sheet[top : top + height, left : left + width] = picture
+    return sheet
+
+
+def _choose_row(stage: Stage, camera: CameraSettings, size: tuple[int, int]) -> StillRow:
+    """Choose upright close stills for one actor; several need the whole picture."""
+    if len(stage.players) == 1:
+        return StillRow(6, 1.15, "top" if camera.kind == "top" else "follow")
+    return StillRow(4, size[1] / size[0], camera.kind)
+
+
+def _space_evenly(last: int, count: int) -> list[int]:
+    return [round(k) for k in np.linspace(0, last, count)]
+
+
+def _choose_ghost_frames(stage: Stage) -> list[int]:
+    """Choose frames about a stride apart for the actor that goes furthest, less the first where a loop ends there."""
+    paths = [player.body.anatomy.hips_world[:, [0, 2]] for player in stage.players]
+    lengths = [np.linalg.norm(np.diff(path, axis=0), axis=1).sum() for path in paths]
+    most = max(4, _MAX_GHOSTS // len(paths))
+    furthest = paths[int(np.argmax(lengths))]
+    # Swaying on the spot makes a long path, too, that leads nowhere.
+    reach = np.linalg.norm(furthest - furthest[0], axis=1).max()
+    count = min(round(min(max(lengths), 2 * reach) / _GHOST_STRIDE) + 1, most)
+    if count == 1:
+        return [stage.num_frames // 2]
+    loop = max(lengths) > 3 * _GHOST_STRIDE and np.linalg.norm(furthest[-1] - furthest[0]) < _GHOST_STRIDE
+    return _space_evenly(stage.num_frames - 1, count + 1)[1:] if loop else _space_evenly(stage.num_frames - 1, count)
+
+
+def _add_label(picture: Array, text: str) -> Array:
+    from PIL import Image, ImageDraw, ImageFont
+
+    image = Image.fromarray(picture)
+    height = max(9, round(picture.shape[0] * 0.07))
+    draw = ImageDraw.Draw(image)
+    draw.text((height * 0.6, height * 0.4), text, fill=colours.VISOR, font=ImageFont.load_default(size=height))
+    return np.asarray(image)
+
 
 WRITERS = {".mp4": mp4_writer, ".gif": gif_writer, ".webp": webp_writer}
 ENDINGS = (*WRITERS, ".png")

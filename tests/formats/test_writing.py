@@ -19,7 +19,7 @@ from mapctl.formats import usd
 from mapctl.formats.atomic import atomic_path, write_bytes
 from priors import checkpoints
 from priors.checkpoints import write_tensors
-from scenes.writers import gif_writer, mp4_writer, save_png, webp_writer
+from scenes.film import gif_writer, mp4_writer, save_png, webp_writer
 
 MOTION = walk(150)
 PICTURE = np.random.default_rng(0).integers(0, 255, (240, 320, 3), dtype=np.uint8)

@@ -9,7 +9,7 @@ from tiny_tweener import tiny_tweener
 import priors
 from controllers.inbetweening.pipeline import InfillSettings
 from controllers.inbetweening.proposers import AutoInbetweener, SlerpInbetweener
-from controllers.inbetweening.proposers.walked import WalkedPlaces
+from controllers.inbetweening.proposers.slerp import WalkedPlaces
 from controllers.inbetweening.tween import measure_keyframe_errors, tween
 from mapctl.inbetweening import GapQuery
 from mapctl.inbetweening.loose_keys import LooseKeys

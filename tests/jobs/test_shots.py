@@ -10,7 +10,7 @@ from helpers import walk
 
 import priors
 from controllers.shots.clip_ends import Lead
-from controllers.shots.keys.looking import measure_look_errors, turn_heads
+from controllers.shots.keys.posing import measure_look_errors, turn_heads
 from controllers.shots.request import Look, Others, Reach, ShotRequest
 from controllers.shots.rest_pose import build_rest_pose
 from controllers.shots.shot import solve_shot

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 
 from controllers.inbetweening.proposers.auto import AutoInbetweener
 from controllers.inbetweening.proposers.rollouts import RolloutInbetweener
-from controllers.inbetweening.proposers.slerp import SlerpInbetweener
-from controllers.inbetweening.proposers.stitched import StitchedInbetweener
+from controllers.inbetweening.proposers.slerp import SlerpInbetweener, StitchedInbetweener
 from mapctl.errors import RequestError
 from mapctl.protocols import Density, Inbetweener
 

@@ -12,8 +12,7 @@ import torch
 
 from controllers.inbetweening.proposers.partial_keys import propose_through_keys
 from controllers.inbetweening.proposers.rollouts import RolloutSettings, extrapolate_end
-from controllers.inbetweening.proposers.stitched import StitchedInbetweener
-from controllers.inbetweening.proposers.walked import PlaceWalker
+from controllers.inbetweening.proposers.slerp import PlaceWalker, StitchedInbetweener
 from mapctl import contacts
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening import GapQuery, Proposal

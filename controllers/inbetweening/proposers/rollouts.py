@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from controllers.common.map_refinement import estimate_rest_height
-from controllers.inbetweening.proposers.walked import PlaceWalker
+from controllers.inbetweening.proposers.slerp import PlaceWalker
 from mapctl import contacts, rotations
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode, integrate_root
 from mapctl.inbetweening import GapQuery, Proposal
