@@ -11,7 +11,7 @@ from tiny_refiner import refiner_of
 from tiny_stitcher import tiny_stitcher
 from tiny_transformer import tiny_transformer
 from tiny_tweener import tiny_tweener
-from toy_density import linear_density, toy_density
+from toy_density import toy_density
 
 from controllers.inbetweening.proposers import (
     AutoInbetweener,
@@ -142,7 +142,6 @@ DENSITIES: dict[str, Density] = {
     "absolute": _lstm_gmm(components=2, seed=2, retain=0.0, correlated=False),
     "kernels": replace(_lstm_gmm(torch.float32, components=3, seed=1), use_fast=True),
     "toy": toy_density(torch.float64),
-    "linear": linear_density(torch.float64),
 }
 """LSTM-GMM of one Gaussian, of several, and the paper's variant (absolute frames, diagonal Gaussians), on the reference
 path; the second on the fast path; one that knows only `mapctl.protocols`; and one that tells its mean only."""

@@ -4,12 +4,11 @@ import math
 from dataclasses import dataclass
 
 import torch
-from helpers import corpus, generator
+from helpers import corpus
 from torch import Tensor
 
 from mapctl.features import LAYOUT, ground_speed
 from mapctl.protocols import DataLimits, Density, DiscreteChoices, InitialStates, LastFrameState
-from priors.markov_gaussian import MarkovGaussian
 
 N = LAYOUT.continuous
 
@@ -54,28 +53,6 @@ class ToyDensity(Density[LastFrameState]):
         for step, bits in zip(noise.unbind(1), plan.contacts.unbind(1), strict=True):
             frames.append(torch.cat([self._expect(frames[-1]) + self.sigma * step, bits.to(step)], dim=-1))
         return torch.stack(frames[1:], dim=1), self._score(noise)
-
-
-@dataclass(frozen=True, eq=False)
-class LinearDensity(MarkovGaussian):
-    """Features that go back to a mean; which toes are planted depends on how far they are from it."""
-
-    initial_states: InitialStates[LastFrameState]
-    mean: Tensor  # (continuous,)
-    sigma: Tensor  # (continuous,)
-    odds: Tensor  # (continuous, 2)
-    name, limits = "linear", DataLimits(slowest=0.5, fastest=2.0, turn_rate=1.0)
-
-    def expect(self, before):
-        away = before[..., :N] - self.mean
-        return torch.cat([self.mean + 0.9 * away, away @ self.odds], dim=-1)
-
-
-def linear_density(dtype: torch.dtype = torch.float32) -> LinearDensity:
-    """With the toy's statistics and starts."""
-    toy = toy_density(dtype)
-    odds = torch.randn(N, 2, generator=generator(3)).to(dtype) / toy.sigma[:, None]
-    return LinearDensity(toy.initial_states, toy.mean, toy.sigma, odds)
 
 
 def toy_density(dtype: torch.dtype = torch.float32) -> ToyDensity:

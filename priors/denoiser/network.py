@@ -22,7 +22,7 @@ from mapctl.pose import BodyPose
 from mapctl.recording import Capture, CaptureProposal
 from mapctl.skeleton import CANONICAL
 from priors import checkpoints
-from priors.config import NetworkConfig
+from priors.checkpoints import NetworkConfig
 
 _NON_ROOT_JOINTS = CANONICAL.num_joints - 1
 _ANGLE_CHANNELS = 2 + 3 * _NON_ROOT_JOINTS  # tilt and rotation vectors

@@ -15,7 +15,7 @@ from mapctl.inbetweening.position_image import mirror_positions
 from mapctl.protocols import PositionInfiller
 from mapctl.skeleton import CANONICAL
 from priors import checkpoints
-from priors.config import NetworkConfig
+from priors.checkpoints import NetworkConfig
 
 Architecture = Literal["skips", "image"]
 _LEAK = 0.2

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from mapctl.errors import RequestError
 from mapctl.inbetweening.pose_pairs import MAX_FITTED_DISTANCE, PAIR_FEATURES, TRAVELLING_DISTANCE
 from priors import checkpoints
-from priors.config import NetworkConfig
+from priors.checkpoints import NetworkConfig
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from mapctl.features import LAYOUT, PRIOR_FPS, FeatureLayout
 from mapctl.kinematics.joint_places import place_joints
 from mapctl.protocols import DensityState, DiscreteChoices
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
-from priors.config import NetworkConfig, require_at_least
+from priors.checkpoints import NetworkConfig, require_at_least
 
 _CHANGE = 2e-3  # of a feature, by which steps are differentiated
 _JOINTS = LAYOUT.slices["joint_rotations"].start

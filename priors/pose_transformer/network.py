@@ -26,7 +26,7 @@ from mapctl.numerics.intervals import last_observed, next_observed, true_interva
 from mapctl.protocols import Inbetweener
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors import checkpoints
-from priors.config import NetworkConfig
+from priors.checkpoints import NetworkConfig
 
 _JOINTS = CANONICAL.num_joints
 _ROTATION_ROWS = 6 * _JOINTS

@@ -25,7 +25,7 @@ from mapctl.protocols import Refiner
 from mapctl.skeleton import CANONICAL
 from mapctl.terms.trial import Trial
 from priors import checkpoints
-from priors.config import NetworkConfig
+from priors.checkpoints import NetworkConfig
 
 
 def compute_end_effectors(

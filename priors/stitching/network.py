@@ -39,7 +39,7 @@ from torch.nn.functional import elu
 
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT
-from priors.config import NetworkConfig
+from priors.checkpoints import NetworkConfig
 
 SIDES = 2
 """Forward and backward."""

@@ -17,7 +17,7 @@ from mapctl.features import LAYOUT, ground_speed
 from mapctl.joint_roles import find_feet
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT
 from mapctl.terms.trial import Trial
-from priors.config import require_at_least
+from priors.checkpoints import require_at_least
 from priors.lstm_gmm.network import LstmGmm
 
 PAST_FRAMES = 3

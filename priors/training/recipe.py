@@ -4,9 +4,9 @@ import math
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import Field, asdict, dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Generic, Protocol, TypeVar, runtime_checkable
+from typing import Any, ClassVar, Generic, TypeVar
 
 from torch import Tensor
 
@@ -14,7 +14,7 @@ from mapctl.errors import CheckpointError, RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.formats.atomic import write_text
 from priors import checkpoints
-from priors.config import NetworkConfig, require_at_least
+from priors.checkpoints import NetworkConfig, require_at_least
 from priors.licences import OF_DATA
 from priors.training.corpus import Corpus, Split, read_corpus, split_corpus
 from priors.training.trainer import GradientTrainer, Trainer, select_device
@@ -31,25 +31,8 @@ def ignore_line(line: str) -> None:
     """Take a line of news, and do nothing with it."""
 
 
-@runtime_checkable
-class Settings(Protocol):
-    """How a model is trained: a frozen dataclass with at least these."""
-
-    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
-
-    @property
-    def seed(self) -> int:
-        """Seed of everything random, including the split of the clips."""
-        ...
-
-    @property
-    def steps(self) -> int:
-        """Steps in all."""
-        ...
-
-
 C = TypeVar("C", bound=NetworkConfig)
-S = TypeVar("S", bound=Settings)
+S = TypeVar("S", bound=Any)  # settings: a frozen dataclass with at least `seed` and `steps`
 T = TypeVar("T", bound=Trainer[Any])
 G = TypeVar("G", bound=GradientTrainer[Any])
 

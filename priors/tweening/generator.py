@@ -15,8 +15,8 @@ from mapctl.inbetweening import PositionImage
 from mapctl.joint_ranges import JointRanges
 from mapctl.numerics.intervals import last_observed, next_observed
 from mapctl.skeleton import CANONICAL, Skeleton
-from priors.config import NetworkConfig
-from priors.tweening.residual import ResidualConv
+from priors.checkpoints import NetworkConfig
+from priors.tweening.path import ResidualConv
 
 _OTHERS = CANONICAL.num_joints - 1
 ROOT_ROWS = 6

@@ -13,9 +13,13 @@ from priors.lstm_gmm import labels
 from priors.lstm_gmm.density import LstmGmmDensity
 from priors.lstm_gmm.labels import Labels
 from priors.lstm_gmm.network import LstmGmm, LstmGmmConfig
-from priors.training.initial_states import select_initial_states
 from priors.training.moment_matching import MatchingSettings
-from priors.training.recipes.lstm_gmm import DensityTrainer, TrainingSettings, compute_feature_statistics
+from priors.training.recipes.lstm_gmm import (
+    DensityTrainer,
+    TrainingSettings,
+    compute_feature_statistics,
+    select_initial_states,
+)
 
 CLIPS = ("set_walk_glad_1.bvh", "set_turn-left_glad_2.bvh", "set_turn-right_old_3.bvh", "set_run_old_4.bvh", "odd.bvh")
 PATTERN = r"_(?P<gait>walk|run|turn-left|turn-right)_(?P<style>[a-z]+)_"

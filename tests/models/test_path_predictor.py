@@ -15,8 +15,7 @@ from mapctl.kinematics import heading
 from mapctl.protocols import PathPredictor
 from priors import checkpoints
 from priors.tweening import path
-from priors.tweening.path import PathConfig
-from priors.tweening.residual import ResidualConv
+from priors.tweening.path import PathConfig, ResidualConv
 
 
 def local_motion(frames=90, **options):

@@ -12,9 +12,8 @@ from mapctl.skeleton import CANONICAL
 from mapctl.terms.trial import Trial
 from priors.lstm_gmm.network import LstmGmmConfig
 from priors.training.moment_matching import MatchingSettings
-from priors.training.recipes import density_critic as free_runs
-from priors.training.recipes.density_critic import CriticSettings
-from priors.training.recipes.lstm_gmm import DensityTrainer, TrainingSettings
+from priors.training.recipes import lstm_gmm as free_runs
+from priors.training.recipes.lstm_gmm import CriticSettings, DensityTrainer, TrainingSettings
 from priors.training.trainer import draw_weights
 
 CRITIC = CriticSettings(steps=3, frames=8, head_start=2, batch=4, history=8, every=1)

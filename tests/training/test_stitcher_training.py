@@ -12,14 +12,16 @@ import priors
 from mapctl.errors import RequestError
 from priors.stitching.network import DrawnLatents
 from priors.stitching.sides import count_made, join_sides, walk_sides
-from priors.training.augmentation.transition_windows import Known, Transition, TransitionWindows
 from priors.training.recipes import stitcher as recipe_module
 from priors.training.recipes.stitcher import (
     TEMPERATURES,
     TRIES,
+    Known,
     Shares,
     StitcherRecipe,
     StitcherSettings,
+    Transition,
+    TransitionWindows,
     calibrate_temperature,
     interpolate,
     place,

@@ -3,8 +3,19 @@
 Same mathematics as `LstmGmm.plan`, `rollout` and `sample` (the specification, tested to agree), in compiled
 loops. A rollout is one node of torch's graph: what is built on its features and densities chains onto it by
 autograd, and its gradient is the hand-written back-propagation through time.
+
+Compiled kernels of the LSTM-GMM rollout and its pullback: one core, float32 (imported late: needs numba).
+
+A rollout cannot run its frames side by side, so every frame reads every weight once. For one particle that
+is a matter of memory bandwidth, for many of arithmetic; `affine` serves both, by tiles of 4 rows by 4
+particles whose 16 sums stay in registers. It was measured as fast as BLAS for one particle and twice as
+fast for 8 to 32, and it has no threads to fight with. Weights are float32, or the bits of half precision,
+which takes half the time. Sizes are padded with zeros, so no loop has a remainder: widths to multiples of
+16, particles to multiples of 4. All kernels lie in one file because compiled code kept on disk goes stale
+by file.
 """
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -15,10 +26,389 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from mapctl.numerics.jit import make_jit_decorators
 from mapctl.protocols import DiscreteChoices, PreparedRollout
-from priors.lstm_gmm.fast import kernels, layout
-from priors.lstm_gmm.fast.layout import Array, ChoiceBuffers, Tape
+from priors.lstm_gmm.fast import layout
+from priors.lstm_gmm.fast.layout import GIVEN, LIKELIEST, SAMPLED, Array, ChoiceBuffers, Tape, widen
 from priors.lstm_gmm.network import LstmGmm, LstmState
+
+_ZERO, _HALF, _ONE, _TWO, _FOUR = (np.float32(value) for value in (0, 0.5, 1, 2, 4))
+_LOG2E, _LN2_HIGH, _LN2_LOW = np.float32(1.44269504), np.float32(0.693359375), np.float32(-2.12194440e-4)
+_EXP_LOW, _EXP_HIGH = np.float32(-87.0), np.float32(88.0)
+_EXP = tuple(np.float32(1 / math.factorial(k)) for k in range(8))
+
+# Sums may be reordered and fused, which vectorises them.
+_entry, _inner = make_jit_decorators("reassoc", "contract", "nsz")
+_, _ordered = make_jit_decorators("contract")
+
+
+@_ordered
+def exp(x):
+    """e^x to 2 ulp by range reduction and a Taylor polynomial: unlike libm's, it runs in vector registers."""
+    x = _EXP_LOW if x < _EXP_LOW else (_EXP_HIGH if x > _EXP_HIGH else x)
+    power = np.floor(x * _LOG2E + _HALF)
+    rest = (x - power * _LN2_HIGH) - power * _LN2_LOW
+    value = _EXP[7]
+    value = value * rest + _EXP[6]
+    value = value * rest + _EXP[5]
+    value = value * rest + _EXP[4]
+    value = value * rest + _EXP[3]
+    value = value * rest + _EXP[2]
+    value = value * rest + _EXP[1]
+    value = value * rest + _EXP[0]
+    return value * np.int32((np.int32(power) + np.int32(127)) << np.int32(23)).view(np.float32)
+
+
+@_inner
+def sigmoid(x):
+    """Logistic function."""
+    return _ONE / (_ONE + exp(-x))
+
+
+@_inner
+def tanh(x):
+    """Hyperbolic tangent, exact at 0 (padded units rest on that)."""
+    return _TWO / (_ONE + exp(-_TWO * x)) - _ONE
+
+
+@_inner
+def affine(weight, bias, x, out):
+    """out = x weight^T + bias over the first columns of x and out; weight is (rows, columns), both padded."""
+    rows, columns = weight.shape
+    tiled = len(x) - len(x) % 4
+    for r in range(0, rows, 4):
+        w0, w1, w2, w3 = weight[r], weight[r + 1], weight[r + 2], weight[r + 3]
+        for b in range(0, tiled, 4):
+            x0, x1, x2, x3 = x[b], x[b + 1], x[b + 2], x[b + 3]
+            a00 = a10 = a20 = a30 = bias[r]
+            a01 = a11 = a21 = a31 = bias[r + 1]
+            a02 = a12 = a22 = a32 = bias[r + 2]
+            a03 = a13 = a23 = a33 = bias[r + 3]
+            for k in range(columns):
+                p0, p1, p2, p3 = widen(w0[k]), widen(w1[k]), widen(w2[k]), widen(w3[k])
+                q0, q1, q2, q3 = x0[k], x1[k], x2[k], x3[k]
+                a00, a01, a02, a03 = a00 + p0 * q0, a01 + p1 * q0, a02 + p2 * q0, a03 + p3 * q0
+                a10, a11, a12, a13 = a10 + p0 * q1, a11 + p1 * q1, a12 + p2 * q1, a13 + p3 * q1
+                a20, a21, a22, a23 = a20 + p0 * q2, a21 + p1 * q2, a22 + p2 * q2, a23 + p3 * q2
+                a30, a31, a32, a33 = a30 + p0 * q3, a31 + p1 * q3, a32 + p2 * q3, a33 + p3 * q3
+            out[b, r], out[b, r + 1], out[b, r + 2], out[b, r + 3] = a00, a01, a02, a03
+            out[b + 1, r], out[b + 1, r + 1], out[b + 1, r + 2], out[b + 1, r + 3] = a10, a11, a12, a13
+            out[b + 2, r], out[b + 2, r + 1], out[b + 2, r + 2], out[b + 2, r + 3] = a20, a21, a22, a23
+            out[b + 3, r], out[b + 3, r + 1], out[b + 3, r + 2], out[b + 3, r + 3] = a30, a31, a32, a33
+        for b in range(tiled, len(x)):
+            xb = x[b]
+            s0, s1, s2, s3 = bias[r], bias[r + 1], bias[r + 2], bias[r + 3]
+            for k in range(columns):
+                q, p0, p1, p2, p3 = xb[k], widen(w0[k]), widen(w1[k]), widen(w2[k]), widen(w3[k])
+                s0, s1, s2, s3 = s0 + p0 * q, s1 + p1 * q, s2 + p2 * q, s3 + p3 * q
+            out[b, r], out[b, r + 1], out[b, r + 2], out[b, r + 3] = s0, s1, s2, s3
+
+
+@_inner
+def affine_pullback(weight, transposed, nothing, gradient, out):
+    """out = gradient weight over the first columns of out, from `weight` or its transposed copy.
+
+    One particle reads the weights that its rollout has just left in cache, 8 rows at a time; for several, arithmetic
+    counts, and products with the copy have more of it in registers. `nothing` is a zero bias.
+    """
+    rows, columns = weight.shape
+    if len(gradient) > 1:
+        affine(transposed, nothing, gradient, out)
+        return
+    d, total = gradient[0], out[0, :columns]
+    for k in range(columns):
+        total[k] = _ZERO
+    for r in range(0, rows, 8):
+        w0, w1, w2, w3 = weight[r], weight[r + 1], weight[r + 2], weight[r + 3]
+        w4, w5, w6, w7 = weight[r + 4], weight[r + 5], weight[r + 6], weight[r + 7]
+        d0, d1, d2, d3, d4, d5, d6, d7 = d[r], d[r + 1], d[r + 2], d[r + 3], d[r + 4], d[r + 5], d[r + 6], d[r + 7]
+        for k in range(columns):
+            low = (d0 * widen(w0[k]) + d1 * widen(w1[k])) + (d2 * widen(w2[k]) + d3 * widen(w3[k]))
+            high = (d4 * widen(w4[k]) + d5 * widen(w5[k])) + (d6 * widen(w6[k]) + d7 * widen(w7[k]))
+            total[k] += low + high
+
+
+@_inner
+def copy(source, target, at):
+    """target[:, at:] = source. Written out: numba takes seconds to compile it as slices."""
+    for b in range(len(source)):
+        row, out = source[b], target[b, at : at + source.shape[1]]
+        for u in range(len(row)):
+            out[u] = row[u]
+
+
+@_inner
+def relu(x, width):
+    """max(x, 0) in place over the first `width` columns; NaN stays."""
+    for b in range(len(x)):
+        row = x[b, :width]
+        for u in range(width):
+            row[u] = _ZERO if row[u] <= _ZERO else row[u]
+
+
+@_inner
+def relu_pullback(gradient, active, width):
+    """Zero the gradient in place where the activation was zero."""
+    for b in range(len(gradient)):
+        row, kept = gradient[b, :width], active[b, :width]
+        for u in range(width):
+            row[u] = row[u] if kept[u] > _ZERO else _ZERO
+
+
+@_inner
+def lstm_cell(gates, before, after, tanh_cell, hidden):
+    """Gates (pre-activations, replaced by activations) and old cell to new cell and hidden state."""
+    width = before.shape[1]
+    for b in range(len(gates)):
+        row = gates[b]
+        for u in range(2 * width):
+            row[u] = sigmoid(row[u])
+        for u in range(2 * width, 3 * width):
+            row[u] = tanh(row[u])
+        for u in range(3 * width, 4 * width):
+            row[u] = sigmoid(row[u])
+        new, old, squashed, out = after[b], before[b], tanh_cell[b], hidden[b]
+        for u in range(width):
+            new[u] = row[width + u] * old[u] + row[u] * row[2 * width + u]
+        for u in range(width):
+            squashed[u] = tanh(new[u])
+        for u in range(width):
+            out[u] = row[3 * width + u] * squashed[u]
+
+
+@_inner
+def lstm_cell_pullback(above, carry, d_cell, gates, before, tanh_cell, d_gates):
+    """Gradient of the pre-activations; d_cell goes from after the frame to before it, in place.
+
+    The hidden state's gradient is above[:, :W] (this frame's use of it) + carry[:, W:] (the next frame's).
+    """
+    width = before.shape[1]
+    for b in range(len(gates)):
+        i, f, g, o = (
+            gates[b, :width],
+            gates[b, width : 2 * width],
+            gates[b, 2 * width : 3 * width],
+            gates[b, 3 * width :],
+        )
+        up, later, dc, old, squashed, d = (above[b], carry[b, width:], d_cell[b], before[b], tanh_cell[b], d_gates[b])
+        for u in range(width):
+            d[3 * width + u] = (up[u] + later[u]) * squashed[u] * o[u] * (_ONE - o[u])
+        for u in range(width):
+            dc[u] += (up[u] + later[u]) * o[u] * (_ONE - squashed[u] * squashed[u])
+        for u in range(width):
+            d[u] = dc[u] * g[u] * i[u] * (_ONE - i[u])
+        for u in range(width):
+            d[width + u] = dc[u] * old[u] * f[u] * (_ONE - f[u])
+        for u in range(width):
+            d[2 * width + u] = dc[u] * i[u] * (_ONE - g[u] * g[u])
+        for u in range(width):
+            dc[u] *= f[u]
+
+
+@_inner
+def choose_discrete(settings, count, head, uniform, source):
+    """Component and contact bits of one particle from the head's weight and contact rows."""
+    weights, bits = (head[settings.weight : settings.weight + count], head[settings.contact : settings.contact + 2])
+    best = 0
+    for k in range(1, count):
+        best = k if weights[k] > weights[best] else best
+    if source == LIKELIEST:
+        return best, bits[0] > _ZERO, bits[1] > _ZERO
+    top, total = weights[best], _ZERO
+    for k in range(count):
+        total += exp(weights[k] - top)
+    component, passed = 0, exp(weights[0] - top)
+    while component < count - 1 and passed <= uniform[0] * total:
+        component += 1
+        passed += exp(weights[component] - top)
+    return component, uniform[1] < sigmoid(bits[0]), uniform[2] < sigmoid(bits[1])
+
+
+@_inner
+def discrete_density(settings, count, head, component, contacts):
+    """Log probability of a component and the contact bits; their rows of the head become its gradient."""
+    weights = head[settings.weight : settings.weight + count]
+    top, total, chosen = weights[0], _ZERO, weights[component]
+    for k in range(1, count):
+        top = weights[k] if weights[k] > top else top
+    for k in range(count):
+        weights[k] = exp(weights[k] - top)
+        total += weights[k]
+    density = chosen - top - math.log(total)
+    for k in range(count):
+        weights[k] = (_ONE if k == component else _ZERO) - weights[k] / total
+    for side in range(2):
+        sign = _ONE if contacts[side] else -_ONE
+        logit = sign * head[settings.contact + side]
+        # log sigmoid without overflow
+        density += (logit if logit < _ZERO else _ZERO) - math.log1p(exp(-abs(logit)))
+        head[settings.contact + side] = sign * sigmoid(-logit)
+    return np.float32(density)
+
+
+@_inner
+def compose_gaussian(settings, head, before, noise, after, mixing):
+    """The next frame's Gaussian values and their log density; the head's rows become sigma and slope.
+
+    `mixing` is the component's (C, C) triangle; it leaves volumes, and so densities, as they are.
+    """
+    size = settings.continuous
+    means, rows = head[:size], head[settings.log_sigma : settings.log_sigma + size]
+    span, limit, density = settings.high - settings.low, settings.clamp, _ZERO
+    for j in range(size):
+        carried = before[j]
+        carried = -limit if carried < -limit else (limit if carried > limit else carried)
+        after[j] = means[j] + settings.retain * carried
+    for j in range(size):
+        share = sigmoid(_FOUR * rows[j] / span - _ONE)
+        log_sigma = settings.low + span * share
+        means[j] = exp(log_sigma)
+        rows[j] = _FOUR * share * (_ONE - share)
+        density -= log_sigma + _HALF * noise[j] * noise[j]
+    for j in range(size):
+        row, total = mixing[j], _ZERO
+        for i in range(size):
+            total += row[i] * means[i] * noise[i]
+        after[j] += total
+    return density - _HALF * np.float32(math.log(2 * math.pi)) * size
+
+
+@_inner
+def compose(weights, biases, settings, tape, now, after, noise, choices, t, source, logits, features, density):
+    """Output layer of one frame: only the chosen component's slice of it is computed."""
+    count, size, shared = len(weights.head), settings.continuous, settings.weight
+    head, hidden, following = tape.head[now], tape.third[now], tape.frame[after]
+    affine(weights.head[0, shared:], biases.head[0, shared:], hidden, logits)
+    copy(logits, head, shared)
+    for b in range(len(noise)):
+        if source != GIVEN:
+            uniform = choices.uniform[b, t] if source == SAMPLED else choices.uniform[0, 0]
+            k, left, right = choose_discrete(settings, count, head[b], uniform, source)
+            choices.component[b, t], choices.contacts[b, t, 0], choices.contacts[b, t, 1] = k, left, right
+        k = choices.component[b, t]
+        affine(weights.head[k, :shared], biases.head[k, :shared], hidden[b : b + 1], head[b : b + 1])
+        discrete = discrete_density(settings, count, head[b], k, choices.contacts[b, t])
+        continuous = compose_gaussian(
+            settings, head[b], tape.frame[now, b], noise[b, t], following[b], settings.mixing[k]
+        )
+        density[b, t] = discrete + continuous
+        for j in range(size):
+            features[b, t, j] = following[b, j] * settings.std[j] + settings.mean[j]
+        for side in range(2):
+            bit, j = _ONE if choices.contacts[b, t, side] else _ZERO, size + side
+            features[b, t, j], following[b, j] = bit, (bit - settings.mean[j]) / settings.std[j]
+
+
+@_entry
+def forward(weights, biases, settings, tape, noise, choices, source, features, density):
+    """Roll out noise (batch, frames, continuous) from slot 0 of the tape; fills features and density."""
+    slots, width = len(tape.frame), len(weights.fc2)
+    hidden = np.empty((2, noise.shape[0], width), np.float32)
+    logits = np.empty((len(noise), weights.head.shape[1] - settings.weight), np.float32)
+    for t in range(noise.shape[1]):
+        now, after = t % slots, (t + 1) % slots
+        inputs, onward = tape.lstm_input[now], tape.lstm_input[after]
+        affine(weights.fc1, biases.fc1, tape.frame[now], tape.first[now])
+        relu(tape.first[now], width)
+        affine(weights.fc2, biases.fc2, tape.first[now], inputs[0])
+        relu(inputs[0], width)
+        for layer in range(2):
+            gates = tape.gates[now, layer]
+            affine(weights.lstm[layer], biases.lstm[layer], inputs[layer], gates)
+            old, new = tape.cell[now, layer], tape.cell[after, layer]
+            lstm_cell(gates, old, new, tape.tanh_cell[now, layer], hidden[layer])
+            copy(hidden[layer], onward[layer], width)
+            if layer == 0:
+                copy(hidden[0], inputs[1], 0)
+        affine(weights.fc3, biases.fc3, hidden[1], tape.third[now])
+        relu(tape.third[now], width)
+        compose(weights, biases, settings, tape, now, after, noise, choices, t, source, logits, features, density)
+
+
+@_inner
+def compose_pullback(settings, tape, noise, component, t, d_feature, d_density, d_frame, d_noise, d_head, d_spread):
+    """Gradient on one frame to its noise, the rows of the head and (d_frame, in place) the frame before.
+
+    `d_spread` (C,) is scratch: the gradient on sigma times noise, before the mixing.
+    """
+    size, first = settings.continuous, settings.log_sigma
+    for b in range(len(noise)):
+        head, before, gradient, d_rows = tape.head[t, b], tape.frame[t, b], d_frame[b], d_head[b]
+        n, dn, df, up = noise[b, t], d_noise[b, t], d_feature[b, t], d_density[b, t]
+        for j in range(size):
+            d_rows[j] = gradient[j] + df[j] * settings.std[j]
+        mixing = settings.mixing[component[b, t]]
+        for i in range(size):
+            d_spread[i] = _ZERO
+        for j in range(size):
+            row, pulled = mixing[j], d_rows[j]
+            for i in range(size):
+                d_spread[i] += row[i] * pulled
+        for j in range(size):
+            dn[j] = d_spread[j] * head[j] - up * n[j]
+        for j in range(size):
+            d_rows[first + j] = (d_spread[j] * head[j] * n[j] - up) * head[first + j]
+        for j in range(settings.weight, len(head)):
+            d_rows[j] = up * head[j]
+        for j in range(size, len(gradient)):
+            gradient[j] = _ZERO
+        for j in range(size):
+            inside = before[j] >= -settings.clamp and before[j] <= settings.clamp
+            gradient[j] = settings.retain * d_rows[j] if inside else _ZERO
+
+
+@_entry
+def backward(
+    weights,
+    transposed,
+    nothing,
+    settings,
+    tape,
+    noise,
+    component,
+    d_feature,
+    d_density,
+    d_noise,
+    d_frame,
+    d_input,
+    d_cell,
+):
+    """Pullback of `forward` by back-propagation through time: fills d_noise.
+
+    d_frame (batch, Z), d_input (2, batch, 2 W; the hidden state's half) and d_cell (2, batch, W) come in as zeros and
+    leave as gradients on the state. `transposed` is read for several particles only. `nothing` is a zero bias.
+    """
+    batch, width = len(noise), len(weights.fc2)
+    d_head = np.zeros((batch, weights.head.shape[1]), np.float32)
+    d_third, d_above = np.zeros((batch, width), np.float32), np.zeros((batch, width), np.float32)
+    d_gates, d_before = np.zeros((batch, 4 * width), np.float32), np.zeros_like(d_frame)
+    d_spread = np.zeros(settings.continuous, np.float32)
+    for t in range(noise.shape[1] - 1, -1, -1):
+        compose_pullback(settings, tape, noise, component, t, d_feature, d_density, d_frame, d_noise, d_head, d_spread)
+        for b in range(batch):
+            k, row = component[b, t], slice(b, b + 1)
+            affine_pullback(weights.head[k], transposed.head[k], nothing, d_head[row], d_third[row])
+        relu_pullback(d_third, tape.third[t], width)
+        affine_pullback(weights.fc3, transposed.fc3, nothing, d_third, d_above)
+        for layer in (1, 0):
+            above = d_above if layer == 1 else d_input[1]
+            lstm_cell_pullback(
+                above,
+                d_input[layer],
+                d_cell[layer],
+                tape.gates[t, layer],
+                tape.cell[t, layer],
+                tape.tanh_cell[t, layer],
+                d_gates,
+            )
+            affine_pullback(weights.lstm[layer], transposed.lstm[layer], nothing, d_gates, d_input[layer])
+        relu_pullback(d_input[0], tape.lstm_input[t, 0], width)
+        affine_pullback(weights.fc2, transposed.fc2, nothing, d_input[0], d_third)
+        relu_pullback(d_third, tape.first[t], width)
+        affine_pullback(weights.fc1, transposed.fc1, nothing, d_third, d_before)
+        for b in range(batch):
+            for j in range(d_frame.shape[1]):
+                d_frame[b, j] += d_before[b, j]
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +432,7 @@ class FastRollout:
 
     def __init__(self, model: LstmGmm, *, relative: "FastRollout | None" = None):
         """Pack the weights; those of a `relative` are taken where its model has the same, as a conditioned copy has."""
-        self._model, self._kernels = model, kernels
+        self._model = model
         self._config, self._layout = model.config, model.layout
         shared = relative if relative is not None and model.shares_weights(relative._model) else None
         self._weights = layout.pack_weights(model) if shared is None else shared._weights
@@ -148,7 +538,7 @@ class FastRollout:
         return tape
 
     def _roll(self, run: _KernelPass, source: int) -> None:
-        self._kernels.forward(
+        forward(
             self._weights,
             self._biases,
             self._settings,
@@ -183,7 +573,7 @@ class FastRollout:
         """Fill d_noise; return the gradients on the first slot of the tape."""
         on_state = (run.tape.frame[0], run.tape.lstm_input[0], run.tape.cell[0])
         d_frame, d_input, d_cell = (np.zeros_like(part) for part in on_state)
-        self._kernels.backward(
+        backward(
             self._weights,
             self._weights if len(run.noise) == 1 else self._transposed,
             self._zero_bias,

@@ -15,7 +15,7 @@ from mapctl.features import LAYOUT
 from mapctl.pose import BodyPose
 from mapctl.recording import Capture, CaptureProposal
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
-from priors.config import require_at_least
+from priors.checkpoints import require_at_least
 from priors.denoiser.network import DenoiserConfig, DenoiserNetwork
 from priors.training.augmentation.corruption import CorruptionSettings, corrupt, make_clean_capture
 from priors.training.augmentation.pose_windows import PoseVariation, vary_features
@@ -102,9 +102,7 @@ class DenoiserRecipe(NetworkRecipe[DenoiserConfig, DenoiserSettings, DenoiserTra
     kind = "denoiser"
     trainer_class = DenoiserTrainer
     config: DenoiserConfig = field(default_factory=DenoiserConfig)
-    """The network."""
     settings: DenoiserSettings = field(default_factory=DenoiserSettings)
-    """How it is trained."""
 
     def score(self, row: Row) -> float:
         """The loss of unseen windows."""

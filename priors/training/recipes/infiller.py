@@ -16,7 +16,7 @@ from torch.nn.functional import binary_cross_entropy_with_logits as cross_entrop
 
 from mapctl.errors import RequestError
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
-from priors.config import require_at_least
+from priors.checkpoints import require_at_least
 from priors.infiller.network import InfillerConfig, InfillerNetwork
 from priors.training.augmentation.corruption import Draws
 from priors.training.corpus import Corpus
@@ -201,9 +201,7 @@ class InfillerRecipe(NetworkRecipe[InfillerConfig, InfillerSettings, InfillerTra
     kind = "infiller"
     trainer_class = InfillerTrainer
     config: InfillerConfig = field(default_factory=InfillerConfig)
-    """The network."""
     settings: InfillerSettings = field(default_factory=InfillerSettings)
-    """How it is trained."""
 
     def score(self, row: Row) -> float:
         """Error of gaps in unseen windows over that of the guess, geometric mean over their lengths."""

@@ -11,7 +11,7 @@ from mapctl.errors import RequestError
 from mapctl.features import GroundPose
 from mapctl.inbetweening.pose_pairs import TRAVELLING_DISTANCE, PosePairs, sample_pose_pairs
 from mapctl.pose import decode
-from priors.config import require_at_least
+from priors.checkpoints import require_at_least
 from priors.keyframe_timing.model import KeyframeTimingConfig, KeyframeTimingNetwork
 from priors.training.corpus import Corpus, Split
 from priors.training.recipe import Export, Gathered, Recipe, Row, average_logarithms
@@ -84,9 +84,7 @@ class KeyframeTimingRecipe(Recipe[KeyframeTimingConfig, KeyframeTimingSettings, 
     kind = "keyframe-timing"
     uses_gpu = False
     config: KeyframeTimingConfig = field(default_factory=KeyframeTimingConfig)
-    """The regression."""
     settings: KeyframeTimingSettings = field(default_factory=KeyframeTimingSettings)
-    """How it is fitted."""
 
     def make_trainer(self, parts: Split) -> KeyframeTimingTrainer:
         """With the pairs of poses that it is fitted to."""

@@ -13,7 +13,7 @@ from torch.nn.functional import binary_cross_entropy_with_logits as cross_entrop
 from mapctl.inbetweening.partial_motion import PartialMotion
 from mapctl.inbetweening.root_trajectory import LocalMotion
 from mapctl.metrics.root_prediction import SPANS, average_displacement_errors, compute_displacement_errors
-from priors.config import require_at_least
+from priors.checkpoints import require_at_least
 from priors.training.augmentation.pose_windows import PoseVariation, PoseWindows, Variation, find_kind
 from priors.training.corpus import Corpus
 from priors.training.recipe import NetworkRecipe, Row, average_logarithms
@@ -100,9 +100,7 @@ class PathRecipe(NetworkRecipe[PathConfig, PathSettings, PathTrainer]):
     kind = "path"
     trainer_class = PathTrainer
     config: PathConfig = field(default_factory=PathConfig)
-    """The network."""
     settings: PathSettings = field(default_factory=PathSettings)
-    """How it is trained."""
 
     def score(self, row: Row) -> float:
         """Errors over unseen clips, cm, geometric mean over spans and the height."""

@@ -15,7 +15,7 @@ from mapctl.errors import RequestError
 from mapctl.inbetweening.partial_motion import EFFECTORS, KnownParts, PartialMotion
 from mapctl.numerics import gaussian
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
-from priors.config import require_at_least
+from priors.checkpoints import require_at_least
 from priors.pose_transformer.network import QUANTILES, PoseTransformerConfig, PoseTransformerNetwork, ProposedPoses
 from priors.training.augmentation.corruption import Draws
 from priors.training.augmentation.pose_windows import PoseVariation, PoseWindows, Variation, add_targets
@@ -313,9 +313,7 @@ class PoseTransformerRecipe(NetworkRecipe[PoseTransformerConfig, PoseTransformer
     kind = "pose-transformer"
     trainer_class = PoseTransformerTrainer
     config: PoseTransformerConfig = field(default_factory=PoseTransformerConfig)
-    """The network."""
     settings: PoseTransformerSettings = field(default_factory=PoseTransformerSettings)
-    """How it is trained."""
 
     def score(self, row: Row) -> float:
         """Error of unseen windows over the interpolation's, geometric mean over gaps and lost arms."""

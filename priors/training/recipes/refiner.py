@@ -18,7 +18,7 @@ from mapctl.metrics.realism import RealismSettings, canonical_positions, cut_win
 from mapctl.metrics.realism.classifier import compute_held_out_accuracy
 from mapctl.pose import decode
 from priors import checkpoints
-from priors.config import require_at_least
+from priors.checkpoints import require_at_least
 from priors.lstm_gmm import density
 from priors.lstm_gmm.density import LstmGmmDensity
 from priors.refiner.network import LstmRefiner, RefinerConfig, RefinerNetwork, compute_end_effectors, count_channels
@@ -231,9 +231,7 @@ class RefinerRecipe(Recipe[RefinerConfig, AdversarialSettings, AdversarialTraine
     keeps_best = True
     uses_gpu = False
     config: RefinerConfig = field(default_factory=RefinerConfig)
-    """The network."""
     settings: AdversarialSettings = field(default_factory=AdversarialSettings)
-    """How it is trained."""
     match: str | None = None
     """Regular expression for the clips; the density's own if None."""
     report_steps: int = 50

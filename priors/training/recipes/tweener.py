@@ -30,7 +30,7 @@ from mapctl.numerics.intervals import last_observed, next_observed, true_interva
 from mapctl.pose import BodyPose
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors import checkpoints
-from priors.config import require_at_least
+from priors.checkpoints import require_at_least
 from priors.training.augmentation.key_layouts import KeySequences, KeySettings, draw_splices, draw_windows
 from priors.training.augmentation.pose_windows import PoseWindows, find_kind
 from priors.training.corpus import Corpus, Split
@@ -352,9 +352,7 @@ class TweenerRecipe(NetworkRecipe[GeneratorConfig, TweenerSettings, TweenerTrain
 
     kind = "tweener"
     config: GeneratorConfig = field(default_factory=GeneratorConfig)
-    """The network."""
     settings: TweenerSettings = field(default_factory=TweenerSettings)
-    """How it is trained."""
     path: str = "path"
     """The path predictor that sees where the hips go, bundled or trained."""
     labels: str = LABELS
