@@ -1,6 +1,5 @@
 """`mapctl compile`: everything that is compiled once, now."""
 
-import os
 import time
 from dataclasses import dataclass
 from typing import ClassVar
@@ -14,7 +13,6 @@ from mapctl.commands.shared.command import ModelCommand
 from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.commands.shared.shots import parse_follow, walk
 from mapctl.intent.steering import Command
-from mapctl.numerics import compilation, jit
 
 
 @dataclass(frozen=True)
@@ -30,18 +28,11 @@ class CompileKernels(ModelCommand):
 
 def run(command: CompileKernels) -> int:
     """Move a character for a moment in every way that has kernels of its own, which compiles those not yet on disk."""
-    made: list[int] = []
-
-    def note(number: int, total: int, begins: bool) -> None:
-        if not begins:
-            made.append(number)
-
     start = time.perf_counter()
-    with compilation.tell(note), show_progress("trying kernels", quiet=command.quiet):
+    with show_progress("trying kernels", quiet=command.quiet):
         _use_kernels()
     if not command.quiet:
-        print(f"kernels   {len(made)} compiled, {time.perf_counter() - start:.1f} s")
-        print(f"kept in   {_describe_place(jit.find_folders())}")
+        print(f"kernels are compiled, {time.perf_counter() - start:.1f} s")
     return 0
 
 
@@ -52,9 +43,3 @@ def _use_kernels() -> None:
     state, _ = steer.begin(prior, ahead, generator=generator)
     steer.step(state, ahead)
     prior.sample(prior.initial_states.state.pick(torch.tensor([0])), 1, generator)
-
-
-def _describe_place(folders: set[str]) -> str:
-    if not folders:
-        return "no folder: none can be written to; name one in NUMBA_CACHE_DIR"
-    return os.path.commonpath(folders)

@@ -5,7 +5,7 @@ import json
 import pytest
 from helpers import run
 
-from mapctl.commands.bench import run as bench
+from mapctl.commands import bench
 
 
 @pytest.mark.slow

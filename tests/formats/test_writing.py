@@ -137,18 +137,3 @@ def test_a_command_says_it_in_one_line(tmp_path, prior, monkeypatch, capsys, req
     place = Path("new/folder/generated_000.bvh")
     assert (told.out, told.err) == ("", f"mapctl: cannot write {place}: File too large\n")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_compiled_code_that_finds_no_room_works(tmp_path, monkeypatch):
-    from numba.core.caching import FunctionCache
-
-    from mapctl.numerics.jit import make_jit_decorators
-
-    monkeypatch.setattr(FunctionCache, "save_overload", _no_space)
-    monkeypatch.setattr(FunctionCache, "load_overload", lambda *words: None)
-    entry, _ = make_jit_decorators()
-    assert entry(_doubled)(21) == 42
-
-
-def _doubled(number):
-    return 2 * number

@@ -44,18 +44,14 @@ def conclude(status: "Status", *, strict: bool) -> int:
 
 
 class Command:
-    """Base of the frozen dataclasses of options. The function `run` beside them, or a package's module `run`, does the
-    work."""
+    """Base of the frozen dataclasses of options; the function `run` beside them does the work."""
 
     def run(self) -> int:
         """Do the work and return the exit status; MapctlError for what is wrong with the request."""
-        module = import_module(type(self).__module__)
-        work = getattr(module, "run", None)
-        work = work if callable(work) else import_module(f"{module.__name__}.run").run
         if not gc.isenabled():
             gc.freeze()
             gc.enable()
-        return work(self)
+        return import_module(type(self).__module__).run(self)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,46 +6,38 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from mapctl.errors import WriteError
-from mapctl.numerics import compilation
-from mapctl.runtime import progress
+from mapctl.runtime.progress import Progress
 
 LINES = "MAPCTL_PROGRESS"
 """Environment variable that asks for lines `progress DONE/TOTAL LABEL` on standard error."""
 
 
-_COMPILING = "compiling kernels, once"
-
-
 @contextmanager
-def show_progress(label: str, *, quiet: bool = False) -> Iterator[progress.Progress | None]:
+def show_progress(label: str, *, quiet: bool = False) -> Iterator[Progress | None]:
     """Yield a function that moves a bar on standard error; None where there is no terminal, or with `quiet`. Where the
-    environment variable MAPCTL_PROGRESS is set to something, it writes a line for each hundredth instead. Kernels that
-    must be compiled, which takes seconds, have a bar of their own.
+    environment variable MAPCTL_PROGRESS is set to something, it writes a line for each hundredth instead.
     """
     if os.environ.get(LINES):
-        write = _write_lines(_COMPILING)
-        with compilation.tell(lambda number, total, begins: write(number - begins, total)):
-            yield _write_lines(label)
+        yield _write_lines(label)
         return
     if quiet or not sys.stderr.isatty():
         yield None
         return
+    from rich import progress
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    with Progress(*columns, console=Console(stderr=True), transient=True) as shown:
-        compiling = shown.add_task(_COMPILING, visible=False)
+    columns = (
+        progress.TextColumn("{task.description}"),
+        progress.BarColumn(),
+        progress.MofNCompleteColumn(),
+        progress.TimeRemainingColumn(),
+    )
+    with progress.Progress(*columns, console=Console(stderr=True), transient=True) as shown:
         task = shown.add_task(label, total=None)
-
-        def tell(number: int, total: int, begins: bool) -> None:
-            shown.update(compiling, completed=number - begins, total=total, visible=begins, refresh=True)
-
-        with compilation.tell(tell):
-            yield lambda done, total: shown.update(task, completed=done, total=total)
+        yield lambda done, total: shown.update(task, completed=done, total=total)
 
 
-def _write_lines(label: str) -> progress.Progress:
+def _write_lines(label: str) -> Progress:
     last = -1
 
     def write(done: int, total: int) -> None:

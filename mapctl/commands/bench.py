@@ -1,9 +1,10 @@
-"""Measure and print what the solver and walks cost; one thread, no model is judged here (see `tests/benchmarks`)."""
+"""`mapctl bench`: cost of the solver and of walks on this machine; no model is judged here (see `tests/benchmarks`)."""
 
 import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 
@@ -12,7 +13,8 @@ from controllers.common.initial_state import select_initial_state
 from controllers.following.follow import FollowSettings, build_follow_terms, follow
 from controllers.steering import steer
 from mapctl import curves, report
-from mapctl.commands.bench import Bench
+from mapctl.commands.shared import options
+from mapctl.commands.shared.command import ModelCommand
 from mapctl.commands.shared.tables import print_table
 from mapctl.features import LAYOUT, PRIOR_FPS
 from mapctl.intent.steering import Command
@@ -25,6 +27,20 @@ from mapctl.skeleton import CANONICAL
 
 Row = dict[str, object]
 _SPEED = 1.2  # m/s of every walk
+
+
+@dataclass(frozen=True)
+class Bench(ModelCommand):
+    """Cost on this machine: energy and gradient of a window, fast path and reference; following a curve; steering."""
+
+    tells_licence: ClassVar[bool] = False
+
+    prior: options.Name = "locomotion"
+    """A bundled prior, or the file or run folder of a trained one."""
+    live: options.Name = "locomotion-live"
+    """The prior that is steered: a bundled one, or the file or run folder of a trained one."""
+    json: bool = False
+    """Print JSON instead of a table."""
 
 
 @dataclass(frozen=True)
