@@ -20,8 +20,17 @@ from mapctl.pose import BodyPose
 from mapctl.protocols import Inbetweener
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors import checkpoints
-from priors.stitching.network import DrawnLatents, StitcherConfig, StitcherNetwork
-from priors.stitching.sides import Ends, Joined, count_made, join_sides, walk_sides, walk_stepwise
+from priors.stitching.network import (
+    DrawnLatents,
+    Ends,
+    Joined,
+    StitcherConfig,
+    StitcherNetwork,
+    count_made,
+    join_sides,
+    walk_sides,
+    walk_stepwise,
+)
 
 CHUNK = 16
 """Draws at once: batches of one size are rounded alike, so that the first draws do not depend on the count."""

@@ -27,8 +27,7 @@ from mapctl.errors import CheckpointError, RequestError
 from mapctl.formats.atomic import check_folder, write_text
 from priors import checkpoints
 from priors.checkpoints import write_tensors
-from priors.training.recipe import C, Gathered, Progress, Recipe, Row, S, T, ignore_line
-from priors.training.trainer import select_prefixed, use_device
+from priors.training.recipe import C, Gathered, Progress, Recipe, Row, S, T, ignore_line, select_prefixed, use_device
 
 CHECKPOINT, LOSSES, EVENTS = "checkpoint.safetensors", "losses.csv", "tensorboard"
 """Files and folder of a run folder."""

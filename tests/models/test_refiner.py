@@ -80,23 +80,6 @@ def test_pieces_of_any_sizes_give_the_whole(sizes, lookahead, piece):
     torch.testing.assert_close(torch.cat(streamed, dim=1), refiner.refine(features), atol=1e-9, rtol=0)
 
 
-def test_a_stream_runs_no_further_behind_than_its_look_ahead():
-    seen = 0
-
-    def frame_by_frame():
-        nonlocal seen
-        for frame in clips().split(1, dim=1):
-            seen += 1
-            yield frame
-
-    lags, out = [], 0
-    for piece in refiner_of().stream(frame_by_frame()):
-        out += piece.shape[1]
-        lags.append(seen - out)
-    assert out == 40
-    assert lags == [2] * 38 + [0]  # all of the rest at the end, where nothing follows
-
-
 @pytest.mark.parametrize("lookahead", [0, 1, 3])
 @pytest.mark.parametrize("changed", [1, 20, 39])
 def test_a_frame_sees_the_past_and_its_look_ahead_but_nothing_later(changed, lookahead):

@@ -16,10 +16,8 @@ from controllers.inbetweening.tween import tween
 from mapctl.inbetweening.effector_targets import EffectorTargets
 from mapctl.inbetweening.missing import MissingMask
 from mapctl.intent.keyframes import Keys
-from mapctl.kinematics import heading
-from mapctl.rotations import about_y, multiply, rotate
-from priors.stitching.inbetweener import Wishes, fit_shared
-from priors.stitching.sides import Joined
+from priors.stitching.inbetweener import fit_shared
+from priors.stitching.network import Joined
 
 RAW = InfillSettings(finish=False)
 GAP = slice(21, 40)
@@ -97,25 +95,6 @@ def test_then_limbs_and_the_body_bend_until_it_is_met():
     )
     assert miss(query, done.motion) < 1e-3
     assert [source.by for source in done.sources] == ["stitcher"]
-
-
-def test_hips_that_are_told_are_wished_for_where_they_are_and_as_they_face():
-    """A metre off is as much as 3.3 radians, and a sigma is 2 cm of either."""
-    motion, frame, aside, turn = walk(60), 30, 0.2, 0.5
-    query = query_of(motion, (GAP.start, GAP.stop))
-    joints, roots = query.missing.joints.clone(), query.missing.root.clone()
-    joints[frame, 0] = roots[frame] = False
-    wishes = Wishes.of(replace(query, missing=MissingMask(joints, roots)), GAP.start, GAP.stop)
-    facing, at = heading(motion.local_quat_xyzw[GAP.start - 1, 0]), motion.root_position[GAP.start - 1]
-    frames = len(motion.root_position[GAP])
-    root = rotate(about_y(-facing).expand(frames, 4), motion.root_position[GAP] - at * torch.tensor([1.0, 0.0, 1.0]))
-    quats = motion.local_quat_xyzw[GAP].clone()
-    quats[:, 0] = multiply(about_y(turn - facing).expand(frames, 4), quats[:, 0])
-    root[:, 0] += aside
-    joined = Joined(root[None].float(), quats[None].float(), torch.zeros(1, frames, 2), torch.zeros(1))
-    expected = torch.tensor([[aside / 0.02, 0.0, 0.0, 0.3 * turn / 0.02]])
-    torch.testing.assert_close(wishes.measure(joined), expected, atol=0.07, rtol=0)  # its bones are not quite those
-    assert wishes.measure_farthest(joined) == pytest.approx(aside, abs=1e-3)
 
 
 @pytest.mark.slow

@@ -14,8 +14,7 @@ from mapctl.inbetweening.missing import MissingMask
 from mapctl.recording.masks import ALL, Mask
 from mapctl.retarget import to_canonical
 from priors.stitching.inbetweener import Draws, see_ends
-from priors.stitching.network import DrawnLatents
-from priors.stitching.sides import count_made, join_sides, walk_sides
+from priors.stitching.network import DrawnLatents, count_made, join_sides, walk_sides
 
 PRINTED = replace(CONFIG, shared=0, own=4, printed=True)
 each_length = pytest.mark.parametrize("frames", [2, 3, 4, 5, 8, 15, 24])

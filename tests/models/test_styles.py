@@ -10,7 +10,7 @@ from helpers import corpus, generator
 from mapctl.errors import CheckpointError, RequestError
 from mapctl.motion_dna import MotionDna
 from priors.training.recipes.tweener import collect_dna, compute_classes, group_clips
-from priors.tweening.styles import Style, count_clips, draw_style, encode_classes, find_class, pick_class, read_classes
+from priors.tweening.styles import Style, count_clips, encode_classes, find_class, pick_class, read_classes
 
 
 @pytest.mark.parametrize(
@@ -75,23 +75,3 @@ def test_an_unknown_class_is_told_with_the_nearest():
         pick_class(known, "wavelefthand")
     with pytest.raises(RequestError, match="know no classes"):
         pick_class({}, "walk")
-
-
-def test_styles_are_drawn_one_after_the_other_then_by_parts():
-    poses = torch.randn(6, 21, 3, generator=generator())
-    styles = [Style("a", torch.zeros(5), poses), Style("b", torch.ones(5)), Style("c", 2 * torch.ones(5))]
-
-    def encode(dna, name):
-        return Style(name, dna.poses.mean().expand(5), dna.poses)
-
-    def drawn(number, seed=0, of=styles):
-        return draw_style(of, number, encode, order=range(len(of))[::-1], generator=generator(seed))
-
-    assert [drawn(number).name for number in range(3)] == ["c", "b", "a"]
-    assert drawn(3).name in ("c and a", "c and b")
-    assert drawn(5).name == "a, 3 of its poses"
-    assert not torch.equal(drawn(5).vector, drawn(5, seed=1).vector)
-    assert torch.equal(drawn(5).vector, drawn(5).vector)
-    assert len(drawn(0, of=styles[:1]).poses) == 3  # one file: never all of it, which is the first variation
-    with pytest.raises(RequestError, match="the class b alone leaves nothing to vary"):
-        drawn(0, of=styles[1:2])

@@ -22,7 +22,6 @@ from mapctl.protocols import Inbetweener
 from mapctl.recording.masks import ALL, Mask
 from mapctl.retarget import to_canonical
 from mapctl.skeleton import CANONICAL
-from priors.tweening.inbetweener import keep_feet
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,24 +73,6 @@ def test_hips_that_tremble_are_led_calmly():
     told = torch.diff(shaken.root_position, n=3, dim=0)[10:-10].norm()
     assert float(trembling) < 0.4 * float(told)
     assert float(calm) < float(trembling)
-
-
-def test_planted_feet_stay_where_the_hips_were_calmed():
-    """And feet in the air go with the hips."""
-    motion, query = walk(60), query_of(walk(60), (1, 59))
-    away = torch.tensor([0.01, -0.005, 0.012]).double() * (-1.0) ** torch.arange(60)[:, None]
-    calm = replace(motion, root_position=motion.root_position - away)
-    planted = torch.zeros(60, 2).double()
-    planted[20:40, 0] = 1
-    kept = keep_feet(calm, away, planted, query).joint_positions()
-    ankles = [CANONICAL.index("leftFoot"), CANONICAL.index("rightFoot")]
-    off = (kept - motion.joint_positions())[:, ankles].norm(dim=-1)
-    assert float(off[20:40, 0].max()) < 4e-3  # a leg that is stretched reaches no further
-    assert float(off[20:40, 0].median()) < 1e-3
-    assert float(off[20:40, 1].min()) > 0.01
-    assert float(off[:20, 0].min()) > 0.01
-    hands = CANONICAL.index("leftHand")
-    torch.testing.assert_close(kept[:, hands], calm.joint_positions()[:, hands])
 
 
 def test_hips_go_where_the_path_predictor_sees_them_go_and_arrive():

@@ -5,13 +5,13 @@ from functools import partial
 
 import pytest
 import torch
-from helpers import corpus, write_corpus
+from helpers import write_corpus
 
 import priors
 from priors.lstm_gmm.network import LstmGmmConfig
 from priors.training import run
 from priors.training.recipes import lstm_gmm
-from priors.training.recipes.lstm_gmm import DensityRecipe, DensityTrainer, TrainingSettings
+from priors.training.recipes.lstm_gmm import DensityRecipe, TrainingSettings
 
 TINY = LstmGmmConfig(width=8, components=2)
 SETTINGS = TrainingSettings(steps=6, batch=4, window=20)
@@ -40,12 +40,3 @@ def test_fine_tuning_begins_with_the_priors_weights_statistics_and_labels(tmp_pa
         torch.testing.assert_close(after.reference.state_dict()[name], value, atol=2e-3, rtol=1e-3)
     assert torch.equal(after.feature_std, before.feature_std)
     assert after.card.data["init"] == {"name": first.name, "licence": before.card.licence}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("bfloat16", [False, True])
-def test_both_precisions_learn_and_keep_their_weights_in_float32(bfloat16):
-    trainer = DensityTrainer(TINY, replace(SETTINGS, steps=400, learning_rate=5e-3, bfloat16=bfloat16), corpus())
-    losses = [trainer.train_step()["loss"] for _ in range(60)]
-    assert sum(losses[-5:]) < sum(losses[:5]) - 10
-    assert {weight.dtype for weight in trainer.network.parameters()} == {torch.float32}

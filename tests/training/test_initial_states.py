@@ -39,18 +39,6 @@ def test_abilities_are_the_speeds_and_turns_of_the_data():
     assert measure_data_limits(still).turn_rate == 0
 
 
-def test_starts_weigh_as_much_as_the_data_has_of_their_speed():
-    data, model = corpus(5), tiny_network()
-    found = select_initial_states(model, data, count=5, generator=generator())
-    assert float(found.weight.sum()) == pytest.approx(1)
-    assert found.weight.tolist() == pytest.approx([0.2] * 5)  # each walk has a speed of its own, and all are as long
-    longer = Corpus(
-        data.names, (*data.lengths[:-1], data.lengths[-1] + 100), torch.cat([data.features, data.features[-100:]])
-    )
-    weight = select_initial_states(model, longer, count=5, generator=generator()).weight
-    assert sorted(weight.tolist()) == pytest.approx([1 / 6] * 4 + [2 / 6])
-
-
 def walks_and_runs() -> tuple[Corpus, torch.Tensor]:
     """Fifteen clips: nine of a kind, five of another, one of a third."""
     walks = corpus(5)

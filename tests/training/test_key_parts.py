@@ -36,27 +36,6 @@ def test_whole_keys_tell_everything():
     assert bool(found.view.isnan().all())
 
 
-def test_halves_tell_the_hips_and_what_hangs_on_them():
-    found, known = told(halves=1.0)
-    axes = found.axes[known]
-    assert bool(axes[:, 0].all())
-    assert bool(found.heading[known].all())
-    legs, arms = axes[:, LEGS].all(dim=-1).all(dim=-1), axes[:, ARMS].all(dim=-1).all(dim=-1)
-    for some in (legs & arms, legs & ~arms, arms & ~legs, ~arms & ~legs):
-        assert 0.05 < float(some.float().mean()) < 0.6
-    parent = torch.tensor(CANONICAL.parents[1:])
-    assert not bool((axes[:, 1:].any(dim=-1) & ~axes[:, parent].any(dim=-1)).any())
-
-
-def test_places_tell_where_the_hips_are_over_the_ground_and_no_heading():
-    found, known = told(places=1.0)
-    bare = known & ~found.heading
-    assert 0.4 < float(bare.sum() / known.sum()) < 1
-    assert bool(found.axes[bare][:, 0, ::2].all())
-    assert int(found.axes[bare].sum()) == 2 * int(bare.sum())
-    assert bool(found.axes[known & found.heading].all())
-
-
 def test_drawings_tell_no_depth_and_are_seen_from_one_side():
     found, known = told(drawings=1.0)
     drawn = found.known & ~found.heading

@@ -12,8 +12,8 @@ from mapctl.features import LAYOUT, GroundPose, encode
 from mapctl.pose import decode
 from priors.refiner.network import RefinerConfig
 from priors.training.corpus import Corpus
+from priors.training.recipe import HistoryBuffer
 from priors.training.recipes.refiner import AdversarialSettings, AdversarialTrainer, compute_root_error
-from priors.training.trainer import HistoryBuffer
 
 TINY = RefinerConfig(width=8, memory=6, lookahead=1, joints=("hips", "leftHand", "rightToes"))
 SHORT = {"steps": 5, "window": 12, "batch": 4, "warm_up": 2, "head_start": 0, "critic_updates": 1, "history": 10}

@@ -19,8 +19,8 @@ from mapctl.commands.train import KINDS
 from mapctl.errors import CheckpointError, MapctlError, RequestError
 from priors import checkpoints
 from priors.training import run as runs
+from priors.training.recipe import warmup_cosine
 from priors.training.run import train
-from priors.training.trainer import warmup_cosine
 
 pytestmark = pytest.mark.usefixtures("small_judgements")
 NAMES = list_params(MODELS)

@@ -9,15 +9,12 @@ import torch
 from helpers import corpus, write_corpus
 
 import priors
-from mapctl.errors import RequestError
-from priors.stitching.network import DrawnLatents
-from priors.stitching.sides import count_made, join_sides, walk_sides
+from priors.stitching.network import DrawnLatents, count_made, join_sides, walk_sides
 from priors.training.recipes import stitcher as recipe_module
 from priors.training.recipes.stitcher import (
     TEMPERATURES,
     TRIES,
     Known,
-    Shares,
     StitcherRecipe,
     StitcherSettings,
     Transition,
@@ -86,9 +83,3 @@ def test_a_run_writes_the_temperature_that_it_finds(tmp_path, monkeypatch):
     settings = replace(SETTINGS, steps=2)
     train(StitcherRecipe(data, tmp_path / "run", config=tiny_stitcher.CONFIG, settings=settings))
     assert float(priors.load_stitcher(str(tmp_path / "run")).network.temperature) == 2.5
-
-
-@pytest.mark.parametrize("shares", [Shares(-0.1, 0.5, 0.2), Shares(0.6, 0.4, 0.1), Shares(0.0, 0.0, 0.0)])
-def test_shares_that_are_none_are_refused(shares):
-    with pytest.raises(RequestError, match="shares of a batch"):
-        StitcherSettings(shares=shares)

@@ -36,20 +36,6 @@ def test_windows_are_clips_mirrored_half_of_the_time():
     assert not torch.equal(drawn, drawn_of(whole, plain, seed=1))
 
 
-def test_small_folders_are_drawn_more_often_where_evenness_asks_for_it():
-    clip = corpus(1, 60).features
-    uneven = Corpus(
-        ("big/a", "big/b", "big/c", "small/d"), (60, 60, 60, 30), torch.cat([clip, clip, clip, clip[:30] + 100])
-    )
-
-    def share(evenness):
-        windows = drawn_of(uneven, replace(SETTINGS, poses=FAMILIAR, batch=600, evenness=evenness))
-        return float((windows[:, 0, LAYOUT.slices["root_height"]] > 50).double().mean())
-
-    assert share(0.0) == pytest.approx(0.1, abs=0.05)
-    assert share(1.0) == pytest.approx(0.5, abs=0.07)
-
-
 def test_a_rig_calibrated_otherwise_stands_as_still(monkeypatch):
     """Joint frames turned by a constant: what does not move still does not, the hips' place stays."""
     still = corpus(1, 16).features[:1].expand(16, -1).contiguous()

@@ -20,10 +20,8 @@ from priors.training.recipes.pose_transformer import (
     PoseTransformerRecipe,
     PoseTransformerSettings,
     PoseTransformerTrainer,
-    calibrate_spread,
     compute_losses,
     hide,
-    measure_coverage,
 )
 
 SETTINGS = PoseTransformerSettings(steps=6, batch=100, window=32)
@@ -88,23 +86,6 @@ def test_the_loss_falls_on_windows_that_it_sees_again_and_again():
     for name in ("loss", "places_cm", "contacts_nats"):
         assert rows[-1][name] < 0.9 * rows[0][name], name
     assert all(math.isfinite(value) for row in rows for value in row.values())
-
-
-@pytest.mark.slow
-def test_the_spread_learns_alone_and_is_calibrated():
-    trainer = PoseTransformerTrainer(CONFIG, SETTINGS, corpus(2, 60))
-    truth = windows_of(corpus(2, 60))
-    parts = compute_losses(trainer.network, truth, with_gap(truth, 8, 30), SETTINGS)
-    parts["spread"].backward()
-    touched = {
-        name for name, weight in trainer.network.named_parameters() if weight.grad is not None and weight.grad.any()
-    }
-    assert touched
-    assert all(name.startswith("spread.") for name in touched)
-    calibrate_spread(trainer, corpus(2, 80))
-    covered = measure_coverage(trainer, corpus(2, 80))
-    assert covered["within_50%"] == pytest.approx(0.5, abs=0.12)
-    assert covered["within_90%"] == pytest.approx(0.9, abs=0.08)
 
 
 @pytest.mark.slow

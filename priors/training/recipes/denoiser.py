@@ -20,8 +20,7 @@ from priors.denoiser.network import DenoiserConfig, DenoiserNetwork
 from priors.training.augmentation.corruption import CorruptionSettings, corrupt, make_clean_capture
 from priors.training.augmentation.pose_windows import PoseVariation, vary_features
 from priors.training.corpus import Corpus
-from priors.training.recipe import NetworkRecipe, Row, average_logarithms
-from priors.training.trainer import GradientTrainer, make_generator
+from priors.training.recipe import GradientTrainer, NetworkRecipe, Row, average_logarithms, make_generator
 from priors.training.windows import FeatureWindows
 
 _TOES = list(TOE_JOINTS)

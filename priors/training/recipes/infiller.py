@@ -20,8 +20,7 @@ from priors.checkpoints import require_at_least
 from priors.infiller.network import InfillerConfig, InfillerNetwork
 from priors.training.augmentation.corruption import Draws
 from priors.training.corpus import Corpus
-from priors.training.recipe import NetworkRecipe, Row, average_logarithms
-from priors.training.trainer import GradientTrainer, make_generator
+from priors.training.recipe import GradientTrainer, NetworkRecipe, Row, average_logarithms, make_generator
 from priors.training.windows import PositionWindows, Window
 
 _JOINTS = CANONICAL.num_joints

@@ -14,8 +14,7 @@ from mapctl.pose import decode
 from priors.checkpoints import require_at_least
 from priors.keyframe_timing.model import KeyframeTimingConfig, KeyframeTimingNetwork
 from priors.training.corpus import Corpus, Split
-from priors.training.recipe import Export, Gathered, Recipe, Row, average_logarithms
-from priors.training.trainer import Trainer
+from priors.training.recipe import Export, Gathered, Recipe, Row, Trainer, average_logarithms
 
 _PERCENTILES = (0.1, 0.9)  # between which four of five pairs lie
 

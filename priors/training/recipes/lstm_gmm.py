@@ -45,10 +45,14 @@ from priors.training.augmentation.clip_copies import ClipCopies, add_copies
 from priors.training.augmentation.splices import Splices, add_splices, drop_splices, hide_splices
 from priors.training.corpus import Corpus, Split, follow_paces, measure_pace_changes
 from priors.training.moment_matching import MatchingSettings, moment_loss, run_free
-from priors.training.recipe import Export, Gathered, Progress, Recipe, Row
-from priors.training.trainer import (
+from priors.training.recipe import (
+    Export,
+    Gathered,
     GradientTrainer,
     HistoryBuffer,
+    Progress,
+    Recipe,
+    Row,
     draw_weights,
     make_divergence_error,
     make_generator,

@@ -16,8 +16,7 @@ from mapctl.metrics.root_prediction import SPANS, average_displacement_errors, c
 from priors.checkpoints import require_at_least
 from priors.training.augmentation.pose_windows import PoseVariation, PoseWindows, Variation, find_kind
 from priors.training.corpus import Corpus
-from priors.training.recipe import NetworkRecipe, Row, average_logarithms
-from priors.training.trainer import GradientTrainer, make_generator
+from priors.training.recipe import GradientTrainer, NetworkRecipe, Row, average_logarithms, make_generator
 from priors.tweening.path import PathConfig, PathNetwork
 
 _VALIDATED = ("V1", "V8", "V32", "V64", "Y")

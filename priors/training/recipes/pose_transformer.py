@@ -20,8 +20,16 @@ from priors.pose_transformer.network import QUANTILES, PoseTransformerConfig, Po
 from priors.training.augmentation.corruption import Draws
 from priors.training.augmentation.pose_windows import PoseVariation, PoseWindows, Variation, add_targets
 from priors.training.corpus import Corpus
-from priors.training.recipe import Export, Gathered, NetworkRecipe, Row, average_logarithms
-from priors.training.trainer import GradientTrainer, make_adam, make_generator
+from priors.training.recipe import (
+    Export,
+    Gathered,
+    GradientTrainer,
+    NetworkRecipe,
+    Row,
+    average_logarithms,
+    make_adam,
+    make_generator,
+)
 
 _JOINTS = CANONICAL.num_joints
 _TRUNK = CANONICAL.indices(("spine", "chest", "neck", "head"))

@@ -27,17 +27,30 @@ from priors.stitching.network import (
     POSE,
     SEEN_FUTURE,
     DrawnLatents,
+    Ends,
     Gaussian,
+    Joined,
+    Latents,
     PosteriorNetwork,
+    Sides,
     StitcherConfig,
     StitcherNetwork,
+    count_made,
+    join_sides,
     multiply_in_bfloat16,
+    walk_sides,
 )
-from priors.stitching.sides import Ends, Joined, Latents, Sides, count_made, join_sides, walk_sides
 from priors.training.augmentation.pose_windows import WindowPicker
 from priors.training.corpus import Corpus, Split
-from priors.training.recipe import Export, Gathered, NetworkRecipe, Row, average_logarithms
-from priors.training.trainer import GradientTrainer, make_generator
+from priors.training.recipe import (
+    Export,
+    Gathered,
+    GradientTrainer,
+    NetworkRecipe,
+    Row,
+    average_logarithms,
+    make_generator,
+)
 
 
 class Known(NamedTuple):

@@ -34,8 +34,15 @@ from priors.checkpoints import require_at_least
 from priors.training.augmentation.key_layouts import KeySequences, KeySettings, draw_splices, draw_windows
 from priors.training.augmentation.pose_windows import PoseWindows, find_kind
 from priors.training.corpus import Corpus, Split
-from priors.training.recipe import Export, Gathered, NetworkRecipe, Row, average_logarithms
-from priors.training.trainer import GradientTrainer, make_generator
+from priors.training.recipe import (
+    Export,
+    Gathered,
+    GradientTrainer,
+    NetworkRecipe,
+    Row,
+    average_logarithms,
+    make_generator,
+)
 from priors.tweening import path as path_predictor
 from priors.tweening.generator import GeneratorConfig, GeneratorNetwork, regularise_batch
 from priors.tweening.keys import ToldParts, make_key_image
