@@ -8,14 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from mapctl.formats.character import (
-    RestFrames,
-    UnevenScaleError,
-    chain_matrices,
-    compose_matrices,
-    nearest_rotations,
-    split_scale,
-)
+from mapctl.formats.character import RestFrames, UnevenScaleError, chain_matrices
 
 PARENTS = (-1, 0, 1, 1, 3)
 NAMES = ("a", "b", "c", "d", "e")
@@ -66,13 +59,6 @@ def test_locals_come_back(seed):
     )
 
 
-def test_no_rotation_is_the_rest_pose():
-    frames, _, _ = example(3)
-    motion = frames.to_motion(frames.matrices()[None], Fraction(30), frames.skeleton({}), None)
-    np.testing.assert_allclose(motion.local_quat_xyzw[..., 3].abs().numpy(), 1.0, atol=1e-12)
-    np.testing.assert_allclose(motion.joint_positions()[0].numpy(), frames.positions, atol=1e-12)
-
-
 def test_a_joint_that_moves_within_its_parent_is_kept():
     frames, local, _ = example(5)
     local = local.copy()
@@ -104,38 +90,6 @@ def test_uneven_scale_is_told_with_its_joint(linear, why):
     worlds[1, :3, :3] = linear
     with pytest.raises(UnevenScaleError, match=f"joint b: .*{why}"):
         RestFrames.of(("a", "b", "c"), (-1, 0, 1), worlds, np.eye(4))
-
-
-@given(st.integers(0, 2**32 - 1))
-@settings(max_examples=20, deadline=None)
-def test_rotation_and_scale_of_a_matrix(seed):
-    random = np.random.default_rng(seed)
-    turn, scale = Rotation.random(rng=random).as_matrix(), float(random.uniform(0.01, 100))
-    matrix = np.eye(4)
-    matrix[:3, :3] = scale * turn
-    found = split_scale(matrix)
-    np.testing.assert_allclose(found[0], turn, atol=1e-9)
-    assert found[1] == pytest.approx(scale)
-    noisy = turn + random.normal(scale=1e-4, size=(3, 3))
-    assert np.linalg.det(nearest_rotations(noisy)) == pytest.approx(1.0)
-    np.testing.assert_allclose(nearest_rotations(noisy), turn, atol=1e-3)
-
-
-def test_parts_make_the_matrix_that_scipy_makes():
-    random = np.random.default_rng(0)
-    quat = Rotation.random(5, rng=random).as_quat()
-    moved, scale = random.normal(size=(5, 3)), random.uniform(0.5, 2, (5, 3))
-    found = compose_matrices(moved, quat, scale)
-    for k in range(5):
-        point = random.normal(size=3)
-        wanted = Rotation.from_quat(quat[k]).apply(scale[k] * point) + moved[k]
-        np.testing.assert_allclose((found[k] @ [*point, 1.0])[:3], wanted, atol=1e-12)
-
-
-def test_aligned_frames_are_told():
-    worlds = np.tile(np.eye(4), (2, 1, 1))
-    assert RestFrames.of(("a", "b"), (-1, 0), worlds, np.eye(4)).are_aligned
-    assert not example(0)[0].are_aligned
 
 
 @pytest.mark.parametrize("mirror", [(-1, -1, -1), (1, 1, -1), (-0.5, 0.5, 0.5)])

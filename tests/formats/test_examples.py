@@ -69,19 +69,3 @@ def test_an_example_that_there_is_not_is_named_in_one_line(tmp_path, capsys):
         mapctl.load("example:run")
     assert run("denoise", "example:run", "-o", tmp_path / "out.bvh") == 2
     assert capsys.readouterr().err.count("\n") == 1
-
-
-@pytest.mark.slow
-def test_its_script_makes_it_anew_and_denoising_brings_it_back(tmp_path):
-    """On this machine or another: rounding moves the walk by little, and seeds keep the noise."""
-    clean = make_example.make_walk(tmp_path)
-    made, shipped = make_example.spoil(clean), mapctl.load(NAME)
-    assert made.num_frames == shipped.num_frames
-    assert error(made, shipped) < 2
-    assert run("denoise", NAME, "-o", tmp_path / "clean.bvh", "--weights", "free") == 0
-    assert error(mapctl.load(tmp_path / "clean.bvh"), clean) < 0.4 * error(shipped, clean)
-
-
-def error(motion, other) -> float:
-    """Mean distance of the joints, centimetres."""
-    return 100 * float((motion.joint_positions() - other.joint_positions()).norm(dim=-1).mean())

@@ -363,12 +363,6 @@ def test_a_vrma_is_as_its_specification_says(kind, tmp_path):
         assert at[f"{side}Toes"][2] > at[f"{side}Foot"][2]
 
 
-def test_bones_that_travel_are_noted(tmp_path, capsys):
-    track = torch.full((5, 3), 0.3, dtype=torch.float64)
-    replace(walk(5), moving_offsets={CANONICAL.index("leftHand"): track}).save(tmp_path / "out.vrma")
-    assert "only the hips of a .vrma travel" in capsys.readouterr().err
-
-
 def test_a_motion_whose_bones_are_not_known_is_refused(tmp_path):
     with pytest.raises(RequestError, match=r"a \.vrma needs the motion of a VRM or of canonical joints"):
         formats.load(make_animated(tmp_path, "mixamo").path).save(tmp_path / "out.vrma")
