@@ -7,9 +7,9 @@ from test_stitcher import query_of
 from tiny_stitcher import tiny_stitcher
 
 from controllers.inbetweening.pipeline import InfillSettings
-from controllers.inbetweening.proposers import AutoInbetweener, SlerpInbetweener, StitchedInbetweener
+from controllers.inbetweening.proposers import SlerpInbetweener, StitchedInbetweener
 from controllers.inbetweening.tween import tween
-from mapctl.intent.keyframes import Key, Keys
+from mapctl.intent.keyframes import Keys
 
 RAW = InfillSettings(finish=False)
 
@@ -72,27 +72,6 @@ def test_what_was_stitched_is_reported():
     assert [(row["by"], row["start"], row["stop"]) for row in told["fallback"]] == [("slerp", 21, 59)]
     assert told["timing"]["draw_ms"] > 0
     assert told["timing"]["finish_ms"] > 0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("told", "by"), [({}, "slerp"), ({"limbs": ("leftHand",)}, "stitcher"), ({"root_only": True}, "stitcher")]
-)
-def test_auto_leaves_it_gaps_in_which_parts_are_told(told, by):
-    """And loads it only there; what is too long is the network's."""
-    loaded = []
-
-    def load():
-        loaded.append(1)
-        return tiny_stitcher()
-
-    auto, motion = AutoInbetweener(SlerpPartly(), stitcher=load), walk(200)
-    keys = (20, Key(30, **told), 40, 100, Key(150, **told), 199) if told else (20, 40, 100, 199)
-    done = tween(motion, Keys(keys), auto, settings=RAW)
-    found = {source.start: source.by for source in done.sources}
-    assert found[21] == by
-    assert {source.by for source in done.sources if source.start > 40} == {"slerp"}
-    assert len(loaded) == (by == "stitcher")
 
 
 class SlerpPartly(SlerpInbetweener):

@@ -134,15 +134,6 @@ def test_auto_keeps_a_long_gap_that_the_network_fills_and_in_which_the_body_move
     assert find_source(moving, Told(tweened.proposal, has_style=True)) == ["tweener"]
 
 
-def test_auto_leaves_gaps_with_room_for_a_style_to_a_tweener_that_was_told_one():
-    motion = walk(200)
-    room = ChoiceSettings().styled
-    query = query_of(motion, (1, room), (room + 1, 2 * room + 1))  # the first a frame short of it
-    network, tweened = (Proposal(motion, torch.zeros(200, 2), name) for name in ("transformer", "tweener"))
-    auto = AutoInbetweener(Told(network), tweener=Told(tweened, has_style=True))
-    assert [source.by for source in auto.propose(query).attribute(query)] == ["transformer", "tweener"]
-
-
 @pytest.mark.slow
 def test_auto_leaves_long_gaps_to_it_that_have_partial_keys_within():
     """A network that fills less would leap to the hand, or away from it."""

@@ -1,7 +1,6 @@
 """The tweener told how to move: by poses, by classes, in gaps beyond what its network sees, beside others in auto."""
 
 from dataclasses import replace
-from itertools import pairwise
 
 import pytest
 import tiny_tweener
@@ -128,10 +127,3 @@ def test_several_styles_are_mixed():
     assert mix_styles([other]).poses is None
     both = motion_dna.join([FAST, MotionDna(FAST.poses.flip(0))])
     torch.testing.assert_close(tweener.encode_style(both).vector, one.vector)
-
-
-@pytest.mark.parametrize("frames", [481, 700])
-def test_no_part_of_a_split_gap_is_long(frames):
-    query = query_of(walk(frames + 2), (1, frames + 1))
-    edges = [0, *next(find_splits(query)).frames, frames + 1]
-    assert max(b - a for a, b in pairwise(edges)) <= 241

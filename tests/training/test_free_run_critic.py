@@ -74,17 +74,3 @@ def test_its_gradient_is_what_would_make_free_runs_pass():
             if weight.grad is not None:
                 weight -= 1e-4 * weight.grad
     assert believe(run_again()) > before
-
-
-def test_what_is_kept_is_the_mean_of_the_weights_since_it_joined():
-    trainer = make_trainer()
-    for _ in range(2):
-        trainer.train_step()
-        assert all(map(torch.equal, trainer.average.parameters(), trainer.network.parameters()))
-    for _ in range(3):
-        before = [weight.clone() for weight in trainer.average.parameters()]
-        trainer.train_step()
-        done = trainer.step - 2
-        keep = done / (done + 20)
-        for mean, old, new in zip(trainer.average.parameters(), before, trainer.network.parameters(), strict=True):
-            torch.testing.assert_close(mean, keep * old + (1 - keep) * new)

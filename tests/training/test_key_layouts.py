@@ -69,17 +69,6 @@ def test_between_keys_of_one_clip_is_what_its_performer_did(windows):
         assert float(turn[both].max()) < 0.3
 
 
-def test_who_is_farther_away_in_time_may_be_so_in_space(windows):
-    slow = KeySettings(longest=200.0, speed=0.2, parts=WHOLE)
-    for seed in range(5):
-        drawn = draw(windows, seed, settings=slow)
-        for row, known in enumerate(drawn.known):
-            for start, stop in gaps_of(known):
-                if drawn.clip[row, start] != drawn.clip[row, stop]:
-                    way = drawn.motion.root_position[row, stop] - drawn.motion.root_position[row, start]
-                    assert float(way[::2].norm()) <= 0.2 * (stop - start) / 30 + 1e-4
-
-
 def test_the_same_generator_draws_the_same(windows):
     one, other = draw(windows, 3), draw(windows, 3)
     assert torch.equal(one.known, other.known)

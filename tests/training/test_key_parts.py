@@ -5,12 +5,11 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers import corpus, generator
+from helpers import generator
 
 from mapctl.skeleton import CANONICAL
-from priors.training.augmentation.key_layouts import WHOLE, KeySettings, draw_windows, tell_parts
-from priors.training.augmentation.pose_windows import PoseWindows
-from priors.tweening.keys import ToldParts, lead_reference, make_key_image
+from priors.training.augmentation.key_layouts import WHOLE, tell_parts
+from priors.tweening.keys import ToldParts, lead_reference
 
 BATCH, FRAMES = 60, 90
 LEGS = CANONICAL.indices(("leftLowerLeg", "rightLowerLeg", "leftFoot", "rightFoot", "leftToes", "rightToes"))
@@ -67,19 +66,3 @@ def test_headings_that_are_told_lead_and_a_view_does_not_turn():
     some.heading[0, 40] = True
     assert bool(straight(0.3, some)[1] == pytest.approx(0.3))
     assert bool(straight(0.3, replace(some, view=torch.tensor([1.2])))[1] == pytest.approx(1.2))
-
-
-def test_an_image_of_a_drawing_holds_the_drawn_coordinates():
-    windows = PoseWindows(corpus(3, 140), kinds=(), evenness=1.0)
-    layout = KeySettings(longest=60.0, parts=replace(WHOLE, drawings=1.0))
-    drawn = draw_windows(windows, 4, 80, layout, progress=1.0, tempo=0.0, generator=generator())
-    image = make_key_image(drawn.motion, drawn.told)
-    assert torch.equal(image.known_axes, drawn.told.axes)
-    assert torch.equal(image.heading, drawn.told.view[:, None].expand(-1, 80))
-    places = drawn.motion.world_poses()[0]
-    right = torch.stack([drawn.told.view.cos(), torch.zeros(4), -drawn.told.view.sin()], dim=-1)
-    across = ((places - places[..., :1, :]) * right[:, None, None]).sum(dim=-1)
-    mask = drawn.told.axes[..., 0] & drawn.told.known[..., None]
-    seen = image.places[..., 0] - image.places[..., :1, 0]
-    assert torch.allclose(seen[mask], across[mask], atol=1e-5)
-    assert torch.allclose(image.places[..., 1][mask], places[..., 1][mask], atol=1e-5)

@@ -68,20 +68,6 @@ def test_its_gradient_is_that_of_the_run_with_the_draws_held():
     assert float((gradient * direction).sum()) == pytest.approx(expected, rel=1e-4)
 
 
-def test_training_runs_free_once_it_has_begun(monkeypatch):
-    settings = TrainingSettings(
-        steps=4, batch=4, window=12, matching=MatchingSettings(begin=0.5, every=1, wander=0, batch=4)
-    )
-    trainer, runs = DensityTrainer(LstmGmmConfig(width=8, components=1), settings, corpus()), []
-    draw = trainer.network.draw
-    monkeypatch.setattr(
-        trainer.network, "draw", lambda *run, **told: (runs.append(trainer.step), draw(*run, **told))[1]
-    )
-    for _ in range(4):
-        trainer.train_step()
-    assert runs == [2, 3]
-
-
 def labelled_trainer(**kwargs) -> DensityTrainer:
     """One that can be told a gait and a pace."""
     settings = TrainingSettings(steps=2, batch=4, window=12, untold=0.0, matching=MatchingSettings(wander=3, **kwargs))

@@ -36,12 +36,6 @@ def test_something_is_known_and_something_unknown_in_nearly_every_window(frames)
     assert float((~shown.known.everything).any(dim=1).float().mean()) > 0.97
 
 
-def test_shares_of_kinds():
-    _, shown = drawn(joints=0.3, keys=0.1)
-    whole_root = shown.known.root.all(dim=1)
-    assert float(whole_root.float().mean()) == pytest.approx(0.3 * 0.8 + 0.02, abs=0.08)
-
-
 def test_gaps_alone_are_whole_poses_between_runs():
     _, shown = drawn(joints=0.0, keys=0.0, parts=0.0, several=0.0, open=0.0)
     known = shown.known
@@ -87,20 +81,3 @@ def test_windows_are_the_clips_and_varied_ones_keep_their_legs():
     assert 1.1 < float(arms.max()) < 1.16
     mirrored = varied.offsets[:, CANONICAL.mirror_partners()] * torch.tensor([-1.0, 1.0, 1.0])
     torch.testing.assert_close(mirrored, varied.offsets)
-
-
-def test_tempo_stretches_time_and_a_whole_step_is_exact():
-    clip, first = torch.tensor([0]), torch.tensor([5])
-    one, half = (WINDOWS.at(clip, first, 21, torch.tensor([tempo])) for tempo in (1.0, 0.5))
-    torch.testing.assert_close(half.root_position[:, ::2], one.root_position[:, :11], atol=1e-6, rtol=0)
-    torch.testing.assert_close(half.quats[:, ::2].abs(), one.quats[:, :11].abs(), atol=1e-6, rtol=0)
-
-
-def test_kinds_are_drawn_evenly():
-    """One clip of each kind, of different lengths: each is drawn as often."""
-    uneven = PoseWindows(corpus(), kinds=("walk", "run"), evenness=0.0)
-    shares = []
-    for windows in (WINDOWS, uneven):
-        room = (windows.picker.lengths - 39).float() * windows.picker.weights
-        shares.append(float(room[0] / room.sum()))
-    assert abs(shares[0] - 0.5) < abs(shares[1] - 0.5)

@@ -1,11 +1,10 @@
 """Splices of clips: pieces as they are, ways that lead from the one to the other, and only what passes for mocap."""
 
-from collections import Counter
 from pathlib import Path
 
 import pytest
 import torch
-from helpers import generator, go_at, run, walk
+from helpers import generator, run, walk
 from jaxtyping import Float
 from performers import Performer
 from tiny_stitcher import save_tiny_stitcher
@@ -98,20 +97,6 @@ def test_pieces_are_cut_where_somebody_stands_or_goes(corpus):
         assert cut.gap in GAPS
     assert {cut.clips for cut in cuts[2::3]} == {(2, 2), (2, 3), (3, 2), (3, 3)}
     assert 0.3 < torch.tensor([cut.turn for cut in cuts]).std() < 0.7
-
-
-def test_gaits_change_twice_as_often_as_anything_else():
-    paces = [go_at(speed, seconds=3) for speed in (0.0, 1.2, 2.6)]
-    stands, walks, runs = range(3)
-    corpus = Corpus(("stands", "walks", "runs"), tuple(map(len, paces)), torch.cat(paces))
-    pairs = [cut.clips for cut in draw_cuts(corpus, 70, GAPS, generator())]
-    assert pairs[3:7] == 2 * [(walks, runs), (runs, walks)]
-    counts = Counter(pairs)
-    assert counts[stands, stands] == 10
-    assert counts[stands, walks] + counts[stands, runs] == counts[walks, stands] + counts[runs, stands] == 10
-    assert counts[walks, runs] == counts[runs, walks] == 20
-    without = corpus.subset([walks, runs])
-    assert Counter(cut.clips for cut in draw_cuts(without, 8, GAPS, generator())) == {(0, 1): 4, (1, 0): 4}
 
 
 @pytest.mark.slow

@@ -28,16 +28,6 @@ def test_steps_lower_the_loss(recipe):
     assert sum(losses[-5:]) < sum(losses[:5]) - 10
 
 
-def test_each_window_is_mirrored_with_even_odds():
-    trainer = DensityTrainer(TINY, replace(SETTINGS, batch=1), corpus())
-    trainer.windows.starts = trainer.windows.starts[:1]
-    plain = trainer.windows.features[: SETTINGS.window + 1]
-    drawn = [trainer._draw_windows()[0][0] for _ in range(200)]
-    mirrored = sum(torch.equal(window, mirror_features(plain)) for window in drawn)
-    assert mirrored + sum(torch.equal(window, plain) for window in drawn) == 200
-    assert 70 < mirrored < 130
-
-
 def test_statistics_are_symmetric_and_floored():
     mean, std = compute_feature_statistics(corpus().features)
     torch.testing.assert_close(mirror_features(mean[None])[0], mean, atol=1e-5, rtol=0)
