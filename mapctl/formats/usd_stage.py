@@ -181,9 +181,6 @@ def _check_file(name: str, full: str, folder: Path, most_bytes: int) -> None:
         raise Refusal(f"names {name!r}, which has {file.stat().st_size >> 20} MiB, allowed are {most_bytes >> 20}")
 
 
-# pyright: reportAttributeAccessIssue=false
-
-
 @dataclass(frozen=True, eq=False)
 class SkeletonPrim:
     """A UsdSkel.Skeleton, read."""
@@ -302,9 +299,6 @@ def _read_matrices(attribute: Usd.Attribute, count: int, where: str) -> Array | 
     if not np.isfinite(matrices).all():
         raise Refusal(f"{where}: {attribute.GetName()} holds numbers that are not finite")
     return matrices
-
-
-# pyright: reportAttributeAccessIssue=false
 
 
 @dataclass(frozen=True, eq=False)
@@ -450,9 +444,6 @@ def to_quaternions(turns: Array) -> Array:
     return np.linalg.eigh(symmetric)[1][:, :, -1]
 
 
-# pyright: reportAttributeAccessIssue=false
-
-
 def corner_colours(mesh: UsdGeom.Mesh, counts: Array, vertices: Array, folder: Path) -> Array:
     """Return sRGB and opacity (corners, 4), 0 to 1, of a mesh's corners, of which face k has `counts[k]` and corner k
     is at vertex `vertices[k]`."""
@@ -535,9 +526,6 @@ def _read_picture(source: UsdShade.Shader, folder: Path) -> Array | None:
         return None
     with asset:
         return decode_picture(bytes(asset.GetBuffer()))
-
-
-# pyright: reportAttributeAccessIssue=false
 
 
 def read_parts(stage: Usd.Stage, skeleton: SkeletonPrim, folder: Path) -> list[MeshPart]:
@@ -647,7 +635,6 @@ def _read_array(attribute: Usd.Attribute, width: int, dtype: type) -> Array:
 
 
 # The package loads its modules at run time and declares no types.
-# pyright: reportAttributeAccessIssue=false
 
 
 def _check_extent(frames: int, joints: int, most: int) -> None:
@@ -845,4 +832,3 @@ def _set_extent(prim: Usd.Prim, places: Array) -> None:
 
 
 # The package loads its modules at run time and declares no types.
-# pyright: reportAttributeAccessIssue=false
