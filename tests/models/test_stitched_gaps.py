@@ -72,11 +72,3 @@ def test_what_was_stitched_is_reported():
     assert [(row["by"], row["start"], row["stop"]) for row in told["fallback"]] == [("slerp", 21, 59)]
     assert told["timing"]["draw_ms"] > 0
     assert told["timing"]["finish_ms"] > 0
-
-
-class SlerpPartly(SlerpInbetweener):
-    """One that takes partial keys, as networks do."""
-
-    @property
-    def takes_partial_keys(self):
-        return True
