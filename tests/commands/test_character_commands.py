@@ -1,6 +1,5 @@
 """--character as a user types it: which films show a character, what stays as it is without it, and refusals."""
 
-from dataclasses import replace
 from importlib.util import find_spec
 
 import numpy as np
@@ -11,7 +10,6 @@ from helpers import run, walk
 
 from mapctl.mesh.mannequin import Mannequin
 from mapctl.mesh.skinned_body import SkinnedBody
-from scenes.drawn_character import DrawnCharacter
 from scenes.stage import Stage
 
 pytestmark = pytest.mark.skipif(any(find_spec(name) is None for name in ("PIL", "av")), reason="needs mapctl[render]")
@@ -66,27 +64,6 @@ def test_render_takes_a_characters_own_motion_as_it_is(staged, tmp_path):
     np.testing.assert_array_equal(*others)
 
 
-@pytest.mark.slow
-def test_what_a_retargeted_motion_cannot_keep_is_told(prior, hero, staged, tmp_path, capsys, monkeypatch):
-    plain = DrawnCharacter.put_on
-
-    def with_note(character, motion):
-        drawn = plain(character, motion)
-        return replace(drawn, placed=replace(drawn.placed, notes=("its legs are too short",)))
-
-    monkeypatch.setattr(DrawnCharacter, "put_on", with_note)
-    walk(12).save(tmp_path / "walk.bvh")
-    (tmp_path / "scene.toml").write_text(SCENE.format(prior=prior, outputs="'x.png'").replace("own/child", "hero"))
-    film = ("--character", hero, "--size", "96x64")
-    words = ("render", tmp_path / "walk.bvh", "-o", tmp_path / "x.png", *film)
-    assert run(*words) == 0
-    assert capsys.readouterr().out.count("its legs are too short") == 1
-    assert run(*words, "--quiet") == 0
-    assert capsys.readouterr().out == ""
-    assert run("run", tmp_path / "scene.toml", "-o", tmp_path / "out") == 0
-    assert capsys.readouterr().out.count("its legs are too short") == 1
-
-
 SCENE = """prior = '{prior}'
 outputs = [{outputs}]
 size = [96, 64]
@@ -105,14 +82,6 @@ def test_scenes_give_characters_by_actor(prior, staged, tmp_path):
     scene.write_text(SCENE.format(prior=prior, outputs="'x.png'"))
     assert run("run", scene, "-o", tmp_path / "out", "--quiet") == 0
     assert kinds(staged) == [[Mannequin, SkinnedBody]]
-
-
-@pytest.mark.slow
-def test_a_scene_without_a_film_needs_no_character(prior, staged, tmp_path):
-    scene = tmp_path / "scene.toml"
-    scene.write_text(SCENE.format(prior=prior, outputs="'x.json'"))
-    assert run("run", scene, "-o", tmp_path / "out", "--quiet") == 0, "the missing own/child.glb is not read"
-    assert staged == []
 
 
 def write_broken(folder):

@@ -1,7 +1,6 @@
 """The command line: every command does its job and says so."""
 
 import json
-from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -9,8 +8,6 @@ from helpers import run
 
 import mapctl
 from mapctl.commands import COMMANDS
-from mapctl.commands.shared.options import parse_size
-from mapctl.motion import Motion
 
 
 @pytest.fixture(scope="session")
@@ -103,29 +100,6 @@ def test_generate_writes_different_clips(prior, tmp_path):
         assert ((tmp_path / name / "generated_000.bvh").read_bytes() == clips[0].read_bytes()) is same
 
 
-@pytest.mark.slow
-def test_generate_goes_on_from_a_clip_or_a_start(walk, prior, tmp_path):
-    words = ("generate", "--seconds", 1, "--prior", prior, "--temperature", 0)
-    assert run(*words, "-o", tmp_path / "clip", "--start", walk) == 0
-    assert run(*words, "-o", tmp_path / "index", "--start", 2) == 0
-    ends, begins = (
-        mapctl.load(path).joint_positions()[at, 0]
-        for path, at in ((walk, -1), (tmp_path / "clip" / "generated_000.bvh", 0))
-    )
-    assert float((ends - begins).norm()) < 0.2
-
-
-@pytest.mark.slow
-def test_long_motion_comes_in_pieces(prior, tmp_path, monkeypatch):
-    """Of two seconds here: 4.5 s are three; the header was written before the last of them was drawn."""
-    monkeypatch.setattr(import_module("controllers.generation.generate"), "_CHUNK", 60)
-    assert run("generate", "-o", tmp_path, "--seconds", 4.5, "--prior", prior, "--quiet") == 0
-    motion = mapctl.load(tmp_path / "generated_000.bvh")
-    assert motion.num_frames == 135
-    steps = motion.root_position.diff(dim=0).norm(dim=-1)
-    assert float(steps.max()) < 0.2
-
-
 def test_convert_there_and_back(walk, tmp_path, capsys):
     assert run("convert", walk, tmp_path / "a.npz") == 0
     assert run("convert", tmp_path / "a.npz", tmp_path / "b.bvh") == 0
@@ -197,30 +171,6 @@ def test_demo_leaves_four_files(prior, tmp_path, monkeypatch):
     assert {path.suffix for path in (tmp_path / "demo").iterdir()} == {".bvh", ".json", ".mp4", ".png"}
 
 
-@pytest.mark.parametrize(
-    ("lacking", "left", "told"),
-    [
-        ({"av", "pyrender"}, {".bvh", ".json", ".png"}, ".mp4: films need the package av"),
-        (
-            {"av", "pyrender", "PIL", "matplotlib"},
-            {".bvh", ".json"},
-            ".mp4, .png: films need the packages av, PIL, mat",
-        ),
-    ],
-)
-def test_a_demo_without_packages_of_films_leaves_the_rest(prior, tmp_path, monkeypatch, capsys, lacking, left, told):
-    monkeypatch.setenv("MAPCTL_RENDERER", "stick")
-    monkeypatch.setattr("mapctl.commands.shared.outputs.find_spec", lambda name: None if name in lacking else name)
-    monkeypatch.setattr("mapctl.commands.demo.CURVE", "line:0.5")
-    monkeypatch.setattr("mapctl.commands.demo._SIZE", (96, 64))
-    assert run("demo", "-o", tmp_path / "demo", "--prior", prior) == 0
-    assert {path.suffix for path in (tmp_path / "demo").iterdir()} == left
-    out, err = capsys.readouterr()
-    assert f"not made  {told}" in out
-    assert "pip install 'mapctl[render]'" in out
-    assert err == ""
-
-
 def test_info_names_what_is_here(prior, capsys):
     assert run("info") == 0
     told = capsys.readouterr().out
@@ -228,22 +178,6 @@ def test_info_names_what_is_here(prior, capsys):
         assert word in told
     assert run("info", prior) == 0
     assert json.loads(capsys.readouterr().out)["kind"] == "lstm-gmm"
-
-
-@pytest.mark.slow
-def test_clips_that_are_finished_stay(prior, tmp_path, monkeypatch, capsys):
-    save = Motion.save
-
-    def interrupted(motion, path):
-        if Path(path).name == "generated_002.bvh":
-            raise KeyboardInterrupt
-        save(motion, path)
-
-    monkeypatch.setattr(Motion, "save", interrupted)
-    words = ("generate", "-o", tmp_path / "gen", "--seconds", 1, "--count", 4, "--prior", prior)
-    assert run(*words, "--quiet") == 130
-    assert capsys.readouterr().err == "mapctl: interrupted; 2 of 4 clips are finished\n"
-    assert sorted(path.name for path in (tmp_path / "gen").iterdir()) == ["generated_000.bvh", "generated_001.bvh"]
 
 
 def presses_ctrl_c(monkeypatch, *, after):
@@ -279,19 +213,3 @@ def test_an_interrupted_walk_is_written_as_far_as_it_was_solved(prior, tmp_path,
         "interrupted; what was solved until then is kept",
         35,
     )
-
-
-@pytest.mark.slow
-def test_an_interrupted_demo_and_scene_are_written_without_films(prior, tmp_path, monkeypatch):
-    presses_ctrl_c(monkeypatch, after=1)
-    assert run("demo", "-o", tmp_path / "demo", "--prior", prior, "--quiet") == 130
-    assert {file.name for file in (tmp_path / "demo").iterdir()} == {"figure8.bvh", "figure8.json"}
-    actors = "".join(f"[[actors]]\nname = '{name}'\ncurve = 'circle:2'\nseconds = 2\n" for name in ("ann", "bob"))
-    outputs = "outputs = ['scene.mp4', 'scene.bvh', 'scene.json']\n"
-    (tmp_path / "scene.toml").write_text(f"prior = '{prior}'\n{outputs}{actors}")
-    assert run("run", tmp_path / "scene.toml", "-o", tmp_path / "scene", "--quiet") == 130
-    assert {file.name for file in (tmp_path / "scene").iterdir()} == {"scene-ann.bvh", "scene.json"}
-
-
-def test_sizes_are_read():
-    assert parse_size("1280x720") == (1280, 720)

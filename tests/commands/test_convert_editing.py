@@ -1,7 +1,6 @@
 """Edits of `mapctl convert` as a user types them: alone, together, over folders, and what is refused."""
 
 import itertools
-import json
 import shutil
 from pathlib import Path
 
@@ -12,7 +11,6 @@ from helpers import run, walk
 
 import mapctl
 from mapctl import editing
-from mapctl.commands import convert as convert_folder
 from mapctl.editing.rigged_motion import RiggedMotion
 
 EDITS = ["--mirror", "--loop", "--plant-feet"]
@@ -46,14 +44,6 @@ def test_all_go_together(here, capsys, chosen, travel):
     )
     hips = RiggedMotion.of(motion).position("hips")
     assert (float((hips[-1] - hips[0]).norm()) < 0.2) == (travel == "--in-place")
-
-
-def test_a_loop_is_a_whole_number_of_frames_at_the_wanted_rate(here, capsys):
-    assert run("convert", "in.bvh", "out.npz", "--loop", "--in-place", "--fps", "24") == 0
-    motion = mapctl.load("out.npz")
-    assert (motion.fps, motion.num_frames) == (24, 24)
-    bends = motion.join(motion).joint_positions().diff(n=2, dim=0).norm(dim=-1).amax(dim=1)
-    assert float(bends[22:24].max()) <= float(bends[:22].max())
 
 
 def test_edits_come_after_frames_and_rig(here):
@@ -101,17 +91,6 @@ def test_a_folder_becomes_a_folder_with_the_same_names(here, capsys):
     torch.testing.assert_close(mapctl.load("out/day 1/a.npz").joint_positions(), wanted, atol=1e-9, rtol=0)
 
 
-def test_without_an_ending_files_keep_their_own(here):
-    assert run("convert", "takes", "out", "--quiet") == 0
-    assert sorted(path.name for path in Path("out").rglob("*.*")) == ["a.bvh", "b.npz", "c.bvh"]
-
-
-@pytest.mark.slow
-def test_a_folder_on_another_rig(here):
-    assert run("convert", "takes", "out", "--rig", "mixamo", "--mirror", "--root-motion", "--quiet") == 0
-    assert mapctl.load("out/c.bvh").skeleton.names[:2] == ("root", "mixamorig:Hips")
-
-
 def test_a_clip_that_fails_stops_no_other_one(here, capsys):
     Path("takes/0.bvh").write_text("HIERARCHY\nnonsense")
     walk(5).save("takes/short.bvh")
@@ -130,14 +109,6 @@ def test_what_is_there_is_done_again_only_if_asked_for(here, capsys):
     assert Path("out/c.bvh").read_text() == "mine"
     assert run("convert", "takes", "out", "--again", "--quiet") == 0
     assert Path("out/c.bvh").read_text() != "mine"
-
-
-@pytest.mark.slow
-def test_more_processes_give_the_same_files(here):
-    assert run("convert", "takes", "one", "--plant-feet", "--quiet") == 0
-    assert run("convert", "takes", "two", "--plant-feet", "--quiet", "--jobs", 2) == 0
-    for path in Path("one").rglob("*.*"):
-        assert path.read_bytes() == Path("two", path.relative_to("one")).read_bytes()
 
 
 @pytest.mark.parametrize(
@@ -173,32 +144,3 @@ def test_two_results_of_one_name_and_results_over_what_is_read_are_refused(here,
     assert run("convert", "takes/day 1", "takes") in (0, 2)
     after = {path: path.read_bytes() for path in before}
     assert before == after
-
-
-def test_an_interrupted_folder_goes_on_where_it_was(here, monkeypatch, capsys):
-    convert, done = convert_folder.FileConverter._convert, []
-
-    def stop_after_one(self, job):
-        if done:
-            raise KeyboardInterrupt
-        done.append(job)
-        return convert(self, job)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(convert_folder.FileConverter, "_convert", stop_after_one)
-        assert run("convert", "takes", "out") == 130
-    assert "1 of 3 files are finished; the same command goes on with the others" in capsys.readouterr().err
-    assert run("convert", "takes", "out") == 0
-    assert "2 converted" in capsys.readouterr().out
-
-
-def test_measure_names_the_cycle(here, capsys):
-    assert run("measure", "in.bvh") == 0
-    line = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("cycle"))
-    assert ", 30 frames, 1.00 s," in line
-    assert "120 steps a minute, stride 1.3" in line
-    assert "right foot 0.48 of a cycle after the left" in line
-    assert run("measure", "in.bvh", "--json") == 0
-    told = json.loads(capsys.readouterr().out)["cycle"]
-    assert told["frames"] == 30
-    assert told["gait"]

@@ -1,8 +1,6 @@
 """`mapctl denoise` as a user types it: files, folders, reports, and what is refused."""
 
-import errno
 import json
-import os
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -67,12 +65,6 @@ def test_causal_is_said(denoise, recording, tmp_path, capsys):
     assert denoise(recording, "-o", tmp_path / "out.bvh", "--causal", "--delay", 0.3) == 0
     assert "causal: a frame is decided at most 0.30 s after it came" in capsys.readouterr().out
     assert mapctl.load(tmp_path / "out.bvh").num_frames == 40
-
-
-def test_a_prior_joins_the_last_stage(denoise, recording, tmp_path):
-    prior, report = save_tiny_prior(tmp_path / "prior.safetensors"), tmp_path / "r.json"
-    assert denoise(recording, "-o", tmp_path / "o.bvh", "--prior", prior, "--report", report, "--quiet") == 0
-    assert "likelihood" in json.loads(report.read_text())["ledger"]
 
 
 @pytest.fixture
@@ -140,31 +132,6 @@ def test_an_interrupted_folder_says_what_is_done_and_goes_on(denoise, folder, tm
     assert told == "mapctl: interrupted; 1 of 2 files are finished; the same command goes on with the others\n"
     assert denoise(folder, "-o", out) == 0
     assert ", 1 there already" in capsys.readouterr().out
-
-
-def test_a_full_disk_ends_a_folder_in_one_line(denoise, folder, tmp_path, monkeypatch, capsys):
-    write, out = Path.write_bytes, tmp_path / "out"
-
-    def full(path, content):
-        if list(out.rglob("[a-z]*.bvh")):
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        return write(path, content)
-
-    monkeypatch.setattr(Path, "write_bytes", full)
-    assert denoise(folder, "-o", out) == 2
-    told = capsys.readouterr().err
-    assert told.startswith("mapctl: cannot write ")
-    goes_on = "1 of 2 files are finished; the same command goes on with the others"
-    assert told.endswith(f": No space left on device; {goes_on}\n")
-    assert told.count("\n") == 1
-    assert [path.name for path in out.rglob("*") if path.is_file()] == ["a.bvh"]
-
-
-@pytest.mark.slow
-def test_an_output_folder_inside_the_input_is_not_denoised_itself(denoise, folder, capsys):
-    for _ in range(2):
-        assert denoise(folder, "-o", folder / "clean", "--again") == 0
-        assert "2 denoised" in capsys.readouterr().out
 
 
 @pytest.mark.slow

@@ -1,17 +1,13 @@
 """`--dna` of tween, infill and chain: motion files of any rig and classes by name, alone, mixed and drawn among."""
 
-import json
 from pathlib import Path
 
 import pytest
-import torch
 from captures import on_rig
 from helpers import run
 from tiny_path import save_tiny_path
 from tiny_prior import save_tiny_prior
 from tiny_tweener import save_tiny_tweener
-
-from mapctl import formats
 
 FRAMES = 70
 
@@ -104,50 +100,3 @@ def test_methods_without_styles_refuse_them(here, capsys, job, method):
 def test_options_that_do_not_go_with_a_style_are_refused(here, capsys, job, words, said):
     assert run(job, *JOBS[job], "--dna", "style.bvh", *words) == 2
     assert said in capsys.readouterr().err
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("dna", "names"),
-    [
-        ("style.bvh", ["style.bvh", "style.bvh, 1 of its poses", "style.bvh, 1 of its poses"]),
-        ("walk,style.bvh", ["walk and style.bvh", "walk|style.bvh", "walk|style.bvh"]),
-        (None, ["", "walk|wave-left-hand", "walk|wave-left-hand"]),
-    ],
-)
-def test_variations_are_drawn_among_styles_and_come_again(here, models, prior, capsys, dna, names):
-    words = [*JOBS["tween"], *models, "--prior", prior, "--variations", 3, "--seed", 2, "--report", "r.json"]
-    found = []
-    for _ in range(2):
-        assert run("tween", *words, *([] if dna is None else ["--dna", dna])) == 0
-        found.append([Path(f"out_00{number}.bvh").read_bytes() for number in range(3)])
-    assert found[0] == found[1]
-    assert len(set(found[0])) == 3
-    told = json.loads(Path("r.json").read_text())
-    assert told["diversity"]["root_aligned_cm"] > 0
-    assert all("energy_nats" in row for row in told["variations"])
-    lines = capsys.readouterr().out.splitlines()[:3]
-    for line, name in zip(lines, names, strict=True):
-        style = line.partition(" in the style of ")[2]
-        if "|" in name:
-            assert style in name.split("|")
-        else:
-            assert style.startswith(name.partition(",")[0])
-    if dna is not None and "," in dna:
-        assert lines[1] != lines[2]
-
-
-@pytest.mark.slow
-def test_auto_takes_the_named_tweener_in_long_gaps_and_the_transformer_elsewhere(here, models, capsys):
-    """Only a walk that lasts has a long gap; its path predictor may be named with it."""
-    on_rig("bandai", 240).save("long.bvh")
-    named = models[2:6]
-    said = {}
-    for method in ("auto", "tweener"):
-        words = ["long.bvh", "-o", f"{method}.bvh", "--keyframes", "0,30,239", "--no-finish", "--method", method]
-        assert run("tween", *words, *named) == 0
-        said[method] = capsys.readouterr().out
-    assert "frames 1:30: transformer" in said["auto"]
-    assert "frames 31:239: tweener" in said["auto"]
-    auto, alone = (formats.load(f"{method}.bvh") for method in ("auto", "tweener"))
-    torch.testing.assert_close(auto.local_quat_xyzw[80:230], alone.local_quat_xyzw[80:230], atol=1e-4, rtol=0)

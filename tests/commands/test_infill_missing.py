@@ -1,7 +1,5 @@
 """`mapctl infill` of files with NaN, as a user types it: as if their gaps had been named."""
 
-import json
-
 import pytest
 from captures import on_rig
 from helpers import run
@@ -71,36 +69,6 @@ def test_joints_of_nan_are_lost_joints(infilled, clip, tmp_path, rig, gap):
     lossy = without(source, tmp_path / "lossy.bvh", [(f"{name} ", start, stop) for name in NAMES[rig]])
     words = ["--joints", ",".join(NAMES[rig]), *(["--gap", f"{start}:{stop}"] if gap else [])]
     assert infilled(lossy) == infilled(source, *words)
-
-
-@pytest.mark.parametrize(("rig", "root"), [("canonical", "hips"), ("bandai", "Hips"), ("daz", "hip")])
-def test_the_roots_place_alone_may_be_lost(infilled, clip, tmp_path, rig, root):
-    source = clip(rig)
-    lossy = without(source, tmp_path / "lossy.bvh", [(f"{root} Xposition", 20, 30)])
-    assert infilled(lossy) == infilled(source, "--joints", "root position", "--gap", "20:30")
-
-
-@pytest.mark.slow
-def test_what_is_asked_for_comes_to_what_is_nan(infilled, clip, tmp_path):
-    source = clip("bandai")
-    both = without(source, tmp_path / "both.bvh", [("", 8, 12), ("Hand_L", 20, 30)])
-    for lost, words in (
-        ([("", 8, 12)], ("--joints", "Hand_L", "--gap", "20:30")),
-        ([("Hand_L", 20, 30)], ("--gap", "8:12")),
-    ):
-        lossy = without(source, tmp_path / "lossy.bvh", lost)
-        assert infilled(lossy, *words) == infilled(both)
-
-
-def test_where_something_is_nan_nothing_else_is_looked_for(tiny, clip, tmp_path):
-    lines = clip("bandai").read_text().splitlines()
-    lines[-25:-15] = [lines[-26]] * 10
-    (tmp_path / "frozen.bvh").write_text("\n".join(lines) + "\n")
-    lossy = without(tmp_path / "frozen.bvh", tmp_path / "lossy.bvh", [("", 5, 9)])
-    words = [*words_of("infiller"), "--inbetweener", tiny, "--report", tmp_path / "r.json", "--quiet"]
-    assert run("infill", lossy, "-o", tmp_path / "out.bvh", *words) == 0
-    (gap,) = json.loads((tmp_path / "r.json").read_text())["gaps"]
-    assert (gap["start"], gap["stop"]) == (5, 9)
 
 
 def test_an_archive_with_nan_is_filled(infilled, tmp_path):

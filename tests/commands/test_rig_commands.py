@@ -12,16 +12,10 @@ from strange_rigs import CASES
 
 import controllers
 import mapctl
-from controllers.common.character import Character
 from controllers.following.follow import FollowSettings
-from controllers.steering import steer
 from mapctl import curves, retarget
-from mapctl.errors import RequestError
-from mapctl.intent.steering import Command
 from mapctl.problem.receding_horizon import HorizonSettings
 from mapctl.problem.window_solvers import LatentNoiseSolver
-from mapctl.retarget import figure
-from mapctl.retarget.reference_pose import axis_vector
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, Skeleton
 from mapctl.solver.budget import Budget
 from mapctl.terms import FootContact
@@ -40,11 +34,6 @@ def clip(tmp_path_factory):
     path = tmp_path_factory.mktemp("rig") / "tall.bvh"
     made.motion(person(SIZE, 45)).save(path)
     return path
-
-
-def taller() -> Skeleton:
-    """The canonical body, larger."""
-    return Skeleton(CANONICAL.names, CANONICAL.parents, CANONICAL.offsets * SIZE)
 
 
 def test_info_tells_a_clips_rig(clip, capsys):
@@ -211,20 +200,6 @@ def test_a_rig_that_names_too_little_is_refused_for_a_body(prior, tmp_path, caps
     assert run("info", "--rig", "mixamo") == 2
 
 
-@pytest.mark.parametrize(("up", "facing"), [("z", "-y"), ("z", "x"), ("-y", "x"), ("x", "auto"), ("y", "-z")])
-def test_a_rigs_axes_are_the_files(up, facing):
-    rig = replace(retarget.load_rig("mixamo"), up=up, facing=facing)
-    standing = figure.make_tpose_clip(rig)
-    canonical, rigmap = retarget.to_canonical(standing, rig)
-    assert (rigmap.up, rigmap.rest) == (up, "T")
-    height = standing.joint_positions()[0] @ axis_vector(up)
-    assert float(height.max() - height.min()) > 1.2
-    assert float(canonical.joint_positions()[0, CANONICAL.index("head"), 1]) > 1.2
-    if facing != "auto":
-        ahead = standing.skeleton.offsets[standing.skeleton.index("mixamorig:LeftToeBase")]  # with all rotations zero
-        assert float(ahead @ axis_vector(facing)) == pytest.approx(0.0906, abs=1e-6)
-
-
 def test_convert_to_a_z_up_rig_stands_in_its_world(clip, tmp_path):
     walk = retarget.from_canonical(person(1.0), retarget.identify_rig(bandai_skeleton()))
     walk.save(tmp_path / "in.bvh")
@@ -261,22 +236,6 @@ def test_motion_is_written_on_the_clips_rig(job, clip, prior, tmp_path):
     assert 0.8 < float(canonical.root_position[:, 1].mean()) / SIZE < 1.0
 
 
-@pytest.mark.slow
-def test_actors_of_a_scene_have_rigs_of_their_own(clip, prior, tmp_path):
-    (tmp_path / "own").mkdir()
-    mapctl.load(clip).save(tmp_path / "own" / "tall.bvh")
-    rigs_of = {"a": "rig = 'own/tall.bvh'", "b": "rig = 'xsens'", "c": ""}
-    actors = [f"{{curve = 'line:2', seconds = 0.4, name = '{name}', {rig}}}" for name, rig in rigs_of.items()]
-    scene = f"prior = '{prior}'\nactors = [{', '.join(actors)}]\noutputs = ['a.bvh']\n"
-    (tmp_path / "s.toml").write_text(scene.replace(", }", "}"))
-    assert run("run", tmp_path / "s.toml", "-o", tmp_path, "--rig", "mixamo", "--quiet") == 0
-    made = [mapctl.load(tmp_path / f"a-{name}.bvh").skeleton for name in rigs_of]
-    assert made[0].matches(mapctl.load(clip).skeleton, 1e-4)
-    assert ("Chest4" in made[1].names, "mixamorig:Spine1" in made[2].names) == (True, True)
-    (tmp_path / "s.toml").write_text(scene.replace(", }", "}").replace("xsens", "nobody"))
-    assert run("run", tmp_path / "s.toml", "-o", tmp_path, "--quiet") == 2
-
-
 def test_twice_the_legs_make_twice_the_way():
     """The same walk, of everything twice as long: a prior cannot tell it from its own."""
     density, double = tiny_density(), Skeleton(CANONICAL.names, CANONICAL.parents, CANONICAL.offsets * 2)
@@ -302,23 +261,3 @@ def test_twice_the_legs_make_twice_the_way():
     torch.testing.assert_close(places, small.motion.joint_positions(), atol=0.02, rtol=0)
     residuals = [{entry.name: float(entry.residual.mean()) for entry in done.ledger.entries} for done in (small, large)]
     assert residuals[1]["path"] == pytest.approx(2 * residuals[0]["path"], rel=0.1)
-
-
-def test_a_tall_character_is_steered_in_its_own_metres():
-    settings = steer.SteerSettings(horizon=10, evaluations=3, footing=FootContact(rest_height=SIZE * TOE_REST_HEIGHT))
-    state, first = steer.begin(
-        tiny_density(), Command(1.3, 0.0), generator=generator(), settings=settings, at=(1.0, 2.0), skeleton=taller()
-    )
-    torch.testing.assert_close(first.motion.root_position[0, ::2], torch.tensor([1.0, 2.0]).double(), atol=1e-5, rtol=0)
-    state, frames = steer.step(state, Command(1.3, 0.0))
-    assert state.character.scale == pytest.approx(SIZE)
-    assert frames.motion.skeleton.offsets is state.character.skeleton.offsets
-    step = (frames.motion.root_position[0] - first.motion.root_position[0]).norm()
-    assert 0.005 < float(step) < 0.15
-    assert frames.steering_targets[0].speed == pytest.approx(first.steering_targets[0].speed, abs=0.2)
-
-
-def test_who_has_no_legs_is_refused():
-    stump = Skeleton(CANONICAL.names, CANONICAL.parents, CANONICAL.offsets * 0.0)
-    with pytest.raises(RequestError, match="legs of a human's length"):
-        Character(stump, 0.0)

@@ -3,20 +3,13 @@
 import json
 import os
 import shutil
-from dataclasses import replace
 
 import pytest
 from helpers import run, walk
-from stage import Actor
 from tiny_weights import FREE, save_tiny_weights
 
 import mapctl
-from mapctl import formats
-from mapctl.cli import parse
-from mapctl.commands import COMMANDS, live
-from mapctl.commands.shared.command import ModelCommand
 from priors import weight_sets
-from scenes.live.app import LiveApp
 
 NOT_FREE = "CC BY-NC 4.0"
 BUNDLED = weight_sets.list_models("free")  # so that tests see what a user sees without the others
@@ -128,34 +121,6 @@ def test_commands_work_with_the_free_weights_alone(alone, capsys, name):
     assert weight_sets.VARIABLE not in os.environ
 
 
-def test_all_commands_that_take_bundled_models_have_the_option():
-    without = {"train", "render", "convert", "blender-addon"}
-    assert {name for name, kind in COMMANDS.items() if not issubclass(kind, ModelCommand)} == without
-    assert getattr(parse(["bench", "--weights", "free"]), "weights", None) == "free"
-
-
-def test_the_live_page_tells_the_licence_of_what_its_characters_load(alone, monkeypatch, capsys):
-    """The process of a character is left out."""
-    asked = []
-    monkeypatch.setattr(live, "_start_characters", lambda *_: [Actor()])
-    monkeypatch.setattr(LiveApp, "__init__", lambda show, characters, looks, **_: asked.append(looks[0].licence))
-    monkeypatch.setattr(LiveApp, "url", "http://127.0.0.1:8080", raising=False)
-    monkeypatch.setattr(LiveApp, "run", lambda show: (_ for _ in ()).throw(KeyboardInterrupt))
-    monkeypatch.setattr(LiveApp, "save_recordings", lambda *_: [])
-    monkeypatch.setattr(LiveApp, "close", lambda show: None)
-    assert run("live", "--weights", "free") == 0
-    told = f"{FREE} (free/locomotion, free/stitcher)"
-    assert asked == [told]
-    assert f"licence   {told}" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("words", [words for words, _ in JOBS.values()], ids=list(JOBS))
-def test_without_the_full_weights_nothing_else_stands_in(alone, fails, words):
-    told = fails(*words.split())
-    assert "the full weights have no" in told
-    assert "none are installed; free/" in told
-
-
 def test_what_the_free_set_lacks_is_refused_in_one_line(both, fails):
     for name in ("transformer", "general", "tweener"):
         for ending in ("json", "safetensors"):
@@ -182,25 +147,6 @@ def test_the_option_comes_before_the_scene_file_and_that_before_the_environment(
     (both / "scene.toml").write_text(f'weights = "free"\n{SCENE}')
     assert used() == {"free/locomotion"}
     assert used("--weights", "full") == {"locomotion"}
-
-
-def test_the_keys_of_a_shot_may_name_the_weights(both):
-    words = (
-        "follow",
-        "line:1",
-        "-o",
-        "o.npz",
-        "--seconds",
-        "1",
-        "--quiet",
-        "--keys",
-        "shot.toml",
-        "--report",
-        "o.json",
-    )
-    (both / "shot.toml").write_text('weights = "free"\n[[key]]\nseconds = 0.5\nlook_at = [0.0, 1.5, 3.0]\n')
-    assert run(*words) == 0
-    assert licence_of(both / "o.json")["models"] == {"free/locomotion": FREE, "free/transformer": FREE}
 
 
 def test_weights_that_do_not_exist_are_refused_in_one_line(both, fails, monkeypatch):
@@ -236,11 +182,6 @@ def test_a_motion_keeps_its_licence_from_file_to_file(both, capsys, ending):
     assert mapctl.load("clean.npz").licence == line
     assert run("convert", "clean.npz", "copy.glb") == 0
     assert mapctl.load("copy.glb").licence == line
-
-
-def mark(folder, source):
-    """Write a clip as `given.npz`, marked as if a model of the full set had made it."""
-    formats.save(replace(mapctl.load(folder / source), licence=f"{NOT_FREE} (somebody)"), folder / "given.npz")
 
 
 def test_info_lists_both_sets(both, capsys):
