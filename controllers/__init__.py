@@ -11,8 +11,8 @@ if TYPE_CHECKING:
     from controllers.generation.generate import GenerateSettings as GenerateSettings
     from controllers.generation.generate import generate as generate
     from controllers.inbetweening.blend import blend as blend
-    from controllers.inbetweening.chain import chain as chain
     from controllers.inbetweening.infill import InfillSettings as InfillSettings
+    from controllers.inbetweening.infill import chain as chain
     from controllers.inbetweening.infill import infill as infill
     from controllers.inbetweening.infill import retraced as retraced
     from controllers.inbetweening.proposers import AutoInbetweener as AutoInbetweener
@@ -55,7 +55,7 @@ _HOMES = {
     "GenerateSettings": "controllers.generation.generate",
     "generate": "controllers.generation.generate",
     "blend": "controllers.inbetweening.blend",
-    "chain": "controllers.inbetweening.chain",
+    "chain": "controllers.inbetweening.infill",
     "InfillSettings": "controllers.inbetweening.infill",
     "infill": "controllers.inbetweening.infill",
     "retraced": "controllers.inbetweening.infill",

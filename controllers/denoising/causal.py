@@ -10,8 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from controllers.denoising.denoise import MIN_DENOISE_FRAMES, denoise
-from controllers.denoising.result import DenoiseSolution, crossfade, join_segments
-from controllers.denoising.segment import DenoiseSettings
+from controllers.denoising.segment import DenoiseSettings, DenoiseSolution, crossfade, join_segments
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.motion import Motion

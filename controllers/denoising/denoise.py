@@ -19,8 +19,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from controllers.denoising.result import DenoiseSolution, join_segments, shift_frames
-from controllers.denoising.segment import DenoiseSettings, SegmentDenoiser
+from controllers.denoising.segment import DenoiseSettings, DenoiseSolution, SegmentDenoiser, join_segments, shift_frames
 from mapctl import rotations
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening import GapQuery

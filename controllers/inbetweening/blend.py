@@ -8,10 +8,9 @@ from fractions import Fraction
 import torch
 from torch import Tensor
 
-from controllers.inbetweening.feasibility import MIN_JERK_PEAK_ACCELERATION
 from controllers.inbetweening.keyframes import effector_joint
-from controllers.inbetweening.pipeline import InfillSettings, fill
-from controllers.inbetweening.solution import InbetweenSolution
+from controllers.inbetweening.pipeline import InbetweenSolution, InfillSettings, fill
+from controllers.inbetweening.tween import MIN_JERK_PEAK_ACCELERATION
 from mapctl import rotations
 from mapctl.errors import RequestError
 from mapctl.inbetweening.missing import MissingMask, restore_observed

@@ -12,20 +12,19 @@ estimates that of the gap, as far as n tests discern a clip's own mean from nois
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from fractions import Fraction
+from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from controllers.common.canonical_clip import CanonicalClip
-from controllers.common.map_refinement import RefinementSettings
-from controllers.inbetweening.drawn_poses import fit_drawings, measure_drawing_error
+from controllers.common.map_refinement import RefinementSettings, refine
+from controllers.inbetweening.keyframes import fit_drawings, measure_drawing_error
 from controllers.inbetweening.proposers.auto import STANDING_STILL
 from controllers.inbetweening.proposers.partial_keys import propose_through_keys
-from controllers.inbetweening.refine import INFILL_REFINEMENT, refine_gaps
-from controllers.inbetweening.solution import InbetweenSolution
 from mapctl import contacts, rotations
 from mapctl.curves.curve import Curve
 from mapctl.errors import RequestError
@@ -36,18 +35,296 @@ from mapctl.inbetweening.loose_keys import LooseKeys, estimate_standing_height, 
 from mapctl.inbetweening.missing import MissingMask, compute_velocity_share, interpolate_missing, restore_observed
 from mapctl.inbetweening.path_closing import lead_over_keys
 from mapctl.inbetweening.query import GapSource, estimate_contact_logits
+from mapctl.inbetweening.seam_blending import blend_seams_in_positions, blend_seams_in_rotations
 from mapctl.kinematics import heading
 from mapctl.metrics.liveliness import measure_path_length
 from mapctl.motion import Motion
 from mapctl.numerics.intervals import true_intervals
 from mapctl.numerics.smooth_offsets import interpolate_offsets
 from mapctl.problem.ledger import Ledger
-from mapctl.problem.solution import Outcome, Status
+from mapctl.problem.solution import Outcome, Solution, Status, WindowRecord
 from mapctl.protocols import Density, Inbetweener
-from mapctl.retarget import as_rig, from_canonical, rig_joint_positions, to_canonical
+from mapctl.recording import Capture
+from mapctl.recording.fusion import transfer_change
+from mapctl.retarget import RigMap, as_rig, from_canonical, rig_joint_positions, to_canonical
 from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import CANONICAL, leg_length
-from mapctl.terms import Term
+from mapctl.solver.budget import Budget
+from mapctl.solver.lbfgs import LbfgsSettings
+from mapctl.terms import Clearance, FootContact, Jerk, Term
+
+_CONTEXT_FRAMES = 16  # frames at the prior's rate, on either side of a gap, that the MAP stage sees
+_USUAL_ERROR = 0.03  # metres: median error of a joint at which the sigmas below hold
+_TRUST_RANGE = (0.1, 1.0)  # of that factor; above 1 the MAP stage moved proposals no nearer to the truth
+INFILL_REFINEMENT = RefinementSettings(
+    uncertainty_ramp=8.0,
+    unobserved_sigma_deg=2.0,
+    unobserved_sigma_cm=2.0,
+    jerk=Jerk(sigma=150.0, frames=96),
+    clearance=Clearance(),
+    footing=FootContact(0.1, 0.05, 0.05, heels=None),
+    budget=Budget(evaluations=16),
+    lbfgs=LbfgsSettings(max_iterations=16),
+)
+"""Settings about an infiller's proposal, whose error is larger than a denoiser's: heights of toes stay near the
+network's, since styles differ in them, except those of toes that skate; a jerk term. More evaluations lower no
+error of a gap."""
+
+
+def refine_gaps(
+    proposal: Proposal,
+    query: GapQuery,
+    targets: EffectorTargets | None,
+    settings: RefinementSettings,
+    densities: Sequence[Density],
+    terms: Sequence[Term],
+) -> tuple[Motion, Ledger, tuple[WindowRecord, ...]]:
+    """Refine a proposal gap by gap; also returns the ledger and the cost of its windows."""
+    motion, missing = proposal.motion, query.missing
+    quats, root = motion.local_quat_xyzw.clone(), motion.root_position.clone()
+    trust = None if proposal.spread is None else _compute_trust(proposal.spread)
+    ledger, windows = Ledger(), []
+    for first, last in _find_gap_windows(missing.frames):
+        if last - first < 2:
+            continue
+        part, part_missing = slice(first, last), missing.slice(first, last)
+        capture = Capture.of_motion(
+            motion.slice(first, last),
+            seen=~part_missing.joints,
+            seen_root=~part_missing.root,
+            sigma=torch.zeros(CANONICAL.num_joints),
+            sigma_root=0.0,
+        )
+        refined = refine(
+            motion.slice(first, last),
+            proposal.contact_logits[part],
+            capture,
+            settings,
+            densities=densities,
+            targets=None if targets is None else EffectorTargets(targets.places[part], targets.wanted[part]),
+            terms=terms,
+            first_frame=first,
+            trust=None if trust is None else trust[part],
+        )
+        quats[part] = torch.where(part_missing.joints[..., None], refined.motion.local_quat_xyzw, quats[part])
+        root[part] = torch.where(part_missing.root[:, None], refined.motion.root_position, root[part])
+        ledger, windows = ledger.join(refined.ledger), [*windows, *refined.windows]
+    return replace(motion, root_position=root, local_quat_xyzw=quats), ledger, tuple(windows)
+
+
+def _compute_trust(spread: Float[Tensor, "frames joints 2"]) -> Float[Tensor, "frames joints"]:
+    """Compute by which factor the sigmas of a proposal change: its median error beside the usual one."""
+    return (spread[..., 0] / _USUAL_ERROR).clamp(*_TRUST_RANGE).float()
+
+
+def _find_gap_windows(missing: Bool[Tensor, " frames"]) -> list[tuple[int, int]]:
+    """Find first frame and one past the last of each gap with its context; gaps whose contexts overlap are merged."""
+    near = missing.clone()
+    for _, start, stop in true_intervals(missing[:, None]):
+        near[max(0, start - _CONTEXT_FRAMES) : stop + _CONTEXT_FRAMES] = True
+    return [(start, stop) for _, start, stop in true_intervals(near[:, None])]
+
+
+@dataclass(frozen=True)
+class Pick:
+    """Which of several answers this is."""
+
+    name: str
+    """Name of this answer."""
+    energies: Mapping[str, float]
+    """Mean energies of a frame by the names of all answers, nats."""
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class InbetweenSolution(Solution):
+    """A complete motion on the given rig, at its rate, with all of its frames."""
+
+    missing: MissingMask
+    """Values that were filled in, by joint of the rig."""
+    rig: Rig
+    """The rig as it was identified."""
+    contacts: Bool[Tensor, "frames 2"] = field(default_factory=lambda: torch.zeros(0, 2, dtype=torch.bool))
+    """Contacts of the left and the right toe, at PRIOR_FPS."""
+    sources: tuple[GapSource, ...] = ()
+    """Proposer of the motion in each gap in which nothing was known."""
+    proposal_seconds: float = 0.0
+    """Of `seconds`, those in which the in-betweener proposed."""
+    pick: Pick | None = None
+    """Which of several answers this is; None where one alone was made."""
+    gap_notes: tuple[str, ...] = ()
+    """A note on each of these gaps: proposer, error estimate, remarks."""
+
+    @property
+    def frame_ms(self) -> float:
+        """Compute of each filled frame, milliseconds."""
+        return 1000 * self.seconds / max(1, int(self.missing.frames.sum()))
+
+    def list_gaps(self) -> list[dict[str, Any]]:
+        """List what was filled in: frames, how many joints of the rig, and whether the body's position was missing."""
+        joints, root = self.missing.joints, self.missing.root
+        return [
+            {
+                "start": start,
+                "stop": stop,
+                "joints": int(joints[start:stop].any(dim=0).sum()),
+                "root": bool(root[start:stop].any()),
+            }
+            for _, start, stop in true_intervals(self.missing.frames[:, None])
+        ]
+
+    def details(self) -> dict[str, Any]:
+        """Return gaps, who filled them, contacts at PRIOR_FPS, and compute of each filled frame.
+
+        `sides_apart_cm` is the farthest at which two sides met, if any did; `fallback` lists gaps, in frames at
+        PRIOR_FPS, that were not the in-betweener's that was asked for.
+        """
+        apart = [100 * source.apart for source in self.sources if source.apart is not None]
+        return {
+            "gaps": self.list_gaps(),
+            "gap_notes": list(self.gap_notes),
+            "fallback": [
+                {"start": source.start, "stop": source.stop, "by": source.by, "reason": source.reason}
+                for source in self.sources
+                if source.reason
+            ],
+            **({"sides_apart_cm": max(apart)} if apart else {}),
+            **({"picked": self.pick.name, "draws": dict(self.pick.energies)} if self.pick else {}),
+            "timing": {
+                "draw_ms": 1000 * self.proposal_seconds,
+                "finish_ms": 1000 * (self.seconds - self.proposal_seconds),
+            },
+            "contacts": self.contacts.tolist(),
+            "frame_ms": self.frame_ms,
+        }
+
+
+_TIE_FRAMES = 1e-6  # frames
+
+
+@dataclass(frozen=True, eq=False)
+class CanonicalClip:
+    """A clip with missing values, on its own rig and on canonical joints."""
+
+    original: Motion
+    """The clip as given; its missing values may be anything."""
+    missing: MissingMask
+    """Missing values, by joint of the rig."""
+    interpolated: Motion
+    """The clip with its missing values interpolated."""
+    canonical: Motion
+    """The interpolated clip on canonical joints and the performer's bones, at its own rate."""
+    rigmap: RigMap
+    """Map from the rig to canonical joints."""
+
+    @staticmethod
+    def of(motion: Motion, missing: MissingMask, rig: Rig | None = None) -> "CanonicalClip":
+        """Make a clip canonical; `rig` overrides recognition. RequestError for a rig that is not recognised."""
+        interpolated = interpolate_missing(motion, missing)
+        return CanonicalClip(motion, missing, interpolated, *to_canonical(interpolated, rig))
+
+    def query(
+        self,
+        *,
+        effector_targets: EffectorTargets | None = None,
+        keep_trajectory: bool = False,
+        loose: LooseKeys | None = None,
+    ) -> GapQuery:
+        """Build the query for in-betweeners, at PRIOR_FPS; targets and loose keys are by frame of the clip.
+
+        A frame of the query between two of the clip is the nearby frame with the fewest missing values, if that has
+        fewer than the two.
+        """
+        canonical, missing = self.canonical, self.missing
+        whole = _resample_to_end(canonical)
+        at = torch.arange(whole.num_frames, dtype=torch.float64) * float(canonical.fps) / PRIOR_FPS
+        at = at.clamp(max=canonical.num_frames - 1)
+        low = (at + 1e-9).floor().long()
+        high = torch.where(at - low > _TIE_FRAMES, low + 1, low).clamp(max=canonical.num_frames - 1)
+        missing_values = torch.cat([missing.joints, missing.root[:, None]], dim=1)
+        best = _find_most_complete_frames(at, missing_values.sum(dim=1))
+        snapped = missing_values[best].sum(dim=1) < (missing_values[low] | missing_values[high]).sum(dim=1)
+        at = torch.where(snapped, best.to(at), at)
+        low, high = torch.where(snapped, best, low), torch.where(snapped, best, high)
+        quats = torch.where(snapped[:, None, None], canonical.local_quat_xyzw[best], whole.local_quat_xyzw)
+        root = torch.where(snapped[:, None], canonical.root_position[best], whole.root_position)
+        shown = replace(whole, root_position=root, local_quat_xyzw=rotations.make_sign_continuous(quats))
+        joints, seconds = self._missing_canonical_joints(), at / float(canonical.fps)
+        if effector_targets is not None:
+            effector_targets = effector_targets.shown(seconds, fps=float(canonical.fps))
+        if loose is not None:
+            loose = loose.shown(seconds, fps=float(canonical.fps))
+        mask = MissingMask(joints[low] | joints[high], missing.root[low] | missing.root[high])
+        return GapQuery(shown, mask, seconds, effector_targets, keep_trajectory, loose)
+
+    def back(self, made: Motion, query: GapQuery) -> Motion:
+        """Return an answer to the query on the rig, at the clip's rate, with blended seams and what is known to the
+        bit. If the answer is the query's own interpolation, return the interpolation on the rig.
+        """
+        filled = self.interpolated
+        if made is not query.motion or query.keep_trajectory or query.loose is not None:
+            at_prior_rate = self.canonical.fps == PRIOR_FPS
+            own = made if at_prior_rate else transfer_change(self.canonical, query.motion, made, query.seconds)
+            filled = from_canonical(own, self.rigmap, self.interpolated)
+            filled = self._blend_seams(restore_observed(filled, self.interpolated, self.missing))
+        return self.restore_observed(filled)
+
+    def restore_observed(self, motion: Motion) -> Motion:
+        """Return the original with its missing values from a motion on its rig."""
+        return restore_observed(motion, self.original, self.missing)
+
+    def _missing_canonical_joints(self) -> Bool[Tensor, "frames joints"]:
+        """Find the canonical joints whose rotation is missing; an End Site rotates with its parent."""
+        columns = []
+        for joint, own in enumerate(self.rigmap.joint_of):
+            columns.append(columns[CANONICAL.parents[joint]] if own is None else self.missing.joints[:, own])
+        return torch.stack(columns, dim=1)
+
+    def _blend_seams(self, filled: Motion) -> Motion:
+        fps, missing = float(self.original.fps), self.missing
+        moving = {
+            joint: blend_seams_in_positions(values, missing.root, fps=fps)
+            for joint, values in filled.moving_offsets.items()
+        }
+        return replace(
+            filled,
+            moving_offsets=moving,
+            root_position=blend_seams_in_positions(filled.root_position, missing.root, fps=fps),
+            local_quat_xyzw=blend_seams_in_rotations(filled.local_quat_xyzw, missing.joints, fps=fps),
+        )
+
+
+def _resample_to_end(canonical: Motion) -> Motion:
+    """Resample to PRIOR_FPS; an end that is far from the last frame there gets a frame of its own."""
+    last = canonical.num_frames - 1
+    moments = int(last * PRIOR_FPS / canonical.fps) + 1
+    over = last * PRIOR_FPS / canonical.fps - (moments - 1)
+    if over <= Fraction(1, 2):
+        return canonical.resample(PRIOR_FPS)
+    frame = torch.arange(canonical.num_frames + math.ceil(canonical.fps / PRIOR_FPS)).clamp(max=last)
+    held = replace(
+        canonical, root_position=canonical.root_position[frame], local_quat_xyzw=canonical.local_quat_xyzw[frame]
+    )
+    return held.resample(PRIOR_FPS).slice(0, moments + 1)
+
+
+def _find_most_complete_frames(
+    at: Float[Tensor, " shown"], missing_counts: Int[Tensor, " frames"]
+) -> Int[Tensor, " shown"]:
+    """Find for each time, in frames of the clip, the frame with the fewest missing values of those nearer to it than to
+    another time; the nearest of several; any other frame if there is none.
+    """
+    edges = (at[1:] + at[:-1]) / 2 + _TIE_FRAMES  # a frame midway between two times belongs to the earlier one
+    beyond = at.new_full((1,), torch.inf)
+    own, last = at.round().long(), len(missing_counts) - 1
+    reach = math.ceil(float(torch.diff(at).max()) / 2) + 1 if len(at) > 1 else last
+    frames = own[:, None] + torch.arange(-reach, reach + 1)
+    near = (frames > torch.cat([-beyond, edges])[:, None]) & (frames <= torch.cat([edges, beyond])[:, None])
+    inside = near & (frames >= 0) & (frames <= last)
+    frames = frames.clamp(0, last)
+    cost = missing_counts[frames] + (frames - at[:, None]).abs() / (2 * reach + 2)
+    best = torch.where(inside, cost, torch.inf).argmin(dim=1, keepdim=True)
+    return torch.where(inside.any(dim=1), frames.gather(1, best)[:, 0], missing_counts.argmax())
+
 
 _SHARPNESS = 1.75  # s above: over unseen clips and their copies in varied poses the error is flat from 1.5 to 2.5
 _TEST_NOISE = 0.5  # variance of a test's logarithm over that between clips, over the same

@@ -4,26 +4,126 @@ of a hand or a foot, the limb is bent to reach it.
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
-from controllers.inbetweening.feasibility import check_keyframes, note_joint_ranges
 from controllers.inbetweening.keyframes import (
     collect_effector_targets,
     collect_loose_keys,
     keyframe_errors,
     missing_between_keys,
 )
-from controllers.inbetweening.pipeline import InfillSettings, fill
-from controllers.inbetweening.solution import InbetweenSolution
+from controllers.inbetweening.pipeline import InbetweenSolution, InfillSettings, fill
+from mapctl import joint_ranges, rotations
+from mapctl.inbetweening.effector_targets import EffectorTargets
+from mapctl.inbetweening.loose_keys import LooseKeys
 from mapctl.inbetweening.missing import MissingMask, interpolate_missing
 from mapctl.intent.keyframes import Key, Keys
 from mapctl.motion import Motion
 from mapctl.protocols import Density, Inbetweener
-from mapctl.retarget import RigMap, as_rig, identify_rig, to_canonical
+from mapctl.retarget import RigMap, as_rig, identify_rig, rig_joint_positions, to_canonical
 from mapctl.retarget.rigs import Rig
 from mapctl.terms import Term
+
+_MAX_ROOT_SPEED = 10.0  # m/s of the hips
+_MAX_JOINT_RATE = 30.0  # rad/s of a joint
+_MAX_EFFECTOR_SPEED = 25.0  # m/s of a hand or a foot: beyond kicks and throws
+_MAX_EFFECTOR_ACCELERATION = 130.0
+"""m/s^2 of a hand relative to the hips: one frame in a thousand of mocap's (walks to fights) has more."""
+_REPORTED_DEGREES = 1.0  # beyond a joint's range, of which there is a note
+_MAX_NOTES = 4  # joints beyond their ranges that are named
+MIN_JERK_PEAK_ACCELERATION = 5.77
+"""Peak acceleration of the minimum-jerk trajectory, over distance and time squared (Flash and Hogan 1985)."""
+
+
+def check_keyframes(
+    motion: Motion,
+    canonical: Motion,
+    rigmap: RigMap,
+    missing: MissingMask,
+    targets: EffectorTargets | None,
+    loose: LooseKeys | None = None,
+) -> tuple[str, ...]:
+    """Note neighbouring keys between which even the shortest path is too fast: by position of the hips (metres), by
+    rotation of the joints that both give, or by effector targets. Places of loose keys count over the ground.
+
+    The motion is valid where it is not missing, on its rig and on canonical joints.
+    """
+    hips = canonical.root_position
+    notes = _check_hips(hips, missing, loose, fps=float(motion.fps))
+    for start, stop in pairwise((~missing.root).nonzero()[:, 0].tolist()):
+        seconds = float((stop - start) / motion.fps)
+        quats = motion.local_quat_xyzw[[start, stop]]
+        turns = rotations.to_rotation_vector(rotations.multiply(rotations.inverse(quats[0]), quats[1])).norm(dim=-1)
+        rates = turns * ~(missing.joints[start] | missing.joints[stop]) / seconds
+        worst = int(rates.argmax())
+        if (rate := float(rates[worst])) > _MAX_JOINT_RATE:
+            name = motion.skeleton.names[worst]
+            notes.append(f"{name} needs {rate:.0f} rad/s between frames {start} and {stop}, faster than joints turn")
+    return (*notes, *([] if targets is None else _check_effector_targets(motion, hips, rigmap, missing, targets)))
+
+
+def note_joint_ranges(canonical: Motion, missing: MissingMask, rigmap: RigMap) -> tuple[str, ...]:
+    """Note the joints that keys turn beyond their ranges: they stay as given. The motion is canonical and valid where
+    it is not missing; the mask is of the rig's joints."""
+    known = torch.zeros(canonical.num_frames, canonical.num_joints, dtype=torch.bool)
+    for joint, own in enumerate(rigmap.joint_of):
+        above = rigmap.joint_of[canonical.skeleton.parents[joint]] if joint else None
+        if own is not None and above is not None:
+            known[:, joint] = ~(missing.joints[:, own] | missing.joints[:, above])
+    found = joint_ranges.outside(canonical, known=known)
+    notes = [
+        f"{one.joint} is {one.degrees:.0f} degrees beyond its range in the key at frame {one.frame}, and stays as given"
+        for one in found
+        if one.degrees > _REPORTED_DEGREES
+    ]
+    more = [] if len(notes) <= _MAX_NOTES else [f"and {len(notes) - _MAX_NOTES} more joints are beyond their ranges"]
+    return (*notes[:_MAX_NOTES], *more)
+
+
+def _check_hips(
+    hips: Float[Tensor, "frames 3"], missing: MissingMask, loose: LooseKeys | None, *, fps: float
+) -> list[str]:
+    """Note places of the hips that are too far from one key to the next."""
+    notes, told, places = [], ~missing.root, hips.clone()
+    placed = torch.zeros_like(told) if loose is None else loose.placed
+    if loose is not None:
+        places[placed, ::2] = loose.ground[placed]
+    for start, stop in pairwise((told | placed).nonzero()[:, 0].tolist()):
+        axes = [0, 2] if bool(placed[start] | placed[stop]) else [0, 1, 2]
+        speed = float((places[stop] - places[start])[axes].norm()) * fps / (stop - start)
+        if speed > _MAX_ROOT_SPEED:
+            notes.append(f"the hips need {speed:.1f} m/s between frames {start} and {stop}, faster than anyone runs")
+    return notes
+
+
+def _check_effector_targets(
+    motion: Motion, hips: Float[Tensor, "frames 3"], rigmap: RigMap, missing: MissingMask, targets: EffectorTargets
+) -> list[str]:
+    """Note hands and feet that are too fast between neighbouring keys, one of which gives only their position."""
+    notes, whole, own = [], ~missing.frames, rig_joint_positions(motion, rigmap)
+    for limb in targets.wanted.any(dim=0).nonzero()[:, 0].tolist():
+        wanted = targets.wanted[:, limb]
+        positions = torch.where(wanted[:, None], targets.places[:, limb], own[:, limb])
+        for start, stop in pairwise((wanted | whole).nonzero()[:, 0].tolist()):
+            if not bool(wanted[start] | wanted[stop]):
+                continue
+            displacement, seconds = positions[stop] - positions[start], (stop - start) / float(motion.fps)
+            speed, name = float(displacement.norm()) / seconds, motion.skeleton.names[rigmap.joint_of[limb] or 0]
+            distance = float((displacement - (hips[stop] - hips[start])).norm())
+            acceleration = MIN_JERK_PEAK_ACCELERATION * distance / seconds**2
+            if speed > _MAX_EFFECTOR_SPEED:
+                notes.append(f"{name} needs {speed:.0f} m/s between frames {start} and {stop}, faster than limbs move")
+            elif acceleration > _MAX_EFFECTOR_ACCELERATION:
+                notes.append(
+                    f"{name} goes {100 * distance:.0f} cm in {seconds:.2f} s between frames {start} and {stop}, which"
+                    f" takes {acceleration:.0f} m/s^2; mocap's hardly ever reach {_MAX_EFFECTOR_ACCELERATION:.0f}"
+                )
+    return notes
 
 
 def tween(

@@ -8,6 +8,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from controllers.common.map_refinement import RefinementSettings, estimate_rest_height
+from controllers.inbetweening.pipeline import INFILL_REFINEMENT, InbetweenSolution, Pick
 from controllers.inbetweening.proposers.auto import AutoInbetweener
 from controllers.inbetweening.proposers.rollouts import (
     EVERY_ROLLOUT_JUMPED,
@@ -15,8 +16,6 @@ from controllers.inbetweening.proposers.rollouts import (
     select_likeliest_density,
 )
 from controllers.inbetweening.proposers.slerp import SlerpInbetweener
-from controllers.inbetweening.refine import INFILL_REFINEMENT
-from controllers.inbetweening.solution import InbetweenSolution, Pick
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode, integrate_root
 from mapctl.metrics.realism import Diversity, measure_diversity

@@ -8,7 +8,7 @@ import torch
 import tyro
 from tyro.conf import arg
 
-from controllers.inbetweening.chain import ChainSettings, chain
+from controllers.inbetweening.infill import ChainSettings, chain
 from controllers.inbetweening.pipeline import InfillSettings
 from controllers.inbetweening.proposers import build_inbetweener
 from mapctl.commands.shared import inputs, options, outputs, results

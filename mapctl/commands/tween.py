@@ -12,9 +12,8 @@ import priors
 from controllers.inbetweening.keyframe_poses import KeyframeClip, build_keyframe_clip
 from controllers.inbetweening.keyframe_timing import KeyInterval, suggest_intervals
 from controllers.inbetweening.keyframes import check_effectors
-from controllers.inbetweening.pipeline import InfillSettings
+from controllers.inbetweening.pipeline import InbetweenSolution, InfillSettings
 from controllers.inbetweening.proposers import ModelLoaders, RolloutInbetweener, StitchedInbetweener, build_inbetweener
-from controllers.inbetweening.solution import InbetweenSolution
 from controllers.inbetweening.tween import measure_keyframe_errors, tween
 from controllers.inbetweening.variations import Source, Tweening, Variations, lowest_energy, sample_variations
 from mapctl import report

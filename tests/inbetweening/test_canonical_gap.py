@@ -7,7 +7,7 @@ import torch
 from captures import apart_deg
 from helpers import walk
 
-from controllers.common.canonical_clip import CanonicalClip
+from controllers.inbetweening.pipeline import CanonicalClip
 from mapctl import retarget
 from mapctl.inbetweening.missing import MissingMask
 from mapctl.recording.masks import ROOT, Mask

@@ -8,7 +8,7 @@ from performers import FEET, TOES, Performer
 from rig_maker import Make, make, names_of
 
 from controllers.inbetweening.blend import LimbTransfer, blend
-from controllers.inbetweening.chain import ChainSettings, chain
+from controllers.inbetweening.infill import ChainSettings, chain
 from controllers.inbetweening.proposers import SlerpInbetweener
 from mapctl import retarget
 from mapctl.motion import Motion

@@ -11,8 +11,7 @@ from methods import UNFINISHED, by_method
 from tiny_infiller import tiny_infiller
 from tiny_tweener import tiny_tweener
 
-from controllers.inbetweening.drawn_poses import fit_drawings, measure_drawing_error
-from controllers.inbetweening.keyframes import missing_between_keys
+from controllers.inbetweening.keyframes import fit_drawings, measure_drawing_error, missing_between_keys
 from controllers.inbetweening.tween import measure_keyframe_errors, tween
 from mapctl import rotations
 from mapctl.inbetweening.loose_keys import LooseKeys, view_axes

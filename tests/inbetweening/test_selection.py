@@ -7,7 +7,7 @@ import torch
 from helpers import tiny_density, walk
 from tiny_infiller import tiny_infiller
 
-from controllers.common.canonical_clip import CanonicalClip
+from controllers.inbetweening.pipeline import CanonicalClip
 from controllers.inbetweening.proposers.auto import STANDING_STILL, AutoInbetweener
 from controllers.inbetweening.proposers.rollouts import hold_planted
 from controllers.inbetweening.tween import tween

@@ -12,12 +12,10 @@ from tiny_infiller import tiny_infiller
 from tiny_prior import save_tiny_prior
 
 import priors
-from controllers.common.canonical_clip import CanonicalClip
 from controllers.inbetweening.infill import infill
-from controllers.inbetweening.pipeline import InfillSettings
+from controllers.inbetweening.pipeline import INFILL_REFINEMENT, CanonicalClip, InfillSettings
 from controllers.inbetweening.proposers import AutoInbetweener, RolloutInbetweener, SlerpInbetweener
 from controllers.inbetweening.proposers.rollouts import Roller, Rollout, RolloutSettings
-from controllers.inbetweening.refine import INFILL_REFINEMENT
 from controllers.inbetweening.tween import tween
 from controllers.inbetweening.variations import lowest_energy, sample_variations
 from mapctl.errors import RequestError

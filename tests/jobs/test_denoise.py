@@ -12,7 +12,7 @@ from helpers import generator
 from tiny_denoiser import QUICK, tiny_denoiser
 
 from controllers.denoising.denoise import begins_with_tpose, denoise, hold_rigid_bones
-from controllers.denoising.result import join_segments
+from controllers.denoising.segment import join_segments
 from mapctl import retarget, rotations
 from mapctl.recording.masks import ALL, ROOT, Mask
 from mapctl.skeleton import CANONICAL

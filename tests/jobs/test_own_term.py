@@ -15,8 +15,7 @@ from controllers.denoising.denoise import denoise
 from controllers.following.follow import follow
 from controllers.generation.generate import GenerateSettings, generate
 from controllers.inbetweening.blend import LimbTransfer, blend
-from controllers.inbetweening.chain import ChainSettings, chain
-from controllers.inbetweening.infill import infill
+from controllers.inbetweening.infill import ChainSettings, chain, infill
 from controllers.inbetweening.tween import tween
 from controllers.steering import steer
 from mapctl import curves, retarget

@@ -8,7 +8,7 @@ import torch
 from captures import on_rig
 from catalogue import INBETWEENERS
 
-from controllers.common.canonical_clip import CanonicalClip
+from controllers.inbetweening.pipeline import CanonicalClip
 from mapctl.inbetweening.missing import MissingMask
 from mapctl.protocols import Inbetweener
 from mapctl.recording.masks import ALL, Mask

@@ -8,7 +8,7 @@ from captures import on_rig
 from tiny_transformer import save_tiny_transformer, tiny_transformer
 
 import priors
-from controllers.common.canonical_clip import CanonicalClip
+from controllers.inbetweening.pipeline import CanonicalClip
 from mapctl import rotations
 from mapctl.errors import CheckpointError
 from mapctl.inbetweening import GapQuery

@@ -7,7 +7,7 @@ import torch
 from helpers import walk
 from tiny_stitcher import CONFIG, network, tiny_stitcher
 
-from controllers.common.canonical_clip import CanonicalClip
+from controllers.inbetweening.pipeline import CanonicalClip
 from mapctl import rotations
 from mapctl.features import mirror_features
 from mapctl.inbetweening.missing import MissingMask

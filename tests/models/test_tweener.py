@@ -9,7 +9,7 @@ from tiny_path import ToldPath, save_tiny_path
 from tiny_tweener import save_tiny_tweener, tiny_tweener
 
 import priors
-from controllers.common.canonical_clip import CanonicalClip
+from controllers.inbetweening.pipeline import CanonicalClip
 from controllers.inbetweening.proposers import AutoInbetweener, SlerpInbetweener
 from controllers.inbetweening.proposers.auto import ChoiceSettings
 from mapctl import rotations
