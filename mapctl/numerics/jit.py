@@ -1,4 +1,4 @@
-"""How numba kernels are compiled: kept on disk, on one core, without Python objects inside."""
+"""How numba kernels are compiled: kept on disk where that can be, on one core, without Python objects inside."""
 
 from collections.abc import Callable
 from typing import Any
@@ -16,7 +16,11 @@ def make_jit_decorators(*relaxed: str) -> tuple[JitDecorator, JitDecorator]:
     """
     compiler: Any = njit  # whose overloads no type checker follows
     shared: dict[str, Any] = {"error_model": "numpy", "fastmath": set(relaxed)}
-    return (
-        compiler(nogil=True, cache=True, **shared),
-        compiler(no_cpython_wrapper=True, no_cfunc_wrapper=True, **shared),
-    )
+
+    def entry(function: Callable[..., Any]) -> Callable[..., Any]:
+        try:
+            return compiler(nogil=True, cache=True, **shared)(function)
+        except RuntimeError:  # numba found no folder that it may write to: each process compiles
+            return compiler(nogil=True, **shared)(function)
+
+    return entry, compiler(no_cpython_wrapper=True, no_cfunc_wrapper=True, **shared)

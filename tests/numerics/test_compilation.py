@@ -6,6 +6,8 @@ import sys
 
 import pytest
 
+from mapctl.numerics.jit import make_jit_decorators
+
 
 @pytest.mark.slow
 def test_no_job_compiles_after_the_command(tmp_path):
@@ -24,3 +26,10 @@ def test_no_job_compiles_after_the_command(tmp_path):
         kept.append({path: path.stat().st_mtime_ns for path in (tmp_path / "kept").rglob("*.nb?")})
     assert kept[0]
     assert all(files == kept[0] for files in kept)
+
+
+def test_a_kernel_without_a_folder_to_be_kept_in_is_compiled_all_the_same():
+    namespace: dict = {}
+    exec(compile("def twice(number):\n    return number + number\n", "no-such-folder/kernel.py", "exec"), namespace)
+    entry, _ = make_jit_decorators()
+    assert entry(namespace["twice"])(21) == 42
