@@ -74,7 +74,7 @@ def run(command: Bench) -> int:
     return 0
 
 
-def _measure_evaluation(prior: Density, count: int, repeats: int) -> Row:
+def _measure_evaluation(prior: "priors.LstmGmmDensity", count: int, repeats: int) -> Row:
     """Time energy and gradient of one window on the fast path and on the torch reference."""
     fast, slow = (_time_evaluation(each, count, repeats) for each in (prior, prior.without_kernels()))
     return {
