@@ -30,7 +30,7 @@ from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, Skeleton
 from mapctl.terms import Term
 
 _LOOK = 20  # frames after which is looked whether a pace has been taken on
-# Times that a label is told at once; a run that is told more often flings its legs.
+# Times that a label counts at once; runs conditioned on it more often fling their legs.
 _MOST_EMPHATIC = {"stand": 4, "walk": 4, "run": 2}
 _WITHOUT_END = 3600 * PRIOR_FPS  # frames for which a pace lasts that the data never change
 
@@ -52,9 +52,9 @@ def draw_paces(
 
 
 class PacePlan:
-    """Tells a prior paces one after the other, and the more emphatically the longer it does not take one on.
+    """Conditions a prior on paces one after the other, with the more weight the longer it does not take one on.
 
-    A label is a bias of the network's: told twice, it counts twice. Once it has the pace, telling it once suffices.
+    A label is a bias of the network's: given twice, it counts twice. Once the motion has the pace, once suffices.
     """
 
     def __init__(self, prior: Density, paces: Iterator[tuple[str, int]]):
@@ -62,22 +62,22 @@ class PacePlan:
         self._prior, self._paces = prior, paces
         self._pace, self._left = next(paces)
         self._emphasis = 1
-        self._told: dict[str, list[Density]] = {}
+        self._conditioned: dict[str, list[Density]] = {}
         # The frame before which each ends. What reads them is never far behind, if anything does.
         self._pieces = deque[tuple[int, Density]](maxlen=1000)
         self._seen = 0
 
-    def tell(self, longest: int) -> tuple[Density, int]:
-        """Return the prior told what is to come, and for how many frames, at most `longest`, it is to be sampled."""
-        told = self._told.setdefault(self._pace, [self._prior])  # as often as their index says
-        while len(told) <= self._emphasis:
-            told.append(told[-1].conditioned_on([label_pace(self._pace)]))
-        return told[self._emphasis], min(self._left, longest, _LOOK)
+    def condition(self, longest: int) -> tuple[Density, int]:
+        """Return the prior conditioned on the next pace, and for how many frames, at most `longest`, to sample it."""
+        conditioned = self._conditioned.setdefault(self._pace, [self._prior])  # as often as their index says
+        while len(conditioned) <= self._emphasis:
+            conditioned.append(conditioned[-1].conditioned_on([label_pace(self._pace)]))
+        return conditioned[self._emphasis], min(self._left, longest, _LOOK)
 
     def see(self, features: Float[Tensor, "frames size"]) -> None:
         """Go on after what was sampled."""
         self._seen += len(features)
-        self._pieces.append((self._seen, self._told[self._pace][self._emphasis]))
+        self._pieces.append((self._seen, self._conditioned[self._pace][self._emphasis]))
         self._left -= len(features)
         if self._left == 0:
             (self._pace, self._left), self._emphasis = next(self._paces), 1
@@ -85,16 +85,16 @@ class PacePlan:
         has = find_pace(measure_way_speed(features))
         self._emphasis = 1 if has == self._pace else min(self._emphasis + 1, _MOST_EMPHATIC[self._pace])
 
-    def find_told(self, frame: int) -> Density:
-        """Find the prior as it was told when a frame was sampled, counted from 0; earlier frames are then forgotten."""
+    def find_prior(self, frame: int) -> Density:
+        """Find the prior as conditioned when a frame was sampled, counted from 0; earlier frames are then forgotten."""
         while self._pieces[0][0] <= frame:
             self._pieces.popleft()
         return self._pieces[0][1]
 
 
 def plan_paces(prior: Density, speed: float, generator: torch.Generator) -> PacePlan | None:
-    """Plan which paces a prior is told: from the pace of a mean `speed`, m/s, on, as often as its data change. None for
-    a prior that knows no paces."""
+    """Plan the paces that a prior is conditioned on: from the pace of a mean `speed`, m/s, on, as often as its data
+    change. None for a prior without labels of paces."""
     if not prior.pace_rates:
         return None
     return PacePlan(prior, draw_paces(prior.pace_rates, find_pace(speed), generator))
@@ -122,9 +122,9 @@ class GenerateSettings:
     condition_on_start: bool = True
     """Whether a prior with labels is conditioned on those of the initial state's clip (gait, style): unconditioned,
     one whose free runs no critic has judged lets most runs fall into a walk within ten seconds, as no clip does."""
-    tell_paces: bool = True
-    """Whether a prior that knows paces is told one after the other, as often as its data change theirs: samples of a
-    density hardly ever change theirs unless they are told."""
+    vary_paces: bool = True
+    """Whether a prior with labels of paces is conditioned on one after the other, as often as its data change theirs:
+    samples of a density hardly ever change theirs by themselves."""
     foot_cleanup: FootCleanupSettings | None = field(default_factory=FootCleanupSettings)
     """Settings of the foot clean-up; None leaves it out."""
     sigma_planted: float | None = None
@@ -260,13 +260,13 @@ def sample_pieces(
     paces: PacePlan | None = None,
     longest: int = _CHUNK,
 ) -> Iterator[Float[Tensor, "_ size"]]:
-    """Sample consecutive pieces of one motion, of at most `longest` frames, without end; `paces` are told meanwhile."""
+    """Sample consecutive pieces of one motion, of at most `longest` frames, without end, conditioned on `paces`."""
     settings, prior, state = settings or GenerateSettings(), beginning.prior, beginning.state
     while True:
-        told, count = (prior, longest) if paces is None else paces.tell(longest)
-        draw = told.sample
+        conditioned, count = (prior, longest) if paces is None else paces.condition(longest)
+        draw = conditioned.sample
         if settings.sigma_planted is not None:
-            draw = partial(told.sample_planted, sigma_speed=settings.sigma_planted)
+            draw = partial(conditioned.sample_planted, sigma_speed=settings.sigma_planted)
         features, state = draw(state, count, generator, temperature=settings.temperature)
         if paces is not None:
             paces.see(features[0])
@@ -304,7 +304,7 @@ def _start_stream(
         raise RequestError(f"seconds must be positive, got {seconds:g}")
     frames = max(2, round(seconds * PRIOR_FPS))
     beginning = initialise_generation(prior, settings, clip, generator, scale=character.scale)
-    paces = plan_paces(beginning.prior, beginning.speed, generator) if settings.tell_paces else None
+    paces = plan_paces(beginning.prior, beginning.speed, generator) if settings.vary_paces else None
     pieces, ground_pose = sample_pieces(beginning, generator, settings, paces=paces), beginning.ground_pose
     if refiner is not None:
         pieces = (piece[0] for piece in refiner.stream(piece.unsqueeze(0) for piece in pieces))
@@ -320,7 +320,7 @@ def _start_stream(
             skeleton=character.unit_skeleton,
             terms=[character.term(term) for term in terms],
             record=solved.append,
-            find_prior=None if paces is None else paces.find_told,
+            find_prior=None if paces is None else paces.find_prior,
         )
     return _rechunk(pieces, frames), ground_pose
 

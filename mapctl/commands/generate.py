@@ -74,7 +74,7 @@ def run(command: Generate) -> int:
     if command.style not in (None, "none"):
         names = [name.strip() for name in command.style.split(",")]
         prior = prior.conditioned_on(names)
-        settings = replace(settings, tell_paces=not {*names} & {*PACES, *map(label_pace, PACES)})
+        settings = replace(settings, vary_paces=not {*names} & {*PACES, *map(label_pace, PACES)})
     refiner = None if command.refiner is None else priors.refiner_of(command.prior, command.refiner)
     character = read_character(command.rig, command)
     if settings.foot_cleanup is not None:
@@ -108,7 +108,7 @@ def _check_settings(command: Generate) -> tuple[GenerateSettings, Motion | None]
         command.temperature,
         start,
         condition_on_start=command.style is None,
-        tell_paces=command.style != "none",
+        vary_paces=command.style != "none",
         foot_cleanup=finishing,
         sigma_planted=planted,
     )

@@ -2,6 +2,7 @@
 
 import functools
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -106,7 +107,9 @@ def _open_app(command: Live, receiver: "OscReceiver | None") -> "tuple[LiveApp, 
     rigs = _choose_recorded_rigs(command, drawn, bodies)
     looks = [CharacterLook(*one, licence) for one in zip(drawn, rigs, strict=True)]
     characters = _start_characters(command, bodies)
-    try:
+    with ExitStack() as undo:  # a page that does not open leaves no process behind
+        for character in characters:
+            undo.callback(character.close)
         skeletons = [character.skeleton for character in characters]
         stream = streaming.open_stream(_stream(command), skeletons)
         show = LiveApp(
@@ -118,11 +121,8 @@ def _open_app(command: Live, receiver: "OscReceiver | None") -> "tuple[LiveApp, 
             stream=stream,
             source=receiver,
         )
-        return show, stream
-    except BaseException:
-        for character in characters:
-            character.close()
-        raise
+        undo.pop_all()
+    return show, stream
 
 
 def _check(command: Live) -> None:
@@ -178,7 +178,7 @@ def _start_characters(command: Live, bodies: Sequence[Character]) -> Sequence[Ch
         (_START_SPACING * (number - (command.characters - 1) / 2), 0.0) for number in range(command.characters)
     ]
     found: list[CharacterProcess] = []
-    try:
+    with ExitStack() as undo:
         for number, (at, own) in enumerate(zip(positions, bodies, strict=True)):
             request = CharacterRequest(
                 load,
@@ -190,10 +190,8 @@ def _start_characters(command: Live, bodies: Sequence[Character]) -> Sequence[Ch
                 transitions=functools.partial(priors.load_stitcher, priors.add_set(_STITCHER)),
             )
             found.append(CharacterProcess(request))
+            undo.callback(found[-1].close)
         for character in found:
             character.wait()
-    except BaseException:
-        for character in found:
-            character.close()
-        raise
+        undo.pop_all()
     return found

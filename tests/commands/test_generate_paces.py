@@ -29,7 +29,7 @@ def test_paces_are_told_unless_one_is_named(tmp_path, prior, monkeypatch, style,
         """Generation has begun."""
 
     def stream(*_given, settings, **_more):
-        raise Asked(settings.tell_paces, settings.condition_on_start)
+        raise Asked(settings.vary_paces, settings.condition_on_start)
 
     monkeypatch.setattr(generate_run, "stream", stream)
     words = () if style is None else ("--style", style)

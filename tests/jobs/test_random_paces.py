@@ -163,7 +163,7 @@ def pacing(monkeypatch):
 @pytest.mark.parametrize(("tell", "expected"), [(True, {"pace=walk", "pace=run"}), (False, set())])
 def test_generated_motion_is_told(pacing, tell, expected):
     density, told = pacing
-    settings = GenerateSettings(foot_cleanup=None, tell_paces=tell)
+    settings = GenerateSettings(foot_cleanup=None, vary_paces=tell)
     motion = generate(density, seconds=10.0, generator=generator(), settings=settings).motion
     assert motion.num_frames == 300
     assert set(told.values()) == expected
