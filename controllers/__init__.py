@@ -24,59 +24,28 @@ if TYPE_CHECKING:
     from mapctl.intent.keyframes import Key as Key
     from mapctl.intent.keyframes import Keys as Keys
 
-__all__ = [
-    "AutoInbetweener",
-    "DenoiseSettings",
-    "Drawing",
-    "FollowSettings",
-    "GenerateSettings",
-    "InfillSettings",
-    "Key",
-    "Keys",
-    "RolloutInbetweener",
-    "SlerpInbetweener",
-    "blend",
-    "chain",
-    "denoise",
-    "follow",
-    "generate",
-    "infill",
-    "retraced",
-    "steer",
-    "tween",
-]
-
 # A process does one job or two, and all of them take longer to import than a second of walking takes to solve.
-_HOMES = {
-    "DenoiseSettings": "controllers.denoising.denoise",
-    "denoise": "controllers.denoising.denoise",
-    "FollowSettings": "controllers.following.follow",
-    "follow": "controllers.following.follow",
-    "GenerateSettings": "controllers.generation.generate",
-    "generate": "controllers.generation.generate",
-    "blend": "controllers.inbetweening.blend",
-    "chain": "controllers.inbetweening.infill",
-    "InfillSettings": "controllers.inbetweening.infill",
-    "infill": "controllers.inbetweening.infill",
-    "retraced": "controllers.inbetweening.infill",
-    "AutoInbetweener": "controllers.inbetweening.proposers",
-    "RolloutInbetweener": "controllers.inbetweening.proposers",
-    "SlerpInbetweener": "controllers.inbetweening.proposers",
-    "tween": "controllers.inbetweening.tween",
-    "steer": "controllers.steering.steer",
-    "Drawing": "mapctl.intent.keyframes",
-    "Key": "mapctl.intent.keyframes",
-    "Keys": "mapctl.intent.keyframes",
+_NAMES = {
+    "controllers.denoising.denoise": ("DenoiseSettings", "denoise"),
+    "controllers.following.follow": ("FollowSettings", "follow"),
+    "controllers.generation.generate": ("GenerateSettings", "generate"),
+    "controllers.inbetweening.blend": ("blend",),
+    "controllers.inbetweening.infill": ("InfillSettings", "chain", "infill", "retraced"),
+    "controllers.inbetweening.proposers": ("AutoInbetweener", "RolloutInbetweener", "SlerpInbetweener"),
+    "controllers.inbetweening.tween": ("tween",),
+    "mapctl.intent.keyframes": ("Drawing", "Key", "Keys"),
 }
+_HOMES = {name: home for home, names in _NAMES.items() for name in names}
 
 
 def __getattr__(name: str):
+    if name == "steer":
+        return import_module("controllers.steering.steer")
     if name not in _HOMES:
         raise AttributeError(f"module 'controllers' has no attribute {name!r}")
-    module = import_module(_HOMES[name])
-    return module if name == "steer" else getattr(module, name)
+    return getattr(import_module(_HOMES[name]), name)
 
 
 def __dir__() -> list[str]:
     """Return the public names, which arrive on first use; what was imported for them is not meant for users."""
-    return __all__
+    return sorted([*_HOMES, "steer"])

@@ -25,58 +25,22 @@ if TYPE_CHECKING:
     from mapctl.skeleton import CANONICAL as CANONICAL
     from mapctl.skeleton import Skeleton as Skeleton
 
-__all__ = [
-    "CANONICAL",
-    "Motion",
-    "Skeleton",
-    "__version__",
-    "curves",
-    "editing",
-    "errors",
-    "features",
-    "formats",
-    "inbetweening",
-    "load",
-    "metrics",
-    "motion_dna",
-    "pose",
-    "protocols",
-    "recording",
-    "report",
-    "retarget",
-    "terms",
-]
-
 # torch takes a second to import; `mapctl --help` must not wait for it, so public names arrive on first use.
-_HOMES = {
-    "load": "mapctl.formats",
-    "Motion": "mapctl.motion",
-    "Skeleton": "mapctl.skeleton",
-    "CANONICAL": "mapctl.skeleton",
-    "curves": "mapctl.curves",
-    "editing": "mapctl.editing",
-    "errors": "mapctl.errors",
-    "features": "mapctl.features",
-    "formats": "mapctl.formats",
-    "inbetweening": "mapctl.inbetweening",
-    "metrics": "mapctl.metrics",
-    "motion_dna": "mapctl.motion_dna",
-    "pose": "mapctl.pose",
-    "protocols": "mapctl.protocols",
-    "recording": "mapctl.recording",
-    "report": "mapctl.report",
-    "retarget": "mapctl.retarget",
-    "terms": "mapctl.terms",
-}
+_SUBMODULES = (
+    *("curves", "editing", "errors", "features", "formats", "inbetweening", "metrics", "motion_dna", "pose"),
+    *("protocols", "recording", "report", "retarget", "terms"),
+)
+_HOMES = {"load": "formats", "Motion": "motion", "Skeleton": "skeleton", "CANONICAL": "skeleton"}
 
 
 def __getattr__(name: str):
+    if name in _SUBMODULES:
+        return import_module(f"mapctl.{name}")
     if name not in _HOMES:
         raise AttributeError(f"module 'mapctl' has no attribute {name!r}")
-    module = import_module(_HOMES[name])
-    return module if _HOMES[name] == f"mapctl.{name}" else getattr(module, name)
+    return getattr(import_module(f"mapctl.{_HOMES[name]}"), name)
 
 
 def __dir__() -> list[str]:
     """Return the public names, which arrive on first use; what was imported for them is not meant for users."""
-    return __all__
+    return sorted([*_HOMES, *_SUBMODULES, "__version__"])

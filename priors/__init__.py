@@ -20,35 +20,6 @@ if TYPE_CHECKING:
     from priors.tweening.inbetweener import Tweener as Tweener
     from priors.tweening.path import ConvPathPredictor as ConvPathPredictor
 
-__all__ = [
-    "AUTO",
-    "ConvDenoiser",
-    "ConvInfiller",
-    "ConvPathPredictor",
-    "KeyframeTiming",
-    "LstmGmmDensity",
-    "LstmRefiner",
-    "PoseTransformer",
-    "Stitcher",
-    "Tweener",
-    "add_set",
-    "find_kind",
-    "has_model",
-    "load",
-    "load_choice",
-    "load_denoiser",
-    "load_inbetweener",
-    "load_infiller",
-    "load_keyframe_timing",
-    "load_path",
-    "load_refiner",
-    "load_stitcher",
-    "load_transformer",
-    "load_tweener",
-    "refiner_of",
-    "use_weights",
-]
-
 # A walk needs one of these models, and all of them take longer to import than a second of it takes to solve.
 _HOMES = {
     "ConvDenoiser": "denoiser.network",
@@ -70,8 +41,7 @@ def __getattr__(name: str):
 
 
 def __dir__() -> list[str]:
-    """Return the public names, which arrive on first use; what was imported for them is not meant for users."""
-    return __all__
+    return sorted([*globals(), *_HOMES])
 
 
 def _import_model(name: str) -> ModuleType:

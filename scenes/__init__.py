@@ -19,18 +19,6 @@ if TYPE_CHECKING:
     from scenes.scene_file import load as load
     from scenes.stage import Shot as Shot
 
-__all__ = [
-    "Actor",
-    "CameraSettings",
-    "SceneDescription",
-    "Shot",
-    "back_end",
-    "film",
-    "find_scene",
-    "list_scenes",
-    "load",
-]
-
 # Graphics libraries take seconds to import and may be missing, so public names arrive on first use.
 _HOMES = {
     "CameraSettings": "scenes.cameras",
@@ -52,7 +40,7 @@ def __getattr__(name: str):
 
 def __dir__() -> list[str]:
     """Return the public names, which arrive on first use; what was imported for them is not meant for users."""
-    return __all__
+    return sorted([*_HOMES, "find_scene", "list_scenes"])
 
 
 def list_scenes() -> tuple[str, ...]:
