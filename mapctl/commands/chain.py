@@ -14,14 +14,13 @@ from controllers.inbetweening.proposers import build_inbetweener
 from mapctl.commands.shared import inputs, options, outputs, results
 from mapctl.commands.shared.command import ModelCommand
 from mapctl.commands.shared.progress_bar import show_progress
-from mapctl.commands.shared.results import read_dna
 from mapctl.errors import RequestError
 from mapctl.retarget import to_canonical
 from scenes.film import film
 
 
 @dataclass(frozen=True)
-class Chain(ModelCommand, options.RigOptions):
+class Chain(ModelCommand, options.RigOptions, options.ProposalOptions):
     """One long motion through short pieces of many clips, the gaps between them filled in; on the first clip's rig."""
 
     clips: tyro.conf.Positional[Annotated[tuple[Path, ...], arg(metavar="CLIP CLIP ...")]]
@@ -34,20 +33,6 @@ class Chain(ModelCommand, options.RigOptions):
     """Frames between two pieces: sampled from A to B."""
     seed: options.Count = 0
     """Seed of the gaps' lengths and of what rollouts sample."""
-    method: options.Method = "auto"
-    """Who proposes, as in `mapctl infill`."""
-    dna: options.MaybeDna = None
-    """Motion files or classes whose style the tweener takes, as in `mapctl infill`."""
-    no_finish: bool = False
-    """Leave the proposal as it is, on rigid bones: no MAP stage plants the feet."""
-    inbetweener: options.MaybeName = None
-    """The file or run folder of a trained transformer, infiller or tweener; the bundled one if not given. With auto a
-    tweener is for long gaps, beside the bundled transformer."""
-    stitcher: options.MaybeName = None
-    """The file or run folder of a trained stitcher for --method stitcher, where --inbetweener fills what it leaves, and
-    for auto; the bundled one if not given."""
-    path: options.MaybeName = None
-    """The file or run folder of the path predictor that the tweener was trained with; the bundled one if not given."""
     video: options.MaybeFile = None
     """Film of the motion: .mp4, .gif, .webp or .png."""
     quiet: bool = False
@@ -57,20 +42,13 @@ class Chain(ModelCommand, options.RigOptions):
 def run(command: Chain) -> int:
     """Check everything, chain, write, report."""
     options.check_seed(command.seed)
-    results.check_method(
-        command.method, finish=not command.no_finish, inbetweener=command.inbetweener, stitcher=command.stitcher
-    )
+    results.check_proposal(command)
     results.check_destinations(command.out, command.video, given=command.clips)
-    if command.path is not None and not results.takes_path(command.method, command.inbetweener):
-        raise RequestError("--path predicts where the hips go for --method tweener; leave it out")
-    dna = read_dna(command.dna, command.method)
     settings = ChainSettings(piece=command.piece, gap=_parse_gap(command))
     rig = inputs.read_rig(command.rig, command)
     done = chain(
         [inputs.read_motion(path, rig, quiet=command.quiet) for path in command.clips],
-        build_inbetweener(
-            command.method, results.load_models(command.inbetweener, None, command.path, dna, command.stitcher)
-        ),
+        build_inbetweener(command.method, results.load_models(command)),
         settings=settings,
         filling=InfillSettings(finish=not command.no_finish),
         rig=rig,

@@ -14,7 +14,6 @@ from mapctl import report
 from mapctl.commands.shared import inputs, options, outputs, results
 from mapctl.commands.shared.command import ModelCommand, conclude
 from mapctl.commands.shared.options import parse_ranges
-from mapctl.commands.shared.results import read_dna
 from mapctl.errors import RequestError
 from mapctl.motion import Motion
 from mapctl.protocols import Inbetweener
@@ -24,7 +23,7 @@ from mapctl.retarget.rigs import Rig
 
 
 @dataclass(frozen=True)
-class Infill(ModelCommand, options.RigOptions):
+class Infill(ModelCommand, options.RigOptions, options.ProposalOptions):
     """Fill in missing frames or joints of a motion; all else stays as it was. On any known rig."""
 
     source: options.InFile
@@ -41,29 +40,9 @@ class Infill(ModelCommand, options.RigOptions):
     are filled first; all frames may be lost so."""
     joints: Annotated[str | None, arg(metavar="NAME,NAME")] = None
     """Only these joints are missing, canonical names or the rig's own: in the gaps, or throughout if there are none."""
-    method: options.Method = "auto"
-    """Method that proposes. auto: the transformer, the stitcher where hands, feet or hips are told in up to 2 s, the
-    tweener, if the set of weights has one, through gaps of more than 8 s and those of more than 6 s in which the
-    transformer hardly moves, or a held pose where the body stands still; a note on each gap names it. transformer,
-    infiller, tweener: that network alone. stitcher: gaps of up to 2 s between whole poses from both sides, led by
-    hands, feet, hips or a trajectory told in them. rollouts: a density's rollouts, wherever nothing is known. slerp:
-    interpolation."""
-    dna: options.MaybeDna = None
-    """Motion files of any known rig, or classes that `mapctl info tweener` lists, whose style the tweener takes: in all
-    gaps with --method tweener, in those of 2 s and more without parts with auto."""
-    no_finish: bool = False
-    """Leave the proposal as it is, on rigid bones and with exact keys: no MAP stage plants the feet."""
     curve: options.MaybeCurve = None
     """Trajectory of the hips in the gaps: a CSV or SVG file, or a shape, that passes within 1 m of where each begins
     and ends."""
-    inbetweener: options.MaybeName = None
-    """The file or run folder of a trained transformer, infiller or tweener; the bundled one if not given. With auto a
-    tweener is for long gaps, beside the bundled transformer."""
-    stitcher: options.MaybeName = None
-    """The file or run folder of a trained stitcher for --method stitcher, where --inbetweener fills what it leaves, and
-    for auto; the bundled one if not given."""
-    path: options.MaybeName = None
-    """For --way and the tweener: the file or run folder of a trained path predictor; the bundled one if not given."""
     prior: options.MaybeName = None
     """A density whose likelihood joins the MAP stage: a bundled one, a file or a run folder; `auto` takes, window by
     window, the bundled one under which the motion is likelier. It extrapolates a gap at the end (`auto` if none is
@@ -101,16 +80,11 @@ def _check(command: Infill) -> None:
     options.check_seed(command.seed)
     if command.way and command.curve is not None:
         raise RequestError("--way and --curve both say where the hips go; choose one")
-    if command.path is not None and not command.way and not results.takes_path(command.method, command.inbetweener):
-        raise RequestError("--path predicts the hips' place for --way and for --method tweener; leave it out")
     if command.curve is not None and command.method in ("slerp", "rollouts"):
         raise RequestError(f"--curve needs the steps that a network makes; leave --method {command.method} out")
     if command.curve is not None and command.dna is not None:
         raise RequestError("--dna says how to move and --curve where; only one of them can be had, leave the other out")
-    finish, prior = not command.no_finish, command.prior
-    results.check_method(
-        command.method, finish=finish, prior=prior, inbetweener=command.inbetweener, stitcher=command.stitcher
-    )
+    results.check_proposal(command, prior=command.prior, way=bool(command.way))
     results.check_destinations(command.out, command.video, command.report, given=(command.source,))
 
 
@@ -159,10 +133,7 @@ def _run_infilling(
 
 
 def _build_inbetweener(command: Infill) -> Inbetweener:
-    dna = read_dna(command.dna, command.method)
-    return build_inbetweener(
-        command.method, results.load_models(command.inbetweener, command.prior, command.path, dna, command.stitcher)
-    )
+    return build_inbetweener(command.method, results.load_models(command, prior=command.prior))
 
 
 def _tell(command: Infill, done: InbetweenSolution) -> None:

@@ -36,7 +36,7 @@ _START_SPACING = 1.5  # metres between characters where they begin
 
 
 @dataclass(frozen=True)
-class Live(ModelCommand, options.ReadOptions):
+class Live(ModelCommand, options.ReadOptions, streaming.StreamOptions):
     """Steer characters in a browser on this machine: sliders, keys, drawn paths, recording."""
 
     port: Annotated[int, arg(metavar="P")] = 8080
@@ -53,13 +53,6 @@ class Live(ModelCommand, options.ReadOptions):
     """A bundled prior, or the file or run folder of a trained one."""
     seed: options.Count = 0
     """Seed of the first poses."""
-    stream: options.MaybeEndpoint = None
-    """Where poses go over the VMC protocol (most programs receive at port 39539): a port alone is on this machine. The
-    second character's poses go to the next port, and so on."""
-    stream_root: bool = False
-    """Let the root travel over the ground in the stream, and not the hips."""
-    stream_delay: options.Number = 0.1
-    """Seconds by which the stream is behind, so that a frame that is computed late is not sent late."""
     listen: options.MaybeEndpoint = None
     """Where commands come from over OSC, as /mapctl/speed 1.4 (docs/guides/streaming.md): a port alone takes those of
     this machine; 0.0.0.0:PORT takes those of every machine."""
@@ -111,7 +104,7 @@ def _open_app(command: Live, receiver: "OscReceiver | None") -> "tuple[LiveApp, 
         for character in characters:
             undo.callback(character.close)
         skeletons = [character.skeleton for character in characters]
-        stream = streaming.open_stream(_stream(command), skeletons)
+        stream = streaming.open_stream(command, skeletons)
         show = LiveApp(
             characters,
             looks,
@@ -138,11 +131,7 @@ def _check(command: Live) -> None:
     for package in ("viser", "trimesh"):
         if find_spec(package) is None:
             raise RequestError(f"this needs the package {package}: pip install 'mapctl[live]'")
-    streaming.check(_stream(command), command.listen, characters=command.characters)
-
-
-def _stream(command: Live) -> streaming.StreamOptions:
-    return streaming.StreamOptions(command.stream, command.stream_root, command.stream_delay)
+    streaming.check(command, command.listen, characters=command.characters)
 
 
 def _read_drawn(command: Live) -> list[DrawnCharacter | None]:

@@ -50,7 +50,7 @@ _TURN_RATE_DEG = round(math.degrees(SteeringLimits.turn_rate), 1)
 
 
 @dataclass(frozen=True)
-class Steer(ModelCommand, options.ReadOptions):
+class Steer(ModelCommand, options.ReadOptions, streaming.StreamOptions):
     """A character follows a script of speeds and directions, as in live steering."""
 
     commands: Positional[Annotated[Path, arg(metavar="COMMANDS.csv")]]
@@ -65,13 +65,6 @@ class Steer(ModelCommand, options.ReadOptions):
     realtime: bool = False
     """Play against the wall clock: every step has a deadline and brings the best found by then. On a machine that
     cannot keep up the script's time runs slower than the clock's, and the summary says so."""
-    stream: options.MaybeEndpoint = None
-    """With --realtime: where poses go over the VMC protocol, each frame when it is due (most programs receive at port
-    39539). A port alone is on this machine."""
-    stream_root: bool = False
-    """Let the root travel over the ground in the stream, and not the hips."""
-    stream_delay: options.Number = 0.1
-    """Seconds by which the stream is behind, so that a frame that is computed late is not sent late."""
     prior: options.Name = "locomotion-live"
     """A bundled prior, or the file or run folder of a trained one."""
     stitcher: options.MaybeName = None
@@ -113,7 +106,7 @@ def run(command: Steer) -> int:
     for labels in {wanted.labels for wanted in track.commands if wanted.labels}:
         prior.conditioned_on(labels)  # unknown labels are refused now
     stepper = _choose_stepper(command, track)
-    stream = streaming.open_stream(_stream(command), [character.skeleton])
+    stream = streaming.open_stream(command, [character.skeleton])
     try:
         recorder, records, frames = _run_steering(command, prior, track, character, stepper, stream)
     finally:
@@ -144,11 +137,7 @@ def _check(command: Steer) -> None:
     outputs.check_files(options.collect_paths(command.out, command.report))
     if command.stream is not None and not command.realtime:
         raise RequestError("--stream goes by the clock, which needs --realtime; give both")
-    streaming.check(_stream(command))
-
-
-def _stream(command: Steer) -> streaming.StreamOptions:
-    return streaming.StreamOptions(command.stream, command.stream_root, command.stream_delay)
+    streaming.check(command)
 
 
 def _limits(command: Steer) -> SteeringLimits:

@@ -36,7 +36,7 @@ from scenes.film import draw_strips_to
 
 
 @dataclass(frozen=True)
-class Tween(ModelCommand, options.RigOptions):
+class Tween(ModelCommand, options.RigOptions, options.ProposalOptions):
     """Make the motion between keyframes: frames of a clip, or poses that a file sets in time and space. On any known
     rig."""
 
@@ -59,26 +59,6 @@ class Tween(ModelCommand, options.RigOptions):
     given timing."""
     timing: options.MaybeName = None
     """The file or run folder of a trained keyframe timing for --suggest-timing; the bundled one if not given."""
-    method: options.Method = "auto"
-    """Method that proposes. auto: the transformer, the stitcher where hands, feet or hips are told in up to 2 s, the
-    tweener, if the set of weights has one, through gaps of more than 8 s and those of more than 6 s in which the
-    transformer hardly moves, or a held pose where the body stands still; a note on each gap names it. transformer,
-    infiller, tweener: that network alone. stitcher: gaps of up to 2 s between whole poses from both sides, led by
-    hands, feet, hips or a trajectory told in them. rollouts: a density's rollouts, wherever nothing is known. slerp:
-    interpolation."""
-    dna: options.MaybeDna = None
-    """Motion files of any known rig, or classes that `mapctl info tweener` lists, whose style the tweener takes: in all
-    gaps with --method tweener, in those of 2 s and more between whole poses with auto. Several are mixed."""
-    no_finish: bool = False
-    """Leave the proposal as it is, on rigid bones and with exact keys: no MAP stage plants the feet."""
-    inbetweener: options.MaybeName = None
-    """The file or run folder of a trained transformer, infiller or tweener; the bundled one if not given. With auto a
-    tweener is for long gaps, beside the bundled transformer."""
-    stitcher: options.MaybeName = None
-    """The file or run folder of a trained stitcher for --method stitcher, where --inbetweener fills what it leaves, and
-    for auto; the bundled one if not given."""
-    path: options.MaybeName = None
-    """The file or run folder of the path predictor that the tweener was trained with; the bundled one if not given."""
     prior: options.MaybeName = None
     """A density whose likelihood joins the MAP stage: a bundled one, a file or a run folder; `auto` takes, window by
     window, the bundled one under which the motion is likelier."""
@@ -114,8 +94,8 @@ def run(command: Tween) -> int:
 def _run_request(command: Tween, request: KeyRequest | None) -> int:
     _check(command, [command.source] if request is None else [command.source, *map(Path, request.files)])
     clip = _read_keyframe_clip(command, request)
-    dna = read_dna(command.dna, command.method)
-    models = results.load_models(command.inbetweener, command.prior, command.path, dna, command.stitcher)
+    dna = read_dna(command)
+    models = results.load_models(command, prior=command.prior, dna=dna)
     make = _prepare_tweening(command, clip)
     if command.variations > 1:
         ok = run_variations(command, clip, make, models, dna)
@@ -172,18 +152,10 @@ def _check(command: Tween, given: Sequence[Path]) -> None:
         raise RequestError(f"{unused[0]} is for motion files; {command.source} says itself what its keys are")
     if not _is_key_file(command) and command.keyframes is None:
         raise RequestError("of a motion file, --keyframes says which frames are keys (see mapctl tween --help)")
-    if command.path is not None and not results.takes_path(command.method, command.inbetweener):
-        raise RequestError("--path predicts where the hips go for --method tweener; leave it out")
     check_answers(command, given)
     # Variations are rollouts of a density with every method.
     prior = command.prior if command.variations == command.best_of == 1 else None
-    results.check_method(
-        command.method,
-        finish=not command.no_finish,
-        prior=prior,
-        inbetweener=command.inbetweener,
-        stitcher=command.stitcher,
-    )
+    results.check_proposal(command, prior=prior)
 
 
 def _read_keyframe_clip(command: Tween, request: KeyRequest | None) -> KeyframeClip:

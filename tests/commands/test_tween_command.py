@@ -130,7 +130,7 @@ def test_a_report_tells_every_key_and_how_far_it_is_missed(tween, source, tmp_pa
         (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--method", "infiller", "--dna", "in.bvh"], "leave --dna out"),
         (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--method", "tweener", "--dna", "no.bvh"], "no.bvh"),
         (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--method", "tweener"], "--method tweener takes no infiller"),
-        (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--path", "x"], "--path predicts where the hips go"),
+        (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--path", "x"], "--path predicts the hips' place"),
         (["in.bvh", "-o", "in.bvh", "--keyframes", "0,9"], "in.bvh would be written over what it is made from"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",

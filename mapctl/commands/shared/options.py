@@ -25,7 +25,6 @@ MaybeCurve = Annotated[str | None, arg(metavar="CURVE")]
 MaybeNumber = Annotated[float | None, arg(metavar="NUMBER")]
 MaybeCount = Annotated[int | None, arg(metavar="N")]
 MaybeName = Annotated[str | None, arg(metavar="NAME")]
-MaybeDna = Annotated[str | None, arg(metavar="CLIP|NAME,...")]
 MaybeRig = Annotated[str | None, arg(metavar="PRESET|FILE.toml|CLIP")]
 MaybeEndpoint = Annotated[str | None, arg(metavar="HOST:PORT")]
 MaybeCharacter = Annotated[str | None, arg(metavar="CHARACTER")]
@@ -33,7 +32,6 @@ MaybeWeights = Annotated[str | None, arg(metavar="free|full")]
 CameraKind = Literal["follow", "fixed", "top"]
 Size = Annotated[str, arg(metavar="WxH")]
 
-Method = Annotated[str, arg(metavar="auto|transformer|infiller|tweener|stitcher|rollouts|slerp")]
 OutRig = Annotated[str, arg(metavar="canonical|PRESET|FILE.toml|CLIP")]
 MaybeAxis = Annotated[Literal["x", "y", "z", "-x", "-y", "-z"] | None, arg(metavar="x|y|z|-x|-y|-z")]
 
@@ -55,6 +53,33 @@ class RigOptions(ReadOptions):
 
     rig: MaybeRig = None
     """The rig of what is read, where it is not the one that would be recognised; see `mapctl info IN`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProposalOptions:
+    """Options on how in-betweens are proposed."""
+
+    method: Annotated[str, arg(metavar="auto|transformer|infiller|tweener|stitcher|rollouts|slerp")] = "auto"
+    """Method that proposes. auto: the transformer, the stitcher where hands, feet or hips are told in up to 2 s, the
+    tweener, if the set of weights has one, through gaps of more than 8 s and those of more than 6 s in which the
+    transformer hardly moves, or a held pose where the body stands still; a note on each gap names it. transformer,
+    infiller, tweener: that network alone. stitcher: gaps of up to 2 s between whole poses from both sides, led by
+    hands, feet, hips or a trajectory told in them. rollouts: a density's rollouts, wherever nothing is known. slerp:
+    interpolation."""
+    dna: Annotated[str | None, arg(metavar="CLIP|NAME,...")] = None
+    """Motion files of any known rig, or classes that `mapctl info tweener` lists, whose style the tweener takes: in all
+    gaps with --method tweener, in those of 2 s and more between whole poses with auto. Several are mixed."""
+    no_finish: bool = False
+    """Leave the proposal as it is, on rigid bones and with exact keys: no MAP stage plants the feet."""
+    inbetweener: MaybeName = None
+    """The file or run folder of a trained transformer, infiller or tweener; the bundled one if not given. With auto a
+    tweener is for long gaps, beside the bundled transformer."""
+    stitcher: MaybeName = None
+    """The file or run folder of a trained stitcher for --method stitcher, where --inbetweener fills what it leaves, and
+    for auto; the bundled one if not given."""
+    path: MaybeName = None
+    """The file or run folder of a trained path predictor, for the tweener trained with it and for `infill --way`; the
+    bundled one if not given."""
 
 
 def check_seed(seed: int) -> None:

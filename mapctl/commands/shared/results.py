@@ -13,6 +13,7 @@ from mapctl import formats, metrics, motion_dna
 from mapctl import report as reports
 from mapctl.commands.shared import inputs, options, outputs
 from mapctl.commands.shared.inputs import read_motion
+from mapctl.commands.shared.options import ProposalOptions
 from mapctl.commands.shared.outputs import add_licence
 from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.errors import RequestError
@@ -41,16 +42,16 @@ class Example:
     """Poses of the file; None for a class."""
 
 
-def read_dna(text: str | None, method: str) -> tuple[Example, ...]:
-    """Read the motion files that a --dna option names; what is none is a class. RequestError for methods without
-    styles, and for files that no poses can be taken of."""
-    if text is None:
+def read_dna(command: ProposalOptions) -> tuple[Example, ...]:
+    """Read the motion files that --dna names; what is none is a class. RequestError for methods without styles, and for
+    files that no poses can be taken of."""
+    if command.dna is None:
         return ()
-    if method not in METHODS:
-        raise RequestError(f"--method {method} knows no style; leave --dna out or take --method tweener")
-    names = [name.strip() for name in text.split(",")]
+    if command.method not in METHODS:
+        raise RequestError(f"--method {command.method} knows no style; leave --dna out or take --method tweener")
+    names = [name.strip() for name in command.dna.split(",")]
     if not all(names):
-        raise RequestError(f"--dna takes motion files and classes with a comma between two, got {text!r}")
+        raise RequestError(f"--dna takes motion files and classes with a comma between two, got {command.dna!r}")
     return tuple(_read_example(name) for name in names)
 
 
@@ -110,22 +111,21 @@ def check_destinations(out: Path, video: Path | None, *others: Path | None, give
         outputs.check_film(video, _SIZE)
 
 
-def check_method(
-    method: str, *, finish: bool, prior: str | None = None, inbetweener: str | None, stitcher: str | None
-) -> None:
-    """Raise RequestError for an unknown method, and for a density or a network that the method does not use."""
+def check_proposal(command: ProposalOptions, *, prior: str | None = None, way: bool | None = None) -> None:
+    """Raise RequestError for an unknown method, and for a density or a network that the method does not use. `way`:
+    whether --way asks for the hips' place, of a command that has it."""
+    method = command.method
     proposers.check_method(method)
-    if stitcher is not None and method not in ("auto", "stitcher"):
+    if command.stitcher is not None and method not in ("auto", "stitcher"):
         raise RequestError(f"--method {method} stitches nothing; leave --stitcher out or take --method stitcher")
-    if prior is not None and not finish and method not in ("auto", "rollouts"):
+    if prior is not None and command.no_finish and method not in ("auto", "rollouts"):
         raise RequestError(f"--method {method} --no-finish has no MAP stage for a density; leave --prior out")
-    if inbetweener is not None and method == "slerp":
+    if command.inbetweener is not None and method == "slerp":
         raise RequestError("--method slerp knows no network; leave --inbetweener out")
-
-
-def takes_path(method: str, inbetweener: str | None) -> bool:
-    """Return whether a method may ask a path predictor: tweeners do, and the one that `auto` is given."""
-    return method == "tweener" or (method == "auto" and _is_tweener(inbetweener))
+    takes_path = method == "tweener" or (method == "auto" and _is_tweener(command.inbetweener))
+    if command.path is not None and not takes_path and not way:
+        users = "--method tweener" if way is None else "--way and for --method tweener"
+        raise RequestError(f"--path predicts the hips' place for {users}; leave it out")
 
 
 def _is_tweener(inbetweener: str | None) -> bool:
@@ -133,18 +133,15 @@ def _is_tweener(inbetweener: str | None) -> bool:
 
 
 def load_models(
-    inbetweener: str | None,
-    prior: str | None,
-    path: str | None = None,
-    dna: Sequence[Example] = (),
-    stitcher: str | None = None,
+    command: ProposalOptions, *, prior: str | None = None, dna: Sequence[Example] | None = None
 ) -> ModelLoaders:
     """Build the loaders of the named models, or of the bundled ones, tweeners in a style if there is one; RequestError
     for a network that is not of the kind that the method asks for, and for classes that are not known. A named tweener
     is, for `auto`, the one that it takes in long gaps.
     """
 
-    is_tweener = _is_tweener(inbetweener)
+    inbetweener, path, is_tweener = command.inbetweener, command.path, _is_tweener(command.inbetweener)
+    dna = read_dna(command) if dna is None else dna
 
     def load_network(method: str) -> Inbetweener:
         if method == "infiller" and inbetweener is None:
@@ -170,7 +167,7 @@ def load_models(
 
     load_densities = partial(priors.load_choice, prior or "auto")
     return ModelLoaders(
-        load_network, load_densities, load_tweener, partial(priors.load_stitcher, stitcher or "stitcher")
+        load_network, load_densities, load_tweener, partial(priors.load_stitcher, command.stitcher or "stitcher")
     )
 
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
+from mapctl.commands.shared import options
 from mapctl.errors import RequestError
 from mapctl.skeleton import Skeleton
 from mapctl.streaming.endpoint import Endpoint
@@ -17,45 +18,46 @@ _STREAM, _LISTEN = "--stream", "--listen"
 _MAX_DELAY = 5.0  # seconds
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class StreamOptions:
-    """How poses are streamed."""
+    """Options on how poses are streamed."""
 
-    to: str | None
-    """Where they go, HOST:PORT; None streams nothing."""
-    root_travels: bool
-    """Whether the root travels, and not the hips."""
-    delay: float
-    """Seconds by which the stream is behind."""
+    stream: options.MaybeEndpoint = None
+    """Where poses go over the VMC protocol, each frame when it is due (most programs receive at port 39539). A port
+    alone is on this machine; a second character's poses go to the next port, and so on."""
+    stream_root: bool = False
+    """Let the root travel over the ground in the stream, and not the hips."""
+    stream_delay: options.Number = 0.1
+    """Seconds by which the stream is behind, so that a frame that is computed late is not sent late."""
 
 
-def check(stream: StreamOptions, listen: str | None = None, *, characters: int = 1) -> None:
+def check(command: StreamOptions, listen: str | None = None, *, characters: int = 1) -> None:
     """Raise RequestError for endpoints that cannot be, unknown hosts, ports that meet, or a missing package."""
-    if stream.root_travels and stream.to is None:
+    if command.stream_root and command.stream is None:
         raise RequestError(f"--stream-root says how {_STREAM} is sent; give both")
-    if not 0 <= stream.delay <= _MAX_DELAY:
-        raise RequestError(f"--stream-delay must be 0 to {_MAX_DELAY:g} seconds, got {stream.delay:g}")
+    if not 0 <= command.stream_delay <= _MAX_DELAY:
+        raise RequestError(f"--stream-delay must be 0 to {_MAX_DELAY:g} seconds, got {command.stream_delay:g}")
     targets: list[Endpoint] = []
-    if stream.to is not None:
-        first = Endpoint.parse(stream.to, option=_STREAM)
+    if command.stream is not None:
+        first = Endpoint.parse(command.stream, option=_STREAM)
         targets = [first.offset(k, option=_STREAM) for k in range(characters)]
         first.resolve(option=_STREAM)
     if listen is not None:
         source = Endpoint.parse(listen, option=_LISTEN)
         if any(source == target for target in targets):
             raise RequestError(f"{_LISTEN} {source} is where {_STREAM} sends poses to; choose another port")
-    if (stream.to or listen) and find_spec("pythonosc") is None:
+    if (command.stream or listen) and find_spec("pythonosc") is None:
         raise RequestError("streaming needs the package python-osc: pip install 'mapctl[stream]'")
 
 
-def open_stream(stream: StreamOptions, skeletons: Sequence[Skeleton]) -> "PoseStream | None":
+def open_stream(command: StreamOptions, skeletons: Sequence[Skeleton]) -> "PoseStream | None":
     """Open the stream of characters with these bones; None where none is asked for."""
-    if stream.to is None:
+    if command.stream is None:
         return None
     from mapctl.streaming.sender import PoseStream
 
-    to = Endpoint.parse(stream.to, option=_STREAM)
-    return PoseStream(to, skeletons, root_travels=stream.root_travels, delay=stream.delay)
+    to = Endpoint.parse(command.stream, option=_STREAM)
+    return PoseStream(to, skeletons, root_travels=command.stream_root, delay=command.stream_delay)
 
 
 def open_receiver(text: str | None) -> "OscReceiver | None":
