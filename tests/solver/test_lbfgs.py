@@ -145,6 +145,25 @@ def test_little_won_by_a_guessed_step_is_not_the_end():
     assert result.energy[0] < 1e-4
 
 
+def test_where_the_curvature_model_misleads_the_gradient_is_tried_again():
+    """Finite only along the gradient of the best point so far: steps by curvature pairs all fail."""
+    scales = torch.tensor([1.0, 3.0], dtype=torch.float64)
+    best = {"x": torch.tensor([[2.0, 1.0]], dtype=torch.float64), "energy": torch.tensor([math.inf])}
+
+    def function(x: Tensor) -> tuple[Tensor, Tensor]:
+        energy, gradient = with_gradient(lambda x: 0.5 * (scales * x**2).sum(-1))(x)
+        step, downhill = (x - best["x"])[0], (scales * best["x"])[0]
+        if abs(step[0] * downhill[1] - step[1] * downhill[0]) > 1e-9 * step.norm():
+            return torch.full_like(energy, math.inf), gradient
+        if energy < best["energy"]:
+            best.update(x=x.clone(), energy=energy)
+        return energy, gradient
+
+    found = minimise(function, best["x"].clone(), settings=replace(TIGHT, gradient_tolerance=1e-3))
+    assert found.status == (LbfgsStatus.CONVERGED,)
+    assert float(found.energy) < 1e-5
+
+
 def test_problems_in_a_batch_are_those_alone_to_the_bit():
     # Of very different size, starts and lengths; one ends at once, one is never finite.
     scales = torch.tensor([1.0, 1e-4, 1e6, 1.0, 1.0], dtype=torch.float64)
