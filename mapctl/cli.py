@@ -13,6 +13,7 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import redirect_stderr
+from dataclasses import make_dataclass
 from functools import reduce
 from operator import or_
 from types import FrameType
@@ -21,7 +22,7 @@ from typing import Annotated, Any
 import tyro
 
 from mapctl import __version__
-from mapctl.commands import COMMANDS, MANY_THREADS, SUBCOMMANDS, Runnable
+from mapctl.commands import COMMANDS, MANY_THREADS, SUBCOMMANDS, Runnable, load_command
 from mapctl.commands.shared.command import INTERRUPTED, INVALID, SIGNALLED, UNREAD, use_single_thread
 from mapctl.errors import MapctlError, RequestError
 
@@ -81,10 +82,14 @@ def parse(words: Sequence[str]) -> Runnable:
     """The command that the words ask for. RequestError where there is none; SystemExit after --help."""
     name, *others = words or [""]
     if name not in COMMANDS:
-        return _read_options(_join(COMMANDS), words, "mapctl", _DESCRIPTION)
+        # Stand-ins: the commands themselves take seconds to import.
+        summaries = {
+            name: make_dataclass(kind, (), namespace={"__doc__": text}) for name, (kind, text) in COMMANDS.items()
+        }
+        return _read_options(_join(summaries), words, "mapctl", _DESCRIPTION)
     if name not in MANY_THREADS:
         use_single_thread()
-    command = COMMANDS[name]
+    command = load_command(name)
     kind = _join(SUBCOMMANDS[name]) if name in SUBCOMMANDS else command
     return _read_options(kind, others, f"mapctl {name}", command.__doc__ or "")
 

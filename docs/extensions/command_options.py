@@ -12,7 +12,7 @@ from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
 from mapctl.cli import STYLE
-from mapctl.commands import COMMANDS, SUBCOMMANDS
+from mapctl.commands import COMMANDS, SUBCOMMANDS, load_command
 
 _DEFAULT = re.compile(r"\s*\((default: (?P<value>.*)|required)\)\s*$", re.DOTALL)
 
@@ -33,7 +33,7 @@ class CommandList(MarkdownDirective):
 
     def run(self) -> list[nodes.Node]:
         """Parse the table."""
-        rows = (f"| [{name}]({name}.md) | {_describe(kind).split('. ')[0]} |" for name, kind in COMMANDS.items())
+        rows = (f"| [{name}]({name}.md) | {summary.rstrip('.')} |" for name, (_, summary) in COMMANDS.items())
         return self.parse(["| command | what it does |", "|---|---|", *rows])
 
 
@@ -53,7 +53,7 @@ def _describe(kind: type) -> str:
 
 
 def _format_options(words: list[str]) -> Iterator[str]:
-    kind = COMMANDS[words[0]] if len(words) == 1 else SUBCOMMANDS[words[0]][words[1]]
+    kind = load_command(words[0]) if len(words) == 1 else SUBCOMMANDS[words[0]][words[1]]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # tyro has no other interface to its options
         parser = tyro.extras.get_parser(kind, config=STYLE)

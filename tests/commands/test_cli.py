@@ -7,7 +7,6 @@ import pytest
 from helpers import run
 
 import mapctl
-from mapctl.commands import COMMANDS
 
 
 @pytest.fixture(scope="session")
@@ -22,14 +21,6 @@ def walk(prior, tmp_path_factory) -> Path:
 def test_version_is_told(capsys):
     assert run("--version") == 0
     assert capsys.readouterr().out == f"mapctl {mapctl.__version__}\n"
-
-
-@pytest.mark.parametrize("name", COMMANDS)
-def test_every_command_has_help(name, capsys):
-    with pytest.raises(SystemExit) as stop:
-        run(name, "--help")
-    assert stop.value.code == 0
-    assert f"mapctl {name}" in capsys.readouterr().out
 
 
 @pytest.mark.slow
