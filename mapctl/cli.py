@@ -94,7 +94,7 @@ def parse(words: Sequence[str]) -> Runnable:
     return _read_options(kind, others, f"mapctl {name}", command.__doc__ or "")
 
 
-def _join(kinds: Mapping[str, type[Runnable]]) -> Any:
+def _join(kinds: Mapping[str, type]) -> Any:
     return reduce(or_, (_subcommand(name, kind) for name, kind in kinds.items()))
 
 
@@ -123,7 +123,7 @@ def _print_version() -> int:
     return 0
 
 
-def _subcommand(name: str, kind: type[Runnable]) -> Any:
+def _subcommand(name: str, kind: type) -> Any:
     return Annotated[kind, tyro.conf.subcommand(name, prefix_name=False)]
 
 
