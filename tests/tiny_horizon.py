@@ -5,8 +5,8 @@ from helpers import generator, tiny_density
 
 from controllers.common.initial_state import select_initial_state
 from mapctl import curves
-from mapctl.problem.context import WindowContext, WindowRequest
 from mapctl.problem.receding_horizon import HorizonSettings, RecedingHorizonSolver
+from mapctl.problem.unknowns import WindowContext, WindowRequest
 from mapctl.problem.window_solvers import LatentNoiseSolver
 from mapctl.skeleton import CANONICAL
 from mapctl.solver.budget import Budget

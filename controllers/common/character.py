@@ -13,7 +13,7 @@ from mapctl.errors import RequestError
 from mapctl.features import LAYOUT
 from mapctl.intent.steering import Command, SteeringLimits
 from mapctl.motion import Motion
-from mapctl.problem.ledger import Ledger
+from mapctl.problem.solution import Ledger
 from mapctl.protocols import DataLimits
 from mapctl.retarget import RigMap
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, Skeleton

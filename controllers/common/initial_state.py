@@ -11,10 +11,9 @@ from mapctl.curves import Curve
 from mapctl.features import LAYOUT, GroundPose, ground_speed, integrate_root
 from mapctl.numerics import gaussian
 from mapctl.pose import decode
-from mapctl.problem.context import WindowContext
-from mapctl.problem.latent_noise import LatentNoise
 from mapctl.problem.objective import Objective
 from mapctl.problem.receding_horizon import CommittedFrames
+from mapctl.problem.unknowns import LatentNoise, WindowContext
 from mapctl.protocols import Density, DensityState
 from mapctl.rotations import wrap_angle
 from mapctl.skeleton import Skeleton

@@ -1,7 +1,7 @@
 """MAP refinement of a proposal: as near to it as its uncertainty asks for, with planted feet (Wang et al. 2019, Eq.
 18-19).
 
-A receding horizon over offsets from the proposal's poses (see mapctl.problem.pose_offsets), each window solved by
+A receding horizon over offsets from the proposal's poses (see mapctl.problem.window_solvers), each window solved by
 L-BFGS.
 """
 
@@ -25,10 +25,9 @@ from mapctl.numerics.intervals import last_observed, next_observed
 from mapctl.pose import BodyPose, decode
 from mapctl.problem import density_selection
 from mapctl.problem.density_selection import DensityEnsemble, DensityInterval
-from mapctl.problem.ledger import Ledger
-from mapctl.problem.pose_offsets import PoseOffsetSolver
 from mapctl.problem.receding_horizon import CommittedFrames, HorizonSettings, RecedingHorizonSolver, TermsOf
-from mapctl.problem.solution import Outcome, WindowRecord
+from mapctl.problem.solution import Ledger, Outcome, WindowRecord
+from mapctl.problem.window_solvers import PoseOffsetSolver
 from mapctl.protocols import Density
 from mapctl.recording import Capture
 from mapctl.skeleton import CANONICAL, TOES

@@ -27,8 +27,7 @@ from mapctl.inbetweening.missing import MissingMask
 from mapctl.motion import Motion
 from mapctl.numerics.intervals import true_intervals
 from mapctl.pose import BodyPose
-from mapctl.problem.ledger import Ledger
-from mapctl.problem.solution import Outcome, Status
+from mapctl.problem.solution import Ledger, Outcome, Status
 from mapctl.protocols import Denoiser, Density, Inbetweener
 from mapctl.recording import Capture, CaptureProposal
 from mapctl.recording.inspection import NOISE_CM, Artefact, inspect_recording

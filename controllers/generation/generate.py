@@ -19,12 +19,11 @@ from controllers.generation.foot_cleanup import FootCleanupSettings, clean_up_fe
 from mapctl import retarget
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode, integrate_root
-from mapctl.metrics.pace_changes import find_pace, label_pace
+from mapctl.metrics.gait import find_pace, label_pace
 from mapctl.motion import Motion
 from mapctl.pose import decode
-from mapctl.problem.ledger import Ledger
 from mapctl.problem.receding_horizon import CommittedFrames, replay
-from mapctl.problem.solution import Outcome, Solution, Status
+from mapctl.problem.solution import Ledger, Outcome, Solution, Status
 from mapctl.protocols import Density, DensityState, Refiner
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, Skeleton
 from mapctl.terms import Term

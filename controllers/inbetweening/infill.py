@@ -15,9 +15,8 @@ from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening import GapQuery, Proposal
 from mapctl.inbetweening.missing import MissingMask, interpolate_missing
-from mapctl.inbetweening.path_closing import close_path
 from mapctl.inbetweening.query import estimate_contact_logits
-from mapctl.inbetweening.root_trajectory import TREMBLE_HZ, LocalMotion, RootTrajectory
+from mapctl.inbetweening.root_trajectory import TREMBLE_HZ, LocalMotion, RootTrajectory, close_path
 from mapctl.kinematics import heading
 from mapctl.kinematics.placing import rotate_about_vertical
 from mapctl.motion import Motion

@@ -18,8 +18,7 @@ from torch import Tensor
 
 from mapctl import joint_ranges, rotations
 from mapctl.errors import RequestError
-from mapctl.inbetweening.effector_targets import EffectorTargets
-from mapctl.inbetweening.loose_keys import LooseKeys, estimate_size, measure_floor, view_axes
+from mapctl.inbetweening.effector_targets import EffectorTargets, LooseKeys, estimate_size, measure_floor, view_axes
 from mapctl.inbetweening.missing import MissingMask
 from mapctl.intent.keyframes import Drawing, Key, Keys
 from mapctl.joint_names import classify_joint, describe_nearest, find_joint

@@ -30,19 +30,24 @@ from mapctl.curves.curve import Curve
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening import GapQuery, Proposal
-from mapctl.inbetweening.effector_targets import EffectorTargets, compute_target_errors, reach_effector_targets
-from mapctl.inbetweening.loose_keys import LooseKeys, estimate_standing_height, lead_over_places
+from mapctl.inbetweening.effector_targets import (
+    EffectorTargets,
+    LooseKeys,
+    compute_target_errors,
+    estimate_standing_height,
+    lead_over_places,
+    reach_effector_targets,
+)
 from mapctl.inbetweening.missing import MissingMask, compute_velocity_share, interpolate_missing, restore_observed
-from mapctl.inbetweening.path_closing import lead_over_keys
 from mapctl.inbetweening.query import GapSource, estimate_contact_logits
+from mapctl.inbetweening.root_trajectory import lead_over_keys
 from mapctl.inbetweening.seam_blending import blend_seams_in_positions, blend_seams_in_rotations
 from mapctl.kinematics import heading
 from mapctl.metrics.liveliness import measure_path_length
 from mapctl.motion import Motion
 from mapctl.numerics.intervals import true_intervals
 from mapctl.numerics.smooth_offsets import interpolate_offsets
-from mapctl.problem.ledger import Ledger
-from mapctl.problem.solution import Outcome, Solution, Status, WindowRecord
+from mapctl.problem.solution import Ledger, Outcome, Solution, Status, WindowRecord
 from mapctl.protocols import Density, Inbetweener
 from mapctl.recording import Capture
 from mapctl.recording.fusion import transfer_change

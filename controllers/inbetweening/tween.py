@@ -19,8 +19,7 @@ from controllers.inbetweening.keyframes import (
 )
 from controllers.inbetweening.pipeline import InbetweenSolution, InfillSettings, fill
 from mapctl import joint_ranges, rotations
-from mapctl.inbetweening.effector_targets import EffectorTargets
-from mapctl.inbetweening.loose_keys import LooseKeys
+from mapctl.inbetweening.effector_targets import EffectorTargets, LooseKeys
 from mapctl.inbetweening.missing import MissingMask, interpolate_missing
 from mapctl.intent.keyframes import Key, Keys
 from mapctl.motion import Motion

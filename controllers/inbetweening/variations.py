@@ -21,9 +21,9 @@ from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode, integrate_roo
 from mapctl.metrics.realism import Diversity, measure_diversity
 from mapctl.motion import Motion
 from mapctl.problem import density_selection
-from mapctl.problem.ledger import Ledger
 from mapctl.problem.objective import Objective
 from mapctl.problem.receding_horizon import replay
+from mapctl.problem.solution import Ledger
 from mapctl.protocols import Density, Inbetweener
 from mapctl.retarget import to_canonical
 from mapctl.retarget.rigs import Rig

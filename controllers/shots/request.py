@@ -1,7 +1,7 @@
 """Requests for shots: several wishes that hold at once."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 
@@ -11,9 +11,9 @@ from torch import Tensor
 
 from controllers.common.character import Character
 from controllers.common.initial_state import MotionStart, start_from_state
-from controllers.inbetweening.pipeline import fill
-from controllers.shots.transitions import Filling, choose_filling
-from mapctl import kinematics
+from controllers.common.map_refinement import estimate_rest_height
+from controllers.inbetweening.pipeline import InfillSettings, fill
+from mapctl import contacts, kinematics
 from mapctl.curves import Curve
 from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import RequestError
@@ -22,11 +22,114 @@ from mapctl.inbetweening.missing import MissingMask
 from mapctl.intent.keyframes import WorldPosition
 from mapctl.intent.path import SpeedProfile, TimedSpeed
 from mapctl.kinematics.placing import bring_curve_points, measure_travel, move_to, rotate_about_vertical
+from mapctl.metrics import worst_frame
 from mapctl.motion import Motion
 from mapctl.numerics.intervals import true_intervals
 from mapctl.problem.receding_horizon import replay
 from mapctl.protocols import Density, Inbetweener
-from mapctl.skeleton import LIMBS
+from mapctl.skeleton import CANONICAL, LIMBS, TOES
+
+_CONTEXT = 16  # frames on either side that the in-betweener is shown
+_ACCELERATION_WEIGHT = 0.003  # m/s for a m/s^2 of the worst hand or toe
+_SKATE_WEIGHT = 0.5  # of skating toes beside sliding of the support
+_DETOUR_WEIGHT = 0.5  # of the trajectory's excess length over the straight one, m/s for m/s
+_UNSUPPORTED_WEIGHT = 0.5  # of the longest time on no planted foot, m/s for a second
+_SKATE_HEIGHT = 0.025  # metres
+_TOES = CANONICAL.indices(TOES)
+_EFFECTORS = CANONICAL.indices(("leftHand", "rightHand", *TOES))
+
+
+@dataclass(frozen=True)
+class Transition:
+    """Frames start to stop between two spans, which the in-betweener makes."""
+
+    start: int
+    """First frame."""
+    stop: int
+    """One past the last frame."""
+
+
+@dataclass(frozen=True, eq=False)
+class Filling:
+    """A shot's motion of which a part is to be made anew."""
+
+    motion: Motion
+    """All frames of the shot."""
+    missing: MissingMask
+    """What is to be made."""
+    around: tuple[int, int]
+    """Frames start to stop that it is within."""
+
+
+def measure_transition_cost(before: Motion, after: Motion, one: Transition, inbetweener: Inbetweener) -> float:
+    """Measure what a viewer would mind of a transition from one motion to another, both of the whole shot's frames,
+    m/s (see `judge`)."""
+    frame = torch.arange(before.num_frames)
+    missing = MissingMask.of_frames((frame >= one.start) & (frame < one.stop), before.num_joints)
+    return _measure_cost(Filling(join_across(before, after, one), missing, (one.start, one.stop)), inbetweener)
+
+
+def choose_filling(candidates: Sequence[Filling], inbetweener: Inbetweener) -> int:
+    """Choose the candidate that costs a viewer least (see `judge`). The in-betweener's proposals are compared, without
+    MAP."""
+    if len(candidates) == 1:
+        return 0
+    costs = [_measure_cost(one, inbetweener) for one in candidates]
+    return costs.index(min(costs))
+
+
+def _measure_cost(filling: Filling, inbetweener: Inbetweener) -> float:
+    """Measure what a viewer would mind, m/s."""
+    start, stop = filling.around
+    first, last = max(0, start - _CONTEXT), min(filling.motion.num_frames, stop + _CONTEXT)
+    gap = (max(1, start - first), min(stop, filling.motion.num_frames - 1) - first)
+    part, missing = filling.motion.slice(first, last), filling.missing.slice(first, last)
+    if not bool(missing.frames.any()):
+        return 0.0
+    done = fill(part, missing, inbetweener, settings=InfillSettings(finish=False))
+    return judge(done.motion, done.contacts, gap)
+
+
+def judge(motion: Motion, planted: Bool[Tensor, "frames 2"], gap: tuple[int, int]) -> float:
+    """Judge a filled gap as a viewer would, m/s: sliding, skating, detours, time on no foot (see
+    `compute_artefact_cost`), and the worst acceleration."""
+    cost = compute_artefact_cost(motion, planted, gap)
+    shown = motion.slice(max(0, gap[0] - 2), min(motion.num_frames, gap[1] + 2))
+    peaks = worst_frame.measure_peaks(shown.joint_positions()[:, _EFFECTORS], shown.root_position, float(shown.fps))
+    return cost + _ACCELERATION_WEIGHT * peaks.acceleration
+
+
+def compute_artefact_cost(motion: Motion, planted: Bool[Tensor, "frames 2"], gap: tuple[int, int]) -> float:
+    """Compute the cost of visible artefacts in a filled gap as a speed, m/s: sliding of the support, skating toes, a
+    detour, the longest unsupported time.
+    """
+    start, stop = gap[0] - 1, gap[1] + 1
+    positions, fps = motion.joint_positions()[start:stop], float(motion.fps)
+    toes, hips = positions[:, _TOES], positions[:, 0]
+    height = estimate_rest_height(motion, contacts.debounced(planted))[start:stop]
+    above, speeds = (toes[..., 1] - height)[1:], torch.diff(toes[..., ::2], dim=0).norm(dim=-1) * fps
+    slide = float(contacts.support_speed(above, speeds).mean())
+    skate = float((speeds * (1 - above / _SKATE_HEIGHT).clamp(0, 1)).mean())
+    ground = hips[:, ::2]
+    detour = float(torch.diff(ground, dim=0).norm(dim=-1).sum()) - float((ground[-1] - ground[0]).norm())
+    unsupported = worst_frame.measure_longest_unsupported(toes, hips, fps)
+    return (
+        slide
+        + _SKATE_WEIGHT * skate
+        + _DETOUR_WEIGHT * detour * fps / len(positions)
+        + _UNSUPPORTED_WEIGHT * unsupported
+    )
+
+
+def join_across(before: Motion, after: Motion, transition: Transition) -> Motion:
+    """Take frames before the transition from one motion, the others from another of as many frames."""
+    earlier = torch.arange(before.num_frames) < transition.start
+    return replace(
+        before,
+        root_position=torch.where(earlier[:, None], before.root_position, after.root_position),
+        local_quat_xyzw=torch.where(earlier[:, None, None], before.local_quat_xyzw, after.local_quat_xyzw),
+    )
+
 
 _MEMORY_FRAMES = 120  # at PRIOR_FPS, that warm up the density's state
 TRAVEL_FRAMES = 15

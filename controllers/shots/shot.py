@@ -24,9 +24,10 @@ from torch import Tensor
 from controllers.common.character import Character
 from controllers.following.follow import FollowSettings, walk_arcs
 from controllers.inbetweening.pipeline import fill
-from controllers.shots.keys.posing import (
+from controllers.shots.posing import (
     MetPose,
     as_reaches,
+    build_rest_pose,
     look_where_hands_reach,
     measure_look_errors,
     measure_pose_error,
@@ -34,17 +35,20 @@ from controllers.shots.keys.posing import (
     pose_frames,
     turn_heads,
 )
-from controllers.shots.keys.reaching import (
-    STRETCHED_SHARE,
-    ReachTargets,
-    check_reaches,
-    go_down,
-    lean_way,
-    settle_reaches,
+from controllers.shots.reaching import STRETCHED_SHARE, ReachTargets, check_reaches, go_down, lean_way, settle_reaches
+from controllers.shots.request import (
+    Filling,
+    Look,
+    PoseKey,
+    Reach,
+    ShotRequest,
+    Transition,
+    arrive,
+    choose_filling,
+    go_on,
+    join_across,
+    measure_transition_cost,
 )
-from controllers.shots.request import Look, PoseKey, Reach, ShotRequest, arrive, go_on
-from controllers.shots.rest_pose import build_rest_pose
-from controllers.shots.transitions import Filling, Transition, choose_filling, join_across, measure_transition_cost
 from controllers.shots.way import Span, Way, cut_curve, lay_timeline, plan_way
 from mapctl.curves.obstacles import measure_clearance
 from mapctl.errors import MapctlError
@@ -53,9 +57,7 @@ from mapctl.inbetweening.effector_targets import compute_target_errors
 from mapctl.inbetweening.missing import MissingMask
 from mapctl.kinematics.placing import move_to, rotate_about_vertical
 from mapctl.motion import Motion
-from mapctl.numerics import vectors
-from mapctl.problem.ledger import Ledger
-from mapctl.problem.solution import Outcome, Solution, Status, WindowRecord
+from mapctl.problem.solution import Ledger, Outcome, Solution, Status, WindowRecord
 from mapctl.protocols import Density, Inbetweener
 from mapctl.skeleton import CANONICAL, LIMBS, TOES, Skeleton
 from mapctl.solver.swarm import SwarmSettings, run_swarm
@@ -437,10 +439,10 @@ def check_wishes(request: ShotRequest, way: Way, motion: Motion, met: Sequence[M
     if request.others is not None and not request.others.courtesy:
         last = request.others.hips.shape[1] - 1
         there = request.others.hips[:, torch.arange(len(hips)).clamp(max=last)]
-        apart = 100 * float(vectors.length(hips[None] - there).amin())
+        apart = 100 * float((hips[None] - there).norm(dim=-1).amin())
         asked = f"{request.others.distance:g} m"
         found.append(Wish("keep apart", asked, apart, 100 * request.others.distance - 1.0, "cm", at_least=True))
-    still, last = 100 * vectors.length(torch.diff(hips, dim=0)) * PRIOR_FPS, (motion.num_frames - 1) / PRIOR_FPS
+    still, last = 100 * torch.diff(hips, dim=0).norm(dim=-1) * PRIOR_FPS, (motion.num_frames - 1) / PRIOR_FPS
     limit = 100 * _STILL_TOLERANCE
     if request.stand_at_start:
         moved = float(still[:_STILL_AT_START].mean())
@@ -503,7 +505,7 @@ def _find_remedy(reach: Reach, motion: Motion) -> str:
     for name, place in reach.places.items():
         limb = LIMBS[name]
         away = motion.joint_positions()[:, limb.upper] - motion.root_position.new_tensor(place)
-        lacking = torch.maximum(lacking, vectors.length(away) - STRETCHED_SHARE * limb.length(motion.skeleton))
+        lacking = torch.maximum(lacking, away.norm(dim=-1) - STRETCHED_SHARE * limb.length(motion.skeleton))
     wanted = reach.seconds * PRIOR_FPS
     within = (lacking <= 0).nonzero()[:, 0]
     if len(within):
@@ -520,7 +522,7 @@ def _check_path(way: Way, hips: Tensor, away: Tensor) -> Wish:
 
 def _check_progress(way: Way, hips: Tensor, away: Tensor) -> Wish:
     """Measure how far the hips come to be from where they are to be at that time, on the way as it is bent."""
-    behind = vectors.length(hips - way.curve.ground_point(way.arcs))[away]
+    behind = (hips - way.curve.ground_point(way.arcs)).norm(dim=-1)[away]
     return Wish("progress", "on time", 100 * float(behind.max()), 100 * _PROGRESS_TOLERANCE, "cm")
 
 
@@ -544,7 +546,7 @@ def _find_frames_away(request: ShotRequest, way: Way) -> Tensor:
 def _measure_offsets(way: Way, hips: Tensor) -> Tensor:
     """Measure the distance of the hips to the way by frame, metres."""
     near = way.wished.nearest(hips, way.wished_arcs)
-    return vectors.length(hips - way.wished.ground_point(near))
+    return (hips - way.wished.ground_point(near)).norm(dim=-1)
 
 
 OVERLAP = 54

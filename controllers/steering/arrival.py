@@ -22,9 +22,8 @@ from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode, integrate_roo
 from mapctl.intent.steering import Arrival, Command, SteeringTarget
 from mapctl.motion import Motion
 from mapctl.pose import decode
-from mapctl.problem.ledger import Ledger
 from mapctl.problem.receding_horizon import CommittedFrames, replay
-from mapctl.problem.solution import Outcome, Status
+from mapctl.problem.solution import Ledger, Outcome, Status
 from mapctl.runtime.stepwise import StepwiseWork
 
 LEAST_FRAMES = 4

@@ -24,7 +24,7 @@ from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.intent.steering import Command, SteeringTarget
 from mapctl.motion import Motion
-from mapctl.problem.ledger import Ledger
+from mapctl.problem.solution import Ledger
 from mapctl.rotations import make_sign_continuous
 
 _MARGIN_USED, _MARGIN_RISE, _MARGIN_FALL = 0.75, 1.5, 0.997  # found within a second, and forgotten within a minute

@@ -9,6 +9,11 @@ The density that walks knows no reaches, so they are no terms of its windows: ar
 frames that it delivers, and the next step goes on from the walk alone. A hand is on its way while its place can be
 reached within half a second, as the forecast says; who walks past lets it go. Both the way there and the way back are
 of minimum jerk.
+
+Ways round obstacles for who is steered: the direction nearest to the commanded one in which nothing is in the way.
+
+One step at a time, without a plan: for curves and times that are known in advance, `controllers.shots.way` finds the
+shortest way round.
 """
 
 import math
@@ -24,28 +29,62 @@ from torch import Tensor
 from controllers.common.character import Character
 from controllers.common.initial_state import start_from_state
 from mapctl import rotations
+from mapctl.curves.obstacles import Obstacle, measure_clearance
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, ground_speed
-from mapctl.intent.avoidance import lead_around
 from mapctl.intent.steering import Arrival, Command, SteeringLimits, SteeringTarget
 from mapctl.kinematics import inverse
 from mapctl.kinematics.arm_aims import bend_within, find_out, lead_about
 from mapctl.kinematics.head_turning import turn_head
 from mapctl.motion import Motion
-from mapctl.numerics.easing import smootherstep
-from mapctl.numerics.minimum_jerk import MinimumJerkTrack
+from mapctl.numerics.easing import MinimumJerkTrack, smootherstep
 from mapctl.pose import decode
-from mapctl.problem.context import WindowRequest
-from mapctl.problem.ledger import Ledger
 from mapctl.problem.receding_horizon import CommittedFrames, HorizonSettings, RecedingHorizonSolver
-from mapctl.problem.solution import Outcome, Solution, Status
-from mapctl.problem.warm_start import BestOfSamples, SteeringKnots
-from mapctl.problem.window_solvers import LatentNoiseSolver, SingleWindowSolver, SolvedWindow
+from mapctl.problem.solution import Ledger, Outcome, Solution, Status
+from mapctl.problem.unknowns import WindowRequest
+from mapctl.problem.window_solvers import (
+    BestOfSamples,
+    LatentNoiseSolver,
+    SingleWindowSolver,
+    SolvedWindow,
+    SteeringKnots,
+)
 from mapctl.protocols import Density
 from mapctl.skeleton import CANONICAL, LIMBS, Skeleton
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings, LbfgsStatus
 from mapctl.terms import FootContact, KeepClear, LatentPrior, RootVelocity, StepLength, Term
+
+_BODY = 0.4  # metres from an obstacle's edge to the hips of who walks past
+_LOOK_AHEAD, _LOOK_SECONDS = 0.6, 1.2  # metres, and seconds of walking, in which the way must be clear
+_HEADINGS, _WIDEST = 65, math.radians(140.0)  # directions that are tried, and how far off the commanded one
+_PLACES = 16  # along each
+_GET_OUT = 0.3  # metres of clearance gained by metre, for who is too near already
+_STAY = 0.5  # share of a change of direction that counts beside the deviation: who goes left keeps to the left
+
+
+def lead_around(
+    obstacles: tuple[Obstacle, ...], *, place: tuple[float, float], heading: float, wanted: float, speed: float
+) -> float:
+    """Return the direction of travel, radians, nearest to the `wanted` one that leads clear of obstacles.
+
+    `place` is where one is (x and z, metres), `heading` the direction in which one goes now, `speed` in m/s. Where
+    every direction is blocked, the clearest.
+    """
+    if not obstacles or speed <= 0:
+        return wanted
+    offsets = torch.linspace(-_WIDEST, _WIDEST, _HEADINGS, dtype=torch.float64)
+    angles = wanted + offsets
+    along = torch.linspace(0, _LOOK_AHEAD + _LOOK_SECONDS * speed, _PLACES, dtype=torch.float64)
+    start = torch.tensor(place, dtype=torch.float64)
+    rays = start + along[:, None] * torch.stack([angles.sin(), angles.cos()], dim=-1)[:, None]
+    near = float(measure_clearance(obstacles, start))
+    lacking = (torch.clamp(near + _GET_OUT * along, max=_BODY) - measure_clearance(obstacles, rays)).amax(dim=1)
+    if bool((lacking > 1e-6).all()):
+        return float(angles[lacking.argmin()])
+    cost = offsets.abs() + _STAY * rotations.wrap_angle(angles - heading).abs()
+    return float(angles[torch.where(lacking > 1e-6, torch.inf, cost).argmin()])
+
 
 _RAISE_SECONDS = 0.7  # in which a hand goes to its place, and back
 _TURN_SECONDS = 0.5  # in which a head turns there, and back

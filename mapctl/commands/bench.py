@@ -18,10 +18,9 @@ from mapctl.commands.shared.command import ModelCommand
 from mapctl.commands.shared.tables import print_table
 from mapctl.features import LAYOUT, PRIOR_FPS
 from mapctl.intent.steering import Command
-from mapctl.problem.context import WindowContext
-from mapctl.problem.latent_noise import LatentNoise
 from mapctl.problem.objective import Objective
 from mapctl.problem.solution import Outcome
+from mapctl.problem.unknowns import LatentNoise, WindowContext
 from mapctl.protocols import Density
 from mapctl.skeleton import CANONICAL
 

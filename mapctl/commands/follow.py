@@ -18,7 +18,7 @@ from mapctl.commands.shared.shots import ShotPlan, Walk, parse_follow, plan_shot
 from mapctl.curves import Curve
 from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import RequestError
-from mapctl.intent.cornering import turns_sharply
+from mapctl.intent.path import turns_sharply
 from mapctl.intent.shot_keys import read_shot_keys
 from priors.lstm_gmm.density import LstmGmmDensity
 from scenes.scene_file import Actor

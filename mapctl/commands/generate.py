@@ -20,7 +20,7 @@ from mapctl.commands.shared.inputs import read_character
 from mapctl.commands.shared.progress_bar import explain_progress, show_progress
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
-from mapctl.metrics.pace_changes import PACES, label_pace
+from mapctl.metrics.gait import PACES, label_pace
 from mapctl.motion import Motion
 from mapctl.retarget import to_canonical
 

@@ -19,10 +19,9 @@ from mapctl.commands.shared.tables import format_cell, print_table
 from mapctl.curves.curve import Curve
 from mapctl.errors import CheckpointError, MapctlError, RequestError
 from mapctl.features import PRIOR_FPS
-from mapctl.metrics import realism
-from mapctl.metrics.comparison import make_comparable
-from mapctl.metrics.realism.diversity import align_to_start, measure_position_diversity
-from mapctl.metrics.realism.gait import PIECE_SECONDS
+from mapctl.metrics import make_comparable, realism
+from mapctl.metrics.gait import PIECE_SECONDS
+from mapctl.metrics.realism import align_to_start, measure_position_diversity
 from mapctl.motion import Motion
 from mapctl.retarget.rigs import Rig
 from priors import checkpoints

@@ -31,8 +31,7 @@ from mapctl.commands.shared.shots import (
 )
 from mapctl.curves import Curve
 from mapctl.errors import FileFormatError, RequestError
-from mapctl.intent.cornering import turns_sharply
-from mapctl.intent.path import PathRequest
+from mapctl.intent.path import PathRequest, turns_sharply
 from priors.lstm_gmm.density import LstmGmmDensity
 from scenes.drawn_character import DrawnCharacter
 from scenes.film import film

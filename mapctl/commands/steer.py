@@ -33,10 +33,8 @@ from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.curves.obstacles import Obstacle, measure_clearance
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
-from mapctl.intent.steering import Arrival, CommandTrack, SteeringLimits
-from mapctl.intent.steering_csv import read_commands
-from mapctl.metrics.arrivals import measure_arrivals
-from mapctl.metrics.travel import measure_commands
+from mapctl.intent.steering import Arrival, CommandTrack, SteeringLimits, read_commands
+from mapctl.metrics.travel import measure_arrivals, measure_commands
 from mapctl.motion import Motion, join_licences
 from mapctl.problem.solution import Outcome, Solution, Status
 from mapctl.terms import FootContact

@@ -9,8 +9,7 @@ import torch
 from tyro.conf import arg
 
 import priors
-from controllers.inbetweening.keyframe_poses import KeyframeClip, build_keyframe_clip
-from controllers.inbetweening.keyframe_timing import KeyInterval, suggest_intervals
+from controllers.inbetweening.keyframe_poses import KeyframeClip, KeyInterval, build_keyframe_clip, suggest_intervals
 from controllers.inbetweening.keyframes import check_effectors
 from controllers.inbetweening.pipeline import InbetweenSolution, InfillSettings
 from controllers.inbetweening.proposers import ModelLoaders, RolloutInbetweener, StitchedInbetweener, build_inbetweener

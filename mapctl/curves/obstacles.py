@@ -8,7 +8,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl.errors import RequestError
-from mapctl.numerics import vectors
 
 
 @dataclass(frozen=True)
@@ -44,11 +43,11 @@ class Obstacle:
         """Compute how far points (x, z) are from its edge, metres; negative within."""
         away = ground - ground.new_tensor(self.place)
         if self.size is None:
-            return vectors.length(away) - (self.radius or 0.0)
+            return away.norm(dim=-1) - (self.radius or 0.0)
         angle = math.radians(self.turn_deg)
         turn = ground.new_tensor([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
         beyond = (away @ turn).abs() - ground.new_tensor(self.size) / 2
-        return vectors.length(beyond.clamp_min(0)) + beyond.amax(dim=-1).clamp_max(0)
+        return beyond.clamp_min(0).norm(dim=-1) + beyond.amax(dim=-1).clamp_max(0)
 
     def outline(self) -> Float[Tensor, "points 2"]:
         """Return points around its edge, in order, metres."""

@@ -1,11 +1,9 @@
 """Editing of motions on their own rigs: mirrored, planted, looped, on the spot, or with travel on the root joint."""
 
-from mapctl.editing.cycles import Cycle, describe_cycle, find_cycle
 from mapctl.editing.footing import plant_feet
-from mapctl.editing.ground_transform import GroundTransform
-from mapctl.editing.looping import Loop, close_loop
+from mapctl.editing.looping import Cycle, Loop, close_loop, describe_cycle, find_cycle
 from mapctl.editing.mirroring import mirror
-from mapctl.editing.travel import move_travel_to_root, remove_travel
+from mapctl.editing.travel import GroundTransform, move_travel_to_root, remove_travel
 
 __all__ = [
     "Cycle",

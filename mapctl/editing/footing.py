@@ -9,9 +9,8 @@ from torch import Tensor
 
 from mapctl import contacts
 from mapctl.contacts.supports import compute_rest_log_probability, fit_supports
-from mapctl.editing.ground_transform import GroundTransform, move_by_share, repeat_over_ground
-from mapctl.editing.legs import place_ankles
-from mapctl.editing.rigged_motion import RiggedMotion
+from mapctl.editing.rigged_motion import RiggedMotion, place_ankles
+from mapctl.editing.travel import GroundTransform, move_by_share, repeat_over_ground
 from mapctl.motion import Motion
 from mapctl.numerics import gaussian
 from mapctl.numerics.intervals import true_intervals

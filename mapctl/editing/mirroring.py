@@ -13,8 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl import kinematics, rotations
-from mapctl.editing.legs import place_ankles
-from mapctl.editing.rigged_motion import RiggedMotion
+from mapctl.editing.rigged_motion import RiggedMotion, place_ankles
 from mapctl.joint_names import Side, normalise_name, split_side
 from mapctl.motion import Motion
 from mapctl.retarget import RigMap

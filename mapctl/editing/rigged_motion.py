@@ -1,4 +1,9 @@
-"""A motion on its own rig, put upright, with which of its joints are canonical ones."""
+"""A motion on its own rig, put upright, with which of its joints are canonical ones.
+
+Legs of any rig brought to where their ankles are wanted, by thigh and shin alone; feet keep their orientation.
+
+A leg that is where it is wanted stays to within rounding, so that frames without a change have none.
+"""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -9,6 +14,7 @@ from torch import Tensor
 
 from mapctl import retarget, rotations
 from mapctl.motion import Motion
+from mapctl.numerics import gaussian
 from mapctl.retarget import RigMap
 from mapctl.retarget.rigs import Rig
 from mapctl.retarget.stance import SIDES
@@ -112,3 +118,115 @@ def keep_numbers(motion: Motion, like: Motion) -> Motion:
 def _keep(own: Float[Tensor, "frames 3"], other: Float[Tensor, "frames 3"]) -> Float[Tensor, "frames 3"]:
     same = (own - other).abs().amax(dim=-1, keepdim=True) < _SAME
     return torch.where(same, other, own)
+
+
+_FREE_EXTENSION = 0.985  # of the leg: a leg may be that straight, whatever it was
+_MAX_EXTENSION = 0.9995  # of the leg that one may be at most
+_SOFT_SHARE = 0.004  # of the leg, before the most that it may be, over which it gives in
+_HIP_DROP_SECONDS = 0.12  # seconds over which hips go down for a leg that is too short, and up again
+_FORWARD_SHARE = 0.1  # of an added bend, by how much it is where knees usually go rather than where this one went
+_TINY = 1e-9
+
+
+def place_ankles(rigged: RiggedMotion, ankles: Float[Tensor, "frames 2 3"]) -> Motion:
+    """Return the upright motion with its ankles (left, right) at positions in the world, metres.
+
+    Hips go down, smoothly and by as little as it takes, where a leg is too short. All local rotations stay, but those
+    of upper legs, lower legs and feet.
+    """
+    dip = _find_hips_dip(rigged, ankles)
+    if float(dip.max()) > 0:
+        down = torch.stack([0 * dip, -dip, 0 * dip], dim=-1)
+        rigged = rigged.with_motion(rigged.shift_hips(down))
+    motion = rigged.motion
+    local = motion.local_quat_xyzw.clone()
+    for k, side in enumerate(SIDES):
+        _place_ankle(rigged, side, ankles[:, k], local)
+    return replace(motion, local_quat_xyzw=rotations.make_sign_continuous(local))
+
+
+def _place_ankle(rigged: RiggedMotion, side: str, target: Float[Tensor, "frames 3"], local: Tensor) -> None:
+    """Write the local rotations of one leg into `local`."""
+    joints = [rigged.rigmap.joints[side + part] for part in ("UpperLeg", "LowerLeg", "Foot")]
+    places, world = rigged.motion.joint_positions(), rigged.motion.joint_rotations()
+    at, knee, ankle = (places[:, joint] for joint in joints)
+    thigh_turn, shin_turn = _turn_leg(knee - at, ankle - knee, target - at, _find_forward(rigged, side))
+    parents = [rigged.motion.skeleton.parents[joint] for joint in joints]
+    # What carries each joint has turned as the bone above it did, helper joints between the two included.
+    turns = (None, thigh_turn, shin_turn)
+    wanted = (
+        rotations.multiply(thigh_turn, world[:, joints[0]]),
+        rotations.multiply(shin_turn, world[:, joints[1]]),
+        world[:, joints[2]],
+    )
+    moved = (target - ankle).abs().amax(-1) > _TINY
+    for joint, parent, turn, goal in zip(joints, parents, turns, wanted, strict=True):
+        above = world[:, parent] if turn is None else rotations.multiply(turn, world[:, parent])
+        found = rotations.multiply(rotations.inverse(above), goal)
+        local[:, joint] = torch.where(moved[:, None], found, local[:, joint])
+
+
+def _find_forward(rigged: RiggedMotion, side: str) -> Float[Tensor, "frames 3"]:
+    """Return the direction in the world in which the knee of a straight leg would bend."""
+    thigh = rigged.rigmap.joints[side + "UpperLeg"]
+    rest = rigged.rigmap.tpose_quat_xyzw[CANONICAL.index(side + "UpperLeg")]
+    turn = rotations.multiply(
+        rigged.motion.joint_rotations()[:, thigh], rotations.inverse(rest).expand(rigged.motion.num_frames, 4)
+    )
+    return rotations.rotate(turn, turn.new_tensor([0.0, 0.0, 1.0]).expand(len(turn), 3))
+
+
+def _turn_leg(
+    thigh: Float[Tensor, "frames 3"],
+    shin: Float[Tensor, "frames 3"],
+    target: Float[Tensor, "frames 3"],
+    forward: Float[Tensor, "frames 3"],
+) -> tuple[Float[Tensor, "frames 4"], Float[Tensor, "frames 4"]]:
+    """Return the rotations in the world of thigh and shin that bring their end to a target, all as vectors from the
+    hip joint, metres. The knee stays in its plane; what it bends further goes a little more forward."""
+    upper, lower, whole = thigh.norm(dim=-1), shin.norm(dim=-1), (thigh + shin).norm(dim=-1)
+    far = _limit_extension(target.norm(dim=-1), whole, upper + lower)
+    swing = rotations.between_vectors(thigh + shin, target)
+    axis = torch.nn.functional.normalize(target, dim=-1)
+    thigh, shin = rotations.rotate(swing, thigh), rotations.rotate(swing, shin)
+    side = thigh - (thigh * axis).sum(-1, keepdim=True) * axis
+    ahead = forward - (forward * axis).sum(-1, keepdim=True) * axis
+    along = (upper.square() - lower.square() + far.square()) / (2 * far).clamp_min(_TINY)
+    height = (upper.square() - along.square()).clamp_min(0).sqrt()
+    added = (height - side.norm(dim=-1)).clamp_min(0)[:, None]
+    way = torch.nn.functional.normalize(side + _FORWARD_SHARE * added * ahead, dim=-1)
+    knee = along[:, None] * axis + height[:, None] * way
+    turn = rotations.multiply(rotations.between_vectors(thigh, knee), swing)
+    bent = rotations.rotate(rotations.multiply(turn, rotations.inverse(swing)), shin)
+    return turn, rotations.multiply(rotations.between_vectors(bent, far[:, None] * axis - knee), turn)
+
+
+def _limit_extension(
+    far: Float[Tensor, " frames"], was: Float[Tensor, " frames"], length: Float[Tensor, " frames"]
+) -> Float[Tensor, " frames"]:
+    """Return how far an ankle may be: as far as it is wanted, and ever less beyond what is nearly the most. A leg that
+    was straighter may stay so."""
+    most, soft = torch.maximum(_MAX_EXTENSION * length, was), _SOFT_SHARE * length
+    over = (far - (most - soft)).clamp_min(0)
+    limited = torch.minimum(far, most - soft) + soft * (1 - torch.exp(-over / soft))
+    return torch.where(far <= was, far, torch.maximum(limited, torch.minimum(was, far)))
+
+
+def _find_hips_dip(rigged: RiggedMotion, ankles: Float[Tensor, "frames 2 3"]) -> Float[Tensor, " frames"]:
+    """Find by how much hips go down for the legs to reach, metres, smooth over time; 0 where they reach anyway."""
+    hips, knees, now = (rigged.positions(part) for part in ("UpperLeg", "LowerLeg", "Foot"))
+    length = (knees - hips).norm(dim=-1) + (now - knees).norm(dim=-1)
+    was = (now - hips).norm(dim=-1)
+    most = torch.maximum(length * _FREE_EXTENSION, was.minimum(length * _MAX_EXTENSION))
+    to_ankles = ankles - hips
+    down = -to_ankles[..., 1]
+    level = to_ankles[..., ::2].square().sum(-1)
+    short = (down - (most.square() - level).clamp_min(0).sqrt()).clamp_min(0)
+    wanted = (ankles - now).norm(dim=-1) > _TINY
+    short = torch.where((down > 0.5 * most) & wanted, short, 0.0).amax(dim=-1)
+    if float(short.max()) == 0:
+        return short
+    frames = max(1, round(_HIP_DROP_SECONDS * float(rigged.motion.fps)))
+    padded = torch.nn.functional.pad(short[None, None], (frames, frames), mode="replicate")
+    highest = torch.nn.functional.max_pool1d(padded, 2 * frames + 1, stride=1)[0, 0]
+    return gaussian.convolve(highest, gaussian.kernel(frames / 2, side=2 * frames), "repeated")

@@ -3,21 +3,143 @@
 Travel is the slow part of the hips' way over the ground: a Gaussian takes sway and the rise and fall of speed with each
 step out of it, and these stay with the hips. Of a loop it is the same share of the cycle's travel in every frame, so
 that what is left repeats exactly.
+
+Rigid transforms of the ground: a turn about the vertical, then a shift; and shares of one, as of a cycle's travel.
+
+A place on the ground is the complex number z + ix, so that turning by an angle is multiplying by exp(i angle).
 """
 
+import cmath
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 from torch import Tensor
 
 from mapctl import rotations
-from mapctl.editing.ground_transform import GroundTransform, move_by_share
 from mapctl.editing.rigged_motion import RiggedMotion
-from mapctl.editing.root_joint import add_root, set_root_track
+from mapctl.formats import bvh
+from mapctl.formats.character import add_root_to_character
 from mapctl.motion import Motion
 from mapctl.numerics import gaussian
 from mapctl.retarget.rigs import Rig
+from mapctl.skeleton import Skeleton
+
+_NO_TURN = 1e-9  # radians under which a transform is a shift alone
+
+
+@dataclass(frozen=True)
+class GroundTransform:
+    """A turn about the vertical through the origin, then a shift over the ground."""
+
+    turn: float
+    """Turn, radians; positive turns +Z toward +X."""
+    shift_xz: tuple[float, float]
+    """Shift along x and z, metres."""
+
+    @property
+    def distance(self) -> float:
+        """Length of the shift, metres."""
+        return math.hypot(*self.shift_xz)
+
+    def share(self, shares: Float[Tensor, " frames"]) -> tuple[Float[Tensor, " frames"], Float[Tensor, "frames 2"]]:
+        """Return the turns (radians) and shifts (metres) of shares of this transform: 0 is none, 1 all of it.
+
+        All are turns about the same point, or shifts along one line. Share a and then share b are share a + b.
+        """
+        if abs(self.turn) < _NO_TURN:
+            return 0 * shares, shares[:, None] * shares.new_tensor(self.shift_xz)
+        # (1 - exp(i s a)) / (1 - exp(i a)) without the loss of digits that small angles would bring.
+        size = torch.sin(shares * self.turn / 2) / math.sin(self.turn / 2)
+        x, z = self.shift_xz
+        place = torch.polar(size.abs(), (shares - 1) * self.turn / 2) * size.sign() * complex(z, x)
+        return shares * self.turn, torch.stack([place.imag, place.real], dim=-1)
+
+
+def move_over_ground(motion: Motion, turns: Float[Tensor, " frames"], shifts_xz: Float[Tensor, "frames 2"]) -> Motion:
+    """Turn each frame of a motion with Y up about the vertical through the origin (radians), then shift it (metres)."""
+    local = motion.local_quat_xyzw.clone()
+    local[:, 0] = rotations.multiply(rotations.about_y(turns), local[:, 0])
+    place = rotations.rotate_about_y(motion.root_position, turns) + rotations.lift_ground(shifts_xz)
+    return replace(motion, root_position=place, local_quat_xyzw=rotations.make_sign_continuous(local))
+
+
+def move_by_share(motion: Motion, transform: GroundTransform, shares: Float[Tensor, " frames"]) -> Motion:
+    """Move each frame of a motion with Y up by a share of a transform."""
+    return move_over_ground(motion, *transform.share(shares))
+
+
+def repeat_over_ground(motion: Motion, transform: GroundTransform, times: int) -> Motion:
+    """Repeat a motion with Y up, each time moved on by the transform; the first one stays."""
+    rounds = torch.arange(times, dtype=torch.float64).repeat_interleave(motion.num_frames)
+    tiled = replace(
+        motion,
+        root_position=motion.root_position.repeat(times, 1),
+        local_quat_xyzw=motion.local_quat_xyzw.repeat(times, 1, 1),
+        moving_offsets={joint: track.repeat(times, 1) for joint, track in motion.moving_offsets.items()},
+    )
+    return move_by_share(tiled, transform, rounds)
+
+
+def fit_ground_transform(
+    before: Float[Tensor, "*points 3"], after: Float[Tensor, "*points 3"], *, turning: bool = True
+) -> GroundTransform:
+    """Fit the transform that brings points nearest to others, by least squares; without `turning` a shift alone."""
+    start, stop = (_as_places(points).flatten() for points in (before, after))
+    product = ((start - start.mean()).conj() * (stop - stop.mean())).sum()
+    turn = float(product.angle()) if turning else 0.0
+    shift = complex(stop.mean().item()) - cmath.rect(1.0, turn) * complex(start.mean().item())
+    return GroundTransform(turn, (shift.imag, shift.real))
+
+
+def _as_places(points: Float[Tensor, "*points 3"]) -> Complex[Tensor, "*points"]:
+    return torch.complex(points[..., 2], points[..., 0])
+
+
+_NAMES = ("root", "motion_root")
+
+
+def set_root_track(
+    motion: Motion, place: Float[Tensor, "frames 3"], turn_xyzw: Float[Tensor, "frames 4"], kept: Sequence[int]
+) -> Motion:
+    """Return a motion whose joint 0 has this position (metres) and rotation (xyzw). Those of its children that are
+    `kept` stay where they are in the world, the others go with it."""
+    places, world = motion.joint_positions(), motion.joint_rotations()
+    local, moving = motion.local_quat_xyzw.clone(), dict(motion.moving_offsets)
+    local[:, 0], back = turn_xyzw, rotations.inverse(turn_xyzw)
+    for child in kept:
+        local[:, child] = rotations.multiply(back, world[:, child])
+        moving[child] = rotations.rotate(back, places[:, child] - place)
+    return replace(
+        motion,
+        root_position=place,
+        local_quat_xyzw=rotations.make_sign_continuous(local),
+        moving_offsets=dict(sorted(moving.items())),
+    )
+
+
+def add_root(motion: Motion) -> Motion:
+    """Return the same motion with a still joint above its first one, at the origin of the world; the file's layout, or
+    its character (glTF, VRM), has it too."""
+    old, frames = motion.skeleton, motion.num_frames
+    name = next(name for name in (*_NAMES, *(f"root_{n}" for n in range(old.num_joints + 1))) if name not in old.names)
+    offsets = torch.cat([old.offsets.new_zeros(1, 3), old.offsets])
+    offsets[1] = motion.root_position[0]
+    skeleton = Skeleton((name, *old.names), (-1, *(parent + 1 for parent in old.parents)), offsets, old.end_offsets)
+    still = motion.local_quat_xyzw.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(frames, 1, 4)
+    moving = {joint + 1: track for joint, track in motion.moving_offsets.items()}
+    return Motion(
+        skeleton,
+        motion.fps,
+        torch.zeros_like(motion.root_position),
+        torch.cat([still, motion.local_quat_xyzw], dim=1),
+        {1: motion.root_position, **moving},
+        bvh.add_root_to_layout(motion.source, name) or add_root_to_character(motion.source, name),
+        motion.licence,
+    )
+
 
 _SLOW_SECONDS = 0.4  # standard deviation, seconds: of a sway of one a second 4 % is taken for travel
 

@@ -1,17 +1,20 @@
 """Target positions of effectors in frames that are otherwise free, and inverse kinematics that meets them."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from mapctl import rotations
 from mapctl.errors import RequestError
 from mapctl.kinematics import inverse
 from mapctl.motion import Motion
 from mapctl.numerics import smooth_offsets
-from mapctl.skeleton import CANONICAL, LIMBS
+from mapctl.numerics.intervals import fill_missing, fill_missing_angle
+from mapctl.skeleton import CANONICAL, LIMBS, TOE_REST_HEIGHT, Skeleton, leg_length
 
 _MIN_REACH_SECONDS = 0.15  # seconds over which a limb goes to its target and back, at least
 _REACH_ACCELERATION = 15.0  # m/s^2 at which it goes farther
@@ -83,3 +86,180 @@ def reach_effector_targets(motion: Motion, targets: EffectorTargets, free: Bool[
         )
         motion = replace(motion, local_quat_xyzw=torch.where(turning[..., None], quats, motion.local_quat_xyzw))
     return motion
+
+
+_ANKLE_REST_HEIGHT = 0.1174
+"""Height of the canonical ankles over the floor while the foot is flat on it, metres."""
+_REST_HEIGHTS = {
+    joint: _ANKLE_REST_HEIGHT if name.endswith("Foot") else TOE_REST_HEIGHT
+    for joint, name in enumerate(CANONICAL.names)
+    if name.endswith(("Foot", "Toes"))
+}
+_SAME_VIEW = math.radians(1.0)
+_LEAST_LINE = 1e-3  # metres: a shorter way has no direction
+
+
+@dataclass(frozen=True, eq=False)
+class LooseKeys:
+    """Places over the ground and drawings, by frame."""
+
+    placed: Bool[Tensor, " frames"]
+    """Whether the hips' place over the ground is told by itself."""
+    ground: Float[Tensor, "frames 2"]
+    """That place (x, z), world, metres; anything finite where there is none."""
+    drawn: Bool[Tensor, "frames joints"]
+    """Whether a canonical joint is drawn."""
+    sketch: Float[Tensor, "frames joints 2"]
+    """Where it is drawn: to the viewer's right and up, in the drawing's own unit."""
+    view: Float[Tensor, " frames"]
+    """Heading from the body to the viewer, radians."""
+
+    @staticmethod
+    def none(frames: int, joints: int) -> "LooseKeys":
+        """Return no key in any frame."""
+        one, number = torch.bool, torch.float64
+        return LooseKeys(
+            torch.zeros(frames, dtype=one),
+            torch.zeros(frames, 2, dtype=number),
+            torch.zeros(frames, joints, dtype=one),
+            torch.zeros(frames, joints, 2, dtype=number),
+            torch.zeros(frames, dtype=number),
+        )
+
+    @property
+    def drawings(self) -> Bool[Tensor, " frames"]:
+        """Frames with a drawing."""
+        return self.drawn.any(dim=1)
+
+    def shown(self, seconds: Float[Tensor, " shown"], *, fps: float) -> "LooseKeys":
+        """Return the keys at other, increasing times: each is moved to the time nearest to its own."""
+        nearest = find_nearest_times(len(self.placed), seconds, fps=fps)
+        frames = (self.placed | self.drawings).nonzero()[:, 0]
+        moved = LooseKeys.none(len(seconds), self.drawn.shape[1])
+        values = {name: _move(getattr(moved, name), value, nearest, frames) for name, value in vars(self).items()}
+        return LooseKeys(**values)
+
+    def scaled(self, factor: float) -> "LooseKeys":
+        """Return the keys of a world that is so many times as large; drawings are of any size anyway."""
+        return replace(self, ground=self.ground * factor)
+
+    def see_from_one_side(self, skeleton: Skeleton) -> "SeenDrawings | None":
+        """Return all drawings as seen by who sees the first of them, by a body with these bones; None without any."""
+        frames = self.drawings.nonzero()[:, 0].tolist()
+        if not frames:
+            return None
+        places = torch.zeros(*self.drawn.shape, 3, dtype=torch.float64)
+        axes = torch.zeros(*self.drawn.shape, 3, dtype=torch.bool)
+        view = float(self.view[frames[0]])
+        for frame in frames:
+            drawn = self.drawn[frame].nonzero()[:, 0].tolist()
+            sketch = self.sketch[frame, drawn].double()
+            sketch = _stand_at_origin(estimate_size(sketch, drawn, skeleton) * sketch, drawn, skeleton)
+            cosine = math.cos(float(self.view[frame]) - view)
+            # From elsewhere only heights look the same.
+            flat = abs(cosine) > math.cos(_SAME_VIEW)
+            places[frame, drawn, 0], places[frame, drawn, 1] = math.copysign(1.0, cosine) * sketch[:, 0], sketch[:, 1]
+            axes[frame, drawn, 0], axes[frame, drawn, 1] = flat, True
+        return SeenDrawings(places, axes, view)
+
+
+@dataclass(frozen=True, eq=False)
+class SeenDrawings:
+    """Drawings in metres, seen from one side."""
+
+    places: Float[Tensor, "frames joints 3"]
+    """To the viewer's right from the hips, up from the floor, and 0."""
+    known: Bool[Tensor, "frames joints 3"]
+    """Which of these is drawn."""
+    view: float
+    """Heading from the body to the viewer, radians."""
+
+
+def _move(target: Tensor, values: Tensor, nearest: Int[Tensor, " frames"], frames: Int[Tensor, " keys"]) -> Tensor:
+    return target.index_put((nearest[frames],), values[frames].to(target))
+
+
+def lead_over_places(
+    ground: Float[Tensor, "batch frames 2"],
+    heading: Float[Tensor, "batch frames"],
+    *,
+    placed: Bool[Tensor, "batch frames"],
+    faced: Bool[Tensor, "batch frames"],
+) -> tuple[Float[Tensor, "batch frames 2"], Float[Tensor, "batch frames"]]:
+    """Lead ground (metres) and heading (radians) straight from one told place to the next, and from one told heading to
+    the next. Where no heading of a motion is told it looks along its way: at a place between both lines that meet
+    there, and from place to place evenly."""
+    way = fill_missing(ground, placed)
+    told = fill_missing_angle(heading, faced)
+    return way, torch.where(faced.any(dim=1, keepdim=True), told, _look_along(way, placed))
+
+
+def _look_along(way: Float[Tensor, "batch frames 2"], placed: Bool[Tensor, "batch frames"]) -> Tensor:
+    line = torch.nn.functional.normalize(torch.diff(way, dim=1), dim=-1)
+    none = torch.zeros_like(way[:, :1])
+    along = torch.cat([none, line], dim=1) + torch.cat([line, none], dim=1)
+    moves = along.norm(dim=-1) > _LEAST_LINE
+    heading = fill_missing_angle(torch.atan2(along[..., 0], along[..., 1]), placed & moves)
+    return torch.where(moves.any(dim=1, keepdim=True), heading, 0.0)
+
+
+def view_axes(view: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 2 3"]:
+    """Return the directions in the world that are drawn to the right and up, seen from these headings, radians."""
+    zero, one = torch.zeros_like(view), torch.ones_like(view)
+    right = rotations.rotate_about_y(torch.stack([one, zero, zero], dim=-1), view)
+    return torch.stack([right, torch.stack([zero, one, zero], dim=-1)], dim=-2)
+
+
+def estimate_size(sketch: Float[Tensor, "drawn 2"], joints: Sequence[int], skeleton: Skeleton) -> float:
+    """Estimate the metres of a drawing's unit: the largest for which no two joints are drawn farther apart than the
+    bones between them are long."""
+    chains = _measure_chains(skeleton)[joints][:, joints]
+    apart = torch.cdist(sketch, sketch)
+    far = apart > 1e-9 * float(apart.max())
+    return float((chains[far] / apart[far]).min())
+
+
+def measure_floor(heights: Float[Tensor, " joints"], skeleton: Skeleton) -> float:
+    """Measure the height of a floor on which the lowest foot of canonical joints would stand, metres; NaN heights are
+    not known."""
+    size = leg_length(skeleton) / leg_length(CANONICAL)
+    floors = torch.stack([heights[joint] - size * rest for joint, rest in _REST_HEIGHTS.items()])
+    floors = floors[torch.isfinite(floors)]
+    return float(floors.min()) if len(floors) else math.nan
+
+
+def estimate_standing_height(skeleton: Skeleton) -> float:
+    """Estimate the hips' height of canonical joints that stand on both feet, metres."""
+    return -measure_floor(_rest_heights(skeleton), skeleton)
+
+
+def _stand_at_origin(
+    sketch: Float[Tensor, "drawn 2"], joints: Sequence[int], skeleton: Skeleton
+) -> Float[Tensor, "drawn 2"]:
+    """Move a drawing, in metres, so that its hips are over the origin and its lowest foot is on the floor; where these
+    are not drawn its middle is, and as high as it would be while standing upright."""
+    middle = sketch[joints.index(0), 0] if 0 in joints else sketch[:, 0].mean()
+    heights = torch.full((skeleton.num_joints,), torch.nan, dtype=sketch.dtype)
+    heights[joints] = sketch[:, 1]
+    floor = measure_floor(heights, skeleton)
+    if math.isnan(floor):
+        standing = _rest_heights(skeleton)[joints] + estimate_standing_height(skeleton)
+        floor = float((sketch[:, 1] - standing).mean())
+    return sketch - torch.stack([middle, middle.new_tensor(floor)])
+
+
+def _rest_heights(skeleton: Skeleton) -> Float[Tensor, " joints"]:
+    """Return the joints' heights over the hips in the T-pose, metres."""
+    heights = [0.0]
+    for joint, parent in enumerate(skeleton.parents[1:], start=1):
+        heights.append(heights[parent] + float(skeleton.offsets[joint, 1]))
+    return torch.tensor(heights, dtype=torch.float64)
+
+
+def _measure_chains(skeleton: Skeleton) -> Float[Tensor, "joints joints"]:
+    """Measure the bones between each two joints, metres."""
+    lengths, on_way = skeleton.offsets.norm(dim=-1), torch.zeros(skeleton.num_joints, skeleton.num_joints)
+    for joint, parent in enumerate(skeleton.parents[1:], start=1):
+        on_way[joint] = on_way[parent]
+        on_way[joint, joint] = 1.0
+    return ((on_way[:, None] - on_way[None]).abs() * lengths).sum(dim=-1)

@@ -9,8 +9,7 @@ from torch import Tensor
 
 from mapctl import contacts, rotations
 from mapctl.features import PRIOR_FPS
-from mapctl.inbetweening.effector_targets import EffectorTargets
-from mapctl.inbetweening.loose_keys import LooseKeys
+from mapctl.inbetweening.effector_targets import EffectorTargets, LooseKeys
 from mapctl.inbetweening.missing import MissingMask
 from mapctl.motion import Motion
 from mapctl.numerics.intervals import true_intervals

@@ -11,8 +11,9 @@ from pydantic import Field
 
 from mapctl.errors import FileFormatError, RequestError
 from mapctl.formats import toml
+from mapctl.formats.text import finite_number, read_table, shorten
 from mapctl.formats.toml import STRICT
-from mapctl.intent.keyframes import KINDS, NO_PLACE, check_kinds
+from mapctl.intent.keyframes import KINDS, NO_PLACE, Drawing, check_kinds
 
 _MOST_SECONDS = 3600.0
 _MOST_FRAMES = 100_000
@@ -182,3 +183,35 @@ def _suggest_key(key: Sequence[int | str]) -> str:
     names = [item.name for item in fields(KeyEntry if len(key) > 1 else KeyRequest)]
     near = get_close_matches(str(key[-1]), names, n=1, cutoff=0)
     return f"the nearest is {near[0]}; allowed: {', '.join(names)}"
+
+
+_COLUMNS = ("joint", "x", "y")
+
+
+def read_drawing(path: str | PathLike[str], view_deg: float = 0.0) -> Drawing:
+    """Read a drawing, x to the viewer's right and y up, in any unit. FileFormatError names file and line."""
+    lines = read_table(path, f"a CSV of the columns {','.join(_COLUMNS)}")
+    header, names = (lines[0][0], [word.lower() for word in lines[0][1]]) if lines else (1, [])
+    if sorted(names) != sorted(_COLUMNS):
+        found = shorten(",".join(names))
+        raise FileFormatError(path, f"found the columns {found}, expected {','.join(_COLUMNS)}, each once", header)
+    places: dict[str, tuple[float, float]] = {}
+    for number, words in lines[1:]:
+        if len(words) != len(names):
+            raise FileFormatError(path, f"found {len(words)} values where {len(names)} belong", number)
+        told = dict(zip(names, words, strict=True))
+        if not told["joint"] or told["joint"] in places:
+            raise FileFormatError(path, f"each line names a joint, each once, got {shorten(told['joint'])}", number)
+        x, y = (_read_number(path, number, axis, told[axis]) for axis in ("x", "y"))
+        places[told["joint"]] = (x, y)
+    try:
+        return Drawing(places, view_deg)
+    except RequestError as error:
+        raise FileFormatError(path, str(error)) from error
+
+
+def _read_number(path: str | PathLike[str], line: int, axis: str, word: str) -> float:
+    value = finite_number(word)
+    if value is None:
+        raise FileFormatError(path, f"{axis} must be a finite number, got {shorten(word)}", line)
+    return value

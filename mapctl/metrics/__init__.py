@@ -11,13 +11,65 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mapctl import retarget
 from mapctl.curves.curve import Curve
 from mapctl.curves.tracking import track_arcs
 from mapctl.errors import RequestError
+from mapctl.features import PRIOR_FPS
 from mapctl.joint_roles import find_feet, find_hips, find_upper_legs
-from mapctl.metrics import body, feet, path
+from mapctl.metrics import body, feet
 from mapctl.motion import Motion
+from mapctl.numerics import gaussian
+from mapctl.numerics.gaussian import gaussian_kernel, low_pass
+from mapctl.retarget import UNKNOWN_RIG_NOTE
+from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import CANONICAL
+
+LOW_PASS_SECONDS = 0.5
+"""Standard deviation of the Gaussian that takes natural sway out of the path error."""
+SWAY_SECONDS = 0.35
+"""Standard deviation of the Gaussian whose slow part is not sway."""
+
+
+def compute_path_error(
+    positions: Float[Tensor, "frames axes"], curve: Curve, arcs: Float[Tensor, "frames"]
+) -> Float[Tensor, "frames"]:
+    """Compute the distance of each position to the curve at the walk's arc, between the curve's ends, metres; without
+    height for a ground curve. `arcs` come from `track`: the nearest point of all may belong to another branch."""
+    on_it = arcs if curve.closed else arcs.clamp(0, curve.length)
+    apart = curve.point(on_it) - (positions[:, ::2] if positions.shape[1] > curve.dims else positions)
+    return apart.norm(dim=-1)
+
+
+def compute_low_pass_error(
+    positions: Float[Tensor, "frames axes"], curve: Curve, arcs: Float[Tensor, "frames"], fps: float
+) -> Float[Tensor, "frames"]:
+    """Compute the size of the sideways offset after a Gaussian of 0.5 s, metres.
+
+    The offset is smoothed and not the walk, which would shrink on every bend. `arcs` come from `track`.
+    """
+    return low_pass(curve.signed_offset(positions, arcs), seconds=LOW_PASS_SECONDS, fps=fps).abs()
+
+
+def sway(offset: Float[Tensor, "frames"], fps: float, seconds: float = SWAY_SECONDS) -> float:
+    """Return the root mean square of a sideways offset without its slow part; NaN for clips too short (2.2 s)."""
+    kernel = gaussian_kernel(seconds, fps)
+    reach = len(kernel) // 2
+    if len(offset) <= 2 * reach + 4:
+        return math.nan
+    # Inside, where the whole kernel lies on the walk.
+    quick = (offset - gaussian.convolve(offset, kernel, "nothing"))[reach:-reach]
+    return float(quick.square().mean().sqrt())
+
+
+def straight_offset(ground: Float[Tensor, "frames 2"]) -> Float[Tensor, "frames"]:
+    """Return the distance of a walk (x, z) from the line piece between its ends, metres; left is positive."""
+    along = ground[-1] - ground[0]
+    apart = ground - ground[0]
+    share = ((apart @ along) / along.square().sum().clamp_min(1e-12)).clamp(0, 1)
+    side = torch.sign(along[1] * apart[:, 0] - along[0] * apart[:, 1])
+    return (apart - share[:, None] * along).norm(dim=-1) * side
+
 
 _CM = 100.0
 
@@ -42,7 +94,7 @@ def measure(
     measures |= _measure_heels(motion)
     measures |= _measure_body(positions, hips, find_upper_legs(motion.skeleton), fps)
     if curve is None:
-        return measures | {"sway_cm": path.sway(path.straight_offset(positions[:, hips, ::2]), fps) * _CM}
+        return measures | {"sway_cm": sway(straight_offset(positions[:, hips, ::2]), fps) * _CM}
     follower = hips if joint is None else motion.skeleton.index(joint)
     return measures | _measure_path(positions[:, follower], curve, speed, fps)
 
@@ -92,11 +144,9 @@ def _measure_path(
 ) -> dict[str, float]:
     arcs = track_arcs(curve, positions)
     travelled = float(arcs[-1] - arcs[0])
-    measures = _summarise_errors("path_error_{}_cm", path.compute_path_error(positions, curve, arcs))
-    measures |= _summarise_errors(
-        "path_error_low_passed_{}_cm", path.compute_low_pass_error(positions, curve, arcs, fps)
-    )
-    measures |= {"sway_cm": path.sway(curve.signed_offset(positions, arcs), fps) * _CM, "travelled_m": travelled}
+    measures = _summarise_errors("path_error_{}_cm", compute_path_error(positions, curve, arcs))
+    measures |= _summarise_errors("path_error_low_passed_{}_cm", compute_low_pass_error(positions, curve, arcs, fps))
+    measures |= {"sway_cm": sway(curve.signed_offset(positions, arcs), fps) * _CM, "travelled_m": travelled}
     if speed is not None:
         wanted = speed * (len(positions) - 1) / fps
         measures |= {"wanted_m": wanted, "progress_ratio": travelled / wanted if wanted else float("nan")}
@@ -135,3 +185,26 @@ def _summarise_values(values: Tensor) -> MeasureStatistics:
     if len(values) == 0:
         return MeasureStatistics(float("nan"), float("nan"), float("nan"))
     return MeasureStatistics(float(values.mean()), *values.quantile(values.new_tensor([0.02, 0.98])).tolist())
+
+
+_RATE_TOLERANCE = 0.02  # share of the reference's rate within which measures are the same, as of 29.97 frames a second
+
+
+def make_comparable(motion: Motion, rig: Rig | None = None) -> tuple[Motion, tuple[str, ...]]:
+    """Convert a motion to what reference values of mocap were measured on: canonical joints, Y up, 30 frames a second.
+
+    Frames are left out of faster motions; slower ones stay, since nothing is known between their frames. Sentences tell
+    what could not be made so: a rig that is not known stays as it is in the file. `rig` wins over what would be
+    recognised.
+    """
+    notes: tuple[str, ...] = ()
+    try:
+        motion = retarget.to_canonical(motion, rig)[0]
+    except RequestError:
+        notes = (UNKNOWN_RIG_NOTE,)
+    if motion.fps > PRIOR_FPS * (1 + _RATE_TOLERANCE):
+        motion = motion.resample(PRIOR_FPS)
+    if motion.fps < PRIOR_FPS * (1 - _RATE_TOLERANCE):
+        rate = f"{float(motion.fps):.4g} frames a second"
+        notes = (*notes, f"measured at {rate}; mocap's values at {PRIOR_FPS} tell of quicker changes")
+    return motion, notes

@@ -17,10 +17,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl.errors import RequestError
-from mapctl.problem.ledger import Ledger, LedgerEntry
-from mapctl.solver.gradient import differentiate
-from mapctl.terms.adjoints.gradient import TrialGradient
-from mapctl.terms.base import DifferentiatedTerm, Term
+from mapctl.problem.solution import Ledger, LedgerEntry
+from mapctl.solver.lbfgs import differentiate
+from mapctl.terms.base import DifferentiatedTerm, Term, TrialGradient
 from mapctl.terms.trial import Trial
 
 

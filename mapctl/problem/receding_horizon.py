@@ -14,10 +14,9 @@ from torch import Tensor
 
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, integrate_root
-from mapctl.problem.context import WindowContext, WindowRequest
 from mapctl.problem.density_selection import DensityEnsemble
-from mapctl.problem.ledger import Ledger
-from mapctl.problem.solution import Outcome, WindowRecord
+from mapctl.problem.solution import Ledger, Outcome, WindowRecord
+from mapctl.problem.unknowns import WindowContext, WindowRequest
 from mapctl.problem.window_solvers import LatentNoiseSolver, SingleWindowSolver, SolvedWindow
 from mapctl.protocols import AnyDensity, DensityState
 from mapctl.skeleton import CANONICAL, Skeleton

@@ -1,23 +1,141 @@
-"""Solvers of one window: a start, a parametrisation of its frames, and L-BFGS over the unknowns."""
+"""Solvers of one window: a start, a parametrisation of its frames, and L-BFGS over the unknowns.
 
-from collections.abc import Sequence
+Warm starts of L-BFGS in a window: the last window's noise, the best of random draws, or a particle swarm.
+
+A swarm over all the noise of a window (34 x 66 numbers) gained nothing over zero noise when tried. Here it searches a
+few numbers that steer: the root's noise (sideways, forward, turn) at a few knots in time, linear in between.
+
+Unknowns that are offsets of each frame's pose and position about a proposed motion, in sigmas, smooth in time.
+
+x = proposal + sigma * (K z): the posterior of a model that proposes whole motions, as a rollout's x = mu + sigma d is
+that of a density, so that the standard normal prior of z is the observation term of denoising (Wang et al. 2019, Eq.
+25) in coordinates that converge. K smooths white z to unit variance, so that a correction of one frame moves its
+neighbours along. Positions are in the world, not steps from frame to frame: terms on observed positions are then well
+conditioned.
+"""
+
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mapctl.problem.context import WindowRequest
-from mapctl.problem.density_selection import DensityChoice
-from mapctl.problem.latent_noise import LatentNoise
-from mapctl.problem.ledger import Ledger
+from mapctl.features import LAYOUT
+from mapctl.numerics import gaussian
+from mapctl.pose import BodyPose
+from mapctl.problem.density_selection import DensityChoice, DensityEnsemble
 from mapctl.problem.objective import Objective, Parametrisation
-from mapctl.problem.warm_start import WarmStartProposal, keep_warm_start
+from mapctl.problem.solution import Ledger
+from mapctl.problem.unknowns import LatentNoise, WindowContext, WindowRequest
 from mapctl.solver.budget import Budget, Meter
 from mapctl.solver.lbfgs import LbfgsResult, LbfgsSettings, minimise
+from mapctl.solver.swarm import SwarmSettings, run_best_of_samples, run_swarm
 from mapctl.terms.base import Term
+from mapctl.terms.likelihood import Likelihood
 from mapctl.terms.trial import Trial
+
+WarmStartProposal = Callable[[WindowRequest, Float[Tensor, "1 unknowns"], Meter], Float[Tensor, "1 unknowns"]]
+"""(request, warm start over the whole window, meter) to the unknowns from which L-BFGS starts."""
+
+
+def keep_warm_start(
+    request: WindowRequest, warm: Float[Tensor, "1 unknowns"], meter: Meter
+) -> Float[Tensor, "1 unknowns"]:
+    """Return the warm start itself."""
+    return warm
+
+
+@dataclass(frozen=True)
+class SteeringKnots:
+    """A space of few dimensions in the noise of a window: some blocks of features at knots in time."""
+
+    knots: int = 4
+    """Number of knots, evenly spaced over the window; between them the noise is linear."""
+    blocks: tuple[str, ...] = ("root_displacement_heading", "heading_change")
+    """Feature blocks whose noise is searched."""
+    spread: float = 0.7
+    """Standard deviation of draws at each knot, in units of the noise, whose own is 1."""
+
+    def size(self) -> int:
+        """Return the number of dimensions."""
+        return self.knots * len(self._columns())
+
+    def expand(self, values: Float[Tensor, "batch size"], frames: int) -> Float[Tensor, "batch frames continuous"]:
+        """Return the noise of whole windows at points of the space."""
+        knots = torch.unflatten(values, -1, (self.knots, -1)).transpose(1, 2)
+        dense = torch.nn.functional.interpolate(knots, size=frames, mode="linear", align_corners=True)
+        noise = values.new_zeros(len(values), frames, LAYOUT.continuous)
+        noise[..., self._columns()] = dense.transpose(1, 2)
+        return noise
+
+    def _columns(self) -> list[int]:
+        return [i for block in self.blocks for i in range(LAYOUT.slices[block].start, LAYOUT.slices[block].stop)]
+
+
+@dataclass(frozen=True, eq=False)
+class _SteeredNoise:
+    """A window's noise as points of the steering space around the warm start."""
+
+    request: WindowRequest
+    warm: Float[Tensor, "1 unknowns"]
+    space: SteeringKnots
+
+    def unknowns(self, points: Float[Tensor, "batch size"]) -> Float[Tensor, "batch unknowns"]:
+        """Return the unknowns of whole windows."""
+        noise = self.space.expand(points.to(self.warm.dtype), self.request.context.frames)
+        return self.warm + noise.flatten(1)
+
+    def energy(self, points: Float[Tensor, "batch size"]) -> Float[Tensor, " batch"]:
+        """Compute the total energy of each point, nats, under a plan of its own."""
+        unknowns = self.unknowns(points)
+        with torch.no_grad():
+            latents = LatentNoise.from_unknowns(self.request.context, unknowns)
+            return Objective(latents.build, self.request.terms).energy(unknowns)
+
+
+@dataclass(frozen=True)
+class BestOfSamples:
+    """The best of random draws in the steering space, the warm start among them."""
+
+    count: int = 32
+    """Number of draws."""
+    space: SteeringKnots = SteeringKnots()
+    """Space in which they are drawn."""
+
+    def __call__(
+        self, request: WindowRequest, warm: Float[Tensor, "1 unknowns"], meter: Meter
+    ) -> Float[Tensor, "1 unknowns"]:
+        """Return the best draw about the warm start, or that itself; the meter counts what was evaluated."""
+        noise, generator = _SteeredNoise(request, warm, self.space), request.generator
+        start, spread = torch.zeros(self.space.size()), self.space.spread
+        found = run_best_of_samples(
+            noise.energy, start=start, spread=spread, count=self.count, meter=meter, generator=generator
+        )
+        return noise.unknowns(found.x[None])
+
+
+@dataclass(frozen=True)
+class SwarmProposal:
+    """A particle swarm (Wang et al. 2019, section 5.2) in the steering space, started at the warm start."""
+
+    settings: SwarmSettings = field(default_factory=lambda: SwarmSettings(particles=16, iterations=6))
+    """Number of particles and iterations."""
+    space: SteeringKnots = SteeringKnots()
+    """Space in which they move."""
+
+    def __call__(
+        self, request: WindowRequest, warm: Float[Tensor, "1 unknowns"], meter: Meter
+    ) -> Float[Tensor, "1 unknowns"]:
+        """Return the best point of the swarm, or the warm start itself; the meter counts what was evaluated."""
+        noise, generator = _SteeredNoise(request, warm, self.space), request.generator
+        start, spread = torch.zeros(self.space.size()), self.space.spread
+        found = run_swarm(
+            noise.energy, start=start, spread=spread, settings=self.settings, meter=meter, generator=generator
+        )
+        return noise.unknowns(found.x[None])
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,3 +268,92 @@ def _build_solved_window(
         float(result.energy[0]),
         result.status[0].value,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class PoseOffsets:
+    """Unknowns are offsets about a proposal's root position, heading and angles, one batch row a candidate."""
+
+    context: WindowContext
+    """What is known before the window. A single density scores the motion with teacher forcing (Eq. 15)."""
+    proposal: BodyPose
+    """Proposed poses of the window's frames, unbatched."""
+    contacts: Bool[Tensor, "frames 2"]
+    """Left and right toe planted in each frame."""
+    sigma: Float[Tensor, "frames width"]
+    """Standard deviations of root, heading and angles (see `BodyPose.pack`): metres and radians."""
+    smooth: float = 2.0
+    """Sigma of the smoothing, frames."""
+
+    @cached_property
+    def _heel_plan(self) -> Trial:
+        """The proposal, whose poses say which heels are planted."""
+        features = self.proposal.features(self.context.place, self.contacts)
+        return self.context.plan_heels(features[None], self.contacts[None])
+
+    @cached_property
+    def _smoothing_matrix(self) -> Float[Tensor, "frames frames"]:
+        return gaussian.unit_variance_matrix(len(self.sigma), self.smooth, self.sigma.dtype)
+
+    def build(self, unknowns: Float[Tensor, "batch unknowns"]) -> Trial:
+        """Build the trials of the proposal with the offsets added; differentiable."""
+        white = torch.unflatten(unknowns, -1, self.sigma.shape)
+        offset = self.sigma * torch.einsum("ts,bsw->btw", self._smoothing_matrix, white)
+        pose = BodyPose.unpack(self.proposal.pack() + offset)
+        features = pose.features(self.context.place, self.contacts)
+        log_density = None
+        if not isinstance(self.context.density, DensityEnsemble):
+            log_density = self.context.density.log_prob(features, self.context.expand_state(len(white)))
+        contacts = self.contacts.expand(len(white), -1, -1)
+        return self.context.build_trial(
+            features, contacts, noise=white, log_density=log_density, heel_plan=self._heel_plan
+        )
+
+    def warm_start(self, unknowns: Float[Tensor, "1 unknowns"]) -> Float[Tensor, "frames width"]:
+        """Return the white offsets by frame, in sigmas."""
+        return torch.unflatten(unknowns[0], -1, self.sigma.shape)
+
+
+@dataclass(frozen=True, eq=False)
+class PoseOffsetSolver:
+    """L-BFGS over the offsets of a proposed motion, window by window.
+
+    Of an ensemble, the density under which a window's proposal is likeliest scores the window, with less weight where
+    the proposal is less likely than that density's own data.
+    """
+
+    proposal: BodyPose
+    """The proposed motion, unbatched."""
+    contacts: Bool[Tensor, "frames 2"]
+    """Left and right toe planted in each frame of it."""
+    sigma: Float[Tensor, "frames width"]
+    """Standard deviations of root, heading and angles by frame (see `BodyPose.pack`): metres and radians."""
+    smooth: float = 2.0
+    """Sigma of the smoothing, frames."""
+    temperature: float = 1.0
+    """Temperature of the selected density's likelihood."""
+    lbfgs: LbfgsSettings = field(default_factory=lambda: LbfgsSettings(max_iterations=20))
+    """Settings of L-BFGS in one window."""
+    budget: Budget = field(default_factory=lambda: Budget(evaluations=20))
+    """Budget of one window."""
+    first_frame: int = 0
+    """Frame of the whole motion that the proposal begins at."""
+
+    def __call__(self, request: WindowRequest) -> SolvedWindow:
+        """Solve one window; the proposal stays where nothing finite is found.
+
+        The search starts from the proposal, without a warm start: the frames that the last window's offsets were
+        smoothed together with are committed now.
+        """
+        context, terms = request.context, request.terms
+        first = context.first_frame - self.first_frame
+        stop = first + context.frames
+        proposal, contacts = self.proposal.slice(first, stop), self.contacts[first:stop]
+        choice = None
+        if isinstance(context.density, DensityEnsemble) and context.density.densities:
+            choice, state = context.density.select(proposal.features(context.place, contacts), context.state)
+            context = replace(context, density=choice.density, state=state)
+            terms = (*terms, Likelihood(self.temperature / choice.weight))
+        offsets = PoseOffsets(context, proposal, contacts, self.sigma[first:stop], smooth=self.smooth)
+        start, meter = torch.zeros(1, offsets.sigma.numel()), Meter(self.budget.within(request.seconds))
+        return replace(minimise_window(offsets, terms, start, self.lbfgs, meter), choice=choice)

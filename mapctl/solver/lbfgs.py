@@ -318,3 +318,19 @@ def _cubic_minimum(a: _EvaluatedPoint, b: _EvaluatedPoint) -> float:
     root = math.sqrt(square)
     denominator = b.slope - a.slope + 2.0 * root
     return width * (1.0 - (b.slope + root - bend) / denominator) if denominator else 0.5 * width
+
+
+def differentiate(
+    energy: Callable[[Float[Tensor, "batch n"]], Float[Tensor, " batch"]],
+) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
+    """Return a function that gives the energies of a batch of points and their gradients (batch, n) by reverse-mode
+    differentiation, both detached; the points are independent of each other.
+    """
+
+    def evaluate(points: Tensor) -> tuple[Tensor, Tensor]:
+        points = points.detach().requires_grad_(True)
+        energies = energy(points)
+        (gradient,) = torch.autograd.grad(energies.sum(), points)
+        return energies.detach(), gradient
+
+    return evaluate

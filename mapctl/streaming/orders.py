@@ -4,13 +4,19 @@ This is the syntax alone: which orders there are, and how many numbers or words 
 limits of its numbers, belong to whoever obeys it.
 """
 
+import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from mapctl.errors import RequestError
-from mapctl.numerics.checks import is_number
 from mapctl.streaming.messages import Message
+
+
+def is_number(value: object) -> bool:
+    """Return whether a value is a finite number."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
 
 _ADDRESS = re.compile(r"/mapctl(?:/(?P<character>\d{1,4}))?/(?P<name>[a-z][a-z_/]{0,30})")
 _SHOWN_LENGTH = 40  # characters of what a program sent that a message repeats

@@ -1,18 +1,15 @@
 """The terms of the MAP problem. A new one is a file here, a name below and an instance in tests/catalogue.py."""
 
 from mapctl.terms.base import Term
-from mapctl.terms.clearance import Clearance
-from mapctl.terms.foot_contact import FootContact, LandingSigmas
+from mapctl.terms.foot_contact import Clearance, FootContact, LandingSigmas, Support
 from mapctl.terms.jerk import Jerk
 from mapctl.terms.keep_clear import KeepApart, KeepClear, WithinReach
 from mapctl.terms.keyframe import Keyframe
-from mapctl.terms.latent_prior import LatentPrior
-from mapctl.terms.likelihood import Likelihood
+from mapctl.terms.likelihood import LatentPrior, Likelihood
 from mapctl.terms.motion_tracking import MotionTracking
 from mapctl.terms.path import Path
 from mapctl.terms.root_velocity import RootVelocity
 from mapctl.terms.step_length import StepLength
-from mapctl.terms.support import Support
 
 ALL = (
     Likelihood,

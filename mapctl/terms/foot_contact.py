@@ -1,5 +1,10 @@
 """Foot contact: planted toes and heels do not move and are on the ground (Wang et al. 2019, Eq. 18), and come there
-without a snap."""
+without a snap.
+
+Support: while a foot is near the ground, one that is near it does not move.
+
+Unlike foot contact it does not depend on contact bits, so a motion cannot slide by leaving every toe unplanted.
+"""
 
 from dataclasses import dataclass, field, replace
 
@@ -8,9 +13,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from mapctl.contacts import support_speed
 from mapctl.skeleton import TOE_REST_HEIGHT, find_heel_drops
-from mapctl.terms.adjoints import kernels
-from mapctl.terms.adjoints.gradient import TrialGradient
+from mapctl.terms import kernels
+from mapctl.terms.base import TrialGradient
 from mapctl.terms.trial import Trial
 
 
@@ -163,3 +169,64 @@ def _hold(
 def _stays(planted: Bool[Tensor, "batch steps 2"]) -> Bool[Tensor, "batch frames 2"]:
     """True where a point is planted in a frame and in the one before it, be that before the window."""
     return planted[:, 1:] & planted[:, :-1]
+
+
+@dataclass(frozen=True, eq=False)
+class Clearance:
+    """Toes that are not planted are the higher over the ground the faster they travel, up to the usual clearance of
+    walking people."""
+
+    height: float = 0.035
+    """Clearance of a toe in full swing over its rest height, metres: less costs."""
+    speed: float = 1.0
+    """Speed over the ground from which all of `height` is wanted, m/s; below, in proportion."""
+    sigma: float = 0.015
+    """Standard deviation of the height that is lacking, metres."""
+    rest_height: float | Float[Tensor, "frames 2"] = TOE_REST_HEIGHT
+    """Height of the toe joint while the foot is flat on the ground, metres; of each toe's in each frame, if not one."""
+    share: Float[Tensor, "frames 2"] | None = None
+    """Share of the height that each toe is to clear in each frame of the window, 0 to 1; None: all of it."""
+    name: str = "clearance"
+    """Name in the ledger."""
+    unit: str = "m"
+    """Unit of the residual."""
+
+    def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
+        """Return the energies of both toes, nats."""
+        return 0.5 * (self._height_deficit(trial) / self.sigma).square().sum(-1)
+
+    def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
+        """Return the height that the lower toe is lacking, metres; 0 where none is."""
+        return self._height_deficit(trial).amax(-1)
+
+    def _height_deficit(self, trial: Trial) -> Float[Tensor, "batch frames 2"]:
+        wanted = self.height * (trial.toe_speeds / self.speed).clamp(max=1)
+        if self.share is not None:
+            wanted = wanted * self.share.to(wanted)
+        lacking = wanted - (trial.toe_heights - self.rest_height)
+        return torch.where(trial.contacts, 0.0, lacking.clamp_min(0))
+
+
+@dataclass(frozen=True, eq=False)
+class Support:
+    """The slowest of the toes near the ground, which supports the body, does not travel; flight costs nothing."""
+
+    sigma: float = 0.1
+    """Standard deviation of that toe's speed over the ground, m/s; mocap's planted toes move at 0.05."""
+    rest_height: float | Float[Tensor, "frames 2"] = TOE_REST_HEIGHT
+    """Height of the toe joint while the foot is flat on the ground, metres; of each toe's in each frame, if not one."""
+    name: str = "support"
+    """Name in the ledger."""
+    unit: str = "m/s"
+    """Unit of the residual."""
+
+    def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
+        """Return the energies, nats."""
+        return 0.5 * (self._speed(trial) / self.sigma).square()
+
+    def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
+        """Return the speed of the supporting toe over the ground, m/s; 0 in flight."""
+        return self._speed(trial)
+
+    def _speed(self, trial: Trial) -> Float[Tensor, "batch frames"]:
+        return support_speed(trial.toe_heights - self.rest_height, trial.toe_speeds)

@@ -6,8 +6,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl.curves.obstacles import Obstacle, measure_clearance
-from mapctl.numerics import vectors
 from mapctl.skeleton import CANONICAL
+from mapctl.terms.base import length
 from mapctl.terms.trial import Trial
 
 _WIDEST = CANONICAL.indices(("hips", "leftHand", "rightHand", "leftLowerArm", "rightLowerArm", "leftToes", "rightToes"))
@@ -66,7 +66,7 @@ class KeepApart:
 
     def _lacking(self, trial: Trial) -> Float[Tensor, "batch others frames"]:
         away = trial.root_xz_world[:, None] - self.others.to(trial.features)
-        return (self.distance - vectors.length(away)).clamp_min(0)
+        return (self.distance - length(away)).clamp_min(0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,4 +98,4 @@ class WithinReach:
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Return the distance beyond reach, metres; 0 where the limb reaches."""
         away = trial.joints_world[..., self.shoulder, :] - self.place.to(trial.features)
-        return (vectors.length(away) - self.reach).clamp_min(0) * self.wanted
+        return (length(away) - self.reach).clamp_min(0) * self.wanted

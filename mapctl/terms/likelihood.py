@@ -6,7 +6,8 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from mapctl.terms.adjoints.gradient import TrialGradient
+from mapctl.terms import kernels
+from mapctl.terms.base import TrialGradient
 from mapctl.terms.trial import Trial
 
 
@@ -33,3 +34,29 @@ class Likelihood:
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Return minus the log density, nats."""
         return -trial.require_log_density()
+
+
+@dataclass(frozen=True)
+class LatentPrior:
+    """The trial's noise is normal with mean 0: latents of a rollout, input noise or pose offsets."""
+
+    sigma: float = 1.0
+    """Standard deviation of each number, in units of the noise, whose own is 1; above 1 leaves more of it."""
+    name: str = "noise"
+    """Name in the ledger."""
+    unit: str = "rms"
+    """Unit of the residual."""
+
+    def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
+        """Return the energies, nats: half the squared numbers of each frame over sigma squared."""
+        return 0.5 * (trial.require_noise() / self.sigma).square().sum(-1)
+
+    def add_gradient(self, trial: Trial, gradient: TrialGradient) -> Float[np.ndarray, "batch frames"]:
+        """Add the gradient of the summed energies of a float32 trial, and return the energies, nats."""
+        energy = np.empty(gradient.log_density.shape)
+        kernels.add_latent_prior(trial.require_noise().numpy(), self.sigma, energy, gradient.noise)
+        return energy
+
+    def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
+        """Return the root mean square of a frame's numbers."""
+        return trial.require_noise().square().mean(-1).sqrt()

@@ -14,10 +14,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl.curves import Curve
-from mapctl.curves.local_frame import LocalFrame, find_local_frames
-from mapctl.numerics import gaussian, vectors
-from mapctl.terms.adjoints import kernels
-from mapctl.terms.adjoints.gradient import TrialGradient
+from mapctl.numerics import gaussian
+from mapctl.terms import kernels
+from mapctl.terms.base import TrialGradient, length
+from mapctl.terms.kernels import LocalFrame, find_local_frames
 from mapctl.terms.trial import Trial
 
 _REACH = 0.6  # metres around the wanted arc in which the nearest point is sought: a crossing's other branch is farther
@@ -88,7 +88,7 @@ class Path:
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Return the distance to the curve, metres."""
         positions = self._positions(trial)
-        return vectors.length(positions - self._nearest_frame(positions).place)
+        return length(positions - self._nearest_frame(positions).place)
 
     def _positions(self, trial: Trial) -> Float[Tensor, "batch frames dims"]:
         if self.joint == "hips" and self.curve.dims == 2:  # no need of the whole body's kinematics

@@ -13,9 +13,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mapctl.numerics import gaussian, vectors
-from mapctl.terms.adjoints import kernels
-from mapctl.terms.adjoints.gradient import TrialGradient
+from mapctl.numerics import gaussian
+from mapctl.terms import kernels
+from mapctl.terms.base import TrialGradient, length
 from mapctl.terms.trial import Trial
 
 
@@ -73,12 +73,12 @@ class RootVelocity:
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Return the size of the low-pass velocity error, m/s."""
-        return vectors.length(self._velocity_error(trial))
+        return length(self._velocity_error(trial))
 
     @cached_property
     def _units(self) -> Float[Tensor, "frames 2 2"]:
         """Axes along and across the target velocity, each divided by its sigma, m/s."""
-        speed = vectors.length(self.velocities).unsqueeze(-1)
+        speed = length(self.velocities).unsqueeze(-1)
         resting = torch.tensor([0.0, 1.0], dtype=speed.dtype)
         along = torch.where(speed > 1e-6, self.velocities / speed.clamp_min(1e-6), resting)
         across = torch.stack([along[:, 1], -along[:, 0]], dim=-1)

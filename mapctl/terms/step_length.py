@@ -8,8 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl.skeleton import TOES
-from mapctl.terms.adjoints import kernels
-from mapctl.terms.adjoints.gradient import TrialGradient
+from mapctl.terms import kernels
+from mapctl.terms.base import TrialGradient
 from mapctl.terms.trial import Trial
 
 _NEVER = -2  # below every frame

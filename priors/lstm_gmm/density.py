@@ -11,11 +11,10 @@ from torch import Tensor
 
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT
-from mapctl.metrics.pace_changes import find_pace, label_pace
+from mapctl.metrics.gait import find_pace, label_pace
 from mapctl.protocols import DataLimits, Density, DiscreteChoices, InitialStates, PreparedRollout
 from mapctl.solver.budget import Budget, Meter
-from mapctl.solver.gradient import differentiate
-from mapctl.solver.lbfgs import LbfgsSettings, minimise
+from mapctl.solver.lbfgs import LbfgsSettings, differentiate, minimise
 from priors import checkpoints
 from priors.lstm_gmm import labels as clip_labels
 from priors.lstm_gmm.fast.rollout import FastRollout

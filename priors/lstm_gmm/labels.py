@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl.errors import RequestError
-from mapctl.metrics.pace_changes import CHANGES, PACES, label_pace
+from mapctl.metrics.gait import CHANGES, PACES, label_pace
 
 _OTHER_SIDE = {"left": "right", "right": "left"}
 

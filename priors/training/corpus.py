@@ -28,7 +28,7 @@ from mapctl.contacts import ContactSettings, estimate_floor_heights
 from mapctl.errors import MapctlError, RequestError
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode, integrate_root
 from mapctl.formats import load
-from mapctl.metrics.pace_changes import PACES, PaceChanges, count_pace_changes, follow_pace, measure_speed
+from mapctl.metrics.gait import PACES, PaceChanges, count_pace_changes, follow_pace, measure_speed
 from mapctl.motion import Motion
 from mapctl.retarget import RigMap, identify_rig, rigs
 from mapctl.retarget.carry import RiggedCharacter, retarget_canonical

@@ -11,10 +11,9 @@ from mapctl import contacts, kinematics, rotations
 from mapctl.errors import CheckpointError
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening import GapQuery, PositionImage, Proposal
-from mapctl.inbetweening.loose_keys import LooseKeys
-from mapctl.inbetweening.path_closing import lead_over_keys
+from mapctl.inbetweening.effector_targets import LooseKeys
 from mapctl.inbetweening.query import GapSource
-from mapctl.inbetweening.root_trajectory import TREMBLE_HZ, LocalMotion
+from mapctl.inbetweening.root_trajectory import TREMBLE_HZ, LocalMotion, lead_over_keys
 from mapctl.inbetweening.whole_body import bend_limbs
 from mapctl.kinematics import heading
 from mapctl.motion import Motion

@@ -14,7 +14,7 @@ from torch import Tensor
 from mapctl import rotations
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening import PositionImage
-from mapctl.inbetweening.loose_keys import lead_over_places
+from mapctl.inbetweening.effector_targets import lead_over_places
 from mapctl.inbetweening.partial_motion import PartialMotion
 from mapctl.kinematics import heading
 from mapctl.motion import Motion

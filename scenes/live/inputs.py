@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from mapctl.intent.steering import STEP_LENGTHS, Command
-from mapctl.numerics.checks import is_number
+from mapctl.streaming.orders import is_number
 
 UNCONDITIONED = "any"
 """The choice that gives a prior no label."""

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import viser
 
 from mapctl.intent.steering import STEP_LENGTHS
-from mapctl.numerics.checks import is_number
+from mapctl.streaming.orders import is_number
 from scenes.live import paths
 from scenes.live.camera import CameraMode
 from scenes.live.character import KEPT_SECONDS, ShownCharacter

@@ -14,7 +14,7 @@ import viser
 from scipy.spatial import KDTree
 
 from mapctl import curves
-from mapctl.curves import csv_file, svg_file
+from mapctl.curves import files
 from mapctl.curves.curve import Curve
 from mapctl.errors import FileFormatError, MapctlError, RequestError
 from mapctl.mesh import colours
@@ -138,7 +138,7 @@ def read_path(name: str, content: bytes) -> tuple[PathPoints, str]:
         file = Path(folder) / f"path{ending}"
         file.write_bytes(content)
         try:
-            given = svg_file.read_svg(file) if ending == ".svg" else csv_file.read_csv(file)
+            given = files.read_svg(file) if ending == ".svg" else files.read_csv(file)
             curve = curves.from_points(given[:, [0, -1]])
         except FileFormatError as error:
             raise RequestError(str(error).replace(str(file), name[-60:])) from None

@@ -9,7 +9,7 @@ import viser
 
 from mapctl.curves.obstacles import Obstacle
 from mapctl.mesh import colours
-from mapctl.numerics.checks import is_number
+from mapctl.streaming.orders import is_number
 from scenes.live.character import ShownCharacter
 from scenes.live.ground import to_rgb_bytes
 from scenes.live.inputs import DISC_RADII, Point, SteeringInputs, parse_point

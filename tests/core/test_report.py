@@ -9,8 +9,7 @@ import torch
 
 from mapctl import curves, report
 from mapctl.motion import Motion
-from mapctl.problem.ledger import Ledger, LedgerEntry
-from mapctl.problem.solution import Outcome, Solution, Status, WindowRecord
+from mapctl.problem.solution import Ledger, LedgerEntry, Outcome, Solution, Status, WindowRecord
 from mapctl.skeleton import CANONICAL
 
 FRAMES = 90

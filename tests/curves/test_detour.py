@@ -3,8 +3,8 @@
 import pytest
 import torch
 
+from controllers.shots.way import apply_detour, find_detour
 from mapctl import curves
-from mapctl.curves.detour import apply_detour, find_detour
 from mapctl.curves.obstacles import Obstacle, measure_clearance
 
 MARGIN = 0.35

@@ -6,8 +6,7 @@ import torch
 from helpers import walk
 from rig_maker import Make, make, names_of
 
-from mapctl.editing.legs import place_ankles
-from mapctl.editing.rigged_motion import RiggedMotion
+from mapctl.editing.rigged_motion import RiggedMotion, place_ankles
 from mapctl.motion import Motion
 
 RIGS = {

@@ -9,8 +9,8 @@ from rigs_to_edit import RIGS, on_rig, soft_knees, toe_speed
 
 from mapctl import editing, retarget
 from mapctl.editing.footing import find_contacts
-from mapctl.editing.ground_transform import repeat_over_ground
 from mapctl.editing.rigged_motion import RiggedMotion
+from mapctl.editing.travel import repeat_over_ground
 from mapctl.skeleton import CANONICAL
 
 LEGS = [side + part for part in ("UpperLeg", "LowerLeg", "Foot") for side in ("left", "right")]

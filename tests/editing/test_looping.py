@@ -11,9 +11,9 @@ from rigs_to_edit import RIGS, soft_knees
 
 from mapctl import editing, rotations
 from mapctl.editing.footing import find_contacts
-from mapctl.editing.ground_transform import repeat_over_ground
 from mapctl.editing.looping import Peaks
 from mapctl.editing.rigged_motion import RiggedMotion
+from mapctl.editing.travel import repeat_over_ground
 
 
 def uneven(frames: int = 120, *, fps: int = 30, turn_rate: float = 0.0, cadence: float = 0.93):

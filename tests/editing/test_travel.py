@@ -10,8 +10,8 @@ from rigs_to_edit import RIGS, on_rig
 
 import mapctl
 from mapctl import editing, rotations
-from mapctl.editing.ground_transform import GroundTransform, fit_ground_transform, move_by_share
 from mapctl.editing.rigged_motion import RiggedMotion
+from mapctl.editing.travel import GroundTransform, fit_ground_transform, move_by_share
 from mapctl.formats import bvh
 
 

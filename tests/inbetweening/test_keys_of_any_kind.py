@@ -14,7 +14,7 @@ from tiny_tweener import tiny_tweener
 from controllers.inbetweening.keyframes import fit_drawings, measure_drawing_error, missing_between_keys
 from controllers.inbetweening.tween import measure_keyframe_errors, tween
 from mapctl import rotations
-from mapctl.inbetweening.loose_keys import LooseKeys, view_axes
+from mapctl.inbetweening.effector_targets import LooseKeys, view_axes
 from mapctl.inbetweening.missing import restore_observed
 from mapctl.intent.keyframes import Drawing, Key, Keys
 from mapctl.kinematics import heading

@@ -6,7 +6,6 @@ import torch
 from captures import on_rig
 
 from mapctl import rotations
-from mapctl.inbetweening.interpolation import interpolate_positions
 from mapctl.inbetweening.partial_motion import (
     EFFECTORS,
     KnownParts,
@@ -15,6 +14,7 @@ from mapctl.inbetweening.partial_motion import (
     mirror_quats,
 )
 from mapctl.skeleton import CANONICAL, LIMBS
+from priors.training.windows import interpolate_positions
 
 FRAMES = 40
 MEAN = torch.nn.functional.normalize(

@@ -14,7 +14,7 @@ from controllers.inbetweening.proposers import SlerpInbetweener
 from mapctl import retarget
 from mapctl.errors import RequestError
 from mapctl.inbetweening.missing import MissingMask
-from mapctl.inbetweening.path_closing import close_path
+from mapctl.inbetweening.root_trajectory import close_path
 from mapctl.motion import Motion
 from mapctl.recording.masks import ROOT, Mask
 from mapctl.skeleton import CANONICAL, leg_length

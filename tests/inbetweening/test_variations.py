@@ -21,8 +21,7 @@ from controllers.inbetweening.variations import lowest_energy, sample_variations
 from mapctl.errors import RequestError
 from mapctl.inbetweening.missing import MissingMask
 from mapctl.intent.keyframes import Keys
-from mapctl.problem.warm_start import SwarmProposal
-from mapctl.problem.window_solvers import LatentNoiseSolver
+from mapctl.problem.window_solvers import LatentNoiseSolver, SwarmProposal
 from mapctl.recording.masks import Mask
 from mapctl.skeleton import CANONICAL
 from mapctl.solver.budget import Budget

@@ -12,7 +12,7 @@ from controllers.inbetweening.proposers import AutoInbetweener, SlerpInbetweener
 from controllers.inbetweening.proposers.slerp import WalkedPlaces
 from controllers.inbetweening.tween import measure_keyframe_errors, tween
 from mapctl.inbetweening import GapQuery
-from mapctl.inbetweening.loose_keys import LooseKeys
+from mapctl.inbetweening.effector_targets import LooseKeys
 from mapctl.inbetweening.missing import MissingMask
 from mapctl.intent.keyframes import Key, Keys
 from mapctl.skeleton import CANONICAL

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
+from controllers.steering.steer import lead_around
 from mapctl.curves.obstacles import Obstacle, measure_clearance
-from mapctl.intent.avoidance import lead_around
 
 AHEAD = dict(place=(0.0, 0.0), heading=0.0, wanted=0.0, speed=1.2)
 

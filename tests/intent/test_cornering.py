@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from mapctl import curves
-from mapctl.intent.cornering import find_reversals, slow_for_corners, turns_sharply
-from mapctl.intent.path import SpeedProfile
+from mapctl.intent.path import SpeedProfile, find_reversals, slow_for_corners, turns_sharply
 
 USUAL = SpeedProfile.constant(1.2)
 

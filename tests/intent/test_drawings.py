@@ -3,7 +3,7 @@
 import pytest
 
 from mapctl.errors import FileFormatError
-from mapctl.intent.drawing_csv import read_drawing
+from mapctl.intent.keyframe_toml import read_drawing
 from mapctl.intent.keyframes import Drawing
 
 

@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mapctl.errors import FileFormatError, RequestError
-from mapctl.intent.steering import STEP_LENGTHS, Command, CommandTrack, SteeringLimits, SteeringTarget
-from mapctl.intent.steering_csv import read_commands
+from mapctl.intent.steering import STEP_LENGTHS, Command, CommandTrack, SteeringLimits, SteeringTarget, read_commands
 
 ANGLES = st.floats(-20, 20)
 SPEEDS = st.floats(0, 5)

@@ -9,8 +9,8 @@ from helpers import corpus, generator, tiny_density, tiny_model
 from controllers.generation.foot_cleanup import FootCleanupSettings, clean_up_feet
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, GroundPose
-from mapctl.problem.context import WindowContext, WindowRequest
 from mapctl.problem.receding_horizon import HorizonSettings
+from mapctl.problem.unknowns import WindowContext, WindowRequest
 from mapctl.problem.window_solvers import GuidedNoiseSolver
 from mapctl.terms import FootContact, MotionTracking
 from mapctl.terms.trial import Trial

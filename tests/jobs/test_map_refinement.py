@@ -15,9 +15,9 @@ from mapctl.motion import Motion
 from mapctl.numerics.intervals import true_intervals
 from mapctl.pose import BodyPose
 from mapctl.problem import window_solvers
-from mapctl.problem.context import WindowContext
 from mapctl.problem.density_selection import DensityEnsemble
-from mapctl.problem.pose_offsets import PoseOffsets
+from mapctl.problem.unknowns import WindowContext
+from mapctl.problem.window_solvers import PoseOffsets
 from mapctl.recording import Capture
 from mapctl.skeleton import CANONICAL, TOES
 from mapctl.solver.budget import Budget

@@ -8,8 +8,8 @@ import torch
 from helpers import walk
 
 import priors
-from controllers.shots.keys.posing import measure_pose_error, meet_poses
-from controllers.shots.keys.reaching import ReachTargets, go_down, settle_reaches
+from controllers.shots.posing import measure_pose_error, meet_poses
+from controllers.shots.reaching import ReachTargets, go_down, settle_reaches
 from controllers.shots.request import Arrival, PoseKey, Reach, ShotRequest, arrive
 from controllers.shots.shot import OVERLAP, close_loop
 from controllers.shots.way import Way, plan_way

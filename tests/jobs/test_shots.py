@@ -9,9 +9,8 @@ import torch
 from helpers import walk
 
 import priors
-from controllers.shots.keys.posing import measure_look_errors, turn_heads
+from controllers.shots.posing import build_rest_pose, measure_look_errors, turn_heads
 from controllers.shots.request import Lead, Look, Others, Reach, ShotRequest
-from controllers.shots.rest_pose import build_rest_pose
 from controllers.shots.shot import solve_shot
 from controllers.shots.way import StandingEnds, lay_timeline, plan_speeds, plan_way
 from mapctl import curves, rotations

@@ -13,10 +13,10 @@ from helpers import generator, walk
 
 from mapctl import curves
 from mapctl.curves import Curve
-from mapctl.curves.local_frame import find_local_frames
 from mapctl.features import LAYOUT, GroundPose, encode, integrate_root
 from mapctl.kinematics import fast
 from mapctl.skeleton import CANONICAL, Skeleton
+from mapctl.terms.kernels import find_local_frames
 from mapctl.terms.trial import Trial
 
 PAST = 8

@@ -13,7 +13,7 @@ from helpers import random_motion, run, walk
 from rig_maker import Make, make, names_of, person
 
 from mapctl import metrics
-from mapctl.metrics.comparison import make_comparable
+from mapctl.metrics import make_comparable
 from mapctl.motion import Motion
 from mapctl.retarget import UNKNOWN_RIG_NOTE, put_upright
 from mapctl.skeleton import Skeleton

@@ -8,11 +8,11 @@ import pytest
 import torch
 from helpers import walk, walk_through
 
-from mapctl import curves
+from mapctl import curves, metrics
 from mapctl.contacts import detect_contacts
 from mapctl.contacts.heels import derive_heel_contacts
 from mapctl.errors import MapctlError, RequestError
-from mapctl.metrics import body, compute_reference, feet, measure, path
+from mapctl.metrics import body, compute_reference, feet, measure
 from mapctl.skeleton import CANONICAL, find_heel_drops
 
 TOES = [CANONICAL.index("leftToes"), CANONICAL.index("rightToes")]
@@ -73,8 +73,8 @@ def test_sway_is_what_a_slow_gaussian_leaves():
     weights = np.exp(-0.5 * ((np.arange(-taps, taps + 1) / fps) / 0.35) ** 2)
     weights /= weights.sum()
     quick = [offset[t] - weights @ offset[t - taps : t + taps + 1] for t in range(taps, 200 - taps)]
-    assert path.sway(torch.tensor(offset), fps) == pytest.approx(np.sqrt(np.mean(np.square(quick))), rel=1e-12)
-    assert math.isnan(path.sway(torch.tensor(offset[: 2 * taps + 4]), fps))
+    assert metrics.sway(torch.tensor(offset), fps) == pytest.approx(np.sqrt(np.mean(np.square(quick))), rel=1e-12)
+    assert math.isnan(metrics.sway(torch.tensor(offset[: 2 * taps + 4]), fps))
 
 
 def test_sway_of_a_straight_walk_is_its_swing_from_side_to_side():

@@ -3,14 +3,7 @@
 import numpy as np
 import pytest
 
-from mapctl.metrics.pace_changes import (
-    PACES,
-    PaceChanges,
-    compute_ground_velocity,
-    count_pace_changes,
-    find_pace,
-    follow_pace,
-)
+from mapctl.metrics.gait import PACES, PaceChanges, compute_ground_velocity, count_pace_changes, find_pace, follow_pace
 
 
 @pytest.mark.parametrize(

@@ -15,9 +15,8 @@ from hypothesis import strategies as st
 
 from mapctl import retarget
 from mapctl.errors import RequestError
-from mapctl.metrics import body, realism
-from mapctl.metrics.realism import classifier, frechet, gait, windows
-from mapctl.metrics.realism.diversity import align_to_start, average_pairwise_distance, measure_diversity
+from mapctl.metrics import body, gait, realism
+from mapctl.metrics.realism import align_to_start, average_pairwise_distance, measure_diversity
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL
 
@@ -94,23 +93,23 @@ def test_frechet_distance_is_the_formula(seed):
     root = scipy.linalg.sqrtm(np.cov(first.T) @ np.cov(second.T)).real
     apart = ((first.mean(0) - second.mean(0)) ** 2).sum()
     expected = apart + np.trace(np.cov(first.T) + np.cov(second.T) - 2 * root)
-    got = frechet.frechet_distance(torch.from_numpy(first), torch.from_numpy(second))
+    got = realism.frechet_distance(torch.from_numpy(first), torch.from_numpy(second))
     assert got == pytest.approx(expected, rel=1e-9)
-    assert got == pytest.approx(frechet.frechet_distance(torch.from_numpy(second), torch.from_numpy(first)), rel=1e-9)
+    assert got == pytest.approx(realism.frechet_distance(torch.from_numpy(second), torch.from_numpy(first)), rel=1e-9)
 
 
 def test_frechet_distance_of_a_shift_is_its_square_even_where_covariances_are_singular():
     """Four points in twenty dimensions, where the covariances' product has no real root by the textbook."""
     points = torch.randn(4, 20, generator=generator(1), dtype=torch.float64)
-    assert frechet.frechet_distance(points, points) == pytest.approx(0, abs=1e-12)
-    assert frechet.frechet_distance(points + 0.5, points) == pytest.approx(20 * 0.25, rel=1e-12)
+    assert realism.frechet_distance(points, points) == pytest.approx(0, abs=1e-12)
+    assert realism.frechet_distance(points + 0.5, points) == pytest.approx(20 * 0.25, rel=1e-12)
 
 
 @pytest.mark.parametrize("count", [30, 200])
 def test_basis_holds_the_largest_variances(count):
     """Whichever Gram matrix is the smaller; 30 frames of 4 channels are 120 features."""
     drawn = torch.randn(count, 30, 4, generator=generator(2)) @ torch.diag(torch.tensor([3.0, 2.0, 1.0, 0.5]))
-    basis = frechet.Basis.of(drawn, 6)
+    basis = realism.Basis.of(drawn, 6)
     flat = drawn.flatten(1).double()
     standardised = (flat - flat.mean(0)) / flat.std(0, correction=0)
     largest = torch.linalg.svdvals(standardised)[:6]
@@ -149,11 +148,11 @@ def test_the_same_seed_gives_the_same_bits_and_leaves_torch_alone():
     expected = torch.rand(3)
     torch.manual_seed(7)
     threads = torch.get_num_threads()
-    score = classifier.compute_held_out_accuracy(first, second, generator=generator(5), settings=SMALL)
+    score = realism.compute_held_out_accuracy(first, second, generator=generator(5), settings=SMALL)
     assert torch.equal(torch.rand(3), expected)
     assert torch.get_num_threads() == threads
     torch.rand(5)  # another state of the global generator
-    assert classifier.compute_held_out_accuracy(first, second, generator=generator(5), settings=SMALL) == score
+    assert realism.compute_held_out_accuracy(first, second, generator=generator(5), settings=SMALL) == score
 
 
 @pytest.mark.slow
@@ -164,7 +163,7 @@ def test_no_clip_is_both_learnt_and_held_out():
         marked[clip, :, :, clip] = 1
     clips = list(marked)
     settings = realism.ClassifierSettings(steps=150, width=8, batch=32)
-    by_heart = classifier.compute_held_out_accuracy(clips[::2], clips[1::2], generator=generator(1), settings=settings)
+    by_heart = realism.compute_held_out_accuracy(clips[::2], clips[1::2], generator=generator(1), settings=settings)
     assert by_heart < 0.8
 
 
@@ -176,7 +175,7 @@ def test_too_few_or_too_short_clips_are_refused():
     with pytest.raises(RequestError, match="mocap clip 3 of 8: 20 frames"):
         realism.measure_realism(clips, [*clips[:2], walk(20), *clips[3:]], generator=generator())
     with pytest.raises(RequestError, match="4 folds"):
-        classifier.compute_held_out_accuracy(windows_of(clips[:3]), windows_of(clips), generator=generator())
+        realism.compute_held_out_accuracy(windows_of(clips[:3]), windows_of(clips), generator=generator())
 
 
 @pytest.mark.parametrize("wrong", [{"folds": 1}, {"steps": 0}, {"batch": 1}, {"width": 0}])
@@ -220,8 +219,8 @@ def test_diversity_needs_samples_of_one_length():
 
 def test_from_own_start_stands_at_the_origin_and_faces_ahead():
     seen = align_to_start(moved(walk(40, turn_rate=0.5), turn=2.0, shift=(3.0, -1.0)).joint_positions())
-    torch.testing.assert_close(seen[0, windows.HIPS, ::2], torch.zeros(2).double(), atol=1e-9, rtol=0)
-    assert float(windows.facing_angle(seen)[0]) == pytest.approx(0, abs=1e-9)
+    torch.testing.assert_close(seen[0, realism.HIPS, ::2], torch.zeros(2).double(), atol=1e-9, rtol=0)
+    assert float(realism.facing_angle(seen)[0]) == pytest.approx(0, abs=1e-9)
 
 
 def test_step_lengths_go_from_foot_to_other_foot():

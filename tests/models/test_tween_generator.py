@@ -8,9 +8,9 @@ from helpers import generator, walk
 
 from mapctl import joint_ranges, rotations
 from mapctl.inbetweening import PositionImage
-from mapctl.inbetweening.interpolation import interpolate_heading, interpolate_positions
 from mapctl.kinematics import heading
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
+from priors.training.windows import interpolate_heading, interpolate_positions
 from priors.tweening.generator import (
     INPUT_ROWS,
     PAPER,

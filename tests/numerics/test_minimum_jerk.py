@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from mapctl.numerics.minimum_jerk import MinimumJerkTrack
+from mapctl.numerics.easing import MinimumJerkTrack
 
 
 def rest(*values: float) -> MinimumJerkTrack:

@@ -10,13 +10,11 @@ from helpers import generator, tiny_density, tiny_model, walk
 
 from mapctl.features import LAYOUT, encode, integrate_root
 from mapctl.kinematics.fast import WorldPoses
-from mapctl.problem.context import WindowContext
-from mapctl.problem.latent_noise import LatentNoise
 from mapctl.problem.objective import AdjointParametrisation, Objective
+from mapctl.problem.unknowns import LatentNoise, WindowContext
 from mapctl.skeleton import CANONICAL
 from mapctl.terms import LatentPrior
-from mapctl.terms.adjoints.gradient import TrialGradient
-from mapctl.terms.base import DifferentiatedTerm
+from mapctl.terms.base import DifferentiatedTerm, TrialGradient
 from priors.lstm_gmm.fast import layout
 from priors.lstm_gmm.network import LstmGmm
 

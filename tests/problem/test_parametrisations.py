@@ -7,10 +7,9 @@ from helpers import corpus, finite_difference, generator, noise, tiny_density, w
 
 from mapctl.features import LAYOUT, GroundPose
 from mapctl.pose import BodyPose
-from mapctl.problem.context import WindowContext
-from mapctl.problem.latent_noise import LatentNoise
 from mapctl.problem.objective import Objective, Parametrisation
-from mapctl.problem.pose_offsets import PoseOffsets
+from mapctl.problem.unknowns import LatentNoise, WindowContext
+from mapctl.problem.window_solvers import PoseOffsets
 from mapctl.terms import FootContact, Jerk, LatentPrior, Likelihood
 
 FRAMES, SIZE = 7, LAYOUT.continuous

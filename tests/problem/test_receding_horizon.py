@@ -14,11 +14,10 @@ from mapctl.features import LAYOUT, GroundPose, integrate_root
 from mapctl.kinematics import heading
 from mapctl.metrics.feet import locate_heels
 from mapctl.pose import decode
-from mapctl.problem.latent_noise import LatentNoise
 from mapctl.problem.objective import Objective
 from mapctl.problem.solution import Outcome
-from mapctl.problem.warm_start import BestOfSamples, SwarmProposal
-from mapctl.problem.window_solvers import LatentNoiseSolver
+from mapctl.problem.unknowns import LatentNoise
+from mapctl.problem.window_solvers import BestOfSamples, LatentNoiseSolver, SwarmProposal
 from mapctl.skeleton import CANONICAL, FEET
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings

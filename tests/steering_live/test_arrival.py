@@ -14,7 +14,7 @@ from controllers.steering.arrival import Arriver
 from controllers.steering.loop import Recorder, StreamClock, drive
 from mapctl.features import PRIOR_FPS
 from mapctl.intent.steering import Arrival, CommandTrack
-from mapctl.metrics.arrivals import measure_arrivals
+from mapctl.metrics.travel import measure_arrivals
 from mapctl.retarget import to_canonical
 from mapctl.skeleton import CANONICAL, Skeleton
 

@@ -12,8 +12,7 @@ from mapctl import curves
 from mapctl.curves.obstacles import Obstacle
 from mapctl.intent.steering import Command, SteeringLimits
 from mapctl.motion import Motion
-from mapctl.problem.ledger import Ledger
-from mapctl.problem.solution import Outcome, Status
+from mapctl.problem.solution import Ledger, Outcome, Status
 
 LINE = curves.from_points(torch.tensor([[0.0, 0.0], [0.0, 5.0]]))
 

@@ -8,10 +8,15 @@ import torch
 from helpers import corpus, walk, write_corpus
 
 from mapctl.features import LAYOUT, encode, mirror_features
-from mapctl.metrics.states import summarise_states
 from priors.lstm_gmm.network import PAPER, LstmGmmConfig
 from priors.training.recipes import lstm_gmm
-from priors.training.recipes.lstm_gmm import DensityRecipe, DensityTrainer, TrainingSettings, compute_feature_statistics
+from priors.training.recipes.lstm_gmm import (
+    DensityRecipe,
+    DensityTrainer,
+    TrainingSettings,
+    compute_feature_statistics,
+    summarise_states,
+)
 from priors.training.run import train
 
 TINY = LstmGmmConfig(width=8, components=2)

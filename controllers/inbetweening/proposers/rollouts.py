@@ -29,8 +29,7 @@ from mapctl.numerics.smooth_offsets import interpolate_offsets
 from mapctl.pose import decode
 from mapctl.problem import density_selection
 from mapctl.problem.receding_horizon import CommittedFrames, RecedingHorizonSolver, replay
-from mapctl.problem.warm_start import SteeringKnots, SwarmProposal, keep_warm_start
-from mapctl.problem.window_solvers import LatentNoiseSolver, SolvedWindow
+from mapctl.problem.window_solvers import LatentNoiseSolver, SolvedWindow, SteeringKnots, SwarmProposal, keep_warm_start
 from mapctl.protocols import Density, DensityState, Inbetweener
 from mapctl.skeleton import CANONICAL, TOE_JOINTS, TOES
 from mapctl.solver.budget import Budget

@@ -17,7 +17,7 @@ from mapctl.commands.shared.options import ProposalOptions
 from mapctl.commands.shared.outputs import add_licence
 from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.errors import RequestError
-from mapctl.metrics.comparison import make_comparable
+from mapctl.metrics import make_comparable
 from mapctl.motion import Motion
 from mapctl.motion_dna import MotionDna
 from mapctl.problem.solution import Solution

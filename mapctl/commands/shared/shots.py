@@ -13,9 +13,8 @@ from torch import Tensor
 
 from controllers.common.character import Character
 from controllers.following.follow import FollowSettings, follow
-from controllers.shots.keys.posing import MetPose
+from controllers.shots.posing import MetPose, build_rest_pose
 from controllers.shots.request import Arrival, Lead, Look, Others, PoseKey, Reach, ShotRequest
-from controllers.shots.rest_pose import build_rest_pose
 from controllers.shots.shot import ShotSettings, ShotSolution, solve_shot
 from controllers.shots.way import APART_MARGIN, Way, plan_way
 from mapctl import kinematics, report

@@ -30,7 +30,6 @@ from mapctl import rotations
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, ground_speed, integrate_root, mirror_features
 from mapctl.metrics import compute_reference
-from mapctl.metrics.states import summarise_states
 from mapctl.pose import decode
 from mapctl.problem import density_selection
 from mapctl.protocols import DataLimits, InitialStates
@@ -59,6 +58,16 @@ from priors.training.recipe import (
     use_device,
 )
 from priors.training.windows import FeatureWindows
+
+
+def summarise_states(features: Float[Tensor, "frames size"]) -> dict[str, float]:
+    """Summarise mean speed (m/s), mean root height (m) and mean standard deviation of the joint rotations (rad)."""
+    return {
+        "speed": float(ground_speed(features).mean()),
+        "height": float(LAYOUT.pick(features, "root_height").mean()),
+        "pose": float(LAYOUT.pick(features, "joint_rotations").std(0).mean()),
+    }
+
 
 _SECOND = PRIOR_FPS  # frames
 _WARM_UP_FRAMES = 40  # frames of a clip before a start; the memory has settled by then

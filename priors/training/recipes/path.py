@@ -11,8 +11,12 @@ from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits as cross_entropy
 
 from mapctl.inbetweening.partial_motion import PartialMotion
-from mapctl.inbetweening.root_trajectory import LocalMotion
-from mapctl.metrics.root_prediction import SPANS, average_displacement_errors, compute_displacement_errors
+from mapctl.inbetweening.root_trajectory import (
+    SPANS,
+    LocalMotion,
+    average_displacement_errors,
+    compute_displacement_errors,
+)
 from priors.checkpoints import require_at_least
 from priors.training.augmentation.pose_windows import PoseVariation, PoseWindows, Variation, find_kind
 from priors.training.corpus import Corpus

@@ -14,8 +14,7 @@ from torch.nn.functional import binary_cross_entropy_with_logits as cross_entrop
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, integrate_root
 from mapctl.metrics import measure
-from mapctl.metrics.realism import RealismSettings, canonical_positions, cut_windows
-from mapctl.metrics.realism.classifier import compute_held_out_accuracy
+from mapctl.metrics.realism import RealismSettings, canonical_positions, compute_held_out_accuracy, cut_windows
 from mapctl.pose import decode
 from priors import checkpoints
 from priors.checkpoints import require_at_least

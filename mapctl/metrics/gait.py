@@ -1,11 +1,15 @@
-"""Range of gait in a set of clips: step length, speed and turning of pieces of one length."""
+"""Paces, and changes of pace: starts, stops, and changes between a walk and a run, by the hips' smoothed speed."""
 
 from collections.abc import Sequence
+from dataclasses import astuple, dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray
+from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
 from mapctl import contacts
@@ -15,6 +19,99 @@ from mapctl.metrics import body
 from mapctl.motion import Motion
 from mapctl.numerics.gaussian import low_pass
 from mapctl.rotations import unwrap_angle
+
+_SMOOTH_SECONDS = 0.2  # standard deviation of a Gaussian over which sway within a stride is averaged out
+STANDS, GOES = 0.2, 0.6
+"""Speeds between which a start or a stop leads, m/s."""
+WALKS, RUNS = 1.7, 2.1
+"""Speeds between which a change of gait leads, m/s."""
+
+PACES = "stand", "walk", "run"
+"""Paces from slow to fast; who goes and does not run walks."""
+CHANGES = {
+    ("stand", "walk"): "starts",
+    ("walk", "stand"): "stops",
+    ("walk", "run"): "changes to a run",
+    ("run", "walk"): "changes to a walk",
+}
+"""Names of the changes from one pace to the next, by both, in the order of the fields of PaceChanges."""
+
+
+@dataclass(frozen=True)
+class PaceChanges:
+    """How often the pace of one motion changes."""
+
+    starts: int = 0
+    """From under 0.2 to over 0.6 m/s."""
+    stops: int = 0
+    """From over 0.6 to under 0.2 m/s."""
+    to_run: int = 0
+    """From under 1.7 to over 2.1 m/s."""
+    to_walk: int = 0
+    """From over 2.1 to under 1.7 m/s."""
+
+    def __add__(self, other: "PaceChanges") -> "PaceChanges":
+        return PaceChanges(*(one + another for one, another in zip(astuple(self), astuple(other), strict=True)))
+
+    def by_name(self) -> dict[str, int]:
+        """Return how often each of CHANGES happens, by its name."""
+        return dict(zip(CHANGES.values(), astuple(self), strict=True))
+
+
+def label_pace(pace: str) -> str:
+    """Return the label of a pace, `pace=walk`, for a density that is conditioned on it."""
+    return f"pace={pace}"
+
+
+def compute_ground_velocity(ground: Float[ndarray, "frames 2"], fps: float) -> Float[ndarray, "frames 2"]:
+    """Compute the velocity of the hips over the ground, m/s, from their x and z in metres, without the sway within a
+    stride; of at least two frames."""
+    # Velocities are smoothed rather than places: who runs at a clip's end does not stay there.
+    velocity = np.gradient(ground, 1 / fps, axis=0)
+    return gaussian_filter1d(velocity, _SMOOTH_SECONDS * fps, axis=0, mode="nearest")
+
+
+def measure_speed(ground: Float[ndarray, "frames 2"], fps: float) -> Float[ndarray, " frames"]:
+    """Measure the speed of the hips over the ground, m/s, from their x and z in metres, without the sway within a
+    stride; 0 for a single frame."""
+    return np.linalg.norm(compute_ground_velocity(ground, fps), axis=1) if len(ground) > 1 else np.zeros(len(ground))
+
+
+def count_pace_changes(speed: Float[ndarray, " frames"]) -> PaceChanges:
+    """Count the changes along a motion's smoothed speed, m/s. Who hesitates without passing both bounds changes
+    nothing."""
+    goes, runs = (_follow(speed, *bounds) for bounds in ((STANDS, GOES), (WALKS, RUNS)))
+    return PaceChanges(_count_rises(goes), _count_rises(~goes), _count_rises(runs), _count_rises(~runs))
+
+
+def follow_pace(speed: Float[ndarray, " frames"]) -> Int[ndarray, " frames"]:
+    """Follow the pace along a motion's smoothed speed, m/s: the index in PACES of each frame.
+
+    A pace lasts until the other bound of a change is passed, so that `count_pace_changes` counts the changes of it;
+    before the first bound that is passed, it is the one that this bound tells.
+    """
+    goes, runs = (_follow(speed, *bounds) for bounds in ((STANDS, GOES), (WALKS, RUNS)))
+    return np.where(runs, 2, goes.astype(int))
+
+
+def find_pace(speed: float) -> str:
+    """Find the pace of a mean speed, m/s, halfway between the bounds of changes."""
+    return PACES[(speed > (STANDS + GOES) / 2) + (speed > (WALKS + RUNS) / 2)]
+
+
+def _follow(speed: Float[ndarray, " frames"], low: float, high: float) -> Bool[ndarray, " frames"]:
+    """Whether it was over `high` since it was last under `low`. Before either, the first of them tells; between both
+    all along, the mean."""
+    passed = np.flatnonzero((speed < low) | (speed > high))
+    if len(passed) == 0:
+        return np.full(len(speed), len(speed) > 0 and float(np.mean(speed)) > (low + high) / 2)
+    last = np.searchsorted(passed, np.arange(len(speed)), side="right") - 1
+    return (speed > high)[passed[np.maximum(last, 0)]]
+
+
+def _count_rises(fast: Bool[ndarray, " frames"]) -> int:
+    return int(np.count_nonzero(~fast[:-1] & fast[1:]))
+
 
 PIECE_SECONDS = 3.0
 """Length of the pieces: long averages vary less than short ones, so sets are compared in pieces of one length."""

@@ -8,17 +8,18 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from controllers.inbetweening.pipeline import fill
-from controllers.shots.request import Look, PoseKey, Reach
-from controllers.shots.transitions import Filling, choose_filling
+from controllers.shots.request import Filling, Look, PoseKey, Reach, choose_filling
 from controllers.shots.way import Way
 from mapctl import kinematics, rotations
-from mapctl.features import PRIOR_FPS
+from mapctl.features import PRIOR_FPS, GroundPose
 from mapctl.inbetweening.missing import MissingMask
+from mapctl.inbetweening.partial_motion import mirror_quats
 from mapctl.kinematics.head_turning import measure_look_angle, turn_head
 from mapctl.motion import Motion
 from mapctl.numerics.intervals import widen
-from mapctl.protocols import Inbetweener
-from mapctl.skeleton import CANONICAL
+from mapctl.pose import decode
+from mapctl.protocols import Density, Inbetweener
+from mapctl.skeleton import CANONICAL, TOES, Skeleton
 
 _WIDTHS = (10, 16, 24, 36)  # frames on either side of a key that are tried
 _MOST_WIDTH = 75
@@ -268,3 +269,28 @@ def _ease(frames: int, look: Look) -> Float[Tensor, " frames"]:
     before = (look.seconds - seconds).clamp_min(0) + (seconds - look.seconds - look.hold_seconds).clamp_min(0)
     share = (1 - before / _EASE_SECONDS).clamp_min(0)
     return share * share * (3 - 2 * share)
+
+
+_BEND_DEG = {"UpperLeg": -5.0, "LowerLeg": 10.0, "Foot": -5.0, "Toes": 0.0}
+"""Bends of a leg that stands at ease, degrees about the lateral axis; the foot stays flat."""
+_SPREAD_DEG = 3.0  # of each thigh sideways, undone at the foot
+
+
+def build_rest_pose(density: Density, skeleton: Skeleton, toe_height: float) -> Motion:
+    """Build one frame that stands at the origin and faces +Z, toes at `toe_height` metres.
+
+    The trunk and the arms are the mean, over both sides, of the density's initial states: people who walk carry their
+    arms much as they do when they stand.
+    """
+    states = decode(density.initial_states.state.last_frame, GroundPose.origin(), skeleton=skeleton)
+    quats = states.local_quat_xyzw.double()
+    mean = rotations.average(torch.cat([quats, mirror_quats(quats)]))
+    for side, outwards in (("left", 1.0), ("right", -1.0)):
+        for part, bend in _BEND_DEG.items():
+            spread = outwards * {"UpperLeg": _SPREAD_DEG, "Foot": -_SPREAD_DEG}.get(part, 0.0)
+            angles = torch.deg2rad(torch.tensor([bend, 0.0, spread], dtype=torch.float64))
+            mean[CANONICAL.index(side + part)] = rotations.from_rotation_vector(angles)
+    mean[0] = mean.new_tensor([0.0, 0.0, 0.0, 1.0])
+    pose = replace(states.slice(0, 1), root_position=torch.zeros(1, 3, dtype=torch.float64), local_quat_xyzw=mean[None])
+    toes = pose.joint_positions()[0, list(skeleton.indices(TOES)), 1]
+    return replace(pose, root_position=mean.new_tensor([[0.0, toe_height - float(toes.mean()), 0.0]]))

@@ -1,0 +1,450 @@
+"""Realism without users: can a network tell made motion from mocap, and how far apart are they?
+
+Every number comes with its floor: what mocap shows against mocap.
+
+Frechet distance between two sets of windows: of the Gaussians that fit their principal components.
+
+As the Frechet inception distance (Heusel et al. 2017, section 2), on standardised joint positions and velocities
+instead of a network's features.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import scipy
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from mapctl import retarget, rotations
+from mapctl.errors import RequestError
+from mapctl.features import PRIOR_FPS
+from mapctl.metrics import body
+from mapctl.metrics.gait import GaitSpread, measure_gait_spread
+from mapctl.motion import Motion
+from mapctl.runtime.progress import Progress
+from mapctl.skeleton import CANONICAL
+
+
+@dataclass(frozen=True, eq=False)
+class Basis:
+    """Principal components of a reference set of windows; both sets of a distance are projected on one basis."""
+
+    mean: Float[Tensor, "features"]
+    """Mean of each feature, m or m/s."""
+    std: Float[Tensor, "features"]
+    """Standard deviation of each feature, m or m/s."""
+    axes: Float[Tensor, "features dims"]
+    """Orthonormal axes, in units of the standard deviations."""
+
+    @staticmethod
+    def of(windows: Float[Tensor, "windows frames channels"], dims: int) -> "Basis":
+        """Fit the first `dims` components; fewer where there are fewer windows."""
+        flat = windows.flatten(1)
+        mean, std = flat.mean(0), flat.std(0, correction=0).clamp_min(_LEAST_STD)
+        return Basis(mean, std, _principal_axes((flat - mean) / std, min(dims, *flat.shape)))
+
+    def project(self, windows: Float[Tensor, "windows frames channels"]) -> Float[Tensor, "windows dims"]:
+        """Project windows to coordinates, float64."""
+        return (((windows.flatten(1) - self.mean) / self.std) @ self.axes).double()
+
+
+def _principal_axes(centred: Float[Tensor, "windows features"], dims: int) -> Float[Tensor, "features dims"]:
+    """Return principal axes by the smaller of the two Gram matrices: seconds for a clip's worth or a thousand."""
+    few = len(centred) < centred.shape[1]
+    gram = (centred @ centred.T if few else centred.T @ centred).double().numpy()
+    largest = [len(gram) - dims, len(gram) - 1]
+    vectors = torch.from_numpy(scipy.linalg.eigh(gram, subset_by_index=largest)[1]).to(centred.dtype)
+    return torch.nn.functional.normalize(centred.T @ vectors if few else vectors, dim=0)
+
+
+def frechet_distance(points: Float[Tensor, "points dims"], reference: Float[Tensor, "others dims"]) -> float:
+    """Return |m1 - m2|^2 + tr(C1 + C2 - 2 (C1 C2)^(1/2)) of the points' means and covariances; each set needs two
+    points.
+
+    With triangles C = R^T R the root's trace is the sum of the singular values of R1 R2^T, so no matrix root is taken
+    and singular covariances (fewer points than dimensions) do no harm.
+    """
+    first, second = _covariance_triangle(points), _covariance_triangle(reference)
+    apart = (points.mean(0) - reference.mean(0)).square().sum()
+    return float(
+        apart + first.square().sum() + second.square().sum() - 2 * torch.linalg.svdvals(first @ second.T).sum()
+    )
+
+
+def _covariance_triangle(points: Float[Tensor, "points dims"]) -> Float[Tensor, "rows dims"]:
+    """Return R with R^T R the covariance."""
+    return torch.linalg.qr(points - points.mean(0), mode="r").R / (len(points) - 1) ** 0.5
+
+
+HIPS = CANONICAL.index("hips")
+_UPPER_LEGS = CANONICAL.index("leftUpperLeg"), CANONICAL.index("rightUpperLeg")
+
+
+@dataclass(frozen=True)
+class WindowSettings:
+    """Settings of the windows that clips are cut into."""
+
+    frames: int = 30
+    """Frames a window, at 30 a second; one more is needed before it for the velocities."""
+    step: int = 10
+    """Stride from one window to the next, frames."""
+
+    def __post_init__(self):
+        for name in ("frames", "step"):
+            if getattr(self, name) < 1:
+                raise RequestError(f"{name} of a window must be at least 1, got {getattr(self, name)}")
+
+
+def canonical_positions(motion: Motion) -> Float[Tensor, "frames joints 3"]:
+    """Return the world positions (metres) of the canonical joints at 30 frames a second; RequestError for rigs not
+    known."""
+    return retarget.to_canonical(motion)[0].resample(PRIOR_FPS).joint_positions()
+
+
+def facing_angle(positions: Float[Tensor, "frames joints 3"]) -> Float[Tensor, "frames"]:
+    """Return the facing of canonical joints, radians, from positions alone, so that every rig has the same."""
+    left, right = _UPPER_LEGS
+    return body.facing(positions[:, left], positions[:, right])
+
+
+def transform_to_ground_frame(
+    positions: Float[Tensor, "*batch frames joints 3"],
+    ground_xz: Float[Tensor, "*batch #frames 2"],
+    angle: Float[Tensor, "*batch #frames"],
+) -> Float[Tensor, "*batch frames joints 3"]:
+    """Transform world positions into frames on the ground that face by `angle` radians; height stays."""
+    return rotations.rotate_about_y(positions - rotations.lift_ground(ground_xz).unsqueeze(-2), -angle.unsqueeze(-1))
+
+
+def cut_windows(
+    positions: Float[Tensor, "clip_frames joints 3"], settings: WindowSettings = WindowSettings()
+) -> Float[Tensor, "windows frames channels"]:
+    """Cut one clip into windows, float32: joint positions (m), then velocities (m/s) from the frame before each.
+
+    `positions` are those of `canonical_positions`. A window is relative to the hips' ground projection and facing in
+    the frame before its first. RequestError for a clip shorter than one window.
+    """
+    frames, ground, angle = find_window_frames(positions, settings)
+    relative = transform_to_ground_frame(positions[frames], ground, angle)
+    velocity = relative.diff(dim=1) * PRIOR_FPS
+    return torch.cat([relative[:, 1:].flatten(2), velocity.flatten(2)], dim=-1).float()
+
+
+def find_window_frames(
+    positions: Float[Tensor, "clip_frames joints 3"], settings: WindowSettings
+) -> tuple[Int[Tensor, "windows frames_and_one"], Float[Tensor, "windows 1 2"], Float[Tensor, "windows 1"]]:
+    """Find the frames of each window of a clip, the one before it first, with the hips' ground projection (m) and
+    facing (radians) in that one. RequestError for a clip shorter than one window."""
+    needed = settings.frames + 1
+    if len(positions) < needed:
+        raise RequestError(f"{len(positions)} frames at {PRIOR_FPS} fps; a window needs at least {needed}")
+    starts = torch.arange(0, len(positions) - settings.frames, settings.step)
+    ground, angle = positions[starts, HIPS, ::2], facing_angle(positions)[starts]
+    return starts[:, None] + torch.arange(needed), ground.unsqueeze(1), angle.unsqueeze(1)
+
+
+_CM = 100.0
+
+
+class Diversity(NamedTuple):
+    """Average pairwise distance of samples."""
+
+    world_cm: float
+    """Distance between the joints in the world, centimetres: of trajectories and poses."""
+    root_aligned_cm: float
+    """Distance between the joints relative to the hips and facing of each frame, centimetres: of poses and timing."""
+
+
+def measure_diversity(samples: Sequence[Motion]) -> Diversity:
+    """Measure diversity of several samples from one start (any known rig); RequestError for fewer than two, or other
+    lengths."""
+    lengths = sorted({sample.num_frames / sample.fps for sample in samples})
+    if len(samples) < 2 or len(lengths) > 1:
+        shown = " and ".join(f"{float(length):.4g}" for length in lengths)
+        raise RequestError(f"diversity needs at least 2 samples of one length, got {len(samples)} of {shown} s")
+    return measure_position_diversity(torch.stack([canonical_positions(sample) for sample in samples]))
+
+
+def measure_position_diversity(positions: Float[Tensor, "samples frames joints 3"]) -> Diversity:
+    """Measure diversity from world positions of the canonical joints, metres."""
+    aligned = torch.stack([_align_to_root(sample) for sample in positions])
+    return Diversity(average_pairwise_distance(positions) * _CM, average_pairwise_distance(aligned) * _CM)
+
+
+def align_to_start(positions: Float[Tensor, "frames joints 3"]) -> Float[Tensor, "frames joints 3"]:
+    """Move a clip to begin at the origin facing +Z, to compare clips that did not begin at one position."""
+    return transform_to_ground_frame(positions, positions[:1, HIPS, ::2], facing_angle(positions)[:1])
+
+
+def average_pairwise_distance(positions: Float[Tensor, "samples frames joints 3"]) -> float:
+    """Return the mean over pairs of samples, frames and joints of the distance between joints, in the unit of
+    `positions`."""
+    samples, frames, joints, _ = positions.shape
+    # frame by frame, for the distances of a thousand samples at once would need gigabytes
+    total = sum(float(torch.cdist(at, at).sum()) for at in positions.permute(1, 2, 0, 3))
+    return total / (samples * (samples - 1) * frames * joints)
+
+
+def _align_to_root(positions: Float[Tensor, "frames joints 3"]) -> Float[Tensor, "frames joints 3"]:
+    relative = transform_to_ground_frame(positions, positions[:, HIPS, ::2], facing_angle(positions))
+    return relative - relative[:, HIPS : HIPS + 1]
+
+
+_LEAST_STD = 1e-3
+"""Floor of a standard deviation, m or m/s, so that joints that hardly move do not decide."""
+
+
+@dataclass(frozen=True)
+class ClassifierSettings:
+    """Settings of the network and its training: about 10 s an accuracy on one core at 90 clips."""
+
+    folds: int = 4
+    """Number of parts of the clips; each is held out once while a network learns on the others."""
+    steps: int = 400
+    """Number of optimiser steps of each network, so that large sets cost no more than small ones. More make a stricter
+    judge."""
+    batch: int = 64
+    """Number of windows a step, half from each set."""
+    width: int = 48
+    """Number of channels of each convolution."""
+    dropout: float = 0.3
+    """Share of activations that are dropped in training."""
+    learning_rate: float = 1e-3
+    """Learning rate of AdamW, a number without unit."""
+    weight_decay: float = 1e-2
+    """Weight decay of AdamW, a number without unit."""
+
+    def __post_init__(self):
+        for name, least in (("folds", 2), ("steps", 1), ("batch", 2), ("width", 1)):
+            if getattr(self, name) < least:
+                raise RequestError(f"{name} must be at least {least}, got {getattr(self, name)}")
+
+
+def compute_held_out_accuracy(
+    first: Sequence[Float[Tensor, "_ frames channels"]],
+    second: Sequence[Float[Tensor, "_ frames channels"]],
+    *,
+    generator: torch.Generator,
+    settings: ClassifierSettings = ClassifierSettings(),
+    tick: Callable[[], None] = lambda: None,
+) -> float:
+    """Compute the balanced accuracy, 0 to 1, of networks on clips that their training did not see, mean over folds.
+
+    Each set is a list of clips' windows. Folds are by clip, for windows of one clip overlap; `tick` is called after
+    each. The same generator state gives the same bits; torch's global generator and thread count are left as they were.
+    RequestError for sets of fewer clips than folds.
+    """
+    if min(len(first), len(second)) < settings.folds:
+        raise RequestError(f"{settings.folds} folds need as many clips in each set, got {len(first)} and {len(second)}")
+    sets = [(clips, torch.randperm(len(clips), generator=generator).tolist()) for clips in (first, second)]
+    total = 0.0
+    for fold in range(settings.folds):
+        others = [k for k in range(settings.folds) if k != fold]
+        training = [torch.cat([clips[i] for k in others for i in order[k :: settings.folds]]) for clips, order in sets]
+        held_out = [torch.cat([clips[i] for i in order[fold :: settings.folds]]) for clips, order in sets]
+        with _isolate_torch(generator):
+            network = _train_network(training, settings)
+            total += balanced_accuracy(*(score(network, windows) for windows in held_out))
+        tick()
+    return total / settings.folds
+
+
+@contextmanager
+def _isolate_torch(generator: torch.Generator) -> Iterator[None]:
+    """Seed torch's global generator from ours (weights and dropout draw from it) and use one thread, within."""
+    threads = torch.get_num_threads()
+    seed = int(torch.randint(2**62, (1,), generator=generator))
+    with torch.random.fork_rng(devices=[]):
+        torch.default_generator.manual_seed(seed)
+        torch.set_num_threads(1)
+        try:
+            yield
+        finally:
+            torch.set_num_threads(threads)
+
+
+class _Standardise(nn.Module):
+    """Channels to zero mean and unit deviation, and to the front, where convolutions want them."""
+
+    def __init__(self, windows: Float[Tensor, "windows frames channels"]):
+        super().__init__()
+        self.mean, self.std = windows.mean((0, 1)), windows.std((0, 1), correction=0).clamp_min(_LEAST_STD)
+
+    def forward(self, windows: Float[Tensor, "batch frames channels"]) -> Float[Tensor, "batch channels frames"]:
+        return ((windows - self.mean) / self.std).transpose(1, 2)
+
+
+def _build_network(windows: Float[Tensor, "windows frames channels"], settings: ClassifierSettings) -> nn.Module:
+    """Build three convolutions over time, the mean over the remaining frames, and one logit: positive for the first
+    set."""
+    layers: list[nn.Module] = [_Standardise(windows)]
+    channels = windows.shape[-1]
+    for stride in (1, 2, 2):
+        layers += [nn.Conv1d(channels, settings.width, 5, stride, padding=2), nn.LeakyReLU(0.2)]
+        layers.append(nn.Dropout(settings.dropout))
+        channels = settings.width
+    return nn.Sequential(*layers, nn.AdaptiveAvgPool1d(1), nn.Flatten(), nn.Linear(channels, 1), nn.Flatten(0))
+
+
+def _train_network(sets: Sequence[Float[Tensor, "_ frames channels"]], settings: ClassifierSettings) -> nn.Module:
+    network = _build_network(torch.cat(list(sets)), settings)
+    optimiser = torch.optim.AdamW(network.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay)
+    half = settings.batch // 2
+    target = torch.cat([torch.ones(half), torch.zeros(half)])
+    for _ in range(settings.steps):
+        batch = torch.cat([windows[torch.randint(len(windows), (half,))] for windows in sets])
+        loss = nn.functional.binary_cross_entropy_with_logits(network(batch), target)
+        optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        optimiser.step()
+    return network.eval()
+
+
+@torch.no_grad()
+def score(network: nn.Module, windows: Float[Tensor, "windows frames channels"]) -> Float[Tensor, " windows"]:
+    """Return the logits of windows, positive for the first set, a few hundred windows at a time."""
+    return torch.cat([network(part) for part in windows.split(512)])
+
+
+def balanced_accuracy(first: Float[Tensor, " first"], second: Float[Tensor, " second"]) -> float:
+    """Return the mean over both sets of the share of windows whose logit names their own set."""
+    return (float((first > 0).double().mean()) + 1 - float((second > 0).double().mean())) / 2
+
+
+__all__ = [
+    "ClassifierSettings",
+    "Diversity",
+    "GaitSpread",
+    "Realism",
+    "RealismSettings",
+    "WindowSettings",
+    "average_pairwise_distance",
+    "canonical_positions",
+    "cut_windows",
+    "measure_diversity",
+    "measure_gait_spread",
+    "measure_realism",
+    "measure_window_realism",
+]
+
+
+@dataclass(frozen=True)
+class RealismSettings:
+    """Settings of a realism measurement."""
+
+    windows: WindowSettings = field(default_factory=WindowSettings)
+    """Settings of the windows that clips are cut into."""
+    classifier: ClassifierSettings = field(default_factory=ClassifierSettings)
+    """Settings of the network that tells the sets apart."""
+    dims: int = 32
+    """Number of principal components of mocap's windows in which the Frechet distance is taken."""
+
+    def __post_init__(self):
+        if self.dims < 1:
+            raise RequestError(f"dims must be at least 1, got {self.dims}")
+
+    @property
+    def min_clips(self) -> int:
+        """Number of clips that each set needs, so that half of the mocap still has one for every fold."""
+        return 2 * self.classifier.folds
+
+
+@dataclass(frozen=True)
+class Realism:
+    """How made motion compares with mocap."""
+
+    accuracy: float
+    """Balanced held-out accuracy of the network, made against mocap, a share: 0.5 is perfect, 1 is told apart every
+    time."""
+    floor_accuracy: float
+    """Balanced held-out accuracy of the network, one half of the mocap's clips against the other, a share likewise."""
+    frechet: float
+    """Frechet distance of made windows to mocap's, no unit: coordinates are in mocap's standard deviations."""
+    floor_frechet: float
+    """Frechet distance between the halves, in the same coordinates without unit; halves are smaller sets, which adds to
+    it."""
+    made_windows: int
+    """Number of windows of the made clips."""
+    mocap_windows: int
+    """Number of windows of the mocap clips."""
+
+
+def measure_realism(
+    made: Sequence[Motion],
+    mocap: Sequence[Motion],
+    *,
+    generator: torch.Generator,
+    settings: RealismSettings = RealismSettings(),
+    progress: Progress | None = None,
+) -> Realism:
+    """Compare made clips with mocap, both of any known rig and frame rate; half a minute on one core.
+
+    The floor's halves are every other clip of one shuffle that the generator draws: neither style nor length is
+    balanced between them, so a small set's floor scatters around 0.5 from seed to seed. It does not depend on `made`.
+    Sets should hold the same kinds of motion, or the network learns to tell the kinds apart. RequestError for fewer
+    than 8 clips in a set, clips shorter than a window (31 frames at 30 fps), and rigs that are not known.
+    """
+    _check_counts(len(made), len(mocap), settings)
+    sets = [_cut_clips(clips, name, settings.windows) for name, clips in (("made", made), ("mocap", mocap))]
+    return measure_window_realism(*sets, generator=generator, settings=settings, progress=progress)
+
+
+def measure_window_realism(
+    made: Sequence[Tensor],
+    mocap: Sequence[Tensor],
+    *,
+    generator: torch.Generator,
+    settings: RealismSettings = RealismSettings(),
+    progress: Progress | None = None,
+) -> Realism:
+    """Measure realism from `cut_windows` of each clip, (windows, frames, channels); RequestError for too few clips."""
+    _check_counts(len(made), len(mocap), settings)
+    seeds = torch.randint(2**62, (2,), generator=generator).tolist()
+    shuffled, ours = (torch.Generator().manual_seed(seed) for seed in seeds)
+    order = torch.randperm(len(mocap), generator=shuffled).tolist()
+    halves = [[mocap[i] for i in half] for half in (order[::2], order[1::2])]
+    tick = _make_tick(progress, 2 * settings.classifier.folds)
+    floor, accuracy = (
+        compute_held_out_accuracy(*sets, generator=drawn, settings=settings.classifier, tick=tick)
+        for sets, drawn in ((halves, shuffled), ((made, mocap), ours))
+    )
+    basis = Basis.of(torch.cat(list(mocap)), settings.dims)
+    points = [basis.project(torch.cat(list(clips))) for clips in (made, mocap, *halves)]
+    return Realism(
+        accuracy,
+        floor,
+        frechet_distance(points[0], points[1]),
+        frechet_distance(points[2], points[3]),
+        made_windows=len(points[0]),
+        mocap_windows=len(points[1]),
+    )
+
+
+def _check_counts(made: int, mocap: int, settings: RealismSettings) -> None:
+    if min(made, mocap) < settings.min_clips:
+        raise RequestError(
+            f"realism needs at least {settings.min_clips} clips of each, made and mocap; got {made} and {mocap}"
+        )
+
+
+def _cut_clips(clips: Sequence[Motion], name: str, settings: WindowSettings) -> list[Tensor]:
+    windows = []
+    for number, clip in enumerate(clips, start=1):
+        try:
+            windows.append(cut_windows(canonical_positions(clip), settings))
+        except RequestError as error:
+            raise RequestError(f"{name} clip {number} of {len(clips)}: {error}") from error
+    return windows
+
+
+def _make_tick(progress: Progress | None, total: int) -> Callable[[], None]:
+    done = iter(range(1, total + 1))
+
+    def tick() -> None:
+        if progress is not None:
+            progress(next(done), total)
+
+    return tick

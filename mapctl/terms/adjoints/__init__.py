@@ -1,1 +1,0 @@
-"""Hand-written gradients of the terms that following and steering use, on the quantities of a trial."""
