@@ -13,7 +13,7 @@ from mapctl.errors import RequestError
 if TYPE_CHECKING:
     from scenes import film as film
     from scenes.cameras import CameraSettings as CameraSettings
-    from scenes.renderers.select import back_end as back_end
+    from scenes.renderers import back_end as back_end
     from scenes.scene_file import Actor as Actor
     from scenes.scene_file import SceneDescription as SceneDescription
     from scenes.scene_file import load as load
@@ -27,7 +27,7 @@ _HOMES = {
     "load": "scenes.scene_file",
     "film": "scenes.film",
     "Shot": "scenes.stage",
-    "back_end": "scenes.renderers.select",
+    "back_end": "scenes.renderers",
 }
 
 

@@ -8,14 +8,14 @@ from os import PathLike, fspath
 
 from mapctl import formats
 from mapctl.errors import RequestError
+from mapctl.mesh.body import SkinnedBody
 from mapctl.mesh.character_mesh import CharacterMesh
 from mapctl.mesh.mannequin import Mannequin
 from mapctl.mesh.primitives import Array
-from mapctl.mesh.skinned_body import SkinnedBody
 from mapctl.motion import Motion
 from mapctl.retarget import as_rig, from_canonical, put_upright, to_canonical
 from mapctl.retarget.carry import RiggedCharacter, retarget_canonical
-from mapctl.retarget.figure import load_standing_character
+from mapctl.retarget.character import load_standing_character
 
 _SAME_BONE = 1e-4  # metres by which bones of one character may differ between files, which round
 

@@ -22,9 +22,7 @@ from mapctl.mesh.primitives import Array, Surface
 from mapctl.motion import Motion
 from mapctl.retarget.rigs import Rig
 from scenes.cameras import CameraSettings
-from scenes.content import Painter
-from scenes.renderers import STICK_FIGURES
-from scenes.renderers.select import RendererName, select_painter
+from scenes.renderers import STICK_FIGURES, Painter, RendererName, select_painter
 from scenes.stage import Shot, Stage
 
 Write = Callable[[Array], None]
@@ -285,8 +283,8 @@ def film(
     be left out. Where stick figures are drawn a character is one of them, and a line is logged that says so. `out` is a
     path or several, each ending in .mp4, .gif, .webp or .png (a contact sheet: ghosts along the trajectory over a row
     of stills). Each frame of the motions is one frame of the film unless `fps` resamples them. `size` is the width and
-    height in pixels (MP4 rounds up to even). `props` are what stands around (`scenes.props`). `progress` is called with
-    frames done and all frames. `renderer` is that of `scenes.renderers.select.select_painter`. RequestError for
+    height in pixels (MP4 rounds up to even). `props` are what stands around (`scenes.overlays`). `progress` is called
+    with frames done and all frames. `renderer` is that of `scenes.renderers.select_painter`. RequestError for
     endings, sizes and paths that cannot be.
     """
     paths = check_outputs([out] if isinstance(out, str | PathLike) else out, size)

@@ -20,8 +20,8 @@ from mapctl.mesh.primitives import Array, Surface, merge_surfaces
 from mapctl.motion import Motion
 from scenes import overlays
 from scenes.cameras import CameraSettings, View, compute_views
-from scenes.content import Content, Figure
 from scenes.drawn_character import DrawnMotion
+from scenes.renderers import Content, Figure
 
 _RIBBON_STEP = 0.06
 _LEAST_SECONDS = 0.3  # for which what is asked for at one moment is shown strongly

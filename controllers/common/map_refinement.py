@@ -15,8 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl import rotations
-from mapctl.contacts import debounced
-from mapctl.contacts.supports import compute_rest_log_probability, fit_supports
+from mapctl.contacts import compute_rest_log_probability, debounced, fit_supports
 from mapctl.features import LAYOUT, GroundPose
 from mapctl.inbetweening.effector_targets import EffectorTargets
 from mapctl.motion import Motion

@@ -30,7 +30,15 @@ from mapctl.pose import BodyPose
 from mapctl.problem.solution import Ledger, Outcome, Status
 from mapctl.protocols import Denoiser, Density, Inbetweener
 from mapctl.recording import Capture, CaptureProposal
-from mapctl.recording.inspection import NOISE_CM, Artefact, inspect_recording
+from mapctl.recording.fusion import (
+    angle_between,
+    blend_poses,
+    estimate_blend_weights,
+    estimate_geodesic_deviation,
+    extrapolate_linear,
+    linear_fit_weights,
+)
+from mapctl.recording.inspection import NOISE_CM, Artefact, exchange_swapped_limbs, inspect_recording
 from mapctl.recording.masks import (
     ROOT,
     Mask,
@@ -42,17 +50,8 @@ from mapctl.recording.masks import (
     write_back_masked,
 )
 from mapctl.recording.noise_estimation import estimate_angle_noise, estimate_position_noise
-from mapctl.recording.pose_mixing import (
-    angle_between,
-    blend_poses,
-    estimate_blend_weights,
-    estimate_geodesic_deviation,
-    extrapolate_linear,
-    linear_fit_weights,
-)
-from mapctl.recording.swap_detection import exchange_swapped_limbs
 from mapctl.retarget import RigMap, as_rig, from_canonical, to_canonical
-from mapctl.retarget.rig_poses import RigPoses
+from mapctl.retarget.anatomy import RigPoses
 from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import CANONICAL, LIMBS
 from mapctl.terms import Term

@@ -19,8 +19,8 @@ from mapctl.motion import Motion
 from mapctl.protocols import Density, Inbetweener
 from mapctl.retarget import from_canonical, to_canonical
 from mapctl.retarget.carry import RiggedCharacter, retarget_motion
+from mapctl.retarget.character import Stance
 from mapctl.retarget.rigs import Rig
-from mapctl.retarget.stance import Stance
 from mapctl.skeleton import CANONICAL, LIMBS, Limb
 from mapctl.terms import Term
 

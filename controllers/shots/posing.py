@@ -14,7 +14,7 @@ from mapctl import kinematics, rotations
 from mapctl.features import PRIOR_FPS, GroundPose
 from mapctl.inbetweening.missing import MissingMask
 from mapctl.inbetweening.partial_motion import mirror_quats
-from mapctl.kinematics.head_turning import measure_look_angle, turn_head
+from mapctl.kinematics.placing import measure_look_angle, turn_head
 from mapctl.motion import Motion
 from mapctl.numerics.intervals import widen
 from mapctl.pose import decode

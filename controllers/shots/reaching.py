@@ -17,7 +17,7 @@ from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening.effector_targets import EffectorTargets
 from mapctl.inbetweening.missing import MissingMask
 from mapctl.kinematics import inverse
-from mapctl.kinematics.arm_aims import bend_within, find_out, lead_about
+from mapctl.kinematics.inverse import bend_within, find_out, lead_about
 from mapctl.motion import Motion
 from mapctl.numerics.easing import smootherstep
 from mapctl.numerics.intervals import true_intervals, widen

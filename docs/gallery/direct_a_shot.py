@@ -13,7 +13,7 @@ from controllers.shots.shot import solve_shot
 from mapctl.curves.obstacles import Obstacle
 from scenes import CameraSettings, Shot
 from scenes.film import film
-from scenes.props import build_obstacle, build_target
+from scenes.overlays import build_obstacle, build_target
 from scenes.stage import Mark, Wishes
 
 ball, pillar = (0.4, 1.25, 1.6), Obstacle(place=(0.05, 3.3), radius=0.3)

@@ -15,7 +15,7 @@ import mapctl
 import priors
 from mapctl.retarget import load_rig
 from mapctl.retarget.carry import retarget_motion
-from mapctl.retarget.figure import make_tpose_clip
+from mapctl.retarget.character import make_tpose_clip
 from scenes import CameraSettings, Shot
 from scenes.drawn_character import DrawnCharacter
 from scenes.film import film

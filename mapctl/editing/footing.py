@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl import contacts
-from mapctl.contacts.supports import compute_rest_log_probability, fit_supports
+from mapctl.contacts import compute_rest_log_probability, fit_supports
 from mapctl.editing.rigged_motion import RiggedMotion, place_ankles
 from mapctl.editing.travel import GroundTransform, move_by_share, repeat_over_ground
 from mapctl.motion import Motion
@@ -48,7 +48,7 @@ def plant_feet(
 ) -> Motion:
     """Hold planted toes still and on the floor, on the motion's own rig at its own rate.
 
-    A toe is planted where it rests and carries the body (see `mapctl.contacts.supports`), noise smoothed away; then it
+    A toe is planted where it rests and carries the body (see `mapctl.contacts`), noise smoothed away; then it
     stays where it is on average during that contact, at the height of its support. Thighs and shins bring it there,
     feet keep their orientation, and hips go down where a leg is too short. All other local rotations stay to the bit.
     `cycle` is the travel of a loop, which stays one. `rig` wins over what would be recognised; RequestError where the

@@ -16,8 +16,8 @@ from mapctl import retarget, rotations
 from mapctl.motion import Motion
 from mapctl.numerics import gaussian
 from mapctl.retarget import RigMap
+from mapctl.retarget.character import SIDES
 from mapctl.retarget.rigs import Rig
-from mapctl.retarget.stance import SIDES
 from mapctl.skeleton import CANONICAL
 
 _SAME = 1e-12  # difference of rotations (xyzw) and lengths (metres) that rounding leaves

@@ -9,8 +9,8 @@ from mapctl.errors import MapctlError
 from mapctl.formats.character import CharacterSource, ending_family
 from mapctl.formats.parts import decode_srgb
 from mapctl.mesh.character_mesh import CharacterMesh
+from mapctl.mesh.mannequin import build_skin
 from mapctl.mesh.primitives import Array
-from mapctl.mesh.skinning import build_skin
 from mapctl.motion import Motion
 
 _FAMILIES = {".glb": "gltf", ".vrma": "gltf", ".usd": "usd", ".fbx": "fbx"}

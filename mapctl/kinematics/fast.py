@@ -16,6 +16,7 @@ from torch.autograd.function import once_differentiable
 
 from mapctl.features import LAYOUT, GroundPose
 from mapctl.kinematics import fast_kernels
+from mapctl.pose import BodyPose
 from mapctl.skeleton import FEET, Skeleton, find_heels
 
 
@@ -198,3 +199,18 @@ class _Body(torch.autograd.Function):
             features, _COLUMNS, bones, world, *map(_contiguous_array, pulled), gradient, ground, heading
         )
         return *map(torch.from_numpy, (gradient, ground, heading)), None
+
+
+def place_joints(
+    features: Float[Tensor, "batch frames size"],
+    root_xz_world: Float[Tensor, "batch frames 2"],
+    heading: Float[Tensor, "batch frames"],
+    skeleton: Skeleton,
+) -> Float[Tensor, "batch frames joints 3"]:
+    """Place the joints of features in the world, metres, over these points of the ground, facing these headings.
+
+    Features are of single precision; all tensors lie on one device.
+    """
+    if features.device.type == "cpu":
+        return compute_joints_and_heels(features, root_xz_world, heading, skeleton)[0]
+    return BodyPose.of_features_at(features, root_xz_world, heading).joints_world(skeleton)

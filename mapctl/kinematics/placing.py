@@ -9,6 +9,8 @@ from torch import Tensor
 
 from mapctl import rotations
 from mapctl.motion import Motion
+from mapctl.numerics.easing import smootherstep
+from mapctl.skeleton import CANONICAL
 
 
 def rotate_about_vertical(motion: Motion, angle: Float[Tensor, "*frames"] | float) -> Motion:
@@ -41,3 +43,42 @@ def bring_curve_points(
     found = points.clone()
     found[:, ground] = (points[:, ground] - pivot[ground]) @ turn + ground_xz.to(points)
     return found
+
+
+_NECK, _HEAD = CANONICAL.indices(("neck", "head"))
+_TURNS = ((_NECK, 0.45, math.radians(40.0)), (_HEAD, 1.0, math.radians(55.0)))
+"""Joints that turn, one after the other: the share of what is then left, and the most that each turns."""
+_LOSING, _LOST = math.radians(115.0), math.radians(150.0)
+"""Angles off the trunk's facing from which on a place is looked at less, and no more: who turned the head after what
+goes past behind the back would whip it from one shoulder to the other."""
+_FORWARD = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+
+
+def turn_head(motion: Motion, places: Float[Tensor, "#frames 3"], weight: Float[Tensor, " frames"]) -> Motion:
+    """Turn neck and head toward places in the world, metres, by a share `weight` (0 to 1) in each frame, and by 95
+    degrees at most; what is behind is not looked at."""
+    chest = CANONICAL.parents[_NECK]
+    behind = _find_turn(motion, chest, places).norm(dim=-1)
+    weight = weight * smootherstep(((_LOST - behind) / (_LOST - _LOSING)).clamp(0, 1)).to(weight)
+    for joint, share, most in _TURNS:
+        turn = _find_turn(motion, _HEAD, places)
+        angle = turn.norm(dim=-1, keepdim=True).clamp_min(1e-9)
+        turn = turn * (share * weight[:, None] * angle).clamp(max=most) / angle
+        quats = motion.local_quat_xyzw.clone()
+        above = motion.joint_rotations()[:, CANONICAL.parents[joint]]
+        world = rotations.multiply(rotations.from_rotation_vector(turn), motion.joint_rotations()[:, joint])
+        quats[:, joint] = rotations.multiply(rotations.inverse(above), world)
+        motion = replace(motion, local_quat_xyzw=quats)
+    return motion
+
+
+def measure_look_angle(motion: Motion, places: Float[Tensor, "#frames 3"]) -> Float[Tensor, " frames"]:
+    """Measure the angle between where the head faces and places in the world, radians."""
+    return _find_turn(motion, _HEAD, places).norm(dim=-1)
+
+
+def _find_turn(motion: Motion, joint: int, places: Float[Tensor, "#frames 3"]) -> Float[Tensor, "frames 3"]:
+    """Find the rotation vectors in the world that turn a joint's facing toward places, as the head sees them."""
+    facing = rotations.rotate(motion.joint_rotations()[:, joint], _FORWARD.expand(motion.num_frames, 3))
+    wanted = places.to(facing) - motion.joint_positions()[:, _HEAD]
+    return rotations.to_rotation_vector(rotations.between_vectors(facing, wanted))

@@ -10,9 +10,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl import contacts, rotations
-from mapctl.contacts.heels import derive_heel_contacts
+from mapctl.contacts import derive_heel_contacts
 from mapctl.motion import Motion
-from mapctl.retarget.stance import level_feet
+from mapctl.retarget.character import level_feet
 from mapctl.skeleton import FEET, TOES, find_heel_drops, find_heels
 
 SKATE_REACH = 0.025

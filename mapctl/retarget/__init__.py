@@ -18,10 +18,9 @@ from mapctl.errors import RequestError
 from mapctl.formats.character import CharacterSource
 from mapctl.formats.examples import is_example
 from mapctl.motion import Motion
-from mapctl.retarget.body_plan import goes_on_four_legs
+from mapctl.retarget.anatomy import RigPoses, goes_on_four_legs
 from mapctl.retarget.joint_matching import Match, correct_sides, match
 from mapctl.retarget.reference_pose import TPose, find_tpose, is_canonical_tpose, measure_bones, rest_rotations
-from mapctl.retarget.rig_poses import RigPoses
 from mapctl.retarget.rigs import Rig, find_preset, known_rigs, read_rig_toml
 from mapctl.skeleton import CANONICAL, Skeleton
 

@@ -6,16 +6,128 @@ so the result does not depend on how a file orients its joint axes, nor on what 
 """
 
 import math
-from collections.abc import Collection, Iterator, Mapping
+import re
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import product
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mapctl import rotations
-from mapctl.retarget.rig_poses import RigPoses, unit_vectors
-from mapctl.skeleton import CANONICAL
+from mapctl import kinematics, rotations
+from mapctl.motion import Motion
+from mapctl.skeleton import CANONICAL, Skeleton, mirror_name
+
+SAMPLES = 200
+"""Number of frames of a clip that are looked at, spread over it."""
+_POINTS_APART = 1e-3  # metres between two joints below which they are one
+
+JointOf = Sequence[int | None]
+"""For each canonical joint the rig's joint, or None."""
+
+
+@dataclass(frozen=True, eq=False)
+class RigPoses:
+    """Poses of one rig in its file's world: frames of a clip, or the single pose with all rotations zero."""
+
+    positions: Float[Tensor, "poses joints 3"]
+    """World positions, metres."""
+    orientations: Float[Tensor, "poses joints 4"]
+    """World rotations (xyzw)."""
+    skeleton: Skeleton
+    """Skeleton of the rig."""
+    joint_of: tuple[int | None, ...]
+    """Index of the rig's joint for each canonical joint, or None."""
+
+    @staticmethod
+    def zero(skeleton: Skeleton, joint_of: JointOf = range(CANONICAL.num_joints)) -> "RigPoses":
+        """Return the pose with all rotations zero; of canonical joints where none are named."""
+        still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).expand(1, skeleton.num_joints, 4)
+        root = torch.zeros(1, 3, dtype=torch.float64)
+        return RigPoses(
+            *kinematics.forward_kinematics(skeleton.offsets, skeleton.parents, root, still), skeleton, tuple(joint_of)
+        )
+
+    @staticmethod
+    def of(motion: Motion, joint_of: JointOf) -> "RigPoses":
+        """Sample up to SAMPLES frames of a clip, the first among them."""
+        picked = torch.linspace(0, motion.num_frames - 1, min(SAMPLES, motion.num_frames)).round().long()
+        return RigPoses(
+            motion.joint_positions()[picked], motion.joint_rotations()[picked], motion.skeleton, tuple(joint_of)
+        )
+
+    def has(self, *names: str) -> bool:
+        """Return whether the rig has all these canonical joints."""
+        return all(self.joint_of[CANONICAL.index(name)] is not None for name in names)
+
+    def joint(self, name: str) -> int:
+        """Return the rig's joint of a canonical one that it has."""
+        joint = self.joint_of[CANONICAL.index(name)]
+        assert joint is not None
+        return joint
+
+    def position(self, name: str) -> Float[Tensor, "poses 3"]:
+        """Return the position of a canonical joint that the rig has, metres."""
+        return self.positions[:, self.joint(name)]
+
+    def middle(self, part: str) -> Float[Tensor, "poses 3"]:
+        """Return the point halfway between the left and the right joint of a part, metres."""
+        return (self.position("left" + part) + self.position("right" + part)) / 2
+
+    def across(self, part: str) -> Float[Tensor, "poses 3"]:
+        """Return the vector from the right joint of a part to the left, metres."""
+        return self.position("left" + part) - self.position("right" + part)
+
+    def end(self, name: str) -> Float[Tensor, "poses 3"] | None:
+        """Return the position of the End Site of a canonical joint, metres, if there is one of some length."""
+        joint = self.joint_of[CANONICAL.index(name)]
+        site = self.skeleton.end_offsets.get(self.skeleton.names[joint]) if joint is not None else None
+        if joint is None or site is None or max(map(abs, site)) < 1e-4:
+            return None
+        offset = torch.tensor(site, dtype=torch.float64).expand(len(self.positions), 3)
+        return self.positions[:, joint] + rotations.rotate(self.orientations[:, joint], offset)
+
+    def up(self) -> Float[Tensor, "poses 3"]:
+        """Return the unit vector from the thighs to the upper arms."""
+        return unit_vectors(self.middle("UpperArm") - self.middle("UpperLeg"))
+
+    def left(self) -> Float[Tensor, "poses 3"]:
+        """Return the unit vector along the hip line to the left, square to `up`."""
+        across = self.side_line("UpperLeg")
+        return unit_vectors(across - self.up() * (across * self.up()).sum(-1, keepdim=True))
+
+    def side_line(self, part: str) -> Float[Tensor, "poses 3"]:
+        """Return the vector from the right joint of a part to the left, metres; by the upper arms where the rig has no
+        such joints, as shoulders, or both are at one point."""
+        across = self.across(part) if self.has("left" + part, "right" + part) else self.across("UpperArm")
+        return across if float(across.norm(dim=-1).mean()) > _POINTS_APART else self.across("UpperArm")
+
+    def bone(self, name: str) -> Float[Tensor, "poses 3"] | None:
+        """Return the vector, metres, from a canonical joint to the next one of its limb or trunk that the rig has, or
+        to its End Site; None where the rig lacks either end."""
+        if not self.has(name):
+            return None
+        following = next_joint(name)
+        while following is not None and not self.has(following):
+            following = next_joint(following)
+        stop = self.end(name) if following is None else self.position(following)
+        return None if stop is None else stop - self.position(name)
+
+
+def next_joint(name: str) -> str | None:
+    """Return the canonical joint that a bone leads to: the knee for the thigh; None for hips and ends of limbs."""
+    below = {"spine": "chest", "chest": "neck", "neck": "head"}
+    if name in ("hips", *below):
+        return below.get(name)
+    children = CANONICAL.children(CANONICAL.index(name))
+    return CANONICAL.names[children[0]] if children else None
+
+
+def unit_vectors(vectors: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+    """Scale vectors to length 1; a vanishing one stays zero."""
+    return torch.nn.functional.normalize(vectors, dim=-1, eps=1e-9)
+
 
 CONTRADICTION = math.radians(75)
 """Angle between two readings of a joint from which one of them is wrong. Rigs orient joints in quarter turns; hinge
@@ -337,3 +449,258 @@ def are_sides_swapped(zero: RigPoses, clip: RigPoses | None) -> bool:
 
 MIN_FRONT = 0.3
 """Least mean of `measure_front` from which it counts."""
+
+
+_MAX_LENGTH_RATIO = 1.2  # ratio of the lengths of two bones of one pair
+_MIN_REACH_SHARE = 0.25  # of the reach of the joint that they hang from, below which two branches are no limbs
+_MAX_SIDE_RATIO = 1.6  # of the lengths of two bones of one pair; performers are not the same on both sides
+
+LimbPair = tuple[list[int], list[int]]
+"""The joints of the two limbs of a pair, side by side, from the body outward."""
+
+
+def match_by_tree(skeleton: Skeleton) -> Mapping[str, int]:
+    """Match canonical joint names to the rig's joints, as far as the tree shows; empty where it is no human body's.
+
+    Sides are arbitrary: which limb of a pair is the left one has to be decided by names or positions.
+    """
+    tree = JointTree(skeleton)
+    for hips in range(skeleton.num_joints):
+        for legs in tree.find_limb_pairs(hips):
+            others = [child for child in tree.children[hips] if child not in (legs[0][0], legs[1][0])]
+            for trunk in sorted(others, key=lambda child: -tree.reach[child]):
+                for chest in tree.below(trunk):
+                    arms = tree.find_limb_pairs(chest)
+                    if arms:
+                        return _name_body_joints(tree, hips, legs, chest, arms[0])
+    return {}
+
+
+def _name_body_joints(tree: "JointTree", hips: int, legs: LimbPair, chest: int, arms: LimbPair) -> Mapping[str, int]:
+    found = {"hips": hips}
+    for side, leg, arm in zip(("left", "right"), legs, arms, strict=True):
+        found |= tree.limb(leg, [side + part for part in ("", "UpperLeg", "LowerLeg", "Foot", "Toes")])
+        found |= tree.limb(arm, [side + part for part in ("Shoulder", "UpperArm", "LowerArm", "Hand", "")])
+    trunk = path_below(tree.skeleton, hips, chest)
+    if trunk:
+        found["spine"] = trunk[0]
+    if len(trunk) > 1:
+        found["chest"] = trunk[-1]
+    others = [child for child in tree.children[chest] if child not in (arms[0][0], arms[1][0])]
+    if others:
+        up = tree.chain(max(others, key=lambda child: tree.reach[child]))
+        found |= {"head": up[0]} if len(up) == 1 else {"neck": up[0], "head": up[1]}
+    return found
+
+
+class JointTree:
+    """Children, bone lengths and reaches of a skeleton's joints; a reach is the length of the longest chain below."""
+
+    def __init__(self, skeleton: Skeleton):
+        self.skeleton = skeleton
+        self.children = [skeleton.children(joint) for joint in range(skeleton.num_joints)]
+        self.length = skeleton.offsets.norm(dim=-1).tolist()
+        ends = {skeleton.index(name): torch.tensor(site).norm().item() for name, site in skeleton.end_offsets.items()}
+        self.reach = [0.0] * skeleton.num_joints
+        for joint in reversed(range(skeleton.num_joints)):
+            below = [self.length[child] + self.reach[child] for child in self.children[joint]]
+            self.reach[joint] = max([ends.get(joint, 0.0), *below])
+
+    def find_limb_pairs(self, joint: int) -> list[LimbPair]:
+        """Find branches that are a pair of limbs, bone for bone of about the same length; the longest pair first."""
+        found = []
+        for k, first in enumerate(self.children[joint]):
+            for second in self.children[joint][k + 1 :]:
+                paths = self.trace_limb_pair(first, second)
+                long = sum(self.length[joint] for joint in paths[0][1:])
+                far = long >= _MIN_REACH_SHARE * self.reach[joint]
+                if far and len(paths[0]) >= 3 and self.are_alike(first, second):
+                    found.append((-long, paths))
+        return [paths for _, paths in sorted(found)]
+
+    def trace_limb_pair(self, first: int, second: int) -> LimbPair:
+        """Follow two branches down as long as they are alike; a sword in one hand is not."""
+        paths = [first], [second]
+        while True:
+            ends = product(self.children[paths[0][-1]], self.children[paths[1][-1]])
+            steps = [step for step in ends if self.are_alike(*step)]
+            if not steps:
+                return paths
+            best = max(steps, key=lambda step: min(self.reach[joint] + self.length[joint] for joint in step))
+            for path, joint in zip(paths, best, strict=True):
+                path.append(joint)
+
+    def are_alike(self, first: int, second: int) -> bool:
+        """Return whether two bones are of about the same length."""
+        return are_alike(self.length[first], self.length[second], _MAX_LENGTH_RATIO)
+
+    def chain(self, joint: int) -> list[int]:
+        """Return the joints from this one to the farthest leaf."""
+        path = [joint]
+        while self.children[path[-1]]:
+            path.append(max(self.children[path[-1]], key=lambda child: self.length[child] + self.reach[child]))
+        return path
+
+    def below(self, joint: int) -> list[int]:
+        """Return the joint and all below it, parents first."""
+        found = [joint]
+        for above in found:
+            found.extend(self.children[above])
+        return found
+
+    def limb(self, path: list[int], names: list[str]) -> dict[str, int]:
+        """Name a limb's joints: the second and third begin its two longest bones; a bare side is no name."""
+        both = [self.length[path[k + 1]] + self.length[path[k + 2]] for k in range(len(path) - 2)]
+        upper = max(range(len(both)), key=both.__getitem__)
+        placed = {name: upper + k - 1 for k, name in enumerate(names)}
+        return {name: path[at] for name, at in placed.items() if len(name) > 5 and 0 <= at < len(path)}
+
+
+def are_alike(first: float, second: float, ratio: float) -> bool:
+    """Return whether two lengths, metres, differ by no more than a ratio."""
+    short, long = sorted((first, second))
+    return long <= ratio * short + 1e-6
+
+
+def find_by_other_side(skeleton: Skeleton, found: Mapping[str, int]) -> dict[str, int]:
+    """Find canonical joints that only the other side has so far, from the hips outward."""
+    more: dict[str, int] = {}
+    for name in CANONICAL.names:
+        known = {**found, **more}
+        above = CANONICAL.names[CANONICAL.parents[CANONICAL.index(name)]] if name != "hips" else name
+        needed = (mirror_name(name), above, mirror_name(above))
+        if name in known or mirror_name(name) == name or not all(one in known for one in needed):
+            continue
+        path = path_below(skeleton, known[mirror_name(above)], known[mirror_name(name)])
+        ends = _follow(skeleton, known[above], path, {*known.values()}) if path else []
+        parts = {CANONICAL.names[joint] for joint in descendants(CANONICAL, {CANONICAL.index(name)})}
+        below = [known[part] for part in parts & known.keys()]
+        fitting = [end for end in ends if all(path_below(skeleton, end, joint) for joint in below)]
+        if fitting:
+            size = len(descendants(skeleton, {known[mirror_name(name)]}))
+            more[name] = min(fitting, key=lambda end: abs(len(descendants(skeleton, {end})) - size))
+    return more
+
+
+def _follow(skeleton: Skeleton, start: int, path: list[int], taken: set[int]) -> list[int]:
+    """Return the joints below `start` to which bones lead that are as long as those of a path on the other side."""
+    ends, lengths = [start], skeleton.offsets.norm(dim=-1).tolist()
+    for joint in path:
+        below = [child for end in ends for child in skeleton.children(end)]
+        ends = [child for child in below if are_alike(lengths[joint], lengths[child], _MAX_SIDE_RATIO)]
+    return [end for end in ends if end not in taken]
+
+
+def descendants(skeleton: Skeleton, joints: Collection[int]) -> set[int]:
+    """Return joints and all below them."""
+    found = set(joints)
+    for child, parent in enumerate(skeleton.parents):
+        if parent in found:
+            found.add(child)
+    return found
+
+
+def ancestors(skeleton: Skeleton, joints: Collection[int]) -> set[int]:
+    """Return joints and all above them."""
+    found = set(joints)
+    for child in reversed(range(1, skeleton.num_joints)):
+        if child in found:
+            found.add(skeleton.parents[child])
+    return found
+
+
+def path_below(skeleton: Skeleton, above: int, joint: int) -> list[int]:
+    """Return the joints below `above` down to a joint, and that joint; none where it does not hang from it."""
+    path = []
+    while joint >= 0 and joint != above:
+        path.append(joint)
+        joint = skeleton.parents[joint]
+    return path[::-1] if joint == above else []
+
+
+_ANIMAL = re.compile(
+    r"(?<![A-Za-z])(paw|hoof|hock|fetlock)|Paw|Hoof|Hock|Fetlock|[Ff]ore_?[Ll]eg"
+    r"|(?i:(front|hind|rear)_?(left_?|right_?|[lr]_?)?(up|low|leg|limb|thigh))"
+)
+"""In names of joints; people have a hindfoot and a forefoot, too."""
+_MIN_ANIMAL = 2  # joints named as an animal's, from which it is one
+_SQUARE = 0.5  # cosine between trunk and legs, below which the trunk lies across them
+_ALONG = 0.7  # cosine between arms and legs, above which the arms stand beside the legs
+_DEPTH = 0.7  # of the feet under the hips, from which hands are on the ground as well
+_STANDS = -0.7  # cosine between trunk and legs, below which somebody stands upright
+_MOST = 0.95  # share of a clip's frames on all fours that shows it, where the rest pose does not
+_BODIES_APART = 0.1  # metres between the hips of two bodies
+_LIMB_SHARE = 0.7  # of an arm's length, from which another pair of limbs is one
+
+
+def goes_on_four_legs(skeleton: Skeleton, zero: RigPoses, clip: RigPoses | None) -> bool:
+    """Return whether the body is a four-legged one: by its joints' names, or by a trunk across four parallel limbs.
+
+    The pose with all rotations zero tells where it is one; a clip in which the body stands upright overrules it.
+    """
+    if sum(bool(_ANIMAL.search(name)) for name in skeleton.names) >= _MIN_ANIMAL:
+        return True
+    if clip is not None and bool((_trunk_against_legs(clip) < _STANDS).any()):
+        return False
+    return bool(_is_on_all_fours(zero)[0])
+
+
+def stays_on_all_fours(clip: RigPoses) -> bool:
+    """Return whether the body has hands beside its feet under a level trunk in nearly all frames."""
+    return float(_is_on_all_fours(clip).double().mean()) >= _MOST
+
+
+def find_second_body(poses: RigPoses, joints: Mapping[str, int]) -> int | None:
+    """Find the hips of another body in the file than the one that is matched, by its tree; None where there is none.
+
+    A second set of joints in the same place, as the controls of a rig are, is no other body.
+    """
+    skeleton = poses.skeleton
+    near = descendants(skeleton, joints.values()) | ancestors(skeleton, joints.values())
+    rest = [joint for joint in range(skeleton.num_joints) if joint not in near]
+    place = {joint: number for number, joint in enumerate([-1, *rest])}
+    parents = (-1, *(place.get(skeleton.parents[joint], 0) for joint in rest))
+    offsets = torch.cat([torch.zeros(1, 3, dtype=skeleton.offsets.dtype), skeleton.offsets[rest]])
+    ends = {name: end for name, end in skeleton.end_offsets.items() if skeleton.index(name) in place}
+    other = match_by_tree(Skeleton(("", *(skeleton.names[j] for j in rest)), parents, offsets, ends))
+    if "hips" not in other or other["hips"] == 0:
+        return None
+    hips = rest[other["hips"] - 1]
+    apart = (poses.positions[:, hips] - poses.positions[:, joints["hips"]]).norm(dim=-1).mean()
+    return hips if float(apart) > _BODIES_APART else None
+
+
+def find_further_limbs(skeleton: Skeleton, joints: Mapping[str, int]) -> tuple[int, int] | None:
+    """Find a pair of limbs as long as the arms that hangs from the trunk beside arms and legs; None where none does."""
+    trunk = [joints[name] for name in ("hips", "spine", "chest", "neck") if name in joints]
+    inside = {joint for joint in descendants(skeleton, {joints["hips"]}) if descendants(skeleton, {joint}) & {*trunk}}
+    limbs = {joint for name, joint in joints.items() if joint not in trunk and name != "head"}
+    arm = path_below(skeleton, joints["leftUpperArm"], joints.get("leftHand", joints["leftLowerArm"]))
+    tree, least = JointTree(skeleton), _LIMB_SHARE * float(skeleton.offsets[arm].norm(dim=-1).sum())
+    for joint in sorted({*trunk, *inside}):
+        for first, second in tree.find_limb_pairs(joint):
+            long = sum(tree.length[below] for below in first[1:]) >= least
+            if long and not descendants(skeleton, {first[0], second[0]}) & limbs:
+                return first[0], second[0]
+    return None
+
+
+def _is_on_all_fours(poses: RigPoses) -> Bool[Tensor, " poses"]:
+    """Return whether the trunk lies across parallel arms and legs, and the hands are about as far down as the feet,
+    which those of a crouching person are not."""
+    legs, arms = _limbs(poses, "Leg"), _limbs(poses, "Arm")
+    front = "Hand" if poses.has("leftHand", "rightHand") else "LowerArm"
+    depth = [((poses.middle(part) - poses.middle("UpperLeg")) * legs).sum(-1) for part in (front, "Foot")]
+    square = (_trunk_against_legs(poses).abs() < _SQUARE) & ((legs * arms).sum(-1) > _ALONG)
+    return square & (depth[0] > _DEPTH * depth[1])
+
+
+def _trunk_against_legs(poses: RigPoses) -> Float[Tensor, " poses"]:
+    """Return the cosine between trunk and legs: -1 where somebody stands upright."""
+    return (poses.up() * _limbs(poses, "Leg")).sum(-1)
+
+
+def _limbs(poses: RigPoses, part: str) -> Float[Tensor, "poses 3"]:
+    """Return the mean direction of both upper and lower limbs of a kind, downward along them."""
+    bones = [poses.bone(f"{side}{half}{part}") for side in ("left", "right") for half in ("Upper", "Lower")]
+    return unit_vectors(sum((bone for bone in bones if bone is not None), torch.zeros_like(poses.positions[:, 0])))

@@ -15,12 +15,18 @@ from mapctl.joint_names import Part, Side
 from mapctl.joint_roles import classify_joints
 from mapctl.motion import Motion
 from mapctl.retarget import RigMap
-from mapctl.retarget.anatomy import MIN_FRONT, SIGNS, measure_front
-from mapctl.retarget.body_plan import find_further_limbs, find_second_body, stays_on_all_fours
+from mapctl.retarget.anatomy import (
+    MIN_FRONT,
+    SIGNS,
+    RigPoses,
+    find_further_limbs,
+    find_second_body,
+    measure_front,
+    path_below,
+    stays_on_all_fours,
+)
+from mapctl.retarget.character import SIDES
 from mapctl.retarget.joint_matching import HELPER_NAME, KnownBy
-from mapctl.retarget.rig_poses import RigPoses
-from mapctl.retarget.stance import SIDES
-from mapctl.retarget.topology import path_below
 from mapctl.skeleton import CANONICAL, LIMBS, Skeleton, mirror_name
 
 _MAX_LISTED = 4  # joints that have a line each; of more there is one line

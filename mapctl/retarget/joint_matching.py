@@ -14,10 +14,8 @@ from mapctl.errors import RequestError
 from mapctl.joint_names import Part, Role, Side, abbreviate_names, describe_nearest, normalise_name
 from mapctl.joint_roles import classify_joints, find_hips
 from mapctl.motion import Motion
-from mapctl.retarget.anatomy import are_sides_swapped
-from mapctl.retarget.rig_poses import RigPoses
+from mapctl.retarget.anatomy import RigPoses, are_sides_swapped, descendants, find_by_other_side, match_by_tree
 from mapctl.retarget.rigs import Rig, known_rigs
-from mapctl.retarget.topology import descendants, find_by_other_side, match_by_tree
 from mapctl.skeleton import CANONICAL, Skeleton, mirror_name
 
 MIN_SCORE = 0.6

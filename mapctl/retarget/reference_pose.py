@@ -17,8 +17,17 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl import kinematics, rotations
-from mapctl.retarget.anatomy import CORE, SIGNS, estimate_frames, find_up_axis, orthonormal_frame
-from mapctl.retarget.rig_poses import JointOf, RigPoses, next_joint, unit_vectors
+from mapctl.retarget.anatomy import (
+    CORE,
+    SIGNS,
+    JointOf,
+    RigPoses,
+    estimate_frames,
+    find_up_axis,
+    next_joint,
+    orthonormal_frame,
+    unit_vectors,
+)
 from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import CANONICAL, Skeleton
 

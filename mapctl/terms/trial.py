@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mapctl.contacts.heels import derive_heel_contacts
+from mapctl.contacts import derive_heel_contacts
 from mapctl.errors import MapctlError
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, integrate_root
 from mapctl.kinematics import fast

@@ -27,7 +27,7 @@ from torch import Tensor, nn
 
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, PRIOR_FPS, FeatureLayout
-from mapctl.kinematics.joint_places import place_joints
+from mapctl.kinematics.fast import place_joints
 from mapctl.protocols import DensityState, DiscreteChoices
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors.checkpoints import NetworkConfig, require_at_least

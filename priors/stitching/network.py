@@ -51,7 +51,7 @@ from torch.nn.functional import elu
 from mapctl import rotations
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, GroundPose
-from mapctl.kinematics.joint_places import place_joints
+from mapctl.kinematics.fast import place_joints
 from mapctl.pose import BodyPose
 from mapctl.runtime.stepwise import StepwiseWork
 from mapctl.skeleton import CANONICAL

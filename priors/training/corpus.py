@@ -32,7 +32,7 @@ from mapctl.metrics.gait import PACES, PaceChanges, count_pace_changes, follow_p
 from mapctl.motion import Motion
 from mapctl.retarget import RigMap, identify_rig, rigs
 from mapctl.retarget.carry import RiggedCharacter, retarget_canonical
-from mapctl.retarget.stance import Stance
+from mapctl.retarget.character import Stance
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors.checkpoints import write_tensors
 from priors.training.mocap.cuts import Cut, FrameCuts, find_cuts

@@ -8,8 +8,8 @@ import viser
 from trimesh.visual import ColorVisuals
 
 from mapctl.mesh.character_mesh import CharacterMesh
+from mapctl.mesh.mannequin import Skin, at_rest, build_skin
 from mapctl.mesh.primitives import Array
-from mapctl.mesh.skinning import Skin, at_rest, build_skin
 from mapctl.motion import Motion
 from mapctl.retarget import RigMap
 from mapctl.skeleton import Skeleton

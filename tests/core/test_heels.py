@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from mapctl import rotations
-from mapctl.contacts import detect_contacts
-from mapctl.contacts.heels import HeelContactSettings, derive_heel_contacts
+from mapctl.contacts import HeelContactSettings, derive_heel_contacts, detect_contacts
 from mapctl.skeleton import CANONICAL, TOES, Skeleton, find_heel_drops, find_heels
 
 FPS = 30.0

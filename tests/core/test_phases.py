@@ -7,7 +7,7 @@ import pytest
 import torch
 from helpers import CADENCE, walk
 
-from mapctl.contacts.phases import REACH, compute_phases, mirror_phases, reversed_phases
+from mapctl.contacts import REACH, compute_phases, mirror_phases, reversed_phases
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, encode, reversed_features
 

@@ -7,8 +7,7 @@ import pytest
 import torch
 from helpers import walk
 
-from mapctl.contacts import detect_contacts
-from mapctl.contacts.supports import compute_rest_log_probability, fit_supports
+from mapctl.contacts import compute_rest_log_probability, detect_contacts, fit_supports
 from mapctl.numerics.intervals import true_intervals
 from mapctl.recording.inspection import list_foot_artefacts
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, TOES

@@ -15,16 +15,15 @@ from mapctl import formats
 from mapctl.contacts import detect_contacts
 from mapctl.errors import FileFormatError, MapctlError
 from mapctl.mesh import colours
+from mapctl.mesh.body import SkinnedBody
 from mapctl.mesh.character_mesh import CharacterMesh
 from mapctl.mesh.mannequin import Mannequin
-from mapctl.mesh.skinned_body import SkinnedBody
 from mapctl.retarget.carry import RiggedCharacter, retarget_motion
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
+from scenes import renderers
 from scenes.cameras import CameraSettings
-from scenes.content import Figure
 from scenes.drawn_character import DrawnCharacter
-from scenes.renderers import offscreen
-from scenes.renderers.select import select_painter
+from scenes.renderers import Figure, select_painter
 from scenes.stage import Shot, Stage
 
 GREY = colours.rgb("slate")
@@ -39,7 +38,7 @@ MAKES = {
 def has_graphics() -> bool:
     try:
         return bool(select_painter("egl"))
-    except offscreen.NoGraphicsError:
+    except renderers.NoGraphicsError:
         return False
 
 

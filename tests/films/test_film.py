@@ -11,11 +11,10 @@ from scenes_walks import walk
 from mapctl import curves
 from mapctl.errors import RequestError
 from mapctl.mesh import colours
+from scenes import renderers
 from scenes.cameras import CameraSettings
-from scenes.content import Painter
 from scenes.film import film
-from scenes.renderers import offscreen, select
-from scenes.renderers.select import back_end, select_painter
+from scenes.renderers import Painter, back_end, select_painter
 from scenes.stage import Shot, Stage
 
 av = pytest.importorskip("av")
@@ -26,7 +25,7 @@ SMALL = (96, 64)
 def has_graphics() -> bool:
     try:
         return isinstance(select_painter("egl"), Painter)
-    except offscreen.NoGraphicsError:
+    except renderers.NoGraphicsError:
         return False
 
 
@@ -186,10 +185,10 @@ def test_a_film_that_fails_leaves_nothing_behind_and_an_older_one_alone(tmp_path
 
 def test_without_opengl_there_are_stick_figures_and_one_line_says_so(monkeypatch, caplog):
     def missing():
-        raise offscreen.NoGraphicsError("no OpenGL without a window (libEGL.so.1 not found)")
+        raise renderers.NoGraphicsError("no OpenGL without a window (libEGL.so.1 not found)")
 
     monkeypatch.setattr(offscreen, "_open_graphics", missing)
-    monkeypatch.delenv(select.RENDERER_VARIABLE, raising=False)
+    monkeypatch.delenv(renderers.RENDERER_VARIABLE, raising=False)
     with caplog.at_level(logging.WARNING, logger="mapctl.scenes"):
         brush = select_painter()
     assert brush.name.startswith("matplotlib")
@@ -197,5 +196,5 @@ def test_without_opengl_there_are_stick_figures_and_one_line_says_so(monkeypatch
     assert "libEGL.so.1" in record.getMessage()
     assert "\n" not in record.getMessage()
     assert "libEGL.so.1" in back_end()
-    with pytest.raises(offscreen.NoGraphicsError):
+    with pytest.raises(renderers.NoGraphicsError):
         select_painter("egl")

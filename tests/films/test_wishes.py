@@ -6,11 +6,10 @@ from helpers import moved
 from scenes_walks import walk
 
 from mapctl.mesh import colours
+from scenes import renderers
 from scenes.cameras import CameraSettings
-from scenes.content import Content
-from scenes.props import build_target
-from scenes.renderers import offscreen
-from scenes.renderers.select import select_painter
+from scenes.overlays import build_target
+from scenes.renderers import Content, select_painter
 from scenes.stage import Mark, Shot, Stage, Wishes
 
 
@@ -39,7 +38,7 @@ def test_a_mark_is_strong_at_its_time_and_faint_at_others():
 def test_one_sees_through_a_pose_and_it_covers_the_actor_who_is_in_it(renderer):
     try:
         brush = select_painter(renderer)
-    except offscreen.NoGraphicsError:
+    except renderers.NoGraphicsError:
         pytest.skip("no OpenGL without a window here")
     motion = walk(6, speed=0.0)
     beside = moved(motion.slice(2, 3), turn=0.0, shift=(0.7, 0.0))

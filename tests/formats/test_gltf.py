@@ -17,8 +17,8 @@ import mapctl
 from mapctl import editing, formats, retarget, rotations
 from mapctl.errors import FileFormatError, RequestError
 from mapctl.formats.character import CharacterSource
-from mapctl.mesh.skinning import build_skin
-from mapctl.retarget import figure
+from mapctl.mesh.mannequin import build_skin
+from mapctl.retarget import character
 from mapctl.retarget.carry import RiggedCharacter, retarget_motion
 from mapctl.skeleton import CANONICAL
 
@@ -144,7 +144,7 @@ def test_of_several_animations_the_one_that_is_read_is_named(tmp_path, capsys):
 
 def follow_up(made, frames=20):
     """A walk on the character that was made."""
-    body = RiggedCharacter.of(figure.load_standing_character(made.path))[1]
+    body = RiggedCharacter.of(character.load_standing_character(made.path))[1]
     return body.on_rig(retarget_motion(walk(frames), body).motion)
 
 

@@ -18,8 +18,8 @@ from usd_viewer import UsdViewer, find_faults
 from mapctl import cli, formats, rotations
 from mapctl.errors import FileFormatError, RequestError
 from mapctl.formats import usd
-from mapctl.mesh.skinning import build_skin
-from mapctl.retarget import figure
+from mapctl.mesh.mannequin import build_skin
+from mapctl.retarget import character
 from mapctl.retarget.carry import RiggedCharacter, retarget_motion
 from mapctl.skeleton import CANONICAL, Skeleton
 
@@ -75,7 +75,7 @@ def skinned(mesh, motion, frame):
 
 def follow_up(path):
     """Another motion on the character that a file holds."""
-    body = RiggedCharacter.of(figure.load_standing_character(path))[1]
+    body = RiggedCharacter.of(character.load_standing_character(path))[1]
     return body.on_rig(retarget_motion(walk(12), body).motion)
 
 

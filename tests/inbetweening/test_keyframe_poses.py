@@ -16,7 +16,7 @@ from mapctl import retarget
 from mapctl.errors import RequestError
 from mapctl.intent.keyframe_toml import KeyEntry, KeyRequest
 from mapctl.kinematics import heading
-from mapctl.retarget.stance import Stance
+from mapctl.retarget.character import Stance
 from mapctl.skeleton import leg_length
 
 RIGS = ("canonical", "bandai", "daz")

@@ -6,7 +6,7 @@ from character_maker import make_character_glb
 from glb_builder import stripes
 
 from mapctl import formats
-from mapctl.mesh.refinement import choose_cell, part_triangle, refine
+from mapctl.mesh.character_mesh import choose_cell, part_triangle, refine
 
 SQUARE = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0]])
 FACES = np.array([[0, 1, 2], [0, 2, 3]])

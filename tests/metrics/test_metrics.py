@@ -9,8 +9,7 @@ import torch
 from helpers import walk, walk_through
 
 from mapctl import curves, metrics
-from mapctl.contacts import detect_contacts
-from mapctl.contacts.heels import derive_heel_contacts
+from mapctl.contacts import derive_heel_contacts, detect_contacts
 from mapctl.errors import MapctlError, RequestError
 from mapctl.metrics import body, compute_reference, feet, measure
 from mapctl.skeleton import CANONICAL, find_heel_drops

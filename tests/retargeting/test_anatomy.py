@@ -23,10 +23,9 @@ from mapctl.errors import RequestError
 from mapctl.formats.bvh import layout
 from mapctl.motion import Motion
 from mapctl.retarget import put_upright
-from mapctl.retarget.anatomy import are_sides_swapped, find_up_axis
+from mapctl.retarget.anatomy import RigPoses, are_sides_swapped, find_up_axis
 from mapctl.retarget.doubts import assess_fit
 from mapctl.retarget.reference_pose import find_tpose, upright_rotation
-from mapctl.retarget.rig_poses import RigPoses
 from mapctl.retarget.rigs import UNITS
 from mapctl.skeleton import CANONICAL, Skeleton, mirror_name
 

@@ -14,9 +14,8 @@ import mapctl
 from mapctl import contacts, retarget, rotations
 from mapctl.commands.shared import inputs
 from mapctl.motion import Motion
-from mapctl.retarget.carry import RiggedCharacter, retarget_motion
-from mapctl.retarget.carry.character import LEGS, limb_extension
-from mapctl.retarget.carry.legs import fit_hips
+from mapctl.retarget.carry import RiggedCharacter, fit_hips, retarget_motion
+from mapctl.retarget.character import LEGS, limb_extension
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, leg_length
 
 USUAL = Performer()

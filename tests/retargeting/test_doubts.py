@@ -13,9 +13,9 @@ from strange_rigs import CASES, DOUBTFUL, REFUSED, SURE
 from mapctl import retarget, rotations
 from mapctl.errors import RequestError
 from mapctl.motion import Motion
-from mapctl.retarget import body_plan, rigs
+from mapctl.retarget import anatomy, rigs
+from mapctl.retarget.anatomy import RigPoses
 from mapctl.retarget.doubts import assess_fit
-from mapctl.retarget.rig_poses import RigPoses
 from mapctl.skeleton import CANONICAL
 
 
@@ -120,4 +120,4 @@ def test_a_crouch_with_hanging_arms_is_no_walk_on_four_legs(knee_deg, four):
     body = replace(CANONICAL, offsets=offsets)
     motion = Motion(body, Fraction(30), torch.zeros(1, 3, dtype=torch.float64), pose)
     poses = RigPoses.of(motion, range(CANONICAL.num_joints))
-    assert body_plan.goes_on_four_legs(body, poses, None) is four
+    assert anatomy.goes_on_four_legs(body, poses, None) is four

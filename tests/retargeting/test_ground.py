@@ -7,8 +7,7 @@ import torch
 from performers import FEET, HIPJOINTS, TOES, Performer
 
 from mapctl.motion import Motion
-from mapctl.retarget.carry import GroundMode, RiggedCharacter, retarget_canonical, retarget_motion
-from mapctl.retarget.carry.legs import find_ground
+from mapctl.retarget.carry import GroundMode, RiggedCharacter, find_ground, retarget_canonical, retarget_motion
 from mapctl.skeleton import leg_length
 
 CLIMBS = Performer(stair=0.10, upright=0.9)

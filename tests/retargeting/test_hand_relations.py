@@ -12,7 +12,7 @@ from performers import FEET, HIPJOINTS, KNEES, Performer
 from mapctl.motion import Motion
 from mapctl.retarget import identify_rig
 from mapctl.retarget.carry import RiggedCharacter, retarget_canonical, retarget_motion
-from mapctl.retarget.stance import Stance
+from mapctl.retarget.character import Stance
 from mapctl.skeleton import CANONICAL, Skeleton
 
 FRAMES = 60

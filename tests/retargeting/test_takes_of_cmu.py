@@ -13,8 +13,7 @@ from performers import Performer
 from rig_maker import Make, make, names_of
 
 from mapctl.motion import Motion
-from mapctl.retarget.carry import RiggedCharacter, retarget_motion
-from mapctl.retarget.carry.legs import find_ground
+from mapctl.retarget.carry import RiggedCharacter, find_ground, retarget_motion
 
 FOLDER = Path(os.environ.get("MAPCTL_CMU", ""))
 

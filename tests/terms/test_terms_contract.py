@@ -9,7 +9,7 @@ from catalogue import FRAMES, PAST, TERMS, moved_curve, trial
 from helpers import generator, walk
 
 from mapctl import terms
-from mapctl.contacts.heels import derive_heel_contacts
+from mapctl.contacts import derive_heel_contacts
 from mapctl.curves import line
 from mapctl.features import LAYOUT, GroundPose, encode
 from mapctl.metrics.feet import locate_heels

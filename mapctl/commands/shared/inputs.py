@@ -15,7 +15,8 @@ from mapctl.features import PRIOR_FPS
 from mapctl.formats.text import warn_once
 from mapctl.motion import Motion
 from mapctl.recording.masks import Mask, masks_from_missing
-from mapctl.retarget import figure, identify_rig, load_rig
+from mapctl.retarget import identify_rig, load_rig
+from mapctl.retarget.character import load_standing_character, make_tpose_clip
 from mapctl.retarget.doubts import assess_fit
 from mapctl.retarget.rigs import Rig, parse_unit
 from priors.licences import note_licence
@@ -61,12 +62,12 @@ def read_rig_clip(text: str, options: ReadOptions | None = None) -> tuple[Motion
     on the joints of a preset or a TOML file. Also return its rig, where it is given."""
     if formats.ending_of(text) in formats.READERS:
         rig = None if options is None else read_rig(None, options)
-        clip = figure.load_standing_character(text) or formats.load(text, metres_per_unit=rig and rig.metres_per_unit)
+        clip = load_standing_character(text) or formats.load(text, metres_per_unit=rig and rig.metres_per_unit)
         if not getattr(options, "quiet", False):
             print_doubts(Path(text), clip, rig)
         return clip, rig
     rig = load_rig(text)
-    return figure.make_tpose_clip(rig), rig
+    return make_tpose_clip(rig), rig
 
 
 def read_motion(path: Path, rig: Rig | None, *, fps: Fraction | None = None, quiet: bool = False) -> Motion:

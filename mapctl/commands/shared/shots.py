@@ -37,7 +37,7 @@ from mapctl.runtime.progress import Progress
 from mapctl.skeleton import CANONICAL
 from priors.lstm_gmm.density import LstmGmmDensity
 from scenes.drawn_character import DrawnCharacter
-from scenes.props import build_hips_mark, build_look_mark, build_obstacle, build_target
+from scenes.overlays import build_hips_mark, build_look_mark, build_obstacle, build_target
 from scenes.scene_file import Actor
 from scenes.stage import Mark, Shot, Wishes
 

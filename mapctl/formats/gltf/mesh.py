@@ -17,8 +17,15 @@ from mapctl.formats.gltf.reader import (
     read_skeleton,
 )
 from mapctl.formats.parts import decode_picture, decode_srgb, encode_srgb, sample_picture
-from mapctl.mesh.character_mesh import CharacterMesh, compute_normals, merge_meshes
-from mapctl.mesh.refinement import MOST_CELLS, Refinement, choose_cell, refine
+from mapctl.mesh.character_mesh import (
+    MOST_CELLS,
+    CharacterMesh,
+    Refinement,
+    choose_cell,
+    compute_normals,
+    merge_meshes,
+    refine,
+)
 
 Array = np.ndarray
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6

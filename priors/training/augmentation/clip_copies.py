@@ -16,9 +16,8 @@ from mapctl.features import LAYOUT, encode
 from mapctl.inbetweening.partial_motion import PartialMotion
 from mapctl.motion import Motion
 from mapctl.pose import BodyPose
-from mapctl.retarget.carry.character import LEGS, limb_extension
-from mapctl.retarget.carry.legs import fit_hips, lower_hips, reach_ankle_targets
-from mapctl.retarget.stance import FEET, TOES
+from mapctl.retarget.carry import fit_hips, lower_hips, reach_ankle_targets
+from mapctl.retarget.character import FEET, LEGS, TOES, limb_extension
 from mapctl.rotations import to_rotation_vector
 from priors.training.augmentation.pose_windows import PoseWindows
 from priors.training.corpus import Corpus

@@ -14,11 +14,11 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits as cross_entropy
 
-from mapctl.contacts.phases import compute_phases, mirror_phases, reversed_phases
+from mapctl.contacts import compute_phases, mirror_phases, reversed_phases
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, GroundPose, integrate_root, mirror_features, reversed_features
 from mapctl.kinematics import forward_kinematics
-from mapctl.kinematics.joint_places import place_joints
+from mapctl.kinematics.fast import place_joints
 from mapctl.pose import BodyPose
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors.checkpoints import require_at_least

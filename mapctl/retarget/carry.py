@@ -1,32 +1,176 @@
-"""Where hips and feet go on the receiving body: the giver's trajectories in scale, as legs and ground ask for.
+"""Retargeting: motion of one performer on the bones of another, with the same contacts.
+
+Rotations stay, but of legs, and of arms whose hands are near something. The hips go as far and as high as the legs'
+lengths and the ground ask for, each toe joint is as high over its own rest height as the giver's over his, in scale,
+and while a foot is planted it moves as little as the giver's. Hands near the body, each other or the floor are brought
+where they were relative to these. Two-bone inverse kinematics brings legs and arms there. (The footsteps are kept as
+in Gleicher 1998, but joint by joint instead of by spacetime optimisation.)
+
+Where hips and feet go on the receiving body: the giver's trajectories in scale, as legs and ground ask for.
 
 What the giver's feet stand on is the floor, or what is higher, as stairs and platforms. Toes are as far over their own
 rest height as the giver's, standing ones where the giver's stand.
 """
 
 import math
-from dataclasses import dataclass, replace
+import re
+from collections import defaultdict
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Literal, get_args
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl import contacts, kinematics, rotations
+from mapctl.errors import RequestError
+from mapctl.joint_names import Part, Side, abbreviate_names, classify_joint
 from mapctl.kinematics import inverse
 from mapctl.motion import Motion
 from mapctl.numerics.easing import smootherstep
-from mapctl.retarget.carry.character import LEGS, RiggedCharacter, limb_lengths
-from mapctl.retarget.carry.holding import (
+from mapctl.retarget import RigMap, as_rig, to_canonical
+from mapctl.retarget.anatomy import ancestors
+from mapctl.retarget.character import (
+    FEET,
+    HIP_JOINTS,
+    LEGS,
+    MAX_TOE_SINK,
+    SHINS,
+    TOES,
+    RiggedCharacter,
+    Stance,
+    limb_extension,
+    limb_lengths,
+)
+from mapctl.retarget.hands import (
+    HandTargets,
     Spans,
     envelope,
     hold_through,
+    keep_hand_relations,
     low_pass,
     mean_by_span,
     merge_contacts,
     soft_clamp,
 )
-from mapctl.retarget.stance import FEET, HIP_JOINTS, MAX_TOE_SINK, SHINS, TOES, Stance
+from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import Skeleton, leg_length
+
+_FOOT_METRES = 0.005  # metres that a foot misses its target by before it is worth a line
+_HAND_METRES = 0.01  # metres that a hand does
+_DIP_METRES = 0.05  # metres that hips go lower than in scale before it is worth a line
+_MOVES_RADIANS = math.radians(1.0)  # angle within which a joint does not move
+
+
+@dataclass(frozen=True)
+class Miss:
+    """How far effectors are from where they should be."""
+
+    metres: float = 0.0
+    """The farthest, metres."""
+    frame: int = 0
+    """Frame in which that is."""
+    frames: int = 0
+    """Frames in which one is farther off than is worth a line: 0.5 cm for feet, 1 cm for hands."""
+    of_frames: int = 0
+    """Frames of the motion."""
+
+
+@dataclass(frozen=True)
+class Changes:
+    """What retargeting changed, beside bones."""
+
+    scale: float = 1.0
+    """Length of the body's legs over the giver's."""
+    travel_ratio: float = 1.0
+    """Way of the hips over the ground over the giver's; 1 for who stays in place."""
+    hips_lowered_m: float = 0.0
+    """How much lower the hips are at most than in scale, metres, for legs that are too short."""
+    hands_moved_m: float = 0.0
+    """How far hands are moved at most to where they touch what the giver's touch, metres."""
+    feet_missed: Miss = Miss()
+    """Ankles against their targets."""
+    hands_missed: Miss = Miss()
+    """Hands that are near something against their targets."""
+    foot_tilt_deg: float = 0.0
+    """By how much the giver's T-pose lays its feet wrongly at most, degrees, positive down; it is taken out."""
+    unmatched_joints: tuple[str, ...] = ()
+    """Joints of the giver that move and have no counterpart."""
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Return sentences about what could not be kept; empty where all is."""
+        feet, hands, dip, names = self.feet_missed, self.hands_missed, self.hips_lowered_m, self.unmatched_joints
+        found = (
+            (feet.frames, _note_miss("the legs are too short for some of the way: feet are", feet, _FOOT_METRES)),
+            (hands.frames, _note_miss("the arms are too short for some of it: hands are", hands, _HAND_METRES)),
+            (dip >= _DIP_METRES, f"the hips are up to {100 * dip:.1f} cm lower than in scale, so that the feet reach"),
+            (names, f"joints without a counterpart are left out: {abbreviate_names(names)}"),
+        )
+        return tuple(note for counts, note in found if counts)
+
+
+@dataclass(frozen=True, eq=False)
+class RetargetedMotion:
+    """A motion on another body."""
+
+    motion: Motion
+    """On canonical joints, with the bones of the body."""
+    changes: Changes = Changes()
+    """What was changed."""
+    fingers: Mapping[int, Float[Tensor, "frames 4"]] = field(default_factory=dict)
+    """Local rotations (xyzw) of the body's finger joints that turn as the giver's, by joint of its rig."""
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Return sentences about what could not be kept; empty where all is."""
+        return self.changes.notes
+
+
+def measure_changes(
+    given: Motion,
+    done: Motion,
+    ankles: Float[Tensor, "frames 2 3"],
+    hands: HandTargets,
+    *,
+    dip: Float[Tensor, "frames 3"],
+    tilt: Float[Tensor, "2 2"],
+) -> Changes:
+    """Measure what became of a motion (canonical joints): `ankles` and `hands` are what was aimed at, `dip` how much
+    lower the hips are than in scale, metres, `tilt` the pitch of foot and toes taken out of each foot, radians."""
+    ways = [float(m.root_position[:, ::2].diff(dim=0).norm(dim=-1).sum()) for m in (done, given)]
+    return Changes(
+        scale=leg_length(done.skeleton) / leg_length(given.skeleton),
+        travel_ratio=ways[0] / ways[1] if ways[1] > 1e-6 else 1.0,
+        hips_lowered_m=max(0.0, float(dip[:, 1].max())),
+        hands_moved_m=float(hands.offset.norm(dim=-1).max()),
+        feet_missed=_measure_miss((done.joint_positions()[:, FEET] - ankles).norm(dim=-1), _FOOT_METRES),
+        hands_missed=_measure_miss(hands.errors, _HAND_METRES),
+        foot_tilt_deg=-math.degrees(float(tilt[:, 0].flatten()[tilt[:, 0].abs().argmax()])),
+    )
+
+
+def list_unmatched_joints(clip: Motion, giver: RigMap, matched: Collection[int]) -> tuple[str, ...]:
+    """List the joints of a clip that move and are not `matched`, nor is or hangs from them any canonical joint: what
+    their turns do is lost."""
+    led_by = ancestors(clip.skeleton, [*giver.joints.values(), *matched])
+    dots = (clip.local_quat_xyzw * clip.local_quat_xyzw[:1]).sum(-1).abs().amin(dim=0).clamp(max=1.0)
+    moves = 2 * torch.acos(dots) > _MOVES_RADIANS
+    return tuple(name for j, name in enumerate(clip.skeleton.names) if j not in led_by and bool(moves[j]))
+
+
+def _measure_miss(off: Float[Tensor, "frames 2"], noted: float) -> Miss:
+    farthest = off.amax(dim=-1)
+    return Miss(float(farthest.max()), int(farthest.argmax()), int((farthest > noted).sum()), len(off))
+
+
+def _note_miss(begin: str, miss: Miss, noted: float) -> str:
+    return (
+        f"{begin} up to {100 * miss.metres:.1f} cm off (frame {miss.frame}), by more than {100 * noted:g} cm in"
+        f" {miss.frames} of {miss.of_frames} frames"
+    )
+
 
 _FREE_EXTENSION = 0.985  # of the leg: a leg may be that straight, whatever the giver's is
 _MAX_EXTENSION = 0.9995  # of the leg: how straight one may be at most
@@ -212,3 +356,91 @@ def reach_ankle_targets(moved: Motion, ankles: Float[Tensor, "frames 2 3"]) -> M
     turned[:, [*FEET, *TOES]] = world[:, [*FEET, *TOES]]
     local = rotations.make_sign_continuous(kinematics.local_from_world(moved.skeleton.parents, turned))
     return replace(moved, local_quat_xyzw=local)
+
+
+__all__ = ["Changes", "GroundMode", "RetargetedMotion", "RiggedCharacter", "retarget_canonical", "retarget_motion"]
+
+GroundMode = Literal["fit", "keep"]
+"""Whether what feet stand on, as stairs, is scaled with the body (`fit`) or as high as it was, in metres (`keep`)."""
+_FINGERS = re.compile(r"thumb|index|mid|ring|pinky|little", re.IGNORECASE)
+_SAME = {"little": "pinky"}
+
+
+def retarget_motion(
+    clip: Motion, body: RiggedCharacter, rig: Rig | None = None, *, ground: GroundMode = "fit"
+) -> RetargetedMotion:
+    """Retarget a clip of any rig to a body's bones, in the canonical joint frames of its rig.
+
+    A clip of the body's own skeleton comes as it is, to the bit. `rig` is the clip's, where it is not the one that
+    would be recognised. `ground`: see `GroundMode`. RequestError where the clip's joints cannot be identified, or for
+    another `ground`.
+    """
+    if clip.skeleton.matches(body.rigmap.rig_skeleton):
+        return RetargetedMotion(replace(to_canonical(clip, as_rig(body.rigmap))[0], skeleton=body.skeleton))
+    canonical, giver = RiggedCharacter.of(clip, rig)
+    found = retarget_canonical(canonical, giver, body, ground=ground)
+    fingers = match_fingers(clip.skeleton, body.rigmap.rig_skeleton)
+    unmatched = list_unmatched_joints(clip, giver.rigmap, fingers.values())
+    carried = _carry_fingers(clip, giver.rigmap, body.rigmap, fingers)
+    return replace(found, changes=replace(found.changes, unmatched_joints=unmatched), fingers=carried)
+
+
+def retarget_canonical(
+    motion: Motion, giver: RiggedCharacter, body: RiggedCharacter, *, ground: GroundMode = "fit"
+) -> RetargetedMotion:
+    """Retarget a motion (canonical joints, any part of a clip) whose giver is known. RequestError for another `ground`
+    than those of `GroundMode`."""
+    if ground not in get_args(GroundMode):
+        raise RequestError(f"the ground is one of {', '.join(get_args(GroundMode))}, got {ground!r}")
+    keeps = ground == "keep"
+    giver = replace(giver, stance=giver.stance.keep_floor()) if keeps else giver
+    own = giver.stance.leveled(motion)
+    scale = leg_length(body.leveled) / leg_length(own.skeleton)
+    found = find_ground(own, giver.stance)
+    higher = 1 - scale if keeps else 0.0
+    moved = transfer_root(own, giver, body, scale, higher * found.under_hips(float(own.fps)))
+    raised = higher * found.height
+    ankles = find_ankle_targets(own, moved, giver.stance, body.stance, found, scale=scale, raised=raised)
+    straight = limb_extension(own, LEGS)
+    lowered = lower_hips(fit_hips(moved, ankles, straight), ankles, straight)
+    standing = reach_ankle_targets(lowered, ankles)
+    done, hands = keep_hand_relations(own, standing, giver.stance, scale=scale)
+    changes = measure_changes(
+        motion, done, ankles, hands, dip=moved.root_position - lowered.root_position, tilt=giver.stance.tilt
+    )
+    return RetargetedMotion(body.stance.restore_foot_tilt(done), changes)
+
+
+def match_fingers(giver: Skeleton, body: Skeleton) -> dict[int, int]:
+    """Match finger joints by side, finger and place along it: a joint of the giver by joint of the body."""
+    theirs = _list_fingers(giver)
+    return {joint: theirs[finger] for finger, joint in _list_fingers(body).items() if finger in theirs}
+
+
+def _carry_fingers(
+    clip: Motion, giver: RigMap, body: RigMap, pairs: Mapping[int, int]
+) -> Mapping[int, Float[Tensor, "frames 4"]]:
+    """Return the local rotations (xyzw) of the body's finger joints that turn as the giver's do, by joint of its rig;
+    in the T-poses of both rigs, fingers are taken to point along the same direction."""
+    ours, theirs = body.rest_quat_xyzw, giver.rest_quat_xyzw
+    found = {}
+    for joint, other in pairs.items():
+        rest, their_rest = ours[body.rig_skeleton.parents[joint]], theirs[giver.rig_skeleton.parents[other]]
+        idle, their_idle = body.idle_quat_xyzw[joint], giver.idle_quat_xyzw[other]
+        # From the parent's frame in one T-pose to that in the other; each rotation is what it adds to rest.
+        turn = rotations.multiply(rotations.inverse(rest), their_rest).expand(clip.num_frames, 4)
+        added = rotations.multiply(clip.local_quat_xyzw[:, other], rotations.inverse(their_idle).expand_as(turn))
+        added = rotations.multiply(rotations.multiply(turn, added), rotations.inverse(turn))
+        found[joint] = rotations.multiply(added, idle.expand_as(turn))
+    return found
+
+
+def _list_fingers(skeleton: Skeleton) -> dict[tuple[Side, str, int], int]:
+    """List finger joints by side, finger and number along it, from 0."""
+    chains: dict[tuple[Side, str], list[int]] = defaultdict(list)
+    for joint, name in enumerate(skeleton.names):
+        role, finger = classify_joint(name), _FINGERS.search(name)
+        if role.part is Part.FINGER and role.side is not Side.MIDDLE and finger:
+            word = finger[0].lower()
+            chains[role.side, _SAME.get(word, word)].append(joint)
+    return {(*chain, k): joint for chain, joints in chains.items() for k, joint in enumerate(joints)}
