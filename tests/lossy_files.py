@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from mapctl.formats import bvh
-from mapctl.formats.bvh import layout, text
+from mapctl.formats import bvh as layout
+from mapctl.formats import bvh_text as text
 from mapctl.motion import Motion
 
 GOOD = """HIERARCHY

@@ -29,12 +29,10 @@ from torch import Tensor
 
 from mapctl import rotations
 from mapctl.errors import FileFormatError, RequestError
-from mapctl.formats import missing
-from mapctl.formats.bvh import euler
-from mapctl.formats.frame_rate import FASTEST, SLOWEST
+from mapctl.formats import euler, missing
 from mapctl.formats.missing import MissingValues
 from mapctl.formats.text import MAX_POSES, NUMBER, check_extent, decode, finite_number, read_bytes, shorten
-from mapctl.formats.units import FileUnit, guess_unit
+from mapctl.formats.units import FASTEST, SLOWEST, FileUnit, guess_unit
 from mapctl.motion import Motion
 from mapctl.skeleton import Skeleton
 

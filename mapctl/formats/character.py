@@ -11,9 +11,9 @@ import torch
 
 from mapctl import kinematics, rotations
 from mapctl.errors import FileFormatError, RequestError
-from mapctl.formats.frame_rate import FASTEST, frame_rate
 from mapctl.formats.parts import CharacterPath, FoundCharacter, MeshPart, find_name
 from mapctl.formats.text import warn_once
+from mapctl.formats.units import FASTEST, frame_rate
 from mapctl.mesh.character_mesh import CharacterMesh, compute_normals, merge_meshes
 from mapctl.motion import Motion
 from mapctl.skeleton import Skeleton

@@ -26,9 +26,9 @@ from torch import Tensor
 from mapctl.errors import FileFormatError, MapctlError, RequestError
 from mapctl.formats import missing
 from mapctl.formats.atomic import write_bytes
-from mapctl.formats.frame_rate import FASTEST, SLOWEST
 from mapctl.formats.missing import MissingValues
 from mapctl.formats.text import LARGEST_VALUE, MAX_FILE_BYTES, NUMBER, one_line, read_bytes
+from mapctl.formats.units import FASTEST, SLOWEST
 from mapctl.motion import Motion
 from mapctl.skeleton import Skeleton
 

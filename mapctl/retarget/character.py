@@ -20,7 +20,7 @@ from torch import Tensor
 
 from mapctl import contacts, formats, kinematics, retarget, rotations
 from mapctl.errors import MapctlError, RequestError
-from mapctl.formats.bvh import layout as bvh_layout
+from mapctl.formats import bvh
 from mapctl.motion import Motion
 from mapctl.retarget import RigMap, from_canonical, to_canonical
 from mapctl.retarget.anatomy import RigPoses, descendants
@@ -271,7 +271,7 @@ def make_tpose_clip(rig: Rig) -> Motion:
     standing = retarget.from_canonical(_canonical_tpose(), retarget.identify_rig(skeleton, rig))
     if rig.metres_per_unit is None:
         return standing
-    layout = bvh_layout.choose_layout(standing, rig.name)
+    layout = bvh.choose_layout(standing, rig.name)
     return replace(standing, source=replace(layout, metres_per_unit=rig.metres_per_unit))
 
 

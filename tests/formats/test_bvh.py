@@ -13,8 +13,7 @@ from turns import turn
 
 from mapctl import formats, rotations
 from mapctl.errors import RequestError
-from mapctl.formats import bvh
-from mapctl.formats.bvh import text as bvh_text
+from mapctl.formats import bvh, bvh_text
 from mapctl.formats.units import UNITS, guess_unit
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL

@@ -6,7 +6,7 @@ import hypothesis.strategies as st
 import pytest
 from hypothesis import given, settings
 
-from mapctl.formats.frame_rate import frame_rate
+from mapctl.formats.units import frame_rate
 
 RATES = {
     "0.0333333": 30,

@@ -20,7 +20,7 @@ from torch import Tensor
 import mapctl
 from mapctl import kinematics, retarget, rotations
 from mapctl.errors import RequestError
-from mapctl.formats.bvh import layout
+from mapctl.formats import bvh as layout
 from mapctl.motion import Motion
 from mapctl.retarget import put_upright
 from mapctl.retarget.anatomy import RigPoses, are_sides_swapped, find_up_axis
