@@ -10,11 +10,13 @@ import numpy as np
 import torch
 
 from mapctl import kinematics, rotations
-from mapctl.errors import FileFormatError, RequestError
-from mapctl.formats.parts import CharacterPath, FoundCharacter, MeshPart, find_name
+from mapctl.errors import FileFormatError, MapctlError, RequestError
+from mapctl.formats.parts import CharacterPath, FoundCharacter, MeshPart, decode_srgb, find_name
+from mapctl.formats.sandbox import Refusal
 from mapctl.formats.text import warn_once
 from mapctl.formats.units import FASTEST, frame_rate
 from mapctl.mesh.character_mesh import CharacterMesh, compute_normals, merge_meshes
+from mapctl.mesh.mannequin import build_skin
 from mapctl.motion import Motion
 from mapctl.skeleton import Skeleton
 
@@ -38,8 +40,8 @@ def choose_name(path: Path, names: Sequence[str], wanted: str | None, what: str,
     """
     try:
         return find_name(path.name, names, wanted, what, several=several)
-    except LookupError as error:
-        raise FileFormatError(path, error.args[0]) from None
+    except Refusal as refusal:
+        raise FileFormatError(path, refusal.args[0]) from None
 
 
 def note_animation(chosen: CharacterPath, names: Collection[str], read: str | None) -> None:
@@ -120,6 +122,10 @@ class RestFrames:
         ends = {self.names[j]: tuple((end - self.positions[j]).tolist()) for j, end in end_positions.items()}
         return Skeleton(self.names, self.parents, torch.from_numpy(offsets), ends)
 
+    def rest_motion(self, skeleton: Skeleton, source: object) -> Motion:
+        """Return one frame of the rest pose."""
+        return self.to_motion(self.matrices()[None], _DEFAULT_FPS, skeleton, source)
+
     def to_motion(self, worlds: Array, fps: Fraction, skeleton: Skeleton, source: object) -> Motion:
         """Return the motion of world matrices (frames, joints, 4, 4) in the file's joint frames."""
         turns = torch.from_numpy(nearest_rotations(np.sign(self.scales)[:, None, None] * worlds[..., :3, :3]))
@@ -153,6 +159,17 @@ class RestFrames:
             moved[:, joint] = rotations.rotate(back, places[:, joint] - start) / scale
             turned[:, joint] = rotations.multiply(back, world[:, joint])
         return moved.numpy(), rotations.make_sign_continuous(turned).numpy()
+
+
+def build_frames(
+    path: Path, armature: str, names: Sequence[str], parents: tuple[int, ...], worlds: Array, outer: Array
+) -> RestFrames:
+    """Return `RestFrames.of` an armature's joints; FileFormatError names one that is stretched."""
+    try:
+        return RestFrames.of(tuple(names), parents, worlds, outer)
+    except UnevenScaleError as error:
+        what = f"armature {armature!r}: {error.args[0]}; apply it and export again"
+        raise FileFormatError(path, what) from None
 
 
 def split_scales(parents: tuple[int, ...], worlds: Array) -> tuple[Array, Array]:
@@ -396,20 +413,21 @@ def build_mesh(
     path: str | PathLike[str], armature: str, parts: Sequence[MeshPart], frames: RestFrames
 ) -> CharacterMesh:
     """Build the mesh of all parts in the rest pose. FileFormatError where there is none, or it is broken."""
-    found = [_build_part(path, part, frames) for part in parts if len(part.faces)]
+    found = [build_part(path, part, frames) for part in parts if len(part.faces)]
     if not found:
         raise FileFormatError(path, f"armature {armature!r} carries no triangles")
     return merge_meshes(found)
 
 
-def _build_part(path: str | PathLike[str], part: MeshPart, frames: RestFrames) -> CharacterMesh:
+def build_part(path: str | PathLike[str], part: MeshPart, frames: RestFrames) -> CharacterMesh:
+    """Build the mesh of one part in the rest pose. FileFormatError where it is broken."""
     count = len(part.points)
     if count > _MAX_VERTICES:
         raise FileFormatError(path, f"a mesh has {count} vertices, allowed are {_MAX_VERTICES}")
     for table in (part.points, part.matrices, part.rgba):
         if not np.isfinite(table).all() or np.abs(table).max(initial=0.0) > _LARGEST:
             raise FileFormatError(path, "its mesh holds numbers that are not finite, or too large")
-    if part.faces.min() < 0 or part.faces.max() >= count:
+    if part.faces.min(initial=0) < 0 or part.faces.max(initial=0) >= count:
         raise FileFormatError(path, f"a triangle names vertex {part.faces.max()} of {count}")
     if part.rows.min() < 0 or part.rows.max() >= len(part.joints):
         raise FileFormatError(path, f"a vertex names joint {part.rows.max()} of {len(part.joints)}")
@@ -423,3 +441,73 @@ def _build_part(path: str | PathLike[str], part: MeshPart, frames: RestFrames) -
     normals = compute_normals(vertices, part.faces)
     rest = frames.positions
     return CharacterMesh(vertices, normals, part.faces, part.rgba, part.joints[part.rows], part.shares, rest)
+
+
+_MOST_CARRIERS = 4  # joints of a vertex, as every engine takes them
+
+
+@dataclass(frozen=True, eq=False)
+class SkinnedBody:
+    """A body in its skeleton's rest pose: no joint is turned and the root is at the origin."""
+
+    name: str
+    """What it is: the mannequin, or a character's own mesh."""
+    rest: Array
+    """(joints, 3) joints, metres."""
+    vertices: Array
+    """(n, 3) metres."""
+    normals: Array
+    """(n, 3) unit."""
+    faces: Array
+    """(m, 3) vertex indices, counter-clockwise seen from outside."""
+    linear_rgb: Array
+    """(n, 3) colours, 0 to 1, in proportion to light as both formats want them."""
+    joints: Array
+    """(n, k) indices of the joints that move a vertex, at most four."""
+    weights: Array
+    """(n, k) their shares; each vertex's add up to 1."""
+
+
+def build_skinned_body(motion: Motion) -> SkinnedBody:
+    """Build the body of a motion: the mesh of the character that it is of, with a colour at every vertex, where that
+    came from a file of another format; else the mannequin."""
+    rest, mesh = _rest_positions(motion), _load_own_mesh(motion)
+    if mesh is not None:
+        joints, weights = _strongest(mesh)
+        vertices, rgb = mesh.vertices - mesh.rest[0], mesh.rgba[:, :3]
+        return SkinnedBody("character", rest, vertices, mesh.normals, mesh.faces, decode_srgb(rgb), joints, weights)
+    body = build_skin(motion)
+    one = np.ones((len(body.joint), 1))
+    vertices = body.vertices + rest[body.joint]
+    return SkinnedBody(
+        "mannequin", rest, vertices, body.normals, body.faces, decode_srgb(body.rgb), body.joint[:, None], one
+    )
+
+
+def _load_own_mesh(motion: Motion) -> CharacterMesh | None:
+    """Load the mesh of the character's file; None for other motions, and for files without triangles."""
+    source = motion.source
+    if not isinstance(source, CharacterSource) or not source.holds(motion) or source.has_new_root:
+        return None
+    from mapctl.formats import load_mesh
+
+    try:
+        source.check_unchanged()
+        return load_mesh(source.choice)
+    except MapctlError:
+        return None
+
+
+def _strongest(mesh: CharacterMesh) -> tuple[Array, Array]:
+    """Return the strongest carriers of each vertex, and their shares, which add up to 1."""
+    order = np.argsort(-mesh.weights, axis=1, kind="stable")[:, :_MOST_CARRIERS]
+    joints, weights = (np.take_along_axis(table, order, axis=1) for table in (mesh.joints, mesh.weights))
+    return joints, weights / weights.sum(axis=1, keepdims=True)
+
+
+def _rest_positions(motion: Motion) -> Array:
+    """Return joint positions (joints, 3), metres, with all rotations zero and the root at the origin."""
+    offsets, rest = motion.skeleton.offsets.numpy(), np.zeros((motion.num_joints, 3))
+    for joint, parent in enumerate(motion.skeleton.parents):
+        rest[joint] = offsets[joint] + rest[parent] if parent >= 0 else 0.0
+    return rest

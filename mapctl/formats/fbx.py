@@ -1,6 +1,5 @@
 """FBX in, by the package ufbx: characters and captures, as rigs and as clips. FBX is not written."""
 
-from fractions import Fraction
 from importlib.util import find_spec
 from os import PathLike
 
@@ -10,7 +9,7 @@ from mapctl.errors import FileFormatError
 from mapctl.formats import sandbox
 from mapctl.formats.character import (
     RestFrames,
-    UnevenScaleError,
+    build_frames,
     build_mesh,
     check_size,
     complete_bind_pose,
@@ -21,17 +20,10 @@ from mapctl.formats.character import (
     place_joints,
 )
 from mapctl.formats.parts import CharacterPath, parse_character_path
-from mapctl.formats.text import MAX_POSES, check_ordinary, warn_once
+from mapctl.formats.text import check_ordinary, warn_once
 from mapctl.mesh.character_mesh import CharacterMesh
 from mapctl.motion import Motion
 from mapctl.skeleton import Skeleton
-
-_REST_FPS = Fraction(30)
-
-
-def is_installed() -> bool:
-    """Return whether the package is installed."""
-    return find_spec("ufbx") is not None
 
 
 def load(path: str | PathLike[str]) -> Motion:
@@ -44,21 +36,22 @@ def load(path: str | PathLike[str]) -> Motion:
     chosen, found = _read(path, "motion")
     frames, skeleton = _read_skeleton(chosen, found)
     note_animation(chosen, found.animations, found.animation)
+    source = describe_source(chosen, found, frames, frames.names)
     if found.take is None:
-        return _rest_motion(chosen, found, frames, skeleton)
+        return frames.rest_motion(skeleton, source)
     outer = np.eye(4) + np.zeros((1, 4, 4))
     for one in np.moveaxis(compose_transforms(chosen.file, found.take.above), 1, 0):
         outer = outer @ one
     local = compose_transforms(chosen.file, found.take.local)
     worlds = place_joints(chosen.file, frames.parents, local, outer)
-    source = describe_source(chosen, found, frames, frames.names)
     return frames.to_motion(worlds, frame_rate_of(found.take.rate), skeleton, source)
 
 
 def load_rest(path: str | PathLike[str]) -> Motion:
     """Read one frame of the rest pose, as `load` reads an animation."""
     chosen, found = _read(path, "rest")
-    return _rest_motion(chosen, found, *_read_skeleton(chosen, found))
+    frames, skeleton = _read_skeleton(chosen, found)
+    return frames.rest_motion(skeleton, describe_source(chosen, found, frames, frames.names))
 
 
 def load_mesh(path: str | PathLike[str]) -> CharacterMesh:
@@ -71,13 +64,13 @@ def load_mesh(path: str | PathLike[str]) -> CharacterMesh:
 def _read(path: str | PathLike[str], wanted: str):
     """Return what the path chooses, and the `fbx_scene.FbxCharacter` of it."""
     chosen = parse_character_path(path)
-    if not is_installed():
+    if find_spec("ufbx") is None:
         raise FileFormatError(chosen.file, "FBX needs the package ufbx: pip install 'mapctl[fbx]'")
     check_ordinary(chosen.file)
     from mapctl.formats.fbx_scene import read_character
 
     options = {"armature": chosen.armature, "animation": chosen.animation, "wanted": wanted}
-    found = sandbox.call(read_character, chosen.file, most_poses=MAX_POSES, **options)
+    found = sandbox.call(read_character, chosen.file, **options)
     if found.fault:
         warn_once(f"{chosen.file}: {found.fault}; its joints and motion are read")
     return chosen, found
@@ -94,16 +87,7 @@ def _read_skeleton(chosen: CharacterPath, found) -> tuple[RestFrames, Skeleton]:
         if complete is not None:
             worlds = complete
             break
-    try:
-        frames = RestFrames.of(tuple(found.names), parents, worlds, found.outer)
-    except UnevenScaleError as error:
-        what = f"armature {found.armature!r}: {error.args[0]}; apply it and export again"
-        raise FileFormatError(chosen.file, what) from None
+    frames = build_frames(chosen.file, found.armature, found.names, parents, worlds, found.outer)
     rests = frames.matrices()
     tips = {joint: (rests[joint] @ np.append(end, 1.0))[:3] for joint, end in found.ends.items()}
     return frames, frames.skeleton(tips)
-
-
-def _rest_motion(chosen: CharacterPath, found, frames: RestFrames, skeleton: Skeleton) -> Motion:
-    source = describe_source(chosen, found, frames, frames.names)
-    return frames.to_motion(frames.matrices()[None], _REST_FPS, skeleton, source)

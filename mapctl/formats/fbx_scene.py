@@ -22,6 +22,7 @@ from mapctl.formats.parts import (
     strongest,
 )
 from mapctl.formats.sandbox import Refusal
+from mapctl.formats.text import MAX_POSES
 
 Array = np.ndarray
 NEWEST, OLDEST = 7799, 3000
@@ -56,18 +57,13 @@ class FbxCharacter(FoundCharacter):
     """The animation."""
 
 
-def read_character(
-    path: str, *, armature: str | None, animation: str | None, wanted: str, most_poses: int
-) -> FbxCharacter:
-    """Read an armature, and `wanted` besides: `rest` nothing, `motion` its animation, of at most so many frames times
-    joints, `mesh` its triangles. Refusal says why not."""
+def read_character(path: str, *, armature: str | None, animation: str | None, wanted: str) -> FbxCharacter:
+    """Read an armature, and `wanted` besides: `rest` nothing, `motion` its animation, `mesh` its triangles. Refusal
+    says why not."""
     scene, fault = open_scene(path, with_mesh=wanted == "mesh")
     armatures = find_armatures(scene)
     names = [one.name for one in armatures]
-    try:
-        own = armatures[find_name(Path(path).name, names, armature, "armature", several=False)]
-    except LookupError as error:
-        raise Refusal(error.args[0]) from None
+    own = armatures[find_name(Path(path).name, names, armature, "armature", several=False)]
     root = own.nodes[0]
     found = FbxCharacter(
         armature=own.name,
@@ -83,7 +79,7 @@ def read_character(
     )
     if wanted == "motion":
         found.animations = time_takes(scene, own)
-        found.take = read_take(scene, own, animation, most_poses)
+        found.take = read_take(scene, own, animation)
         found.animation = found.take and found.take.name
     if wanted == "mesh":
         found.parts = read_parts(scene, own, Path(path).resolve().parent)
@@ -323,20 +319,17 @@ def time_takes(scene: ufbx.Scene, armature: Armature) -> dict[str, float]:
     return {name: end - begin for name, (begin, end) in spans.items()}
 
 
-def read_take(scene: ufbx.Scene, armature: Armature, wanted: str | None, most_poses: int) -> Take | None:
+def read_take(scene: ufbx.Scene, armature: Armature, wanted: str | None) -> Take | None:
     """Read the wanted animation, or the first that moves the armature; None where none does."""
     takes, own = _name_takes(scene), _own_elements(armature)
     if wanted is not None:
-        try:
-            find_name("", list(takes), wanted, "animation", several=True)
-        except LookupError as error:
-            raise Refusal(error.args[0]) from None
+        find_name("", list(takes), wanted, "animation", several=True)
         if not _moved_nodes(takes[wanted]) & own:
             raise Refusal(f"animation {wanted!r} does not move {armature.name!r}")
-        return _sample(scene, takes[wanted], wanted, armature, most_poses)
+        return _sample(scene, takes[wanted], wanted, armature)
     for name, stack in takes.items():
         if _moved_nodes(stack) & own:
-            return _sample(scene, stack, name, armature, most_poses)
+            return _sample(scene, stack, name, armature)
     return None
 
 
@@ -361,7 +354,7 @@ def _moved_nodes(stack: ufbx.AnimStack) -> set[int]:
     }
 
 
-def _sample(scene: ufbx.Scene, stack: ufbx.AnimStack, name: str, armature: Armature, most_poses: int) -> Take:
+def _sample(scene: ufbx.Scene, stack: ufbx.AnimStack, name: str, armature: Armature) -> Take:
     outer = line_of(armature.nodes[0])[:0:-1]
     rate = scene.settings.frames_per_second
     rate = rate if np.isfinite(rate) and 0.01 <= rate <= 1e5 else _USUAL_RATE
@@ -370,8 +363,8 @@ def _sample(scene: ufbx.Scene, stack: ufbx.AnimStack, name: str, armature: Armat
         raise Refusal(f"animation {name!r} lasts from {begin:g} to {end:g} s")
     count = np.floor((end - begin) * rate + _EARLY_SHARE) + 1
     joints = len(armature.nodes) + len(outer)
-    if count * joints > most_poses:
-        raise Refusal(f"{count:.0f} frames of {joints} joints, allowed are {most_poses} in all")
+    if count * joints > MAX_POSES:
+        raise Refusal(f"{count:.0f} frames of {joints} joints, allowed are {MAX_POSES} in all")
     times = begin + np.arange(int(count)) / rate
     moved = _moved_nodes(stack)
     anim = stack.anim

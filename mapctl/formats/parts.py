@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
+from mapctl.formats.sandbox import Refusal
+
 Array = np.ndarray
 _MAX_NAMED = 8
 MOST_CARRIERS = 8
@@ -54,16 +56,16 @@ def make_unique(names: Sequence[str]) -> list[str]:
 def find_name(file: str, names: Sequence[str], wanted: str | None, what: str, *, several: bool) -> int:
     """Return the index of the wanted name, or of the only or first one; `what` is `armature` or `animation`.
 
-    LookupError lists the names where none is the wanted one, or several are there and one must be chosen: FILE#NAME.
+    Refusal lists the names where none is the wanted one, or several are there and one must be chosen: FILE#NAME.
     """
     listed = ", ".join(repr(name) for name in names[:_MAX_NAMED]) + (" ..." if len(names) > _MAX_NAMED else "")
     example = f"{file}#{names[0] if what == 'armature' else '/' + names[0]}" if names else ""
     if wanted is not None:
         if wanted in names:
             return names.index(wanted)
-        raise LookupError(f"has no {what} {wanted!r}; it has {listed or 'none'}")
+        raise Refusal(f"has no {what} {wanted!r}; it has {listed or 'none'}")
     if len(names) > 1 and not several:
-        raise LookupError(f"has {len(names)} {what}s: {listed}; choose one, as {example}")
+        raise Refusal(f"has {len(names)} {what}s: {listed}; choose one, as {example}")
     return 0
 
 

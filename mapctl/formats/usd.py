@@ -22,6 +22,7 @@ from mapctl.formats.character import (
     CharacterSource,
     RestFrames,
     UnevenScaleError,
+    build_frames,
     build_mesh,
     character_of,
     check_size,
@@ -36,13 +37,12 @@ from mapctl.formats.character import (
     split_scales,
 )
 from mapctl.formats.parts import CharacterPath, make_unique, parse_character_path
-from mapctl.formats.text import MAX_FILE_BYTES, MAX_POSES, check_extent, check_ordinary
+from mapctl.formats.text import check_extent, check_ordinary
 from mapctl.mesh.character_mesh import CharacterMesh
 from mapctl.motion import Motion
 from mapctl.skeleton import Skeleton
 
 Array = np.ndarray
-_REST_FPS = Fraction(30)
 _FASTEST_CODES = 240
 """Time codes per second up to which each is a frame; more are parts of frames."""
 
@@ -70,7 +70,7 @@ def load(path: str | PathLike[str]) -> Motion:
     frames = _read_frames(chosen, found)
     note_animation(chosen, found.animations, found.animation)
     if found.poses is None:
-        return _rest_motion(chosen, found, frames)
+        return frames.rest_motion(frames.skeleton({}), _source(chosen, found, frames))
     seconds, local, outers = found.poses.seconds, found.poses.local, found.poses.outer
     fps, times = _choose_times(chosen, seconds, found.per_second, len(frames.names))
     check_size(chosen.file, outers)
@@ -80,14 +80,14 @@ def load(path: str | PathLike[str]) -> Motion:
     if len(frames.names) > local.shape[1]:
         local = np.concatenate([np.tile(np.eye(4), (len(times), 1, 1, 1)), local], axis=1)
     worlds = place_joints(chosen.file, frames.parents, local, outers)
-    source = _source(chosen, found, frames)
-    return frames.to_motion(worlds, fps, frames.skeleton({}), source)
+    return frames.to_motion(worlds, fps, frames.skeleton({}), _source(chosen, found, frames))
 
 
 def load_rest(path: str | PathLike[str]) -> Motion:
     """Read one frame of the rest pose, as `load` reads an animation."""
     chosen, found = _read(path, "rest")
-    return _rest_motion(chosen, found, _read_frames(chosen, found))
+    frames = _read_frames(chosen, found)
+    return frames.rest_motion(frames.skeleton({}), _source(chosen, found, frames))
 
 
 def load_mesh(path: str | PathLike[str]) -> CharacterMesh:
@@ -140,8 +140,7 @@ def _read(path: str | PathLike[str], wanted: str):
     from mapctl.formats.usd_stage import read_character
 
     options = {"armature": chosen.armature, "animation": chosen.animation, "wanted": wanted}
-    bounds = {"most_poses": MAX_POSES, "most_bytes": MAX_FILE_BYTES}
-    return chosen, sandbox.call(read_character, chosen.file, **options, **bounds)
+    return chosen, sandbox.call(read_character, chosen.file, **options)
 
 
 def _read_frames(chosen: CharacterPath, found) -> RestFrames:
@@ -158,11 +157,7 @@ def _read_frames(chosen: CharacterPath, found) -> RestFrames:
         bind, rest = (None if table is None else np.concatenate([np.eye(4)[None], table]) for table in (bind, rest))
     worlds = _choose_rest(chosen, tuple(parents), bind, rest, (found.outer, found.stage))
     check_size(chosen.file, worlds)
-    try:
-        return RestFrames.of(tuple(make_unique(names)), tuple(parents), worlds, found.outer)
-    except UnevenScaleError as error:
-        what = f"skeleton {found.armature!r}: {error.args[0]}; apply it and export again"
-        raise FileFormatError(chosen.file, what) from None
+    return build_frames(chosen.file, found.armature, make_unique(names), tuple(parents), worlds, found.outer)
 
 
 def _choose_rest(
@@ -200,11 +195,6 @@ def _split(chosen: CharacterPath, matrices: Array) -> Array:
     return np.concatenate([matrices[:, :3, 3], turns.numpy(), scales], axis=1)[:, None]
 
 
-def _rest_motion(chosen: CharacterPath, found, frames: RestFrames) -> Motion:
-    source = _source(chosen, found, frames)
-    return frames.to_motion(frames.matrices()[None], _REST_FPS, frames.skeleton({}), source)
-
-
 def _source(chosen: CharacterPath, found, frames: RestFrames) -> CharacterSource:
     """Return where the motion is from; its nodes are PRIM.JOINT, of a root that was added PRIM alone."""
     added = [found.path] * (len(frames.names) - len(found.joints))
@@ -225,11 +215,11 @@ def save(motion: Motion, path: str | PathLike[str]) -> None:
     source = character_of(motion, PurePath(path).suffix)
     if source is not None:
         return _save_character(motion, path, source)
-    from mapctl.formats import usd_mannequin
+    from mapctl.formats.usd_stage import build_stage, export
 
-    stage = usd_mannequin.build_stage(motion, joint_paths(motion.skeleton))
+    stage = build_stage(motion, joint_paths(motion.skeleton))
     with atomic_path(path) as scratch:
-        usd_mannequin.export(stage, scratch)
+        export(stage, scratch)
 
 
 def _save_character(motion: Motion, path: str | PathLike[str], source: CharacterSource) -> None:
@@ -251,8 +241,7 @@ def _save_character(motion: Motion, path: str | PathLike[str], source: Character
     )
     folder = str(target.resolve().parent)
     with atomic_path(path) as scratch:
-        options = {"scratch": str(scratch), "folder": folder, "most_bytes": MAX_FILE_BYTES}
-        unwritten = sandbox.call(write_character, source.path, motion=new, **options)
+        unwritten = sandbox.call(write_character, source.path, motion=new, scratch=str(scratch), folder=folder)
         if unwritten:
             raise OSError(unwritten)
 

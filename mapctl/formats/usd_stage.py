@@ -1,15 +1,18 @@
-"""USD files by the package usd-core: skeletons, animations, triangles as arrays; and characters written.
+"""USD files by the package usd-core: skeletons, animations, triangles as arrays; characters and mannequins written.
 
-Without torch, for `mapctl.formats.sandbox`.
+Readers are without torch, for `mapctl.formats.sandbox`.
 """
 
 # The package loads its modules at run time and declares no types.
 # pyright: reportAttributeAccessIssue=false
 
+import errno
 import os
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from pxr import Ar, Gf, Sdf, Tf, Usd, UsdGeom, UsdShade, UsdSkel, UsdUtils, Vt
@@ -27,8 +30,16 @@ from mapctl.formats.parts import (
     strongest,
 )
 from mapctl.formats.sandbox import Refusal
+from mapctl.formats.text import MAX_FILE_BYTES, MAX_POSES
+
+if TYPE_CHECKING:  # the sandbox has no torch
+    from mapctl.formats.character import SkinnedBody
+    from mapctl.motion import Motion
+    from mapctl.skeleton import Skeleton
 
 Array = np.ndarray
+_ROOT = "/character"
+_WRITE_FAULT = re.compile(r"rror occurred writing file: (.+?)'")
 _MAX_LAYERS = 1000
 _REASON = re.compile(r"in file \S+ : '(.+?)'?\s*$", re.MULTILINE)
 ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
@@ -65,13 +76,11 @@ class UsdCharacter(FoundCharacter):
     """The animation."""
 
 
-def read_character(
-    path: str, *, armature: str | None, animation: str | None, wanted: str, most_poses: int, most_bytes: int
-) -> UsdCharacter:
-    """Read a skeleton, and `wanted` besides: `rest` nothing, `motion` its animation, of at most so many frames times
-    joints, `mesh` its triangles; layers have at most `most_bytes`. Refusal says why not."""
+def read_character(path: str, *, armature: str | None, animation: str | None, wanted: str) -> UsdCharacter:
+    """Read a skeleton, and `wanted` besides: `rest` nothing, `motion` its animation, `mesh` its triangles. Refusal says
+    why not."""
     try:
-        stage = open_stage(path, most_bytes)
+        stage = open_stage(path)
         name, skeleton = choose_skeleton(stage, Path(path).name, armature)
         found = UsdCharacter(
             armature=name,
@@ -89,7 +98,7 @@ def read_character(
         )
         if wanted == "motion":
             found.animations = time_animations(stage, skeleton)
-            found.poses = read_animation(stage, skeleton, animation, most_poses)
+            found.poses = read_animation(stage, skeleton, animation)
             found.animation = found.poses and found.poses.name
         if wanted == "mesh":
             found.parts = read_parts(stage, skeleton, Path(path).resolve().parent)
@@ -98,11 +107,11 @@ def read_character(
         raise Refusal(f"is no sound USD file: {first_reason(error)}") from None
 
 
-def open_stage(path: str, most_bytes: int) -> Usd.Stage:
+def open_stage(path: str) -> Usd.Stage:
     """Open a file with all that it refers to. Refusal where it is broken, or names layers that are not there, lie
-    elsewhere, or are larger than `most_bytes`."""
+    elsewhere, or are larger than files may be."""
     root = open_layer(path)
-    check_layers(root, Path(path).resolve().parent, most_bytes)
+    check_layers(root, Path(path).resolve().parent)
     try:
         stage = Usd.Stage.Open(root)
     except Tf.ErrorException as error:
@@ -123,7 +132,7 @@ def open_layer(path: str) -> Sdf.Layer:
     return layer
 
 
-def check_layers(root: Sdf.Layer, folder: Path, most_bytes: int) -> None:
+def check_layers(root: Sdf.Layer, folder: Path) -> None:
     """Refuse layers that the root layer names, or those name, unless they are sound files in the folder."""
     waiting, seen = [root], {root.identifier}
     while waiting:
@@ -135,7 +144,7 @@ def check_layers(root: Sdf.Layer, folder: Path, most_bytes: int) -> None:
             seen.add(full)
             if len(seen) > _MAX_LAYERS:
                 raise Refusal(f"is made of more than {_MAX_LAYERS} layers")
-            _check_file(name, full, folder, most_bytes)
+            _check_file(name, full, folder)
             if "#" not in name:
                 waiting.append(open_layer(full))
 
@@ -168,7 +177,7 @@ def _named_layers(layer: Sdf.Layer) -> set[str]:
     return found
 
 
-def _check_file(name: str, full: str, folder: Path, most_bytes: int) -> None:
+def _check_file(name: str, full: str, folder: Path) -> None:
     if not is_inside(full, folder):
         raise Refusal(f"names {name!r}, which is not in its folder; such files are not read")
     if "#" in name:  # the pattern of value clips, which USD looks for where it leads
@@ -177,8 +186,8 @@ def _check_file(name: str, full: str, folder: Path, most_bytes: int) -> None:
     file = Path(outer)
     if not file.is_file() or (inner and not Ar.GetResolver().Resolve(full)):
         raise Refusal(f"names {name!r}, which is not there")
-    if file.stat().st_size > most_bytes:
-        raise Refusal(f"names {name!r}, which has {file.stat().st_size >> 20} MiB, allowed are {most_bytes >> 20}")
+    if file.stat().st_size > MAX_FILE_BYTES:
+        raise Refusal(f"names {name!r}, which has {file.stat().st_size >> 20} MiB, allowed are {MAX_FILE_BYTES >> 20}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,10 +219,7 @@ def find_skeletons(stage: Usd.Stage) -> tuple[list[str], list[Usd.Prim]]:
 def choose_skeleton(stage: Usd.Stage, file: str, wanted: str | None) -> tuple[str, SkeletonPrim]:
     """Return the wanted or only skeleton and its name; Refusal names them where there are several."""
     names, prims = find_skeletons(stage)
-    try:
-        number = find_name(file, names, wanted, "armature", several=False)
-    except LookupError as error:
-        raise Refusal(error.args[0]) from None
+    number = find_name(file, names, wanted, "armature", several=False)
     return names[number], read_skeleton(prims[number])
 
 
@@ -326,16 +332,13 @@ def name_animations(stage: Usd.Stage, skeleton: SkeletonPrim) -> tuple[list[str]
     return make_unique([prim.GetName() for prim in found]), found, bool(bound and found[:1] == [bound])
 
 
-def read_animation(stage: Usd.Stage, skeleton: SkeletonPrim, wanted: str | None, most_poses: int) -> Animation | None:
+def read_animation(stage: Usd.Stage, skeleton: SkeletonPrim, wanted: str | None) -> Animation | None:
     """Read the wanted animation, or the one that is bound to the skeleton; None where none is."""
     names, prims, bound = name_animations(stage, skeleton)
     if wanted is None and not bound:
         return None
-    try:
-        number = find_name("", names, wanted, "animation", several=True)
-    except LookupError as error:
-        raise Refusal(error.args[0]) from None
-    return _sample(stage, skeleton, prims[number], names[number], most_poses)
+    number = find_name("", names, wanted, "animation", several=True)
+    return _sample(stage, skeleton, prims[number], names[number])
 
 
 def time_animations(stage: Usd.Stage, skeleton: SkeletonPrim) -> dict[str, float]:
@@ -369,7 +372,7 @@ def _attributes_of(prim: Usd.Prim) -> list[Usd.Attribute]:
     return [animation.GetTranslationsAttr(), animation.GetRotationsAttr(), animation.GetScalesAttr()]
 
 
-def _sample(stage: Usd.Stage, skeleton: SkeletonPrim, prim: Usd.Prim, name: str, most_poses: int) -> Animation:
+def _sample(stage: Usd.Stage, skeleton: SkeletonPrim, prim: Usd.Prim, name: str) -> Animation:
     animation, attributes, what = UsdSkel.Animation(prim), _attributes_of(prim), f"animation {name!r}"
     codes = {code for attribute in attributes for code in attribute.GetTimeSamples()}
     placed = animated_placement(skeleton.prim)
@@ -379,10 +382,10 @@ def _sample(stage: Usd.Stage, skeleton: SkeletonPrim, prim: Usd.Prim, name: str,
     codes |= set(placed)
     if codes and not np.isfinite(sum(codes)):
         raise Refusal(f"{what} has times that are not finite")
-    _check_extent(len(codes), len(skeleton.joints), most_poses)
+    _check_extent(len(codes), len(skeleton.joints))
     if placed:
-        span = range(int(np.ceil(min(codes))), int(min(np.floor(max(codes)), min(codes) + most_poses)) + 1)
-        _check_extent(len(span), len(skeleton.joints), most_poses)
+        span = range(int(np.ceil(min(codes))), int(min(np.floor(max(codes)), min(codes) + MAX_POSES)) + 1)
+        _check_extent(len(span), len(skeleton.joints))
         codes |= {float(code) for code in span}
     times = np.array(sorted(codes) or [0.0])
     local = _sample_joints(skeleton, animation, attributes, times, what)
@@ -634,12 +637,9 @@ def _read_array(attribute: Usd.Attribute, width: int, dtype: type) -> Array:
     return np.array([] if value is None else value, dtype).reshape(-1, width)
 
 
-# The package loads its modules at run time and declares no types.
-
-
-def _check_extent(frames: int, joints: int, most: int) -> None:
-    if frames * joints > most:
-        raise Refusal(f"{frames} frames of {joints} joints, allowed are {most} in all")
+def _check_extent(frames: int, joints: int) -> None:
+    if frames * joints > MAX_POSES:
+        raise Refusal(f"{frames} frames of {joints} joints, allowed are {MAX_POSES} in all")
 
 
 @dataclass(eq=False, kw_only=True)
@@ -666,11 +666,11 @@ class NewMotion:
     """(4, 4) what takes the skeleton's space to the world, as it was read."""
 
 
-def write_character(path: str, *, motion: NewMotion, scratch: str, folder: str, most_bytes: int) -> str:
+def write_character(path: str, *, motion: NewMotion, scratch: str, folder: str) -> str:
     """Write a character's file with a motion to `scratch`, which is for a `folder`; all else of it stays as it is.
     Return why that cannot be, empty where it was written."""
     try:
-        stage = open_stage(path, most_bytes)
+        stage = open_stage(path)
     except (Tf.ErrorException, UnicodeDecodeError) as error:
         raise Refusal(f"is no sound USD file: {first_reason(error)}") from None
     try:
@@ -832,3 +832,109 @@ def _set_extent(prim: Usd.Prim, places: Array) -> None:
 
 
 # The package loads its modules at run time and declares no types.
+
+
+def build_stage(motion: "Motion", joints: Sequence[str]) -> Usd.Stage:
+    """Build a stage in memory: skeleton, animation and skinned mannequin; `joints` are the joints' paths. Not for the
+    sandbox: it needs torch."""
+    from mapctl.formats.character import build_skinned_body
+
+    stage, rate = Usd.Stage.CreateInMemory(), float(motion.fps)
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    stage.SetTimeCodesPerSecond(rate)
+    stage.SetFramesPerSecond(rate)
+    stage.SetStartTimeCode(0)
+    stage.SetEndTimeCode(motion.num_frames - 1)
+    top = UsdSkel.Root.Define(stage, _ROOT)
+    stage.SetDefaultPrim(top.GetPrim())
+    body = build_skinned_body(motion)
+    skeleton = _define_skeleton(stage, motion.skeleton, joints, body.rest)
+    animation = _define_animation(stage, motion, joints)
+    UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets([animation.GetPath()])
+    mesh = _define_mesh(stage, body)
+    UsdSkel.BindingAPI.Apply(mesh).CreateSkeletonRel().SetTargets([skeleton.GetPath()])
+    _set_whole_extent(top, motion)
+    if motion.licence:
+        stage.GetRootLayer().customLayerData = {"licence": motion.licence}
+    return stage
+
+
+def export(stage: Usd.Stage, scratch: Path) -> None:
+    """Export the stage; OSError where it cannot be written: USD's own error has many lines, the reason among them."""
+    try:
+        written = stage.GetRootLayer().Export(str(scratch))
+    except RuntimeError as error:
+        found = _WRITE_FAULT.search(str(error))
+        reason = found[1] if found else "USD cannot write there"
+        number = next((number for number in (errno.ENOSPC, errno.EDQUOT) if os.strerror(number) == reason), None)
+        raise OSError(number, reason) from error
+    if not written:
+        raise OSError("USD does not say why")
+
+
+def _define_skeleton(
+    stage: Usd.Stage, skeleton: "Skeleton", joints: Sequence[str], rest: np.ndarray
+) -> UsdSkel.Skeleton:
+    made = UsdSkel.Skeleton.Define(stage, f"{_ROOT}/skeleton")
+    made.CreateJointsAttr(joints)
+    made.CreateJointNamesAttr(list(skeleton.names))
+    made.CreateBindTransformsAttr(Vt.Matrix4dArray.FromNumpy(_translation_matrices(rest)))
+    offsets = skeleton.offsets.numpy().copy()
+    offsets[0] = 0.0
+    made.CreateRestTransformsAttr(Vt.Matrix4dArray.FromNumpy(_translation_matrices(offsets)))
+    return made
+
+
+def _translation_matrices(places: np.ndarray) -> np.ndarray:
+    """Return (n, 4, 4) translation matrices; USD's vectors are rows, so the translation is the last row."""
+    matrices = np.tile(np.eye(4), (len(places), 1, 1))
+    matrices[:, 3, :3] = places
+    return matrices
+
+
+def _define_animation(stage: Usd.Stage, motion: "Motion", joints: Sequence[str]) -> UsdSkel.Animation:
+    from mapctl.formats.bvh import all_translations, as_array
+    from mapctl.rotations import make_sign_continuous
+
+    made = UsdSkel.Animation.Define(stage, f"{_ROOT}/motion")
+    made.CreateJointsAttr(joints)
+    made.CreateScalesAttr(Vt.Vec3hArray.FromNumpy(np.ones((len(joints), 3), np.float16)))
+    places = all_translations(motion).astype(np.float32)
+    turns = as_array(make_sign_continuous(motion.local_quat_xyzw)).astype(np.float32)
+    moved, turned = made.CreateTranslationsAttr(), made.CreateRotationsAttr()
+    if not motion.moving_offsets and (places[:, 0] == places[0, 0]).all():
+        moved.Set(Vt.Vec3fArray.FromNumpy(places[0]))
+    else:
+        for frame, values in enumerate(places):
+            moved.Set(Vt.Vec3fArray.FromNumpy(values), frame)
+    for frame, values in enumerate(turns):
+        turned.Set(Vt.QuatfArray.FromNumpy(values), frame)  # from imaginary parts and then the real one, as ours
+    return made
+
+
+def _define_mesh(stage: Usd.Stage, body: "SkinnedBody"):
+    made = UsdGeom.Mesh.Define(stage, f"{_ROOT}/{body.name}")
+    made.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(body.vertices.astype(np.float32)))
+    made.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(body.faces), 3, np.int32)))
+    made.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(body.faces.reshape(-1).astype(np.int32)))
+    made.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(body.normals.astype(np.float32)))
+    made.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+    made.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    made.CreateExtentAttr([Gf.Vec3f(*corner.tolist()) for corner in (body.vertices.min(0), body.vertices.max(0))])
+    colour = made.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
+    colour.Set(Vt.Vec3fArray.FromNumpy(body.linear_rgb.astype(np.float32)))
+    binding = UsdSkel.BindingAPI.Apply(made.GetPrim())
+    width = body.joints.shape[1]
+    joints, weights = body.joints.reshape(-1).astype(np.int32), body.weights.reshape(-1).astype(np.float32)
+    binding.CreateJointIndicesPrimvar(False, width).Set(Vt.IntArray.FromNumpy(joints))
+    binding.CreateJointWeightsPrimvar(False, width).Set(Vt.FloatArray.FromNumpy(weights))
+    binding.CreateGeomBindTransformAttr(Gf.Matrix4d(1.0))
+    return made.GetPrim()
+
+
+def _set_whole_extent(top: UsdSkel.Root, motion: "Motion") -> None:
+    """Set the extent of the whole trajectory, an arm's length around the joints; viewers frame the character by it."""
+    places = motion.joint_positions().numpy().reshape(-1, 3)
+    corners = places.min(0) - _MARGIN, places.max(0) + _MARGIN
+    top.CreateExtentAttr([Gf.Vec3f(*corner.tolist()) for corner in corners])

@@ -1,7 +1,6 @@
 """Files of glTF 2.0: the JSON document and its buffers, from .glb and .vrm (one file) or .gltf with files beside it.
 
-The document is read as plain dictionaries: pygltflib, which writes the mannequin, takes
-seconds to read one of a thousand accessors.
+The document is read and written as plain dictionaries: pygltflib takes seconds to read one of a thousand accessors.
 """
 
 import base64

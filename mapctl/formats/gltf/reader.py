@@ -14,7 +14,8 @@ from mapctl.errors import FileFormatError
 from mapctl.formats.character import (
     CharacterSource,
     RestFrames,
-    UnevenScaleError,
+    build_frames,
+    build_part,
     chain_matrices,
     choose_name,
     complete_bind_pose,
@@ -23,9 +24,28 @@ from mapctl.formats.character import (
     sample_times,
     stamp_file,
 )
-from mapctl.formats.gltf.document import GltfFile, Json, read_accessor, read_file, refuse_malformed
-from mapctl.formats.parts import CharacterPath, make_unique, parse_character_path
+from mapctl.formats.gltf.document import (
+    GltfFile,
+    Json,
+    read_accessor,
+    read_file,
+    read_neighbour,
+    read_view,
+    refuse_malformed,
+)
+from mapctl.formats.parts import (
+    CharacterPath,
+    MeshPart,
+    decode_picture,
+    decode_srgb,
+    encode_srgb,
+    make_unique,
+    parse_character_path,
+    sample_picture,
+)
 from mapctl.formats.text import check_extent
+from mapctl.mesh.character_mesh import CharacterMesh, merge_meshes
+from mapctl.mesh.character_mesh import MOST_CELLS, Refinement, choose_cell, refine
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL, Skeleton
 
@@ -33,8 +53,8 @@ Array = np.ndarray
 LICENCE = "licence"
 """Key of the asset's extras under which mapctl writes the licence of a motion."""
 _MAX_JOINTS = 4096
+_TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _WIDTHS = {"translation": "VEC3", "rotation": "VEC4", "scale": "VEC3"}
-_REST_FPS = Fraction(30)
 ANIMATION = "VRMC_vrm_animation"
 """Extension of a file that holds the animation of a humanoid alone."""
 _EXTENSIONS = "VRMC_vrm", ANIMATION
@@ -158,7 +178,7 @@ def load(path: str | PathLike[str]) -> Motion:
     frames, skeleton = read_skeleton(gltf, armature)
     found = _find_animation(gltf, armature, chosen)
     if found is None:
-        return _rest_motion(gltf, armature, frames, skeleton)
+        return frames.rest_motion(skeleton, _source(gltf, armature, frames, None))
     name, tracks = found
     source = replace(_source(gltf, armature, frames, name), animations=time_animations(gltf, armature.nodes))
     note_animation(chosen, source.animations, name)
@@ -171,7 +191,8 @@ def load(path: str | PathLike[str]) -> Motion:
 def load_rest(path: str | PathLike[str]) -> Motion:
     """Read one frame of a character's rest pose, as `load` reads its animation."""
     _, gltf, armature = open_character(path)
-    return _rest_motion(gltf, armature, *read_skeleton(gltf, armature))
+    frames, skeleton = read_skeleton(gltf, armature)
+    return frames.rest_motion(skeleton, _source(gltf, armature, frames, None))
 
 
 def open_character(path: str | PathLike[str]) -> tuple[CharacterPath, GltfFile, Armature]:
@@ -219,11 +240,6 @@ def _read_licence(gltf: GltfFile) -> str:
     return found if isinstance(found, str) else ""
 
 
-def _rest_motion(gltf: GltfFile, armature: Armature, frames: RestFrames, skeleton: Skeleton) -> Motion:
-    source = _source(gltf, armature, frames, None)
-    return frames.to_motion(frames.matrices()[None], _REST_FPS, skeleton, source)
-
-
 def _source(gltf: GltfFile, armature: Armature, frames: RestFrames, animation: str | None) -> CharacterSource:
     return CharacterSource(
         gltf.path.resolve(),
@@ -267,11 +283,7 @@ def read_rest_frames(gltf: GltfFile, armature: Armature) -> RestFrames:
     local = np.stack([node_matrix(gltf.get("nodes", node)) for node in armature.nodes])
     outer = tree.outer_matrix(armature.nodes[0])
     worlds = chain_matrices(armature.parents, local, outer)
-    try:
-        frames = RestFrames.of(names, armature.parents, worlds, outer)
-    except UnevenScaleError as error:
-        what = f"armature {armature.name!r}: {error.args[0]}; apply it and export again"
-        raise FileFormatError(gltf.path, what) from None
+    frames = build_frames(gltf.path, armature.name, names, armature.parents, worlds, outer)
     bound = None if is_vrm(gltf) else _bind_worlds(gltf, armature, worlds, outer)
     return frames if bound is None else RestFrames.of(names, armature.parents, bound, outer)
 
@@ -536,3 +548,192 @@ def select_canonical(bones: Mapping[str, str]) -> dict[str, str]:
     canonical chest where a file has one."""
     chest = {"chest": bones["upperChest"]} if "upperChest" in bones else {}
     return {name: own for name, own in {**bones, **chest}.items() if name in CANONICAL.names}
+
+
+@dataclass(frozen=True, eq=False)
+class Paint:
+    """What gives a primitive its colours."""
+
+    linear: Array
+    """(n, 4) factor at each vertex in proportion to light, and opacity."""
+    places: Array | None
+    """(n, 2) where in the picture vertices are, 0 to 1 across and down; None without a picture."""
+    picture: Array | None
+    """(height, width, 4) sRGB, 0 to 255."""
+    blended: bool
+    """Whether one sees through what is not opaque."""
+
+    def colours(self, corners: Array, shares: Array) -> Array:
+        """Return the colours (n, 4), sRGB and opacity, 0 to 1, of points on triangles: see `refinement.Paint`."""
+        linear = np.einsum("nc,nck->nk", shares, self.linear[corners])
+        light = linear[:, :3]
+        if self.places is not None and self.picture is not None:
+            texels = sample_picture(self.picture, np.einsum("nc,nck->nk", shares, self.places[corners]))
+            light, linear[:, 3] = light * decode_srgb(texels[:, :3]), linear[:, 3] * texels[:, 3]
+        rgba = np.column_stack([encode_srgb(light), linear[:, 3]])
+        if not self.blended:
+            rgba[:, 3] = 1.0
+        return rgba.clip(0.0, 1.0)
+
+    def at_vertices(self) -> Array:
+        """Return the colours of the vertices, (n, 4)."""
+        corners = np.repeat(np.arange(len(self.linear))[:, None], 3, axis=1)
+        return self.colours(corners, np.tile([1.0, 0.0, 0.0], (len(corners), 1)))
+
+    def coarsen(self, vertices: Array, faces: Array, cell: float) -> "Paint":
+        """Average what of the picture lies within cells of this length, metres, on the triangles, so that points
+        between which there is more show no noise."""
+        if self.picture is None or self.places is None:
+            return self
+        size = np.array(self.picture.shape[1::-1])
+        corners, inside = vertices[faces], size * self.places[faces]
+        lengths, texels = (np.linalg.norm(at - np.roll(at, 1, axis=1), axis=2).sum() for at in (corners, inside))
+        factor = int(min(cell * texels / max(lengths, 1e-9), *(size / 4)))
+        return self if factor < 2 else replace(self, picture=_shrink(self.picture, factor))
+
+
+@refuse_malformed
+def load_mesh(path: str | PathLike[str]) -> CharacterMesh:
+    """Read the mesh of a character: what its skins carry, and what hangs on its joints rigidly. `path` chooses as in
+    `load`. FileFormatError where the file has no triangles for the armature, or they are broken."""
+    _, gltf, armature = open_character(path)
+    frames, _ = read_skeleton(gltf, armature)
+    tree, place = NodeTree(gltf), {node: joint for joint, node in enumerate(armature.nodes)}
+    found: list[CharacterMesh] = []
+    for number, node in enumerate(gltf.all("nodes")):
+        mesh, skin = node.get("mesh"), node.get("skin")
+        if mesh is None:
+            continue
+        if skin is not None and skin in armature.skins:
+            joints = np.array([place[node] for node in gltf.get("skins", skin)["joints"]])
+            inverse = read_inverse_binds(gltf, skin)
+            matrices = np.tile(np.eye(4), (len(joints), 1, 1)) if inverse is None else inverse
+        else:
+            line = tree.line(number)
+            above = next((above for above in line if above in place), None)
+            if above is None or skin is not None:
+                continue
+            joints, matrix = np.array([place[above]]), np.eye(4)
+            for below in reversed(line[: line.index(above)]):
+                matrix = matrix @ node_matrix(gltf.get("nodes", below))
+            matrices = matrix[None]
+        for k, primitive in enumerate(gltf.get("meshes", mesh).get("primitives", ())):
+            what = f"meshes[{mesh}].primitives[{k}]"
+            if primitive.get("mode", 4) not in (_TRIANGLES, _STRIP, _FAN) or "POSITION" not in primitive["attributes"]:
+                continue
+            points = read_accessor(gltf, primitive["attributes"]["POSITION"], "VEC3").astype(np.float64)
+            rows, shares = np.zeros((len(points), 1), np.int64), np.ones((len(points), 1))
+            if skin is not None:
+                rows, shares = _read_carriers(gltf, primitive, len(joints), len(points), what)
+            faces, plain = _read_faces(gltf, primitive, len(points), what), np.ones((len(points), 4))
+            placed = build_part(gltf.path, MeshPart(points, faces, plain, joints, matrices, rows, shares), frames)
+            rgba, fine = _read_colours(gltf, primitive, placed.vertices, faces, what)
+            found.append(replace(placed, rgba=rgba, fine=fine))
+    if not found:
+        raise FileFormatError(gltf.path, f"armature {armature.name!r} carries no triangles")
+    return merge_meshes(found)
+
+
+def _read_colours(
+    gltf: GltfFile, primitive: Json, vertices: Array, faces: Array, what: str
+) -> tuple[Array, Refinement | None]:
+    """Return the vertices' colours, and finer triangles where a picture shows more than these can."""
+    paint = read_paint(gltf, primitive, len(vertices), what)
+    if paint.picture is None or not len(faces):
+        return paint.at_vertices(), None
+    share = MOST_CELLS // sum(len(mesh.get("primitives", ())) for mesh in gltf.all("meshes"))
+    wrong, cell = choose_cell(vertices, faces, paint.colours, share)
+    if not wrong.any():
+        return paint.at_vertices(), None
+    paint = paint.coarsen(vertices, faces, cell)
+    return paint.at_vertices(), refine(vertices, faces, wrong, cell, paint.colours)
+
+
+def _read_carriers(gltf: GltfFile, primitive: Json, known: int, count: int, what: str) -> tuple[Array, Array]:
+    """Return by vertex the indices among a skin's `known` joints and their shares, (n, k) each."""
+    joints, weights = [], []
+    for number in range(4):
+        if f"JOINTS_{number}" in primitive["attributes"] and f"WEIGHTS_{number}" in primitive["attributes"]:
+            joints.append(read_accessor(gltf, primitive["attributes"][f"JOINTS_{number}"], "VEC4"))
+            weights.append(read_accessor(gltf, primitive["attributes"][f"WEIGHTS_{number}"], "VEC4").astype(np.float64))
+    if not joints:
+        raise FileFormatError(gltf.path, f"{what} has a skin and no JOINTS_0 and WEIGHTS_0")
+    own, shares = np.concatenate(joints, axis=1).astype(np.int64), np.concatenate(weights, axis=1)
+    if own.shape != shares.shape or len(own) != count:
+        raise FileFormatError(gltf.path, f"{what} has {count} vertices and {len(own)} rows of joints")
+    own = np.where(shares > 0, own, 0)
+    if own.min() < 0 or own.max() >= known:
+        raise FileFormatError(gltf.path, f"{what} names joint {own.max()} of a skin of {known}")
+    total = shares.sum(axis=1, keepdims=True)
+    shares[total[:, 0] <= 0, 0] = 1.0
+    return own, shares / np.where(total > 0, total, 1.0)
+
+
+def _read_faces(gltf: GltfFile, primitive: Json, count: int, what: str) -> Array:
+    order = (
+        np.arange(count)
+        if primitive.get("indices") is None
+        else read_accessor(gltf, primitive["indices"], "SCALAR")[:, 0]
+    )
+    order = order.astype(np.int64)
+    if len(order) and (order.min() < 0 or order.max() >= count):
+        raise FileFormatError(gltf.path, f"{what} names vertex {order.max()} of {count}")
+    mode = primitive.get("mode", 4)
+    if mode == _TRIANGLES:
+        return order[: len(order) // 3 * 3].reshape(-1, 3)
+    if mode == _STRIP:
+        faces = np.stack([order[:-2], order[1:-1], order[2:]], axis=1)
+        faces[1::2] = faces[1::2, ::-1]
+        return faces
+    return np.stack([np.full(max(len(order) - 2, 0), order[0]), order[1:-1], order[2:]], axis=1)
+
+
+def read_paint(gltf: GltfFile, primitive: Json, count: int, what: str) -> Paint:
+    """Read what gives a primitive of `count` vertices its colours.
+
+    Without the package pillow, or of a kind that it does not know, a picture's place is taken by the material's plain
+    colour.
+    """
+    material = {} if primitive.get("material") is None else gltf.get("materials", primitive["material"])
+    look, blended = material.get("pbrMetallicRoughness", {}), material.get("alphaMode") == "BLEND"
+    linear = np.tile(np.array(look.get("baseColorFactor", (1.0, 1.0, 1.0, 1.0)), np.float64), (count, 1))
+    if "COLOR_0" in primitive["attributes"]:
+        own = read_accessor(gltf, primitive["attributes"]["COLOR_0"], "VEC3", "VEC4").astype(np.float64)
+        if len(own) != count:
+            raise FileFormatError(gltf.path, f"{what} has {count} vertices and {len(own)} colours")
+        linear[:, : own.shape[1]] *= own
+    texture = look.get("baseColorTexture")
+    shown = None if texture is None else _read_shown(gltf, primitive, texture, count)
+    places, picture = (None, None) if shown is None else shown
+    return Paint(linear, places, picture, blended)
+
+
+def _read_shown(gltf: GltfFile, primitive: Json, info: Json, count: int) -> tuple[Array, Array] | None:
+    """Return where the vertices are in the picture, and the picture; None where it cannot be read."""
+    name = f"TEXCOORD_{info.get('texCoord', 0)}"
+    if name not in primitive["attributes"]:
+        return None
+    picture = _read_picture(gltf, info["index"])
+    if picture is None:
+        return None
+    where = read_accessor(gltf, primitive["attributes"][name], "VEC2").astype(np.float64)
+    if len(where) != count:
+        raise FileFormatError(gltf.path, f"{name} has {len(where)} rows for {count} vertices")
+    return where, picture
+
+
+def _shrink(picture: Array, factor: int) -> Array:
+    """Average squares of so many texels; what is left over at the edges counts as the last square's."""
+    height, width = (side // factor for side in picture.shape[:2])
+    squares = picture[: height * factor, : width * factor].reshape(height, factor, width, factor, 4)
+    return squares.mean(axis=(1, 3))
+
+
+def _read_picture(gltf: GltfFile, texture: int) -> Array | None:
+    source = gltf.get("textures", texture).get("source")
+    if source is None:
+        return None
+    image = gltf.get("images", source)
+    if image.get("uri") is not None:
+        return decode_picture(read_neighbour(gltf.path, image["uri"]))
+    return None if image.get("bufferView") is None else decode_picture(bytes(read_view(gltf, image["bufferView"])))

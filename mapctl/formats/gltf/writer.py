@@ -11,17 +11,15 @@ from os import PathLike
 from pathlib import Path, PurePath
 
 import numpy as np
-import pygltflib
 import torch
 
 from mapctl import kinematics, rotations
 from mapctl.errors import RequestError
-from mapctl.formats.atomic import write_bytes, write_pieces
+from mapctl.formats.atomic import write_pieces
 from mapctl.formats.bvh import check_finite
-from mapctl.formats.character import CharacterSource, character_of, compose_matrices, split_scale
+from mapctl.formats.character import CharacterSource, build_skinned_body, character_of, compose_matrices, split_scale
 from mapctl.formats.gltf.document import GltfFile, Json, compose_glb, read_file, read_neighbour, refuse_malformed
 from mapctl.formats.gltf.reader import ANIMATION, LICENCE, name_animations, read_bones
-from mapctl.formats.skinned import SkinnedBody, build_skinned_body
 from mapctl.formats.text import warn_once
 from mapctl.motion import Motion
 from mapctl.rotations import make_sign_continuous
@@ -32,7 +30,8 @@ Array = np.ndarray
 _STILL = 1e-6  # metres and quaternion components that vary less than this need one key
 _MIME = {b"\x89PNG": "image/png", b"\xff\xd8\xff": "image/jpeg", b"RIFF": "image/webp", b"\xabKTX": "image/ktx2"}
 _KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
-_COMPONENT = {"float32": pygltflib.FLOAT, "uint16": pygltflib.UNSIGNED_SHORT, "uint32": pygltflib.UNSIGNED_INT}
+_COMPONENT = {"float32": 5126, "uint16": 5123, "uint32": 5125}
+_ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
 _THUMBS = {"ThumbProximal": "ThumbMetacarpal", "ThumbIntermediate": "ThumbProximal"}
 """Bones of VRM 0 that have another name in VRM 1."""
 _HALF_TURN = torch.tensor([0.0, 1.0, 0.0, 0.0], dtype=torch.float64)
@@ -54,7 +53,7 @@ def save(motion: Motion, path: str | PathLike[str]) -> None:
     if ending == ".vrm" and (source is None or not source.humanoid):
         raise RequestError(f"cannot write {path}: a .vrm needs a character, as by --rig hero.vrm")
     if source is None:
-        write_bytes(path, to_bytes(motion, path=path))
+        write_pieces(path, _compose(motion))
     else:
         _save_character(motion, path, source)
 
@@ -68,7 +67,7 @@ def _save_character(motion: Motion, path: str | PathLike[str], source: Character
     """
     source.check_unchanged()
     gltf, tree, binary = _gather(source.path)
-    appended = _Appended(tree, sum(len(piece) for piece in binary))
+    appended = _Arrays(tree, sum(len(piece) for piece in binary))
     nodes = [int(node) for node in source.nodes]
     if source.has_new_root:
         nodes[0] = _add_node_above(tree, nodes[1], source.frames.names[0])
@@ -129,21 +128,24 @@ def _embed_image(gltf: GltfFile, tree: Json, image: Json, pieces: list[bytes], s
     return size + len(data) + -len(data) % 4
 
 
-class _Appended:
+class _Arrays:
     """Arrays that are added to a document and its buffer."""
 
     def __init__(self, tree: Json, size: int):
         self.tree, self.size, self.pieces = tree, size, list[bytes]()
 
-    def add(self, values: Array) -> int:
-        """Add numbers, (n,) or (n, width), with least and greatest; return the index of the new accessor."""
-        table = np.ascontiguousarray(values, np.float32).reshape(len(values), -1)
+    def add(self, values: Array, target: int | None = None) -> int:
+        """Add numbers, (n,) or (n, width), floats with 32 bits, with least and greatest; return the index of the new
+        accessor."""
+        table = np.ascontiguousarray(values, np.float32 if values.dtype.kind == "f" else None).reshape(len(values), -1)
         views, accessors = self.tree.setdefault("bufferViews", []), self.tree.setdefault("accessors", [])
         views.append({"buffer": 0, "byteOffset": self.size, "byteLength": table.nbytes})
+        if target is not None:
+            views[-1]["target"] = target
         accessors.append(
             {
                 "bufferView": len(views) - 1,
-                "componentType": 5126,
+                "componentType": _COMPONENT[table.dtype.name],
                 "count": len(table),
                 "type": _KINDS[table.shape[1]],
                 "min": table.min(0).tolist(),
@@ -156,7 +158,7 @@ class _Appended:
 
 
 def _build_character_animation(
-    motion: Motion, source: CharacterSource, nodes: Sequence[int], tree: Json, appended: _Appended, name: str
+    motion: Motion, source: CharacterSource, nodes: Sequence[int], tree: Json, appended: _Arrays, name: str
 ) -> Json:
     moved, turned = source.frames.to_locals(motion)
     times = np.arange(motion.num_frames) / float(motion.fps)
@@ -173,12 +175,7 @@ def _build_character_animation(
             if constant and path == "translation" and np.allclose(values[0], usual, rtol=1e-6, atol=1e-6):
                 continue
             output = appended.add(values[:1] if constant else values)
-            animation["channels"].append(
-                {"sampler": len(animation["samplers"]), "target": {"node": node, "path": path}}
-            )
-            animation["samplers"].append(
-                {"input": still if constant else every, "output": output, "interpolation": "LINEAR"}
-            )
+            _add_channel(animation, node, path, still if constant else every, output)
     return animation
 
 
@@ -215,89 +212,40 @@ def _use_parts(node: Json) -> None:
     node["scale"] = [scale] * 3
 
 
-class _Buffer:
-    """The one binary buffer of a file, filled array by array."""
-
-    def __init__(self, document: pygltflib.GLTF2):
-        self.document, self.blob = document, bytearray()
-
-    def add(self, values: np.ndarray, target: int | None = None) -> int:
-        """Add values, (n,) or (n, width), with least and greatest; return the index of the new accessor."""
-        table = np.ascontiguousarray(values).reshape(len(values), -1)
-        view = pygltflib.BufferView(buffer=0, byteOffset=len(self.blob), byteLength=table.nbytes, target=target)
-        self.blob += table.tobytes()
-        self.blob += bytes(-len(self.blob) % 4)
-        self.document.bufferViews.append(view)
-        self.document.accessors.append(
-            pygltflib.Accessor(
-                bufferView=len(self.document.bufferViews) - 1,
-                componentType=_COMPONENT[table.dtype.name],
-                count=len(table),
-                type=_KINDS[table.shape[1]],
-                min=table.min(0).tolist(),
-                max=table.max(0).tolist(),
-            )
-        )
-        return len(self.document.accessors) - 1
+def _add_channel(animation: Json, node: int, path: str, times: int, values: int) -> None:
+    animation["channels"].append({"sampler": len(animation["samplers"]), "target": {"node": node, "path": path}})
+    animation["samplers"].append({"input": times, "output": values, "interpolation": "LINEAR"})
 
 
-def to_bytes(
-    motion: Motion,
-    *,
-    path: str | PathLike[str] = "a .glb file",
-    bones: Mapping[str, int] | None = None,
-    root_at_rest: list[float] | None = None,
-) -> bytes:
-    """Return the content of the file; `path` is what an error names.
+def _compose(
+    motion: Motion, bones: Mapping[str, int] | None = None, root_at_rest: list[float] | None = None
+) -> list[bytes]:
+    """Compose the pieces of a file on a mannequin.
 
     With `bones`, the joint by VRM's name of a bone, it is a VRM animation, without the mannequin; `root_at_rest` is
     then the position of the root in the T-pose, metres.
     """
-    if not (motion.root_position.isfinite().all() and motion.local_quat_xyzw.isfinite().all()):
-        raise RequestError(f"cannot write {path}: the motion is not finite")
-    told: Json = {"copyright": motion.licence, "extras": {LICENCE: motion.licence}} if motion.licence else {}
-    document = pygltflib.GLTF2(asset=pygltflib.Asset(version="2.0", generator=f"mapctl {__version__}", **told))
-    buffer = _Buffer(document)
-    document.nodes = _build_nodes(motion)
-    tops = [0]
+    licence: Json = {"copyright": motion.licence, "extras": {LICENCE: motion.licence}} if motion.licence else {}
+    tree: Json = {
+        "asset": {"version": "2.0", "generator": f"mapctl {__version__}", **licence},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": _build_nodes(motion),
+    }
+    arrays = _Arrays(tree, 0)
     if bones is None:
-        tops.append(_add_body(motion, document, buffer))
+        _add_body(motion, tree, arrays)
     else:
-        document.nodes[0].translation = root_at_rest
-        document.extensionsUsed = [ANIMATION]
+        tree["nodes"][0]["translation"] = root_at_rest
+        tree["extensionsUsed"] = [ANIMATION]
         humanoid = {"humanBones": {bone: {"node": node} for bone, node in bones.items()}}
-        document.extensions = {ANIMATION: {"specVersion": "1.0", "humanoid": humanoid}}
-    document.scene, document.scenes = 0, [pygltflib.Scene(nodes=tops)]
-    document.animations = [_build_animation(motion, buffer)]
-    document.buffers = [pygltflib.Buffer(byteLength=len(buffer.blob))]
-    document.set_binary_blob(bytes(buffer.blob))
-    return b"".join(document.save_to_bytes())
+        tree["extensions"] = {ANIMATION: {"specVersion": "1.0", "humanoid": humanoid}}
+    tree["animations"] = [_build_animation(motion, arrays)]
+    tree["buffers"] = [{"byteLength": arrays.size}]
+    return compose_glb(tree, arrays.pieces)
 
 
-def _add_body(motion: Motion, document: pygltflib.GLTF2, buffer: _Buffer) -> int:
-    """Add the skinned mesh of the motion's body; return its node."""
-    joints, body = motion.num_joints, build_skinned_body(motion)
-    document.meshes = [_build_mesh(body, buffer)]
-    inverse = np.tile(np.eye(4, dtype=np.float32), (joints, 1, 1))
-    inverse[:, 3, :3] = -body.rest  # column-major: the translation is the last row here
-    document.skins = [
-        pygltflib.Skin(
-            joints=list(range(joints)), skeleton=0, inverseBindMatrices=buffer.add(inverse.reshape(joints, 16))
-        )
-    ]
-    document.nodes.append(pygltflib.Node(name="mannequin", mesh=0, skin=0))
-    document.materials = [
-        pygltflib.Material(
-            name="mannequin",
-            pbrMetallicRoughness=pygltflib.PbrMetallicRoughness(
-                baseColorFactor=[1.0, 1.0, 1.0, 1.0], metallicFactor=0.0, roughnessFactor=0.8
-            ),
-        )
-    ]
-    return len(document.nodes) - 1
-
-
-def _build_nodes(motion: Motion) -> list[pygltflib.Node]:
+def _build_nodes(motion: Motion) -> list[Json]:
     """Build a node for each joint, in file order, then one for each End Site."""
     skeleton, offsets = motion.skeleton, motion.skeleton.offsets.clone()
     offsets[0] = motion.root_position[0]
@@ -307,43 +255,46 @@ def _build_nodes(motion: Motion) -> list[pygltflib.Node]:
     for number, name in enumerate(skeleton.end_offsets):
         below[skeleton.index(name)].append(motion.num_joints + number)
     joints = [
-        pygltflib.Node(name=name, children=children, translation=offset.tolist())
+        {"name": name, "translation": offset.tolist()} | ({"children": children} if children else {})
         for name, children, offset in zip(skeleton.names, below, offsets, strict=True)
     ]
-    ends = [pygltflib.Node(name=f"{name}_end", translation=list(at)) for name, at in skeleton.end_offsets.items()]
+    ends = [{"name": f"{name}_end", "translation": list(at)} for name, at in skeleton.end_offsets.items()]
     return [*joints, *ends]
 
 
-def _build_mesh(body: SkinnedBody, buffer: _Buffer) -> pygltflib.Mesh:
+def _add_body(motion: Motion, tree: Json, arrays: _Arrays) -> None:
+    """Add the skinned mesh of the motion's body."""
+    joints, body = motion.num_joints, build_skinned_body(motion)
     missing = ((0, 0), (0, 4 - body.joints.shape[1]))
-    carrier = np.pad(body.joints, missing).astype(np.uint16)
     weight = np.pad(body.weights, missing).astype(np.float32)
     weight /= weight.sum(axis=1, keepdims=True)
-    attributes = pygltflib.Attributes(
-        POSITION=buffer.add(body.vertices.astype(np.float32), pygltflib.ARRAY_BUFFER),
-        NORMAL=buffer.add(body.normals.astype(np.float32), pygltflib.ARRAY_BUFFER),
-        COLOR_0=buffer.add(body.linear_rgb.astype(np.float32), pygltflib.ARRAY_BUFFER),
-        JOINTS_0=buffer.add(carrier, pygltflib.ARRAY_BUFFER),
-        WEIGHTS_0=buffer.add(weight, pygltflib.ARRAY_BUFFER),
-    )
-    faces = buffer.add(body.faces.reshape(-1).astype(np.uint32), pygltflib.ELEMENT_ARRAY_BUFFER)
-    return pygltflib.Mesh(
-        name=body.name, primitives=[pygltflib.Primitive(attributes=attributes, indices=faces, material=0)]
-    )
+    columns = {
+        "POSITION": body.vertices,
+        "NORMAL": body.normals,
+        "COLOR_0": body.linear_rgb,
+        "JOINTS_0": np.pad(body.joints, missing).astype(np.uint16),
+        "WEIGHTS_0": weight,
+    }
+    attributes = {name: arrays.add(values, _ARRAY_BUFFER) for name, values in columns.items()}
+    faces = arrays.add(body.faces.reshape(-1).astype(np.uint32), _ELEMENT_ARRAY_BUFFER)
+    tree["meshes"] = [{"name": body.name, "primitives": [{"attributes": attributes, "indices": faces, "material": 0}]}]
+    inverse = np.tile(np.eye(4, dtype=np.float32), (joints, 1, 1))
+    inverse[:, 3, :3] = -body.rest  # column-major: the translation is the last row here
+    binds = arrays.add(inverse.reshape(joints, 16))
+    tree["skins"] = [{"joints": list(range(joints)), "skeleton": 0, "inverseBindMatrices": binds}]
+    look = {"baseColorFactor": [1.0, 1.0, 1.0, 1.0], "metallicFactor": 0.0, "roughnessFactor": 0.8}
+    tree["materials"] = [{"name": "mannequin", "pbrMetallicRoughness": look}]
+    tree["scenes"][0]["nodes"].append(len(tree["nodes"]))
+    tree["nodes"].append({"name": "mannequin", "mesh": 0, "skin": 0})
 
 
-def _build_animation(motion: Motion, buffer: _Buffer) -> pygltflib.Animation:
-    times = buffer.add((np.arange(motion.num_frames) / float(motion.fps)).astype(np.float32))
-    animation = pygltflib.Animation(name="motion", channels=[], samplers=[])
-    travelling = {0: motion.root_position, **motion.moving_offsets}
-    quats = make_sign_continuous(motion.local_quat_xyzw)
-    tracks = [(joint, "translation", values) for joint, values in travelling.items()]
-    tracks += [(joint, "rotation", quats[:, joint]) for joint in range(motion.num_joints)]
-    for joint, path, values in tracks:
-        output = buffer.add(values.numpy().astype(np.float32))
-        animation.samplers.append(pygltflib.AnimationSampler(input=times, output=output, interpolation="LINEAR"))
-        target = pygltflib.AnimationChannelTarget(node=joint, path=path)
-        animation.channels.append(pygltflib.AnimationChannel(sampler=len(animation.samplers) - 1, target=target))
+def _build_animation(motion: Motion, arrays: _Arrays) -> Json:
+    times = arrays.add(np.arange(motion.num_frames) / float(motion.fps))
+    animation: Json = {"name": "motion", "channels": [], "samplers": []}
+    for joint, values in {0: motion.root_position, **motion.moving_offsets}.items():
+        _add_channel(animation, joint, "translation", times, arrays.add(values.numpy()))
+    for joint, values in enumerate(make_sign_continuous(motion.local_quat_xyzw).unbind(1)):
+        _add_channel(animation, joint, "rotation", times, arrays.add(values.numpy()))
     return animation
 
 
@@ -356,7 +307,7 @@ def _save_bones(motion: Motion, path: str | PathLike[str]) -> None:
     body, hips = _select_bones(motion, bones, path)
     of_joint = {joint: bone for bone, joint in bones.items()}
     order = {of_joint[motion.skeleton.index(name)]: node for node, name in enumerate(body.skeleton.names)}
-    write_bytes(path, to_bytes(body, path=path, bones=order, root_at_rest=hips))
+    write_pieces(path, _compose(body, order, hips))
 
 
 def _find_bones(motion: Motion) -> dict[str, int]:
