@@ -3,17 +3,21 @@
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
+from importlib import import_module
+from importlib.util import find_spec
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
 from mapctl import kinematics, rotations
 from mapctl.errors import FileFormatError, MapctlError, RequestError
-from mapctl.formats.parts import CharacterPath, FoundCharacter, MeshPart, decode_srgb, find_name
+from mapctl.formats import sandbox
+from mapctl.formats.parts import CharacterPath, FoundCharacter, MeshPart, decode_srgb, find_name, parse_character_path
 from mapctl.formats.sandbox import Refusal
-from mapctl.formats.text import warn_once
+from mapctl.formats.text import check_ordinary, warn_once
 from mapctl.formats.units import FASTEST, frame_rate
 from mapctl.mesh.character_mesh import CharacterMesh, compute_normals, merge_meshes
 from mapctl.mesh.mannequin import build_skin
@@ -42,6 +46,19 @@ def choose_name(path: Path, names: Sequence[str], wanted: str | None, what: str,
         return find_name(path.name, names, wanted, what, several=several)
     except Refusal as refusal:
         raise FileFormatError(path, refusal.args[0]) from None
+
+
+def read_native(
+    path: str | PathLike[str], wanted: str, *, reader: str, package: str, needed: str
+) -> tuple[CharacterPath, Any]:
+    """Return what a path chooses, and what the native reader of that module of this package finds of it: `wanted` is
+    `rest`, `motion` or `mesh`. FileFormatError says what is `needed` where the reader's package is not installed."""
+    chosen = parse_character_path(path)
+    if find_spec(package) is None:
+        raise FileFormatError(chosen.file, needed)
+    check_ordinary(chosen.file)
+    options = {"armature": chosen.armature, "animation": chosen.animation, "wanted": wanted}
+    return chosen, sandbox.call(import_module(f"mapctl.formats.{reader}").read_character, chosen.file, **options)
 
 
 def note_animation(chosen: CharacterPath, names: Collection[str], read: str | None) -> None:

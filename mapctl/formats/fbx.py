@@ -1,12 +1,9 @@
 """FBX in, by the package ufbx: characters and captures, as rigs and as clips. FBX is not written."""
 
-from importlib.util import find_spec
 from os import PathLike
 
 import numpy as np
 
-from mapctl.errors import FileFormatError
-from mapctl.formats import sandbox
 from mapctl.formats.character import (
     RestFrames,
     build_frames,
@@ -18,9 +15,10 @@ from mapctl.formats.character import (
     frame_rate_of,
     note_animation,
     place_joints,
+    read_native,
 )
-from mapctl.formats.parts import CharacterPath, parse_character_path
-from mapctl.formats.text import check_ordinary, warn_once
+from mapctl.formats.parts import CharacterPath
+from mapctl.formats.text import warn_once
 from mapctl.mesh.character_mesh import CharacterMesh
 from mapctl.motion import Motion
 from mapctl.skeleton import Skeleton
@@ -63,14 +61,8 @@ def load_mesh(path: str | PathLike[str]) -> CharacterMesh:
 
 def _read(path: str | PathLike[str], wanted: str):
     """Return what the path chooses, and the `fbx_scene.FbxCharacter` of it."""
-    chosen = parse_character_path(path)
-    if find_spec("ufbx") is None:
-        raise FileFormatError(chosen.file, "FBX needs the package ufbx: pip install 'mapctl[fbx]'")
-    check_ordinary(chosen.file)
-    from mapctl.formats.fbx_scene import read_character
-
-    options = {"armature": chosen.armature, "animation": chosen.animation, "wanted": wanted}
-    found = sandbox.call(read_character, chosen.file, **options)
+    needed = "FBX needs the package ufbx: pip install 'mapctl[fbx]'"
+    chosen, found = read_native(path, wanted, reader="fbx_scene", package="ufbx", needed=needed)
     if found.fault:
         warn_once(f"{chosen.file}: {found.fault}; its joints and motion are read")
     return chosen, found

@@ -6,6 +6,7 @@ Needs the package usd-core: pip install 'mapctl[usd]'.
 import re
 from dataclasses import replace
 from fractions import Fraction
+from functools import partial
 from importlib.util import find_spec
 from os import PathLike
 from pathlib import Path, PurePath
@@ -32,12 +33,13 @@ from mapctl.formats.character import (
     frame_rate_of,
     note_animation,
     place_joints,
+    read_native,
     sample_times,
     split_scale,
     split_scales,
 )
-from mapctl.formats.parts import CharacterPath, make_unique, parse_character_path
-from mapctl.formats.text import check_extent, check_ordinary
+from mapctl.formats.parts import CharacterPath, make_unique
+from mapctl.formats.text import check_extent
 from mapctl.mesh.character_mesh import CharacterMesh
 from mapctl.motion import Motion
 from mapctl.skeleton import Skeleton
@@ -45,6 +47,8 @@ from mapctl.skeleton import Skeleton
 Array = np.ndarray
 _FASTEST_CODES = 240
 """Time codes per second up to which each is a frame; more are parts of frames."""
+_NEEDED = "USD needs the package usd-core: pip install 'mapctl[usd]'"
+_read = partial(read_native, reader="usd_stage", package="pxr", needed=_NEEDED)
 
 
 def is_installed() -> bool:
@@ -55,7 +59,7 @@ def is_installed() -> bool:
 def check_installed(path: str | PathLike[str]) -> None:
     """Raise RequestError that names the extra if USD cannot be written here."""
     if not is_installed():
-        raise RequestError(f"cannot write {path}: USD needs the package usd-core: pip install 'mapctl[usd]'")
+        raise RequestError(f"cannot write {path}: {_NEEDED}")
 
 
 def load(path: str | PathLike[str]) -> Motion:
@@ -129,18 +133,6 @@ def _choose_times(chosen: CharacterPath, seconds: Array, per_second: float, join
     fps, times = sample_times(seconds)
     check_extent(chosen.file, len(times), joints)
     return fps, times
-
-
-def _read(path: str | PathLike[str], wanted: str):
-    """Return what the path chooses, and the `usd_stage.UsdCharacter` of it."""
-    chosen = parse_character_path(path)
-    if not is_installed():
-        raise FileFormatError(chosen.file, "USD needs the package usd-core: pip install 'mapctl[usd]'")
-    check_ordinary(chosen.file)
-    from mapctl.formats.usd_stage import read_character
-
-    options = {"armature": chosen.armature, "animation": chosen.animation, "wanted": wanted}
-    return chosen, sandbox.call(read_character, chosen.file, **options)
 
 
 def _read_frames(chosen: CharacterPath, found) -> RestFrames:
