@@ -11,8 +11,7 @@ from scenes.live import paths
 from scenes.live.camera import CameraMode
 from scenes.live.character import KEPT_SECONDS, ShownCharacter
 from scenes.live.inputs import DISC_RADII, HANDS, UNCONDITIONED, WITHIN, SteeringInputs
-from scenes.live.recording import FORMATS, Recorder, describe_length
-from scenes.live.timeline import Timeline
+from scenes.live.recording import FORMATS, Recorder, Timeline, describe_length
 
 if TYPE_CHECKING:
     from scenes.live.app import LiveApp

@@ -18,8 +18,8 @@ from mapctl.runtime.live_protocol import LiveCharacter
 from scenes.live.app import LiveApp
 from scenes.live.camera import CameraMode
 from scenes.live.character import CharacterLook
-from scenes.live.driving import KeyAction
 from scenes.live.ground import intersect_ground
+from scenes.live.inputs import KeyAction
 from scenes.live.page import Gamepad, PageState
 from scenes.live.recording import FORMATS, encode_motion, join_chunks, write_new
 

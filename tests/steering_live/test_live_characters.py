@@ -21,8 +21,7 @@ from mapctl.commands import live
 from mapctl.commands.live import Live
 from mapctl.motion import Motion
 from scenes.drawn_character import DrawnCharacter
-from scenes.live.bodies import SkinnedBody
-from scenes.live.character import CharacterLook, ShownCharacter
+from scenes.live.character import CharacterLook, ShownCharacter, SkinnedBody
 from scenes.live.recording import encode_motion, join_chunks
 
 

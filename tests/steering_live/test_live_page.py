@@ -15,8 +15,20 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from mapctl.intent.steering import Command
-from scenes.live.driving import ACTIONS, HELP, KEYS, Driving, DrivingOutputs, KeyAction, find_direction, list_presses
-from scenes.live.inputs import UNCONDITIONED, InputLimits, SteeringInputs, parse_point
+from scenes.live.inputs import (
+    ACTIONS,
+    HELP,
+    KEYS,
+    UNCONDITIONED,
+    Driving,
+    DrivingOutputs,
+    InputLimits,
+    KeyAction,
+    SteeringInputs,
+    find_direction,
+    list_presses,
+    parse_point,
+)
 from scenes.live.page import Gamepad, PageChannel, PageState, is_own_page, open_server, parse_state
 
 OWN = {"Host": "127.0.0.1:8080", "Origin": "http://127.0.0.1:8080", "Upgrade": "websocket"}
