@@ -14,8 +14,8 @@ from mapctl.errors import MapctlError
 from mapctl.features import PRIOR_FPS
 from mapctl.mesh import colours
 from mapctl.mesh.character_mesh import CharacterMesh
-from mapctl.mesh.primitives import Array
 from mapctl.mesh.mannequin import Skin, at_rest, build_skin
+from mapctl.mesh.primitives import Array
 from mapctl.motion import Motion
 from mapctl.retarget import RigMap
 from mapctl.runtime.live_protocol import FrameChunk, LiveCharacter

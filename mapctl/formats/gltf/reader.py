@@ -44,8 +44,7 @@ from mapctl.formats.parts import (
     sample_picture,
 )
 from mapctl.formats.text import check_extent
-from mapctl.mesh.character_mesh import CharacterMesh, merge_meshes
-from mapctl.mesh.character_mesh import MOST_CELLS, Refinement, choose_cell, refine
+from mapctl.mesh.character_mesh import MOST_CELLS, CharacterMesh, Refinement, choose_cell, merge_meshes, refine
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL, Skeleton
 
