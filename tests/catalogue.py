@@ -90,7 +90,7 @@ TERMS: dict[str, Term] = {
     "apart": KeepApart(0.2 * torch.rand(2, FRAMES, 2, generator=generator(3)).double() + 0.5, 1.5),
     "within reach": WithinReach(6, _FAR, torch.arange(FRAMES) % 2 == 1, 0.5),
 }
-"""Names for the tests' output to instances; at least one of every class in `mapctl.terms.ALL`."""
+"""Names for the tests' output to instances; at least one of every class in `mapctl.terms`."""
 
 
 def trial(batch=3, *, dtype=torch.float64, past=PAST, disturbed=0.05, seed=0):

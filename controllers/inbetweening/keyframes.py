@@ -9,7 +9,7 @@ or to him does not show, and is as the proposed pose has it.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -30,38 +30,22 @@ from mapctl.skeleton import CANONICAL, LIMBS, Skeleton
 from mapctl.solver import lbfgs
 from mapctl.solver.lbfgs import LbfgsSettings
 
-
-@dataclass(frozen=True)
-class FitSettings:
-    """Sigmas and search of the fit."""
-
-    sigma_drawn: float = 0.005
-    """Distance of a joint from where it is drawn, metres."""
-    sigma_pose_deg: float = 25.0
-    """Turn of a joint from the proposed pose, degrees."""
-    sigma_tilt_deg: float = 15.0
-    """Tilt of the hips from the proposed pose, degrees."""
-    sigma_range_deg: float = 3.0
-    """Turn of a joint beyond its range, degrees."""
-    sigma_size: float = 0.03
-    """Share by which a drawing is larger than its bones let it be."""
-    turns: int = 8
-    """Headings, evenly around, from which the search sets out."""
-    sigma_heading_deg: float = 45.0
-    """Turn from the proposed heading, degrees, by which among these answers is chosen where keys tell a heading."""
-    lbfgs: LbfgsSettings = field(
-        default_factory=lambda: LbfgsSettings(max_iterations=80, relative_energy_tolerance=1e-5)
-    )
-    """Search from each of them."""
+_SIGMA_DRAWN = 0.005  # metres of a joint from where it is drawn
+_SIGMA_POSE_DEG, _SIGMA_TILT_DEG = 25.0, 15.0  # degrees of a joint's turn, and the hips' tilt, from the proposed pose
+_SIGMA_RANGE_DEG = 3.0  # degrees of a joint's turn beyond its range
+_SIGMA_SIZE = 0.03  # share by which a drawing is larger than its bones let it be
+_TURNS = 8  # headings, evenly around, from which the search sets out
+_SIGMA_HEADING_DEG = 45.0  # degrees from the proposed heading, by which an answer is chosen where keys tell a heading
+_SEARCH = LbfgsSettings(max_iterations=80, relative_energy_tolerance=1e-5)
 
 
-def fit_drawings(motion: Motion, loose: LooseKeys, *, faced: bool, settings: FitSettings | None = None) -> Motion:
+def fit_drawings(motion: Motion, loose: LooseKeys, *, faced: bool) -> Motion:
     """Turn the joints of a canonical motion, in frames with drawings, until they look as drawn; `faced` says whether
     its headings are more than a guess. The lower foot then stands on the floor."""
-    settings, frames = settings or FitSettings(), loose.drawings.nonzero()[:, 0]
+    frames = loose.drawings.nonzero()[:, 0]
     root, quats = motion.root_position.clone(), motion.local_quat_xyzw.clone()
     for frame in frames.tolist():
-        fitted = _fit(motion.skeleton, quats[frame], _View.of(loose, frame, motion.skeleton), faced, settings)
+        fitted = _fit(motion.skeleton, quats[frame], _View.of(loose, frame, motion.skeleton), faced)
         quats[frame] = fitted
         root[frame, 1] = -measure_floor(_place_joints(motion.skeleton, fitted)[:, 1], motion.skeleton)
     return replace(motion, root_position=root, local_quat_xyzw=quats)
@@ -99,11 +83,9 @@ class _View:
         return _View(joints, target - target.mean(dim=0), view_axes(loose.view[frame]).double())
 
 
-def _fit(
-    skeleton: Skeleton, made: Float[Tensor, "joints 4"], view: _View, faced: bool, settings: FitSettings
-) -> Float[Tensor, "joints 4"]:
+def _fit(skeleton: Skeleton, made: Float[Tensor, "joints 4"], view: _View, faced: bool) -> Float[Tensor, "joints 4"]:
     """Fit one pose, from several headings at once, and return the best."""
-    count, joints = settings.turns, len(made)
+    count, joints = _TURNS, len(made)
     turns = torch.arange(count, dtype=made.dtype) * (2 * math.pi / count)
     start = made.expand(count, -1, -1).clone()
     start[:, 0] = rotations.multiply(rotations.about_y(turns), start[:, 0])
@@ -115,14 +97,14 @@ def _fit(
         turn, size = rows[:, :-1].unflatten(1, (joints, 3)), rows[:, -1]
         quats = rotations.multiply(start, rotations.from_rotation_vector(turn))
         seen = _place_joints(skeleton, quats)[:, view.joints] @ view.axes.mT
-        off = seen - seen.mean(dim=1, keepdim=True) - (settings.sigma_size * size).exp()[:, None, None] * view.target
+        off = seen - seen.mean(dim=1, keepdim=True) - (_SIGMA_SIZE * size).exp()[:, None, None] * view.target
         angles = ranges.to_angles(rotations.to_matrix(quats[:, 1:]))
         beyond = (ranges.find_excess(angles) - own).clamp_min(0)
         return 0.5 * (
-            (off / settings.sigma_drawn).square().sum(dim=(1, 2))
-            + (torch.rad2deg(turn[:, 1:]) / settings.sigma_pose_deg).square().sum(dim=(1, 2))
-            + (_tilt_deg(start[:, 0], quats[:, 0]) / settings.sigma_tilt_deg).square()
-            + (torch.rad2deg(beyond) / settings.sigma_range_deg).square().sum(dim=(1, 2))
+            (off / _SIGMA_DRAWN).square().sum(dim=(1, 2))
+            + (torch.rad2deg(turn[:, 1:]) / _SIGMA_POSE_DEG).square().sum(dim=(1, 2))
+            + (_tilt_deg(start[:, 0], quats[:, 0]) / _SIGMA_TILT_DEG).square()
+            + (torch.rad2deg(beyond) / _SIGMA_RANGE_DEG).square().sum(dim=(1, 2))
             + size.square()
         )
 
@@ -133,11 +115,11 @@ def _fit(
             (gradient,) = torch.autograd.grad(energy.sum(), rows)
         return energy.detach(), gradient
 
-    found = lbfgs.minimise(differentiate, unknowns, settings=settings.lbfgs)
+    found = lbfgs.minimise(differentiate, unknowns, settings=_SEARCH)
     turn = found.x[:, :-1].unflatten(1, (joints, 3))
     quats = rotations.multiply(start, rotations.from_rotation_vector(turn))
     away = torch.rad2deg(rotations.wrap_angle(heading(quats[:, 0]) - heading(made[:1])))
-    energy = found.energy + (0.5 * (away / settings.sigma_heading_deg).square() if faced else 0.0)
+    energy = found.energy + (0.5 * (away / _SIGMA_HEADING_DEG).square() if faced else 0.0)
     return quats[int(energy.argmin())]
 
 

@@ -6,16 +6,17 @@ step, and trunk and limbs that reach, with the MAP stage of all in-betweening be
 
 Spans of a shot joined into one motion: when the first step begins and which foot takes the last one.
 
-Both are choices with several basins: a few frames earlier another foot is in the air. What is tried is a grid, samples,
-a particle swarm, or the middle alone; what the in-betweener makes of it is judged as a viewer would.
+Both are choices with several basins: a few frames earlier another foot is in the air. A grid is tried; what the
+in-betweener makes of it is judged as a viewer would.
 """
 
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise, product
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -60,7 +61,6 @@ from mapctl.motion import Motion
 from mapctl.problem.solution import Ledger, Outcome, Solution, Status, WindowRecord
 from mapctl.protocols import Density, Inbetweener
 from mapctl.skeleton import CANONICAL, LIMBS, TOES, Skeleton
-from mapctl.solver.swarm import SwarmSettings, run_swarm
 from mapctl.terms import KeepApart, KeepClear, Term
 
 TAIL = 14
@@ -69,22 +69,6 @@ _STILL_START, _STILL_END = 12, 26  # frames of standing at least, where a shot b
 _SHORTEST = 12  # frames of a transition
 _HASTY = 20  # frames of a transition for which there is no room
 _SETTLED = 8  # frames that are left of a walk between two transitions
-_PARTICLES = 5
-
-Search = Literal["middle", "grid", "samples", "swarm"]
-"""How transitions are tried."""
-
-
-@dataclass(frozen=True)
-class JoinSettings:
-    """How transitions are tried."""
-
-    search: Search = "grid"
-    """Which."""
-    evaluations: int = 15
-    """Transitions that samples and swarm try, each."""
-    seed: int = 0
-    """Seed of samples and swarm."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,17 +106,16 @@ class _Room:
         return found if fits else None
 
 
-def join_pieces(
-    pieces: Sequence[Piece], inbetweener: Inbetweener, settings: JoinSettings | None = None
-) -> tuple[Motion, Bool[Tensor, " frames"]]:
+def join_pieces(pieces: Sequence[Piece], inbetweener: Inbetweener) -> tuple[Motion, Bool[Tensor, " frames"]]:
     """Join pieces by the transitions that cost least; also return the frames that the in-betweener is to make."""
-    settings = settings or JoinSettings()
     joined = pieces[0].motion
     missing = torch.zeros(joined.num_frames, dtype=torch.bool)
     earliest = 0
     for before, after in pairwise(pieces):
         room = _find_room(before.span, after.span, joined.num_frames, earliest)
-        chosen = _search(_CostOfTransitions(joined, after.motion, inbetweener), room, settings)
+        grid = [found for step, length in product(room.steps, room.lengths) if (found := room.lay(step, length))]
+        cost = partial(measure_transition_cost, joined, after.motion, inbetweener=inbetweener)
+        chosen = min(grid, key=cost) if len(grid) > 1 else grid[0] if grid else None
         if chosen is None:
             chosen = _lay_hasty_transition(before.span, after.span, joined.num_frames, earliest)
         joined = join_across(joined, after.motion, chosen)
@@ -154,64 +137,6 @@ def _find_room(before: Span, after: Span, frames: int, earliest: int) -> _Room:
     longest = after.start - (earliest if after.what == "walk" else before.stop)
     lengths = tuple(sorted({18, 26, longest}))
     return _Room(after.start, (0, 4, 8, 12, 16), lengths, True, earliest, latest)
-
-
-@dataclass(eq=False)
-class _CostOfTransitions:
-    """What each transition costs, measured once."""
-
-    before: Motion
-    """Motion that it leaves."""
-    after: Motion
-    """Motion that it leads to."""
-    inbetweener: Inbetweener
-    """That makes it."""
-
-    def __post_init__(self):
-        self.known: dict[Transition, float] = {}
-
-    def __call__(self, one: Transition) -> float:
-        if one not in self.known:
-            self.known[one] = measure_transition_cost(self.before, self.after, one, self.inbetweener)
-        return self.known[one]
-
-
-def _search(cost: _CostOfTransitions, room: _Room, settings: JoinSettings) -> Transition | None:
-    """Search a room for the transition that costs least; None where nothing fits."""
-    grid = [found for step, length in product(room.steps, room.lengths) if (found := room.lay(step, length))]
-    if len(grid) <= 1 or settings.search == "middle":
-        return grid[len(grid) // 2] if grid else None
-    if settings.search == "grid":
-        return min(grid, key=cost)
-    generator = torch.Generator().manual_seed(settings.seed)
-    low = torch.tensor([room.steps[0], room.lengths[0]], dtype=torch.float64)
-    high = torch.tensor([room.steps[-1], room.lengths[-1]], dtype=torch.float64)
-    if settings.search == "samples":
-        drawn = low + (high - low) * torch.rand(settings.evaluations, 2, generator=generator, dtype=torch.float64)
-        tried = [found for point in drawn.round().long().tolist() if (found := room.lay(*point))]
-        return min([grid[len(grid) // 2], *tried], key=cost)
-    return _fly(cost, room, (low, high), settings, generator) or grid[len(grid) // 2]
-
-
-def _fly(
-    cost: Callable[[Transition], float],
-    room: _Room,
-    bounds: tuple[Tensor, Tensor],
-    settings: JoinSettings,
-    generator: torch.Generator,
-) -> Transition | None:
-    """Search by a particle swarm over step and length, both in frames."""
-    low, high = bounds
-
-    def costs(points: Tensor) -> Tensor:
-        laid = [room.lay(*point) for point in points.round().long().tolist()]
-        return torch.tensor([torch.inf if one is None else cost(one) for one in laid], dtype=torch.float64)
-
-    swarm = SwarmSettings(particles=_PARTICLES, iterations=max(1, settings.evaluations // _PARTICLES))
-    found = run_swarm(
-        costs, start=(low + high) / 2, spread=(high - low) / 3, settings=swarm, bounds=bounds, generator=generator
-    )
-    return room.lay(*found.x.round().long().tolist())
 
 
 def _lay_hasty_transition(before: Span, after: Span, frames: int, earliest: int) -> Transition:
@@ -631,16 +556,6 @@ _CORNER_STEP, _CORNER_CURVATURE = 0.1, 1.5
 # metres between the places where a way's curvature is looked at, and the 1/m from which on it is a corner
 
 
-@dataclass(frozen=True)
-class ShotSettings:
-    """Settings of shots."""
-
-    follow: FollowSettings = field(default_factory=FollowSettings)
-    """Sigmas and search of the walks."""
-    join: JoinSettings = field(default_factory=JoinSettings)
-    """How transitions between standing and walking are tried."""
-
-
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class ShotSolution(Solution):
     """A shot's motion and what became of every wish."""
@@ -665,7 +580,7 @@ def solve_shot(
     request: ShotRequest,
     *,
     generator: torch.Generator | None = None,
-    settings: ShotSettings | None = None,
+    settings: FollowSettings | None = None,
     skeleton: Skeleton = CANONICAL,
     progress: Callable[[int, int], None] | None = None,
 ) -> ShotSolution:
@@ -674,8 +589,8 @@ def solve_shot(
     Wishes that do not hold are named with numbers in the status, which is then infeasible.
     """
     began = time.perf_counter()
-    settings, generator = settings or ShotSettings(), generator or torch.Generator().manual_seed(0)
-    character = Character(skeleton, settings.follow.footing.rest_height)
+    settings, generator = settings or FollowSettings(), generator or torch.Generator().manual_seed(0)
+    character = Character(skeleton, settings.footing.rest_height)
     way = plan_way(request)
     rest = build_rest_pose(prior, skeleton, character.toe_rest_height)
     told = as_reaches(request.poses, way, rest)
@@ -690,11 +605,11 @@ def solve_shot(
         walked_way,
         rest,
         character=character,
-        settings=_free_heels_at_corners(settings.follow, way),
+        settings=_free_heels_at_corners(settings, way),
         generator=generator,
         progress=progress,
     )
-    motion = _join_walks(pieces, request, way, inbetweener, settings.join)
+    motion = _join_walks(pieces, request, way, inbetweener)
     motion, reaches, met = _meet_keys(motion, request, way, inbetweener)
     wishes = check_wishes(replace(request, reaches=reaches), way, motion, met)
     notes = [way.note] if way.note else []
@@ -721,11 +636,9 @@ def _free_heels_at_corners(settings: FollowSettings, way: Way) -> FollowSettings
     return replace(settings, footing=replace(settings.footing, heels=None)) if cornered else settings
 
 
-def _join_walks(
-    pieces: Sequence[Piece], request: ShotRequest, way: Way, inbetweener: Inbetweener, settings: JoinSettings
-) -> Motion:
+def _join_walks(pieces: Sequence[Piece], request: ShotRequest, way: Way, inbetweener: Inbetweener) -> Motion:
     """Join stands and walks into one motion that goes on from, ends in, or comes round to what is asked for."""
-    motion, missing = join_pieces(pieces, inbetweener, settings)
+    motion, missing = join_pieces(pieces, inbetweener)
     if request.lead is not None:
         motion = go_on(motion, missing, request.lead, inbetweener)
     elif bool(missing.any()):

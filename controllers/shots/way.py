@@ -26,42 +26,28 @@ ClearanceOf = Callable[[Float[Tensor, "arcs offsets 2"], Float[Tensor, " arcs"]]
 """Ground points and their arcs to the distance by which they are clear, metres; negative where nobody may walk."""
 
 
-@dataclass(frozen=True)
-class DetourSettings:
-    """How far a detour may lead, and what it costs."""
-
-    widest: float = 3.0
-    """Largest sideways offset, metres."""
-    spacing: float = 0.05
-    """Metres between the arcs at which offsets are chosen."""
-    step: float = 0.025
-    """Metres between the offsets that are tried."""
-    steepest: float = 1.0
-    """Largest change of the offset per metre of arc."""
-    decay: float = 0.6
-    """Metres of arc over which an offset that is no longer needed falls by a factor of e."""
-    bend: float = 0.5
-    """Metres of arc over which a detour bends: the square root of what bending costs beside the offset."""
+_WIDEST, _OFFSET_STEP = 3.0, 0.025  # metres of the largest sideways offset, and between the offsets that are tried
+_ARC_SPACING = 0.05  # metres between the arcs at which offsets are chosen
+_STEEPEST = 1.0  # largest change of the offset per metre of arc
+_DECAY = 0.6  # metres of arc over which an offset that is no longer needed falls by a factor of e
+_DETOUR_BEND = 0.5  # metres of arc over which a detour bends: the root of what bending costs beside the offset
 
 
-def find_detour(
-    curve: Curve, clearance: ClearanceOf, settings: DetourSettings | None = None
-) -> Float[Tensor, " arcs"] | None:
-    """Find sideways offsets, metres to the left, at arcs `settings.spacing` apart, under which a curve keeps clear.
+def find_detour(curve: Curve, clearance: ClearanceOf) -> Float[Tensor, " arcs"] | None:
+    """Find sideways offsets, metres to the left, at arcs 5 cm apart, under which a curve keeps clear.
 
     Dynamic programming over the arcs: the sum of squared offsets and slopes is least among all ways on the grid, so
     that left or right of each obstacle is chosen for the whole way. The offset at the start is 0, and so is that at the
     end, where that is free. None where no way leads through.
     """
-    settings = settings or DetourSettings()
-    arcs = torch.linspace(0, curve.length, max(2, round(curve.length / settings.spacing) + 1), dtype=torch.float64)
-    count = 2 * round(settings.widest / settings.step) + 1
-    offsets = torch.linspace(-settings.widest, settings.widest, count, dtype=torch.float64)
+    arcs = torch.linspace(0, curve.length, max(2, round(curve.length / _ARC_SPACING) + 1), dtype=torch.float64)
+    count = 2 * round(_WIDEST / _OFFSET_STEP) + 1
+    offsets = torch.linspace(-_WIDEST, _WIDEST, count, dtype=torch.float64)
     free = _find_free(curve, arcs, offsets, clearance).numpy()
-    chosen = _choose_offsets(free, offsets.numpy(), settings)
+    chosen = _choose_offsets(free, offsets.numpy())
     if chosen is None:
         return None
-    return torch.from_numpy(_smooth_offsets(free, offsets.numpy(), chosen, settings))
+    return torch.from_numpy(_smooth_offsets(free, offsets.numpy(), chosen))
 
 
 def apply_detour(curve: Curve, offsets: Float[Tensor, " arcs"]) -> Curve:
@@ -101,16 +87,16 @@ def _find_free(curve: Curve, arcs: Tensor, offsets: Tensor, clearance: Clearance
     return clearance(_ground_points(curve, arcs, offsets.expand(len(arcs), -1)), arcs) >= 0
 
 
-def _choose_offsets(free: ndarray, offsets: ndarray, settings: DetourSettings) -> ndarray | None:
+def _choose_offsets(free: ndarray, offsets: ndarray) -> ndarray | None:
     """Choose the number of the cheapest offset at each arc; None where every way is blocked."""
-    reach = max(1, round(settings.steepest * settings.spacing / settings.step))
-    slopes = np.arange(-reach, reach + 1) * settings.step / settings.spacing
+    reach = max(1, round(_STEEPEST * _ARC_SPACING / _OFFSET_STEP))
+    slopes = np.arange(-reach, reach + 1) * _OFFSET_STEP / _ARC_SPACING
     cost, came_from = np.full(len(offsets), np.inf), []
     cost[len(offsets) // 2] = 0.0 if free[0, len(offsets) // 2] else np.inf
     for row in free[1:]:
         padded = np.pad(cost, reach, constant_values=np.inf)
         ways = np.stack([padded[k : k + len(offsets)] for k in range(2 * reach + 1)])
-        ways += (settings.decay * slopes[:, None]) ** 2
+        ways += (_DECAY * slopes[:, None]) ** 2
         best = ways.argmin(axis=0)
         cost = np.where(row, ways[best, np.arange(len(offsets))] + offsets**2, np.inf)
         came_from.append(best - reach)
@@ -125,7 +111,7 @@ def _choose_offsets(free: ndarray, offsets: ndarray, settings: DetourSettings) -
     return np.array(chosen[::-1])
 
 
-def _smooth_offsets(free: ndarray, offsets: ndarray, chosen: ndarray, settings: DetourSettings) -> ndarray:
+def _smooth_offsets(free: ndarray, offsets: ndarray, chosen: ndarray) -> ndarray:
     """Minimise offsets, slopes and bends between the walls on either side of the chosen way."""
     lowest, highest = np.empty(len(chosen)), np.empty(len(chosen))
     for arc, (row, at) in enumerate(zip(free, chosen, strict=True)):
@@ -137,8 +123,8 @@ def _smooth_offsets(free: ndarray, offsets: ndarray, chosen: ndarray, settings: 
     lowest[-1] = highest[-1] = offsets[chosen[-1]]
     widened = np.maximum(highest, lowest + 1e-6)  # the solver wants some room
     line = np.eye(len(chosen))
-    slopes, bends = np.diff(line, axis=0) / settings.spacing, np.diff(line, 2, axis=0) / settings.spacing**2
-    rows = np.concatenate([line, settings.decay * slopes, settings.bend**2 * bends])
+    slopes, bends = np.diff(line, axis=0) / _ARC_SPACING, np.diff(line, 2, axis=0) / _ARC_SPACING**2
+    rows = np.concatenate([line, _DECAY * slopes, _DETOUR_BEND**2 * bends])
     wanted = scipy.sparse.csr_array(rows)
     return scipy.optimize.lsq_linear(wanted, np.zeros(len(rows)), bounds=(lowest, widened), tol=1e-8).x
 

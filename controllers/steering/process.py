@@ -2,31 +2,347 @@
 
 Neither a web server nor another character then delays its steps: each has its own core as long as there are cores.
 Times cross between processes as values of time.perf_counter, which all processes of a machine share.
+
+The process of a character that is steered live: load, begin, and at every step read orders and send frames.
+
+Sources of commands: pure pursuit of a curve, and what a live character obeys: the last command or drawn path.
+
+Pure pursuit is for curves that are not known in advance or change; `controllers.follow` is more exact.
 """
 
+import itertools
+import math
+import os
 import queue
 import threading
+import time
+import traceback
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
+import torch
 
-from controllers.steering.process_worker import CharacterRequest, run_worker
+from controllers.steering import steer
+from controllers.steering.arrival import Arriver
+from controllers.steering.loop import find_second_zero, iterate_steps
+from controllers.steering.steer import SteerFrames, SteerSettings
 from mapctl import curves
+from mapctl.curves.curve import Curve
 from mapctl.errors import MapctlError, RequestError
-from mapctl.intent.steering import Arrival, Command
+from mapctl.features import PRIOR_FPS
+from mapctl.intent.steering import Arrival, Command, SteeringLimits
+from mapctl.protocols import Density
 from mapctl.runtime.live_protocol import FrameChunk
 from mapctl.runtime.processes import open_pipe, preload, send_queued, spawn
-from mapctl.skeleton import Skeleton
+from mapctl.skeleton import CANONICAL, Skeleton
 
-__all__ = ["CharacterProcess", "CharacterRequest"]
+_ARRIVAL_DISTANCE = 0.15  # metres before the end of a path at which the character stops
+_SEARCH_BACKWARD, _SEARCH_FORWARD = 0.1, 0.5  # metres around the last nearest arc in which the next is searched
+_SEARCH_POINTS = 61
+
+
+class PurePursuit:
+    """A Source, and the Display from which it gets the character's position. Closed curves have no end."""
+
+    def __init__(self, curve: Curve, *, speed: float, look_ahead: float = 0.5):
+        """Begin at the curve's start; `speed` in m/s; `look_ahead` in metres: less tracks closer and sways more."""
+        self.curve, self.speed, self.look_ahead = curve, speed, look_ahead
+        self.arc = 0.0
+        self.position = self._point(0.0)
+
+    @property
+    def first(self) -> Command:
+        """First command, at the curve's first point."""
+        return Command(self.speed, self.curve.start_heading)
+
+    @property
+    def left(self) -> float | None:
+        """Arc left from the point last nearest to the character to the end of an open curve, metres; None on a closed
+        one."""
+        return None if self.curve.closed else self.curve.length - self.arc
+
+    def show(self, frames: SteerFrames, due: float) -> None:
+        """Keep where the character is; when its frames are `due` (seconds of the stream) does not matter."""
+        self.position = frames.motion.root_position[-1, ::2]
+
+    def at(self, seconds: float) -> Command:
+        """Return the command towards the point ahead of the character; how many seconds of the stream have passed does
+        not matter."""
+        first, last = self.arc - _SEARCH_BACKWARD, self.arc + _SEARCH_FORWARD
+        arcs = torch.linspace(first, last, _SEARCH_POINTS, dtype=torch.float64).tolist()
+        distances = torch.stack([(self._point(arc) - self.position).norm() for arc in arcs])
+        self.arc = arcs[int(distances.argmin())]
+        direction = self._point(self.arc + self.look_ahead) - self.position
+        return Command(self.speed, math.atan2(float(direction[0]), float(direction[1])))
+
+    def _point(self, arc: float) -> torch.Tensor:
+        """Return x and z of the curve at an arc, float64, metres."""
+        return self.curve.point(arc)[[0, -1]].double()
+
+
+class Autopilot:
+    """A Source, and the Display from which it gets the character's position."""
+
+    def __init__(self, command: Command, limits: SteeringLimits):
+        """Begin with a command; `limits` determine how soon to brake before the end of a path."""
+        self._command, self._limits = command, limits
+        self._pursuit: PurePursuit | None = None
+        self._goal: Arrival | None = None  # its time counted from when it is asked for
+        self._last: SteerFrames | None = None
+
+    def command(self, command: Command) -> None:
+        """Hold this command from now on."""
+        self._command, self._pursuit, self._goal = command, None, None
+
+    def go(self, command: Command, place: tuple[float, float], within: float, facing: float | None) -> None:
+        """Be at a `place` (x and z, metres) `within` so many seconds from the next step on, `facing` so (radians), and
+        hold the command from then on."""
+        self.command(command)
+        self._goal = Arrival(place, within, facing)
+
+    def stay(self) -> None:
+        """Go to no place any more."""
+        self._command, self._goal = replace(self._command, arrival=None), None
+
+    def aim(self, command: Command) -> None:
+        """Reach, look and walk round obstacles as this command says; nothing else of it counts."""
+        self._command = replace(
+            self._command, reach=command.reach, look_at=command.look_at, obstacles=command.obstacles
+        )
+
+    def walk(self, curve: Curve, speed: float) -> None:
+        """Walk along a curve at a `speed` in m/s, with the step length and labels of the last command; stop at the end
+        of an open one."""
+        self._pursuit, self._goal = PurePursuit(curve, speed=speed), None
+        self._command = replace(self._command, arrival=None)
+        if self._last is not None:
+            self._pursuit.show(self._last, 0.0)
+
+    def show(self, frames: SteerFrames, due: float) -> None:
+        """Keep where the character is; when its frames are `due` (seconds of the stream) does not matter."""
+        self._last = frames
+        if self._pursuit is not None:
+            self._pursuit.show(frames, due)
+
+    def at(self, seconds: float) -> Command:
+        """Return the command that holds now, at so many seconds of the stream."""
+        if self._goal is not None:
+            self._command = replace(self._command, arrival=replace(self._goal, by=seconds + self._goal.by))
+            self._goal = None
+        if self._pursuit is None:
+            return self._command
+        pursued, left = self._pursuit.at(seconds), self._pursuit.left
+        if left is not None:
+            # The highest speed from which braking stops in time: v^2 = 2 a s.
+            speed = min(pursued.speed, math.sqrt(2 * self._limits.braking * max(0.0, left - _ARRIVAL_DISTANCE)))
+            if left <= _ARRIVAL_DISTANCE:
+                self.command(
+                    replace(
+                        self._command, speed=0.0, heading=pursued.heading, facing=None, turning=None, step_length=None
+                    )
+                )
+                return self._command
+            pursued = Command(speed, pursued.heading)
+        return replace(self._command, speed=pursued.speed, heading=pursued.heading, facing=None, turning=None)
+
+
+_WARM_UP_STEPS = 3  # steps before the clock starts, which compile and load what is needed
+_TURN = 0.618034  # share of a step between processes one after the other: multiples of the golden ratio spread evenly
+
+
+@dataclass(frozen=True)
+class CharacterRequest:
+    """Request for a steered character."""
+
+    load: Callable[[], Any]
+    """Loader of the density, called in the character's process: `functools.partial(priors.load, "locomotion")`."""
+    first: Command
+    """First command."""
+    seed: int = 0
+    """Seed of the first pose."""
+    at: tuple[float, float] = (0.0, 0.0)
+    """Position of the first pose, x and z in metres."""
+    settings: SteerSettings = field(default_factory=SteerSettings)
+    """Sigmas, window lengths and budget."""
+    skeleton: Skeleton = CANONICAL
+    """Bones of the character, on canonical joints; the toes' height of its stance is that of the settings' footing."""
+    transitions: Callable[[], Any] | None = None
+    """Loader of who makes the way to a place, called there too; without one the character can be sent nowhere."""
+
+
+class ParentClosed(Exception):
+    """The parent process closed the connection, or has ended."""
+
+
+class ProcessClock:
+    """Clock and Display of the character's process: it reads orders while it waits, and sends frames."""
+
+    real = True
+
+    def __init__(self, connection: Connection, pilot: Autopilot, prior: Density):
+        self._connection, self._pilot, self._prior = connection, pilot, prior
+        self.again = False
+        self._began = 0.0  # time of the stream's second 0
+        self._behind = 0.0  # seconds by which the clock is behind time.perf_counter: pauses, and what was held
+        self._paused_at: float | None = None  # value of time.perf_counter
+        self._held = 0.0  # seconds by which the next frames are late
+        self._notes: list[str] = []
+
+    def now(self) -> float:
+        """See Clock: time.perf_counter less the pauses."""
+        return (time.perf_counter() if self._paused_at is None else self._paused_at) - self._behind
+
+    def wait_until(self, seconds: float) -> None:
+        """See Clock."""
+        while True:
+            left = max(0.0, seconds - self.now()) if self._paused_at is None else None
+            if self._connection.poll(left):
+                self._handle_order()
+            elif left is not None:
+                return
+
+    def hold(self, seconds: float) -> None:
+        """See Clock: like a pause."""
+        self._behind += seconds
+        self._held += seconds
+
+    def show(self, frames: SteerFrames, due: float) -> None:
+        """See Display."""
+        self._pilot.show(frames, due)
+        if frames.refusal is not None:
+            self._notes.append(frames.refusal.reason)
+        at = self._began + due + self._behind
+        spare = at - time.perf_counter() - self._held
+        chunk = _to_frame_chunk(frames, due, at=at, spare=spare, notes=tuple(self._notes))
+        self._connection.send(("frames", chunk))
+        self._held = 0.0
+        self._notes.clear()
+
+    def begin(self, state: steer.SteerState, frames: SteerFrames) -> None:
+        """Show the first pose, and start the stream's seconds there."""
+        self.again = False
+        self._began = find_second_zero(self, state)
+        self.show(frames, 0.0)
+
+    def _pause(self, paused: bool) -> None:
+        now = time.perf_counter()
+        if self._paused_at is not None:
+            self._behind += now - self._paused_at
+        self._paused_at = now if paused else None
+
+    def _handle_order(self) -> None:
+        try:
+            word, *content = self._connection.recv()
+        except EOFError:
+            raise ParentClosed from None
+        if word == "close":
+            raise ParentClosed
+        try:
+            self._execute_order(word, *content)
+        except MapctlError as error:  # an impossible order; the one before it holds
+            self._notes.append(str(error))
+
+    def _execute_order(self, word: str, *content: Any) -> None:
+        if word == "reset":
+            self.again = True
+        elif word == "pause":
+            self._pause(*content)
+        elif word == "aim":
+            self._pilot.aim(*content)
+        elif word == "go":
+            command, *where = content
+            command, notes = steer.accept(self._prior, command)
+            self._notes += notes
+            self._pilot.go(command, *where)
+        elif word == "walk":
+            points, speed, closed = content
+            self._pilot.walk(curves.through(points, closed=closed), min(speed, self._prior.limits.max_steering_speed))
+        else:
+            command, notes = steer.accept(self._prior, *content)
+            self._notes += notes
+            self._pilot.command(command)
+
+
+def run_worker(connection: Connection, request: CharacterRequest) -> None:
+    """Steer until the parent closes the connection; anything else that ends it is sent to the parent, in a line."""
+    torch.set_num_threads(1)
+    with suppress(ParentClosed, BrokenPipeError):
+        try:
+            connection.send(("started", os.getpid()))
+            _run_character(connection, request)
+        except ParentClosed:  # a requested end is no failure to report
+            return
+        except MapctlError as error:
+            connection.send(("failed", str(error)))
+        except Exception as error:
+            last = traceback.extract_tb(error.__traceback__)[-1]
+            what = f"{type(error).__name__}: {error}".splitlines()[0]
+            connection.send(("failed", f"a character's process ended: {what} ({last.name}, line {last.lineno})"))
+
+
+def _run_character(connection: Connection, request: CharacterRequest) -> None:
+    prior, transitions = request.load(), None if request.transitions is None else request.transitions()
+    first, generator = steer.accept(prior, request.first)[0], torch.Generator().manual_seed(request.seed)
+    pilot = Autopilot(first, request.settings.limits)
+    stepper = steer.step if transitions is None else Arriver(transitions)
+    clock = ProcessClock(connection, pilot, prior)
+    for number in itertools.count():
+        state, pose = steer.begin(
+            prior, first, generator=generator, at=request.at, settings=request.settings, skeleton=request.skeleton
+        )
+        if number == 0:
+            _warm_up(state, first, transitions)
+            connection.send(("ready", None))
+        _wait_for_turn(request.settings.commit / PRIOR_FPS)
+        clock.begin(state, pose)
+        for _ in iterate_steps(state, pilot, [clock], clock=clock, stepper=stepper):
+            if clock.again:
+                break
+        pilot.stay()
+        first = pilot.at(clock.now())
+
+
+def _wait_for_turn(seconds: float) -> None:
+    """Wait until a moment that is this process's own among steps of so many seconds: characters that begin together
+    would search at the same time and then rest at the same time, and the last would have hardly any time to spare."""
+    turn = os.getpid() * _TURN % 1
+    time.sleep(seconds * ((turn - time.perf_counter() / seconds) % 1))
+
+
+def _warm_up(state: steer.SteerState, first: Command, transitions: Any | None) -> None:
+    for _ in range(_WARM_UP_STEPS):
+        steer.step(state, first)
+    if transitions is not None:
+        Arriver(transitions)(state, replace(first, arrival=Arrival((0.0, 0.0), 1.0)))
+
+
+def _to_frame_chunk(
+    frames: SteerFrames, seconds: float, *, at: float, spare: float, notes: tuple[str, ...]
+) -> FrameChunk:
+    return FrameChunk(
+        at,
+        seconds,
+        frames.motion.root_position.numpy(),
+        frames.motion.local_quat_xyzw.numpy(),
+        frames.contacts.numpy(),
+        frames.forecast.numpy(),
+        frames.steering_targets[-1].velocity,
+        spare,
+        frames.seconds,
+        notes,
+    )
+
 
 _READY_SECONDS = 120.0
 _MAX_QUEUED_STEPS = 3000  # steps that are kept for a caller that does not poll: five minutes
 _PROCESS_ENDED = "a character's process ended by itself"
 
-preload("controllers.steering.process_worker")
+preload("controllers.steering.process")
 
 
 class CharacterProcess:

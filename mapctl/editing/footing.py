@@ -1,7 +1,6 @@
 """Footing: planted toes are held still and on the floor by the legs, and nothing else changes."""
 
 import math
-from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
@@ -19,33 +18,14 @@ from mapctl.retarget.rigs import Rig
 
 _MEDIAN_OF_NORMAL = 0.6745  # of the size of a normal variable, in standard deviations
 _NOISE_FRAMES = 12  # frames from which noise is estimated
+_NOISE_SPEED = 0.04  # m/s that noise of toes makes once they are smoothed, before contacts are looked for
+_SMOOTH_SECONDS = (0.04, 0.15)  # least and greatest standard deviation of that Gaussian
+_MERGE_SECONDS, _MERGE_METRES = 0.15, 0.06  # contacts at one position with less than these between them are one
+_ROLL_METRES = 0.005  # over its usual height in a contact, from which a planted toe is on its way down or up
+_FADE_SECONDS = 0.12  # over which a foot comes to its position and leaves it: a swing foot is moved as little as that
 
 
-@dataclass(frozen=True)
-class FootingSettings:
-    """How contacts are found, and how a foot comes to its place and leaves it."""
-
-    noise_speed: float = 0.04
-    """Toes are smoothed, before contacts are looked for, until their noise makes this speed, m/s."""
-    smooth_seconds: tuple[float, float] = (0.04, 0.15)
-    """Least and greatest standard deviation of the Gaussian that they are smoothed by, seconds."""
-    merge_seconds: float = 0.15
-    """Contacts at one place with less time between them are one, seconds."""
-    merge_metres: float = 0.06
-    """How far apart such contacts are at most, metres."""
-    roll_metres: float = 0.005
-    """A planted toe higher than this over its usual height in that contact is on its way down or up, metres."""
-    fade_seconds: float = 0.12
-    """Time over which a foot comes to its place and leaves it, seconds: a swing foot is moved by as little as its next
-    contact asks for."""
-
-
-def plant_feet(
-    motion: Motion,
-    rig: Rig | None = None,
-    cycle: GroundTransform | None = None,
-    settings: FootingSettings = FootingSettings(),
-) -> Motion:
+def plant_feet(motion: Motion, rig: Rig | None = None, cycle: GroundTransform | None = None) -> Motion:
     """Hold planted toes still and on the floor, on the motion's own rig at its own rate.
 
     A toe is planted where it rests and carries the body (see `mapctl.contacts`), noise smoothed away; then it
@@ -56,53 +36,46 @@ def plant_feet(
     """
     rigged = RiggedMotion.of(motion, rig)
     if cycle is None:
-        return rigged.with_motion(_plant(rigged, settings)).in_file_world(motion)
+        return rigged.with_motion(_plant(rigged)).in_file_world(motion)
     frames = motion.num_frames
     around = rigged.with_motion(repeat_over_ground(rigged.motion, cycle, 3))
-    middle = _plant(around, settings).slice(frames, 2 * frames)
+    middle = _plant(around).slice(frames, 2 * frames)
     planted = move_by_share(middle, cycle, -torch.ones(frames, dtype=torch.float64))
     return rigged.with_motion(planted).in_file_world(motion)
 
 
-def _plant(rigged: RiggedMotion, settings: FootingSettings) -> Motion:
+def _plant(rigged: RiggedMotion) -> Motion:
     toes, fps = rigged.positions("Toes"), float(rigged.motion.fps)
-    planted = find_contacts(toes, rigged.position("hips"), fps, settings)
+    planted = find_contacts(toes, rigged.position("hips"), fps)
     if not bool(planted.any()):
         return rigged.motion
-    corrections = correct_toes(toes, toes, planted, fps, settings)
-    corrections[..., 1] = _correct_heights(toes, planted, fps, settings)
+    corrections = correct_toes(toes, toes, planted, fps)
+    corrections[..., 1] = _correct_heights(toes, planted, fps)
     return place_ankles(rigged, rigged.positions("Foot") + corrections)
 
 
 def find_contacts(
-    toes: Float[Tensor, "frames 2 3"],
-    hips: Float[Tensor, "frames 3"],
-    fps: float,
-    settings: FootingSettings = FootingSettings(),
+    toes: Float[Tensor, "frames 2 3"], hips: Float[Tensor, "frames 3"], fps: float
 ) -> Bool[Tensor, "frames 2"]:
     """Find in which frames each toe is planted; contacts that noise alone parts are one. Positions in metres."""
-    sigma = _choose_smoothing(toes, fps, settings)
+    sigma = _choose_smoothing(toes, fps)
     smooth = _smooth(toes, sigma)
-    noise = torch.tensor([[settings.noise_speed]])
+    noise = torch.tensor([[_NOISE_SPEED]])
     resting = compute_rest_log_probability(smooth, hips, fps, noise)
-    if sigma <= settings.smooth_seconds[0] * fps:  # hardly any noise: what is seen as it is counts too
+    if sigma <= _SMOOTH_SECONDS[0] * fps:  # hardly any noise: what is seen as it is counts too
         resting = resting.maximum(compute_rest_log_probability(toes, hips, fps, noise))
     shortest = max(1, round(contacts.ContactSettings().shortest * fps))
     planted = contacts.remove_short_runs(resting > math.log(0.5), shortest)
     for foot, start, stop in list(true_intervals(~planted)):
         inside = start > 0 and stop < len(planted)
-        if inside and stop - start < settings.merge_seconds * fps:
+        if inside and stop - start < _MERGE_SECONDS * fps:
             apart = (smooth[start - 1, foot] - smooth[stop, foot])[::2].norm()
-            planted[start:stop, foot] |= bool(apart < settings.merge_metres)
+            planted[start:stop, foot] |= bool(apart < _MERGE_METRES)
     return planted
 
 
 def correct_toes(
-    toes: Float[Tensor, "frames 2 3"],
-    drift: Float[Tensor, "frames 2 3"],
-    planted: Bool[Tensor, "frames 2"],
-    fps: float,
-    settings: FootingSettings = FootingSettings(),
+    toes: Float[Tensor, "frames 2 3"], drift: Float[Tensor, "frames 2 3"], planted: Bool[Tensor, "frames 2"], fps: float
 ) -> Float[Tensor, "frames 2 3"]:
     """Return corrections of toe positions, metres, that take the drift out of each contact but for its mean, and are
     smooth between contacts. Drift equal to the positions leaves toes quite still."""
@@ -110,35 +83,35 @@ def correct_toes(
     for foot, start, stop in true_intervals(planted):
         own = drift[start:stop, foot]
         corrections[start:stop, foot] = own.mean(dim=0) - own
-    return _interpolate(corrections, planted, fps, settings)
+    return _interpolate(corrections, planted, fps)
 
 
 def _correct_heights(
-    toes: Float[Tensor, "frames 2 3"], planted: Bool[Tensor, "frames 2"], fps: float, settings: FootingSettings
+    toes: Float[Tensor, "frames 2 3"], planted: Bool[Tensor, "frames 2"], fps: float
 ) -> Float[Tensor, "frames 2"]:
     """Return corrections that put planted toes at the height of their support, and let no toe go lower. The ends of a
     contact, in which a toe is on its way down or up, are left to what is between."""
-    smooth = _smooth(toes, _choose_smoothing(toes, fps, settings))
+    smooth = _smooth(toes, _choose_smoothing(toes, fps))
     rest, heights, smooth = fit_supports(smooth, planted), toes[..., 1], smooth[..., 1]
     firm = heights < rest
     for foot, start, stop in true_intervals(planted):
         usual = smooth[start:stop, foot].median()
-        firm[start:stop, foot] |= smooth[start:stop, foot] < usual + settings.roll_metres
-    return _interpolate(torch.where(firm, rest - heights, 0.0)[..., None], firm, fps, settings)[..., 0]
+        firm[start:stop, foot] |= smooth[start:stop, foot] < usual + _ROLL_METRES
+    return _interpolate(torch.where(firm, rest - heights, 0.0)[..., None], firm, fps)[..., 0]
 
 
-def _choose_smoothing(toes: Float[Tensor, "frames 2 3"], fps: float, settings: FootingSettings) -> float:
+def _choose_smoothing(toes: Float[Tensor, "frames 2 3"], fps: float) -> float:
     """Choose the standard deviation in frames of the Gaussian that leaves so little of the noise.
 
     Noise is told by third differences, of which white noise of 1 makes 20 in the square; most frames have little else.
     Of it a Gaussian of s frames leaves velocities of (4 sqrt(pi) s^3)^-1/2 a frame.
     """
-    least, most = (seconds * fps for seconds in settings.smooth_seconds)
+    least, most = (seconds * fps for seconds in _SMOOTH_SECONDS)
     if len(toes) < _NOISE_FRAMES:
         return least
     sizes = toes[..., ::2].diff(n=3, dim=0).abs().flatten()
     noise = float(sizes.median()) / _MEDIAN_OF_NORMAL / math.sqrt(20)
-    wanted = ((noise * fps / settings.noise_speed) ** 2 / (4 * math.sqrt(math.pi))) ** (1 / 3)
+    wanted = ((noise * fps / _NOISE_SPEED) ** 2 / (4 * math.sqrt(math.pi))) ** (1 / 3)
     return min(max(wanted, least), most)
 
 
@@ -148,11 +121,11 @@ def _smooth(values: Float[Tensor, "frames *width"], sigma: float) -> Float[Tenso
 
 
 def _interpolate(
-    corrections: Float[Tensor, "frames 2 width"], firm: Bool[Tensor, "frames 2"], fps: float, settings: FootingSettings
+    corrections: Float[Tensor, "frames 2 width"], firm: Bool[Tensor, "frames 2"], fps: float
 ) -> Float[Tensor, "frames 2 width"]:
     return torch.stack(
         [
-            interpolate_offsets(corrections[:, foot], firm[:, foot], seconds=settings.fade_seconds, fps=fps)
+            interpolate_offsets(corrections[:, foot], firm[:, foot], seconds=_FADE_SECONDS, fps=fps)
             for foot in range(corrections.shape[1])
         ],
         dim=1,

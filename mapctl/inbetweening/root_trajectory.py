@@ -6,7 +6,6 @@ What the prediction misses the next known position by is spread in proportion to
 slide, and who walks takes steps that are a little longer, shorter or aside.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -146,12 +145,12 @@ def compute_displacement_errors(
 
 
 def average_displacement_errors(
-    predicted_xz: Float[Tensor, "frames 2"], true_xz: Float[Tensor, "frames 2"], spans: Sequence[int] = SPANS
+    predicted_xz: Float[Tensor, "frames 2"], true_xz: Float[Tensor, "frames 2"]
 ) -> dict[str, float]:
     """Average them over a clip by the name of the span, `V1` and so on, cm; spans that it is too short for are left
     out."""
     return {
         f"V{span}": 100 * float(compute_displacement_errors(predicted_xz, true_xz, span).mean())
-        for span in spans
+        for span in SPANS
         if span < len(true_xz)
     }

@@ -51,9 +51,9 @@ def compute_low_pass_error(
     return low_pass(curve.signed_offset(positions, arcs), seconds=LOW_PASS_SECONDS, fps=fps).abs()
 
 
-def sway(offset: Float[Tensor, "frames"], fps: float, seconds: float = SWAY_SECONDS) -> float:
+def sway(offset: Float[Tensor, "frames"], fps: float) -> float:
     """Return the root mean square of a sideways offset without its slow part; NaN for clips too short (2.2 s)."""
-    kernel = gaussian_kernel(seconds, fps)
+    kernel = gaussian_kernel(SWAY_SECONDS, fps)
     reach = len(kernel) // 2
     if len(offset) <= 2 * reach + 4:
         return math.nan

@@ -38,17 +38,17 @@ class ToeMeasurements:
         return ToeMeasurements(height, speed, contacts.detect_contacts(toe_positions, fps))
 
 
-def skate(toes: ToeMeasurements, reach: float = SKATE_REACH) -> float:
-    """Return the mean over frames and toes of speed (2 - 2^(h / reach)) where the height h is under `reach`; m/s."""
+def skate(toes: ToeMeasurements) -> float:
+    """Return the mean over frames and toes of speed (2 - 2^(h / 2.5 cm)) where the height h is under 2.5 cm; m/s."""
     height = toes.height[1:]
-    weight = torch.where(height < reach, 2 - torch.exp2(height.clamp(0, reach) / reach), 0.0)
+    weight = torch.where(height < SKATE_REACH, 2 - torch.exp2(height.clamp(0, SKATE_REACH) / SKATE_REACH), 0.0)
     return float((toes.speed * weight).mean())
 
 
-def skate_ratio(toes: ToeMeasurements, *, height: float = 0.05, speed: float = 0.2) -> float:
-    """Return the share of toe-frames under `height` metres, at both ends of the step, that move faster than `speed`."""
-    low = toes.height < height
-    return float((low[1:] & low[:-1] & (toes.speed > speed)).double().mean())
+def skate_ratio(toes: ToeMeasurements) -> float:
+    """Return the share of toe-frames under 5 cm, at both ends of the step, that move faster than 0.2 m/s."""
+    low = toes.height < 0.05
+    return float((low[1:] & low[:-1] & (toes.speed > 0.2)).double().mean())
 
 
 def contact_speed(toes: ToeMeasurements) -> float:

@@ -1,8 +1,8 @@
 """Particle swarm (Kennedy and Eberhart 1995; Wang et al. 2019, section 5.2) by pyswarms, and a baseline of samples.
 
 pyswarms' own optimisers keep every iterate, draw first velocities from [0, 1] whatever the unit, and cannot stop at a
-budget; so its swarm, topologies and update rules are used, and the loop is here. pyswarms also sets up the process's
-logging (and a report.log in the working folder) at import and with every object made, which is suppressed here.
+budget; so its update rules are used, and the loop is here. Its import is slow and sets up the process's logging (and a
+report.log in the working folder), which is suppressed here; its draws from numpy's global state leave that as it was.
 """
 
 import logging.config
@@ -11,6 +11,7 @@ import threading
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,8 +23,6 @@ from mapctl.solver.budget import Meter
 
 Cost = Callable[[Tensor], Tensor]
 """Points (particles, n) to energies (particles,); what is not finite counts as infinity."""
-Bounds = tuple[Tensor, Tensor]
-"""Least and greatest value of every unknown, (n,) each; particles that leave stop at the border."""
 
 
 @dataclass(frozen=True)
@@ -39,17 +38,18 @@ class SwarmSettings:
     cognitive: float = 1.4962
     """Pull toward the particle's own best point: largest factor of the way there, each iteration."""
     social: float = 1.4962
-    """Pull toward the best point among its neighbours: largest factor of the way there, each iteration."""
-    neighbours: int | None = None
-    """Number of nearest particles that share their best point, itself among them; None: all."""
+    """Pull toward the best point of all: largest factor of the way there, each iteration."""
 
     def __post_init__(self):
         if self.particles < 1 or self.iterations < 1:
             raise RequestError(
                 f"particles and iterations must be 1 or more, got {self.particles} and {self.iterations}"
             )
-        if self.neighbours is not None and self.neighbours < 2:
-            raise RequestError(f"a particle's neighbours must be 2 or more (or None for all), got {self.neighbours}")
+
+    @property
+    def weights(self) -> dict[str, float]:
+        """Weights as pyswarms names them."""
+        return {"w": self.inertia, "c1": self.cognitive, "c2": self.social}
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,33 +72,42 @@ def run_swarm(
     start: Float[Tensor, " n"],
     spread: Float[Tensor, " n"] | float,
     settings: SwarmSettings = SwarmSettings(),
-    bounds: Bounds | None = None,
     meter: Meter | None = None,
     generator: torch.Generator,
 ) -> SwarmResult:
     """Search from `start`, which is the first particle; the others begin at samples around it, all at rest.
 
-    `spread` is the standard deviation of the samples, `bounds` the least and greatest value of each, in units of the
-    unknowns. The swarm stops before an iteration
-    that the meter cannot pay in full. The same generator state gives the same bits. Raises RequestError where the start
-    is no vector or out of bounds, or the cost answers in another shape.
+    `spread` is the standard deviation of the samples, in units of the unknowns. The swarm stops before an iteration
+    that the meter cannot pay in full. The same generator state gives the same bits. RequestError where the start is no
+    vector, or the cost answers in another shape.
     """
     meter = Meter() if meter is None else meter
     track = _BestTracker(cost, start, meter)
-    points = _sample_points(start, spread, bounds, min(settings.particles, meter.remaining), generator)
+    points = _sample_points(start, spread, min(settings.particles, meter.remaining), generator)
     if not len(points):
         return track.result()
     seed = torch.randint(2**32, (8,), generator=generator, device=generator.device).cpu().numpy()
-    limits = None if bounds is None else (_to_numpy(bounds[0]), _to_numpy(bounds[1]))
-    swarm = _make_swarm(_to_numpy(points), settings, limits, np.random.RandomState(seed))
+    random, (operators, make_swarm) = np.random.RandomState(seed), _import_pyswarms()
+    first = _to_numpy(points)
+    swarm = make_swarm(first, np.zeros_like(first), options=settings.weights)
+    swarm.pbest_cost, swarm.best_pos, swarm.best_cost = np.full(len(first), np.inf), first[0], np.inf
     for iteration in range(settings.iterations):
         if iteration:
-            swarm.move()
-        energies = track.evaluate(torch.as_tensor(swarm.positions).to(start))
-        if energies is None:
+            with _use_numpy_state(random):
+                swarm.velocity = operators.compute_velocity(swarm, None, _keep_velocity)
+            swarm.position = operators.compute_position(swarm, None, None)
+        swarm.current_cost = track.evaluate(torch.as_tensor(swarm.position).to(start))
+        if swarm.current_cost is None:
             break
-        swarm.learn(energies)
+        swarm.pbest_pos, swarm.pbest_cost = operators.compute_pbest(swarm)
+        best = int(swarm.pbest_cost.argmin())
+        if swarm.pbest_cost[best] < swarm.best_cost:
+            swarm.best_pos, swarm.best_cost = swarm.pbest_pos[best], swarm.pbest_cost[best]
     return track.result()
+
+
+def _keep_velocity(velocity: np.ndarray, clamp: None, **_: object) -> np.ndarray:
+    return velocity
 
 
 def run_best_of_samples(
@@ -107,20 +116,18 @@ def run_best_of_samples(
     start: Float[Tensor, " n"],
     spread: Float[Tensor, " n"] | float,
     count: int,
-    bounds: Bounds | None = None,
     meter: Meter | None = None,
     generator: torch.Generator,
 ) -> SwarmResult:
     """Find the best of `count` points, evaluated at once: the start and samples around it; fewer on a short budget.
 
-    `spread` is the standard deviation of the samples, `bounds` the least and greatest value of each, in units of the
-    unknowns. Errors as of `run_swarm`, which it is held against.
+    `spread` is the standard deviation of the samples, in units of the unknowns. Errors as of `run_swarm`.
     """
     if count < 1:
         raise RequestError(f"the best of how many? at least 1, got {count}")
     meter = Meter() if meter is None else meter
     track = _BestTracker(cost, start, meter)
-    points = _sample_points(start, spread, bounds, min(count, meter.remaining), generator)
+    points = _sample_points(start, spread, min(count, meter.remaining), generator)
     if len(points):
         track.evaluate(points)
     return track.result()
@@ -156,49 +163,44 @@ class _BestTracker:
 
 
 def _sample_points(
-    start: Tensor, spread: Tensor | float, bounds: Bounds | None, count: float, generator: torch.Generator
+    start: Tensor, spread: Tensor | float, count: float, generator: torch.Generator
 ) -> Float[Tensor, "count n"]:
-    """Return the start and normal samples around it, inside the bounds."""
+    """Return the start and normal samples around it."""
     if start.ndim != 1 or not start.is_floating_point():
         raise RequestError(f"a swarm starts from a vector of real numbers, got {tuple(start.shape)} {start.dtype}")
     noise = torch.randn(int(count), len(start), dtype=start.dtype, device=generator.device, generator=generator)
     points = start + noise.to(start.device) * spread
     points[:1] = start
-    if bounds is None:
-        return points
-    low, high = bounds
-    if not ((low <= start) & (start <= high)).all():
-        raise RequestError("a swarm's start must lie within its bounds")
-    return points.clamp(low, high)
+    return points
 
 
 def _to_numpy(values: Tensor) -> np.ndarray:
     return values.detach().to("cpu", torch.float64).numpy()
 
 
-def _make_swarm(
-    points: np.ndarray,
-    settings: SwarmSettings,
-    limits: tuple[np.ndarray, np.ndarray] | None,
-    random: np.random.RandomState,
-):
-    with _suppress_logging_config():
-        from mapctl.solver.particle_swarm import ParticleSwarm  # slow
-
-        weights = {"w": settings.inertia, "c1": settings.cognitive, "c2": settings.social}
-        return ParticleSwarm(points, weights, settings.neighbours, limits, random)
-
-
 _LOGGING_LOCK = threading.Lock()
 
 
-@contextmanager
-def _suppress_logging_config() -> Generator[None, None, None]:
-    """Suppress what pyswarms configures while it is imported or its objects are made."""
+def _import_pyswarms() -> tuple[Any, Any]:
+    """Import pyswarms' update rules and its swarm, without what it configures at import."""
     with _LOGGING_LOCK:
         configure = logging.config.dictConfig
         logging.config.dictConfig = lambda config: None
         try:
-            yield
+            from pyswarms.backend import operators  # pyright: ignore[reportMissingTypeStubs]
+            from pyswarms.backend.swarms import Swarm  # pyright: ignore[reportMissingTypeStubs]
         finally:
             logging.config.dictConfig = configure
+    return operators, Swarm
+
+
+@contextmanager
+def _use_numpy_state(random: np.random.RandomState) -> Generator[None, None, None]:
+    """Use `random` for numpy's global draws within, and move it on; afterwards the global state is as it was."""
+    before = np.random.get_state()
+    np.random.set_state(random.get_state())
+    try:
+        yield
+    finally:
+        random.set_state(np.random.get_state())
+        np.random.set_state(before)

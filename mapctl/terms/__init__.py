@@ -11,26 +11,7 @@ from mapctl.terms.path import Path
 from mapctl.terms.root_velocity import RootVelocity
 from mapctl.terms.step_length import StepLength
 
-ALL = (
-    Likelihood,
-    LatentPrior,
-    Path,
-    FootContact,
-    Jerk,
-    MotionTracking,
-    StepLength,
-    RootVelocity,
-    Keyframe,
-    Clearance,
-    Support,
-    KeepClear,
-    KeepApart,
-    WithinReach,
-)
-"""Every term of mapctl itself."""
-
 __all__ = [
-    "ALL",
     "Clearance",
     "FootContact",
     "Jerk",

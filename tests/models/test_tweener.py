@@ -11,7 +11,6 @@ from tiny_tweener import save_tiny_tweener, tiny_tweener
 import priors
 from controllers.inbetweening.pipeline import CanonicalClip
 from controllers.inbetweening.proposers import AutoInbetweener, SlerpInbetweener
-from controllers.inbetweening.proposers.auto import ChoiceSettings
 from mapctl import rotations
 from mapctl.errors import CheckpointError
 from mapctl.inbetweening import GapQuery, Proposal
@@ -108,7 +107,7 @@ def test_the_answer_moves_and_turns_with_its_keys():
 
 def test_auto_leaves_long_gaps_between_whole_poses_to_it_and_holds_who_stands():
     query = query_of(walk(200), (1, 30), (31, 190))
-    auto = AutoInbetweener(SlerpInbetweener(), settings=ChoiceSettings(long=75), tweener=tiny_tweener())
+    auto = AutoInbetweener(SlerpInbetweener(), long=75, tweener=tiny_tweener())
     assert [source.by for source in auto.propose(query).attribute(query)] == ["slerp", "tweener"]
     plain = AutoInbetweener(SlerpInbetweener())
     assert {source.by for source in plain.propose(query).attribute(query)} == {"slerp"}
@@ -125,7 +124,7 @@ def test_auto_keeps_a_long_gap_that_the_network_fills_and_in_which_the_body_move
     tweened = Told(Proposal(motion, logits, "tweener"))
 
     def find_source(network: Proposal, tweener: Inbetweener = tweened) -> list[str]:
-        auto = AutoInbetweener(Told(network), settings=ChoiceSettings(long=75), tweener=tweener)
+        auto = AutoInbetweener(Told(network), long=75, tweener=tweener)
         return [source.by for source in auto.propose(query).attribute(query)]
 
     assert find_source(moving) == ["transformer"]
@@ -138,7 +137,7 @@ def test_auto_keeps_a_long_gap_that_the_network_fills_and_in_which_the_body_move
 def test_auto_leaves_long_gaps_to_it_that_have_partial_keys_within():
     """A network that fills less would leap to the hand, or away from it."""
     motion, told = walk(200), (1, 190)
-    auto = AutoInbetweener(SlerpInbetweener(), settings=ChoiceSettings(long=75), tweener=tiny_tweener())
+    auto = AutoInbetweener(SlerpInbetweener(), long=75, tweener=tiny_tweener())
     query = query_of(motion, told)
     wanted = torch.zeros(200, 21, dtype=torch.bool)
     wanted[90, CANONICAL.index("leftHand")] = True

@@ -6,7 +6,7 @@ import pytest
 import torch
 from helpers import walk
 
-from controllers.steering.process_worker import Autopilot
+from controllers.steering.process import Autopilot
 from controllers.steering.steer import SteerFrames
 from mapctl import curves
 from mapctl.curves.obstacles import Obstacle

@@ -12,8 +12,7 @@ from tiny_prior import save_tiny_prior
 from tiny_stitcher import save_tiny_stitcher
 
 import priors
-from controllers.steering.process import CharacterProcess, CharacterRequest
-from controllers.steering.process_worker import run_worker
+from controllers.steering.process import CharacterProcess, CharacterRequest, run_worker
 from mapctl.errors import MapctlError, RequestError
 from mapctl.intent.steering import Command
 from mapctl.runtime.live_protocol import LiveCharacter

@@ -15,7 +15,7 @@ from tiny_steering import AHEAD, DENSITY, QUICK, begun
 import priors
 from controllers.steering import steer
 from controllers.steering.loop import Recorder, StepRecord, StreamClock, drive, summarise_step_timing
-from controllers.steering.process_worker import PurePursuit
+from controllers.steering.process import PurePursuit
 from mapctl import curves
 from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import RequestError

@@ -48,14 +48,12 @@ METHODS: Mapping[str, Callable[[ModelLoaders], Inbetweener]] = {
     "slerp": lambda models: SlerpInbetweener(),
 }
 """Builders of in-betweeners by the name of the method."""
-_RENAMED = {"map": "--method auto", "linear": "--method slerp --no-finish"}
 
 
 def check_method(method: str) -> None:
     """Raise RequestError for an unknown method."""
     if method not in METHODS:
-        known = f"{method} is now {_RENAMED[method]}" if method in _RENAMED else f"there are {', '.join(METHODS)}"
-        raise RequestError(f"there is no --method {method}; {known}")
+        raise RequestError(f"there is no --method {method}; there are {', '.join(METHODS)}")
 
 
 def build_inbetweener(method: str, models: ModelLoaders) -> Inbetweener:

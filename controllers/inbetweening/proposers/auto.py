@@ -6,7 +6,7 @@ either, and then the pose transformer's answer is nearer to mocap in all that it
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -25,30 +25,15 @@ STANDING_STILL = "standing still"
 """Name of the source of a gap in which the pose before it is held."""
 _TOES = CANONICAL.indices(TOES)
 _PLANTED_HEIGHT = 0.025  # metres above the lowest toe
-
-
-@dataclass(frozen=True)
-class ChoiceSettings:
-    """Lengths of gaps from which others than the network propose, and what counts as standing still."""
-
-    long: int = 181
-    """Frames of the shortest gap between whole poses, with partial keys in it or none, that can be a tweener's."""
-    lively: float = 0.5
-    """Path of the joints seen from the hips, over that of the tweener, from which on such a gap without keys in it is
-    the network's all the same: walks it fills better, where it knows nothing it hardly moves."""
-    styled: int = 60
-    """And where the tweener was told a style: in less than 2 s there is no room for one."""
-    stitched: int = 60
-    """Frames of the longest gap between whole poses, with partial keys in it, that is a stitcher's."""
-    held: int = 46
-    """Frames of the shortest gap in which a pose is held."""
-    astray: float = 0.03
-    """Distance over the ground, metres, from which on the hips of somebody who stands are astray: the pose is held
-    then. Under it the network's gesture is nearer to mocap than a held pose."""
-    same_pose_distance: float = 0.06
-    """Mean distance of the joints, metres, below which two poses count as one."""
-    at_rest: float = 0.15
-    """Mean speed of the joints beside a gap, m/s, below which the body is at rest."""
+_LIVELY = 0.5
+"""Path of the joints seen from the hips, over that of the tweener, from which on a long gap without keys in it is the
+network's all the same: walks it fills better, where it knows nothing it hardly moves."""
+_STYLED = 60  # frames of the shortest gap that is a tweener's that was given a style: in less there is no room for one
+_STITCHED = 60  # frames of the longest gap between whole poses, with partial keys in it, that is a stitcher's
+_HELD = 46  # frames of the shortest gap in which a pose is held
+_ASTRAY = 0.03  # metres over the ground from which on standing hips are astray, and the pose is held
+_SAME_POSE_DISTANCE = 0.06  # mean distance of the joints, metres, below which two poses count as one
+_AT_REST = 0.15  # mean speed of the joints beside a gap, m/s, below which the body is at rest
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,8 +46,8 @@ class AutoInbetweener(Inbetweener):
     """In-betweener that proposes first, and fills gaps in which something is known."""
     densities: Sequence[Density] = ()
     """Densities for the end, and for walks over places; without any both are the network's or the tweener's."""
-    settings: ChoiceSettings = field(default_factory=ChoiceSettings)
-    """Thresholds of the choice."""
+    long: int = 181
+    """Frames of the shortest gap between whole poses, with partial keys in it or none, that can be a tweener's."""
     tweener: Inbetweener | None = None
     """In-betweener for long gaps between whole poses; without one they are the network's."""
     stitcher: Callable[[], Inbetweener] | None = None
@@ -106,8 +91,8 @@ class AutoInbetweener(Inbetweener):
             made = _fill_from(stitched, made, query, told)
         for gap in query.enclosed_gaps:
             # Who was told to move in a style moves; tweeners let others tremble.
-            held = not self.has_style if _is_within(gap, long) else _goes_astray(query, made, gap, self.settings)
-            if held and _is_standing_still(query, *gap, self.settings):
+            held = not self.has_style if _is_within(gap, long) else _goes_astray(query, made, gap)
+            if held and _is_standing_still(query, *gap):
                 made = _hold_pose(query, made, gap)
         if self.has_style:
             made = _note_no_style(query, made, [gap for gap in query.enclosed_gaps if not _is_within(gap, long)])
@@ -117,7 +102,7 @@ class AutoInbetweener(Inbetweener):
         """Return whether a gap is the tweener's: long, or with room for the style that it was told."""
         if self.tweener is None or query.keep_trajectory:
             return False
-        shortest = self.settings.styled if self.has_style else self.settings.long
+        shortest = _STYLED if self.has_style else self.long
         return stop - start >= shortest and not _is_beside_part(query, start, stop)
 
     def _keeps(self, query: GapQuery, made: Proposal, tweened: Proposal, gap: tuple[int, int]) -> bool:
@@ -126,13 +111,13 @@ class AutoInbetweener(Inbetweener):
         if INTERPOLATION in by or _has_parts_within(query, *gap):
             return False
         path, other = (measure_path_length(one.motion.slice(gap[0] - 1, gap[1] + 1)) for one in (made, tweened))
-        return path >= self.settings.lively * other
+        return path >= _LIVELY * other
 
     def _is_stitchers(self, query: GapQuery, start: int, stop: int) -> bool:
         """Return whether a gap is the stitcher's: short, with more told in it than the poses beside it."""
         if query.keep_trajectory or self._is_tweeners(query, start, stop) or _is_beside_part(query, start, stop):
             return False
-        return stop - start <= self.settings.stitched and _has_parts_within(query, start, stop)
+        return stop - start <= _STITCHED and _has_parts_within(query, start, stop)
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,13 +154,13 @@ def _fill_from(proposal: Proposal, made: Proposal, query: GapQuery, gaps: Sequen
     return replace(made.take(proposal, gaps), others=(*made.others, *others))
 
 
-def _is_standing_still(query: GapQuery, start: int, stop: int, settings: ChoiceSettings) -> bool:
+def _is_standing_still(query: GapQuery, start: int, stop: int) -> bool:
     """Return whether the body has the same whole pose and position before and after a gap, and is at rest in known
     frames beside it.
     """
     targets = query.effector_targets
     told = targets is not None and bool(targets.wanted[start:stop].any())
-    if stop - start < settings.held or query.keep_trajectory or told or _is_beside_part(query, start, stop):
+    if stop - start < _HELD or query.keep_trajectory or told or _is_beside_part(query, start, stop):
         return False
     positions, unknown = query.motion.joint_positions(), query.missing.frames
     apart = float((positions[stop] - positions[start - 1]).norm(dim=-1).mean())
@@ -183,14 +168,14 @@ def _is_standing_still(query: GapQuery, start: int, stop: int, settings: ChoiceS
     for one, other in ((start - 2, start - 1), (stop, stop + 1)):
         if one >= 0 and other < len(positions) and not bool(unknown[[one, other]].any()):
             speeds.append(float((positions[other] - positions[one]).norm(dim=-1).mean()) * PRIOR_FPS)
-    return apart < settings.same_pose_distance and max(speeds) < settings.at_rest
+    return apart < _SAME_POSE_DISTANCE and max(speeds) < _AT_REST
 
 
-def _goes_astray(query: GapQuery, made: Proposal, gap: tuple[int, int], settings: ChoiceSettings) -> bool:
+def _goes_astray(query: GapQuery, made: Proposal, gap: tuple[int, int]) -> bool:
     """Return whether a proposal takes the hips far from the straight way through a gap."""
     part = slice(*gap)
     off = (made.motion.root_position - query.motion.root_position)[part, ::2].norm(dim=-1)
-    return float(off.max()) > settings.astray * query.scale
+    return float(off.max()) > _ASTRAY * query.scale
 
 
 def _hold_pose(query: GapQuery, made: Proposal, gap: tuple[int, int]) -> Proposal:

@@ -15,7 +15,7 @@ from controllers.common.character import Character
 from controllers.following.follow import FollowSettings, follow
 from controllers.shots.posing import MetPose, build_rest_pose
 from controllers.shots.request import Arrival, Lead, Look, Others, PoseKey, Reach, ShotRequest
-from controllers.shots.shot import ShotSettings, ShotSolution, solve_shot
+from controllers.shots.shot import ShotSolution, solve_shot
 from controllers.shots.way import APART_MARGIN, Way, plan_way
 from mapctl import kinematics, report
 from mapctl.commands.shared.inputs import read_clip
@@ -391,7 +391,7 @@ def play_shot(
         inbetweener,
         plan.request,
         generator=torch.Generator().manual_seed(plan.actor.seed),
-        settings=ShotSettings(follow=follow),
+        settings=follow,
         skeleton=plan.character.skeleton,
         progress=progress,
     )
