@@ -108,14 +108,7 @@ def _fit(skeleton: Skeleton, made: Float[Tensor, "joints 4"], view: _View, faced
             + size.square()
         )
 
-    def differentiate(points: Tensor) -> tuple[Tensor, Tensor]:
-        rows = points.detach().requires_grad_(True)
-        with torch.enable_grad():
-            energy = energies(rows)
-            (gradient,) = torch.autograd.grad(energy.sum(), rows)
-        return energy.detach(), gradient
-
-    found = lbfgs.minimise(differentiate, unknowns, settings=_SEARCH)
+    found = lbfgs.minimise(lbfgs.differentiate(energies), unknowns, settings=_SEARCH)
     turn = found.x[:, :-1].unflatten(1, (joints, 3))
     quats = rotations.multiply(start, rotations.from_rotation_vector(turn))
     away = torch.rad2deg(rotations.wrap_angle(heading(quats[:, 0]) - heading(made[:1])))

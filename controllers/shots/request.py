@@ -63,14 +63,14 @@ class Filling:
 
 def measure_transition_cost(before: Motion, after: Motion, one: Transition, inbetweener: Inbetweener) -> float:
     """Measure what a viewer would mind of a transition from one motion to another, both of the whole shot's frames,
-    m/s (see `judge`)."""
+    m/s."""
     frame = torch.arange(before.num_frames)
     missing = MissingMask.of_frames((frame >= one.start) & (frame < one.stop), before.num_joints)
     return _measure_cost(Filling(join_across(before, after, one), missing, (one.start, one.stop)), inbetweener)
 
 
 def choose_filling(candidates: Sequence[Filling], inbetweener: Inbetweener) -> int:
-    """Choose the candidate that costs a viewer least (see `judge`). The in-betweener's proposals are compared, without
+    """Choose the candidate that costs a viewer least. The in-betweener's proposals are compared, without
     MAP."""
     if len(candidates) == 1:
         return 0
@@ -79,7 +79,8 @@ def choose_filling(candidates: Sequence[Filling], inbetweener: Inbetweener) -> i
 
 
 def _measure_cost(filling: Filling, inbetweener: Inbetweener) -> float:
-    """Measure what a viewer would mind, m/s."""
+    """Measure what a viewer would mind, m/s: sliding, skating, detours, time on no foot (see `compute_artefact_cost`),
+    and the worst acceleration."""
     start, stop = filling.around
     first, last = max(0, start - _CONTEXT), min(filling.motion.num_frames, stop + _CONTEXT)
     gap = (max(1, start - first), min(stop, filling.motion.num_frames - 1) - first)
@@ -87,16 +88,9 @@ def _measure_cost(filling: Filling, inbetweener: Inbetweener) -> float:
     if not bool(missing.frames.any()):
         return 0.0
     done = fill(part, missing, inbetweener, settings=InfillSettings(finish=False))
-    return judge(done.motion, done.contacts, gap)
-
-
-def judge(motion: Motion, planted: Bool[Tensor, "frames 2"], gap: tuple[int, int]) -> float:
-    """Judge a filled gap as a viewer would, m/s: sliding, skating, detours, time on no foot (see
-    `compute_artefact_cost`), and the worst acceleration."""
-    cost = compute_artefact_cost(motion, planted, gap)
-    shown = motion.slice(max(0, gap[0] - 2), min(motion.num_frames, gap[1] + 2))
+    shown = done.motion.slice(max(0, gap[0] - 2), min(done.motion.num_frames, gap[1] + 2))
     peaks = worst_frame.measure_peaks(shown.joint_positions()[:, _EFFECTORS], shown.root_position, float(shown.fps))
-    return cost + _ACCELERATION_WEIGHT * peaks.acceleration
+    return compute_artefact_cost(done.motion, done.contacts, gap) + _ACCELERATION_WEIGHT * peaks.acceleration
 
 
 def compute_artefact_cost(motion: Motion, planted: Bool[Tensor, "frames 2"], gap: tuple[int, int]) -> float:

@@ -14,7 +14,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import partial, reduce
 from itertools import pairwise, product
 from typing import Any
 
@@ -617,7 +617,7 @@ def solve_shot(
     return ShotSolution(
         motion,
         Status(Outcome.DONE).with_notes(notes, infeasible=bool(notes)),
-        character.ledger(_join_ledgers(ledger for ledger, _ in walked)),
+        character.ledger(reduce(Ledger.join, (ledger for ledger, _ in walked), Ledger())),
         tuple(window for _, windows in walked for window in windows),
         seconds=time.perf_counter() - began,
         way=way,
@@ -667,10 +667,3 @@ def _meet_keys(
         motion = fill(motion, free, inbetweener, targets=reach.led_there(motion).targets).motion
     motion = look_where_hands_reach(motion, reaches, request.looks, posed)
     return turn_heads(motion, request.looks), reaches, tuple(met)
-
-
-def _join_ledgers(ledgers) -> Ledger:
-    whole = Ledger()
-    for ledger in ledgers:
-        whole = whole.join(ledger)
-    return whole

@@ -11,8 +11,9 @@ are to end earlier: several characters that share a machine's last processor all
 """
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import reduce
 from itertools import pairwise
 from typing import Protocol, runtime_checkable
 
@@ -206,10 +207,7 @@ class Recorder:
     @property
     def ledger(self) -> Ledger:
         """Ledger of all solved frames."""
-        ledger = Ledger()
-        for piece in self.pieces:
-            ledger = ledger.join(piece.ledger) if piece.ledger.entries else ledger
-        return ledger
+        return reduce(Ledger.join, (piece.ledger for piece in self.pieces if piece.ledger.entries), Ledger())
 
 
 def find_second_zero(clock: Clock, state: SteerState) -> float:
@@ -258,15 +256,13 @@ def drive(
     *,
     frames: int,
     clock: Clock | None = None,
-    settings: LoopSettings | None = None,
-    stop: Callable[[], bool] = lambda: False,
     stepper: Stepper | None = None,
 ) -> tuple[SteerState, list[StepRecord]]:
-    """Steer until `frames` have been delivered, `stop()` is true, or Ctrl-C."""
+    """Steer until `frames` have been delivered, or Ctrl-C."""
     records: list[StepRecord] = []
-    stream = iterate_steps(state, source, displays, clock=clock or StreamClock(), settings=settings, stepper=stepper)
+    stream = iterate_steps(state, source, displays, clock=clock or StreamClock(), stepper=stepper)
     try:
-        while state.frames < frames and not stop():
+        while state.frames < frames:
             state, record = next(stream)
             records.append(record)
     except KeyboardInterrupt:

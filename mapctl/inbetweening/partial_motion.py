@@ -158,7 +158,7 @@ def interpolate_partial_motion(
     ground = _where_ever(shown, fill_missing(root[..., ::2], shown), 0.0)
     height = _where_ever(known.height, fill_missing(root[..., 1:2], known.height), mean_height)
     heading = _where_ever(known.heading, fill_missing_angle(motion.heading, known.heading)[..., None], 0.0)
-    quats = _interpolate_quats(motion.quats, known.rotations)
+    quats = interpolate_quats(motion.quats, known.rotations)
     ever = known.rotations.any(dim=1, keepdim=True)[..., None]
     return _reach_targets(
         replace(
@@ -216,9 +216,11 @@ def _where_ever(known: Bool[Tensor, "batch frames"], values: Tensor, otherwise: 
     return torch.where(known.any(dim=1)[:, None, None], values, otherwise)
 
 
-def _interpolate_quats(
+def interpolate_quats(
     quats: Float[Tensor, "batch frames joints 4"], known: Bool[Tensor, "batch frames joints"]
 ) -> Float[Tensor, "batch frames joints 4"]:
+    """Interpolate local rotations (xyzw) along the shortest arc from the last known frame to the next, joint by joint;
+    beyond the first and the last they are held."""
     batch = len(quats)
     columns = known.transpose(1, 2).flatten(0, 1)
     before, after = last_observed(columns), next_observed(columns)

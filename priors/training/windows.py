@@ -9,7 +9,8 @@ from torch import Tensor
 from mapctl import kinematics, rotations
 from mapctl.features import LAYOUT, ground_speed, mirror_features
 from mapctl.inbetweening import PositionImage
-from mapctl.numerics.intervals import fill_missing, fill_missing_angle, last_observed, next_observed
+from mapctl.inbetweening.partial_motion import interpolate_quats
+from mapctl.numerics.intervals import fill_missing, fill_missing_angle
 from mapctl.pose import BodyPose
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors.training.corpus import Corpus, find_window_starts, number_clip_folders
@@ -29,16 +30,7 @@ def interpolate_positions(
     for joint, parent in enumerate(CANONICAL.parents):
         if parent >= 0:
             shown[..., parent] &= known[..., joint]
-    batch, _, joints = shown.shape
-    columns = shown.transpose(1, 2).flatten(0, 1)
-    before, after = last_observed(columns), next_observed(columns)
-    weight = (torch.arange(columns.shape[1]) - before).to(positions_world) / (after - before).clamp_min(1)
-    quats = local_quat_xyzw.transpose(1, 2).flatten(0, 1)
-    missing = ~columns
-    row, frame = missing.nonzero(as_tuple=True)
-    between = rotations.slerp(quats[row, before[missing]], quats[row, after[missing]], weight[row, frame].clamp(0, 1))
-    quats = quats.index_put((row, frame), between)
-    matrices = rotations.to_matrix(quats.unflatten(0, (batch, joints)).transpose(1, 2))
+    matrices = rotations.to_matrix(interpolate_quats(local_quat_xyzw, shown))
     root = fill_missing(positions_world[:, :, 0], known[..., 0])
     interpolated = kinematics.positions_from_matrices(CANONICAL, matrices) + root[:, :, None]
     return torch.where(known[..., None], positions_world, interpolated)

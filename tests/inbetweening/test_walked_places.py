@@ -9,7 +9,7 @@ from tiny_tweener import tiny_tweener
 import priors
 from controllers.inbetweening.pipeline import InfillSettings
 from controllers.inbetweening.proposers import AutoInbetweener, SlerpInbetweener
-from controllers.inbetweening.proposers.slerp import WalkedPlaces
+from controllers.inbetweening.proposers.slerp import lay_curve
 from controllers.inbetweening.tween import measure_keyframe_errors, tween
 from mapctl.inbetweening import GapQuery
 from mapctl.inbetweening.effector_targets import LooseKeys
@@ -32,10 +32,10 @@ def query_of(frames=FRAMES, way=WAY, *, drawn=False):
 
 
 def test_the_curve_is_at_every_place_in_its_frame_and_goes_on():
-    walked = WalkedPlaces.of(query_of(), FASTEST, 20)
-    assert len(walked.arcs) == 111
-    assert (torch.diff(walked.arcs) > 0).all()
-    found = walked.curve.ground_point(walked.arcs[list(FRAMES)])
+    curve, arcs = lay_curve(query_of(), FASTEST, 20)
+    assert len(arcs) == 111
+    assert (torch.diff(arcs) > 0).all()
+    found = curve.ground_point(arcs[list(FRAMES)])
     torch.testing.assert_close(found, torch.tensor(WAY).double(), atol=0.02, rtol=0)
 
 
@@ -50,7 +50,7 @@ def test_the_curve_is_at_every_place_in_its_frame_and_goes_on():
     ids=["drawn", "open", "stands", "too fast"],
 )
 def test_what_is_no_walk_is_left_to_others(query):
-    assert WalkedPlaces.of(query, FASTEST, 5) is None
+    assert lay_curve(query, FASTEST, 5) is None
 
 
 @pytest.mark.slow

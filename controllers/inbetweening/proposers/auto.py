@@ -12,7 +12,7 @@ import torch
 
 from controllers.inbetweening.proposers.partial_keys import propose_through_keys
 from controllers.inbetweening.proposers.rollouts import RolloutSettings, extrapolate_end
-from controllers.inbetweening.proposers.slerp import PlaceWalker, StitchedInbetweener
+from controllers.inbetweening.proposers.slerp import StitchedInbetweener, walk_over_places
 from mapctl import contacts
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening import GapQuery, Proposal
@@ -76,7 +76,7 @@ class AutoInbetweener(Inbetweener):
         where that knows such walks.
         """
         if query.loose is not None:
-            walked = PlaceWalker(tuple(self.densities)).propose(query, generator=generator)
+            walked = walk_over_places(query, self.densities, generator)
             return walked or (self.tweener or self.network).propose(query, generator=generator)
         made = self.network.propose(query, generator=generator)
         long = [gap for gap in query.hide_partial_keys().enclosed_gaps if self._is_tweeners(query, *gap)]

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from controllers.common.map_refinement import estimate_rest_height
-from controllers.inbetweening.proposers.slerp import PlaceWalker
+from controllers.inbetweening.proposers.slerp import walk_over_places
 from mapctl import contacts, rotations
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode, integrate_root
 from mapctl.inbetweening import GapQuery, Proposal
@@ -226,7 +226,7 @@ class RolloutInbetweener(Inbetweener):
         gaps in which every attempt jumps, and loose keys but for places that are all that is told, which are walked
         over."""
         if query.loose is not None:
-            walked = PlaceWalker(tuple(self.densities)).propose(query, generator=generator)
+            walked = walk_over_places(query, self.densities, generator)
             return walked or self.fallback.propose(query, generator=generator)
         base = self.fallback.propose(query, generator=generator)
         if not query.enclosed_gaps:

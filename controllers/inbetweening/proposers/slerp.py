@@ -4,8 +4,8 @@ A walk over places that are all that is told: a density follows a curve through 
 section 5.2).
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import scipy
 import torch
@@ -88,78 +88,59 @@ def _put_in(stitched: Proposal, made: Proposal, query: GapQuery) -> Proposal:
 _LEAST_WAY = 0.3  # metres from place to place, at the canonical size, that are walked and not stood
 
 
-@dataclass(frozen=True, eq=False)
-class WalkedPlaces:
-    """A curve through places, and where on it somebody is in each frame."""
-
-    curve: Curve
-    """The curve, metres at the canonical size."""
-    arcs: Float[Tensor, " ahead"]
-    """Arcs of the frames and of a window beyond them, metres."""
-
-    @staticmethod
-    def of(query: GapQuery, fastest: float, ahead: int) -> "WalkedPlaces | None":
-        """Lay a curve through the places of a query of which they are all that is told, from its first frame to its
-        last; None where there are others, where somebody would stand, or be faster than `fastest`, m/s."""
-        loose = query.loose
-        if loose is None or not query.only_places:
-            return None
-        frames = loose.placed.nonzero()[:, 0]
-        if len(frames) < 2 or int(frames[0]) > 0 or int(frames[-1]) < query.motion.num_frames - 1:
-            return None
-        places = loose.ground[frames].double() / query.scale
-        ways = torch.diff(places, dim=0).norm(dim=-1)
-        speeds = ways * PRIOR_FPS / torch.diff(frames)
-        if float(ways.min()) < _LEAST_WAY or float(speeds.max()) > fastest:
-            return None
-        curve = curves.through(places)
-        at = _find_arcs(curve, places)
-        if float(torch.diff(at).min()) <= 0:
-            return None
-        timed = scipy.interpolate.PchipInterpolator(frames.numpy(), at.numpy())
-        inside = torch.as_tensor(timed(torch.arange(int(frames[-1]) + 1).numpy()))
-        speed = float(inside[-1] - inside[-2])
-        beyond = inside[-1] + speed * torch.arange(1, ahead + 1)
-        return WalkedPlaces(curve, torch.cat([inside, beyond]))
+def lay_curve(query: GapQuery, fastest: float, ahead: int) -> tuple[Curve, Float[Tensor, " ahead"]] | None:
+    """Lay a curve through the places of a query of which they are all that is given, from its first frame to its last,
+    metres at the canonical size; also return the arcs of the frames and of so many `ahead` of them, metres. None where
+    there are others, and where the body would stand, or be faster than `fastest`, m/s."""
+    loose = query.loose
+    if loose is None or not query.only_places:
+        return None
+    frames = loose.placed.nonzero()[:, 0]
+    if len(frames) < 2 or int(frames[0]) > 0 or int(frames[-1]) < query.motion.num_frames - 1:
+        return None
+    places = loose.ground[frames].double() / query.scale
+    ways = torch.diff(places, dim=0).norm(dim=-1)
+    speeds = ways * PRIOR_FPS / torch.diff(frames)
+    if float(ways.min()) < _LEAST_WAY or float(speeds.max()) > fastest:
+        return None
+    curve = curves.through(places)
+    at = _find_arcs(curve, places)
+    if float(torch.diff(at).min()) <= 0:
+        return None
+    timed = scipy.interpolate.PchipInterpolator(frames.numpy(), at.numpy())
+    inside = torch.as_tensor(timed(torch.arange(int(frames[-1]) + 1).numpy()))
+    speed = float(inside[-1] - inside[-2])
+    return curve, torch.cat([inside, inside[-1] + speed * torch.arange(1, ahead + 1)])
 
 
-@dataclass(frozen=True)
-class PlaceWalker:
-    """Walks over places by one of several densities."""
-
-    densities: tuple[Density, ...]
-    """Densities; the first, that of locomotion, walks."""
-    settings: FollowSettings = field(default_factory=FollowSettings)
-    """Sigmas and search of following."""
-
-    def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal | None:
-        """Propose a walk; None where it is not one that the density knows (see `WalkedPlaces.of`)."""
-        if not self.densities:
-            return None
-        density, ahead = self.densities[0], self.settings.window.frames
-        walked = WalkedPlaces.of(query, density.limits.fastest, ahead)
-        if walked is None:
-            return None
-        frames = query.motion.num_frames
-        motion, done, _ = walk_arcs(
-            density,
-            walked.curve,
-            walked.arcs,
-            frames,
-            character=Character(),
-            settings=self.settings,
-            generator=generator or torch.Generator().manual_seed(0),
-        )
-        body = replace(query.motion, root_position=motion.root_position, local_quat_xyzw=motion.local_quat_xyzw)
-        root = body.root_position * query.scale
-        source = f"walk of {density.name}"
-        planted = done.features[:, LAYOUT.slices["contacts"]] > 0.5
-        return Proposal(
-            replace(body, root_position=root),
-            contacts.to_logits(planted),
-            source,
-            (GapSource(0, frames, source, "along a curve through the places, which are all that keys tell"),),
-        )
+def walk_over_places(
+    query: GapQuery, densities: Sequence[Density], generator: torch.Generator | None
+) -> Proposal | None:
+    """Propose a walk over places by the first density, that of locomotion; None where it is not one that the density
+    knows (see `lay_curve`)."""
+    settings = FollowSettings()
+    laid = lay_curve(query, densities[0].limits.fastest, settings.window.frames) if densities else None
+    if laid is None:
+        return None
+    curve, arcs = laid
+    frames = query.motion.num_frames
+    motion, done, _ = walk_arcs(
+        densities[0],
+        curve,
+        arcs,
+        frames,
+        character=Character(),
+        settings=settings,
+        generator=generator or torch.Generator().manual_seed(0),
+    )
+    root, source = motion.root_position * query.scale, f"walk of {densities[0].name}"
+    planted = done.features[:, LAYOUT.slices["contacts"]] > 0.5
+    return Proposal(
+        replace(query.motion, root_position=root, local_quat_xyzw=motion.local_quat_xyzw),
+        contacts.to_logits(planted),
+        source,
+        (GapSource(0, frames, source, "along a curve through the places, which are all that keys tell"),),
+    )
 
 
 def _find_arcs(curve: Curve, places: Float[Tensor, "places 2"]) -> Float[Tensor, " places"]:
