@@ -67,14 +67,7 @@ def load_with_missing(path: str | PathLike[str]) -> tuple[Motion, MissingValues]
 
 
 def _read(path: str | PathLike[str], *, lossy: bool) -> tuple[Motion, MissingValues]:
-    return build_motion(path, read_arrays(path, read_bytes(path)), lossy=lossy)
-
-
-def build_motion(
-    path: str | PathLike[str], arrays: dict[str, np.ndarray], *, lossy: bool = False
-) -> tuple[Motion, MissingValues]:
-    """Build a motion of the arrays of a file; FileFormatError names the key that is wrong. With `lossy` tracks may
-    have NaN, and where is returned."""
+    arrays = _read_arrays(path, read_bytes(path))
     _check_shapes(path, arrays, lossy=lossy)
     lost = _replace_missing(path, arrays)
     if (found := str(arrays["format"])) != FORMAT:
@@ -92,21 +85,15 @@ def save(motion: Motion, path: str | PathLike[str]) -> None:
     for key, values in arrays.items():
         if values.dtype.kind == "f" and not np.isfinite(values).all():
             raise RequestError(f"cannot write {path}: {key} is not finite")
-    write_bytes(path, pack_arrays(arrays))
-
-
-def pack_arrays(arrays: dict[str, np.ndarray]) -> bytes:
-    """Return the archive of these arrays."""
     buffer = io.BytesIO()
     np.savez_compressed(buffer, allow_pickle=False, **arrays)
-    return buffer.getvalue()
+    write_bytes(path, buffer.getvalue())
 
 
 def to_arrays(motion: Motion) -> dict[str, np.ndarray]:
     """Return the arrays of a motion, by the keys above."""
     skeleton, moving = motion.skeleton, sorted(motion.moving_offsets)
     tracks = np.array([_numbers(motion.moving_offsets[joint]) for joint in moving])
-    told = {_LICENCE: np.array(motion.licence)} if motion.licence else {}
     return {
         "format": np.array(FORMAT),
         "names": np.array(skeleton.names),
@@ -119,8 +106,7 @@ def to_arrays(motion: Motion) -> dict[str, np.ndarray]:
         "local_quat_xyzw": _numbers(motion.local_quat_xyzw),
         "moving_joints": np.array(moving, dtype=np.int64),
         "moving_offsets": tracks.reshape(len(moving), motion.num_frames, 3),
-        **told,
-    }
+    } | ({_LICENCE: np.array(motion.licence)} if motion.licence else {})
 
 
 def _build_motion(arrays: dict[str, np.ndarray]) -> Motion:
@@ -146,27 +132,20 @@ def _build_motion(arrays: dict[str, np.ndarray]) -> Motion:
     )
 
 
-def read_arrays(path: str | PathLike[str], raw: bytes) -> dict[str, np.ndarray]:
+def _read_arrays(path: str | PathLike[str], raw: bytes) -> dict[str, np.ndarray]:
     """Read the known keys. Sizes are bounded before anything is unpacked, and pickled objects are refused."""
     if not raw.startswith(b"PK\x03\x04"):
         raise FileFormatError(path, "is not an .npz archive")
     try:
         with zipfile.ZipFile(io.BytesIO(raw)) as archive:
             _check_members(path, archive)
-            return {key: _read_array(archive, key) for key in _list_keys(archive)}
+            keys = [*_KEYS, *([_LICENCE] if f"{_LICENCE}.npy" in archive.namelist() else [])]
+            contents = {key: io.BytesIO(archive.read(f"{key}.npy")) for key in keys}
+            return {key: np.lib.format.read_array(content, allow_pickle=False) for key, content in contents.items()}
     except FileFormatError:
         raise
     except Exception as error:  # zipfile and numpy raise whatever a forged archive leads their parsers to
         raise FileFormatError(path, f"is not a sound .npz archive: {one_line(error)}") from error
-
-
-def _list_keys(archive: zipfile.ZipFile) -> list[str]:
-    """List the known keys that are there; those that must be have been checked."""
-    return [*_KEYS, *([_LICENCE] if f"{_LICENCE}.npy" in archive.namelist() else [])]
-
-
-def _read_array(archive: zipfile.ZipFile, key: str) -> np.ndarray:
-    return np.lib.format.read_array(io.BytesIO(archive.read(f"{key}.npy")), allow_pickle=False)
 
 
 def _check_members(path: str | PathLike[str], archive: zipfile.ZipFile) -> None:

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from mapctl.errors import FileFormatError
+from mapctl.formats.text import one_line
 
 try:
     import resource
@@ -50,7 +51,7 @@ def call(reader: Callable[..., Any], path: str | PathLike[str], **options: Any) 
     if done.returncode == 0:
         outcome, content = pickle.loads(done.stdout)  # noqa: S301 - of our own reader
         if outcome == "refused":
-            raise FileFormatError(path, _one_line(content))
+            raise FileFormatError(path, one_line(content, _LONGEST_MESSAGE))
         return content
     errors = done.stderr.decode(errors="replace")
     if "MemoryError" in errors or "bad_alloc" in errors:
@@ -91,8 +92,3 @@ def _environment() -> dict[str, str]:
     paths = [_ROOT, *filter(None, [os.environ.get("PYTHONPATH")])]
     single = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "PXR_WORK_THREAD_LIMIT"), "1")
     return {**os.environ, **single, "PYTHONPATH": os.pathsep.join(paths), "PYTHONIOENCODING": "utf-8"}
-
-
-def _one_line(message: str) -> str:
-    plain = "".join(letter if letter.isprintable() else " " for letter in " ".join(message.split()))
-    return plain if len(plain) <= _LONGEST_MESSAGE else f"{plain[: _LONGEST_MESSAGE - 3]}..."

@@ -55,7 +55,7 @@ def shorten(word: str, limit: int = 40) -> str:
     return ascii(word if len(word) <= limit else word[: limit - 3] + "...")
 
 
-def one_line(error: Exception, limit: int = 160) -> str:
+def one_line(error: Exception | str, limit: int = 160) -> str:
     """Shorten a library's message to one printable line: some quote pieces of the file."""
     text = " ".join(str(error).split())
     return text if text.isprintable() and len(text) <= limit else shorten(text, limit)

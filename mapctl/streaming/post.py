@@ -33,24 +33,10 @@ class StreamStatistics:
     """Why the first of those was not sent."""
 
 
-@dataclass(frozen=True)
-class PostRequest:
-    """Request for a process that sends."""
-
-    family: int
-    """Family of the socket."""
-    address: str
-    """Numeric address of the receivers."""
-    ports: tuple[int, ...]
-    """Port of each character's receiver."""
-    late_seconds: float
-    """How long after it was due a frame is late, seconds."""
-
-
 class _Post:
-    def __init__(self, request: PostRequest):
-        self._request = request
-        self._socket = socket.socket(request.family, socket.SOCK_DGRAM)
+    def __init__(self, family: int, receivers: Sequence[tuple[str, int]], late_seconds: float):
+        self._receivers, self._late_seconds = receivers, late_seconds
+        self._socket = socket.socket(family, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
         self._waiting: list[tuple[float, int, int, Sequence[bytes]]] = []
         self._counter = itertools.count()
@@ -81,7 +67,7 @@ class _Post:
             due, _, character, packets = heapq.heappop(self._waiting)
             try:
                 for packet in packets:
-                    self._socket.sendto(packet, (self._request.address, self._request.ports[character]))
+                    self._socket.sendto(packet, self._receivers[character])
             except OSError as error:  # nobody there, or no room: the next frame comes anyway
                 self._count_unsent(error.strerror or str(error))
             else:
@@ -93,7 +79,7 @@ class _Post:
         self.statistics = replace(
             known,
             frames_sent=known.frames_sent + 1,
-            late=known.late + (now - due > self._request.late_seconds),
+            late=known.late + (now - due > self._late_seconds),
             largest_gap_ms=max(known.largest_gap_ms, 1000 * gap),
             largest_lateness_ms=max(known.largest_lateness_ms, 1000 * (now - due)),
         )
@@ -103,9 +89,10 @@ class _Post:
         self.statistics = replace(known, not_sent=known.not_sent + 1, fault=known.fault or why)
 
 
-def run_post(connection: Connection, request: PostRequest) -> None:
-    """Send frames until told to close, or until the parent has ended; then send what waits, and say what was sent."""
-    post, listening = _Post(request), True
+def run_post(connection: Connection, family: int, receivers: Sequence[tuple[str, int]], late_seconds: float) -> None:
+    """Send frames, of each character to its receiver (numeric address and port), until the order to close, or until the
+    parent has ended; then send what waits, and the statistics. A frame is late so many seconds after it was due."""
+    post, listening = _Post(family, receivers, late_seconds), True
     while listening or post.seconds_left() is not None:
         if not listening:
             time.sleep(post.seconds_left() or 0.0)

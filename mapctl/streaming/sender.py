@@ -18,7 +18,7 @@ from mapctl.skeleton import Skeleton
 from mapctl.streaming import vmc
 from mapctl.streaming.endpoint import Endpoint
 from mapctl.streaming.messages import Message
-from mapctl.streaming.post import PostRequest, StreamStatistics, run_post
+from mapctl.streaming.post import StreamStatistics, run_post
 
 LATE_SECONDS = 0.5 / PRIOR_FPS
 """A frame that is sent more than this after it was due is late: half the time for which it is shown."""
@@ -50,12 +50,12 @@ class PoseStream:
         """
         self.endpoints = [endpoint.offset(k, option=OPTION) for k in range(len(skeletons))]
         family, address = endpoint.resolve(option=OPTION)
-        request = PostRequest(int(family), address, tuple(one.port for one in self.endpoints), LATE_SECONDS)
+        receivers = [(address, one.port) for one in self.endpoints]
         self._skeletons, self._root_travels, self._delay = list(skeletons), root_travels, delay
         self.statistics = StreamStatistics()
         """What was sent; known after `close`."""
         self._ours, theirs = multiprocessing.Pipe()
-        self._process = spawn(run_post, theirs, request)
+        self._process = spawn(run_post, theirs, int(family), receivers, LATE_SECONDS)
         theirs.close()
         self._queue: queue.SimpleQueue[tuple[object, ...] | None] = queue.SimpleQueue()
         threading.Thread(target=send_queued, args=(self._ours, self._queue), daemon=True).start()

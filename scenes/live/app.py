@@ -21,17 +21,7 @@ from mapctl.streaming.orders import HANDS, Order, keep_latest, read_order
 from scenes.live.camera import CameraMode, WorldView
 from scenes.live.character import CharacterLook, ShownCharacter
 from scenes.live.ground import add_scenery, intersect_ground, parse_ray
-from scenes.live.inputs import (
-    DISC_RADII,
-    HELP,
-    KEYS,
-    WITHIN,
-    Driving,
-    DrivingOutputs,
-    InputLimits,
-    KeyAction,
-    parse_point,
-)
+from scenes.live.inputs import DISC_RADII, HELP, KEYS, WITHIN, Driving, InputLimits, KeyAction, parse_point
 from scenes.live.page import HOST, PageChannel, open_server
 from scenes.live.panel import Panel
 from scenes.live.paths import PathEditor, Ray, write_csv
@@ -97,8 +87,8 @@ class LiveApp:
         self.timeline = Timeline(self.characters, self._set_paused, lambda: self.is_paused)
         self.panel = Panel(self.server.gui, self, characters=len(characters))
         self.panel.show_inputs(self.chosen.inputs)
-        outputs = DrivingOutputs(self._drive, self._act, self.view.chase.orbit, self.view.find_heading, self.notify)
-        self.driving = Driving(outputs, self.limits.fastest, min(1.2, self.limits.fastest))
+        outputs = self._drive, self._act, self.view.chase.orbit, self.view.find_heading, self.notify
+        self.driving = Driving(*outputs, self.limits.fastest, min(1.2, self.limits.fastest))
         self._remote = None if source is None else RemoteCommands(source, self)
         scene.on_click()(lambda event: self.enqueue(lambda: self.click(event.ray_origin, event.ray_direction)))
         self.server.on_client_connect(lambda client: self.enqueue(lambda: self.show_all([client])))

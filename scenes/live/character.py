@@ -86,8 +86,8 @@ class SkinnedBody:
         weights = _sum_weights(mesh, np.searchsorted(self._joints, carriers), len(self._joints))
         same = _find_same(np.column_stack([mesh.vertices, weights]))
         self._bones: list[tuple[int, viser.MeshSkinnedBoneHandle]] = []
-        for number, group in enumerate(group_by_colour(mesh, _MAX_COLOURS)):
-            self._add_group(scene, f"{name}/skin{number}", replace(group, faces=same[group.faces]), weights)
+        for number, (faces, rgba) in enumerate(_group_by_colour(mesh, _MAX_COLOURS)):
+            self._add_group(scene, f"{name}/skin{number}", same[faces], rgba, weights)
 
     def prepare(self, motion: Motion) -> list[BodyPose]:
         """Prepare the poses of frames on canonical joints with the character's bones: transforms of its bones."""
@@ -102,9 +102,9 @@ class SkinnedBody:
             bone.position = pose.positions[joint]
             bone.wxyz = wxyz[joint]
 
-    def _add_group(self, scene: viser.SceneApi, name: str, group: "ColourGroup", weights: Array) -> None:
+    def _add_group(self, scene: viser.SceneApi, name: str, faces: Array, rgba: Array, weights: Array) -> None:
         mesh = self._character.mesh
-        vertices, faces = np.unique(group.faces, return_inverse=True)
+        vertices, faces = np.unique(faces, return_inverse=True)
         bones = np.flatnonzero(weights[vertices].max(axis=0) > 0)
         handle = scene.add_mesh_skinned(
             name,
@@ -113,25 +113,16 @@ class SkinnedBody:
             bone_wxyzs=np.tile([1.0, 0.0, 0.0, 0.0], (len(bones), 1)),
             bone_positions=mesh.rest[self._joints[bones]],
             skin_weights=weights[np.ix_(vertices, bones)],
-            color=tuple((255 * group.rgba[:3]).round().astype(int).tolist()),
-            opacity=None if group.rgba[3] > _OPAQUE else float(group.rgba[3]),
+            color=tuple((255 * rgba[:3]).round().astype(int).tolist()),
+            opacity=None if rgba[3] > _OPAQUE else float(rgba[3]),
             side="double",
         )
         self._bones += zip(bones.tolist(), handle.bones, strict=True)
 
 
-@dataclass(frozen=True, eq=False)
-class ColourGroup:
-    """Triangles that are shown in one colour."""
-
-    faces: Array
-    """(m, 3) vertex indices of the mesh."""
-    rgba: Array
-    """(4,) sRGB colour and opacity, 0 to 1: their mean by area."""
-
-
-def group_by_colour(mesh: CharacterMesh, most: int) -> list[ColourGroup]:
-    """Group the triangles by colour into at most so many groups, opaque ones apart from others.
+def _group_by_colour(mesh: CharacterMesh, most: int) -> list[tuple[Array, Array]]:
+    """Group the triangles by colour into at most so many groups, opaque ones apart from others: their vertex indices
+    (m, 3), and the mean by area of their sRGB colour and opacity (4,), 0 to 1.
 
     The group with the largest variance, by area, is halved at its mean along that channel (median cut, Heckbert 1982),
     until all are alike or there are enough.
@@ -150,7 +141,7 @@ def group_by_colour(mesh: CharacterMesh, most: int) -> list[ColourGroup]:
             break
         low = values <= np.average(values, weights=area[groups[worst]])
         groups[worst : worst + 1] = [groups[worst][low], groups[worst][~low]]
-    return [ColourGroup(mesh.faces[group], np.average(rgba[group], axis=0, weights=area[group])) for group in groups]
+    return [(mesh.faces[group], np.average(rgba[group], axis=0, weights=area[group])) for group in groups]
 
 
 def find_carriers(rigmap: RigMap) -> Array:

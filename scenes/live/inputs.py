@@ -176,9 +176,10 @@ _ORDER_SECONDS, _LEAST_TURN, _LEAST_SPEED = 0.1, 2.0, 0.05  # between inputs; de
 _ORBIT_RATE = math.radians(100.0)  # radians/s
 
 
-@dataclass(frozen=True)
-class DrivingOutputs:
-    """Functions that act on what keys and sticks ask for."""
+@dataclass
+class Driving:
+    """Held keys and sticks of each page; the first page that drives is obeyed until it releases its controls. The
+    character stands when keys are released, the gamepad is unplugged, or the page goes away."""
 
     steer: Callable[[float, float | None], None]
     """Steer at a speed, m/s, in a heading, degrees; None keeps it."""
@@ -190,15 +191,6 @@ class DrivingOutputs:
     """Return the heading, degrees, of a direction to the right and away as a viewer's camera sees it."""
     notify: Callable[[str, str], None]
     """Show a note: title and text."""
-
-
-@dataclass
-class Driving:
-    """Held keys and sticks of each page; the first page that drives is obeyed until it releases its controls. The
-    character stands when keys are released, the gamepad is unplugged, or the page goes away."""
-
-    outputs: DrivingOutputs
-    """Where inputs go."""
     fastest: float
     """The prior's fastest speed, m/s."""
     walk_speed: float = 1.2
@@ -217,12 +209,12 @@ class Driving:
         self._pages[page] = state
         for code in sorted(state.keys - before.keys):
             if code in ACTIONS:
-                self.outputs.act(ACTIONS[code])
+                self.act(ACTIONS[code])
         for action in list_presses(before.pad, state.pad):
-            self.outputs.act(action)
+            self.act(action)
         if (before.pad is None) != (state.pad is None):
             plugged = "left stick walks, right trigger runs" if state.pad else "unplugged; the character stands"
-            self.outputs.notify("Gamepad", plugged)
+            self.notify("Gamepad", plugged)
 
     def step(self, now: float) -> None:
         """Act on what is held at a value of time.perf_counter."""
@@ -231,7 +223,7 @@ class Driving:
         for page in self._pages.values():
             turn = sum(TURNS.get(code, 0.0) for code in page.keys) - (0.0 if page.pad is None else _read_look(page.pad))
             if turn:
-                self.outputs.orbit(turn * _ORBIT_RATE * seconds)
+                self.orbit(turn * _ORBIT_RATE * seconds)
         self._drive(now)
 
     def _drive(self, now: float) -> None:
@@ -240,14 +232,14 @@ class Driving:
             was, self._driver = self._driver, next(iter(wanted), None)
             if was is not None and self._driver is None:
                 self._given = None
-                self.outputs.steer(0.0, None)
+                self.steer(0.0, None)
         if self._driver is None:
             return
         direction, speed = wanted[self._driver]
-        heading = self.outputs.find_heading(direction, self._pages[self._driver].viewer)
+        heading = self.find_heading(direction, self._pages[self._driver].viewer)
         if self._is_new(speed, heading, now):
             self._given, self._given_at = (speed, heading), now
-            self.outputs.steer(speed, heading)
+            self.steer(speed, heading)
 
     def _read(self, page: PageState) -> tuple[tuple[float, float], float] | None:
         """Return direction and speed that a page asks for; None where it asks for none."""

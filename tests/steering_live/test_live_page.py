@@ -21,7 +21,6 @@ from scenes.live.inputs import (
     KEYS,
     UNCONDITIONED,
     Driving,
-    DrivingOutputs,
     InputLimits,
     KeyAction,
     SteeringInputs,
@@ -146,14 +145,14 @@ class Deck:
 
     def __init__(self):
         self.heard: list[tuple] = []
-        outputs = DrivingOutputs(
+        self.driving = Driving(
             lambda speed, heading: self.heard.append(("steer", speed, heading)),
             lambda action: self.heard.append(("act", action)),
             lambda angle: self.heard.append(("orbit", round(angle, 6))),
             lambda direction, viewer: 90.0 - math.degrees(math.atan2(*direction)),
             lambda title, text: self.heard.append(("note", text)),
+            fastest=3.8,
         )
-        self.driving = Driving(outputs, fastest=3.8)
 
     def hold(self, *codes: str, page: int = 0, at: float | None = None) -> None:
         self.driving.hear(page, PageState(keys=frozenset(codes)))

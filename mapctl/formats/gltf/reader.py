@@ -1,6 +1,6 @@
 """glTF, VRM and VRM animations in: which nodes are a character's joints, their rest pose, and an animation of them."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -204,11 +204,22 @@ def open_character(path: str | PathLike[str]) -> tuple[CharacterPath, GltfFile, 
 
 
 def read_skeleton(gltf: GltfFile, armature: Armature) -> tuple[RestFrames, Skeleton]:
-    """Read the rest frames, and the skeleton that is aligned with the world in them."""
-    frames = read_rest_frames(gltf, armature)
-    worlds = frames.matrices()
+    """Read the rest frames, and the skeleton that is aligned with the world in them.
+
+    The rest pose is the one in which the skins are bound where all of them say one and bones are as long as the nodes'
+    (VRM files: always the nodes'); else the nodes'. FileFormatError for uneven scale.
+    """
+    names = make_unique([str(gltf.get("nodes", node).get("name") or f"node_{node}") for node in armature.nodes])
+    local = np.stack([node_matrix(gltf.get("nodes", node)) for node in armature.nodes])
+    outer = NodeTree(gltf).outer_matrix(armature.nodes[0])
+    worlds = chain_matrices(armature.parents, local, outer)
+    frames = build_frames(gltf.path, armature.name, names, armature.parents, worlds, outer)
+    is_vrm = any(name in gltf.tree.get("extensions", {}) for name in ("VRM", *_EXTENSIONS))  # whatever its ending
+    if not is_vrm and (bound := _bind_worlds(gltf, armature, worlds, outer)) is not None:
+        frames = RestFrames.of(tuple(names), armature.parents, bound, outer)
+    rests = frames.matrices()
     ends = {
-        joint: (worlds[joint] @ node_matrix(gltf.get("nodes", node)))[:3, 3] for joint, node in armature.ends.items()
+        joint: (rests[joint] @ node_matrix(gltf.get("nodes", node)))[:3, 3] for joint, node in armature.ends.items()
     }
     skeleton = frames.skeleton(ends)
     if not float(skeleton.offsets.abs().max()) <= 1e6:
@@ -240,6 +251,11 @@ def _read_licence(gltf: GltfFile) -> str:
 
 
 def _source(gltf: GltfFile, armature: Armature, frames: RestFrames, animation: str | None) -> CharacterSource:
+    at = dict(zip(armature.nodes, frames.names, strict=True))
+    bones = {bone: at[node] for bone, node in read_bones(gltf).items() if node in at}
+    if "upperChest" in bones:  # it carries the arms, and is the canonical chest where a file has one
+        bones["chest"] = bones["upperChest"]
+    humanoid = {bone: name for bone, name in bones.items() if bone in CANONICAL.names}
     return CharacterSource(
         gltf.path.resolve(),
         armature.name,
@@ -247,7 +263,7 @@ def _source(gltf: GltfFile, armature: Armature, frames: RestFrames, animation: s
         frames,
         armature.nodes,
         animation,
-        read_humanoid_names(gltf, armature, frames.names),
+        humanoid,
         armature.all_names,
     )
 
@@ -272,25 +288,6 @@ def find_armatures(gltf: GltfFile) -> list[Armature]:
     found = [_build_armature(gltf, tree, joints, skins, animated) for joints, skins in groups]
     names = make_unique([armature.name for armature in found])
     return [replace(armature, name=name, all_names=names) for name, armature in zip(names, found, strict=True)]
-
-
-def read_rest_frames(gltf: GltfFile, armature: Armature) -> RestFrames:
-    """Read the rest pose: the one in which the skins are bound where all of them say one and bones are as long as the
-    nodes' (VRM files: always the nodes'); else the nodes'. FileFormatError for uneven scale."""
-    tree = NodeTree(gltf)
-    names = tuple(make_unique([str(gltf.get("nodes", node).get("name") or f"node_{node}") for node in armature.nodes]))
-    local = np.stack([node_matrix(gltf.get("nodes", node)) for node in armature.nodes])
-    outer = tree.outer_matrix(armature.nodes[0])
-    worlds = chain_matrices(armature.parents, local, outer)
-    frames = build_frames(gltf.path, armature.name, names, armature.parents, worlds, outer)
-    bound = None if is_vrm(gltf) else _bind_worlds(gltf, armature, worlds, outer)
-    return frames if bound is None else RestFrames.of(names, armature.parents, bound, outer)
-
-
-def read_humanoid_names(gltf: GltfFile, armature: Armature, names: tuple[str, ...]) -> dict[str, str]:
-    """Return joint names by canonical name as a VRM file says them; empty for other files."""
-    at = {node: name for node, name in zip(armature.nodes, names, strict=True)}
-    return select_canonical({bone: at[node] for bone, node in read_bones(gltf).items() if node in at})
 
 
 def read_inverse_binds(gltf: GltfFile, skin: int) -> Array | None:
@@ -526,11 +523,6 @@ def _sample_spline(keys: Array, low: Array, gap: Array, share: Array) -> Array:
     return before + (after - before) * rise + bend * ((1 - t) * leave - t * arrive)
 
 
-def is_vrm(gltf: GltfFile) -> bool:
-    """Return whether the file is a VRM character, 0 or 1, or a VRM animation, whatever its ending."""
-    return any(name in gltf.tree.get("extensions", {}) for name in ("VRM", *_EXTENSIONS))
-
-
 def read_bones(gltf: GltfFile) -> dict[str, int]:
     """Return the node of each bone of the humanoid, by VRM's name; empty for files that are no VRM."""
     extensions = gltf.tree.get("extensions", {})
@@ -540,13 +532,6 @@ def read_bones(gltf: GltfFile) -> dict[str, int]:
             return {bone: found["node"] for bone, found in bones.items()}
     bones = extensions.get("VRM", {}).get("humanoid", {}).get("humanBones", [])
     return {bone["bone"]: bone["node"] for bone in bones}
-
-
-def select_canonical(bones: Mapping[str, str]) -> dict[str, str]:
-    """Return what is given by bone for the canonical joints alone. VRM's `upperChest`, which carries the arms, is the
-    canonical chest where a file has one."""
-    chest = {"chest": bones["upperChest"]} if "upperChest" in bones else {}
-    return {name: own for name, own in {**bones, **chest}.items() if name in CANONICAL.names}
 
 
 @dataclass(frozen=True, eq=False)
