@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 
 import torch
-from torch import Tensor
 
 from controllers.inbetweening.keyframes import effector_joint
 from controllers.inbetweening.pipeline import InbetweenSolution, InfillSettings, fill
@@ -125,13 +124,9 @@ def _copy_limb(posed: Motion, own: Motion, other: Motion, limb: Limb, transfer: 
         goals, quats, own.skeleton, free=free, limbs=(limb,), root_position=part.root_position
     )
     whole = posed.local_quat_xyzw.clone()
-    whole[there] = torch.where(free[..., None] | _make_joint_mask(limb.end), solved, whole[there])
+    whole[there] = torch.where(free[..., None], solved, whole[there])
     whole[there, limb.end] = quats[:, limb.end]
     return replace(posed, local_quat_xyzw=rotations.make_sign_continuous(whole))
-
-
-def _make_joint_mask(joint: int) -> Tensor:
-    return (torch.arange(CANONICAL.num_joints) == joint)[None, :, None]
 
 
 def _compute_margins(

@@ -446,7 +446,8 @@ class _View:
     def measure_surprise(self, query: GapQuery, tried: Proposal, judged: _Frames) -> float:
         """Measure the logarithm of a proposal's squared error in frames that it was not shown, over the expected."""
         truth, made = self.compute_positions(query.motion), self.compute_positions(tried.motion)
-        return math.log((_compute_mean_square(truth, made, judged) + _RESOLUTION) / self.expect_error(tried, judged))
+        error = float((truth - made)[judged.part].square().sum(dim=-1).mean())
+        return math.log((error + _RESOLUTION) / self.expect_error(tried, judged))
 
 
 def _find_gaps(proposal: Proposal, query: GapQuery) -> list[_Frames]:
@@ -486,12 +487,6 @@ def _count_known(known: Bool[Tensor, " frames"]) -> int:
     """Count the known frames that are a gap's own: up to the end, or half of those up to the next gap."""
     run = int(known.long().cumprod(0).sum())
     return run if run == len(known) else run // 2
-
-
-def _compute_mean_square(
-    one: Float[Tensor, "frames joints 3"], other: Float[Tensor, "frames joints 3"], frames: _Frames
-) -> float:
-    return float((one - other)[frames.part].square().sum(dim=-1).mean())
 
 
 _INFILLER, _INFILLER_FRAMES = "infiller", 75
@@ -710,12 +705,6 @@ def meet_places(proposal: Proposal, query: GapQuery) -> Proposal:
     return replace(proposal, motion=replace(motion, root_position=root))
 
 
-def hold_loose_keys(query: GapQuery) -> MissingMask:
-    """Return what is missing when the hips stay at their places, over the ground and as high as proposed."""
-    missing = query.missing
-    return missing if query.loose is None else MissingMask(missing.joints, missing.root & ~query.loose.placed)
-
-
 def note_drawings(motion: Motion, query: GapQuery) -> tuple[str, ...]:
     """Note drawings of a query that a motion does not look like."""
     if query.loose is None:
@@ -782,7 +771,9 @@ def fill(
     proposed = time.perf_counter()
     made, ledger, windows = answer.motion, Ledger(), ()
     if settings.finish:
-        firm = replace(query, missing=hold_loose_keys(query))
+        # The hips stay at the positions of loose keys, over the ground and as high as proposed.
+        root = query.missing.root if query.loose is None else query.missing.root & ~query.loose.placed
+        firm = replace(query, missing=MissingMask(query.missing.joints, root))
         made, ledger, windows = refine_gaps(answer, firm, reached, settings.refinement, densities, terms)
     done, unreached = _reach_targets(clip, clip.back(made, asked), targets)
     done, abrupt = _meet_places(clip, done, loose), ()

@@ -204,18 +204,14 @@ def lean_way(way: Way, request: ShotRequest, rest: Motion) -> Way:
             aside = _find_lacking_aside(way, arc, rest, name, place)
             if abs(aside) > _LEAST_BEND:
                 met.append(float(arc))
-                offsets += aside * smootherstep(1 - (along - arc).abs() / _find_bend_length(aside))
+                reach_length = _BEND_LENGTH * max(1.0, abs(aside) / _USUAL_BEND)
+                offsets += aside * smootherstep(1 - (along - arc).abs() / reach_length)
     offsets = offsets.clamp(-_STEP_ASIDE, _STEP_ASIDE) * smootherstep(along / (0.5 * _BEND_LENGTH))
     if bool((offsets.abs() < 1e-3).all()):
         return way
     # A closed curve is walked once at most here, and bent it is an open one.
     tried = (bend_way(way, share * offsets, met) for share in _BEND_SHARES)
     return next((bent for bent in tried if not _is_blocked(bent, request)), way)
-
-
-def _find_bend_length(aside: float) -> float:
-    """Return over how many metres of arc a way bends before and after a reach that is so far aside."""
-    return _BEND_LENGTH * max(1.0, abs(aside) / _USUAL_BEND)
 
 
 def _find_lacking_aside(way: Way, arc: Tensor, rest: Motion, name: str, place: Sequence[float]) -> float:

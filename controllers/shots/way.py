@@ -218,7 +218,7 @@ def plan_speeds(
         if ends.start:
             speed = min(speed, ends.acceleration * max(0.0, time - ends.still))
         if ends.end:
-            braking = min(length - arc, _braking_distance(last - ends.settled - time, ends.acceleration))
+            braking = min(length - arc, 0.5 * ends.acceleration * max(0.0, last - ends.settled - time) ** 2)
             speed = min(speed, math.sqrt(2 * ends.acceleration * max(0.0, braking)))
         stopped = ends.end and length - arc < 0.004
         if (seconds is None and (stopped or arc >= length)) or time > last + 1e-9:
@@ -230,11 +230,6 @@ def plan_speeds(
     if seconds is None and ends.end:
         speeds += [0.0] * round(ends.settled * fps)
     return torch.tensor(speeds, dtype=torch.float64)
-
-
-def _braking_distance(seconds: float, acceleration: float) -> float:
-    """Return the distance in which one stops within a time, metres."""
-    return 0.5 * acceleration * max(0.0, seconds) ** 2
 
 
 _BODY_MARGIN = 0.35  # metres from the hips to an obstacle's edge: arms swing that far

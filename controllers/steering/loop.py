@@ -281,7 +281,10 @@ def summarise_step_timing(
     """
     each = np.repeat([1000 * r.seconds / r.frames for r in records], [r.frames for r in records])
     count = sum(record.frames for record in records)
-    latencies = [due - at for at in arrivals if (due := _find_first_affected_due(records, at)) is not None]
+    dues = [next((record.due for record in records if record.asked >= at - 1e-9), None) for at in arrivals]
+    latencies = [due - at for at, due in zip(arrivals, dues, strict=True) if due is not None]
+    # Of a command that arrives just after the source was asked, the longest over all steps.
+    worst = max((b.due - a.asked for a, b in pairwise(records)), default=None)
     return {
         "frame_ms_p50": float(np.percentile(each, 50)) if count else None,
         "frame_ms_p99": float(np.percentile(each, 99)) if count else None,
@@ -290,15 +293,6 @@ def summarise_step_timing(
         "evaluations_per_frame": sum(record.evaluations for record in records) / max(1, count),
         "steps_cut_short": sum(bool(record.note) for record in records),
         "held_s": sum(record.held for record in records),
-        "command_latency_s": max(latencies, default=_worst_latency(records)),
+        "command_latency_s": max(latencies, default=worst),
         "threads": torch.get_num_threads(),
     }
-
-
-def _find_first_affected_due(records: Sequence[StepRecord], arrival: float) -> float | None:
-    return next((record.due for record in records if record.asked >= arrival - 1e-9), None)
-
-
-def _worst_latency(records: Sequence[StepRecord]) -> float | None:
-    """Compute the latency of a command that arrives just after the source was asked, the longest over all steps."""
-    return max((b.due - a.asked for a, b in pairwise(records)), default=None)

@@ -58,7 +58,7 @@ def reach_targets(
     shifts = torch.zeros_like(body.root_position)
     if not len(frames):
         return body, shifts
-    part = _select_frames(body, frames)
+    part = replace(body, root_position=body.root_position[frames], local_quat_xyzw=body.local_quat_xyzw[frames])
     goals, wanted = targets.places[frames], targets.wanted[frames]
     sigma = _compute_offset_sigmas(turning[frames], moving[frames], stray[frames].double())
     offsets = _minimise_offsets(part, goals[:, _ENDS], wanted[:, _ENDS], sigma)
@@ -70,10 +70,6 @@ def reach_targets(
     root[frames], quats[frames] = bent.root_position, bent.local_quat_xyzw
     shifts[frames] = shift
     return replace(body, root_position=root, local_quat_xyzw=quats), shifts
-
-
-def _select_frames(motion: Motion, frames: Tensor) -> Motion:
-    return replace(motion, root_position=motion.root_position[frames], local_quat_xyzw=motion.local_quat_xyzw[frames])
 
 
 def _compute_offset_sigmas(
