@@ -10,27 +10,27 @@ from priors.weight_sets import add_set as add_set
 from priors.weight_sets import use_weights as use_weights
 
 if TYPE_CHECKING:
-    from priors.denoiser.network import ConvDenoiser as ConvDenoiser
-    from priors.infiller.network import ConvInfiller as ConvInfiller
-    from priors.keyframe_timing.model import KeyframeTiming as KeyframeTiming
+    from priors.denoiser import ConvDenoiser as ConvDenoiser
+    from priors.infiller import ConvInfiller as ConvInfiller
+    from priors.keyframe_timing import KeyframeTiming as KeyframeTiming
     from priors.lstm_gmm.density import LstmGmmDensity as LstmGmmDensity
-    from priors.pose_transformer.network import PoseTransformer as PoseTransformer
-    from priors.refiner.network import LstmRefiner as LstmRefiner
-    from priors.stitching.inbetweener import Stitcher as Stitcher
-    from priors.tweening.inbetweener import Tweener as Tweener
-    from priors.tweening.path import ConvPathPredictor as ConvPathPredictor
+    from priors.path import ConvPathPredictor as ConvPathPredictor
+    from priors.pose_transformer import PoseTransformer as PoseTransformer
+    from priors.refiner import LstmRefiner as LstmRefiner
+    from priors.stitcher import Stitcher as Stitcher
+    from priors.tweener import Tweener as Tweener
 
 # A walk needs one of these models, and all of them take longer to import than a second of it takes to solve.
 _HOMES = {
-    "ConvDenoiser": "denoiser.network",
-    "ConvInfiller": "infiller.network",
-    "KeyframeTiming": "keyframe_timing.model",
+    "ConvDenoiser": "denoiser",
+    "ConvInfiller": "infiller",
+    "KeyframeTiming": "keyframe_timing",
     "LstmGmmDensity": "lstm_gmm.density",
-    "PoseTransformer": "pose_transformer.network",
-    "LstmRefiner": "refiner.network",
-    "Stitcher": "stitching.inbetweener",
-    "Tweener": "tweening.inbetweener",
-    "ConvPathPredictor": "tweening.path",
+    "PoseTransformer": "pose_transformer",
+    "LstmRefiner": "refiner",
+    "Stitcher": "stitcher",
+    "Tweener": "tweener",
+    "ConvPathPredictor": "path",
 }
 
 

@@ -23,7 +23,7 @@ from mapctl.terms.trial import Trial
 from priors.checkpoints import Card
 from priors.lstm_gmm.density import LstmGmmDensity
 from priors.lstm_gmm.network import LstmGmm, LstmGmmConfig
-from priors.training.corpus import Corpus
+from priors.training.data import Corpus
 from priors.training.recipes.lstm_gmm import compute_feature_statistics, measure_data_limits, select_initial_states
 
 STRIDE = 0.25

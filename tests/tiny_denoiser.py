@@ -9,7 +9,7 @@ from controllers.denoising.denoise import DenoiseSettings
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings
 from priors import checkpoints
-from priors.denoiser.network import ConvDenoiser, DenoiserConfig, DenoiserNetwork
+from priors.denoiser import ConvDenoiser, DenoiserConfig, DenoiserNetwork
 
 QUICK = DenoiseSettings(
     refinement=RefinementSettings(lbfgs=LbfgsSettings(max_iterations=4), budget=Budget(evaluations=4))

@@ -8,7 +8,7 @@ from mapctl import kinematics
 from mapctl.inbetweening import PositionImage
 from mapctl.skeleton import CANONICAL
 from priors import checkpoints
-from priors.infiller.network import ConvInfiller, InfillerConfig, InfillerNetwork
+from priors.infiller import ConvInfiller, InfillerConfig, InfillerNetwork
 
 CONFIG = InfillerConfig(widths=(8, 8, 8, 8, 8))
 TOES = (CANONICAL.index("leftToes"), CANONICAL.index("rightToes"))

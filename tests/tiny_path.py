@@ -11,7 +11,7 @@ from mapctl.inbetweening.root_trajectory import LocalMotion, RootTrajectory
 from mapctl.motion import Motion
 from mapctl.protocols import PathPredictor
 from priors import checkpoints
-from priors.tweening.path import ConvPathPredictor, PathConfig, PathNetwork
+from priors.path import ConvPathPredictor, PathConfig, PathNetwork
 
 CONFIG = PathConfig(width=4)
 

@@ -6,7 +6,7 @@ import torch
 from helpers import corpus
 
 from priors import checkpoints
-from priors.refiner.network import LstmRefiner, RefinerConfig, RefinerNetwork, count_channels
+from priors.refiner import LstmRefiner, RefinerConfig, RefinerNetwork, count_channels
 
 TINY = RefinerConfig(width=6, memory=5, lookahead=2, joints=("hips", "leftHand", "rightToes"))
 walks = cache(corpus)

@@ -6,8 +6,7 @@ import torch
 
 from mapctl.features import LAYOUT
 from priors import checkpoints
-from priors.stitching.inbetweener import Stitcher
-from priors.stitching.network import StitcherConfig, StitcherNetwork
+from priors.stitcher import Stitcher, StitcherConfig, StitcherNetwork
 
 CONFIG = StitcherConfig(
     embedding=(10, 8),

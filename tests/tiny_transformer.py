@@ -5,7 +5,7 @@ from pathlib import Path
 import torch
 
 from priors import checkpoints
-from priors.pose_transformer.network import PoseTransformer, PoseTransformerConfig, PoseTransformerNetwork
+from priors.pose_transformer import PoseTransformer, PoseTransformerConfig, PoseTransformerNetwork
 
 CONFIG = PoseTransformerConfig(width=16, layers=1, heads=2, kernel=3)
 

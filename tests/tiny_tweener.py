@@ -11,9 +11,7 @@ from mapctl.motion_dna import MotionDna
 from mapctl.protocols import PathPredictor
 from priors import checkpoints
 from priors.checkpoints import compute_hash
-from priors.tweening.generator import GeneratorConfig, GeneratorNetwork
-from priors.tweening.inbetweener import Tweener
-from priors.tweening.styles import encode_classes
+from priors.tweener import GeneratorConfig, GeneratorNetwork, Tweener, encode_classes
 
 CONFIG = GeneratorConfig((8, 8, 8, 12, 12, 12), (12, 12, 8, 8, 8, 8), style=5)
 

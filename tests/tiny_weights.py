@@ -14,7 +14,7 @@ from tiny_transformer import save_tiny_transformer
 from tiny_tweener import save_tiny_tweener
 
 from priors import checkpoints
-from priors.keyframe_timing.model import KeyframeTimingConfig, KeyframeTimingNetwork
+from priors.keyframe_timing import KeyframeTimingConfig, KeyframeTimingNetwork
 
 FREE = "free for any use"
 MODELS = (

@@ -14,7 +14,7 @@ import tiny_transformer
 import tiny_tweener
 
 from priors.lstm_gmm.network import LstmGmmConfig
-from priors.refiner.network import RefinerConfig
+from priors.refiner import RefinerConfig
 from priors.training.recipes import (
     denoiser,
     infiller,

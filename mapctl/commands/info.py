@@ -25,7 +25,7 @@ from mapctl.retarget.doubts import Fit, assess_fit
 from mapctl.skeleton import CANONICAL
 from priors import checkpoints, weight_sets
 from priors.licences import find_strictest
-from priors.tweening.styles import count_clips
+from priors.tweener import count_clips
 
 
 @dataclass(frozen=True)

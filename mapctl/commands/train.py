@@ -2,11 +2,9 @@
 `priors.training.recipes`.
 """
 
-import math
-import re
 import sys
-from abc import ABC
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from functools import reduce
 from importlib import import_module
@@ -17,25 +15,20 @@ from tyro.conf import arg, subcommand
 
 from mapctl.commands.shared import options
 from mapctl.commands.shared.command import use_single_thread
-from mapctl.commands.shared.progress_bar import explain_end
-from mapctl.errors import CheckpointError, RequestError
+from mapctl.errors import CheckpointError, RequestError, WriteError
 
 if TYPE_CHECKING:
-    from priors.training.recipe import Recipe
-
-_AT_LEAST_ONE = ("width", "layers", "components", "steps", "batch", "window", "pairs")
+    from priors.training.loop import Recipe
 
 
 @dataclass(frozen=True)
-class TrainOptions(ABC):
+class TrainOptions:
     """Options of `train` for any model. They are named as the fields of its recipe, settings and network are."""
 
     model: ClassVar[str]
     """Kind of model, as the command line calls it."""
     recipe_class: ClassVar[str]
     """Module and class of its recipe."""
-    network: ClassVar[str] = ""
-    """Module of its network and of the paper's."""
     used_by: ClassVar[str]
     """How commands take what was trained."""
     single_thread: ClassVar[bool] = True
@@ -48,15 +41,14 @@ class TrainOptions(ABC):
     match: Annotated[str | None, arg(metavar="REGEX")] = None
     """Only clips whose path below the data folder holds this regular expression."""
     cuts: options.MaybeFile = None
-    """Table (CSV) of file, first and last frame: which frames are motion; `cmu` is the one for takes of CMU that comes
-    with mapctl. Each Frame_Cuts.csv in the data folder is found by itself (docs/guides/data.md)."""
+    """Table (CSV) of file, first and last frame: which frames are motion (`*,1,` leaves out frame 0 of all); `cmu` is
+    the one for takes of CMU that comes with mapctl. Each Frame_Cuts.csv in the data folder is found by itself
+    (docs/guides/data.md)."""
     level: bool = False
     """Put every clip on the canonical body and a level floor: for captures whose floor slopes or whose feet rest at
     other heights, as those of CMU."""
-    skip_first: bool = False
-    """Leave out frame 0 of every clip (the T-pose of CMU takes)."""
     steps: options.MaybeCount = None
-    """Steps in all; with --resume, those of the run so far if not given."""
+    """Steps in all."""
     seed: options.MaybeCount = None
     """Seed of weights, windows, noise and the split of the clips."""
     patience: options.Count = 0
@@ -64,83 +56,62 @@ class TrainOptions(ABC):
     resume: bool = False
     """Go on from the run folder's last checkpoint."""
     licence: Annotated[str | None, arg(metavar="TEXT")] = None
-    """Licence of the weights, for their card; if not given, that of the run so far with --resume, else `that of the
-    training data`."""
+    """Licence of the weights, for their card; if not given, `that of the training data`."""
     quiet: bool = False
     """No lines of news."""
 
     def run(self) -> int:
         """Check, train, name the result."""
-        recipe = self._resumed().recipe()
+        recipe = self.recipe()
         if self.single_thread:
             use_single_thread()
-        from priors.training import run
+        from priors.training import loop
 
-        with explain_end(self._describe_saved):
-            path = run.train(recipe, _ignore if self.quiet else _print, warn=_warn)
+        with self._explain_end():
+            path = loop.train(recipe, _ignore if self.quiet else _print, warn=_warn)
         if not self.quiet:
             print(f"wrote {path}; {self.used_by} {self.out}")
         return 0
 
     def recipe(self) -> "Recipe[Any, Any, Any]":
         """Return the recipe with these options; RequestError for numbers that make no sense."""
-        self.check()
+        if self.seed is not None:
+            options.check_seed(self.seed)
         module, name = self.recipe_class.split(":")
         kind = getattr(import_module(f"priors.training.recipes.{module}"), name)
-        parts = self.find_parts(kind)
         given = {name: value for name, value in self.collect().items() if value is not None}
-        own = {field.name for field in fields(kind)}
+        own = {field.name: field for field in fields(kind)}
+        parts = {name: cast(Any, own[name].default_factory)() for name in ("config", "settings")}
+        if given.pop("paper", False):
+            parts["config"] = import_module(type(parts["config"]).__module__).PAPER
         for part, usual in parts.items():
-            named = {field.name for field in fields(usual)} - own
+            named = {field.name for field in fields(usual)} - {*own}
             parts[part] = replace(usual, **{name: value for name, value in given.items() if name in named})
         return kind(**{name: value for name, value in given.items() if name in own}, **parts)
-
-    def find_parts(self, kind: Any) -> dict[str, Any]:
-        """Return the network's shape and the settings that the options change."""
-        usual = {field.name: field for field in fields(kind)}
-        found = {name: cast(Any, usual[name].default_factory)() for name in ("config", "settings")}
-        return found | ({"config": import_module(self.network).PAPER} if getattr(self, "paper", False) else {})
 
     def collect(self) -> dict[str, Any]:
         """Collect the options by the names of the recipe's fields, its settings' and its network's; None is not
         given."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
-    def check(self) -> None:
-        """Raise RequestError for what makes no sense for any model."""
-        for name in _AT_LEAST_ONE:
-            if (value := getattr(self, name, None)) is not None and value < 1:
-                raise RequestError(f"--{name} must be at least 1, got {value}")
-        if self.seed is not None:
-            options.check_seed(self.seed)
-        rate = getattr(self, "learning_rate", None)
-        if rate is not None and not 0 < rate < 1:
-            raise RequestError(f"the learning rate must lie between 0 and 1, got {rate:g}")
-        if self.licence is not None and (not self.licence.strip() or len(self.licence.splitlines()) > 1):
-            raise RequestError(f"--licence must be one line of text, got {self.licence!r}")
+    @contextmanager
+    def _explain_end(self) -> Iterator[None]:
+        """Add to the message of Ctrl-C, SIGTERM or a full disk which step is saved, and what to type."""
         try:
-            re.compile(self.match or "")
-        except re.error as error:
-            raise RequestError(f"--match must be a regular expression, got {self.match!r} ({error})") from error
-
-    def _resumed(self) -> "TrainOptions":
-        """With the steps and the licence of the run so far, where it is resumed and others are not given."""
-        if not self.resume or (index := self._read_index()) is None:
-            return self
-        steps = index["steps"] if self.steps is None else self.steps
-        return replace(self, steps=steps, licence=index["licence"] if self.licence is None else self.licence)
+            yield
+        except KeyboardInterrupt as stop:
+            raise KeyboardInterrupt(self._describe_saved() or "nothing was saved yet") from stop
+        except WriteError as error:
+            raise WriteError("; ".join(filter(None, (str(error), self._describe_saved())))) from error
 
     def _describe_saved(self) -> str:
-        index = self._read_index()
-        return "" if index is None else f"step {index['step']} is saved; the same command with --resume goes on"
-
-    def _read_index(self) -> dict[str, Any] | None:
-        from priors.training.run import read_index
+        from priors.training.loop import read_index
 
         try:
-            return read_index(self.out)
+            step = read_index(self.out)["step"]
         except CheckpointError:
-            return None
+            return ""
+        return f"step {step} is saved; the same command with --resume goes on"
 
 
 @dataclass(frozen=True)
@@ -169,22 +140,6 @@ class TunableOptions(NetworkOptions):
     device: Annotated[Literal["auto", "cpu", "cuda"], arg(metavar="auto|cpu|cuda")] = "auto"
     """Where to compute; auto is a GPU with CUDA where there is one."""
 
-    def check(self) -> None:
-        """Raise RequestError for what makes no sense for any model."""
-        super().check()
-        if self.init_share is not None and (not 0 <= self.init_share < 1 or self.init is None):
-            raise RequestError(f"--init-share must be from 0 to below 1, and needs --init; got {self.init_share:g}")
-
-    def collect(self) -> dict[str, Any]:
-        """Collect the options; weights that begin with others name the licence of those as well."""
-        found = super().collect()
-        if self.licence is None and self.init is not None:
-            from priors import checkpoints, licences
-
-            card = checkpoints.read_card(checkpoints.locate(self.init).with_suffix(".json"))
-            found["licence"] = f"{licences.OF_DATA}; {card.licence}"
-        return found
-
 
 @dataclass(frozen=True)
 class TrainDensity(TunableOptions):
@@ -192,7 +147,6 @@ class TrainDensity(TunableOptions):
 
     model = "lstm-gmm"
     recipe_class = "lstm_gmm:DensityRecipe"
-    network = "priors.lstm_gmm.network"
     used_by = "use it with --prior"
     single_thread = False
 
@@ -226,34 +180,13 @@ class TrainDensity(TunableOptions):
     """Share of the windows of standing characters that training sees, 1 by default: below it for motion that mostly
     stands, whose density is hard to steer into a walk otherwise."""
 
-    def check(self) -> None:
-        """Raise RequestError for what makes no sense for a density."""
-        super().check()
+    def collect(self) -> dict[str, Any]:
+        """Collect the options; RequestError for those of the network where it is another prior's."""
         if self.init is not None and (self.paper or self.width is not None or self.components is not None):
             raise RequestError(
                 "with --init the network is that prior's; --width, --components and --paper do not apply"
             )
-        if self.stitcher is not None and self.splices == 0:
-            raise RequestError("--stitcher is for --splices N; give their number, or leave it out")
-
-    def find_parts(self, kind: Any) -> dict[str, Any]:
-        """Return the network's shape and the settings that the options change."""
-        from priors.training.augmentation.clip_copies import ClipCopies
-
-        parts = super().find_parts(kind)
-        settings = parts["settings"]
-        copies = ClipCopies(self.copies, tempo=self.tempo, strides=self.strides)
-        critic = replace(settings.critic, steps=self.critic_steps)
-        # Set together, since the critic's steps are checked against all.
-        settings = replace(settings, steps=self.steps or settings.steps, copies=copies, critic=critic)
-        return {**parts, "settings": settings}
-
-    def collect(self) -> dict[str, Any]:
-        """Collect the options; copies and splices have settings of their own."""
-        from priors.training.augmentation.splices import Splices
-
-        splices = Splices(self.splices, self.stitcher or Splices.stitcher)
-        return {**super().collect(), "copies": None, "splices": splices}
+        return super().collect()
 
 
 @dataclass(frozen=True)
@@ -263,7 +196,6 @@ class TrainRefiner(NetworkOptions):
 
     model = "refiner"
     recipe_class = "refiner:RefinerRecipe"
-    network = "priors.refiner.network"
     used_by = "use it with --refiner"
 
     match: Annotated[str | None, arg(metavar="REGEX")] = None
@@ -288,12 +220,6 @@ class TrainDenoiser(TunableOptions):
     angles: options.MaybeNumber = None
     """Weight of the error of joint angles (radians) in the loss, beside the centimetres of positions; 20 if not
     given."""
-
-    def check(self) -> None:
-        """Raise RequestError for what makes no sense for a denoiser."""
-        super().check()
-        if self.angles is not None and not (math.isfinite(self.angles) and self.angles >= 0):
-            raise RequestError(f"--angles must be 0 or more, got {self.angles:g}")
 
 
 @dataclass(frozen=True)
@@ -359,7 +285,6 @@ class TrainTweener(TunableOptions):
 
     model = "tweener"
     recipe_class = "tweener:TweenerRecipe"
-    network = "priors.tweening.generator"
     used_by = "use it with mapctl tween --method tweener --inbetweener"
 
     path: options.MaybeName = None
@@ -379,11 +304,7 @@ class TrainStitcher(TunableOptions):
 
     model = "stitcher"
     recipe_class = "stitcher:StitcherRecipe"
-    network = "priors.stitching.network"
     used_by = "use it with --stitcher"
-
-    paper: bool = False
-    """The scheme of Ren et al. 2024, at our widths; other options still hold."""
 
 
 KINDS: Mapping[str, type[TrainOptions]] = {

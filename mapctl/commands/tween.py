@@ -29,8 +29,8 @@ from mapctl.protocols import Inbetweener
 from mapctl.retarget import to_canonical
 from mapctl.retarget.rigs import Rig
 from priors import licences
-from priors.stitching.inbetweener import Stitcher
-from priors.tweening.styles import draw_style
+from priors.stitcher import Stitcher
+from priors.tweener import draw_style
 from scenes.film import draw_strips_to
 
 

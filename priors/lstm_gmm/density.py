@@ -1,9 +1,11 @@
 """A loaded LSTM-GMM as the solver uses it: the reference network, its fast path, its initial states and its card."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -11,44 +13,112 @@ from torch import Tensor
 
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT
-from mapctl.metrics.gait import find_pace, label_pace
+from mapctl.metrics.gait import CHANGES, PACES, find_pace, label_pace
 from mapctl.protocols import DataLimits, Density, DiscreteChoices, InitialStates, PreparedRollout
 from mapctl.solver.budget import Budget, Meter
 from mapctl.solver.lbfgs import LbfgsSettings, differentiate, minimise
 from priors import checkpoints
-from priors.lstm_gmm import labels as clip_labels
-from priors.lstm_gmm.fast.rollout import FastRollout
-from priors.lstm_gmm.labels import PACE_LABELS, read_pace_rates
+from priors.lstm_gmm.fast import FastRollout
 from priors.lstm_gmm.network import LstmGmm, LstmGmmConfig, LstmState, Planting
+
+_OTHER_SIDE = {"left": "right", "right": "left"}
+
+
+@dataclass(frozen=True, eq=False)
+class Labels:
+    """Which labels hold for which clip."""
+
+    names: tuple[str, ...]
+    """Labels as `group=value`, sorted: gait=run, style=active."""
+    held: Float[Tensor, "clips labels"]
+    """1 where a label holds."""
+
+    @staticmethod
+    def none(clips: int) -> "Labels":
+        """Return no labels, for so many clips."""
+        return Labels((), torch.zeros(clips, 0))
+
+    @property
+    def groups(self) -> Float[Tensor, "groups labels"]:
+        """1 where a label belongs to a group."""
+        kinds = [name.split("=")[0] for name in self.names]
+        return torch.tensor([[float(kind == group) for kind in kinds] for group in dict.fromkeys(kinds)])
+
+    @property
+    def mirrored(self) -> list[int]:
+        """Index of each label's mirror image: left and right are swapped where both are known."""
+        swapped = [re.sub("left|right", lambda side: _OTHER_SIDE[side[0]], name) for name in self.names]
+        return [self.names.index(other) if other in self.names else i for i, other in enumerate(swapped)]
+
+    def renamed(self, names: tuple[str, ...]) -> "Labels":
+        """Return the clips under other labels; a label that only one of both knows holds for none."""
+        held = torch.zeros(len(self.held), len(names))
+        for column, name in enumerate(names):
+            if name in self.names:
+                held[:, column] = self.held[:, self.names.index(name)]
+        return Labels(names, held)
+
+
+def read_clip_labels(clip: str, pattern: str) -> set[str]:
+    """Read the labels that one clip's name tells; none where the pattern is empty or is not found in it."""
+    return _parse_match(re.search(pattern, clip)) if pattern else set()
+
+
+def read_labels(clips: Sequence[str], pattern: str) -> Labels:
+    """Read labels from clips' names by the named groups of a regular expression; an empty pattern reads none.
+
+    RequestError where it is no regular expression, has no named group or matches no clip.
+    """
+    if not pattern:
+        return Labels.none(len(clips))
+    try:
+        compiled = re.compile(pattern)
+    except re.error as error:
+        raise RequestError(f"labels must be a regular expression, got {pattern!r} ({error})") from error
+    if not compiled.groupindex:
+        raise RequestError(f"labels need named groups as in (?P<style>[a-z]+), got {pattern!r}")
+    found = [_parse_match(compiled.search(name)) for name in clips]
+    names = tuple(sorted(set().union(*found)))
+    if not names:
+        raise RequestError(f"the labels {pattern!r} match no clip, such as {clips[0]!r}")
+    return Labels(names, torch.tensor([[float(name in clip) for name in names] for clip in found]))
+
+
+def _parse_match(match: re.Match[str] | None) -> set[str]:
+    if match is None:
+        return set()
+    return {f"{group}={value}" for group, value in match.groupdict().items() if value}
+
+
+PACE_LABELS = tuple(map(label_pace, PACES))
+"""Labels of PACES."""
+
+
+def read_pace_rates(holds: Mapping[str, Any]) -> dict[tuple[str, str], float]:
+    """Read changes a second from one pace to another, by both paces, from what a card says that its clips hold. None of
+    a pace that they hold for less than the 0.3 s to which a card rounds."""
+    minutes = holds["minutes by pace"]
+    return {
+        (before, after): holds[name] / (60 * minutes[before])
+        for (before, after), name in CHANGES.items()
+        if minutes[before] > 0 and minutes[after] > 0
+    }
+
 
 _MIN_STD = 0.05  # least standard deviation of a unit of the memory: some hardly vary in the data
 
 
-@dataclass(frozen=True)
-class StateInferenceSettings:
-    """Settings of the search for a state."""
-
-    frames: int = 10
-    """Number of frames that are to be likely, of a motion that has as many."""
-    lbfgs: LbfgsSettings = field(default_factory=lambda: LbfgsSettings(max_iterations=30))
-    """Settings of L-BFGS."""
-    budget: Budget = field(default_factory=lambda: Budget(evaluations=40))
-    """Budget of the search."""
+_INFERRED_FRAMES = 10  # of a motion that has as many, which are to be likely after the state
+_SEARCH, _BUDGET = LbfgsSettings(max_iterations=30), Budget(evaluations=40)
 
 
-def infer_lstm_state(
-    model: LstmGmm,
-    known: LstmState,
-    features: Float[Tensor, "frames size"],
-    settings: StateInferenceSettings | None = None,
-) -> LstmState:
+def infer_lstm_state(model: LstmGmm, known: LstmState, features: Float[Tensor, "frames size"]) -> LstmState:
     """Find a state (batch of one) before `features` (physical units) that makes the first of them likely (Eq. 26).
 
     `known` are states after motion of the data. The frame before the first is taken to equal the first. The result is
     never less likely, a prior of the memory included, than the best of `known`; the same input gives the same state.
     """
-    settings = settings or StateInferenceSettings()
-    first, wanted = features[:1], features[None, : settings.frames]
+    first, wanted = features[:1], features[None, :_INFERRED_FRAMES]
     memory = torch.cat([known.hidden, known.cell], dim=-1)
     centre, sigma = memory.mean(dim=1), memory.std(dim=1, correction=0).clamp_min(_MIN_STD)
 
@@ -64,7 +134,7 @@ def infer_lstm_state(
     with torch.no_grad():
         starts = ((memory - centre[:, None]) / sigma[:, None]).transpose(0, 1).flatten(1)
         start = starts[energy(starts).argmin()][None]
-    found = minimise(differentiate(energy), start, settings=settings.lbfgs, meter=Meter(settings.budget))
+    found = minimise(differentiate(energy), start, settings=_SEARCH, meter=Meter(_BUDGET))
     return state_of(found.x)
 
 
@@ -128,7 +198,7 @@ class LstmGmmDensity(checkpoints.LoadedModel, Density[LstmState]):
         RequestError for labels that it does not know.
         """
         full, starts = [self._label(name) for name in labels], self.initial_states
-        known = clip_labels.read(starts.names, self.card.data.get("labels", "")).renamed(tuple(full))
+        known = read_labels(starts.names, self.card.data.get("labels", "")).renamed(tuple(full))
         paces = [[label_pace(find_pace(speed)) == label for label in full] for speed in starts.speed.tolist()]
         fitting = (known.held + torch.tensor(paces).reshape(known.held.shape)).sum(-1)
         rows = (fitting == fitting.max()).nonzero()[:, 0]
@@ -148,7 +218,7 @@ class LstmGmmDensity(checkpoints.LoadedModel, Density[LstmState]):
 
     def conditioned_like_clip(self, name: str) -> "LstmGmmDensity":
         """Return the density given the labels that a clip's path tells, of those that it knows."""
-        told = clip_labels.read_name(name, self.card.data.get("labels", ""))
+        told = read_clip_labels(name, self.card.data.get("labels", ""))
         known = sorted(told & {*self.reference.config.labels})
         return self._with_network(self.reference.conditioned_on(known))
 

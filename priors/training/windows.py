@@ -1,19 +1,32 @@
-"""Windows of a corpus, as training draws them: of its features, and of joint positions."""
+"""Windows of a corpus, as training draws them: of its features, and of joint positions.
 
-from dataclasses import dataclass
+Windows of a corpus as whole poses: of bodies and tempos that vary, and half of them mirrored.
+
+Windows in poses that no clip shows: joints turned by constants that drift, bodies tilted up to lying and lowered.
+
+A model that has seen the poses of one performer alone returns to them where it should not. Truth and input are changed
+alike, so the task stays the same.
+"""
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mapctl import kinematics, rotations
-from mapctl.features import LAYOUT, ground_speed, mirror_features
+from mapctl.contacts import ContactSettings
+from mapctl.errors import RequestError
+from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, ground_speed, mirror_features
 from mapctl.inbetweening import PositionImage
-from mapctl.inbetweening.partial_motion import interpolate_quats
+from mapctl.inbetweening.partial_motion import EFFECTORS, KnownParts, PartialMotion, interpolate_quats, mirror_quats
 from mapctl.numerics.intervals import fill_missing, fill_missing_angle
 from mapctl.pose import BodyPose
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
-from priors.training.corpus import Corpus, find_window_starts, number_clip_folders
+from priors.training.data import Corpus, find_window_starts, number_clip_folders
 
 
 def interpolate_positions(
@@ -194,3 +207,234 @@ class PositionWindows:
         quats = torch.where(mirrored[:, None, None, None], over, quats)
         quats[:, :, 0] = rotations.multiply(rotations.about_y(heading), quats[:, :, 0])
         return Window(places, quats, heading, contacts, present)
+
+
+_WIDE = {"UpperArm": 0.6, "LowerArm": 0.5, "UpperLeg": 0.5, "LowerLeg": 0.5}
+_TURN_SIGMA = torch.tensor(
+    [0.0] + [next((wide for part, wide in _WIDE.items() if part in name), 0.3) for name in CANONICAL.names[1:]]
+)
+"""Spread of a joint's rotation vector, radians; the hips are tilted instead."""
+
+
+@dataclass(frozen=True)
+class PoseVariation:
+    """How far windows leave the poses of their clips."""
+
+    share: float = 0.7
+    """Share of windows whose joints are turned, each by normal rotation vectors times one uniform number a window."""
+    drift: float = 0.3
+    """Turn that is added over the window, as a share of the first."""
+    tilted: float = 0.35
+    """Share of windows whose hips are tilted about a horizontal axis, and lowered."""
+    tilt: float = 1.6
+    """Largest tilt, radians."""
+    lowering: float = 0.6
+    """Largest lowering, metres."""
+
+
+def vary_poses(
+    heading: Float[Tensor, "batch frames"],
+    quats: Float[Tensor, "batch frames joints 4"],
+    height: Float[Tensor, "batch frames"],
+    variation: PoseVariation,
+    generator: torch.Generator,
+) -> tuple[Float[Tensor, "batch frames"], Float[Tensor, "batch frames joints 4"], Float[Tensor, "batch frames"]]:
+    """Return headings (radians), local rotations (the hips' without their heading) and hips heights (metres) of windows
+    in other poses."""
+    batch, frames, joints = quats.shape[:3]
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(batch, *shape, generator=generator)
+
+    def turn(size: float) -> Tensor:
+        return size * _TURN_SIGMA[:, None] * torch.randn(batch, 1, joints, 3, generator=generator)
+
+    amount = (uniform() < variation.share) * uniform()
+    progress = torch.linspace(0, 1, frames)[:, None, None]
+    vectors = amount[:, None, None, None] * (turn(1.0) + progress * turn(variation.drift))
+    tilted, about = uniform() < variation.tilted, 2 * math.pi * uniform()
+    axis = torch.stack([about.cos(), torch.zeros(batch), about.sin()], dim=-1)
+    tilt = rotations.from_rotation_vector((tilted * variation.tilt * uniform())[:, None] * axis)
+    lowered = height - (tilted * variation.lowering * uniform())[:, None]
+    quats = rotations.multiply(quats, rotations.from_rotation_vector(vectors))
+    hips = rotations.multiply(tilt[:, None].expand(-1, frames, -1), quats[..., 0, :])
+    turned, upright = rotations.split_heading(hips)
+    quats = torch.cat([upright[..., None, :], quats[..., 1:, :]], dim=-2)
+    return heading + rotations.unwrap_angle(turned), quats, torch.where(tilted[:, None], lowered, height)
+
+
+def vary_features(
+    features: Float[Tensor, "batch frames size"], variation: PoseVariation, generator: torch.Generator
+) -> Float[Tensor, "batch frames size"]:
+    """Return the features of windows in other poses."""
+    pose = BodyPose.of_features(features, GroundPose.origin())
+    quats = rotations.from_rotation_vector(pose.rotation_vectors)
+    heading, quats, height = vary_poses(pose.heading, quats, pose.root_position[..., 1], variation, generator)
+    root = torch.stack([pose.root_position[..., 0], height, pose.root_position[..., 2]], dim=-1)
+    vectors = rotations.to_rotation_vector(quats)
+    varied = BodyPose(root, heading, vectors[..., 0, ::2], vectors[..., 1:, :])
+    planted = keep_still(LAYOUT.pick(features, "contacts"), varied.joints_world())
+    return varied.features(GroundPose.origin(), planted > 0)
+
+
+def keep_still(
+    contacts: Float[Tensor, "batch frames 2"], positions: Float[Tensor, "batch frames joints 3"]
+) -> Float[Tensor, "batch frames 2"]:
+    """Keep contacts of toes that still do not travel; world positions, metres."""
+    toes = positions[..., list(TOE_JOINTS), ::2]
+    speed = torch.diff(toes, dim=1, prepend=toes[:, :1]).norm(dim=-1) * PRIOR_FPS
+    return contacts * (speed < ContactSettings.slow)
+
+
+_VARIED = (
+    (("leftShoulder", "rightShoulder", "leftUpperArm", "rightUpperArm"), 1),
+    (("leftUpperLeg", "rightUpperLeg"), 1),
+    (("spine", "chest", "neck", "head"), 3),
+    (("leftLowerArm", "rightLowerArm"), 3),
+    (("leftHand", "rightHand"), 3),
+)
+"""Joints whose bones vary together, and how many of their axes: widths along x alone, lengths along all."""
+
+
+@dataclass(frozen=True)
+class Variation:
+    """How bodies, tempos and poses vary. Legs keep their length, the unit of all others."""
+
+    tempo: float = 0.1
+    """Largest change of tempo, as a share."""
+    bones: float = 0.15
+    """Largest change of the widths of shoulders and hips and of the lengths of trunk, forearms and hands."""
+    share: float = 0.5
+    """Share of windows whose tempo, and share whose bones vary."""
+    poses: PoseVariation = field(default_factory=PoseVariation)
+    """How far poses leave those of the clips."""
+
+
+class WindowPicker:
+    """Picks where windows begin in a corpus, clips of every kind alike."""
+
+    def __init__(self, corpus: Corpus, *, kinds: Sequence[str], evenness: float):
+        """`evenness` among kinds of clips, told by the first of these patterns that is in their names: 0 draws by their
+        frames, 1 the same number of each kind.
+        """
+        self.lengths = corpus.locate_clips()[0]
+        kind = torch.tensor([find_kind(name, kinds) for name in corpus.names])
+        share = torch.zeros(len(kinds) + 1).index_add(0, kind, self.lengths.float())
+        self.weights = share[kind] ** -evenness
+
+    def pick(
+        self, span: Int[Tensor, " batch"], generator: torch.Generator
+    ) -> tuple[Int[Tensor, " batch"], Int[Tensor, " batch"]]:
+        """Pick clips, and the first frames of windows of so many frames in them; RequestError where no clip is so
+        long."""
+        room = (self.lengths - int(span.max()) + 1).clamp_min(0).float()
+        if not bool(room.any()):
+            raise RequestError(f"no clip is as long as the window of {int(span.max())} frames")
+        clip = torch.multinomial(room * self.weights, len(span), replacement=True, generator=generator)
+        return clip, (torch.rand(len(span), generator=generator) * (self.lengths[clip] - span + 1)).long()
+
+
+class PoseWindows:
+    """Draws windows from a corpus."""
+
+    def __init__(self, corpus: Corpus, *, kinds: Sequence[str], evenness: float):
+        """`evenness` among kinds of clips, told by the first of these patterns that is in their names: 0 draws by their
+        frames, 1 the same number of each kind.
+        """
+        self.picker = WindowPicker(corpus, kinds=kinds, evenness=evenness)
+        self.lengths, self.starts = corpus.locate_clips()
+        self.ground, self.heading = corpus.integrate_roots()
+        self.height = LAYOUT.pick(corpus.features, "root_height")
+        self.contacts = LAYOUT.pick(corpus.features, "contacts")
+        poses = [BodyPose.of_features_in_place(part) for part in corpus.features.split(_CHUNK_FRAMES)]
+        self.quats = torch.cat([rotations.from_rotation_vector(pose.rotation_vectors) for pose in poses])
+
+    def draw(
+        self, batch: int, frames: int, generator: torch.Generator, *, variation: Variation | None = None
+    ) -> PartialMotion:
+        """So many windows of so many frames, of which everything is known; RequestError where no clip is so long."""
+        tempo = torch.ones(batch)
+        if variation is not None:
+            chosen = torch.rand(batch, generator=generator) < variation.share
+            change = variation.tempo * (2 * torch.rand(batch, generator=generator) - 1)
+            tempo = torch.where(chosen, 1 + change, 1.0)
+        clip, first = self.picker.pick(1 + ((frames - 1) * tempo).ceil().long(), generator)
+        window = self.at(clip, first, frames, tempo)
+        mirrored = torch.rand(batch, generator=generator) < 0.5
+        window = choose_rows(mirrored, window.mirrored(), window)
+        if variation is None:
+            return window
+        return _leave_poses(_reshape_bodies(window, variation, generator), variation.poses, generator)
+
+    def at(
+        self, clip: Int[Tensor, " batch"], first: Int[Tensor, " batch"], frames: int, tempo: Float[Tensor, " batch"]
+    ) -> PartialMotion:
+        """From these frames of these clips on, in steps of `tempo` frames."""
+        time = first[:, None] + torch.arange(frames) * tempo[:, None].double()
+        return self.gather(clip[:, None].expand_as(time), time)
+
+    def gather(self, clip: Int[Tensor, "batch frames"], time: Float[Tensor, "batch frames"]) -> PartialMotion:
+        """Gather frames of any clips; times are in frames and may lie between two, those beyond a clip's last frame
+        show that."""
+        low = time.floor().long()
+        weight = (time - low).float()
+        last = self.lengths[clip] - 1
+        one, other = (self.starts[clip] + at.minimum(last) for at in (low, low + 1))
+        nearest = torch.where(weight < 0.5, one, other)
+        quats, after = self.quats[one], self.quats[other]
+        after = torch.where((quats * after).sum(dim=-1, keepdim=True) < 0, -after, after)
+        quats = torch.nn.functional.normalize(torch.lerp(quats, after, weight[..., None, None]), dim=-1)
+        ground = torch.lerp(self.ground[one], self.ground[other], weight[..., None])
+        height = torch.lerp(self.height[one], self.height[other], weight[..., None])
+        root = torch.cat([ground[..., :1], height, ground[..., 1:]], dim=-1)
+        heading = torch.lerp(self.heading[one], self.heading[other], weight)
+        batch, frames = clip.shape
+        offsets = CANONICAL.offsets.to(root).expand(batch, -1, -1)
+        known = KnownParts.whole(torch.ones(batch, frames, dtype=torch.bool))
+        targets = torch.zeros(batch, frames, len(EFFECTORS), 3)
+        return PartialMotion(root, heading, quats, self.contacts[nearest], targets, offsets, known)
+
+    def mean_quats(self) -> Float[Tensor, "joints 4"]:
+        """Mean rotation of each joint, of a motion and its mirror image."""
+        sample = self.quats[:: max(1, len(self.quats) // 20_000)]
+        return rotations.average(torch.cat([sample, mirror_quats(sample)]).double()).float()
+
+
+def find_kind(name: str, kinds: Sequence[str]) -> int:
+    """Number of the first of these patterns that is in a clip's name; that of none is one more than the last."""
+    return next((number for number, kind in enumerate(kinds) if re.search(kind, name)), len(kinds))
+
+
+def choose_rows(chosen: Tensor, one: PartialMotion, other: PartialMotion) -> PartialMotion:
+    """Take rows of one where they are chosen, of the other elsewhere; both know everything."""
+
+    def pick(name: str) -> Tensor:
+        first = getattr(one, name)
+        return torch.where(chosen.view(-1, *[1] * (first.ndim - 1)), first, getattr(other, name))
+
+    names = ("root_position", "heading", "quats", "contacts", "targets", "offsets")
+    return replace(other, **{name: pick(name) for name in names})
+
+
+def _reshape_bodies(window: PartialMotion, variation: Variation, generator: torch.Generator) -> PartialMotion:
+    """Give bodies other widths and lengths, the same on both sides."""
+    batch = len(window.offsets)
+    factors = torch.ones(batch, CANONICAL.num_joints, 3)
+    for joints, axes in _VARIED:
+        factor = 1 + variation.bones * (2 * torch.rand(batch, generator=generator) - 1)
+        factors[:, CANONICAL.indices(joints), :axes] = factor[:, None, None]
+    chosen = (torch.rand(batch, generator=generator) < variation.share)[:, None, None]
+    return replace(window, offsets=torch.where(chosen, window.offsets * factors, window.offsets))
+
+
+def _leave_poses(window: PartialMotion, variation: PoseVariation, generator: torch.Generator) -> PartialMotion:
+    """Turn joints, tilt and lower bodies."""
+    root = window.root_position.clone()
+    heading, quats, root[..., 1] = vary_poses(window.heading, window.quats, root[..., 1], variation, generator)
+    varied = replace(window, root_position=root, heading=heading, quats=quats)
+    return replace(varied, contacts=keep_still(window.contacts, varied.world_poses()[0]))
+
+
+def add_targets(motion: PartialMotion) -> PartialMotion:
+    """Aim hands and feet at where they are."""
+    return replace(motion, targets=motion.world_poses()[0][..., list(EFFECTORS), :])

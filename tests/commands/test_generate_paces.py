@@ -5,7 +5,7 @@ from helpers import run
 from tiny_prior import save_tiny_prior
 
 from mapctl.commands import generate as generate_run
-from priors.lstm_gmm.labels import PACE_LABELS
+from priors.lstm_gmm.density import PACE_LABELS
 
 
 @pytest.fixture(scope="module")

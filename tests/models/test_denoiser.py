@@ -14,7 +14,7 @@ from mapctl import rotations
 from mapctl.protocols import Denoiser
 from mapctl.recording import Capture
 from mapctl.skeleton import CANONICAL
-from priors.denoiser import network as denoiser
+from priors import denoiser as denoiser
 
 JOINTS = CANONICAL.num_joints
 

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from mapctl.features import LAYOUT, GroundPose
 from mapctl.pose import decode
 from mapctl.skeleton import CANONICAL
-from priors.refiner.network import compute_end_effectors, count_channels
+from priors.refiner import compute_end_effectors, count_channels
 
 JOINTS = ("hips", "head", "leftHand", "rightToes")
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from mapctl.protocols import DiscreteChoices
-from priors.lstm_gmm.fast.rollout import FastRollout
+from priors.lstm_gmm.fast import FastRollout
 from priors.lstm_gmm.network import LstmGmm, LstmGmmConfig, LstmState
 
 CASES = [(7, 1, 5), (64, 3, 5), (64, 8, 1), (33, 5, 4), (256, 1, 5)]  # width, batch, components

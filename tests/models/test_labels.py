@@ -9,9 +9,8 @@ from helpers import corpus, generator
 from mapctl.errors import RequestError
 from mapctl.protocols import DataLimits
 from priors.checkpoints import Card
-from priors.lstm_gmm import labels
-from priors.lstm_gmm.density import LstmGmmDensity
-from priors.lstm_gmm.labels import Labels
+from priors.lstm_gmm import density
+from priors.lstm_gmm.density import Labels, LstmGmmDensity
 from priors.lstm_gmm.network import LstmGmm, LstmGmmConfig
 from priors.training.moment_matching import MatchingSettings
 from priors.training.recipes.lstm_gmm import (
@@ -26,7 +25,7 @@ PATTERN = r"_(?P<gait>walk|run|turn-left|turn-right)_(?P<style>[a-z]+)_"
 
 
 def test_labels_are_the_named_groups_of_the_clip_names():
-    found = labels.read(CLIPS, PATTERN)
+    found = density.read_labels(CLIPS, PATTERN)
     assert found.names == ("gait=run", "gait=turn-left", "gait=turn-right", "gait=walk", "style=glad", "style=old")
     held = [{found.names[i] for i in row.nonzero()[:, 0].tolist()} for row in found.held]
     assert held == [
@@ -40,7 +39,7 @@ def test_labels_are_the_named_groups_of_the_clip_names():
 
 
 def test_a_mirrored_turn_is_the_other_turn():
-    found = labels.read(CLIPS, PATTERN)
+    found = density.read_labels(CLIPS, PATTERN)
     assert [found.names[i] for i in found.mirrored] == [
         "gait=run",
         "gait=turn-right",
@@ -49,7 +48,7 @@ def test_a_mirrored_turn_is_the_other_turn():
         "style=glad",
         "style=old",
     ]
-    only_left = labels.read(CLIPS[:2], PATTERN)
+    only_left = density.read_labels(CLIPS[:2], PATTERN)
     assert only_left.mirrored == list(range(len(only_left.names)))
 
 

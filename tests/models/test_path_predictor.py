@@ -13,9 +13,8 @@ from mapctl.features import LAYOUT, encode
 from mapctl.inbetweening.root_trajectory import LocalMotion, RootTrajectory
 from mapctl.kinematics import heading
 from mapctl.protocols import PathPredictor
-from priors import checkpoints
-from priors.tweening import path
-from priors.tweening.path import PathConfig
+from priors import checkpoints, path
+from priors.path import PathConfig
 
 
 def local_motion(frames=90, **options):

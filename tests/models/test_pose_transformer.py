@@ -19,7 +19,7 @@ from mapctl.motion import Motion
 from mapctl.recording.masks import ALL, Mask
 from mapctl.retarget import to_canonical
 from mapctl.skeleton import CANONICAL
-from priors.pose_transformer import network as module
+from priors import pose_transformer as module
 
 FRAMES = 50
 DRAWN = tiny_transformer(drawn=0.05)

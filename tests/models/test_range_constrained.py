@@ -6,7 +6,7 @@ from helpers import generator
 
 from mapctl import joint_ranges, kinematics, rotations
 from mapctl.skeleton import CANONICAL
-from priors.tweening.generator import POSE_ROWS, RangeConstrainedKinematics
+from priors.tweener import POSE_ROWS, RangeConstrainedKinematics
 
 
 @pytest.fixture

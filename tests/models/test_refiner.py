@@ -14,7 +14,7 @@ import priors
 from mapctl.errors import CheckpointError
 from mapctl.features import LAYOUT
 from priors import checkpoints
-from priors.refiner import network as refiners
+from priors import refiner as refiners
 
 BITS = LAYOUT.slices["contacts"]
 

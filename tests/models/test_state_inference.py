@@ -7,7 +7,8 @@ from helpers import tiny_density, walk
 
 from mapctl.features import encode
 from mapctl.solver.budget import Budget
-from priors.lstm_gmm.density import StateInferenceSettings, infer_lstm_state
+from priors.lstm_gmm import density
+from priors.lstm_gmm.density import infer_lstm_state
 from priors.lstm_gmm.network import LstmState
 
 
@@ -50,8 +51,9 @@ def test_the_first_frames_are_likelier_than_after_an_empty_memory_or_any_known_o
         assert nats(found, first) - prior(found) > nats(other, first) - prior(other)
 
 
-def test_without_a_search_it_is_the_best_of_the_known_ones():
+def test_without_a_search_it_is_the_best_of_the_known_ones(monkeypatch):
+    monkeypatch.setattr(density, "_BUDGET", Budget(evaluations=1))
     known = tiny().initial_states.state
-    found = infer_lstm_state(tiny().reference, known, frames(), StateInferenceSettings(budget=Budget(evaluations=1)))
+    found = infer_lstm_state(tiny().reference, known, frames())
     apart = (known.hidden - found.hidden).abs().amax(dim=(0, 2))
     assert float(apart.min()) < 1e-5

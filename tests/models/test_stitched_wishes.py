@@ -16,8 +16,7 @@ from controllers.inbetweening.tween import tween
 from mapctl.inbetweening.effector_targets import EffectorTargets
 from mapctl.inbetweening.missing import MissingMask
 from mapctl.intent.keyframes import Keys
-from priors.stitching.inbetweener import fit_shared
-from priors.stitching.network import Joined
+from priors.stitcher import Joined, fit_shared
 
 RAW = InfillSettings(finish=False)
 GAP = slice(21, 40)

@@ -13,10 +13,8 @@ from mapctl.features import mirror_features
 from mapctl.inbetweening.missing import MissingMask
 from mapctl.recording.masks import ALL, Mask
 from mapctl.retarget import to_canonical
-from priors.stitching.inbetweener import Draws, see_ends
-from priors.stitching.network import DrawnLatents, count_made, join_sides, walk_sides
+from priors.stitcher import DrawnLatents, Draws, count_made, join_sides, see_ends, walk_sides
 
-PRINTED = replace(CONFIG, shared=0, own=4, printed=True)
 each_length = pytest.mark.parametrize("frames", [2, 3, 4, 5, 8, 15, 24])
 
 
@@ -45,12 +43,11 @@ def test_untaught_it_interpolates_places_evenly(frames):
 
 
 @each_length
-@pytest.mark.parametrize("config", [CONFIG, PRINTED], ids=["at once", "in turn"])
-def test_every_length_is_made(frames, config):
-    made = count_made(network(config), frames)
+def test_every_length_is_made(frames):
+    made = count_made(network(CONFIG), frames)
     ends = bare(walk(60), 11, 10 + frames)
-    drawn = DrawnLatents.sample(config, 1, made, torch.Generator().manual_seed(1))
-    joined = join_sides(walk_sides(network(config), ends, frames, drawn))
+    drawn = DrawnLatents.sample(CONFIG, 1, made, torch.Generator().manual_seed(1))
+    joined = join_sides(walk_sides(network(CONFIG), ends, frames, drawn))
     assert joined.quats.shape == (1, frames - 1, 21, 4)
     assert all(bool(getattr(joined, name).isfinite().all()) for name in ("root_position", "quats", "contacts", "apart"))
 

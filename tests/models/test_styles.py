@@ -10,7 +10,7 @@ from helpers import corpus, generator
 from mapctl.errors import CheckpointError, RequestError
 from mapctl.motion_dna import MotionDna
 from priors.training.recipes.tweener import collect_dna, compute_classes, group_clips
-from priors.tweening.styles import Style, count_clips, encode_classes, find_class, pick_class, read_classes
+from priors.tweener import Style, count_clips, encode_classes, find_class, pick_class, read_classes
 
 
 @pytest.mark.parametrize(

@@ -11,14 +11,7 @@ from mapctl.inbetweening import PositionImage
 from mapctl.kinematics import heading
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors.training.windows import interpolate_heading, interpolate_positions
-from priors.tweening.generator import (
-    INPUT_ROWS,
-    PAPER,
-    GeneratorConfig,
-    GeneratorNetwork,
-    StyleEncoder,
-    regularise_batch,
-)
+from priors.tweener import INPUT_ROWS, PAPER, GeneratorConfig, GeneratorNetwork, StyleEncoder, regularise_batch
 
 SMALL = GeneratorConfig((8, 8, 8, 12, 12, 12), (12, 12, 8, 8, 8, 8), style=5)
 

@@ -14,8 +14,7 @@ from mapctl import motion_dna
 from mapctl.kinematics import heading
 from mapctl.motion_dna import MotionDna
 from mapctl.skeleton import TOE_JOINTS, TOE_REST_HEIGHT
-from priors.tweening.inbetweener import find_splits, place_poses, show_edges
-from priors.tweening.styles import Style, mix_styles, read_classes
+from priors.tweener import Style, find_splits, mix_styles, place_poses, read_classes, show_edges
 
 FAST = motion_dna.of(walk(90, cadence=1.4, seed=5))
 

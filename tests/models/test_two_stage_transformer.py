@@ -8,8 +8,8 @@ from helpers import corpus
 from tiny_transformer import CONFIG, network
 
 from mapctl.inbetweening.partial_motion import KnownParts
-from priors.training.augmentation.pose_windows import PoseWindows, add_targets
 from priors.training.recipes.pose_transformer import hide
+from priors.training.windows import PoseWindows, add_targets
 
 TWO = replace(CONFIG, detail=2)
 

@@ -15,7 +15,7 @@ from mapctl.problem.unknowns import LatentNoise, WindowContext
 from mapctl.skeleton import CANONICAL
 from mapctl.terms import LatentPrior
 from mapctl.terms.base import DifferentiatedTerm, TrialGradient
-from priors.lstm_gmm.fast import layout
+from priors.lstm_gmm import fast
 from priors.lstm_gmm.network import LstmGmm
 
 BY_HAND = {name: term for name, term in TERMS.items() if isinstance(term, DifferentiatedTerm)}
@@ -133,7 +133,7 @@ def half_network(**shape) -> LstmGmm:
     return network
 
 
-@pytest.mark.skipif(not layout.converts_half(), reason="the processor does not convert half precision")
+@pytest.mark.skipif(not fast.converts_half(), reason="the processor does not convert half precision")
 @pytest.mark.parametrize("batch", [1, 5])
 def test_half_precision_changes_nothing(batch, monkeypatch):
     network = half_network(components=3)
@@ -142,7 +142,7 @@ def test_half_precision_changes_nothing(batch, monkeypatch):
     noise = torch.randn(batch, FRAMES * LAYOUT.continuous, generator=generator(batch))
     found = []
     for halves in (True, False):
-        monkeypatch.setattr(layout, "converts_half", lambda halves=halves: halves)
+        monkeypatch.setattr(fast, "converts_half", lambda halves=halves: halves)
         unknowns = LatentNoise.from_unknowns(context(replace(density)), noise)
         found.append(Objective.of(unknowns, [TERMS["noise"], TERMS["footing"]]).energy_and_gradient(noise))
         assert (replace(density)._fast._weights.lstm.dtype == np.uint16) is halves

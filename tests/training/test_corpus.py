@@ -9,7 +9,7 @@ from helpers import corpus
 
 from mapctl.errors import MapctlError, RequestError
 from mapctl.features import LAYOUT
-from priors.training import corpus as corpora
+from priors.training import data as corpora
 
 
 def test_a_clip_that_cannot_be_used_is_named(tmp_path):
@@ -68,7 +68,7 @@ def test_a_cache_of_other_rig_tables_or_contact_thresholds_is_not_taken(tmp_path
         ("ContactSettings", partial(contacts, slow=0.4)),
     ):
         with monkeypatch.context() as patch:
-            patch.setattr(f"priors.training.corpus.{what}", other)
+            patch.setattr(f"priors.training.data.{what}", other)
             patch.setattr(corpora, "read_clip_features", None)
             with pytest.raises(RequestError, match="none of the 3"):
                 corpora.read_corpus(data, match="walk-[0-2]", cache=tmp_path)

@@ -9,7 +9,7 @@ from helpers import corpus, generator
 from mapctl import rotations
 from mapctl.features import LAYOUT
 from mapctl.skeleton import CANONICAL
-from priors.training.augmentation.corruption import LIMBS, CorruptionSettings, corrupt, make_clean_capture
+from priors.training.augment import LIMBS, CorruptionSettings, corrupt, make_clean_capture
 
 JOINTS = CANONICAL.num_joints
 NOTHING = CorruptionSettings(

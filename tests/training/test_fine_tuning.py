@@ -9,7 +9,7 @@ from helpers import write_corpus
 
 import priors
 from priors.lstm_gmm.network import LstmGmmConfig
-from priors.training import run
+from priors.training import loop
 from priors.training.recipes import lstm_gmm
 from priors.training.recipes.lstm_gmm import DensityRecipe, TrainingSettings
 
@@ -30,10 +30,10 @@ def test_fine_tuning_begins_with_the_priors_weights_statistics_and_labels(tmp_pa
         starts=4,
         labels=r"-(?P<number>[0-4])",
     )
-    first = run.train(request)
+    first = loop.train(request)
     slow = replace(SETTINGS, steps=1, learning_rate=1e-6)
     tuned = replace(request, out=tmp_path / "second", init=str(first), match="walk-[0-2]", settings=slow, labels="")
-    before, after = (priors.load(str(path)) for path in (first, run.train(tuned)))
+    before, after = (priors.load(str(path)) for path in (first, loop.train(tuned)))
     assert after.reference.config == before.reference.config
     assert len(after.reference.config.labels) == 3  # of the clips trained on
     for name, value in before.reference.state_dict().items():

@@ -10,8 +10,7 @@ from helpers import run, walk, write_corpus
 
 from mapctl.errors import FileFormatError
 from mapctl.features import encode
-from priors.training.corpus import read_corpus
-from priors.training.mocap.cuts import TABLE_NAME, Cut, find_cuts, read_cuts
+from priors.training.data import TABLE_NAME, Cut, find_cuts, read_corpus, read_cuts
 
 pytestmark = pytest.mark.usefixtures("small_judgements")
 STYLES = {
@@ -79,11 +78,6 @@ def test_a_given_table_counts_before_one_that_is_found(styles, tmp_path):
 )
 def test_rows_name_files_their_ends_and_patterns(files, tmp_path, rows, lengths):
     assert read(files, tmp_path, cuts=table(tmp_path, *rows)).lengths == lengths
-
-
-def test_skip_first_drops_frame_0_where_a_cut_keeps_it(files, tmp_path):
-    found = read(files, tmp_path, skip_first=True, cuts=table(tmp_path, "walk-0,,", "walk-1,5,"))
-    assert found.lengths == (79, 75, 79)
 
 
 def test_takes_of_cmu_have_a_table_that_comes_with_mapctl(files, tmp_path, monkeypatch):

@@ -12,8 +12,10 @@ from priors.training.moment_matching import MatchingSettings
 from priors.training.recipes import lstm_gmm as free_runs
 from priors.training.recipes.lstm_gmm import CriticSettings, DensityTrainer, TrainingSettings
 
-CRITIC = CriticSettings(steps=3, frames=8, head_start=2, batch=4, history=8, every=1)
-SETTINGS = TrainingSettings(steps=5, batch=4, window=20, critic=CRITIC, matching=MatchingSettings(wander=4, batch=4))
+CRITIC = CriticSettings(frames=8, head_start=2, batch=4, history=8, every=1)
+SETTINGS = TrainingSettings(
+    steps=5, batch=4, window=20, critic_steps=3, critic=CRITIC, matching=MatchingSettings(wander=4, batch=4)
+)
 
 
 def make_trainer(settings: TrainingSettings = SETTINGS) -> DensityTrainer:

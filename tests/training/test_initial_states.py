@@ -6,7 +6,7 @@ from helpers import corpus, generator
 
 from mapctl.features import LAYOUT, ground_speed
 from priors.lstm_gmm.network import LstmGmm, LstmGmmConfig
-from priors.training.corpus import Corpus
+from priors.training.data import Corpus
 from priors.training.recipes.lstm_gmm import compute_feature_statistics, measure_data_limits, select_initial_states
 
 

@@ -7,8 +7,8 @@ import torch
 from helpers import corpus, generator
 
 from mapctl import rotations
-from priors.training.augmentation.key_layouts import WHOLE, KeySettings, draw_splices, draw_windows
-from priors.training.augmentation.pose_windows import PoseWindows
+from priors.training.recipes.tweener import WHOLE, KeySettings, draw_splices, draw_windows
+from priors.training.windows import PoseWindows
 
 SETTINGS = KeySettings(longest=200.0, open_ends=0.0, parts=WHOLE)
 

@@ -8,8 +8,8 @@ import torch
 from helpers import generator
 
 from mapctl.skeleton import CANONICAL
-from priors.training.augmentation.key_layouts import WHOLE, tell_parts
-from priors.tweening.keys import ToldParts, lead_reference
+from priors.training.recipes.tweener import WHOLE, tell_parts
+from priors.tweener import ToldParts, lead_reference
 
 BATCH, FRAMES = 60, 90
 LEGS = CANONICAL.indices(("leftLowerLeg", "rightLowerLeg", "leftFoot", "rightFoot", "leftToes", "rightToes"))

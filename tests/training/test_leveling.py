@@ -14,8 +14,7 @@ from mapctl.features import GroundPose, encode
 from mapctl.motion import Motion
 from mapctl.pose import BodyPose
 from mapctl.skeleton import CANONICAL, TOE_JOINTS, TOE_REST_HEIGHT
-from priors.training.corpus import find_floor_slope, read_clip_features, stand_on_canonical, turn_level
-from priors.training.mocap.cuts import Cut
+from priors.training.data import Cut, find_floor_slope, read_clip_features, stand_on_canonical, turn_level
 
 pytestmark = pytest.mark.usefixtures("small_judgements")
 SMALL = Performer(size=0.9, toe_height=-0.03)

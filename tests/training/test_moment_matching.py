@@ -6,9 +6,9 @@ import torch
 from helpers import corpus, finite_difference, generator, tiny_model
 
 from mapctl.features import LAYOUT
-from priors.lstm_gmm.labels import PACE_LABELS, Labels
+from priors.lstm_gmm.density import PACE_LABELS, Labels
 from priors.lstm_gmm.network import LstmGmmConfig
-from priors.training.corpus import follow_paces
+from priors.training.data import follow_paces
 from priors.training.moment_matching import MatchingSettings, moment_loss, run_free
 from priors.training.recipes.lstm_gmm import DensityTrainer, TrainingSettings
 

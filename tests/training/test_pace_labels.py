@@ -8,9 +8,9 @@ import torch
 from helpers import generator, go_at, run, write_corpus
 
 import priors
-from priors.lstm_gmm.labels import PACE_LABELS, Labels, read_pace_rates
+from priors.lstm_gmm.density import PACE_LABELS, Labels, read_pace_rates
 from priors.lstm_gmm.network import LstmGmmConfig
-from priors.training.corpus import Corpus, follow_paces, measure_pace_changes, measure_speeds
+from priors.training.data import Corpus, follow_paces, measure_pace_changes, measure_speeds
 from priors.training.recipes.lstm_gmm import DensityTrainer, TrainingSettings
 
 pytestmark = pytest.mark.usefixtures("small_judgements")

@@ -7,9 +7,9 @@ from captures import on_rig
 from mapctl.features import encode
 from mapctl.inbetweening.partial_motion import EFFECTORS
 from mapctl.skeleton import CANONICAL, leg_length
-from priors.training.augmentation.pose_windows import PoseWindows, Variation, add_targets
-from priors.training.corpus import Corpus
+from priors.training.data import Corpus
 from priors.training.recipes.pose_transformer import PartSettings, sample_known_parts
+from priors.training.windows import PoseWindows, Variation, add_targets
 
 BATCH = 400
 

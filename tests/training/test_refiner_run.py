@@ -10,8 +10,9 @@ from tiny_prior import save_walking_density
 
 import priors
 from mapctl.metrics.realism import ClassifierSettings, RealismSettings
-from priors.refiner.network import RefinerConfig
-from priors.training import corpus as corpora
+from priors.refiner import RefinerConfig
+from priors.training import data as corpora
+from priors.training.loop import train
 from priors.training.recipes.refiner import (
     AdversarialSettings,
     AdversarialTrainer,
@@ -20,7 +21,6 @@ from priors.training.recipes.refiner import (
     compute_realism_gap,
     sample_corpus,
 )
-from priors.training.run import train
 
 TINY = RefinerConfig(width=6, memory=5, lookahead=1, joints=("hips", "rightToes"))
 SETTINGS = AdversarialSettings(

@@ -10,9 +10,9 @@ from torch.nn.functional import logsigmoid
 
 from mapctl.features import LAYOUT, GroundPose, encode
 from mapctl.pose import decode
-from priors.refiner.network import RefinerConfig
-from priors.training.corpus import Corpus
-from priors.training.recipe import HistoryBuffer
+from priors.refiner import RefinerConfig
+from priors.training.data import Corpus
+from priors.training.loop import HistoryBuffer
 from priors.training.recipes.refiner import AdversarialSettings, AdversarialTrainer, compute_root_error
 
 TINY = RefinerConfig(width=8, memory=6, lookahead=1, joints=("hips", "leftHand", "rightToes"))

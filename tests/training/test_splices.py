@@ -14,10 +14,10 @@ import priors
 from mapctl.features import LAYOUT, GroundPose, encode
 from mapctl.pose import decode
 from mapctl.skeleton import CANONICAL
-from priors.lstm_gmm import labels
-from priors.training.augmentation import splices as module
-from priors.training.augmentation.splices import FOLDER, Splices, add_splices, draw_cuts
-from priors.training.corpus import Corpus
+from priors.lstm_gmm import density
+from priors.training import augment as module
+from priors.training.augment import FOLDER, add_splices, draw_cuts
+from priors.training.data import Corpus
 from priors.training.recipes import lstm_gmm
 
 pytestmark = pytest.mark.usefixtures("small_judgements")
@@ -54,7 +54,7 @@ def corpus():
 @pytest.fixture
 def all_pass(monkeypatch):
     """Whatever comes of it is kept."""
-    monkeypatch.setattr(module, "list_faults", lambda measures, bounds: [])
+    monkeypatch.setattr(module, "_passes", lambda features, bounds: True)
 
 
 @pytest.fixture
@@ -101,7 +101,7 @@ def test_pieces_are_cut_where_somebody_stands_or_goes(corpus):
 
 @pytest.mark.slow
 def test_a_splice_is_two_pieces_and_a_way_between(corpus, tiny, all_pass):
-    spliced = add_splices(corpus, Splices(12, tiny))
+    spliced = add_splices(corpus, 12, tiny)
     assert spliced.names[:4] == corpus.names
     assert len(spliced.names) == 16
     assert torch.equal(spliced.features[: len(corpus.features)], corpus.features)
@@ -129,11 +129,11 @@ def test_the_bundled_stitcher_passes_for_mocap_and_a_wild_one_does_not(corpus, t
 
     monkeypatch.setattr(module, "find_bounds", find)  # feet that stand to the hair are not what mocap is like
     wild = str(save_tiny_stitcher(tmp_path / "wild.safetensors", drawn=30.0))
-    assert len(add_splices(corpus, Splices(18, wild)).names) == 4
+    assert len(add_splices(corpus, 18, wild).names) == 4
     assert len(asked) == 3  # who sets off, who stops, who stands: each is bounded by what it is made of
     assert {100, 120} in asked
     assert {100, 120, 150} in asked
-    kept = add_splices(corpus, Splices(18))
+    kept = add_splices(corpus, 18)
     assert len(kept.names) > 4 + 4
     for features in kept.clips()[4:]:
         places = decode(features, GroundPose.origin()).joint_positions()
@@ -147,25 +147,25 @@ def test_they_are_kept_for_a_run_that_goes_on(corpus, tmp_path, all_pass, monkey
         for name, drawn in (("a", 1.0), ("b", 3.0))
     )
     cache = tmp_path / "cache"
-    made = add_splices(corpus, Splices(4, one), cache)
+    made = add_splices(corpus, 4, one, cache)
     (stored,) = cache.iterdir()
     with monkeypatch.context() as within:
         within.setattr(module, "_walk_all", lambda *_: pytest.fail("made anew"))
-        again = add_splices(corpus, Splices(4, one), cache)
+        again = add_splices(corpus, 4, one, cache)
     assert torch.equal(again.features, made.features)
     assert (again.names, again.lengths) == (made.names, made.lengths)
     # Nothing else is taken for them.
     some = corpus.subset(range(1, len(corpus.names)))
-    for wanted, clips in (
-        (Splices(5, one), corpus),
-        (Splices(4, other), corpus),
-        (Splices(4, one, seed=2), corpus),
-        (Splices(4, one), some),
+    for (count, name, seed), clips in (
+        ((5, one, 1), corpus),
+        ((4, other, 1), corpus),
+        ((4, one, 2), corpus),
+        ((4, one, 1), some),
     ):
-        assert not torch.equal(add_splices(clips, wanted, cache).features, made.features)
+        assert not torch.equal(add_splices(clips, count, name, cache, seed=seed).features, made.features)
     assert len(list(cache.iterdir())) == 5
     stored.write_bytes(b"damaged")
-    assert torch.equal(add_splices(corpus, Splices(4, one), cache).features, made.features)
+    assert torch.equal(add_splices(corpus, 4, one, cache).features, made.features)
 
 
 @pytest.fixture
@@ -198,7 +198,7 @@ def test_a_density_is_trained_on_them_and_its_card_says_so(data, tmp_path, tiny,
 
 @pytest.mark.slow
 def test_a_splice_has_no_label_and_no_start_lies_in_one(data, tmp_path, tiny, all_pass):
-    seen, read_labels = [], labels.read
+    seen, read_labels = [], density.read_labels
 
     def see(names, pattern):
         seen.append((names, read := read_labels(names, pattern)))
@@ -206,7 +206,7 @@ def test_a_splice_has_no_label_and_no_start_lies_in_one(data, tmp_path, tiny, al
 
     words = ("--splices", 9, "--stitcher", tiny, "--quiet", "--labels", "(?P<what>walk|wave)")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(lstm_gmm.labels, "read", see)
+        patch.setattr(lstm_gmm.density, "read_labels", see)
         assert train(data, tmp_path / "run", *words) == 0
     names, read = seen[0]
     assert names.count("") == 9
@@ -219,9 +219,9 @@ def test_a_splice_has_no_label_and_no_start_lies_in_one(data, tmp_path, tiny, al
 def test_clips_that_are_held_out_are_in_no_splice(data, tmp_path, tiny, all_pass):
     seen = []
 
-    def see(corpus, splices, cache):
+    def see(corpus, *request, **seed):
         seen.append(corpus.names)
-        return add_splices(corpus, splices, cache)
+        return add_splices(corpus, *request, **seed)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("priors.training.recipes.lstm_gmm.add_splices", see)

@@ -5,7 +5,7 @@ import torch
 from helpers import generator, go_at, run, write_corpus
 
 import priors
-from priors.training.corpus import Corpus, find_window_starts
+from priors.training.data import Corpus, find_window_starts
 from priors.training.windows import FeatureWindows
 
 FRAMES = 20

@@ -9,7 +9,8 @@ import torch
 from helpers import corpus, write_corpus
 
 import priors
-from priors.stitching.network import DrawnLatents, count_made, join_sides, walk_sides
+from priors.stitcher import DrawnLatents, count_made, join_sides, walk_sides
+from priors.training.loop import train
 from priors.training.recipes import stitcher as recipe_module
 from priors.training.recipes.stitcher import (
     TEMPERATURES,
@@ -24,7 +25,6 @@ from priors.training.recipes.stitcher import (
     place,
     sample_nearest,
 )
-from priors.training.run import train
 
 SETTINGS = StitcherSettings(steps=10, batch=6, window=24)
 

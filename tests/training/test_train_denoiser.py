@@ -8,12 +8,11 @@ import torch
 from helpers import corpus, generator
 
 from mapctl.features import LAYOUT
-from priors.denoiser.network import DenoiserConfig
-from priors.training.augmentation.corruption import CorruptionSettings
-from priors.training.augmentation.pose_windows import PoseVariation
-from priors.training.corpus import Corpus
+from priors.denoiser import DenoiserConfig
+from priors.training.augment import CorruptionSettings
+from priors.training.data import Corpus
 from priors.training.recipes.denoiser import DenoiserSettings, DenoiserTrainer, compute_denoiser_losses, draw_performers
-from priors.training.windows import FeatureWindows
+from priors.training.windows import FeatureWindows, PoseVariation
 
 TINY = DenoiserConfig(width=8, dilations=(1, 2))
 FAMILIAR = PoseVariation(share=0.0, tilted=0.0)

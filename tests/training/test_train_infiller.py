@@ -11,7 +11,7 @@ from tiny_infiller import CONFIG, network
 
 import mapctl
 from mapctl.skeleton import CANONICAL
-from priors.infiller.network import InfillerConfig
+from priors.infiller import InfillerConfig
 from priors.training.recipes.infiller import GapSettings, InfillerSettings, InfillerTrainer, compute_infiller_losses
 from priors.training.windows import PositionWindows
 

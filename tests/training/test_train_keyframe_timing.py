@@ -13,14 +13,14 @@ from safetensors.torch import load_file
 import priors
 from mapctl.errors import CheckpointError
 from mapctl.inbetweening.pose_pairs import PosePairs
-from priors.keyframe_timing.model import KeyframeTimingConfig
+from priors.keyframe_timing import KeyframeTimingConfig
+from priors.training.loop import train
 from priors.training.recipes.keyframe_timing import (
     KeyframeTimingRecipe,
     KeyframeTimingSettings,
     KeyframeTimingTrainer,
     solve_weights,
 )
-from priors.training.run import train
 
 SETTINGS = KeyframeTimingSettings()
 

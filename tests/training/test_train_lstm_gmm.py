@@ -9,6 +9,7 @@ from helpers import corpus, walk, write_corpus
 
 from mapctl.features import LAYOUT, encode, mirror_features
 from priors.lstm_gmm.network import PAPER, LstmGmmConfig
+from priors.training.loop import train
 from priors.training.recipes import lstm_gmm
 from priors.training.recipes.lstm_gmm import (
     DensityRecipe,
@@ -17,7 +18,6 @@ from priors.training.recipes.lstm_gmm import (
     compute_feature_statistics,
     summarise_states,
 )
-from priors.training.run import train
 
 TINY = LstmGmmConfig(width=8, components=2)
 MEASURE = lstm_gmm.measure_free_runs

@@ -8,10 +8,10 @@ import torch
 from helpers import corpus, generator
 
 from mapctl.inbetweening.root_trajectory import LocalMotion, RootTrajectory
-from priors.training.augmentation.pose_windows import PoseWindows
-from priors.training.corpus import Corpus
+from priors.path import PathNetwork
+from priors.training.data import Corpus
 from priors.training.recipes.path import PathSettings, PathTrainer, compute_path_losses, measure_clip
-from priors.tweening.path import PathNetwork
+from priors.training.windows import PoseWindows
 
 SETTINGS = PathSettings(steps=30, batch=128, window=40, learning_rate=1e-2)
 

@@ -12,8 +12,7 @@ from tiny_transformer import CONFIG, network
 import mapctl
 from mapctl.inbetweening.partial_motion import KnownParts
 from priors import checkpoints
-from priors.pose_transformer.network import PoseTransformerConfig
-from priors.training.augmentation.pose_windows import PoseWindows, add_targets
+from priors.pose_transformer import PoseTransformerConfig
 from priors.training.recipes.lstm_gmm import DensityRecipe
 from priors.training.recipes.pose_transformer import (
     PoseTransformerRecipe,
@@ -22,6 +21,7 @@ from priors.training.recipes.pose_transformer import (
     compute_losses,
     hide,
 )
+from priors.training.windows import PoseWindows, add_targets
 
 SETTINGS = PoseTransformerSettings(steps=6, batch=100, window=32)
 

@@ -10,17 +10,19 @@ from helpers import corpus, generator
 
 from mapctl import kinematics, rotations
 from mapctl.skeleton import CANONICAL
-from priors.training.augmentation.key_layouts import KeySettings, draw_splices, draw_windows
-from priors.training.augmentation.pose_windows import PoseWindows
 from priors.training.recipes.tweener import (
+    KeySettings,
     LossWeights,
     TweenerSettings,
     TweenerTrainer,
     compute_tweener_losses,
+    draw_splices,
     draw_style_poses,
+    draw_windows,
     measure_gap,
 )
-from priors.tweening.generator import ConstrainedPose, GeneratedPoses, GeneratorNetwork
+from priors.training.windows import PoseWindows
+from priors.tweener import ConstrainedPose, GeneratedPoses, GeneratorNetwork
 
 SETTINGS = TweenerSettings(steps=30, batch=96, learning_rate=1e-2, layout=KeySettings(longest=60.0))
 ERRORS = ("places_cm", "pace_cm", "feet_cm", "keys_cm", "turns")

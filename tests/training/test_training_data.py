@@ -10,7 +10,7 @@ from helpers import bandai_skeleton, corpus, walks
 import priors
 from mapctl import retarget
 from mapctl.errors import RequestError
-from priors.training import corpus as corpora
+from priors.training import data as corpora
 from priors.training.recipes.denoiser import DenoiserSettings, DenoiserTrainer
 from priors.training.recipes.lstm_gmm import DensityRecipe
 

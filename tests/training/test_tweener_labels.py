@@ -9,8 +9,8 @@ from tiny_path import save_tiny_path
 
 import priors
 from mapctl.errors import RequestError
+from priors.training.loop import train
 from priors.training.recipes.tweener import TweenerRecipe, TweenerSettings
-from priors.training.run import train
 
 SETTINGS = replace(TweenerSettings(), steps=1, batch=3, window=32)
 

@@ -12,7 +12,7 @@ from mapctl.contacts import ContactSettings
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose
 from mapctl.pose import BodyPose
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
-from priors.training.augmentation.pose_windows import PoseVariation, vary_features
+from priors.training.windows import PoseVariation, vary_features
 
 TURNED = PoseVariation(share=1.0, drift=0.0, tilted=0.0)
 TILTED = PoseVariation(share=0.0, tilted=1.0)

@@ -6,13 +6,13 @@ import pytest
 import torch
 
 from mapctl import rotations
-from priors.tweening import keys
+from priors import tweener
 
 FRAMES = 193
 
 
 def bend_way(way, facing, told):
-    return keys.bend_way(way, facing, placed=told, faced=told)
+    return tweener.bend_way(way, facing, placed=told, faced=told)
 
 
 def lead(displacement, first, last, frames=FRAMES, turn=0.0):

@@ -11,7 +11,7 @@ from mapctl.inbetweening.missing import MissingMask, interpolate_missing
 from mapctl.motion import Motion
 from mapctl.pose import decode
 from mapctl.skeleton import CANONICAL
-from priors.training.corpus import Corpus
+from priors.training.data import Corpus
 from priors.training.windows import PositionWindows
 
 SWAP = CANONICAL.mirror_partners()

@@ -51,17 +51,6 @@ def _write_lines(label: str) -> Progress:
 
 
 @contextmanager
-def explain_end(describe: Callable[[], str]) -> Iterator[None]:
-    """Add to the message of Ctrl-C, SIGTERM or a full disk within what `describe` finds saved, and what to type."""
-    try:
-        yield
-    except KeyboardInterrupt as stop:
-        raise KeyboardInterrupt(describe() or "nothing was saved yet") from stop
-    except WriteError as error:
-        raise WriteError(_join_sentences(str(error), describe())) from error
-
-
-@contextmanager
 def explain_progress(count: int, what: str, then: str = "") -> Iterator[Callable[[int], None]]:
     """Yield a function that takes the number of finished items; add it to the message of Ctrl-C, SIGTERM or a full disk
     within, and what to do `then`.

@@ -23,9 +23,8 @@ from mapctl.motion_dna import MotionDna
 from mapctl.problem.solution import Solution
 from mapctl.protocols import Inbetweener
 from mapctl.retarget.rigs import Rig
-from priors.stitching.inbetweener import Stitcher
-from priors.tweening.inbetweener import Tweener
-from priors.tweening.styles import Style, mix_styles, pick_class
+from priors.stitcher import Stitcher
+from priors.tweener import Style, Tweener, mix_styles, pick_class
 from scenes.film import film_side_by_side
 
 METHODS = ("auto", "tweener")

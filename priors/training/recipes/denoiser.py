@@ -16,12 +16,11 @@ from mapctl.pose import BodyPose
 from mapctl.recording import Capture, CaptureProposal
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors.checkpoints import require_at_least
-from priors.denoiser.network import DenoiserConfig, DenoiserNetwork
-from priors.training.augmentation.corruption import CorruptionSettings, corrupt, make_clean_capture
-from priors.training.augmentation.pose_windows import PoseVariation, vary_features
-from priors.training.corpus import Corpus
-from priors.training.recipe import GradientTrainer, NetworkRecipe, Row, average_logarithms, make_generator
-from priors.training.windows import FeatureWindows
+from priors.denoiser import DenoiserConfig, DenoiserNetwork
+from priors.training.augment import CorruptionSettings, corrupt, make_clean_capture
+from priors.training.data import Corpus
+from priors.training.loop import GradientTrainer, NetworkRecipe, Row, average_logarithms, make_generator
+from priors.training.windows import FeatureWindows, PoseVariation, vary_features
 
 _TOES = list(TOE_JOINTS)
 

@@ -17,10 +17,10 @@ from torch.nn.functional import binary_cross_entropy_with_logits as cross_entrop
 from mapctl.errors import RequestError
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors.checkpoints import require_at_least
-from priors.infiller.network import InfillerConfig, InfillerNetwork
-from priors.training.augmentation.corruption import Draws
-from priors.training.corpus import Corpus
-from priors.training.recipe import GradientTrainer, NetworkRecipe, Row, average_logarithms, make_generator
+from priors.infiller import InfillerConfig, InfillerNetwork
+from priors.training.augment import Draws
+from priors.training.data import Corpus
+from priors.training.loop import GradientTrainer, NetworkRecipe, Row, average_logarithms, make_generator
 from priors.training.windows import PositionWindows, Window
 
 _JOINTS = CANONICAL.num_joints

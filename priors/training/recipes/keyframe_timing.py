@@ -12,9 +12,9 @@ from mapctl.features import GroundPose
 from mapctl.inbetweening.pose_pairs import TRAVELLING_DISTANCE, PosePairs, sample_pose_pairs
 from mapctl.pose import decode
 from priors.checkpoints import require_at_least
-from priors.keyframe_timing.model import KeyframeTimingConfig, KeyframeTimingNetwork
-from priors.training.corpus import Corpus, Split
-from priors.training.recipe import Export, Gathered, Recipe, Row, Trainer, average_logarithms
+from priors.keyframe_timing import KeyframeTimingConfig, KeyframeTimingNetwork
+from priors.training.data import Corpus, Split
+from priors.training.loop import Export, Gathered, Recipe, Row, Trainer, average_logarithms
 
 _PERCENTILES = (0.1, 0.9)  # between which four of five pairs lie
 

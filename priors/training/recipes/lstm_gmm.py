@@ -35,16 +35,14 @@ from mapctl.problem import density_selection
 from mapctl.protocols import DataLimits, InitialStates
 from mapctl.skeleton import CANONICAL
 from mapctl.terms.trial import Trial
+from priors import stitcher
 from priors.checkpoints import require_at_least
-from priors.lstm_gmm import density, labels
-from priors.lstm_gmm.labels import PACE_LABELS, Labels
+from priors.lstm_gmm import density
+from priors.lstm_gmm.density import PACE_LABELS, Labels
 from priors.lstm_gmm.network import NOISE_UNIT, LstmGmm, LstmGmmConfig, LstmState
-from priors.stitching import inbetweener
-from priors.training.augmentation.clip_copies import ClipCopies, add_copies
-from priors.training.augmentation.splices import Splices, add_splices, drop_splices, hide_splices
-from priors.training.corpus import Corpus, Split, follow_paces, measure_pace_changes
-from priors.training.moment_matching import MatchingSettings, moment_loss, run_free
-from priors.training.recipe import (
+from priors.training.augment import add_copies, add_splices, drop_splices, hide_splices
+from priors.training.data import Corpus, Split, follow_paces, measure_pace_changes
+from priors.training.loop import (
     Export,
     Gathered,
     GradientTrainer,
@@ -57,6 +55,7 @@ from priors.training.recipe import (
     make_generator,
     use_device,
 )
+from priors.training.moment_matching import MatchingSettings, moment_loss, run_free
 from priors.training.windows import FeatureWindows
 
 
@@ -206,8 +205,6 @@ _FALL = 0.3  # share of the steps in which it falls to nothing
 class CriticSettings:
     """When the critic joins, how it learns, and how the density does from then on."""
 
-    steps: int = 0
-    """Last steps of the run, in which it judges free runs; 0 leaves it out."""
     learning_rate: float = 3e-4
     """Of the density in these steps; it falls to nothing over the last three tenths."""
     every: int = 2
@@ -232,7 +229,7 @@ class CriticSettings:
     """Share of the past in the running mean of the density's weights, which is what is kept."""
 
     def __post_init__(self):
-        require_at_least(self, 0, "steps", "head_start")
+        require_at_least(self, 0, "head_start")
         require_at_least(self, 1, "every", "updates", "batch", "history")
         require_at_least(self, 2, "frames")
 
@@ -442,6 +439,7 @@ def compute_feature_statistics(features: Float[Tensor, "frames size"]) -> tuple[
 
 
 _KEEP_GROUP_PROBABILITY = 0.7
+_MOST = 0.3  # change of tempo or stride, beyond which walks are no longer likely
 _LEAST_RUNS = 4  # free runs that are compared: slow ones with slow ones, by quarters
 _UNTOLD = {"critic": 2 * math.log(2), "told": 0.5}  # of a critic that knows nothing
 
@@ -467,8 +465,12 @@ class TrainingSettings:
     A network that knows the level is shown all levels down to none, low ones more often."""
     bit_flips: float = 0.02
     """Share of input contact bits that are flipped."""
-    copies: ClipCopies = field(default_factory=ClipCopies)
-    """Copies of the clips at other tempos and with other strides, for corpora of a few minutes."""
+    copies: int = 0
+    """Copies of each clip at other tempos and with other strides, for corpora of a few minutes."""
+    tempo: float = 0.15
+    """Largest change of a copy's tempo, as a share: 0.15 plays at 0.85 to 1.15 of the speed."""
+    strides: float = 0.1
+    """Largest change of how far a copy's feet and hips go, as a share: as of a body with longer or shorter legs."""
     standing_share: float = 1.0
     """Share of the windows in which nobody goes anywhere that are drawn: where most of the motion stands, a density
     that sees all of them stands fast, and is hard to steer into a walk."""
@@ -476,8 +478,10 @@ class TrainingSettings:
     """Decoupled."""
     matching: MatchingSettings = field(default_factory=MatchingSettings)
     """Free runs held to the data's moments."""
+    critic_steps: int = 0
+    """Last steps of the run, in which a critic judges free runs; 0 leaves it out."""
     critic: CriticSettings = field(default_factory=CriticSettings)
-    """Free runs judged by a critic."""
+    """How that critic learns."""
     untold: float = 0.5
     """Share of the windows without labels; the others show each group (gait, style) with probability 0.7."""
     bfloat16: bool = False
@@ -487,12 +491,16 @@ class TrainingSettings:
 
     def __post_init__(self):
         require_at_least(self, 1, "steps", "batch", "window")
-        if self.critic.steps >= self.steps:
+        require_at_least(self, 0, "copies", "critic_steps")
+        for name, change in (("tempo", self.tempo), ("strides", self.strides)):
+            if not 0 <= change <= _MOST:
+                raise RequestError(f"{name} must lie between 0 and {_MOST}, got {change:g}")
+        if self.critic_steps >= self.steps:
             raise RequestError(
-                f"a critic joins the last steps of a run: {self.critic.steps} of them are not under the {self.steps} of"
+                f"a critic joins the last steps of a run: {self.critic_steps} of them are not under the {self.steps} of"
                 " all"
             )
-        if self.critic.steps and self.window < self.critic.frames:
+        if self.critic_steps and self.window < self.critic.frames:
             raise RequestError(f"the critic sees {self.critic.frames} frames; windows have {self.window}")
         if not 0 < self.standing_share <= 1:
             raise RequestError(f"the share of standing windows must be over 0 and at most 1: {self.standing_share:g}")
@@ -526,7 +534,7 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
         self.judge: FreeRunJudge | None = None
         self.average = self.network
         """Moving average of the weights since the critic joined, the weights themselves without one."""
-        if settings.critic.steps:
+        if settings.critic_steps:
             self.judge = FreeRunJudge(settings.critic, self.windows, seed=settings.seed)
             self.average = copy.deepcopy(self.network).requires_grad_(False)
 
@@ -587,7 +595,7 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
             if self._criticised % settings.critic.every == 0:
                 self._add_free_run_gradients(*self._latest)
             return
-        begin = matching.begin * (self.steps - settings.critic.steps)
+        begin = matching.begin * (self.steps - settings.critic_steps)
         if matching.begin < 1 and self.step >= begin and self.step % matching.every == 0:
             self._add_free_run_gradients(*self._latest)
 
@@ -595,8 +603,8 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
         """Compute that of the current step."""
         settings = self.settings
         if self._joined is not None:
-            return settings.critic.compute_learning_rate(self._criticised, settings.critic.steps)
-        steps = self.steps - settings.critic.steps
+            return settings.critic.compute_learning_rate(self._criticised, settings.critic_steps)
+        steps = self.steps - settings.critic_steps
         warm = min(1.0, (self.step + 1) / 200)
         return warm * settings.learning_rate * 0.5 * (1 + math.cos(math.pi * min(1.0, self.step / steps)))
 
@@ -617,7 +625,7 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
     @property
     def _criticised(self) -> int:
         """Steps since the critic joined; below 0 before."""
-        return self.step - self.steps + self.settings.critic.steps
+        return self.step - self.steps + self.settings.critic_steps
 
     @property
     def _joined(self) -> FreeRunJudge | None:
@@ -735,8 +743,10 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
     settings: TrainingSettings = field(default_factory=TrainingSettings)
     starts: int = 64
     """Moments of mocap that the finished prior carries."""
-    splices: Splices = field(default_factory=Splices)
-    """Splices of the clips, which are trained on as well."""
+    splices: int = 0
+    """Splices of the clips that are tried; those that pass for mocap are trained on as well."""
+    stitcher: str = "stitcher"
+    """Stitcher of the splices: the bundled one, or the file or run folder of a trained one."""
     labels: str = ""
     """Regular expression whose named groups read labels from a clip's path, to condition the density on."""
     label_pace: bool = False
@@ -748,33 +758,35 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
     def __post_init__(self):
         super().__post_init__()
         require_at_least(self, 1, "starts")
+        require_at_least(self, 0, "splices")
         if self.label_pace and "(?P<pace>" in self.labels:
             raise RequestError("the group pace is that of --label-pace; call the one of --labels by another name")
 
     def check(self) -> None:
         """Before anything is read."""
         super().check()
-        if self.splices.count:
-            inbetweener.load(self.splices.stitcher)  # a wrong name shall not be told after all clips were read
+        if self.splices:
+            stitcher.load(self.stitcher)  # a wrong name shall not be told after all clips were read
 
     def gather(self, progress: Progress, warn: Progress) -> Gathered:
         """Read and split the clips, and add their splices to those that are trained on."""
         gathered = super().gather(progress, warn)
-        splices = replace(self.splices, seed=self.settings.seed)
-        parts = replace(gathered.parts, train=add_splices(gathered.parts.train, splices, self.out / "cache"))
-        if splices.count:
-            kept = len(parts.train.names) - len(gathered.parts.train.names)
-            progress(f"{kept} of {splices.count} splices pass for mocap")
+        cache, seed = self.out / "cache", self.settings.seed
+        train = add_splices(gathered.parts.train, self.splices, self.stitcher, cache, seed=seed)
+        if self.splices:
+            progress(f"{len(train.names) - len(gathered.parts.train.names)} of {self.splices} splices pass for mocap")
+        parts = replace(gathered.parts, train=train)
         return Gathered(gathered.corpus, parts)
 
     def make_trainer(self, parts: Split) -> DensityTrainer:
         """Make the trainer of a new network for the clips' labels, or of the initial network with its own labels."""
         with use_device("cpu"):  # copies are made one after the other
             seeded = make_generator(self.settings.seed)
-            copied = add_copies(parts.train.to("cpu"), self.settings.copies, seeded)
+            own = self.settings
+            copied = add_copies(parts.train.to("cpu"), own.copies, seeded, tempo=own.tempo, strides=own.strides)
             followed = follow_paces(copied) if self.label_pace or self.init is not None else None
         corpus = copied.to(torch.get_default_device().type)
-        known = labels.read(hide_splices(corpus.names), self.labels)
+        known = density.read_labels(hide_splices(corpus.names), self.labels)
         followed = None if followed is None else followed.to(corpus.features.device)
         if self.init is None:
             known = known.renamed((*known.names, *PACE_LABELS)) if self.label_pace else known
@@ -807,7 +819,7 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
         """The network with moments to start from, and what the data show to be possible."""
         model, corpus, parts = trainer.average.eval(), gathered.corpus, gathered.parts
         clips, seeded = drop_splices(parts.train), make_generator(self.settings.seed)
-        known = labels.read(clips.names, self.labels)
+        known = density.read_labels(clips.names, self.labels)
         found = select_initial_states(model, clips, count=self.starts, generator=seeded, labels=known.held)
         data = {
             "clips": len(corpus.names),
@@ -837,5 +849,4 @@ class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
 
     def _describe_splices(self) -> dict[str, str]:
         """How many were tried, and by which stitcher; nothing where there are none."""
-        splices = self.splices
-        return {"splices": str(splices.count), "stitcher": splices.stitcher} if splices.count else {}
+        return {"splices": str(self.splices), "stitcher": self.stitcher} if self.splices else {}

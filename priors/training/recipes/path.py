@@ -18,10 +18,10 @@ from mapctl.inbetweening.root_trajectory import (
     compute_displacement_errors,
 )
 from priors.checkpoints import require_at_least
-from priors.training.augmentation.pose_windows import PoseVariation, PoseWindows, Variation, find_kind
-from priors.training.corpus import Corpus
-from priors.training.recipe import GradientTrainer, NetworkRecipe, Row, average_logarithms, make_generator
-from priors.tweening.path import PathConfig, PathNetwork
+from priors.path import PathConfig, PathNetwork
+from priors.training.data import Corpus
+from priors.training.loop import GradientTrainer, NetworkRecipe, Row, average_logarithms, make_generator
+from priors.training.windows import PoseVariation, PoseWindows, Variation, find_kind
 
 _VALIDATED = ("V1", "V8", "V32", "V64", "Y")
 _SHORTEST_WINDOW = 32  # frames

@@ -16,11 +16,10 @@ from mapctl.inbetweening.partial_motion import EFFECTORS, KnownParts, PartialMot
 from mapctl.numerics import gaussian
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors.checkpoints import require_at_least
-from priors.pose_transformer.network import QUANTILES, PoseTransformerConfig, PoseTransformerNetwork, ProposedPoses
-from priors.training.augmentation.corruption import Draws
-from priors.training.augmentation.pose_windows import PoseVariation, PoseWindows, Variation, add_targets
-from priors.training.corpus import Corpus
-from priors.training.recipe import (
+from priors.pose_transformer import QUANTILES, PoseTransformerConfig, PoseTransformerNetwork, ProposedPoses
+from priors.training.augment import Draws
+from priors.training.data import Corpus
+from priors.training.loop import (
     Export,
     Gathered,
     GradientTrainer,
@@ -30,6 +29,7 @@ from priors.training.recipe import (
     make_adam,
     make_generator,
 )
+from priors.training.windows import PoseVariation, PoseWindows, Variation, add_targets
 
 _JOINTS = CANONICAL.num_joints
 _TRUNK = CANONICAL.indices(("spine", "chest", "neck", "head"))

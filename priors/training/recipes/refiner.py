@@ -20,10 +20,10 @@ from priors import checkpoints
 from priors.checkpoints import require_at_least
 from priors.lstm_gmm import density
 from priors.lstm_gmm.density import LstmGmmDensity
-from priors.refiner.network import LstmRefiner, RefinerConfig, RefinerNetwork, compute_end_effectors, count_channels
-from priors.training.corpus import Corpus, Split, find_window_starts
+from priors.refiner import LstmRefiner, RefinerConfig, RefinerNetwork, compute_end_effectors, count_channels
+from priors.training.data import Corpus, Split, find_window_starts
+from priors.training.loop import Export, Gathered, HistoryBuffer, Recipe, Row, Trainer, draw_weights
 from priors.training.moment_matching import MatchingSettings, moment_loss
-from priors.training.recipe import Export, Gathered, HistoryBuffer, Recipe, Row, Trainer, draw_weights
 from priors.training.windows import FeatureWindows
 
 _MIN_MOMENT_FRAMES = 8  # frames of a window that moments can be had of

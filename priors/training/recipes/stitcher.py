@@ -22,7 +22,7 @@ from mapctl.kinematics.fast import place_joints
 from mapctl.pose import BodyPose
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors.checkpoints import require_at_least
-from priors.stitching.network import (
+from priors.stitcher import (
     PACE,
     POSE,
     SEEN_FUTURE,
@@ -40,9 +40,8 @@ from priors.stitching.network import (
     multiply_in_bfloat16,
     walk_sides,
 )
-from priors.training.augmentation.pose_windows import WindowPicker
-from priors.training.corpus import Corpus, Split
-from priors.training.recipe import (
+from priors.training.data import Corpus, Split
+from priors.training.loop import (
     Export,
     Gathered,
     GradientTrainer,
@@ -51,6 +50,7 @@ from priors.training.recipe import (
     average_logarithms,
     make_generator,
 )
+from priors.training.windows import WindowPicker
 
 
 class Known(NamedTuple):

@@ -26,8 +26,8 @@ from priors.checkpoints import NetworkConfig
 
 _NON_ROOT_JOINTS = CANONICAL.num_joints - 1
 _ANGLE_CHANNELS = 2 + 3 * _NON_ROOT_JOINTS  # tilt and rotation vectors
-_INPUT_CHANNELS = 2 * _ANGLE_CHANNELS + 2 + 1 + 6 + 3 + 2 * (CANONICAL.num_joints + 1)
 _WORLD_CHANNELS = 2 * (6 + 3) * CANONICAL.num_joints  # world rotations and places, observed and smoothed
+_INPUT_CHANNELS = 2 * _ANGLE_CHANNELS + 2 + 1 + 6 + 3 + 2 * (CANONICAL.num_joints + 1) + _WORLD_CHANNELS
 _OUTPUT_BLOCKS = (_ANGLE_CHANNELS, 1, 3, 2)  # angles, turn, place beside the slow one, contacts
 
 _SMOOTHING_SIGMA, _REFERENCE_SIGMA = 2.0, 6.0  # frames, sigma: of the proposal's start, and of the frame of reference
@@ -44,7 +44,7 @@ _CHUNK_FRAMES, _MARGIN_FRAMES = 512, 64  # frames cleaned at once, and beside th
 class DenoiserConfig(NetworkConfig):
     """Shape of the network."""
 
-    FIXED: ClassVar = {"plain": False}
+    FIXED: ClassVar = {"plain": False, "sees_world": True}
 
     width: int = 192
     """Channels of the hidden layers."""
@@ -52,9 +52,6 @@ class DenoiserConfig(NetworkConfig):
     """Frames that one convolution sees."""
     dilations: tuple[int, ...] = (1, 2, 4, 8, 1, 2, 4, 8)
     """Dilation of each residual block, frames."""
-    sees_world: bool = True
-    """Whether joints' world rotations and places are inputs beside their angles: noise of places, which makes a joint's
-    angles err against its parent's, is independent there, and feet that slide can be seen."""
 
     def __post_init__(self):
         if self.width < 1 or self.kernel < 1 or self.kernel % 2 == 0 or min(self.dilations, default=0) < 1:
@@ -68,8 +65,7 @@ class DenoiserNetwork(nn.Module):
         """Compute convolutions in bfloat16 if so asked; what they are given and give back is not."""
         super().__init__()
         self.config, self.reduced_precision = config, bfloat16
-        channels = _INPUT_CHANNELS + (_WORLD_CHANNELS if config.sees_world else 0)
-        self.first = nn.Conv1d(channels, config.width, config.kernel, padding=config.kernel // 2)
+        self.first = nn.Conv1d(_INPUT_CHANNELS, config.width, config.kernel, padding=config.kernel // 2)
         self.blocks = nn.ModuleList(
             _ResidualBlock(config.width, config.kernel, dilation) for dilation in config.dilations
         )
@@ -83,7 +79,7 @@ class DenoiserNetwork(nn.Module):
     def forward(self, capture: Capture) -> CaptureProposal:
         """Propose a motion, frames that were not observed at all included."""
         view = _CaptureView(capture)
-        inputs = view.inputs(sees_world=self.config.sees_world)
+        inputs = view.inputs()
         with torch.autocast(inputs.device.type, torch.bfloat16, enabled=self.reduced_precision):
             hidden = self._convolve(inputs)
             change, spread = self.last(hidden).to(inputs.dtype), self.spread(hidden.detach()).to(inputs.dtype)
@@ -138,7 +134,7 @@ class _CaptureView:
         self.turn = (capture.heading - self.slow_heading)[..., None]
         self.off = rotations.rotate_about_y(root - self.slow_root, -self.slow_heading)
 
-    def inputs(self, *, sees_world: bool) -> Float[Tensor, "batch frames inputs"]:
+    def inputs(self) -> Float[Tensor, "batch frames inputs"]:
         """Encode the capture, and the same smoothed, in units of about one."""
         rate, *way = self._slow_way()
         return torch.cat(
@@ -152,7 +148,7 @@ class _CaptureView:
                 _smooth(self.off, _SMOOTHING_SIGMA) / POSITION_UNIT,
                 *way,
                 *self._certainty(),
-                *(self._world() if sees_world else ()),
+                *self._world(),
             ],
             dim=-1,
         )
@@ -172,7 +168,8 @@ class _CaptureView:
         return [known.to(self.angles), level[:, None].expand(-1, capture.frames, -1)]
 
     def _world(self) -> list[Float[Tensor, "batch frames inputs"]]:
-        """Encode the world rotations and places of all joints in the slow frame of the hips."""
+        """Encode the world rotations and places of all joints in the slow frame of the hips: noise of places, which
+        makes a joint's angles err against its parent's, is independent there, and feet that slide can be seen."""
         x, z = self.angles[..., :2].unbind(dim=-1)
         tilt = rotations.rotation_vector_to_matrix(torch.stack([x, torch.zeros_like(x), z], dim=-1))
         hips = rotations.to_matrix(rotations.about_y(self.turn[..., 0])) @ tilt
@@ -247,8 +244,5 @@ class ConvDenoiser(checkpoints.LoadedModel):
 def load(name: str) -> ConvDenoiser:
     """Load the bundled denoiser by name, or one by its file or run folder; CheckpointError if there is none."""
     with checkpoints.open_checkpoint(name, "denoiser") as (tensors, card):
-        # Older cards do not tell what was not there yet; what is left out takes its default.
-        network = checkpoints.build_network(
-            DenoiserNetwork, DenoiserConfig.of_card({"sees_world": False} | card.config), tensors
-        )
+        network = checkpoints.build_network(DenoiserNetwork, DenoiserConfig.of_card(card.config), tensors)
     return ConvDenoiser(name, network, card)

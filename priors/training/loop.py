@@ -1,42 +1,41 @@
-"""What a training run needs: data and settings. A model's own recipe says what is trained, measured and written.
+"""The training loop of every model: steps, validations, early stopping, checkpoints, and at the end weights and card.
 
-A network and how it takes one step of training.
+A model's recipe says what it is trained on, and its trainer takes the steps. A run folder holds
+`checkpoint.safetensors`, from which training resumes, `losses.csv` and `tensorboard/`, the features of the clips in
+`cache/`, and at the end `model.safetensors` with its card, `model.json`.
 
-Where training computes: on processors, or on a GPU with CUDA.
-
-Inside `use_device` that is torch's default device, so that windows, networks and random numbers are made there.
+Inside `use_device` a GPU is torch's default device, so that windows, networks and random numbers are made there.
 """
 
+import csv
+import io
+import json
 import math
 import os
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
+from datetime import timedelta
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
 
 import torch
 from jaxtyping import Float
+from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
 from mapctl.errors import CheckpointError, MapctlError, RequestError
 from mapctl.features import PRIOR_FPS
-from mapctl.formats.atomic import write_text
+from mapctl.formats.atomic import check_folder, write_text
+from mapctl.formats.text import one_line
 from priors import checkpoints
-from priors.checkpoints import NetworkConfig, require_at_least
+from priors.checkpoints import NetworkConfig, require_at_least, write_tensors
 from priors.licences import OF_DATA
-from priors.training.corpus import Corpus, Split, read_corpus, split_corpus
+from priors.training.data import Corpus, Split, read_corpus, split_corpus
 from priors.weight_sets import name_for_records
-
-
-def select_device(wanted: str) -> str:
-    """Return the device of `auto`, `cpu` or `cuda`; RequestError where this machine has none."""
-    if wanted not in ("auto", "cpu", "cuda"):
-        raise RequestError(f"device must be auto, cpu or cuda, got {wanted!r}")
-    if wanted == "cuda" and not torch.cuda.is_available():
-        raise RequestError("this machine has no CUDA device; use --device cpu")
-    return ("cuda" if torch.cuda.is_available() else "cpu") if wanted == "auto" else wanted
 
 
 @contextmanager
@@ -309,14 +308,12 @@ class Recipe(ABC, Generic[C, S, T]):
     """How it is trained."""
     match: str | None = None
     """Regular expression that a file's path below `data` must contain."""
-    skip_first: bool = False
-    """Drop frame 0 of every clip (the T-pose of CMU takes)."""
     cuts: Path | None = None
     """Table of the frames of each file that are motion; those named `Frame_Cuts.csv` in the folder are found."""
     level: bool = False
     """Put every clip on the canonical body and a level floor."""
-    licence: str = OF_DATA
-    """Licence of the weights, for the card, one line."""
+    licence: str | None = None
+    """Licence of the weights, for the card; that of the data if None, and of the weights that training began with."""
     resume: bool = False
     """Continue from the run folder's last checkpoint."""
     patience: int = 0
@@ -353,9 +350,14 @@ class Recipe(ABC, Generic[C, S, T]):
 
     def find_device(self) -> str:
         """Return `cpu` or `cuda`; RequestError for one that this machine or model cannot have."""
-        if not self.uses_gpu and self.device == "cuda":
+        if self.device not in ("auto", "cpu", "cuda"):
+            raise RequestError(f"device must be auto, cpu or cuda, got {self.device!r}")
+        if self.device == "cuda" and not self.uses_gpu:
             raise RequestError(f"a {self.kind} is not trained on GPUs; use --device cpu")
-        return select_device(self.device) if self.uses_gpu else "cpu"
+        there = self.uses_gpu and torch.cuda.is_available()
+        if self.device == "cuda" and not there:
+            raise RequestError("this machine has no CUDA device; use --device cpu")
+        return "cuda" if there and self.device != "cpu" else "cpu"
 
     @property
     def split_seed(self) -> int:
@@ -379,15 +381,8 @@ class Recipe(ABC, Generic[C, S, T]):
             if done % 200 == 0 or done == total:
                 progress(f"read {done} of {total} clips")
 
-        cache, cuts = self.out / "cache", self.cuts
         corpus = read_corpus(
-            self.data,
-            match=self.chosen,
-            cache=cache,
-            skip_first=self.skip_first,
-            cuts=cuts,
-            level=self.level,
-            progress=report,
+            self.data, match=self.chosen, cache=self.out / "cache", cuts=self.cuts, level=self.level, progress=report
         )
         if corpus.skipped:
             reasons = [f"{self.data / file.name}: {file.reason}" for file in corpus.skipped]
@@ -420,6 +415,11 @@ class Recipe(ABC, Generic[C, S, T]):
         """Describe the model that training began with, and its licence, for a card's data; nothing without one."""
         init = getattr(self, "init", None)
         return {} if init is None else {"init": {"name": name_for_records(init), "licence": _read_card(init).licence}}
+
+    def find_licence(self) -> str:
+        """Return the licence of the weights, for the card."""
+        init = self.describe_origin().get("init")
+        return self.licence or (OF_DATA if init is None else f"{OF_DATA}; {init['licence']}")
 
     def describe_data(self, gathered: Gathered) -> Row:
         """Describe what training saw, for a card."""
@@ -457,6 +457,11 @@ class NetworkRecipe(Recipe[C, S, G]):
     init_share: float = 0.0
     """Share of those weights in the ones that are written: the mean of both is often better on familiar and on
     unfamiliar data than either (Wortsman et al. 2022)."""
+
+    def __post_init__(self):
+        super().__post_init__()
+        if not 0 <= self.init_share < 1 or (self.init_share and self.init is None):
+            raise RequestError(f"init_share must be from 0 to below 1, and needs init; got {self.init_share:g}")
 
     def draw_trainer(self, parts: Split) -> G:
         """Make the trainer with drawn weights."""
@@ -499,3 +504,239 @@ def average_logarithms(values: Iterable[float | None]) -> float:
 
 def _read_card(name: str) -> checkpoints.Card:
     return checkpoints.read_card(checkpoints.locate(name).with_suffix(".json"))
+
+
+CHECKPOINT, LOSSES, EVENTS = "checkpoint.safetensors", "losses.csv", "tensorboard"
+"""Files and folder of a run folder."""
+TRAINING, VALIDATION = "training", "validation"
+"""What the column `part` of LOSSES holds: mean losses since the last report, or measures of held-out clips."""
+_FIRST_LINE_SECONDS, _LINE_SECONDS = 5.0, 30.0  # to the first line on the losses, and from line to line
+
+
+def train(recipe: Recipe[Any, Any, Any], progress: Progress = ignore_line, *, warn: Progress = ignore_line) -> Path:
+    """Train to the end of the recipe, or until validation no longer improves, and write RUN/model.safetensors; return
+    its path. `progress` gets lines on losses and validations, `warn` one on files that cannot be used.
+
+    MapctlError where training diverges; the last checkpoint then stays as it was.
+    """
+    recipe.check()
+    check_folder(recipe.out)
+    present = (recipe.out / CHECKPOINT).exists()
+    if recipe.resume and not present:
+        raise CheckpointError(f"{recipe.out} holds no checkpoint to resume from")
+    if present and not recipe.resume:
+        raise RequestError(f"{recipe.out} already holds a run; pass --resume to continue it, or choose another folder")
+    gathered = recipe.gather(progress, warn)
+    with use_device(recipe.find_device()):
+        run = TrainingRun(recipe, gathered, progress)
+        run.go()
+        return run.export()
+
+
+class TrainingRun(Generic[C, S, T]):
+    """A trainer, its curve of validations and its checkpoints."""
+
+    def __init__(self, recipe: Recipe[C, S, T], gathered: Gathered, progress: Progress = ignore_line):
+        self.recipe, self.gathered, self.progress = recipe, gathered, progress
+        self.parts = gathered.parts.to(torch.get_default_device().type)
+        self.trainer = recipe.make_trainer(self.parts)
+        self.identity = json.loads(json.dumps(recipe.describe_run(self.trainer, gathered.corpus)))
+        self.curve: list[Row] = []
+        self.losses: list[Row] = []  # since the last report
+        self.keeps_best = recipe.keeps_best or recipe.patience > 0
+        self.best = _copy_weights(self.trainer.exported) if self.keeps_best else {}
+        self.stop_reason: str | None = None
+        if recipe.resume:
+            self._load()
+            progress(f"resumed at step {self.trainer.step}")
+        self.log = Log(recipe.out, self.trainer.step)
+        self.began, self.first_step = time.monotonic(), self.trainer.step
+        self.due = self.began + _FIRST_LINE_SECONDS
+
+    def go(self) -> None:
+        """Train to the end of the run; see `train`."""
+        saved = self.began
+        while True:
+            if self._validation_due():
+                self.validate()
+            ended = self.stop_reason is not None or self.trainer.step >= self.trainer.steps
+            overdue = time.monotonic() - saved > 60 * self.recipe.checkpoint_minutes
+            if self.trainer.step and (ended or overdue):
+                self.save()
+                saved = time.monotonic()
+            if ended:
+                break
+            self.step()
+        self.log.close()
+
+    def step(self) -> None:
+        """Take one step, and report on the last ones where it is time."""
+        recipe, trainer = self.recipe, self.trainer
+        self.losses.append(trainer.train_step())
+        last = trainer.step >= trainer.steps
+        if last or time.monotonic() >= self.due:
+            self.due = time.monotonic() + _LINE_SECONDS
+            self.progress(self._format_progress())
+        if (reason := recipe.find_stop_reason(trainer, self.losses)) is not None:
+            self._stop(reason)
+        if last or trainer.step % recipe.report_steps == 0:
+            self.log.write(trainer.step, TRAINING, _average(self.losses))
+            self.losses = []
+
+    def validate(self) -> None:
+        """Measure the weights as they are, and stop where `patience` validations have brought nothing better."""
+        recipe, trainer = self.recipe, self.trainer
+        if not self.keeps_best:
+            trainer.check_finite()
+        measured = trainer.validate(self.parts.validation)
+        row = {name: value if math.isfinite(value) else None for name, value in measured.items()}
+        scores = [recipe.score(each) for each in [*self.curve, row]]
+        scores = [math.inf if math.isnan(score) else score for score in scores]
+        if self.keeps_best and all(scores[-1] < before for before in scores[:-1]):
+            self.best = _copy_weights(trainer.exported)
+        self.curve.append({"step": trainer.step, **row})
+        self.log.write(trainer.step, VALIDATION, row)
+        measures = ", ".join(f"{name} {'-' if value is None else f'{value:.4g}'}" for name, value in row.items())
+        self.progress(f"validation at step {trainer.step}: {measures}")
+        if recipe.patience and len(scores) - 1 - scores.index(min(scores)) >= recipe.patience:
+            self._stop(f"no better in {recipe.patience} validations")
+
+    def save(self) -> None:
+        """Write a checkpoint, unless training was stopped, since what is resumed comes to the same end; MapctlError
+        where the weights are not finite."""
+        if self.stop_reason is not None:
+            return
+        if not self.keeps_best:
+            self.trainer.check_finite()
+        index = {"step": self.trainer.step, "identity": self.identity, "curve": self.curve}
+        tensors = self.trainer.state() | {f"best.{name}": value for name, value in self.best.items()}
+        write_tensors(self.recipe.out / CHECKPOINT, tensors, metadata={"run": json.dumps(index)})
+
+    def export(self) -> Path:
+        """Write the model with its card."""
+        recipe, path = self.recipe, self.recipe.out / "model.safetensors"
+        if self.keeps_best:
+            self.trainer.exported.load_state_dict(self.best)
+        for network in self.trainer.networks().values():
+            network.to("cpu")
+        recipe.finish(self.trainer)
+        exported = recipe.export(self.trainer, self.gathered, self.curve)
+        ended = {} if self.stop_reason is None else {"ended": f"step {self.trainer.step}: {self.stop_reason}"}
+        card = checkpoints.Card(
+            kind=recipe.kind,
+            config=recipe.find_shape(self.trainer).as_card(),
+            licence=recipe.find_licence(),
+            data={**exported.data, **recipe.describe_origin(), "trained_on": self.gathered.describe_training()},
+            training={"settings": asdict(recipe.settings), "curve": self.curve, **ended},
+            quality=exported.quality,
+            abilities=exported.abilities,
+            **checkpoints.Card.layout_fields(),
+        )
+        checkpoints.save(dict(exported.tensors), card, path, half=exported.half)
+        return path
+
+    def _stop(self, reason: str) -> None:
+        self.stop_reason = reason
+        self.progress(f"{reason}: training ends with the best weights so far")
+
+    def _format_progress(self) -> str:
+        """Format the mean losses since the last report, the rate and the time left."""
+        step, steps = self.trainer.step, self.trainer.steps
+        rate = (step - self.first_step) / max(1e-9, time.monotonic() - self.began)
+        losses = ", ".join(f"{name} {value:.3f}" for name, value in _average(self.losses).items())
+        left = timedelta(seconds=round((steps - step) / rate))
+        return f"step {step}/{steps}: {losses}, {rate:.3g} steps/s, {left} left"
+
+    def _validation_due(self) -> bool:
+        """Whether the weights have still to be measured: every so many steps and at the end, and, where a recipe keeps
+        the best, before the first step."""
+        if self.recipe.keeps_best and not self.curve:
+            return True
+        step, measured = self.trainer.step, self.curve[-1]["step"] if self.curve else 0
+        due = step >= self.trainer.steps or step % self.recipe.validate_steps == 0
+        return due and step > measured and self.stop_reason is None
+
+    def _load(self) -> None:
+        with _explain_unreadable(self.recipe.out):
+            index, tensors = _read_checkpoint(self.recipe.out)
+            for part, now in self.identity.items():
+                then = index["identity"][part]
+                changed = [f"{key}: {then.get(key)} then, {now[key]} now" for key in now if then.get(key) != now[key]]
+                if changed:
+                    raise CheckpointError(
+                        f"{self.recipe.out}: the run was begun with other {part} ({'; '.join(changed)})"
+                    )
+            self.curve = [{**row, "step": int(row["step"])} for row in index["curve"]]
+            self.trainer.load_state(tensors, int(index["step"]))
+            if self.keeps_best:  # a run that was begun without patience kept none
+                self.best = select_prefixed("best.", tensors) or _copy_weights(self.trainer.exported)
+        if self.trainer.step > self.trainer.steps:
+            done, wanted = self.trainer.step, self.trainer.steps
+            raise RequestError(f"{self.recipe.out}: {done} steps are done; --steps must be at least that, got {wanted}")
+
+
+class Log:
+    """Mean losses and measures of held-out clips, as RUN/losses.csv and, where it is installed, for TensorBoard."""
+
+    def __init__(self, run: Path, step: int):
+        """Rows beyond `step`, at which the run goes on, are dropped: they come again."""
+        self._path, self._rows, self._events = run / LOSSES, [], None
+        if step and self._path.exists():
+            with self._path.open(encoding="utf-8", newline="") as file:
+                rows = [{name: cell for name, cell in row.items() if cell} for row in csv.DictReader(file)]
+            self._rows = [row for row in rows if int(row["step"]) <= step]
+        if find_spec("tensorboard") is not None:
+            from torch.utils.tensorboard.writer import SummaryWriter  # an optional extra, slow to import
+
+            self._events = SummaryWriter(str(run / EVENTS), purge_step=step + 1 if step else None)
+
+    def write(self, step: int, part: str, values: Mapping[str, Any]) -> None:
+        """Add a row; values that are not finite numbers are left out."""
+        finite = {name: v for name, v in values.items() if isinstance(v, int | float) and math.isfinite(v)}
+        self._rows.append({"step": str(step), "part": part, **{name: f"{v:.9g}" for name, v in finite.items()}})
+        text = io.StringIO()
+        columns = dict.fromkeys(name for row in self._rows for name in row)
+        table = csv.DictWriter(text, list(columns), lineterminator="\n")
+        table.writeheader()
+        table.writerows(self._rows)
+        write_text(self._path, text.getvalue())
+        if self._events is not None:
+            for name, value in finite.items():
+                self._events.add_scalar(f"{part}/{name}", value, step)
+            self._events.flush()
+
+    def close(self) -> None:
+        """Close the event files."""
+        if self._events is not None:
+            self._events.close()
+
+
+def _average(rows: Sequence[Row]) -> Row:
+    """Mean of each loss over the rows that have it."""
+    names = dict.fromkeys(name for row in rows for name in row)
+    found = {name: [row[name] for row in rows if name in row] for name in names}
+    return {name: sum(values) / len(values) for name, values in found.items()}
+
+
+def read_index(run: Path) -> dict[str, Any]:
+    """Read what the checkpoint of a run folder holds beside its tensors; CheckpointError where there is none."""
+    with _explain_unreadable(run):
+        return _read_checkpoint(run)[0]
+
+
+def _read_checkpoint(run: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    with safe_open(run / CHECKPOINT, framework="pt") as file:
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        return json.loads(file.metadata()["run"]), tensors
+
+
+@contextmanager
+def _explain_unreadable(run: Path) -> Iterator[None]:
+    try:
+        yield
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RuntimeError, SafetensorError) as error:
+        raise CheckpointError(f"{run}: no readable checkpoint ({type(error).__name__}: {one_line(error)})") from error
+
+
+def _copy_weights(network: nn.Module) -> dict[str, Tensor]:
+    return {name: value.clone() for name, value in network.state_dict().items()}
