@@ -54,7 +54,7 @@ def test_command_writes_the_zip(tmp_path, capsys):
 
 
 def test_rotations_are_scipys(source):
-    rotations = source("rotations")
+    rotations = source("exchange")
     turns = Rotation.random(500, rng=0)
     half = Rotation.from_rotvec(np.pi * np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [0.6, 0.8, 0], [0, 0, 0]]))
     turns = Rotation.concatenate([turns, half])
@@ -65,7 +65,7 @@ def test_rotations_are_scipys(source):
 
 
 def test_axes_do_not_turn_over(source):
-    rotations = source("rotations")
+    rotations = source("exchange")
     angles = 1.2 * np.sin(np.linspace(0.1, 12, 80))[:, None] * [0.6, 0, 0.8]
     turns = Rotation.from_rotvec(angles)
     quats = rotations.join_signs(np.roll(rotations.to_quaternions(turns.as_matrix()), 1, axis=-1))
@@ -124,7 +124,7 @@ def test_mapctl_is_found_by_path_by_preference_and_by_python(source, tmp_path, m
     found = tmp_path / "bin"
     found.mkdir()
     monkeypatch.setenv("PATH", str(found))
-    with pytest.raises(source("problem").AddonError, match="was not found: pip install mapctl"):
+    with pytest.raises(source("process").AddonError, match="was not found: pip install mapctl"):
         process.find_command("")
     (found / "python3").write_text('#!/bin/sh\n[ "$1 $2 $3" = "-m mapctl --version" ] && echo mapctl 0.1.0\n')
     (found / "python3").chmod(0o755)
@@ -135,5 +135,5 @@ def test_mapctl_is_found_by_path_by_preference_and_by_python(source, tmp_path, m
 
 @pytest.mark.parametrize(("said", "told"), [("mapctl 0.0.12", "too old"), ("other 1.0", "does not answer like mapctl")])
 def test_other_programs_are_refused(source, tmp_path, said, told):
-    with pytest.raises(source("problem").AddonError, match=told):
+    with pytest.raises(source("process").AddonError, match=told):
         source("process").find_command(write_program(tmp_path, f"print('{said}')"))

@@ -187,7 +187,7 @@ def test_without_opengl_there_are_stick_figures_and_one_line_says_so(monkeypatch
     def missing():
         raise renderers.NoGraphicsError("no OpenGL without a window (libEGL.so.1 not found)")
 
-    monkeypatch.setattr(offscreen, "_open_graphics", missing)
+    monkeypatch.setattr(renderers, "_open_graphics", missing)
     monkeypatch.delenv(renderers.RENDERER_VARIABLE, raising=False)
     with caplog.at_level(logging.WARNING, logger="mapctl.scenes"):
         brush = select_painter()

@@ -6,16 +6,16 @@ library; mapctl itself runs as a process of its own.
 
 import bpy
 
-from . import operators, panel, settings
+from . import interface
 
-_CLASSES = (*settings.CLASSES, *operators.OPERATORS, panel.MAPCTL_PT_sidebar)
+_CLASSES = (*interface.CLASSES, *interface.OPERATORS, interface.MAPCTL_PT_sidebar)
 
 
 def register() -> None:
     """Add all classes, and the options that scenes keep."""
     for each in _CLASSES:
         bpy.utils.register_class(each)
-    bpy.types.Scene.mapctl = bpy.props.PointerProperty(type=settings.MAPCTL_PG_settings)
+    bpy.types.Scene.mapctl = bpy.props.PointerProperty(type=interface.MAPCTL_PG_settings)
 
 
 def unregister() -> None:

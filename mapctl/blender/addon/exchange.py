@@ -1,4 +1,7 @@
-"""Motions in mapctl's .npz files (docs/guides/formats.md): written and read with numpy alone."""
+"""Motions in mapctl's .npz files (docs/guides/formats.md), and rotations, with numpy alone.
+
+The add-on runs in Blender's own Python and cannot import mapctl.
+"""
 
 from dataclasses import dataclass
 from fractions import Fraction
@@ -6,8 +9,73 @@ from pathlib import Path
 
 import numpy as np
 
-from .problem import AddonError
-from .rotations import to_matrices, to_quaternions, transpose
+from .process import AddonError
+
+_NO_ANGLE = 1e-6  # sine of half an angle below which its axis is rounding
+
+
+def to_matrices(quat_xyzw: np.ndarray) -> np.ndarray:
+    """Convert unit quaternions (..., 4), the real part last, to rotation matrices (..., 3, 3)."""
+    x, y, z, w = np.moveaxis(quat_xyzw, -1, 0)
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
+        (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
+        (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
+    )
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def to_quaternions(matrices: np.ndarray) -> np.ndarray:
+    """Convert rotation matrices (..., 3, 3) to unit quaternions (..., 4), the real part last and not negative.
+
+    Of the four squares the largest is taken, so that no division is by a small number (Shepperd, 1978).
+    """
+    m = np.moveaxis(matrices, (-2, -1), (0, 1))
+    outer = np.empty((*matrices.shape[:-2], 4, 4))  # four times the products of x, y, z, w
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        outer[..., i, i] = 1 + m[i, i] - m[j, j] - m[k, k]
+        outer[..., i, j] = outer[..., j, i] = m[i, j] + m[j, i]
+        outer[..., i, 3] = outer[..., 3, i] = m[k, j] - m[j, k]
+    outer[..., 3, 3] = 1 + m[0, 0] + m[1, 1] + m[2, 2]
+    largest = np.argmax(np.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
+    rows = np.take_along_axis(outer, largest[..., None, None], axis=-2)[..., 0, :]
+    rows = rows / np.linalg.norm(rows, axis=-1, keepdims=True)
+    return np.where(rows[..., 3:] < 0, -rows, rows)
+
+
+def orthonormalise(matrices: np.ndarray) -> np.ndarray:
+    """Take the nearest rotations (..., 3, 3) of matrices that may scale, stretch or mirror as well."""
+    left, _, right = np.linalg.svd(matrices)
+    left[..., :, 2] *= np.sign(np.linalg.det(left @ right))[..., None]
+    return left @ right
+
+
+def join_signs(quaternions: np.ndarray) -> np.ndarray:
+    """Turn signs of quaternions (frames, 4) so that each is nearest to the one before it."""
+    dots = np.einsum("ij,ij->i", quaternions[1:], quaternions[:-1])
+    signs = np.cumprod(np.r_[1.0, np.where(dots < 0, -1.0, 1.0)])
+    return quaternions * signs[:, None]
+
+
+def to_axis_angles(quat_wxyz: np.ndarray) -> np.ndarray:
+    """Convert quaternions (frames, 4) with joined signs, the real part first, to angles and unit axes (frames, 4). An
+    axis never turns over from one frame to the next, the angle goes through 0 instead; without an angle it stays."""
+    sine = np.linalg.norm(quat_wxyz[:, 1:], axis=-1)
+    known = sine > _NO_ANGLE
+    if not known.any():
+        return np.tile([0.0, 0.0, 1.0, 0.0], (len(sine), 1))
+    last = np.maximum.accumulate(np.where(known, np.arange(len(sine)), known.argmax()))
+    axes = quat_wxyz[last, 1:] / sine[last, None]
+    signs = np.cumprod(np.r_[1.0, np.where(np.einsum("ij,ij->i", axes[1:], axes[:-1]) < 0, -1.0, 1.0)])
+    along = np.einsum("ij,ij->i", quat_wxyz[:, 1:], signs[:, None] * axes)
+    angles = np.unwrap(2 * np.arctan2(along, quat_wxyz[:, 0]), period=4 * np.pi)
+    return np.concatenate([angles[:, None], signs[:, None] * axes], axis=-1)
+
+
+def transpose(matrices: np.ndarray) -> np.ndarray:
+    """Exchange the last two axes: the inverses of rotations."""
+    return np.swapaxes(matrices, -1, -2)
+
 
 FORMAT = "mapctl-motion-1"
 """Name and version of the set of keys."""

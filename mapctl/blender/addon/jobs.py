@@ -1,23 +1,203 @@
 """The four jobs, step by step: they read the scene, run mapctl, and make a new action of what it wrote."""
 
 import tempfile
-from collections.abc import Generator, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Generator, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import bpy
 import numpy as np
 
-from . import exchange
+from . import actions, exchange, rigify
+from .body import (
+    Y_UP,
+    Body,
+    Keys,
+    list_channels,
+    measure_fps,
+    place_joints,
+    pose_bones,
+    read_poses,
+    sample_motion,
+    sample_worlds,
+    solve_controls,
+    take_bones,
+    take_rest,
+    to_armature,
+)
 from .exchange import WorldMotion
-from .problem import AddonError, Step
-from .process import run_command
-from .scene import actions, rigify
-from .scene.body import Body, take_bones
-from .scene.drawn_curve import measure_height, sample_curve, write_curve
-from .scene.making import Result, Scene, make_action, restored_scene
-from .scene.sampling import measure_fps, sample_motion, sample_worlds, take_rest, to_armature
+from .process import AddonError, Step, run_command
+
+_LEVEL = 0.05  # metres that a level curve may rise and fall
+
+
+def sample_curve(drawn: bpy.types.Object, scene: bpy.types.Scene) -> np.ndarray:
+    """Sample a curve in the world at its own resolution, without bevel, extrusion and modifiers: (points, 3) in metres,
+    Y up, the first point again at the end of a cyclic one. AddonError for curves that are not one line."""
+    splines = drawn.data.splines
+    if len(splines) != 1:
+        raise AddonError(f"{drawn.name} has {len(splines)} splines; a character follows a curve of one")
+    plain = drawn.data.copy()
+    holder = bpy.data.objects.new(drawn.name, plain)
+    try:
+        plain.bevel_depth = plain.extrude = plain.offset = 0.0
+        plain.bevel_object = plain.taper_object = None
+        plain.use_fill_caps = False
+        if plain.dimensions == "2D":
+            plain.fill_mode = "NONE"
+        local = np.array([vertex.co for vertex in holder.to_mesh().vertices], dtype=np.float64).reshape(-1, 3)
+        holder.to_mesh_clear()
+    finally:
+        bpy.data.objects.remove(holder)
+        bpy.data.curves.remove(plain)
+    if len(local) < 2:
+        raise AddonError(f"{drawn.name} has no length")
+    matrix = np.array(drawn.matrix_world, dtype=np.float64)
+    world = (local @ matrix[:3, :3].T + matrix[:3, 3]) @ Y_UP.T * scene.unit_settings.scale_length
+    return np.concatenate([world, world[:1]]) if splines[0].use_cyclic_u else world
+
+
+def measure_height(points: np.ndarray) -> tuple[float, bool]:
+    """Measure how high the curve is, metres, and whether it is level."""
+    heights = points[:, 1]
+    return float(np.median(heights)), bool(np.ptp(heights) <= _LEVEL)
+
+
+_PROBES = 24  # frames in which the result is compared with what was wanted
+_OFF = 0.001  # metres from which on bones that do not follow are told
+_NEEDLESS = ("hips", "chest", "spine_fk.001")  # controls of a generated rig that a new action leaves alone
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What a job works on."""
+
+    scene: bpy.types.Scene
+    """The scene, whose frame rate and frames count."""
+    armature: bpy.types.Object
+    """The character."""
+    command: tuple[str, ...]
+    """Words that start mapctl."""
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """A motion that an action is to be made of."""
+
+    body: Body
+    """The character's joints."""
+    frames: range
+    """Frames of the scene."""
+    moved: np.ndarray
+    """What moves the joints from their rest in the armature's space, (frames, joints, 4, 4)."""
+    travelling: frozenset[int]
+    """Joints that travel within their parent."""
+    made: np.ndarray
+    """Which frames have generated keys, (frames,)."""
+    name: str
+    """Name of the new action."""
+    fresh: bool
+    """Whether the action is empty at first, not a copy of the one before."""
+
+
+def make_action(at: Scene, result: Result) -> Generator[Step, None, tuple[str, ...]]:
+    """Make an action of a result; the one before is kept by a fake user. Ended early it leaves no trace."""
+    with _restored_pose(at, result.body.switches):
+        if result.fresh:
+            actions.add_action(at.armature, result.name)
+        else:
+            actions.copy_action(at.armature, result.name)
+        keys = yield from _find_keys(at, result)
+        for channel in list_channels(at.armature, keys):
+            actions.write_channel(at.armature, channel, result.frames, result.made)
+        _reset_unkeyed(at.armature, keys)
+        return (yield from _compare(at, result))
+
+
+def _find_keys(at: Scene, result: Result) -> Generator[Step, None, list[Keys]]:
+    """Find what bones or controls are keyed with, and take their keys of before out of the action."""
+    body = result.body
+    if not body.controls:
+        actions.clear_bones(at.armature, body.bones)
+        return pose_bones(at.armature, body, result.moved, result.travelling)
+    actions.clear_bones(at.armature, [control.bone for control in body.controls])
+    for bone, name in body.switches.items():
+        path = f'pose.bones["{bpy.utils.escape_identifier(bone)}"]["{name}"]'
+        actions.set_constant(at.armature, path, 1.0, result.frames.start)
+    if result.fresh:
+        _reset_needless(at.armature)
+    return (yield from solve_controls(at.armature, body, at.scene, result.frames, result.moved))
+
+
+def _compare(at: Scene, result: Result) -> Generator[Step, None, tuple[str, ...]]:
+    """Compare what Blender makes of the action with what was wanted; return what is wrong with it."""
+    body, scale = result.body, np.linalg.norm(result.body.frame[:3, 0])
+    worst, where = 0.0, ""
+    for number in np.unique(np.linspace(0, len(result.frames) - 1, _PROBES).astype(int)):
+        at.scene.frame_set(result.frames[number])
+        actual = read_poses(at.armature, body.bones) @ np.linalg.inv(body.rests)
+        apart = np.linalg.norm(place_joints(body, actual) - place_joints(body, result.moved[number]), axis=-1) * scale
+        if apart.max() > worst:
+            worst, where = float(apart.max()), body.names[int(apart.argmax())]
+        yield Step("checking")
+    if worst < _OFF:
+        return ()
+    return (f"{where} is up to {100 * worst:.1f} cm off: constraints or drivers keep bones from where they should be",)
+
+
+def _reset_unkeyed(armature: bpy.types.Object, keys: Sequence[Keys]) -> None:
+    """Reset what else a keyed bone's place and scale were set to."""
+    for each in keys:
+        bone = armature.pose.bones[each.bone]
+        bone.scale = (1.0, 1.0, 1.0)
+        if not each.travels:
+            bone.location = (0.0, 0.0, 0.0)
+
+
+def _reset_needless(armature: bpy.types.Object) -> None:
+    """Reset the controls that would bend a generated rig beside those that are keyed."""
+    for bone in armature.pose.bones:
+        if bone.name in _NEEDLESS or "tweak" in bone.name:
+            bone.matrix_basis.identity()
+
+
+@contextmanager
+def restored_scene(at: Scene) -> Iterator[None]:
+    """Go back to the frame of before at the end."""
+    frame, subframe = at.scene.frame_current, at.scene.frame_subframe
+    try:
+        yield
+    finally:
+        at.scene.frame_set(frame, subframe=subframe)
+
+
+@contextmanager
+def _restored_pose(at: Scene, switches: Mapping[str, str]) -> Iterator[None]:
+    """Keep the old action by a fake user at the end; go back to it, and to the pose, if the block ends early."""
+    armature = at.armature
+    bones = armature.pose.bones
+    before = {bone.name: bone.matrix_basis.copy() for bone in bones}
+    switched = {bone: bones[bone][name] for bone, name in switches.items()}
+    data = armature.animation_data
+    old, slot = (data.action, actions.name_slot(armature)) if data else (None, "")
+    known = set(bpy.data.actions)
+
+    def restore() -> None:
+        actions.assign_action(armature, old, slot)
+        for made in set(bpy.data.actions) - known:
+            bpy.data.actions.remove(made)
+        for name, basis in before.items():
+            bones[name].matrix_basis = basis
+        for bone, value in switched.items():
+            bones[bone][switches[bone]] = value
+
+    with ExitStack() as failing:
+        failing.callback(restore)
+        yield
+        failing.pop_all()
+    if old is not None:
+        old.use_fake_user = True
 
 
 @dataclass(frozen=True)
@@ -34,33 +214,8 @@ Job = Generator[Step, None, Outcome]
 """Steps of a job, and what to tell of it."""
 
 
-@dataclass(frozen=True)
-class WalkOptions:
-    """How a character walks along a curve."""
-
-    speed: float = 0.0
-    """Metres a second; 0 for mapctl's own, which is slower in sharp corners."""
-    seconds: float = 0.0
-    """Duration; 0 for once along the curve."""
-    gait: str = ""
-    """Gait that the prior knows; nothing for any."""
-    style: str = ""
-    """Style that the prior knows; nothing for any."""
-    seed: int = 0
-    """Seed of everything random."""
-
-    def list_words(self, fps: float) -> list[str]:
-        """List the words of `mapctl follow`."""
-        words = ["--seed", str(self.seed)]
-        for name, value in (("--speed", self.speed), ("--seconds", self.seconds)):
-            words += [name, f"{value:.6g}"] if value > 0 else []
-        for name, value in (("--gait", self.gait), ("--style", self.style)):
-            words += [name, value] if value else []
-        return words + (["--fps", f"{fps:.9g}"] if self.gait or self.style else [])
-
-
-def walk_along(at: Scene, drawn: bpy.types.Object, options: WalkOptions) -> Job:
-    """Let the character walk along a curve, from the scene's first frame on."""
+def walk_along(at: Scene, drawn: bpy.types.Object, options: Sequence[str]) -> Job:
+    """Let the character walk along a curve, from the scene's first frame on; `options` are those of `mapctl follow`."""
     body, points = take_body(at), sample_curve(drawn, at.scene)
     height, level = measure_height(points)
     made, travelling, lines = yield from _ask_for_walk(at, body, points, options)
@@ -80,14 +235,15 @@ def walk_along(at: Scene, drawn: bpy.types.Object, options: WalkOptions) -> Job:
 
 
 def _ask_for_walk(
-    at: Scene, body: Body, points: np.ndarray, options: WalkOptions
+    at: Scene, body: Body, points: np.ndarray, options: Sequence[str]
 ) -> Generator[Step, None, tuple[WorldMotion, frozenset[int], list[str]]]:
     """Ask mapctl for the walk, at the scene's frame rate; also return which joints travel, and what it said."""
     fps = measure_fps(at.scene)
-    with _temporary_folder() as folder:
+    with tempfile.TemporaryDirectory(prefix="mapctl-") as name:
+        folder = Path(name)
         exchange.write(take_rest(body, fps), folder / "character.npz", _place_ends(body), frozenset())
-        write_curve(points, folder / "curve.csv")
-        words = ["follow", "curve.csv", "--rig", "character.npz", "-o", "walk.npz", *options.list_words(float(fps))]
+        np.savetxt(folder / "curve.csv", points[:, ::2], fmt="%.6f", delimiter=",", header="x,z", comments="")
+        words = ["follow", "curve.csv", "--rig", "character.npz", "-o", "walk.npz", *options]
         lines = yield from run_command([*at.command, *words], folder, "walking")
         made, travelling = exchange.read(folder / "walk.npz")
         if made.fps != fps:  # resampling takes a moment, solving at another rate than the priors' takes long
@@ -154,7 +310,8 @@ def name_joints(at: Scene, bones: Sequence[str]) -> list[str]:
 def _edit(at: Scene, frames: range, words: Sequence[str], made: np.ndarray, suffix: str, label: str) -> Job:
     """Send the action to a command of mapctl, and make a new one of what comes back."""
     body, old = take_body(at), actions.find_action(at.armature)
-    with restored_scene(at), _temporary_folder() as folder:
+    with restored_scene(at), tempfile.TemporaryDirectory(prefix="mapctl-") as temporary:
+        folder = Path(temporary)
         with rigify.keep_lengths(at.armature):
             motion, worlds = yield from sample_motion(at.armature, body, at.scene, frames)
         exchange.write(motion, folder / "given.npz", _place_ends(body), body.movable)
@@ -165,7 +322,8 @@ def _edit(at: Scene, frames: range, words: Sequence[str], made: np.ndarray, suff
             rig = ["--rig", "rigify.toml"]
         lines = yield from run_command([*at.command, *(names.get(word, word) for word in words), *rig], folder, label)
         answer, travelling = exchange.read(folder / "made.npz")
-        _check_length(answer, frames)
+        if len(answer.positions) != len(frames):
+            raise AddonError(f"mapctl answered with {len(answer.positions)} frames where {len(frames)} were asked for")
         moved = to_armature(answer, body, worlds)
         name = f"{old.name} {suffix}"
         warnings = yield from make_action(at, Result(body, frames, moved, travelling, made, name, fresh=False))
@@ -178,16 +336,5 @@ def _shorten(lines: Sequence[str]) -> tuple[str, ...]:
     return tuple(line.removeprefix("made.npz: ") for line in lines if not line.startswith("wrote "))
 
 
-def _check_length(motion: WorldMotion, frames: range) -> None:
-    if len(motion.positions) != len(frames):
-        raise AddonError(f"mapctl answered with {len(motion.positions)} frames where {len(frames)} were asked for")
-
-
 def _place_ends(body: Body) -> dict[str, np.ndarray]:
     return {name: body.to_world(tail) for name, tail in body.ends.items()}
-
-
-@contextmanager
-def _temporary_folder() -> Iterator[Path]:
-    with tempfile.TemporaryDirectory(prefix="mapctl-") as folder:
-        yield Path(folder)

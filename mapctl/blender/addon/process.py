@@ -9,9 +9,29 @@ import threading
 from collections.abc import Callable, Generator, Sequence
 from functools import cache
 from pathlib import Path
-from typing import IO
+from typing import IO, NamedTuple
 
-from .problem import AddonError, Step
+
+class AddonError(Exception):
+    """A reason, in one line, why nothing was changed, and what can be done about it."""
+
+
+class Step(NamedTuple):
+    """How far a job is."""
+
+    label: str
+    """What is being done."""
+    done: int = 0
+    """Work done."""
+    total: int = 0
+    """Work in all; 0 where that is not known."""
+    idle: bool = False
+    """Whether the job waits for another process, so that asking again at once leads nowhere."""
+
+    def describe(self) -> str:
+        """Describe it in a few words."""
+        return f"{self.label} {100 * self.done // self.total} %" if self.total else self.label
+
 
 OLDEST = (0, 1, 0)
 """The oldest mapctl whose commands and files are those that this add-on uses."""

@@ -10,8 +10,8 @@ from contextlib import contextmanager
 import bpy
 import numpy as np
 
-from ..problem import AddonError
 from .body import Body, Control, measure_frame
+from .process import AddonError
 
 _SIDES = {"L": "left", "R": "right"}
 _TRUNK = (

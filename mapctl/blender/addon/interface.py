@@ -1,16 +1,141 @@
-"""The four operators. In the interface they run beside it, until Esc; in the background they return when done."""
+"""Preferences, options, operators and the panel in the sidebar of the 3D view.
 
+In the interface operators run beside it, until Esc; in the background they return when done.
+"""
+
+# Blender reads properties from annotations, which are calls.
 # pyright: reportInvalidTypeForm=false
 
+import textwrap
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 
 import bpy
+from bpy.props import BoolProperty, FloatProperty, IntProperty, PointerProperty, StringProperty
 
-from . import jobs, process
-from .problem import AddonError, Step
-from .scene import actions
-from .settings import BetweenProperties, CleanUpProperties, GapProperties, WalkProperties, read_command
+from . import actions, jobs, process
+from .body import measure_fps
+from .process import AddonError, Step
+
+
+class WalkProperties:
+    """Options of the walk along a curve."""
+
+    speed: FloatProperty(name="Speed", description="Metres a second; 0 for the usual speed", min=0, soft_max=4)
+    seconds: FloatProperty(name="Seconds", description="Duration; 0 for once along the curve", min=0, soft_max=120)
+    gait: StringProperty(name="Gait", description="Gait that mapctl knows, as walk or run; empty for any")
+    style: StringProperty(name="Style", description="Style that mapctl knows; empty for any")
+    seed: IntProperty(name="Seed", description="Another seed is another walk", min=0)
+
+
+class CleanUpProperties:
+    """Options of the clean-up."""
+
+    anchor: BoolProperty(
+        name="Stop Sliding", description="Correct the trajectory so that planted feet do not travel", default=False
+    )
+
+
+class GapProperties:
+    """Options of the filling of gaps."""
+
+    first: IntProperty(name="First", description="First frame of the gap", default=1)
+    last: IntProperty(name="Last", description="Last frame of the gap", default=24)
+    selected: BoolProperty(
+        name="Selected Bones Only", description="Only the bones selected in Pose Mode are filled", default=False
+    )
+
+
+class MAPCTL_PG_walk(WalkProperties, bpy.types.PropertyGroup):
+    """Options of the walk along a curve, of a scene."""
+
+
+class MAPCTL_PG_clean_up(CleanUpProperties, bpy.types.PropertyGroup):
+    """Options of the clean-up, of a scene."""
+
+
+class MAPCTL_PG_gap(GapProperties, bpy.types.PropertyGroup):
+    """Options of the filling of gaps, of a scene."""
+
+
+class MAPCTL_PG_settings(bpy.types.PropertyGroup):
+    """Options of all operators, of a scene."""
+
+    walk: PointerProperty(type=MAPCTL_PG_walk)
+    clean_up: PointerProperty(type=MAPCTL_PG_clean_up)
+    gap: PointerProperty(type=MAPCTL_PG_gap)
+
+
+class MAPCTL_OT_find(bpy.types.Operator):
+    """Look for mapctl and tell its version"""
+
+    bl_idname = "mapctl.find"
+    bl_label = "Look for mapctl"
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Look, and tell."""
+        try:
+            words = process.find_command(read_command(context))
+        except AddonError as problem:
+            self.report({"ERROR"}, str(problem))
+            return {"CANCELLED"}
+        version = ".".join(map(str, process.read_version(words) or ()))
+        self.report({"INFO"}, f"mapctl {version}: {' '.join(words)}")
+        return {"FINISHED"}
+
+
+class MAPCTL_OT_preview_gap(bpy.types.Operator):
+    """Take the preview range as the gap"""
+
+    bl_idname = "mapctl.preview_gap"
+    bl_label = "Gap from Preview Range"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's own way
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Return whether there is a preview range."""
+        return context.scene.use_preview_range
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Take it."""
+        gap = context.scene.mapctl.gap
+        gap.first, gap.last = context.scene.frame_preview_start, context.scene.frame_preview_end
+        return {"FINISHED"}
+
+
+class MAPCTL_AP_preferences(bpy.types.AddonPreferences):
+    """Preferences of the add-on."""
+
+    bl_idname = __package__ or ""
+
+    command: StringProperty(
+        name="mapctl",
+        description="Program, or command as in: /path/to/python -m mapctl. Empty to look for it on the PATH",
+    )
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw them."""
+        self.layout.prop(self, "command")
+        self.layout.operator(MAPCTL_OT_find.bl_idname)
+        self.layout.label(text="mapctl runs as a program of its own: pip install mapctl")
+
+
+def read_command(context: bpy.types.Context) -> str:
+    """Read the command of the preferences."""
+    return context.preferences.addons[__package__ or ""].preferences.command
+
+
+CLASSES = (
+    MAPCTL_PG_walk,
+    MAPCTL_PG_clean_up,
+    MAPCTL_PG_gap,
+    MAPCTL_PG_settings,
+    MAPCTL_OT_find,
+    MAPCTL_OT_preview_gap,
+    MAPCTL_AP_preferences,
+)
+
 
 _TICK = 0.1  # seconds between two looks at a job
 _SLICE = 0.08  # seconds that a job may take of each
@@ -87,17 +212,16 @@ class JobOperator:
             return {"CANCELLED"}
         if event.type != "TIMER":
             return {"PASS_THROUGH"} if event.type in _VIEW_EVENTS else {"RUNNING_MODAL"}
-        try:
+        with ExitStack() as ending:
+            ending.callback(self._leave, context)
             step = self._advance_for(self._job, _SLICE)
-        except BaseException:
-            self._leave(context)
-            raise
-        if step is not None:
-            Report.step = step
-            _show(context, step)
-            return {"RUNNING_MODAL"}
-        self._leave(context)
-        return self._conclude(context)
+            if step is not None:
+                ending.pop_all()
+        if step is None:
+            return self._conclude(context)
+        Report.step = step
+        _show(context, step)
+        return {"RUNNING_MODAL"}
 
     def cancel(self, context: bpy.types.Context) -> None:
         """End the job and its process: on Esc, and where Blender closes the file."""
@@ -167,8 +291,14 @@ class MAPCTL_OT_walk(JobOperator, WalkProperties, bpy.types.Operator):
         drawn = [each for each in context.selected_objects if each.type == "CURVE"]
         if len(drawn) != 1:
             raise AddonError(f"select the armature and one curve; {len(drawn)} curves are selected")
-        options = jobs.WalkOptions(self.speed, self.seconds, self.gait.strip(), self.style.strip(), self.seed)
-        return jobs.walk_along(at, drawn[0], options)
+        words = ["--seed", str(self.seed)]
+        for name, value in (("--speed", self.speed), ("--seconds", self.seconds)):
+            words += [name, f"{value:.6g}"] if value > 0 else []
+        named = [(name, value.strip()) for name, value in (("--gait", self.gait), ("--style", self.style))]
+        words += [word for name, value in named if value for word in (name, value)]
+        if any(value for _, value in named):
+            words += ["--fps", f"{float(measure_fps(at.scene)):.9g}"]
+        return jobs.walk_along(at, drawn[0], words)
 
 
 class MAPCTL_OT_clean_up(JobOperator, CleanUpProperties, bpy.types.Operator):
@@ -195,7 +325,7 @@ class MAPCTL_OT_fill_gap(JobOperator, GapProperties, bpy.types.Operator):
         return jobs.fill_gap(at, find_frames(at), range(self.first, self.last + 1), joints)
 
 
-class MAPCTL_OT_in_between(JobOperator, BetweenProperties, bpy.types.Operator):
+class MAPCTL_OT_in_between(JobOperator, bpy.types.Operator):
     """Make the motion between the keyed frames of the armature's action, as a new action; generated keys are no keys"""
 
     bl_idname = "mapctl.in_between"
@@ -231,3 +361,45 @@ def _redraw(context: bpy.types.Context) -> None:
 
 
 OPERATORS = (MAPCTL_OT_walk, MAPCTL_OT_clean_up, MAPCTL_OT_fill_gap, MAPCTL_OT_in_between)
+
+
+_WIDTH = 44  # characters of a line of the panel, about
+
+
+class MAPCTL_PT_sidebar(bpy.types.Panel):
+    """All operators with their options, and what happened last."""
+
+    bl_label = "mapctl"
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+    bl_category = "mapctl"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw it."""
+        settings = context.scene.mapctl
+        self._draw_job(MAPCTL_OT_walk, settings.walk, ("speed", "seconds", "gait", "style", "seed"))
+        self._draw_job(MAPCTL_OT_clean_up, settings.clean_up, ("anchor",))
+        self._draw_job(MAPCTL_OT_fill_gap, settings.gap, ("first", "last", "selected"))
+        self.layout.operator(MAPCTL_OT_preview_gap.bl_idname)
+        self._draw_job(MAPCTL_OT_in_between, None, ())
+        self._draw_report()
+
+    def _draw_job(self, operator: type, options: bpy.types.PropertyGroup | None, names: tuple[str, ...]) -> None:
+        """Draw the options of an operator and its button, which hands them on."""
+        column = self.layout.box().column(align=True)
+        for name in names:
+            column.prop(options, name)
+        button = column.operator(operator.bl_idname)
+        for name in names:
+            setattr(button, name, getattr(options, name))
+
+    def _draw_report(self) -> None:
+        column = self.layout.column(align=True)
+        if Report.step is not None:
+            column.label(text=Report.step.describe(), icon="TIME")
+            column.label(text="Esc to cancel")
+            return
+        icon = "ERROR" if Report.failed else "INFO"
+        for line in Report.lines:
+            for number, part in enumerate(textwrap.wrap(line, _WIDTH)):
+                column.label(text=part, icon="BLANK1" if number else icon)

@@ -1,1 +1,0 @@
-"""What the add-on reads of a scene and writes into it: armatures, actions and curves."""
