@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from functools import partial
 from importlib import import_module
 from os import PathLike, fspath
 from pathlib import Path
@@ -78,54 +79,31 @@ def mp4_writer(path: Path, size: tuple[int, int], fps: Fraction) -> Iterator[Wri
 
 
 @contextmanager
-def gif_writer(path: Path, size: tuple[int, int], fps: Fraction) -> Iterator[Write]:
-    """Yield a function that adds a picture to a looping GIF. All share one palette.
+def _loop_writer(form: _Loop, path: Path, size: tuple[int, int], fps: Fraction) -> Iterator[Write]:
+    """Yield a function that adds a picture to a looping GIF, in which all share one palette, or WebP, in all colours.
 
-    GIF counts in hundredths of a second; the delays alternate so that the whole keeps its time. Over 50
-    pictures a second only every second, third, ... is kept. RequestError when it outgrows 600 megapixels.
+    Delays alternate between ticks of the format so that the whole keeps its time. Over 50 pictures a second only every
+    second, third, ... is kept. RequestError when it outgrows the pixels of its form.
     """
     image = _import_package("PIL.Image")
-    with _loop_writer(_GIF, lambda picture, first: _quantize(image, picture, first), path, size, fps) as write:
-        yield write
-
-
-@contextmanager
-def webp_writer(path: Path, size: tuple[int, int], fps: Fraction) -> Iterator[Write]:
-    """Yield a function that adds a picture to a looping WebP, in all colours.
-
-    WebP counts in milliseconds; the delays alternate so that the whole keeps its time. Over 50 pictures a second only
-    every second, third, ... is kept. RequestError when it outgrows 200 megapixels.
-    """
-    image = _import_package("PIL.Image")
-    with _loop_writer(_WEBP, lambda picture, _: image.fromarray(picture), path, size, fps) as write:
-        yield write
-
-
-@contextmanager
-def _loop_writer(
-    form: _Loop, prepare: Callable[[Array, Any], Any], path: Path, size: tuple[int, int], fps: Fraction
-) -> Iterator[Write]:
-    """Yield a function that adds a picture, as `prepare` makes it of one and of the first that it made."""
     stride, count, pictures = math.ceil(fps / _LOOP_FPS), 0, []
+    most = form.most_pixels // (size[0] * size[1])
 
     def write(picture: Array) -> None:
         nonlocal count
         count += 1
         if (count - 1) % stride == 0:
-            _check_loop_size(form, len(pictures) + 1, size)
-            pictures.append(prepare(picture, pictures[0] if pictures else None))
+            if len(pictures) == most:
+                found = f"a {form.name} of {size[0]}x{size[1]} can have {most} pictures"
+                raise RequestError(f"{found}; shrink it or write an MP4")
+            first = pictures[0] if pictures else None
+            pictures.append(_quantize(image, picture, first) if form is _GIF else image.fromarray(picture))
 
     yield write
     ends = [round(1000 // form.tick * min((k + 1) * stride, count) / fps) for k in range(len(pictures))]
     delays = [form.tick * max(stop - start, 1) for start, stop in zip([0, *ends], ends, strict=False)]
     first, *others = pictures
     first.save(path, form.name, save_all=True, append_images=others, duration=delays, loop=0, quality=form.quality)
-
-
-def _check_loop_size(form: _Loop, pictures: int, size: tuple[int, int]) -> None:
-    most = form.most_pixels // (size[0] * size[1])
-    if pictures > most:
-        raise RequestError(f"a {form.name} of {size[0]}x{size[1]} can have {most} pictures; shrink it or write an MP4")
 
 
 def _quantize(image, picture: Array, first):
@@ -169,32 +147,23 @@ _MAX_GHOSTS = 16
 """Number of ghosts of all actors together, but at least four each."""
 
 
-@dataclass(frozen=True)
-class StillRow:
-    """Layout of the stills."""
-
-    count: int
-    """Number of stills beside each other."""
-    height_over_width: float
-    """Height of one over its width."""
-    kind: str
-    """Kind of the stills' camera (see CameraSettings)."""
-
-
 def draw_contact_sheet(stage: Stage, brush: Painter, camera: CameraSettings, size: tuple[int, int]) -> Array:
     """Draw the sheet, (height, width, 3) uint8 of the given width; the ghosts' picture has `size`, the stills come
     below."""
     wide = replace(camera, kind="top" if camera.kind == "top" else "fixed")
     top = brush.paint(stage.views(wide, size)[0], stage.compose_ghosts(_choose_ghost_frames(stage)))
-    row = _choose_row(stage, camera, size)
+    # One actor has upright close stills; several need the whole picture.
+    count, tall, kind = 4, size[1] / size[0], camera.kind
+    if len(stage.players) == 1:
+        count, tall, kind = 6, 1.15, "top" if camera.kind == "top" else "follow"
     gap = max(2, round(_GAP * size[0]))
-    width = (size[0] - (row.count - 1) * gap) // row.count
-    height = max(1, round(width * row.height_over_width))
+    width = (size[0] - (count - 1) * gap) // count
+    height = max(1, round(width * tall))
     sheet = np.full((size[1] + gap + height, size[0], 3), 255, np.uint8)
     sheet[: size[1]] = top
-    views = stage.views(replace(camera, kind=row.kind), (width, height))
-    for k, moment in enumerate(_space_evenly(stage.num_frames - 1, row.count)):
-        left = round(k * (size[0] - width) / (row.count - 1))
+    views = stage.views(replace(camera, kind=kind), (width, height))
+    for k, moment in enumerate(_space_evenly(stage.num_frames - 1, count)):
+        left = round(k * (size[0] - width) / (count - 1))
         still = _add_label(brush.paint(views[moment], stage.content(moment)), f"{moment / float(stage.fps):.1f} s")
         sheet[size[1] + gap :, left : left + width] = still
     return sheet
@@ -218,13 +187,6 @@ def draw_strips(
             )
             sheet[top : top + height, left : left + width] = picture
     return sheet
-
-
-def _choose_row(stage: Stage, camera: CameraSettings, size: tuple[int, int]) -> StillRow:
-    """Choose upright close stills for one actor; several need the whole picture."""
-    if len(stage.players) == 1:
-        return StillRow(6, 1.15, "top" if camera.kind == "top" else "follow")
-    return StillRow(4, size[1] / size[0], camera.kind)
 
 
 def _space_evenly(last: int, count: int) -> list[int]:
@@ -256,7 +218,7 @@ def _add_label(picture: Array, text: str) -> Array:
     return np.asarray(image)
 
 
-WRITERS = {".mp4": mp4_writer, ".gif": gif_writer, ".webp": webp_writer}
+WRITERS = {".mp4": mp4_writer, ".gif": partial(_loop_writer, _GIF), ".webp": partial(_loop_writer, _WEBP)}
 ENDINGS = (*WRITERS, ".png")
 """Endings that `film` can write."""
 _MIN_PIXELS, _MAX_PIXELS = 16, 8192

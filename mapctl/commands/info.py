@@ -187,9 +187,9 @@ def print_clip(path: Path, command: Info) -> None:
     fit = assess_fit(rigmap, motion)
     _print(describe_clip(path, motion, rigmap, fit), as_json=as_json)
     if picture is not None:
-        from scenes import rig_picture
+        from scenes.rig_picture import plot_rig
 
-        rig_picture.plot_rig(rig_picture.RigPicture(rigmap, motion, fit, path.name), picture)
+        plot_rig(rigmap, motion, fit, title=path.name, path=picture)
 
 
 def describe_clip(path: Path, motion: Motion, rigmap: RigMap, fit: Fit) -> dict[str, Any]:

@@ -6,7 +6,6 @@ beside this file holds them with the command that wrote it.
 """
 
 import json
-import math
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
@@ -142,31 +141,14 @@ def outside(
     return sorted(found, key=lambda one: -one.degrees)
 
 
-def read_table(text: str) -> dict[str, JointRange]:
-    """Parse the joints of a table of ranges as JSON; MapctlError for one that is not such a table."""
-    try:
-        rows = json.loads(text)["joints"]
-        ranges = {
-            name: JointRange(
-                row["order"], *(tuple(map(float, row[key])) for key in ("mid_quat_xyzw", "low_deg", "high_deg"))
-            )
-            for name, row in rows.items()
-        }
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise MapctlError(f"no table of joint ranges ({type(error).__name__}: {error})") from error
-    for name, one in ranges.items():
-        if (len(one.mid_quat_xyzw), len(one.low_deg), len(one.high_deg)) != (4, 3, 3):
-            raise MapctlError(f"the range of {name} must have a quaternion and three angles at either end")
-        ends = [*one.low_deg, *one.high_deg]
-        if not all(map(math.isfinite, ends)) or any(a >= b for a, b in zip(one.low_deg, one.high_deg, strict=True)):
-            raise MapctlError(f"the range of {name} must lead from a lower to a higher angle, got {ends}")
-    return ranges
-
-
 @cache
 def load() -> JointRanges:
     """Return the bundled ranges."""
-    text = files(__name__).joinpath(TABLE).read_text("utf-8")
-    # They are kept for all who ask: whoever asks first may build a network on another device.
+    rows = json.loads(files(__name__).joinpath(TABLE).read_text("utf-8"))["joints"]
+    keys = ("mid_quat_xyzw", "low_deg", "high_deg")
+    ranges = {
+        name: JointRange(row["order"], *(tuple(map(float, row[key])) for key in keys)) for name, row in rows.items()
+    }
+    # Kept for every later call, while the first may be within another default device.
     with torch.device("cpu"):
-        return JointRanges.of_joints(read_table(text))
+        return JointRanges.of_joints(ranges)

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
 import numpy as np
 
@@ -190,7 +190,6 @@ def _add_tips(motion: Motion, joints: Array, turns: Array, scale: float) -> Poin
     return Points((*parents, *(j for j, _ in extra)), (*found, *(found[j] for j, _ in extra)), world)
 
 
-@runtime_checkable
 class Body(Protocol):
     """A mannequin, or a character with a mesh of its own."""
 
@@ -240,13 +239,9 @@ class SkinnedBody:
         """Frames of the motion."""
         return self._bones.num_frames
 
-    @property
+    @cached_property
     def seen(self) -> Array:
         """Positions (frames, n, 3) of its bones, and of the vertices that are outermost at rest, metres."""
-        return self._seen
-
-    @cached_property
-    def _seen(self) -> Array:
         vertices = self._mesh.vertices
         outer = np.concatenate([vertices.argmin(axis=0), vertices.argmax(axis=0)])
         joint = self._mesh.joints[outer, self._mesh.weights[outer].argmax(axis=1)]

@@ -168,7 +168,11 @@ def merge_meshes(meshes: list[CharacterMesh]) -> CharacterMesh:
     """Merge meshes of one skeleton, at least one, into one mesh."""
     counts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
     widest = max(mesh.joints.shape[1] for mesh in meshes)
-    padded = [np.pad(table, ((0, 0), (0, widest - table.shape[1]))) for mesh in meshes for table in _carriers(mesh)]
+    padded = [
+        np.pad(table, ((0, 0), (0, widest - table.shape[1])))
+        for mesh in meshes
+        for table in (mesh.joints, mesh.weights)
+    ]
     return CharacterMesh(
         vertices=np.concatenate([mesh.vertices for mesh in meshes]),
         normals=np.concatenate([mesh.normals for mesh in meshes]),
@@ -191,10 +195,6 @@ def _merge_refinements(meshes: list[CharacterMesh]) -> Refinement:
         np.concatenate([one.faces + start for one, start in zip(fine, points, strict=False)]),
         np.concatenate([one.rgba for one in fine]),
     )
-
-
-def _carriers(mesh: CharacterMesh) -> tuple[Array, Array]:
-    return mesh.joints, mesh.weights
 
 
 def compute_normals(vertices: Array, faces: Array) -> Array:

@@ -125,7 +125,7 @@ def _estimate_sigma(
     """
     sigma = torch.full((values.shape[1],), math.nan, dtype=values.dtype)
     for order, fewest in _ORDERS.items():
-        differences, used = _differences(values, order - differenced), _observed_windows(seen, order + 1)
+        differences, used = torch.diff(values, n=order - differenced, dim=0), _observed_windows(seen, order + 1)
         if len(differences) == 0:
             continue
         # Not of a whole that is shorter, which has nothing better.
@@ -133,12 +133,6 @@ def _estimate_sigma(
         found = _robust_sigma(differences, used) / math.sqrt(math.comb(2 * order, order))
         sigma = torch.where(sigma.isnan() & enough, found, sigma)
     return sigma if len(values) > min(_ORDERS) else torch.zeros_like(sigma)
-
-
-def _differences(values: Tensor, order: int) -> Tensor:
-    for _ in range(order):
-        values = torch.diff(values, dim=0)
-    return values
 
 
 def _observed_windows(seen: Bool[Tensor, "frames joints"], length: int) -> Bool[Tensor, "runs joints"]:

@@ -65,7 +65,7 @@ def state() -> list:
 
 def told() -> tuple[str, ...]:
     """What the panel tells."""
-    return tuple(module("operators").Report.lines)
+    return tuple(module("interface").Report.lines)
 
 
 def finish(facts: dict, arrays: dict | None = None) -> None:

@@ -148,7 +148,7 @@ def play_generated() -> None:
 
 def end_at(label: str, done: int) -> str:
     """End a clean-up at this step; whether all is as it was."""
-    armature, jobs, operators = bpy.context.object, blender_stage.module("jobs"), blender_stage.module("operators")
+    armature, jobs, operators = bpy.context.object, blender_stage.module("jobs"), blender_stage.module("interface")
     bpy.context.scene.frame_set(5)
     before, command = blender_stage.state(), blender_stage.module("process").find_command(read_command())
     at = jobs.Scene(bpy.context.scene, armature, command)
@@ -241,7 +241,7 @@ def end_walk_early(drawn) -> str:
     """End a walk while the controls are set; whether all is as it was."""
     jobs, before = blender_stage.module("jobs"), blender_stage.state()
     at = jobs.Scene(bpy.context.scene, bpy.context.object, blender_stage.module("process").find_command(read_command()))
-    job = jobs.walk_along(at, drawn, jobs.WalkOptions())
+    job = jobs.walk_along(at, drawn, ())
     while (step := next(job)).label != "setting the controls" or step.done < 3:
         pass
     job.close()
@@ -263,7 +263,7 @@ def expect(name: str, run, **options) -> None:
         facts["errors"][name] = [str(run(**options)), ""]
     except RuntimeError as error:
         told = blender_stage.told()[0]
-        same = blender_stage.state() == before and blender_stage.module("operators").Report.failed
+        same = blender_stage.state() == before and blender_stage.module("interface").Report.failed
         facts["errors"][name] = [told if told in str(error) else str(error), "unchanged" if same else "changed"]
 
 

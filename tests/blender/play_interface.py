@@ -33,7 +33,7 @@ def make_window():
 def start_modal(mode: str):
     """Begin a clean-up as the interface does."""
     blender_stage.use(mode)
-    operators = blender_stage.module("operators")
+    operators = blender_stage.module("interface")
     window, notes = make_window()
     told: list = []
     context = SimpleNamespace(
@@ -71,12 +71,12 @@ def play_modal() -> None:
     pressed, context, notes, told = start_modal("sleep")
     timer, escape, key = (SimpleNamespace(type=kind) for kind in ("TIMER", "ESC", "A"))
     process = blender_stage.FOLDER / "process.txt"
-    seen = {blender_stage.module("operators").Report.step.describe()}
+    seen = {blender_stage.module("interface").Report.step.describe()}
     facts["poll while one runs"] = bpy.ops.mapctl.clean_up.poll()
     while "walking 25 %" not in seen:
         assert pressed.modal(context, timer) == {"RUNNING_MODAL"}
-        seen.add(blender_stage.module("operators").Report.step.describe())
-        blender_stage.module("operators").time.sleep(0.02)
+        seen.add(blender_stage.module("interface").Report.step.describe())
+        blender_stage.module("interface").time.sleep(0.02)
     facts["steps"] = sorted(seen)
     facts["panel while it runs"] = draw_panel()
     facts["keys are held"] = sorted(pressed.modal(context, key))
@@ -89,7 +89,7 @@ def play_modal() -> None:
         "unchanged": blender_stage.state() == before,
         "notes": [note for note in notes if note in ("begin", "end", "timer", "handler", None)],
         "told": blender_stage.told(),
-        "step": blender_stage.module("operators").Report.step is None,
+        "step": blender_stage.module("interface").Report.step is None,
     }
     pressed, context, notes, told = start_modal("echo")
     answer = {"RUNNING_MODAL"}
@@ -141,7 +141,7 @@ class Layout:
 def draw_panel() -> list[str]:
     """What the panel shows now."""
     drawn: list[str] = []
-    panel = blender_stage.module("panel").MAPCTL_PT_sidebar
+    panel = blender_stage.module("interface").MAPCTL_PT_sidebar
     standing = SimpleNamespace(layout=Layout(drawn))
     for name in ("_draw_job", "_draw_report"):
         setattr(standing, name, getattr(panel, name).__get__(standing))

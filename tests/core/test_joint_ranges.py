@@ -68,25 +68,3 @@ def test_other_skeletons_are_refused():
     other = replace(motion, skeleton=replace(CANONICAL, names=("body", *CANONICAL.names[1:])))
     with pytest.raises(MapctlError, match="to_canonical"):
         joint_ranges.outside(other)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("{", "no table of joint ranges"),
-        ("[]", "no table of joint ranges"),
-        ('{"joints": {"head": {"order": "XYZ"}}}', "KeyError"),
-        (
-            '{"joints": {"head": {"order": "XYZ", "mid_quat_xyzw": [0, 0, 0, 1], "low_deg": [0, 5], "high_deg": [1]}}}',
-            "the range of head must have",
-        ),
-        (
-            '{"joints": {"head": {"order": "XYZ", "mid_quat_xyzw": [0, 0, 0, 1], "low_deg": [0, 5, 0],'
-            ' "high_deg": [1, 5, 1]}}}',
-            "the range of head must lead from a lower",
-        ),
-    ],
-)
-def test_damaged_tables_are_refused(text, message):
-    with pytest.raises(MapctlError, match=message):
-        joint_ranges.read_table(text)

@@ -19,7 +19,7 @@ from mapctl.formats import usd
 from mapctl.formats.atomic import atomic_path, write_bytes
 from priors import checkpoints
 from priors.checkpoints import write_tensors
-from scenes.film import gif_writer, mp4_writer, save_png, webp_writer
+from scenes.film import WRITERS, save_png
 
 MOTION = walk(150)
 PICTURE = np.random.default_rng(0).integers(0, 255, (240, 320, 3), dtype=np.uint8)
@@ -48,9 +48,9 @@ WRITERS = {
     "a.bvh": _save,
     "a.npz": _save,
     "a.glb": _save,
-    "a.mp4": _film(mp4_writer),
-    "a.gif": _film(gif_writer, PICTURE[::2, ::2]),  # colours of noise take long to choose
-    "a.webp": _film(webp_writer),
+    "a.mp4": _film(WRITERS[".mp4"]),
+    "a.gif": _film(WRITERS[".gif"], PICTURE[::2, ::2]),  # colours of noise take long to choose
+    "a.webp": _film(WRITERS[".webp"]),
     "a.png": lambda path: save_png(path, PICTURE),
     "a.json": lambda path: report.write_report({"values": list(range(9000))}, path),
     "a.safetensors": lambda path: write_tensors(path, TENSORS),
