@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from functools import cache
 from types import ModuleType
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -79,6 +79,7 @@ def blend_veils(plain: Array, covered: Array) -> Array:
     return np.rint(colours.blend_colours(plain.astype(np.float32), covered, _VEIL_OPACITY)).astype(np.uint8)
 
 
+@runtime_checkable
 class Painter(Protocol):
     """Turns content into pixels."""
 

@@ -239,7 +239,7 @@ class SkinnedBody:
         """Frames of the motion."""
         return self._bones.num_frames
 
-    @cached_property
+    @property
     def seen(self) -> Array:
         """Positions (frames, n, 3) of its bones, and of the vertices that are outermost at rest, metres."""
         vertices = self._mesh.vertices

@@ -51,7 +51,7 @@ def main(words: list[str] | None = None) -> None:
 
     def tween(motion: Motion) -> Motion:
         frames = range(0, motion.num_frames, round(float(motion.fps)))
-        return controllers.tween(motion, controllers.Keys([*frames]), transformer).motion
+        return controllers.tween(motion, controllers.Keys(tuple(frames)), transformer).motion
 
     single: dict[str, Callable[[], Motion]] = {
         "follow": lambda: (

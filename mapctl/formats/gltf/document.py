@@ -93,7 +93,7 @@ def read_file(path: str | PathLike[str]) -> GltfFile:
     for name in _COMPRESSED.keys() & set(tree.get("extensionsRequired", ())):
         what = f"is compressed ({_COMPRESSED[name]}, {name}); export it again without compression"
         raise FileFormatError(file, what)
-    return GltfFile(file, tree, _open_buffers(file, tree.get("buffers", ()), binary))
+    return GltfFile(file, tree, _open_buffers(file, tree.get("buffers", []), binary))
 
 
 def compose_glb(tree: Json, binary: list[bytes]) -> list[bytes]:
