@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -190,6 +190,7 @@ def _add_tips(motion: Motion, joints: Array, turns: Array, scale: float) -> Poin
     return Points((*parents, *(j for j, _ in extra)), (*found, *(found[j] for j, _ in extra)), world)
 
 
+@runtime_checkable
 class Body(Protocol):
     """A mannequin, or a character with a mesh of its own."""
 
