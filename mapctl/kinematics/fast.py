@@ -136,8 +136,9 @@ class WorldPoses:
 @lru_cache(maxsize=16)
 def _tabulate_bones(skeleton: Skeleton) -> Bones:
     """Skeletons are compared by identity."""
-    feet = np.array(skeleton.indices(FEET))
-    return Bones(np.array(skeleton.parents), skeleton.offsets.double().numpy(), feet, find_heels(skeleton).numpy())
+    # A copy: sent to another process, a tensor moves to shared memory, and a view of where it was would dangle.
+    offsets, feet = skeleton.offsets.double().numpy().copy(), np.array(skeleton.indices(FEET))
+    return Bones(np.array(skeleton.parents), offsets, feet, find_heels(skeleton).numpy())
 
 
 def _allocate_points(features: Tensor, bones: Bones) -> tuple[Tensor, Tensor]:

@@ -144,6 +144,15 @@ def test_any_tree_and_bones():
     agree(body_of, skeleton=Skeleton(CANONICAL.names, parents, offsets))
 
 
+def test_bones_do_not_lie_in_the_memory_of_the_skeleton():
+    """Sent to another process, a tensor moves to shared memory, and where it was is soon written over."""
+    skeleton, features = Skeleton(CANONICAL.names, CANONICAL.parents, CANONICAL.offsets.clone()), encode(walk(8))[0]
+    place = (features[None].float(), torch.zeros(1, 8, 2), torch.zeros(1, 8), skeleton)
+    before = fast.compute_joints_and_heels(*place)[0]
+    skeleton.offsets.fill_(torch.nan)
+    torch.testing.assert_close(fast.compute_joints_and_heels(*place)[0], before, rtol=0, atol=0)
+
+
 def test_gradients_are_those_of_finite_differences():
     whole, step = trial(1), 1e-3
     value = everything_of(whole)
