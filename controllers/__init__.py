@@ -6,8 +6,6 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from controllers.denoising.denoise import DenoiseSettings as DenoiseSettings
     from controllers.denoising.denoise import denoise as denoise
-    from controllers.following.follow import FollowSettings as FollowSettings
-    from controllers.following.follow import follow as follow
     from controllers.generation.generate import GenerateSettings as GenerateSettings
     from controllers.generation.generate import generate as generate
     from controllers.inbetweening.blend import blend as blend
@@ -19,6 +17,8 @@ if TYPE_CHECKING:
     from controllers.inbetweening.proposers import RolloutInbetweener as RolloutInbetweener
     from controllers.inbetweening.proposers import SlerpInbetweener as SlerpInbetweener
     from controllers.inbetweening.tween import tween as tween
+    from controllers.shots.shot import follow as follow
+    from controllers.shots.walk import FollowSettings as FollowSettings
     from controllers.steering import steer as steer
     from mapctl.intent.keyframes import Drawing as Drawing
     from mapctl.intent.keyframes import Key as Key
@@ -27,7 +27,8 @@ if TYPE_CHECKING:
 # A process does one job or two, and all of them take longer to import than a second of walking takes to solve.
 _NAMES = {
     "controllers.denoising.denoise": ("DenoiseSettings", "denoise"),
-    "controllers.following.follow": ("FollowSettings", "follow"),
+    "controllers.shots.shot": ("follow",),
+    "controllers.shots.walk": ("FollowSettings",),
     "controllers.generation.generate": ("GenerateSettings", "generate"),
     "controllers.inbetweening.blend": ("blend",),
     "controllers.inbetweening.infill": ("InfillSettings", "chain", "infill", "retraced"),

@@ -105,13 +105,6 @@ class Actor:
                 return f"keys[{number}].{key.fault}"
         return None
 
-    @property
-    def wishes_more(self) -> bool:
-        """Whether more is wished than to walk along a curve."""
-        ends = self.start != "walk" or self.end != "walk"
-        told = self.curve is None or self.speed_by_time is not None or self.gait or self.style
-        return bool(ends or told or self.keys or self.loop)
-
 
 def _parse_clip_frame(text: str) -> tuple[str, int] | None:
     clip, colon, frame = text.rpartition(":")

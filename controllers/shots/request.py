@@ -2,7 +2,8 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import combinations
 
 import torch
@@ -20,7 +21,7 @@ from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS, GroundPose, encode, integrate_root
 from mapctl.inbetweening.missing import MissingMask
 from mapctl.intent.keyframes import WorldPosition
-from mapctl.intent.path import SpeedProfile, TimedSpeed
+from mapctl.intent.path import SpeedProfile, TimedSpeed, find_reversals
 from mapctl.kinematics.placing import bring_curve_points, measure_travel, move_to, rotate_about_vertical
 from mapctl.metrics import worst_frame
 from mapctl.motion import Motion
@@ -413,8 +414,8 @@ class ShotRequest:
 
     curve: Curve
     """Curve to walk, world, metres."""
-    speed: SpeedProfile | TimedSpeed = field(default_factory=lambda: SpeedProfile.constant(1.2))
-    """Speed along it."""
+    speed: SpeedProfile | TimedSpeed | None = None
+    """Speed along it; None is USUAL_SPEED, and less in corners that turn faster than people who walk do."""
     seconds: float | None = None
     """Duration, seconds; None walks the curve once."""
     lead: Lead | None = None
@@ -441,6 +442,13 @@ class ShotRequest:
     @property
     def _start(self) -> Float[Tensor, "2"]:
         return self.curve.ground_point(0.0)
+
+    @cached_property
+    def walks_only(self) -> bool:
+        """Whether it is nothing but a walk along the curve, in its stride, which needs no in-betweener."""
+        ends = self.begins_standing or self.ends_standing or self.lead or self.arrival or self.loop
+        more = self._named_keys or self.obstacles or self.others or isinstance(self.speed, TimedSpeed)
+        return not (ends or more) and (self.curve.closed or not find_reversals(self.curve))
 
     @property
     def begins_standing(self) -> bool:

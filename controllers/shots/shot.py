@@ -12,7 +12,7 @@ in-betweener makes of it is judged as a viewer would.
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial, reduce
 from itertools import pairwise, product
@@ -23,7 +23,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from controllers.common.character import Character
-from controllers.following.follow import FollowSettings, walk_arcs
 from controllers.inbetweening.pipeline import fill
 from controllers.shots.posing import (
     MetPose,
@@ -50,16 +49,21 @@ from controllers.shots.request import (
     join_across,
     measure_transition_cost,
 )
+from controllers.shots.walk import FollowSettings, check_path, check_tracking, walk_arcs
 from controllers.shots.way import Span, Way, cut_curve, lay_timeline, plan_way
+from mapctl.curves import Curve
 from mapctl.curves.obstacles import measure_clearance
-from mapctl.errors import MapctlError
+from mapctl.errors import MapctlError, RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening.effector_targets import compute_target_errors
 from mapctl.inbetweening.missing import MissingMask
+from mapctl.intent.path import SpeedProfile, find_reversals, walk_at_ease
 from mapctl.kinematics.placing import move_to, rotate_about_vertical
 from mapctl.motion import Motion
-from mapctl.problem.solution import Ledger, Outcome, Solution, Status, WindowRecord
+from mapctl.problem.receding_horizon import CommittedFrames
+from mapctl.problem.solution import Ledger, Outcome, Solution, Status
 from mapctl.protocols import Density, Inbetweener
+from mapctl.runtime.progress import Progress
 from mapctl.skeleton import CANONICAL, LIMBS, TOES, Skeleton
 from mapctl.terms import KeepApart, KeepClear, Term
 
@@ -172,26 +176,39 @@ def walk_pieces(
     character: Character,
     settings: FollowSettings,
     generator: torch.Generator,
-    progress: Callable[[int, int], None] | None = None,
-) -> tuple[list[Piece], list[tuple[Ledger, tuple[WindowRecord, ...]]]]:
-    """Stand and walk along a way, span by span; also return ledger and windows of each walk."""
-    frames = len(way.speeds)
+    terms: Sequence[Term] = (),
+    progress: Progress | None = None,
+    deadline: float | None = None,
+) -> tuple[list[Piece], list[CommittedFrames], Outcome]:
+    """Stand and walk along a way, span by span; also return what was solved for each walk, and how that ended."""
+    frames, outcome = len(way.speeds), Outcome.DONE
     reach = ReachTargets.of(request.reaches, frames)
     pieces, walked = [], []
-    for span in lay_timeline(way.speeds, slowest=character.data_limits(prior.limits).slowest):
+    slowest = character.data_limits(prior.limits).slowest
+    walks_only = request.walks_only  # at a speed that is nearly none, too
+    for span in [Span("walk", 0, frames)] if walks_only else lay_timeline(way.speeds, slowest=slowest):
         if span.what == "stand":
             lead = request.lead if span.start == 0 else None
             standing = _stand(rest, way, span) if lead is None else lead.last_pose
             pieces.append(Piece(span, spread_over(standing, 0, frames)))
             continue
-        motion, ledger, windows = _walk(
-            prior, way, span, request, reach, character=character, settings=settings, generator=generator
+        motion, done, outcome = _walk(
+            prior,
+            way,
+            span,
+            request,
+            reach,
+            character=character,
+            settings=settings,
+            generator=generator,
+            terms=terms,
+            progress=progress,
+            deadline=deadline,
         )
-        pieces.append(Piece(span, spread_over(motion, span.start, frames)))
-        walked.append((ledger, windows))
-        if progress is not None:
-            progress(span.stop, frames)
-    return pieces, walked
+        part = motion if outcome is not Outcome.DONE else spread_over(motion, span.start, frames)
+        pieces.append(Piece(span, part))
+        walked.append(done)
+    return pieces, walked, outcome
 
 
 def _walk(
@@ -204,7 +221,10 @@ def _walk(
     character: Character,
     settings: FollowSettings,
     generator: torch.Generator,
-) -> tuple[Motion, Ledger, tuple[WindowRecord, ...]]:
+    terms: Sequence[Term],
+    progress: Progress | None,
+    deadline: float | None,
+) -> tuple[Motion, CommittedFrames, Outcome]:
     """Walk the frames of a span, and some more at its last speed where another span follows."""
     tail = TAIL if span.stop < len(way.speeds) else 0
     frames = span.stop - span.start + tail
@@ -215,18 +235,22 @@ def _walk(
 
     def terms_of(first: int, count: int) -> Sequence[Term]:
         begin = span.start + first
-        terms: list[Term] = list(reach.terms(character.skeleton, begin, count))
+        found = [*terms, *reach.terms(character.skeleton, begin, count)]
         if request.obstacles:
-            terms.append(KeepClear(request.obstacles))
+            found.append(KeepClear(request.obstacles))
         if request.others is not None:
             last = request.others.hips.shape[1] - 1
             hips = request.others.hips[:, torch.arange(begin, begin + count).clamp(max=last)]
-            terms.append(KeepApart(hips, request.others.distance + 0.05))
-        return terms
+            found.append(KeepApart(hips, request.others.distance + 0.05))
+        return found
+
+    def report_frames(done: int, _: int) -> None:
+        if progress is not None:
+            progress(min(span.start + done, span.stop), len(way.speeds))
 
     start = request.lead.start(prior, character) if request.lead is not None and span.start == 0 else None
     best, least = None, math.inf
-    for _ in range(_TRIES):
+    for _ in range(_TRIES if not request.walks_only or _pivots(request, way.curve) else 1):
         motion, done, outcome = walk_arcs(
             prior,
             curve,
@@ -237,14 +261,19 @@ def _walk(
             generator=generator,
             terms_of=terms_of,
             start=start,
+            first_frame=span.start,
+            progress=report_frames,
+            deadline=deadline,
         )
-        if outcome is Outcome.INTERRUPTED:  # half a shot is none: its other half would stand still
-            raise KeyboardInterrupt
         if outcome is not Outcome.DONE:
+            if request.walks_only:
+                return motion, done, outcome
+            if outcome is Outcome.INTERRUPTED:  # half a shot is none: its other half would stand still
+                raise KeyboardInterrupt
             raise MapctlError(f"the walk from frame {span.start} on {outcome.value}")
         fault = _judge_walk(motion, curve.ground_point(arcs[:frames]))
         if fault < least:
-            best, least = (motion, done.ledger, done.windows), fault
+            best, least = (motion, done, outcome), fault
         if fault <= 1:
             break
     assert best is not None
@@ -341,7 +370,7 @@ def check_wishes(request: ShotRequest, way: Way, motion: Motion, met: Sequence[M
     positions = motion.joint_positions()
     hips = positions[:, 0, ::2]
     away = _find_frames_away(request, way)
-    found = [_check_path(way, hips, away), _check_progress(way, hips, away)]
+    found = [_check_path(way, positions[:, 0], away), _check_progress(way, hips, away)]
     if request.loop:
         found.append(_check_seam(positions))
     for reach in request.reaches:
@@ -383,7 +412,7 @@ def check_wishes(request: ShotRequest, way: Way, motion: Motion, met: Sequence[M
 def describe_fights(wishes: Sequence[Wish], way: Way, motion: Motion) -> list[str]:
     """Describe every wish that does not hold: by how much, what else is wished at that time and how that fares there,
     and what would settle it."""
-    sentences, offsets = [], _measure_offsets(way, motion.root_position[:, ::2])
+    sentences, offsets = [], _measure_offsets(way, motion.root_position)
     for one in wishes:
         if one.holds:
             continue
@@ -469,9 +498,9 @@ def _find_frames_away(request: ShotRequest, way: Way) -> Tensor:
 
 
 def _measure_offsets(way: Way, hips: Tensor) -> Tensor:
-    """Measure the distance of the hips to the way by frame, metres."""
-    near = way.wished.nearest(hips, way.wished_arcs)
-    return (hips - way.wished.ground_point(near)).norm(dim=-1)
+    """Measure the distance of the hips to the way by frame, metres: over the ground, or in space if the curve is."""
+    points = hips if way.wished.dims == 3 else hips[:, ::2]
+    return (points - way.wished.point(way.wished.nearest(points, way.wished_arcs))).norm(dim=-1)
 
 
 OVERLAP = 54
@@ -552,10 +581,6 @@ def find_jumps(motion: Motion) -> Bool[Tensor, " steps"]:
     return ((speed > _JUMP_SPEED) & (speed > _JUMP_RATIO * beside)).any(dim=1)
 
 
-_CORNER_STEP, _CORNER_CURVATURE = 0.1, 1.5
-# metres between the places where a way's curvature is looked at, and the 1/m from which on it is a corner
-
-
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class ShotSolution(Solution):
     """A shot's motion and what became of every wish."""
@@ -576,20 +601,28 @@ class ShotSolution(Solution):
 
 def solve_shot(
     prior: Density,
-    inbetweener: Inbetweener,
+    inbetweener: Inbetweener | None,
     request: ShotRequest,
     *,
     generator: torch.Generator | None = None,
     settings: FollowSettings | None = None,
     skeleton: Skeleton = CANONICAL,
-    progress: Callable[[int, int], None] | None = None,
+    terms: Sequence[Term] = (),
+    progress: Progress | None = None,
+    deadline_seconds: float | None = None,
 ) -> ShotSolution:
     """Make a motion in which all wishes of the request hold, at PRIOR_FPS, on the canonical joints of `skeleton`.
 
-    Wishes that do not hold are named with numbers in the status, which is then infeasible.
+    Where nothing but a walk is requested, no `inbetweener` is needed, and after `deadline_seconds` of wall clock, and
+    at Ctrl-C, the solution so far is returned and the status says so. `terms` are the caller's own, in every window of
+    the walks; they see the character at its own size and the time since the first frame. On another `skeleton`
+    strides are as long as its legs, and the toes' rest height is that of the settings' footing. Wishes that do not hold
+    are named with numbers in the status, which is then infeasible.
     """
-    began = time.perf_counter()
-    settings, generator = settings or FollowSettings(), generator or torch.Generator().manual_seed(0)
+    if inbetweener is None and not request.walks_only:
+        raise RequestError("standing, reversing, keys and clips need an in-betweener, and none is given")
+    began, settings = time.perf_counter(), settings or FollowSettings()
+    deadline = None if deadline_seconds is None else time.monotonic() + deadline_seconds
     character = Character(skeleton, settings.footing.rest_height)
     way = plan_way(request)
     rest = build_rest_pose(prior, skeleton, character.toe_rest_height)
@@ -598,28 +631,39 @@ def solve_shot(
     request = replace(request, reaches=(*request.reaches, *told), poses=poses)
     check_reaches(request.reaches, way, rest)
     way = lean_way(way, request, rest)
-    walked_way = way.walked_on(OVERLAP) if request.loop else way
-    pieces, walked = walk_pieces(
+    if _pivots(request, way.curve):
+        settings = replace(settings, footing=replace(settings.footing, heels=None))
+    pieces, walked, outcome = walk_pieces(
         prior,
         request,
-        walked_way,
+        way.walked_on(OVERLAP) if request.loop else way,
         rest,
         character=character,
-        settings=_free_heels_at_corners(settings, way),
-        generator=generator,
+        settings=settings,
+        generator=generator or torch.Generator().manual_seed(0),
+        terms=terms,
         progress=progress,
+        deadline=deadline,
     )
-    motion = _join_walks(pieces, request, way, inbetweener)
-    motion, reaches, met = _meet_keys(motion, request, way, inbetweener)
-    wishes = check_wishes(replace(request, reaches=reaches), way, motion, met)
+    motion, reaches, met = pieces[0].motion, request.reaches, ()
+    if inbetweener is not None:
+        motion = _join_walks(pieces, request, way, inbetweener)
+        motion, reaches, met = _meet_keys(motion, request, way, inbetweener)
     notes = [way.note] if way.note else []
+    if request.walks_only and request.speed is not None:
+        notes += check_path(way.curve, way.arcs, character.data_limits(prior.limits))
+    if request.walks_only:
+        notes += check_tracking(motion, way.curve)
+    way = way.slice(motion.num_frames)
+    wishes = check_wishes(replace(request, reaches=reaches), way, motion, met)
     notes += describe_fights(wishes, way, motion)
     return ShotSolution(
         motion,
-        Status(Outcome.DONE).with_notes(notes, infeasible=bool(notes)),
-        character.ledger(reduce(Ledger.join, (ledger for ledger, _ in walked), Ledger())),
-        tuple(window for _, windows in walked for window in windows),
-        seconds=time.perf_counter() - began,
+        Status(outcome).with_notes(notes, infeasible=bool(notes)),
+        character.ledger(reduce(Ledger.join, (done.ledger for done in walked), Ledger())),
+        tuple(window for done in walked for window in done.windows),
+        walked[0].features if request.walks_only else None,
+        time.perf_counter() - began,
         way=way,
         wishes=wishes,
         reaches=reaches,
@@ -627,13 +671,43 @@ def solve_shot(
     )
 
 
-def _free_heels_at_corners(settings: FollowSettings, way: Way) -> FollowSettings:
-    """Leave heels out of the footing where a way has a corner: a foot pivots there while it lies flat."""
-    curve = way.curve
-    arcs = torch.arange(0.0, curve.length, _CORNER_STEP, dtype=torch.float64)
-    turning = curve.curvature(arcs).abs()
-    cornered = len(turning) > 0 and float(turning.max()) > _CORNER_CURVATURE
-    return replace(settings, footing=replace(settings.footing, heels=None)) if cornered else settings
+def follow(
+    prior: Density,
+    curve: Curve,
+    *,
+    seconds: float | None = None,
+    speed: float | SpeedProfile | None = None,
+    inbetweener: Inbetweener | None = None,
+    generator: torch.Generator | None = None,
+    settings: FollowSettings | None = None,
+    skeleton: Skeleton = CANONICAL,
+    terms: Sequence[Term] = (),
+    progress: Progress | None = None,
+    deadline_seconds: float | None = None,
+) -> ShotSolution:
+    """Walk a character along a curve from its first point, facing along it: a shot with nothing but a curve.
+
+    `speed` is m/s or a profile along the arc; without one it is the usual speed, and less in corners. Without `seconds`
+    the curve is walked once. An `inbetweener` is needed where the curve reverses. See `solve_shot` for the rest.
+    RequestError for requests that make no sense; infeasible ones are named with numbers in the status.
+    """
+    profile = SpeedProfile.constant(speed) if isinstance(speed, float | int) else speed
+    return solve_shot(
+        prior,
+        inbetweener,
+        ShotRequest(curve, profile, seconds),
+        generator=generator,
+        settings=settings,
+        skeleton=skeleton,
+        terms=terms,
+        progress=progress,
+        deadline_seconds=deadline_seconds,
+    )
+
+
+def _pivots(request: ShotRequest, curve: Curve) -> bool:
+    """Return whether a foot pivots while it lies flat: in corners of a curve that are slowed for."""
+    return request.speed is None and bool(len(walk_at_ease(curve).speeds) > 1 or find_reversals(curve))
 
 
 def _join_walks(pieces: Sequence[Piece], request: ShotRequest, way: Way, inbetweener: Inbetweener) -> Motion:

@@ -19,7 +19,7 @@ from mapctl.curves import Curve
 from mapctl.curves.obstacles import measure_clearance
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
-from mapctl.intent.path import PathRequest, SpeedProfile, TimedSpeed, find_reversals, integrate_speeds, slow_for_corners
+from mapctl.intent.path import PathRequest, SpeedProfile, TimedSpeed, find_reversals, integrate_speeds, walk_at_ease
 from mapctl.numerics.intervals import true_intervals
 
 ClearanceOf = Callable[[Float[Tensor, "arcs offsets 2"], Float[Tensor, " arcs"]], Float[Tensor, "arcs offsets"]]
@@ -260,6 +260,13 @@ class Way:
     """How far aside of that the way leads, metres."""
     note: str | None = None
     """What was changed about the request, or why it cannot hold."""
+    blocked: bool = False
+    """Whether no way leads around the obstacles and past the others."""
+
+    def slice(self, frames: int) -> "Way":
+        """Return the way of the first frames."""
+        cut = {name: getattr(self, name)[:frames] for name in ("speeds", "arcs", "wished_arcs", "aside")}
+        return replace(self, **cut)
 
     def walked_on(self, frames: int) -> "Way":
         """Return the way of a loop, walked on for some more frames."""
@@ -275,10 +282,9 @@ class Way:
 def plan_way(request: ShotRequest) -> Way:
     """Plan the way of a shot: first around obstacles, then past others, who are met where the plan is when they are
     there. Where no way leads through the curve stays as it is, and a note says so."""
-    speeds = _plan_speeds(request, request.curve)
-    arcs = integrate_speeds(speeds, PRIOR_FPS)
+    way = _plan_along(request, request.curve)
     if not request.obstacles and request.others is None:
-        return _plain(request.curve, speeds)
+        return way
 
     at_start = float(measure_clearance(request.obstacles, request.curve.ground_point(0.0)[None]))
 
@@ -289,21 +295,13 @@ def plan_way(request: ShotRequest) -> Way:
         return (
             clear
             if request.others is None
-            else torch.minimum(clear, _clear_of_others(points, at, arcs, request.others))
+            else torch.minimum(clear, _clear_of_others(points, at, way.arcs, request.others))
         )
 
     offsets = find_detour(request.curve, clearance)
     if offsets is None:
-        note = "no way leads around the obstacles and past the others"
-        return replace(_plain(request.curve, speeds), note=note)
-    curve = apply_detour(request.curve, offsets)
-    speeds = _plan_speeds(request, curve)
-    return _plain(curve, speeds)
-
-
-def _plain(curve: Curve, speeds: Float[Tensor, " frames"]) -> Way:
-    arcs = integrate_speeds(speeds, PRIOR_FPS)
-    return Way(curve, speeds, arcs, curve, arcs, torch.zeros_like(arcs))
+        return replace(way, note="no way leads around the obstacles and past the others", blocked=True)
+    return _plan_along(request, apply_detour(request.curve, offsets))
 
 
 def bend_way(way: Way, offsets: Float[Tensor, " arcs"], met: Sequence[float]) -> Way:
@@ -331,31 +329,36 @@ def bend_way(way: Way, offsets: Float[Tensor, " arcs"], met: Sequence[float]) ->
     return replace(way, curve=curve, speeds=speeds, arcs=arcs, wished_arcs=way.arcs, aside=moved)
 
 
-def _plan_speeds(request: ShotRequest, curve: Curve) -> Float[Tensor, " frames"]:
-    """Plan the speed at each frame; a shot without a duration lasts until the curve ends."""
-    ends = StandingEnds(request.begins_standing, request.ends_standing)
+def _plan_along(request: ShotRequest, curve: Curve) -> Way:
+    """Plan when a character is where along a curve; a shot without a duration lasts until the curve ends."""
+    ends, arcs, note = StandingEnds(request.begins_standing, request.ends_standing), None, None
     if isinstance(request.speed, TimedSpeed):
         frames = max(2, round((request.seconds or 0.0) * PRIOR_FPS))
-        return limit_timed_speeds(request.speed.at(frames, PRIOR_FPS), PRIOR_FPS, ends)
-    if (reversals := find_reversals(curve)) and not curve.closed:
-        return _plan_reversals(request, curve, reversals, ends)
-    path, _ = PathRequest(curve, slow_for_corners(curve, request.speed), request.seconds).fitted(PRIOR_FPS)
-    frames = path.frames(PRIOR_FPS)
-    if ends.start or ends.end:
-        length = math.inf if curve.closed and request.seconds is not None else curve.length
-        return plan_speeds(path.profile, length, PRIOR_FPS, ends, seconds=request.seconds, most=_MOST_FRAMES)
-    arcs = path.arcs(frames, PRIOR_FPS)
-    speeds = torch.tensor([path.profile.at(float(arc)) for arc in arcs], dtype=torch.float64)
-    # A loop's frame after its last is its first again.
-    return speeds * (curve.length * PRIOR_FPS / speeds.sum()) if request.loop else speeds
+        speeds = limit_timed_speeds(request.speed.at(frames, PRIOR_FPS), PRIOR_FPS, ends)
+    elif not curve.closed and (reversals := find_reversals(curve)):
+        speeds = _plan_reversals(request, curve, reversals, ends)
+    else:
+        path, note = PathRequest(curve, request.speed or walk_at_ease(curve), request.seconds).fitted(PRIOR_FPS)
+        arcs = path.arcs(path.frames(PRIOR_FPS), PRIOR_FPS)
+        speeds = torch.tensor([path.profile.at(float(arc)) for arc in arcs], dtype=torch.float64)
+        if ends.start or ends.end:
+            length = math.inf if curve.closed and request.seconds is not None else curve.length
+            speeds = plan_speeds(path.profile, length, PRIOR_FPS, ends, seconds=request.seconds, most=_MOST_FRAMES)
+            arcs = note = None
+        elif request.loop:  # its frame after its last is its first again
+            speeds, arcs = speeds * (curve.length * PRIOR_FPS / speeds.sum()), None
+        elif request.speed is None:
+            arcs = None
+    arcs = integrate_speeds(speeds, PRIOR_FPS) if arcs is None else arcs
+    return Way(curve, speeds, arcs, curve, arcs, torch.zeros_like(arcs), note)
 
 
 def _plan_reversals(
     request: ShotRequest, curve: Curve, reversals: Sequence[float], ends: StandingEnds
 ) -> Float[Tensor, " frames"]:
     """Plan speeds along a curve that reverses: to a standing at each reversal, and on from there."""
-    assert isinstance(request.speed, SpeedProfile)
-    profile, stops, speeds = slow_for_corners(curve, request.speed), [0.0, *reversals, curve.length], []
+    assert not isinstance(request.speed, TimedSpeed)
+    profile, stops, speeds = request.speed or walk_at_ease(curve), [0.0, *reversals, curve.length], []
     for number, (start, stop) in enumerate(pairwise(stops)):
         last = number == len(reversals)
         piece = replace(

@@ -10,7 +10,8 @@ import torch
 
 import priors
 from controllers.common.initial_state import select_initial_state
-from controllers.following.follow import FollowSettings, build_follow_terms, follow
+from controllers.shots.shot import follow
+from controllers.shots.walk import FollowSettings, build_follow_terms
 from controllers.steering import steer
 from mapctl import curves, report
 from mapctl.commands.shared import options

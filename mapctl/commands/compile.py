@@ -7,11 +7,11 @@ from typing import ClassVar
 import torch
 
 import priors
+from controllers.shots.shot import follow
 from controllers.steering import steer
 from mapctl import curves
 from mapctl.commands.shared.command import ModelCommand
 from mapctl.commands.shared.progress_bar import show_progress
-from mapctl.commands.shared.shots import parse_follow, walk
 from mapctl.intent.steering import Command
 
 
@@ -38,7 +38,7 @@ def run(command: CompileKernels) -> int:
 
 def _use_kernels() -> None:
     prior, generator = priors.load("locomotion"), torch.Generator().manual_seed(0)
-    walk(prior, parse_follow(curves.line(length=1.0), None, 0.1), seed=0)
+    follow(prior, curves.line(length=1.0), seconds=0.1)
     ahead = Command(1.0, 0.0)
     state, _ = steer.begin(prior, ahead, generator=generator)
     steer.step(state, ahead)

@@ -5,13 +5,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import priors
+from controllers.common.character import Character
 from mapctl import report
 from mapctl.commands.shared import inputs, options, outputs
 from mapctl.commands.shared.command import INTERRUPTED, ModelCommand
 from mapctl.commands.shared.progress_bar import show_progress
-from mapctl.commands.shared.shots import Walk, parse_follow, walk
+from mapctl.commands.shared.shots import PlayedShot, plan_shot, play_shot
 from scenes.cameras import CameraSettings
 from scenes.film import film
+from scenes.scene_file import Actor
 
 
 @dataclass(frozen=True)
@@ -44,10 +46,12 @@ def run(command: Demo) -> int:
     options.check_seed(command.seed)
     outputs.check_folder(command.out)
     missing = {ending: outputs.find_missing_render(ending) for ending in ("mp4", "png")}
-    request = parse_follow(inputs.read_curve(CURVE, None), SPEED, None)
-    prior = priors.load(command.prior)
+    actor, curve = Actor(curve=CURVE, speed=SPEED, seed=command.seed), inputs.read_curve(CURVE, None)
+    plan = plan_shot(
+        actor, curve, priors.load(command.prior), character=Character(), folder=Path(), options=options.ReadOptions()
+    )
     with show_progress("walking", quiet=command.quiet) as progress:
-        done = walk(prior, request, seed=command.seed, progress=progress)
+        done = play_shot(plan, progress=progress)
     with outputs.make_folder(command.out) as folder:
         pictures = () if done.interrupted else (ending for ending, lacking in missing.items() if not lacking)
         files = {ending: folder / f"figure8.{ending}" for ending in ("bvh", "json", *pictures)}
@@ -66,7 +70,7 @@ def _describe_missing(missing: Mapping[str, Sequence[str]]) -> str:
     return f"{endings}: {outputs.describe_missing_render(packages)}"
 
 
-def _write(command: Demo, done: Walk, files: dict[str, Path]) -> None:
+def _write(command: Demo, done: PlayedShot, files: dict[str, Path]) -> None:
     outputs.save_motion(done.solution.motion, files["bvh"])
     request = options.describe_request("demo", command) | {"curve": CURVE, "speed": SPEED}
     report.write_report(done.report(request), files["json"])

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from tyro.conf import Positional, UseAppendAction, arg
 
@@ -14,17 +14,14 @@ from mapctl.commands.shared import inputs, options, outputs
 from mapctl.commands.shared.command import ModelCommand, conclude
 from mapctl.commands.shared.inputs import read_character
 from mapctl.commands.shared.progress_bar import show_progress
-from mapctl.commands.shared.shots import ShotPlan, Walk, parse_follow, plan_shot, walk
+from mapctl.commands.shared.shots import PlayedShot, ShotPlan, build_obstacles, plan_shot, play_shot, stage_actor
 from mapctl.curves import Curve
 from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import RequestError
-from mapctl.intent.path import turns_sharply
-from mapctl.intent.shot_keys import read_shot_keys
+from mapctl.intent.shot_keys import read_shot_keys, read_shot_weights
 from priors.lstm_gmm.density import LstmGmmDensity
+from scenes.film import film
 from scenes.scene_file import Actor
-
-if TYPE_CHECKING:
-    from mapctl.commands.shared.shots import PlayedShot
 
 
 @dataclass(frozen=True)
@@ -90,37 +87,21 @@ def _find_weights(command: FollowCurve) -> str | None:
     """Find the set of weights: of the option, else of the file of keys."""
     if command.weights is not None or command.keys is None:
         return command.weights
-    from mapctl.intent.shot_keys import read_shot_weights
-
     return read_shot_weights(command.keys)
 
 
 def _follow(command: FollowCurve) -> int:
     curve = inputs.read_curve(command.curve, command.metres_per_unit)
-    request = parse_follow(curve, command.speed, command.seconds)
     character, prior = read_character(command.rig, command), priors.load(command.prior)
-    cornering = command.speed is None and turns_sharply(curve)
-    if cornering or _wishes_more(command):
-        from mapctl.commands.shared.shots import play_shot
-
-        planned = plan_walk(command, curve, prior, character)
-        with show_progress("walking", quiet=command.quiet) as progress:
-            done = play_shot(planned, [], priors.load_inbetweener(), progress=progress)
-    else:
-        with show_progress("walking", quiet=command.quiet) as progress:
-            done = walk(prior, request, seed=command.seed, progress=progress, character=character)
+    plan = plan_walk(command, curve, prior, character)
+    with show_progress("walking", quiet=command.quiet) as progress:
+        done = play_shot(plan, progress=progress)
     video = None if done.interrupted else command.video
     _write(command, done, video)
     if not command.quiet:
         files = ", ".join(map(str, options.collect_paths(command.out, video, command.report)))
         print("\n".join([*done.summary(), f"wrote     {files}"]))
     return conclude(done.solution.status, strict=command.strict)
-
-
-def _wishes_more(command: FollowCurve) -> bool:
-    """Return whether more is wished than to walk along a curve."""
-    told = command.keys is not None or command.gait or command.style or command.fps is not None
-    return bool(told or command.avoid or command.start != "walk" or command.end != "walk" or command.loop)
 
 
 def _check(command: FollowCurve) -> None:
@@ -133,7 +114,7 @@ def _check(command: FollowCurve) -> None:
         outputs.check_film(command.video, _SIZE)
 
 
-def _write(command: FollowCurve, done: "Walk | PlayedShot", video: Path | None) -> None:
+def _write(command: FollowCurve, done: PlayedShot, video: Path | None) -> None:
     outputs.save_motion(done.on_rig, command.out)
     if command.report is not None:
         report.write_report(done.report(options.describe_request("follow", command)), command.report)
@@ -141,10 +122,7 @@ def _write(command: FollowCurve, done: "Walk | PlayedShot", video: Path | None) 
         _film(command, done, video)
 
 
-def _film(command: FollowCurve, done: "Walk | PlayedShot", video: Path) -> None:
-    from mapctl.commands.shared.shots import build_obstacles, stage_actor
-    from scenes.film import film
-
+def _film(command: FollowCurve, done: PlayedShot, video: Path) -> None:
     with show_progress("filming", quiet=command.quiet) as progress:
         film([stage_actor(done)], video, size=_SIZE, props=build_obstacles([done]), progress=progress)
 

@@ -19,19 +19,15 @@ from mapctl.commands.shared.progress_bar import show_progress
 from mapctl.commands.shared.shots import (
     PlayedShot,
     ShotPlan,
-    Walk,
     build_obstacles,
     let_others_pass,
-    parse_follow,
     plan_shot,
     play_shot,
     print_notes,
     stage_actor,
-    walk,
 )
 from mapctl.curves import Curve
 from mapctl.errors import FileFormatError, RequestError
-from mapctl.intent.path import PathRequest, turns_sharply
 from priors.lstm_gmm.density import LstmGmmDensity
 from scenes.drawn_character import DrawnCharacter
 from scenes.film import film
@@ -80,7 +76,7 @@ def _run_scene(command: RunScene, path: Path, scene: SceneDescription, curves: S
     outputs.check_folder(command.out)
     for film_path in scene.films(command.out):
         outputs.require_render("av" if film_path.suffix.lower() == ".mp4" else "PIL")
-    walks, interrupted = _solve(command, scene, plans, prior, characters)
+    walks, interrupted = _solve(command, scene, plans)
     with outputs.make_folder(command.out):
         _write(command, scene, walks, films=() if interrupted else scene.films(command.out), drawn=drawn)
     if interrupted:
@@ -96,11 +92,8 @@ def _plan(
     prior: LstmGmmDensity,
     character: Character,
     path: Path,
-) -> PathRequest | ShotPlan:
-    """Plan what an actor does: a walk along its curve, or a shot where it is to do more."""
-    cornering = actor.speed is None and turns_sharply(curve)
-    if not (actor.wishes_more or scene.obstacles or scene.keep_apart is not None or cornering):
-        return parse_follow(curve, actor.speed, actor.seconds)
+) -> ShotPlan:
+    """Plan an actor's shot."""
     obstacles = [obstacle.build() for obstacle in scene.obstacles]
     try:
         return plan_shot(
@@ -129,47 +122,28 @@ def _read_drawn(command: RunScene, scene: SceneDescription, path: Path) -> Drawn
     return [read[file] for file in named]
 
 
-def _solve(
-    command: RunScene,
-    scene: SceneDescription,
-    plans: Sequence[PathRequest | ShotPlan],
-    prior: LstmGmmDensity,
-    characters: Sequence[Character],
-) -> tuple[list[Walk | PlayedShot], bool]:
+def _solve(command: RunScene, scene: SceneDescription, plans: Sequence[ShotPlan]) -> tuple[list[PlayedShot], bool]:
     """Solve for the first actors, for all unless Ctrl-C came, and return whether it did."""
-    done: list[Walk | PlayedShot] = []
-    shots = any(isinstance(plan, ShotPlan) for plan in plans)
+    done: list[PlayedShot] = []
     if scene.keep_apart is not None:
-        plans = let_others_pass([plan for plan in plans if isinstance(plan, ShotPlan)], scene.keep_apart)
-    inbetweener = priors.load_inbetweener() if shots else None
-    for actor, plan, character in zip(scene.actors, plans, characters, strict=True):
+        plans = let_others_pass(plans, scene.keep_apart)
+    for plan in plans:
         try:
-            with show_progress(actor.name, quiet=command.quiet) as progress:
-                if isinstance(plan, PathRequest) or inbetweener is None:
-                    assert isinstance(plan, PathRequest)
-                    done.append(walk(prior, plan, seed=actor.seed, progress=progress, character=character))
-                else:
-                    earlier = [one for one in done if isinstance(one, PlayedShot)]
-                    made = play_shot(plan, earlier, inbetweener, keep_apart=scene.keep_apart, progress=progress)
-                    done.append(made)
+            with show_progress(plan.actor.name, quiet=command.quiet) as progress:
+                done.append(play_shot(plan, done, keep_apart=scene.keep_apart, progress=progress))
         except KeyboardInterrupt:
             if not done:
                 raise
             return done, True
         if not command.quiet:
-            print("\n".join([f"{actor.name}:", *(f"  {line}" for line in done[-1].summary())]))
+            print("\n".join([f"{plan.actor.name}:", *(f"  {line}" for line in done[-1].summary())]))
         if done[-1].interrupted:
             return done, True
     return done, False
 
 
 def _write(
-    command: RunScene,
-    scene: SceneDescription,
-    walks: Sequence[Walk | PlayedShot],
-    *,
-    films: Sequence[Path],
-    drawn: Drawn,
+    command: RunScene, scene: SceneDescription, walks: Sequence[PlayedShot], *, films: Sequence[Path], drawn: Drawn
 ) -> None:
     motions, reports = scene.motions(command.out), scene.reports(command.out)
     begun = scene.actors[: len(walks)]
@@ -189,7 +163,7 @@ def _write(
 
 
 def _film(
-    command: RunScene, scene: SceneDescription, walks: Sequence[Walk | PlayedShot], films: Sequence[Path], drawn: Drawn
+    command: RunScene, scene: SceneDescription, walks: Sequence[PlayedShot], films: Sequence[Path], drawn: Drawn
 ) -> None:
     shots = [
         stage_actor(done, colour=actor.colour, start_seconds=actor.start_seconds, character=character)
@@ -202,7 +176,7 @@ def _film(
         print_notes(shots)
 
 
-def _report(command: RunScene, scene: SceneDescription, walks: Sequence[Walk | PlayedShot]) -> dict[str, Any]:
+def _report(command: RunScene, scene: SceneDescription, walks: Sequence[PlayedShot]) -> dict[str, Any]:
     """Build the report, by actor of each walk that has begun."""
     request = options.describe_request("run", command) | {"title": scene.title}
     actors = {

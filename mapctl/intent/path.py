@@ -186,9 +186,10 @@ _REVERSAL_ANGLE = math.radians(110.0)  # from which on a corner is turned on the
 _BRAKING = 0.9  # m/s^2, before a corner and after it
 
 
-def slow_for_corners(curve: Curve, profile: SpeedProfile) -> SpeedProfile:
-    """Return a speed profile that is lower before and in corners that turn faster than people who walk do; the same
-    one where none does."""
+def walk_at_ease(curve: Curve) -> SpeedProfile:
+    """Return the speeds of a walk for which none is given: USUAL_SPEED, and lower before and in corners that turn
+    faster than people who walk do."""
+    profile = SpeedProfile.constant(USUAL_SPEED)
     count = max(2, round(curve.length / _STEP) + 1)
     arcs = torch.linspace(0, curve.length, count, dtype=torch.float64)
     wanted = torch.tensor([profile.at(arc) for arc in arcs.tolist()], dtype=torch.float64)
@@ -202,12 +203,6 @@ def slow_for_corners(curve: Curve, profile: SpeedProfile) -> SpeedProfile:
         if curve.closed:
             speeds[0] = speeds[-1] = min(speeds[0], speeds[-1])
     return SpeedProfile(tuple(arcs.tolist()), tuple(speeds))
-
-
-def turns_sharply(curve: Curve) -> bool:
-    """Return whether a curve has corners, at the usual speed, or reverses."""
-    usual = SpeedProfile.constant(USUAL_SPEED)
-    return slow_for_corners(curve, usual) is not usual or bool(find_reversals(curve))
 
 
 def find_reversals(curve: Curve) -> list[float]:

@@ -12,7 +12,7 @@ from strange_rigs import CASES
 
 import controllers
 import mapctl
-from controllers.following.follow import FollowSettings
+from controllers.shots.walk import FollowSettings
 from mapctl import curves, retarget
 from mapctl.problem.receding_horizon import HorizonSettings
 from mapctl.problem.window_solvers import LatentNoiseSolver

@@ -17,7 +17,7 @@ from rig_maker import Make, make, names_of
 
 import mapctl
 import priors
-from controllers.following.follow import follow
+from controllers.shots.shot import follow
 from mapctl import contacts, curves, formats, retarget
 from mapctl.commands.shared import inputs
 from mapctl.motion import Motion

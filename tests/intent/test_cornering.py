@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 
 from mapctl import curves
-from mapctl.intent.path import SpeedProfile, find_reversals, slow_for_corners, turns_sharply
-
-USUAL = SpeedProfile.constant(1.2)
+from mapctl.intent.path import USUAL_SPEED, find_reversals, walk_at_ease
 
 
 def polygon(*points, closed=False):
@@ -14,17 +12,15 @@ def polygon(*points, closed=False):
 
 
 @pytest.mark.parametrize("shape", ["line:5", "circle:1", "circle:4", "wave:0.8x8", "figure8:1.5", "s:8"])
-def test_gentle_curves_are_walked_as_fast_as_asked(shape):
-    assert slow_for_corners(curves.read(shape), USUAL) is USUAL
-    assert not turns_sharply(curves.read(shape))
+def test_gentle_curves_are_walked_at_the_usual_speed_throughout(shape):
+    assert walk_at_ease(curves.read(shape)).speeds == (USUAL_SPEED,)
 
 
 @pytest.mark.parametrize("degrees", [90, 130, -90])
 def test_a_corner_is_slowed_for_in_time_and_left_again(degrees):
     turn = np.radians(degrees)
     curve = polygon((0, 0), (0, 4), (4 * np.sin(turn), 4 + 4 * np.cos(turn)))
-    profile = slow_for_corners(curve, USUAL)
-    assert turns_sharply(curve)
+    profile = walk_at_ease(curve)
     assert 0.69 < profile.at(4.0) < 0.72
     assert profile.at(1.0) == profile.at(7.0) == 1.2
     arcs = np.arange(0.0, 8.0, 0.05)
@@ -34,7 +30,7 @@ def test_a_corner_is_slowed_for_in_time_and_left_again(degrees):
 
 def test_a_loop_slows_down_for_the_corner_at_its_beginning():
     square = polygon((0, 0), (0, 4), (4, 4), (4, 0), (0, 0), closed=True)
-    profile = slow_for_corners(square, USUAL)
+    profile = walk_at_ease(square)
     assert profile.at(0.0) == pytest.approx(profile.at(square.length), abs=1e-9)
     assert profile.at(0.0) < 0.8
     assert profile.at(square.length - 0.3) < 1.15

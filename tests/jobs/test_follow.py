@@ -8,7 +8,7 @@ from helpers import generator, tiny_density
 
 import controllers
 from controllers.common.initial_state import select_initial_state
-from controllers.following.follow import FollowSettings, build_follow_terms, check_path
+from controllers.shots.walk import FollowSettings, build_follow_terms, check_path
 from mapctl import curves
 from mapctl.errors import RequestError
 from mapctl.features import encode
@@ -118,7 +118,7 @@ def test_a_speed_beyond_the_data_is_named_with_both_numbers():
 
 def notes(curve, speed, seconds, profile=None):
     request = PathRequest(curve, profile or SpeedProfile.constant(speed), seconds)
-    return check_path(request, request.arcs(request.frames(30), 30), ABLE)
+    return check_path(curve, request.arcs(request.frames(30), 30), ABLE)
 
 
 def test_a_corner_is_named_with_its_place_and_angles():

@@ -9,7 +9,7 @@ from helpers import generator
 import controllers
 import priors
 from controllers.common.character import Character
-from controllers.following.follow import FollowSettings
+from controllers.shots.walk import FollowSettings
 from mapctl import curves
 from mapctl.metrics.worst_frame import measure_peaks
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, TOES

@@ -12,11 +12,11 @@ from tiny_denoiser import tiny_denoiser
 from toy_density import toy_density
 
 from controllers.denoising.denoise import denoise
-from controllers.following.follow import follow
 from controllers.generation.generate import GenerateSettings, generate
 from controllers.inbetweening.blend import LimbTransfer, blend
 from controllers.inbetweening.infill import ChainSettings, chain, infill
 from controllers.inbetweening.tween import tween
+from controllers.shots.shot import follow
 from controllers.steering import steer
 from mapctl import curves, retarget
 from mapctl.errors import RequestError

@@ -13,8 +13,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from controllers.common.character import Character
-from controllers.following.follow import FollowSettings, walk_arcs
 from controllers.inbetweening.proposers.partial_keys import meet_partial_keys
+from controllers.shots.walk import FollowSettings, walk_arcs
 from mapctl import contacts, curves
 from mapctl.curves import Curve
 from mapctl.features import LAYOUT, PRIOR_FPS

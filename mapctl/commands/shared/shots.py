@@ -1,4 +1,4 @@
-"""Solved walks along curves with their measures and cost, for follow, run and demo."""
+"""Shots of actors, planned and solved, with their measures and cost, for follow, run and demo."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -11,11 +11,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+import priors
 from controllers.common.character import Character
-from controllers.following.follow import FollowSettings, follow
 from controllers.shots.posing import MetPose, build_rest_pose
 from controllers.shots.request import Arrival, Lead, Look, Others, PoseKey, Reach, ShotRequest
 from controllers.shots.shot import ShotSolution, solve_shot
+from controllers.shots.walk import FollowSettings
 from controllers.shots.way import APART_MARGIN, Way, plan_way
 from mapctl import kinematics, report
 from mapctl.commands.shared.inputs import read_clip
@@ -25,110 +26,19 @@ from mapctl.curves import Curve
 from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
-from mapctl.intent.path import USUAL_SPEED, PathRequest, SpeedProfile, TimedSpeed
+from mapctl.intent.path import SpeedProfile, TimedSpeed
 from mapctl.intent.shot_keys import ShotKey
 from mapctl.mesh.primitives import Surface
 from mapctl.motion import Motion
-from mapctl.problem.solution import Outcome, Solution
-from mapctl.protocols import Inbetweener
+from mapctl.problem.solution import Outcome
 from mapctl.recording.fusion import resample_by_splines
 from mapctl.retarget.carry import RiggedCharacter, retarget_motion
 from mapctl.runtime.progress import Progress
-from mapctl.skeleton import CANONICAL
 from priors.lstm_gmm.density import LstmGmmDensity
 from scenes.drawn_character import DrawnCharacter
 from scenes.overlays import build_hips_mark, build_look_mark, build_obstacle, build_target
 from scenes.scene_file import Actor
 from scenes.stage import Mark, Shot, Wishes
-
-
-@dataclass(frozen=True, eq=False)
-class Walk:
-    """A solved walk."""
-
-    request: PathRequest
-    """Request for the walk."""
-    prior: LstmGmmDensity
-    """Density of the character's motion."""
-    seed: int
-    """Seed of everything random."""
-    solution: Solution
-    """Solution of the request."""
-    character: Character | None = None
-    """Character that walks, where that is not the canonical body."""
-
-    @property
-    def on_rig(self) -> Motion:
-        """Motion on the requested rig."""
-        motion = self.solution.motion
-        return motion if self.character is None else self.character.on_rig(motion)
-
-    @property
-    def interrupted(self) -> bool:
-        """Whether Ctrl-C ended the solve, so that this is the first part of the walk."""
-        return self.solution.status.outcome is Outcome.INTERRUPTED
-
-    @cached_property
-    def measures(self) -> Mapping[str, float]:
-        """Measures of the motion against the curve and the requested arc along it."""
-        motion = self.solution.motion
-        wanted = float(self.request.arcs(motion.num_frames, float(motion.fps))[-1])
-        return report.measure_path(motion, self.request.curve, wanted_m=wanted)
-
-    def report(self, request: Mapping[str, Any]) -> dict[str, Any]:
-        """Build the report of this walk; `request` is what the user wrote."""
-        card = self.prior.card
-        prior = {"name": self.prior.name, "licence": card.licence, "quality": card.quality}
-        told = report.build_report(self.solution, request=request, measures=self.measures, seed=self.seed, prior=prior)
-        return add_licence(told)
-
-    def summary(self) -> list[str]:
-        """Format a few lines for the user."""
-        m = {name: "-" if value != value else f"{value:.1f}" for name, value in self.measures.items()}
-        cost = report.summarise_timing(self.solution.windows, seconds=self.solution.seconds)
-        motion, speed, planted = (self.solution.motion, self.measures["speed_m_s"], self.measures["planted_share"])
-        return [
-            f"motion    {motion.num_frames} frames, {motion.seconds:.1f} s, {speed:.2f} m/s",
-            f"path      error {m['path_error_mean_cm']} cm mean, {m['path_error_max_cm']} max; sway {m['sway_cm']} cm",
-            f"progress  {m['travelled_m']} of {m['wanted_m']} m",
-            f"feet      planted {planted:.0%} of the time, then moving {m['contact_speed_cm_s']} cm/s",
-            f"cost      {cost['frame_ms_p50']:.1f} ms a frame (p99 {cost['frame_ms_p99']:.1f}), "
-            f"{cost['evaluations_per_frame']:.1f} evaluations a frame, threads: {cost['threads']}",
-            f"status    {self.solution.status.text}",
-        ]
-
-
-def walk(
-    prior: LstmGmmDensity,
-    request: PathRequest,
-    *,
-    seed: int,
-    progress: Progress | None = None,
-    character: Character | None = None,
-) -> Walk:
-    """Solve a walk for a character of any size. Compiling or loading the fast path, once a process, is not counted."""
-    prior.warm_up()
-    bones = CANONICAL if character is None else character.skeleton
-    settings = None if character is None else FollowSettings().with_rest_height(character.toe_rest_height)
-    solution = follow(
-        prior,
-        request.curve,
-        seconds=request.seconds,
-        speed=request.profile,
-        generator=torch.Generator().manual_seed(seed),
-        progress=progress,
-        skeleton=bones,
-        settings=settings,
-    )
-    return Walk(request, prior, seed, solution, character)
-
-
-def parse_follow(curve: Curve, speed: str | float | None, seconds: float | None) -> PathRequest:
-    """Parse and check a request: RequestError for speeds and durations that make no sense or take too long."""
-    profile = SpeedProfile.parse(str(USUAL_SPEED if speed is None else speed))
-    request = PathRequest(curve, profile, seconds)
-    request.frames(PRIOR_FPS)
-    return request
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,7 +107,7 @@ def plan_shot(
     return ShotPlan(actor, request, prior.conditioned_on(labels) if labels else prior, character, rate)
 
 
-def _read_speed(actor: Actor, curve: Curve) -> SpeedProfile | TimedSpeed:
+def _read_speed(actor: Actor, curve: Curve) -> SpeedProfile | TimedSpeed | None:
     if actor.speed_by_time is not None:
         speed = TimedSpeed.parse(actor.speed_by_time)
         if actor.curve is not None and not any(speed.speeds):
@@ -205,7 +115,7 @@ def _read_speed(actor: Actor, curve: Curve) -> SpeedProfile | TimedSpeed:
         return speed
     if actor.curve is None:
         return TimedSpeed((0.0,), (0.0,))
-    return SpeedProfile.parse(str(USUAL_SPEED if actor.speed is None else actor.speed))
+    return None if actor.speed is None else SpeedProfile.parse(str(actor.speed))
 
 
 def _build_pose_key(body: "_Body", key: ShotKey, seconds: float, within: int) -> PoseKey:
@@ -358,40 +268,45 @@ class PlayedShot:
 
     def summary(self) -> list[str]:
         """Format a few lines for the user."""
-        motion = self.solution.motion
+        m = {name: "-" if value != value else f"{value:.1f}" for name, value in self.measures.items()}
+        cost = report.summarise_timing(self.solution.windows, seconds=self.solution.seconds)
+        motion, speed, planted = self.solution.motion, self.measures["speed_m_s"], self.measures["planted_share"]
         wishes = [
             f"wish      {wish.name} ({wish.asked}): {wish.got:.1f} {wish.unit}" + ("" if wish.holds else ", NOT HELD")
             for wish in self.solution.wishes
         ]
         return [
-            f"motion    {motion.num_frames} frames, {motion.seconds:.1f} s",
+            f"motion    {motion.num_frames} frames, {motion.seconds:.1f} s, {speed:.2f} m/s",
+            f"path      error {m['path_error_mean_cm']} cm mean, {m['path_error_max_cm']} max; sway {m['sway_cm']} cm",
+            f"progress  {m['travelled_m']} of {m['wanted_m']} m",
+            f"feet      planted {planted:.0%} of the time, then moving {m['contact_speed_cm_s']} cm/s",
             *wishes,
-            f"cost      {1000 * self.solution.seconds / motion.num_frames:.1f} ms a frame",
+            f"cost      {cost['frame_ms_p50']:.1f} ms a frame (p99 {cost['frame_ms_p99']:.1f}), "
+            f"{cost['evaluations_per_frame']:.1f} evaluations a frame, threads: {cost['threads']}",
             f"status    {self.solution.status.text}",
         ]
 
 
 def play_shot(
     plan: ShotPlan,
-    earlier: Sequence[PlayedShot],
-    inbetweener: Inbetweener,
+    earlier: Sequence[PlayedShot] = (),
     *,
     keep_apart: float | None = None,
     progress: Progress | None = None,
 ) -> PlayedShot:
-    """Solve an actor's shot; characters that were solved earlier are walked around."""
+    """Solve an actor's shot; characters that were solved earlier are walked around. Compiling or loading the fast path,
+    once a process, is not counted."""
     plan.prior.warm_up()
     if keep_apart is not None and earlier:
         tracks = [(one.plan, one.solution.motion.root_position[:, ::2]) for one in earlier]
         plan = replace(plan, request=replace(plan.request, others=_find_others(plan, tracks, keep_apart)))
-    follow = FollowSettings().with_rest_height(plan.character.toe_rest_height)
-
+    settings = FollowSettings().with_rest_height(plan.character.toe_rest_height)
     solution = solve_shot(
         plan.prior,
-        inbetweener,
+        None if plan.request.walks_only else priors.load_inbetweener(),
         plan.request,
         generator=torch.Generator().manual_seed(plan.actor.seed),
-        settings=follow,
+        settings=settings,
         skeleton=plan.character.skeleton,
         progress=progress,
     )
@@ -405,9 +320,9 @@ def let_others_pass(plans: Sequence[ShotPlan], keep_apart: float) -> list[ShotPl
     for plan in plans:
         others = _find_others(plan, tracks, keep_apart) if tracks else None
         way = plan_way(replace(plan.request, others=others))
-        if way.note is not None and others is not None:
+        if way.blocked and others is not None:
             alone = plan_way(plan.request)
-            if alone.note is None:
+            if not alone.blocked:
                 room = _find_others(given[0], [(plan, _walk_along(alone))], (keep_apart - APART_MARGIN) / 2)
                 given[0] = replace(given[0], request=replace(given[0].request, others=replace(room, courtesy=True)))
                 way = alone
@@ -435,18 +350,13 @@ def _find_others(
 
 
 def stage_actor(
-    done: Walk | PlayedShot,
-    *,
-    colour: str | None = None,
-    start_seconds: float = 0.0,
-    character: DrawnCharacter | None = None,
+    done: PlayedShot, *, colour: str | None = None, start_seconds: float = 0.0, character: DrawnCharacter | None = None
 ) -> Shot:
     """Put what an actor did on a stage, and what it was asked for: targets, places to look at, places and facings of
     the hips, and whole poses. It is drawn as a character if there is one."""
-    wishes = _collect_wishes(done) if isinstance(done, PlayedShot) else Wishes()
     motion = done.solution.motion
     drawn = None if character is None else character.put_on(motion)
-    return Shot(motion, done.request.curve, colour, start_seconds, wishes, drawn)
+    return Shot(motion, done.request.curve, colour, start_seconds, _collect_wishes(done), drawn)
 
 
 def print_notes(shots: Sequence[Shot]) -> None:
@@ -455,10 +365,9 @@ def print_notes(shots: Sequence[Shot]) -> None:
         print(f"note      the character that is drawn: {note}")
 
 
-def build_obstacles(done: Sequence[Walk | PlayedShot]) -> list[Surface]:
+def build_obstacles(done: Sequence[PlayedShot]) -> list[Surface]:
     """Build every obstacle of some actors once."""
-    shots = [one.request for one in done if isinstance(one, PlayedShot)]
-    return [build_obstacle(each) for each in dict.fromkeys(each for request in shots for each in request.obstacles)]
+    return [build_obstacle(each) for each in dict.fromkeys(each for one in done for each in one.request.obstacles)]
 
 
 def _collect_wishes(done: PlayedShot) -> Wishes:

@@ -1,6 +1,6 @@
-"""Walk along a curve (Wang et al. 2019, section 5.2): select an initial state, then solve a receding horizon."""
+"""Walk so that the hips are at given arcs of a curve (Wang et al. 2019, section 5.2): select an initial state, then
+solve a receding horizon."""
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -13,14 +13,12 @@ from controllers.common.initial_state import MotionStart, select_initial_state
 from mapctl.curves import Curve
 from mapctl.curves.tracking import track_arcs
 from mapctl.features import PRIOR_FPS
-from mapctl.intent.path import PathRequest, SpeedProfile
 from mapctl.motion import Motion
 from mapctl.pose import decode
 from mapctl.problem.receding_horizon import CommittedFrames, HorizonSettings, RecedingHorizonSolver, TermsOf
-from mapctl.problem.solution import Outcome, Solution, Status
+from mapctl.problem.solution import Outcome
 from mapctl.problem.window_solvers import LatentNoiseSolver, SingleWindowSolver
 from mapctl.protocols import DataLimits, Density
-from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.terms import FootContact, LandingSigmas, LatentPrior, Path, Term
 
 _PATH_TOLERANCE_CM = 15.0
@@ -28,7 +26,7 @@ _OVERSHOOT = 0.15  # metres: the last frame of a walk may lie one frame's step b
 _CORNER_SECONDS = 1.0
 
 
-def check_path(request: PathRequest, arcs: Float[Tensor, " frames"], limits: DataLimits) -> list[str]:
+def check_path(curve: Curve, arcs: Float[Tensor, " frames"], limits: DataLimits) -> list[str]:
     """Note speeds and corners beyond the prior's data, and a curve that ends too soon."""
     notes = []
     speeds = torch.diff(arcs) * PRIOR_FPS
@@ -37,18 +35,16 @@ def check_path(request: PathRequest, arcs: Float[Tensor, " frames"], limits: Dat
         notes.append(f"{fastest:.2f} m/s is faster than the prior's data, which reach {limits.fastest:.2f} m/s")
     if slowest < limits.slowest:
         notes.append(f"{slowest:.2f} m/s is slower than the prior's data, which begin at {limits.slowest:.2f} m/s")
-    notes += _check_corners(request, arcs, limits)
-    if not request.curve.closed and float(arcs[-1]) > request.curve.length + _OVERSHOOT:
-        over = float(arcs[-1]) - request.curve.length
-        notes.append(
-            f"the last {over:.1f} m go straight on beyond the end of the curve of {request.curve.length:.1f} m"
-        )
+    notes += _check_corners(curve, arcs, limits)
+    if not curve.closed and float(arcs[-1]) > curve.length + _OVERSHOOT:
+        over = float(arcs[-1]) - curve.length
+        notes.append(f"the last {over:.1f} m go straight on beyond the end of the curve of {curve.length:.1f} m")
     return notes
 
 
-def check_tracking(motion: Motion, curve: Curve, joint: str) -> list[str]:
+def check_tracking(motion: Motion, curve: Curve) -> list[str]:
     """Note the interval around the worst frame in which the path error exceeds 15 cm, if there is one."""
-    walked = motion.joint_positions()[:, motion.skeleton.index(joint)]
+    walked = motion.root_position
     positions = walked[:, ::2] if curve.dims == 2 else walked
     error = (positions - curve.point(track_arcs(curve, walked, start=0.0))).norm(dim=-1)
     if float(error.max()) * 100 <= _PATH_TOLERANCE_CM:
@@ -65,10 +61,10 @@ def _find_interval_around(off: Bool[Tensor, " frames"], worst: int) -> tuple[int
     return int(before[-1]) + 1 if len(before) else 0, int(after[0]) - 1 if len(after) else len(off) - 1
 
 
-def _check_corners(request: PathRequest, arcs: Tensor, limits: DataLimits) -> list[str]:
+def _check_corners(curve: Curve, arcs: Tensor, limits: DataLimits) -> list[str]:
     """Note the sharpest turn over one second of the walk (or all of a shorter one), if it is beyond the data."""
     step = min(round(_CORNER_SECONDS * PRIOR_FPS), len(arcs) - 1)
-    samples = request.curve.curvature(arcs) * torch.gradient(arcs)[0]
+    samples = curve.curvature(arcs) * torch.gradient(arcs)[0]
     turned = torch.nn.functional.pad(samples.cumsum(0), (1, 0))
     turned = (turned[step:] - turned[:-step]).abs()
     worst = int(turned.argmax())
@@ -102,8 +98,6 @@ class FollowSettings:
     """Lengths of the receding horizon."""
     method: SingleWindowSolver = field(default_factory=LatentNoiseSolver)
     """Solver of one window."""
-    joint: str = "hips"
-    """Joint that follows the curve."""
 
     def with_rest_height(self, height: float) -> "FollowSettings":
         """Return the settings for feet whose toe joints rest at this `height` over the floor, metres."""
@@ -118,58 +112,6 @@ class FollowSettings:
         return replace(self, footing=character.footing(self.footing), **sigmas)
 
 
-def follow(
-    prior: Density,
-    curve: Curve,
-    *,
-    seconds: float | None = None,
-    speed: float | SpeedProfile = 1.2,
-    generator: torch.Generator | None = None,
-    settings: FollowSettings | None = None,
-    skeleton: Skeleton = CANONICAL,
-    terms: Sequence[Term] = (),
-    progress: Callable[[int, int], None] | None = None,
-    deadline_seconds: float | None = None,
-) -> Solution:
-    """Walk a character along the curve from its first point, facing along it.
-
-    `speed` is m/s or a profile along the arc; without `seconds` the curve is walked once. `terms` are the caller's own,
-    the same in every window; they see the character at its own size and the time since the first frame. On another
-    `skeleton` (canonical names) strides are as long as its legs, and the toes' rest height is that of
-    `settings.footing`. The first frame is the start pose. The motion is at PRIOR_FPS; `Motion.resample` gives other
-    rates. After `deadline_seconds` of wall clock, and at Ctrl-C, the solution so far is returned and the status says
-    so. RequestError for requests that make no sense; infeasible ones are named with numbers in the status.
-    """
-    began = time.perf_counter()
-    deadline = None if deadline_seconds is None else time.monotonic() + deadline_seconds
-    profile = speed if isinstance(speed, SpeedProfile) else SpeedProfile.constant(speed)
-    request, lowered = PathRequest(curve, profile, seconds).fitted(PRIOR_FPS)
-    settings = settings or FollowSettings()
-    character = Character(skeleton, settings.footing.rest_height)
-    generator = generator or torch.Generator().manual_seed(0)
-    frames = request.frames(PRIOR_FPS)
-    # Windows look ahead beyond the last frame, so the requested arcs extend that far.
-    arcs = request.arcs(frames + settings.window.frames, PRIOR_FPS)
-    motion, done, outcome = walk_arcs(
-        prior,
-        curve,
-        arcs,
-        frames,
-        character=character,
-        settings=settings,
-        generator=generator,
-        terms_of=lambda _first, _frames: terms,
-        progress=progress,
-        deadline=deadline,
-    )
-    notes = [lowered] if lowered else []
-    notes += check_path(request, arcs[:frames], character.data_limits(prior.limits))
-    notes += check_tracking(motion, curve, settings.joint)
-    status = Status(outcome).with_notes(notes, infeasible=bool(notes))
-    ledger, seconds = character.ledger(done.ledger), time.perf_counter() - began
-    return Solution(motion, status, ledger, done.windows, done.features, seconds)
-
-
 def walk_arcs(
     prior: Density,
     curve: Curve,
@@ -181,13 +123,15 @@ def walk_arcs(
     generator: torch.Generator,
     terms_of: TermsOf = lambda _first, _frames: (),
     start: MotionStart | None = None,
+    first_frame: int = 0,
     progress: Callable[[int, int], None] | None = None,
     deadline: float | None = None,
 ) -> tuple[Motion, CommittedFrames, Outcome]:
     """Walk a character along a curve so that it is at one arc (metres) in each frame; arcs extend a window beyond.
 
-    It begins in `start`, of the prior's size, or in the initial state that suits the arcs best. `terms_of` gives more
-    terms for each window, which see the character at its own size. The ledger is of the prior's size.
+    Its first frame is `first_frame` of the shot. It begins in `start`, of the prior's size, or in the initial state
+    that suits the arcs best. `terms_of` gives more terms for each window, which see the character at its own size. The
+    ledger is of the prior's size.
     """
     unit_curve, unit_arcs = character.curve(curve), arcs / character.scale
     follow_terms = build_follow_terms(unit_curve, unit_arcs, settings.scaled_to(character))
@@ -205,9 +149,10 @@ def walk_arcs(
             fps=PRIOR_FPS,
             generator=generator,
         )
+    committed = replace(start.committed, discarded=first_frame)  # so that terms see the time in the shot
     solver = RecedingHorizonSolver(prior, settings.window, character.unit_skeleton, method=settings.method)
     done, outcome = solver.solve(
-        start.committed, all_terms, frames, generator=generator, progress=progress, deadline=deadline
+        committed, all_terms, frames, generator=generator, progress=progress, deadline=deadline
     )
     motion = character.motion(decode(done.features, start.before_first, skeleton=character.unit_skeleton))
     return motion, done, outcome
@@ -218,7 +163,6 @@ def build_follow_terms(curve: Curve, arcs: Float[Tensor, " frames"], settings: F
     path = Path(
         curve,
         arcs,
-        joint=settings.joint,
         sigma_slow=settings.path_sigma_slow,
         free_sway=settings.path_free_sway,
         sigma_raw=settings.path_sigma_raw,
