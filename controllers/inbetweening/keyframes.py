@@ -125,7 +125,7 @@ def _place_joints(skeleton: Skeleton, quats: Float[Tensor, "*batch joints 4"]) -
 def _tilt_deg(one: Float[Tensor, "batch 4"], other: Float[Tensor, "batch 4"]) -> Float[Tensor, " batch"]:
     """Return by how much the body's axis leans otherwise, as a chord, degrees."""
     up = one.new_tensor([0.0, 1.0, 0.0]).expand(len(one), 3)
-    # A body seen from itself: what is up for it tells its lean without its heading.
+    # The vertical in the frame of the hips: their lean without their heading.
     lean = rotations.rotate(rotations.inverse(one), up) - rotations.rotate(rotations.inverse(other), up)
     return torch.rad2deg((lean.square().sum(dim=-1) + 1e-12).sqrt())
 

@@ -87,14 +87,14 @@ def note_joint_ranges(canonical: Motion, missing: MissingMask, rigmap: RigMap) -
 def _check_hips(
     hips: Float[Tensor, "frames 3"], missing: MissingMask, loose: LooseKeys | None, *, fps: float
 ) -> list[str]:
-    """Note places of the hips that are too far from one key to the next."""
-    notes, told, places = [], ~missing.root, hips.clone()
-    placed = torch.zeros_like(told) if loose is None else loose.placed
+    """Note positions of the hips that are too far from one key to the next."""
+    notes, known, positions = [], ~missing.root, hips.clone()
+    placed = torch.zeros_like(known) if loose is None else loose.placed
     if loose is not None:
-        places[placed, ::2] = loose.ground[placed]
-    for start, stop in pairwise((told | placed).nonzero()[:, 0].tolist()):
+        positions[placed, ::2] = loose.ground[placed]
+    for start, stop in pairwise((known | placed).nonzero()[:, 0].tolist()):
         axes = [0, 2] if bool(placed[start] | placed[stop]) else [0, 1, 2]
-        speed = float((places[stop] - places[start])[axes].norm()) * fps / (stop - start)
+        speed = float((positions[stop] - positions[start])[axes].norm()) * fps / (stop - start)
         if speed > _MAX_ROOT_SPEED:
             notes.append(f"the hips need {speed:.1f} m/s between frames {start} and {stop}, faster than anyone runs")
     return notes

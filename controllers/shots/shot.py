@@ -626,9 +626,9 @@ def solve_shot(
     character = Character(skeleton, settings.footing.rest_height)
     way = plan_way(request)
     rest = build_rest_pose(prior, skeleton, character.toe_rest_height)
-    told = as_reaches(request.poses, way, rest)
+    limb_keys = as_reaches(request.poses, way, rest)
     poses = tuple(key for key in request.poses if not key.joints)
-    request = replace(request, reaches=(*request.reaches, *told), poses=poses)
+    request = replace(request, reaches=(*request.reaches, *limb_keys), poses=poses)
     check_reaches(request.reaches, way, rest)
     way = lean_way(way, request, rest)
     if _pivots(request, way.curve):

@@ -72,7 +72,7 @@ class AutoInbetweener(Inbetweener):
     def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
         """Propose for each gap what its length and the poses beside it ask for.
 
-        Loose keys are the tweener's, if there is one; places that are all that is told are walked over by a density
+        Loose keys are the tweener's, if there is one; keys that give positions alone are walked over by a density
         where that knows such walks.
         """
         if query.loose is not None:

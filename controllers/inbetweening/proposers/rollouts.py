@@ -223,7 +223,7 @@ class RolloutInbetweener(Inbetweener):
 
     def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
         """Propose a different motion for each sample; gaps too short or too long are left to the fallback, and so are
-        gaps in which every attempt jumps, and loose keys but for places that are all that is told, which are walked
+        gaps in which every attempt jumps, and loose keys but for those that give positions alone, which are walked
         over."""
         if query.loose is not None:
             walked = walk_over_places(query, self.densities, generator)

@@ -1,6 +1,6 @@
 """Interpolation as an in-betweener: joints by slerp, the root linearly, or along the trajectory that a query keeps.
 
-A walk over places that are all that is told: a density follows a curve through them in time (Wang et al. 2019,
+A walk over keys that give positions alone: a density follows a curve through them in time (Wang et al. 2019,
 section 5.2).
 """
 
@@ -47,7 +47,7 @@ class StitchedInbetweener(Inbetweener):
         return True
 
     def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
-        """Propose for each gap the stitcher's motion, bent to what is told of it in part; what it left is the other's,
+        """Propose for each gap the stitcher's motion, bent to its partial keys; gaps that it leaves are the other's,
         and the proposal says why."""
         stitched = self.stitcher.propose(query, generator=generator)
         sources = stitched.attribute(query)

@@ -263,8 +263,8 @@ class PlayedShot:
         card = self.plan.prior.card
         prior = {"name": self.plan.prior.name, "licence": card.licence, "quality": card.quality}
         seed = self.plan.actor.seed
-        told = report.build_report(self.solution, request=request, measures=self.measures, seed=seed, prior=prior)
-        return add_licence(told)
+        found = report.build_report(self.solution, request=request, measures=self.measures, seed=seed, prior=prior)
+        return add_licence(found)
 
     def summary(self) -> list[str]:
         """Format a few lines for the user."""
