@@ -10,11 +10,12 @@ import math
 from abc import abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Generic, Protocol, TypeAlias, TypeVar, runtime_checkable
+from typing import Any, Generic, Protocol, TypeAlias, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from typing_extensions import TypeVar  # with a default before Python 3.13; torch brings it
 
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT
@@ -67,7 +68,7 @@ class LastFrameState(DensityState):
         return LastFrameState(self.last_frame[rows])
 
 
-State = TypeVar("State", bound=DensityState)
+State = TypeVar("State", bound=DensityState, default=Any)
 
 
 @dataclass(frozen=True, eq=False)

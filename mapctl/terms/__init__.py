@@ -10,6 +10,7 @@ from mapctl.terms.motion_tracking import MotionTracking
 from mapctl.terms.path import Path
 from mapctl.terms.root_velocity import RootVelocity
 from mapctl.terms.step_length import StepLength
+from mapctl.terms.trial import Trial
 
 __all__ = [
     "Clearance",
@@ -27,5 +28,6 @@ __all__ = [
     "StepLength",
     "Support",
     "Term",
+    "Trial",
     "WithinReach",
 ]

@@ -6,6 +6,9 @@ Tutorials and the gallery are run where the site is built.
 import re
 import shlex
 import shutil
+import subprocess
+import sys
+from pathlib import Path
 
 import pages
 import pytest
@@ -44,6 +47,16 @@ def test_python_runs_as_it_stands(page, files, tmp_path, monkeypatch):
         if str(block) == "README.md-python-0":
             assert left["solution"].ledger.summary()["path"]["residual_mean"] < 0.05
             assert mapctl.load("circle.bvh").num_frames == left["solution"].motion.num_frames
+
+
+@pytest.mark.slow
+def test_the_script_that_is_checked_in_strict_mode_runs(tmp_path):
+    script = Path(__file__).with_name("user_script.py")
+    shown = subprocess.run(
+        [sys.executable, script, "example:noisy-walk", tmp_path / "out"], capture_output=True, text=True, check=True
+    ).stdout
+    assert "hand height" in shown
+    assert {mapctl.load(file).num_frames for file in tmp_path.glob("out-*.bvh")} == {240, 60}
 
 
 def test_commands_are_understood():

@@ -18,6 +18,7 @@ pytestmark = pytest.mark.slow
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("mapctl", "priors", "controllers", "scenes")
 DATA = (
+    "*/py.typed",
     "mapctl/blender/addon/*.toml",
     "mapctl/examples/*",
     "mapctl/joint_ranges/*.json",
