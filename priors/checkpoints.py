@@ -26,7 +26,7 @@ from mapctl.features import LAYOUT
 from mapctl.formats import toml
 from mapctl.formats.atomic import atomic_path
 from mapctl.formats.text import one_line, shorten
-from priors import licences, weight_sets
+from priors import weight_sets
 
 _SYSTEM_ERROR = re.compile(r"\(os error (\d+)\)")
 
@@ -245,9 +245,11 @@ def _note_card(name: str, path: Path, card: Card) -> None:
     """Note a model's licence; CheckpointError where it lies in the free set and is not free."""
     weights = weight_sets.find_set_of(path)
     known = path.stem if weights == weight_sets.SETS[0] else f"{weights}/{path.stem}"
-    if weights == "free" and card.licence not in licences.FREE:
+    if weights == "free" and card.licence not in weight_sets.FREE:
         raise CheckpointError(f"{known} lies with the free weights, and its licence is {card.licence!r}")
-    licences.note_licence(name if weights is None else known, " ".join(card.licence.split()) or licences.NONE_TOLD)
+    weight_sets.note_licence(
+        name if weights is None else known, " ".join(card.licence.split()) or weight_sets.NONE_TOLD
+    )
 
 
 C = TypeVar("C", bound="NetworkConfig")

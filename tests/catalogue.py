@@ -16,10 +16,10 @@ from toy_density import toy_density
 from controllers.inbetweening.proposers import (
     AutoInbetweener,
     RolloutInbetweener,
+    RolloutSettings,
     SlerpInbetweener,
     StitchedInbetweener,
 )
-from controllers.inbetweening.proposers.rollouts import RolloutSettings
 from mapctl import curves
 from mapctl.curves import Curve
 from mapctl.curves.obstacles import Obstacle

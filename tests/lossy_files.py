@@ -8,7 +8,7 @@ import numpy as np
 
 from mapctl.formats import bvh
 from mapctl.formats import bvh as layout
-from mapctl.formats import bvh_text as text
+from mapctl.formats import bvh as text
 from mapctl.motion import Motion
 
 GOOD = """HIERARCHY

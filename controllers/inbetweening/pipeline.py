@@ -23,8 +23,7 @@ from torch import Tensor
 
 from controllers.common.map_refinement import RefinementSettings, refine
 from controllers.inbetweening.keyframes import fit_drawings, measure_drawing_error
-from controllers.inbetweening.proposers.auto import STANDING_STILL
-from controllers.inbetweening.proposers.partial_keys import propose_through_keys
+from controllers.inbetweening.proposers import STANDING_STILL, propose_through_keys
 from mapctl import contacts, rotations
 from mapctl.curves.curve import Curve
 from mapctl.errors import RequestError
@@ -43,7 +42,7 @@ from mapctl.inbetweening.query import GapSource, estimate_contact_logits
 from mapctl.inbetweening.root_trajectory import lead_over_keys
 from mapctl.inbetweening.seam_blending import blend_seams_in_positions, blend_seams_in_rotations
 from mapctl.kinematics import heading
-from mapctl.metrics.liveliness import measure_path_length
+from mapctl.metrics.body import measure_path_length
 from mapctl.motion import Motion
 from mapctl.numerics.intervals import true_intervals
 from mapctl.numerics.smooth_offsets import interpolate_offsets

@@ -9,13 +9,13 @@ from torch import Tensor
 
 from controllers.common.map_refinement import RefinementSettings, estimate_rest_height
 from controllers.inbetweening.pipeline import INFILL_REFINEMENT, InbetweenSolution, Pick
-from controllers.inbetweening.proposers.auto import AutoInbetweener
-from controllers.inbetweening.proposers.rollouts import (
+from controllers.inbetweening.proposers import (
     EVERY_ROLLOUT_JUMPED,
+    AutoInbetweener,
     RolloutInbetweener,
+    SlerpInbetweener,
     select_likeliest_density,
 )
-from controllers.inbetweening.proposers.slerp import SlerpInbetweener
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode, integrate_root
 from mapctl.metrics.realism import Diversity, measure_diversity

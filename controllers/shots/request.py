@@ -22,8 +22,8 @@ from mapctl.features import PRIOR_FPS, GroundPose, encode, integrate_root
 from mapctl.inbetweening.missing import MissingMask
 from mapctl.intent.keyframes import WorldPosition
 from mapctl.intent.path import SpeedProfile, TimedSpeed, find_reversals
-from mapctl.kinematics.placing import bring_curve_points, measure_travel, move_to, rotate_about_vertical
-from mapctl.metrics import worst_frame
+from mapctl.kinematics import bring_curve_points, measure_travel, move_to, rotate_about_vertical
+from mapctl.metrics import body
 from mapctl.motion import Motion
 from mapctl.numerics.intervals import true_intervals
 from mapctl.problem.receding_horizon import replay
@@ -90,7 +90,7 @@ def _measure_cost(filling: Filling, inbetweener: Inbetweener) -> float:
         return 0.0
     done = fill(part, missing, inbetweener, settings=InfillSettings(finish=False))
     shown = done.motion.slice(max(0, gap[0] - 2), min(done.motion.num_frames, gap[1] + 2))
-    peaks = worst_frame.measure_peaks(shown.joint_positions()[:, _EFFECTORS], shown.root_position, float(shown.fps))
+    peaks = body.measure_peaks(shown.joint_positions()[:, _EFFECTORS], shown.root_position, float(shown.fps))
     return compute_artefact_cost(done.motion, done.contacts, gap) + _ACCELERATION_WEIGHT * peaks.acceleration
 
 
@@ -107,7 +107,7 @@ def compute_artefact_cost(motion: Motion, planted: Bool[Tensor, "frames 2"], gap
     skate = float((speeds * (1 - above / _SKATE_HEIGHT).clamp(0, 1)).mean())
     ground = hips[:, ::2]
     detour = float(torch.diff(ground, dim=0).norm(dim=-1).sum()) - float((ground[-1] - ground[0]).norm())
-    unsupported = worst_frame.measure_longest_unsupported(toes, hips, fps)
+    unsupported = body.measure_longest_unsupported(toes, hips, fps)
     return (
         slide
         + _SKATE_WEIGHT * skate

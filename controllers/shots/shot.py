@@ -24,18 +24,23 @@ from torch import Tensor
 
 from controllers.common.character import Character
 from controllers.inbetweening.pipeline import fill
-from controllers.shots.posing import (
+from controllers.shots.reaching import (
+    STRETCHED_SHARE,
     MetPose,
+    ReachTargets,
     as_reaches,
     build_rest_pose,
+    check_reaches,
+    go_down,
+    lean_way,
     look_where_hands_reach,
     measure_look_errors,
     measure_pose_error,
     meet_poses,
     pose_frames,
+    settle_reaches,
     turn_heads,
 )
-from controllers.shots.reaching import STRETCHED_SHARE, ReachTargets, check_reaches, go_down, lean_way, settle_reaches
 from controllers.shots.request import (
     Filling,
     Look,
@@ -58,7 +63,7 @@ from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening.effector_targets import compute_target_errors
 from mapctl.inbetweening.missing import MissingMask
 from mapctl.intent.path import SpeedProfile, find_reversals, walk_at_ease
-from mapctl.kinematics.placing import move_to, rotate_about_vertical
+from mapctl.kinematics import move_to, rotate_about_vertical
 from mapctl.motion import Motion
 from mapctl.problem.receding_horizon import CommittedFrames
 from mapctl.problem.solution import Ledger, Outcome, Solution, Status

@@ -16,7 +16,7 @@ from controllers.steering import steer
 from mapctl import curves, report
 from mapctl.commands.shared import options
 from mapctl.commands.shared.command import ModelCommand
-from mapctl.commands.shared.tables import print_table
+from mapctl.commands.shared.outputs import print_table
 from mapctl.features import LAYOUT, PRIOR_FPS
 from mapctl.intent.steering import Command
 from mapctl.problem.objective import Objective

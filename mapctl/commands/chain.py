@@ -13,7 +13,7 @@ from controllers.inbetweening.pipeline import InfillSettings
 from controllers.inbetweening.proposers import build_inbetweener
 from mapctl.commands.shared import inputs, options, outputs, results
 from mapctl.commands.shared.command import ModelCommand
-from mapctl.commands.shared.progress_bar import show_progress
+from mapctl.commands.shared.outputs import show_progress
 from mapctl.errors import RequestError
 from mapctl.retarget import to_canonical
 from scenes.film import film

@@ -11,7 +11,7 @@ from controllers.shots.shot import follow
 from controllers.steering import steer
 from mapctl import curves
 from mapctl.commands.shared.command import ModelCommand
-from mapctl.commands.shared.progress_bar import show_progress
+from mapctl.commands.shared.outputs import show_progress
 from mapctl.intent.steering import Command
 
 

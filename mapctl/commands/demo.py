@@ -9,7 +9,7 @@ from controllers.common.character import Character
 from mapctl import report
 from mapctl.commands.shared import inputs, options, outputs
 from mapctl.commands.shared.command import INTERRUPTED, ModelCommand
-from mapctl.commands.shared.progress_bar import show_progress
+from mapctl.commands.shared.outputs import show_progress
 from mapctl.commands.shared.shots import PlayedShot, plan_shot, play_shot
 from scenes.cameras import CameraSettings
 from scenes.film import film

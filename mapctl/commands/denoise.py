@@ -17,7 +17,7 @@ from controllers.denoising.segment import DenoiseSolution
 from mapctl import formats, report
 from mapctl.commands.shared import folders, inputs, options, outputs, results
 from mapctl.commands.shared.command import ModelCommand, conclude
-from mapctl.commands.shared.progress_bar import show_progress
+from mapctl.commands.shared.outputs import show_progress
 from mapctl.errors import RequestError
 from mapctl.motion import Motion, join_licences
 from mapctl.protocols import Denoiser, Inbetweener
@@ -25,7 +25,7 @@ from mapctl.recording.masks import load_masks, masks_from_missing
 from mapctl.retarget.rigs import Rig
 from mapctl.runtime.file_jobs import FileJob, FileResult, run_over_cluster, run_over_processes, try_job
 from mapctl.skeleton import CANONICAL
-from priors import licences
+from priors import weight_sets
 
 
 @dataclass(frozen=True)
@@ -264,7 +264,7 @@ def run_folder(command: Denoise, settings: DenoiseSettings) -> int:
     load = partial(priors.load_denoiser, priors.add_set(command.denoiser))
     load_inbetweener = partial(priors.load_inbetweener, priors.add_set(command.inbetweener or "transformer"))
     load_inbetweener()
-    used = dict(licences.find_used_licences())  # what the processes use, and they do not record
+    used = dict(weight_sets.find_used_licences())  # what the processes use, and they do not record
     after = None if command.report is None else ReportWriter(command, command.report, used)
     licence = outputs.format_used_licences()
     rig, on_read = inputs.read_rig(command.rig, command), None if command.quiet else inputs.print_doubts
@@ -307,6 +307,6 @@ class ReportWriter:
         path = (self.folder / job.out.relative_to(self.command.out)).with_suffix(".json")
         path.parent.mkdir(parents=True, exist_ok=True)
         own = done.motion.licence
-        used = self.used | ({str(job.source): licences.shorten_licence(own)} if own else {})
+        used = self.used | ({str(job.source): weight_sets.shorten_licence(own)} if own else {})
         told = results.build_report("denoise", self.command, done)
-        report.write_report(told | licences.describe_licences(used), path)
+        report.write_report(told | weight_sets.describe_licences(used), path)

@@ -13,7 +13,7 @@ from mapctl import formats, report
 from mapctl.commands.shared import inputs, options, outputs
 from mapctl.commands.shared.command import ModelCommand, conclude
 from mapctl.commands.shared.inputs import read_character
-from mapctl.commands.shared.progress_bar import show_progress
+from mapctl.commands.shared.outputs import show_progress
 from mapctl.commands.shared.shots import PlayedShot, ShotPlan, build_obstacles, plan_shot, play_shot, stage_actor
 from mapctl.curves import Curve
 from mapctl.curves.obstacles import Obstacle

@@ -17,7 +17,7 @@ from mapctl import formats
 from mapctl.commands.shared import inputs, options, outputs
 from mapctl.commands.shared.command import ModelCommand
 from mapctl.commands.shared.inputs import read_character
-from mapctl.commands.shared.progress_bar import explain_progress, show_progress
+from mapctl.commands.shared.outputs import explain_progress, show_progress
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.metrics.gait import PACES, label_pace

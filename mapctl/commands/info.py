@@ -13,7 +13,7 @@ import scenes
 from mapctl import formats, report, retarget
 from mapctl.commands.shared import inputs, options, outputs
 from mapctl.commands.shared.command import ModelCommand
-from mapctl.commands.shared.tables import print_table
+from mapctl.commands.shared.outputs import print_table
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.formats import bvh
@@ -24,8 +24,8 @@ from mapctl.retarget import RigMap
 from mapctl.retarget.doubts import Fit, assess_fit
 from mapctl.skeleton import CANONICAL
 from priors import checkpoints, weight_sets
-from priors.licences import find_strictest
 from priors.tweener import count_clips
+from priors.weight_sets import find_strictest
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,7 @@ from mapctl import editing, formats, metrics, report, retarget
 from mapctl.commands.shared import inputs, options
 from mapctl.commands.shared.command import ModelCommand
 from mapctl.commands.shared.inputs import read_motion
-from mapctl.commands.shared.progress_bar import show_progress
-from mapctl.commands.shared.tables import format_cell, print_table
+from mapctl.commands.shared.outputs import format_cell, print_table, show_progress
 from mapctl.curves.curve import Curve
 from mapctl.errors import CheckpointError, MapctlError, RequestError
 from mapctl.features import PRIOR_FPS

@@ -7,7 +7,7 @@ from tyro.conf import arg
 
 from mapctl.commands.shared import inputs, options, outputs
 from mapctl.commands.shared.command import Command
-from mapctl.commands.shared.progress_bar import show_progress
+from mapctl.commands.shared.outputs import show_progress
 from mapctl.curves import Curve
 from mapctl.motion import Motion
 from mapctl.retarget import put_upright

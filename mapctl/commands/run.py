@@ -15,7 +15,7 @@ from mapctl import report
 from mapctl.commands.shared import options, outputs
 from mapctl.commands.shared.command import INTERRUPTED, ModelCommand, conclude
 from mapctl.commands.shared.inputs import read_character, read_drawn_character
-from mapctl.commands.shared.progress_bar import show_progress
+from mapctl.commands.shared.outputs import show_progress
 from mapctl.commands.shared.shots import (
     PlayedShot,
     ShotPlan,

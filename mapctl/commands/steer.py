@@ -29,7 +29,7 @@ from mapctl import formats, metrics, report
 from mapctl.commands.shared import inputs, options, outputs, streaming
 from mapctl.commands.shared.command import ModelCommand, conclude
 from mapctl.commands.shared.inputs import read_character
-from mapctl.commands.shared.progress_bar import show_progress
+from mapctl.commands.shared.outputs import show_progress
 from mapctl.curves.obstacles import Obstacle, measure_clearance
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
@@ -38,8 +38,8 @@ from mapctl.metrics.travel import measure_arrivals, measure_commands
 from mapctl.motion import Motion, join_licences
 from mapctl.problem.solution import Outcome, Solution, Status
 from mapctl.terms import FootContact
-from priors.licences import note_licence
 from priors.lstm_gmm.density import LstmGmmDensity
+from priors.weight_sets import note_licence
 
 if TYPE_CHECKING:
     from mapctl.streaming.sender import PoseStream

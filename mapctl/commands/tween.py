@@ -9,8 +9,13 @@ import torch
 from tyro.conf import arg
 
 import priors
-from controllers.inbetweening.keyframe_poses import KeyframeClip, KeyInterval, build_keyframe_clip, suggest_intervals
-from controllers.inbetweening.keyframes import check_effectors
+from controllers.inbetweening.keyframes import (
+    KeyframeClip,
+    KeyInterval,
+    build_keyframe_clip,
+    check_effectors,
+    suggest_intervals,
+)
 from controllers.inbetweening.pipeline import InbetweenSolution, InfillSettings
 from controllers.inbetweening.proposers import ModelLoaders, RolloutInbetweener, StitchedInbetweener, build_inbetweener
 from controllers.inbetweening.tween import measure_keyframe_errors, tween
@@ -19,16 +24,15 @@ from mapctl import report
 from mapctl.commands.shared import inputs, options, outputs, results
 from mapctl.commands.shared.command import NOT_SATISFIED, ModelCommand, conclude
 from mapctl.commands.shared.options import parse_frame
-from mapctl.commands.shared.progress_bar import show_progress
+from mapctl.commands.shared.outputs import print_table, show_progress
 from mapctl.commands.shared.results import Example, find_styles, find_tweener, read_dna, restyle
-from mapctl.commands.shared.tables import print_table
 from mapctl.errors import FileFormatError, RequestError
 from mapctl.intent.keyframe_toml import KeyRequest, read_keys
 from mapctl.intent.keyframes import Keys
 from mapctl.protocols import Inbetweener
 from mapctl.retarget import to_canonical
 from mapctl.retarget.rigs import Rig
-from priors import licences
+from priors import weight_sets
 from priors.stitcher import Stitcher
 from priors.tweener import draw_style
 from scenes.film import draw_strips_to
@@ -178,7 +182,7 @@ def _load_key_file(command: Tween, request: KeyRequest, rig: Rig | None) -> Keyf
         clip = build_keyframe_clip(request, rig, None if command.quiet else inputs.print_doubts)
     except RequestError as error:
         raise FileFormatError(command.source, str(error)) from error
-    licences.note_licence(str(command.source), clip.motion.licence)
+    weight_sets.note_licence(str(command.source), clip.motion.licence)
     return clip
 
 

@@ -1,9 +1,11 @@
-"""Fast root integration and forward kinematics of a trial: compiled, with hand-written adjoints, on one core.
+"""Root integration and forward kinematics of a trial, compiled, with adjoints written by hand, on one core.
 
-Same mathematics as `features.integrate_root` and `kinematics.positions_from_matrices`, which remain the specification
-and serve every case but float32 on the CPU. Each is one node of torch's graph, differentiable once.
+`features.integrate_root` and `kinematics.positions_from_matrices` remain the specification, and serve every case but
+float32 on the CPU. Each is one node of torch's graph, differentiable once. Kernels compute in float64 whatever the
+arrays hold, so that sums over frames stay exact.
 """
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -15,9 +17,187 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mapctl.features import LAYOUT, GroundPose
-from mapctl.kinematics import fast_kernels
+from mapctl.numerics.jit import make_jit_decorators
 from mapctl.pose import BodyPose
 from mapctl.skeleton import FEET, Skeleton, find_heels
+
+entry, inner = make_jit_decorators("contract", "nsz")
+
+_SERIES_THRESHOLD = 1e-2  # squared radians below which the series are exact to 1e-10 and the quotients begin to cancel
+
+
+@entry
+def root_forward(features, columns, start_xz, start_heading, ground, headings):
+    """Integrate features (batch, frames, size) by Eq. 4; fill ground (batch, frames, 2), headings (batch, frames)."""
+    dx, dz, turn = columns.dx, columns.dz, columns.turn
+    for b in range(len(features)):
+        x, z, heading = np.float64(start_xz[b, 0]), np.float64(start_xz[b, 1]), np.float64(start_heading[b])
+        for t in range(features.shape[1]):
+            now = features[b, t]
+            sine, cosine = math.sin(heading), math.cos(heading)
+            x += cosine * now[dx] + sine * now[dz]
+            z += cosine * now[dz] - sine * now[dx]
+            heading += now[turn]
+            ground[b, t, 0], ground[b, t, 1], headings[b, t] = x, z, heading
+
+
+@entry
+def root_backward(features, columns, start_heading, d_ground, d_headings, d_features):
+    """Apply the adjoint of `root_forward`; fill the root's columns of d_features, which come in as zeros."""
+    dx, dz, turn = columns.dx, columns.dz, columns.turn
+    for b in range(len(features)):
+        heading = np.float64(start_heading[b])
+        for t in range(features.shape[1]):
+            heading += features[b, t, turn]
+        gx, gz, gh = 0.0, 0.0, 0.0  # on the position and the heading after the frame
+        for t in range(features.shape[1] - 1, -1, -1):
+            now, out = features[b, t], d_features[b, t]
+            gx, gz, gh = gx + d_ground[b, t, 0], gz + d_ground[b, t, 1], gh + d_headings[b, t]
+            heading -= now[turn]
+            sine, cosine = math.sin(heading), math.cos(heading)
+            out[dx], out[dz], out[turn] = cosine * gx - sine * gz, sine * gx + cosine * gz, gh
+            gh += gx * (cosine * now[dz] - sine * now[dx]) - gz * (sine * now[dz] + cosine * now[dx])
+
+
+@inner
+def rotation_series(square):
+    """Return sin(a)/a, (1 - cos a)/a^2 and (a - sin a)/a^3 of an angle a, from its square; smooth at 0."""
+    if square < _SERIES_THRESHOLD:
+        first = 1.0 - square / 6.0 * (1.0 - square / 20.0 * (1.0 - square / 42.0))
+        second = 0.5 - square / 24.0 * (1.0 - square / 30.0 * (1.0 - square / 56.0))
+        third = 1.0 / 6.0 - square / 120.0 * (1.0 - square / 42.0 * (1.0 - square / 72.0))
+        return first, second, third
+    angle = math.sqrt(square)
+    first = math.sin(angle) / angle
+    return first, (1.0 - math.cos(angle)) / square, (1.0 - first) / square
+
+
+@inner
+def compose_rotation(world, above, x, y, z):
+    """Set world = above exp([x y z]): a frame rotated by a rotation vector given in it (Rodrigues)."""
+    first, second, _ = rotation_series(x * x + y * y + z * z)
+    r00, r11, r22 = 1.0 - second * (y * y + z * z), 1.0 - second * (x * x + z * z), 1.0 - second * (x * x + y * y)
+    r01, r10 = second * x * y - first * z, second * x * y + first * z
+    r02, r20 = second * x * z + first * y, second * x * z - first * y
+    r12, r21 = second * y * z - first * x, second * y * z + first * x
+    for i in range(3):
+        a0, a1, a2 = above[i, 0], above[i, 1], above[i, 2]
+        world[i, 0] = a0 * r00 + a1 * r10 + a2 * r20
+        world[i, 1] = a0 * r01 + a1 * r11 + a2 * r21
+        world[i, 2] = a0 * r02 + a1 * r12 + a2 * r22
+
+
+@inner
+def fill_rotation_about_y(turn, heading):
+    """Fill the matrix of a rotation about +Y."""
+    sine, cosine = math.sin(heading), math.cos(heading)
+    turn[0, 0], turn[0, 1], turn[0, 2] = cosine, 0.0, sine
+    turn[1, 0], turn[1, 1], turn[1, 2] = 0.0, 1.0, 0.0
+    turn[2, 0], turn[2, 1], turn[2, 2] = -sine, 0.0, cosine
+
+
+@entry
+def body_forward(features, columns, ground, headings, bones, positions, heels, world):
+    """Fill positions (batch, frames, joints, 3) and rotations `world` (batch, frames, joints, 3, 3) of every joint, and
+    the positions of the heels (batch, frames, 2, 3). `bones` are those of `Bones`."""
+    parents, offsets, feet, heel_offsets = bones.parents, bones.offsets, bones.feet, bones.heels
+    heading_frame = np.empty((3, 3))
+    for b in range(len(features)):
+        for t in range(features.shape[1]):
+            now, at, frames = features[b, t], positions[b, t], world[b, t]
+            fill_rotation_about_y(heading_frame, np.float64(headings[b, t]))
+            compose_rotation(
+                frames[0], heading_frame, np.float64(now[columns.tilt_x]), 0.0, np.float64(now[columns.tilt_z])
+            )
+            at[0, 0], at[0, 1], at[0, 2] = ground[b, t, 0], now[columns.height], ground[b, t, 1]
+            for joint in range(1, len(parents)):
+                above, bone, vector = frames[parents[joint]], offsets[joint], columns.joints + 3 * (joint - 1)
+                for i in range(3):
+                    step = above[i, 0] * bone[0] + above[i, 1] * bone[1] + above[i, 2] * bone[2]
+                    at[joint, i] = at[parents[joint], i] + step
+                compose_rotation(
+                    frames[joint],
+                    above,
+                    np.float64(now[vector]),
+                    np.float64(now[vector + 1]),
+                    np.float64(now[vector + 2]),
+                )
+            for side in range(len(feet)):
+                above, bone, foot = frames[feet[side]], heel_offsets[side], feet[side]
+                for i in range(3):
+                    step = above[i, 0] * bone[0] + above[i, 1] * bone[1] + above[i, 2] * bone[2]
+                    heels[b, t, side, i] = at[foot, i] + step
+
+
+@inner
+def rotation_vector_gradient(world, torque, x, y, z):
+    """Return the gradient to a joint's rotation vector from the torque about it: the right Jacobian's transpose, in its
+    frame."""
+    ux = world[0, 0] * torque[0] + world[1, 0] * torque[1] + world[2, 0] * torque[2]
+    uy = world[0, 1] * torque[0] + world[1, 1] * torque[1] + world[2, 1] * torque[2]
+    uz = world[0, 2] * torque[0] + world[1, 2] * torque[1] + world[2, 2] * torque[2]
+    _, second, third = rotation_series(x * x + y * y + z * z)
+    cx, cy, cz = y * uz - z * uy, z * ux - x * uz, x * uy - y * ux
+    return (
+        ux + second * cx + third * (y * cz - z * cy),
+        uy + second * cy + third * (z * cx - x * cz),
+        uz + second * cz + third * (x * cy - y * cx),
+    )
+
+
+@entry
+def body_backward(features, columns, bones, world, d_positions, d_heels, d_features, d_ground, d_headings):
+    """Apply the adjoint of `body_forward`, by forces and torques as in statics.
+
+    A gradient on a position is a force there. The gradient of a joint's rotation is the torque about that joint of the
+    forces on all its descendants; both are summed from the leaves to the root. Fills the body's columns of
+    d_features, which come in as zeros, d_ground and d_headings.
+    """
+    parents, offsets, feet, heel_offsets = bones.parents, bones.offsets, bones.feet, bones.heels
+    pulled, still = np.empty(3), np.zeros(3)
+    force, torque = np.empty((len(parents), 3)), np.empty((len(parents), 3))
+    for b in range(len(features)):
+        for t in range(features.shape[1]):
+            now, out, frames = features[b, t], d_features[b, t], world[b, t]
+            for joint in range(len(parents)):  # written out: slices take as long as all the rest to compile
+                for i in range(3):
+                    force[joint, i], torque[joint, i] = d_positions[b, t, joint, i], 0.0
+            for side in range(len(feet)):
+                foot = feet[side]
+                for i in range(3):
+                    pulled[i] = d_heels[b, t, side, i]
+                accumulate_to_parent(frames[foot], heel_offsets[side], pulled, still, force[foot], torque[foot])
+            for joint in range(len(parents) - 1, 0, -1):
+                v = columns.joints + 3 * (joint - 1)
+                out[v], out[v + 1], out[v + 2] = rotation_vector_gradient(
+                    frames[joint], torque[joint], np.float64(now[v]), np.float64(now[v + 1]), np.float64(now[v + 2])
+                )
+                accumulate_to_parent(
+                    frames[parents[joint]],
+                    offsets[joint],
+                    force[joint],
+                    torque[joint],
+                    force[parents[joint]],
+                    torque[parents[joint]],
+                )
+            out[columns.tilt_x], _, out[columns.tilt_z] = rotation_vector_gradient(
+                frames[0], torque[0], np.float64(now[columns.tilt_x]), 0.0, np.float64(now[columns.tilt_z])
+            )
+            out[columns.height] = force[0, 1]
+            d_ground[b, t, 0], d_ground[b, t, 1], d_headings[b, t] = force[0, 0], force[0, 2], torque[0, 1]
+
+
+@inner
+def accumulate_to_parent(above, bone, force, torque, force_above, torque_above):
+    """Add a joint's force and torque to its parent's; the force's lever is the bone between them."""
+    x = above[0, 0] * bone[0] + above[0, 1] * bone[1] + above[0, 2] * bone[2]
+    y = above[1, 0] * bone[0] + above[1, 1] * bone[1] + above[1, 2] * bone[2]
+    z = above[2, 0] * bone[0] + above[2, 1] * bone[1] + above[2, 2] * bone[2]
+    torque_above[0] += torque[0] + (y * force[2] - z * force[1])
+    torque_above[1] += torque[1] + (z * force[0] - x * force[2])
+    torque_above[2] += torque[2] + (x * force[1] - y * force[0])
+    for i in range(3):
+        force_above[i] += force[i]
 
 
 class FeatureColumns(NamedTuple):
@@ -110,12 +290,10 @@ class WorldPoses:
         batch, bones, known = len(features), _tabulate_bones(skeleton), _contiguous_array(features)
         at, start_heading = start.position_xz.expand(batch, 2).contiguous(), start.heading.expand(batch).contiguous()
         ground, heading = features.new_empty(*known.shape[:2], 2), features.new_empty(known.shape[:2])
-        fast_kernels.root_forward(known, _COLUMNS, at.numpy(), start_heading.numpy(), ground.numpy(), heading.numpy())
+        root_forward(known, _COLUMNS, at.numpy(), start_heading.numpy(), ground.numpy(), heading.numpy())
         positions, heels = _allocate_points(features, bones)
         turns = np.empty((*positions.shape, 3), np.float32)
-        fast_kernels.body_forward(
-            known, _COLUMNS, ground.numpy(), heading.numpy(), bones, positions.numpy(), heels.numpy(), turns
-        )
+        body_forward(known, _COLUMNS, ground.numpy(), heading.numpy(), bones, positions.numpy(), heels.numpy(), turns)
         return WorldPoses(ground, heading, positions, heels, known, start_heading.numpy(), bones, turns)
 
     def pull_back(
@@ -124,12 +302,12 @@ class WorldPoses:
         """Return the gradient on the features (batch, frames, size) from those on roots, headings, joints and heels."""
         gradient, (batch, frames, _) = np.zeros(self._features.shape, np.float32), self._features.shape
         ground, heading = np.empty((batch, frames, 2), np.float32), np.empty((batch, frames), np.float32)
-        fast_kernels.body_backward(
+        body_backward(
             self._features, _COLUMNS, self._bones, self._rotations, d_joints, d_heels, gradient, ground, heading
         )
         ground += d_root_xz
         heading += d_heading
-        fast_kernels.root_backward(self._features, _COLUMNS, self._start_heading, ground, heading, gradient)
+        root_backward(self._features, _COLUMNS, self._start_heading, ground, heading, gradient)
         return gradient
 
 
@@ -157,7 +335,7 @@ class _Root(torch.autograd.Function):
     def forward(ctx: Any, features: Tensor, start_xz: Tensor, start_heading: Tensor):
         ground, heading = features.new_empty(*features.shape[:2], 2), features.new_empty(features.shape[:2])
         known, at = _contiguous_array(features), start_heading.numpy()
-        fast_kernels.root_forward(known, _COLUMNS, start_xz.numpy(), at, ground.numpy(), heading.numpy())
+        root_forward(known, _COLUMNS, start_xz.numpy(), at, ground.numpy(), heading.numpy())
         ctx.known = known, at
         return ground, heading
 
@@ -166,7 +344,7 @@ class _Root(torch.autograd.Function):
     def backward(ctx: Any, *pulled: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
         features, start_heading = ctx.known
         gradient = np.zeros(features.shape, np.float32)
-        fast_kernels.root_backward(features, _COLUMNS, start_heading, *map(_contiguous_array, pulled), gradient)
+        root_backward(features, _COLUMNS, start_heading, *map(_contiguous_array, pulled), gradient)
         return torch.from_numpy(gradient), None, None
 
 
@@ -177,7 +355,7 @@ class _Body(torch.autograd.Function):
         positions, heels = _allocate_points(features, bones)
         world = np.empty((*positions.shape, 3), np.float32)
         known = _contiguous_array(features)
-        fast_kernels.body_forward(
+        body_forward(
             known,
             _COLUMNS,
             _contiguous_array(ground),
@@ -196,9 +374,7 @@ class _Body(torch.autograd.Function):
         features, bones, world = ctx.known
         gradient, shape = np.zeros(features.shape, np.float32), features.shape[:2]
         ground, heading = np.empty((*shape, 2), np.float32), np.empty(shape, np.float32)
-        fast_kernels.body_backward(
-            features, _COLUMNS, bones, world, *map(_contiguous_array, pulled), gradient, ground, heading
-        )
+        body_backward(features, _COLUMNS, bones, world, *map(_contiguous_array, pulled), gradient, ground, heading)
         return *map(torch.from_numpy, (gradient, ground, heading)), None
 
 

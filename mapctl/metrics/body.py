@@ -1,10 +1,21 @@
-"""Measures of the whole body: jitter, speed, facing, height and variety of poses."""
+"""Measures of the whole body: jitter, worst frames, and liveliness.
+
+Worst frames (the fastest hand, the largest acceleration, the longest travel without support) are reported beside
+means, which hide them: a hand that jumps by half a metre in one frame of two hundred hardly moves the mean. Liveliness
+(speed, spread and jerk of joints) is a ratio of sums over many gaps, since a mean of ratios is dominated by bodies that
+stand still.
+"""
+
+from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mapctl import rotations
+from mapctl import contacts, rotations
+from mapctl.kinematics import heading_of_matrix
+from mapctl.motion import Motion
 from mapctl.numerics.gaussian import low_pass
 from mapctl.rotations import unwrap_angle
 
@@ -43,3 +54,106 @@ def pose_variation(
     """
     relative = rotations.rotate_about_y(positions - hips[:, None], -angle[:, None])
     return float(relative.movedim(-1, 0).std(dim=1, correction=0).mean())
+
+
+_NEAR_FLOOR = 0.05  # height of the lower toe over its floor, metres, above which the body flies
+_LOW, _SLOW = 0.03, 0.35  # limits of a supporting toe's height, metres, and speed, m/s
+_MOVING_SPEED = 0.3  # speed of moving hips, m/s
+
+
+class Peaks(NamedTuple):
+    """Peaks of hands and feet relative to the hips."""
+
+    step: float
+    """Largest displacement in a thirtieth of a second, metres."""
+    acceleration: float
+    """Largest acceleration, m/s^2."""
+
+
+def measure_peaks(ends: Float[Tensor, "frames ends 3"], hips: Float[Tensor, "frames 3"], fps: float) -> Peaks:
+    """Measure peaks of world positions in metres; 0 for clips of too few frames."""
+    relative = ends - hips[:, None]
+    steps, changes = (torch.diff(relative, n=order, dim=0).norm(dim=-1) for order in (1, 2))
+    step, change = (float(sizes.max()) if sizes.numel() else 0.0 for sizes in (steps, changes))
+    return Peaks(step * fps / 30, change * fps**2)
+
+
+def find_unsupported(
+    toes: Float[Tensor, "frames feet 3"], hips: Float[Tensor, "frames 3"], fps: float
+) -> Bool[Tensor, " steps"]:
+    """Return by frame but the first whether the hips move over the ground while no toe is planted and the lower one is
+    near its floor: the body slides, it does not fly. World positions in metres; the floor is each toe's own 5th
+    percentile."""
+    height = (toes[..., 1] - contacts.estimate_floor_heights(toes))[1:]
+    speed, pace = (torch.diff(positions[..., ::2], dim=0).norm(dim=-1) * fps for positions in (toes, hips))
+    planted = ((height < _LOW) & (speed < _SLOW)).any(dim=1)
+    return ~planted & (height.amin(dim=1) < _NEAR_FLOOR) & (pace > _MOVING_SPEED)
+
+
+def measure_longest_unsupported(
+    toes: Float[Tensor, "frames feet 3"], hips: Float[Tensor, "frames 3"], fps: float
+) -> float:
+    """Measure the longest run of `find_unsupported`, seconds."""
+    longest = run = 0
+    for bad in find_unsupported(toes, hips, fps).tolist():
+        run = run + 1 if bad else 0
+        longest = max(longest, run)
+    return longest / fps
+
+
+_UNIT = 100.0  # cm
+
+
+@dataclass(frozen=True)
+class Liveliness:
+    """Sums over frames and joints of the body seen from its hips along their heading."""
+
+    count: float
+    """Frames times joints that were summed over."""
+    error: float
+    """Distances from the true places, cm."""
+    speed: float
+    """Changes from frame to frame, cm."""
+    spread: float
+    """Distances from the mean pose, cm."""
+    jerk: float
+    """Third differences, cm."""
+
+    def __add__(self, other: "Liveliness") -> "Liveliness":
+        return Liveliness(*(getattr(self, one.name) + getattr(other, one.name) for one in fields(self)))
+
+
+NOTHING = Liveliness(0.0, 0.0, 0.0, 0.0, 0.0)
+"""To begin a sum with."""
+
+
+def see_from_hips(
+    places: Float[Tensor, "*batch frames joints 3"], hips_world_matrix: Float[Tensor, "*batch frames 3 3"]
+) -> Float[Tensor, "*batch frames joints 3"]:
+    """Return joint places from the hips along the hips' heading, metres."""
+    return rotations.rotate_about_y(places - places[..., :1, :], -heading_of_matrix(hips_world_matrix)[..., None])
+
+
+def measure_path_length(motion: Motion) -> float:
+    """Measure the length of the joints' paths as seen from the hips, mean over joints, metres."""
+    seen = see_from_hips(motion.joint_positions(), rotations.to_matrix(motion.local_quat_xyzw[:, 0]))
+    return float(seen.diff(dim=0).norm(dim=-1).sum(dim=0).mean())
+
+
+def measure_liveliness(
+    seen: Float[Tensor, "frames joints 3"], true: Float[Tensor, "frames joints 3"], inside: Bool[Tensor, " frames"]
+) -> Liveliness:
+    """Measure one motion as `see_from_hips` returns it beside the true one, in the frames inside the gap; differences
+    take in the keys around it."""
+    joints = seen.shape[1]
+    error = ((seen - true).norm(dim=-1) * inside[:, None]).sum()
+    within = seen[inside]
+    spread = (within - within.mean(dim=0)).norm(dim=-1).sum()
+    sums = []
+    for order in (1, 3):
+        change = torch.diff(seen, n=order, dim=0).norm(dim=-1)
+        near = inside.float().unfold(0, order + 1, 1).amax(dim=-1)
+        sums.append((change * near[:, None]).sum())
+    speed, jerk = sums
+    found = (_UNIT * float(each) for each in (error, speed, spread, jerk))
+    return Liveliness(float(inside.sum()) * joints, *found)

@@ -10,8 +10,7 @@ from collections.abc import Iterator, Sequence
 from pythonosc.osc_packet import OscPacket
 
 from mapctl.errors import RequestError
-from mapctl.streaming.endpoint import Endpoint
-from mapctl.streaming.messages import Message
+from mapctl.streaming.messages import Endpoint, Message
 
 MAX_DATAGRAM_BYTES = 4096
 """Longer packets are dropped unread."""

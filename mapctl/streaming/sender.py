@@ -1,24 +1,129 @@
-"""Streams of poses: frames become packets here, and `post` sends each when it is due."""
+"""Streams of poses over the VMC protocol (protocol.vmc.info, Marionette, version 2.5); `post` sends packets when due.
+
+A bone has the name of Unity's HumanBodyBones, its position and rotation in its parent's frame, and no rotation in the
+T-pose. Unity's space is left-handed: +Y up, a character faces +Z and its left hand is toward -X. Ours is its mirror
+image through x = 0: a position (x, y, z) becomes (-x, y, z) and a rotation (x, y, z, w) becomes (x, -y, -z, w).
+"""
 
 import multiprocessing
 import queue
 import threading
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import dataclass, field
 
+import numpy as np
+import torch
 from jaxtyping import Float
 from numpy import ndarray
 from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
 from pythonosc.osc_message import OscMessage
 from pythonosc.osc_message_builder import OscMessageBuilder
 
+from mapctl import kinematics, rotations
 from mapctl.features import PRIOR_FPS
-from mapctl.runtime.processes import send_queued, spawn
-from mapctl.skeleton import Skeleton
-from mapctl.streaming import vmc
-from mapctl.streaming.endpoint import Endpoint
-from mapctl.streaming.messages import Message
+from mapctl.runtime.file_jobs import send_queued, spawn
+from mapctl.skeleton import CANONICAL, Skeleton
+from mapctl.streaming.messages import Endpoint, Message
 from mapctl.streaming.post import StreamStatistics, run_post
+
+OK, TIME, ROOT, BONE = "/VMC/Ext/OK", "/VMC/Ext/T", "/VMC/Ext/Root/Pos", "/VMC/Ext/Bone/Pos"
+"""Addresses: whether there is a character, the stream's time, the character's root, and one bone."""
+BONE_NAMES = tuple(name[0].upper() + name[1:] for name in CANONICAL.names)
+"""Names of the canonical joints in Unity, in their order. There is no UpperChest: the neck hangs from the chest."""
+_AVAILABLE = (1, 3, 0)  # a model is loaded, calibrated, in the normal mode
+_ROOT_NAME = "root"
+_TRANSFORM_NUMBERS = 7  # three of a place, four of a rotation
+_MIRROR_PLACE, _MIRROR_QUAT = np.array([-1.0, 1.0, 1.0]), np.array([1.0, -1.0, -1.0, 1.0])
+
+
+@dataclass(frozen=True, eq=False)
+class VmcFrame:
+    """One frame as it was received, in canonical axes."""
+
+    seconds: float
+    """Time of the stream, seconds."""
+    root_position: Float[ndarray, "3"]
+    """Position of the character's root in the world, metres."""
+    root_quat_xyzw: Float[ndarray, "4"]
+    """Orientation of the root."""
+    bone_positions: Float[ndarray, "joints 3"]
+    """Each canonical joint in its parent's frame, metres; the hips in the root's."""
+    bone_quats_xyzw: Float[ndarray, "joints 4"]
+    """Rotation of each canonical joint in its parent's frame."""
+
+    def joint_positions(self) -> Float[ndarray, "joints 3"]:
+        """Return the world positions of the canonical joints, metres, from the bones alone."""
+        root, turn, offsets, quats = (
+            torch.from_numpy(values)
+            for values in (self.root_position, self.root_quat_xyzw, self.bone_positions, self.bone_quats_xyzw)
+        )
+        hips = root + rotations.rotate(turn, offsets[0])
+        quats = torch.cat([rotations.multiply(turn, quats[0])[None], quats[1:]])
+        return kinematics.forward_kinematics(offsets, CANONICAL.parents, hips, quats)[0].numpy()
+
+
+def encode_frame(
+    skeleton: Skeleton,
+    position: Float[ndarray, "3"],
+    quats_xyzw: Float[ndarray, "joints 4"],
+    seconds: float,
+    *,
+    root_travels: bool = False,
+) -> list[Message]:
+    """Return the messages of one frame.
+
+    `skeleton` has the canonical joints with the character's bones, `position` is its hips in the world, metres, and
+    `quats_xyzw` are the joints' rotations in their parents' frames. The root stays at the origin and the hips travel;
+    with `root_travels` the root is on the ground below the hips. The time comes last: it ends the frame.
+    """
+    ground = position * (1.0, 0.0, 1.0) if root_travels else np.zeros(3)
+    places = skeleton.offsets.numpy().copy()
+    places[0] = position - ground
+    values = np.concatenate([places * _MIRROR_PLACE, quats_xyzw * _MIRROR_QUAT], axis=-1)
+    root = (*(ground * _MIRROR_PLACE).tolist(), 0.0, 0.0, 0.0, 1.0)
+    bones = [Message(BONE, (name, *row)) for name, row in zip(BONE_NAMES, values.tolist(), strict=True)]
+    return [Message(ROOT, (_ROOT_NAME, *root)), *bones, Message(OK, _AVAILABLE), Message(TIME, (float(seconds),))]
+
+
+@dataclass
+class FrameAssembler:
+    """Receiver's side: collects messages to frames. A frame of which a bone was lost is left out."""
+
+    _bones: dict[str, Float[ndarray, "7"]] = field(default_factory=dict)
+    _root: Float[ndarray, "7"] | None = None
+
+    def take(self, message: Message) -> VmcFrame | None:
+        """Take one message; return the frame that it completes. What is no pose, or no number, is passed over."""
+        if message.address == TIME:
+            return self._complete(message.arguments)
+        if message.address in (ROOT, BONE) and (found := _read_transform(message.arguments)) is not None:
+            if message.address == ROOT:
+                self._root = found[1]
+            elif found[0] in BONE_NAMES:
+                self._bones[found[0]] = found[1]
+        return None
+
+    def _complete(self, arguments: tuple[object, ...]) -> VmcFrame | None:
+        bones, self._bones, root = self._bones, {}, self._root
+        if len(bones) < len(BONE_NAMES) or root is None or not _are_numbers(arguments[:1]):
+            return None
+        rows = np.array([bones[name] for name in BONE_NAMES])
+        return VmcFrame(float(arguments[0]), root[:3], root[3:], rows[:, :3], rows[:, 3:])  # pyright: ignore[reportArgumentType]
+
+
+def _read_transform(arguments: tuple[object, ...]) -> tuple[str, Float[ndarray, "7"]] | None:
+    """Return name, place and rotation in canonical axes; what comes after them, as in version 2.1, means nothing."""
+    name, numbers = arguments[:1], arguments[1 : 1 + _TRANSFORM_NUMBERS]
+    if not name or not isinstance(name[0], str) or len(numbers) < _TRANSFORM_NUMBERS or not _are_numbers(numbers):
+        return None
+    values = np.array(numbers, dtype=np.float64)
+    return name[0], np.concatenate([values[:3] * _MIRROR_PLACE, values[3:] * _MIRROR_QUAT])
+
+
+def _are_numbers(values: tuple[object, ...]) -> bool:
+    return bool(values) and all(isinstance(value, int | float) and np.isfinite(value) for value in values)
+
 
 LATE_SECONDS = 0.5 / PRIOR_FPS
 """A frame that is sent more than this after it was due is late: half the time for which it is shown."""
@@ -42,7 +147,7 @@ class PoseStream:
         root_travels: bool = False,
         delay: float = DEFAULT_DELAY,
     ):
-        """Start the process that sends. `skeletons` have the canonical joints; see `vmc.encode_frame` for
+        """Start the process that sends. `skeletons` have the canonical joints; see `encode_frame` for
         `root_travels`.
 
         Every frame is sent `delay` seconds after it is to be seen here, so that one that is delivered late by less
@@ -75,7 +180,7 @@ class PoseStream:
         skeleton = self._skeletons[character]
         for k in range(len(root)):
             at = k / PRIOR_FPS
-            messages = vmc.encode_frame(skeleton, root[k], quats[k], seconds + at, root_travels=self._root_travels)
+            messages = encode_frame(skeleton, root[k], quats[k], seconds + at, root_travels=self._root_travels)
             self._queue.put(("put", character, due + at + self._delay, pack(messages)))
 
     def forget(self, character: int) -> None:

@@ -35,8 +35,8 @@ from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode, reversed_feat
 from mapctl.inbetweening.partial_motion import PartialMotion
 from mapctl.joint_roles import find_feet, find_hips
 from mapctl.kinematics import chain_matrices
+from mapctl.metrics.body import measure_longest_unsupported, measure_peaks
 from mapctl.metrics.gait import GOES, RUNS, STANDS, WALKS
-from mapctl.metrics.worst_frame import measure_longest_unsupported, measure_peaks
 from mapctl.motion import Motion
 from mapctl.pose import BodyPose, decode
 from mapctl.recording import Capture

@@ -33,9 +33,8 @@ from mapctl.formats.atomic import check_folder, write_text
 from mapctl.formats.text import one_line
 from priors import checkpoints
 from priors.checkpoints import NetworkConfig, require_at_least, write_tensors
-from priors.licences import OF_DATA
 from priors.training.data import Corpus, Split, read_corpus, split_corpus
-from priors.weight_sets import name_for_records
+from priors.weight_sets import OF_DATA, name_for_records
 
 
 @contextmanager

@@ -23,7 +23,7 @@ from mapctl.curves.obstacles import Obstacle, measure_clearance
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.intent.path import TimedSpeed
-from mapctl.metrics import measure, worst_frame
+from mapctl.metrics import body, measure
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL, TOES
 
@@ -82,7 +82,7 @@ def draw_shot(generator: torch.Generator) -> tuple[ShotRequest, tuple[str, ...]]
 def look_at(motion: Motion) -> dict[str, float]:
     """Measure planted toes, jitter, and the fastest hand or toe about the hips."""
     found, fps = measure(motion), float(motion.fps)
-    peaks = worst_frame.measure_peaks(motion.joint_positions()[:, ENDS], motion.root_position, fps)
+    peaks = body.measure_peaks(motion.joint_positions()[:, ENDS], motion.root_position, fps)
     return {
         "planted toes, cm/s": found["contact_speed_cm_s"],
         "jitter, m/s^3": found["jitter_m_s3"],

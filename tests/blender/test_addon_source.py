@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 import mapctl
 from mapctl import __version__
-from mapctl.blender.archive import build_addon_zip
+from mapctl.commands.blender_addon import build_addon_zip
 from mapctl.skeleton import CANONICAL
 
 SOURCE = ROOT / "mapctl" / "blender" / "addon"

@@ -5,7 +5,7 @@ import pytest
 from blender_session import needs_blender, run_in_blender
 
 import mapctl
-from mapctl.blender.archive import build_addon_zip
+from mapctl.commands.blender_addon import build_addon_zip
 
 pytestmark = needs_blender
 

@@ -8,7 +8,7 @@ from tiny_infiller import save_tiny_infiller
 from tiny_prior import save_tiny_prior
 
 import mapctl
-from mapctl.blender.archive import build_addon_zip
+from mapctl.commands.blender_addon import build_addon_zip
 
 pytestmark = needs_blender
 

@@ -8,7 +8,7 @@ from helpers import generator, walk
 from rigs_to_edit import RIGS, on_rig, soft_knees, toe_speed
 
 from mapctl import editing, retarget
-from mapctl.editing.footing import find_contacts
+from mapctl.editing.looping import find_contacts
 from mapctl.editing.rigged_motion import RiggedMotion
 from mapctl.editing.travel import repeat_over_ground
 from mapctl.skeleton import CANONICAL

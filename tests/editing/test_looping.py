@@ -10,8 +10,7 @@ from rig_maker import make
 from rigs_to_edit import RIGS, soft_knees
 
 from mapctl import editing, rotations
-from mapctl.editing.footing import find_contacts
-from mapctl.editing.looping import Peaks
+from mapctl.editing.looping import Peaks, find_contacts
 from mapctl.editing.rigged_motion import RiggedMotion
 from mapctl.editing.travel import repeat_over_ground
 

@@ -13,7 +13,7 @@ from turns import turn
 
 from mapctl import formats, rotations
 from mapctl.errors import RequestError
-from mapctl.formats import bvh, bvh_text
+from mapctl.formats import bvh
 from mapctl.formats.units import UNITS, guess_unit
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL
@@ -105,7 +105,7 @@ def content(parents, channels, frames, seed):
     offsets = random.normal(0, 40, (joints, 3)).round(4)
     names, ends = tuple(f"joint{j}" for j in range(joints)), {joints - 1: (0.0, 5.0, 0.0)}
     offsets = tuple((x, y, z) for x, y, z in offsets.tolist())
-    tree = bvh_text.Hierarchy(names, tuple(parents), offsets, tuple(channels), ends)
+    tree = bvh.Hierarchy(names, tuple(parents), offsets, tuple(channels), ends)
     values = random.uniform(-180, 180, (frames, len(tree.labels()))).round(4)
     return tree, values
 
@@ -117,7 +117,7 @@ def test_any_layout_is_read_as_defined_and_written_back_as_it_came(tmp_path_fact
     tree, values = content(*file)
     folder = tmp_path_factory.mktemp("layout")
     first, second, third = (folder / f"{name}.bvh" for name in ("first", "second", "third"))
-    first.write_text(bvh_text.compose(tree, "0.0333333", values, decimals=6))
+    first.write_text(bvh.compose(tree, "0.0333333", values, decimals=6))
     places, turns = world(tree, values)
     motion = agrees(first, places, turns, bvh.load(first).source.metres_per_unit)
     motion.save(second)
@@ -127,7 +127,7 @@ def test_any_layout_is_read_as_defined_and_written_back_as_it_came(tmp_path_fact
     again.save(third)
     motion.save(first)
     assert first.read_bytes() == second.read_bytes()
-    assert np.abs(bvh_text.read(third).values - bvh_text.read(second).values).max() < 1e-4
+    assert np.abs(bvh.read(third).values - bvh.read(second).values).max() < 1e-4
 
 
 QUIRKS = {
@@ -179,17 +179,17 @@ def test_unit_is_found_by_the_size_of_the_body_and_undone(unit, named, tmp_path)
     names = tuple(motion.skeleton.names if named else (f"bone{j}" for j in range(motion.num_joints)))
     motion = replace(motion, skeleton=replace(motion.skeleton, names=names, end_offsets={}))
     motion.save(tmp_path / "cm.bvh")
-    text = bvh_text.read(tmp_path / "cm.bvh")
+    text = bvh.read(tmp_path / "cm.bvh")
     offsets = tuple(tuple(float(x) * 0.01 / unit for x in offset) for offset in text.hierarchy.offsets)
     tree = replace(text.hierarchy, offsets=offsets)
     values = text.values.copy()
     values[:, :3] *= 0.01 / unit
-    (tmp_path / "unit.bvh").write_text(bvh_text.compose(tree, "0.0333333", values, decimals=8))
+    (tmp_path / "unit.bvh").write_text(bvh.compose(tree, "0.0333333", values, decimals=8))
     read = bvh.load(tmp_path / "unit.bvh")
     assert read.source.metres_per_unit == unit
     torch.testing.assert_close(read.root_position, motion.root_position, atol=1e-6, rtol=0)
     read.save(tmp_path / "back.bvh")
-    back = np.array(bvh_text.read(tmp_path / "back.bvh").hierarchy.offsets)
+    back = np.array(bvh.read(tmp_path / "back.bvh").hierarchy.offsets)
     order = [names.index(name) for name in tree.names]
     assert np.abs(back[1:] - bones[order][1:]).max() < 1e-5 / unit
 
@@ -225,7 +225,7 @@ def standing(frames=20, seed=0) -> Motion:
 def test_a_motion_without_source_is_written_in_the_plain_layout(tmp_path):
     motion = standing()
     motion.save(tmp_path / "out.bvh")
-    tree = bvh_text.read(tmp_path / "out.bvh").hierarchy
+    tree = bvh.read(tmp_path / "out.bvh").hierarchy
     assert tree.offsets[0] == (0, 0, 0)
     assert tree.channels[0] == ("Xposition", "Yposition", "Zposition", "Zrotation", "Xrotation", "Yrotation")
     assert set(tree.channels[1:]) == {("Zrotation", "Xrotation", "Yrotation")}
@@ -250,7 +250,7 @@ def test_still_six_channel_joints_are_bones_and_travelling_ones_are_not(tmp_path
     assert motion.skeleton.offsets[2].tolist() == [0, -0.79, 0.01]
     assert motion.root_position.tolist() == [[0.05, 0, 0], [0.05, 0, 0]]
     motion.save(tmp_path / "out.bvh")
-    before, after = (bvh_text.read(tmp_path / f"{name}.bvh") for name in ("in", "out"))
+    before, after = (bvh.read(tmp_path / f"{name}.bvh") for name in ("in", "out"))
     assert np.abs(before.values - after.values).max() < 1e-5
     assert before.hierarchy == after.hierarchy
 

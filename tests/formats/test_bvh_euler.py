@@ -10,7 +10,7 @@ from turns import turn
 
 from mapctl import rotations
 from mapctl.formats import bvh
-from mapctl.formats import bvh_text as text
+from mapctl.formats import bvh as text
 
 AXES = "XYZ"
 EULER_ORDERS = [order for order in product(range(3), repeat=3) if order[0] != order[1] != order[2]]

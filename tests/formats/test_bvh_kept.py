@@ -10,7 +10,7 @@ from lossy_files import with_all_channels
 
 import mapctl
 from mapctl import rotations
-from mapctl.formats import bvh_text as text
+from mapctl.formats import bvh as text
 
 FRAMES = 40
 

@@ -12,7 +12,7 @@ from tiny_infiller import tiny_infiller
 from controllers.inbetweening import blend as blending
 from controllers.inbetweening.blend import LimbTransfer, blend
 from mapctl import rotations
-from mapctl.metrics import worst_frame
+from mapctl.metrics import body
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL
 
@@ -66,7 +66,7 @@ ENDS = [CANONICAL.index(name) for name in ("leftHand", "rightHand", "leftToes", 
 
 
 def peaks_of(motion):
-    return worst_frame.measure_peaks(motion.joint_positions()[:, ENDS], motion.root_position, float(motion.fps))
+    return body.measure_peaks(motion.joint_positions()[:, ENDS], motion.root_position, float(motion.fps))
 
 
 @pytest.mark.parametrize("fps", [30, 60])

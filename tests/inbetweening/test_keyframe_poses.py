@@ -10,7 +10,7 @@ from rig_maker import Make, make, names_of
 from tiny_infiller import tiny_infiller
 
 import mapctl
-from controllers.inbetweening.keyframe_poses import build_keyframe_clip
+from controllers.inbetweening.keyframes import build_keyframe_clip
 from controllers.inbetweening.tween import measure_keyframe_errors, tween
 from mapctl import retarget
 from mapctl.errors import RequestError

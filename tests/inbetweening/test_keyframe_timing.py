@@ -8,7 +8,7 @@ from captures import on_rig
 from helpers import generator, moved, random_motion, walk
 
 import priors
-from controllers.inbetweening import keyframe_poses
+from controllers.inbetweening import keyframes
 from mapctl.errors import RequestError
 from mapctl.inbetweening.missing import MissingMask, restore_observed
 from mapctl.inbetweening.pose_pairs import PAIR_FEATURES, sample_pose_pairs
@@ -18,7 +18,7 @@ KEYS = Keys((0, 20, 50, 89))
 
 
 def suggest_intervals(motion, keys):
-    return keyframe_poses.suggest_intervals(motion, keys, priors.load_keyframe_timing())
+    return keyframes.suggest_intervals(motion, keys, priors.load_keyframe_timing())
 
 
 def frames(intervals):

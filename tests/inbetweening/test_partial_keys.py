@@ -13,14 +13,13 @@ from methods import by_method
 from tiny_infiller import tiny_infiller
 
 from controllers.inbetweening.pipeline import InfillSettings
-from controllers.inbetweening.proposers import SlerpInbetweener
-from controllers.inbetweening.proposers.partial_keys import propose_through_keys
+from controllers.inbetweening.proposers import SlerpInbetweener, propose_through_keys
 from controllers.inbetweening.tween import tween
 from mapctl.inbetweening import GapQuery
 from mapctl.inbetweening.effector_targets import EffectorTargets
 from mapctl.inbetweening.missing import MissingMask
 from mapctl.intent.keyframes import Key, Keys
-from mapctl.metrics import worst_frame
+from mapctl.metrics import body
 from mapctl.retarget import to_canonical
 from mapctl.skeleton import CANONICAL, LIMBS
 
@@ -30,7 +29,7 @@ HANDS = {"canonical": "leftHand", "bandai": "Hand_L", "daz": "lHand"}
 
 def peaks_of(motion):
     canonical = to_canonical(motion)[0]
-    return worst_frame.measure_peaks(canonical.joint_positions()[:, ENDS], canonical.root_position, float(motion.fps))
+    return body.measure_peaks(canonical.joint_positions()[:, ENDS], canonical.root_position, float(motion.fps))
 
 
 def asked(motion, keys, *, method="infiller", drawn=0.0):

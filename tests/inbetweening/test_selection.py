@@ -8,8 +8,7 @@ from helpers import tiny_density, walk
 from tiny_infiller import tiny_infiller
 
 from controllers.inbetweening.pipeline import CanonicalClip
-from controllers.inbetweening.proposers.auto import STANDING_STILL, AutoInbetweener
-from controllers.inbetweening.proposers.rollouts import hold_planted
+from controllers.inbetweening.proposers import STANDING_STILL, AutoInbetweener, hold_planted
 from controllers.inbetweening.tween import tween
 from mapctl import contacts, rotations
 from mapctl.inbetweening import Proposal

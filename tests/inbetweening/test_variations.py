@@ -14,8 +14,14 @@ from tiny_prior import save_tiny_prior
 import priors
 from controllers.inbetweening.infill import infill
 from controllers.inbetweening.pipeline import INFILL_REFINEMENT, CanonicalClip, InfillSettings
-from controllers.inbetweening.proposers import AutoInbetweener, RolloutInbetweener, SlerpInbetweener
-from controllers.inbetweening.proposers.rollouts import Roller, Rollout, RolloutSettings
+from controllers.inbetweening.proposers import (
+    AutoInbetweener,
+    Roller,
+    Rollout,
+    RolloutInbetweener,
+    RolloutSettings,
+    SlerpInbetweener,
+)
 from controllers.inbetweening.tween import tween
 from controllers.inbetweening.variations import lowest_energy, sample_variations
 from mapctl.errors import RequestError

@@ -8,8 +8,7 @@ from tiny_tweener import tiny_tweener
 
 import priors
 from controllers.inbetweening.pipeline import InfillSettings
-from controllers.inbetweening.proposers import AutoInbetweener, SlerpInbetweener
-from controllers.inbetweening.proposers.slerp import lay_curve
+from controllers.inbetweening.proposers import AutoInbetweener, SlerpInbetweener, lay_curve
 from controllers.inbetweening.tween import measure_keyframe_errors, tween
 from mapctl.inbetweening import GapQuery
 from mapctl.inbetweening.effector_targets import LooseKeys

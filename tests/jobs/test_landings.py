@@ -11,7 +11,7 @@ import priors
 from controllers.common.character import Character
 from controllers.shots.walk import FollowSettings
 from mapctl import curves
-from mapctl.metrics.worst_frame import measure_peaks
+from mapctl.metrics.body import measure_peaks
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, TOES
 
 

@@ -8,15 +8,14 @@ import torch
 from helpers import walk
 
 import priors
-from controllers.shots.posing import measure_pose_error, meet_poses
-from controllers.shots.reaching import ReachTargets, go_down, settle_reaches
+from controllers.shots.reaching import ReachTargets, go_down, measure_pose_error, meet_poses, settle_reaches
 from controllers.shots.request import Arrival, PoseKey, Reach, ShotRequest, arrive
 from controllers.shots.shot import OVERLAP, close_loop
 from controllers.shots.way import Way, plan_way
 from mapctl import curves, kinematics
 from mapctl.errors import RequestError
 from mapctl.intent.path import SpeedProfile
-from mapctl.metrics import worst_frame
+from mapctl.metrics import body
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL, TOES
 
@@ -82,7 +81,7 @@ def test_a_key_is_met_exactly_and_the_rest_of_the_shot_stays(key, walked, way, i
         assert float(made.root_position[60, 1]) == pytest.approx(0.8, abs=1e-3)
     torch.testing.assert_close(made.root_position[:20], walked.root_position[:20])
     torch.testing.assert_close(made.local_quat_xyzw[-15:], walked.local_quat_xyzw[-15:])
-    peaks = worst_frame.measure_peaks(made.joint_positions()[:, ENDS], made.root_position, 30.0)
+    peaks = body.measure_peaks(made.joint_positions()[:, ENDS], made.root_position, 30.0)
     assert peaks.step * 30 < 5.5
 
 
@@ -177,7 +176,7 @@ def test_a_shot_ends_in_a_clips_frame_and_moves_as_the_clip_does(walked, inbetwe
     assert made.num_frames == walked.num_frames
     torch.testing.assert_close(made.joint_positions()[-1], arrival.motion.joint_positions()[0], atol=1e-6, rtol=0)
     ahead = torch.cat([made.joint_positions(), arrival.motion.joint_positions()[1:3]])
-    peaks = worst_frame.measure_peaks(ahead[-30:, ENDS], ahead[-30:, 0], 30.0)
+    peaks = body.measure_peaks(ahead[-30:, ENDS], ahead[-30:, 0], 30.0)
     assert peaks.step * 30 < 5.5
     torch.testing.assert_close(made.root_position[:60], walked.root_position[:60])
 

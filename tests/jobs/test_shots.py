@@ -9,7 +9,7 @@ import torch
 from helpers import walk
 
 import priors
-from controllers.shots.posing import build_rest_pose, measure_look_errors, turn_heads
+from controllers.shots.reaching import build_rest_pose, measure_look_errors, turn_heads
 from controllers.shots.request import Lead, Look, Others, Reach, ShotRequest
 from controllers.shots.shot import solve_shot
 from controllers.shots.way import StandingEnds, lay_timeline, plan_speeds, plan_way
@@ -17,7 +17,7 @@ from mapctl import curves, rotations
 from mapctl.curves.obstacles import Obstacle, measure_clearance
 from mapctl.errors import RequestError
 from mapctl.intent.path import SpeedProfile, TimedSpeed
-from mapctl.metrics import worst_frame
+from mapctl.metrics import body
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, TOES
 
 LINE = curves.line(length=3)
@@ -183,7 +183,7 @@ def test_the_motion_of_a_shot_does_what_its_wishes_say(shot):
 def test_nothing_jumps_in_a_shot(shot):
     _, done = shot
     ends = done.motion.joint_positions()[:, list(CANONICAL.indices(("leftHand", "rightHand", *TOES)))]
-    peaks = worst_frame.measure_peaks(ends, done.motion.root_position, 30.0)
+    peaks = body.measure_peaks(ends, done.motion.root_position, 30.0)
     assert peaks.step * 30 < 5.5
     assert peaks.acceleration < 110
 
@@ -202,7 +202,7 @@ def test_who_reaches_far_aside_leaves_the_way_for_it_and_is_told():
     assert 0.3 < float(hips[60]) < 1.0
     assert float(hips[[0, -1]].abs().max()) < 0.1
     ends = done.motion.joint_positions()[:, list(CANONICAL.indices(("leftHand", "rightHand", *TOES)))]
-    assert worst_frame.measure_peaks(ends, done.motion.root_position, 30.0).step * 30 < 5.5
+    assert body.measure_peaks(ends, done.motion.root_position, 30.0).step * 30 < 5.5
 
 
 @pytest.mark.slow

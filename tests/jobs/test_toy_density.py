@@ -11,8 +11,7 @@ from toy_density import toy_density
 from controllers.common.map_refinement import RefinementSettings
 from controllers.denoising.denoise import DenoiseSettings, denoise
 from controllers.inbetweening.pipeline import InfillSettings
-from controllers.inbetweening.proposers import AutoInbetweener, RolloutInbetweener
-from controllers.inbetweening.proposers.rollouts import RolloutSettings
+from controllers.inbetweening.proposers import AutoInbetweener, RolloutInbetweener, RolloutSettings
 from controllers.inbetweening.tween import tween
 from controllers.shots.shot import follow
 from controllers.shots.walk import FollowSettings

@@ -6,7 +6,7 @@ import torch
 from helpers import walk
 
 from mapctl import contacts
-from mapctl.metrics import worst_frame
+from mapctl.metrics import body
 from mapctl.skeleton import CANONICAL
 
 TOES = [CANONICAL.index(name) for name in ("leftToes", "rightToes")]
@@ -18,19 +18,19 @@ def test_a_jump_of_one_frame_is_the_largest_step_whatever_the_body_does(fps):
     motion = walk(2 * fps, fps=fps)
     places = motion.joint_positions()
     ends = places[:, HANDS].clone()
-    calm = worst_frame.measure_peaks(ends, places[:, 0], fps)
+    calm = body.measure_peaks(ends, places[:, 0], fps)
     ends[fps, 0] += torch.tensor([0.0, 0.6, 0.0]).double()
-    peaks = worst_frame.measure_peaks(ends, places[:, 0], fps)
+    peaks = body.measure_peaks(ends, places[:, 0], fps)
     assert peaks.step == pytest.approx(0.6 * fps / 30, abs=calm.step)
     assert peaks.acceleration == pytest.approx(1.2 * fps**2, abs=calm.acceleration)
-    shifted = worst_frame.measure_peaks(
+    shifted = body.measure_peaks(
         ends + torch.arange(2 * fps)[:, None, None], places[:, 0] + torch.arange(2 * fps)[:, None], fps
     )
     assert shifted == pytest.approx(peaks)
 
 
 def test_a_single_frame_has_no_peaks():
-    assert worst_frame.measure_peaks(torch.zeros(1, 2, 3), torch.zeros(1, 3), 30.0) == (0.0, 0.0)
+    assert body.measure_peaks(torch.zeros(1, 2, 3), torch.zeros(1, 3), 30.0) == (0.0, 0.0)
 
 
 def independent(toes, hips, fps):
@@ -52,10 +52,10 @@ def test_the_longest_time_unsupported_is_that_of_the_definition(slide):
     toes, hips = (motion.joint_positions()[:, joints].clone() for joints in (TOES, [0]))
     shift = torch.arange(90).clamp(min=30, max=70)[:, None] * torch.tensor([slide, 0.0, 0.0]).double()
     toes, hips = toes + shift[:, None], hips[:, 0] + shift
-    assert worst_frame.measure_longest_unsupported(toes, hips, 30.0) == pytest.approx(
+    assert body.measure_longest_unsupported(toes, hips, 30.0) == pytest.approx(
         independent(toes.numpy(), hips.numpy(), 30.0)
     )
-    assert (worst_frame.measure_longest_unsupported(toes, hips, 30.0) > 0.5) == (slide > 0.005)
+    assert (body.measure_longest_unsupported(toes, hips, 30.0) > 0.5) == (slide > 0.005)
 
 
 def test_a_body_stands_on_the_slowest_low_toe_and_on_none_in_flight():

@@ -10,7 +10,7 @@ from tiny_weights import FREE, MODELS, change_card, save_tiny_weights
 
 import priors
 from mapctl.errors import CheckpointError, RequestError
-from priors import checkpoints, licences, weight_sets
+from priors import checkpoints, weight_sets
 
 NOT_FREE = "CC BY-NC 4.0"
 
@@ -142,16 +142,16 @@ def test_bundled_models_of_the_free_set_are_free():
 
 def test_what_is_loaded_is_recorded_with_its_licence(folder):
     priors.load("locomotion")
-    with licences.record_licences() as used:
+    with weight_sets.record_licences() as used:
         assert not used
         priors.load("locomotion")
         priors.load_denoiser("free/denoiser")
         checkpoints.note_use("stitcher")
         priors.load(str(folder / "general.safetensors"))
     assert used == {"locomotion": NOT_FREE, "free/denoiser": FREE, "stitcher": NOT_FREE, "general": NOT_FREE}
-    assert licences.find_used_licences() == {}
-    assert licences.describe_licences(used) == {"licence": {"strictest": NOT_FREE, "models": dict(used)}}
-    assert licences.format_licences(used) == f"{NOT_FREE} (locomotion, stitcher, general); {FREE} (free/denoiser)"
+    assert weight_sets.find_used_licences() == {}
+    assert weight_sets.describe_licences(used) == {"licence": {"strictest": NOT_FREE, "models": dict(used)}}
+    assert weight_sets.format_licences(used) == f"{NOT_FREE} (locomotion, stitcher, general); {FREE} (free/denoiser)"
 
 
 @pytest.mark.parametrize(
@@ -169,4 +169,4 @@ def test_what_is_loaded_is_recorded_with_its_licence(folder):
     ],
 )
 def test_the_strictest_licence(held, strictest):
-    assert licences.find_strictest(held) == strictest
+    assert weight_sets.find_strictest(held) == strictest

@@ -8,7 +8,7 @@ from captures import DEGREE, shaken, swaying
 from helpers import generator, quat_xyzw
 
 from mapctl import rotations
-from mapctl.recording import faults
+from mapctl.recording import inspection
 
 
 def turned(quats, frames, joint, degrees):
@@ -21,11 +21,11 @@ def turned(quats, frames, joint, degrees):
 
 
 def find_angle_spikes(quats):
-    return faults.find_angle_spikes(quats, torch.ones(quats.shape[:2], dtype=torch.bool))
+    return inspection.find_angle_spikes(quats, torch.ones(quats.shape[:2], dtype=torch.bool))
 
 
 def find_position_spikes(places):
-    return faults.find_position_spikes(places, torch.ones(len(places), dtype=torch.bool))
+    return inspection.find_position_spikes(places, torch.ones(len(places), dtype=torch.bool))
 
 
 @pytest.mark.parametrize("frames", [[40], [40, 41], [2], [97], [0], [99]], ids=str)

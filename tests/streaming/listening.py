@@ -9,7 +9,7 @@ from contextlib import closing, contextmanager
 import numpy as np
 
 from mapctl.streaming.receiver import read_messages
-from mapctl.streaming.vmc import FrameAssembler, VmcFrame
+from mapctl.streaming.sender import FrameAssembler, VmcFrame
 
 
 def free_ports(count: int) -> int:

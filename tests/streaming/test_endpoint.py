@@ -3,7 +3,7 @@
 import pytest
 
 from mapctl.errors import RequestError
-from mapctl.streaming.endpoint import Endpoint
+from mapctl.streaming.messages import Endpoint
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,7 @@ import pytest
 from pythonosc.udp_client import SimpleUDPClient
 
 from mapctl.errors import RequestError
-from mapctl.streaming.endpoint import Endpoint
-from mapctl.streaming.messages import Message
+from mapctl.streaming.messages import Endpoint, Message
 from mapctl.streaming.receiver import MAX_DATAGRAM_BYTES, OscReceiver
 
 

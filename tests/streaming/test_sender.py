@@ -9,10 +9,9 @@ import pytest
 from helpers import walk
 
 from mapctl.skeleton import CANONICAL
-from mapctl.streaming.endpoint import Endpoint
+from mapctl.streaming.messages import Endpoint
 from mapctl.streaming.receiver import read_messages
-from mapctl.streaming.sender import PoseStream
-from mapctl.streaming.vmc import FrameAssembler, VmcFrame
+from mapctl.streaming.sender import FrameAssembler, PoseStream, VmcFrame
 
 MOTION = walk(30)
 ROOT, QUATS = MOTION.root_position.numpy(), MOTION.local_quat_xyzw.numpy()

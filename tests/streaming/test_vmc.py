@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from mapctl.skeleton import CANONICAL, Skeleton
-from mapctl.streaming import vmc
+from mapctl.streaming import sender
 from mapctl.streaming.messages import Message
 from mapctl.streaming.receiver import read_messages
 from mapctl.streaming.sender import pack
@@ -45,7 +45,7 @@ def frame(seed: int):
     """A random pose of a random body, and its messages."""
     motion = random_motion(body(seed), 1, seed=seed)
     root, quats = motion.root_position[0].numpy(), motion.local_quat_xyzw[0].numpy()
-    return motion, vmc.encode_frame(motion.skeleton, root, quats, 1.5)
+    return motion, sender.encode_frame(motion.skeleton, root, quats, 1.5)
 
 
 def sent_over(messages):
@@ -54,7 +54,7 @@ def sent_over(messages):
 
 
 def assembled(messages):
-    assembler = vmc.FrameAssembler()
+    assembler = sender.FrameAssembler()
     return [found for message in messages if (found := assembler.take(message)) is not None]
 
 
@@ -62,7 +62,7 @@ def assembled(messages):
 def test_joints_come_back(seed, root_travels):
     motion = random_motion(body(seed), 1, seed=seed)
     root, quats = motion.root_position[0].numpy(), motion.local_quat_xyzw[0].numpy()
-    messages = vmc.encode_frame(motion.skeleton, root, quats, 12.25, root_travels=root_travels)
+    messages = sender.encode_frame(motion.skeleton, root, quats, 12.25, root_travels=root_travels)
     (exact,) = assembled(messages)
     np.testing.assert_allclose(exact.joint_positions(), motion.joint_positions()[0], atol=1e-12)
     np.testing.assert_array_equal(exact.bone_quats_xyzw, quats)
@@ -75,7 +75,7 @@ def test_joints_come_back(seed, root_travels):
 def test_a_left_handed_program_rebuilds_the_body(seed):
     """By its own tree and by scipy: whatever shares no code with the project."""
     motion, messages = frame(seed)
-    local = {m.arguments[0]: m.arguments[1:] for m in sent_over(messages) if m.address == vmc.BONE}
+    local = {m.arguments[0]: m.arguments[1:] for m in sent_over(messages) if m.address == sender.BONE}
 
     def world(name):
         place, turn = np.array(local[name][:3]), Rotation.from_quat(local[name][3:])
@@ -84,14 +84,14 @@ def test_a_left_handed_program_rebuilds_the_body(seed):
         at, above = world(PARENTS[name])
         return at + above.apply(place), above * turn
 
-    for joint, name in enumerate(vmc.BONE_NAMES):
+    for joint, name in enumerate(sender.BONE_NAMES):
         np.testing.assert_allclose(FLIP @ world(name)[0], motion.joint_positions()[0, joint], atol=3e-6)
 
 
 def test_the_t_pose_has_no_rotation_and_its_left_hand_at_minus_x():
     still = np.tile([0.0, 0.0, 0.0, 1.0], (21, 1))
-    messages = vmc.encode_frame(CANONICAL, np.array([0.0, 0.9, 0.0]), still, 0.0)
-    bones = {m.arguments[0]: m.arguments[1:] for m in messages if m.address == vmc.BONE}
+    messages = sender.encode_frame(CANONICAL, np.array([0.0, 0.9, 0.0]), still, 0.0)
+    bones = {m.arguments[0]: m.arguments[1:] for m in messages if m.address == sender.BONE}
     assert {tuple(np.abs(values[3:])) for values in bones.values()} == {(0.0, 0.0, 0.0, 1.0)}
     assert bones["LeftUpperArm"][0] < 0 < bones["RightUpperArm"][0]
     assert bones["LeftToes"][2] > 0
@@ -100,10 +100,10 @@ def test_the_t_pose_has_no_rotation_and_its_left_hand_at_minus_x():
 def test_hips_travel_or_the_root_does():
     motion = walk(60, turn_rate=0.5)
     place, quats = motion.root_position[50].numpy(), motion.local_quat_xyzw[50].numpy()
-    by_hips = vmc.encode_frame(CANONICAL, place, quats, 0.0)
-    by_root = vmc.encode_frame(CANONICAL, place, quats, 0.0, root_travels=True)
+    by_hips = sender.encode_frame(CANONICAL, place, quats, 0.0)
+    by_root = sender.encode_frame(CANONICAL, place, quats, 0.0, root_travels=True)
     mirrored = FLIP @ place
-    assert by_hips[0] == Message(vmc.ROOT, ("root", *np.zeros(3) * [-1, 1, 1], 0.0, 0.0, 0.0, 1.0))
+    assert by_hips[0] == Message(sender.ROOT, ("root", *np.zeros(3) * [-1, 1, 1], 0.0, 0.0, 0.0, 1.0))
     np.testing.assert_allclose(by_hips[1].arguments[1:4], mirrored)
     np.testing.assert_allclose(by_root[0].arguments[1:4], mirrored * [1, 0, 1])
     np.testing.assert_allclose(by_root[1].arguments[1:4], mirrored * [0, 1, 0])
@@ -119,13 +119,13 @@ def test_a_frame_with_a_lost_packet_is_left_out():
 @pytest.mark.parametrize(
     "message",
     [
-        Message(vmc.BONE),
-        Message(vmc.BONE, ("Hips", 1.0, 2.0)),
-        Message(vmc.BONE, ("Hips", *[math.nan] * 7)),
-        Message(vmc.BONE, ("Tail", *[0.0] * 7)),
-        Message(vmc.BONE, (3, *[0.0] * 7)),
-        Message(vmc.BONE, ("Hips", *["x"] * 7)),
-        Message(vmc.BONE, ("Hips", *[[0.0]] * 7)),
+        Message(sender.BONE),
+        Message(sender.BONE, ("Hips", 1.0, 2.0)),
+        Message(sender.BONE, ("Hips", *[math.nan] * 7)),
+        Message(sender.BONE, ("Tail", *[0.0] * 7)),
+        Message(sender.BONE, (3, *[0.0] * 7)),
+        Message(sender.BONE, ("Hips", *["x"] * 7)),
+        Message(sender.BONE, ("Hips", *[[0.0]] * 7)),
         Message("/VMC/Ext/Blend/Val", ("Joy", 1.0)),
     ],
 )

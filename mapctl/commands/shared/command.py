@@ -67,11 +67,11 @@ class ModelCommand(Command):
 
     def run(self) -> int:
         """Do the work with these weights, and tell the licence of its result."""
-        from priors import licences, weight_sets
+        from priors import weight_sets
 
-        with weight_sets.use_weights(self.weights), licences.record_licences() as used:
+        with weight_sets.use_weights(self.weights), weight_sets.record_licences() as used:
             weight_sets.find_current_set()  # an impossible one is refused now
             status = super().run()
         if used and self.tells_licence and not getattr(self, "quiet", False):
-            print(f"licence   {licences.format_licences(used)}")
+            print(f"licence   {weight_sets.format_licences(used)}")
         return status

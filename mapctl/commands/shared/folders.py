@@ -6,7 +6,7 @@ from pathlib import Path
 from mapctl import formats
 from mapctl.commands.shared import outputs
 from mapctl.commands.shared.command import NOT_SATISFIED
-from mapctl.commands.shared.progress_bar import explain_progress, show_progress
+from mapctl.commands.shared.outputs import explain_progress, show_progress
 from mapctl.errors import RequestError
 from mapctl.runtime.file_jobs import FileJob, FileResult
 

@@ -19,7 +19,7 @@ from mapctl.retarget import identify_rig, load_rig
 from mapctl.retarget.character import load_standing_character, make_tpose_clip
 from mapctl.retarget.doubts import assess_fit
 from mapctl.retarget.rigs import Rig, parse_unit
-from priors.licences import note_licence
+from priors.weight_sets import note_licence
 
 if TYPE_CHECKING:
     from mapctl.retarget.carry import RiggedCharacter

@@ -1,7 +1,11 @@
-"""Checks of output files and folders before any long work, so that a typing error does not cost an hour."""
+"""What commands write: checks of files before any long work, tables on standard output, and progress.
+
+Progress is a bar on a terminal, lines for a program that asks for them, and nothing in a pipe.
+"""
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from importlib.util import find_spec
@@ -9,11 +13,16 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
 from mapctl import formats
-from mapctl.errors import RequestError
+from mapctl.errors import RequestError, WriteError
 from mapctl.formats import atomic
 from mapctl.motion import Motion
-from priors import licences
+from mapctl.runtime.progress import Progress
+from priors import weight_sets
 
 
 def check_files(paths: Sequence[Path], *, given: Sequence[Path] = ()) -> None:
@@ -87,12 +96,12 @@ def make_folder(folder: Path) -> Iterator[Path]:
 
 def add_licence(report: Mapping[str, Any]) -> dict[str, Any]:
     """Add to a report the licences of the models that were used, the strictest first."""
-    return {**report, **licences.describe_licences(licences.find_used_licences())}
+    return {**report, **weight_sets.describe_licences(weight_sets.find_used_licences())}
 
 
 def format_used_licences() -> str:
     """Format the licences of what was used so far for a file: without the folders of models and motions."""
-    return licences.format_licences(licences.shorten_names(licences.find_used_licences()))
+    return weight_sets.format_licences(weight_sets.shorten_names(weight_sets.find_used_licences()))
 
 
 def mark_motion(motion: Motion) -> Motion:
@@ -104,3 +113,93 @@ def mark_motion(motion: Motion) -> Motion:
 def save_motion(motion: Motion, path: Path) -> None:
     """Write a motion with the licences of what it was made with, in formats that keep them."""
     formats.save(mark_motion(motion), path)
+
+
+NUMBER_FORMAT = "{:.4g}"
+
+
+def print_table(columns: Sequence[str], rows: Sequence[Sequence[object]], *, title: str | None = None) -> None:
+    """Numbers to the right with four digits, the rest as text; None and NaN as a dash."""
+    console = Console(width=None if Console().is_terminal else 200, highlight=False)
+    table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left", pad_edge=False)
+    for number, column in enumerate(columns):
+        numeric = any(isinstance(row[number], int | float) for row in rows)
+        table.add_column(column, justify="right" if numeric else "left", overflow="fold")
+    for row in rows:
+        table.add_row(*(format_cell(value) for value in row))
+    console.print(table)
+
+
+def format_cell(value: object) -> str:
+    """One value as a table shows it."""
+    if value is None or value != value:
+        return "-"
+    return NUMBER_FORMAT.format(value) if isinstance(value, float) else str(value)
+
+
+LINES = "MAPCTL_PROGRESS"
+"""Environment variable that asks for lines `progress DONE/TOTAL LABEL` on standard error."""
+
+
+@contextmanager
+def show_progress(label: str, *, quiet: bool = False) -> Iterator[Progress | None]:
+    """Yield a function that moves a bar on standard error; None where there is no terminal, or with `quiet`. Where the
+    environment variable MAPCTL_PROGRESS is set to something, it writes a line for each hundredth instead.
+    """
+    if os.environ.get(LINES):
+        yield _write_lines(label)
+        return
+    if quiet or not sys.stderr.isatty():
+        yield None
+        return
+    from rich import progress
+    from rich.console import Console
+
+    columns = (
+        progress.TextColumn("{task.description}"),
+        progress.BarColumn(),
+        progress.MofNCompleteColumn(),
+        progress.TimeRemainingColumn(),
+    )
+    with progress.Progress(*columns, console=Console(stderr=True), transient=True) as shown:
+        task = shown.add_task(label, total=None)
+        yield lambda done, total: shown.update(task, completed=done, total=total)
+
+
+def _write_lines(label: str) -> Progress:
+    last = -1
+
+    def write(done: int, total: int) -> None:
+        nonlocal last
+        hundredth = 100 * done // max(total, 1)
+        if hundredth != last:
+            last = hundredth
+            print(f"progress {done}/{total} {label}", file=sys.stderr, flush=True)
+
+    return write
+
+
+@contextmanager
+def explain_progress(count: int, what: str, then: str = "") -> Iterator[Callable[[int], None]]:
+    """Yield a function that takes the number of finished items; add it to the message of Ctrl-C, SIGTERM or a full disk
+    within, and what to do `then`.
+    """
+    finished = 0
+
+    def set_finished(number: int) -> None:
+        nonlocal finished
+        finished = number
+
+    def kept() -> tuple[str, ...]:
+        return (f"{finished} of {count} {what} are finished", then) if finished else ()
+
+    try:
+        yield set_finished
+    except KeyboardInterrupt as stop:
+        raise KeyboardInterrupt(_join_sentences(str(stop), *kept())) from stop
+    except WriteError as error:
+        raise WriteError(_join_sentences(str(error), *kept())) from error
+
+
+def _join_sentences(*parts: str) -> str:
+    return "; ".join(filter(None, parts))

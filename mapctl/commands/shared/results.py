@@ -14,8 +14,7 @@ from mapctl import report as reports
 from mapctl.commands.shared import inputs, options, outputs
 from mapctl.commands.shared.inputs import read_motion
 from mapctl.commands.shared.options import ProposalOptions
-from mapctl.commands.shared.outputs import add_licence
-from mapctl.commands.shared.progress_bar import show_progress
+from mapctl.commands.shared.outputs import add_licence, show_progress
 from mapctl.errors import RequestError
 from mapctl.metrics import make_comparable
 from mapctl.motion import Motion

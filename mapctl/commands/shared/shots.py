@@ -13,7 +13,7 @@ from torch import Tensor
 
 import priors
 from controllers.common.character import Character
-from controllers.shots.posing import MetPose, build_rest_pose
+from controllers.shots.reaching import MetPose, build_rest_pose
 from controllers.shots.request import Arrival, Lead, Look, Others, PoseKey, Reach, ShotRequest
 from controllers.shots.shot import ShotSolution, solve_shot
 from controllers.shots.walk import FollowSettings

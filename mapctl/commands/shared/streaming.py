@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from mapctl.commands.shared import options
 from mapctl.errors import RequestError
 from mapctl.skeleton import Skeleton
-from mapctl.streaming.endpoint import Endpoint
+from mapctl.streaming.messages import Endpoint
 
 if TYPE_CHECKING:
     from mapctl.streaming.receiver import OscReceiver

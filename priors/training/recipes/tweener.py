@@ -32,7 +32,7 @@ from mapctl.errors import RequestError
 from mapctl.inbetweening.partial_motion import KnownParts, PartialMotion, interpolate_partial_motion
 from mapctl.inbetweening.position_image import mirror_positions
 from mapctl.inbetweening.root_trajectory import LocalMotion, RootTrajectory, compute_displacement_errors
-from mapctl.metrics.liveliness import NOTHING, Liveliness, measure_liveliness, see_from_hips
+from mapctl.metrics.body import NOTHING, Liveliness, measure_liveliness, see_from_hips
 from mapctl.motion_dna import MotionDna
 from mapctl.numerics.intervals import last_observed, next_observed, true_intervals
 from mapctl.pose import BodyPose

@@ -1,0 +1,979 @@
+"""Proposers of motion in gaps: the in-betweeners behind --method.
+
+- Interpolation (`SlerpInbetweener`), and a stitcher that fills gaps from both sides (`StitchedInbetweener`).
+- Walks over keys that give positions alone: a density follows a curve through them in time (Wang et al. 2019, 5.2).
+- Rollouts of a density, steered to the next known frames (Wang et al. 2019, Eq. 14-19, with the frames after a gap as
+  the target): a swarm searches latent noise of the root, then L-BFGS all latent noise; the error left at arrival is
+  distributed over the gap.
+- Proposals through partial keys, which give only positions of hands, feet or hips. An in-betweener that was not trained
+  with such keys meets them in their frame and ignores them in the frames beside, so they are hidden from it: it
+  proposes freely, then along the trajectory on which the targets can be met. The error left at a key's frame is met by
+  the smallest motion of the whole body (`mapctl.inbetweening.whole_body`).
+- The choice among them (`AutoInbetweener`). Rollouts have no part in it: their feet slide less as proposed, but the MAP
+  stage plants the feet of either, and then the pose transformer's answer is nearer to mocap.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import scipy
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from controllers.common.character import Character
+from controllers.common.map_refinement import estimate_rest_height
+from controllers.shots.walk import FollowSettings, walk_arcs
+from mapctl import contacts, curves, rotations
+from mapctl.curves import Curve
+from mapctl.errors import RequestError
+from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode, integrate_root
+from mapctl.inbetweening import GapQuery, Proposal
+from mapctl.inbetweening.effector_targets import EffectorTargets
+from mapctl.inbetweening.query import INTERPOLATION, GapSource, estimate_contact_logits
+from mapctl.inbetweening.seam_blending import blend_seams_in_positions, blend_seams_in_rotations
+from mapctl.inbetweening.whole_body import bend_limbs, reach_targets
+from mapctl.kinematics import heading
+from mapctl.metrics.body import measure_path_length, measure_peaks
+from mapctl.motion import Motion
+from mapctl.numerics import gaussian
+from mapctl.numerics.intervals import fill_missing, last_observed, next_observed, true_intervals
+from mapctl.numerics.smooth_offsets import interpolate_offsets, interpolate_turns
+from mapctl.pose import decode
+from mapctl.problem import density_selection
+from mapctl.problem.receding_horizon import CommittedFrames, RecedingHorizonSolver, replay
+from mapctl.problem.window_solvers import LatentNoiseSolver, SolvedWindow, SteeringKnots, SwarmProposal, keep_warm_start
+from mapctl.protocols import Density, DensityState, Inbetweener
+from mapctl.skeleton import CANONICAL, LIMBS, TOE_JOINTS, TOES
+from mapctl.solver.budget import Budget
+from mapctl.solver.lbfgs import LbfgsSettings
+from mapctl.solver.swarm import SwarmSettings
+from mapctl.terms import FootContact, Keyframe, LatentPrior
+
+_MIN_ROOT_UNCERTAINTY = 0.02  # metres, of the position of a standing body
+_ROOT_UNCERTAINTY_SHARE = 0.4  # of the distance travelled since the last known position
+_MIN_DIRECTION_SPEED = 0.2  # m/s from which a trajectory determines the facing
+_STEP_SECONDS = 0.25
+_STRETCH_SHARE = 0.985  # of a limb's length that it reaches
+_MIN_LIMB_SECONDS, _LIMB_ACCELERATION = 0.15, 15.0
+"""Least time in which a limb goes to its target, and its acceleration (m/s^2) beyond that: a sixth of what hands and
+feet reach in walking."""
+_MIN_TRUNK_SECONDS, _TRUNK_ACCELERATION = 0.25, 3.0
+"""Least time and acceleration of hips and trunk."""
+_ARMS = [
+    joint
+    for name, limb in LIMBS.items()
+    if name.endswith("Hand")
+    for joint in (CANONICAL.parents[limb.upper], limb.upper, limb.lower, limb.end)
+]
+_TRUNK = [joint for joint in range(CANONICAL.num_joints) if joint not in _ARMS]  # and legs
+_FEET = tuple(limb.end for name, limb in LIMBS.items() if name.endswith("Foot"))
+
+
+def propose_through_keys(
+    query: GapQuery, inbetweener: Inbetweener, generator: torch.Generator | None
+) -> tuple[Proposal, EffectorTargets | None]:
+    """Propose a motion with hands and feet at their targets, and the hips at theirs in frames that give no more; also
+    return the targets, moved within reach where they are not.
+    """
+    hips, targets, wanted = _find_partial_keys(query)
+    if not bool((hips | wanted).any()):
+        return inbetweener.propose(query, generator=generator), targets
+    if inbetweener.takes_partial_keys:
+        return _reach_exactly(query, inbetweener.propose(query, generator=generator), wanted)
+    blind = guided = query.hide_partial_keys()
+    if bool(query.missing.root.any()):
+        first = inbetweener.rough.propose(blind, generator=generator).motion
+        guided = _interpolate_trajectory(query, blind, first, targets, hips)
+    answer = inbetweener.propose(replace(guided, effector_targets=_add_root_targets(query, hips)), generator=generator)
+    return meet_partial_keys(query, answer)
+
+
+def meet_partial_keys(query: GapQuery, answer: Proposal) -> tuple[Proposal, EffectorTargets | None]:
+    """Bend a motion that does not meet partial keys until it does, going there and coming back as bodies do; also
+    return the targets, moved within reach where they are not."""
+    hips, targets, wanted = _find_partial_keys(query)
+    if not bool((hips | wanted).any()):
+        return answer, targets
+    blind, made = query.hide_partial_keys(), answer.motion
+    posed = _set_hips(made, query.motion, hips)
+    if targets is None:
+        return replace(answer, motion=_blend_key_poses(made, posed, hips, blind)), None
+    turning, moving = query.missing.joints, query.missing.root
+    stray = torch.full(hips.shape, _MIN_ROOT_UNCERTAINTY)
+    posed = reach_targets(posed, targets, turning=turning, moving=moving, stray=stray)[0]
+    reached = torch.where(targets.wanted[..., None], posed.joint_positions(), targets.places)
+    there = replace(answer, motion=_blend_key_poses(made, posed, hips | wanted, blind))
+    return there, EffectorTargets(reached, targets.wanted)
+
+
+def _find_partial_keys(
+    query: GapQuery,
+) -> tuple[Bool[Tensor, " frames"], EffectorTargets | None, Bool[Tensor, " frames"]]:
+    """Find the frames in which the hips alone are told, the effector targets, and the frames that have some."""
+    hips, targets = query.root_only_keys, query.effector_targets
+    return hips, targets, torch.zeros_like(hips) if targets is None else targets.wanted.any(dim=1)
+
+
+def _reach_exactly(
+    query: GapQuery, answer: Proposal, wanted: Bool[Tensor, " frames"]
+) -> tuple[Proposal, EffectorTargets | None]:
+    """Move a motion that was made through effector targets so that limbs reach them: the body where limbs alone do
+    not, and no more than that, or it would leave where the network has it."""
+    targets = query.effector_targets
+    if targets is None:
+        return answer, None
+    far = wanted & _find_out_of_reach(answer.motion, targets)
+    if not bool(far.any()):
+        return answer, targets
+    told, targets, wanted = targets, EffectorTargets(targets.places, targets.wanted & far[:, None]), far
+    turning, moving = query.missing.joints, query.missing.root
+    stray = torch.full(wanted.shape, _MIN_ROOT_UNCERTAINTY)
+    posed = reach_targets(answer.motion, targets, turning=turning, moving=moving, stray=stray)[0]
+    reached = torch.where(targets.wanted[..., None], posed.joint_positions(), targets.places)
+    there = replace(answer, motion=_blend_key_poses(answer.motion, posed, wanted, query))
+    return there, EffectorTargets(reached, told.wanted)
+
+
+def _find_out_of_reach(motion: Motion, targets: EffectorTargets) -> Bool[Tensor, " frames"]:
+    """Find the frames in which a target is farther away than its limb is long."""
+    positions, far = motion.joint_positions(), torch.zeros(motion.num_frames, dtype=torch.bool)
+    for limb in LIMBS.values():
+        away = (targets.places[:, limb.end] - positions[:, limb.upper]).norm(dim=-1)
+        far |= targets.wanted[:, limb.end] & (away > _STRETCH_SHARE * limb.length(motion.skeleton))
+    return far
+
+
+def _add_root_targets(query: GapQuery, hips: Bool[Tensor, " frames"]) -> EffectorTargets | None:
+    """Join the effector targets and the positions of hips that are known alone."""
+    targets = query.effector_targets
+    if not bool(hips.any()):
+        return targets
+    positions = query.motion.joint_positions()
+    wanted = torch.zeros(positions.shape[:2], dtype=torch.bool)
+    wanted[hips, 0] = True
+    if targets is None:
+        return EffectorTargets(positions, wanted)
+    positions = torch.where(targets.wanted[..., None], targets.places, positions)
+    return EffectorTargets(positions, wanted | targets.wanted)
+
+
+def _interpolate_trajectory(
+    query: GapQuery, blind: GapQuery, body: Motion, targets: EffectorTargets | None, hips: Bool[Tensor, " frames"]
+) -> GapQuery:
+    """Return the query with its hips along a trajectory through all keys, and facing along it."""
+    root, facing = body.root_position.clone(), rotations.unwrap_angle(heading(body.local_quat_xyzw[:, 0]))
+    knots = ~blind.missing.root | hips
+    root[knots] = query.motion.root_position[knots]
+    own = heading(query.motion.local_quat_xyzw[:, 0])
+    facing = torch.where(knots, facing + rotations.wrap_angle(own - facing), facing)
+    if targets is not None:
+        wanted = targets.wanted.any(dim=1) & blind.missing.root & ~hips
+        turning, moving = blind.missing.joints, blind.missing.root
+        stray = _estimate_root_uncertainty(body, moving)
+        root = root + reach_targets(body, targets, turning=turning, moving=moving, stray=stray)[1]
+        positions = _interpolate_knots(root, knots | wanted, query.seconds)
+        facing = facing + torch.where(
+            knots, 0.0, _compute_heading_change(body.root_position, positions, float(body.fps))
+        )
+        knots = knots | wanted
+    positions = _interpolate_knots(root, knots, query.seconds)
+    turned = _interpolate_knots(facing[:, None], knots, query.seconds)[:, 0]
+    shown = query.motion
+    quats = shown.local_quat_xyzw.clone()
+    turn = torch.where(blind.missing.root, turned - heading(quats[:, 0]), 0.0)
+    quats[:, 0] = rotations.multiply(rotations.about_y(turn), quats[:, 0])
+    root = torch.where(blind.missing.root[:, None], positions, shown.root_position)
+    return replace(blind, motion=replace(shown, root_position=root, local_quat_xyzw=quats), keep_trajectory=True)
+
+
+def _estimate_root_uncertainty(body: Motion, missing: Bool[Tensor, " frames"]) -> Float[Tensor, " frames"]:
+    """Estimate the uncertainty of proposed hips, metres: proportional to their speed and to the time from the nearest
+    known frame.
+    """
+    known, frame, fps = ~missing[None], torch.arange(len(missing)), float(body.fps)
+    before, after = last_observed(known)[0], next_observed(known)[0]
+    seconds = torch.minimum((frame - before).abs(), (after - frame).abs()) / fps
+    path_length = (body.root_position[after] - body.root_position[before])[:, ::2].norm(dim=-1)
+    return _MIN_ROOT_UNCERTAINTY + _ROOT_UNCERTAINTY_SHARE * seconds * path_length * fps / (after - before).clamp_min(1)
+
+
+def _interpolate_knots(
+    values: Float[Tensor, "frames width"], knots: Bool[Tensor, " frames"], seconds: Float[Tensor, " frames"]
+) -> Float[Tensor, "frames width"]:
+    """Interpolate between values at knots by monotone cubics in time; constant beyond the first and the last."""
+    if int(knots.sum()) < 2:
+        return values
+    # Linear beyond the ends: a monotone cubic's own estimate of its slope there is up to half too large.
+    at, known = (torch.cat([2 * v[:1] - v[1:2], v, 2 * v[-1:] - v[-2:-1]]) for v in (seconds[knots], values[knots]))
+    curve = scipy.interpolate.PchipInterpolator(at.numpy(), known.numpy())
+    return torch.as_tensor(curve(seconds.clamp(at[1], at[-2]).numpy())).to(values)
+
+
+def _compute_heading_change(
+    before: Float[Tensor, "frames 3"], after: Float[Tensor, "frames 3"], fps: float
+) -> Float[Tensor, " frames"]:
+    """Compute the difference of two trajectories' directions, radians, weighted by speed: none where either stands."""
+    one, speed = _compute_travel_direction(before[:, ::2], fps)
+    other, other_speed = _compute_travel_direction(after[:, ::2], fps)
+    weight = torch.minimum(speed, other_speed).square()
+    return rotations.wrap_angle(other - one) * weight / (weight + _MIN_DIRECTION_SPEED**2)
+
+
+def _compute_travel_direction(
+    ground: Float[Tensor, "frames 2"], fps: float
+) -> tuple[Float[Tensor, " frames"], Float[Tensor, " frames"]]:
+    """Compute a trajectory's direction, radians, and speed, m/s, without the sway of single steps."""
+    reach, frame = max(1, round(_STEP_SECONDS * fps)), torch.arange(len(ground))
+    start, stop = (frame - reach).clamp_min(0), (frame + reach).clamp(max=len(ground) - 1)
+    velocity = (ground[stop] - ground[start]) * fps / (stop - start).clamp_min(1)[:, None]
+    return torch.atan2(velocity[:, 0], velocity[:, 1]), velocity.norm(dim=1)
+
+
+def _set_hips(body: Motion, known: Motion, frames: Bool[Tensor, " frames"]) -> Motion:
+    """Set the hips to those of `known` in these frames; the body takes their heading, and their children keep their
+    tilt."""
+    quats, root = body.local_quat_xyzw.clone(), body.root_position.clone()
+    facing = heading(known.local_quat_xyzw[:, 0]) - heading(quats[:, 0])
+    turned = rotations.multiply(rotations.about_y(facing), quats[:, 0])
+    tilted = rotations.multiply(rotations.inverse(known.local_quat_xyzw[:, 0]), turned)
+    for child in body.skeleton.children(0):
+        quats[:, child] = torch.where(frames[:, None], rotations.multiply(tilted, quats[:, child]), quats[:, child])
+    quats[frames, 0], root[frames] = known.local_quat_xyzw[frames, 0], known.root_position[frames]
+    return replace(body, local_quat_xyzw=quats, root_position=root)
+
+
+def _blend_key_poses(body: Motion, posed: Motion, keys: Bool[Tensor, " frames"], query: GapQuery) -> Motion:
+    """Blend `body` to the poses `posed` in the frames of keys and back, feet staying on their own trajectories."""
+    fps = float(body.fps)
+    positions, goals = body.joint_positions(), posed.joint_positions()
+    distance = torch.where(keys[:, None], (goals - positions).norm(dim=-1), 0.0)
+    limb = _compute_duration(distance[:, [limb.end for limb in LIMBS.values()]], _MIN_LIMB_SECONDS, _LIMB_ACCELERATION)
+    trunk = _compute_duration(distance[:, :1], _MIN_TRUNK_SECONDS, _TRUNK_ACCELERATION)
+    known = ~query.missing.joints | keys[:, None]
+    wanted_quats = torch.where(keys[:, None, None], posed.local_quat_xyzw, body.local_quat_xyzw)
+    quats = body.local_quat_xyzw.clone()
+    for joints, seconds in ((_ARMS, limb), (_TRUNK, trunk)):
+        there, firm = wanted_quats[:, joints], known[:, joints]
+        quats[:, joints] = interpolate_turns(quats[:, joints], there, firm, seconds=seconds, fps=fps)
+    offset = interpolate_offsets(
+        (posed.root_position - body.root_position) * keys[:, None], ~query.missing.root | keys, seconds=trunk, fps=fps
+    )
+    made = replace(body, root_position=body.root_position + offset, local_quat_xyzw=quats)
+    goals_made, wanted = made.joint_positions(), torch.zeros(made.num_frames, CANONICAL.num_joints, dtype=torch.bool)
+    for foot in _FEET:
+        firm = keys | ~query.missing.joints[:, CANONICAL.parents[foot]]
+        goals_made[:, foot] = positions[:, foot] + interpolate_offsets(
+            (goals - positions)[:, foot] * keys[:, None], firm, seconds=limb, fps=fps
+        )
+    # Legs alone: arms that are to reach something would be turned back to where they were.
+    turning = query.missing.joints.index_fill(1, torch.tensor(_ARMS), False)
+    return bend_limbs(made, body, goals_made, wanted, turning)
+
+
+def _compute_duration(distance: Float[Tensor, "frames parts"], least: float, calm: float) -> float:
+    """Compute the seconds in which the farthest part goes to its target and back: a spring's of acceleration `calm`."""
+    return max(least, math.sqrt(float(distance.max()) / calm))
+
+
+class SlerpInbetweener(Inbetweener):
+    """In-betweener that proposes the query's interpolation; before and after all known frames poses are held."""
+
+    def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
+        """Propose the query's own motion, with contacts where its toes are low and slow."""
+        return Proposal(query.motion, estimate_contact_logits(query.motion), "slerp")
+
+
+@dataclass(frozen=True, eq=False)
+class StitchedInbetweener(Inbetweener):
+    """In-betweener that fills gaps between two whole poses from both sides (Ren et al. 2024), and leaves all others to
+    another one."""
+
+    stitcher: Inbetweener
+    """In-betweener that leaves interpolated what it cannot fill, and says why."""
+    load_fallback: Callable[[], Inbetweener]
+    """Loader of the in-betweener for the rest, called where there is some."""
+
+    @property
+    def takes_partial_keys(self) -> bool:
+        """Whether they reach `propose`; they are hidden there from who does not take them."""
+        return True
+
+    def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
+        """Propose for each gap the stitcher's motion, bent to its partial keys; gaps that it leaves are the other's,
+        and the proposal says why."""
+        stitched = self.stitcher.propose(query, generator=generator)
+        sources = stitched.attribute(query)
+        left = [source for source in sources if source.by == INTERPOLATION]
+        if len(left) < len(sources):
+            stitched = meet_partial_keys(query, stitched)[0]
+        if not left:
+            return stitched
+        fallback = self.load_fallback()
+        asked = query if fallback.takes_partial_keys else query.hide_partial_keys()
+        made = fallback.propose(asked, generator=generator)
+        made = replace(made, others=_pass_on(left, made))
+        return made if len(left) == len(sources) else _put_in(stitched, made, query)
+
+
+def _pass_on(left: list[GapSource], made: Proposal) -> tuple[GapSource, ...]:
+    """Name who made what was left, and both reasons if that one had another to leave it on."""
+    named = {source.start: source for source in made.others}
+    passed = []
+    for source in left:
+        own = named.pop(source.start, GapSource(source.start, source.stop, made.source))
+        reason = "; ".join(filter(None, (source.reason, own.reason)))
+        passed.append(replace(own, reason=reason))
+    return (*passed, *named.values())
+
+
+def _put_in(stitched: Proposal, made: Proposal, query: GapQuery) -> Proposal:
+    """Put the gaps that were stitched into another proposal."""
+    sources = [source for source in stitched.attribute(query) if source.by != INTERPOLATION]
+    starts = {source.start for source in sources}
+    others = (*(other for other in made.others if other.start not in starts), *sources)
+    # Partial keys divide a gap, and are the stitcher's too.
+    whole = query.hide_partial_keys().enclosed_gaps
+    gaps = [gap for gap in whole if any(gap[0] <= start < gap[1] for start in starts)]
+    return replace(made.take(stitched, gaps), others=others)
+
+
+_LEAST_WAY = 0.3  # metres from place to place, at the canonical size, that are walked and not stood
+
+
+def lay_curve(query: GapQuery, fastest: float, ahead: int) -> tuple[Curve, Float[Tensor, " ahead"]] | None:
+    """Lay a curve through the places of a query of which they are all that is given, from its first frame to its last,
+    metres at the canonical size; also return the arcs of the frames and of so many `ahead` of them, metres. None where
+    there are others, and where the body would stand, or be faster than `fastest`, m/s."""
+    loose = query.loose
+    if loose is None or not query.only_places:
+        return None
+    frames = loose.placed.nonzero()[:, 0]
+    if len(frames) < 2 or int(frames[0]) > 0 or int(frames[-1]) < query.motion.num_frames - 1:
+        return None
+    places = loose.ground[frames].double() / query.scale
+    ways = torch.diff(places, dim=0).norm(dim=-1)
+    speeds = ways * PRIOR_FPS / torch.diff(frames)
+    if float(ways.min()) < _LEAST_WAY or float(speeds.max()) > fastest:
+        return None
+    curve = curves.through(places)
+    at = _find_arcs(curve, places)
+    if float(torch.diff(at).min()) <= 0:
+        return None
+    timed = scipy.interpolate.PchipInterpolator(frames.numpy(), at.numpy())
+    inside = torch.as_tensor(timed(torch.arange(int(frames[-1]) + 1).numpy()))
+    speed = float(inside[-1] - inside[-2])
+    return curve, torch.cat([inside, inside[-1] + speed * torch.arange(1, ahead + 1)])
+
+
+def walk_over_places(
+    query: GapQuery, densities: Sequence[Density], generator: torch.Generator | None
+) -> Proposal | None:
+    """Propose a walk over places by the first density, that of locomotion; None where it is not one that the density
+    knows (see `lay_curve`)."""
+    settings = FollowSettings()
+    laid = lay_curve(query, densities[0].limits.fastest, settings.window.frames) if densities else None
+    if laid is None:
+        return None
+    curve, arcs = laid
+    frames = query.motion.num_frames
+    motion, done, _ = walk_arcs(
+        densities[0],
+        curve,
+        arcs,
+        frames,
+        character=Character(),
+        settings=settings,
+        generator=generator or torch.Generator().manual_seed(0),
+    )
+    root, source = motion.root_position * query.scale, f"walk of {densities[0].name}"
+    planted = done.features[:, LAYOUT.slices["contacts"]] > 0.5
+    return Proposal(
+        replace(query.motion, root_position=root, local_quat_xyzw=motion.local_quat_xyzw),
+        contacts.to_logits(planted),
+        source,
+        (GapSource(0, frames, source, "along a curve through the places, which are all that keys tell"),),
+    )
+
+
+def _find_arcs(curve: Curve, places: Float[Tensor, "places 2"]) -> Float[Tensor, " places"]:
+    """Find the arcs of the places that a curve leads through, metres."""
+    dense = torch.linspace(0, curve.length, max(2, round(100 * curve.length)), dtype=torch.float64)
+    points, found, first = curve.ground_point(dense), [], 0
+    for place in places[:-1]:
+        # A curve that crosses itself comes by twice.
+        away = (points[first:] - place).norm(dim=-1)
+        near = (away < float(away.min()) + 0.01).nonzero()[0, 0] if len(found) else away.argmin()
+        first += int(near)
+        found.append(float(dense[first]))
+    return torch.tensor([*found, curve.length], dtype=torch.float64)
+
+
+_TOES = list(TOE_JOINTS)
+_STANCE_FADE_SECONDS = 0.12  # over which a swinging foot's correction fades away from its contacts
+
+
+def hold_planted(
+    motion: Motion,
+    planted: Bool[Tensor, "frames 2"],
+    *,
+    free: Bool[Tensor, " frames"],
+    rest_height: Float[Tensor, "frames 2"],
+) -> Motion:
+    """Hold the toes (left, right) of a canonical motion at one position during each contact, in frames that are free.
+
+    A contact that begins or ends in frames that are not free keeps its position there; others are held at the mean of
+    their positions, at `rest_height` (metres). Between contacts the correction fades. Hips and the feet's orientations
+    stay.
+    """
+    positions, goals = motion.joint_positions(), motion.joint_positions().clone()
+    for foot, toe in enumerate(_TOES):
+        offset = torch.zeros_like(positions[:, toe])
+        for _, start, stop in true_intervals(planted[:, foot, None]):
+            part = slice(start, stop)
+            offset[part] = _compute_stance_offset(positions[part, toe], ~free[part], rest_height[part, foot])
+        firm = ~free | planted[:, foot]
+        goals[:, CANONICAL.parents[toe]] += interpolate_offsets(
+            offset, firm, seconds=_STANCE_FADE_SECONDS, fps=float(motion.fps)
+        )
+    turning = free[:, None].expand(-1, CANONICAL.num_joints)
+    return bend_limbs(motion, motion, goals, torch.zeros_like(turning), turning)
+
+
+def _compute_stance_offset(
+    positions: Float[Tensor, "contact 3"], anchored: Bool[Tensor, " contact"], rest_height: Float[Tensor, " contact"]
+) -> Float[Tensor, "contact 3"]:
+    """Compute the offsets from a contact's positions to the anchored ones, interpolated linearly, or to their mean."""
+    if bool(anchored.any()):
+        return fill_missing(positions[None], anchored[None])[0] - positions
+    middle = positions.mean(dim=0)
+    middle[1] = rest_height.mean()
+    return middle - positions
+
+
+_PAST_FRAMES = 3  # frames before a gap that terms look back on
+
+
+def select_likeliest_density(densities: Sequence[Density], motion: Motion) -> Density:
+    """Select the density under which a canonical motion, with a proposal's observation noise, is likeliest."""
+    if len(densities) == 1:
+        return densities[0]
+    blurred = [density.with_observation_noise(density_selection.proposal_sigma()) for density in densities]
+    return densities[blurred.index(density_selection.select_density_for_motion(blurred, motion).density)]
+
+
+def commit_before(
+    body: Motion,
+    contact_logits: Float[Tensor, "frames 2"],
+    start: int,
+    density: Density,
+    state: DensityState | None = None,
+    *,
+    since: int = 0,
+) -> CommittedFrames:
+    """Commit a motion's frames before a gap, with their contacts, single precision; a density's `state` is advanced
+    from frame `since` on.
+    """
+    features, before = encode(body.slice(0, max(2, start)))
+    ground, heading = integrate_root(features, before)
+    features[:, LAYOUT.slices["contacts"]] = (contact_logits[: len(features)] > 0).to(features)
+    features = features[:start].float()
+    ground_pose = GroundPose(ground[start - 1].float(), heading[start - 1].float())
+    past = body.slice(max(0, start - _PAST_FRAMES), start).joint_positions().float()
+    advanced = state if state is not None and since >= start else replay(density, features, state, since=since)
+    return CommittedFrames(advanced, ground_pose, features, past)
+
+
+def insert_rollout(
+    body: Motion,
+    contact_logits: Float[Tensor, "frames 2"],
+    window: SolvedWindow,
+    ground_pose: GroundPose,
+    gap: tuple[int, int],
+) -> tuple[Motion, Float[Tensor, "frames 2"]]:
+    """Insert a rollout in its gap, corrected so that it arrives at the frame after it, if there is one; also return the
+    contact logits.
+    """
+    start, stop = gap
+    made = decode(window.trial.features[0], GroundPose(ground_pose.position_xz.double(), ground_pose.heading.double()))
+    count, planted = stop - start, window.trial.contacts[0]
+    root, quats, logits = body.root_position.clone(), body.local_quat_xyzw.clone(), contact_logits.clone()
+    root[start:stop], quats[start:stop] = made.root_position[:count], made.local_quat_xyzw[:count]
+    if count < len(made.root_position):
+        there, here = body.slice(stop, stop + 1), made.slice(count, count + 1)
+        root[start:stop], quats[start:stop] = _arrive(here, there, root[start:stop], quats[start:stop])
+    new = torch.zeros(len(root), dtype=torch.bool)
+    new[start:stop] = True
+    root = blend_seams_in_positions(root, new, fps=PRIOR_FPS)
+    quats = blend_seams_in_rotations(quats, new[:, None].expand(-1, CANONICAL.num_joints), fps=PRIOR_FPS)
+    logits[start:stop] = contacts.to_logits(planted[:count]).to(logits)
+    return replace(body, root_position=root, local_quat_xyzw=quats), logits
+
+
+def _arrive(
+    here: Motion, there: Motion, root: Float[Tensor, "frames 3"], quats: Float[Tensor, "frames joints 4"]
+) -> tuple[Float[Tensor, "frames 3"], Float[Tensor, "frames joints 4"]]:
+    """Spread what a rollout arrives `here` instead of `there` over all its frames: none of it in the two frames before,
+    all of it in two after, so that it leaves and arrives at its own pace."""
+    turn = rotations.to_rotation_vector(
+        rotations.multiply(rotations.inverse(here.local_quat_xyzw), there.local_quat_xyzw)
+    )
+    firm = torch.ones(len(root) + 4, dtype=torch.bool)
+    firm[2:-2] = False
+    miss = root.new_zeros(len(firm), 3 + 3 * quats.shape[1])
+    miss[-2:] = torch.cat([there.root_position - here.root_position, turn.flatten(1)], dim=1)
+    offsets = interpolate_offsets(miss, firm, seconds=math.inf, fps=PRIOR_FPS)[2:-2]
+    turns = rotations.from_rotation_vector(offsets[:, 3:].unflatten(1, (-1, 3)))
+    return root + offsets[:, :3], rotations.multiply(quats, turns)
+
+
+EVERY_ROLLOUT_JUMPED = "every rollout jumped"
+"""Why a gap is the fallback's that rollouts would take."""
+_ENDS = CANONICAL.indices(("leftHand", "rightHand", *TOES))  # what a leg or an arm that is thrown over moves farthest
+
+
+@dataclass(frozen=True)
+class RolloutSettings:
+    """Settings of rollouts through gaps."""
+
+    temperature: float = 0.5
+    """Standard deviation of a rollout's initial noise: the difference between samples."""
+    slow: float = 3.0
+    """Frames (sigma) over which that noise is smoothed, at the same deviation: samples then differ in motion, not in
+    jitter."""
+    sigma_noise: float = 2.0
+    """Sigma of the latent prior while steering: above 1 leaves more of the initial noise."""
+    sigma_arrival: float = 0.03
+    """Sigma of the distance of every joint from the known frames at which a rollout arrives, metres."""
+    ahead: int = 15
+    """Frames after a gap that are rolled with it, of which the known ones are targets too."""
+    footing: FootContact = field(default_factory=lambda: FootContact(0.1, 0.05, 0.05, heels=None))
+    """Contact term."""
+    shortest: int = 2
+    """Frames of the shortest gap that is rolled through: shorter ones leave nothing to vary."""
+    longest: int = 180
+    """Frames of the longest gap that is rolled through; longer ones are left to the fallback."""
+    attempts: int = 3
+    """Rollouts through a gap, each from other noise, until one does not jump; then the gap is left to the fallback."""
+    jump: float = 1.5
+    """A rollout jumps where a hand or a foot steps, relative to the hips, so many times as far as anywhere in the
+    fallback's motion: an arrival that noise does not lead to is bought with a leg thrown over in one frame."""
+    least_jump: float = 0.12
+    """Metres in a frame that no jump stays under, however still the fallback's motion is; hands and feet of a walk step
+    as far."""
+    method: LatentNoiseSolver = field(
+        default_factory=lambda: LatentNoiseSolver(
+            rounds=2,
+            lbfgs=LbfgsSettings(max_iterations=24),
+            budget=Budget(evaluations=96),
+            proposal=SwarmProposal(SwarmSettings(particles=8, iterations=5), SteeringKnots(knots=4, spread=0.7)),
+        )
+    )
+    """Solver: the swarm and the search after it."""
+
+    @property
+    def span(self) -> str:
+        """Range of gaps that are rolled through, in words: seconds from key to key."""
+        return f"{(self.shortest + 1) / PRIOR_FPS:.2g} to {(self.longest + 1) / PRIOR_FPS:.2g} s"
+
+
+@dataclass(frozen=True, eq=False)
+class RolloutInbetweener(Inbetweener):
+    """In-betweener that rolls the density under which the fallback's proposal is likeliest through unknown gaps."""
+
+    densities: Sequence[Density]
+    """Densities to choose from, at least one."""
+    fallback: Inbetweener
+    """Proposes what is not rolled through, and what comes before and after."""
+    settings: RolloutSettings = field(default_factory=RolloutSettings)
+    """Settings of the rollouts."""
+
+    @property
+    def rough(self) -> Inbetweener:
+        """Rough in-betweener of the fallback."""
+        return self.fallback.rough
+
+    def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
+        """Propose a different motion for each sample; gaps too short or too long are left to the fallback, and so are
+        gaps in which every attempt jumps, and loose keys but for those that give positions alone, which are walked
+        over."""
+        if query.loose is not None:
+            walked = walk_over_places(query, self.densities, generator)
+            return walked or self.fallback.propose(query, generator=generator)
+        base = self.fallback.propose(query, generator=generator)
+        if not query.enclosed_gaps:
+            return base
+        roller, others = Roller.of(query, base, self.densities), list(base.others)
+        generator, settings = generator or torch.Generator().manual_seed(0), self.settings
+        largest = max(settings.least_jump, settings.jump * _measure_largest_step(roller.body))
+        for start, stop in query.enclosed_gaps:
+            if not settings.shortest <= stop - start <= settings.longest:
+                others.append(GapSource(start, stop, base.source, f"rollouts take {settings.span}"))
+            elif (rollout := roller.roll_steadily(start, stop, generator, settings, largest)) is None:
+                others.append(GapSource(start, stop, base.source, EVERY_ROLLOUT_JUMPED))
+            else:
+                roller.accept_rollout(rollout)
+                others.append(GapSource(start, stop, f"rollout of {roller.density.name}"))
+        return replace(base, motion=roller.motion, contact_logits=roller.contact_logits, others=tuple(others))
+
+
+@dataclass(frozen=True, eq=False)
+class Rollout:
+    """A density's motion through one gap."""
+
+    start: int
+    """First frame of the gap, at PRIOR_FPS."""
+    body: Motion
+    """The whole motion at unit size, the gap filled."""
+    contact_logits: Float[Tensor, "frames 2"]
+    """Contact logits of the left and the right toe."""
+
+
+@dataclass(eq=False)
+class Roller:
+    """Roller of a density through gaps, one after the other in time, each from the accepted ones before it."""
+
+    query: GapQuery
+    """Query with the known values and the targets."""
+    body: Motion
+    """All frames so far, at unit size."""
+    contact_logits: Float[Tensor, "frames 2"]
+    """Contact logits so far."""
+    density: Density
+    """The density that is rolled."""
+    state: DensityState | None = None
+    """The density's state after `done` frames."""
+    done: int = 0
+    """Number of frames that the state includes."""
+
+    @staticmethod
+    def of(query: GapQuery, proposal: Proposal, densities: Sequence[Density]) -> "Roller":
+        """Begin with a proposal, and the density under which it is likeliest."""
+        body = query.to_unit_size(proposal.motion)
+        return Roller(query, body, proposal.contact_logits.clone(), select_likeliest_density(densities, body))
+
+    @property
+    def motion(self) -> Motion:
+        """The motion so far, on the character's bones."""
+        return self.query.to_character(self.body)
+
+    def roll_steadily(
+        self, start: int, stop: int, generator: torch.Generator, settings: RolloutSettings, largest: float
+    ) -> Rollout | None:
+        """Roll until no hand or foot steps farther than `largest`, metres in a frame; None where all attempts do."""
+        for _ in range(settings.attempts):
+            rollout = self.roll(start, stop, generator, settings)
+            if _measure_largest_step(rollout.body.slice(start - 1, stop + 1)) <= largest:
+                return rollout
+        return None
+
+    def roll(self, start: int, stop: int, generator: torch.Generator, settings: RolloutSettings) -> Rollout:
+        """Roll through frames start to stop; only the density's state is advanced."""
+        committed = commit_before(self.body, self.contact_logits, start, self.density, self.state, since=self.done)
+        assert not isinstance(committed.state, tuple)
+        self.state, self.done = committed.state, start
+        arrival = self._build_arrival_target(start, stop, settings)
+        frames = len(arrival.places)
+        noise = _sample_smooth_noise(frames, generator, settings)
+        terms = (LatentPrior(settings.sigma_noise), settings.footing, arrival)
+        solver = RecedingHorizonSolver(self.density, method=settings.method)
+        window = solver.solve_window(replace(committed, warm_start=noise), terms, frames, generator=generator)
+        body, logits = insert_rollout(self.body, self.contact_logits, window, committed.place, (start, stop))
+        return Rollout(start, self._hold_planted(body, logits, start, stop), logits)
+
+    def accept_rollout(self, rollout: Rollout) -> None:
+        """Accept a rollout, from which later ones go on."""
+        self.body, self.contact_logits = rollout.body, rollout.contact_logits
+
+    def _hold_planted(self, body: Motion, logits: Float[Tensor, "frames 2"], start: int, stop: int) -> Motion:
+        """Hold planted toes in the gap, which the correction at arrival has moved."""
+        planted, free = contacts.debounced(logits > 0), torch.zeros(len(logits), dtype=torch.bool)
+        free[start:stop] = True
+        held = hold_planted(body, planted, free=free, rest_height=estimate_rest_height(body, planted))
+        quats = torch.where(free[:, None, None], held.local_quat_xyzw, body.local_quat_xyzw)
+        return replace(body, local_quat_xyzw=quats)
+
+    def _build_arrival_target(self, start: int, stop: int, settings: RolloutSettings) -> Keyframe:
+        """Build the target of all joints in the known frames after the gap, and of effectors within it."""
+        part = slice(start, stop + settings.ahead)
+        known = ~self.query.nothing_known[part]
+        last = int(known.nonzero()[-1]) + 1
+        positions, known = self.body.joint_positions()[part][:last], known[:last]
+        wanted = known[:, None].expand(-1, CANONICAL.num_joints)
+        if (targets := self.query.effector_targets) is not None:
+            own_targets = targets.wanted[part][:last]
+            positions = torch.where(own_targets[..., None], targets.places[part][:last] / self.query.scale, positions)
+            wanted = wanted | own_targets
+        return Keyframe(positions.float(), wanted, settings.sigma_arrival)
+
+
+def _measure_largest_step(body: Motion) -> float:
+    """Measure how far a hand or a toe steps at most from one frame to the next, relative to the hips, metres."""
+    positions = body.joint_positions()
+    return measure_peaks(positions[:, _ENDS], positions[:, 0], PRIOR_FPS).step
+
+
+def _sample_smooth_noise(
+    frames: int, generator: torch.Generator, settings: RolloutSettings
+) -> Float[Tensor, "frames continuous"]:
+    """Sample noise that changes slowly."""
+    white = torch.randn(frames, LAYOUT.continuous, generator=generator)
+    return settings.temperature * gaussian.unit_variance_matrix(frames, settings.slow, white.dtype) @ white
+
+
+_MIN_KNOWN_FRAMES = 5  # fewest frames from which a motion is extrapolated
+
+
+def extrapolate_end(
+    query: GapQuery, proposal: Proposal, densities: Sequence[Density], settings: RolloutSettings
+) -> Proposal:
+    """Extrapolate a proposal from the last known frame to its end, if nothing is known there.
+
+    It stays unchanged where the first density (that of locomotion) does not find the frames before as likely as its own
+    data: densities then stop or turn away. None runs backwards, so a beginning stays as well.
+    """
+    missing, stop = query.nothing_known, query.motion.num_frames
+    start = stop - int(missing.flip(0).long().cumprod(0).sum())
+    # Only frames since the gap before count, not what fills that.
+    since = int(missing[:start].nonzero()[-1]) + 1 if bool(missing[:start].any()) else 0
+    if start == stop or start - since < _MIN_KNOWN_FRAMES or not densities:
+        return proposal
+    body, logits = query.to_unit_size(proposal.motion), proposal.contact_logits
+    known = body.slice(since, start)
+    blurred = densities[0].with_observation_noise(density_selection.proposal_sigma())
+    if density_selection.select_density_for_motion([blurred], known).weight < 1:
+        return proposal
+    density = select_likeliest_density(densities, known)
+    solver = RecedingHorizonSolver(density, method=replace(settings.method, proposal=keep_warm_start))
+    for first in range(start, stop, settings.longest):
+        committed, count = commit_before(body, logits, first, density), min(settings.longest, stop - first)
+        terms = (LatentPrior(settings.sigma_noise), settings.footing)
+        window = solver.solve_window(committed, terms, count, generator=torch.Generator())
+        body, logits = insert_rollout(body, logits, window, committed.place, (first, first + count))
+    source = GapSource(start, stop, f"density {density.name}")
+    return replace(proposal, motion=query.to_character(body), contact_logits=logits, others=(*proposal.others, source))
+
+
+STANDING_STILL = "standing still"
+"""Name of the source of a gap in which the pose before it is held."""
+_PLANTED_HEIGHT = 0.025  # metres above the lowest toe
+_LIVELY = 0.5
+"""Path of the joints seen from the hips, over that of the tweener, from which on a long gap without keys in it is the
+network's all the same: walks it fills better, where it knows nothing it hardly moves."""
+_STYLED = 60  # frames of the shortest gap that is a tweener's that was given a style: in less there is no room for one
+_STITCHED = 60  # frames of the longest gap between whole poses, with partial keys in it, that is a stitcher's
+_HELD = 46  # frames of the shortest gap in which a pose is held
+_ASTRAY = 0.03  # metres over the ground from which on standing hips are astray, and the pose is held
+_SAME_POSE_DISTANCE = 0.06  # mean distance of the joints, metres, below which two poses count as one
+_AT_REST = 0.15  # mean speed of the joints beside a gap, m/s, below which the body is at rest
+
+
+@dataclass(frozen=True, eq=False)
+class AutoInbetweener(Inbetweener):
+    """In-betweener that takes a network's proposal, except in gaps that are a tweener's or a stitcher's and where a
+    pose is held; the end is extrapolated by a density.
+    """
+
+    network: Inbetweener
+    """In-betweener that proposes first, and fills gaps in which something is known."""
+    densities: Sequence[Density] = ()
+    """Densities for the end, and for walks over places; without any both are the network's or the tweener's."""
+    long: int = 181
+    """Frames of the shortest gap between whole poses, with partial keys in it or none, that can be a tweener's."""
+    tweener: Inbetweener | None = None
+    """In-betweener for long gaps between whole poses; without one they are the network's."""
+    stitcher: Callable[[], Inbetweener] | None = None
+    """Loader of the stitcher, for short gaps between whole poses in which parts of the body are told; without one they
+    are the network's. It is called where there is such a gap."""
+
+    @property
+    def rough(self) -> Inbetweener:
+        """Rough in-betweener of the network."""
+        return self.network.rough
+
+    @property
+    def takes_partial_keys(self) -> bool:
+        """Whether the network does."""
+        return self.network.takes_partial_keys
+
+    @property
+    def has_style(self) -> bool:
+        """Whether the tweener was told one."""
+        return self.tweener is not None and self.tweener.has_style
+
+    def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
+        """Propose for each gap what its length and the poses beside it ask for.
+
+        Loose keys are the tweener's, if there is one; keys that give positions alone are walked over by a density
+        where that knows such walks.
+        """
+        if query.loose is not None:
+            walked = walk_over_places(query, self.densities, generator)
+            return walked or (self.tweener or self.network).propose(query, generator=generator)
+        made = self.network.propose(query, generator=generator)
+        long = [gap for gap in query.hide_partial_keys().enclosed_gaps if self._is_tweeners(query, *gap)]
+        if long and self.tweener is not None:
+            tweened, _ = propose_through_keys(query, self.tweener, generator)
+            long = [gap for gap in long if self.has_style or not self._keeps(query, made, tweened, gap)]
+            made = _fill_from(tweened, made, query, long)
+        told = [gap for gap in query.hide_partial_keys().enclosed_gaps if self._is_stitchers(query, *gap)]
+        if told and self.stitcher is not None:
+            proposed = _Given(made)  # and not asked again for what the stitcher leaves
+            stitched = StitchedInbetweener(self.stitcher(), lambda: proposed).propose(query, generator=generator)
+            made = _fill_from(stitched, made, query, told)
+        for gap in query.enclosed_gaps:
+            # Who was told to move in a style moves; tweeners let others tremble.
+            held = not self.has_style if _is_within(gap, long) else _goes_astray(query, made, gap)
+            if held and _is_standing_still(query, *gap):
+                made = _hold_pose(query, made, gap)
+        if self.has_style:
+            made = _note_no_style(query, made, [gap for gap in query.enclosed_gaps if not _is_within(gap, long)])
+        return extrapolate_end(query, made, self.densities, RolloutSettings())
+
+    def _is_tweeners(self, query: GapQuery, start: int, stop: int) -> bool:
+        """Return whether a gap is the tweener's: long, or with room for the style that it was told."""
+        if self.tweener is None or query.keep_trajectory:
+            return False
+        shortest = _STYLED if self.has_style else self.long
+        return stop - start >= shortest and not _is_beside_part(query, start, stop)
+
+    def _keeps(self, query: GapQuery, made: Proposal, tweened: Proposal, gap: tuple[int, int]) -> bool:
+        """Return whether a gap stays the network's: it fills the whole of it, and the body moves there."""
+        by = {source.by for source in made.attribute(query) if (source.start, source.stop) == gap}
+        if INTERPOLATION in by or _has_parts_within(query, *gap):
+            return False
+        path, other = (measure_path_length(one.motion.slice(gap[0] - 1, gap[1] + 1)) for one in (made, tweened))
+        return path >= _LIVELY * other
+
+    def _is_stitchers(self, query: GapQuery, start: int, stop: int) -> bool:
+        """Return whether a gap is the stitcher's: short, with more told in it than the poses beside it."""
+        if query.keep_trajectory or self._is_tweeners(query, start, stop) or _is_beside_part(query, start, stop):
+            return False
+        return stop - start <= _STITCHED and _has_parts_within(query, start, stop)
+
+
+@dataclass(frozen=True, eq=False)
+class _Given(Inbetweener):
+    """Proposes what it was given, whatever is asked."""
+
+    proposal: Proposal
+
+    def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
+        return self.proposal
+
+
+def _is_beside_part(query: GapQuery, start: int, stop: int) -> bool:
+    """Return whether a frame beside a gap is known in part."""
+    edges = [start - 1, stop]
+    return bool(query.missing.joints[edges].any() | query.missing.root[edges].any())
+
+
+def _has_parts_within(query: GapQuery, start: int, stop: int) -> bool:
+    """Return whether places of hands, feet or hips are told within a gap."""
+    within, targets = slice(start, stop), query.effector_targets
+    return bool(query.root_only_keys[within].any() or (targets is not None and targets.wanted[within].any()))
+
+
+def _is_within(gap: tuple[int, int], gaps: Sequence[tuple[int, int]]) -> bool:
+    """Return whether a gap is one of others, or between partial keys in one of them."""
+    return any(start <= gap[0] and gap[1] <= stop for start, stop in gaps)
+
+
+def _fill_from(proposal: Proposal, made: Proposal, query: GapQuery, gaps: Sequence[tuple[int, int]]) -> Proposal:
+    """Fill gaps as another proposal has them."""
+    sources = proposal.attribute(query)
+    others = tuple(source for source in sources if _is_within((source.start, source.stop), gaps))
+    return replace(made.take(proposal, gaps), others=(*made.others, *others))
+
+
+def _is_standing_still(query: GapQuery, start: int, stop: int) -> bool:
+    """Return whether the body has the same whole pose and position before and after a gap, and is at rest in known
+    frames beside it.
+    """
+    targets = query.effector_targets
+    told = targets is not None and bool(targets.wanted[start:stop].any())
+    if stop - start < _HELD or query.keep_trajectory or told or _is_beside_part(query, start, stop):
+        return False
+    positions, unknown = query.motion.joint_positions(), query.missing.frames
+    apart = float((positions[stop] - positions[start - 1]).norm(dim=-1).mean())
+    speeds = [0.0]
+    for one, other in ((start - 2, start - 1), (stop, stop + 1)):
+        if one >= 0 and other < len(positions) and not bool(unknown[[one, other]].any()):
+            speeds.append(float((positions[other] - positions[one]).norm(dim=-1).mean()) * PRIOR_FPS)
+    return apart < _SAME_POSE_DISTANCE and max(speeds) < _AT_REST
+
+
+def _goes_astray(query: GapQuery, made: Proposal, gap: tuple[int, int]) -> bool:
+    """Return whether a proposal takes the hips far from the straight way through a gap."""
+    part = slice(*gap)
+    off = (made.motion.root_position - query.motion.root_position)[part, ::2].norm(dim=-1)
+    return float(off.max()) > _ASTRAY * query.scale
+
+
+def _hold_pose(query: GapQuery, made: Proposal, gap: tuple[int, int]) -> Proposal:
+    """Hold the pose, interpolated slowly to the next."""
+    part, logits = slice(*gap), made.contact_logits.clone()
+    toes = query.motion.joint_positions()[part, list(TOE_JOINTS), 1]
+    logits[part] = contacts.to_logits(toes < toes.amin() + _PLANTED_HEIGHT).to(logits)
+    return _fill_from(Proposal(query.motion, logits, STANDING_STILL), made, query, [gap])
+
+
+def _note_no_style(query: GapQuery, made: Proposal, gaps: Sequence[tuple[int, int]]) -> Proposal:
+    """Say of gaps that they are not in the style that was told."""
+    reason, sources = "too short, or with parts told, for a style", made.attribute(query)
+    said = tuple(replace(one, reason=one.reason or reason) for one in sources if (one.start, one.stop) in gaps)
+    return replace(made, others=(*made.others, *said))
+
+
+__all__ = [
+    "METHODS",
+    "AutoInbetweener",
+    "ModelLoaders",
+    "RolloutInbetweener",
+    "SlerpInbetweener",
+    "StitchedInbetweener",
+    "build_inbetweener",
+    "check_method",
+]
+
+
+@dataclass(frozen=True)
+class ModelLoaders:
+    """Loaders of the models that an in-betweener needs, called when it needs them."""
+
+    network: Callable[[str], Inbetweener]
+    """Loader of the network that a method asks for by its own name; of whichever is given for `rollouts`, and for
+    `auto` of whichever but a tweener."""
+    densities: Callable[[], Sequence[Density]]
+    """Loader of the densities for rollouts."""
+    tweener: Callable[[], Inbetweener | None]
+    """Loader of the network for long gaps that `auto` takes beside the other; of None where there is none."""
+    stitcher: Callable[[], Inbetweener]
+    """Loader of the network that fills gaps from both sides."""
+
+
+METHODS: Mapping[str, Callable[[ModelLoaders], Inbetweener]] = {
+    "auto": lambda models: AutoInbetweener(
+        models.network("auto"), models.densities(), tweener=models.tweener(), stitcher=models.stitcher
+    ),
+    "transformer": lambda models: models.network("transformer"),
+    "infiller": lambda models: models.network("infiller"),
+    "tweener": lambda models: models.network("tweener"),
+    "stitcher": lambda models: StitchedInbetweener(models.stitcher(), lambda: models.network("stitcher")),
+    "rollouts": lambda models: RolloutInbetweener(models.densities(), models.network("rollouts")),
+    "slerp": lambda models: SlerpInbetweener(),
+}
+"""Builders of in-betweeners by the name of the method."""
+
+
+def check_method(method: str) -> None:
+    """Raise RequestError for an unknown method."""
+    if method not in METHODS:
+        raise RequestError(f"there is no --method {method}; there are {', '.join(METHODS)}")
+
+
+def build_inbetweener(method: str, models: ModelLoaders) -> Inbetweener:
+    """Build the in-betweener of a method; RequestError for one that there is not."""
+    check_method(method)
+    return METHODS[method](models)
