@@ -8,7 +8,8 @@ import torch
 from captures import noisy, on_rig, shaken
 from tiny_denoiser import QUICK, tiny_denoiser
 
-from controllers.denoising.denoise import begins_with_tpose, denoise, find_lead_transition
+from controllers.denoising.denoise import begins_with_tpose, denoise
+from controllers.denoising.lead_pose import find_lead_transition
 from mapctl import retarget, rotations
 from mapctl.motion import Motion
 from mapctl.retarget.rigs import Rig
