@@ -17,7 +17,8 @@ from mapctl.inbetweening import GapQuery, Proposal
 from mapctl.inbetweening.missing import MissingMask, interpolate_missing
 from mapctl.inbetweening.query import estimate_contact_logits
 from mapctl.inbetweening.root_trajectory import TREMBLE_HZ, LocalMotion, RootTrajectory, close_path
-from mapctl.kinematics import heading, rotate_about_vertical
+from mapctl.kinematics import heading
+from mapctl.kinematics.moving import rotate_about_vertical
 from mapctl.motion import Motion
 from mapctl.numerics.intervals import true_intervals
 from mapctl.numerics.smooth_offsets import smooth_between

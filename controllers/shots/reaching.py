@@ -21,8 +21,9 @@ from mapctl.features import PRIOR_FPS, GroundPose
 from mapctl.inbetweening.effector_targets import EffectorTargets
 from mapctl.inbetweening.missing import MissingMask
 from mapctl.inbetweening.partial_motion import mirror_quats
-from mapctl.kinematics import inverse, measure_look_angle, turn_head
+from mapctl.kinematics import inverse
 from mapctl.kinematics.inverse import bend_within, find_out, lead_about
+from mapctl.kinematics.moving import measure_look_angle, turn_head
 from mapctl.motion import Motion
 from mapctl.numerics.easing import smootherstep
 from mapctl.numerics.intervals import true_intervals, widen

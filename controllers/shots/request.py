@@ -22,7 +22,7 @@ from mapctl.features import PRIOR_FPS, GroundPose, encode, integrate_root
 from mapctl.inbetweening.missing import MissingMask
 from mapctl.intent.keyframes import WorldPosition
 from mapctl.intent.path import SpeedProfile, TimedSpeed, find_reversals
-from mapctl.kinematics import bring_curve_points, measure_travel, move_to, rotate_about_vertical
+from mapctl.kinematics.moving import bring_curve_points, measure_travel, move_to, rotate_about_vertical
 from mapctl.metrics import body
 from mapctl.motion import Motion
 from mapctl.numerics.intervals import true_intervals

@@ -63,7 +63,7 @@ from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening.effector_targets import compute_target_errors
 from mapctl.inbetweening.missing import MissingMask
 from mapctl.intent.path import SpeedProfile, find_reversals, walk_at_ease
-from mapctl.kinematics import move_to, rotate_about_vertical
+from mapctl.kinematics.moving import move_to, rotate_about_vertical
 from mapctl.motion import Motion
 from mapctl.problem.receding_horizon import CommittedFrames
 from mapctl.problem.solution import Ledger, Outcome, Solution, Status

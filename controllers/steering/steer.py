@@ -33,8 +33,9 @@ from mapctl.curves.obstacles import Obstacle, measure_clearance
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, ground_speed
 from mapctl.intent.steering import Arrival, Command, SteeringLimits, SteeringTarget
-from mapctl.kinematics import inverse, turn_head
+from mapctl.kinematics import inverse
 from mapctl.kinematics.inverse import bend_within, find_out, lead_about
+from mapctl.kinematics.moving import turn_head
 from mapctl.motion import Motion
 from mapctl.numerics.easing import MinimumJerkTrack, smootherstep
 from mapctl.pose import decode

@@ -14,7 +14,8 @@ from mapctl import contacts, rotations
 from mapctl.curves.obstacles import measure_clearance
 from mapctl.intent.steering import Arrival, Command, CommandTrack
 from mapctl.joint_roles import find_feet
-from mapctl.kinematics import heading, measure_look_angle
+from mapctl.kinematics import heading
+from mapctl.kinematics.moving import measure_look_angle
 from mapctl.metrics.gait import step_lengths
 from mapctl.motion import Motion
 

@@ -9,7 +9,7 @@ from helpers import walk
 
 from controllers.steering.steer import Overlay
 from mapctl.intent.steering import Command
-from mapctl.kinematics import measure_look_angle
+from mapctl.kinematics.moving import measure_look_angle
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL, TOES
 
