@@ -12,8 +12,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from controllers.inbetweening.pipeline import fill
-from controllers.shots.request import Filling, Look, PoseKey, Reach, ShotRequest, choose_filling
-from controllers.shots.way import Way, bend_way
+from controllers.shots.request import Look, PoseKey, Reach, ShotRequest
+from controllers.shots.seams import Filling, choose_filling
+from controllers.shots.trajectory import Trajectory, bend_trajectory
 from mapctl import kinematics, rotations
 from mapctl.curves.obstacles import measure_clearance
 from mapctl.errors import RequestError
@@ -38,9 +39,9 @@ EASY_SHARE = 0.9
 """Share of a stretched limb's length that it reaches without strain."""
 STRETCHED_SHARE = 0.97
 """Share of its length that a limb is stretched toward what it cannot reach."""
-_BENT_SHARE = 0.85  # of its length, from which on the way to a place is shortened
+_BENT_SHARE = 0.85  # of its length, beyond which the path to a target is shortened
 _LEAN = 0.05  # metres that leaning adds to what a limb reaches
-_TOLERANCE_SHARE = 0.9  # of a tolerance that is made use of
+_TOLERANCE_SHARE = 0.9  # of a tolerance that is used
 _TRUNK = list(CANONICAL.indices(("spine", "chest", "neck", "head")))
 
 
@@ -51,7 +52,7 @@ class ReachTargets:
     targets: EffectorTargets
     """World positions of hands and feet."""
     tolerances: Float[Tensor, "frames joints"]
-    """How far from there they may be, metres."""
+    """Allowed distance from there, metres."""
 
     @staticmethod
     def of(reaches: Sequence[Reach], frames: int) -> "ReachTargets":
@@ -73,7 +74,7 @@ class ReachTargets:
         toward = motion.joint_positions() - self.targets.places
         far = toward.norm(dim=-1).clamp_min(1e-6)
         share = (_TOLERANCE_SHARE * self.tolerances / far).clamp(max=1.0)
-        return self._at(self.targets.places + share[..., None] * toward)
+        return replace(self, targets=replace(self.targets, places=self.targets.places + share[..., None] * toward))
 
     def terms(self, skeleton: Skeleton, first: int, frames: int) -> list[WithinReach]:
         """Build the terms that lead a walk near enough, for frames of the shot; lengths are of the skeleton's size."""
@@ -108,31 +109,26 @@ class ReachTargets:
         return replace(self, targets=EffectorTargets(places, wanted))
 
     def led_there(self, motion: Motion) -> "ReachTargets":
-        """Return targets in all frames around a reach: from where limbs are, smoothly to the place and back.
-
-        Told of the place alone, an in-betweener that never saw such a reach goes there at the last moment. The way is
-        about the shoulder, its direction and its distance by themselves: a straight one may lead through the body.
-        """
+        """Return targets in all frames around a reach: from where limbs are, smoothly to the target and back, since an
+        in-betweener given the target alone goes there at the last moment. Direction and distance from the shoulder
+        change by themselves: a straight path may lead through the body."""
         places, wanted, positions = self.targets.places.clone(), self.targets.wanted.clone(), motion.joint_positions()
         frame = torch.arange(len(wanted))
         for name, limb in LIMBS.items():
             reached, out = self.targets.wanted[:, limb.end], find_out(name, positions)
             shoulder = positions[:, limb.upper]
             bones = limb.length(motion.skeleton)
-            way = positions[:, limb.end] - shoulder
+            path = positions[:, limb.end] - shoulder
             for _, first, last in true_intervals(reached[:, None].clone()):
                 away = (first - frame).clamp_min(0) + (frame - last + 1).clamp_min(0)
-                share = smootherstep((1 - away / (AROUND_FRAMES + 1)).to(way))
+                share = smootherstep((1 - away / (AROUND_FRAMES + 1)).to(path))
                 aim = places[frame.clamp(first, last - 1), limb.end] - shoulder
                 aim = bend_within(aim, bones, easy=_BENT_SHARE, most=STRETCHED_SHARE)
-                way = torch.where(share[:, None] > 0, lead_about(way, aim, share, out=out), way)
+                path = torch.where(share[:, None] > 0, lead_about(path, aim, share, out=out), path)
             near = widen(reached, AROUND_FRAMES)
-            places[:, limb.end] = torch.where(reached[:, None], places[:, limb.end], shoulder + way)
+            places[:, limb.end] = torch.where(reached[:, None], places[:, limb.end], shoulder + path)
             wanted[:, limb.end] = near
         return replace(self, targets=EffectorTargets(places, wanted))
-
-    def _at(self, places: Float[Tensor, "frames joints 3"]) -> "ReachTargets":
-        return replace(self, targets=EffectorTargets(places, self.targets.wanted))
 
     def free_limbs(self, joints: int, posed: Bool[Tensor, " frames"]) -> MissingMask:
         """Return what the in-betweener makes anew: trunk and limb around every reach, but in `posed` frames."""
@@ -156,35 +152,31 @@ def settle_reaches(reaches: Sequence[Reach], motion: Motion) -> tuple[Reach, ...
         hold, at = round(reach.hold_seconds * PRIOR_FPS), round(reach.seconds * PRIOR_FPS)
         first = max(0, at - reach.within_frames)
         last = min(motion.num_frames - 1 - hold, at + reach.within_frames)
-        away = torch.stack(
-            [
-                (positions[:, CANONICAL.index(name)] - positions.new_tensor(place)).norm(dim=-1)
-                for name, place in reach.places.items()
-            ]
-        ).sum(dim=0)
+        limbs = [CANONICAL.index(name) for name in reach.places]
+        away = (positions[:, limbs] - positions.new_tensor(list(reach.places.values()))).norm(dim=-1).sum(dim=-1)
         best = first + int(away[first : max(first, last) + 1].argmin())
         found.append(replace(reach, seconds=best / PRIOR_FPS))
     return tuple(found)
 
 
 _TIPTOE, _CROUCH = 0.15, 1.0  # metres by which a body rises or goes down for a reach
-_STEP_ASIDE = 1.2  # metres between the way and a body that leans and leaves it for a reach
-_BEND_LENGTH, _BEND_STEP = 1.2, 0.05  # metres of arc over which the way bends toward a reach, and between its offsets
+_STEP_ASIDE = 1.2  # metres between the trajectory and a body that leans and leaves it for a reach
+_BEND_LENGTH, _BEND_STEP = 1.2, 0.05  # metres of arc over which it bends toward a reach, and between its offsets
 _LEAST_BEND, _USUAL_BEND, _MOST_BEND = 0.1, 0.5, 0.9
-"""Metres aside: less the walk makes up for, more takes longer, more still is another way."""
+"""Metres aside: less is left to the walk, more takes longer, more still is another trajectory."""
 _BEND_SHARES = (1.0, 0.7, 0.4)  # of a bend that are tried, where an obstacle is in the way of all of it
 _STRAIGHT_AHEAD = 0.6  # of a limb's length that it reaches down beside whatever it reaches aside
 _LEAST_CROUCH, _MOST_CROUCH, _POSED_FRAMES = 0.03, 0.3, 15  # metres down; frames beside a pose that is kept
 _BODY = 0.25  # metres from the hips to an obstacle's edge
 
 
-def check_reaches(reaches: Sequence[Reach], way: Way, rest: Motion) -> None:
+def check_reaches(reaches: Sequence[Reach], trajectory: Trajectory, rest: Motion) -> None:
     """Raise RequestError, with the distance, for targets beyond any arm or leg: too high over the ground, or too far
-    from where the way is at that time for any lean or step aside."""
+    from where the trajectory is at that time for any lean or step aside."""
     positions = rest.joint_positions()[0]
     for reach in reaches:
-        frame = min(round(reach.seconds * PRIOR_FPS), len(way.arcs) - 1)
-        on_way = way.curve.ground_point(way.arcs[frame])
+        frame = min(round(reach.seconds * PRIOR_FPS), len(trajectory.arcs) - 1)
+        on_way = trajectory.curve.ground_point(trajectory.arcs[frame])
         for name, place in reach.places.items():
             limb = LIMBS[name]
             bones = limb.length(rest.skeleton)
@@ -194,51 +186,51 @@ def check_reaches(reaches: Sequence[Reach], way: Way, rest: Motion) -> None:
             most = bones + (_TIPTOE if target[1] > positions[limb.upper, 1] else _CROUCH)
             if up > most or aside > bones + _STEP_ASIDE:
                 raise RequestError(
-                    f"{name} at {reach.seconds:g} s is to be {aside:.1f} m from where the way is then, and {up:.1f} m "
+                    f"{name} at {reach.seconds:g} s is to be {aside:.1f} m from where the walk is then, and {up:.1f} m "
                     f"above or below the joint it reaches from; it is {bones:.2f} m long"
                 )
 
 
-def lean_way(way: Way, request: ShotRequest, rest: Motion) -> Way:
-    """Return a way that is bent toward what is reached for where that is too far aside for an arm and a lean."""
-    length = way.curve.length
-    if not request.reaches or (way.curve.closed and float(way.arcs[-1]) > length):
-        return way
+def bend_toward_reaches(trajectory: Trajectory, request: ShotRequest, rest: Motion) -> Trajectory:
+    """Return a trajectory bent toward what is reached for where that is too far aside for an arm and a lean."""
+    length = trajectory.curve.length
+    if not request.reaches or (trajectory.curve.closed and float(trajectory.arcs[-1]) > length):
+        return trajectory
     along = torch.linspace(0, length, max(2, round(length / _BEND_STEP) + 1), dtype=torch.float64)
     offsets, met = torch.zeros_like(along), []
     for reach in request.reaches:
-        arc = way.arcs[min(round(reach.seconds * PRIOR_FPS), len(way.arcs) - 1)]
+        arc = trajectory.arcs[min(round(reach.seconds * PRIOR_FPS), len(trajectory.arcs) - 1)]
         for name, place in reach.places.items():
-            aside = _find_lacking_aside(way, arc, rest, name, place)
+            aside = _find_lacking_aside(trajectory, arc, rest, name, place)
             if abs(aside) > _LEAST_BEND:
                 met.append(float(arc))
                 reach_length = _BEND_LENGTH * max(1.0, abs(aside) / _USUAL_BEND)
                 offsets += aside * smootherstep(1 - (along - arc).abs() / reach_length)
     offsets = offsets.clamp(-_STEP_ASIDE, _STEP_ASIDE) * smootherstep(along / (0.5 * _BEND_LENGTH))
     if bool((offsets.abs() < 1e-3).all()):
-        return way
-    # A closed curve is walked once at most here, and bent it is an open one.
-    tried = (bend_way(way, share * offsets, met) for share in _BEND_SHARES)
-    return next((bent for bent in tried if not _is_blocked(bent, request)), way)
+        return trajectory
+    for share in _BEND_SHARES:  # a closed curve is walked once at most here, and bent it is an open one
+        bent = bend_trajectory(trajectory, share * offsets, met)
+        clear = measure_clearance(request.obstacles, bent.curve.ground_point(bent.arcs))
+        if float(clear.amin()) >= _BODY:
+            return bent
+    return trajectory
 
 
-def _find_lacking_aside(way: Way, arc: Tensor, rest: Motion, name: str, place: Sequence[float]) -> float:
-    """Find how far to the left of the way one would have to be for a limb to reach a place, metres; 0 where it does."""
+def _find_lacking_aside(trajectory: Trajectory, arc: Tensor, rest: Motion, name: str, place: Sequence[float]) -> float:
+    """Find how far to the left of the trajectory a limb reaches a target, metres; 0 where it does anyway."""
     limb, positions = LIMBS[name], rest.joint_positions()[0]
     bones = limb.length(rest.skeleton)
-    target = way.curve.points.new_tensor(place)
-    ground = target[::2] - way.curve.ground_point(arc)
-    left, ahead = float(ground @ way.curve.left(arc)), float(ground @ way.curve.tangent(arc)[way.curve.ground_axes])
+    target = trajectory.curve.points.new_tensor(place)
+    ground = target[::2] - trajectory.curve.ground_point(arc)
+    left, ahead = (
+        float(ground @ trajectory.curve.left(arc)),
+        float(ground @ trajectory.curve.tangent(arc)[trajectory.curve.ground_axes]),
+    )
     beside = left - float(positions[limb.upper, 0])
     room = (EASY_SHARE * bones) ** 2 - ahead**2 - float(target[1] - positions[limb.upper, 1]) ** 2
     lacking = max(0.0, abs(beside) - math.sqrt(max(0.0, room)))
     return math.copysign(min(lacking, _MOST_BEND), beside)
-
-
-def _is_blocked(way: Way, request: ShotRequest) -> bool:
-    """Return whether a way leads through an obstacle."""
-    places = way.curve.ground_point(way.arcs)
-    return bool(request.obstacles) and float(measure_clearance(request.obstacles, places).amin()) < _BODY
 
 
 def go_down(motion: Motion, reaches: Sequence[Reach], posed: Bool[Tensor, " frames"]) -> Motion:
@@ -293,7 +285,7 @@ def _keep_feet(motion: Motion, before: Motion) -> Motion:
 
 _WIDTHS = (10, 16, 24, 36)  # frames on either side of a key that are tried
 _MOST_WIDTH = 75
-_POSE_TOLERANCE_SHARE = 0.95  # of a tolerance that is made use of
+_POSE_TOLERANCE_SHARE = 0.95  # of a tolerance that is used
 _MOST_EASINGS = 8
 _HIPS_SPEED, _JOINT_SPEED, _TURN_RATE = 1.3, 2.0, 2.5  # m/s, m/s about the hips, rad/s: at most, on the way to a key
 
@@ -305,7 +297,7 @@ class MetPose:
     key: PoseKey
     """The key, at the time at which it was met."""
     wanted: Motion
-    """One frame: the pose in its place as the key asks for it; what it does not tell is as it was found."""
+    """One frame: the pose as the key asks for it; what it does not give is as it was found."""
     start: int
     """First frame of the key."""
     stop: int
@@ -318,7 +310,7 @@ class MetPose:
 
 
 def meet_poses(
-    motion: Motion, keys: Sequence[PoseKey], way: Way, inbetweener: Inbetweener
+    motion: Motion, keys: Sequence[PoseKey], trajectory: Trajectory, inbetweener: Inbetweener
 ) -> tuple[Motion, tuple[MetPose, ...]]:
     """Change a shot's motion so that it meets the keys; how far around them, and when within the frames that a key
     allows, costs a viewer least."""
@@ -328,7 +320,7 @@ def meet_poses(
         earliest = met[-1].stop if met else 0
         following = [_frame_of(other.seconds, motion) - other.within_frames for other in waiting[number + 1 :]]
         latest = min([motion.num_frames, *following])
-        tried = list(_list_fillings(motion, key, way, earliest, latest))
+        tried = list(_list_fillings(motion, key, trajectory, earliest, latest))
         filling, chosen = tried[choose_filling([filling for filling, _ in tried], inbetweener)]
         if bool(filling.missing.frames.any()):
             motion = fill(filling.motion, filling.missing, inbetweener).motion
@@ -339,22 +331,22 @@ def meet_poses(
 
 
 def measure_pose_error(motion: Motion, met: MetPose) -> tuple[float, float]:
-    """Measure the largest distance of what a key tells from where it is to be, metres, and of the heading, degrees."""
+    """Measure the largest distance of what a key gives from where it is to be, metres, and of the heading, degrees."""
     held = motion.slice(met.start, met.stop)
     away = (held.joint_positions() - met.wanted.joint_positions()).norm(dim=-1)
-    counted = away if met.key.tells_body else away[:, :1]
+    counted = away if met.key.gives_body else away[:, :1]
     turned = _measure_turns(held, met.wanted)
     return float(counted.max()), float(torch.rad2deg(turned.max()))
 
 
-def as_reaches(keys: Sequence[PoseKey], way: Way, found: Motion) -> tuple[Reach, ...]:
+def as_reaches(keys: Sequence[PoseKey], trajectory: Trajectory, found: Motion) -> tuple[Reach, ...]:
     """Return the keys of which only hands and feet count as reaches for where these are in the pose; `found` is any
     frame of the character."""
     reaches = []
     for key in keys:
         if key.joints:
-            frame = min(round(key.seconds * PRIOR_FPS), len(way.arcs) - 1)
-            positions = _place_pose(found, key, way, frame).joint_positions()[0]
+            frame = min(round(key.seconds * PRIOR_FPS), len(trajectory.arcs) - 1)
+            positions = _place_pose(found, key, trajectory, frame).joint_positions()[0]
             places = {name: tuple(positions[CANONICAL.index(name)].tolist()) for name in key.joints}
             reaches.append(Reach(key.seconds, places, key.hold_seconds, key.tolerance, key.within_frames))
     return tuple(reaches)
@@ -364,7 +356,7 @@ def pose_frames(met: Sequence[MetPose], frames: int) -> Bool[Tensor, " frames"]:
     """Mark the frames in which a whole pose is held."""
     held = torch.zeros(frames, dtype=torch.bool)
     for one in met:
-        if one.key.tells_body:
+        if one.key.gives_body:
             held[one.start : one.stop] = True
     return held
 
@@ -374,7 +366,7 @@ def _frame_of(seconds: float, motion: Motion) -> int:
 
 
 def _list_fillings(
-    motion: Motion, key: PoseKey, way: Way, earliest: int, latest: int
+    motion: Motion, key: PoseKey, trajectory: Trajectory, earliest: int, latest: int
 ) -> Iterator[tuple[Filling, MetPose]]:
     """List what may be made anew around a key, by when it is met and how far around it."""
     shifts = {0, key.within_frames, -key.within_frames, key.within_frames // 2, -(key.within_frames // 2)}
@@ -382,7 +374,7 @@ def _list_fillings(
     for shift in sorted(shifts, key=abs):
         start = max(earliest, min(_frame_of(key.seconds, motion) + shift, latest - 1))
         stop = min(start + hold, latest)
-        asked = _place_pose(motion.slice(start, start + 1), key, way, start)
+        asked = _place_pose(motion.slice(start, start + 1), key, trajectory, start)
         shown = _relax(asked, motion.slice(start, start + 1), key)
         least = _find_least_width(motion, shown, start)
         for width in sorted({min(_MOST_WIDTH, max(least, width)) for width in _WIDTHS}):
@@ -392,23 +384,23 @@ def _list_fillings(
             yield found, MetPose(replace(key, seconds=start / PRIOR_FPS), asked, start, stop)
 
 
-def _place_pose(found: Motion, key: PoseKey, way: Way, frame: int) -> Motion:
-    """Return one frame as a key asks for it, what it does not tell as found; a pose without a place and a facing is on
-    the way and along it."""
+def _place_pose(found: Motion, key: PoseKey, trajectory: Trajectory, frame: int) -> Motion:
+    """Return one frame as a key asks for it, what it does not give as found; a pose without a position and a facing is
+    on the trajectory and along it."""
     pose = found if key.pose is None else key.pose
     root, quats = pose.root_position.double().clone(), pose.local_quat_xyzw.double().clone()
-    arc = way.arcs[frame : frame + 1]
+    arc = trajectory.arcs[frame : frame + 1]
     if key.place is not None:
         root[0, ::2] = root.new_tensor(key.place)
     elif key.pose is not None:
-        root[0, ::2] = way.curve.ground_point(arc)
+        root[0, ::2] = trajectory.curve.ground_point(arc)
     if key.height is not None:
         root[0, 1] = key.height
     angle = None
     if key.facing_deg is not None:
         angle = torch.deg2rad(root.new_tensor([key.facing_deg]))
     elif key.pose is not None:
-        angle = way.curve.heading(arc).to(root)
+        angle = trajectory.curve.heading(arc).to(root)
     if angle is not None:
         turn = rotations.about_y(angle - kinematics.heading(quats[:, 0]))
         quats[:, 0] = rotations.multiply(turn, quats[:, 0])
@@ -419,7 +411,7 @@ def _relax(asked: Motion, found: Motion, key: PoseKey) -> Motion:
     """Return a pose nearer to what the character does anyway, as far as the tolerance allows."""
     if key.most == 0:
         return asked
-    allowed = key.most if key.tells_facing_alone else 100 * key.most
+    allowed = key.most if key.gives_facing_alone else 100 * key.most
     share, eased = 1.0, found
     for _ in range(_MOST_EASINGS):
         eased = _blend(asked, found, share)
@@ -439,8 +431,8 @@ def _blend(one: Motion, other: Motion, share: float) -> Motion:
 
 
 def _measure_off(pose: Motion, asked: Motion, key: PoseKey) -> float:
-    """Measure how far off a pose is, centimetres, or degrees where only a facing is told."""
-    if key.tells_facing_alone:
+    """Measure how far off a pose is, centimetres, or degrees where only a facing is given."""
+    if key.gives_facing_alone:
         return float(torch.rad2deg(_measure_turns(pose, asked))[0])
     return 100 * float((pose.joint_positions() - asked.joint_positions()).norm(dim=-1).max())
 
@@ -471,11 +463,11 @@ def _build_filling(
     part = slice(*held)
     missing = torch.zeros(frames, dtype=torch.bool)
     missing[around[0] : around[1]] = True
-    # A shot's first and last frame stay, where no key tells them.
+    # A shot's first and last frame stay, where no key gives them.
     missing[0] = missing[-1] = False
     mask = MissingMask.of_frames(missing, joints)
     mask = MissingMask(mask.joints.clone(), mask.root.clone())
-    if key.tells_body:
+    if key.gives_body:
         root[part], quats[part] = pose.root_position, pose.local_quat_xyzw
         mask.root[part], mask.joints[part] = False, False
     else:
@@ -484,7 +476,7 @@ def _build_filling(
         root[part] = pose.root_position + (0.0 if still else 1.0) * travelled * root.new_tensor([1.0, 0.0, 1.0])
         quats[part, 0] = pose.local_quat_xyzw[:, 0]
         mask.root[part] = False
-        if key.tells_facing:
+        if key.gives_facing:
             mask.joints[part, 0] = False
     changed = replace(motion, root_position=root, local_quat_xyzw=quats)
     return Filling(changed, mask, around)

@@ -35,6 +35,6 @@ for wish in shot.wishes:
 # %%
 # The way (red) is led round the pillar before anything is walked. The ball shines while it is to be touched.
 
-actor = Shot(shot.motion, shot.way.curve, wishes=Wishes([Mark(build_target(ball), (2.2, 2.4))]))
+actor = Shot(shot.motion, shot.trajectory.curve, wishes=Wishes([Mark(build_target(ball), (2.2, 2.4))]))
 camera, props = CameraSettings(azimuth_deg=65), [build_obstacle(pillar)]
 film([actor], "reach-and-walk-round-a-pillar.webp", camera=camera, props=props, size=(480, 270), fps=15)

@@ -17,7 +17,7 @@ import controllers
 import priors
 from controllers.shots.request import Look, Reach, ShotRequest
 from controllers.shots.shot import ShotSolution, solve_shot
-from controllers.shots.way import plan_way
+from controllers.shots.trajectory import plan_trajectory
 from mapctl import curves
 from mapctl.curves.obstacles import Obstacle, measure_clearance
 from mapctl.errors import RequestError
@@ -55,7 +55,7 @@ def draw_shot(generator: torch.Generator) -> tuple[ShotRequest, tuple[str, ...]]
         along, aside = uniform(2.5, 5.0), uniform(-0.4, 0.4)
         x, z = (request.curve.point(along) + aside * request.curve.left(along)).tolist()
         request = replace(request, obstacles=(Obstacle((x, z), uniform(0.2, 0.6)),))
-    way = plan_way(request)
+    way = plan_trajectory(request)
 
     def locate(seconds: float, ahead: float, aside: float) -> tuple[float, float]:
         arc = way.arcs[min(round(seconds * PRIOR_FPS), len(way.arcs) - 1)]

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from controllers.shots.way import apply_detour, find_detour
+from controllers.shots.trajectory import apply_detour, find_detour
 from mapctl import curves
 from mapctl.curves.obstacles import Obstacle, measure_clearance
 

@@ -9,9 +9,9 @@ from helpers import walk
 
 import priors
 from controllers.shots.reaching import ReachTargets, go_down, measure_pose_error, meet_poses, settle_reaches
-from controllers.shots.request import Arrival, PoseKey, Reach, ShotRequest, arrive
-from controllers.shots.shot import OVERLAP, close_loop
-from controllers.shots.way import Way, plan_way
+from controllers.shots.request import Arrival, PoseKey, Reach, ShotRequest
+from controllers.shots.seams import OVERLAP, arrive, close_loop
+from controllers.shots.trajectory import Trajectory, plan_trajectory
 from mapctl import curves, kinematics
 from mapctl.errors import RequestError
 from mapctl.intent.path import SpeedProfile
@@ -29,8 +29,8 @@ def inbetweener():
 
 
 @pytest.fixture(scope="module")
-def way() -> Way:
-    return plan_way(ShotRequest(LINE, seconds=4.0, speed=SpeedProfile.constant(1.0)))
+def way() -> Trajectory:
+    return plan_trajectory(ShotRequest(LINE, seconds=4.0, speed=SpeedProfile.constant(1.0)))
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +68,7 @@ def crouched() -> Motion:
 def test_a_key_is_met_exactly_and_the_rest_of_the_shot_stays(key, walked, way, inbetweener):
     made, (met,) = meet_poses(walked, (key,), way, inbetweener)
     metres, degrees = measure_pose_error(made, met)
-    if key.tells_facing_alone:
+    if key.gives_facing_alone:
         assert degrees < 0.1
     else:
         assert metres < 0.001
@@ -105,7 +105,7 @@ def test_a_key_may_be_met_within_its_frames(walked, way, inbetweener):
 @pytest.mark.parametrize(
     ("make", "said"),
     [
-        (lambda: PoseKey(1.0), "tells nothing"),
+        (lambda: PoseKey(1.0), "gives nothing"),
         (lambda: PoseKey(1.0, crouched(), tolerance={"leftHand": 0.1}), "one number"),
         (lambda: ShotRequest(LINE, poses=(PoseKey(1.0, facing_deg=0), PoseKey(1.05, facing_deg=9))), "two frames"),
         (lambda: ShotRequest(LINE, seconds=2.0, poses=(PoseKey(3.0, facing_deg=0.0),)), "not within the shot's 2 s"),

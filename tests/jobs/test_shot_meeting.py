@@ -9,7 +9,7 @@ import torch
 import priors
 from controllers.common.character import Character
 from controllers.shots.request import Others, ShotRequest
-from controllers.shots.way import Way, plan_way
+from controllers.shots.trajectory import Trajectory, plan_trajectory
 from mapctl import curves
 from mapctl.commands.shared.shots import ShotPlan, let_others_pass
 from mapctl.curves.obstacles import Obstacle
@@ -30,7 +30,7 @@ def meet(width: float) -> list[ShotPlan]:
     return [plan([(0.0, 0.0), (0.0, 6.0)], walls), plan([(0.0, 6.0), (0.0, 0.0)], walls)]
 
 
-def hips(way: Way):
+def hips(way: Trajectory):
     return way.curve.ground_point(way.arcs)
 
 
@@ -41,9 +41,9 @@ def test_in_a_narrow_passage_both_make_room():
     assert second is plans[1]
     assert first.request.others is not None
     assert first.request.others.courtesy
-    one = plan_way(first.request)
+    one = plan_trajectory(first.request)
     assert one.note is None
-    other = plan_way(replace(second.request, others=Others(hips(one)[None], APART)))
+    other = plan_trajectory(replace(second.request, others=Others(hips(one)[None], APART)))
     assert other.note is None
     frames = min(len(one.arcs), len(other.arcs))
     away = (hips(one)[:frames] - hips(other)[:frames]).norm(dim=-1)
@@ -51,8 +51,8 @@ def test_in_a_narrow_passage_both_make_room():
     aside = [float(hips(way)[int(away.argmin()), 0]) for way in (one, other)]
     assert min(map(abs, aside)) > 0.2
     assert aside[0] * aside[1] < 0
-    alone = plan_way(plans[0].request)
-    assert plan_way(replace(plans[1].request, others=Others(hips(alone)[None], APART))).note is not None
+    alone = plan_trajectory(plans[0].request)
+    assert plan_trajectory(replace(plans[1].request, others=Others(hips(alone)[None], APART))).note is not None
 
 
 def test_where_there_is_room_for_two_the_first_one_makes_none():

@@ -7,7 +7,7 @@ import torch
 from helpers import walk
 from linear_inbetweener import LinearInbetweener
 
-from controllers.shots.shot import find_jumps, repair_jumps
+from controllers.shots.seams import find_jumps, repair_jumps
 from mapctl.skeleton import CANONICAL, LIMBS
 
 AT = 40

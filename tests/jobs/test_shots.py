@@ -12,7 +12,7 @@ import priors
 from controllers.shots.reaching import build_rest_pose, measure_look_errors, turn_heads
 from controllers.shots.request import Lead, Look, Others, Reach, ShotRequest
 from controllers.shots.shot import solve_shot
-from controllers.shots.way import StandingEnds, lay_timeline, plan_speeds, plan_way
+from controllers.shots.trajectory import StandingEnds, lay_timeline, plan_speeds, plan_trajectory
 from mapctl import curves, rotations
 from mapctl.curves.obstacles import Obstacle, measure_clearance
 from mapctl.errors import RequestError
@@ -63,11 +63,11 @@ def test_a_way_past_somebody_who_comes_the_other_way_keeps_apart_when_they_meet(
     seconds = 5.0
     towards = torch.stack([torch.full((150,), 0.1), 6 - 1.2 * torch.arange(150) / 30], -1).double()
     request = ShotRequest(curves.line(length=6), seconds=seconds, others=Others(towards[None], 0.6))
-    way = plan_way(request)
+    way = plan_trajectory(request)
     assert way.note is None
     there = way.curve.point(way.arcs)
     assert float((there - towards[: len(there)]).norm(dim=-1).min()) > 0.6
-    alone = plan_way(replace(request, others=None))
+    alone = plan_trajectory(replace(request, others=None))
     assert float((alone.curve.point(alone.arcs) - towards[: len(alone.arcs)]).norm(dim=-1).min()) < 0.2
 
 
@@ -78,7 +78,7 @@ def test_a_way_past_somebody_who_comes_the_other_way_keeps_apart_when_they_meet(
     ("wishes", "said"),
     [
         ({"speed": TimedSpeed((0.0,), (1.0,))}, "need the shot's seconds"),
-        ({"obstacles": (Obstacle((0.1, 0.0), 0.5),)}, "on the start"),
+        ({"obstacles": (Obstacle((0.1, 0.0), 0.5),)}, "the start is within the obstacle"),
         ({"seconds": 2.0, "reaches": (Reach(1.9, {"leftHand": (0, 1, 1)}, 0.3),)}, "not within the shot's 2 s"),
         (
             {"reaches": (Reach(1.0, {"leftHand": (0.3, 1, 1)}), Reach(1.05, {"leftHand": (0.3, 1.4, 1)}))},

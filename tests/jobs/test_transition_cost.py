@@ -5,7 +5,7 @@ from dataclasses import replace
 import torch
 from helpers import walk
 
-from controllers.shots.request import compute_artefact_cost
+from controllers.shots.seams import compute_artefact_cost
 
 
 def test_a_slide_costs_what_a_viewer_sees_and_a_walk_does_not():

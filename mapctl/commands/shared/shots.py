@@ -16,8 +16,8 @@ from controllers.common.character import Character
 from controllers.shots.reaching import MetPose, build_rest_pose
 from controllers.shots.request import Arrival, Lead, Look, Others, PoseKey, Reach, ShotRequest
 from controllers.shots.shot import ShotSolution, solve_shot
+from controllers.shots.trajectory import APART_MARGIN, Trajectory, plan_trajectory
 from controllers.shots.walk import FollowSettings
-from controllers.shots.way import APART_MARGIN, Way, plan_way
 from mapctl import kinematics, report
 from mapctl.commands.shared.inputs import read_clip
 from mapctl.commands.shared.options import ReadOptions
@@ -216,7 +216,7 @@ def _find_after(solution: ShotSolution, request: ShotRequest) -> Motion | None:
         return solution.motion.slice(0, _BESIDE)
     if request.arrival is None:
         return None
-    arrival = request.arrival.bring_to(solution.way.curve, float(solution.way.arcs[-1])).motion
+    arrival = request.arrival.bring_to(solution.trajectory.curve, float(solution.trajectory.arcs[-1])).motion
     return arrival.slice(1, min(arrival.num_frames, 1 + _BESIDE))
 
 
@@ -255,7 +255,7 @@ class PlayedShot:
     @cached_property
     def measures(self) -> Mapping[str, float]:
         """Measures of the motion against the way that was planned."""
-        way = self.solution.way
+        way = self.solution.trajectory
         return report.measure_path(self.solution.motion, way.curve, wanted_m=float(way.arcs[-1]))
 
     def report(self, request: Mapping[str, Any]) -> dict[str, Any]:
@@ -319,9 +319,9 @@ def let_others_pass(plans: Sequence[ShotPlan], keep_apart: float) -> list[ShotPl
     given, tracks = list(plans), list[tuple[ShotPlan, Float[Tensor, "frames 2"]]]()
     for plan in plans:
         others = _find_others(plan, tracks, keep_apart) if tracks else None
-        way = plan_way(replace(plan.request, others=others))
+        way = plan_trajectory(replace(plan.request, others=others))
         if way.blocked and others is not None:
-            alone = plan_way(plan.request)
+            alone = plan_trajectory(plan.request)
             if not alone.blocked:
                 room = _find_others(given[0], [(plan, _walk_along(alone))], (keep_apart - APART_MARGIN) / 2)
                 given[0] = replace(given[0], request=replace(given[0].request, others=replace(room, courtesy=True)))
@@ -330,8 +330,8 @@ def let_others_pass(plans: Sequence[ShotPlan], keep_apart: float) -> list[ShotPl
     return given
 
 
-def _walk_along(way: Way) -> Float[Tensor, "frames 2"]:
-    return way.curve.ground_point(way.arcs)
+def _walk_along(trajectory: Trajectory) -> Float[Tensor, "frames 2"]:
+    return trajectory.curve.ground_point(trajectory.arcs)
 
 
 def _find_others(
@@ -376,12 +376,12 @@ def _collect_wishes(done: PlayedShot) -> Wishes:
         Mark(build_target(place), _find_span(reach)) for reach in solution.reaches for place in reach.places.values()
     ]
     marks += [Mark(build_look_mark(look.place), _find_span(look)) for look in done.request.looks]
-    marks += [_mark_hips(met) for met in solution.met if not met.key.tells_body]
-    return Wishes(marks, [met.wanted for met in solution.met if met.key.tells_body])
+    marks += [_mark_hips(met) for met in solution.met if not met.key.gives_body]
+    return Wishes(marks, [met.wanted for met in solution.met if met.key.gives_body])
 
 
 def _mark_hips(met: MetPose) -> Mark:
-    heading = float(kinematics.heading(met.wanted.local_quat_xyzw[0, 0])) if met.key.tells_facing else None
+    heading = float(kinematics.heading(met.wanted.local_quat_xyzw[0, 0])) if met.key.gives_facing else None
     return Mark(build_hips_mark(met.wanted.root_position[0, ::2].numpy(), heading), met.seconds)
 
 

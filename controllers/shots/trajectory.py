@@ -1,4 +1,5 @@
-"""What a character does when: the frames in which it stands, those in which it walks, and the transitions between."""
+"""The root trajectory of a shot: where the hips are to be in each frame, clear of obstacles and of others, and the
+spans in which the character stands or walks."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -9,7 +10,7 @@ from typing import Literal
 import numpy as np
 import scipy
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from numpy import ndarray
 from torch import Tensor
 
@@ -36,69 +37,50 @@ _DETOUR_BEND = 0.5  # metres of arc over which a detour bends: the root of what 
 def find_detour(curve: Curve, clearance: ClearanceOf) -> Float[Tensor, " arcs"] | None:
     """Find sideways offsets, metres to the left, at arcs 5 cm apart, under which a curve keeps clear.
 
-    Dynamic programming over the arcs: the sum of squared offsets and slopes is least among all ways on the grid, so
-    that left or right of each obstacle is chosen for the whole way. The offset at the start is 0, and so is that at the
-    end, where that is free. None where no way leads through.
+    Dynamic programming over the arcs: the sum of squared offsets and slopes is least among all paths on the grid. The
+    offset at the start is 0, and so is that at the end, where that is free. None where no path leads through.
     """
     arcs = torch.linspace(0, curve.length, max(2, round(curve.length / _ARC_SPACING) + 1), dtype=torch.float64)
     count = 2 * round(_WIDEST / _OFFSET_STEP) + 1
     offsets = torch.linspace(-_WIDEST, _WIDEST, count, dtype=torch.float64)
-    free = _find_free(curve, arcs, offsets, clearance).numpy()
+    points = curve.ground_point(arcs)[:, None] + offsets[:, None] * curve.left(arcs)[:, None]
+    free = (clearance(points, arcs) >= 0).numpy()
     chosen = _choose_offsets(free, offsets.numpy())
-    if chosen is None:
-        return None
-    return torch.from_numpy(_smooth_offsets(free, offsets.numpy(), chosen))
+    return None if chosen is None else torch.from_numpy(_smooth_offsets(free, offsets.numpy(), chosen))
 
 
-def apply_detour(curve: Curve, offsets: Float[Tensor, " arcs"]) -> Curve:
+def apply_detour(curve: Curve, offsets: Float[Tensor, " knots"]) -> Curve:
     """Return the curve moved sideways by offsets at evenly spaced arcs, as `find_detour` returns them."""
     if not bool((offsets.abs() > 1e-3).any()):
         return curve
     fine = torch.linspace(0, curve.length, max(2, round(curve.length / 0.02)), dtype=torch.float64)
     moved = curve.point(fine).clone()
-    moved[:, curve.ground_axes] = find_ground_beside(curve, offsets, fine)
+    moved[:, curve.ground_axes] = _ground_beside(curve, offsets, fine)
     return curves.from_points(moved, closed=False)
 
 
-def find_ground_beside(
-    curve: Curve, offsets: Float[Tensor, " knots"], arcs: Float[Tensor, " arcs"]
-) -> Float[Tensor, "arcs 2"]:
-    """Find where arcs of a curve, metres, are on the ground once it is moved sideways by offsets at evenly spaced
-    arcs, as `find_detour` returns them."""
-    between = interpolate_evenly(curve, offsets, arcs)
-    return _ground_points(curve, arcs, between[:, None])[:, 0]
+def _ground_beside(curve: Curve, offsets: Tensor, arcs: Float[Tensor, " arcs"]) -> Float[Tensor, "arcs 2"]:
+    return curve.ground_point(arcs) + _interpolate(curve, offsets, arcs)[:, None] * curve.left(arcs)
 
 
-def interpolate_evenly(
-    curve: Curve, values: Float[Tensor, " knots"], arcs: Float[Tensor, " arcs"]
-) -> Float[Tensor, " arcs"]:
+def _interpolate(curve: Curve, values: Tensor, arcs: Float[Tensor, " arcs"]) -> Float[Tensor, " arcs"]:
     """Interpolate values at evenly spaced arcs of a curve to others, metres."""
     knots = torch.linspace(0, curve.length, len(values), dtype=torch.float64)
     return torch.from_numpy(np.interp(arcs.numpy(), knots.numpy(), values.numpy()))
 
 
-def _ground_points(
-    curve: Curve, arcs: Float[Tensor, " arcs"], offsets: Float[Tensor, "arcs offsets"]
-) -> Float[Tensor, "arcs offsets 2"]:
-    return curve.ground_point(arcs)[:, None] + offsets[..., None] * curve.left(arcs)[:, None]
-
-
-def _find_free(curve: Curve, arcs: Tensor, offsets: Tensor, clearance: ClearanceOf) -> Bool[Tensor, "arcs offsets"]:
-    return clearance(_ground_points(curve, arcs, offsets.expand(len(arcs), -1)), arcs) >= 0
-
-
 def _choose_offsets(free: ndarray, offsets: ndarray) -> ndarray | None:
-    """Choose the number of the cheapest offset at each arc; None where every way is blocked."""
+    """Choose the number of the cheapest offset at each arc; None where every path is blocked."""
     reach = max(1, round(_STEEPEST * _ARC_SPACING / _OFFSET_STEP))
     slopes = np.arange(-reach, reach + 1) * _OFFSET_STEP / _ARC_SPACING
     cost, came_from = np.full(len(offsets), np.inf), []
     cost[len(offsets) // 2] = 0.0 if free[0, len(offsets) // 2] else np.inf
     for row in free[1:]:
         padded = np.pad(cost, reach, constant_values=np.inf)
-        ways = np.stack([padded[k : k + len(offsets)] for k in range(2 * reach + 1)])
-        ways += (_DECAY * slopes[:, None]) ** 2
-        best = ways.argmin(axis=0)
-        cost = np.where(row, ways[best, np.arange(len(offsets))] + offsets**2, np.inf)
+        moves = np.stack([padded[k : k + len(offsets)] for k in range(2 * reach + 1)])
+        moves += (_DECAY * slopes[:, None]) ** 2
+        best = moves.argmin(axis=0)
+        cost = np.where(row, moves[best, np.arange(len(offsets))] + offsets**2, np.inf)
         came_from.append(best - reach)
     if not np.isfinite(cost).any():
         return None
@@ -112,7 +94,7 @@ def _choose_offsets(free: ndarray, offsets: ndarray) -> ndarray | None:
 
 
 def _smooth_offsets(free: ndarray, offsets: ndarray, chosen: ndarray) -> ndarray:
-    """Minimise offsets, slopes and bends between the walls on either side of the chosen way."""
+    """Minimise offsets, slopes and bends between the walls on either side of the chosen path."""
     lowest, highest = np.empty(len(chosen)), np.empty(len(chosen))
     for arc, (row, at) in enumerate(zip(free, chosen, strict=True)):
         walls = np.flatnonzero(~row)
@@ -130,8 +112,8 @@ def _smooth_offsets(free: ndarray, offsets: ndarray, chosen: ndarray) -> ndarray
 
 
 _STANDING_SPEED = 0.05  # m/s
-_WALKING_SHARE = 0.7  # of the fastest speed beside a standing, at which the density walks already
-_SHORTEST_WALK = 15  # frames: what is shorter is a step that the in-betweener makes alone
+_WALKING_SHARE = 0.7  # of the fastest speed beside a stand, at which the density walks already
+_SHORTEST_WALK = 15  # frames: a shorter one is a step that the in-betweener generates
 
 
 @dataclass(frozen=True)
@@ -139,7 +121,7 @@ class Span:
     """Frames start to stop in which a character stands or walks."""
 
     what: Literal["stand", "walk"]
-    """What it does."""
+    """Stand or walk."""
     start: int
     """First frame."""
     stop: int
@@ -149,8 +131,8 @@ class Span:
 def lay_timeline(speeds: Float[Tensor, " frames"], *, slowest: float) -> list[Span]:
     """Lay out the spans of a shot by its speeds, m/s a frame; between spans, from one to the next, lie transitions.
 
-    A character that never stands walks throughout. A walk beside a standing begins and ends where the wanted speed is
-    most of the fastest, and no lower than `slowest`, which the density can walk.
+    A character that never stands walks throughout. A walk beside a stand begins and ends where the requested speed is
+    most of the fastest, and no lower than `slowest`, m/s, which the density can walk.
     """
     frames = len(speeds)
     standing = [(start, stop) for _, start, stop in true_intervals((speeds < _STANDING_SPEED)[:, None])]
@@ -159,27 +141,21 @@ def lay_timeline(speeds: Float[Tensor, " frames"], *, slowest: float) -> list[Sp
     spans, before = [], 0
     for start, stop in [*standing, (frames, frames)]:
         if start > before:
-            spans += _lay_walk(speeds, before, start, slowest)
+            enough = max(slowest, _WALKING_SHARE * float(speeds[before:start].max()))
+            fast = before + (speeds[before:start] >= enough).nonzero()[:, 0]
+            if len(fast):
+                first, last = int(fast[0]) if before > 0 else 0, int(fast[-1]) + 1 if start < frames else frames
+                if last - first >= _SHORTEST_WALK:
+                    spans.append(Span("walk", first, last))
         if stop > start:
             spans.append(Span("stand", start, stop))
         before = stop
     return spans
 
 
-def _lay_walk(speeds: Tensor, start: int, stop: int, slowest: float) -> list[Span]:
-    """Lay the walk between two standings, or a shot's end."""
-    enough = max(slowest, _WALKING_SHARE * float(speeds[start:stop].max()))
-    fast = (speeds[start:stop] >= enough).nonzero()[:, 0]
-    if not len(fast):
-        return []
-    first = start + int(fast[0]) if start > 0 else start
-    last = start + int(fast[-1]) + 1 if stop < len(speeds) else stop
-    return [Span("walk", first, last)] if last - first >= _SHORTEST_WALK else []
-
-
 @dataclass(frozen=True)
 class StandingEnds:
-    """Which ends of a shot stand, and how speeds rise and fall there."""
+    """Ends of a shot at which the character stands, and how speeds rise and fall there."""
 
     start: bool
     """Whether it begins standing."""
@@ -192,15 +168,14 @@ class StandingEnds:
     settled: float = 1.0
     """Seconds of standing at the end."""
 
-
-def limit_timed_speeds(speeds: Float[Tensor, " frames"], fps: float, ends: StandingEnds) -> Float[Tensor, " frames"]:
-    """Let speeds by time, m/s, rise from standing and fall to it at the ends that stand, where they do not already."""
-    seconds, found = torch.arange(len(speeds), dtype=speeds.dtype) / fps, speeds
-    if ends.start and float(speeds[0]) >= _STANDING_SPEED:
-        found = torch.minimum(found, ends.acceleration * (seconds - ends.still).clamp_min(0))
-    if ends.end and float(speeds[-1]) >= _STANDING_SPEED:
-        found = torch.minimum(found, ends.acceleration * (seconds[-1] - seconds - ends.settled).clamp_min(0))
-    return found
+    def limit(self, speeds: Float[Tensor, " frames"], fps: float) -> Float[Tensor, " frames"]:
+        """Let speeds by time, m/s, rise from standing and fall to it, where they do not already."""
+        seconds, found = torch.arange(len(speeds), dtype=speeds.dtype) / fps, speeds
+        if self.start and float(speeds[0]) >= _STANDING_SPEED:
+            found = torch.minimum(found, self.acceleration * (seconds - self.still).clamp_min(0))
+        if self.end and float(speeds[-1]) >= _STANDING_SPEED:
+            found = torch.minimum(found, self.acceleration * (seconds[-1] - seconds - self.settled).clamp_min(0))
+        return found
 
 
 def plan_speeds(
@@ -234,17 +209,17 @@ def plan_speeds(
 
 _BODY_MARGIN = 0.35  # metres from the hips to an obstacle's edge: arms swing that far
 APART_MARGIN = 0.15
-"""Metres beyond the distance to others by which ways keep apart: hips sway, and are early or late."""
+"""Metres beyond the distance to others by which trajectories keep apart: hips sway, and are early or late."""
 _TURN_SECONDS = 0.6  # of standing where a curve reverses
 _FINE_STEP = 0.02  # metres of arc
-_MADE_UP = 3.0  # metres of arc over which one makes up for a longer way
+_CATCH_UP = 3.0  # metres of arc over which a longer trajectory is caught up
 _MOST_FRAMES = 108_000
 _MEETING_FRAMES = 6  # frames by which either may be early or late
 
 
 @dataclass(frozen=True, eq=False)
-class Way:
-    """Where a character is to be at each frame."""
+class Trajectory:
+    """Where a character is to be in each frame."""
 
     curve: Curve
     """Curve that is clear of obstacles and others, and near enough to what is reached for."""
@@ -252,91 +227,88 @@ class Way:
     """Speed along it, m/s."""
     arcs: Float[Tensor, " frames"]
     """Arc along it, metres."""
-    wished: Curve
+    unbent: Curve
     """Curve before it was bent toward what is reached for."""
-    wished_arcs: Float[Tensor, " frames"]
+    unbent_arcs: Float[Tensor, " frames"]
     """Arc along that, metres."""
     aside: Float[Tensor, " frames"]
-    """How far aside of that the way leads, metres."""
+    """Distance of the curve from the unbent one, metres."""
     note: str | None = None
     """What was changed about the request, or why it cannot hold."""
     blocked: bool = False
-    """Whether no way leads around the obstacles and past the others."""
+    """Whether no path leads around the obstacles and past the others."""
 
-    def slice(self, frames: int) -> "Way":
-        """Return the way of the first frames."""
-        cut = {name: getattr(self, name)[:frames] for name in ("speeds", "arcs", "wished_arcs", "aside")}
+    def slice(self, frames: int) -> "Trajectory":
+        """Return the first frames."""
+        cut = {name: getattr(self, name)[:frames] for name in ("speeds", "arcs", "unbent_arcs", "aside")}
         return replace(self, **cut)
 
-    def walked_on(self, frames: int) -> "Way":
-        """Return the way of a loop, walked on for some more frames."""
+    def extend_loop(self, frames: int) -> "Trajectory":
+        """Return the trajectory of a loop with some more frames, of its next lap."""
         return replace(
             self,
             speeds=torch.cat([self.speeds, self.speeds[:frames]]),
             arcs=torch.cat([self.arcs, self.curve.length + self.arcs[:frames]]),
-            wished_arcs=torch.cat([self.wished_arcs, self.wished.length + self.wished_arcs[:frames]]),
+            unbent_arcs=torch.cat([self.unbent_arcs, self.unbent.length + self.unbent_arcs[:frames]]),
             aside=torch.cat([self.aside, self.aside[:frames]]),
         )
 
 
-def plan_way(request: ShotRequest) -> Way:
-    """Plan the way of a shot: first around obstacles, then past others, who are met where the plan is when they are
-    there. Where no way leads through the curve stays as it is, and a note says so."""
-    way = _plan_along(request, request.curve)
+def plan_trajectory(request: ShotRequest) -> Trajectory:
+    """Plan the root trajectory of a shot: first around obstacles, then past others, where they are at that time. Where
+    no path leads through the curve stays as it is, and a note says so."""
+    plain = _plan_along(request, request.curve)
     if not request.obstacles and request.others is None:
-        return way
-
+        return plain
     at_start = float(measure_clearance(request.obstacles, request.curve.ground_point(0.0)[None]))
 
     def clearance(points: Tensor, at: Tensor) -> Tensor:
-        # Who begins beside an obstacle has to get away from it first.
+        # A character that begins beside an obstacle has to get away from it first.
         margin = (at_start + 0.5 * at).clamp(max=_BODY_MARGIN)[:, None]
         clear = measure_clearance(request.obstacles, points) - margin
-        return (
-            clear
-            if request.others is None
-            else torch.minimum(clear, _clear_of_others(points, at, way.arcs, request.others))
-        )
+        if request.others is None:
+            return clear
+        return torch.minimum(clear, _clear_of_others(points, at, plain.arcs, request.others))
 
     offsets = find_detour(request.curve, clearance)
     if offsets is None:
-        return replace(way, note="no way leads around the obstacles and past the others", blocked=True)
+        return replace(plain, note="no way leads around the obstacles and past the others", blocked=True)
     return _plan_along(request, apply_detour(request.curve, offsets))
 
 
-def bend_way(way: Way, offsets: Float[Tensor, " arcs"], met: Sequence[float]) -> Way:
-    """Return a way moved sideways by offsets, metres to the left, at evenly spaced arcs. Whenever one would have been
-    at one of the arcs `met`, metres, one is beside it: what a bend is longer by is made up for gradually before."""
-    curve = apply_detour(way.curve, offsets)
-    if curve is way.curve:
-        return way
-    length = way.curve.length
+def bend_trajectory(plain: Trajectory, offsets: Float[Tensor, " arcs"], met: Sequence[float]) -> Trajectory:
+    """Return a trajectory moved sideways by offsets, metres to the left, at evenly spaced arcs. It passes the arcs
+    `met`, metres, at the same times as before: the extra length is caught up gradually before them."""
+    curve = apply_detour(plain.curve, offsets)
+    if curve is plain.curve:
+        return plain
+    length = plain.curve.length
     before = torch.linspace(0, length, max(2, round(length / _FINE_STEP) + 1), dtype=torch.float64)
-    ground = find_ground_beside(way.curve, offsets, before)
+    ground = _ground_beside(plain.curve, offsets, before)
     along = torch.cat([ground.new_zeros(1), torch.diff(ground, dim=0).norm(dim=-1).cumsum(0)])
     longer = np.interp([*sorted(met), length], before.numpy(), (along - before).numpy())
     knots, gained = [0.0], [0.0]
     for arc, extra in zip([*sorted(met), length], longer, strict=True):
-        if arc - _MADE_UP > knots[-1]:
-            knots.append(arc - _MADE_UP)
+        if arc - _CATCH_UP > knots[-1]:
+            knots.append(arc - _CATCH_UP)
             gained.append(gained[-1])
         if arc > knots[-1]:
             knots.append(arc)
             gained.append(float(extra))
-    arcs = way.arcs + torch.from_numpy(np.interp(way.arcs.numpy(), knots, gained))
+    arcs = plain.arcs + torch.from_numpy(np.interp(plain.arcs.numpy(), knots, gained))
     speeds = torch.diff(arcs, append=2 * arcs[-1:] - arcs[-2:-1]) * PRIOR_FPS
-    moved = interpolate_evenly(way.curve, offsets.abs(), way.arcs)
-    return replace(way, curve=curve, speeds=speeds, arcs=arcs, wished_arcs=way.arcs, aside=moved)
+    aside = _interpolate(plain.curve, offsets.abs(), plain.arcs)
+    return replace(plain, curve=curve, speeds=speeds, arcs=arcs, unbent_arcs=plain.arcs, aside=aside)
 
 
-def _plan_along(request: ShotRequest, curve: Curve) -> Way:
-    """Plan when a character is where along a curve; a shot without a duration lasts until the curve ends."""
+def _plan_along(request: ShotRequest, curve: Curve) -> Trajectory:
+    """Plan the arcs along a curve by frame; a shot without a duration lasts until the curve ends."""
     ends, arcs, note = StandingEnds(request.begins_standing, request.ends_standing), None, None
     if isinstance(request.speed, TimedSpeed):
         frames = max(2, round((request.seconds or 0.0) * PRIOR_FPS))
-        speeds = limit_timed_speeds(request.speed.at(frames, PRIOR_FPS), PRIOR_FPS, ends)
+        speeds = ends.limit(request.speed.at(frames, PRIOR_FPS), PRIOR_FPS)
     elif not curve.closed and (reversals := find_reversals(curve)):
-        speeds = _plan_reversals(request, curve, reversals, ends)
+        speeds = _plan_reversals(request.speed or walk_at_ease(curve), request.seconds, curve, reversals, ends)
     else:
         path, note = PathRequest(curve, request.speed or walk_at_ease(curve), request.seconds).fitted(PRIOR_FPS)
         arcs = path.arcs(path.frames(PRIOR_FPS), PRIOR_FPS)
@@ -350,32 +322,28 @@ def _plan_along(request: ShotRequest, curve: Curve) -> Way:
         elif request.speed is None:
             arcs = None
     arcs = integrate_speeds(speeds, PRIOR_FPS) if arcs is None else arcs
-    return Way(curve, speeds, arcs, curve, arcs, torch.zeros_like(arcs), note)
+    return Trajectory(curve, speeds, arcs, curve, arcs, torch.zeros_like(arcs), note)
 
 
 def _plan_reversals(
-    request: ShotRequest, curve: Curve, reversals: Sequence[float], ends: StandingEnds
+    profile: SpeedProfile, seconds: float | None, curve: Curve, reversals: Sequence[float], ends: StandingEnds
 ) -> Float[Tensor, " frames"]:
-    """Plan speeds along a curve that reverses: to a standing at each reversal, and on from there."""
-    assert not isinstance(request.speed, TimedSpeed)
-    profile, stops, speeds = request.speed or walk_at_ease(curve), [0.0, *reversals, curve.length], []
+    """Plan speeds along a curve that reverses: to a stand at each reversal, and on from there."""
+    stops, speeds = [0.0, *reversals, curve.length], []
     for number, (start, stop) in enumerate(pairwise(stops)):
-        last = number == len(reversals)
-        piece = replace(
-            ends,
-            start=ends.start if number == 0 else True,
-            end=ends.end if last else True,
-            still=ends.still if number == 0 else _TURN_SECONDS / 2,
-            settled=ends.settled if last else _TURN_SECONDS / 2,
-        )
+        piece, turning = ends, _TURN_SECONDS / 2
+        if number > 0:
+            piece = replace(piece, start=True, still=turning)
+        if number < len(reversals):
+            piece = replace(piece, end=True, settled=turning)
         onward = SpeedProfile(tuple(arc - start for arc in profile.arcs), profile.speeds)
         found = plan_speeds(onward, stop - start, PRIOR_FPS, piece, seconds=None, most=_MOST_FRAMES)
         # Rounded to frames, a piece's arcs miss its length by a little.
         speeds.append(found * ((stop - start) * PRIOR_FPS / found.sum()))
     planned = torch.cat(speeds)
-    if request.seconds is None:
+    if seconds is None:
         return planned
-    frames = max(2, round(request.seconds * PRIOR_FPS))
+    frames = max(2, round(seconds * PRIOR_FPS))
     return torch.cat([planned, planned.new_zeros(frames)])[:frames]
 
 
@@ -385,10 +353,8 @@ def _clear_of_others(
     """Compute by how much points are clear of others when they are reached."""
     frame = torch.searchsorted(arcs.contiguous(), at.contiguous()).clamp(max=len(arcs) - 1)
     clear = torch.full(points.shape[:2], torch.inf, dtype=points.dtype)
-    last = others.hips.shape[1] - 1
     for late in range(-_MEETING_FRAMES, _MEETING_FRAMES + 1, 3):
-        there = others.hips[:, (frame + late).clamp(0, last)].to(points)
-        away = (points[None] - there[:, :, None]).norm(dim=-1)
+        away = (points[None] - others.at(frame + late).to(points)[:, :, None]).norm(dim=-1)
         clear = torch.minimum(clear, away.amin(dim=0))
     return clear - others.distance - APART_MARGIN
 

@@ -1,0 +1,247 @@
+"""What the in-betweener generates in a walked motion: transitions between its spans, seams of loops and clips, jumps.
+
+Where a transition lies is a choice with several basins: a few frames earlier another foot is in the air. A grid is
+tried, and the proposal with the least visible artefacts is taken.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise, product
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from controllers.common.map_refinement import estimate_rest_height
+from controllers.inbetweening.pipeline import InfillSettings, fill
+from controllers.shots.request import Arrival, Lead
+from controllers.shots.trajectory import Span
+from controllers.shots.walk import Piece
+from mapctl import contacts
+from mapctl.features import PRIOR_FPS
+from mapctl.inbetweening.missing import MissingMask
+from mapctl.metrics import body
+from mapctl.motion import Motion
+from mapctl.numerics.intervals import true_intervals
+from mapctl.protocols import Inbetweener
+from mapctl.skeleton import CANONICAL, TOES
+
+_CONTEXT = 16  # frames on either side that the in-betweener is given
+_ACCELERATION_WEIGHT = 0.003  # m/s for a m/s^2 of the worst hand or toe
+_SKATE_WEIGHT = 0.5  # of skating toes beside sliding of the support
+_DETOUR_WEIGHT = 0.5  # of the trajectory's excess length over the straight one, m/s for m/s
+_UNSUPPORTED_WEIGHT = 0.5  # of the longest time on no planted foot, m/s for a second
+_SKATE_HEIGHT = 0.025  # metres
+_TOES = CANONICAL.indices(TOES)
+_EFFECTORS = CANONICAL.indices(("leftHand", "rightHand", *TOES))
+
+
+@dataclass(frozen=True, eq=False)
+class Filling:
+    """A shot's motion of which the in-betweener is to generate a part."""
+
+    motion: Motion
+    """All frames of the shot."""
+    missing: MissingMask
+    """The part."""
+    around: tuple[int, int]
+    """Frames start to stop that it is within."""
+
+    @staticmethod
+    def of_frames(motion: Motion, start: int, stop: int) -> "Filling":
+        """Return the filling of whole frames from start to stop."""
+        frame = torch.arange(motion.num_frames)
+        missing = MissingMask.of_frames((frame >= start) & (frame < stop), motion.num_joints)
+        return Filling(motion, missing, (start, stop))
+
+    def cost(self, inbetweener: Inbetweener) -> float:
+        """Compute the cost of what is visible of the in-betweener's proposal, m/s: sliding, skating, detours, time on
+        no foot (see `compute_artefact_cost`), and the worst acceleration."""
+        start, stop = self.around
+        first, last = max(0, start - _CONTEXT), min(self.motion.num_frames, stop + _CONTEXT)
+        gap = (max(1, start - first), min(stop, self.motion.num_frames - 1) - first)
+        part, missing = self.motion.slice(first, last), self.missing.slice(first, last)
+        if not bool(missing.frames.any()):
+            return 0.0
+        done = fill(part, missing, inbetweener, settings=InfillSettings(finish=False))
+        shown = done.motion.slice(max(0, gap[0] - 2), min(done.motion.num_frames, gap[1] + 2))
+        peaks = body.measure_peaks(shown.joint_positions()[:, _EFFECTORS], shown.root_position, float(shown.fps))
+        return compute_artefact_cost(done.motion, done.contacts, gap) + _ACCELERATION_WEIGHT * peaks.acceleration
+
+
+def choose_filling(candidates: Sequence[Filling], inbetweener: Inbetweener) -> int:
+    """Choose the candidate of the least cost, by the in-betweener's proposals without MAP."""
+    return min(range(len(candidates)), key=lambda at: candidates[at].cost(inbetweener)) if len(candidates) > 1 else 0
+
+
+def compute_artefact_cost(motion: Motion, planted: Bool[Tensor, "frames 2"], gap: tuple[int, int]) -> float:
+    """Compute the cost of visible artefacts in a filled gap as a speed, m/s: sliding of the support, skating toes, a
+    detour, the longest unsupported time.
+    """
+    start, stop = gap[0] - 1, gap[1] + 1
+    positions, fps = motion.joint_positions()[start:stop], float(motion.fps)
+    toes, hips = positions[:, _TOES], positions[:, 0]
+    height = estimate_rest_height(motion, contacts.debounced(planted))[start:stop]
+    above, speeds = (toes[..., 1] - height)[1:], torch.diff(toes[..., ::2], dim=0).norm(dim=-1) * fps
+    slide = float(contacts.support_speed(above, speeds).mean())
+    skate = float((speeds * (1 - above / _SKATE_HEIGHT).clamp(0, 1)).mean())
+    ground = hips[:, ::2]
+    detour = float(torch.diff(ground, dim=0).norm(dim=-1).sum()) - float((ground[-1] - ground[0]).norm())
+    unsupported = body.measure_longest_unsupported(toes, hips, fps)
+    return (
+        slide
+        + _SKATE_WEIGHT * skate
+        + _DETOUR_WEIGHT * detour * fps / len(positions)
+        + _UNSUPPORTED_WEIGHT * unsupported
+    )
+
+
+def _join_across(before: Motion, after: Motion, frame: int) -> Motion:
+    """Take the frames before one from one motion, the others from another of as many frames."""
+    earlier = torch.arange(before.num_frames) < frame
+    return replace(
+        before,
+        root_position=torch.where(earlier[:, None], before.root_position, after.root_position),
+        local_quat_xyzw=torch.where(earlier[:, None, None], before.local_quat_xyzw, after.local_quat_xyzw),
+    )
+
+
+def fill_frames(motion: Motion, missing: Bool[Tensor, " frames"], inbetweener: Inbetweener) -> Motion:
+    """Generate whole frames of a motion."""
+    return fill(motion, MissingMask.of_frames(missing, motion.num_joints), inbetweener).motion
+
+
+_STILL_START, _STILL_END = 12, 26  # frames of standing at least, where a shot begins and ends with it
+_SHORTEST = 12  # frames of a transition
+_HASTY = 20  # frames of a transition for which there is no room
+_SETTLED = 8  # frames that are left of a walk between two transitions
+
+
+def join_pieces(pieces: Sequence[Piece], inbetweener: Inbetweener) -> tuple[Motion, Bool[Tensor, " frames"]]:
+    """Join pieces by the transitions that cost least; also return the frames that the in-betweener is to generate."""
+    joined = pieces[0].motion
+    missing = torch.zeros(joined.num_frames, dtype=torch.bool)
+    earliest = 0
+    for before, after in pairwise(pieces):
+        candidates = [
+            Filling.of_frames(_join_across(joined, after.motion, start), start, stop)
+            for start, stop in _lay_transitions(before.span, after.span, joined.num_frames, earliest)
+        ]
+        chosen = candidates[choose_filling(candidates, inbetweener)]
+        joined, (start, stop) = chosen.motion, chosen.around
+        missing[start:stop] = True
+        earliest = stop + _SETTLED
+    return joined, missing
+
+
+def _lay_transitions(before: Span, after: Span, frames: int, earliest: int) -> list[tuple[int, int]]:
+    """List the transitions from one span to the next, frames start to stop, that leave enough of both; where none does,
+    one as late as the stand after it allows."""
+    own = before.start + (_SETTLED if before.what == "walk" else _STILL_START if before.start == 0 else 1)
+    first, latest, hasty = max(earliest, own), after.stop - 1, min(after.start + 1, after.stop - 1)
+    if after.what == "stand" and after.stop == frames:
+        latest, hasty = min(latest, frames - _STILL_END), min(hasty, frames - _STILL_END)
+    if before.what == "walk":
+        grid = product((-12, -8, -4, 0, 4, 8), (26, 34))
+        tried = [(before.stop + step, before.stop + step + length) for step, length in grid]
+    else:
+        # From standing to walking one may begin at once; from a stand to the next there may be more than a step.
+        longest = after.start - (first if after.what == "walk" else before.stop)
+        grid = product((0, 4, 8, 12, 16), sorted({18, 26, longest}))
+        tried = [(after.start + step - length, after.start + step) for step, length in grid]
+    found = [(start, stop) for start, stop in tried if first <= start and stop <= latest and stop - start >= _SHORTEST]
+    start = max(earliest, min(before.stop - 1, hasty - _HASTY))
+    return found or [(start, max(start + 1, hasty))]
+
+
+_REST, _SOON = 24, 45  # frames in which limbs come to rest, or until the first step where it ends that soon
+
+
+def go_on(motion: Motion, missing: Bool[Tensor, " frames"], lead: Lead, inbetweener: Inbetweener) -> Motion:
+    """Generate the missing frames of a shot that goes on from a clip; where that ends in a gesture, limbs come to rest
+    until the first step, by the motion of the clip's last frames."""
+    if not lead.gestures:
+        return fill_frames(motion, missing, inbetweener)
+    first = next(((start, stop) for _, start, stop in true_intervals(missing[:, None].clone())), None)
+    rest = first[1] if first is not None and first[0] < _SOON else min(_REST, motion.num_frames - 1)
+    missing = missing.clone()
+    missing[1:rest] = True
+    past = lead.past
+    whole = fill_frames(past.join(motion), torch.cat([missing.new_zeros(past.num_frames), missing]), inbetweener)
+    return whole.slice(past.num_frames, whole.num_frames)
+
+
+def arrive(motion: Motion, arrival: Arrival, inbetweener: Inbetweener) -> Motion:
+    """Generate the last steps of a shot's motion anew so that it ends in an arrival, which is in position."""
+    last = motion.num_frames - 1
+    longer = replace(
+        motion,
+        root_position=torch.cat([motion.root_position[:-1], arrival.motion.root_position]),
+        local_quat_xyzw=torch.cat([motion.local_quat_xyzw[:-1], arrival.motion.local_quat_xyzw]),
+    )
+    tried = [Filling.of_frames(longer, max(1, last - width), last) for width in (18, 26, 36, 50)]
+    return _fill_best(tried, inbetweener).slice(0, last + 1)
+
+
+def _fill_best(tried: Sequence[Filling], inbetweener: Inbetweener) -> Motion:
+    chosen = tried[choose_filling(tried, inbetweener)]
+    return fill(chosen.motion, chosen.missing, inbetweener).motion
+
+
+OVERLAP = 54
+"""Frames, at PRIOR_FPS, that a walk goes on for after once around."""
+_EARLIEST, _LATEST = 16, 44  # frames after the first at which laps may be joined: about a stride
+_TRIED = 3  # of the best of them
+
+
+def close_loop(motion: Motion, frames: int, inbetweener: Inbetweener) -> Motion:
+    """Return one lap of so many frames of a walk that goes on for OVERLAP more: its second lap's first frames, and then
+    the first lap's from where both are most alike."""
+    positions = motion.joint_positions()
+    laps = [positions[start:].flatten(1) for start in (0, frames)]
+    here, later = (torch.cat([lap[1:], 3.0 * torch.diff(lap, dim=0)], dim=-1) for lap in laps)
+    count = min(len(here), len(later))
+    unlike = (here[:count] - later[:count]).norm(dim=-1)
+    tried = []
+    for seam in (unlike[_EARLIEST:_LATEST].argsort()[:_TRIED] + _EARLIEST).tolist():
+        source = torch.arange(frames)
+        source[:seam] += frames
+        joined = replace(
+            motion, root_position=motion.root_position[source], local_quat_xyzw=motion.local_quat_xyzw[source]
+        )
+        tried += [Filling.of_frames(joined, seam - width, seam + width) for width in (3, 6, 10)]
+    return _fill_best(tried, inbetweener)
+
+
+_JUMP_SPEED = 3.0  # m/s about the hips
+_JUMP_RATIO = 1.6  # of the speed two frames earlier and later: limbs that swing fast do so for longer
+_AROUND = 6  # frames before and after a jump
+
+
+def repair_jumps(motion: Motion, inbetweener: Inbetweener, *, past: Motion | None = None) -> Motion:
+    """Generate frames around jumps anew, where that is calmer; the first and the last frame stay. `past` are the frames
+    before the first, where there are any."""
+    if past is not None:
+        whole = repair_jumps(past.join(motion), inbetweener)
+        return _join_across(motion, whole.slice(past.num_frames, whole.num_frames), 1)
+    missing = torch.zeros(motion.num_frames, dtype=torch.bool)
+    for frame in find_jumps(motion).nonzero()[:, 0].tolist():
+        missing[max(1, frame - _AROUND) : frame + _AROUND + 2] = True
+    missing[-1] = False
+    if not bool(missing.any()):
+        return motion
+    calmer = fill_frames(motion, missing, inbetweener)
+    peaks = [
+        torch.diff(each.joint_positions()[:, _EFFECTORS], n=2, dim=0).norm(dim=-1).max() for each in (calmer, motion)
+    ]
+    return calmer if float(peaks[0]) < float(peaks[1]) else motion
+
+
+def find_jumps(motion: Motion) -> Bool[Tensor, " steps"]:
+    """Find the steps from one frame to the next in which a hand or a toe moves much faster than shortly before and
+    after."""
+    positions = motion.joint_positions()
+    speed = torch.diff(positions[:, _EFFECTORS] - positions[:, :1], dim=0).norm(dim=-1) * PRIOR_FPS
+    beside = torch.full_like(speed, torch.inf)  # at the ends nothing shows what was before, or comes after
+    beside[2:-2] = torch.maximum(speed[:-4], speed[4:])
+    return ((speed > _JUMP_SPEED) & (speed > _JUMP_RATIO * beside)).any(dim=1)
