@@ -1,4 +1,11 @@
-"""Unknowns that are the noise of a rollout: x = mu_k + sigma_k d, components k and contact bits fixed by a plan."""
+"""Unknowns of a window: the noise of a rollout, or offsets about a proposed motion.
+
+Noise: x = mu_k + sigma_k d, components k and contact bits fixed by a plan. Offsets: x = proposal + sigma * (K z), the
+posterior of a model that proposes whole motions, so that the standard normal prior of z is the observation term of
+denoising (Wang et al. 2019, Eq. 25) in coordinates that converge. K smooths white z to unit variance, so that a
+correction of one frame moves its neighbours along; positions are in the world, so that terms on observed positions are
+well conditioned.
+"""
 
 import math
 from collections.abc import Sequence
@@ -12,7 +19,10 @@ from torch import Tensor
 from mapctl.errors import MapctlError
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose
 from mapctl.kinematics import fast
+from mapctl.numerics import gaussian
+from mapctl.pose import BodyPose
 from mapctl.problem.density_selection import DensityEnsemble
+from mapctl.problem.objective import Parametrisation
 from mapctl.protocols import AnyDensity, DensityState, DiscreteChoices, PreparedRollout
 from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.terms.base import Term, TrialGradient
@@ -65,12 +75,10 @@ class WindowContext:
         self,
         features: Float[Tensor, "batch frames size"],
         contacts: Bool[Tensor, "batch frames 2"],
-        *,
-        noise: Float[Tensor, "batch frames width"] | None,
-        log_density: Float[Tensor, "batch frames"] | None,
-        heel_plan: Trial | None = None,
+        noise: Float[Tensor, "batch frames width"] | None = None,
+        log_density: Float[Tensor, "batch frames"] | None = None,
     ) -> Trial:
-        """Build the trial of candidate features, physical units, in this context; `heel_plan` as `Trial` has it."""
+        """Build the trial of candidate features, physical units, in this context."""
         return Trial(
             features,
             self.place,
@@ -80,17 +88,10 @@ class WindowContext:
             before=self.before,
             contacts_before=self.contacts_before,
             heels_before=self.heels_before,
-            heel_plan=heel_plan,
             skeleton=self.skeleton,
             fps=self.fps,
             first_frame=self.first_frame,
         )
-
-    def plan_heels(
-        self, features: Float[Tensor, "batch frames size"], contacts: Bool[Tensor, "batch frames 2"]
-    ) -> Trial:
-        """Return the trial of a plan, whose poses and toes' contacts say which heels are planted, for `build_trial`."""
-        return self.build_trial(features, contacts, noise=None, log_density=None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,21 +112,19 @@ class WindowRequest:
 
 
 @dataclass(frozen=True, eq=False)
-class LatentNoise:
+class LatentNoise(Parametrisation):
     """Unknowns are the standard normal numbers d of a rollout, one batch row a candidate."""
 
     context: WindowContext
     """What is known before the window."""
     plan: DiscreteChoices
     """Components and contact bits of each frame."""
-
     prepared: PreparedRollout | None = None
     """Rollouts of as many candidates as the plan is for, where they are prepared already."""
     heel_plan: Trial | None = None
-    """Motion whose poses say which heels are planted; None: see `holds_heels`."""
+    """Motion whose poses determine which heels are planted; None: see `holds_heels`."""
     holds_heels: bool = False
-    """Whether the first trial that is built is the motion whose poses say which heels are planted; if not, each
-    candidate's own do."""
+    """Whether the first trial that is built is that motion; if not, each candidate's own poses count."""
 
     @staticmethod
     def from_unknowns(context: WindowContext, unknowns: Float[Tensor, "batch unknowns"]) -> "LatentNoise":
@@ -153,10 +152,10 @@ class LatentNoise:
         noise = torch.unflatten(unknowns, -1, (context.frames, LAYOUT.continuous))
         plan = self._expand_plan(len(noise))
         features, log_density = context.prior.rollout(context.expand_state(len(noise)), noise, plan)
-        return self._hold_heels(context.build_trial(features, plan.contacts, noise=noise, log_density=log_density))
+        return self._hold_heels(context.build_trial(features, plan.contacts, noise, log_density))
 
     def build_detached(self, unknowns: Float[Tensor, "batch unknowns"]) -> Trial | None:
-        """See AdjointParametrisation."""
+        """See Parametrisation."""
         context, batch = self.context, len(unknowns)
         noise = torch.unflatten(unknowns.detach(), -1, (context.frames, LAYOUT.continuous))
         if not fast.is_supported(noise, context.place, context.skeleton):
@@ -164,11 +163,11 @@ class LatentNoise:
         rollout, contacts = self._prepare(batch)
         features, log_density = rollout.roll_out(noise)
         poses = fast.WorldPoses.compute(features, context.place, context.skeleton)
-        trial = context.build_trial(features, contacts, noise=noise, log_density=log_density)
+        trial = context.build_trial(features, contacts, noise, log_density)
         return self._hold_heels(replace(trial, world_poses=poses))
 
     def pull_back(self, trial: Trial, gradient: TrialGradient) -> Float[Tensor, "batch unknowns"]:
-        """See AdjointParametrisation."""
+        """See Parametrisation."""
         assert trial.world_poses is not None
         on_world = (gradient.root_xz_world, gradient.heading, gradient.joints_world, gradient.heels_world)
         d_features = gradient.features + trial.world_poses.pull_back(*on_world)
@@ -190,7 +189,7 @@ class LatentNoise:
         return {} if rollout is None else {len(contacts): (rollout, contacts)}
 
     def _hold_heels(self, trial: Trial) -> Trial:
-        """Let the planned motion say which heels are planted in a trial."""
+        """Let the planned motion determine which heels are planted in a trial."""
         if self.holds_heels and not self._held:
             self._held.append(replace(trial, features=trial.features.detach(), noise=None, log_density=None))
         plan = self._held[0] if self._held else self.heel_plan
@@ -198,7 +197,7 @@ class LatentNoise:
 
     @cached_property
     def _held(self) -> list[Trial]:
-        """The first trial that was built, where it says which heels are planted; without a gradient."""
+        """The first trial that was built, without a gradient."""
         return []
 
     def _expand_plan(self, batch: int) -> DiscreteChoices:
@@ -209,3 +208,45 @@ class LatentNoise:
     def warm_start(self, unknowns: Float[Tensor, "1 unknowns"]) -> Float[Tensor, "frames width"]:
         """Return the noise by frame."""
         return torch.unflatten(unknowns[0], -1, (self.context.frames, LAYOUT.continuous))
+
+
+@dataclass(frozen=True, eq=False)
+class PoseOffsets(Parametrisation):
+    """Unknowns are offsets about a proposal's root position, heading and angles, one batch row a candidate."""
+
+    context: WindowContext
+    """What is known before the window. A single density scores the motion with teacher forcing (Eq. 15)."""
+    proposal: BodyPose
+    """Proposed poses of the window's frames, unbatched."""
+    contacts: Bool[Tensor, "frames 2"]
+    """Left and right toe planted in each frame."""
+    sigma: Float[Tensor, "frames width"]
+    """Standard deviations of root, heading and angles (see `BodyPose.pack`): metres and radians."""
+    smooth: float = 2.0
+    """Sigma of the smoothing, frames."""
+
+    @cached_property
+    def _heel_plan(self) -> Trial:
+        """The proposal, whose poses determine which heels are planted."""
+        features = self.proposal.features(self.context.place, self.contacts)
+        return self.context.build_trial(features[None], self.contacts[None])
+
+    @cached_property
+    def _smoothing_matrix(self) -> Float[Tensor, "frames frames"]:
+        return gaussian.unit_variance_matrix(len(self.sigma), self.smooth, self.sigma.dtype)
+
+    def build(self, unknowns: Float[Tensor, "batch unknowns"]) -> Trial:
+        """Build the trials of the proposal with the offsets added; differentiable."""
+        white = torch.unflatten(unknowns, -1, self.sigma.shape)
+        offset = self.sigma * torch.einsum("ts,bsw->btw", self._smoothing_matrix, white)
+        pose = BodyPose.unpack(self.proposal.pack() + offset)
+        features = pose.features(self.context.place, self.contacts)
+        log_density = None
+        if not isinstance(self.context.density, DensityEnsemble):
+            log_density = self.context.density.log_prob(features, self.context.expand_state(len(white)))
+        contacts = self.contacts.expand(len(white), -1, -1)
+        return replace(self.context.build_trial(features, contacts, white, log_density), heel_plan=self._heel_plan)
+
+    def warm_start(self, unknowns: Float[Tensor, "1 unknowns"]) -> Float[Tensor, "frames width"]:
+        """Return the white offsets by frame, in sigmas."""
+        return torch.unflatten(unknowns[0], -1, self.sigma.shape)

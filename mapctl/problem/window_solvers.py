@@ -1,38 +1,28 @@
 """Solvers of one window: a start, a parametrisation of its frames, and L-BFGS over the unknowns.
 
-Warm starts of L-BFGS in a window: the last window's noise, the best of random draws, or a particle swarm.
-
-A swarm over all the noise of a window (34 x 66 numbers) gained nothing over zero noise when tried. Here it searches a
-few numbers that steer: the root's noise (sideways, forward, turn) at a few knots in time, linear in between.
-
-Unknowns that are offsets of each frame's pose and position about a proposed motion, in sigmas, smooth in time.
-
-x = proposal + sigma * (K z): the posterior of a model that proposes whole motions, as a rollout's x = mu + sigma d is
-that of a density, so that the standard normal prior of z is the observation term of denoising (Wang et al. 2019, Eq.
-25) in coordinates that converge. K smooths white z to unit variance, so that a correction of one frame moves its
-neighbours along. Positions are in the world, not steps from frame to frame: terms on observed positions are then well
-conditioned.
+The search over a rollout's noise starts at the last window's noise, the best of random draws, or a particle swarm. A
+swarm over all the noise of a window (34 x 66 numbers) gained nothing over zero noise: it searches a few numbers that
+steer, noise at a few knots in time, linear in between.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import Protocol, runtime_checkable
+from functools import partial
+from typing import TypeAlias
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl.features import LAYOUT
-from mapctl.numerics import gaussian
 from mapctl.pose import BodyPose
 from mapctl.problem.density_selection import DensityChoice, DensityEnsemble
 from mapctl.problem.objective import Objective, Parametrisation
 from mapctl.problem.solution import Ledger
-from mapctl.problem.unknowns import LatentNoise, WindowContext, WindowRequest
+from mapctl.problem.unknowns import LatentNoise, PoseOffsets, WindowRequest
 from mapctl.solver.budget import Budget, Meter
 from mapctl.solver.lbfgs import LbfgsResult, LbfgsSettings, minimise
-from mapctl.solver.swarm import SwarmSettings, run_best_of_samples, run_swarm
+from mapctl.solver.swarm import SwarmResult, SwarmSettings, run_best_of_samples, run_swarm
 from mapctl.terms.base import Term
 from mapctl.terms.likelihood import Likelihood
 from mapctl.terms.trial import Trial
@@ -71,29 +61,24 @@ class SteeringKnots:
         noise[..., self._columns()] = dense.transpose(1, 2)
         return noise
 
+    def search(
+        self, method: Callable[..., SwarmResult], request: WindowRequest, warm: Float[Tensor, "1 unknowns"]
+    ) -> Float[Tensor, "1 unknowns"]:
+        """Return the unknowns of the best point about the warm start that a method finds, each under its own plan."""
+
+        def unknowns(points: Float[Tensor, "batch size"]) -> Float[Tensor, "batch unknowns"]:
+            return warm + self.expand(points.to(warm.dtype), request.context.frames).flatten(1)
+
+        def energy(points: Float[Tensor, "batch size"]) -> Float[Tensor, " batch"]:
+            noise = unknowns(points)
+            with torch.no_grad():
+                return Objective(LatentNoise.from_unknowns(request.context, noise).build, request.terms).energy(noise)
+
+        found = method(energy, start=torch.zeros(self.size()), spread=self.spread, generator=request.generator)
+        return unknowns(found.x[None])
+
     def _columns(self) -> list[int]:
         return [i for block in self.blocks for i in range(LAYOUT.slices[block].start, LAYOUT.slices[block].stop)]
-
-
-@dataclass(frozen=True, eq=False)
-class _SteeredNoise:
-    """A window's noise as points of the steering space around the warm start."""
-
-    request: WindowRequest
-    warm: Float[Tensor, "1 unknowns"]
-    space: SteeringKnots
-
-    def unknowns(self, points: Float[Tensor, "batch size"]) -> Float[Tensor, "batch unknowns"]:
-        """Return the unknowns of whole windows."""
-        noise = self.space.expand(points.to(self.warm.dtype), self.request.context.frames)
-        return self.warm + noise.flatten(1)
-
-    def energy(self, points: Float[Tensor, "batch size"]) -> Float[Tensor, " batch"]:
-        """Compute the total energy of each point, nats, under a plan of its own."""
-        unknowns = self.unknowns(points)
-        with torch.no_grad():
-            latents = LatentNoise.from_unknowns(self.request.context, unknowns)
-            return Objective(latents.build, self.request.terms).energy(unknowns)
 
 
 @dataclass(frozen=True)
@@ -108,20 +93,15 @@ class BestOfSamples:
     def __call__(
         self, request: WindowRequest, warm: Float[Tensor, "1 unknowns"], meter: Meter
     ) -> Float[Tensor, "1 unknowns"]:
-        """Return the best draw about the warm start, or that itself; the meter counts what was evaluated."""
-        noise, generator = _SteeredNoise(request, warm, self.space), request.generator
-        start, spread = torch.zeros(self.space.size()), self.space.spread
-        found = run_best_of_samples(
-            noise.energy, start=start, spread=spread, count=self.count, meter=meter, generator=generator
-        )
-        return noise.unknowns(found.x[None])
+        """Return the best draw; the meter counts what was evaluated."""
+        return self.space.search(partial(run_best_of_samples, count=self.count, meter=meter), request, warm)
 
 
 @dataclass(frozen=True)
 class SwarmProposal:
     """A particle swarm (Wang et al. 2019, section 5.2) in the steering space, started at the warm start."""
 
-    settings: SwarmSettings = field(default_factory=lambda: SwarmSettings(particles=16, iterations=6))
+    settings: SwarmSettings = field(default_factory=SwarmSettings)
     """Number of particles and iterations."""
     space: SteeringKnots = SteeringKnots()
     """Space in which they move."""
@@ -129,13 +109,8 @@ class SwarmProposal:
     def __call__(
         self, request: WindowRequest, warm: Float[Tensor, "1 unknowns"], meter: Meter
     ) -> Float[Tensor, "1 unknowns"]:
-        """Return the best point of the swarm, or the warm start itself; the meter counts what was evaluated."""
-        noise, generator = _SteeredNoise(request, warm, self.space), request.generator
-        start, spread = torch.zeros(self.space.size()), self.space.spread
-        found = run_swarm(
-            noise.energy, start=start, spread=spread, settings=self.settings, meter=meter, generator=generator
-        )
-        return noise.unknowns(found.x[None])
+        """Return the best point of the swarm; the meter counts what was evaluated."""
+        return self.space.search(partial(run_swarm, settings=self.settings, meter=meter), request, warm)
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,13 +135,8 @@ class SolvedWindow:
     """Density of an ensemble that scored the window; None for a single density."""
 
 
-@runtime_checkable
-class SingleWindowSolver(Protocol):
-    """Solves one window."""
-
-    def __call__(self, request: WindowRequest) -> SolvedWindow:
-        """Solve the window; its result is detached, and no worse than its start."""
-        ...
+SingleWindowSolver: TypeAlias = Callable[[WindowRequest], SolvedWindow]
+"""Solves one window; its result is detached, and no worse than its start."""
 
 
 @dataclass(frozen=True)
@@ -235,7 +205,7 @@ class GuidedNoiseSolver:
         plan, noise = context.prior.latents(self.guide.unsqueeze(0), context.prior_state)
         start = self.share * noise[0]
         start[: len(request.warm_start)] = request.warm_start[: len(start)]
-        heels = context.plan_heels(self.guide.unsqueeze(0), plan.contacts)
+        heels = context.build_trial(self.guide.unsqueeze(0), plan.contacts)
         unknowns = LatentNoise(context, plan, heel_plan=heels)
         return minimise_window(unknowns, request.terms, start.flatten().unsqueeze(0), self.lbfgs, meter)
 
@@ -268,50 +238,6 @@ def _build_solved_window(
         float(result.energy[0]),
         result.status[0].value,
     )
-
-
-@dataclass(frozen=True, eq=False)
-class PoseOffsets:
-    """Unknowns are offsets about a proposal's root position, heading and angles, one batch row a candidate."""
-
-    context: WindowContext
-    """What is known before the window. A single density scores the motion with teacher forcing (Eq. 15)."""
-    proposal: BodyPose
-    """Proposed poses of the window's frames, unbatched."""
-    contacts: Bool[Tensor, "frames 2"]
-    """Left and right toe planted in each frame."""
-    sigma: Float[Tensor, "frames width"]
-    """Standard deviations of root, heading and angles (see `BodyPose.pack`): metres and radians."""
-    smooth: float = 2.0
-    """Sigma of the smoothing, frames."""
-
-    @cached_property
-    def _heel_plan(self) -> Trial:
-        """The proposal, whose poses say which heels are planted."""
-        features = self.proposal.features(self.context.place, self.contacts)
-        return self.context.plan_heels(features[None], self.contacts[None])
-
-    @cached_property
-    def _smoothing_matrix(self) -> Float[Tensor, "frames frames"]:
-        return gaussian.unit_variance_matrix(len(self.sigma), self.smooth, self.sigma.dtype)
-
-    def build(self, unknowns: Float[Tensor, "batch unknowns"]) -> Trial:
-        """Build the trials of the proposal with the offsets added; differentiable."""
-        white = torch.unflatten(unknowns, -1, self.sigma.shape)
-        offset = self.sigma * torch.einsum("ts,bsw->btw", self._smoothing_matrix, white)
-        pose = BodyPose.unpack(self.proposal.pack() + offset)
-        features = pose.features(self.context.place, self.contacts)
-        log_density = None
-        if not isinstance(self.context.density, DensityEnsemble):
-            log_density = self.context.density.log_prob(features, self.context.expand_state(len(white)))
-        contacts = self.contacts.expand(len(white), -1, -1)
-        return self.context.build_trial(
-            features, contacts, noise=white, log_density=log_density, heel_plan=self._heel_plan
-        )
-
-    def warm_start(self, unknowns: Float[Tensor, "1 unknowns"]) -> Float[Tensor, "frames width"]:
-        """Return the white offsets by frame, in sigmas."""
-        return torch.unflatten(unknowns[0], -1, self.sigma.shape)
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,12 +5,10 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from mapctl.errors import RequestError
-
 
 @dataclass(frozen=True)
 class Budget:
-    """Limits of one solve; None is no limit. Raises RequestError where a limit is negative or no number."""
+    """Limits of one solve; None is no limit."""
 
     evaluations: int | None = None
     """Evaluations of the energy, with or without gradient; a batch counts every candidate in it."""
@@ -22,18 +20,13 @@ class Budget:
     """Time of an evaluation, seconds, as far as known: one that would end after `seconds` is not begun. Later ones are
     expected to take as long as the last. None asks for the time at the beginning alone."""
 
-    def __post_init__(self):
-        for name, limit in (("evaluations", self.evaluations), ("seconds", self.seconds), ("least", self.least)):
-            if limit is not None and (math.isnan(limit) or limit < 0):
-                raise RequestError(f"a budget's {name} must be 0 or more (or None for no limit), got {limit}")
-
     def within(self, seconds: float) -> "Budget":
         """Return this budget, ending after so many seconds at the latest; infinity leaves it as it is."""
         return replace(self, seconds=seconds if self.seconds is None else min(self.seconds, seconds))
 
 
 class Meter:
-    """Counts evaluations against a budget; the clock starts when the meter is made. Says no, never raises."""
+    """Counts evaluations against a budget; the clock starts when the meter is made. It refuses, and never raises."""
 
     def __init__(self, budget: Budget = Budget(), *, clock: Callable[[], float] = time.monotonic):
         self.budget = budget
@@ -68,23 +61,12 @@ class Meter:
         """Whether not one more evaluation is allowed."""
         return self._late() or not self._affords(1)
 
-    @property
-    def reason(self) -> str:
-        """Which limit was reached, in words; empty while neither was."""
-        if not self._affords(1):
-            return f"used its {self.budget.evaluations} evaluations"
-        return f"used its {self.budget.seconds:g} s" if self._late() else ""
-
-    @property
-    def seconds(self) -> float:
-        """Seconds since the meter was made."""
-        return self._clock() - self._began
-
     def _late(self, count: int = 1) -> bool:
         return self._past_deadline(count) and self.evaluations >= self.budget.least
 
     def _past_deadline(self, count: int = 1) -> bool:
-        return self.budget.seconds is not None and self.seconds + count * self._expected >= self.budget.seconds
+        now = self._clock() - self._began
+        return self.budget.seconds is not None and now + count * self._expected >= self.budget.seconds
 
     def _affords(self, count: int) -> bool:
         return self.budget.evaluations is None or self.evaluations + count <= self.budget.evaluations

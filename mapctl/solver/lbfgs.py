@@ -55,20 +55,8 @@ class LbfgsSettings:
     """Share of the slope's predicted decrease that a step must keep."""
     curvature: float = 0.9
     """Share of the starting slope that may be left at a step's end; between `armijo` and 1."""
-    initial_step: float | None = None
-    """Length of the first trial step, unit of the unknowns; None: the gradient's length, 1 at most."""
-    max_step: float = math.inf
-    """Longest step, Euclidean, in units of the unknowns."""
     max_trials: int = 12
     """Largest number of trial steps in one line search."""
-
-    def __post_init__(self):
-        if self.memory < 1 or self.max_iterations < 0 or self.max_trials < 1:
-            raise RequestError("L-BFGS needs memory and max_trials of 1 or more, and max_iterations of 0 or more")
-        if not 0 < self.armijo < self.curvature < 1:
-            raise RequestError(f"L-BFGS needs 0 < armijo < curvature < 1, got {self.armijo} and {self.curvature}")
-        if not self.max_step > 0 or (self.initial_step is not None and not self.initial_step > 0):
-            raise RequestError(f"L-BFGS steps must be positive, got {self.initial_step} and {self.max_step}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,12 +69,8 @@ class LbfgsResult:
     """Energies at x; infinity where no evaluation was finite, or none was allowed."""
     start_energy: Float[Tensor, " batch"]
     """Energies at the start; infinity where it was not finite, or not evaluated."""
-    gradient_norm: Float[Tensor, " batch"]
-    """Largest absolute entry of the gradient at x."""
     evaluations: Int[Tensor, " batch"]
     """Evaluations while the problem was running; the meter also counts the idle rows of finished problems."""
-    iterations: Int[Tensor, " batch"]
-    """Number of accepted steps."""
     status: tuple[LbfgsStatus, ...]
     """Reason why each problem ended."""
 
@@ -97,51 +81,29 @@ def minimise(
     *,
     settings: LbfgsSettings = LbfgsSettings(),
     meter: Meter | None = None,
-    callback: Callable[[int, Float[Tensor, " batch"]], None] | None = None,
 ) -> LbfgsResult:
     """Minimise a batch of independent problems from `x`, evaluating the whole batch at once.
 
-    The meter is asked before every evaluation; each counts the batch. A trial with an energy or gradient that
-    is not finite has failed. After every evaluation `callback` gets their number and the best energies.
-    Raises RequestError where `x` is not a float32 or float64 matrix, or the function answers in other shapes.
+    The meter is asked before every evaluation; each counts the batch. A trial with an energy or gradient that is not
+    finite has failed. RequestError where `x` is not a float32 or float64 matrix, or the function returns other shapes.
     """
     if x.ndim != 2 or x.dtype not in (torch.float32, torch.float64):
         raise RequestError(f"L-BFGS starts from (batch, n) float32 or float64, got {tuple(x.shape)} {x.dtype}")
     meter = Meter() if meter is None else meter
     problems = [_Problem(row, settings) for row in x.detach().cpu().numpy().copy()]
-    calls = 0
     while any(problem.running for problem in problems) and meter.take(len(problems)):
-        energies, gradients = _evaluate(function, np.stack([problem.ask for problem in problems]), x)
-        for problem, energy, gradient in zip(problems, energies, gradients, strict=True):
-            problem.tell(energy, gradient)
-        calls += 1
-        if callback is not None:
-            callback(calls, x.new_tensor([problem.best.energy for problem in problems]))
-    return _collect_result(problems, x)
-
-
-def _evaluate(function: EnergyAndGradient, points: Point, like: Tensor) -> tuple[list[float], Vector]:
-    energy, gradient = function(torch.as_tensor(points).to(like.device))
-    if energy.shape != like.shape[:1] or gradient.shape != like.shape:
-        raise RequestError(
-            f"an objective must answer energies {tuple(like.shape[:1])} and gradients {tuple(like.shape)}, "
-            f"got {tuple(energy.shape)} and {tuple(gradient.shape)}"
-        )
-    energies = [float(each) for each in energy.detach()]
-    return energies, gradient.detach().to("cpu", torch.float64).numpy()
-
-
-def _collect_result(problems: list["_Problem"], x: Tensor) -> LbfgsResult:
-    count = torch.tensor([[p.evaluations, p.iterations] for p in problems], dtype=torch.int64).reshape(-1, 2)
-    points = [p.best.x for p in problems]
+        energy, gradient = function(torch.as_tensor(np.stack([problem.ask for problem in problems])).to(x.device))
+        if energy.shape != x.shape[:1] or gradient.shape != x.shape:
+            raise RequestError(f"an objective returned {tuple(energy.shape)} and {tuple(gradient.shape)} for {x.shape}")
+        energies, gradients = energy.detach().tolist(), gradient.detach().to("cpu", torch.float64).numpy()
+        for problem, value, row in zip(problems, energies, gradients, strict=True):
+            problem.tell(value, row)
     return LbfgsResult(
-        x=torch.as_tensor(np.stack(points)).to(x.device) if points else x.detach().clone(),
-        energy=x.new_tensor([p.best.energy for p in problems]),
-        start_energy=x.new_tensor([p.start_energy for p in problems]),
-        gradient_norm=x.new_tensor([p.best.gradient_norm for p in problems]),
-        evaluations=count[:, 0],
-        iterations=count[:, 1],
-        status=tuple(p.status for p in problems),
+        x=torch.as_tensor(np.stack([problem.best.x for problem in problems])).to(x.device) if problems else x.clone(),
+        energy=x.new_tensor([problem.best.energy for problem in problems]),
+        start_energy=x.new_tensor([problem.start_energy for problem in problems]),
+        evaluations=torch.tensor([problem.evaluations for problem in problems], dtype=torch.int64),
+        status=tuple(problem.status for problem in problems),
     )
 
 
@@ -201,7 +163,7 @@ class _Problem:
         if not here.finite:
             return LbfgsStatus.NOT_FINITE
         self.start_energy = here.energy
-        length = settings.initial_step or min(1.0, float(np.linalg.norm(here.gradient)))
+        length = min(1.0, float(np.linalg.norm(here.gradient)))
         while here.gradient_norm > settings.gradient_tolerance:
             if self.iterations == settings.max_iterations:
                 return LbfgsStatus.OUT_OF_BUDGET
@@ -274,13 +236,12 @@ def _line_search(
 
     `low` is the best step so far that decreases enough, `high` the shortest known to be too long.
     """
-    longest = settings.max_step / float(np.linalg.norm(direction))
     slope = float(direction @ origin.gradient)
     # Energies are rounded to the caller's precision: a rise within that says nothing.
     noise = 2.0 * float(np.finfo(origin.x.dtype).eps) * abs(origin.energy)
     low = base = _EvaluatedPoint(origin.x, origin.energy, origin.gradient, 0.0, slope)
     high: _EvaluatedPoint | None = None
-    step = min(first, longest)
+    step = first
     for _ in range(settings.max_trials):
         x = (origin.x + step * direction).astype(origin.x.dtype)
         if np.array_equal(x, low.x):
@@ -289,11 +250,11 @@ def _line_search(
         trial.step, trial.slope = step, float(direction @ trial.gradient)
         if not trial.finite or trial.energy > base.energy + settings.armijo * step * slope + noise:
             high = trial
-        elif trial.slope >= settings.curvature * slope or step == longest:
+        elif trial.slope >= settings.curvature * slope:
             return trial
         else:
             low = trial
-        step = min(_next_step(low, high), longest)
+        step = _next_step(low, high)
     return low if low is not base else None
 
 

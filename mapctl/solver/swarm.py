@@ -18,7 +18,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mapctl.errors import RequestError
 from mapctl.solver.budget import Meter
 
 Cost = Callable[[Tensor], Tensor]
@@ -40,17 +39,6 @@ class SwarmSettings:
     social: float = 1.4962
     """Pull toward the best point of all: largest factor of the way there, each iteration."""
 
-    def __post_init__(self):
-        if self.particles < 1 or self.iterations < 1:
-            raise RequestError(
-                f"particles and iterations must be 1 or more, got {self.particles} and {self.iterations}"
-            )
-
-    @property
-    def weights(self) -> dict[str, float]:
-        """Weights as pyswarms names them."""
-        return {"w": self.inertia, "c1": self.cognitive, "c2": self.social}
-
 
 @dataclass(frozen=True, eq=False)
 class SwarmResult:
@@ -62,8 +50,6 @@ class SwarmResult:
     """Energy at x; infinity where nothing finite was seen, or no evaluation was allowed (then x is the start)."""
     evaluations: int
     """Number of points evaluated."""
-    history: tuple[float, ...]
-    """Best energy so far after every evaluation of the swarm."""
 
 
 def run_swarm(
@@ -78,8 +64,7 @@ def run_swarm(
     """Search from `start`, which is the first particle; the others begin at samples around it, all at rest.
 
     `spread` is the standard deviation of the samples, in units of the unknowns. The swarm stops before an iteration
-    that the meter cannot pay in full. The same generator state gives the same bits. RequestError where the start is no
-    vector, or the cost answers in another shape.
+    that the meter cannot pay in full. The same generator state gives the same bits.
     """
     meter = Meter() if meter is None else meter
     track = _BestTracker(cost, start, meter)
@@ -88,13 +73,13 @@ def run_swarm(
         return track.result()
     seed = torch.randint(2**32, (8,), generator=generator, device=generator.device).cpu().numpy()
     random, (operators, make_swarm) = np.random.RandomState(seed), _import_pyswarms()
-    first = _to_numpy(points)
-    swarm = make_swarm(first, np.zeros_like(first), options=settings.weights)
+    first, weights = _to_numpy(points), {"w": settings.inertia, "c1": settings.cognitive, "c2": settings.social}
+    swarm = make_swarm(first, np.zeros_like(first), options=weights)
     swarm.pbest_cost, swarm.best_pos, swarm.best_cost = np.full(len(first), np.inf), first[0], np.inf
     for iteration in range(settings.iterations):
         if iteration:
             with _use_numpy_state(random):
-                swarm.velocity = operators.compute_velocity(swarm, None, _keep_velocity)
+                swarm.velocity = operators.compute_velocity(swarm, None, lambda velocity, clamp, **_: velocity)
             swarm.position = operators.compute_position(swarm, None, None)
         swarm.current_cost = track.evaluate(torch.as_tensor(swarm.position).to(start))
         if swarm.current_cost is None:
@@ -104,10 +89,6 @@ def run_swarm(
         if swarm.pbest_cost[best] < swarm.best_cost:
             swarm.best_pos, swarm.best_cost = swarm.pbest_pos[best], swarm.pbest_cost[best]
     return track.result()
-
-
-def _keep_velocity(velocity: np.ndarray, clamp: None, **_: object) -> np.ndarray:
-    return velocity
 
 
 def run_best_of_samples(
@@ -121,10 +102,8 @@ def run_best_of_samples(
 ) -> SwarmResult:
     """Find the best of `count` points, evaluated at once: the start and samples around it; fewer on a short budget.
 
-    `spread` is the standard deviation of the samples, in units of the unknowns. Errors as of `run_swarm`.
+    `spread` is the standard deviation of the samples, in units of the unknowns.
     """
-    if count < 1:
-        raise RequestError(f"the best of how many? at least 1, got {count}")
     meter = Meter() if meter is None else meter
     track = _BestTracker(cost, start, meter)
     points = _sample_points(start, spread, min(count, meter.remaining), generator)
@@ -140,34 +119,28 @@ class _BestTracker:
         self._cost, self._meter = cost, meter
         self._x, self._energy = start.detach().clone(), math.inf
         self._evaluations = 0
-        self._history: list[float] = []
 
     def evaluate(self, points: Float[Tensor, "particles n"]) -> np.ndarray | None:
         """Evaluate energies, infinite where they are not finite; None where the budget does not pay for them."""
         if not self._meter.take(len(points)):
             return None
         energies = self._cost(points.clone()).detach()
-        if energies.shape != (len(points),):
-            raise RequestError(f"a cost must answer energies ({len(points)},), got {tuple(energies.shape)}")
         energies = torch.where(energies.isfinite(), energies, math.inf)
         best = int(energies.argmin())
         if energies[best] < self._energy:
             self._x, self._energy = points[best].clone(), float(energies[best])
         self._evaluations += len(points)
-        self._history.append(self._energy)
         return _to_numpy(energies)
 
     def result(self) -> SwarmResult:
         """Return the result so far."""
-        return SwarmResult(self._x, self._energy, self._evaluations, tuple(self._history))
+        return SwarmResult(self._x, self._energy, self._evaluations)
 
 
 def _sample_points(
     start: Tensor, spread: Tensor | float, count: float, generator: torch.Generator
 ) -> Float[Tensor, "count n"]:
     """Return the start and normal samples around it."""
-    if start.ndim != 1 or not start.is_floating_point():
-        raise RequestError(f"a swarm starts from a vector of real numbers, got {tuple(start.shape)} {start.dtype}")
     noise = torch.randn(int(count), len(start), dtype=start.dtype, device=generator.device, generator=generator)
     points = start + noise.to(start.device) * spread
     points[:1] = start

@@ -79,7 +79,7 @@ def test_a_scene_goes_on_from_a_clip_on_its_rig_and_keeps_apart(tmp_path):
 
 REFUSED = {
     "obstacle": (["--avoid", "1,2"], "an obstacle is X,Z,RADIUS"),
-    "obstacle on the start": (["--avoid", "0,0.1,0.5"], "stands on the start"),
+    "obstacle on the start": (["--avoid", "0,0.1,0.5"], "the start is within the obstacle"),
     "start": (["--start", "sitting"], "--start: expected walk, stand or CLIP:FRAME"),
     "start clip": (["--start", "gone.bvh:3"], "gone.bvh"),
     "style": (["--style", "sad"], "knows no style 'sad', only"),

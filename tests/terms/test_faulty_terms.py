@@ -58,15 +58,15 @@ def fine(noise):
 @pytest.mark.parametrize("name", SHAPES)
 def test_a_wrong_shape_is_named_with_the_one_expected(name):
     wrong, told = SHAPES[name]
-    with pytest.raises(RequestError, match=f"the term 'own' gave an energy of .*{told}.*expected.*\\[2, 12\\]"):
+    with pytest.raises(RequestError, match=f"the energy of the term 'own' has .*{told}.*expected.*\\[2, 12\\]"):
         objective(Own(wrong)).energy_and_gradient(START)
-    with pytest.raises(RequestError, match=f"the term 'own' gave a residual of .*{told}"):
+    with pytest.raises(RequestError, match=f"the residual of the term 'own' has .*{told}"):
         objective(Own(fine, wrong)).build_ledger(BASE)
 
 
 @pytest.mark.parametrize("what", NONE)
 def test_what_is_not_finite_is_named(what):
-    with pytest.raises(RequestError, match=f"the term 'own' gave an? {what} that is not finite .* in frame 0"):
+    with pytest.raises(RequestError, match=f"the {what} of the term 'own' is not finite .* in frame 0"):
         objective(Own(NONE[what])).energy_and_gradient(START)
 
 
@@ -75,7 +75,7 @@ def test_the_one_of_many_is_named_and_its_frame():
         return torch.where(torch.arange(FRAMES) == 5, torch.nan, 1.0) * noise.sum(-1)
 
     terms = Own(fine, name="first"), Own(late, name="second"), Own(fine, name="third")
-    with pytest.raises(RequestError, match=r"the term 'second' gave an energy .* in frame 5"):
+    with pytest.raises(RequestError, match=r"the energy of the term 'second' .* in frame 5"):
         objective(*terms).energy_and_gradient(START)
 
 
