@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 import trimesh
 import viser
 from trimesh.visual import ColorVisuals
@@ -13,37 +14,26 @@ from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import MapctlError
 from mapctl.features import PRIOR_FPS
 from mapctl.mesh import colours
-from mapctl.mesh.character_mesh import CharacterMesh
-from mapctl.mesh.mannequin import Skin, at_rest, build_skin
+from mapctl.mesh.mannequin import at_rest, build_skin
 from mapctl.mesh.primitives import Array
 from mapctl.motion import Motion
 from mapctl.retarget import RigMap
 from mapctl.runtime.live_protocol import FrameChunk, LiveCharacter
-from mapctl.skeleton import Skeleton
+from mapctl.skeleton import TOE_JOINTS, Skeleton
 from scenes.drawn_character import DrawnCharacter
-from scenes.live.camera import facing_of
-from scenes.live.ground import FootMarks, Trajectories
+from scenes.live.camera import facing_of, to_rgb_bytes
 from scenes.live.inputs import SteeringInputs
 
 KEPT_SECONDS = 120.0
 """Seconds of shown frames that are kept for looking back."""
 _TRAIL_FRAMES, _SPEED_FRAMES = 4 * PRIOR_FPS, 16  # of the past trajectory, and over which speed is measured
-_PACE_SECONDS = 3.0  # over which lateness is judged
-_LATE_SHARE = 0.5  # of these frames, from which the machine is too slow
+_TRAIL_POINTS, _RESET_METRES = 24, 0.5  # of a band on the ground; a step of the past that only a reset makes
+_MARK_HEIGHT, _FOOT_RADIUS = 0.012, 0.12  # metres over the ground, and of a planted foot's disc
 _MAX_COLOURS = 12  # of a character's mesh
-_DIGITS = 6  # decimal places of metres and weights at which vertices are the same
-_NEAR = 0.03  # of a colour, 0 to 1, within which triangles are alike
 _OPAQUE = 0.999
 
-
-@dataclass(frozen=True, eq=False)
-class BodyPose:
-    """A pose, in the terms of the body that prepared it."""
-
-    positions: Array
-    """(n, 3) positions of what the body moves, metres."""
-    quat_xyzw: Array
-    """(n or more, 4) rotations."""
+Pose = tuple[Array, Array]
+"""Positions (n, 3), metres, and rotations (n or more, 4), xyzw, of what a body moves."""
 
 
 class MannequinBody:
@@ -57,18 +47,24 @@ class MannequinBody:
             paths.append(f"{paths[parent] if parent >= 0 else name}/{skeleton.names[joint]}")
             offset = skeleton.offsets[joint].numpy()
             self._joints.append(scene.add_frame(paths[joint], show_axes=False, position=offset))
-            if (part := _extract_part(body, joint)) is not None:
-                scene.add_mesh_trimesh(f"{paths[joint]}/skin", part)
+            faces = body.faces[body.joint[body.faces[:, 0]] == joint]
+            if len(faces):
+                used, packed = np.unique(faces, return_inverse=True)
+                mesh = trimesh.Trimesh(
+                    body.vertices[used], packed.reshape(-1, 3), vertex_normals=body.normals[used], process=False
+                )
+                mesh.visual = ColorVisuals(mesh, vertex_colors=(255 * body.rgb[used]).round().astype(np.uint8))
+                scene.add_mesh_trimesh(f"{paths[joint]}/skin", mesh)
 
-    def prepare(self, motion: Motion) -> list[BodyPose]:
+    def prepare(self, motion: Motion) -> list[Pose]:
         """Prepare the poses of frames: position of the root, and local rotation of every joint."""
         roots, quats = motion.root_position.numpy(), motion.local_quat_xyzw.numpy()
-        return [BodyPose(root[None], turns) for root, turns in zip(roots, quats, strict=True)]
+        return list(zip(roots[:, None], quats, strict=True))
 
-    def pose(self, pose: BodyPose) -> None:
+    def pose(self, pose: Pose) -> None:
         """Move the root and turn the joints."""
-        self._joints[0].position = pose.positions[0]
-        for handle, wxyz in zip(self._joints, np.roll(pose.quat_xyzw, 1, axis=1), strict=True):
+        self._joints[0].position = pose[0][0]
+        for handle, wxyz in zip(self._joints, np.roll(pose[1], 1, axis=1), strict=True):
             handle.wxyz = wxyz
 
 
@@ -82,25 +78,31 @@ class SkinnedBody:
         """Add the character's mesh in its rest pose."""
         self._character, mesh = character, character.mesh
         carriers = find_carriers(character.body.leveled_map)
-        self._joints = np.unique(carriers)
-        weights = _sum_weights(mesh, np.searchsorted(self._joints, carriers), len(self._joints))
-        same = _find_same(np.column_stack([mesh.vertices, weights]))
+        self._joints, bone = np.unique(carriers, return_inverse=True)
+        weights = np.zeros((len(mesh.vertices), len(self._joints)))
+        rows = np.arange(len(weights))
+        for joints, shares in zip(mesh.joints.T, mesh.weights.T, strict=True):
+            np.add.at(weights, (rows, bone[joints]), shares)
+        # A browser shades smoothly over shared vertices only, and files have several where texture charts meet.
+        alike = np.column_stack([mesh.vertices, weights]).round(6)
+        _, first, number = np.unique(alike, axis=0, return_index=True, return_inverse=True)
+        faces, rgba = first[number.reshape(-1)][mesh.faces], mesh.rgba[mesh.faces].mean(axis=1)
         self._bones: list[tuple[int, viser.MeshSkinnedBoneHandle]] = []
-        for number, (faces, rgba) in enumerate(_group_by_colour(mesh, _MAX_COLOURS)):
-            self._add_group(scene, f"{name}/skin{number}", same[faces], rgba, weights)
+        for group, label in enumerate(np.unique(labels := _group_colours(rgba))):
+            own = labels == label
+            self._add_group(scene, f"{name}/skin{group}", faces[own], rgba[own].mean(axis=0), weights)
 
-    def prepare(self, motion: Motion) -> list[BodyPose]:
+    def prepare(self, motion: Motion) -> list[Pose]:
         """Prepare the poses of frames on canonical joints with the character's bones: transforms of its bones."""
         placed = self._character.put_on(motion).placed.motion
         positions, quats = placed.joint_positions().numpy(), placed.joint_rotations().numpy()
-        return [BodyPose(*pair) for pair in zip(positions[:, self._joints], quats[:, self._joints], strict=True)]
+        return list(zip(positions[:, self._joints], quats[:, self._joints], strict=True))
 
-    def pose(self, pose: BodyPose) -> None:
+    def pose(self, pose: Pose) -> None:
         """Move the bones."""
-        wxyz = np.roll(pose.quat_xyzw, 1, axis=1)
+        wxyz = np.roll(pose[1], 1, axis=1)
         for joint, bone in self._bones:
-            bone.position = pose.positions[joint]
-            bone.wxyz = wxyz[joint]
+            bone.position, bone.wxyz = pose[0][joint], wxyz[joint]
 
     def _add_group(self, scene: viser.SceneApi, name: str, faces: Array, rgba: Array, weights: Array) -> None:
         mesh = self._character.mesh
@@ -120,74 +122,70 @@ class SkinnedBody:
         self._bones += zip(bones.tolist(), handle.bones, strict=True)
 
 
-def _group_by_colour(mesh: CharacterMesh, most: int) -> list[tuple[Array, Array]]:
-    """Group the triangles by colour into at most so many groups, opaque ones apart from others: their vertex indices
-    (m, 3), and the mean by area of their sRGB colour and opacity (4,), 0 to 1.
-
-    The group with the largest variance, by area, is halved at its mean along that channel (median cut, Heckbert 1982),
-    until all are alike or there are enough.
-    """
-    corners = mesh.vertices[mesh.faces]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    rgba, area = mesh.rgba[mesh.faces].mean(axis=1), np.linalg.norm(across, axis=1) / 2 + 1e-12
-    opaque = rgba[:, 3] >= _OPAQUE
-    groups = [np.flatnonzero(mask) for mask in (opaque, ~opaque) if mask.any()]
-    while len(groups) < most:
-        spreads = [_measure_spread(rgba[group], area[group]) for group in groups]
-        worst = max(range(len(groups)), key=lambda k: spreads[k].max())
-        channel = int(spreads[worst].argmax())
-        values = rgba[groups[worst], channel]
-        if np.ptp(values) < _NEAR:
-            break
-        low = values <= np.average(values, weights=area[groups[worst]])
-        groups[worst : worst + 1] = [groups[worst][low], groups[worst][~low]]
-    return [(mesh.faces[group], np.average(rgba[group], axis=0, weights=area[group])) for group in groups]
+def _group_colours(rgba: Array) -> Array:
+    """Return a label by triangle: those alike in colour (k-means), opaque ones apart from others."""
+    distinct, of = np.unique(rgba.round(2), axis=0, return_inverse=True)
+    count = min(_MAX_COLOURS // 2, len(distinct))
+    _, label = scipy.cluster.vq.kmeans2(distinct, count, minit="++", rng=0)
+    return (2 * label + (distinct[:, 3] < _OPAQUE))[of.reshape(-1)]
 
 
 def find_carriers(rigmap: RigMap) -> Array:
     """Return by joint of a rig the joint with which it moves as one: itself if it is a canonical one, or rests in
     another pose than the file's; else that of its parent, as fingers move with their hand."""
-    parents, moving = rigmap.rig_skeleton.parents, set(rigmap.joints.values())
-    still = rigmap.idle_quat_xyzw[:, 3].abs() > 1 - 1e-9
-    moving |= {joint for joint in range(len(parents)) if not still[joint]}
+    moving = set(rigmap.joints.values())
+    moving |= set(np.flatnonzero((rigmap.idle_quat_xyzw[:, 3].abs() <= 1 - 1e-9).numpy()).tolist())
     found: list[int] = []
-    for joint, parent in enumerate(parents):
+    for joint, parent in enumerate(rigmap.rig_skeleton.parents):
         found.append(joint if joint in moving or parent < 0 else found[parent])
     return np.array(found)
 
 
-def _extract_part(body: Skin, joint: int) -> trimesh.Trimesh | None:
-    """Extract the triangles that hang on a joint, None if there are none."""
-    faces = body.faces[body.joint[body.faces[:, 0]] == joint]
-    if not len(faces):
-        return None
-    used, packed = np.unique(faces, return_inverse=True)
-    rgba = np.column_stack([body.rgb[used], np.ones(len(used))])
-    mesh = trimesh.Trimesh(body.vertices[used], packed.reshape(-1, 3), vertex_normals=body.normals[used], process=False)
-    mesh.visual = ColorVisuals(mesh, vertex_colors=(255 * rgba).round().astype(np.uint8))
-    return mesh
+class Marks:
+    """Marks of one character on the ground: a disc below each planted toe, an arrow of the target velocity, and lines
+    of the past and the planned trajectory."""
 
+    def __init__(self, scene: viser.SceneApi, name: str):
+        """Add them, hidden until there is something to show."""
+        self._feet = [
+            scene.add_cylinder(
+                f"{name}/foot{k}",
+                _FOOT_RADIUS,
+                _MARK_HEIGHT,
+                to_rgb_bytes(colour),
+                wxyz=(0.5**0.5, 0.5**0.5, 0.0, 0.0),
+                cast_shadow=False,
+                visible=False,
+            )
+            for k, colour in enumerate((colours.LEFT, colours.RIGHT))
+        ]
+        self.bands = scene.add_frame(f"{name}/bands", show_axes=False)
+        none, red = np.zeros((1, 2, 3), np.float32), to_rgb_bytes(colours.TARGET)
+        self._target = scene.add_arrows(f"{name}/bands/target", none, red, shaft_radius=0.025, head_radius=0.07)
+        self._trails = [
+            scene.add_line_segments(
+                f"{name}/bands/{what}",
+                np.zeros((_TRAIL_POINTS - 1, 2, 3), np.float32),
+                to_rgb_bytes(colours.TRAIL),
+                thickness=thickness,
+            )
+            for what, thickness in (("past", 0.02), ("plan", 0.05))
+        ]
 
-def _measure_spread(rgba: Array, area: Array) -> Array:
-    """Return by channel the variance times the area."""
-    spread = (area[:, None] * (rgba - np.average(rgba, axis=0, weights=area)) ** 2).sum(axis=0)
-    return np.where(np.ptp(rgba, axis=0) < _NEAR, 0.0, spread)
+    def show_feet(self, toes: Array, contacts: Array) -> None:
+        """Show a disc below each toe (of toes (2, 3)) whose contact (2,) is 1."""
+        for foot, (x, _, z), contact in zip(self._feet, toes, contacts, strict=True):
+            foot.visible, foot.position = bool(contact > 0.5), (x, _MARK_HEIGHT / 2, z)
 
-
-def _find_same(rows: Array) -> Array:
-    """Return for each row the first of those that are the same: a browser shades smoothly over shared vertices only,
-    and files have several where texture charts meet."""
-    _, first, number = np.unique(rows.round(_DIGITS), axis=0, return_index=True, return_inverse=True)
-    return first[number.reshape(-1)]
-
-
-def _sum_weights(mesh: CharacterMesh, bone: Array, count: int) -> Array:
-    """Return the weights of bones (n, bones), by joint the `bone` that carries it."""
-    summed = np.zeros((len(mesh.vertices), count))
-    rows = np.arange(len(mesh.vertices))
-    for joints, weights in zip(mesh.joints.T, mesh.weights.T, strict=True):
-        np.add.at(summed, (rows, bone[joints]), weights)
-    return summed
+    def show_bands(self, velocity: tuple[float, float], past: Array, plan: Array) -> None:
+        """Show a target velocity, m/s, the past root trajectory (n, 2) up to now, and the planned one, metres."""
+        here = past[-1]
+        self._target.points = np.insert([[here, here + velocity]], 1, _MARK_HEIGHT, axis=2)
+        for trail, points in zip(self._trails, (past, np.concatenate([here[None], plan])), strict=True):
+            at = np.linspace(0, len(points) - 1, _TRAIL_POINTS)
+            flat = np.stack([np.interp(at, np.arange(len(points)), axis) for axis in points.T], axis=-1)
+            line = np.insert(flat, 1, _MARK_HEIGHT, axis=1)
+            trail.points = np.stack([line[:-1], line[1:]], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,7 +198,7 @@ class DueFrame:
     """The chunk that it came with, without its forecast."""
     frame: int
     """Its index there."""
-    pose: BodyPose
+    pose: Pose
     """Pose of the body."""
     plan: Array
     """(ahead, 2) planned trajectory of the root, x and z, metres."""
@@ -223,7 +221,7 @@ class ShownCharacter:
 
     def __init__(self, scene: viser.SceneApi, world: str, number: int, character: LiveCharacter, look: CharacterLook):
         """Set up character `number`, from 0, with its nodes below the node `world`."""
-        self.name, self.character, self.look = f"character {number + 1}", character, look
+        self.name, self.character, self.look = f"Character {number + 1}", character, look
         self.inputs = SteeringInputs()
         self.recorded: list[FrameChunk] | None = None
         """Frames since its recording began; None while it is not recorded."""
@@ -237,37 +235,26 @@ class ShownCharacter:
         """Frames that were shown, oldest first."""
         self.frames = self.late_frames = 0
         """Frames, and late ones of them, since the last reset."""
-        self._pace: deque[tuple[float, int, int]] = deque()  # time, frames and late frames of chunks
         path, colour = f"{world}/character{number + 1}", colours.default_colour(number)
-        self._body = (
-            MannequinBody(scene, path, character.skeleton, colour)
-            if look.drawn is None
-            else SkinnedBody(scene, path, look.drawn)
-        )
-        self._feet = FootMarks(scene, f"{world}/feet{number + 1}", character.skeleton)
-        self.trajectories = Trajectories(scene, f"{world}/trajectories{number + 1}")
+        if look.drawn is None:
+            self._body = MannequinBody(scene, path, character.skeleton, colour)
+        else:
+            self._body = SkinnedBody(scene, path, look.drawn)
+        self.marks = Marks(scene, f"{world}/marks{number + 1}")
         self._waiting: deque[DueFrame] = deque()
         self._shown: DueFrame | None = None
 
-    def command(self, obstacles: Sequence[Obstacle] = ()) -> None:
+    def command(self, obstacles: Sequence[Obstacle]) -> None:
         """Send the character its inputs; it leaves its path."""
         self.character.command(replace(self.inputs.command, obstacles=tuple(obstacles)))
 
-    def aim(self, obstacles: Sequence[Obstacle] = ()) -> None:
+    def aim(self, obstacles: Sequence[Obstacle]) -> None:
         """Send the character its targets and obstacles alone; it keeps its path."""
         self.character.aim(replace(self.inputs.command, obstacles=tuple(obstacles)))
 
-    def go(
-        self, position: tuple[float, float], within: float, facing: float | None, obstacles: Sequence[Obstacle] = ()
-    ) -> None:
-        """Send the character to a position, x and z in metres, in so many seconds, facing so, radians; there it obeys
-        its inputs."""
-        self.character.go(replace(self.inputs.command, obstacles=tuple(obstacles)), position, within, facing)
-
-    def reset(self, obstacles: Sequence[Obstacle] = ()) -> None:
+    def reset(self, obstacles: Sequence[Obstacle]) -> None:
         """Restart with the first inputs; a recording goes on."""
         self._waiting.clear()
-        self._pace.clear()
         self.inputs, self.ended, self._shown = SteeringInputs(), "", None
         self.frames = self.late_frames = 0
         self.command(obstacles)
@@ -275,13 +262,11 @@ class ShownCharacter:
 
     def pause(self, paused: bool, seconds: float = 0.0) -> None:
         """Stop the character, or let it go on after so many seconds."""
-        self._pace.clear()
         self._waiting = deque(replace(one, due=one.due + seconds) for one in self._waiting)
         self.character.pause(paused)
 
-    def receive(self, now: float) -> list[FrameChunk]:
-        """Take the chunks that came until now, a value of time.perf_counter, and return them; MapctlError, once, if the
-        process has ended."""
+    def receive(self) -> list[FrameChunk]:
+        """Take the chunks that came, and return them; MapctlError, once, if the process has ended."""
         if self.ended:
             return []
         try:
@@ -292,61 +277,53 @@ class ShownCharacter:
         for chunk in chunks:
             if self.recorded is not None:
                 self.recorded.append(chunk)
-            self._pace.append((now, len(chunk.root), chunk.late_frames))
             self.frames += len(chunk.root)
             self.late_frames += chunk.late_frames
             poses, plan = self._body.prepare(chunk.motion(self.character.skeleton)), chunk.forecast[:, 0, ::2].copy()
             kept = replace(chunk, forecast=chunk.forecast[:0])  # two minutes of it would be large
             self._waiting += [DueFrame(chunk.due_of(k), kept, k, pose, plan) for k, pose in enumerate(poses)]
-        while self._pace and now - self._pace[0][0] > _PACE_SECONDS:
-            self._pace.popleft()
         return chunks
 
     def describe_status(self) -> str:
         """Describe speed, cost and lateness; why it has ended, and whether this machine is too slow for it."""
         if self.ended:
-            return f"⚠️ {self.name.capitalize()} has ended: {self.ended}. Reset restarts it."
+            return f"⚠️ {self.name} has ended: {self.ended}. Reset restarts it."
         if len(self.past) < 2:
             return "..."
         recent = np.array([one.chunk.root[one.frame, ::2] for one in self.past[-_SPEED_FRAMES:]])
         speed = float(np.linalg.norm(recent[-1] - recent[0])) * PRIOR_FPS / (len(recent) - 1)
         chunk = self.past[-1].chunk
-        cost = 1000 * chunk.compute_seconds / len(chunk.root)
-        frames, late = sum(row[1] for row in self._pace), sum(row[2] for row in self._pace)
-        is_slow = frames > PRIOR_FPS / 2 and late >= _LATE_SHARE * frames
-        warning = f"  \n⚠️ This machine is too slow: {100 * late / frames:.0f} % of frames come late" if is_slow else ""
+        is_slow = self.frames > PRIOR_FPS / 2 and 2 * self.late_frames >= self.frames
+        warning = "  \n⚠️ This machine is too slow." if is_slow else ""
         return (
             f"**{speed:.2f} m/s**, target {np.hypot(*chunk.target_velocity):.2f}  \n"
-            f"{cost:.1f} ms a frame · {self.late_frames} of {self.frames} frames late{warning}"
+            f"{1000 * chunk.compute_seconds / len(chunk.root):.1f} ms a frame · "
+            f"{self.late_frames} of {self.frames} frames late{warning}"
         )
 
     def show_due(self, now: float) -> None:
         """Show the newest frame that is due, a value of time.perf_counter."""
-        due = None
+        count = len(self.past)
         while self._waiting and self._waiting[0].due <= now:
-            due = self._waiting.popleft()
-            self.past.append(due)
-        if due is not None:
+            self.past.append(self._waiting.popleft())
+        if len(self.past) > count:
             del self.past[: -round(KEPT_SECONDS * PRIOR_FPS)]
             self.show_past(0)
 
     def show_past(self, back: int) -> None:
         """Show the frame that is so many frames before the newest one; the oldest if there are fewer."""
-        if not self.past:
-            return
         index = max(0, len(self.past) - 1 - back)
-        shown = self.past[index]
-        if shown is self._shown:
+        if not self.past or self.past[index] is self._shown:
             return
-        is_same_chunk = back == 0 and self._shown is not None and shown.chunk is self._shown.chunk
-        chunk, k, self._shown = shown.chunk, shown.frame, shown
-        self._body.pose(shown.pose)
+        before, self._shown = self._shown, self.past[index]
+        chunk, k = self._shown.chunk, self._shown.frame
+        self._body.pose(self._shown.pose)
         self.position, self.facing = chunk.root[k, ::2], facing_of(chunk.quats[k, 0])
         joints = chunk.motion(self.character.skeleton).joint_positions()[k].numpy()
-        self._feet.show(joints, chunk.contacts[k])
-        if not is_same_chunk:  # the bands change ten times a second
+        self.marks.show_feet(joints[list(TOE_JOINTS)], chunk.contacts[k])
+        if back or before is None or before.chunk is not chunk:  # the bands change ten times a second
             trail = self.past[max(0, index - _TRAIL_FRAMES) : index + 1]
             positions = np.array([one.chunk.root[one.frame, ::2] for one in trail])
-            jumps = np.flatnonzero(np.linalg.norm(np.diff(positions, axis=0), axis=1) > 0.5)  # by a reset
+            jumps = np.flatnonzero(np.linalg.norm(np.diff(positions, axis=0), axis=1) > _RESET_METRES)
             first = int(jumps[-1]) + 1 if len(jumps) else 0
-            self.trajectories.update(chunk.target_velocity, positions[first:], shown.plan)
+            self.marks.show_bands(chunk.target_velocity, positions[first:], self._shown.plan)

@@ -8,16 +8,15 @@
   let socket = null, sent = "";
 
   const round = (value) => Math.round(value * 50) / 50;
-  const readPad = () => {
-    const found = [...(navigator.getGamepads?.() ?? [])].find((one) => one !== null && one.connected);
-    if (found === undefined) return null;
-    const values = (all, count) => Array.from({ length: count }, (_, k) => (document.hidden ? 0 : round(all[k] ?? 0)));
-    return { axes: values(found.axes, 4), buttons: values(found.buttons.map((button) => button.value), 17) };
+  const readStick = () => {
+    const pad = [...(navigator.getGamepads?.() ?? [])].find((one) => one !== null && one.connected);
+    if (pad === undefined || document.hidden) return null;
+    return [pad.axes[0], pad.axes[1], pad.buttons[7]?.value].map((value) => round(value ?? 0));
   };
   const send = () => {
     if (socket?.readyState !== WebSocket.OPEN) return;
     const viewer = document.querySelector("[data-mapctl-viewer]")?.dataset.mapctlViewer;
-    const state = JSON.stringify({ keys: [...held], pad: readPad(), viewer: viewer ? Number(viewer) : null });
+    const state = JSON.stringify({ keys: [...held], stick: readStick(), viewer: viewer ? Number(viewer) : null });
     if (state !== sent) socket.send(sent = state);
   };
   const connect = () => {

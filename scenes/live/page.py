@@ -13,8 +13,8 @@ import json
 import logging
 import math
 import queue
-from collections.abc import Awaitable, Callable, Sequence
-from contextlib import redirect_stdout
+from collections.abc import Sequence
+from contextlib import redirect_stdout, suppress
 from importlib.resources import files
 from typing import Annotated, Any
 
@@ -27,22 +27,11 @@ from websockets.http11 import Request, Response
 
 HOST = "127.0.0.1"
 """The only address that the server binds to."""
-_NAMES = (HOST, "localhost")
 _PATH = "/mapctl/page"  # of the script's socket
 _MAX_MESSAGE = 2000  # characters
-_NOT_FRAMED = {"Content-Security-Policy": "frame-ancestors 'none'", "X-Frame-Options": "DENY"}
 _REFUSAL = b"Only the page of mapctl live itself may do that.\n"
 
 _Share = Annotated[float, pydantic.Field(ge=-1.5, le=1.5, allow_inf_nan=False)]
-
-
-class Gamepad(pydantic.BaseModel, frozen=True, extra="forbid"):
-    """Sticks and buttons in the order of the browser's standard mapping."""
-
-    axes: tuple[_Share, _Share, _Share, _Share]
-    """Sticks, -1 to 1: left one right and down, right one right and down."""
-    buttons: Annotated[tuple[_Share, ...], pydantic.Field(min_length=17, max_length=17)]
-    """How far each button is pressed, 0 to 1."""
 
 
 class PageState(pydantic.BaseModel, frozen=True, extra="forbid"):
@@ -50,8 +39,8 @@ class PageState(pydantic.BaseModel, frozen=True, extra="forbid"):
 
     keys: Annotated[frozenset[str], pydantic.Field(max_length=16)] = frozenset()
     """Held keys, as KeyboardEvent.code names them."""
-    pad: Gamepad | None = None
-    """Gamepad, if there is one."""
+    stick: tuple[_Share, _Share, _Share] | None = None
+    """A gamepad's left stick to the right and down, -1 to 1, and its right trigger, 0 to 1; None without one."""
     viewer: Annotated[int, pydantic.Field(ge=0)] | None = None
     """Number of viser's client in this page."""
 
@@ -67,22 +56,16 @@ class PageChannel:
 
     def poll(self) -> list[tuple[int, PageState | None]]:
         """Return the states since the last call by number of the page; None for a page that is gone."""
-        found = []
-        while not self._arrived.empty():
-            found.append(self._arrived.get())
-        return found
+        return [self._arrived.get() for _ in range(self._arrived.qsize())]
 
     async def serve(self, connection: Any) -> None:
         """Take the states of one page until it goes; messages that are none are ignored."""
         number = next(self._numbers)
-        try:
+        with suppress(ConnectionClosed):
             async for text in connection:
                 if (state := parse_state(text)) is not None:
                     self._arrived.put((number, state))
-        except ConnectionClosed:
-            pass
-        finally:
-            self._arrived.put((number, None))
+        self._arrived.put((number, None))
 
     def insert_script(self, body: bytes, encoding: str | None) -> bytes:
         """Insert the script into viser's page, before viser's own."""
@@ -95,12 +78,10 @@ class PageChannel:
 
 def parse_state(text: object) -> PageState | None:
     """Parse a message of the script; None where it is not one."""
-    if not isinstance(text, str) or len(text) > _MAX_MESSAGE:
-        return None
-    try:
-        return PageState.model_validate_json(text)
-    except pydantic.ValidationError:
-        return None
+    if isinstance(text, str) and len(text) <= _MAX_MESSAGE:
+        with suppress(pydantic.ValidationError):
+            return PageState.model_validate_json(text)
+    return None
 
 
 def open_server(port: int, channel: PageChannel) -> viser.ViserServer:
@@ -112,8 +93,17 @@ def open_server(port: int, channel: PageChannel) -> viser.ViserServer:
     serve = websockets_server.serve
 
     def guarded(handler: Any, host: str, port: int, *, process_request: Any, **options: Any) -> Any:
-        answer = _guard_requests(process_request, port, channel)
-        return serve(_share_connections(handler, channel), host, port, process_request=answer, **options)
+        async def handle(connection: Any) -> None:
+            await (channel.serve if connection.request.path == _PATH else handler)(connection)
+
+        def answer(connection: Any, request: Request) -> Response | None:
+            if not is_own_page(request.headers, port):
+                about = Headers({"Content-Length": str(len(_REFUSAL)), "Content-Type": "text/plain"})
+                return Response(http.HTTPStatus.FORBIDDEN, "Forbidden", about, _REFUSAL)
+            response = process_request(connection, request)
+            return None if response is None else _finish_page(response, request, channel)
+
+        return serve(handle, host, port, process_request=answer, **options)
 
     websockets_server.serve = guarded
     try:
@@ -121,14 +111,18 @@ def open_server(port: int, channel: PageChannel) -> viser.ViserServer:
             server = viser.ViserServer(host=HOST, port=port, label="mapctl live", verbose=False)
     finally:
         websockets_server.serve = serve
-    server.on_client_connect(_mark_page)
+
+    @server.on_client_connect
+    async def _(client: viser.ClientHandle) -> None:  # gives the page's script the number of viser's client
+        client.gui.add_html(f'<i hidden data-mapctl-viewer="{client.client_id}"></i>', order=-math.inf)
+
     return server
 
 
 def is_own_page(headers: Headers, port: int) -> bool:
     """Return whether a request is from a page of this server: `Host` is this server, and so is `Origin`, which may be
     missing unless the request is for a WebSocket."""
-    hosts = [f"{name}:{port}" for name in _NAMES]
+    hosts = [f"{name}:{port}" for name in (HOST, "localhost")]
     asked, origins = headers.get_all("Host"), headers.get_all("Origin")
     if len(asked) != 1 or asked[0].lower() not in hosts:
         return False
@@ -137,38 +131,11 @@ def is_own_page(headers: Headers, port: int) -> bool:
     return len(origins) == 1 and origins[0].lower() in [f"http://{host}" for host in hosts]
 
 
-def _share_connections(
-    handler: Callable[[Any], Awaitable[None]], channel: PageChannel
-) -> Callable[[Any], Awaitable[None]]:
-    async def handled(connection: Any) -> None:
-        await (channel.serve if connection.request.path == _PATH else handler)(connection)
-
-    return handled
-
-
-def _guard_requests(answer: Callable[[Any, Request], Response | None], port: int, channel: PageChannel) -> Any:
-    written: dict[str | None, bytes] = {}  # viser's page with the script, by encoding
-
-    def answered(connection: Any, request: Request) -> Response | None:
-        if not is_own_page(request.headers, port):
-            about = Headers({"Content-Length": str(len(_REFUSAL)), "Content-Type": "text/plain"})
-            return Response(http.HTTPStatus.FORBIDDEN, "Forbidden", about, _REFUSAL)
-        response = answer(connection, request)
-        if response is None:
-            return None
-        response.headers.update(_NOT_FRAMED)
-        if response.status_code == http.HTTPStatus.OK and request.path.partition("?")[0] in ("/", "/index.html"):
-            encoding = response.headers.get("Content-Encoding")
-            if encoding not in written:
-                written[encoding] = channel.insert_script(bytes(response.body), encoding)
-            response.body = written[encoding]
-            del response.headers["Content-Length"]
-            response.headers["Content-Length"] = str(len(response.body))
-        return response
-
-    return answered
-
-
-async def _mark_page(client: viser.ClientHandle) -> None:
-    """Give the page's script the number of viser's client."""
-    client.gui.add_html(f'<i hidden data-mapctl-viewer="{client.client_id}"></i>', order=-math.inf)
+def _finish_page(response: Response, request: Request, channel: PageChannel) -> Response:
+    """Forbid frames around a response, and insert the script where it is the page."""
+    response.headers.update({"Content-Security-Policy": "frame-ancestors 'none'", "X-Frame-Options": "DENY"})
+    if response.status_code == http.HTTPStatus.OK and request.path.partition("?")[0] in ("/", "/index.html"):
+        response.body = channel.insert_script(bytes(response.body), response.headers.get("Content-Encoding"))
+        del response.headers["Content-Length"]
+        response.headers["Content-Length"] = str(len(response.body))
+    return response

@@ -5,19 +5,18 @@ from typing import TYPE_CHECKING, Any
 
 import viser
 
+from mapctl.features import PRIOR_FPS
 from mapctl.intent.steering import STEP_LENGTHS
 from mapctl.streaming.orders import is_number
 from scenes.live import paths
 from scenes.live.camera import CameraMode
 from scenes.live.character import KEPT_SECONDS, ShownCharacter
 from scenes.live.inputs import DISC_RADII, HANDS, UNCONDITIONED, WITHIN, SteeringInputs
-from scenes.live.recording import FORMATS, Recorder, Timeline, describe_length
+from scenes.live.recording import FORMATS, Recorder, Timeline
 
 if TYPE_CHECKING:
     from scenes.live.app import LiveApp
 
-_WIDTH = 340  # pixels, until a viewer drags the panel's edge
-_DEFAULT_STEP_LENGTH = 0.65  # metres
 _NO_HAND = "none"
 _WALK_ON, _STAND = "walk on", "stand"
 _LEGEND = "On the ground: **red** target velocity, **yellow** planned and past trajectory; discs are planted feet."
@@ -30,12 +29,11 @@ class Panel:
         """Dock the panel at the right edge, and add all controls."""
         self._gui, self._app = gui, app
         gui.main_panel.dock_right()
-        gui.main_panel.set_width(_WIDTH)
+        gui.main_panel.set_width(340)  # pixels
         self.status = gui.add_markdown("...")
         if characters > 1:
             names = [str(k + 1) for k in range(characters)]
-            self.character = gui.add_dropdown("Character", names)
-            self._on_change(self.character, lambda value: app.choose(names.index(value)))
+            self._on_change(gui.add_dropdown("Character", names), lambda value: app.choose(names.index(value)))
         self.paused = self._add_button("Pause", lambda client: app.set_paused(not app.is_paused))
         self._add_button("Reset", lambda client: app.restart())
         tabs = gui.add_tab_group()
@@ -57,12 +55,12 @@ class Panel:
         self.strafe = gui.add_checkbox("Face a fixed direction", False)
         self.facing = gui.add_slider("Facing, degrees", -180.0, 180.0, 1.0, 0.0, disabled=True)
         self.measured = gui.add_checkbox("Measured steps", False)
-        self.step_length = gui.add_slider("Step length, m", *STEP_LENGTHS, 0.05, _DEFAULT_STEP_LENGTH, disabled=True)
+        self.step_length = gui.add_slider("Step length, m", *STEP_LENGTHS, 0.05, 0.65, disabled=True)
         self.labels = {
             group: gui.add_dropdown(group.capitalize(), [UNCONDITIONED, *names])
             for group, names in limits.labels.items()
         }
-        self.refusal = gui.add_markdown("", visible=False)
+        self.refusal = gui.add_markdown("")
         self._on_change(self.speed, lambda value: change(speed=value))
         self._on_change(self.heading, lambda value: change(heading=value))
         self._on_change(self.strafe, lambda value: change(facing=self.facing.value if value else None))
@@ -73,20 +71,21 @@ class Panel:
             self._on_change(handle, lambda value, of=group: change(labels={of: value}))
 
     def _add_path(self) -> None:
-        gui, app = self._gui, self._app
+        gui, app, path = self._gui, self._app, self._app.path
         self.draw = gui.add_checkbox("Draw by clicking on the ground", False, hint=paths.HELP)
         self.closed = gui.add_checkbox("Closed to a loop", False, hint="a closed path is walked again and again")
         self.path = gui.add_markdown(paths.HELP)
-        self._on_change(self.closed, lambda value: app.path.close(value is True))
-        self._add_button("Walk it", lambda client: app.walk_path(), icon=viser.Icon.ROUTE)
-        self._add_button("Clear", lambda client: app.path.clear(), icon=viser.Icon.ERASER)
+        self._on_change(self.closed, lambda value: path.edit(path.points, closed=value is True))
+        walk = self._add_button("Walk it", lambda client: app.walk(app.chosen, path.points, closed=path.is_closed))
+        walk.icon = viser.Icon.ROUTE
+        self._add_button("Clear", lambda client: path.edit([]), icon=viser.Icon.ERASER)
         hint = "x,z in metres, as mapctl follow reads it"
         self._add_button("Download CSV", app.download_path, icon=viser.Icon.DOWNLOAD, hint=hint)
         load = gui.add_upload_button("Load CSV or SVG", icon=viser.Icon.UPLOAD, mime_type=",".join(paths.ENDINGS))
 
         @load.on_upload
         async def _(event: viser.GuiEvent) -> None:
-            app.enqueue(lambda: app.path.load(load.value.name, load.value.content))
+            app.enqueue(lambda: path.load(load.value.name, load.value.content))
 
         with gui.add_folder("Go there"):
             self.go = gui.add_checkbox("Go where I click on the ground", False)
@@ -99,56 +98,44 @@ class Panel:
         gui, targets = self._gui, self._app.targets
         self.hand = gui.add_dropdown("Hand", [_NO_HAND, *HANDS], hint="drag the ball that it reaches for")
         self.looks = gui.add_checkbox("Look at it", False)
-        self.disc = gui.add_checkbox("Disc to walk round", False)
+        self.disc = gui.add_checkbox("Disc to walk round", False, hint="drag it to where it is to be")
         self.radius = gui.add_slider("Radius, m", *DISC_RADII, 0.1, 0.5)
         self._on_change(self.hand, lambda value: targets.reach(value if value in HANDS else None))
         self._on_change(self.looks, lambda value: targets.look(value is True))
         self._on_change(self.disc, lambda value: targets.put_disc(self.radius.value if value else None))
         self._on_change(self.radius, lambda value: targets.put_disc(value) if self.disc.value else None)
-        self._add_button("Bring them here", lambda client: targets.bring(), icon=viser.Icon.MAP_PIN)
 
     def _add_playing(self) -> None:
         gui, app = self._gui, self._app
+        recorder, timeline = app.recorder, app.timeline
         self.ending = gui.add_dropdown("File", list(FORMATS), hint="mapctl render makes a film of it")
         self.record = self._add_button(
             "Record",
-            lambda client: app.recorder.toggle(app.chosen, self.chosen_ending, client),
+            lambda client: recorder.toggle(app.chosen, self.ending.value, client),
             color="red",
             icon=viser.Icon.PLAYER_RECORD,
         )
         self.recorded = gui.add_markdown("")
-        self._add_button(
-            "Save again",
-            lambda client: app.recorder.save_last(self.chosen_ending, client),
-            icon=viser.Icon.DOWNLOAD,
-            hint="the last recording",
-        )
+        again = self._add_button("Save again", lambda client: recorder.save_last(self.ending.value, client))
+        again.icon = viser.Icon.DOWNLOAD
         hint = "the characters stop while you look at the past"
         self.back = gui.add_slider("Look back, s", -KEPT_SECONDS, 0.0, 0.1, 0.0, hint=hint)
         self.timeline = gui.add_markdown("")
-        self._on_change(self.back, lambda value: app.timeline.look_back(-value) if is_number(value) else None)
-        self._add_button("Replay", lambda client: app.timeline.replay(), icon=viser.Icon.PLAYER_PLAY)
-        self._add_button(
-            "Back to live", lambda client: app.timeline.return_to_present(), icon=viser.Icon.PLAYER_TRACK_NEXT
-        )
+        self._on_change(self.back, lambda value: timeline.look_back(-value))
+        self._add_button("Replay", lambda client: timeline.replay(), icon=viser.Icon.PLAYER_PLAY)
+        live = self._add_button("Back to live", lambda client: timeline.return_to_present())
+        live.icon = viser.Icon.PLAYER_TRACK_NEXT
 
     def _add_view(self) -> None:
         gui, app = self._gui, self._app
         modes = [mode.value for mode in CameraMode]
-        self.camera = gui.add_dropdown("Camera", modes, initial_value=app.view.chase.mode.value)
-        self._on_change(self.camera, lambda value: app.set_camera(CameraMode(value)))
+        camera = gui.add_dropdown("Camera", modes, initial_value=app.view.chase.mode.value)
+        self._on_change(camera, lambda value: setattr(app.view.chase, "mode", CameraMode(value)))
         self._add_button("Show all", lambda client: app.show_all(), icon=viser.Icon.USERS)
-        self.marks = gui.add_checkbox("Arrows and trails", True)
-        self._on_change(self.marks, lambda value: app.show_marks(value is True))
         gui.add_markdown(_LEGEND)
 
-    @property
-    def chosen_ending(self) -> str:
-        """Ending of the file that is asked for, one of FORMATS whatever a browser sent."""
-        return self.ending.value if self.ending.value in FORMATS else FORMATS[0]
-
     def read_journey(self) -> tuple[float, float | None, bool] | None:
-        """Return seconds, facing (radians) and whether to stand there, if a click on the ground sends the character;
+        """Return seconds, facing (degrees) and whether to stand there, if a click on the ground sends the character;
         None otherwise."""
         within, facing = self.within.value, self.turn.value if self.turns.value is True else None
         if self.go.value is not True or not is_number(within) or not (facing is None or is_number(facing)):
@@ -173,18 +160,16 @@ class Panel:
         """Enable the controls that have an effect."""
         self.facing.disabled, self.step_length.disabled = inputs.facing is None, inputs.step_length is None
 
-    def show_refusal(self, notes: list[str]) -> None:
-        """Show what could not be done as it was asked, until the next input."""
-        _set(self.refusal, content="\n\n".join(f"⚠️ {note}" for note in notes), visible=bool(notes))
-
     def show_state(self, character: ShownCharacter, recorder: Recorder, timeline: Timeline) -> None:
         """Bring all texts up to date; a few times a second is enough."""
         recorded, back = character.recorded, -round(timeline.seconds_back or 0.0, 1)
-        last = "" if recorder.last is None else f"Last: {recorder.last.seconds:.1f} s"
-        _set(self.status, content=character.describe_status())
-        _set(self.record, label="Record" if recorded is None else "Stop and save")
-        _set(self.recorded, content=last if recorded is None else f"● **{describe_length(recorded)}**")
-        _set(self.timeline, content=timeline.describe())
+        self.status.content = character.describe_status()
+        self.record.label = "Record" if recorded is None else "Stop and save"
+        if recorded is not None:
+            self.recorded.content = f"● **{sum(len(chunk.root) for chunk in recorded) / PRIOR_FPS:.1f} s**"
+        else:
+            self.recorded.content = "" if recorder.last is None else f"Last: {recorder.last.seconds:.1f} s"
+        self.timeline.content = timeline.describe()
         if abs(self.back.value - back) > 0.05:
             self.back.value = back
 
@@ -207,10 +192,3 @@ class Panel:
             self._app.enqueue(lambda: action(event.client))
 
         return button
-
-
-def _set(handle: Any, **values: Any) -> None:
-    """Set what differs, since each change is sent to all browsers."""
-    for name, value in values.items():
-        if getattr(handle, name) != value:
-            setattr(handle, name, value)

@@ -2,9 +2,9 @@
 
 import itertools
 import tempfile
-import threading
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -25,12 +25,13 @@ FORMATS = ("bvh", "glb", "npz")
 
 
 class Recorder:
-    """Recordings of characters; the last one is kept, so that a file of another format can be made of it."""
+    """Recordings of characters; the last one is kept, so that a file of another format can be written of it."""
 
     def __init__(self, server: viser.ViserServer, notify: Callable[[str, str], None]):
         """Files go to browsers of `server`; `notify` shows a note: title and text."""
         self._server, self._notify = server, notify
-        self._thread: threading.Thread | None = None
+        self._pool = ThreadPoolExecutor(1)  # a long recording takes seconds
+        self._saved: Future[None] | None = None
         self.last: Motion | None = None
         """Last recording."""
 
@@ -45,33 +46,26 @@ class Recorder:
         self.save_last(ending, client)
 
     def save_last(self, ending: str, client: viser.ClientHandle | None) -> None:
-        """Give a browser the last recording as a file of this ending; from a thread, since a long one takes seconds.
-        RequestError where there is none."""
+        """Give a browser the last recording as a file of this ending; write it into the current folder where that
+        browser is gone. RequestError where there is none."""
         if self.last is None:
             raise RequestError("nothing was recorded yet")
-        motion = self.last
+        self._saved = self._pool.submit(self._save, self.last, ending, client)
 
-        def work() -> None:
-            torch.set_num_threads(1)
-            try:
-                self._send(f"mapctl.{ending}", encode_motion(motion, ending), client)
-            except Exception as error:
-                self._notify("Nothing saved", f"{type(error).__name__}: {error}")
+    def wait(self) -> None:
+        """Wait for the file that is being written."""
+        if self._saved is not None:
+            self._saved.result()
 
-        self._thread = threading.Thread(target=work, daemon=True)
-        self._thread.start()
-
-    def wait(self, seconds: float = 10.0) -> None:
-        """Wait for the file that is being made."""
-        if self._thread is not None:
-            self._thread.join(seconds)
-
-    def _send(self, name: str, content: bytes, client: viser.ClientHandle | None) -> None:
-        """Send a file to a browser; write it into the current folder where that browser is gone."""
-        if client is not None and client.client_id in self._server.get_clients():
-            client.send_file_download(name, content, save_immediately=True)
-        else:
-            self._notify("Saved", f"the recording is in {write_new(Path.cwd() / name, content).name}")
+    def _save(self, motion: Motion, ending: str, client: viser.ClientHandle | None) -> None:
+        try:
+            name, content = f"mapctl.{ending}", encode_motion(motion, ending)
+            if client is not None and client.client_id in self._server.get_clients():
+                client.send_file_download(name, content, save_immediately=True)
+            else:
+                self._notify("Saved", f"the recording is in {write_new(Path.cwd() / name, content).name}")
+        except Exception as error:
+            self._notify("Nothing saved", f"{type(error).__name__}: {error}")
 
 
 def join_chunks(character: ShownCharacter, chunks: Sequence[FrameChunk]) -> Motion:
@@ -107,26 +101,15 @@ def write_new(path: Path, content: bytes) -> Path:
     raise AssertionError  # there is always another number
 
 
-def describe_length(chunks: Sequence[FrameChunk]) -> str:
-    """Describe how long a recording is: 1:02.3, 1869 frames."""
-    frames = sum(len(chunk.root) for chunk in chunks)
-    minutes, seconds = divmod(frames / PRIOR_FPS, 60)
-    return f"{int(minutes)}:{seconds:04.1f}, {frames} frame{'s' * (frames != 1)}"
-
-
 class Timeline:
-    """Looking back stops the characters, so that none moves on unseen; returning lets them go on, unless they were
-    paused before."""
+    """Looking back stops the characters, so that none moves on unseen; returning lets them go on."""
 
-    def __init__(
-        self, characters: Sequence[ShownCharacter], pause: Callable[[bool], None], is_paused: Callable[[], bool]
-    ):
+    def __init__(self, characters: Sequence[ShownCharacter], pause: Callable[[bool], None]):
         """`pause` stops all characters, or lets them go on."""
-        self._characters, self._pause, self._is_paused = characters, pause, is_paused
+        self._characters, self._pause = characters, pause
         self.seconds_back: float | None = None
         """How far back the shown moment is; None for the present."""
         self._replayed: float | None = None  # value of time.perf_counter up to which was replayed
-        self._goes_on = False
 
     @property
     def kept_seconds(self) -> float:
@@ -135,9 +118,7 @@ class Timeline:
 
     def look_back(self, seconds: float) -> None:
         """Show what was so many seconds ago, or the oldest frame."""
-        if self.seconds_back is None:
-            self._goes_on = not self._is_paused()
-            self._pause(True)
+        self._pause(True)
         self._replayed = None
         self.seconds_back = min(max(0.0, seconds), self.kept_seconds)
 
@@ -147,33 +128,29 @@ class Timeline:
         self._replayed = time.perf_counter()
 
     def return_to_present(self) -> None:
-        """Show the present again; characters go on if they went before."""
+        """Show the present again; characters go on."""
         if self.seconds_back is not None:
-            self.leave()
-            if self._goes_on:
-                self._pause(False)
-
-    def leave(self) -> None:
-        """Show the present again; characters that stand go on standing."""
-        self.seconds_back, self._replayed = None, None
-        for character in self._characters:
-            character.show_past(0)
+            self.seconds_back = self._replayed = None
+            for character in self._characters:
+                character.show_past(0)
+            self._pause(False)
 
     def step(self, now: float) -> None:
         """Show the past at a value of time.perf_counter; nothing in the present."""
-        if self.seconds_back is not None and self._replayed is not None:
+        if self.seconds_back is None:
+            return
+        if self._replayed is not None:
             self.seconds_back -= now - self._replayed
             self._replayed = now
-            if self.seconds_back <= 0:
-                self.return_to_present()
-        if self.seconds_back is not None:
-            for character in self._characters:
-                character.show_past(round(self.seconds_back * PRIOR_FPS))
+        if self.seconds_back <= 0 and self._replayed is not None:
+            self.return_to_present()
+            return
+        for character in self._characters:
+            character.show_past(round(self.seconds_back * PRIOR_FPS))
 
     def describe(self) -> str:
         """Describe what is shown, in a line."""
         if self.seconds_back is None:
-            kept = self.kept_seconds
-            return f"Live. Look back up to {f'{kept:.0f} s' if kept < KEPT_SECONDS - 1 else '2 minutes'}."
+            return f"Live. Look back up to {min(self.kept_seconds, KEPT_SECONDS):.0f} s."
         doing = "Past" if self._replayed is None else "Replay"
         return f"**{doing}, {self.seconds_back:.1f} s ago.** The characters wait."

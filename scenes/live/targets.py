@@ -3,21 +3,20 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import viser
 
 from mapctl.curves.obstacles import Obstacle
 from mapctl.mesh import colours
-from mapctl.streaming.orders import is_number
+from scenes.live.camera import to_rgb_bytes
 from scenes.live.character import ShownCharacter
-from scenes.live.ground import to_rgb_bytes
-from scenes.live.inputs import DISC_RADII, Point, SteeringInputs, parse_point
+from scenes.live.inputs import Point, SteeringInputs, parse_point
 
 _HANDLE_SIZE, _BALL_RADIUS, _GOAL_RADIUS = 0.25, 0.045, 0.08  # metres
-_DISC_HEIGHT, _DISC_COLOUR = 0.35, (185, 170, 156)
+_DISC_HEIGHT, _DISC_COLOUR, _DISC_AHEAD = 0.35, (185, 170, 156), 2.5
 _TARGET_AHEAD, _TARGET_ASIDE, _TARGET_HEIGHT = 0.45, 0.3, 1.2  # metres from a character, where a target appears
-_DISC_AHEAD = 2.5
 
 
 class LiveTargets:
@@ -37,23 +36,20 @@ class LiveTargets:
         """Add the handles below the node `world`, hidden."""
         self._scene, self._world, self._characters, self._chosen = scene, world, characters, chosen
         self.obstacles: tuple[Obstacle, ...] = ()
-        self.target = scene.add_transform_controls(
-            f"{world}/target", _HANDLE_SIZE, disable_rotations=True, depth_test=False, visible=False
-        )
-        scene.add_icosphere(f"{world}/target/ball", _BALL_RADIUS, color=to_rgb_bytes(colours.TARGET))
-        self.disc = scene.add_transform_controls(
-            f"{world}/disc",
-            2 * _HANDLE_SIZE,
-            disable_rotations=True,
-            active_axes=(True, False, True),
-            depth_test=False,
-            visible=False,
-        )
-        self._goal = scene.add_icosphere(
-            f"{world}/goal", _GOAL_RADIUS, color=to_rgb_bytes(colours.TARGET), visible=False
-        )
-        _on_drag(self.target, lambda point: enqueue(lambda: self.move_target(point)))
-        _on_drag(self.disc, lambda point: enqueue(lambda: self.move_disc(point)))
+        look: dict[str, Any] = {"disable_rotations": True, "depth_test": False, "visible": False}
+        red = to_rgb_bytes(colours.TARGET)
+        self.target = scene.add_transform_controls(f"{world}/target", _HANDLE_SIZE, **look)
+        scene.add_icosphere(f"{world}/target/ball", _BALL_RADIUS, color=red)
+        ground = (True, False, True)
+        self.disc = scene.add_transform_controls(f"{world}/disc", 2 * _HANDLE_SIZE, active_axes=ground, **look)
+        self._goal = scene.add_icosphere(f"{world}/goal", _GOAL_RADIUS, color=red, visible=False)
+        for handle, moved in ((self.target, self.move_target), (self.disc, self.move_disc)):
+
+            @handle.on_update
+            async def _(event: viser.TransformControlsEvent, handle: Any = handle, moved: Any = moved) -> None:
+                point = parse_point(handle.position)
+                if event.client_id is not None and point is not None:  # not where the server moves it
+                    enqueue(lambda: moved(point))
 
     def reach(self, hand: str | None) -> None:
         """Have the chosen character reach for the target with a hand, or with none."""
@@ -67,15 +63,7 @@ class LiveTargets:
     def move_target(self, point: Point) -> None:
         """Move the chosen character's target, metres."""
         inputs = self._chosen().inputs
-        reach = dict.fromkeys(inputs.reach, point)
-        self._aim(replace(inputs, reach=reach, look_at=inputs.look_at and point))
-
-    def bring(self) -> None:
-        """Put target and disc before the chosen character."""
-        if self.obstacles:
-            self.set_disc(self._disc_ahead(self.obstacles[0].radius or DISC_RADII[0]))
-        hand = next(iter(self._chosen().inputs.reach), None)
-        self.move_target(self._target_ahead(hand))
+        self._aim(replace(inputs, reach=dict.fromkeys(inputs.reach, point), look_at=inputs.look_at and point))
 
     def show(self) -> None:
         """Show the chosen character's target where it has one."""
@@ -88,11 +76,9 @@ class LiveTargets:
     def put_disc(self, radius: float | None) -> None:
         """Put a disc of a radius, metres, where there is one already or ahead of the chosen character; None removes
         it."""
-        if radius is None:
-            self.set_disc(None)
-        elif is_number(radius) and DISC_RADII[0] <= radius <= DISC_RADII[1]:
-            ahead = self.obstacles[0] if self.obstacles else self._disc_ahead(radius)
-            self.set_disc(replace(ahead, radius=radius))
+        x, z = self._chosen().position + _DISC_AHEAD * self._axes()[0]
+        place = self.obstacles[0].place if self.obstacles else (float(x), float(z))
+        self.set_disc(None if radius is None else Obstacle(place, radius))
 
     def move_disc(self, point: Point) -> None:
         """Move the disc, metres."""
@@ -101,59 +87,42 @@ class LiveTargets:
 
     def set_disc(self, disc: Obstacle | None) -> None:
         """Have all characters walk round a disc, or round nothing."""
-        before, self.obstacles = self.obstacles, () if disc is None else (disc,)
+        self.obstacles = () if disc is None else (disc,)
         self.disc.visible = disc is not None
         if disc is not None and disc.radius is not None:
             self.disc.position = (disc.place[0], _DISC_HEIGHT, disc.place[1])
-            if not before or before[0].radius != disc.radius:
-                self._scene.add_cylinder(
-                    f"{self._world}/disc/solid",
-                    disc.radius,
-                    _DISC_HEIGHT,
-                    color=_DISC_COLOUR,
-                    opacity=0.8,
-                    wxyz=(math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0),
-                    position=(0.0, -_DISC_HEIGHT / 2, 0.0),
-                )
+            self._scene.add_cylinder(
+                f"{self._world}/disc/solid",
+                disc.radius,
+                _DISC_HEIGHT,
+                color=_DISC_COLOUR,
+                opacity=0.8,
+                wxyz=(math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0),
+                position=(0.0, -_DISC_HEIGHT / 2, 0.0),
+            )
         for character in self._characters:
             character.aim(self.obstacles)
 
     def go(self, character: ShownCharacter, position: tuple[float, float], within: float, facing: float | None) -> None:
-        """Send a character to a position, x and z in metres, in so many seconds, facing so, radians, and mark it."""
-        character.go(position, within, facing, self.obstacles)
+        """Send a character to a position, x and z in metres, in so many seconds, facing so, radians, and mark it; there
+        it obeys its inputs."""
+        command = replace(character.inputs.command, obstacles=self.obstacles)
+        character.character.go(command, position, within, facing)
         self._goal.position, self._goal.visible = (position[0], 0.0, position[1]), True
 
     def _aim(self, inputs: SteeringInputs) -> None:
-        character = self._chosen()
-        character.inputs = inputs
-        character.aim(self.obstacles)
+        self._chosen().inputs = inputs
+        self._chosen().aim(self.obstacles)
         self.show()
 
     def _find_target(self, hand: str | None) -> Point:
-        inputs = self._chosen().inputs
-        return next(iter(inputs.reach.values()), inputs.look_at) or self._target_ahead(hand)
-
-    def _target_ahead(self, hand: str | None) -> Point:
-        """Return a point before the chosen character, on the hand's side."""
-        ahead, left = self._axes()
+        """Return the chosen character's target; one before it, on the hand's side, where it has none."""
+        inputs, (ahead, left) = self._chosen().inputs, self._axes()
         side = {"left": 1.0, "right": -1.0}.get(hand or "", 0.0)
         x, z = self._chosen().position + _TARGET_AHEAD * ahead + side * _TARGET_ASIDE * left
-        return float(x), _TARGET_HEIGHT, float(z)
-
-    def _disc_ahead(self, radius: float) -> Obstacle:
-        x, z = self._chosen().position + _DISC_AHEAD * self._axes()[0]
-        return Obstacle((float(x), float(z)), radius)
+        return next(iter(inputs.reach.values()), inputs.look_at) or (float(x), _TARGET_HEIGHT, float(z))
 
     def _axes(self) -> tuple[np.ndarray, np.ndarray]:
         heading = math.radians(self._chosen().inputs.heading)
         ahead = np.array([math.sin(heading), math.cos(heading)])
         return ahead, np.array([ahead[1], -ahead[0]])
-
-
-def _on_drag(handle: viser.TransformControlsHandle, moved: Callable[[Point], None]) -> None:
-    """Act where a user drags a handle, not where the server moves it. A coroutine, so that drags stay in order."""
-
-    @handle.on_update
-    async def _(event: viser.TransformControlsEvent) -> None:
-        if event.client_id is not None and (point := parse_point(handle.position)) is not None:
-            moved(point)

@@ -1,4 +1,4 @@
-"""The camera of the live viewer follows smoothly and frames all characters; arrows point along their trajectory."""
+"""The camera of the live viewer follows smoothly and frames all characters."""
 
 import math
 
@@ -9,8 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from scenes.cameras import View, look_at
-from scenes.live.camera import _FOV, CameraMode, ChaseCamera, facing_of, frame_characters, turn_about_up
-from scenes.live.ground import build_arrow, build_tail
+from scenes.live.camera import FOV, CameraMode, ChaseCamera, facing_of, frame_characters, turn_about_up
 
 
 @pytest.mark.parametrize("size", [(400, 620), (940, 760), (1580, 1080)])
@@ -20,7 +19,7 @@ def test_all_characters_are_in_view_from_behind_and_large_enough(size, count, le
     eye, target = frame_characters(positions, size[0] / size[1])
     assert eye[2] < -2, "characters begin facing +Z"
     assert eye[1] > 1
-    view = View(look_at(eye, target), _FOV, *size)
+    view = View(look_at(eye, target), FOV, *size)
     middles = []
     for x, z in positions:
         corners = np.array([[x + dx, y, z + dz] for dx in (-0.4, 0.4) for y in (0, 1.8) for dz in (-0.5, 0.5)])
@@ -70,18 +69,11 @@ def test_it_turns_behind_the_character_without_overshooting_or_rocking_with_the_
     assert np.ptp(rocked[20:]) < math.radians(3)
 
 
-def test_a_character_that_walks_at_the_camera_does_not_swing_it_round(chase):
-    follow(chase, 1.0, 1.2, math.pi - 0.02)
-    assert abs(chase.yaw) < math.radians(10)
-
-
 def test_following_does_not_turn_and_staying_does_not_move(chase):
     chase.mode = CameraMode.FOLLOW
     follow(chase, 2, 1.2, 1.0)
     assert chase.yaw == 0.0
     assert np.linalg.norm(chase.position) > 1.5
-    chase.orbit(0.3)
-    assert chase.yaw == 0.3
     chase.mode = CameraMode.FREE
     at = chase.position.copy()
     follow(chase, 1, 1.2, 1.0)
@@ -118,7 +110,7 @@ def test_the_node_of_the_world_is_where_the_camera_shows_points(show):
     shown = viser.transforms.SO3(np.array(node.wxyz)).apply(points) + node.position
     np.testing.assert_allclose(shown, chase.to_view(points), atol=1e-4)
     look = np.asarray(show.server.initial_camera.look_at) - np.asarray(show.server.initial_camera.position)
-    away = chase.direction_to_world(look)
+    away = turn_about_up(look, chase.yaw)
     heading = show.view.find_heading((0.0, 1.0), None)
     assert heading == pytest.approx(math.degrees(math.atan2(away[0], away[2])))
 
@@ -128,17 +120,3 @@ def test_facing_is_that_of_the_hips():
         assert facing_of(np.array([0.0, math.sin(angle / 2), 0.0, math.cos(angle / 2)])) == pytest.approx(angle)
         turned = turn_about_up(np.array([0.0, 0, 1]), angle)
         np.testing.assert_allclose(turned[[0, 2]], [math.sin(angle), math.cos(angle)])
-
-
-def test_an_arrow_points_along_its_trajectory_and_a_tail_begins_as_a_point():
-    way = np.stack([np.linspace(0, 1, 30), np.zeros(30)], axis=-1)
-    edges = build_arrow(way, 0.1)
-    np.testing.assert_allclose(edges[-2:], [[1, 0], [1, 0]], atol=1e-9)
-    widths = np.linalg.norm(edges[::2] - edges[1::2], axis=1)
-    assert widths[:-2] == pytest.approx(0.1)
-    assert widths[-2] > 0.2
-    tail = build_tail(way)
-    np.testing.assert_allclose(tail[:2], 0, atol=1e-9)
-    assert np.linalg.norm(tail[-2] - tail[-1]) > 0.02
-    assert build_arrow(way * 0.01, 0.1) is None
-    assert build_tail(way[:1]) is None

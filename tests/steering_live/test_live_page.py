@@ -22,13 +22,11 @@ from scenes.live.inputs import (
     UNCONDITIONED,
     Driving,
     InputLimits,
-    KeyAction,
     SteeringInputs,
     find_direction,
-    list_presses,
     parse_point,
 )
-from scenes.live.page import Gamepad, PageChannel, PageState, is_own_page, open_server, parse_state
+from scenes.live.page import PageChannel, PageState, is_own_page, open_server, parse_state
 
 OWN = {"Host": "127.0.0.1:8080", "Origin": "http://127.0.0.1:8080", "Upgrade": "websocket"}
 
@@ -118,9 +116,9 @@ def test_states_arrive_and_nonsense_is_ignored(server, channel):
         '{"keys": "KeyW"}',
         '{"keys": [["KeyW"]]}',
         json.dumps({"keys": [f"Key{k}" for k in range(17)]}),
-        '{"pad": {"axes": [1e9, 0, 0, 0], "buttons": []}}',
-        '{"pad": {"axes": [NaN, 0, 0, 0], "buttons": []}}',
-        '{"pad": {}}',
+        '{"stick": [1e9, 0, 0]}',
+        '{"stick": [NaN, 0, 0]}',
+        '{"stick": {}}',
         '{"viewer": -1}',
         '{"other": 1}',
         "[" * 1900,
@@ -133,13 +131,6 @@ def test_what_is_no_state_is_none(text):
     assert parse_state(text) is None
 
 
-def pad(right: float = 0, down: float = 0, look: float = 0, **pressed: float) -> Gamepad:
-    buttons = [0.0] * 17
-    for name, value in pressed.items():
-        buttons[int(name[1:])] = value
-    return Gamepad(axes=(right, down, look, 0.0), buttons=tuple(buttons))
-
-
 class Deck:
     """Notes what it is asked; the camera looks along +X."""
 
@@ -148,14 +139,12 @@ class Deck:
         self.driving = Driving(
             lambda speed, heading: self.heard.append(("steer", speed, heading)),
             lambda action: self.heard.append(("act", action)),
-            lambda angle: self.heard.append(("orbit", round(angle, 6))),
             lambda direction, viewer: 90.0 - math.degrees(math.atan2(*direction)),
-            lambda title, text: self.heard.append(("note", text)),
             fastest=3.8,
         )
 
     def hold(self, *codes: str, page: int = 0, at: float | None = None) -> None:
-        self.driving.hear(page, PageState(keys=frozenset(codes)))
+        self.driving.update(page, PageState(keys=frozenset(codes)))
         if at is not None:
             self.driving.step(at)
 
@@ -182,38 +171,33 @@ def test_the_first_page_drives_until_it_releases_or_goes_away(deck):
     assert len(deck.heard) == 1
     deck.hold(at=0.4)
     assert deck.heard[-1] == ("steer", 1.2, pytest.approx(-90.0))
-    deck.driving.hear(1, None)
+    deck.driving.update(1, None)
     deck.driving.step(0.5)
     assert deck.heard[-1] == ("steer", 0.0, None)
 
 
-def test_single_keys_act_once_and_q_and_e_orbit_as_long_as_they_are_held(deck):
+def test_single_keys_act_once(deck):
     deck.hold("KeyX", at=0.0)
     deck.hold("KeyX", "KeyP", at=5.0)
-    assert deck.heard == [("act", KeyAction.STAND), ("act", KeyAction.PAUSE)]
-    for k in range(3):
-        deck.hold("KeyQ", at=6 + k / 60)
-    assert deck.heard[-1] == ("orbit", pytest.approx(math.radians(100) / 60, abs=1e-5))
+    assert deck.heard == [("act", "KeyX"), ("act", "KeyP")]
 
 
 def test_a_stick_walks_with_its_push_a_trigger_runs_and_an_unplugged_gamepad_stands(deck):
-    def push(at: float, *axes: float, **pressed: float) -> tuple:
-        deck.driving.hear(0, PageState(pad=pad(*axes, **pressed)))
+    def push(at: float, right: float, down: float, trigger: float = 0.0) -> list[tuple]:
+        deck.driving.update(0, PageState(stick=(right, down, trigger)))
         deck.driving.step(at)
-        return deck.heard[-1]
+        return deck.heard[-1:]
 
-    assert push(0.0, 0.1, -0.1)[0] == "note", "sticks never rest at zero"
-    assert push(0.1, 0.0, -1.0) == ("steer", 1.2, pytest.approx(90.0))
-    assert push(0.3, 0.0, -1.0, b7=1.0)[1] == pytest.approx(2.85)
-    assert push(0.5, 0.565, 0.0) == ("steer", pytest.approx(0.6), pytest.approx(0.0))
-    deck.driving.hear(0, PageState())
+    assert push(0.0, 0.1, -0.1) == [], "sticks never rest at zero"
+    assert push(0.1, 0.0, -1.0) == [("steer", 1.2, pytest.approx(90.0))]
+    assert push(0.3, 0.0, -1.0, 1.0) == [("steer", pytest.approx(2.85), pytest.approx(90.0))]
+    assert push(0.5, 0.565, 0.0) == [("steer", pytest.approx(0.6), pytest.approx(0.0))]
+    deck.driving.update(0, PageState())
     deck.driving.step(0.7)
-    assert deck.heard[-2:] == [("note", "unplugged; the character stands"), ("steer", 0.0, None)]
+    assert deck.heard[-1] == ("steer", 0.0, None)
 
 
-def test_buttons_act_when_they_are_pressed_and_directions_add_up():
-    assert list_presses(None, pad(b0=1.0)) == [KeyAction.STAND]
-    assert list_presses(pad(b0=1.0), pad(b0=1.0, b3=1.0)) == [KeyAction.NEXT]
+def test_directions_add_up():
     assert find_direction({"KeyW", "ArrowUp", "KeyD"}) == pytest.approx((0.5**0.5, 0.5**0.5))
     assert find_direction({"KeyW", "KeyS"}) is None
     text = " ".join(key for key, _ in HELP)
@@ -227,7 +211,7 @@ ANYTHING = st.one_of(
 CHANGES = st.dictionaries(st.sampled_from(["speed", "heading", "facing", "step_length"]), ANYTHING)
 
 
-@settings(suppress_health_check=[HealthCheck.too_slow])  # on a starved core
+@settings(max_examples=40, suppress_health_check=[HealthCheck.too_slow])  # on a starved core
 @given(CHANGES, CHANGES)
 def test_whatever_is_asked_the_inputs_are_a_command_within_limits(first, second):
     inputs = SteeringInputs()
