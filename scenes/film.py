@@ -4,7 +4,7 @@ import logging
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from fractions import Fraction
 from functools import partial
 from importlib import import_module
@@ -30,26 +30,10 @@ Write = Callable[[Array], None]
 _QUALITY = {"crf": "19", "preset": "veryfast"}
 _BT709 = 1
 """Code of the HD colour standard in the stream's tags; players that find none guess by the picture's size."""
-_GIF_COLOURS = 255
 _LOOP_FPS = 50
 """Browsers slow down loops of pictures that are faster."""
-
-
-@dataclass(frozen=True)
-class _Loop:
-    """A format of pictures that repeat for ever. All are held in memory until they are written."""
-
-    name: str
-    """Name of the format."""
-    tick: int
-    """Milliseconds in which it counts."""
-    most_pixels: int
-    """Pixels that all pictures may have together."""
-    quality: int = 0
-    """Quality, 0 to 100, where the format loses some."""
-
-
-_GIF, _WEBP = _Loop("GIF", 10, 600_000_000), _Loop("WebP", 1, 200_000_000, quality=75)
+_LOOP_PIXELS = 300_000_000
+"""Pixels that all pictures of a loop may have together: they are held in memory until they are written."""
 
 
 @contextmanager
@@ -79,48 +63,30 @@ def mp4_writer(path: Path, size: tuple[int, int], fps: Fraction) -> Iterator[Wri
 
 
 @contextmanager
-def _loop_writer(form: _Loop, path: Path, size: tuple[int, int], fps: Fraction) -> Iterator[Write]:
-    """Yield a function that adds a picture to a looping GIF, in which all share one palette, or WebP, in all colours.
+def _loop_writer(name: str, tick: int, path: Path, size: tuple[int, int], fps: Fraction) -> Iterator[Write]:
+    """Yield a function that adds a picture to a looping GIF or WebP.
 
-    Delays alternate between ticks of the format so that the whole keeps its time. Over 50 pictures a second only every
-    second, third, ... is kept. RequestError when it outgrows the pixels of its form.
+    Delays alternate between ticks of the format, milliseconds, so that the whole keeps its time. Over 50 pictures a
+    second only every second, third, ... is kept. RequestError when it outgrows memory.
     """
     image = _import_package("PIL.Image")
     stride, count, pictures = math.ceil(fps / _LOOP_FPS), 0, []
-    most = form.most_pixels // (size[0] * size[1])
+    most = _LOOP_PIXELS // (size[0] * size[1])
 
     def write(picture: Array) -> None:
         nonlocal count
-        count += 1
-        if (count - 1) % stride == 0:
+        if count % stride == 0:
             if len(pictures) == most:
-                found = f"a {form.name} of {size[0]}x{size[1]} can have {most} pictures"
+                found = f"a {name} of {size[0]}x{size[1]} can have {most} pictures"
                 raise RequestError(f"{found}; shrink it or write an MP4")
-            first = pictures[0] if pictures else None
-            pictures.append(_quantize(image, picture, first) if form is _GIF else image.fromarray(picture))
+            pictures.append(image.fromarray(picture))
+        count += 1
 
     yield write
-    ends = [round(1000 // form.tick * min((k + 1) * stride, count) / fps) for k in range(len(pictures))]
-    delays = [form.tick * max(stop - start, 1) for start, stop in zip([0, *ends], ends, strict=False)]
+    ends = [round(1000 // tick * min((k + 1) * stride, count) / fps) for k in range(len(pictures))]
+    delays = [tick * max(stop - start, 1) for start, stop in zip([0, *ends], ends, strict=False)]
     first, *others = pictures
-    first.save(path, form.name, save_all=True, append_images=others, duration=delays, loop=0, quality=form.quality)
-
-
-def _quantize(image, picture: Array, first):
-    """Quantise with the palette of the first picture, or for the first with one of its own."""
-    whole, plain = image.fromarray(picture), image.Dither.NONE
-    if first is None:
-        sample = image.fromarray(np.concatenate([picture, _make_swatches(picture.shape[1], picture.shape[0] // 12)]))
-        first = sample.quantize(_GIF_COLOURS, method=image.Quantize.MAXCOVERAGE, dither=plain)
-    return whole.quantize(palette=first, dither=plain)
-
-
-def _make_swatches(width: int, height: int) -> Array:
-    """Make (4 * ceil(height / 4), width, 3): colours in light and shade that the first picture may lack."""
-    shown = (colours.LEFT, colours.RIGHT, colours.TARGET, colours.TRAIL)
-    light = np.linspace(0.55, 1.0, width)[:, None]
-    rows = np.stack([colours.rgb(colour) * light * 255 for colour in shown])
-    return np.repeat(rows.astype(np.uint8), math.ceil(height / len(shown)), axis=0)
+    first.save(path, name, save_all=True, append_images=others, duration=delays, loop=0, quality=75)
 
 
 def save_png(path: Path, picture: Array) -> None:
@@ -156,17 +122,8 @@ def draw_contact_sheet(stage: Stage, brush: Painter, camera: CameraSettings, siz
     count, tall, kind = 4, size[1] / size[0], camera.kind
     if len(stage.players) == 1:
         count, tall, kind = 6, 1.15, "top" if camera.kind == "top" else "follow"
-    gap = max(2, round(_GAP * size[0]))
-    width = (size[0] - (count - 1) * gap) // count
-    height = max(1, round(width * tall))
-    sheet = np.full((size[1] + gap + height, size[0], 3), 255, np.uint8)
-    sheet[: size[1]] = top
-    views = stage.views(replace(camera, kind=kind), (width, height))
-    for k, moment in enumerate(_space_evenly(stage.num_frames - 1, count)):
-        left = round(k * (size[0] - width) / (count - 1))
-        still = _add_label(brush.paint(views[moment], stage.content(moment)), f"{moment / float(stage.fps):.1f} s")
-        sheet[size[1] + gap :, left : left + width] = still
-    return sheet
+    gap = np.full((_measure_gap(size[0]), size[0], 3), 255, np.uint8)
+    return np.concatenate([top, gap, _draw_stills(stage, brush, replace(camera, kind=kind), size[0], count, tall)])
 
 
 def draw_strips(
@@ -174,19 +131,31 @@ def draw_strips(
 ) -> Array:
     """Draw a row of stills of each stage, at the same shares of its time, below each other and under its name: (height,
     width, 3) uint8 of the given width, all rows together as high as they come."""
-    gap = max(2, round(_GAP * size[0]))
-    width = (size[0] - (_STRIP_STILLS - 1) * gap) // _STRIP_STILLS
-    height = round(width * _STRIP_SHAPE)
-    sheet = np.full((len(strips) * (height + gap) - gap, size[0], 3), 255, np.uint8)
-    for row, (name, stage) in enumerate(strips):
-        views, top = stage.views(camera, (width, height)), row * (height + gap)
-        for k, moment in enumerate(_space_evenly(stage.num_frames - 1, _STRIP_STILLS)):
-            left, label = k * (width + gap), f"{moment / float(stage.fps):.1f} s"
-            picture = _add_label(
-                brush.paint(views[moment], stage.content(moment)), label if k else name.replace(" and ", "\n")
-            )
-            sheet[top : top + height, left : left + width] = picture
-    return sheet
+    rows, gap = [], np.full((_measure_gap(size[0]), size[0], 3), 255, np.uint8)
+    for name, stage in strips:
+        name = name.replace(" and ", "\n")
+        rows += [gap, _draw_stills(stage, brush, camera, size[0], _STRIP_STILLS, _STRIP_SHAPE, name)]
+    return np.concatenate(rows[1:])
+
+
+def _draw_stills(
+    stage: Stage, brush: Painter, camera: CameraSettings, width: int, count: int, tall: float, name: str = ""
+) -> Array:
+    """Draw a row of stills, `tall` times as high as wide, each under its time or the first under a name."""
+    gap = _measure_gap(width)
+    each = (width - (count - 1) * gap) // count
+    height = max(1, round(each * tall))
+    row = np.full((height, width, 3), 255, np.uint8)
+    views = stage.views(camera, (each, height))
+    for k, moment in enumerate(_space_evenly(stage.num_frames - 1, count)):
+        left = round(k * (width - each) / (count - 1))
+        label = f"{moment / float(stage.fps):.1f} s" if k or not name else name
+        row[:, left : left + each] = _add_label(brush.paint(views[moment], stage.content(moment)), label)
+    return row
+
+
+def _measure_gap(width: int) -> int:
+    return max(2, round(_GAP * width))
 
 
 def _space_evenly(last: int, count: int) -> list[int]:
@@ -197,15 +166,14 @@ def _choose_ghost_frames(stage: Stage) -> list[int]:
     """Choose frames about a stride apart for the actor that goes furthest, less the first where a loop ends there."""
     paths = [player.body.anatomy.hips_world[:, [0, 2]] for player in stage.players]
     lengths = [np.linalg.norm(np.diff(path, axis=0), axis=1).sum() for path in paths]
-    most = max(4, _MAX_GHOSTS // len(paths))
-    furthest = paths[int(np.argmax(lengths))]
+    furthest, last = paths[int(np.argmax(lengths))], stage.num_frames - 1
     # Swaying on the spot makes a long path, too, that leads nowhere.
     reach = np.linalg.norm(furthest - furthest[0], axis=1).max()
-    count = min(round(min(max(lengths), 2 * reach) / _GHOST_STRIDE) + 1, most)
+    count = min(round(min(max(lengths), 2 * reach) / _GHOST_STRIDE) + 1, max(4, _MAX_GHOSTS // len(paths)))
     if count == 1:
         return [stage.num_frames // 2]
     loop = max(lengths) > 3 * _GHOST_STRIDE and np.linalg.norm(furthest[-1] - furthest[0]) < _GHOST_STRIDE
-    return _space_evenly(stage.num_frames - 1, count + 1)[1:] if loop else _space_evenly(stage.num_frames - 1, count)
+    return _space_evenly(last, count + loop)[int(loop) :]
 
 
 def _add_label(picture: Array, text: str) -> Array:
@@ -218,7 +186,7 @@ def _add_label(picture: Array, text: str) -> Array:
     return np.asarray(image)
 
 
-WRITERS = {".mp4": mp4_writer, ".gif": partial(_loop_writer, _GIF), ".webp": partial(_loop_writer, _WEBP)}
+WRITERS = {".mp4": mp4_writer, ".gif": partial(_loop_writer, "GIF", 10), ".webp": partial(_loop_writer, "WebP", 1)}
 ENDINGS = (*WRITERS, ".png")
 """Endings that `film` can write."""
 _MIN_PIXELS, _MAX_PIXELS = 16, 8192
@@ -254,16 +222,11 @@ def film(
     stage = Stage(shots, fps, props)
     if brush.name == STICK_FIGURES and any(shot.drawn is not None for shot in shots):
         _log.warning("stick figures show no mesh: characters are drawn by their bones")
-    moving, sheets = (
-        [p for p in paths if p.suffix.lower() in WRITERS],
-        [p for p in paths if p.suffix.lower() == ".png"],
-    )
-    if moving:
+    if moving := [path for path in paths if path.suffix.lower() in WRITERS]:
         _write_films(moving, stage, brush, camera, size, progress)
-    if sheets:
-        picture = draw_contact_sheet(stage, brush, camera, size)
-        for path in sheets:
-            save_png(path, picture)
+    for path in paths:
+        if path not in moving:
+            save_png(path, draw_contact_sheet(stage, brush, camera, size))
     return paths
 
 
@@ -310,12 +273,6 @@ def check_outputs(out: Sequence[PathOrText], size: tuple[int, int]) -> list[Path
     return [Path(path) for path in out]
 
 
-def render_frames(stage: Stage, brush: Painter, camera: CameraSettings, size: tuple[int, int]) -> Iterator[Array]:
-    """Render every picture of a film in turn, (height, width, 3) uint8."""
-    for frame, view in enumerate(stage.views(camera, size)):
-        yield brush.paint(view, stage.content(frame))
-
-
 def _write_films(
     paths: Sequence[Path],
     stage: Stage,
@@ -325,12 +282,13 @@ def _write_films(
     progress: Callable[[int, int], None] | None,
 ) -> None:
     with ExitStack() as open_files:
-        writers: list[Any] = []
+        writers: list[Write] = []
         for path in paths:
             scratch = open_files.enter_context(atomic.atomic_path(path))
             writers.append(open_files.enter_context(WRITERS[path.suffix.lower()](scratch, size, stage.fps)))
-        for done, picture in enumerate(render_frames(stage, brush, camera, size), start=1):
+        for frame, view in enumerate(stage.views(camera, size)):
+            picture = np.ascontiguousarray(brush.paint(view, stage.content(frame)))
             for write in writers:
-                write(np.ascontiguousarray(picture))
+                write(picture)
             if progress is not None:
-                progress(done, stage.num_frames)
+                progress(frame + 1, stage.num_frames)

@@ -252,10 +252,7 @@ class SkinnedBody:
     def surface(self, frame: int) -> Surface:
         """Return the mesh in one frame; it is open, as clothes and hair are, and seen from both sides."""
         vertices, normals = self._mesh.pose(self._places[frame], self._turns[frame])
-        fine = self._mesh.fine
-        if fine is None:
-            return Surface(vertices, self._mesh.faces, self._mesh.rgba, normals, is_open=True)
-        return Surface(fine.spread(vertices), fine.faces, fine.rgba, unit(fine.spread(normals)), is_open=True)
+        return Surface(vertices, self._mesh.faces, self._mesh.rgba, normals, is_open=True)
 
     def sticks(self, frame: int) -> tuple[Array, Array, Array]:
         """Return all bones in one frame: ends (n, 2, 3) and radii (n,) in metres, colours (n, 3) sRGB."""

@@ -67,25 +67,17 @@ def vertices_of(body, frame: int) -> np.ndarray:
     return body.surface(frame).vertices
 
 
-def refined(mesh: CharacterMesh, vertices: np.ndarray) -> np.ndarray:
-    """Where the points that are drawn are, if the file's vertices are here."""
-    fine = mesh.fine
-    assert fine is not None, "there is a picture"
-    return np.einsum("nc,nck->nk", fine.shares, vertices[fine.corners])
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", MAKES)
 def test_a_character_in_its_own_motion_is_where_its_file_has_it(made, name):
     path, viewer = made[name].path, GlbViewer(made[name].path)
     motion = formats.load(path)
     drawn = DrawnCharacter.load(path).put_on(motion)
-    mesh = drawn.mesh
     assert drawn.notes == ()
     assert drawn.placed.motion is motion, "nothing is converted"
     body = drawn.build_body(motion.fps, GREY)
     for frame in (0, 7, 19, 30):
-        wanted = refined(mesh, viewer.skinned(0, frame / 30))
+        wanted = viewer.skinned(0, frame / 30)
         np.testing.assert_allclose(vertices_of(body, frame), wanted, atol=1e-5)
 
 
@@ -98,7 +90,7 @@ def test_any_motion_is_put_on_it_as_convert_does(made, name, tmp_path):
     drawn.placed.motion.save(written)
     viewer, body = GlbViewer(written), drawn.build_body(clip.fps, GREY)
     for frame in (0, 20, 44):
-        wanted = refined(drawn.mesh, viewer.skinned(0, frame / 30))
+        wanted = viewer.skinned(0, frame / 30)
         np.testing.assert_allclose(vertices_of(body, frame), wanted, atol=1e-5)
     own = RiggedCharacter.of(DrawnCharacter.load(path).standing)[1]
     expected = own.on_rig(retarget_motion(clip, own).motion)

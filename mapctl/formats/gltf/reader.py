@@ -44,7 +44,7 @@ from mapctl.formats.parts import (
     sample_picture,
 )
 from mapctl.formats.text import check_extent
-from mapctl.mesh.character_mesh import MOST_CELLS, CharacterMesh, Refinement, choose_cell, merge_meshes, refine
+from mapctl.mesh.character_mesh import CharacterMesh, merge_meshes
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL, Skeleton
 
@@ -534,48 +534,6 @@ def read_bones(gltf: GltfFile) -> dict[str, int]:
     return {bone["bone"]: bone["node"] for bone in bones}
 
 
-@dataclass(frozen=True, eq=False)
-class Paint:
-    """What gives a primitive its colours."""
-
-    linear: Array
-    """(n, 4) factor at each vertex in proportion to light, and opacity."""
-    places: Array | None
-    """(n, 2) where in the picture vertices are, 0 to 1 across and down; None without a picture."""
-    picture: Array | None
-    """(height, width, 4) sRGB, 0 to 255."""
-    blended: bool
-    """Whether one sees through what is not opaque."""
-
-    def colours(self, corners: Array, shares: Array) -> Array:
-        """Return the colours (n, 4), sRGB and opacity, 0 to 1, of points on triangles: see `refinement.Paint`."""
-        linear = np.einsum("nc,nck->nk", shares, self.linear[corners])
-        light = linear[:, :3]
-        if self.places is not None and self.picture is not None:
-            texels = sample_picture(self.picture, np.einsum("nc,nck->nk", shares, self.places[corners]))
-            light, linear[:, 3] = light * decode_srgb(texels[:, :3]), linear[:, 3] * texels[:, 3]
-        rgba = np.column_stack([encode_srgb(light), linear[:, 3]])
-        if not self.blended:
-            rgba[:, 3] = 1.0
-        return rgba.clip(0.0, 1.0)
-
-    def at_vertices(self) -> Array:
-        """Return the colours of the vertices, (n, 4)."""
-        corners = np.repeat(np.arange(len(self.linear))[:, None], 3, axis=1)
-        return self.colours(corners, np.tile([1.0, 0.0, 0.0], (len(corners), 1)))
-
-    def coarsen(self, vertices: Array, faces: Array, cell: float) -> "Paint":
-        """Average what of the picture lies within cells of this length, metres, on the triangles, so that points
-        between which there is more show no noise."""
-        if self.picture is None or self.places is None:
-            return self
-        size = np.array(self.picture.shape[1::-1])
-        corners, inside = vertices[faces], size * self.places[faces]
-        lengths, texels = (np.linalg.norm(at - np.roll(at, 1, axis=1), axis=2).sum() for at in (corners, inside))
-        factor = int(min(cell * texels / max(lengths, 1e-9), *(size / 4)))
-        return self if factor < 2 else replace(self, picture=_shrink(self.picture, factor))
-
-
 @refuse_malformed
 def load_mesh(path: str | PathLike[str]) -> CharacterMesh:
     """Read the mesh of a character: what its skins carry, and what hangs on its joints rigidly. `path` chooses as in
@@ -609,28 +567,14 @@ def load_mesh(path: str | PathLike[str]) -> CharacterMesh:
             rows, shares = np.zeros((len(points), 1), np.int64), np.ones((len(points), 1))
             if skin is not None:
                 rows, shares = _read_carriers(gltf, primitive, len(joints), len(points), what)
-            faces, plain = _read_faces(gltf, primitive, len(points), what), np.ones((len(points), 4))
-            placed = build_part(gltf.path, MeshPart(points, faces, plain, joints, matrices, rows, shares), frames)
-            rgba, fine = _read_colours(gltf, primitive, placed.vertices, faces, what)
-            found.append(replace(placed, rgba=rgba, fine=fine))
+            faces, rgba = (
+                _read_faces(gltf, primitive, len(points), what),
+                read_colours(gltf, primitive, len(points), what),
+            )
+            found.append(build_part(gltf.path, MeshPart(points, faces, rgba, joints, matrices, rows, shares), frames))
     if not found:
         raise FileFormatError(gltf.path, f"armature {armature.name!r} carries no triangles")
     return merge_meshes(found)
-
-
-def _read_colours(
-    gltf: GltfFile, primitive: Json, vertices: Array, faces: Array, what: str
-) -> tuple[Array, Refinement | None]:
-    """Return the vertices' colours, and finer triangles where a picture shows more than these can."""
-    paint = read_paint(gltf, primitive, len(vertices), what)
-    if paint.picture is None or not len(faces):
-        return paint.at_vertices(), None
-    share = MOST_CELLS // sum(len(mesh.get("primitives", ())) for mesh in gltf.all("meshes"))
-    wrong, cell = choose_cell(vertices, faces, paint.colours, share)
-    if not wrong.any():
-        return paint.at_vertices(), None
-    paint = paint.coarsen(vertices, faces, cell)
-    return paint.at_vertices(), refine(vertices, faces, wrong, cell, paint.colours)
 
 
 def _read_carriers(gltf: GltfFile, primitive: Json, known: int, count: int, what: str) -> tuple[Array, Array]:
@@ -672,14 +616,14 @@ def _read_faces(gltf: GltfFile, primitive: Json, count: int, what: str) -> Array
     return np.stack([np.full(max(len(order) - 2, 0), order[0]), order[1:-1], order[2:]], axis=1)
 
 
-def read_paint(gltf: GltfFile, primitive: Json, count: int, what: str) -> Paint:
-    """Read what gives a primitive of `count` vertices its colours.
+def read_colours(gltf: GltfFile, primitive: Json, count: int, what: str) -> Array:
+    """Read the colours of a primitive's `count` vertices, (n, 4): sRGB and opacity, 0 to 1.
 
     Without the package pillow, or of a kind that it does not know, a picture's place is taken by the material's plain
     colour.
     """
     material = {} if primitive.get("material") is None else gltf.get("materials", primitive["material"])
-    look, blended = material.get("pbrMetallicRoughness", {}), material.get("alphaMode") == "BLEND"
+    look = material.get("pbrMetallicRoughness", {})
     linear = np.tile(np.array(look.get("baseColorFactor", (1.0, 1.0, 1.0, 1.0)), np.float64), (count, 1))
     if "COLOR_0" in primitive["attributes"]:
         own = read_accessor(gltf, primitive["attributes"]["COLOR_0"], "VEC3", "VEC4").astype(np.float64)
@@ -688,8 +632,11 @@ def read_paint(gltf: GltfFile, primitive: Json, count: int, what: str) -> Paint:
         linear[:, : own.shape[1]] *= own
     texture = look.get("baseColorTexture")
     shown = None if texture is None else _read_shown(gltf, primitive, texture, count)
-    places, picture = (None, None) if shown is None else shown
-    return Paint(linear, places, picture, blended)
+    if shown is not None:
+        texels = sample_picture(shown[1], shown[0])
+        linear *= np.column_stack([decode_srgb(texels[:, :3]), texels[:, 3]])
+    opacity = linear[:, 3:] if material.get("alphaMode") == "BLEND" else np.ones((count, 1))
+    return np.concatenate([encode_srgb(linear[:, :3]), opacity], axis=1).clip(0.0, 1.0)
 
 
 def _read_shown(gltf: GltfFile, primitive: Json, info: Json, count: int) -> tuple[Array, Array] | None:
@@ -704,13 +651,6 @@ def _read_shown(gltf: GltfFile, primitive: Json, info: Json, count: int) -> tupl
     if len(where) != count:
         raise FileFormatError(gltf.path, f"{name} has {len(where)} rows for {count} vertices")
     return where, picture
-
-
-def _shrink(picture: Array, factor: int) -> Array:
-    """Average squares of so many texels; what is left over at the edges counts as the last square's."""
-    height, width = (side // factor for side in picture.shape[:2])
-    squares = picture[: height * factor, : width * factor].reshape(height, factor, width, factor, 4)
-    return squares.mean(axis=(1, 3))
 
 
 def _read_picture(gltf: GltfFile, texture: int) -> Array | None:
