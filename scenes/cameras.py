@@ -113,14 +113,11 @@ def fit_eye(points: Array, axes: Array, *, fov: float, aspect: float) -> Array:
     """
     right, up, back = (points @ axes).T
     wide, high = aspect * np.tan(fov / 2), np.tan(fov / 2)
-    away = max(_find_apex(right, back, wide), _find_apex(up, back, high))
+    # How far back the tightest wedge starts that opens over all points, left and right, and up and down.
+    wedges = ((right, wide), (up, high))
+    away = max(((across / s + back).max() + (-across / s + back).max()) / 2 for across, s in wedges)
     depth = away - back
     return axes @ np.array([_find_centre(right, depth), _find_centre(up, depth), away])
-
-
-def _find_apex(across: Array, back: Array, slope: float) -> float:
-    """Find how far back the tightest wedge of a slope starts that opens over all points."""
-    return float(((across / slope + back).max() + (-across / slope + back).max()) / 2)
 
 
 def _find_centre(across: Array, depth: Array) -> float:
@@ -151,9 +148,9 @@ def compute_views(
     seen = seen[:: max(1, len(seen) // _MAX_FRAMES)].reshape(-1, 3)
     framed = 2 * np.arctan(np.tan(fov / 2) * settings.zoom / _FRAMING_MARGIN)
     eye = fit_eye(seen, axes, fov=framed, aspect=size[0] / size[1])
-    pose = np.eye(4)
-    pose[:3, :3] = axes
-    return [View(_move_camera(pose, eye + shift), float(fov), *size) for shift in centre]
+    poses = np.tile(np.eye(4), (len(centre), 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = axes, eye + centre
+    return [View(pose, float(fov), *size) for pose in poses]
 
 
 def _smooth(path: Array, sigma: float) -> Array:
@@ -161,9 +158,3 @@ def _smooth(path: Array, sigma: float) -> Array:
     margin = math.ceil(3 * sigma)
     longer = np.pad(path, ((margin, margin), (0, 0)), mode="reflect", reflect_type="odd")
     return scipy.ndimage.gaussian_filter1d(longer, sigma, axis=0, truncate=3.0)[margin : margin + len(path)]
-
-
-def _move_camera(pose: Array, eye: Array) -> Array:
-    moved = pose.copy()
-    moved[:3, 3] = eye
-    return moved

@@ -51,12 +51,12 @@ class DrawnMotion:
     def build_body(self, fps: Fraction, colour: Array) -> SkinnedBody:
         """Build the body at a film's rate; `colour` is that of its bones (red, green, blue, 0 to 1), where these are
         drawn."""
-        return _build_body(self.mesh, self.placed, fps, colour)
+        bones = replace(self.placed.bones, source=None).resample(fps)
+        return SkinnedBody(self.mesh, self.placed.motion.resample(fps), Mannequin(bones, colour))
 
     def build_pose(self, pose: Motion, colour: Array) -> SkinnedBody:
-        """Build the body in one frame of the giver's skeleton; `colour` is that of its bones (red, green, blue, 0 to
-        1), where these are drawn."""
-        return _build_body(self.mesh, self.place(pose), pose.fps, colour)
+        """Build the body in one frame of the giver's skeleton; `colour` as of `build_body`."""
+        return replace(self, placed=self.place(pose)).build_body(pose.fps, colour)
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,10 +100,10 @@ class DrawnCharacter:
         are retargeted (mapctl.retarget.carry), as by `mapctl convert --rig`. RequestError where the joints of either
         cannot be identified.
         """
-        place = self._choose_way(motion)
+        place = self._choose_conversion(motion)
         return DrawnMotion(self.mesh, place(motion), place)
 
-    def _choose_way(self, motion: Motion) -> Callable[[Motion], Placed]:
+    def _choose_conversion(self, motion: Motion) -> Callable[[Motion], Placed]:
         if motion.skeleton.matches(self.standing.skeleton, _SAME_BONE):
             return _keep
         for rigmap in (self.body.leveled_map, self.body.rigmap):
@@ -124,8 +124,3 @@ def _keep(motion: Motion) -> Placed:
         return Placed(upright, to_canonical(upright)[0])
     except RequestError:  # a creature, whose joints are drawn all the same
         return Placed(upright, upright)
-
-
-def _build_body(mesh: CharacterMesh, placed: Placed, fps: Fraction, colour: Array) -> SkinnedBody:
-    motion, bones = placed.motion.resample(fps), replace(placed.bones, source=None).resample(fps)
-    return SkinnedBody(mesh, motion, Mannequin(bones, colour))

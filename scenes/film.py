@@ -173,7 +173,7 @@ def _choose_ghost_frames(stage: Stage) -> list[int]:
     if count == 1:
         return [stage.num_frames // 2]
     loop = max(lengths) > 3 * _GHOST_STRIDE and np.linalg.norm(furthest[-1] - furthest[0]) < _GHOST_STRIDE
-    return _space_evenly(last, count + loop)[int(loop) :]
+    return _space_evenly(last, count + 1)[1:] if loop else _space_evenly(last, count)
 
 
 def _add_label(picture: Array, text: str) -> Array:

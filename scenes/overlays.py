@@ -10,18 +10,12 @@ from mapctl.curves.obstacles import Obstacle
 from mapctl.mesh import colours
 from mapctl.mesh.primitives import Array, Surface, merge_surfaces, unit, unit_sphere
 
-TILE_HEIGHT, LINE_HEIGHT, TARGET_HEIGHT, TRAIL_HEIGHT, MARK_HEIGHT, SHADOW_HEIGHT = (
-    0.0,
-    0.002,
-    0.004,
-    0.006,
-    0.008,
-    0.010,
-)
+TILE_HEIGHT, LINE_HEIGHT, TARGET_HEIGHT, TRAIL_HEIGHT, MARK_HEIGHT, SHADOW_HEIGHT = np.arange(6) * 0.002
 LIGHT = unit(np.array([-0.34, -1.0, -0.28]))
 """Direction in which the light of the shadows travels."""
 _LINE, _MAJOR_LINE = 0.014, 0.03
 _MAX_TILES = 60
+_SQUARE = np.array([[0, 0], [0, 1], [1, 1], [1, 0]])
 _FADE_START, _FADE_END = 2.0, 6.5
 _SHADOW_CELLS = 52
 _SHADOW_STRENGTH = 0.5
@@ -38,46 +32,32 @@ def build_grid(places: Array) -> Surface:
         step *= 5
     first, last = np.floor(low / step).astype(int), np.ceil(high / step).astype(int)
     x, z = (np.arange(a, b + 1) for a, b in zip(first, last, strict=True))
-    tree = scipy.spatial.KDTree(places)
-    tiles = _build_tiles(x, z, step)
+    a, b = np.meshgrid(x[:-1], z[:-1], indexing="ij")
+    dark = (a + b) % 2 == 0  # every second square of a chessboard
+    tiles = (np.stack([a[dark], b[dark]], axis=-1)[:, None] + _SQUARE) * step
     lines = [_build_lines(x, z, step), _build_lines(z, x, step)[:, ::-1, ::-1]]
     strong = np.concatenate([np.repeat(x % 5 == 0, len(z) - 1), np.repeat(z % 5 == 0, len(x) - 1)])
-    quads = np.concatenate([tiles, *lines])
-    height = np.repeat([TILE_HEIGHT, LINE_HEIGHT], [len(tiles), len(strong)])
-    rgb = np.where(np.arange(len(quads))[:, None] < len(tiles), colours.rgb(colours.TILE), colours.rgb(colours.GRID))
+    quads, is_tile = np.concatenate([tiles, *lines]), np.arange(len(tiles) + len(strong)) < len(tiles)
     strength = np.concatenate([np.ones(len(tiles)), np.where(strong, 1.0, 0.62)])
-    return _fade_quads(quads, height, rgb, strength, tree)
-
-
-def _build_tiles(x: Array, z: Array, step: float) -> Array:
-    """Build every second square of a chessboard, (quads, 4, 2)."""
-    a, b = np.meshgrid(x[:-1], z[:-1], indexing="ij")
-    dark = (a + b) % 2 == 0
-    corner = np.stack([a[dark], b[dark]], axis=-1)[:, None]
-    return (corner + np.array([[0, 0], [0, 1], [1, 1], [1, 0]])) * step
+    # Colours fade to the background's, opaque, for eight bits of opacity show as rings.
+    distance = scipy.spatial.KDTree(places).query(quads.reshape(-1, 2))[0].reshape(-1, 4)
+    share = np.clip((_FADE_END - distance) / (_FADE_END - _FADE_START), 0, 1)
+    shown = strength[:, None] * share * share * (3 - 2 * share)
+    kept = shown.max(axis=1) > 0
+    height = np.repeat(np.where(is_tile, TILE_HEIGHT, LINE_HEIGHT)[kept], 4)
+    rgb = np.where(is_tile[:, None], colours.rgb(colours.TILE), colours.rgb(colours.GRID))[kept].repeat(4, axis=0)
+    rgb = colours.blend_colours(colours.rgb(colours.BACKGROUND), rgb, shown[kept].reshape(-1, 1))
+    vertices = np.insert(quads[kept].reshape(-1, 2), 1, height, axis=1)
+    faces = _triangulate_quads(np.arange(len(vertices)).reshape(-1, 4))
+    return Surface(vertices, faces, np.column_stack([rgb, np.ones(len(rgb))]))
 
 
 def _build_lines(x: Array, z: Array, step: float) -> Array:
     """Build lines along z in pieces of one square, so that they can fade, (quads, 4, 2)."""
-    a, b = np.meshgrid(x, z[:-1], indexing="ij")
-    half = np.where(a % 5 == 0, _MAJOR_LINE, _LINE).reshape(-1, 1) / 2 * step**0.5
-    left, right = a.reshape(-1, 1) * step - half, a.reshape(-1, 1) * step + half
-    near, far = b.reshape(-1, 1) * step, (b.reshape(-1, 1) + 1) * step
-    return np.stack([np.concatenate([left, left, right, right], 1), np.concatenate([near, far, far, near], 1)], axis=-1)
-
-
-def _fade_quads(quads: Array, height: Array, rgb: Array, strength: Array, tree: "scipy.spatial.KDTree") -> Surface:
-    """Build quads whose colours fade to the background's; opaque, for eight bits of opacity show as rings."""
-    distance = tree.query(quads.reshape(-1, 2))[0].reshape(-1, 4)
-    share = np.clip((_FADE_END - distance) / (_FADE_END - _FADE_START), 0, 1)
-    shown = strength[:, None] * share * share * (3 - 2 * share)
-    kept = shown.max(axis=1) > 0
-    quads, shown, many = quads[kept], shown[kept], int(kept.sum())
-    vertices = np.insert(quads, 1, np.broadcast_to(height[kept, None], (many, 4)), axis=-1).reshape(-1, 3)
-    background = colours.rgb(colours.BACKGROUND)
-    colour = colours.blend_colours(background, np.repeat(rgb[kept], 4, axis=0), shown.reshape(-1, 1))
-    rgba = np.concatenate([colour, np.ones((4 * many, 1))], axis=1)
-    return Surface(vertices, _triangulate_quads(np.arange(4 * many).reshape(-1, 4)), rgba)
+    a, b = (values.reshape(-1, 1, 1) for values in np.meshgrid(x, z[:-1], indexing="ij"))
+    width = np.where(a % 5 == 0, _MAJOR_LINE, _LINE) * step**0.5
+    across = a * step + width * (_SQUARE[:, :1] - 0.5)
+    return np.concatenate([across, (b + _SQUARE[:, 1:]) * step], axis=-1)
 
 
 def build_ribbon(points: Array, *, width: float, rgb: Array, height: float) -> Surface:
@@ -99,20 +79,16 @@ def cut_ribbon(whole: Surface, points: int) -> Surface:
 
 
 def build_discs(centres: Array, rgb: Array, *, radius: float = 0.085, corners: int = 24) -> Surface:
-    """Build marks on the ground at centres (n, 2) x, z in colours (n, 3): a pale disc with a strong rim."""
+    """Build marks on the ground at centres (n, 2) x, z in colours (n, 3): a disc that is pale in its middle."""
     turn = np.arange(corners) * 2 * np.pi / corners
-    circle = np.stack([np.sin(turn), np.cos(turn)], axis=-1)
-    rings = np.concatenate([np.zeros((1, 2)), *(circle * radius * share for share in (0.74, 0.78, 1.0))])
-    flat = (centres[:, None] + rings).reshape(-1, 2)
-    alpha = np.repeat([0.35, 0.35, 0.9, 0.9], [1, corners, corners, corners])
-    rgba = np.concatenate([np.repeat(rgb, len(rings), axis=0), np.tile(alpha, len(centres))[:, None]], axis=1)
-    ring = 1 + np.arange(3 * corners).reshape(3, corners)
-    following = np.roll(ring, -1, axis=1)
-    fan = np.stack([np.zeros(corners, int), ring[0], following[0]], axis=-1)
-    bands = [np.stack([ring[k], ring[k + 1], following[k + 1], following[k]], axis=-1) for k in range(2)]
-    faces = np.concatenate([fan, _triangulate_quads(np.concatenate(bands))])
-    shifts = len(rings) * np.arange(len(centres))[:, None, None]
-    return Surface(np.insert(flat, 1, MARK_HEIGHT, axis=1), (faces + shifts).reshape(-1, 3), rgba)
+    rim = radius * np.stack([np.sin(turn), np.cos(turn)], axis=-1)
+    flat = (centres[:, None] + np.concatenate([np.zeros((1, 2)), rim])).reshape(-1, 2)
+    alpha = np.tile(np.repeat([0.2, 0.9], [1, corners]), len(centres))
+    index = 1 + np.arange(corners)
+    fan = np.stack([np.zeros(corners, int), index, np.roll(index, -1)], axis=-1)
+    faces = fan + (corners + 1) * np.arange(len(centres))[:, None, None]
+    rgba = np.column_stack([np.repeat(rgb, corners + 1, axis=0), alpha])
+    return Surface(np.insert(flat, 1, MARK_HEIGHT, axis=1), faces.reshape(-1, 3), rgba)
 
 
 def build_arrow(start: Array, heading: float, rgb: Array, *, length: float) -> Surface:
@@ -175,33 +151,30 @@ _TARGET_RADIUS, _LOOK_RADIUS, _PLACE_RADIUS = 0.035, 0.05, 0.16  # metres
 
 
 def build_obstacle(obstacle: Obstacle) -> Surface:
-    """Build a low solid on the ground with the obstacle's outline."""
+    """Build a low solid on the ground with the obstacle's outline, its walls darker than its top."""
     outline = obstacle.outline().numpy()
     count = len(outline)
     low, high = (np.insert(outline, 1, height, axis=1) for height in (0.0, _HEIGHT))
     index = np.arange(count)
     following = np.roll(index, -1)
-    walls = np.stack([index, following, following + count, index + count], axis=1)
-    walls = np.concatenate([walls[:, [0, 1, 2]], walls[:, [0, 2, 3]]])
-    fan = np.stack([np.zeros(count - 2, int), index[1:-1], index[2:]], axis=1) + 2 * count
-    top = colours.rgb(_OBSTACLE_COLOUR)
-    rgb = np.concatenate([np.tile(_SHADE * top, (2 * count, 1)), np.tile(top, (count, 1))])
-    return _make_flat(
-        np.concatenate([low, high, high]), np.concatenate([walls, walls[:, ::-1], fan, fan[:, ::-1]]), rgb
-    )
+    walls = _triangulate_quads(np.stack([index, following, following + count, index + count], axis=1))
+    fan = np.stack([np.zeros(count - 2, int), index[1:-1], index[2:]], axis=1)
+    sides = _make_plain(np.concatenate([low, high]), np.concatenate([walls, walls[:, ::-1]]), _OBSTACLE_COLOUR)
+    sides.rgba[:, :3] *= _SHADE
+    return merge_surfaces([sides, _make_plain(high, np.concatenate([fan, fan[:, ::-1]]), _OBSTACLE_COLOUR)])
 
 
 def build_target(place: tuple[float, float, float]) -> Surface:
-    """Build a small ball at a place (x, y, z), metres, that a hand or a foot is to reach."""
+    """Build a small ball at a position (x, y, z), metres, that a hand or a foot is to reach."""
     vertices, faces = unit_sphere()
-    return _make_plain(_TARGET_RADIUS * vertices + np.array(place), faces)
+    return _make_plain(_TARGET_RADIUS * vertices + np.array(place), faces, colours.TARGET)
 
 
 def build_look_mark(place: tuple[float, float, float]) -> Surface:
-    """Build a small octahedron at a place to be looked at."""
+    """Build a small octahedron at a position to be looked at."""
     axes = np.concatenate([np.eye(3), -np.eye(3)])
     faces = np.array([[x, y, z] for x in (0, 3) for y in (1, 4) for z in (2, 5)])
-    return _make_plain(_LOOK_RADIUS * axes + np.array(place), faces)
+    return _make_plain(_LOOK_RADIUS * axes + np.array(place), faces, colours.TARGET)
 
 
 def build_hips_mark(place: Array, heading: float | None) -> Surface:
@@ -214,10 +187,5 @@ def build_hips_mark(place: Array, heading: float | None) -> Surface:
     return merge_surfaces([disc, build_arrow(place, heading, rgb, length=3 * _PLACE_RADIUS)])
 
 
-def _make_plain(vertices: Array, faces: Array) -> Surface:
-    """Make a surface in the colour of all that is asked for."""
-    return _make_flat(vertices, faces, np.tile(colours.rgb(colours.TARGET), (len(vertices), 1)))
-
-
-def _make_flat(vertices: Array, faces: Array, rgb: Array) -> Surface:
-    return Surface(vertices, faces, np.concatenate([rgb, np.ones((len(rgb), 1))], axis=1))
+def _make_plain(vertices: Array, faces: Array, colour: str) -> Surface:
+    return Surface(vertices, faces, np.tile([*colours.rgb(colour), 1.0], (len(vertices), 1)))

@@ -111,39 +111,24 @@ def list_layers(ground: Sequence[Surface], bodies: Sequence[Surface], eye: Array
 
     Sheer is the ground, and over it the triangles of bodies that are not opaque, the furthest first.
     """
-    lit = [_shade_flat(body, eye) for body in bodies]
-    solid, sheer = zip(*map(_split_sheer, lit), strict=True) if lit else ((), ())
-    hazy = [body for body in sheer if len(body.faces)]
-    layers = {
-        Layer.CLOSED: [body for body in solid if not body.is_open],
-        Layer.OPEN: [body for body in solid if body.is_open and len(body.faces)],
-        Layer.SHEER: [*(_shade_flat(one, eye) for one in ground), *_sort_far_first(hazy, eye)],
-    }
-    return {layer: merge_surfaces(surfaces) for layer, surfaces in layers.items() if surfaces}
+    layers: dict[Layer, list[Surface]] = {layer: [] for layer in Layer}
+    layers[Layer.SHEER] += [_shade_flat(surface, eye) for surface in ground]
+    for body in (_shade_flat(one, eye) for one in bodies):
+        # Vertices of opaque triangles have no opacity, by which a mesh as a whole would count as seen through.
+        solid = replace(body, rgba=np.column_stack([body.rgba[:, :3], np.ones(len(body.rgba))]))
+        is_sheer = (body.rgba[body.faces, 3] < _OPAQUE).any(axis=1)
+        layers[Layer.OPEN if body.is_open else Layer.CLOSED].append(replace(solid, faces=body.faces[~is_sheer]))
+        if is_sheer.any():
+            faces = body.faces[is_sheer]
+            away = np.linalg.norm(body.vertices[faces].mean(axis=1) - eye, axis=1)
+            layers[Layer.SHEER].append(replace(body, faces=faces[np.argsort(-away)]))
+    merged = {layer: merge_surfaces(surfaces) for layer, surfaces in layers.items() if surfaces}
+    return {layer: surface for layer, surface in merged.items() if len(surface.faces)}
 
 
 def _shade_flat(surface: Surface, eye: Array) -> Surface:
     """Put the light into the colours of the vertices."""
     return replace(surface, rgba=shade(surface, eye), normals=None)
-
-
-def _split_sheer(surface: Surface) -> tuple[Surface, Surface]:
-    """Part opaque triangles from those that are not; vertices of opaque ones tell no opacity, by which a mesh as a
-    whole would count as one that is seen through."""
-    if (surface.rgba[:, 3] >= _OPAQUE).all():
-        return surface, replace(surface, faces=surface.faces[:0])
-    hazy = (surface.rgba[surface.faces, 3] < _OPAQUE).any(axis=1)
-    plain = np.column_stack([surface.rgba[:, :3], np.ones(len(surface.rgba))])
-    return replace(surface, faces=surface.faces[~hazy], rgba=plain), replace(surface, faces=surface.faces[hazy])
-
-
-def _sort_far_first(surfaces: Sequence[Surface], eye: Array) -> list[Surface]:
-    """Merge surfaces into one whose triangles are in the order of their distance from the eye; none of none."""
-    if not surfaces:
-        return []
-    whole = merge_surfaces(surfaces)
-    away = np.linalg.norm(whole.vertices[whole.faces].mean(axis=1) - eye, axis=1)
-    return [replace(whole, faces=whole.faces[np.argsort(-away)])]
 
 
 def shade(surface: Surface, eye: Array) -> Array:
@@ -230,25 +215,16 @@ def _open_graphics() -> tuple[ModuleType, Any]:
         import pyrender
 
         return pyrender, pyrender.OffscreenRenderer(64, 64)
-    except _list_graphics_errors() as error:
+    except Exception as error:  # a missing library, driver or display raises anything between Python and EGL
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise NoGraphicsError(f"no OpenGL without a window ({reason})") from error
-
-
-def _list_graphics_errors() -> tuple[type[Exception], ...]:
-    """List what a missing library, driver or display raises somewhere between Python and EGL; of windows, anything."""
-    if not NEEDS_NO_SCREEN:
-        return (Exception,)  # each windowing system has errors of its own
-    plain = (ImportError, OSError, AttributeError, AssertionError, ValueError, RuntimeError, TypeError)
-    own = getattr(sys.modules.get("OpenGL.error"), "Error", None)  # nobody raises it before it is imported
-    return plain if own is None else (*plain, own)
 
 
 RendererName = Literal["auto", "egl", "stick"]
 RENDERER_VARIABLE = "MAPCTL_RENDERER"
 """Environment variable with the renderer where none is asked for."""
 
-_PACKAGES = "libegl1 libgl1 libgl1-mesa-dri libgles2"
+_ADVICE = "For shaded bodies: pip install 'mapctl[render]', and on Debian apt-get install libegl1 libgl1-mesa-dri"
 _log = logging.getLogger("mapctl.scenes")
 
 
@@ -268,7 +244,7 @@ def select_painter(name: RendererName | None = None) -> Painter:
     except NoGraphicsError as error:
         if wanted == "egl":
             raise
-        _log.warning("%s; drawing stick figures. %s", error, _advise(error))
+        _log.warning("%s; drawing stick figures. %s", error, _ADVICE)
         return _make_stick_painter()
 
 
@@ -278,13 +254,6 @@ def back_end() -> str:
         return select_painter("egl").name
     except NoGraphicsError as error:
         return f"{STICK_FIGURES}: {error}"
-
-
-def _advise(error: NoGraphicsError) -> str:
-    """Say what to install."""
-    if isinstance(error.__cause__, ModuleNotFoundError):
-        return "For shaded bodies: pip install 'mapctl[render]'"
-    return f"On Debian: apt-get install {_PACKAGES}" if NEEDS_NO_SCREEN else "For shaded bodies: a screen is needed"
 
 
 def _make_stick_painter() -> Painter:
@@ -323,15 +292,20 @@ class StickPainter:
         axes.set(xlim=(0, view.width), ylim=(view.height, 0))
         for surface in content.ground:
             _draw_flat(axes, view, surface)
-        for figure in content.figures:
-            _draw_shadow(axes, view, figure)
-        for figure in content.figures:
-            _draw_figure(axes, view, figure)
+        sticks = [(*figure.body.sticks(figure.frame), figure) for figure in content.figures]
+        for ends, radii, _, _ in sticks:  # shadows are the sticks laid on the ground along the light
+            fallen = ends - ends[..., 1:2] * (LIGHT / LIGHT[1])
+            _draw_lines(
+                axes, view, fallen, radii, np.tile([*colours.rgb(colours.SHADOW), _STICK_SHADOW], (len(ends), 1))
+            )
+        for ends, radii, rgb, figure in sticks:
+            _draw_lines(axes, view, ends, radii, figure.tint(rgb))
         picture = self._shoot(view)
         if not content.veils:
             return picture
         for figure in content.veils:
-            _draw_figure(axes, view, figure)
+            ends, radii, rgb = figure.body.sticks(figure.frame)
+            _draw_lines(axes, view, ends, radii + figure.shell, figure.tint(rgb))
         return blend_veils(picture, self._shoot(view))
 
     def _shoot(self, view: View) -> Array:
@@ -348,19 +322,6 @@ def _draw_flat(axes, view: View, surface: Surface) -> None:
     # One array is several times faster than a list of triangles; with antialiasing these would show their seams.
     triangles: Any = corners[shown, :, :2]
     axes.add_collection(PolyCollection(triangles, facecolors=rgba[shown], linewidths=0, antialiaseds=False))
-
-
-def _draw_shadow(axes, view: View, figure: Figure) -> None:
-    """Draw the sticks laid on the ground along the light."""
-    ends, radii, _ = figure.body.sticks(figure.frame)
-    fallen = ends - ends[..., 1:2] * (LIGHT / LIGHT[1])
-    shade = np.tile([*colours.rgb(colours.SHADOW), _STICK_SHADOW], (len(ends), 1))
-    _draw_lines(axes, view, fallen, radii, shade)
-
-
-def _draw_figure(axes, view: View, figure: Figure) -> None:
-    ends, radii, rgb = figure.body.sticks(figure.frame)
-    _draw_lines(axes, view, ends, radii + figure.shell, figure.tint(rgb))
 
 
 def _draw_lines(axes, view: View, ends: Array, radii: Array, shown: Array) -> None:

@@ -67,54 +67,33 @@ class Shot(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class StagedWishes:
-    """Wishes made ready for a film."""
-
-    marks: Sequence[tuple[Surface, int, int]]
-    """Shapes, and the film's first and last frame in which they are asked for."""
-    poses: Sequence[Figure]
-    """Bodies in the poses."""
-
-    @staticmethod
-    def of(wishes: Wishes, motion: Motion, start_seconds: float, drawn: DrawnMotion | None = None) -> "StagedWishes":
-        """Prepare the wishes of an actor whose motion, at the film's rate, starts at a time; of a character that is
-        drawn with its own mesh poses are shown with it too."""
-        marks, fps = [], motion.fps
-        for mark in wishes.marks:
-            early, late = mark.seconds
-            margin = max(0.0, _LEAST_SECONDS - (late - early)) / 2
-            first, last = (round((start_seconds + at) * fps) for at in (early - margin, late + margin))
-            marks.append((mark.surface, first, last))
-        return StagedWishes(marks, _build_figures(wishes.poses, motion, drawn))
-
-    def marks_at(self, frame: int) -> list[Surface]:
-        """Return the marks in a frame of the film: strong while they are asked for, faint before and after."""
-        return [
-            surface if first <= frame <= last else _thin_out(surface, _FAINT) for surface, first, last in self.marks
-        ]
-
-    def all_marks(self) -> list[Surface]:
-        """Return all marks as they are while they are asked for."""
-        return [surface for surface, _, _ in self.marks]
-
-
-@dataclass(frozen=True, eq=False)
 class StagedActor:
-    """An actor made ready: its body, and its ribbons and contacts computed once."""
+    """An actor prepared for a film: its body, and its ribbons, contacts and marks computed once."""
 
     body: Body
     wish: Surface | None
+    """Ribbon of its curve."""
     trail: Surface
     planted: Array
     """(frames, feet) whether the foot is planted."""
     start: int
     """Film frame of the motion's first frame."""
-    wishes: StagedWishes
-    """What it is asked for beside the curve."""
+    marks: Sequence[tuple[Surface, int, int]]
+    """Shapes, and the film's first and last frame in which they are asked for."""
+    poses: Sequence[Figure]
+    """Bodies in the poses that are asked for."""
 
     def frame(self, film_frame: int) -> int:
         """Return the motion's frame at a film's; the first before it starts and the last after it ends."""
         return min(max(film_frame - self.start, 0), self.body.num_frames - 1)
+
+    def marks_at(self, film_frame: int) -> list[Surface]:
+        """Return the marks in a frame of the film: strong while they are asked for, faint before and after."""
+        faint = np.array([1.0, 1.0, 1.0, _FAINT])
+        return [
+            mark if first <= film_frame <= last else replace(mark, rgba=mark.rgba * faint)
+            for mark, first, last in self.marks
+        ]
 
 
 class Stage:
@@ -128,7 +107,7 @@ class Stage:
         self.num_frames = max(p.start + p.body.num_frames for p in self.players)
         self._grid = overlays.build_grid(self._places()[:, [0, 2]])
         wishes = [player.wish for player in self.players if player.wish is not None]
-        self._veils = [figure for player in self.players for figure in player.wishes.poses]
+        self._veils = [figure for player in self.players for figure in player.poses]
         self._still = merge_surfaces([self._grid, *wishes, *props])
 
     @property
@@ -141,7 +120,7 @@ class Stage:
         figures = [Figure(player.body, player.frame(film_frame)) for player in self.players]
         trails = [overlays.cut_ribbon(p.trail, f.frame + 1) for p, f in zip(self.players, figures, strict=True)]
         marks = [_build_contact_marks(p, f.frame) for p, f in zip(self.players, figures, strict=True)]
-        asked = [mark for player in self.players for mark in player.wishes.marks_at(film_frame)]
+        asked = [mark for player in self.players for mark in player.marks_at(film_frame)]
         ground = [self._still, *trails, *(m for m in marks if m is not None), *asked]
         return Content(ground, figures, self._veils)
 
@@ -157,7 +136,7 @@ class Stage:
             for frame, fade in {player.frame(at): float(fade) for at, fade in moments}.items()
         ]
         trails = [player.trail for player in self.players]
-        marks = [mark for player in self.players for mark in player.wishes.all_marks()]
+        marks = [mark for player in self.players for mark, _, _ in player.marks]
         return Content([self._still, *trails, *marks], figures, self._veils)
 
     def views(self, settings: CameraSettings, size: tuple[int, int]) -> list[View]:
@@ -188,12 +167,26 @@ def _prepare_actor(shot: Shot, number: int, count: int, fps: Fraction) -> Staged
     wish, trod = colours.rgb(colours.TARGET), colours.rgb(colours.TRAIL)
     if count > 1:
         wish, trod = colours.blend_colours(colour, colours.rgb(colours.BACKGROUND), 0.62), colour
-    ribbon = None if shot.curve is None else _build_curve_ribbon(shot.curve, wish)
     path = body.anatomy.hips_world[:, [0, 2]]
-    trail = overlays.build_ribbon(path, width=0.05, rgb=trod, height=overlays.TRAIL_HEIGHT)
-    wishes = StagedWishes.of(shot.wishes, motion, shot.start_seconds, shot.drawn)
-    planted = _detect_foot_contacts(body, float(fps))
-    return StagedActor(body, ribbon, trail, planted, round(shot.start_seconds * fps), wishes)
+    balls = [foot.ball for foot in body.anatomy.feet]
+    planted = np.zeros((body.num_frames, len(balls)), bool)
+    if len(balls) == 2:
+        planted = detect_contacts(torch.from_numpy(body.anatomy.points.world[:, balls]), float(fps)).numpy()
+    marks = []
+    for mark in shot.wishes.marks:
+        early, late = mark.seconds
+        margin = max(0.0, _LEAST_SECONDS - (late - early)) / 2
+        first, last = (round((shot.start_seconds + at) * fps) for at in (early - margin, late + margin))
+        marks.append((mark.surface, first, last))
+    return StagedActor(
+        body,
+        None if shot.curve is None else _build_curve_ribbon(shot.curve, wish),
+        overlays.build_ribbon(path, width=0.05, rgb=trod, height=overlays.TRAIL_HEIGHT),
+        planted,
+        round(shot.start_seconds * fps),
+        marks,
+        _build_figures(shot.wishes.poses, motion, shot.drawn),
+    )
 
 
 def _build_curve_ribbon(curve: Curve, rgb: Array) -> Surface:
@@ -202,13 +195,6 @@ def _build_curve_ribbon(curve: Curve, rgb: Array) -> Surface:
     keep = max(1, round(_RIBBON_STEP / max(curve.length / (len(points) - 1), 1e-6)))
     thin = np.concatenate([points[:-1:keep], points[-1:]])
     return overlays.build_ribbon(thin, width=0.11, rgb=rgb, height=overlays.TARGET_HEIGHT)
-
-
-def _detect_foot_contacts(body: Body, fps: float) -> Array:
-    balls = [foot.ball for foot in body.anatomy.feet]
-    if len(balls) != 2:
-        return np.zeros((body.num_frames, len(balls)), bool)
-    return detect_contacts(torch.from_numpy(body.anatomy.points.world[:, balls]), fps).numpy()
 
 
 def _build_contact_marks(player: StagedActor, frame: int) -> Surface | None:
@@ -232,7 +218,3 @@ def _build_figures(poses: Sequence[Motion], motion: Motion, drawn: DrawnMotion |
     body = Mannequin(whole, colours.rgb(colours.TARGET))
     numbers = range(motion.num_frames, whole.num_frames)
     return [Figure(body, number, _TINT, toward=colours.TARGET, shell=_SHELL) for number in numbers]
-
-
-def _thin_out(surface: Surface, opacity: float) -> Surface:
-    return replace(surface, rgba=surface.rgba * np.array([1.0, 1.0, 1.0, opacity]))
