@@ -1,9 +1,9 @@
-"""Be there, face so, at a time: a walk is steered toward a place that is far, and its end is stitched to it.
+"""Arrivals: be at a ground position, facing so, at a time. A walk is steered toward a far target, its end is stitched.
 
-Ren et al. 2024 make what lies between two poses; here the first is the last that was delivered, with those before it,
-and the second is where the character is to be: in a pose that is given, or in that of one of the moments from which the
-prior begins, walking on or standing. A step that is steered toward the place plays while this is worked out. The
-density's state is then advanced over what was shown, and steering goes on.
+Ren et al. 2024 generate what lies between two poses; here the first is the last that was delivered, with those before
+it, and the second is the target: a given pose, or one of the initial states of the prior, walking on or standing. A
+step that is steered toward the target plays while this is computed. The density's state is then advanced over what was
+shown, and steering goes on.
 """
 
 import math
@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from controllers.steering.steer import KEPT_FRAMES, Refusal, SteerFrames, SteerState, condition_prior, step
+from controllers.steering.steer import KEPT_FRAMES, Approach, Refusal, SteerFrames, SteerState, condition_prior, step
 from mapctl import rotations
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode, integrate_root, reversed_features
 from mapctl.intent.steering import Arrival, Command, SteeringTarget
@@ -27,8 +27,8 @@ from mapctl.problem.solution import Ledger, Outcome, Status
 from mapctl.runtime.stepwise import StepwiseWork
 
 LEAST_FRAMES = 4
-"""Frames of the shortest way."""
-_FAR = 0.3  # metres from which on the way to a place says where to face there
+"""Frames of the shortest stitched trajectory."""
+_FAR = 0.3  # metres beyond which the direction to a target is the facing there
 _CANDIDATES = 4  # moments of the prior that are tried at the place
 _AFTER = 10  # frames of the prior's own continuation that say how motion goes on from there
 _JUDGED_FRAMES = 60  # that are kept for terms that look back
@@ -36,7 +36,7 @@ _JUDGED_FRAMES = 60  # that are kept for terms that look back
 
 @runtime_checkable
 class TransitionMaker(Protocol):
-    """Who makes the frames between two poses."""
+    """Model that generates the frames between two poses."""
 
     @property
     def longest(self) -> int:
@@ -51,13 +51,13 @@ class TransitionMaker(Protocol):
         turn: Float[Tensor, " batch"],
         frames: int,
     ) -> Generator[None, None, Float[Tensor, "batch frames size"]]:
-        """Make, a frame at a time, features from the frame after the last of `before` to the last of `after`, which is
-        run backwards and `frames` later: there, seen from the last of `before`, is `place`, metres, and the heading
-        another by `turn`."""
+        """Generate, a frame at a time, features from the frame after the last of `before` to the last of `after`, which
+        runs backwards and is `frames` later, at `place`, metres, and turned by `turn`, seen from the last of `before`.
+        """
         ...
 
 
-def begin_way(
+def begin_stitch(
     transitions: TransitionMaker,
     state: SteerState,
     command: Command,
@@ -66,11 +66,11 @@ def begin_way(
     *,
     planned: Float[Tensor, "ahead size"],
 ) -> tuple[Float[Tensor, "held size"], StepwiseWork[Float[Tensor, "rest size"]]]:
-    """Begin the way to a place, so many frames away: return features of the first frames, which play meanwhile, and
-    the work that makes the others.
+    """Begin the stitch to a target, so many frames away: return features of the first frames, which play meanwhile,
+    and the work that computes the others.
 
-    The first are those of the next step as they were `planned` before; there are none where no time is left for the
-    rest of the way after them.
+    The first are those of the next step as they were `planned` before; there are none where no time is left for
+    the rest after them.
     """
     held = planned[: state.settings.commit]
     if frames - len(held) < LEAST_FRAMES:
@@ -78,14 +78,14 @@ def begin_way(
     there = replace(state, committed=commit_frames(state, held)) if len(held) else state
     if len(held) and needed_speed(there, order, frames - len(held)) > state.prior.limits.max_steering_speed:
         there, held = state, held[:0]
-    return held, StepwiseWork(plan_way(transitions, there, command, order, frames - len(held)))
+    return held, StepwiseWork(plan_stitch(transitions, there, command, order, frames - len(held)))
 
 
 def commit_frames(state: SteerState, new: Float[Tensor, "frames size"]) -> CommittedFrames:
-    """Return what is committed after frames that nobody has solved: the density's state is advanced over them."""
+    """Return what is committed after frames that were not solved: the density's state is advanced over them."""
     committed = state.committed
     start = GroundPose(committed.place.position_xz.double(), committed.place.heading.double())
-    ground, facing = integrate_root(new.double(), start)  # in single precision a long way would not end on the place
+    ground, facing = integrate_root(new.double(), start)  # in single precision a long one would miss the target
     unit = decode(new, committed.place, skeleton=state.character.unit_skeleton)
     joints = torch.cat([committed.joints_world, unit.joint_positions().to(committed.joints_world)])
     return replace(
@@ -100,15 +100,15 @@ def commit_frames(state: SteerState, new: Float[Tensor, "frames size"]) -> Commi
 
 
 def needed_speed(state: SteerState, order: Arrival, frames: int) -> float:
-    """Return the mean speed that a place needs, m/s of a body of unit size."""
+    """Return the mean speed that a target needs, m/s of a body of unit size."""
     here = state.committed.place.position_xz * state.character.scale
     return math.dist(order.place, here.tolist()) / state.character.scale * PRIOR_FPS / frames
 
 
-def plan_way(
+def plan_stitch(
     transitions: TransitionMaker, state: SteerState, command: Command, order: Arrival, frames: int
 ) -> Generator[None, None, Float[Tensor, "frames size"]]:
-    """Plan the frames to a place, a frame at a time, in the pose there to which the way is smoothest."""
+    """Plan the frames to a target, a frame at a time, in the pose there to which the motion is smoothest."""
     character = state.character
     after = _pose_candidates(state, command, order)
     here = state.committed.place
@@ -120,10 +120,10 @@ def plan_way(
     seen = rotations.rotate_ground(place - here.position_xz, -here.heading)
     turn = rotations.wrap_angle(torch.tensor(facing, dtype=torch.float32) - here.heading)
     count = len(after)
-    ways = yield from transitions.connect(
+    found = yield from transitions.connect(
         state.committed.features, after, seen.expand(count, -1), turn.expand(count), frames
     )
-    return ways[int(_measure_roughness(state, ways).argmin())]
+    return found[int(_measure_roughness(state, found).argmin())]
 
 
 def _pose_candidates(state: SteerState, command: Command, order: Arrival) -> Float[Tensor, "batch after size"]:
@@ -146,45 +146,19 @@ def _pose_candidates(state: SteerState, command: Command, order: Arrival) -> Flo
     return reversed_features(torch.cat([begun.last_frame[:, None], on], dim=1))
 
 
-def _measure_roughness(state: SteerState, ways: Float[Tensor, "batch frames size"]) -> Float[Tensor, " batch"]:
-    """Measure the root mean square acceleration of the joints on ways from where the character is."""
+def _measure_roughness(state: SteerState, motions: Float[Tensor, "batch frames size"]) -> Float[Tensor, " batch"]:
+    """Measure the root mean square acceleration of the joints of motions from where the character is."""
     rough = []
-    for way in ways:
-        joints = decode(way, state.committed.place, skeleton=state.character.unit_skeleton).joint_positions()
+    for features in motions:
+        joints = decode(features, state.committed.place, skeleton=state.character.unit_skeleton).joint_positions()
         whole = torch.cat([state.committed.joints_world[-2:].to(joints), joints])
         rough.append(torch.diff(whole, n=2, dim=0).square().sum(dim=-1).mean().sqrt())
     return torch.stack(rough)
 
 
-_STITCHED_FRAMES = 45  # of the end of a way that is walked first
-_LEAST_SPEED = 0.3  # m/s below which nobody sets out: there is time to stand first
+_STITCHED_FRAMES = 45  # at the end of a motion that is walked first
+_LEAST_SPEED = 0.3  # m/s below which the character does not set out: there is time to stand first
 _PAST_FRAMES = 60  # of targets that are kept for terms that look back
-
-
-@dataclass(frozen=True, eq=False)
-class Approach:
-    """How far an order is carried out."""
-
-    order: Arrival | None
-    """The last order, if the last command had one."""
-    held: Command
-    """The command that is steered by, without an order: the last one, or the one before it where its order is refused.
-    """
-    planned: Float[Tensor, "frames size"] | None = None
-    """Features of the next frames to the place that are not delivered yet, none of them once it is there; None while it
-    is walked to."""
-    rest: StepwiseWork[Float[Tensor, "rest size"]] | None = None
-    """Work that makes the frames after these."""
-    refused: bool = False
-    """Whether the order is not obeyed."""
-
-    @property
-    def _has_planned(self) -> bool:
-        return self.planned is not None and len(self.planned) > 0
-
-    def ahead(self) -> Tensor | None:
-        """Return what is planned of the next step, if anything is."""
-        return self.rest.finish() if self.rest is not None and not self._has_planned else self.planned
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,16 +166,16 @@ class Arriver:
     """A step of steering that obeys orders to be somewhere."""
 
     transitions: TransitionMaker
-    """Who makes the way."""
+    """Model of the stitch."""
 
     def __call__(
         self, state: SteerState, command: Command, *, seconds: float | None = None
     ) -> tuple[SteerState, SteerFrames]:
         """Solve or deliver the next frames, as `controllers.steering.steer.step`. A command whose order cannot be met
-        is not obeyed: the one before it holds, and the frames' `refusal` says why."""
+        is not obeyed: the one before it holds, and the frames' `refusal` has the reason."""
         began = time.perf_counter()
         order, plain, refusal = command.arrival, replace(command, arrival=None), None
-        approach = state.approach if isinstance(state.approach, Approach) else None
+        approach = state.approach
         if order is None:
             return step(replace(state, approach=Approach(None, plain)), plain, seconds=seconds)
         left, new = _arrival_frame(order) - state.frames + 1, approach is None or approach.order is not order
@@ -210,7 +184,7 @@ class Arriver:
             refusal = _refuse(state, order)
             before = approach.held if approach and refusal else plain
             approach = Approach(order, before, refused=refusal is not None)
-        # Who has to walk first does so until little is left; a way that can be stitched as a whole is.
+        # What is too far is walked first until little is left; what can be stitched as a whole is.
         most = self.transitions.longest + 1 if new else _STITCHED_FRAMES
         if approach.planned is None and not approach.refused and left <= most:
             ahead = None if old is None else old.ahead()
@@ -219,7 +193,7 @@ class Arriver:
                 after, frames, work = found
                 _proceed(work, began, seconds)
                 return after, frames
-            held, rest = begin_way(self.transitions, state, command, order, left, planned=planned)
+            held, rest = begin_stitch(self.transitions, state, command, order, left, planned=planned)
             approach = replace(approach, planned=held, rest=rest)
         if approach.rest is not None and approach.planned is not None and not len(approach.planned):
             approach = replace(approach, planned=approach.rest.finish(), rest=None)
@@ -249,7 +223,7 @@ class Arriver:
         there = replace(there, settings=settings)
         if needed_speed(there, order, rest) > state.prior.limits.max_steering_speed:
             return None
-        work = StepwiseWork(plan_way(self.transitions, there, command, order, rest))
+        work = StepwiseWork(plan_stitch(self.transitions, there, command, order, rest))
         nothing = there.committed.features[:0]
         return replace(there, approach=replace(approach, planned=nothing, rest=work)), frames, work
 
@@ -265,11 +239,11 @@ def _arrival_frame(order: Arrival) -> int:
 
 
 def _refuse(state: SteerState, order: Arrival) -> Refusal | None:
-    """Say why an order cannot be met; None where it can."""
+    """Return why an order cannot be met; None where it can."""
     frames, scale = _arrival_frame(order) - state.frames + 1, state.character.scale
     left, least = frames / PRIOR_FPS, LEAST_FRAMES / PRIOR_FPS
     if frames < LEAST_FRAMES:
-        reason = f"an arrival in {left:.2f} s is not obeyed: nobody comes anywhere in less than {least:.2f} s"
+        reason = f"an arrival in {left:.2f} s is not obeyed: the shortest takes {least:.2f} s"
         return Refusal(order, reason)
     needs, fastest = needed_speed(state, order, frames) * scale, state.prior.limits.max_steering_speed * scale
     if needs <= fastest:
@@ -281,7 +255,7 @@ def _refuse(state: SteerState, order: Arrival) -> Refusal | None:
 
 
 def _lead_to(state: SteerState, command: Command, order: Arrival, left: int) -> Command:
-    """Lead to a place that is far, at the pace that comes there in time; who would come too early stands."""
+    """Lead to a far target, at the pace that comes there in time; one that would come too early stands."""
     scale = state.character.scale
     here = (state.committed.place.position_xz * scale).tolist()
     away = (order.place[0] - here[0], order.place[1] - here[1])

@@ -5,17 +5,17 @@ shown, so a command waits for two steps at most: 0.2 s at three frames a step.
 
 On a machine that is too slow, a step that begins late searches less, but has time for
 `SteerSettings.least_evaluations`, by what steps cost lately, so that commands are obeyed. If its frames are still
-later than `LoopSettings.slack`, the stream's time is held for as long: motion plays slower than real time, and no frame
-and no command is dropped. Where other processes hold steps up beyond the time that they were given, those that follow
-are to end earlier: several characters that share a machine's last processor all search less before any is late.
+later than `_SLACK`, the stream's time is held for as long: motion plays slower than real time, and no frame and no
+command is dropped. Where other processes hold steps up beyond the time that they were given, those that follow are to
+end earlier: several characters that share a machine's last processor all search less before any is late.
 """
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import reduce
 from itertools import pairwise
-from typing import Protocol, runtime_checkable
+from typing import Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 import torch
@@ -28,7 +28,12 @@ from mapctl.motion import Motion
 from mapctl.problem.solution import Ledger
 from mapctl.rotations import make_sign_continuous
 
+_MARGIN, _MOST_MARGIN = 0.015, 0.05  # seconds before frames are due at which a step is to end, for the display
 _MARGIN_USED, _MARGIN_RISE, _MARGIN_FALL = 0.75, 1.5, 0.997  # found within a second, and forgotten within a minute
+_SLACK = 0.1  # seconds by which frames may be late before time is held for them; less is made up by searching less
+
+Stepper: TypeAlias = Callable[..., tuple[SteerState, SteerFrames]]
+"""(state, command, seconds=...) to the next state and frames, as `controllers.steering.steer.step`."""
 
 
 @runtime_checkable
@@ -41,17 +46,6 @@ class Source(Protocol):
 
 
 @runtime_checkable
-class Stepper(Protocol):
-    """Maker of the next frames."""
-
-    def __call__(
-        self, state: SteerState, command: Command, *, seconds: float | None = None
-    ) -> tuple[SteerState, SteerFrames]:
-        """Make them, as `controllers.steering.steer.step` does."""
-        ...
-
-
-@runtime_checkable
 class Display(Protocol):
     """Destination of frames."""
 
@@ -60,31 +54,31 @@ class Display(Protocol):
         ...
 
 
-@runtime_checkable
-class Clock(Protocol):
-    """Clock of the stream."""
+class StreamClock:
+    """Time that passes only by waiting: as fast as the machine can, so that nothing is late."""
 
-    real: bool
+    real = False
     """Whether time passes by itself, so that a step has a deadline."""
 
+    def __init__(self):
+        self._now = -1.0
+
     def now(self) -> float:
-        """Return the time, seconds."""
-        ...
+        """Return the time, seconds; -1 before the first wait."""
+        return self._now
 
     def wait_until(self, seconds: float) -> None:
         """Wait until that time; return at once if it has passed."""
-        ...
+        self._now = max(self._now, seconds)
 
     def hold(self, seconds: float) -> None:
         """Set the time back by so many seconds."""
-        ...
 
 
-class WallClock:
-    """Real time since the clock was made, less the time for which it was held."""
+class WallClock(StreamClock):
+    """Real time since the clock was started, less the time for which it was held."""
 
     real = True
-    """Time passes by itself."""
 
     def __init__(self):
         self._began = time.perf_counter()
@@ -105,46 +99,6 @@ class WallClock:
     def perf_counter_at(self, seconds: float) -> float:
         """Return the value of time.perf_counter, seconds, at a time of this clock, if it is not held until then."""
         return self._began + seconds
-
-
-class StreamClock:
-    """Time that passes only by waiting: as fast as the machine can, so that nothing is late."""
-
-    real = False
-    """Time passes only by waiting."""
-
-    def __init__(self):
-        self._now = -1.0
-
-    def now(self) -> float:
-        """Return the time, seconds; -1 before the first wait."""
-        return self._now
-
-    def wait_until(self, seconds: float) -> None:
-        """Let it be that time at once; never earlier than it is."""
-        self._now = max(self._now, seconds)
-
-    def hold(self, seconds: float) -> None:
-        """Change nothing: nothing is late, so it is never called."""
-
-
-@dataclass(frozen=True)
-class LoopSettings:
-    """Timing of the loop."""
-
-    margin: float = 0.015
-    """Seconds before frames are due at which a step is to end: for the way to the display, and for other processes."""
-    most_margin: float = 0.05
-    """Seconds up to which the margin grows where steps end later than they were to."""
-    slack: float = 0.1
-    """Seconds by which frames may be late before time is held for them; less is compensated by searching less."""
-
-    def adapt_margin(self, margin: float, spare: float) -> float:
-        """Return the margin after a step of this one that ended `spare` seconds before its frames were due: larger if
-        much of it was used up, else a little smaller."""
-        if spare < _MARGIN_USED * margin:
-            return max(margin, min(self.most_margin, _MARGIN_RISE * margin))
-        return max(self.margin, _MARGIN_FALL * margin)
 
 
 @dataclass(frozen=True)
@@ -210,7 +164,7 @@ class Recorder:
         return reduce(Ledger.join, (piece.ledger for piece in self.pieces if piece.ledger.entries), Ledger())
 
 
-def find_second_zero(clock: Clock, state: SteerState) -> float:
+def find_second_zero(clock: StreamClock, state: SteerState) -> float:
     """Return the clock's time at the stream's second 0, for a next step that begins now."""
     return clock.now() + (state.settings.commit - state.frames) / PRIOR_FPS
 
@@ -220,17 +174,15 @@ def iterate_steps(
     source: Source,
     displays: Sequence[Display],
     *,
-    clock: Clock,
-    settings: LoopSettings | None = None,
+    clock: StreamClock,
     stepper: Stepper | None = None,
 ) -> Iterator[tuple[SteerState, StepRecord]]:
     """Yield one step after the other without end; the first pose counts as delivered.
 
     Frame k is due at second k / PRIOR_FPS. The clock starts a step before that.
     """
-    settings = settings or LoopSettings()
     lead = state.settings.commit / PRIOR_FPS
-    begun, margin = find_second_zero(clock, state), settings.margin
+    begun, margin = find_second_zero(clock, state), _MARGIN
     while True:
         due = state.frames / PRIOR_FPS
         clock.wait_until(begun + due - lead)
@@ -239,8 +191,11 @@ def iterate_steps(
         seconds = max(left, state.cost.needed_seconds(state.settings.least_evaluations)) if clock.real else None
         state, new = (stepper or step)(state, source.at(asked), seconds=seconds)
         delivered = clock.now() - begun
-        margin = settings.adapt_margin(margin, due - delivered)
-        held = delivered - due if clock.real and delivered - due > settings.slack else 0.0
+        if due - delivered < _MARGIN_USED * margin:
+            margin = max(margin, min(_MOST_MARGIN, _MARGIN_RISE * margin))
+        else:
+            margin = max(_MARGIN, _MARGIN_FALL * margin)
+        held = delivered - due if clock.real and delivered - due > _SLACK else 0.0
         if held:
             clock.hold(held)  # before they are shown, since they are due now
         for display in displays:
@@ -255,7 +210,7 @@ def drive(
     displays: Sequence[Display],
     *,
     frames: int,
-    clock: Clock | None = None,
+    clock: StreamClock | None = None,
     stepper: Stepper | None = None,
 ) -> tuple[SteerState, list[StepRecord]]:
     """Steer until `frames` have been delivered, or Ctrl-C."""

@@ -1,13 +1,9 @@
-"""A character that is steered live in a process of its own.
+"""A character that is steered live in a process of its own: it reads orders at every step and sends frames.
 
 Neither a web server nor another character then delays its steps: each has its own core as long as there are cores.
-Times cross between processes as values of time.perf_counter, which all processes of a machine share.
-
-The process of a character that is steered live: load, begin, and at every step read orders and send frames.
-
-Sources of commands: pure pursuit of a curve, and what a live character obeys: the last command or drawn path.
-
-Pure pursuit is for curves that are not known in advance or change; `controllers.follow` is more exact.
+Times cross between processes as values of time.perf_counter, which all processes of a machine share. It obeys the last
+command, or follows a drawn path by pure pursuit, for curves that are not known in advance; `controllers.follow` is more
+exact.
 """
 
 import itertools
@@ -29,7 +25,7 @@ import torch
 
 from controllers.steering import steer
 from controllers.steering.arrival import Arriver
-from controllers.steering.loop import find_second_zero, iterate_steps
+from controllers.steering.loop import WallClock, find_second_zero, iterate_steps
 from controllers.steering.steer import SteerFrames, SteerSettings
 from mapctl import curves
 from mapctl.curves.curve import Curve
@@ -74,9 +70,9 @@ class PurePursuit:
         """Return the command towards the point ahead of the character; how many seconds of the stream have passed does
         not matter."""
         first, last = self.arc - _SEARCH_BACKWARD, self.arc + _SEARCH_FORWARD
-        arcs = torch.linspace(first, last, _SEARCH_POINTS, dtype=torch.float64).tolist()
-        distances = torch.stack([(self._point(arc) - self.position).norm() for arc in arcs])
-        self.arc = arcs[int(distances.argmin())]
+        arcs = torch.linspace(first, last, _SEARCH_POINTS, dtype=torch.float64)
+        distances = (self.curve.ground_point(arcs) - self.position).norm(dim=-1)
+        self.arc = float(arcs[distances.argmin()])
         direction = self._point(self.arc + self.look_ahead) - self.position
         return Command(self.speed, math.atan2(float(direction[0]), float(direction[1])))
 
@@ -172,17 +168,15 @@ class CharacterRequest:
     skeleton: Skeleton = CANONICAL
     """Bones of the character, on canonical joints; the toes' height of its stance is that of the settings' footing."""
     transitions: Callable[[], Any] | None = None
-    """Loader of who makes the way to a place, called there too; without one the character can be sent nowhere."""
+    """Loader of the model of arrivals, called there too; without one the character cannot be sent to a position."""
 
 
 class ParentClosed(Exception):
     """The parent process closed the connection, or has ended."""
 
 
-class ProcessClock:
+class ProcessClock(WallClock):
     """Clock and Display of the character's process: it reads orders while it waits, and sends frames."""
-
-    real = True
 
     def __init__(self, connection: Connection, pilot: Autopilot, prior: Density):
         self._connection, self._pilot, self._prior = connection, pilot, prior
@@ -194,11 +188,11 @@ class ProcessClock:
         self._notes: list[str] = []
 
     def now(self) -> float:
-        """See Clock: time.perf_counter less the pauses."""
+        """Return time.perf_counter less the pauses, seconds."""
         return (time.perf_counter() if self._paused_at is None else self._paused_at) - self._behind
 
     def wait_until(self, seconds: float) -> None:
-        """See Clock."""
+        """Obey orders until that time, seconds."""
         while True:
             left = max(0.0, seconds - self.now()) if self._paused_at is None else None
             if self._connection.poll(left):
@@ -207,12 +201,12 @@ class ProcessClock:
                 return
 
     def hold(self, seconds: float) -> None:
-        """See Clock: like a pause."""
+        """Pause for so many seconds."""
         self._behind += seconds
         self._held += seconds
 
     def show(self, frames: SteerFrames, due: float) -> None:
-        """See Display."""
+        """Send the frames; `due` is in seconds of the stream."""
         self._pilot.show(frames, due)
         if frames.refusal is not None:
             self._notes.append(frames.refusal.reason)
@@ -383,7 +377,7 @@ class CharacterProcess:
         that is possible, and obey the command from then on; a note says why not. RequestError where the request has no
         `transitions`, and for numbers that are none."""
         if self._request.transitions is None:
-            raise RequestError("this character was made without transitions, which take it to a place")
+            raise RequestError("this character has no transitions, which take it to a position")
         Arrival(place, within, facing)  # so that errors are raised here, not in the process
         self._send("go", command, place, within, facing)
 

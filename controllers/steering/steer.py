@@ -12,8 +12,8 @@ of minimum jerk.
 
 Ways round obstacles for who is steered: the direction nearest to the commanded one in which nothing is in the way.
 
-One step at a time, without a plan: for curves and times that are known in advance, `controllers.shots.way` finds the
-shortest way round.
+One step at a time, without a plan: for curves and times that are known in advance, `controllers.shots.trajectory` finds
+the shortest detour.
 """
 
 import math
@@ -30,7 +30,6 @@ from controllers.common.character import Character
 from controllers.common.initial_state import start_from_state
 from mapctl import rotations
 from mapctl.curves.obstacles import Obstacle, measure_clearance
-from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, ground_speed
 from mapctl.intent.steering import Arrival, Command, SteeringLimits, SteeringTarget
 from mapctl.kinematics import inverse
@@ -50,6 +49,7 @@ from mapctl.problem.window_solvers import (
     SteeringKnots,
 )
 from mapctl.protocols import Density
+from mapctl.runtime.stepwise import StepwiseWork
 from mapctl.skeleton import CANONICAL, LIMBS, Skeleton
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings, LbfgsStatus
@@ -284,12 +284,6 @@ class SteerSettings:
     noise: LatentPrior = field(default_factory=lambda: LatentPrior(sigma=2.0))
     """Prior on the latent noise, as in path following."""
 
-    def __post_init__(self):
-        if not 1 <= self.commit < self.horizon or self.evaluations < 1 or self.least_evaluations < 0:
-            raise RequestError(
-                f"steering needs 1 <= commit < horizon, evaluations >= 1 and least_evaluations >= 0, got {self}"
-            )
-
     def scaled_to(self, character: Character) -> "SteerSettings":
         """Return the settings for a character of this size, in metres of the prior's size."""
         names = "sigma_speed", "sigma_step", "stuck", "standing"
@@ -306,10 +300,6 @@ class StepCost:
     rest: float = 0.005
     """Seconds of a step before its search begins and after it ends."""
 
-    def limit_search(self, seconds: float) -> float:
-        """Return the seconds after which the search of a step of so many seconds must end."""
-        return max(0.0, seconds - self.rest)
-
     def needed_seconds(self, evaluations: int) -> float:
         """Return the seconds of a step that makes so many evaluations."""
         return self.rest + evaluations * self.evaluation
@@ -322,6 +312,39 @@ class StepCost:
         if cut_short and search is not None:
             rest = min(_LONGEST_REST, _expect(rest, max(0.0, seconds - search)))
         return StepCost(one, rest)
+
+
+@dataclass(frozen=True, eq=False)
+class Approach:
+    """How far an order to be somewhere is carried out."""
+
+    order: Arrival | None
+    """The last order, if the last command had one."""
+    held: Command
+    """The command that is steered by, without an order: the last one, or the one before it where its order is refused.
+    """
+    planned: Float[Tensor, "frames size"] | None = None
+    """Features of the next frames to the target that are not delivered yet, none of them once it is there; None while
+    it is walked to."""
+    rest: StepwiseWork[Float[Tensor, "rest size"]] | None = None
+    """Work that computes the frames after these."""
+    refused: bool = False
+    """Whether the order is not obeyed."""
+
+    def ahead(self) -> Tensor | None:
+        """Return the next planned frames, if there are any."""
+        has_planned = self.planned is not None and len(self.planned) > 0
+        return self.rest.finish() if self.rest is not None and not has_planned else self.planned
+
+
+@dataclass(frozen=True, eq=False)
+class Refusal:
+    """An order that is not obeyed."""
+
+    order: Arrival
+    """The order."""
+    reason: str
+    """Reason, with numbers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -348,18 +371,8 @@ class SteerState:
     """What hands and head are doing beside the walk."""
     cost: StepCost = field(default_factory=StepCost)
     """What steps have cost lately."""
-    approach: object | None = None
+    approach: Approach | None = None
     """Last order to be somewhere, and how far it is carried out (`controllers.steering.arrival`)."""
-
-
-@dataclass(frozen=True, eq=False)
-class Refusal:
-    """An order that is not obeyed."""
-
-    order: Arrival
-    """The order."""
-    reason: str
-    """Why, with numbers."""
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -453,7 +466,7 @@ def step(state: SteerState, command: Command, *, seconds: float | None = None) -
     terms = (*_build_steering_terms(state, targets, command.step_length, sigma_facing), *state.terms)
     if asked.obstacles:
         terms = (*terms, character.term(KeepClear(asked.obstacles)))
-    search = None if seconds is None else state.cost.limit_search(seconds)
+    search = None if seconds is None else max(0.0, seconds - state.cost.rest)
     done, outcome = _solve_step(conditioned, terms, search, free=free)
     if outcome is not Outcome.DONE:
         cold = replace(state.committed, warm_start=state.committed.warm_start[:0], forecast=None)
@@ -520,7 +533,7 @@ def _solve_step(
     method: SingleWindowSolver = _limit_evaluations(state, settings.evaluations, seconds)
     if free:
         half = _limit_evaluations(state, settings.evaluations // 2, seconds and seconds / 2)
-        method = RelaxedFootingFirst.of(half, settings.random_starts, terms, settings.footing)
+        method = _relax_footing_first(half, settings.random_starts, terms, settings.footing)
     window = HorizonSettings(frames=settings.horizon, overlap=settings.horizon - settings.commit)
     solver = RecedingHorizonSolver(state.prior, window, state.character.unit_skeleton, method=method)
     frames = len(state.committed.features) + settings.commit
@@ -596,36 +609,27 @@ def _build_steering_terms(
     return (*terms, StepLength(step_length, sigma=settings.sigma_step)) if step_length else terms
 
 
-@dataclass(frozen=True)
-class RelaxedFootingFirst:
-    """Window solver that spends half on all terms but contacts, from the best of some samples, and half on all terms.
+def _relax_footing_first(
+    half: LatentNoiseSolver, samples: int, terms: Sequence[Term], footing: FootContact
+) -> SingleWindowSolver:
+    """Build a window solver that spends half on all terms but contacts, from the best of some samples, and half on all
+    terms, each with half of the time.
 
     A standing character has both feet planted, by contacts that are fixed while a window is solved: the contact term
     then prevents any step. The search without it finds one, along which the prior predicts new contacts.
     """
+    space = SteeringKnots(_KNOTS, tuple(LAYOUT.slices)[:-1], _KNOT_SIGMA)
+    budget = replace(half.budget, evaluations=samples + (half.budget.evaluations or 1))
+    relaxed = replace(half, proposal=BestOfSamples(samples, space), budget=budget)
+    others = [term for term in terms if term.name != footing.name]
 
-    relaxed_method: LatentNoiseSolver
-    """Solver of the first half."""
-    half: LatentNoiseSolver
-    """Solver of the second half."""
-    relaxed_terms: Sequence[Term]
-    """Terms of the first half."""
-
-    @staticmethod
-    def of(half: LatentNoiseSolver, samples: int, terms: Sequence[Term], footing: FootContact) -> "RelaxedFootingFirst":
-        """Build it from the solver of one half; the first draws so many samples beside its own evaluations."""
-        space = SteeringKnots(_KNOTS, tuple(LAYOUT.slices)[:-1], _KNOT_SIGMA)
-        budget = replace(half.budget, evaluations=samples + (half.budget.evaluations or 1))
-        relaxed = replace(half, proposal=BestOfSamples(samples, space), budget=budget)
-        others = [term for term in terms if term.name != footing.name]
-        return RelaxedFootingFirst(relaxed, half, others)
-
-    def __call__(self, request: WindowRequest) -> SolvedWindow:
-        """Solve the window; either half has half of the time."""
+    def solve(request: WindowRequest) -> SolvedWindow:
         request = replace(request, seconds=request.seconds / 2)
-        first = self.relaxed_method(replace(request, terms=self.relaxed_terms))
-        second = self.half(replace(request, warm_start=first.warm_start))
+        first = relaxed(replace(request, terms=others))
+        second = half(replace(request, warm_start=first.warm_start))
         return replace(second, evaluations=first.evaluations + second.evaluations)
+
+    return solve
 
 
 def _expect(known: float, last: float) -> float:

@@ -1,9 +1,7 @@
-"""Making curves: built-in shapes, points, CSV and SVG files. `Curve` itself is in `mapctl.curves.curve`."""
+"""Curves by shape, points, CSV or SVG file. `Curve` itself is in `mapctl.curves.curve`."""
 
 import math
 import os
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 
@@ -18,25 +16,61 @@ from mapctl.curves import files
 from mapctl.curves.curve import MAX_POINTS, SPACING, Curve, build_dense_polyline
 from mapctl.errors import FileFormatError, RequestError
 
-MIN_SIZE, MAX_SIZE = 0.01, 10_000.0
-"""Least and greatest radius, length or amplitude, metres."""
+_MIN_SIZE, _MAX_SIZE = 0.01, 10_000.0  # metres of a radius, length or amplitude
+_SPLINE_SPACING = 0.02  # metres between the points that a spline is drawn with
+_FILE_ENDINGS = (".csv", ".tsv", ".txt", ".svg")
 
 
-@dataclass(frozen=True)
-class Shape:
-    """Specification of a built-in curve."""
-
-    sizes: tuple[str, ...]
-    """Names of its sizes, in the order in which text gives them (joined by `x`); metres."""
-    points: Callable[..., ndarray]
-    """Sizes to points (n, 2), metres."""
-    closed: bool
-    """Whether it ends where it starts."""
-    example: str
-    """Example, as typed."""
+def circle(*, radius: float) -> Curve:
+    """Return a circle to the left of its start, the origin, heading +Z; radius in metres (0.01 to 10,000)."""
+    _check_sizes("circle", radius=radius)
+    return _join_arcs((radius, 2 * math.pi), closed=True)
 
 
-def _join_circular_arcs(*arcs: tuple[float, float]) -> ndarray:
+def figure8(*, radius: float) -> Curve:
+    """Return two circles that touch at the origin, the left one first, both along +Z there; radius in metres."""
+    _check_sizes("figure8", radius=radius)
+    return _join_arcs((radius, 2 * math.pi), (-radius, 2 * math.pi), closed=True)
+
+
+def s(*, length: float) -> Curve:
+    """Return an S: a half circle to the left, then one to the right; `length` metres from end to end, along +X."""
+    _check_sizes("s", length=length)
+    return _join_arcs((length / 4, math.pi), (-length / 4, math.pi), closed=False)
+
+
+def line(*, length: float) -> Curve:
+    """Return a straight line along +Z; length in metres."""
+    _check_sizes("line", length=length)
+    z = np.linspace(0, length, min(math.ceil(length / SPACING), MAX_POINTS) + 1)
+    return Curve(torch.from_numpy(np.stack([np.zeros_like(z), z], axis=1)))
+
+
+def wave(*, amplitude: float, length: float) -> Curve:
+    """Return one period of a sine along +Z, first to the left: `amplitude` (half of peak to peak) and `length`
+    in metres."""
+    _check_sizes("wave", amplitude=amplitude, length=length)
+    longest = length + 4 * amplitude  # an upper bound of its arc length
+    z = np.linspace(0, length, min(math.ceil(max(longest / SPACING, 360)), MAX_POINTS) + 1)
+    return Curve(torch.from_numpy(np.stack([amplitude * np.sin(2 * math.pi * z / length), z], axis=1)))
+
+
+_SHAPES = {
+    "circle": (circle, ("radius",), "circle:4"),
+    "figure8": (figure8, ("radius",), "figure8:2"),
+    "s": (s, ("length",), "s:6"),
+    "line": (line, ("length",), "line:10"),
+    "wave": (wave, ("amplitude", "length"), "wave:1x8"),
+}  # name: function, sizes in the order in which text gives them (joined by `x`), example
+
+
+def _check_sizes(shape: str, **sizes: float) -> None:
+    for name, value in sizes.items():
+        if not _MIN_SIZE <= value <= _MAX_SIZE:
+            raise RequestError(f"{shape}: {name} must be {_MIN_SIZE:g} to {_MAX_SIZE:g} m, got {value:g}")
+
+
+def _join_arcs(*arcs: tuple[float, float], closed: bool) -> Curve:
     """Join circular arcs (signed radius, left positive; angle) smoothly, from the origin along +Z."""
     place, heading, pieces = np.zeros(2), 0.0, [np.zeros((1, 2))]
     for radius, angle in arcs:
@@ -46,74 +80,25 @@ def _join_circular_arcs(*arcs: tuple[float, float]) -> ndarray:
         across = radius * np.stack([np.cos(heading) - np.cos(turned), np.sin(turned) - np.sin(heading)], axis=1)
         pieces.append(place + across)
         place, heading = pieces[-1][-1], turned[-1]
-    return np.concatenate(pieces)
-
-
-def _circle(radius: float) -> ndarray:
-    return _join_circular_arcs((radius, 2 * math.pi))
-
-
-def _figure8(radius: float) -> ndarray:
-    return _join_circular_arcs((radius, 2 * math.pi), (-radius, 2 * math.pi))
-
-
-def _s(length: float) -> ndarray:
-    return _join_circular_arcs((length / 4, math.pi), (-length / 4, math.pi))
-
-
-def _line(length: float) -> ndarray:
-    z = np.linspace(0, length, min(math.ceil(length / SPACING), MAX_POINTS) + 1)
-    return np.stack([np.zeros_like(z), z], axis=1)
-
-
-def _wave(amplitude: float, length: float) -> ndarray:
-    travelled = length + 4 * amplitude  # an upper bound of its arc length
-    count = min(math.ceil(max(travelled / SPACING, 360)), MAX_POINTS)
-    z = np.linspace(0, length, count + 1)
-    return np.stack([amplitude * np.sin(2 * math.pi * z / length), z], axis=1)
-
-
-SHAPES: Mapping[str, Shape] = {
-    "circle": Shape(("radius",), _circle, True, "circle:4"),
-    "figure8": Shape(("radius",), _figure8, True, "figure8:2"),
-    "s": Shape(("length",), _s, False, "s:6"),
-    "line": Shape(("length",), _line, False, "line:10"),
-    "wave": Shape(("amplitude", "length"), _wave, False, "wave:1x8"),
-}
-SHAPE_EXAMPLES = ", ".join(shape.example for shape in SHAPES.values())
-"""Examples of what may be typed, for messages."""
-
-
-def sample_shape(name: str, sizes: Mapping[str, float]) -> ndarray:
-    """Sample points of a built-in curve. RequestError for a size that is not from 1 cm to 10 km."""
-    for size, value in sizes.items():
-        if not MIN_SIZE <= value <= MAX_SIZE:
-            raise RequestError(f"{name}: {size} must be {MIN_SIZE:g} to {MAX_SIZE:g} m, got {value:g}")
-    points = SHAPES[name].points(**sizes)
-    if SHAPES[name].closed:
+    points = np.concatenate(pieces)
+    if closed:
         points[-1] = points[0]  # exactly
-    return points
+    return Curve(torch.from_numpy(points), closed)
 
 
-def parse_shape(text: str) -> tuple[str, dict[str, float]]:
-    """Name and sizes of a shape as typed: `wave:1x8`. RequestError says what may be typed."""
+def _parse_shape(text: str) -> Curve:
+    """Return the curve of a shape as typed: `wave:1x8`. RequestError states what may be typed."""
     name, _, numbers = text.partition(":")
-    shape = SHAPES.get(name.strip().lower())
-    if shape is None:
-        raise RequestError(f"unknown curve {text!r}: expected {SHAPE_EXAMPLES}, or a CSV or SVG file")
-    words = numbers.lower().split("x")
+    if name.strip().lower() not in _SHAPES:
+        examples = ", ".join(example for _, _, example in _SHAPES.values())
+        raise RequestError(f"unknown curve {text!r}: expected {examples}, or a CSV or SVG file")
+    shape, sizes, example = _SHAPES[name.strip().lower()]
     try:
-        values = [float(word) for word in words]
+        values = dict(zip(sizes, map(float, numbers.lower().split("x")), strict=True))
     except ValueError:
-        values = []
-    if len(values) != len(shape.sizes):
-        form = f"{name}:{'x'.join(size.upper() for size in shape.sizes)}"
-        raise RequestError(f"cannot read the curve {text!r}: expected {form} in metres, as {shape.example}")
-    return name.strip().lower(), dict(zip(shape.sizes, values, strict=True))
-
-
-_SPLINE_SPACING = 0.02  # metres between the points that a spline is drawn with
-_FILE_ENDINGS = (".csv", ".tsv", ".txt", ".svg")
+        form = f"{name}:{'x'.join(size.upper() for size in sizes)}"
+        raise RequestError(f"cannot read the curve {text!r}: expected {form} in metres, as {example}") from None
+    return shape(**values)
 
 
 def from_points(points: Float[Tensor, "points dims"] | ndarray, *, closed: bool | None = None) -> Curve:
@@ -150,36 +135,6 @@ def through(points: Float[Tensor, "points dims"] | ndarray, *, closed: bool = Fa
     return from_points(spline(fine), closed=is_loop)
 
 
-def circle(*, radius: float) -> Curve:
-    """Make a circle to the left of its start, the origin, heading +Z; radius in metres (0.01 to 10,000)."""
-    return _build_shape("circle", {"radius": radius})
-
-
-def figure8(*, radius: float) -> Curve:
-    """Make two circles that touch at the origin, the left one first, both along +Z there; radius in metres."""
-    return _build_shape("figure8", {"radius": radius})
-
-
-def s(*, length: float) -> Curve:
-    """Make an S: a half circle to the left, then one to the right; `length` metres from end to end, along +X."""
-    return _build_shape("s", {"length": length})
-
-
-def line(*, length: float) -> Curve:
-    """Make a straight line along +Z; length in metres."""
-    return _build_shape("line", {"length": length})
-
-
-def wave(*, amplitude: float, length: float) -> Curve:
-    """Make one period of a sine along +Z, first to the left: `amplitude` (half of peak to peak) and `length`
-    in metres."""
-    return _build_shape("wave", {"amplitude": amplitude, "length": length})
-
-
-def _build_shape(name: str, sizes: dict[str, float]) -> Curve:
-    return Curve(torch.from_numpy(sample_shape(name, sizes)), SHAPES[name].closed)
-
-
 def read(source: str | PathLike[str], *, metres_per_unit: float | None = None) -> Curve:
     """Read the curve that a shape (`circle:4`, `wave:1x8`), a CSV file or an SVG file (by its ending) describes.
 
@@ -193,7 +148,7 @@ def read(source: str | PathLike[str], *, metres_per_unit: float | None = None) -
         return _read_file(text, metres_per_unit)
     if metres_per_unit is not None:
         raise RequestError(f"metres per unit is for files; the curve {text!r} is in metres")
-    return _build_shape(*parse_shape(text))
+    return _parse_shape(text)
 
 
 def _read_file(path: str, metres_per_unit: float | None) -> Curve:

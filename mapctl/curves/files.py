@@ -11,10 +11,14 @@ from numpy import ndarray
 
 from mapctl.curves.curve import MAX_LENGTH, MAX_POINTS
 from mapctl.errors import FileFormatError
-from mapctl.formats.text import read_bytes, shorten
+from mapctl.formats.text import finite_number, read_bytes, shorten
+
+_MAX_CSV_BYTES = 64 * 2**20
+_COLUMNS = (("x", "z"), ("x", "y", "z"))
+_EXPECTED = "columns x,z or x,y,z in metres"
 
 
-def read_text(path: str | PathLike[str], limit: int, expected: str) -> str:
+def _read_text(path: str | PathLike[str], limit: int, expected: str) -> str:
     """Read the file's text, of `limit` bytes at most; FileFormatError for what is no text, with what was expected."""
     if Path(path).is_file() and Path(path).stat().st_size > limit:
         raise FileFormatError(path, f"is larger than {limit // 2**20} MiB, too large for a curve")
@@ -27,13 +31,6 @@ def read_text(path: str | PathLike[str], limit: int, expected: str) -> str:
     return text
 
 
-MAX_CSV_BYTES = 64 * 2**20
-"""Largest table that is read."""
-
-_COLUMNS = (("x", "z"), ("x", "y", "z"))
-_EXPECTED = "columns x,z or x,y,z in metres"
-
-
 def read_csv(path: str | PathLike[str]) -> ndarray:
     """Read points (n, 2) as x, z or (n, 3) as x, y, z from a table, metres.
 
@@ -41,18 +38,26 @@ def read_csv(path: str | PathLike[str]) -> ndarray:
     the columns; blank lines and lines from `#` on are skipped. FileFormatError names file and line.
     """
     rows, order = [], None
-    for number, line in enumerate(read_text(path, MAX_CSV_BYTES, _EXPECTED).splitlines(), start=1):
+    for number, line in enumerate(_read_text(path, _MAX_CSV_BYTES, _EXPECTED).splitlines(), start=1):
         words = _split_line(line)
         if not words:
             continue
         if order is None:
-            order = _parse_header(path, words, number)
-            if order is not None:
+            names = [word.lower() for word in words]
+            columns = next((columns for columns in _COLUMNS if sorted(names) == list(columns)), None)
+            if columns is not None:
+                order = [names.index(column) for column in columns]
                 continue
-            order = _default_column_order(path, words, number)
+            order = list(range(len(words)))
+            if len(words) not in (2, 3) or all(finite_number(word) is None for word in words):
+                raise FileFormatError(path, f"found {shorten(','.join(words))}, expected {_EXPECTED}", number)
+        values = [finite_number(word) for word in words]
+        if len(words) != len(order) or not all(value is not None and abs(value) <= MAX_LENGTH for value in values):
+            expected = f"expected {len(order)} numbers up to {MAX_LENGTH:g} (metres)"
+            raise FileFormatError(path, f"{expected}, got {shorten(','.join(words))}", number)
         if len(rows) == MAX_POINTS:
             raise FileFormatError(path, f"more than {MAX_POINTS} points", number)
-        rows.append(_parse_row(path, words, number, len(order)))
+        rows.append(values)
     if not rows:
         raise FileFormatError(path, f"holds no points; expected {_EXPECTED}")
     return np.array(rows)[:, order]
@@ -69,45 +74,7 @@ def _split_line(line: str) -> list[str]:
     return [word.strip().strip('"') for word in words] if line else []
 
 
-def _parse_header(path: str | PathLike[str], words: list[str], number: int) -> list[int] | None:
-    """Parse which columns are x, (y,) z; None if the line is no header."""
-    if any(_is_number(word) for word in words):
-        return None
-    names = [word.lower() for word in words]
-    for columns in _COLUMNS:
-        if sorted(names) == list(columns):
-            return [names.index(column) for column in columns]
-    raise FileFormatError(path, f"found the columns {shorten(','.join(words))}, expected {_EXPECTED}", number)
-
-
-def _default_column_order(path: str | PathLike[str], words: list[str], number: int) -> list[int]:
-    if len(words) not in map(len, _COLUMNS):
-        raise FileFormatError(path, f"found {len(words)} column{'s' * (len(words) != 1)}, expected {_EXPECTED}", number)
-    return list(range(len(words)))
-
-
-def _parse_row(path: str | PathLike[str], words: list[str], number: int, columns: int) -> list[float]:
-    if len(words) != columns:
-        raise FileFormatError(path, f"found {len(words)} values where {columns} belong", number)
-    values = [float(word) if _is_number(word) else math.nan for word in words]
-    if all(abs(value) <= MAX_LENGTH for value in values):
-        return values
-    wrong = next(word for word in words if not (_is_number(word) and abs(float(word)) <= MAX_LENGTH))
-    expected = f"expected a number up to {MAX_LENGTH:g} (metres)"
-    raise FileFormatError(path, f"{expected}, got {shorten(wrong)}", number)
-
-
-def _is_number(word: str) -> bool:
-    """Return whether the word is a number, nan and inf included: those are refused by their size. `1_000` is none."""
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return word.isascii() and "_" not in word
-
-
-MAX_SVG_BYTES, MAX_SVG_SEGMENTS = 2 * 2**20, 30_000
-"""Largest drawing that is read: its parser takes seconds for a megabyte."""
+_MAX_SVG_BYTES, _MAX_SVG_SEGMENTS = 2 * 2**20, 30_000  # its parser takes seconds for a megabyte
 SVG_METRES_PER_UNIT = 0.01
 """Scale of a drawing unless asked otherwise: 100 SVG units are a metre."""
 
@@ -131,8 +98,8 @@ def _read_segments(path: str | PathLike[str], metres_per_unit: float) -> list:
     segments = [segment for drawn in _read_svg_paths(path) for segment in drawn]
     if not segments:
         raise FileFormatError(path, "holds no drawn path")
-    if len(segments) > MAX_SVG_SEGMENTS:
-        raise FileFormatError(path, f"holds {len(segments)} path segments, allowed are {MAX_SVG_SEGMENTS}")
+    if len(segments) > _MAX_SVG_SEGMENTS:
+        raise FileFormatError(path, f"holds {len(segments)} path segments, allowed are {_MAX_SVG_SEGMENTS}")
     for before, after in pairwise(segments):
         gap = abs(after.start - before.end) * metres_per_unit
         if gap > 1e-3:
@@ -145,7 +112,7 @@ def _read_segments(path: str | PathLike[str], metres_per_unit: float) -> list:
 def _read_svg_paths(path: str | PathLike[str]) -> list:
     from svgpathtools.document import CONVERSIONS, CONVERT_ONLY_PATHS, Document  # slow to import
 
-    text = read_text(path, MAX_SVG_BYTES, "an SVG drawing")
+    text = _read_text(path, _MAX_SVG_BYTES, "an SVG drawing")
     try:
         document = Document.from_svg_string(text)
         for element in document.tree.iter():

@@ -1,4 +1,4 @@
-"""Keys of a shot: what a character does at a time or for a while, as scene and key files tell it."""
+"""Keys of a shot: what a character does at a time or for a while, as scene and key files give it."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -39,11 +39,11 @@ class ShotKey:
     pose_frame: Annotated[int, Field(ge=0, le=_MOST_FRAMES)] = 0
     """Frame of the pose in its file."""
     place: tuple[Coordinate, Coordinate] | None = None
-    """Hips over the ground, x and z, metres; on the way if not given."""
+    """Hips over the ground, x and z, metres; on the trajectory if not given."""
     height: Annotated[float, Field(ge=0, le=10)] | None = None
     """Height of the hips, metres; that of the pose if not given."""
     facing_deg: Annotated[float, Field(ge=-3600, le=3600)] | None = None
-    """Heading of the hips, degrees: 0 along +Z, 90 along +X; that of a pose is along the way if not given."""
+    """Heading of the hips, degrees: 0 along +Z, 90 along +X; that of a pose is along the trajectory if not given."""
     joints: tuple[str, ...] = ()
     """Hands and feet whose positions in the pose are all that counts of it."""
     root_only: bool = False
@@ -53,7 +53,7 @@ class ShotKey:
     hold_seconds: Seconds = 0.0
     """For how long."""
     tolerance: Tolerance | Mapping[str, Tolerance] = 0.0
-    """How far from there a joint may be, metres, of all or by hand and foot; degrees of a key that tells a facing and
+    """How far from there a joint may be, metres, of all or by hand and foot; degrees of a key that gives a facing and
     nothing else; 0 is exact."""
     within_frames: Annotated[int, Field(ge=0, le=_MOST_SHIFT)] = 0
     """How many frames of the motion earlier or later it may be."""
@@ -61,35 +61,27 @@ class ShotKey:
     @property
     def fault(self) -> str | None:
         """A fault that the types cannot express, after the key it is of; None without any."""
+        tolerated = self.tolerance if isinstance(self.tolerance, Mapping) else {}
+        limbs = {"reach": self.reach, "joints": self.joints, "tolerance": tolerated}
+        idle = {"pose_frame": self.pose_frame, "joints": self.joints, "root_only": self.root_only}
         if (self.seconds is None) == (self.frame is None):
             return "seconds: a key is at seconds or at a frame, one of them"
-        if not (self.reach or self.look_at or self.tells_hips):
-            return "reach: a key tells a reach, a look_at, a pose, or a place, a height or a facing of the hips"
-        return self._pose_fault or self._limb_fault
-
-    @property
-    def _pose_fault(self) -> str | None:
-        if self.pose is None:
-            idle = {"pose_frame": self.pose_frame, "joints": self.joints, "root_only": self.root_only}
-            found = next((name for name, value in idle.items() if value), None)
-            return None if found is None else f"{found}: this is of a pose, and the key has none"
+        if not (self.reach or self.look_at or self.gives_hips):
+            return "reach: a key gives a reach, a look_at, a pose, or a place, a height or a facing of the hips"
+        if self.pose is None and any(idle.values()):
+            return f"{next(name for name, value in idle.items() if value)}: this is of a pose, and the key has none"
         if self.root_only and self.joints:
             return "root_only: of a pose only the hips count, or some joints; choose one"
+        for name, given in limbs.items():
+            if unknown := [limb for limb in given if limb not in LIMBS]:
+                return f"{name}.{unknown[0]}: hands and feet are {', '.join(LIMBS)}"
+        if unused := [limb for limb in tolerated if limb not in {*self.reach, *self.joints}]:
+            return f"tolerance.{unused[0]}: the key gives no place of it"
         return None
 
     @property
-    def _limb_fault(self) -> str | None:
-        tolerated = self.tolerance if isinstance(self.tolerance, Mapping) else {}
-        for name, limbs in (("reach", self.reach), ("joints", self.joints), ("tolerance", tolerated)):
-            unknown = [limb for limb in limbs if limb not in LIMBS]
-            if unknown:
-                return f"{name}.{unknown[0]}: hands and feet are {', '.join(LIMBS)}"
-        idle = [limb for limb in tolerated if limb not in {*self.reach, *self.joints}]
-        return f"tolerance.{idle[0]}: the key tells no place of it" if idle else None
-
-    @property
-    def tells_hips(self) -> bool:
-        """Whether it tells a pose, or where the hips are or face."""
+    def gives_hips(self) -> bool:
+        """Whether it gives a pose, or position, height or facing of the hips."""
         return any(value is not None for value in (self.pose, self.place, self.height, self.facing_deg))
 
     def at_seconds(self, fps: float) -> float:
@@ -106,7 +98,7 @@ class _ShotKeyFile:
     key: Annotated[tuple[ShotKey, ...], Field(min_length=1, max_length=10_000)]
     """One [[key]] table each."""
     weights: Literal["free", "full"] | None = None
-    """Set of bundled models, where the command does not tell; the environment's or the full one if not given."""
+    """Set of bundled models, where the command gives none; the environment's or the full one if not given."""
 
 
 def read_shot_weights(path: str | PathLike[str]) -> str | None:

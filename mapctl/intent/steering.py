@@ -12,7 +12,7 @@ import math
 from bisect import bisect_right
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from os import PathLike
 from pathlib import Path
 
@@ -120,11 +120,9 @@ class Command:
         if speed < self.speed:
             said.append(f"the speed of {self.speed:g} m/s{when} was lowered to {speed:.2f} m/s, the prior's fastest")
         if step is not None and (held := min(longest, max(shortest, step))) != step:
-            way = "raised" if held > step else "lowered"
-            said.append(
-                f"the step length of {step:g} m{when} was {way} to {held:g} m; "
-                f"steps can be {shortest:g} to {longest:g} m long"
-            )
+            change = f"{'raised' if held > step else 'lowered'} to {held:g} m"
+            allowed = f"steps can be {shortest:g} to {longest:g} m long"
+            said.append(f"the step length of {step:g} m{when} was {change}; {allowed}")
             step = held
         turned = {name: _wrap_whole_turns(getattr(self, name)) for name in ("heading", "facing")}
         return replace(self, speed=speed, step_length=step, **turned), said
@@ -150,21 +148,13 @@ class CommandTrack:
         """Return the command that holds at a time."""
         return self.commands[max(0, bisect_right(self.times, seconds + 1e-9) - 1)]
 
-    def arrivals(self, before: float, upto: float) -> list[float]:
-        """Return the times, seconds, at which a command came: later than `before`, and not later than `upto`,
-        seconds."""
-        return list(self.times[bisect_right(self.times, before + 1e-9) : bisect_right(self.times, upto + 1e-9)])
-
     def limit_speed(self, fastest: float) -> tuple["CommandTrack", list[str]]:
         """Limit every command to what can be held, speeds to the `fastest` (m/s); also return a note for each number
         that was changed."""
-        found = [
-            command.within(fastest, when=f" at {time:g} s")
-            for time, command in zip(self.times, self.commands, strict=True)
-        ]
-        return CommandTrack(self.times, tuple(command for command, _ in found)), [
-            one for _, said in found for one in said
-        ]
+        pairs = zip(self.times, self.commands, strict=True)
+        found = [command.within(fastest, when=f" at {time:g} s") for time, command in pairs]
+        notes = [note for _, notes in found for note in notes]
+        return CommandTrack(self.times, tuple(command for command, _ in found)), notes
 
 
 @dataclass(frozen=True)
@@ -196,11 +186,8 @@ class SteeringTarget:
 
     def ahead(self, command: Command, limits: SteeringLimits, *, frames: int, fps: float) -> "list[SteeringTarget]":
         """Return the targets of the next frames if the command stays."""
-        wishes, wish = [], self
-        for _ in range(frames):
-            wish = wish.step_toward(command, limits, 1 / fps)
-            wishes.append(wish)
-        return wishes
+        steps = accumulate(range(frames), lambda target, _: target.step_toward(command, limits, 1 / fps), initial=self)
+        return list(steps)[1:]
 
 
 def _wrap_whole_turns(angle: float | None) -> float | None:
@@ -217,20 +204,14 @@ def _step_angle_toward(angle: float, wanted: float, most: float) -> float:
 _REQUIRED_COLUMNS = ("time_s", "speed_mps", "heading_deg")
 _LABEL_COLUMNS = ("gait", "style")
 _HAND_COLUMNS = dict(zip(("left_hand", "right_hand"), REACHING_HANDS, strict=True))
-_PLACES = (*_HAND_COLUMNS, "look")
-_GOTO, _GOTO_MORE = ("goto_x_m", "goto_z_m", "within_s"), ("goto_facing_deg", "pose")
+_GOTO = ("goto_x_m", "goto_z_m", "within_s")
 _ALLOWED_COLUMNS = (
     *_REQUIRED_COLUMNS,
-    "facing_deg",
-    "turn_deg_s",
-    "step_m",
-    *_LABEL_COLUMNS,
-    *(f"{name}_{axis}" for name in _PLACES for axis in "xyz"),
-    *_GOTO,
-    *_GOTO_MORE,
+    *("facing_deg", "turn_deg_s", "step_m", *_LABEL_COLUMNS),
+    *(f"{name}_{axis}" for name in (*_HAND_COLUMNS, "look") for axis in "xyz"),
+    *(*_GOTO, "goto_facing_deg", "pose"),
 )
-_MAX_SPEED, _MAX_TIME, _MAX_VALUE, _MAX_PLACE = 1000.0, 1e6, 1e6, 1e4
-_MAX_GOTO, _MAX_WITHIN = 1000.0, 3600.0
+_MAX_VALUE = 1e6
 
 
 def read_commands(path: str | PathLike[str]) -> CommandTrack:
@@ -239,113 +220,97 @@ def read_commands(path: str | PathLike[str]) -> CommandTrack:
     header, names = (lines[0][0], [word.lower() for word in lines[0][1]]) if lines else (1, [])
     missing = [name for name in _REQUIRED_COLUMNS if name not in names]
     if missing:
-        raise FileFormatError(
-            path, f"has no column {', '.join(missing)}; expected {','.join(_REQUIRED_COLUMNS)}", header
-        )
-    unknown = [name for name in names if name not in _ALLOWED_COLUMNS]
-    if unknown or len(set(names)) < len(names):
-        found = shorten(",".join(names))
-        raise FileFormatError(
-            path, f"found the columns {found}, expected {','.join(_ALLOWED_COLUMNS)}, each once", header
-        )
+        expected = ",".join(_REQUIRED_COLUMNS)
+        raise FileFormatError(path, f"has no column {', '.join(missing)}; expected {expected}", header)
+    if not set(names) <= set(_ALLOWED_COLUMNS) or len(set(names)) < len(names):
+        found, allowed = shorten(",".join(names)), ",".join(_ALLOWED_COLUMNS)
+        raise FileFormatError(path, f"found the columns {found}, expected {allowed}, each once", header)
     if len(lines) < 2:
         raise FileFormatError(path, "holds no commands")
-    times: list[float] = []
-    commands: list[Command] = []
+    times, commands = list[float](), list[Command]()
     for number, words in lines[1:]:
         if len(words) != len(names):
             raise FileFormatError(path, f"found {len(words)} values where {len(names)} belong", number)
-        line = _Line(path, number, dict(zip(names, words, strict=True)))
-        time = line.within("time_s", 0, _MAX_TIME)
+        line = _Line(path, number, {name: word for name, word in zip(names, words, strict=True) if word})
+        time = line.number_in("time_s", 0, _MAX_VALUE)
         if times and time <= times[-1]:
             raise FileFormatError(path, f"time_s must rise, got {time:g} after {times[-1]:g}", number)
         times.append(time)
-        commands.append(line.command())
+        commands.append(line.command(time))
     return CommandTrack(tuple(times), tuple(commands))
 
 
 @dataclass(frozen=True)
 class _Line:
-    """One line of a script."""
+    """The values that a line of a script gives, by column."""
 
     path: str | PathLike[str]
     number: int
     words: dict[str, str]
 
-    def command(self) -> Command:
-        labels = tuple(self.words[name] for name in _LABEL_COLUMNS if self.words.get(name))
-        speed = self.within("speed_mps", 0, _MAX_SPEED)
+    def command(self, time: float) -> Command:
+        reach = {joint: self.point(name) for name, joint in _HAND_COLUMNS.items()}
         return Command(
-            speed,
-            math.radians(self.value("heading_deg")),
+            self.number_in("speed_mps", 0, 1000),
+            math.radians(self.number_in("heading_deg")),
             self.angle("facing_deg"),
             self.angle("turn_deg_s"),
-            self.within("step_m", 0.05, 3.0) if self.words.get("step_m") else None,
-            labels,
-            {joint: place for name, joint in _HAND_COLUMNS.items() if (place := self.place(name)) is not None},
-            self.place("look"),
-            arrival=self.arrival(),
+            self.number_in("step_m", 0.05, 3.0) if "step_m" in self.words else None,
+            tuple(self.words[name] for name in _LABEL_COLUMNS if name in self.words),
+            {joint: point for joint, point in reach.items() if point is not None},
+            self.point("look"),
+            arrival=self.arrival(time),
         )
 
-    def arrival(self) -> Arrival | None:
-        """Return where to be, and by when; None where the line says nothing of it."""
-        told = [name for name in (*_GOTO, *_GOTO_MORE) if self.words.get(name)]
-        if not told:
+    def arrival(self, time: float) -> Arrival | None:
+        """Return the target of the hips and its time; None where the line has none."""
+        given = [name for name in (*_GOTO, "goto_facing_deg", "pose") if name in self.words]
+        if not given:
             return None
-        if missing := [name for name in _GOTO if name not in told]:
-            raise FileFormatError(self.path, f"{told[0]} needs {' and '.join(missing)} too", self.number)
-        x, z = (self.within(name, -_MAX_GOTO, _MAX_GOTO) for name in ("goto_x_m", "goto_z_m"))
-        within = self.within("within_s", 0, _MAX_WITHIN)
+        if missing := [name for name in _GOTO if name not in given]:
+            raise self.fault(f"{given[0]} needs {' and '.join(missing)} too")
+        x, z = (self.number_in(name, -1000, 1000) for name in ("goto_x_m", "goto_z_m"))
+        within = self.number_in("within_s", 0, 3600)
         if within == 0:
-            raise FileFormatError(self.path, "within_s must be more than 0", self.number)
-        by = self.value("time_s") + within
-        return Arrival((x, z), by, self.angle("goto_facing_deg"), self.pose() if "pose" in told else None)
+            raise self.fault("within_s must be more than 0")
+        return Arrival((x, z), time + within, self.angle("goto_facing_deg"), self.pose() if "pose" in given else None)
 
     def pose(self) -> Motion:
         """Return the pose of FILE:FRAME, canonical."""
-        name, colon, number = self.words["pose"].rpartition(":")
-        if not (name and colon and number.isdecimal()):
-            raise FileFormatError(
-                self.path, f"pose is FILE:FRAME, a motion file and a frame of it; got {self.words['pose']}", self.number
-            )
-        file = Path(self.path).parent / name
+        name, _, frame = self.words["pose"].rpartition(":")
+        if not (name and frame.isdecimal()):
+            raise self.fault(f"pose is FILE:FRAME, a motion file and a frame of it; got {self.words['pose']}")
         try:
-            motion = formats.load(file)
-            pose = (
-                to_canonical(motion.slice(int(number), int(number) + 1))[0] if int(number) < motion.num_frames else None
-            )
+            motion, at = formats.load(Path(self.path).parent / name), int(frame)
+            if at >= motion.num_frames:
+                raise RequestError(f"{name} has the frames 0:{motion.num_frames}, and no {frame}")
+            return to_canonical(motion.slice(at, at + 1))[0]
         except (OSError, MapctlError) as error:
-            raise FileFormatError(self.path, f"pose: {error}", self.number) from error
-        if pose is None:
-            raise FileFormatError(
-                self.path, f"pose: {name} has the frames 0:{motion.num_frames}, and no {number}", self.number
-            )
-        return pose
+            raise self.fault(f"pose: {error}") from error
 
-    def place(self, name: str) -> tuple[float, float, float] | None:
-        """Return a place of three columns, metres; None where the line leaves all of them open."""
+    def point(self, name: str) -> tuple[float, float, float] | None:
+        """Return a point of three columns, metres; None where the line gives none of them."""
         columns = [f"{name}_{axis}" for axis in "xyz"]
-        told = [column for column in columns if self.words.get(column)]
-        if not told:
+        given = [column for column in columns if column in self.words]
+        if not given:
             return None
-        if len(told) < len(columns):
-            raise FileFormatError(self.path, f"{name} needs {', '.join(columns)}, all or none", self.number)
-        x, y, z = (self.within(column, -_MAX_PLACE, _MAX_PLACE) for column in columns)
+        if len(given) < len(columns):
+            raise self.fault(f"{name} needs {', '.join(columns)}, all or none")
+        x, y, z = (self.number_in(column, -1e4, 1e4) for column in columns)
         return x, y, z
 
     def angle(self, name: str) -> float | None:
-        """Return an angle in radians; None where the line leaves it open."""
-        return math.radians(self.value(name)) if self.words.get(name) else None
+        """Return an angle in radians; None where the line does not give it."""
+        return math.radians(self.number_in(name)) if name in self.words else None
 
-    def within(self, name: str, low: float, high: float) -> float:
-        if not low <= (value := self.value(name)) <= high:
-            raise FileFormatError(
-                self.path, f"{name} must lie between {low:g} and {high:g}, got {value:g}", self.number
-            )
-        return value
-
-    def value(self, name: str) -> float:
-        value = finite_number(self.words[name])
+    def number_in(self, name: str, low: float = -_MAX_VALUE, high: float = _MAX_VALUE) -> float:
+        word = self.words.get(name, "")
+        value = finite_number(word)
         if value is None or abs(value) > _MAX_VALUE:
-            raise FileFormatError(self.path, f"{name} must be a number, got {shorten(self.words[name])}", self.number)
+            raise self.fault(f"{name} must be a number, got {shorten(word)}")
+        if not low <= value <= high:
+            raise self.fault(f"{name} must lie between {low:g} and {high:g}, got {value:g}")
         return value
+
+    def fault(self, reason: str) -> FileFormatError:
+        return FileFormatError(self.path, reason, self.number)

@@ -51,8 +51,6 @@ def test_turning_on_and_on_stays_within_the_limits_and_never_arrives():
 def test_a_track_holds_each_command_until_the_next():
     track = CommandTrack((1.0, 2.0), (Command(1, 0), Command(2, 0)))
     assert [track.at(t).speed for t in (0, 1, 1.99, 2, 9)] == [1, 1, 1, 2, 2]
-    assert track.arrivals(0, 1.5) == [1.0]
-    assert track.arrivals(1.0, 2.0) == [2.0]
 
 
 def test_speeds_beyond_the_priors_are_lowered_and_said():

@@ -240,9 +240,9 @@ def test_a_cost_is_learned_from_steps_and_a_longer_one_is_believed_later():
 def test_a_search_that_was_cut_tells_what_comes_after_it():
     cost = steer.StepCost(0.002, 0.004)
     for _ in range(60):
-        cost = cost.learn(cost.limit_search(0.05) + 0.009, 10, search=cost.limit_search(0.05), cut_short=True)
+        cost = cost.learn((0.05 - cost.rest) + 0.009, 10, search=(0.05 - cost.rest), cut_short=True)
     assert cost.rest == pytest.approx(0.009, abs=5e-4)
-    assert cost.limit_search(0.05) == pytest.approx(0.041, abs=5e-4)
+    assert (0.05 - cost.rest) == pytest.approx(0.041, abs=5e-4)
     assert cost.learn(9.0, 10, search=0.04, cut_short=True).rest <= 0.02, "that was another process"
     assert cost.learn(0.001, 10, search=None, cut_short=False).rest == cost.rest
 

@@ -100,7 +100,7 @@ def plan_shot(
             Reach(when, key.reach, key.hold_seconds, key.tolerance, within) for when, within, key in keys if key.reach
         ),
         looks=tuple(Look(when, key.look_at, key.hold_seconds) for when, _, key in keys if key.look_at is not None),
-        poses=tuple(_build_pose_key(body, key, when, within) for when, within, key in keys if key.tells_hips),
+        poses=tuple(_build_pose_key(body, key, when, within) for when, within, key in keys if key.gives_hips),
         obstacles=tuple(obstacles),
     )
     labels = [f"{group}={value}" for group, value in (("gait", actor.gait), ("style", actor.style)) if value]
