@@ -66,37 +66,6 @@ def test_progress_and_path_error_are_the_walks_own(name):
         assert got[f"path_error_low_passed_{kind}_cm"] < got[f"path_error_{kind}_cm"]
 
 
-def test_the_way_back_counts_even_nearer_to_the_way_out():
-    """Legs 20 cm apart; on the way back the walker is 15 cm off, so 5 cm from the way out."""
-    curve = hairpin(apart=0.2)
-    arcs = torch.linspace(0, curve.length, 200, dtype=torch.float64)
-    inward = torch.where(arcs > curve.length / 2 + 0.5, 0.15, 0.0)
-    places = curve.point(arcs) - inward[:, None] * torch.tensor([1.0, 0.0])
-    got = measure(walk_through(places), curve, speed=1.0)
-    assert got["travelled_m"] == pytest.approx(curve.length, rel=0.02)
-    assert got["path_error_max_cm"] == pytest.approx(15, abs=0.5)
-
-
-@pytest.mark.parametrize("share", [0.3, 0.5, 0.8])
-def test_a_walk_that_ends_early_has_gone_so_far(share):
-    for name in ("hairpin", "back on itself", "figure8"):
-        arcs, _, places = made(CURVES[name], laps=share)
-        assert float(track_arcs(CURVES[name], places)[-1]) == pytest.approx(float(arcs[-1]), abs=0.13)
-
-
-def test_what_was_left_out_of_a_curve_is_missed():
-    """The walker turns 1 m before the tip: no arc is skipped in a jump, and the tip counts as missed."""
-    curve = hairpin(apart=0.3)
-    out = np.stack([np.zeros(100), np.linspace(0, 3, 100)], axis=1)
-    across = np.stack([np.linspace(0, 0.3, 10), np.full(10, 3.0)], axis=1)
-    places = np.concatenate([out, across, out[::-1] + np.array([0.3, 0.0])])
-    got = measure(walk_through(places), curve, speed=1.0)
-    assert got["travelled_m"] == pytest.approx(curve.length, abs=0.1)
-    assert 50 < got["path_error_max_cm"] < 115
-    steps = track_arcs(curve, torch.tensor(places)).diff()
-    assert float(steps.max()) < 1.5  # the nearest place goes on by 2.4 m at once
-
-
 def test_steps_back_and_standing_are_followed():
     """To and fro by 0.4 m on a line: the nearest place is the truth there."""
     z = 2 + np.concatenate([np.linspace(0, 1, 30), np.linspace(1, 0.6, 20), np.full(40, 0.6), np.linspace(0.6, 2, 40)])

@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapctl import curves
-from mapctl.curves.tracking import track_arcs
 from mapctl.errors import RequestError
 
 ARCS = torch.linspace(0, 30, 301, dtype=torch.float64)
@@ -41,18 +40,6 @@ def test_circle_is_round_turns_left_and_wraps(radius):
     assert curve.start_heading == pytest.approx(0, abs=0.02)
 
 
-def test_figure8_is_a_left_then_a_right_circle_that_touch_at_the_start():
-    curve = curves.figure8(radius=2.0)
-    lap = 4 * math.pi
-    for arc in (0.0, lap, 2 * lap):
-        torch.testing.assert_close(curve.point(arc), torch.zeros(2, dtype=torch.float64), rtol=0, atol=1e-3)
-        assert curve.tangent(arc)[1] > 0.999
-    assert float(curve.curvature(lap / 2)) == pytest.approx(0.5, rel=0.01)
-    assert float(curve.curvature(1.5 * lap)) == pytest.approx(-0.5, rel=0.01)
-    assert curve.points[:, 0].max() == pytest.approx(4, abs=1e-4)
-    assert curve.points[:, 0].min() == pytest.approx(-4, abs=1e-4)
-
-
 def test_s_line_and_wave_have_the_asked_sizes():
     s, line, wave = curves.s(length=6.0), curves.line(length=10.0), curves.wave(amplitude=1.5, length=8.0)
     assert float((s.points[-1] - s.points[0]).norm()) == pytest.approx(6.0, abs=1e-9)
@@ -65,17 +52,6 @@ def test_s_line_and_wave_have_the_asked_sizes():
     assert float(wave.points[:, 0].max()) == pytest.approx(1.5, abs=1e-5)
     assert wave.start_heading == pytest.approx(math.atan2(1.5 * 2 * math.pi / 8, 1), abs=0.02)
     assert not any(curve.closed for curve in (s, line, wave))
-
-
-def test_left_is_plus_x_when_facing_plus_z():
-    line = curves.line(length=2.0)
-    places = torch.tensor([[0.3, 0.9, 1.0], [-0.2, 0.0, 1.0]], dtype=torch.float64)
-    arcs = line.nearest(places)
-    torch.testing.assert_close(arcs, torch.ones(2, dtype=torch.float64))
-    torch.testing.assert_close(line.signed_offset(places, arcs), torch.tensor([0.3, -0.2], dtype=torch.float64))
-    inside = torch.tensor([[3.0, 1.0]], dtype=torch.float64)  # of a circle that turns left
-    circle = curves.circle(radius=4.0)
-    assert float(circle.signed_offset(inside, circle.nearest(inside))) > 0
 
 
 def test_a_curve_through_points_passes_them_smoothly_and_few_points_are_a_line():
@@ -127,16 +103,6 @@ def test_any_drawing_keeps_its_points_its_length_and_its_nearest_places(seed, di
     inside = (arc > 0.5) & (arc < curve.length - 0.5)  # else the search meets the straight extension
     np.testing.assert_allclose(gap[inside], distance[inside], atol=1e-4)
     assert (gap <= distance + 1e-4).all()
-
-
-def test_a_local_search_stays_on_its_branch_where_a_curve_crosses_itself():
-    t = np.linspace(0, 2 * math.pi, 2000)
-    bow = curves.from_points(np.stack([np.sin(2 * t), 2 * np.sin(t)], axis=1))
-    arcs = torch.linspace(0, 2 * bow.length, 700, dtype=torch.float64)
-    torch.testing.assert_close(track_arcs(bow, bow.point(arcs)), arcs, rtol=0, atol=1e-4)
-    off_to_a_side = bow.point(arcs) + 0.05 * bow.left(arcs)
-    found = bow.nearest(off_to_a_side, around=arcs + 0.1, reach=0.3)
-    torch.testing.assert_close(bow.signed_offset(off_to_a_side, found), torch.full_like(arcs, 0.05), rtol=0, atol=1e-3)
 
 
 def test_gradients_of_places_and_of_searches():

@@ -4,7 +4,7 @@ import pytest
 import torch
 from helpers import generator
 
-from mapctl.curves.obstacles import Obstacle, measure_clearance
+from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import RequestError
 
 SHAPES = {
@@ -36,14 +36,6 @@ def test_a_positive_turn_turns_z_toward_x():
     assert float(box.distance(torch.tensor([0.9, 0.0]))) < 0 < float(box.distance(torch.tensor([0.0, 0.9])))
     slanted = Obstacle((0.0, 0.0), size=(0.2, 2.0), turn_deg=45)
     assert float(slanted.distance(torch.tensor([0.6, 0.6]))) < 0 < float(slanted.distance(torch.tensor([-0.6, 0.6])))
-
-
-def test_clearance_is_that_of_the_nearest_and_infinite_without_any():
-    points = torch.tensor([[0.4, 0.0], [3.0, 3.0]])
-    both = tuple(SHAPES.values())
-    expected = torch.stack([one.distance(points) for one in both]).amin(0)
-    torch.testing.assert_close(measure_clearance(both, points), expected)
-    assert bool(measure_clearance((), points).isinf().all())
 
 
 @pytest.mark.parametrize("text", ["1,2", "a,b,c", "1,2,3,4", "0,0,0", "0,0,-1", "0,0,nan"])

@@ -28,14 +28,6 @@ def test_a_corner_is_slowed_for_in_time_and_left_again(degrees):
     assert np.abs(np.diff(squares)).max() / (2 * 0.05) < 0.95, "braking and setting off, m/s^2"
 
 
-def test_a_loop_slows_down_for_the_corner_at_its_beginning():
-    square = polygon((0, 0), (0, 4), (4, 4), (4, 0), (0, 0), closed=True)
-    profile = walk_at_ease(square)
-    assert profile.at(0.0) == pytest.approx(profile.at(square.length), abs=1e-9)
-    assert profile.at(0.0) < 0.8
-    assert profile.at(square.length - 0.3) < 1.15
-
-
 def test_reversals_are_found_where_they_are_and_hairpins_are_none():
     there = find_reversals(polygon((0, 0), (0, 4), (0, 1), (2, 1)))
     assert there == pytest.approx([4.0], abs=0.05)

@@ -31,26 +31,12 @@ def test_a_wish_comes_to_the_command_within_the_limits_and_by_the_short_way(head
 HAND = "left_hand_x,left_hand_y,left_hand_z"
 
 
-def test_facing_goes_with_travel_unless_it_is_held():
-    wish = SteeringTarget(1.0, 0.0, 0.0)
-    walked, strafed = (
-        wish.ahead(Command(1.0, 1.0, facing), SteeringLimits(), frames=60, fps=30)[-1] for facing in (None, 0.0)
-    )
-    assert (walked.facing, strafed.facing) == pytest.approx((1.0, 0.0))
-    assert strafed.heading == pytest.approx(1.0)
-
-
 def test_turning_on_and_on_stays_within_the_limits_and_never_arrives():
     limits = SteeringLimits(turn_rate=2.0)
     for asked, got in ((0.7, 0.7), (-1.5, -1.5), (9.0, 2.0)):
         wishes = SteeringTarget(1.0, 0.3, 0.3).ahead(Command(1.0, 5.0, turning=asked), limits, frames=90, fps=30)
         assert wishes[-1].heading - 0.3 == pytest.approx(3 * got)
         assert wishes[-1].facing == pytest.approx(wishes[-1].heading, abs=2 * math.pi / 30)
-
-
-def test_a_track_holds_each_command_until_the_next():
-    track = CommandTrack((1.0, 2.0), (Command(1, 0), Command(2, 0)))
-    assert [track.at(t).speed for t in (0, 1, 1.99, 2, 9)] == [1, 1, 1, 2, 2]
 
 
 def test_speeds_beyond_the_priors_are_lowered_and_said():
@@ -69,14 +55,6 @@ def test_steps_that_nobody_takes_are_brought_near_and_said():
         "the speed of 9 m/s at 2 s was lowere",
         "the step length of 0.01 m at 2 s was",
     ]
-
-
-def test_angles_of_many_turns_are_the_same_direction_and_others_stay_to_the_bit():
-    held, said = Command(1.0, 1e9, 7.0).within(3.0)
-    assert said == []
-    assert math.cos(held.heading) == pytest.approx(math.cos(1e9), abs=1e-6)
-    assert held.facing == pytest.approx(7.0 - 2 * math.pi)
-    assert Command(1.0, 5.9, -6.1).within(3.0)[0] == Command(1.0, 5.9, -6.1)
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,7 @@ import torch
 from helpers import generator, tiny_density
 
 import controllers
-from controllers.common.initial_state import select_initial_state
-from controllers.shots.walk import FollowSettings, build_follow_terms, check_path
+from controllers.shots.walk import FollowSettings, check_path
 from mapctl import curves
 from mapctl.errors import RequestError
 from mapctl.features import encode
@@ -129,18 +128,6 @@ def test_a_corner_is_named_with_its_place_and_angles():
     assert notes(curves.circle(radius=0.5), 1.2, 3.0)[0].startswith("the curve turns 13")
 
 
-def test_a_corner_is_judged_by_the_time_it_takes_not_by_the_speed_at_the_start():
-    arc = torch.linspace(0, math.pi / 2, 200).double()
-    bend = torch.stack([4 - 4 * arc.cos(), 8 + 4 * arc.sin()], -1)  # a quarter of a circle of 4 m after 8 m of line
-    curve = curves.from_points(torch.cat([torch.tensor([[0.0, 0.0]]).double(), bend]))
-    late = SpeedProfile((7.0, 8.0), (0.5, 1.9))
-    assert notes(curve, None, 18.0, late) == []
-    fast = SpeedProfile((0.0, 8.0), (1.9, 0.5))
-    assert notes(curve, None, 10.0, fast) == []
-    sharp = curves.circle(radius=1.0)
-    assert notes(sharp, None, 4.0, SpeedProfile((0.0, 3.0), (0.5, 1.9)))[0].startswith("the curve turns 10")
-
-
 def test_a_curve_too_short_for_the_seconds_is_slowed_down_or_named():
     request, note = PathRequest(curves.line(length=3), SpeedProfile.constant(1.0), 4.0).fitted(30)
     assert float(request.arcs(120, 30)[-1]) == pytest.approx(3.0, abs=0.05)
@@ -151,25 +138,6 @@ def test_a_curve_too_short_for_the_seconds_is_slowed_down_or_named():
     assert "go straight on beyond the end of the curve of 1.0 m" in notes(curves.line(length=1), 1.0, 4.0)[-1]
     closed = PathRequest(curves.circle(radius=0.1), SpeedProfile.constant(1.0), 4.0)
     assert closed.fitted(30) == (closed, None)
-
-
-def test_the_start_is_one_of_the_best_by_the_wishes_speed():
-    arcs = 0.04 * torch.arange(60, dtype=torch.float64)
-    curve = curves.circle(radius=2)
-    terms_of = build_follow_terms(curve, arcs, QUICK)
-    found = select_initial_state(DENSITY, curve, arcs, terms_of, skeleton=CANONICAL, fps=30.0, generator=generator())
-    assert any(torch.equal(found.committed.state.last_frame[0], row) for row in DENSITY.initial_states.state.last_frame)
-    stood = found.before_first.displace(found.committed.features[0, :2], found.committed.features[0, 2])
-    torch.testing.assert_close(stood.position_xz, found.committed.place.position_xz, atol=1e-6, rtol=0)
-    torch.testing.assert_close(stood.heading, found.committed.place.heading)
-
-
-@pytest.mark.parametrize(
-    "text", ["", "fast", "0:1,0:2", "2:1,1:1", "0:1,2", "0:-1", "0:1:2", "nan", "nan:1", "0:1,inf:2"]
-)
-def test_profiles_that_are_none_are_refused(text):
-    with pytest.raises(RequestError):
-        SpeedProfile.parse(text)
 
 
 def test_arcs_are_the_integral_of_speed():

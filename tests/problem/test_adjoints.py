@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from catalogue import DENSITIES, FRAMES, PAST, TERMS, excite, trial
-from helpers import generator, tiny_density, tiny_model, walk
+from catalogue import DENSITIES, FRAMES, PAST, TERMS, trial
+from helpers import generator, tiny_density, walk
 
 from mapctl.features import LAYOUT, encode, integrate_root
 from mapctl.kinematics.fast import WorldPoses
@@ -15,8 +15,6 @@ from mapctl.problem.unknowns import LatentNoise, WindowContext
 from mapctl.skeleton import CANONICAL
 from mapctl.terms import LatentPrior
 from mapctl.terms.base import DifferentiatedTerm, TrialGradient
-from priors.lstm_gmm import fast
-from priors.lstm_gmm.network import LstmGmm
 
 BY_HAND = {name: term for name, term in TERMS.items() if isinstance(term, DifferentiatedTerm)}
 PARTS = ("features", "noise", "log_density")
@@ -121,30 +119,3 @@ def test_double_precision_is_left_to_autograd():
     assert unknowns.build_detached(noise) is None
     energy, gradient = Objective.of(unknowns, [LatentPrior(), TERMS["footing"]]).energy_and_gradient(noise)
     assert energy.dtype == gradient.dtype == torch.float64
-
-
-def half_network(**shape) -> LstmGmm:
-    """A network whose weights half precision holds."""
-    network = tiny_model(dtype=torch.float32, **shape)
-    excite(network, 1)
-    with torch.no_grad():
-        for values in network.parameters():
-            values.copy_(values.half().float())
-    return network
-
-
-@pytest.mark.skipif(not fast.converts_half(), reason="the processor does not convert half precision")
-@pytest.mark.parametrize("batch", [1, 5])
-def test_half_precision_changes_nothing(batch, monkeypatch):
-    network = half_network(components=3)
-    density = replace(tiny_density(), reference=network, use_fast=True)
-    assert density._fast._weights.lstm.dtype == np.uint16
-    noise = torch.randn(batch, FRAMES * LAYOUT.continuous, generator=generator(batch))
-    found = []
-    for halves in (True, False):
-        monkeypatch.setattr(fast, "converts_half", lambda halves=halves: halves)
-        unknowns = LatentNoise.from_unknowns(context(replace(density)), noise)
-        found.append(Objective.of(unknowns, [TERMS["noise"], TERMS["footing"]]).energy_and_gradient(noise))
-        assert (replace(density)._fast._weights.lstm.dtype == np.uint16) is halves
-    for ours, theirs in zip(*found, strict=True):
-        assert_near(ours, theirs.numpy(), 1e-5)

@@ -1,17 +1,16 @@
 """Which density a motion is likelier under, and how far it is trusted."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 
 import pytest
 import torch
-from helpers import generator, tiny_density, walk
+from helpers import tiny_density, walk
 from toy_density import ToyDensity, toy_density
 
 from mapctl.features import LAYOUT, encode
 from mapctl.problem import density_selection
-from mapctl.rotations import from_rotation_vector, multiply
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,33 +65,6 @@ def test_the_weight_falls_with_what_is_lacking(lacking, weight):
     assert density_selection.select_density_for_motion(
         [flat("a", 0.0, usual=lacking)], walk(20)
     ).weight == pytest.approx(weight)
-
-
-def test_the_motion_it_knows_is_likelier_than_a_twisted_one():
-    motion = walk(60)
-    turns = 0.3 * torch.randn(*motion.local_quat_xyzw.shape[:2], 3, generator=generator(), dtype=torch.float64)
-    twisted = replace(motion, local_quat_xyzw=multiply(motion.local_quat_xyzw, from_rotation_vector(turns)))
-    name = tiny().name
-    plain, other = (
-        density_selection.select_density_for_motion([tiny()], each).nats[name] for each in (motion, twisted)
-    )
-    assert plain > other + 10
-
-
-def test_blur_widens_the_density_and_nothing_widens_it_by_nothing():
-    features = encode(walk(40))[0].float()[None]
-    state = tiny().start_after(features[:, 0])
-    sharp = tiny().log_prob(features[:, 1:], state)
-    none = tiny().with_observation_noise(torch.zeros(LAYOUT.continuous)).log_prob(features[:, 1:], state)
-    assert torch.allclose(none, sharp, rtol=1e-4)
-    away = features.clone()
-    away[..., 10] += 0.3  # radians, far beyond what the walks show
-    blurs = [tiny().with_observation_noise(times * density_selection.proposal_sigma()) for times in (1, 30)]
-    costs = [
-        float((density.log_prob(features[:, 1:], state) - density.log_prob(away[:, 1:], state)).mean())
-        for density in (tiny(), *blurs)
-    ]
-    assert costs[0] > costs[1] > costs[2] > 0
 
 
 def test_a_blurred_density_is_that_of_a_sum():

@@ -51,18 +51,6 @@ def test_latents_build_the_rollout_of_their_plan():
     assert trial.before is CONTEXT.before
 
 
-def test_the_gradient_through_the_whole_chain_is_that_of_finite_differences():
-    unknowns = 0.5 * noise(2, FRAMES, dtype=torch.float64).flatten(1)
-    objective = Objective(LatentNoise.from_unknowns(CONTEXT, unknowns).build, (LatentPrior(), FootContact(), Jerk()))
-    energy, gradient = objective.energy_and_gradient(unknowns)
-    direction = torch.randn(unknowns.shape, generator=generator(4), dtype=torch.float64)
-    difference = finite_difference(lambda x: objective.energy(x).sum(), unknowns, direction)
-    assert float((gradient * direction).sum()) == pytest.approx(difference, rel=1e-5)
-    torch.testing.assert_close(energy, objective.energy(unknowns))
-    assert not energy.requires_grad
-    assert not unknowns.requires_grad
-
-
 def test_the_ledger_adds_up_to_the_energy_and_names_every_term():
     unknowns = noise(1, FRAMES, dtype=torch.float64).flatten(1)
     terms = (LatentPrior(), FootContact(), Jerk())

@@ -50,15 +50,6 @@ def test_a_path_is_walked_braked_for_and_stood_at():
     assert pilot.at(0.0).heading == pytest.approx(0.0, abs=0.1)
 
 
-def test_a_closed_path_goes_round_and_round():
-    pilot = Autopilot(Command(1.0, 0.0), SteeringLimits())
-    pilot.walk(curves.read("circle:1"), 1.0)
-    for turn in torch.linspace(0, 12, 200).tolist():
-        x, z = curves.read("circle:1").point(turn).tolist()
-        at_place(pilot, x, z)
-        assert pilot.at(0.0).speed == 1.0
-
-
 def test_what_is_aimed_at_on_a_path_keeps_the_path_and_stays_at_its_end():
     disc, place = (Obstacle((1.0, 2.0), 0.4),), (0.3, 1.2, 4.0)
     pilot = Autopilot(Command(1.0, 0.5), SteeringLimits())

@@ -93,19 +93,6 @@ def test_it_is_a_live_character_that_walks_in_time(remote):
 
 
 @pytest.mark.slow
-def test_it_turns_when_told_and_walks_a_path(remote):
-    remote.command(Command(1.2, np.pi / 2))
-    last = collected(remote, 2.5)[-1]
-    assert np.argmax(np.abs(last.target_velocity)) == 0, "the wish is along x"
-    assert last.target_velocity[0] == pytest.approx(1.2, abs=0.05)
-    here = last.root[-1]
-    remote.walk([(here[0], here[2]), (here[0], here[2] - 1), (here[0], here[2] - 9)], 1.0)
-    assert collected(remote, 2.0)[-1].target_velocity[1] < -0.3
-    with pytest.raises(RequestError):
-        remote.walk([(0.0, 0.0)], 1.0)
-
-
-@pytest.mark.slow
 def test_a_pause_stops_time_and_going_on_loses_none(remote):
     remote.command(Command(1.0, 0.0))
     before = collected(remote, 0.5)[-1]
@@ -120,23 +107,6 @@ def test_a_pause_stops_time_and_going_on_loses_none(remote):
 
 def notes(remote, seconds=1.0):
     return [note for piece in collected(remote, seconds) for note in piece.notes]
-
-
-@pytest.mark.slow
-def test_orders_that_cannot_be_are_brought_near_or_left_out_and_said(remote):
-    remote.reset()
-    remote.command(Command(99.0, 1e9, step_length=99.0))
-    said = notes(remote)
-    assert any("the speed of 99 m/s was lowered to 2.20 m/s" in note for note in said)
-    assert any("the step length of 99 m was lowered to 1.2 m" in note for note in said)
-    remote.command(Command(1.0, 0.0))
-    collected(remote, 2.5)
-    remote.command(Command(2.0, 0.0, labels=("swim",)))
-    [note] = notes(remote)
-    assert "knows no" in note
-    assert np.hypot(*collected(remote, 0.5)[-1].target_velocity) == pytest.approx(1.0, abs=0.05), (
-        "the order before it holds"
-    )
 
 
 @pytest.mark.slow

@@ -1,9 +1,6 @@
 """Steering with an untrained density: the contract of a step and of the loop, not the quality of the walk."""
 
-import functools
-import itertools
 import math
-import time
 from dataclasses import replace
 
 import pytest
@@ -19,11 +16,6 @@ from controllers.steering.process import PurePursuit
 from mapctl import curves
 from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import RequestError
-from mapctl.intent.steering import Command
-from mapctl.problem import window_solvers
-from mapctl.problem.objective import Objective
-from mapctl.skeleton import CANONICAL, Skeleton
-from mapctl.solver.budget import Meter
 
 
 def steered(steps, command=AHEAD, **how):
@@ -176,17 +168,6 @@ def test_steps_that_others_hold_up_are_to_end_earlier():
     assert min(spare[3:]) > 0.009
 
 
-def test_ctrl_c_keeps_what_was_shown():
-    class Interrupting(Heard):
-        def at(self, seconds):
-            if len(self.times) == 2:
-                raise KeyboardInterrupt
-            return super().at(seconds)
-
-    state, records = drive(begun()[0], Interrupting(), [], frames=300)
-    assert (state.frames, len(records)) == (7, 2)
-
-
 def test_latency_runs_from_the_arrival_to_the_first_frame_that_could_change():
     records = [StepRecord(3, k / 10, k / 10 + 0.1, k / 10 + 0.05, 0.06, 4, "") for k in range(5)]
     assert summarise_step_timing(records, [0.1])["command_latency_s"] == pytest.approx(0.1)
@@ -215,65 +196,3 @@ def test_obstacles_lead_the_direction_round_and_hold_joints_off():
     assert abs(led.steering_targets[-1].heading) > 0.05 > abs(calm.steering_targets[-1].heading)
     names = {entry.name for entry in led.ledger.entries}
     assert names == {entry.name for entry in calm.ledger.entries} | {"clear"}
-
-
-def test_obstacles_are_of_the_characters_own_metres():
-    """One of half the size is led round what is half as far and half as large, to the same side."""
-    turned = []
-    for size in (1.0, 0.5):
-        body = Skeleton(CANONICAL.names, CANONICAL.parents, size * CANONICAL.offsets)
-        state, _ = steer.begin(DENSITY, AHEAD, generator=generator(0), settings=QUICK, skeleton=body)
-        command = Command(1.2 * size, 0.0, obstacles=(Obstacle((0.05 * size, 1.4 * size), 0.6 * size),))
-        turned.append(steer.step(state, command)[1].steering_targets[-1].heading)
-    assert min(map(abs, turned)) > 0.05
-    assert turned[0] * turned[1] > 0
-
-
-def test_a_cost_is_learned_from_steps_and_a_longer_one_is_believed_later():
-    first = steer.StepCost(0.002)
-    assert first.needed_seconds(6) == pytest.approx(first.rest + 0.012)
-    slower, faster = (first.learn(14 * one, 14, search=None, cut_short=False).evaluation for one in (0.004, 0.001))
-    assert first.evaluation < slower < 0.0025
-    assert 0.001 < faster < 0.0017
-
-
-def test_a_search_that_was_cut_tells_what_comes_after_it():
-    cost = steer.StepCost(0.002, 0.004)
-    for _ in range(60):
-        cost = cost.learn((0.05 - cost.rest) + 0.009, 10, search=(0.05 - cost.rest), cut_short=True)
-    assert cost.rest == pytest.approx(0.009, abs=5e-4)
-    assert (0.05 - cost.rest) == pytest.approx(0.041, abs=5e-4)
-    assert cost.learn(9.0, 10, search=0.04, cut_short=True).rest <= 0.02, "that was another process"
-    assert cost.learn(0.001, 10, search=None, cut_short=False).rest == cost.rest
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("free", [False, True], ids=["walking", "stuck"])
-def test_steps_return_within_their_time(monkeypatch, free):
-    """An evaluation takes 2 ms, the rest of a step 3 ms before the search ends and after it."""
-    now = [0.0]
-    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
-    monkeypatch.setattr(window_solvers, "Meter", functools.partial(Meter, clock=lambda: now[0]))
-    evaluate, decode = Objective.energy_and_gradient, steer.decode
-
-    def slow_evaluate(self, x):
-        now[0] += 0.002 * len(x)
-        return evaluate(self, x)
-
-    def slow_decode(*given, **named):
-        now[0] += 0.003
-        return decode(*given, **named)
-
-    monkeypatch.setattr(Objective, "energy_and_gradient", slow_evaluate)
-    monkeypatch.setattr(steer, "decode", slow_decode)
-    settings = replace(QUICK, evaluations=20, random_starts=2, stuck=-1.0 if free else 9.0)
-    for seconds in (0.006, 0.012, 0.031):
-        state, _ = begun(settings=settings)
-        state, made = replace(state, cost=steer.StepCost(0.002)), []
-        for _ in range(8):
-            began = now[0]
-            state, frames = steer.step(state, AHEAD, seconds=seconds)
-            made.append(frames.evaluations)
-            assert now[0] - began <= seconds + 0.003, (frames.evaluations, frames.notes, state.cost)
-    assert max(made) > 0
-    assert list(itertools.accumulate(made))[-1] >= 8 * 5

@@ -46,13 +46,6 @@ def test_too_slow_costs_under_the_sigma_of_speed():
     torch.testing.assert_close(energy, torch.full((1, FRAMES), 0.5 * 1.5**2).double())
 
 
-def test_another_direction_costs_under_its_own_sigma_as_an_angle():
-    energy = wanting(1.0, 0.0, sigma_direction=0.3, sigma_speed=1.0)(gliding(1.0, 0.2))
-    along, across = 1 - math.cos(0.2), math.sin(0.2)
-    expected = 0.5 * (along**2 + (across / max(0.3, 1.0)) ** 2)  # at rest and near it, across is no finer than along
-    torch.testing.assert_close(energy, torch.full((1, FRAMES), expected).double())
-
-
 def test_facing_is_an_angle():
     for turns in (0, 3):
         facing = torch.full((FRAMES,), 0.3 + 2 * math.pi * turns, dtype=torch.float64)
@@ -67,13 +60,3 @@ def test_what_was_missed_before_the_window_is_owed():
     energy = wanting(1.2, 0.0)(late)[0]
     assert float(energy[0]) > 1
     assert float(energy[-5:].max()) < 1e-9
-
-
-def test_a_strides_rise_and_fall_is_free():
-    """Speed that swings by a third of its mean at two strides a second costs a fiftieth of what it would unsmoothed."""
-    trial = gliding(1.2, 0.0)
-    swing = 0.4 * torch.sin(2 * math.pi * 2 * torch.arange(FRAMES) / 30)
-    trial.features[0, :, 1] += swing / 30
-    inner = slice(12, FRAMES - 12)
-    energy = wanting(1.2, 0.0)(trial)[0, inner]
-    assert float(energy.mean()) < 0.02 * float((0.5 * (swing[inner] / 0.1) ** 2).mean())

@@ -29,7 +29,7 @@ def rows(whole, picked):
 
 
 def test_the_catalogue_has_every_term():
-    assert {type(term).__name__ for term in TERMS.values()} == {*terms.__all__} - {"LandingSigmas", "Term"}
+    assert {type(term).__name__ for term in TERMS.values()} == {*terms.__all__} - {"LandingSigmas", "Term", "Trial"}
 
 
 @each_term
@@ -40,15 +40,6 @@ def test_energies_and_residuals_are_one_finite_number_a_frame(name):
             assert values.shape == (batch, FRAMES)
             assert values.dtype == dtype
             assert bool(torch.isfinite(values).all())
-
-
-@each_term
-def test_energies_and_residuals_are_not_negative_but_for_densities(name):
-    if isinstance(TERMS[name], Likelihood):
-        assert float(TERMS[name](trial(8)).min()) < 0
-        return
-    assert float(TERMS[name](trial(8)).min()) >= 0
-    assert float(TERMS[name].residual(trial(8)).min()) >= 0
 
 
 @each_term
@@ -205,27 +196,6 @@ def test_a_planted_heel_pays_for_speed_and_height_as_its_sigmas_say(past):
     assert bool((term(free) - toes(free) < expected).all())
 
 
-def test_sigmas_of_heels_keep_their_proportion_to_those_of_toes():
-    term = FootContact(0.03, 0.01, 0.005, heels=HeelSigmas(0.05, 0.02, 0.01, doubt=3.0))
-    assert term.with_sigmas(0.06, 0.04, 0.0025).heels == HeelSigmas(0.1, 0.08, 0.005, doubt=3.0)
-    assert replace(term, heels=None).with_sigmas(0.06, 0.04, 0.0025) == FootContact(0.06, 0.04, 0.0025, heels=None)
-
-
-def test_another_motion_may_say_which_heels_are_planted():
-    whole = replace(trial(3, disturbed=0.0), heel_contacts=None)
-    raised = whole.features.clone()
-    raised[..., LAYOUT.slices["root_height"]] += 0.2
-    raised = replace(whole, features=raised)
-    assert torch.equal(raised.heels_planted[:, 1:], whole.heels_planted[:, 1:])
-    tilted = whole.features.clone()
-    tilted[..., LAYOUT.slices["root_tilt"]] += 0.5
-    tilted = replace(whole, features=tilted)
-    assert not torch.equal(tilted.heels_planted, whole.heels_planted)
-    assert torch.equal(replace(tilted, heel_plan=whole).heels_planted, whole.heels_planted)
-    alone = replace(tilted, heel_plan=rows(whole, slice(1))).heels_planted
-    assert torch.equal(alone, whole.heels_planted[:1].expand_as(alone))
-
-
 def test_heel_contacts_come_from_the_toes_and_the_pose():
     whole = replace(trial(2, disturbed=0.0), heel_contacts=None)
     motion = walk(PAST + FRAMES, turn_rate=0.2)
@@ -237,18 +207,6 @@ def test_heel_contacts_come_from_the_toes_and_the_pose():
     unknown = replace(whole, before=whole.before[:0])
     assert not unknown.heels_planted[:, 0].any()
     assert torch.equal(unknown.heels_planted[:, 1:], wanted[:, 1:])
-
-
-def test_a_toe_that_lands_as_the_window_begins_is_not_held_by_its_swing():
-    whole = trial(2, disturbed=0.0)
-    both, left = torch.ones_like(whole.contacts), torch.tensor([[True, False], [False, False]])
-    landing = replace(whole, contacts=both, contacts_before=torch.zeros(2, dtype=torch.bool))
-    term = FootContact(heels=None)
-    assert float(term.residual(landing)[:, 0].max()) == 0
-    standing = term.residual(replace(landing, contacts_before=left))
-    assert float(standing[0, 0]) > 0
-    assert float(standing[1, 0]) == 0
-    torch.testing.assert_close(standing[:, 1:], term.residual(landing)[:, 1:])
 
 
 def test_the_seam_sees_a_jump_at_its_start_and_nothing_beyond():
@@ -271,7 +229,3 @@ def test_a_toe_pays_for_acceleration_beyond_what_is_free(past):
     expected[FRAMES - len(sizes) :] = 0.5 * (((sizes - 20).clamp(min=0) / 5) ** 2).sum(-1)
     assert float(expected.max()) > 1, "some are harder than what is free"
     torch.testing.assert_close((hard(whole) - free(whole))[0], expected, rtol=1e-3, atol=1e-3)
-
-
-def test_limits_of_landings_grow_with_the_body():
-    assert LandingSigmas(70.0, 10.0).scale(0.5) == LandingSigmas(35.0, 5.0)
