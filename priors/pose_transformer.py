@@ -21,8 +21,8 @@ from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening import GapQuery, Proposal
 from mapctl.inbetweening.partial_motion import EFFECTORS, KnownParts, PartialMotion, interpolate_partial_motion
 from mapctl.inbetweening.query import INTERPOLATION, GapSource
-from mapctl.inbetweening.seam_blending import blend_seams_in_positions, blend_seams_in_rotations
 from mapctl.numerics.intervals import last_observed, next_observed, true_intervals
+from mapctl.numerics.smooth_offsets import blend_seams_in_positions, blend_seams_in_rotations
 from mapctl.protocols import Inbetweener
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors import checkpoints

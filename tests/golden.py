@@ -88,8 +88,6 @@ COMMANDS = {
     " --suggest-timing --method infiller --no-finish",
     "tween variations": "tween walk.bvh -o several.bvh --keyframes 0,12 --inbetweener infiller.safetensors"
     " --prior tiny.safetensors --variations 2",
-    "tween best": "tween walk.bvh -o best.bvh --keyframes 0,16 --inbetweener infiller.safetensors"
-    " --prior tiny.safetensors --best-of 2",
     "tween slerp": "tween walk.bvh -o slerped.bvh --keyframes 0,14,29 --method slerp --no-finish",
     "blend": "blend walk.bvh --from other.bvh --joints leftHand --frames 5:15 --at 12 -o blended.bvh"
     " --inbetweener infiller.safetensors",

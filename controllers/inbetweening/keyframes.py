@@ -8,7 +8,7 @@ away from the viewer is as the proposed pose has it.
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import reduce
 from itertools import pairwise
@@ -30,8 +30,7 @@ from mapctl.inbetweening.pose_pairs import (
     compute_pose_distance,
     compute_travel_distance,
 )
-from mapctl.intent.keyframe_toml import KeyEntry, KeyRequest, read_drawing
-from mapctl.intent.keyframes import Drawing, Key, Keys
+from mapctl.intent.keyframes import Drawing, Key, KeyEntry, KeyRequest, Keys, read_drawing
 from mapctl.joint_names import classify_joint, describe_nearest, find_joint
 from mapctl.kinematics import forward_kinematics, heading
 from mapctl.motion import Motion, join_licences
@@ -54,12 +53,14 @@ _SEARCH = LbfgsSettings(max_iterations=80, relative_energy_tolerance=1e-5)
 def fit_drawings(motion: Motion, loose: LooseKeys, *, faced: bool) -> Motion:
     """Turn the joints of a canonical motion, in frames with drawings, until they look as drawn; `faced` says whether
     its headings are more than a guess. The lower foot then stands on the floor."""
-    frames = loose.drawings.nonzero()[:, 0]
-    root, quats = motion.root_position.clone(), motion.local_quat_xyzw.clone()
-    for frame in frames.tolist():
-        fitted = _fit(motion.skeleton, quats[frame], _View.of(loose, frame, motion.skeleton), faced)
-        quats[frame] = fitted
-        root[frame, 1] = -measure_floor(_place_joints(motion.skeleton, fitted)[:, 1], motion.skeleton)
+    root, quats, skeleton = motion.root_position.clone(), motion.local_quat_xyzw.clone(), motion.skeleton
+    for frame in loose.drawings.nonzero()[:, 0].tolist():
+        joints = loose.drawn[frame].nonzero()[:, 0].tolist()
+        sketch = loose.sketch[frame, joints].double()
+        target = estimate_size(sketch, joints, skeleton) * sketch
+        axes = view_axes(loose.view[frame]).double()
+        quats[frame] = _fit(skeleton, quats[frame], joints, target - target.mean(dim=0), axes, faced)
+        root[frame, 1] = -measure_floor(_place_joints(skeleton, quats[frame])[:, 1], skeleton)
     return replace(motion, root_position=root, local_quat_xyzw=quats)
 
 
@@ -76,27 +77,16 @@ def measure_drawing_error(places: Float[Tensor, "joints 3"], loose: LooseKeys, f
     return float(size * (seen - scale * sketch).norm(dim=-1).mean())
 
 
-@dataclass(frozen=True, eq=False)
-class _View:
-    """One drawing, as it is fitted."""
-
-    joints: list[int]
-    """Canonical joints that are drawn."""
-    target: Float[Tensor, "drawn 2"]
-    """Where, about their mean, metres by the estimated size."""
-    axes: Float[Tensor, "2 3"]
-    """Directions to the right and up."""
-
-    @staticmethod
-    def of(loose: LooseKeys, frame: int, skeleton: Skeleton) -> "_View":
-        joints = loose.drawn[frame].nonzero()[:, 0].tolist()
-        sketch = loose.sketch[frame, joints].double()
-        target = estimate_size(sketch, joints, skeleton) * sketch
-        return _View(joints, target - target.mean(dim=0), view_axes(loose.view[frame]).double())
-
-
-def _fit(skeleton: Skeleton, made: Float[Tensor, "joints 4"], view: _View, faced: bool) -> Float[Tensor, "joints 4"]:
-    """Fit one pose, from several headings at once, and return the best."""
+def _fit(
+    skeleton: Skeleton,
+    made: Float[Tensor, "joints 4"],
+    drawn: list[int],
+    target: Float[Tensor, "drawn 2"],
+    axes: Float[Tensor, "2 3"],
+    faced: bool,
+) -> Float[Tensor, "joints 4"]:
+    """Fit one pose, from several headings at once, and return the best: the drawn joints to their targets about their
+    mean, metres, seen along the axes to the right and up."""
     count, joints = _TURNS, len(made)
     turns = torch.arange(count, dtype=made.dtype) * (2 * math.pi / count)
     start = made.expand(count, -1, -1).clone()
@@ -108,8 +98,8 @@ def _fit(skeleton: Skeleton, made: Float[Tensor, "joints 4"], view: _View, faced
     def energies(rows: Tensor) -> Tensor:
         turn, size = rows[:, :-1].unflatten(1, (joints, 3)), rows[:, -1]
         quats = rotations.multiply(start, rotations.from_rotation_vector(turn))
-        seen = _place_joints(skeleton, quats)[:, view.joints] @ view.axes.mT
-        off = seen - seen.mean(dim=1, keepdim=True) - (_SIGMA_SIZE * size).exp()[:, None, None] * view.target
+        seen = _place_joints(skeleton, quats)[:, drawn] @ axes.mT
+        off = seen - seen.mean(dim=1, keepdim=True) - (_SIGMA_SIZE * size).exp()[:, None, None] * target
         angles = ranges.to_angles(rotations.to_matrix(quats[:, 1:]))
         beyond = (ranges.find_excess(angles) - own).clamp_min(0)
         return 0.5 * (
@@ -147,7 +137,11 @@ def missing_between_keys(keys: Sequence[Key], motion: Motion, rigmap: RigMap) ->
     free = torch.ones(motion.num_frames, dtype=torch.bool)
     free[[key.frame for key in keys if key.what == "pose"]] = False
     joints, root = free[:, None].expand(-1, motion.num_joints).clone(), free.clone()
-    carries_hips = torch.tensor([_carries_hips(joint, rigmap) for joint in range(motion.num_joints)])
+    carries_hips = torch.zeros(motion.num_joints, dtype=torch.bool)
+    own = rigmap.joint_of[0]
+    while own is not None and own >= 0:
+        carries_hips[own] = True
+        own = rigmap.rig_skeleton.parents[own]
     for key in keys:
         if key.what in ("root", "half"):
             root[key.frame] = False
@@ -230,22 +224,17 @@ def keyframe_errors(made: Motion, source: Motion, keys: Keys, rigmap: RigMap) ->
             rows.append(row | {"missed_cm": 100 * float(miss[targets.wanted[key.frame]].max())})
             continue
         if loose is not None and key.what in ("place", "drawing"):
-            rows.append(row | _compute_loose_errors(seen[key.frame], loose, key.frame))
+            position = seen[key.frame]
+            if bool(loose.placed[key.frame]):
+                row["missed_cm"] = 100 * float((position[0, ::2] - loose.ground[key.frame]).norm())
+            if key.drawing is not None:
+                row["drawn_cm"] = 100 * measure_drawing_error(position, loose, key.frame)
+            rows.append(row)
             continue
         joints = [hips or 0] if key.what == "root" else known[key.frame].nonzero()[:, 0].tolist()
         row |= {"missed_cm": float(distance[key.frame, joints].max())}
         rows.append(row | {"missed_deg": float(angles[key.frame, joints].max())})
     return rows
-
-
-def _compute_loose_errors(places: Float[Tensor, "joints 3"], loose: LooseKeys, frame: int) -> dict[str, float]:
-    """Compute by how much the hips miss their place over the ground, and joints on average where they are drawn."""
-    row: dict[str, float] = {}
-    if bool(loose.placed[frame]):
-        row["missed_cm"] = 100 * float((places[0, ::2] - loose.ground[frame]).norm())
-    if bool(loose.drawn[frame].any()):
-        row["drawn_cm"] = 100 * measure_drawing_error(places, loose, frame)
-    return row
 
 
 def check_effectors(names: Sequence[str], motion: Motion, rig: Rig | None = None) -> None:
@@ -285,17 +274,6 @@ def _is_leg(name: str) -> bool:
     return name.endswith(("Leg", "Foot", "Toes"))
 
 
-def _carries_hips(joint: int, rigmap: RigMap) -> bool:
-    """Return whether a joint of the rig is the hips or an ancestor of theirs."""
-    own: int | None = rigmap.joint_of[0]
-    parents: Sequence[int] = rigmap.rig_skeleton.parents
-    while own is not None and own >= 0:
-        if own == joint:
-            return True
-        own = parents[own]
-    return False
-
-
 @dataclass(frozen=True, eq=False)
 class KeyframeClip:
     """Motion and keys as `tween` takes them."""
@@ -316,74 +294,36 @@ def build_keyframe_clip(
     is read, its motion and its rig.
     """
     first = next((number for number, key in enumerate(request.key) if key.pose is not None), 0)
-    reader = _PoseReader(rig, on_read)
+    body_path = request.body or request.key[first].pose or ""
+    loaded: dict[str, tuple[Motion, Motion]] = {}  # clips as read, and on canonical joints with the body's bones
+
+    def load(path: str, own_rig: Rig | None) -> Motion:
+        clip = formats.load(Path(path), metres_per_unit=None if own_rig is None else own_rig.metres_per_unit)
+        if on_read is not None:
+            on_read(Path(path), clip, own_rig)
+        return clip
+
     with _prefix_errors("body" if request.body is not None else f"key[{first}].pose"):
-        body = reader.body(request.body or request.key[first].pose or "")
+        body_clip = load(body_path, rig)
+        canonical, body = RiggedCharacter.of(body_clip, rig)
+        loaded[body_path] = body_clip, canonical
     fps = Fraction(request.fps).limit_denominator(100_000)
     keys, poses = {}, {}
     for number, key in enumerate(request.key):
         frame = request.frame_of(key)
         keys[frame] = _build_key(key, frame, body.rigmap, number)
-        if key.needs_pose or key.tells_place:
-            poses[frame] = replace(_build_pose(key, request, reader, body, number), fps=fps, source=body.clip.source)
-    motion = replace(_interpolate_poses(poses, max(keys) + 1), licence=reader.licence)
+        if not (key.needs_pose or key.tells_place):
+            continue
+        path = key.pose or body_path
+        if path not in loaded:
+            with _prefix_errors(f"key[{number}].pose"):
+                clip = load(path, None)
+                loaded[path] = clip, retarget_motion(clip, body).motion
+        pose = _build_pose(key, number, *loaded[path], body_clip.skeleton, body.rigmap)
+        poses[frame] = replace(pose, fps=fps, source=body_clip.source)
+    licence = join_licences(clip.licence for clip, _ in loaded.values())
+    motion = replace(_interpolate_poses(poses, max(keys) + 1), licence=licence)
     return KeyframeClip(motion, Keys(tuple(keys.values())), as_rig(body.rigmap))
-
-
-@dataclass(frozen=True, eq=False)
-class _LoadedClip:
-    """Motion of a file, as read and retargeted."""
-
-    path: str
-    """The file."""
-    clip: Motion
-    """Clip as read."""
-    canonical: Motion
-    """Clip on canonical joints, with the bones of the body and on its floor."""
-    target_body: RiggedCharacter
-    """The body."""
-
-    @property
-    def rigmap(self) -> RigMap:
-        """Map from canonical joints to the body's rig."""
-        return self.target_body.rigmap
-
-
-@dataclass(eq=False)
-class _PoseReader:
-    """Reader that loads every file once."""
-
-    rig: Rig | None
-    """Rig of the body."""
-    on_read: Callable[[Path, Motion, Rig | None], None] | None
-    """Function called with each file, its motion and its rig."""
-    clips: dict[str, _LoadedClip] = field(default_factory=dict)
-    """Loaded clips by path."""
-
-    @property
-    def licence(self) -> str:
-        """Licences of all loaded clips."""
-        return join_licences(each.clip.licence for each in self.clips.values())
-
-    def body(self, path: str) -> _LoadedClip:
-        """Load the body's own file, on its rig where one is given."""
-        clip = self._load(path, self.rig)
-        self.clips[path] = _LoadedClip(path, clip, *RiggedCharacter.of(clip, self.rig))
-        return self.clips[path]
-
-    def pose(self, path: str, body: _LoadedClip) -> _LoadedClip:
-        """Load a clip, retargeted to the body; the rig of another skeleton must be recognised."""
-        if path not in self.clips:
-            clip = self._load(path, None)
-            moved = retarget_motion(clip, body.target_body).motion
-            self.clips[path] = _LoadedClip(path, clip, moved, body.target_body)
-        return self.clips[path]
-
-    def _load(self, path: str, rig: Rig | None) -> Motion:
-        clip = formats.load(Path(path), metres_per_unit=None if rig is None else rig.metres_per_unit)
-        if self.on_read is not None:
-            self.on_read(Path(path), clip, rig)
-        return clip
 
 
 def _build_key(key: KeyEntry, frame: int, rigmap: RigMap, number: int) -> Key:
@@ -401,28 +341,20 @@ def _build_key(key: KeyEntry, frame: int, rigmap: RigMap, number: int) -> Key:
     return Key(frame, key.joints, key.reach, root_only=kind, half=key.half, drawing=drawing, placed=placed)
 
 
-def _build_pose(key: KeyEntry, request: KeyRequest, reader: _PoseReader, body: _LoadedClip, number: int) -> Motion:
-    """Build one frame on the body's rig, at its requested position and heading; of a key that tells a place alone, any
-    pose of the body's there."""
-    with _prefix_errors(f"key[{number}].pose"):
-        found = reader.pose(key.pose or request.body or body.path, body)
-    clip = found.clip
+def _build_pose(
+    key: KeyEntry, number: int, clip: Motion, canonical: Motion, skeleton: Skeleton, rigmap: RigMap
+) -> Motion:
+    """Build one frame on the body's rig, at its requested position, height and heading."""
     frame = key.pose_frame or 0
     if key.pose_seconds is not None:
         frame = round(key.pose_seconds * float(clip.fps))
     if frame >= clip.num_frames:
         name = "pose_frame" if key.pose_seconds is None else "pose_seconds"
         raise RequestError(f"key[{number}].{name}: the frame {frame} is not one of the pose's 0:{clip.num_frames}")
-    own, canonical = clip.slice(frame, frame + 1), found.canonical.slice(frame, frame + 1)
-    same = clip.skeleton.matches(body.clip.skeleton)
+    own, pose = clip.slice(frame, frame + 1), canonical.slice(frame, frame + 1)
+    same = clip.skeleton.matches(skeleton)
     if same and key.place is None and key.height is None and key.facing_deg is None:
         return own
-    placed = _position_pose(replace(canonical, source=None), key)
-    return from_canonical(placed, body.rigmap, own if same else None)
-
-
-def _position_pose(pose: Motion, key: KeyEntry) -> Motion:
-    """Set a canonical pose's position on the ground, its height and its heading."""
     root, quats = pose.root_position.clone(), pose.local_quat_xyzw.clone()
     if key.place is not None:
         root[0, 0], root[0, 2] = key.place
@@ -431,7 +363,8 @@ def _position_pose(pose: Motion, key: KeyEntry) -> Motion:
     if key.facing_deg is not None:
         turn = torch.deg2rad(torch.tensor([key.facing_deg], dtype=torch.float64)) - heading(quats[:, 0])
         quats[:, 0] = rotations.multiply(rotations.about_y(turn), quats[:, 0])
-    return replace(pose, root_position=root, local_quat_xyzw=quats)
+    placed = replace(pose, root_position=root, local_quat_xyzw=quats, source=None)
+    return from_canonical(placed, rigmap, own if same else None)
 
 
 def _interpolate_poses(poses: dict[int, Motion], frames: int) -> Motion:

@@ -1,18 +1,10 @@
 """Fill missing frames or joints of a motion on any rig: an in-betweener proposes, MAP refines the proposal, and what is
 known stays to the bit.
-
-Shrinkage of a proposal towards interpolation, gap by gap: no worse than that where a network is out of its depth.
-
-A gap's answer is  b + w (p - b),  b the interpolation and p the proposal. With mean squared errors B and P of the two,
-w = B^s / (B^s + P^s): for s = 1 the best weights where the errors are independent (Bates and Granger 1969). B follows
-from the velocities beside the gap. P is what the network itself expects, corrected by tests where the truth is known:
-frames of which the same is hidden beside the gap. The logarithm of the network's error there over the expected one
-estimates that of the gap, as far as n tests discern a clip's own mean from noise (Efron and Morris 1973).
 """
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Any
@@ -23,7 +15,8 @@ from torch import Tensor
 
 from controllers.common.map_refinement import RefinementSettings, refine
 from controllers.inbetweening.keyframes import fit_drawings, measure_drawing_error
-from controllers.inbetweening.proposers import STANDING_STILL, propose_through_keys
+from controllers.inbetweening.proposers import propose_through_keys
+from controllers.inbetweening.shrinkage import shrink
 from mapctl import contacts, rotations
 from mapctl.curves.curve import Curve
 from mapctl.errors import RequestError
@@ -37,29 +30,24 @@ from mapctl.inbetweening.effector_targets import (
     lead_over_places,
     reach_effector_targets,
 )
-from mapctl.inbetweening.missing import MissingMask, compute_velocity_share, interpolate_missing, restore_observed
-from mapctl.inbetweening.query import GapSource, estimate_contact_logits
+from mapctl.inbetweening.missing import MissingMask, interpolate_missing, restore_observed
+from mapctl.inbetweening.query import GapSource
 from mapctl.inbetweening.root_trajectory import lead_over_keys
-from mapctl.inbetweening.seam_blending import blend_seams_in_positions, blend_seams_in_rotations
 from mapctl.kinematics import heading
-from mapctl.metrics.body import measure_path_length
 from mapctl.motion import Motion
 from mapctl.numerics.intervals import true_intervals
-from mapctl.numerics.smooth_offsets import interpolate_offsets
-from mapctl.problem.solution import Ledger, Outcome, Solution, Status, WindowRecord
+from mapctl.numerics.smooth_offsets import blend_seams_in_positions, blend_seams_in_rotations, interpolate_offsets
+from mapctl.problem.solution import Ledger, Outcome, Solution, Status
 from mapctl.protocols import Density, Inbetweener
 from mapctl.recording import Capture
 from mapctl.recording.fusion import transfer_change
 from mapctl.retarget import RigMap, as_rig, from_canonical, rig_joint_positions, to_canonical
 from mapctl.retarget.rigs import Rig
-from mapctl.skeleton import CANONICAL, leg_length
+from mapctl.skeleton import CANONICAL
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings
 from mapctl.terms import Clearance, FootContact, Jerk, Term
 
-_CONTEXT_FRAMES = 16  # frames at the prior's rate, on either side of a gap, that the MAP stage sees
-_USUAL_ERROR = 0.03  # metres: median error of a joint at which the sigmas below hold
-_TRUST_RANGE = (0.1, 1.0)  # of that factor; above 1 the MAP stage moved proposals no nearer to the truth
 INFILL_REFINEMENT = RefinementSettings(
     uncertainty_ramp=8.0,
     unobserved_sigma_deg=2.0,
@@ -75,68 +63,14 @@ network's, since styles differ in them, except those of toes that skate; a jerk 
 error of a gap."""
 
 
-def refine_gaps(
-    proposal: Proposal,
-    query: GapQuery,
-    targets: EffectorTargets | None,
-    settings: RefinementSettings,
-    densities: Sequence[Density],
-    terms: Sequence[Term],
-) -> tuple[Motion, Ledger, tuple[WindowRecord, ...]]:
-    """Refine a proposal gap by gap; also returns the ledger and the cost of its windows."""
-    motion, missing = proposal.motion, query.missing
-    quats, root = motion.local_quat_xyzw.clone(), motion.root_position.clone()
-    trust = None if proposal.spread is None else _compute_trust(proposal.spread)
-    ledger, windows = Ledger(), []
-    for first, last in _find_gap_windows(missing.frames):
-        if last - first < 2:
-            continue
-        part, part_missing = slice(first, last), missing.slice(first, last)
-        capture = Capture.of_motion(
-            motion.slice(first, last),
-            seen=~part_missing.joints,
-            seen_root=~part_missing.root,
-            sigma=torch.zeros(CANONICAL.num_joints),
-            sigma_root=0.0,
-        )
-        refined = refine(
-            motion.slice(first, last),
-            proposal.contact_logits[part],
-            capture,
-            settings,
-            densities=densities,
-            targets=None if targets is None else EffectorTargets(targets.places[part], targets.wanted[part]),
-            terms=terms,
-            first_frame=first,
-            trust=None if trust is None else trust[part],
-        )
-        quats[part] = torch.where(part_missing.joints[..., None], refined.motion.local_quat_xyzw, quats[part])
-        root[part] = torch.where(part_missing.root[:, None], refined.motion.root_position, root[part])
-        ledger, windows = ledger.join(refined.ledger), [*windows, *refined.windows]
-    return replace(motion, root_position=root, local_quat_xyzw=quats), ledger, tuple(windows)
-
-
-def _compute_trust(spread: Float[Tensor, "frames joints 2"]) -> Float[Tensor, "frames joints"]:
-    """Compute by which factor the sigmas of a proposal change: its median error beside the usual one."""
-    return (spread[..., 0] / _USUAL_ERROR).clamp(*_TRUST_RANGE).float()
-
-
-def _find_gap_windows(missing: Bool[Tensor, " frames"]) -> list[tuple[int, int]]:
-    """Find first frame and one past the last of each gap with its context; gaps whose contexts overlap are merged."""
-    near = missing.clone()
-    for _, start, stop in true_intervals(missing[:, None]):
-        near[max(0, start - _CONTEXT_FRAMES) : stop + _CONTEXT_FRAMES] = True
-    return [(start, stop) for _, start, stop in true_intervals(near[:, None])]
-
-
 @dataclass(frozen=True)
-class Pick:
-    """Which of several answers this is."""
+class InfillSettings:
+    """Settings of in-betweening."""
 
-    name: str
-    """Name of this answer."""
-    energies: Mapping[str, float]
-    """Mean energies of a frame by the names of all answers, nats."""
+    finish: bool = True
+    """Whether MAP refines the proposal; if not it stays as proposed, on rigid bones and with exact keys."""
+    refinement: RefinementSettings = field(default_factory=lambda: INFILL_REFINEMENT)
+    """Sigmas and search of the MAP stage."""
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -153,8 +87,6 @@ class InbetweenSolution(Solution):
     """Proposer of the motion in each gap in which nothing was known."""
     proposal_seconds: float = 0.0
     """Of `seconds`, those in which the in-betweener proposed."""
-    pick: Pick | None = None
-    """Which of several answers this is; None where one alone was made."""
     gap_notes: tuple[str, ...] = ()
     """A note on each of these gaps: proposer, error estimate, remarks."""
 
@@ -192,7 +124,6 @@ class InbetweenSolution(Solution):
                 if source.reason
             ],
             **({"sides_apart_cm": max(apart)} if apart else {}),
-            **({"picked": self.pick.name, "draws": dict(self.pick.energies)} if self.pick else {}),
             "timing": {
                 "draw_ms": 1000 * self.proposal_seconds,
                 "finish_ms": 1000 * (self.seconds - self.proposal_seconds),
@@ -200,6 +131,112 @@ class InbetweenSolution(Solution):
             "contacts": self.contacts.tolist(),
             "frame_ms": self.frame_ms,
         }
+
+
+_CONTEXT_FRAMES = 16  # frames at the prior's rate, on either side of a gap, that the MAP stage sees
+_USUAL_ERROR = 0.03  # metres: median error of a joint at which the sigmas of INFILL_REFINEMENT hold
+_TRUST_RANGE = (0.1, 1.0)  # of an error over the usual one; above 1 MAP moved proposals no nearer to the truth
+
+
+def fill(
+    motion: Motion,
+    missing: MissingMask,
+    inbetweener: Inbetweener,
+    *,
+    settings: InfillSettings | None = None,
+    densities: Sequence[Density] = (),
+    terms: Sequence[Term] = (),
+    rig: Rig | None = None,
+    targets: EffectorTargets | None = None,
+    loose: LooseKeys | None = None,
+    curve: Curve | None = None,
+    generator: torch.Generator | None = None,
+) -> InbetweenSolution:
+    """Fill missing values of a motion.
+
+    `targets` are positions of the rig's hands and feet in frames in which they are missing, `loose` places over the
+    ground and drawings in such frames; the hips follow `curve` while they are missing. The MAP stage adds `terms`, and
+    the likeliest of `densities` its likelihood; RequestError for terms where it is left out.
+    """
+    settings, began = settings or InfillSettings(), time.perf_counter()
+    if terms and not settings.finish:
+        raise RequestError("terms belong to the MAP stage, which is left out")
+    generator = generator or torch.Generator().manual_seed(0)
+    # The query: the clip at the prior's rate on canonical joints, led along what is asked for.
+    clip = CanonicalClip.of(motion, missing, rig)
+    if curve is not None:
+        clip = replace(clip, canonical=_lead_along_curve(clip.canonical, missing.root, curve))
+    if loose is not None:
+        clip = replace(clip, canonical=_lead_over_ground(clip, loose))
+    asked = clip.query(effector_targets=targets, keep_trajectory=curve is not None, loose=loose)
+    query = _pose_drawings(asked, inbetweener, generator)
+    # The proposal, on the keys and shrunk towards interpolation as far as it is doubtful.
+    answer, reached = propose_through_keys(query, inbetweener, generator)
+    answer = shrink(answer, query, inbetweener.rough, generator)
+    if query.loose is not None and bool(query.loose.placed.any()):
+        known = query.motion.root_position
+        root = lead_over_keys(answer.motion.root_position, known, query.missing.root, query.loose)
+        answer = replace(answer, motion=replace(answer.motion, root_position=root))
+    proposed = time.perf_counter()
+    # MAP, gap by gap with its context. The hips stay at the positions of loose keys, and as high as proposed.
+    canonical, ledger, windows = answer.motion, Ledger(), ()
+    quats, root = canonical.local_quat_xyzw.clone(), canonical.root_position.clone()
+    unknown_root = query.missing.root if query.loose is None else query.missing.root & ~query.loose.placed
+    unknown = MissingMask(query.missing.joints, unknown_root)
+    spread = answer.spread
+    trust = None if spread is None else (spread[..., 0] / _USUAL_ERROR).clamp(*_TRUST_RANGE).float()
+    for first, last in _find_windows(unknown.frames) if settings.finish else ():
+        part, part_unknown = slice(first, last), unknown.slice(first, last)
+        proposal = canonical.slice(first, last)
+        refined = refine(
+            proposal,
+            answer.contact_logits[part],
+            Capture.of_motion(
+                proposal,
+                seen=~part_unknown.joints,
+                seen_root=~part_unknown.root,
+                sigma=torch.zeros(CANONICAL.num_joints),
+                sigma_root=0.0,
+            ),
+            settings.refinement,
+            densities=densities,
+            targets=None if reached is None else EffectorTargets(reached.places[part], reached.wanted[part]),
+            terms=terms,
+            first_frame=first,
+            trust=None if trust is None else trust[part],
+        )
+        quats[part] = torch.where(part_unknown.joints[..., None], refined.motion.local_quat_xyzw, quats[part])
+        root[part] = torch.where(part_unknown.root[:, None], refined.motion.root_position, root[part])
+        ledger, windows = ledger.join(refined.ledger), (*windows, *refined.windows)
+    if settings.finish:
+        canonical = replace(canonical, root_position=root, local_quat_xyzw=quats)
+    # The result on the rig: seams, then targets and places to the millimetre.
+    done, unreached = _reach_targets(clip, clip.back(canonical, asked), targets)
+    done, abrupt = _meet_places(clip, done, loose), ()
+    if targets is None and loose is None and curve is None:
+        done, abrupt = take_simpler(done, clip.restore_observed(clip.interpolated), missing)
+    notes = (*_note_open_ends(clip, answer, loose), *_note_drawings(canonical, asked), *abrupt)
+    return InbetweenSolution(
+        done,
+        Status(Outcome.DONE).with_notes(notes).with_notes(unreached, infeasible=bool(unreached)),
+        ledger,
+        windows,
+        seconds=time.perf_counter() - began,
+        proposal_seconds=proposed - began,
+        missing=missing,
+        rig=as_rig(clip.rigmap),
+        contacts=contacts.debounced(answer.contact_logits > 0),
+        sources=answer.attribute(query),
+        gap_notes=_note_gaps(query, answer, fps=float(motion.fps)),
+    )
+
+
+def _find_windows(missing: Bool[Tensor, " frames"]) -> list[tuple[int, int]]:
+    """Find first frame and one past the last of each gap with its context; gaps whose contexts overlap are merged."""
+    near = missing.clone()
+    for _, start, stop in true_intervals(missing[:, None]):
+        near[max(0, start - _CONTEXT_FRAMES) : stop + _CONTEXT_FRAMES] = True
+    return [(start, stop) for _, start, stop in true_intervals(near[:, None]) if stop - start > 1]
 
 
 _TIE_FRAMES = 1e-6  # frames
@@ -330,258 +367,10 @@ def _find_most_complete_frames(
     return torch.where(inside.any(dim=1), frames.gather(1, best)[:, 0], missing_counts.argmax())
 
 
-_SHARPNESS = 1.75  # s above: over unseen clips and their copies in varied poses the error is flat from 1.5 to 2.5
-_TEST_NOISE = 0.5  # variance of a test's logarithm over that between clips, over the same
-_RESOLUTION = 2e-6  # square metres: no error is known better than to 1.4 mm
-_STRAIGHT_ERROR, _SPLINE_ERROR = 0.030, 0.019
-"""Mean squared error of straight lines over that of the velocities beside a gap times its duration, in gaps of any
-length; and what of it a cubic of the whole velocity removes: the mean square of t (1 - t) (2 - t) / 2."""
-_MEDIAN, _PERCENTILE_90 = 0.85, 1.65  # of a gap's mean error, over the expected root mean square
-_HOLE_DISTANCE = 10  # known frames between a gap and a hole of its length
-
-
-@dataclass(frozen=True)
-class _Frames:
-    """Frames from `start` up to `stop`."""
-
-    start: int
-    stop: int
-
-    def __len__(self) -> int:
-        return self.stop - self.start
-
-    @property
-    def part(self) -> slice:
-        """The frames as a slice."""
-        return slice(self.start, self.stop)
-
-
-def shrink(
-    proposal: Proposal, query: GapQuery, inbetweener: Inbetweener, generator: torch.Generator | None = None
-) -> Proposal:
-    """Shrink a proposal with a spread towards the query's motion in gaps with known frames on both sides of which
-    nothing else is asked; the spread becomes that of the answer. The in-betweener, which proposed, is tested."""
-    views = {gap: _View.of(query, gap) for gap in _find_gaps(proposal, query)}
-    simple_errors = {gap: error for gap, view in views.items() if (error := view.expect_simple_error(query, gap))}
-    views = {gap: views[gap] for gap in simple_errors}
-    if proposal.spread is None or not views:
-        return proposal
-    tests, hidden = {gap: _lay_tests(query.missing, gap) for gap in views}, query.missing
-    for gap, several in tests.items():
-        for hole, _ in several:
-            hidden = views[gap].hide(hidden, hole)
-    trial = replace(query, motion=interpolate_missing(query.motion, hidden), missing=hidden)
-    tried = inbetweener.propose(trial, generator=generator) if any(tests.values()) else proposal
-    simple = replace(proposal, motion=query.motion, contact_logits=estimate_contact_logits(query.motion))
-    done, spread, remarks = proposal, proposal.spread.clone(), []
-    for gap, view in views.items():
-        surprises = [view.measure_surprise(query, tried, judged) for _, judged in tests[gap]]
-        own = view.expect_error(proposal, gap) * math.exp(sum(surprises) / (len(surprises) + _TEST_NOISE))
-        weight = 1 / (1 + (own / simple_errors[gap]) ** _SHARPNESS)
-        done = done.lerp(simple, weight, gap.part)
-        size = math.sqrt((1 - weight) ** 2 * simple_errors[gap] + weight**2 * own)
-        shape = spread[gap.part].log().mean(dim=-1, keepdim=True).exp()
-        shape = shape / shape[:, view.shown].mean()
-        spread[gap.part] = size * shape * torch.tensor([_MEDIAN, _PERCENTILE_90])
-        if weight < 0.5:
-            remark = f"{100 * (1 - weight):.0f} % interpolation: the motion is unfamiliar to the {proposal.source}"
-            remarks.append(GapSource(gap.start, gap.stop, proposal.source, remark=remark))
-    return replace(done, spread=spread, others=(*proposal.others, *remarks))
-
-
-@dataclass(frozen=True)
-class _View:
-    """Positions that depend on what is missing in a gap; all joints that are known, and the root if it is, are held."""
-
-    joints: Bool[Tensor, " joints"]
-    """Joints whose rotations are missing."""
-    root: bool
-    """Whether the root position is."""
-    shown: Bool[Tensor, " joints"]
-    """Joints whose positions depend on these."""
-
-    @staticmethod
-    def of(query: GapQuery, gap: _Frames) -> "_View":
-        """Return the view of a gap."""
-        missing = query.missing.slice(gap.start, gap.stop)
-        shown = ~query.known_positions[gap.part].all(dim=0)
-        return _View(missing.joints.any(dim=0), bool(missing.root.any()), shown)
-
-    def compute_positions(self, motion: Motion) -> Float[Tensor, "frames shown 3"]:
-        """Compute the positions, metres."""
-        held = motion.local_quat_xyzw.new_tensor([0.0, 0.0, 0.0, 1.0])
-        quats = torch.where(self.joints[:, None], motion.local_quat_xyzw, held)
-        root = motion.root_position if self.root else torch.zeros_like(motion.root_position)
-        return replace(motion, local_quat_xyzw=quats, root_position=root).joint_positions()[:, self.shown]
-
-    def hide(self, missing: MissingMask, frames: _Frames) -> MissingMask:
-        """Return the mask in which the same is missing in other frames, too."""
-        joints, root = missing.joints.clone(), missing.root.clone()
-        joints[frames.part] |= self.joints
-        root[frames.part] |= self.root
-        return MissingMask(joints, root)
-
-    def expect_error(self, proposal: Proposal, frames: _Frames) -> float:
-        """Compute the mean squared error that a proposal's spread expects, square metres."""
-        assert proposal.spread is not None, "only proposals with a spread are judged"
-        return float(proposal.spread[frames.part][:, self.shown].prod(dim=-1).mean()) + _RESOLUTION
-
-    def expect_simple_error(self, query: GapQuery, gap: _Frames) -> float | None:
-        """Compute the mean squared error of interpolation that the velocities beside a gap let expect, square metres;
-        None without any: bare poses are no evidence against a proposal."""
-        positions, known, length = self.compute_positions(query.motion), ~query.missing.frames, len(gap) + 1
-        straight = (positions[gap.stop] - positions[gap.start - 1]) / length
-        excess = [
-            float((positions[last] - positions[last - 1] - straight).square().sum(dim=-1).mean())
-            for last in (gap.start - 1, gap.stop + 1)
-            if 0 < last < len(known) and bool(known[last - 1 : last + 1].all())
-        ]
-        if not excess:
-            return None
-        share = float(compute_velocity_share(length, fps=float(PRIOR_FPS)))
-        bent = _STRAIGHT_ERROR - _SPLINE_ERROR * share**2
-        return bent * length**2 * sum(excess) / len(excess) + _RESOLUTION
-
-    def measure_surprise(self, query: GapQuery, tried: Proposal, judged: _Frames) -> float:
-        """Measure the logarithm of a proposal's squared error in frames that it was not shown, over the expected."""
-        truth, made = self.compute_positions(query.motion), self.compute_positions(tried.motion)
-        error = float((truth - made)[judged.part].square().sum(dim=-1).mean())
-        return math.log((error + _RESOLUTION) / self.expect_error(tried, judged))
-
-
-def _find_gaps(proposal: Proposal, query: GapQuery) -> list[_Frames]:
-    """Find the gaps between known frames that are the proposer's own, without parts that are asked for in them."""
-    if query.keep_trajectory or query.loose is not None:
-        return []
-    missing, asked = query.missing.frames, query.missing.root & ~query.nothing_known
-    if query.effector_targets is not None:
-        asked = asked | query.effector_targets.wanted.any(dim=1)
-    for other in proposal.others:
-        asked[other.start : other.stop] |= other.by != proposal.source
-    return [
-        _Frames(start, stop)
-        for _, start, stop in true_intervals(missing[:, None])
-        if start > 0 and stop < len(missing) and not bool(asked[start:stop].any())
-    ]
-
-
-def _lay_tests(missing: MissingMask, gap: _Frames) -> list[tuple[_Frames, _Frames]]:
-    """Lay a hole of the gap's length into the known frames on either side; where neither has room, hide half of those
-    that there are, together with the gap. Return what is hidden in a row, and which frames of it are judged."""
-    known, length = ~missing.frames, len(gap)
-    before, after = _count_known(known[: gap.start].flip(0)), _count_known(known[gap.stop :])
-    holes = [
-        _Frames(start, start + length)
-        for room, start in ((before, gap.start - _HOLE_DISTANCE - length), (after, gap.stop + _HOLE_DISTANCE))
-        if room >= length + 2 * _HOLE_DISTANCE
-    ]
-    if holes:
-        return [(hole, hole) for hole in holes]
-    wider = _Frames(gap.start - min(before // 2, length), gap.stop + min(after // 2, length))
-    sides = (_Frames(wider.start, gap.start), _Frames(gap.stop, wider.stop))
-    return [(wider, side) for side in sides if len(side) > 1]
-
-
-def _count_known(known: Bool[Tensor, " frames"]) -> int:
-    """Count the known frames that are a gap's own: up to the end, or half of those up to the next gap."""
-    run = int(known.long().cumprod(0).sum())
-    return run if run == len(known) else run // 2
-
-
-_INFILLER, _INFILLER_FRAMES = "infiller", 75
-"""Name of the source whose longest gaps in training were of so many frames: their mean length and a deviation."""
-_TRAVELLING_SPEED = 0.35  # m/s of hips with canonical legs, from one end of a gap to the other: a body that travels
-_MORPH_RATIO, _MIN_MORPH_FRAMES = 1.3, 45
-"""Largest ratio of a morph's path to the straight one, and fewest frames: an interpolation instead of a motion."""
-_STILL_SPEED = 0.12  # m/s of the joints below which a body is still: there is no motion to miss
-
-
-def compose_gap_notes(query: GapQuery, made: Motion, answer: Proposal, *, fps: float) -> tuple[str, ...]:
-    """Compose a line for each gap of a proposal, in frames of the motion at `fps`; gaps without remarks share one by
-    proposer.
-    """
-    sources = answer.attribute(query)
-    lines: list[str] = []
-    plain: dict[str, list[GapSource]] = {}
-    for source in sources:
-        remarks = _describe_gap(query, made, source)
-        if not remarks and source.by == answer.source:
-            plain.setdefault(source.by, []).append(source)
-        else:
-            lines.append(_join_remarks([source], query, answer, remarks, fps))
-    return (*lines, *(_join_remarks(each, query, answer, [], fps) for each in plain.values()))
-
-
-def _join_remarks(
-    sources: Sequence[GapSource], query: GapQuery, answer: Proposal, remarks: Sequence[str], fps: float
-) -> str:
-    """Join the frames, the proposer, the error estimate (of the gap with the largest), and further remarks."""
-    where = ", ".join(_format_frames(query, source, fps) for source in sources)
-    found = [answer.spread[one.start : one.stop] for one in sources if answer.spread is not None]
-    sure = []
-    if found and sources[0].by == answer.source:
-        median, percentile_90 = max(
-            (100 * each.mean(dim=(0, 1)) for each in found), key=lambda one: float(one[1])
-        ).tolist()
-        sure = [
-            f"by its own estimate joints within {median:.1f} cm of the truth in half of cases and within"
-            f" {percentile_90:.1f} cm in nine of ten"
-        ]
-    return f"frames {where}: {', '.join([sources[0].by, *sure, *remarks])}"
-
-
-def _format_frames(query: GapQuery, source: GapSource, fps: float) -> str:
-    """Format a gap in frames of the motion's own rate."""
-    first = 0 if source.start == 0 else round(float(query.seconds[source.start - 1]) * fps) + 1
-    last = len(query.seconds) - 1
-    stop = round(float(query.seconds[min(source.stop, last)]) * fps)
-    return f"{first}:{stop + (source.stop > last)}"
-
-
-def _describe_gap(query: GapQuery, made: Motion, source: GapSource) -> list[str]:
-    """List remarks on one gap beyond its proposer and error estimate."""
-    remarks, seconds = [*filter(None, (source.reason, source.remark))], (source.stop - source.start) / PRIOR_FPS
-    if source.stop - source.start > _INFILLER_FRAMES and source.by == _INFILLER:
-        remarks.append(f"and {seconds:.1f} s are longer than the {_INFILLER_FRAMES / PRIOR_FPS:.0f} s that it knows")
-    if _is_morph(query, made, source):
-        remarks.append("a still morph: it goes hardly further than straight from one pose to the other; give more keys")
-    return remarks
-
-
-def is_travelling(motion: Motion, start: int, stop: int) -> bool:
-    """Return whether the body (canonical joints) travels in a gap, faster than a shift of weight."""
-    distance = float((motion.root_position[stop] - motion.root_position[start])[::2].norm())
-    fastest_still = _TRAVELLING_SPEED * (stop - start) / float(motion.fps)
-    return distance * leg_length(CANONICAL) / leg_length(motion.skeleton) > fastest_still
-
-
-def _is_morph(query: GapQuery, made: Motion, source: GapSource) -> bool:
-    """Return whether a long gap is filled by little more than an interpolation although the body moves around it."""
-    if source.stop - source.start < _MIN_MORPH_FRAMES or source.by == STANDING_STILL:
-        return False
-    first, end = max(0, source.start - 1), min(source.stop + 1, query.motion.num_frames)
-    path_length, straight = (measure_path_length(each.slice(first, end)) for each in (made, query.motion))
-    travelling = is_travelling(query.motion, max(0, source.start - 1), min(source.stop, len(query.missing.root) - 1))
-    speed, straight_speed = (each * PRIOR_FPS / (source.stop - source.start) for each in (path_length, straight))
-    still = straight_speed < _STILL_SPEED and _is_still_beside(query, source)
-    return speed < max(_STILL_SPEED, _MORPH_RATIO * straight_speed) and (travelling or not still)
-
-
-def _is_still_beside(query: GapQuery, source: GapSource) -> bool:
-    """Return whether known frames beside a gap, if there are any, hardly move."""
-    positions = query.motion.joint_positions()
-    for one, other in ((source.start - 2, source.start - 1), (source.stop, source.stop + 1)):
-        if one < 0 or other >= len(positions) or bool(query.missing.root[[one, other]].any()):
-            continue
-        if float((positions[other] - positions[one]).norm(dim=-1).mean()) * PRIOR_FPS > _STILL_SPEED:
-            return False
-    return True
-
-
 _MAX_EDGE_DISTANCE = 1.0  # metres from a gap's edge to the curve
 
 
-def move_root_along_curve(motion: Motion, missing: Bool[Tensor, " frames"], curve: Curve) -> Motion:
+def _lead_along_curve(motion: Motion, missing: Bool[Tensor, " frames"], curve: Curve) -> Motion:
     """Move and orient the hips of a canonical motion along the curve, at constant speed, in frames in which they are
     missing.
 
@@ -608,38 +397,149 @@ def move_root_along_curve(motion: Motion, missing: Bool[Tensor, " frames"], curv
         if curve.closed and last < first:
             last = last + curve.length
         at = first + share * (last - first)
-        position = curve.point(at) + _interpolate_edges(offsets, share)
+        position = curve.point(at) + torch.lerp(offsets[0], offsets[1], share[:, None])
         turns = curve.heading(torch.stack([first, last])) - facing[edges]
-        turn = curve.heading(at) - _interpolate_edges(rotations.wrap_angle(turns)[:, None], share)[:, 0]
-        root[start:stop, 0], root[start:stop, 2] = position[:, 0], position[:, 1]
+        turn = curve.heading(at) - torch.lerp(*rotations.wrap_angle(turns), share)
+        root[start:stop, ::2] = position
         own = rotations.about_y(turn - heading(quats[start:stop, 0]))
         quats[start:stop, 0] = rotations.multiply(own, quats[start:stop, 0])
     return replace(motion, root_position=root, local_quat_xyzw=rotations.make_sign_continuous(quats))
 
 
-def _interpolate_edges(
-    ends: Float[Tensor, "2 width"], share: Float[Tensor, " frames"]
-) -> Float[Tensor, "frames width"]:
-    return torch.lerp(ends[0], ends[1], share[:, None])
-
-
-def move_root_over_places(
-    motion: Motion, missing_root: Bool[Tensor, " frames"], missing_hips: Bool[Tensor, " frames"], loose: LooseKeys
-) -> Motion:
-    """Move the hips of a canonical motion over the places of loose keys where their position is missing, and turn them
-    along that way where no frame tells their rotation. At a height that no frame tells they stand."""
+def _lead_over_ground(clip: CanonicalClip, loose: LooseKeys) -> Motion:
+    """Lead the canonical hips over the places of loose keys where their position is missing, and turn them along that
+    trajectory where no frame gives their rotation. At a height that no frame gives they stand."""
+    motion, missing_root, hips = clip.canonical, clip.missing.root, clip.rigmap.joint_of[0]
+    missing_hips = missing_root if hips is None else clip.missing.joints[:, hips]
     root, quats = motion.root_position.clone(), motion.local_quat_xyzw.clone()
     ground = torch.where(loose.placed[:, None], loose.ground, root[:, ::2])
     facing = heading(quats[:, 0])
-    way, looked = lead_over_places(
+    led, looked = lead_over_places(
         ground[None], facing[None], placed=(loose.placed | ~missing_root)[None], faced=~missing_hips[None]
     )
-    root[:, ::2] = torch.where(missing_root[:, None], way[0], root[:, ::2])
+    root[:, ::2] = torch.where(missing_root[:, None], led[0], root[:, ::2])
     if bool(missing_root.all()):
         root[:, 1] = estimate_standing_height(motion.skeleton)
     turn = torch.where(missing_hips, looked[0] - facing, 0.0)
     quats[:, 0] = rotations.multiply(rotations.about_y(turn), quats[:, 0])
     return replace(motion, root_position=root, local_quat_xyzw=quats)
+
+
+def _pose_drawings(query: GapQuery, inbetweener: Inbetweener, generator: torch.Generator) -> GapQuery:
+    """Return a query that has poses instead of drawings, fitted about what an in-betweener proposes; their place stays
+    open where it is not given."""
+    loose = query.loose
+    if loose is None or not bool(loose.drawn.any()):
+        return query
+    first, drawn = inbetweener.propose(query, generator=generator).motion, loose.drawings
+    fitted = fit_drawings(first, loose, faced=not bool(query.missing.joints[:, 0].all()))
+    root, quats = query.motion.root_position.clone(), query.motion.local_quat_xyzw.clone()
+    quats[drawn], root[drawn, 1] = fitted.local_quat_xyzw[drawn], fitted.root_position[drawn, 1]
+    missing = MissingMask(query.missing.joints & ~drawn[:, None], query.missing.root)
+    shown = interpolate_missing(replace(query.motion, local_quat_xyzw=quats), missing)
+    places = replace(loose, drawn=torch.zeros_like(loose.drawn))
+    return replace(query, motion=replace(shown, root_position=root), missing=missing, loose=places)
+
+
+_PLACE_SECONDS = 0.5  # over which what the hips are moved by fades away from a place
+_REPORTED_ERROR = 0.001  # metres from a target beyond which there is a note
+_REACH_TOLERANCE = 1e-4  # metres from a target within which it is reached
+_MAX_REACH_ATTEMPTS = 6
+
+
+def _meet_places(clip: CanonicalClip, filled: Motion, loose: LooseKeys | None) -> Motion:
+    """Move the hips, smoothly, by the little that resampling and the MAP stage leave them from their places."""
+    if loose is None or not bool(loose.placed.any()):
+        return filled
+    canonical, rigmap = to_canonical(filled, as_rig(clip.rigmap))
+    root, free = canonical.root_position.clone(), clip.missing.root
+    off = torch.where((loose.placed & free)[:, None], loose.ground - root[:, ::2], 0.0)
+    moved = interpolate_offsets(off, loose.placed | ~free, seconds=_PLACE_SECONDS, fps=float(filled.fps))
+    root[:, ::2] += torch.where(free[:, None], moved, 0.0)
+    return clip.restore_observed(from_canonical(replace(canonical, root_position=root), rigmap, filled))
+
+
+def _reach_targets(
+    clip: CanonicalClip, filled: Motion, targets: EffectorTargets | None
+) -> tuple[Motion, tuple[str, ...]]:
+    """Bend limbs until they are at their targets; also note those that are out of reach."""
+    if targets is None:
+        return filled, ()
+    canonical, rigmap = to_canonical(filled, as_rig(clip.rigmap))
+    aim, done, errors = targets, filled, torch.full((1,), torch.inf)
+    for _ in range(_MAX_REACH_ATTEMPTS):
+        there = reach_effector_targets(canonical, aim, clip.missing.frames)
+        done = clip.restore_observed(from_canonical(there, rigmap, filled))
+        found = rig_joint_positions(done, rigmap)
+        before, errors = errors, compute_target_errors(found, targets)
+        if float(errors.max()) < _REACH_TOLERANCE or float((errors - before).abs().max()) < _REACH_TOLERANCE:
+            break
+        # Joints that only the rig has offset an effector from its canonical position.
+        aim = EffectorTargets(targets.places + there.joint_positions() - found, targets.wanted)
+    if float(errors.max()) <= _REPORTED_ERROR:
+        return done, ()
+    worst = int(errors.argmax())
+    return done, (f"frame {worst}: a limb stays {100 * float(errors.max()):.1f} cm from its target, out of reach",)
+
+
+def _note_gaps(query: GapQuery, answer: Proposal, *, fps: float) -> tuple[str, ...]:
+    """Note each gap of a proposal, in frames of the motion at `fps`: proposer, error estimate (of the gap with the
+    largest) and remarks. Gaps without remarks share one note by proposer."""
+    last = len(query.seconds) - 1
+    noted: dict[object, list[GapSource]] = {}
+    for number, source in enumerate(answer.attribute(query)):
+        plain = not (source.reason or source.remark) and source.by == answer.source
+        noted.setdefault(source.by if plain else number, []).append(source)
+    notes = []
+    for key, sources in sorted(noted.items(), key=lambda item: isinstance(item[0], str)):
+        frames, words = [], [sources[0].by]
+        for source in sources:
+            first = 0 if source.start == 0 else round(float(query.seconds[source.start - 1]) * fps) + 1
+            stop = round(float(query.seconds[min(source.stop, last)]) * fps)
+            frames.append(f"{first}:{stop + (source.stop > last)}")
+        if answer.spread is not None and sources[0].by == answer.source:
+            errors = [100 * answer.spread[one.start : one.stop].mean(dim=(0, 1)) for one in sources]
+            median, percentile_90 = max(errors, key=lambda error: float(error[1])).tolist()
+            words.append(
+                f"by its own estimate joints within {median:.1f} cm of the truth in half of cases and within"
+                f" {percentile_90:.1f} cm in nine of ten"
+            )
+        if not isinstance(key, str):
+            words += filter(None, (sources[0].reason, sources[0].remark))
+        notes.append(f"frames {', '.join(frames)}: {', '.join(words)}")
+    return tuple(notes)
+
+
+def _note_open_ends(clip: CanonicalClip, answer: Proposal, loose: LooseKeys | None) -> tuple[str, ...]:
+    """Note which in-betweener extrapolates gaps that have one edge only."""
+    notes, missing = [], clip.missing.root if loose is None else clip.missing.root & ~loose.placed & ~loose.drawings
+    if bool(missing[0]):
+        notes.append(
+            f"a gap at the beginning: the motion is extended backwards by {answer.source}, with nothing before it to"
+            " meet"
+        )
+    if bool(missing[-1]):
+        at_end = [other.by for other in answer.others if other.stop == answer.motion.num_frames]
+        by = at_end[0] if at_end else answer.source
+        notes.append(f"a gap at the end: the motion is extended by {by}, with nothing after it to meet")
+    return tuple(notes)
+
+
+_REPORTED_PLACE_ERROR = 0.03  # metres from where a joint is drawn, on average, beyond which there is a note
+
+
+def _note_drawings(motion: Motion, query: GapQuery) -> tuple[str, ...]:
+    """Note drawings of a query that a motion does not look like."""
+    if query.loose is None:
+        return ()
+    places, frames = motion.joint_positions(), query.loose.drawings.nonzero()[:, 0].tolist()
+    missed = {frame: measure_drawing_error(places[frame], query.loose, frame) for frame in frames}
+    return tuple(
+        f"at {float(query.seconds[frame]):.2f} s joints stay {100 * error:.0f} cm from where they are drawn, on"
+        " average: bones do not look so"
+        for frame, error in missed.items()
+        if error > _REPORTED_PLACE_ERROR
+    )
 
 
 _MOST = 130.0  # m/s^2 of a joint over 1/30 s: one frame in a thousand of mocap's has more
@@ -673,182 +573,3 @@ def _compute_accelerations(motion: Motion, step: int) -> Float[Tensor, " bends"]
     positions = motion.joint_positions()
     bends = positions[2 * step :] - 2 * positions[step:-step] + positions[: -2 * step]
     return bends.norm(dim=-1).amax(dim=-1) * (float(motion.fps) / step) ** 2
-
-
-_REPORTED_PLACE_ERROR = 0.03  # metres from where a joint is drawn, on average, beyond which there is a note
-
-
-def show_drawn_poses(query: GapQuery, inbetweener: Inbetweener, generator: torch.Generator) -> GapQuery:
-    """Return a query that has poses instead of drawings, fitted about what an in-betweener proposes; their place stays
-    open where it is not told."""
-    loose = query.loose
-    if loose is None or not bool(loose.drawn.any()):
-        return query
-    first = inbetweener.propose(query, generator=generator).motion
-    fitted = fit_drawings(first, loose, faced=not bool(query.missing.joints[:, 0].all()))
-    drawn = loose.drawings
-    root, quats = query.motion.root_position.clone(), query.motion.local_quat_xyzw.clone()
-    quats[drawn], root[drawn, 1] = fitted.local_quat_xyzw[drawn], fitted.root_position[drawn, 1]
-    missing = MissingMask(query.missing.joints & ~drawn[:, None], query.missing.root)
-    shown = interpolate_missing(replace(query.motion, local_quat_xyzw=quats), missing)
-    places = replace(loose, drawn=torch.zeros_like(loose.drawn))
-    return replace(query, motion=replace(shown, root_position=root), missing=missing, loose=places)
-
-
-def meet_places(proposal: Proposal, query: GapQuery) -> Proposal:
-    """Lead the hips of a proposal over the places of loose keys."""
-    if query.loose is None or not bool(query.loose.placed.any()):
-        return proposal
-    motion, known, lost = proposal.motion, query.motion.root_position, query.missing.root
-    root = lead_over_keys(motion.root_position, known, lost, query.loose)
-    return replace(proposal, motion=replace(motion, root_position=root))
-
-
-def note_drawings(motion: Motion, query: GapQuery) -> tuple[str, ...]:
-    """Note drawings of a query that a motion does not look like."""
-    if query.loose is None:
-        return ()
-    places, frames = motion.joint_positions(), query.loose.drawings.nonzero()[:, 0].tolist()
-    missed = {frame: measure_drawing_error(places[frame], query.loose, frame) for frame in frames}
-    return tuple(
-        f"at {float(query.seconds[frame]):.2f} s joints stay {100 * error:.0f} cm from where they are drawn, on"
-        " average: bones do not look so"
-        for frame, error in missed.items()
-        if error > _REPORTED_PLACE_ERROR
-    )
-
-
-_REPORTED_ERROR = 0.001  # metres from a target beyond which there is a note
-_REACH_TOLERANCE = 1e-4  # metres from a target within which it is reached
-_MAX_REACH_ATTEMPTS = 6
-_PLACE_SECONDS = 0.5  # over which what the hips are moved by fades away from a place
-
-
-@dataclass(frozen=True)
-class InfillSettings:
-    """Settings of in-betweening."""
-
-    finish: bool = True
-    """Whether MAP refines the proposal; if not it stays as proposed, on rigid bones and with exact keys."""
-    refinement: RefinementSettings = field(default_factory=lambda: INFILL_REFINEMENT)
-    """Sigmas and search of the MAP stage."""
-
-
-def fill(
-    motion: Motion,
-    missing: MissingMask,
-    inbetweener: Inbetweener,
-    *,
-    settings: InfillSettings | None = None,
-    densities: Sequence[Density] = (),
-    terms: Sequence[Term] = (),
-    rig: Rig | None = None,
-    targets: EffectorTargets | None = None,
-    loose: LooseKeys | None = None,
-    curve: Curve | None = None,
-    generator: torch.Generator | None = None,
-) -> InbetweenSolution:
-    """Fill missing values of a motion.
-
-    `targets` are positions of the rig's hands and feet in frames in which they are missing, `loose` places over the
-    ground and drawings in such frames; the hips follow `curve` while they are missing. The MAP stage adds `terms`, and
-    the likeliest of `densities` its likelihood; RequestError for terms where it is left out.
-    """
-    settings, began = settings or InfillSettings(), time.perf_counter()
-    if terms and not settings.finish:
-        raise RequestError("terms belong to the MAP stage, which is left out")
-    generator = generator or torch.Generator().manual_seed(0)
-    clip = CanonicalClip.of(motion, missing, rig)
-    if curve is not None:
-        clip = replace(clip, canonical=move_root_along_curve(clip.canonical, missing.root, curve))
-    if loose is not None:
-        clip = _lead_over_places(clip, loose)
-    query = clip.query(effector_targets=targets, keep_trajectory=curve is not None, loose=loose)
-    asked, query = query, show_drawn_poses(query, inbetweener, generator)
-    answer, reached = propose_through_keys(query, inbetweener, generator)
-    answer = meet_places(shrink(answer, query, inbetweener.rough, generator), query)
-    proposed = time.perf_counter()
-    made, ledger, windows = answer.motion, Ledger(), ()
-    if settings.finish:
-        # The hips stay at the positions of loose keys, over the ground and as high as proposed.
-        root = query.missing.root if query.loose is None else query.missing.root & ~query.loose.placed
-        firm = replace(query, missing=MissingMask(query.missing.joints, root))
-        made, ledger, windows = refine_gaps(answer, firm, reached, settings.refinement, densities, terms)
-    done, unreached = _reach_targets(clip, clip.back(made, asked), targets)
-    done, abrupt = _meet_places(clip, done, loose), ()
-    if targets is None and loose is None and curve is None:
-        done, abrupt = take_simpler(done, clip.restore_observed(clip.interpolated), missing)
-    status = (
-        Status(Outcome.DONE).with_notes(_note_open_ends(clip, answer, loose)).with_notes(note_drawings(made, asked))
-    )
-    status = status.with_notes(abrupt).with_notes(unreached, infeasible=bool(unreached))
-    return InbetweenSolution(
-        done,
-        status,
-        ledger,
-        windows,
-        seconds=time.perf_counter() - began,
-        proposal_seconds=proposed - began,
-        missing=missing,
-        rig=as_rig(clip.rigmap),
-        contacts=contacts.debounced(answer.contact_logits > 0),
-        sources=answer.attribute(query),
-        gap_notes=compose_gap_notes(query, made, answer, fps=float(motion.fps)),
-    )
-
-
-def _lead_over_places(clip: CanonicalClip, loose: LooseKeys) -> CanonicalClip:
-    """Lead the interpolation between keys over the places of loose ones."""
-    hips = clip.rigmap.joint_of[0]
-    turned = clip.missing.root if hips is None else clip.missing.joints[:, hips]
-    return replace(clip, canonical=move_root_over_places(clip.canonical, clip.missing.root, turned, loose))
-
-
-def _meet_places(clip: CanonicalClip, filled: Motion, loose: LooseKeys | None) -> Motion:
-    """Move the hips, smoothly, by the little that resampling and the MAP stage leave them from their places."""
-    if loose is None or not bool(loose.placed.any()):
-        return filled
-    canonical, rigmap = to_canonical(filled, as_rig(clip.rigmap))
-    root, free = canonical.root_position.clone(), clip.missing.root
-    off = torch.where((loose.placed & free)[:, None], loose.ground - root[:, ::2], 0.0)
-    moved = interpolate_offsets(off, loose.placed | ~free, seconds=_PLACE_SECONDS, fps=float(filled.fps))
-    root[:, ::2] += torch.where(free[:, None], moved, 0.0)
-    return clip.restore_observed(from_canonical(replace(canonical, root_position=root), rigmap, filled))
-
-
-def _note_open_ends(clip: CanonicalClip, answer: Proposal, loose: LooseKeys | None) -> tuple[str, ...]:
-    """Note which in-betweener extrapolates gaps that have one edge only."""
-    notes, missing = [], clip.missing.root if loose is None else clip.missing.root & ~loose.placed & ~loose.drawings
-    if bool(missing[0]):
-        by = answer.source
-        notes.append(
-            f"a gap at the beginning: the motion is extended backwards by {by}, with nothing before it to meet"
-        )
-    if bool(missing[-1]):
-        end = max(answer.others, key=lambda one: one.stop, default=None)
-        by = end.by if end is not None and end.stop == answer.motion.num_frames else answer.source
-        notes.append(f"a gap at the end: the motion is extended by {by}, with nothing after it to meet")
-    return tuple(notes)
-
-
-def _reach_targets(
-    clip: CanonicalClip, filled: Motion, targets: EffectorTargets | None
-) -> tuple[Motion, tuple[str, ...]]:
-    """Bend limbs until they are at their targets; and note those that are out of reach."""
-    if targets is None:
-        return filled, ()
-    canonical, rigmap = to_canonical(filled, as_rig(clip.rigmap))
-    aim, done, errors = targets, filled, torch.full((1,), torch.inf)
-    for _ in range(_MAX_REACH_ATTEMPTS):
-        there = reach_effector_targets(canonical, aim, clip.missing.frames)
-        done = clip.restore_observed(from_canonical(there, rigmap, filled))
-        found = rig_joint_positions(done, rigmap)
-        before, errors = errors, compute_target_errors(found, targets)
-        if float(errors.max()) < _REACH_TOLERANCE or float((errors - before).abs().max()) < _REACH_TOLERANCE:
-            break
-        # Joints that only the rig has offset an effector from its canonical position.
-        aim = EffectorTargets(targets.places + there.joint_positions() - found, targets.wanted)
-    if float(errors.max()) <= _REPORTED_ERROR:
-        return done, ()
-    worst = int(errors.argmax())
-    return done, (f"frame {worst}: a limb stays {100 * float(errors.max()):.1f} cm from its target, out of reach",)

@@ -32,14 +32,18 @@ from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode, integrate_roo
 from mapctl.inbetweening import GapQuery, Proposal
 from mapctl.inbetweening.effector_targets import EffectorTargets
 from mapctl.inbetweening.query import INTERPOLATION, GapSource, estimate_contact_logits
-from mapctl.inbetweening.seam_blending import blend_seams_in_positions, blend_seams_in_rotations
 from mapctl.inbetweening.whole_body import bend_limbs, reach_targets
 from mapctl.kinematics import heading
 from mapctl.metrics.body import measure_path_length, measure_peaks
 from mapctl.motion import Motion
 from mapctl.numerics import gaussian
 from mapctl.numerics.intervals import fill_missing, last_observed, next_observed, true_intervals
-from mapctl.numerics.smooth_offsets import interpolate_offsets, interpolate_turns
+from mapctl.numerics.smooth_offsets import (
+    blend_seams_in_positions,
+    blend_seams_in_rotations,
+    interpolate_offsets,
+    interpolate_turns,
+)
 from mapctl.pose import decode
 from mapctl.problem import density_selection
 from mapctl.problem.receding_horizon import CommittedFrames, RecedingHorizonSolver, replay

@@ -19,7 +19,7 @@ from controllers.inbetweening.keyframes import (
 from controllers.inbetweening.pipeline import InbetweenSolution, InfillSettings
 from controllers.inbetweening.proposers import ModelLoaders, RolloutInbetweener, StitchedInbetweener, build_inbetweener
 from controllers.inbetweening.tween import measure_keyframe_errors, tween
-from controllers.inbetweening.variations import Source, Tweening, Variations, lowest_energy, sample_variations
+from controllers.inbetweening.variations import Source, Tweening, Variations, sample_variations
 from mapctl import report
 from mapctl.commands.shared import inputs, options, outputs, results
 from mapctl.commands.shared.command import NOT_SATISFIED, ModelCommand, conclude
@@ -27,8 +27,7 @@ from mapctl.commands.shared.options import parse_frame
 from mapctl.commands.shared.outputs import print_table, show_progress
 from mapctl.commands.shared.results import Example, find_styles, find_tweener, read_dna, restyle
 from mapctl.errors import FileFormatError, RequestError
-from mapctl.intent.keyframe_toml import KeyRequest, read_keys
-from mapctl.intent.keyframes import Keys
+from mapctl.intent.keyframes import KeyRequest, Keys, read_keys
 from mapctl.protocols import Inbetweener
 from mapctl.retarget import to_canonical
 from mapctl.retarget.rigs import Rig
@@ -70,10 +69,6 @@ class Tween(ModelCommand, options.RigOptions, options.ProposalOptions):
     --dna the others are in one of its styles each, and when all were had by some of the poses of one; with --method
     tweener alone each is of a class; with --method stitcher they are its draws. Else they are rollouts of densities
     (--prior, or auto), steered from key to key."""
-    best_of: options.Count = 1
-    """Number of motions of which the one with the lowest energy is kept: from the network's proposal, slerp's, and
-    rollouts of densities (--prior, or auto) that are steered from key to key; with --method stitcher from its calm
-    answer and its draws."""
     seed: options.Count = 0
     """Seed of everything that is sampled; the first variations do not depend on their number."""
     report: options.MaybeFile = None
@@ -104,10 +99,7 @@ def _run_request(command: Tween, request: KeyRequest | None) -> int:
         ok = run_variations(command, clip, make, models, dna)
         return NOT_SATISFIED if command.strict and not ok else 0
     intervals = _suggest_timing(command, clip)
-    if command.best_of > 1:
-        done = tween_lowest_energy(command, make, models)
-    else:
-        done = make(build_inbetweener(command.method, models), torch.Generator().manual_seed(command.seed))
+    done = make(build_inbetweener(command.method, models), torch.Generator().manual_seed(command.seed))
     outputs.save_motion(done.motion, command.out)
     if command.report is not None:
         report.write_report(_build_report(command, done, clip, intervals), command.report)
@@ -157,7 +149,7 @@ def _check(command: Tween, given: Sequence[Path]) -> None:
         raise RequestError("of a motion file, --keyframes says which frames are keys (see mapctl tween --help)")
     check_answers(command, given)
     # Variations are rollouts of a density with every method.
-    prior = command.prior if command.variations == command.best_of == 1 else None
+    prior = command.prior if command.variations == 1 else None
     results.check_proposal(command, prior=prior)
 
 
@@ -215,7 +207,6 @@ def _build_report(
 
 _MAX_ANSWERS = 1000
 _IN_STYLE = " in the style of "
-_FIRST_SAMPLED = 3  # the motions before it are the network's and slerp's
 
 
 def number_paths(path: Path, count: int) -> list[Path]:
@@ -226,22 +217,14 @@ def number_paths(path: Path, count: int) -> list[Path]:
 def check_answers(command: Tween, given: Sequence[Path]) -> None:
     """Raise RequestError for options that exclude several motions, and files that cannot be written."""
     options.check_seed(command.seed)
-    for name, count in (("--variations", command.variations), ("--best-of", command.best_of)):
-        if not 1 <= count <= _MAX_ANSWERS:
-            raise RequestError(f"{name} must be 1 to {_MAX_ANSWERS}, got {count}")
-        if count > 1 and command.method == "slerp":
-            raise RequestError(f"--method slerp knows one answer only; leave {name} out")
-    if command.dna is not None and command.best_of > 1:
-        raise RequestError("--best-of keeps one of several rollouts, which know no style; leave it or --dna out")
-    if command.variations > 1 and command.best_of > 1:
-        raise RequestError("--variations keeps all answers and --best-of one; choose one")
+    if not 1 <= command.variations <= _MAX_ANSWERS:
+        raise RequestError(f"--variations must be 1 to {_MAX_ANSWERS}, got {command.variations}")
+    if command.variations > 1 and command.method == "slerp":
+        raise RequestError("--method slerp knows one answer only; leave --variations out")
     if command.variations == 1:
         # Of the stitcher, whose draws are asked for by number, one answer is the calm one whatever the seed.
-        sampled = command.method in ("rollouts", "stitcher")
-        if command.seed and command.best_of < _FIRST_SAMPLED and not sampled:
-            raise RequestError(
-                "--seed is of what is drawn, and nothing is; ask for --variations, --best-of 3 or --method rollouts"
-            )
+        if command.seed and command.method not in ("rollouts", "stitcher"):
+            raise RequestError("--seed is of what is drawn, and nothing is; ask for --variations or --method rollouts")
         results.check_destinations(command.out, command.video, command.report, given=given)
         return
     if command.suggest_timing:
@@ -250,19 +233,6 @@ def check_answers(command: Tween, given: Sequence[Path]) -> None:
         raise RequestError("--video of several answers is a .png of stills; film OUT_000 by `mapctl render`")
     first, *others = number_paths(command.out, command.variations)
     results.check_destinations(first, command.video, *others, command.report, given=given)
-
-
-def tween_lowest_energy(command: Tween, make: Tweening, models: ModelLoaders) -> InbetweenSolution:
-    """Make several motions and keep the one with the lowest energy."""
-    generator = torch.Generator().manual_seed(command.seed)
-    with show_progress("answers", quiet=command.quiet) as progress:
-        stitched = build_inbetweener("stitcher", models) if command.method == "stitcher" else None
-        source = _draw_stitches(command, stitched)
-        first = {"calm": stitched} if stitched else None
-        rollouts = RolloutInbetweener(models.densities(), stitched or models.network("rollouts"))
-        return lowest_energy(
-            make, rollouts, command.best_of, generator=generator, first=first, source=source, progress=progress
-        )
 
 
 def run_variations(
@@ -294,14 +264,13 @@ def run_variations(
     return all(one.solution.status.ok for one in found.each)
 
 
-def _draw_stitches(command: Tween, first: Inbetweener | None) -> Source | None:
+def _draw_stitches(command: Tween, first: Inbetweener) -> Source | None:
     """Draw from the stitcher, if it is one that was asked for."""
     if not isinstance(first, StitchedInbetweener) or not isinstance(first.stitcher, Stitcher):
         return None
     drawing, longest = first.stitcher.drawing(command.seed), first.stitcher.longest
     return Source(
         lambda number, draws: replace(first, stitcher=drawing.numbered(number)),
-        "draw",
         f"whole poses with 1 to {longest} frames between them",
     )
 
@@ -320,7 +289,7 @@ def _prepare_styles(command: Tween, first: Inbetweener, dna: Sequence[Example]) 
     def draw(number: int, draws: torch.Generator) -> Inbetweener:
         return restyle(first, draw_style(styles, number, tweener.encode_style, order=order, generator=draws))
 
-    return Source(draw, "style", "room for a style")
+    return Source(draw, "room for a style")
 
 
 def _tell_variations(found: Variations, files: Sequence[Path], keys: int) -> None:

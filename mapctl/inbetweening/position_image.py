@@ -16,11 +16,11 @@ from torch import Tensor
 from mapctl import contacts, rotations
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening.query import GapQuery, Proposal
-from mapctl.inbetweening.seam_blending import blend_seams_in_positions, blend_seams_in_rotations
 from mapctl.kinematics import heading, inverse
 from mapctl.motion import Motion
 from mapctl.numerics import gaussian
 from mapctl.numerics.intervals import last_observed, next_observed
+from mapctl.numerics.smooth_offsets import blend_seams_in_positions, blend_seams_in_rotations
 from mapctl.skeleton import CANONICAL, LIMBS, TOE_JOINTS, Limb
 
 _PARTNERS = CANONICAL.mirror_partners()

@@ -3,7 +3,7 @@
 import bisect
 import math
 from dataclasses import dataclass
-from itertools import accumulate
+from itertools import accumulate, pairwise
 
 import numpy as np
 import torch
@@ -20,6 +20,12 @@ USUAL_SPEED = 1.2
 _SUBSTEPS = 10  # integration steps a frame
 
 
+def _check_speeds(name: str, at: tuple[float, ...], speeds: tuple[float, ...]) -> None:
+    rises = all(a < b for a, b in pairwise(at))
+    if not at or len(at) != len(speeds) or not rises or not all(map(math.isfinite, at)):
+        raise RequestError(f"speeds need as many {name}, which rise, got {at} and {speeds}")
+
+
 @dataclass(frozen=True)
 class SpeedProfile:
     """Speed along a curve, m/s, linear between the given arcs and constant beyond them."""
@@ -30,13 +36,9 @@ class SpeedProfile:
     """Speeds at those arcs, m/s, positive."""
 
     def __post_init__(self):
-        if len(self.arcs) != len(self.speeds) or not self.arcs:
-            raise RequestError("a speed profile needs one speed for each arc")
-        rises = all(a < b for a, b in zip(self.arcs, self.arcs[1:], strict=False))
-        if not rises or not all(math.isfinite(arc) for arc in self.arcs):
-            raise RequestError(f"the arcs of a speed profile must rise, got {self.arcs}")
+        _check_speeds("arcs", self.arcs, self.speeds)
         for speed in self.speeds:
-            if not 0 < speed < float("inf"):
+            if not 0 < speed < math.inf:
                 raise RequestError(f"speed must be positive, got {speed:g} m/s")
 
     @staticmethod
@@ -148,13 +150,9 @@ class TimedSpeed:
     """Speeds at those times, m/s; zero is to stand."""
 
     def __post_init__(self):
-        if len(self.seconds) != len(self.speeds) or not self.seconds:
-            raise RequestError("speeds by time need one speed for each time")
-        rises = all(a < b for a, b in zip(self.seconds, self.seconds[1:], strict=False))
-        if not rises or not all(math.isfinite(time) for time in self.seconds):
-            raise RequestError(f"the times of speeds must rise, got {self.seconds}")
+        _check_speeds("times", self.seconds, self.speeds)
         for speed in self.speeds:
-            if not 0 <= speed < float("inf"):
+            if not 0 <= speed < math.inf:
                 raise RequestError(f"speed must be zero or positive, got {speed:g} m/s")
 
     @staticmethod

@@ -57,15 +57,6 @@ def test_one_answer_is_the_calm_one_whatever_the_seed(clip):
     assert Path("a.bvh").read_bytes() == Path("b.bvh").read_bytes()
 
 
-@pytest.mark.slow
-def test_the_best_of_some_names_its_pick(clip):
-    words = ("tween", clip, "-o", "best.bvh", "--keyframes", "0,20", *STITCH, "--best-of", 3, "--report", "best.json")
-    assert run(*words) == 0
-    report = json.loads(Path("best.json").read_text())
-    assert set(report["draws"]) == {"calm", "draw 1", "draw 2"}
-    assert report["picked"] == min(report["draws"], key=report["draws"].get)
-
-
 def test_infill_and_chain_stitch(clip):
     assert run("infill", clip, "-o", "whole.bvh", "--gap", "10:25", *STITCH, "--report", "whole.json") == 0
     assert json.loads(Path("whole.json").read_text())["gap_notes"] == ["frames 10:25: stitcher"]

@@ -14,7 +14,7 @@ from helpers import random_motion, walk
 
 from mapctl import curves, formats
 from mapctl.errors import FileFormatError, MapctlError, RequestError
-from mapctl.intent.keyframe_toml import read_drawing, read_keys
+from mapctl.intent.keyframes import read_drawing, read_keys
 from mapctl.intent.steering import read_commands
 from mapctl.recording.masks import load_masks
 from mapctl.retarget.rigs import read_rig_toml

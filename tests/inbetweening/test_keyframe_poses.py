@@ -14,7 +14,7 @@ from controllers.inbetweening.keyframes import build_keyframe_clip
 from controllers.inbetweening.tween import measure_keyframe_errors, tween
 from mapctl import retarget
 from mapctl.errors import RequestError
-from mapctl.intent.keyframe_toml import KeyEntry, KeyRequest
+from mapctl.intent.keyframes import KeyEntry, KeyRequest
 from mapctl.kinematics import heading
 from mapctl.retarget.character import Stance
 from mapctl.skeleton import leg_length

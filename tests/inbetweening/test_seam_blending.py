@@ -6,7 +6,7 @@ from captures import apart_deg, swaying, vectors
 from helpers import generator, quat_xyzw
 
 from mapctl import rotations
-from mapctl.inbetweening.seam_blending import blend_seams_in_positions, blend_seams_in_rotations
+from mapctl.numerics.smooth_offsets import blend_seams_in_positions, blend_seams_in_rotations
 
 FRAMES = 120
 GAPS = [(40, 70), (50, 51), (0, 20), (117, 119)]

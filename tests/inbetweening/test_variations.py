@@ -1,7 +1,6 @@
-"""`mapctl tween --variations K` and `--best-of K`: several motions through the same keys, all of which meet them."""
+"""`mapctl tween --variations K`: several motions through the same keys, all of which meet them."""
 
 import math
-import re
 from dataclasses import replace
 
 import pytest
@@ -23,7 +22,7 @@ from controllers.inbetweening.proposers import (
     SlerpInbetweener,
 )
 from controllers.inbetweening.tween import tween
-from controllers.inbetweening.variations import lowest_energy, sample_variations
+from controllers.inbetweening.variations import sample_variations
 from mapctl.errors import RequestError
 from mapctl.inbetweening.missing import MissingMask
 from mapctl.intent.keyframes import Keys
@@ -176,23 +175,3 @@ def test_what_leaves_nothing_to_vary_is_refused(prior):
     for count in (1, 1001):
         with pytest.raises(RequestError, match=f"variations are 2 to 1000, got {count}"):
             asked(motion, prior, count=count)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("keys", [SHORT_KEYS, (0, 24)])
-def test_the_best_is_the_answer_of_least_energy_and_all_are_told(prior, keys):
-    motion = on_rig("canonical", SHORT)
-    rollouts = RolloutInbetweener([prior], INFILLER, QUICK)
-    make = making(motion, Keys(keys))
-    made = lowest_energy(make, rollouts, 4, generator=generator(0), refinement=FEW.refinement)
-    assert torch.equal(made.motion.root_position[list(keys)], motion.root_position[list(keys)])
-    told = dict(re.findall(r"(network|slerp|rollout \d) (-?[\d.]+)", made.notes[-1].split(": ", 1)[1]))
-    assert list(told) == ["network", "slerp", "rollout 1", "rollout 2"]
-    winner = min(told, key=lambda name: float(told[name]))
-    assert made.notes[-1].startswith(f"the best of 4 is from the {winner}; ")
-    # Its own energy, found anew, is that told; the answers that variations have as well have the same.
-    others = asked(motion, prior, keys=keys).each
-    for name, one in zip(("network", "rollout 1", "rollout 2"), others, strict=True):
-        assert float(told[name]) == pytest.approx(one.energy, abs=0.06)
-        if name == winner:
-            assert torch.equal(made.motion.local_quat_xyzw, one.solution.motion.local_quat_xyzw)

@@ -3,8 +3,7 @@
 import pytest
 
 from mapctl.errors import FileFormatError
-from mapctl.intent.keyframe_toml import read_drawing
-from mapctl.intent.keyframes import Drawing
+from mapctl.intent.keyframes import Drawing, read_drawing
 
 
 def test_joints_are_read_by_column_in_any_unit(tmp_path):

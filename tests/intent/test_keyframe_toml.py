@@ -3,7 +3,7 @@
 import pytest
 
 from mapctl.errors import FileFormatError
-from mapctl.intent.keyframe_toml import KeyEntry, read_keys
+from mapctl.intent.keyframes import KeyEntry, read_keys
 
 TWO = '[[key]]\nframe = 0\npose = "a.bvh"\n[[key]]\nframe = 30\npose = "b.bvh"\n'
 
