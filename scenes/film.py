@@ -210,7 +210,7 @@ def film(
     """Film the actors walking together; one pass serves all outputs. Returns the paths written.
 
     `actors` are Shots, or tuples (motion, curve, colour, start seconds, wishes, drawn) of which all but the motion may
-    be left out. Where stick figures are drawn a character is one of them, and a line is logged that says so. `out` is a
+    be left out. Where stick figures are drawn a character is one of them, and a line is logged on that. `out` is a
     path or several, each ending in .mp4, .gif, .webp or .png (a contact sheet: ghosts along the trajectory over a row
     of stills). Each frame of the motions is one frame of the film unless `fps` resamples them. `size` is the width and
     height in pixels (MP4 rounds up to even). `props` are what stands around (`scenes.overlays`). `progress` is called

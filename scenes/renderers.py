@@ -154,7 +154,7 @@ _CLIP_NEAR, _CLIP_FAR = 0.3, 400.0
 
 
 class NoGraphicsError(MapctlError):
-    """OpenGL cannot be used here; the message says what is missing."""
+    """OpenGL cannot be used here; the message names what is missing."""
 
 
 class OffscreenPainter:
@@ -231,7 +231,7 @@ _log = logging.getLogger("mapctl.scenes")
 def select_painter(name: RendererName | None = None) -> Painter:
     """Select the painter of a name; None takes the one in MAPCTL_RENDERER, else `auto`.
 
-    `auto` falls back to stick figures and logs one line that says what is missing; `egl` raises NoGraphicsError.
+    `auto` falls back to stick figures and logs one line on what is missing; `egl` raises NoGraphicsError.
     RequestError for other names, and where not even matplotlib is installed.
     """
     wanted = name or os.environ.get(RENDERER_VARIABLE) or "auto"

@@ -132,7 +132,7 @@ class Stage:
         figures = [
             Figure(player.body, frame, fade)
             for player in self.players
-            # A later ghost replaces one in the same pose: an actor who waits or has arrived.
+            # A later ghost replaces one in the same pose: an actor that waits or has arrived.
             for frame, fade in {player.frame(at): float(fade) for at, fade in moments}.items()
         ]
         trails = [player.trail for player in self.players]

@@ -224,8 +224,8 @@ class SkinnedBody:
     def __init__(self, mesh: CharacterMesh, motion: Motion, bones: Body):
         """`motion` is on the joints of the mesh, frame by frame that of `bones`. MapctlError where it is not."""
         if motion.num_joints != len(mesh.rest) or motion.num_frames != bones.num_frames:
-            told = f"{motion.num_joints} joints and {motion.num_frames} frames"
-            raise MapctlError(f"a mesh of {len(mesh.rest)} joints and {bones.num_frames} frames got {told}")
+            found = f"{motion.num_joints} joints and {motion.num_frames} frames"
+            raise MapctlError(f"a mesh of {len(mesh.rest)} joints and {bones.num_frames} frames got {found}")
         self._mesh, self._bones = mesh, bones
         self._places = motion.joint_positions().numpy()
         self._turns = rotations.to_matrix(motion.joint_rotations()).numpy()

@@ -63,7 +63,7 @@ class LiveCharacter(Protocol):
     """Skeleton of the character."""
 
     def command(self, command: Command) -> None:
-        """Obey this command from now on, as far as possible (`FrameChunk.notes` tell), and follow no path."""
+        """Obey this command from now on, as far as possible (see `FrameChunk.notes`), and follow no path."""
         ...
 
     def walk(self, points: Sequence[tuple[float, float]], speed: float, *, closed: bool = False) -> None:
@@ -72,7 +72,7 @@ class LiveCharacter(Protocol):
         ...
 
     def aim(self, command: Command) -> None:
-        """Reach, look and walk round obstacles as this command says; nothing else of it counts, and a path is kept."""
+        """Reach, look and walk round obstacles as in this command; nothing else of it counts, and a path is kept."""
         ...
 
     def go(self, command: Command, place: tuple[float, float], within: float, facing: float | None = None) -> None:

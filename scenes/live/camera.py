@@ -64,11 +64,13 @@ class ChaseCamera:
         if self.mode is CameraMode.FREE or seconds <= 0:
             self._last = position
             return
-        if self._last is None or float(np.linalg.norm(position - self._last)) > _JUMP_METRES:
+        last = self._last
+        if last is None or float(np.linalg.norm(position - last)) > _JUMP_METRES:
             self.jump(position, facing)
+            last = position
         seconds = min(seconds, _LONGEST_STEP)
-        pace = (position - self._last) / seconds
-        off, speed = _relax(self.position - self._last, self._speed - pace, _MOVE_RATE, seconds)
+        pace = (position - last) / seconds
+        off, speed = _relax(self.position - last, self._speed - pace, _MOVE_RATE, seconds)
         self.position, self._speed, self._last = position + off, speed + pace, position
         if self.mode is CameraMode.CHASE:
             off, self._spin = _relax(math.remainder(self.yaw - facing, math.tau), self._spin, _TURN_RATE, seconds)

@@ -143,8 +143,7 @@ def draw_panel() -> list[str]:
     drawn: list[str] = []
     panel = blender_stage.module("interface").MAPCTL_PT_sidebar
     standing = SimpleNamespace(layout=Layout(drawn))
-    for name in ("_draw_job", "_draw_report"):
-        setattr(standing, name, getattr(panel, name).__get__(standing))
+    standing._draw_report = panel._draw_report.__get__(standing)
     panel.draw(standing, bpy.context)
     return drawn
 
@@ -157,11 +156,7 @@ def check_manifest() -> str:
 
 
 def play_settings() -> None:
-    """Options are the scene's, and the gap is taken from the preview range; the add-on goes and comes."""
-    scene = bpy.context.scene
-    scene.use_preview_range, scene.frame_preview_start, scene.frame_preview_end = True, 20, 31
-    bpy.ops.mapctl.preview_gap()
-    facts["gap"] = [scene.mapctl.gap.first, scene.mapctl.gap.last]
+    """Options are the scene's; the add-on goes and comes."""
     facts["panel"] = draw_panel()
     bpy.ops.preferences.addon_disable(module=blender_stage.ADDON)
     facts["manifest"] = check_manifest()

@@ -64,17 +64,6 @@ def test_rotations_are_scipys(source):
     assert (rotations.to_quaternions(turns.as_matrix())[:, 3] >= 0).all()
 
 
-def test_axes_do_not_turn_over(source):
-    rotations = source("exchange")
-    angles = 1.2 * np.sin(np.linspace(0.1, 12, 80))[:, None] * [0.6, 0, 0.8]
-    turns = Rotation.from_rotvec(angles)
-    quats = rotations.join_signs(np.roll(rotations.to_quaternions(turns.as_matrix()), 1, axis=-1))
-    found = rotations.to_axis_angles(quats)
-    assert np.abs(np.diff(found, axis=0)).max() < 0.2
-    back = Rotation.from_rotvec(found[:, :1] * found[:, 1:])
-    assert (back * turns.inv()).magnitude().max() < 1e-7
-
-
 @pytest.mark.parametrize("motion", [walk(20), random_motion(CANONICAL, 7, seed=3, fps=Fraction(24000, 1001))])
 def test_files_are_mapctls(source, tmp_path, motion):
     exchange = source("exchange")

@@ -47,7 +47,7 @@ def test_what_constraints_keep_from_its_place_is_told(facts):
     assert facts["apart"]["arm that is stretched"] < CLOSE, "constraints still hold"
     assert "mixamorig:Left" in facts["stretched told"][0]
     assert " cm off: constraints" in facts["stretched told"][0]
-    assert facts["stretched told"][1:] == ["frame 0 of what mapctl says is frame 1 of the scene", "echoed"]
+    assert facts["stretched told"][1:] == ["frame 0 in mapctl's lines is frame 1 of the scene", "echoed"]
 
 
 def test_rigs_animated_by_ik_keep_hands_and_feet_where_they_were(facts):

@@ -46,12 +46,8 @@ def test_jobs_end_by_themselves_in_the_interface(facts):
 
 
 def test_panel_has_every_operator(facts):
-    operators = [f"mapctl.{name}" for name in ("walk", "clean_up", "fill_gap", "preview_gap", "in_between")]
+    operators = [f"mapctl.{name}" for name in ("walk", "clean_up", "fill_gap", "in_between")]
     assert [name for name in facts["panel"] if name.startswith("mapctl.")] == operators
-
-
-def test_gap_is_taken_from_the_preview_range(facts):
-    assert facts["gap"] == [20, 31]
 
 
 def test_blender_accepts_the_manifest(facts):

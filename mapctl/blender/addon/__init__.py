@@ -8,12 +8,10 @@ import bpy
 
 from . import interface
 
-_CLASSES = (*interface.CLASSES, *interface.OPERATORS, interface.MAPCTL_PT_sidebar)
-
 
 def register() -> None:
     """Add all classes, and the options that scenes keep."""
-    for each in _CLASSES:
+    for each in interface.CLASSES:
         bpy.utils.register_class(each)
     bpy.types.Scene.mapctl = bpy.props.PointerProperty(type=interface.MAPCTL_PG_settings)
 
@@ -21,5 +19,5 @@ def register() -> None:
 def unregister() -> None:
     """Take all that away again."""
     del bpy.types.Scene.mapctl
-    for each in reversed(_CLASSES):
+    for each in reversed(interface.CLASSES):
         bpy.utils.unregister_class(each)

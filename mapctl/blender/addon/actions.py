@@ -128,7 +128,7 @@ def set_constant(armature: bpy.types.Object, path: str, value: float, frame: int
 
 
 def write_channel(armature: bpy.types.Object, channel: Channel, frames: range, made: np.ndarray) -> None:
-    """Write a key for every frame, linear between them, generated ones where `made` (frames,) says so."""
+    """Write a key for every frame, linear between them, generated ones where `made` (frames,) is true."""
     holder = open_curves(armature)
     for index, values in enumerate(channel.values.T):
         curve = holder.fcurves.new(channel.path, index=index)

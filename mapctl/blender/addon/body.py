@@ -9,12 +9,13 @@ import numpy as np
 from mathutils import Matrix, Quaternion
 
 from .actions import Channel, name_channel
-from .exchange import WorldMotion, join_signs, orthonormalise, to_axis_angles, to_quaternions, transpose
+from .exchange import WorldMotion, join_signs, orthonormalise, to_quaternions, transpose
 from .process import AddonError, Step
 
 Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 """From Blender's axes, Z up and facing -Y, to mapctl's, Y up and facing +Z."""
 _UNEVEN = 1e-3  # what scales may differ by, relative
+_NO_ANGLE = 1e-6  # sine of half an angle below which its axis is rounding
 _FEWEST = 10  # bones that deform, from which on the others are left out
 
 
@@ -57,7 +58,7 @@ class Body:
     switches: dict[str, str] = field(default_factory=dict)
     """Custom property of a bone of a generated rig that is keyed to 1, by bone."""
     rig_toml: str = ""
-    """What mapctl is told of the joints by a rig file; nothing where it finds out itself."""
+    """A rig file with names of the joints; nothing where mapctl recognises them itself."""
 
     def to_world(self, places: np.ndarray) -> np.ndarray:
         """Convert places (..., 3) in the armature's space to mapctl's, with the armature at the origin."""
@@ -235,7 +236,7 @@ def solve_controls(
     """Find what the controls of a generated rig are keyed with.
 
     Each is moved as its joint still has to move, on the assumption that it goes along with its carrier; Blender then
-    says where the joints are, until they are right. So whatever lies between the controls is accounted for.
+    shows where the joints are, until they are right. So whatever lies between the controls is accounted for.
     """
     found = np.empty((len(body.controls), len(frames), 4, 4))
     for number, frame in enumerate(frames):
@@ -305,8 +306,16 @@ def _convert_rotations(matrices: np.ndarray, mode: str) -> tuple[str, np.ndarray
     quaternions = join_signs(np.roll(to_quaternions(orthonormalise(matrices)), 1, axis=-1))  # wxyz from here on
     if mode == "QUATERNION":
         return "rotation_quaternion", quaternions
-    if mode == "AXIS_ANGLE":
-        return "rotation_axis_angle", to_axis_angles(quaternions)
+    if mode == "AXIS_ANGLE":  # axes do not turn over, angles go through 0 instead
+        vectors = quaternions[:, 1:]
+        lengths = np.linalg.norm(vectors, axis=1)
+        known = lengths > _NO_ANGLE  # where there is no angle the axis stays
+        last = np.maximum.accumulate(np.where(known, np.arange(len(known)), known.argmax()))
+        axes = vectors[last] / np.maximum(lengths[last, None], 1e-9)
+        turns = np.where((axes[1:] * axes[:-1]).sum(axis=1) < 0, -1.0, 1.0)
+        axes *= np.cumprod(np.r_[1.0, turns])[:, None]
+        halves = np.arctan2((vectors * axes).sum(axis=1), quaternions[:, 0])
+        return "rotation_axis_angle", np.column_stack([np.unwrap(2 * halves, period=4 * np.pi), axes])
     angles = [Quaternion(quaternions[0]).to_euler(mode)]
     for quaternion in quaternions[1:]:
         angles.append(Quaternion(quaternion).to_euler(mode, angles[-1]))

@@ -11,8 +11,6 @@ import numpy as np
 
 from .process import AddonError
 
-_NO_ANGLE = 1e-6  # sine of half an angle below which its axis is rounding
-
 
 def to_matrices(quat_xyzw: np.ndarray) -> np.ndarray:
     """Convert unit quaternions (..., 4), the real part last, to rotation matrices (..., 3, 3)."""
@@ -55,21 +53,6 @@ def join_signs(quaternions: np.ndarray) -> np.ndarray:
     dots = np.einsum("ij,ij->i", quaternions[1:], quaternions[:-1])
     signs = np.cumprod(np.r_[1.0, np.where(dots < 0, -1.0, 1.0)])
     return quaternions * signs[:, None]
-
-
-def to_axis_angles(quat_wxyz: np.ndarray) -> np.ndarray:
-    """Convert quaternions (frames, 4) with joined signs, the real part first, to angles and unit axes (frames, 4). An
-    axis never turns over from one frame to the next, the angle goes through 0 instead; without an angle it stays."""
-    sine = np.linalg.norm(quat_wxyz[:, 1:], axis=-1)
-    known = sine > _NO_ANGLE
-    if not known.any():
-        return np.tile([0.0, 0.0, 1.0, 0.0], (len(sine), 1))
-    last = np.maximum.accumulate(np.where(known, np.arange(len(sine)), known.argmax()))
-    axes = quat_wxyz[last, 1:] / sine[last, None]
-    signs = np.cumprod(np.r_[1.0, np.where(np.einsum("ij,ij->i", axes[1:], axes[:-1]) < 0, -1.0, 1.0)])
-    along = np.einsum("ij,ij->i", quat_wxyz[:, 1:], signs[:, None] * axes)
-    angles = np.unwrap(2 * np.arctan2(along, quat_wxyz[:, 0]), period=4 * np.pi)
-    return np.concatenate([angles[:, None], signs[:, None] * axes], axis=-1)
 
 
 def transpose(matrices: np.ndarray) -> np.ndarray:

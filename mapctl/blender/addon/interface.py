@@ -12,7 +12,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 
 import bpy
-from bpy.props import BoolProperty, FloatProperty, IntProperty, PointerProperty, StringProperty
+from bpy.props import BoolProperty, FloatProperty, IntProperty, StringProperty
 
 from . import actions, jobs, process
 from .body import measure_fps
@@ -47,61 +47,8 @@ class GapProperties:
     )
 
 
-class MAPCTL_PG_walk(WalkProperties, bpy.types.PropertyGroup):
-    """Options of the walk along a curve, of a scene."""
-
-
-class MAPCTL_PG_clean_up(CleanUpProperties, bpy.types.PropertyGroup):
-    """Options of the clean-up, of a scene."""
-
-
-class MAPCTL_PG_gap(GapProperties, bpy.types.PropertyGroup):
-    """Options of the filling of gaps, of a scene."""
-
-
-class MAPCTL_PG_settings(bpy.types.PropertyGroup):
+class MAPCTL_PG_settings(WalkProperties, CleanUpProperties, GapProperties, bpy.types.PropertyGroup):
     """Options of all operators, of a scene."""
-
-    walk: PointerProperty(type=MAPCTL_PG_walk)
-    clean_up: PointerProperty(type=MAPCTL_PG_clean_up)
-    gap: PointerProperty(type=MAPCTL_PG_gap)
-
-
-class MAPCTL_OT_find(bpy.types.Operator):
-    """Look for mapctl and tell its version"""
-
-    bl_idname = "mapctl.find"
-    bl_label = "Look for mapctl"
-
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        """Look, and tell."""
-        try:
-            words = process.find_command(read_command(context))
-        except AddonError as problem:
-            self.report({"ERROR"}, str(problem))
-            return {"CANCELLED"}
-        version = ".".join(map(str, process.read_version(words) or ()))
-        self.report({"INFO"}, f"mapctl {version}: {' '.join(words)}")
-        return {"FINISHED"}
-
-
-class MAPCTL_OT_preview_gap(bpy.types.Operator):
-    """Take the preview range as the gap"""
-
-    bl_idname = "mapctl.preview_gap"
-    bl_label = "Gap from Preview Range"
-    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's own way
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        """Return whether there is a preview range."""
-        return context.scene.use_preview_range
-
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        """Take it."""
-        gap = context.scene.mapctl.gap
-        gap.first, gap.last = context.scene.frame_preview_start, context.scene.frame_preview_end
-        return {"FINISHED"}
 
 
 class MAPCTL_AP_preferences(bpy.types.AddonPreferences):
@@ -117,24 +64,12 @@ class MAPCTL_AP_preferences(bpy.types.AddonPreferences):
     def draw(self, context: bpy.types.Context) -> None:
         """Draw them."""
         self.layout.prop(self, "command")
-        self.layout.operator(MAPCTL_OT_find.bl_idname)
         self.layout.label(text="mapctl runs as a program of its own: pip install mapctl")
 
 
 def read_command(context: bpy.types.Context) -> str:
     """Read the command of the preferences."""
     return context.preferences.addons[__package__ or ""].preferences.command
-
-
-CLASSES = (
-    MAPCTL_PG_walk,
-    MAPCTL_PG_clean_up,
-    MAPCTL_PG_gap,
-    MAPCTL_PG_settings,
-    MAPCTL_OT_find,
-    MAPCTL_OT_preview_gap,
-    MAPCTL_AP_preferences,
-)
 
 
 _TICK = 0.1  # seconds between two looks at a job
@@ -144,22 +79,22 @@ _SHOWN_LINES = 8
 
 
 class Report:
-    """What the panel tells: of a job that runs, or of the last one."""
+    """What the panel shows: of a job that runs, or of the last one."""
 
     step: Step | None = None
     """How far the job that runs is; None while none runs."""
     lines: tuple[str, ...] = ()
-    """What was told last."""
+    """Lines on the last job."""
     failed: bool = False
-    """Whether that is why nothing was done."""
+    """Whether they are why nothing was done."""
 
 
 class JobOperator:
-    """Base of operators: runs a job to its end, and tells of it."""
+    """Base of operators: runs a job to its end, and reports it."""
 
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's own way
     report: Callable[[set[str], str], None]
-    """Blender's way to tell the user something."""
+    """Blender's message to the user."""
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -208,7 +143,7 @@ class JobOperator:
         """Go on with the job; nothing but the view can be changed meanwhile, so that all is undone in one step."""
         if event.type == "ESC":
             self.cancel(context)
-            self._tell(("cancelled: nothing was changed",), failed=True)
+            self._report(("cancelled: nothing was changed",), failed=True)
             return {"CANCELLED"}
         if event.type != "TIMER":
             return {"PASS_THROUGH"} if event.type in _VIEW_EVENTS else {"RUNNING_MODAL"}
@@ -236,9 +171,8 @@ class JobOperator:
         _redraw(context)
 
     def _begin(self, context: bpy.types.Context) -> jobs.Job:
-        """Begin the job; what is wrong comes out of its first step, so that it is told in one place."""
-        self._outcome = jobs.Outcome(())
-        self._problem = ""
+        """Begin the job; what is wrong comes out of its first step, so that it is reported in one place."""
+        self._lines, self._warnings, self._problem = (), (), ""
 
         def run() -> jobs.Job:
             command = process.find_command(read_command(context))
@@ -252,7 +186,7 @@ class JobOperator:
         try:
             return next(job)
         except StopIteration as end:
-            self._outcome = end.value
+            self._lines, self._warnings = end.value
         except AddonError as problem:
             self._problem = str(problem)
         return None
@@ -266,17 +200,17 @@ class JobOperator:
         return step
 
     def _conclude(self, context: bpy.types.Context) -> set[str]:
-        told = (self._problem,) if self._problem else (*self._outcome.warnings, *self._outcome.lines)
-        self._tell(told, failed=bool(self._problem))
+        lines = (self._problem,) if self._problem else (*self._warnings, *self._lines)
+        self._report(lines, failed=bool(self._problem))
         if self._problem:
             self.report({"ERROR"}, self._problem)
             return {"CANCELLED"}
-        for line in self._outcome.warnings:
+        for line in self._warnings:
             self.report({"WARNING"}, line)
         self.report({"INFO"}, f"new action: {context.object.animation_data.action.name}")
         return {"FINISHED"}
 
-    def _tell(self, lines: tuple[str, ...], *, failed: bool) -> None:
+    def _report(self, lines: tuple[str, ...], *, failed: bool) -> None:
         Report.lines, Report.failed = lines[:_SHOWN_LINES], failed
 
 
@@ -360,9 +294,6 @@ def _redraw(context: bpy.types.Context) -> None:
             area.tag_redraw()
 
 
-OPERATORS = (MAPCTL_OT_walk, MAPCTL_OT_clean_up, MAPCTL_OT_fill_gap, MAPCTL_OT_in_between)
-
-
 _WIDTH = 44  # characters of a line of the panel, about
 
 
@@ -376,22 +307,20 @@ class MAPCTL_PT_sidebar(bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         """Draw it."""
-        settings = context.scene.mapctl
-        self._draw_job(MAPCTL_OT_walk, settings.walk, ("speed", "seconds", "gait", "style", "seed"))
-        self._draw_job(MAPCTL_OT_clean_up, settings.clean_up, ("anchor",))
-        self._draw_job(MAPCTL_OT_fill_gap, settings.gap, ("first", "last", "selected"))
-        self.layout.operator(MAPCTL_OT_preview_gap.bl_idname)
-        self._draw_job(MAPCTL_OT_in_between, None, ())
+        for operator, options in (
+            (MAPCTL_OT_walk, WalkProperties),
+            (MAPCTL_OT_clean_up, CleanUpProperties),
+            (MAPCTL_OT_fill_gap, GapProperties),
+            (MAPCTL_OT_in_between, object),
+        ):
+            column, settings = self.layout.box().column(align=True), context.scene.mapctl
+            names = tuple(getattr(options, "__annotations__", ()))
+            for name in names:
+                column.prop(settings, name)
+            button = column.operator(operator.bl_idname)
+            for name in names:
+                setattr(button, name, getattr(settings, name))
         self._draw_report()
-
-    def _draw_job(self, operator: type, options: bpy.types.PropertyGroup | None, names: tuple[str, ...]) -> None:
-        """Draw the options of an operator and its button, which hands them on."""
-        column = self.layout.box().column(align=True)
-        for name in names:
-            column.prop(options, name)
-        button = column.operator(operator.bl_idname)
-        for name in names:
-            setattr(button, name, getattr(options, name))
 
     def _draw_report(self) -> None:
         column = self.layout.column(align=True)
@@ -403,3 +332,14 @@ class MAPCTL_PT_sidebar(bpy.types.Panel):
         for line in Report.lines:
             for number, part in enumerate(textwrap.wrap(line, _WIDTH)):
                 column.label(text=part, icon="BLANK1" if number else icon)
+
+
+CLASSES = (
+    MAPCTL_PG_settings,
+    MAPCTL_AP_preferences,
+    MAPCTL_OT_walk,
+    MAPCTL_OT_clean_up,
+    MAPCTL_OT_fill_gap,
+    MAPCTL_OT_in_between,
+    MAPCTL_PT_sidebar,
+)

@@ -58,14 +58,8 @@ def sample_curve(drawn: bpy.types.Object, scene: bpy.types.Scene) -> np.ndarray:
     return np.concatenate([world, world[:1]]) if splines[0].use_cyclic_u else world
 
 
-def measure_height(points: np.ndarray) -> tuple[float, bool]:
-    """Measure how high the curve is, metres, and whether it is level."""
-    heights = points[:, 1]
-    return float(np.median(heights)), bool(np.ptp(heights) <= _LEVEL)
-
-
 _PROBES = 24  # frames in which the result is compared with what was wanted
-_OFF = 0.001  # metres from which on bones that do not follow are told
+_OFF = 0.001  # metres from which on bones that do not follow are named
 _NEEDLESS = ("hips", "chest", "spine_fk.001")  # controls of a generated rig that a new action leaves alone
 
 
@@ -200,24 +194,14 @@ def _restored_pose(at: Scene, switches: Mapping[str, str]) -> Iterator[None]:
         old.use_fake_user = True
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """What there is to tell of a job that was done."""
-
-    lines: tuple[str, ...]
-    """What mapctl said."""
-    warnings: tuple[str, ...] = ()
-    """What is not as it should be."""
-
-
-Job = Generator[Step, None, Outcome]
-"""Steps of a job, and what to tell of it."""
+Job = Generator[Step, None, tuple[tuple[str, ...], tuple[str, ...]]]
+"""Steps of a job; it returns mapctl's lines, and what is not as it should be."""
 
 
 def walk_along(at: Scene, drawn: bpy.types.Object, options: Sequence[str]) -> Job:
     """Let the character walk along a curve, from the scene's first frame on; `options` are those of `mapctl follow`."""
     body, points = take_body(at), sample_curve(drawn, at.scene)
-    height, level = measure_height(points)
+    height = float(np.median(points[:, 1]))
     made, travelling, lines = yield from _ask_for_walk(at, body, points, options)
     made = replace(made, positions=made.positions + np.array([0.0, height, 0.0]))
     first = at.scene.frame_preview_start if at.scene.use_preview_range else at.scene.frame_start
@@ -229,15 +213,15 @@ def walk_along(at: Scene, drawn: bpy.types.Object, options: Sequence[str]) -> Jo
         name = f"{at.armature.name} along {drawn.name}"
         warnings = yield from make_action(at, Result(body, frames, moved, travelling, plain, name, fresh=True))
     at.scene.frame_end = max(at.scene.frame_end, frames.stop - 1)
-    if not level:
+    if np.ptp(points[:, 1]) > _LEVEL:
         warnings = (*warnings, f"{drawn.name} is not level: the character walks at its median height")
-    return Outcome(_shorten(lines), warnings)
+    return _shorten(lines), warnings
 
 
 def _ask_for_walk(
     at: Scene, body: Body, points: np.ndarray, options: Sequence[str]
 ) -> Generator[Step, None, tuple[WorldMotion, frozenset[int], list[str]]]:
-    """Ask mapctl for the walk, at the scene's frame rate; also return which joints travel, and what it said."""
+    """Ask mapctl for the walk, at the scene's frame rate; also return which joints travel, and its lines."""
     fps = measure_fps(at.scene)
     with tempfile.TemporaryDirectory(prefix="mapctl-") as name:
         folder = Path(name)
@@ -327,12 +311,12 @@ def _edit(at: Scene, frames: range, words: Sequence[str], made: np.ndarray, suff
         moved = to_armature(answer, body, worlds)
         name = f"{old.name} {suffix}"
         warnings = yield from make_action(at, Result(body, frames, moved, travelling, made, name, fresh=False))
-    counted = f"frame 0 of what mapctl says is frame {frames.start} of the scene"
-    return Outcome((counted, *_shorten(lines)), warnings)
+    counted = f"frame 0 in mapctl's lines is frame {frames.start} of the scene"
+    return (counted, *_shorten(lines)), warnings
 
 
 def _shorten(lines: Sequence[str]) -> tuple[str, ...]:
-    """Leave the names of temporary files out of what mapctl said."""
+    """Leave the names of temporary files out of mapctl's lines."""
     return tuple(line.removeprefix("made.npz: ") for line in lines if not line.startswith("wrote "))
 
 

@@ -1,4 +1,4 @@
-"""mapctl as a process of its own: found, started, listened to, ended."""
+"""mapctl as a process of its own: found, started, read, ended."""
 
 import os
 import re
@@ -45,50 +45,40 @@ _NO_WINDOW = getattr(subprocess, "CREATE_NO_WINDOW", 0)  # on Windows
 def find_command(preference: str) -> tuple[str, ...]:
     """Find the words that start mapctl: those of the preference, the program on PATH, or a Python that has it.
 
-    AddonError says what to do where there is none, or an older one than OLDEST.
+    AddonError where there is none, or an older one than OLDEST.
     """
-    words = _choose_command(preference.strip())
-    version = read_version(words)
-    if version is None:
+    preference = preference.strip()
+    if preference:
+        words = (preference,) if shutil.which(preference) else tuple(shlex.split(preference, posix=os.name != "nt"))
+        if not shutil.which(words[0]):
+            raise AddonError(f"{preference}: no such program; set mapctl's path in {_WHERE}")
+        version = read_version(words)
+    else:
+        candidates = [("mapctl",), ("python3", "-m", "mapctl"), ("python", "-m", "mapctl")]
+        candidates = [(path, *rest) for name, *rest in candidates if (path := shutil.which(name))]
+        found = [(each, version) for each in candidates if (version := read_version(each))]
+        if not found:
+            raise AddonError(f"mapctl was not found: pip install mapctl, then set its path in {_WHERE}")
+        words, version = found[0]
+    if not version:
         raise AddonError(f"{shlex.join(words)} does not answer like mapctl; set the command in {_WHERE}")
     if version < OLDEST:
-        found, needed = (".".join(map(str, numbers)) for numbers in (version, OLDEST))
-        raise AddonError(f"mapctl {found} is too old, {needed} or later is needed: pip install --upgrade mapctl")
+        shown, needed = (".".join(map(str, numbers)) for numbers in (version, OLDEST))
+        raise AddonError(f"mapctl {shown} is too old, {needed} or later is needed: pip install --upgrade mapctl")
     return words
 
 
-def _choose_command(preference: str) -> tuple[str, ...]:
-    if preference:
-        words = (preference,) if shutil.which(preference) else tuple(shlex.split(preference, posix=os.name != "nt"))
-        if words and shutil.which(words[0]):
-            return words
-        raise AddonError(f"{preference}: no such program; set mapctl's path in {_WHERE}")
-    if program := shutil.which("mapctl"):
-        return (program,)
-    for name in ("python3", "python"):
-        python = shutil.which(name)
-        if python and read_version((python, "-m", "mapctl")):
-            return python, "-m", "mapctl"
-    raise AddonError(f"mapctl was not found: pip install mapctl, then set its path in {_WHERE}")
-
-
-def read_version(words: tuple[str, ...]) -> tuple[int, ...] | None:
-    """Ask a command for its version; None where it gives none as mapctl does. A version is remembered."""
-    try:
-        return _ask_version(words)
-    except (OSError, ValueError, subprocess.SubprocessError):
-        return None
-
-
 @cache
-def _ask_version(words: tuple[str, ...]) -> tuple[int, ...]:
-    answer = subprocess.run(
-        [*words, "--version"], capture_output=True, text=True, timeout=_PATIENCE, creationflags=_NO_WINDOW, check=True
-    )
-    found = re.match(r"mapctl (\d+)\.(\d+)(?:\.(\d+))?", answer.stdout)
-    if found is None:
-        raise ValueError(answer.stdout)
-    return tuple(int(number or 0) for number in found.groups())
+def read_version(words: tuple[str, ...]) -> tuple[int, ...]:
+    """Ask a command for its version; nothing where it gives none as mapctl does."""
+    try:
+        answer = subprocess.run(
+            [*words, "--version"], capture_output=True, text=True, timeout=_PATIENCE, creationflags=_NO_WINDOW
+        ).stdout
+    except (OSError, ValueError, subprocess.SubprocessError):
+        return ()
+    found = re.match(r"mapctl (\d+)\.(\d+)(?:\.(\d+))?", answer)
+    return tuple(int(number or 0) for number in found.groups()) if found else ()
 
 
 class Process:
@@ -101,7 +91,7 @@ class Process:
         self.errors: list[str] = []
         """Lines on standard error so far, without those of progress."""
         self.step = Step("starting mapctl", idle=True)
-        """What the command said last of its progress."""
+        """Its last line of progress."""
         try:
             self._process = subprocess.Popen(
                 [str(word) for word in words],
@@ -116,7 +106,7 @@ class Process:
             )
         except OSError as error:
             raise AddonError(f"{words[0]} cannot be started: {error.strerror or error}") from error
-        pipes = (self._process.stdout, self.lines.append), (self._process.stderr, self._hear)
+        pipes = (self._process.stdout, self.lines.append), (self._process.stderr, self._read_error)
         self._threads = [threading.Thread(target=_read_lines, args=pipe, daemon=True) for pipe in pipes]
         for thread in self._threads:
             thread.start()
@@ -127,15 +117,13 @@ class Process:
         return self._process.poll() is None
 
     def check(self) -> None:
-        """Wait for the end of its output; AddonError with what it said where it failed."""
+        """Wait for the end of its output; AddonError with its last error where it failed."""
         for thread in self._threads:
             thread.join()
         if self._process.wait() != 0:
-            said = [line for line in self.errors if line.strip()] or [
-                f"it ended with status {self._process.returncode}"
-            ]
-            own = [line for line in said if line.startswith("mapctl: ")]
-            raise AddonError((own or said)[-1].removeprefix("mapctl: "))
+            lines = [f"it ended with status {self._process.returncode}", *filter(str.strip, self.errors)]
+            own = [line for line in lines if line.startswith("mapctl: ")]
+            raise AddonError((own or lines)[-1].removeprefix("mapctl: "))
 
     def end(self) -> None:
         """End it if it still runs: ask first, then insist."""
@@ -148,7 +136,7 @@ class Process:
             self._process.kill()
             self._process.wait()
 
-    def _hear(self, line: str) -> None:
+    def _read_error(self, line: str) -> None:
         found = _PROGRESS.match(line)
         if found is None:
             self.errors.append(line)

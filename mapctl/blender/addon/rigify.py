@@ -1,4 +1,4 @@
-"""Rigs that Rigify made: which controls make its joints, and what mapctl is told of Rigify's names.
+"""Rigs that Rigify made: which controls make its joints, and Rigify's names of them for mapctl.
 
 The FK controls of a generated rig move as the joints do. The torso carries the second spine joint, the lower spine
 bends from there to the hips and the upper spine to the chest.
