@@ -255,16 +255,23 @@ class Killed(Exception):
 
 
 @contextmanager
-def killing(trainer: type, number: int) -> Iterator[None]:
-    """Kills the training within when a trainer's step of this number is begun."""
-    whole = trainer.train_step
+def killing(settings: type, number: int) -> Iterator[None]:
+    """Kills the training with these settings when its step of this number is begun."""
+    make = settings.make_trainer
 
-    def stopping(self):
-        if self.step == number:
-            raise Killed
-        return whole(self)
+    def make_stopping(self, parts):
+        trainer = make(self, parts)
+        whole = trainer.train_step
+
+        def train_step():
+            if trainer.step == number:
+                raise Killed
+            return whole()
+
+        trainer.train_step = train_step
+        return trainer
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(trainer, "train_step", stopping)
+        patch.setattr(settings, "make_trainer", make_stopping)
         with pytest.raises(Killed):
             yield

@@ -1,10 +1,11 @@
-"""The training loop of every model: steps, validations, early stopping, checkpoints, and at the end weights and card.
+"""The training loop of every model: steps, validation, early stopping, checkpoints, and at the end weights and card.
 
-A model's recipe says what it is trained on, and its trainer takes the steps. A run folder holds
-`checkpoint.safetensors`, from which training resumes, `losses.csv` and `tensorboard/`, the features of the clips in
-`cache/`, and at the end `model.safetensors` with its card, `model.json`.
+A recipe (`priors.training.recipes`) is a class of settings, which are the options of `mapctl train MODEL` too, and a
+trainer that takes the steps. A run folder holds `checkpoint.safetensors`, from which training resumes, `losses.csv` and
+`tensorboard/`, the features of the clips in `cache/`, and at the end `model.safetensors` with its card, `model.json`.
 
-Inside `use_device` a GPU is torch's default device, so that windows, networks and random numbers are made there.
+Under torchrun every process draws windows of its own and torch's DistributedDataParallel averages the gradients; the
+first process validates, reports and writes.
 """
 
 import csv
@@ -12,50 +13,261 @@ import io
 import json
 import math
 import os
+import sys
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from datetime import timedelta
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Annotated, Any, ClassVar, Generic, Literal, TypeVar
 
 import torch
-from jaxtyping import Float
 from safetensors import SafetensorError, safe_open
-from torch import Tensor, nn
+from torch import Tensor, distributed, nn
+from torch.nn.parallel import DistributedDataParallel
+from tyro.conf import Fixed, Suppress, arg
 
-from mapctl.errors import CheckpointError, MapctlError, RequestError
+from mapctl.errors import CheckpointError, MapctlError, RequestError, WriteError
 from mapctl.features import PRIOR_FPS
 from mapctl.formats.atomic import check_folder, write_text
 from mapctl.formats.text import one_line
 from priors import checkpoints
 from priors.checkpoints import NetworkConfig, require_at_least, write_tensors
-from priors.training.data import Corpus, Split, read_corpus, split_corpus
+from priors.training.data import Split, read_corpus, split_corpus
 from priors.weight_sets import OF_DATA, name_for_records
 
-
-@contextmanager
-def use_device(name: str) -> Iterator[None]:
-    """Make tensors on this device unless another is given."""
-    if torch.get_default_device().type == torch.device(name).type:
-        yield  # as it is: a default of torch's costs each of its calls a little
-        return
-    with torch.device(name):
-        yield
-
-
-def make_generator(seed: int) -> torch.Generator:
-    """Make a generator that draws on the device in use."""
-    return torch.Generator(torch.get_default_device()).manual_seed(seed)
-
-
-Network = TypeVar("Network", bound=nn.Module)
-Drawn = TypeVar("Drawn")
+CHECKPOINT, LOSSES, EVENTS = "checkpoint.safetensors", "losses.csv", "tensorboard"
+"""Files and folder of a run folder."""
+TRAINING, VALIDATION = "training", "validation"
+"""What the column `part` of LOSSES holds: mean losses since the last report, or measures of held-out clips."""
+_FIRST_LINE_SECONDS, _LINE_SECONDS = 5.0, 30.0  # to the first line on the losses, and from line to line
 _WARM_UP_SHARE = 0.05  # share of the steps in which the learning rate rises
 _MAX_GRADIENT_NORM = 1.0
+_MOST_NAMED = 5  # files that a warning names
+_MAY_CHANGE = (
+    *("data", "out", "cuts", "level", "licence", "resume", "quiet", "patience", "steps", "device", "bfloat16", "shape"),
+    *("checkpoint_minutes", "report_steps", "validate_steps"),
+)  # settings that do not change what a step does
+
+Count = Annotated[int, arg(metavar="N")]
+MaybeCount = Annotated[int | None, arg(metavar="N")]
+Number = Annotated[float, arg(metavar="NUMBER")]
+Name = Annotated[str, arg(metavar="NAME")]
+Pattern = Annotated[str | None, arg(metavar="REGEX")]
+InPython = (Fixed, Suppress)
+"""Annotates settings that are no options of the command line."""
+
+Network = TypeVar("Network", bound=nn.Module)
+Made = TypeVar("Made")
+Row = dict[str, Any]
+"""Losses of a step, or measures of held-out clips; in a curve None replaces what is not finite."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings(ABC):
+    """Settings of any model. A model's class is the class of options of its command as well."""
+
+    kind: ClassVar[str]
+    """Kind of the model, in its card and on the command line."""
+    used_by: ClassVar[str]
+    """How commands take what was trained."""
+    keeps_best: ClassVar[bool] = False
+    """Whether the weights of the best validation are exported even without `patience`."""
+    uses_gpu: ClassVar[bool] = True
+    """Whether it can be trained on a GPU, and by several processes."""
+    single_thread: ClassVar[bool] = True
+    """Whether training is fastest on one thread."""
+
+    data: Annotated[Path, arg(metavar="DIR")]
+    """Folder of .bvh files, searched with everything below it."""
+    out: Annotated[Path, arg(aliases=["-o"], metavar="DIR")]
+    """Run folder: checkpoint, losses, and at the end model.safetensors with its card."""
+    match: Pattern = None
+    """Only clips whose path below the data folder holds this regular expression."""
+    cuts: Annotated[Path | None, arg(metavar="FILE")] = None
+    """Table (CSV) of file, first and last frame: which frames are motion (`*,1,` leaves out frame 0 of all); `cmu` is
+    the one for takes of CMU that comes with mapctl. Each Frame_Cuts.csv in the data folder is found by itself
+    (docs/guides/data.md)."""
+    level: bool = False
+    """Put every clip on the canonical body and a level floor: for captures whose floor slopes or whose feet rest at
+    other heights, as those of CMU."""
+    steps: Count = 10_000
+    """Steps in all."""
+    seed: Count = 1
+    """Seed of weights, windows, noise and the split of the clips."""
+    patience: Count = 0
+    """End training after so many validations without a better one, with the best weights; 0 takes all steps."""
+    resume: bool = False
+    """Go on from the run folder's last checkpoint."""
+    licence: Annotated[str | None, arg(metavar="TEXT")] = None
+    """Licence of the weights, for their card; if not given, `that of the training data`."""
+    quiet: bool = False
+    """Print no progress."""
+    checkpoint_minutes: Annotated[float, *InPython] = 3.0
+    """Between checkpoints."""
+    report_steps: Annotated[int, *InPython] = 100
+    """Steps of whose losses the log holds the means."""
+    validate_steps: Annotated[int, *InPython] = 1000
+    """Steps between two validations."""
+
+    def __post_init__(self):
+        require_at_least(self, 1, "steps", "report_steps", "validate_steps")
+        require_at_least(self, 0, "patience")
+        if not 0 <= self.seed < 2**63:
+            raise RequestError(f"the seed must be a whole number from 0 to 2^63 - 1, got {self.seed}")
+
+    @abstractmethod
+    def make_trainer(self, parts: Split) -> "Trainer[Any]":
+        """Make the trainer as it is before the first step."""
+
+    def run(self) -> int:
+        """Train as `mapctl train` does and report how the result is used; return the exit status. What ends it early
+        (Ctrl-C, a full disk) states which step is saved."""
+        if self.single_thread:
+            torch.set_num_threads(1)
+        try:
+            path = train(self)
+        except KeyboardInterrupt as stop:
+            raise KeyboardInterrupt(_describe_saved(self.out)) from stop
+        except WriteError as error:
+            raise WriteError(f"{error}; {_describe_saved(self.out)}") from error
+        self.report(f"wrote {path}; {self.used_by} {self.out}")
+        return 0
+
+    def check(self) -> None:
+        """Raise RequestError for what cannot be, before anything is read."""
+        if not self.data.is_dir() or not os.access(self.data, os.R_OK | os.X_OK):
+            raise RequestError(f"{self.data} is not a folder that can be read")
+        self.find_device()
+
+    def find_device(self) -> str:
+        """Return `cpu` or `cuda`; RequestError for one that this machine does not have."""
+        return "cpu"
+
+    @property
+    def chosen(self) -> str:
+        """Regular expression for the clips."""
+        return self.match or ""
+
+    @property
+    def split_seed(self) -> int:
+        """Seed by which clips are kept from training."""
+        return self.seed
+
+    def find_origin(self) -> dict[str, dict[str, str]]:
+        """Return the model that training began with and its licence, for a card's data; nothing without one."""
+        return {}
+
+    def gather(self) -> Split:
+        """Read the clips and split them; RUN/skipped.txt lists the files that were left out.
+
+        RequestError where nothing is left, or what is left cannot be split.
+        """
+        corpus = read_corpus(
+            self.data, match=self.chosen, cache=self.out / "cache", cuts=self.cuts, level=self.level, report=self.report
+        )
+        if corpus.skipped and is_main():
+            reasons = [f"{self.data / name}: {reason}" for name, reason in corpus.skipped.items()]
+            rest = f"; all in {self.out / 'skipped.txt'}" if len(reasons) > _MOST_NAMED else ""
+            found = f"left out {len(reasons)} of {len(reasons) + len(corpus.names)} files"
+            print(f"mapctl: {found}: {'; '.join(reasons[:_MOST_NAMED])}{rest}", file=sys.stderr, flush=True)
+            write_text(self.out / "skipped.txt", "".join(f"{n}: {reason}\n" for n, reason in corpus.skipped.items()))
+        parts = split_corpus(corpus, self.split_seed)
+        held = f", without {parts.test.names[0]}, which is held out" if parts.validation is parts.test else ""
+        frames = f"{len(corpus.names)} clips, {len(corpus.features)} frames"
+        self.report(f"{frames}; training on {len(parts.train.names)}{held}")
+        return parts
+
+    def report(self, line: str) -> None:
+        """Print a line at once, so that a log file shows how far a run of hours has come."""
+        if not self.quiet and is_main():
+            print(line, flush=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class NetworkSettings(Settings):
+    """Settings of any network that is trained by one gradient, and may start from another network's weights."""
+
+    shape_options: ClassVar[tuple[str, ...]] = ("width", "paper")
+    """Options that decide the shape of the network."""
+
+    batch: Count = 64
+    """Windows a step."""
+    window: Count = 64
+    """Frames a window."""
+    learning_rate: Number = 1e-3
+    """At its highest; less to fine-tune."""
+    bfloat16: bool = False
+    """Let the network compute in bfloat16: faster on a processor or GPU that has it."""
+    init: Annotated[str | None, arg(metavar="NAME")] = None
+    """Begin with the weights of this model, bundled or trained, and fine-tune them."""
+    init_share: Number = 0.0
+    """Share of the weights of --init in the ones that are written, the rest being the fine-tuned ones': 0.7 keeps most
+    of what the initial model knew (Wortsman et al. 2022)."""
+    device: Annotated[Literal["auto", "cpu", "cuda"], arg(metavar="auto|cpu|cuda")] = "auto"
+    """Where to compute; auto is a GPU with CUDA where there is one."""
+    shape: Annotated[NetworkConfig | None, *InPython] = None
+    """Shape of the network, in place of the one that the options ask for."""
+
+    def __post_init__(self):
+        super().__post_init__()
+        require_at_least(self, 1, "batch", "window")
+        if not 0 <= self.init_share < 1 or (self.init_share and self.init is None):
+            raise RequestError(f"--init-share is from 0 to below 1, and needs --init; got {self.init_share:g}")
+        if self.init is not None and any(getattr(self, name, None) for name in self.shape_options):
+            raise RequestError("with --init the network is that model's; options of its shape do not apply")
+
+    @abstractmethod
+    def make_config(self) -> NetworkConfig:
+        """Return the shape of the network that these settings ask for."""
+
+    def find_config(self) -> Any:
+        """Return the shape of the network: that of the initial model, where there is one."""
+        asked = self.shape or self.make_config()
+        if self.init is None:
+            return asked
+        card = _read_card(self.init)
+        if card.kind != self.kind:
+            raise CheckpointError(f"{self.init} holds a {card.kind}, not a {self.kind}")
+        return type(asked).of_card(card.config)
+
+    def find_device(self) -> str:
+        """Return `cpu` or `cuda`; RequestError for one that this machine does not have."""
+        there = torch.cuda.is_available()
+        if self.device == "cuda" and not there:
+            raise RequestError("this machine has no CUDA device; use --device cpu")
+        return "cuda" if there and self.device != "cpu" else "cpu"
+
+    @property
+    def split_seed(self) -> int:
+        """Seed by which clips are kept from training: that of the initial weights, where there are any, or the run
+        would train on what their measures hold out."""
+        return self.seed if self.init is None else int(_read_card(self.init).data.get("split_seed", self.seed))
+
+    def find_origin(self) -> dict[str, dict[str, str]]:
+        """Return the model that training began with and its licence, for a card's data; nothing without one."""
+        if self.init is None:
+            return {}
+        return {"init": {"name": name_for_records(self.init), "licence": _read_card(self.init).licence}}
+
+
+@dataclass
+class Export:
+    """What a finished run writes, beside what every card holds."""
+
+    tensors: Mapping[str, Tensor]
+    """Weights, by name."""
+    data: Row = field(default_factory=dict)
+    """What it was trained on, for the card."""
+    quality: Row = field(default_factory=dict)
+    """Measures, for the card."""
+    abilities: dict[str, float] = field(default_factory=dict)
+    """Speeds and turning that the data show."""
+    half: bool = True
+    """Whether weights are kept in float16."""
 
 
 class Trainer(ABC, Generic[Network]):
@@ -63,18 +275,25 @@ class Trainer(ABC, Generic[Network]):
 
     network: Network
     """The network that is trained."""
+    config: Any
+    """Its shape, a NetworkConfig."""
 
-    def __init__(self, *, steps: int, seed: int):
-        self.step, self.steps, self.seed = 0, steps, seed
-        self.generator = make_generator(seed)
+    def __init__(self, settings: Any):
+        self.settings, self.step, self.steps = settings, 0, settings.steps
+        self.generator = make_generator(settings.seed + count_processes()[0])
 
     @abstractmethod
     def train_step(self) -> dict[str, float]:
         """Take one step; return the parts of its loss."""
 
     @abstractmethod
-    def validate(self, corpus: Corpus) -> dict[str, Any]:
+    def validate(self, corpus: Any) -> dict[str, Any]:
         """Measure the network on held-out clips."""
+
+    @abstractmethod
+    def score(self, row: Row) -> float:
+        """Return the one number among measures of held-out clips that says how good a model is, smaller where it is
+        better; NaN without one."""
 
     @property
     def exported(self) -> Network:
@@ -89,10 +308,20 @@ class Trainer(ABC, Generic[Network]):
         """Return all optimisers, by their names in checkpoints."""
         return {}
 
-    def check_finite(self) -> None:
-        """Raise MapctlError unless every weight is finite."""
-        if not all(bool(torch.isfinite(values).all()) for values in self.exported.parameters()):
-            raise make_divergence_error(self.step, "its weights are not finite")
+    def find_stop_reason(self, rows: Sequence[Row]) -> str | None:
+        """Return why to stop after these losses since the last report, if there is a reason."""
+        return None
+
+    def identify(self) -> Row:
+        """Return what must not change between a run's parts beside the settings, the network and the clips."""
+        return {}
+
+    def finish(self) -> None:
+        """Change the weights once more, before they are measured and written."""
+
+    def export(self, parts: Split) -> Export:
+        """Return what is written at the end."""
+        return Export(self.exported.state_dict(), quality={"test": self.validate(parts.test)})
 
     def state(self) -> dict[str, Tensor]:
         """Return everything that a continuation needs, but the step."""
@@ -106,10 +335,10 @@ class Trainer(ABC, Generic[Network]):
 
     def load_state(self, tensors: Mapping[str, Tensor], step: int) -> None:
         """Go on from what `state` returned; KeyError or RuntimeError where it is not whole."""
-        if tensors["generator"].shape == self.generator.get_state().shape:
+        if tensors["generator"].shape == self.generator.get_state().shape and is_main():
             self.generator.set_state(tensors["generator"])
-        else:  # that of another kind of device
-            self.generator.manual_seed(self.seed + step)
+        else:  # that of another kind of device or of another process
+            self.generator.manual_seed(self.settings.seed + 7919 * step + count_processes()[0])
         for kind, network in self.networks().items():
             network.load_state_dict(select_prefixed(f"{kind}.", tensors))
         for kind, optimiser in self.optimisers().items():
@@ -124,17 +353,17 @@ class Trainer(ABC, Generic[Network]):
 class GradientTrainer(Trainer[Network]):
     """One network, one loss: AdamW, unless another is made; the learning rate rises, then falls along a cosine."""
 
-    def __init__(self, make: Callable[[], Network], settings: Any):
-        """`make` builds the network (see `draw_weights`); settings have steps, a learning rate and a seed."""
-        super().__init__(steps=settings.steps, seed=settings.seed)
-        self.settings, self.learning_rate, self.grown = settings, settings.learning_rate, False
+    def __init__(self, settings: Any, make: Callable[[], Network]):
+        """`make` builds the network (see `draw_weights`)."""
+        super().__init__(settings)
         self.network = draw_weights(make, settings.seed).to(torch.get_default_device())
         self._optimisers = self.make_optimisers()
+        self._parallel: Callable[[], dict[str, Tensor]] | None = None
 
     @property
     def progress(self) -> float:
         """Share of training that is done, by which tasks become harder; 1 where the weights began as trained ones."""
-        return 1.0 if self.grown else self.step / self.steps
+        return self.step / self.steps if self.settings.init is None else 1.0
 
     @abstractmethod
     def losses(self) -> dict[str, Tensor]:
@@ -142,7 +371,7 @@ class GradientTrainer(Trainer[Network]):
 
     def make_optimisers(self) -> dict[str, torch.optim.Optimizer]:
         """Make those of the network's weights, by their names in checkpoints; all have the same learning rate."""
-        return {"optimiser": make_adam(self.weights(), self.learning_rate)}
+        return {"optimiser": make_adam(self.weights(), self.settings.learning_rate)}
 
     def optimisers(self) -> dict[str, torch.optim.Optimizer]:
         """Return all optimisers, by their names in checkpoints."""
@@ -154,7 +383,7 @@ class GradientTrainer(Trainer[Network]):
 
     def compute_learning_rate(self) -> float:
         """Compute that of the current step."""
-        return self.learning_rate * warmup_cosine(self.step, self.steps)
+        return self.settings.learning_rate * warmup_cosine(self.step, self.steps)
 
     def limit_gradients(self) -> None:
         """Clip the gradients before the optimiser's step."""
@@ -162,12 +391,17 @@ class GradientTrainer(Trainer[Network]):
 
     def train_step(self) -> dict[str, float]:
         """Take one update; return the parts of its loss. MapctlError, and no update, where that is not finite."""
+        if self._parallel is None:
+            alone = count_processes()[1] == 1
+            self._parallel = (
+                self.losses if alone else DistributedDataParallel(_Losses(self), find_unused_parameters=True)
+            )
         optimisers = self._optimisers.values()
-        for group in [group for optimiser in optimisers for group in optimiser.param_groups]:
-            group["lr"] = self.compute_learning_rate()
         for optimiser in optimisers:
+            for group in optimiser.param_groups:
+                group["lr"] = self.compute_learning_rate()
             optimiser.zero_grad(set_to_none=True)
-        losses = self.losses()
+        losses = self._parallel()
         losses["loss"].backward()
         parts = {name: float(value.detach()) for name, value in losses.items()}
         if not math.isfinite(parts["loss"]):
@@ -178,500 +412,202 @@ class GradientTrainer(Trainer[Network]):
         self.step += 1
         return parts
 
+    def begin(self) -> None:
+        """Begin with the weights of `init`, where there is one and the run is not resumed."""
+        if self.settings.init is not None and not self.settings.resume:
+            self.network.load_state_dict(self.read_initial_weights())
 
-def make_adam(weights: Iterable[nn.Parameter], learning_rate: float) -> torch.optim.Optimizer:
-    """Make the usual optimiser."""
-    return torch.optim.AdamW(weights, lr=learning_rate, weight_decay=1e-4)
+    def read_initial_weights(self) -> dict[str, Tensor]:
+        """Read the weights of `init` for this network; layers that the other lacks are as drawn."""
+        tensors, own = checkpoints.load(checkpoints.locate(self.settings.init))[0], self.network.state_dict()
+        return own | {name: value for name, value in tensors.items() if name in own}
 
-
-def draw_weights(make: Callable[[], Drawn], seed: int) -> Drawn:
-    """Return what `make` builds with torch's global generator, seeded, whose own numbers are left alone. It is made on
-    the processor, so that it is the same whatever device it is then moved to."""
-    with use_device("cpu"), torch.random.fork_rng(devices=[]):
-        torch.default_generator.manual_seed(seed)
-        return make()
-
-
-def make_divergence_error(step: int, how: str) -> MapctlError:
-    """Make the error of a run whose numbers are no longer finite."""
-    return MapctlError(f"training diverged at step {step}: {how}; the last checkpoint, if there is one, is kept")
-
-
-def warmup_cosine(step: int, steps: int) -> float:
-    """Return the share of the highest learning rate: rising, then along a cosine to zero."""
-    rise = max(1, round(_WARM_UP_SHARE * steps))
-    if step < rise:
-        return (step + 1) / rise
-    return 0.5 * (1 + math.cos(math.pi * (step - rise) / max(1, steps - rise)))
-
-
-def select_prefixed(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Select those whose names begin so, without it."""
-    return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}
-
-
-class HistoryBuffer:
-    """Windows that earlier weights made, so that the critic does not forget faults that it once knew."""
-
-    def __init__(self, windows: Float[Tensor, "size frames features"]):
-        self.windows = windows.clone()
-
-    def mix(self, fresh: Float[Tensor, "batch frames features"], generator: torch.Generator) -> Tensor:
-        """Half a batch of the fresh ones, half of kept ones; then the fresh half takes the place of kept ones."""
-        half = len(fresh) // 2
-        picked = torch.randperm(len(self.windows), generator=generator)
-        mixed = torch.cat([fresh[: len(fresh) - half], self.windows[picked[:half]]])
-        self.windows[picked[half : 2 * half]] = fresh[:half]
-        return mixed
-
-    def keep(self, fresh: Float[Tensor, "batch frames features"], generator: torch.Generator) -> None:
-        """Put the fresh ones in the place of kept ones."""
-        picked = torch.randperm(len(self.windows), generator=generator)[: len(fresh)]
-        self.windows[picked] = fresh[: len(picked)]
-
-    def draw(self, count: int, generator: torch.Generator) -> Float[Tensor, "count frames features"]:
-        """Draw so many of the kept ones, any of them more than once."""
-        return self.windows[torch.randint(len(self.windows), (count,), generator=generator)]
-
-
-Row = dict[str, Any]
-"""Losses of a step, or measures of held-out clips; in a curve None replaces what is not finite."""
-Progress = Callable[[str], None]
-"""Called with one line of news."""
-_MOST_NAMED = 5  # files that a warning names
-
-
-def ignore_line(line: str) -> None:
-    """Take a line of news, and do nothing with it."""
-
-
-C = TypeVar("C", bound=NetworkConfig)
-S = TypeVar("S", bound=Any)  # settings: a frozen dataclass with at least `seed` and `steps`
-T = TypeVar("T", bound=Trainer[Any])
-G = TypeVar("G", bound=GradientTrainer[Any])
-
-
-@dataclass(frozen=True)
-class Gathered:
-    """What a run is trained on."""
-
-    corpus: Corpus
-    """All clips."""
-    parts: Split
-    """The same, by what they are for."""
-
-    def held_out(self) -> dict[str, list[str]]:
-        """Return the clips that training does not see, for a card."""
-        return {"validation": list(self.parts.validation.names), "test": list(self.parts.test.names)}
-
-    def describe_training(self) -> dict[str, float]:
-        """Describe how much motion training sees, for a card."""
-        train = self.parts.train
-        return {"clips": len(train.names), "minutes": round(len(train.features) / PRIOR_FPS / 60, 2)}
-
-
-@dataclass(frozen=True)
-class Export:
-    """What a finished run writes, beside what every card holds."""
-
-    tensors: Mapping[str, Tensor]
-    """By name."""
-    data: Row
-    """What it was trained on, for the card."""
-    quality: Row
-    """Measures, for the card."""
-    abilities: dict[str, float] = field(default_factory=dict)
-    """Speeds and turning that the data show."""
-    half: bool = True
-    """Whether weights are kept in float16."""
-
-
-@dataclass(frozen=True)
-class Recipe(ABC, Generic[C, S, T]):
-    """What to train on, and how. A model's subclass gives `config` and `settings` their defaults."""
-
-    kind: ClassVar[str]
-    """Name of the kind of model, in its card and on the command line."""
-    keeps_best: ClassVar[bool] = False
-    """Whether the weights of the best validation (see `score`) are exported even without `patience`."""
-    uses_gpu: ClassVar[bool] = True
-    """Whether it can be trained on a GPU."""
-
-    data: Path
-    """Folder of BVH files, searched below."""
-    out: Path
-    """Run folder: checkpoint, losses, finished model."""
-    config: C
-    """The network."""
-    settings: S
-    """How it is trained."""
-    match: str | None = None
-    """Regular expression that a file's path below `data` must contain."""
-    cuts: Path | None = None
-    """Table of the frames of each file that are motion; those named `Frame_Cuts.csv` in the folder are found."""
-    level: bool = False
-    """Put every clip on the canonical body and a level floor."""
-    licence: str | None = None
-    """Licence of the weights, for the card; that of the data if None, and of the weights that training began with."""
-    resume: bool = False
-    """Continue from the run folder's last checkpoint."""
-    patience: int = 0
-    """Validations without a better one after which training ends, with the best weights; 0 trains all steps."""
-    checkpoint_minutes: float = 3.0
-    """Between checkpoints."""
-    report_steps: int = 100
-    """Steps of whose losses the log holds the means."""
-    validate_steps: int = 1000
-    """Steps between two validations."""
-    device: str = "auto"
-    """Where to compute: `cpu`, `cuda`, or `auto` for a GPU where there is one."""
-
-    def __post_init__(self):
-        require_at_least(self, 1, "report_steps", "validate_steps")
-        require_at_least(self, 0, "patience")
-
-    @abstractmethod
-    def make_trainer(self, parts: Split) -> T:
-        """Make the trainer as it is before the first step."""
-
-    @abstractmethod
-    def score(self, row: Row) -> float:
-        """Return the one number among measures of held-out clips that says how good a model is, smaller where it is
-        better; NaN without one."""
-
-    def check(self) -> None:
-        """Raise RequestError for what cannot be, before anything is read."""
-        if not self.data.is_dir():
-            raise RequestError(f"{self.data} is not a folder of BVH files")
-        if not os.access(self.data, os.R_OK | os.X_OK):
-            raise RequestError(f"{self.data} cannot be read: permission denied")
-        self.find_device()
-
-    def find_device(self) -> str:
-        """Return `cpu` or `cuda`; RequestError for one that this machine or model cannot have."""
-        if self.device not in ("auto", "cpu", "cuda"):
-            raise RequestError(f"device must be auto, cpu or cuda, got {self.device!r}")
-        if self.device == "cuda" and not self.uses_gpu:
-            raise RequestError(f"a {self.kind} is not trained on GPUs; use --device cpu")
-        there = self.uses_gpu and torch.cuda.is_available()
-        if self.device == "cuda" and not there:
-            raise RequestError("this machine has no CUDA device; use --device cpu")
-        return "cuda" if there and self.device != "cpu" else "cpu"
-
-    @property
-    def split_seed(self) -> int:
-        """Seed by which clips are kept from training: that of the initial weights, where there are any, or the run
-        would train on what their measures hold out."""
-        init = getattr(self, "init", None)
-        return self.settings.seed if init is None else int(_read_card(init).data.get("split_seed", self.settings.seed))
-
-    @property
-    def chosen(self) -> str:
-        """Regular expression for the clips."""
-        return self.match or ""
-
-    def gather(self, progress: Progress, warn: Progress) -> Gathered:
-        """Read the clips and split them; `warn` gets a line on files that were left out, RUN/skipped.txt has them all.
-
-        RequestError where nothing is left, or what is left cannot be split.
-        """
-
-        def report(done: int, total: int) -> None:
-            if done % 200 == 0 or done == total:
-                progress(f"read {done} of {total} clips")
-
-        corpus = read_corpus(
-            self.data, match=self.chosen, cache=self.out / "cache", cuts=self.cuts, level=self.level, progress=report
-        )
-        if corpus.skipped:
-            reasons = [f"{self.data / file.name}: {file.reason}" for file in corpus.skipped]
-            count, more = len(reasons) + len(corpus.names), len(reasons) - _MOST_NAMED
-            rest = f"; and {more} more, all in {self.out / 'skipped.txt'}" if more > 0 else ""
-            warn(f"left out {len(reasons)} of {count} files: {'; '.join(reasons[:_MOST_NAMED])}{rest}")
-            write_text(self.out / "skipped.txt", "".join(f"{file.name}: {file.reason}\n" for file in corpus.skipped))
-        for line in corpus.cuts:
-            progress(f"frames by {line}")
-        parts = split_corpus(corpus, self.split_seed)
-        size = f"{len(corpus.names)} clips, {len(corpus.features)} frames"
-        held = f", without {parts.test.names[0]}, which is held out" if parts.validation is parts.test else ""
-        progress(f"{size}; training on {len(parts.train.names)}{held}")
-        return Gathered(corpus, parts)
-
-    def find_shape(self, trainer: T) -> C:
-        """Return the configuration of the network that is trained."""
-        return self.config
-
-    def describe_run(self, trainer: T, corpus: Corpus) -> dict[str, Row]:
-        """Describe what must not change between a run's parts. The number of steps may, and the precision."""
-        settings = {name: v for name, v in asdict(self.settings).items() if name not in ("steps", "bfloat16")}
-        return {
-            "settings": settings,
-            "network": self.find_shape(trainer).as_card(),
-            "data": corpus.identity() | {"split seed": self.split_seed},
-        }
-
-    def describe_origin(self) -> dict[str, dict[str, str]]:
-        """Describe the model that training began with, and its licence, for a card's data; nothing without one."""
-        init = getattr(self, "init", None)
-        return {} if init is None else {"init": {"name": name_for_records(init), "licence": _read_card(init).licence}}
-
-    def find_licence(self) -> str:
-        """Return the licence of the weights, for the card."""
-        init = self.describe_origin().get("init")
-        return self.licence or (OF_DATA if init is None else f"{OF_DATA}; {init['licence']}")
-
-    def describe_data(self, gathered: Gathered) -> Row:
-        """Describe what training saw, for a card."""
-        corpus = gathered.corpus
-        return {
-            **corpus.identity(),
-            **corpus.describe_selection(),
-            "match": self.chosen,
-            "split_seed": self.split_seed,
-            "held_out": gathered.held_out(),
-        }
-
-    def find_stop_reason(self, trainer: T, rows: Sequence[Row]) -> str | None:
-        """Return why to stop after these losses since the last report, if there is a reason."""
-        return None
-
-    def finish(self, trainer: T) -> None:
-        """Change the weights once more, before they are measured and written."""
-
-    def export(self, trainer: T, gathered: Gathered, curve: Sequence[Row]) -> Export:
-        """Return what is written at the end."""
-        quality = {"test": trainer.validate(gathered.parts.test)}
-        return Export(trainer.exported.state_dict(), self.describe_data(gathered), quality)
-
-
-@dataclass(frozen=True)
-class NetworkRecipe(Recipe[C, S, G]):
-    """Recipe of one network, which may start from another network's weights."""
-
-    trainer_class: ClassVar[Callable[..., Any]]
-    """Makes the trainer of a network's shape, settings and clips."""
-
-    init: str | None = None
-    """Begin with the weights of this model, bundled or trained."""
-    init_share: float = 0.0
-    """Share of those weights in the ones that are written: the mean of both is often better on familiar and on
-    unfamiliar data than either (Wortsman et al. 2022)."""
-
-    def __post_init__(self):
-        super().__post_init__()
-        if not 0 <= self.init_share < 1 or (self.init_share and self.init is None):
-            raise RequestError(f"init_share must be from 0 to below 1, and needs init; got {self.init_share:g}")
-
-    def draw_trainer(self, parts: Split) -> G:
-        """Make the trainer with drawn weights."""
-        return self.trainer_class(self.config, self.settings, parts.train)
-
-    def make_trainer(self, parts: Split) -> G:
-        """Make the trainer as it is before the first step."""
-        trainer = self.draw_trainer(parts)
-        trainer.grown = self.init is not None
-        if self.init is not None and not self.resume:
-            trainer.network.load_state_dict(self.read_initial_weights(self.init, trainer))
-        return trainer
-
-    def read_initial_weights(self, name: str, trainer: G) -> dict[str, Tensor]:
-        """Read another model's weights for this trainer's network; CheckpointError if they are not of its shape."""
-        tensors, card = checkpoints.load(checkpoints.locate(name))
-        if card.kind != self.kind or type(self.config).of_card(card.config) != self.config:
-            wanted = f"{self.kind} of {self.config.as_card()}"
-            raise CheckpointError(f"{name} holds: {card.kind} of {card.config}; wanted: {wanted}")
-        return trainer.network.state_dict() | tensors  # layers that the other lacks begin as drawn
-
-    def finish(self, trainer: G) -> None:
+    def finish(self) -> None:
         """Move the weights towards the initial ones, as far as those have a share."""
-        if self.init is not None and self.init_share:
-            before = self.read_initial_weights(self.init, trainer)
-            for name, value in trainer.network.state_dict().items():
+        if self.settings.init_share:
+            before = self.read_initial_weights()
+            for name, value in self.exported.state_dict().items():
                 if value.is_floating_point():
-                    value.lerp_(before[name].to(value), self.init_share)
-
-    def describe_run(self, trainer: G, corpus: Corpus) -> dict[str, Row]:
-        """Describe what must not change between a run's parts."""
-        return {**super().describe_run(trainer, corpus), "init": {"name": self.init}}
+                    value.lerp_(before[name].to(value), self.settings.init_share)
 
 
-def average_logarithms(values: Iterable[float | None]) -> float:
-    """Geometric mean of the positive ones among them, NaN of none: a tenth less of any counts alike."""
-    logs = [math.log(value) for value in values if value is not None and value > 0]
-    return math.exp(sum(logs) / len(logs)) if logs else math.nan
+class _Losses(nn.Module):
+    """The losses of a trainer as the module that DistributedDataParallel runs."""
+
+    def __init__(self, trainer: GradientTrainer[Any]):
+        super().__init__()
+        self.networks = nn.ModuleDict(trainer.networks())
+        self.compute = trainer.losses
+
+    def forward(self) -> dict[str, Tensor]:
+        return self.compute()
 
 
-def _read_card(name: str) -> checkpoints.Card:
-    return checkpoints.read_card(checkpoints.locate(name).with_suffix(".json"))
-
-
-CHECKPOINT, LOSSES, EVENTS = "checkpoint.safetensors", "losses.csv", "tensorboard"
-"""Files and folder of a run folder."""
-TRAINING, VALIDATION = "training", "validation"
-"""What the column `part` of LOSSES holds: mean losses since the last report, or measures of held-out clips."""
-_FIRST_LINE_SECONDS, _LINE_SECONDS = 5.0, 30.0  # to the first line on the losses, and from line to line
-
-
-def train(recipe: Recipe[Any, Any, Any], progress: Progress = ignore_line, *, warn: Progress = ignore_line) -> Path:
-    """Train to the end of the recipe, or until validation no longer improves, and write RUN/model.safetensors; return
-    its path. `progress` gets lines on losses and validations, `warn` one on files that cannot be used.
+def train(settings: Settings) -> Path:
+    """Train to the end, or until validation no longer improves, and write RUN/model.safetensors; return its path.
 
     MapctlError where training diverges; the last checkpoint then stays as it was.
     """
-    recipe.check()
-    check_folder(recipe.out)
-    present = (recipe.out / CHECKPOINT).exists()
-    if recipe.resume and not present:
-        raise CheckpointError(f"{recipe.out} holds no checkpoint to resume from")
-    if present and not recipe.resume:
-        raise RequestError(f"{recipe.out} already holds a run; pass --resume to continue it, or choose another folder")
-    gathered = recipe.gather(progress, warn)
-    with use_device(recipe.find_device()):
-        run = TrainingRun(recipe, gathered, progress)
-        run.go()
-        return run.export()
-
-
-class TrainingRun(Generic[C, S, T]):
-    """A trainer, its curve of validations and its checkpoints."""
-
-    def __init__(self, recipe: Recipe[C, S, T], gathered: Gathered, progress: Progress = ignore_line):
-        self.recipe, self.gathered, self.progress = recipe, gathered, progress
-        self.parts = gathered.parts.to(torch.get_default_device().type)
-        self.trainer = recipe.make_trainer(self.parts)
-        self.identity = json.loads(json.dumps(recipe.describe_run(self.trainer, gathered.corpus)))
-        self.curve: list[Row] = []
-        self.losses: list[Row] = []  # since the last report
-        self.keeps_best = recipe.keeps_best or recipe.patience > 0
-        self.best = _copy_weights(self.trainer.exported) if self.keeps_best else {}
-        self.stop_reason: str | None = None
-        if recipe.resume:
-            self._load()
-            progress(f"resumed at step {self.trainer.step}")
-        self.log = Log(recipe.out, self.trainer.step)
-        self.began, self.first_step = time.monotonic(), self.trainer.step
-        self.due = self.began + _FIRST_LINE_SECONDS
-
-    def go(self) -> None:
-        """Train to the end of the run; see `train`."""
-        saved = self.began
+    settings.check()
+    check_folder(settings.out)
+    present = (settings.out / CHECKPOINT).exists()
+    if settings.resume and not present:
+        raise CheckpointError(f"{settings.out} holds no checkpoint to resume from")
+    if present and not settings.resume:
+        raise RequestError(f"{settings.out} already holds a run; pass --resume to continue, or choose another folder")
+    with _join_processes(settings), use_device(settings.find_device()):
+        parts = _read_in_turn(settings.gather)
+        held = parts.to(torch.get_default_device().type)
+        trainer = settings.make_trainer(held)
+        keeps_best, identity = settings.keeps_best or settings.patience > 0, _identify(settings, trainer, parts)
+        best = _copy_weights(trainer.exported) if keeps_best else {}
+        curve: list[Row] = []
+        if settings.resume:
+            curve, kept = _load_checkpoint(settings, trainer, identity)
+            best = (kept or _copy_weights(trainer.exported)) if keeps_best else {}
+            settings.report(f"resumed at step {trainer.step}")
+        log = Log(settings.out, trainer.step)
+        losses: list[Row] = []  # since the last report
+        began = saved = time.monotonic()
+        first, due, stopped = trainer.step, began + _FIRST_LINE_SECONDS, None
         while True:
-            if self._validation_due():
-                self.validate()
-            ended = self.stop_reason is not None or self.trainer.step >= self.trainer.steps
-            overdue = time.monotonic() - saved > 60 * self.recipe.checkpoint_minutes
-            if self.trainer.step and (ended or overdue):
-                self.save()
+            last = trainer.step >= trainer.steps
+            measured = curve[-1]["step"] if curve else 0
+            on_time = (last or trainer.step % settings.validate_steps == 0) and trainer.step > measured
+            if stopped is None and (on_time or (keeps_best and not curve)):
+                if is_main():
+                    row = _finite(trainer.validate(held.validation))
+                    log.write(trainer.step, VALIDATION, row)
+                    shown = ", ".join(f"{name} {'-' if v is None else f'{v:.4g}'}" for name, v in row.items())
+                    settings.report(f"validation at step {trainer.step}: {shown}")
+                else:
+                    row = {}
+                row = _send_to_all(row)
+                curve.append({"step": trainer.step, **row})
+                scores = [math.inf if math.isnan(score) else score for score in map(trainer.score, curve)]
+                if keeps_best and all(scores[-1] < before for before in scores[:-1]):
+                    best = _copy_weights(trainer.exported)
+                if settings.patience and len(scores) - 1 - scores.index(min(scores)) >= settings.patience:
+                    stopped = f"no better in {settings.patience} validations"
+            overdue = time.monotonic() - saved > 60 * settings.checkpoint_minutes
+            # A run that was stopped keeps its last checkpoint: resumed from there it comes to the same end.
+            if trainer.step and stopped is None and (last or overdue) and is_main():
+                _check_finite(trainer)
+                kept = {f"best.{name}": value for name, value in best.items()}
+                index = {"step": trainer.step, "identity": identity, "curve": curve}
+                write_tensors(settings.out / CHECKPOINT, trainer.state() | kept, metadata={"run": json.dumps(index)})
                 saved = time.monotonic()
-            if ended:
+            if last or stopped is not None:
                 break
-            self.step()
-        self.log.close()
-
-    def step(self) -> None:
-        """Take one step, and report on the last ones where it is time."""
-        recipe, trainer = self.recipe, self.trainer
-        self.losses.append(trainer.train_step())
-        last = trainer.step >= trainer.steps
-        if last or time.monotonic() >= self.due:
-            self.due = time.monotonic() + _LINE_SECONDS
-            self.progress(self._format_progress())
-        if (reason := recipe.find_stop_reason(trainer, self.losses)) is not None:
-            self._stop(reason)
-        if last or trainer.step % recipe.report_steps == 0:
-            self.log.write(trainer.step, TRAINING, _average(self.losses))
-            self.losses = []
-
-    def validate(self) -> None:
-        """Measure the weights as they are, and stop where `patience` validations have brought nothing better."""
-        recipe, trainer = self.recipe, self.trainer
-        if not self.keeps_best:
-            trainer.check_finite()
-        measured = trainer.validate(self.parts.validation)
-        row = {name: value if math.isfinite(value) else None for name, value in measured.items()}
-        scores = [recipe.score(each) for each in [*self.curve, row]]
-        scores = [math.inf if math.isnan(score) else score for score in scores]
-        if self.keeps_best and all(scores[-1] < before for before in scores[:-1]):
-            self.best = _copy_weights(trainer.exported)
-        self.curve.append({"step": trainer.step, **row})
-        self.log.write(trainer.step, VALIDATION, row)
-        measures = ", ".join(f"{name} {'-' if value is None else f'{value:.4g}'}" for name, value in row.items())
-        self.progress(f"validation at step {trainer.step}: {measures}")
-        if recipe.patience and len(scores) - 1 - scores.index(min(scores)) >= recipe.patience:
-            self._stop(f"no better in {recipe.patience} validations")
-
-    def save(self) -> None:
-        """Write a checkpoint, unless training was stopped, since what is resumed comes to the same end; MapctlError
-        where the weights are not finite."""
-        if self.stop_reason is not None:
-            return
-        if not self.keeps_best:
-            self.trainer.check_finite()
-        index = {"step": self.trainer.step, "identity": self.identity, "curve": self.curve}
-        tensors = self.trainer.state() | {f"best.{name}": value for name, value in self.best.items()}
-        write_tensors(self.recipe.out / CHECKPOINT, tensors, metadata={"run": json.dumps(index)})
-
-    def export(self) -> Path:
-        """Write the model with its card."""
-        recipe, path = self.recipe, self.recipe.out / "model.safetensors"
-        if self.keeps_best:
-            self.trainer.exported.load_state_dict(self.best)
-        for network in self.trainer.networks().values():
-            network.to("cpu")
-        recipe.finish(self.trainer)
-        exported = recipe.export(self.trainer, self.gathered, self.curve)
-        ended = {} if self.stop_reason is None else {"ended": f"step {self.trainer.step}: {self.stop_reason}"}
-        card = checkpoints.Card(
-            kind=recipe.kind,
-            config=recipe.find_shape(self.trainer).as_card(),
-            licence=recipe.find_licence(),
-            data={**exported.data, **recipe.describe_origin(), "trained_on": self.gathered.describe_training()},
-            training={"settings": asdict(recipe.settings), "curve": self.curve, **ended},
-            quality=exported.quality,
-            abilities=exported.abilities,
-            **checkpoints.Card.layout_fields(),
-        )
-        checkpoints.save(dict(exported.tensors), card, path, half=exported.half)
+            losses.append(trainer.train_step())
+            last = trainer.step >= trainer.steps
+            stopped = trainer.find_stop_reason(losses)
+            if last or time.monotonic() >= due:
+                rate = (trainer.step - first) / max(1e-9, time.monotonic() - began)
+                left = timedelta(seconds=round((trainer.steps - trainer.step) / rate))
+                means = ", ".join(f"{name} {value:.3f}" for name, value in _average(losses).items())
+                settings.report(f"step {trainer.step}/{trainer.steps}: {means}, {rate:.3g} steps/s, {left} left")
+                due = time.monotonic() + _LINE_SECONDS
+            if last or trainer.step % settings.report_steps == 0:
+                log.write(trainer.step, TRAINING, _average(losses))
+                losses = []
+        log.close()
+        if stopped is not None:
+            settings.report(f"{stopped}: training ends with the best weights so far")
+        if keeps_best:
+            trainer.exported.load_state_dict(best)
+        path = settings.out / "model.safetensors"
+        if is_main():
+            _export(settings, trainer, parts, curve, stopped, path)
         return path
 
-    def _stop(self, reason: str) -> None:
-        self.stop_reason = reason
-        self.progress(f"{reason}: training ends with the best weights so far")
 
-    def _format_progress(self) -> str:
-        """Format the mean losses since the last report, the rate and the time left."""
-        step, steps = self.trainer.step, self.trainer.steps
-        rate = (step - self.first_step) / max(1e-9, time.monotonic() - self.began)
-        losses = ", ".join(f"{name} {value:.3f}" for name, value in _average(self.losses).items())
-        left = timedelta(seconds=round((steps - step) / rate))
-        return f"step {step}/{steps}: {losses}, {rate:.3g} steps/s, {left} left"
+def _export(
+    settings: Settings, trainer: Trainer[Any], parts: Split, curve: list[Row], stopped: str | None, path: Path
+) -> None:
+    """Write the model with its card."""
+    for network in trainer.networks().values():
+        network.to("cpu")
+    trainer.finish()
+    exported, origin = trainer.export(parts), settings.find_origin()
+    corpus = parts.whole
+    data = {
+        **corpus.identity(),
+        **corpus.describe_selection(),
+        "match": settings.chosen,
+        "split_seed": settings.split_seed,
+        "held_out": {"validation": list(parts.validation.names), "test": list(parts.test.names)},
+        **exported.data,
+        **origin,
+        "trained_on": {
+            "clips": len(parts.train.names),
+            "minutes": round(len(parts.train.features) / PRIOR_FPS / 60, 2),
+        },
+    }
+    ended = {} if stopped is None else {"ended": f"step {trainer.step}: {stopped}"}
+    inherited = OF_DATA if not origin else f"{OF_DATA}; {origin['init']['licence']}"
+    card = checkpoints.Card(
+        kind=settings.kind,
+        config=trainer.config.as_card(),
+        licence=settings.licence or inherited,
+        data=data,
+        training={"settings": _list_settings(settings), "curve": curve, **ended},
+        quality=exported.quality,
+        abilities=exported.abilities,
+        **checkpoints.Card.layout_fields(),
+    )
+    checkpoints.save(dict(exported.tensors), card, path, half=exported.half)
 
-    def _validation_due(self) -> bool:
-        """Whether the weights have still to be measured: every so many steps and at the end, and, where a recipe keeps
-        the best, before the first step."""
-        if self.recipe.keeps_best and not self.curve:
-            return True
-        step, measured = self.trainer.step, self.curve[-1]["step"] if self.curve else 0
-        due = step >= self.trainer.steps or step % self.recipe.validate_steps == 0
-        return due and step > measured and self.stop_reason is None
 
-    def _load(self) -> None:
-        with _explain_unreadable(self.recipe.out):
-            index, tensors = _read_checkpoint(self.recipe.out)
-            for part, now in self.identity.items():
-                then = index["identity"][part]
-                changed = [f"{key}: {then.get(key)} then, {now[key]} now" for key in now if then.get(key) != now[key]]
-                if changed:
-                    raise CheckpointError(
-                        f"{self.recipe.out}: the run was begun with other {part} ({'; '.join(changed)})"
-                    )
-            self.curve = [{**row, "step": int(row["step"])} for row in index["curve"]]
-            self.trainer.load_state(tensors, int(index["step"]))
-            if self.keeps_best:  # a run that was begun without patience kept none
-                self.best = select_prefixed("best.", tensors) or _copy_weights(self.trainer.exported)
-        if self.trainer.step > self.trainer.steps:
-            done, wanted = self.trainer.step, self.trainer.steps
-            raise RequestError(f"{self.recipe.out}: {done} steps are done; --steps must be at least that, got {wanted}")
+def _list_settings(settings: Settings) -> Row:
+    """Return the settings that change what a step does, and the number of steps."""
+    return {name: v for name, v in asdict(settings).items() if name == "steps" or name not in _MAY_CHANGE}
+
+
+def _identify(settings: Settings, trainer: Trainer[Any], parts: Split) -> dict[str, Row]:
+    """Return what must not change between a run's parts. The number of steps may, and the precision."""
+    chosen = {name: value for name, value in _list_settings(settings).items() if name != "steps"}
+    data = parts.whole.identity() | {"split seed": settings.split_seed} | trainer.identify()
+    return json.loads(json.dumps({"settings": chosen, "network": trainer.config.as_card(), "data": data}))
+
+
+def _load_checkpoint(
+    settings: Settings, trainer: Trainer[Any], identity: dict[str, Row]
+) -> tuple[list[Row], dict[str, Tensor]]:
+    """Go on from the run folder's checkpoint; return the curve and the best weights so far."""
+    with _explain_unreadable(settings.out):
+        index, tensors = _read_checkpoint(settings.out)
+        for part, now in identity.items():
+            then = index["identity"][part]
+            if changed := [f"{key}: {then.get(key)} then, {now[key]} now" for key in now if then.get(key) != now[key]]:
+                raise CheckpointError(f"{settings.out}: the run was begun with other {part} ({'; '.join(changed)})")
+        curve = [{**row, "step": int(row["step"])} for row in index["curve"]]
+        trainer.load_state(tensors, int(index["step"]))
+    if trainer.step > trainer.steps:
+        raise RequestError(f"{settings.out}: {trainer.step} steps are done; --steps must be at least that")
+    return curve, select_prefixed("best.", tensors)
+
+
+def _describe_saved(run: Path) -> str:
+    try:
+        with _explain_unreadable(run):
+            return f"step {_read_checkpoint(run)[0]['step']} is saved; the same command with --resume goes on"
+    except CheckpointError:
+        return "nothing was saved yet"
+
+
+def _read_checkpoint(run: Path) -> tuple[Row, dict[str, Tensor]]:
+    with safe_open(run / CHECKPOINT, framework="pt") as file:
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        return json.loads(file.metadata()["run"]), tensors
+
+
+@contextmanager
+def _explain_unreadable(run: Path) -> Iterator[None]:
+    try:
+        yield
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RuntimeError, SafetensorError) as error:
+        raise CheckpointError(f"{run}: no readable checkpoint ({type(error).__name__}: {one_line(error)})") from error
 
 
 class Log:
@@ -682,16 +618,17 @@ class Log:
         self._path, self._rows, self._events = run / LOSSES, [], None
         if step and self._path.exists():
             with self._path.open(encoding="utf-8", newline="") as file:
-                rows = [{name: cell for name, cell in row.items() if cell} for row in csv.DictReader(file)]
-            self._rows = [row for row in rows if int(row["step"]) <= step]
-        if find_spec("tensorboard") is not None:
+                self._rows = [row for row in csv.DictReader(file) if int(row["step"]) <= step]
+        if is_main() and find_spec("tensorboard") is not None:
             from torch.utils.tensorboard.writer import SummaryWriter  # an optional extra, slow to import
 
             self._events = SummaryWriter(str(run / EVENTS), purge_step=step + 1 if step else None)
 
     def write(self, step: int, part: str, values: Mapping[str, Any]) -> None:
         """Add a row; values that are not finite numbers are left out."""
-        finite = {name: v for name, v in values.items() if isinstance(v, int | float) and math.isfinite(v)}
+        if not is_main():
+            return
+        finite = {name: value for name, value in _finite(values).items() if value is not None}
         self._rows.append({"step": str(step), "part": part, **{name: f"{v:.9g}" for name, v in finite.items()}})
         text = io.StringIO()
         columns = dict.fromkeys(name for row in self._rows for name in row)
@@ -710,6 +647,119 @@ class Log:
             self._events.close()
 
 
+def count_processes() -> tuple[int, int]:
+    """Return the number of this process, and how many train together (1 unless torchrun started them)."""
+    return int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1"))
+
+
+def is_main() -> bool:
+    """Whether this process validates, reports and writes."""
+    return count_processes()[0] == 0
+
+
+@contextmanager
+def _join_processes(settings: Settings) -> Iterator[None]:
+    """Join the processes that torchrun started, if it did."""
+    if count_processes()[1] == 1:
+        yield
+        return
+    if not settings.uses_gpu:
+        raise RequestError(f"a {settings.kind} is trained by one process")
+    on_gpu = settings.find_device() == "cuda"
+    if on_gpu:
+        torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
+    distributed.init_process_group("nccl" if on_gpu else "gloo")
+    try:
+        yield
+    finally:
+        distributed.destroy_process_group()
+
+
+def _read_in_turn(read: Callable[[], Made]) -> Made:
+    """Read in the first process, then in the others, which find its cache."""
+    found = read() if is_main() else None
+    if count_processes()[1] > 1:
+        distributed.barrier()
+    return read() if found is None else found
+
+
+def _send_to_all(row: Row) -> Row:
+    """Return the first process' row."""
+    rows = [row]
+    if count_processes()[1] > 1:
+        distributed.broadcast_object_list(rows)
+    return rows[0]
+
+
+@contextmanager
+def use_device(name: str) -> Iterator[None]:
+    """Make tensors, networks and random numbers on this device unless another is given."""
+    if torch.get_default_device().type == torch.device(name).type:
+        yield  # as it is: a default of torch's costs each of its calls a little
+        return
+    with torch.device(name):
+        yield
+
+
+def make_generator(seed: int) -> torch.Generator:
+    """Make a generator that draws on the device in use."""
+    return torch.Generator(torch.get_default_device()).manual_seed(seed)
+
+
+def make_adam(weights: Iterable[nn.Parameter], learning_rate: float) -> torch.optim.Optimizer:
+    """Make the usual optimiser."""
+    return torch.optim.AdamW(weights, lr=learning_rate, weight_decay=1e-4)
+
+
+def draw_weights(make: Callable[[], Made], seed: int) -> Made:
+    """Return what `make` builds with torch's global generator, seeded, whose own numbers are left alone. It is built on
+    the processor, so that it is the same whatever device it is then moved to."""
+    with use_device("cpu"), torch.random.fork_rng(devices=[]):
+        torch.default_generator.manual_seed(seed)
+        return make()
+
+
+def update_average(average: nn.Module, network: nn.Module, keep: float) -> None:
+    """Move a running mean of weights towards the latest ones; `keep` is the share of the past."""
+    with torch.no_grad():
+        for mean, weight in zip(average.parameters(), network.parameters(), strict=True):
+            mean.lerp_(weight, 1 - keep)
+
+
+def warmup_cosine(step: int, steps: int) -> float:
+    """Return the share of the highest learning rate: rising, then along a cosine to zero."""
+    rise = max(1, round(_WARM_UP_SHARE * steps))
+    if step < rise:
+        return (step + 1) / rise
+    return 0.5 * (1 + math.cos(math.pi * (step - rise) / max(1, steps - rise)))
+
+
+def average_logarithms(values: Iterable[float | None]) -> float:
+    """Geometric mean of the positive ones among them, NaN of none: a tenth less of any counts alike."""
+    logs = [math.log(value) for value in values if value is not None and value > 0]
+    return math.exp(sum(logs) / len(logs)) if logs else math.nan
+
+
+def select_prefixed(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Select those whose names begin so, without it."""
+    return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}
+
+
+def make_divergence_error(step: int, how: str) -> MapctlError:
+    """Make the error of a run whose numbers are no longer finite."""
+    return MapctlError(f"training diverged at step {step}: {how}; the last checkpoint, if there is one, is kept")
+
+
+def _check_finite(trainer: Trainer[Any]) -> None:
+    if not all(bool(torch.isfinite(values).all()) for values in trainer.exported.parameters()):
+        raise make_divergence_error(trainer.step, "its weights are not finite")
+
+
+def _finite(values: Mapping[str, Any]) -> Row:
+    """Replace what is not a finite number by None."""
+    return {name: v if isinstance(v, int | float) and math.isfinite(v) else None for name, v in values.items()}
+
+
 def _average(rows: Sequence[Row]) -> Row:
     """Mean of each loss over the rows that have it."""
     names = dict.fromkeys(name for row in rows for name in row)
@@ -717,25 +767,14 @@ def _average(rows: Sequence[Row]) -> Row:
     return {name: sum(values) / len(values) for name, values in found.items()}
 
 
-def read_index(run: Path) -> dict[str, Any]:
-    """Read what the checkpoint of a run folder holds beside its tensors; CheckpointError where there is none."""
-    with _explain_unreadable(run):
-        return _read_checkpoint(run)[0]
-
-
-def _read_checkpoint(run: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    with safe_open(run / CHECKPOINT, framework="pt") as file:
-        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        return json.loads(file.metadata()["run"]), tensors
-
-
-@contextmanager
-def _explain_unreadable(run: Path) -> Iterator[None]:
-    try:
-        yield
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, RuntimeError, SafetensorError) as error:
-        raise CheckpointError(f"{run}: no readable checkpoint ({type(error).__name__}: {one_line(error)})") from error
-
-
 def _copy_weights(network: nn.Module) -> dict[str, Tensor]:
     return {name: value.clone() for name, value in network.state_dict().items()}
+
+
+def _read_card(name: str) -> checkpoints.Card:
+    return checkpoints.read_card(checkpoints.locate(name).with_suffix(".json"))
+
+
+def given(config: Any, **options: Any) -> Any:
+    """Return a network's shape with those of the options that are given (not None)."""
+    return replace(config, **{name: value for name, value in options.items() if value is not None})

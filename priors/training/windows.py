@@ -1,16 +1,13 @@
-"""Windows of a corpus, as training draws them: of its features, and of joint positions.
+"""Windows of a corpus, as training draws them: of its features, of joint positions, and of whole poses of bodies and
+tempos that vary, half of them mirrored.
 
-Windows of a corpus as whole poses: of bodies and tempos that vary, and half of them mirrored.
-
-Windows in poses that no clip shows: joints turned by constants that drift, bodies tilted up to lying and lowered.
-
-A model that has seen the poses of one performer alone returns to them where it should not. Truth and input are changed
-alike, so the task stays the same.
+Windows may be in poses that no clip shows: joints turned by constants that drift, bodies tilted up to lying and
+lowered. A model that has seen the poses of one performer alone returns to them where it should not. Truth and input are
+changed alike, so the task stays the same.
 """
 
 import math
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -54,8 +51,10 @@ def interpolate_heading(heading: Float[Tensor, "batch frames"], known: Bool[Tens
     return fill_missing_angle(heading, known[..., 0])
 
 
+KINDS = ("walk-turn", "walk", "run|dash", "^cmu")
+"""Kinds of clips, as patterns of their names, among which windows are evened; clips of none are another kind."""
 _CHUNK_FRAMES = 50_000  # frames
-_GOING = 0.25  # m/s that the hips of somebody who goes reach, on average over the frames around one
+_GOING = 0.25  # m/s that the hips of a walking character reach, on average over the frames around one
 _AROUND = 9  # frames, so that who shifts his weight goes nowhere
 
 
@@ -313,13 +312,11 @@ class Variation:
 class WindowPicker:
     """Picks where windows begin in a corpus, clips of every kind alike."""
 
-    def __init__(self, corpus: Corpus, *, kinds: Sequence[str], evenness: float):
-        """`evenness` among kinds of clips, told by the first of these patterns that is in their names: 0 draws by their
-        frames, 1 the same number of each kind.
-        """
+    def __init__(self, corpus: Corpus, *, evenness: float):
+        """`evenness` among KINDS of clips: 0 draws by their frames, 1 the same number of each kind."""
         self.lengths = corpus.locate_clips()[0]
-        kind = torch.tensor([find_kind(name, kinds) for name in corpus.names])
-        share = torch.zeros(len(kinds) + 1).index_add(0, kind, self.lengths.float())
+        kind = torch.tensor([find_kind(name) for name in corpus.names])
+        share = torch.zeros(len(KINDS) + 1).index_add(0, kind, self.lengths.float())
         self.weights = share[kind] ** -evenness
 
     def pick(
@@ -337,11 +334,9 @@ class WindowPicker:
 class PoseWindows:
     """Draws windows from a corpus."""
 
-    def __init__(self, corpus: Corpus, *, kinds: Sequence[str], evenness: float):
-        """`evenness` among kinds of clips, told by the first of these patterns that is in their names: 0 draws by their
-        frames, 1 the same number of each kind.
-        """
-        self.picker = WindowPicker(corpus, kinds=kinds, evenness=evenness)
+    def __init__(self, corpus: Corpus, *, evenness: float):
+        """`evenness` among KINDS of clips: 0 draws by their frames, 1 the same number of each kind."""
+        self.picker = WindowPicker(corpus, evenness=evenness)
         self.lengths, self.starts = corpus.locate_clips()
         self.ground, self.heading = corpus.integrate_roots()
         self.height = LAYOUT.pick(corpus.features, "root_height")
@@ -400,9 +395,9 @@ class PoseWindows:
         return rotations.average(torch.cat([sample, mirror_quats(sample)]).double()).float()
 
 
-def find_kind(name: str, kinds: Sequence[str]) -> int:
-    """Number of the first of these patterns that is in a clip's name; that of none is one more than the last."""
-    return next((number for number, kind in enumerate(kinds) if re.search(kind, name)), len(kinds))
+def find_kind(name: str) -> int:
+    """Number of the first of KINDS that is in a clip's name; that of none is one more than the last."""
+    return next((number for number, kind in enumerate(KINDS) if re.search(kind, name)), len(KINDS))
 
 
 def choose_rows(chosen: Tensor, one: PartialMotion, other: PartialMotion) -> PartialMotion:

@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers import corpus, generator
+from trainable_models import small_settings
 
 from mapctl.errors import RequestError
 from mapctl.protocols import DataLimits
@@ -12,13 +13,7 @@ from priors.checkpoints import Card
 from priors.lstm_gmm import density
 from priors.lstm_gmm.density import Labels, LstmGmmDensity
 from priors.lstm_gmm.network import LstmGmm, LstmGmmConfig
-from priors.training.moment_matching import MatchingSettings
-from priors.training.recipes.lstm_gmm import (
-    DensityTrainer,
-    TrainingSettings,
-    compute_feature_statistics,
-    select_initial_states,
-)
+from priors.training.recipes.lstm_gmm import DensityTrainer, compute_feature_statistics, select_initial_states
 
 CLIPS = ("set_walk_glad_1.bvh", "set_turn-left_glad_2.bvh", "set_turn-right_old_3.bvh", "set_run_old_4.bvh", "odd.bvh")
 PATTERN = r"_(?P<gait>walk|run|turn-left|turn-right)_(?P<style>[a-z]+)_"
@@ -71,12 +66,12 @@ def test_a_copy_that_was_told_is_the_network_under_that_condition():
         network.conditioned_on(["style=new"])
 
 
-def test_half_of_the_windows_are_told_nothing_and_none_more_than_is_known():
+def test_half_of_the_windows_are_shown_no_label(tmp_path):
     data = corpus(5)
     known = Labels(("gait=walk", "style=old"), torch.tensor([[1.0, 1.0]] * 5))
-    settings = TrainingSettings(steps=1, batch=2000, window=6, matching=MatchingSettings(begin=1.0))
-    trainer = DensityTrainer(LstmGmmConfig(width=8, components=1, labels=known.names), settings, data, labels=known)
-    _, told = trainer._draw_windows()
+    settings = small_settings("lstm-gmm", tmp_path, tmp_path, batch=2000, window=6)
+    trainer = DensityTrainer(settings, data, LstmGmmConfig(width=8, components=1, labels=known.names), known)
+    _, told = trainer.draw_windows()
     silent = float((told.sum(-1) == 0).double().mean())
     assert pytest.approx(silent, abs=0.04) == 0.5 + 0.5 * 0.09
     assert {tuple(row) for row in told.tolist()} == {(0, 0), (1, 0), (0, 1), (1, 1)}

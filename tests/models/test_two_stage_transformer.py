@@ -15,7 +15,7 @@ TWO = replace(CONFIG, detail=2)
 
 
 def windows(count=3, frames=30):
-    drawn = PoseWindows(corpus(2, 80), kinds=(), evenness=0.0).draw(count, frames, torch.Generator().manual_seed(0))
+    drawn = PoseWindows(corpus(2, 80), evenness=0.0).draw(count, frames, torch.Generator().manual_seed(0))
     return add_targets(drawn)
 
 

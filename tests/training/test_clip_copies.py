@@ -1,19 +1,15 @@
 """Copies of clips at other tempos and with other strides are motions: feet stand, contacts hold, headings stay."""
 
-import math
-from dataclasses import replace
-
 import pytest
 import torch
-from helpers import generator, run, walk
+from helpers import generator, walk
 from performers import Performer
 
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode
 from mapctl.pose import BodyPose
 from mapctl.skeleton import TOE_JOINTS
 from priors.training.augment import add_copies, change_strides, copy_clip
-from priors.training.data import Corpus, Split
-from priors.training.recipes.lstm_gmm import DensityRecipe, TrainingSettings
+from priors.training.data import Corpus
 from priors.training.windows import PoseWindows
 
 pytestmark = pytest.mark.usefixtures("small_judgements")
@@ -34,7 +30,7 @@ def corpus():
 
 @pytest.fixture(scope="module")
 def windows(corpus):
-    return PoseWindows(corpus, kinds=(), evenness=0.0)
+    return PoseWindows(corpus, evenness=0.0)
 
 
 def decoded(features):
@@ -98,33 +94,3 @@ def test_copies_come_after_their_clips_with_their_names_and_the_seed_draws_them(
     assert all(least - 1 <= length <= most + 1 for length in (one.lengths[3], one.lengths[6]))
     spread = [one.features[:, LAYOUT.slices["root_height"]], corpus.features]
     assert all(map(lambda part: bool(torch.isfinite(part).all()), spread))
-
-
-def test_training_sees_copies_and_what_is_held_out_has_none(tmp_path):
-    clips = corpus_of(*(walk(90, turn_rate=0.2 * k, seed=k) for k in range(3)))
-    parts = Split(clips, clips.subset([0]), clips.subset([0]))
-    settings = TrainingSettings(window=20, batch=4, copies=2)
-    recipe = DensityRecipe(tmp_path, tmp_path, settings=settings, labels=r"walk_(?P<which>\d)", device="cpu")
-    recipe = replace(recipe, config=replace(recipe.config, width=8, components=2))
-    trainer = recipe.make_trainer(parts)
-    assert len(trainer.clip_ends) == 9
-    assert len(trainer.windows.features) > 2.4 * len(clips.features)
-    held = trainer.labels.held
-    assert torch.equal(held[3:6], held[:3])
-    assert torch.equal(held[6:], held[:3])
-    assert math.isfinite(float(trainer.losses()["loss"].detach()))
-    plain = replace(recipe, settings=replace(settings, copies=0)).make_trainer(parts)
-    assert torch.equal(plain.windows.features, clips.features)
-
-
-@pytest.mark.parametrize(
-    ("option", "said"),
-    [
-        (("--copies", -1), "copies must be at least 0, got -1"),
-        (("--tempo", 0.5), "tempo must lie between 0 and 0.3, got 0.5"),
-        (("--strides", -0.1), "strides must lie between 0 and 0.3, got -0.1"),
-    ],
-)
-def test_numbers_that_make_no_sense_are_refused(tmp_path, capsys, option, said):
-    assert run("train", "lstm-gmm", "--data", tmp_path, "-o", tmp_path / "run", *option) == 2
-    assert capsys.readouterr().err == f"mapctl: {said}\n"

@@ -1,7 +1,7 @@
-"""Training of the denoiser: windows of clean motion, spoilt anew each time, and how far from them it comes back."""
+"""Training of the denoiser: windows of clean motion, corrupted anew each time, and what it returns."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -10,127 +10,121 @@ from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits as cross_entropy
 
 from mapctl import rotations
-from mapctl.errors import RequestError
 from mapctl.features import LAYOUT
 from mapctl.pose import BodyPose
 from mapctl.recording import Capture, CaptureProposal
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors.checkpoints import require_at_least
 from priors.denoiser import DenoiserConfig, DenoiserNetwork
-from priors.training.augment import CorruptionSettings, corrupt, make_clean_capture
-from priors.training.data import Corpus
-from priors.training.loop import GradientTrainer, NetworkRecipe, Row, average_logarithms, make_generator
+from priors.training.augment import corrupt, make_clean_capture
+from priors.training.data import Corpus, Split
+from priors.training.loop import (
+    Count,
+    GradientTrainer,
+    MaybeCount,
+    NetworkSettings,
+    Number,
+    Row,
+    average_logarithms,
+    given,
+    make_generator,
+)
 from priors.training.windows import FeatureWindows, PoseVariation, vary_features
 
+# Weights beside that of the position error, cm, which is 1.
+_PACE = 0.5  # of the joints' velocity error, cm a frame
+_FEET = 0.5  # of the planted toes' error in velocity, cm a frame
+_CONTACTS = 0.5  # of the contacts' cross entropy, nats
+_SPREAD = 0.1  # of the negative log-likelihood of the errors, which only the spread's own layer learns from
+_EVENNESS = 0.5  # of windows among the data's top folders: 0 by their frames, 1 the same number from each
+_CALIBRATION_DEG = 5.0  # spread of a rig's joint frames about the canonical ones, in half of the windows
+_SIZE = 0.05  # spread of a performer's size: of the logarithm of the distance that the hips travel
 _TOES = list(TOE_JOINTS)
 
 
-@dataclass(frozen=True)
-class DenoiserSettings:
-    """How a denoiser is trained."""
+@dataclass(frozen=True, kw_only=True)
+class DenoiserSettings(NetworkSettings):
+    """Train the denoiser that denoise begins with."""
 
-    steps: int = 16_000
-    """Updates."""
-    batch: int = 48
-    """Windows an update."""
-    window: int = 64
-    """Frames of each."""
-    learning_rate: float = 1e-3
-    """At its highest; it falls to nothing along a cosine."""
-    pace: float = 0.5
-    """Weight of the joints' velocity error, cm a frame; that of the position error, cm, is 1."""
-    feet: float = 0.5
-    """Weight of the planted toes' error in velocity, cm a frame."""
-    angles: float = 20.0
-    """Weight of the error of the angles, radians: what turns about its own bone moves no joint."""
-    contacts: float = 0.5
-    """Weight of the contacts' cross entropy, nats."""
-    evenness: float = 0.5
-    """How evenly windows are drawn from the data's top folders: 0 by their frames, 1 the same number from each."""
-    calibration_deg: float = 5.0
-    """Spread of a rig's joint frames about the canonical ones, in half of the windows: other rigs find theirs in
-    other ways."""
-    poses: PoseVariation = field(default_factory=PoseVariation)
-    """How far poses leave those of the clips."""
-    spread: float = 0.1
-    """Weight of the negative log-likelihood of the errors, which only the spread's own layer learns from."""
-    corruption: CorruptionSettings = field(default_factory=CorruptionSettings)
-    """How windows are spoilt."""
-    bfloat16: bool = False
-    """The network computes in bfloat16; weights and loss stay in float32."""
-    seed: int = 1
-    """Seed of weights, windows and noise."""
+    kind = "denoiser"
+    used_by = "use it with --denoiser"
+
+    steps: Count = 16_000
+    """Steps in all."""
+    batch: Count = 48
+    """Windows a step."""
+    width: MaybeCount = None
+    """Channels of every layer."""
+    angles: Number = 20.0
+    """Weight of the error of joint angles (radians) in the loss, beside the centimetres of positions: what turns about
+    its own bone moves no joint."""
 
     def __post_init__(self):
-        require_at_least(self, 1, "steps", "batch")
-        if self.window < 16:
-            raise RequestError(f"window must be at least 16 frames, got {self.window}")
+        super().__post_init__()
+        require_at_least(self, 16, "window")
+
+    def make_config(self) -> DenoiserConfig:
+        """Return the shape of the network that these settings ask for."""
+        return given(DenoiserConfig(), width=self.width)
+
+    def make_trainer(self, parts: Split) -> "DenoiserTrainer":
+        """Make the trainer as it is before the first step."""
+        return DenoiserTrainer(self, parts.train)
 
 
 class DenoiserTrainer(GradientTrainer[DenoiserNetwork]):
-    """Draws windows, spoils them, and brings the network nearer to cleaning them."""
+    """Draws windows, corrupts them, and brings the network nearer to cleaning them."""
 
-    def __init__(self, config: DenoiserConfig, settings: DenoiserSettings, corpus: Corpus):
+    def __init__(self, settings: DenoiserSettings, corpus: Corpus):
         """RequestError where no clip is as long as a window."""
-        self.windows = FeatureWindows(corpus, settings.window, evenness=settings.evenness)
-        super().__init__(lambda: DenoiserNetwork(config, bfloat16=settings.bfloat16), settings)
+        self.windows = FeatureWindows(corpus, settings.window, evenness=_EVENNESS)
+        self.config = settings.find_config()
+        super().__init__(settings, lambda: DenoiserNetwork(self.config, bfloat16=settings.bfloat16))
+        self.begin()
 
     def losses(self) -> dict[str, Tensor]:
         """Compute the losses of a newly drawn batch."""
-        windows = draw_performers(self.windows, self.settings, self.generator, batch=self.settings.batch)
-        return compute_denoiser_losses(self.network, windows, self.settings, self.generator)
+        windows = draw_performers(self.windows, self.settings.batch, self.generator)
+        return compute_denoiser_losses(self.network, windows, self.settings.angles, self.generator)
 
+    @torch.no_grad()
     def validate(self, corpus: Corpus) -> dict[str, Any]:
         """Measure the errors on 6 batches of held-out windows, corrupted identically each time."""
         settings, generator, rows = self.settings, make_generator(0), []
         # What is held out may have no clip as long as a window; that must not end a run after an hour.
-        drawn = FeatureWindows(corpus, min(settings.window, max(corpus.lengths)), evenness=settings.evenness)
-        with torch.no_grad():
-            for _ in range(6):
-                windows = draw_performers(drawn, settings, generator)
-                rows.append(compute_denoiser_losses(self.network, windows, settings, generator))
+        drawn = FeatureWindows(corpus, min(settings.window, max(corpus.lengths)), evenness=_EVENNESS)
+        for _ in range(6):
+            windows = draw_performers(drawn, settings.batch, generator)
+            rows.append(compute_denoiser_losses(self.network, windows, settings.angles, generator))
         means = torch.stack([torch.stack(list(row.values())) for row in rows]).mean(dim=0)
         return dict(zip(rows[0], means.tolist(), strict=True))
 
-
-@dataclass(frozen=True)
-class DenoiserRecipe(NetworkRecipe[DenoiserConfig, DenoiserSettings, DenoiserTrainer]):
-    """What to train a denoiser on, and how."""
-
-    kind = "denoiser"
-    trainer_class = DenoiserTrainer
-    config: DenoiserConfig = field(default_factory=DenoiserConfig)
-    settings: DenoiserSettings = field(default_factory=DenoiserSettings)
-
     def score(self, row: Row) -> float:
-        """The loss of unseen windows."""
+        """Return the loss of unseen windows."""
         return average_logarithms([row.get("loss")])
 
 
 def draw_performers(
-    windows: FeatureWindows, settings: DenoiserSettings, generator: torch.Generator, *, batch: int | None = None
+    windows: FeatureWindows, batch: int, generator: torch.Generator
 ) -> Float[Tensor, "batch window size"]:
-    """Windows of performers a little larger or smaller, on rigs calibrated a little differently, in varied poses."""
-    batch = batch or settings.batch
+    """Draw windows of performers of varied sizes, on rigs calibrated a little differently, in varied poses."""
     features = windows.draw(batch, generator).features.clone()
-    size = torch.exp(settings.corruption.size * torch.randn(batch, 1, 1, generator=generator))
+    size = torch.exp(_SIZE * torch.randn(batch, 1, 1, generator=generator))
     for block in ("root_displacement_heading", "root_height"):
         features[..., LAYOUT.slices[block]] *= size
-    features[..., LAYOUT.slices["joint_rotations"]] = _perturb_joint_frames(
-        features, settings.calibration_deg, generator
-    )
-    return vary_features(features, settings.poses, generator)
+    features[..., LAYOUT.slices["joint_rotations"]] = _perturb_joint_frames(features, generator)
+    return vary_features(features, PoseVariation(), generator)
 
 
 def _perturb_joint_frames(
-    windows: Float[Tensor, "batch window size"], spread_deg: float, generator: torch.Generator
+    windows: Float[Tensor, "batch window size"], generator: torch.Generator
 ) -> Float[Tensor, "batch window width"]:
     """Joint rotations (rotation vectors, flat) with every joint's frame turned by a constant; below it nothing turns.
 
     Bones point a little elsewhere then; what is still stays still.
     """
     batch, others = len(windows), CANONICAL.num_joints - 1
-    turns = math.radians(spread_deg) * torch.randn(batch, 1, others, 3, generator=generator)
+    turns = math.radians(_CALIBRATION_DEG) * torch.randn(batch, 1, others, 3, generator=generator)
     turns = turns * (torch.rand(batch, 1, 1, 1, generator=generator) < 0.5)
     own = rotations.from_rotation_vector(torch.cat([torch.zeros_like(turns[:, :, :1]), turns], dim=2))
     above = own[:, :, [max(0, parent) for parent in CANONICAL.parents]]
@@ -141,11 +135,11 @@ def _perturb_joint_frames(
 
 
 def compute_denoiser_losses(
-    network: DenoiserNetwork, windows: Tensor, settings: DenoiserSettings, generator: torch.Generator
+    network: DenoiserNetwork, windows: Tensor, angle_weight: float, generator: torch.Generator
 ) -> dict[str, Tensor]:
     """The loss, and in plain units the errors it is made of."""
     clean = make_clean_capture(windows)
-    cleaned = network(corrupt(clean, settings.corruption, generator))
+    cleaned = network(corrupt(clean, generator))
     angles = _pack_angles(clean)
     bits = LAYOUT.pick(windows, "contacts")
     wanted, got = BodyPose.unpack(_pack(clean)).joints_world(), cleaned.pose.joints_world()
@@ -155,16 +149,10 @@ def compute_denoiser_losses(
     feet = (slip[..., _TOES] * planted).sum() / planted.sum().clamp_min(1)
     turned = (cleaned.pose.angles - angles).abs().mean()
     contacts = cross_entropy(cleaned.contact_logits.float(), bits)
-    loss = (
-        place
-        + settings.pace * slip.mean()
-        + settings.feet * feet
-        + settings.angles * turned
-        + settings.contacts * contacts
-    )
+    loss = place + _PACE * slip.mean() + _FEET * feet + angle_weight * turned + _CONTACTS * contacts
     spread = _compute_spread_loss(cleaned, _pack(clean))
     return {
-        "loss": loss + settings.spread * spread,
+        "loss": loss + _SPREAD * spread,
         "error_cm": place,
         "feet_cm_frame": feet,
         "angles_deg": torch.rad2deg(turned),

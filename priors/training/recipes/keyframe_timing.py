@@ -1,58 +1,59 @@
 """Fit of the keyframe timing: least absolute deviations of the logarithm of seconds, over pairs of poses of mocap."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mapctl.errors import RequestError
 from mapctl.features import GroundPose
 from mapctl.inbetweening.pose_pairs import TRAVELLING_DISTANCE, PosePairs, sample_pose_pairs
 from mapctl.pose import decode
 from priors.checkpoints import require_at_least
 from priors.keyframe_timing import KeyframeTimingConfig, KeyframeTimingNetwork
 from priors.training.data import Corpus, Split
-from priors.training.loop import Export, Gathered, Recipe, Row, Trainer, average_logarithms
+from priors.training.loop import Count, Export, Row, Settings, Trainer, average_logarithms
 
 _PERCENTILES = (0.1, 0.9)  # between which four of five pairs lie
+_RIDGE = 1.0  # weight of the squared weights, of features of about unit spread
+_MIN_DEVIATION = 0.15  # of the logarithm of seconds, below which all deviations weigh the same
 
 
-@dataclass(frozen=True)
-class KeyframeTimingSettings:
-    """How a timing is fitted."""
+@dataclass(frozen=True, kw_only=True)
+class KeyframeTimingSettings(Settings):
+    """Fit how long people take from one pose to the next, which tween suggests; a step reweights the least squares."""
 
-    steps: int = 15
+    kind = "keyframe-timing"
+    used_by = "use it with mapctl tween --suggest-timing --timing"
+    uses_gpu = False
+
+    steps: Count = 15
     """Reweightings of the least squares."""
-    pairs: int = 5
+    pairs: Count = 5
     """Pairs of poses drawn of every clip."""
-    ridge: float = 1.0
-    """Weight of the squared weights, of features of about unit spread."""
-    min_deviation: float = 0.15
-    """Standard deviation of the logarithm of seconds below which all deviations weigh the same."""
-    seed: int = 1
-    """Seed of the pose pairs and of the split of the clips."""
 
     def __post_init__(self):
-        require_at_least(self, 1, "steps", "pairs")
-        if not (self.ridge > 0 and self.min_deviation > 0):
-            raise RequestError(f"ridge and min_deviation must be positive, got {self.ridge:g}, {self.min_deviation:g}")
+        super().__post_init__()
+        require_at_least(self, 1, "pairs")
+
+    def make_trainer(self, parts: Split) -> "KeyframeTimingTrainer":
+        """Make the trainer with the pairs of poses that the timing is fitted to."""
+        return KeyframeTimingTrainer(self, parts.train)
 
 
 class KeyframeTimingTrainer(Trainer[KeyframeTimingNetwork]):
-    """Solves for the weights again and again, with less and less said by pairs that are far off."""
+    """Solves for the weights again and again, with less and less weight on pairs that are far off."""
 
-    def __init__(self, config: KeyframeTimingConfig, settings: KeyframeTimingSettings, corpus: Corpus):
-        super().__init__(steps=settings.steps, seed=settings.seed)
-        self.settings = settings
-        self.network = KeyframeTimingNetwork(config).double()
-        self.pairs = draw_pairs(corpus, config, settings.pairs, self.generator)
+    def __init__(self, settings: KeyframeTimingSettings, corpus: Corpus):
+        super().__init__(settings)
+        self.config = KeyframeTimingConfig()
+        self.network = KeyframeTimingNetwork(self.config).double()
+        self.pairs = draw_pairs(corpus, self.config, settings.pairs, self.generator)
 
     def train_step(self) -> dict[str, float]:
         """Solve once, and see within which bounds the truth lies; the factor by which half of the pairs are off."""
         network, pairs = self.network, self.pairs
-        weights = solve_weights(pairs, network.weights if self.step else None, self.settings)
+        weights = solve_weights(pairs, network.weights if self.step else None)
         network.weights.copy_(weights)
         ratio = pairs.seconds / network(pairs.features, pairs.metres)[:, 1]
         for row, which in enumerate(_split_by_distance(pairs)):
@@ -72,32 +73,16 @@ class KeyframeTimingTrainer(Trainer[KeyframeTimingNetwork]):
                 row[f"{name}_half_off_by"] = _measure_error(ratio[which])
         return row
 
-    def check_finite(self) -> None:
-        """The weights are solved for, and the ridge leaves no equations without a solution."""
-
-
-@dataclass(frozen=True)
-class KeyframeTimingRecipe(Recipe[KeyframeTimingConfig, KeyframeTimingSettings, KeyframeTimingTrainer]):
-    """What to fit a keyframe timing to, and how."""
-
-    kind = "keyframe-timing"
-    uses_gpu = False
-    config: KeyframeTimingConfig = field(default_factory=KeyframeTimingConfig)
-    settings: KeyframeTimingSettings = field(default_factory=KeyframeTimingSettings)
-
-    def make_trainer(self, parts: Split) -> KeyframeTimingTrainer:
-        """With the pairs of poses that it is fitted to."""
-        return KeyframeTimingTrainer(self.config, self.settings, parts.train)
-
     def score(self, row: Row) -> float:
-        """The factor by which half of unseen pairs are off at most."""
+        """Return the factor by which half of unseen pairs are off at most."""
         return average_logarithms([row.get("half_off_by")])
 
-    def export(self, trainer: KeyframeTimingTrainer, gathered: Gathered, curve: Sequence[Row]) -> Export:
+    def export(self, parts: Split) -> Export:
         """Export the weights in float32: they are less than a kilobyte."""
-        made = super().export(trainer, gathered, curve)
-        tensors = {name: value.float() for name, value in made.tensors.items()}
-        return replace(made, tensors=tensors, data={**made.data, "pairs": len(trainer.pairs.seconds)}, half=False)
+        done = super().export(parts)
+        done.tensors = {name: value.float() for name, value in done.tensors.items()}
+        done.data, done.half = {"pairs": len(self.pairs.seconds)}, False
+        return done
 
 
 def draw_pairs(corpus: Corpus, config: KeyframeTimingConfig, count: int, generator: torch.Generator) -> PosePairs:
@@ -107,9 +92,7 @@ def draw_pairs(corpus: Corpus, config: KeyframeTimingConfig, count: int, generat
     return sample_pose_pairs(bodies, generator, count=count, shortest=config.shortest, longest=config.longest)
 
 
-def solve_weights(
-    pairs: PosePairs, before: Float[Tensor, " features"] | None, settings: KeyframeTimingSettings
-) -> Float[Tensor, " features"]:
+def solve_weights(pairs: PosePairs, before: Float[Tensor, " features"] | None) -> Float[Tensor, " features"]:
     """Solve the regression: least squares of the logarithm of seconds with a ridge over features of about unit spread.
 
     Each pair is weighted by one over the absolute residual of the weights `before`, so that repeated calls minimise
@@ -117,13 +100,13 @@ def solve_weights(
     """
     mean, spread = pairs.features.mean(dim=0), pairs.features.std(dim=0) + 1e-9
     mean[0], spread[0] = 0.0, 1.0
-    unit, told = (pairs.features - mean) / spread, pairs.seconds.log()
-    counts = torch.ones_like(told)
+    unit, wanted = (pairs.features - mean) / spread, pairs.seconds.log()
+    counts = torch.ones_like(wanted)
     if before is not None:
-        counts = 1 / (told - pairs.features @ before).abs().clamp_min(settings.min_deviation)
+        counts = 1 / (wanted - pairs.features @ before).abs().clamp_min(_MIN_DEVIATION)
     heavy = unit * counts[:, None]
-    ridge = settings.ridge * torch.eye(unit.shape[1], dtype=unit.dtype)
-    weights = torch.linalg.solve(heavy.T @ unit + ridge, heavy.T @ told) / spread
+    ridge = _RIDGE * torch.eye(unit.shape[1], dtype=unit.dtype)
+    weights = torch.linalg.solve(heavy.T @ unit + ridge, heavy.T @ wanted) / spread
     weights[0] -= (weights[1:] * mean[1:]).sum()
     return weights
 

@@ -1,30 +1,22 @@
 """Training of the LSTM-GMM: Wang et al. 2019, section 4.1.3, with departures.
 
-Windows of clips with noise on the inputs; loss is the negative log density of the next frame (Eq. 8).
-
-What a density is worth on held-out clips: likelihood, and whether, sampled for long, it stays a person
-moving as the data do.
-
-A critic of the density's free runs, which joins the last steps of training.
-
-Moments (see moment_matching) hold each number of a free run to the data, not how they go together: a classifier still
-separates such runs from mocap by poses and by the hips' trajectory. The critic judges a second of a free run, far from
-the mocap that it began with; the density is made likelier to pass, beside being likely. Ours. It sees what the
-classifier of `mapctl measure` does: positions and velocities in the ground frame of the first frame. Feet that hardly
-move are not magnified, as for the refiner's critic: by the noise of their single frames, which a mixture draws and no
-weights take away, it wins at once.
+Windows of clips with noise on the inputs; the loss is the negative log density of the next frame (Eq. 8). In the last
+quarter of the steps free runs are held to the data's moments, and in the last `critic_steps` a critic of free runs
+joins (`priors.training.critics`). Likelihood on held-out clips does not predict stability, so free runs are measured
+too.
 """
 
 import copy
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from dataclasses import asdict, dataclass, replace
+from typing import Annotated
 
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor, nn
-from torch.nn.functional import leaky_relu, one_hot, softplus
+from torch import Tensor, distributed, nn
+from torch.nn.functional import one_hot
+from tyro.conf import arg
 
 from mapctl import rotations
 from mapctl.errors import RequestError
@@ -33,30 +25,375 @@ from mapctl.metrics import compute_reference
 from mapctl.pose import decode
 from mapctl.problem import density_selection
 from mapctl.protocols import DataLimits, InitialStates
-from mapctl.skeleton import CANONICAL
-from mapctl.terms.trial import Trial
-from priors import stitcher
 from priors.checkpoints import require_at_least
 from priors.lstm_gmm import density
 from priors.lstm_gmm.density import PACE_LABELS, Labels
-from priors.lstm_gmm.network import NOISE_UNIT, LstmGmm, LstmGmmConfig, LstmState
-from priors.training.augment import add_copies, add_splices, drop_splices, hide_splices
+from priors.lstm_gmm.network import NOISE_UNIT, PAPER, LstmGmm, LstmGmmConfig, LstmState
+from priors.training.augment import add_copies
+from priors.training.critics import (
+    FREE_RUN_MOMENTS,
+    HISTORY,
+    SEEN_FRAMES,
+    FreeRunJudge,
+    HistoryBuffer,
+    moment_loss,
+    run_free,
+)
 from priors.training.data import Corpus, Split, follow_paces, measure_pace_changes
 from priors.training.loop import (
+    Count,
     Export,
-    Gathered,
     GradientTrainer,
-    HistoryBuffer,
-    Progress,
-    Recipe,
+    InPython,
+    MaybeCount,
+    NetworkSettings,
+    Number,
     Row,
-    draw_weights,
-    make_divergence_error,
+    count_processes,
+    given,
     make_generator,
+    update_average,
     use_device,
 )
-from priors.training.moment_matching import MatchingSettings, moment_loss, run_free
 from priors.training.windows import FeatureWindows
+
+_GRADIENT_CLIP = 5.0
+_WEIGHT_DECAY = 1e-4
+_INPUT_NOISE = 0.05  # standard deviation of the noise on normalised inputs (section 4.1.3)
+_NOISE_RANGE = 4.0  # largest noise of a window, as a multiple of that
+_BIT_FLIPS = 0.02  # share of input contact bits that are flipped
+_UNLABELLED = 0.5  # share of the windows without labels; the others show each group (gait, style) with probability 0.7
+_KEEP_GROUP_PROBABILITY = 0.7
+_MOST = 0.3  # change of tempo or stride, beyond which walks are no longer likely
+_MATCH_FROM = 0.75  # share of the steps before the critic, after which free runs are held to the data
+_MATCH_EVERY, _FREE_RUNS = 4, 32  # steps from one comparison to the next; runs of one
+_CRITIC_EVERY = 2  # steps from one free run to the next while the critic judges them
+_CRITIC_UPDATES, _CRITIC_HEAD_START = 2, 400  # updates of the critic in a step, and before the first
+_CRITIC_RATE = 3e-4  # learning rate of the density while the critic judges
+_CRITIC_RISE, _CRITIC_FALL = 20, 0.3  # steps in which it rises, share of the steps in which it falls to nothing
+_AVERAGE = 0.995  # share of the past in the running mean of the weights while the critic judges
+_UNTAUGHT = {"critic": 2 * math.log(2), "accuracy": 0.5}  # of a critic that has learnt nothing
+_SECOND = PRIOR_FPS  # frames
+_WARM_UP_FRAMES = 40  # frames of a clip before a start; the memory has settled by then
+_SETTLING_FRAMES = 300
+
+
+@dataclass(frozen=True, kw_only=True)
+class DensitySettings(NetworkSettings):
+    """Train the density that follow, generate, steer and others use as their prior."""
+
+    kind = "lstm-gmm"
+    used_by = "use it with --prior"
+    single_thread = False
+    shape_options = ("width", "components", "paper")
+
+    steps: Count = 20_000
+    """Steps in all."""
+    batch: Count = 128
+    """Windows a step."""
+    window: Count = 50
+    """Frames a window."""
+    width: MaybeCount = None
+    """Units of every hidden layer."""
+    components: MaybeCount = None
+    """Gaussians in the mixture."""
+    paper: bool = False
+    """The network of Wang et al. 2019; other options still hold."""
+    labels: Annotated[str, arg(metavar="REGEX")] = ""
+    """Named groups read labels from the clips' paths, as in '_(?P<gait>walk|run)_(?P<style>[a-z]+)_', for --style."""
+    label_pace: bool = False
+    """Make the pace a label as well: stand, walk or run, by how a window of training ends. Random motion is then given
+    one pace after another, as often as the clips change theirs."""
+    copies: Count = 0
+    """Copies of each clip at other tempos and with other strides that training sees beside it: for a few minutes of
+    motion (docs/guides/data.md)."""
+    tempo: Number = 0.15
+    """Largest change of a copy's tempo, as a share."""
+    strides: Number = 0.1
+    """Largest change of how far a copy steps, as a share: as of a body with other legs."""
+    critic_steps: Count = 0
+    """Last steps in which a critic joins that separates a second of a free run from captured motion, and the density is
+    trained to pass as well; what is kept is then the running mean of the weights."""
+    standing_share: Number = 1.0
+    """Share of the windows of standing characters that training sees, 1 by default: below it for motion that mostly
+    stands, whose density is hard to steer into a walk otherwise."""
+    starts: Annotated[int, *InPython] = 64
+    """Moments of mocap that the finished prior carries."""
+
+    def __post_init__(self):
+        super().__post_init__()
+        require_at_least(self, 1, "starts")
+        require_at_least(self, 0, "copies", "critic_steps")
+        if not (0 <= self.tempo <= _MOST and 0 <= self.strides <= _MOST):
+            raise RequestError(f"--tempo and --strides lie between 0 and {_MOST}")
+        if not 0 < self.standing_share <= 1:
+            raise RequestError(f"--standing-share is over 0 and at most 1, got {self.standing_share:g}")
+        if self.critic_steps >= self.steps:
+            raise RequestError(
+                f"a critic joins the last steps of a run: {self.critic_steps} are not under {self.steps}"
+            )
+        if self.critic_steps and self.window < SEEN_FRAMES:
+            raise RequestError(f"the critic sees {SEEN_FRAMES} frames; windows have {self.window}")
+        if self.label_pace and "(?P<pace>" in self.labels:
+            raise RequestError("the group pace is that of --label-pace; call the one of --labels by another name")
+
+    def make_config(self) -> LstmGmmConfig:
+        """Return the shape of the network that these settings ask for, before it has labels."""
+        return given(PAPER if self.paper else LstmGmmConfig(), width=self.width, components=self.components)
+
+    def make_trainer(self, parts: Split) -> "DensityTrainer":
+        """Make the trainer of a network for the clips' labels, or of the initial network with its own labels."""
+        with use_device("cpu"):  # copies are generated one after the other
+            seeded, train = make_generator(self.seed), parts.train.to("cpu")
+            copied = add_copies(train, self.copies, seeded, tempo=self.tempo, strides=self.strides)
+        corpus = copied.to(torch.get_default_device().type)
+        known, config = density.read_labels(corpus.names, self.labels), self.find_config()
+        if self.init is None:
+            known = known.renamed((*known.names, *PACE_LABELS)) if self.label_pace else known
+            config = replace(config, labels=known.names)
+        known = known.renamed(config.labels)
+        with_paces = {*PACE_LABELS} <= {*config.labels}
+        if self.label_pace and not with_paces:
+            raise RequestError(f"the prior {self.init!r} was not trained with labels of paces; leave --label-pace out")
+        paces = follow_paces(copied).to(corpus.features.device) if with_paces else None
+        return DensityTrainer(self, corpus, config, known, paces)
+
+
+class DensityTrainer(GradientTrainer[LstmGmm]):
+    """Draws windows, adds noise to the inputs, and makes the frames after them likelier."""
+
+    def __init__(
+        self,
+        settings: DensitySettings,
+        corpus: Corpus,
+        config: LstmGmmConfig,
+        labels: Labels | None = None,
+        paces: Int[Tensor, " frames"] | None = None,
+    ):
+        """`labels` of the corpus' clips, the network's own, with those of PACE_LABELS held by none; `paces` of its
+        frames, as `follow_paces` finds them, if these are labels."""
+        mean, std = compute_feature_statistics(corpus.features)
+        super().__init__(settings, lambda: LstmGmm(config, mean=mean, std=std))
+        self.config, self.labels, self.paces = config, labels or Labels.none(len(corpus.lengths)), paces
+        self._pace_labels = [] if paces is None else [self.labels.names.index(name) for name in PACE_LABELS]
+        self.clip_ends = torch.tensor(corpus.lengths).cumsum(0)
+        self.windows = FeatureWindows(corpus, settings.window + 1, standing_share=settings.standing_share)
+        self._latest = corpus.features[:0], self.labels.held[:0]  # windows of the step under way, and their labels
+        self.begin()
+        self.judge: FreeRunJudge | None = None
+        self.average = self.network
+        """Moving average of the weights since the critic joined, the weights themselves without one."""
+        if settings.critic_steps:
+            if count_processes()[1] > 1:
+                raise RequestError("a density is trained with a critic by one process")
+            self.judge = FreeRunJudge(self.windows, seed=settings.seed)
+            self.average = copy.deepcopy(self.network).requires_grad_(False)
+
+    @property
+    def exported(self) -> LstmGmm:
+        """The moving average of the weights."""
+        return self.average
+
+    def networks(self) -> dict[str, nn.Module]:
+        """All that is learnt, by its name in checkpoints."""
+        critic = {} if self.judge is None else {"average": self.average, "critic": self.judge.network}
+        return {"model": self.network, **critic}
+
+    def optimisers(self) -> dict[str, torch.optim.Optimizer]:
+        """One for each of the two that contend."""
+        return super().optimisers() | ({} if self.judge is None else {"critic-optimiser": self.judge.optimiser})
+
+    def make_optimisers(self) -> dict[str, torch.optim.Optimizer]:
+        """Make AdamW."""
+        rate = self.settings.learning_rate
+        return {"optimiser": torch.optim.AdamW(self.network.parameters(), lr=rate, weight_decay=_WEIGHT_DECAY)}
+
+    def read_initial_weights(self) -> dict[str, Tensor]:
+        """Read the initial prior's weights and statistics."""
+        return dict(density.load(self.settings.init).reference.state_dict())
+
+    def state(self) -> dict[str, Tensor]:
+        """Return everything that a continuation needs, but the step."""
+        history = None if self.judge is None else self.judge.history
+        return super().state() | ({} if history is None else {"history": history.windows})
+
+    def load_state(self, tensors: Mapping[str, Tensor], step: int) -> None:
+        """Go on from what `state` returned; KeyError or RuntimeError where it is not whole."""
+        super().load_state(tensors, step)
+        if self.judge is not None and "history" in tensors:
+            self.judge.history = HistoryBuffer(tensors["history"].to(self.windows.features.device))
+
+    def train_step(self) -> dict[str, float]:
+        """One update, and those of the critic where it has joined: `critic` is its loss, 1.39 where it has learnt
+        nothing, `accuracy` the share of windows that it classifies correctly."""
+        if self.judge is not None and self._criticised == 0:
+            self._introduce(self.judge)
+        parts = super().train_step()
+        if self.judge is None:
+            return parts
+        if self.judge.history is None:
+            self.average.load_state_dict(self.network.state_dict())
+            return {**parts, **_UNTAUGHT}
+        parts |= self.judge.learn(self.step, _CRITIC_UPDATES, self.generator)
+        update_average(self.average, self.network, min(_AVERAGE, self._criticised / (self._criticised + 20)))
+        return parts
+
+    def losses(self) -> dict[str, Tensor]:
+        """Compute the losses of a newly drawn batch, nats a frame."""
+        self._latest = self.draw_windows()
+        return {"loss": -self._log_prob(*self._latest).mean()}
+
+    def limit_gradients(self) -> None:
+        """Clip, and add the gradient of free runs where it is time for it."""
+        nn.utils.clip_grad_norm_(self.network.parameters(), _GRADIENT_CLIP)
+        joined = self.judge is not None and self._criticised >= 0
+        begun = self.step >= _MATCH_FROM * (self.steps - self.settings.critic_steps)
+        if self._criticised % _CRITIC_EVERY == 0 if joined else begun and self.step % _MATCH_EVERY == 0:
+            self._add_free_run_gradients(self.judge if joined else None)
+
+    def compute_learning_rate(self) -> float:
+        """Compute that of the current step."""
+        settings = self.settings
+        if self._criticised >= 0:
+            left = (settings.critic_steps - self._criticised) / max(1.0, _CRITIC_FALL * settings.critic_steps)
+            return _CRITIC_RATE * min(1.0, (self._criticised + 1) / _CRITIC_RISE) * min(1.0, left)
+        steps = self.steps - settings.critic_steps
+        warm = min(1.0, (self.step + 1) / 200)
+        return warm * settings.learning_rate * 0.5 * (1 + math.cos(math.pi * min(1.0, self.step / steps)))
+
+    def validate(self, corpus: Corpus) -> dict[str, float]:
+        """Measure the likelihood and the health of free runs."""
+        self.average.eval()
+        row = {"validation_nats": compute_validation_nats(self.average, corpus)}
+        row |= measure_free_runs(self.average, corpus)
+        self.average.train()
+        return row
+
+    def score(self, row: Row) -> float:
+        """Return the negative log density of unseen clips, nats a frame."""
+        found = row.get("validation_nats")
+        return math.nan if found is None else found
+
+    def export(self, parts: Split) -> Export:
+        """The network with moments to start from, and what the data show to be possible."""
+        model, settings = self.average.eval(), self.settings
+        known = density.read_labels(parts.train.names, settings.labels)
+        found = select_initial_states(
+            model, parts.train, count=settings.starts, generator=make_generator(settings.seed), labels=known.held
+        )
+        starts = {
+            "starts.previous": found.state.last_frame,
+            "starts.hidden": found.state.hidden,
+            "starts.cell": found.state.cell,
+            "starts.speed": found.speed,
+            "starts.weight": found.weight,
+        }
+        data = {"holds": measure_pace_changes(parts.whole), "labels": settings.labels, "starts": list(found.names)}
+        quality = {
+            "test_nats_per_frame": compute_validation_nats(model, parts.test),
+            "windows": compute_window_nats(model, (parts.validation, parts.test)),
+            "mocap": _measure_mocap(parts),
+            "data": summarise_states(parts.train.features),
+        }
+        return Export({**model.state_dict(), **starts}, data, quality, asdict(measure_data_limits(parts.train)))
+
+    @property
+    def _criticised(self) -> int:
+        """Steps since the critic joined; below 0 before."""
+        return self.step - self.steps + self.settings.critic_steps
+
+    @torch.no_grad()
+    def _introduce(self, judge: FreeRunJudge) -> None:
+        """Show free runs to the critic, and let it learn before the density is trained by it."""
+        self.average.load_state_dict(self.network.state_dict())
+        runs: list[Tensor] = []
+        while sum(map(len, runs)) < HISTORY:
+            runs.append(self._run_free(*self.draw_windows())[0])
+        judge.fill(torch.cat(runs)[:HISTORY])
+        with torch.enable_grad():
+            judge.learn(self.step, _CRITIC_HEAD_START, self.generator)
+
+    def _run_free(self, windows: Tensor, shown: Tensor) -> tuple[Tensor, Tensor]:
+        """Free runs after the first windows, given their paces as the network is in this step, and how these go on.
+
+        A pace may change within a window. Gait and style last, and runs have them from the frames they begin with:
+        given them as well, a density of walks was no better.
+        """
+        windows, shown = windows[:_FREE_RUNS], shown[:_FREE_RUNS]
+        paces = torch.zeros_like(shown)
+        paces[:, self._pace_labels] = shown[:, self._pace_labels]
+        condition = self._make_condition(shown.new_zeros(len(shown), 1), paces)
+        least = SEEN_FRAMES if self.judge is not None else 0
+        return run_free(self.network, windows, self.generator, least=least, condition=condition)
+
+    def _add_free_run_gradients(self, judge: FreeRunJudge | None) -> None:
+        """Add the gradient of the free runs' mismatch, and that of the critic's loss where it has joined, each clipped
+        on its own: no loss drowns another."""
+        made, real = self._run_free(*self._latest)
+        moments = moment_loss(made[:, : real.shape[1]], real, FREE_RUN_MOMENTS)
+        self._add_gradient(moments, retain_graph=judge is not None)
+        if judge is not None:
+            self._add_gradient(judge.score(made, self.generator))
+
+    def _add_gradient(self, loss: Tensor, *, retain_graph: bool = False) -> None:
+        parameters, processes = [p for p in self.network.parameters() if p.requires_grad], count_processes()[1]
+        found = torch.autograd.grad(loss, parameters, retain_graph=retain_graph, allow_unused=True)
+        used = [(p, g.contiguous()) for p, g in zip(parameters, found, strict=True) if g is not None]
+        if processes > 1:
+            for _, gradient in used:
+                distributed.all_reduce(gradient.div_(processes))
+        norm = torch.linalg.vector_norm(torch.stack([torch.linalg.vector_norm(g) for _, g in used]))
+        if bool(torch.isfinite(norm)):  # a free run that left the data's range carries no information
+            share = _GRADIENT_CLIP / norm.clamp(min=_GRADIENT_CLIP)
+            for parameter, gradient in used:
+                parameter.grad = share * gradient if parameter.grad is None else parameter.grad + share * gradient
+
+    def draw_windows(self) -> tuple[Float[Tensor, "batch window_and_one size"], Float[Tensor, "batch labels"]]:
+        """Windows of clips with the labels that the network is shown."""
+        drawn = self.windows.draw(self.settings.batch, self.generator)
+        labels = self.labels.held[torch.searchsorted(self.clip_ends, drawn.first, right=True)]
+        labels = torch.where(drawn.mirrored[:, None], labels[:, self.labels.mirrored], labels)
+        if self.paces is not None:
+            # How a window ends: given a pace that is not yet its own, the network changes to it within a window.
+            ends = self.paces[drawn.first + self.settings.window]
+            labels[:, self._pace_labels] = one_hot(ends, len(PACE_LABELS)).to(labels.dtype)
+        if not self.labels.names:
+            return drawn.features, labels
+        # Mostly no label or one group only, so that the network works with any subset of labels.
+        groups = self.labels.groups
+        shown = torch.rand(len(labels), len(groups), generator=self.generator) < _KEEP_GROUP_PROBABILITY
+        shown &= torch.rand(len(labels), 1, generator=self.generator) >= _UNLABELLED
+        return drawn.features, labels * (shown.to(labels.dtype) @ groups)
+
+    def _log_prob(self, windows: Tensor, shown: Tensor) -> Tensor:
+        """Log density of frames 1.. given noisy frames 0..: noise is on the inputs only (section 4.1.3)."""
+        model, size = self.network, self.network.layout.continuous
+        inputs, level = self._add_noise(model.normalise(windows[:, :-1]), size)
+        memory = model.start_after(windows[:, 0])
+        condition = self._make_condition(level, shown)
+        with torch.autocast(windows.device.type, torch.bfloat16, enabled=self.settings.bfloat16):
+            mixture, _ = model(inputs, (memory.hidden, memory.cell), condition=condition)
+        target = torch.cat([model.normalise(windows[:, 1:])[..., :size], windows[:, 1:, size:]], dim=-1)
+        return mixture.log_prob(target, model.whitening)
+
+    def _make_condition(self, level: Float[Tensor, "batch 1"], shown: Tensor) -> Float[Tensor, "batch conditions"]:
+        """Return the network's condition: the level of its input's noise where it takes it, and labels."""
+        return torch.cat([level / NOISE_UNIT, shown], -1) if self.network.config.knows_noise else shown
+
+    def _add_noise(self, inputs: Tensor, size: int) -> tuple[Tensor, Float[Tensor, "batch 1"]]:
+        """Inputs with noise and flipped bits, and each window's level of noise: log-uniform, or, where the network is
+        given it, all levels down to none, low ones more often."""
+        shape = inputs.shape
+        share = torch.rand(shape[0], 1, 1, generator=self.generator)
+        if self.network.config.knows_noise:
+            level = _INPUT_NOISE * _NOISE_RANGE * share.square()
+        else:
+            level = _INPUT_NOISE * torch.exp(share * math.log(_NOISE_RANGE))
+        noise = torch.randn(shape[0], shape[1], size, generator=self.generator) * level
+        flips = torch.rand(shape[0], shape[1], 2, generator=self.generator) < _BIT_FLIPS
+        bits = torch.where(flips, -inputs[..., size:], inputs[..., size:])
+        noisy = torch.cat([inputs[..., :size] + noise, bits], dim=-1)
+        return noisy, level[:, 0]
 
 
 def summarise_states(features: Float[Tensor, "frames size"]) -> dict[str, float]:
@@ -66,10 +403,6 @@ def summarise_states(features: Float[Tensor, "frames size"]) -> dict[str, float]
         "height": float(LAYOUT.pick(features, "root_height").mean()),
         "pose": float(LAYOUT.pick(features, "joint_rotations").std(0).mean()),
     }
-
-
-_SECOND = PRIOR_FPS  # frames
-_WARM_UP_FRAMES = 40  # frames of a clip before a start; the memory has settled by then
 
 
 def select_initial_states(
@@ -192,170 +525,6 @@ def _state_after(model: LstmGmm, clip: Float[Tensor, "frames size"]) -> LstmStat
         return model.advance(state, clip[1:].unsqueeze(0))
 
 
-_WIDTH = 128
-_LAYERS = ((3, 1), (5, 2), (5, 2), (3, 1))  # kernel and stride
-_LEAST_STD = 0.01
-_HIPS = CANONICAL.index("hips")
-_MEASURED = 256  # captured windows by which the critic's input is standardised
-_WARM_UP = 20  # steps in which the density's learning rate rises
-_FALL = 0.3  # share of the steps in which it falls to nothing
-
-
-@dataclass(frozen=True)
-class CriticSettings:
-    """When the critic joins, how it learns, and how the density does from then on."""
-
-    learning_rate: float = 3e-4
-    """Of the density in these steps; it falls to nothing over the last three tenths."""
-    every: int = 2
-    """Steps from one free run to the next."""
-    frames: int = 30
-    """Frames of a run that it sees."""
-    weight: float = 1.0
-    """Weight of its loss, whose gradient is clipped by itself."""
-    rate: float = 6e-4
-    """Learning rate of the critic."""
-    updates: int = 2
-    """Updates of the critic in a step."""
-    head_start: int = 400
-    """Updates of the critic before the density is trained by it."""
-    batch: int = 64
-    """Windows of captured motion an update, and as many of free runs."""
-    history: int = 512
-    """Windows of free runs that are kept for it."""
-    penalty: float = 0.5
-    """Weight of its squared slope at captured motion."""
-    average: float = 0.995
-    """Share of the past in the running mean of the density's weights, which is what is kept."""
-
-    def __post_init__(self):
-        require_at_least(self, 0, "head_start")
-        require_at_least(self, 1, "every", "updates", "batch", "history")
-        require_at_least(self, 2, "frames")
-
-    def compute_learning_rate(self, step: int, steps: int) -> float:
-        """That of the density in a step of so many with the critic."""
-        rise = min(1.0, (step + 1) / _WARM_UP)
-        return self.learning_rate * rise * min(1.0, (steps - step) / max(1.0, _FALL * steps))
-
-
-class FreeRunJudge:
-    """The critic, its optimiser, and the free runs that it has been shown."""
-
-    def __init__(self, settings: CriticSettings, windows: FeatureWindows, *, seed: int):
-        """`windows` are of captured motion, and longer than what it sees."""
-        self.settings, self.windows = settings, windows
-        shown = self._show_captured(_MEASURED, torch.Generator(windows.features.device).manual_seed(seed))
-        self.network = draw_weights(lambda: FreeRunCritic(shown.cpu()), seed).to(torch.get_default_device())
-        self.optimiser = torch.optim.Adam(self.network.parameters(), lr=settings.rate, betas=(0.5, 0.99))
-        self.history: HistoryBuffer | None = None
-
-    def fill(self, made: Float[Tensor, "history frames size"]) -> None:
-        """Begin to keep free runs for the critic to learn from, with these."""
-        self.history = HistoryBuffer(self._show_end(made))
-
-    def score(self, made: Float[Tensor, "batch frames size"], generator: torch.Generator) -> Tensor:
-        """Return the density's loss, whose gradient goes into what generated the motion; and keep the free runs in
-        place of earlier ones."""
-        assert self.history is not None
-        shown = self._show_end(made)
-        self.history.keep(shown.detach(), generator)
-        return self.settings.weight * compute_generator_loss(self.network(shown))
-
-    def learn(self, step: int, updates: int, generator: torch.Generator) -> dict[str, float]:
-        """Take updates on captured motion and what is kept; return the mean loss (1.39 where nothing is known), and the
-        mean share of windows classified correctly."""
-        rows = [self._update(step, generator) for _ in range(updates)]
-        return {name: sum(row[name] for row in rows) / len(rows) for name in ("critic", "told")}
-
-    def _update(self, step: int, generator: torch.Generator) -> dict[str, float]:
-        assert self.history is not None
-        count = self.settings.batch
-        real = self._show_captured(count, generator)
-        for_real, for_made = self.network(real), self.network(self.history.draw(count, generator))
-        loss = compute_critic_loss(for_real, for_made)
-        total = loss + self.settings.penalty * compute_gradient_penalty(self.network, real)
-        self.optimiser.zero_grad(set_to_none=True)
-        total.backward()
-        if not math.isfinite(float(total.detach())):
-            raise make_divergence_error(step, f"the loss of the critic is {float(total.detach())}")
-        self.optimiser.step()
-        right = torch.cat([for_real > 0, for_made < 0]).float().mean()
-        return {"critic": float(loss.detach()), "told": float(right)}
-
-    def _show_captured(self, count: int, generator: torch.Generator) -> Float[Tensor, "count seen rows"]:
-        return show(self.windows.draw(count, generator).features[:, : self.settings.frames + 1])
-
-    def _show_end(self, made: Float[Tensor, "batch frames size"]) -> Float[Tensor, "batch seen rows"]:
-        """Show the last frames of free runs: they are farthest from mocap."""
-        return show(made[:, -self.settings.frames - 1 :])
-
-
-class FreeRunCritic(nn.Module):
-    """Tells captured motion from free runs."""
-
-    mean: Tensor
-    std: Tensor
-
-    def __init__(self, rows: Float[Tensor, "windows frames rows"]):
-        """`rows` are captured, as `show` returns them; what it sees is measured in their standard deviations."""
-        super().__init__()
-        self.register_buffer("mean", rows.mean((0, 1)))
-        self.register_buffer("std", rows.std((0, 1)).clamp_min(_LEAST_STD))
-        widths = (rows.shape[-1], *(_WIDTH,) * (len(_LAYERS) - 1))
-        self.layers = nn.ModuleList(
-            nn.Conv1d(seen, _WIDTH, kernel, stride, padding=kernel // 2)
-            for seen, (kernel, stride) in zip(widths, _LAYERS, strict=True)
-        )
-        self.last = nn.Linear(2 * _WIDTH, 1)
-
-    def standardise(self, rows: Float[Tensor, "batch frames rows"]) -> Float[Tensor, "batch frames rows"]:
-        """Put rows into the units that `judge` takes."""
-        return (rows - self.mean) / self.std
-
-    def judge(self, standard: Float[Tensor, "batch frames rows"]) -> Float[Tensor, " batch"]:
-        """Return the logits that windows were captured; by the mean over time and by the worst moment."""
-        hidden = standard.transpose(1, 2)
-        for layer in self.layers:
-            hidden = leaky_relu(layer(hidden), 0.2)
-        return self.last(torch.cat([hidden.mean(-1), hidden.amax(-1)], -1))[:, 0]
-
-    def forward(self, rows: Float[Tensor, "batch frames rows"]) -> Float[Tensor, " batch"]:
-        """Return the logits that windows of what `show` returns were captured."""
-        return self.judge(self.standardise(rows))
-
-
-def show(features: Float[Tensor, "batch frames size"]) -> Float[Tensor, "batch frames_less_one rows"]:
-    """Encode motion from its second frame on, in metres and m/s on the ground frame of the first: joints about the
-    hips, all joints' velocities, and the hips."""
-    trial = Trial.of_features(features)
-    first = rotations.lift_ground(trial.joints_world[:, :1, _HIPS, ::2]).unsqueeze(-2)
-    seen = rotations.rotate_about_y(trial.joints_world - first, -trial.heading[:, :1, None])
-    hips, velocity = seen[:, 1:, _HIPS], torch.diff(seen, dim=1) * PRIOR_FPS
-    about = seen[:, 1:] - rotations.lift_ground(hips[..., ::2]).unsqueeze(-2)
-    return torch.cat([about.flatten(2), velocity.flatten(2), hips], dim=-1)
-
-
-def compute_critic_loss(real: Float[Tensor, " batch"], made: Float[Tensor, " others"]) -> Tensor:
-    """Cross entropy of both answers in nats; 1.39 where nothing is known (Goodfellow et al. 2014, Eq. 1)."""
-    return softplus(-real).mean() + softplus(made).mean()
-
-
-def compute_generator_loss(made: Float[Tensor, " batch"]) -> Tensor:
-    """Negative log probability that what was made is taken for captured (Goodfellow et al. 2014, section 3)."""
-    return softplus(-made).mean()
-
-
-def compute_gradient_penalty(critic: FreeRunCritic, real: Float[Tensor, "batch frames rows"]) -> Tensor:
-    """Mean squared slope of the critic at captured motion (R1 of Mescheder et al. 2018), by standard deviations."""
-    standard = critic.standardise(real).detach().requires_grad_()
-    (slope,) = torch.autograd.grad(critic.judge(standard).sum(), standard, create_graph=True)
-    return slope.square().flatten(1).sum(dim=1).mean()
-
-
-_SETTLING_FRAMES = 300
-
-
 def measure_free_runs(
     model: LstmGmm, corpus: Corpus, *, runs: int = 8, frames: int = 1500, temperature: float = 1.0, seed: int = 0
 ) -> dict[str, float]:
@@ -374,16 +543,6 @@ def measure_free_runs(
     result["free_run_slowest_m_s"] = float(ground_speed(settled[:, -150:]).mean(-1).min())
     result["free_run_finite"] = float(torch.isfinite(features).all())
     return result
-
-
-def measure_quality(model: LstmGmm, parts: Split) -> dict[str, Any]:
-    """Measure the quality of a finished network, for its card."""
-    return {
-        "test_nats_per_frame": compute_validation_nats(model, parts.test),
-        "windows": compute_window_nats(model, (parts.validation, parts.test)),
-        "mocap": _measure_mocap(parts),
-        "data": summarise_states(parts.train.features),
-    }
 
 
 def _measure_mocap(parts: Split) -> dict[str, dict[str, float]]:
@@ -436,417 +595,3 @@ def compute_feature_statistics(features: Float[Tensor, "frames size"]) -> tuple[
     for values in (mean, floor, std):
         values[LAYOUT.slices["contacts"]] = 0.5
     return mean, torch.maximum(std, floor)
-
-
-_KEEP_GROUP_PROBABILITY = 0.7
-_MOST = 0.3  # change of tempo or stride, beyond which walks are no longer likely
-_LEAST_RUNS = 4  # free runs that are compared: slow ones with slow ones, by quarters
-_UNTOLD = {"critic": 2 * math.log(2), "told": 0.5}  # of a critic that knows nothing
-
-
-@dataclass(frozen=True)
-class TrainingSettings:
-    """How a density is trained."""
-
-    steps: int = 20_000
-    """Optimiser steps in all."""
-    batch: int = 128
-    """Windows a step."""
-    window: int = 50
-    """Frames a window."""
-    learning_rate: float = 1e-3
-    """At the start."""
-    gradient_clip: float = 5.0
-    """The gradient's norm is clipped to this."""
-    input_noise: float = 0.05
-    """Standard deviation of the noise on normalised inputs (section 4.1.3)."""
-    noise_range: float = 4.0
-    """Each window draws its noise level log-uniformly between `input_noise` and this many times it; 1 is the paper.
-    A network that knows the level is shown all levels down to none, low ones more often."""
-    bit_flips: float = 0.02
-    """Share of input contact bits that are flipped."""
-    copies: int = 0
-    """Copies of each clip at other tempos and with other strides, for corpora of a few minutes."""
-    tempo: float = 0.15
-    """Largest change of a copy's tempo, as a share: 0.15 plays at 0.85 to 1.15 of the speed."""
-    strides: float = 0.1
-    """Largest change of how far a copy's feet and hips go, as a share: as of a body with longer or shorter legs."""
-    standing_share: float = 1.0
-    """Share of the windows in which nobody goes anywhere that are drawn: where most of the motion stands, a density
-    that sees all of them stands fast, and is hard to steer into a walk."""
-    weight_decay: float = 1e-4
-    """Decoupled."""
-    matching: MatchingSettings = field(default_factory=MatchingSettings)
-    """Free runs held to the data's moments."""
-    critic_steps: int = 0
-    """Last steps of the run, in which a critic judges free runs; 0 leaves it out."""
-    critic: CriticSettings = field(default_factory=CriticSettings)
-    """How that critic learns."""
-    untold: float = 0.5
-    """Share of the windows without labels; the others show each group (gait, style) with probability 0.7."""
-    bfloat16: bool = False
-    """The network computes in bfloat16, weights and loss stay in float32: faster where the processor has it."""
-    seed: int = 1
-    """Seed of weights, windows and noise."""
-
-    def __post_init__(self):
-        require_at_least(self, 1, "steps", "batch", "window")
-        require_at_least(self, 0, "copies", "critic_steps")
-        for name, change in (("tempo", self.tempo), ("strides", self.strides)):
-            if not 0 <= change <= _MOST:
-                raise RequestError(f"{name} must lie between 0 and {_MOST}, got {change:g}")
-        if self.critic_steps >= self.steps:
-            raise RequestError(
-                f"a critic joins the last steps of a run: {self.critic_steps} of them are not under the {self.steps} of"
-                " all"
-            )
-        if self.critic_steps and self.window < self.critic.frames:
-            raise RequestError(f"the critic sees {self.critic.frames} frames; windows have {self.window}")
-        if not 0 < self.standing_share <= 1:
-            raise RequestError(f"the share of standing windows must be over 0 and at most 1: {self.standing_share:g}")
-
-
-class DensityTrainer(GradientTrainer[LstmGmm]):
-    """Draws windows, spoils the inputs, and makes the frames after them likelier."""
-
-    def __init__(
-        self,
-        config: LstmGmmConfig,
-        settings: TrainingSettings,
-        corpus: Corpus,
-        *,
-        labels: Labels | None = None,
-        paces: Int[Tensor, " frames"] | None = None,
-        init: Mapping[str, Tensor] | None = None,
-    ):
-        """`labels` of the corpus' clips, the network's own, with those of PACE_LABELS held by none; `paces` of its
-        frames, as `follow_paces` finds them, if these are told; `init` holds weights and statistics to begin with."""
-        mean, std = compute_feature_statistics(corpus.features)
-        super().__init__(lambda: LstmGmm(config, mean=mean, std=std), settings)
-        if init is not None:
-            self.network.load_state_dict(dict(init))
-        self.labels = labels or Labels.none(len(corpus.lengths))
-        self.paces = paces
-        self._pace_labels = [] if paces is None else [self.labels.names.index(name) for name in PACE_LABELS]
-        self.clip_ends = torch.tensor(corpus.lengths).cumsum(0)
-        self.windows = FeatureWindows(corpus, settings.window + 1, standing_share=settings.standing_share)
-        self._latest = corpus.features[:0], self.labels.held[:0]  # windows of the step under way, and their labels
-        self.judge: FreeRunJudge | None = None
-        self.average = self.network
-        """Moving average of the weights since the critic joined, the weights themselves without one."""
-        if settings.critic_steps:
-            self.judge = FreeRunJudge(settings.critic, self.windows, seed=settings.seed)
-            self.average = copy.deepcopy(self.network).requires_grad_(False)
-
-    @property
-    def exported(self) -> LstmGmm:
-        """The moving average of the weights."""
-        return self.average
-
-    def networks(self) -> dict[str, nn.Module]:
-        """All that is learnt, by its name in checkpoints."""
-        critic = {} if self.judge is None else {"average": self.average, "critic": self.judge.network}
-        return {"model": self.network, **critic}
-
-    def optimisers(self) -> dict[str, torch.optim.Optimizer]:
-        """One for each of the two that contend."""
-        return super().optimisers() | ({} if self.judge is None else {"critic-optimiser": self.judge.optimiser})
-
-    def state(self) -> dict[str, Tensor]:
-        """Return everything that a continuation needs, but the step."""
-        if self.judge is None or self.judge.history is None:
-            return super().state()
-        return super().state() | {"history": self.judge.history.windows}
-
-    def load_state(self, tensors: Mapping[str, Tensor], step: int) -> None:
-        """Go on from what `state` returned; KeyError or RuntimeError where it is not whole."""
-        super().load_state(tensors, step)
-        if self.judge is not None and "history" in tensors:
-            self.judge.history = HistoryBuffer(tensors["history"].to(self.windows.features.device))
-
-    def train_step(self) -> dict[str, float]:
-        """One update, and those of the critic where it has joined; `critic` is its loss, 1.39 where it knows nothing,
-        `told` the share of windows that it tells from mocap."""
-        if self.judge is not None and self._criticised == 0:
-            self._introduce(self.judge)
-        parts = super().train_step()
-        if self.judge is None:
-            return parts
-        if self.judge.history is None:
-            self.average.load_state_dict(self.network.state_dict())
-            return {**parts, **_UNTOLD}
-        parts |= self.judge.learn(self.step, self.settings.critic.updates, self.generator)
-        keep = min(self.settings.critic.average, self._criticised / (self._criticised + 20))
-        with torch.no_grad():
-            for mean, weight in zip(self.average.parameters(), self.network.parameters(), strict=True):
-                mean.lerp_(weight, 1 - keep)
-        return parts
-
-    def losses(self) -> dict[str, Tensor]:
-        """Compute the losses of a newly drawn batch, nats a frame."""
-        self._latest = self._draw_windows()
-        return {"loss": -self._log_prob(*self._latest).mean()}
-
-    def limit_gradients(self) -> None:
-        """Clip, and add the gradient of free runs where it is time for it."""
-        settings, matching = self.settings, self.settings.matching
-        nn.utils.clip_grad_norm_(self.network.parameters(), settings.gradient_clip)
-        if self._joined is not None:
-            if self._criticised % settings.critic.every == 0:
-                self._add_free_run_gradients(*self._latest)
-            return
-        begin = matching.begin * (self.steps - settings.critic_steps)
-        if matching.begin < 1 and self.step >= begin and self.step % matching.every == 0:
-            self._add_free_run_gradients(*self._latest)
-
-    def compute_learning_rate(self) -> float:
-        """Compute that of the current step."""
-        settings = self.settings
-        if self._joined is not None:
-            return settings.critic.compute_learning_rate(self._criticised, settings.critic_steps)
-        steps = self.steps - settings.critic_steps
-        warm = min(1.0, (self.step + 1) / 200)
-        return warm * settings.learning_rate * 0.5 * (1 + math.cos(math.pi * min(1.0, self.step / steps)))
-
-    def make_optimisers(self) -> dict[str, torch.optim.Optimizer]:
-        """Make AdamW with the settings' weight decay."""
-        settings, weights = self.settings, self.network.parameters()
-        adam = torch.optim.AdamW(weights, lr=settings.learning_rate, weight_decay=settings.weight_decay)
-        return {"optimiser": adam}
-
-    def validate(self, corpus: Corpus) -> dict[str, float]:
-        """Likelihood and the health of free runs: likelihood does not predict stability."""
-        self.average.eval()
-        row = {"validation_nats": compute_validation_nats(self.average, corpus)}
-        row |= measure_free_runs(self.average, corpus)
-        self.average.train()
-        return row
-
-    @property
-    def _criticised(self) -> int:
-        """Steps since the critic joined; below 0 before."""
-        return self.step - self.steps + self.settings.critic_steps
-
-    @property
-    def _joined(self) -> FreeRunJudge | None:
-        """The critic, once it has joined."""
-        return self.judge if self._criticised >= 0 else None
-
-    @torch.no_grad()
-    def _introduce(self, judge: FreeRunJudge) -> None:
-        """Show the critic what the density makes, and let it learn, before the density hears it."""
-        settings = self.settings.critic
-        self.average.load_state_dict(self.network.state_dict())
-        made, count = [], settings.history
-        while sum(map(len, made)) < count:
-            made.append(self._run_free(*self._draw_windows())[0])
-        judge.fill(torch.cat(made)[:count])
-        with torch.enable_grad():
-            judge.learn(self.step, settings.head_start, self.generator)
-
-    def _run_free(self, windows: Tensor, told: Tensor) -> tuple[Tensor, Tensor]:
-        """Free runs after the first windows, told their paces as the network is in this step, and how these go on.
-
-        A pace may change within a window. Gait and style last, and runs have them from the frames they begin with: told
-        them as well, a density of walks was no better.
-        """
-        matching = self.settings.matching
-        matching = replace(matching, batch=max(_LEAST_RUNS, matching.batch))
-        least = self.settings.critic.frames if self.judge is not None else 0
-        paces = torch.zeros_like(told)
-        paces[:, self._pace_labels] = told[:, self._pace_labels]
-        condition = self._make_condition(told.new_zeros(len(told), 1), paces)
-        return run_free(self.network, windows, matching, self.generator, least=least, condition=condition)
-
-    def _add_free_run_gradients(self, windows: Tensor, told: Tensor) -> None:
-        """Add the gradient of the free runs' mismatch, and that of what the critic says of them where it has joined,
-        each clipped on its own: no loss drowns another."""
-        judge, (made, real) = self._joined, self._run_free(windows, told)
-        if self.settings.matching.begin < 1:
-            moments = moment_loss(made[:, : real.shape[1]], real, self.settings.matching)
-            self._add_gradient(moments, retain_graph=judge is not None)
-        if judge is not None:
-            self._add_gradient(judge.score(made, self.generator))
-
-    def _add_gradient(self, loss: Tensor, *, retain_graph: bool = False) -> None:
-        parameters = [p for p in self.network.parameters() if p.requires_grad]
-        before = [p.grad for p in parameters]
-        for parameter in parameters:
-            parameter.grad = None
-        loss.backward(retain_graph=retain_graph)
-        found = [p.grad for p in parameters]
-        norm = torch.linalg.vector_norm(torch.stack([torch.linalg.vector_norm(g) for g in found if g is not None]))
-        share = self.settings.gradient_clip / norm.clamp(min=self.settings.gradient_clip)
-        # A free run that left the data's range says nothing.
-        share = share if bool(torch.isfinite(norm)) else None
-        for parameter, gradient, own in zip(parameters, found, before, strict=True):
-            parameter.grad = own
-            if gradient is not None and share is not None:
-                parameter.grad = share * gradient if own is None else own + share * gradient
-
-    def _draw_windows(self) -> tuple[Float[Tensor, "batch window_and_one size"], Float[Tensor, "batch labels"]]:
-        """Windows of clips with the labels that the network is shown."""
-        drawn = self.windows.draw(self.settings.batch, self.generator)
-        labels = self.labels.held[torch.searchsorted(self.clip_ends, drawn.first, right=True)]
-        labels = torch.where(drawn.mirrored[:, None], labels[:, self.labels.mirrored], labels)
-        if self.paces is not None:
-            # How a window ends: told a pace that is not yet its own, the network changes to it within a window.
-            ends = self.paces[drawn.first + self.settings.window]
-            labels[:, self._pace_labels] = one_hot(ends, len(PACE_LABELS)).to(labels.dtype)
-        return drawn.features, self._tell_some(labels)
-
-    def _tell_some(self, labels: Float[Tensor, "batch labels"]) -> Float[Tensor, "batch labels"]:
-        """Mostly show no label or one group only, so that the network works with any subset of labels."""
-        if not self.labels.names:
-            return labels
-        groups = self.labels.groups
-        told = torch.rand(len(labels), len(groups), generator=self.generator) < _KEEP_GROUP_PROBABILITY
-        told &= torch.rand(len(labels), 1, generator=self.generator) >= self.settings.untold
-        return labels * (told.to(labels.dtype) @ groups)
-
-    def _log_prob(self, windows: Tensor, told: Tensor) -> Tensor:
-        """Log density of frames 1.. given noisy frames 0..: noise is on the inputs only (section 4.1.3)."""
-        model, size = self.network, self.network.layout.continuous
-        inputs, level = self._add_noise(model.normalise(windows[:, :-1]), size)
-        memory = model.start_after(windows[:, 0])
-        condition = self._make_condition(level, told)
-        with torch.autocast(windows.device.type, torch.bfloat16, enabled=self.settings.bfloat16):
-            mixture, _ = model(inputs, (memory.hidden, memory.cell), condition=condition)
-        target = torch.cat([model.normalise(windows[:, 1:])[..., :size], windows[:, 1:, size:]], dim=-1)
-        return mixture.log_prob(target, model.whitening)
-
-    def _make_condition(self, level: Float[Tensor, "batch 1"], told: Tensor) -> Float[Tensor, "batch conditions"]:
-        """Make what the network is told: the level of its input's noise where it wants to know it, and labels."""
-        return torch.cat([level / NOISE_UNIT, told], -1) if self.network.config.knows_noise else told
-
-    def _add_noise(self, inputs: Tensor, size: int) -> tuple[Tensor, Float[Tensor, "batch 1"]]:
-        """Inputs with noise and flipped bits, and each window's level of noise."""
-        settings, shape = self.settings, inputs.shape
-        share = torch.rand(shape[0], 1, 1, generator=self.generator)
-        if self.network.config.knows_noise:
-            level = settings.input_noise * settings.noise_range * share.square()
-        else:
-            level = settings.input_noise * torch.exp(share * math.log(settings.noise_range))
-        noise = torch.randn(shape[0], shape[1], size, generator=self.generator) * level
-        flips = torch.rand(shape[0], shape[1], 2, generator=self.generator) < settings.bit_flips
-        bits = torch.where(flips, -inputs[..., size:], inputs[..., size:])
-        noisy = torch.cat([inputs[..., :size] + noise, bits], dim=-1)
-        return noisy, level[:, 0]
-
-
-@dataclass(frozen=True)
-class DensityRecipe(Recipe[LstmGmmConfig, TrainingSettings, DensityTrainer]):
-    """What to train a density on, and how."""
-
-    kind = "lstm-gmm"
-    config: LstmGmmConfig = field(default_factory=LstmGmmConfig)
-    settings: TrainingSettings = field(default_factory=TrainingSettings)
-    starts: int = 64
-    """Moments of mocap that the finished prior carries."""
-    splices: int = 0
-    """Splices of the clips that are tried; those that pass for mocap are trained on as well."""
-    stitcher: str = "stitcher"
-    """Stitcher of the splices: the bundled one, or the file or run folder of a trained one."""
-    labels: str = ""
-    """Regular expression whose named groups read labels from a clip's path, to condition the density on."""
-    label_pace: bool = False
-    """Whether the pace is a label as well: stand, walk or run, by how a window ends. It is where training begins with a
-    prior that knows paces."""
-    init: str | None = None
-    """Prior whose weights and statistics training begins with; the network is then that prior's."""
-
-    def __post_init__(self):
-        super().__post_init__()
-        require_at_least(self, 1, "starts")
-        require_at_least(self, 0, "splices")
-        if self.label_pace and "(?P<pace>" in self.labels:
-            raise RequestError("the group pace is that of --label-pace; call the one of --labels by another name")
-
-    def check(self) -> None:
-        """Before anything is read."""
-        super().check()
-        if self.splices:
-            stitcher.load(self.stitcher)  # a wrong name shall not be told after all clips were read
-
-    def gather(self, progress: Progress, warn: Progress) -> Gathered:
-        """Read and split the clips, and add their splices to those that are trained on."""
-        gathered = super().gather(progress, warn)
-        cache, seed = self.out / "cache", self.settings.seed
-        train = add_splices(gathered.parts.train, self.splices, self.stitcher, cache, seed=seed)
-        if self.splices:
-            progress(f"{len(train.names) - len(gathered.parts.train.names)} of {self.splices} splices pass for mocap")
-        parts = replace(gathered.parts, train=train)
-        return Gathered(gathered.corpus, parts)
-
-    def make_trainer(self, parts: Split) -> DensityTrainer:
-        """Make the trainer of a new network for the clips' labels, or of the initial network with its own labels."""
-        with use_device("cpu"):  # copies are made one after the other
-            seeded = make_generator(self.settings.seed)
-            own = self.settings
-            copied = add_copies(parts.train.to("cpu"), own.copies, seeded, tempo=own.tempo, strides=own.strides)
-            followed = follow_paces(copied) if self.label_pace or self.init is not None else None
-        corpus = copied.to(torch.get_default_device().type)
-        known = density.read_labels(hide_splices(corpus.names), self.labels)
-        followed = None if followed is None else followed.to(corpus.features.device)
-        if self.init is None:
-            known = known.renamed((*known.names, *PACE_LABELS)) if self.label_pace else known
-            config = replace(self.config, labels=known.names)
-            return DensityTrainer(config, self.settings, corpus, labels=known, paces=followed)
-        before = density.load(self.init).reference
-        known, paces = known.renamed(before.config.labels), None
-        if {*PACE_LABELS} <= {*known.names}:
-            paces = followed
-        elif self.label_pace:
-            raise RequestError(f"the prior {self.init!r} was not trained with labels of paces; leave --label-pace out")
-        return DensityTrainer(before.config, self.settings, corpus, labels=known, paces=paces, init=before.state_dict())
-
-    def find_shape(self, trainer: DensityTrainer) -> LstmGmmConfig:
-        """Return the configuration of the network that is trained."""
-        return trainer.network.config
-
-    def describe_run(self, trainer: DensityTrainer, corpus: Corpus) -> dict[str, Row]:
-        """Describe what must not change between a run's parts."""
-        own = {"match": self.chosen, "labels": self.labels, "init": self.init or "", "paces": self.label_pace}
-        found = super().describe_run(trainer, corpus)
-        return {**found, "data": found["data"] | own | self._describe_splices()}
-
-    def score(self, row: Row) -> float:
-        """Return the negative log density of unseen clips, nats a frame."""
-        found = row.get("validation_nats")
-        return math.nan if found is None else found
-
-    def export(self, trainer: DensityTrainer, gathered: Gathered, curve: Sequence[Row]) -> Export:
-        """The network with moments to start from, and what the data show to be possible."""
-        model, corpus, parts = trainer.average.eval(), gathered.corpus, gathered.parts
-        clips, seeded = drop_splices(parts.train), make_generator(self.settings.seed)
-        known = density.read_labels(clips.names, self.labels)
-        found = select_initial_states(model, clips, count=self.starts, generator=seeded, labels=known.held)
-        data = {
-            "clips": len(corpus.names),
-            "frames": len(corpus.features),
-            **corpus.describe_selection(),
-            "holds": measure_pace_changes(corpus),
-            "match": self.chosen,
-            "labels": self.labels,
-            **self._describe_splices(),
-            "split_seed": self.split_seed,
-            "starts": list(found.names),
-            "held_out": gathered.held_out(),
-        }
-        return Export(
-            {
-                **model.state_dict(),
-                "starts.previous": found.state.last_frame,
-                "starts.hidden": found.state.hidden,
-                "starts.cell": found.state.cell,
-                "starts.speed": found.speed,
-                "starts.weight": found.weight,
-            },
-            data,
-            measure_quality(model, parts),
-            asdict(measure_data_limits(clips)),
-        )
-
-    def _describe_splices(self) -> dict[str, str]:
-        """How many were tried, and by which stitcher; nothing where there are none."""
-        return {"splices": str(self.splices), "stitcher": self.stitcher} if self.splices else {}

@@ -1,9 +1,9 @@
-"""Training of the path predictor: windows of motion, and how far from its own the predicted trajectory of the hips
-ends (Zhou et al. 2020, section 3.4).
+"""Training of the path predictor: windows of motion, and how far the predicted trajectory of the hips is from
+their own (Zhou et al. 2020, section 3.4).
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -19,74 +19,87 @@ from mapctl.inbetweening.root_trajectory import (
 )
 from priors.checkpoints import require_at_least
 from priors.path import PathConfig, PathNetwork
-from priors.training.data import Corpus
-from priors.training.loop import GradientTrainer, NetworkRecipe, Row, average_logarithms, make_generator
-from priors.training.windows import PoseVariation, PoseWindows, Variation, find_kind
+from priors.training.data import Corpus, Split
+from priors.training.loop import (
+    Count,
+    GradientTrainer,
+    MaybeCount,
+    NetworkSettings,
+    Number,
+    Row,
+    average_logarithms,
+    given,
+    make_generator,
+)
+from priors.training.windows import KINDS, PoseVariation, PoseWindows, Variation, find_kind
 
 _VALIDATED = ("V1", "V8", "V32", "V64", "Y")
 _SHORTEST_WINDOW = 32  # frames
-_MIN_STD = 0.05  # metres: of a place that hardly moves, as the thighs' from the hips
+_MIN_STD = 0.05  # metres: of a position that hardly moves, as the thighs' from the hips
+_HEIGHT = 1.0  # weight of the error of the hips' height, cm; that of the displacements, cm, is 1
+_CONTACTS = 0.5  # weight of the contacts' cross entropy, nats
+_VARIATION = Variation(poses=PoseVariation(share=0.0, tilted=0.0))
 
 
-@dataclass(frozen=True)
-class PathSettings:
-    """How a path predictor is trained."""
+@dataclass(frozen=True, kw_only=True)
+class PathSettings(NetworkSettings):
+    """Train a path predictor, which predicts the root trajectory from how the body moves about the hips."""
 
-    steps: int = 12_000
-    """Updates."""
-    batch: int = 4096
-    """Frames an update; windows of one update are equally long."""
-    window: int = 192
+    kind = "path"
+    used_by = "use it with mapctl infill --way A:B --path"
+
+    steps: Count = 12_000
+    """Steps in all."""
+    batch: Count = 4096
+    """Frames a step; windows of one step are equally long."""
+    window: Count = 192
     """Frames of the longest window; the shortest have 32."""
-    learning_rate: float = 2e-3
-    """At its highest; it falls to nothing along a cosine."""
-    height: float = 1.0
-    """Weight of the error of the hips' height, cm; that of the displacements, cm, is 1."""
-    contacts: float = 0.5
-    """Weight of the contacts' cross entropy, nats."""
-    evenness: float = 1.0
-    """How evenly windows are drawn from kinds of clips: 0 by their frames, 1 the same number from each."""
-    kinds: tuple[str, ...] = ("walk-turn", "walk", "run|dash", "^cmu")
-    """Kinds, as patterns of names; clips of none of these are another kind."""
-    variation: Variation = field(default_factory=lambda: Variation(poses=PoseVariation(share=0.0, tilted=0.0)))
-    """How bodies and tempos vary."""
-    bfloat16: bool = False
-    """The network computes in bfloat16; weights and loss stay in float32."""
-    seed: int = 1
-    """Seed of weights and windows."""
+    learning_rate: Number = 2e-3
+    """At its highest; less to fine-tune."""
+    width: MaybeCount = None
+    """Channels of the outer layers; the inner ones have twice as many."""
 
     def __post_init__(self):
-        require_at_least(self, 1, "steps", "batch")
+        super().__post_init__()
         require_at_least(self, _SHORTEST_WINDOW, "window")
+
+    def make_config(self) -> PathConfig:
+        """Return the shape of the network that these settings ask for."""
+        return given(PathConfig(), width=self.width)
+
+    def make_trainer(self, parts: Split) -> "PathTrainer":
+        """Make the trainer as it is before the first step."""
+        return PathTrainer(self, parts.train)
 
 
 class PathTrainer(GradientTrainer[PathNetwork]):
     """Draws windows, and brings the trajectory that the network predicts of them nearer to their own."""
 
-    def __init__(self, config: PathConfig, settings: PathSettings, corpus: Corpus):
-        self.windows = PoseWindows(corpus, kinds=settings.kinds, evenness=settings.evenness)
+    def __init__(self, settings: PathSettings, corpus: Corpus):
+        self.windows = PoseWindows(corpus, evenness=1.0)
         # A window at the fastest tempo must fit into the longest clip.
-        self.longest = min(settings.window, int(int(self.windows.lengths.max()) / (1 + settings.variation.tempo)) - 1)
-        super().__init__(lambda: PathNetwork(config, bfloat16=settings.bfloat16), settings)
+        self.longest = min(settings.window, int(int(self.windows.lengths.max()) / (1 + _VARIATION.tempo)) - 1)
+        self.config = settings.find_config()
+        super().__init__(settings, lambda: PathNetwork(self.config, bfloat16=settings.bfloat16))
         _set_moments(self.network, self.windows)
+        self.begin()
 
     def losses(self) -> dict[str, Tensor]:
         """Compute the losses of a newly drawn batch."""
         spare = max(0, self.longest - _SHORTEST_WINDOW)
         frames = min(self.longest, _SHORTEST_WINDOW + int(torch.randint(spare + 1, (), generator=self.generator)))
         batch = max(1, self.settings.batch // frames)
-        motion = self.windows.draw(batch, frames, self.generator, variation=self.settings.variation)
-        return compute_path_losses(self.network, motion, self.settings)
+        return compute_path_losses(self.network, self.windows.draw(batch, frames, self.generator, variation=_VARIATION))
 
     @torch.no_grad()
     def validate(self, corpus: Corpus) -> dict[str, Any]:
-        """Mean error of displacements and heights over unseen clips, cm, by kind and of all clips alike."""
-        windows = PoseWindows(corpus, kinds=self.settings.kinds, evenness=1.0)
-        kinds = [*self.settings.kinds, "other"]
+        """Measure the mean error of displacements and heights over unseen clips, cm, by kind and of all clips alike."""
+        windows = PoseWindows(corpus, evenness=1.0)
+        kinds = [*KINDS, "other"]
         rows: dict[str, list[Mapping[str, float]]] = {}
         for number, name in enumerate(corpus.names):
             found = measure_clip(self.network, windows, number)
-            for group in ("all", kinds[find_kind(name, self.settings.kinds)]):
+            for group in ("all", kinds[find_kind(name)]):
                 rows.setdefault(group, []).append(found)
         return {
             f"{group}_{name}_cm": sum(row[name] for row in found if name in row) / sum(name in row for row in found)
@@ -95,22 +108,12 @@ class PathTrainer(GradientTrainer[PathNetwork]):
             if any(name in row for row in found)
         }
 
-
-@dataclass(frozen=True)
-class PathRecipe(NetworkRecipe[PathConfig, PathSettings, PathTrainer]):
-    """What to train a path predictor on, and how."""
-
-    kind = "path"
-    trainer_class = PathTrainer
-    config: PathConfig = field(default_factory=PathConfig)
-    settings: PathSettings = field(default_factory=PathSettings)
-
     def score(self, row: Row) -> float:
-        """Errors over unseen clips, cm, geometric mean over spans and the height."""
+        """Return the errors over unseen clips, cm, geometric mean over spans and the height."""
         return average_logarithms(row.get(f"all_{name}_cm") for name in _VALIDATED)
 
 
-def compute_path_losses(network: PathNetwork, motion: PartialMotion, settings: PathSettings) -> dict[str, Tensor]:
+def compute_path_losses(network: PathNetwork, motion: PartialMotion) -> dict[str, Tensor]:
     """The loss, and in plain units the errors it is made of.
 
     Displacements over 1, 2, 4 to 64 frames count alike (Zhou et al. 2020, Eq. 5), but by their distance instead of its
@@ -128,7 +131,7 @@ def compute_path_losses(network: PathNetwork, motion: PartialMotion, settings: P
     )
     height = 100 * (predicted.height - hips[..., 1]).abs().mean()
     contacts = cross_entropy(predicted.contacts, motion.contacts)
-    loss = path.mean() + settings.height * height + settings.contacts * contacts
+    loss = path.mean() + _HEIGHT * height + _CONTACTS * contacts
     parts = {"path_cm": path.mean(), "V1_cm": path[0], "height_cm": height, "contacts_nats": contacts}
     return {"loss": loss, **parts}
 
@@ -145,7 +148,7 @@ def measure_clip(network: PathNetwork, windows: PoseWindows, number: int) -> dic
 
 
 def _set_moments(network: PathNetwork, windows: PoseWindows) -> None:
-    """Tell the network means and spreads of the places that it sees, of motion and its mirror image."""
+    """Set means and spreads of the positions that the network sees, of motion and its mirror image."""
     batch = windows.draw(4000, 4, make_generator(0))
     seen = LocalMotion.of_world(batch.world_poses()[0], batch.heading)
     places = torch.cat([seen.places, seen.mirrored().places])[..., 1:, :].flatten(0, 1)

@@ -1,8 +1,7 @@
-"""Training of the pose transformer: windows of which parts are hidden, and how far from them it comes back."""
+"""Training of the pose transformer: windows of which parts are hidden, and their distance from what it returns."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -11,73 +10,341 @@ from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits as cross_entropy
 
 from mapctl import rotations
-from mapctl.errors import RequestError
 from mapctl.inbetweening.partial_motion import EFFECTORS, KnownParts, PartialMotion
 from mapctl.numerics import gaussian
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors.checkpoints import require_at_least
 from priors.pose_transformer import QUANTILES, PoseTransformerConfig, PoseTransformerNetwork, ProposedPoses
 from priors.training.augment import Draws
-from priors.training.data import Corpus
+from priors.training.data import Corpus, Split
 from priors.training.loop import (
+    Count,
     Export,
-    Gathered,
     GradientTrainer,
-    NetworkRecipe,
+    MaybeCount,
+    NetworkSettings,
+    Number,
     Row,
     average_logarithms,
+    given,
     make_adam,
     make_generator,
 )
 from priors.training.windows import PoseVariation, PoseWindows, Variation, add_targets
 
+VALIDATED_GAPS = (5, 15, 30, 45, 60, 120)
+"""Gaps that are validated, frames."""
+_SHORTEST_WINDOW = 8  # frames
+_VALIDATED_WINDOWS = 128
+_UNFAMILIAR, _UNFAMILIAR_GAPS = Variation(poses=PoseVariation(share=1.0)), (5, 15, 30)
+_CALIBRATED_FRAMES = (10, 20, 40, 60, 90)
+_MIN_STD_ROTATION, _MIN_STD_POSITION = 0.1, 0.05
 _JOINTS = CANONICAL.num_joints
 _TRUNK = CANONICAL.indices(("spine", "chest", "neck", "head"))
 
+# Weights of the loss.
+_PLACES = 10.0  # of the mean distance of joints from their true positions, metres
+_HARM = 10.0  # of the metres by which joints are farther from there than interpolation puts them
+_PACE = 20.0  # of the error of joints' steps, metres a frame
+_TURNS = 1.0  # of the error of world rotations: norm of the difference of matrices
+_HIPS = 5.0  # of the distance of the hips, metres
+_FEET = 5.0  # of the planted toes' steps, metres a frame
+_CONTACTS = 0.05  # of the contacts' cross entropy, nats
+_EASE = 0.4  # how much windows count for more whose interpolation errs little: 0 all alike, 1 by the share of its error
+_EVENNESS = 0.85  # of windows among kinds of clips: 0 by their frames, 1 the same number from each
 
-@dataclass(frozen=True)
-class PartSettings:
-    """What stays known. A window has gaps, lost joints, or keys; shares of the three are these, gaps get the rest."""
-
-    joints: float = 0.22
-    """Share of windows that lose joints."""
-    keys: float = 0.08
-    """Share of windows of which only single frames are known, now and then."""
-    several: float = 0.25
-    """Share of windows with gaps that have several."""
-    bare: float = 0.4
-    """Share of runs of known frames that are one frame long."""
-    context: int = 16
-    """Frames of the longest run beside a gap."""
-    open: float = 0.08
-    """Share of windows with gaps that end, or half as often begin, in one."""
-    parts: float = 0.33
-    """Share of windows with gaps of which something is told in the gap."""
-    reaching: float = 0.5
-    """Share of windows that lose joints of which hands or feet that are lost are told where to be, now and then or for
-    a while; half of them lose the trunk too."""
+# What stays known: a window has gaps, lost joints, or keys.
+_LOST = 0.22  # share of windows that lose joints
+_KEYS = 0.08  # share of windows of which only single frames are known, now and then
+_SEVERAL = 0.25  # share of windows with gaps that have several
+_BARE = 0.4  # share of runs of known frames that are one frame long
+_CONTEXT = 16  # frames of the longest run beside a gap
+_OPEN = 0.08  # share of windows with gaps that end, or half as often begin, in one
+_GIVEN = 0.33  # share of windows with gaps of which something is known in the gap
+_REACHING = 0.5  # share of windows with lost joints whose lost hands or feet have known positions now and then
 
 
-def sample_known_parts(motion: PartialMotion, settings: PartSettings, generator: torch.Generator) -> PartialMotion:
+@dataclass(frozen=True, kw_only=True)
+class PoseTransformerSettings(NetworkSettings):
+    """Train the pose transformer that infill, tween, blend and chain begin with; --batch is in frames."""
+
+    kind = "pose-transformer"
+    used_by = "use it with --inbetweener"
+    shape_options = ("width", "layers", "detail")
+
+    steps: Count = 11_500
+    """Steps in all."""
+    batch: Count = 2000
+    """Frames a step; windows of one step are equally long."""
+    window: Count = 200
+    """Frames of the longest window; the shortest have 8, and as many are drawn of each octave."""
+    learning_rate: Number = 1.5e-3
+    """At its highest; less to fine-tune."""
+    width: MaybeCount = None
+    """Numbers of a frame's token, even; every 32 of them have a head of attention."""
+    layers: MaybeCount = None
+    """Layers of attention."""
+    detail: MaybeCount = None
+    """Layers of a second stage, which corrects what the first proposes; the first then looks at frames alone in which
+    something is known."""
+
+    def __post_init__(self):
+        super().__post_init__()
+        require_at_least(self, 2 * _SHORTEST_WINDOW, "window")
+
+    def make_config(self) -> PoseTransformerConfig:
+        """Return the shape of the network that these settings ask for; the width decides the number of heads."""
+        heads = None if self.width is None else max(1, self.width // 32)
+        return given(PoseTransformerConfig(), width=self.width, heads=heads, layers=self.layers, detail=self.detail)
+
+    def make_trainer(self, parts: Split) -> "PoseTransformerTrainer":
+        """Make the trainer as it is before the first step."""
+        return PoseTransformerTrainer(self, parts.train)
+
+
+class PoseTransformerTrainer(GradientTrainer[PoseTransformerNetwork]):
+    """Draws windows, hides parts of them, and brings the network nearer to proposing them."""
+
+    def __init__(self, settings: PoseTransformerSettings, corpus: Corpus):
+        self.windows = PoseWindows(corpus, evenness=_EVENNESS)
+        self.longest = min(settings.window, int(self.windows.lengths.max()) * 9 // 10 - 1)
+        self.config = settings.find_config()
+        super().__init__(settings, lambda: PoseTransformerNetwork(self.config, bfloat16=settings.bfloat16))
+        _set_moments(self.network, self.windows)
+        self.begin()
+
+    def make_optimisers(self) -> dict[str, torch.optim.Optimizer]:
+        """Optimise the layers' matrices by Muon (Jordan et al. 2024), at the step size that makes one learning rate
+        serve both (Liu et al. 2025); all else by AdamW."""
+        weights = dict(self.network.named_parameters())
+        matrices = {name for name, weight in weights.items() if ".layers." in f".{name}" and weight.ndim == 2}
+        muon = torch.optim.Muon(
+            [weights[name] for name in weights if name in matrices],
+            lr=self.settings.learning_rate,
+            weight_decay=0.01,
+            adjust_lr_fn="match_rms_adamw",
+        )
+        others = [weight for name, weight in weights.items() if name not in matrices]
+        return {"optimiser": make_adam(others, self.settings.learning_rate), "muon": muon}
+
+    def losses(self) -> dict[str, Tensor]:
+        """Compute the losses of a newly drawn batch."""
+        share = float(torch.rand((), generator=self.generator))
+        frames = round(_SHORTEST_WINDOW * (self.longest / _SHORTEST_WINDOW) ** share)
+        batch = max(1, self.settings.batch // frames)
+        truth = add_targets(self.windows.draw(batch, frames, self.generator, variation=Variation()))
+        return compute_losses(self.network, truth, sample_known_parts(truth, self.generator))
+
+    @torch.no_grad()
+    def validate(self, corpus: Corpus) -> dict[str, Any]:
+        """Measure the error of gaps in unseen windows after 10 frames and after one, before one frame, cm and as a
+        share of the interpolation's; the same in unfamiliar poses; and of lost arms."""
+        windows = PoseWindows(corpus, evenness=1.0)
+        row: dict[str, Any] = {}
+        for past in (10, 1):
+            for gap in VALIDATED_GAPS:
+                frames = past + gap + 1
+                if frames > int(windows.lengths.max()):
+                    continue
+                truth = windows.draw(_VALIDATED_WINDOWS, frames, make_generator(gap))
+                observed = torch.ones(truth.heading.shape, dtype=torch.bool)
+                observed[:, past : past + gap] = False
+                error, share = measure_error(self.network, truth, KnownParts.whole(observed))
+                row |= {f"error_{past}_{gap}_cm": error, f"share_{past}_{gap}": share}
+        for gap in _UNFAMILIAR_GAPS:
+            truth = windows.draw(_VALIDATED_WINDOWS, 11 + gap, make_generator(gap), variation=_UNFAMILIAR)
+            observed = torch.ones(truth.heading.shape, dtype=torch.bool)
+            observed[:, 10 : 10 + gap] = False
+            error, share = measure_error(self.network, truth, KnownParts.whole(observed))
+            row |= {f"error_unfamiliar_{gap}_cm": error, f"share_unfamiliar_{gap}": share}
+        truth = windows.draw(_VALIDATED_WINDOWS, min(60, int(windows.lengths.max())), make_generator(1))
+        known = KnownParts.whole(torch.ones(truth.heading.shape, dtype=torch.bool))
+        lost = known.rotations.clone()
+        lost[..., [CANONICAL.index(name) for name in ("leftUpperArm", "leftLowerArm", "leftHand")]] = False
+        error, share = measure_error(self.network, truth, replace(known, rotations=lost))
+        return row | {"error_arm_cm": error, "share_arm": share}
+
+    def score(self, row: Row) -> float:
+        """Return the error of unseen windows over the interpolation's, geometric mean over gaps and lost arms."""
+        return average_logarithms(value for name, value in row.items() if name.startswith("share_"))
+
+    def export(self, parts: Split) -> Export:
+        """Calibrate the spread of the proposals on the validation clips, and measure that on the test clips."""
+        calibrate_spread(self, parts.validation)
+        done = super().export(parts)
+        done.quality |= measure_coverage(self, parts.test)
+        return done
+
+
+@torch.no_grad()
+def calibrate_spread(trainer: PoseTransformerTrainer, corpus: Corpus) -> None:
+    """Shift the spreads' logarithms so that over unseen windows, in varied poses, as many errors lie within them as
+    they say."""
+    over = _measure_spread(trainer, corpus, seed=1)
+    shift = [float(each.quantile(share)) for share, each in zip(QUANTILES, over, strict=True)]
+    trainer.network.spread_shift += torch.tensor(shift)
+
+
+@torch.no_grad()
+def measure_coverage(trainer: PoseTransformerTrainer, corpus: Corpus) -> dict[str, float]:
+    """Measure by spread the share of errors in unseen windows that lie within it."""
+    over = _measure_spread(trainer, corpus, seed=2)
+    return {
+        f"within_{share:.0%}": float((each <= 0).float().mean()) for share, each in zip(QUANTILES, over, strict=True)
+    }
+
+
+def _measure_spread(trainer: PoseTransformerTrainer, corpus: Corpus, seed: int) -> list[Tensor]:
+    """Measure by quantile the logarithm of errors over the spread."""
+    generator, windows = make_generator(seed), PoseWindows(corpus, evenness=1.0)
+    found: list[Tensor] = []
+    for frames in _CALIBRATED_FRAMES:
+        if frames <= int(windows.lengths.max()):
+            truth = add_targets(windows.draw(_VALIDATED_WINDOWS, frames, generator, variation=Variation()))
+            shown = hide(trainer.network, sample_known_parts(truth, generator))
+            proposed = trainer.network(shown)
+            distance = (proposed.poses(truth.offsets)[0] - truth.world_poses()[0]).norm(dim=-1)
+            unknown = ~shown.known.positions
+            found.append((torch.log(distance + 1e-4)[..., None] - proposed.log_spread)[unknown][::7])
+    return list(torch.cat(found).unbind(dim=-1))
+
+
+def hide(network: PoseTransformerNetwork, motion: PartialMotion) -> PartialMotion:
+    """Interpolate what is not known, and forget contacts of toes that are not."""
+    toes = motion.known.positions[..., list(TOE_JOINTS)]
+    shown = replace(motion, contacts=torch.where(toes, motion.contacts, 0.5))
+    return network.interpolate(shown)
+
+
+@torch.no_grad()
+def measure_error(network: PoseTransformerNetwork, truth: PartialMotion, known: KnownParts) -> tuple[float, float]:
+    """Measure the mean distance of unknown joints from their true places, cm, and as a share of the interpolation's."""
+    shown = hide(network, replace(truth, known=known))
+    unknown = ~known.positions
+    places = truth.world_poses()[0]
+    errors = [
+        float(((made - places).norm(dim=-1) * unknown).sum() / unknown.sum())
+        for made in (network(shown).poses(truth.offsets)[0], shown.world_poses()[0])
+    ]
+    return 100 * errors[0], errors[0] / errors[1]
+
+
+def compute_losses(network: PoseTransformerNetwork, truth: PartialMotion, hidden: PartialMotion) -> dict[str, Tensor]:
+    """Compute the loss, and in plain units the errors it is made of.
+
+    Distances, not squares, window by window divided by how many joints in how many frames are unknown: two lost joints
+    count as much as a gap. They are the same however the motion is turned. Windows that interpolation nearly solves
+    count for more, or the network learns to fidget where nobody moves.
+    """
+    shown = hide(network, hidden)
+    proposed = network(shown)
+    losses = _compare(proposed, truth, shown)
+    if proposed.rough is not None:
+        losses["loss"] = losses["loss"] + _compare(proposed.rough, truth, shown, spread_weight=0.0)["loss"]
+    return losses
+
+
+def _compare(
+    proposed: ProposedPoses, truth: PartialMotion, shown: PartialMotion, spread_weight: float = 1.0
+) -> dict[str, Tensor]:
+    known = shown.known
+    wanted, wanted_world = truth.world_poses()
+    guess = shown.world_poses()[0]
+    made, made_world = proposed.poses(truth.offsets)
+    unknown, turned = ~known.positions, ~known.world_rotations
+    count = unknown.sum(dim=(1, 2)).clamp_min(1)
+    weight = _weigh_windows((guess - wanted).norm(dim=-1), unknown)
+    wrong = made - wanted
+    distance = _length(wrong)
+    places = (distance * unknown).sum(dim=(1, 2)) / count
+    slip = torch.diff(wrong, dim=1)
+    slipping = unknown[:, 1:] | unknown[:, :-1]
+    pace = (_length(slip) * slipping).sum(dim=(1, 2)) / count
+    twist = _length((made_world - wanted_world).flatten(-2))
+    turns = (twist * turned).sum(dim=(1, 2)) / turned.sum(dim=(1, 2)).clamp_min(1)
+    lost = unknown[..., 0]
+    hips = (distance[..., 0] * lost).sum(dim=1) / lost.sum(dim=1).clamp_min(1)
+    toes = list(TOE_JOINTS)
+    planted = truth.contacts[:, 1:] * truth.contacts[:, :-1] * slipping[..., toes]
+    feet = (_length(slip[..., toes, :]) * planted).sum(dim=(1, 2)) / planted.sum(dim=(1, 2)).clamp_min(1)
+    unsure = unknown[..., toes]
+    nats = cross_entropy(proposed.contacts, truth.contacts, reduction="none")
+    contacts = (nats * unsure).sum() / unsure.sum().clamp_min(1)
+    spread = _quantile_loss(proposed, distance.detach(), unknown)
+    simple = ((guess - wanted).norm(dim=-1) * unknown).sum(dim=(1, 2)) / count
+    harm = (places - simple).clamp_min(0.0)
+    terms = _PLACES * places + _HARM * harm + _PACE * pace + _TURNS * turns + _HIPS * hips + _FEET * feet
+    loss = (weight * terms).mean() + _CONTACTS * contacts + spread_weight * spread
+    return {
+        "loss": loss,
+        "places_cm": 100 * places.mean(),
+        "share": (places / simple.clamp_min(1e-3)).mean(),
+        "worse": (harm > 0.0015 + 0.05 * simple).float().mean(),
+        "pace_cm": 100 * pace.mean(),
+        "turns": turns.mean(),
+        "feet_cm": 100 * feet.mean(),
+        "contacts_nats": contacts,
+        "spread": spread,
+    }
+
+
+def _length(vectors: Tensor) -> Tensor:
+    """Norm whose gradient is finite at zero."""
+    return (vectors.square().sum(dim=-1) + 1e-10).sqrt()
+
+
+def _weigh_windows(error: Tensor, unknown: Tensor) -> Float[Tensor, " batch"]:
+    """Weigh windows by the mean error of the interpolation, metres: 1 at 5 cm."""
+    mean = (error * unknown).sum(dim=(1, 2)) / unknown.sum(dim=(1, 2)).clamp_min(1)
+    return ((0.05 + 0.01) / (mean + 0.01)) ** _EASE
+
+
+def _quantile_loss(proposed: ProposedPoses, distance: Tensor, unknown: Tensor) -> Tensor:
+    """Pinball loss of the logarithm of the error (Koenker and Bassett 1978)."""
+    over = torch.log(distance + 1e-4)[..., None] - proposed.log_spread
+    share = over.new_tensor(QUANTILES)
+    loss = torch.maximum(share * over, (share - 1) * over).sum(dim=-1)
+    return (loss * unknown).sum() / unknown.sum().clamp_min(1)
+
+
+def _set_moments(network: PoseTransformerNetwork, windows: PoseWindows) -> None:
+    """Mean and spread of rotations and places of the data and its mirror image."""
+    batch = windows.draw(4000, 4, make_generator(0))
+    both = [batch, batch.mirrored()]
+    quats = torch.cat([each.quats for each in both]).flatten(0, 1)
+    six = rotations.to_six(rotations.to_matrix(quats))
+    mean = windows.mean_quats()
+    network.mean_quats.copy_(mean)
+    network.mean_rotation.copy_(six.mean(dim=0))
+    network.std_rotation.copy_(six.std(dim=0).clamp_min(_MIN_STD_ROTATION))
+    ahead = [replace(each, heading=torch.zeros_like(each.heading)) for each in both]
+    places = torch.cat([each.world_poses()[0] for each in ahead])
+    ground = torch.cat([each.root_position for each in both]) * places.new_tensor([1.0, 0.0, 1.0])
+    places = (places - ground[..., None, :]).flatten(0, 1)
+    network.mean_position.copy_(places.mean(dim=0))
+    network.std_position.copy_(places.std(dim=0).clamp_min(_MIN_STD_POSITION))
+
+
+def sample_known_parts(motion: PartialMotion, generator: torch.Generator) -> PartialMotion:
     """Return windows of which only a part is known; something is known in every window."""
     batch, frames = motion.heading.shape
     draw = Draws(generator, batch, frames)
     kind = draw.uniform()
-    lossy, keyed = kind < settings.joints, kind > 1 - settings.keys
-    poses = torch.where(keyed[:, None], _sample_keys(draw), _sample_gaps(draw, settings))
+    lossy, keyed = kind < _LOST, kind > 1 - _KEYS
+    poses = torch.where(keyed[:, None], _sample_keys(draw), _sample_gaps(draw))
     poses = torch.where((lossy & (draw.uniform() < 0.8))[:, None], True, poses)
     known = KnownParts.whole(poses)
     lost = torch.where(lossy[:, None, None], _sample_lost_joints(draw), False)
-    reaching = lossy & (draw.uniform() < settings.reaching)
+    reaching = lossy & (draw.uniform() < _REACHING)
     lost = lost | _lose_trunk(draw, lost, reaching & (draw.uniform() < 0.5))
-    told = ~lossy & (draw.uniform() < settings.parts)
-    motion, known = _tell_parts(draw, motion, known, told)
+    given = ~lossy & (draw.uniform() < _GIVEN)
+    motion, known = _give_parts(draw, motion, known, given)
     known = replace(known, rotations=known.rotations & ~lost)
     effectors = reaching[:, None, None] & _sample_reached(draw, 0.5) & ~known.positions[..., list(EFFECTORS)]
     return replace(motion, known=replace(known, effectors=known.effectors | effectors))
 
 
-def _sample_gaps(draw: Draws, settings: PartSettings) -> Bool[Tensor, "batch frames"]:
+def _sample_gaps(draw: Draws) -> Bool[Tensor, "batch frames"]:
     """True where a pose is known: a run, a gap, a run, and so on; mostly one gap."""
     known = torch.zeros(draw.batch, draw.frames, dtype=torch.bool)
     numbers = draw.uniform(4).tolist()
@@ -86,16 +353,16 @@ def _sample_gaps(draw: Draws, settings: PartSettings) -> Bool[Tensor, "batch fra
         values = iter(many[row])
 
         def run(values=values) -> int:
-            if next(values) < settings.bare:
+            if next(values) < _BARE:
                 return 1
-            return 1 + math.ceil(next(values) * (settings.context - 1))
+            return 1 + math.ceil(next(values) * (_CONTEXT - 1))
 
         mask = [False] * draw.frames
-        before = 0 if begin < settings.open / 2 else min(run(), draw.frames - 2)
-        after = 0 if end < settings.open and before else min(run(), draw.frames - before - 1)
+        before = 0 if begin < _OPEN / 2 else min(run(), draw.frames - 2)
+        after = 0 if end < _OPEN and before else min(run(), draw.frames - before - 1)
         mask[:before] = [True] * before
         mask[draw.frames - after :] = [True] * after
-        if several < settings.several:
+        if several < _SEVERAL:
             mean, at = 3 * (draw.frames / 6) ** scale, before
             for _ in range(8):
                 at += max(1, round(mean * (0.3 + 1.4 * next(values))))
@@ -132,24 +399,24 @@ def _sample_lost_joints(draw: Draws) -> Bool[Tensor, "batch frames joints"]:
 def _lose_trunk(
     draw: Draws, lost: Bool[Tensor, "batch frames joints"], chosen: Bool[Tensor, " batch"]
 ) -> Bool[Tensor, "batch frames joints"]:
-    """Spine to head of chosen windows in the frames that lack any joint: who reaches far leans and turns."""
+    """Spine to head of chosen windows in the frames that lack any joint: a body that reaches far leans and turns."""
     trunk = torch.zeros(_JOINTS, dtype=torch.bool)
     trunk[list(_TRUNK)] = True
     return chosen[:, None, None] & lost.any(dim=-1, keepdim=True) & trunk
 
 
 def _sample_reached(draw: Draws, held: float) -> Bool[Tensor, "batch frames 1"]:
-    """Frames in which places of hands and feet are told: one here and there, or, in a share of windows, a while."""
+    """Frames in which places of hands and feet are given: one here and there, or, in a share of windows, a while."""
     reached = draw.uniform(draw.frames, 1) < draw.uniform(1, 1) ** 2 * 0.12
     stretch = draw.mark(draw.uniform() * draw.frames, 1 + draw.uniform() * 12)[..., None]
     return torch.where((draw.uniform() < held)[:, None, None], stretch, reached)
 
 
-def _tell_parts(
-    draw: Draws, motion: PartialMotion, known: KnownParts, told: Bool[Tensor, " batch"]
+def _give_parts(
+    draw: Draws, motion: PartialMotion, known: KnownParts, given: Bool[Tensor, " batch"]
 ) -> tuple[PartialMotion, KnownParts]:
-    """Tell something in gaps: some joints, the hips throughout, roughly, or at single frames, hands and feet."""
-    which = torch.where(told, draw.uniform(), 2.0)
+    """Make something known in gaps: some joints, the hips throughout, roughly, or at single frames, hands and feet."""
+    which = torch.where(given, draw.uniform(), 2.0)
 
     def chosen(low: float, high: float) -> Bool[Tensor, "batch 1"]:
         return ((which >= low) & (which < high))[:, None]
@@ -158,7 +425,7 @@ def _tell_parts(
     joints = torch.where(draw.uniform(1) < 0.4, ~joints, joints)
     stretch = _sample_stretch(draw, 1)
     rotations = known.rotations | (chosen(0.0, 0.2)[..., None] & joints[:, None] & stretch[..., None])
-    # With joints often, else alone: where the hips go and face, as far as it is told.
+    # With joints often, else alone: where the hips go and face, as far as it is given.
     throughout = (chosen(0.0, 0.2) & (draw.uniform(1) < 0.6)) | chosen(0.2, 0.35)
     single = chosen(0.5, 0.72) & (draw.uniform(draw.frames) < draw.uniform(1) ** 2 * 0.15)
     hips = (throughout & stretch) | single
@@ -190,304 +457,3 @@ def _roughen(draw: Draws, root: Float[Tensor, "batch frames 3"], path: Bool[Tens
     rough = root.clone()
     rough[rows] = torch.stack([smooth[..., 0], root[rows][..., 1], smooth[..., 1]], dim=-1)
     return torch.where(path[..., None], rough, root)
-
-
-VALIDATED_GAPS = (5, 15, 30, 45, 60, 120)
-"""Gaps that are validated, frames."""
-_SHORTEST_WINDOW = 8  # frames
-_VALIDATED_WINDOWS = 128
-_UNFAMILIAR, _UNFAMILIAR_GAPS = Variation(poses=PoseVariation(share=1.0)), (5, 15, 30)
-_CALIBRATED_FRAMES = (10, 20, 40, 60, 90)
-_MIN_STD_ROTATION, _MIN_STD_POSITION = 0.1, 0.05
-
-
-@dataclass(frozen=True)
-class PoseTransformerSettings:
-    """How a pose transformer is trained."""
-
-    steps: int = 11_500
-    """Updates."""
-    batch: int = 2000
-    """Frames an update; windows of one update are equally long."""
-    window: int = 200
-    """Frames of the longest window; the shortest have 8, and as many are drawn of each octave."""
-    learning_rate: float = 1.5e-3
-    """At its highest; it falls to nothing along a cosine."""
-    places: float = 10.0
-    """Weight of the mean distance of joints from their true places, metres."""
-    pace: float = 20.0
-    """Weight of the error of joints' steps, metres a frame."""
-    turns: float = 1.0
-    """Weight of the error of world rotations: norm of the difference of matrices."""
-    hips: float = 5.0
-    """Weight of the distance of the hips, metres."""
-    feet: float = 5.0
-    """Weight of the planted toes' steps, metres a frame."""
-    contacts: float = 0.05
-    """Weight of the contacts' cross entropy, nats."""
-    harm: float = 10.0
-    """Weight of the distance, metres, by which joints are farther from their true positions than interpolation puts
-    them: an error beyond interpolation's counts twice."""
-    spread: float = 1.0
-    """Weight of the quantile loss of the spread, which only its own layers learn from."""
-    ease: float = 0.4
-    """How much windows count for more whose interpolation errs little: 0 all alike, 1 by the share of its error."""
-    evenness: float = 0.85
-    """How evenly windows are drawn from kinds of clips: 0 by their frames, 1 the same number from each."""
-    kinds: tuple[str, ...] = ("walk-turn", "walk", "run|dash", "^cmu")
-    """Kinds, as patterns of names; clips of none of these are another kind."""
-    parts: PartSettings = field(default_factory=PartSettings)
-    """What stays known."""
-    variation: Variation = field(default_factory=Variation)
-    """How bodies and tempos vary."""
-    bfloat16: bool = False
-    """The network computes in bfloat16; weights and loss stay in float32."""
-    seed: int = 1
-    """Seed of weights, windows and what stays known."""
-
-    def __post_init__(self):
-        require_at_least(self, 1, "steps", "batch")
-        if self.window < 2 * _SHORTEST_WINDOW:
-            raise RequestError(f"window must be at least {2 * _SHORTEST_WINDOW} frames, got {self.window}")
-
-
-class PoseTransformerTrainer(GradientTrainer[PoseTransformerNetwork]):
-    """Draws windows, hides parts of them, and brings the network nearer to proposing them."""
-
-    def __init__(self, config: PoseTransformerConfig, settings: PoseTransformerSettings, corpus: Corpus):
-        self.windows = PoseWindows(corpus, kinds=settings.kinds, evenness=settings.evenness)
-        self.longest = min(settings.window, int(self.windows.lengths.max()) * 9 // 10 - 1)
-        super().__init__(lambda: PoseTransformerNetwork(config, bfloat16=settings.bfloat16), settings)
-        _set_moments(self.network, self.windows)
-
-    def make_optimisers(self) -> dict[str, torch.optim.Optimizer]:
-        """Matrices of the layers by Muon (Jordan et al. 2024), at the step size that makes one learning rate serve both
-        (Liu et al. 2025); all else by AdamW."""
-        weights = dict(self.network.named_parameters())
-        matrices = {name for name, weight in weights.items() if ".layers." in f".{name}" and weight.ndim == 2}
-        muon = torch.optim.Muon(
-            [weights[name] for name in weights if name in matrices],
-            lr=self.learning_rate,
-            weight_decay=0.01,
-            adjust_lr_fn="match_rms_adamw",
-        )
-        others = [weight for name, weight in weights.items() if name not in matrices]
-        return {"optimiser": make_adam(others, self.learning_rate), "muon": muon}
-
-    def losses(self) -> dict[str, Tensor]:
-        """Compute the losses of a newly drawn batch."""
-        settings = self.settings
-        share = float(torch.rand((), generator=self.generator))
-        frames = round(_SHORTEST_WINDOW * (self.longest / _SHORTEST_WINDOW) ** share)
-        batch = max(1, settings.batch // frames)
-        truth = add_targets(self.windows.draw(batch, frames, self.generator, variation=settings.variation))
-        hidden = sample_known_parts(truth, settings.parts, self.generator)
-        return compute_losses(self.network, truth, hidden, settings)
-
-    @torch.no_grad()
-    def validate(self, corpus: Corpus) -> dict[str, Any]:
-        """Error of gaps in unseen windows after 10 frames and after one, before one frame, cm and share of the
-        interpolation's; the same in unfamiliar poses; and of lost arms."""
-        windows = PoseWindows(corpus, kinds=self.settings.kinds, evenness=1.0)
-        row: dict[str, Any] = {}
-        for past in (10, 1):
-            for gap in VALIDATED_GAPS:
-                frames = past + gap + 1
-                if frames > int(windows.lengths.max()):
-                    continue
-                truth = windows.draw(_VALIDATED_WINDOWS, frames, make_generator(gap))
-                observed = torch.ones(truth.heading.shape, dtype=torch.bool)
-                observed[:, past : past + gap] = False
-                error, share = measure_error(self.network, truth, KnownParts.whole(observed))
-                row |= {f"error_{past}_{gap}_cm": error, f"share_{past}_{gap}": share}
-        for gap in _UNFAMILIAR_GAPS:
-            truth = windows.draw(_VALIDATED_WINDOWS, 11 + gap, make_generator(gap), variation=_UNFAMILIAR)
-            observed = torch.ones(truth.heading.shape, dtype=torch.bool)
-            observed[:, 10 : 10 + gap] = False
-            error, share = measure_error(self.network, truth, KnownParts.whole(observed))
-            row |= {f"error_unfamiliar_{gap}_cm": error, f"share_unfamiliar_{gap}": share}
-        truth = windows.draw(_VALIDATED_WINDOWS, min(60, int(windows.lengths.max())), make_generator(1))
-        known = KnownParts.whole(torch.ones(truth.heading.shape, dtype=torch.bool))
-        lost = known.rotations.clone()
-        lost[..., [CANONICAL.index(name) for name in ("leftUpperArm", "leftLowerArm", "leftHand")]] = False
-        error, share = measure_error(self.network, truth, replace(known, rotations=lost))
-        return row | {"error_arm_cm": error, "share_arm": share}
-
-
-@dataclass(frozen=True)
-class PoseTransformerRecipe(NetworkRecipe[PoseTransformerConfig, PoseTransformerSettings, PoseTransformerTrainer]):
-    """What to train a pose transformer on, and how."""
-
-    kind = "pose-transformer"
-    trainer_class = PoseTransformerTrainer
-    config: PoseTransformerConfig = field(default_factory=PoseTransformerConfig)
-    settings: PoseTransformerSettings = field(default_factory=PoseTransformerSettings)
-
-    def score(self, row: Row) -> float:
-        """Error of unseen windows over the interpolation's, geometric mean over gaps and lost arms."""
-        return average_logarithms(value for name, value in row.items() if name.startswith("share_"))
-
-    def export(self, trainer: PoseTransformerTrainer, gathered: Gathered, curve: Sequence[Row]) -> Export:
-        """Calibrate how sure it is on the validation clips, and measure that on the test clips."""
-        calibrate_spread(trainer, gathered.parts.validation)
-        done = super().export(trainer, gathered, curve)
-        return replace(done, quality=done.quality | measure_coverage(trainer, gathered.parts.test))
-
-
-@torch.no_grad()
-def calibrate_spread(trainer: PoseTransformerTrainer, corpus: Corpus) -> None:
-    """Shift the spreads' logarithms so that over unseen windows, in varied poses, as many errors lie within them as
-    they say."""
-    over = _measure_spread(trainer, corpus, seed=1)
-    shift = [float(each.quantile(share)) for share, each in zip(QUANTILES, over, strict=True)]
-    trainer.network.spread_shift += torch.tensor(shift)
-
-
-@torch.no_grad()
-def measure_coverage(trainer: PoseTransformerTrainer, corpus: Corpus) -> dict[str, float]:
-    """Measure by spread the share of errors in unseen windows that lie within it."""
-    over = _measure_spread(trainer, corpus, seed=2)
-    return {
-        f"within_{share:.0%}": float((each <= 0).float().mean()) for share, each in zip(QUANTILES, over, strict=True)
-    }
-
-
-def _measure_spread(trainer: PoseTransformerTrainer, corpus: Corpus, seed: int) -> list[Tensor]:
-    """Measure by quantile the logarithm of errors over the spread."""
-    settings, generator = trainer.settings, make_generator(seed)
-    windows = PoseWindows(corpus, kinds=settings.kinds, evenness=1.0)
-    found: list[Tensor] = []
-    for frames in _CALIBRATED_FRAMES:
-        if frames <= int(windows.lengths.max()):
-            truth = add_targets(windows.draw(_VALIDATED_WINDOWS, frames, generator, variation=settings.variation))
-            shown = hide(trainer.network, sample_known_parts(truth, settings.parts, generator))
-            proposed = trainer.network(shown)
-            distance = (proposed.poses(truth.offsets)[0] - truth.world_poses()[0]).norm(dim=-1)
-            unknown = ~shown.known.positions
-            found.append((torch.log(distance + 1e-4)[..., None] - proposed.log_spread)[unknown][::7])
-    return list(torch.cat(found).unbind(dim=-1))
-
-
-def hide(network: PoseTransformerNetwork, motion: PartialMotion) -> PartialMotion:
-    """Interpolate what is not known, and forget contacts of toes that are not."""
-    toes = motion.known.positions[..., list(TOE_JOINTS)]
-    shown = replace(motion, contacts=torch.where(toes, motion.contacts, 0.5))
-    return network.interpolate(shown)
-
-
-@torch.no_grad()
-def measure_error(network: PoseTransformerNetwork, truth: PartialMotion, known: KnownParts) -> tuple[float, float]:
-    """Measure the mean distance of unknown joints from their true places, cm, and as a share of the interpolation's."""
-    shown = hide(network, replace(truth, known=known))
-    unknown = ~known.positions
-    places = truth.world_poses()[0]
-    errors = [
-        float(((made - places).norm(dim=-1) * unknown).sum() / unknown.sum())
-        for made in (network(shown).poses(truth.offsets)[0], shown.world_poses()[0])
-    ]
-    return 100 * errors[0], errors[0] / errors[1]
-
-
-def compute_losses(
-    network: PoseTransformerNetwork, truth: PartialMotion, hidden: PartialMotion, settings: PoseTransformerSettings
-) -> dict[str, Tensor]:
-    """Compute the loss, and in plain units the errors it is made of.
-
-    Distances, not squares, window by window divided by how many joints in how many frames are unknown: two lost joints
-    count as much as a gap. They are the same however the motion is turned. Windows that interpolation nearly solves
-    count for more, or the network learns to fidget where nobody moves.
-    """
-    shown = hide(network, hidden)
-    proposed = network(shown)
-    losses = _compare(proposed, truth, shown, settings)
-    if proposed.rough is not None:
-        losses["loss"] = losses["loss"] + _compare(proposed.rough, truth, shown, replace(settings, spread=0.0))["loss"]
-    return losses
-
-
-def _compare(
-    proposed: ProposedPoses, truth: PartialMotion, shown: PartialMotion, settings: PoseTransformerSettings
-) -> dict[str, Tensor]:
-    known = shown.known
-    wanted, wanted_world = truth.world_poses()
-    guess = shown.world_poses()[0]
-    made, made_world = proposed.poses(truth.offsets)
-    unknown, turned = ~known.positions, ~known.world_rotations
-    count = unknown.sum(dim=(1, 2)).clamp_min(1)
-    weight = _weigh_windows((guess - wanted).norm(dim=-1), unknown, settings.ease)
-    wrong = made - wanted
-    distance = _length(wrong)
-    places = (distance * unknown).sum(dim=(1, 2)) / count
-    slip = torch.diff(wrong, dim=1)
-    slipping = unknown[:, 1:] | unknown[:, :-1]
-    pace = (_length(slip) * slipping).sum(dim=(1, 2)) / count
-    twist = _length((made_world - wanted_world).flatten(-2))
-    turns = (twist * turned).sum(dim=(1, 2)) / turned.sum(dim=(1, 2)).clamp_min(1)
-    lost = unknown[..., 0]
-    hips = (distance[..., 0] * lost).sum(dim=1) / lost.sum(dim=1).clamp_min(1)
-    toes = list(TOE_JOINTS)
-    planted = truth.contacts[:, 1:] * truth.contacts[:, :-1] * slipping[..., toes]
-    feet = (_length(slip[..., toes, :]) * planted).sum(dim=(1, 2)) / planted.sum(dim=(1, 2)).clamp_min(1)
-    unsure = unknown[..., toes]
-    nats = cross_entropy(proposed.contacts, truth.contacts, reduction="none")
-    contacts = (nats * unsure).sum() / unsure.sum().clamp_min(1)
-    spread = _quantile_loss(proposed, distance.detach(), unknown)
-    simple = ((guess - wanted).norm(dim=-1) * unknown).sum(dim=(1, 2)) / count
-    harm = (places - simple).clamp_min(0.0)
-    terms = (
-        settings.places * places
-        + settings.harm * harm
-        + settings.pace * pace
-        + settings.turns * turns
-        + settings.hips * hips
-        + settings.feet * feet
-    )
-    loss = (weight * terms).mean() + settings.contacts * contacts + settings.spread * spread
-    return {
-        "loss": loss,
-        "places_cm": 100 * places.mean(),
-        "share": (places / simple.clamp_min(1e-3)).mean(),
-        "worse": (harm > 0.0015 + 0.05 * simple).float().mean(),
-        "pace_cm": 100 * pace.mean(),
-        "turns": turns.mean(),
-        "feet_cm": 100 * feet.mean(),
-        "contacts_nats": contacts,
-        "spread": spread,
-    }
-
-
-def _length(vectors: Tensor) -> Tensor:
-    """Norm whose gradient is finite at zero."""
-    return (vectors.square().sum(dim=-1) + 1e-10).sqrt()
-
-
-def _weigh_windows(error: Tensor, unknown: Tensor, ease: float) -> Float[Tensor, " batch"]:
-    """Weigh windows by the mean error of the interpolation, metres: 1 at 5 cm."""
-    mean = (error * unknown).sum(dim=(1, 2)) / unknown.sum(dim=(1, 2)).clamp_min(1)
-    return ((0.05 + 0.01) / (mean + 0.01)) ** ease
-
-
-def _quantile_loss(proposed: ProposedPoses, distance: Tensor, unknown: Tensor) -> Tensor:
-    """Pinball loss of the logarithm of the error (Koenker and Bassett 1978)."""
-    over = torch.log(distance + 1e-4)[..., None] - proposed.log_spread
-    share = over.new_tensor(QUANTILES)
-    loss = torch.maximum(share * over, (share - 1) * over).sum(dim=-1)
-    return (loss * unknown).sum() / unknown.sum().clamp_min(1)
-
-
-def _set_moments(network: PoseTransformerNetwork, windows: PoseWindows) -> None:
-    """Mean and spread of rotations and places of the data and its mirror image."""
-    batch = windows.draw(4000, 4, make_generator(0))
-    both = [batch, batch.mirrored()]
-    quats = torch.cat([each.quats for each in both]).flatten(0, 1)
-    six = rotations.to_six(rotations.to_matrix(quats))
-    mean = windows.mean_quats()
-    network.mean_quats.copy_(mean)
-    network.mean_rotation.copy_(six.mean(dim=0))
-    network.std_rotation.copy_(six.std(dim=0).clamp_min(_MIN_STD_ROTATION))
-    ahead = [replace(each, heading=torch.zeros_like(each.heading)) for each in both]
-    places = torch.cat([each.world_poses()[0] for each in ahead])
-    ground = torch.cat([each.root_position for each in both]) * places.new_tensor([1.0, 0.0, 1.0])
-    places = (places - ground[..., None, :]).flatten(0, 1)
-    network.mean_position.copy_(places.mean(dim=0))
-    network.std_position.copy_(places.std(dim=0).clamp_min(_MIN_STD_POSITION))

@@ -1,17 +1,17 @@
-"""Adversarial training of the refiner: Wang et al. 2019, sections 4.2.1 and 4.2.2, with departures kept as settings."""
+"""Adversarial training of the refiner: Wang et al. 2019, sections 4.2.1 and 4.2.2, with departures."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits as cross_entropy
 
-from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, integrate_root
 from mapctl.metrics import measure
 from mapctl.metrics.realism import RealismSettings, canonical_positions, compute_held_out_accuracy, cut_windows
@@ -20,81 +20,122 @@ from priors import checkpoints
 from priors.checkpoints import require_at_least
 from priors.lstm_gmm import density
 from priors.lstm_gmm.density import LstmGmmDensity
-from priors.refiner import LstmRefiner, RefinerConfig, RefinerNetwork, compute_end_effectors, count_channels
+from priors.refiner import PAPER, LstmRefiner, RefinerConfig, RefinerNetwork, compute_end_effectors
+from priors.training.critics import WINDOW_MOMENTS, EndEffectorCritic, HistoryBuffer, moment_loss
 from priors.training.data import Corpus, Split, find_window_starts
-from priors.training.loop import Export, Gathered, HistoryBuffer, Recipe, Row, Trainer, draw_weights
-from priors.training.moment_matching import MatchingSettings, moment_loss
+from priors.training.loop import (
+    Count,
+    Export,
+    InPython,
+    Name,
+    Pattern,
+    Row,
+    Settings,
+    Trainer,
+    draw_weights,
+    update_average,
+)
 from priors.training.windows import FeatureWindows
 
 _MIN_MOMENT_FRAMES = 8  # frames of a window that moments can be had of
-_MOMENTS = MatchingSettings(feet=0.25, jerk=2.0, pace=0.0, spread=0.5, drift=0.0)  # as pieces of a window show them
 _CRITIC_WON = 0.98  # share that the critic classifies correctly, over a report, from which it has won
 _BETAS = (0.5, 0.9)
-_FOOT_JOINTS = ("leftFoot", "leftToes", "rightFoot", "rightToes")
 _WARM_UP_FRAMES = 60  # frames of a clip that condition the density before it runs freely
+_CRITIC_UPDATES = 2  # updates of the critic in each round (the paper's 1)
+_REFINER_UPDATES = 1  # initial updates of the refiner in each round (the paper's 5); doubled and halved as either wins
+_STRONG, _WEAK = 0.01, 1.0  # critic's loss below which the refiner's updates are doubled, and above which halved
+_MOST_UPDATES = 20  # they are never more than this
+_HISTORY = 320  # refined windows kept for the critic
+_ROOT = 20.0  # weight of the squared distance between the root trajectories before and after (Eq. 13), per m^2
+_REFINER_RATE, _CRITIC_RATE = 1e-4, 5e-4  # learning rates (the paper's 0.002 and 0.005)
+_CRITIC_AROUND = 2  # frames on either side that its first layer sees (the paper's 0): jitter takes three frames
+_CRITIC_SLOW = 0.05  # ground speed of feet, m/s, below which the critic sees it magnified
+_MOMENTS = 10.0  # weight of feet, jerk and spread: the critic alone lets feet slide while it is still learning
+_AVERAGE = 0.99  # share of the past in the running mean of the refiner's weights, which is what is kept
 
 
-@dataclass(frozen=True)
-class AdversarialSettings:
-    """How a refiner is trained."""
+@dataclass(frozen=True, kw_only=True)
+class RefinerSettings(Settings):
+    """Train a refiner, which makes a density's samples look captured; a step is a round of updates of the refiner and
+    its critic. The best refiner by held-out samples is kept, and training stops where one side wins."""
 
-    steps: int = 4000
+    kind = "refiner"
+    used_by = "use it with --refiner"
+    keeps_best = True
+    uses_gpu = False
+
+    match: Pattern = None
+    """Only clips whose path below the data folder holds this regular expression; by default the clips that the density
+    was trained on."""
+    steps: Count = 4000
     """Rounds after the warm-up: some updates of the refiner, then some of the critic."""
-    window: int = 48
-    """Frames that the critic sees."""
-    batch: int = 32
-    """Windows an update."""
-    warm_up: int = 75
-    """Updates of each before the rounds (section 4.2.2)."""
-    head_start: int = 200
-    """Updates of the critic before anything else (the paper's 0): a refiner led by a critic that knows nothing spoils
-    samples that were nearly good."""
-    critic_updates: int = 2
-    """Updates of the critic in each round (the paper's 1)."""
-    refiner_updates: int = 1
-    """Initial updates of the refiner in each round (the paper's 5); doubled and halved as either wins."""
-    strong: float = 0.01
-    """Critic's loss below which the refiner's updates are doubled."""
-    weak: float = 1.0
-    """Critic's loss above which they are halved."""
-    most_updates: int = 20
-    """They are never more than this."""
-    history: int = 320
-    """Refined windows kept for the critic."""
-    root: float = 20.0
-    """Weight of the squared distance between the root trajectories before and after (Eq. 13), per m^2."""
-    refiner_rate: float = 1e-4
-    """Learning rate (the paper's 0.002)."""
-    critic_rate: float = 5e-4
-    """Learning rate (the paper's 0.005)."""
-    critic_width: int = 128
-    """Units of the critic's layers (the paper's 500)."""
-    critic_around: int = 2
-    """Frames on either side that its first layer sees (the paper's 0): tremble is a matter of three frames."""
-    critic_slow: float = 0.05
-    """Ground speed of feet, m/s, below which the critic sees it magnified; 0 (the paper's) leaves that out."""
-    moments: float = 10.0
-    """Weight of feet, jerk and spread as they are in captured windows (see moment_matching.moment_loss; the paper's 0).
-    The critic alone lets feet slide twice as fast while it is still learning to see them."""
-    average: float = 0.99
-    """Share of the past in the running mean of the refiner's weights, which is what is kept; 0 keeps the last."""
+    batch: Count = 32
+    """Windows a step."""
+    window: Count = 48
+    """Frames a window."""
     bfloat16: bool = False
-    """The networks compute in bfloat16; weights and losses stay in float32."""
-    seed: int = 1
-    """Seed of weights, windows and noise."""
+    """Let the network compute in bfloat16: faster on a processor that has it."""
+    density: Name = "locomotion"
+    """The prior whose samples it refines."""
+    paper: bool = False
+    """The network of Wang et al. 2019; other options still hold."""
+    report_steps: Annotated[int, *InPython] = 50
+    """Rounds of whose losses the log holds the means."""
+    validate_steps: Annotated[int, *InPython] = 300
+    """Rounds between measures of held-out samples."""
+    shape: Annotated[RefinerConfig | None, *InPython] = None
+    """Shape of the network, in place of ours and the paper's."""
+    warm_up: Annotated[int, *InPython] = 75
+    """Updates of each before the rounds (section 4.2.2)."""
+    head_start: Annotated[int, *InPython] = 200
+    """Updates of the critic before anything else (the paper's 0): a refiner led by a critic that has learnt nothing
+    spoils samples that were nearly good."""
+    critic_width: Annotated[int, *InPython] = 128
+    """Units of the critic's layers (the paper's 500)."""
+    samples: Annotated[int, *InPython] = 300
+    """Motions of `seconds` drawn from the density to train on."""
+    seconds: Annotated[float, *InPython] = 10.0
+    """Duration of each sampled motion, s."""
+    judged: Annotated[int, *InPython] = 24
+    """Motions drawn to be measured, and held-out clips at least, if there are as many."""
 
     def __post_init__(self):
-        require_at_least(self, 1, "steps", "batch", "refiner_updates", "critic_updates", "most_updates")
-        if self.window < (least := 2 * self.critic_around + 2):
-            raise RequestError(f"window must be at least {least}, got {self.window}: the critic needs them to see one")
-        if self.history < self.batch or self.batch < 2:
-            raise RequestError(f"the history must hold a batch of 2 or more, got {self.history} for {self.batch}")
-        if self.moments > 0 and self.window < _MIN_MOMENT_FRAMES:
-            raise RequestError(
-                f"window must be at least {_MIN_MOMENT_FRAMES} for moments to be compared, got {self.window}"
-            )
-        if not 0 <= self.average < 1:
-            raise RequestError(f"average must lie in [0, 1), got {self.average:g}")
+        super().__post_init__()
+        require_at_least(self, 2, "batch")
+        require_at_least(self, _MIN_MOMENT_FRAMES, "window")
+
+    @property
+    def config(self) -> RefinerConfig:
+        """Shape of the network."""
+        return self.shape or (PAPER if self.paper else RefinerConfig())
+
+    @cached_property
+    def prior(self) -> LstmGmmDensity:
+        """The density, loaded."""
+        return density.load(self.density)
+
+    @property
+    def chosen(self) -> str:
+        """Regular expression for the clips."""
+        return self.prior.card.data.get("match", "") if self.match is None else self.match
+
+    @property
+    def split_seed(self) -> int:
+        """Seed of the density's split, so that its held-out clips stay held out."""
+        return self.prior.card.data.get("split_seed", self.seed)
+
+    def make_trainer(self, parts: Split) -> "AdversarialTrainer":
+        """Make the trainer with samples of the density, to train on and to be measured."""
+        raw, measured = self.sample(parts)
+        return AdversarialTrainer(self, parts.train, raw, RefinerEvaluator.of(measured, parts.validation))
+
+    def sample(self, parts: Split) -> tuple[Corpus, Corpus]:
+        """Sample motions to train on, and others to measure."""
+        generator, frames = torch.Generator().manual_seed(self.seed), round(self.seconds * PRIOR_FPS)
+        first, second = (
+            sample_corpus(self.prior, parts.train, count, frames, generator) for count in (self.samples, self.judged)
+        )
+        return first, second
 
 
 class AdversarialTrainer(Trainer[RefinerNetwork]):
@@ -102,25 +143,38 @@ class AdversarialTrainer(Trainer[RefinerNetwork]):
 
     def __init__(
         self,
-        config: RefinerConfig,
-        settings: AdversarialSettings,
+        settings: RefinerSettings,
         corpus: Corpus,
         raw: Corpus,
         evaluate: Callable[[RefinerNetwork], Row] = lambda network: {},
     ):
         """`corpus` is captured, `raw` sampled from the density that is to be refined; `evaluate` measures a refiner."""
-        super().__init__(steps=settings.steps, seed=settings.seed)
-        self.settings, self.updates, self.evaluate = settings, settings.refiner_updates, evaluate
-        statistics = compute_statistics(corpus, config, settings.window)
-        self.refiner, self.critic = draw_weights(lambda: _make_sides(config, settings, statistics), settings.seed)
+        super().__init__(settings)
+        self.config, self.updates, self.evaluate = settings.config, _REFINER_UPDATES, evaluate
+        statistics = compute_statistics(corpus, self.config, settings.window)
+        self.refiner, self.critic = draw_weights(lambda: self._make_sides(statistics), settings.seed)
         self.network = deepcopy(self.refiner).requires_grad_(False)
         self.captured = FeatureWindows(corpus, settings.window)
-        self.raw = FeatureWindows(raw, settings.window + self.refiner.before + config.lookahead)
-        self.refiner_optimiser = torch.optim.Adam(self.refiner.parameters(), lr=settings.refiner_rate, betas=_BETAS)
-        self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), lr=settings.critic_rate, betas=_BETAS)
+        self.raw = FeatureWindows(raw, settings.window + self.refiner.before + self.config.lookahead)
+        self.refiner_optimiser = torch.optim.Adam(self.refiner.parameters(), lr=_REFINER_RATE, betas=_BETAS)
+        self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), lr=_CRITIC_RATE, betas=_BETAS)
+        count = max(_HISTORY, settings.batch)
         with torch.no_grad():
-            first = [self.refiner(self._draw(self.raw))[0] for _ in range(-(-settings.history // settings.batch))]
-        self.history = HistoryBuffer(torch.cat(first)[: settings.history])
+            first = [self.refiner(self._draw(self.raw))[0] for _ in range(-(-count // settings.batch))]
+        self.history = HistoryBuffer(torch.cat(first)[:count])
+
+    def _make_sides(self, statistics: dict[str, Tensor]) -> tuple[RefinerNetwork, EndEffectorCritic]:
+        """Make refiner and critic, their weights drawn in this order."""
+        refiner = RefinerNetwork(self.config, **statistics)
+        critic = EndEffectorCritic(
+            self.config.joints,
+            width=self.settings.critic_width,
+            around=_CRITIC_AROUND,
+            slow=_CRITIC_SLOW,
+            reach_mean=statistics["reach_mean"],
+            reach_std=statistics["reach_std"],
+        )
+        return refiner, critic
 
     def networks(self) -> dict[str, nn.Module]:
         """All that is learnt, by its name in checkpoints."""
@@ -141,24 +195,24 @@ class AdversarialTrainer(Trainer[RefinerNetwork]):
     def train_step(self) -> dict[str, float]:
         """Updates of the refiner, then of the critic, and the balance of section 4.2.2.
 
-        Mean of Eq. 9 and half of Eq. 10 in nats, where 0.69 is a critic that can tell nothing; the share of its batch
-        that the critic told apart; and how often the refiner was updated.
+        Return the mean of Eq. 9 and half of Eq. 10 in nats, where 0.69 is a critic that has learnt nothing; the share
+        of its batch that the critic classified correctly; and how often the refiner was updated.
         """
         if self.step == 0:
             self.warm_up()
-        updates, settings = self.updates, self.settings
+        updates = self.updates
         refiner = sum(self._refine() for _ in range(updates)) / updates
-        judged = [self._criticise() for _ in range(settings.critic_updates)]
-        critic, told = (sum(each) / settings.critic_updates for each in zip(*judged, strict=True))
-        if critic < settings.strong:
-            self.updates = min(2 * updates, settings.most_updates)
-        elif critic > settings.weak:
+        judged = [self._criticise() for _ in range(_CRITIC_UPDATES)]
+        critic, accuracy = (sum(each) / _CRITIC_UPDATES for each in zip(*judged, strict=True))
+        if critic < _STRONG:
+            self.updates = min(2 * updates, _MOST_UPDATES)
+        elif critic > _WEAK:
             self.updates = max(1, updates // 2)
         self.step += 1
-        return {"refiner": refiner, "critic": critic, "told": told, "updates": updates}
+        return {"refiner": refiner, "critic": critic, "accuracy": accuracy, "updates": updates}
 
     def validate(self, corpus: Corpus) -> Row:
-        """Measures of refined samples beside mocap's (see `RefinerEvaluator`, which holds validation clips)."""
+        """Measure refined samples beside mocap's (see `RefinerEvaluator`, which holds validation clips)."""
         return self.evaluate(self.network)
 
     def state(self) -> dict[str, Tensor]:
@@ -180,14 +234,10 @@ class AdversarialTrainer(Trainer[RefinerNetwork]):
             odds = self.critic(refined.float())
         refined = refined.float()
         loss = cross_entropy(odds.float(), torch.ones(odds.shape))
-        total = loss + self.settings.root * compute_root_error(raw[:, self.refiner.before :], refined)
-        if self.settings.moments > 0:
-            captured = self._draw(self.captured)
-            total = total + self.settings.moments * moment_loss(refined, captured, _MOMENTS)
+        total = loss + _ROOT * compute_root_error(raw[:, self.refiner.before :], refined)
+        total = total + _MOMENTS * moment_loss(refined, self._draw(self.captured), WINDOW_MOMENTS)
         self._step(self.refiner_optimiser, self.refiner, total)
-        with torch.no_grad():
-            for mean, latest in zip(self.network.parameters(), self.refiner.parameters(), strict=True):
-                mean.lerp_(latest, 1 - self.settings.average)
+        update_average(self.network, self.refiner, _AVERAGE)
         return float(loss.detach())
 
     def _criticise(self) -> tuple[float, float]:
@@ -217,134 +267,30 @@ class AdversarialTrainer(Trainer[RefinerNetwork]):
     def _draw(self, windows: FeatureWindows) -> Float[Tensor, "batch frames size"]:
         return windows.draw(self.settings.batch, self.generator).features
 
-
-@dataclass(frozen=True)
-class RefinerRecipe(Recipe[RefinerConfig, AdversarialSettings, AdversarialTrainer]):
-    """What to train a refiner on, and how.
-
-    The best refiner by held-out samples is kept, and training stops where one side wins.
-    """
-
-    kind = "refiner"
-    keeps_best = True
-    uses_gpu = False
-    config: RefinerConfig = field(default_factory=RefinerConfig)
-    settings: AdversarialSettings = field(default_factory=AdversarialSettings)
-    match: str | None = None
-    """Regular expression for the clips; the density's own if None."""
-    report_steps: int = 50
-    """Rounds of whose losses the log holds the means."""
-    validate_steps: int = 300
-    """Rounds between measures of held-out samples."""
-    density: str = "locomotion"
-    """Prior whose samples are refined."""
-    samples: int = 300
-    """Motions of `seconds` drawn from the density to train on."""
-    seconds: float = 10.0
-    """Duration of each sampled motion, s."""
-    judged: int = 24
-    """Motions drawn to be measured, and held-out clips at least, if there are as many."""
-    realism: RealismSettings = field(default_factory=RealismSettings)
-    """Settings of the classifier that separates samples from mocap."""
-
-    @cached_property
-    def prior(self) -> LstmGmmDensity:
-        """The density, loaded."""
-        return density.load(self.density)
-
-    @property
-    def chosen(self) -> str:
-        """Regular expression for the clips."""
-        return self.prior.card.data.get("match", "") if self.match is None else self.match
-
-    @property
-    def split_seed(self) -> int:
-        """Seed of the density's split, so that its held-out clips stay held out."""
-        return self.prior.card.data.get("split_seed", self.settings.seed)
-
-    def make_trainer(self, parts: Split) -> AdversarialTrainer:
-        """Make the trainer with samples of the density, to train on and to be measured."""
-        raw, measured = self._sample(parts)
-        judge = RefinerEvaluator.of(measured, parts.validation, self.realism)
-        return AdversarialTrainer(self.config, self.settings, parts.train, raw, judge)
-
-    def _sample(self, parts: Split) -> tuple[Corpus, Corpus]:
-        """Sample motions to train on, and others to measure."""
-        generator, frames = torch.Generator().manual_seed(self.settings.seed), round(self.seconds * PRIOR_FPS)
-        first, second = (
-            sample_corpus(self.prior, parts.train, count, frames, generator) for count in (self.samples, self.judged)
-        )
-        return first, second
-
     def score(self, row: Row) -> float:
-        """Measure how far foot speed, jitter and classifier accuracy are from mocap's."""
+        """Return how far foot speed, jitter and classifier accuracy are from mocap's."""
         return compute_realism_gap(row)
 
-    def find_stop_reason(self, trainer: AdversarialTrainer, rows: Sequence[Row]) -> str | None:
+    def find_stop_reason(self, rows: Sequence[Row]) -> str | None:
         """Return why to stop after these losses since the last report: a loss is not finite, or the critic classifies
         nearly all correctly."""
         if not all(math.isfinite(rows[-1][name]) for name in ("refiner", "critic")):
-            return f"training diverged at step {trainer.step}"
-        if len(rows) >= self.report_steps and sum(row["told"] for row in rows) / len(rows) > _CRITIC_WON:
+            return f"training diverged at step {self.step}"
+        if len(rows) >= self.settings.report_steps and sum(row["accuracy"] for row in rows) / len(rows) > _CRITIC_WON:
             return "the critic has won"
         return None
 
-    def describe_run(self, trainer: AdversarialTrainer, corpus: Corpus) -> dict[str, Row]:
-        """Describe what must not change between a run's parts."""
-        found = super().describe_run(trainer, corpus)
-        return {**found, "data": found["data"] | {"density": self.density, "match": self.chosen}}
-
-    def export(self, trainer: AdversarialTrainer, gathered: Gathered, curve: Sequence[Row]) -> Export:
+    def export(self, parts: Split) -> Export:
         """Return the best refiner so far, measured on the test clips, by which none was chosen."""
-        data = {
-            "density": self.density,
-            "density_config": self.prior.reference.config.as_card(),
-            "samples": self.samples,
-            **self.describe_data(gathered),
-        }
-        best = min(curve, key=compute_realism_gap)
-        judge = RefinerEvaluator.of(self._sample(gathered.parts)[1], gathered.parts.test, self.realism)
+        settings, evaluate = self.settings, RefinerEvaluator.of(self.settings.sample(parts)[1], parts.test)
         # Feet that never touch the floor have no speed there, and a card holds no other numbers than finite ones.
-        test = {name: value if math.isfinite(value) else None for name, value in judge(trainer.network).items()}
-        return Export(trainer.network.state_dict(), data, {"step": best["step"], "test": test})
-
-
-class Critic(nn.Module):
-    """Tells captured windows from refined ones by end effectors and contact bits."""
-
-    reach_mean: Tensor
-    reach_std: Tensor
-
-    def __init__(
-        self, joints: Sequence[str], *, width: int, around: int, slow: float, reach_mean: Tensor, reach_std: Tensor
-    ):
-        """`width` units in the first layer and in each direction of the LSTM; the first layer sees `around` frames on
-        either side of its own, and feet's ground speeds under `slow` (m/s) magnified, unless that is 0.
-        """
-        super().__init__()
-        self.joints = tuple(joints)
-        self.register_buffer("reach_mean", reach_mean.clone())
-        self.register_buffer("reach_std", reach_std.clone())
-        self.slow = slow
-        self.magnified_columns = [
-            len(joints) + number for number, name in enumerate(joints) if slow > 0 and name in _FOOT_JOINTS
-        ]
-        seen = count_channels(joints) + 2 * len(self.magnified_columns) + 2
-        self.first = nn.Conv1d(seen, width, 2 * around + 1)
-        self.lstm = nn.LSTM(width, width, batch_first=True, bidirectional=True)
-        self.last = nn.Linear(2 * width, 1)
-
-    def forward(self, features: Float[Tensor, "batch frames size"]) -> Float[Tensor, "batch judged"]:
-        """Logits, frame by frame, that a window was captured; for the frames that have enough on either side."""
-        ends = compute_end_effectors(features, self.joints)
-        seen = [(ends - self.reach_mean) / self.reach_std, 2 * LAYOUT.pick(features, "contacts")[:, 1:] - 1]
-        if self.magnified_columns:
-            # A foot that slides by 10 cm/s is a twentieth of the spread of feet's speeds, and what every viewer sees.
-            ground = ends.unflatten(-1, (-1, 3))[:, :, self.magnified_columns, ::2]
-            seen.append(0.5 * torch.asinh(ground / self.slow).flatten(2))
-        seen = torch.cat(seen, dim=-1).transpose(1, 2)
-        hidden, _ = self.lstm(torch.nn.functional.leaky_relu(self.first(seen), 0.2).transpose(1, 2))
-        return self.last(hidden)[..., 0]
+        test = {name: value if math.isfinite(value) else None for name, value in evaluate(self.network).items()}
+        data = {
+            "density": settings.density,
+            "density_config": settings.prior.reference.config.as_card(),
+            "samples": settings.samples,
+        }
+        return Export(self.network.state_dict(), data, {"test": test})
 
 
 def compute_root_error(before: Tensor, after: Tensor) -> Tensor:
@@ -373,21 +319,6 @@ def compute_statistics(corpus: Corpus, config: RefinerConfig, window: int) -> di
     return {"mean": mean, "std": std, "reach_mean": reach.mean(0), "reach_std": reach.std(0).clamp(min=0.01)}
 
 
-def _make_sides(
-    config: RefinerConfig, settings: AdversarialSettings, statistics: dict[str, Tensor]
-) -> tuple[RefinerNetwork, Critic]:
-    """Refiner and critic, their weights drawn in this order."""
-    refiner = RefinerNetwork(config, **statistics)
-    critic = Critic(
-        config.joints,
-        width=settings.critic_width,
-        around=settings.critic_around,
-        slow=settings.critic_slow,
-        **{name: statistics[name] for name in ("reach_mean", "reach_std")},
-    )
-    return refiner, critic
-
-
 @dataclass(frozen=True, eq=False)
 class RefinerEvaluator:
     """Measures refined samples beside the raw ones and mocap that training does not see."""
@@ -398,13 +329,14 @@ class RefinerEvaluator:
     """Mocap's measures."""
     windows: list[Tensor]
     """Mocap's windows for the classifier."""
-    settings: RealismSettings
+    settings: RealismSettings = field(default_factory=RealismSettings)
     """Settings of the realism classifier."""
 
     @staticmethod
-    def of(raw: Corpus, held: Corpus, settings: RealismSettings) -> "RefinerEvaluator":
+    def of(raw: Corpus, held: Corpus, settings: RealismSettings | None = None) -> "RefinerEvaluator":
         """Against clips that training does not see: of those that a refiner is chosen by, or of those that are left to
         measure the chosen one."""
+        settings = settings or RealismSettings()
         clips = [clip for clip in held.clips() if len(clip) > settings.windows.frames]
         motions = [decode(clip, GroundPose.origin()) for clip in clips]
         windows = [cut_windows(canonical_positions(motion), settings.windows) for motion in motions]
@@ -426,7 +358,7 @@ class RefinerEvaluator:
                 for clip in refined
             ]
             seeded = torch.Generator().manual_seed(0)
-            row["told_apart"] = compute_held_out_accuracy(
+            row["classifier_accuracy"] = compute_held_out_accuracy(
                 made, self.windows, generator=seeded, settings=self.settings.classifier
             )
         return row
@@ -454,8 +386,8 @@ def compute_realism_gap(row: Mapping[str, float | None]) -> float:
     ratios = [value or math.nan for name, value in row.items() if name.endswith("_ratio")]
     if not all(value > 0 for value in ratios):
         return math.inf
-    told = row.get("told_apart") or 0.0
-    return sum(abs(math.log(value)) for value in ratios) + 2 * max(0.0, told - 0.5)
+    accuracy = row.get("classifier_accuracy") or 0.0
+    return sum(abs(math.log(value)) for value in ratios) + 2 * max(0.0, accuracy - 0.5)
 
 
 _NO_CARD = checkpoints.Card("refiner", {}, licence="", **checkpoints.Card.layout_fields())

@@ -1,12 +1,12 @@
 """Training of the stitcher: both ways between two poses of mocap, longer and longer ones.
 
-What a stitcher does between poses of unseen clips: how near it comes, how far its sides are apart, and how its
-answers differ.
+Validation measures, between poses of unseen clips, how near the answers come, how far the two sides are apart, and how
+the answers differ.
 """
 
 import copy
-from collections.abc import Mapping, Sequence
-from dataclasses import astuple, dataclass, field, replace
+import itertools
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import torch
@@ -42,15 +42,150 @@ from priors.stitcher import (
 )
 from priors.training.data import Corpus, Split
 from priors.training.loop import (
+    Count,
     Export,
-    Gathered,
     GradientTrainer,
-    NetworkRecipe,
+    NetworkSettings,
     Row,
     average_logarithms,
     make_generator,
+    update_average,
 )
 from priors.training.windows import WindowPicker
+
+_SHORTEST, _FIRST_LONGEST = 2, 8  # frames from pose to pose
+_LEAST_WINDOW = 16  # frames of the longest transition
+_CONTEXT = 10  # frames known before or after, at most
+_LENGTH_GROWTH = 0.5  # share of training in which transitions become longer
+_AVERAGE = 0.999
+_EVENNESS = 0.85  # of windows among kinds of clips: 0 by their frames, 1 the same number from each
+_LEAST_SPREAD = 0.05  # of a feature, of the typical one of its block
+_EASE = 0.4  # power of the interpolation's error by which windows count less
+_EASE_METRES = 0.05  # error at which they count 1
+TRIES = 4
+"""Draws of which the nearest is taught."""
+SHARES = {"informed": 0.4, "calm": 0.3, "nearest": 0.2}
+"""Shares of a batch whose latents are the posterior's, which has seen the truth; the prior's mean; and the one of
+several draws from the prior that comes nearest to the truth (the variety loss of Gupta et al. 2018, "Social GAN"). The
+rest has draws from the prior, which have only to meet."""
+WEIGHTS = {
+    "places": 10.0,  # mean distance of joints from their true positions, metres (the paper's FK loss, Eq. 7)
+    "pace": 20.0,  # error of joints' steps, metres a frame
+    "state": 0.5,  # absolute error of steps, turns and poses, in units of their spread (Eq. 6)
+    "contacts": 0.1,  # cross entropy of the contacts, nats
+    "feet": 5.0,  # steps of toes that are planted, metres a frame
+    "stitching": 5.0,  # mean distance of the two sides' joints where they overlap, metres (Eq. 4)
+    "shared": 0.001,  # divergence of the shared latents' posterior from a standard normal distribution, nats
+    "prior": 0.02,  # divergence of that posterior, as it is, from its prior, which is to learn it, nats
+    "own": 0.02,  # divergence of the frames' latents from their prior, nats a transition
+    "phase": 0.3,  # absolute error of the phases
+}
+"""Weights of the losses."""
+VALIDATED_GAPS = (5, 15, 30, 45)
+"""Frames between the two poses."""
+TEMPERATURES = (0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0, 2.25, 2.5, 2.75, 3.0)
+"""Of draws, that are tried."""
+_WINDOWS, _DRAWS = 96, 8
+_DRAWN_GAP = 30
+_AS_NEAR = 1.01  # of the least error of the best draw
+
+
+@dataclass(frozen=True, kw_only=True)
+class StitcherSettings(NetworkSettings):
+    """Train the stitcher, which generates many motions from one pose to another; --batch is in transitions, --window in
+    frames of the longest."""
+
+    kind = "stitcher"
+    used_by = "use it with --stitcher"
+
+    steps: Count = 12_000
+    """Steps in all."""
+    window: Count = 61
+    """Frames from one pose to the other in the longest transition."""
+
+    def __post_init__(self):
+        super().__post_init__()
+        require_at_least(self, _LEAST_WINDOW, "window")
+
+    def make_config(self) -> StitcherConfig:
+        """Return the shape of the network."""
+        return StitcherConfig()
+
+    def make_trainer(self, parts: Split) -> "StitcherTrainer":
+        """Make the trainer as it is before the first step."""
+        return StitcherTrainer(self, parts.train)
+
+
+class StitcherTrainer(GradientTrainer[StitcherNetwork]):
+    """Draws transitions, hides what is between their ends, and brings both sides nearer to it."""
+
+    def __init__(self, settings: StitcherSettings, corpus: Corpus):
+        self.config = config = settings.find_config()
+        self.windows = TransitionWindows(corpus, evenness=_EVENNESS)
+        self.longest = min(config.longest, settings.window, max(corpus.lengths) - 2 * _CONTEXT - 1)
+        if self.longest < _SHORTEST:
+            raise RequestError(f"a stitcher needs clips of {_SHORTEST + 2 * _CONTEXT + 1} frames and more")
+        device = torch.get_default_device()
+        super().__init__(settings, lambda: self._make(config, device))
+        _set_moments(self.network, corpus)
+        self.begin()
+        self.average = copy.deepcopy(self.network).requires_grad_(False)
+        """Moving average of the weights: what is measured and exported."""
+
+    def _make(self, config: StitcherConfig, device: torch.device) -> StitcherNetwork:
+        network = StitcherNetwork(config)
+        self.posterior = PosteriorNetwork(config).to(device)
+        """Sees the truth."""
+        return network
+
+    def make_optimisers(self) -> dict[str, torch.optim.Optimizer]:
+        """AdamW with a short memory."""
+        return {"optimiser": torch.optim.AdamW(self.weights(), lr=self.settings.learning_rate, betas=(0.5, 0.9))}
+
+    def weights(self) -> list[nn.Parameter]:
+        """Those of the posterior too."""
+        return [*super().weights(), *self.posterior.parameters()]
+
+    def networks(self) -> dict[str, nn.Module]:
+        """All that is learnt, by its name in checkpoints."""
+        return super().networks() | {"posterior": self.posterior, "average": self.average}
+
+    @property
+    def exported(self) -> StitcherNetwork:
+        """The moving average of the weights."""
+        return self.average
+
+    def losses(self) -> dict[str, Tensor]:
+        """Compute the losses of a newly drawn batch."""
+        longest = _FIRST_LONGEST + max(0, self.longest - _FIRST_LONGEST) * min(1.0, self.progress / _LENGTH_GROWTH)
+        longest = max(_SHORTEST, min(round(longest), self.longest))
+        frames = int(torch.randint(_SHORTEST, longest + 1, (), generator=self.generator))
+        truth = self.windows.draw(self.settings.batch, frames, _draw_known(self.generator), self.generator)
+        with multiply_in_bfloat16(self.network, self.posterior, wanted=self.settings.bfloat16):
+            parts, errors = find_stitcher_losses(self.network, self.posterior, truth, self.generator)
+        return {"loss": torch.stack([WEIGHTS[name] * value for name, value in parts.items()]).sum(), **errors}
+
+    def train_step(self) -> dict[str, float]:
+        """Take one update, and bring the average nearer."""
+        parts = super().train_step()
+        update_average(self.average, self.network, min(_AVERAGE, (1 + self.step) / (10 + self.step)))
+        return parts
+
+    @torch.no_grad()
+    def validate(self, corpus: Corpus) -> dict[str, Any]:
+        """Measure transitions of unseen clips."""
+        return measure_transitions(self.average, TransitionWindows(corpus, evenness=1.0))
+
+    def score(self, row: Row) -> float:
+        """Return the error of the calm answer to unseen transitions over the interpolation's, geometric mean over
+        lengths, after a pose and after ten frames."""
+        return average_logarithms(value for name, value in row.items() if name.startswith(("bare_", "past_")))
+
+    def export(self, parts: Split) -> Export:
+        """Return the average of the weights, with draws as wide as they come near to the truth."""
+        windows = TransitionWindows(parts.validation, evenness=1.0)
+        self.average.temperature.fill_(calibrate_temperature(self.average, windows))
+        return super().export(parts)
 
 
 class Known(NamedTuple):
@@ -126,13 +261,13 @@ class Transition:
 class TransitionWindows:
     """Draws transitions from a corpus, half of them mirrored."""
 
-    def __init__(self, corpus: Corpus, *, kinds: Sequence[str], evenness: float):
+    def __init__(self, corpus: Corpus, *, evenness: float):
         """`evenness` among kinds of clips, as `WindowPicker` takes it."""
         self.features = corpus.features
         self.phases = torch.cat([compute_phases(LAYOUT.pick(clip, "contacts")) for clip in corpus.clips()]).to(
             self.features
         )
-        self.picker = WindowPicker(corpus, kinds=kinds, evenness=evenness)
+        self.picker = WindowPicker(corpus, evenness=evenness)
         self.starts = corpus.locate_clips()[1]
 
     def draw(self, batch: int, frames: int, known: Known, generator: torch.Generator) -> Transition:
@@ -147,11 +282,15 @@ class TransitionWindows:
         return Transition(features, torch.where(mirrored, mirror_phases(phases), phases), frames, lead, known)
 
 
-_EASE_METRES = 0.05
-
-
-TRIES = 4
-"""Draws of which the nearest is taught."""
+def _draw_known(generator: torch.Generator) -> Known:
+    """Two bare poses in two fifths of the cases; in the rest up to 10 frames before, and after or not."""
+    share = float(torch.rand((), generator=generator))
+    before, after = torch.randint(0, _CONTEXT + 1, (2,), generator=generator).tolist()
+    if share < 0.4:
+        return Known()
+    if share < 0.55:
+        return Known(1, min(1, after))
+    return Known(max(1, before) if share < 0.75 else _CONTEXT, after if share < 0.8 else 0)
 
 
 @dataclass(eq=False)
@@ -178,22 +317,22 @@ class TaughtLatents:
         if not count:
             self.nats.append(self.noise.shared[:0])
             return self.noise.share(prior, seen)
-        told = self.posterior.tell_shared(self.missed)
-        self.cost = told.diverge(Gaussian(torch.zeros_like(told.mean), torch.zeros_like(told.mean)))
+        found = self.posterior.tell_shared(self.missed)
+        self.cost = found.diverge(Gaussian(torch.zeros_like(found.mean), torch.zeros_like(found.mean)))
         # Held to a prior that sees the ends, the posterior would learn to tell nothing but these.
-        self.nats.append(told.detach().diverge(prior.row(slice(count))))
+        self.nats.append(found.detach().diverge(prior.row(slice(count))))
         noise = self.noise.shared
-        return torch.cat([told.draw(noise[:count]), prior.row(slice(count, None)).draw(noise[count:])])
+        return torch.cat([found.draw(noise[:count]), prior.row(slice(count, None)).draw(noise[count:])])
 
     def own(self, prior: Gaussian, encoded: Float[Tensor, "2 batch width"], step: int) -> Float[Tensor, "2 batch own"]:
         """A frame's, of both sides."""
         last = self.truth.shape[2] - 1
         ahead = [min(step + number, last) for number in range(SEEN_FUTURE)]
-        told = self.posterior.tell_own(self.truth[:, :, ahead], encoded)
-        self.nats.append(told.diverge(prior).mean(dim=0))
+        found = self.posterior.tell_own(self.truth[:, :, ahead], encoded)
+        self.nats.append(found.diverge(prior).mean(dim=0))
         noise = self.noise.slow[:, :, step]
         informed = torch.arange(noise.shape[1]) < self.missed.shape[1]
-        return torch.where(informed[:, None], told.draw(noise), prior.draw(noise))
+        return torch.where(informed[:, None], found.draw(noise), prior.draw(noise))
 
     def diverge(self) -> dict[str, Tensor]:
         """Return the divergences that are learnt, nats a transition, by the names of their weights."""
@@ -233,69 +372,12 @@ def sample_nearest(network: StitcherNetwork, truth: Transition, generator: torch
     return noise.rows(best * count + torch.arange(count))
 
 
-@dataclass(frozen=True)
-class LossWeights:
-    """Weights of what is learnt; each loss is divided by its mean before training where `relative`."""
-
-    places: float = 10.0
-    """Mean distance of joints from their true places, metres (the paper's FK loss, Eq. 7)."""
-    pace: float = 20.0
-    """Error of joints' steps, metres a frame."""
-    state: float = 0.5
-    """Absolute error of steps, turns and poses, in units of their spread (Eq. 6)."""
-    contacts: float = 0.1
-    """Cross entropy of the contacts, nats."""
-    feet: float = 5.0
-    """Steps of toes that are planted, metres a frame."""
-    stitching: float = 5.0
-    """Mean distance of the two sides' joints where they overlap, metres (Eq. 4)."""
-    shared: float = 0.001
-    """Divergence of the posterior of what both sides share from a standard normal distribution, nats."""
-    prior: float = 0.02
-    """Divergence of that posterior, as it is, from its prior, which is to learn it, nats."""
-    own: float = 0.02
-    """Divergence of the frames' latents from their prior, nats a transition."""
-    phase: float = 0.3
-    """Absolute error of the phases."""
-    ease: float = 0.4
-    """Power of the interpolation's error by which windows count less; 0 lets all count the same."""
-
-    def weigh(self, parts: Mapping[str, Tensor]) -> Tensor:
-        """Return the loss."""
-        return torch.stack([getattr(self, name) * value for name, value in parts.items()]).sum()
-
-
-@dataclass(frozen=True)
-class Shares:
-    """Shares of a batch by where latents come from; the rest has draws from the prior, which have only to meet."""
-
-    informed: float = 0.4
-    """From the posterior, which has seen the truth."""
-    calm: float = 0.3
-    """The prior's mean."""
-    nearest: float = 0.2
-    """The one of several draws from the prior that comes nearest to the truth (the variety loss of Gupta et al. 2018,
-    "Social GAN"): so draws are taught to come near to all that may be meant, where the posterior teaches what a latent
-    is to say."""
-
-    def count(self, batch: int) -> tuple[int, int, int]:
-        """Return the rows at which the first three end."""
-        told = self.informed, self.informed + self.calm, self.informed + self.calm + self.nearest
-        informed, calm, nearest = (round(batch * share) for share in told)
-        return informed, calm, nearest
-
-
 def find_stitcher_losses(
-    network: StitcherNetwork,
-    posterior: PosteriorNetwork,
-    truth: Transition,
-    shares: Shares,
-    ease: float,
-    generator: torch.Generator,
+    network: StitcherNetwork, posterior: PosteriorNetwork, truth: Transition, generator: torch.Generator
 ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     """Find the losses by the names of their weights, and in plain units the errors that they are made of."""
     batch = len(truth.features)
-    informed, calm, compared = shares.count(batch)
+    informed, calm, compared = (round(batch * share) for share in itertools.accumulate(SHARES.values()))
     row = torch.arange(batch)
     noise = DrawnLatents.sample(network.config, batch, count_made(network, truth.frames), generator)
     noise = noise.still((row >= informed) & (row < calm))
@@ -304,9 +386,9 @@ def find_stitcher_losses(
     wanted, missed = truth.truth(), miss_calmly(network, truth.rows(row[:informed]))
     latents = TaughtLatents(posterior, (wanted - network.mean) / network.std, missed, noise)
     sides = walk_sides(network, truth.ends(), truth.frames, latents)
-    parts, distance, slip = _compare(network, truth, sides, compared, ease)
+    parts, distance, slip = _compare(network, truth, sides, compared)
     parts |= latents.diverge()
-    told = {
+    errors = {
         "places_cm": 100 * distance[:, :informed].mean() if informed else torch.zeros(()),
         "calm_cm": 100 * distance[:, informed:calm].mean() if calm > informed else torch.zeros(()),
         "nearest_cm": 100 * distance[:, calm:].mean() if compared > calm else torch.zeros(()),
@@ -319,24 +401,24 @@ def find_stitcher_losses(
         "own_nats": parts["own"],
         "phase": parts["phase"],
     }
-    return parts, told
+    return parts, errors
 
 
 def _compare(
-    network: StitcherNetwork, truth: Transition, sides: Sides, compared: int, power: float
+    network: StitcherNetwork, truth: Transition, sides: Sides, compared: int
 ) -> tuple[dict[str, Tensor], Float[Tensor, "sides compared made joints"], Float[Tensor, "sides compared made joints"]]:
     """Compare the first rows with the truth, and let all of them meet and stand; also return the distances of joints
     from their true places, and the errors of their steps, metres."""
     made = sides.features.shape[2]
     true, places = truth.truth()[:, :compared, :made], sides.place_joints()
     # Windows that interpolation nearly solves count for more, or the network learns to fidget where nobody moves.
-    ease = weigh_windows(truth, power)[:compared]
+    ease = weigh_windows(truth)[:compared]
     wrong = places[:, :compared] - truth.place_joints(made)[:, :compared]
     distance = _measure_length(wrong)
     slip = _measure_length(torch.diff(wrong, dim=2, prepend=torch.zeros_like(wrong[:, :, :1])))
     off = ((sides.features[:, :compared] - true) / network.std).abs()
     steps = _measure_length(torch.diff(places[..., list(TOE_JOINTS), :], dim=2))
-    # Who was drawn is compared with no truth: toes that its own sides call planted are to stand.
+    # A draw is compared with no truth: toes that its own sides call planted are to stand.
     stand = torch.cat([true[..., POSE.stop :], sides.features[:, compared:, :, POSE.stop :].detach()], dim=1)
     planted = stand[:, :, 1:] * stand[:, :, :-1]
     phases = torch.cat([sides.at_ends[:, :, None], sides.phases[:, :, : made - 1]], dim=2)[:, :compared]
@@ -360,11 +442,11 @@ def measure_apart(places: Float[Tensor, "2 batch made joints 3"], frames: int) -
 
 
 @torch.no_grad()
-def weigh_windows(truth: Transition, power: float) -> Float[Tensor, " batch"]:
-    """Weigh transitions by a power of the mean error of the interpolation: 1 at 5 cm."""
+def weigh_windows(truth: Transition) -> Float[Tensor, " batch"]:
+    """Weigh transitions by a power (_EASE) of the mean error of the interpolation: 1 at 5 cm."""
     body, guess = interpolate(truth)
     error = (body.joints_world() - guess.joints_world()).norm(dim=-1).mean(dim=(1, 2))
-    return ((_EASE_METRES + 0.01) / (error + 0.01)) ** power
+    return ((_EASE_METRES + 0.01) / (error + 0.01)) ** _EASE
 
 
 def interpolate(truth: Transition) -> tuple[BodyPose, BodyPose]:
@@ -381,15 +463,6 @@ def interpolate(truth: Transition) -> tuple[BodyPose, BodyPose]:
 def _measure_length(vectors: Tensor) -> Tensor:
     """Norm whose gradient is finite at zero."""
     return (vectors.square().sum(dim=-1) + 1e-10).sqrt()
-
-
-VALIDATED_GAPS = (5, 15, 30, 45)
-"""Frames between the two poses."""
-TEMPERATURES = (0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0, 2.25, 2.5, 2.75, 3.0)
-"""Of draws, that are tried."""
-_WINDOWS, _DRAWS = 96, 8
-_DRAWN_GAP = 30
-_AS_NEAR = 1.01  # of the least error of the best draw
 
 
 @torch.no_grad()
@@ -480,152 +553,6 @@ def _draw(
     generator, batch, made = make_generator(0), len(truth.features), count_made(network, truth.frames)
     latents = [DrawnLatents.sample(network.config, batch, made, generator) for _ in range(_DRAWS)]
     return torch.stack([place(answer(network, truth, each.scale(temperature))) for each in latents])
-
-
-_SHORTEST, _FIRST_LONGEST = 2, 8  # frames from pose to pose
-_LEAST_WINDOW = 16  # frames of the longest transition
-_CONTEXT = 10  # frames told before or after, at most
-_LENGTH_GROWTH = 0.5  # share of training in which transitions become longer
-_AVERAGE = 0.999
-_LEAST_SPREAD = 0.05  # of a feature, of the typical one of its block
-
-
-@dataclass(frozen=True)
-class StitcherSettings:
-    """How a stitcher is trained."""
-
-    steps: int = 12_000
-    """Updates."""
-    batch: int = 64
-    """Transitions an update, all of one length."""
-    window: int = 61
-    """Frames from one pose to the other in the longest."""
-    learning_rate: float = 1e-3
-    """At its highest; it falls to nothing along a cosine."""
-    shares: Shares = field(default_factory=Shares)
-    """Where the transitions' latents come from."""
-    weights: LossWeights = field(default_factory=LossWeights)
-    """Of what is learnt."""
-    evenness: float = 0.85
-    """How evenly windows are drawn from kinds of clips: 0 by their frames, 1 the same number from each."""
-    kinds: tuple[str, ...] = ("walk-turn", "walk", "run|dash", "^cmu")
-    """Kinds, as patterns of names; clips of none of these are another kind."""
-    bfloat16: bool = False
-    """Layers multiply in bfloat16; weights, all else and the loss stay in float32."""
-    seed: int = 1
-    """Seed of weights, windows and latents."""
-
-    def __post_init__(self):
-        require_at_least(self, 1, "steps", "batch")
-        if self.window < _LEAST_WINDOW:
-            raise RequestError(f"window must be at least {_LEAST_WINDOW} frames, got {self.window}")
-        shares = astuple(self.shares)
-        if min(shares) < 0 or not 0 < sum(shares) <= 1:
-            raise RequestError("shares of a batch are 0 to 1 together, and more than nothing")
-
-
-class StitcherTrainer(GradientTrainer[StitcherNetwork]):
-    """Draws transitions, hides what is between their ends, and brings both sides nearer to it."""
-
-    def __init__(self, config: StitcherConfig, settings: StitcherSettings, corpus: Corpus):
-        self.windows = TransitionWindows(corpus, kinds=settings.kinds, evenness=settings.evenness)
-        self.longest = min(config.longest, settings.window, max(corpus.lengths) - 2 * _CONTEXT - 1)
-        if self.longest < _SHORTEST:
-            raise RequestError(f"a stitcher needs clips of {_SHORTEST + 2 * _CONTEXT + 1} frames and more")
-        device = torch.get_default_device()
-        super().__init__(lambda: self._make(config, device), settings)
-        _set_moments(self.network, corpus)
-        self.average = copy.deepcopy(self.network).requires_grad_(False)
-        """Moving average of the weights: what is measured and exported."""
-
-    def _make(self, config: StitcherConfig, device: torch.device) -> StitcherNetwork:
-        network = StitcherNetwork(config)
-        self.posterior = PosteriorNetwork(config).to(device)
-        """Sees the truth."""
-        return network
-
-    def make_optimisers(self) -> dict[str, torch.optim.Optimizer]:
-        """AdamW with a short memory."""
-        return {"optimiser": torch.optim.AdamW(self.weights(), lr=self.learning_rate, betas=(0.5, 0.9))}
-
-    def weights(self) -> list[nn.Parameter]:
-        """Those of the posterior too."""
-        return [*super().weights(), *self.posterior.parameters()]
-
-    def networks(self) -> dict[str, nn.Module]:
-        """All that is learnt, by its name in checkpoints."""
-        return super().networks() | {"posterior": self.posterior, "average": self.average}
-
-    @property
-    def exported(self) -> StitcherNetwork:
-        """The moving average of the weights."""
-        return self.average
-
-    def losses(self) -> dict[str, Tensor]:
-        """Compute the losses of a newly drawn batch."""
-        settings = self.settings
-        longest = _FIRST_LONGEST + max(0, self.longest - _FIRST_LONGEST) * min(1.0, self.progress / _LENGTH_GROWTH)
-        longest = max(_SHORTEST, min(round(longest), self.longest))
-        frames = int(torch.randint(_SHORTEST, longest + 1, (), generator=self.generator))
-        truth = self.windows.draw(settings.batch, frames, _draw_known(self.generator), self.generator)
-        with multiply_in_bfloat16(self.network, self.posterior, wanted=settings.bfloat16):
-            parts, errors = find_stitcher_losses(
-                self.network, self.posterior, truth, settings.shares, settings.weights.ease, self.generator
-            )
-        return {"loss": settings.weights.weigh(parts), **errors}
-
-    def train_step(self) -> dict[str, float]:
-        """Take one update, and bring the average nearer."""
-        parts = super().train_step()
-        keep = min(_AVERAGE, (1 + self.step) / (10 + self.step))
-        with torch.no_grad():
-            for mean, weight in zip(self.average.parameters(), self.network.parameters(), strict=True):
-                mean.lerp_(weight, 1 - keep)
-        return parts
-
-    @torch.no_grad()
-    def validate(self, corpus: Corpus) -> dict[str, Any]:
-        """Measure transitions of unseen clips."""
-        windows = TransitionWindows(corpus, kinds=self.settings.kinds, evenness=1.0)
-        return measure_transitions(self.average, windows)
-
-
-def _draw_known(generator: torch.Generator) -> Known:
-    """Two bare poses in two fifths of the cases; in the rest up to 10 frames before, and after or not."""
-    share = float(torch.rand((), generator=generator))
-    before, after = torch.randint(0, _CONTEXT + 1, (2,), generator=generator).tolist()
-    if share < 0.4:
-        return Known()
-    if share < 0.55:
-        return Known(1, min(1, after))
-    return Known(max(1, before) if share < 0.75 else _CONTEXT, after if share < 0.8 else 0)
-
-
-@dataclass(frozen=True)
-class StitcherRecipe(NetworkRecipe[StitcherConfig, StitcherSettings, StitcherTrainer]):
-    """What to train a stitcher on, and how."""
-
-    kind = "stitcher"
-    trainer_class = StitcherTrainer
-    config: StitcherConfig = field(default_factory=StitcherConfig)
-    settings: StitcherSettings = field(default_factory=StitcherSettings)
-
-    def make_trainer(self, parts: Split) -> StitcherTrainer:
-        """As it is before the first step."""
-        trainer = super().make_trainer(parts)
-        trainer.average.load_state_dict(trainer.network.state_dict())
-        return trainer
-
-    def export(self, trainer: StitcherTrainer, gathered: Gathered, curve: Sequence[Row]) -> Export:
-        """What is written at the end: the average of the weights, and how wide its draws are."""
-        windows = TransitionWindows(gathered.parts.validation, kinds=self.settings.kinds, evenness=1.0)
-        trainer.average.temperature.fill_(calibrate_temperature(trainer.average, windows))
-        return replace(super().export(trainer, gathered, curve), tensors=trainer.average.state_dict())
-
-    def score(self, row: Row) -> float:
-        """Error of the calm answer to unseen transitions over the interpolation's, geometric mean over lengths, after a
-        pose and after ten frames."""
-        return average_logarithms(value for name, value in row.items() if name.startswith(("bare_", "past_")))
 
 
 def _set_moments(network: StitcherNetwork, corpus: Corpus) -> None:

@@ -1,31 +1,23 @@
 """Training of the generator of long in-betweens by distances (Zhou et al. 2020, sections 3.4 to 3.6, appendix C).
 
-Part of each batch are windows of one clip, whose truth is known; the others (`TweenerSettings.spliced`) are spliced of
-several, of which only keys and style are. What lies between keys of different clips is held by what the generator
-learnt in windows of one; the paper's critic is left out, with which results were no better.
-
-Losses of the generator of long in-betweens: distances from the truth, keys, the hips' way, style (Zhou et al. 2020,
-section 3.6), from which its recipe takes one sum.
-
-Sequences of keys far apart, as the generator of long in-betweens is trained on them (Zhou et al. 2020, appendix C).
-
-A sequence is one window of a clip, or excerpts of several clips one after the other with a long gap at every splice.
-Gaps grow in the course of training.
-
-Keys that tell less than whole poses (Zhou et al. 2020, section 5): halves, the hips alone, some joints, places on
-the ground, and drawings seen from one side.
+Most of each batch are windows of one clip, whose truth is known; the others are spliced of excerpts of several clips
+with a long gap at every splice, of which only keys and style are. Gaps grow in the course of training. What lies
+between keys of different clips is held by what the generator learnt in windows of one; the paper's critic is left out,
+with which results were no better. Some keys are less than whole poses (section 5): halves, the hips alone, some joints,
+positions on the ground, and drawings seen from one side.
 """
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Annotated, Any
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import avg_pool1d
 from torch.nn.functional import binary_cross_entropy_with_logits as cross_entropy
+from tyro.conf import arg
 
 from mapctl import kinematics, motion_dna, rotations
 from mapctl.errors import RequestError
@@ -43,17 +35,19 @@ from priors.checkpoints import require_at_least
 from priors.path import PathNetwork
 from priors.training.data import Corpus, Split
 from priors.training.loop import (
+    Count,
     Export,
-    Gathered,
     GradientTrainer,
-    NetworkRecipe,
+    Name,
+    NetworkSettings,
     Row,
     average_logarithms,
     make_generator,
 )
-from priors.training.windows import PoseWindows, choose_rows, find_kind
+from priors.training.windows import KINDS, PoseWindows, choose_rows, find_kind
 from priors.tweener import (
     LABELS,
+    PAPER,
     GeneratorConfig,
     GeneratorNetwork,
     ToldParts,
@@ -66,127 +60,54 @@ from priors.tweener import (
 _JOINTS = CANONICAL.num_joints
 _LEGS = frozenset(j for j, name in enumerate(CANONICAL.names) if name.endswith(("Leg", "Foot", "Toes")))
 
+WEIGHTS = {
+    "places": 10.0,  # distance of joints from their true positions, seen from the hips, metres
+    "turns": 1.0,  # error of local rotations: norm of the difference of matrices
+    "pace": 20.0,  # error of the joints' steps, metres a frame
+    "activity": 20.0,  # error of joints' mean speed and acceleration over a second, metres a frame (and frame)
+    "feet": 5.0,  # the planted toes' steps, metres a frame
+    "keys": 10.0,  # distance and rotations at keys, beside those everywhere
+    "path": 2.0,  # error of the hips' displacements over 1, 8, 32 and 96 frames, metres, where they are known
+    "root": 0.3,  # distance of the hips' path from its positions at keys (Eq. 10), metres
+    "contacts": 0.05,  # cross entropy of the contacts that the path predictor finds, nats
+    "style": 4.0,  # distance of the style's poses from the nearest generated ones (Eq. 11), metres
+    "dwell": 2.0,  # distance from the style's poses of those that come nearest to one in each gap (Eq. 12), metres
+    "regularisation": 0.05,  # batch regularisation (Eq. 9)
+}
+"""Weights of the losses."""
+_METRES = ("places", "pace", "activity", "feet", "keys", "path", "root", "style", "dwell")
+_HALF = 60.0  # frames from the nearest key at which what a performer did counts half
+_DWELL = 5  # frames for which a pose of the style must be near: none flashes up
+_PATH_SPANS = (1, 8, 32, 96)
+_SOME = 3  # of so many sequences one has its trajectory predicted and its rotations compared: they cost as much as all
+_ACTIVITY_FRAMES = 32  # over which joints' speeds and accelerations are averaged
+_DNA_GAP = 90  # frames, 3 s, for each of which a gap has a pose of the style (Eq. 12)
+_MIN_STD = 0.05  # metres
 
-@dataclass(frozen=True)
-class PartSettings:
-    """How many sequences have keys that are not whole, and what these tell."""
-
-    halves: float = 0.1
-    """Share of sequences with keys of half a body, of the hips alone or of some joints."""
-    places: float = 0.1
-    """Share of sequences with keys that are nothing but places on the ground."""
-    drawings: float = 0.1
-    """Share of sequences with keys that are seen from one side."""
-
-
-WHOLE = PartSettings(halves=0.0, places=0.0, drawings=0.0)
-"""Keys are whole poses."""
-
-
-def tell_parts(
-    known: Bool[Tensor, "batch frames"],
-    heading: Float[Tensor, "batch frames"],
-    settings: PartSettings,
-    rolls: Iterator[float],
-) -> ToldParts:
-    """Choose what is told in frames that are keys, of motions with these headings, radians: of most sequences all of
-    the pose."""
-    told = ToldParts.whole(known)
-    axes, faced, view = told.axes.clone(), told.heading.clone(), told.view.clone()
-    for row in range(len(known)):
-        kind = next(rolls)
-        runs = [slice(start, stop) for _, start, stop in true_intervals(known[row][:, None])]
-        if not runs:
-            continue
-        if (kind := kind - settings.halves) < 0:
-            for run in runs:
-                axes[row, run] = _draw_part(rolls)[:, None]
-        elif (kind := kind - settings.places) < 0:
-            whole = 0.4 * (next(rolls) < 0.6)
-            for run in runs:
-                if next(rolls) >= whole:
-                    axes[row, run], faced[row, run] = _PLACE, False
-        elif kind - settings.drawings < 0:
-            view[row] = _draw_view(float(heading[row, runs[0].start]), rolls)
-            for run in runs:
-                if next(rolls) < 0.75:
-                    axes[row, run], faced[row, run] = False, False
-                    axes[row, run.start] = _draw_drawing(rolls)
-    return ToldParts(axes, faced, view)
-
-
-def _see_joints(turning: Iterable[int]) -> Bool[Tensor, " joints"]:
-    """Return which joints' positions are told by rotations of some."""
-    told, rotations = [True], set(turning)
-    for parent in CANONICAL.parents[1:]:
-        told.append(told[parent] and parent in rotations)
-    return torch.tensor(told)
-
-
-_UPPER, _LOWER = (_see_joints({0, *part}) for part in (set(range(_JOINTS)) - _LEGS, _LEGS))
-_HIPS = _see_joints({0})
-_PLACE = torch.zeros(_JOINTS, 3, dtype=torch.bool)
-_PLACE[0, ::2] = True
-
-
-def _draw_part(rolls: Iterator[float]) -> Bool[Tensor, " joints"]:
-    """Draw which joints are told of a key."""
-    kind = next(rolls)
-    for share, part in ((0.3, _UPPER), (0.3, _LOWER), (0.1, _HIPS), (0.15, torch.ones(_JOINTS, dtype=torch.bool))):
-        if (kind := kind - share) < 0:
-            return part
-    return _see_joints({0} | {joint for joint in range(_JOINTS) if next(rolls) < 0.8})
-
-
-def _draw_view(heading: float, rolls: Iterator[float]) -> float:
-    """Draw from where somebody is seen, radians: half of the time from before, behind, the side or between these."""
-    around = next(rolls)
-    return heading + round(8 * around) * math.pi / 4 if next(rolls) < 0.5 else 2 * math.pi * around
-
-
-def _draw_drawing(rolls: Iterator[float]) -> Bool[Tensor, "joints 3"]:
-    """Draw which coordinates a drawing tells: two of all joints or of some; the third of the hips' if they are
-    placed."""
-    drawn = torch.ones(_JOINTS, dtype=torch.bool)
-    if next(rolls) < 0.4:
-        drawn = torch.tensor([next(rolls) < 0.7 for _ in range(_JOINTS)])
-        drawn[0] = True
-    axes = drawn[:, None] & torch.tensor([True, True, False])
-    axes[0, 2] = next(rolls) < 0.5
-    return axes
-
-
-_SPLICED_FROM = 90  # frames of the shortest gap with a splice, 3 s
+# Sequences.
+_SPLICED = 0.25  # share of the frames that are in sequences spliced of several clips
+_SPLICE = (192, 1024)  # frames of the shortest and the longest spliced sequence
+_SHORTEST_WINDOW, _LEAST_WINDOW = 64, 32  # frames
+_TEMPO = 0.15  # largest change of tempo of windows of one clip, as a share
+_STYLED = 0.35  # share of sequences with a style: poses that are in them, or, where spliced, more often of another clip
+_FOREIGN_STYLES = 0.7  # share of styles of spliced sequences that are of another clip
+_STYLE_POSES = 2, 8
 _ROLLS = 4096  # random numbers drawn at once
 
+# Keys.
+_FIRST_LONGEST_GAP, _LONGEST_GAP = 30.0, 480.0  # frames when training begins, and grown up (paper: 600 at 60 fps)
+_SHORTEST_GAP = 30.0  # frames of the shortest longest gap of a sequence; the logarithm is drawn evenly
+_GROWN = 0.25  # share of training after which gaps grow no more
+_SPLICED_FROM = 90  # frames of the shortest gap with a splice, 3 s
+_RUNS, _RUN = 0.4, 12  # share of keys that are several frames, a pose and its pace, and their most frames
+_OPEN_ENDS = 0.1  # share of sequences that begin, and as many that end, without a key
+_SPEED = 1.5  # m/s, below which the hips travel where clips are spliced
+_HALVES, _PLACES, _DRAWINGS = 0.1, 0.1, 0.1  # shares with keys of parts of a body, of ground positions, and drawings
 
-@dataclass(frozen=True)
-class KeySettings:
-    """Where keys lie."""
-
-    first_longest: float = 30.0
-    """Frames of the longest gap when training begins."""
-    longest: float = 480.0
-    """And when it has grown up (paper: 600 at 60 fps)."""
-    shortest: float = 30.0
-    """Frames of the shortest that a sequence's longest gap may be; the logarithm is drawn evenly."""
-    grown: float = 0.25
-    """Share of training after which gaps grow no more."""
-    runs: float = 0.4
-    """Share of keys that are several frames: a pose and its pace."""
-    run: int = 12
-    """Frames of such a key, at most."""
-    open_ends: float = 0.1
-    """Share of sequences that begin, and as many that end, without a key."""
-    speed: float = 1.5
-    """Speed, m/s, below which the hips travel where clips are spliced: distances are proportional to the time."""
-    parts: PartSettings = field(default_factory=PartSettings)
-    """How much keys tell."""
-
-    def longest_at(self, progress: float) -> float:
-        """Return the frames of the longest gap at a `progress` of training from 0 to 1."""
-        share = min(1.0, progress / self.grown)
-        return self.first_longest * (self.longest / self.first_longest) ** share
+# Validation.
+_VALIDATED_FRAMES = 192  # of the gap that is validated, 6.4 s; of shorter clips all but the ends
+_SHORTEST_VALIDATED = 90
+_VALIDATED_OF_KIND = 24
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,7 +117,7 @@ class KeySequences:
     motion: PartialMotion
     """Poses by frame; between keys of different clips they are anything finite."""
     told: ToldParts
-    """What is told of the frames that are keys."""
+    """What is known of the frames that are keys."""
     truthful: Bool[Tensor, "batch frames"]
     """Whether the poses between the keys are a performer's."""
     clip: Int[Tensor, "batch frames"]
@@ -210,42 +131,214 @@ class KeySequences:
         return self.told.known
 
 
+@dataclass(frozen=True, kw_only=True)
+class TweenerSettings(NetworkSettings):
+    """Train a tweener, which generates motion between keys that are seconds apart."""
+
+    kind = "tweener"
+    used_by = "use it with mapctl tween --method tweener --inbetweener"
+
+    steps: Count = 16_000
+    """Steps in all."""
+    batch: Count = 8192
+    """Frames a step."""
+    window: Count = 330
+    """Frames of the longest window of one clip; of those the shortest have 64."""
+    path: Name = "path"
+    """Path predictor, bundled or trained, for the root trajectory of what is generated."""
+    paper: bool = False
+    """The network of Zhou et al. 2020; other options still hold."""
+    labels: Annotated[str, arg(metavar="REGEX")] = LABELS
+    """Class of a clip by its path below the data folder, for `mapctl tween --dna NAME`: what the first group matches;
+    if not given, Bandai Namco's content, else the folder or the file's name without a number."""
+
+    def __post_init__(self):
+        super().__post_init__()
+        require_at_least(self, _LEAST_WINDOW, "window")
+
+    def check(self) -> None:
+        """Raise RequestError for what cannot be, before anything is read."""
+        super().check()
+        find_class("", self.labels)
+        path_predictor.load(self.path)
+
+    def make_config(self) -> GeneratorConfig:
+        """Return the shape of the network that these settings ask for."""
+        return PAPER if self.paper else GeneratorConfig()
+
+    def make_trainer(self, parts: Split) -> "TweenerTrainer":
+        """Make the trainer as it is before the first step."""
+        group_clips(parts.train.names, self.labels)  # what the end of training needs
+        return TweenerTrainer(self, parts.train)
+
+
+class TweenerTrainer(GradientTrainer[GeneratorNetwork]):
+    """Draws sequences, hides all but their keys, and brings the generator nearer to what was between."""
+
+    def __init__(self, settings: TweenerSettings, corpus: Corpus):
+        self.path = path_predictor.load(settings.path).network.to(torch.get_default_device())
+        self.path.reduced_precision = settings.bfloat16
+        self.windows = PoseWindows(corpus, evenness=1.0)
+        self.longest = min(settings.window, int(int(self.windows.lengths.max()) / (1 + _TEMPO)) - 1)
+        self.config = settings.find_config()
+        super().__init__(settings, lambda: GeneratorNetwork(self.config, bfloat16=settings.bfloat16))
+        _set_moments(self.network, self.windows)
+        self.begin()
+
+    def make_optimisers(self) -> dict[str, torch.optim.Optimizer]:
+        """Adam with the short memory that pays where the data change from step to step."""
+        rate = self.settings.learning_rate
+        return {"optimiser": torch.optim.Adam(self.network.parameters(), lr=rate, betas=(0.5, 0.9))}
+
+    def losses(self) -> dict[str, Tensor]:
+        """Compute the losses of a newly drawn batch."""
+        batch, progress, generator = self.settings.batch, self.progress, self.generator
+        shortest, reach = min(_SHORTEST_WINDOW, self.longest), round(1.25 * find_longest_gap(progress))
+        frames = self._draw_frames(shortest, min(self.longest, shortest + reach))
+        count = max(1, round((1 - _SPLICED) * batch / frames))
+        one = draw_windows(self.windows, count, frames, progress=progress, generator=generator)
+        frames = self._draw_frames(*_SPLICE)
+        count = max(1, round(_SPLICED * batch / frames))
+        other = draw_splices(self.windows, count, frames, progress=progress, generator=generator)
+        parts, spliced = self._compare(one, 0.0), self._compare(other, _FOREIGN_STYLES)
+        parts["loss"] = parts["loss"] + spliced["loss"]
+        return parts | {f"spliced_{name}": spliced[name] for name in ("keys_cm", "root_cm", "style_cm", "dwell_cm")}
+
+    def _draw_frames(self, shortest: int, longest: int) -> int:
+        share = float(torch.rand((), generator=self.generator))
+        return round(shortest * (max(shortest, longest) / shortest) ** share)
+
+    def _compare(self, sequences: KeySequences, foreign: float) -> dict[str, Tensor]:
+        poses = draw_style_poses(self.windows, sequences, foreign, self.generator)
+        styled = torch.rand(len(poses), generator=self.generator) < _STYLED
+        return compute_tweener_losses(self.network, self.path, sequences, poses, styled)
+
+    def validate(self, corpus: Corpus) -> dict[str, Any]:
+        """Measure gaps of unseen clips (see `measure_kinds`)."""
+        return measure_kinds(self.network, corpus)
+
+    def score(self, row: Row) -> float:
+        """Return the error of unseen gaps over slerp's, geometric mean over kinds of clips."""
+        kinds = [name.removesuffix("_slerp_cm") for name, value in row.items() if name.endswith("_slerp_cm") and value]
+        pairs = [(row.get(f"{kind}_error_cm"), row[f"{kind}_slerp_cm"]) for kind in kinds]
+        return average_logarithms(error / slerp for error, slerp in pairs if error is not None)
+
+    def identify(self) -> Row:
+        """Return the path predictor, which must not change between a run's parts."""
+        return {"path": checkpoints.compute_hash(self.settings.path)}
+
+    def export(self, parts: Split) -> Export:
+        """Return the weights, with the path predictor and the classes for the card."""
+        done = super().export(parts)
+        classes = compute_classes(self.network, parts.train, self.settings.labels)
+        done.data = {"path": checkpoints.compute_hash(self.settings.path), **classes}
+        return done
+
+
+def find_longest_gap(progress: float) -> float:
+    """Return the frames of the longest gap at a `progress` of training from 0 to 1."""
+    return _FIRST_LONGEST_GAP * (_LONGEST_GAP / _FIRST_LONGEST_GAP) ** min(1.0, progress / _GROWN)
+
+
+def choose_parts(
+    known: Bool[Tensor, "batch frames"], heading: Float[Tensor, "batch frames"], partial: bool, rolls: Iterator[float]
+) -> ToldParts:
+    """Choose what is known in frames that are keys, of motions with these headings, radians: of most sequences all of
+    the pose, and of all of them unless `partial`."""
+    told = ToldParts.whole(known)
+    axes, faced, view = told.axes.clone(), told.heading.clone(), told.view.clone()
+    for row in range(len(known)):
+        kind = next(rolls)
+        runs = [slice(start, stop) for _, start, stop in true_intervals(known[row][:, None])]
+        if not runs:
+            continue
+        if partial and kind < _HALVES:
+            for run in runs:
+                axes[row, run] = _draw_part(rolls)[:, None]
+        elif partial and kind < _HALVES + _PLACES:
+            whole = 0.4 * (next(rolls) < 0.6)
+            for run in runs:
+                if next(rolls) >= whole:
+                    axes[row, run], faced[row, run] = _PLACE, False
+        elif partial and kind < _HALVES + _PLACES + _DRAWINGS:
+            view[row] = _draw_view(float(heading[row, runs[0].start]), rolls)
+            for run in runs:
+                if next(rolls) < 0.75:
+                    axes[row, run], faced[row, run] = False, False
+                    axes[row, run.start] = _draw_drawing(rolls)
+    return ToldParts(axes, faced, view)
+
+
+def _see_joints(turning: Iterable[int]) -> Bool[Tensor, " joints"]:
+    """Return which joints' positions are known by the rotations of some."""
+    told, rotations = [True], set(turning)
+    for parent in CANONICAL.parents[1:]:
+        told.append(told[parent] and parent in rotations)
+    return torch.tensor(told)
+
+
+_UPPER, _LOWER = (_see_joints({0, *part}) for part in (set(range(_JOINTS)) - _LEGS, _LEGS))
+_HIPS = _see_joints({0})
+_PLACE = torch.zeros(_JOINTS, 3, dtype=torch.bool)
+_PLACE[0, ::2] = True
+
+
+def _draw_part(rolls: Iterator[float]) -> Bool[Tensor, " joints"]:
+    """Draw which joints are known of a key."""
+    kind = next(rolls)
+    for share, part in ((0.3, _UPPER), (0.3, _LOWER), (0.1, _HIPS), (0.15, torch.ones(_JOINTS, dtype=torch.bool))):
+        if (kind := kind - share) < 0:
+            return part
+    return _see_joints({0} | {joint for joint in range(_JOINTS) if next(rolls) < 0.8})
+
+
+def _draw_view(heading: float, rolls: Iterator[float]) -> float:
+    """Draw from where a body is seen, radians: half of the time from before, behind, the side or between these."""
+    around = next(rolls)
+    return heading + round(8 * around) * math.pi / 4 if next(rolls) < 0.5 else 2 * math.pi * around
+
+
+def _draw_drawing(rolls: Iterator[float]) -> Bool[Tensor, "joints 3"]:
+    """Draw which coordinates a drawing shows: two of all joints or of some; the third of the hips' if they are
+    placed."""
+    drawn = torch.ones(_JOINTS, dtype=torch.bool)
+    if next(rolls) < 0.4:
+        drawn = torch.tensor([next(rolls) < 0.7 for _ in range(_JOINTS)])
+        drawn[0] = True
+    axes = drawn[:, None] & torch.tensor([True, True, False])
+    axes[0, 2] = next(rolls) < 0.5
+    return axes
+
+
 def draw_windows(
-    windows: PoseWindows,
-    batch: int,
-    frames: int,
-    settings: KeySettings,
-    *,
-    progress: float,
-    tempo: float,
-    generator: torch.Generator,
+    windows: PoseWindows, batch: int, frames: int, *, progress: float, generator: torch.Generator, partial: bool = True
 ) -> KeySequences:
-    """Draw windows of single clips, half of them up to the share `tempo` slower or faster, and keys in them."""
+    """Draw windows of single clips, half of them up to the share _TEMPO slower or faster, and keys in them."""
     varied = torch.rand(batch, generator=generator) < 0.5
-    pace = torch.where(varied, 1 + tempo * (2 * torch.rand(batch, generator=generator) - 1), 1.0)
+    pace = torch.where(varied, 1 + _TEMPO * (2 * torch.rand(batch, generator=generator) - 1), 1.0)
     clip, first = windows.picker.pick(1 + ((frames - 1) * pace).ceil().long(), generator)
     motion = windows.at(clip, first, frames, pace)
     rolls = _roll(generator)
     known = torch.zeros(batch, frames, dtype=torch.bool)
     for row in known:
-        for start, stop in _lay_keys(frames, settings, settings.longest_at(progress), rolls):
+        for start, stop in _lay_keys(frames, find_longest_gap(progress), rolls):
             row[start:stop] = True
     everywhere = torch.ones_like(known)
     clip = clip[:, None].expand_as(known)
-    return _finish(motion, known, everywhere, clip, settings.parts, rolls, generator)
+    return _finish(motion, known, everywhere, clip, partial, rolls, generator)
 
 
 def draw_splices(
-    windows: PoseWindows, batch: int, frames: int, settings: KeySettings, *, progress: float, generator: torch.Generator
+    windows: PoseWindows, batch: int, frames: int, *, progress: float, generator: torch.Generator, partial: bool = True
 ) -> KeySequences:
     """Draw keys of several clips: of one under 3 s, above that of another one the likelier the longer the gap is."""
-    rolls, longest = _roll(generator), settings.longest_at(progress)
+    rolls, longest = _roll(generator), find_longest_gap(progress)
     shape = (batch, frames)
     clip, time = (torch.zeros(shape, dtype=torch.long) for _ in range(2))
     known, truthful = (torch.zeros(shape, dtype=torch.bool) for _ in range(2))
     turn, shift = torch.zeros(shape), torch.zeros(*shape, 2)
     for row in range(batch):
-        for part in _splice(windows, frames, settings, longest, rolls, generator):
+        for part in _splice(windows, frames, longest, rolls, generator):
             during, key = slice(part.start, None), slice(part.key, part.stop)
             clip[row, during] = part.clip
             time[row, during] = part.first + torch.arange(frames - part.start)
@@ -253,7 +346,7 @@ def draw_splices(
             known[row, key] = True
             truthful[row, part.truthful_from : part.stop] = True
     motion = _place(windows.gather(clip, time.double()), turn, shift)
-    return _finish(motion, known, truthful, clip, settings.parts, rolls, generator)
+    return _finish(motion, known, truthful, clip, partial, rolls, generator)
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,80 +367,68 @@ class _Part:
 
 
 def _splice(
-    windows: PoseWindows,
-    frames: int,
-    settings: KeySettings,
-    longest: float,
-    rolls: Iterator[float],
-    generator: torch.Generator,
+    windows: PoseWindows, frames: int, longest: float, rolls: Iterator[float], generator: torch.Generator
 ) -> Iterator[_Part]:
     """Yield the keys of a sequence in temporal order."""
-    length = _draw_longest(settings, longest, rolls)
-    part = _begin(windows, settings, rolls, generator)
+    length = _draw_longest(longest, rolls)
+    part = _begin(windows, rolls, generator)
     while part.key < frames:
         yield part
         gap = _draw_gap(length, rolls)
         last = part.stop - 1
         room = int(windows.lengths[part.clip]) - 1 - part.time_at(last)
-        other = next(rolls) < gap / settings.longest if gap >= _SPLICED_FROM else gap > room
+        other = next(rolls) < gap / _LONGEST_GAP if gap >= _SPLICED_FROM else gap > room
         if other or gap > room:
             gap = gap if gap >= _SPLICED_FROM else gap + _SPLICED_FROM
-            part = _leave(windows, part, gap, settings, rolls, generator)
+            part = _leave(windows, part, gap, rolls, generator)
         else:
-            stop = last + gap + min(_draw_run(settings, rolls), room - gap + 1)
+            stop = last + gap + min(_draw_run(rolls), room - gap + 1)
             part = replace(part, key=last + gap, stop=stop, truthful_from=last)
 
 
-def _begin(windows: PoseWindows, settings: KeySettings, rolls: Iterator[float], generator: torch.Generator) -> _Part:
-    run = _draw_run(settings, rolls)
+def _begin(windows: PoseWindows, rolls: Iterator[float], generator: torch.Generator) -> _Part:
+    run = _draw_run(rolls)
     clip, first = (int(each) for each in windows.picker.pick(torch.tensor([run]), generator))
     turn = 2 * math.pi * next(rolls)
     shift = -rotations.rotate_ground(windows.ground[windows.starts[clip] + first], torch.tensor(turn))
     return _Part(clip, 0, first, 0, run, 0, turn, shift)
 
 
-def _leave(
-    windows: PoseWindows,
-    part: _Part,
-    gap: int,
-    settings: KeySettings,
-    rolls: Iterator[float],
-    generator: torch.Generator,
-) -> _Part:
+def _leave(windows: PoseWindows, part: _Part, gap: int, rolls: Iterator[float], generator: torch.Generator) -> _Part:
     """Go on with another clip after so many frames, at a distance that is proportional to them."""
-    new, last = _begin(windows, settings, rolls, generator), part.stop - 1
+    new, last = _begin(windows, rolls, generator), part.stop - 1
     before = windows.starts[part.clip] + part.time_at(last)
     place = rotations.rotate_ground(windows.ground[before], torch.tensor(part.turn)) + part.shift
-    way = gap / 30 * settings.speed * next(rolls)
+    way = gap / 30 * _SPEED * next(rolls)
     towards = 2 * math.pi * next(rolls)
     shift = new.shift + place + way * torch.tensor([math.sin(towards), math.cos(towards)])
     start = last + gap
     return replace(new, start=start, key=start, stop=start + new.stop, truthful_from=start, shift=shift)
 
 
-def _lay_keys(frames: int, settings: KeySettings, longest: float, rolls: Iterator[float]) -> Iterator[tuple[int, int]]:
+def _lay_keys(frames: int, longest: float, rolls: Iterator[float]) -> Iterator[tuple[int, int]]:
     """Yield first frames of keys in a window, and one past their last."""
-    length = _draw_longest(settings, longest, rolls)
-    at = 0 if next(rolls) >= settings.open_ends else min(frames - 1, _draw_gap(length, rolls))
+    length = _draw_longest(longest, rolls)
+    at = 0 if next(rolls) >= _OPEN_ENDS else min(frames - 1, _draw_gap(length, rolls))
     while at < frames:
-        stop = at + _draw_run(settings, rolls)
+        stop = at + _draw_run(rolls)
         yield at, stop
         at = stop - 1 + _draw_gap(length, rolls)
-    if next(rolls) >= settings.open_ends:
-        yield frames - _draw_run(settings, rolls), frames
+    if next(rolls) >= _OPEN_ENDS:
+        yield frames - _draw_run(rolls), frames
 
 
-def _draw_longest(settings: KeySettings, longest: float, rolls: Iterator[float]) -> float:
-    return settings.shortest * (longest / settings.shortest) ** next(rolls)
+def _draw_longest(longest: float, rolls: Iterator[float]) -> float:
+    return _SHORTEST_GAP * (longest / _SHORTEST_GAP) ** next(rolls)
 
 
 def _draw_gap(longest: float, rolls: Iterator[float]) -> int:
     return max(2, round(longest * (0.3 + 0.7 * next(rolls))))
 
 
-def _draw_run(settings: KeySettings, rolls: Iterator[float]) -> int:
-    several = next(rolls) < settings.runs
-    return 2 + int(next(rolls) * (settings.run - 1)) if several else 1
+def _draw_run(rolls: Iterator[float]) -> int:
+    several = next(rolls) < _RUNS
+    return 2 + int(next(rolls) * (_RUN - 1)) if several else 1
 
 
 def _roll(generator: torch.Generator) -> Iterator[float]:
@@ -367,55 +448,14 @@ def _finish(
     known: Tensor,
     truthful: Tensor,
     clip: Tensor,
-    parts: PartSettings,
+    partial: bool,
     rolls: Iterator[float],
     generator: torch.Generator,
 ) -> KeySequences:
-    """Mirror half of the sequences, and choose what keys tell."""
+    """Mirror half of the sequences, and choose what is known of keys."""
     mirrored = torch.rand(len(known), generator=generator) < 0.5
     motion = choose_rows(mirrored, motion.mirrored(), motion)
-    return KeySequences(motion, tell_parts(known, motion.heading, parts, rolls), truthful, clip, mirrored)
-
-
-_DWELL = 5  # frames for which a pose of the style must be near: none flashes up
-_PATH_SPANS = (1, 8, 32, 96)
-_SOME = 3  # of so many sequences one has its way predicted and its rotations compared: they cost as much as all else
-_ACTIVITY_FRAMES = 32  # over which joints' speeds and accelerations are averaged
-_DNA_GAP = 90  # frames, 3 s, for each of which a gap has a pose of the style (Eq. 12)
-_METRES = ("places", "pace", "activity", "feet", "keys", "path", "root", "style", "dwell")
-
-
-@dataclass(frozen=True)
-class LossWeights:
-    """What each error counts."""
-
-    places: float = 10.0
-    """Weight of the distance of joints from where they truly are, seen from the hips, metres."""
-    pace: float = 20.0
-    """Weight of the error of their steps, metres a frame."""
-    activity: float = 20.0
-    """Weight of the error of joints' mean speed and acceleration over a second, metres a frame (and frame): who does
-    not know the phase of a step steps all the same, and who stands does not tremble."""
-    turns: float = 1.0
-    """Weight of the error of local rotations: norm of the difference of matrices."""
-    keys: float = 10.0
-    """Weight of distance and rotations at keys, beside those everywhere."""
-    feet: float = 5.0
-    """Weight of the planted toes' steps, metres a frame."""
-    contacts: float = 0.05
-    """Weight of the cross entropy of the contacts that the path predictor sees, nats."""
-    path: float = 2.0
-    """Weight of the error of the hips' displacements over 1, 8, 32 and 96 frames, metres, where they are known."""
-    root: float = 0.3
-    """Weight of the distance of the hips' path from its places at keys (Eq. 10), metres."""
-    style: float = 4.0
-    """Weight of the distance of the style's poses from the nearest that are made (Eq. 11), metres."""
-    dwell: float = 2.0
-    """Weight of the distance from the style's poses of those that come nearest to one in each gap (Eq. 12), metres."""
-    regularisation: float = 0.05
-    """Weight of batch regularisation (Eq. 9)."""
-    half: float = 60.0
-    """Frames from the nearest key at which what a performer did counts half."""
+    return KeySequences(motion, choose_parts(known, motion.heading, partial, rolls), truthful, clip, mirrored)
 
 
 def see_without_root(
@@ -431,7 +471,6 @@ def compute_tweener_losses(
     sequences: KeySequences,
     style_poses: Float[Tensor, "batch poses joints 3"],
     styled: Bool[Tensor, " batch"],
-    weights: LossWeights,
 ) -> dict[str, Tensor]:
     """The loss, and in plain units the errors it is made of.
 
@@ -444,7 +483,7 @@ def compute_tweener_losses(
     made = made_poses.turn_to_world(image)
     wanted = image.places - image.places[..., :1, :]  # seen from the hips, as what is made
     local = motion.local_matrices()
-    weight = _weigh_frames(known, weights) * sequences.truthful
+    weight = _weigh_frames(known) * sequences.truthful
     shown = _Errors(made_poses.pose.places, wanted)
     heading = kinematics.heading_of_matrix(made.local_matrix[..., 0, :, :])
     some = slice(0, -(-len(known) // _SOME))
@@ -460,15 +499,15 @@ def compute_tweener_losses(
     }
     trajectory = path(LocalMotion.of_world(made.places[some], heading[some]))
     way = trajectory.integrate(heading[some])
-    terms |= _compute_path_terms(trajectory, way, sequences, some, weights)
+    terms |= _compute_path_terms(trajectory, way, sequences, some)
     without_root = see_without_root(made.places, made.local_matrix[..., 0, :, :])
     apart = torch.cdist(style_poses.flatten(-2), without_root.flatten(-2)) / len(CANONICAL.names) ** 0.5
     terms["style"] = _compute_style_error(apart, styled)
     terms["dwell"] = _compute_dwell_error(apart, known, styled)
     terms["regularisation"] = regularise_batch(tuple(each[some] for each in made_poses.responses))
-    loss = torch.stack([getattr(weights, name) * value for name, value in terms.items()]).sum()
-    told = {f"{name}_cm": 100 * terms[name] for name in _METRES}
-    return {"loss": loss, **told, **{name: terms[name] for name in ("turns", "contacts", "regularisation")}}
+    loss = torch.stack([WEIGHTS[name] * value for name, value in terms.items()]).sum()
+    shown_cm = {f"{name}_cm": 100 * terms[name] for name in _METRES}
+    return {"loss": loss, **shown_cm, **{name: terms[name] for name in ("turns", "contacts", "regularisation")}}
 
 
 class _Errors:
@@ -498,7 +537,7 @@ class _Errors:
         return error
 
     def keys(self, told: ToldParts) -> Tensor:
-        """Compare the coordinates that keys tell of joints but the hips, from which they are seen."""
+        """Compare the coordinates that are known at keys, of joints but the hips, from which they are seen."""
         joints = told.axes[..., 1:, :].any(dim=-1).float()
         return _average(_length((self.off * told.axes)[..., 1:, :]), joints)
 
@@ -508,7 +547,7 @@ class _Errors:
 
 
 def _compute_path_terms(
-    trajectory: RootTrajectory, made: Tensor, sequences: KeySequences, some: slice, weights: LossWeights
+    trajectory: RootTrajectory, made: Tensor, sequences: KeySequences, some: slice
 ) -> dict[str, Tensor]:
     """Errors of where the hips of some sequences go, as the path predictor sees it, metres, and of contacts, nats."""
     motion, known, truthful = sequences.motion, sequences.known[some], sequences.truthful[some]
@@ -527,7 +566,7 @@ def _compute_path_terms(
     return {
         "path": torch.stack(errors).mean() + height,
         "root": (_length(off) * share).sum(dim=1).mean(),
-        "contacts": _average(nats, _weigh_frames(known, weights) * truthful),
+        "contacts": _average(nats, _weigh_frames(known) * truthful),
     }
 
 
@@ -553,11 +592,11 @@ def _compute_dwell_error(
     return torch.stack(found).mean() if found else apart.new_zeros(())
 
 
-def _weigh_frames(known: Bool[Tensor, "batch frames"], weights: LossWeights) -> Float[Tensor, "batch frames"]:
+def _weigh_frames(known: Bool[Tensor, "batch frames"]) -> Float[Tensor, "batch frames"]:
     """1 at a key, less the farther the nearest is."""
     frame = torch.arange(known.shape[1])
     away = torch.minimum((frame - last_observed(known)).abs(), (next_observed(known) - frame).abs())
-    return 1 / (1 + away / weights.half)
+    return 1 / (1 + away / _HALF)
 
 
 def _average_seconds(values: Float[Tensor, "batch frames columns"]) -> Float[Tensor, "batch seconds columns"]:
@@ -578,153 +617,8 @@ def _length(vectors: Tensor) -> Tensor:
     return vectors.square().sum(dim=-1).add(1e-8).sqrt()
 
 
-_SHORTEST_WINDOW, _LEAST_WINDOW = 64, 32  # frames
-_MIN_STD = 0.05  # metres
-_FOREIGN_STYLES = 0.7  # share of styles of spliced sequences that are of another clip
-_STYLE_POSES = 2, 8
-_VALIDATED_FRAMES = 192  # of the gap that is validated, 6.4 s; of shorter clips all but the ends
-_SHORTEST_VALIDATED = 90
-_VALIDATED_OF_KIND = 24
-
-
-@dataclass(frozen=True)
-class TweenerSettings:
-    """How the generator is trained."""
-
-    steps: int = 16_000
-    """Updates."""
-    batch: int = 8192
-    """Frames an update."""
-    spliced: float = 0.25
-    """Share of them in sequences that are spliced of several clips; the others are in windows of one."""
-    window: int = 330
-    """Frames of the longest window of one clip; of those the shortest have 64."""
-    splice: tuple[int, int] = (192, 1024)
-    """Frames of the shortest and the longest sequence that is spliced."""
-    learning_rate: float = 1e-3
-    """At its highest; it falls to nothing along a cosine."""
-    weights: LossWeights = field(default_factory=LossWeights)
-    """What each error counts."""
-    styled: float = 0.35
-    """Share of sequences that are given a style: of windows poses that are in them, of what is spliced poses in it or,
-    more often, of another clip altogether."""
-    tempo: float = 0.15
-    """Largest change of tempo of windows of one clip, as a share."""
-    layout: KeySettings = field(default_factory=KeySettings)
-    """Where keys lie."""
-    evenness: float = 1.0
-    """How evenly clips are drawn from their kinds: 0 by their frames, 1 the same number from each."""
-    kinds: tuple[str, ...] = ("walk-turn", "walk", "run|dash", "^cmu")
-    """Kinds, as patterns of names; clips of none of these are another kind."""
-    bfloat16: bool = False
-    """Both networks compute in bfloat16; weights and losses stay in float32."""
-    seed: int = 1
-    """Seed of weights, windows and keys."""
-
-    def __post_init__(self):
-        require_at_least(self, 1, "steps", "batch")
-        require_at_least(self, _LEAST_WINDOW, "window")
-
-
-class TweenerTrainer(GradientTrainer[GeneratorNetwork]):
-    """Draws sequences, hides all but their keys, and brings the generator nearer to what was between."""
-
-    def __init__(self, config: GeneratorConfig, settings: TweenerSettings, corpus: Corpus, path: PathNetwork):
-        self.path = path.to(torch.get_default_device())
-        self.windows = PoseWindows(corpus, kinds=settings.kinds, evenness=settings.evenness)
-        fits = int(int(self.windows.lengths.max()) / (1 + settings.tempo)) - 1
-        self.longest = min(settings.window, fits)
-        super().__init__(lambda: GeneratorNetwork(config, bfloat16=settings.bfloat16), settings)
-        _set_moments(self.network, self.windows)
-
-    def make_optimisers(self) -> dict[str, torch.optim.Optimizer]:
-        """Adam with the short memory that pays where the data change from step to step."""
-        return {"optimiser": torch.optim.Adam(self.network.parameters(), lr=self.learning_rate, betas=(0.5, 0.9))}
-
-    def losses(self) -> dict[str, Tensor]:
-        """Compute the losses of a newly drawn batch."""
-        settings = self.settings
-        progress = self.progress
-        reach = round(1.25 * settings.layout.longest_at(progress))
-        shortest = min(_SHORTEST_WINDOW, self.longest)
-        frames = self._draw_frames(shortest, min(self.longest, shortest + reach))
-        one = draw_windows(
-            self.windows,
-            max(1, round((1 - settings.spliced) * settings.batch / frames)),
-            frames,
-            settings.layout,
-            progress=progress,
-            tempo=settings.tempo,
-            generator=self.generator,
-        )
-        frames = self._draw_frames(*settings.splice)
-        batch = max(1, round(settings.spliced * settings.batch / frames))
-        other = draw_splices(self.windows, batch, frames, settings.layout, progress=progress, generator=self.generator)
-        parts, spliced = (
-            self._compare(sequences, foreign) for sequences, foreign in ((one, 0.0), (other, _FOREIGN_STYLES))
-        )
-        parts["loss"] = parts["loss"] + spliced["loss"]
-        return parts | {f"spliced_{name}": spliced[name] for name in ("keys_cm", "root_cm", "style_cm", "dwell_cm")}
-
-    def _draw_frames(self, shortest: int, longest: int) -> int:
-        share = float(torch.rand((), generator=self.generator))
-        return round(shortest * (max(shortest, longest) / shortest) ** share)
-
-    def _compare(self, sequences: KeySequences, foreign: float) -> dict[str, Tensor]:
-        poses = draw_style_poses(self.windows, sequences, foreign, self.generator)
-        styled = torch.rand(len(poses), generator=self.generator) < self.settings.styled
-        weights = self.settings.weights
-        return compute_tweener_losses(self.network, self.path, sequences, poses, styled, weights)
-
-    def validate(self, corpus: Corpus) -> dict[str, Any]:
-        """Measure gaps of unseen clips (see `measure_kinds`)."""
-        return measure_kinds(self.network, corpus, self.settings.kinds)
-
-
-@dataclass(frozen=True)
-class TweenerRecipe(NetworkRecipe[GeneratorConfig, TweenerSettings, TweenerTrainer]):
-    """What to train the generator on, and how."""
-
-    kind = "tweener"
-    config: GeneratorConfig = field(default_factory=GeneratorConfig)
-    settings: TweenerSettings = field(default_factory=TweenerSettings)
-    path: str = "path"
-    """The path predictor that sees where the hips go, bundled or trained."""
-    labels: str = LABELS
-    """Regular expression whose first group in a clip's name is its class, whose style the card tells."""
-
-    def check(self) -> None:
-        """Before anything is read."""
-        super().check()
-        find_class("", self.labels)
-        path_predictor.load(self.path)
-
-    def draw_trainer(self, parts: Split) -> TweenerTrainer:
-        """Make the trainer with drawn weights."""
-        group_clips(parts.train.names, self.labels)  # what the end of training needs
-        network = path_predictor.load(self.path).network
-        network.reduced_precision = self.settings.bfloat16
-        return TweenerTrainer(self.config, self.settings, parts.train, network)
-
-    def score(self, row: Row) -> float:
-        """Error of unseen gaps over slerp's, geometric mean over kinds of clips."""
-        kinds = [name.removesuffix("_slerp_cm") for name, value in row.items() if name.endswith("_slerp_cm") and value]
-        pairs = [(row.get(f"{kind}_error_cm"), row[f"{kind}_slerp_cm"]) for kind in kinds if "before_" not in kind]
-        return average_logarithms(error / slerp for error, slerp in pairs if error is not None)
-
-    def describe_run(self, trainer: TweenerTrainer, corpus: Corpus) -> dict[str, Row]:
-        """What must not change between a run's parts."""
-        return {**super().describe_run(trainer, corpus), "path": {"hash": checkpoints.compute_hash(self.path)}}
-
-    def export(self, trainer: TweenerTrainer, gathered: Gathered, curve: Sequence[Row]) -> Export:
-        """What is written at the end: the card tells the path predictor it was trained with."""
-        done = super().export(trainer, gathered, curve)
-        classes = compute_classes(trainer.network, gathered.parts.train, self.labels)
-        return replace(done, data={**done.data, "path": checkpoints.compute_hash(self.path), **classes})
-
-
 def _set_moments(network: GeneratorNetwork, windows: PoseWindows) -> None:
-    """Tell the network means and spreads of the places that it sees along their heading, mirrored ones too."""
+    """Set means and spreads of the positions that the network sees along their heading, mirrored ones too."""
     batch = windows.draw(4000, 4, make_generator(0))
     local = batch.local_matrices()
     seen = see_from_hips(kinematics.positions_from_matrices(CANONICAL, local), local[..., 0, :, :])
@@ -754,13 +648,13 @@ def draw_style_poses(
 
 
 @torch.no_grad()
-def measure_kinds(network: GeneratorNetwork, corpus: Corpus, kinds: Sequence[str]) -> dict[str, Any]:
-    """By kind of clips with one long gap between two poses: error beside slerp's, cm, and speed, spread and jerk over
+def measure_kinds(network: GeneratorNetwork, corpus: Corpus) -> dict[str, Any]:
+    """Measure gaps between two poses by kind of clips: error beside slerp's, cm, and speed, spread and jerk over
     mocap's, of sums."""
-    windows = PoseWindows(corpus, kinds=kinds, evenness=1.0)
-    kind_of = [find_kind(name, kinds) for name in corpus.names]
+    windows = PoseWindows(corpus, evenness=1.0)
+    kind_of = [find_kind(name) for name in corpus.names]
     row: dict[str, Any] = {}
-    for kind, name in enumerate([*kinds, "other"]):
+    for kind, name in enumerate([*KINDS, "other"]):
         found = [number for number, each in enumerate(kind_of) if each == kind]
         found = [one for one in found if int(windows.lengths[one]) >= _SHORTEST_VALIDATED + 2]
         if found:
