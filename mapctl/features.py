@@ -168,11 +168,11 @@ def mirror_features(features: Float[Tensor, "*batch size"]) -> Float[Tensor, "*b
 def reversed_features(features: Float[Tensor, "*batch frames size"]) -> Float[Tensor, "*batch frames size"]:
     """Return the features of the motion run backwards, as `encode` finds them in it, in units of LAYOUT.
 
-    A frame's step, turn and contacts are those by which it was reached, so backwards the frame after it has them: the step as
-    -R(-turn) step, in the heading at which it ended, the turn as its negative, the contacts as they are. All else stays
-    with its frame. The first frame repeats the second's, as in `encode`; how the given first frame was reached is
-    dropped, and is all that twice does not give back. The motion begins at `GroundPose.before` of the given last ground
-    pose, by the first step and turn that are returned.
+    A frame's step, turn and contacts are those by which it was reached, so backwards the frame after it has them: the
+    step as -R(-turn) step, in the heading at which it ended, the turn as its negative, the contacts as they are. All
+    else stays with its frame. The first frame repeats the second's, as in `encode`; how the given first frame was
+    reached is dropped. The motion begins at `GroundPose.before` of the given last ground pose, by the first step and
+    turn that are returned.
 
     Equal to `encode` of the reversed motion but for contacts, now and then, at the frame where one begins or ends: how
     low a toe is belongs to the frame, how slow it is to the way there, and features hold only whether it is both. For

@@ -1,6 +1,7 @@
 """The body of one actor over a whole motion, as whoever paints it sees it."""
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol, runtime_checkable
@@ -52,6 +53,11 @@ class Foot:
     heights: tuple[float, float]
     """Heights of ankle and ball over the sole, metres."""
 
+    @property
+    def bones(self) -> list[tuple[int, int]]:
+        """Bone from ankle to ball, and from ball to tip if the rig has toes."""
+        return [(self.ankle, self.ball)] + ([] if self.tip is None else [(self.ball, self.tip)])
+
 
 class Anatomy:
     """Hips, head axes and feet of a motion of any rig and length, which a body is built on."""
@@ -62,7 +68,9 @@ class Anatomy:
         joints, parents = motion.joint_positions().numpy(), motion.skeleton.parents
         self.scale = _thigh_and_shin_length(joints[0], parents, classify_joints(motion.skeleton)) / _STANDARD_LEG
         self.points = _add_tips(motion, joints, self.rotations, self.scale)
-        self.hips = _hips_joint(motion)
+        self.hips = 0  # of an unknown rig: its root
+        with suppress(RequestError):
+            self.hips = find_hips(motion.skeleton)
 
     @property
     def hips_world(self) -> Array:
@@ -118,7 +126,8 @@ class Anatomy:
             return None
         ball = next((k for k in below if self.points.roles[k].part is Part.TOES), below[0])
         tip = next(self.children(ball), None) if ball < self.joints else None
-        flat = self._flat_frames(ankle, ball)
+        height = self.points.world[:, [ankle, ball], 1].sum(axis=1)
+        flat = height <= np.quantile(height, 0.1)  # frames in which the foot is most likely flat
         along = self.points.world[:, ball] - self.points.world[:, ankle]
         axes = _axes_from(
             up=self._to_joint_frame(ankle, _UP)[flat].mean(0), forward=self._to_joint_frame(ankle, along)[flat].mean(0)
@@ -128,15 +137,8 @@ class Anatomy:
         toe_axes = _axes_from(
             up=self._to_joint_frame(toe, _UP)[flat].mean(0), forward=self._to_joint_frame(toe, level)[flat].mean(0)
         )
-        heights = tuple(self._height(point, flat) for point in (ankle, ball))
-        return Foot(
-            side, ankle, ball, tip, axes, toe_axes, (max(heights[0], heights[1] + 0.02 * self.scale), heights[1])
-        )
-
-    def _flat_frames(self, ankle: int, ball: int) -> Array:
-        """Return frames in which the foot is most likely flat: ankle and ball together at their lowest."""
-        height = self.points.world[:, [ankle, ball], 1].sum(axis=1)
-        return height <= np.quantile(height, 0.1)
+        above, low = (self._height(point, flat) for point in (ankle, ball))
+        return Foot(side, ankle, ball, tip, axes, toe_axes, (max(above, low + 0.02 * self.scale), low))
 
     def _height(self, point: int, flat: Array) -> float:
         """Return the height of a point over the ground y = 0 in the flat frames, metres, limited to what a foot can
@@ -156,13 +158,6 @@ def _axes_from(*, up: Array, forward: Array) -> Array:
     if np.linalg.norm(across) < 1e-6 * np.linalg.norm(forward) + 1e-12:
         across = np.array([1.0, 0.0, 0.0])  # arbitrary where the motion does not determine it
     return frame_along(up, across)
-
-
-def _hips_joint(motion: Motion) -> int:
-    try:
-        return find_hips(motion.skeleton)
-    except RequestError:
-        return 0  # of an unknown rig: its root
 
 
 def _thigh_and_shin_length(rest: Array, parents: tuple[int, ...], found: tuple[Role, ...]) -> float:

@@ -1,6 +1,6 @@
 """A mannequin for any skeleton: left limbs blue, right limbs orange, torso in the actor's colour."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property
 
@@ -96,7 +96,9 @@ class Mannequin:
         anatomy = self.anatomy
         head = anatomy.find(Part.HEAD)
         skull = [] if head is None else [np.array([head, head])]
-        return [self.bones.ends[:, 0], *skull, *(np.array(_carrier_joints(anatomy, foot)) for foot in anatomy.feet)]
+        toes = [foot.ball if foot.ball < anatomy.joints else foot.ankle for foot in anatomy.feet]
+        shoes = [np.array([foot.ankle, toe][: len(foot.bones)]) for foot, toe in zip(anatomy.feet, toes, strict=True)]
+        return [self.bones.ends[:, 0], *skull, *shoes]
 
     def surface(self, frame: int) -> Surface:
         """Return the whole body in one frame."""
@@ -112,7 +114,7 @@ class Mannequin:
     @cached_property
     def _sticks(self) -> tuple[Array, Array, Array]:
         anatomy, bones = self.anatomy, self.bones
-        shoes = [(joints, foot) for foot in anatomy.feet for joints in _foot_bones(foot)]
+        shoes = [(joints, foot) for foot in anatomy.feet for joints in foot.bones]
         head = anatomy.find(Part.HEAD)
         crown = [(head, tip) for tip in anatomy.children(head) if tip >= anatomy.joints][:1] if head is not None else []
         ends = np.array([*map(tuple, bones.ends), *(joints for joints, _ in shoes), *crown]).reshape(-1, 2)
@@ -142,8 +144,14 @@ class Mannequin:
 
 
 def _build_bones(anatomy: Anatomy, colour: Array) -> Bones:
-    parents = anatomy.points.parents
-    pairs = [(parent, child) for child, parent in enumerate(parents) if _is_drawn(anatomy, child, parent)]
+    # No bone leads from a floor root to the hips; none is within skull and shoes, or without length.
+    rest = anatomy.points.world[0]
+    pairs = [
+        (parent, child)
+        for child, parent in enumerate(anatomy.points.parents)
+        if parent >= anatomy.hips and child > anatomy.hips and anatomy.points.roles[parent].part not in _BOXED
+        if np.linalg.norm(rest[child] - rest[parent]) > 0.005 * anatomy.scale
+    ]
     ends = pairs or [(anatomy.hips, anatomy.hips)]  # a lone joint is a ball
     shares = _trunk_shares(anatomy)
     return Bones(
@@ -155,27 +163,18 @@ def _build_bones(anatomy: Anatomy, colour: Array) -> Bones:
     )
 
 
-def _is_drawn(anatomy: Anatomy, child: int, parent: int) -> bool:
-    """Return whether a bone is drawn: none from a floor root to the hips, none within skull and shoes, none without
-    length."""
-    if parent < 0 or child <= anatomy.hips or anatomy.points.roles[parent].part in _BOXED:
-        return False
-    length = np.linalg.norm(anatomy.points.world[0, child] - anatomy.points.world[0, parent])
-    return parent >= anatomy.hips and bool(length > 0.005 * anatomy.scale)
-
-
 def _trunk_shares(anatomy: Anatomy) -> Array:
     """Return every point's share of the distance from hips to neck along the bones; 0 for legs, 1 for arms and head."""
     points, top = anatomy.points, anatomy.find(Part.NECK)
     top = anatomy.find(Part.HEAD) if top is None else top
-    way = np.zeros(len(points.parents))
+    length = np.zeros(len(points.parents))
     for point, parent in enumerate(points.parents):
         if point > anatomy.hips and parent >= 0:
-            way[point] = way[parent] + np.linalg.norm(points.world[0, point] - points.world[0, parent])
+            length[point] = length[parent] + np.linalg.norm(points.world[0, point] - points.world[0, parent])
     legs = (Part.UPPER_LEG, Part.LOWER_LEG, Part.FOOT, Part.TOES)
     low = np.array([role.part in legs for role in points.roles])
-    whole = way[top] if top is not None and way[top] > 0 else 0.5 * anatomy.scale
-    return np.where(low, 0.0, np.clip(way / whole, 0.0, 1.0))
+    whole = length[top] if top is not None and length[top] > 0 else 0.5 * anatomy.scale
+    return np.where(low, 0.0, np.clip(length / whole, 0.0, 1.0))
 
 
 def _is_link(anatomy: Anatomy, child: int, parent: int) -> bool:
@@ -238,11 +237,11 @@ def _shoe(anatomy: Anatomy, foot: Foot, frame: int) -> RoundedBoxes:
     """Build heel to ball and, where there are toes, ball to tip; soles on the ground when the foot is flat."""
     world, scale = anatomy.points.world[frame], anatomy.scale
     turn, boxes = anatomy.rotations[frame, foot.ankle] @ foot.axes, []
-    reach = _forward_reach(turn, world[foot.ball] - world[foot.ankle]) + (0.03 if foot.tip is None else 0.01) * scale
+    reach = float(turn[:, 2] @ (world[foot.ball] - world[foot.ankle])) + (0.03 if foot.tip is None else 0.01) * scale
     boxes.append(_sole(world[foot.ankle], turn, -foot.heights[0], (-0.055 * scale, reach), 0.085, scale))
     if foot.tip is not None:
         turn = anatomy.rotations[frame, foot.ball] @ foot.toe_axes
-        reach = max(_forward_reach(turn, world[foot.tip] - world[foot.ball]), 0.04 * scale)
+        reach = max(float(turn[:, 2] @ (world[foot.tip] - world[foot.ball])), 0.04 * scale)
         boxes.append(_sole(world[foot.ball], turn, -foot.heights[1], (-0.035 * scale, reach), 0.055, scale))
     centre, frames, half = (np.stack(values) for values in zip(*boxes, strict=True))
     many, leather = len(boxes), colours.blend_colours(_limb_colour(foot.side), np.zeros(3), 0.28)
@@ -251,26 +250,11 @@ def _shoe(anatomy: Anatomy, foot: Foot, frame: int) -> RoundedBoxes:
     )
 
 
-def _forward_reach(turn: Array, vector: Array) -> float:
-    """Return how far a vector reaches along the foot, metres."""
-    return float(turn[:, 2] @ vector)
-
-
 def _sole(joint: Array, turn: Array, floor: float, along: tuple[float, float], thick: float, scale: float):
     """Return the centre, frame and half extents of a box with its floor over a joint and its reach along it, metres."""
     middle = np.array([0.0, floor + thick * scale / 2, sum(along) / 2])
     half = np.array([0.045 * scale, thick * scale / 2, (along[1] - along[0]) / 2])
     return joint + turn @ middle, turn, np.maximum(half - _EDGE * scale, 0.0)
-
-
-def _carrier_joints(anatomy: Anatomy, foot: Foot) -> list[int]:
-    """Return the joints that carry the boxes of a shoe: ankle, and the toes if the rig has them."""
-    return [foot.ankle] if foot.tip is None else [foot.ankle, foot.ball if foot.ball < anatomy.joints else foot.ankle]
-
-
-def _foot_bones(foot: Foot) -> list[tuple[int, int]]:
-    """Return the bone from ankle to ball, and from ball to tip if the rig has toes."""
-    return [(foot.ankle, foot.ball)] + ([] if foot.tip is None else [(foot.ball, foot.tip)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -314,10 +298,7 @@ def build_skin(motion: Motion, colour: str = "slate") -> Skin:
 
 def at_rest(skeleton: Skeleton = CANONICAL) -> Motion:
     """Return one frame of a skeleton in its rest pose, the lowest joint as high as a toe joint of a flat foot."""
-    still = torch.zeros(1, skeleton.num_joints, 4, dtype=torch.float64)
-    still[..., 3] = 1.0
+    still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).repeat(1, skeleton.num_joints, 1)
     motion = Motion(skeleton, Fraction(30), torch.zeros(1, 3, dtype=torch.float64), still)
     lowest = float(motion.joint_positions()[..., 1].min())
-    return Motion(
-        skeleton, Fraction(30), torch.tensor([[0.0, TOE_REST_HEIGHT - lowest, 0.0]], dtype=torch.float64), still
-    )
+    return replace(motion, root_position=torch.tensor([[0.0, TOE_REST_HEIGHT - lowest, 0.0]], dtype=torch.float64))
