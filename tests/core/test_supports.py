@@ -94,12 +94,6 @@ def test_a_foot_that_hangs_below_both_supports_is_not_below_its_floor():
     assert float(fit_supports(toes, PLANTED)[middle, 0]) == pytest.approx(0.48 + TOE_REST_HEIGHT, abs=0.005)
 
 
-def test_a_take_of_minutes_fits_in_parts():
-    """More intervals than are fitted at once: the same supports."""
-    toes, planted = TOE_POSITIONS.repeat(20, 1, 1), PLANTED.repeat(20, 1)
-    assert torch.allclose(fit_supports(toes, planted)[:300], fit_supports(TOE_POSITIONS, PLANTED)[:300], atol=1e-3)
-
-
 def resting(toes=TOE_POSITIONS, hips=HIPS, noise=NO_NOISE):
     return compute_rest_log_probability(toes, hips, 30.0, noise) > math.log(0.5)
 

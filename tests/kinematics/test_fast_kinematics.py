@@ -1,11 +1,5 @@
 """The compiled kinematics and curve search against the torch code that specifies them."""
 
-import os
-import shutil
-import subprocess
-import sys
-from pathlib import Path as FilePath
-
 import pytest
 import torch
 from catalogue import FRAMES, TERMS
@@ -20,7 +14,6 @@ from mapctl.terms.kernels import find_local_frames
 from mapctl.terms.trial import Trial
 
 PAST = 8
-ROOT = FilePath(__file__).resolve().parents[2]
 CLOSED = torch.tensor([[0.0, 0.0], [2.0, 0.0], [2.0, 1.0], [0.0, 1.0], [0.0, 0.0]]).double()
 SPIRAL = torch.linspace(0, 6, 600).double()
 CURVES = {
@@ -164,13 +157,6 @@ def test_gradients_are_those_of_finite_differences():
     assert float((gradient * way).sum()) == pytest.approx(slope, rel=1e-3)
 
 
-def test_the_same_candidates_give_the_same_bytes_alone_and_in_a_batch():
-    whole = trial()
-    alone = trial(1, features=whole.features[1:2].detach())
-    assert torch.equal(everything_of(alone)[0], everything_of(whole)[1])
-    assert torch.equal(value_and_gradient(trial(), body_of)[1], value_and_gradient(trial(), body_of)[1])
-
-
 def beside(curve, *, count=400, dtype=torch.float64):
     """Arcs from before the start to beyond the end, and points about a foot away from them."""
     arcs = torch.linspace(-0.8, curve.length + 0.8, count, dtype=torch.float64)
@@ -202,39 +188,3 @@ def test_places_and_axes_are_the_curves_own(name):
     torch.testing.assert_close(found.axes[same][:, 1], curve.tangent(nearest)[same], atol=1e-6, rtol=0)
     left = found.axes[same][:, 0, curve.ground_axes]
     torch.testing.assert_close(left, curve.left(nearest)[same], atol=1e-6, rtol=0)
-
-
-@each_curve
-def test_the_wanted_place_lies_straight_on_from_the_nearest(name):
-    curve = CURVES[name]
-    points, arcs = beside(curve)
-    found = find_local_frames(curve, points, arcs, reach=0.6)
-    apart = (found.axes @ (found.tangent_extension - found.place).unsqueeze(-1)).squeeze(-1)
-    torch.testing.assert_close(apart[..., 0], torch.zeros_like(apart[..., 0]), atol=1e-9, rtol=0)
-    torch.testing.assert_close(curve.point(arcs - apart[..., 1]), found.place, atol=1e-9, rtol=0)
-
-
-COMPILED = """
-import torch
-from mapctl.features import GroundPose
-from mapctl.kinematics import fast
-ground, heading = fast.integrate_root_fast(torch.ones(1, 2, 68), GroundPose.origin())
-print(float(heading[0, 1]))
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not hasattr(os, "geteuid"), reason="needs POSIX permissions")
-def test_kernels_work_where_nothing_can_be_written(tmp_path):
-    shutil.copytree(ROOT / "mapctl", tmp_path / "mapctl", ignore=shutil.ignore_patterns("__pycache__"))
-    (tmp_path / "mapctl" / "kinematics" / "__pycache__").write_text("a file where the cache's folder would be")
-    # HOME is a file too, so neither the package's folder nor the user's cache can be made.
-    home = tmp_path / "home"
-    home.write_text("")
-    surroundings = {**os.environ, "HOME": str(home), "XDG_CACHE_HOME": str(home), "PYTHONDONTWRITEBYTECODE": "1"}
-    surroundings.pop("NUMBA_CACHE_DIR", None)
-    ran = subprocess.run(
-        [sys.executable, "-c", COMPILED], cwd=tmp_path, env=surroundings, capture_output=True, text=True, timeout=200
-    )
-    assert ran.returncode == 0, ran.stderr
-    assert ran.stdout.strip() == "2.0"

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from captures import apart_deg, on_rig, shaken
+from captures import apart_deg, shaken
 from helpers import bandai_skeleton, cmu_skeleton, generator, quat_xyzw, random_motion, walk
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -39,16 +39,6 @@ def test_any_pose_comes_back_from_its_places_whatever_one_starts_from(rig, seed)
     assert (made.joint_positions() - wanted.joint_positions()).norm(dim=-1).max() < 1e-9
 
 
-@pytest.mark.parametrize("rig", ["canonical", "bandai", "daz"])
-def test_twist_and_swing_of_a_walk_come_back_as_places(rig):
-    motion = on_rig(rig, 30)
-    start = shaken(motion.local_quat_xyzw, 0.4)
-    still = replace(motion, moving_offsets={})  # bones keep their lengths: a hip that travels is not one
-    made = solved(still.joint_positions(), start, motion.skeleton)
-    assert (made.joint_positions() - still.joint_positions()).norm(dim=-1).max() < 1e-9
-    assert torch.allclose(lengths(made), lengths(still), atol=1e-12)
-
-
 ARM = Limb(*(CANONICAL.index(f"left{part}") for part in ("UpperArm", "LowerArm", "Hand")), (0, 0, -1))
 LEG = Limb(*(CANONICAL.index(f"right{part}") for part in ("UpperLeg", "LowerLeg", "Foot")), (0, 0, 1))
 
@@ -67,7 +57,7 @@ def test_limbs_whose_bones_have_their_lengths_come_back_as_all_do(seed):
 
 
 @pytest.mark.parametrize("limb", [ARM, LEG], ids=["arm", "leg"])
-@pytest.mark.parametrize("share", [0.2, 0.5, 0.7])
+@pytest.mark.parametrize("share", [0.2, 0.7])
 def test_a_limb_of_short_bones_that_point_the_wrong_way_bends_as_it_did(limb, share):
     """As the mean of several swings: the end's place is met all the same."""
     motion = walk(40)
@@ -124,18 +114,6 @@ def test_joints_that_are_not_free_stay_as_they_are():
     assert apart_deg(nothing.local_quat_xyzw, start).max() < 1e-5
 
 
-def test_the_free_reach_from_where_the_others_leave_them():
-    """An arm's joints are free, the trunk is not: the elbow and the hand are met."""
-    motion = walk(12)
-    arm = [CANONICAL.index(name) for name in ("leftUpperArm", "leftLowerArm")]
-    start = motion.local_quat_xyzw.clone()
-    start[:, arm] = shaken(start[:, arm], 0.5)
-    free = torch.zeros(12, CANONICAL.num_joints, dtype=torch.bool)
-    free[:, arm] = True
-    made = solved(motion.joint_positions(), start, free=free)
-    assert (made.joint_positions() - motion.joint_positions()).norm(dim=-1).max() < 1e-9
-
-
 def test_a_limb_that_cannot_reach_points_at_its_place_on_rigid_bones():
     motion = walk(6)
     hand, elbow = CANONICAL.index("leftHand"), CANONICAL.index("leftLowerArm")
@@ -147,15 +125,6 @@ def test_a_limb_that_cannot_reach_points_at_its_place_on_rigid_bones():
     cosine = torch.cosine_similarity(aim, bone, dim=-1)
     assert cosine.min() > 1 - 1e-9
     assert torch.allclose(lengths(made), lengths(motion), atol=1e-12)
-
-
-def test_places_of_bones_that_have_stretched_are_met_by_rigid_ones_as_nearly_as_they_can():
-    """A network's bones do."""
-    motion = walk(6)
-    shift = 0.01 * torch.randn(6, CANONICAL.num_joints, 3, generator=generator(), dtype=torch.float64)
-    made = solved(motion.joint_positions() + shift, motion.local_quat_xyzw)
-    assert torch.allclose(lengths(made), lengths(motion), atol=1e-12)
-    assert (made.joint_positions() - motion.joint_positions() - shift).norm(dim=-1).mean() < 0.02
 
 
 def chain(*offsets):

@@ -69,7 +69,7 @@ def test_gradient_of_a_toe_is_that_of_finite_differences():
     )
 
 
-@pytest.mark.parametrize("degrees", [0, 45, 90, -135])
+@pytest.mark.parametrize("degrees", [45, -135])
 def test_heading_is_the_direction_that_the_hips_face(degrees):
     angle = math.radians(degrees)
     turn, lean = quat_xyzw(torch.tensor([[0, angle, 0], [0.2, 0, -0.1]], dtype=torch.float64))

@@ -18,12 +18,6 @@ def test_weights_are_the_gaussian_of_the_frames_between():
     assert torch.equal(weight.diagonal(), torch.ones(5, dtype=torch.float64))
 
 
-def test_averages_keep_what_is_constant_to_the_very_ends():
-    weight = gaussian.averaging_matrix(12, 3.0, torch.float32)
-    assert weight.dtype == torch.float32
-    torch.testing.assert_close(weight.sum(dim=-1), torch.ones(12))
-
-
 def test_a_kernel_adds_up_to_one_and_keeps_lines_inside():
     kernel = gaussian.kernel(2.0, 6)
     assert (len(kernel), float(kernel.sum()), int(kernel.argmax())) == (13, pytest.approx(1), 6)
@@ -37,15 +31,6 @@ def test_matrix_and_kernel_say_the_same():
     torch.testing.assert_close(gaussian.convolve(values, kernel, "nothing")[12:-12], wanted[12:-12])
     known = gaussian.convolve(torch.ones_like(values), kernel, "nothing")
     torch.testing.assert_close(gaussian.convolve(values, kernel, "nothing") / known, wanted)
-
-
-@pytest.mark.parametrize("frames", [1, 5])
-def test_beyond_the_ends_the_outermost_frame_goes_on(frames):
-    """For motions shorter than the kernel too."""
-    level = torch.full((frames, 2), 3.0)
-    found = gaussian.convolve(level, gaussian.kernel(2.0, 6), "repeated")
-    torch.testing.assert_close(found, level)
-    assert gaussian.convolve(level, gaussian.kernel(2.0, 6), "nothing").max() < 3
 
 
 def test_white_noise_smoothed_to_unit_variance_keeps_its_variance_in_every_frame():

@@ -45,8 +45,3 @@ def test_a_goal_that_changes_on_the_way_makes_no_jump():
     np.testing.assert_allclose(
         np.gradient(velocity, step)[1:-1], acceleration[1:-1], atol=0.06 * np.abs(acceleration).max()
     )
-
-
-def test_the_same_goal_changes_nothing():
-    track = rest(0.0).aim(torch.ones(1, dtype=torch.float64), 0.5).move(0.2)
-    assert track.aim(torch.ones(1, dtype=torch.float64), 0.5) is track

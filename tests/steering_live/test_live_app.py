@@ -254,16 +254,6 @@ def test_a_replay_ends_in_the_present(show, actors):
     assert (show.timeline.seconds_back, show.is_paused) == (None, False)
 
 
-def test_a_pause_makes_nothing_late(show):
-    run(show, 1)
-    character = show.chosen
-    character._waiting.clear()
-    character.character.poll = lambda: [delivered()]
-    chunk = character.receive()[0]
-    character.pause(False, 2.0)
-    assert character._waiting[0].due == pytest.approx(chunk.due + 2.0)
-
-
 @pytest.mark.parametrize("ending", FORMATS)
 def test_a_recording_is_the_motion_that_was_shown(show, tmp_path, monkeypatch, ending):
     monkeypatch.chdir(tmp_path)

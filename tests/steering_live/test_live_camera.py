@@ -80,17 +80,6 @@ def test_following_does_not_turn_and_staying_does_not_move(chase):
     np.testing.assert_array_equal(chase.position, at)
 
 
-def test_a_jump_is_followed_at_once_and_another_character_is_glided_to(chase):
-    chase.step(1 / 60, np.array([5.0, 0.0]), 1.0)
-    np.testing.assert_allclose(chase.position, [5, 0], atol=0.1)
-    chase.switch(np.array([9.0, 0.0]))
-    chase.step(1 / 60, np.array([9.0, 0.0]), 1.0)
-    assert chase.position[0] < 5.5
-    for _ in range(240):
-        chase.step(1 / 60, np.array([9.0, 0.0]), 1.0)
-    np.testing.assert_allclose(chase.position, [9, 0], atol=0.01)
-
-
 @given(st.floats(-7, 7), st.tuples(st.floats(-50, 50), st.floats(-50, 50)))
 def test_views_and_world_are_inverse_and_a_chased_character_looks_away(yaw, position):
     chase = ChaseCamera()

@@ -54,12 +54,6 @@ def test_only_pages_of_this_server_may_connect(changes, may):
     assert is_own_page(headers, 8080) is may
 
 
-def test_two_origins_are_none():
-    headers = Headers(OWN)
-    headers["Origin"] = "http://example.org"
-    assert not is_own_page(headers, 8080)
-
-
 @pytest.fixture(scope="module")
 def channel():
     return PageChannel(KEYS, HELP)
