@@ -24,7 +24,7 @@ from mapctl.numerics.intervals import last_observed, next_observed
 from mapctl.pose import BodyPose, decode
 from mapctl.problem import density_selection
 from mapctl.problem.density_selection import DensityEnsemble, DensityInterval
-from mapctl.problem.receding_horizon import CommittedFrames, HorizonSettings, RecedingHorizonSolver, TermsOf
+from mapctl.problem.receding_horizon import CommittedFrames, HorizonSettings, RecedingHorizonSolver
 from mapctl.problem.solution import Ledger, Outcome, WindowRecord
 from mapctl.problem.window_solvers import PoseOffsetSolver
 from mapctl.protocols import Density
@@ -125,22 +125,29 @@ def refine(
     start = _extrapolate_backward(pose)
     root, angle = _compute_proposal_sigma(capture, settings, trust)
     planted, supports = _find_contacts(proposal, contacts, root, angle, settings.smooth)
+    clearing = _ramp_from_observed(_find_observed_toes(capture), settings.clearance_ramp)
+
+    def terms_of(first: int, frames: int) -> list[Term]:
+        part = slice(first, first + frames)
+        found: list[Term] = [LatentPrior(1.0), replace(settings.footing, supports=supports[part]), *terms]
+        if settings.clearance is not None:
+            found.append(replace(settings.clearance, rest_height=supports[part], share=clearing[part]))
+        if settings.jerk is not None:
+            found.append(settings.jerk)
+        if targets is not None:
+            found.append(Keyframe(targets.places[part], targets.wanted[part]))
+        return found
+
     ensemble = DensityEnsemble(
         [density.with_observation_noise(density_selection.proposal_sigma()) for density in densities]
     )
+    sigma = torch.cat([root.expand(-1, 3), angle.repeat_interleave(3, dim=-1)], dim=-1)  # in the order of pose.pack
     solver = RecedingHorizonSolver(
         ensemble,
         HorizonSettings(settings.frames, settings.ahead, settings.past, beyond_end=False),
         proposal.skeleton,
         method=PoseOffsetSolver(
-            pose,
-            planted,
-            _pack_sigma(root, angle),
-            settings.smooth,
-            settings.temperature,
-            settings.lbfgs,
-            settings.budget,
-            first_frame,
+            pose, planted, sigma, settings.smooth, settings.temperature, settings.lbfgs, settings.budget, first_frame
         ),
     )
     # The densities begin in states that make the first window's proposal likely.
@@ -148,37 +155,11 @@ def refine(
     states = ensemble.infer_state(pose.slice(0, first.stop).features(start, planted[first]))
     before = torch.zeros(0, proposal.num_joints, 3)
     done = CommittedFrames(states, start, torch.zeros(0, LAYOUT.size), before, discarded=first_frame)
-    terms_of = _lay_terms(settings, supports, capture, targets, terms)
     done, outcome = solver.solve(done, terms_of, proposal.num_frames, generator=torch.Generator())
     if outcome is Outcome.INTERRUPTED:
         raise KeyboardInterrupt
     motion = decode(done.features, start, skeleton=proposal.skeleton)
     return RefinedMotion(motion, planted, supports, done.ledger, done.windows)
-
-
-def _lay_terms(
-    settings: RefinementSettings,
-    supports: Float[Tensor, "frames 2"],
-    capture: Capture,
-    targets: EffectorTargets | None,
-    caller_terms: Sequence[Term],
-) -> TermsOf:
-    """Lay the terms of each window."""
-    clearing = _ramp_from_observed(_find_observed_toes(capture), settings.clearance_ramp)
-
-    def terms_of(first: int, frames: int) -> list[Term]:
-        part = slice(first, first + frames)
-        footing = replace(settings.footing, supports=supports[part])
-        terms: list[Term] = [LatentPrior(1.0), footing, *caller_terms]
-        if settings.clearance is not None:
-            terms.append(replace(settings.clearance, rest_height=supports[part], share=clearing[part]))
-        if settings.jerk is not None:
-            terms.append(settings.jerk)
-        if targets is not None:
-            terms.append(Keyframe(targets.places[part], targets.wanted[part]))
-        return terms
-
-    return terms_of
 
 
 def _extrapolate_backward(pose: BodyPose) -> GroundPose:
@@ -254,13 +235,6 @@ def _compute_proposal_sigma(
     root = torch.where(capture.seen_root[0], settings.share * capture.sigma_root[0], unobserved_root)
     # Feet are planted even in a capture without noise, if only by half a millimetre.
     return root.clamp_min(5e-4)[:, None], angle
-
-
-def _pack_sigma(
-    root: Float[Tensor, "frames 1"], angle: Float[Tensor, "frames joints"]
-) -> Float[Tensor, "frames width"]:
-    """Lay the sigmas out as `BodyPose.pack` does."""
-    return torch.cat([root.expand(-1, 3), angle.repeat_interleave(3, dim=-1)], dim=-1)
 
 
 def _find_observed_toes(capture: Capture) -> Bool[Tensor, "frames 2"]:

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from fractions import Fraction
 
 import torch
 
@@ -60,17 +59,25 @@ def blend(
     Durations are the source's at any two frame rates. RequestError for frames that either motion has not, and for
     joints that are no hand or foot; margins too short for any limb are named in the status, which is then infeasible.
     """
-    _check_transfer(source, transfer)
+    if not transfer.limbs:
+        raise RequestError("blending needs a hand or a foot")
+    if not 0 <= transfer.start < transfer.stop <= source.num_frames:
+        raise RequestError(f"frames {transfer.start}:{transfer.stop} are not within the source's 0:{source.num_frames}")
+    if transfer.margin is not None and not 0 <= transfer.margin <= 10:
+        raise RequestError(f"the margin must lie between 0 and 10 seconds, got {transfer.margin:g}")
     own, rigmap = to_canonical(motion, rig)
     retargeted = retarget_motion(source, RiggedCharacter(rigmap, Stance.of(own, rigmap)))
-    other = _resample_source(retargeted.motion, transfer, motion.fps)
-    transfer = replace(transfer, start=0, stop=other.num_frames)
-    _check_destination(motion, transfer)
+    # To the frame after the last, where there is one: at a higher rate some frames lie between the two.
+    taken = retargeted.motion.slice(transfer.start, min(transfer.stop + 1, source.num_frames)).resample(motion.fps)
+    wanted = max(1, round((transfer.stop - transfer.start) * motion.fps / source.fps))
+    other = taken.slice(0, min(wanted, taken.num_frames))
+    there = slice(transfer.at, transfer.at + other.num_frames)
+    if not 0 <= there.start < there.stop <= motion.num_frames:
+        raise RequestError(f"frames {there.start}:{there.stop} are not within the motion's 0:{motion.num_frames}")
     limbs = [LIMBS[CANONICAL.names[effector_joint(name, rigmap)]] for name in transfer.limbs]
-    there = slice(transfer.at, transfer.at + transfer.stop - transfer.start)
     posed = own
     for limb in limbs:
-        posed = _copy_limb(posed, own, other, limb, transfer)
+        posed = _copy_limb(posed, own, other, limb, there)
     before, after = _compute_margins(own, posed, limbs, there, transfer.margin)
     free = slice(max(0, there.start - before), min(motion.num_frames, there.stop + after))
     joints = [rigmap.joint_of[joint] for limb in limbs for joint in (limb.upper, limb.lower, limb.end)]
@@ -91,21 +98,11 @@ def blend(
     return replace(done, missing=MissingMask((margin_frames | new) & moved, nothing), status=status)
 
 
-def _resample_source(source: Motion, transfer: LimbTransfer, fps: Fraction) -> Motion:
-    """Resample the frames of the transfer to another rate."""
-    wanted = max(1, round((transfer.stop - transfer.start) * fps / source.fps))
-    # To the frame after the last, where there is one: at a higher rate some frames lie between the two.
-    taken = source.slice(transfer.start, min(transfer.stop + 1, source.num_frames)).resample(fps)
-    return taken.slice(0, min(wanted, taken.num_frames))
-
-
-def _copy_limb(posed: Motion, own: Motion, other: Motion, limb: Limb, transfer: LimbTransfer) -> Motion:
+def _copy_limb(posed: Motion, own: Motion, theirs: Motion, limb: Limb, there: slice) -> Motion:
     """Copy one limb of a source on the same bones: its orientations relative to the hips' heading, and the vector from
     its root to its effector.
     """
-    there = slice(transfer.at, transfer.at + transfer.stop - transfer.start)
-    here = slice(transfer.start, transfer.stop)
-    part, theirs = own.slice(there.start, there.stop), other.slice(here.start, here.stop)
+    part = own.slice(there.start, there.stop)
     turn = rotations.about_y(heading(part.local_quat_xyzw[:, 0]) - heading(theirs.local_quat_xyzw[:, 0]))
     positions, quats = theirs.joint_positions(), part.local_quat_xyzw.clone()
     world, given = part.joint_rotations(), theirs.joint_rotations()
@@ -165,18 +162,3 @@ def _note_infeasible_margins(
                     f"{math.sqrt(MIN_JERK_PEAK_ACCELERATION * distance / _MAX_HAND_ACCELERATION):.2f} s would do"
                 )
     return tuple(notes)
-
-
-def _check_transfer(source: Motion, transfer: LimbTransfer) -> None:
-    if not transfer.limbs:
-        raise RequestError("blending needs a hand or a foot")
-    if not 0 <= transfer.start < transfer.stop <= source.num_frames:
-        raise RequestError(f"frames {transfer.start}:{transfer.stop} are not within the source's 0:{source.num_frames}")
-    if transfer.margin is not None and not 0 <= transfer.margin <= 10:
-        raise RequestError(f"the margin must lie between 0 and 10 seconds, got {transfer.margin:g}")
-
-
-def _check_destination(motion: Motion, transfer: LimbTransfer) -> None:
-    last = transfer.at + transfer.stop - transfer.start
-    if not 0 <= transfer.at < last <= motion.num_frames:
-        raise RequestError(f"frames {transfer.at}:{last} are not within the motion's 0:{motion.num_frames}")

@@ -1,13 +1,11 @@
-"""Fill the gaps of a motion: frames that are missing, or joints (Kaufmann et al. 2020, section 4.2); or the hips'
-trajectory alone, told by the body (Zhou et al. 2020, section 3.4).
+"""Fill the gaps of a motion: frames that are missing, or joints (Kaufmann et al. 2020, section 4.2); the hips'
+trajectory alone, predicted from the body (Zhou et al. 2020, section 3.4); or what lies between pieces of clips.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool
-from torch import Tensor
 
 from controllers.inbetweening.pipeline import InbetweenSolution, InfillSettings, fill
 from mapctl.curves.curve import Curve
@@ -16,7 +14,7 @@ from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening import GapQuery, Proposal
 from mapctl.inbetweening.missing import MissingMask, interpolate_missing
 from mapctl.inbetweening.query import estimate_contact_logits
-from mapctl.inbetweening.root_trajectory import TREMBLE_HZ, LocalMotion, RootTrajectory, close_path
+from mapctl.inbetweening.root_trajectory import TREMBLE_HZ, LocalMotion, close_path
 from mapctl.kinematics import heading
 from mapctl.kinematics.moving import rotate_about_vertical
 from mapctl.motion import Motion
@@ -28,9 +26,6 @@ from mapctl.retarget import identify_rig
 from mapctl.retarget.carry import RiggedCharacter, retarget_motion
 from mapctl.retarget.rigs import Rig
 from mapctl.terms import Term
-
-SOURCE = "path"
-"""Name of the in-betweener in notes, where no other proposes poses."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,41 +47,23 @@ class RetracedInbetweener(Inbetweener):
         """Propose the poses' motion along the predicted trajectory, which leads from the last known position of the
         hips to the next. Gaps in which nothing at all is known keep the trajectory that was proposed with them.
         """
-        posed = self._propose_poses(query, generator)
-        lost = find_lost_trajectory(query)
+        if self.poses is None:
+            posed = Proposal(query.motion, estimate_contact_logits(query.motion), "path")
+        else:
+            posed = self.poses.propose(query, generator=generator)
+        lost = torch.zeros_like(query.missing.root)
+        for _, start, stop in true_intervals(query.missing.root[:, None]):
+            lost[start:stop] = not bool(query.nothing_known[start:stop].all())
         body = query.to_unit_size(posed.motion)
-        predicted = predict_trajectory(body, self.path)
         facing = heading(body.local_quat_xyzw[:, 0])
+        # Wherever the hips were said to be, even the last bit of the answer must not depend on it.
+        seen = replace(body, root_position=torch.zeros_like(body.root_position)).joint_positions()
+        predicted = self.path.predict(LocalMotion.of_world(seen.float()[None], facing.float()[None]))
         root = close_path(predicted.integrate(facing[None].float())[0].double(), body.root_position, lost)
         root = smooth_between(root, ~lost, hertz=TREMBLE_HZ, fps=PRIOR_FPS)
         motion = query.to_character(replace(body, root_position=root))
         logits = torch.where(lost[:, None], predicted.contacts[0], posed.contact_logits)
         return replace(posed, motion=motion, contact_logits=logits)
-
-    def _propose_poses(self, query: GapQuery, generator: torch.Generator | None) -> Proposal:
-        if self.poses is None:
-            return Proposal(query.motion, estimate_contact_logits(query.motion), SOURCE)
-        return self.poses.propose(query, generator=generator)
-
-
-def predict_trajectory(body: Motion, path: PathPredictor) -> RootTrajectory:
-    """Predict the trajectory of a whole motion of unit size on canonical joints at PRIOR_FPS, a batch of one."""
-    facing = heading(body.local_quat_xyzw[:, 0]).float()
-    # Wherever the hips were said to be, even the last bit of the answer must not depend on it.
-    body = replace(body, root_position=torch.zeros_like(body.root_position))
-    return path.predict(LocalMotion.of_world(body.joint_positions().float()[None], facing[None]))
-
-
-def find_lost_trajectory(query: GapQuery) -> Bool[Tensor, " frames"]:
-    """Find where the hips' position is missing while the body is known at least in part: in intervals of which
-    something is known."""
-    lost, missing = torch.zeros_like(query.missing.root), query.missing.root
-    for _, start, stop in true_intervals(missing[:, None]):
-        lost[start:stop] = not bool(query.nothing_known[start:stop].all())
-    return lost
-
-
-__all__ = ["InbetweenSolution", "InfillSettings", "infill", "retraced"]
 
 
 def infill(
@@ -207,19 +184,21 @@ def chain(
     whole: Motion | None = None
     masks: list[Mask] = []
     for clip in clips:
-        piece, piece_notes = _cut_piece(clip, body, settings.piece, rig)
-        notes += piece_notes
+        retargeted = retarget_motion(clip, body, rig)
+        notes += retargeted.notes
+        motion = retargeted.motion.resample(PRIOR_FPS)
+        count = min(settings.piece, motion.num_frames)
+        start = (motion.num_frames - count) // 2
+        piece = replace(motion.slice(start, start + count), source=None)
         if whole is None:
             whole = piece
             continue
-        low, high = settings.gap
-        gap = int(torch.randint(low, high + 1, (), generator=generator))
+        gap = int(torch.randint(settings.gap[0], settings.gap[1] + 1, (), generator=generator))
         masks.append(Mask(ALL, whole.num_frames, whole.num_frames + gap))
         piece = _align_to_predecessor(whole, piece, gap)
         last = torch.full((gap,), whole.num_frames - 1)
-        whole = whole.join(
-            replace(whole, root_position=whole.root_position[last], local_quat_xyzw=whole.local_quat_xyzw[last])
-        ).join(piece)
+        held = replace(whole, root_position=whole.root_position[last], local_quat_xyzw=whole.local_quat_xyzw[last])
+        whole = whole.join(held).join(piece)
     assert whole is not None, "there are clips"
     done = infill(
         body.on_rig(whole),
@@ -234,27 +213,12 @@ def chain(
     return replace(done, status=done.status.with_notes(notes))
 
 
-def _cut_piece(clip: Motion, body: RiggedCharacter, frames: int, rig: Rig | None) -> tuple[Motion, tuple[str, ...]]:
-    """Cut frames from a clip's middle, retargeted to the body and its floor; and note what could not be kept."""
-    retargeted = retarget_motion(clip, body, rig)
-    motion = retargeted.motion.resample(PRIOR_FPS)
-    count = min(frames, motion.num_frames)
-    start = (motion.num_frames - count) // 2
-    return replace(motion.slice(start, start + count), source=None), retargeted.notes
-
-
 def _align_to_predecessor(before: Motion, piece: Motion, gap: int) -> Motion:
     """Align a piece to the position and heading that the motion before it reaches after so many frames."""
     facing = heading(before.local_quat_xyzw[-1:, 0])
     turned = rotate_about_vertical(piece, facing - heading(piece.local_quat_xyzw[:1, 0]))
-    velocity = _compute_mean_velocity(before.root_position[-_VELOCITY_FRAMES:])
-    next_velocity = _compute_mean_velocity(turned.root_position[:_VELOCITY_FRAMES])
-    target = before.root_position[-1] + (gap + 1) / 2 * (velocity + next_velocity)
-    offset = target - turned.root_position[0]
+    ends = before.root_position[-_VELOCITY_FRAMES:], turned.root_position[:_VELOCITY_FRAMES]
+    velocity, next_velocity = ((end[-1] - end[0]) / max(1, len(end) - 1) for end in ends)  # metres a frame
+    offset = before.root_position[-1] + (gap + 1) / 2 * (velocity + next_velocity) - turned.root_position[0]
     offset[1] = 0
     return replace(turned, root_position=turned.root_position + offset)
-
-
-def _compute_mean_velocity(positions: Tensor) -> Tensor:
-    """Compute the mean velocity, metres a frame."""
-    return (positions[-1] - positions[0]) / max(1, len(positions) - 1)

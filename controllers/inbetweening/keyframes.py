@@ -8,7 +8,7 @@ away from the viewer is as the proposed pose has it.
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from fractions import Fraction
 from functools import reduce
 from itertools import pairwise
@@ -203,38 +203,6 @@ def resolve_drawing(drawing: Drawing, rigmap: RigMap) -> dict[int, tuple[float, 
             raise RequestError(f"{name!r} is drawn twice, by its own name and by the canonical one")
         found[joint] = place
     return found
-
-
-def keyframe_errors(made: Motion, source: Motion, keys: Keys, rigmap: RigMap) -> list[dict[str, Any]]:
-    """Compute by key the largest error over joints: of positions, cm, and of rotations, degrees, where it gives any."""
-    wanted, hips = keys.checked(source), rigmap.joint_of[0]
-    distance = 100 * (made.joint_positions() - source.joint_positions()).norm(dim=-1)
-    rotation = rotations.multiply(rotations.inverse(source.joint_rotations()), made.joint_rotations())
-    angles = torch.rad2deg(rotations.to_rotation_vector(rotation).norm(dim=-1))
-    targets = collect_effector_targets(wanted, source, rigmap)
-    loose = collect_loose_keys(wanted, source, rigmap)
-    known = ~missing_between_keys(wanted, source, rigmap).joints
-    rows, places = [], rig_joint_positions(made, rigmap)
-    # A drawing may have joints that are no more than an End Site on the rig.
-    seen = places if loose is None else to_canonical(made, as_rig(rigmap))[0].joint_positions()
-    for key in wanted:
-        row: dict[str, Any] = {"frame": key.frame, "what": key.what}
-        if key.what == "limbs" and targets is not None:
-            miss = (places[key.frame] - targets.places[key.frame]).norm(dim=-1)
-            rows.append(row | {"missed_cm": 100 * float(miss[targets.wanted[key.frame]].max())})
-            continue
-        if loose is not None and key.what in ("place", "drawing"):
-            position = seen[key.frame]
-            if bool(loose.placed[key.frame]):
-                row["missed_cm"] = 100 * float((position[0, ::2] - loose.ground[key.frame]).norm())
-            if key.drawing is not None:
-                row["drawn_cm"] = 100 * measure_drawing_error(position, loose, key.frame)
-            rows.append(row)
-            continue
-        joints = [hips or 0] if key.what == "root" else known[key.frame].nonzero()[:, 0].tolist()
-        row |= {"missed_cm": float(distance[key.frame, joints].max())}
-        rows.append(row | {"missed_deg": float(angles[key.frame, joints].max())})
-    return rows
 
 
 def check_effectors(names: Sequence[str], motion: Motion, rig: Rig | None = None) -> None:
@@ -436,18 +404,7 @@ class KeyInterval:
 
     def summary(self) -> dict[str, Any]:
         """Return the interval as a report's JSON has it."""
-        return {
-            "from": self.start,
-            "to": self.stop,
-            "given": self.given,
-            "suggested": self.suggested,
-            "usual": list(self.usual),
-            "metres": self.metres,
-            "given_m_s": self.given_speed,
-            "suggested_m_s": self.suggested_speed,
-            "apart_cm": self.pose_distance_cm,
-            "reason": self.reason,
-        }
+        return asdict(self) | {"given": self.given, "reason": self.reason}
 
 
 def suggest_intervals(motion: Motion, keys: Keys, timing: TimingModel, rig: Rig | None = None) -> list[KeyInterval]:
@@ -457,7 +414,10 @@ def suggest_intervals(motion: Motion, keys: Keys, timing: TimingModel, rig: Rig 
     key_frames = [key.frame for key in keys.checked(motion) if key.what == "pose"]
     if len(key_frames) < 2:
         raise RequestError(f"timing is suggested between whole poses; the keys have {len(key_frames)}, it takes two")
-    canonical = to_canonical(_select_frames(motion, key_frames), rig)[0]
+    picked = torch.tensor(key_frames)
+    moving = {joint: values[picked] for joint, values in motion.moving_offsets.items()}
+    poses = Motion(motion.skeleton, motion.fps, motion.root_position[picked], motion.local_quat_xyzw[picked], moving)
+    canonical = to_canonical(poses, rig)[0]
     scale, fps = leg_length(canonical.skeleton) / leg_length(CANONICAL), float(motion.fps)
     body = Motion(CANONICAL, canonical.fps, canonical.root_position / scale, canonical.local_quat_xyzw)
     first = torch.arange(len(key_frames) - 1)
@@ -472,10 +432,3 @@ def suggest_intervals(motion: Motion, keys: Keys, timing: TimingModel, rig: Rig 
         speeds = distance * fps / (stop - start), distance * fps / suggested
         intervals.append(KeyInterval(start, stop, suggested, (low, high), distance, *speeds, pose_distance))
     return intervals
-
-
-def _select_frames(motion: Motion, frames: Sequence[int]) -> Motion:
-    """Return a motion of these frames alone."""
-    picked = torch.tensor(frames)
-    moving = {joint: values[picked] for joint, values in motion.moving_offsets.items()}
-    return Motion(motion.skeleton, motion.fps, motion.root_position[picked], motion.local_quat_xyzw[picked], moving)

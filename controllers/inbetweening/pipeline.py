@@ -399,7 +399,8 @@ def _lead_along_curve(motion: Motion, missing: Bool[Tensor, " frames"], curve: C
         at = first + share * (last - first)
         position = curve.point(at) + torch.lerp(offsets[0], offsets[1], share[:, None])
         turns = curve.heading(torch.stack([first, last])) - facing[edges]
-        turn = curve.heading(at) - torch.lerp(*rotations.wrap_angle(turns), share)
+        turns = rotations.wrap_angle(turns)
+        turn = curve.heading(at) - torch.lerp(turns[0], turns[1], share)
         root[start:stop, ::2] = position
         own = rotations.about_y(turn - heading(quats[start:stop, 0]))
         quats[start:stop, 0] = rotations.multiply(own, quats[start:stop, 0])

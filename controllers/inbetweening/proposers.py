@@ -85,7 +85,14 @@ def propose_through_keys(
     if not bool((hips | wanted).any()):
         return inbetweener.propose(query, generator=generator), targets
     if inbetweener.takes_partial_keys:
-        return _reach_exactly(query, inbetweener.propose(query, generator=generator), wanted)
+        answer = inbetweener.propose(query, generator=generator)
+        far = wanted if targets is None else wanted & _find_out_of_reach(answer.motion, targets)
+        if targets is None or not bool(far.any()):
+            return answer, targets
+        # The body moves where limbs alone do not reach, and no more than that: it would leave where the network has it.
+        near = EffectorTargets(targets.places, targets.wanted & far[:, None])
+        answer, reached = _move_body(query, answer, answer.motion, near, far, query)
+        return answer, EffectorTargets(reached.places, targets.wanted)
     blind = guided = query.hide_partial_keys()
     if bool(query.missing.root.any()):
         first = inbetweener.rough.propose(blind, generator=generator).motion
@@ -100,44 +107,36 @@ def meet_partial_keys(query: GapQuery, answer: Proposal) -> tuple[Proposal, Effe
     hips, targets, wanted = _find_partial_keys(query)
     if not bool((hips | wanted).any()):
         return answer, targets
-    blind, made = query.hide_partial_keys(), answer.motion
-    posed = _set_hips(made, query.motion, hips)
+    blind, posed = query.hide_partial_keys(), _set_hips(answer.motion, query.motion, hips)
     if targets is None:
-        return replace(answer, motion=_blend_key_poses(made, posed, hips, blind)), None
-    turning, moving = query.missing.joints, query.missing.root
-    stray = torch.full(hips.shape, _MIN_ROOT_UNCERTAINTY)
-    posed = reach_targets(posed, targets, turning=turning, moving=moving, stray=stray)[0]
-    reached = torch.where(targets.wanted[..., None], posed.joint_positions(), targets.places)
-    there = replace(answer, motion=_blend_key_poses(made, posed, hips | wanted, blind))
-    return there, EffectorTargets(reached, targets.wanted)
+        return replace(answer, motion=_blend_key_poses(answer.motion, posed, hips, blind)), None
+    return _move_body(query, answer, posed, targets, hips | wanted, blind)
 
 
 def _find_partial_keys(
     query: GapQuery,
 ) -> tuple[Bool[Tensor, " frames"], EffectorTargets | None, Bool[Tensor, " frames"]]:
-    """Find the frames in which the hips alone are told, the effector targets, and the frames that have some."""
+    """Find the frames in which the hips alone are given, the effector targets, and the frames that have some."""
     hips, targets = query.root_only_keys, query.effector_targets
     return hips, targets, torch.zeros_like(hips) if targets is None else targets.wanted.any(dim=1)
 
 
-def _reach_exactly(
-    query: GapQuery, answer: Proposal, wanted: Bool[Tensor, " frames"]
-) -> tuple[Proposal, EffectorTargets | None]:
-    """Move a motion that was made through effector targets so that limbs reach them: the body where limbs alone do
-    not, and no more than that, or it would leave where the network has it."""
-    targets = query.effector_targets
-    if targets is None:
-        return answer, None
-    far = wanted & _find_out_of_reach(answer.motion, targets)
-    if not bool(far.any()):
-        return answer, targets
-    told, targets, wanted = targets, EffectorTargets(targets.places, targets.wanted & far[:, None]), far
+def _move_body(
+    query: GapQuery,
+    answer: Proposal,
+    posed: Motion,
+    targets: EffectorTargets,
+    keys: Bool[Tensor, " frames"],
+    blind: GapQuery,
+) -> tuple[Proposal, EffectorTargets]:
+    """Move the whole body of `posed` to the targets, and blend the answer to it in the frames of keys; also return the
+    targets as they are reached."""
+    stray = torch.full(keys.shape, _MIN_ROOT_UNCERTAINTY)
     turning, moving = query.missing.joints, query.missing.root
-    stray = torch.full(wanted.shape, _MIN_ROOT_UNCERTAINTY)
-    posed = reach_targets(answer.motion, targets, turning=turning, moving=moving, stray=stray)[0]
+    posed = reach_targets(posed, targets, turning=turning, moving=moving, stray=stray)[0]
     reached = torch.where(targets.wanted[..., None], posed.joint_positions(), targets.places)
-    there = replace(answer, motion=_blend_key_poses(answer.motion, posed, wanted, query))
-    return there, EffectorTargets(reached, told.wanted)
+    there = replace(answer, motion=_blend_key_poses(answer.motion, posed, keys, blind))
+    return there, EffectorTargets(reached, targets.wanted)
 
 
 def _find_out_of_reach(motion: Motion, targets: EffectorTargets) -> Bool[Tensor, " frames"]:
@@ -301,46 +300,40 @@ class StitchedInbetweener(Inbetweener):
 
     @property
     def takes_partial_keys(self) -> bool:
-        """Whether they reach `propose`; they are hidden there from who does not take them."""
+        """Whether they reach `propose`: yes; they are hidden there from a fallback that does not take them."""
         return True
 
     def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
         """Propose for each gap the stitcher's motion, bent to its partial keys; gaps that it leaves are the other's,
         and the proposal says why."""
-        stitched = self.stitcher.propose(query, generator=generator)
-        sources = stitched.attribute(query)
-        left = [source for source in sources if source.by == INTERPOLATION]
-        if len(left) < len(sources):
-            stitched = meet_partial_keys(query, stitched)[0]
-        if not left:
-            return stitched
-        fallback = self.load_fallback()
-        asked = query if fallback.takes_partial_keys else query.hide_partial_keys()
-        made = fallback.propose(asked, generator=generator)
-        made = replace(made, others=_pass_on(left, made))
-        return made if len(left) == len(sources) else _put_in(stitched, made, query)
+
+        def propose_rest() -> Proposal:
+            fallback = self.load_fallback()
+            asked = query if fallback.takes_partial_keys else query.hide_partial_keys()
+            return fallback.propose(asked, generator=generator)
+
+        return _complete_stitched(query, self.stitcher.propose(query, generator=generator), propose_rest)
 
 
-def _pass_on(left: list[GapSource], made: Proposal) -> tuple[GapSource, ...]:
-    """Name who made what was left, and both reasons if that one had another to leave it on."""
-    named = {source.start: source for source in made.others}
-    passed = []
-    for source in left:
-        own = named.pop(source.start, GapSource(source.start, source.stop, made.source))
-        reason = "; ".join(filter(None, (source.reason, own.reason)))
-        passed.append(replace(own, reason=reason))
-    return (*passed, *named.values())
-
-
-def _put_in(stitched: Proposal, made: Proposal, query: GapQuery) -> Proposal:
-    """Put the gaps that were stitched into another proposal."""
-    sources = [source for source in stitched.attribute(query) if source.by != INTERPOLATION]
-    starts = {source.start for source in sources}
-    others = (*(other for other in made.others if other.start not in starts), *sources)
+def _complete_stitched(query: GapQuery, stitched: Proposal, propose_rest: Callable[[], Proposal]) -> Proposal:
+    """Bend a stitcher's proposal to partial keys, and take the gaps that it left interpolated from another one."""
+    sources = stitched.attribute(query)
+    left = [source for source in sources if source.by == INTERPOLATION]
+    filled = [source for source in sources if source.by != INTERPOLATION]
+    if filled:
+        stitched = meet_partial_keys(query, stitched)[0]
+    if not left:
+        return stitched
+    rest = propose_rest()
+    named = {source.start: source for source in rest.others}
+    for source in left:  # both reasons, where the other one left the gap, too
+        own = named.get(source.start, GapSource(source.start, source.stop, rest.source))
+        named[source.start] = replace(own, reason="; ".join(filter(None, (source.reason, own.reason))))
+    named |= {source.start: source for source in filled}
     # Partial keys divide a gap, and are the stitcher's too.
     whole = query.hide_partial_keys().enclosed_gaps
-    gaps = [gap for gap in whole if any(gap[0] <= start < gap[1] for start in starts)]
-    return replace(made.take(stitched, gaps), others=others)
+    gaps = [gap for gap in whole if any(gap[0] <= source.start < gap[1] for source in filled)]
+    return replace(rest.take(stitched, gaps), others=tuple(named.values()))
 
 
 _LEAST_WAY = 0.3  # metres from place to place, at the canonical size, that are walked and not stood
@@ -485,8 +478,7 @@ def commit_before(
     features = features[:start].float()
     ground_pose = GroundPose(ground[start - 1].float(), heading[start - 1].float())
     past = body.slice(max(0, start - _PAST_FRAMES), start).joint_positions().float()
-    advanced = state if state is not None and since >= start else replay(density, features, state, since=since)
-    return CommittedFrames(advanced, ground_pose, features, past)
+    return CommittedFrames(replay(density, features, state, since=since), ground_pose, features, past)
 
 
 def insert_rollout(
@@ -537,29 +529,24 @@ EVERY_ROLLOUT_JUMPED = "every rollout jumped"
 _ENDS = CANONICAL.indices(("leftHand", "rightHand", *TOES))  # what a leg or an arm that is thrown over moves farthest
 
 
+_TEMPERATURE, _SLOW = 0.5, 3.0
+"""Standard deviation of a rollout's initial noise, the difference between samples; and frames (sigma) over which it is
+smoothed, at the same deviation: samples then differ in motion, not in jitter."""
+_SIGMA_NOISE = 2.0  # of the latent prior while steering: above 1 leaves more of the initial noise
+_SIGMA_ARRIVAL = 0.03  # metres, of every joint from the known frames at which a rollout arrives
+_SHORTEST, _LONGEST = 2, 180  # frames of gaps that are rolled through: shorter ones leave nothing to vary
+_ATTEMPTS = 3  # rollouts through a gap, each from other noise, until one does not jump
+_FOOTING = FootContact(0.1, 0.05, 0.05, heels=None)
+ROLLOUT_SPAN = f"{(_SHORTEST + 1) / PRIOR_FPS:.2g} to {(_LONGEST + 1) / PRIOR_FPS:.2g} s"
+"""Range of gaps that are rolled through, in words: seconds from key to key."""
+
+
 @dataclass(frozen=True)
 class RolloutSettings:
     """Settings of rollouts through gaps."""
 
-    temperature: float = 0.5
-    """Standard deviation of a rollout's initial noise: the difference between samples."""
-    slow: float = 3.0
-    """Frames (sigma) over which that noise is smoothed, at the same deviation: samples then differ in motion, not in
-    jitter."""
-    sigma_noise: float = 2.0
-    """Sigma of the latent prior while steering: above 1 leaves more of the initial noise."""
-    sigma_arrival: float = 0.03
-    """Sigma of the distance of every joint from the known frames at which a rollout arrives, metres."""
     ahead: int = 15
     """Frames after a gap that are rolled with it, of which the known ones are targets too."""
-    footing: FootContact = field(default_factory=lambda: FootContact(0.1, 0.05, 0.05, heels=None))
-    """Contact term."""
-    shortest: int = 2
-    """Frames of the shortest gap that is rolled through: shorter ones leave nothing to vary."""
-    longest: int = 180
-    """Frames of the longest gap that is rolled through; longer ones are left to the fallback."""
-    attempts: int = 3
-    """Rollouts through a gap, each from other noise, until one does not jump; then the gap is left to the fallback."""
     jump: float = 1.5
     """A rollout jumps where a hand or a foot steps, relative to the hips, so many times as far as anywhere in the
     fallback's motion: an arrival that noise does not lead to is bought with a leg thrown over in one frame."""
@@ -576,15 +563,11 @@ class RolloutSettings:
     )
     """Solver: the swarm and the search after it."""
 
-    @property
-    def span(self) -> str:
-        """Range of gaps that are rolled through, in words: seconds from key to key."""
-        return f"{(self.shortest + 1) / PRIOR_FPS:.2g} to {(self.longest + 1) / PRIOR_FPS:.2g} s"
-
 
 @dataclass(frozen=True, eq=False)
 class RolloutInbetweener(Inbetweener):
-    """In-betweener that rolls the density under which the fallback's proposal is likeliest through unknown gaps."""
+    """In-betweener that rolls the density under which the fallback's proposal is likeliest through unknown gaps, one
+    after the other in time."""
 
     densities: Sequence[Density]
     """Densities to choose from, at least one."""
@@ -608,108 +591,63 @@ class RolloutInbetweener(Inbetweener):
         base = self.fallback.propose(query, generator=generator)
         if not query.enclosed_gaps:
             return base
-        roller, others = Roller.of(query, base, self.densities), list(base.others)
         generator, settings = generator or torch.Generator().manual_seed(0), self.settings
-        largest = max(settings.least_jump, settings.jump * _measure_largest_step(roller.body))
+        body, logits, others = query.to_unit_size(base.motion), base.contact_logits.clone(), list(base.others)
+        density = select_likeliest_density(self.densities, body)
+        largest = max(settings.least_jump, settings.jump * _measure_largest_step(body))
+        state, since = None, 0
         for start, stop in query.enclosed_gaps:
-            if not settings.shortest <= stop - start <= settings.longest:
-                others.append(GapSource(start, stop, base.source, f"rollouts take {settings.span}"))
-            elif (rollout := roller.roll_steadily(start, stop, generator, settings, largest)) is None:
-                others.append(GapSource(start, stop, base.source, EVERY_ROLLOUT_JUMPED))
+            if not _SHORTEST <= stop - start <= _LONGEST:
+                others.append(GapSource(start, stop, base.source, f"rollouts take {ROLLOUT_SPAN}"))
+                continue
+            committed = commit_before(body, logits, start, density, state, since=since)
+            assert not isinstance(committed.state, tuple), "one density has one state"
+            state, since = committed.state, start
+            for _ in range(_ATTEMPTS):
+                rolled = self._roll(query, body, logits, density, committed, (start, stop), generator)
+                if _measure_largest_step(rolled[0].slice(start - 1, stop + 1)) <= largest:
+                    body, logits = rolled
+                    others.append(GapSource(start, stop, f"rollout of {density.name}"))
+                    break
             else:
-                roller.accept_rollout(rollout)
-                others.append(GapSource(start, stop, f"rollout of {roller.density.name}"))
-        return replace(base, motion=roller.motion, contact_logits=roller.contact_logits, others=tuple(others))
+                others.append(GapSource(start, stop, base.source, EVERY_ROLLOUT_JUMPED))
+        return replace(base, motion=query.to_character(body), contact_logits=logits, others=tuple(others))
 
-
-@dataclass(frozen=True, eq=False)
-class Rollout:
-    """A density's motion through one gap."""
-
-    start: int
-    """First frame of the gap, at PRIOR_FPS."""
-    body: Motion
-    """The whole motion at unit size, the gap filled."""
-    contact_logits: Float[Tensor, "frames 2"]
-    """Contact logits of the left and the right toe."""
-
-
-@dataclass(eq=False)
-class Roller:
-    """Roller of a density through gaps, one after the other in time, each from the accepted ones before it."""
-
-    query: GapQuery
-    """Query with the known values and the targets."""
-    body: Motion
-    """All frames so far, at unit size."""
-    contact_logits: Float[Tensor, "frames 2"]
-    """Contact logits so far."""
-    density: Density
-    """The density that is rolled."""
-    state: DensityState | None = None
-    """The density's state after `done` frames."""
-    done: int = 0
-    """Number of frames that the state includes."""
-
-    @staticmethod
-    def of(query: GapQuery, proposal: Proposal, densities: Sequence[Density]) -> "Roller":
-        """Begin with a proposal, and the density under which it is likeliest."""
-        body = query.to_unit_size(proposal.motion)
-        return Roller(query, body, proposal.contact_logits.clone(), select_likeliest_density(densities, body))
-
-    @property
-    def motion(self) -> Motion:
-        """The motion so far, on the character's bones."""
-        return self.query.to_character(self.body)
-
-    def roll_steadily(
-        self, start: int, stop: int, generator: torch.Generator, settings: RolloutSettings, largest: float
-    ) -> Rollout | None:
-        """Roll until no hand or foot steps farther than `largest`, metres in a frame; None where all attempts do."""
-        for _ in range(settings.attempts):
-            rollout = self.roll(start, stop, generator, settings)
-            if _measure_largest_step(rollout.body.slice(start - 1, stop + 1)) <= largest:
-                return rollout
-        return None
-
-    def roll(self, start: int, stop: int, generator: torch.Generator, settings: RolloutSettings) -> Rollout:
-        """Roll through frames start to stop; only the density's state is advanced."""
-        committed = commit_before(self.body, self.contact_logits, start, self.density, self.state, since=self.done)
-        assert not isinstance(committed.state, tuple)
-        self.state, self.done = committed.state, start
-        arrival = self._build_arrival_target(start, stop, settings)
-        frames = len(arrival.places)
-        noise = _sample_smooth_noise(frames, generator, settings)
-        terms = (LatentPrior(settings.sigma_noise), settings.footing, arrival)
-        solver = RecedingHorizonSolver(self.density, method=settings.method)
-        window = solver.solve_window(replace(committed, warm_start=noise), terms, frames, generator=generator)
-        body, logits = insert_rollout(self.body, self.contact_logits, window, committed.place, (start, stop))
-        return Rollout(start, self._hold_planted(body, logits, start, stop), logits)
-
-    def accept_rollout(self, rollout: Rollout) -> None:
-        """Accept a rollout, from which later ones go on."""
-        self.body, self.contact_logits = rollout.body, rollout.contact_logits
-
-    def _hold_planted(self, body: Motion, logits: Float[Tensor, "frames 2"], start: int, stop: int) -> Motion:
-        """Hold planted toes in the gap, which the correction at arrival has moved."""
+    def _roll(
+        self,
+        query: GapQuery,
+        body: Motion,
+        logits: Float[Tensor, "frames 2"],
+        density: Density,
+        committed: CommittedFrames,
+        gap: tuple[int, int],
+        generator: torch.Generator,
+    ) -> tuple[Motion, Float[Tensor, "frames 2"]]:
+        """Roll through a gap to all joints in the known frames after it, and to effector targets within it; planted
+        toes, which the correction at arrival moves, are then held. Also return the contact logits."""
+        (start, stop), settings = gap, self.settings
+        part = slice(start, stop + settings.ahead)
+        known = ~query.nothing_known[part]
+        frames = int(known.nonzero()[-1]) + 1
+        positions = body.joint_positions()[part][:frames]
+        wanted = known[:frames, None].expand(-1, CANONICAL.num_joints)
+        if (targets := query.effector_targets) is not None:
+            own = targets.wanted[part][:frames]
+            positions = torch.where(own[..., None], targets.places[part][:frames] / query.scale, positions)
+            wanted = wanted | own
+        arrival = Keyframe(positions.float(), wanted, _SIGMA_ARRIVAL)
+        white = torch.randn(frames, LAYOUT.continuous, generator=generator)
+        noise = _TEMPERATURE * gaussian.unit_variance_matrix(frames, _SLOW, white.dtype) @ white
+        window = RecedingHorizonSolver(density, method=settings.method).solve_window(
+            replace(committed, warm_start=noise),
+            (LatentPrior(_SIGMA_NOISE), _FOOTING, arrival),
+            frames,
+            generator=generator,
+        )
+        body, logits = insert_rollout(body, logits, window, committed.place, gap)
         planted, free = contacts.debounced(logits > 0), torch.zeros(len(logits), dtype=torch.bool)
         free[start:stop] = True
-        held = hold_planted(body, planted, free=free, rest_height=estimate_rest_height(body, planted))
-        quats = torch.where(free[:, None, None], held.local_quat_xyzw, body.local_quat_xyzw)
-        return replace(body, local_quat_xyzw=quats)
-
-    def _build_arrival_target(self, start: int, stop: int, settings: RolloutSettings) -> Keyframe:
-        """Build the target of all joints in the known frames after the gap, and of effectors within it."""
-        part = slice(start, stop + settings.ahead)
-        known = ~self.query.nothing_known[part]
-        last = int(known.nonzero()[-1]) + 1
-        positions, known = self.body.joint_positions()[part][:last], known[:last]
-        wanted = known[:, None].expand(-1, CANONICAL.num_joints)
-        if (targets := self.query.effector_targets) is not None:
-            own_targets = targets.wanted[part][:last]
-            positions = torch.where(own_targets[..., None], targets.places[part][:last] / self.query.scale, positions)
-            wanted = wanted | own_targets
-        return Keyframe(positions.float(), wanted, settings.sigma_arrival)
+        return hold_planted(body, planted, free=free, rest_height=estimate_rest_height(body, planted)), logits
 
 
 def _measure_largest_step(body: Motion) -> float:
@@ -718,20 +656,10 @@ def _measure_largest_step(body: Motion) -> float:
     return measure_peaks(positions[:, _ENDS], positions[:, 0], PRIOR_FPS).step
 
 
-def _sample_smooth_noise(
-    frames: int, generator: torch.Generator, settings: RolloutSettings
-) -> Float[Tensor, "frames continuous"]:
-    """Sample noise that changes slowly."""
-    white = torch.randn(frames, LAYOUT.continuous, generator=generator)
-    return settings.temperature * gaussian.unit_variance_matrix(frames, settings.slow, white.dtype) @ white
-
-
 _MIN_KNOWN_FRAMES = 5  # fewest frames from which a motion is extrapolated
 
 
-def extrapolate_end(
-    query: GapQuery, proposal: Proposal, densities: Sequence[Density], settings: RolloutSettings
-) -> Proposal:
+def extrapolate_end(query: GapQuery, proposal: Proposal, densities: Sequence[Density]) -> Proposal:
     """Extrapolate a proposal from the last known frame to its end, if nothing is known there.
 
     It stays unchanged where the first density (that of locomotion) does not find the frames before as likely as its own
@@ -749,10 +677,10 @@ def extrapolate_end(
     if density_selection.select_density_for_motion([blurred], known).weight < 1:
         return proposal
     density = select_likeliest_density(densities, known)
-    solver = RecedingHorizonSolver(density, method=replace(settings.method, proposal=keep_warm_start))
-    for first in range(start, stop, settings.longest):
-        committed, count = commit_before(body, logits, first, density), min(settings.longest, stop - first)
-        terms = (LatentPrior(settings.sigma_noise), settings.footing)
+    solver = RecedingHorizonSolver(density, method=replace(RolloutSettings().method, proposal=keep_warm_start))
+    for first in range(start, stop, _LONGEST):
+        committed, count = commit_before(body, logits, first, density), min(_LONGEST, stop - first)
+        terms = (LatentPrior(_SIGMA_NOISE), _FOOTING)
         window = solver.solve_window(committed, terms, count, generator=torch.Generator())
         body, logits = insert_rollout(body, logits, window, committed.place, (first, first + count))
     source = GapSource(start, stop, f"density {density.name}")
@@ -815,56 +743,50 @@ class AutoInbetweener(Inbetweener):
         if query.loose is not None:
             walked = walk_over_places(query, self.densities, generator)
             return walked or (self.tweener or self.network).propose(query, generator=generator)
-        made = self.network.propose(query, generator=generator)
-        long = [gap for gap in query.hide_partial_keys().enclosed_gaps if self._is_tweeners(query, *gap)]
+        answer = self.network.propose(query, generator=generator)
+        whole = query.hide_partial_keys().enclosed_gaps
+        long = [gap for gap in whole if self._is_tweeners(query, *gap)]
+        stitched = [
+            gap
+            for gap in whole
+            if gap not in long and gap[1] - gap[0] <= _STITCHED and _has_parts_within(query, *gap)
+            if not (query.keep_trajectory or _is_beside_part(query, *gap))
+        ]
         if long and self.tweener is not None:
             tweened, _ = propose_through_keys(query, self.tweener, generator)
-            long = [gap for gap in long if self.has_style or not self._keeps(query, made, tweened, gap)]
-            made = _fill_from(tweened, made, query, long)
-        told = [gap for gap in query.hide_partial_keys().enclosed_gaps if self._is_stitchers(query, *gap)]
-        if told and self.stitcher is not None:
-            proposed = _Given(made)  # and not asked again for what the stitcher leaves
-            stitched = StitchedInbetweener(self.stitcher(), lambda: proposed).propose(query, generator=generator)
-            made = _fill_from(stitched, made, query, told)
+            long = [gap for gap in long if self.has_style or not _stays_networks(query, answer, tweened, gap)]
+            answer = _fill_from(tweened, answer, query, long)
+        if stitched and self.stitcher is not None:
+            network, short = answer, self.stitcher().propose(query, generator=generator)
+            answer = _fill_from(_complete_stitched(query, short, lambda: network), answer, query, stitched)
         for gap in query.enclosed_gaps:
-            # Who was told to move in a style moves; tweeners let others tremble.
-            held = not self.has_style if _is_within(gap, long) else _goes_astray(query, made, gap)
+            # A body that was given a style moves; tweeners let others tremble.
+            held = not self.has_style if _is_within(gap, long) else _goes_astray(query, answer, gap)
             if held and _is_standing_still(query, *gap):
-                made = _hold_pose(query, made, gap)
+                answer = _hold_pose(query, answer, gap)
         if self.has_style:
-            made = _note_no_style(query, made, [gap for gap in query.enclosed_gaps if not _is_within(gap, long)])
-        return extrapolate_end(query, made, self.densities, RolloutSettings())
+            reason = "too short, or with parts told, for a style"
+            gaps = [gap for gap in query.enclosed_gaps if not _is_within(gap, long)]
+            sources = [one for one in answer.attribute(query) if (one.start, one.stop) in gaps]
+            unstyled = tuple(replace(one, reason=one.reason or reason) for one in sources)
+            answer = replace(answer, others=(*answer.others, *unstyled))
+        return extrapolate_end(query, answer, self.densities)
 
     def _is_tweeners(self, query: GapQuery, start: int, stop: int) -> bool:
-        """Return whether a gap is the tweener's: long, or with room for the style that it was told."""
+        """Return whether a gap is the tweener's: long, or with room for the style that it was given."""
         if self.tweener is None or query.keep_trajectory:
             return False
         shortest = _STYLED if self.has_style else self.long
         return stop - start >= shortest and not _is_beside_part(query, start, stop)
 
-    def _keeps(self, query: GapQuery, made: Proposal, tweened: Proposal, gap: tuple[int, int]) -> bool:
-        """Return whether a gap stays the network's: it fills the whole of it, and the body moves there."""
-        by = {source.by for source in made.attribute(query) if (source.start, source.stop) == gap}
-        if INTERPOLATION in by or _has_parts_within(query, *gap):
-            return False
-        path, other = (measure_path_length(one.motion.slice(gap[0] - 1, gap[1] + 1)) for one in (made, tweened))
-        return path >= _LIVELY * other
 
-    def _is_stitchers(self, query: GapQuery, start: int, stop: int) -> bool:
-        """Return whether a gap is the stitcher's: short, with more told in it than the poses beside it."""
-        if query.keep_trajectory or self._is_tweeners(query, start, stop) or _is_beside_part(query, start, stop):
-            return False
-        return stop - start <= _STITCHED and _has_parts_within(query, start, stop)
-
-
-@dataclass(frozen=True, eq=False)
-class _Given(Inbetweener):
-    """Proposes what it was given, whatever is asked."""
-
-    proposal: Proposal
-
-    def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
-        return self.proposal
+def _stays_networks(query: GapQuery, answer: Proposal, tweened: Proposal, gap: tuple[int, int]) -> bool:
+    """Return whether a gap stays the network's: it fills the whole of it, and the body moves there."""
+    by = {source.by for source in answer.attribute(query) if (source.start, source.stop) == gap}
+    if INTERPOLATION in by or _has_parts_within(query, *gap):
+        return False
+    path, other = (measure_path_length(one.motion.slice(gap[0] - 1, gap[1] + 1)) for one in (answer, tweened))
+    return path >= _LIVELY * other
 
 
 def _is_beside_part(query: GapQuery, start: int, stop: int) -> bool:
@@ -921,25 +843,6 @@ def _hold_pose(query: GapQuery, made: Proposal, gap: tuple[int, int]) -> Proposa
     toes = query.motion.joint_positions()[part, list(TOE_JOINTS), 1]
     logits[part] = contacts.to_logits(toes < toes.amin() + _PLANTED_HEIGHT).to(logits)
     return _fill_from(Proposal(query.motion, logits, STANDING_STILL), made, query, [gap])
-
-
-def _note_no_style(query: GapQuery, made: Proposal, gaps: Sequence[tuple[int, int]]) -> Proposal:
-    """Say of gaps that they are not in the style that was told."""
-    reason, sources = "too short, or with parts told, for a style", made.attribute(query)
-    said = tuple(replace(one, reason=one.reason or reason) for one in sources if (one.start, one.stop) in gaps)
-    return replace(made, others=(*made.others, *said))
-
-
-__all__ = [
-    "METHODS",
-    "AutoInbetweener",
-    "ModelLoaders",
-    "RolloutInbetweener",
-    "SlerpInbetweener",
-    "StitchedInbetweener",
-    "build_inbetweener",
-    "check_method",
-]
 
 
 @dataclass(frozen=True)

@@ -2,19 +2,19 @@
 of a hand or a foot, the limb is bent to reach it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool
 from torch import Tensor
 
 from controllers.inbetweening.keyframes import (
     collect_effector_targets,
     collect_loose_keys,
-    keyframe_errors,
+    measure_drawing_error,
     missing_between_keys,
 )
 from controllers.inbetweening.pipeline import InbetweenSolution, InfillSettings, fill
@@ -52,18 +52,49 @@ def check_keyframes(
 
     The motion is valid where it is not missing, on its rig and on canonical joints.
     """
-    hips = canonical.root_position
-    notes = _check_hips(hips, missing, loose, fps=float(motion.fps))
-    for start, stop in pairwise((~missing.root).nonzero()[:, 0].tolist()):
-        seconds = float((stop - start) / motion.fps)
-        quats = motion.local_quat_xyzw[[start, stop]]
-        turns = rotations.to_rotation_vector(rotations.multiply(rotations.inverse(quats[0]), quats[1])).norm(dim=-1)
-        rates = turns * ~(missing.joints[start] | missing.joints[stop]) / seconds
+    notes, fps, known, hips = [], float(motion.fps), ~missing.root, canonical.root_position
+    placed, positions = torch.zeros_like(known) if loose is None else loose.placed, hips.clone()
+    if loose is not None:
+        positions[placed, ::2] = loose.ground[placed]
+    for start, stop in _pairs(known | placed):
+        axes = [0, 2] if bool(placed[start] | placed[stop]) else [0, 1, 2]
+        speed = float((positions[stop] - positions[start])[axes].norm()) * fps / (stop - start)
+        if speed > _MAX_ROOT_SPEED:
+            notes.append(f"the hips need {speed:.1f} m/s between frames {start} and {stop}, faster than anyone runs")
+    for start, stop in _pairs(known):
+        one, other = motion.local_quat_xyzw[[start, stop]]
+        turns = rotations.to_rotation_vector(rotations.multiply(rotations.inverse(one), other)).norm(dim=-1)
+        rates = turns * ~(missing.joints[start] | missing.joints[stop]) * fps / (stop - start)
         worst = int(rates.argmax())
         if (rate := float(rates[worst])) > _MAX_JOINT_RATE:
             name = motion.skeleton.names[worst]
             notes.append(f"{name} needs {rate:.0f} rad/s between frames {start} and {stop}, faster than joints turn")
-    return (*notes, *([] if targets is None else _check_effector_targets(motion, hips, rigmap, missing, targets)))
+    if targets is None:
+        return tuple(notes)
+    whole, own = ~missing.frames, rig_joint_positions(motion, rigmap)
+    for limb in targets.wanted.any(dim=0).nonzero()[:, 0].tolist():
+        wanted, name = targets.wanted[:, limb], motion.skeleton.names[rigmap.joint_of[limb] or 0]
+        ends = torch.where(wanted[:, None], targets.places[:, limb], own[:, limb])
+        for start, stop in _pairs(wanted | whole):
+            if not bool(wanted[start] | wanted[stop]):
+                continue
+            displacement, seconds = ends[stop] - ends[start], (stop - start) / fps
+            speed = float(displacement.norm()) / seconds
+            distance = float((displacement - (hips[stop] - hips[start])).norm())
+            acceleration = MIN_JERK_PEAK_ACCELERATION * distance / seconds**2
+            if speed > _MAX_EFFECTOR_SPEED:
+                notes.append(f"{name} needs {speed:.0f} m/s between frames {start} and {stop}, faster than limbs move")
+            elif acceleration > _MAX_EFFECTOR_ACCELERATION:
+                notes.append(
+                    f"{name} goes {100 * distance:.0f} cm in {seconds:.2f} s between frames {start} and {stop}, which"
+                    f" takes {acceleration:.0f} m/s^2; mocap's hardly ever reach {_MAX_EFFECTOR_ACCELERATION:.0f}"
+                )
+    return tuple(notes)
+
+
+def _pairs(keys: Bool[Tensor, " frames"]) -> Iterator[tuple[int, int]]:
+    """Return the frames of neighbouring keys."""
+    return pairwise(keys.nonzero()[:, 0].tolist())
 
 
 def note_joint_ranges(canonical: Motion, missing: MissingMask, rigmap: RigMap) -> tuple[str, ...]:
@@ -82,47 +113,6 @@ def note_joint_ranges(canonical: Motion, missing: MissingMask, rigmap: RigMap) -
     ]
     more = [] if len(notes) <= _MAX_NOTES else [f"and {len(notes) - _MAX_NOTES} more joints are beyond their ranges"]
     return (*notes[:_MAX_NOTES], *more)
-
-
-def _check_hips(
-    hips: Float[Tensor, "frames 3"], missing: MissingMask, loose: LooseKeys | None, *, fps: float
-) -> list[str]:
-    """Note positions of the hips that are too far from one key to the next."""
-    notes, known, positions = [], ~missing.root, hips.clone()
-    placed = torch.zeros_like(known) if loose is None else loose.placed
-    if loose is not None:
-        positions[placed, ::2] = loose.ground[placed]
-    for start, stop in pairwise((known | placed).nonzero()[:, 0].tolist()):
-        axes = [0, 2] if bool(placed[start] | placed[stop]) else [0, 1, 2]
-        speed = float((positions[stop] - positions[start])[axes].norm()) * fps / (stop - start)
-        if speed > _MAX_ROOT_SPEED:
-            notes.append(f"the hips need {speed:.1f} m/s between frames {start} and {stop}, faster than anyone runs")
-    return notes
-
-
-def _check_effector_targets(
-    motion: Motion, hips: Float[Tensor, "frames 3"], rigmap: RigMap, missing: MissingMask, targets: EffectorTargets
-) -> list[str]:
-    """Note hands and feet that are too fast between neighbouring keys, one of which gives only their position."""
-    notes, whole, own = [], ~missing.frames, rig_joint_positions(motion, rigmap)
-    for limb in targets.wanted.any(dim=0).nonzero()[:, 0].tolist():
-        wanted = targets.wanted[:, limb]
-        positions = torch.where(wanted[:, None], targets.places[:, limb], own[:, limb])
-        for start, stop in pairwise((wanted | whole).nonzero()[:, 0].tolist()):
-            if not bool(wanted[start] | wanted[stop]):
-                continue
-            displacement, seconds = positions[stop] - positions[start], (stop - start) / float(motion.fps)
-            speed, name = float(displacement.norm()) / seconds, motion.skeleton.names[rigmap.joint_of[limb] or 0]
-            distance = float((displacement - (hips[stop] - hips[start])).norm())
-            acceleration = MIN_JERK_PEAK_ACCELERATION * distance / seconds**2
-            if speed > _MAX_EFFECTOR_SPEED:
-                notes.append(f"{name} needs {speed:.0f} m/s between frames {start} and {stop}, faster than limbs move")
-            elif acceleration > _MAX_EFFECTOR_ACCELERATION:
-                notes.append(
-                    f"{name} goes {100 * distance:.0f} cm in {seconds:.2f} s between frames {start} and {stop}, which"
-                    f" takes {acceleration:.0f} m/s^2; mocap's hardly ever reach {_MAX_EFFECTOR_ACCELERATION:.0f}"
-                )
-    return notes
 
 
 def tween(
@@ -183,5 +173,34 @@ def keyframe_motion(wanted: Sequence[Key], motion: Motion, rig: Rig | None) -> t
 
 
 def measure_keyframe_errors(made: Motion, source: Motion, keys: Keys, rig: Rig | None = None) -> list[dict[str, Any]]:
-    """Measure by key how far what it gives is missed (see `controllers.inbetweening.keyframes.keyframe_errors`)."""
-    return keyframe_errors(made, source, keys, keyframe_motion(keys.checked(source), source, rig)[1])
+    """Measure by key the largest error over joints: of positions, cm, and of rotations, degrees, where it gives any."""
+    wanted = keys.checked(source)
+    rigmap = keyframe_motion(wanted, source, rig)[1]
+    hips = rigmap.joint_of[0]
+    distance = 100 * (made.joint_positions() - source.joint_positions()).norm(dim=-1)
+    rotation = rotations.multiply(rotations.inverse(source.joint_rotations()), made.joint_rotations())
+    angles = torch.rad2deg(rotations.to_rotation_vector(rotation).norm(dim=-1))
+    targets = collect_effector_targets(wanted, source, rigmap)
+    loose = collect_loose_keys(wanted, source, rigmap)
+    known = ~missing_between_keys(wanted, source, rigmap).joints
+    rows, places = [], rig_joint_positions(made, rigmap)
+    # A drawing may have joints that are no more than an End Site on the rig.
+    seen = places if loose is None else to_canonical(made, as_rig(rigmap))[0].joint_positions()
+    for key in wanted:
+        row: dict[str, Any] = {"frame": key.frame, "what": key.what}
+        if key.what == "limbs" and targets is not None:
+            miss = (places[key.frame] - targets.places[key.frame]).norm(dim=-1)
+            rows.append(row | {"missed_cm": 100 * float(miss[targets.wanted[key.frame]].max())})
+            continue
+        if loose is not None and key.what in ("place", "drawing"):
+            position = seen[key.frame]
+            if bool(loose.placed[key.frame]):
+                row["missed_cm"] = 100 * float((position[0, ::2] - loose.ground[key.frame]).norm())
+            if key.drawing is not None:
+                row["drawn_cm"] = 100 * measure_drawing_error(position, loose, key.frame)
+            rows.append(row)
+            continue
+        joints = [hips or 0] if key.what == "root" else known[key.frame].nonzero()[:, 0].tolist()
+        row |= {"missed_cm": float(distance[key.frame, joints].max())}
+        rows.append(row | {"missed_deg": float(angles[key.frame, joints].max())})
+    return rows

@@ -9,7 +9,12 @@ from torch import Tensor
 
 from controllers.common.map_refinement import RefinementSettings, estimate_rest_height
 from controllers.inbetweening.pipeline import INFILL_REFINEMENT, InbetweenSolution
-from controllers.inbetweening.proposers import EVERY_ROLLOUT_JUMPED, RolloutInbetweener, select_likeliest_density
+from controllers.inbetweening.proposers import (
+    EVERY_ROLLOUT_JUMPED,
+    ROLLOUT_SPAN,
+    RolloutInbetweener,
+    select_likeliest_density,
+)
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode, integrate_root
 from mapctl.metrics.realism import Diversity, measure_diversity
@@ -139,7 +144,7 @@ def sample_variations(
     density = select_likeliest_density(rollouts.densities, to_canonical(plain.motion, plain.rig)[0])
     if source is None:
         rolled = replace(rollouts, densities=[density])
-        source = Source(lambda number, draws: rolled, f"{rollouts.settings.span} between them")
+        source = Source(lambda number, draws: rolled, f"{ROLLOUT_SPAN} between them")
     found = [plain]
     for number in range(count - 1):
         if progress is not None:

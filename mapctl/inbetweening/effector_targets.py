@@ -9,7 +9,6 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mapctl import rotations
-from mapctl.errors import RequestError
 from mapctl.kinematics import inverse
 from mapctl.motion import Motion
 from mapctl.numerics import smooth_offsets
@@ -32,7 +31,7 @@ class EffectorTargets:
 
     def shown(self, seconds: Float[Tensor, " shown"], *, fps: float) -> "EffectorTargets":
         """Return the targets at other, increasing times: each is moved to the time nearest to its own."""
-        nearest = find_nearest_times(len(self.places), seconds, fps=fps)
+        nearest = _find_nearest_times(len(self.places), seconds, fps=fps)
         joints = self.places.shape[1]
         positions, wanted = self.places.new_zeros(len(seconds), joints, 3), self.wanted.new_zeros(len(seconds), joints)
         for frame, joint in self.wanted.nonzero().tolist():
@@ -41,20 +40,12 @@ class EffectorTargets:
         return EffectorTargets(positions, wanted)
 
 
-def find_nearest_times(frames: int, seconds: Float[Tensor, " shown"], *, fps: float) -> Int[Tensor, " frames"]:
+def _find_nearest_times(frames: int, seconds: Float[Tensor, " shown"], *, fps: float) -> Int[Tensor, " frames"]:
     """Find for each of so many frames which of other, increasing times is the nearest."""
     own = torch.arange(frames, dtype=seconds.dtype) / fps
     after = torch.searchsorted(seconds, own).clamp(max=len(seconds) - 1)
     before = (after - 1).clamp_min(0)
     return torch.where((seconds[before] - own).abs() <= (seconds[after] - own).abs(), before, after)
-
-
-def check_limbs(targets: EffectorTargets) -> None:
-    """Raise RequestError unless only effectors of limbs have targets."""
-    wanted = [CANONICAL.names[joint] for joint in targets.wanted.any(dim=0).nonzero()[:, 0].tolist()]
-    other = [name for name in wanted if name not in LIMBS]
-    if other:
-        raise RequestError(f"effector targets are for {', '.join(LIMBS)}; {other[0]} has none")
 
 
 def compute_target_errors(
@@ -67,8 +58,7 @@ def compute_target_errors(
 
 def reach_effector_targets(motion: Motion, targets: EffectorTargets, free: Bool[Tensor, " frames"]) -> Motion:
     """Bend limbs of a canonical motion to their targets, if these are in reach; they go there and back smoothly within
-    frames that are `free`. RequestError for targets of joints that are no effector."""
-    check_limbs(targets)
+    frames that are `free`."""
     for limb in LIMBS.values():
         wanted = targets.wanted[:, limb.end] & free
         if not bool(wanted.any()):
@@ -133,11 +123,12 @@ class LooseKeys:
 
     def shown(self, seconds: Float[Tensor, " shown"], *, fps: float) -> "LooseKeys":
         """Return the keys at other, increasing times: each is moved to the time nearest to its own."""
-        nearest = find_nearest_times(len(self.placed), seconds, fps=fps)
+        nearest = _find_nearest_times(len(self.placed), seconds, fps=fps)
         frames = (self.placed | self.drawings).nonzero()[:, 0]
         moved = LooseKeys.none(len(seconds), self.drawn.shape[1])
-        values = {name: _move(getattr(moved, name), value, nearest, frames) for name, value in vars(self).items()}
-        return LooseKeys(**values)
+        for name, values in vars(moved).items():
+            values[nearest[frames]] = getattr(self, name)[frames].to(values)
+        return moved
 
     def scaled(self, factor: float) -> "LooseKeys":
         """Return the keys of a world that is so many times as large; drawings are of any size anyway."""
@@ -175,10 +166,6 @@ class SeenDrawings:
     """Heading from the body to the viewer, radians."""
 
 
-def _move(target: Tensor, values: Tensor, nearest: Int[Tensor, " frames"], frames: Int[Tensor, " keys"]) -> Tensor:
-    return target.index_put((nearest[frames],), values[frames].to(target))
-
-
 def lead_over_places(
     ground: Float[Tensor, "batch frames 2"],
     heading: Float[Tensor, "batch frames"],
@@ -186,21 +173,17 @@ def lead_over_places(
     placed: Bool[Tensor, "batch frames"],
     faced: Bool[Tensor, "batch frames"],
 ) -> tuple[Float[Tensor, "batch frames 2"], Float[Tensor, "batch frames"]]:
-    """Lead ground (metres) and heading (radians) straight from one told place to the next, and from one told heading to
-    the next. Where no heading of a motion is told it looks along its way: at a place between both lines that meet
+    """Lead ground (metres) and heading (radians) straight from one given place to the next, and from one given heading
+    to the next. Where no heading of a motion is given it looks along its path: at a place between both lines that meet
     there, and from place to place evenly."""
-    way = fill_missing(ground, placed)
-    told = fill_missing_angle(heading, faced)
-    return way, torch.where(faced.any(dim=1, keepdim=True), told, _look_along(way, placed))
-
-
-def _look_along(way: Float[Tensor, "batch frames 2"], placed: Bool[Tensor, "batch frames"]) -> Tensor:
-    line = torch.nn.functional.normalize(torch.diff(way, dim=1), dim=-1)
-    none = torch.zeros_like(way[:, :1])
+    path = fill_missing(ground, placed)
+    line = torch.nn.functional.normalize(torch.diff(path, dim=1), dim=-1)
+    none = torch.zeros_like(path[:, :1])
     along = torch.cat([none, line], dim=1) + torch.cat([line, none], dim=1)
     moves = along.norm(dim=-1) > _LEAST_LINE
-    heading = fill_missing_angle(torch.atan2(along[..., 0], along[..., 1]), placed & moves)
-    return torch.where(moves.any(dim=1, keepdim=True), heading, 0.0)
+    looked = fill_missing_angle(torch.atan2(along[..., 0], along[..., 1]), placed & moves)
+    looked = torch.where(moves.any(dim=1, keepdim=True), looked, 0.0)
+    return path, torch.where(faced.any(dim=1, keepdim=True), fill_missing_angle(heading, faced), looked)
 
 
 def view_axes(view: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 2 3"]:

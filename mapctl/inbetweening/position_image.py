@@ -17,11 +17,10 @@ from mapctl import contacts, rotations
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening.query import GapQuery, Proposal
 from mapctl.kinematics import heading, inverse
-from mapctl.motion import Motion
 from mapctl.numerics import gaussian
 from mapctl.numerics.intervals import last_observed, next_observed
 from mapctl.numerics.smooth_offsets import blend_seams_in_positions, blend_seams_in_rotations
-from mapctl.skeleton import CANONICAL, LIMBS, TOE_JOINTS, Limb
+from mapctl.skeleton import CANONICAL, LIMBS, TOE_JOINTS
 
 _PARTNERS = CANONICAL.mirror_partners()
 
@@ -160,14 +159,26 @@ def propose_from_positions(
     """
     shown, missing = query.motion, query.missing
     body = query.to_unit_size(shown)
-    planted = contacts.detect_contacts(body.joint_positions()[:, list(TOE_JOINTS)], PRIOR_FPS)
-    image = make_position_image(query)
+    positions, facing = body.joint_positions(), heading(shown.local_quat_xyzw[:, 0])
+    planted = contacts.detect_contacts(positions[:, list(TOE_JOINTS)], PRIOR_FPS)
+    image = PositionImage.of_world(
+        positions.float()[None],
+        facing.float()[None],
+        planted.float()[None],
+        known=query.known_positions[None],
+        present=torch.ones(1, len(positions), dtype=torch.bool),
+        toes=TOE_JOINTS,
+    )
     answer = complete(image)
     wanted = image.to_world(_remove_jitter(answer.places, image))[0].double()
     if query.keep_trajectory:
         wanted = wanted - _estimate_root_drift(wanted[:, 0] - body.root_position, missing.root)[:, None]
     root = torch.where(missing.root[:, None], wanted[:, 0], body.root_position)
-    limbs = _select_limbs(missing.joints)
+    # Limbs that are known in no frame bend as proposed.
+    limbs = [
+        replace(limb, shown=not bool(missing.joints[:, [limb.upper, limb.lower]].any(dim=1).all()))
+        for limb in LIMBS.values()
+    ]
     quats = inverse.solve_inverse_kinematics(
         wanted, shown.local_quat_xyzw, CANONICAL, free=missing.joints, root_position=root, limbs=limbs
     )
@@ -175,31 +186,12 @@ def propose_from_positions(
     quats = blend_seams_in_rotations(quats, missing.joints, fps=PRIOR_FPS)
     root = blend_seams_in_positions(root * query.scale, missing.root, fps=PRIOR_FPS)
     motion = replace(shown, root_position=root, local_quat_xyzw=quats)
-    slow = _compute_toe_speeds(motion) < _MIN_SWING_SPEED * query.scale
+    toes = motion.joint_positions()[:, list(TOE_JOINTS)][..., ::2]
+    speeds = torch.diff(toes, dim=0, prepend=toes[:1]).norm(dim=-1) * float(motion.fps)
+    slow = speeds < _MIN_SWING_SPEED * query.scale
     logits = torch.where(slow, answer.contacts[0], -contacts.CERTAIN_LOGIT)
     known = image.known[0][:, list(TOE_JOINTS)]
     return Proposal(motion, torch.where(known, contacts.to_logits(planted), logits), source)
-
-
-def make_position_image(query: GapQuery) -> PositionImage:
-    """Make the image of a query, of unit size, in a batch of one."""
-    positions = query.to_unit_size(query.motion).joint_positions()
-    planted = contacts.detect_contacts(positions[:, list(TOE_JOINTS)], PRIOR_FPS)
-    return PositionImage.of_world(
-        positions.float()[None],
-        heading(query.motion.local_quat_xyzw[:, 0]).float()[None],
-        planted.float()[None],
-        known=query.known_positions[None],
-        present=torch.ones(1, len(positions), dtype=torch.bool),
-        toes=TOE_JOINTS,
-    )
-
-
-def _select_limbs(missing: Bool[Tensor, "frames joints"]) -> list[Limb]:
-    """Return arms and legs; those known in no frame bend as proposed."""
-    return [
-        replace(limb, shown=not bool(missing[:, [limb.upper, limb.lower]].any(dim=1).all())) for limb in LIMBS.values()
-    ]
 
 
 def _remove_jitter(positions: Float[Tensor, "1 frames joints 3"], image: PositionImage) -> Tensor:
@@ -222,9 +214,3 @@ def _estimate_root_drift(
     for _ in range(_DRIFT_PASSES):  # each takes the slow part of the remainder
         slow = slow + torch.where(missing[:, None], gaussian.convolve(offset - slow, taps, "repeated"), 0.0)
     return slow
-
-
-def _compute_toe_speeds(motion: Motion) -> Float[Tensor, "frames 2"]:
-    """Compute speeds of the toes over the ground, m/s."""
-    toes = motion.joint_positions()[:, list(TOE_JOINTS)][..., ::2]
-    return torch.diff(toes, dim=0, prepend=toes[:1]).norm(dim=-1) * float(motion.fps)

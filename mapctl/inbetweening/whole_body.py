@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl import rotations
-from mapctl.inbetweening.effector_targets import EffectorTargets, check_limbs
+from mapctl.inbetweening.effector_targets import EffectorTargets
 from mapctl.kinematics import forward_kinematics, inverse
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL, LIMBS
@@ -50,19 +50,21 @@ def reach_targets(
     `turning` are joints that may rotate and `moving` frames in which the hips may move; all else stays. `stray` is the
     standard deviation, metres, of a shift of the whole body, feet included, over the ground. Feet without a target keep
     their positions, but for that shift, and their orientations. Frames without a target stay to the bit; limbs point at
-    a target out of reach. Also returns the shift, metres; 0 in all other frames. RequestError for targets of joints
-    that end no limb.
+    a target out of reach. Also returns the shift, metres; 0 in all other frames.
     """
-    check_limbs(targets)
     frames = targets.wanted.any(dim=1).nonzero()[:, 0]
     shifts = torch.zeros_like(body.root_position)
     if not len(frames):
         return body, shifts
     part = replace(body, root_position=body.root_position[frames], local_quat_xyzw=body.local_quat_xyzw[frames])
     goals, wanted = targets.places[frames], targets.wanted[frames]
-    sigma = _compute_offset_sigmas(turning[frames], moving[frames], stray[frames].double())
+    # Sigmas of shift (x, z), lean (x, y, z) and the rotations of the trunk; 0 for what may not move.
+    step, lean = stray[frames].double()[:, None].expand(-1, 2), torch.full((len(frames), 3), _SIGMA_LEAN).double()
+    turn = _SIGMA_ROTATION * turning[frames][:, _TRUNK_JOINTS].double().repeat_interleave(3, dim=1)
+    sigma = torch.cat([torch.cat([step, lean], dim=1) * moving[frames, None], turn], dim=1)
     offsets = _minimise_offsets(part, goals[:, _ENDS], wanted[:, _ENDS], sigma)
-    posed, shift = _apply_offsets_to_motion(part, offsets)
+    root, quats, shift = _apply_offsets(offsets, part.root_position, part.local_quat_xyzw)
+    posed = replace(part, root_position=root, local_quat_xyzw=quats)
     before = part.joint_positions()
     ends = torch.where(wanted[..., None], goals, before + shift[:, None])
     bent = bend_limbs(posed, part, ends, wanted, turning[frames])
@@ -70,15 +72,6 @@ def reach_targets(
     root[frames], quats[frames] = bent.root_position, bent.local_quat_xyzw
     shifts[frames] = shift
     return replace(body, root_position=root, local_quat_xyzw=quats), shifts
-
-
-def _compute_offset_sigmas(
-    turning: Bool[Tensor, "poses joints"], moving: Bool[Tensor, " poses"], stray: Float[Tensor, " poses"]
-) -> Float[Tensor, "poses offsets"]:
-    """Return sigmas of shift (x, z), lean (x, y, z) and the rotations of `_TURNING`; 0 for what may not move."""
-    step, lean = stray[:, None].expand(-1, 2), stray.new_full((len(stray), 3), _SIGMA_LEAN)
-    turn = _SIGMA_ROTATION * turning[:, _TRUNK_JOINTS].to(stray).repeat_interleave(3, dim=1)
-    return torch.cat([torch.cat([step, lean], dim=1) * moving[:, None], turn], dim=1)
 
 
 def _minimise_offsets(
@@ -168,11 +161,6 @@ def _apply_offsets(
     quats = quats.expand(*x.shape[:-1], *quats.shape[-2:]).clone()
     quats[..., _TRUNK_JOINTS, :] = rotations.multiply(quats[..., _TRUNK_JOINTS, :], turns)
     return root + shift + x[..., 2:5], quats, shift
-
-
-def _apply_offsets_to_motion(part: Motion, offsets: Tensor) -> tuple[Motion, Float[Tensor, "poses 3"]]:
-    root, quats, shift = _apply_offsets(offsets, part.root_position, part.local_quat_xyzw)
-    return replace(part, root_position=root, local_quat_xyzw=quats), shift
 
 
 def bend_limbs(

@@ -104,7 +104,7 @@ def test_timing_is_suggested_and_the_given_one_made(folder, capsys):
     assert run("tween", keys, "-o", "out.bvh", *words) == 0
     assert Path("out.bvh").read_bytes() == Path("plain.bvh").read_bytes()
     (row,) = json.loads(Path("r.json").read_text())["key_timing"]
-    assert (row["from"], row["to"], row["given"]) == (0, 40, 40)
+    assert (row["start"], row["stop"], row["given"]) == (0, 40, 40)
     assert row["usual"][0] <= row["suggested"] <= row["usual"][1]
     told = capsys.readouterr().out
     assert re.search(rf"\b0 +40 +40 +{row['suggested']} +\w+", told)

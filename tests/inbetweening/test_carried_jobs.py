@@ -1,13 +1,11 @@
 """The jobs that bring motion of one rig to another all stand it on the other's floor."""
 
-import pytest
 import torch
 from helpers import bandai_skeleton, generator
 from methods import UNFINISHED
-from performers import FEET, TOES, Performer
+from performers import TOES, Performer
 from rig_maker import Make, make, names_of
 
-from controllers.inbetweening.blend import LimbTransfer, blend
 from controllers.inbetweening.infill import ChainSettings, chain
 from controllers.inbetweening.proposers import SlerpInbetweener
 from mapctl import retarget
@@ -27,13 +25,6 @@ def others_walk() -> Motion:
     return make(Make(names_of("mixamo"), size=1.2, extras=False)).motion(OTHER.walks())
 
 
-def foot_of(motion: Motion) -> str:
-    """The rig's name of the left foot."""
-    joint = retarget.identify_rig(motion.skeleton).joint_of[FEET[0]]
-    assert joint is not None
-    return motion.skeleton.names[joint]
-
-
 def test_pieces_of_a_chain_stand_on_the_first_ones_floor():
     settings = ChainSettings(piece=40, gap=(10, 10))
     done = chain(
@@ -42,14 +33,3 @@ def test_pieces_of_a_chain_stand_on_the_first_ones_floor():
     toes = retarget.to_canonical(done.motion)[0].joint_positions()[:, TOES, 1]
     for piece in (slice(0, 40), slice(50, 90)):
         torch.testing.assert_close(toes[piece].amin(0), torch.full((2,), TOE_REST_HEIGHT).double(), atol=0.01, rtol=0)
-
-
-@pytest.mark.slow
-def test_a_borrowed_foot_is_as_high_as_it_was():
-    """The same step of somebody else comes at the same height of the foot over the floor, in scale."""
-    motion, source = own_walk(), others_walk()
-    name = foot_of(motion)
-    borrowed = LimbTransfer((name,), start=40, stop=60, at=40)
-    done = blend(motion, source, borrowed, SlerpInbetweener(), settings=UNFINISHED)
-    before, after = (retarget.to_canonical(m)[0].joint_positions()[40:60, FEET[0]] for m in (motion, done.motion))
-    torch.testing.assert_close(after, before, atol=0.015, rtol=0)

@@ -67,17 +67,6 @@ def test_places_in_reach_are_met_and_bones_stay_rigid(limb, fps):
     assert (lengths(made) - lengths(motion)).abs().max() < 1e-12
 
 
-def test_several_limbs_are_met_at_once():
-    motion = walk(60)
-    targets = at(motion, {(30, limb): nearer(motion, 30, limb) for limb in LIMBS})
-    assert (
-        compute_target_errors(
-            reach_effector_targets(motion, targets, all_free(motion)).joint_positions(), targets
-        ).max()
-        < HAIR
-    )
-
-
 @pytest.mark.parametrize("limb", LIMBS)
 def test_only_the_limb_turns_and_only_where_it_is_free(limb):
     motion, free = walk(60), torch.zeros(60, dtype=torch.bool)
@@ -87,21 +76,6 @@ def test_only_the_limb_turns_and_only_where_it_is_free(limb):
     assert set(turned.any(dim=0).nonzero()[:, 0].tolist()) == {LIMBS[limb].upper, LIMBS[limb].lower}
     assert torch.equal(made.local_quat_xyzw[~free], motion.local_quat_xyzw[~free])
     assert torch.equal(made.root_position, motion.root_position)
-
-
-@pytest.mark.parametrize("fps", [30, 120])
-def test_a_limb_goes_there_and_back_smoothly(fps):
-    """Far away nothing is left of the offset, and no step is a leap."""
-    motion, frame = walk(4 * fps, fps=fps), 2 * fps
-    made = reach_effector_targets(
-        motion, at(motion, {(frame, "leftHand"): nearer(motion, frame, "leftHand")}), all_free(motion)
-    )
-    offset = (made.joint_positions() - motion.joint_positions())[:, CANONICAL.index("leftHand")]
-    peak = offset[frame].norm()
-    assert offset[: frame - fps].norm(dim=-1).max() < 0.02 * peak
-    assert offset[frame + fps :].norm(dim=-1).max() < 0.02 * peak
-    assert torch.diff(offset, dim=0).norm(dim=-1).max() * fps < 8 * peak
-    assert torch.diff(offset, n=2, dim=0).norm(dim=-1).max() * fps**2 < 120 * peak
 
 
 @pytest.mark.parametrize("limb", LIMBS)
@@ -118,15 +92,6 @@ def test_out_of_reach_the_limb_is_straight_and_points_there_and_is_said_to_miss(
     assert wrong[:15].max() == wrong[16:].max() == 0
 
 
-@pytest.mark.parametrize("limb", LIMBS)
-def test_a_place_where_the_limb_begins_breaks_nothing(limb):
-    motion = walk(31)
-    made = reach_effector_targets(
-        motion, at(motion, {(15, limb): place_of(motion, 15, CANONICAL.names[LIMBS[limb].upper])}), all_free(motion)
-    )
-    assert made.joint_positions().isfinite().all()
-
-
 @pytest.mark.parametrize(("limb", "forward"), [("leftFoot", 1), ("rightFoot", 1), ("leftHand", -1), ("rightHand", -1)])
 def test_straight_limbs_bend_knees_forward_and_elbows_back(limb, forward):
     motion = standing()
@@ -138,18 +103,3 @@ def test_straight_limbs_bend_knees_forward_and_elbows_back(limb, forward):
     across = bent - (bent @ axis) * axis
     assert float(across[2]) * forward > 0.05
     assert abs(float(across[2])) == pytest.approx(float(across.norm()), rel=0.02)
-
-
-def test_a_bent_limb_stays_in_its_plane():
-    """Knees that point outward do not swing to the front."""
-    motion = standing(leftUpperLeg=(0.0, 1.2, 0.0), leftLowerLeg=(0.6, 0.0, 0.0))
-    begins, ends = place_of(motion, 15, "leftUpperLeg"), place_of(motion, 15, "leftFoot")
-    made = reach_effector_targets(
-        motion, at(motion, {(15, "leftFoot"): ends + 0.1 * (begins - ends)}), all_free(motion)
-    )
-    axis = torch.nn.functional.normalize(ends - begins, dim=-1)
-    knees = [place_of(each, 15, "leftLowerLeg") - begins for each in (motion, made)]
-    before, after = (knee - (knee @ axis) * axis for knee in knees)
-    assert float(after.norm()) > float(before.norm()) > 0.05
-    assert float(after @ before) == pytest.approx(float(after.norm() * before.norm()), rel=1e-9)
-    assert float(after[0]) > 2 * float(after[2])

@@ -54,8 +54,10 @@ def same(first, second):
     return quats and torch.equal(first.joint_positions(), second.joint_positions())
 
 
-@pytest.mark.parametrize(("rig", "fps"), CASES)
-@pytest.mark.parametrize("method", ["infiller", "slerp"])
+@pytest.mark.parametrize(
+    ("rig", "fps", "method"),
+    [("canonical", 30, "infiller"), ("bandai", 30, "slerp"), ("daz", 120, "infiller"), ("daz", 30, "auto")],
+)
 def test_known_frames_stay_to_the_bit_and_the_gap_is_filled_with_something(rig, fps, method):
     motion = on_rig(rig, 2 * fps, fps=fps)
     mask = seconds(motion, 0.7, 1.2)
@@ -63,15 +65,6 @@ def test_known_frames_stay_to_the_bit_and_the_gap_is_filled_with_something(rig, 
     assert_known_stays(motion, made, [mask])
     gap = slice(mask.start, mask.stop)
     assert (made.joint_positions()[gap] - motion.joint_positions()[gap]).norm(dim=-1).mean() > 0.002
-
-
-@pytest.mark.parametrize("rig", RIGS)
-def test_the_map_stage_keeps_what_is_known_too(rig):
-    motion = on_rig(rig, 50)
-    mask = Mask(ALL, 20, 32)
-    done = filled(motion, mask, method="auto")
-    assert_known_stays(motion, done.motion, [mask])
-    assert "footing" in done.ledger.summary()
 
 
 @pytest.mark.parametrize(
@@ -152,13 +145,6 @@ def test_lost_joints_are_filled_and_no_other(rig):
         assert 1 <= int(moved.sum()) <= 2
 
 
-def test_what_is_known_keeps_even_the_signs_of_its_quaternions():
-    motion = on_rig("bandai", 45)
-    motion.local_quat_xyzw[30:] *= -1
-    made = filled(motion, Mask(ALL, 15, 25)).motion
-    assert torch.equal(made.local_quat_xyzw[25:], motion.local_quat_xyzw[25:])
-
-
 @pytest.mark.parametrize("method", ["infiller", "auto"])
 def test_gaps_at_the_beginning_and_the_end_are_extended_into_and_said(method):
     motion = on_rig("bandai", 50)
@@ -166,23 +152,6 @@ def test_gaps_at_the_beginning_and_the_end_are_extended_into_and_said(method):
     done = filled(motion, *masks, method=method)
     assert_known_stays(motion, done.motion, masks)
     assert [note.partition(":")[0] for note in done.notes][:2] == ["a gap at the beginning", "a gap at the end"]
-
-
-@pytest.mark.parametrize(("frames", "method"), [(2, "infiller"), (3, "infiller"), (5, "slerp"), (3, "auto")])
-def test_motions_of_a_few_frames_break_nothing(frames, method):
-    motion = on_rig("canonical", frames)
-    for mask in (Mask(ALL, 0, 1), Mask(ALL, frames - 1, frames), Mask(ALL, 1, frames)):
-        assert_known_stays(motion, filled(motion, mask, method=method).motion, [mask])
-
-
-@pytest.mark.parametrize("fps", [30, 120])
-def test_seams_do_not_leap(fps):
-    """Whatever is proposed: a frame differs from the next by no more than within the gap."""
-    motion = on_rig("bandai", 3 * fps, fps=fps)
-    mask = seconds(motion, 1.0, 2.0)
-    steps = torch.diff(filled(motion, mask).motion.joint_positions(), dim=0).norm(dim=-1).amax(dim=1)
-    edges = torch.stack([steps[mask.start - 1], steps[mask.stop - 1]])
-    assert edges.max() < 2 * max(float(steps[mask.start : mask.stop - 1].max()), float(steps[: mask.start - 1].max()))
 
 
 def test_who_stands_with_a_foot_on_a_step_is_not_lifted_off_the_floor():

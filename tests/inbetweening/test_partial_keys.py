@@ -12,8 +12,7 @@ from linear_inbetweener import LinearInbetweener
 from methods import by_method
 from tiny_infiller import tiny_infiller
 
-from controllers.inbetweening.pipeline import InfillSettings
-from controllers.inbetweening.proposers import SlerpInbetweener, propose_through_keys
+from controllers.inbetweening.proposers import propose_through_keys
 from controllers.inbetweening.tween import tween
 from mapctl.inbetweening import GapQuery
 from mapctl.inbetweening.effector_targets import EffectorTargets
@@ -78,17 +77,6 @@ def test_hips_told_at_one_frame_do_not_swing_the_body(fps, turn):
     assert (done.motion.root_position - motion.root_position)[4 * fps // 3].norm() < 1e-9
 
 
-@pytest.mark.slow
-def test_several_frames_of_one_hand_are_held_without_a_tremble():
-    motion = walk(90)
-    place = tuple((motion.root_position[45] + torch.tensor([0.2, 0.3, 0.4]).double()).tolist())
-    held = tuple(Key(frame, places={"leftHand": place}) for frame in range(40, 51))
-    made = asked(motion, (0, *held, 89)).motion
-    places = made.joint_positions()[40:51, CANONICAL.index("leftHand")]
-    assert (places - torch.tensor(place).double()).norm(dim=-1).max() < 0.002
-    assert peaks_of(made).acceleration < 80
-
-
 class Told(LinearInbetweener):
     """One that takes hands and feet in single frames into account, as far as it says."""
 
@@ -118,19 +106,3 @@ def test_the_body_moves_for_a_hand_only_where_its_arm_does_not_reach(share, move
     assert float(away) <= limb.length(CANONICAL)
     if not moves:
         assert torch.equal(made.motion.local_quat_xyzw, freely.local_quat_xyzw)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("finish", [False, True], ids=["proposed", "finished"])
-def test_hands_over_the_head_are_reached_by_the_arms(finish):
-    """By one that takes no such keys too: where its arms hung, the MAP stage had to lift the whole body."""
-    motion, hands = walk(31), CANONICAL.indices(("leftHand", "rightHand"))
-    places = motion.joint_positions().clone()
-    across = torch.tensor([0.8, 0.0, 0.8]).double()
-    head = places[15, CANONICAL.index("head")].clone()
-    places[15, hands] = head + (places[15, hands] - head) * across + torch.tensor([0.0, 0.15, 0.0]).double()
-    told = {CANONICAL.names[hand]: tuple(places[15, hand].tolist()) for hand in hands}
-    keys = Keys((0, Key(15, places=told), 30))
-    made = tween(motion, keys, SlerpInbetweener(), settings=InfillSettings(finish=finish)).motion
-    assert (made.joint_positions() - places)[15, hands].norm(dim=-1).max() < 0.01
-    assert made.root_position[:, 1].max() - motion.root_position[:, 1].max() < 0.03

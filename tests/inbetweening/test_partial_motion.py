@@ -14,7 +14,6 @@ from mapctl.inbetweening.partial_motion import (
     mirror_quats,
 )
 from mapctl.skeleton import CANONICAL, LIMBS
-from priors.training.windows import interpolate_positions
 
 FRAMES = 40
 MEAN = torch.nn.functional.normalize(
@@ -54,15 +53,6 @@ def test_unknown_values_do_not_matter_and_known_ones_stay():
     known = partial_motion(gap()).known.positions
     truth = on_rig("canonical", FRAMES).joint_positions()[None]
     torch.testing.assert_close(world_positions(one)[known], truth[known], atol=1e-9, rtol=0)
-
-
-def test_a_gap_of_whole_poses_is_the_interpolation_of_all_the_rest():
-    """The infiller's interpolation, written for positions; hips turn about their heading here, as a whole there."""
-    made = world_positions(interpolate_partial_motion(partial_motion(gap()), MEAN, 0.9))
-    motion, known = on_rig("canonical", FRAMES), gap().positions
-    there = interpolate_positions(motion.joint_positions()[None], motion.local_quat_xyzw[None], known)
-    torch.testing.assert_close(made[..., 0, :], there[..., 0, :], atol=1e-9, rtol=0)
-    assert float((made - there).norm(dim=-1).max()) < 0.02
 
 
 def test_unknown_limbs_bend_to_their_targets_and_known_ones_do_not():

@@ -52,20 +52,6 @@ def still(frames):
     return replace(motion, root_position=motion.root_position[first], local_quat_xyzw=motion.local_quat_xyzw[first])
 
 
-@pytest.mark.parametrize(("start", "stop"), [(1, 31), (1, 91), (20, 110), (1, 180)])
-def test_whatever_slides_the_network_is_kept_where_it_has_an_answer(start, stop):
-    """Poses of a walk that straight lines slide between: densities, which would step, do not take the gap, since behind
-    MAP they are farther from mocap."""
-    motion = walk(stop + (20 if start > 1 else 1))
-    network = Network(sway=0.2)
-    query, answer = chosen(motion, start, stop, densities=[tiny_density()], network=network)
-    alone = network.propose(query)
-    assert [(one.start, one.stop, one.by) for one in answer.attribute(query)] == [(start, stop, "network")]
-    assert torch.equal(answer.motion.root_position, alone.motion.root_position)
-    assert torch.equal(answer.motion.local_quat_xyzw, alone.motion.local_quat_xyzw)
-    assert torch.equal(answer.contact_logits, alone.contact_logits)
-
-
 @pytest.mark.parametrize("seconds", [2, 4, 8])
 def test_somebody_who_stands_stays_where_he_is(seconds):
     motion = still(30 * seconds + 1)
@@ -75,16 +61,6 @@ def test_somebody_who_stands_stays_where_he_is(seconds):
     away = (done.motion.root_position - motion.root_position).norm(dim=-1)
     assert away.max() < 0.02
     assert any("standing still" in note for note in done.gap_notes)
-
-
-def test_somebody_who_is_on_the_move_beside_a_gap_does_not_just_stand():
-    """The same pose before and after, but hands that are in full swing."""
-    motion = walk(120, cadence=1.0)
-    period = 30
-    motion = replace(motion, root_position=motion.root_position * torch.tensor([0.0, 1.0, 0.0]).double())
-    start, stop = 20, 20 + 3 * period - 1
-    query, answer = chosen(motion, start, stop, network=Network(sway=0.2))
-    assert answer.attribute(query)[0].by == "network"
 
 
 @pytest.mark.parametrize(
