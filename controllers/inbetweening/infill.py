@@ -31,7 +31,7 @@ from mapctl.terms import Term
 @dataclass(frozen=True, eq=False)
 class RetracedInbetweener(Inbetweener):
     """In-betweener that lets another propose the poses that are missing, and predicts the hips' trajectory wherever it
-    is lost while the body is known: calmed, since hips that are told by how toes move tremble with these."""
+    is lost while the body is known: calmed, since hips that follow from how toes move tremble with these."""
 
     path: PathPredictor
     """Predictor of the trajectory."""

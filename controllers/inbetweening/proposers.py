@@ -716,7 +716,7 @@ class AutoInbetweener(Inbetweener):
     tweener: Inbetweener | None = None
     """In-betweener for long gaps between whole poses; without one they are the network's."""
     stitcher: Callable[[], Inbetweener] | None = None
-    """Loader of the stitcher, for short gaps between whole poses in which parts of the body are told; without one they
+    """Loader of the stitcher, for short gaps between whole poses in which parts of the body are given; without one they
     are the network's. It is called where there is such a gap."""
 
     @property
@@ -731,7 +731,7 @@ class AutoInbetweener(Inbetweener):
 
     @property
     def has_style(self) -> bool:
-        """Whether the tweener was told one."""
+        """Whether the tweener was given one."""
         return self.tweener is not None and self.tweener.has_style
 
     def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
@@ -796,7 +796,7 @@ def _is_beside_part(query: GapQuery, start: int, stop: int) -> bool:
 
 
 def _has_parts_within(query: GapQuery, start: int, stop: int) -> bool:
-    """Return whether places of hands, feet or hips are told within a gap."""
+    """Return whether positions of hands, feet or hips are given within a gap."""
     within, targets = slice(start, stop), query.effector_targets
     return bool(query.root_only_keys[within].any() or (targets is not None and targets.wanted[within].any()))
 
@@ -818,8 +818,8 @@ def _is_standing_still(query: GapQuery, start: int, stop: int) -> bool:
     frames beside it.
     """
     targets = query.effector_targets
-    told = targets is not None and bool(targets.wanted[start:stop].any())
-    if stop - start < _HELD or query.keep_trajectory or told or _is_beside_part(query, start, stop):
+    given = targets is not None and bool(targets.wanted[start:stop].any())
+    if stop - start < _HELD or query.keep_trajectory or given or _is_beside_part(query, start, stop):
         return False
     positions, unknown = query.motion.joint_positions(), query.missing.frames
     apart = float((positions[stop] - positions[start - 1]).norm(dim=-1).mean())

@@ -94,7 +94,7 @@ class LooseKeys:
     """Places over the ground and drawings, by frame."""
 
     placed: Bool[Tensor, " frames"]
-    """Whether the hips' place over the ground is told by itself."""
+    """Whether the hips' place over the ground is given by itself."""
     ground: Float[Tensor, "frames 2"]
     """That place (x, z), world, metres; anything finite where there is none."""
     drawn: Bool[Tensor, "frames joints"]

@@ -55,7 +55,7 @@ class PositionImage:
     ) -> "PositionImage":
         """Build an image from world positions (metres) and the hips' heading (radians), interpolated where they are not
         known; the reference is their root, and `toes` are the indices of the left and the right one. Contacts of toes
-        that are not known may be anything finite. Where single coordinates are known they are told by `known_axes`,
+        that are not known may be anything finite. Where single coordinates are known they are given by `known_axes`,
         beside the joints that are `known` whole."""
         known = known & present[..., None]
         axes = known[..., None].expand(*known.shape, 3)

@@ -60,9 +60,9 @@ class GapQuery:
 
     @property
     def only_places(self) -> bool:
-        """Whether nothing is told but where the hips are over the ground."""
-        untold = bool(self.nothing_known.all()) and self.effector_targets is None
-        return untold and self.loose is not None and not bool(self.loose.drawn.any())
+        """Whether nothing is given but where the hips are over the ground."""
+        open_poses = bool(self.nothing_known.all()) and self.effector_targets is None
+        return open_poses and self.loose is not None and not bool(self.loose.drawn.any())
 
     @property
     def root_only_keys(self) -> Bool[Tensor, " frames"]:

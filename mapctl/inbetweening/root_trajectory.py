@@ -1,4 +1,4 @@
-"""The hips' trajectory as the body tells it: the body seen from its hips, and steps that lead from frame to frame.
+"""The hips' trajectory: the body seen from its hips, and steps that lead from frame to frame.
 
 A predicted trajectory of the hips, led through the positions that are known.
 
@@ -19,7 +19,7 @@ from mapctl.inbetweening.position_image import mirror_positions
 from mapctl.numerics.intervals import true_intervals
 
 TREMBLE_HZ = 7.0
-"""Frequency of which half is left in a way that is told by how the body moves: so led, hips tremble with its toes."""
+"""Frequency of which half is left in a predicted trajectory: hips that follow from how toes move tremble with these."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,9 +122,9 @@ def lead_over_keys(
     path = close_path(predicted, known, lost)
     if loose is None or not bool(loose.placed.any()):
         return path
-    told = torch.stack([loose.ground[:, 0], predicted[:, 1], loose.ground[:, 1]], dim=-1).to(known)
+    given = torch.stack([loose.ground[:, 0], predicted[:, 1], loose.ground[:, 1]], dim=-1).to(known)
     placed = lost & loose.placed
-    ground = close_path(predicted, torch.where(placed[:, None], told, known), lost & ~placed)
+    ground = close_path(predicted, torch.where(placed[:, None], given, known), lost & ~placed)
     return torch.stack([ground[:, 0], path[:, 1], ground[:, 2]], dim=-1)
 
 

@@ -1,19 +1,23 @@
-"""Blending counts in the other clip's own frames, whatever the two frame rates."""
+"""Blending counts in the other clip's own frames, and pieces of a chain stand on the first one's floor."""
 
 from dataclasses import replace
 from fractions import Fraction
 
 import pytest
 import torch
-from helpers import walk
+from helpers import bandai_skeleton, generator, walk
 from methods import UNFINISHED
+from performers import TOES, Performer
+from rig_maker import Make, make, names_of
 from tiny_infiller import tiny_infiller
 
 from controllers.inbetweening.blend import LimbTransfer, blend
-from mapctl import rotations
+from controllers.inbetweening.infill import ChainSettings, chain
+from controllers.inbetweening.proposers import SlerpInbetweener
+from mapctl import retarget, rotations
 from mapctl.metrics import body
 from mapctl.motion import Motion
-from mapctl.skeleton import CANONICAL
+from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT
 
 HAND, ARM = CANONICAL.index("leftHand"), CANONICAL.index("leftUpperArm")
 
@@ -63,3 +67,26 @@ def test_a_borrowed_limb_goes_there_and_comes_back_as_bodies_do(fps, margin):
     assert made.step < max(1.3 * max(own.step, theirs.step), 0.17)
     assert made.acceleration < max(1.5 * max(own.acceleration, theirs.acceleration), 60)
     assert not any("takes" in note for note in done.notes)
+
+
+OTHER = Performer(size=1.2, toe_height=-0.06)
+
+
+def own_walk() -> Motion:
+    """On the Bandai Namco rig."""
+    return retarget.from_canonical(Performer().walks(), retarget.identify_rig(bandai_skeleton()))
+
+
+def others_walk() -> Motion:
+    """On another rig, of somebody tall whose toes are below the floor."""
+    return make(Make(names_of("mixamo"), size=1.2, extras=False)).motion(OTHER.walks())
+
+
+def test_pieces_of_a_chain_stand_on_the_first_ones_floor():
+    settings = ChainSettings(piece=40, gap=(10, 10))
+    done = chain(
+        [own_walk(), others_walk()], SlerpInbetweener(), settings=settings, filling=UNFINISHED, generator=generator()
+    )
+    toes = retarget.to_canonical(done.motion)[0].joint_positions()[:, TOES, 1]
+    for piece in (slice(0, 40), slice(50, 90)):
+        torch.testing.assert_close(toes[piece].amin(0), torch.full((2,), TOE_REST_HEIGHT).double(), atol=0.01, rtol=0)

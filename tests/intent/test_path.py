@@ -1,10 +1,12 @@
-"""Slowing down before corners: gentle curves are left alone, corners are slowed for in time, reversals are found."""
+"""Speeds along a path: corners are slowed for in time, reversals are found, arcs are the integral of speed."""
 
 import numpy as np
 import pytest
+import torch
 
 from mapctl import curves
-from mapctl.intent.path import USUAL_SPEED, find_reversals, walk_at_ease
+from mapctl.errors import RequestError
+from mapctl.intent.path import USUAL_SPEED, TimedSpeed, find_reversals, walk_at_ease
 
 
 def polygon(*points, closed=False):
@@ -33,3 +35,22 @@ def test_reversals_are_found_where_they_are_and_hairpins_are_none():
     assert there == pytest.approx([4.0], abs=0.05)
     assert find_reversals(polygon((0, 0), (0, 4), (0.5, 4), (0.5, 0))) == []
     assert find_reversals(curves.read("figure8:1.5")) == []
+
+
+def test_arcs_are_the_integral_of_speeds():
+    speed = TimedSpeed.parse(((0, 0), (1, 1.2), (3, 1.2), (4, 0)))
+    arcs = speed.arcs(181, 30)
+    torch.testing.assert_close(arcs[30], torch.tensor(0.6).double())
+    torch.testing.assert_close(arcs[120], torch.tensor(0.6 + 2.4 + 0.6).double())
+    torch.testing.assert_close(arcs[180], arcs[120])
+    assert float(arcs[0]) == 0
+    assert bool((arcs.diff() >= 0).all())
+
+
+@pytest.mark.parametrize(
+    ("seconds", "speeds"),
+    [((), ()), ((0.0, 0.0), (1.0, 1.0)), ((1.0, 0.0), (1.0, 1.0)), ((0.0,), (-1.0,)), ((0.0,), (float("inf"),))],
+)
+def test_times_rise_and_speeds_are_not_negative(seconds, speeds):
+    with pytest.raises(RequestError):
+        TimedSpeed(seconds, speeds)

@@ -1,9 +1,9 @@
-"""Key files: what they may hold, and what is said of what they may not."""
+"""Key files and drawings: what they may hold, and the errors of what they may not."""
 
 import pytest
 
 from mapctl.errors import FileFormatError
-from mapctl.intent.keyframes import KeyEntry, read_keys
+from mapctl.intent.keyframes import Drawing, KeyEntry, read_drawing, read_keys
 
 TWO = '[[key]]\nframe = 0\npose = "a.bvh"\n[[key]]\nframe = 30\npose = "b.bvh"\n'
 
@@ -66,4 +66,28 @@ def test_what_is_wrong_is_said_with_its_place(tmp_path, text, said):
     with pytest.raises(FileFormatError) as caught:
         read_keys(path)
     assert str(caught.value).startswith(f"{path}: {said}")
+    assert "\n" not in str(caught.value)
+
+
+def test_joints_are_read_by_column_in_any_unit(tmp_path):
+    (tmp_path / "pose.csv").write_text("Y,joint,X\n120.5,head,-3\n\n1e2, hips ,0\n")
+    assert read_drawing(tmp_path / "pose.csv", 90) == Drawing({"head": (-3.0, 120.5), "hips": (0.0, 100.0)}, 90)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("joint,x,y\n", "the drawing has no joints"),
+        ("joint,x\nhead,1\n", "line 1: found the columns 'joint,x', expected joint,x,y"),
+        ("joint,x,y\nhead,1,2\nhips,nan,0\n", "line 3: x must be a finite number, got 'nan'"),
+        ("joint,x,y\nhead,1\n", "line 2: found 2 values where 3 belong"),
+        ("joint,x,y\nhead,1,2\nhead,1,3\n", "line 3: each line names a joint, each once, got 'head'"),
+        ("", "the file is empty"),
+    ],
+)
+def test_what_is_no_drawing_is_said_with_its_line(tmp_path, text, said):
+    (tmp_path / "pose.csv").write_text(text)
+    with pytest.raises(FileFormatError) as caught:
+        read_drawing(tmp_path / "pose.csv")
+    assert said in str(caught.value)
     assert "\n" not in str(caught.value)
