@@ -9,8 +9,8 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from controllers.denoising.denoise import MIN_DENOISE_FRAMES, denoise
-from controllers.denoising.segment import DenoiseSettings, DenoiseSolution, crossfade, join_segments
+from controllers.denoising.denoise import MIN_DENOISE_FRAMES, DenoiseSettings, denoise
+from controllers.denoising.solution import DenoiseSolution, crossfade, join_segments
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.motion import Motion

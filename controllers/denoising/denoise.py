@@ -1,20 +1,29 @@
-"""Denoise a capture on any rig (Wang et al. 2019, section 5.4): inspection, a proposal, and the MAP stage about it.
+"""Denoise a capture on any rig (Wang et al. 2019, section 5.4).
 
-A network trained on all kinds of motion proposes; its proposal is fused with the capture by the noise that the capture
-itself shows, so that on unfamiliar motion the result is a filter of the capture; the MAP stage plants the feet. The
-result is on the capture's own rig, at its own rate, with all of its frames.
+1. Inspection (`mapctl.recording.inspection`): noise, spikes, drop-outs, held frames, bones that vary only by noise.
+2. Proposal: a network that was trained on all kinds of motion sees the capture on canonical joints at PRIOR_FPS; an
+   in-betweener proposes what is lost for longer.
+3. Evidence test (`mapctl.recording.fusion`): the proposal is fused with the capture by the noise that the capture
+   itself shows, so that on unfamiliar motion the result is a filter of the capture.
+4. Refinement (`controllers.common.map_refinement`): the MAP problem about the fused motion plants the feet.
+5. Result: on the capture's own rig, at its own rate, with all of its frames; the input where it would become rougher.
 """
 
+import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from fractions import Fraction
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from controllers.denoising.lead_pose import find_lead_transition, has_lead_pose, restore_lead_pose
-from controllers.denoising.segment import DenoiseSettings, DenoiseSolution, SegmentDenoiser, join_segments
+from controllers.common.map_refinement import RefinedMotion, RefinementSettings, anchor_to_contacts, refine
+from controllers.denoising.solution import DenoiseSolution, join_segments, move_frames
+from mapctl import rotations
+from mapctl.contacts import debounced
+from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening import GapQuery
 from mapctl.inbetweening.missing import MissingMask
@@ -24,7 +33,25 @@ from mapctl.pose import BodyPose
 from mapctl.problem.solution import Ledger, Outcome, Status
 from mapctl.protocols import Denoiser, Density, Inbetweener
 from mapctl.recording import Capture, CaptureProposal
-from mapctl.recording.inspection import NOISE_CM, Artefact, exchange_swapped_limbs, inspect_recording
+from mapctl.recording.fusion import (
+    fuse_positions,
+    fuse_rotations,
+    measure_kept_noise,
+    smooth_columns,
+    transfer_change,
+    upsample,
+)
+from mapctl.recording.inspection import (
+    ALL,
+    NOISE_CM,
+    Artefact,
+    Inspection,
+    count_lead_frames,
+    hold_rigid_bones,
+    inspect_recording,
+    list_artefacts,
+    travel,
+)
 from mapctl.recording.masks import (
     Mask,
     expand_valid_masks,
@@ -33,11 +60,374 @@ from mapctl.recording.masks import (
     trim_masks_before,
     write_back_masked,
 )
-from mapctl.recording.noise_estimation import estimate_position_noise
-from mapctl.retarget import as_rig, to_canonical
+from mapctl.recording.noise_estimation import choose_continuous_signs, estimate_angle_noise, estimate_position_noise
+from mapctl.retarget import RigMap, as_rig, from_canonical, identify_rig, to_canonical
 from mapctl.retarget.rigs import Rig
-from mapctl.skeleton import CANONICAL
+from mapctl.skeleton import CANONICAL, TOES, leg_length
 from mapctl.terms import Term
+
+MIN_DENOISE_FRAMES = 8
+"""Fewest frames of a capture whose noise can be estimated."""
+_RIG_FRAMES = 3000  # frames from which the rig is identified
+_SEGMENT_SECONDS = 60.0  # seconds of a long capture that are cleaned at once
+_OVERLAP_SECONDS = 2.0  # seconds that two segments share
+
+
+@dataclass(frozen=True)
+class DenoiseSettings:
+    """Noise of the capture, and settings of the search."""
+
+    sigma_deg: float | None = None
+    """Noise of each of a joint's angles, degrees; estimated from the capture, joint by joint, if None."""
+    sigma_cm: float | None = None
+    """Noise of each coordinate of the hips, centimetres; estimated from the capture if None."""
+    anchor: bool = False
+    """Whether the trajectory is corrected so that planted feet do not travel, for captures that drift."""
+    refinement: RefinementSettings = field(default_factory=RefinementSettings)
+    """Settings of the MAP stage."""
+
+    def __post_init__(self):
+        for name in ("sigma_deg", "sigma_cm"):
+            value = getattr(self, name)
+            if value is not None and not 0 <= value <= 100:
+                raise RequestError(f"{name} must lie between 0 and 100, got {value:g}")
+
+
+def denoise(
+    motion: Motion,
+    denoiser: Denoiser,
+    *,
+    inbetweener: Inbetweener | None = None,
+    masks: Sequence[Mask] = (),
+    settings: DenoiseSettings | None = None,
+    densities: Sequence[Density] = (),
+    terms: Sequence[Term] = (),
+    rig: Rig | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> DenoiseSolution:
+    """Denoise a motion on any rig that `mapctl.retarget.rigs` identifies, or on a given one; RequestError for others
+    and for masks that do not fit.
+
+    `denoiser` proposes (see priors.load_denoiser), and `inbetweener`, if there is one, what is lost for longer (see
+    LostPartFiller). Of `densities` the likeliest adds its likelihood to each window of the MAP stage; `terms` are the
+    caller's own, which see the time since the capture's first frame. A T-pose before the motion, as many captures begin
+    with, and the frames blended with it stay as captured. A long capture is cleaned in segments that crossfade, so
+    memory beyond the capture's own does not grow with it. `progress` is called with frames done and all frames.
+    """
+    settings, capture, stretched = settings or DenoiseSettings(), motion, []
+    if capture.num_frames >= MIN_DENOISE_FRAMES:
+        motion, stretched = hold_rigid_bones(capture)
+    denoiser = denoiser if inbetweener is None else LostPartFiller(denoiser, inbetweener)
+    masks = resolve_joint_names(motion, masks, rig)
+    expand_valid_masks(motion, masks)  # checked whole: for a segment they are cut to its frames
+    # Identified once: a segment may lack the frames that show the rig's T-pose.
+    beginning, rigmap = to_canonical(motion.slice(0, min(motion.num_frames, _RIG_FRAMES)), rig)
+    rig, lead = as_rig(rigmap), count_lead_frames(beginning)
+    frames, fps = motion.num_frames - lead, float(motion.fps)
+    long, shared = (max(MIN_DENOISE_FRAMES, round(seconds * fps)) for seconds in (_SEGMENT_SECONDS, _OVERLAP_SECONDS))
+    pieces: list[tuple[DenoiseSolution, int]] = []
+    start = stop = 0
+    while stop < frames:
+        before, stop = stop, frames if frames - start <= long + shared else start + long
+        part, part_masks = motion.slice(lead + start, lead + stop), slice_masks(masks, lead + start, lead + stop)
+        if pieces:  # missing joints are known only from the segment before
+            last, first = pieces[-1]
+            part = write_back_masked(part, last.motion.slice(start - first, before - first), part_masks)
+            part_masks = trim_masks_before(part_masks, before - start)
+        first_frame = round((lead + start) / fps * PRIOR_FPS)
+        done = _denoise_segment(part, denoiser, part_masks, settings, densities, terms, rig, first_frame)
+        pieces.append((done, start))
+        start = stop - shared
+        if progress is not None:
+            progress(lead + stop, motion.num_frames)
+    done = join_segments(pieces)
+    notes = list(done.notes)
+    if lead:
+        done = _prepend_lead(motion.slice(0, lead), done)
+        notes.insert(0, f"the T-pose in frame 0 stays as it is, and so do frames blended with it: 0 to {lead - 1}")
+    if stretched:
+        notes.insert(0, f"offsets of {len(stretched)} bones vary only by noise: they are held at their medians")
+    status = replace(done.status, notes=tuple(notes))
+    return replace(done, capture=capture, rig=rig, faults=(*stretched, *done.faults), status=status).assess()
+
+
+def _prepend_lead(lead: Motion, done: DenoiseSolution) -> DenoiseSolution:
+    """Put the lead pose before a clean motion; what is known by frame is there as in the first one after it."""
+    frames, count = lead.num_frames, round(lead.num_frames * PRIOR_FPS / float(lead.fps))
+    contacts, share, error = (
+        torch.cat([values[:1].expand(count, -1), values]) for values in (done.contacts, done.proposal_share, done.error)
+    )
+    return replace(
+        done,
+        motion=lead.join(done.motion),
+        faults=move_frames(done.faults, frames),
+        density_intervals=move_frames(done.density_intervals, frames),
+        contacts=contacts,
+        proposal_share=share,
+        error=error,
+    )
+
+
+def _denoise_segment(
+    motion: Motion,
+    denoiser: Denoiser,
+    masks: Sequence[Mask],
+    settings: DenoiseSettings,
+    densities: Sequence[Density],
+    terms: Sequence[Term],
+    rig: Rig,
+    first_frame: int,
+) -> DenoiseSolution:
+    """Denoise a segment that begins at frame `first_frame` of the capture, at PRIOR_FPS, the time that terms see."""
+    began, inspection = time.perf_counter(), inspect_recording(motion, masks)
+    if motion.num_frames < MIN_DENOISE_FRAMES:
+        note = f"{motion.num_frames} frames are too few to tell noise from motion: nothing was changed"
+        nothing = torch.zeros(motion.num_frames, CANONICAL.num_joints)
+        return DenoiseSolution(
+            motion,
+            Status(Outcome.DONE, (note,)),
+            Ledger(),
+            capture=motion,
+            noise=inspection.noise,
+            noise_root=inspection.noise_root,
+            faults=(),
+            contacts=nothing[:, :2] > 0,
+            proposal_share=nothing,
+            error=nothing,
+        )
+    observation = _Observation.of(inspection, settings, rig)
+    proposal, contacts, spread = _propose(observation, denoiser)
+    fused, share, error = _fuse(observation, proposal)
+    error = torch.where(observation.seen, error, spread)  # where nothing was observed, the model's own estimate
+    shown = fused.resample(PRIOR_FPS)
+    fps, last = float(motion.fps), motion.num_frames - 1
+    at = (torch.arange(shown.num_frames) * fps / PRIOR_FPS).round().long().clamp(max=last)
+    contacts = contacts[at]
+    refined = refine(
+        anchor_to_contacts(shown, debounced(contacts > 0)) if settings.anchor else shown,
+        contacts,
+        observation.capture(shown, at),
+        settings.refinement,
+        densities=densities,
+        terms=terms,
+        first_frame=first_frame,
+    )
+    seconds = torch.arange(shown.num_frames, dtype=torch.float64) / PRIOR_FPS
+    changed = transfer_change(fused, shown, refined.motion, seconds)
+    clean, notes = from_canonical(changed, observation.rigmap, observation.repaired), ()
+    faults = _list_faults(inspection, observation.rigmap, clean, shown, refined)
+    whole = bool(inspection.known.all() and inspection.seen_root.all()) and not terms
+    if whole and _measure_roughness(clean) > _measure_roughness(motion):
+        start = first_frame / PRIOR_FPS
+        notes = (f"frames from {start:.1f} s on would become rougher than they are: they were not changed",)
+    stops = [part.stop for part in refined.density_intervals]
+    densities_used = [
+        replace(
+            part,
+            start=round(part.start * fps / PRIOR_FPS),
+            stop=last + 1 if stop == shown.num_frames else round(stop * fps / PRIOR_FPS),
+        )
+        for part, stop in zip(refined.density_intervals, stops, strict=True)
+    ]
+    return DenoiseSolution(
+        motion if notes else clean,
+        Status(Outcome.DONE, notes),
+        refined.ledger,
+        refined.windows,
+        seconds=time.perf_counter() - began,
+        capture=motion,
+        noise=inspection.noise,
+        noise_root=inspection.noise_root,
+        faults=faults,
+        contacts=refined.contacts,
+        proposal_share=share[at],
+        error=error[at],
+        density_intervals=move_frames(densities_used, 0, stop=last + 1),
+    )
+
+
+def _measure_roughness(motion: Motion) -> float:
+    """Measure the mean third difference of joints' positions, metres: what noise adds most to."""
+    return float(motion.joint_positions().diff(n=3, dim=0).norm(dim=-1).mean())
+
+
+@dataclass(frozen=True, eq=False)
+class _Observation:
+    """An inspected recording on canonical joints, at its own rate and on the performer's bones."""
+
+    repaired: Motion
+    """The recording on its rig, faults filled in."""
+    rigmap: RigMap
+    canonical: Motion
+    seen: Bool[Tensor, "frames joints"]
+    seen_root: Bool[Tensor, " frames"]
+    sigma: Float[Tensor, " joints"]
+    """Noise of canonical joints' angles, radians."""
+    sigma_root: float
+    """Noise of the hips' position, metres."""
+
+    @staticmethod
+    def of(inspection: Inspection, settings: DenoiseSettings, rig: Rig) -> "_Observation":
+        """Put an inspected recording on canonical joints, and estimate its noise there."""
+        repaired = _smooth_noncanonical_joints(inspection, rig)
+        canonical, rigmap = to_canonical(repaired, rig)
+        canonical = replace(canonical, local_quat_xyzw=choose_continuous_signs(canonical.local_quat_xyzw))
+        seen, above_hips = _map_to_canonical(inspection.known, rigmap)
+        seen_root = inspection.seen_root & above_hips
+        sigma = estimate_angle_noise(canonical.local_quat_xyzw, seen)
+        if settings.sigma_deg is not None:
+            # Joints that never move have no noise either: they are locked, or the rig has none there.
+            sigma = torch.where(sigma > 0, math.radians(settings.sigma_deg), 0.0).to(sigma)
+        root = estimate_position_noise(canonical.root_position, seen_root)
+        sigma_root = root if settings.sigma_cm is None else settings.sigma_cm / 100
+        return _Observation(repaired, rigmap, canonical, seen, seen_root, sigma, sigma_root)
+
+    def capture(
+        self, motion: Motion, at: Tensor, shown: Tensor | bool = True, *, kept: float = 1.0, scale: float = 1.0
+    ) -> Capture:
+        """Return a motion of frames `at` as a capture that is observed where `shown`, with a share `kept` of the
+        noise's power, lengths times `scale`."""
+        return Capture.of_motion(
+            motion,
+            seen=self.seen[at] & torch.as_tensor(shown)[..., None],
+            seen_root=self.seen_root[at] & shown,
+            sigma=kept**0.5 * self.sigma,
+            sigma_root=kept**0.5 * scale * self.sigma_root,
+        )
+
+
+def _smooth_noncanonical_joints(inspection: Inspection, rig: Rig) -> Motion:
+    """Return the repaired capture; joints without a canonical one, such as fingers, are smoothed by their noise."""
+    motion = inspection.repaired()
+    used = set(identify_rig(motion.skeleton, rig).joint_of)
+    others = [j for j in range(motion.num_joints) if j not in used and inspection.noise[j] > 0]
+    if not others:
+        return motion
+    quats = motion.local_quat_xyzw.clone()
+    sigma, seen = inspection.noise[others], inspection.seen[:, others]
+    quats[:, others] = fuse_rotations(None, quats[:, others], seen, sigma, float(motion.fps)).values
+    return replace(motion, local_quat_xyzw=quats)
+
+
+def _map_to_canonical(
+    observed: Bool[Tensor, "frames rigged"], rigmap: RigMap
+) -> tuple[Bool[Tensor, "frames joints"], Bool[Tensor, " frames"]]:
+    """Map a mask: a canonical joint is observed if its rig joint is, and all between it and the canonical parent. Also
+    return where all ancestors of the hips were observed, which determine their position."""
+    parents = rigmap.rig_skeleton.parents
+
+    def are_observed(joint: int | None, above: int | None) -> Bool[Tensor, " frames"]:
+        column = torch.ones(len(observed), dtype=torch.bool)
+        while joint is not None and joint >= 0 and joint != above:
+            column = column & observed[:, joint]
+            joint = parents[joint]
+        return column
+
+    aboves = [rigmap.joint_of[CANONICAL.parents[k]] if k else None for k in range(CANONICAL.num_joints)]
+    columns = [are_observed(joint, above) for joint, above in zip(rigmap.joint_of, aboves, strict=True)]
+    hips = rigmap.joint_of[0]
+    return torch.stack(columns, dim=1), are_observed(None if hips is None else parents[hips], None)
+
+
+def _propose(
+    observation: _Observation, denoiser: Denoiser
+) -> tuple[Motion, Float[Tensor, "frames 2"], Float[Tensor, "frames joints"]]:
+    """Propose the motion on the performer's bones, contact logits, and the expected error of each of a joint's angles,
+    radians, at the capture's rate.
+
+    The denoiser sees every nth frame of the capture without what is too fast for that, or at low rates its frames with
+    unobserved ones between them, so that no noise is interpolated: whole steps that come nearest to PRIOR_FPS.
+    """
+    canonical, skeleton, fps = observation.canonical, observation.rigmap.skeleton, float(observation.canonical.fps)
+    scale = leg_length(CANONICAL) / leg_length(skeleton)
+    step, between = max(1, round(fps / PRIOR_FPS)), max(1, round(PRIOR_FPS / fps))
+    quats, root, kept = canonical.local_quat_xyzw, canonical.root_position, 1.0
+    if step > 1:
+        hertz = _LOW_PASS * fps / step
+        quats = smooth_columns(quats, observation.seen.double(), hertz, fps)
+        quats = torch.nn.functional.normalize(quats, dim=-1)
+        root = smooth_columns(root[:, None], observation.seen_root.double()[:, None], hertz, fps)[:, 0]
+        kept = measure_kept_noise(hertz, fps)
+    last = canonical.num_frames - 1
+    frames = torch.arange(0, last + step, step).repeat_interleave(between).clamp(max=last)
+    thin = Motion(canonical.skeleton, Fraction(PRIOR_FPS), scale * root[frames], quats[frames])
+    cleaned = denoiser.clean(
+        observation.capture(thin, frames, torch.arange(len(frames)) % between == 0, kept=kept, scale=scale)
+    )
+    seconds = torch.arange(len(frames), dtype=torch.float64) * step / between / fps
+
+    def follow(values: Tensor) -> Tensor:
+        return values[::between] if step == 1 else upsample(values, seconds, fps=fps, frames=last + 1)
+
+    quats = follow(rotations.make_sign_continuous(cleaned.pose.local_quat_xyzw[0].double()))
+    root = follow(cleaned.pose.root_position[0].double()) / scale
+    motion = Motion(skeleton, canonical.fps, root, torch.nn.functional.normalize(quats, dim=-1))
+    return motion, follow(cleaned.contact_logits[0]), follow(cleaned.log_spread[0, :, 1:].double()).exp()
+
+
+_LOW_PASS = 0.4  # of the rate of the frames that the denoiser sees: what is faster would be folded into them
+
+
+def _fuse(
+    observation: _Observation, proposal: Motion
+) -> tuple[Motion, Float[Tensor, "frames joints"], Float[Tensor, "frames joints"]]:
+    """Fuse the proposal with the capture; also the share of the proposal, and the error, radians, that remains."""
+    capture, fps = observation.canonical, float(observation.canonical.fps)
+    turned = fuse_rotations(proposal.local_quat_xyzw, capture.local_quat_xyzw, observation.seen, observation.sigma, fps)
+    moved = fuse_positions(
+        proposal.root_position, capture.root_position, observation.seen_root, observation.sigma_root, fps
+    )
+    quats = rotations.make_sign_continuous(turned.values)
+    fused = replace(proposal, root_position=moved.values[:, 0], local_quat_xyzw=quats)
+    return fused, turned.share, turned.error
+
+
+_NOISE_DEG = 0.5  # least noise of angles that is listed, degrees: optical capture has as much
+_SKATE_SPEED = 0.2  # m/s that a planted toe moves by, over some frames, before it is said to slide
+_FLOAT_HEIGHT = 0.03  # metres that it is above its support
+_FOOT_FRAMES = 3  # frames of either
+
+
+def _list_faults(
+    inspection: Inspection, rigmap: RigMap, clean: Motion, shown: Motion, refined: RefinedMotion
+) -> tuple[Artefact, ...]:
+    """List the artefacts, on the rig; `shown` is the motion before the MAP stage."""
+    capture, names, frames = inspection.motion, clean.skeleton.names, clean.num_frames
+    turn = rotations.multiply(rotations.inverse(capture.local_quat_xyzw), clean.local_quat_xyzw)
+    turned = torch.rad2deg(rotations.to_rotation_vector(turn).norm(dim=-1))
+    travelling = [names[capture.travelling_joint]]
+    moved = 100 * (travel(clean) - travel(capture)).norm(dim=-1, keepdim=True)
+    noise = [*zip(names, torch.rad2deg(inspection.noise).tolist(), strict=True)]
+    found = [Artefact(name, 0, frames, "noise", level, "deg") for name, level in noise if level >= _NOISE_DEG]
+    if 100 * inspection.noise_root >= NOISE_CM:
+        found.append(Artefact(travelling[0], 0, frames, "noise", 100 * inspection.noise_root, "cm"))
+    found += list_artefacts(names, inspection.spikes, "spike", "deg", turned)
+    found += list_artefacts(travelling, inspection.spikes_root[:, None], "spike", "cm", moved)
+    found += list_artefacts([ALL], inspection.frozen[:, None], "frozen")
+    found += list_artefacts(names, inspection.dropouts & ~inspection.frozen[:, None], "dropout")
+    indices = shown.skeleton.indices(TOES)
+    toes, feet = shown.joint_positions()[:, indices], [rigmap.joint_of[toe] for toe in indices]
+    known = [names[foot] if foot is not None else TOES[side] for side, foot in enumerate(feet)]
+    ratio = float(clean.fps) / PRIOR_FPS
+    for fault in list_foot_artefacts(known, toes, refined.contacts, refined.supports):
+        found.append(replace(fault, start=round(fault.start * ratio), stop=round(fault.stop * ratio)))
+    return tuple(found)
+
+
+def list_foot_artefacts(
+    names: Sequence[str],
+    toes: Float[Tensor, "frames 2 3"],
+    planted: Bool[Tensor, "frames 2"],
+    supports: Float[Tensor, "frames 2"],
+) -> list[Artefact]:
+    """List planted toes that slide, and that are over the height at which they rest; metres, at PRIOR_FPS."""
+    steps = torch.diff(toes[..., ::2], dim=0, prepend=toes[:1, :, ::2]).norm(dim=-1)
+    height = toes[..., 1] - supports
+    slides, floats = planted & (steps * PRIOR_FPS > _SKATE_SPEED), planted & (height > _FLOAT_HEIGHT)
+    found = list_artefacts(names, slides, "slide", "cm", steps, total=lambda part: 100 * part.sum())
+    found += list_artefacts(names, floats, "float", "cm", 100 * height)
+    return [fault for fault in found if fault.stop - fault.start >= _FOOT_FRAMES]
+
 
 _LOST_FRAMES = 8
 """Fewest consecutive frames without a joint that an in-betweener fills; shorter ones are the denoiser's own."""
@@ -75,173 +465,3 @@ def _find_lost(unseen: Bool[Tensor, "frames columns"]) -> Bool[Tensor, "frames c
     for column, start, stop in true_intervals(unseen):
         lost[start:stop, column] = stop - start >= _LOST_FRAMES
     return lost
-
-
-_NO_TRAVEL = 1e-3  # metres by which a rigid bone may vary where no noise is measured
-_SPIKE_SIGMAS, _DRIFT_SIGMAS = 5.0, 5.0  # noise of one frame, and of a block's median, that a rigid bone may show
-_SPIKE_SECONDS, _BLOCK_SECONDS = 1 / 30, 0.5
-_MEDIAN_NOISE = 1.2533  # standard deviation of a median by that of a mean
-
-
-def hold_rigid_bones(motion: Motion) -> tuple[Motion, tuple[Artefact, ...]]:
-    """Return the motion with the median offset of every joint whose offset varies only by noise, and these as faults.
-
-    The joint that travels stays, and so does one whose offset drifts or differs for more than a frame, as in rigs that
-    stretch. An offset of zero counts as lost.
-    """
-    moving, faults = dict(motion.moving_offsets), []
-    for joint, track in motion.moving_offsets.items():
-        held = None if joint == motion.travelling_joint else _find_rigid_offset(track, float(motion.fps))
-        if held is None:
-            continue
-        moving[joint] = held.expand_as(track)
-        amount = 100 * float((track - held).norm(dim=-1).max())
-        if amount >= NOISE_CM:
-            faults.append(Artefact(motion.skeleton.names[joint], 0, motion.num_frames, "stretch", amount, "cm"))
-    return replace(motion, moving_offsets=moving), tuple(faults)
-
-
-def _find_rigid_offset(track: Float[Tensor, "frames 3"], fps: float) -> Float[Tensor, "3"] | None:
-    """Return the median of an offset that varies only by noise, of frames in which it is not zero; None for others."""
-    known = track.any(dim=-1)
-    if not known.any():
-        return None
-    median = track[known].median(dim=0).values
-    away = torch.where(known[:, None], track - median, 0.0)
-    noise = torch.tensor([estimate_position_noise(track[:, [axis] * 3], known) for axis in range(3)]).to(track)
-    apart = (away.abs() > (_SPIKE_SIGMAS * noise).clamp_min(_NO_TRAVEL)).any(dim=-1, keepdim=True)
-    if any(stop - start > max(1, round(_SPIKE_SECONDS * fps)) for _, start, stop in true_intervals(apart)):
-        return None
-    size = max(1, min(len(track), round(_BLOCK_SECONDS * fps)))
-    drift = away.unfold(0, size, size).median(dim=-1).values.abs()
-    allowed = _DRIFT_SIGMAS * _MEDIAN_NOISE * noise / size**0.5
-    return None if (drift > allowed.clamp_min(_NO_TRAVEL)).any() else median
-
-
-__all__ = ["DenoiseSettings", "DenoiseSolution", "begins_with_tpose", "denoise"]
-
-MIN_DENOISE_FRAMES = 8
-"""Fewest frames of a capture whose noise can be estimated."""
-_RIG_FRAMES = 3000  # frames from which the rig is identified
-_SEGMENT_SECONDS = 60.0  # seconds of a long capture that are cleaned at once
-_OVERLAP_SECONDS = 2.0  # seconds that two segments share
-
-
-def denoise(
-    motion: Motion,
-    denoiser: Denoiser,
-    *,
-    inbetweener: Inbetweener | None = None,
-    masks: Sequence[Mask] = (),
-    settings: DenoiseSettings | None = None,
-    densities: Sequence[Density] = (),
-    terms: Sequence[Term] = (),
-    rig: Rig | None = None,
-    progress: Callable[[int, int], None] | None = None,
-) -> DenoiseSolution:
-    """Denoise a motion on any rig that `mapctl.retarget.rigs` identifies, or on a given one; RequestError for others
-    and for masks that do not fit.
-
-    `denoiser` proposes (see priors.load_denoiser), and `inbetweener`, if there is one, what is lost for longer (see
-    LostPartFiller). Of `densities` the likeliest adds its likelihood to each window of the MAP stage; `terms` are the
-    caller's own, which see the time since the capture's first frame. A T-pose in frame 0, as many captures begin with,
-    stays. Offsets of bones that vary only by noise are held at their medians. A long capture is cleaned in segments
-    that crossfade, so memory beyond the capture's own does not grow with it. `progress` is called with frames done and
-    all frames.
-    """
-    settings, capture = settings or DenoiseSettings(), motion
-    stretched = ()
-    if capture.num_frames >= MIN_DENOISE_FRAMES:
-        motion, stretched = hold_rigid_bones(capture)
-    denoiser = denoiser if inbetweener is None else LostPartFiller(denoiser, inbetweener)
-    masks = resolve_joint_names(motion, masks, rig)
-    hidden, _ = expand_valid_masks(motion, masks)  # checked whole: for a segment they are cut to its frames
-    # Identified once: a segment may lack the frames that show the rig's T-pose.
-    beginning, rigmap = to_canonical(_slice_beginning(motion), rig)
-    rig = as_rig(rigmap)
-    motion, swapped = exchange_swapped_limbs(motion, rigmap, hidden)
-    lead = 1 if has_lead_pose(_slice_beginning(motion), beginning, rigmap) else 0
-    transition = find_lead_transition(motion, rigmap) if lead else None
-    all_masks = (*masks, *(transition.masks(motion.skeleton.names) if transition else ()))
-    frames, fps = motion.num_frames - lead, float(motion.fps)
-    long, shared = (max(MIN_DENOISE_FRAMES, round(seconds * fps)) for seconds in (_SEGMENT_SECONDS, _OVERLAP_SECONDS))
-    pieces: list[tuple[DenoiseSolution, int]] = []
-    start = stop = 0
-    while stop < frames:
-        before, stop = stop, frames if frames - start <= long + shared else start + long
-        part, part_masks = motion.slice(lead + start, lead + stop), slice_masks(all_masks, lead + start, lead + stop)
-        if pieces:  # missing joints are known only from the segment before
-            last, first = pieces[-1]
-            part = write_back_masked(part, last.motion.slice(start - first, before - first), part_masks)
-            part_masks = trim_masks_before(part_masks, before - start)
-        denoised = _denoise_segment(
-            part, denoiser, part_masks, settings, densities, terms, rig, seconds=(lead + start) / fps
-        )
-        pieces.append((denoised, start))
-        start = stop - shared
-        if progress is not None:
-            progress(lead + stop, motion.num_frames)
-    done = replace(join_segments(pieces), capture=motion.slice(lead, motion.num_frames), rig=rig)
-    done = restore_lead_pose(motion, done, rigmap, transition, masks) if transition else done
-    if stretched or swapped:
-        held = f"offsets of {len(stretched)} bones vary only by noise: they are held at their medians"
-        exchanged = f"left and right limbs are swapped {len(swapped)} times: they are exchanged back"
-        notes = (*[held] * bool(stretched), *[exchanged] * bool(swapped), *done.notes)
-        cut = motion.num_frames - done.motion.num_frames
-        swapped = tuple(replace(fault, start=fault.start - cut, stop=fault.stop - cut) for fault in swapped)
-        status = replace(done.status, notes=notes)
-        capture = capture.slice(cut, motion.num_frames)
-        done = replace(done, capture=capture, faults=(*stretched, *swapped, *done.faults), status=status)
-    return done.assess()
-
-
-def begins_with_tpose(motion: Motion, rig: Rig | None = None) -> bool:
-    """Return whether frame 0 is a T-pose, or the rig's rest pose, that does not belong to the motion."""
-    beginning = _slice_beginning(motion)
-    return has_lead_pose(beginning, *to_canonical(beginning, rig))
-
-
-def _slice_beginning(motion: Motion) -> Motion:
-    """Slice the frames from which the rig is identified."""
-    return motion.slice(0, min(motion.num_frames, _RIG_FRAMES))
-
-
-def _denoise_segment(
-    motion: Motion,
-    denoiser: Denoiser,
-    masks: Sequence[Mask],
-    settings: DenoiseSettings,
-    densities: Sequence[Density],
-    terms: Sequence[Term],
-    rig: Rig,
-    *,
-    seconds: float,
-) -> DenoiseSolution:
-    """Denoise a segment that begins so many seconds after the capture."""
-    began = time.perf_counter()
-    inspection = inspect_recording(motion, masks)
-    if motion.num_frames < MIN_DENOISE_FRAMES:
-        note = f"{motion.num_frames} frames are too few to tell noise from motion: nothing was changed"
-        return DenoiseSolution(
-            motion,
-            Status(Outcome.DONE, (note,)),
-            Ledger(),
-            capture=motion,
-            noise=inspection.noise,
-            noise_root=inspection.noise_root,
-            faults=(),
-            contacts=torch.zeros(motion.num_frames, 2, dtype=torch.bool),
-            proposal_share=torch.zeros(motion.num_frames, CANONICAL.num_joints),
-            error=torch.zeros(motion.num_frames, CANONICAL.num_joints),
-        )
-    done = SegmentDenoiser(inspection, denoiser, settings, rig).run(densities, terms, round(seconds * PRIOR_FPS))
-    whole = bool(inspection.known.all() and inspection.seen_root.all()) and not terms
-    if whole and _measure_roughness(done.motion) > _measure_roughness(motion):
-        note = f"frames from {seconds:.1f} s on would become rougher than they are: they were not changed"
-        done = replace(done, motion=motion, status=replace(done.status, notes=(*done.status.notes, note)))
-    return replace(done, seconds=time.perf_counter() - began)
-
-
-def _measure_roughness(motion: Motion) -> float:
-    """Measure the mean third difference of joints' positions, metres: what noise adds most to."""
-    return float(motion.joint_positions().diff(n=3, dim=0).norm(dim=-1).mean()) if motion.num_frames > 3 else 0.0

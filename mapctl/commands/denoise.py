@@ -13,7 +13,7 @@ from tyro.conf import Positional, arg
 import priors
 from controllers.denoising.causal import denoise_causal
 from controllers.denoising.denoise import DenoiseSettings, denoise
-from controllers.denoising.segment import DenoiseSolution
+from controllers.denoising.solution import DenoiseSolution
 from mapctl import formats, report
 from mapctl.commands.shared import folders, inputs, options, outputs, results
 from mapctl.commands.shared.command import ModelCommand, conclude

@@ -7,9 +7,9 @@ import pytest
 import torch
 from helpers import walk
 
+from controllers.denoising.denoise import list_foot_artefacts
 from mapctl.contacts import compute_rest_log_probability, detect_contacts, fit_supports
 from mapctl.numerics.intervals import true_intervals
-from mapctl.recording.inspection import list_foot_artefacts
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, TOES
 
 POSITIONS = walk(330).joint_positions()
@@ -63,7 +63,7 @@ def test_toes_rest_on_the_floor_that_their_contacts_show(floor, noise):
     for (foot, start, stop), height in zip(CONTACTS, heights, strict=True):
         assert float(supports[start, foot]) == pytest.approx(TOE_REST_HEIGHT + height, abs=0.01)
         assert supports[start:stop, foot].unique().numel() == 1
-    found = list_foot_artefacts(TOES, toes, PLANTED, rest_height=supports, fps=30)
+    found = list_foot_artefacts(TOES, toes, PLANTED, supports)
     assert not [artefact for artefact in found if artefact.kind == "float"]
 
 
@@ -76,7 +76,7 @@ def test_a_foot_in_the_air_is_listed_whatever_the_floor(floor):
     foot, start, stop = CONTACTS[raised]
     (found,) = [
         artefact
-        for artefact in list_foot_artefacts(TOES, toes, PLANTED, rest_height=fit_supports(toes, PLANTED), fps=30)
+        for artefact in list_foot_artefacts(TOES, toes, PLANTED, fit_supports(toes, PLANTED))
         if artefact.kind == "float"
     ]
     assert (found.joint, found.start, found.stop) == (TOES[foot], start, stop)

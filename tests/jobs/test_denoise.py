@@ -11,10 +11,11 @@ from captures import apart_deg, error_cm, noisy, on_rig, shaken
 from helpers import generator
 from tiny_denoiser import QUICK, tiny_denoiser
 
-from controllers.denoising.denoise import begins_with_tpose, denoise, hold_rigid_bones
-from controllers.denoising.segment import join_segments
+from controllers.denoising.denoise import denoise
+from controllers.denoising.solution import join_segments
 from mapctl import retarget, rotations
-from mapctl.recording.masks import ALL, ROOT, Mask
+from mapctl.recording.inspection import count_lead_frames, hold_rigid_bones
+from mapctl.recording.masks import ALL, Mask
 from mapctl.skeleton import CANONICAL
 
 RIGS = ("canonical", "bandai", "daz")
@@ -24,7 +25,6 @@ def cleaned(motion, **changes):
     return denoise(motion, tiny_denoiser(), **{"settings": QUICK} | changes)
 
 
-LEGS = [[f"{part}_{side}" for part in ("UpperLeg", "LowerLeg", "Foot", "Toes")] for side in "LR"]
 OTHERS = [("bandai", 24), ("daz", 120)]
 
 
@@ -119,20 +119,6 @@ def test_bones_of_a_capture_with_noisy_offsets_are_rigid_afterwards():
     assert {fault.joint for fault in done.faults if fault.kind == "stretch"} == set(truth.skeleton.names[2:])
 
 
-def test_legs_of_a_capture_that_are_swapped_are_exchanged_back():
-    truth = on_rig("bandai", 90)
-    legs = [[j for j, name in enumerate(truth.skeleton.names) if name in wanted] for wanted in LEGS]
-    quats = truth.local_quat_xyzw.clone()
-    quats[40:42, legs[0] + legs[1]] = quats[40:42, legs[1] + legs[0]]
-    given = replace(truth, local_quat_xyzw=quats)
-    done = cleaned(given)
-    assert done.capture is given or torch.equal(done.capture.local_quat_xyzw, quats)
-    assert [(f.start, f.stop) for f in done.faults if f.kind == "swap"] == [(40, 42)]
-    assert any("exchanged back" in note for note in done.notes)
-    apart = (done.motion.joint_positions() - truth.joint_positions()).norm(dim=-1)[38:44]
-    assert apart.max() < 0.05 < 0.2 < (given.joint_positions() - truth.joint_positions()).norm(dim=-1).max()
-
-
 def test_a_network_that_is_wrong_does_little_harm():
     """What it leaves out of the capture goes back in."""
     truth = on_rig("bandai", 150)
@@ -218,33 +204,51 @@ def test_planted_faults_are_listed_where_they_are():
     assert apart_deg(done.motion.local_quat_xyzw, truth.local_quat_xyzw)[40, arm] < 12
 
 
-@pytest.mark.parametrize("rig", RIGS)
-def test_a_tpose_in_frame_0_stays(rig):
-    truth = on_rig(rig, 60)
-    tpose = (
-        retarget.from_canonical(
-            replace(
-                retarget.to_canonical(truth)[0].slice(0, 1),
-                local_quat_xyzw=torch.tensor([0.0, 0, 0, 1], dtype=torch.float64).expand(1, CANONICAL.num_joints, 4),
-            ),
-            retarget.identify_rig(truth.skeleton),
-        )
-        if rig != "canonical"
-        else replace(
-            truth.slice(0, 1),
-            local_quat_xyzw=torch.tensor([0.0, 0, 0, 1], dtype=torch.float64).expand(1, CANONICAL.num_joints, 4),
-        )
+ARMS_DOWN = (("leftUpperArm", -1.25), ("rightUpperArm", 1.25))
+
+
+def lead(rig, fps, shares):
+    """A walk with its arms down behind its T-pose, which is blended into its first frames by these shares."""
+    canonical, rigmap = retarget.to_canonical(on_rig(rig, 2 * fps, fps=fps))
+    quats = canonical.local_quat_xyzw.clone()
+    for name, angle in ARMS_DOWN:
+        turn = rotations.from_rotation_vector(torch.tensor([0.0, 0.0, angle], dtype=torch.float64))
+        quats[:, CANONICAL.index(name)] = rotations.multiply(quats[:, CANONICAL.index(name)], turn.expand(2 * fps, 4))
+    quats[0, 1:] = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
+    for frame, share in enumerate(shares, start=1):
+        weight = torch.full((CANONICAL.num_joints,), share, dtype=torch.float64)
+        quats[frame] = rotations.slerp(quats[0], quats[frame], weight)
+    return retarget.from_canonical(replace(canonical, local_quat_xyzw=quats), rigmap)
+
+
+@pytest.mark.parametrize(("rig", "fps"), [("canonical", 30), ("bandai", 60), ("daz", 120)])
+@pytest.mark.parametrize("shares", [(), (0.26, 0.53, 0.78)])
+def test_a_tpose_and_the_frames_blended_with_it_stay_as_captured(rig, fps, shares):
+    truth = lead(rig, fps, shares)
+    given, first = noisy(truth, 3.0, 1.0), 1 + len(shares)
+    done = cleaned(given)
+    assert torch.equal(done.motion.local_quat_xyzw[:first], given.local_quat_xyzw[:first])
+    assert done.motion.num_frames == done.capture.num_frames == 2 * fps
+    assert not torch.equal(done.motion.local_quat_xyzw[first], given.local_quat_xyzw[first])
+    rest = slice(first, 2 * fps)
+    assert error_cm(truth.slice(first, 2 * fps), done.motion.slice(rest.start, rest.stop)) < 0.8 * error_cm(
+        truth.slice(first, 2 * fps), given.slice(first, 2 * fps)
     )
-    given = replace(tpose, source=truth.source).join(noisy(truth))
-    assert begins_with_tpose(given)
-    assert not begins_with_tpose(truth)
-    done = cleaned(given, masks=[Mask(ROOT, 10, 12)])
-    assert done.motion.num_frames == 61
-    assert apart_deg(done.motion.local_quat_xyzw[0], tpose.local_quat_xyzw[0]).max() < 1e-4
-    assert torch.equal(done.motion.joint_positions()[0], tpose.joint_positions()[0])
-    assert error_cm(truth, done.motion.slice(1, 61)) < 0.85 * error_cm(truth, given.slice(1, 61))
-    assert next((f.start, f.stop) for f in done.faults if f.kind == "noise") == (1, 61)
+    assert next((f.start, f.stop) for f in done.faults if f.kind == "noise") == (first, 2 * fps)
     assert "T-pose" in done.notes[0]
+    assert abs(len(done.contacts) - 60) <= 4
+
+
+def test_a_motion_that_begins_with_arms_out_has_no_lead_pose():
+    """A dancer's arms may be out in frame 0: nothing leaps."""
+    motion = on_rig("canonical", 90)
+    quats = motion.local_quat_xyzw.clone()
+    down = torch.linspace(0.05, 1.2, 90, dtype=torch.float64)
+    for name, angle in ARMS_DOWN:
+        vector = torch.zeros(90, 3, dtype=torch.float64)
+        vector[:, 2] = math.copysign(1.0, angle) * down
+        quats[:, CANONICAL.index(name)] = rotations.from_rotation_vector(vector)
+    assert count_lead_frames(replace(motion, local_quat_xyzw=shaken(quats, math.radians(6.0)))) == 0
 
 
 @pytest.mark.slow
