@@ -141,7 +141,7 @@ class AutogradRollout(PreparedRollout):
     def roll_out(
         self, noise: Float[Tensor, "batch frames continuous"]
     ) -> tuple[Float[Tensor, "batch frames size"], Float[Tensor, "batch frames"]]:
-        """Return features and log densities (nats) as `Density.rollout`, detached."""
+        """See PreparedRollout."""
         noise = noise.detach().requires_grad_(True)
         features, log_density = self._density.rollout(self._state, noise, self._plan)
         self._rolled = noise, (features, log_density)
@@ -150,7 +150,7 @@ class AutogradRollout(PreparedRollout):
     def pull_back(
         self, d_features: Float[Tensor, "batch frames size"], d_log_density: Float[Tensor, "batch frames"]
     ) -> Float[Tensor, "batch frames continuous"]:
-        """Return the gradient on the noise of the last `roll_out` from those on its features and log densities."""
+        """See PreparedRollout."""
         assert self._rolled is not None, "there is no rollout yet"
         noise, rolled = self._rolled
         depends = [(out, d) for out, d in zip(rolled, (d_features, d_log_density), strict=True) if out.requires_grad]
@@ -300,7 +300,7 @@ class Density(Protocol[State]):
         return self
 
     def conditioned_like_clip(self, name: str) -> "Density[State]":
-        """Return the density given the labels that a clip's path tells. Default: itself."""
+        """Return the density given the labels in a clip's path. Default: itself."""
         return self
 
     @property
@@ -314,7 +314,7 @@ class Density(Protocol[State]):
 
 
 AnyDensity: TypeAlias = Density[Any]
-"""A density for those who hand its states back to it and need not know their type."""
+"""A density whose states have any type."""
 
 
 @runtime_checkable
@@ -334,14 +334,13 @@ class Inbetweener(Protocol):
 
     @property
     def has_style(self) -> bool:
-        """Whether it was told how to move, by motion DNA; gaps then go to it in which another would do as well.
-        Default: no."""
+        """Whether it is conditioned on motion DNA; gaps that others would do as well then go to it. Default: no."""
         return False
 
     @abstractmethod
     def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
         """Propose a motion of the query's frames without gaps; what is drawn is drawn from the generator, or from a
-        new one with seed 0. The proposal names who made it, and for each gap that this one leaves who did, and why."""
+        new one with seed 0. The proposal names the model of each gap, with the reason where it is another."""
         ...
 
 
@@ -361,7 +360,7 @@ class PositionInfiller(Inbetweener, Protocol):
 
 @runtime_checkable
 class PathPredictor(Protocol):
-    """Tells where the hips go from how the body moves about them (Zhou et al. 2020, section 3.4)."""
+    """Predicts the root trajectory from the motion of the body about it (Zhou et al. 2020, section 3.4)."""
 
     @abstractmethod
     def predict(self, motion: LocalMotion) -> RootTrajectory:

@@ -11,7 +11,7 @@ from mapctl import retarget
 from mapctl.curves import Curve
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT
-from mapctl.intent.steering import Command, SteeringLimits
+from mapctl.intent.steering import Command, SteeringLimits, SteeringTarget
 from mapctl.motion import Motion
 from mapctl.problem.solution import Ledger
 from mapctl.protocols import DataLimits
@@ -70,6 +70,10 @@ class Character:
         """Scale a command to the prior's size."""
         step = None if command.step_length is None else command.step_length / self.scale
         return replace(command, speed=command.speed / self.scale, step_length=step)
+
+    def target(self, target: SteeringTarget) -> SteeringTarget:
+        """Scale a steering target of the prior's size to the character's."""
+        return replace(target, speed=target.speed * self.scale)
 
     def limits(self, limits: SteeringLimits) -> SteeringLimits:
         """Scale the limits of steering targets to the prior's size."""

@@ -70,7 +70,7 @@ def select_initial_state(
     flat = noise[:, :ahead].flatten(1)
     with torch.no_grad():
         energy = Objective(LatentNoise.from_unknowns(context, flat).build, terms_of(1, ahead)).energy(flat) / ahead
-    # The plain rollout soon leaves the curve, and its energy then says little: it counts for a tenth.
+    # The plain rollout soon leaves the curve, where its energy means little: it counts for a tenth.
     best = (0.1 * energy + _candidate_energy(features, wanted, fps)).argsort()[:_BEST_CANDIDATES]
     pick = int(best[torch.randint(len(best), (1,), generator=generator)])
     ground_pose = GroundPose(ground_poses.position_xz[pick], ground_poses.heading[pick])

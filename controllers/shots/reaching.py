@@ -86,8 +86,8 @@ class ReachTargets:
                 continue
             missing = frames - len(wanted)  # look-ahead beyond the shot's end
             place = torch.cat([self.targets.places[window, limb.end], torch.zeros(missing, 3, dtype=torch.float64)])
-            wished = torch.cat([wanted, wanted.new_zeros(missing)])
-            term = WithinReach(limb.upper, place, wished, EASY_SHARE * limb.length(skeleton))
+            sought = torch.cat([wanted, wanted.new_zeros(missing)])
+            term = WithinReach(limb.upper, place, sought, EASY_SHARE * limb.length(skeleton))
             found.append(replace(term, name=f"{name} within reach"))
         return found
 
@@ -235,7 +235,7 @@ def _find_lacking_aside(trajectory: Trajectory, arc: Tensor, rest: Motion, name:
 
 def go_down(motion: Motion, reaches: Sequence[Reach], posed: Bool[Tensor, " frames"]) -> Motion:
     """Let the hips go down, and come up again, for what is too low to reach for upright; feet stay where they go.
-    Nobody goes down within half a second of a frame that is `posed`."""
+    The hips stay within half a second of a frame that is `posed`."""
     down = torch.zeros(motion.num_frames, dtype=torch.float64)
     frame, near = torch.arange(motion.num_frames), widen(posed, _POSED_FRAMES)
     for reach in reaches:
@@ -368,7 +368,7 @@ def _frame_of(seconds: float, motion: Motion) -> int:
 def _list_fillings(
     motion: Motion, key: PoseKey, trajectory: Trajectory, earliest: int, latest: int
 ) -> Iterator[tuple[Filling, MetPose]]:
-    """List what may be made anew around a key, by when it is met and how far around it."""
+    """List what may be generated around a key, by when it is met and how far around it."""
     shifts = {0, key.within_frames, -key.within_frames, key.within_frames // 2, -(key.within_frames // 2)}
     hold = round(key.hold_seconds * PRIOR_FPS) + 1
     for shift in sorted(shifts, key=abs):

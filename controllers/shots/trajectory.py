@@ -24,7 +24,7 @@ from mapctl.intent.path import PathRequest, SpeedProfile, TimedSpeed, find_rever
 from mapctl.numerics.intervals import true_intervals
 
 ClearanceOf = Callable[[Float[Tensor, "arcs offsets 2"], Float[Tensor, " arcs"]], Float[Tensor, "arcs offsets"]]
-"""Ground points and their arcs to the distance by which they are clear, metres; negative where nobody may walk."""
+"""Ground points and their arcs to the distance by which they are clear, metres; negative where it is not."""
 
 
 _WIDEST, _OFFSET_STEP = 3.0, 0.025  # metres of the largest sideways offset, and between the offsets that are tried
@@ -256,7 +256,7 @@ class Trajectory:
 
 def plan_trajectory(request: ShotRequest) -> Trajectory:
     """Plan the root trajectory of a shot: first around obstacles, then past others, where they are at that time. Where
-    no path leads through the curve stays as it is, and a note says so."""
+    no path leads through the curve stays as it is, with a note."""
     plain = _plan_along(request, request.curve)
     if not request.obstacles and request.others is None:
         return plain

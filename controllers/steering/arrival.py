@@ -284,7 +284,7 @@ def _deliver(state: SteerState, approach: Approach, command: Command) -> tuple[S
         Ledger(),
         features=new,
         contacts=LAYOUT.pick(new, "contacts"),
-        steering_targets=tuple(replace(target, speed=target.speed * character.scale) for target in targets),
+        steering_targets=tuple(map(character.target, targets)),
         forecast=forecast * character.scale,
     )
     next_state = replace(

@@ -106,7 +106,7 @@ class Autopilot:
         self._command, self._goal = replace(self._command, arrival=None), None
 
     def aim(self, command: Command) -> None:
-        """Reach, look and walk round obstacles as this command says; nothing else of it counts."""
+        """Reach, look and walk round obstacles as this command does; nothing else of it counts."""
         self._command = replace(
             self._command, reach=command.reach, look_at=command.look_at, obstacles=command.obstacles
         )
@@ -344,7 +344,7 @@ class CharacterProcess:
     LiveCharacter (mapctl.runtime.live_protocol). No order waits."""
 
     def __init__(self, request: CharacterRequest):
-        """Start the process; several start in parallel if all are made before the first `wait`."""
+        """Start the process; several start in parallel if all are created before the first `wait`."""
         self._request = request
         self.skeleton: Skeleton = request.skeleton
         self._start()
@@ -358,7 +358,7 @@ class CharacterProcess:
             raise RequestError(self._failed)
 
     def command(self, command: Command) -> None:
-        """Obey this command from now on, as far as possible (`FrameChunk.notes` tell), and follow no path."""
+        """Obey this command from now on, as far as possible (see `FrameChunk.notes`), and follow no path."""
         self._send("command", command)
 
     def walk(self, points: Sequence[tuple[float, float]], speed: float, *, closed: bool = False) -> None:
@@ -369,13 +369,13 @@ class CharacterProcess:
         self._send("walk", positions, speed, closed)
 
     def aim(self, command: Command) -> None:
-        """Reach, look and walk round obstacles as this command says; nothing else of it counts, and a path is kept."""
+        """Reach, look and walk round obstacles as this command does; nothing else of it counts, and a path is kept."""
         self._send("aim", command)
 
     def go(self, command: Command, place: tuple[float, float], within: float, facing: float | None = None) -> None:
         """Be at a `place` (x and z, metres) `within` so many seconds, `facing` so (radians; None as it comes there), if
-        that is possible, and obey the command from then on; a note says why not. RequestError where the request has no
-        `transitions`, and for numbers that are none."""
+        that is possible, and obey the command from then on; a note has the reason if not. RequestError without
+        `transitions` in the request, and for numbers that are none."""
         if self._request.transitions is None:
             raise RequestError("this character has no transitions, which take it to a position")
         Arrival(place, within, facing)  # so that errors are raised here, not in the process

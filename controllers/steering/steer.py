@@ -1,24 +1,14 @@
 """Steering (Wang et al. 2019, section 5.3): a few frames a step, looking a second ahead, warm-started by the last step.
 
 `step` is pure: a state and a command give the next state and its frames, to the bit for the same evaluations. It has no
-clock; a caller with a deadline passes the seconds that are left, and gets the best solution found by then.
-
-Hands that reach and heads that look, live, on top of a steered walk: pose offsets with limited acceleration.
-
-The density that walks knows no reaches, so they are no terms of its windows: arms, trunk and head are turned in the
-frames that it delivers, and the next step goes on from the walk alone. A hand is on its way while its place can be
-reached within half a second, as the forecast says; who walks past lets it go. Both the way there and the way back are
-of minimum jerk.
-
-Ways round obstacles for who is steered: the direction nearest to the commanded one in which nothing is in the way.
-
-One step at a time, without a plan: for curves and times that are known in advance, `controllers.shots.trajectory` finds
-the shortest detour.
+clock; a caller with a deadline passes the seconds that are left, and gets the best solution found by then. Obstacles
+are passed by the direction nearest to the commanded one that is clear, one step at a time, without a plan: for curves
+that are known in advance, `controllers.shots.trajectory` finds the shortest detour.
 """
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
@@ -28,15 +18,11 @@ from torch import Tensor
 
 from controllers.common.character import Character
 from controllers.common.initial_state import start_from_state
+from controllers.steering.overlay import Overlay
 from mapctl import rotations
 from mapctl.curves.obstacles import Obstacle, measure_clearance
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, ground_speed
 from mapctl.intent.steering import Arrival, Command, SteeringLimits, SteeringTarget
-from mapctl.kinematics import inverse
-from mapctl.kinematics.inverse import bend_within, find_out, lead_about
-from mapctl.kinematics.moving import turn_head
-from mapctl.motion import Motion
-from mapctl.numerics.easing import MinimumJerkTrack, smootherstep
 from mapctl.pose import decode
 from mapctl.problem.receding_horizon import CommittedFrames, HorizonSettings, RecedingHorizonSolver
 from mapctl.problem.solution import Ledger, Outcome, Solution, Status
@@ -50,17 +36,17 @@ from mapctl.problem.window_solvers import (
 )
 from mapctl.protocols import Density
 from mapctl.runtime.stepwise import StepwiseWork
-from mapctl.skeleton import CANONICAL, LIMBS, Skeleton
+from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings, LbfgsStatus
 from mapctl.terms import FootContact, KeepClear, LatentPrior, RootVelocity, StepLength, Term
 
-_BODY = 0.4  # metres from an obstacle's edge to the hips of who walks past
+_BODY = 0.4  # metres from an obstacle's edge to the hips that pass it
 _LOOK_AHEAD, _LOOK_SECONDS = 0.6, 1.2  # metres, and seconds of walking, in which the way must be clear
 _HEADINGS, _WIDEST = 65, math.radians(140.0)  # directions that are tried, and how far off the commanded one
 _PLACES = 16  # along each
-_GET_OUT = 0.3  # metres of clearance gained by metre, for who is too near already
-_STAY = 0.5  # share of a change of direction that counts beside the deviation: who goes left keeps to the left
+_GET_OUT = 0.3  # metres of clearance gained by metre, where it is too near already
+_STAY = 0.5  # share of a change of direction that counts beside the deviation, which keeps the side
 
 
 def lead_around(
@@ -68,8 +54,8 @@ def lead_around(
 ) -> float:
     """Return the direction of travel, radians, nearest to the `wanted` one that leads clear of obstacles.
 
-    `place` is where one is (x and z, metres), `heading` the direction in which one goes now, `speed` in m/s. Where
-    every direction is blocked, the clearest.
+    `place` is the position (x and z, metres), `heading` the direction of travel now, `speed` in m/s. Where every
+    direction is blocked, the clearest.
     """
     if not obstacles or speed <= 0:
         return wanted
@@ -86,153 +72,8 @@ def lead_around(
     return float(angles[torch.where(lacking > 1e-6, torch.inf, cost).argmin()])
 
 
-_RAISE_SECONDS = 0.7  # in which a hand goes to its place, and back
-_TURN_SECONDS = 0.5  # in which a head turns there, and back
-_MOVE_SECONDS, _MOVE_SPEED = 0.5, 1.2  # least time in which a hand follows a place that moved, and its mean speed, m/s
-_AHEAD_FRAMES = 15  # of the forecast, after which a place must be in reach
-_NEAR = 0.45  # metres beyond the arm at which a hand sets out, to reach with a lean or to point there
-_LET_GO = 0.1  # metres farther than that, at which a hand lets go
-_BEHIND = 0.45  # cosine below zero of the angle to a shoulder's front beyond which nothing is reached
-_EASY_SHARE = 0.85  # of an arm's length, beyond which the trunk leans
-_BENT_SHARE, _STRETCHED_SHARE = 0.95, 0.99  # of it, between which an arm gives up reaching exactly
-_MOST_LEAN = 0.4  # radians that the trunk turns toward a place, twice
-_LEAN_EASE = 0.03  # metres out of reach, up to which the trunk hardly moves
-_BEGUN_SHARE = 0.15  # of the way, in which an elbow comes to where inverse kinematics has it
-_TRUNK = CANONICAL.indices(("spine", "chest"))
-_HEAD = "head"
-
-
-@dataclass(frozen=True, eq=False)
-class PartTrack:
-    """How far a hand or the head is on its way to a place, and where that is."""
-
-    weight: MinimumJerkTrack
-    """Share of the way there, 0 to 1."""
-    place: MinimumJerkTrack
-    """Place in the world, metres."""
-
-    @staticmethod
-    def begin(place: tuple[float, float, float]) -> "PartTrack":
-        """Begin without a share."""
-        zero = torch.zeros(1, dtype=torch.float64)
-        return PartTrack(MinimumJerkTrack.rest_at(zero), MinimumJerkTrack.rest_at(zero.new_tensor(place)))
-
-    @property
-    def idle(self) -> bool:
-        """Whether it has no share, and will have none."""
-        return self.weight.resting and float(self.weight.value) == 0.0
-
-    def aim(self, place: tuple[float, float, float] | None, wanted: bool, seconds: float) -> "PartTrack":
-        """Go toward a place if it is wanted, and back if not."""
-        found = self
-        if place is not None:
-            goal = self.place.goal.new_tensor(place)
-            way = float((goal - self.place.value).norm())
-            moved = self.place.aim(goal, max(_MOVE_SECONDS, way / _MOVE_SPEED))
-            found = replace(self, place=MinimumJerkTrack.rest_at(goal) if self.idle else moved)
-        return replace(found, weight=found.weight.aim(found.weight.goal.new_tensor([float(wanted)]), seconds))
-
-    def move(self, frames: int) -> tuple["PartTrack", Float[Tensor, " frames"], Float[Tensor, "frames 3"]]:
-        """Move on for so many frames; also return share and place in each."""
-        track, weights, places = self, [], []
-        for _ in range(frames):
-            track = PartTrack(track.weight.move(1 / PRIOR_FPS), track.place.move(1 / PRIOR_FPS))
-            weights.append(track.weight.value)
-            places.append(track.place.value)
-        return track, torch.cat(weights), torch.stack(places)
-
-
-@dataclass(frozen=True, eq=False)
-class Overlay:
-    """What hands and head are doing beside the walk; `pose` gives the frames and the next overlay."""
-
-    parts: Mapping[str, PartTrack] = field(default_factory=dict)
-    """Tracks by `leftHand`, `rightHand` and `head`, of those that are not idle."""
-
-    def pose(
-        self, walk: Motion, command: Command, forecast: Float[Tensor, "ahead joints 3"]
-    ) -> tuple["Overlay", Motion]:
-        """Pose the frames of a step under a command; `forecast` holds the world joints of the frames after them.
-        A walk with nothing to reach for and to look at comes back as it is."""
-        if not (self.parts or command.reach or command.look_at):
-            return self, walk
-        parts = self._aim_parts(walk, command, forecast)
-        moved = {name: part.move(walk.num_frames) for name, part in parts.items()}
-        arms = {name: moved[name][1:] for name in moved if name != _HEAD}
-        posed = _reach(_lean(_lean(walk, arms), arms), arms) if arms else walk
-        if _HEAD in moved:
-            posed = turn_head(posed, moved[_HEAD][2], moved[_HEAD][1])
-        return Overlay({name: part for name, (part, *_) in moved.items() if not part.idle}), posed
-
-    def _aim_parts(self, walk: Motion, command: Command, forecast: Tensor) -> dict[str, PartTrack]:
-        parts = dict(self.parts)
-        joints = torch.cat([walk.joint_positions(), forecast.to(walk.root_position)])
-        soon = joints[min(walk.num_frames - 1 + _AHEAD_FRAMES, len(joints) - 1)]
-        for name in {*parts, *command.reach} - {_HEAD}:
-            place = command.reach.get(name)
-            part = parts.get(name) or PartTrack.begin(place or (0.0, 0.0, 0.0))
-            on_its_way = bool(part.weight.goal > 0)
-            wanted = place is not None and _is_in_reach(name, place, soon, walk.skeleton, keep=on_its_way)
-            if wanted or name in parts:
-                parts[name] = part.aim(place, wanted, _RAISE_SECONDS)
-        if command.look_at is not None or _HEAD in parts:
-            part = parts.get(_HEAD) or PartTrack.begin(command.look_at or (0.0, 0.0, 0.0))
-            parts[_HEAD] = part.aim(command.look_at, command.look_at is not None, _TURN_SECONDS)
-        return parts
-
-
-def _is_in_reach(
-    name: str, place: tuple[float, float, float], joints: Float[Tensor, "joints 3"], skeleton: Skeleton, *, keep: bool
-) -> bool:
-    """Return whether a hand gets to a place from a pose, with a lean of the trunk; one on its way a little farther."""
-    limb = LIMBS[name]
-    away = joints.new_tensor(place) - joints[limb.upper]
-    near = float(away.norm()) < limb.length(skeleton) + _NEAR + _LET_GO * keep
-    return near and float(away @ find_out(name, joints[None])[0]) > -_BEHIND * float(away.norm())
-
-
-def _lean(walk: Motion, arms: Mapping[str, tuple[Tensor, Tensor]]) -> Motion:
-    """Turn the trunk toward what arms alone do not reach, about as far as brings the shoulders there: they go there on
-    a circle, so that a second lean is needed where the way is long."""
-    joints, turn = walk.joint_positions(), torch.zeros(walk.num_frames, 3, dtype=torch.float64)
-    for name, (weight, place) in arms.items():
-        limb = LIMBS[name]
-        length = limb.length(walk.skeleton)
-        shoulder, away = joints[:, limb.upper] - joints[:, _TRUNK[0]], place - joints[:, limb.upper]
-        short = (away.norm(dim=-1) - _EASY_SHARE * length).clamp_min(0)
-        angle = short**2 / (short + _LEAN_EASE) / shoulder.norm(dim=-1)
-        angle = weight * _MOST_LEAN * torch.tanh(angle / _MOST_LEAN)
-        axis = torch.nn.functional.normalize(torch.linalg.cross(shoulder.to(away), away), dim=-1)
-        turn = turn + angle[:, None] * axis
-    quats, half = walk.local_quat_xyzw.clone(), rotations.from_rotation_vector(turn / 2).to(walk.local_quat_xyzw)
-    for joint in _TRUNK:
-        above = replace(walk, local_quat_xyzw=quats).joint_rotations()[:, CANONICAL.parents[joint]]
-        world = rotations.multiply(half, rotations.multiply(above, quats[:, joint]))
-        quats[:, joint] = rotations.multiply(rotations.inverse(above), world)
-    return replace(walk, local_quat_xyzw=quats)
-
-
-def _reach(motion: Motion, arms: Mapping[str, tuple[Tensor, Tensor]]) -> Motion:
-    """Bend arms of a motion so that hands are by their shares on the way from where they are to the places."""
-    joints, world = motion.joint_positions(), motion.joint_rotations()
-    quats = motion.local_quat_xyzw.clone()
-    for name, (weight, place) in arms.items():
-        limb, offsets = LIMBS[name], motion.skeleton.offsets.to(joints)
-        length = limb.length(motion.skeleton)
-        aim = place.to(joints) - joints[:, limb.upper]
-        aim = bend_within(aim, length, easy=_BENT_SHARE, most=_STRETCHED_SHARE)
-        own, out = joints[:, limb.end] - joints[:, limb.upper], find_out(name, joints)
-        aim = lead_about(own, aim, weight.to(joints), out=out)
-        turned, bent = inverse.reach(limb, world[:, limb.upper], quats[:, limb.lower], aim, offsets)
-        above = world[:, CANONICAL.parents[limb.upper]]
-        begun = smootherstep(weight / _BEGUN_SHARE).to(joints)
-        for joint, local in ((limb.upper, rotations.multiply(rotations.inverse(above), turned)), (limb.lower, bent)):
-            quats[:, joint] = rotations.slerp(quats[:, joint], local.to(quats), begun)
-    return replace(motion, local_quat_xyzw=quats)
-
-
 KEPT_FRAMES = 11
-"""Last frames whose features are kept: who goes to a place begins as it came here."""
+"""Last frames whose features are kept: an arrival goes on from them."""
 _PAST_TARGET_FRAMES = 60  # past targets that are kept: more than the root velocity term looks back on
 _RECENT_FRAMES = 15  # frames, half a second, over which the velocity error is measured
 _MIN_TRAVEL_SPEED = 0.3  # m/s below which the velocity has no direction
@@ -273,10 +114,10 @@ class SteerSettings:
     """Mean speed over the last half second, m/s, below which a character whose target ahead is faster than it by more
     than `stuck` is solved that way at once: it would count as stuck half a second later."""
     sigma_leaving: float = 0.1
-    """Sigma of the hips' heading in such steps, radians, where it is smaller than `sigma_facing`: who has to turn for a
-    start finds his first step sooner where the body turns first."""
+    """Sigma of the hips' heading in such steps, radians, where it is smaller than `sigma_facing`: a start that needs a
+    turn finds its first step sooner where the body turns first."""
     leaving_turn: float = 1.6
-    """Factor of the turn rate of `limits` at which the target may turn when somebody who stands is to go far aside."""
+    """Factor of the turn rate of `limits` at which the target of a standing character may turn far aside."""
     random_starts: int = 12
     """Random warm starts of that solve, evaluated in one batch beside the evaluations; it begins at the best."""
     footing: FootContact = field(default_factory=FootContact)
@@ -377,7 +218,7 @@ class SteerState:
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class SteerFrames(Solution):
-    """New frames of a step, at PRIOR_FPS, in the world; the status says if a deadline cut the search short."""
+    """New frames of a step, at PRIOR_FPS, in the world; the status notes a search that a deadline cut short."""
 
     contacts: Float[Tensor, "frames 2"]
     """Contacts of the left and the right toe, 1 or 0."""
@@ -388,7 +229,7 @@ class SteerFrames(Solution):
     evaluations: int = 0
     """Energy-and-gradient evaluations of the step."""
     refusal: Refusal | None = None
-    """An order to be somewhere that is not obeyed; said once."""
+    """An order to be somewhere that is not obeyed; given once."""
 
 
 def begin(
@@ -427,7 +268,7 @@ def begin(
         Status(Outcome.DONE),
         Ledger(),
         contacts=LAYOUT.pick(first, "contacts"),
-        steering_targets=(_scale_to_character(target, character),),
+        steering_targets=(character.target(target),),
         forecast=start.committed.joints_world[:0],
     )
     past_targets, unit_terms = torch.tensor([target.velocity]), tuple(character.term(term) for term in terms)
@@ -453,8 +294,7 @@ def step(state: SteerState, command: Command, *, seconds: float | None = None) -
 
     RequestError for labels that the prior does not know. The first step under new labels takes longer.
     """
-    began = time.perf_counter()
-    settings, character = state.settings, state.character
+    began, settings, character = time.perf_counter(), state.settings, state.character
     asked, command = command, character.command(_lead_around(state, command))
     stuck = _velocity_error(state) > settings.stuck
     if stuck:
@@ -489,7 +329,7 @@ def step(state: SteerState, command: Command, *, seconds: float | None = None) -
         new,
         spent,
         contacts=LAYOUT.pick(new, "contacts"),
-        steering_targets=tuple(_scale_to_character(target, character) for target in committed_targets),
+        steering_targets=tuple(character.target(target) for target in committed_targets),
         forecast=forecast,
         evaluations=record.evaluations,
     )
@@ -514,10 +354,6 @@ def _lead_around(state: SteerState, command: Command) -> Command:
     heading = state.target.heading if state.target.speed > 0 else float(state.committed.place.heading)
     led = lead_around(command.obstacles, place=(x, z), heading=heading, wanted=command.heading, speed=command.speed)
     return command if led == command.heading else replace(command, heading=led)
-
-
-def _scale_to_character(target: SteeringTarget, character: Character) -> SteeringTarget:
-    return replace(target, speed=target.speed * character.scale)
 
 
 @lru_cache(maxsize=64)
@@ -557,7 +393,7 @@ def _velocity_error(state: SteerState) -> float:
 
 
 def _plan_targets(state: SteerState, command: Command) -> tuple[list[SteeringTarget], bool]:
-    """Return the targets of a window, and whether a standing character is told to go, who may turn faster."""
+    """Return the targets of a window, and whether a standing character is to go; it may turn faster."""
     settings, target = state.settings, state.target
     targets = target.ahead(command, settings.limits, frames=settings.horizon, fps=PRIOR_FPS)
     leaving = _is_leaving(state, targets)
@@ -568,7 +404,7 @@ def _plan_targets(state: SteerState, command: Command) -> tuple[list[SteeringTar
 
 
 def _is_leaving(state: SteerState, targets: Sequence[SteeringTarget]) -> bool:
-    """Whether a standing character is told to go."""
+    """Return whether a standing character is to go."""
     if len(state.committed.joints_world) <= _RECENT_FRAMES:
         return False
     speed = float(_recent_velocity(state).norm())

@@ -36,7 +36,7 @@ def build_dense_polyline(
     """Build the polyline through `points` (n, 2 or 3; metres), vertices about 1 cm apart, and whether it is closed.
 
     Straight pieces are divided evenly; of points denser than 1 cm the one that bends the curve most is kept in each
-    centimetre. Closed where `closed` says so, or by default where the ends lie within 1 mm, or half the points' usual
+    centimetre. Closed where `closed` is true, or by default where the ends lie within 1 mm, or half the points' usual
     spacing, of each other; a closed polyline repeats its first point at the end. Raises RequestError with the reason
     where points make no curve.
     """

@@ -1,4 +1,4 @@
-"""Obstacles on the ground: discs and boxes that nobody walks into."""
+"""Obstacles on the ground: discs and boxes to keep clear of."""
 
 import math
 from dataclasses import dataclass

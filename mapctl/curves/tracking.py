@@ -31,8 +31,8 @@ def track_arcs(
 ) -> Float[Tensor, " frames"]:
     """Track the arcs of a walk, metres, not wrapped: without a jump, and forward unless the walk goes back.
 
-    So the other leg of a hairpin, a crossing's other branch and a curve that touches itself are told apart, and laps of
-    a closed one counted; beyond open ends the curve goes on straight. Points are (x, y, z), or (x, z) for a curve on
+    So the other leg of a hairpin, a crossing's other branch and a curve that touches itself are distinguished, and laps
+    of a closed one counted; beyond open ends the curve goes on straight. Points are (x, y, z), or (x, z) for a curve on
     the ground. The first arc is searched within `reach` metres of `start`: by default of the curve's start if the walk
     begins within `reach` of it (where a figure-8 crosses, arcs are ambiguous), else anywhere on the curve. Every arc is
     the nearest within `reach` metres of the tracked one.

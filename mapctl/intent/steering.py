@@ -78,8 +78,8 @@ class Command:
     facing: float | None = None
     """Facing of the hips, radians; None is the direction of travel."""
     turning: float | None = None
-    """Rate at which the direction of travel turns on and on, radians/s, to the left where positive; `heading` then says
-    nothing but where to begin."""
+    """Rate at which the direction of travel turns on and on, radians/s, to the left where positive; `heading` is then
+    where to begin."""
     step_length: float | None = None
     """Step length from one foot's touch-down to the other's, metres; None leaves it to the prior."""
     labels: tuple[str, ...] = ()
@@ -113,19 +113,19 @@ class Command:
         """Limit the command to what can be held: at most `fastest` m/s, steps of STEP_LENGTHS, and angles of one turn.
 
         With a sentence for each number that changed; `when` (` at 3 s`) follows its name. An angle of more than a turn
-        is the same direction, so nothing is said of it.
+        is the same direction, without a note.
         """
-        said, (shortest, longest) = [], STEP_LENGTHS
+        notes, (shortest, longest) = [], STEP_LENGTHS
         speed, step = min(self.speed, fastest), self.step_length
         if speed < self.speed:
-            said.append(f"the speed of {self.speed:g} m/s{when} was lowered to {speed:.2f} m/s, the prior's fastest")
+            notes.append(f"the speed of {self.speed:g} m/s{when} was lowered to {speed:.2f} m/s, the prior's fastest")
         if step is not None and (held := min(longest, max(shortest, step))) != step:
             change = f"{'raised' if held > step else 'lowered'} to {held:g} m"
             allowed = f"steps can be {shortest:g} to {longest:g} m long"
-            said.append(f"the step length of {step:g} m{when} was {change}; {allowed}")
+            notes.append(f"the step length of {step:g} m{when} was {change}; {allowed}")
             step = held
         turned = {name: _wrap_whole_turns(getattr(self, name)) for name in ("heading", "facing")}
-        return replace(self, speed=speed, step_length=step, **turned), said
+        return replace(self, speed=speed, step_length=step, **turned), notes
 
 
 @dataclass(frozen=True)

@@ -82,7 +82,7 @@ def _join_entries(before: LedgerEntry | None, after: LedgerEntry | None, first: 
 
 
 class Outcome(Enum):
-    """How a solve ended; the value is said to the user."""
+    """How a solve ended; the value is its message."""
 
     DONE = "done"
     BUDGET = "stopped at its budget"

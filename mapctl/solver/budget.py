@@ -26,7 +26,7 @@ class Budget:
 
 
 class Meter:
-    """Counts evaluations against a budget; the clock starts when the meter is made. It refuses, and never raises."""
+    """Counts evaluations against a budget; the clock starts with the meter. It refuses, and never raises."""
 
     def __init__(self, budget: Budget = Budget(), *, clock: Callable[[], float] = time.monotonic):
         self.budget = budget

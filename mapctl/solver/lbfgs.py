@@ -97,7 +97,7 @@ def minimise(
             raise RequestError(f"an objective returned {tuple(energy.shape)} and {tuple(gradient.shape)} for {x.shape}")
         energies, gradients = energy.detach().tolist(), gradient.detach().to("cpu", torch.float64).numpy()
         for problem, value, row in zip(problems, energies, gradients, strict=True):
-            problem.tell(value, row)
+            problem.receive(value, row)
     return LbfgsResult(
         x=torch.as_tensor(np.stack([problem.best.x for problem in problems])).to(x.device) if problems else x.clone(),
         energy=x.new_tensor([problem.best.energy for problem in problems]),
@@ -143,7 +143,7 @@ class _Problem:
         self._search = self._descend(start)
         self.ask = next(self._search)
 
-    def tell(self, energy: float, gradient: Vector):
+    def receive(self, energy: float, gradient: Vector):
         """Take the evaluation of `ask`; a finished problem ignores it."""
         if not self.running:
             return
@@ -174,7 +174,7 @@ class _Problem:
                     return LbfgsStatus.STALLED
                 pairs.clear()  # the model misleads: one more try along the gradient
                 continue
-            guessed = not pairs  # a first step's length is a guess, so how little it wins says nothing
+            guessed = not pairs  # a first step's length is a guess, so how little it wins does not count
             won, scale = here.energy - found.energy, max(abs(here.energy), abs(found.energy), 1.0)
             step = found.x.astype(np.float64) - here.x
             length = float(np.linalg.norm(step))
@@ -237,7 +237,7 @@ def _line_search(
     `low` is the best step so far that decreases enough, `high` the shortest known to be too long.
     """
     slope = float(direction @ origin.gradient)
-    # Energies are rounded to the caller's precision: a rise within that says nothing.
+    # Energies are rounded to the caller's precision: a rise within that does not count.
     noise = 2.0 * float(np.finfo(origin.x.dtype).eps) * abs(origin.energy)
     low = base = _EvaluatedPoint(origin.x, origin.energy, origin.gradient, 0.0, slope)
     high: _EvaluatedPoint | None = None

@@ -1,9 +1,5 @@
-"""Foot contact: planted toes and heels do not move and are on the ground (Wang et al. 2019, Eq. 18), and come there
-without a snap.
-
-Support: while a foot is near the ground, one that is near it does not move.
-
-Unlike foot contact it does not depend on contact bits, so a motion cannot slide by leaving every toe unplanted.
+"""Feet: planted toes and heels do not move and are on the ground (Wang et al. 2019, Eq. 18), and land without a snap;
+toes that travel clear the ground; the toe that supports the body does not move, whatever the contact bits.
 """
 
 from dataclasses import dataclass, field, replace
@@ -72,9 +68,7 @@ class FootContact:
     supports: Float[Tensor, "frames 2"] | None = None
     """Height at which each toe rests in each frame of the window, metres; None: `rest_height`."""
     name: str = "footing"
-    """Name in the ledger."""
     unit: str = "m/s"
-    """Unit of the residual."""
 
     def with_sigmas(self, speed: float, height: float, below: float) -> "FootContact":
         """Return the term with these sigmas of toes, `speed` in m/s, `height` and `below` in metres; those of heels
@@ -105,43 +99,21 @@ class FootContact:
 
     def add_gradient(self, trial: Trial, gradient: TrialGradient) -> Float[np.ndarray, "batch frames"]:
         """Add the gradient of the summed energies of a float32 trial, and return the energies, nats."""
-        energy = np.zeros(gradient.log_density.shape)
-        resting = np.empty((trial.features.shape[1], 2))
+        energy, resting = np.zeros(gradient.log_density.shape), np.empty((trial.features.shape[1], 2))
         resting[:] = self._rest_heights
-        kernels.add_contact(
-            trial.joints_world.numpy(),
-            trial.last_before.numpy(),
-            trial.planted.numpy(),
-            trial.toes,
-            float(trial.fps),
-            (self.sigma_speed, self.sigma_height, self.sigma_below),
-            resting,
-            0.0,
-            energy,
-            gradient.joints_world,
-        )
+        toes, fps, dtype = trial.joints_world.numpy(), float(trial.fps), trial.features.dtype
+        before, planted = trial.before[-2:].to(dtype).numpy(), trial.planted.numpy()
+        sigmas, d_toes = (self.sigma_speed, self.sigma_height, self.sigma_below), gradient.joints_world
+        kernels.add_contact(toes, before[-1:], planted, trial.toes, fps, sigmas, resting, 0.0, energy, d_toes)
         if self.landing is not None:
-            kernels.add_landing(
-                trial.joints_world.numpy(),
-                trial.before[-2:].to(trial.features.dtype).numpy(),
-                trial.toes,
-                float(trial.fps),
-                (self.landing.free, self.landing.sigma),
-                energy,
-                gradient.joints_world,
-            )
+            sigmas = (self.landing.free, self.landing.sigma)
+            kernels.add_landing(toes, before, trial.toes, fps, sigmas, energy, d_toes)
         if self.heels is not None:
+            heels, before = trial.heels_world.numpy(), trial.heels_before[-1:].to(dtype).numpy()
+            planted, sigmas = trial.heels_planted.numpy(), (self.heels.speed, self.heels.height, self.heels.below)
+            resting, doubt = resting - find_heel_drops(trial.skeleton), float(self.heels.doubt)
             kernels.add_contact(
-                trial.heels_world.numpy(),
-                trial.heels_before[-1:].to(trial.features.dtype).numpy(),
-                trial.heels_planted.numpy(),
-                (0, 1),
-                float(trial.fps),
-                (self.heels.speed, self.heels.height, self.heels.below),
-                resting - find_heel_drops(trial.skeleton),
-                float(self.heels.doubt),
-                energy,
-                gradient.heels_world,
+                heels, before, planted, (0, 1), fps, sigmas, resting, doubt, energy, gradient.heels_world
             )
         return energy
 
@@ -187,9 +159,7 @@ class Clearance:
     share: Float[Tensor, "frames 2"] | None = None
     """Share of the height that each toe is to clear in each frame of the window, 0 to 1; None: all of it."""
     name: str = "clearance"
-    """Name in the ledger."""
     unit: str = "m"
-    """Unit of the residual."""
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Return the energies of both toes, nats."""
@@ -216,9 +186,7 @@ class Support:
     rest_height: float | Float[Tensor, "frames 2"] = TOE_REST_HEIGHT
     """Height of the toe joint while the foot is flat on the ground, metres; of each toe's in each frame, if not one."""
     name: str = "support"
-    """Name in the ledger."""
     unit: str = "m/s"
-    """Unit of the residual."""
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Return the energies, nats."""

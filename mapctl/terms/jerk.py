@@ -18,9 +18,7 @@ class Jerk:
     frames: int = 3
     """Number of frames that the seam reaches into the window."""
     name: str = "seam"
-    """Name in the ledger."""
     unit: str = "m/s^3"
-    """Unit of the residual."""
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Return the energies, nats, mean over joints; 0 beyond the seam and with fewer than three frames before the

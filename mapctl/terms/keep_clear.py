@@ -1,4 +1,4 @@
-"""Keeping clear: of obstacles on the ground, and of others who move."""
+"""Keeping clear of obstacles on the ground and of other characters; keeping targets within reach."""
 
 from dataclasses import dataclass
 
@@ -24,9 +24,7 @@ class KeepClear:
     sigma: float = 0.02
     """Standard deviation of the distance by which a joint is too near, metres."""
     name: str = "clear"
-    """Name in the ledger."""
     unit: str = "m"
-    """Unit of the residual."""
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Return the energies of the joints that reach farthest from the body, nats."""
@@ -43,7 +41,7 @@ class KeepClear:
 
 @dataclass(frozen=True, eq=False)
 class KeepApart:
-    """The hips stay away from those of others, whose way is known."""
+    """The hips stay away from those of others, whose trajectories are known."""
 
     others: Float[Tensor, "others frames 2"]
     """Hips of the others on the ground in each frame of the window, x and z, metres."""
@@ -52,9 +50,7 @@ class KeepApart:
     sigma: float = 0.02
     """Standard deviation of the distance that is lacking, metres."""
     name: str = "apart"
-    """Name in the ledger."""
     unit: str = "m"
-    """Unit of the residual."""
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Return the energies, nats, summed over the others."""
@@ -84,11 +80,9 @@ class WithinReach:
     sigma: float = 0.02
     """Standard deviation of the distance that it would have to be longer, metres."""
     robust: float = 0.1
-    """Such distance beyond which the energy rises linearly, metres: nobody lunges for what is out of reach."""
+    """Such distance beyond which the energy rises linearly, metres: what is out of reach is worth no lunge."""
     name: str = "within reach"
-    """Name in the ledger."""
     unit: str = "m"
-    """Unit of the residual."""
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Return the energies, nats."""

@@ -20,9 +20,7 @@ class Keyframe:
     sigma: float = 0.002
     """Standard deviation of a joint about its target along each axis, metres."""
     name: str = "keyframe"
-    """Name in the ledger."""
     unit: str = "m"
-    """Unit of the residual."""
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Return the energies, nats, summed over joints."""

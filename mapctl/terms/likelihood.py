@@ -18,9 +18,7 @@ class Likelihood:
     temperature: float = 1.0
     """Factor by which log densities are divided; above 1 the prior counts less."""
     name: str = "likelihood"
-    """Name in the ledger."""
     unit: str = "nats"
-    """Unit of the residual."""
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Return the energies, nats; negative where the density is above 1."""
@@ -43,9 +41,7 @@ class LatentPrior:
     sigma: float = 1.0
     """Standard deviation of each number, in units of the noise, whose own is 1; above 1 leaves more of it."""
     name: str = "noise"
-    """Name in the ledger."""
     unit: str = "rms"
-    """Unit of the residual."""
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Return the energies, nats: half the squared numbers of each frame over sigma squared."""

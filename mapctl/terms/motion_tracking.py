@@ -16,7 +16,7 @@ class MotionTracking:
     """The poses are near those of a target motion, and so is the trajectory.
 
     Poses are compared as joint positions relative to the hips' position and heading; trajectories from the window's
-    first frame on, not in the world: where sliding feet are made to stand, the character falls a little behind the
+    first frame on, not in the world: where sliding feet stand instead, the character falls a little behind the
     target with each step, which costs nothing in later windows.
     """
 
@@ -33,9 +33,7 @@ class MotionTracking:
     effective_joints: float = 6.0
     """Number of independent joints that a body is worth: neighbours move together, so 21 are not 21 observations."""
     name: str = "closeness"
-    """Name in the ledger."""
     unit: str = "m"
-    """Unit of the residual."""
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Return the energies, nats."""

@@ -46,9 +46,7 @@ class Path:
     slow_seconds: float = 0.35
     """Standard deviation of the Gaussian that separates the slow offset from the sway."""
     name: str = "path"
-    """Name in the ledger."""
     unit: str = "m"
-    """Unit of the residual."""
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Return the energies of the sideways offset, its slow part, progress, and height in space, nats."""
@@ -70,18 +68,9 @@ class Path:
             self, trial.before, trial.skeleton.index(self.joint), sigma, positions.dtype
         )
         pulled = np.zeros(tuple(positions.shape), np.float32)
-        kernels.add_path(
-            positions.numpy(),
-            near.tangent_extension.numpy(),
-            near.axes.numpy(),
-            known.numpy(),
-            weights.numpy(),
-            (self.sigma_raw, self.sigma_progress, self.sigma_height),
-            self.sigma_slow,
-            self.free_sway,
-            energy,
-            pulled,
-        )
+        points = (each.numpy() for each in (positions, near.tangent_extension, near.axes, known, weights))
+        sigmas = (self.sigma_raw, self.sigma_progress, self.sigma_height)
+        kernels.add_path(*points, sigmas, self.sigma_slow, self.free_sway, energy, pulled)
         self._select_target(trial, gradient)[...] += pulled
         return energy
 

@@ -38,9 +38,7 @@ class RootVelocity:
     slow_seconds: float = 0.25
     """Standard deviation of the Gaussian that removes a stride's own rise and fall of speed, seconds."""
     name: str = "travel"
-    """Name in the ledger."""
     unit: str = "m/s"
-    """Unit of the residual."""
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Return the energies, nats."""
@@ -56,17 +54,9 @@ class RootVelocity:
         """Add the gradient of the summed energies of a float32 trial, and return the energies, nats."""
         known, weights = _build_velocity_smoother(self, trial.before, trial.fps, trial.features.dtype)
         energy, (velocities, units, facing) = np.empty(gradient.log_density.shape), self._tables
-        kernels.add_root_velocity(
-            trial.root_xz_world.numpy(),
-            trial.start.position_xz.expand(len(energy), 2).numpy(),
-            known.numpy(),
-            weights.numpy(),
-            velocities,
-            units,
-            float(trial.fps),
-            energy,
-            gradient.root_xz_world,
-        )
+        start = trial.start.position_xz.expand(len(energy), 2)
+        ground = (each.numpy() for each in (trial.root_xz_world, start, known, weights))
+        kernels.add_root_velocity(*ground, velocities, units, float(trial.fps), energy, gradient.root_xz_world)
         if facing is not None:
             kernels.add_facing(trial.heading.numpy(), facing, self.sigma_facing, energy, gradient.heading)
         return energy

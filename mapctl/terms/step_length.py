@@ -28,9 +28,7 @@ class StepLength:
     sigma: float = 0.012
     """Standard deviation of a step's length, metres: small, since few frames of a window are touch-downs."""
     name: str = "steps"
-    """Name in the ledger."""
     unit: str = "m"
-    """Unit of the residual."""
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Return the energies in the frames of touch-downs, nats; 0 in all others."""
@@ -39,16 +37,8 @@ class StepLength:
     def add_gradient(self, trial: Trial, gradient: TrialGradient) -> Float[np.ndarray, "batch frames"]:
         """Add the gradient of the summed energies of a float32 trial, and return the energies, nats."""
         energy = np.empty(gradient.log_density.shape)
-        kernels.add_step_length(
-            trial.joints_world.numpy(),
-            trial.last_before.numpy(),
-            trial.planted.numpy(),
-            trial.toes,
-            self.length,
-            self.sigma,
-            energy,
-            gradient.joints_world,
-        )
+        feet = (each.numpy() for each in (trial.joints_world, trial.last_before, trial.planted))
+        kernels.add_step_length(*feet, trial.toes, self.length, self.sigma, energy, gradient.joints_world)
         return energy
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
@@ -73,7 +63,7 @@ def _find_touch_downs(trial: Trial) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     frame before the window."""
     planted = trial.planted
     known = planted.clone()
-    known[:, 0] &= len(trial.before) > 0  # else nobody knows where that was
+    known[:, 0] &= len(trial.before) > 0  # else its position is not known
     frames = torch.arange(-1, planted.shape[1] - 1)[:, None]
     last = torch.where(known, frames, _NEVER).cummax(dim=1).values[:, 1:].flip(-1)
     row, frame, foot = (planted[:, 1:] & ~planted[:, :-1] & (last > _NEVER)).nonzero().unbind(-1)

@@ -7,7 +7,7 @@ import pytest
 import torch
 from helpers import walk
 
-from controllers.steering.steer import Overlay
+from controllers.steering.overlay import Overlay
 from mapctl.intent.steering import Command
 from mapctl.kinematics.moving import measure_look_angle
 from mapctl.motion import Motion
