@@ -45,7 +45,7 @@ class Parametrisation(Protocol):
 
     def pull_back(self, trial: Trial, gradient: TrialGradient) -> Float[Tensor, "batch unknowns"]:
         """Return the gradient on the unknowns of the trial that `build_detached` built last."""
-        raise NotImplementedError
+        raise TypeError(f"{type(self).__name__} has no gradient of its own")
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +120,7 @@ class Objective:
     def build_ledger(self, trial: Trial) -> Ledger:
         """By term, the energies and residuals of a trial of one candidate; RequestError where one of them has another
         shape, or is not finite for a motion that is."""
-        entries, plausible = [], _is_plausible(trial)
+        entries, plausible = list[LedgerEntry](), _is_plausible(trial)
         with torch.no_grad():
             for term in self.terms:
                 energy, residual = _evaluate(term, "energy", trial), _evaluate(term, "residual", trial)
@@ -167,18 +167,21 @@ def _is_plausible(trial: Trial) -> bool:
 def _evaluate(term: Term, what: str, trial: Trial) -> Float[Tensor, "batch frames"]:
     """Return a term's energy or residual; RequestError for another shape. An error of the term gets a note with its
     name."""
-    try:
-        values: object = term(trial) if what == "energy" else term.residual(trial)
-    except Exception as error:
-        error.add_note(f"while the term {term.name!r} computed its {what}")
-        raise
-    expected = trial.features.shape[:-1]
+    values, expected = _call(term, what, trial), trial.features.shape[:-1]
     if isinstance(values, Tensor) and values.shape == expected:
         return values
     found = f"shape {list(values.shape)}" if isinstance(values, Tensor) else f"a {type(values).__name__}"
     raise RequestError(
         f"the {what} of the term {term.name!r} has {found}; expected {list(expected)}: candidates, frames"
     )
+
+
+def _call(term: Term, what: str, trial: Trial) -> object:
+    try:
+        return term(trial) if what == "energy" else term.residual(trial)
+    except Exception as error:
+        error.add_note(f"while the term {term.name!r} computed its {what}")
+        raise
 
 
 def _check_finite(term: Term, what: str, values: Float[Tensor, "batch frames"]) -> None:

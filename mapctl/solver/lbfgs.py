@@ -95,7 +95,10 @@ def minimise(
         energy, gradient = function(torch.as_tensor(np.stack([problem.ask for problem in problems])).to(x.device))
         if energy.shape != x.shape[:1] or gradient.shape != x.shape:
             raise RequestError(f"an objective returned {tuple(energy.shape)} and {tuple(gradient.shape)} for {x.shape}")
-        energies, gradients = energy.detach().tolist(), gradient.detach().to("cpu", torch.float64).numpy()
+        energies, gradients = (
+            [float(each) for each in energy.detach()],
+            gradient.detach().to("cpu", torch.float64).numpy(),
+        )
         for problem, value, row in zip(problems, energies, gradients, strict=True):
             problem.receive(value, row)
     return LbfgsResult(
@@ -124,10 +127,6 @@ class _EvaluatedPoint:
     @property
     def finite(self) -> bool:
         return math.isfinite(self.energy) and math.isfinite(self.gradient_norm)
-
-
-Search = Generator[Point, _EvaluatedPoint]
-"""Search of one problem: it yields points, and is sent what they were evaluated to."""
 
 
 class _Problem:

@@ -79,7 +79,7 @@ def run_swarm(
     for iteration in range(settings.iterations):
         if iteration:
             with _use_numpy_state(random):
-                swarm.velocity = operators.compute_velocity(swarm, None, lambda velocity, clamp, **_: velocity)
+                swarm.velocity = operators.compute_velocity(swarm, None, _keep_velocity)
             swarm.position = operators.compute_position(swarm, None, None)
         swarm.current_cost = track.evaluate(torch.as_tensor(swarm.position).to(start))
         if swarm.current_cost is None:
@@ -89,6 +89,10 @@ def run_swarm(
         if swarm.pbest_cost[best] < swarm.best_cost:
             swarm.best_pos, swarm.best_cost = swarm.pbest_pos[best], swarm.pbest_cost[best]
     return track.result()
+
+
+def _keep_velocity(velocity: np.ndarray, clamp: None, **_: object) -> np.ndarray:
+    return velocity
 
 
 def run_best_of_samples(

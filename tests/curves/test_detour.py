@@ -42,12 +42,6 @@ def test_a_detour_is_clear_and_the_curve_itself_far_away(curve, obstacles):
     assert not detour.closed
 
 
-@pytest.mark.slow
-def test_a_side_that_a_wall_closes_is_not_taken():
-    wall = Obstacle((1.6, 4.5), size=(2.4, 0.2))  # the disc alone would be passed on this side
-    assert float(points_of(lead_around(LINE, Obstacle((-0.2, 4.5), 0.5), wall))[:, 0].min()) < -0.9
-
-
 def test_a_curve_that_is_clear_stays_as_it_is():
     assert lead_around(LINE, Obstacle((3.0, 4.5), 0.5)) is LINE
 

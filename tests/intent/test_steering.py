@@ -31,14 +31,6 @@ def test_a_wish_comes_to_the_command_within_the_limits_and_by_the_short_way(head
 HAND = "left_hand_x,left_hand_y,left_hand_z"
 
 
-def test_turning_on_and_on_stays_within_the_limits_and_never_arrives():
-    limits = SteeringLimits(turn_rate=2.0)
-    for asked, got in ((0.7, 0.7), (-1.5, -1.5), (9.0, 2.0)):
-        wishes = SteeringTarget(1.0, 0.3, 0.3).ahead(Command(1.0, 5.0, turning=asked), limits, frames=90, fps=30)
-        assert wishes[-1].heading - 0.3 == pytest.approx(3 * got)
-        assert wishes[-1].facing == pytest.approx(wishes[-1].heading, abs=2 * math.pi / 30)
-
-
 def test_speeds_beyond_the_priors_are_lowered_and_said():
     track, said = CommandTrack((0.0, 1.0), (Command(50, 0), Command(1, 0))).limit_speed(3.0)
     assert [command.speed for command in track.commands] == [3.0, 1.0]

@@ -1,26 +1,14 @@
 """Toes land without a snap where motion is made: in walks along curves and in the clean-up of generated motion."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 from helpers import generator
 
 import controllers
 import priors
-from controllers.common.character import Character
-from controllers.shots.walk import FollowSettings
 from mapctl import curves
 from mapctl.metrics.body import measure_peaks
-from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, TOES
-
-
-def test_a_body_of_twice_the_size_may_accelerate_twice_as_hard():
-    """Terms see it at the size of the priors' body."""
-    giant = replace(CANONICAL, offsets=2 * CANONICAL.offsets)
-    landing = Character(giant, 2 * TOE_REST_HEIGHT).footing(FollowSettings().footing).landing
-    assert landing is not None
-    assert (2 * landing.free, 2 * landing.sigma) == pytest.approx((70.0, 10.0))
+from mapctl.skeleton import CANONICAL, TOES
 
 
 @pytest.mark.slow

@@ -122,31 +122,6 @@ def test_terms_see_a_character_at_its_own_size():
     assert float(entry.residual.max()) == pytest.approx(before + 0.03 - height_of(done, 18), abs=2e-3)
 
 
-@dataclass(frozen=True)
-class FarFromOrigin:
-    """Asks nothing; its residual is the hips' distance from the world's origin over the ground."""
-
-    name: str = "far"
-    unit: str = "m"
-
-    def __call__(self, trial):
-        return 0.0 * trial.features[..., 0]
-
-    def residual(self, trial):
-        return trial.root_xz_world.norm(dim=-1)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("start", [None, WALKER], ids=["origin", "clip"])
-def test_terms_of_a_generated_motion_see_where_it_is_in_the_world(start):
-    """Its windows are solved near their own origin, for precision."""
-    done = generate(TOY, seconds=2.0, generator=generator(), start_clip=start, terms=[FarFromOrigin()])
-    (entry,) = [entry for entry in done.ledger.entries if entry.name == "far"]
-    away = done.motion.root_position[:, ::2].norm(dim=-1)
-    assert float(away[-1]) > 0.5
-    torch.testing.assert_close(entry.residual.double(), away, atol=2e-3, rtol=0)
-
-
 def test_terms_without_a_map_stage_to_join_are_refused():
     with pytest.raises(RequestError, match="terms belong to the MAP stage"):
         tween(WALKER, Keys((0, 39)), LinearInbetweener(), settings=UNFINISHED, terms=[HandHeight(1.0)])

@@ -32,8 +32,3 @@ def test_a_jump_is_made_anew_and_other_frames_stay(jumping):
     assert torch.equal(made.local_quat_xyzw[others], jumping.local_quat_xyzw[others])
     moved = (made.joint_positions() - jumping.joint_positions())[AT - 1 : AT + 1].norm(dim=-1)
     assert float(moved.max()) > 0.05
-
-
-def test_a_walk_without_jumps_is_left_alone():
-    motion = walk(60)
-    assert repair_jumps(motion, LinearInbetweener()) is motion

@@ -9,7 +9,6 @@ from helpers import walk
 from controllers.steering.process import Autopilot
 from controllers.steering.steer import SteerFrames
 from mapctl import curves
-from mapctl.curves.obstacles import Obstacle
 from mapctl.intent.steering import Command, SteeringLimits
 from mapctl.motion import Motion
 from mapctl.problem.solution import Ledger, Outcome, Status
@@ -48,20 +47,6 @@ def test_a_path_is_walked_braked_for_and_stood_at():
     assert all(b <= a + 1e-9 for a, b in pairwise(speeds))
     assert speeds[-1] == 0.0
     assert pilot.at(0.0).heading == pytest.approx(0.0, abs=0.1)
-
-
-def test_what_is_aimed_at_on_a_path_keeps_the_path_and_stays_at_its_end():
-    disc, place = (Obstacle((1.0, 2.0), 0.4),), (0.3, 1.2, 4.0)
-    pilot = Autopilot(Command(1.0, 0.5), SteeringLimits())
-    at_place(pilot, 0.0, 0.0)
-    pilot.walk(LINE, 1.4)
-    pilot.aim(Command(3.0, 2.0, reach={"leftHand": place}, look_at=place, obstacles=disc))
-    at_place(pilot, 0.0, 1.0)
-    assert (pilot.at(0.0).speed, pilot.at(0.0).heading) == (1.4, pytest.approx(0.0, abs=0.01))
-    for step in range(10, 51):
-        at_place(pilot, 0.0, 0.1 * step)
-        last = pilot.at(0.0)
-    assert (last.speed, last.reach, last.look_at, last.obstacles) == (0.0, {"leftHand": place}, place, disc)
 
 
 def test_an_order_to_be_somewhere_counts_its_seconds_from_the_next_step_and_stays_one_order():

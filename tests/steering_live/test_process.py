@@ -13,7 +13,7 @@ from tiny_stitcher import save_tiny_stitcher
 
 import priors
 from controllers.steering.process import CharacterProcess, CharacterRequest, run_worker
-from mapctl.errors import MapctlError, RequestError
+from mapctl.errors import RequestError
 from mapctl.intent.steering import Command
 from mapctl.runtime.live_protocol import LiveCharacter
 
@@ -92,59 +92,8 @@ def test_it_is_a_live_character_that_walks_in_time(remote):
     assert pieces[-1].root[-1, 2] > pieces[0].root[0, 2], "it goes along +z"
 
 
-@pytest.mark.slow
-def test_a_pause_stops_time_and_going_on_loses_none(remote):
-    remote.command(Command(1.0, 0.0))
-    before = collected(remote, 0.5)[-1]
-    remote.pause(True)
-    collected(remote, 0.5)
-    assert collected(remote, 0.5) == []
-    remote.pause(False)
-    after = collected(remote, 1.0)
-    assert after[0].seconds - before.seconds < 0.6
-    assert after[-1].spare > -0.05, "the pause made nothing late"
-
-
 def notes(remote, seconds=1.0):
     return [note for piece in collected(remote, seconds) for note in piece.notes]
-
-
-@pytest.mark.slow
-def test_who_is_gone_is_said_after_all_that_came_until_then_and_comes_back_by_a_reset(load):
-    lost = CharacterProcess(CharacterRequest(load, Command(1.0, 0.0)))
-    lost.wait()
-    time.sleep(0.5)
-    lost._process.kill()
-    lost._process.join()
-    time.sleep(0.2)
-    assert sum(len(piece.root) for piece in lost.poll()) >= 6
-    with pytest.raises(MapctlError, match="ended by itself"):
-        lost.poll()
-    lost.reset()
-    lost.wait()
-    until, found = time.perf_counter() + 10.0, []
-    while len(found) <= 2 and time.perf_counter() < until:
-        found += collected(lost, 0.1)
-    assert len(found) > 2
-    lost.close()
-
-
-class Trap:
-    """A prior that ends all steps after the first few."""
-
-    def __init__(self, load, left):
-        self.prior, self.left = load(), left
-
-    def __getattr__(self, name):
-        return getattr(self.prior, name)
-
-    def plan_search(self, *given):
-        self.left -= 1
-        return self.prior.plan_search(*given) if self.left else 1 / 0
-
-
-def trapped(load, left=10):
-    return Trap(load, left)
 
 
 def sent_by(here, there, load):
@@ -165,19 +114,8 @@ def test_an_end_that_is_wanted_is_no_failure(load):
     assert "failed" not in words
 
 
-@pytest.mark.parametrize(
-    ("breaking", "said"),
-    [
-        (lambda load: functools.partial(priors.load, "nobody"), r"no prior 'nobody'"),
-        pytest.param(
-            lambda load: functools.partial(trapped, load, 10),
-            r"ZeroDivisionError: .*\(plan_search, line \d+\)$",
-            marks=pytest.mark.slow,
-        ),
-    ],
-    ids=["no such prior", "an error that nobody thought of"],
-)
-def test_a_worker_says_what_ends_it(load, breaking, said):
-    word, text = sent_by(*Pipe(), breaking(load))[-1]
-    assert word == "failed"
-    assert re.search(said, text)
+def test_a_worker_sends_what_ends_it():
+    here, there = Pipe()
+    last = sent_by(here, there, functools.partial(priors.load, "nobody"))[-1]
+    assert last[0] == "failed"
+    assert re.search("no prior 'nobody'", last[1])

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import pytest
 import torch
-from catalogue import FRAMES, trial
+from catalogue import trial
 
 from mapctl.errors import RequestError
 from mapctl.problem.objective import Objective
@@ -68,15 +68,6 @@ def test_a_wrong_shape_is_named_with_the_one_expected(name):
 def test_what_is_not_finite_is_named(what):
     with pytest.raises(RequestError, match=f"the {what} of the term 'own' is not finite .* in frame 0"):
         objective(Own(NONE[what])).energy_and_gradient(START)
-
-
-def test_the_one_of_many_is_named_and_its_frame():
-    def late(noise):
-        return torch.where(torch.arange(FRAMES) == 5, torch.nan, 1.0) * noise.sum(-1)
-
-    terms = Own(fine, name="first"), Own(late, name="second"), Own(fine, name="third")
-    with pytest.raises(RequestError, match=r"the energy of the term 'second' .* in frame 5"):
-        objective(*terms).energy_and_gradient(START)
 
 
 def test_a_motion_that_is_not_finite_is_no_terms_fault():
