@@ -55,11 +55,13 @@ def draw_shot(generator: torch.Generator) -> tuple[ShotRequest, tuple[str, ...]]
         along, aside = uniform(2.5, 5.0), uniform(-0.4, 0.4)
         x, z = (request.curve.point(along) + aside * request.curve.left(along)).tolist()
         request = replace(request, obstacles=(Obstacle((x, z), uniform(0.2, 0.6)),))
-    way = plan_trajectory(request)
+    trajectory = plan_trajectory(request)
 
     def locate(seconds: float, ahead: float, aside: float) -> tuple[float, float]:
-        arc = way.arcs[min(round(seconds * PRIOR_FPS), len(way.arcs) - 1)]
-        x, z = (way.curve.point(arc) + ahead * way.curve.tangent(arc) + aside * way.curve.left(arc)).tolist()
+        arc = trajectory.arcs[min(round(seconds * PRIOR_FPS), len(trajectory.arcs) - 1)]
+        x, z = (
+            trajectory.curve.point(arc) + ahead * trajectory.curve.tangent(arc) + aside * trajectory.curve.left(arc)
+        ).tolist()
         return x, z
 
     if "reach" in chosen:

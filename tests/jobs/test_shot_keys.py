@@ -29,15 +29,15 @@ def inbetweener():
 
 
 @pytest.fixture(scope="module")
-def way() -> Trajectory:
+def trajectory() -> Trajectory:
     return plan_trajectory(ShotRequest(LINE, seconds=4.0, speed=SpeedProfile.constant(1.0)))
 
 
 @pytest.fixture(scope="module")
-def walked(way) -> Motion:
-    motion = walk(len(way.speeds))
+def walked(trajectory) -> Motion:
+    motion = walk(len(trajectory.speeds))
     along = torch.zeros_like(motion.root_position)
-    along[:, 2] = way.arcs
+    along[:, 2] = trajectory.arcs
     return replace(motion, root_position=motion.root_position * torch.tensor([0.0, 1.0, 0.0]) + along)
 
 
@@ -70,8 +70,8 @@ def crouched() -> Motion:
     ],
     ids=["pose", "held and turned", "place", "facing", "height", "hips"],
 )
-def test_a_key_is_met_exactly_and_the_rest_of_the_shot_stays(key, walked, way, inbetweener):
-    made, (met,) = meet_poses(walked, (key,), way, inbetweener)
+def test_a_key_is_met_exactly_and_the_rest_of_the_shot_stays(key, walked, trajectory, inbetweener):
+    made, (met,) = meet_poses(walked, (key,), trajectory, inbetweener)
     metres, degrees = measure_pose_error(made, met)
     if key.gives_facing_alone:
         assert degrees < 0.1
@@ -91,12 +91,12 @@ def test_a_key_is_met_exactly_and_the_rest_of_the_shot_stays(key, walked, way, i
 
 
 @pytest.mark.slow
-def test_a_rough_key_may_be_missed_by_its_tolerance_and_no_more(walked, way, inbetweener):
+def test_a_rough_key_may_be_missed_by_its_tolerance_and_no_more(walked, trajectory, inbetweener):
     key = PoseKey(2.0, crouched(), tolerance=0.12)
-    made, (met,) = meet_poses(walked, (key,), way, inbetweener)
+    made, (met,) = meet_poses(walked, (key,), trajectory, inbetweener)
     assert 0.01 < measure_pose_error(made, met)[0] <= 0.12
     facing = PoseKey(2.0, facing_deg=60.0, tolerance=20.0)
-    made, (met,) = meet_poses(walked, (facing,), way, inbetweener)
+    made, (met,) = meet_poses(walked, (facing,), trajectory, inbetweener)
     assert 10 < measure_pose_error(made, met)[1] <= 20
 
 

@@ -30,8 +30,8 @@ def meet(width: float) -> list[ShotPlan]:
     return [plan([(0.0, 0.0), (0.0, 6.0)], walls), plan([(0.0, 6.0), (0.0, 0.0)], walls)]
 
 
-def hips(way: Trajectory):
-    return way.curve.ground_point(way.arcs)
+def hips(trajectory: Trajectory):
+    return trajectory.curve.ground_point(trajectory.arcs)
 
 
 @pytest.mark.slow
@@ -48,7 +48,7 @@ def test_in_a_narrow_passage_both_make_room():
     frames = min(len(one.arcs), len(other.arcs))
     away = (hips(one)[:frames] - hips(other)[:frames]).norm(dim=-1)
     assert float(away.min()) > APART
-    aside = [float(hips(way)[int(away.argmin()), 0]) for way in (one, other)]
+    aside = [float(hips(path)[int(away.argmin()), 0]) for path in (one, other)]
     assert min(map(abs, aside)) > 0.2
     assert aside[0] * aside[1] < 0
     alone = plan_trajectory(plans[0].request)

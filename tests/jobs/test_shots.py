@@ -63,9 +63,9 @@ def test_a_way_past_somebody_who_comes_the_other_way_keeps_apart_when_they_meet(
     seconds = 5.0
     towards = torch.stack([torch.full((150,), 0.1), 6 - 1.2 * torch.arange(150) / 30], -1).double()
     request = ShotRequest(curves.line(length=6), seconds=seconds, others=Others(towards[None], 0.6))
-    way = plan_trajectory(request)
-    assert way.note is None
-    there = way.curve.point(way.arcs)
+    trajectory = plan_trajectory(request)
+    assert trajectory.note is None
+    there = trajectory.curve.point(trajectory.arcs)
     assert float((there - towards[: len(there)]).norm(dim=-1).min()) > 0.6
     alone = plan_trajectory(replace(request, others=None))
     assert float((alone.curve.point(alone.arcs) - towards[: len(alone.arcs)]).norm(dim=-1).min()) < 0.2
