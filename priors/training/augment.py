@@ -154,17 +154,17 @@ class _Noise:
     """How noisy each window of a batch is."""
 
     angle: Float[Tensor, "batch joints"]
-    """Of each of a joint's angles, radians; 0 where places are noisy."""
+    """Of each of a joint's angles, radians; 0 where positions are noisy."""
     root: Float[Tensor, " batch"]
-    """Of each coordinate of the hips, metres; 0 where places are noisy."""
+    """Of each coordinate of the hips, metres; 0 where positions are noisy."""
     place: Float[Tensor, " batch"]
-    """Of each coordinate of every joint's place, metres; 0 where angles are noisy."""
+    """Of each coordinate of every joint's position, metres; 0 where angles are noisy."""
     stays: Float[Tensor, " batch"]
     """Share of the noise that comes from the frame before."""
     given_angle: Float[Tensor, "batch joints"]
     """Noise of angles that the network is given, radians."""
     given_root: Float[Tensor, " batch"]
-    """Noise of the hips' place that it is given, metres."""
+    """Noise of the hips' position that the network is given, metres."""
 
 
 _MAX_NOISE_RAD = 0.6  # radians of noise; more is no noise but another motion
@@ -179,7 +179,7 @@ def _bone_lengths() -> Float[Tensor, " joints"]:
 
 
 def _sample_noise(draw: Draws) -> _Noise:
-    """Draw the noise of angles and the hips, or that of all places."""
+    """Draw the noise of angles and the hips, or that of all positions."""
     angle = torch.deg2rad(draw.log_uniform(*_ANGLE_DEG, 1)) * (draw.uniform(1) > _CLEAN)
     uneven = torch.where(draw.uniform(1) < 0.5, _UNEVEN, 0.0) * draw.normal(_JOINTS)
     root = draw.log_uniform(*_ROOT_CM) / 100 * (draw.uniform() > _CLEAN)
@@ -193,7 +193,7 @@ def _sample_noise(draw: Draws) -> _Noise:
 
 
 def _angles_of_places(place: Float[Tensor, " batch"]) -> Float[Tensor, "batch joints"]:
-    """Noise of a joint's angles about its parent where both bones point from one noisy place to another, radians."""
+    """Noise of a joint's angles about its parent where both bones point from one noisy position to another, radians."""
     own = (math.sqrt(2) * place[:, None] / _bone_lengths().to(place)).clamp(max=_MAX_NOISE_RAD)
     own = own * torch.tensor([bool(CANONICAL.children(joint)) for joint in range(_JOINTS)])
     above = own[:, [max(0, parent) for parent in CANONICAL.parents]].clone()
@@ -213,8 +213,8 @@ def _estimated_share(stays: Float[Tensor, " batch"]) -> Float[Tensor, " batch"]:
 def _perturb_places(
     quats: Float[Tensor, "batch frames joints 4"], root: Float[Tensor, "batch frames 3"], noise: _Noise, draw: Draws
 ) -> tuple[Tensor, Tensor]:
-    """Turn the bones of windows whose places are noisy from each noisy place to that of the first joint below, and move
-    the hips by their own noise."""
+    """Turn the bones of windows whose positions are noisy from each noisy joint to the first one below, and move the
+    hips by their own noise."""
     rows = noise.place.nonzero()[:, 0]
     if len(rows) == 0:
         return quats, root
@@ -319,7 +319,7 @@ def copy_clip(windows: PoseWindows, number: int, *, tempo: float, strides: float
 def change_strides(motion: Motion, factor: float) -> Motion:
     """Return a motion on canonical joints whose hips and feet go this many times as far over the ground.
 
-    Toes keep their heights, feet their orientation, and what stands stands: all places are scaled from one point of
+    Toes keep their heights, feet their orientation, and what stands stands: all positions are scaled from one point of
     the floor, which also sets feet further apart. Legs reach there, and the hips go down where they would be too short.
     """
     if factor == 1:

@@ -387,9 +387,9 @@ STEEPEST = 0.05
 """Largest slope that is taken for a fault of the capture, metres a metre."""
 _STILL = 0.25  # m/s of a toe that stands
 _ROUGH = 0.015  # metres rms of standing toes about the plane, beyond which they stand on stairs or things
-_FEW = 12  # standing toes that tell a plane
+_FEW = 12  # standing toes that determine a plane
 _NEAR = 0.01  # metres; what is further from the plane counts less
-_USUAL = 0.02  # slope, metres a metre: across a straight walk nothing tells it, and it shall be none
+_USUAL = 0.02  # slope, metres a metre: across a straight walk nothing determines it, and it shall be 0
 
 
 def stand_on_canonical(motion: Motion, rigmap: RigMap) -> Motion:

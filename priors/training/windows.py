@@ -55,7 +55,7 @@ KINDS = ("walk-turn", "walk", "run|dash", "^cmu")
 """Kinds of clips, as patterns of their names, among which windows are evened; clips of none are another kind."""
 _CHUNK_FRAMES = 50_000  # frames
 _GOING = 0.25  # m/s that the hips of a walking character reach, on average over the frames around one
-_AROUND = 9  # frames, so that who shifts his weight goes nowhere
+_AROUND = 9  # frames, so that a shift of weight is no walk
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +117,7 @@ class FeatureWindows:
 def _thin_standing(
     features: Float[Tensor, "frames size"], starts: Int[Tensor, " starts"], frames: int, share: float
 ) -> Int[Tensor, " left"]:
-    """Leave this share of the windows in which nobody goes anywhere, evenly over the corpus, and all others."""
+    """Leave this share of the windows of standing characters, evenly over the corpus, and all others."""
     around = torch.full((1, 1, _AROUND), 1 / _AROUND)
     padded = torch.nn.functional.pad(ground_speed(features)[None, None], (_AROUND // 2, _AROUND // 2), mode="replicate")
     speed = torch.nn.functional.conv1d(padded, around)[0, 0]

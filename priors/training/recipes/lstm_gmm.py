@@ -462,7 +462,7 @@ def measure_data_limits(corpus: Corpus) -> DataLimits:
         speeds.append(pace)
         turns.append(turn.abs()[pace[_SECOND:] > 0.5])
     speeds, turns = torch.cat(speeds), torch.cat(turns)
-    turn_rate = float(turns.quantile(0.995)) if len(turns) else 0.0  # nobody may walk in the data
+    turn_rate = float(turns.quantile(0.995)) if len(turns) else 0.0  # the data may hold no walk
     return DataLimits(float(speeds.quantile(0.01)), float(speeds.quantile(0.99)), turn_rate)
 
 
@@ -565,7 +565,7 @@ def compute_validation_nats(model: LstmGmm, corpus: Corpus, frames: int = 100) -
 
 def compute_window_nats(model: LstmGmm, corpora: Iterable[Corpus]) -> dict[str, float]:
     """Log density a frame, physical units, of motion as wrong as a proposal is: mean over windows, and the value that
-    98 % of them reach. By it a density's trust is told (see mapctl.problem.density_selection); clips begin with an
+    98 % of them reach. A density is trusted by it (see mapctl.problem.density_selection); clips begin with an
     empty memory.
     """
     blurred, found = model.cpu().with_observation_noise(density_selection.proposal_sigma()), []

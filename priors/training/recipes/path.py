@@ -2,7 +2,6 @@
 their own (Zhou et al. 2020, section 3.4).
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -31,7 +30,7 @@ from priors.training.loop import (
     given,
     make_generator,
 )
-from priors.training.windows import KINDS, PoseVariation, PoseWindows, Variation, find_kind
+from priors.training.windows import PoseVariation, PoseWindows, Variation
 
 _VALIDATED = ("V1", "V8", "V32", "V64", "Y")
 _SHORTEST_WINDOW = 32  # frames
@@ -93,24 +92,15 @@ class PathTrainer(GradientTrainer[PathNetwork]):
 
     @torch.no_grad()
     def validate(self, corpus: Corpus) -> dict[str, Any]:
-        """Measure the mean error of displacements and heights over unseen clips, cm, by kind and of all clips alike."""
+        """Measure the mean error of displacements and heights over unseen clips, cm."""
         windows = PoseWindows(corpus, evenness=1.0)
-        kinds = [*KINDS, "other"]
-        rows: dict[str, list[Mapping[str, float]]] = {}
-        for number, name in enumerate(corpus.names):
-            found = measure_clip(self.network, windows, number)
-            for group in ("all", kinds[find_kind(name)]):
-                rows.setdefault(group, []).append(found)
-        return {
-            f"{group}_{name}_cm": sum(row[name] for row in found if name in row) / sum(name in row for row in found)
-            for group, found in rows.items()
-            for name in _VALIDATED
-            if any(name in row for row in found)
-        }
+        rows = [measure_clip(self.network, windows, number) for number in range(len(corpus.names))]
+        found = {name: [row[name] for row in rows if name in row] for name in _VALIDATED}
+        return {f"{name}_cm": sum(values) / len(values) for name, values in found.items() if values}
 
     def score(self, row: Row) -> float:
         """Return the errors over unseen clips, cm, geometric mean over spans and the height."""
-        return average_logarithms(row.get(f"all_{name}_cm") for name in _VALIDATED)
+        return average_logarithms(row.get(f"{name}_cm") for name in _VALIDATED)
 
 
 def compute_path_losses(network: PathNetwork, motion: PartialMotion) -> dict[str, Tensor]:

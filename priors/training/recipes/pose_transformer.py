@@ -139,30 +139,23 @@ class PoseTransformerTrainer(GradientTrainer[PoseTransformerNetwork]):
     def validate(self, corpus: Corpus) -> dict[str, Any]:
         """Measure the error of gaps in unseen windows after 10 frames and after one, before one frame, cm and as a
         share of the interpolation's; the same in unfamiliar poses; and of lost arms."""
-        windows = PoseWindows(corpus, evenness=1.0)
-        row: dict[str, Any] = {}
-        for past in (10, 1):
-            for gap in VALIDATED_GAPS:
+        windows, row = PoseWindows(corpus, evenness=1.0), {}
+        cases = [(f"{past}_{gap}", past, gap, None) for past in (10, 1) for gap in VALIDATED_GAPS]
+        cases += [(f"unfamiliar_{gap}", 10, gap, _UNFAMILIAR) for gap in _UNFAMILIAR_GAPS]
+        for name, past, gap, variation in cases:
+            if past + gap + 1 <= int(windows.lengths.max()):
                 frames = past + gap + 1
-                if frames > int(windows.lengths.max()):
-                    continue
-                truth = windows.draw(_VALIDATED_WINDOWS, frames, make_generator(gap))
+                truth = windows.draw(_VALIDATED_WINDOWS, frames, make_generator(gap), variation=variation)
                 observed = torch.ones(truth.heading.shape, dtype=torch.bool)
                 observed[:, past : past + gap] = False
-                error, share = measure_error(self.network, truth, KnownParts.whole(observed))
-                row |= {f"error_{past}_{gap}_cm": error, f"share_{past}_{gap}": share}
-        for gap in _UNFAMILIAR_GAPS:
-            truth = windows.draw(_VALIDATED_WINDOWS, 11 + gap, make_generator(gap), variation=_UNFAMILIAR)
-            observed = torch.ones(truth.heading.shape, dtype=torch.bool)
-            observed[:, 10 : 10 + gap] = False
-            error, share = measure_error(self.network, truth, KnownParts.whole(observed))
-            row |= {f"error_unfamiliar_{gap}_cm": error, f"share_unfamiliar_{gap}": share}
+                known = KnownParts.whole(observed)
+                row[f"error_{name}_cm"], row[f"share_{name}"] = measure_error(self.network, truth, known)
         truth = windows.draw(_VALIDATED_WINDOWS, min(60, int(windows.lengths.max())), make_generator(1))
         known = KnownParts.whole(torch.ones(truth.heading.shape, dtype=torch.bool))
         lost = known.rotations.clone()
         lost[..., [CANONICAL.index(name) for name in ("leftUpperArm", "leftLowerArm", "leftHand")]] = False
-        error, share = measure_error(self.network, truth, replace(known, rotations=lost))
-        return row | {"error_arm_cm": error, "share_arm": share}
+        row["error_arm_cm"], row["share_arm"] = measure_error(self.network, truth, replace(known, rotations=lost))
+        return row
 
     def score(self, row: Row) -> float:
         """Return the error of unseen windows over the interpolation's, geometric mean over gaps and lost arms."""
@@ -218,7 +211,7 @@ def hide(network: PoseTransformerNetwork, motion: PartialMotion) -> PartialMotio
 
 @torch.no_grad()
 def measure_error(network: PoseTransformerNetwork, truth: PartialMotion, known: KnownParts) -> tuple[float, float]:
-    """Measure the mean distance of unknown joints from their true places, cm, and as a share of the interpolation's."""
+    """Measure the mean distance of unknown joints from the truth, cm, and as a share of the interpolation's."""
     shown = hide(network, replace(truth, known=known))
     unknown = ~known.positions
     places = truth.world_poses()[0]
@@ -234,7 +227,7 @@ def compute_losses(network: PoseTransformerNetwork, truth: PartialMotion, hidden
 
     Distances, not squares, window by window divided by how many joints in how many frames are unknown: two lost joints
     count as much as a gap. They are the same however the motion is turned. Windows that interpolation nearly solves
-    count for more, or the network learns to fidget where nobody moves.
+    count for more, or the network learns to fidget where bodies stand still.
     """
     shown = hide(network, hidden)
     proposed = network(shown)
@@ -308,7 +301,7 @@ def _quantile_loss(proposed: ProposedPoses, distance: Tensor, unknown: Tensor) -
 
 
 def _set_moments(network: PoseTransformerNetwork, windows: PoseWindows) -> None:
-    """Mean and spread of rotations and places of the data and its mirror image."""
+    """Set mean and spread to those of rotations and positions of the data and its mirror image."""
     batch = windows.draw(4000, 4, make_generator(0))
     both = [batch, batch.mirrored()]
     quats = torch.cat([each.quats for each in both]).flatten(0, 1)
@@ -406,7 +399,7 @@ def _lose_trunk(
 
 
 def _sample_reached(draw: Draws, held: float) -> Bool[Tensor, "batch frames 1"]:
-    """Frames in which places of hands and feet are given: one here and there, or, in a share of windows, a while."""
+    """Draw frames in which hands and feet are given: one here and there, or, in a share of windows, a while."""
     reached = draw.uniform(draw.frames, 1) < draw.uniform(1, 1) ** 2 * 0.12
     stretch = draw.mark(draw.uniform() * draw.frames, 1 + draw.uniform() * 12)[..., None]
     return torch.where((draw.uniform() < held)[:, None, None], stretch, reached)

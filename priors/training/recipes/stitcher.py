@@ -1,7 +1,6 @@
-"""Training of the stitcher: both ways between two poses of mocap, longer and longer ones.
+"""Training of the stitcher: both directions between two poses of mocap, over longer and longer times.
 
-Validation measures, between poses of unseen clips, how near the answers come, how far the two sides are apart, and how
-the answers differ.
+Validation measures, between poses of unseen clips, how near the answers come.
 """
 
 import copy
@@ -29,8 +28,6 @@ from priors.stitcher import (
     DrawnLatents,
     Ends,
     Gaussian,
-    Joined,
-    Latents,
     PosteriorNetwork,
     Sides,
     StitcherConfig,
@@ -86,7 +83,6 @@ VALIDATED_GAPS = (5, 15, 30, 45)
 TEMPERATURES = (0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0, 2.25, 2.5, 2.75, 3.0)
 """Of draws, that are tried."""
 _WINDOWS, _DRAWS = 96, 8
-_DRAWN_GAP = 30
 _AS_NEAR = 1.01  # of the least error of the best draw
 
 
@@ -189,7 +185,7 @@ class StitcherTrainer(GradientTrainer[StitcherNetwork]):
 
 
 class Known(NamedTuple):
-    """What is told of the ends of a transition."""
+    """What is known of the ends of a transition."""
 
     before: int = 0
     """Frames before the first pose."""
@@ -202,7 +198,7 @@ class Transition:
     """Transitions of one length, with a frame or more on either side."""
 
     features: Float[Tensor, "batch window size"]
-    """Forwards, from the first frame told before to the last one told after."""
+    """Forwards, from the first frame known before to the last one known after."""
     phases: Float[Tensor, "batch window 4"]
     """Of both toes."""
     frames: int
@@ -210,7 +206,7 @@ class Transition:
     lead: int
     """Frames of the window before the first pose."""
     known: Known
-    """What is told."""
+    """What is known."""
 
     @property
     def between(self) -> slice:
@@ -236,7 +232,7 @@ class Transition:
         return Ends(torch.stack(sides), torch.stack(present)[:, None].expand(-1, batch, -1), place[:, -1], turn[:, -1])
 
     def integrate(self) -> tuple[Float[Tensor, "batch frames 2"], Float[Tensor, "batch frames"]]:
-        """Places over the ground and headings of the frames between and of the second pose, seen from the first."""
+        """Return ground positions and headings of the frames between and of the second pose, seen from the first."""
         return integrate_root(self.features[:, self.between], GroundPose.origin())
 
     def truth(self) -> Float[Tensor, "2 batch frames size"]:
@@ -272,7 +268,7 @@ class TransitionWindows:
 
     def draw(self, batch: int, frames: int, known: Known, generator: torch.Generator) -> Transition:
         """So many transitions of so many frames; RequestError where no clip is so long."""
-        lead, rest = max(known.before, 1), max(known.after, 1)  # one frame more tells the pace of the ends
+        lead, rest = max(known.before, 1), max(known.after, 1)  # one frame more shows the pace of the ends
         window = lead + frames + 1 + rest
         clip, first = self.picker.pick(torch.full((batch,), window), generator)
         index = (self.starts[clip] + first)[:, None] + torch.arange(window)
@@ -319,7 +315,7 @@ class TaughtLatents:
             return self.noise.share(prior, seen)
         found = self.posterior.tell_shared(self.missed)
         self.cost = found.diverge(Gaussian(torch.zeros_like(found.mean), torch.zeros_like(found.mean)))
-        # Held to a prior that sees the ends, the posterior would learn to tell nothing but these.
+        # Held to a prior that sees the ends, the posterior would learn to encode nothing but these.
         self.nats.append(found.detach().diverge(prior.row(slice(count))))
         noise = self.noise.shared
         return torch.cat([found.draw(noise[:count]), prior.row(slice(count, None)).draw(noise[count:])])
@@ -411,7 +407,7 @@ def _compare(
     from their true places, and the errors of their steps, metres."""
     made = sides.features.shape[2]
     true, places = truth.truth()[:, :compared, :made], sides.place_joints()
-    # Windows that interpolation nearly solves count for more, or the network learns to fidget where nobody moves.
+    # Windows that interpolation nearly solves count for more, or the network learns to fidget where bodies stand still.
     ease = weigh_windows(truth)[:compared]
     wrong = places[:, :compared] - truth.place_joints(made)[:, :compared]
     distance = _measure_length(wrong)
@@ -468,23 +464,15 @@ def _measure_length(vectors: Tensor) -> Tensor:
 @torch.no_grad()
 def measure_transitions(network: StitcherNetwork, windows: TransitionWindows) -> dict[str, float]:
     """Measure the calm answer to two bare poses, and to a pose after 10 frames, as shares of the interpolation's mean
-    distance of joints; and in a gap of 30 frames, in cm, errors of one draw and of the best of 8, and how far draws are
-    apart. `apart` is the distance of the sides before they are joined, cm.
-    """
+    distance of joints."""
     row: dict[str, float] = {}
     for name, known in (("bare", Known()), ("past", Known(before=10))):
         for gap in VALIDATED_GAPS:
-            if not _has_room(network, windows, gap):
-                continue
-            truth = windows.draw(_WINDOWS, gap + 1, known, make_generator(gap))
-            places, guess = _true_places(truth)
-            joined = answer(network, truth, make_calm(network, truth))
-            error = (place(joined) - places).norm(dim=-1).mean()
-            row[f"{name}_{gap}"] = float(error / (guess - places).norm(dim=-1).mean())
-            if known == Known():
-                row[f"apart_{gap}_cm"] = 100 * float(joined.apart.mean())
-            if known == Known() and gap == _DRAWN_GAP:
-                row |= _measure_draws(network, truth, places)
+            if _has_room(network, windows, gap):
+                truth = windows.draw(_WINDOWS, gap + 1, known, make_generator(gap))
+                true, guess = (body.joints_world()[:, :-1] for body in interpolate(truth))
+                error = (place_answers(network, truth) - true).norm(dim=-1).mean()
+                row[f"{name}_{gap}"] = float(error / (guess - true).norm(dim=-1).mean())
     return row
 
 
@@ -498,61 +486,29 @@ def calibrate_temperature(network: StitcherNetwork, windows: TransitionWindows) 
         if not _has_room(network, windows, gap):
             continue
         truth = windows.draw(_WINDOWS, gap + 1, Known(), make_generator(gap))
-        places = _true_places(truth)[0]
-        unit = (place(answer(network, truth, make_calm(network, truth))) - places).norm(dim=-1).mean()
+        true = interpolate(truth)[0].joints_world()[:, :-1]
+        unit = (place_answers(network, truth) - true).norm(dim=-1).mean()
+        generator, batch, made = make_generator(0), len(truth.features), count_made(network, truth.frames)
+        draws = [DrawnLatents.sample(network.config, batch, made, generator) for _ in range(_DRAWS)]
         for number, temperature in enumerate(TEMPERATURES):
-            errors = (_draw(network, truth, temperature) - places).norm(dim=-1).mean(dim=(2, 3))
-            scores[number] += errors.amin(dim=0).mean() / unit
+            placed = torch.stack([place_answers(network, truth, each.scale(temperature)) for each in draws])
+            scores[number] += (placed - true).norm(dim=-1).mean(dim=(2, 3)).amin(dim=0).mean() / unit
     return TEMPERATURES[int((scores <= _AS_NEAR * scores.min()).nonzero().max())]
 
 
-def answer(network: StitcherNetwork, truth: Transition, latents: Latents) -> Joined:
-    """Return what a stitcher makes of the ends of transitions."""
-    ends = truth.ends()
-    return join_sides(walk_sides(network, ends, truth.frames, latents))
-
-
-def make_calm(network: StitcherNetwork, truth: Transition) -> DrawnLatents:
-    """Make latents at the mean."""
-    return DrawnLatents.calm(network.config, len(truth.features), count_made(network, truth.frames))
-
-
-def place(joined: Joined) -> Float[Tensor, "batch frames joints 3"]:
-    """Place the joints, metres, seen from the first pose."""
-    return forward_kinematics(
-        CANONICAL.offsets.to(joined.quats), CANONICAL.parents, joined.root_position, joined.quats
-    )[0]
-
-
-def _true_places(truth: Transition) -> tuple[Tensor, Tensor]:
-    """Places of joints between the poses, true and interpolated."""
-    bodies = interpolate(truth)
-    true, guess = (body.joints_world()[:, :-1] for body in bodies)
-    return true, guess
-
-
-def _measure_draws(network: StitcherNetwork, truth: Transition, places: Tensor) -> dict[str, float]:
-    draws = _draw(network, truth, float(network.temperature))
-    errors = (draws - places).norm(dim=-1).mean(dim=(2, 3))
-    pairs = [(one - other).norm(dim=-1).mean() for number, one in enumerate(draws) for other in draws[:number]]
-    return {
-        "draw_cm": 100 * float(errors[0].mean()),
-        "best_cm": 100 * float(errors.amin(dim=0).mean()),
-        "spread_cm": 100 * float(torch.stack(pairs).mean()),
-    }
+def place_answers(
+    network: StitcherNetwork, truth: Transition, latents: DrawnLatents | None = None
+) -> Float[Tensor, "batch frames joints 3"]:
+    """Return the joints' positions, metres, seen from the first pose, that a stitcher puts between the ends of
+    transitions; with latents at their mean unless others are given."""
+    calm = DrawnLatents.calm(network.config, len(truth.features), count_made(network, truth.frames))
+    joined = join_sides(walk_sides(network, truth.ends(), truth.frames, latents or calm))
+    offsets = CANONICAL.offsets.to(joined.quats)
+    return forward_kinematics(offsets, CANONICAL.parents, joined.root_position, joined.quats)[0]
 
 
 def _has_room(network: StitcherNetwork, windows: TransitionWindows, gap: int) -> bool:
     return gap + 13 <= max(windows.picker.lengths.tolist()) and gap + 1 <= network.config.longest
-
-
-def _draw(
-    network: StitcherNetwork, truth: Transition, temperature: float
-) -> Float[Tensor, "draws batch frames joints 3"]:
-    """Draw answers; those of one temperature have the noise of those of another, scaled."""
-    generator, batch, made = make_generator(0), len(truth.features), count_made(network, truth.frames)
-    latents = [DrawnLatents.sample(network.config, batch, made, generator) for _ in range(_DRAWS)]
-    return torch.stack([place(answer(network, truth, each.scale(temperature))) for each in latents])
 
 
 def _set_moments(network: StitcherNetwork, corpus: Corpus) -> None:

@@ -245,8 +245,8 @@ def choose_parts(
 ) -> ToldParts:
     """Choose what is known in frames that are keys, of motions with these headings, radians: of most sequences all of
     the pose, and of all of them unless `partial`."""
-    told = ToldParts.whole(known)
-    axes, faced, view = told.axes.clone(), told.heading.clone(), told.view.clone()
+    whole = ToldParts.whole(known)
+    axes, faced, view = whole.axes.clone(), whole.heading.clone(), whole.view.clone()
     for row in range(len(known)):
         kind = next(rolls)
         runs = [slice(start, stop) for _, start, stop in true_intervals(known[row][:, None])]
@@ -256,9 +256,9 @@ def choose_parts(
             for run in runs:
                 axes[row, run] = _draw_part(rolls)[:, None]
         elif partial and kind < _HALVES + _PLACES:
-            whole = 0.4 * (next(rolls) < 0.6)
+            kept = 0.4 * (next(rolls) < 0.6)
             for run in runs:
-                if next(rolls) >= whole:
+                if next(rolls) >= kept:
                     axes[row, run], faced[row, run] = _PLACE, False
         elif partial and kind < _HALVES + _PLACES + _DRAWINGS:
             view[row] = _draw_view(float(heading[row, runs[0].start]), rolls)
@@ -271,10 +271,10 @@ def choose_parts(
 
 def _see_joints(turning: Iterable[int]) -> Bool[Tensor, " joints"]:
     """Return which joints' positions are known by the rotations of some."""
-    told, rotations = [True], set(turning)
+    seen, rotations = [True], set(turning)
     for parent in CANONICAL.parents[1:]:
-        told.append(told[parent] and parent in rotations)
-    return torch.tensor(told)
+        seen.append(seen[parent] and parent in rotations)
+    return torch.tensor(seen)
 
 
 _UPPER, _LOWER = (_see_joints({0, *part}) for part in (set(range(_JOINTS)) - _LEGS, _LEGS))
@@ -461,7 +461,7 @@ def _finish(
 def see_without_root(
     places: Float[Tensor, "*batch joints 3"], hips_world_matrix: Float[Tensor, "*batch 3 3"]
 ) -> Float[Tensor, "*batch joints 3"]:
-    """Return places from the hips without the hips' rotation."""
+    """Return positions from the hips without the hips' rotation."""
     return places @ hips_world_matrix
 
 
@@ -631,8 +631,8 @@ def _set_moments(network: GeneratorNetwork, windows: PoseWindows) -> None:
 def draw_style_poses(
     windows: PoseWindows, sequences: KeySequences, foreign: float, generator: torch.Generator
 ) -> Float[Tensor, "batch poses joints 3"]:
-    """Draw poses anywhere in each sequence, or, of this share of them, in another clip: places from the hips, metres,
-    without the hips' rotation."""
+    """Draw poses anywhere in each sequence, or, of this share of them, in another clip: positions from the hips,
+    metres, without the hips' rotation."""
     batch, frames = sequences.clip.shape
     few, many = _STYLE_POSES
     count = int(torch.randint(few, many + 1, (), generator=generator))
