@@ -34,7 +34,7 @@ from mapctl.intent.keyframes import Drawing, Key, KeyEntry, KeyRequest, Keys, re
 from mapctl.joint_names import classify_joint, describe_nearest, find_joint
 from mapctl.kinematics import forward_kinematics, heading
 from mapctl.motion import Motion, join_licences
-from mapctl.retarget import RigMap, as_rig, from_canonical, identify_rig, rig_joint_positions, to_canonical
+from mapctl.retarget import RigMap, as_rig, from_canonical, rig_joint_positions, to_canonical
 from mapctl.retarget.carry import RiggedCharacter, retarget_motion
 from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import CANONICAL, LIMBS, Skeleton, leg_length
@@ -203,13 +203,6 @@ def resolve_drawing(drawing: Drawing, rigmap: RigMap) -> dict[int, tuple[float, 
             raise RequestError(f"{name!r} is drawn twice, by its own name and by the canonical one")
         found[joint] = place
     return found
-
-
-def check_effectors(names: Sequence[str], motion: Motion, rig: Rig | None = None) -> None:
-    """Raise RequestError for a name that is no hand or foot of the motion's rig."""
-    rigmap = identify_rig(motion.skeleton, rig, motion=motion)
-    for name in names:
-        effector_joint(name, rigmap)
 
 
 def effector_joint(name: str, rigmap: RigMap) -> int:

@@ -428,25 +428,20 @@ def hold_planted(
     for foot, toe in enumerate(_TOES):
         offset = torch.zeros_like(positions[:, toe])
         for _, start, stop in true_intervals(planted[:, foot, None]):
-            part = slice(start, stop)
-            offset[part] = _compute_stance_offset(positions[part, toe], ~free[part], rest_height[part, foot])
+            part, anchored = slice(start, stop), ~free[start:stop]
+            stance = positions[part, toe]
+            if bool(anchored.any()):
+                held = fill_missing(stance[None], anchored[None])[0]
+            else:
+                held = stance.mean(dim=0)
+                held[1] = rest_height[part, foot].mean()
+            offset[part] = held - stance
         firm = ~free | planted[:, foot]
         goals[:, CANONICAL.parents[toe]] += interpolate_offsets(
             offset, firm, seconds=_STANCE_FADE_SECONDS, fps=float(motion.fps)
         )
     turning = free[:, None].expand(-1, CANONICAL.num_joints)
     return bend_limbs(motion, motion, goals, torch.zeros_like(turning), turning)
-
-
-def _compute_stance_offset(
-    positions: Float[Tensor, "contact 3"], anchored: Bool[Tensor, " contact"], rest_height: Float[Tensor, " contact"]
-) -> Float[Tensor, "contact 3"]:
-    """Compute the offsets from a contact's positions to the anchored ones, interpolated linearly, or to their mean."""
-    if bool(anchored.any()):
-        return fill_missing(positions[None], anchored[None])[0] - positions
-    middle = positions.mean(dim=0)
-    middle[1] = rest_height.mean()
-    return middle - positions
 
 
 _PAST_FRAMES = 3  # frames before a gap that terms look back on

@@ -9,13 +9,7 @@ import torch
 from tyro.conf import arg
 
 import priors
-from controllers.inbetweening.keyframes import (
-    KeyframeClip,
-    KeyInterval,
-    build_keyframe_clip,
-    check_effectors,
-    suggest_intervals,
-)
+from controllers.inbetweening.keyframes import KeyframeClip, KeyInterval, build_keyframe_clip, suggest_intervals
 from controllers.inbetweening.pipeline import InbetweenSolution, InfillSettings
 from controllers.inbetweening.proposers import ModelLoaders, RolloutInbetweener, StitchedInbetweener, build_inbetweener
 from controllers.inbetweening.tween import measure_keyframe_errors, tween
@@ -164,8 +158,6 @@ def _read_keyframe_clip(command: Tween, request: KeyRequest | None) -> KeyframeC
         name = "--root-only" if command.root_only else "--joints"
         raise RequestError(f"{name} is about keys between the first and the last, and --keyframes has none there")
     limbs = () if command.joints is None else tuple(name.strip() for name in command.joints.split(","))
-    if limbs:  # also where there is no key between the first and the last
-        check_effectors(limbs, motion, rig)
     return KeyframeClip(motion, Keys.of(frames, limbs=limbs, root_only=command.root_only), rig)
 
 
