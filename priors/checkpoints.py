@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from hashlib import sha256
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, TypeVar
+from typing import Annotated, Any, ClassVar, Generic, TypeVar
 
 import torch
 from pydantic import AfterValidator, BaseModel, ConfigDict, TypeAdapter, ValidationError
@@ -122,6 +122,18 @@ class LoadedModel:
         return f"<{self}>"
 
 
+@dataclass(frozen=True, eq=False, repr=False)
+class NetworkModel(LoadedModel, Generic[N]):
+    """A trained network with its name and card."""
+
+    name: str
+    """Name, file or run folder by which it was asked for."""
+    network: N
+    """Network with its weights, in evaluation mode."""
+    card: Card
+    """Card of the weights."""
+
+
 def save(tensors: dict[str, Tensor], card: Card, path: Path, *, half: bool = True) -> None:
     """Write `path` (.safetensors) and its card (.json beside it); float16 unless `half` is false.
 
@@ -190,6 +202,15 @@ def build_network(make: Callable[..., N], config: Any, tensors: dict[str, Tensor
     network = make(config, **statistics)
     network.load_state_dict(tensors)
     return network.eval().requires_grad_(False)
+
+
+def load_network(
+    name: str, kind: str, make: Callable[..., N], config: "type[NetworkConfig]", *, called: str | None = None
+) -> tuple[N, Card]:
+    """Load the network of a kind by a bundled name, a file or a run folder, and its card; CheckpointError as in
+    `open_checkpoint`."""
+    with open_checkpoint(name, kind, called=called) as (tensors, card):
+        return build_network(make, config.of_card(card.config), tensors), card
 
 
 class _WithoutDraws(TorchFunctionMode):

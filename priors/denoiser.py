@@ -81,16 +81,13 @@ class DenoiserNetwork(nn.Module):
         view = _CaptureView(capture)
         inputs = view.inputs()
         with torch.autocast(inputs.device.type, torch.bfloat16, enabled=self.reduced_precision):
-            hidden = self._convolve(inputs)
+            hidden = self.first(inputs.transpose(1, 2))
+            for block in self.blocks:
+                hidden = block(hidden)
+            hidden = hidden.transpose(1, 2)
             change, spread = self.last(hidden).to(inputs.dtype), self.spread(hidden.detach()).to(inputs.dtype)
         pose, contacts = view.changed(change)
         return CaptureProposal(pose, contacts, spread)
-
-    def _convolve(self, inputs: Float[Tensor, "batch frames inputs"]) -> Float[Tensor, "batch frames width"]:
-        hidden = self.first(inputs.transpose(1, 2))
-        for block in self.blocks:
-            hidden = block(hidden)
-        return hidden.transpose(1, 2)
 
 
 class _ResidualBlock(nn.Module):
@@ -136,7 +133,14 @@ class _CaptureView:
 
     def inputs(self) -> Float[Tensor, "batch frames inputs"]:
         """Encode the capture, and the same smoothed, in units of about one."""
-        rate, *way = self._slow_way()
+        # How the slow frame of the hips turns and travels, and its height.
+        rate = _difference_frames(self.slow_heading[..., None]) / _VELOCITY_UNIT
+        way = rotations.rotate_about_y(_difference_frames(self.slow_root), -self.slow_heading)[..., ::2]
+        height = (self.slow_root[..., 1:2] - _HIPS_HEIGHT) / ANGLE_UNIT
+        # Flags of what was observed, and the sigmas of its noise.
+        capture = self.capture
+        level = torch.log(torch.cat([capture.sigma, 3 * capture.sigma_root[:, None]], dim=-1).clamp_min(0.001)) + 3
+        known = torch.cat([capture.seen, capture.seen_root[..., None]], dim=-1)
         return torch.cat(
             [
                 self.angles / ANGLE_UNIT,
@@ -146,26 +150,14 @@ class _CaptureView:
                 rate,
                 self.off / POSITION_UNIT,
                 _smooth(self.off, _SMOOTHING_SIGMA) / POSITION_UNIT,
-                *way,
-                *self._certainty(),
+                way / _VELOCITY_UNIT,
+                height,
+                known.to(self.angles),
+                level[:, None].expand(-1, capture.frames, -1),
                 *self._world(),
             ],
             dim=-1,
         )
-
-    def _slow_way(self) -> list[Float[Tensor, "batch frames inputs"]]:
-        """Encode how the slow frame of the hips turns and travels, and its height."""
-        rate = _difference_frames(self.slow_heading[..., None])
-        way = rotations.rotate_about_y(_difference_frames(self.slow_root), -self.slow_heading)
-        height = (self.slow_root[..., 1:2] - _HIPS_HEIGHT) / ANGLE_UNIT
-        return [rate / _VELOCITY_UNIT, way[..., ::2] / _VELOCITY_UNIT, height]
-
-    def _certainty(self) -> list[Float[Tensor, "batch frames inputs"]]:
-        """Encode what was observed, and the sigmas of its noise."""
-        capture = self.capture
-        level = torch.log(torch.cat([capture.sigma, 3 * capture.sigma_root[:, None]], dim=-1).clamp_min(0.001)) + 3
-        known = torch.cat([capture.seen, capture.seen_root[..., None]], dim=-1)
-        return [known.to(self.angles), level[:, None].expand(-1, capture.frames, -1)]
 
     def _world(self) -> list[Float[Tensor, "batch frames inputs"]]:
         """Encode the world rotations and places of all joints in the slow frame of the hips: noise of places, which
@@ -190,12 +182,9 @@ class _CaptureView:
             _smooth(self.turn, _SMOOTHING_SIGMA) - self.turn + ANGLE_UNIT * turn
         )
         off = self.off + self.root_noise_share * (_smooth(self.off, _SMOOTHING_SIGMA) - self.off + POSITION_UNIT * off)
-        return self._unpack(angles, turn, off), contacts
-
-    def _unpack(self, angles: Tensor, turn: Tensor, off: Tensor) -> BodyPose:
         root = self.slow_root + rotations.rotate_about_y(off, self.slow_heading)
         packed = torch.cat([root, (self.slow_heading + turn[..., 0])[..., None], angles], dim=-1)
-        return BodyPose.unpack(packed)
+        return BodyPose.unpack(packed), contacts
 
 
 def _spread_over_angles(joints: Float[Tensor, "batch frames joints"]) -> Float[Tensor, "batch frames angles"]:
@@ -215,15 +204,8 @@ def _smooth(values: Float[Tensor, "batch frames width"], sigma: float) -> Float[
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class ConvDenoiser(checkpoints.LoadedModel):
+class ConvDenoiser(checkpoints.NetworkModel[DenoiserNetwork]):
     """A trained denoiser (see mapctl.protocols.Denoiser)."""
-
-    name: str
-    """Name under which it was loaded."""
-    network: DenoiserNetwork
-    """Network with its weights."""
-    card: checkpoints.Card
-    """Card of the weights."""
 
     def clean(self, capture: Capture) -> CaptureProposal:
         """Propose the motion of a capture of any length, piece by piece, each with a margin that it shares."""
@@ -243,6 +225,5 @@ class ConvDenoiser(checkpoints.LoadedModel):
 
 def load(name: str) -> ConvDenoiser:
     """Load the bundled denoiser by name, or one by its file or run folder; CheckpointError if there is none."""
-    with checkpoints.open_checkpoint(name, "denoiser") as (tensors, card):
-        network = checkpoints.build_network(DenoiserNetwork, DenoiserConfig.of_card(card.config), tensors)
+    network, card = checkpoints.load_network(name, "denoiser", DenoiserNetwork, DenoiserConfig)
     return ConvDenoiser(name, network, card)

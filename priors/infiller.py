@@ -164,7 +164,8 @@ class InfillerNetwork(nn.Module):
     def forward(self, image: PositionImage) -> ProposedPositions:
         """Fill an image; ours keeps known positions to the bit, an autoencoder makes all anew (Kaufmann et al. 2020,
         section 4.2)."""
-        shown = self._show(image)
+        # Joints that are never known are shown at their mean.
+        shown = torch.where(image.ever_known[:, None, :, None], image.places, self.mean)
         rows = self._rows(image, shown)
         rows = torch.cat([rows, _encode_masks(image)], dim=-1) if self.keeps_observed else rows
         with torch.autocast(rows.device.type, torch.bfloat16, enabled=self.reduced_precision):
@@ -176,10 +177,6 @@ class InfillerNetwork(nn.Module):
         if not self.keeps_observed:
             return ProposedPositions(self.mean + change, contacts)
         return ProposedPositions(torch.where(image.known[..., None], image.places, shown + change), contacts)
-
-    def _show(self, image: PositionImage) -> Float[Tensor, "batch frames joints 3"]:
-        """Return the image's places, with joints that are never known at their mean."""
-        return torch.where(image.ever_known[:, None, :, None], image.places, self.mean)
 
     def _rows(self, image: PositionImage, shown: Tensor) -> Float[Tensor, "batch frames rows"]:
         """Encode the image in about unit size; an autoencoder's unknown positions are 0, their mean (section 3.3)."""
@@ -208,15 +205,8 @@ def _count_frames_since(known: Tensor) -> Float[Tensor, "batch frames"]:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class ConvInfiller(checkpoints.LoadedModel, PositionInfiller):
+class ConvInfiller(checkpoints.NetworkModel[InfillerNetwork], PositionInfiller):
     """A trained infiller."""
-
-    name: str
-    """Name under which it was loaded."""
-    network: InfillerNetwork
-    """Network in evaluation mode."""
-    card: checkpoints.Card
-    """Card of the weights."""
 
     @torch.no_grad()
     def complete(self, image: PositionImage) -> ProposedPositions:
@@ -231,6 +221,5 @@ class ConvInfiller(checkpoints.LoadedModel, PositionInfiller):
 
 def load(name: str) -> ConvInfiller:
     """Load a trained infiller by its file or run folder; CheckpointError for anything else."""
-    with checkpoints.open_checkpoint(name, "infiller") as (tensors, card):
-        network = checkpoints.build_network(InfillerNetwork, InfillerConfig.of_card(card.config), tensors)
+    network, card = checkpoints.load_network(name, "infiller", InfillerNetwork, InfillerConfig)
     return ConvInfiller(name, network, card)

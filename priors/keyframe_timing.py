@@ -58,15 +58,8 @@ class KeyframeTimingNetwork(nn.Module):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class KeyframeTiming(checkpoints.LoadedModel):
+class KeyframeTiming(checkpoints.NetworkModel[KeyframeTimingNetwork]):
     """A fitted regression, as controllers get it."""
-
-    name: str
-    """Name under which it was loaded."""
-    network: KeyframeTimingNetwork
-    """Network with its weights."""
-    card: checkpoints.Card
-    """Card of the weights."""
 
     def estimate_seconds(
         self, features: Float[Tensor, "pairs features"], metres: Float[Tensor, " pairs"]
@@ -78,6 +71,7 @@ class KeyframeTiming(checkpoints.LoadedModel):
 
 def load(name: str) -> KeyframeTiming:
     """The bundled timing by name, or a trained one by its file or run folder; CheckpointError if there is none."""
-    with checkpoints.open_checkpoint(name, "keyframe-timing", called="keyframe timing") as (tensors, card):
-        network = checkpoints.build_network(KeyframeTimingNetwork, KeyframeTimingConfig.of_card(card.config), tensors)
+    network, card = checkpoints.load_network(
+        name, "keyframe-timing", KeyframeTimingNetwork, KeyframeTimingConfig, called="keyframe timing"
+    )
     return KeyframeTiming(name, network, card)

@@ -142,7 +142,8 @@ class PathNetwork(nn.Module):
         steps, height, contacts, shares = out.split([2, 1, 2, len(_ANCHORS) + 1], dim=-1)
         return RootTrajectory(
             _mix_anchored_steps(motion, shares) + _STEP_UNIT * steps,
-            _stand_on_floor(motion) + _HEIGHT_UNIT * height[..., 0],
+            # Of hips whose lower toe stands.
+            TOE_REST_HEIGHT - motion.places[..., list(TOE_JOINTS), 1].amin(dim=-1) + _HEIGHT_UNIT * height[..., 0],
             _CONTACT_UNIT * contacts,
         )
 
@@ -168,21 +169,9 @@ def _mix_anchored_steps(motion: LocalMotion, shares: Float[Tensor, "batch frames
     return (torch.softmax(shares, dim=-1)[..., :-1, None] * steps).sum(dim=-2)
 
 
-def _stand_on_floor(motion: LocalMotion) -> Float[Tensor, "batch frames"]:
-    """Return the height of the hips whose lower toe stands, metres."""
-    return TOE_REST_HEIGHT - motion.places[..., list(TOE_JOINTS), 1].amin(dim=-1)
-
-
 @dataclass(frozen=True, eq=False, repr=False)
-class ConvPathPredictor(checkpoints.LoadedModel, PathPredictor):
+class ConvPathPredictor(checkpoints.NetworkModel[PathNetwork], PathPredictor):
     """A trained path predictor."""
-
-    name: str
-    """Name under which it was loaded."""
-    network: PathNetwork
-    """Network in evaluation mode."""
-    card: checkpoints.Card
-    """Card of the weights."""
 
     @torch.no_grad()
     def predict(self, motion: LocalMotion) -> RootTrajectory:
@@ -198,6 +187,5 @@ class ConvPathPredictor(checkpoints.LoadedModel, PathPredictor):
 def load(name: str = "path") -> ConvPathPredictor:
     """Load the bundled path predictor, or a trained one by its file or run folder; CheckpointError for anything
     else."""
-    with checkpoints.open_checkpoint(name, "path") as (tensors, card):
-        network = checkpoints.build_network(PathNetwork, PathConfig.of_card(card.config), tensors)
+    network, card = checkpoints.load_network(name, "path", PathNetwork, PathConfig)
     return ConvPathPredictor(name, network, card)

@@ -173,15 +173,22 @@ class PoseTransformerNetwork(nn.Module):
         aim = rotations.rotate_about_y(motion.targets - world[..., list(EFFECTORS), :], -motion.heading[..., None])
         aim = torch.where(known.effectors[..., None], aim / _TARGET_UNIT, 0.0)
         places = (local - self.mean_position) / self.std_position
-        flags = _encode_flags(known)
+        # Where the hips are and face, seen from the first frame.
+        ground, facing = motion.root_position[..., ::2], motion.heading
+        travelled = rotations.rotate_ground(ground - ground[:, :1], -facing[:, :1]) / _TRAVEL_UNIT
+        turned = (facing - facing[:, :1])[..., None]
         return torch.cat(
             [
                 *(each.flatten(-2) for each in (six, places, step, aim)),
                 turn,
                 2 * motion.contacts - 1,
-                flags,
-                _encode_times(known),
-                _encode_travel(motion),
+                known.rotations.float(),
+                torch.stack([known.heading, known.ground, known.height, known.path], dim=-1).float(),
+                known.effectors.float(),
+                *map(_encode_distance, (known.rotations.any(dim=-1), known.ground, known.effectors.any(dim=-1))),
+                travelled,
+                torch.sin(turned),
+                torch.cos(turned),
             ],
             dim=-1,
         )
@@ -283,26 +290,8 @@ def _difference(values: Float[Tensor, "batch frames *rest"]) -> Float[Tensor, "b
     return torch.diff(values, dim=1, prepend=values[:, :1])
 
 
-def _encode_flags(known: KnownParts) -> Float[Tensor, "batch frames flags"]:
-    told = torch.stack([known.heading, known.ground, known.height, known.path], dim=-1)
-    return torch.cat([known.rotations, told, known.effectors], dim=-1).float()
-
-
-def _encode_travel(motion: PartialMotion) -> Float[Tensor, "batch frames 4"]:
-    """Encode where the hips are and face, seen from the first frame."""
-    ground, facing = motion.root_position[..., ::2], motion.heading
-    travelled = rotations.rotate_ground(ground - ground[:, :1], -facing[:, :1]) / _TRAVEL_UNIT
-    turned = facing - facing[:, :1]
-    return torch.cat([travelled, torch.sin(turned)[..., None], torch.cos(turned)[..., None]], dim=-1)
-
-
-def _encode_times(known: KnownParts) -> Float[Tensor, "batch frames times"]:
-    """Encode frames since and until a rotation, the hips' place, and a target were known, each on three scales."""
-    told = (known.rotations.any(dim=-1), known.ground, known.effectors.any(dim=-1))
-    return torch.cat([_encode_distance(each) for each in told], dim=-1)
-
-
 def _encode_distance(known: Bool[Tensor, "batch frames"]) -> Float[Tensor, "batch frames 6"]:
+    """Encode frames since and until one was known, each on three scales."""
     frame = torch.arange(known.shape[1], device=known.device)
     before, after = frame - last_observed(known), next_observed(known) - frame
     none = ~known.any(dim=1)[:, None]
@@ -324,15 +313,8 @@ _PARTNERS = CANONICAL.mirror_partners()
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class PoseTransformer(checkpoints.LoadedModel, Inbetweener):
+class PoseTransformer(checkpoints.NetworkModel[PoseTransformerNetwork], Inbetweener):
     """A trained pose transformer."""
-
-    name: str
-    """Name under which it was loaded."""
-    network: PoseTransformerNetwork
-    """Network in evaluation mode."""
-    card: checkpoints.Card
-    """Card of the weights."""
 
     @property
     def takes_partial_keys(self) -> bool:
@@ -345,7 +327,10 @@ class PoseTransformer(checkpoints.LoadedModel, Inbetweener):
 
         Gaps of more than MAX_GAP_FRAMES in which nothing is known stay interpolated.
         """
-        origin = _find_origin(query)
+        # Far from the world's origin single precision is coarse.
+        known = (~query.missing.root).nonzero()[:, 0]
+        origin = query.motion.root_position[known[0] if len(known) else 0].clone()
+        origin[1] = 0.0
         motion = self._show(_move(query, -origin))
         gaps = _find_silent_gaps(query)
         longest = max((stop - start for start, stop in gaps if stop - start <= MAX_GAP_FRAMES), default=0)
@@ -411,21 +396,18 @@ class PoseTransformer(checkpoints.LoadedModel, Inbetweener):
     def _propose_windows(self, motion: PartialMotion, longest: int) -> ProposedPoses:
         """Propose window by window, with room for the longest gap; where two overlap, one fades into the other."""
         frames = motion.heading.shape[1]
-        joined, weights = _rows_of(motion), torch.zeros(frames)
+        logits = contacts.to_logits(motion.contacts > 0.5)
+        spread = motion.root_position.new_full((*motion.heading.shape, _JOINTS, 2), -9.0)
+        joined = _pack(ProposedPoses(motion.root_position, motion.local_matrices(), logits, spread))
+        weights = torch.zeros(frames)
         for first, stop in _lay_windows(~motion.known.everything[0], max(_MAX_WINDOW, longest + 2 * _CONTEXT)):
             rows = _pack(self.network(motion.slice(first, stop)))
-            fade = _fade_in(first, weights, stop)
+            shared, fade = int(weights[first:stop].sum()), torch.ones(stop - first)
+            if shared > 1:  # rising where another window has been before
+                fade[:shared] = torch.linspace(0, 1, shared)
             joined[:, first:stop] = torch.lerp(joined[:, first:stop], rows, fade[:, None])
             weights[first:stop] = 1.0
         return _unpack(joined)
-
-
-def _find_origin(query: GapQuery) -> Float[Tensor, " 3"]:
-    """Return the hips' first known place on the ground: far from the world's origin single precision is coarse."""
-    known = (~query.missing.root).nonzero()[:, 0]
-    origin = query.motion.root_position[known[0] if len(known) else 0].clone()
-    origin[1] = 0.0
-    return origin
 
 
 def _move(query: GapQuery, shift: Float[Tensor, " 3"]) -> GapQuery:
@@ -451,15 +433,6 @@ def _lay_windows(unknown: Bool[Tensor, " frames"], longest: int) -> Iterator[tup
         yield first, stop
 
 
-def _fade_in(first: int, weights: Float[Tensor, " frames"], stop: int) -> Float[Tensor, " window"]:
-    """Return the share of a window by frame: rising where another one has been before."""
-    shared = int(weights[first:stop].sum())
-    fade = torch.ones(stop - first)
-    if shared > 1:
-        fade[:shared] = torch.linspace(0, 1, shared)
-    return fade
-
-
 def _find_silent_gaps(query: GapQuery) -> list[tuple[int, int]]:
     """Return first frames and one past the last of gaps in which nothing is told."""
     silent = query.nothing_known
@@ -468,13 +441,6 @@ def _find_silent_gaps(query: GapQuery) -> list[tuple[int, int]]:
     if query.keep_trajectory:
         silent = silent & ~query.missing.root
     return [(start, stop) for _, start, stop in true_intervals(silent[:, None])]
-
-
-def _rows_of(motion: PartialMotion) -> Float[Tensor, "batch frames rows"]:
-    """Return rows as of a proposal that is the motion itself."""
-    logits = contacts.to_logits(motion.contacts > 0.5)
-    spread = motion.root_position.new_full((*motion.heading.shape, CANONICAL.num_joints, 2), -9.0)
-    return _pack(ProposedPoses(motion.root_position, motion.local_matrices(), logits, spread))
 
 
 def _pack(poses: ProposedPoses) -> Float[Tensor, "batch frames rows"]:
@@ -512,6 +478,5 @@ def load(name: str = "transformer") -> PoseTransformer:
     """Load the bundled pose transformer, or a trained one by its file or run folder; CheckpointError for anything
     else.
     """
-    with checkpoints.open_checkpoint(name, "pose-transformer") as (tensors, card):
-        network = checkpoints.build_network(PoseTransformerNetwork, PoseTransformerConfig.of_card(card.config), tensors)
+    network, card = checkpoints.load_network(name, "pose-transformer", PoseTransformerNetwork, PoseTransformerConfig)
     return PoseTransformer(name, network, card)

@@ -1,14 +1,11 @@
-"""The adversarial refiner: a residual LSTM that makes sampled motion look captured (Wang et al. 2019, section 4.2, Eq.
-11).
+"""The adversarial refiner: a residual LSTM after which sampled motion looks captured (Wang et al. 2019, section 4.2,
+Eq. 11).
 
 State and end effectors through a layer, an LSTM and a layer give what is added to the state. Two departures: the first
-layer also sees some frames ahead, since tremble cannot be told from motion without what follows; and the residual is
-bounded, so that no input can make it explode. Contact bits are in its input and in its output (section 4.3).
-
-Positions and velocities of chosen joints, differentiable: inputs of the refiner and its critic beside the state.
-
-Wang et al. 2019, section 4.2.1: the density's features say little of where hands and feet end up, and that is where a
-viewer looks. By the one forward kinematics of the project.
+layer also sees some frames ahead, since tremble cannot be distinguished from motion without what follows; and the
+residual is bounded, so that no input can make it explode. Contact bits are in its input and in its output (section
+4.3). End effectors are in the input because the density's features say little of where hands and feet end up, and that
+is where a viewer looks (section 4.2.1).
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -105,7 +102,7 @@ class RefinerNetwork(nn.Module):
 
     def __init__(self, config: RefinerConfig, *, mean: Tensor, std: Tensor, reach_mean: Tensor, reach_std: Tensor):
         """Take statistics of the features (size,) and of `compute_end_effectors` (channels,); RuntimeError for other
-        widths. widths."""
+        widths."""
         super().__init__()
         self.config = config
         reach = count_channels(config.joints)
@@ -145,15 +142,8 @@ class RefinerNetwork(nn.Module):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class LstmRefiner(checkpoints.LoadedModel, Refiner):
+class LstmRefiner(checkpoints.NetworkModel[RefinerNetwork], Refiner):
     """A trained refiner."""
-
-    name: str
-    """Name under which it was loaded."""
-    network: RefinerNetwork
-    """Network with its weights."""
-    card: checkpoints.Card
-    """Card of the weights."""
 
     def stream(self, pieces: Iterable[Float[Tensor, "batch _ size"]]) -> Iterator[Float[Tensor, "batch _ size"]]:
         """Refine consecutive pieces, `lookahead` frames behind their input, in memory that does not grow.

@@ -1,45 +1,28 @@
-"""The stitcher as an in-betweener: short gaps between whole poses, in as many ways as are drawn.
+"""The stitcher: short gaps between whole poses, in as many ways as are drawn (Ren et al. 2024, sections 3.2, 3.3, 4.1).
 
-Networks of dual posture stitching (Ren et al. 2024, sections 3.3 and 4.1), both sides at once.
+Two generators, one from each pose, step towards each other until they overlap; both sides are computed in one call, on
+tensors with a leading axis of two, forward first, and share no weights. Each side encodes its current frame, the other
+side's latest frame, and where and when that is. An LSTM and heads give the distribution of the latent now and on
+arrival, and a decoder LSTM with experts gated by the phase gives the next frame. The sides are then joined: the overlap
+is blended, and what they disagree on in position is spread over the whole transition, where the paper's blend of the
+overlap alone would slide both feet. Constraints within a gap are met by Gauss-Newton over the latent (`fit_shared`).
 
-Each side sees its current frame, how far the frame is to which it goes, that frame, and when it is to be there. An
-LSTM encodes them, heads tell the distribution of the latent now and on arrival, and a decoder LSTM with experts gated
-by the phase makes the next frame. Departures from what is printed:
+Departures from what is printed:
 
-- The paper's encoder sees the two frames and never what comes between, so that its latent can tell nothing of it. Here
-  a posterior, in training alone, sees the true in-between, and the paper's encoder is the prior that it is held to.
+- The paper's encoder sees the two frames and not what comes between. Here a posterior, in training alone, sees the true
+  in-between, and the paper's encoder is the prior that it is held to.
 - Most of the latent belongs to the whole transition and is the same for both sides, so that they agree on which foot
-  goes first by construction; the rest, a frame's, changes slowly.
-- What the network makes is added to a step between the one that led to the frame, where that is known, and the one that
-  would lead to the target at an even pace. Untrained, it interpolates bare poses.
-- The decoder is given the offset and the encoder's output too, not the embeddings and the latent alone; the experts
-  are given what both sides share of the latent.
-- Both sides step at once, and arrival counts by the way to the target in force (see `priors.stitcher`).
-- Widths make 2 million weights a generator, not 13.4. Features of `mapctl.features` (68), of frames and of changes,
-  replace root positions and quaternions, and the head has as many numbers, not 88.
-
-Layers of which there are two, the forward and the backward side's, computed in one call.
-
-The sides share no weights; tensors have a leading axis of two, forward first.
-
-The posterior of a transition's latent, which sees the truth: in training alone, and in no file of weights.
-
-Ren et al. 2024 have none: their encoder (section 3.3) sees the ends, and nothing of what comes between.
-
-Both sides of a transition, walked towards each other (Ren et al. 2024, section 3.2 and Eq. 3).
-
-Both step at once, each towards the other's latest frame, so that one call serves both; the paper has them in turn. Once
-they have met, each goes on towards the true far end for the frames of the overlap. Features of the backward side are
-those of the motion run backwards (`mapctl.features.reversed_features`).
-
-Two sides joined to one transition: their overlap blended, and what they disagree on in place spread over all of it.
-
-Ren et al. 2024, section 3.2, blend the overlap alone. Ten centimetres between two sides blended over eight frames would
-slide both feet; spread over the whole way they are a slightly longer or shorter walk.
+  goes first; the rest, a frame's, changes slowly.
+- The output is added to a step between the one that led to the frame, where that is known, and the one that would lead
+  to the target at an even pace. Untrained, the network interpolates bare poses.
+- The decoder is given the offset and the encoder's output too; the experts are given the shared latent.
+- Both sides step at once, and arrival is measured to the target in force.
+- Widths give 2 million weights a generator, not 13.4. Features of `mapctl.features` (68), of frames and of changes,
+  replace root positions and quaternions.
 """
 
 import math
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
@@ -109,20 +92,26 @@ def multiply_in_bfloat16(*networks: nn.Module, wanted: bool = True) -> Iterator[
 
 
 class SidedLayers(nn.Module):
-    """Affine layers with ELU between them."""
+    """Affine layers with ELU between them, of one or of several experts: blending what these give before each
+    nonlinearity is blending their weights (Zhang et al. 2018)."""
 
-    def __init__(self, *widths: int):
+    def __init__(self, *widths: int, experts: int = 1):
         super().__init__()
-        self.layers = nn.ModuleList(SidedLinear(one, other) for one, other in pairwise(widths))
+        self.experts = experts
+        self.layers = nn.ModuleList(SidedLinear(one, experts * other) for one, other in pairwise(widths))
 
-    def forward(self, x: Float[Tensor, "2 batch inputs"]) -> Float[Tensor, "2 batch outputs"]:
-        """Return the outputs of each side."""
+    def forward(
+        self, x: Float[Tensor, "2 batch inputs"], share: Float[Tensor, "2 batch experts"] | None = None
+    ) -> Float[Tensor, "2 batch outputs"]:
+        """Return the outputs of each side, for the experts' shares."""
         for number, layer in enumerate(self.layers):
             x = layer(elu(x) if number else x)
+            if share is not None:
+                x = (share[..., None] * x.unflatten(-1, (self.experts, -1))).sum(dim=-2)
         return x
 
     def shrink_last(self, share: float) -> None:
-        """Shrink what the last layer makes at first."""
+        """Shrink the initial output of the last layer."""
         with torch.no_grad():
             list(self.layers.parameters())[-2].mul_(share)
 
@@ -144,30 +133,6 @@ class SidedLstm(nn.Module):
         enter, forget, leave, new = self.gates(torch.cat([x, output], dim=-1)).chunk(4, dim=-1)
         cell = torch.sigmoid(forget) * cell + torch.sigmoid(enter) * torch.tanh(new)
         return torch.sigmoid(leave) * torch.tanh(cell), cell
-
-
-class SidedExperts(nn.Module):
-    """Affine layers whose weights are a blend of several experts' (Zhang et al. 2018); blending what the experts make
-    before each nonlinearity is the same."""
-
-    def __init__(self, experts: int, widths: Sequence[int]):
-        super().__init__()
-        self.experts = experts
-        self.layers = nn.ModuleList(SidedLinear(one, experts * other) for one, other in pairwise(widths))
-
-    def forward(
-        self, x: Float[Tensor, "2 batch inputs"], share: Float[Tensor, "2 batch experts"]
-    ) -> Float[Tensor, "2 batch outputs"]:
-        """Return the outputs of each side, for the experts' shares."""
-        for number, layer in enumerate(self.layers):
-            each = layer(elu(x) if number else x).unflatten(-1, (self.experts, -1))
-            x = (share[..., None] * each).sum(dim=-2)
-        return x
-
-    def shrink_last(self, share: float) -> None:
-        """Shrink what the last layer makes at first."""
-        with torch.no_grad():
-            list(self.layers.parameters())[-2].mul_(share)
 
 
 PHASES = 4
@@ -220,32 +185,62 @@ class StitcherConfig(NetworkConfig):
 
 
 @dataclass(frozen=True, eq=False)
-class Situation:
-    """What both sides know of one frame; features are in physical units, in each side's own sense of time."""
+class Frame:
+    """A frame of both sides in physical units, each in its side's own sense of time."""
 
     features: Float[Tensor, "2 batch size"]
-    """Of the current frames."""
+    """Features."""
     change: Float[Tensor, "2 batch pose"]
-    """By how much the pose became another in the step that led there."""
+    """Change of the pose in the step that led there."""
     paced: Float[Tensor, "2 batch"]
-    """1 where change, step, turn and contacts of the current frame are known."""
-    target: Float[Tensor, "2 batch size"]
-    """Features of the frames that they go to, whose step, turn and contacts tell how motion goes on from there."""
-    target_change: Float[Tensor, "2 batch pose"]
-    """By how much the pose becomes another in the step on from there."""
-    target_paced: Float[Tensor, "2 batch"]
-    """1 where these are known."""
+    """1 where change, step, turn and contacts are known."""
+
+    def exchange(self) -> "Frame":
+        """Return for each side the other's frame in its own sense of time: the step and turn that led there lead on
+        from there."""
+        features = self.features.flip(0)
+        step, turn = _pick_pace(features)
+        back = -rotations.rotate_ground(step, -turn)
+        features = torch.cat([back, -turn[..., None], features[..., POSE.start :]], dim=-1)
+        return Frame(features, -self.change.flip(0), self.paced.flip(0))
+
+
+@dataclass(frozen=True, eq=False)
+class Situation:
+    """Input of both sides for one frame."""
+
+    now: Frame
+    """Current frames."""
+    target: Frame
+    """Frames to which they go."""
     place: Float[Tensor, "2 batch 2"]
-    """Where the target is, seen from the current frame in its heading frame, metres."""
+    """Position of the target, seen from the current frame in its heading frame, metres."""
     turn: Float[Tensor, "2 batch"]
-    """By how much the target's heading is another, radians in -pi to pi."""
+    """Difference of the headings, radians in -pi to pi."""
     left: Float[Tensor, "2 batch"]
     """Frames to the target."""
+
+    @staticmethod
+    def of(now: Frame, at: GroundPose, target: Frame, target_at: GroundPose, left: float) -> "Situation":
+        """See from each side the frame that is given for the other."""
+        away = target_at.position_xz.flip(0) - at.position_xz
+        return Situation(
+            now,
+            target.exchange(),
+            rotations.rotate_ground(away, -at.heading),
+            rotations.wrap_angle(target_at.heading.flip(0) - at.heading),
+            torch.full_like(now.paced, left),
+        )
+
+    def on_arrival(self) -> "Situation":
+        """Return the input if the target were reached."""
+        nil = torch.zeros_like(self.left)
+        return Situation(self.target, self.target, torch.zeros_like(self.place), nil, nil)
 
 
 @dataclass(frozen=True, eq=False)
 class Memory:
-    """What the sides remember from frame to frame."""
+    """Memory of the sides from frame to frame."""
 
     encoder: tuple[Tensor, Tensor]
     decoder: tuple[Tensor, Tensor]
@@ -254,14 +249,11 @@ class Memory:
 
     def keep(self, before: "Memory", active: Float[Tensor, "2 batch"]) -> "Memory":
         """Return this memory where a side is active, and the one before elsewhere."""
-        on = active[..., None]
-
-        def pick(now: Tensor, then: Tensor) -> Tensor:
-            return on * now + (1 - on) * then
-
-        encoder = pick(self.encoder[0], before.encoder[0]), pick(self.encoder[1], before.encoder[1])
-        decoder = pick(self.decoder[0], before.decoder[0]), pick(self.decoder[1], before.decoder[1])
-        return Memory(encoder, decoder, pick(self.phase, before.phase))
+        pairs = zip(
+            (*self.encoder, *self.decoder, self.phase), (*before.encoder, *before.decoder, before.phase), strict=True
+        )
+        parts = [active[..., None] * now + (1 - active[..., None]) * then for now, then in pairs]
+        return Memory((parts[0], parts[1]), (parts[2], parts[3]), parts[4])
 
 
 @dataclass(frozen=True, eq=False)
@@ -323,7 +315,7 @@ class StitcherNetwork(nn.Module):
         self.now = SidedLayers(config.encoder, config.head, 2 * config.own)
         self.arrived = SidedLayers(config.encoder, config.head, 2 * config.own)
         self.decoder = SidedLstm(told + config.shared + config.own, config.decoder)
-        self.experts = SidedExperts(config.experts, (config.decoder + config.shared, *config.expert, LAYOUT.size))
+        self.experts = SidedLayers(config.decoder + config.shared, *config.expert, LAYOUT.size, experts=config.experts)
         self.carry = nn.Parameter(torch.zeros(2, SIDES, 1, POSE.stop))
         self.gate = SidedLayers(PHASES, *config.gate, config.experts)
         self.first_phase = SidedLayers(seen, config.phase, PHASES)
@@ -345,16 +337,10 @@ class StitcherNetwork(nn.Module):
     def embed(self, now: Situation) -> Float[Tensor, "2 batch seen"]:
         """Embed state, offset and target, each with the time to arrival (Eq. 11 and 12)."""
         time = self._wave(now.left)
-        pose = (now.target - now.features)[..., POSE] / self.std[POSE]
+        pose = (now.target.features - now.now.features)[..., POSE] / self.std[POSE]
         offset = torch.cat([now.place, now.turn[..., None], pose], dim=-1)
-        return torch.cat(
-            [
-                self.state(self._normalise(now.features, now.change, now.paced)) + time,
-                self.offset(offset) + time,
-                self.target(self._normalise(now.target, now.target_change, now.target_paced)) + time,
-            ],
-            dim=-1,
-        )
+        parts = (self.state(self._normalise(now.now)), self.offset(offset), self.target(self._normalise(now.target)))
+        return torch.cat([part + time for part in parts], dim=-1)
 
     def begin(self, seen: Float[Tensor, "2 batch seen"]) -> Memory:
         """Return the memory before the first frame."""
@@ -375,20 +361,7 @@ class StitcherNetwork(nn.Module):
         """Encode a frame at which a side has `arrived` by some share; also returns the LSTM's memory and the prior's
         distribution of the frame's latent: that of now, and by this share that on arrival (Eq. 1)."""
         output, cell = self.encoder(seen, memory.encoder)
-        # As if it were there: the target in place of the current frame, from the memory before this frame.
-        there = self.embed(
-            Situation(
-                now.target,
-                now.target_change,
-                now.target_paced,
-                now.target,
-                now.target_change,
-                now.target_paced,
-                torch.zeros_like(now.place),
-                torch.zeros_like(now.turn),
-                torch.zeros_like(now.left),
-            )
-        )
+        there = self.embed(now.on_arrival())
         arrival = Gaussian.of(self.arrived(self.encoder(there, memory.encoder)[0]))
         return output, (output, cell), Gaussian.of(self.now(output)).blend(arrival, arrived)
 
@@ -408,7 +381,7 @@ class StitcherNetwork(nn.Module):
         made = self.experts(torch.cat([output, latent[..., : self.config.shared]], dim=-1), share)
         pace, change = self._lean(now)
         pace = pace + made[..., PACE] * self.std[PACE]
-        pose = now.features[..., POSE] + change + made[..., POSE].clamp(-_CLAMP, _CLAMP) * self.change[POSE]
+        pose = now.now.features[..., POSE] + change + made[..., POSE].clamp(-_CLAMP, _CLAMP) * self.change[POSE]
         logits = made[..., POSE.stop :]
         features = torch.cat([pace, pose, torch.sigmoid(logits)], dim=-1)
         step = self.next_phase(torch.cat([(features.detach() - self.mean) / self.std, memory.phase], dim=-1))
@@ -417,32 +390,24 @@ class StitcherNetwork(nn.Module):
     def _lean(self, now: Situation) -> tuple[Float[Tensor, "2 batch pace"], Float[Tensor, "2 batch pose"]]:
         """Return the step, turn and change of pose that what is made is added to: between those that led to the frame
         and those that lead to the target at an even pace."""
-        kept, even = self._keep_pace(now), 1 / now.left.clamp_min(1)[..., None]
+        left = now.left.clamp_min(1)[..., None]
+        even = 1 / left
+        # None of a bare pose's, and none in the last step to the target.
+        share = torch.sigmoid(4 * (self.carry[0] + self.carry[1] * left / self.config.longest))
+        kept = now.now.paced[..., None] * share * (1 - 1 / left)
         pace = torch.cat([now.place, now.turn[..., None]], dim=-1) * even
-        change = (now.target - now.features)[..., POSE] * even
+        change = (now.target.features - now.now.features)[..., POSE] * even
         return (
-            torch.lerp(pace, now.features[..., PACE], kept[..., PACE]),
-            torch.lerp(change, now.change, kept[..., POSE]),
+            torch.lerp(pace, now.now.features[..., PACE], kept[..., PACE]),
+            torch.lerp(change, now.now.change, kept[..., POSE]),
         )
 
-    def _keep_pace(self, now: Situation) -> Float[Tensor, "2 batch continuous"]:
-        """Return the share of the step that led to a frame in the one on from there: none of a bare pose's, and none
-        in the last step to the target."""
-        left = now.left.clamp_min(1)[..., None]
-        share = torch.sigmoid(4 * (self.carry[0] + self.carry[1] * left / self.config.longest))
-        return now.paced[..., None] * share * (1 - 1 / left)
-
-    def _normalise(
-        self,
-        features: Float[Tensor, "2 batch size"],
-        change: Float[Tensor, "2 batch pose"],
-        paced: Float[Tensor, "2 batch"],
-    ) -> Float[Tensor, "2 batch state"]:
-        """Return features and change in units of their spread, what is unknown of a bare pose at zero, and whether it
-        is."""
-        known = paced[..., None]
-        scaled = (features - self.mean) / self.std
-        moved = (change / self.change[POSE]).clamp(-_CLAMP, _CLAMP)
+    def _normalise(self, frame: Frame) -> Float[Tensor, "2 batch state"]:
+        """Return features and change in units of their spread, unknown parts of a bare pose at zero, and a flag of
+        them."""
+        known = frame.paced[..., None]
+        scaled = (frame.features - self.mean) / self.std
+        moved = (frame.change / self.change[POSE]).clamp(-_CLAMP, _CLAMP)
         return torch.cat(
             [scaled[..., PACE] * known, scaled[..., POSE], scaled[..., POSE.stop :] * known, moved * known, known],
             dim=-1,
@@ -550,8 +515,6 @@ def _draw_noise(
     return torch.stack(slow, dim=2)
 
 
-Frame = tuple[Float[Tensor, "2 batch size"], Float[Tensor, "2 batch pose"], Float[Tensor, "2 batch"]]
-"""Features, the change of pose that led to them, and 1 where change, step, turn and contacts are known."""
 _OVERLAP_SHARE, _MOST_OVERLAP = 8, 6  # K is so much of the frames, and no more
 
 
@@ -568,15 +531,18 @@ class Ends:
     turn: Float[Tensor, "batch"]
     """By how much its heading is another, radians."""
 
-    @property
-    def paced(self) -> Float[Tensor, "2 batch"]:
-        """1 where step, turn and contacts of the end are known: not of a bare pose, without a frame before it."""
-        return self.present[:, :, -2] if self.present.shape[2] > 1 else torch.zeros_like(self.present[:, :, 0])
+    def frame(self, number: int) -> Frame:
+        """Return a frame, of which change and pace are known where the one before it is; a negative number counts from
+        the end."""
+        now, before = self.features[:, :, number], number % self.features.shape[2] - 1
+        if before < 0:
+            return Frame(now, torch.zeros_like(now[..., POSE]), torch.zeros_like(self.present[:, :, 0]))
+        return Frame(now, (now - self.features[:, :, before])[..., POSE], self.present[:, :, before])
 
 
 @runtime_checkable
 class Latents(Protocol):
-    """Where latents come from."""
+    """Source of latents: drawn before, or in training also a posterior's."""
 
     def share(self, prior: Gaussian, seen: Float[Tensor, "2 batch seen"]) -> Float[Tensor, "batch shared"]:
         """What both sides share over the transition."""
@@ -606,12 +572,6 @@ class Sides:
     at_ends: Float[Tensor, "sides batch 4"]
     """Phases of the ends themselves."""
 
-    @property
-    def overlap(self) -> tuple[int, int]:
-        """First and last frame, counted from the first pose, that both sides made; none if the first is the later."""
-        made = self.features.shape[2]
-        return self.frames - made, made
-
     def place_joints(self) -> Float[Tensor, "sides batch made joints 3"]:
         """Place the joints, metres, seen from the first end."""
         shape = self.features.shape[:2]
@@ -634,83 +594,39 @@ def walk_sides(network: StitcherNetwork, ends: Ends, frames: int, latents: Laten
 
 def walk_stepwise(network: StitcherNetwork, ends: Ends, frames: int, latents: Latents) -> Generator[None, None, Sides]:
     """Walk both sides as `walk_sides`, a frame at a time."""
-    made = count_made(network, frames)
-    memory, shared, at = yield from _enter(network, ends, frames, latents)
-    walker = _Walker(network, ends, frames, latents, shared, at)
-    standing, rows = _Standing(*_pick_end(ends), at, memory), []
-    for step in range(made):
-        left = frames - 2 * step
-        standing, logits = walker.step(standing, step, left)
-        yield
-        rows.append((standing.now, logits, standing.at.position_xz, standing.at.heading, standing.memory.phase))
-    columns = (torch.stack(column, dim=2) for column in zip(*rows, strict=True))
-    return Sides(frames, *columns, at_ends=memory.phase)
-
-
-@dataclass(frozen=True, eq=False)
-class _Standing:
-    """Where both sides are."""
-
-    now: Float[Tensor, "2 batch size"]
-    change: Float[Tensor, "2 batch pose"]
-    paced: Float[Tensor, "2 batch"]
-    at: GroundPose
-    memory: Memory
-
-
-@dataclass(frozen=True, eq=False)
-class _Walker:
-    """Steps of both sides at once."""
-
-    network: StitcherNetwork
-    ends: Ends
-    frames: int
-    latents: Latents
-    shared: Float[Tensor, "batch shared"]
-    far_at: GroundPose
-
-    def step(self, standing: _Standing, step: int, left: int) -> tuple[_Standing, Tensor]:
-        """Take one step of each side towards the other, `left` frames away, or towards the far end once they have met;
-        also returns the contacts' logits."""
-        network, memory, paced = self.network, standing.memory, standing.paced
-        here = standing.now, standing.change, paced
-        aligned = left >= 1
-        target, target_at = (here, standing.at) if aligned else (_pick_end(self.ends), self.far_at)
-        left = left if aligned else self.frames - step
-        situation = _look(here, standing.at, target, target_at, float(left))
+    zero = torch.zeros_like(ends.place)
+    end, ends_at = ends.frame(-1), GroundPose(torch.stack([zero, ends.place]), torch.stack([zero[:, 0], ends.turn]))
+    memory, shared = yield from _enter(network, ends, ends_at, frames, latents)
+    here, at, first_phase, rows = end, ends_at, memory.phase, []
+    for step in range(count_made(network, frames)):
+        # Towards the other side, or towards the far end once they have met.
+        left, target, target_at = frames - 2 * step, here, at
+        if left < 1:
+            left, target, target_at = frames - step, end, ends_at
+        situation = Situation.of(here, at, target, target_at, float(left))
         seen = network.embed(situation)
-        arrived = torch.full_like(paced, step / (step + left))  # by the way to the target in force
+        arrived = torch.full_like(here.paced, step / (step + left))
         encoded, encoder, prior = network.encode(seen, situation, memory, arrived)
-        own = self.latents.own(prior, encoded, step)
-        latent = torch.cat([self.shared.expand(2, -1, -1), own], dim=-1)
+        latent = torch.cat([shared.expand(2, -1, -1), latents.own(prior, encoded, step)], dim=-1)
         now, logits, memory = network.decode(seen, encoded, latent, situation, memory, encoder)
-        change, at = (now - standing.now)[..., POSE], standing.at.displace(*_pick_pace(now))
-        return _Standing(now, change, torch.ones_like(paced), at, memory), logits
-
-
-def reverse_sense(features: Float[Tensor, "*batch size"]) -> Float[Tensor, "*batch size"]:
-    """Return single frames as who walks the other way reads them: the step and turn that led there lead on from
-    there."""
-    step, turn = _pick_pace(features)
-    back = -rotations.rotate_ground(step, -turn)
-    return torch.cat([back, -turn[..., None], features[..., LAYOUT.slices["root_height"].start :]], dim=-1)
+        at = at.displace(*_pick_pace(now))
+        here = Frame(now, (now - here.features)[..., POSE], torch.ones_like(here.paced))
+        yield
+        rows.append((now, logits, at.position_xz, at.heading, memory.phase))
+    columns = (torch.stack(column, dim=2) for column in zip(*rows, strict=True))
+    return Sides(frames, *columns, at_ends=first_phase)
 
 
 def _enter(
-    network: StitcherNetwork, ends: Ends, frames: int, latents: Latents
-) -> Generator[None, None, tuple[Memory, Float[Tensor, "batch shared"], GroundPose]]:
-    """Walk through the frames before each end; returns the memory there, what is shared and where the ends are."""
-    context = ends.features.shape[2]
-    zero = torch.zeros_like(ends.place)
-    at = GroundPose(torch.stack([zero, ends.place]), torch.stack([zero[:, 0], ends.turn]))
-    grounds = [at]
+    network: StitcherNetwork, ends: Ends, at: GroundPose, frames: int, latents: Latents
+) -> Generator[None, None, tuple[Memory, Float[Tensor, "batch shared"]]]:
+    """Walk through the frames before each end; returns the memory there and the shared latent."""
+    context, end, grounds = ends.features.shape[2], ends.frame(-1), [at]
     for number in range(context - 1, 0, -1):
         grounds.insert(0, grounds[0].before(*_pick_pace(ends.features[:, :, number])))
-    end = _pick_end(ends)
 
     def look(number: int) -> Situation:
-        left = float(frames + context - 1 - number)
-        return _look(_pick_frame(ends, number), grounds[number], end, at, left)
+        return Situation.of(ends.frame(number), grounds[number], end, at, float(frames + context - 1 - number))
 
     first = network.embed(look(context - 1))
     shared = latents.share(network.tell_shared(first), first)
@@ -727,37 +643,7 @@ def _enter(
         yield
     if context > 1:
         memory = network.begin(first).keep(memory, 1 - before)
-    return memory, shared, at
-
-
-def _pick_end(ends: Ends) -> Frame:
-    return _pick_frame(ends, ends.features.shape[2] - 1)
-
-
-def _pick_frame(ends: Ends, number: int) -> Frame:
-    """Pick a frame, its change of pose since the frame before, and whether that one is known."""
-    now = ends.features[:, :, number]
-    if number == 0:
-        return now, torch.zeros_like(now[..., POSE]), torch.zeros_like(ends.present[:, :, 0])
-    return now, (now - ends.features[:, :, number - 1])[..., POSE], ends.present[:, :, number - 1]
-
-
-def _look(now: Frame, at: GroundPose, target: Frame, target_at: GroundPose, left: float) -> Situation:
-    """Tell each side what it knows: of the other it sees the frame given for it."""
-    away = target_at.position_xz.flip(0) - at.position_xz
-    features, change, paced = now
-    aim, aim_change, aim_paced = target
-    return Situation(
-        features=features,
-        change=change,
-        paced=paced,
-        target=reverse_sense(aim.flip(0)),
-        target_change=-aim_change.flip(0),
-        target_paced=aim_paced.flip(0),
-        place=rotations.rotate_ground(away, -at.heading),
-        turn=rotations.wrap_angle(target_at.heading.flip(0) - at.heading),
-        left=torch.full_like(paced, left),
-    )
+    return memory, shared
 
 
 def _pick_pace(features: Float[Tensor, "*batch size"]) -> tuple[Float[Tensor, "*batch 2"], Float[Tensor, "*batch"]]:
@@ -790,58 +676,38 @@ class Joined:
 
 def join_sides(sides: Sides) -> Joined:
     """Join the sides of a transition of two frames or more."""
-    between, made = sides.frames - 1, sides.features.shape[2]
-    first, last = sides.overlap
+    made = sides.features.shape[2]
+    first, last = sides.frames - made, made  # of the overlap, counted from the first pose
     if first > last:
         raise ValueError("sides that have no frame in common cannot be joined")
-    bodies = [_place_body(sides, side) for side in (0, 1)]
+    bodies = [BodyPose.of_features_at(*each) for each in zip(sides.features, sides.place, sides.heading, strict=True)]
     seam = (first + last) // 2
-    index = [seam - 1, between - seam]  # the same frame, as each side counts
+    index = [seam - 1, sides.frames - 1 - seam]  # the same frame, as each side counts
     pairs = [body.slice(at, at + 1) for body, at in zip(bodies, index, strict=True)]
     apart = (pairs[0].joints_world() - pairs[1].joints_world()).norm(dim=-1).mean(dim=(1, 2))
     miss = (pairs[1].root_position - pairs[0].root_position)[:, 0, ::2]
     twist = rotations.wrap_angle(pairs[1].heading - pairs[0].heading)[:, 0]
     rows = []
     for side, body in enumerate(bodies):
-        frame = torch.arange(1, made + 1) if side == 0 else torch.arange(made, 0, -1)
-        share = _ease((frame / (sides.frames / 2)).clamp_max(1)) * (0.5 if side == 0 else -0.5)
-        order = slice(None) if side == 0 else torch.arange(made - 1, -1, -1)
-        root, quats = body.root_position[:, order], body.local_quat_xyzw[:, order]
-        heading = rotations.about_y(share * twist[:, None])
-        hips = rotations.multiply(heading, quats[..., 0, :])
-        offset = rotations.lift_ground(share[:, None] * miss[:, None])
+        order = torch.arange(made) if side == 0 else torch.arange(made - 1, -1, -1)
+        share = ((order + 1) / (sides.frames / 2)).clamp_max(1)
+        share = share * share * (3 - 2 * share) * (0.5 if side == 0 else -0.5)  # no leap of speed at either end
+        quats = body.local_quat_xyzw[:, order]
+        hips = rotations.multiply(rotations.about_y(share * twist[:, None]), quats[..., 0, :])
         quats = torch.cat([hips[..., None, :], quats[..., 1:, :]], dim=-2)
-        rows.append((root + offset, quats, sides.logits[side][:, order]))
-    root, quats, logits = (_blend(one, other, between, first, last) for one, other in zip(*rows, strict=True))
+        root = body.root_position[:, order] + rotations.lift_ground(share[:, None] * miss[:, None])
+        rows.append((root, quats, sides.logits[side][:, order]))
+    root, quats, logits = (_blend(one, other, first, last) for one, other in zip(*rows, strict=True))
     return Joined(root, quats, logits, apart)
 
 
-def _place_body(sides: Sides, side: int) -> BodyPose:
-    """The poses of a side in the world of the first end, in its own order."""
-    features, ground = sides.features[side], sides.place[side]
-    height = LAYOUT.pick(features, "root_height")
-    root = torch.cat([ground[..., :1], height, ground[..., 1:]], dim=-1)
-    tilt, joints = LAYOUT.pick(features, "root_tilt"), LAYOUT.pick(features, "joint_rotations")
-    return BodyPose(root, sides.heading[side], tilt, joints.unflatten(-1, (-1, 3)))
-
-
-def _ease(share: Float[Tensor, " frames"]) -> Float[Tensor, " frames"]:
-    """From 0 to 1 without a leap of speed at either end."""
-    return share * share * (3 - 2 * share)
-
-
-def _blend(one: Tensor, other: Tensor, between: int, first: int, last: int) -> Tensor:
-    """Take the first side's frames up to the overlap, the second's after it, and a blend between that goes from one to
-    the other evenly; quaternions on the shortest arc."""
-    made = one.shape[1]
+def _blend(one: Tensor, other: Tensor, first: int, last: int) -> Tensor:
+    """Take the first side's frames up to the overlap, the second's after it, and an even blend between; quaternions on
+    the shortest arc."""
     count = last - first + 1
-    share = torch.arange(1, count + 1, dtype=one.dtype) / (count + 1)
+    share = (torch.arange(1, count + 1, dtype=one.dtype) / (count + 1))[None, :, None]
     a, b = one[:, first - 1 : last], other[:, :count]
-    if one.ndim == 4:
-        mixed = rotations.slerp(a, b, share[None, :, None].expand(a.shape[:-1]))
-    else:
-        mixed = torch.lerp(a, b, share[None, :, None])
-    assert made + (made - count) == between
+    mixed = rotations.slerp(a, b, share.expand(a.shape[:-1])) if one.ndim == 4 else torch.lerp(a, b, share)
     return torch.cat([one[:, : first - 1], mixed, other[:, count:]], dim=1)
 
 
@@ -858,8 +724,6 @@ class Draws:
     """Of the noise; each pair of poses has noise of its own."""
     temperature: float = 1.0
     """Standard deviation of the noise."""
-    dropped: int = 0
-    """Draws so far that were not finite, which nobody is given."""
     chunks: dict[tuple[bytes, int, int], Joined] = field(default_factory=dict)
     """Those made, by the ends, the frames from one to the other and the number of the chunk."""
 
@@ -879,7 +743,6 @@ class Draws:
         if (made := self.chunks.get((told, frames, chunk))) is None:
             made = make(self.seed_chunk(start, chunk), self.temperature)
             self.chunks[told, frames, chunk] = made
-            self.dropped += int((~made.finite).sum())
         good = made.finite.roll(-row).nonzero()
         return made.row((row + int(good[0])) % CHUNK) if len(good) else None
 
@@ -1024,15 +887,9 @@ _PARTNERS = CANONICAL.mirror_partners()
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Stitcher(checkpoints.LoadedModel, Inbetweener):
+class Stitcher(checkpoints.NetworkModel[StitcherNetwork], Inbetweener):
     """A trained stitcher (Ren et al. 2024)."""
 
-    name: str
-    """Name under which it was loaded."""
-    network: StitcherNetwork
-    """Network in evaluation mode."""
-    card: checkpoints.Card
-    """Card of the weights."""
     draws: Draws | None = None
     """What it draws its answers from; without it gives the calm one, with the latent at its mean."""
     number: int = 0
@@ -1121,7 +978,10 @@ class Stitcher(checkpoints.LoadedModel, Inbetweener):
             latents = DrawnLatents.sample(config, len(place), made, noise).scale(float(self.network.temperature))
         joined = join_sides((yield from walk_stepwise(self.network, ends, frames, latents)))
         origin = GroundPose(torch.zeros_like(place), torch.zeros_like(turn))
-        first, last = _stand_at(before[:, -1], origin), _stand_at(after[:, -1], GroundPose(place, turn))
+        first, last = (
+            BodyPose.of_features_at(known[:, -1:], at.position_xz[:, None], at.heading[:, None])
+            for known, at in ((before, origin), (after, GroundPose(place, turn)))
+        )
         root = torch.cat([first.root_position, joined.root_position, last.root_position], dim=1)
         quats = torch.cat([first.local_quat_xyzw, joined.quats, last.local_quat_xyzw], dim=1)
         planted = torch.cat([(joined.contacts > 0).float(), after[:, -1:, LAYOUT.slices["contacts"]]], dim=1)
@@ -1244,13 +1104,6 @@ def _encode(body: Motion, start: int, stop: int) -> Float[Tensor, "frames size"]
     return encode(part)[0]
 
 
-def _stand_at(features: Float[Tensor, "batch size"], at: GroundPose) -> BodyPose:
-    """Return single poses at ground poses."""
-    root = rotations.lift_ground(at.position_xz) + torch.nn.functional.pad(LAYOUT.pick(features, "root_height"), (1, 1))
-    joints = LAYOUT.pick(features, "joint_rotations").unflatten(-1, (-1, 3))
-    return BodyPose(root[:, None], at.heading[:, None], LAYOUT.pick(features, "root_tilt")[:, None], joints[:, None])
-
-
 def _place(
     joined: Joined, body: Motion, start: int
 ) -> tuple[Float[Tensor, "frames 3"], Float[Tensor, "frames joints 4"]]:
@@ -1294,6 +1147,5 @@ def _list_partly_known(query: GapQuery) -> list[GapSource]:
 
 def load(name: str = "stitcher") -> Stitcher:
     """Load the bundled stitcher, or a trained one by its file or run folder; CheckpointError for anything else."""
-    with checkpoints.open_checkpoint(name, "stitcher") as (tensors, card):
-        network = checkpoints.build_network(StitcherNetwork, StitcherConfig.of_card(card.config), tensors)
+    network, card = checkpoints.load_network(name, "stitcher", StitcherNetwork, StitcherConfig)
     return Stitcher(name, network, card)

@@ -1,14 +1,9 @@
-"""The tweener as an in-betweener: poses from the generator, the hips' way from the path predictor, exact keys.
+"""The tweener: long in-betweens from few keys (Zhou et al. 2020).
 
-What the generator is told: poses or parts of them at keys, seen from a reference that leads from key to key.
-
-The way between two keys that who walks forwards would take: it leaves the first along its heading, comes to the next
-along that one's, and turns in between.
-
-Styles: what a generator is told of how to move, by poses of a motion (its DNA) or by the name of a class.
-
-The classes of a set of weights are in its card: what the style encoder made of clips of training, as vectors. No pose
-of mocap is kept.
+A convolutional generator computes rotations within the ranges of the joints from positions of keys, seen from a
+reference that leads from key to key; the path predictor computes the root trajectory from how the body moves; keys are
+then met exactly. A style conditions the generator: the mean encoding of poses of a motion (its DNA), or of the clips of
+a class, whose vectors are in the card of the weights.
 """
 
 import base64
@@ -17,11 +12,11 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
@@ -57,18 +52,6 @@ _REACH, _REACH_A_SECOND, _LONGEST_REACH = 0.8, 0.3, 2.0
 sharper is the turn for its way. Chosen on captured walks: a turn of 90 degrees takes about 2 s."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Legs:
-    """Ways from key to key, one a row."""
-
-    row: Int[Tensor, " legs"]
-    """Sequence that each is of."""
-    start: Int[Tensor, " legs"]
-    """Frame of its first key."""
-    frames: Int[Tensor, " legs"]
-    """Frames from there to the next."""
-
-
 def bend_way(
     way: Float[Tensor, "batch frames 2"],
     facing: Float[Tensor, "batch frames"],
@@ -76,102 +59,62 @@ def bend_way(
     placed: Bool[Tensor, "batch frames"],
     faced: Bool[Tensor, "batch frames"],
 ) -> tuple[Float[Tensor, "batch frames 2"], Float[Tensor, "batch frames"]]:
-    """Bend a way (x, z, metres) and headings (radians) that lead straight between frames in which a place is told, and
-    evenly between frames in which a heading is. Between neighbours that tell both, and that who walks forwards at an
-    even pace would take more than a second for, the way becomes a cubic curve along both headings (Hermite) and the
-    heading its tangent. It stays as it is at what is told, for who stands or walks on straight, and between keys of
-    which one looks away from the other; in between it bends the more, the clearer it is.
+    """Bend trajectories (x, z, metres) and headings (radians) that lead straight between known positions, and evenly
+    between known headings. Between neighbouring frames of which both are known and that are more than a second apart,
+    the trajectory becomes a cubic curve along both headings (Hermite) and the heading its tangent. It stays as it is at
+    what is known, for a character that stands or walks on straight, and between keys of which one looks away from the
+    other; in between it bends the more, the clearer it is.
     """
-    legs = _find_legs(placed, faced)
-    if not len(legs.row):
-        return way, facing
-    ends = legs.start + legs.frames
-    first, last = way[legs.row, legs.start], way[legs.row, ends]
-    chord = last - first
-    length = chord.norm(dim=-1)
-    towards = torch.atan2(chord[:, 0], chord[:, 1])
-    turns = [rotations.wrap_angle(facing[legs.row, at] - towards) for at in (legs.start, ends)]
-    share = _choose_share(legs, length, torch.stack(turns).abs().amax(dim=0))
-    reach = length * (_REACH + _REACH_A_SECOND * legs.frames / PRIOR_FPS).clamp(max=_LONGEST_REACH)
-    tangents = [_point(towards + turn) * reach[:, None] for turn in turns]
-    return _follow(way, facing, legs, share, (first, last, *tangents), towards + turns[0])
-
-
-def bend_motion(motion: Motion, *, placed: Bool[Tensor, " frames"], faced: Bool[Tensor, " frames"]) -> Motion:
-    """Bend the hips' way and turn the body along it, in frames of a motion at PRIOR_FPS and of unit size between those
-    whose hips have a known place and heading."""
-    facing = rotations.unwrap_angle(heading(motion.local_quat_xyzw[:, 0]))
-    way, turned = bend_way(motion.root_position[None, :, ::2], facing[None], placed=placed[None], faced=faced[None])
-    root, quats = motion.root_position.clone(), motion.local_quat_xyzw.clone()
-    root[:, ::2] = way[0]
-    bent = turned[0] != facing
-    quats[bent, 0] = rotations.multiply(rotations.about_y((turned[0] - facing)[bent]), quats[bent, 0])
-    return replace(motion, root_position=root, local_quat_xyzw=quats)
-
-
-def _find_legs(placed: Tensor, faced: Tensor) -> _Legs:
-    """Find frames that tell a place and a heading with more than _SHORT until the next that tells anything, and that
-    both as well."""
-    row, frame = (placed | faced).nonzero(as_tuple=True)
-    whole, frames = (placed & faced)[row, frame], torch.diff(frame)
+    row, start = (placed | faced).nonzero(as_tuple=True)
+    whole, frames = (placed & faced)[row, start], torch.diff(start)
     long = (torch.diff(row) == 0) & (frames > _SHORT * PRIOR_FPS) & whole[:-1] & whole[1:]
-    return _Legs(row[:-1][long], frame[:-1][long], frames[long])
-
-
-def _choose_share(legs: _Legs, length: Tensor, aside: Tensor) -> Float[Tensor, " legs"]:
-    seconds = legs.frames / PRIOR_FPS
+    row, start, frames = row[:-1][long], start[:-1][long], frames[long]
+    if not len(row):
+        return way, facing
+    first, last, seconds = way[row, start], way[row, start + frames], frames / PRIOR_FPS
+    chord = last - first
+    length, towards = chord.norm(dim=-1), torch.atan2(chord[:, 0], chord[:, 1])
+    turns = [rotations.wrap_angle(facing[row, at] - towards) for at in (start, start + frames)]
+    aside = torch.stack(turns).abs().amax(dim=0)
     ahead = _ramp(aside, _SWAYS, _TURNS) * _ramp(aside, _ASIDE, _AHEAD)
-    return _ramp(seconds, _SHORT, _WHOLE) * _ramp(length / seconds, _SLOW, _WALKS) * ahead
-
-
-def _follow(
-    way: Tensor,
-    facing: Tensor,
-    legs: _Legs,
-    share: Float[Tensor, " legs"],
-    curve: tuple[Tensor, ...],
-    begins: Float[Tensor, " legs"],
-) -> tuple[Tensor, Tensor]:
-    """Follow the curves evenly, as far as each one's share; the curves begin at these headings."""
+    share = _ramp(seconds, _SHORT, _WHOLE) * _ramp(length / seconds, _SLOW, _WALKS) * ahead
+    reach = length * (_REACH + _REACH_A_SECOND * frames / PRIOR_FPS).clamp(max=_LONGEST_REACH)
+    along = [torch.stack([(towards + turn).sin(), (towards + turn).cos()], dim=-1) * reach[:, None] for turn in turns]
+    curves = torch.stack([first, last, *along], dim=1)
     bent, turned = way.clone(), facing.clone()
-    parameters = torch.linspace(0, 1, _SAMPLES).to(way)
-    steps = torch.diff(_place(curve, parameters.expand(len(share), -1)), dim=1).norm(dim=-1)
-    walked = torch.nn.functional.pad(steps.cumsum(dim=1), (1, 0))
     for leg in (share > 0).nonzero()[:, 0].tolist():
-        row, start, count = int(legs.row[leg]), int(legs.start[leg]), int(legs.frames[leg])
-        inside = slice(start + 1, start + count)
-        wanted = walked[leg, -1] * torch.arange(1, count).to(way) / count
-        parameter = _invert(walked[leg], wanted)
-        own = tuple(each[leg : leg + 1] for each in curve)
-        place, along = (each(own, parameter[None])[0] for each in (_place, _differentiate))
+        count, inside = int(frames[leg]), (int(row[leg]), slice(int(start[leg]) + 1, int(start[leg] + frames[leg])))
+        place, slope = _walk_evenly(curves[leg], count)
         # Evenly turning headings are unwrapped, and a curve's begin where they do.
-        begun = facing[row, start] + rotations.wrap_angle(torch.atan2(along[:, 0], along[:, 1]) - begins[leg])
-        bent[row, inside] += share[leg] * (place - way[row, inside])
-        turned[row, inside] += share[leg] * rotations.wrap_angle(begun - facing[row, inside])
+        off = torch.atan2(slope[:, 0], slope[:, 1]) - (towards[leg] + turns[0][leg])
+        begun = facing[row[leg], start[leg]] + rotations.wrap_angle(off)
+        bent[inside] += share[leg] * (place - way[inside])
+        turned[inside] += share[leg] * rotations.wrap_angle(begun - facing[inside])
     return bent, turned
 
 
-def _invert(walked: Float[Tensor, " samples"], wanted: Float[Tensor, " frames"]) -> Float[Tensor, " frames"]:
-    """Return the curve's parameters after so many metres."""
+def _walk_evenly(
+    curve: Float[Tensor, "4 2"], count: int
+) -> tuple[Float[Tensor, "frames 2"], Float[Tensor, "frames 2"]]:
+    """Return the points between the ends of a Hermite curve, in so many even steps, and the slopes there."""
+    steps = torch.diff(_evaluate(curve, torch.linspace(0, 1, _SAMPLES).to(curve))[0], dim=0).norm(dim=-1)
+    walked = pad(steps.cumsum(dim=0), (1, 0))
+    wanted = walked[-1] * torch.arange(1, count).to(curve) / count
     after = torch.searchsorted(walked, wanted).clamp(1, _SAMPLES - 1)
     before, step = walked[after - 1], walked[after] - walked[after - 1]
-    return (after - 1 + (wanted - before) / step.clamp_min(1e-9)) / (_SAMPLES - 1)
+    return _evaluate(curve, (after - 1 + (wanted - before) / step.clamp_min(1e-9)) / (_SAMPLES - 1))
 
 
-def _place(curve: tuple[Tensor, ...], parameter: Float[Tensor, "legs points"]) -> Float[Tensor, "legs points 2"]:
-    u = parameter[..., None]
-    weights = (2 * u**3 - 3 * u**2 + 1, 3 * u**2 - 2 * u**3, u**3 - 2 * u**2 + u, u**3 - u**2)
-    return sum((weight * each[:, None] for weight, each in zip(weights, curve, strict=True)), torch.zeros_like(u))
-
-
-def _differentiate(curve: tuple[Tensor, ...], parameter: Float[Tensor, "legs points"]) -> Tensor:
-    u = parameter[..., None]
-    weights = (6 * u**2 - 6 * u, 6 * u - 6 * u**2, 3 * u**2 - 4 * u + 1, 3 * u**2 - 2 * u)
-    return sum((weight * each[:, None] for weight, each in zip(weights, curve, strict=True)), torch.zeros_like(u))
-
-
-def _point(heading: Float[Tensor, " legs"]) -> Float[Tensor, "legs 2"]:
-    return torch.stack([heading.sin(), heading.cos()], dim=-1)
+def _evaluate(curve: Float[Tensor, "4 2"], parameter: Float[Tensor, " points"]) -> tuple[Tensor, Tensor]:
+    """Return points and slopes of a cubic curve from its ends and its tangents there."""
+    u = parameter[:, None]
+    place = (2 * u**3 - 3 * u**2 + 1, 3 * u**2 - 2 * u**3, u**3 - 2 * u**2 + u, u**3 - u**2)
+    slope = (6 * u**2 - 6 * u, 6 * u - 6 * u**2, 3 * u**2 - 4 * u + 1, 3 * u**2 - 2 * u)
+    one, other = (
+        sum((weight * each for weight, each in zip(weights, curve, strict=True)), torch.zeros_like(u))
+        for weights in (place, slope)
+    )
+    return one, other
 
 
 def _ramp(value: Tensor, none: float, whole: float) -> Tensor:
@@ -635,27 +578,25 @@ PART_FRAMES = MAX_KEY_FRAMES // 2
 """Frames of the longest part of a gap that is split."""
 
 
-@dataclass(frozen=True, eq=False)
-class Split:
-    """A gap that is longer than the network sees, and frames in it at which poses are told."""
+class Split(NamedTuple):
+    """A gap that is longer than the network sees."""
 
     start: int
-    """First frame of the gap."""
+    """First frame."""
     stop: int
     """One past its last."""
 
     @property
     def frames(self) -> list[int]:
-        """Frames at which poses are told, evenly from edge to edge."""
+        """Frames at which poses split it, evenly from edge to edge."""
         parts = -(-(self.stop - self.start) // PART_FRAMES)
         return [self.start + round(part * (self.stop - self.start) / parts) for part in range(1, parts)]
 
 
-def find_splits(query: GapQuery) -> Iterator[Split]:
-    """Yield the gaps in which nothing is known and that are longer than the network sees."""
-    for _, start, stop in true_intervals(query.nothing_known[:, None]):
-        if stop - start > MAX_KEY_FRAMES:
-            yield Split(start, stop)
+def find_splits(query: GapQuery) -> list[Split]:
+    """Find the gaps in which nothing is known and that are longer than the network sees."""
+    gaps = [Split(start, stop) for _, start, stop in true_intervals(query.nothing_known[:, None])]
+    return [gap for gap in gaps if gap.stop - gap.start > MAX_KEY_FRAMES]
 
 
 def show_edges(query: GapQuery, split: Split) -> Float[Tensor, "poses joints 3"]:
@@ -697,17 +638,11 @@ _KEY_SECONDS = 0.5  # over which what a key was missed by fades away from it
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Tweener(checkpoints.LoadedModel, Inbetweener):
+class Tweener(checkpoints.NetworkModel[GeneratorNetwork], Inbetweener):
     """A trained generator of long in-betweens with the path predictor that it was trained with."""
 
-    name: str
-    """Name under which it was loaded."""
-    network: GeneratorNetwork
-    """Network in evaluation mode."""
     path: PathPredictor
-    """Predictor of where the hips go."""
-    card: checkpoints.Card
-    """Card of the weights."""
+    """Predictor of the root trajectory."""
     style: Style | None = field(default=None)
     """How to move; None leaves it to the keys."""
     classes: Mapping[str, Style] = field(default_factory=dict)
@@ -745,7 +680,7 @@ class Tweener(checkpoints.LoadedModel, Inbetweener):
         stay there. Effector targets are ignored. Gaps that are longer than the network sees are split by poses of the
         style, or of the keys beside them.
         """
-        shown, missing, splits = query.motion, query.missing, list(find_splits(query))
+        shown, missing, splits = query.motion, query.missing, find_splits(query)
         told = self._tell_poses(query, splits)
         made, origin = self._make(query, told)
         met = interpolate_turns(made, shown.local_quat_xyzw, ~missing.joints, seconds=_KEY_SECONDS, fps=PRIOR_FPS)
@@ -852,9 +787,16 @@ def calm_poses(quats: Float[Tensor, "frames joints 4"]) -> Float[Tensor, "frames
 
 
 def _walk_over(query: GapQuery) -> Motion:
-    """Return the query's motion at unit size, in whose gaps the hips go as who walks would."""
-    missing = query.missing
-    return bend_motion(query.to_unit_size(query.motion), placed=~missing.root, faced=~missing.joints[:, 0])
+    """Return the query's motion at unit size, whose hips go through gaps along `bend_way`."""
+    motion = query.to_unit_size(query.motion)
+    facing = rotations.unwrap_angle(heading(motion.local_quat_xyzw[:, 0]))
+    placed, faced = ~query.missing.root[None], ~query.missing.joints[None, :, 0]
+    way, turned = bend_way(motion.root_position[None, :, ::2], facing[None], placed=placed, faced=faced)
+    root, quats = motion.root_position.clone(), motion.local_quat_xyzw.clone()
+    root[:, ::2] = way[0]
+    bent = turned[0] != facing
+    quats[bent, 0] = rotations.multiply(rotations.about_y((turned[0] - facing)[bent]), quats[bent, 0])
+    return replace(motion, root_position=root, local_quat_xyzw=quats)
 
 
 def _find_told_joints(query: GapQuery) -> Bool[Tensor, "frames joints"]:
@@ -882,12 +824,11 @@ def keep_feet(
 def load(name: str = "tweener", path: str = "path") -> Tweener:
     """Load the bundled tweener, or a trained one by its file or run folder, with the path predictor that it was trained
     with; CheckpointError for anything else, and for another path predictor."""
-    with checkpoints.open_checkpoint(name, "tweener") as (tensors, card):
-        network = checkpoints.build_network(GeneratorNetwork, GeneratorConfig.of_card(card.config), tensors)
-        classes = read_classes(card, network.config.style)
+    network, card = checkpoints.load_network(name, "tweener", GeneratorNetwork, GeneratorConfig)
+    classes = read_classes(card, network.config.style)
     wanted, found = card.data.get("path"), checkpoints.compute_hash(path)
     if wanted != found:
         raise CheckpointError(
             f"{name} was trained with the path predictor {str(wanted)[:12]}; {path} is {found}: name it by --path"
         )
-    return Tweener(name, network, path_predictor.load(path), card, classes=classes)
+    return Tweener(name, network, card, path_predictor.load(path), classes=classes)

@@ -45,15 +45,10 @@ def use_weights(name: str | None) -> Iterator[None]:
     try:
         yield
     finally:
-        if name is not None:
-            _restore(before)
-
-
-def _restore(before: str | None) -> None:
-    if before is None:
-        os.environ.pop(VARIABLE, None)
-    else:
-        os.environ[VARIABLE] = before
+        if name is not None and before is not None:
+            os.environ[VARIABLE] = before
+        elif name is not None:
+            os.environ.pop(VARIABLE, None)
 
 
 def _check(name: str, what: str) -> str:
@@ -210,13 +205,12 @@ def shorten_names(used: Licences) -> Licences:
 def _find_known(licence: str) -> str | None:
     """Find the known licence that a text names, before models in parentheses; of several, which a motion has that is
     joined from others, the strictest. None where one of them is not known."""
-    found = [_find_known_part(part) for part in licence.split("; ")]
+    found = [
+        next((known for known in _BY_STRICTNESS if part == known or part.startswith(f"{known} (")), None)
+        for part in licence.split("; ")
+    ]
     known = [each for each in found if each is not None]
     return max(known, key=_BY_STRICTNESS.index) if len(known) == len(found) else None
-
-
-def _find_known_part(part: str) -> str | None:
-    return next((known for known in _BY_STRICTNESS if part == known or part.startswith(f"{known} (")), None)
 
 
 def _rank(licence: str) -> int:

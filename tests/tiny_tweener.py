@@ -45,7 +45,7 @@ def card(
 
 def tiny_tweener(*, seed: int = 0, path: PathPredictor | None = None) -> Tweener:
     """As the controllers take it."""
-    return Tweener("tiny", network(seed=seed), path or tiny_path.tiny_path(), card())
+    return Tweener("tiny", network(seed=seed), card(), path or tiny_path.tiny_path())
 
 
 def save_tiny_tweener(

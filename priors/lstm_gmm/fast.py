@@ -1,23 +1,15 @@
 """The fast path of the LSTM-GMM: rollouts over latent noise and their pullback on one core, float32.
 
-Same mathematics as `LstmGmm.plan`, `rollout` and `sample` (the specification, tested to agree), in compiled
-loops. A rollout is one node of torch's graph: what is built on its features and densities chains onto it by
-autograd, and its gradient is the hand-written back-propagation through time.
+Same mathematics as `LstmGmm.plan`, `rollout` and `sample` (the specification, tested to agree), in compiled loops. A
+rollout is one node of torch's graph: what is built on its features and densities chains onto it by autograd, and its
+gradient is the hand-written back-propagation through time.
 
-Compiled kernels of the LSTM-GMM rollout and its pullback: one core, float32 (imported late: needs numba).
-
-A rollout cannot run its frames side by side, so every frame reads every weight once. For one particle that
-is a matter of memory bandwidth, for many of arithmetic; `affine` serves both, by tiles of 4 rows by 4
-particles whose 16 sums stay in registers. It was measured as fast as BLAS for one particle and twice as
-fast for 8 to 32, and it has no threads to fight with. Weights are float32, or the bits of half precision,
-which takes half the time. Sizes are padded with zeros, so no loop has a remainder: widths to multiples of
-16, particles to multiples of 4. All kernels lie in one file because compiled code kept on disk goes stale
-by file.
-
-Memory of the fast rollout: the network's weights packed for the kernels, and the tape of its activations.
-
-Sizes are padded with zeros so that no loop of the kernels has a remainder: widths to multiples of 16,
-particles to multiples of 4 where there are several. A padded unit stays exactly 0 and so changes nothing.
+A rollout cannot run its frames side by side, so every frame reads every weight once. For one particle that is a matter
+of memory bandwidth, for many of arithmetic; `affine` serves both, by tiles of 4 rows by 4 particles whose 16 sums stay
+in registers. It was measured as fast as BLAS for one particle and twice as fast for 8 to 32, and it has no threads to
+fight with. Weights are float32, or the bits of half precision, which takes half the time. Sizes are padded with zeros,
+so no loop has a remainder: widths to multiples of 16, particles to multiples of 4; a padded unit stays exactly 0. All
+kernels lie in one file because compiled code kept on disk goes stale by file.
 """
 
 import math
@@ -71,17 +63,6 @@ def converts_half() -> bool:
     return bool(llvm.get_host_cpu_features().get("f16c", False))
 
 
-def is_half(weights: np.ndarray) -> bool:
-    """Return whether half precision holds every weight exactly."""
-    with np.errstate(over="ignore"):
-        return bool(np.array_equal(weights.astype(np.float16).astype(np.float32), weights))
-
-
-def to_half_bits(weights: np.ndarray) -> np.ndarray:
-    """Return the bits (uint16) of the weights in half precision."""
-    return weights.astype(np.float16).view(np.uint16)
-
-
 Array = NDArray[np.float32]
 
 GIVEN, LIKELIEST, SAMPLED = 0, 1, 2
@@ -94,7 +75,7 @@ WIDTH_STEP, BATCH_STEP, ROW_STEP = 16, 4, 4
 class Layers(NamedTuple):
     """The network's weights; transposed for the pullback; or its biases, with the last axis gone.
 
-    Weights are float32, or uint16 where half precision holds them all (`to_half_bits`); biases are float32. Axes
+    Weights are float32, or uint16 where half precision holds them all ; biases are float32. Axes
     are padded: Z features, W units, H rows of the head, which are means, log sigmas, weights, contact logits.
     """
 
@@ -216,9 +197,10 @@ def pack_weights(model: LstmGmm) -> Layers:
         fc3=_pad_matrix(_to_numpy(model.fc3.weight), width, width),
         head=_pack_head(model, _to_numpy(model.out.weight), width),
     )
-    if converts_half() and all(is_half(weight) for weight in weights):
-        return Layers(*(to_half_bits(weight) for weight in weights))
-    return weights
+    with np.errstate(over="ignore"):
+        halves = [weight.astype(np.float16) for weight in weights]
+    exact = all(np.array_equal(half.astype(np.float32), weight) for half, weight in zip(halves, weights, strict=True))
+    return Layers(*(half.view(np.uint16) for half in halves)) if exact and converts_half() else weights
 
 
 def pack_biases(model: LstmGmm) -> Layers:
@@ -714,16 +696,9 @@ class FastRollout:
 
     def plan(self, state: LstmState, noise: Float[Tensor, "batch frames continuous"]) -> DiscreteChoices:
         """The likeliest component and contact bits of each frame along the rollout that the noise gives."""
-        return self.plan_and_rollout(state, noise)[0]
-
-    def plan_and_rollout(
-        self, state: LstmState, noise: Float[Tensor, "batch frames continuous"]
-    ) -> tuple[DiscreteChoices, Float[Tensor, "batch frames size"], Float[Tensor, "batch frames"]]:
-        """`plan` and the `rollout` under it in one pass, without gradient: what scoring particles needs."""
         batch, frames, _ = noise.shape
         run = self._run(state, noise, _allocate_choices(batch, frames), LIKELIEST, slots=2)
-        plan = DiscreteChoices(_to_tensor(run.choices.component, batch), _to_tensor(run.choices.contacts, batch))
-        return plan, _to_tensor(run.features, batch).to(noise.dtype), _to_tensor(run.density, batch).to(noise.dtype)
+        return DiscreteChoices(_to_tensor(run.choices.component, batch), _to_tensor(run.choices.contacts, batch))
 
     def rollout(
         self, state: LstmState, noise: Float[Tensor, "batch frames continuous"], plan: DiscreteChoices

@@ -1,6 +1,5 @@
 """Weights on disk: they come back, and whatever does not fit is refused in one line."""
 
-import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -8,6 +7,11 @@ from pathlib import Path
 import pytest
 import torch
 from helpers import tiny_density
+from tiny_denoiser import save_tiny_denoiser
+from tiny_infiller import save_tiny_infiller
+from tiny_path import save_tiny_path
+from tiny_stitcher import save_tiny_stitcher
+from tiny_transformer import save_tiny_transformer
 
 import priors
 from mapctl.errors import CheckpointError
@@ -110,12 +114,6 @@ def test_a_broken_card_is_refused(tmp_path, content):
     refused(path, match="no readable card")
 
 
-def test_a_missing_card_is_refused(tmp_path):
-    path = write(tmp_path)
-    path.with_suffix(".json").unlink()
-    refused(path, match="no readable card")
-
-
 class Trap:
     """Unpickling it writes a file."""
 
@@ -149,7 +147,29 @@ def test_a_failed_save_leaves_the_old_weights(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["model.json", "model.safetensors"]
 
 
-def test_the_card_is_plain_json(tmp_path):
-    card = json.loads(write(tmp_path).with_suffix(".json").read_text("utf-8"))
-    assert card["fingerprint"] == LAYOUT.fingerprint()
-    assert card["layout"] == [list(block) for block in LAYOUT.blocks]
+@pytest.mark.parametrize(
+    ("kind", "save", "load"),
+    [
+        ("denoiser", save_tiny_denoiser, priors.load_denoiser),
+        ("infiller", save_tiny_infiller, priors.load_infiller),
+        ("path", save_tiny_path, priors.load_path),
+        ("pose-transformer", save_tiny_transformer, priors.load_transformer),
+        ("stitcher", save_tiny_stitcher, priors.load_stitcher),
+    ],
+)
+def test_a_network_loads_by_file_or_folder_and_no_other_kind_or_shape_does(tmp_path, kind, save, load):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    path = save(folder / "model.safetensors")
+    tensors, card = checkpoints.load(path)
+    for name in (path, folder):
+        model = load(str(name))
+        assert (model.name, model.card.kind, str(name) in repr(model)) == (str(name), kind, True)
+        assert all(torch.equal(value, tensors[key]) for key, value in model.network.state_dict().items())
+        assert not any(parameter.requires_grad for parameter in model.network.parameters())
+    checkpoints.save(tensors, replace(card, kind="critic"), path)
+    with pytest.raises(CheckpointError, match="a critic is no"):
+        load(str(path))
+    checkpoints.save(dict(list(tensors.items())[1:]), card, path)
+    with pytest.raises(CheckpointError, match="do not fit its card"):
+        load(str(path))

@@ -7,11 +7,9 @@ import pytest
 import torch
 from captures import DEGREE
 from helpers import generator, walk
-from tiny_denoiser import CONFIG, network, save_tiny_denoiser, tiny_denoiser
+from tiny_denoiser import network, tiny_denoiser
 
-import priors
 from mapctl import rotations
-from mapctl.protocols import Denoiser
 from mapctl.recording import Capture
 from mapctl.skeleton import CANONICAL
 from priors import denoiser as denoiser
@@ -114,24 +112,6 @@ def test_what_was_not_seen_does_not_matter():
     assert torch.equal(first.contact_logits, second.contact_logits)
 
 
-def test_a_batch_is_its_members():
-    first, second = capture(degrees=5, seed=1), capture(degrees=2, seed=2)
-    names = ("root", "hips", "joints", "seen_root", "seen", "sigma_root", "sigma")
-    both = Capture(*(torch.cat([getattr(first, name), getattr(second, name)]) for name in names))
-    together, alone = network(drawn=0.3)(both), network(drawn=0.3)(second)
-    assert torch.allclose(together.pose.angles[1:], alone.pose.angles, atol=1e-5)
-    assert torch.allclose(together.pose.root_position[1:], alone.pose.root_position, atol=1e-5)
-
-
-def test_gaps_are_filled_with_something_finite():
-    noisy = capture(degrees=5, centimetres=3)
-    noisy.seen[:] = False
-    noisy.seen_root[:] = False
-    proposal = network(drawn=0.3)(noisy)
-    assert proposal.pose.pack().isfinite().all()
-    assert proposal.contact_logits.isfinite().all()
-
-
 @pytest.mark.parametrize("frames", [1, 2, 9])
 def test_short_captures_break_nothing(frames):
     cleaned = tiny_denoiser(drawn=0.3).clean(capture(frames, degrees=5))
@@ -153,16 +133,3 @@ def test_a_long_capture_in_pieces_is_one_pass(monkeypatch):
     apart = (pieces.pose.heading - whole.pose.heading)[0]
     assert (apart - apart.mean()).abs().max() < 1e-2
     assert pieces.pose.heading[0, -1] - pieces.pose.heading[0, 0] > 2 * 2 * math.pi
-
-
-def test_a_saved_denoiser_loads_as_it_was(tmp_path):
-    path = save_tiny_denoiser(tmp_path / "run" / "model.safetensors", drawn=0.3)
-    wanted = network(drawn=0.3)
-    for name in (path, path.parent):
-        loaded = priors.load_denoiser(str(name))
-        assert isinstance(loaded, Denoiser)
-        assert (loaded.name, loaded.network.config, loaded.card.kind) == (str(name), CONFIG, "denoiser")
-        noisy = capture(degrees=5)
-        assert torch.allclose(
-            loaded.clean(noisy).pose.angles, wanted(noisy).pose.angles, atol=1e-3
-        )  # float16 in the file

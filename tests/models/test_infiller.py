@@ -4,11 +4,9 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers import generator, moved, walk
-from tiny_infiller import CONFIG, network, save_tiny_infiller, shown, tiny_infiller
+from helpers import generator, walk
+from tiny_infiller import CONFIG, network, shown
 
-import priors
-from mapctl.inbetweening.position_image import mirror_positions
 from mapctl.skeleton import CANONICAL
 
 JOINTS = CANONICAL.num_joints
@@ -59,20 +57,6 @@ def test_known_places_stay_to_the_bit():
     assert (proposed.places != image.places).any()
 
 
-def test_the_autoencoder_makes_everything_anew():
-    image = holed()
-    proposed = network(drawn=DRAWN, config=of("image"))(image)
-    assert (proposed.places[image.known] != image.places[image.known]).any()
-
-
-@pytest.mark.parametrize("architecture", ARCHITECTURES)
-def test_it_does_not_matter_where_the_motion_stands_and_faces(architecture):
-    motion, net = walk(60, turn_rate=0.8), network(drawn=DRAWN, config=of(architecture))
-    here, there = holed(motion=motion), holed(motion=moved(motion, turn=2.2, shift=(5.0, -3.0)))
-    assert torch.allclose(net(here).places, net(there).places, atol=1e-3)
-    assert torch.allclose(net(here).contacts, net(there).contacts, atol=1e-3)
-
-
 @pytest.mark.parametrize("architecture", ARCHITECTURES)
 def test_a_batch_is_its_members(architecture):
     first, second = holed(), holed(gaps=((5, 30), (50, 60)), seed=1, turn_rate=-0.5)
@@ -81,23 +65,3 @@ def test_a_batch_is_its_members(architecture):
     together, alone = net(both), net(second)
     assert torch.allclose(together.places[1:], alone.places, atol=1e-5)
     assert torch.allclose(together.contacts[1:], alone.contacts, atol=1e-5)
-
-
-def test_what_it_proposes_for_the_mirror_image_is_the_mirror_image():
-    """Its network alone does not: a left step is not a right one to it."""
-    infiller, image = tiny_infiller(drawn=DRAWN), holed()
-    there, here = infiller.complete(image.mirrored()), infiller.complete(image)
-    assert torch.allclose(there.places, mirror_positions(here.places), atol=1e-5)
-    assert torch.allclose(there.contacts, here.contacts.flip(-1), atol=1e-5)
-    alone = infiller.network(image.mirrored()).places
-    assert not torch.allclose(alone, mirror_positions(infiller.network(image).places), atol=1e-3)
-    assert torch.equal(here.places[image.known], image.places[image.known])
-
-
-def test_a_saved_infiller_loads_as_it_was(tmp_path):
-    path = save_tiny_infiller(tmp_path / "run" / "model.safetensors", drawn=DRAWN)
-    wanted = tiny_infiller(drawn=DRAWN).complete(holed())
-    for name in (path, path.parent):
-        loaded = priors.load_infiller(str(name))
-        assert (loaded.name, loaded.network.config, loaded.card.kind) == (str(name), CONFIG, "infiller")
-        assert torch.allclose(loaded.complete(holed()).places, wanted.places, atol=1e-3)  # float16 in the file

@@ -1,15 +1,30 @@
-"""The LSTM-GMM against torch.distributions, and its five operations against each other."""
+"""The LSTM-GMM against torch.distributions; states before a motion, planted toes and labels."""
+
+from dataclasses import replace
+from functools import cache
 
 import pytest
 import torch
 from catalogue import NETWORKS
-from helpers import corpus, generator, noise
+from helpers import corpus, generator, noise, tiny_density, walk
+from torch import Tensor
 from torch.distributions import Bernoulli, Categorical, Independent, MixtureSameFamily, MultivariateNormal
+from trainable_models import small_settings
 
-from mapctl.features import LAYOUT
-from mapctl.protocols import DiscreteChoices
+from mapctl.errors import RequestError
+from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode
+from mapctl.pose import BodyPose
+from mapctl.protocols import DataLimits, DiscreteChoices
+from mapctl.skeleton import TOE_JOINTS
+from priors.checkpoints import Card
+from priors.lstm_gmm import density
+from priors.lstm_gmm.density import LstmGmmDensity
+from priors.lstm_gmm.network import LstmGmm, LstmGmmConfig, LstmState, Planting
+from priors.training.recipes.lstm_gmm import DensityTrainer, compute_feature_statistics, select_initial_states
 
 SIZE = LAYOUT.continuous
+
+
 each_network = pytest.mark.parametrize("kind", NETWORKS)
 
 
@@ -89,21 +104,6 @@ def spread(mixture):
 
 
 @each_network
-def test_noise_is_the_standardised_error_of_the_chosen_component(kind):
-    network = NETWORKS[kind]
-    state = warm(network)
-    draws, plan, frames, _ = rolled(network, state)
-    mixture = mixture_of(network, state, frames)
-    picked = plan.component[..., None, None].expand(-1, -1, 1, SIZE)
-    mean, sigma = (part.gather(-2, picked)[..., 0, :] for part in (mixture.mean, mixture.log_sigma.exp()))
-    error = network.normalise(frames)[..., :SIZE] - mean
-    if network.whitening is not None:
-        error = (network.whitening[plan.component] @ error.unsqueeze(-1))[..., 0]
-    torch.testing.assert_close(error / sigma, draws, atol=1e-7, rtol=1e-7)
-    assert torch.equal(frames[..., SIZE:] > 0.5, plan.contacts)
-
-
-@each_network
 def test_draws_follow_the_mixture(kind):
     network = NETWORKS[kind]
     count = 4000
@@ -124,15 +124,209 @@ def test_draws_follow_the_mixture(kind):
     torch.testing.assert_close(bits, torch.sigmoid(mixture.contact_logit[0, 0]), atol=0.04, rtol=0)
 
 
-def test_at_temperature_zero_only_the_discrete_choices_are_drawn():
-    network = NETWORKS["one"]
-    state = warm(network)
-    drawn, _ = network.sample(state, 6, generator(1), temperature=0.0)
-    plan = DiscreteChoices(torch.zeros(2, 6, dtype=torch.long), drawn[..., SIZE:] > 0.5)
-    torch.testing.assert_close(network.rollout(state, torch.zeros(2, 6, SIZE).double(), plan)[0], drawn)
-
-
 def test_long_free_runs_stay_finite():
     network = NETWORKS["several"]
     drawn, _ = network.sample(warm(network), 300, generator(), temperature=2.0)
     assert bool(torch.isfinite(drawn).all())
+
+
+@cache
+def tiny():
+    """Of weights so large that what it remembers makes a difference."""
+    density = tiny_density(width=12)
+    for layer in (density.reference.fc3, density.reference.out):
+        layer.weight.mul_(4)
+    return density
+
+
+def frames(count=30, seed=3):
+    return encode(walk(count, turn_rate=0.4, seed=seed))[0].float()
+
+
+def nats(state, features):
+    with torch.no_grad():
+        return float(tiny().log_prob(features[None], state).sum())
+
+
+def prior(state):
+    """Of the memory, by the mean and spread of the known ones."""
+    known = tiny().initial_states.state
+    total = 0.0
+    for mine, theirs in ((state.hidden, known.hidden), (state.cell, known.cell)):
+        spread = theirs.std(dim=1, correction=0).clamp_min(0.05)
+        total += float(0.5 * ((mine[:, 0] - theirs.mean(dim=1)) / spread).square().sum())
+    return total
+
+
+def test_the_first_frames_are_likelier_than_after_an_empty_memory_or_any_known_one():
+    first = frames()[:10]
+    found = tiny().infer_state(frames())
+    assert nats(found, first) > nats(tiny().start_after(first[:1]), first) + 10
+    known = tiny().initial_states.state
+    for row in range(known.batch):
+        other = known.pick(torch.tensor([row]))
+        other = LstmState(first[:1], other.hidden, other.cell)
+        assert nats(found, first) - prior(found) > nats(other, first) - prior(other)
+
+
+SIGMA = 0.06
+
+
+def place_toes(frame: Tensor) -> Tensor:
+    """After one frame from the origin, by the pose and not by the kernels."""
+    pose = BodyPose.of_features(frame[None], GroundPose.origin(frame.dtype))
+    return pose.joints_world()[0, list(TOE_JOINTS)].flatten()
+
+
+@pytest.fixture(scope="module")
+def frames_of_planting():
+    """Two frames_of_planting of a walk, of which both say that both toes stand."""
+    features = encode(walk(40))[0].float()[20:22]
+    features[:, SIZE:] = 1.0
+    return features
+
+
+@pytest.fixture(scope="module")
+def factor():
+    """Of a covariance whose values depend on each other."""
+    made = 0.01 * torch.randn(SIZE, SIZE, generator=generator(1)) / SIZE**0.5 + 0.004 * torch.eye(SIZE)
+    made[:2] *= 0.3
+    return made
+
+
+def condition(before, mean, factor, *, bits=(1.0, 1.0), count=1, seed=0):
+    noise = torch.randn(count, SIZE, generator=generator(seed))
+    sample = torch.cat([mean + noise @ factor.T, torch.tensor(bits).expand(count, 2)], dim=-1)
+    rows = (before.expand(count, -1), sample, mean.expand(count, -1), factor.expand(count, -1, -1))
+    return sample, Planting(SIGMA).condition(*rows, generator(seed + 1))
+
+
+@pytest.mark.slow
+def test_samples_are_those_of_the_conditional_gaussian(frames_of_planting, factor):
+    before, mean = frames_of_planting[0], frames_of_planting[1, :SIZE]
+    still = before.clone()
+    still[:3] = 0
+    base = torch.cat([mean, frames_of_planting[1, SIZE:]]).double()
+    jacobian = torch.func.jacrev(place_toes)(base)[:, :SIZE]
+    step = place_toes(base) - place_toes(still.double())
+    # In the form of information, where the conditioning has that of a gain.
+    precision = torch.linalg.inv((factor @ factor.T).double()) + jacobian.T @ jacobian / (SIGMA / PRIOR_FPS) ** 2
+    covariance = torch.linalg.inv(precision)
+    expected = mean.double() - covariance @ jacobian.T @ step / (SIGMA / PRIOR_FPS) ** 2
+    _, found = condition(before, mean, factor, count=20_000)
+    values, sigma = found[:, :SIZE].double(), covariance.diagonal().sqrt()
+    assert ((values.mean(0) - expected) / sigma).abs().max() < 0.05
+    assert (torch.cov(values.T) - covariance).div(sigma[:, None] * sigma).abs().max() < 0.05
+
+
+def test_a_density_samples_so(monkeypatch):
+    density = tiny_density()
+    state = density.initial_states.state.pick(torch.tensor([0]))
+    one, same = (density.sample_planted(state, 20, generator(3), sigma_speed=SIGMA)[0] for _ in range(2))
+    assert torch.equal(one, same)
+    assert one.isfinite().all()
+    plain = density.reference.sample(state, 20, generator(3))[0]
+    assert not torch.allclose(one, plain)
+    # Nothing is random about a toe without noise: the frames_of_planting are the means.
+    cold, mean = (
+        density.reference.sample(state, 20, generator(3), temperature=0.0, planting=planting)[0]
+        for planting in (Planting(SIGMA), None)
+    )
+    assert torch.allclose(cold[:, 0], mean[:, 0], atol=1e-6)
+
+
+CLIPS = ("set_walk_glad_1.bvh", "set_turn-left_glad_2.bvh", "set_turn-right_old_3.bvh", "set_run_old_4.bvh", "odd.bvh")
+
+
+PATTERN = r"_(?P<gait>walk|run|turn-left|turn-right)_(?P<style>[a-z]+)_"
+
+
+def test_labels_are_the_named_groups_of_the_clip_names():
+    found = density.read_labels(CLIPS, PATTERN)
+    assert found.names == ("gait=run", "gait=turn-left", "gait=turn-right", "gait=walk", "style=glad", "style=old")
+    held = [{found.names[i] for i in row.nonzero()[:, 0].tolist()} for row in found.held]
+    assert held == [
+        {"gait=walk", "style=glad"},
+        {"gait=turn-left", "style=glad"},
+        {"gait=turn-right", "style=old"},
+        {"gait=run", "style=old"},
+        set(),
+    ]
+    assert found.groups.tolist() == [[1, 1, 1, 1, 0, 0], [0, 0, 0, 0, 1, 1]]
+
+
+def test_a_mirrored_turn_is_the_other_turn():
+    found = density.read_labels(CLIPS, PATTERN)
+    assert [found.names[i] for i in found.mirrored] == [
+        "gait=run",
+        "gait=turn-right",
+        "gait=turn-left",
+        "gait=walk",
+        "style=glad",
+        "style=old",
+    ]
+    only_left = density.read_labels(CLIPS[:2], PATTERN)
+    assert only_left.mirrored == list(range(len(only_left.names)))
+
+
+def told_network() -> LstmGmm:
+    mean, std = compute_feature_statistics(corpus().features)
+    torch.manual_seed(0)
+    return LstmGmm(LstmGmmConfig(width=8, components=2, labels=("gait=run", "style=old")), mean=mean, std=std)
+
+
+def test_a_copy_that_was_told_is_the_network_under_that_condition():
+    network, inputs = told_network(), torch.randn(1, 6, 68, generator=generator())
+    memory = network.start_after(inputs[:, 0])
+    condition = torch.tensor([[0.0, 0.0, 1.0]])  # clean; not running; old
+    expected, _ = network(inputs, (memory.hidden, memory.cell), condition=condition)
+    untold, _ = network(inputs, (memory.hidden, memory.cell))
+    old, _ = network.conditioned_on(["style=old"])(inputs, (memory.hidden, memory.cell))
+    torch.testing.assert_close(old.mean, expected.mean)
+    assert not torch.allclose(untold.mean, expected.mean)
+    with pytest.raises(RequestError, match="no label 'style=new', only gait=run, style=old"):
+        network.conditioned_on(["style=new"])
+
+
+def test_half_of_the_windows_are_shown_no_label(tmp_path):
+    data = corpus(5)
+    known = density.Labels(("gait=walk", "style=old"), torch.tensor([[1.0, 1.0]] * 5))
+    settings = small_settings("lstm-gmm", tmp_path, tmp_path, batch=2000, window=6)
+    trainer = DensityTrainer(settings, data, LstmGmmConfig(width=8, components=1, labels=known.names), known)
+    _, told = trainer.draw_windows()
+    silent = float((told.sum(-1) == 0).double().mean())
+    assert pytest.approx(silent, abs=0.04) == 0.5 + 0.5 * 0.09
+    assert {tuple(row) for row in told.tolist()} == {(0, 0), (1, 0), (0, 1), (1, 1)}
+
+
+def labelled_density() -> LstmGmmDensity:
+    model, data = told_network(), corpus(4)
+    names = ("a_run_old_1", "a_walk_old_2", "a_walk_new_3", "a_run_new_4")
+    found = select_initial_states(model, replace(data, names=names), count=4, generator=generator())
+    pattern = r"_(?P<gait>run)?(walk)?_(?P<style>old)?"
+    card = Card("lstm-gmm", model.config.as_card(), licence="none", data={"labels": pattern}, **Card.layout_fields())
+    return LstmGmmDensity("named", model, found, DataLimits(0.5, 1.5, 1.0), card, use_fast=False)
+
+
+def test_a_told_density_begins_where_the_labels_hold():
+    density = labelled_density()
+    old_runner = density.conditioned_on(["run", "style=old"])
+    assert old_runner.initial_states.names == ("a_run_old_1",)
+    assert len(density.conditioned_on(["old"]).initial_states.names) == 2
+    assert float(old_runner.initial_states.weight.sum()) == 1
+    assert len(density.conditioned_on([]).initial_states.names) == 4
+    state, noise = density.initial_states.state.pick(torch.tensor([0])), torch.zeros(1, 3, 66)
+    plan = density.plan(state, noise)
+    told, untold = (some.rollout(state, noise, plan)[0] for some in (old_runner, density))
+    assert not torch.allclose(told, untold)
+
+
+def test_a_density_is_told_what_a_clips_path_tells_of_the_labels_that_it_knows():
+    density = labelled_density()
+    state, noise = density.initial_states.state.pick(torch.tensor([0])), torch.zeros(1, 3, 66)
+    plan = density.plan(state, noise)
+
+    for name, told in (("set/b_run_old_9.bvh", ["run", "old"]), ("set/b_walk_old_9.bvh", ["old"]), ("other.bvh", [])):
+        like, on = density.conditioned_like_clip(name), density.conditioned_on(told)
+        assert torch.allclose(like.rollout(state, noise, plan)[0], on.rollout(state, noise, plan)[0])
+        assert like.initial_states.names == density.initial_states.names

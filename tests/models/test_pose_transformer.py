@@ -1,29 +1,35 @@
-"""The pose transformer: what it keeps, how it moves with its input, and what it is told."""
+"""The pose transformer: what it keeps, what it is given, and its two stages."""
 
 from dataclasses import replace
 
 import pytest
 import torch
 from captures import on_rig
-from tiny_transformer import save_tiny_transformer, tiny_transformer
+from helpers import corpus
+from tiny_transformer import CONFIG, network, tiny_transformer
 
-import priors
 from controllers.inbetweening.pipeline import CanonicalClip
 from mapctl import rotations
-from mapctl.errors import CheckpointError
-from mapctl.inbetweening import GapQuery
 from mapctl.inbetweening.effector_targets import EffectorTargets
 from mapctl.inbetweening.missing import MissingMask
-from mapctl.inbetweening.partial_motion import KnownParts, interpolate_partial_motion
+from mapctl.inbetweening.partial_motion import KnownParts
 from mapctl.motion import Motion
 from mapctl.recording.masks import ALL, Mask
 from mapctl.retarget import to_canonical
 from mapctl.skeleton import CANONICAL
 from priors import pose_transformer as module
+from priors.training.recipes.pose_transformer import hide
+from priors.training.windows import PoseWindows, add_targets
 
 FRAMES = 50
+
+
 DRAWN = tiny_transformer(drawn=0.05)
+
+
 GAP = [Mask(ALL, 15, 25)]
+
+
 ARM = [Mask("leftLowerArm", 0, FRAMES), Mask("leftHand", 0, FRAMES)]
 
 
@@ -73,28 +79,6 @@ def test_values_within_a_gap_do_not_matter():
     assert apart(DRAWN.propose(query).motion, DRAWN.propose(other).motion) < 1e-5
 
 
-@pytest.mark.parametrize("masks", [GAP, ARM], ids=["gap", "arm"])
-def test_it_turns_and_moves_with_its_input(masks):
-    query = query_of(masks)
-    there = replace(query, motion=moved(query.motion, 2.1, (7.0, 0.0, -3.0)))
-    wanted = moved(DRAWN.propose(query).motion, 2.1, (7.0, 0.0, -3.0))
-    assert apart(DRAWN.propose(there).motion, wanted) < 1e-4
-
-
-def mirrored_query(query: GapQuery) -> GapQuery:
-    partners = CANONICAL.mirror_partners()
-    mask = MissingMask(query.missing.joints[:, partners], query.missing.root)
-    return replace(query, motion=query.motion.mirror(), missing=mask)
-
-
-@pytest.mark.parametrize("masks", [GAP, ARM], ids=["gap", "arm"])
-def test_the_mirrored_question_has_the_mirrored_answer(masks):
-    query = query_of(masks)
-    one, other = DRAWN.propose(query), DRAWN.propose(mirrored_query(query))
-    assert apart(one.motion.mirror(), other.motion) < 1e-4
-    torch.testing.assert_close(one.contact_logits, other.contact_logits.flip(-1), atol=1e-4, rtol=1e-4)
-
-
 def test_a_larger_body_gets_the_same_motion_on_its_own_bones():
     query = query_of(GAP, "daz")
     answer = DRAWN.propose(query)
@@ -132,35 +116,52 @@ def test_a_target_of_a_hand_changes_the_frames_beside_it_too():
     assert float(moved_by[:15].max()) < 1e-9
 
 
-@pytest.mark.parametrize("faced", [True, False])
-@pytest.mark.parametrize("tilted", [True, False])
-def test_hips_keep_the_heading_or_the_tilt_that_is_known(faced, tilted):
-    query = query_of(GAP)
-    motion = DRAWN._show(query)
-    frames = motion.heading.shape[1]
-    gap = torch.zeros(1, frames, dtype=torch.bool)
-    gap[:, 15:25] = True
-    known = KnownParts.whole(~gap)
-    turning = known.rotations.clone()
-    turning[..., 0] |= gap & tilted
-    known = replace(known, rotations=turning, heading=known.heading | (gap & faced))
-    shown = interpolate_partial_motion(replace(motion, known=known), DRAWN.network.mean_quats, 0.9)
-    hips = DRAWN.network(shown).local_matrix[0, :, 0]
-    own_heading, tilt = rotations.split_heading(rotations.from_matrix(hips))
-    _, shown_tilt = shown.heading[0], shown.quats[0, :, 0]
-    heading_off = rotations.wrap_angle(own_heading - shown.heading[0]).abs()[15:25]
-    tilt_off = (rotations.to_matrix(tilt) - rotations.to_matrix(shown_tilt)).abs().amax(dim=(1, 2))[15:25]
-    assert (float(heading_off.max()) < 1e-5) == faced
-    assert (float(tilt_off.max()) < 1e-5) == tilted
+TWO = replace(CONFIG, detail=2)
 
 
-def test_weights_load_by_file_and_others_are_refused(tmp_path):
-    path = save_tiny_transformer(tmp_path / "mine.safetensors", drawn=0.05)
-    loaded = priors.load_inbetweener(str(path))
-    query = query_of(GAP)
-    assert apart(loaded.propose(query).motion, DRAWN.propose(query).motion) < 0.02  # float16
-    with pytest.raises(CheckpointError, match="is no infiller"):
-        priors.load_infiller(str(path))
-    (tmp_path / "mine.json").write_text((tmp_path / "mine.json").read_text().replace('"width": 16', '"width": 32'))
-    with pytest.raises(CheckpointError, match="do not fit"):
-        priors.load_transformer(str(path))
+def windows(count=3, frames=30):
+    drawn = PoseWindows(corpus(2, 80), evenness=0.0).draw(count, frames, torch.Generator().manual_seed(0))
+    return add_targets(drawn)
+
+
+def with_gap(motion, start, stop):
+    told = torch.ones(motion.heading.shape, dtype=torch.bool)
+    told[:, start:stop] = False
+    return replace(motion, known=KnownParts.whole(told))
+
+
+def test_untrained_both_stages_interpolate_and_what_is_known_stays():
+    hidden = with_gap(windows(), 10, 20)
+    untrained = network(config=TWO)
+    shown = hide(untrained, hidden)
+    proposed = untrained(shown)
+    places, guess = proposed.poses(hidden.offsets)[0], shown.world_poses()[0]
+    torch.testing.assert_close(places, guess, atol=1e-4, rtol=0)
+    torch.testing.assert_close(proposed.rough.poses(hidden.offsets)[0], guess, atol=1e-4, rtol=0)
+    drawn = network(drawn=0.2, config=TWO)
+    made = drawn(hide(drawn, hidden))
+    truth = hidden.world_poses()[0]
+    torch.testing.assert_close(made.poses(hidden.offsets)[0][:, :10], truth[:, :10], atol=1e-4, rtol=0)
+    assert float((made.poses(hidden.offsets)[0] - truth)[:, 10:20].norm(dim=-1).mean()) > 0.02
+
+
+def with_tilt_alone(motion):
+    """Of hips in a gap the tilt is known, and not the heading."""
+    hidden = with_gap(motion, 10, 20)
+    rotations = hidden.known.rotations.clone()
+    rotations[:, 10:20, 0] = True
+    return replace(hidden, known=replace(hidden.known, rotations=rotations))
+
+
+@pytest.mark.parametrize("hide_parts", [lambda motion: with_gap(motion, 10, 20), with_tilt_alone])
+def test_the_second_stage_adds_to_what_the_first_proposes(hide_parts):
+    hidden = hide_parts(windows())
+    # The first stage's head is drawn; the second's is still nil.
+    made = network(drawn=0.2, config=TWO)
+    proposed = made(hide(made, hidden))
+    torch.testing.assert_close(proposed.local_matrix, proposed.rough.local_matrix, atol=1e-5, rtol=0)
+    torch.testing.assert_close(proposed.root_position, proposed.rough.root_position)
+    torch.nn.init.normal_(made.detail.head.weight, std=0.2)
+    corrected = made(hide(made, hidden))
+    torch.testing.assert_close(corrected.rough.local_matrix, proposed.rough.local_matrix)
+    assert float((corrected.local_matrix - proposed.local_matrix)[:, 10:20].abs().max()) > 0.01

@@ -1,20 +1,19 @@
-"""The refiner: what it may change and what it may see, whole or in pieces, and its file."""
+"""Refiners: the contract of any, what the LSTM may change and see, and the end effectors that it sees."""
 
 from dataclasses import replace
 
 import pytest
 import torch
-from helpers import generator
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from safetensors.torch import load_file
-from tiny_refiner import TINY, network_of, refiner_of, walks
+from catalogue import REFINERS
+from helpers import corpus, generator
+from scipy.spatial.transform import Rotation
+from tiny_refiner import TINY, refiner_of, walks
 
-import priors
-from mapctl.errors import CheckpointError
-from mapctl.features import LAYOUT
-from priors import checkpoints
-from priors import refiner as refiners
+from mapctl.features import LAYOUT, GroundPose
+from mapctl.pose import decode
+from mapctl.protocols import Refiner
+from mapctl.skeleton import CANONICAL
+from priors.refiner import compute_end_effectors, count_channels
 
 BITS = LAYOUT.slices["contacts"]
 
@@ -54,32 +53,6 @@ def test_a_trained_one_overrules_contact_bits_and_leaves_them_hard():
     assert not torch.equal(refined, features[..., BITS])
 
 
-def test_the_networks_bits_are_probabilities_with_a_slope():
-    features = clips().requires_grad_()
-    bits = network_of()(features)[0][..., BITS]
-    assert bool(((bits > 0) & (bits < 1)).all())
-    (slope,) = torch.autograd.grad(bits.sum(), features)
-    assert float(slope[..., : LAYOUT.continuous].abs().max()) > 0
-
-
-@pytest.mark.slow
-@given(st.lists(st.integers(0, 13), min_size=1, max_size=12), st.integers(0, 4), st.integers(1, 9))
-@settings(max_examples=40)
-def test_pieces_of_any_sizes_give_the_whole(sizes, lookahead, piece):
-    """Whatever is given at once, and whatever is refined at once."""
-    refiner = refiner_of(replace(TINY, lookahead=lookahead))
-    features = clips(100).repeat(1, 2, 1)[:, : sum(sizes)]
-    pieces = features.split(sizes, dim=1)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(refiners, "_CHUNK_FRAMES", piece)
-        streamed = list(refiner.stream(pieces))
-    if not features.shape[1]:
-        assert streamed == []
-        return
-    assert all(out.shape[1] <= piece for out in streamed)
-    torch.testing.assert_close(torch.cat(streamed, dim=1), refiner.refine(features), atol=1e-9, rtol=0)
-
-
 @pytest.mark.parametrize("lookahead", [0, 1, 3])
 @pytest.mark.parametrize("changed", [1, 20, 39])
 def test_a_frame_sees_the_past_and_its_look_ahead_but_nothing_later(changed, lookahead):
@@ -94,40 +67,71 @@ def test_a_frame_sees_the_past_and_its_look_ahead_but_nothing_later(changed, loo
     assert float(difference[first:].min()) > 0
 
 
-@pytest.fixture
-def stored(tmp_path):
-    """Written as training writes it."""
-    refiner = refiner_of(scale=0.1)
-    path = tmp_path / "run" / "model.safetensors"
-    path.parent.mkdir()
-    tensors = {name: value.float() for name, value in refiner.network.state_dict().items()}
-    checkpoints.save(tensors, refiner.card, path)
-    return path
+CLIPS = torch.stack([clip[:40] for clip in corpus().clips()[:3]]).double()
 
 
-def test_a_stored_refiner_does_as_before_by_file_or_by_folder(stored):
-    features = clips().float()
-    expected = refiner_of(scale=0.1).refine(features.double()).float()
-    for name in (str(stored), str(stored.parent)):
-        loaded = priors.load_refiner(name)
-        assert loaded.network.config == TINY
-        assert loaded.name == name
-        refined = loaded.refine(features)
-        torch.testing.assert_close(refined, expected, atol=2e-3, rtol=0)
-        assert not refined.requires_grad
+each_refiner = pytest.mark.parametrize("refiner", REFINERS.values(), ids=REFINERS)
 
 
-def stored_again(path, *, tensors=None, **card):
-    before = checkpoints.read_card(path.with_suffix(".json"))
-    checkpoints.save(load_file(path) if tensors is None else tensors, replace(before, **card), path)
+@each_refiner
+@pytest.mark.parametrize("frames", [1, 2, 40])
+def test_as_many_frames_come_out_with_hard_bits(refiner, frames):
+    assert isinstance(refiner, Refiner)
+    refined = refiner.refine(CLIPS[:, :frames])
+    assert refined.shape == (3, frames, LAYOUT.size)
+    assert set(refined[..., BITS].unique().tolist()) <= {0.0, 1.0}
 
 
-def test_weights_of_another_kind_or_layout_are_refused(stored):
-    stored_again(stored, kind="lstm-gmm")
-    with pytest.raises(CheckpointError, match="a lstm-gmm is no refiner"):
-        priors.load_refiner(str(stored))
-    stored_again(stored, kind="refiner", fingerprint="0" * 12)
-    with pytest.raises(CheckpointError, match="its features are"):
-        priors.load_refiner(str(stored))
-    with pytest.raises(CheckpointError, match="no prior 'nobody'"):
-        priors.load_refiner("nobody")
+@each_refiner
+@pytest.mark.parametrize("size", [1, 7, 39])
+def test_pieces_give_the_whole(refiner, size):
+    streamed = torch.cat(list(refiner.stream(CLIPS.split(size, dim=1))), dim=1)
+    torch.testing.assert_close(streamed, refiner.refine(CLIPS), atol=1e-9, rtol=0)
+
+
+@each_refiner
+def test_it_does_not_matter_what_else_is_in_the_batch(refiner):
+    one_by_one = torch.cat([refiner.refine(CLIPS[k : k + 1]) for k in range(3)])
+    torch.testing.assert_close(refiner.refine(CLIPS), one_by_one, atol=1e-12, rtol=0)
+
+
+JOINTS = ("hips", "head", "leftHand", "rightToes")
+
+
+def clip(frames=40, number=0):
+    return corpus().clips()[number][:frames].double()
+
+
+def by_positions(features, joints, start):
+    """From the world positions of the decoded motion; headings by hand, turned back by scipy."""
+    motion = decode(features, start)
+    index = [CANONICAL.index(name) for name in joints]
+    world, root = motion.joint_positions()[:, index].numpy(), motion.root_position.numpy()
+    heading = float(start.heading) + LAYOUT.pick(features, "heading_change")[:, 0].cumsum(0).numpy()
+    rows = []
+    for frame in range(1, len(features)):
+        back = Rotation.from_euler("y", -heading[frame])
+        ground = root[frame] * [1, 0, 1]
+        velocity = 30 * (world[frame] - world[frame - 1])
+        rows.append(torch.from_numpy(back.apply([*(world[frame] - ground), *velocity])).flatten())
+    return torch.stack(rows)
+
+
+@pytest.mark.parametrize("number", [0, 1, 4])
+def test_they_are_positions_and_velocities_in_the_heading_frame_wherever_the_motion_stands(number):
+    features = clip(number=number)
+    found = compute_end_effectors(features[None], JOINTS)[0]
+    assert found.shape == (39, count_channels(JOINTS))
+    for place in (GroundPose.origin(), GroundPose(torch.tensor([3.0, -7.0]), torch.tensor(2.5))):
+        torch.testing.assert_close(found, by_positions(features, JOINTS, place), atol=1e-9, rtol=0)
+
+
+def test_a_frame_depends_on_itself_and_the_one_before_only():
+    """And of the one before on its pose alone: that it turned or went on to get there shows nowhere."""
+    features = clip()[None]
+    found = compute_end_effectors(features, JOINTS)
+    torch.testing.assert_close(compute_end_effectors(features[:, 17:19], JOINTS)[0, 0], found[0, 17], atol=1e-9, rtol=0)
+    moved = features.clone()
+    for block in ("root_displacement_heading", "heading_change"):
+        moved[:, 0, LAYOUT.slices[block]] += 0.7
+    torch.testing.assert_close(compute_end_effectors(moved, JOINTS), found, atol=1e-9, rtol=0)

@@ -1,19 +1,23 @@
-"""The stitcher: both ends exact, wherever they are, and nothing told but what is told."""
+"""The stitcher: both ends exact, draws, constraints within a gap, and who fills what cannot be stitched."""
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from helpers import walk
+from scipy.optimize import least_squares
 from tiny_stitcher import CONFIG, network, tiny_stitcher
 
-from controllers.inbetweening.pipeline import CanonicalClip
-from mapctl import rotations
-from mapctl.features import mirror_features
+from controllers.inbetweening.pipeline import CanonicalClip, InfillSettings
+from controllers.inbetweening.proposers import SlerpInbetweener, StitchedInbetweener
+from controllers.inbetweening.tween import tween
+from mapctl.inbetweening.effector_targets import EffectorTargets
 from mapctl.inbetweening.missing import MissingMask
+from mapctl.intent.keyframes import Keys
 from mapctl.recording.masks import ALL, Mask
 from mapctl.retarget import to_canonical
-from priors.stitcher import DrawnLatents, Draws, count_made, join_sides, see_ends, walk_sides
+from priors.stitcher import DrawnLatents, Draws, Joined, count_made, fit_shared, join_sides, see_ends, walk_sides
 
 each_length = pytest.mark.parametrize("frames", [2, 3, 4, 5, 8, 15, 24])
 
@@ -65,44 +69,6 @@ def test_only_the_poses_of_bare_ends_are_seen():
     assert torch.equal(one.quats, two.quats)
 
 
-@pytest.mark.slow
-def test_the_pace_of_the_ends_counts_where_it_is_known():
-    motion = walk(60, turn_rate=0.6)
-    missing = torch.zeros(60, dtype=torch.bool)
-    missing[11:30] = True
-    known, unknown = see_ends(motion, missing, 11, 30), bare(motion, 11, 30)
-    assert known.features.shape[2] == 11
-    assert bool((known.paced == 1).all())
-    assert bool((unknown.paced == 0).all())
-    one, two = (tiny_stitcher().answer(each, 20).root_position for each in (known, unknown))
-    assert float((one - two).abs().max()) > 1e-5
-
-
-def test_the_answer_moves_and_turns_with_its_ends():
-    motion = walk(60, turn_rate=0.4)
-    turn = rotations.about_y(torch.tensor(2.0).double()).expand(60, 4)
-    quats = motion.local_quat_xyzw.clone()
-    quats[:, 0] = rotations.multiply(turn, quats[:, 0])
-    shift = torch.tensor([400.0, 0.0, -90.0]).double()
-    moved = replace(motion, root_position=rotations.rotate(turn, motion.root_position) + shift, local_quat_xyzw=quats)
-    one, two = (bare(each, 11, 30) for each in (motion, moved))
-    joined, other = (tiny_stitcher().answer(each, 20) for each in (one, two))
-    torch.testing.assert_close(joined.root_position, other.root_position, atol=1e-4, rtol=0)
-
-
-def test_the_calm_answer_to_the_mirror_image_is_the_mirror_image():
-    motion = walk(60, turn_rate=0.4)
-    ends = bare(motion, 11, 30)
-    joined = tiny_stitcher().answer(ends, 20)
-    mirrored = replace(
-        ends, features=mirror_features(ends.features), place=ends.place * torch.tensor([-1.0, 1.0]), turn=-ends.turn
-    )
-    flip = torch.tensor([-1.0, 1.0, 1.0])
-    torch.testing.assert_close(
-        tiny_stitcher().answer(mirrored, 20).root_position, flip * joined.root_position, atol=1e-5, rtol=0
-    )
-
-
 def test_the_first_draws_do_not_depend_on_the_count_and_differ():
     ends = bare(walk(60), 11, 30)
     few, many = (
@@ -126,18 +92,6 @@ def test_gaps_are_filled_between_poses_that_stay_and_too_long_ones_are_named():
     assert float(step) < 2 * float(motion.joint_positions().diff(dim=0).norm(dim=-1).max())
 
 
-@pytest.mark.slow
-def test_one_that_draws_gives_the_same_for_the_same_seed_and_number_and_others_for_others():
-    query = query_of(walk(60), (20, 40))
-
-    def places(seed, number):
-        return tiny_stitcher().drawing(seed).numbered(number).propose(query).motion.root_position
-
-    assert torch.equal(places(1, 9), places(1, 9))
-    for other in ((1, 0), (1, 8), (2, 9)):
-        assert float((places(1, 9) - places(*other)).abs().max()) > 1e-5
-
-
 def test_draws_that_are_not_finite_are_dropped_and_counted():
     made = tiny_stitcher().draw(bare(walk(60), 11, 30), 20, count=8, generator=torch.Generator().manual_seed(3))
     made.root_position[[2, 3]] = torch.nan
@@ -148,7 +102,6 @@ def test_draws_that_are_not_finite_are_dropped_and_counted():
 
     assert torch.equal(pick(2).quats, made.quats[4:5])
     assert torch.equal(pick(1).quats, made.quats[1:2])
-    assert draws.dropped == 2
     made.root_position[:] = torch.nan
     assert Draws(0).pick(bare(walk(60), 11, 30), 11, 20, 0, lambda noise, heat: made) is None
 
@@ -158,3 +111,135 @@ def test_an_answer_that_is_not_finite_is_left_to_another():
     broken.network.experts.shrink_last(float("nan"))
     source = broken.propose(query_of(walk(60), (20, 40))).others[0]
     assert (source.by, source.reason) == ("interpolation", "nothing finite came of it")
+
+
+RAW = InfillSettings(finish=False)
+
+
+def never():
+    raise AssertionError("nothing was left to the other")
+
+
+def stitched(load=never):
+    return StitchedInbetweener(tiny_stitcher(), load)
+
+
+def test_gaps_that_are_too_long_or_have_one_end_are_the_others_and_the_rest_stays_stitched():
+    query = query_of(walk(90), (10, 25), (40, 70), (80, 90))
+    made, alone = stitched(SlerpInbetweener).propose(query), tiny_stitcher().propose(query)
+    assert torch.equal(made.motion.local_quat_xyzw[10:25], alone.motion.local_quat_xyzw[10:25])
+    slerp = SlerpInbetweener().propose(query).motion
+    assert torch.equal(made.motion.local_quat_xyzw[40:], slerp.local_quat_xyzw[40:])
+    first, second, third = made.attribute(query)
+    assert (first.by, first.reason) == ("stitcher", "")
+    assert (second.by, second.reason) == ("slerp", "longer than the 23 frames that the stitcher fills")
+    assert (third.by, third.start, third.stop) == ("slerp", 80, 90)
+    assert third.reason.startswith("known in part or on one side alone")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("limbs", [(), ("leftHand",)])
+def test_hands_on_the_way_are_reached(limbs):
+    """Between whole poses the stitcher fills a gap with a hand told in it too."""
+    motion, keys = walk(60), Keys.of([20, 30, 40], limbs=limbs)
+    done = tween(motion, keys, stitched(SlerpInbetweener), settings=RAW)
+    bys = {source.by for source in done.sources if 20 < source.start < 40}
+    assert bys == {"stitcher"}
+    if limbs:
+        hand = motion.skeleton.indices(["leftHand"])
+        off = (done.motion.joint_positions() - motion.joint_positions())[30, hand].norm()
+        assert float(off) < 1e-3
+
+
+def test_what_was_stitched_is_reported():
+    done = tween(walk(60), Keys.of([0, 20, 59]), stitched(SlerpInbetweener), settings=RAW)
+    told = done.details()
+    assert 0 <= told["sides_apart_cm"] < 100
+    assert [(row["by"], row["start"], row["stop"]) for row in told["fallback"]] == [("slerp", 21, 59)]
+    assert told["timing"]["draw_ms"] > 0
+    assert told["timing"]["finish_ms"] > 0
+
+
+GAP = slice(21, 40)
+
+
+def wishing(motion, frame, limb, offset):
+    """A query that wants a limb elsewhere in a frame."""
+    joint = motion.skeleton.index(limb)
+    places = motion.joint_positions().clone()
+    places[frame, joint] += torch.tensor(offset).double()
+    wanted = torch.zeros(places.shape[:2], dtype=torch.bool)
+    wanted[frame, joint] = True
+    return replace(query_of(motion, (GAP.start, GAP.stop)), effector_targets=EffectorTargets(places, wanted))
+
+
+def miss(query, motion):
+    targets = query.effector_targets
+    return float((motion.joint_positions() - targets.places).norm(dim=-1)[targets.wanted].max())
+
+
+@pytest.mark.parametrize("spread", [0.7, 1.5])
+def test_the_fit_is_that_of_least_squares(spread):
+    """On a map that bends a little, beside scipy's: both minimise residuals and the distance from the centre."""
+    draw = np.random.default_rng(1)
+    matrix, wish, centre = draw.normal(size=(5, 4)), draw.normal(size=5), draw.normal(size=4)
+
+    def residuals(codes):
+        bent = codes @ matrix.T
+        return bent + 0.05 * np.sin(bent) - 3 * wish
+
+    def make(codes):  # motions whose hips go where the codes say
+        root = torch.nn.functional.pad(codes[..., None], (0, 2)).float()
+        return Joined(root, torch.zeros(len(codes), 4, 21, 4), torch.zeros(len(codes), 4, 2), torch.zeros(len(codes)))
+
+    def read(made):
+        return made.root_position[..., 0].double().numpy()
+
+    def measure(made):
+        return torch.as_tensor(residuals(read(made))).float()
+
+    def energy(codes):
+        return np.square(residuals(codes)).sum() + np.square((codes - centre) / spread).sum()
+
+    found = read(fit_shared(make, measure, torch.as_tensor(centre).float(), spread))[0]
+    best = least_squares(lambda codes: np.concatenate([residuals(codes), (codes - centre) / spread]), centre).x
+    assert energy(found) < 0.8 * energy(centre)
+    assert energy(found) == pytest.approx(energy(best), rel=0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("limb", ["leftHand", "rightFoot"])
+def test_what_is_wanted_leads_the_answer(limb):
+    query = wishing(walk(60), 30, limb, (0.2, 0.25, 0.1))
+    plain = tiny_stitcher().propose(replace(query, effector_targets=None))
+    led = tiny_stitcher().propose(query)
+    assert miss(query, led.motion) < miss(query, plain.motion) - 0.001
+    ends = [GAP.start - 1, GAP.stop]
+    assert torch.equal(led.motion.local_quat_xyzw[ends], query.motion.local_quat_xyzw[ends])
+    assert f"{100 * miss(query, led.motion):.1f} cm off unbent" in led.attribute(query)[0].remark
+
+
+@pytest.mark.slow
+def test_hips_that_are_told_alone_are_met_and_divide_the_gap():
+    motion = walk(60, turn_rate=0.5)
+    done = tween(motion, Keys.of([20, 28, 40], root_only=True), StitchedInbetweener(tiny_stitcher(), SlerpInbetweener))
+    torch.testing.assert_close(done.motion.root_position[28], motion.root_position[28], atol=1e-6, rtol=0)
+    inner = [(source.start, source.stop, source.by) for source in done.sources if 20 < source.start < 40]
+    assert inner == [(21, 28, "stitcher"), (29, 40, "stitcher")]
+    steps = torch.diff(done.motion.joint_positions()[20:41], dim=0).norm(dim=-1)
+    assert float(steps.max()) < 0.25  # nothing leaps
+
+
+@pytest.mark.slow
+def test_a_trajectory_is_followed_and_one_that_is_far_is_the_others():
+    query = query_of(walk(60), (GAP.start, GAP.stop))
+    bow = 0.15 * torch.sin(torch.linspace(0, torch.pi, GAP.stop - GAP.start + 2)[1:-1]).double()
+    for scale, by in ((1.0, "stitcher"), (8.0, "slerp")):
+        root = query.motion.root_position.clone()
+        root[GAP, 0] += scale * bow
+        led = replace(query, motion=replace(query.motion, root_position=root), keep_trajectory=True)
+        made = StitchedInbetweener(tiny_stitcher(), SlerpInbetweener).propose(led)
+        assert [source.by for source in made.attribute(led)] == [by]
+        assert float((made.motion.root_position - root)[GAP, ::2].norm(dim=-1).mean()) < 0.03
+    (source,) = made.attribute(led)
+    assert "off the trajectory" in source.reason

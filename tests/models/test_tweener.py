@@ -1,37 +1,48 @@
-"""The tweener as an in-betweener: exact keys, hips that go by the body, any length, one path predictor."""
+"""The tweener: exact keys, hips that go by the body, styles, gaps beyond what its network sees, and the network."""
 
-from dataclasses import dataclass, replace
+import json
+from dataclasses import replace
 
 import pytest
+import tiny_tweener as tiny
 import torch
-from helpers import walk
+from helpers import corpus, generator, walk
 from tiny_path import ToldPath, save_tiny_path
 from tiny_tweener import save_tiny_tweener, tiny_tweener
 
 import priors
 from controllers.inbetweening.pipeline import CanonicalClip
 from controllers.inbetweening.proposers import AutoInbetweener, SlerpInbetweener
-from mapctl import rotations
-from mapctl.errors import CheckpointError
-from mapctl.inbetweening import GapQuery, Proposal
-from mapctl.inbetweening.effector_targets import EffectorTargets
+from mapctl import joint_ranges, motion_dna
+from mapctl.errors import CheckpointError, RequestError
+from mapctl.inbetweening import PositionImage
 from mapctl.inbetweening.missing import MissingMask
-from mapctl.inbetweening.query import INTERPOLATION, GapSource
-from mapctl.protocols import Inbetweener
+from mapctl.kinematics import heading
+from mapctl.motion_dna import MotionDna
 from mapctl.recording.masks import ALL, Mask
 from mapctl.retarget import to_canonical
-from mapctl.skeleton import CANONICAL
-
-
-@dataclass(frozen=True, eq=False)
-class Told(Inbetweener):
-    """Proposes what it was told."""
-
-    proposal: Proposal
-    has_style: bool = False
-
-    def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
-        return self.proposal
+from mapctl.skeleton import CANONICAL, TOE_JOINTS, TOE_REST_HEIGHT
+from priors.training.recipes.tweener import collect_dna, compute_classes
+from priors.training.windows import interpolate_heading, interpolate_positions
+from priors.tweener import (
+    INPUT_ROWS,
+    PAPER,
+    POSE_ROWS,
+    GeneratorConfig,
+    GeneratorNetwork,
+    RangeConstrainedKinematics,
+    Style,
+    StyleEncoder,
+    count_clips,
+    encode_classes,
+    find_class,
+    find_splits,
+    mix_styles,
+    pick_class,
+    place_poses,
+    read_classes,
+    regularise_batch,
+)
 
 
 def query_of(motion, *gaps):
@@ -85,26 +96,6 @@ def test_hips_go_where_the_path_predictor_sees_them_go_and_arrive():
         assert float(steps.min()) > 0
 
 
-def test_who_stands_and_whom_the_path_lets_stand_does_not_slide():
-    motion = standing(240)
-    made = tiny_tweener(path=ToldPath(motion)).propose(query_of(motion, (1, 239))).motion
-    assert float((made.root_position - motion.root_position)[:, ::2].abs().max()) < 1e-3
-
-
-def test_the_answer_moves_and_turns_with_its_keys():
-    motion = walk(90, turn_rate=0.4)
-    turn = rotations.about_y(torch.tensor(2.0).double())
-    quats = motion.local_quat_xyzw.clone()
-    quats[:, 0] = rotations.multiply(turn.expand(90, 4), quats[:, 0])
-    shift = torch.tensor([4000.0, 0.0, -90.0]).double()
-    root = rotations.rotate(turn.expand(90, 4), motion.root_position) + shift
-    one = tiny_tweener().propose(query_of(motion, (1, 89))).motion
-    other = tiny_tweener().propose(query_of(replace(motion, root_position=root, local_quat_xyzw=quats), (1, 89))).motion
-    wanted = rotations.rotate(turn.expand(90, 4), one.root_position) + shift
-    assert float((wanted - other.root_position).abs().max()) < 2e-3
-    assert float((one.local_quat_xyzw[:, 1:] - other.local_quat_xyzw[:, 1:]).abs().max()) < 2e-3
-
-
 def test_auto_leaves_long_gaps_between_whole_poses_to_it_and_holds_who_stands():
     query = query_of(walk(200), (1, 30), (31, 190))
     auto = AutoInbetweener(SlerpInbetweener(), long=75, tweener=tiny_tweener())
@@ -115,45 +106,6 @@ def test_auto_leaves_long_gaps_between_whole_poses_to_it_and_holds_who_stands():
     assert [source.by for source in auto.propose(still).attribute(still)] == ["standing still"]
 
 
-def test_auto_keeps_a_long_gap_that_the_network_fills_and_in_which_the_body_moves():
-    motion = walk(200)
-    query = query_of(motion, (31, 190))
-    logits = torch.zeros(200, 2)
-    moving, still = Proposal(motion, logits, "transformer"), Proposal(query.motion, logits, "transformer")
-    unfilled = replace(moving, others=(GapSource(31, 190, INTERPOLATION, "longer than it knows"),))
-    tweened = Told(Proposal(motion, logits, "tweener"))
-
-    def find_source(network: Proposal, tweener: Inbetweener = tweened) -> list[str]:
-        auto = AutoInbetweener(Told(network), long=75, tweener=tweener)
-        return [source.by for source in auto.propose(query).attribute(query)]
-
-    assert find_source(moving) == ["transformer"]
-    assert find_source(still) == ["tweener"]
-    assert find_source(unfilled) == ["tweener"]
-    assert find_source(moving, Told(tweened.proposal, has_style=True)) == ["tweener"]
-
-
-@pytest.mark.slow
-def test_auto_leaves_long_gaps_to_it_that_have_partial_keys_within():
-    """A network that fills less would leap to the hand, or away from it."""
-    motion, told = walk(200), (1, 190)
-    auto = AutoInbetweener(SlerpInbetweener(), long=75, tweener=tiny_tweener())
-    query = query_of(motion, told)
-    wanted = torch.zeros(200, 21, dtype=torch.bool)
-    wanted[90, CANONICAL.index("leftHand")] = True
-    handed = replace(query, effector_targets=EffectorTargets(motion.joint_positions() + 0.1, wanted))
-    made = auto.propose(handed)
-    assert [source.by for source in made.attribute(handed)] == ["tweener"]
-    free = auto.propose(query).motion.joint_positions()
-    assert float((made.motion.joint_positions() - free)[90].norm(dim=-1).max()) > 1e-3
-    joints, root = query.missing.joints.clone(), query.missing.root.clone()
-    joints[90, 0] = root[90] = False
-    hips = replace(query, missing=MissingMask(joints, root))
-    made = auto.propose(hips)
-    assert [source.by for source in made.attribute(hips)] == ["tweener", "tweener"]
-    assert float((made.motion.root_position - motion.root_position)[90, ::2].abs().max()) < 1e-9
-
-
 def test_it_goes_with_the_path_predictor_that_it_was_trained_with(tmp_path):
     predictor = str(save_tiny_path(tmp_path / "path.safetensors"))
     saved = str(save_tiny_tweener(tmp_path / "tweener.safetensors", predictor))
@@ -161,3 +113,244 @@ def test_it_goes_with_the_path_predictor_that_it_was_trained_with(tmp_path):
     assert priors.load_inbetweener(saved, predictor).card.kind == "tweener"
     with pytest.raises(CheckpointError, match="trained with the path predictor"):
         priors.load_tweener(saved, "path")
+
+
+FAST = motion_dna.of(walk(90, cadence=1.4, seed=5))
+
+
+def furthest(one, other):
+    """How far rotations of two motions are apart, the most of all joints, by frame."""
+    return (one.local_quat_xyzw - other.local_quat_xyzw).abs().amax(dim=(1, 2))
+
+
+def test_a_style_changes_what_is_made_and_keeps_the_keys():
+    query, plain = query_of(walk(120), (1, 119)), tiny_tweener()
+    styled = plain.styled(FAST)
+    assert (plain.has_style, styled.has_style) == (False, True)
+    one, other = (each.propose(query) for each in (plain, styled))
+    assert (one.source, other.source) == ("tweener", "tweener in the style of motion DNA")
+    apart = furthest(one.motion, other.motion)
+    assert float(apart[30:90].max()) > 1e-3
+    assert float(apart[[0, 119]].max()) == 0
+
+
+def test_a_class_of_the_card_is_a_style_without_poses():
+    card = tiny.card(classes=("walk", "dance-on"))
+    classes = read_classes(card, tiny.CONFIG.style)
+    assert set(classes) == {"walk", "dance-on"}
+    plain, query = tiny_tweener(), query_of(walk(120), (1, 119))
+    made = [plain.in_style(style).propose(query).motion for style in classes.values()]
+    assert float(furthest(*made)[30:90].max()) > 1e-4
+    assert all(style.poses is None for style in classes.values())
+
+
+@pytest.mark.slow
+def test_a_long_gap_is_split_by_poses_of_the_style_or_of_the_keys_and_a_note_says_so():
+    query, plain = query_of(walk(600), (10, 580)), tiny_tweener()
+    made = {}
+    for tweener, by in ((plain, "the keys beside it"), (plain.styled(FAST), "the style")):
+        answer = tweener.propose(query)
+        (source,) = answer.attribute(query)
+        assert (source.start, source.stop) == (10, 580)
+        assert source.reason == f"longer than the 16 s that the tweener sees; split at 6.7, 13.0 s by poses of {by}"
+        made[by] = answer.motion
+    nothing = replace(plain, style=Style("nothing", plain.encode_style(FAST).vector))
+    assert float(furthest(made["the style"], nothing.propose(query).motion)[150:450].max()) > 1e-3
+    short = query_of(walk(120), (10, 100))
+    assert not plain.propose(short).attribute(short)[0].reason
+
+
+def test_poses_that_split_a_gap_stand_on_the_way_and_face_along_it():
+    query = query_of(walk(1100, turn_rate=0.05), (1, 1099))
+    (split,) = find_splits(query)
+    assert split.frames == [221, 440, 660, 879]
+    body = query.to_unit_size(query.motion)
+    placed = place_poses(FAST.poses, body, split.frames)
+    assert float((placed[:, 0] - body.root_position[split.frames])[:, ::2].abs().max()) < 1e-6
+    torch.testing.assert_close(placed[:, list(TOE_JOINTS), 1].amin(dim=1), torch.full((4,), TOE_REST_HEIGHT).double())
+    across = (placed[:, 13] - placed[:, 17])[:, ::2]  # from the right upper leg to the left
+    own = FAST.poses[[number * len(FAST.poses) // 4 for number in range(4)]]
+    first = (own[:, 13] - own[:, 17])[:, ::2]
+    turned = torch.atan2(across[:, 0], across[:, 1]) - torch.atan2(first[:, 0], first[:, 1])
+    off = turned - heading(body.local_quat_xyzw[split.frames, 0])
+    assert float(torch.sin(off / 2).abs().max()) < 1e-4
+
+
+@pytest.mark.slow
+def test_auto_gives_the_tweener_what_has_room_for_a_style_and_holds_nobody():
+    query = query_of(walk(200), (1, 30), (31, 100), (101, 199))
+    styled = AutoInbetweener(SlerpInbetweener(), tweener=tiny_tweener().styled(FAST))
+    assert styled.has_style
+    sources = styled.propose(query).attribute(query)
+    name = "tweener in the style of motion DNA"
+    assert [source.by for source in sources] == ["slerp", name, name]
+    assert sources[0].reason == "too short, or with parts told, for a style"
+    plain = AutoInbetweener(SlerpInbetweener(), tweener=tiny_tweener()).propose(query).attribute(query)
+    assert {source.by for source in plain} == {"slerp"}
+    still = query_of(standing(200), (1, 199))
+    assert [source.by for source in styled.propose(still).attribute(still)] == [name]
+
+
+def test_several_styles_are_mixed():
+    tweener = tiny_tweener()
+    one, other = tweener.encode_style(FAST, "one"), Style("other", torch.ones(5))
+    mixed = mix_styles([one, other])
+    assert mixed.name == "one and other"
+    torch.testing.assert_close(mixed.vector, (one.vector + 1) / 2)
+    assert mixed.poses is not None
+    assert len(mixed.poses) == len(FAST.poses)
+    assert mix_styles([other]).poses is None
+    both = motion_dna.join([FAST, MotionDna(FAST.poses.flip(0))])
+    torch.testing.assert_close(tweener.encode_style(both).vector, one.vector)
+
+
+@pytest.mark.parametrize(
+    ("clip", "name"),
+    [
+        ("bandai-namco-2/data/dataset-2_wave-left-hand_active_015.bvh", "wave-left-hand"),
+        ("dataset-1_walk_feminine_001.bvh", "walk"),
+        ("cmu/01/01_01.bvh", "cmu-01"),
+        ("dance/salsa_03.bvh", "dance"),
+        ("a/b/c/x.bvh", "b-c"),
+        ("jump_03.bvh", "jump"),
+        ("003.bvh", None),
+    ],
+)
+def test_the_class_of_a_clip_is_in_its_name(clip, name):
+    assert find_class(clip) == name
+
+
+def test_vectors_are_means_over_clips_and_come_back_from_the_card():
+    encoder, made = tiny.network().style, corpus(3, 90)
+    members = collect_dna(made, r"walk-([01])")
+    assert {name: len(each) for name, each in members.items()} == {"0": 1, "1": 1}
+    other = MotionDna(torch.randn(4, 21, 3, generator=generator()))
+    two = {"both": [members["0"][0], other], "one": members["0"]}
+    data = encode_classes(encoder, two)
+    card = tiny.card()
+    card.data.update(json.loads(json.dumps(data)))
+    classes = read_classes(card, 5)
+    each = [encoder(dna.poses[None])[0] for dna in two["both"]]
+    assert float((each[0] - each[1]).abs().max()) > 0.1
+    torch.testing.assert_close(classes["both"].vector, (each[0] + each[1]) / 2, atol=2e-3, rtol=2e-3)
+    torch.testing.assert_close(classes["one"].vector, each[0], atol=2e-3, rtol=2e-3)
+    assert count_clips(card.data)["classes"] == {"both": 2, "one": 1}
+    assert compute_classes(tiny.network(), made)["classes"]["walk"]["clips"] == 3
+
+
+@pytest.mark.parametrize("vector", ["%%%", "AAAA", None, "AHwAfAB8AHwAfA=="])
+def test_a_broken_class_is_refused(vector):
+    card = tiny.card()
+    card.data["classes"] = {"walk": {"clips": 1, "vector": vector}}
+    with pytest.raises(CheckpointError, match="the class walk in the card"):
+        read_classes(card, 5)
+
+
+def test_an_unknown_class_is_told_with_the_nearest():
+    known = {name: Style(name, torch.zeros(5)) for name in ("wave-left-hand", "walk", "run")}
+    assert pick_class(known, "run").name == "run"
+    with pytest.raises(RequestError, match="no class wavelefthand; the nearest class is wave-left-hand"):
+        pick_class(known, "wavelefthand")
+    with pytest.raises(RequestError, match="know no classes"):
+        pick_class({}, "walk")
+
+
+SMALL = GeneratorConfig((8, 8, 8, 12, 12, 12), (12, 12, 8, 8, 8, 8), style=5)
+
+
+def network(config=SMALL, seed=0):
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        made = GeneratorNetwork(config)
+        torch.nn.init.normal_(made.last.weight, std=0.05)
+    return made.eval().requires_grad_(False)
+
+
+def count(module):
+    return sum(each.numel() for each in module.parameters())
+
+
+def image_of(motion, keys, *, present=None, known_axes=None):
+    """Whole poses are known at the keys."""
+    known = torch.zeros(1, motion.num_frames, 21, dtype=torch.bool)
+    known[:, list(keys)] = True
+    places, facing = motion.joint_positions().float()[None], heading(motion.local_quat_xyzw[:, 0]).float()[None]
+    between = interpolate_positions(places, motion.local_quat_xyzw.float()[None], known)
+    return PositionImage.of_world(
+        between,
+        interpolate_heading(facing, known),
+        torch.zeros(1, motion.num_frames, 2),
+        known=known,
+        present=torch.ones(1, motion.num_frames, dtype=torch.bool) if present is None else present,
+        toes=TOE_JOINTS,
+        known_axes=known_axes,
+    )
+
+
+def test_weights_are_as_many_as_may_be_bundled_and_as_in_the_paper():
+    """With the path predictor's 0.8 million under 10 MB in float16; in the paper 7.3 + 24.3 + 1.1 million."""
+    with torch.device("meta"):
+        ours, paper = GeneratorNetwork(), GeneratorNetwork(PAPER)
+    assert count(ours) == pytest.approx(4.1e6, rel=0.05)
+    assert 2 * (count(ours) + 0.85e6) < 10e6
+    assert sum(count(layer.conv) for layer in paper.encoder) == pytest.approx(7.3e6, rel=0.05)
+    assert sum(count(layer.conv) for layer in paper.decoder) + count(paper.last) == pytest.approx(24.3e6, rel=0.05)
+    assert count(paper.style) == pytest.approx(1.1e6, rel=0.05)
+    assert INPUT_ROWS == 133
+
+
+def test_the_style_changes_the_answer_and_does_not_depend_on_the_order_of_its_poses():
+    made, image = network(), image_of(walk(70), (0, 69))
+    encoder = StyleEncoder(5)
+    poses = torch.randn(1, 6, 21, 3, generator=generator())
+    found = encoder(poses)
+    torch.testing.assert_close(found, encoder(poses[:, torch.tensor([3, 1, 5, 0, 2, 4])]))
+    hips = poses.clone()
+    hips[..., 0, :] += 1.0
+    torch.testing.assert_close(found, encoder(hips))
+    apart = made(image, found.detach()).pose.places - made(image, -found.detach()).pose.places
+    assert float(apart.abs().max()) > 1e-3
+
+
+def test_batch_regularisation_is_nil_for_unit_responses_and_grows_with_mean_and_spread():
+    unit = torch.randn(16, 4, 500, generator=generator())
+    unit = (unit - unit.mean(dim=(0, 2), keepdim=True)) / unit.std(dim=(0, 2), keepdim=True, unbiased=False)
+    assert float(regularise_batch((unit, unit))) < 1e-6
+    assert float(regularise_batch((unit + 0.5,))) == pytest.approx(0.25, rel=1e-3)
+    assert float(regularise_batch((unit * 2.0, unit))) == pytest.approx(0.4805, rel=1e-3)
+    responses = network().generate(torch.randn(2, INPUT_ROWS, 128, generator=generator()), torch.zeros(2, 5))[1]
+    assert len(responses) == 6 + 13
+
+
+def test_coordinates_are_known_one_by_one():
+    """A drawing of a hand from the front: its depth is told by the key before."""
+    motion, hand = walk(30), CANONICAL.index("leftHand")
+    axes = torch.zeros(1, 30, 21, 3, dtype=torch.bool)
+    axes[0, 20, hand, :2] = True
+    image = image_of(motion, (2,), known_axes=axes)
+    copied, away = image.copy_nearest()
+    assert away[0, 20, hand].tolist() == [0, 0, 18]
+    assert torch.equal(copied[0, 25, hand, :2], image.places[0, 20, hand, :2])
+    assert torch.equal(copied[0, 25, hand, 2], image.places[0, 2, hand, 2])
+    assert not image.known[0, 20].any()
+    assert image.mirrored().known_axes[0, 20, CANONICAL.index("rightHand")].tolist() == [True, True, False]
+
+
+@pytest.fixture
+def layer():
+    return RangeConstrainedKinematics().double()
+
+
+def rows(*shape, spread=1.0, seed=0):
+    return spread * torch.randn(*shape, POSE_ROWS, generator=generator(seed), dtype=torch.float64)
+
+
+@pytest.mark.parametrize("spread", [0.1, 1.0, 50.0])
+def test_whatever_goes_in_a_body_within_its_ranges_comes_out(layer, spread):
+    pose = layer(rows(2, 7, spread=spread))
+    angles = joint_ranges.load().to_angles(pose.local_matrix[..., 1:, :, :])
+    assert float(joint_ranges.load().find_excess(angles).max()) < 1e-5
+    unit = pose.local_matrix.mT @ pose.local_matrix
+    torch.testing.assert_close(unit, torch.eye(3).double().expand_as(unit), atol=1e-5, rtol=0)
+    lengths = (pose.places[..., 1:, :] - pose.places[..., list(CANONICAL.parents[1:]), :]).norm(dim=-1)
+    torch.testing.assert_close(lengths, CANONICAL.offsets[1:].norm(dim=-1).expand_as(lengths), atol=1e-6, rtol=0)

@@ -3,7 +3,6 @@
 import os
 import re
 import shutil
-from pathlib import Path
 
 import pytest
 from tiny_weights import FREE, MODELS, change_card, save_tiny_weights
@@ -88,23 +87,6 @@ def test_what_the_free_set_lacks_is_refused_though_the_full_one_has_it(folder):
         priors.load("free/general")
     with pytest.raises(CheckpointError, match="no prior 'nobody': neither a file nor one of denoiser"):
         priors.load("nobody")
-
-
-def test_the_full_set_never_stands_in_for_a_missing_one(folder):
-    for path in (folder / "free").iterdir():
-        path.unlink()
-    with priors.use_weights("free"), pytest.raises(CheckpointError, match="none are installed"):
-        priors.load("locomotion")
-
-
-def test_a_name_with_a_set_means_no_file_of_that_name(folder, tmp_path_factory, monkeypatch):
-    elsewhere = tmp_path_factory.mktemp("elsewhere")
-    save_tiny_weights(elsewhere / "free")
-    monkeypatch.chdir(elsewhere)
-    assert checkpoints.locate("free/locomotion") == folder / "free" / "locomotion.safetensors"
-    with pytest.raises(CheckpointError, match="the free weights have no 'general'"):
-        checkpoints.locate("free/general")
-    assert checkpoints.locate("./free/general") == Path("free/general.safetensors")
 
 
 def test_auto_chooses_among_what_the_set_has(folder):
