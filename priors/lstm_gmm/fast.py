@@ -198,7 +198,7 @@ def pack_weights(model: LstmGmm) -> Layers:
         head=_pack_head(model, _to_numpy(model.out.weight), width),
     )
     with np.errstate(over="ignore"):
-        halves = [weight.astype(np.float16) for weight in weights]
+        halves: list[Any] = [weight.astype(np.float16) for weight in weights]
     exact = all(np.array_equal(half.astype(np.float32), weight) for half, weight in zip(halves, weights, strict=True))
     return Layers(*(half.view(np.uint16) for half in halves)) if exact and converts_half() else weights
 
