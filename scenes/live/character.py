@@ -28,6 +28,7 @@ KEPT_SECONDS = 120.0
 """Seconds of shown frames that are kept for looking back."""
 _TRAIL_FRAMES, _SPEED_FRAMES = 4 * PRIOR_FPS, 16  # of the past trajectory, and over which speed is measured
 _TRAIL_POINTS, _RESET_METRES = 24, 0.5  # of a band on the ground; a step of the past that only a reset makes
+_FAR = 1e4  # metres
 _MARK_HEIGHT, _FOOT_RADIUS = 0.012, 0.12  # metres over the ground, and of a planted foot's disc
 _MAX_COLOURS = 12  # of a character's mesh
 _OPAQUE = 0.999
@@ -159,15 +160,19 @@ class Marks:
             )
             for k, colour in enumerate((colours.LEFT, colours.RIGHT))
         ]
-        self.bands = scene.add_frame(f"{name}/bands", show_axes=False)
-        none, red = np.zeros((1, 2, 3), np.float32), to_rgb_bytes(colours.TARGET)
-        self._target = scene.add_arrows(f"{name}/bands/target", none, red, shaft_radius=0.025, head_radius=0.07)
+        # A browser culls what is out of view by the points that it gets first, so those are far apart.
+        far = np.linspace(-_FAR, _FAR, 2 * _TRAIL_POINTS)[:, None].repeat(3, axis=1).reshape(-1, 2, 3)
+        self._target = scene.add_arrows(
+            f"{name}/bands/target",
+            far[[0]],
+            to_rgb_bytes(colours.TARGET),
+            shaft_radius=0.025,
+            head_radius=0.07,
+            visible=False,
+        )
         self._trails = [
             scene.add_line_segments(
-                f"{name}/bands/{what}",
-                np.zeros((_TRAIL_POINTS - 1, 2, 3), np.float32),
-                to_rgb_bytes(colours.TRAIL),
-                thickness=thickness,
+                f"{name}/bands/{what}", far[1:], to_rgb_bytes(colours.TRAIL), thickness=thickness, visible=False
             )
             for what, thickness in (("past", 0.02), ("plan", 0.05))
         ]
@@ -180,12 +185,13 @@ class Marks:
     def show_bands(self, velocity: tuple[float, float], past: Array, plan: Array) -> None:
         """Show a target velocity, m/s, the past root trajectory (n, 2) up to now, and the planned one, metres."""
         here = past[-1]
+        self._target.visible = True
         self._target.points = np.insert([[here, here + velocity]], 1, _MARK_HEIGHT, axis=2)
         for trail, points in zip(self._trails, (past, np.concatenate([here[None], plan])), strict=True):
             at = np.linspace(0, len(points) - 1, _TRAIL_POINTS)
             flat = np.stack([np.interp(at, np.arange(len(points)), axis) for axis in points.T], axis=-1)
             line = np.insert(flat, 1, _MARK_HEIGHT, axis=1)
-            trail.points = np.stack([line[:-1], line[1:]], axis=1)
+            trail.points, trail.visible = np.stack([line[:-1], line[1:]], axis=1), True
 
 
 @dataclass(frozen=True, eq=False)

@@ -83,17 +83,6 @@ def test_a_foot_in_the_air_is_listed_whatever_the_floor(floor):
     assert 3 < found.amount < 6
 
 
-def test_a_foot_that_hangs_below_both_supports_is_not_below_its_floor():
-    toes = lifted([0.48] * len(CONTACTS))
-    (_, _, last), (_, first, _) = CONTACTS[2:4]
-    middle = (last + first) // 2
-    toes[last:first, 0, 1] -= 0.4 * torch.hann_window(first - last, periodic=False).double()
-    supports = fit_supports(toes, PLANTED)
-    assert float((supports - toes[..., 1])[last:first, 0].max()) < 1e-6
-    toes[last:first, 0, 1] = 0.48 + TOE_REST_HEIGHT - 0.02  # noise: the floor stays
-    assert float(fit_supports(toes, PLANTED)[middle, 0]) == pytest.approx(0.48 + TOE_REST_HEIGHT, abs=0.005)
-
-
 def resting(toes=TOE_POSITIONS, hips=HIPS, noise=NO_NOISE):
     return compute_rest_log_probability(toes, hips, 30.0, noise) > math.log(0.5)
 

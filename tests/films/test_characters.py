@@ -1,7 +1,6 @@
 """Characters in films: their mesh is where the file's matrices have it, stands on the floor, and is in the picture."""
 
 from dataclasses import replace
-from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -126,15 +125,6 @@ def test_what_is_no_character_is_refused(tmp_path):
         DrawnCharacter.load(tmp_path / "walk.bvh")
     with pytest.raises(MapctlError):
         DrawnCharacter.load(tmp_path / "missing.glb")
-
-
-def test_a_film_at_another_rate_shows_the_character_there(hero):
-    clip = long_walk(60)
-    drawn = hero.put_on(clip)
-    stage = Stage([Shot(clip, drawn=drawn)], fps=10)
-    assert stage.num_frames == 20
-    same = drawn.build_body(Fraction(30), GREY)
-    np.testing.assert_allclose(vertices_of(stage.players[0].body, 7), vertices_of(same, 21), atol=1e-6)
 
 
 @pytest.mark.slow

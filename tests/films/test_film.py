@@ -92,21 +92,6 @@ def test_the_curve_and_the_growing_trail_are_seen(renderer):
     assert trail[2] > trail[1] > trail[0]
 
 
-def test_both_painters_put_the_actor_at_the_same_place():
-    if not has_graphics():
-        pytest.skip("no OpenGL without a window here")
-    stage = Stage([Shot(moved(walk(3), turn=0.4, shift=(1.0, 2.0)))])
-    view = stage.views(CameraSettings(), (160, 120))[0]
-    centres = []
-    for name in ("egl", "stick"):
-        picture = select_painter(name).paint(view, stage.content(0))
-        assert picture.shape == (120, 160, 3)
-        assert picture.dtype == np.uint8
-        limbs = [near(picture, c, 0.97).mean() for c in (colours.LEFT, colours.RIGHT)]
-        centres.append(limbs)
-    assert np.array(centres[0]) == pytest.approx(np.array(centres[1]), abs=4)
-
-
 def test_fps_resamples_and_keeps_the_duration(tmp_path):
     film([Shot(walk(13, fps=12))], tmp_path / "slow.mp4", size=SMALL, fps=6, renderer="stick")
     frames, rate, *_ = read_mp4(tmp_path / "slow.mp4")

@@ -10,7 +10,7 @@ from helpers import generator
 from mapctl import rotations
 from mapctl.numerics.smooth_offsets import interpolate_offsets, interpolate_turns, smooth_between, solve_offsets
 
-SPANS = [(0, 9), (0, 3), (3, 4), (3, 5), (4, 9), (8, 9), (7, 9), (1, 8)]
+SPANS = [(0, 9), (0, 3), (3, 4), (7, 9), (1, 8)]
 
 
 @pytest.mark.parametrize(("start", "stop"), SPANS)
