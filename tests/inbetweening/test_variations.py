@@ -7,6 +7,7 @@ import pytest
 import torch
 from captures import on_rig
 from helpers import generator, tiny_density
+from methods import UNFINISHED
 from tiny_infiller import tiny_infiller
 from tiny_prior import save_tiny_prior
 
@@ -26,6 +27,7 @@ from mapctl.solver.lbfgs import LbfgsSettings
 from mapctl.solver.swarm import SwarmSettings
 
 FRAMES, KEYS = 45, (0, 20, 23, 44)
+FEW_FRAMES, FEW_KEYS = 25, (0, 10, 13, 24)
 FEW = InfillSettings(refinement=replace(INFILL_REFINEMENT, budget=Budget(evaluations=4)))
 QUICK = RolloutSettings(
     ahead=4,
@@ -66,8 +68,8 @@ def asked(motion, prior, *, count=3, seed=0, keys=KEYS, rolling=QUICK, **told):
 
 @pytest.mark.parametrize(("rig", "fps"), [("canonical", 30), pytest.param("daz", 60, marks=pytest.mark.slow)])
 def test_every_variation_meets_the_keys_to_the_bit_and_no_two_are_the_same(prior, rig, fps):
-    motion = on_rig(rig, FRAMES * fps // 30, fps=fps)
-    keys = [key * fps // 30 for key in KEYS]
+    motion = on_rig(rig, FEW_FRAMES * fps // 30, fps=fps)
+    keys = [key * fps // 30 for key in FEW_KEYS]
     found = asked(motion, prior, keys=tuple(keys))
     places = [one.solution.motion.joint_positions() for one in found.each]
     for one in found.each:
@@ -75,7 +77,7 @@ def test_every_variation_meets_the_keys_to_the_bit_and_no_two_are_the_same(prior
         assert torch.equal(made.local_quat_xyzw[keys], motion.local_quat_xyzw[keys])
         assert torch.equal(made.root_position[keys], motion.root_position[keys])
     apart = [float((places[i] - places[j]).norm(dim=-1).max()) for i in range(3) for j in range(i)]
-    assert min(apart) > 0.005
+    assert min(apart) > 0.002  # gaps are a third of a second
     assert found.diversity.world_cm > 0.1
     assert all(torch.isfinite(torch.tensor(one.energy)) for one in found.each)
 
@@ -115,7 +117,8 @@ def test_a_gap_in_which_every_rollout_jumps_is_left_to_the_fallback():
 def test_an_end_is_extended_by_a_density_and_a_beginning_never(prior, frames):
     motion, masks = on_rig("bandai", FRAMES), [Mask("*", 0, 2), Mask("*", *frames)]
     plain, made, again = (
-        infill(motion, inbetweener, masks) for inbetweener in (INFILLER, *[AutoInbetweener(INFILLER, [prior])] * 2)
+        infill(motion, inbetweener, masks, settings=UNFINISHED)
+        for inbetweener in (INFILLER, *[AutoInbetweener(INFILLER, [prior])] * 2)
     )
     known = ~made.missing.frames
     for one in (plain, made):
