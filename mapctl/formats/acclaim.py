@@ -15,7 +15,7 @@ bone that a frame leaves out keeps its last values, at first those of the rest p
 
 from array import array
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from fractions import Fraction
 from math import nan
 from os import PathLike, fspath
@@ -43,9 +43,7 @@ _INCH = 0.0254
 MAX_BONES = 1000
 """Most bones that are read; a body with fingers has about 60."""
 _SECTIONS = frozenset((":version", ":name", ":units", ":documentation", ":root", ":bonedata", ":hierarchy", ":skin"))
-_IGNORED = frozenset(("id", "bodymass", "cofmass", "limits"))
-_ALLOWED_KEYS = "name, direction, length, axis, dof, limits or end"
-_AXES = {"x": 0, "y": 1, "z": 2}
+_BONE_KEYS = ("name", "direction", "length", "axis", "dof", "limits", "id", "bodymass", "cofmass")
 _UNIT_ERROR = 0.01
 """How far a direction's length may be from one: files round to a few digits."""
 
@@ -210,14 +208,10 @@ def _quaternions(asf: AsfSkeleton, values: np.ndarray, *, degrees: bool) -> Floa
     for bone, (axes, columns) in enumerate(_columns(asf, "r")):
         angles = values[:, columns[::-1]]
         # About fixed axes the first named rotation comes first; about moving ones, last.
-        turns[:, bone] = euler.to_quat_xyzw(np.deg2rad(angles) if degrees else angles, _reverse_axes(axes))
+        turns[:, bone] = euler.to_quat_xyzw(np.deg2rad(angles) if degrees else angles, axes[::-1])
     frame = torch.from_numpy(asf.axis_quat_xyzw).expand(len(values), -1, 4)
     about = rotations.multiply(rotations.multiply(frame, torch.from_numpy(turns)), rotations.inverse(frame))
     return rotations.make_sign_continuous(about)
-
-
-def _reverse_axes(axes: Sequence[int]) -> tuple[int, ...]:
-    return tuple(axes[::-1])
 
 
 def read_asf(path: str | PathLike[str]) -> AsfSkeleton:
@@ -235,16 +229,13 @@ def rows(text: str) -> Iterator[Row]:
 _BLANKS = str.maketrans(",()", "   ")
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Bone:
-    """A bone as far as it has been read."""
-
+    name: str
     line: int
-    name: str = ""
-    direction: np.ndarray | None = None
-    length: float | None = None
-    axis: np.ndarray = field(default_factory=lambda: np.array([0.0, 0.0, 0.0, 1.0]))
-    channels: tuple[str, ...] = ()
+    end: np.ndarray
+    axis: np.ndarray
+    channels: tuple[str, ...]
 
 
 class _AsfReader:
@@ -263,14 +254,13 @@ class _AsfReader:
         self._units(sections.get(":units", []))
         root, position = self._root(sections[":root"])
         bones = [root, *self._bones(sections[":bonedata"])]
-        index = self._index(bones)
-        order, parents = self._tree(bones, index, sections[":hierarchy"])
+        order, parents = self._tree(bones, sections[":hierarchy"])
         place = {bone: number for number, bone in enumerate(order)}
         kept = [bones[bone] for bone in order]
         return AsfSkeleton(
             names=tuple(bone.name for bone in kept),
             parents=tuple(place[parents[bone]] if bone else -1 for bone in order),
-            ends=np.array([self._end(bone) for bone in kept]),
+            ends=np.array([bone.end for bone in kept]),
             axis_quat_xyzw=np.array([bone.axis for bone in kept]),
             channels=tuple(bone.channels for bone in kept),
             root_position=position,
@@ -299,107 +289,90 @@ class _AsfReader:
 
     def _units(self, section: Sequence[Row]) -> None:
         for line, words in section:
-            key, value = words[0].lower(), words[1].lower() if len(words) == 2 else ""
+            key = words[0].lower()
             if key == "length":
-                self.length = self._numbers(words[:2], line, 1)[0]  # some add the unit's name
+                self.length = self._numbers((line, words[:2]), 1)[0]  # some add the unit's name
                 if not 1e-3 <= self.length <= 1e3:
                     self.fail(f"expected a length unit from 0.001 to 1000, got {self.length:g}", line)
-            elif key == "angle":
-                if value not in ("deg", "rad"):
-                    self.fail(f"expected 'angle deg' or 'angle rad', got {shorten(' '.join(words))}", line)
-                self.degrees = value == "deg"
+            elif key == "angle" and [word.lower() for word in words[1:]] in (["deg"], ["rad"]):
+                self.degrees = words[1].lower() == "deg"
             elif key != "mass":
-                self.fail(f"expected mass, length or angle, got {shorten(words[0])}", line)
+                self.fail(f"expected mass, length, angle deg or angle rad, got {shorten(' '.join(words))}", line)
 
     def _root(self, section: Sequence[Row]) -> tuple[_Bone, np.ndarray]:
         """Read the root and its pre-set position."""
-        root = _Bone(section[0][0] if section else 0, "root")
-        told: dict[str, tuple[int, list[str]]] = {}
+        rows: dict[str, Row] = {}
         for line, words in section:
             key = words[0].lower()
-            if key not in ("order", "axis", "position", "orientation") or key in told:
+            if key not in ("order", "axis", "position", "orientation") or key in rows:
                 self.fail(f"expected order, axis, position and orientation once each, got {shorten(words[0])}", line)
-            told[key] = line, words
-        if "order" not in told:
+            rows[key] = line, words
+        channels = self._channels(rows["order"], allowed="tr") if "order" in rows else ()
+        if not channels:
             self.fail("the root has no order, as TX TY TZ RX RY RZ", section[-1][0] if section else None)
-        line, words = told["order"]
-        root.channels = self._channels(words, line, allowed="tr")
-        if not root.channels:
-            self.fail("expected the root's order as TX TY TZ RX RY RZ, got nothing", line)
-        axes = self._axis_order(told["axis"][1][-1], told["axis"][0]) if "axis" in told else (0, 1, 2)
-        if "orientation" in told:
-            line, words = told["orientation"]
-            root.axis = self._fixed_axes_quat(self._numbers(words, line, 3), axes)
-        if "position" not in told:
-            return root, np.zeros(3)
-        line, words = told["position"]
-        return root, np.array(self._numbers(words, line, 3))
+        line, words = rows.get("axis", (0, ["XYZ"]))
+        angles = self._numbers(rows["orientation"], 3) if "orientation" in rows else [0.0, 0.0, 0.0]
+        position = self._numbers(rows["position"], 3) if "position" in rows else [0.0, 0.0, 0.0]
+        axis = self._fixed_axes_quat(angles, words[-1], line)
+        return _Bone("root", section[0][0], np.zeros(3), axis, channels), np.array(position)
 
     def _bones(self, section: Sequence[Row]) -> Iterator[_Bone]:
-        bone, seen, after_limits = None, set(), False
+        rows: dict[str, Row] | None = None
+        begun, key = 0, ""
         for line, words in section:
-            key = words[0].lower()
-            if key == "begin" and bone is None:
-                bone, seen = _Bone(line), set()
-            elif bone is None:
-                self.fail(f"expected begin, got {shorten(words[0])}", line)
+            before, key = key, words[0].lower()
+            if rows is None:
+                if key != "begin":
+                    self.fail(f"expected begin, got {shorten(words[0])}", line)
+                rows, begun = {}, line
             elif key == "end":
-                yield self._check_complete(bone, line)
-                bone = None
-            elif not (after_limits and _is_limit(words[0])):
-                if key in seen:
-                    self.fail(f"a second {key} in a bone", line)
-                seen.add(key)
-                self._take(bone, key, words, line)
-                after_limits = key == "limits"
-        if bone is not None:
-            self.fail(f"the bone of line {bone.line} has no end", section[-1][0])
+                yield self._bone(rows, begun, line)
+                rows = None
+            elif before == "limits" and _is_limit(words[0]):
+                key = before
+            elif key not in _BONE_KEYS or key in rows:
+                self.fail(f"expected {', '.join(_BONE_KEYS)} once each or end, got {shorten(words[0])}", line)
+            else:
+                rows[key] = line, words
+        if rows is not None:
+            self.fail(f"the bone of line {begun} has no end", section[-1][0])
 
-    def _take(self, bone: _Bone, key: str, words: list[str], line: int) -> None:
-        """Read one line of a bone."""
-        if key == "name":
-            if len(words) != 2:
-                self.fail(f"expected one name, got {shorten(' '.join(words[1:]))}", line)
-            bone.name = words[1]
-        elif key == "direction":
-            bone.direction = self._direction(words, line)
-        elif key == "length":
-            bone.length = self._numbers(words, line, 1)[0]
-            if bone.length < 0:
-                self.fail(f"expected a length of 0 or more, got {bone.length:g}", line)
-        elif key == "axis":
-            if len(words) != 5:
-                self.fail(f"expected three angles and an order as XYZ, got {len(words) - 1} words", line)
-            bone.axis = self._fixed_axes_quat(self._numbers(words[:4], line, 3), self._axis_order(words[4], line))
-        elif key == "dof":
-            bone.channels = self._channels(words, line, allowed="r")
-        elif key not in _IGNORED:
-            self.fail(f"expected {_ALLOWED_KEYS}, got {shorten(words[0])}", line)
-
-    def _check_complete(self, bone: _Bone, line: int) -> _Bone:
-        lacks = [
-            key
-            for key, value in (("name", bone.name or None), ("direction", bone.direction), ("length", bone.length))
-            if value is None
-        ]
+    def _bone(self, rows: dict[str, Row], begun: int, end: int) -> _Bone:
+        lacks = [key for key in ("name", "direction", "length") if key not in rows]
         if lacks:
-            self.fail(f"the bone of line {bone.line} has no {' and no '.join(lacks)}", line)
-        return bone
+            self.fail(f"the bone of line {begun} has no {' and no '.join(lacks)}", end)
+        line, words = rows["name"]
+        if len(words) != 2:
+            self.fail(f"expected one name, got {shorten(' '.join(words[1:]))}", line)
+        direction, (length,) = np.array(self._numbers(rows["direction"], 3)), self._numbers(rows["length"], 1)
+        norm = float(np.linalg.norm(direction))
+        if norm and abs(norm - 1) > _UNIT_ERROR:
+            self.fail(f"expected a direction of length 1, got one of {norm:g}", rows["direction"][0])
+        if length < 0:
+            self.fail(f"expected a length of 0 or more, got {length:g}", rows["length"][0])
+        axis = np.array([0.0, 0.0, 0.0, 1.0])
+        if "axis" in rows:
+            line, angles = rows["axis"]
+            if len(angles) != 5:
+                self.fail(f"expected three angles and an order as XYZ, got {len(angles) - 1} words", line)
+            axis = self._fixed_axes_quat(self._numbers((line, angles[:4]), 3), angles[4], line)
+        channels = self._channels(rows["dof"], allowed="r") if "dof" in rows else ()
+        return _Bone(words[1], begun, direction * length, axis, channels)
 
-    def _index(self, bones: Sequence[_Bone]) -> dict[str, int]:
-        """Index bones by name in lower case, as files are not strict about it."""
-        found: dict[str, int] = {}
+    def _tree(self, bones: Sequence[_Bone], section: Sequence[Row]) -> tuple[list[int], dict[int, int]]:
+        """Sort bones depth first in file order; also return the parent of each. The numbers are those of `bones`.
+
+        Files are not strict about the case of names.
+        """
+        index: dict[str, int] = {}
         for number, bone in enumerate(bones):
-            if bone.name.lower() in found:
+            if bone.name.lower() in index:
                 self.fail(f"a second bone named {shorten(bone.name)}, names must be unique", bone.line)
             if number > MAX_BONES:
                 self.fail(f"more than {MAX_BONES} bones, which is the most allowed", bone.line)
-            found[bone.name.lower()] = number
-        return found
-
-    def _tree(self, bones: Sequence[_Bone], index: dict[str, int], section: Sequence[Row]):
-        """Sort bones depth first in file order; also return the parent of each. The numbers are those of `bones`."""
-        parents, children = {}, {}
+            index[bone.name.lower()] = number
+        parents: dict[int, int] = {}
+        children: dict[int, list[int]] = {}
         for line, words in section:
             if words[0].lower() in ("begin", "end") and len(words) == 1:
                 continue
@@ -421,37 +394,25 @@ class _AsfReader:
             self.fail(f"the bone {shorten(bone.name)} does not hang on the root in :hierarchy", bone.line)
         return order, parents
 
-    def _end(self, bone: _Bone) -> np.ndarray:
-        return np.zeros(3) if bone.direction is None or bone.length is None else bone.direction * bone.length
-
-    def _direction(self, words: list[str], line: int) -> np.ndarray:
-        vector = np.array(self._numbers(words, line, 3))
-        norm = float(np.linalg.norm(vector))
-        if norm and abs(norm - 1) > _UNIT_ERROR:
-            self.fail(f"expected a direction of length 1, got one of {norm:g}", line)
-        return vector
-
-    def _channels(self, words: list[str], line: int, *, allowed: str) -> tuple[str, ...]:
-        channels = tuple(word.lower() for word in words[1:])
-        known = {kind + axis for kind in allowed for axis in _AXES}
+    def _channels(self, row: Row, *, allowed: str) -> tuple[str, ...]:
+        channels = tuple(word.lower() for word in row[1][1:])
+        known = {kind + axis for kind in allowed for axis in "xyz"}
         if set(channels) - known or len(set(channels)) < len(channels):
             wanted = " ".join(sorted(known, reverse=allowed != "r"))
-            self.fail(f"expected of {wanted} each at most once, got {shorten(' '.join(words[1:]))}", line)
+            self.fail(f"expected of {wanted} each at most once, got {shorten(' '.join(row[1][1:]))}", row[0])
         return channels
 
-    def _axis_order(self, word: str, line: int) -> tuple[int, ...]:
-        if sorted(word.lower()) != ["x", "y", "z"]:
-            self.fail(f"expected an axis order as XYZ, got {shorten(word)}", line)
-        return tuple(_AXES[letter] for letter in word.lower())
-
-    def _fixed_axes_quat(self, angles: Sequence[float], axes: tuple[int, ...]) -> np.ndarray:
-        """Return the quaternion of three rotations about fixed axes: `angles` about x, y and z in the order that `axes`
-        says."""
+    def _fixed_axes_quat(self, angles: Sequence[float], order: str, line: int) -> np.ndarray:
+        """Return the quaternion of rotations about fixed axes: `angles` about x, y and z in the `order` as XYZ."""
+        if sorted(order.lower()) != ["x", "y", "z"]:
+            self.fail(f"expected an axis order as XYZ, got {shorten(order)}", line)
+        axes = tuple("xyz".index(letter) for letter in order.lower())[::-1]
         radians = np.deg2rad(angles) if self.degrees else np.array(angles)
-        return euler.to_quat_xyzw(radians[list(axes[::-1])], axes[::-1])
+        return euler.to_quat_xyzw(radians[list(axes)], axes)
 
-    def _numbers(self, words: list[str], line: int, count: int) -> list[float]:
+    def _numbers(self, row: Row, count: int) -> list[float]:
         """Parse the words after the first as numbers."""
+        line, words = row
         values = [finite_number(word) for word in words[1:]]
         if len(values) != count or None in values:
             got = shorten(" ".join(words[1:]) or "nothing")
@@ -473,118 +434,73 @@ def read_amc(path: str | PathLike[str], skeleton: AsfSkeleton, *, lossy: bool = 
 
     A `lossy` one may hold NaN among its values, but not only NaN.
     """
-    reader = _AmcReader(path, skeleton, lossy)
-    reader.read(rows(decode(path, read_bytes(path), "AMC text")[0]))
-    values = np.frombuffer(reader.values).reshape(reader.frames, reader.width)
-    return AmcText(values, reader.degrees, reader.fps)
 
+    def fail(message: str, line: int) -> NoReturn:
+        raise FileFormatError(path, message, line)
 
-@dataclass
-class _AmcReader:
-    path: str | PathLike[str]
-    skeleton: AsfSkeleton
-    lossy: bool = False
-    degrees: bool | None = None
-    fps: Fraction | None = None
-    full: bool = False
-    frames: int = 0
-    """Number of frames begun so far."""
-    number: int = 0
-    """Number of the current frame, as the file counts."""
-    line: int = 0
-    """Line at which the current frame began."""
-    values: array = field(default_factory=lambda: array("d"))
-    seen: set[int] = field(default_factory=set)
-    """Bones of the current frame so far."""
-    expected_bones: set[int] = field(default_factory=set)
-    """Bones of the first frame; in a fully specified file those of all."""
+    counts = [len(channels) for channels in skeleton.channels]
+    starts = np.cumsum([0, *counts])[:-1].tolist()
+    bones = {name.lower(): bone for bone, name in enumerate(skeleton.names)}
+    row, values = array("d", bytes(8 * sum(counts))), array("d")
+    degrees, fps, full = None, None, False
+    frames, number, begun, line = 0, 0, 0, 1
+    seen, expected = set[int](), set[int]()
 
-    def __post_init__(self):
-        counts = [len(channels) for channels in self.skeleton.channels]
-        starts = np.cumsum([0, *counts])[:-1].tolist()
-        self.width = sum(counts)
-        names = [name.lower() for name in self.skeleton.names]
-        self.columns = dict(zip(names, zip(range(len(names)), starts, counts, strict=True), strict=True))
-        self.row = array("d", bytes(8 * self.width))
+    def keep_frame() -> None:
+        if 0 not in seen:
+            fail(f"frame {number} has no line for the root", begun)
+        if full and seen != expected:
+            bone = shorten(skeleton.names[min(seen ^ expected)])
+            fail(f"not every frame up to {number} holds {bone}, but the file says it is fully specified", begun)
+        values.extend(row)
 
-    def fail(self, message: str, line: int) -> NoReturn:
-        raise FileFormatError(self.path, message, line)
-
-    def read(self, lines: Iterator[Row]) -> None:
-        line = 1
-        for line, words in lines:
-            if words[0].startswith(":"):
-                self._keyword(words, line)
-            elif len(words) == 1 and words[0].isdecimal() and words[0].isascii():
-                self._finish()
-                self._begin(words[0], line)
-            else:
-                self._bone(words, line)
-        if not self.frames:
-            self.fail("holds no frame, expected a line with the number 1", line)
-        self._finish()
-
-    def _keyword(self, words: Sequence[str], line: int) -> None:
-        word = words[0].lower()
-        if word not in _KEYWORDS or self.frames:
-            allowed = "a frame's number or a bone" if self.frames else f"one of {', '.join(_KEYWORDS)}"
-            self.fail(f"expected {allowed}, got {shorten(words[0])}", line)
-        if word in (":degrees", ":radians"):
-            if self.degrees is not None:
-                self.fail("a second word on the unit of angles", line)
-            self.degrees = word == ":degrees"
-        elif word == ":samples-per-second":
-            self.fps = self._rate(words, line)
-        elif word == ":fully-specified":
-            self.full = True
-
-    def _rate(self, words: Sequence[str], line: int) -> Fraction:
-        value = finite_number(words[1]) if len(words) == 2 else None
-        if value is None or not SLOWEST <= value <= FASTEST:
-            got = shorten(" ".join(words[1:]))
-            self.fail(f"expected {SLOWEST:g} to {FASTEST:g} samples a second, got {got}", line)
-        return Fraction(value).limit_denominator(100_000)
-
-    def _begin(self, word: str, line: int) -> None:
-        number = int(word) if len(word) <= 9 else -1
-        if number < 0 or (self.frames and number != self.number + 1):
-            expected = f"frame {self.number + 1} after frame {self.number}" if self.frames else "a frame's number"
-            self.fail(f"expected {expected}, got {shorten(word)}", line)
-        self.frames, self.number, self.line, self.seen = self.frames + 1, number, line, set()
-        if self.frames * max(self.width, len(self.columns)) > MAX_POSES:
-            self.fail(f"more than {MAX_POSES} values, which is the most allowed", line)
-
-    def _bone(self, words: Sequence[str], line: int) -> None:
-        if not self.frames:
-            self.fail(f"expected the number of the first frame, got {shorten(words[0])}", line)
-        if words[0].lower() not in self.columns:
-            self.fail(f"the skeleton has no bone {shorten(words[0])}", line)
-        bone, start, count = self.columns[words[0].lower()]
-        if bone in self.seen:
-            self.fail(f"a second line for {shorten(words[0])} in frame {self.number}", line)
-        if len(words) - 1 != count:
-            self.fail(f"{shorten(words[0])} has {len(words) - 1} values, expected {count}", line)
-        for column, word in enumerate(words[1:], start):
-            value = nan if self.lossy and missing.is_nan(word) else finite_number(word)
-            if value is None:
-                channel = self.skeleton.channels[bone][column - start]
-                got = f"{shorten(word)}{missing.missing_hint(word)}"
-                self.fail(f"{shorten(words[0])} {channel}: expected {NUMBER}, got {got}", line)
-            self.row[column] = value
-        self.seen.add(bone)
-
-    def _finish(self) -> None:
-        """Keep the frame that has been read, if any."""
-        if not self.frames:
-            return
-        if 0 not in self.seen:
-            self.fail(f"frame {self.number} has no line for the root", self.line)
-        if self.frames == 1:
-            self.expected_bones = self.seen
-        if self.full and self.seen != self.expected_bones:
-            bone = self.skeleton.names[min(self.seen ^ self.expected_bones)]
-            self.fail(
-                f"not every frame up to {self.number} holds {shorten(bone)}, but the file says it is fully specified",
-                self.line,
-            )
-        self.values.extend(self.row)
+    for line, words in rows(decode(path, read_bytes(path), "AMC text")[0]):
+        word, shown = words[0].lower(), shorten(words[0])
+        if word.startswith(":"):
+            if word not in _KEYWORDS or frames:
+                allowed = "a frame's number or a bone" if frames else f"one of {', '.join(_KEYWORDS)}"
+                fail(f"expected {allowed}, got {shown}", line)
+            if word in (":degrees", ":radians"):
+                if degrees is not None:
+                    fail("a second word on the unit of angles", line)
+                degrees = word == ":degrees"
+            elif word == ":samples-per-second":
+                fps = finite_number(words[1]) if len(words) == 2 else None
+                if fps is None or not SLOWEST <= fps <= FASTEST:
+                    got = shorten(" ".join(words[1:]))
+                    fail(f"expected {SLOWEST:g} to {FASTEST:g} samples a second, got {got}", line)
+            full = full or word == ":fully-specified"
+        elif len(words) == 1 and word.isdecimal() and word.isascii():
+            if frames:
+                expected = expected or seen
+                keep_frame()
+            following = int(word) if len(word) <= 9 else -1
+            if following < 0 or (frames and following != number + 1):
+                wanted = f"frame {number + 1} after frame {number}" if frames else "a frame's number"
+                fail(f"expected {wanted}, got {shown}", line)
+            frames, number, begun, seen = frames + 1, following, line, set()
+            if frames * max(len(row), len(bones)) > MAX_POSES:
+                fail(f"more than {MAX_POSES} values, which is the most allowed", line)
+        else:
+            if not frames:
+                fail(f"expected the number of the first frame, got {shown}", line)
+            if word not in bones:
+                fail(f"the skeleton has no bone {shown}", line)
+            bone = bones[word]
+            if bone in seen:
+                fail(f"a second line for {shown} in frame {number}", line)
+            if len(words) - 1 != counts[bone]:
+                fail(f"{shown} has {len(words) - 1} values, expected {counts[bone]}", line)
+            for channel, text in enumerate(words[1:]):
+                value = nan if lossy and missing.is_nan(text) else finite_number(text)
+                if value is None:
+                    got = f"{shorten(text)}{missing.missing_hint(text)}"
+                    fail(f"{shown} {skeleton.channels[bone][channel]}: expected {NUMBER}, got {got}", line)
+                row[starts[bone] + channel] = value
+            seen.add(bone)
+    if not frames:
+        fail("holds no frame, expected a line with the number 1", line)
+    expected = expected or seen
+    keep_frame()
+    rate = None if fps is None else Fraction(fps).limit_denominator(100_000)
+    return AmcText(np.frombuffer(values).reshape(frames, len(row)), degrees, rate)
