@@ -10,7 +10,7 @@ another number or the last row is cut off.
 """
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from itertools import count, pairwise
@@ -155,20 +155,12 @@ class Hierarchy:
         return [[(channel, next(column)) for channel in channels] for channels in self.channels]
 
 
-def read_hierarchy(scanner: Scanner) -> Hierarchy:
-    """Read from HIERARCHY to the word MOTION, which is taken too."""
-    scanner.expect("HIERARCHY")
-    reader = _Reader(scanner)
-    while (word := scanner.word()).upper() != "MOTION":
-        reader.take(word)
-    return reader.finish()
-
-
 @dataclass
 class _Node:
-    """A joint, or an End Site (whose parent is its joint), as far as it has been read."""
+    """A joint, or an End Site (of the joint `parent`), as far as it has been read."""
 
     name: str
+    number: int
     parent: int
     line: int
     is_end: bool = False
@@ -179,131 +171,97 @@ class _Node:
         return f"the End Site of line {self.line}" if self.is_end else f"joint {shorten(self.name)}"
 
 
-class _Reader:
-    def __init__(self, scanner: Scanner):
-        self.scanner = scanner
-        self.joints: dict[str, int] = {}
-        self.nodes: list[_Node] = []
-        self.ends: dict[int, _Node] = {}
-        self.open: list[_Node] = []
-        self.renamed: list[str] = []
-        self.handlers: dict[str, Callable[[], None]] = {
-            "ROOT": self._root,
-            "JOINT": self._joint,
-            "END": self._end,
-            "OFFSET": self._offset,
-            "CHANNELS": self._channels,
-            "}": self._close,
-        }
+def read_hierarchy(scanner: Scanner) -> Hierarchy:
+    """Read from HIERARCHY to the word MOTION, which is taken too."""
+    scanner.expect("HIERARCHY")
+    joints: dict[str, _Node] = {}
+    ends: dict[int, _Node] = {}
+    opened: list[_Node] = []
+    renamed: list[str] = []
+    while (word := scanner.word().upper()) != "MOTION":
+        if word not in ("ROOT", "JOINT", "END", "OFFSET", "CHANNELS", "}"):
+            allowed = "OFFSET, CHANNELS, JOINT, End Site or '}'" if opened else "ROOT or MOTION"
+            scanner.fail(f"expected {allowed}, got {scanner.shown(scanner.text[scanner.start : scanner.stop])}")
+        if word == "ROOT":
+            if joints:
+                scanner.fail("a second ROOT, allowed is one")
+            opened.append(_open_joint(scanner, joints, -1, renamed))
+            continue
+        if not opened:
+            scanner.fail(f"{word} outside of a joint, expected ROOT or MOTION")
+        node = opened[-1]
+        if word == "JOINT":
+            if node.is_end:
+                scanner.fail("a JOINT within an End Site, expected OFFSET or '}'")
+            opened.append(_open_joint(scanner, joints, node.number, renamed))
+        elif word == "END":
+            if node.is_end or node.number in ends:
+                scanner.fail(f"a second End Site in {node}")
+            ends[node.number] = _Node(scanner.name(), -1, node.number, scanner.line, is_end=True)
+            scanner.expect("{")
+            opened.append(ends[node.number])
+        elif word == "OFFSET":
+            if node.offset is not None:
+                scanner.fail(f"a second OFFSET in {node}")
+            x, y, z = (scanner.number(f"the {axis} of OFFSET") for axis in "XYZ")
+            node.offset = (x, y, z)
+        elif word == "CHANNELS":
+            if node.channels is not None:
+                scanner.fail(f"a second CHANNELS in {node}")
+            node.channels = _read_channels(scanner, node)
+        else:
+            if node.offset is None:
+                scanner.fail(f"{node} has no OFFSET")
+            opened.pop()
+    if opened or not joints:
+        lacks = f"'}}' before MOTION: {opened[-1]} is still open" if opened else "ROOT before MOTION"
+        scanner.fail(f"expected {lacks}")
+    if renamed:
+        more = f" and {len(renamed) - 3} more" if len(renamed) > 3 else ""
+        warn_once(f"{scanner.path}: names must be unique, so it reads {', '.join(renamed[:3])}{more}")
+    return Hierarchy(
+        names=tuple(joints),
+        parents=tuple(node.parent for node in joints.values()),
+        offsets=tuple(node.offset or _ORIGIN for node in joints.values()),
+        channels=tuple(node.channels or () for node in joints.values()),
+        end_offsets={joint: node.offset or _ORIGIN for joint, node in ends.items()},
+    )
 
-    def take(self, word: str) -> None:
-        handler = self.handlers.get(word.upper())
-        if handler is None:
-            allowed = "OFFSET, CHANNELS, JOINT, End Site or '}'" if self.open else "ROOT or MOTION"
-            self.scanner.fail(f"expected {allowed}, got {self.scanner.shown(word)}")
-        handler()
 
-    def finish(self) -> Hierarchy:
-        if self.open:
-            self.scanner.fail(f"expected '}}' before MOTION: {self.open[-1]} is still open")
-        if not self.nodes:
-            self.scanner.fail("expected ROOT before MOTION")
-        if self.renamed:
-            more = f" and {len(self.renamed) - 3} more" if len(self.renamed) > 3 else ""
-            warn_once(f"{self.scanner.path}: names must be unique, so it reads {', '.join(self.renamed[:3])}{more}")
-        return Hierarchy(
-            names=tuple(self.joints),
-            parents=tuple(node.parent for node in self.nodes),
-            offsets=tuple(node.offset or _ORIGIN for node in self.nodes),
-            channels=tuple(node.channels or () for node in self.nodes),
-            end_offsets={joint: node.offset or _ORIGIN for joint, node in self.ends.items()},
-        )
-
-    def _root(self) -> None:
-        if self.nodes:
-            self.scanner.fail("a second ROOT, allowed is one")
-        self._open_joint(parent=-1)
-
-    def _joint(self) -> None:
-        node = self._current("JOINT")
-        if node.is_end:
-            self.scanner.fail("a JOINT within an End Site, expected OFFSET or '}'")
-        self._open_joint(parent=self.joints[node.name])
-
-    def _open_joint(self, *, parent: int) -> None:
-        name = self.scanner.name()
-        if len(self.joints) == MAX_JOINTS:
-            self.scanner.fail(f"more than {MAX_JOINTS} joints, which is the most allowed")
-        if name in self.joints:
-            name = self._unique_name(name)
-        self.joints[name] = len(self.joints)
-        self.nodes.append(_Node(name, parent, self.scanner.line))
-        self._open_brace(self.nodes[-1])
-
-    def _unique_name(self, name: str) -> str:
-        """Make a name for a joint whose own is taken: `Bip01_2` for the second Bip01, one that no joint of the file
-        has."""
-        taken = {line.strip() for line in _JOINT_LINE.findall(self.scanner.text)} | set(self.joints)
+def _open_joint(scanner: Scanner, joints: dict[str, _Node], parent: int, renamed: list[str]) -> _Node:
+    """Read a joint's name and brace. One whose name is taken gets one that no joint of the file has: `Bip01_2` for the
+    second Bip01."""
+    own = name = scanner.name()
+    if len(joints) == MAX_JOINTS:
+        scanner.fail(f"more than {MAX_JOINTS} joints, which is the most allowed")
+    if name in joints:
+        taken = {line.strip() for line in _JOINT_LINE.findall(scanner.text)} | set(joints)
         own = next(own for number in count(2) if (own := f"{name}_{number}") not in taken)
-        self.renamed.append(f"the joint {shorten(name)} of line {self.scanner.line} as {own!r}")
-        return own
+        renamed.append(f"the joint {shorten(name)} of line {scanner.line} as {own!r}")
+    joints[own] = _Node(own, len(joints), parent, scanner.line)
+    scanner.expect("{")
+    return joints[own]
 
-    def _end(self) -> None:
-        node = self._current("End Site")
-        if node.is_end or self.joints[node.name] in self.ends:
-            self.scanner.fail(f"a second End Site in {node}")
-        end = _Node(self.scanner.name(), self.joints[node.name], self.scanner.line, is_end=True)
-        self.ends[end.parent] = end
-        self._open_brace(end)
 
-    def _open_brace(self, node: _Node) -> None:
-        self.scanner.expect("{")
-        self.open.append(node)
-
-    def _close(self) -> None:
-        node = self._current("'}'")
-        if node.offset is None:
-            self.scanner.fail(f"{node} has no OFFSET")
-        self.open.pop()
-
-    def _offset(self) -> None:
-        node = self._current("OFFSET")
-        if node.offset is not None:
-            self.scanner.fail(f"a second OFFSET in {node}")
-        x, y, z = (self.scanner.number(f"the {axis} of OFFSET") for axis in "XYZ")
-        node.offset = (x, y, z)
-
-    def _channels(self) -> None:
-        node = self._current("CHANNELS")
-        if node.channels is not None:
-            self.scanner.fail(f"a second CHANNELS in {node}")
-        most = 0 if node.is_end else MAX_CHANNELS
-        number = self.scanner.word()
-        if number not in map(str, range(most + 1)):
-            self.scanner.fail(f"expected 0 to {most} CHANNELS in {node}, got {self.scanner.shown(number)}")
-        node.channels = tuple(self._channel() for _ in range(int(number)))
-        self._check(node.channels)
-
-    def _channel(self) -> str:
-        word = self.scanner.word()
+def _read_channels(scanner: Scanner, node: _Node) -> tuple[str, ...]:
+    """Read a node's channels: ZXZ is an Euler order, ZZX is none; a position is given once."""
+    most = 0 if node.is_end else MAX_CHANNELS
+    number = scanner.word()
+    if number not in map(str, range(most + 1)):
+        scanner.fail(f"expected 0 to {most} CHANNELS in {node}, got {scanner.shown(number)}")
+    channels = []
+    for _ in range(int(number)):
+        word = scanner.word()
         found = _CHANNEL.fullmatch(word)
         if found is None:
-            self.scanner.fail(f"expected a channel as Xposition or Zrotation, got {self.scanner.shown(word)}")
-        return found.group(1).upper() + found.group(2).lower()
-
-    def _check(self, channels: tuple[str, ...]) -> None:
-        """Check a joint's channels: ZXZ is an Euler order, ZZX is none; a position is given once."""
-        positions = [c for c in channels if c.endswith("position")]
-        rotations = [c for c in channels if c.endswith("rotation")]
-        twice = any(a == b for a, b in pairwise(rotations))
-        if twice or len(rotations) > 3 or len(set(positions)) < len(positions):
-            self.scanner.fail(f"expected up to three positions and an Euler order, got {' '.join(channels)}")
-
-    def _current(self, word: str) -> _Node:
-        """Return the open node that `word` belongs to."""
-        if not self.open:
-            self.scanner.fail(f"{word} outside of a joint, expected ROOT or MOTION")
-        return self.open[-1]
+            scanner.fail(f"expected a channel as Xposition or Zrotation, got {scanner.shown(word)}")
+        channels.append(found.group(1).upper() + found.group(2).lower())
+    positions = [channel for channel in channels if channel.endswith("position")]
+    turns = [channel for channel in channels if channel.endswith("rotation")]
+    twice = any(a == b for a, b in pairwise(turns))
+    if twice or len(turns) > 3 or len(set(positions)) < len(positions):
+        scanner.fail(f"expected up to three positions and an Euler order, got {' '.join(channels)}")
+    return tuple(channels)
 
 
 _FRAMES = re.compile(r"\s*+frames[ \t]*+:?[ \t]*+([^\s:]+)", re.IGNORECASE)
@@ -334,29 +292,20 @@ def read(path: str | PathLike[str], *, lossy: bool = False) -> BvhText:
     text, encoding = decode(path, read_bytes(path), "BVH text")
     scanner = Scanner(path, text)
     hierarchy = read_hierarchy(scanner)
-    frames, frames_line = _parse_frame_count(scanner), scanner.line
-    frame_time = _parse_frame_time(scanner)
+    word = scanner.match(_FRAMES, "'Frames: COUNT'")
+    if not re.fullmatch(r"[+]?[0-9]{1,12}", word):
+        scanner.fail(f"expected a positive number of frames, got {shorten(word)}")
+    frames, frames_line = int(word), scanner.line
+    frame_time = scanner.match(_FRAME_TIME, "'Frame Time: SECONDS'")
+    seconds = finite_number(frame_time)
+    if seconds is None or len(frame_time) > 60 or not SHORTEST_FRAME <= seconds <= LONGEST_FRAME:
+        allowed = f"between {SHORTEST_FRAME:g} and {LONGEST_FRAME:g} s"
+        scanner.fail(f"expected a frame time {allowed}, got {shorten(frame_time)}")
     labels = hierarchy.labels()
     values = _parse_values(scanner, labels, frames=frames, frames_line=frames_line, lossy=lossy)
     missing.check_any_known(path, np.isnan(values))
     check_extent(path, len(values), len(hierarchy.names))
     return BvhText(hierarchy, frame_time, values, encoding)
-
-
-def _parse_frame_count(scanner: Scanner) -> int:
-    word = scanner.match(_FRAMES, "'Frames: COUNT'")
-    if not re.fullmatch(r"[+]?[0-9]{1,12}", word):
-        scanner.fail(f"expected a positive number of frames, got {shorten(word)}")
-    return int(word)
-
-
-def _parse_frame_time(scanner: Scanner) -> str:
-    word = scanner.match(_FRAME_TIME, "'Frame Time: SECONDS'")
-    seconds = finite_number(word)
-    if seconds is None or len(word) > 60 or not SHORTEST_FRAME <= seconds <= LONGEST_FRAME:
-        allowed = f"between {SHORTEST_FRAME:g} and {LONGEST_FRAME:g} s"
-        scanner.fail(f"expected a frame time {allowed}, got {shorten(word)}")
-    return word
 
 
 def _parse_values(scanner: Scanner, labels: Sequence[str], *, frames: int, frames_line: int, lossy: bool) -> np.ndarray:
