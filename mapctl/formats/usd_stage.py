@@ -713,7 +713,8 @@ def _add_motion(stage: Usd.Stage, motion: NewMotion) -> None:
     if not prim or not prim.IsA(UsdSkel.Skeleton):
         raise Refusal(f"has no Skeleton {motion.skeleton}")
     skeleton = read_skeleton(_as_own(stage, prim))
-    replaced = _find_replaced(stage, skeleton, motion.animation)
+    names, prims, _ = name_animations(stage, skeleton)
+    replaced = prims[names.index(motion.animation)] if motion.animation in names else None
     codes = _set_times(stage, replaced, len(motion.translations), motion.rate)
     moved, turned, scales = _place_roots(skeleton, motion, codes)
     path = skeleton.prim.GetPath().AppendChild(_free_name(skeleton.prim, motion.stem))
@@ -733,14 +734,6 @@ def _as_own(stage: Usd.Stage, prim: Usd.Prim) -> Usd.Prim:
         if one.IsInstance():
             one.SetInstanceable(False)
     return stage.GetPrimAtPath(path)
-
-
-def _find_replaced(stage: Usd.Stage, skeleton: SkeletonPrim, name: str | None) -> Usd.Prim | None:
-    """Return the animation that the motion was read from; None where it was read from none."""
-    if name is None:
-        return None
-    names, prims, _ = name_animations(stage, skeleton)
-    return prims[names.index(name)] if name in names else None
 
 
 def _set_times(stage: Usd.Stage, replaced: Usd.Prim | None, frames: int, rate: float) -> Array:
@@ -829,9 +822,6 @@ def _set_extent(prim: Usd.Prim, places: Array) -> None:
     own = (back[:3, :3] @ grid + back[:3, 3:]).T
     extent.Clear()
     extent.Set(Vt.Vec3fArray.FromNumpy(np.array([own.min(0), own.max(0)], np.float32)))
-
-
-# The package loads its modules at run time and declares no types.
 
 
 def build_stage(motion: "Motion", joints: Sequence[str]) -> Usd.Stage:

@@ -5,42 +5,17 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from acclaim import assert_same_places, ends_of, pair
+from acclaim import assert_same_places, pair
 
 import mapctl
 from mapctl.errors import FileFormatError, RequestError
 
 
-@pytest.mark.parametrize("seed", range(6))
-@pytest.mark.parametrize("degrees", [True, False])
-@pytest.mark.parametrize("missing", [0.0, 0.4])
+@pytest.mark.parametrize(("seed", "degrees", "missing"), [(0, True, 0.0), (1, False, 0.4), (2, True, 0.4)])
 def test_bones_are_where_the_definition_puts_them(tmp_path, seed, degrees, missing):
     turned = {"orientation": np.array([20.0, -30, 40]), "position": np.array([1.0, 2, 3])} if seed % 2 else {}
     told = pair(seed=seed, degrees=degrees, missing=missing, **turned)
     assert_same_places(mapctl.load(told.write(tmp_path)), told)
-
-
-def test_the_rest_pose_is_a_person_with_joint_frames_as_the_world(tmp_path):
-    told = pair(1)
-    still = {name: values * 0 for name, values in told.frames[0].items()}
-    motion = mapctl.load(replace(told, frames=(still,)).write(tmp_path))
-    names, places = motion.skeleton.names, motion.joint_positions()[0].numpy()
-    assert names[0] == "root"
-    np.testing.assert_allclose(motion.joint_rotations()[0].numpy(), np.tile([0, 0, 0, 1], (len(names), 1)), atol=1e-12)
-    tall = places[names.index("head"), 1] - places[names.index("ltoes"), 1]
-    assert 1.2 < tall < 1.8
-    assert places[names.index("lhand"), 0] > 0.5
-
-
-@pytest.mark.parametrize("ending", [".bvh", ".npz"])
-def test_written_elsewhere_and_read_back_joints_are_in_the_same_places(tmp_path, ending):
-    motion = mapctl.load(pair(9, seed=3).write(tmp_path))
-    motion.save(tmp_path / f"again{ending}")
-    again = mapctl.load(tmp_path / f"again{ending}")
-    assert (again.fps, again.skeleton.names) == (motion.fps, motion.skeleton.names)
-    np.testing.assert_allclose(again.joint_positions(), motion.joint_positions(), atol=2e-6)
-    for name, place in ends_of(again).items():
-        np.testing.assert_allclose(place, ends_of(motion)[name], atol=2e-6)
 
 
 def test_bones_that_a_take_never_names_rest(tmp_path):

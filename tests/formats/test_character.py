@@ -70,12 +70,6 @@ def test_a_joint_that_moves_within_its_parent_is_kept():
     np.testing.assert_allclose(frames.to_locals(motion)[0], local[..., :3, 3], atol=1e-9)
 
 
-def test_end_sites_are_offsets_from_their_joint():
-    frames, _, _ = example(1)
-    skeleton = frames.skeleton({4: frames.positions[4] + [0.0, 0.1, 0.2]})
-    assert skeleton.end_offsets == {"e": pytest.approx((0.0, 0.1, 0.2))}
-
-
 @pytest.mark.parametrize(
     ("linear", "why"),
     [

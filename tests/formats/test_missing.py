@@ -57,14 +57,6 @@ def test_whole_frames_are_lost_whole_also_joints_without_channels(clip, tmp_path
     assert motion.skeleton.matches(whole.skeleton)
 
 
-def test_a_joint_that_is_never_known_rests(clip, tmp_path):
-    rig, _, file = clip
-    lossy = without(file, tmp_path / "lossy.bvh", [(HAND[rig], 0, 12)])
-    assert masks_of(lossy) == {Mask(HAND[rig], 0, 12)}
-    joint = formats.load_with_missing(lossy)[0].local_quat_xyzw[:, mapctl.load(file).skeleton.index(HAND[rig])]
-    assert joint.abs().max() == joint[:, 3].abs().min() == 1
-
-
 def test_the_place_of_a_still_joint_is_known_by_any_frame_and_by_its_offset(tmp_path):
     file = with_all_channels(on_rig("daz", 12), tmp_path / "in.bvh")
     whole = mapctl.load(file)

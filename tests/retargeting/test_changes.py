@@ -1,17 +1,12 @@
 """What retargeting says of what it changed; fingers of rigs that have the same ones; the command that writes both."""
 
-import math
-from dataclasses import replace
-
 import pytest
 import torch
-from hand_poses import arms_down
-from helpers import quat_xyzw, run, walk
+from helpers import walk
 from performers import Performer
 from rig_maker import Make, make, names_of
 from scipy.spatial.transform import Rotation
 
-import mapctl
 from mapctl.motion import Motion
 from mapctl.retarget.carry import RiggedCharacter, match_fingers, retarget_motion
 from mapctl.skeleton import Skeleton
@@ -76,36 +71,3 @@ def test_fingers_are_matched_by_side_finger_and_place():
         "rIndex0": "RightHandIndex1",
         "little_01_l": "LeftHandPinky1",
     }
-
-
-@pytest.fixture
-def files(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    clip = arms_down(Performer().walks())
-    clip.save("in.bvh")
-    Performer(leg=0.8, toe_height=0.03).walks().save("rig.bvh")
-    on(MIXAMO).save("mixamo.bvh")
-    return tmp_path
-
-
-def test_another_take_keeps_its_further_joints(files):
-    """On the rig's own skeleton nothing rests that moved."""
-    clip = on(MIXAMO, 30)
-    clip.save("take.bvh")
-    assert run("convert", "take.bvh", "out.npz", "--rig", "mixamo.bvh") == 0
-    made, wanted = mapctl.load("out.npz"), mapctl.load("take.bvh")
-    dots = (made.local_quat_xyzw * wanted.local_quat_xyzw).sum(-1).abs()
-    assert float(2 * torch.acos(dots.clamp(max=1)).max()) < math.radians(1e-3)
-
-
-def test_a_finger_that_is_at_rest_in_its_own_way_adds_nothing():
-    """Whatever local rotation that rest has on either rig."""
-    clip, body = on(MIXAMO), RiggedCharacter.of(on(UE5))[1]
-    still = clip.local_quat_xyzw.clone()
-    joint = clip.skeleton.index(FINGERS[0])
-    still[:, joint] = quat_xyzw(torch.zeros(1, 3, dtype=torch.float64))
-    found = retarget_motion(replace(clip, local_quat_xyzw=still), body)
-    turned = found.fingers[body.rigmap.rig_skeleton.index(FINGERS[0])]
-    rest = body.rigmap.idle_quat_xyzw
-    own = turned.new_tensor([0, 0, 0, 1.0]) if rest is None else rest[body.rigmap.rig_skeleton.index(FINGERS[0])]
-    torch.testing.assert_close((turned * own).sum(-1).abs(), torch.ones(40).double(), atol=1e-9, rtol=0)

@@ -217,8 +217,7 @@ def test_arms_that_are_too_short_get_as_near_as_they_can_and_say_so():
     assert float(after) < 3.5 * float(before)  # the hand is asked 10 cm farther within 6 frames
 
 
-@pytest.mark.parametrize("make", [at_hip, on_chest])
-@pytest.mark.parametrize("name", ["long arms", "wide shoulders", "small"])
+@pytest.mark.parametrize(("make", "name"), [(at_hip, "long arms"), (on_chest, "small")])
 def test_hands_that_go_there_and_back_are_where_they_were(make, name):
     clip = make(arms_down(standing()))
     there = retarget_motion(clip, body_of(BODIES[name])).motion

@@ -8,7 +8,6 @@ from helpers import bandai_skeleton, cmu_skeleton, random_motion, turn_between
 
 from mapctl import retarget
 from mapctl.errors import RequestError
-from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL, Skeleton
 
 SKELETONS = {"bandai-namco": bandai_skeleton(), "cmu-daz": cmu_skeleton(), "canonical": CANONICAL}
@@ -39,24 +38,6 @@ def test_back_and_there_is_the_canonical_motion(rig):
     canonical, _ = retarget.to_canonical(retarget.from_canonical(wanted, rigmap), retarget.as_rig(rigmap))
     assert turn_between(canonical.local_quat_xyzw, wanted.local_quat_xyzw) < 1e-6
     torch.testing.assert_close(canonical.joint_positions(), wanted.joint_positions(), atol=1e-9, rtol=0)
-
-
-@each_rig
-def test_the_t_pose_comes_out_as_identity(rig):
-    rigmap = retarget.identify_rig(SKELETONS[rig])
-    tpose = Motion(
-        rigmap.skeleton,
-        random_on(rig).fps,
-        torch.zeros(1, 3).double(),
-        torch.tensor([0.0, 0, 0, 1]).double().expand(1, 21, 4),
-    )
-    on_rig = retarget.from_canonical(tpose, rigmap)
-    world = on_rig.joint_rotations()[0]
-    for c, joint in enumerate(rigmap.joint_of):
-        if joint is not None:
-            assert turn_between(world[joint], rigmap.tpose_quat_xyzw[c]) < 1e-6
-    local = retarget.to_canonical(on_rig)[0].local_quat_xyzw
-    assert turn_between(local, tpose.local_quat_xyzw) < 1e-6
 
 
 def test_missing_toes_of_cmu_are_the_feets_end_sites():

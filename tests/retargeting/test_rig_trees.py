@@ -60,14 +60,6 @@ def test_metahuman_is_told_from_ue5_by_its_further_joints_and_both_take_the_same
     assert retarget.load_rig("ue5").joints == retarget.load_rig("metahuman").joints
 
 
-def test_vrm_0_faces_back_and_is_not_the_canonical_skeleton_of_the_same_names():
-    back = make(replace(TREES["vrm", "0, facing back"], extras=False)).skeleton
-    front = make(replace(TREES["vrm", "1"], extras=False)).skeleton
-    assert (retarget.identify_rig(back).facing, retarget.identify_rig(front).facing) == ("-z", "z")
-    assert retarget.identify_rig(front).joint_names["chest"] == "upperChest"
-    assert retarget.identify_rig(CANONICAL).rig.name == "canonical"
-
-
 @pytest.mark.parametrize(
     ("trunk", "chest"),
     [
