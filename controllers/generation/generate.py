@@ -81,7 +81,7 @@ class PacePlan:
         if self._left == 0:
             (self._pace, self._left), self._emphasis = next(self._paces), 1
             return
-        has = find_pace(measure_way_speed(features))
+        has = find_pace(measure_net_speed(features))
         self._emphasis = 1 if has == self._pace else min(self._emphasis + 1, _MOST_EMPHATIC[self._pace])
 
     def find_prior(self, frame: int) -> Density:
@@ -99,8 +99,8 @@ def plan_paces(prior: Density, speed: float, generator: torch.Generator) -> Pace
     return PacePlan(prior, draw_paces(prior.pace_rates, find_pace(speed), generator))
 
 
-def measure_way_speed(features: Float[Tensor, "frames size"]) -> float:
-    """Speed of the way that the frames lead, m/s: without the sway of somebody who stands."""
+def measure_net_speed(features: Float[Tensor, "frames size"]) -> float:
+    """Measure the speed of the net displacement of some frames, m/s: without the sway of a standing character."""
     return float(LAYOUT.pick(features, "root_displacement_heading").mean(0).norm()) * PRIOR_FPS
 
 
@@ -163,11 +163,29 @@ def stream(
     settings, solved = settings or GenerateSettings(), list[CommittedFrames]()
     if terms and settings.foot_cleanup is None:
         raise RequestError("terms belong to the foot clean-up, which is left out")
-    character = settings.character(skeleton)
-    pieces, ground_pose = _start_stream(
-        prior, seconds, generator, settings, start_clip, refiner, character, terms, solved
-    )
-    return _decode_pieces(pieces, ground_pose, character, solved)
+    if not 0 < seconds < float("inf"):
+        raise RequestError(f"seconds must be positive, got {seconds:g}")
+    character, frames = settings.character(skeleton), max(2, round(seconds * PRIOR_FPS))
+    beginning = initialise_generation(prior, settings, start_clip, generator, scale=character.scale)
+    paces = plan_paces(beginning.prior, beginning.speed, generator) if settings.vary_paces else None
+    pieces = sample_pieces(beginning, generator, settings, paces=paces)
+    if refiner is not None:
+        pieces = (piece[0] for piece in refiner.stream(piece.unsqueeze(0) for piece in pieces))
+    if settings.foot_cleanup is not None:
+        pieces = clean_up_feet(
+            beginning.prior,
+            pieces,
+            frames=frames,
+            state=beginning.state,
+            generator=generator,
+            ground_pose=beginning.ground_pose,
+            settings=settings.foot_cleanup.scaled_to(character),
+            skeleton=character.unit_skeleton,
+            terms=[character.term(term) for term in terms],
+            record=solved.append,
+            find_prior=None if paces is None else paces.find_prior,
+        )
+    return _decode_pieces(_rechunk(pieces, frames), beginning.ground_pose, character, solved)
 
 
 def generate(
@@ -192,20 +210,20 @@ def generate(
         skeleton=skeleton,
         terms=terms,
     )
-    return reduce(_join_pieces, pieces)
 
+    def join(whole: Solution, piece: Solution) -> Solution:
+        assert whole.features is not None
+        assert piece.features is not None
+        return replace(
+            whole,
+            motion=whole.motion.join(piece.motion),
+            ledger=whole.ledger.join(piece.ledger),
+            windows=whole.windows + piece.windows,
+            features=torch.cat([whole.features, piece.features]),
+            seconds=whole.seconds + piece.seconds,
+        )
 
-def _join_pieces(whole: Solution, piece: Solution) -> Solution:
-    assert whole.features is not None
-    assert piece.features is not None
-    return replace(
-        whole,
-        motion=whole.motion.join(piece.motion),
-        ledger=whole.ledger.join(piece.ledger),
-        windows=whole.windows + piece.windows,
-        features=torch.cat([whole.features, piece.features]),
-        seconds=whole.seconds + piece.seconds,
-    )
+    return reduce(join, pieces)
 
 
 @dataclass(frozen=True)
@@ -238,7 +256,7 @@ def initialise_generation(
         observed = features.float()
         state = replay(prior, observed[1:], prior.start_after(observed[:1]))
         return Beginning(
-            prior, state, GroundPose(ground[-1], heading[-1]), measure_way_speed(observed[1:][-PRIOR_FPS:])
+            prior, state, GroundPose(ground[-1], heading[-1]), measure_net_speed(observed[1:][-PRIOR_FPS:])
         )
     speeds = prior.initial_states.speed
     count = len(speeds)
@@ -283,45 +301,6 @@ def sample_stratified_starts(prior: Density, count: int, generator: torch.Genera
     first = torch.rand((), generator=generator, dtype=torch.float64)
     quantiles = torch.remainder(first + _GOLDEN * torch.arange(count, dtype=torch.float64), 1.0) * cumulative[-1]
     return slow_to_fast[torch.searchsorted(cumulative, quantiles).clamp(max=len(cumulative) - 1)].tolist()
-
-
-def _start_stream(
-    prior: Density,
-    seconds: float,
-    generator: torch.Generator,
-    settings: GenerateSettings,
-    clip: Motion | None,
-    refiner: Refiner | None,
-    character: Character,
-    terms: Sequence[Term],
-    solved: list[CommittedFrames],
-) -> tuple[Iterator[Float[Tensor, "_ size"]], GroundPose]:
-    """Start pieces of features, and find the ground pose before the first; RequestError comes before any sampling.
-    Windows of the foot clean-up are appended to `solved`.
-    """
-    if not 0 < seconds < float("inf"):
-        raise RequestError(f"seconds must be positive, got {seconds:g}")
-    frames = max(2, round(seconds * PRIOR_FPS))
-    beginning = initialise_generation(prior, settings, clip, generator, scale=character.scale)
-    paces = plan_paces(beginning.prior, beginning.speed, generator) if settings.vary_paces else None
-    pieces, ground_pose = sample_pieces(beginning, generator, settings, paces=paces), beginning.ground_pose
-    if refiner is not None:
-        pieces = (piece[0] for piece in refiner.stream(piece.unsqueeze(0) for piece in pieces))
-    if settings.foot_cleanup is not None:
-        pieces = clean_up_feet(
-            beginning.prior,
-            pieces,
-            frames=frames,
-            state=beginning.state,
-            generator=generator,
-            ground_pose=ground_pose,
-            settings=settings.foot_cleanup.scaled_to(character),
-            skeleton=character.unit_skeleton,
-            terms=[character.term(term) for term in terms],
-            record=solved.append,
-            find_prior=None if paces is None else paces.find_prior,
-        )
-    return _rechunk(pieces, frames), ground_pose
 
 
 def _rechunk(pieces: Iterable[Float[Tensor, "_ size"]], frames: int) -> Iterator[Float[Tensor, "_ size"]]:

@@ -72,6 +72,7 @@ def straight_offset(ground: Float[Tensor, "frames 2"]) -> Float[Tensor, "frames"
 
 
 _CM = 100.0
+_HEELS = "heel_contact_speed_cm_s", "heel_planted_share", "heel_slide_max_cm", "foot_turn_deg_s"
 
 
 def measure(
@@ -91,7 +92,10 @@ def measure(
         raise RequestError("measures need a motion of at least 2 frames")
     positions, fps, hips = motion.joint_positions(), float(motion.fps), find_hips(motion.skeleton)
     measures = _measure_feet(positions[:, list(find_feet(motion.skeleton))], fps)
-    measures |= _measure_heels(motion)
+    if motion.skeleton.names == CANONICAL.names:  # other rigs do not show where heels are
+        measures |= feet.measure_heels(motion)
+    else:
+        measures |= dict.fromkeys(_HEELS, math.nan)
     measures |= _measure_body(positions, hips, find_upper_legs(motion.skeleton), fps)
     if curve is None:
         return measures | {"sway_cm": sway(straight_offset(positions[:, hips, ::2]), fps) * _CM}
@@ -109,21 +113,6 @@ def _measure_feet(toe_positions: Float[Tensor, "frames 2 3"], fps: float) -> dic
         "penetration_cm": feet.penetration(toes) * _CM,
         "float_cm": feet.float_height(toes) * _CM,
     }
-
-
-def _measure_heels(motion: Motion) -> dict[str, float]:
-    """Measure heels, of which only canonical joints tell where they are."""
-    names = "heel_contact_speed_cm_s", "heel_planted_share", "heel_slide_max_cm", "foot_turn_deg_s"
-    if motion.skeleton.names != CANONICAL.names:
-        return dict.fromkeys(names, float("nan"))
-    heels = feet.HeelMeasurements.of(motion)
-    values = (
-        heels.contact_speed() * _CM,
-        heels.planted_share(),
-        heels.largest_slide() * _CM,
-        math.degrees(heels.turn_rate()),
-    )
-    return dict(zip(names, values, strict=True))
 
 
 def _measure_body(positions: Tensor, hips: int, upper_legs: tuple[int, int], fps: float) -> dict[str, float]:

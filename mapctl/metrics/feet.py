@@ -3,6 +3,7 @@
 The floor is the clip's own: the 5th percentile of each toe's height.
 """
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -12,6 +13,7 @@ from torch import Tensor
 from mapctl import contacts, rotations
 from mapctl.contacts import derive_heel_contacts
 from mapctl.motion import Motion
+from mapctl.numerics.intervals import true_intervals
 from mapctl.retarget.character import level_feet
 from mapctl.skeleton import FEET, TOES, find_heel_drops, find_heels
 
@@ -79,61 +81,24 @@ def locate_heels(motion: Motion) -> Float[Tensor, "frames 2 3"]:
     return motion.joint_positions()[:, feet] + turned
 
 
-@dataclass(frozen=True, eq=False)
-class HeelMeasurements:
-    """Heels of a clip with the inputs of their measures."""
+def measure_heels(motion: Motion) -> dict[str, float]:
+    """Measure the heels of a motion of canonical joints; how its feet lie flat is shown by the clip.
 
-    ground: Float[Tensor, "frames 2 2"]
-    """Place over the ground, metres."""
-    yaw: Float[Tensor, "frames 2"]
-    """Direction from heel to toe about +Y, radians, not wrapped."""
-    planted: Bool[Tensor, "frames 2"]
-    """Contacts by `contacts.heels.derive_heel_contacts`."""
-    fps: float
-    """Frames a second."""
-
-    @staticmethod
-    def of(motion: Motion) -> "HeelMeasurements":
-        """Measure a motion of canonical joints; how its feet lie flat is told by the clip."""
-        toes, heels, planted = _derive_heels(motion)
-        forward = toes - heels
-        yaw = rotations.unwrap_angle(torch.atan2(forward[..., 0], forward[..., 2]).T).T
-        return HeelMeasurements(heels[..., ::2], yaw, planted, float(motion.fps))
-
-    @property
-    def _stays(self) -> Bool[Tensor, "steps 2"]:
-        return self.planted[1:] & self.planted[:-1]
-
-    def contact_speed(self) -> float:
-        """Return the mean speed of planted heels over the ground, m/s; NaN if none is planted in two frames."""
-        return float((self.ground.diff(dim=0).norm(dim=-1) * self.fps)[self._stays].mean())
-
-    def planted_share(self) -> float:
-        """Return the share of heel-frames that are planted."""
-        return float(self.planted[1:].double().mean())
-
-    def largest_slide(self) -> float:
-        """Return how far a heel gets at most from where it was planted, within one contact, metres; NaN if none is
-        planted."""
-        start, slides = self.ground[0], []
-        for frame in range(len(self.ground)):
-            lands = ~self.planted[frame - 1] if frame else torch.ones_like(self.planted[0])
-            start = torch.where(lands[:, None], self.ground[frame], start)
-            slides.append((self.ground[frame] - start).norm(dim=-1))
-        held = torch.stack(slides)[self.planted]
-        return float(held.max()) if len(held) else float("nan")
-
-    def turn_rate(self) -> float:
-        """Return the mean rate at which feet turn about the vertical while toe and heel are planted, rad/s; NaN if none
-        is."""
-        return float((self.yaw.diff(dim=0).abs() * self.fps)[self._stays].mean())
-
-
-def _derive_heels(
-    motion: Motion,
-) -> tuple[Float[Tensor, "frames 2 3"], Float[Tensor, "frames 2 3"], Bool[Tensor, "frames 2"]]:
-    """Toes and heels in the world, metres, and whether each heel is planted."""
+    `heel_contact_speed_cm_s`: mean speed of planted heels over the ground; `heel_planted_share`; `heel_slide_max_cm`:
+    how far a heel gets at most from where it was planted, within one contact; `foot_turn_deg_s`: mean rate at which
+    feet turn about the vertical while toe and heel are planted. NaN where none is planted.
+    """
     level, fps = level_feet(motion), float(motion.fps)
     toes, heels = level.joint_positions()[:, level.skeleton.indices(TOES)], locate_heels(level)
     drops = heels.new_tensor(find_heel_drops(level.skeleton))
-    return toes, heels, derive_heel_contacts(contacts.detect_contacts(toes, fps), toes, heels, drops, fps)
+    planted = derive_heel_contacts(contacts.detect_contacts(toes, fps), toes, heels, drops, fps)
+    stays, forward, ground = planted[1:] & planted[:-1], toes - heels, heels[..., ::2]
+    yaw = rotations.unwrap_angle(torch.atan2(forward[..., 0], forward[..., 2]).T).T
+    runs = [ground[start:stop, foot] for foot, start, stop in true_intervals(planted)]
+    slides = [float((run - run[0]).norm(dim=-1).max()) for run in runs]
+    return {
+        "heel_contact_speed_cm_s": 100 * float((ground.diff(dim=0).norm(dim=-1) * fps)[stays].mean()),
+        "heel_planted_share": float(planted[1:].double().mean()),
+        "heel_slide_max_cm": 100 * max(slides, default=math.nan),
+        "foot_turn_deg_s": math.degrees(float((yaw.diff(dim=0).abs() * fps)[stays].mean())),
+    }

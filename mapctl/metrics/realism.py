@@ -1,11 +1,8 @@
-"""Realism without users: can a network tell made motion from mocap, and how far apart are they?
+"""Realism without users: the accuracy of a network that separates generated windows from captured ones, and the Frechet
+distance of both sets. Each number comes with its floor, one half of the captures against the other.
 
-Every number comes with its floor: what mocap shows against mocap.
-
-Frechet distance between two sets of windows: of the Gaussians that fit their principal components.
-
-As the Frechet inception distance (Heusel et al. 2017, section 2), on standardised joint positions and velocities
-instead of a network's features.
+The distance is that of the Gaussians fitted to the windows' principal components, as the Frechet inception distance
+(Heusel et al. 2017, section 2), on standardised joint positions and velocities instead of a network's features.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -15,7 +12,7 @@ from typing import NamedTuple
 
 import scipy
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from mapctl import retarget, rotations
@@ -27,60 +24,23 @@ from mapctl.motion import Motion
 from mapctl.runtime.progress import Progress
 from mapctl.skeleton import CANONICAL
 
-
-@dataclass(frozen=True, eq=False)
-class Basis:
-    """Principal components of a reference set of windows; both sets of a distance are projected on one basis."""
-
-    mean: Float[Tensor, "features"]
-    """Mean of each feature, m or m/s."""
-    std: Float[Tensor, "features"]
-    """Standard deviation of each feature, m or m/s."""
-    axes: Float[Tensor, "features dims"]
-    """Orthonormal axes, in units of the standard deviations."""
-
-    @staticmethod
-    def of(windows: Float[Tensor, "windows frames channels"], dims: int) -> "Basis":
-        """Fit the first `dims` components; fewer where there are fewer windows."""
-        flat = windows.flatten(1)
-        mean, std = flat.mean(0), flat.std(0, correction=0).clamp_min(_LEAST_STD)
-        return Basis(mean, std, _principal_axes((flat - mean) / std, min(dims, *flat.shape)))
-
-    def project(self, windows: Float[Tensor, "windows frames channels"]) -> Float[Tensor, "windows dims"]:
-        """Project windows to coordinates, float64."""
-        return (((windows.flatten(1) - self.mean) / self.std) @ self.axes).double()
-
-
-def _principal_axes(centred: Float[Tensor, "windows features"], dims: int) -> Float[Tensor, "features dims"]:
-    """Return principal axes by the smaller of the two Gram matrices: seconds for a clip's worth or a thousand."""
-    few = len(centred) < centred.shape[1]
-    gram = (centred @ centred.T if few else centred.T @ centred).double().numpy()
-    largest = [len(gram) - dims, len(gram) - 1]
-    vectors = torch.from_numpy(scipy.linalg.eigh(gram, subset_by_index=largest)[1]).to(centred.dtype)
-    return torch.nn.functional.normalize(centred.T @ vectors if few else vectors, dim=0)
-
-
-def frechet_distance(points: Float[Tensor, "points dims"], reference: Float[Tensor, "others dims"]) -> float:
-    """Return |m1 - m2|^2 + tr(C1 + C2 - 2 (C1 C2)^(1/2)) of the points' means and covariances; each set needs two
-    points.
-
-    With triangles C = R^T R the root's trace is the sum of the singular values of R1 R2^T, so no matrix root is taken
-    and singular covariances (fewer points than dimensions) do no harm.
-    """
-    first, second = _covariance_triangle(points), _covariance_triangle(reference)
-    apart = (points.mean(0) - reference.mean(0)).square().sum()
-    return float(
-        apart + first.square().sum() + second.square().sum() - 2 * torch.linalg.svdvals(first @ second.T).sum()
-    )
-
-
-def _covariance_triangle(points: Float[Tensor, "points dims"]) -> Float[Tensor, "rows dims"]:
-    """Return R with R^T R the covariance."""
-    return torch.linalg.qr(points - points.mean(0), mode="r").R / (len(points) - 1) ** 0.5
-
+__all__ = [
+    "Diversity",
+    "GaitSpread",
+    "Realism",
+    "RealismSettings",
+    "WindowSettings",
+    "canonical_positions",
+    "cut_windows",
+    "measure_diversity",
+    "measure_gait_spread",
+    "measure_realism",
+    "measure_window_realism",
+]
 
 HIPS = CANONICAL.index("hips")
 _UPPER_LEGS = CANONICAL.index("leftUpperLeg"), CANONICAL.index("rightUpperLeg")
+_LEAST_STD = 1e-3  # floor of a standard deviation, m or m/s, so that joints that hardly move do not decide
 
 
 @dataclass(frozen=True)
@@ -92,10 +52,115 @@ class WindowSettings:
     step: int = 10
     """Stride from one window to the next, frames."""
 
-    def __post_init__(self):
-        for name in ("frames", "step"):
-            if getattr(self, name) < 1:
-                raise RequestError(f"{name} of a window must be at least 1, got {getattr(self, name)}")
+
+@dataclass(frozen=True)
+class ClassifierSettings:
+    """Settings of the network and its training: about 10 s an accuracy on one core at 90 clips."""
+
+    folds: int = 4
+    """Number of parts of the clips; each is held out once while a network learns on the others."""
+    steps: int = 400
+    """Number of optimiser steps of each network, so that large sets cost no more than small ones. More make a stricter
+    judge."""
+    batch: int = 64
+    """Number of windows a step, half from each set."""
+    width: int = 48
+    """Number of channels of each convolution."""
+    dropout: float = 0.3
+    """Share of activations that are dropped in training."""
+    learning_rate: float = 1e-3
+    """Learning rate of AdamW, a number without unit."""
+    weight_decay: float = 1e-2
+    """Weight decay of AdamW, a number without unit."""
+
+
+@dataclass(frozen=True)
+class RealismSettings:
+    """Settings of a realism measurement."""
+
+    windows: WindowSettings = field(default_factory=WindowSettings)
+    """Settings of the windows that clips are cut into."""
+    classifier: ClassifierSettings = field(default_factory=ClassifierSettings)
+    """Settings of the network that separates the sets."""
+    dims: int = 32
+    """Number of principal components of mocap's windows in which the Frechet distance is taken."""
+
+    @property
+    def min_clips(self) -> int:
+        """Number of clips that each set needs, so that half of the mocap still has one for every fold."""
+        return 2 * self.classifier.folds
+
+
+@dataclass(frozen=True)
+class Realism:
+    """How generated motion compares with mocap."""
+
+    accuracy: float
+    """Balanced held-out accuracy of the network, generated against mocap, a share: 0.5 is perfect, 1 is separated every
+    time."""
+    floor_accuracy: float
+    """Balanced held-out accuracy of the network, one half of the mocap's clips against the other, a share likewise."""
+    frechet: float
+    """Frechet distance of generated windows to mocap's, no unit: coordinates are in mocap's standard deviations."""
+    floor_frechet: float
+    """Frechet distance between the halves, in the same coordinates without unit; halves are smaller sets, which adds to
+    it."""
+    made_windows: int
+    """Number of windows of the generated clips."""
+    mocap_windows: int
+    """Number of windows of the mocap clips."""
+
+
+def measure_realism(
+    made: Sequence[Motion],
+    mocap: Sequence[Motion],
+    *,
+    generator: torch.Generator,
+    settings: RealismSettings = RealismSettings(),
+    progress: Progress | None = None,
+) -> Realism:
+    """Compare generated clips with mocap, both of any known rig and frame rate; half a minute on one core.
+
+    The floor's halves are every other clip of one shuffle that the generator draws: neither style nor length is
+    balanced between them, so a small set's floor scatters around 0.5 from seed to seed. It does not depend on `made`.
+    Sets should hold the same kinds of motion, or the network learns to separate the kinds. RequestError for fewer
+    than 8 clips in a set, clips shorter than a window (31 frames at 30 fps), and rigs that are not known.
+    """
+    sets = [[cut_windows(canonical_positions(clip), settings.windows) for clip in clips] for clips in (made, mocap)]
+    return measure_window_realism(*sets, generator=generator, settings=settings, progress=progress)
+
+
+def measure_window_realism(
+    made: Sequence[Tensor],
+    mocap: Sequence[Tensor],
+    *,
+    generator: torch.Generator,
+    settings: RealismSettings = RealismSettings(),
+    progress: Progress | None = None,
+) -> Realism:
+    """Measure realism from `cut_windows` of each clip, (windows, frames, channels); RequestError for too few clips."""
+    if min(len(made), len(mocap)) < settings.min_clips:
+        counts = f"got {len(made)} and {len(mocap)}"
+        raise RequestError(f"realism needs at least {settings.min_clips} clips of each, made and mocap; {counts}")
+    seeds = torch.randint(2**62, (2,), generator=generator).tolist()
+    shuffled, ours = (torch.Generator().manual_seed(seed) for seed in seeds)
+    order = torch.randperm(len(mocap), generator=shuffled).tolist()
+    halves = [[mocap[i] for i in half] for half in (order[::2], order[1::2])]
+    total = 2 * settings.classifier.folds
+    done = iter(range(1, total + 1))
+
+    def tick() -> None:
+        if progress is not None:
+            progress(next(done), total)
+
+    floor, accuracy = (
+        compute_held_out_accuracy(*sets, generator=drawn, settings=settings.classifier, tick=tick)
+        for sets, drawn in ((halves, shuffled), ((made, mocap), ours))
+    )
+    basis = Basis.of(torch.cat(list(mocap)), settings.dims)
+    points = [basis.project(torch.cat(list(clips))) for clips in (made, mocap, *halves)]
+    frechet, floor_frechet = frechet_distance(*points[:2]), frechet_distance(*points[2:])
+    return Realism(accuracy, floor, frechet, floor_frechet, len(points[0]), len(points[1]))
 
 
 def canonical_positions(motion: Motion) -> Float[Tensor, "frames joints 3"]:
@@ -127,100 +192,60 @@ def cut_windows(
     `positions` are those of `canonical_positions`. A window is relative to the hips' ground projection and facing in
     the frame before its first. RequestError for a clip shorter than one window.
     """
-    frames, ground, angle = find_window_frames(positions, settings)
-    relative = transform_to_ground_frame(positions[frames], ground, angle)
-    velocity = relative.diff(dim=1) * PRIOR_FPS
-    return torch.cat([relative[:, 1:].flatten(2), velocity.flatten(2)], dim=-1).float()
-
-
-def find_window_frames(
-    positions: Float[Tensor, "clip_frames joints 3"], settings: WindowSettings
-) -> tuple[Int[Tensor, "windows frames_and_one"], Float[Tensor, "windows 1 2"], Float[Tensor, "windows 1"]]:
-    """Find the frames of each window of a clip, the one before it first, with the hips' ground projection (m) and
-    facing (radians) in that one. RequestError for a clip shorter than one window."""
     needed = settings.frames + 1
     if len(positions) < needed:
         raise RequestError(f"{len(positions)} frames at {PRIOR_FPS} fps; a window needs at least {needed}")
     starts = torch.arange(0, len(positions) - settings.frames, settings.step)
     ground, angle = positions[starts, HIPS, ::2], facing_angle(positions)[starts]
-    return starts[:, None] + torch.arange(needed), ground.unsqueeze(1), angle.unsqueeze(1)
+    frames = starts[:, None] + torch.arange(needed)
+    relative = transform_to_ground_frame(positions[frames], ground.unsqueeze(1), angle.unsqueeze(1))
+    velocity = relative.diff(dim=1) * PRIOR_FPS
+    return torch.cat([relative[:, 1:].flatten(2), velocity.flatten(2)], dim=-1).float()
 
 
-_CM = 100.0
+@dataclass(frozen=True, eq=False)
+class Basis:
+    """Principal components of a reference set of windows; both sets of a distance are projected on one basis."""
+
+    mean: Float[Tensor, "features"]
+    """Mean of each feature, m or m/s."""
+    std: Float[Tensor, "features"]
+    """Standard deviation of each feature, m or m/s."""
+    axes: Float[Tensor, "features dims"]
+    """Orthonormal axes, in units of the standard deviations."""
+
+    @staticmethod
+    def of(windows: Float[Tensor, "windows frames channels"], dims: int) -> "Basis":
+        """Fit the first `dims` components, fewer where there are fewer windows, by the smaller of both Gram
+        matrices."""
+        flat = windows.flatten(1)
+        mean, std = flat.mean(0), flat.std(0, correction=0).clamp_min(_LEAST_STD)
+        centred, dims = (flat - mean) / std, min(dims, *flat.shape)
+        few = len(centred) < centred.shape[1]
+        gram = (centred @ centred.T if few else centred.T @ centred).double().numpy()
+        largest = scipy.linalg.eigh(gram, subset_by_index=[len(gram) - dims, len(gram) - 1])[1]
+        vectors = torch.from_numpy(largest).to(centred.dtype)
+        return Basis(mean, std, torch.nn.functional.normalize(centred.T @ vectors if few else vectors, dim=0))
+
+    def project(self, windows: Float[Tensor, "windows frames channels"]) -> Float[Tensor, "windows dims"]:
+        """Project windows to coordinates, float64."""
+        return (((windows.flatten(1) - self.mean) / self.std) @ self.axes).double()
 
 
-class Diversity(NamedTuple):
-    """Average pairwise distance of samples."""
+def frechet_distance(points: Float[Tensor, "points dims"], reference: Float[Tensor, "others dims"]) -> float:
+    """Return |m1 - m2|^2 + tr(C1 + C2 - 2 (C1 C2)^(1/2)) of the points' means and covariances; each set needs two
+    points.
 
-    world_cm: float
-    """Distance between the joints in the world, centimetres: of trajectories and poses."""
-    root_aligned_cm: float
-    """Distance between the joints relative to the hips and facing of each frame, centimetres: of poses and timing."""
-
-
-def measure_diversity(samples: Sequence[Motion]) -> Diversity:
-    """Measure diversity of several samples from one start (any known rig); RequestError for fewer than two, or other
-    lengths."""
-    lengths = sorted({sample.num_frames / sample.fps for sample in samples})
-    if len(samples) < 2 or len(lengths) > 1:
-        shown = " and ".join(f"{float(length):.4g}" for length in lengths)
-        raise RequestError(f"diversity needs at least 2 samples of one length, got {len(samples)} of {shown} s")
-    return measure_position_diversity(torch.stack([canonical_positions(sample) for sample in samples]))
-
-
-def measure_position_diversity(positions: Float[Tensor, "samples frames joints 3"]) -> Diversity:
-    """Measure diversity from world positions of the canonical joints, metres."""
-    aligned = torch.stack([_align_to_root(sample) for sample in positions])
-    return Diversity(average_pairwise_distance(positions) * _CM, average_pairwise_distance(aligned) * _CM)
-
-
-def align_to_start(positions: Float[Tensor, "frames joints 3"]) -> Float[Tensor, "frames joints 3"]:
-    """Move a clip to begin at the origin facing +Z, to compare clips that did not begin at one position."""
-    return transform_to_ground_frame(positions, positions[:1, HIPS, ::2], facing_angle(positions)[:1])
-
-
-def average_pairwise_distance(positions: Float[Tensor, "samples frames joints 3"]) -> float:
-    """Return the mean over pairs of samples, frames and joints of the distance between joints, in the unit of
-    `positions`."""
-    samples, frames, joints, _ = positions.shape
-    # frame by frame, for the distances of a thousand samples at once would need gigabytes
-    total = sum(float(torch.cdist(at, at).sum()) for at in positions.permute(1, 2, 0, 3))
-    return total / (samples * (samples - 1) * frames * joints)
-
-
-def _align_to_root(positions: Float[Tensor, "frames joints 3"]) -> Float[Tensor, "frames joints 3"]:
-    relative = transform_to_ground_frame(positions, positions[:, HIPS, ::2], facing_angle(positions))
-    return relative - relative[:, HIPS : HIPS + 1]
-
-
-_LEAST_STD = 1e-3
-"""Floor of a standard deviation, m or m/s, so that joints that hardly move do not decide."""
-
-
-@dataclass(frozen=True)
-class ClassifierSettings:
-    """Settings of the network and its training: about 10 s an accuracy on one core at 90 clips."""
-
-    folds: int = 4
-    """Number of parts of the clips; each is held out once while a network learns on the others."""
-    steps: int = 400
-    """Number of optimiser steps of each network, so that large sets cost no more than small ones. More make a stricter
-    judge."""
-    batch: int = 64
-    """Number of windows a step, half from each set."""
-    width: int = 48
-    """Number of channels of each convolution."""
-    dropout: float = 0.3
-    """Share of activations that are dropped in training."""
-    learning_rate: float = 1e-3
-    """Learning rate of AdamW, a number without unit."""
-    weight_decay: float = 1e-2
-    """Weight decay of AdamW, a number without unit."""
-
-    def __post_init__(self):
-        for name, least in (("folds", 2), ("steps", 1), ("batch", 2), ("width", 1)):
-            if getattr(self, name) < least:
-                raise RequestError(f"{name} must be at least {least}, got {getattr(self, name)}")
+    With triangles C = R^T R the root's trace is the sum of the singular values of R1 R2^T, so no matrix root is taken
+    and singular covariances (fewer points than dimensions) do no harm.
+    """
+    first, second = (
+        torch.linalg.qr(each - each.mean(0), mode="r").R / (len(each) - 1) ** 0.5 for each in (points, reference)
+    )
+    apart = (points.mean(0) - reference.mean(0)).square().sum()
+    return float(
+        apart + first.square().sum() + second.square().sum() - 2 * torch.linalg.svdvals(first @ second.T).sum()
+    )
 
 
 def compute_held_out_accuracy(
@@ -247,7 +272,9 @@ def compute_held_out_accuracy(
         held_out = [torch.cat([clips[i] for i in order[fold :: settings.folds]]) for clips, order in sets]
         with _isolate_torch(generator):
             network = _train_network(training, settings)
-            total += balanced_accuracy(*(score(network, windows) for windows in held_out))
+            with torch.no_grad():
+                ours, theirs = (torch.cat([network(part) for part in each.split(512)]) for each in held_out)
+            total += float(((ours > 0).double().mean() + (theirs <= 0).double().mean()) / 2)
         tick()
     return total / settings.folds
 
@@ -277,20 +304,17 @@ class _Standardise(nn.Module):
         return ((windows - self.mean) / self.std).transpose(1, 2)
 
 
-def _build_network(windows: Float[Tensor, "windows frames channels"], settings: ClassifierSettings) -> nn.Module:
-    """Build three convolutions over time, the mean over the remaining frames, and one logit: positive for the first
+def _train_network(sets: Sequence[Float[Tensor, "_ frames channels"]], settings: ClassifierSettings) -> nn.Module:
+    """Train three convolutions over time, the mean over the remaining frames, and one logit: positive for the first
     set."""
+    windows = torch.cat(list(sets))
     layers: list[nn.Module] = [_Standardise(windows)]
     channels = windows.shape[-1]
     for stride in (1, 2, 2):
         layers += [nn.Conv1d(channels, settings.width, 5, stride, padding=2), nn.LeakyReLU(0.2)]
         layers.append(nn.Dropout(settings.dropout))
         channels = settings.width
-    return nn.Sequential(*layers, nn.AdaptiveAvgPool1d(1), nn.Flatten(), nn.Linear(channels, 1), nn.Flatten(0))
-
-
-def _train_network(sets: Sequence[Float[Tensor, "_ frames channels"]], settings: ClassifierSettings) -> nn.Module:
-    network = _build_network(torch.cat(list(sets)), settings)
+    network = nn.Sequential(*layers, nn.AdaptiveAvgPool1d(1), nn.Flatten(), nn.Linear(channels, 1), nn.Flatten(0))
     optimiser = torch.optim.AdamW(network.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay)
     half = settings.batch // 2
     target = torch.cat([torch.ones(half), torch.zeros(half)])
@@ -303,148 +327,41 @@ def _train_network(sets: Sequence[Float[Tensor, "_ frames channels"]], settings:
     return network.eval()
 
 
-@torch.no_grad()
-def score(network: nn.Module, windows: Float[Tensor, "windows frames channels"]) -> Float[Tensor, " windows"]:
-    """Return the logits of windows, positive for the first set, a few hundred windows at a time."""
-    return torch.cat([network(part) for part in windows.split(512)])
+class Diversity(NamedTuple):
+    """Average pairwise distance of samples."""
+
+    world_cm: float
+    """Distance between the joints in the world, centimetres: of trajectories and poses."""
+    root_aligned_cm: float
+    """Distance between the joints relative to the hips and facing of each frame, centimetres: of poses and timing."""
 
 
-def balanced_accuracy(first: Float[Tensor, " first"], second: Float[Tensor, " second"]) -> float:
-    """Return the mean over both sets of the share of windows whose logit names their own set."""
-    return (float((first > 0).double().mean()) + 1 - float((second > 0).double().mean())) / 2
+def measure_diversity(samples: Sequence[Motion]) -> Diversity:
+    """Measure diversity of several samples from one start (any known rig); RequestError for fewer than two, or other
+    lengths."""
+    lengths = sorted({sample.num_frames / sample.fps for sample in samples})
+    if len(samples) < 2 or len(lengths) > 1:
+        shown = " and ".join(f"{float(length):.4g}" for length in lengths)
+        raise RequestError(f"diversity needs at least 2 samples of one length, got {len(samples)} of {shown} s")
+    return measure_position_diversity(torch.stack([canonical_positions(sample) for sample in samples]))
 
 
-__all__ = [
-    "ClassifierSettings",
-    "Diversity",
-    "GaitSpread",
-    "Realism",
-    "RealismSettings",
-    "WindowSettings",
-    "average_pairwise_distance",
-    "canonical_positions",
-    "cut_windows",
-    "measure_diversity",
-    "measure_gait_spread",
-    "measure_realism",
-    "measure_window_realism",
-]
+def measure_position_diversity(positions: Float[Tensor, "samples frames joints 3"]) -> Diversity:
+    """Measure diversity from world positions of the canonical joints, metres."""
+    aligned = [transform_to_ground_frame(each, each[:, HIPS, ::2], facing_angle(each)) for each in positions]
+    relative = torch.stack([each - each[:, HIPS : HIPS + 1] for each in aligned])
+    return Diversity(*(100.0 * average_pairwise_distance(each) for each in (positions, relative)))
 
 
-@dataclass(frozen=True)
-class RealismSettings:
-    """Settings of a realism measurement."""
-
-    windows: WindowSettings = field(default_factory=WindowSettings)
-    """Settings of the windows that clips are cut into."""
-    classifier: ClassifierSettings = field(default_factory=ClassifierSettings)
-    """Settings of the network that tells the sets apart."""
-    dims: int = 32
-    """Number of principal components of mocap's windows in which the Frechet distance is taken."""
-
-    def __post_init__(self):
-        if self.dims < 1:
-            raise RequestError(f"dims must be at least 1, got {self.dims}")
-
-    @property
-    def min_clips(self) -> int:
-        """Number of clips that each set needs, so that half of the mocap still has one for every fold."""
-        return 2 * self.classifier.folds
+def align_to_start(positions: Float[Tensor, "frames joints 3"]) -> Float[Tensor, "frames joints 3"]:
+    """Move a clip to begin at the origin facing +Z, to compare clips that did not begin at one position."""
+    return transform_to_ground_frame(positions, positions[:1, HIPS, ::2], facing_angle(positions)[:1])
 
 
-@dataclass(frozen=True)
-class Realism:
-    """How made motion compares with mocap."""
-
-    accuracy: float
-    """Balanced held-out accuracy of the network, made against mocap, a share: 0.5 is perfect, 1 is told apart every
-    time."""
-    floor_accuracy: float
-    """Balanced held-out accuracy of the network, one half of the mocap's clips against the other, a share likewise."""
-    frechet: float
-    """Frechet distance of made windows to mocap's, no unit: coordinates are in mocap's standard deviations."""
-    floor_frechet: float
-    """Frechet distance between the halves, in the same coordinates without unit; halves are smaller sets, which adds to
-    it."""
-    made_windows: int
-    """Number of windows of the made clips."""
-    mocap_windows: int
-    """Number of windows of the mocap clips."""
-
-
-def measure_realism(
-    made: Sequence[Motion],
-    mocap: Sequence[Motion],
-    *,
-    generator: torch.Generator,
-    settings: RealismSettings = RealismSettings(),
-    progress: Progress | None = None,
-) -> Realism:
-    """Compare made clips with mocap, both of any known rig and frame rate; half a minute on one core.
-
-    The floor's halves are every other clip of one shuffle that the generator draws: neither style nor length is
-    balanced between them, so a small set's floor scatters around 0.5 from seed to seed. It does not depend on `made`.
-    Sets should hold the same kinds of motion, or the network learns to tell the kinds apart. RequestError for fewer
-    than 8 clips in a set, clips shorter than a window (31 frames at 30 fps), and rigs that are not known.
-    """
-    _check_counts(len(made), len(mocap), settings)
-    sets = [_cut_clips(clips, name, settings.windows) for name, clips in (("made", made), ("mocap", mocap))]
-    return measure_window_realism(*sets, generator=generator, settings=settings, progress=progress)
-
-
-def measure_window_realism(
-    made: Sequence[Tensor],
-    mocap: Sequence[Tensor],
-    *,
-    generator: torch.Generator,
-    settings: RealismSettings = RealismSettings(),
-    progress: Progress | None = None,
-) -> Realism:
-    """Measure realism from `cut_windows` of each clip, (windows, frames, channels); RequestError for too few clips."""
-    _check_counts(len(made), len(mocap), settings)
-    seeds = torch.randint(2**62, (2,), generator=generator).tolist()
-    shuffled, ours = (torch.Generator().manual_seed(seed) for seed in seeds)
-    order = torch.randperm(len(mocap), generator=shuffled).tolist()
-    halves = [[mocap[i] for i in half] for half in (order[::2], order[1::2])]
-    tick = _make_tick(progress, 2 * settings.classifier.folds)
-    floor, accuracy = (
-        compute_held_out_accuracy(*sets, generator=drawn, settings=settings.classifier, tick=tick)
-        for sets, drawn in ((halves, shuffled), ((made, mocap), ours))
-    )
-    basis = Basis.of(torch.cat(list(mocap)), settings.dims)
-    points = [basis.project(torch.cat(list(clips))) for clips in (made, mocap, *halves)]
-    return Realism(
-        accuracy,
-        floor,
-        frechet_distance(points[0], points[1]),
-        frechet_distance(points[2], points[3]),
-        made_windows=len(points[0]),
-        mocap_windows=len(points[1]),
-    )
-
-
-def _check_counts(made: int, mocap: int, settings: RealismSettings) -> None:
-    if min(made, mocap) < settings.min_clips:
-        raise RequestError(
-            f"realism needs at least {settings.min_clips} clips of each, made and mocap; got {made} and {mocap}"
-        )
-
-
-def _cut_clips(clips: Sequence[Motion], name: str, settings: WindowSettings) -> list[Tensor]:
-    windows = []
-    for number, clip in enumerate(clips, start=1):
-        try:
-            windows.append(cut_windows(canonical_positions(clip), settings))
-        except RequestError as error:
-            raise RequestError(f"{name} clip {number} of {len(clips)}: {error}") from error
-    return windows
-
-
-def _make_tick(progress: Progress | None, total: int) -> Callable[[], None]:
-    done = iter(range(1, total + 1))
-
-    def tick() -> None:
-        if progress is not None:
-            progress(next(done), total)
-
-    return tick
+def average_pairwise_distance(positions: Float[Tensor, "samples frames joints 3"]) -> float:
+    """Return the mean over pairs of samples, frames and joints of the distance between joints, in the unit of
+    `positions`."""
+    samples, frames, joints, _ = positions.shape
+    # frame by frame, for the distances of a thousand samples at once would need gigabytes
+    total = sum(float(torch.cdist(at, at).sum()) for at in positions.permute(1, 2, 0, 3))
+    return total / (samples * (samples - 1) * frames * joints)

@@ -8,7 +8,7 @@
   turning point of a kick.
 - Replaced values: a joint, or the whole body, that leaps to a value and keeps it, or is zero for a frame.
 - Held values: a joint, or the whole body, that keeps its value while the motion goes on, so that the last value lags
-  behind. What rests comes to rest and leaves it again.
+  behind, or whose white noise stops. What rests comes to rest and leaves it again.
 - Stretched bones: offsets in six-channel files that vary only by noise.
 - Lead pose: a T-pose in frame 0 that does not belong to the motion, and the frames after it that an exporter's filter
   blended with it.
@@ -23,6 +23,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from scipy.ndimage import median_filter
+from scipy.stats import norm
 from torch import Tensor
 
 from mapctl import rotations
@@ -185,6 +186,8 @@ class Prediction:
 
     error: Float[Tensor, "frames tracks"]
     """Distance of the value from the prediction."""
+    spread: Float[Tensor, "frames tracks"]
+    """Standard deviation of each coordinate about a polynomial, from the neighbours."""
     scale: Float[Tensor, "frames tracks"]
     """Standard error of each coordinate of the prediction."""
     freedom: Float[Tensor, "frames tracks"]
@@ -210,7 +213,7 @@ def predict_frames(
     usable = torch.stack([prediction.freedom > 0 for prediction in found])
     rank = scores.argsort(dim=0).argsort(dim=0)[:, None]
     best = torch.where(usable, rank, -1).argmax(dim=0, keepdim=True)
-    numbers = ([getattr(each, name) for each in found] for name in ("error", "scale", "freedom"))
+    numbers = ([getattr(each, name) for each in found] for name in ("error", "spread", "scale", "freedom"))
     return Prediction(*(torch.stack(each).gather(0, best)[0] for each in numbers))
 
 
@@ -251,7 +254,7 @@ def _predict(
     # A moment of rest is no reason to expect none of the motion that the track has otherwise.
     usual = torch.where(seen & (total > 0), shrunk, math.nan).nanmedian(dim=0).values.nan_to_num(0.0)
     scale = (torch.maximum(shrunk, usual) * (1 + inverse[..., 0, 0].clamp_min(0))).sqrt()
-    return Prediction((values - mean).norm(dim=-1), scale, total)
+    return Prediction((values - mean).norm(dim=-1), shrunk.sqrt(), scale, total)
 
 
 def _invert(moments: Float[Tensor, "frames tracks sums"], degree: int) -> Float[Tensor, "frames tracks terms terms"]:
@@ -440,9 +443,12 @@ def _find_faults(
     for run, wrong in zip(runs, replaced, strict=True):
         seen[run.start, run.tracks] &= not wrong
     prediction = predict_frames(values, seen, least)
+    loud = _find_loud(prediction, ~equal)
     faults = [run for run, wrong in zip(runs, replaced, strict=True) if wrong]
     for run, wrong in zip(runs, replaced, strict=True):
-        if not wrong and run.stop - run.start > 1 and _lags(run, values, prediction, ahead, behind):
+        if wrong or run.stop - run.start == 1:
+            continue
+        if _lags(run, values, prediction, ahead, behind) or _stops_trembling(run, prediction, loud, least):
             faults.append(_Run(run.start + 1, run.stop, run.tracks))
     return faults
 
@@ -467,6 +473,32 @@ def _lags(
     known = prediction.freedom[last, tracks] > 0
     evidence = torch.where(known, lagging - prediction.log_density()[last, tracks], 0.0)
     return float(evidence.sum()) > math.log(len(values)) and bool(leaps[last, tracks].any())
+
+
+_QUIET = 0.01  # chance of a window that is as quiet as those beside a rest
+_WHITE = 100.0  # degrees of freedom from which the windows of a track have one scale: noise, which never rests
+
+
+def _find_loud(prediction: Prediction, free: Bool[Tensor, "frames tracks"]) -> Bool[Tensor, "frames tracks"]:
+    """Find the frames of noisy tracks about which those that are `free` are no more quiet than chance has them: a
+    quantile of chi-squared by its cube root (Wilson and Hilferty 1931)."""
+    spread, freedom = prediction.spread, prediction.freedom
+    usual = torch.where((freedom > 0) & free, spread, math.nan).nanmedian(dim=0).values
+    part = 2 / (9 * freedom.clamp_min(1))
+    least = (1 - part + norm.ppf(_QUIET) * part.sqrt()).clamp_min(0) ** 3
+    return (freedom > _WHITE) & (spread.square() > least * usual.square())
+
+
+def _stops_trembling(
+    run: _Run, prediction: Prediction, loud: Bool[Tensor, "frames tracks"], least: Float[Tensor, " tracks"]
+) -> bool:
+    """Return whether most tracks are noise, beside the run as ever. Frames of noise are equal by chance if all three
+    numbers are within the resolution, `least`."""
+    beside = [frame for frame in (run.start, run.stop) if 0 < frame < len(loud)]
+    noisy = loud[beside][:, run.tracks]
+    ratio = prediction.spread[beside][:, run.tracks].amin(dim=0) / least[run.tracks]
+    chance = 3 * (run.stop - run.start - 1) * float(torch.where(noisy.all(dim=0), ratio.log(), 0.0).sum())
+    return float(noisy.all(dim=0).double().mean()) > 0.5 and chance > math.log(len(loud))
 
 
 _NO_TRAVEL = 1e-3  # metres by which a rigid bone may vary where no noise is measured

@@ -5,12 +5,10 @@ import math
 from dataclasses import replace
 from fractions import Fraction
 
-import numpy as np
 import pytest
 import torch
 from captures import trembling
 from helpers import random_motion, run, walk
-from rig_maker import Make, make, names_of, person
 
 from mapctl import metrics
 from mapctl.metrics import make_comparable
@@ -56,17 +54,6 @@ def test_slower_files_stay_as_they_are_and_that_is_said(fps, said):
     assert all("frames a second" in note for note in notes)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("options", [{"arms_down_deg": 40.0, "root": "Reference"}, {}, {"bones_along_x": True}])
-def test_a_file_with_z_up_has_the_measures_of_the_same_with_y_up(options, tmp_path, capsys):
-    found = []
-    for zup in (False, True):
-        make(Make(names_of("mixamo"), zup=zup, **options)).motion(person(frames=95)).save(tmp_path / f"{zup}.bvh")
-        found.append(told(capsys, tmp_path / f"{zup}.bvh", "--curve", "line:2")["measures"])
-    assert found[1]["hips_height_m"] > 0.8
-    assert found[0] == pytest.approx(found[1], rel=1e-3, abs=1e-3, nan_ok=True)
-
-
 def unknown() -> Motion:
     """A skeleton that is no body but has hips, feet and thighs by name."""
     names = ("Hips", "LeftUpLeg", "LeftFoot", "RightUpLeg", "RightFoot")
@@ -82,19 +69,3 @@ def test_what_is_not_known_of_a_rig_is_said_in_one_line(tmp_path, capsys):
     assert run("measure", tmp_path / "a.bvh") == 0
     assert UNKNOWN_RIG_NOTE in capsys.readouterr().out
     assert put_upright(unknown())[1] == (UNKNOWN_RIG_NOTE,)
-
-
-@pytest.mark.parametrize("root", [None, "Reference"])
-def test_upright_motions_keep_their_rig_and_every_distance(root):
-    motion = make(Make(names_of("mixamo"), zup=True, root=root)).motion(person(frames=20))
-    upright, notes = put_upright(motion)
-    assert notes == ()
-    assert upright.skeleton is motion.skeleton
-    was, now = motion.joint_positions(), upright.joint_positions()
-    head = motion.skeleton.names.index("mixamorig:Head")
-    assert float(was[:, head, 2].min()) > 1.3  # along Z
-    assert float(now[:, head, 1].min()) > 1.3  # along Y
-    # Rotated about x by a quarter turn: y was -z, z was y.
-    np.testing.assert_allclose(now, torch.stack([was[..., 0], was[..., 2], -was[..., 1]], -1), atol=1e-9)
-    again, _ = put_upright(upright)
-    np.testing.assert_allclose(again.joint_positions(), now, atol=1e-12)

@@ -5,7 +5,7 @@ from fractions import Fraction
 
 import pytest
 import torch
-from captures import DEGREE, apart_deg, on_rig, shaken
+from captures import DEGREE, apart_deg, on_rig, shaken, trembling
 
 from mapctl import rotations
 from mapctl.motion import Motion
@@ -37,6 +37,12 @@ def test_a_joint_that_stands_still_is_found_and_only_that(motion):
     assert torch.equal(found.dropouts, wanted)
     assert torch.equal(found.seen, ~wanted)
     assert not found.spikes.any()
+
+
+def test_what_no_longer_trembles_with_the_rest_is_found_to_the_end(motion):
+    joint, noisy = moving_joint(motion), trembling(motion, 2 * DEGREE)
+    found = inspect_recording(with_quats(noisy, slice(100, 120), joint, noisy.local_quat_xyzw[100, joint]))
+    assert found.dropouts.nonzero().tolist() == [[frame, joint] for frame in range(101, 120)]
 
 
 @pytest.mark.parametrize("whole", [False, True])

@@ -5,33 +5,14 @@ import math
 import pytest
 import torch
 from captures import shaken
-from helpers import generator, quat_xyzw, walk
-from hypothesis import given, settings
+from helpers import quat_xyzw, walk
 from hypothesis import strategies as st
 
 from mapctl import rotations
-from mapctl.numerics.intervals import fill_missing
 from mapctl.recording import Capture
 from mapctl.skeleton import CANONICAL
 
 masks = st.lists(st.lists(st.booleans(), min_size=9, max_size=9), min_size=1, max_size=3).map(torch.tensor)
-
-
-@settings(max_examples=60)
-@given(masks)
-def test_gaps_are_filled_straight_as_a_loop_fills_them(seen):
-    values = torch.randn(len(seen), 9, 2, generator=generator(), dtype=torch.float64)
-    found = fill_missing(values, seen)
-    for row in range(len(seen)):
-        known = [frame for frame in range(9) if seen[row, frame]]
-        for frame in range(9):
-            if not known:
-                continue
-            a = max([k for k in known if k <= frame], default=known[0])
-            b = min([k for k in known if k >= frame], default=known[-1])
-            share = (frame - a) / (b - a) if b > a else 0.0
-            wanted = values[row, a] + share * (values[row, b] - values[row, a])
-            assert torch.allclose(found[row, frame], wanted)
 
 
 def capture_of(motion, seen=None, seen_root=None):
