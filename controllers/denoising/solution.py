@@ -102,16 +102,16 @@ class DenoiseSolution(Solution):
         """Compute by joint of the rig the mean distance it was moved by, cm, and the mean angle in its parent, deg."""
         rotation = rotations.multiply(rotations.inverse(self.capture.local_quat_xyzw), self.motion.local_quat_xyzw)
         angle = torch.rad2deg(rotations.to_rotation_vector(rotation).norm(dim=-1))
-        return self._measure_moves().mean(dim=0), angle.mean(dim=0)
+        return 100 * self._measure_moves().mean(dim=0), angle.mean(dim=0)
 
     def find_largest_move(self) -> tuple[str, int, float]:
         """Find the joint of the rig and the frame that were moved most, and by how many centimetres."""
         moved = self._measure_moves()
         frame, joint = divmod(int(moved.argmax()), moved.shape[1])
-        return self.motion.skeleton.names[joint], frame, float(moved[frame, joint])
+        return self.motion.skeleton.names[joint], frame, 100 * float(moved[frame, joint])
 
     def _measure_moves(self) -> Float[Tensor, "frames joints"]:
-        return 100 * (self.motion.joint_positions() - self.capture.joint_positions()).norm(dim=-1)
+        return (self.motion.joint_positions() - self.capture.joint_positions()).norm(dim=-1)
 
     def _list_frames(self, mask: Bool[Tensor, "frames columns"]) -> list[tuple[int, int, int]]:
         """List runs by column of a mask at PRIOR_FPS, in frames of the capture."""

@@ -20,8 +20,8 @@ def stand(frames: int):
     return replace(motion, local_quat_xyzw=local, root_position=root)
 
 
-@pytest.mark.parametrize("fps", [25, 30, 60, 120])
-@pytest.mark.parametrize("cadence", [0.7, 1.0, 1.4])
+@pytest.mark.parametrize("fps", [25, 120])
+@pytest.mark.parametrize("cadence", [0.7, 1.4])
 def test_a_walk_has_one_stride(fps, cadence):
     motion = walk(4 * fps, cadence=cadence, fps=fps)
     cycle = editing.find_cycle(motion)
@@ -66,9 +66,3 @@ def test_what_never_comes_back_is_refused_with_what_comes_nearest():
     root = motion.root_position + torch.stack([0 * shift, 0 * shift, shift], dim=-1)
     with pytest.raises(RequestError, match=r"frames \d+ and \d+ come nearest, .* [\d.]+ cm apart; [\d.]+ are allowed"):
         editing.find_cycle(replace(motion, local_quat_xyzw=local, root_position=root))
-
-
-@pytest.mark.parametrize("frames", [1, 2, 5, 12])
-def test_clips_that_are_too_short_are_refused(frames):
-    with pytest.raises(RequestError, match="too short"):
-        editing.find_cycle(walk(frames))

@@ -44,7 +44,7 @@ def test_noise_shrinks_and_rig_frames_and_rate_stay(rig, fps):
     assert len(done.proposal_share) == len(done.contacts)
 
 
-@pytest.mark.parametrize("drawn", [0.0, 0.3])
+@pytest.mark.parametrize("drawn", [0.3])
 @pytest.mark.parametrize(("rig", "fps"), [("canonical", 30), ("bandai", 30), ("daz", 120)])
 def test_a_clean_capture_changes_by_less_than_half_a_centimetre(rig, fps, drawn):
     truth = on_rig(rig, 3 * fps, fps=fps)

@@ -8,11 +8,8 @@ from helpers import corpus, generator, tiny_density, tiny_model
 
 from controllers.generation.foot_cleanup import FootCleanupSettings, clean_up_feet
 from mapctl.errors import RequestError
-from mapctl.features import LAYOUT, GroundPose
+from mapctl.features import LAYOUT
 from mapctl.problem.receding_horizon import HorizonSettings
-from mapctl.problem.unknowns import WindowContext, WindowRequest
-from mapctl.problem.window_solvers import GuidedNoiseSolver
-from mapctl.terms import FootContact, MotionTracking
 from mapctl.terms.trial import Trial
 
 SETTINGS = FootCleanupSettings(window=HorizonSettings(frames=12, overlap=6))
@@ -70,16 +67,3 @@ def test_latents_are_what_rolls_out_to_the_motion(seed):
     plan, noise = model.latents(frames[None, 1:], state)
     rebuilt, _ = model.rollout(state, noise, plan)
     torch.testing.assert_close(rebuilt[0], frames[1:], atol=1e-8, rtol=1e-8)
-
-
-def test_a_guide_that_is_all_that_is_wished_comes_back():
-    guide = clip(13)[1:]
-    state = DENSITY.start_after(clip(13)[:1])
-    context = WindowContext(DENSITY, state, GroundPose.origin(), torch.zeros(0, 21, 3), 12)
-    exact = GuidedNoiseSolver(guide, share=1.0)
-    request = WindowRequest(context, [MotionTracking(guide)], torch.zeros(0, LAYOUT.continuous), generator())
-    solved = exact(request)
-    assert float((solved.trial.features[0] - guide).abs().max()) < 1e-3
-    assert torch.equal(solved.trial.contacts[0], guide[:, -2:] > 0.5)
-    pulled = GuidedNoiseSolver(guide, share=0.5)(replace(request, terms=[MotionTracking(guide), FootContact()]))
-    assert pulled.energy < pulled.start_energy

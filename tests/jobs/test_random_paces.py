@@ -14,7 +14,6 @@ from controllers.generation.generate import (
     Beginning,
     GenerateSettings,
     draw_paces,
-    generate,
     initialise_generation,
     plan_paces,
     sample_pieces,
@@ -141,29 +140,3 @@ def test_a_density_without_paces_samples_as_in_one_go():
     begun = Beginning(density, state, GroundPose.origin(torch.float64), 1.0)
     (piece,) = islice(sample_pieces(begun, generator(4), longest=50), 1)
     assert torch.equal(piece, density.sample(state, 50, generator(4))[0][0])
-
-
-@pytest.fixture
-def pacing(monkeypatch):
-    """A density that runs off and walks again all the time, and what its copies were told last."""
-    density, told = replace(tiny_density(), use_fast=False), {}
-
-    def condition(self, labels):
-        copy = replace(self)
-        told[copy] = labels[-1]
-        return copy
-
-    rates = {("walk", "run"): 3.0, ("run", "walk"): 3.0}
-    monkeypatch.setattr(type(density), "pace_rates", property(lambda self: rates))
-    monkeypatch.setattr(type(density), "conditioned_on", condition)
-    return density, told
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("tell", "expected"), [(True, {"pace=walk", "pace=run"}), (False, set())])
-def test_generated_motion_is_told(pacing, tell, expected):
-    density, told = pacing
-    settings = GenerateSettings(foot_cleanup=None, vary_paces=tell)
-    motion = generate(density, seconds=10.0, generator=generator(), settings=settings).motion
-    assert motion.num_frames == 300
-    assert set(told.values()) == expected

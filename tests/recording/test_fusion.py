@@ -13,7 +13,7 @@ from mapctl.recording.fusion import fuse_positions, fuse_rotations, smooth_colum
 
 JOINTS, SIGMA = 4, 5 * DEGREE
 LEVEL = torch.full((JOINTS,), SIGMA, dtype=torch.float64)
-RATES = [24, 30, 120]
+RATES = [24, 120]
 
 
 def truth(fps: float, seconds: float = 8.0):
