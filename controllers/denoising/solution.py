@@ -145,10 +145,7 @@ def _append_segment(whole: DenoiseSolution, piece: DenoiseSolution, start: int) 
     skip = start + shared // 2
     kept = round(skip * ratio)
     skipped = kept - round(start * ratio)
-    faults, densities = (
-        (move_frames(one, 0, stop=skip), move_frames(other, start, skip, frames))
-        for one, other in ((whole.faults, piece.faults), (whole.density_intervals, piece.density_intervals))
-    )
+    later = move_frames(piece.density_intervals, start, skip, frames)
     share = piece.motion.num_frames / frames
     return replace(
         whole,
@@ -156,7 +153,7 @@ def _append_segment(whole: DenoiseSolution, piece: DenoiseSolution, start: int) 
         capture=whole.capture.join(piece.capture.slice(shared, piece.capture.num_frames)),
         noise=(1 - share) * whole.noise + share * piece.noise,
         noise_root=(1 - share) * whole.noise_root + share * piece.noise_root,
-        faults=_merge_faults(*faults),
+        faults=_merge_faults(move_frames(whole.faults, 0, stop=skip), move_frames(piece.faults, start, skip, frames)),
         contacts=torch.cat([whole.contacts[:kept], piece.contacts[skipped:]]),
         proposal_share=torch.cat([whole.proposal_share[:kept], piece.proposal_share[skipped:]]),
         error=torch.cat([whole.error[:kept], piece.error[skipped:]]),
@@ -164,7 +161,7 @@ def _append_segment(whole: DenoiseSolution, piece: DenoiseSolution, start: int) 
         seconds=whole.seconds + piece.seconds,
         windows=whole.windows + piece.windows,
         status=replace(whole.status, notes=tuple(dict.fromkeys(whole.notes + piece.notes))),
-        density_intervals=(*densities[0], *densities[1]),
+        density_intervals=(*move_frames(whole.density_intervals, 0, stop=skip), *later),
     )
 
 

@@ -485,7 +485,7 @@ def _find_loud(prediction: Prediction, free: Bool[Tensor, "frames tracks"]) -> B
     spread, freedom = prediction.spread, prediction.freedom
     usual = torch.where((freedom > 0) & free, spread, math.nan).nanmedian(dim=0).values
     part = 2 / (9 * freedom.clamp_min(1))
-    least = (1 - part + norm.ppf(_QUIET) * part.sqrt()).clamp_min(0) ** 3
+    least = (1 - part + float(norm.ppf(_QUIET)) * part.sqrt()).clamp_min(0) ** 3
     return (freedom > _WHITE) & (spread.square() > least * usual.square())
 
 
