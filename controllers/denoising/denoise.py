@@ -46,7 +46,7 @@ from mapctl.recording.inspection import (
     NOISE_CM,
     Artefact,
     Inspection,
-    count_lead_frames,
+    estimate_lead_shares,
     hold_rigid_bones,
     inspect_recording,
     list_artefacts,
@@ -61,6 +61,7 @@ from mapctl.recording.masks import (
     write_back_masked,
 )
 from mapctl.recording.noise_estimation import choose_continuous_signs, estimate_angle_noise, estimate_position_noise
+from mapctl.recording.swaps import exchange_swapped_limbs
 from mapctl.retarget import RigMap, as_rig, from_canonical, identify_rig, to_canonical
 from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import CANONICAL, TOES, leg_length
@@ -71,6 +72,7 @@ MIN_DENOISE_FRAMES = 8
 _RIG_FRAMES = 3000  # frames from which the rig is identified
 _SEGMENT_SECONDS = 60.0  # seconds of a long capture that are cleaned at once
 _OVERLAP_SECONDS = 2.0  # seconds that two segments share
+_LEAD_SIGMAS = 3.0  # noise of an angle within which a joint of a lead pose may differ from what is expected
 
 
 @dataclass(frozen=True)
@@ -111,7 +113,7 @@ def denoise(
     `denoiser` proposes (see priors.load_denoiser), and `inbetweener`, if there is one, what is lost for longer (see
     LostPartFiller). Of `densities` the likeliest adds its likelihood to each window of the MAP stage; `terms` are the
     caller's own, which see the time since the capture's first frame. A T-pose before the motion, as many captures begin
-    with, and the frames blended with it stay as captured. A long capture is cleaned in segments that crossfade, so
+    with, and the frames blended with it stay but for noise. A long capture is cleaned in segments that crossfade, so
     memory beyond the capture's own does not grow with it. `progress` is called with frames done and all frames.
     """
     settings, capture, stretched = settings or DenoiseSettings(), motion, []
@@ -119,10 +121,12 @@ def denoise(
         motion, stretched = hold_rigid_bones(capture)
     denoiser = denoiser if inbetweener is None else LostPartFiller(denoiser, inbetweener)
     masks = resolve_joint_names(motion, masks, rig)
-    expand_valid_masks(motion, masks)  # checked whole: for a segment they are cut to its frames
+    hidden, _ = expand_valid_masks(motion, masks)  # checked whole: for a segment they are cut to its frames
     # Identified once: a segment may lack the frames that show the rig's T-pose.
     beginning, rigmap = to_canonical(motion.slice(0, min(motion.num_frames, _RIG_FRAMES)), rig)
-    rig, lead = as_rig(rigmap), count_lead_frames(beginning)
+    motion, swapped = exchange_swapped_limbs(motion, rigmap, hidden)
+    rig, shares = as_rig(rigmap), estimate_lead_shares(beginning)
+    lead = len(shares)
     frames, fps = motion.num_frames - lead, float(motion.fps)
     long, shared = (max(MIN_DENOISE_FRAMES, round(seconds * fps)) for seconds in (_SEGMENT_SECONDS, _OVERLAP_SECONDS))
     pieces: list[tuple[DenoiseSolution, int]] = []
@@ -143,17 +147,37 @@ def denoise(
     done = join_segments(pieces)
     notes = list(done.notes)
     if lead:
-        done = _prepend_lead(motion.slice(0, lead), done)
-        notes.insert(0, f"the T-pose in frame 0 stays as it is, and so do frames blended with it: 0 to {lead - 1}")
+        done = _prepend_lead(motion.slice(0, lead), done, shares, rigmap)
+        notes.insert(0, f"the T-pose in frame 0 stays but for noise, and so do frames blended with it: 0 to {lead - 1}")
+    if swapped:
+        notes.insert(0, f"left and right limbs are swapped {len(swapped)} times: they are exchanged back")
     if stretched:
         notes.insert(0, f"offsets of {len(stretched)} bones vary only by noise: they are held at their medians")
     status = replace(done.status, notes=tuple(notes))
-    return replace(done, capture=capture, rig=rig, faults=(*stretched, *done.faults), status=status).assess()
+    return replace(done, capture=capture, rig=rig, faults=(*stretched, *swapped, *done.faults), status=status).assess()
 
 
-def _prepend_lead(lead: Motion, done: DenoiseSolution) -> DenoiseSolution:
-    """Put the lead pose before a clean motion; what is known by frame is there as in the first one after it."""
+def _prepend_lead(
+    lead: Motion, done: DenoiseSolution, shares: Float[Tensor, " lead"], rigmap: RigMap
+) -> DenoiseSolution:
+    """Put the lead pose before a clean motion; what is known by frame is there as in the first one after it.
+
+    Frame 0 is shrunk towards the rest pose, and frames blended with it towards the arc from there to the motion, as far
+    as the noise explains what lies between.
+    """
     frames, count = lead.num_frames, round(lead.num_frames * PRIOR_FPS / float(lead.fps))
+    captured, tpose = lead.local_quat_xyzw, torch.zeros(1, CANONICAL.num_joints, 4, dtype=torch.float64)
+    tpose[..., 3] = 1
+    at_rest = from_canonical(Motion(rigmap.skeleton, lead.fps, lead.root_position[:1], tpose), rigmap).local_quat_xyzw
+    zero = torch.zeros_like(at_rest).index_fill(-1, torch.tensor(3), 1.0)
+    rest = min((zero, at_rest), key=lambda quats: float(_find_turns(quats, captured[:1]).norm(dim=-1).mean()))
+    first = _shrink(rest, captured[:1], done.noise)
+    whole = _find_turns(first, done.motion.local_quat_xyzw[:1])
+    arc = rotations.multiply(
+        first.expand_as(captured[1:]), rotations.from_rotation_vector(shares[1:, None, None].to(whole) * whole)
+    )
+    clean = torch.cat([first, _shrink(arc, captured[1:], done.noise)])
+    lead = replace(lead, local_quat_xyzw=clean)
     contacts, share, error = (
         torch.cat([values[:1].expand(count, -1), values]) for values in (done.contacts, done.proposal_share, done.error)
     )
@@ -166,6 +190,19 @@ def _prepend_lead(lead: Motion, done: DenoiseSolution) -> DenoiseSolution:
         proposal_share=share,
         error=error,
     )
+
+
+def _find_turns(start: Tensor, stop: Tensor) -> Float[Tensor, "frames joints 3"]:
+    """Return rotation vectors from rotations to others, radians."""
+    return rotations.to_rotation_vector(rotations.multiply(rotations.inverse(start).expand_as(stop), stop))
+
+
+def _shrink(expected: Tensor, captured: Tensor, noise: Float[Tensor, " joints"]) -> Float[Tensor, "frames joints 4"]:
+    """Shrink captured rotations towards expected ones by the share of their squared distance that is noise."""
+    turns = _find_turns(expected, captured)
+    power = turns.square().sum(dim=-1, keepdim=True).clamp_min(1e-12)
+    kept = (1 - (_LEAD_SIGMAS * noise[:, None]).square() / power).clamp_min(0)
+    return rotations.multiply(expected.expand_as(captured), rotations.from_rotation_vector(kept * turns))
 
 
 def _denoise_segment(

@@ -184,6 +184,8 @@ _LEAST_SPREAD = 1e-3  # variance of the logarithm of windows' scales, below whic
 class Prediction:
     """Predictions of every frame of every track from its neighbours, (frames, tracks)."""
 
+    mean: Float[Tensor, "frames tracks width"]
+    """Prediction of the value."""
     error: Float[Tensor, "frames tracks"]
     """Distance of the value from the prediction."""
     spread: Float[Tensor, "frames tracks"]
@@ -214,7 +216,8 @@ def predict_frames(
     rank = scores.argsort(dim=0).argsort(dim=0)[:, None]
     best = torch.where(usable, rank, -1).argmax(dim=0, keepdim=True)
     numbers = ([getattr(each, name) for each in found] for name in ("error", "spread", "scale", "freedom"))
-    return Prediction(*(torch.stack(each).gather(0, best)[0] for each in numbers))
+    mean = torch.take_along_dim(torch.stack([each.mean for each in found]), best[..., None], dim=0)[0]
+    return Prediction(mean, *(torch.stack(each).gather(0, best)[0] for each in numbers))
 
 
 def _score(prediction: Prediction, seen: Bool[Tensor, "frames tracks"]) -> Float[Tensor, " tracks"]:
@@ -254,7 +257,7 @@ def _predict(
     # A moment of rest is no reason to expect none of the motion that the track has otherwise.
     usual = torch.where(seen & (total > 0), shrunk, math.nan).nanmedian(dim=0).values.nan_to_num(0.0)
     scale = (torch.maximum(shrunk, usual) * (1 + inverse[..., 0, 0].clamp_min(0))).sqrt()
-    return Prediction((values - mean).norm(dim=-1), shrunk.sqrt(), scale, total)
+    return Prediction(mean + centre, (values - mean).norm(dim=-1), shrunk.sqrt(), scale, total)
 
 
 def _invert(moments: Float[Tensor, "frames tracks sums"], degree: int) -> Float[Tensor, "frames tracks terms terms"]:
@@ -295,8 +298,8 @@ def _shrink_scale(
 
 _MEDIAN_FRAMES = 5  # frames of the running median: bursts of up to two are detected
 _CANDIDATE_RATIO, _CANDIDATE_FRAMES = 3.0, 13  # distance from the median, by its median over so many frames
-_SHARE = 0.01  # of a track's frames that is expected to spike
-_ROTATIONS = 4 / 3 * math.pi * math.pi**3  # volume of all rotation vectors, among which a false rotation may be any
+SHARE = 0.01  # of a track's frames that is expected to spike
+ROTATIONS = 4 / 3 * math.pi * math.pi**3  # volume of all rotation vectors, among which a false rotation may be any
 _BODY = 4 / 3 * math.pi * 2.0**3  # volume about a body, cubic metres, within which its false position lies
 _FIT_ROUNDS = 5
 
@@ -305,14 +308,14 @@ def find_angle_spikes(
     quats: Float[Tensor, "frames joints 4"], seen: Bool[Tensor, "frames joints"]
 ) -> Bool[Tensor, "frames joints"]:
     """Find which joints spike in which frames that are seen."""
-    return _find_spikes(2 * choose_continuous_signs(quats), seen, math.log(_SHARE / _ROTATIONS))
+    return _find_spikes(2 * choose_continuous_signs(quats), seen, math.log(SHARE / ROTATIONS))
 
 
 def find_position_spikes(
     positions: Float[Tensor, "frames 3"], seen: Bool[Tensor, " frames"]
 ) -> Bool[Tensor, " frames"]:
     """Find the frames in which the position spikes; metres."""
-    return _find_spikes(positions[:, None], seen[:, None], math.log(_SHARE / _BODY))[:, 0]
+    return _find_spikes(positions[:, None], seen[:, None], math.log(SHARE / _BODY))[:, 0]
 
 
 def _find_spikes(
@@ -396,7 +399,7 @@ def _find_held_frames(
         return held[:, :-1], frozen
     turning = (quats != quats[:1]).any(dim=-1).any(dim=0)
     zero = (quats[:, turning, :3] == 0).all(dim=-1).all(dim=-1) & turning.any()
-    volumes = quats.new_tensor([_ROTATIONS] * quats.shape[1] + [_BODY])[moving]
+    volumes = quats.new_tensor([ROTATIONS] * quats.shape[1] + [_BODY])[moving]
     values, ignored, equal = values[:, moving], ignored[:, moving], equal[:, moving]
     whole = equal.all(dim=1)
     runs = [_Run(start - 1, stop, slice(None)) for _, start, stop in true_intervals(whole[:, None])]
@@ -546,8 +549,9 @@ _BLEND_SECONDS, _LEAST_BLEND = 0.06, 4  # longest blend, the longer of the two
 _UNBLENDED = 0.9  # share of the motion from which a frame is free of the pose
 
 
-def count_lead_frames(canonical: Motion) -> int:
-    """Return how many frames of a motion on canonical joints are its lead pose and blended with it; 0 without one.
+def estimate_lead_shares(canonical: Motion) -> Float[Tensor, " lead"]:
+    """Estimate the share of the motion in each frame of a lead pose: 0 in frame 0, rising in those that an exporter's
+    filter blended with it; no frames where a motion on canonical joints has none.
 
     A lead pose has its arms out and all joints straight, and the motion, which has its arms down in most frames, does
     not extrapolate to it. The share of the motion in each frame after it is fitted by least squares to all joints.
@@ -557,11 +561,11 @@ def count_lead_frames(canonical: Motion) -> int:
     arms = turned[:, upper].amin(dim=-1)
     straight = bool(turned[0].mean() < _STRAIGHT) and bool(arms[0] < _ARMS_OUT)
     if len(arms) < 2 or not straight or not bool(arms[1:].median() > _ARMS_DOWN):
-        return 0
+        return torch.zeros(0)
     fps, after = float(canonical.fps), canonical.num_frames - 1
     longest = min(max(_LEAST_BLEND, math.ceil(_BLEND_SECONDS * fps)), after - 4)
     if longest < 1:
-        return 1
+        return torch.zeros(1)
     fitted = min(max(_LEAST_LINE, round(_LINE_SECONDS * fps)), after - longest)
     quats = rotations.make_sign_continuous(canonical.local_quat_xyzw[:, 1:])
     frames = torch.arange(canonical.num_frames, dtype=quats.dtype)[1:]
@@ -572,7 +576,7 @@ def count_lead_frames(canonical: Motion) -> int:
     ahead = (line[0] + frames[:longest, None] * line[1]).unflatten(-1, quats.shape[1:])
     ahead = torch.nn.functional.normalize(ahead, dim=-1)
     if bool((rotations.to_rotation_vector(ahead[0, upper]).norm(dim=-1) < _ARMS_OUT).all()):
-        return 0
+        return torch.zeros(0)
     whole, gone = (
         rotations.to_rotation_vector(rotations.multiply(rotations.inverse(quats[:1]).expand_as(ahead), each))
         for each in (ahead, quats[1 : 1 + longest])
@@ -581,4 +585,4 @@ def count_lead_frames(canonical: Motion) -> int:
     free = (share >= _UNBLENDED).nonzero()
     count = int(free[0]) if len(free) else longest
     blended = (gone - share[:, None, None] * whole)[:count].square().sum() < (gone - whole)[:count].square().sum()
-    return 1 + count if blended else 1
+    return torch.cat([torch.zeros(1).to(share), share[:count].clamp(0, 1)]) if blended else torch.zeros(1)
