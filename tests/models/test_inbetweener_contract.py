@@ -1,5 +1,7 @@
 """What every in-betweener keeps to, whoever wrote it."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from captures import on_rig
