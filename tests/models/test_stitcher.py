@@ -79,19 +79,6 @@ def test_the_first_draws_do_not_depend_on_the_count_and_differ():
     assert float((many.quats[0] - many.quats[9]).abs().max()) > 1e-4
 
 
-def test_gaps_are_filled_between_poses_that_stay_and_too_long_ones_are_named():
-    motion = walk(90)
-    query = query_of(motion, (10, 25), (40, 70))
-    made = tiny_stitcher().propose(query)
-    known = ~query.missing.frames
-    torch.testing.assert_close(made.motion.root_position[known], motion.root_position[known])
-    sources = made.attribute(query)
-    assert [source.by for source in sources] == ["stitcher", "interpolation"]
-    assert sources[1].reason == "longer than the 23 frames that the stitcher fills"
-    step = made.motion.joint_positions()[9:26].diff(dim=0).norm(dim=-1).max()
-    assert float(step) < 2 * float(motion.joint_positions().diff(dim=0).norm(dim=-1).max())
-
-
 def test_draws_that_are_not_finite_are_dropped_and_counted():
     made = tiny_stitcher().draw(bare(walk(60), 11, 30), 20, count=8, generator=torch.Generator().manual_seed(3))
     made.root_position[[2, 3]] = torch.nan

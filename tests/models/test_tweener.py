@@ -72,6 +72,7 @@ def test_keys_stay_to_the_bit_and_are_approached_smoothly():
     assert float(beside.max()) < 3 * float(step.median())
 
 
+@pytest.mark.slow
 def test_hips_that_tremble_are_led_calmly():
     motion = walk(100)
     shaken = replace(motion, root_position=motion.root_position + 0.01 * (-1.0) ** torch.arange(100)[:, None])
@@ -94,16 +95,6 @@ def test_hips_go_where_the_path_predictor_sees_them_go_and_arrive():
         assert float(away.max()) < 0.1  # the made body faces elsewhere than the walk's
         steps = torch.diff(made.root_position[:, 2])
         assert float(steps.min()) > 0
-
-
-def test_auto_leaves_long_gaps_between_whole_poses_to_it_and_holds_who_stands():
-    query = query_of(walk(200), (1, 30), (31, 190))
-    auto = AutoInbetweener(SlerpInbetweener(), long=75, tweener=tiny_tweener())
-    assert [source.by for source in auto.propose(query).attribute(query)] == ["slerp", "tweener"]
-    plain = AutoInbetweener(SlerpInbetweener())
-    assert {source.by for source in plain.propose(query).attribute(query)} == {"slerp"}
-    still = query_of(standing(200), (1, 199))
-    assert [source.by for source in auto.propose(still).attribute(still)] == ["standing still"]
 
 
 def test_it_goes_with_the_path_predictor_that_it_was_trained_with(tmp_path):
@@ -160,6 +151,7 @@ def test_a_long_gap_is_split_by_poses_of_the_style_or_of_the_keys_and_a_note_say
     assert not plain.propose(short).attribute(short)[0].reason
 
 
+@pytest.mark.slow
 def test_poses_that_split_a_gap_stand_on_the_way_and_face_along_it():
     query = query_of(walk(1100, turn_rate=0.05), (1, 1099))
     (split,) = find_splits(query)
