@@ -72,7 +72,8 @@ def _read(path: str | PathLike[str], *, lossy: bool) -> tuple[Motion, MissingVal
     lost = _replace_missing(path, arrays)
     if (found := str(arrays["format"])) != FORMAT:
         raise FileFormatError(path, f"format is {found[:40]!r}, expected {FORMAT!r}")
-    _check_rotations(path, arrays["local_quat_xyzw"])
+    if (np.abs(np.linalg.norm(arrays["local_quat_xyzw"], axis=-1) - 1) > 1e-3).any():
+        raise FileFormatError(path, "local_quat_xyzw holds what is no unit quaternion")
     try:
         return _build_motion(arrays), lost
     except (MapctlError, ZeroDivisionError, ValueError, IndexError) as error:
@@ -138,7 +139,11 @@ def _read_arrays(path: str | PathLike[str], raw: bytes) -> dict[str, np.ndarray]
         raise FileFormatError(path, "is not an .npz archive")
     try:
         with zipfile.ZipFile(io.BytesIO(raw)) as archive:
-            _check_members(path, archive)
+            sizes = {member.filename.removesuffix(".npy"): member.file_size for member in archive.infolist()}
+            if lacking := _KEYS.keys() - sizes.keys():
+                raise FileFormatError(path, f"lacks the keys {', '.join(key for key in _KEYS if key in lacking)}")
+            if (total := sum(sizes.get(key, 0) for key in (*_KEYS, _LICENCE))) > MAX_FILE_BYTES:
+                raise FileFormatError(path, f"unpacks to {total >> 20} MiB, allowed are {MAX_FILE_BYTES >> 20}")
             keys = [*_KEYS, *([_LICENCE] if f"{_LICENCE}.npy" in archive.namelist() else [])]
             contents = {key: io.BytesIO(archive.read(f"{key}.npy")) for key in keys}
             return {key: np.lib.format.read_array(content, allow_pickle=False) for key, content in contents.items()}
@@ -146,14 +151,6 @@ def _read_arrays(path: str | PathLike[str], raw: bytes) -> dict[str, np.ndarray]
         raise
     except Exception as error:  # zipfile and numpy raise whatever a forged archive leads their parsers to
         raise FileFormatError(path, f"is not a sound .npz archive: {one_line(error)}") from error
-
-
-def _check_members(path: str | PathLike[str], archive: zipfile.ZipFile) -> None:
-    sizes = {member.filename: member.file_size for member in archive.infolist()}
-    if missing := [key for key in _KEYS if f"{key}.npy" not in sizes]:
-        raise FileFormatError(path, f"lacks the keys {', '.join(missing)}")
-    if (total := sum(sizes.get(f"{key}.npy", 0) for key in (*_KEYS, _LICENCE))) > MAX_FILE_BYTES:
-        raise FileFormatError(path, f"unpacks to {total >> 20} MiB, allowed are {MAX_FILE_BYTES >> 20}")
 
 
 def _check_shapes(path: str | PathLike[str], arrays: dict[str, np.ndarray], *, lossy: bool) -> None:
@@ -198,13 +195,6 @@ def _replace_missing(path: str | PathLike[str], arrays: dict[str, np.ndarray]) -
             "root_position_world": missing.interpolate_nan(arrays["root_position_world"], np.zeros(3)),
         }
     return MissingValues(torch.from_numpy(turns.any(axis=-1)), torch.from_numpy(places))
-
-
-def _check_rotations(path: str | PathLike[str], quat_xyzw: np.ndarray) -> None:
-    bad = np.abs(np.linalg.norm(quat_xyzw, axis=-1) - 1) > 1e-3
-    if bad.any():
-        frame, joint = np.argwhere(bad)[0].tolist()
-        raise FileFormatError(path, f"local_quat_xyzw of frame {frame}, joint {joint} is no unit quaternion")
 
 
 def _numbers(values: Tensor) -> np.ndarray:

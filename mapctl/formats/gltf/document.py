@@ -238,8 +238,7 @@ def _open_buffers(file: Path, buffers: list[Json], binary: bytes) -> list[bytes]
     found: list[bytes] = []
     for number, buffer in enumerate(buffers):
         size, uri = buffer["byteLength"], buffer.get("uri")
-        own = binary if number == 0 else b""
-        data = own if uri is None else read_neighbour(file, uri)
+        data = read_neighbour(file, uri) if uri is not None else binary if number == 0 else b""
         if not 0 <= size <= min(len(data), MAX_FILE_BYTES):
             raise FileFormatError(file, f"buffers[{number}] should have {size} bytes, there are {len(data)}")
         found.append(data)

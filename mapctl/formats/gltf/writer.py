@@ -78,15 +78,11 @@ def _save_character(motion: Motion, path: str | PathLike[str], source: Character
     tree["animations"] = [animation, *kept]
     if motion.licence:
         asset = tree["asset"]
-        tree["asset"] = {**asset, "extras": {**_find_extras(asset), LICENCE: motion.licence}}
+        extras = asset.get("extras")
+        tree["asset"] = {**asset, "extras": {**(extras if isinstance(extras, dict) else {}), LICENCE: motion.licence}}
     first = tree["buffers"][0] if tree.get("buffers") else {}
     tree["buffers"] = [{**first, "byteLength": appended.size}]
     write_pieces(path, compose_glb(tree, [*binary, *appended.pieces]))
-
-
-def _find_extras(asset: Json) -> Json:
-    extras = asset.get("extras")
-    return extras if isinstance(extras, dict) else {}
 
 
 @refuse_malformed
