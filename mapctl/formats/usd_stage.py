@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from pxr import Ar, Gf, Sdf, Tf, Usd, UsdGeom, UsdShade, UsdSkel, UsdUtils, Vt
+from scipy.spatial.transform import Rotation
 
 from mapctl.formats.parts import (
     FoundCharacter,
@@ -81,10 +82,12 @@ def read_character(path: str, *, armature: str | None, animation: str | None, wa
     why not."""
     try:
         stage = open_stage(path)
-        name, skeleton = choose_skeleton(stage, Path(path).name, armature)
+        names, prims = find_skeletons(stage)
+        number = find_name(Path(path).name, names, armature, "armature", several=False)
+        skeleton = read_skeleton(prims[number])
         found = UsdCharacter(
-            armature=name,
-            armatures=find_skeletons(stage)[0],
+            armature=names[number],
+            armatures=names,
             names=skeleton.names,
             parents=skeleton.parents,
             metres_per_unit=UsdGeom.GetStageMetersPerUnit(stage),
@@ -144,9 +147,16 @@ def check_layers(root: Sdf.Layer, folder: Path) -> None:
             seen.add(full)
             if len(seen) > _MAX_LAYERS:
                 raise Refusal(f"is made of more than {_MAX_LAYERS} layers")
-            _check_file(name, full, folder)
-            if "#" not in name:
-                waiting.append(open_layer(full))
+            if not is_inside(full, folder):
+                raise Refusal(f"names {name!r}, which is not in its folder; such files are not read")
+            if "#" in name:  # the pattern of value clips, which USD looks for where it leads
+                continue
+            outer, inner = Ar.SplitPackageRelativePathOuter(full)
+            if not Path(outer).is_file() or (inner and not Ar.GetResolver().Resolve(full)):
+                raise Refusal(f"names {name!r}, which is not there")
+            if Path(outer).stat().st_size > MAX_FILE_BYTES:
+                raise Refusal(f"names {name!r}, which has more than {MAX_FILE_BYTES >> 20} MiB")
+            waiting.append(open_layer(full))
 
 
 def is_inside(full: str, folder: Path) -> bool:
@@ -177,19 +187,6 @@ def _named_layers(layer: Sdf.Layer) -> set[str]:
     return found
 
 
-def _check_file(name: str, full: str, folder: Path) -> None:
-    if not is_inside(full, folder):
-        raise Refusal(f"names {name!r}, which is not in its folder; such files are not read")
-    if "#" in name:  # the pattern of value clips, which USD looks for where it leads
-        return
-    outer, inner = Ar.SplitPackageRelativePathOuter(full)
-    file = Path(outer)
-    if not file.is_file() or (inner and not Ar.GetResolver().Resolve(full)):
-        raise Refusal(f"names {name!r}, which is not there")
-    if file.stat().st_size > MAX_FILE_BYTES:
-        raise Refusal(f"names {name!r}, which has {file.stat().st_size >> 20} MiB, allowed are {MAX_FILE_BYTES >> 20}")
-
-
 @dataclass(frozen=True, eq=False)
 class SkeletonPrim:
     """A UsdSkel.Skeleton, read."""
@@ -216,13 +213,6 @@ def find_skeletons(stage: Usd.Stage) -> tuple[list[str], list[Usd.Prim]]:
     return make_unique([prim.GetName() for prim in prims]), prims
 
 
-def choose_skeleton(stage: Usd.Stage, file: str, wanted: str | None) -> tuple[str, SkeletonPrim]:
-    """Return the wanted or only skeleton and its name; Refusal names them where there are several."""
-    names, prims = find_skeletons(stage)
-    number = find_name(file, names, wanted, "armature", several=False)
-    return names[number], read_skeleton(prims[number])
-
-
 def walk(stage: Usd.Stage) -> Usd.PrimRange:
     """Go through the prims of a stage, those in instances too."""
     return Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies())
@@ -232,17 +222,18 @@ def read_skeleton(prim: Usd.Prim) -> SkeletonPrim:
     """Read a skeleton's joints and poses. Refusal where they are no tree, or its tables do not fit together."""
     skeleton, where = UsdSkel.Skeleton(prim), f"skeleton {prim.GetName()!r}"
     joints = [str(joint) for joint in read_value(skeleton.GetJointsAttr()) or ()]
-    if not joints:
-        raise Refusal(f"{where} has no joints")
-    if len(joints) > MAX_JOINTS:
-        raise Refusal(f"{where} has {len(joints)} joints, allowed are {MAX_JOINTS}")
+    if not 1 <= len(joints) <= MAX_JOINTS:
+        raise Refusal(f"{where} has {len(joints)} joints, allowed are 1 to {MAX_JOINTS}")
     parents = _find_parents(joints, where)
     said = [str(name) for name in read_value(skeleton.GetJointNamesAttr()) or ()]
     bind = _read_matrices(skeleton.GetBindTransformsAttr(), len(joints), where)
     rest = _read_matrices(skeleton.GetRestTransformsAttr(), len(joints), where)
     if bind is None and rest is None:
         raise Refusal(f"{where} has neither bindTransforms nor restTransforms")
-    return SkeletonPrim(prim, joints, _name_joints(joints, said), parents, bind, rest)
+    if len(said) != len(joints) or len(set(said)) < len(said) or not all(said):
+        said = [joint.rpartition("/")[2] for joint in joints]
+    names = said if len(set(said)) == len(joints) else joints
+    return SkeletonPrim(prim, joints, names, parents, bind, rest)
 
 
 def world_of(prim: Usd.Prim, time: Usd.TimeCode) -> Array:
@@ -286,25 +277,13 @@ def _find_parents(joints: list[str], where: str) -> list[int]:
     return parents
 
 
-def _name_joints(joints: list[str], said: list[str]) -> list[str]:
-    """Return the names that the skeleton gives its joints, else the last words of their paths where these are unique,
-    else the paths."""
-    if len(said) == len(joints) and len(set(said)) == len(said) and all(said):
-        return said
-    leaves = [joint.rpartition("/")[2] for joint in joints]
-    return leaves if len(set(leaves)) == len(leaves) else joints
-
-
 def _read_matrices(attribute: Usd.Attribute, count: int, where: str) -> Array | None:
     value = read_value(attribute)
     if value is None or not len(value):
         return None
-    if len(value) != count:
-        raise Refusal(f"{where} has {count} joints and {len(value)} {attribute.GetName()}")
-    matrices = np.array(value, np.float64).reshape(count, 4, 4).transpose(0, 2, 1)
-    if not np.isfinite(matrices).all():
-        raise Refusal(f"{where}: {attribute.GetName()} holds numbers that are not finite")
-    return matrices
+    if len(value) != count or not np.isfinite(value).all():
+        raise Refusal(f"{where}: {attribute.GetName()} are not {count} matrices of finite numbers")
+    return np.array(value, np.float64).reshape(count, 4, 4).transpose(0, 2, 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -407,20 +386,14 @@ def _sample_joints(
     for attribute, columns in zip(attributes, (slice(0, 3), slice(3, 7), slice(7, 10)), strict=True):
         varies = len(attribute.GetTimeSamples()) > 1
         for key, time in enumerate(times.tolist() if varies else times[:1].tolist()):
-            table = _read_table(attribute, time, len(moved), what)
-            if table is not None:
-                local[key if varies else slice(None), there, columns] = table[here]
+            value = read_value(attribute, Usd.TimeCode(time))
+            if value is None or not len(value):
+                continue
+            if len(value) != len(moved):
+                raise Refusal(f"{what} has {len(moved)} joints and {len(value)} {attribute.GetName()}")
+            table = np.array(value, np.float64).reshape(len(moved), -1)
+            local[key if varies else slice(None), there, columns] = table[here]
     return local
-
-
-def _read_table(attribute: Usd.Attribute, time: float, count: int, what: str) -> Array | None:
-    """Return the values of all animated joints at a time; None where there are none."""
-    value = read_value(attribute, Usd.TimeCode(time))
-    if value is None or not len(value):
-        return None
-    if len(value) != count:
-        raise Refusal(f"{what} has {count} joints and {len(value)} {attribute.GetName()}")
-    return np.array(value, np.float64).reshape(count, -1)
 
 
 def rest_parts(skeleton: SkeletonPrim) -> Array:
@@ -556,13 +529,20 @@ def _read_mesh(query: UsdSkel.SkinningQuery, skeleton: SkeletonPrim, folder: Pat
     """Read a mesh; None for what is none, is not to be seen, or has no skin."""
     prim = query.GetPrim()
     mesh = UsdGeom.Mesh(prim)
-    if not mesh or not query.HasJointInfluences() or not _is_seen(mesh):
+    if not mesh or not query.HasJointInfluences():
+        return None
+    seen = mesh.ComputeVisibility(Usd.TimeCode.EarliestTime()) != UsdGeom.Tokens.invisible
+    if not seen or mesh.ComputePurpose() not in (UsdGeom.Tokens.default_, UsdGeom.Tokens.render):
         return None
     what = f"mesh {prim.GetName()!r}"
     points = _read_array(mesh.GetPointsAttr(), 3, np.float64)
     counts = _read_array(mesh.GetFaceVertexCountsAttr(), 1, np.int64)[:, 0]
     vertices = _read_array(mesh.GetFaceVertexIndicesAttr(), 1, np.int64)[:, 0]
-    _check_topology(points, counts, vertices, what)
+    if len(vertices) > _MAX_CORNERS:
+        raise Refusal(f"{what} has {len(vertices)} corners, allowed are {_MAX_CORNERS}")
+    named = vertices.min(initial=0) >= 0 and vertices.max(initial=-1) < len(points)
+    if counts.min(initial=0) < 0 or counts.sum() != len(vertices) or not named:
+        raise Refusal(f"{what}: its faceVertexCounts or faceVertexIndices do not fit its {len(points)} points")
     holes = np.zeros(len(counts), bool)
     skipped = _read_array(mesh.GetHoleIndicesAttr(), 1, np.int64)[:, 0]
     holes[skipped[(skipped >= 0) & (skipped < len(counts))]] = True
@@ -576,20 +556,6 @@ def _read_mesh(query: UsdSkel.SkinningQuery, skeleton: SkeletonPrim, folder: Pat
         raise Refusal(f"{what} names joint {rows.max()} of {len(joints)}")
     rgba = mean_at_vertices(corner_colours(mesh, counts, vertices, folder), vertices, len(points))
     return MeshPart(points, faces, rgba, joints, matrices, rows, shares)
-
-
-def _is_seen(mesh: UsdGeom.Mesh) -> bool:
-    seen = mesh.ComputeVisibility(Usd.TimeCode.EarliestTime()) != UsdGeom.Tokens.invisible
-    return seen and mesh.ComputePurpose() in (UsdGeom.Tokens.default_, UsdGeom.Tokens.render)
-
-
-def _check_topology(points: Array, counts: Array, vertices: Array, what: str) -> None:
-    if len(vertices) > _MAX_CORNERS:
-        raise Refusal(f"{what} has {len(vertices)} corners, allowed are {_MAX_CORNERS}")
-    if counts.min(initial=0) < 0 or counts.sum() != len(vertices):
-        raise Refusal(f"{what}: faceVertexCounts say {counts.sum()} corners, there are {len(vertices)}")
-    if len(vertices) and (vertices.min() < 0 or vertices.max() >= len(points)):
-        raise Refusal(f"{what} names vertex {vertices.max()} of {len(points)}")
 
 
 def _read_palette(query: UsdSkel.SkinningQuery, skeleton: SkeletonPrim) -> tuple[Array, Array]:
@@ -716,11 +682,16 @@ def _add_motion(stage: Usd.Stage, motion: NewMotion) -> None:
     names, prims, _ = name_animations(stage, skeleton)
     replaced = prims[names.index(motion.animation)] if motion.animation in names else None
     codes = _set_times(stage, replaced, len(motion.translations), motion.rate)
-    moved, turned, scales = _place_roots(skeleton, motion, codes)
+    moved, turned = _place_roots(skeleton, motion, codes)
     path = skeleton.prim.GetPath().AppendChild(_free_name(skeleton.prim, motion.stem))
     made = UsdSkel.Animation.Define(stage, path) if replaced is None else UsdSkel.Animation(_as_own(stage, replaced))
     made.CreateJointsAttr(skeleton.joints)
-    _write_values(made, moved, turned, scales, codes)
+    attributes = made.CreateTranslationsAttr(), made.CreateRotationsAttr(), made.CreateScalesAttr()
+    for attribute in attributes:
+        attribute.Clear()
+    attributes[2].Set(Vt.Vec3hArray.FromNumpy(np.ascontiguousarray(motion.scales, np.float16)))
+    _write_samples(attributes[1], Vt.QuatfArray, turned, codes.tolist())
+    _write_samples(attributes[0], Vt.Vec3fArray, moved, codes.tolist())
     binding = UsdSkel.BindingAPI.Apply(skeleton.prim)
     binding.CreateAnimationSourceRel().SetTargets([made.GetPath()])
     _set_extent(skeleton.prim, motion.places)
@@ -743,7 +714,12 @@ def _set_times(stage: Usd.Stage, replaced: Usd.Prim | None, frames: int, rate: f
     then the stage keeps its rate, so that this goes on as fast as before.
     """
     start, step = 0.0, 1.0
-    if _others_move(stage, replaced):
+    if any(
+        attribute.ValueMightBeTimeVarying()
+        for prim in walk(stage)
+        if replaced is None or prim.GetPath() != replaced.GetPath()
+        for attribute in prim.GetAttributes()
+    ):
         start = stage.GetStartTimeCode() if stage.HasAuthoredTimeCodeRange() else 0.0
         step = stage.GetTimeCodesPerSecond() / rate
     else:
@@ -755,38 +731,22 @@ def _set_times(stage: Usd.Stage, replaced: Usd.Prim | None, frames: int, rate: f
     return codes
 
 
-def _others_move(stage: Usd.Stage, replaced: Usd.Prim | None) -> bool:
-    return any(
-        attribute.ValueMightBeTimeVarying()
-        for prim in walk(stage)
-        if replaced is None or prim.GetPath() != replaced.GetPath()
-        for attribute in prim.GetAttributes()
-    )
-
-
-def _place_roots(skeleton: SkeletonPrim, motion: NewMotion, codes: Array) -> tuple[Array, Array, Array]:
-    """Return translations (frames, joints, 3), rotations (frames, joints, 4) and scales (joints, 3), with those of the
-    roots in the skeleton's space as its placement is at each time."""
-    moved, turned, scales = motion.translations.copy(), motion.rotations.copy(), motion.scales.copy()
+def _place_roots(skeleton: SkeletonPrim, motion: NewMotion, codes: Array) -> tuple[Array, Array]:
+    """Return translations (frames, joints, 3) and rotations (frames, joints, 4), with those of the roots in the
+    skeleton's space as its placement is at each time."""
+    moved, turned = motion.translations.copy(), motion.rotations.copy()
     if not animated_placement(skeleton.prim):
-        return moved, turned, scales
+        return moved, turned
     roots = [joint for joint, parent in enumerate(skeleton.parents) if parent < 0]
     for frame, code in enumerate(codes.tolist()):
         change = np.linalg.pinv(world_of(skeleton.prim, Usd.TimeCode(code))) @ motion.outer
         turn = change[:3, :3] / np.cbrt(abs(np.linalg.det(change[:3, :3])))
         moved[frame, roots] = moved[frame, roots] @ change[:3, :3].T + change[:3, 3]
-        turned[frame, roots] = multiply_quaternions(to_quaternions(turn[None])[0], turned[frame, roots])
+        turned[frame, roots] = (Rotation.from_matrix(turn) * Rotation.from_quat(turned[frame, roots])).as_quat()
     for frame in range(1, len(codes)):
         flipped = (turned[frame] * turned[frame - 1]).sum(-1) < 0
         turned[frame, flipped] *= -1
-    return moved, turned, scales
-
-
-def multiply_quaternions(first: Array, second: Array) -> Array:
-    """Return products xyzw (n, 4) of one quaternion (4,) and several (n, 4): those' rotations, then the first's."""
-    x, w = first[:3], first[3]
-    y, v = second[:, :3], second[:, 3:]
-    return np.concatenate([w * y + v * x + np.cross(x, y), w * v - (y @ x)[:, None]], axis=1)
+    return moved, turned
 
 
 def _free_name(prim: Usd.Prim, stem: str) -> str:
@@ -797,16 +757,9 @@ def _free_name(prim: Usd.Prim, stem: str) -> str:
     return next(name for name in names if name not in taken)
 
 
-def _write_values(made: UsdSkel.Animation, moved: Array, turned: Array, scales: Array, codes: Array) -> None:
-    attributes = made.CreateTranslationsAttr(), made.CreateRotationsAttr(), made.CreateScalesAttr()
-    for attribute in attributes:
-        attribute.Clear()
-    attributes[2].Set(Vt.Vec3hArray.FromNumpy(np.ascontiguousarray(scales, np.float16)))
-    moved, turned = np.ascontiguousarray(moved, np.float32), np.ascontiguousarray(turned, np.float32)
-    times = codes.tolist()
-    for frame, code in enumerate(times):
-        attributes[1].Set(Vt.QuatfArray.FromNumpy(turned[frame]), code)
-        attributes[0].Set(Vt.Vec3fArray.FromNumpy(moved[frame]), code)
+def _write_samples(attribute: Usd.Attribute, kind: type, values: Array, codes: list[float]) -> None:
+    for value, code in zip(np.ascontiguousarray(values, np.float32), codes, strict=True):
+        attribute.Set(kind.FromNumpy(value), code)  # USD's quaternions take xyzw, as ours are
 
 
 def _set_extent(prim: Usd.Prim, places: Array) -> None:
@@ -844,7 +797,9 @@ def build_stage(motion: "Motion", joints: Sequence[str]) -> Usd.Stage:
     UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets([animation.GetPath()])
     mesh = _define_mesh(stage, body)
     UsdSkel.BindingAPI.Apply(mesh).CreateSkeletonRel().SetTargets([skeleton.GetPath()])
-    _set_whole_extent(top, motion)
+    reach = motion.joint_positions().numpy().reshape(-1, 3)  # viewers frame the character by the extent
+    corners = reach.min(0) - _MARGIN, reach.max(0) + _MARGIN
+    top.CreateExtentAttr([Gf.Vec3f(*corner.tolist()) for corner in corners])
     if motion.licence:
         stage.GetRootLayer().customLayerData = {"licence": motion.licence}
     return stage
@@ -896,10 +851,8 @@ def _define_animation(stage: Usd.Stage, motion: "Motion", joints: Sequence[str])
     if not motion.moving_offsets and (places[:, 0] == places[0, 0]).all():
         moved.Set(Vt.Vec3fArray.FromNumpy(places[0]))
     else:
-        for frame, values in enumerate(places):
-            moved.Set(Vt.Vec3fArray.FromNumpy(values), frame)
-    for frame, values in enumerate(turns):
-        turned.Set(Vt.QuatfArray.FromNumpy(values), frame)  # from imaginary parts and then the real one, as ours
+        _write_samples(moved, Vt.Vec3fArray, places, list(range(motion.num_frames)))
+    _write_samples(turned, Vt.QuatfArray, turns, list(range(motion.num_frames)))
     return made
 
 
@@ -921,10 +874,3 @@ def _define_mesh(stage: Usd.Stage, body: "SkinnedBody"):
     binding.CreateJointWeightsPrimvar(False, width).Set(Vt.FloatArray.FromNumpy(weights))
     binding.CreateGeomBindTransformAttr(Gf.Matrix4d(1.0))
     return made.GetPrim()
-
-
-def _set_whole_extent(top: UsdSkel.Root, motion: "Motion") -> None:
-    """Set the extent of the whole trajectory, an arm's length around the joints; viewers frame the character by it."""
-    places = motion.joint_positions().numpy().reshape(-1, 3)
-    corners = places.min(0) - _MARGIN, places.max(0) + _MARGIN
-    top.CreateExtentAttr([Gf.Vec3f(*corner.tolist()) for corner in corners])
