@@ -5,7 +5,7 @@ Names, tree and bones are those of one two-legged person, and the T-pose agrees 
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import pairwise, product
 
 import torch
 
@@ -98,12 +98,10 @@ def assess_fit(rigmap: RigMap, motion: Motion | None = None) -> Fit:
             *_find_wrong_order(rigmap),
             *_compare_sides(rigmap, zero, clip),
             *_list_joints_by_place(rigmap),
-            *_compare_words(rigmap),
             *_find_skipped_joints(rigmap),
             *_compare_knowledge(rigmap),
             *_find_single_sides(rigmap),
-            *_compare_halves(rigmap.skeleton),
-            *_compare_side_lengths(rigmap.skeleton),
+            *_compare_lengths(rigmap.skeleton),
             *_compare_limbs(body),
             *_check_order(body),
             *_check_poses(rigmap, clip),
@@ -181,28 +179,20 @@ def _compare_sides(rigmap: RigMap, zero: RigPoses, clip: RigPoses | None) -> Ite
 
 def _list_joints_by_place(rigmap: RigMap) -> Iterator[Doubt]:
     """List the joints whose names show neither side nor part."""
-    placed = _list_placed(rigmap)
+    placed = [name for name, how in rigmap.match.known_by.items() if how is KnownBy.PLACE]
+    roles = classify_joints(rigmap.rig_skeleton)
+    quoted = {name: _quote(rigmap, rigmap.joints[name]) for name in placed}
     if len(placed) <= _MAX_LISTED:
         for name in placed:
-            yield Doubt(f"{name} is known by its position alone (joint {_quote(rigmap, rigmap.joints[name])})", (name,))
-        return
-    listed = ", ".join(f"{name} ({_quote(rigmap, rigmap.joints[name])})" for name in placed[:_MAX_LISTED])
-    more = len(placed) - _MAX_LISTED
-    yield Doubt(f"{len(placed)} joints are known by their positions alone: {listed} and {more} more", tuple(placed))
-
-
-def _list_placed(rigmap: RigMap) -> list[str]:
-    return [name for name, how in rigmap.match.known_by.items() if how is KnownBy.PLACE]
-
-
-def _compare_words(rigmap: RigMap) -> Iterator[Doubt]:
-    """Compare the part in the name of a joint with its position in the tree."""
-    roles = classify_joints(rigmap.rig_skeleton)
-    for name in _list_placed(rigmap):
-        joint = rigmap.joints[name]
-        part = roles[joint].part
+            yield Doubt(f"{name} is known by its position alone (joint {quoted[name]})", (name,))
+    else:
+        listed = ", ".join(f"{name} ({quoted[name]})" for name in placed[:_MAX_LISTED])
+        more = len(placed) - _MAX_LISTED
+        yield Doubt(f"{len(placed)} joints are known by their positions alone: {listed} and {more} more", (*placed,))
+    for name in placed:
+        part = roles[rigmap.joints[name]].part
         if part is not Part.OTHER and part not in _PARTS[_split(name)[1]]:
-            yield Doubt(f"{name} is {_quote(rigmap, joint)}, whose name is that of a {part.value}", (name,))
+            yield Doubt(f"{name} is {quoted[name]}, whose name is that of a {part.value}", (name,))
 
 
 def _find_skipped_joints(rigmap: RigMap) -> Iterator[Doubt]:
@@ -283,27 +273,24 @@ def _check_poses(rigmap: RigMap, clip: RigPoses | None) -> Iterator[Doubt]:
         yield Doubt(rigmap.tpose_doubt)
 
 
-def _compare_halves(skeleton: Skeleton) -> Iterator[Doubt]:
-    for side in ("left", "right"):
-        for limb, upper, lower in (("arm", "LowerArm", "Hand"), ("leg", "LowerLeg", "Foot")):
-            halves = _length(skeleton, side + upper), _length(skeleton, side + lower)
-            joints = (side + upper, side + lower)
-            if min(halves) < _NO_BONE:
-                yield Doubt(f"{joints[halves.index(min(halves))]} is at the position of the joint above it", joints)
-            elif not _HALVES[0] <= halves[0] / halves[1] <= _HALVES[1]:
-                centimetres = " and ".join(f"{100 * half:.0f} cm" for half in halves)
-                yield Doubt(f"the {side} {limb} has halves of {centimetres}", joints)
-
-
-def _compare_side_lengths(skeleton: Skeleton) -> Iterator[Doubt]:
+def _compare_lengths(skeleton: Skeleton) -> Iterator[Doubt]:
+    """Compare the two bones of each limb, and those of both sides."""
+    length = dict(zip(CANONICAL.names, skeleton.offsets.norm(dim=-1).tolist(), strict=True))
+    for side, (limb, *parts) in product(SIDES, (("arm", "LowerArm", "Hand"), ("leg", "LowerLeg", "Foot"))):
+        joints = (side + parts[0], side + parts[1])
+        halves = [length[joint] for joint in joints]
+        if min(halves) < _NO_BONE:
+            yield Doubt(f"{min(joints, key=length.__getitem__)} is at the position of the joint above it", joints)
+        elif not _HALVES[0] <= halves[0] / halves[1] <= _HALVES[1]:
+            centimetres = " and ".join(f"{100 * half:.0f} cm" for half in halves)
+            yield Doubt(f"the {side} {limb} has halves of {centimetres}", joints)
     for name in CANONICAL.names:
         if name.startswith("left") and not name.endswith(("Toes", "Shoulder")):
-            other = name.replace("left", "right")
-            own, theirs = _length(skeleton, name), _length(skeleton, other)
-            short, long = sorted((own, theirs))
+            other = mirror_name(name)
+            short, long = sorted((length[name], length[other]))
             if long > _SIDE_RATIO * short and long - short > _MIN_DIFFERENCE:
-                said = f"{100 * own:.0f} and {100 * theirs:.0f} cm"
-                yield Doubt(f"the bones to {name} and {other} differ: {said}", (name, other))
+                found = f"{100 * length[name]:.0f} and {100 * length[other]:.0f} cm"
+                yield Doubt(f"the bones to {name} and {other} differ: {found}", (name, other))
 
 
 def _compare_limbs(body: RigPoses) -> Iterator[Doubt]:
@@ -331,8 +318,3 @@ def _check_order(body: RigPoses) -> Iterator[Doubt]:
         for part in ("UpperArm", "UpperLeg"):
             if sign * float((body.position(side + part) - body.position("hips"))[0, 0]) < -_NO_BONE:
                 yield Doubt(f"{side + part} is on the other side of the hips", (side + part,))
-
-
-def _length(skeleton: Skeleton, name: str) -> float:
-    """Return the length of the bone that leads to a canonical joint, metres."""
-    return float(skeleton.offsets[CANONICAL.index(name)].norm())

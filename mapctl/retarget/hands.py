@@ -7,7 +7,6 @@ is from everything. Places relative to a body's surface are kept in the manner o
 """
 
 from dataclasses import dataclass, replace
-from functools import cache
 
 import torch
 from jaxtyping import Bool, Float
@@ -124,20 +123,18 @@ _HEAD_TIP = (0.0, 0.12, 0.0)  # metres from the head joint to the middle of the 
 _END_SHARE = 0.15  # of a segment, before its ends, over which points stop being beside it
 
 
-@dataclass(frozen=True, eq=False)
-class _Layout:
-    """Which segments a body has."""
-
-    start: tuple[int, ...]
-    """Canonical joint at which each begins, which also turns it."""
-    stop: tuple[int, ...]
-    """Canonical joint at which it ends; its start again for the head, which ends at a point of its own."""
-    widths: Float[Tensor, "segments 2 3"]
-    """Half widths along the axes of the start's frame at both ends, metres, of the canonical body."""
-    is_arm: Bool[Tensor, "2 segments"]
-    """Whether each belongs to the arm of a side: left, right."""
-    beside: Bool[Tensor, "2 segments"]
-    """Whether each is beside the arm of a side while that hangs: trunk and thigh."""
+_ROWS = [(start, stop or start, [(x, x, z), (u, u, w)]) for start, stop, (x, z), (u, w) in _TRUNK] + [
+    (side + start, side + stop, [(first,) * 3, (last,) * 3])
+    for side in SIDES
+    for start, stop, first, last in (*_LIMBS, *_ARMS)
+]
+_STARTS, _STOPS = (list(CANONICAL.indices([row[k] for row in _ROWS])) for k in range(2))
+_WIDTHS = torch.tensor([widths for *_, widths in _ROWS], dtype=torch.float64)
+# Of each side, left first: whether a segment is of its arm, and whether it is trunk or its thigh, beside a hanging arm.
+_IS_ARM, _BESIDE = (
+    torch.tensor([[row[0] in (*trunk, *(side + part for part in parts)) for row in _ROWS] for side in SIDES])
+    for trunk, parts in (((), ("UpperArm", "LowerArm")), (("hips", "spine", "chest"), ("UpperLeg",)))
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,15 +198,6 @@ class _Relations:
     planted: Bool[Tensor, "frames points"]
     """Whether a point stands on the floor."""
 
-    def strength(self) -> Float[Tensor, "frames 2"]:
-        """Return how much hands are bound to anything, 0 to 1."""
-        return 1 - (1 - self.body_strength()) * (1 - self.together)
-
-    def touch_strength(self) -> Float[Tensor, "frames 2"]:
-        """Return how much hands touch anything, 0 to 1."""
-        of_hand = torch.cat([self.touch, self.floor_weight[..., None]], dim=2).unflatten(1, (2, -1)).amax(dim=(2, 3))
-        return torch.maximum(of_hand, self.together)
-
     def body_strength(self) -> Float[Tensor, "frames 2"]:
         """Return how much hands are bound to body and floor, 0 to 1: about as to what binds them most."""
         weight, say = self.by_hand()
@@ -229,7 +217,7 @@ def keep_hand_relations(own: Motion, moved: Motion, giver: Stance, *, scale: flo
     Hands keep their orientation in the world, and elbows go on pointing where they did.
     """
     relations = _find_relations(own, giver)
-    strength = relations.strength()
+    strength = 1 - (1 - relations.body_strength()) * (1 - relations.together)
     if not bool((strength > 0).any()):
         still = torch.zeros(own.num_frames, 2, dtype=torch.float64)
         return moved, HandTargets(still[..., None].expand(-1, -1, 3), still)
@@ -243,23 +231,37 @@ def keep_hand_relations(own: Motion, moved: Motion, giver: Stance, *, scale: flo
         done = _reach(moved, offset, strength, straight)
         missed = missed + done.joint_positions()[:, _HANDS] - (before + offset)
     errors = (done.joint_positions()[:, _HANDS] - (before + offset)).norm(dim=-1)
-    return done, HandTargets(offset, torch.where(relations.touch_strength() > _LEAST_STRENGTH, errors, 0.0))
+    touch = torch.cat([relations.touch, relations.floor_weight[..., None]], dim=2).unflatten(1, (2, -1))
+    touches = torch.maximum(touch.amax(dim=(2, 3)), relations.together) > _LEAST_STRENGTH
+    return done, HandTargets(offset, torch.where(touches, errors, 0.0))
 
 
 def _find_relations(own: Motion, giver: Stance) -> _Relations:
-    size, fps, body = _girth(own.skeleton), float(own.fps), _place_segments(own)
+    size, fps = _girth(own.skeleton), float(own.fps)
     points, thick = _hand_points(own, size), size * _PALM_THICKNESS
-    near = _find_nearest(points, body)
-    say = _let_hang(own)
-    far = torch.lerp(near.distance.new_tensor(_SLIDE_METRES), near.distance.new_tensor(_FAR_METRES), _stays(near, fps))
-    weight, touch = (say * _weigh(near.distance - thick, reach) for reach in (far, _SLIDE_METRES))
+    near = _find_nearest(points, _place_segments(own))
+    # No hand is bound to its own arm, and hardly to trunk and thigh while the arm is straight and hangs.
+    straight = (limb_extension(own, ARMS) - _HANGS_FROM) / (_HANGS_TO - _HANGS_FROM)
+    say = (1 - smootherstep(straight)[..., None] * _BESIDE.double()) * (~_IS_ARM).double()
+    say = say.repeat_interleave(len(_POINTS), dim=1)
+    # A hand that swings past a segment is not put there.
+    stays = torch.ones_like(near.distance)
+    if len(points) > 1:
+        speed = near.local.diff(dim=0).norm(dim=-1) * fps
+        smooth = low_pass(torch.cat([speed[:1], speed]).flatten(1), _SPEED_SECONDS * fps).view_as(stays)
+        stays = 1 - smootherstep((smooth - _SLOW_SPEED) / (_FAST_SPEED - _SLOW_SPEED))
+    far = torch.lerp(stays.new_tensor(_SLIDE_METRES), stays.new_tensor(_FAR_METRES), stays)
+    weight, touch = (
+        envelope((say * _weigh(near.distance - thick, reach)).flatten(1), _FADE_SECONDS, fps).view_as(stays)
+        for reach in (far, _SLIDE_METRES)
+    )
     left, right = points.unflatten(1, (2, -1)).unbind(dim=1)
     between = (left[:, :, None] - right[:, None]).norm(dim=-1).flatten(1).amin(dim=1, keepdim=True)
     height = points[..., 1] - giver.floor - thick
     return _Relations(
         near=near,
-        weight=envelope(weight.flatten(1), _FADE_SECONDS, fps).view_as(weight),
-        touch=envelope(touch.flatten(1), _FADE_SECONDS, fps).view_as(touch),
+        weight=weight,
+        touch=touch,
         apart=(right - left).mean(dim=1),
         together=envelope(_weigh(between - 2 * thick), _FADE_SECONDS, fps),
         floor_height=height,
@@ -273,24 +275,6 @@ def _weigh(
 ) -> Float[Tensor, "*batch"]:
     """Return how much a relation over a distance counts: entirely where it is a touch, not at all from `far` on."""
     return 1 - smootherstep((distance - _TOUCH_METRES) / (far - _TOUCH_METRES))
-
-
-def _stays(near: _Near, fps: float) -> Float[Tensor, "frames points segments"]:
-    """Return how much points stay where they are beside a segment, 0 to 1: a hand that swings past is not put there."""
-    if len(near.local) < 2:
-        return torch.ones_like(near.distance)
-    speed = near.local.diff(dim=0).norm(dim=-1) * fps
-    smooth = low_pass(torch.cat([speed[:1], speed]).flatten(1), _SPEED_SECONDS * fps).view_as(near.distance)
-    return 1 - smootherstep((smooth - _SLOW_SPEED) / (_FAST_SPEED - _SLOW_SPEED))
-
-
-def _let_hang(own: Motion) -> Float[Tensor, "frames points segments"]:
-    """Return how much points may be bound to each segment, 0 to 1: not to the own arm, and hardly to trunk and thigh
-    while the arm is straight: it hangs there, and its hand is not put anywhere."""
-    straight = (limb_extension(own, ARMS) - _HANGS_FROM) / (_HANGS_TO - _HANGS_FROM)
-    found = _layout()
-    of_hand = (1 - smootherstep(straight)[..., None] * found.beside.double()) * (~found.is_arm).double()
-    return of_hand.repeat_interleave(len(_POINTS), dim=1)
 
 
 def _hand_points(motion: Motion, size: float) -> Float[Tensor, "frames points 3"]:
@@ -344,7 +328,10 @@ def _offset_hands(
     points = _hand_points(moved, _girth(moved.skeleton))
     body = _place_segments(done)
     toward = _place_nearest(relations.near, body) - points[:, :, None]
-    slide = _find_slide(relations.near, body)
+    # Points beside a segment may slide along its axis, but not toward its ends, where there is no such direction.
+    share = relations.near.share
+    inside = smootherstep(share / _END_SHARE) * smootherstep((1 - share) / _END_SHARE)
+    slide = inside * torch.nn.functional.normalize(body.end - body.begin, dim=-1)[:, None]
     along = (1 - relations.touch[..., None]) * (toward * slide).sum(-1, keepdim=True)
     offsets = torch.cat([toward - along * slide, at_floor[:, :, None]], dim=2).unflatten(1, (2, -1)).flatten(2, 3)
     weight, say = relations.by_hand()
@@ -371,40 +358,16 @@ def _reach(
     for k, arm in enumerate(ARMS):
         to_hand = places[:, arm.end] - places[:, arm.upper]
         most = straight[:, k, None].clamp(_FREE_EXTENSION, _MOST_EXTENSION) * arm.length(moved.skeleton)
-        direction = _keep_in_reach(to_hand, to_hand + offset[:, k], most)
+        wanted = to_hand + offset[:, k]
+        was, far = to_hand.norm(dim=-1, keepdim=True), wanted.norm(dim=-1, keepdim=True)
+        near = torch.minimum(far, torch.maximum(soft_clamp(far, most, _SOFT_MARGIN), was))
+        direction = wanted * (near / far.clamp_min(1e-9))
         upper, bent = world[:, arm.upper], moved.local_quat_xyzw[:, arm.lower]
         reached = inverse.reach(arm, upper, bent, direction, moved.skeleton.offsets)
         upper, bent = (rotations.slerp(a, b, ease[:, k]) for a, b in zip((upper, bent), reached, strict=True))
         turned[:, arm.upper], turned[:, arm.lower] = upper, rotations.multiply(upper, bent)
     local = kinematics.local_from_world(moved.skeleton.parents, turned)
     return replace(moved, local_quat_xyzw=rotations.make_sign_continuous(local))
-
-
-def _keep_in_reach(
-    before: Float[Tensor, "frames 3"], wanted: Float[Tensor, "frames 3"], most: Float[Tensor, "frames 1"]
-) -> Float[Tensor, "frames 3"]:
-    """Shorten vectors from the shoulder to what an arm reaches; what is no farther than before is as it is."""
-    was, far = before.norm(dim=-1, keepdim=True), wanted.norm(dim=-1, keepdim=True)
-    near = torch.minimum(far, torch.maximum(soft_clamp(far, most, _SOFT_MARGIN), was))
-    return wanted * (near / far.clamp_min(1e-9))
-
-
-@cache
-def _layout() -> _Layout:
-    """Return the segments of the canonical body."""
-    rows = [(start, stop or start, [(x, x, z), (u, u, w)]) for start, stop, (x, z), (u, w) in _TRUNK]
-    for name in SIDES:
-        rows += [
-            (name + start, name + stop, [(first,) * 3, (last,) * 3]) for start, stop, first, last in (*_LIMBS, *_ARMS)
-        ]
-    start, stop, widths = zip(*rows, strict=True)
-    arms, beside = (
-        torch.tensor([[name in {side + part for part in parts} for name in start] for side in SIDES])
-        for parts in (("UpperArm", "LowerArm"), ("UpperLeg",))
-    )
-    trunk = torch.tensor([name in ("hips", "spine", "chest") for name in start])
-    begin, end = (tuple(CANONICAL.indices(names)) for names in (start, stop))
-    return _Layout(begin, end, torch.tensor(widths, dtype=torch.float64), arms, beside | trunk)
 
 
 def _girth(skeleton: Skeleton) -> float:
@@ -416,14 +379,12 @@ def _girth(skeleton: Skeleton) -> float:
 
 def _place_segments(motion: Motion) -> _Segments:
     """Place the segments of a body in every frame of a motion of canonical joints."""
-    found, size = _layout(), _girth(motion.skeleton)
-    places, turns = motion.joint_positions(), motion.joint_rotations()
-    begin, end = places[:, list(found.start)], places[:, list(found.stop)].clone()
-    for k, (start, stop) in enumerate(zip(found.start, found.stop, strict=True)):
-        if start == stop:
-            tip = size * torch.tensor(_HEAD_TIP, dtype=torch.float64)
-            end[:, k] = begin[:, k] + rotations.rotate(turns[:, start], tip.expand(len(places), 3))
-    return _Segments(begin, end, turns[:, list(found.start)], size * found.widths)
+    size, places, turns = _girth(motion.skeleton), motion.joint_positions(), motion.joint_rotations()
+    begin, end = places[:, _STARTS], places[:, _STOPS].clone()
+    tip = (size * torch.tensor(_HEAD_TIP, dtype=torch.float64)).expand(len(places), 3)
+    skull = len(_TRUNK) - 1
+    end[:, skull] = begin[:, skull] + rotations.rotate(turns[:, _STARTS[skull]], tip)
+    return _Segments(begin, end, turns[:, _STARTS], size * _WIDTHS)
 
 
 def _find_nearest(points: Float[Tensor, "frames points 3"], body: _Segments) -> _Near:
@@ -449,14 +410,6 @@ def _place_nearest(near: _Near, body: _Segments) -> Float[Tensor, "frames points
     turns = body.quat_xyzw[:, None].expand(*near.share.shape[:3], 4)
     aside = rotations.rotate(turns, near.aside * _width_at(body, near.share) + near.away)
     return body.begin[:, None] + near.share * axis + aside
-
-
-def _find_slide(near: _Near, body: _Segments) -> Float[Tensor, "frames points segments 3"]:
-    """Return the directions along which points beside a segment may slide without coming nearer or going farther: its
-    axis, of length 1 in the middle and 0 toward its ends, where there is no such direction."""
-    axis = torch.nn.functional.normalize(body.end - body.begin, dim=-1)[:, None]
-    inside = smootherstep(near.share / _END_SHARE) * smootherstep((1 - near.share) / _END_SHARE)
-    return inside * axis
 
 
 def _width_at(body: _Segments, share: Tensor) -> Float[Tensor, "frames points segments 3"]:
