@@ -147,7 +147,6 @@ _MAX_PITCH = math.radians(70)  # of the bone of a flat foot: an End Site may be 
 _REST_WEIGHT = 1.25  # of a standing rest pose against an upright trunk; hanging arms weigh half as much as the trunk
 _Y_UP_WEIGHT = 0.25  # of what most files have
 _STANDING = 0.8  # cosine between the thighs and the body's down in a pose that stands
-_NO_LINE = 1e-3  # metres between two joints below which they are one
 _X, _Y, _Z = torch.eye(3, dtype=torch.float64)
 SIGNS = (("left", 1.0), ("right", -1.0))
 """Signs of x on each side of the body."""
@@ -239,7 +238,8 @@ def estimate_frames(
     turns = rotations.to_matrix(clip.orientations)
     turns = turns if axes is None else turns @ axes
     found, certain = _orient_joints(_Builder(clip, turns), upright)
-    if all(_is_near_quarter_turn(found.frames[name]) for name in CORE if clip.has(name)):
+    core = [found.frames[name] for name in CORE if clip.has(name)]
+    if all(_angle_between(frame, torch.stack([_nearest_axis(axis) for axis in frame])) < _ROUNDING for frame in core):
         found, _ = _orient_joints(_Builder(clip, turns, in_quarter_turns=True), upright)
     frames = found.frames
     if axes is not None:
@@ -263,7 +263,11 @@ def _orient_joints(found: _Builder, upright: Tensor | None) -> tuple[_Builder, d
 
 def _orient_trunk(found: _Builder) -> Iterator[str]:
     clip = found.clip
-    found.orient("hips", clip.side_line("UpperLeg"), _X, _pelvis_up(clip), _Y)
+    # The pelvis is up against the legs where both are stretched, else along the spine.
+    (left, first), (right, second) = (_leg_extension(clip, side) for side, _ in SIGNS)
+    along_spine = unit_vectors(clip.position("spine") - clip.middle("UpperLeg"))
+    up = _SPINE_WEIGHT * along_spine - first * second * (left + right)
+    found.orient("hips", clip.side_line("UpperLeg"), _X, up, _Y)
     top = "chest" if clip.has("chest") else "spine"
     if top == "chest":
         found.orient("chest", clip.side_line("Shoulder"), _X, _bone(clip, "chest", clip.up()), _Y)
@@ -332,14 +336,6 @@ def _orient_leg(found: _Builder, side: str, pitch: float) -> Iterator[str]:
         found.orient(toes, found.axis(foot, _X), _X, found.axis(foot, _Y), _Y)
 
 
-def _pelvis_up(clip: RigPoses) -> Vectors:
-    """Return the pelvis's up direction, weighted: against the legs where both are stretched, else along the spine."""
-    (left, first), (right, second) = (_leg_extension(clip, side) for side, _ in SIGNS)
-    return _SPINE_WEIGHT * unit_vectors(clip.position("spine") - clip.middle("UpperLeg")) - first * second * (
-        left + right
-    )
-
-
 def _leg_extension(clip: RigPoses, side: str) -> tuple[Vectors, Float[Tensor, "poses 1"]]:
     """Return the unit vector from hip to ankle, and how stretched the leg is: about 1 where it stands, 0 where not."""
     hip, knee, ankle = (clip.position(side + part) for part in ("UpperLeg", "LowerLeg", "Foot"))
@@ -369,15 +365,10 @@ def _estimate_foot_pitch(clip: RigPoses, upright: Tensor | None) -> float:
 def _bone(clip: RigPoses, name: str, otherwise: Vectors | None = None) -> Vectors:
     """Return the direction of a joint's bone, or the other one where it has none of some length."""
     bone = clip.bone(name)
-    if otherwise is not None and (bone is None or float(bone.norm(dim=-1).mean()) < _NO_LINE):
+    if otherwise is not None and (bone is None or float(bone.norm(dim=-1).mean()) < _POINTS_APART):
         return otherwise
     assert bone is not None
     return unit_vectors(bone)
-
-
-def _is_near_quarter_turn(frame: Tensor) -> bool:
-    rounded = torch.stack([_nearest_axis(axis) for axis in frame])
-    return _angle_between(frame, rounded) < _ROUNDING
 
 
 def _angle_between(first: Tensor, second: Tensor) -> float:
@@ -488,8 +479,9 @@ def _name_body_joints(tree: "JointTree", hips: int, legs: LimbPair, chest: int, 
         found["chest"] = trunk[-1]
     others = [child for child in tree.children[chest] if child not in (arms[0][0], arms[1][0])]
     if others:
-        up = tree.chain(max(others, key=lambda child: tree.reach[child]))
-        found |= {"head": up[0]} if len(up) == 1 else {"neck": up[0], "head": up[1]}
+        neck = max(others, key=lambda child: tree.reach[child])
+        head = max(tree.children[neck], key=lambda child: tree.length[child] + tree.reach[child], default=None)
+        found |= {"head": neck} if head is None else {"neck": neck, "head": head}
     return found
 
 
@@ -514,7 +506,7 @@ class JointTree:
                 paths = self.trace_limb_pair(first, second)
                 long = sum(self.length[joint] for joint in paths[0][1:])
                 far = long >= _MIN_REACH_SHARE * self.reach[joint]
-                if far and len(paths[0]) >= 3 and self.are_alike(first, second):
+                if far and len(paths[0]) >= 3 and are_alike(self.length[first], self.length[second], _MAX_LENGTH_RATIO):
                     found.append((-long, paths))
         return [paths for _, paths in sorted(found)]
 
@@ -523,23 +515,12 @@ class JointTree:
         paths = [first], [second]
         while True:
             ends = product(self.children[paths[0][-1]], self.children[paths[1][-1]])
-            steps = [step for step in ends if self.are_alike(*step)]
+            steps = [(a, b) for a, b in ends if are_alike(self.length[a], self.length[b], _MAX_LENGTH_RATIO)]
             if not steps:
                 return paths
             best = max(steps, key=lambda step: min(self.reach[joint] + self.length[joint] for joint in step))
             for path, joint in zip(paths, best, strict=True):
                 path.append(joint)
-
-    def are_alike(self, first: int, second: int) -> bool:
-        """Return whether two bones are of about the same length."""
-        return are_alike(self.length[first], self.length[second], _MAX_LENGTH_RATIO)
-
-    def chain(self, joint: int) -> list[int]:
-        """Return the joints from this one to the farthest leaf."""
-        path = [joint]
-        while self.children[path[-1]]:
-            path.append(max(self.children[path[-1]], key=lambda child: self.length[child] + self.reach[child]))
-        return path
 
     def below(self, joint: int) -> list[int]:
         """Return the joint and all below it, parents first."""
@@ -565,6 +546,7 @@ def are_alike(first: float, second: float, ratio: float) -> bool:
 def find_by_other_side(skeleton: Skeleton, found: Mapping[str, int]) -> dict[str, int]:
     """Find canonical joints that only the other side has so far, from the hips outward."""
     more: dict[str, int] = {}
+    lengths = skeleton.offsets.norm(dim=-1).tolist()
     for name in CANONICAL.names:
         known = {**found, **more}
         above = CANONICAL.names[CANONICAL.parents[CANONICAL.index(name)]] if name != "hips" else name
@@ -572,23 +554,20 @@ def find_by_other_side(skeleton: Skeleton, found: Mapping[str, int]) -> dict[str
         if name in known or mirror_name(name) == name or not all(one in known for one in needed):
             continue
         path = path_below(skeleton, known[mirror_name(above)], known[mirror_name(name)])
-        ends = _follow(skeleton, known[above], path, {*known.values()}) if path else []
+        if not path:
+            continue
+        ends = [known[above]]  # of paths whose bones are as long as those of the other side's
+        for joint in path:
+            below = [child for end in ends for child in skeleton.children(end)]
+            ends = [child for child in below if are_alike(lengths[joint], lengths[child], _MAX_SIDE_RATIO)]
         parts = {CANONICAL.names[joint] for joint in descendants(CANONICAL, {CANONICAL.index(name)})}
         below = [known[part] for part in parts & known.keys()]
-        fitting = [end for end in ends if all(path_below(skeleton, end, joint) for joint in below)]
+        free = [end for end in ends if end not in known.values()]
+        fitting = [end for end in free if all(path_below(skeleton, end, joint) for joint in below)]
         if fitting:
             size = len(descendants(skeleton, {known[mirror_name(name)]}))
             more[name] = min(fitting, key=lambda end: abs(len(descendants(skeleton, {end})) - size))
     return more
-
-
-def _follow(skeleton: Skeleton, start: int, path: list[int], taken: set[int]) -> list[int]:
-    """Return the joints below `start` to which bones lead that are as long as those of a path on the other side."""
-    ends, lengths = [start], skeleton.offsets.norm(dim=-1).tolist()
-    for joint in path:
-        below = [child for end in ends for child in skeleton.children(end)]
-        ends = [child for child in below if are_alike(lengths[joint], lengths[child], _MAX_SIDE_RATIO)]
-    return [end for end in ends if end not in taken]
 
 
 def descendants(skeleton: Skeleton, joints: Collection[int]) -> set[int]:

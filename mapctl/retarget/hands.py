@@ -128,7 +128,8 @@ _ROWS = [(start, stop or start, [(x, x, z), (u, u, w)]) for start, stop, (x, z),
     for side in SIDES
     for start, stop, first, last in (*_LIMBS, *_ARMS)
 ]
-_STARTS, _STOPS = (list(CANONICAL.indices([row[k] for row in _ROWS])) for k in range(2))
+_STARTS = list(CANONICAL.indices([start for start, _, _ in _ROWS]))
+_STOPS = list(CANONICAL.indices([stop for _, stop, _ in _ROWS]))
 _WIDTHS = torch.tensor([widths for *_, widths in _ROWS], dtype=torch.float64)
 # Of each side, left first: whether a segment is of its arm, and whether it is trunk or its thigh, beside a hanging arm.
 _IS_ARM, _BESIDE = (

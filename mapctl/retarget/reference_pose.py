@@ -79,13 +79,22 @@ def find_tpose(
     `up` is the up axis that the file declares; one that the rig sets wins. `own` is the rotation (xyzw) of each joint's
     axes in the file against those of the poses.
     """
+    upward, left = _snap_to_axis(zero.up()[0]), zero.left()[0]
     facing = None if rig.facing == "auto" else axis_vector(rig.facing)
-    front = _facing_rotation(zero, facing)
+    if facing is not None and float(facing @ upward) < 0.5:
+        left = torch.linalg.cross(upward, facing)
+    front = _body_frame(_snap_to_axis(left), upward)  # from the zero pose to upright, facing +Z
     rest = classify_reference_pose(zero, front)
-    up = rig.up if rig.up != "auto" else up or _find_up(zero, clip, rest)
+    if rig.up != "auto":
+        up = rig.up
+    elif not up and clip is not None:
+        up = find_up_axis(clip, None if rest == "neither" else zero.up()[0])
+    elif not up:
+        up = "z" if nearest_axis_name(zero.up()[0]) == "z" else "y"
     upright = upright_rotation(up)
-    readings = list(_list_readings(zero, clip, rig, stated, rest, front, up))
-
+    names, still = zero.skeleton.names, (0.0, 0.0, 0.0, 1.0)
+    resting = torch.stack([torch.tensor(rig.idle.get(name, still), dtype=torch.float64) for name in names])
+    readings = list(_list_readings(zero, clip, rig, stated, rest, front, up, resting))
     choose = partial(
         TPose,
         upright_quat_xyzw=upright,
@@ -94,7 +103,7 @@ def find_tpose(
         rest=rest,
     )
     if clip is None:
-        quats, idle, found = (*readings, (_lay_out_tpose(zero, front), _idle_rotations(rig, zero), "rest pose"))[0]
+        quats, idle, found = (*readings, (_lay_out_tpose(zero, front), resting, "rest pose"))[0]
         return choose(tpose_quat_xyzw=quats, idle_quat_xyzw=idle, tpose_from=found)
     anatomy, refused = estimate_frames(clip, upright, own), ""
     for quats, idle, found in readings:
@@ -124,15 +133,21 @@ def _describe_angles(angles: Mapping[str, float]) -> str:
 
 
 def _list_readings(
-    zero: RigPoses, clip: RigPoses | None, rig: Rig, stated: bool, rest: str, front: Tensor, up: str
+    zero: RigPoses, clip: RigPoses | None, rig: Rig, stated: bool, rest: str, front: Tensor, up: str, idle: Tensor
 ) -> Iterator[tuple[Tensor, Tensor, str]]:
     """Yield T-poses by rotations of canonical joints, idle rotations of the rig's, and where they come from."""
     laid_out = _lay_out_tpose(zero, front) if rest != "neither" or rig.rest == "straighten" else None
     # A preset's table is of files as its program writes them; one whose rest pose is another has other joint frames.
     if rig.has_tpose and (stated or rest == "neither" or is_canonical_tpose(zero)):
-        yield _read_table(rig, laid_out), _idle_rotations(rig, zero), "table"
+        # Joints that the table leaves out are as in the rest pose, or unrotated where that is to be the T-pose or none.
+        quats = (
+            UNROTATED.repeat(CANONICAL.num_joints, 1) if laid_out is None or rig.rest == "tpose" else laid_out.clone()
+        )
+        for name, axes in rig.tpose.items():
+            quats[CANONICAL.index(name)] = rotations.from_matrix(frame_from_axes(axes["x"], axes["y"]))
+        yield quats, idle, "table"
     if laid_out is not None:
-        yield laid_out, _idle_rotations(rig, zero), "rest pose"
+        yield laid_out, idle, "rest pose"
     if clip is not None and rig.rest in ("auto", "frame0"):
         first = replace(clip, positions=clip.positions[:1], orientations=clip.orientations[:1])
         turned = _body_frame(first.left()[0], axis_vector(up))
@@ -140,35 +155,9 @@ def _list_readings(
             yield _lay_out_tpose(first, turned), _mean_locals(first), "frame 0"
 
 
-def _read_table(rig: Rig, laid_out: Tensor | None) -> Float[Tensor, "joints 4"]:
-    """Return the world rotations of a rig's joints in the T-pose of its table; of joints that it leaves out, in the
-    rest pose laid out as one, or unrotated where all rotations zero are to be the T-pose or no pose."""
-    quats = UNROTATED.repeat(CANONICAL.num_joints, 1)
-    if laid_out is not None and rig.rest != "tpose":
-        quats = laid_out.clone()
-    for name, axes in rig.tpose.items():
-        quats[CANONICAL.index(name)] = rotations.from_matrix(frame_from_axes(axes["x"], axes["y"]))
-    return quats
-
-
 def frame_from_axes(x: list[float], y: list[float]) -> Float[Tensor, "3 3"]:
     """Return the rotation whose first two columns point along x and (as nearly as they are square) y."""
     return orthonormal_frame(torch.tensor(x, dtype=torch.float64), torch.tensor(y, dtype=torch.float64))
-
-
-def _idle_rotations(rig: Rig, zero: RigPoses) -> Float[Tensor, "rigged 4"]:
-    idle = UNROTATED.repeat(zero.skeleton.num_joints, 1)
-    for joint, name in enumerate(zero.skeleton.names):
-        if name in rig.idle:
-            idle[joint] = torch.tensor(rig.idle[name], dtype=torch.float64)
-    return idle
-
-
-def _find_up(zero: RigPoses, clip: RigPoses | None, rest: str) -> str:
-    """Find the up axis by the clip and a standing rest pose; without a clip, Z where the rest pose has it, else Y."""
-    if clip is None:
-        return "z" if nearest_axis_name(zero.up()[0]) == "z" else "y"
-    return find_up_axis(clip, None if rest == "neither" else zero.up()[0])
 
 
 def is_canonical_tpose(zero: RigPoses) -> bool:
@@ -219,14 +208,6 @@ def nearest_axis_name(direction: Float[Tensor, "3"]) -> str:
     if float(direction[largest].abs()) < math.cos(_SNAP):
         return "unknown"
     return ("-" if float(direction[largest]) < 0 else "") + "xyz"[largest]
-
-
-def _facing_rotation(zero: RigPoses, facing: Tensor | None) -> Float[Tensor, "3 3"]:
-    """Return the rotation of the zero pose to upright, facing +Z; its rows are where left, up and forward were."""
-    up, left = _snap_to_axis(zero.up()[0]), zero.left()[0]
-    if facing is not None and float(facing @ up) < 0.5:
-        left = torch.linalg.cross(up, facing)
-    return _body_frame(_snap_to_axis(left), up)
 
 
 def _body_frame(left: Tensor, up: Tensor) -> Float[Tensor, "3 3"]:
@@ -324,11 +305,7 @@ def _estimate_position(
         if CANONICAL.index(following) in known:
             return spots[parent] + (known[CANONICAL.index(following)] - spots[parent]) * (own / length)
         following = next_joint(following)
-    return spots[parent] + CANONICAL.offsets[c] * _estimate_scale(spots)
-
-
-def _estimate_scale(spots: list[Tensor]) -> float:
-    """Estimate the performer's size relative to the canonical skeleton from the reach of the joints so far."""
-    own = sum(float((spot - spots[CANONICAL.parents[c]]).norm()) for c, spot in enumerate(spots) if c)
+    # The performer's size against the canonical skeleton, from the reach of the joints so far.
+    reach = sum(float((spot - spots[CANONICAL.parents[k]]).norm()) for k, spot in enumerate(spots) if k)
     usual = float(CANONICAL.offsets[1 : len(spots)].norm(dim=-1).sum())
-    return own / usual if own > 0 and usual > 0 else 1.0
+    return spots[parent] + CANONICAL.offsets[c] * (reach / usual if reach > 0 and usual > 0 else 1.0)

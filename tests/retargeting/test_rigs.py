@@ -25,33 +25,9 @@ RESTS = {
     "no pose, bones along x": Make({}, bones_along_x=True, size=0.8),
     "no pose, Z up": Make({}, bones_along_x=True, zup=True),
 }
-INVENTED = dict(
-    zip(
-        CANONICAL.names,
-        [
-            "Rumpf_Pelvis",
-            "belly",
-            "upperBack",
-            "nape_neck",
-            "skull",
-            *(
-                f"{part}.{side}"
-                for side in "LR"
-                for part in (
-                    "collarbone",
-                    "humerus",
-                    "elbow",
-                    "wrist",
-                    "thighbone",
-                    "kneejoint",
-                    "anklejoint",
-                    "toe_root",
-                )
-            ),
-        ],
-        strict=True,
-    )
-)
+TRUNK = ["Rumpf_Pelvis", "belly", "upperBack", "nape_neck", "skull"]
+LIMB = ["collarbone", "humerus", "elbow", "wrist", "thighbone", "kneejoint", "anklejoint", "toe_root"]
+INVENTED = dict(zip(CANONICAL.names, TRUNK + [f"{part}.{side}" for side in "LR" for part in LIMB], strict=True))
 NONSENSE = {name: f"bone_{number}" for number, name in enumerate(CANONICAL.names)}
 
 
