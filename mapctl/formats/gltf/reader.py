@@ -603,9 +603,12 @@ def _read_shown(gltf: GltfFile, primitive: Json, info: Json, count: int) -> tupl
         return None
     image = gltf.get("images", source)
     uri, view = image.get("uri"), image.get("bufferView")
-    if uri is None and view is None:
+    if uri is not None:
+        picture = decode_picture(read_neighbour(gltf.path, uri))
+    elif view is not None:
+        picture = decode_picture(bytes(read_view(gltf, view)))
+    else:
         return None
-    picture = decode_picture(bytes(read_view(gltf, view)) if uri is None else read_neighbour(gltf.path, uri))
     where = read_accessor(gltf, primitive["attributes"][name], "VEC2").astype(np.float64)
     if len(where) != count:
         raise FileFormatError(gltf.path, f"{name} has {len(where)} rows for {count} vertices")
