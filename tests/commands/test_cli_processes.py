@@ -43,9 +43,7 @@ def test_interruption_leaves_nothing_half_done(prior, tmp_path, number, said):
     """Ctrl-C or SIGTERM in the middle of hours of motion: no traceback, no file, no folder."""
     words = ("generate", "-o", tmp_path / "gen", "--seconds", 36_000, "--prior", prior)
     process = _started(words)
-    give_up = time.monotonic() + 100
-    while not list(tmp_path.glob("gen/.*")) and time.monotonic() < give_up:
-        time.sleep(0.05)
+    time.sleep(8)  # by then it samples
     process.send_signal(number)
     process.send_signal(number)  # `timeout` sends it twice
     _, told = _ended(process)
