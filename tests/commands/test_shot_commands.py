@@ -148,7 +148,7 @@ def test_a_loop_leads_into_its_first_frame_at_any_rate(tmp_path):
         ("[[key]]\nseconds = 1\nlook_at = [0, 1, 2]\npose_frame = 3", "key[0].pose_frame: this is of a pose"),
         ("[[key]]\nseconds = 1\npose = 'gone.bvh'", "gone.bvh"),
         ("[[key]]\nseconds = 1\npose = 'a.bvh'\njoints = ['tail']", "key[0].joints.tail: hands and feet are"),
-        ("[[key]]\nseconds = 1\nreach = { leftHand = [0, 1, 2] }\ntolerance = { rightHand = 0.1 }", "gives no place of it"),
+        ("[[key]]\nseconds = 1\nreach = { leftHand = [0, 1, 2] }\ntolerance = { rightHand = 0.1 }", "gives no place"),
         ("[[key]]\nseconds = 1\nfacing_deg = 1\nwithin_frames = -1", "key[0].within_frames: "),
         ("[[key]]\nseconds = 1\nplace = [0, 1]\n[[key]]\nseconds = 1.05\nfacing_deg = 9", "within two frames"),
         ("[[key]]\nseconds = 50\nlook_at = [0, 1, 2]", "not within"),
