@@ -760,7 +760,7 @@ class AutoInbetweener(Inbetweener):
             if held and _is_standing_still(query, *gap):
                 answer = _hold_pose(query, answer, gap)
         if self.has_style:
-            reason = "too short, or with parts told, for a style"
+            reason = "too short, or with partial keys, for a style"
             gaps = [gap for gap in query.enclosed_gaps if not _is_within(gap, long)]
             sources = [one for one in answer.attribute(query) if (one.start, one.stop) in gaps]
             unstyled = tuple(replace(one, reason=one.reason or reason) for one in sources)

@@ -39,7 +39,7 @@ from mapctl.intent.path import SpeedProfile
 from mapctl.motion import Motion
 from mapctl.problem.solution import Ledger, Solution, Status
 from mapctl.protocols import Density, Inbetweener
-from mapctl.runtime.progress import Progress
+from mapctl.runtime.stepwise import Progress
 from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.terms import Term
 

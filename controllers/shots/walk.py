@@ -26,7 +26,7 @@ from mapctl.problem.receding_horizon import CommittedFrames, HorizonSettings, Re
 from mapctl.problem.solution import Outcome
 from mapctl.problem.window_solvers import LatentNoiseSolver, SingleWindowSolver
 from mapctl.protocols import DataLimits, Density
-from mapctl.runtime.progress import Progress
+from mapctl.runtime.stepwise import Progress
 from mapctl.skeleton import CANONICAL, TOES
 from mapctl.terms import FootContact, KeepApart, KeepClear, LandingSigmas, LatentPrior, Path, Term
 

@@ -21,7 +21,7 @@ from mapctl.features import PRIOR_FPS
 from mapctl.metrics import body
 from mapctl.metrics.gait import GaitSpread, measure_gait_spread
 from mapctl.motion import Motion
-from mapctl.runtime.progress import Progress
+from mapctl.runtime.stepwise import Progress
 from mapctl.skeleton import CANONICAL
 
 __all__ = [

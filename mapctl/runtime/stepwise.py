@@ -1,7 +1,7 @@
-"""Work that is done a step at a time, in between what has a deadline."""
+"""Work that is done a step at a time, between deadlines, and the type of functions that are called on progress."""
 
 import time
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from typing import Generic, TypeVar
 
 Result = TypeVar("Result")
@@ -37,3 +37,7 @@ class StepwiseWork(Generic[Result]):
         except BaseException as error:  # a generator that was broken off would end with nothing
             self._error = error
             raise
+
+
+Progress = Callable[[int, int], None]
+"""Function called with work done and work in all."""

@@ -176,7 +176,7 @@ def test_auto_gives_the_tweener_what_has_room_for_a_style_and_holds_nobody():
     sources = styled.propose(query).attribute(query)
     name = "tweener in the style of motion DNA"
     assert [source.by for source in sources] == ["slerp", name, name]
-    assert sources[0].reason == "too short, or with parts told, for a style"
+    assert sources[0].reason == "too short, or with partial keys, for a style"
     plain = AutoInbetweener(SlerpInbetweener(), tweener=tiny_tweener()).propose(query).attribute(query)
     assert {source.by for source in plain} == {"slerp"}
     still = query_of(standing(200), (1, 199))

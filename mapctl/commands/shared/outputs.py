@@ -21,7 +21,7 @@ from mapctl import formats
 from mapctl.errors import RequestError, WriteError
 from mapctl.formats import atomic
 from mapctl.motion import Motion
-from mapctl.runtime.progress import Progress
+from mapctl.runtime.stepwise import Progress
 from priors import weight_sets
 
 

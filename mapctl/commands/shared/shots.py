@@ -33,7 +33,7 @@ from mapctl.motion import Motion
 from mapctl.problem.solution import Outcome
 from mapctl.recording.fusion import resample_by_splines
 from mapctl.retarget.carry import RiggedCharacter, retarget_motion
-from mapctl.runtime.progress import Progress
+from mapctl.runtime.stepwise import Progress
 from priors.lstm_gmm.density import LstmGmmDensity
 from scenes.drawn_character import DrawnCharacter
 from scenes.overlays import build_hips_mark, build_look_mark, build_obstacle, build_target
