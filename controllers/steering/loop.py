@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import reduce
 from itertools import pairwise
-from typing import Protocol, TypeAlias, runtime_checkable
+from typing import TypeAlias
 
 import numpy as np
 import torch
@@ -36,22 +36,10 @@ Stepper: TypeAlias = Callable[..., tuple[SteerState, SteerFrames]]
 """(state, command, seconds=...) to the next state and frames, as `controllers.steering.steer.step`."""
 
 
-@runtime_checkable
-class Source(Protocol):
-    """Source of commands: a script, a joystick, a web page."""
-
-    def at(self, seconds: float) -> Command:
-        """Return the command that holds now, at so many seconds of the stream."""
-        ...
-
-
-@runtime_checkable
-class Display(Protocol):
-    """Destination of frames."""
-
-    def show(self, frames: SteerFrames, due: float) -> None:
-        """Show frames; `due` is the second of the stream at which the first of them is to be visible."""
-        ...
+Source: TypeAlias = Callable[[float], Command]
+"""Seconds of the stream to the command that holds then: a script's `at`, a joystick, a web page."""
+Display: TypeAlias = Callable[[SteerFrames, float], None]
+"""Takes frames and the second of the stream at which the first of them is to be visible."""
 
 
 class StreamClock:
@@ -130,7 +118,7 @@ class StepRecord:
 
 @dataclass
 class Recorder:
-    """A Display that keeps everything, as one motion."""
+    """Keeps everything that its display `show` is given, as one motion."""
 
     pieces: list[SteerFrames] = field(default_factory=list)
     """All that was shown, step by step."""
@@ -189,7 +177,7 @@ def iterate_steps(
         asked = clock.now() - begun
         left = due - asked - margin
         seconds = max(left, state.cost.needed_seconds(state.settings.least_evaluations)) if clock.real else None
-        state, new = (stepper or step)(state, source.at(asked), seconds=seconds)
+        state, new = (stepper or step)(state, source(asked), seconds=seconds)
         delivered = clock.now() - begun
         if due - delivered < _MARGIN_USED * margin:
             margin = max(margin, min(_MOST_MARGIN, _MARGIN_RISE * margin))
@@ -199,7 +187,7 @@ def iterate_steps(
         if held:
             clock.hold(held)  # before they are shown, since they are due now
         for display in displays:
-            display.show(new, due)
+            display(new, due)
         frames, note = new.motion.num_frames, "; ".join(new.notes)
         yield state, StepRecord(frames, asked, due, delivered, new.seconds, new.evaluations, note, held)
 

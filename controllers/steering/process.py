@@ -43,7 +43,7 @@ _SEARCH_POINTS = 61
 
 
 class PurePursuit:
-    """A Source, and the Display from which it gets the character's position. Closed curves have no end."""
+    """A source, `at`, and the display from which it gets the character's position, `show`. Closed curves have no end."""
 
     def __init__(self, curve: Curve, *, speed: float, look_ahead: float = 0.5):
         """Begin at the curve's start; `speed` in m/s; `look_ahead` in metres: less tracks closer and sways more."""
@@ -82,7 +82,7 @@ class PurePursuit:
 
 
 class Autopilot:
-    """A Source, and the Display from which it gets the character's position."""
+    """A source, `at`, and the display from which it gets the character's position, `show`."""
 
     def __init__(self, command: Command, limits: SteeringLimits):
         """Begin with a command; `limits` determine how soon to brake before the end of a path."""
@@ -176,7 +176,7 @@ class ParentClosed(Exception):
 
 
 class ProcessClock(WallClock):
-    """Clock and Display of the character's process: it reads orders while it waits, and sends frames."""
+    """Clock of the character's process, which reads orders while it waits, and its display `show`, which sends frames."""
 
     def __init__(self, connection: Connection, pilot: Autopilot, prior: Density):
         self._connection, self._pilot, self._prior = connection, pilot, prior
@@ -294,7 +294,7 @@ def _run_character(connection: Connection, request: CharacterRequest) -> None:
             connection.send(("ready", None))
         _wait_for_turn(request.settings.commit / PRIOR_FPS)
         clock.begin(state, pose)
-        for _ in iterate_steps(state, pilot, [clock], clock=clock, stepper=stepper):
+        for _ in iterate_steps(state, pilot.at, [clock.show], clock=clock, stepper=stepper):
             if clock.again:
                 break
         pilot.stay()

@@ -187,13 +187,13 @@ def _run_steering(
         steer.step(state, wanted)  # compiling, loading and conditioning on first use must not cost frames
     clock = WallClock() if command.realtime else StreamClock()
     with show_progress("steering", quiet=command.quiet) as progress:
-        displays: list[Display] = [recorder]
+        displays: list[Display] = [recorder.show]
         if stream is not None and isinstance(clock, WallClock):
-            displays.append(_StreamDisplay(stream, clock, frames, find_second_zero(clock, state)))
-            displays[-1].show(pose, 0.0)
+            displays.append(_StreamDisplay(stream, clock, frames, find_second_zero(clock, state)).show)
+            displays[-1](pose, 0.0)
         if progress is not None:
-            displays.append(_ProgressDisplay(progress, frames))
-        _, records = drive(state, track, displays, frames=frames, clock=clock, stepper=stepper)
+            displays.append(_ProgressDisplay(progress, frames).show)
+        _, records = drive(state, track.at, displays, frames=frames, clock=clock, stepper=stepper)
     return recorder, records, frames
 
 
@@ -244,7 +244,7 @@ def _build_report(
 
 @dataclass(frozen=True)
 class _StreamDisplay:
-    """A Display that has frames sent when they are due."""
+    """A display that has frames sent when they are due."""
 
     stream: "PoseStream"
     clock: WallClock
@@ -260,7 +260,7 @@ class _StreamDisplay:
 
 @dataclass(frozen=True)
 class _ProgressDisplay:
-    """A Display that moves a progress bar."""
+    """A display that moves a progress bar."""
 
     progress: Any
     frames: int

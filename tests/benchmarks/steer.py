@@ -76,7 +76,7 @@ def main(words: list[str] | None = None) -> None:
     recorder.show(first, 0.0)
     frames = round(track.times[-1] * PRIOR_FPS)
     began = time.process_time()
-    drive(state, track, [recorder], frames=frames)
+    drive(state, track.at, [recorder.show], frames=frames)
     spent, motion = time.process_time() - began, recorder.motion(frames)
     kinds: dict[str, list[dict[str, float | None]]] = {}
     obeyed = measure_commands(motion, track)[:-1]

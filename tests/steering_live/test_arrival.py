@@ -27,7 +27,7 @@ def play(*orders, frames=70, state=None):
     recorder = Recorder()
     begin, first = begun() if state is None else state
     recorder.show(first, 0.0)
-    drive(begin, track, [recorder], frames=frames, clock=StreamClock(), stepper=ARRIVER)
+    drive(begin, track.at, [recorder.show], frames=frames, clock=StreamClock(), stepper=ARRIVER)
     return recorder, track
 
 

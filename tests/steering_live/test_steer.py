@@ -90,26 +90,20 @@ def test_a_command_tells_the_prior_for_as_long_as_it_holds(tmp_path):
         steer.step(state, replace(AHEAD, labels=("swim",)))
 
 
-class Heard:
-    """A source that writes down when it was asked."""
-
-    def __init__(self):
-        self.times = []
-
-    def at(self, seconds):
-        self.times.append(seconds)
-        return AHEAD
-
-
 def test_the_loop_asks_a_step_before_frames_are_due_and_shows_them_all():
     state, first = begun()
-    source, recorder = Heard(), Recorder()
+    times, recorder = [], Recorder()
+
+    def source(seconds):
+        times.append(seconds)
+        return AHEAD
+
     recorder.show(first, 0.0)
-    state, records = drive(state, source, [recorder], frames=20, clock=StreamClock())
+    state, records = drive(state, source, [recorder.show], frames=20, clock=StreamClock())
     assert state.frames == 22
     assert recorder.motion(20).num_frames == 20
     assert len(recorder.steering_targets) == 22
-    assert source.times == pytest.approx([k / 10 + 1 / 30 - 0.1 for k in range(7)])
+    assert times == pytest.approx([k / 10 + 1 / 30 - 0.1 for k in range(7)])
     assert [record.due for record in records] == pytest.approx([k / 10 + 1 / 30 for k in range(7)])
     assert all(len(entry.energy) == 21 for entry in recorder.ledger.entries)
 
@@ -144,7 +138,7 @@ class Labouring(StreamClock):
 )
 def test_time_stretches_where_steps_take_longer_than_their_frames_last_and_no_frame_is_lost(seconds, rate):
     clock, shown = Labouring(seconds), Recorder()
-    _, records = drive(begun()[0], clock, [shown], frames=120, clock=clock)
+    _, records = drive(begun()[0], clock.at, [shown.show], frames=120, clock=clock)
     assert shown.motion().num_frames == 120
     streamed = records[-1].due - records[0].due
     assert streamed / (streamed + summarise_step_timing(records)["held_s"]) == pytest.approx(rate, abs=0.03)
@@ -161,7 +155,7 @@ def test_steps_that_others_hold_up_are_to_end_earlier():
         clock._now += seconds + 0.012
         return steer.step(state, command)
 
-    _, records = drive(begun()[0], clock, [], frames=40, clock=clock, stepper=held_up)
+    _, records = drive(begun()[0], clock.at, [], frames=40, clock=clock, stepper=held_up)
     spare = [record.due - record.delivered for record in records]
     assert allowed[0] == pytest.approx(0.085)
     assert spare[0] == pytest.approx(0.003)
