@@ -43,7 +43,7 @@ _SEARCH_POINTS = 61
 
 
 class PurePursuit:
-    """A source, `at`, and the display from which it gets the character's position, `show`. Closed curves have no end."""
+    """A source, `at`, and a display that takes the character's position, `show`. Closed curves have no end."""
 
     def __init__(self, curve: Curve, *, speed: float, look_ahead: float = 0.5):
         """Begin at the curve's start; `speed` in m/s; `look_ahead` in metres: less tracks closer and sways more."""
@@ -82,7 +82,7 @@ class PurePursuit:
 
 
 class Autopilot:
-    """A source, `at`, and the display from which it gets the character's position, `show`."""
+    """A source, `at`, and a display that takes the character's position, `show`."""
 
     def __init__(self, command: Command, limits: SteeringLimits):
         """Begin with a command; `limits` determine how soon to brake before the end of a path."""
@@ -176,7 +176,7 @@ class ParentClosed(Exception):
 
 
 class ProcessClock(WallClock):
-    """Clock of the character's process, which reads orders while it waits, and its display `show`, which sends frames."""
+    """Clock of the character's process: reads orders while it waits; its display `show` sends frames."""
 
     def __init__(self, connection: Connection, pilot: Autopilot, prior: Density):
         self._connection, self._pilot, self._prior = connection, pilot, prior
