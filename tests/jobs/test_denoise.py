@@ -25,10 +25,7 @@ def cleaned(motion, **changes):
     return denoise(motion, tiny_denoiser(), **{"settings": QUICK} | changes)
 
 
-OTHERS = [("bandai", 24), ("daz", 120)]
-
-
-@pytest.mark.parametrize(("rig", "fps"), [*((rig, 30) for rig in RIGS), *OTHERS])
+@pytest.mark.parametrize(("rig", "fps"), [("canonical", 30), ("bandai", 24), ("daz", 120)])
 def test_noise_shrinks_and_rig_frames_and_rate_stay(rig, fps):
     truth = on_rig(rig, 3 * fps, fps=fps)
     given = noisy(truth)
@@ -44,11 +41,10 @@ def test_noise_shrinks_and_rig_frames_and_rate_stay(rig, fps):
     assert len(done.proposal_share) == len(done.contacts)
 
 
-@pytest.mark.parametrize("drawn", [0.3])
-@pytest.mark.parametrize(("rig", "fps"), [("canonical", 30), ("bandai", 30), ("daz", 120)])
-def test_a_clean_capture_changes_by_less_than_half_a_centimetre(rig, fps, drawn):
-    truth = on_rig(rig, 3 * fps, fps=fps)
-    done = denoise(truth, tiny_denoiser(drawn=drawn), settings=QUICK)
+@pytest.mark.parametrize(("rig", "fps"), [("bandai", 30), ("daz", 60)])
+def test_a_clean_capture_changes_by_less_than_half_a_centimetre(rig, fps):
+    truth = on_rig(rig, 2 * fps, fps=fps)
+    done = denoise(truth, tiny_denoiser(drawn=0.3), settings=QUICK)
     assert error_cm(truth, done.motion) < 0.5
     assert roughness(done.motion) <= roughness(truth)
 
@@ -226,8 +222,10 @@ def lead(rig, fps, shares):
     return retarget.from_canonical(replace(canonical, local_quat_xyzw=quats), rigmap)
 
 
-@pytest.mark.parametrize(("rig", "fps"), [("canonical", 30), ("bandai", 60), ("daz", 120)])
-@pytest.mark.parametrize("shares", [(), (0.26, 0.53, 0.78)])
+@pytest.mark.parametrize(
+    ("rig", "fps", "shares"),
+    [("canonical", 30, ()), ("bandai", 60, (0.26, 0.53, 0.78)), ("daz", 60, ()), ("daz", 30, (0.26, 0.53, 0.78))],
+)
 def test_a_tpose_and_the_frames_blended_with_it_stay_but_for_noise(rig, fps, shares):
     truth = lead(rig, fps, shares)
     given, first = noisy(truth, 3.0, 1.0), 1 + len(shares)
@@ -283,7 +281,7 @@ def test_a_long_capture_in_pieces_has_all_frames_and_no_jump(monkeypatch, rig, f
     json.dumps(done.details(), allow_nan=False)
 
 
-@pytest.mark.parametrize("frames", [1, 2, 7])
+@pytest.mark.parametrize("frames", [1, 7])
 def test_too_short_a_capture_is_unchanged_and_says_so(frames):
     given = noisy(on_rig("bandai", 30)).slice(0, frames)
     done = cleaned(given)

@@ -41,14 +41,13 @@ def pushed(motion: Motion, at_once: int = 1, causal=None):
 @pytest.mark.parametrize(
     ("rig", "fps", "delay"),
     [
-        ("bandai", 30, 0.1),
         ("daz", 50, 0.2),
-        *(pytest.param(*case, 0.1, marks=pytest.mark.slow) for case in RATES if case != ("bandai", 30)),
+        *(pytest.param(*case, 0.1, marks=pytest.mark.slow) for case in RATES),
         *(pytest.param(*case, 0.2, marks=pytest.mark.slow) for case in RATES if case != ("daz", 50)),
     ],
 )
 def test_all_frames_come_back_once_and_within_the_delay(rig, fps, delay):
-    motion = noisy(on_rig(rig, round(0.8 * fps), fps=fps))
+    motion = noisy(on_rig(rig, round(0.7 * fps), fps=fps))
     given, rest = pushed(motion, causal=CausalSettings(delay=delay, past=0.3))
     count = 0
     for done, come in given:
@@ -98,7 +97,7 @@ def test_the_noise_shrinks_and_passes_meet_without_a_jump():
     assert all(now <= of == 45 for now, of in calls)
 
 
-@pytest.mark.parametrize("frames", [1, 3, 7])
+@pytest.mark.parametrize("frames", [1, 7])
 def test_a_capture_that_is_over_at_once_comes_back(frames):
     motion = noisy(on_rig("bandai", 20)).slice(0, frames)
     assert denoise_causal(motion, tiny_denoiser(), settings=FAST).motion.num_frames == frames

@@ -75,7 +75,7 @@ def test_what_is_lost_for_a_moment_or_whole_stays_the_denoiser_s():
     assert marking.queries == []
 
 
-@pytest.mark.parametrize(("rig", "fps"), [("bandai", 30), ("daz", 120), ("bandai", 25)])
+@pytest.mark.parametrize(("rig", "fps"), [("daz", 60), ("bandai", 25)])
 def test_denoising_takes_it_on_any_rig_and_at_any_rate(rig, fps):
     motion = on_rig(rig, 3 * fps, fps=fps)
     arm = motion.skeleton.names[
