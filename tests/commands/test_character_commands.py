@@ -109,8 +109,3 @@ def test_what_is_no_character_is_one_line_and_nothing_is_written(prior, tmp_path
         assert said in fails("render", "walk.bvh", "-o", "x.png", "--character", file), file
         assert said in fails("run", "scene.toml", "-o", "out")
         assert said in fails("live", "--prior", prior, "--character", file)
-
-
-def test_more_characters_than_walkers_are_refused(prior, hero, fails):
-    twice = ("--character", hero, "--character", hero)
-    assert "--character is given 2 times for 1 of --characters" in fails("live", "--prior", prior, *twice)

@@ -43,7 +43,9 @@ def test_interruption_leaves_nothing_half_done(prior, tmp_path, number, said):
     """Ctrl-C or SIGTERM in the middle of hours of motion: no traceback, no file, no folder."""
     words = ("generate", "-o", tmp_path / "gen", "--seconds", 36_000, "--prior", prior)
     process = _started(words)
-    time.sleep(8)  # by then it samples
+    while not (tmp_path / "gen").exists() and process.poll() is None:
+        time.sleep(0.1)
+    time.sleep(0.5)  # by then it samples
     process.send_signal(number)
     process.send_signal(number)  # `timeout` sends it twice
     _, told = _ended(process)

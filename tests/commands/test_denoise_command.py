@@ -2,13 +2,11 @@
 
 import json
 from importlib.util import find_spec
-from pathlib import Path
 
 import pytest
 from captures import error_cm, noisy, on_rig
 from helpers import run, walk
 from tiny_denoiser import save_tiny_denoiser
-from tiny_prior import save_tiny_prior
 
 import mapctl
 from mapctl import formats
@@ -149,48 +147,3 @@ def test_a_cluster_of_this_machine_gives_the_same_files(denoise, folder, tmp_pat
     assert denoise(folder, "-o", tmp_path / "two", "--cluster", "local", "--jobs", 2, "--quiet") == 0
     for name in ("a.bvh", "deep/b.bvh"):
         assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["in.bvh", "-o", "a.bvh", "--mask", "gone.csv"], "gone.csv"),
-        (["in.bvh", "-o", "a.bvh", "--mask", "wrong.csv"], "line 2"),
-        (["in.bvh", "-o", "a.bvh", "--mask", "name.csv"], "no joint 'Hnad_L' to mask; the nearest is Hand_L"),
-        (["in.bvh", "-o", "a.bvh", "--mask", "late.csv"], "ends at 50, the recording at 40"),
-        (["in.bvh", "-o", "a.bvh", "--causal", "--delay", "0"], "the delay must be"),
-        (["in.bvh", "-o", "a.bvh", "--causal", "--prior", "locomotion"], "leave --prior out"),
-        (["in.bvh", "-o", "a.bvh", "--cluster", "local"], "--cluster is for folders; in.bvh is a file"),
-        (["in.bvh", "-o", "a.bvh", "--again"], "--again is for folders"),
-        (["in.bvh", "-o", "a.bvh", "--jobs", "2"], "--jobs is for folders"),
-        (["in.bvh", "-o", "a.bvh", "--delay", "0.2"], "--delay is how far --causal may look ahead"),
-        (["folder", "-o", "out", "--delay", "0.2"], "--delay is how far --causal may look ahead"),
-        (["folder", "-o", "out", "--strict"], "--strict is for single files"),
-        (["folder", "-o", "out", "--cluster", "10.0.0.1:6379", "--jobs", "2"], "--jobs is for this machine"),
-        (["folder", "-o", "out", "--mask", "wrong.csv"], "--mask is for single files; folder is a folder"),
-        (["folder", "-o", "out", "--video", "p.mp4"], "--video is for single files"),
-        (["folder", "-o", "out", "--causal"], "--causal is for single files"),
-        (["folder", "-o", "out", "--prior", "locomotion"], "--prior is for single files"),
-        (["folder", "-o", "out", "--jobs", "0"], "--jobs must be at least 1, got 0"),
-        (["folder", "-o", "in.bvh"], "in.bvh"),
-        (["empty", "-o", "out"], "below empty"),
-    ],
-    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
-)
-def test_what_is_wrong_is_said_in_a_line_and_nothing_is_written(fails, tiny, recording, words, said):
-    Path("in.bvh").write_bytes(recording.read_bytes())
-    Path("wrong.csv").write_text("joint,start,stop\nHand_L,4,x\n")
-    Path("name.csv").write_text("joint,start,stop\nHnad_L,4,6\n")
-    Path("late.csv").write_text("joint,start,stop\nHand_L,4,50\n")
-    for name in ("folder/a.bvh", "empty/a.txt"):
-        Path(name).parent.mkdir(exist_ok=True)
-        Path(name).write_bytes(recording.read_bytes())
-    assert said in fails("denoise", *words, "--denoiser", tiny)
-
-
-def test_a_folder_is_refused_with_a_network_that_is_no_denoiser(folder, tmp_path, capsys):
-    prior = save_tiny_prior(tmp_path / "prior.safetensors")
-    for name, said in ((prior, "a lstm-gmm is no denoiser"), ("nobody", "no prior 'nobody'")):
-        assert run("denoise", folder, "-o", tmp_path / "out", "--denoiser", name) == 2
-        assert said in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()

@@ -1,7 +1,6 @@
 """`mapctl infill` as a user types it: files, gaps, reports, and what is refused."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -58,15 +57,7 @@ def spoilt(source, out, *gaps):
 
 
 @pytest.mark.parametrize(
-    ("rig", "fps", "method"),
-    [
-        ("bandai", 30, "infiller"),
-        ("bandai", 120, "infiller"),
-        ("canonical", 30, "infiller"),
-        ("daz", 120, "infiller"),
-        ("daz", 30, "slerp"),
-        ("bandai", 30, "auto"),
-    ],
+    ("rig", "fps", "method"), [("bandai", 60, "infiller"), ("daz", 30, "slerp"), ("bandai", 30, "auto")]
 )
 def test_outside_the_gap_every_channel_is_as_it_was(infill, recording, tmp_path, rig, fps, method):
     """In the text of the file, also where what is filled in turns about."""
@@ -77,7 +68,7 @@ def test_outside_the_gap_every_channel_is_as_it_was(infill, recording, tmp_path,
     assert same == [not fps // 2 <= frame < fps for frame in range(len(before))]
 
 
-@pytest.mark.parametrize(("rig", "method"), [("bandai", "auto"), ("bandai", "slerp"), ("daz", "infiller")])
+@pytest.mark.parametrize(("rig", "method"), [("bandai", "auto"), ("daz", "infiller")])
 def test_what_stands_in_the_gap_does_not_matter(infill, recording, tmp_path, rig, method):
     found, gaps = set(), ((10, 15), (22, 30))
     wild = spoilt(recording(rig), tmp_path / "wild.bvh", *gaps)
@@ -97,8 +88,7 @@ def test_several_gaps_in_frames_and_seconds_are_told(infill, recording, tmp_path
     assert mapctl.load(out).num_frames == 45
 
 
-@pytest.mark.parametrize("rig", sorted(NAMES))
-@pytest.mark.parametrize("gap", [(), ("--gap", "20:30")])
+@pytest.mark.parametrize(("rig", "gap"), [("canonical", ()), ("bandai", ("--gap", "20:30")), ("daz", ())])
 def test_lost_joints_with_and_without_gaps(infill, recording, tmp_path, rig, gap):
     source, out, report = recording(rig), tmp_path / "out.bvh", tmp_path / "r.json"
     words = ["--joints", NAMES[rig], *gap, *words_of("infiller"), "--report", report, "--quiet"]
@@ -140,65 +130,3 @@ def test_frozen_frames_are_found(infill, recording, tmp_path, capsys):
     (tmp_path / "frozen.bvh").write_text("\n".join(lines) + "\n")
     assert infill(tmp_path / "frozen.bvh", "-o", tmp_path / "out.bvh", *words_of("infiller")) == 0
     assert "filled 20:30 (22 joints);" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["in.bvh", "-o", "a.bvh"], "say which frames are missing (--gap A:B) or which joints"),
-        (
-            ["in.bvh", "-o", "a.bvh", "--gap", "5:12", "--gap", "11:20"],
-            "the gaps 5:12 and 11:20 overlap; make them one",
-        ),
-        (["in.bvh", "-o", "a.bvh", "--gap", "40:46"], "within the motion's frames 0:45"),
-        (["in.bvh", "-o", "a.bvh", "--gap", "1s:2s"], "within the motion's frames 0:45"),
-        (["in.bvh", "-o", "a.bvh", "--gap", "9:5"], "must begin before it ends"),
-        (["in.bvh", "-o", "a.bvh", "--gap", "5:5"], "must begin before it ends"),
-        (["in.bvh", "-o", "a.bvh", "--gap", "5"], "a gap is A:B, frames or seconds as in 60:120 or 2s:4s; got '5'"),
-        (["in.bvh", "-o", "a.bvh", "--gap", "a:b"], "a frame is a whole number from 0"),
-        (["in.bvh", "-o", "a.bvh", "--gap", "0:45"], "leave nothing of the motion's 45 frames"),
-        (["in.bvh", "-o", "a.bvh", "--joints", "Hnad_L"], "no joint 'Hnad_L' to mask; the nearest is Hand_L"),
-        (["in.bvh", "-o", "a.bvh", "--joints", "Hand_L,LowArm_L"], "the nearest is LowerArm_L"),
-        (["in.bvh", "-o", "a.bvh", "--gap", "5:9", "--method", "best"], "--method"),
-        (["in.bvh", "-o", "a.bvh", "--gap=-5:9"], "a frame is a whole number from 0, or seconds as in 1.5s; got '-5'"),
-        (["in.bvh", "-o", "a.bvh", "--gap", "-5:9"], "a frame is a whole number from 0"),
-        (["in.bvh", "-o", "a.bvh", "--gap", "5:9:12"], "got '9:12'"),
-        (["in.bvh", "-o", "a.bvh", "--gap", ""], "a gap is A:B"),
-        (["in.bvh", "-o", "a.bvh", "--gap", "0:20", "--gap", "20:45"], "leave nothing of the motion's 45 frames"),
-        (["in.bvh", "-o", "a.bvh", "--joints", ""], "no joint '' to mask"),
-        (["in.bvh", "-o", "a.bvh", "--joints", "Hand_L,,Hand_R"], "no joint '' to mask"),
-        (["in.bvh", "-o", "a.bvh", "--joints", "root position"], "leave nothing of the motion's 45 frames"),
-        (["in.bvh", "-o", "in.bvh", "--gap", "5:9"], "in.bvh would be written over what it is made from"),
-        (["in.bvh", "-o", "./in.bvh", "--gap", "5:9"], "would be written over what it is made from"),
-        (["in.bvh", "-o", "link.bvh", "--gap", "5:9"], "link.bvh would be written over what it is made from"),
-        (["in.bvh", "-o", "a.bvh", "--report", "in.bvh", "--gap", "5:9"], "would be written over what it is made from"),
-        (["in.bvh", "-o", ".", "--gap", "5:9"], "unknown ending"),
-        (["in.bvh", "-o", "folder.bvh", "--gap", "5:9"], "it is a folder"),
-        (["folder.bvh", "-o", "a.bvh", "--gap", "5:9"], "is a folder, expected a file"),
-        (
-            ["in.bvh", "-o", "a.bvh", "--gap", "5:9", "--method", "infiller", "--no-finish", "--prior", "general"],
-            "leave --prior out",
-        ),
-        (
-            ["in.bvh", "-o", "a.bvh", "--gap", "5:9", "--method", "slerp", "--no-finish", "--prior", "general"],
-            "leave --prior out",
-        ),
-        (["in.bvh", "-o", "a.bvh", "--gap", "5:9", "--method", "slerp", "--curve", "line:4"], "--curve needs"),
-        (["in.bvh", "-o", "a.bvh", "--gap", "5:9", "--method", "rollouts", "--curve", "line:4"], "--curve needs"),
-        (["in.bvh", "-o", "a.bvh", "--gap", "5:9", "--method", "map"], "there is no --method map; there are auto"),
-        (["in.bvh", "-o", "a.bvh", "--joints", "Hand_L", "--curve", "line:4"], "the hips follow a curve where"),
-    ],
-    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
-)
-def test_what_is_wrong_is_said_in_a_line_and_nothing_is_written(fails, tiny, recording, words, said):
-    Path("in.bvh").write_bytes(recording().read_bytes())
-    Path("link.bvh").symlink_to("in.bvh")
-    Path("folder.bvh").mkdir()
-    assert said in fails("infill", *words, "--inbetweener", tiny)
-
-
-def test_a_network_that_the_method_knows_none_of_is_refused(recording, tmp_path, capsys):
-    words = ["infill", recording(), "-o", tmp_path / "a.bvh", "--gap", "5:9", "--method", "slerp"]
-    assert run(*words, "--inbetweener", "infiller") == 2
-    assert capsys.readouterr().err == "mapctl: --method slerp knows no network; leave --inbetweener out\n"
-    assert not (tmp_path / "a.bvh").exists()

@@ -44,16 +44,7 @@ def clip(tmp_path):
     return of
 
 
-@pytest.mark.parametrize(
-    ("rig", "fps", "seed", "method"),
-    [
-        ("canonical", 30, None, "slerp"),
-        ("bandai", 30, 1, "auto"),
-        ("bandai", 120, None, "infiller"),
-        ("daz", 30, 2, "infiller"),
-        ("daz", 60, 3, "slerp"),
-    ],
-)
+@pytest.mark.parametrize(("rig", "fps", "seed", "method"), [("bandai", 30, 1, "auto"), ("daz", 60, 3, "slerp")])
 def test_frames_of_nan_are_gaps(infilled, clip, tmp_path, rig, fps, seed, method):
     source, gaps = clip(rig, fps, seed), ((fps // 3, fps // 2), (fps, fps + 7))
     lossy = without(source, tmp_path / "lossy.bvh", [("", *gap) for gap in gaps])
@@ -61,8 +52,7 @@ def test_frames_of_nan_are_gaps(infilled, clip, tmp_path, rig, fps, seed, method
     assert infilled(lossy, method=method) == infilled(source, *words, method=method)
 
 
-@pytest.mark.parametrize("rig", sorted(NAMES))
-@pytest.mark.parametrize("gap", [None, (20, 33)])
+@pytest.mark.parametrize(("rig", "gap"), [("canonical", (20, 33)), ("bandai", None), ("daz", (20, 33))])
 def test_joints_of_nan_are_lost_joints(infilled, clip, tmp_path, rig, gap):
     source = clip(rig, seed=4)
     start, stop = gap or (0, 45)
@@ -100,29 +90,6 @@ def test_where_nothing_is_left_it_is_said(tiny, clip, tmp_path, capsys, lost, sa
     assert told.err.count("\n") == 1
     assert said in told.err
     assert not (tmp_path / "out.bvh").exists()
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ("convert", "lossy.bvh", "out.npz"),
-        ("tween", "lossy.bvh", "-o", "out.bvh", "--keyframes", "0,44"),
-        ("info", "lossy.bvh"),
-        ("measure", "lossy.bvh"),
-        ("render", "lossy.bvh", "-o", "out.png"),
-    ],
-    ids=" ".join,
-)
-def test_other_commands_refuse_nan_and_say_who_fills_it(clip, tmp_path, monkeypatch, capsys, words):
-    monkeypatch.chdir(tmp_path)
-    without(clip("bandai"), tmp_path / "lossy.bvh", [("Hand_L Zrotation", 3, 5)])
-    before = sorted(tmp_path.iterdir())
-    assert run(*words) == 2
-    told = capsys.readouterr()
-    assert told.err.count("\n") == 1
-    assert "frame 3, column" in told.err
-    assert "expected a finite number below 1e+08, got 'nan'; `mapctl infill` fills in what is lost" in told.err
-    assert sorted(tmp_path.iterdir()) == before
 
 
 @pytest.mark.slow

@@ -59,29 +59,3 @@ def test_a_whole_clip_may_be_walked_in_place(clip, path, tmp_path):
     out = tmp_path / "out.npz"
     assert run("infill", clip, "-o", out, "--way", "0:60", "--path", path, "--quiet") == 0
     assert mapctl.load(out).num_frames == 60
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--way", "10:61"], "the way 10:61 must begin before it ends, within the motion's frames 0:60"),
-        (["--way", "20:10"], "the way 20:10 must begin before it ends"),
-        (["--way", "10"], "a way is A:B"),
-        (["--way", "5:20", "--way", "10:30"], "the ways 5:20 and 10:30 overlap"),
-        (["--way", "0:60", "--gap", "10:20"], "lost over all frames of a motion whose joints are lost as well"),
-        (["--way", "0:60", "--joints", "leftHand"], "lost over all frames of a motion whose joints are lost as well"),
-        (["--way", "5:20", "--curve", "line:3"], "--way and --curve both say where the hips go"),
-        (["--gap", "5:20"], "--path predicts the hips' place for --way and for --method tweener"),
-        (["--way", "5:20", "--path", "nobody"], "no prior 'nobody'"),
-        (["--way", "5:20", "--path", "denoiser"], "a denoiser is no path"),
-    ],
-    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
-)
-def test_what_makes_no_sense_is_one_line_and_nothing_is_written(clip, path, tmp_path, capsys, words, message):
-    out = tmp_path / "out.bvh"
-    given = [] if "--path" in words else ["--path", path]
-    assert run("infill", clip, "-o", out, *words, *given, "--method", "slerp") == 2
-    told = capsys.readouterr()
-    assert message in told.err
-    assert told.err.count("\n") == 1
-    assert not out.exists()

@@ -1,14 +1,12 @@
 """What `mapctl denoise`, `infill` and `tween` share as a user types them: bytes, films, formats, refusals."""
 
 from importlib.util import find_spec
-from pathlib import Path
 
 import pytest
 from captures import on_rig
 from helpers import run
 from tiny_denoiser import save_tiny_denoiser
 from tiny_infiller import save_tiny_infiller
-from tiny_prior import save_tiny_prior
 
 WORDS = {"denoise": [], "infill": ["--gap", "5:9"], "tween": ["--keyframes", "0,5,11"]}
 """Without a network."""
@@ -53,33 +51,3 @@ def test_a_film_is_made(command, tiny, source, tmp_path):
     words = [*WORDS[command], *tiny[command], "--video", tmp_path / "v.png", "--quiet"]
     assert run(command, source, "-o", tmp_path / "out.bvh", *words) == 0
     assert (tmp_path / "v.png").read_bytes().startswith(b"\x89PNG")
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["gone.bvh", "-o", "a.bvh"], "gone.bvh"),
-        (["broken.bvh", "-o", "a.bvh"], "broken.bvh"),
-        (["in.bvh"], "--out"),
-        (["in.bvh", "-o", "a.mp3"], ".mp3"),
-        (["in.bvh", "-o", "gone/a.bvh"], "gone"),
-        (["in.bvh", "-o", "a.bvh", "--report", "a.bvh"], "asked for twice"),
-        (["in.bvh", "-o", "a.bvh", "--video", "p.avi"], ".mp4"),
-        (["in.bvh", "-o", "a.bvh", "--rig", "nobody"], "nobody"),
-        (["in.bvh", "-o", "./in.bvh"], "would be written over what it is made from"),
-        (["in.bvh", "-o", "a.bvh", "--prior", "nobody"], "no prior 'nobody'"),
-    ],
-    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
-)
-def test_what_is_wrong_is_said_in_a_line_and_nothing_is_written(command, tiny, source, fails, words, said):
-    Path("broken.bvh").write_text("HIERARCHY\nnonsense")
-    assert said in fails(command, *words, *WORDS[command], *tiny[command])
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_a_network_of_another_kind_is_refused(command, source, fails):
-    kind = {"--inbetweener": "in-betweener"}.get(NETWORK[command], NETWORK[command].removeprefix("--"))
-    save_tiny_prior(Path("prior.safetensors"))
-    for name, said in (("prior.safetensors", f"a lstm-gmm is no {kind}"), ("nobody", "no prior 'nobody'")):
-        assert said in fails(command, "in.bvh", "-o", "a.bvh", *WORDS[command], NETWORK[command], name)

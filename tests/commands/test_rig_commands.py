@@ -104,25 +104,6 @@ def test_info_tells_of_a_refused_clip_what_can_be_told(tmp_path, capsys):
     assert run("convert", tmp_path / "dog.bvh", tmp_path / "a.bvh", "--rig", "canonical") == 2
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["odd.bvh", "-o", "rig.jpg"], "--out writes .png, not .jpg"),
-        (["odd.bvh", "-o", "rig"], "--out writes .png, not a file without ending"),
-        (["odd.bvh", "-o", "none/rig.png"], "none"),
-        (["-o", "rig.png"], "a picture of a clip's rig: mapctl info CLIP -o FILE.png"),
-        (["missing.bvh", "-o", "rig.png"], "no such file"),
-    ],
-)
-def test_pictures_that_cannot_be_are_refused_before_anything_is_read(odd, words, said, capsys, monkeypatch):
-    monkeypatch.chdir(odd.parent)
-    assert run("info", *words) == 2
-    told = capsys.readouterr().err
-    assert said in told
-    assert told.count("\n") == 1
-    assert not list(odd.parent.glob("rig*"))
-
-
 def test_a_rig_that_is_given_wins(clip, tmp_path, capsys):
     (tmp_path / "mine.toml").write_text('unit = "in"\nup = "y"\n[joints]\nhips = "mixamorig:Hips"\n')
     assert run("info", clip, "--json", "--rig", tmp_path / "mine.toml") == 0
@@ -131,21 +112,6 @@ def test_a_rig_that_is_given_wins(clip, tmp_path, capsys):
     assert run("convert", clip, tmp_path / "a.bvh", "--rig", "canonical", "--source-rig", tmp_path / "mine.toml") == 0
     assert set(mapctl.load(tmp_path / "a.bvh").skeleton.names) == set(CANONICAL.names)
     assert run("info", clip, "--rig", clip) == 0
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["--rig", "cmu-daz"], "rig cmu-daz: no joint 'hip' for hips"),
-        (["--rig", "nobody"], "no rig 'nobody'"),
-        (["--rig", "none.toml"], "no such file"),
-    ],
-)
-def test_rigs_that_do_not_fit_are_refused(clip, words, said, capsys):
-    assert run("info", clip, *words) == 2
-    told = capsys.readouterr().err
-    assert said in told
-    assert told.count("\n") == 1
 
 
 @pytest.fixture
@@ -161,10 +127,8 @@ def told_rig(request, tmp_path):
 @pytest.mark.parametrize(
     ("job", "told_rig"),
     [
-        *(("convert", rig) for rig in ("mixamo", "Bandai-Namco", "cmu-daz", "iclone", "TOML")),
-        *(("convert", rig) for rig in ("daz-genesis", "metahuman", "rigify", "vrm", "xsens", "rokoko", "mmd")),
-        ("follow", "TOML"),
-        *(pytest.param("follow", rig, marks=pytest.mark.slow) for rig in ("daz-genesis", "rigify", "mmd")),
+        *(("convert", rig) for rig in ("Bandai-Namco", "cmu-daz", "TOML", "rigify", "mmd")),
+        *(pytest.param("follow", rig, marks=pytest.mark.slow) for rig in ("TOML", "daz-genesis", "mmd")),
         *(pytest.param(*pair, marks=pytest.mark.slow) for pair in (("steer", "mixamo"), ("run", "iclone"))),
         ("generate", "TOML"),
     ],
@@ -188,16 +152,6 @@ def test_rigs_by_name_or_file_get_the_canonical_bones(job, told_rig, prior, tmp_
     heights = canonical.joint_positions()[..., 1]
     assert 0.6 < float(heights[:, 0].mean()) < 1.0  # upright in its world, in its unit
     assert float(heights[:, CANONICAL.index("head")].min()) > float(heights[:, 0].max())
-
-
-def test_a_rig_that_names_too_little_is_refused_for_a_body(prior, tmp_path, capsys):
-    (tmp_path / "part.toml").write_text('[joints]\nhips = "Hips"\n')
-    assert run("follow", "line:2", "-o", tmp_path / "a.bvh", "--rig", tmp_path / "part.toml", "--prior", prior) == 2
-    assert "rig part names no joint for spine, " in capsys.readouterr().err
-    assert run("follow", "line:2", "-o", tmp_path / "a.bvh", "--rig", "nobody", "--prior", prior) == 2
-    assert "no rig 'nobody'; known rigs: " in capsys.readouterr().err
-    assert not (tmp_path / "a.bvh").exists()
-    assert run("info", "--rig", "mixamo") == 2
 
 
 def test_convert_to_a_z_up_rig_stands_in_its_world(clip, tmp_path):

@@ -77,38 +77,6 @@ def test_a_scene_goes_on_from_a_clip_on_its_rig_and_keeps_apart(tmp_path):
     ]
 
 
-REFUSED = {
-    "obstacle": (["--avoid", "1,2"], "an obstacle is X,Z,RADIUS"),
-    "obstacle on the start": (["--avoid", "0,0.1,0.5"], "the start is within the obstacle"),
-    "start": (["--start", "sitting"], "--start: expected walk, stand or CLIP:FRAME"),
-    "start clip": (["--start", "gone.bvh:3"], "gone.bvh"),
-    "style": (["--style", "sad"], "knows no style 'sad', only"),
-    "gait": (["--gait", "swim"], "knows no gait 'swim', only"),
-    "end": (["--end", "lying"], "--end: expected walk, stand or CLIP:FRAME"),
-    "end clip": (["--end", "gone.bvh:3"], "gone.bvh"),
-    "open loop": (["--loop"], "a loop needs a closed curve"),
-    "fps": (["--fps", "0"], "--fps must be 1 to 1000"),
-    "keys": (["--keys", "gone.toml"], "gone.toml"),
-}
-
-
-@pytest.mark.parametrize("case", REFUSED)
-def test_what_cannot_be_is_refused_in_one_line_and_nothing_is_written(case, tmp_path, capsys):
-    words, said = REFUSED[case]
-    assert run("follow", "line:2", "-o", tmp_path / "a.bvh", *words) == 2
-    error = capsys.readouterr().err.strip()
-    assert said in error
-    assert "\n" not in error
-    assert not (tmp_path / "a.bvh").exists()
-
-
-def test_a_key_within_an_obstacle_is_refused(tmp_path, capsys):
-    (tmp_path / "keys.toml").write_text("[[key]]\nseconds = 1\nreach = { leftHand = [0.9, 1, 1] }")
-    words = ["--keys", tmp_path / "keys.toml", "--avoid", "1,1,0.3"]
-    assert run("follow", "line:2", "-o", tmp_path / "a.bvh", *words) == 2
-    assert "within the obstacle at 1, 1" in capsys.readouterr().err
-
-
 @pytest.mark.slow
 def test_a_shot_holds_a_pose_of_another_rig_and_ends_in_a_clip(tmp_path):
     on_rig("bandai", 70).save(tmp_path / "clip.bvh")
@@ -135,37 +103,3 @@ def test_a_loop_leads_into_its_first_frame_at_any_rate(tmp_path):
     places = mapctl.load(out).joint_positions()
     steps = torch.diff(torch.cat([places, places[:1]]), dim=0).norm(dim=-1).amax(dim=1)
     assert float(steps[-1]) < 1.2 * float(steps[:-1].max())
-
-
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("[[key]]\nlook_at = [0, 1, 2]", "key[0].seconds: "),
-        ("[[key]]\nseconds = 1", "key[0].reach: "),
-        ("[[key]]\nseconds = 1\nreach = { tail = [0, 1, 2] }", "key[0].reach.tail: hands and feet are"),
-        ("[[key]]\nseconds = 1\nlook = [0, 1, 2]", "key[0].look: there is no such key; allowed: seconds"),
-        ("key = []", "key: "),
-        ("[[key]]\nseconds = 1\nlook_at = [0, 1, 2]\npose_frame = 3", "key[0].pose_frame: this is of a pose"),
-        ("[[key]]\nseconds = 1\npose = 'gone.bvh'", "gone.bvh"),
-        ("[[key]]\nseconds = 1\npose = 'a.bvh'\njoints = ['tail']", "key[0].joints.tail: hands and feet are"),
-        ("[[key]]\nseconds = 1\nreach = { leftHand = [0, 1, 2] }\ntolerance = { rightHand = 0.1 }", "gives no place"),
-        ("[[key]]\nseconds = 1\nfacing_deg = 1\nwithin_frames = -1", "key[0].within_frames: "),
-        ("[[key]]\nseconds = 1\nplace = [0, 1]\n[[key]]\nseconds = 1.05\nfacing_deg = 9", "within two frames"),
-        ("[[key]]\nseconds = 50\nlook_at = [0, 1, 2]", "not within"),
-        ("[[key]]\nseconds = 1\nreach = { leftHand = [5, 1, 2] }", "leftHand at 1 s is to be"),
-    ],
-)
-def test_a_key_that_cannot_be_is_named(text, said, tmp_path, capsys):
-    (tmp_path / "keys.toml").write_text(text)
-    words = ["--keys", tmp_path / "keys.toml", "--seconds", 2]
-    assert run("follow", "line:2", "-o", tmp_path / "a.bvh", *words) == 2
-    assert said in capsys.readouterr().err
-
-
-def test_a_speed_of_zero_with_a_way_to_go_is_refused(tmp_path, capsys):
-    (tmp_path / "scene.toml").write_text(
-        'outputs = ["a.bvh"]\n[[actors]]\ncurve = "line:2"\nspeed_by_time = [[0, 0]]\nseconds = 2\n'
-    )
-    assert run("run", tmp_path / "scene.toml", "-o", tmp_path / "out") == 2
-    assert "zero throughout" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()

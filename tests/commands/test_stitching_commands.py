@@ -72,6 +72,7 @@ def test_a_gap_that_is_too_long_is_anothers_and_the_note_says_so(clip, capsys):
     assert "longer than the 23 frames that the stitcher fills" in told
 
 
+@pytest.mark.slow
 def test_auto_stitches_where_a_hand_is_told(clip, capsys):
     words = ("tween", clip, "-o", "one.bvh", "--no-finish", "--stitcher", "own.safetensors", "--joints", "leftHand")
     assert run(*words, "--keyframes", "0,10,20") == 0
@@ -80,19 +81,3 @@ def test_auto_stitches_where_a_hand_is_told(clip, capsys):
     told = capsys.readouterr().out
     assert "frames 1:30: transformer" in told
     assert "longer than the 23 frames that the stitcher fills" in told
-
-
-@pytest.mark.slow
-def test_a_stitcher_where_none_can_be_is_refused(clip, fails):
-    tween = ("tween", clip, "-o", "out.bvh", "--keyframes", "0,20")
-    assert fails(*tween, "--method", "transformer", "--stitcher", "own.safetensors") == (
-        "mapctl: --method transformer stitches nothing; leave --stitcher out or take --method stitcher\n"
-    )
-    assert "is no stitcher" in fails(*tween, "--method", "stitcher", "--stitcher", "transformer")
-    assert "no prior 'gone'" in fails(*tween, "--method", "stitcher", "--stitcher", "gone")
-    assert "own.safetensors is a stitcher; name it by --stitcher" in fails(*tween, "--inbetweener", "own.safetensors")
-    assert "no MAP stage for a density" in fails(*tween, *STITCH, "--prior", "prior.safetensors")
-    assert "knows no style" in fails(*tween, *STITCH, "--dna", "walk")
-    assert "no two keys have whole poses with 1 to 23 frames between them" in fails(
-        "tween", clip, "-o", "out.bvh", "--keyframes", "0,1", *STITCH, "--variations", 3
-    )

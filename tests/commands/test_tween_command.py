@@ -1,7 +1,6 @@
 """`mapctl tween` as a user types it: keys in frames and seconds, reports, and what is refused."""
 
 import json
-from pathlib import Path
 
 import pytest
 from captures import on_rig
@@ -101,40 +100,3 @@ def test_a_report_tells_every_key_and_how_far_it_is_missed(tween, source, tmp_pa
     assert (told["request"]["keyframes"], told["request"]["method"]) == ("0,16,33,44", "infiller")
     assert {"mapctl", "versions", "motion", "gaps", "ledger", "seconds", "frame_ms", "status"} <= set(told)
     assert "skate_cm_s" in told["measures"]
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["in.bvh", "-o", "a.bvh"], "--keyframes"),
-        (["in.bvh", "-o", "a.bvh", "--keyframes", "9"], "at least two keys, got 1"),
-        (["in.bvh", "-o", "a.bvh", "--keyframes", "9,9"], "at least two keys, got 1"),
-        (["in.bvh", "-o", "a.bvh", "--keyframes", "0,45"], "the key 45 is not one of the motion's frames 0:45"),
-        (["in.bvh", "-o", "a.bvh", "--keyframes", "0,1.5s"], "the key 45 is not one of the motion's frames 0:45"),
-        (["in.bvh", "-o", "a.bvh", "--keyframes", "0,x"], "a frame is a whole number from 0, or seconds as in 1.5s"),
-        (["in.bvh", "-o", "a.bvh", "--keyframes", "0,,9"], "a frame is a whole number from 0"),
-        (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9,20", "--joints", "Hnad_L"], "no hand or foot 'Hnad_L'; the"),
-        (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9,20", "--joints", ""], "no hand or foot ''"),
-        (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--joints", "Hand_L", "--root-only"], "choose one"),
-        (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--method", "best"], "--method"),
-        (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--joints", "Hand_L"], "--joints is about keys between"),
-        (["in.bvh", "-o", "a.bvh", "--keyframes", "9,0,9", "--root-only"], "--root-only is about keys between"),
-        (
-            ["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--method", "infiller", "--no-finish", "--prior", "x"],
-            "leave --prior out",
-        ),
-        (
-            ["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--method", "slerp", "--no-finish", "--prior", "general"],
-            "leave --prior out",
-        ),
-        (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--method", "infiller", "--dna", "in.bvh"], "leave --dna out"),
-        (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--method", "tweener", "--dna", "no.bvh"], "no.bvh"),
-        (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--method", "tweener"], "--method tweener takes no infiller"),
-        (["in.bvh", "-o", "a.bvh", "--keyframes", "0,9", "--path", "x"], "--path predicts the hips' place"),
-        (["in.bvh", "-o", "in.bvh", "--keyframes", "0,9"], "in.bvh would be written over what it is made from"),
-    ],
-    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
-)
-def test_what_is_wrong_is_said_in_a_line_and_nothing_is_written(fails, tiny, source, words, said):
-    Path("in.bvh").write_bytes(source.read_bytes())
-    assert said in fails("tween", *words, "--inbetweener", tiny)

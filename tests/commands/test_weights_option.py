@@ -93,7 +93,7 @@ JOBS = {
     "chain": ("chain in.bvh other.bvh -o out.npz --piece 10 --gap 9:10 --no-finish", {"transformer"}),
 }
 """Words by what they do, and the models that they need at least."""
-LONG = ("follow a shot", "denoise a folder", "infill by rollouts")
+LONG = {*JOBS} - {"follow", "run", "generate", "denoise", "tween", "chain"}
 CASES = [pytest.param(name, marks=pytest.mark.slow if name in LONG else ()) for name in JOBS]
 OUTPUTS = ("out.npz", "a.npz", "made/generated_000.npz")
 REPORTS = ("out.json", "a.json", "told/one.json")
