@@ -101,7 +101,10 @@ def test_what_is_written_is_read_back(ending, tmp_path):
     assert path.read_bytes() == first
 
 
-@pytest.mark.parametrize("ending", INSTALLED)
+@pytest.mark.parametrize(
+    "ending",  # the four of USD go through one reader, in a process of its own
+    [pytest.param(e, marks=pytest.mark.slow) if e in (".usd", ".usdc", ".usda") else e for e in INSTALLED],
+)
 def test_sound_files_are_read_and_broken_ones_refused_in_a_line_or_read(ending, tmp_path):
     path = make(tmp_path, ending)
     motion = formats.load(path)
@@ -110,7 +113,7 @@ def test_sound_files_are_read_and_broken_ones_refused_in_a_line_or_read(ending, 
         assert formats.load_rest(path).num_joints == motion.num_joints
         assert ending == ".vrma" or formats.load_mesh(path).joints.max() < motion.num_joints
     raw, random = path.read_bytes(), np.random.default_rng(1)
-    for case in range(4 if ending[:4] in (".usd", ".fbx") else 40):
+    for case in range(2 if ending[:4] in (".usd", ".fbx") else 40):
         path.write_bytes(mutate(raw, random))
         for read in (formats.load, formats.load_mesh) if ending in formats.CHARACTERS else (formats.load,):
             try:

@@ -37,8 +37,7 @@ def known(gap):
     return (~gap.missing.frames).nonzero()[:, 0].tolist()
 
 
-@pytest.mark.parametrize("fps", RATES)
-@pytest.mark.parametrize("spare", [0, 3])
+@pytest.mark.parametrize(("fps", "spare"), [(10, 0), (24, 3), (50, 0), (120, 3)])
 def test_times_rise_and_reach_the_end(fps, spare):
     motion = walk(fps + spare, fps=fps)
     gap = gap_of(motion, keyed(motion, (0, motion.num_frames - 1)))
@@ -53,7 +52,7 @@ def test_times_rise_and_reach_the_end(fps, spare):
 @pytest.mark.parametrize("fps", RATES)
 def test_a_key_at_any_frame_is_one_moment_with_its_own_pose_and_time(fps):
     motion = walk(fps, fps=fps, turn_rate=0.5)
-    for key in range(2 * max(1, fps // 30), fps - 2 * max(1, fps // 30), 1 + fps // 25):
+    for key in range(2 * max(1, fps // 30), fps - 2 * max(1, fps // 30), 1 + fps // 12):
         gap = gap_of(motion, keyed(motion, (0, key, fps - 1)))
         assert (torch.diff(gap.seconds) > 0).all()
         _, moment, _ = known(gap)

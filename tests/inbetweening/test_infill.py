@@ -20,7 +20,6 @@ from mapctl.recording.masks import ALL, Mask
 from mapctl.skeleton import CANONICAL, TOE_JOINTS, leg_length
 
 RIGS = ("canonical", "bandai", "daz")
-CASES = [*((rig, 30) for rig in RIGS), ("daz", 120)]
 
 
 def filled(motion, *masks, method="infiller", drawn=0.2, infiller=None, **options):
@@ -71,8 +70,7 @@ def test_known_frames_stay_to_the_bit_and_the_gap_is_filled_with_something(rig, 
     ("rig", "method"),
     [
         ("bandai", "infiller"),
-        ("daz", "slerp"),
-        *(pytest.param(*case, marks=pytest.mark.slow) for case in (("canonical", "infiller"), ("daz", "infiller"))),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in (("canonical", "infiller"), ("daz", "slerp"))),
         ("daz", "auto"),
     ],
 )
@@ -105,7 +103,7 @@ class Oracle(PositionInfiller):
         return ProposedPositions(image.from_world(places), torch.zeros(1, places.shape[1], 2))
 
 
-@pytest.mark.parametrize(("rig", "fps"), CASES)
+@pytest.mark.parametrize(("rig", "fps"), [("bandai", 30), ("daz", 60)])
 def test_a_true_proposal_gives_the_true_motion_back(rig, fps):
     motion = on_rig(rig, 3 * fps, fps=fps)
     masks = [seconds(motion, 0.8, 1.4), seconds(motion, 2.0, 2.03 + 1 / fps)]
@@ -119,7 +117,7 @@ def test_a_true_proposal_gives_the_true_motion_back(rig, fps):
     assert off.mean() < 0.01
 
 
-@pytest.mark.parametrize("rig", ["bandai", "daz"])
+@pytest.mark.parametrize("rig", ["daz"])
 def test_a_larger_performer_is_shown_as_one_of_the_networks_size(rig):
     """What is proposed is scaled back: places by the legs, while rotations are the same."""
     small = on_rig(rig, 60)
@@ -133,7 +131,7 @@ def test_a_larger_performer_is_shown_as_one_of_the_networks_size(rig):
     assert (made.joint_positions() - 1.25 * unscaled.joint_positions()).norm(dim=-1).max() < 0.005
 
 
-@pytest.mark.parametrize("rig", RIGS)
+@pytest.mark.parametrize("rig", RIGS[1:])
 def test_lost_joints_are_filled_and_no_other(rig):
     motion = on_rig(rig, 45)
     hand = {"canonical": "leftHand", "bandai": "Hand_L", "daz": "lHand"}[rig]

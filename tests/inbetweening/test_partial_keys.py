@@ -37,7 +37,7 @@ def asked(motion, keys, *, method="infiller", drawn=0.0):
 
 
 HIGH, LOW = (0.5, 1.5, 0.3), (0.25, 0.35, 0.5)
-QUICK = [("bandai", 30, HIGH), ("daz", 120, LOW)]
+QUICK = [("bandai", 30, HIGH)]
 RATES = [("canonical", 30), ("bandai", 30), ("daz", 120), ("canonical", 24)]
 
 
@@ -65,8 +65,7 @@ def test_a_hand_told_at_one_frame_goes_there_and_back(rig, fps, place):
     assert acceleration < 60
 
 
-@pytest.mark.parametrize("fps", [30, 120])
-@pytest.mark.parametrize("turn", [0.0, 1.2])
+@pytest.mark.parametrize(("fps", "turn"), [(30, 1.2), (120, 0.0)])
 def test_hips_told_at_one_frame_do_not_swing_the_body(fps, turn):
     motion = walk(3 * fps, fps=fps, turn_rate=turn)
     own = peaks_of(motion)

@@ -67,12 +67,7 @@ def missed_cm(made, motion, frame, names):
 
 @pytest.mark.parametrize(
     ("rig", "fps", "method"),
-    [
-        *((*case, "infiller") for case in ON_RIGS),
-        ("canonical", 24, "infiller"),
-        ("daz", 30, "slerp"),
-        ("daz", 30, "auto"),
-    ],
+    [("canonical", 24, "infiller"), ("bandai", 30, "infiller"), ("daz", 120, "slerp"), ("daz", 30, "auto")],
 )
 def test_poses_that_are_keys_are_met_to_the_bit(rig, fps, method):
     motion = on_rig(rig, round(1.5 * fps), fps=fps)
@@ -86,8 +81,7 @@ def test_poses_that_are_keys_are_met_to_the_bit(rig, fps, method):
     ("rig", "method", "told"),
     [
         ("canonical", "infiller", {}),
-        ("canonical", "infiller", {"limbs": True}),
-        ("daz", "slerp", {"root_only": True}),
+        ("daz", "slerp", {"limbs": True}),
         pytest.param("bandai", "auto", {"limbs": True}, marks=pytest.mark.slow),
     ],
 )
@@ -116,8 +110,8 @@ def test_on_a_rig_that_only_poses_tell_other_frames_change_nothing_either():
 @pytest.mark.parametrize(
     ("rig", "fps", "method"),
     [
-        *(pytest.param(*case, "infiller", marks=pytest.mark.slow if case[0] != "daz" else ()) for case in ON_RIGS),
-        ("bandai", 30, "auto"),
+        *(pytest.param(*case, "infiller", marks=pytest.mark.slow if case[1] != 120 else ()) for case in ON_RIGS),
+        pytest.param("bandai", 30, "auto", marks=pytest.mark.slow),
     ],
 )
 def test_hands_and_feet_are_met_and_the_rest_is_free(rig, fps, method):
@@ -141,7 +135,7 @@ def test_a_hand_whose_place_is_out_of_reach_is_said_to_miss_it():
     assert note.endswith(" cm from its target, out of reach")
 
 
-@pytest.mark.parametrize(("rig", "fps", "method"), [*((*case, "infiller") for case in ON_RIGS), ("bandai", 30, "auto")])
+@pytest.mark.parametrize(("rig", "fps", "method"), [("daz", 60, "infiller"), ("bandai", 30, "auto")])
 def test_the_place_and_rotation_of_the_hips_are_met_to_the_bit(rig, fps, method):
     motion, frames = on_rig(rig, round(1.5 * fps), fps=fps), frames_of(fps)
     made = made_of(motion, frames, method=method, root_only=True).motion
@@ -152,8 +146,7 @@ def test_the_place_and_rotation_of_the_hips_are_met_to_the_bit(rig, fps, method)
     assert not torch.equal(made.local_quat_xyzw[between], motion.local_quat_xyzw[between])
 
 
-@pytest.mark.parametrize("fps", [24, 120])
-@pytest.mark.parametrize("aside", [1, 2])
+@pytest.mark.parametrize(("fps", "aside"), [(24, 1), (120, 2)])
 def test_hips_that_are_keys_between_two_moments_do_not_leap(fps, aside):
     """At every frame of a fast curve the hips are about as near to it as straight lines from key to key are, and go no
     faster than one walks through all keys.
@@ -168,8 +161,7 @@ def test_hips_that_are_keys_between_two_moments_do_not_leap(fps, aside):
     assert step < 1.35 * own
 
 
-@pytest.mark.parametrize("fps", [30, 120])
-@pytest.mark.parametrize("keys", [(0, 1, 22, 23, 43, 44), (3, 4)])
+@pytest.mark.parametrize(("fps", "keys"), [(120, (0, 1, 22, 23, 43, 44)), (30, (3, 4))])
 def test_keys_may_be_one_frame_apart(fps, keys):
     motion = on_rig("bandai", 45, fps=fps)
     assert_met(made_of(motion, keys).motion, motion, keys)

@@ -22,7 +22,7 @@ RAW = GenerateSettings(foot_cleanup=None)
 @pytest.fixture(autouse=True)
 def short_pieces(monkeypatch):
     """Draws are made a piece at a time: the whole piece of 20 s for one second of motion else."""
-    monkeypatch.setattr(sys.modules["controllers.generation.generate"], "_CHUNK", 100)
+    monkeypatch.setattr(sys.modules["controllers.generation.generate"], "_CHUNK", 50)
 
 
 def made(seconds=1.0, *, seed=0, settings=RAW, **wishes):

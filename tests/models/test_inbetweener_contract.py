@@ -21,7 +21,7 @@ MASKS = {
     "a gap": [Mask(ALL, 15, 25)],
     "two gaps": [Mask(ALL, 10, 20), Mask(ALL, 30, 33)],
     "an arm": [Mask("leftLowerArm", 0, FRAMES), Mask("leftHand", 0, FRAMES)],
-    "both ends": [Mask(ALL, 0, 6), Mask(ALL, 44, FRAMES)],
+    "gaps and both ends": [Mask(ALL, 0, 6), Mask(ALL, 15, 25), Mask(ALL, 30, 33), Mask(ALL, 44, FRAMES)],
 }
 
 
@@ -30,7 +30,7 @@ def query_of(masks, rig="canonical"):
     return CanonicalClip.of(motion, MissingMask.of_masks(motion, masks, to_canonical(motion)[1])).query()
 
 
-@pytest.mark.parametrize("what", MASKS)
+@pytest.mark.parametrize("what", ["gaps and both ends", "an arm"])
 @pytest.mark.parametrize("kind", INBETWEENERS)
 def test_a_proposal_is_a_whole_motion_of_the_query_s_body(kind, what):
     inbetweener, query = INBETWEENERS[kind], query_of(MASKS[what])
@@ -72,8 +72,7 @@ def test_an_answer_moves_and_turns_with_its_query(kind):
     torch.testing.assert_close(found.joint_positions(), wanted.joint_positions(), atol=2e-3, rtol=0)
 
 
-@pytest.mark.parametrize("kind", NETWORKS[:3])
-@pytest.mark.parametrize("what", ["a gap", "an arm"])
+@pytest.mark.parametrize(("kind", "what"), [*((kind, "a gap") for kind in NETWORKS[:3]), ("transformer", "an arm")])
 def test_the_answer_to_the_mirror_image_is_the_mirror_image(kind, what):
     query = query_of(MASKS[what])
     missing = MissingMask(query.missing.joints[:, CANONICAL.mirror_partners()], query.missing.root)

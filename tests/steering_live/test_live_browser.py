@@ -29,10 +29,6 @@ SWITCHES = [
     "--disable-component-update",
     "--disable-sync",
 ]
-PLUG_IN = """window.plugged = {
-    connected: true, axes: [1, 0, 0, 0], buttons: Array(17).fill({value: 0}),
-}"""
-GAMEPADS = "window.plugged = null; navigator.getGamepads = () => [window.plugged];"
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium; .ci/setup browser says how to get it")
 
 
@@ -84,7 +80,6 @@ def open_page(url: str) -> Iterator[Any]:
     with sync_playwright() as drivers:
         browser = drivers.chromium.launch(executable_path=CHROMIUM, args=SWITCHES)
         page, faults = browser.new_page(viewport=SIZE, accept_downloads=True), []
-        page.add_init_script(GAMEPADS)
         page.on("pageerror", lambda error: faults.append(str(error)))
         page.goto(url)
         page.get_by_text(COUNTED).wait_for(timeout=60_000)
@@ -140,13 +135,6 @@ def test_a_walk_through_the_page(prior, tmp_path):
         assert shows(page, "Heading, degrees", bool), "as the camera sees it, which looks past the character"
         page.keyboard.up("w")
         assert shows(page, "Speed, m/s", lambda value: value == 0)
-        page.evaluate(PLUG_IN)
-        assert shows(page, "Speed, m/s", bool)
-        page.evaluate("window.plugged = null")
-        assert shows(page, "Speed, m/s", lambda value: value == 0)
-        page.keyboard.press("h")
-        page.get_by_text("show or hide this list").wait_for()
-        page.keyboard.press("h")
         open_tab(page, "Path")
         draw = page.get_by_text("Draw by clicking on the ground")
         draw.locator("xpath=following::input[@type='checkbox'][1]").check()
@@ -155,7 +143,7 @@ def test_a_walk_through_the_page(prior, tmp_path):
             time.sleep(0.7)
         page.get_by_text("3 points").wait_for(timeout=20_000)
         page.get_by_role("button", name="Walk it").click()
-        walked = recorded(page, tmp_path, 3)
+        walked = recorded(page, tmp_path, 2)
         assert walked.skeleton.names[0] == "hips"
         assert walked.num_frames >= 30
         assert float((walked.root_position[-1] - walked.root_position[0])[::2].norm()) > 0.5
