@@ -9,7 +9,7 @@ import math
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import product
+from itertools import combinations, product
 
 import torch
 from jaxtyping import Bool, Float
@@ -168,8 +168,8 @@ class Anatomy:
     def find_contradictions(self, tpose: Float[Tensor, "joints 4"]) -> dict[str, float]:
         """Return the joints whose world rotation (xyzw) in a T-pose is off by more than CONTRADICTION, each with the
         angle in radians."""
-        quats = {name: tpose[CANONICAL.index(name)] for name in self.certain}
-        angles = {name: _angle_between(self.certain[name], rotations.to_matrix(quat)) for name, quat in quats.items()}
+        matrices = rotations.to_matrix(tpose)
+        angles = {name: _angle_between(frame, matrices[CANONICAL.index(name)]) for name, frame in self.certain.items()}
         return {name: angle for name, angle in angles.items() if angle > CONTRADICTION}
 
     def correct(self, tpose: Float[Tensor, "joints 4"], names: Collection[str]) -> Float[Tensor, "joints 4"]:
@@ -225,6 +225,87 @@ class _Builder:
             near = _angle_between(self.measured[name], self.frames[above]) < CONTRADICTION
             self.frames[name] = self.frames[above] if near else self.measured[name]
 
+    def orient_joints(self, pitch: float) -> dict[str, Float[Tensor, "3 3"]]:
+        """Orient all joints, feet with this pitch while they are flat; return the frames of those that are certain."""
+        clip = self.clip
+        # Files disagree by 33 degrees about where the spine is over the hips: enough to show which pelvis is wrong.
+        self.orient("hips", clip.side_line("UpperLeg"), _X, clip.position("spine") - clip.middle("UpperLeg"), _Y)
+        certain = {"hips": self.frames["hips"]}
+        known = [*self._orient_trunk()]
+        for side, sign in SIGNS:
+            known += [*self._orient_arm(side, sign), *self._orient_leg(side, pitch)]
+        return certain | {name: self.frames[name] for name in known}
+
+    def _orient_trunk(self) -> Iterator[str]:
+        clip = self.clip
+        # The pelvis is up against the legs where both are stretched, else along the spine.
+        (left, first), (right, second) = (_leg_extension(clip, side) for side, _ in SIGNS)
+        along_spine = unit_vectors(clip.position("spine") - clip.middle("UpperLeg"))
+        up = _SPINE_WEIGHT * along_spine - first * second * (left + right)
+        self.orient("hips", clip.side_line("UpperLeg"), _X, up, _Y)
+        top, across = "spine", clip.side_line("Shoulder")
+        if clip.has("chest"):
+            self.orient("chest", across, _X, _bone(clip, "chest", clip.up()), _Y)
+            top, across = "chest", self.axis("chest", _X)
+            yield "chest"
+        self.orient("spine", _bone(clip, "spine", clip.up()), _Y, self.axis("hips", _X) + across, _X)
+        for name in filter(clip.has, ("neck", "head")):
+            up = self.axis(top, _Y)
+            bone = _bone(clip, name, up)
+            bone = bone if float((bone * up).sum(-1).mean()) > _HEAD_UP else up
+            self.orient(name, bone, _Y, self.axis(top, _X), _X)
+        if clip.has("head"):
+            self.continue_frame("head", "neck")
+
+    def _orient_arm(self, side: str, sign: float) -> Iterator[str]:
+        """Orient the joints of an arm: bones lie along x, the elbow bends toward +z."""
+        clip, above = self.clip, "chest" if self.clip.has("chest") else "spine"
+        shoulder, upper, lower, hand = (side + part for part in _ARM)
+        if clip.has(shoulder):
+            bone = _bone(clip, shoulder, sign * self.axis(above, _X))
+            self.orient(shoulder, bone, sign * _X, self.axis(above, _Y), _Y)
+            above = shoulder
+            yield shoulder
+        arm = _bone(clip, upper)
+        forearm = _bone(clip, lower, arm)
+        hinge = -sign * torch.linalg.cross(arm, forearm)
+        bends = self.is_hinge(upper, hinge)
+        # An arm that stays straight has no more twist against the body than the shortest arc from the T-pose gives it.
+        arc = rotations.between_vectors(sign * self.axis(above, _X), arm)
+        self.orient(upper, arm, sign * _X, hinge if bends else rotations.rotate(arc, self.axis(above, _Y)), _Y)
+        self.orient(lower, forearm, sign * _X, hinge if bends else self.axis(upper, _Y), _Y)
+        if clip.has(hand):
+            self.orient(hand, _bone(clip, hand, forearm), sign * _X, self.axis(lower, _Y), _Y)
+            self.continue_frame(hand, lower)
+        if bends:
+            yield upper
+
+    def _orient_leg(self, side: str, pitch: float) -> Iterator[str]:
+        """Orient the joints of a leg: bones lie along -y, the knee bends toward -z, the foot is as when it is flat."""
+        clip = self.clip
+        upper, lower, foot, toes = (side + part for part in ("UpperLeg", "LowerLeg", "Foot", "Toes"))
+        thigh, shin = _bone(clip, upper), _bone(clip, lower)
+        hinge = torch.linalg.cross(thigh, shin)
+        bends = self.is_hinge(upper, hinge)
+        hinge = hinge if bends else self.axis("hips", _X)
+        self.orient(upper, thigh, -_Y, hinge, _X)
+        self.orient(lower, shin, -_Y, hinge, _X)
+        if bends:
+            yield from (upper, lower)
+        bone, across = clip.bone(foot), self.axis(lower, _X)
+        if bone is None:  # nothing but the shin shows where the foot points
+            self.orient(foot, shin, -_Y, across, _X)
+        else:
+            flat = torch.tensor([0.0, -math.sin(pitch), math.cos(pitch)], dtype=torch.float64)
+            self.orient(foot, bone, flat, across, _X)
+            if self.in_quarter_turns and _angle_between(self.frames[foot], self.measured[foot]) > _ROUNDING:
+                # The foot's axes are along its sole, not along its bone.
+                bone = unit_vectors(bone)
+                level = math.cos(pitch) * bone + math.sin(pitch) * torch.linalg.cross(bone, unit_vectors(across))
+                self.orient(foot, level, _Z, across, _X)
+        if clip.has(toes):
+            self.orient(toes, self.axis(foot, _X), _X, self.axis(foot, _Y), _Y)
+
 
 def estimate_frames(
     clip: RigPoses, upright: Float[Tensor, "4"] | None, own: Float[Tensor, "rigged 4"] | None = None
@@ -234,106 +315,20 @@ def estimate_frames(
     Where the axes of all joints of CORE are near the canonical ones, the rig is built in quarter turns, and its joints
     are rounded to them. `own` is the rotation (xyzw) of each joint's own axes in the file against those of the poses.
     """
-    axes = None if own is None else rotations.to_matrix(own)
-    turns = rotations.to_matrix(clip.orientations)
-    turns = turns if axes is None else turns @ axes
-    found, certain = _orient_joints(_Builder(clip, turns), upright)
+    turns, pitch = rotations.to_matrix(clip.orientations), _estimate_foot_pitch(clip, upright)
+    axes = torch.eye(3, dtype=turns.dtype).expand_as(turns[0]) if own is None else rotations.to_matrix(own)
+    found = _Builder(clip, turns if own is None else turns @ axes)
+    certain = found.orient_joints(pitch)
     core = [found.frames[name] for name in CORE if clip.has(name)]
     if all(_angle_between(frame, torch.stack([_nearest_axis(axis) for axis in frame])) < _ROUNDING for frame in core):
-        found, _ = _orient_joints(_Builder(clip, turns, in_quarter_turns=True), upright)
+        found = _Builder(clip, found.turns, in_quarter_turns=True)
+        found.orient_joints(pitch)
     frames = found.frames
-    if axes is not None:
+    if own is not None:
         frames, certain = (
             {name: frame @ axes[clip.joint(name)].T for name, frame in some.items()} for some in (frames, certain)
         )
     return Anatomy(frames, certain, found.in_quarter_turns)
-
-
-def _orient_joints(found: _Builder, upright: Tensor | None) -> tuple[_Builder, dict[str, Tensor]]:
-    """Orient all joints; also return the frames of those that are certain."""
-    clip, pitch = found.clip, _estimate_foot_pitch(found.clip, upright)
-    # Files disagree by 33 degrees about where the spine is over the hips: enough to tell which pelvis is wrong.
-    found.orient("hips", clip.side_line("UpperLeg"), _X, clip.position("spine") - clip.middle("UpperLeg"), _Y)
-    certain = {"hips": found.frames["hips"]}
-    known = [*_orient_trunk(found)]
-    for side, sign in SIGNS:
-        known += [*_orient_arm(found, side, sign), *_orient_leg(found, side, pitch)]
-    return found, certain | {name: found.frames[name] for name in known}
-
-
-def _orient_trunk(found: _Builder) -> Iterator[str]:
-    clip = found.clip
-    # The pelvis is up against the legs where both are stretched, else along the spine.
-    (left, first), (right, second) = (_leg_extension(clip, side) for side, _ in SIGNS)
-    along_spine = unit_vectors(clip.position("spine") - clip.middle("UpperLeg"))
-    up = _SPINE_WEIGHT * along_spine - first * second * (left + right)
-    found.orient("hips", clip.side_line("UpperLeg"), _X, up, _Y)
-    top = "chest" if clip.has("chest") else "spine"
-    if top == "chest":
-        found.orient("chest", clip.side_line("Shoulder"), _X, _bone(clip, "chest", clip.up()), _Y)
-        yield "chest"
-    across = found.axis("hips", _X) + (found.axis("chest", _X) if top == "chest" else clip.side_line("Shoulder"))
-    found.orient("spine", _bone(clip, "spine", clip.up()), _Y, across, _X)
-    for name in ("neck", "head"):
-        if clip.has(name):
-            up, bone = found.axis(top, _Y), _bone(clip, name, found.axis(top, _Y))
-            bone = bone if float((bone * up).sum(-1).mean()) > _HEAD_UP else up
-            found.orient(name, bone, _Y, found.axis(top, _X), _X)
-    if clip.has("head"):
-        found.continue_frame("head", "neck")
-
-
-def _orient_arm(found: _Builder, side: str, sign: float) -> Iterator[str]:
-    """Orient the joints of an arm: bones lie along x, the elbow bends toward +z."""
-    clip, above = found.clip, "chest" if found.clip.has("chest") else "spine"
-    shoulder, upper, lower, hand = (side + part for part in _ARM)
-    if clip.has(shoulder):
-        found.orient(
-            shoulder, _bone(clip, shoulder, sign * found.axis(above, _X)), sign * _X, found.axis(above, _Y), _Y
-        )
-        above = shoulder
-        yield shoulder
-    arm = _bone(clip, upper)
-    forearm = _bone(clip, lower, arm)
-    hinge = -sign * torch.linalg.cross(arm, forearm)
-    bends = found.is_hinge(upper, hinge)
-    # An arm that stays straight has no more twist against the body than the shortest arc from the T-pose gives it.
-    arc = rotations.between_vectors(sign * found.axis(above, _X), arm)
-    found.orient(upper, arm, sign * _X, hinge if bends else rotations.rotate(arc, found.axis(above, _Y)), _Y)
-    found.orient(lower, forearm, sign * _X, hinge if bends else found.axis(upper, _Y), _Y)
-    if clip.has(hand):
-        found.orient(hand, _bone(clip, hand, forearm), sign * _X, found.axis(lower, _Y), _Y)
-        found.continue_frame(hand, lower)
-    if bends:
-        yield upper
-
-
-def _orient_leg(found: _Builder, side: str, pitch: float) -> Iterator[str]:
-    """Orient the joints of a leg: bones lie along -y, the knee bends toward -z, the foot is as when it is flat."""
-    clip = found.clip
-    upper, lower, foot, toes = (side + part for part in ("UpperLeg", "LowerLeg", "Foot", "Toes"))
-    thigh, shin = _bone(clip, upper), _bone(clip, lower)
-    hinge = torch.linalg.cross(thigh, shin)
-    bends = found.is_hinge(upper, hinge)
-    hinge = hinge if bends else found.axis("hips", _X)
-    found.orient(upper, thigh, -_Y, hinge, _X)
-    found.orient(lower, shin, -_Y, hinge, _X)
-    if bends:
-        yield from (upper, lower)
-    bone = clip.bone(foot)
-    if bone is None:  # nothing but the shin shows where the foot points
-        found.orient(foot, shin, -_Y, found.axis(lower, _X), _X)
-    else:
-        flat = torch.tensor([0.0, -math.sin(pitch), math.cos(pitch)], dtype=torch.float64)
-        across = found.axis(lower, _X)
-        found.orient(foot, bone, flat, across, _X)
-        if found.in_quarter_turns and _angle_between(found.frames[foot], found.measured[foot]) > _ROUNDING:
-            # The foot's axes are along its sole, not along its bone.
-            bone = unit_vectors(bone)
-            level = math.cos(pitch) * bone + math.sin(pitch) * torch.linalg.cross(bone, unit_vectors(across))
-            found.orient(foot, level, _Z, across, _X)
-    if clip.has(toes):
-        found.orient(toes, found.axis(foot, _X), _X, found.axis(foot, _Y), _Y)
 
 
 def _leg_extension(clip: RigPoses, side: str) -> tuple[Vectors, Float[Tensor, "poses 1"]]:
@@ -460,29 +455,13 @@ def match_by_tree(skeleton: Skeleton) -> Mapping[str, int]:
         for legs in tree.find_limb_pairs(hips):
             others = [child for child in tree.children[hips] if child not in (legs[0][0], legs[1][0])]
             for trunk in sorted(others, key=lambda child: -tree.reach[child]):
-                for chest in tree.below(trunk):
+                chests = [trunk]
+                for chest in chests:  # parents first
+                    chests += tree.children[chest]
                     arms = tree.find_limb_pairs(chest)
                     if arms:
-                        return _name_body_joints(tree, hips, legs, chest, arms[0])
+                        return tree.name_joints(hips, legs, chest, arms[0])
     return {}
-
-
-def _name_body_joints(tree: "JointTree", hips: int, legs: LimbPair, chest: int, arms: LimbPair) -> Mapping[str, int]:
-    found = {"hips": hips}
-    for side, leg, arm in zip(("left", "right"), legs, arms, strict=True):
-        found |= tree.limb(leg, [side + part for part in ("", "UpperLeg", "LowerLeg", "Foot", "Toes")])
-        found |= tree.limb(arm, [side + part for part in ("Shoulder", "UpperArm", "LowerArm", "Hand", "")])
-    trunk = path_below(tree.skeleton, hips, chest)
-    if trunk:
-        found["spine"] = trunk[0]
-    if len(trunk) > 1:
-        found["chest"] = trunk[-1]
-    others = [child for child in tree.children[chest] if child not in (arms[0][0], arms[1][0])]
-    if others:
-        neck = max(others, key=lambda child: tree.reach[child])
-        head = max(tree.children[neck], key=lambda child: tree.length[child] + tree.reach[child], default=None)
-        found |= {"head": neck} if head is None else {"neck": neck, "head": head}
-    return found
 
 
 class JointTree:
@@ -501,35 +480,41 @@ class JointTree:
     def find_limb_pairs(self, joint: int) -> list[LimbPair]:
         """Find branches that are a pair of limbs, bone for bone of about the same length; the longest pair first."""
         found = []
-        for k, first in enumerate(self.children[joint]):
-            for second in self.children[joint][k + 1 :]:
-                paths = self.trace_limb_pair(first, second)
-                long = sum(self.length[joint] for joint in paths[0][1:])
-                far = long >= _MIN_REACH_SHARE * self.reach[joint]
-                if far and len(paths[0]) >= 3 and are_alike(self.length[first], self.length[second], _MAX_LENGTH_RATIO):
-                    found.append((-long, paths))
+        for first, second in combinations(self.children[joint], 2):
+            paths = [first], [second]
+            while True:  # down as long as they are alike; a sword in one hand is not
+                ends = product(self.children[paths[0][-1]], self.children[paths[1][-1]])
+                steps = [(a, b) for a, b in ends if are_alike(self.length[a], self.length[b], _MAX_LENGTH_RATIO)]
+                if not steps:
+                    break
+                best = max(steps, key=lambda step: min(self.reach[joint] + self.length[joint] for joint in step))
+                for path, below in zip(paths, best, strict=True):
+                    path.append(below)
+            long = sum(self.length[below] for below in paths[0][1:])
+            far = long >= _MIN_REACH_SHARE * self.reach[joint]
+            if far and len(paths[0]) >= 3 and are_alike(self.length[first], self.length[second], _MAX_LENGTH_RATIO):
+                found.append((-long, paths))
         return [paths for _, paths in sorted(found)]
 
-    def trace_limb_pair(self, first: int, second: int) -> LimbPair:
-        """Follow two branches down as long as they are alike; a sword in one hand is not."""
-        paths = [first], [second]
-        while True:
-            ends = product(self.children[paths[0][-1]], self.children[paths[1][-1]])
-            steps = [(a, b) for a, b in ends if are_alike(self.length[a], self.length[b], _MAX_LENGTH_RATIO)]
-            if not steps:
-                return paths
-            best = max(steps, key=lambda step: min(self.reach[joint] + self.length[joint] for joint in step))
-            for path, joint in zip(paths, best, strict=True):
-                path.append(joint)
-
-    def below(self, joint: int) -> list[int]:
-        """Return the joint and all below it, parents first."""
-        found = [joint]
-        for above in found:
-            found.extend(self.children[above])
+    def name_joints(self, hips: int, legs: LimbPair, chest: int, arms: LimbPair) -> dict[str, int]:
+        """Name the joints of a body with these legs and arms."""
+        found = {"hips": hips}
+        for side, leg, arm in zip(("left", "right"), legs, arms, strict=True):
+            found |= self._name_limb(leg, [side + part for part in ("", "UpperLeg", "LowerLeg", "Foot", "Toes")])
+            found |= self._name_limb(arm, [side + part for part in ("Shoulder", "UpperArm", "LowerArm", "Hand", "")])
+        trunk = path_below(self.skeleton, hips, chest)
+        if trunk:
+            found["spine"] = trunk[0]
+        if len(trunk) > 1:
+            found["chest"] = trunk[-1]
+        others = [child for child in self.children[chest] if child not in (arms[0][0], arms[1][0])]
+        if others:
+            neck = max(others, key=lambda child: self.reach[child])
+            head = max(self.children[neck], key=lambda child: self.length[child] + self.reach[child], default=None)
+            found |= {"head": neck} if head is None else {"neck": neck, "head": head}
         return found
 
-    def limb(self, path: list[int], names: list[str]) -> dict[str, int]:
+    def _name_limb(self, path: list[int], names: list[str]) -> dict[str, int]:
         """Name a limb's joints: the second and third begin its two longest bones; a bare side is no name."""
         both = [self.length[path[k + 1]] + self.length[path[k + 2]] for k in range(len(path) - 2)]
         upper = max(range(len(both)), key=both.__getitem__)
@@ -606,7 +591,7 @@ _MIN_ANIMAL = 2  # joints named as an animal's, from which it is one
 _SQUARE = 0.5  # cosine between trunk and legs, below which the trunk lies across them
 _ALONG = 0.7  # cosine between arms and legs, above which the arms stand beside the legs
 _DEPTH = 0.7  # of the feet under the hips, from which hands are on the ground as well
-_STANDS = -0.7  # cosine between trunk and legs, below which somebody stands upright
+_STANDS = -0.7  # cosine between trunk and legs, below which the body stands upright
 _MOST = 0.95  # share of a clip's frames on all fours that shows it, where the rest pose does not
 _BODIES_APART = 0.1  # metres between the hips of two bodies
 _LIMB_SHARE = 0.7  # of an arm's length, from which another pair of limbs is one
@@ -615,11 +600,11 @@ _LIMB_SHARE = 0.7  # of an arm's length, from which another pair of limbs is one
 def goes_on_four_legs(skeleton: Skeleton, zero: RigPoses, clip: RigPoses | None) -> bool:
     """Return whether the body is a four-legged one: by its joints' names, or by a trunk across four parallel limbs.
 
-    The pose with all rotations zero tells where it is one; a clip in which the body stands upright overrules it.
+    The pose with all rotations zero shows where it is one; a clip in which the body stands upright overrules it.
     """
     if sum(bool(_ANIMAL.search(name)) for name in skeleton.names) >= _MIN_ANIMAL:
         return True
-    if clip is not None and bool((_trunk_against_legs(clip) < _STANDS).any()):
+    if clip is not None and bool(((clip.up() * _limbs(clip, "Leg")).sum(-1) < _STANDS).any()):
         return False
     return bool(_is_on_all_fours(zero)[0])
 
@@ -627,6 +612,22 @@ def goes_on_four_legs(skeleton: Skeleton, zero: RigPoses, clip: RigPoses | None)
 def stays_on_all_fours(clip: RigPoses) -> bool:
     """Return whether the body has hands beside its feet under a level trunk in nearly all frames."""
     return float(_is_on_all_fours(clip).double().mean()) >= _MOST
+
+
+def _is_on_all_fours(poses: RigPoses) -> Bool[Tensor, " poses"]:
+    """Return whether the trunk lies across parallel arms and legs, and the hands are about as far down as the feet,
+    which those of a crouching person are not."""
+    legs, arms = _limbs(poses, "Leg"), _limbs(poses, "Arm")
+    front = "Hand" if poses.has("leftHand", "rightHand") else "LowerArm"
+    depth = [((poses.middle(part) - poses.middle("UpperLeg")) * legs).sum(-1) for part in (front, "Foot")]
+    square = ((poses.up() * legs).sum(-1).abs() < _SQUARE) & ((legs * arms).sum(-1) > _ALONG)
+    return square & (depth[0] > _DEPTH * depth[1])
+
+
+def _limbs(poses: RigPoses, part: str) -> Float[Tensor, "poses 3"]:
+    """Return the mean direction of both upper and lower limbs of a kind, downward along them."""
+    bones = [poses.bone(f"{side}{half}{part}") for side in ("left", "right") for half in ("Upper", "Lower")]
+    return unit_vectors(sum((bone for bone in bones if bone is not None), torch.zeros_like(poses.positions[:, 0])))
 
 
 def find_second_body(poses: RigPoses, joints: Mapping[str, int]) -> int | None:
@@ -662,24 +663,3 @@ def find_further_limbs(skeleton: Skeleton, joints: Mapping[str, int]) -> tuple[i
             if long and not descendants(skeleton, {first[0], second[0]}) & limbs:
                 return first[0], second[0]
     return None
-
-
-def _is_on_all_fours(poses: RigPoses) -> Bool[Tensor, " poses"]:
-    """Return whether the trunk lies across parallel arms and legs, and the hands are about as far down as the feet,
-    which those of a crouching person are not."""
-    legs, arms = _limbs(poses, "Leg"), _limbs(poses, "Arm")
-    front = "Hand" if poses.has("leftHand", "rightHand") else "LowerArm"
-    depth = [((poses.middle(part) - poses.middle("UpperLeg")) * legs).sum(-1) for part in (front, "Foot")]
-    square = (_trunk_against_legs(poses).abs() < _SQUARE) & ((legs * arms).sum(-1) > _ALONG)
-    return square & (depth[0] > _DEPTH * depth[1])
-
-
-def _trunk_against_legs(poses: RigPoses) -> Float[Tensor, " poses"]:
-    """Return the cosine between trunk and legs: -1 where somebody stands upright."""
-    return (poses.up() * _limbs(poses, "Leg")).sum(-1)
-
-
-def _limbs(poses: RigPoses, part: str) -> Float[Tensor, "poses 3"]:
-    """Return the mean direction of both upper and lower limbs of a kind, downward along them."""
-    bones = [poses.bone(f"{side}{half}{part}") for side in ("left", "right") for half in ("Upper", "Lower")]
-    return unit_vectors(sum((bone for bone in bones if bone is not None), torch.zeros_like(poses.positions[:, 0])))

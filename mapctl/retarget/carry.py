@@ -1,15 +1,11 @@
 """Retargeting: motion of one performer on the bones of another, with the same contacts.
 
-Rotations stay, but of legs, and of arms whose hands are near something. The hips go as far and as high as the legs'
-lengths and the ground ask for, each toe joint is as high over its own rest height as the giver's over his, in scale,
-and while a foot is planted it moves as little as the giver's. Hands near the body, each other or the floor are brought
-where they were relative to these. Two-bone inverse kinematics brings legs and arms there. (The footsteps are kept as
-in Gleicher 1998, but joint by joint instead of by spacetime optimisation.)
-
-Where hips and feet go on the receiving body: the giver's trajectories in scale, as legs and ground ask for.
-
-What the giver's feet stand on is the floor, or what is higher, as stairs and platforms. Toes are as far over their own
-rest height as the giver's, standing ones where the giver's stand.
+Rotations stay, but of legs, and of arms whose hands are near something. Hips follow the giver's trajectory in scale, as
+high as legs and ground ask for; each toe joint is as high over its own rest height as the giver's over his, in scale,
+and a planted foot moves as little as the giver's. Hands near the body, each other or the floor are brought where they
+were relative to these. Two-bone inverse kinematics brings legs and arms there. (The footsteps are kept as in Gleicher
+1998, but joint by joint instead of by spacetime optimisation.) What feet stand on is the floor, or what is higher, as
+stairs and platforms.
 """
 
 import math
@@ -44,7 +40,6 @@ from mapctl.retarget.character import (
     limb_lengths,
 )
 from mapctl.retarget.hands import (
-    HandTargets,
     Spans,
     envelope,
     hold_through,
@@ -73,8 +68,12 @@ class Miss:
     """Frame in which that is."""
     frames: int = 0
     """Frames in which one is farther off than is worth a line: 0.5 cm for feet, 1 cm for hands."""
-    of_frames: int = 0
-    """Frames of the motion."""
+
+    @staticmethod
+    def of(off: Float[Tensor, "frames 2"], noted: float) -> "Miss":
+        """Measure by how many metres effectors are off, noted from so many metres on."""
+        farthest = off.amax(dim=-1)
+        return Miss(float(farthest.max()), int(farthest.argmax()), int((farthest > noted).sum()))
 
 
 @dataclass(frozen=True)
@@ -83,32 +82,14 @@ class Changes:
 
     scale: float = 1.0
     """Length of the body's legs over the giver's."""
-    travel_ratio: float = 1.0
-    """Way of the hips over the ground over the giver's; 1 for who stays in place."""
     hips_lowered_m: float = 0.0
     """How much lower the hips are at most than in scale, metres, for legs that are too short."""
-    hands_moved_m: float = 0.0
-    """How far hands are moved at most to where they touch what the giver's touch, metres."""
     feet_missed: Miss = Miss()
     """Ankles against their targets."""
     hands_missed: Miss = Miss()
     """Hands that are near something against their targets."""
-    foot_tilt_deg: float = 0.0
-    """By how much the giver's T-pose lays its feet wrongly at most, degrees, positive down; it is taken out."""
     unmatched_joints: tuple[str, ...] = ()
     """Joints of the giver that move and have no counterpart."""
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Return sentences about what could not be kept; empty where all is."""
-        feet, hands, dip, names = self.feet_missed, self.hands_missed, self.hips_lowered_m, self.unmatched_joints
-        found = (
-            (feet.frames, _note_miss("the legs are too short for some of the way: feet are", feet, _FOOT_METRES)),
-            (hands.frames, _note_miss("the arms are too short for some of it: hands are", hands, _HAND_METRES)),
-            (dip >= _DIP_METRES, f"the hips are up to {100 * dip:.1f} cm lower than in scale, so that the feet reach"),
-            (names, f"joints without a counterpart are left out: {abbreviate_names(names)}"),
-        )
-        return tuple(note for counts, note in found if counts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,51 +106,22 @@ class RetargetedMotion:
     @property
     def notes(self) -> tuple[str, ...]:
         """Return sentences about what could not be kept; empty where all is."""
-        return self.changes.notes
-
-
-def measure_changes(
-    given: Motion,
-    done: Motion,
-    ankles: Float[Tensor, "frames 2 3"],
-    hands: HandTargets,
-    *,
-    dip: Float[Tensor, "frames 3"],
-    tilt: Float[Tensor, "2 2"],
-) -> Changes:
-    """Measure what became of a motion (canonical joints): `ankles` and `hands` are what was aimed at, `dip` how much
-    lower the hips are than in scale, metres, `tilt` the pitch of foot and toes taken out of each foot, radians."""
-    ways = [float(m.root_position[:, ::2].diff(dim=0).norm(dim=-1).sum()) for m in (done, given)]
-    return Changes(
-        scale=leg_length(done.skeleton) / leg_length(given.skeleton),
-        travel_ratio=ways[0] / ways[1] if ways[1] > 1e-6 else 1.0,
-        hips_lowered_m=max(0.0, float(dip[:, 1].max())),
-        hands_moved_m=float(hands.offset.norm(dim=-1).max()),
-        feet_missed=_measure_miss((done.joint_positions()[:, FEET] - ankles).norm(dim=-1), _FOOT_METRES),
-        hands_missed=_measure_miss(hands.errors, _HAND_METRES),
-        foot_tilt_deg=-math.degrees(float(tilt[:, 0].flatten()[tilt[:, 0].abs().argmax()])),
-    )
-
-
-def list_unmatched_joints(clip: Motion, giver: RigMap, matched: Collection[int]) -> tuple[str, ...]:
-    """List the joints of a clip that move and are not `matched`, nor is or hangs from them any canonical joint: what
-    their turns do is lost."""
-    led_by = ancestors(clip.skeleton, [*giver.joints.values(), *matched])
-    dots = (clip.local_quat_xyzw * clip.local_quat_xyzw[:1]).sum(-1).abs().amin(dim=0).clamp(max=1.0)
-    moves = 2 * torch.acos(dots) > _MOVES_RADIANS
-    return tuple(name for j, name in enumerate(clip.skeleton.names) if j not in led_by and bool(moves[j]))
-
-
-def _measure_miss(off: Float[Tensor, "frames 2"], noted: float) -> Miss:
-    farthest = off.amax(dim=-1)
-    return Miss(float(farthest.max()), int(farthest.argmax()), int((farthest > noted).sum()), len(off))
-
-
-def _note_miss(begin: str, miss: Miss, noted: float) -> str:
-    return (
-        f"{begin} up to {100 * miss.metres:.1f} cm off (frame {miss.frame}), by more than {100 * noted:g} cm in"
-        f" {miss.frames} of {miss.of_frames} frames"
-    )
+        changes = self.changes
+        found = [
+            f"the {name} are too short for some of it: {ends} are up to {100 * miss.metres:.1f} cm off (frame"
+            f" {miss.frame}), by more than {100 * noted:g} cm in {miss.frames} frames"
+            for name, ends, miss, noted in (
+                ("legs", "feet", changes.feet_missed, _FOOT_METRES),
+                ("arms", "hands", changes.hands_missed, _HAND_METRES),
+            )
+            if miss.frames
+        ]
+        if changes.hips_lowered_m >= _DIP_METRES:
+            dip = f"{100 * changes.hips_lowered_m:.1f} cm"
+            found.append(f"the hips are up to {dip} lower than in scale, so that the feet reach")
+        if changes.unmatched_joints:
+            found.append(f"joints without a counterpart are left out: {abbreviate_names(changes.unmatched_joints)}")
+        return tuple(found)
 
 
 _FREE_EXTENSION = 0.985  # of the leg: a leg may be that straight, whatever the giver's is
@@ -197,34 +149,23 @@ _HIPS_SHARE = 0.5  # of the leg, that hips are over a foot that bears them
 _BODY_SECONDS = 0.2  # seconds over which the ground under the hips is smoothed
 
 
-@dataclass(frozen=True, eq=False)
-class Ground:
-    """Where a giver's feet stand; in the order left, right."""
+def find_ground(own: Motion, stance: Stance) -> tuple[list[Spans], Float[Tensor, "frames 2"]]:
+    """Find what the left and the right foot of a clip stand on (canonical joints, feet level in the T-pose).
 
-    spans: tuple[Spans, ...]
-    """Contacts by foot: first frame and one past the last."""
-    height: Float[Tensor, "frames 2"]
-    """Height of what each foot stands on over the clip's floor, metres; on the way from one contact to the next
-    smoothly between theirs."""
-
-    def under_hips(self, fps: float) -> Float[Tensor, " frames"]:
-        """Return the height of the ground under the body over the clip's floor, metres: the mean of both feet's."""
-        return low_pass(self.height.mean(dim=1, keepdim=True), _BODY_SECONDS * fps)[:, 0]
-
-
-def find_ground(own: Motion, stance: Stance) -> Ground:
-    """Find what the feet of a clip stand on (canonical joints, feet level in the T-pose)."""
+    Return the contacts of each, and the height over the clip's floor of what it stands on, metres; between two contacts
+    smoothly from one to the other.
+    """
     toes, frames = own.joint_positions()[:, TOES], own.num_frames
     over = toes[..., 1] - stance.floor - stance.flat_height
     bearing = _detect_bearing(own)
-    spans, heights = merge_contacts(contacts.detect_contacts(toes, own.fps) | bearing, toes, float(own.fps)), []
+    spans = merge_contacts(contacts.detect_contacts(toes, own.fps) | bearing, toes, float(own.fps))
+    heights = torch.zeros(frames, 2, dtype=torch.float64)
     for k, of_foot in enumerate(spans):
-        height = torch.zeros(frames, 1, dtype=torch.float64)
         if of_foot:
             means, bears = (mean_by_span(v[:, k, None], of_foot) for v in (over, bearing.double()))
-            height = hold_through(of_foot, torch.where((bears > 0.5) & (means > _RAISED_METRES), means, 0.0), frames)
-        heights.append(height)
-    return Ground(tuple(spans), torch.cat(heights, dim=1))
+            raised = torch.where((bears > 0.5) & (means > _RAISED_METRES), means, 0.0)
+            heights[:, k] = hold_through(of_foot, raised, frames)[:, 0]
+    return spans, heights
 
 
 def _detect_bearing(own: Motion) -> Bool[Tensor, "frames 2"]:
@@ -244,7 +185,7 @@ def _detect_bearing(own: Motion) -> Bool[Tensor, "frames 2"]:
     return contacts.remove_short_runs(still, max(1, round(_STILL_SECONDS * fps)))
 
 
-def transfer_root(
+def _transfer_root(
     own: Motion, giver: RiggedCharacter, body: RiggedCharacter, scale: float, raised: Float[Tensor, " frames"]
 ) -> Motion:
     """Put the giver's rotations on the body's bones. The middle between the thighs follows its trajectory in scale, as
@@ -253,15 +194,11 @@ def transfer_root(
     turns = own.joint_rotations()[:, 0]
     # The hips' rotation is noisy; what they carry at another distance is not to shake for it.
     aside = low_pass(rotations.rotate(turns, to_thighs.expand(own.num_frames, 3)), _SMOOTH_SECONDS * float(own.fps))
-    ankle = _ankle_height(body.stance.standing_height, body.leveled)
-    others = _ankle_height(giver.stance.flat_height, own.skeleton)
+    # Ankles over the floor while feet lie flat, mean of both.
+    ankle = (body.stance.standing_height - body.leveled.offsets[TOES, 1]).mean()
+    others = (giver.stance.flat_height - own.skeleton.offsets[TOES, 1]).mean()
     rise = _UP * (ankle - scale * others + (1 - scale) * giver.stance.floor + raised)[:, None]
     return replace(own, skeleton=body.leveled, root_position=scale * own.root_position + rise - aside, source=None)
-
-
-def _ankle_height(toe_height: Float[Tensor, "2"], leveled: Skeleton) -> Float[Tensor, ""]:
-    """Return the height of the ankles over the floor while feet lie flat, metres, mean of both."""
-    return (toe_height - leveled.offsets[TOES, 1]).mean()
 
 
 def fit_hips(moved: Motion, ankles: Float[Tensor, "frames 2 3"], stretch: Float[Tensor, "frames 2"]) -> Motion:
@@ -275,7 +212,8 @@ def fit_hips(moved: Motion, ankles: Float[Tensor, "frames 2 3"], stretch: Float[
     say = smootherstep((stretch - bent) / (straight - bent)) * smootherstep((down - begin) / (end - begin))
     total = say.sum(dim=-1, keepdim=True)
     lower = (say * short).sum(dim=-1, keepdim=True) / (total + _LEAST_SAY)
-    return _lower(moved, low_pass(lower, _HIP_FIT_SECONDS * float(moved.fps)))
+    dip = low_pass(lower, _HIP_FIT_SECONDS * float(moved.fps))
+    return replace(moved, root_position=moved.root_position - dip * _UP)
 
 
 def lower_hips(moved: Motion, ankles: Float[Tensor, "frames 2 3"], stretch: Float[Tensor, "frames 2"]) -> Motion:
@@ -283,7 +221,8 @@ def lower_hips(moved: Motion, ankles: Float[Tensor, "frames 2 3"], stretch: Floa
     short, down = _find_missing_length(moved, ankles, stretch.clamp(_FREE_EXTENSION, _MAX_EXTENSION))
     # A leg that points sideways or up is not helped by lower hips.
     short = torch.where(down > _DOWN_SHARES[0], short.clamp_min(0), 0.0).amax(dim=-1, keepdim=True)
-    return _lower(moved, envelope(short, _HIP_DROP_SECONDS, float(moved.fps)))
+    dip = envelope(short, _HIP_DROP_SECONDS, float(moved.fps))
+    return replace(moved, root_position=moved.root_position - dip * _UP)
 
 
 def _find_missing_length(
@@ -297,27 +236,32 @@ def _find_missing_length(
     return down - (most.square() - level).clamp_min(0).sqrt(), down / most
 
 
-def _lower(moved: Motion, dip: Float[Tensor, "frames 1"]) -> Motion:
-    return replace(moved, root_position=moved.root_position - dip * _UP)
-
-
-def find_ankle_targets(
-    own: Motion, moved: Motion, giver: Stance, body: Stance, ground: Ground, *, scale: float, raised: Tensor
+def _find_ankle_targets(
+    own: Motion,
+    moved: Motion,
+    giver: Stance,
+    body: Stance,
+    spans: list[Spans],
+    ground: Float[Tensor, "frames 2"],
+    raised: Float[Tensor, "frames 2"],
+    *,
+    scale: float,
 ) -> Float[Tensor, "frames 2 3"]:
     """Return target ankle positions, metres: toe joints as the giver's in scale, over their own rest heights, and moved
-    over the ground to where the body's rotations bring them, by as much throughout a contact. High over what they
-    stand on rotations alone count: a kick is a pose, not a position. `raised` (frames, 2) is by how much that ground
-    is kept higher than in scale, metres."""
+    over the ground to where the body's rotations bring them, by as much throughout a contact. High over the `ground`
+    (metres, in scale) rotations alone count: a kick is a pose, not a position. `raised` is by how much the ground is
+    kept higher than in scale, metres."""
     toes, places = own.joint_positions()[:, TOES], scale * own.joint_positions()[:, FEET]
-    shift = moved.joint_positions()[:, TOES] - scale * toes
-    for k, spans in enumerate(ground.spans):
-        aside = shift[:, k, ::2]
-        free = low_pass(aside, _FREE_SECONDS * float(own.fps)) if not spans else None
-        places[:, k, ::2] += hold_through(spans, mean_by_span(aside, spans), len(toes)) if free is None else free
+    aside = (moved.joint_positions()[:, TOES] - scale * toes)[..., ::2]
+    for k, of_foot in enumerate(spans):
+        if of_foot:
+            places[:, k, ::2] += hold_through(of_foot, mean_by_span(aside[:, k], of_foot), len(toes))
+        else:
+            places[:, k, ::2] += low_pass(aside[:, k], _FREE_SECONDS * float(own.fps))
     over = scale * (toes[..., 1] - giver.floor - giver.flat_height)
     lifted = torch.where(over < 0, MAX_TOE_SINK * torch.expm1(over / MAX_TOE_SINK) - over, 0.0)
     places[..., 1] += (1 - scale) * giver.floor + body.standing_height - scale * giver.flat_height + lifted + raised
-    share = (over - scale * ground.height) / leg_length(moved.skeleton)
+    share = (over - ground) / leg_length(moved.skeleton)
     high = smootherstep((share - _LOW_SHARE) / _HIGH_SHARE)[..., None]
     return torch.lerp(places + _foot_length_offset(own, moved, scale), moved.joint_positions()[:, FEET], high)
 
@@ -372,17 +316,21 @@ def retarget_motion(
     """Retarget a clip of any rig to a body's bones, in the canonical joint frames of its rig.
 
     A clip of the body's own skeleton comes as it is, to the bit. `rig` is the clip's, where it is not the one that
-    would be recognised. `ground`: see `GroundMode`. RequestError where the clip's joints cannot be identified, or for
-    another `ground`.
+    would be recognised. RequestError where the clip's joints cannot be identified, or for another `ground` than those
+    of `GroundMode`.
     """
     if clip.skeleton.matches(body.rigmap.rig_skeleton):
         return RetargetedMotion(replace(to_canonical(clip, as_rig(body.rigmap))[0], skeleton=body.skeleton))
     canonical, giver = RiggedCharacter.of(clip, rig)
     found = retarget_canonical(canonical, giver, body, ground=ground)
     fingers = match_fingers(clip.skeleton, body.rigmap.rig_skeleton)
-    unmatched = list_unmatched_joints(clip, giver.rigmap, fingers.values())
+    # What the turns of joints do that move, are not matched and lead to no joint that is, is lost.
+    led_by = ancestors(clip.skeleton, [*giver.rigmap.joints.values(), *fingers.values()])
+    dots = (clip.local_quat_xyzw * clip.local_quat_xyzw[:1]).sum(-1).abs().amin(dim=0).clamp(max=1.0)
+    moves = 2 * torch.acos(dots) > _MOVES_RADIANS
+    lost = tuple(name for j, name in enumerate(clip.skeleton.names) if j not in led_by and bool(moves[j]))
     carried = _carry_fingers(clip, giver.rigmap, body.rigmap, fingers)
-    return replace(found, changes=replace(found.changes, unmatched_joints=unmatched), fingers=carried)
+    return replace(found, changes=replace(found.changes, unmatched_joints=lost), fingers=carried)
 
 
 def retarget_canonical(
@@ -392,21 +340,24 @@ def retarget_canonical(
     than those of `GroundMode`."""
     if ground not in get_args(GroundMode):
         raise RequestError(f"the ground is one of {', '.join(get_args(GroundMode))}, got {ground!r}")
-    keeps = ground == "keep"
-    giver = replace(giver, stance=giver.stance.keep_floor()) if keeps else giver
+    giver = replace(giver, stance=giver.stance.keep_floor()) if ground == "keep" else giver
     own = giver.stance.leveled(motion)
     scale = leg_length(body.leveled) / leg_length(own.skeleton)
-    found = find_ground(own, giver.stance)
-    higher = 1 - scale if keeps else 0.0
-    moved = transfer_root(own, giver, body, scale, higher * found.under_hips(float(own.fps)))
-    raised = higher * found.height
-    ankles = find_ankle_targets(own, moved, giver.stance, body.stance, found, scale=scale, raised=raised)
+    spans, height = find_ground(own, giver.stance)
+    higher = 1 - scale if ground == "keep" else 0.0
+    under_hips = low_pass(height.mean(dim=1, keepdim=True), _BODY_SECONDS * float(own.fps))[:, 0]
+    moved = _transfer_root(own, giver, body, scale, higher * under_hips)
+    grounds = scale * height, higher * height
+    ankles = _find_ankle_targets(own, moved, giver.stance, body.stance, spans, *grounds, scale=scale)
     straight = limb_extension(own, LEGS)
     lowered = lower_hips(fit_hips(moved, ankles, straight), ankles, straight)
     standing = reach_ankle_targets(lowered, ankles)
-    done, hands = keep_hand_relations(own, standing, giver.stance, scale=scale)
-    changes = measure_changes(
-        motion, done, ankles, hands, dip=moved.root_position - lowered.root_position, tilt=giver.stance.tilt
+    done, hands_off = keep_hand_relations(own, standing, giver.stance, scale=scale)
+    changes = Changes(
+        scale=leg_length(done.skeleton) / leg_length(motion.skeleton),
+        hips_lowered_m=max(0.0, float((moved.root_position - lowered.root_position)[:, 1].max())),
+        feet_missed=Miss.of((done.joint_positions()[:, FEET] - ankles).norm(dim=-1), _FOOT_METRES),
+        hands_missed=Miss.of(hands_off, _HAND_METRES),
     )
     return RetargetedMotion(body.stance.restore_foot_tilt(done), changes)
 

@@ -74,13 +74,7 @@ class Stance:
         platform."""
         off = self.toe_offset if abs(self.toe_offset) > _MIN_FLOOR_OFFSET else 0.0
         heights = self.toe_height - off, self.flat_height - off
-        return replace(
-            self,
-            toe_height=heights[0],
-            flat_height=heights[1],
-            floor=self.floor + off,
-            toe_offset=self.toe_offset - off,
-        )
+        return Stance(*heights, self.tilt, self.floor + off, self.toe_offset - off)
 
     @staticmethod
     def at_rest(skeleton: Skeleton) -> "Stance":
@@ -119,13 +113,6 @@ class Stance:
     def restore_foot_tilt(self, motion: Motion) -> Motion:
         """Undo `leveled`."""
         return _rotate_foot_frames(motion, self.tilt)
-
-    def leveled_map(self, rigmap: RigMap) -> RigMap:
-        """Return the map between the rig and canonical joints whose T-pose has its feet flat."""
-        turns = _rotations_about_x(-self.tilt)
-        tpose = rotations.multiply(turns, rigmap.tpose_quat_xyzw)
-        return replace(rigmap, tpose_quat_xyzw=tpose, skeleton=_rotate_bones(rigmap.skeleton, turns))
-
 
 def level_feet(clip: Motion) -> Motion:
     """Return the same movement (canonical joints) with joint frames of feet and toes that are aligned with the world
@@ -214,7 +201,9 @@ class RiggedCharacter:
     @cached_property
     def leveled_map(self) -> RigMap:
         """Between the rig and canonical joints whose T-pose has this performer's feet flat on the floor."""
-        return self.stance.leveled_map(self.rigmap)
+        turns = _rotations_about_x(-self.stance.tilt)
+        tpose = rotations.multiply(turns, self.rigmap.tpose_quat_xyzw)
+        return replace(self.rigmap, tpose_quat_xyzw=tpose, skeleton=_rotate_bones(self.rigmap.skeleton, turns))
 
     @property
     def leveled(self) -> Skeleton:
@@ -263,28 +252,91 @@ def make_tpose_clip(rig: Rig) -> Motion:
     """
     missing = [name for name in REQUIRED if name not in rig.joints]
     if missing:
-        raise RequestError(
-            f"rig {rig.name} names no joint for {', '.join(missing)}: a skeleton cannot be made of it; "
-            "name them, or a clip"
-        )
-    skeleton = _build_skeleton(rig)
-    standing = retarget.from_canonical(_canonical_tpose(), retarget.identify_rig(skeleton, rig))
+        raise RequestError(f"rig {rig.name} names no joint for {', '.join(missing)}; name them, or a clip")
+    root = torch.zeros(_FRAMES, 3, dtype=torch.float64)
+    root[:, 1] = TOE_REST_HEIGHT - RigPoses.zero(CANONICAL).positions[0, TOE_JOINTS[0], 1]
+    still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).expand(_FRAMES, CANONICAL.num_joints, 4)
+    tpose = Motion(CANONICAL, _FPS, root, still.clone())
+    standing = retarget.from_canonical(tpose, retarget.identify_rig(_build_skeleton(rig), rig))
     if rig.metres_per_unit is None:
         return standing
     layout = bvh.choose_layout(standing, rig.name)
     return replace(standing, source=replace(layout, metres_per_unit=rig.metres_per_unit))
 
 
+def _build_skeleton(rig: Rig) -> Skeleton:
+    """Build the joints that the rig names, depth first, as files nest them."""
+    names = CANONICAL.names
+    spine, chest = CANONICAL.index("spine"), CANONICAL.index("chest")
+    places, frames = dict(enumerate(RigPoses.zero(CANONICAL).positions[0])), dict[int, Tensor]()
+    own, above, order = dict[int, str](), dict[int, int](), list[int]()
+
+    def add(joint: int, name: str, parent: int) -> int:
+        own[joint], above[joint] = name, parent
+        order.append(joint)
+        return joint
+
+    def visit(joint: int, parent: int) -> None:
+        if joint == chest and parent == spine and names[chest] in rig.joints:
+            for number, name in enumerate(rig.trunk, start=1):
+                between = add(CANONICAL.num_joints + number, name, parent)
+                places[between] = torch.lerp(places[spine], places[chest], number / (len(rig.trunk) + 1))
+                frames[between], parent = frames[spine], between
+        if names[joint] in rig.joints:
+            axes = rig.tpose.get(names[joint])
+            frames[joint] = frame_from_axes(axes["x"], axes["y"]) if axes else unnamed
+            parent = add(joint, rig.joints[names[joint]], parent)
+        for child in CANONICAL.children(joint):
+            visit(child, parent)
+
+    # Joints that no table has are along the file's axes.
+    unnamed = torch.eye(3, dtype=torch.float64) if rig.tpose else _file_to_world(rig)
+    visit(0, -1)
+    offsets = [places[0] if (p := above[j]) < 0 else frames[p].T @ (places[j] - places[p]) for j in order]
+    tips: dict[str, tuple[float, float, float]] = {}
+    for joint, name in own.items():
+        below = CANONICAL.children(joint) if joint < CANONICAL.num_joints else [chest]
+        if any(names[child] in rig.joints for child in below):
+            continue
+        end = places[below[0]] - places[joint] if below else torch.tensor(CANONICAL.end_offsets[names[joint]]).double()
+        x, y, z = (frames[joint].T @ end).tolist()
+        tips[name] = (x, y, z)
+    parents = tuple(order.index(above[joint]) if above[joint] >= 0 else -1 for joint in order)
+    return Skeleton(tuple(own[joint] for joint in order), parents, torch.stack(offsets), tips)
+
+
+def _file_to_world(rig: Rig) -> Float[Tensor, "3 3"]:
+    """Return the rotation from the rig's world to one with Y up that faces +Z."""
+    upright = None if rig.up == "auto" else upright_rotation(rig.up)
+    up, front = axis_vector("y" if rig.up == "auto" else rig.up), axis_vector("z")
+    if rig.facing != "auto" and abs(float(axis_vector(rig.facing) @ up)) < 0.5:
+        front = axis_vector(rig.facing)
+    elif upright is not None:
+        front = rotations.rotate(rotations.inverse(upright), front)
+    return torch.stack([torch.linalg.cross(up, front), up, front])
+
+
 def load_standing_character(path: str | PathLike[str]) -> Motion | None:
     """Load a second of a character's standing in the rest pose of its file, its soles on the floor; None for files that
     have no rest pose of their own.
 
-    Soles are the lowest vertices that feet carry; where the file has no triangles, the floor is where it has it.
+    Soles are the lowest vertices that feet carry; where the file has no triangles or its rig is not known, the floor is
+    where it has it.
     """
     rest = formats.load_rest(path)
     if rest is None:
         return None
-    down = torch.tensor([0.0, _sole_height(rest, path), 0.0], dtype=torch.float64)
+    sole = 0.0
+    try:
+        mesh = formats.load_mesh(path)
+        rigmap = retarget.identify_rig(rest.skeleton, motion=rest)
+    except MapctlError:
+        pass
+    else:
+        below = descendants(rest.skeleton, [rigmap.joints[side + "Foot"] for side in SIDES])
+        main = np.take_along_axis(mesh.joints, mesh.weights.argmax(axis=1)[:, None], axis=1)[:, 0]
+        sole = float(mesh.vertices[np.isin(main, sorted(below)), 1].min(initial=np.inf))
+    down = torch.tensor([0.0, sole if np.isfinite(sole) else 0.0, 0.0], dtype=torch.float64)
     frames = torch.zeros(_FRAMES, dtype=torch.long)
     return replace(
         rest,
@@ -293,82 +345,3 @@ def load_standing_character(path: str | PathLike[str]) -> Motion | None:
         local_quat_xyzw=rest.local_quat_xyzw[frames],
         moving_offsets={joint: track[frames] for joint, track in rest.moving_offsets.items()},
     )
-
-
-def _sole_height(rest: Motion, path: str | PathLike[str]) -> float:
-    """Return the height of the lowest vertex that a foot, toes or what is below them carry, metres."""
-    try:
-        mesh = formats.load_mesh(path)
-        rigmap = retarget.identify_rig(rest.skeleton, motion=rest)
-    except MapctlError:  # without triangles or a known rig there are no soles
-        return 0.0
-    below = descendants(rest.skeleton, [rigmap.joints[side + "Foot"] for side in SIDES])
-    main = np.take_along_axis(mesh.joints, mesh.weights.argmax(axis=1)[:, None], axis=1)[:, 0]
-    heights = mesh.vertices[np.isin(main, sorted(below)), 1]
-    return float(heights.min()) if len(heights) else 0.0
-
-
-def _canonical_tpose() -> Motion:
-    root = torch.zeros(_FRAMES, 3, dtype=torch.float64)
-    root[:, 1] = TOE_REST_HEIGHT - RigPoses.zero(CANONICAL).positions[0, TOE_JOINTS[0], 1]
-    still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
-    return Motion(CANONICAL, _FPS, root, still.expand(_FRAMES, CANONICAL.num_joints, 4).clone())
-
-
-def _build_skeleton(rig: Rig) -> Skeleton:
-    """Build the joints that the rig names, depth first, as files nest them."""
-    order = [joint for joint in _depth_first(0) if CANONICAL.names[joint] in rig.joints]
-    places = dict(enumerate(RigPoses.zero(CANONICAL).positions[0]))
-    frames = {joint: _joint_frame(rig, CANONICAL.names[joint]) for joint in order}
-    above = {joint: _named_ancestor(joint, rig) for joint in order}
-    own = {joint: rig.joints[CANONICAL.names[joint]] for joint in order}
-    spine, chest = CANONICAL.index("spine"), CANONICAL.index("chest")
-    if above.get(chest) == spine:
-        between = range(CANONICAL.num_joints, CANONICAL.num_joints + len(rig.trunk))
-        for number, joint in enumerate(between, start=1):
-            own[joint], above[joint], frames[joint] = rig.trunk[number - 1], above[chest], frames[spine]
-            places[joint] = torch.lerp(places[spine], places[chest], number / (len(between) + 1))
-            order.insert(order.index(chest), joint)
-            above[chest] = joint
-    offsets = [places[0] if (p := above[j]) is None else frames[p].T @ (places[j] - places[p]) for j in order]
-    ends: dict[str, Tensor] = {}
-    for joint, name in own.items():
-        below = CANONICAL.children(joint) if joint < CANONICAL.num_joints else [chest]
-        if not below:
-            ends[name] = frames[joint].T @ torch.tensor(CANONICAL.end_offsets[CANONICAL.names[joint]]).double()
-        elif all(CANONICAL.names[child] not in rig.joints for child in below):
-            ends[name] = frames[joint].T @ (places[below[0]] - places[joint])
-    parents = tuple(-1 if (p := above[joint]) is None else order.index(p) for joint in order)
-    tips = {name: (float(x), float(y), float(z)) for name, (x, y, z) in ends.items()}
-    return Skeleton(tuple(own[joint] for joint in order), parents, torch.stack(offsets), tips)
-
-
-def _depth_first(joint: int) -> list[int]:
-    return [joint, *(below for child in CANONICAL.children(joint) for below in _depth_first(child))]
-
-
-def _named_ancestor(joint: int, rig: Rig) -> int | None:
-    """Return the nearest canonical joint above that the rig names."""
-    parent = CANONICAL.parents[joint]
-    while parent >= 0 and CANONICAL.names[parent] not in rig.joints:
-        parent = CANONICAL.parents[parent]
-    return None if parent < 0 else parent
-
-
-def _joint_frame(rig: Rig, name: str) -> Float[Tensor, "3 3"]:
-    """Return the rotation of a joint's frame in the T-pose, with Y up: by the table, or by the file's axes."""
-    axes = rig.tpose.get(name)
-    if axes:
-        return frame_from_axes(axes["x"], axes["y"])
-    if rig.tpose:
-        return torch.eye(3, dtype=torch.float64)
-    return _file_to_world(rig)
-
-
-def _file_to_world(rig: Rig) -> Float[Tensor, "3 3"]:
-    up = axis_vector("y" if rig.up == "auto" else rig.up)
-    upright = upright_rotation(rig.up) if rig.up not in ("auto", "y") else None
-    front = axis_vector("z") if upright is None else rotations.rotate(rotations.inverse(upright), axis_vector("z"))
-    if rig.facing != "auto" and abs(float(axis_vector(rig.facing) @ up)) < 0.5:
-        front = axis_vector(rig.facing)
-    return torch.stack([torch.linalg.cross(up, front), up, front])

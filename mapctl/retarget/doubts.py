@@ -1,6 +1,6 @@
 """What is doubtful about how a rig was understood: each reason in a sentence, with the joints that it is about.
 
-Names, tree and bones are those of one two-legged person, and the T-pose agrees with the clip.
+Names, tree and bones are to be those of one two-legged person, and the T-pose is to agree with the clip.
 """
 
 from collections.abc import Iterator
@@ -27,7 +27,7 @@ from mapctl.retarget.anatomy import (
 )
 from mapctl.retarget.character import SIDES
 from mapctl.retarget.joint_matching import HELPER_NAME, KnownBy
-from mapctl.skeleton import CANONICAL, LIMBS, Skeleton, mirror_name
+from mapctl.skeleton import CANONICAL, LIMBS, mirror_name
 
 _MAX_LISTED = 4  # joints that have a line each; of more there is one line
 _MAX_SPEED = 12.0  # m/s of the hips, median over a second, of people on foot
@@ -90,61 +90,47 @@ def assess_fit(rigmap: RigMap, motion: Motion | None = None) -> Fit:
     """Assess how sure it is that a rig was understood, by its names, its tree, its bones and a motion of it."""
     zero = RigPoses.zero(rigmap.rig_skeleton, rigmap.joint_of)
     clip = None if motion is None else RigPoses.of(motion, rigmap.joint_of)
-    body = RigPoses.zero(rigmap.skeleton)
     return Fit(
         (
-            *_check_unit(rigmap, motion),
+            *(() if motion is None else _check_unit(rigmap, motion)),
             *_find_other_bodies(rigmap, clip or zero),
-            *_find_wrong_order(rigmap),
-            *_compare_sides(rigmap, zero, clip),
-            *_list_joints_by_place(rigmap),
-            *_find_skipped_joints(rigmap),
-            *_compare_knowledge(rigmap),
-            *_find_single_sides(rigmap),
-            *_compare_lengths(rigmap.skeleton),
-            *_compare_limbs(body),
-            *_check_order(body),
-            *_check_poses(rigmap, clip),
+            *_compare_sides(rigmap, zero, clip or zero),
+            *_check_names(rigmap),
+            *_check_bones(RigPoses.zero(rigmap.skeleton)),
+            *(() if clip is None else _check_poses(rigmap, clip)),
         )
     )
 
 
-def _check_unit(rigmap: RigMap, motion: Motion | None) -> Iterator[Doubt]:
+def _check_unit(rigmap: RigMap, motion: Motion) -> Iterator[Doubt]:
     """Check the unit that was found by the size of the body, and the speed that results from a unit."""
-    if motion is None:
-        return
     if isinstance(motion.source, FileUnit) and motion.source.unit_doubt:
         yield Doubt(motion.source.unit_doubt)
     travel = motion.joint_positions()[:, rigmap.joints["hips"]].diff(dim=0).norm(dim=-1) * float(motion.fps)
     second = max(1, round(float(motion.fps)))
-    if len(travel) < second:
-        return
-    fastest = float(travel.unfold(0, second, second).median(dim=-1).values.max())
-    if fastest > _MAX_SPEED:
-        yield Doubt(f"the hips travel at {fastest:.0f} m/s for a second: the unit may be wrong")
+    if len(travel) >= second:
+        fastest = float(travel.unfold(0, second, second).median(dim=-1).values.max())
+        if fastest > _MAX_SPEED:
+            yield Doubt(f"the hips travel at {fastest:.0f} m/s for a second: the unit may be wrong")
 
 
 def _find_other_bodies(rigmap: RigMap, poses: RigPoses) -> Iterator[Doubt]:
-    """Find a second body in the file, and a second pair of arms on this one."""
-    other = find_second_body(poses, rigmap.joints)
+    """Find a second body in the file, a second pair of arms on this one, and joints that do not hang from the joint
+    before in their limb or in the trunk."""
+    joints, tree = rigmap.joints, rigmap.rig_skeleton
+    other = find_second_body(poses, joints)
     if other is not None:
         yield Doubt(f"another body is in the file, with hips {_quote(rigmap, other)}; only one is used", ("hips",))
-    if all(how is KnownBy.LIST for how in rigmap.match.known_by.values()):
-        return
-    pair = find_further_limbs(rigmap.rig_skeleton, rigmap.joints)
-    if pair is not None:
-        names = " and ".join(_quote(rigmap, joint) for joint in pair)
-        yield Doubt(f"a further pair of limbs hangs from the trunk: {names}", ("leftUpperArm", "rightUpperArm"))
-
-
-def _find_wrong_order(rigmap: RigMap) -> Iterator[Doubt]:
-    """Find joints of a limb or of the trunk that do not hang from the one before."""
-    joints = rigmap.joints
+    if any(how is not KnownBy.LIST for how in rigmap.match.known_by.values()):
+        pair = find_further_limbs(tree, joints)
+        if pair is not None:
+            names = " and ".join(_quote(rigmap, joint) for joint in pair)
+            yield Doubt(f"a further pair of limbs hangs from the trunk: {names}", ("leftUpperArm", "rightUpperArm"))
     for name, joint in joints.items():
         above = _find_above(rigmap, name)
-        if above is not None and not path_below(rigmap.rig_skeleton, joints[above], joint):
-            own, upper = _quote(rigmap, joint), _quote(rigmap, joints[above])
-            yield Doubt(f"{name} {own} does not hang from {above} {upper}", (name,))
+        if above is not None and not path_below(tree, joints[above], joint):
+            upper = _quote(rigmap, joints[above])
+            yield Doubt(f"{name} {_quote(rigmap, joint)} does not hang from {above} {upper}", (name,))
 
 
 def _find_above(rigmap: RigMap, name: str) -> str | None:
@@ -156,32 +142,30 @@ def _find_above(rigmap: RigMap, name: str) -> str | None:
     return above if above in rigmap.joints else _find_above(rigmap, above)
 
 
-def _compare_sides(rigmap: RigMap, zero: RigPoses, clip: RigPoses | None) -> Iterator[Doubt]:
+def _compare_sides(rigmap: RigMap, zero: RigPoses, poses: RigPoses) -> Iterator[Doubt]:
     """Compare the sides that names have with each other and with those that toes and knees show."""
     exchanged = rigmap.match.sides_exchanged
     if exchanged:
-        yield Doubt("joints called left are on the right, by toes and knees; positions outweigh names", ())
+        yield Doubt("joints called left are on the right, by toes and knees; positions outweigh names")
     roles = classify_joints(rigmap.rig_skeleton)
     named = [name for name, joint in rigmap.joints.items() if roles[joint].side is not Side.MIDDLE]
     for name in named:
         side = roles[rigmap.joints[name]].side.value
-        side = mirror_name(side) if exchanged else side
-        if not name.startswith(side):
+        if not name.startswith(mirror_name(side) if exchanged else side):
             yield Doubt(f"{name} is {_quote(rigmap, rigmap.joints[name])}, a name of the other side", (name,))
-    poses = clip or zero
     turned = torch.nn.functional.cosine_similarity(poses.across("UpperArm"), poses.across("UpperLeg"), dim=-1)
     if float(turned.median()) < -MIN_FRONT:
         yield Doubt("the left arm is on the side of the right leg", ("leftUpperArm", "rightUpperArm"))
-    front = max(abs(float(measure_front(poses).mean())) for poses in (zero, poses))
-    if not named and front < MIN_FRONT:
-        yield Doubt("nothing shows the front: no names of sides, no toes; left may be right", ())
+    if not named and max(abs(float(measure_front(each).mean())) for each in (zero, poses)) < MIN_FRONT:
+        yield Doubt("nothing shows the front: no names of sides, no toes; left may be right")
 
 
-def _list_joints_by_place(rigmap: RigMap) -> Iterator[Doubt]:
-    """List the joints whose names show neither side nor part."""
-    placed = [name for name, how in rigmap.match.known_by.items() if how is KnownBy.PLACE]
-    roles = classify_joints(rigmap.rig_skeleton)
-    quoted = {name: _quote(rigmap, rigmap.joints[name]) for name in placed}
+def _check_names(rigmap: RigMap) -> Iterator[Doubt]:
+    """Check how joints are known: by position alone, beside a joint that was skipped, by other names than their
+    partners, on one side only."""
+    joints, known, names = rigmap.joints, rigmap.match.known_by, rigmap.rig_skeleton.names
+    quoted = {name: _quote(rigmap, joint) for name, joint in joints.items()}
+    placed = [name for name, how in known.items() if how is KnownBy.PLACE]
     if len(placed) <= _MAX_LISTED:
         for name in placed:
             yield Doubt(f"{name} is known by its position alone (joint {quoted[name]})", (name,))
@@ -189,43 +173,41 @@ def _list_joints_by_place(rigmap: RigMap) -> Iterator[Doubt]:
         listed = ", ".join(f"{name} ({quoted[name]})" for name in placed[:_MAX_LISTED])
         more = len(placed) - _MAX_LISTED
         yield Doubt(f"{len(placed)} joints are known by their positions alone: {listed} and {more} more", (*placed,))
+    roles = classify_joints(rigmap.rig_skeleton)
     for name in placed:
-        part = roles[rigmap.joints[name]].part
+        part = roles[joints[name]].part
         if part is not Part.OTHER and part not in _PARTS[_split(name)[1]]:
             yield Doubt(f"{name} is {quoted[name]}, whose name is that of a {part.value}", (name,))
-
-
-def _find_skipped_joints(rigmap: RigMap) -> Iterator[Doubt]:
-    """Find joints but twists and other helpers between chest and arms, or within a limb of which no list knows the next
-    joint."""
-    listed: set[int] = set()
-    names, matched = rigmap.rig_skeleton.names, rigmap.joints.values()
-    for name, joint in rigmap.joints.items():
+    # Joints but twists and other helpers between chest and arms, or within a limb of which no list has the next joint.
+    skipped = set[int]()
+    for name, joint in joints.items():
         side, part = _split(name)
-        first = part == "Shoulder" or (part == "UpperArm" and side + "Shoulder" not in rigmap.joints)
+        first = part == "Shoulder" or (part == "UpperArm" and side + "Shoulder" not in joints)
         above = "chest" if first else _find_above(rigmap, name) if part in _LIMBS else None
-        if above not in rigmap.joints or (above != "chest" and rigmap.match.known_by[name] is KnownBy.LIST):
+        if above not in joints or (above != "chest" and known[name] is KnownBy.LIST):
             continue
-        between = path_below(rigmap.rig_skeleton, rigmap.joints[above], joint)[-2::-1]
-        between = [one for one in between if one not in matched and not HELPER_NAME.search(names[one])]
-        if between and between[0] not in listed:
-            own, skipped = _quote(rigmap, rigmap.joints[above]), _quote(rigmap, between[0])
-            yield Doubt(f"between {above} {own} and {name} {_quote(rigmap, joint)} is {skipped}", (above, name))
-        listed |= {*between}
-
-
-def _compare_knowledge(rigmap: RigMap) -> Iterator[Doubt]:
-    """Compare what both sides are known by: one version of a list, or words alone."""
-    for name in rigmap.joints:
+        between = path_below(rigmap.rig_skeleton, joints[above], joint)[-2::-1]
+        between = [one for one in between if one not in joints.values() and not HELPER_NAME.search(names[one])]
+        if between and between[0] not in skipped:
+            middle = _quote(rigmap, between[0])
+            yield Doubt(f"between {above} {quoted[above]} and {name} {quoted[name]} is {middle}", (above, name))
+        skipped |= {*between}
+    for name in joints:
         other = mirror_name(name)
-        version, usual = _version(rigmap, name), _version(rigmap, other)
-        if other in rigmap.joints and version is not None and usual is not None and version > usual:
-            own, theirs = _quote(rigmap, rigmap.joints[name]), _quote(rigmap, rigmap.joints[other])
-            yield Doubt(f"{name} is {own} and {other} is {theirs}, which is named otherwise", (name,))
+        version, usual = _find_version(rigmap, name), _find_version(rigmap, other)
+        if other in joints and version is not None and usual is not None and version > usual:
+            theirs = quoted[other]
+            yield Doubt(f"{name} is {quoted[name]} and {other} is {theirs}, which is named otherwise", (name,))
+    for name in ("head", "leftHand", "rightHand"):
+        if name not in joints and mirror_name(name) not in joints:
+            yield Doubt(f"no joint is known for {name}", (name,))
+    for name in joints:
+        if (other := mirror_name(name)) not in joints:
+            yield Doubt(f"{other} is missing, {name} is there", (other, name))
 
 
-def _version(rigmap: RigMap, name: str) -> int | None:
-    """Return the version of the rig's list that has the name of a joint, or one more than any where words tell it;
+def _find_version(rigmap: RigMap, name: str) -> int | None:
+    """Return the version of the rig's list that has the name of a joint, or one more than any where words show it;
     None where it is spelled otherwise or known by its place."""
     rig, how = rigmap.rig, rigmap.match.known_by.get(name)
     listed = (rig.joints.get(name), *rig.aliases.get(name, ()))
@@ -235,47 +217,20 @@ def _version(rigmap: RigMap, name: str) -> int | None:
     return listed.index(own) if how is KnownBy.LIST and own in listed else None
 
 
-def _find_single_sides(rigmap: RigMap) -> Iterator[Doubt]:
-    """Find joints that only one side has, and a body without head or hands."""
-    for name in ("head", "leftHand", "rightHand"):
-        if name not in rigmap.joints and mirror_name(name) not in rigmap.joints:
-            yield Doubt(f"no joint is known for {name}", (name,))
-    for name in rigmap.joints:
-        other = mirror_name(name)
-        if other not in rigmap.joints:
-            yield Doubt(f"{other} is missing, {name} is there", (other, name))
-
-
 def _split(name: str) -> tuple[str, str]:
     """Split a canonical name into its side, if it has one, and its part."""
-    for side in ("left", "right"):
-        if name.startswith(side):
-            return side, name.removeprefix(side)
-    return "", name
+    side = next((side for side in SIDES if name.startswith(side)), "")
+    return side, name.removeprefix(side)
 
 
 def _quote(rigmap: RigMap, joint: int) -> str:
     return repr(rigmap.rig_skeleton.names[joint])
 
 
-def _check_poses(rigmap: RigMap, clip: RigPoses | None) -> Iterator[Doubt]:
-    """Check what a clip shows: an upright body, and a T-pose that agrees with it."""
-    if clip is None:
-        return
-    up = clip.up()
-    if rigmap.upright_quat_xyzw is not None:
-        up = rotations.rotate(rigmap.upright_quat_xyzw.expand(len(up), 4), up)
-    if stays_on_all_fours(clip):
-        yield Doubt("hands stand beside the feet under a level trunk in the whole clip: this may be an animal")
-    elif float(up[:, 1].median()) < _UPRIGHT:
-        yield Doubt(f"the body lies or hangs upside down in most frames if {rigmap.up} is up")
-    if rigmap.tpose_doubt:
-        yield Doubt(rigmap.tpose_doubt)
-
-
-def _compare_lengths(skeleton: Skeleton) -> Iterator[Doubt]:
-    """Compare the two bones of each limb, and those of both sides."""
-    length = dict(zip(CANONICAL.names, skeleton.offsets.norm(dim=-1).tolist(), strict=True))
+def _check_bones(body: RigPoses) -> Iterator[Doubt]:
+    """Check the T-pose: lengths of limbs, of both sides, of arms and trunk against legs; what is over and beside
+    what."""
+    length = dict(zip(CANONICAL.names, body.skeleton.offsets.norm(dim=-1).tolist(), strict=True))
     for side, (limb, *parts) in product(SIDES, (("arm", "LowerArm", "Hand"), ("leg", "LowerLeg", "Foot"))):
         joints = (side + parts[0], side + parts[1])
         halves = [length[joint] for joint in joints]
@@ -292,29 +247,37 @@ def _compare_lengths(skeleton: Skeleton) -> Iterator[Doubt]:
                 found = f"{100 * length[name]:.0f} and {100 * length[other]:.0f} cm"
                 yield Doubt(f"the bones to {name} and {other} differ: {found}", (name, other))
 
+    def over_hips(name: str, below: str = "hips") -> list[float]:
+        return (body.position(name) - body.position(below))[0].tolist()
 
-def _compare_limbs(body: RigPoses) -> Iterator[Doubt]:
     leg, arm = (sum(LIMBS[side + end].length(body.skeleton) for side in SIDES) / 2 for end in ("Foot", "Hand"))
-    if leg < _NO_BONE:
-        return
-    trunk = float((body.middle("UpperArm") - body.position("hips")).norm())
-    for name, own, allowed in (("arms", arm, _ARM_BY_LEG), ("trunk", trunk, _TRUNK_BY_LEG)):
-        if not allowed[0] <= own / leg <= allowed[1]:
-            verb = "are" if name == "arms" else "is"
-            yield Doubt(f"{name} {verb} {100 * own:.0f} cm long and legs {100 * leg:.0f} cm")
-    height = max(float((body.position("hips") - body.position(side + "Toes"))[0, 1]) for side in SIDES)
-    if not _HIPS_METRES[0] <= height <= _HIPS_METRES[1]:
-        yield Doubt(f"hips are {height:.2f} m over the toes: the unit may be wrong")
-
-
-def _check_order(body: RigPoses) -> Iterator[Doubt]:
-    """Check that the trunk goes up, shoulders are over the hips, and left is on the left."""
+    if leg >= _NO_BONE:
+        trunk = float((body.middle("UpperArm") - body.position("hips")).norm())
+        for name, own, allowed in (("arms are", arm, _ARM_BY_LEG), ("trunk is", trunk, _TRUNK_BY_LEG)):
+            if not allowed[0] <= own / leg <= allowed[1]:
+                yield Doubt(f"{name} {100 * own:.0f} cm long and legs {100 * leg:.0f} cm")
+        height = max(over_hips("hips", side + "Toes")[1] for side in SIDES)
+        if not _HIPS_METRES[0] <= height <= _HIPS_METRES[1]:
+            yield Doubt(f"hips are {height:.2f} m over the toes: the unit may be wrong")
     for below, above in pairwise(("hips", "spine", "chest", "neck", "head")):
-        if float((body.position(above) - body.position(below))[0, 1]) < -_MAX_SINK:
+        if over_hips(above, below)[1] < -_MAX_SINK:
             yield Doubt(f"{above} is below {below} in the T-pose", (below, above))
     for side, sign in SIGNS:
-        if float((body.position(side + "UpperArm") - body.position("hips"))[0, 1]) < 0:
+        if over_hips(side + "UpperArm")[1] < 0:
             yield Doubt(f"{side}UpperArm is below the hips in the T-pose", (side + "UpperArm",))
         for part in ("UpperArm", "UpperLeg"):
-            if sign * float((body.position(side + part) - body.position("hips"))[0, 0]) < -_NO_BONE:
+            if sign * over_hips(side + part)[0] < -_NO_BONE:
                 yield Doubt(f"{side + part} is on the other side of the hips", (side + part,))
+
+
+def _check_poses(rigmap: RigMap, clip: RigPoses) -> Iterator[Doubt]:
+    """Check what a clip shows: an upright body, and a T-pose that agrees with it."""
+    up = clip.up()
+    if rigmap.upright_quat_xyzw is not None:
+        up = rotations.rotate(rigmap.upright_quat_xyzw.expand(len(up), 4), up)
+    if stays_on_all_fours(clip):
+        yield Doubt("hands stand beside the feet under a level trunk in the whole clip: this may be an animal")
+    elif float(up[:, 1].median()) < _UPRIGHT:
+        yield Doubt(f"the body lies or hangs upside down in most frames if {rigmap.up} is up")
+    if rigmap.tpose_doubt:
+        yield Doubt(rigmap.tpose_doubt)

@@ -169,16 +169,6 @@ class _Near:
 
 
 @dataclass(frozen=True, eq=False)
-class HandTargets:
-    """What hands were aimed at, in the order left, right."""
-
-    offset: Float[Tensor, "frames 2 3"]
-    """From where rotations alone lead to where the hand should be, metres."""
-    errors: Float[Tensor, "frames 2"]
-    """How far hands that are near something are from where they should be, metres."""
-
-
-@dataclass(frozen=True, eq=False)
 class _Relations:
     """What the giver's hands are near; the points of both hands one after another, left first."""
 
@@ -211,8 +201,11 @@ class _Relations:
         return weight, weight / (1 - weight + _SHARPNESS)
 
 
-def keep_hand_relations(own: Motion, moved: Motion, giver: Stance, *, scale: float) -> tuple[Motion, HandTargets]:
-    """Bring hands to where the giver's are relative to body, each other and floor, as far as arms allow.
+def keep_hand_relations(
+    own: Motion, moved: Motion, giver: Stance, *, scale: float
+) -> tuple[Motion, Float[Tensor, "frames 2"]]:
+    """Bring hands to where the giver's are relative to body, each other and floor, as far as arms allow; also return by
+    how much those that touch something miss it, metres.
 
     Both are motions of canonical joints, `own` the giver's, `moved` with its rotations but of legs on other bones.
     Hands keep their orientation in the world, and elbows go on pointing where they did.
@@ -220,8 +213,7 @@ def keep_hand_relations(own: Motion, moved: Motion, giver: Stance, *, scale: flo
     relations = _find_relations(own, giver)
     strength = 1 - (1 - relations.body_strength()) * (1 - relations.together)
     if not bool((strength > 0).any()):
-        still = torch.zeros(own.num_frames, 2, dtype=torch.float64)
-        return moved, HandTargets(still[..., None].expand(-1, -1, 3), still)
+        return moved, torch.zeros(own.num_frames, 2, dtype=torch.float64)
     at_floor = _floor_offsets(own, moved, relations, giver, scale=scale)
     straight = limb_extension(own, ARMS)
     done, before = moved, moved.joint_positions()[:, _HANDS]
@@ -234,7 +226,7 @@ def keep_hand_relations(own: Motion, moved: Motion, giver: Stance, *, scale: flo
     errors = (done.joint_positions()[:, _HANDS] - (before + offset)).norm(dim=-1)
     touch = torch.cat([relations.touch, relations.floor_weight[..., None]], dim=2).unflatten(1, (2, -1))
     touches = torch.maximum(touch.amax(dim=(2, 3)), relations.together) > _LEAST_STRENGTH
-    return done, HandTargets(offset, torch.where(touches, errors, 0.0))
+    return done, torch.where(touches, errors, 0.0)
 
 
 def _find_relations(own: Motion, giver: Stance) -> _Relations:
