@@ -36,7 +36,7 @@ class RiggedMotion:
     def of(motion: Motion, rig: Rig | None = None) -> "RiggedMotion":
         """Identify the rig and put the motion upright; RequestError where the rig's joints cannot be identified."""
         rigmap = retarget.identify_rig(motion.skeleton, rig, motion=motion)
-        return RiggedMotion(_turn_world(motion, rigmap.upright_quat_xyzw), rigmap)
+        return RiggedMotion(retarget.rotate_world(motion, rigmap.upright_quat_xyzw), rigmap)
 
     def with_motion(self, motion: Motion) -> "RiggedMotion":
         """Return another upright motion of the same rig."""
@@ -86,16 +86,8 @@ class RiggedMotion:
     def in_file_world(self, like: Motion | None = None) -> Motion:
         """Return the motion in the world of its file. What is as in `like`, but for rounding, has its numbers."""
         up = self.rigmap.upright_quat_xyzw
-        motion = _turn_world(self.motion, None if up is None else rotations.inverse(up))
+        motion = retarget.rotate_world(self.motion, None if up is None else rotations.inverse(up))
         return motion if like is None else keep_numbers(motion, like)
-
-
-def _turn_world(motion: Motion, turn: Float[Tensor, "4"] | None) -> Motion:
-    if turn is None:
-        return motion
-    every, local = turn.expand(motion.num_frames, 4), motion.local_quat_xyzw.clone()
-    local[:, 0] = rotations.multiply(every, local[:, 0])
-    return replace(motion, root_position=rotations.rotate(every, motion.root_position), local_quat_xyzw=local)
 
 
 def keep_numbers(motion: Motion, like: Motion) -> Motion:

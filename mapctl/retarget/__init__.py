@@ -21,7 +21,7 @@ from mapctl.motion import Motion
 from mapctl.retarget.anatomy import RigPoses, goes_on_four_legs
 from mapctl.retarget.joint_matching import Match, correct_sides, match
 from mapctl.retarget.reference_pose import TPose, find_tpose, is_canonical_tpose, measure_bones, rest_rotations
-from mapctl.retarget.rigs import Rig, find_preset, known_rigs, read_rig_toml
+from mapctl.retarget.rigs import Rig, known_rigs, read_rig_toml
 from mapctl.skeleton import CANONICAL, Skeleton
 
 
@@ -61,9 +61,9 @@ class RigMap(TPose):
 def load_rig(name_or_path: str | PathLike[str]) -> Rig:
     """Load a preset by its name, a rig from a TOML file, or the rig of a clip; RequestError if it is none of them."""
     text, path = str(name_or_path), Path(name_or_path)
-    preset = find_preset(text)
-    if preset is not None:
-        return preset
+    for rig in known_rigs():
+        if rig.name == text.lower():
+            return rig
     if path.suffix.lower() == ".toml":
         return read_rig_toml(path)
     if not path.suffix and not is_example(path):
@@ -181,7 +181,13 @@ def from_canonical(motion: Motion, rigmap: RigMap, original: Motion | None = Non
     kept = original is not None and original.num_frames == frames
     rest = rigmap.idle_quat_xyzw.expand(frames, skeleton.num_joints, 4)
     own = original.local_quat_xyzw if original is not None and kept else rest
-    hips, wanted = _to_file_world(motion, rigmap)
+    targets, hips = motion.joint_rotations(), motion.root_position
+    if rigmap.upright_quat_xyzw is not None:  # back to the file's world
+        back = rotations.inverse(rigmap.upright_quat_xyzw)
+        targets = rotations.multiply(back.expand(targets.shape), targets)
+        hips = rotations.rotate(back.expand(frames, 4), hips)
+    pairs = enumerate(zip(rigmap.joint_of, rigmap.tpose_quat_xyzw, strict=True))
+    wanted = {j: rotations.multiply(targets[:, c], b.expand(frames, 4)) for c, (j, b) in pairs if j is not None}
     local, world = [], []
     for joint, parent in enumerate(skeleton.parents):
         above = world[parent] if parent >= 0 else None
@@ -201,26 +207,13 @@ def from_canonical(motion: Motion, rigmap: RigMap, original: Motion | None = Non
     return _place_hips(on_rig, rigmap, hips, original if kept else None)
 
 
-def _to_file_world(motion: Motion, rigmap: RigMap) -> tuple[Tensor, dict[int, Tensor]]:
-    """Return target positions of the hips, and the world rotation by joint of the rig, in the file's world."""
-    world, hips = motion.joint_rotations(), motion.root_position
-    if rigmap.upright_quat_xyzw is not None:
-        back = rotations.inverse(rigmap.upright_quat_xyzw)
-        world = rotations.multiply(back.expand(world.shape), world)
-        hips = rotations.rotate(back.expand(len(world), 4), hips)
-    pairs = enumerate(zip(rigmap.joint_of, rigmap.tpose_quat_xyzw, strict=True))
-    turns = {j: rotations.multiply(world[:, c], b.expand(len(world), 4)) for c, (j, b) in pairs if j is not None}
-    return hips, turns
-
-
 def _place_hips(on_rig: Motion, rigmap: RigMap, hips: Tensor, original: Motion | None) -> Motion:
     """Move the hips to target positions: by the root itself, or by their offset below it where that is animated."""
     joint = rigmap.joints["hips"]
-    if joint == 0:
-        moving = original.moving_offsets if original is not None else {}
-        return replace(on_rig, root_position=hips, moving_offsets=moving)
     if original is not None:
         on_rig = replace(on_rig, root_position=original.root_position, moving_offsets=original.moving_offsets)
+    if joint == 0:
+        return replace(on_rig, root_position=hips)
     travel = rigmap.hips_travel if original is None else joint in original.moving_offsets
     if not travel:
         missed = hips - on_rig.joint_positions()[:, joint]
@@ -249,11 +242,15 @@ def put_upright(motion: Motion, rig: Rig | None = None) -> tuple[Motion, tuple[s
     Unchanged where Y is up already, or nothing is known.
     """
     try:
-        turn = identify_rig(motion.skeleton, rig, motion=motion).upright_quat_xyzw
+        return rotate_world(motion, identify_rig(motion.skeleton, rig, motion=motion).upright_quat_xyzw), ()
     except RequestError:
         return motion, (UNKNOWN_RIG_NOTE,)
+
+
+def rotate_world(motion: Motion, turn: Float[Tensor, "4"] | None) -> Motion:
+    """Rotate the world of a motion (xyzw); None for no rotation."""
     if turn is None:
-        return motion, ()
+        return motion
     every, local = turn.expand(motion.num_frames, 4), motion.local_quat_xyzw.clone()
     local[:, 0] = rotations.multiply(every, local[:, 0])
-    return replace(motion, root_position=rotations.rotate(every, motion.root_position), local_quat_xyzw=local), ()
+    return replace(motion, root_position=rotations.rotate(every, motion.root_position), local_quat_xyzw=local)

@@ -284,7 +284,7 @@ def _build_skeleton(rig: Rig) -> Skeleton:
                 frames[between], parent = frames[spine], between
         if names[joint] in rig.joints:
             axes = rig.tpose.get(names[joint])
-            frames[joint] = frame_from_axes(axes["x"], axes["y"]) if axes else unnamed
+            frames[joint] = frame_from_axes(axes) if axes else unnamed
             parent = add(joint, rig.joints[names[joint]], parent)
         for child in CANONICAL.children(joint):
             visit(child, parent)

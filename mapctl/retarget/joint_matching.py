@@ -81,16 +81,26 @@ def match(skeleton: Skeleton, rig: Rig | None = None, *, motion: Motion | None =
     """
     given = rig if rig is not None and rig.joints else None
     chosen, found = _find_listed_rig(skeleton) if given is None else (given, _match_by_rig(given, skeleton))
-    if given is not None:
-        _check_given(given, found, skeleton)
+    for name in REQUIRED if given is not None else ():
+        if name in given.joints and name not in found:
+            near = describe_nearest(given.joints[name], skeleton.names, classify_joints(skeleton))
+            raise RequestError(f"rig {given.name}: no joint {given.joints[name]!r} for {name}; {near}")
     known = dict.fromkeys(found, KnownBy.LIST)
     complete = all(name in found for name in REQUIRED)
     if chosen is None or not complete or (given is None and not chosen.fits(skeleton)):
         found, known = _complete_match(skeleton, found, motion)
-    absent = _ABSENT if all(name in found for name in REQUIRED) else 0.0
+    missing = [name for name in REQUIRED if name not in found]
+    absent = 0.0 if missing else _ABSENT
     worth = [_CREDIT[known[c]] if c in known else 0.0 if c in REQUIRED else absent for c in CANONICAL.names]
     score = sum(worth) / len(worth)
-    _check_match(skeleton, found, score)
+    if missing or score < MIN_SCORE:
+        lacking = ", ".join(missing or (name for name in CANONICAL.names if name not in found))
+        others = "" if missing else ", and the names of the others are no body parts"
+        names, rigs = abbreviate_names(skeleton.names), ", ".join(rig.name for rig in known_rigs())
+        raise RequestError(
+            f"the rig is not recognised: no joint is found for {lacking}{others}; its joints are {names}; "
+            f"known rigs: {rigs}; a TOML file can name its joints"
+        )
     if chosen is None:
         chosen = Rig("unlisted", {name: skeleton.names[joint] for name, joint in found.items()})
     if rig is not None and given is None:
@@ -173,14 +183,9 @@ def _measure_fit(rig: Rig, found: Mapping[str, int], skeleton: Skeleton, plain: 
     lacking = len(rig.joints) - len(found) + len(extra - plain)
     # Fingers and props beyond what a preset lists do not count against it; what it lists and the rig lacks does.
     spelled = sum(skeleton.names[joint] in (rig.joints[c], *rig.aliases.get(c, ())) for c, joint in found.items())
-    carried = _ARMS_ON_CHEST * _arms_hang_from_chest(found, skeleton)
+    arms = [found.get(side + "Shoulder", found[side + "UpperArm"]) for side in ("left", "right")]
+    carried = _ARMS_ON_CHEST * all(skeleton.parents[arm] == found.get("chest") for arm in arms)
     return len(found) + explained / (explained + lacking) + spelled / len(found) + carried
-
-
-def _arms_hang_from_chest(found: Mapping[str, int], skeleton: Skeleton) -> bool:
-    """Return whether the chest is the joint from which the shoulders, or else the upper arms, hang."""
-    arms = [found.get(side + "Shoulder", found.get(side + "UpperArm")) for side in ("left", "right")]
-    return all(arm is not None and skeleton.parents[arm] == found.get("chest") for arm in arms)
 
 
 def _complete_match(
@@ -280,22 +285,3 @@ def _assign_sides(
         left = across
     return by_tree
 
-
-def _check_given(rig: Rig, found: Mapping[str, int], skeleton: Skeleton) -> None:
-    for canonical in REQUIRED:
-        if canonical in rig.joints and canonical not in found:
-            near = describe_nearest(rig.joints[canonical], skeleton.names, classify_joints(skeleton))
-            raise RequestError(f"rig {rig.name}: no joint {rig.joints[canonical]!r} for {canonical}; {near}")
-
-
-def _check_match(skeleton: Skeleton, found: Mapping[str, int], score: float) -> None:
-    missing = [name for name in REQUIRED if name not in found]
-    if not missing and score >= MIN_SCORE:
-        return
-    lacking = ", ".join(missing or (name for name in CANONICAL.names if name not in found))
-    what = f"no joint is found for {lacking}" + ("" if missing else ", and the names of the others are no body parts")
-    names, rigs = abbreviate_names(skeleton.names), ", ".join(rig.name for rig in known_rigs())
-    raise RequestError(
-        f"the rig is not recognised: {what}; its joints are {names}; "
-        f"known rigs: {rigs}; a TOML file can name its joints"
-    )

@@ -108,7 +108,12 @@ def find_tpose(
     anatomy, refused = estimate_frames(clip, upright, own), ""
     for quats, idle, found in readings:
         contradicted = anatomy.find_contradictions(quats)
-        doubt = f"{_describe_angles(contradicted)} off in the {found} by how the body moves" if contradicted else ""
+        doubt = ""
+        if contradicted:
+            names, more = ", ".join([*contradicted][:3]), len(contradicted) - 3
+            named = names + (f" and {more} more" if more > 0 else "")
+            are = f"{'is' if len(contradicted) == 1 else 'are'} {math.degrees(max(contradicted.values())):.0f} degrees"
+            doubt = f"{named} {are} off in the {found} by how the body moves"
         if stated and (rig.tpose or rig.rest != "auto"):
             return choose(tpose_quat_xyzw=quats, idle_quat_xyzw=idle, tpose_from=found, tpose_doubt=doubt)
         if not contradicted.keys() & CORE:
@@ -125,13 +130,6 @@ def find_tpose(
     return choose(tpose_quat_xyzw=frames, idle_quat_xyzw=_mean_locals(clip), tpose_from="motion", tpose_doubt=doubt)
 
 
-def _describe_angles(angles: Mapping[str, float]) -> str:
-    """Describe up to three joints and the largest of their angles, radians: `hips, chest and 4 more are 90 degrees`."""
-    names, more = [*angles][:3], len(angles) - 3
-    joints = ", ".join(names) + (f" and {more} more" if more > 0 else "")
-    return f"{joints} {'is' if len(angles) == 1 else 'are'} {math.degrees(max(angles.values())):.0f} degrees"
-
-
 def _list_readings(
     zero: RigPoses, clip: RigPoses | None, rig: Rig, stated: bool, rest: str, front: Tensor, up: str, idle: Tensor
 ) -> Iterator[tuple[Tensor, Tensor, str]]:
@@ -140,24 +138,23 @@ def _list_readings(
     # A preset's table is of files as its program writes them; one whose rest pose is another has other joint frames.
     if rig.has_tpose and (stated or rest == "neither" or is_canonical_tpose(zero)):
         # Joints that the table leaves out are as in the rest pose, or unrotated where that is to be the T-pose or none.
-        quats = (
-            UNROTATED.repeat(CANONICAL.num_joints, 1) if laid_out is None or rig.rest == "tpose" else laid_out.clone()
-        )
+        unrotated = laid_out is None or rig.rest == "tpose"
+        quats = UNROTATED.repeat(CANONICAL.num_joints, 1) if unrotated else laid_out.clone()
         for name, axes in rig.tpose.items():
-            quats[CANONICAL.index(name)] = rotations.from_matrix(frame_from_axes(axes["x"], axes["y"]))
+            quats[CANONICAL.index(name)] = rotations.from_matrix(frame_from_axes(axes))
         yield quats, idle, "table"
     if laid_out is not None:
         yield laid_out, idle, "rest pose"
     if clip is not None and rig.rest in ("auto", "frame0"):
         first = replace(clip, positions=clip.positions[:1], orientations=clip.orientations[:1])
         turned = _body_frame(first.left()[0], axis_vector(up))
-        if rig.rest == "frame0" or is_tpose(first, turned):
+        if rig.rest == "frame0" or _is_exact_tpose(first, turned):
             yield _lay_out_tpose(first, turned), _mean_locals(first), "frame 0"
 
 
-def frame_from_axes(x: list[float], y: list[float]) -> Float[Tensor, "3 3"]:
-    """Return the rotation whose first two columns point along x and (as nearly as they are square) y."""
-    return orthonormal_frame(torch.tensor(x, dtype=torch.float64), torch.tensor(y, dtype=torch.float64))
+def frame_from_axes(axes: Mapping[str, list[float]]) -> Float[Tensor, "3 3"]:
+    """Return the rotation whose first two columns point along the axes x and (as nearly as they are square) y."""
+    return orthonormal_frame(*(torch.tensor(axes[name], dtype=torch.float64) for name in "xy"))
 
 
 def is_canonical_tpose(zero: RigPoses) -> bool:
@@ -187,14 +184,16 @@ def upright_rotation(up: str) -> Float[Tensor, "4"] | None:
     return None if up == "y" else rotations.between_vectors(axis_vector(up), axis_vector("y"))
 
 
-def is_tpose(poses: RigPoses, front: Float[Tensor, "3 3"]) -> bool:
+def _is_exact_tpose(poses: RigPoses, front: Float[Tensor, "3 3"]) -> bool:
     """Return whether the first pose is a T-pose that captures begin with: all straight, arms level, legs vertical."""
-    for side, sign in SIGNS:
-        for part, aim in (("Arm", axis_vector("x") * sign), ("Leg", -axis_vector("y"))):
-            bones = [_bone_direction(poses, f"{side}{half}{part}", front) for half in ("Upper", "Lower")]
-            if any(float(bone @ aim) < math.cos(_EXACT_TPOSE_ANGLE) for bone in bones):
-                return False
-    return True
+    limbs = [
+        (side + half + part, aim)
+        for side, sign in SIGNS
+        for part, aim in (("Arm", axis_vector("x") * sign), ("Leg", -axis_vector("y")))
+        for half in ("Upper", "Lower")
+    ]
+    bones = [(_bone_direction(poses, name, front), aim) for name, aim in limbs]
+    return all(float(bone @ aim) >= math.cos(_EXACT_TPOSE_ANGLE) for bone, aim in bones)
 
 
 def axis_vector(axis: str) -> Float[Tensor, "3"]:

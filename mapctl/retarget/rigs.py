@@ -94,11 +94,6 @@ def known_rigs() -> tuple[Rig, ...]:
         return canonical, *(read_rig_toml(path) for path in sorted(folder.glob("*.toml")))
 
 
-def find_preset(name: str) -> Rig | None:
-    """Return the known rig of this name, in any case; None where there is none."""
-    return next((rig for rig in known_rigs() if rig.name == name.lower()), None)
-
-
 def read_rig_toml(path: Path) -> Rig:
     """Read a rig from a TOML file; FileFormatError says what is wrong with it."""
     keys = ", ".join(item.name for item in fields(_RigFile))
