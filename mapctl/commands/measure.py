@@ -1,6 +1,5 @@
 """`mapctl measure`: the measures of a motion, or of a folder of them, beside those of a reference and of mocap."""
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -17,10 +16,7 @@ from mapctl.commands.shared.inputs import read_motion
 from mapctl.commands.shared.outputs import format_cell, print_table, show_progress
 from mapctl.curves.curve import Curve
 from mapctl.errors import CheckpointError, MapctlError, RequestError
-from mapctl.features import PRIOR_FPS
 from mapctl.metrics import make_comparable, realism
-from mapctl.metrics.gait import PIECE_SECONDS
-from mapctl.metrics.realism import align_to_start, measure_position_diversity
 from mapctl.motion import Motion
 from mapctl.retarget.rigs import Rig
 from priors import checkpoints
@@ -41,7 +37,7 @@ class Measure(ModelCommand, options.RigOptions):
     clip: Positional[Annotated[Path, arg(metavar="CLIP|FOLDER")]]
     """A motion in any format that mapctl reads; or a folder, every one below it."""
     reference: Annotated[Path | None, arg(metavar="CLIP|FOLDER")] = None
-    """Another clip to print beside it; or for a folder another, unseen mocap say: adds realism and diversity."""
+    """Another clip to print beside it; or for a folder another, unseen mocap say: adds realism."""
     curve: options.MaybeCurve = None
     """Curve that it was to follow: circle:4, a CSV, an SVG (see `mapctl follow --help`)."""
     speed: options.MaybeNumber = None
@@ -69,8 +65,6 @@ class _MeasuredClip:
     """Motion made comparable."""
     measures: dict[str, float]
     """Measures by name."""
-    positions: Tensor
-    """Positions of canonical joints, (frames, joints, 3), metres; empty unless read with windows."""
     windows: Tensor
     """Windows, (windows, frames, channels); empty unless read with windows."""
     notes: list[str]
@@ -80,11 +74,8 @@ class _MeasuredClip:
     def read(path: Path, *, with_windows: bool, rig: Rig | None) -> "_MeasuredClip":
         """Read and measure a file; MapctlError for what cannot be read, measured or cut."""
         motion, notes = make_comparable(read_motion(path, rig), rig)
-        measures, positions, windows = metrics.measure(motion), torch.zeros(0), torch.zeros(0)
-        if with_windows:
-            positions = realism.canonical_positions(motion)
-            windows = realism.cut_windows(positions, SETTINGS.windows)
-        return _MeasuredClip(path, motion, measures, positions, windows, [f"{path}: {note}" for note in notes])
+        windows = realism.cut_windows(realism.canonical_positions(motion)) if with_windows else torch.zeros(0)
+        return _MeasuredClip(path, motion, metrics.measure(motion), windows, [f"{path}: {note}" for note in notes])
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,8 +91,6 @@ class ClipSet:
     `metrics.comparison`)."""
     means: dict[str, float]
     """Mean of each measure over the clips that can give it."""
-    positions: list[Tensor]
-    """Canonical joints of each clip, (frames, joints, 3); none unless read with windows."""
     windows: list[Tensor]
     """Windows of each clip, (windows, frames, channels); none unless read with windows."""
     skipped: dict[str, str]
@@ -128,28 +117,15 @@ class ClipSet:
                     progress(number, len(paths))
         if not clips:
             raise RequestError(f"{folder}: no clip can be measured; {next(iter(skipped.values()))}")
-        positions, windows = [c.positions for c in clips if with_windows], [c.windows for c in clips if with_windows]
         return ClipSet(
             folder,
             [clip.path.relative_to(folder).as_posix() for clip in clips],
             [clip.motion for clip in clips],
             _average_measures([clip.measures for clip in clips]),
-            positions,
-            windows,
+            [clip.windows for clip in clips if with_windows],
             skipped,
             tuple(note for clip in clips for note in clip.notes),
         )
-
-    def diversity(self) -> realism.Diversity:
-        """Measure the diversity of the first 3 s of the clips; NaN for fewer than two clips of 3 s.
-
-        Each clip is aligned to its own start, so that sets with different starts can be compared.
-        """
-        frames = round(PIECE_SECONDS * PRIOR_FPS)
-        pieces = [align_to_start(clip)[:frames] for clip in self.positions if len(clip) >= frames]
-        if len(pieces) < 2:
-            return realism.Diversity(math.nan, math.nan)
-        return measure_position_diversity(torch.stack(pieces))
 
 
 def measure_realism(ours: ClipSet, reference: ClipSet) -> realism.Realism:
@@ -166,20 +142,6 @@ def measure_realism(ours: ClipSet, reference: ClipSet) -> realism.Realism:
         return realism.measure_window_realism(
             ours.windows, reference.windows, generator=generator, settings=SETTINGS, progress=progress
         )
-
-
-def compare_variability(ours: ClipSet, reference: ClipSet) -> dict[str, dict[str, float]]:
-    """Compare ours and the reference's by measure: standard deviations of gait, average pairwise distances."""
-    sides = []
-    for clips in (ours, reference):
-        gait = {f"std_of_{name}": spread.std for name, spread in realism.measure_gait_spread(clips.motions).items()}
-        diversity = clips.diversity()
-        sides.append(gait | {f"pairwise_distance_{name}": value for name, value in diversity._asdict().items()})
-    mine, theirs = sides
-    return {
-        name: {"ours": value, "reference": theirs[name], "ratio": value / theirs[name] if theirs[name] else math.nan}
-        for name, value in mine.items()
-    }
 
 
 def _describe_skipped(clips: ClipSet) -> str:
@@ -266,15 +228,11 @@ def _measure_folders(command: Measure) -> dict[str, Any]:
 
 
 def _compare_folders(command: Measure, ours: ClipSet, reference: ClipSet) -> dict[str, Any]:
-    return {
-        "reference_clips": len(reference.motions),
-        "realism": asdict(measure_realism(ours, reference)),
-        "spread": compare_variability(ours, reference),
-    }
+    return {"reference_clips": len(reference.motions), "realism": asdict(measure_realism(ours, reference))}
 
 
 def _print_tables(values: Mapping[str, Any]) -> None:
-    """Print measures, and realism and spread where there are any, each as a table."""
+    """Print measures, and realism where it is measured, each as a table."""
     reference, mocap = values["reference"], values["mocap"]
     rows = [
         [name, value, reference.get(name), _format_range(mocap.get(name))] for name, value in values["measures"].items()
@@ -285,9 +243,6 @@ def _print_tables(values: Mapping[str, Any]) -> None:
     print_table(["measure", "ours", "reference", "mocap (2 to 98 %)"], rows, title=title)
     if "realism" in values:
         _print_realism(values["realism"])
-        rows = [[name, *row.values()] for name, row in values["spread"].items()]
-        title = "how widely the clips spread (in pieces of 3 s)"
-        print_table(["spread", "ours", "reference", "ratio"], rows, title=title)
     if "cycle" in values:
         print(_describe_cycle(values["cycle"]))
     for line in _shorten([*(f"left out {reason}" for reason in values.get("skipped", {}).values()), *values["notes"]]):
@@ -315,10 +270,7 @@ def _describe_cycle(cycle: Mapping[str, Any]) -> str:
     )
     if not cycle["gait"]:
         return about
-    return (
-        f"{about}; {cycle['steps_per_minute']:.0f} steps a minute, stride {cycle['stride_m']:.2f} m; right foot"
-        f" {cycle['right_after_left']:.2f} of a cycle after the left, mirrored {cycle['asymmetry_cm']:.1f} cm off"
-    )
+    return f"{about}; {cycle['steps_per_minute']:.0f} steps a minute, stride {cycle['stride_m']:.2f} m"
 
 
 def _print_realism(realism: Mapping[str, Any]) -> None:

@@ -261,13 +261,7 @@ def describe_cycle(motion: Motion, cycle: Cycle) -> dict[str, float | int | bool
         return values
     hips = motion.root_position
     stride = float((hips[cycle.stop] - hips[cycle.start])[::2].norm())
-    return values | {
-        "steps_per_minute": 120 / seconds,
-        "stride_m": stride,
-        "speed_m_s": stride / seconds,
-        "right_after_left": _measure_phase(motion, cycle),
-        "asymmetry_cm": 100 * _measure_asymmetry(motion, cycle),
-    }
+    return values | {"steps_per_minute": 120 / seconds, "stride_m": stride, "speed_m_s": stride / seconds}
 
 
 def _see_from_hips(motion: Motion) -> Float[Tensor, "frames joints 3"]:
@@ -352,22 +346,6 @@ def _refine(motion: Motion, states: Tensor, start: int, stop: int, step: int, pe
     )
     steps = motion.root_position[start : stop + 1, ::2].diff(dim=0).norm(dim=-1)
     return Cycle(start, stop, distance, periodic, float(steps.mean()) * float(motion.fps))
-
-
-def _measure_phase(motion: Motion, cycle: Cycle) -> float:
-    """Measure how far into the left foot's cycle the right foot's begins, 0 to 1: the phases of the first harmonic of
-    how far the feet are ahead of the hips."""
-    ahead = _see_from_hips(motion)[cycle.start : cycle.stop, list(TOE_JOINTS), 2]
-    turns = torch.fft.rfft(ahead, dim=0)[1].angle()
-    return float((turns[0] - turns[1]) / (2 * torch.pi) % 1)
-
-
-def _measure_asymmetry(motion: Motion, cycle: Cycle) -> float:
-    """Measure the mean distance of joints from their mirror image half a cycle later, metres."""
-    places = _see_from_hips(motion)[cycle.start : cycle.stop]
-    flip = places.new_tensor([-1.0, 1.0, 1.0])
-    mirrored = places[:, motion.skeleton.mirror_partners()] * flip
-    return float((places - mirrored.roll(cycle.frames // 2, dims=0)).norm(dim=-1).mean())
 
 
 _WINDOW_SECONDS = 0.1  # seconds on both sides of the seam over which its ends are compared

@@ -5,9 +5,8 @@ The distance is that of the Gaussians fitted to the windows' principal component
 (Heusel et al. 2017, section 2), on standardised joint positions and velocities instead of a network's features.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import scipy
@@ -19,43 +18,22 @@ from mapctl import retarget, rotations
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.metrics import body
-from mapctl.metrics.gait import GaitSpread, measure_gait_spread
 from mapctl.motion import Motion
 from mapctl.runtime.stepwise import Progress
 from mapctl.skeleton import CANONICAL
-
-__all__ = [
-    "Diversity",
-    "GaitSpread",
-    "Realism",
-    "RealismSettings",
-    "WindowSettings",
-    "canonical_positions",
-    "cut_windows",
-    "measure_diversity",
-    "measure_gait_spread",
-    "measure_realism",
-    "measure_window_realism",
-]
 
 HIPS = CANONICAL.index("hips")
 _UPPER_LEGS = CANONICAL.index("leftUpperLeg"), CANONICAL.index("rightUpperLeg")
 _LEAST_STD = 1e-3  # floor of a standard deviation, m or m/s, so that joints that hardly move do not decide
 
 
-@dataclass(frozen=True)
-class WindowSettings:
-    """Settings of the windows that clips are cut into."""
-
-    frames: int = 30
-    """Frames a window, at 30 a second; one more is needed before it for the velocities."""
-    step: int = 10
-    """Stride from one window to the next, frames."""
+WINDOW_FRAMES, _WINDOW_STEP = 30, 10
+"""Frames a window, at 30 a second; one more is needed before it for the velocities."""
 
 
 @dataclass(frozen=True)
-class ClassifierSettings:
-    """Settings of the network and its training: about 10 s an accuracy on one core at 90 clips."""
+class RealismSettings:
+    """Settings of a realism measurement: about 10 s an accuracy on one core at 90 clips."""
 
     folds: int = 4
     """Number of parts of the clips; each is held out once while a network learns on the others."""
@@ -72,23 +50,13 @@ class ClassifierSettings:
     """Learning rate of AdamW, a number without unit."""
     weight_decay: float = 1e-2
     """Weight decay of AdamW, a number without unit."""
-
-
-@dataclass(frozen=True)
-class RealismSettings:
-    """Settings of a realism measurement."""
-
-    windows: WindowSettings = field(default_factory=WindowSettings)
-    """Settings of the windows that clips are cut into."""
-    classifier: ClassifierSettings = field(default_factory=ClassifierSettings)
-    """Settings of the network that separates the sets."""
     dims: int = 32
     """Number of principal components of mocap's windows in which the Frechet distance is taken."""
 
     @property
     def min_clips(self) -> int:
         """Number of clips that each set needs, so that half of the mocap still has one for every fold."""
-        return 2 * self.classifier.folds
+        return 2 * self.folds
 
 
 @dataclass(frozen=True)
@@ -126,7 +94,7 @@ def measure_realism(
     Sets should hold the same kinds of motion, or the network learns to separate the kinds. RequestError for fewer
     than 8 clips in a set, clips shorter than a window (31 frames at 30 fps), and rigs that are not known.
     """
-    sets = [[cut_windows(canonical_positions(clip), settings.windows) for clip in clips] for clips in (made, mocap)]
+    sets = [[cut_windows(canonical_positions(clip)) for clip in clips] for clips in (made, mocap)]
     return measure_window_realism(*sets, generator=generator, settings=settings, progress=progress)
 
 
@@ -146,7 +114,7 @@ def measure_window_realism(
     shuffled, ours = (torch.Generator().manual_seed(seed) for seed in seeds)
     order = torch.randperm(len(mocap), generator=shuffled).tolist()
     halves = [[mocap[i] for i in half] for half in (order[::2], order[1::2])]
-    total = 2 * settings.classifier.folds
+    total = 2 * settings.folds
     done = iter(range(1, total + 1))
 
     def tick() -> None:
@@ -154,7 +122,7 @@ def measure_window_realism(
             progress(next(done), total)
 
     floor, accuracy = (
-        compute_held_out_accuracy(*sets, generator=drawn, settings=settings.classifier, tick=tick)
+        compute_held_out_accuracy(*sets, generator=drawn, settings=settings, tick=tick)
         for sets, drawn in ((halves, shuffled), ((made, mocap), ours))
     )
     basis = Basis.of(torch.cat(list(mocap)), settings.dims)
@@ -184,18 +152,16 @@ def transform_to_ground_frame(
     return rotations.rotate_about_y(positions - rotations.lift_ground(ground_xz).unsqueeze(-2), -angle.unsqueeze(-1))
 
 
-def cut_windows(
-    positions: Float[Tensor, "clip_frames joints 3"], settings: WindowSettings = WindowSettings()
-) -> Float[Tensor, "windows frames channels"]:
+def cut_windows(positions: Float[Tensor, "clip_frames joints 3"]) -> Float[Tensor, "windows frames channels"]:
     """Cut one clip into windows, float32: joint positions (m), then velocities (m/s) from the frame before each.
 
     `positions` are those of `canonical_positions`. A window is relative to the hips' ground projection and facing in
     the frame before its first. RequestError for a clip shorter than one window.
     """
-    needed = settings.frames + 1
+    needed = WINDOW_FRAMES + 1
     if len(positions) < needed:
         raise RequestError(f"{len(positions)} frames at {PRIOR_FPS} fps; a window needs at least {needed}")
-    starts = torch.arange(0, len(positions) - settings.frames, settings.step)
+    starts = torch.arange(0, len(positions) - WINDOW_FRAMES, _WINDOW_STEP)
     ground, angle = positions[starts, HIPS, ::2], facing_angle(positions)[starts]
     frames = starts[:, None] + torch.arange(needed)
     relative = transform_to_ground_frame(positions[frames], ground.unsqueeze(1), angle.unsqueeze(1))
@@ -253,7 +219,7 @@ def compute_held_out_accuracy(
     second: Sequence[Float[Tensor, "_ frames channels"]],
     *,
     generator: torch.Generator,
-    settings: ClassifierSettings = ClassifierSettings(),
+    settings: RealismSettings = RealismSettings(),
     tick: Callable[[], None] = lambda: None,
 ) -> float:
     """Compute the balanced accuracy, 0 to 1, of networks on clips that their training did not see, mean over folds.
@@ -265,50 +231,34 @@ def compute_held_out_accuracy(
     if min(len(first), len(second)) < settings.folds:
         raise RequestError(f"{settings.folds} folds need as many clips in each set, got {len(first)} and {len(second)}")
     sets = [(clips, torch.randperm(len(clips), generator=generator).tolist()) for clips in (first, second)]
-    total = 0.0
+    total, threads = 0.0, torch.get_num_threads()
     for fold in range(settings.folds):
         others = [k for k in range(settings.folds) if k != fold]
         training = [torch.cat([clips[i] for k in others for i in order[k :: settings.folds]]) for clips, order in sets]
         held_out = [torch.cat([clips[i] for i in order[fold :: settings.folds]]) for clips, order in sets]
-        with _isolate_torch(generator):
-            network = _train_network(training, settings)
-            with torch.no_grad():
-                ours, theirs = (torch.cat([network(part) for part in each.split(512)]) for each in held_out)
-            total += float(((ours > 0).double().mean() + (theirs <= 0).double().mean()) / 2)
+        seed = int(torch.randint(2**62, (1,), generator=generator))
+        with torch.random.fork_rng(devices=[]):  # weights and dropout draw from torch's global generator
+            torch.default_generator.manual_seed(seed)
+            torch.set_num_threads(1)
+            try:
+                classify = _train_network(training, settings)
+                with torch.no_grad():
+                    ours, theirs = (torch.cat([classify(part) for part in each.split(512)]) for each in held_out)
+            finally:
+                torch.set_num_threads(threads)
+        total += float(((ours > 0).double().mean() + (theirs <= 0).double().mean()) / 2)
         tick()
     return total / settings.folds
 
 
-@contextmanager
-def _isolate_torch(generator: torch.Generator) -> Iterator[None]:
-    """Seed torch's global generator from ours (weights and dropout draw from it) and use one thread, within."""
-    threads = torch.get_num_threads()
-    seed = int(torch.randint(2**62, (1,), generator=generator))
-    with torch.random.fork_rng(devices=[]):
-        torch.default_generator.manual_seed(seed)
-        torch.set_num_threads(1)
-        try:
-            yield
-        finally:
-            torch.set_num_threads(threads)
-
-
-class _Standardise(nn.Module):
-    """Channels to zero mean and unit deviation, and to the front, where convolutions want them."""
-
-    def __init__(self, windows: Float[Tensor, "windows frames channels"]):
-        super().__init__()
-        self.mean, self.std = windows.mean((0, 1)), windows.std((0, 1), correction=0).clamp_min(_LEAST_STD)
-
-    def forward(self, windows: Float[Tensor, "batch frames channels"]) -> Float[Tensor, "batch channels frames"]:
-        return ((windows - self.mean) / self.std).transpose(1, 2)
-
-
-def _train_network(sets: Sequence[Float[Tensor, "_ frames channels"]], settings: ClassifierSettings) -> nn.Module:
+def _train_network(
+    sets: Sequence[Float[Tensor, "_ frames channels"]], settings: RealismSettings
+) -> Callable[[Float[Tensor, "_ frames channels"]], Float[Tensor, " _"]]:
     """Train three convolutions over time, the mean over the remaining frames, and one logit: positive for the first
     set."""
     windows = torch.cat(list(sets))
-    layers: list[nn.Module] = [_Standardise(windows)]
+    mean, std = windows.mean((0, 1)), windows.std((0, 1), correction=0).clamp_min(_LEAST_STD)
+    layers: list[nn.Module] = []
     channels = windows.shape[-1]
     for stride in (1, 2, 2):
         layers += [nn.Conv1d(channels, settings.width, 5, stride, padding=2), nn.LeakyReLU(0.2)]
@@ -318,13 +268,18 @@ def _train_network(sets: Sequence[Float[Tensor, "_ frames channels"]], settings:
     optimiser = torch.optim.AdamW(network.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay)
     half = settings.batch // 2
     target = torch.cat([torch.ones(half), torch.zeros(half)])
+
+    def classify(part: Tensor) -> Tensor:
+        return network(((part - mean) / std).transpose(1, 2))
+
     for _ in range(settings.steps):
         batch = torch.cat([windows[torch.randint(len(windows), (half,))] for windows in sets])
-        loss = nn.functional.binary_cross_entropy_with_logits(network(batch), target)
+        loss = nn.functional.binary_cross_entropy_with_logits(classify(batch), target)
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
         optimiser.step()
-    return network.eval()
+    network.eval()
+    return classify
 
 
 class Diversity(NamedTuple):
@@ -343,19 +298,10 @@ def measure_diversity(samples: Sequence[Motion]) -> Diversity:
     if len(samples) < 2 or len(lengths) > 1:
         shown = " and ".join(f"{float(length):.4g}" for length in lengths)
         raise RequestError(f"diversity needs at least 2 samples of one length, got {len(samples)} of {shown} s")
-    return measure_position_diversity(torch.stack([canonical_positions(sample) for sample in samples]))
-
-
-def measure_position_diversity(positions: Float[Tensor, "samples frames joints 3"]) -> Diversity:
-    """Measure diversity from world positions of the canonical joints, metres."""
+    positions = torch.stack([canonical_positions(sample) for sample in samples])
     aligned = [transform_to_ground_frame(each, each[:, HIPS, ::2], facing_angle(each)) for each in positions]
     relative = torch.stack([each - each[:, HIPS : HIPS + 1] for each in aligned])
     return Diversity(*(100.0 * average_pairwise_distance(each) for each in (positions, relative)))
-
-
-def align_to_start(positions: Float[Tensor, "frames joints 3"]) -> Float[Tensor, "frames joints 3"]:
-    """Move a clip to begin at the origin facing +Z, to compare clips that did not begin at one position."""
-    return transform_to_ground_frame(positions, positions[:1, HIPS, ::2], facing_angle(positions)[:1])
 
 
 def average_pairwise_distance(positions: Float[Tensor, "samples frames joints 3"]) -> float:

@@ -114,6 +114,7 @@ class Stance:
         """Undo `leveled`."""
         return _rotate_foot_frames(motion, self.tilt)
 
+
 def level_feet(clip: Motion) -> Motion:
     """Return the same movement (canonical joints) with joint frames of feet and toes that are aligned with the world
     while the foot is flat on the floor, as the clip shows it (see `Stance.of`); no joint moves."""

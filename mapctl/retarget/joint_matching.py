@@ -284,4 +284,3 @@ def _assign_sides(
             across = -across
         left = across
     return by_tree
-

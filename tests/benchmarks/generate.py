@@ -18,7 +18,7 @@ import priors
 from controllers.generation.generate import SIGMA_PLANTED, sample_stratified_starts
 from mapctl.errors import MapctlError
 from mapctl.metrics import measure
-from mapctl.metrics.realism import ClassifierSettings, RealismSettings, measure_realism
+from mapctl.metrics.realism import RealismSettings, measure_realism
 from mapctl.motion import Motion
 from mapctl.protocols import Density, Refiner
 
@@ -61,7 +61,7 @@ def main(words: list[str] | None = None) -> None:
     made = {name: generate_clips(prior, settings, None, given) for name, settings in variants.items()}
     if given.refiner:
         made["refined"] = generate_clips(prior, usual, priors.load_refiner(given.refiner), given)
-    settings = RealismSettings(classifier=ClassifierSettings(steps=given.steps))
+    settings = RealismSettings(steps=given.steps)
     rows: list[Row] = []
     for circle in circles:
         clips = [clip.motion for clip in circle.clips]

@@ -8,14 +8,12 @@ from helpers import bandai_skeleton, walk
 from mapctl import cli, metrics, retarget
 from mapctl.commands import measure
 from mapctl.metrics import realism
-from mapctl.metrics.realism import ClassifierSettings
 
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
     """A small network and few steps."""
-    small = ClassifierSettings(folds=2, steps=5, width=4)
-    monkeypatch.setattr(measure, "SETTINGS", realism.RealismSettings(classifier=small))
+    monkeypatch.setattr(measure, "SETTINGS", realism.RealismSettings(folds=2, steps=5, width=4))
 
 
 @pytest.fixture(scope="module")
@@ -72,10 +70,6 @@ def test_two_folders_are_compared(made, mocap, capsys):
     assert set(values["realism"]) == set(realism.Realism.__dataclass_fields__)
     assert 0 <= values["realism"]["accuracy"] <= 1
     assert (values["realism"]["made_windows"], values["realism"]["mocap_windows"]) == (5 * 7, 4 * 7)
-    for row in values["spread"].values():
-        assert row["ratio"] == pytest.approx(row["ours"] / row["reference"])
-    assert values["spread"]["std_of_speed_m_s"]["ours"] > 0
-    assert values["spread"]["pairwise_distance_world_cm"]["ours"] > 0
 
 
 @pytest.mark.slow

@@ -14,7 +14,13 @@ from torch.nn.functional import binary_cross_entropy_with_logits as cross_entrop
 
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, integrate_root
 from mapctl.metrics import measure
-from mapctl.metrics.realism import RealismSettings, canonical_positions, compute_held_out_accuracy, cut_windows
+from mapctl.metrics.realism import (
+    WINDOW_FRAMES,
+    RealismSettings,
+    canonical_positions,
+    compute_held_out_accuracy,
+    cut_windows,
+)
 from mapctl.pose import decode
 from priors import checkpoints
 from priors.checkpoints import require_at_least
@@ -337,9 +343,9 @@ class RefinerEvaluator:
         """Against clips that training does not see: of those that a refiner is chosen by, or of those that are left to
         measure the chosen one."""
         settings = settings or RealismSettings()
-        clips = [clip for clip in held.clips() if len(clip) > settings.windows.frames]
+        clips = [clip for clip in held.clips() if len(clip) > WINDOW_FRAMES]
         motions = [decode(clip, GroundPose.origin()) for clip in clips]
-        windows = [cut_windows(canonical_positions(motion), settings.windows) for motion in motions]
+        windows = [cut_windows(canonical_positions(motion)) for motion in motions]
         return RefinerEvaluator(torch.stack(raw.clips()), _average_measures(clips), windows, settings)
 
     def __call__(self, network: RefinerNetwork) -> dict[str, float]:
@@ -354,12 +360,12 @@ class RefinerEvaluator:
         }
         if min(len(refined), len(self.windows)) >= self.settings.min_clips:
             made = [
-                cut_windows(canonical_positions(decode(clip, GroundPose.origin())), self.settings.windows)
+                cut_windows(canonical_positions(decode(clip, GroundPose.origin())))
                 for clip in refined
             ]
             seeded = torch.Generator().manual_seed(0)
             row["classifier_accuracy"] = compute_held_out_accuracy(
-                made, self.windows, generator=seeded, settings=self.settings.classifier
+                made, self.windows, generator=seeded, settings=self.settings
             )
         return row
 
