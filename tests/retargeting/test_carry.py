@@ -6,15 +6,23 @@ from dataclasses import replace
 import pytest
 import torch
 from hand_poses import arms_down
-from helpers import bandai_skeleton, generator, quat_xyzw
+from helpers import bandai_skeleton, generator, quat_xyzw, walk
 from performers import FEET, HIPJOINTS, KNEES, TOES, Performer
 from rig_maker import Make, make, names_of
+from scipy.spatial.transform import Rotation
 
 import mapctl
 from mapctl import contacts, retarget, rotations
 from mapctl.commands.shared import inputs
 from mapctl.motion import Motion
-from mapctl.retarget.carry import RiggedCharacter, fit_hips, retarget_motion
+from mapctl.retarget.carry import (
+    GroundMode,
+    RiggedCharacter,
+    find_ground,
+    fit_hips,
+    retarget_canonical,
+    retarget_motion,
+)
 from mapctl.retarget.character import LEGS, limb_extension
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, leg_length
 
@@ -225,3 +233,106 @@ def _lafan_like(frames: int = 90) -> Motion:
             offsets[own] = offsets[own] / offsets[own].norm() * canonical.skeleton.offsets[joint].norm()
     hips = canonical.root_position
     return replace(motion, skeleton=replace(made.skeleton, offsets=offsets), root_position=hips, local_quat_xyzw=local)
+
+
+MIXAMO, UE5 = (make(Make(names_of(name), arms_down_deg=down)) for name, down in (("mixamo", 0.0), ("ue5", 45.0)))
+FINGERS = [f"{side}_{finger}_bone" for side in "LR" for finger in ("Thumb1", "Index1")]
+
+
+def test_numbers_of_a_walk():
+    clip, body = Performer().walks(), Performer(size=1.25, toe_height=0.02).body()
+    found = retarget_motion(clip, body)
+    assert found.changes.scale == pytest.approx(1.25)
+    assert found.changes.hips_lowered_m < 0.01
+    assert found.changes.feet_missed.frames == found.changes.hands_missed.frames == 0
+    assert found.changes.unmatched_joints == found.notes == ()
+
+
+def test_joints_that_move_and_have_no_counterpart_are_named():
+    """Not so a joint of the spine, whose turns the chest has; nor fingers that the other rig has."""
+    clip = MIXAMO.motion(walk(40))
+    plain = RiggedCharacter.of(make(Make(names_of("ue5"), extras=False)).motion(walk(40)))[1]
+    left = retarget_motion(clip, plain).changes.unmatched_joints
+    assert {*FINGERS, "Prop_sword"} <= {*left}
+    assert "Middle" not in left
+    like = RiggedCharacter.of(UE5.motion(walk(40)))[1]
+    assert not {*FINGERS} & {*retarget_motion(clip, like).changes.unmatched_joints}
+
+
+def test_fingers_turn_as_the_givers_in_the_tposes_frames():
+    clip, body = MIXAMO.motion(walk(40)), RiggedCharacter.of(UE5.motion(walk(40)))[1]
+    found = retarget_motion(clip, body)
+    made = body.on_rig(found.motion, fingers=found.fingers)
+    for name in FINGERS:
+        hand = ("left" if name.startswith("L") else "right") + "Hand"
+        added = []
+        for motion, rig in ((clip, MIXAMO), (made, UE5)):
+            frame = rig.tpose[hand]
+            turn = Rotation.from_quat(motion.local_quat_xyzw[:, motion.skeleton.index(name)].numpy())
+            added.append(frame * turn * frame.inv())
+        assert max((added[0].inv() * added[1]).magnitude()) < 1e-6
+        assert max(added[0].magnitude()) > 0.05
+
+
+CLIMBS = Performer(stair=0.10, upright=0.9)
+OTHERS = {"small": Performer(size=0.8, toe_height=0.03), "tall": Performer(size=1.2, toe_height=0.05)}
+
+
+def climb() -> tuple[Motion, RiggedCharacter]:
+    """Up a stair from the floor, after a while on the floor that tells how high toes rest."""
+    return CLIMBS.walks(100), Performer().body()
+
+
+def stands(motion: Motion, clip: Motion) -> torch.Tensor:
+    """Toe heights by frame and foot where the clip's feet stand, nan elsewhere."""
+    still = clip.joint_positions()[:, TOES].diff(dim=0, prepend=clip.joint_positions()[:1, TOES]).norm(dim=-1) < 1e-6
+    return torch.where(still, motion.joint_positions()[:, TOES, 1], torch.nan)
+
+
+@pytest.mark.parametrize("mode", ["fit", "keep"])
+@pytest.mark.parametrize("name", OTHERS)
+def test_steps_are_as_high_as_asked(mode: GroundMode, name):
+    clip, giver = climb()
+    body = OTHERS[name].body()
+    done = retarget_canonical(clip, giver, body, ground=mode)
+    scale = leg_length(body.leveled) / leg_length(clip.skeleton)
+    factor = scale if mode == "fit" else 1.0
+    over = stands(clip, clip) - Performer().toe_height
+    got = stands(done.motion, clip) - OTHERS[name].toe_height
+    high = over > 0.05
+    assert int(high.sum()) > 40
+    assert float((got - factor * over)[high].abs().max()) < 0.012
+    assert done.changes.feet_missed.frames == 0
+
+
+@pytest.mark.parametrize("mode", ["fit", "keep"])
+def test_feet_on_stairs_do_not_slide(mode: GroundMode):
+    clip, giver = climb()
+    for name in OTHERS:
+        done = retarget_canonical(clip, giver, OTHERS[name].body(), ground=mode).motion
+        moved = done.joint_positions()[:, TOES].diff(dim=0).norm(dim=-1)
+        still = clip.joint_positions()[:, TOES].diff(dim=0).norm(dim=-1) < 1e-6
+        still[1:] &= still[:-1].clone()
+        assert float(moved[still].median()) < 1e-3
+        assert float(moved[still].quantile(0.95)) < 4e-3
+
+
+@pytest.mark.parametrize(("height", "kept"), [(0.045, True), (0.02, False)])
+def test_a_low_platform_is_kept_only_where_that_is_asked(height, kept):
+    """From 3 cm on: less may be the height of the toe joints."""
+    walk, body = Performer().walks(), OTHERS["tall"].body()
+    clip = replace(walk, root_position=walk.root_position + torch.tensor([0.0, height, 0.0], dtype=torch.float64))
+    low = {
+        mode: float(retarget_motion(clip, body, ground=mode).motion.joint_positions()[:, TOES, 1].quantile(0.05))
+        for mode in ("fit", "keep")
+    }
+    assert low["fit"] == pytest.approx(0.05, abs=0.008)
+    assert low["keep"] == pytest.approx(0.05 + (height if kept else 0.0), abs=0.008)
+
+
+def test_a_foot_that_is_held_up_stands_on_nothing():
+    """At the height of a kick, and while the body is not over it."""
+    up = torch.full((60,), -1.2, dtype=torch.float64)
+    clip = Performer().stands(turned={HIPJOINTS[0]: up, FEET[0]: -up})
+    _, height = find_ground(clip, Performer().body().stance)
+    assert height.abs().max() == 0

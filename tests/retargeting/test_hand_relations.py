@@ -191,7 +191,7 @@ def test_arms_that_are_too_short_get_as_near_as_they_can_and_say_so():
     assert "cm off (frame " in told[0]
     miss = done.changes.hands_missed
     assert 0.01 < miss.metres < 0.3
-    assert 0 < miss.frames < miss.of_frames == 90
+    assert 0 < miss.frames < 90
     straight = done.motion.joint_positions()[miss.frame]
     far = float((straight[HANDS[1]] - straight[UPPER[1]]).norm()) / float(
         done.motion.skeleton.offsets[[LOWER[1], HANDS[1]]].norm(dim=-1).sum()

@@ -5,15 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from helpers import bandai_skeleton, cmu_skeleton, generator, turn_between, walk
+from helpers import bandai_skeleton, cmu_skeleton, generator, random_motion, turn_between
 from rig_maker import Make, make, names_of, person, versions_of
+from rig_trees import TREES
 from scipy.spatial.transform import Rotation
 
-import mapctl
-from mapctl import kinematics, retarget, rotations
+from mapctl import retarget
 from mapctl.errors import RequestError
-from mapctl.formats import bvh
 from mapctl.retarget import rigs
+from mapctl.retarget.doubts import assess_fit
 from mapctl.retarget.joint_matching import MIN_SCORE, match
 from mapctl.skeleton import CANONICAL, Skeleton
 
@@ -159,43 +159,6 @@ def test_hips_below_a_travelling_root_move_with_it():
     torch.testing.assert_close(back.root_position, motion.root_position + 1, atol=1e-9, rtol=0)
 
 
-def frozen_conversion(motion, rig):
-    """The conversion of the two rigs that the bundled priors were trained through, as it was then."""
-    joint_of = [motion.skeleton.index(rig.joints[c]) if c in rig.joints else None for c in CANONICAL.names]
-    picked, world = [], motion.joint_rotations()
-    for index, (name, joint) in enumerate(zip(CANONICAL.names, joint_of, strict=True)):
-        axes, matrix = rig.tpose.get(name), torch.eye(3, dtype=torch.float64)
-        if axes:
-            x, y = (torch.tensor(axes[axis], dtype=torch.float64) for axis in ("x", "y"))
-            x = torch.nn.functional.normalize(x, dim=0)
-            y = torch.nn.functional.normalize(y - x * (x @ y), dim=0)
-            matrix = torch.stack([x, y, torch.linalg.cross(x, y)], dim=1)
-        if rig.name == "cmu-daz" and name.endswith(("UpperArm", "LowerArm", "UpperLeg", "LowerLeg")):
-            child = CANONICAL.children(index)[0]
-            bone = torch.nn.functional.normalize(motion.skeleton.offsets[joint_of[child]], dim=0)
-            aim = torch.nn.functional.normalize(CANONICAL.offsets[child], dim=0)
-            axis, cosine = torch.linalg.cross(bone, aim), bone @ aim
-            sine = axis.norm().clamp_min(1e-12)
-            matrix = rotations.rotation_vector_to_matrix(axis / sine * torch.atan2(sine, cosine))
-        tpose = rotations.from_matrix(matrix)
-        if joint is None:
-            picked.append(picked[CANONICAL.parents[index]])
-        else:
-            picked.append(rotations.multiply(world[:, joint], rotations.inverse(tpose).expand(len(world), 4)))
-    local = kinematics.local_from_world(CANONICAL.parents, torch.stack(picked, dim=1))
-    return rotations.make_sign_continuous(local), motion.joint_positions()[:, joint_of[0]]
-
-
-@pytest.mark.parametrize(("name", "skeleton"), [("bandai-namco", bandai_skeleton()), ("cmu-daz", cmu_skeleton())])
-def test_the_rigs_that_priors_were_trained_through_convert_as_they_did(name, skeleton):
-    motion = retarget.from_canonical(walk(20), retarget.identify_rig(skeleton))
-    canonical, rigmap = retarget.to_canonical(motion)
-    local, hips = frozen_conversion(motion, retarget.load_rig(name))
-    assert rigmap.rig.name == name
-    torch.testing.assert_close(canonical.local_quat_xyzw, local, atol=1e-12, rtol=0)
-    assert torch.equal(canonical.root_position, hips)
-
-
 TOML = """
 name = "ours"
 up = "{up}"
@@ -223,12 +186,95 @@ def test_a_toml_file_wins(tmp_path):
     assert_returns(motion, canonical, rigmap)
 
 
-def test_a_unit_that_is_set_wins(tmp_path):
-    motion = make(Make(names_of("mixamo"))).motion(person(1.0, 5))
-    motion.save(tmp_path / "a.bvh")
-    found = mapctl.load(tmp_path / "a.bvh")
-    inches = mapctl.load(tmp_path / "a.bvh", metres_per_unit=0.0254)
-    assert (bvh.unit_of(found), bvh.unit_of(inches), bvh.unit_of(motion)) == (0.01, 0.0254, None)
-    torch.testing.assert_close(inches.joint_positions(), 2.54 * found.joint_positions())
-    inches.save(tmp_path / "b.bvh")
-    torch.testing.assert_close(mapctl.load(tmp_path / "b.bvh").root_position, found.root_position, atol=1e-6, rtol=0)
+SKELETONS = {"bandai-namco": bandai_skeleton(), "cmu-daz": cmu_skeleton(), "canonical": CANONICAL}
+each_rig = pytest.mark.parametrize("rig", SKELETONS)
+
+
+@each_rig
+def test_back_and_there_is_the_canonical_motion(rig):
+    rigmap = retarget.identify_rig(SKELETONS[rig])
+    wanted = replace(random_motion(rigmap.skeleton, seed=3))
+    if rig == "cmu-daz":  # it has no toe joints: the toes cannot turn on their own
+        toes = [CANONICAL.index("leftToes"), CANONICAL.index("rightToes")]
+        wanted.local_quat_xyzw[:, toes] = torch.tensor([0.0, 0, 0, 1], dtype=torch.float64)
+    canonical, _ = retarget.to_canonical(retarget.from_canonical(wanted, rigmap), retarget.as_rig(rigmap))
+    assert turn_between(canonical.local_quat_xyzw, wanted.local_quat_xyzw) < 1e-6
+    torch.testing.assert_close(canonical.joint_positions(), wanted.joint_positions(), atol=1e-9, rtol=0)
+
+
+def test_joints_beyond_the_canonical_ones_keep_the_originals_rotation_or_rest():
+    motion = random_motion(cmu_skeleton())
+    canonical, rigmap = retarget.to_canonical(motion)
+    thumb = motion.skeleton.index("lThumb1")
+    kept = retarget.from_canonical(canonical, rigmap, motion).local_quat_xyzw[:, thumb]
+    assert turn_between(kept, motion.local_quat_xyzw[:, thumb]) < 1e-9
+    longer = retarget.from_canonical(canonical.join(canonical), rigmap, motion)
+    assert turn_between(longer.local_quat_xyzw[:, thumb], torch.tensor([0.0, 0, 0, 1]).double().expand(10, 4)) < 1e-9
+
+
+def test_the_static_root_of_an_original_stays():
+    motion = random_motion(bandai_skeleton(), 6)
+    motion = replace(motion, moving_offsets={1: motion.root_position.flip(0)})
+    canonical, rigmap = retarget.to_canonical(motion, retarget.as_rig(retarget.identify_rig(motion.skeleton)))
+    moved = retarget.from_canonical(replace(canonical, root_position=canonical.root_position + 1), rigmap, motion)
+    torch.testing.assert_close(moved.root_position, motion.root_position)
+    hips = motion.joint_positions()[:, 1] + 1
+    torch.testing.assert_close(moved.joint_positions()[:, 1], hips, atol=1e-9, rtol=0)
+
+
+@pytest.mark.parametrize(("preset", "version", "arms"), [(*tree, 40 * (k % 2)) for k, tree in enumerate(TREES)])
+def test_a_rig_as_a_program_writes_it_is_known_and_comes_back(preset, version, arms):
+    wish = replace(TREES[preset, version], arms_down_deg=arms, extras=False)
+    made, wanted = make(wish), person(1.0, 30)
+    motion = made.motion(wanted)
+    canonical, rigmap = retarget.to_canonical(motion)
+    absent = CANONICAL.num_joints - len(made.joint)
+    assert rigmap.rig.name == preset
+    assert rigmap.match.score == pytest.approx(1.0 - 0.6 * absent / CANONICAL.num_joints)
+    assert rigmap.joint_names == dict(made.joint)
+    assert (rigmap.rest, rigmap.up) == ("T" if arms == 0 else "A", "z" if wish.zup else "y")
+    facing = {(False, 0): "z", (False, 180): "-z", (True, 0): "-y"}[wish.zup, wish.turned_deg]
+    assert rigmap.facing == facing
+    assert assess_fit(rigmap, motion).doubts == ()
+    known = [CANONICAL.index(name) for name in made.joint]
+    turned = turn_between(canonical.joint_rotations()[:, known], wanted.joint_rotations()[:, known])
+    assert np.rad2deg(turned) < 0.01
+    # Twists in the chain move no joint of a limb: hands and feet are where they are in truth.
+    places = canonical.joint_positions()[:, known], wanted.joint_positions()[:, known]
+    torch.testing.assert_close(*places, atol=1e-6, rtol=0)
+    back = retarget.from_canonical(canonical, rigmap, motion)
+    assert turn_between(back.local_quat_xyzw, motion.local_quat_xyzw) < 1e-6
+    torch.testing.assert_close(back.joint_positions(), motion.joint_positions(), atol=1e-8, rtol=0)
+
+
+@pytest.mark.parametrize(
+    "tree", [("daz-genesis", "3 and 8"), ("rigify", "deforming"), ("makehuman", "default")], ids=str
+)
+def test_another_motion_on_limbs_of_two_halves_puts_hands_and_feet_where_they_belong(tree):
+    """Without the rig's own motion the twists rest."""
+    made, wanted = make(replace(TREES[tree], arms_down_deg=40, extras=False)), person(1.0, 20)
+    rigmap = retarget.identify_rig(made.skeleton, motion=made.motion(wanted))
+    on_rig = retarget.from_canonical(replace(wanted, skeleton=rigmap.skeleton), rigmap)
+    known = [CANONICAL.index(name) for name in made.joint]
+    places = retarget.rig_joint_positions(on_rig, rigmap)[:, known]
+    torch.testing.assert_close(places, wanted.joint_positions()[:, known], atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("trunk", "chest"),
+    [
+        (("Spine",), None),
+        (("Spine", "Spine1"), "Spine1"),
+        (("Spine", "Spine1", "Spine2"), "Spine2"),
+        (("Spine", "Spine1", "Spine2", "Spine3"), "Spine3"),
+    ],
+)
+def test_of_rigs_that_share_names_the_chest_is_what_the_arms_hang_from(trunk, chest):
+    """HumanIK's names without prefix have trunks of one to ten joints."""
+    names = names_of("mixamo", 1) | {"chest": trunk[-1]} if chest else names_of("mixamo", 1)
+    if chest is None:
+        del names["chest"]
+    made = make(Make(names, between={"chest": trunk[1:-1]} if chest else {}, extras=False))
+    found = retarget.identify_rig(made.skeleton).joint_names
+    assert found.get("chest") == chest
+    assert found["spine"] == "Spine"
