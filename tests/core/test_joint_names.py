@@ -1,15 +1,16 @@
 """Names of joints: canonical ones and the rig's own, in any case, and suggestions that stay on their side and limb."""
 
 import pytest
-from captures import on_rig
+import torch
 from helpers import random_motion
-from rig_maker import Make, make, names_of, person
+from rig_maker import Make, make, names_of
+from scenes_walks import walk
 
 from mapctl.errors import RequestError
-from mapctl.joint_names import find_joint
-from mapctl.recording.masks import ALL, ROOT, Mask, expand_valid_masks, resolve_joint_names
+from mapctl.joint_names import Part, Role, Side, classify_joint, find_joint
+from mapctl.joint_roles import classify_joints, find_feet, find_hips, find_upper_legs
 from mapctl.retarget import canonical_joints, rigs
-from mapctl.skeleton import CANONICAL
+from mapctl.skeleton import Skeleton
 
 
 def spellings(name):
@@ -48,19 +49,95 @@ def test_own_names_as_written_come_first():
         find_joint("HAND", names)
 
 
-@pytest.mark.parametrize("rig", ["daz", "bandai"])
-def test_masks_take_canonical_names(rig):
-    motion = on_rig(rig, 40)
-    own = motion.skeleton.names[canonical_joints(motion)["leftHand"]]
-    asked = [Mask("leftHand", 3, 9), Mask("LEFTHAND", 9, 12), Mask(ALL, 20, 21), Mask(ROOT, 0, 2)]
-    told = resolve_joint_names(motion, asked)
-    assert [mask.joint for mask in told] == [own, own, ALL, ROOT]
-    assert [(mask.start, mask.stop) for mask in told] == [(mask.start, mask.stop) for mask in asked]
-    assert (expand_valid_masks(motion, asked)[0] == expand_valid_masks(motion, told)[0]).all()
+# hips, left and right upper leg, left and right toe; the order in a file varies and tells nothing.
+RIGS = {
+    "canonical": "hips leftUpperLeg rightUpperLeg leftToes rightToes",
+    "bandai": "Hips UpperLeg_L UpperLeg_R Toes_L Toes_R",
+    "mixamo": "mixamorig:* Hips LeftUpLeg RightUpLeg LeftToeBase RightToeBase",
+    "mixamo4": "mixamorig4:* Hips LeftUpLeg RightUpLeg LeftToeBase RightToeBase",
+    "cmu-daz": "hip lThigh rThigh lFoot rFoot",
+    "asf": "root lfemur rfemur ltoes rtoes",
+    "lafan": "Hips LeftUpLeg RightUpLeg LeftToe RightToe",
+    "biped": "Bip01 * Pelvis L_Thigh R_Thigh L_Toe0 R_Toe0",
+    "unreal": "pelvis thigh_l thigh_r ball_l ball_r",
+    "vroid": "J_Bip_* C_Hips L_UpperLeg R_UpperLeg L_ToeBase R_ToeBase",
+    "rigify": "DEF-* hips thigh.L thigh.R toe.L toe.R",
+    "smpl": "Pelvis L_Hip R_Hip L_Foot R_Foot",
+    "motionbuilder": "Character1_* Hips LeftUpLeg RightUpLeg LeftToeBase RightToeBase",
+}
 
 
-def test_names_of_a_rig_that_only_the_user_knows():
-    motion = make(Make({c: f"b{n}" for n, c in enumerate(CANONICAL.names)}, extras=False)).motion(person(frames=3))
-    given_rig = rigs.Rig("mine", {c: f"b{n}" for n, c in enumerate(CANONICAL.names)})
-    (mask,) = resolve_joint_names(motion, [Mask("rightFoot", 0, 1)], given_rig)
-    assert mask.joint == f"b{CANONICAL.names.index('rightFoot')}"
+def joints_of(kind):
+    """The five names, with the prefix before `*`."""
+    prefix, _, rest = RIGS[kind].rpartition("*")
+    return [prefix + name for name in rest.split()]
+
+
+def rig(names):
+    """A skeleton of joints with these names, all under the first."""
+    names = tuple(dict.fromkeys(names))
+    return Skeleton(names, (-1, *[0] * (len(names) - 1)), torch.zeros(len(names), 3, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("kind", RIGS)
+def test_roles_of_known_rigs(kind):
+    names = joints_of(kind)
+    skeleton = rig(["Spine", "LeftHand", "RightHand", "LeftToeNub", "Head", *reversed(names)])
+    found = (find_hips(skeleton), *find_upper_legs(skeleton), *find_feet(skeleton))
+    assert [skeleton.names[joint] for joint in found] == names
+
+
+NAMES = {
+    (Side.LEFT, Part.UPPER_LEG): "leftUpperLeg LeftUpLeg UpperLeg_L lThigh lfemur mixamorig:LeftUpLeg L_Thigh thigh.L",
+    (Side.RIGHT, Part.LOWER_LEG): "rightLowerLeg RightLeg LowerLeg_R rShin rtibia RightKnee Bip01_R_Calf",
+    (Side.LEFT, Part.UPPER_ARM): "leftUpperArm LeftArm UpperArm_L lShldr lhumerus upper_arm.L",
+    (Side.RIGHT, Part.LOWER_ARM): "rightLowerArm RightForeArm LowerArm_R rForeArm rradius RightElbow",
+    (Side.LEFT, Part.SHOULDER): "leftShoulder LeftShoulder Shoulder_L lCollar lclavicle",
+    (Side.RIGHT, Part.HAND): "rightHand RightHand Hand_R rHand RightWrist",
+    (Side.LEFT, Part.FINGER): "lMid1 lThumb2 LeftHandIndex3 lRing1 leftLittleProximal",
+    (Side.RIGHT, Part.TOES): "rightToes RightToeBase Toes_R rtoes",
+    (Side.LEFT, Part.FOOT): "leftFoot LeftFoot Foot_L lFoot LeftAnkle",
+    (Side.MIDDLE, Part.HIPS): "hips Hips hip pelvis joint_Root mixamorig:Hips",
+    (Side.MIDDLE, Part.TORSO): "spine chest Spine1 abdomen LowerBack upperChest",
+    (Side.MIDDLE, Part.HEAD): "head Head mixamorig:Head",
+    (Side.MIDDLE, Part.NECK): "neck Neck1",
+    (Side.MIDDLE, Part.OTHER): "prop tail jaw",
+}
+
+
+HAN = {
+    (Side.LEFT, Part.UPPER_LEG): "左大腿 左太もも",
+    (Side.RIGHT, Part.LOWER_LEG): "右小腿 右ひざ 右膝",
+    (Side.LEFT, Part.FOOT): "左足首 左脚 左脚踝",
+    (Side.RIGHT, Part.TOES): "右つま先 右脚趾 右足指",
+    (Side.LEFT, Part.UPPER_ARM): "左腕 左上臂 左上腕 腕.L",
+    (Side.RIGHT, Part.LOWER_ARM): "右ひじ 右前臂 右前腕 右肘",
+    (Side.LEFT, Part.HAND): "左手 左手首 左手腕",
+    (Side.RIGHT, Part.FINGER): "右人指１ 右食指",
+    (Side.MIDDLE, Part.NECK): "首 脖子",
+    (Side.MIDDLE, Part.HEAD): "頭 头",
+    (Side.MIDDLE, Part.HIPS): "下半身 骨盆",
+    (Side.MIDDLE, Part.TORSO): "上半身 上半身2 腰 胸",
+}
+"""The same in Chinese and Japanese."""
+
+
+@pytest.mark.parametrize("table", [NAMES, HAN], ids=["latin", "han"])
+def test_role_of_every_way_to_name_it(table):
+    for (side, part), names in table.items():
+        assert {name: classify_joint(name) for name in names.split()} == dict.fromkeys(names.split(), Role(side, part))
+
+
+def test_a_shoulder_below_a_collar_is_the_upper_arm_and_a_hip_without_thigh_the_upper_leg():
+    names = ("Hips", "LeftHip", "LeftKnee", "Chest", "LeftCollar", "LeftShoulder", "LeftElbow")
+    skeleton = Skeleton(names, (-1, 0, 1, 0, 3, 4, 5), walk().skeleton.offsets[:7])
+    found = [r.part for r in classify_joints(skeleton)]
+    assert found == [
+        Part.HIPS,
+        Part.UPPER_LEG,
+        Part.LOWER_LEG,
+        Part.TORSO,
+        Part.SHOULDER,
+        Part.UPPER_ARM,
+        Part.LOWER_ARM,
+    ]

@@ -4,7 +4,7 @@ from fractions import Fraction
 
 import pytest
 import torch
-from helpers import bandai_skeleton, generator, quat_xyzw, random_motion, turn_between, walk
+from helpers import bandai_skeleton, generator, random_motion, turn_between
 
 from mapctl.errors import MapctlError
 from mapctl.motion import Motion
@@ -31,14 +31,6 @@ def test_parts_joined_are_the_whole():
     assert (whole.num_frames, whole.num_joints, whole.seconds) == (6, 22, 0.2)
 
 
-@pytest.mark.parametrize("first_travels", [True, False])
-def test_a_travelling_joint_is_joined_to_one_at_rest(first_travels):
-    moving, still = travelling(3), random_motion(bandai_skeleton(), 4, seed=9)
-    pair = (moving, still) if first_travels else (still, moving)
-    joined = pair[0].join(pair[1])
-    torch.testing.assert_close(joined.joint_positions(), torch.cat([m.joint_positions() for m in pair]))
-
-
 @pytest.mark.parametrize("other", ["fps", "skeleton"])
 def test_unlike_motions_are_not_joined(other):
     motion = random_motion(CANONICAL, 3)
@@ -61,28 +53,6 @@ def test_twice_the_rate_keeps_every_frame_and_puts_one_midway():
     right = turn_between(fine.local_quat_xyzw[1], fine.local_quat_xyzw[2])
     assert left == pytest.approx(right, abs=1e-6)
     same(fine.resample(30), motion)
-
-
-@pytest.mark.parametrize("fps", [29.97, 120])
-def test_other_rates_keep_the_duration_and_follow_a_steady_turn(fps):
-    frames, rate = 61, 2.0
-    at = torch.arange(frames, dtype=torch.float64) / 30
-    local = quat_xyzw(torch.stack([0 * at, rate * at, 0 * at], -1))[:, None].expand(-1, 21, -1).clone()
-    motion = Motion(CANONICAL, Fraction(30), torch.stack([at, at, -at], -1), local).resample(fps)
-    times = torch.arange(motion.num_frames, dtype=torch.float64) / float(motion.fps)
-    assert 2 - 1 / float(fps) < float(times[-1]) <= 2 + 1e-9
-    torch.testing.assert_close(motion.root_position[:, 0], times)
-    expected = quat_xyzw(torch.stack([0 * times, rate * times, 0 * times], -1))
-    assert turn_between(motion.local_quat_xyzw[:, 5], expected) < 1e-6
-
-
-def test_mirrored_twice_is_the_motion_itself():
-    motion = walk(20, turn_rate=0.5)
-    twice = motion.mirror().mirror()
-    torch.testing.assert_close(twice.root_position, motion.root_position)
-    torch.testing.assert_close(twice.local_quat_xyzw, motion.local_quat_xyzw)
-    torch.testing.assert_close(twice.skeleton.offsets, motion.skeleton.offsets)
-    assert twice.skeleton.end_offsets == motion.skeleton.end_offsets
 
 
 def test_a_mirror_image_has_every_joint_on_the_other_side():

@@ -7,12 +7,14 @@ import pytest
 import torch
 from helpers import generator, walk
 from rig_maker import make
-from rigs_to_edit import RIGS, soft_knees
+from rigs_to_edit import RIGS, on_rig, soft_knees, toe_speed
 
-from mapctl import editing, rotations
+from mapctl import editing, retarget, rotations
 from mapctl.editing.looping import Peaks, find_contacts
 from mapctl.editing.rigged_motion import RiggedMotion
 from mapctl.editing.travel import repeat_over_ground
+from mapctl.errors import RequestError
+from mapctl.skeleton import CANONICAL
 
 
 def uneven(frames: int = 120, *, fps: int = 30, turn_rate: float = 0.0, cadence: float = 0.93):
@@ -87,3 +89,130 @@ def test_planted_feet_move_as_they_did():
     stays = planted[1:] & planted[:-1]
     assert bool(stays.any())
     assert float((closed.diff(dim=0) - own[cut].diff(dim=0)).norm(dim=-1)[stays].max()) < 1e-4
+
+
+def stand(frames: int):
+    """A body that stands, and once reaches out."""
+    motion = walk(frames)
+    local = torch.zeros_like(motion.local_quat_xyzw)
+    local[..., 3] = 1
+    root = motion.root_position[:1].expand(frames, 3).clone()
+    return replace(motion, local_quat_xyzw=local, root_position=root)
+
+
+@pytest.mark.parametrize("fps", [25, 120])
+@pytest.mark.parametrize("cadence", [0.7, 1.4])
+def test_a_walk_has_one_stride(fps, cadence):
+    motion = walk(4 * fps, cadence=cadence, fps=fps)
+    cycle = editing.find_cycle(motion)
+    told = editing.describe_cycle(motion, cycle)
+    assert cycle.is_gait
+    assert told["seconds"] == pytest.approx(1 / cadence, abs=0.6 / fps + 1e-9)
+    assert told["steps_per_minute"] == pytest.approx(120 * cadence, rel=0.04)
+    travelled = motion.root_position[cycle.stop] - motion.root_position[cycle.start]
+    assert told["stride_m"] == pytest.approx(float(travelled[2]), abs=0.01)
+    assert told["mismatch_cm"] < 3
+
+
+def test_standing_before_and_after_is_no_cycle_of_a_walk():
+    still = stand(60)
+    middle = walk(90, cadence=1.0)
+    end = replace(still, root_position=still.root_position + middle.root_position[-1] * torch.tensor([1.0, 0, 1.0]))
+    motion = still.join(middle).join(end)
+    cycle = editing.find_cycle(motion)
+    assert cycle.frames == pytest.approx(30, abs=1)
+    assert cycle.start >= 55
+    assert cycle.stop <= 155
+
+
+def test_a_body_on_the_spot_has_a_cycle_that_is_no_gait():
+    motion = walk(150, cadence=0.5)
+    still = replace(motion, root_position=motion.root_position * torch.tensor([0.0, 1.0, 0.0]).double())
+    cycle = editing.find_cycle(still)
+    assert not cycle.is_gait
+    assert cycle.frames == pytest.approx(60, abs=1)
+    assert "stride_m" not in editing.describe_cycle(still, cycle)
+
+
+def test_what_never_comes_back_is_refused_with_what_comes_nearest():
+    frames = 90
+    motion = stand(frames)
+    local = motion.local_quat_xyzw.clone()
+    arm = CANONICAL.index("leftUpperArm")
+    reach = torch.linspace(0, 2.5, frames).double()
+    local[:, arm] = rotations.from_rotation_vector(torch.stack([0 * reach, 0 * reach, reach], dim=-1))
+    shift = torch.linspace(0, 3, frames).double() ** 2
+    root = motion.root_position + torch.stack([0 * shift, 0 * shift, shift], dim=-1)
+    with pytest.raises(RequestError, match=r"frames \d+ and \d+ come nearest, .* [\d.]+ cm apart; [\d.]+ are allowed"):
+        editing.find_cycle(replace(motion, local_quat_xyzw=local, root_position=root))
+
+
+LEGS = [side + part for part in ("UpperLeg", "LowerLeg", "Foot") for side in ("left", "right")]
+
+
+def sliding(frames: int = 75, fps: int = 30):
+    """A walk whose body drifts sideways against its feet."""
+    motion = soft_knees(walk(frames, cadence=1.0, fps=fps))
+    drift = torch.linspace(0, 0.25 * frames / fps / 2.5, frames).double()
+    return replace(motion, root_position=motion.root_position + torch.stack([drift, 0 * drift, 0 * drift], dim=-1))
+
+
+def contacts_of(motion):
+    rigged = RiggedMotion.of(motion)
+    return find_contacts(rigged.positions("Toes"), rigged.position("hips"), float(motion.fps))
+
+
+@pytest.mark.parametrize("name", RIGS)
+def test_planted_toes_are_still_on_any_rig_and_the_rest_stays_to_the_bit(name):
+    motion = on_rig(name, sliding())
+    planted = contacts_of(motion)
+    done = editing.plant_feet(motion)
+    assert toe_speed(motion, planted) > 0.08
+    assert toe_speed(done, planted) < 0.002
+    joints = retarget.identify_rig(motion.skeleton, motion=motion).joints
+    others = [j for j in range(motion.num_joints) if j not in {joints[name] for name in LEGS}]
+    assert torch.equal(done.local_quat_xyzw[:, others], motion.local_quat_xyzw[:, others])
+    feet = [joints[name] for name in ("leftFoot", "rightFoot")]
+    turned = (done.joint_rotations() * motion.joint_rotations())[:, feet].sum(dim=-1).abs()
+    torch.testing.assert_close(turned, torch.ones_like(turned), atol=1e-6, rtol=0)
+
+
+def test_noise_is_no_reason_to_let_go():
+    motion = sliding(120, 60)
+    noise = 0.004 * torch.randn(120, 3, generator=generator(), dtype=torch.float64)
+    noisy = replace(motion, root_position=motion.root_position + noise)
+    planted = contacts_of(motion)
+    assert float((contacts_of(noisy) == planted).double().mean()) > 0.9
+    assert toe_speed(noisy, planted) > 0.5
+    inner = planted[2:] & planted[1:-1] & planted[:-2]
+    still = torch.zeros_like(planted)
+    still[2:-2] = inner[1:-1]
+    assert toe_speed(editing.plant_feet(noisy), still & contacts_of(noisy)) < 0.01
+
+
+def test_feet_on_a_box_are_still_and_stay_up():
+    """A walk that goes on 48 cm higher: feet there slide no more than on the floor, and rest as high as they did."""
+    motion = sliding(150)
+    rise = 0.48 * ((torch.arange(150) - 70) / 10).clamp(0, 1).double()
+    high = replace(motion, root_position=motion.root_position + torch.stack([0 * rise, rise, 0 * rise], dim=-1))
+    planted, done = contacts_of(high), editing.plant_feet(high)
+    assert bool(planted[90:].any())
+    assert toe_speed(done, planted) < 0.002
+    heights = [RiggedMotion.of(each).positions("Toes")[..., 1] for each in (high, done)]
+    assert float((heights[1] - heights[0])[planted].abs().max()) < 0.02
+
+
+def test_a_loop_stays_one_with_feet_that_are_still_over_its_seam():
+    loop = editing.close_loop(sliding(120))
+    whole, frames = repeat_over_ground(loop.motion, loop.travel, 3), loop.motion.num_frames
+    stands = contacts_of(whole).any(dim=1)
+    start = next(f for f in range(frames, 2 * frames) if bool(stands[f - 2 : f + 3].all()))
+    motion = whole.slice(start, start + frames)  # begins amid a contact
+    planted = editing.plant_feet(motion, cycle=loop.travel)
+    alone = editing.remove_travel(planted, cycle=loop.travel)
+    bends = alone.join(alone).joint_positions().diff(n=2, dim=0).norm(dim=-1).amax(dim=1)
+    assert float(bends[frames - 2 : frames].max()) <= float(bends[: frames - 2].max())
+    before, after = (repeat_over_ground(m, loop.travel, 3) for m in (motion, planted))
+    contacts = contacts_of(before)
+    contacts[: frames // 2], contacts[-frames // 2 :] = False, False
+    assert toe_speed(after, contacts) < 0.003

@@ -130,13 +130,6 @@ def test_starts_may_be_shared_or_one_for_each_candidate(shape):
     agree(everything_of, place=GroundPose(xz, torch.randn(shape, generator=generator(6)).double()))
 
 
-def test_any_tree_and_bones():
-    order = torch.randperm(CANONICAL.num_joints - 1, generator=generator(7)) + 1
-    parents = (-1, *(int(torch.randint(j, (1,), generator=generator(8 + j))) for j in range(1, len(order) + 1)))
-    offsets = torch.randn(CANONICAL.num_joints, 3, generator=generator(9)).double()
-    agree(body_of, skeleton=Skeleton(CANONICAL.names, parents, offsets))
-
-
 def test_bones_do_not_lie_in_the_memory_of_the_skeleton():
     """Sent to another process, a tensor moves to shared memory, and where it was is soon written over."""
     skeleton, features = Skeleton(CANONICAL.names, CANONICAL.parents, CANONICAL.offsets.clone()), encode(walk(8))[0]
@@ -146,35 +139,11 @@ def test_bones_do_not_lie_in_the_memory_of_the_skeleton():
     torch.testing.assert_close(fast.compute_joints_and_heels(*place)[0], before, rtol=0, atol=0)
 
 
-def test_gradients_are_those_of_finite_differences():
-    whole, step = trial(1), 1e-3
-    value = everything_of(whole)
-    weights = torch.randn(value.shape, generator=generator(3))
-    gradient = value_and_gradient(whole, everything_of)[1]
-    way = torch.randn(whole.features.shape, generator=generator(11))
-    ends = [everything_of(trial(1, features=(whole.features + sign * step * way).detach())) for sign in (1, -1)]
-    slope = float(((ends[0] - ends[1]).detach().double() * weights).sum()) / (2 * step)
-    assert float((gradient * way).sum()) == pytest.approx(slope, rel=1e-3)
-
-
 def beside(curve, *, count=400, dtype=torch.float64):
     """Arcs from before the start to beyond the end, and points about a foot away from them."""
     arcs = torch.linspace(-0.8, curve.length + 0.8, count, dtype=torch.float64)
     shifts = 0.3 * torch.rand(2, count, curve.dims, generator=generator(12)).double() - 0.15
     return (curve.point(arcs) + shifts).to(dtype), arcs + 0.2 * torch.rand(count, generator=generator(13)).double()
-
-
-@each_curve
-def test_the_place_found_is_the_nearest(name):
-    curve = CURVES[name]
-    points, arcs = beside(curve)
-    found = find_local_frames(curve, points, arcs, reach=0.6)
-    reach = min(0.6, curve.length / 2) if curve.closed else 0.6
-    tried = curve.point(arcs.unsqueeze(-1) + torch.linspace(-reach, reach, 2401, dtype=torch.float64))
-    best = (tried - points.unsqueeze(-2)).norm(dim=-1).amin(-1)
-    distance = (found.place - points).norm(dim=-1)
-    assert float((distance - best).max()) < 1e-9
-    assert float((best - distance).max()) < 1e-3
 
 
 @each_curve

@@ -1,18 +1,23 @@
 """Measures against the design's definitions written out anew, and on motions whose measures are known."""
 
+import json
 import math
 from dataclasses import replace
+from fractions import Fraction
 
 import numpy as np
 import pytest
 import torch
-from helpers import walk, walk_through
+from captures import trembling
+from helpers import random_motion, run, walk, walk_through
 
-from mapctl import curves, metrics
+from mapctl import contacts, curves, metrics
 from mapctl.contacts import derive_heel_contacts, detect_contacts
 from mapctl.errors import RequestError
-from mapctl.metrics import body, compute_reference, feet, measure
-from mapctl.skeleton import CANONICAL, find_heel_drops
+from mapctl.metrics import body, compute_reference, feet, make_comparable, measure
+from mapctl.motion import Motion
+from mapctl.retarget import UNKNOWN_RIG_NOTE, put_upright
+from mapctl.skeleton import CANONICAL, Skeleton, find_heel_drops
 
 TOES = [CANONICAL.index("leftToes"), CANONICAL.index("rightToes")]
 
@@ -76,14 +81,6 @@ def test_sway_is_what_a_slow_gaussian_leaves():
     assert math.isnan(metrics.sway(torch.tensor(offset[: 2 * taps + 4]), fps))
 
 
-def test_sway_of_a_straight_walk_is_its_swing_from_side_to_side():
-    time = np.arange(400) / 30
-    places = np.stack([0.03 * np.sin(2 * np.pi * time), 1.2 * time], axis=1)
-    gain = 1 - math.exp(-0.5 * (2 * math.pi * 0.35) ** 2)  # of one hertz after the slow part is gone
-    assert measure(walk_through(places))["sway_cm"] == pytest.approx(3 / math.sqrt(2) * gain, rel=0.03)
-    assert measure(straight(400))["sway_cm"] == pytest.approx(0, abs=1e-9)
-
-
 def test_path_error_is_the_distance_to_the_curve():
     angle = np.linspace(0, 3, 200)
     radius = 2 + 0.05 * np.cos(3 * angle)
@@ -105,26 +102,6 @@ def test_progress_is_measured_along_the_arc(fps):
     assert got["progress_ratio"] == pytest.approx(6 * math.pi / 24, rel=1e-3)
     assert got["path_error_max_cm"] < 1e-3
     assert got["speed_m_s"] == pytest.approx(math.pi / 2, rel=0.01)
-
-
-def test_measures_do_not_depend_on_place_and_direction():
-    rng = np.random.default_rng(5)
-    places = np.cumsum(rng.normal(size=(150, 2)) * 0.004 + [0.0, 0.004], axis=0)
-    here = measure(walk_through(places, swing=0.15, wobble=0.004))
-    turned = np.stack([places[:, 1], -places[:, 0]], axis=1) + np.array([5.0, -3.0])
-    there = measure(walk_through(turned, headings=math.pi / 2, swing=0.15, wobble=0.004))
-    assert here == pytest.approx(there, rel=1e-9)
-
-
-def test_facing_and_turning():
-    angle = np.linspace(0, 7, 300)
-    clip = walk_through(np.zeros((300, 2)), headings=angle)
-    got = measure(clip)
-    assert got["turned_deg"] == pytest.approx(math.degrees(7))
-    assert got["turn_rate_deg_s"] == pytest.approx(math.degrees(7 / (299 / 30)), rel=0.06)
-    positions = clip.joint_positions()
-    left, right = (positions[:, CANONICAL.index(f"{side}UpperLeg")] for side in ("left", "right"))
-    torch.testing.assert_close(body.facing(left, right), torch.tensor(angle))
 
 
 def test_pose_variation_sees_poses_only():
@@ -202,3 +179,109 @@ def test_a_clip_that_never_stands_and_an_unknown_rig_have_no_heels():
     clip = walk(40)
     foreign = replace(clip, skeleton=replace(clip.skeleton, names=("pelvis", *clip.skeleton.names[1:])))
     assert all(math.isnan(measure(foreign)[name]) for name in (*names, "heel_planted_share"))
+
+
+TOES = [CANONICAL.index(name) for name in ("leftToes", "rightToes")]
+HANDS = [CANONICAL.index(name) for name in ("leftHand", "rightHand")]
+
+
+@pytest.mark.parametrize("fps", [30, 60])
+def test_a_jump_of_one_frame_is_the_largest_step_whatever_the_body_does(fps):
+    motion = walk(2 * fps, fps=fps)
+    places = motion.joint_positions()
+    ends = places[:, HANDS].clone()
+    calm = body.measure_peaks(ends, places[:, 0], fps)
+    ends[fps, 0] += torch.tensor([0.0, 0.6, 0.0]).double()
+    peaks = body.measure_peaks(ends, places[:, 0], fps)
+    assert peaks.step == pytest.approx(0.6 * fps / 30, abs=calm.step)
+    assert peaks.acceleration == pytest.approx(1.2 * fps**2, abs=calm.acceleration)
+    shifted = body.measure_peaks(
+        ends + torch.arange(2 * fps)[:, None, None], places[:, 0] + torch.arange(2 * fps)[:, None], fps
+    )
+    assert shifted == pytest.approx(peaks)
+
+
+def independent(toes, hips, fps):
+    """The same by the letter of the definition, frame by frame."""
+    floor, best, run = np.percentile(toes[..., 1], 5, axis=0), 0, 0
+    for t in range(1, len(toes)):
+        speeds = [np.hypot(*(toes[t, k] - toes[t - 1, k])[[0, 2]]) * fps for k in range(2)]
+        low = [toes[t, k, 1] - floor[k] for k in range(2)]
+        carried = any(low[k] < 0.03 and speeds[k] < 0.35 for k in range(2))
+        goes = np.hypot(*(hips[t] - hips[t - 1])[[0, 2]]) * fps > 0.3
+        run = run + 1 if not carried and min(low) < 0.05 and goes else 0
+        best = max(best, run)
+    return best / fps
+
+
+@pytest.mark.parametrize("slide", [0.0, 0.01, 0.02, 0.05])
+def test_the_longest_time_unsupported_is_that_of_the_definition(slide):
+    motion = walk(90)
+    toes, hips = (motion.joint_positions()[:, joints].clone() for joints in (TOES, [0]))
+    shift = torch.arange(90).clamp(min=30, max=70)[:, None] * torch.tensor([slide, 0.0, 0.0]).double()
+    toes, hips = toes + shift[:, None], hips[:, 0] + shift
+    assert body.measure_longest_unsupported(toes, hips, 30.0) == pytest.approx(
+        independent(toes.numpy(), hips.numpy(), 30.0)
+    )
+    assert (body.measure_longest_unsupported(toes, hips, 30.0) > 0.5) == (slide > 0.005)
+
+
+def test_a_body_stands_on_the_slowest_low_toe_and_on_none_in_flight():
+    heights = torch.tensor([[0.0, 0.0], [0.0, 0.2], [0.3, 0.2], [0.01, 0.04]])
+    speeds = torch.tensor([[1.0, 0.1], [1.0, 0.1], [1.0, 0.1], [0.7, 0.5]])
+    torch.testing.assert_close(contacts.support_speed(heights, speeds), torch.tensor([0.1, 1.0, 0.0, 0.5]))
+
+
+TREMOR = math.radians(0.3)
+
+
+def told(capsys, *words: object) -> dict:
+    assert run("measure", *words, "--json") == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def trembling_walk(fps: int) -> Motion:
+    """Ten seconds with noise that is as large in every frame at any rate."""
+    return trembling(walk(10 * fps + 1, fps=fps), TREMOR, seed=fps)
+
+
+def thinned(motion: Motion, step: int) -> Motion:
+    """Every so manieth frame."""
+    return Motion(motion.skeleton, motion.fps / step, motion.root_position[::step], motion.local_quat_xyzw[::step])
+
+
+@pytest.mark.parametrize("fps", [60, 120, 240])
+@pytest.mark.parametrize("folder", [False, True])
+def test_faster_files_are_measured_at_the_rate_of_mocaps_values(fps, folder, tmp_path, capsys):
+    trembling_walk(fps).save(tmp_path / "fast.bvh")
+    values = told(capsys, tmp_path if folder else tmp_path / "fast.bvh")
+    usual = metrics.measure(thinned(trembling_walk(fps), fps // 30))
+    assert values["measures"] == pytest.approx(usual, rel=0.02, abs=0.01)
+    assert metrics.measure(trembling_walk(fps))["jitter_m_s3"] > 3 * usual["jitter_m_s3"]
+    assert values["notes"] == []
+
+
+@pytest.mark.parametrize(("fps", "said"), [(Fraction(30000, 1001), False), (Fraction(24), True), (Fraction(15), True)])
+def test_slower_files_stay_as_they_are_and_that_is_said(fps, said):
+    motion = replace(walk(60), fps=fps)
+    comparable, notes = make_comparable(motion)
+    assert comparable.num_frames == 60
+    assert bool(notes) == said
+    assert all("frames a second" in note for note in notes)
+
+
+def unknown() -> Motion:
+    """A skeleton that is no body but has hips, feet and thighs by name."""
+    names = ("Hips", "LeftUpLeg", "LeftFoot", "RightUpLeg", "RightFoot")
+    offsets = torch.tensor([[0, 0, 0], [0.1, 0, 0], [0, -0.8, 0], [-0.1, 0, 0], [0, -0.8, 0]], dtype=torch.float64)
+    return random_motion(Skeleton(names, (-1, 0, 1, 0, 3), offsets), 40)
+
+
+def test_what_is_not_known_of_a_rig_is_said_in_one_line(tmp_path, capsys):
+    unknown().save(tmp_path / "a.bvh")
+    values = told(capsys, tmp_path / "a.bvh")
+    assert values["notes"] == [f"{tmp_path / 'a.bvh'}: {UNKNOWN_RIG_NOTE}"]
+    assert values["measures"]["jitter_m_s3"] == pytest.approx(metrics.measure(unknown())["jitter_m_s3"], rel=1e-3)
+    assert run("measure", tmp_path / "a.bvh") == 0
+    assert UNKNOWN_RIG_NOTE in capsys.readouterr().out
+    assert put_upright(unknown())[1] == (UNKNOWN_RIG_NOTE,)

@@ -105,18 +105,6 @@ def test_the_same_seed_gives_the_same_bits_and_leaves_torch_alone():
 
 
 @pytest.mark.slow
-def test_no_clip_is_both_learnt_and_held_out():
-    """Clips marked by their own channel can be learnt by heart, which must not help on clips that were not seen."""
-    marked = torch.zeros(8, 3, 30, 16)
-    for clip in range(8):
-        marked[clip, :, :, clip] = 1
-    clips = list(marked)
-    settings = realism.RealismSettings(steps=150, width=8, batch=32)
-    by_heart = realism.compute_held_out_accuracy(clips[::2], clips[1::2], generator=generator(1), settings=settings)
-    assert by_heart < 0.8
-
-
-@pytest.mark.slow
 def test_too_few_or_too_short_clips_are_refused():
     clips = clip_set(8, 31)
     with pytest.raises(RequestError, match="at least 8 clips of each, made and mocap; got 7 and 8"):
@@ -139,13 +127,6 @@ def test_diversity_parts_places_from_poses():
     assert measure_diversity([clip, walk(45, seed=5)]).root_aligned_cm > 0.5
 
 
-def test_diversity_needs_samples_of_one_length():
-    with pytest.raises(RequestError, match="at least 2 samples of one length, got 1"):
-        measure_diversity([walk(45)])
-    with pytest.raises(RequestError, match=r"got 2 of 1\.5 and 2 s"):
-        measure_diversity([walk(45), walk(60)])
-
-
 def test_step_lengths_go_from_foot_to_other_foot():
     planted = torch.zeros(60, 2, dtype=torch.bool)
     for foot, start, stop in ((0, 5, 12), (1, 14, 20), (1, 22, 26), (0, 28, 33), (1, 59, 60)):
@@ -156,4 +137,3 @@ def test_step_lengths_go_from_foot_to_other_foot():
     told = {int(frame): float(lengths[frame]) for frame in (~lengths.isnan()).nonzero()[:, 0]}
     # 22 sets the same foot down again; 59 is a second and more after the touch-down before it
     assert told == pytest.approx({14: 0.5, 28: 0.7})
-

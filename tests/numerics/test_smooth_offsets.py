@@ -8,6 +8,8 @@ import torch
 from helpers import generator
 
 from mapctl import rotations
+from mapctl.numerics import gaussian
+from mapctl.numerics.easing import MinimumJerkTrack
 from mapctl.numerics.smooth_offsets import interpolate_offsets, interpolate_turns, smooth_between, solve_offsets
 
 SPANS = [(0, 9), (0, 3), (3, 4), (7, 9), (1, 8)]
@@ -75,3 +77,51 @@ def test_joints_turn_until_they_are_as_wanted_and_no_further():
     assert float(turned[20, 1]) < 0.1 < float(turned[20, 0])  # a joint is not led by another's keys
     assert float(turned[180:].max()) < 0.03  # and far from keys none is
     assert float(torch.diff(turned[15:26, 0]).abs().max()) < 0.2 * float(turned[20, 0])
+
+
+LINE = torch.linspace(0, 3, 40, dtype=torch.float64)
+
+
+def test_a_kernel_adds_up_to_one_and_keeps_lines_inside():
+    kernel = gaussian.kernel(2.0, 6)
+    assert (len(kernel), float(kernel.sum()), int(kernel.argmax())) == (13, pytest.approx(1), 6)
+    torch.testing.assert_close(gaussian.convolve(LINE, kernel, "nothing")[6:-6], LINE[6:-6])
+
+
+def test_matrix_and_kernel_say_the_same():
+    values = torch.randn(60, 2, 3, generator=generator(), dtype=torch.float64)
+    kernel = gaussian.kernel(1.5, 12)
+    wanted = torch.einsum("ts,sjc->tjc", gaussian.averaging_matrix(60, 1.5, values.dtype), values)
+    torch.testing.assert_close(gaussian.convolve(values, kernel, "nothing")[12:-12], wanted[12:-12])
+    known = gaussian.convolve(torch.ones_like(values), kernel, "nothing")
+    torch.testing.assert_close(gaussian.convolve(values, kernel, "nothing") / known, wanted)
+
+
+def rest(*values: float) -> MinimumJerkTrack:
+    return MinimumJerkTrack.rest_at(torch.tensor(values, dtype=torch.float64))
+
+
+def test_from_rest_it_is_the_polynomial_of_flash_and_hogan():
+    track = rest(1.0).aim(torch.tensor([3.0], dtype=torch.float64), 0.7)
+    for frame in range(1, 21):
+        track = track.move(1 / 30)
+        share = frame / 21
+        expected = 1 + 2 * (10 * share**3 - 15 * share**4 + 6 * share**5)
+        np.testing.assert_allclose(track.value, expected, atol=1e-9)
+        slope = 2 * (30 * share**2 - 60 * share**3 + 30 * share**4) / 0.7
+        np.testing.assert_allclose(track.velocity, slope, atol=1e-9)
+
+
+def test_a_goal_that_changes_on_the_way_makes_no_jump():
+    track, step = rest(0.0), 1 / 300
+    found, generator = [], np.random.default_rng(0)
+    for frame in range(600):
+        if frame % 60 == 0:
+            track = track.aim(torch.tensor(generator.normal(size=1)), 0.4)
+        track = track.move(step)
+        found.append([float(track.value), float(track.velocity), float(track.acceleration)])
+    value, velocity, acceleration = np.array(found).T
+    np.testing.assert_allclose(np.gradient(value, step)[1:-1], velocity[1:-1], atol=0.02 * np.abs(velocity).max())
+    np.testing.assert_allclose(
+        np.gradient(velocity, step)[1:-1], acceleration[1:-1], atol=0.06 * np.abs(acceleration).max()
+    )

@@ -1,16 +1,20 @@
 """A recording is looked over: what stands still, what leaps, where its body is."""
 
+import math
 from dataclasses import replace
 from fractions import Fraction
 
 import pytest
 import torch
-from captures import DEGREE, apart_deg, on_rig, shaken, trembling
+from captures import DEGREE, apart_deg, on_rig, shaken, swaying, trembling
+from helpers import generator, quat_xyzw
 
 from mapctl import rotations
+from mapctl.errors import RequestError
 from mapctl.motion import Motion
-from mapctl.recording.inspection import inspect_recording, travel
-from mapctl.recording.masks import ROOT, Mask
+from mapctl.recording import inspection
+from mapctl.recording.inspection import find_gaps, inspect_recording, travel
+from mapctl.recording.masks import ALL, ROOT, Mask
 
 
 @pytest.fixture(scope="module", params=["canonical", "bandai", "daz"])
@@ -118,3 +122,116 @@ def test_short_recordings_break_nothing(frames):
     found = inspect_recording(motion)
     assert found.seen.shape == (frames, motion.num_joints)
     assert found.repaired().num_frames == frames
+
+
+def turned(quats, frames, joint, degrees):
+    """A joint turned away in some frames."""
+    vector = torch.zeros(len(frames), 3, dtype=torch.float64)
+    vector[:, 1] = degrees * DEGREE
+    out = quats.clone()
+    out[frames, joint] = rotations.multiply(quats[frames, joint], rotations.from_rotation_vector(vector))
+    return out
+
+
+def find_angle_spikes(quats):
+    return inspection.find_angle_spikes(quats, torch.ones(quats.shape[:2], dtype=torch.bool))
+
+
+def find_position_spikes(places):
+    return inspection.find_position_spikes(places, torch.ones(len(places), dtype=torch.bool))
+
+
+@pytest.mark.parametrize("frames", [[40], [40, 41], [2], [97], [0], [99]], ids=str)
+@pytest.mark.parametrize("sigma", [0.0, 1.0, 4.0])
+def test_planted_spikes_are_found_and_nothing_else_is(frames, sigma):
+    quats = turned(shaken(swaying(100), sigma * DEGREE), frames, 3, 60)
+    found = find_angle_spikes(quats)
+    wanted = torch.zeros_like(found)
+    wanted[frames, 3] = True
+    assert torch.equal(found, wanted)
+
+
+def test_small_spikes_are_found_where_there_is_no_noise_and_left_to_what_treats_noise():
+    assert find_angle_spikes(turned(swaying(100), [50], 2, 8)).nonzero().tolist() == [[50, 2]]
+    assert not find_angle_spikes(turned(shaken(swaying(100), 4 * DEGREE), [50], 2, 8)).any()
+
+
+@pytest.mark.parametrize("fps", [30, 60, 120])
+def test_a_fast_swing_and_its_turning_point_are_no_spikes(fps):
+    """A kick: 100 degrees there and back in half a second."""
+    time = torch.arange(3 * fps, dtype=torch.float64) / fps
+    angle = 100 * DEGREE * torch.exp(-0.5 * ((time - 1.5) / 0.1).square())
+    quats = quat_xyzw(torch.stack([angle, 0 * angle, 0 * angle], dim=-1)[:, None])
+    assert not find_angle_spikes(quats).any()
+    assert not find_angle_spikes(shaken(quats, DEGREE)).any()
+
+
+def test_leaps_of_a_place_are_found_and_a_sprint_is_not():
+    time = torch.arange(120, dtype=torch.float64) / 30
+    place = torch.stack([8 * time, 0.9 + 0 * time, 0 * time], dim=-1)
+    assert not find_position_spikes(place).any()
+    place[[30, 70, 71]] += torch.tensor([0.0, 1.5, 0.0])
+    assert find_position_spikes(place).nonzero()[:, 0].tolist() == [30, 70, 71]
+    noise = 0.5 * torch.randn(place.shape, generator=generator(3), dtype=torch.float64)
+    assert not find_position_spikes(place.double() + noise).any()  # as large as this noise is
+
+
+@pytest.mark.parametrize("end", [0, -1])
+def test_a_joint_that_swings_through_an_outermost_frame_does_not_spike_there(end):
+    """A knee that swings by 25 degrees between the first two frames of a run, and ever less later."""
+    angle = (-torch.arange(40, dtype=torch.float64) / 2).exp()[:, None, None] * torch.tensor([math.radians(65), 0, 0])
+    swing = angle if end == 0 else angle.flip(0)
+    assert not find_angle_spikes(quat_xyzw(swing))[end].any()
+    swing[end] += torch.tensor([0.0, math.radians(90), 0.0])
+    assert find_angle_spikes(quat_xyzw(swing))[end].all()
+
+
+RIGS = ("canonical", "bandai", "daz")
+
+
+def frozen(motion, start, stop):
+    """Frames start to stop repeat the one before them."""
+    frame = torch.arange(motion.num_frames)
+    frame[start:stop] = start - 1
+    moving = {joint: values[frame] for joint, values in motion.moving_offsets.items()}
+    return replace(
+        motion,
+        root_position=motion.root_position[frame],
+        moving_offsets=moving,
+        local_quat_xyzw=motion.local_quat_xyzw[frame],
+    )
+
+
+@pytest.mark.parametrize("rig", RIGS)
+@pytest.mark.parametrize("fps", [30, 120])
+def test_a_body_that_freezes_and_goes_on_elsewhere_has_a_gap_there(rig, fps):
+    motion = frozen(on_rig(rig, 3 * fps, fps=fps), fps, 2 * fps)
+    assert find_gaps(motion) == (Mask(ALL, fps, 2 * fps),)
+
+
+@pytest.mark.parametrize("rig", RIGS)
+def test_a_leap_of_a_joint_is_found(rig):
+    motion = on_rig(rig, 90)
+    joint, quats = 7, motion.local_quat_xyzw.clone()
+    turn = quat_xyzw(torch.tensor([1.0, 0.3, 0.0], dtype=torch.float64))
+    quats[44:46, joint] = rotations.multiply(quats[44:46, joint], turn.expand(2, 4))
+    leapt = replace(motion, local_quat_xyzw=quats)
+    assert apart_deg(leapt.local_quat_xyzw, motion.local_quat_xyzw).max() > 50
+    found = find_gaps(leapt)
+    assert {mask.joint for mask in found} == {motion.skeleton.names[joint]}
+    assert {frame for mask in found for frame in range(mask.start, mask.stop)} >= {44, 45}
+
+
+@pytest.mark.parametrize("rig", RIGS)
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda motion: motion,
+        lambda motion: frozen(motion, 60, 90),  # at rest, when the recording ends
+        lambda motion: frozen(motion, 1, 90),  # a stand
+    ],
+    ids=["whole", "rest", "stand"],
+)
+def test_where_nothing_is_wrong_one_is_asked_to_say_what_is(rig, spoil):
+    with pytest.raises(RequestError, match=r"say which frames are missing \(--gap A:B\) or which joints"):
+        find_gaps(spoil(on_rig(rig, 90)))
