@@ -2,23 +2,32 @@
 
 import math
 from dataclasses import replace
+from fractions import Fraction
 from itertools import pairwise
 
+import numpy as np
 import pytest
 import torch
-from helpers import walk
+from helpers import generator, walk
+from linear_inbetweener import LinearInbetweener
 
+import controllers
 import priors
+from controllers.common.character import Character
 from controllers.shots.reaching import build_rest_pose, measure_look_errors, turn_heads
 from controllers.shots.request import Lead, Look, Others, Reach, ShotRequest
+from controllers.shots.seams import compute_artefact_cost, find_jumps, repair_jumps
 from controllers.shots.shot import solve_shot
-from controllers.shots.trajectory import StandingEnds, lay_timeline, plan_speeds, plan_trajectory
-from mapctl import curves, rotations
+from controllers.shots.trajectory import StandingEnds, Trajectory, lay_timeline, plan_speeds, plan_trajectory
+from mapctl import curves, kinematics, rotations
+from mapctl.commands.shared.shots import ShotPlan, let_others_pass
 from mapctl.curves.obstacles import Obstacle, measure_clearance
 from mapctl.errors import RequestError
 from mapctl.intent.path import SpeedProfile, TimedSpeed
 from mapctl.metrics import body
-from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, TOES
+from mapctl.metrics.body import measure_peaks
+from mapctl.skeleton import CANONICAL, LIMBS, TOE_REST_HEIGHT, TOES
+from scenes.scene_file import Actor
 
 LINE = curves.line(length=3)
 STANDING = StandingEnds(start=True, end=True)
@@ -226,3 +235,130 @@ def test_who_goes_on_from_a_gesture_comes_to_rest_without_a_jolt():
     assert float(bent[24:32].max()) < 1.2 * max(float(bent[:24].max()), float(bent[40:].max()))
     moved = torch.diff(places[28:36], dim=0).norm(dim=-1).amax() * fps
     assert float(moved) > 0.5, "it does not freeze"
+
+
+APART = 0.6
+
+
+def plan(points, walls) -> ShotPlan:
+    curve = curves.from_points(torch.tensor(points, dtype=torch.float64), closed=False)
+    request = ShotRequest(curve, obstacles=walls)
+    return ShotPlan(Actor(curve="line:6"), request, priors.load("locomotion"), Character(), Fraction(30))
+
+
+def meet(width: float) -> list[ShotPlan]:
+    """Two who walk toward each other on one line through a passage."""
+    walls = tuple(Obstacle((side * (width / 2 + 1.0), 3.0), size=(2.0, 2.4)) for side in (-1.0, 1.0))
+    return [plan([(0.0, 0.0), (0.0, 6.0)], walls), plan([(0.0, 6.0), (0.0, 0.0)], walls)]
+
+
+def hips(trajectory: Trajectory):
+    return trajectory.curve.ground_point(trajectory.arcs)
+
+
+@pytest.mark.slow
+def test_in_a_narrow_passage_both_make_room():
+    plans = meet(1.8)
+    first, second = let_others_pass(plans, APART)
+    assert second is plans[1]
+    assert first.request.others is not None
+    assert first.request.others.courtesy
+    one = plan_trajectory(first.request)
+    assert one.note is None
+    other = plan_trajectory(replace(second.request, others=Others(hips(one)[None], APART)))
+    assert other.note is None
+    frames = min(len(one.arcs), len(other.arcs))
+    away = (hips(one)[:frames] - hips(other)[:frames]).norm(dim=-1)
+    assert float(away.min()) > APART
+    aside = [float(hips(path)[int(away.argmin()), 0]) for path in (one, other)]
+    assert min(map(abs, aside)) > 0.2
+    assert aside[0] * aside[1] < 0
+    alone = plan_trajectory(plans[0].request)
+    assert plan_trajectory(replace(plans[1].request, others=Others(hips(alone)[None], APART))).note is not None
+
+
+def test_where_there_is_room_for_two_the_first_one_makes_none():
+    plans = meet(3.5)
+    first, second = let_others_pass(plans, APART)
+    assert (first, second) == tuple(plans)
+
+
+AT = 40
+LEG = [LIMBS["leftFoot"].upper, LIMBS["leftFoot"].lower, LIMBS["leftFoot"].end, CANONICAL.index("leftToes")]
+
+
+@pytest.fixture
+def jumping():
+    """A walk whose left leg is a third of a stride ahead from one frame on."""
+    motion = walk(90)
+    quats = motion.local_quat_xyzw.clone()
+    quats[AT:80, LEG] = motion.local_quat_xyzw[AT + 10 :, LEG]
+    return replace(motion, local_quat_xyzw=quats).slice(0, 80)
+
+
+def test_a_jump_is_made_anew_and_other_frames_stay(jumping):
+    assert find_jumps(jumping).nonzero()[:, 0].tolist() == [AT - 1]
+    made = repair_jumps(jumping, LinearInbetweener())
+    assert not bool(find_jumps(made).any())
+    others = torch.tensor([*range(AT - 7), *range(AT + 7, 80)])
+    assert torch.equal(made.root_position[others], jumping.root_position[others])
+    assert torch.equal(made.local_quat_xyzw[others], jumping.local_quat_xyzw[others])
+    moved = (made.joint_positions() - jumping.joint_positions())[AT - 1 : AT + 1].norm(dim=-1)
+    assert float(moved.max()) > 0.05
+
+
+@pytest.mark.slow
+def test_no_toe_snaps_along_the_demos_curve():
+    """Without the limit a toe is 14 cm further within one frame of this walk, and then stands: 132 m/s^2."""
+    curve = curves.figure8(radius=2.0)
+    walk = controllers.follow(priors.load("locomotion"), curve, seconds=18.5, generator=generator(0)).motion
+    positions = walk.joint_positions()
+    peaks = measure_peaks(positions[:, list(CANONICAL.indices(TOES))], positions[:, 0], float(walk.fps))
+    assert peaks.acceleration < 90
+    assert torch.isfinite(positions).all()
+
+
+def test_a_slide_costs_what_a_viewer_sees_and_a_walk_does_not():
+    motion, up = walk(90), torch.zeros(90, 2, dtype=torch.bool)
+    first = torch.zeros(90, dtype=torch.long)
+    sliding = replace(motion, local_quat_xyzw=motion.local_quat_xyzw[first])
+    walks, slides = (compute_artefact_cost(each, up, (1, 89)) for each in (motion, sliding))
+    assert slides > walks + 0.3
+    round_about = motion.root_position.clone()
+    round_about[:, 0] += torch.sin(torch.arange(90) / 89 * torch.pi) * 1.5
+    assert compute_artefact_cost(replace(motion, root_position=round_about), up, (1, 89)) > walks
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("last", [(2.2, 2.2), (0.0, 0.6)], ids=["right angle", "reversal"])
+def test_a_corner_is_kept_to_without_a_lunge(last, seed):
+    prior = priors.load("locomotion")
+    curve = curves.from_points(np.array([(0.0, 0.0), (0.0, 2.2), last]), closed=False)
+    drawn = torch.Generator().manual_seed(seed)
+    done = solve_shot(prior, priors.load_inbetweener(), ShotRequest(curve), generator=drawn)
+    assert done.status.ok, done.status.text
+    hips = done.motion.root_position[:, ::2]
+    off = (hips - done.trajectory.curve.point(done.trajectory.curve.nearest(hips, done.trajectory.arcs))).norm(dim=-1)
+    assert float(off.max()) < (0.1 if last[0] else 0.15), "what the page of limits says"
+    toes = done.motion.joint_positions()[:, list(CANONICAL.indices(TOES))]
+    assert float(torch.diff(toes, n=2, dim=0).norm(dim=-1).max()) * 900 < 88, "twice that of a circle of 2 m"
+    wanted = math.pi / 2 if last[0] else math.pi
+    turned = rotations.wrap_angle(kinematics.heading(done.motion.local_quat_xyzw[-30:, 0]) - wanted)
+    # Over a stride: at each step hips turn to and fro, by up to 17 degrees in mocap.
+    assert abs(float(turned.mean())) < math.radians(15)
+    if not last[0]:
+        assert float((done.trajectory.speeds == 0).sum()) > 10, "it turns on the spot"
+
+
+@pytest.mark.parametrize(("curve", "heels"), [("circle:1", True), ("line:3", True), ("wave:0.5x2", False)])
+def test_heels_are_left_free_where_the_way_has_a_corner(curve, heels, monkeypatch):
+    class Walked(Exception):
+        """Walking has begun."""
+
+    def walk(*_given, settings, **_more):
+        raise Walked(settings.footing.heels is not None)
+
+    monkeypatch.setattr("controllers.shots.shot.walk_spans", walk)
+    with pytest.raises(Walked, match=str(heels)):
+        solve_shot(priors.load("locomotion"), priors.load_inbetweener(), ShotRequest(curves.read(curve)))
