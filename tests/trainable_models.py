@@ -18,10 +18,9 @@ from priors.refiner import RefinerConfig
 
 _WINDOWS = {"batch": 3, "window": 32}
 _SMALL: dict[str, dict[str, Any]] = {
-    "lstm-gmm": {"batch": 4, "window": 20, "starts": 4, "shape": LstmGmmConfig(width=8, components=2)},
+    "lstm-gmm": {"batch": 4, "window": 20, "shape": LstmGmmConfig(width=8, components=2)},
     "refiner": {
-        **{"window": 10, "batch": 160, "warm_up": 1, "head_start": 1, "critic_width": 6},
-        **{"samples": 6, "judged": 2, "seconds": 1.2, "report_steps": 2},
+        **{"window": 10, "batch": 160, "report_steps": 2},
         "shape": RefinerConfig(width=6, memory=5, lookahead=1, joints=("hips", "rightToes")),
     },
     "denoiser": {**_WINDOWS, "shape": tiny_denoiser.CONFIG},

@@ -284,9 +284,12 @@ def _sample_interval(shortest: int, longest: int, draw: Draws) -> Tensor:
     return draw.mark(draw.below(draw.frames - length + 1), length)
 
 
-def add_copies(corpus: Corpus, count: int, generator: torch.Generator, *, tempo: float, strides: float) -> Corpus:
-    """Return a corpus with its clips, and after them so many copies of each, under the same names, whose tempo and
-    strides differ by these shares at most."""
+_TEMPO, _STRIDES = 0.15, 0.1  # largest changes of a copy's tempo and strides, as shares
+
+
+def add_copies(corpus: Corpus, count: int, generator: torch.Generator) -> Corpus:
+    """Return a corpus with its clips, and after them so many copies of each, under the same names, with another tempo
+    and other strides."""
     if count == 0:
         return corpus
     windows = PoseWindows(corpus, evenness=0.0)
@@ -294,7 +297,7 @@ def add_copies(corpus: Corpus, count: int, generator: torch.Generator, *, tempo:
     for _ in range(count):
         for number, name in enumerate(corpus.names):
             change = 2 * torch.rand(2, generator=generator) - 1
-            faster, wider = 1 + tempo * float(change[0]), 1 + strides * float(change[1])
+            faster, wider = 1 + _TEMPO * float(change[0]), 1 + _STRIDES * float(change[1])
             if corpus.lengths[number] > 1 + faster:
                 clips.append(copy_clip(windows, number, tempo=faster, strides=wider))
                 names.append(name)

@@ -48,7 +48,7 @@ _WARM_UP_SHARE = 0.05  # share of the steps in which the learning rate rises
 _MAX_GRADIENT_NORM = 1.0
 _MOST_NAMED = 5  # files that a warning names
 _MAY_CHANGE = (
-    *("data", "out", "cuts", "level", "licence", "resume", "quiet", "patience", "steps", "device", "bfloat16", "shape"),
+    *("data", "out", "cuts", "level", "licence", "resume", "quiet", "patience", "steps", "device", "shape"),
     *("checkpoint_minutes", "report_steps", "validate_steps"),
 )  # settings that do not change what a step does
 
@@ -191,7 +191,11 @@ class Settings(ABC):
 class NetworkSettings(Settings):
     """Settings of any network that is trained by one gradient, and may start from another network's weights."""
 
-    shape_options: ClassVar[tuple[str, ...]] = ("width", "paper")
+    ours: ClassVar[NetworkConfig]
+    """Shape of the network unless options ask for another one."""
+    papers: ClassVar[NetworkConfig | None] = None
+    """Shape of the paper's network, for `paper`."""
+    shape_options: ClassVar[tuple[str, ...]] = ()
     """Options that decide the shape of the network."""
 
     batch: Count = 64
@@ -200,13 +204,8 @@ class NetworkSettings(Settings):
     """Frames a window."""
     learning_rate: Number = 1e-3
     """At its highest; less to fine-tune."""
-    bfloat16: bool = False
-    """Let the network compute in bfloat16: faster on a processor or GPU that has it."""
     init: Annotated[str | None, arg(metavar="NAME")] = None
     """Begin with the weights of this model, bundled or trained, and fine-tune them."""
-    init_share: Number = 0.0
-    """Share of the weights of --init in the ones that are written, the rest being the fine-tuned ones': 0.7 keeps most
-    of what the initial model knew (Wortsman et al. 2022)."""
     device: Annotated[Literal["auto", "cpu", "cuda"], arg(metavar="auto|cpu|cuda")] = "auto"
     """Where to compute; auto is a GPU with CUDA where there is one."""
     shape: Annotated[NetworkConfig | None, *InPython] = None
@@ -215,14 +214,14 @@ class NetworkSettings(Settings):
     def __post_init__(self):
         super().__post_init__()
         require_at_least(self, 1, "batch", "window")
-        if not 0 <= self.init_share < 1 or (self.init_share and self.init is None):
-            raise RequestError(f"--init-share is from 0 to below 1, and needs --init; got {self.init_share:g}")
         if self.init is not None and any(getattr(self, name, None) for name in self.shape_options):
             raise RequestError("with --init the network is that model's; options of its shape do not apply")
 
-    @abstractmethod
-    def make_config(self) -> NetworkConfig:
+    def make_config(self) -> Any:
         """Return the shape of the network that these settings ask for."""
+        config = self.papers if getattr(self, "paper", False) else self.ours
+        given = {name: getattr(self, name) for name in self.shape_options if name != "paper"}
+        return replace(config, **{name: value for name, value in given.items() if value is not None})
 
     def find_config(self) -> Any:
         """Return the shape of the network: that of the initial model, where there is one."""
@@ -315,9 +314,6 @@ class Trainer(ABC, Generic[Network]):
     def identify(self) -> Row:
         """Return what must not change between a run's parts beside the settings, the network and the clips."""
         return {}
-
-    def finish(self) -> None:
-        """Change the weights once more, before they are measured and written."""
 
     def export(self, parts: Split) -> Export:
         """Return what is written at the end."""
@@ -422,14 +418,6 @@ class GradientTrainer(Trainer[Network]):
         tensors, own = checkpoints.load(checkpoints.locate(self.settings.init))[0], self.network.state_dict()
         return own | {name: value for name, value in tensors.items() if name in own}
 
-    def finish(self) -> None:
-        """Move the weights towards the initial ones, as far as those have a share."""
-        if self.settings.init_share:
-            before = self.read_initial_weights()
-            for name, value in self.exported.state_dict().items():
-                if value.is_floating_point():
-                    value.lerp_(before[name].to(value), self.settings.init_share)
-
 
 class _Losses(nn.Module):
     """The losses of a trainer as the module that DistributedDataParallel runs."""
@@ -528,7 +516,6 @@ def _export(
     """Write the model with its card."""
     for network in trainer.networks().values():
         network.to("cpu")
-    trainer.finish()
     exported, origin = trainer.export(parts), settings.find_origin()
     corpus = parts.whole
     data = {
@@ -773,8 +760,3 @@ def _copy_weights(network: nn.Module) -> dict[str, Tensor]:
 
 def _read_card(name: str) -> checkpoints.Card:
     return checkpoints.read_card(checkpoints.locate(name).with_suffix(".json"))
-
-
-def given(config: Any, **options: Any) -> Any:
-    """Return a network's shape with those of the options that are given (not None)."""
-    return replace(config, **{name: value for name, value in options.items() if value is not None})

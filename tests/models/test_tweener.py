@@ -282,7 +282,7 @@ def image_of(motion, keys, *, present=None, known_axes=None):
 def test_weights_are_as_many_as_may_be_bundled_and_as_in_the_paper():
     """With the path predictor's 0.8 million under 10 MB in float16; in the paper 7.3 + 24.3 + 1.1 million."""
     with torch.device("meta"):
-        ours, paper = GeneratorNetwork(), GeneratorNetwork(PAPER)
+        ours, paper = GeneratorNetwork(GeneratorConfig()), GeneratorNetwork(PAPER)
     assert count(ours) == pytest.approx(4.1e6, rel=0.05)
     assert 2 * (count(ours) + 0.85e6) < 10e6
     assert sum(count(layer.conv) for layer in paper.encoder) == pytest.approx(7.3e6, rel=0.05)

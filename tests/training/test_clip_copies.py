@@ -83,7 +83,7 @@ def test_longer_strides_lower_the_hips_and_turn_no_other_joint(corpus):
 
 @pytest.mark.slow
 def test_copies_come_after_their_clips_with_their_names_and_the_seed_draws_them(corpus):
-    one, again, other = (add_copies(corpus, 2, generator(seed), tempo=0.15, strides=0.1) for seed in (1, 1, 2))
+    one, again, other = (add_copies(corpus, 2, generator(seed)) for seed in (1, 1, 2))
     assert one.names == corpus.names * 3
     assert one.lengths[:3] == corpus.lengths
     assert torch.equal(one.features[: len(corpus.features)], corpus.features)

@@ -155,7 +155,7 @@ def test_a_rig_calibrated_otherwise_stands_as_still():
 
 
 def test_an_untrained_denoiser_errs_by_as_much_as_the_corruption():
-    parts = compute_denoiser_losses(tiny_denoiser.network(), corpus(1, 30).features[None], 20.0, generator())
+    parts = compute_denoiser_losses(tiny_denoiser.network(), corpus(1, 30).features[None], generator())
     assert all(bool(value.isfinite()) for value in parts.values())
     assert parts["contacts_nats"] == pytest.approx(math.log(2), rel=1e-3)
 

@@ -23,15 +23,14 @@ from priors.training.loop import (
     GradientTrainer,
     MaybeCount,
     NetworkSettings,
-    Number,
     Row,
     average_logarithms,
-    given,
     make_generator,
 )
 from priors.training.windows import FeatureWindows, PoseVariation, vary_features
 
 # Weights beside that of the position error, cm, which is 1.
+_ANGLES = 20.0  # of the error of joint angles, radians: what turns about its own bone moves no joint
 _PACE = 0.5  # of the joints' velocity error, cm a frame
 _FEET = 0.5  # of the planted toes' error in velocity, cm a frame
 _CONTACTS = 0.5  # of the contacts' cross entropy, nats
@@ -48,6 +47,8 @@ class DenoiserSettings(NetworkSettings):
 
     kind = "denoiser"
     used_by = "use it with --denoiser"
+    ours = DenoiserConfig()
+    shape_options = ("width",)
 
     steps: Count = 16_000
     """Steps in all."""
@@ -55,17 +56,10 @@ class DenoiserSettings(NetworkSettings):
     """Windows a step."""
     width: MaybeCount = None
     """Channels of every layer."""
-    angles: Number = 20.0
-    """Weight of the error of joint angles (radians) in the loss, beside the centimetres of positions: what turns about
-    its own bone moves no joint."""
 
     def __post_init__(self):
         super().__post_init__()
         require_at_least(self, 16, "window")
-
-    def make_config(self) -> DenoiserConfig:
-        """Return the shape of the network that these settings ask for."""
-        return given(DenoiserConfig(), width=self.width)
 
     def make_trainer(self, parts: Split) -> "DenoiserTrainer":
         """Make the trainer as it is before the first step."""
@@ -79,13 +73,13 @@ class DenoiserTrainer(GradientTrainer[DenoiserNetwork]):
         """RequestError where no clip is as long as a window."""
         self.windows = FeatureWindows(corpus, settings.window, evenness=_EVENNESS)
         self.config = settings.find_config()
-        super().__init__(settings, lambda: DenoiserNetwork(self.config, bfloat16=settings.bfloat16))
+        super().__init__(settings, lambda: DenoiserNetwork(self.config))
         self.begin()
 
     def losses(self) -> dict[str, Tensor]:
         """Compute the losses of a newly drawn batch."""
         windows = draw_performers(self.windows, self.settings.batch, self.generator)
-        return compute_denoiser_losses(self.network, windows, self.settings.angles, self.generator)
+        return compute_denoiser_losses(self.network, windows, self.generator)
 
     @torch.no_grad()
     def validate(self, corpus: Corpus) -> dict[str, Any]:
@@ -95,7 +89,7 @@ class DenoiserTrainer(GradientTrainer[DenoiserNetwork]):
         drawn = FeatureWindows(corpus, min(settings.window, max(corpus.lengths)), evenness=_EVENNESS)
         for _ in range(6):
             windows = draw_performers(drawn, settings.batch, generator)
-            rows.append(compute_denoiser_losses(self.network, windows, settings.angles, generator))
+            rows.append(compute_denoiser_losses(self.network, windows, generator))
         means = torch.stack([torch.stack(list(row.values())) for row in rows]).mean(dim=0)
         return dict(zip(rows[0], means.tolist(), strict=True))
 
@@ -134,9 +128,7 @@ def _perturb_joint_frames(
     return rotations.to_rotation_vector(quats).flatten(-2)
 
 
-def compute_denoiser_losses(
-    network: DenoiserNetwork, windows: Tensor, angle_weight: float, generator: torch.Generator
-) -> dict[str, Tensor]:
+def compute_denoiser_losses(network: DenoiserNetwork, windows: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
     """The loss, and in plain units the errors it is made of."""
     clean = make_clean_capture(windows)
     cleaned = network(corrupt(clean, generator))
@@ -149,7 +141,7 @@ def compute_denoiser_losses(
     feet = (slip[..., _TOES] * planted).sum() / planted.sum().clamp_min(1)
     turned = (cleaned.pose.angles - angles).abs().mean()
     contacts = cross_entropy(cleaned.contact_logits.float(), bits)
-    loss = place + _PACE * slip.mean() + _FEET * feet + angle_weight * turned + _CONTACTS * contacts
+    loss = place + _PACE * slip.mean() + _FEET * feet + _ANGLES * turned + _CONTACTS * contacts
     spread = _compute_spread_loss(cleaned, _pack(clean))
     return {
         "loss": loss + _SPREAD * spread,

@@ -19,7 +19,7 @@ from priors.checkpoints import require_at_least
 from priors.infiller import InfillerConfig, InfillerNetwork
 from priors.training.augment import Draws
 from priors.training.data import Corpus, Split
-from priors.training.loop import Count, GradientTrainer, NetworkSettings, Row, average_logarithms, given, make_generator
+from priors.training.loop import Count, GradientTrainer, NetworkSettings, Row, average_logarithms, make_generator
 from priors.training.windows import PositionWindows, Window
 
 VALIDATED_GAPS = (15, 30, 60)
@@ -54,6 +54,7 @@ class InfillerSettings(NetworkSettings):
 
     kind = "infiller"
     used_by = "use it with --method infiller --inbetweener"
+    ours = InfillerConfig()
     shape_options = ("architecture",)
 
     steps: Count = 8_000
@@ -67,10 +68,6 @@ class InfillerSettings(NetworkSettings):
         super().__post_init__()
         require_at_least(self, 32, "window")
 
-    def make_config(self) -> InfillerConfig:
-        """Return the shape of the network that these settings ask for."""
-        return given(InfillerConfig(), architecture=self.architecture)
-
     def make_trainer(self, parts: Split) -> "InfillerTrainer":
         """Make the trainer as it is before the first step."""
         return InfillerTrainer(self, parts.train)
@@ -82,7 +79,7 @@ class InfillerTrainer(GradientTrainer[InfillerNetwork]):
     def __init__(self, settings: InfillerSettings, corpus: Corpus):
         self.windows = PositionWindows(corpus, frames=settings.window, evenness=_EVENNESS)
         self.config = settings.find_config()
-        super().__init__(settings, lambda: InfillerNetwork(self.config, bfloat16=settings.bfloat16))
+        super().__init__(settings, lambda: InfillerNetwork(self.config))
         mean, std = self.windows.moments()
         self.network.mean.copy_(mean)
         self.network.std.copy_(std.clamp_min(_MIN_STD))

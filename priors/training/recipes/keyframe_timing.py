@@ -9,11 +9,11 @@ from torch import Tensor
 from mapctl.features import GroundPose
 from mapctl.inbetweening.pose_pairs import TRAVELLING_DISTANCE, PosePairs, sample_pose_pairs
 from mapctl.pose import decode
-from priors.checkpoints import require_at_least
 from priors.keyframe_timing import KeyframeTimingConfig, KeyframeTimingNetwork
 from priors.training.data import Corpus, Split
 from priors.training.loop import Count, Export, Row, Settings, Trainer, average_logarithms
 
+_PAIRS = 5  # pairs of poses drawn of every clip
 _PERCENTILES = (0.1, 0.9)  # between which four of five pairs lie
 _RIDGE = 1.0  # weight of the squared weights, of features of about unit spread
 _MIN_DEVIATION = 0.15  # of the logarithm of seconds, below which all deviations weigh the same
@@ -29,12 +29,6 @@ class KeyframeTimingSettings(Settings):
 
     steps: Count = 15
     """Reweightings of the least squares."""
-    pairs: Count = 5
-    """Pairs of poses drawn of every clip."""
-
-    def __post_init__(self):
-        super().__post_init__()
-        require_at_least(self, 1, "pairs")
 
     def make_trainer(self, parts: Split) -> "KeyframeTimingTrainer":
         """Make the trainer with the pairs of poses that the timing is fitted to."""
@@ -48,7 +42,7 @@ class KeyframeTimingTrainer(Trainer[KeyframeTimingNetwork]):
         super().__init__(settings)
         self.config = KeyframeTimingConfig()
         self.network = KeyframeTimingNetwork(self.config).double()
-        self.pairs = draw_pairs(corpus, self.config, settings.pairs, self.generator)
+        self.pairs = draw_pairs(corpus, self.config, self.generator)
 
     def train_step(self) -> dict[str, float]:
         """Solve once, and see within which bounds the truth lies; the factor by which half of the pairs are off."""
@@ -64,7 +58,7 @@ class KeyframeTimingTrainer(Trainer[KeyframeTimingNetwork]):
 
     def validate(self, corpus: Corpus) -> Row:
         """The factor by which half of unseen pairs are off, and the share that lies within the bounds."""
-        pairs = draw_pairs(corpus, self.network.config, self.settings.pairs, torch.Generator().manual_seed(0))
+        pairs = draw_pairs(corpus, self.network.config, torch.Generator().manual_seed(0))
         low, suggested, high = self.network(pairs.features, pairs.metres).unbind(dim=-1)
         ratio, inside = pairs.seconds / suggested, (pairs.seconds >= low) & (pairs.seconds <= high)
         row: Row = {"pairs": len(ratio), "half_off_by": _measure_error(ratio), "within": float(inside.double().mean())}
@@ -85,11 +79,11 @@ class KeyframeTimingTrainer(Trainer[KeyframeTimingNetwork]):
         return done
 
 
-def draw_pairs(corpus: Corpus, config: KeyframeTimingConfig, count: int, generator: torch.Generator) -> PosePairs:
+def draw_pairs(corpus: Corpus, config: KeyframeTimingConfig, generator: torch.Generator) -> PosePairs:
     """Draw pose pairs from every clip of a corpus; RequestError where no clip is long enough."""
     origin = GroundPose.origin(torch.float64)
     bodies = (decode(clip.double(), origin) for clip in corpus.clips())
-    return sample_pose_pairs(bodies, generator, count=count, shortest=config.shortest, longest=config.longest)
+    return sample_pose_pairs(bodies, generator, count=_PAIRS, shortest=config.shortest, longest=config.longest)
 
 
 def solve_weights(pairs: PosePairs, before: Float[Tensor, " features"] | None) -> Float[Tensor, " features"]:

@@ -44,13 +44,11 @@ from priors.training.loop import (
     Count,
     Export,
     GradientTrainer,
-    InPython,
     MaybeCount,
     NetworkSettings,
     Number,
     Row,
     count_processes,
-    given,
     make_generator,
     update_average,
     use_device,
@@ -64,7 +62,7 @@ _NOISE_RANGE = 4.0  # largest noise of a window, as a multiple of that
 _BIT_FLIPS = 0.02  # share of input contact bits that are flipped
 _UNLABELLED = 0.5  # share of the windows without labels; the others show each group (gait, style) with probability 0.7
 _KEEP_GROUP_PROBABILITY = 0.7
-_MOST = 0.3  # change of tempo or stride, beyond which walks are no longer likely
+_STARTS = 64  # moments of mocap that the finished prior carries
 _MATCH_FROM = 0.75  # share of the steps before the critic, after which free runs are held to the data
 _MATCH_EVERY, _FREE_RUNS = 4, 32  # steps from one comparison to the next; runs of one
 _CRITIC_EVERY = 2  # steps from one free run to the next while the critic judges them
@@ -85,7 +83,8 @@ class DensitySettings(NetworkSettings):
     kind = "lstm-gmm"
     used_by = "use it with --prior"
     single_thread = False
-    shape_options = ("width", "components", "paper")
+    ours, papers = LstmGmmConfig(), PAPER
+    shape_options = ("width", "paper")
 
     steps: Count = 20_000
     """Steps in all."""
@@ -95,8 +94,6 @@ class DensitySettings(NetworkSettings):
     """Frames a window."""
     width: MaybeCount = None
     """Units of every hidden layer."""
-    components: MaybeCount = None
-    """Gaussians in the mixture."""
     paper: bool = False
     """The network of Wang et al. 2019; other options still hold."""
     labels: Annotated[str, arg(metavar="REGEX")] = ""
@@ -107,25 +104,16 @@ class DensitySettings(NetworkSettings):
     copies: Count = 0
     """Copies of each clip at other tempos and with other strides that training sees beside it: for a few minutes of
     motion (docs/guides/data.md)."""
-    tempo: Number = 0.15
-    """Largest change of a copy's tempo, as a share."""
-    strides: Number = 0.1
-    """Largest change of how far a copy steps, as a share: as of a body with other legs."""
     critic_steps: Count = 0
     """Last steps in which a critic joins that separates a second of a free run from captured motion, and the density is
     trained to pass as well; what is kept is then the running mean of the weights."""
     standing_share: Number = 1.0
     """Share of the windows of standing characters that training sees, 1 by default: below it for motion that mostly
     stands, whose density is hard to steer into a walk otherwise."""
-    starts: Annotated[int, *InPython] = 64
-    """Moments of mocap that the finished prior carries."""
 
     def __post_init__(self):
         super().__post_init__()
-        require_at_least(self, 1, "starts")
         require_at_least(self, 0, "copies", "critic_steps")
-        if not (0 <= self.tempo <= _MOST and 0 <= self.strides <= _MOST):
-            raise RequestError(f"--tempo and --strides lie between 0 and {_MOST}")
         if not 0 < self.standing_share <= 1:
             raise RequestError(f"--standing-share is over 0 and at most 1, got {self.standing_share:g}")
         if self.critic_steps >= self.steps:
@@ -137,15 +125,11 @@ class DensitySettings(NetworkSettings):
         if self.label_pace and "(?P<pace>" in self.labels:
             raise RequestError("the group pace is that of --label-pace; call the one of --labels by another name")
 
-    def make_config(self) -> LstmGmmConfig:
-        """Return the shape of the network that these settings ask for, before it has labels."""
-        return given(PAPER if self.paper else LstmGmmConfig(), width=self.width, components=self.components)
-
     def make_trainer(self, parts: Split) -> "DensityTrainer":
         """Make the trainer of a network for the clips' labels, or of the initial network with its own labels."""
         with use_device("cpu"):  # copies are generated one after the other
             seeded, train = make_generator(self.seed), parts.train.to("cpu")
-            copied = add_copies(train, self.copies, seeded, tempo=self.tempo, strides=self.strides)
+            copied = add_copies(train, self.copies, seeded)
         corpus = copied.to(torch.get_default_device().type)
         known, config = density.read_labels(corpus.names, self.labels), self.find_config()
         if self.init is None:
@@ -279,7 +263,7 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
         model, settings = self.average.eval(), self.settings
         known = density.read_labels(parts.train.names, settings.labels)
         found = select_initial_states(
-            model, parts.train, count=settings.starts, generator=make_generator(settings.seed), labels=known.held
+            model, parts.train, count=_STARTS, generator=make_generator(settings.seed), labels=known.held
         )
         starts = {
             "starts.previous": found.state.last_frame,
@@ -371,8 +355,7 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
         inputs, level = self._add_noise(model.normalise(windows[:, :-1]), size)
         memory = model.start_after(windows[:, 0])
         condition = self._make_condition(level, shown)
-        with torch.autocast(windows.device.type, torch.bfloat16, enabled=self.settings.bfloat16):
-            mixture, _ = model(inputs, (memory.hidden, memory.cell), condition=condition)
+        mixture, _ = model(inputs, (memory.hidden, memory.cell), condition=condition)
         target = torch.cat([model.normalise(windows[:, 1:])[..., :size], windows[:, 1:, size:]], dim=-1)
         return mixture.log_prob(target, model.whitening)
 

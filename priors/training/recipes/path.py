@@ -22,12 +22,10 @@ from priors.training.data import Corpus, Split
 from priors.training.loop import (
     Count,
     GradientTrainer,
-    MaybeCount,
     NetworkSettings,
     Number,
     Row,
     average_logarithms,
-    given,
     make_generator,
 )
 from priors.training.windows import PoseVariation, PoseWindows, Variation
@@ -46,6 +44,7 @@ class PathSettings(NetworkSettings):
 
     kind = "path"
     used_by = "use it with mapctl infill --way A:B --path"
+    ours = PathConfig()
 
     steps: Count = 12_000
     """Steps in all."""
@@ -55,16 +54,10 @@ class PathSettings(NetworkSettings):
     """Frames of the longest window; the shortest have 32."""
     learning_rate: Number = 2e-3
     """At its highest; less to fine-tune."""
-    width: MaybeCount = None
-    """Channels of the outer layers; the inner ones have twice as many."""
 
     def __post_init__(self):
         super().__post_init__()
         require_at_least(self, _SHORTEST_WINDOW, "window")
-
-    def make_config(self) -> PathConfig:
-        """Return the shape of the network that these settings ask for."""
-        return given(PathConfig(), width=self.width)
 
     def make_trainer(self, parts: Split) -> "PathTrainer":
         """Make the trainer as it is before the first step."""
@@ -79,7 +72,7 @@ class PathTrainer(GradientTrainer[PathNetwork]):
         # A window at the fastest tempo must fit into the longest clip.
         self.longest = min(settings.window, int(int(self.windows.lengths.max()) / (1 + _VARIATION.tempo)) - 1)
         self.config = settings.find_config()
-        super().__init__(settings, lambda: PathNetwork(self.config, bfloat16=settings.bfloat16))
+        super().__init__(settings, lambda: PathNetwork(self.config))
         _set_moments(self.network, self.windows)
         self.begin()
 

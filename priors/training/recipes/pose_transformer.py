@@ -26,7 +26,6 @@ from priors.training.loop import (
     Number,
     Row,
     average_logarithms,
-    given,
     make_adam,
     make_generator,
 )
@@ -70,6 +69,7 @@ class PoseTransformerSettings(NetworkSettings):
 
     kind = "pose-transformer"
     used_by = "use it with --inbetweener"
+    ours = PoseTransformerConfig()
     shape_options = ("width", "layers", "detail")
 
     steps: Count = 11_500
@@ -94,8 +94,8 @@ class PoseTransformerSettings(NetworkSettings):
 
     def make_config(self) -> PoseTransformerConfig:
         """Return the shape of the network that these settings ask for; the width decides the number of heads."""
-        heads = None if self.width is None else max(1, self.width // 32)
-        return given(PoseTransformerConfig(), width=self.width, heads=heads, layers=self.layers, detail=self.detail)
+        config = super().make_config()
+        return config if self.width is None else replace(config, heads=max(1, self.width // 32))
 
     def make_trainer(self, parts: Split) -> "PoseTransformerTrainer":
         """Make the trainer as it is before the first step."""
@@ -109,7 +109,7 @@ class PoseTransformerTrainer(GradientTrainer[PoseTransformerNetwork]):
         self.windows = PoseWindows(corpus, evenness=_EVENNESS)
         self.longest = min(settings.window, int(self.windows.lengths.max()) * 9 // 10 - 1)
         self.config = settings.find_config()
-        super().__init__(settings, lambda: PoseTransformerNetwork(self.config, bfloat16=settings.bfloat16))
+        super().__init__(settings, lambda: PoseTransformerNetwork(self.config))
         _set_moments(self.network, self.windows)
         self.begin()
 

@@ -47,6 +47,13 @@ _MIN_MOMENT_FRAMES = 8  # frames of a window that moments can be had of
 _CRITIC_WON = 0.98  # share that the critic classifies correctly, over a report, from which it has won
 _BETAS = (0.5, 0.9)
 _WARM_UP_FRAMES = 60  # frames of a clip that condition the density before it runs freely
+_SAMPLES, _SECONDS = 300, 10.0  # motions drawn from the density to train on, and the duration of each, s
+_JUDGED = 24  # motions drawn to be measured
+_WARM_UP = 75  # updates of each before the rounds (section 4.2.2)
+# Updates of the critic before anything else (the paper's 0): a refiner led by a critic that has learnt nothing harms
+# samples that were nearly good.
+_HEAD_START = 200
+_CRITIC_WIDTH = 128  # units of the critic's layers (the paper's 500)
 _CRITIC_UPDATES = 2  # updates of the critic in each round (the paper's 1)
 _REFINER_UPDATES = 1  # initial updates of the refiner in each round (the paper's 5); doubled and halved as either wins
 _STRONG, _WEAK = 0.01, 1.0  # critic's loss below which the refiner's updates are doubled, and above which halved
@@ -79,8 +86,6 @@ class RefinerSettings(Settings):
     """Windows a step."""
     window: Count = 48
     """Frames a window."""
-    bfloat16: bool = False
-    """Let the network compute in bfloat16: faster on a processor that has it."""
     density: Name = "locomotion"
     """The prior whose samples it refines."""
     paper: bool = False
@@ -91,19 +96,6 @@ class RefinerSettings(Settings):
     """Rounds between measures of held-out samples."""
     shape: Annotated[RefinerConfig | None, *InPython] = None
     """Shape of the network, in place of ours and the paper's."""
-    warm_up: Annotated[int, *InPython] = 75
-    """Updates of each before the rounds (section 4.2.2)."""
-    head_start: Annotated[int, *InPython] = 200
-    """Updates of the critic before anything else (the paper's 0): a refiner led by a critic that has learnt nothing
-    spoils samples that were nearly good."""
-    critic_width: Annotated[int, *InPython] = 128
-    """Units of the critic's layers (the paper's 500)."""
-    samples: Annotated[int, *InPython] = 300
-    """Motions of `seconds` drawn from the density to train on."""
-    seconds: Annotated[float, *InPython] = 10.0
-    """Duration of each sampled motion, s."""
-    judged: Annotated[int, *InPython] = 24
-    """Motions drawn to be measured, and held-out clips at least, if there are as many."""
 
     def __post_init__(self):
         super().__post_init__()
@@ -137,9 +129,9 @@ class RefinerSettings(Settings):
 
     def sample(self, parts: Split) -> tuple[Corpus, Corpus]:
         """Sample motions to train on, and others to measure."""
-        generator, frames = torch.Generator().manual_seed(self.seed), round(self.seconds * PRIOR_FPS)
+        generator, frames = torch.Generator().manual_seed(self.seed), round(_SECONDS * PRIOR_FPS)
         first, second = (
-            sample_corpus(self.prior, parts.train, count, frames, generator) for count in (self.samples, self.judged)
+            sample_corpus(self.prior, parts.train, count, frames, generator) for count in (_SAMPLES, _JUDGED)
         )
         return first, second
 
@@ -174,7 +166,7 @@ class AdversarialTrainer(Trainer[RefinerNetwork]):
         refiner = RefinerNetwork(self.config, **statistics)
         critic = EndEffectorCritic(
             self.config.joints,
-            width=self.settings.critic_width,
+            width=_CRITIC_WIDTH,
             around=_CRITIC_AROUND,
             slow=_CRITIC_SLOW,
             reach_mean=statistics["reach_mean"],
@@ -192,9 +184,9 @@ class AdversarialTrainer(Trainer[RefinerNetwork]):
 
     def warm_up(self) -> None:
         """Before the rounds: the critic alone, then both."""
-        for _ in range(self.settings.head_start):
+        for _ in range(_HEAD_START):
             self._criticise()
-        for _ in range(self.settings.warm_up):
+        for _ in range(_WARM_UP):
             self._refine()
             self._criticise()
 
@@ -235,11 +227,9 @@ class AdversarialTrainer(Trainer[RefinerNetwork]):
     def _refine(self) -> float:
         """One update of the refiner (Eq. 13), and of its running mean."""
         raw = self._draw(self.raw)
-        with self._autocast():
-            refined, _ = self.refiner(raw)
-            odds = self.critic(refined.float())
-        refined = refined.float()
-        loss = cross_entropy(odds.float(), torch.ones(odds.shape))
+        refined, _ = self.refiner(raw)
+        odds = self.critic(refined)
+        loss = cross_entropy(odds, torch.ones(odds.shape))
         total = loss + _ROOT * compute_root_error(raw[:, self.refiner.before :], refined)
         total = total + _MOMENTS * moment_loss(refined, self._draw(self.captured), WINDOW_MOMENTS)
         self._step(self.refiner_optimiser, self.refiner, total)
@@ -248,12 +238,10 @@ class AdversarialTrainer(Trainer[RefinerNetwork]):
 
     def _criticise(self) -> tuple[float, float]:
         """One update of the critic (Eq. 10) on captured windows, fresh refined ones and kept ones."""
-        with torch.no_grad(), self._autocast():
+        with torch.no_grad():
             fresh, _ = self.refiner(self._draw(self.raw))
-        made = self.history.mix(fresh.float(), self.generator)
-        both = torch.cat([self._draw(self.captured), made])
-        with self._autocast():
-            odds = self.critic(both).float()
+        made = self.history.mix(fresh, self.generator)
+        odds = self.critic(torch.cat([self._draw(self.captured), made]))
         truth = torch.cat([torch.ones(len(odds) - len(made)), torch.zeros(len(made))])
         loss = cross_entropy(odds, truth[:, None].expand_as(odds))
         right = ((odds.mean(1) > 0) == (truth > 0.5)).float().mean()
@@ -266,9 +254,6 @@ class AdversarialTrainer(Trainer[RefinerNetwork]):
         loss.backward()
         nn.utils.clip_grad_norm_(model.parameters(), 5.0)
         optimiser.step()
-
-    def _autocast(self) -> torch.autocast:
-        return torch.autocast("cpu", torch.bfloat16, enabled=self.settings.bfloat16)
 
     def _draw(self, windows: FeatureWindows) -> Float[Tensor, "batch frames size"]:
         return windows.draw(self.settings.batch, self.generator).features
@@ -294,7 +279,7 @@ class AdversarialTrainer(Trainer[RefinerNetwork]):
         data = {
             "density": settings.density,
             "density_config": settings.prior.reference.config.as_card(),
-            "samples": settings.samples,
+            "samples": _SAMPLES,
         }
         return Export(self.network.state_dict(), data, {"test": test})
 
@@ -359,10 +344,7 @@ class RefinerEvaluator:
             if self.mocap[name] > 0
         }
         if min(len(refined), len(self.windows)) >= self.settings.min_clips:
-            made = [
-                cut_windows(canonical_positions(decode(clip, GroundPose.origin())))
-                for clip in refined
-            ]
+            made = [cut_windows(canonical_positions(decode(clip, GroundPose.origin()))) for clip in refined]
             seeded = torch.Generator().manual_seed(0)
             row["classifier_accuracy"] = compute_held_out_accuracy(
                 made, self.windows, generator=seeded, settings=self.settings

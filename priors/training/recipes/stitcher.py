@@ -34,7 +34,6 @@ from priors.stitcher import (
     StitcherNetwork,
     count_made,
     join_sides,
-    multiply_in_bfloat16,
     walk_sides,
 )
 from priors.training.data import Corpus, Split
@@ -93,6 +92,7 @@ class StitcherSettings(NetworkSettings):
 
     kind = "stitcher"
     used_by = "use it with --stitcher"
+    ours = StitcherConfig()
 
     steps: Count = 12_000
     """Steps in all."""
@@ -102,10 +102,6 @@ class StitcherSettings(NetworkSettings):
     def __post_init__(self):
         super().__post_init__()
         require_at_least(self, _LEAST_WINDOW, "window")
-
-    def make_config(self) -> StitcherConfig:
-        """Return the shape of the network."""
-        return StitcherConfig()
 
     def make_trainer(self, parts: Split) -> "StitcherTrainer":
         """Make the trainer as it is before the first step."""
@@ -157,8 +153,7 @@ class StitcherTrainer(GradientTrainer[StitcherNetwork]):
         longest = max(_SHORTEST, min(round(longest), self.longest))
         frames = int(torch.randint(_SHORTEST, longest + 1, (), generator=self.generator))
         truth = self.windows.draw(self.settings.batch, frames, _draw_known(self.generator), self.generator)
-        with multiply_in_bfloat16(self.network, self.posterior, wanted=self.settings.bfloat16):
-            parts, errors = find_stitcher_losses(self.network, self.posterior, truth, self.generator)
+        parts, errors = find_stitcher_losses(self.network, self.posterior, truth, self.generator)
         return {"loss": torch.stack([WEIGHTS[name] * value for name, value in parts.items()]).sum(), **errors}
 
     def train_step(self) -> dict[str, float]:

@@ -137,6 +137,8 @@ class TweenerSettings(NetworkSettings):
 
     kind = "tweener"
     used_by = "use it with mapctl tween --method tweener --inbetweener"
+    ours, papers = GeneratorConfig(), PAPER
+    shape_options = ("paper",)
 
     steps: Count = 16_000
     """Steps in all."""
@@ -162,10 +164,6 @@ class TweenerSettings(NetworkSettings):
         find_class("", self.labels)
         path_predictor.load(self.path)
 
-    def make_config(self) -> GeneratorConfig:
-        """Return the shape of the network that these settings ask for."""
-        return PAPER if self.paper else GeneratorConfig()
-
     def make_trainer(self, parts: Split) -> "TweenerTrainer":
         """Make the trainer as it is before the first step."""
         group_clips(parts.train.names, self.labels)  # what the end of training needs
@@ -177,11 +175,10 @@ class TweenerTrainer(GradientTrainer[GeneratorNetwork]):
 
     def __init__(self, settings: TweenerSettings, corpus: Corpus):
         self.path = path_predictor.load(settings.path).network.to(torch.get_default_device())
-        self.path.reduced_precision = settings.bfloat16
         self.windows = PoseWindows(corpus, evenness=1.0)
         self.longest = min(settings.window, int(int(self.windows.lengths.max()) / (1 + _TEMPO)) - 1)
         self.config = settings.find_config()
-        super().__init__(settings, lambda: GeneratorNetwork(self.config, bfloat16=settings.bfloat16))
+        super().__init__(settings, lambda: GeneratorNetwork(self.config))
         _set_moments(self.network, self.windows)
         self.begin()
 
