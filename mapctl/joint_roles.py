@@ -1,7 +1,7 @@
 """Which joint of any rig is the hips, a toe, an upper leg, by the names that rigs commonly use."""
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from mapctl.errors import RequestError
 from mapctl.joint_names import Part, Role, Side, abbreviate_names, classify_joint, normalise_name
@@ -14,17 +14,18 @@ _TOES += ("foot", "footjoint", "ankle", "足首", "脚踝", "脚")
 _UPPER_LEGS = ("upperleg", "upleg", "thigh", "thighbend", "femur", "legupper", "hip", "hipjoint")
 _UPPER_LEGS += ("大腿", "太もも", "足")
 _HIPS = ("hips", "hip", "pelvis", "骨盆", "盆骨", "骨盤", "下半身")
+_SUFFIXES = ("hips", "pelvis")  # after an unknown beginning
 _ROOTS = ("rootjoint", "root")  # of rigs without hips
 
 
 def find_hips(skeleton: Skeleton) -> int:
     """Find the index of the hips; RequestError lists the joints if none is named so."""
-    names = _normalise_names(skeleton)
-    for match, parts in ((_match_exactly, _HIPS), (_match_suffix, _HIPS), (_match_exactly, _ROOTS)):
-        for part in parts:
-            joint = match(names, {part})
-            if joint is not None:
-                return joint
+    names = [normalise_name(name) for name in skeleton.names]
+    for wanted, fits in ((_HIPS, str.__eq__), (_SUFFIXES, str.endswith), (_ROOTS, str.__eq__)):
+        for word in wanted:
+            for joint, name in enumerate(names):
+                if fits(name, word):
+                    return joint
     raise _unknown_joint_error(skeleton, "hips")
 
 
@@ -34,48 +35,29 @@ def find_feet(skeleton: Skeleton) -> tuple[int, int]:
 
 
 def find_upper_legs(skeleton: Skeleton) -> tuple[int, int]:
-    """Find indices of the left and right upper leg, whose line tells facing; RequestError if there are none."""
+    """Find indices of the left and right upper leg, whose line shows facing; RequestError if there are none."""
     return _find_pair(skeleton, _UPPER_LEGS, "upper leg")
 
 
 def _find_pair(skeleton: Skeleton, parts: Sequence[str], role: str) -> tuple[int, int]:
-    names = _normalise_names(skeleton)
-    for match in (_match_exactly, _match_suffix):
+    """Find the joints of a part by plain spellings, as leftfoot, footleft, lfoot, footl; then after an unknown
+    beginning, as in `Character1_LeftFoot`, for which words as short as `lfoot` prove too little."""
+    names = [normalise_name(name) for name in skeleton.names]
+    for whole in (True, False):
         for part in parts:
-            left, right = match(names, _side_spellings(part, "left")), match(names, _side_spellings(part, "right"))
-            if left is not None and right is not None:
-                return left, right
+            found: list[int] = []
+            for side, han in (("left", "左"), ("right", "右")):
+                words = [word for mark in (side, side[0], han) for word in (mark + part, part + mark)]
+                ends = tuple(word for word in words if len(word) >= 6 and side in word)
+                found += [j for j, name in enumerate(names) if (name in words if whole else name.endswith(ends))][:1]
+            if len(found) == 2:
+                return found[0], found[1]
     raise _unknown_joint_error(skeleton, f"left and right {role}")
 
 
-def _side_spellings(part: str, side: str) -> set[str]:
-    """Spell a part of one side in plain ways: leftfoot, footleft, lfoot, footl."""
-    marks = (side, side[0], "左" if side == "left" else "右")
-    return {f"{mark}{part}" for mark in marks} | {f"{part}{mark}" for mark in marks}
-
-
-def _match_exactly(names: Sequence[str], wanted: set[str]) -> int | None:
-    return _find_first(names, wanted.__contains__)
-
-
-def _match_suffix(names: Sequence[str], wanted: set[str]) -> int | None:
-    """Match a name after an unknown beginning (`Character1_LeftFoot`); words as short as `lfoot` prove too little."""
-    telling = tuple(word for word in wanted if len(word) >= 6 and ("left" in word or "right" in word))
-    return _find_first(names, lambda name: name.endswith(telling or tuple(wanted & {"hips", "pelvis"})))
-
-
-def _find_first(names: Sequence[str], fits: Callable[[str], bool]) -> int | None:
-    return next((joint for joint, name in enumerate(names) if fits(name)), None)
-
-
-def _normalise_names(skeleton: Skeleton) -> list[str]:
-    return [normalise_name(name) for name in skeleton.names]
-
-
 def _unknown_joint_error(skeleton: Skeleton, role: str) -> RequestError:
-    return RequestError(
-        f"cannot tell the {role} of this rig by name; its joints are {abbreviate_names(skeleton.names)}"
-    )
+    names = abbreviate_names(skeleton.names)
+    return RequestError(f"cannot tell the {role} of this rig by name; its joints are {names}")
 
 
 def classify_joints(skeleton: Skeleton) -> tuple[Role, ...]:

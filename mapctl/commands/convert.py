@@ -12,8 +12,7 @@ from mapctl import __version__, editing, formats, report, retarget
 from mapctl.commands.shared import folders, inputs, options, outputs
 from mapctl.commands.shared.command import Command
 from mapctl.commands.shared.options import parse_range
-from mapctl.editing import GroundTransform, Loop
-from mapctl.editing.looping import Peaks
+from mapctl.editing import GroundTransform
 from mapctl.editing.rigged_motion import RiggedMotion
 from mapctl.errors import RequestError
 from mapctl.metrics import feet
@@ -196,17 +195,9 @@ def transfer_to_rig(
 
 def _loop(done: Converted) -> Converted:
     loop = editing.close_loop(done.motion, done.rig)
-    return replace(done, motion=loop.motion, cycle=loop.travel, lines=(*done.lines, _describe_loop(loop)))
-
-
-def _describe_loop(loop: Loop) -> str:
-    cycle, motion = loop.cycle, loop.motion
-    return (
-        f"loop: frames {cycle.start}:{cycle.stop}, {motion.seconds:.2f} s, travel {loop.travel.distance:.2f} m; at the"
-        f" seam the largest step is {100 * loop.seam.step:.1f} cm and the largest acceleration"
-        f" {loop.seam.acceleration:.0f} m/s^2, {100 * loop.clip.step:.1f} cm and {loop.clip.acceleration:.0f} m/s^2"
-        " in these frames of the clip"
-    )
+    frames, way = f"{loop.cycle.start}:{loop.cycle.stop}", f"{loop.travel.distance:.2f} m"
+    line = f"loop: frames {frames}, {loop.motion.seconds:.2f} s, travel {way}"
+    return replace(done, motion=loop.motion, cycle=loop.travel, lines=(*done.lines, line))
 
 
 def _plant_feet(done: Converted) -> Converted:
@@ -217,11 +208,7 @@ def _plant_feet(done: Converted) -> Converted:
 
 def _describe_feet(motion: Motion, rig: Rig | None) -> str:
     toes = feet.ToeMeasurements.of(RiggedMotion.of(motion, rig).positions("Toes"), float(motion.fps))
-    peaks = Peaks.of(motion.joint_positions(), float(motion.fps))
-    return (
-        f"planted toes {100 * feet.contact_speed(toes):.1f} cm/s, skate {100 * feet.skate(toes):.1f} cm/s, largest step"
-        f" {100 * peaks.step:.1f} cm and acceleration {peaks.acceleration:.0f} m/s^2"
-    )
+    return f"planted toes {100 * feet.contact_speed(toes):.1f} cm/s, skate {100 * feet.skate(toes):.1f} cm/s"
 
 
 def run(command: Convert) -> int:

@@ -10,7 +10,6 @@ degree. Footing then holds planted toes still and on the floor by the legs, wher
 """
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -73,7 +72,17 @@ def _plant(rigged: RiggedMotion) -> Motion:
     if not bool(planted.any()):
         return rigged.motion
     corrections = correct_toes(toes, toes, planted, fps)
-    corrections[..., 1] = _correct_heights(toes, planted, fps)
+    # Planted toes are at the height of their support, and none is lower. The ends of a contact, in which a toe is on
+    # its way down or up, are left to what is between.
+    smooth, heights = _smooth(toes, _choose_smoothing(toes, fps)), toes[..., 1]
+    rest = fit_supports(smooth, planted)
+    firm = heights < rest
+    for foot, start, stop in true_intervals(planted):
+        usual = smooth[start:stop, foot, 1].median()
+        firm[start:stop, foot] |= smooth[start:stop, foot, 1] < usual + _ROLL_METRES
+    for foot in range(2):
+        missed = torch.where(firm, rest - heights, 0.0)[:, foot, None]
+        corrections[:, foot, 1:2] = interpolate_offsets(missed, firm[:, foot], seconds=_STEP_FADE_SECONDS, fps=fps)
     return place_ankles(rigged, rigged.positions("Foot") + corrections)
 
 
@@ -106,21 +115,8 @@ def correct_toes(
     for foot, start, stop in true_intervals(planted):
         own = drift[start:stop, foot]
         corrections[start:stop, foot] = own.mean(dim=0) - own
-    return _interpolate(corrections, planted, fps)
-
-
-def _correct_heights(
-    toes: Float[Tensor, "frames 2 3"], planted: Bool[Tensor, "frames 2"], fps: float
-) -> Float[Tensor, "frames 2"]:
-    """Return corrections that put planted toes at the height of their support, and let no toe go lower. The ends of a
-    contact, in which a toe is on its way down or up, are left to what is between."""
-    smooth = _smooth(toes, _choose_smoothing(toes, fps))
-    rest, heights, smooth = fit_supports(smooth, planted), toes[..., 1], smooth[..., 1]
-    firm = heights < rest
-    for foot, start, stop in true_intervals(planted):
-        usual = smooth[start:stop, foot].median()
-        firm[start:stop, foot] |= smooth[start:stop, foot] < usual + _ROLL_METRES
-    return _interpolate(torch.where(firm, rest - heights, 0.0)[..., None], firm, fps)[..., 0]
+    feet = zip(corrections.unbind(dim=1), planted.unbind(dim=1), strict=True)
+    return torch.stack([interpolate_offsets(*foot, seconds=_STEP_FADE_SECONDS, fps=fps) for foot in feet], dim=1)
 
 
 def _choose_smoothing(toes: Float[Tensor, "frames 2 3"], fps: float) -> float:
@@ -141,18 +137,6 @@ def _choose_smoothing(toes: Float[Tensor, "frames 2 3"], fps: float) -> float:
 def _smooth(values: Float[Tensor, "frames *width"], sigma: float) -> Float[Tensor, "frames *width"]:
     """Smooth values by a Gaussian of `sigma` frames."""
     return gaussian.convolve(values, gaussian.kernel(max(sigma, 1e-6), side=max(1, round(3 * sigma))), "repeated")
-
-
-def _interpolate(
-    corrections: Float[Tensor, "frames 2 width"], firm: Bool[Tensor, "frames 2"], fps: float
-) -> Float[Tensor, "frames 2 width"]:
-    return torch.stack(
-        [
-            interpolate_offsets(corrections[:, foot], firm[:, foot], seconds=_STEP_FADE_SECONDS, fps=fps)
-            for foot in range(corrections.shape[1])
-        ],
-        dim=1,
-    )
 
 
 SEARCH_FPS = 30
@@ -201,54 +185,42 @@ def find_cycle(motion: Motion) -> Cycle:
 
     RequestError where none is found, which says what comes nearest.
     """
-    fps = float(motion.fps)
-    step = max(1, round(fps / SEARCH_FPS))
-    states = _describe_frames(motion, step)
-    lags = _choose_lags(motion, step)
-    distances = _measure_lags(states[::step], lags)
-    moving = _pair_moving(_find_moving_frames(states[::step]), distances, lags)
-    covered = _cover_steps(motion, step, moving, lags)
-    limit = min(_MAX_DISTANCE, _MAX_SHARE * float(distances[moving].mean())) if bool(moving.any()) else 0.0
-    best = None
-    for fits, periodic in _list_searches(distances, moving, lags, fps / step):
-        known = int((fits & covered).sum()) > _KNOWN_SHARE * int(fits.sum())
-        allowed = fits & covered if known else fits
-        if not bool(allowed.any()):
-            continue
-        lag, start = divmod(int(torch.where(allowed, distances, torch.inf).argmin()), distances.shape[1])
-        found = _refine(motion, states, start * step, (start + lags[lag]) * step, step, periodic)
-        if found.distance <= limit:
-            return found
-        best = found if best is None or found.distance < best.distance else best
-    raise RequestError(f"no cycle is found: {_describe_failure(best, limit)}")
-
-
-def _choose_lags(motion: Motion, step: int) -> range:
-    """Choose the lengths that a cycle may have, in `step` frames; RequestError for clips that are too short."""
+    step = max(1, round(float(motion.fps) / SEARCH_FPS))
     rate, count = float(motion.fps) / step, -(-motion.num_frames // step)
     lags = range(round(_SHORTEST_SECONDS * rate), min(round(_LONGEST_SECONDS * rate), count - 2) + 1)
     if len(lags) < 3:
         raise RequestError(f"no cycle is found: {motion.seconds:.2f} s are too short for one")
-    return lags
-
-
-def _list_searches(
-    distances: Float[Tensor, "lags frames"], moving: Bool[Tensor, "lags frames"], lags: range, rate: float
-) -> Iterator[tuple[Bool[Tensor, "lags frames"], bool]]:
-    """Yield which pairs may be a cycle, and whether they are a period apart: about each period, the shortest first,
-    and at last any a second apart."""
+    states = _describe_frames(motion, step)
+    distances = torch.full((len(lags), count), float("inf"), dtype=states.dtype)
+    for row, lag in enumerate(lags):
+        distances[row, : count - lag] = _measure_distance(states[::step][:-lag], states[::step][lag:])
+    # By lag and frame: whether both frames are there and move, and whether a contact of each foot lies between them.
+    speed = states[::step, :, 3:].square().sum(dim=-1).mean(dim=-1).sqrt()
+    moves = speed >= _MOVING_SHARE * speed.quantile(_FAST_QUANTILE)
+    later = torch.nn.functional.pad(moves, (0, lags[-1])).unfold(0, count, 1)[lags[0] :]
+    moving = moves & later & distances.isfinite()
+    covered = _cover_steps(motion, step, lags)
+    limit = min(_MAX_DISTANCE, _MAX_SHARE * float(distances[moving].mean())) if bool(moving.any()) else 0.0
+    # Pairs about each period, the shortest first, and at last any a second apart.
     lag = torch.tensor(list(lags))[:, None]
-    for period in _find_periods(distances, moving, lags):
-        yield moving & ((lag - period).abs() <= _NEAR_PERIOD * period), True
-    yield moving & (lag >= _SHORTEST_FREE_SECONDS * rate), False
-
-
-def _describe_failure(best: Cycle | None, limit: float) -> str:
+    periods = _find_periods(distances, moving, lags)
+    searches = [(moving & ((lag - period).abs() <= _NEAR_PERIOD * period), True) for period in periods]
+    best = None
+    for fits, periodic in (*searches, (moving & (lag >= _SHORTEST_FREE_SECONDS * rate), False)):
+        known = int((fits & covered).sum()) > _KNOWN_SHARE * int(fits.sum())
+        allowed = fits & covered if known else fits
+        if not bool(allowed.any()):
+            continue
+        row, start = divmod(int(torch.where(allowed, distances, torch.inf).argmin()), count)
+        found = _refine(motion, states, start * step, (start + lags[row]) * step, step, periodic)
+        if found.distance <= limit:
+            return found
+        best = found if best is None or found.distance < best.distance else best
     if best is None:
-        return "the clip never comes back to where it was in a stride or a second"
-    return (
-        f"frames {best.start} and {best.stop} come nearest, with joints and velocities {100 * best.distance:.1f} cm"
-        f" apart; {100 * limit:.1f} are allowed"
+        raise RequestError("no cycle is found: the clip never comes back to where it was in a stride or a second")
+    raise RequestError(
+        f"no cycle is found: frames {best.start} and {best.stop} come nearest, with joints and velocities"
+        f" {100 * best.distance:.1f} cm apart; {100 * limit:.1f} are allowed"
     )
 
 
@@ -264,42 +236,24 @@ def describe_cycle(motion: Motion, cycle: Cycle) -> dict[str, float | int | bool
     return values | {"steps_per_minute": 120 / seconds, "stride_m": stride, "speed_m_s": stride / seconds}
 
 
-def _see_from_hips(motion: Motion) -> Float[Tensor, "frames joints 3"]:
-    """Return joint positions from below the hips, turned to face +Z, metres."""
-    heading = rotations.split_heading(motion.joint_rotations()[:, 0])[0]
-    below = motion.root_position * motion.root_position.new_tensor([1.0, 0.0, 1.0])
-    return rotations.rotate_about_y(motion.joint_positions() - below[:, None], -heading[:, None])
-
-
 def _describe_frames(motion: Motion, step: int) -> Float[Tensor, "frames joints 6"]:
-    """Describe each frame by joint positions and velocities (times 0.1 s) over `step` frames on both sides, metres."""
-    heading = rotations.split_heading(motion.joint_rotations()[:, 0])[0]
+    """Describe each frame by joint positions from below the hips, which face +Z, and velocities (times 0.1 s) over
+    `step` frames on both sides, metres."""
+    back = -rotations.split_heading(motion.joint_rotations()[:, 0])[0][:, None]
     frames = torch.arange(motion.num_frames)
     before, after = (frames - step).clamp(min=0), (frames + step).clamp(max=motion.num_frames - 1)
     seconds = (after - before).clamp(min=1).double() / float(motion.fps)
     places = motion.joint_positions()
     velocity = (places[after] - places[before]) / seconds[:, None, None]
-    velocity = rotations.rotate_about_y(velocity, -heading[:, None])
-    return torch.cat([_see_from_hips(motion), _VELOCITY_SECONDS * velocity], dim=-1)
-
-
-def _measure_lags(states: Float[Tensor, "frames joints 6"], lags: range) -> Float[Tensor, "lags frames"]:
-    """Measure the distance of each frame to that so many frames later; infinite where there is none."""
-    found = torch.full((len(lags), len(states)), float("inf"), dtype=states.dtype)
-    for row, lag in enumerate(lags):
-        found[row, : len(states) - lag] = _measure_distance(states[:-lag], states[lag:])
-    return found
+    below = motion.root_position * motion.root_position.new_tensor([1.0, 0.0, 1.0])
+    seen = rotations.rotate_about_y(places - below[:, None], back)
+    return torch.cat([seen, _VELOCITY_SECONDS * rotations.rotate_about_y(velocity, back)], dim=-1)
 
 
 def _measure_distance(
     one: Float[Tensor, "*batch joints 6"], other: Float[Tensor, "*batch joints 6"]
 ) -> Float[Tensor, "*batch"]:
     return (one - other).square().sum(dim=-1).mean(dim=-1).sqrt()
-
-
-def _find_moving_frames(states: Float[Tensor, "frames joints 6"]) -> Bool[Tensor, " frames"]:
-    speed = states[..., 3:].square().sum(dim=-1).mean(dim=-1).sqrt()
-    return speed >= _MOVING_SHARE * speed.quantile(_FAST_QUANTILE)
 
 
 def _find_periods(
@@ -316,22 +270,12 @@ def _find_periods(
     ]
 
 
-def _pair_moving(
-    moving: Bool[Tensor, " frames"], distances: Float[Tensor, "lags frames"], lags: range
-) -> Bool[Tensor, "lags frames"]:
-    """Return by lag and frame whether both frames are there and move."""
-    later = torch.nn.functional.pad(moving, (0, lags[-1])).unfold(0, len(moving), 1)[lags[0] :]
-    return moving & later & distances.isfinite()
-
-
-def _cover_steps(
-    motion: Motion, step: int, moving: Bool[Tensor, "lags frames"], lags: range
-) -> Bool[Tensor, "lags frames"]:
+def _cover_steps(motion: Motion, step: int, lags: range) -> Bool[Tensor, "lags frames"]:
     """Return which pairs have a contact of each foot and a swing of each between them."""
     positions = motion.joint_positions()
     planted = find_contacts(positions[:, list(TOE_JOINTS)], positions[:, 0], float(motion.fps))[::step]
     counts = torch.nn.functional.pad(planted.long().cumsum(dim=0), (0, 0, 1, 0))
-    lag, frames = torch.tensor(list(lags))[:, None], torch.arange(moving.shape[1])
+    lag, frames = torch.tensor(list(lags))[:, None], torch.arange(len(planted))
     between = counts[(frames + lag).clamp(max=len(planted))] - counts[frames]
     return ((between > 0) & (between < lag[..., None])).all(dim=-1)
 
@@ -352,23 +296,6 @@ _WINDOW_SECONDS = 0.1  # seconds on both sides of the seam over which its ends a
 _FADE_SECONDS = 0.75  # seconds within which what closes the seam fades away, half a cycle at most
 _STRAIGHT = np.deg2rad(6.0)  # radians a cycle, up to which it is taken for straight
 _STILL_METRES = 0.01  # metres by which a root joint that stays in place moves at most
-_SEAM_FRAMES = 2  # frames on both sides of a seam whose steps and accelerations are its own
-
-
-@dataclass(frozen=True)
-class Peaks:
-    """Peaks of any joint in the world."""
-
-    step: float
-    """Largest displacement from frame to frame, metres."""
-    acceleration: float
-    """Largest acceleration, m/s^2."""
-
-    @staticmethod
-    def of(places: Float[Tensor, "frames joints 3"], fps: float) -> "Peaks":
-        """Measure joint positions, metres; 0 for too few frames."""
-        steps, bends = (places.diff(n=order, dim=0).norm(dim=-1) for order in (1, 2))
-        return Peaks(*(float(v.max()) * scale if v.numel() else 0.0 for v, scale in ((steps, 1.0), (bends, fps**2))))
 
 
 @dataclass(frozen=True, eq=False)
@@ -381,10 +308,6 @@ class Loop:
     """Where it was in the clip."""
     travel: GroundTransform
     """How far it moves over the ground by cycle, in a world with Y up."""
-    clip: Peaks
-    """Peaks of the same frames in the clip."""
-    seam: Peaks
-    """Peaks where the last frames are followed by the first."""
 
 
 def close_loop(motion: Motion, rig: Rig | None = None) -> Loop:
@@ -393,34 +316,24 @@ def close_loop(motion: Motion, rig: Rig | None = None) -> Loop:
     Of a walk or a run it is one stride; one that turns by up to 6 degrees is made straight. `rig` wins over what would
     be recognised. RequestError where its joints cannot be identified, and where no cycle is found.
     """
-    rigged = RiggedMotion.of(motion, rig)
+    rigged, fps = RiggedMotion.of(motion, rig), float(motion.fps)
     cycle = find_cycle(rigged.canonical)
-    reach = max(1, round(_WINDOW_SECONDS * float(motion.fps)))
-    travel = _fit_travel(rigged, cycle, reach)
-    first, last = max(0, cycle.start - reach), min(motion.num_frames, cycle.stop + reach + 1)
-    window = _carry_root(rigged, cycle, travel, first, last)
-    shares = (torch.arange(first, last) - cycle.start).double() / cycle.frames
-    still = move_by_share(window, travel, -shares)
-    closed = _close(still, cycle.start - first, cycle.frames, reach, float(motion.fps))
-    closed = move_by_share(closed, travel, shares[cycle.start - first :][: cycle.frames])
-    planted = find_contacts(rigged.positions("Toes"), rigged.position("hips"), float(motion.fps))
-    planted = planted[cycle.start : cycle.stop]
-    source = rigged.with_motion(window.slice(cycle.start - first, cycle.start - first + cycle.frames + 1))
-    closed = _restore_contacts(rigged.with_motion(closed), source, planted, travel)
-    seam = _measure_seam(closed, travel)
-    loop = _restore_root(rigged, closed, cycle)
-    made = rigged.with_motion(loop).in_file_world()
-    own = motion.joint_positions()[cycle.start : cycle.stop + 1]
-    return Loop(made, cycle, travel, Peaks.of(own, float(motion.fps)), seam)
-
-
-def _fit_travel(rigged: RiggedMotion, cycle: Cycle, reach: int) -> GroundTransform:
-    """Fit how the body moves over the ground from the cycle's beginning to its end, all joints and frames around."""
+    reach = max(1, round(_WINDOW_SECONDS * fps))
+    # How the body moves over the ground from the cycle's beginning to its end, all joints and frames around.
     places = rigged.canonical.joint_positions()
     back, on = min(reach, cycle.start), min(reach, len(places) - 1 - cycle.stop)
-    before, after = (places[frame - back : frame + on + 1] for frame in (cycle.start, cycle.stop))
-    travel = fit_ground_transform(before, after)
-    return travel if abs(travel.turn) > _STRAIGHT else fit_ground_transform(before, after, turning=False)
+    around = [places[frame - back : frame + on + 1] for frame in (cycle.start, cycle.stop)]
+    travel = fit_ground_transform(*around)
+    travel = travel if abs(travel.turn) > _STRAIGHT else fit_ground_transform(*around, turning=False)
+    first, last = max(0, cycle.start - reach), min(motion.num_frames, cycle.stop + reach + 1)
+    window, start = _carry_root(rigged, cycle, travel, first, last), cycle.start - first
+    shares = (torch.arange(first, last) - cycle.start).double() / cycle.frames
+    closed = _close(move_by_share(window, travel, -shares), start, cycle.frames, reach, fps)
+    closed = rigged.with_motion(move_by_share(closed, travel, shares[start:][: cycle.frames]))
+    planted = find_contacts(rigged.positions("Toes"), rigged.position("hips"), fps)[cycle.start : cycle.stop]
+    source = rigged.with_motion(window.slice(start, start + cycle.frames + 1))
+    loop = _restore_root(rigged, _restore_contacts(closed, source, planted, travel), cycle)
+    return Loop(rigged.with_motion(loop).in_file_world(), cycle, travel)
 
 
 def _carrier(rigged: RiggedMotion) -> int | None:
@@ -519,9 +432,3 @@ def _restore_contacts(
     corrections = correct_toes(toes, drift, planted.repeat(3, 1), float(closed.motion.fps))[frames : 2 * frames]
     corrections = rotations.rotate_about_y(corrections, torch.tensor(-travel.turn).double())
     return place_ankles(closed, closed.positions("Foot") + corrections)
-
-
-def _measure_seam(motion: Motion, travel: GroundTransform) -> Peaks:
-    twice = repeat_over_ground(motion, travel, 2)
-    near = slice(max(0, motion.num_frames - _SEAM_FRAMES), motion.num_frames + _SEAM_FRAMES)
-    return Peaks.of(twice.joint_positions()[near], float(motion.fps))

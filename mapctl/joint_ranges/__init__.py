@@ -26,30 +26,6 @@ TOLERANCE_DEG = 0.5
 _MIRRORED_SIGN = {"X": 1.0, "Y": -1.0, "Z": -1.0}  # of a turn about an axis, seen in a mirror across the body
 
 
-@dataclass(frozen=True)
-class JointRange:
-    """Range of one joint."""
-
-    order: str
-    """Order of its intrinsic Euler angles, as in `XZY`."""
-    mid_quat_xyzw: tuple[float, ...]
-    """Four numbers: the rotation from which the angles are measured."""
-    low_deg: tuple[float, ...]
-    """Three least angles in their order, degrees."""
-    high_deg: tuple[float, ...]
-    """Three greatest angles in their order, degrees."""
-
-    def mirrored(self) -> "JointRange":
-        """Return the range of the same joint on the other side of the body."""
-        x, y, z, w = self.mid_quat_xyzw
-        low, high = [], []
-        for letter, least, most in zip(self.order, self.low_deg, self.high_deg, strict=True):
-            ends = sorted(_MIRRORED_SIGN[letter] * end for end in (least, most))
-            low.append(ends[0])
-            high.append(ends[1])
-        return JointRange(self.order, (x, -y, -z, w), tuple(low), tuple(high))
-
-
 @dataclass(frozen=True, eq=False)
 class JointRanges:
     """Ranges of all joints but the hips, which turn freely."""
@@ -62,27 +38,6 @@ class JointRanges:
     """Least angles, radians."""
     high: Float[Tensor, "others 3"]
     """Greatest angles, radians."""
-
-    @staticmethod
-    def of_joints(ranges: dict[str, JointRange]) -> "JointRanges":
-        """Collect the ranges of joints by name; a joint on one side has that of its mirror image if it has none of its
-        own. MapctlError for a joint of the canonical skeleton that has neither."""
-        found = []
-        for name in CANONICAL.names[1:]:
-            if name not in ranges and mirror_name(name) not in ranges:
-                raise MapctlError(f"no range for the joint {name!r}")
-            found.append(ranges[name] if name in ranges else ranges[mirror_name(name)].mirrored())
-        mid = torch.tensor([one.mid_quat_xyzw for one in found], dtype=torch.float64)
-        low, high = (
-            torch.deg2rad(torch.tensor([getattr(one, name) for one in found], dtype=torch.float64))
-            for name in ("low_deg", "high_deg")
-        )
-        return JointRanges(
-            rotations.euler_axes([one.order for one in found]),
-            rotations.to_matrix(torch.nn.functional.normalize(mid, dim=-1)),
-            low,
-            high,
-        )
 
     def to_angles(self, local_matrix: Float[Tensor, "*batch others 3 3"]) -> Float[Tensor, "*batch others 3"]:
         """Return the angles of local rotations, radians."""
@@ -143,12 +98,23 @@ def outside(
 
 @cache
 def load() -> JointRanges:
-    """Return the bundled ranges."""
+    """Return the bundled ranges; a joint on one side has those of its mirror image if it has none of its own."""
     rows = json.loads(files(__name__).joinpath(TABLE).read_text("utf-8"))["joints"]
-    keys = ("mid_quat_xyzw", "low_deg", "high_deg")
-    ranges = {
-        name: JointRange(row["order"], *(tuple(map(float, row[key])) for key in keys)) for name, row in rows.items()
-    }
+    orders, mids, lows, highs = [], [], [], []
+    for name in CANONICAL.names[1:]:
+        row = rows.get(name) or rows[mirror_name(name)]
+        bounds = list(zip(row["order"], row["low_deg"], row["high_deg"], strict=True))
+        x, y, z, w = row["mid_quat_xyzw"]
+        if name not in rows:
+            bounds = [(axis, *sorted(_MIRRORED_SIGN[axis] * end for end in ends)) for axis, *ends in bounds]
+            y, z = -y, -z
+        orders.append(row["order"])
+        mids.append((x, y, z, w))
+        lows.append([low for _, low, _ in bounds])
+        highs.append([high for *_, high in bounds])
     # Kept for every later call, while the first may be within another default device.
     with torch.device("cpu"):
-        return JointRanges.of_joints(ranges)
+        mid, low, high = (torch.tensor(values, dtype=torch.float64) for values in (mids, lows, highs))
+        quats = torch.nn.functional.normalize(mid, dim=-1)
+        axes = rotations.euler_axes(orders)
+        return JointRanges(axes, rotations.to_matrix(quats), torch.deg2rad(low), torch.deg2rad(high))

@@ -10,7 +10,7 @@ from rig_maker import make
 from rigs_to_edit import RIGS, on_rig, soft_knees, toe_speed
 
 from mapctl import editing, retarget, rotations
-from mapctl.editing.looping import Peaks, find_contacts
+from mapctl.editing.looping import find_contacts
 from mapctl.editing.rigged_motion import RiggedMotion
 from mapctl.editing.travel import repeat_over_ground
 from mapctl.errors import RequestError
@@ -33,19 +33,21 @@ def five(motion, loop):
     return repeat_over_ground(RiggedMotion.of(motion).with_motion(loop.motion).motion, loop.travel, 5)
 
 
-# Knees of this walk have kinks, which feet that are held make sharper: at 120 frames a second one is at the seam.
-@pytest.mark.parametrize(("fps", "turn_rate", "most"), [(30, 0.5, 1), (120, 0.0, 1.3)])
-def test_five_in_a_row_are_as_calm_as_the_clip(fps, turn_rate, most):
+def peaks(motion) -> list[float]:
+    """The largest step from frame to frame, metres, and acceleration, m/s^2, of any joint."""
+    places = motion.joint_positions()
+    return [float(places.diff(n=n, dim=0).norm(dim=-1).max()) * float(motion.fps) ** (2 * n - 2) for n in (1, 2)]
+
+
+@pytest.mark.parametrize(("fps", "turn_rate"), [(30, 0.5), (120, 0.0)])
+def test_five_in_a_row_are_as_calm_as_the_clip(fps, turn_rate):
     motion = uneven(4 * fps, fps=fps, turn_rate=turn_rate)
     loop = editing.close_loop(motion)
-    whole, clip = (Peaks.of(m.joint_positions(), fps) for m in (five(motion, loop), motion))
-    assert whole.acceleration <= 1.3 * clip.acceleration
-    assert loop.seam.acceleration <= most * clip.acceleration
-    assert loop.seam.step <= clip.step
-    assert whole.step <= 1.05 * clip.step
+    whole, clip = peaks(five(motion, loop)), peaks(motion)
+    assert whole[1] <= 1.3 * clip[1]
+    assert whole[0] <= 1.05 * clip[0]
     raw = motion.slice(loop.cycle.start, loop.cycle.stop)
-    jump = Peaks.of(repeat_over_ground(raw, loop.travel, 2).joint_positions(), fps)
-    assert jump.acceleration > 1.3 * whole.acceleration  # without closing it there is a jump
+    assert peaks(repeat_over_ground(raw, loop.travel, 2))[1] > 1.3 * whole[1]  # without closing it there is a jump
 
 
 @pytest.mark.parametrize("name", RIGS)
