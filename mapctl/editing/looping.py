@@ -74,7 +74,7 @@ def _plant(rigged: RiggedMotion) -> Motion:
     corrections = correct_toes(toes, toes, planted, fps)
     # Planted toes are at the height of their support, and none is lower. The ends of a contact, in which a toe is on
     # its way down or up, are left to what is between.
-    smooth, heights = _smooth(toes, _choose_smoothing(toes, fps)), toes[..., 1]
+    smooth, heights = gaussian.smooth(toes, _choose_smoothing(toes, fps)), toes[..., 1]
     rest = fit_supports(smooth, planted)
     firm = heights < rest
     for foot, start, stop in true_intervals(planted):
@@ -91,7 +91,7 @@ def find_contacts(
 ) -> Bool[Tensor, "frames 2"]:
     """Find in which frames each toe is planted; contacts that noise alone parts are one. Positions in metres."""
     sigma = _choose_smoothing(toes, fps)
-    smooth = _smooth(toes, sigma)
+    smooth = gaussian.smooth(toes, sigma)
     noise = torch.tensor([[_NOISE_SPEED]])
     resting = compute_rest_log_probability(smooth, hips, fps, noise)
     if sigma <= _SMOOTH_SECONDS[0] * fps:  # hardly any noise: what is seen as it is counts too
@@ -132,11 +132,6 @@ def _choose_smoothing(toes: Float[Tensor, "frames 2 3"], fps: float) -> float:
     noise = float(sizes.median()) / _MEDIAN_OF_NORMAL / math.sqrt(20)
     wanted = ((noise * fps / _NOISE_SPEED) ** 2 / (4 * math.sqrt(math.pi))) ** (1 / 3)
     return min(max(wanted, least), most)
-
-
-def _smooth(values: Float[Tensor, "frames *width"], sigma: float) -> Float[Tensor, "frames *width"]:
-    """Smooth values by a Gaussian of `sigma` frames."""
-    return gaussian.convolve(values, gaussian.kernel(max(sigma, 1e-6), side=max(1, round(3 * sigma))), "repeated")
 
 
 SEARCH_FPS = 30

@@ -5,7 +5,6 @@ W' = M W_p R_p^-1 M R, with M the mirror through x = 0 and R the rotations in th
 fingers and twists turn as their partners did, and mirroring twice gives W again.
 """
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import torch
@@ -18,7 +17,7 @@ from mapctl.joint_names import Side, normalise_name, split_side
 from mapctl.motion import Motion
 from mapctl.retarget import RigMap
 from mapctl.retarget.rigs import Rig
-from mapctl.skeleton import mirror_name
+from mapctl.skeleton import Skeleton, mirror_name
 
 _NEAR = 0.02  # metres within which a joint without a side in its name is the mirror image of another at rest
 
@@ -30,61 +29,42 @@ def pair_joints(rigmap: RigMap) -> list[int | None]:
     Canonical joints are paired as such. Others are paired by their names without left and right, as
     `mapctl.joint_names` knows these, else by their places in the T-pose below joints that are paired.
     """
-    names = rigmap.rig_skeleton.names
-    found: dict[int, int] = dict(_pair_canonical(rigmap))
-    for joint, partner in _pair_by_name(names):
-        if joint not in found and partner not in found:
-            found |= {joint: partner, partner: joint}
-    places = _rest_positions(rigmap)
-    for joint in range(len(names)):  # parents come first
-        if joint not in found:
-            partner = _pair_by_place(joint, found, rigmap, places)
-            found |= {} if partner is None else {joint: partner, partner: joint}
-    return [found.get(joint) for joint in range(len(names))]
-
-
-def _pair_canonical(rigmap: RigMap) -> Iterator[tuple[int, int]]:
-    joints = rigmap.joints
-    for name, joint in joints.items():
-        if mirror_name(name) in joints:
-            yield joint, joints[mirror_name(name)]
-
-
-def _pair_by_name(names: tuple[str, ...]) -> Iterator[tuple[int, int]]:
+    skeleton, joints = rigmap.rig_skeleton, rigmap.joints
+    found = {joint: joints[other] for name, joint in joints.items() if (other := mirror_name(name)) in joints}
     sides: dict[Side, dict[str, int]] = {side: {} for side in Side}
-    for joint, name in enumerate(names):
+    for joint, name in enumerate(skeleton.names):
         side, rest = split_side(name)
         sides[side].setdefault(normalise_name(rest), joint)
     for rest, joint in sides[Side.LEFT].items():
-        if rest in sides[Side.RIGHT]:
-            yield joint, sides[Side.RIGHT][rest]
+        partner = sides[Side.RIGHT].get(rest)
+        if partner is not None and joint not in found and partner not in found:
+            found |= {joint: partner, partner: joint}
+    local = kinematics.local_from_world(skeleton.parents, rigmap.rest_quat_xyzw[None])
+    origin = torch.zeros(1, 3, dtype=torch.float64)
+    places = kinematics.forward_kinematics(skeleton.offsets, skeleton.parents, origin, local)[0][0]
+    places = places - places[joints["hips"]]
+    for joint in range(skeleton.num_joints):  # parents come first
+        if joint not in found:
+            partner = _pair_by_place(joint, found, skeleton, places)
+            found |= {} if partner is None else {joint: partner, partner: joint}
+    return [found.get(joint) for joint in range(skeleton.num_joints)]
 
 
-def _pair_by_place(joint: int, found: dict[int, int], rigmap: RigMap, places: Float[Tensor, "joints 3"]) -> int | None:
-    skeleton = rigmap.rig_skeleton
+def _pair_by_place(
+    joint: int, found: dict[int, int], skeleton: Skeleton, places: Float[Tensor, "joints 3"]
+) -> int | None:
     parent = skeleton.parents[joint]
     if parent < 0:
         return joint
-    if parent not in found:
-        return None
-    side = split_side(skeleton.names[joint])[0]
-    around = skeleton.children(found[parent])
     # Of a side in the name no partner was found by that name; what has none and is alone in the middle is its own.
-    free = [] if side is not Side.MIDDLE else [other for other in around if other not in found]
+    if parent not in found or split_side(skeleton.names[joint])[0] is not Side.MIDDLE:
+        return None
     mirrored = places[joint] * places.new_tensor([-1.0, 1.0, 1.0])
-    near = [(float((places[other] - mirrored).norm()), other) for other in free]
-    nearest = min(near, default=None)
-    if nearest is not None and nearest[0] < _NEAR:
-        return nearest[1]
-    return joint if side is Side.MIDDLE and found[parent] == parent else None
-
-
-def _rest_positions(rigmap: RigMap) -> Float[Tensor, "joints 3"]:
-    """Return the joints' places in the T-pose, metres, from the middle of the hips."""
-    skeleton, world = rigmap.rig_skeleton, rigmap.rest_quat_xyzw
-    local = kinematics.local_from_world(skeleton.parents, world[None])
-    places = kinematics.forward_kinematics(skeleton.offsets, skeleton.parents, torch.zeros(1, 3).double(), local)[0][0]
-    return places - places[rigmap.joints["hips"]]
+    free = [other for other in skeleton.children(found[parent]) if other not in found]
+    near = min(((float((places[other] - mirrored).norm()), other) for other in free), default=(_NEAR, joint))
+    if near[0] < _NEAR:
+        return near[1]
+    return joint if found[parent] == parent else None
 
 
 # A reflection through x = 0 keeps rotation about x and reverses rotation about y and z.
@@ -103,7 +83,8 @@ def mirror(motion: Motion, rig: Rig | None = None) -> Motion:
     """
     rigged = RiggedMotion.of(motion, rig)
     mirrored = rigged.with_motion(_mirror_joints(rigged))
-    ankles = _find_ankle_targets(rigged, mirrored)
+    toes = rigged.positions("Toes").flip(1) * _FLIP
+    ankles = mirrored.positions("Foot") + toes - mirrored.positions("Toes")
     if float((ankles - mirrored.positions("Foot")).abs().max()) > _OFF_METRES:
         mirrored = mirrored.with_motion(place_ankles(mirrored, ankles))
     return mirrored.in_file_world()
@@ -113,7 +94,10 @@ def _mirror_joints(rigged: RiggedMotion) -> Motion:
     """Mirror all rotations, travelling joints and the place of the hips. Joints without a partner keep their own local
     rotation."""
     motion, partners, rest = rigged.motion, pair_joints(rigged.rigmap), rigged.rigmap.rest_quat_xyzw
-    turned = _mirror_rotations(motion.joint_rotations(), partners, rest)
+    world = motion.joint_rotations()
+    index = torch.tensor([joint if partner is None else partner for joint, partner in enumerate(partners)])
+    swung = rotations.multiply(world[:, index], rotations.inverse(rest[index]).expand(world.shape))
+    turned = rotations.multiply(swung * _FLIP_XYZW, rest.expand(world.shape))
     local = kinematics.local_from_world(motion.skeleton.parents, turned)
     alone = [joint for joint, partner in enumerate(partners) if partner is None]
     local[:, alone] = motion.local_quat_xyzw[:, alone]
@@ -123,18 +107,8 @@ def _mirror_joints(rigged: RiggedMotion) -> Motion:
         local_quat_xyzw=rotations.make_sign_continuous(local),
         moving_offsets=_mirror_offsets(motion, partners, rest),
     )
-    mirrored, hips = rigged.with_motion(made), rigged.hips
-    missed = motion.joint_positions()[:, hips] * _FLIP - made.joint_positions()[:, hips]
-    return mirrored.shift_hips(missed)
-
-
-def _mirror_rotations(
-    world: Float[Tensor, "frames joints 4"], partners: list[int | None], rest: Float[Tensor, "joints 4"]
-) -> Float[Tensor, "frames joints 4"]:
-    """Return the mirror image of world rotations; joints without a partner are left as they are."""
-    index = torch.tensor([joint if partner is None else partner for joint, partner in enumerate(partners)])
-    swung = rotations.multiply(world[:, index], rotations.inverse(rest[index]).expand(world.shape))
-    return rotations.multiply(swung * _FLIP_XYZW, rest.expand(world.shape))
+    missed = motion.joint_positions()[:, rigged.hips] * _FLIP - made.joint_positions()[:, rigged.hips]
+    return rigged.with_motion(made).shift_hips(missed)
 
 
 def _mirror_offsets(
@@ -154,9 +128,3 @@ def _mirror_offsets(
         away = rotations.rotate(other, track - motion.skeleton.offsets[partner]) * _FLIP
         found[joint] = motion.skeleton.offsets[joint] + rotations.rotate(rotations.inverse(above), away)
     return found
-
-
-def _find_ankle_targets(rigged: RiggedMotion, mirrored: RiggedMotion) -> Float[Tensor, "frames 2 3"]:
-    """Return where ankles go, metres, so that toes are where their partners were, mirrored."""
-    toes = rigged.positions("Toes").flip(1) * _FLIP
-    return mirrored.positions("Foot") + toes - mirrored.positions("Toes")

@@ -50,11 +50,7 @@ class RiggedMotion:
     @cached_property
     def canonical(self) -> Motion:
         """The motion on canonical joints."""
-        return retarget.to_canonical(self.motion, self._upright_rig)[0]
-
-    @property
-    def _upright_rig(self) -> Rig:
-        return replace(retarget.as_rig(self.rigmap), up="y")
+        return retarget.to_canonical(self.motion, replace(retarget.as_rig(self.rigmap), up="y"))[0]
 
     def positions(self, part: str) -> Float[Tensor, "frames 2 3"]:
         """Return world positions, metres, of the left and right canonical joint of a part, as `Toes`.
@@ -87,29 +83,18 @@ class RiggedMotion:
         """Return the motion in the world of its file. What is as in `like`, but for rounding, has its numbers."""
         up = self.rigmap.upright_quat_xyzw
         motion = retarget.rotate_world(self.motion, None if up is None else rotations.inverse(up))
-        return motion if like is None else keep_numbers(motion, like)
+        if like is None:
+            return motion
 
+        def keep(own: Tensor, other: Tensor, same: Tensor | None = None) -> Tensor:
+            near = (own - other).abs().amax(dim=-1, keepdim=True) < _SAME
+            return torch.where(near if same is None else near | same, other, own)
 
-def keep_numbers(motion: Motion, like: Motion) -> Motion:
-    """Return a motion with the numbers of another of the same skeleton and frames, wherever they differ by rounding
-    alone."""
-    own, other = motion.local_quat_xyzw, like.local_quat_xyzw
-    same = torch.minimum((own - other).abs().amax(-1), (own + other).abs().amax(-1)) < _SAME
-    moving = {
-        joint: _keep(track, like.moving_offsets[joint]) if joint in like.moving_offsets else track
-        for joint, track in motion.moving_offsets.items()
-    }
-    return replace(
-        motion,
-        root_position=_keep(motion.root_position, like.root_position),
-        local_quat_xyzw=torch.where(same[..., None], other, own),
-        moving_offsets=moving,
-    )
-
-
-def _keep(own: Float[Tensor, "frames 3"], other: Float[Tensor, "frames 3"]) -> Float[Tensor, "frames 3"]:
-    same = (own - other).abs().amax(dim=-1, keepdim=True) < _SAME
-    return torch.where(same, other, own)
+        own, other = motion.local_quat_xyzw, like.local_quat_xyzw
+        opposite = (own + other).abs().amax(dim=-1, keepdim=True) < _SAME
+        moving = {j: keep(track, like.moving_offsets.get(j, track)) for j, track in motion.moving_offsets.items()}
+        root = keep(motion.root_position, like.root_position)
+        return replace(motion, root_position=root, local_quat_xyzw=keep(own, other, opposite), moving_offsets=moving)
 
 
 _FREE_EXTENSION = 0.985  # of the leg: a leg may be that straight, whatever it was
@@ -142,7 +127,11 @@ def _place_ankle(rigged: RiggedMotion, side: str, target: Float[Tensor, "frames 
     joints = [rigged.rigmap.joints[side + part] for part in ("UpperLeg", "LowerLeg", "Foot")]
     places, world = rigged.motion.joint_positions(), rigged.motion.joint_rotations()
     at, knee, ankle = (places[:, joint] for joint in joints)
-    thigh_turn, shin_turn = _turn_leg(knee - at, ankle - knee, target - at, _find_forward(rigged, side))
+    # The direction in the world in which the knee of a straight leg would bend.
+    rest = rigged.rigmap.tpose_quat_xyzw[CANONICAL.index(side + "UpperLeg")]
+    swung = rotations.multiply(world[:, joints[0]], rotations.inverse(rest).expand(len(world), 4))
+    forward = rotations.rotate(swung, swung.new_tensor([0.0, 0.0, 1.0]).expand(len(swung), 3))
+    thigh_turn, shin_turn = _turn_leg(knee - at, ankle - knee, target - at, forward)
     parents = [rigged.motion.skeleton.parents[joint] for joint in joints]
     # What carries each joint has turned as the bone above it did, helper joints between the two included.
     turns = (None, thigh_turn, shin_turn)
@@ -158,16 +147,6 @@ def _place_ankle(rigged: RiggedMotion, side: str, target: Float[Tensor, "frames 
         local[:, joint] = torch.where(moved[:, None], found, local[:, joint])
 
 
-def _find_forward(rigged: RiggedMotion, side: str) -> Float[Tensor, "frames 3"]:
-    """Return the direction in the world in which the knee of a straight leg would bend."""
-    thigh = rigged.rigmap.joints[side + "UpperLeg"]
-    rest = rigged.rigmap.tpose_quat_xyzw[CANONICAL.index(side + "UpperLeg")]
-    turn = rotations.multiply(
-        rigged.motion.joint_rotations()[:, thigh], rotations.inverse(rest).expand(rigged.motion.num_frames, 4)
-    )
-    return rotations.rotate(turn, turn.new_tensor([0.0, 0.0, 1.0]).expand(len(turn), 3))
-
-
 def _turn_leg(
     thigh: Float[Tensor, "frames 3"],
     shin: Float[Tensor, "frames 3"],
@@ -177,7 +156,12 @@ def _turn_leg(
     """Return the rotations in the world of thigh and shin that bring their end to a target, all as vectors from the
     hip joint, metres. The knee stays in its plane; what it bends further goes a little more forward."""
     upper, lower, whole = thigh.norm(dim=-1), shin.norm(dim=-1), (thigh + shin).norm(dim=-1)
-    far = _limit_extension(target.norm(dim=-1), whole, upper + lower)
+    # As far as it is wanted, and ever less beyond what is nearly the most. A leg that was straighter may stay so.
+    wanted, length = target.norm(dim=-1), upper + lower
+    most, soft = torch.maximum(_MAX_EXTENSION * length, whole), _SOFT_SHARE * length
+    over = (wanted - (most - soft)).clamp_min(0)
+    limited = torch.minimum(wanted, most - soft) + soft * (1 - torch.exp(-over / soft))
+    far = torch.where(wanted <= whole, wanted, torch.maximum(limited, torch.minimum(whole, wanted)))
     swing = rotations.between_vectors(thigh + shin, target)
     axis = torch.nn.functional.normalize(target, dim=-1)
     thigh, shin = rotations.rotate(swing, thigh), rotations.rotate(swing, shin)
@@ -191,17 +175,6 @@ def _turn_leg(
     turn = rotations.multiply(rotations.between_vectors(thigh, knee), swing)
     bent = rotations.rotate(rotations.multiply(turn, rotations.inverse(swing)), shin)
     return turn, rotations.multiply(rotations.between_vectors(bent, far[:, None] * axis - knee), turn)
-
-
-def _limit_extension(
-    far: Float[Tensor, " frames"], was: Float[Tensor, " frames"], length: Float[Tensor, " frames"]
-) -> Float[Tensor, " frames"]:
-    """Return how far an ankle may be: as far as it is wanted, and ever less beyond what is nearly the most. A leg that
-    was straighter may stay so."""
-    most, soft = torch.maximum(_MAX_EXTENSION * length, was), _SOFT_SHARE * length
-    over = (far - (most - soft)).clamp_min(0)
-    limited = torch.minimum(far, most - soft) + soft * (1 - torch.exp(-over / soft))
-    return torch.where(far <= was, far, torch.maximum(limited, torch.minimum(was, far)))
 
 
 def _find_hips_dip(rigged: RiggedMotion, ankles: Float[Tensor, "frames 2 3"]) -> Float[Tensor, " frames"]:

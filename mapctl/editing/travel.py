@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Complex, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from mapctl import rotations
@@ -87,15 +87,11 @@ def fit_ground_transform(
     before: Float[Tensor, "*points 3"], after: Float[Tensor, "*points 3"], *, turning: bool = True
 ) -> GroundTransform:
     """Fit the transform that brings points nearest to others, by least squares; without `turning` a shift alone."""
-    start, stop = (_as_places(points).flatten() for points in (before, after))
+    start, stop = (torch.complex(points[..., 2], points[..., 0]).flatten() for points in (before, after))
     product = ((start - start.mean()).conj() * (stop - stop.mean())).sum()
     turn = float(product.angle()) if turning else 0.0
     shift = complex(stop.mean().item()) - cmath.rect(1.0, turn) * complex(start.mean().item())
     return GroundTransform(turn, (shift.imag, shift.real))
-
-
-def _as_places(points: Float[Tensor, "*points 3"]) -> Complex[Tensor, "*points"]:
-    return torch.complex(points[..., 2], points[..., 0])
 
 
 _NAMES = ("root", "motion_root")

@@ -60,3 +60,15 @@ def low_pass(values: Float[Tensor, "frames"], *, seconds: float, fps: float) -> 
     both = torch.stack([values, torch.ones_like(values)], dim=-1)
     summed, weight = convolve(both, kernel, "nothing").unbind(dim=-1)
     return summed / weight
+
+
+def smooth(values: Float[Tensor, "frames *width"], sigma: float) -> Float[Tensor, "frames *width"]:
+    """Smooth values by a kernel of `sigma` frames; ends are held."""
+    return convolve(values, kernel(max(sigma, 1e-6), side=max(1, round(3 * sigma))), "repeated")
+
+
+def envelope(values: Float[Tensor, "frames columns"], seconds: float, fps: float) -> Float[Tensor, "frames columns"]:
+    """Return smooth values that are about as high as the highest within so many seconds before and after."""
+    frames = max(1, round(seconds * fps))
+    padded = torch.nn.functional.pad(values.T[None], (frames, frames), mode="replicate")
+    return smooth(torch.nn.functional.max_pool1d(padded, 2 * frames + 1, stride=1)[0].T, frames / 2)

@@ -24,6 +24,7 @@ from mapctl.errors import RequestError
 from mapctl.joint_names import Part, Side, abbreviate_names, classify_joint
 from mapctl.kinematics import inverse
 from mapctl.motion import Motion
+from mapctl.numerics import gaussian
 from mapctl.numerics.easing import smootherstep
 from mapctl.retarget import RigMap, as_rig, to_canonical
 from mapctl.retarget.anatomy import ancestors
@@ -39,16 +40,7 @@ from mapctl.retarget.character import (
     limb_extension,
     limb_lengths,
 )
-from mapctl.retarget.hands import (
-    Spans,
-    envelope,
-    hold_through,
-    keep_hand_relations,
-    low_pass,
-    mean_by_span,
-    merge_contacts,
-    soft_clamp,
-)
+from mapctl.retarget.hands import Spans, hold_through, keep_hand_relations, mean_by_span, merge_contacts, soft_clamp
 from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import Skeleton, leg_length
 
@@ -193,7 +185,9 @@ def _transfer_root(
     to_thighs = body.leveled.offsets[HIP_JOINTS].mean(0) - scale * own.skeleton.offsets[HIP_JOINTS].mean(0)
     turns = own.joint_rotations()[:, 0]
     # The hips' rotation is noisy; what they carry at another distance is not to shake for it.
-    aside = low_pass(rotations.rotate(turns, to_thighs.expand(own.num_frames, 3)), _SMOOTH_SECONDS * float(own.fps))
+    aside = gaussian.smooth(
+        rotations.rotate(turns, to_thighs.expand(own.num_frames, 3)), _SMOOTH_SECONDS * float(own.fps)
+    )
     # Ankles over the floor while feet lie flat, mean of both.
     ankle = (body.stance.standing_height - body.leveled.offsets[TOES, 1]).mean()
     others = (giver.stance.flat_height - own.skeleton.offsets[TOES, 1]).mean()
@@ -212,7 +206,7 @@ def fit_hips(moved: Motion, ankles: Float[Tensor, "frames 2 3"], stretch: Float[
     say = smootherstep((stretch - bent) / (straight - bent)) * smootherstep((down - begin) / (end - begin))
     total = say.sum(dim=-1, keepdim=True)
     lower = (say * short).sum(dim=-1, keepdim=True) / (total + _LEAST_SAY)
-    dip = low_pass(lower, _HIP_FIT_SECONDS * float(moved.fps))
+    dip = gaussian.smooth(lower, _HIP_FIT_SECONDS * float(moved.fps))
     return replace(moved, root_position=moved.root_position - dip * _UP)
 
 
@@ -221,7 +215,7 @@ def lower_hips(moved: Motion, ankles: Float[Tensor, "frames 2 3"], stretch: Floa
     short, down = _find_missing_length(moved, ankles, stretch.clamp(_FREE_EXTENSION, _MAX_EXTENSION))
     # A leg that points sideways or up is not helped by lower hips.
     short = torch.where(down > _DOWN_SHARES[0], short.clamp_min(0), 0.0).amax(dim=-1, keepdim=True)
-    dip = envelope(short, _HIP_DROP_SECONDS, float(moved.fps))
+    dip = gaussian.envelope(short, _HIP_DROP_SECONDS, float(moved.fps))
     return replace(moved, root_position=moved.root_position - dip * _UP)
 
 
@@ -257,7 +251,7 @@ def _find_ankle_targets(
         if of_foot:
             places[:, k, ::2] += hold_through(of_foot, mean_by_span(aside[:, k], of_foot), len(toes))
         else:
-            places[:, k, ::2] += low_pass(aside[:, k], _FREE_SECONDS * float(own.fps))
+            places[:, k, ::2] += gaussian.smooth(aside[:, k], _FREE_SECONDS * float(own.fps))
     over = scale * (toes[..., 1] - giver.floor - giver.flat_height)
     lifted = torch.where(over < 0, MAX_TOE_SINK * torch.expm1(over / MAX_TOE_SINK) - over, 0.0)
     places[..., 1] += (1 - scale) * giver.floor + body.standing_height - scale * giver.flat_height + lifted + raised
@@ -345,7 +339,7 @@ def retarget_canonical(
     scale = leg_length(body.leveled) / leg_length(own.skeleton)
     spans, height = find_ground(own, giver.stance)
     higher = 1 - scale if ground == "keep" else 0.0
-    under_hips = low_pass(height.mean(dim=1, keepdim=True), _BODY_SECONDS * float(own.fps))[:, 0]
+    under_hips = gaussian.smooth(height.mean(dim=1, keepdim=True), _BODY_SECONDS * float(own.fps))[:, 0]
     moved = _transfer_root(own, giver, body, scale, higher * under_hips)
     grounds = scale * height, higher * height
     ankles = _find_ankle_targets(own, moved, giver.stance, body.stance, spans, *grounds, scale=scale)

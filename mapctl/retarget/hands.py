@@ -61,20 +61,6 @@ def mean_by_span(values: Float[Tensor, "frames width"], spans: Spans) -> Float[T
     return torch.stack([values[start:stop].mean(0) for start, stop in spans])
 
 
-def low_pass(values: Float[Tensor, "frames columns"], sigma: float) -> Float[Tensor, "frames columns"]:
-    """Low-pass values over time by a Gaussian of `sigma` frames; ends are held."""
-    taps = gaussian.kernel(max(sigma, 1e-6), side=max(1, round(3 * sigma)))
-    return gaussian.convolve(values, taps, "repeated")
-
-
-def envelope(values: Float[Tensor, "frames columns"], seconds: float, fps: float) -> Float[Tensor, "frames columns"]:
-    """Return smooth values that are about as high as the highest within so many seconds before and after."""
-    frames = max(1, round(seconds * fps))
-    padded = torch.nn.functional.pad(values.T[None], (frames, frames), mode="replicate")
-    highest = torch.nn.functional.max_pool1d(padded, 2 * frames + 1, stride=1)[0].T
-    return low_pass(highest, frames / 2)
-
-
 def soft_clamp(
     far: Float[Tensor, "*frames limbs"], most: Float[Tensor, "*#frames limbs"], margin: float
 ) -> Float[Tensor, "*frames limbs"]:
@@ -241,11 +227,11 @@ def _find_relations(own: Motion, giver: Stance) -> _Relations:
     stays = torch.ones_like(near.distance)
     if len(points) > 1:
         speed = near.local.diff(dim=0).norm(dim=-1) * fps
-        smooth = low_pass(torch.cat([speed[:1], speed]).flatten(1), _SPEED_SECONDS * fps).view_as(stays)
+        smooth = gaussian.smooth(torch.cat([speed[:1], speed]).flatten(1), _SPEED_SECONDS * fps).view_as(stays)
         stays = 1 - smootherstep((smooth - _SLOW_SPEED) / (_FAST_SPEED - _SLOW_SPEED))
     far = torch.lerp(stays.new_tensor(_SLIDE_METRES), stays.new_tensor(_FAR_METRES), stays)
     weight, touch = (
-        envelope((say * _weigh(near.distance - thick, reach)).flatten(1), _FADE_SECONDS, fps).view_as(stays)
+        gaussian.envelope((say * _weigh(near.distance - thick, reach)).flatten(1), _FADE_SECONDS, fps).view_as(stays)
         for reach in (far, _SLIDE_METRES)
     )
     left, right = points.unflatten(1, (2, -1)).unbind(dim=1)
@@ -256,9 +242,9 @@ def _find_relations(own: Motion, giver: Stance) -> _Relations:
         weight=weight,
         touch=touch,
         apart=(right - left).mean(dim=1),
-        together=envelope(_weigh(between - 2 * thick), _FADE_SECONDS, fps),
+        together=gaussian.envelope(_weigh(between - 2 * thick), _FADE_SECONDS, fps),
         floor_height=height,
-        floor_weight=envelope(_weigh(height), _FADE_SECONDS, fps),
+        floor_weight=gaussian.envelope(_weigh(height), _FADE_SECONDS, fps),
         planted=_detect_planted(points, height, fps),
     )
 
