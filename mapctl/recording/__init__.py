@@ -49,7 +49,10 @@ class Capture:
         """Make a batch of one from a motion on canonical joints, single precision: what was observed, and the noise,
         `sigma` in radians and `sigma_root` in metres. The signs of its quaternions must not jump between observed
         frames."""
-        joints = _continuous_vectors(motion.local_quat_xyzw[:, 1:])
+        quats = motion.local_quat_xyzw[:, 1:]
+        # Rotation vectors without a jump at a half turn, short ones in most frames.
+        sign = torch.where(quats[..., 3].mean(dim=0, keepdim=True) < 0, -1.0, 1.0)
+        joints = rotations.to_long_rotation_vector(quats * sign[..., None])
         return Capture(
             motion.root_position.float()[None],
             motion.local_quat_xyzw[:, 0].float()[None],
@@ -83,12 +86,6 @@ class Capture:
         """Tilt of the hips, their rotation without the heading (rotation vector, x and z), radians, filled in."""
         vector = rotations.to_rotation_vector(rotations.split_heading(self.hips)[1])
         return fill_missing(vector[..., ::2], self.seen[..., 0])
-
-
-def _continuous_vectors(quats: Float[Tensor, "frames joints 4"]) -> Float[Tensor, "frames joints 3"]:
-    """Return rotation vectors without a jump at a half turn, short ones in most frames, if signs are continuous."""
-    sign = torch.where(quats[..., 3].mean(dim=0, keepdim=True) < 0, -1.0, 1.0)
-    return rotations.to_long_rotation_vector(quats * sign[..., None])
 
 
 @dataclass(frozen=True, eq=False)

@@ -62,7 +62,8 @@ def fuse_rotations(
     if there is one. Joints without noise keep what was observed."""
     capture = choose_continuous_signs(capture)
     weights = seen.double()
-    smooth = [_normalise(smooth_columns(capture, weights, hertz, fps)) for hertz in _list_cutoffs(fps)]
+    smooth = [smooth_columns(capture, weights, hertz, fps) for hertz in _list_cutoffs(fps)]
+    smooth = [torch.nn.functional.normalize(each, dim=-1) for each in smooth]
     about = smooth[0] if proposal is None else proposal
 
     def move(about: Tensor, scale: tuple[float, float], held: bool) -> tuple[Tensor, Tensor, Tensor]:
@@ -156,7 +157,9 @@ def _estimate(
     for hertz, smooth in zip(_list_cutoffs(fps), alone, strict=True):
         # Averaged as the change is, or the outermost frame, which a smoother follows most, were the proposal's alone.
         own = _average(_weigh_own(len(residual), hertz, fps)[:, None], ones[:, :1], fps, seconds)
-        own = _require_seen(own, _average_within(weights, hertz, fps), holds_proposal)
+        # In a gap a smoother knows little: of the frames that it sees, how many are observed.
+        shown = _average(weights, ones, fps, 1 / (4 * math.pi * hertz))
+        own = _require_seen(own, shown, holds_proposal)
         back = [smooth_columns(residual * weights[..., None], weights, hertz, fps)] if holds_proposal else []
         candidates, owns = [*back, smooth, *candidates], [*[own] * len(back), own, *owns]
     # Risks differ by what is slower than the prior's rate alone: a faster camera has more frames of the same.
@@ -195,13 +198,6 @@ def _average(
     return gaussian.convolve(values, taps, "nothing") / ones / weight
 
 
-def _average_within(weights: Float[Tensor, "frames columns"], hertz: float, fps: float) -> Tensor:
-    """Average the weights of the frames that a smoother sees: in a gap it knows little."""
-    taps = gaussian.gaussian_kernel(1 / (4 * math.pi * hertz), fps)
-    ones = gaussian.convolve(torch.ones_like(weights), taps, "nothing")
-    return gaussian.convolve(weights, taps, "nothing") / ones
-
-
 def _require_seen(own: Tensor, seen: Float[Tensor, "frames columns"], holds_proposal: bool) -> Tensor:
     """Raise the noise that a smoother keeps where it sees few frames; where it sees hardly any, in a long gap, only a
     proposal remains, if there is one."""
@@ -238,10 +234,6 @@ def _weigh_own(frames: int, hertz: float, fps: float) -> Float[Tensor, " frames"
 def _relative_vector(start: Tensor, stop: Tensor) -> Float[Tensor, "frames columns 3"]:
     """Return rotation vectors from one to the other, in the first's frame, radians."""
     return rotations.to_rotation_vector(rotations.multiply(rotations.inverse(start).expand_as(stop), stop))
-
-
-def _normalise(quats: Float[Tensor, "frames joints 4"]) -> Float[Tensor, "frames joints 4"]:
-    return torch.nn.functional.normalize(quats, dim=-1)
 
 
 def upsample(

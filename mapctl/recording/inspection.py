@@ -18,6 +18,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -113,14 +114,18 @@ class Inspection:
     def known(self) -> Bool[Tensor, "frames joints"]:
         """Mask of rotations that are observed, or need not be, since the joint is the same wherever it is."""
         quats = self.motion.local_quat_xyzw
-        held = _hold_last_observed(quats, self.seen)
-        still = (quats - held[:1]).norm(dim=-1) < _LOCKED_CHANGE
+        still = (quats - self._held()[:1]).norm(dim=-1) < _LOCKED_CHANGE
         return self.seen | ((still | ~self.seen).all(dim=0) & self.seen.any(dim=0))
+
+    def _held(self) -> Float[Tensor, "frames joints 4"]:
+        """Hold the last observed rotation where nothing is observed: signs are then chosen between frames that
+        count."""
+        return torch.take_along_dim(self.motion.local_quat_xyzw, last_observed(self.seen.T).T[..., None], dim=0)
 
     def repaired(self) -> Motion:
         """Return the recording with artefacts filled in, interpolated from the frames around them."""
         motion, seen = self.motion, self.seen
-        quats = choose_continuous_signs(_hold_last_observed(motion.local_quat_xyzw, seen))
+        quats = choose_continuous_signs(self._held())
         steps = fill_missing(quats.transpose(0, 1), seen.T).transpose(0, 1)
         filled = fill_missing(travel(motion)[None], self.seen_root[None])[0]
         return replace_travel(replace(motion, local_quat_xyzw=torch.nn.functional.normalize(steps, dim=-1)), filled)
@@ -138,11 +143,6 @@ def replace_travel(motion: Motion, position: Float[Tensor, "frames 3"]) -> Motio
     if joint:
         return replace(motion, moving_offsets={**motion.moving_offsets, joint: position})
     return replace(motion, root_position=position)
-
-
-def _hold_last_observed(quats: Tensor, seen: Tensor) -> Tensor:
-    """Hold the last observed rotation where nothing is observed: signs are then chosen between frames that count."""
-    return torch.take_along_dim(quats, last_observed(seen.T).T[..., None], dim=0)
 
 
 def inspect_recording(motion: Motion, masks: Sequence[Mask] = ()) -> Inspection:
@@ -210,21 +210,17 @@ def predict_frames(
 ) -> Prediction:
     """Predict each frame of each track from those of its neighbours that are seen; `least` is the smallest scale that
     a track can have, its resolution."""
-    found = [_predict(values, seen, least, side, degree) for side, degree in _MODELS]
-    scores = torch.stack([_score(prediction, seen) for prediction in found])
+    found, scores = [_predict(values, seen, least, side, degree) for side, degree in _MODELS], []
+    for prediction in found:  # the mean logarithm of the density of the frames that are seen
+        counted = seen & (prediction.freedom > 0)
+        total = torch.where(counted, prediction.log_density(), 0.0).sum(dim=0)
+        scores.append(torch.where(counted.any(dim=0), total / counted.sum(dim=0).clamp_min(1), -math.inf))
     usable = torch.stack([prediction.freedom > 0 for prediction in found])
-    rank = scores.argsort(dim=0).argsort(dim=0)[:, None]
+    rank = torch.stack(scores).argsort(dim=0).argsort(dim=0)[:, None]
     best = torch.where(usable, rank, -1).argmax(dim=0, keepdim=True)
     numbers = ([getattr(each, name) for each in found] for name in ("error", "spread", "scale", "freedom"))
     mean = torch.take_along_dim(torch.stack([each.mean for each in found]), best[..., None], dim=0)[0]
     return Prediction(mean, *(torch.stack(each).gather(0, best)[0] for each in numbers))
-
-
-def _score(prediction: Prediction, seen: Bool[Tensor, "frames tracks"]) -> Float[Tensor, " tracks"]:
-    """Return the mean logarithm of the density of the frames that are seen."""
-    counted = seen & (prediction.freedom > 0)
-    total = torch.where(counted, prediction.log_density(), 0.0).sum(dim=0)
-    return torch.where(counted.any(dim=0), total / counted.sum(dim=0).clamp_min(1), -math.inf)
 
 
 def _predict(
@@ -248,7 +244,12 @@ def _predict(
     shown = values * known[..., None]
     sums = torch.stack([sum_over_lags(shown[..., axis], powers[: degree + 1]) for axis in range(shown.shape[-1])], -1)
     squares = sum_over_lags(shown.square().sum(dim=-1), powers[:1])[..., 0]
-    inverse = _invert(moments, degree)
+    # The normal equations of the polynomials; windows of which all frames are seen have one inverse.
+    order = torch.arange(degree + 1)
+    normal, ridge = moments[..., order[:, None] + order], 1e-9 * torch.eye(degree + 1, dtype=moments.dtype)
+    full = moments[..., 0] > moments[..., 0].amax() - 0.5
+    inverse = torch.linalg.inv(normal[full][0] + ridge).expand_as(normal).clone()
+    inverse[~full] = torch.linalg.inv(normal[~full] + ridge)
     mean = torch.einsum("ftp,ftpw->ftw", inverse[..., 0, :], sums)
     residual = (squares - torch.einsum("ftpw,ftpq,ftqw->ft", sums, inverse, sums)).clamp_min(0)
     freedom = _AXES * (moments[..., 0].round() - (degree + 1)).clamp_min(0)
@@ -258,17 +259,6 @@ def _predict(
     usual = torch.where(seen & (total > 0), shrunk, math.nan).nanmedian(dim=0).values.nan_to_num(0.0)
     scale = (torch.maximum(shrunk, usual) * (1 + inverse[..., 0, 0].clamp_min(0))).sqrt()
     return Prediction(mean + centre, (values - mean).norm(dim=-1), shrunk.sqrt(), scale, total)
-
-
-def _invert(moments: Float[Tensor, "frames tracks sums"], degree: int) -> Float[Tensor, "frames tracks terms terms"]:
-    """Invert the normal equations of polynomials; windows of which all frames are seen have one inverse."""
-    order = torch.arange(degree + 1)
-    normal = moments[..., order[:, None] + order]
-    ridge = 1e-9 * torch.eye(degree + 1, dtype=moments.dtype)
-    full = moments[..., 0] > moments[..., 0].amax() - 0.5
-    inverse = torch.linalg.inv(normal[full][0] + ridge).expand_as(normal).clone()
-    inverse[~full] = torch.linalg.inv(normal[~full] + ridge)
-    return inverse
 
 
 def _shrink_scale(
@@ -325,7 +315,12 @@ def _find_spikes(
 
     Neighbours that spike explain nothing: first no candidate counts as a neighbour, then all that were none.
     """
-    candidates = _find_candidates(values) & seen
+    # Candidates are further from the running median than most about them; more than can spike.
+    numbers = values.numpy()
+    away = np.linalg.norm(numbers - median_filter(numbers, (_MEDIAN_FRAMES, 1, 1), mode="mirror"), axis=-1)
+    frames = 2 * min(_CANDIDATE_FRAMES // 2, len(away) - 1) + 1
+    usual = median_filter(away, (frames, 1), mode="mirror")
+    candidates = torch.from_numpy(away > _CANDIDATE_RATIO * usual + RESOLUTION) & seen
     spikes = candidates.clone()
     changed = candidates.any(dim=0)
     for _ in range(_FIT_ROUNDS):
@@ -341,15 +336,6 @@ def _find_spikes(
         if stop - start > _MEDIAN_FRAMES // 2 or not _is_rough(values[:, track], ~spikes[:, track], start, stop):
             spikes[start:stop, track] = False
     return spikes
-
-
-def _find_candidates(values: Float[Tensor, "frames tracks width"]) -> Bool[Tensor, "frames tracks"]:
-    """Find frames further from the running median than most about them; more than can spike."""
-    numbers = values.numpy()
-    away = np.linalg.norm(numbers - median_filter(numbers, (_MEDIAN_FRAMES, 1, 1), mode="mirror"), axis=-1)
-    frames = 2 * min(_CANDIDATE_FRAMES // 2, len(away) - 1) + 1
-    usual = median_filter(away, (frames, 1), mode="mirror")
-    return torch.from_numpy(away > _CANDIDATE_RATIO * usual + RESOLUTION)
 
 
 def _is_rough(values: Float[Tensor, "frames width"], kept: Bool[Tensor, " frames"], start: int, stop: int) -> bool:
@@ -372,8 +358,11 @@ def _is_rough(values: Float[Tensor, "frames width"], kept: Bool[Tensor, " frames
     return bool((end - (2 * near - far)).norm() > torch.diff(rest, n=2, dim=0).norm(dim=-1).amax())
 
 
-@dataclass(frozen=True)
-class _Run:
+_QUIET = 0.01  # chance of a window that is as quiet as those beside a rest
+_WHITE = 100.0  # degrees of freedom from which the windows of a track have one scale: noise, which never rests
+
+
+class _Run(NamedTuple):
     """Frames `start` to `stop`, in which some tracks have one value."""
 
     start: int
@@ -451,9 +440,26 @@ def _find_faults(
     for run, wrong in zip(runs, replaced, strict=True):
         if wrong or run.stop - run.start == 1:
             continue
-        if _lags(run, values, prediction, ahead, behind) or _stops_trembling(run, prediction, loud, least):
+        # Most tracks are noise, beside the run as ever. Frames of noise are equal by chance if all three numbers are
+        # within the resolution.
+        beside = [frame for frame in (run.start, run.stop) if 0 < frame < len(loud)]
+        noisy = loud[beside][:, run.tracks].all(dim=0)
+        ratio = prediction.spread[beside][:, run.tracks].amin(dim=0) / least[run.tracks]
+        chance = 3 * (run.stop - run.start - 1) * float(torch.where(noisy, ratio.log(), 0.0).sum())
+        stops_trembling = float(noisy.double().mean()) > 0.5 and chance > math.log(len(loud))
+        if stops_trembling or _lags(run, values, prediction, ahead, behind):
             faults.append(_Run(run.start + 1, run.stop, run.tracks))
     return faults
+
+
+def _find_loud(prediction: Prediction, free: Bool[Tensor, "frames tracks"]) -> Bool[Tensor, "frames tracks"]:
+    """Find the frames of noisy tracks about which those that are `free` are no more quiet than chance has them: a
+    quantile of chi-squared by its cube root (Wilson and Hilferty 1931)."""
+    spread, freedom = prediction.spread, prediction.freedom
+    usual = torch.where((freedom > 0) & free, spread, math.nan).nanmedian(dim=0).values
+    part = 2 / (9 * freedom.clamp_min(1))
+    least = (1 - part + float(norm.ppf(_QUIET)) * part.sqrt()).clamp_min(0) ** 3
+    return (freedom > _WHITE) & (spread.square() > least * usual.square())
 
 
 def _lags(
@@ -476,32 +482,6 @@ def _lags(
     known = prediction.freedom[last, tracks] > 0
     evidence = torch.where(known, lagging - prediction.log_density()[last, tracks], 0.0)
     return float(evidence.sum()) > math.log(len(values)) and bool(leaps[last, tracks].any())
-
-
-_QUIET = 0.01  # chance of a window that is as quiet as those beside a rest
-_WHITE = 100.0  # degrees of freedom from which the windows of a track have one scale: noise, which never rests
-
-
-def _find_loud(prediction: Prediction, free: Bool[Tensor, "frames tracks"]) -> Bool[Tensor, "frames tracks"]:
-    """Find the frames of noisy tracks about which those that are `free` are no more quiet than chance has them: a
-    quantile of chi-squared by its cube root (Wilson and Hilferty 1931)."""
-    spread, freedom = prediction.spread, prediction.freedom
-    usual = torch.where((freedom > 0) & free, spread, math.nan).nanmedian(dim=0).values
-    part = 2 / (9 * freedom.clamp_min(1))
-    least = (1 - part + float(norm.ppf(_QUIET)) * part.sqrt()).clamp_min(0) ** 3
-    return (freedom > _WHITE) & (spread.square() > least * usual.square())
-
-
-def _stops_trembling(
-    run: _Run, prediction: Prediction, loud: Bool[Tensor, "frames tracks"], least: Float[Tensor, " tracks"]
-) -> bool:
-    """Return whether most tracks are noise, beside the run as ever. Frames of noise are equal by chance if all three
-    numbers are within the resolution, `least`."""
-    beside = [frame for frame in (run.start, run.stop) if 0 < frame < len(loud)]
-    noisy = loud[beside][:, run.tracks]
-    ratio = prediction.spread[beside][:, run.tracks].amin(dim=0) / least[run.tracks]
-    chance = 3 * (run.stop - run.start - 1) * float(torch.where(noisy.all(dim=0), ratio.log(), 0.0).sum())
-    return float(noisy.all(dim=0).double().mean()) > 0.5 and chance > math.log(len(loud))
 
 
 _NO_TRAVEL = 1e-3  # metres by which a rigid bone may vary where no noise is measured

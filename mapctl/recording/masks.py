@@ -2,7 +2,7 @@
 stop."""
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from os import PathLike
@@ -45,21 +45,19 @@ def load_masks(path: str | PathLike[str]) -> tuple[Mask, ...]:
     if not set(_COLUMNS) <= set(names) or len(set(names)) < len(names):
         found = shorten(",".join(names)) if names else "nothing"
         raise FileFormatError(path, f"needs the columns {', '.join(_COLUMNS)}, each once; found {found}", line)
-    return tuple(_parse_mask(path, line, names, words) for line, words in rows)
-
-
-def _parse_mask(path: str | PathLike[str], line: int, names: Sequence[str], words: Sequence[str]) -> Mask:
-    if len(words) != len(names):
-        raise FileFormatError(path, f"found {len(words)} values where {len(names)} belong", line)
-    row = dict(zip(names, words, strict=True))
-    numbers = [row[name] for name in ("start", "stop")]
-    if not row["joint"] or not all(_FRAME.fullmatch(number) for number in numbers):
-        got = shorten(",".join(words))
-        raise FileFormatError(path, f"expected a joint and two whole frames, got {got}", line)
-    start, stop = map(int, numbers)
-    if not 0 <= start < stop:
-        raise FileFormatError(path, f"needs 0 <= start < stop, got {start} and {stop}", line)
-    return Mask(row["joint"], start, stop)
+    masks = []
+    for line, words in rows:
+        if len(words) != len(names):
+            raise FileFormatError(path, f"found {len(words)} values where {len(names)} belong", line)
+        row = dict(zip(names, words, strict=True))
+        if not row["joint"] or not all(_FRAME.fullmatch(row[name]) for name in ("start", "stop")):
+            got = shorten(",".join(words))
+            raise FileFormatError(path, f"expected a joint and two whole frames, got {got}", line)
+        mask = Mask(row["joint"], int(row["start"]), int(row["stop"]))
+        if not 0 <= mask.start < mask.stop:
+            raise FileFormatError(path, f"needs 0 <= start < stop, got {mask.start} and {mask.stop}", line)
+        masks.append(mask)
+    return tuple(masks)
 
 
 def masks_from_missing(motion: Motion, missing: MissingValues) -> tuple[Mask, ...]:
@@ -113,8 +111,13 @@ def resolve_joint_names(motion: Motion, masks: Sequence[Mask], rig: Rig | None =
 
     `rig` wins over what would be recognised. RequestError, with the nearest names, for joints that it has not.
     """
-    known = cache(lambda: canonical_joints(motion, rig))
-    own = {name: _resolve_joint_name(motion, name, known) for name in {mask.joint for mask in masks} - {ALL, ROOT}}
+    known, names, own = cache(lambda: canonical_joints(motion, rig)), motion.skeleton.names, {}
+    for wanted in {mask.joint for mask in masks} - {ALL, ROOT}:
+        joint = find_joint(wanted, names, known)
+        if joint is None:
+            nearest = describe_nearest(wanted, names, classify_joints(motion.skeleton))
+            raise RequestError(f"no joint {wanted!r} to mask; {nearest}")
+        own[wanted] = names[joint]
     return tuple(replace(mask, joint=own.get(mask.joint, mask.joint)) for mask in masks)
 
 
@@ -148,13 +151,3 @@ def write_back_masked(motion: Motion, clean: Motion, masks: Sequence[Mask]) -> M
         kept = torch.where(root[:, None], clean.moving_offsets[joint], values[:shared])
         moving[joint] = torch.cat([kept, values[shared:]])
     return replace(motion, local_quat_xyzw=quats, root_position=place, moving_offsets=moving)
-
-
-def _resolve_joint_name(motion: Motion, wanted: str, known: Callable[[], Mapping[str, int]]) -> str:
-    names = motion.skeleton.names
-    joint = find_joint(wanted, names, known)
-    if joint is None:
-        raise RequestError(
-            f"no joint {wanted!r} to mask; {describe_nearest(wanted, names, classify_joints(motion.skeleton))}"
-        )
-    return names[joint]

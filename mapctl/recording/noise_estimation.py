@@ -79,7 +79,10 @@ def estimate_angle_noise(
     sigma = _estimate_sigma(steps, seen, differenced=1)
     large = sigma > _LARGE_NOISE
     if large.any():
-        sigma[large] = torch.maximum(sigma[large], _estimate_about_mean(quats[:, large], seen[:, large]))
+        mean = rotations.make_sign_continuous(average_over_time(quats[:, large], seen[:, large]))
+        away = rotations.to_rotation_vector(rotations.multiply(rotations.inverse(mean), quats[:, large]))
+        about_mean = _estimate_sigma(away, seen[:, large], differenced=0).nan_to_num(0.0)
+        sigma[large] = torch.maximum(sigma[large], about_mean)
     known = sigma[(sigma > 0) & sigma.isfinite()]
     usual = known.median() if len(known) else sigma.new_zeros(())
     rounded = _find_step(steps.norm(dim=-1), seen) / math.sqrt(12)
@@ -100,15 +103,6 @@ def _find_step(turns: Float[Tensor, "steps joints"], seen: Bool[Tensor, "frames 
     step = torch.where(alone, sizes, math.inf).amin(dim=0)
     rounded = (sizes.nanmedian(dim=0).values - step < RESOLUTION) & (alone.sum(dim=0) > 2)
     return torch.where(rounded, step, 0.0)
-
-
-def _estimate_about_mean(
-    quats: Float[Tensor, "frames joints 4"], seen: Bool[Tensor, "frames joints"]
-) -> Float[Tensor, " joints"]:
-    """Estimate noise, radians, from the rotation vectors to each frame from the mean about it, which is smooth."""
-    mean = rotations.make_sign_continuous(average_over_time(quats, seen))
-    away = rotations.to_rotation_vector(rotations.multiply(rotations.inverse(mean), quats))
-    return _estimate_sigma(away, seen, differenced=0).nan_to_num(0.0)
 
 
 def estimate_position_noise(places: Float[Tensor, "frames 3"], seen: Bool[Tensor, " frames"]) -> float:

@@ -6,7 +6,6 @@ single joint decides (Kass and Raftery 1995).
 """
 
 import math
-from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import torch
@@ -34,13 +33,22 @@ def exchange_swapped_limbs(
     Rotations are exchanged as those from the T-pose, or as they are in the file, whichever is likelier.
     """
     quats, faults = motion.local_quat_xyzw.clone(), []
+    own, rigged, parents = motion.local_quat_xyzw, rigmap.joints, torch.tensor(motion.skeleton.parents)
     rests = (rigmap.rest_quat_xyzw.to(quats), quats.new_tensor([0, 0, 0, 1]).expand(quats.shape[1], 4))
     for limb in _LIMBS:
         found = []
-        for joints, partners in _list_pairs(rigmap, limb):
-            for rest in rests:
-                exchanged = _exchange(motion, rest, joints, partners)
-                runs = _find_swaps(motion.local_quat_xyzw[:, joints], exchanged, ~hidden[:, joints])
+        for parts in limb:
+            pairs = [(rigged.get(f"left{part}"), rigged.get(f"right{part}")) for part in parts]
+            known = [(left, right) for left, right in pairs if left is not None and right is not None]
+            joints, partners = ([pair[k] for pair in known] + [pair[1 - k] for pair in known] for k in (0, 1))
+            for rest in rests if known else ():
+                # With rest R, a parent's P: a partner's rotation q' is P^-1 P' q' R'^-1 R in the joint's own frame.
+                before = rotations.multiply(rotations.inverse(rest[parents[joints]]), rest[parents[partners]])
+                after = rotations.multiply(rotations.inverse(rest[partners]), rest[joints])
+                shape = own[:, joints].shape
+                exchanged = rotations.multiply(before.expand(shape), own[:, partners])
+                exchanged = rotations.multiply(exchanged, after.expand(shape))
+                runs = _find_swaps(own[:, joints], exchanged, ~hidden[:, joints])
                 found += [(gain, start, stop, joints, exchanged) for gain, start, stop in runs]
         free = torch.ones(motion.num_frames, dtype=torch.bool)
         for _, start, stop, joints, exchanged in sorted(found, key=lambda run: -run[0]):
@@ -51,29 +59,6 @@ def exchange_swapped_limbs(
                 quats[start:stop, joints] = exchanged[start:stop]
                 faults.append(Artefact(motion.skeleton.names[joints[0]], start, stop, "swap", degrees, "deg"))
     return (replace(motion, local_quat_xyzw=quats) if faults else motion), faults
-
-
-def _list_pairs(rigmap: RigMap, limb: Sequence[Sequence[str]]) -> Iterator[tuple[list[int], list[int]]]:
-    """List a limb's joints on the rig, left and right, and the partner of each."""
-    rigged = rigmap.joints
-    for parts in limb:
-        pairs = [(rigged.get(f"left{part}"), rigged.get(f"right{part}")) for part in parts]
-        known = [(left, right) for left, right in pairs if left is not None and right is not None]
-        if known:
-            left, right = (list(side) for side in zip(*known, strict=True))
-            yield left + right, right + left
-
-
-def _exchange(
-    motion: Motion, rest: Float[Tensor, "joints 4"], joints: list[int], partners: list[int]
-) -> Float[Tensor, "frames limb 4"]:
-    """Return the partners' rotations from the rest pose, in the joints' own frames: with rest R, a parent's P, a
-    partner's rotation q' is P^-1 P' q' R'^-1 R."""
-    parents = torch.tensor(motion.skeleton.parents)
-    quats = motion.local_quat_xyzw[:, partners]
-    before = rotations.multiply(rotations.inverse(rest[parents[joints]]), rest[parents[partners]])
-    after = rotations.multiply(rotations.inverse(rest[partners]), rest[joints])
-    return rotations.multiply(rotations.multiply(before.expand_as(quats), quats), after.expand_as(quats))
 
 
 def _find_swaps(
