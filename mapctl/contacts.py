@@ -106,16 +106,9 @@ def debounced(contacts: Bool[Tensor, "frames feet"]) -> Bool[Tensor, "frames fee
     return remove_short_runs(~remove_short_runs(~contacts, MIN_CONTACT_FRAMES), MIN_CONTACT_FRAMES)
 
 
-@dataclass(frozen=True)
-class HeelContactSettings:
-    """Thresholds of a planted heel."""
-
-    reach: float = 0.02
-    """A planted heel is within this height over its rest height beside the toe, metres."""
-    strike: float = 1 / 30
-    """Longest time before a toe's contact in which its heel may be planted already, seconds; at least one frame."""
-    slow: float = 0.35
-    """A heel that has struck is slower than this over the ground since the frame before, m/s, as toes are."""
+_HEEL_REACH = 0.02  # metres over its rest height beside the toe within which a planted heel is
+_STRIKE_SECONDS = 1 / 30  # longest time before a toe's contact in which its heel may be planted already
+_HEEL_SLOW = 0.35  # m/s over the ground since the frame before, below which a heel that has struck is, as toes are
 
 
 def derive_heel_contacts(
@@ -124,7 +117,6 @@ def derive_heel_contacts(
     heels: Float[Tensor, "*batch frames 2 3"],
     drops: Float[Tensor, "2"],
     fps: float,
-    settings: HeelContactSettings = HeelContactSettings(),
 ) -> Bool[Tensor, "*batch frames 2"]:
     """Derive whether the left and the right heel are planted; world positions in metres, `drops` from
     `find_heel_drops`.
@@ -132,14 +124,13 @@ def derive_heel_contacts(
     The floor is that of the toe: a planted toe joint is at its rest height, and the heel's is `drops` below. In the
     frames before a toe's contact the floor is the one on which that contact begins.
     """
-    strike = max(1, round(settings.strike * fps)) if settings.strike > 0 else 0
-    planted = toe_contacts & (heels[..., 1] - toes[..., 1] + drops < settings.reach)
+    planted = toe_contacts & (heels[..., 1] - toes[..., 1] + drops < _HEEL_REACH)
     floors, ahead = toes[..., 1], toe_contacts
     moved = torch.diff(heels[..., ::2], dim=-3).norm(dim=-1)
-    slow = torch.cat([torch.zeros_like(planted[..., :1, :]), moved * fps < settings.slow], dim=-2)
-    for _ in range(strike):
+    slow = torch.cat([torch.zeros_like(planted[..., :1, :]), moved * fps < _HEEL_SLOW], dim=-2)
+    for _ in range(max(1, round(_STRIKE_SECONDS * fps))):
         floors, ahead = torch.where(ahead, floors, _next_frames(floors)), ahead | _next_frames(ahead)
-        low = heels[..., 1] - floors + drops < settings.reach
+        low = heels[..., 1] - floors + drops < _HEEL_REACH
         planted = planted | (ahead & low & slow & _next_frames(planted))
     return planted
 

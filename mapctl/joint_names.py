@@ -124,14 +124,7 @@ def split_side(name: str) -> tuple[Side, str]:
 def classify_joint(name: str) -> Role:
     """Classify a joint's side and part by its name: `LeftUpLeg`, `lThigh`, `UpperLeg_L`, `mixamorig:LeftArm`."""
     side, rest = split_side(name)
-    return Role(side, _classify_part(rest))
-
-
-def _classify_part(name: str) -> Part:
-    for pattern, part in _PARTS:
-        if re.search(pattern, name.lower()):
-            return part
-    return Part.OTHER
+    return Role(side, next((part for pattern, part in _PARTS if re.search(pattern, rest.lower())), Part.OTHER))
 
 
 def find_joint(wanted: str, names: Sequence[str], canonical: Callable[[], Mapping[str, int]] = dict) -> int | None:

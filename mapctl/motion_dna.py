@@ -39,8 +39,11 @@ def of(motion: Motion, count: int = POSES, *, rig: Rig | None = None) -> MotionD
         raise RequestError(f"motion DNA needs at least one pose, got {count}")
     if motion.num_frames < 1:
         raise RequestError("motion DNA needs a motion with frames")
-    canonical = _drop_leap(retarget.to_canonical(motion, rig)[0].resample(PRIOR_FPS))
-    return of_rotations(canonical.local_quat_xyzw, count)
+    quats = retarget.to_canonical(motion, rig)[0].resample(PRIOR_FPS).local_quat_xyzw
+    if len(quats) > 2:  # a T-pose before the take, from which joints leap to the second frame, is none of its poses
+        turned = _measure_turns(quats[:, 1:])
+        quats = quats[1:] if float(turned[0]) > _LEAP * float(turned[1:].max()) else quats
+    return of_rotations(quats, count)
 
 
 def of_rotations(local_quat_xyzw: Float[Tensor, "frames joints 4"], count: int = POSES) -> MotionDna:
@@ -68,14 +71,6 @@ def _measure_turns(local_quat_xyzw: Float[Tensor, "frames joints 4"]) -> Float[T
     """Measure how far joints turn from frame to frame, mean over joints, radians."""
     change = rotations.multiply(rotations.inverse(local_quat_xyzw[:-1]), local_quat_xyzw[1:])
     return rotations.to_rotation_vector(change).norm(dim=-1).mean(dim=-1)
-
-
-def _drop_leap(motion: Motion) -> Motion:
-    """Drop a first frame from which joints leap to the second: a T-pose before the take is none of its poses."""
-    if motion.num_frames < 3:
-        return motion
-    turned = _measure_turns(motion.local_quat_xyzw[:, 1:])
-    return motion.slice(1, motion.num_frames) if float(turned[0]) > _LEAP * float(turned[1:].max()) else motion
 
 
 def join(parts: Sequence[MotionDna]) -> MotionDna:

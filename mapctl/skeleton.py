@@ -37,19 +37,17 @@ class Skeleton:
 
     def __str__(self) -> str:
         kind = "canonical joints" if self.names == CANONICAL.names else "joint" if self.num_joints == 1 else "joints"
-        return f"Skeleton: {self.num_joints} {kind}, root {self.names[0]}, {self._extent():.2f} m across at rest"
-
-    def __repr__(self) -> str:
-        return f"<{self}>"
-
-    def _extent(self) -> float:
-        """Return the largest extent along an axis with all rotations zero, End Sites included, metres."""
+        # The largest extent along an axis with all rotations zero, End Sites included.
         places = [self.offsets[0]]
         for joint in range(1, self.num_joints):
             places.append(places[self.parents[joint]] + self.offsets[joint])
         ends = [places[self.index(name)] + self.offsets.new_tensor(end) for name, end in self.end_offsets.items()]
         spread = torch.stack([*places, *ends])
-        return float((spread.amax(dim=0) - spread.amin(dim=0)).max())
+        extent = float((spread.amax(dim=0) - spread.amin(dim=0)).max())
+        return f"Skeleton: {self.num_joints} {kind}, root {self.names[0]}, {extent:.2f} m across at rest"
+
+    def __repr__(self) -> str:
+        return f"<{self}>"
 
     @property
     def num_joints(self) -> int:

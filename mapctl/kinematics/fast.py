@@ -225,15 +225,16 @@ class Bones(NamedTuple):
     """(2, 3): the heels in the frames of the feet, metres, float64."""
 
 
-def _find_columns() -> FeatureColumns:
-    first = {block: part.start for block, part in LAYOUT.slices.items()}
-    step, tilt = first["root_displacement_heading"], first["root_tilt"]
-    return FeatureColumns(
-        step, step + 1, first["heading_change"], first["root_height"], tilt, tilt + 1, first["joint_rotations"]
-    )
-
-
-_COLUMNS = _find_columns()
+_STEP, _TILT = LAYOUT.slices["root_displacement_heading"].start, LAYOUT.slices["root_tilt"].start
+_COLUMNS = FeatureColumns(
+    _STEP,
+    _STEP + 1,
+    LAYOUT.slices["heading_change"].start,
+    LAYOUT.slices["root_height"].start,
+    _TILT,
+    _TILT + 1,
+    LAYOUT.slices["joint_rotations"].start,
+)
 _JOINTS = 1 + (LAYOUT.slices["joint_rotations"].stop - LAYOUT.slices["joint_rotations"].start) // 3
 
 

@@ -31,26 +31,6 @@ SWAY_SECONDS = 0.35
 """Standard deviation of the Gaussian whose slow part is not sway."""
 
 
-def compute_path_error(
-    positions: Float[Tensor, "frames axes"], curve: Curve, arcs: Float[Tensor, "frames"]
-) -> Float[Tensor, "frames"]:
-    """Compute the distance of each position to the curve at the walk's arc, between the curve's ends, metres; without
-    height for a ground curve. `arcs` come from `track`: the nearest point of all may belong to another branch."""
-    on_it = arcs if curve.closed else arcs.clamp(0, curve.length)
-    apart = curve.point(on_it) - (positions[:, ::2] if positions.shape[1] > curve.dims else positions)
-    return apart.norm(dim=-1)
-
-
-def compute_low_pass_error(
-    positions: Float[Tensor, "frames axes"], curve: Curve, arcs: Float[Tensor, "frames"], fps: float
-) -> Float[Tensor, "frames"]:
-    """Compute the size of the sideways offset after a Gaussian of 0.5 s, metres.
-
-    The offset is smoothed and not the walk, which would shrink on every bend. `arcs` come from `track`.
-    """
-    return low_pass(curve.signed_offset(positions, arcs), seconds=LOW_PASS_SECONDS, fps=fps).abs()
-
-
 def sway(offset: Float[Tensor, "frames"], fps: float) -> float:
     """Return the root mean square of a sideways offset without its slow part; NaN for clips too short (2.2 s)."""
     kernel = gaussian_kernel(SWAY_SECONDS, fps)
@@ -60,15 +40,6 @@ def sway(offset: Float[Tensor, "frames"], fps: float) -> float:
     # Inside, where the whole kernel lies on the walk.
     quick = (offset - gaussian.convolve(offset, kernel, "nothing"))[reach:-reach]
     return float(quick.square().mean().sqrt())
-
-
-def straight_offset(ground: Float[Tensor, "frames 2"]) -> Float[Tensor, "frames"]:
-    """Return the distance of a walk (x, z) from the line piece between its ends, metres; left is positive."""
-    along = ground[-1] - ground[0]
-    apart = ground - ground[0]
-    share = ((apart @ along) / along.square().sum().clamp_min(1e-12)).clamp(0, 1)
-    side = torch.sign(along[1] * apart[:, 0] - along[0] * apart[:, 1])
-    return (apart - share[:, None] * along).norm(dim=-1) * side
 
 
 _CM = 100.0
@@ -98,7 +69,12 @@ def measure(
         measures |= dict.fromkeys(_HEELS, math.nan)
     measures |= _measure_body(positions, hips, find_upper_legs(motion.skeleton), fps)
     if curve is None:
-        return measures | {"sway_cm": sway(straight_offset(positions[:, hips, ::2]), fps) * _CM}
+        # Distances of the walk from the line piece between its ends; left is positive.
+        ground = positions[:, hips, ::2]
+        along, apart = ground[-1] - ground[0], ground - ground[0]
+        share = ((apart @ along) / along.square().sum().clamp_min(1e-12)).clamp(0, 1)
+        side = torch.sign(along[1] * apart[:, 0] - along[0] * apart[:, 1])
+        return measures | {"sway_cm": sway((apart - share[:, None] * along).norm(dim=-1) * side, fps) * _CM}
     follower = hips if joint is None else motion.skeleton.index(joint)
     return measures | _measure_path(positions[:, follower], curve, speed, fps)
 
@@ -133,9 +109,15 @@ def _measure_path(
 ) -> dict[str, float]:
     arcs = track_arcs(curve, positions)
     travelled = float(arcs[-1] - arcs[0])
-    measures = _summarise_errors("path_error_{}_cm", compute_path_error(positions, curve, arcs))
-    measures |= _summarise_errors("path_error_low_passed_{}_cm", compute_low_pass_error(positions, curve, arcs, fps))
-    measures |= {"sway_cm": sway(curve.signed_offset(positions, arcs), fps) * _CM, "travelled_m": travelled}
+    # To the curve at the walk's arc, between the curve's ends, without height for a ground curve: the nearest point of
+    # all may belong to another branch. The offset is smoothed and not the walk, which would shrink on every bend.
+    on_it = curve.point(arcs if curve.closed else arcs.clamp(0, curve.length))
+    apart = on_it - (positions[:, ::2] if positions.shape[1] > curve.dims else positions)
+    offset = curve.signed_offset(positions, arcs)
+    slow = low_pass(offset, seconds=LOW_PASS_SECONDS, fps=fps).abs()
+    measures = _summarise_errors("path_error_{}_cm", apart.norm(dim=-1))
+    measures |= _summarise_errors("path_error_low_passed_{}_cm", slow)
+    measures |= {"sway_cm": sway(offset, fps) * _CM, "travelled_m": travelled}
     if speed is not None:
         wanted = speed * (len(positions) - 1) / fps
         measures |= {"wanted_m": wanted, "progress_ratio": travelled / wanted if wanted else float("nan")}
@@ -167,13 +149,11 @@ def compute_reference(motions: Iterable[Motion]) -> dict[str, MeasureStatistics]
     if not rows:
         raise RequestError("a reference needs at least one clip")
     table = {name: torch.tensor([row[name] for row in rows], dtype=torch.float64) for name in rows[0]}
-    return {name: _summarise_values(values[~values.isnan()]) for name, values in table.items()}
-
-
-def _summarise_values(values: Tensor) -> MeasureStatistics:
-    if len(values) == 0:
-        return MeasureStatistics(float("nan"), float("nan"), float("nan"))
-    return MeasureStatistics(float(values.mean()), *values.quantile(values.new_tensor([0.02, 0.98])).tolist())
+    ends = torch.tensor([0.02, 0.98], dtype=torch.float64)
+    return {
+        name: MeasureStatistics(float(values.nanmean()), *values.nanquantile(ends).tolist())
+        for name, values in table.items()
+    }
 
 
 _RATE_TOLERANCE = 0.02  # share of the reference's rate within which measures are the same, as of 29.97 frames a second

@@ -62,9 +62,9 @@ def measure_commands(motion: Motion, track: CommandTrack) -> list[dict[str, floa
     obstacle.
     """
     velocity, rows = compute_low_pass_velocity(motion), []
-    asked = any(command.step_length is not None for command in track.commands)
-    steps = _step_length_by_frame(motion) if asked else np.full(len(velocity.seconds), math.nan)
-    places = motion.joint_positions()
+    places, fps = motion.joint_positions(), float(motion.fps)
+    toes = places[:, list(find_feet(motion.skeleton))]
+    steps = step_lengths(toes[..., ::2], contacts.detect_contacts(toes, fps), fps).numpy()
     ground = places[:, 0, ::2].numpy()
     ends = [*track.times[1:], float(velocity.seconds[-1])]
     for began, until, command in zip(track.times, ends, track.commands, strict=True):
@@ -101,12 +101,6 @@ def _measure_places(motion: Motion, places: Tensor, frames: ndarray, command: Co
     if command.obstacles:
         found["clearance_cm"] = 100 * float(measure_clearance(command.obstacles, places[frames][..., ::2]).min())
     return found
-
-
-def _step_length_by_frame(motion: Motion) -> Float[ndarray, " frames"]:
-    """Return the length of the step that ends in a frame, metres; NaN where none does."""
-    toes = motion.joint_positions()[:, list(find_feet(motion.skeleton))]
-    return step_lengths(toes[..., ::2], contacts.detect_contacts(toes, float(motion.fps)), float(motion.fps)).numpy()
 
 
 def _find_time_reached(
