@@ -33,16 +33,6 @@ TREES: dict[tuple[str, str], Make] = {
         | {"chest": ("abdomenUpper", "chestLower"), "head": ("neckUpper",)},
         further=ends("{s}Thumb1 {s}Carpal1 {s}Carpal2", lr) | {"lEye": "head", "rEye": "head", "lowerJaw": "head"},
     ),
-    ("daz-genesis", "9"): Make(
-        names_of("daz-genesis", 1),
-        root="Genesis9",
-        between=both("UpperLeg: pelvis; Toes: {s}_metatarsal", lr)
-        | {"chest": ("spine2", "spine3"), "head": ("neck2",)},
-        further=ends("{s}_thumb1 {s}_indexmetacarpal", lr) | ends("{s}_thightwist1 {s}_thightwist2", lr, "UpperLeg"),
-    ),
-    ("daz-genesis", "1 and 2"): Make(
-        names_of("daz-genesis", 2), between=both("UpperLeg: pelvis", lr) | {"chest": ("abdomen2",)}
-    ),
     ("metahuman", "body and face"): Make(
         names_of("metahuman"),
         root="root",
@@ -63,22 +53,6 @@ TREES: dict[tuple[str, str], Make] = {
         )
         | {"chest": ("DEF-spine.002",), "head": ("DEF-spine.005",)},
         further=ends("DEF-palm.01.{s} DEF-thumb.01.{s}", LR) | {"DEF-pelvis.L": "hips", "DEF-breast.L": "chest"},
-        zup=True,
-    ),
-    ("rigify", "metarig"): Make(
-        names_of("rigify", 1),
-        between={"chest": ("spine.002",), "head": ("spine.005",)},
-        further=ends("palm.01.{s} thumb.01.{s}", LR) | {"pelvis.L": "hips", "pelvis.R": "hips", "face": "head"},
-        zup=True,
-    ),
-    ("rigify", "original"): Make(
-        names_of("rigify", 2), between={"chest": ("ORG-spine.002",), "head": ("ORG-spine.005",)}, root="root"
-    ),
-    ("rigify", "FK controls"): Make(
-        names_of("rigify", 3),
-        root="root",
-        between=both("UpperLeg: MCH-thigh_parent.{s}", LR) | {"chest": ("spine_fk.002",)},
-        further=ends("hand_ik.{s}", LR) | ends("foot_ik.{s}", LR, "Foot"),
         zup=True,
     ),
     ("rigify", "everything"): Make(
@@ -106,11 +80,6 @@ TREES: dict[tuple[str, str], Make] = {
         | {"chest": ("Spine2_M",), "head": ("NeckPart1_M",)},
         further=ends("IndexFinger1_{s} ThumbFinger1_{s}", LR),
     ),
-    ("auto-rig-pro", "for engines"): Make(
-        names_of("auto-rig-pro"),
-        between={"chest": ("spine_02.x",)},
-        further=ends("thigh_twist.{s}", lr, "UpperLeg") | ends("index1.{s} thumb1.{s}", lr),
-    ),
     ("iclone", "Character Creator"): Make(
         names_of("iclone"),
         root="RL_BoneRoot",
@@ -121,17 +90,10 @@ TREES: dict[tuple[str, str], Make] = {
         | ends("CC_Base_{s}_KneeShareBone CC_Base_{s}_CalfTwist01", LR, "LowerLeg")
         | ends("CC_Base_{s}_ForearmTwist01 CC_Base_{s}_ElbowShareBone", LR, "LowerArm"),
     ),
-    ("deepmotion", "default"): Make(names_of("deepmotion"), between={"chest": ("spine1_JNT",)}),
     ("humanik", "Character1"): Make(
         names_of("humanik"),
         root="Character1_Reference",
         between={"chest": ("Character1_Spine1",)} | both("LowerArm: Character1_{s}ArmRoll", WORDS),
-    ),
-    ("humanik", "Axis Neuron"): Make(
-        {c: own for c, own in names_of("humanik", 1).items() if "Toes" not in c},
-        root="Robot_Reference",
-        between={"chest": ("Robot_Spine1",)},
-        further=ends("Robot_{s}HandThumb1 Robot_{s}InHandIndex Robot_{s}InHandRing", WORDS),
     ),
     ("mmd", "Japanese"): Make(
         names_of("mmd"),
@@ -140,31 +102,17 @@ TREES: dict[tuple[str, str], Make] = {
         between=both("LowerArm: {s}腕捩; Hand: {s}手捩; UpperArm: {s}肩C", HAN),
         further=ends("{s}親指０ {s}人指１", HAN) | ends("{s}足D", HAN, "UpperLeg"),
     ),
-    ("mmd", "mmd_tools"): Make(names_of("mmd", 1), root="センター", hanging={"spine": "センター"}),
-    ("mmd", "English"): Make(names_of("mmd", 2), root="center", hanging={"spine": "center"}),
     ("xsens", "BVH"): Make(names_of("xsens"), between={"chest": ("Chest2", "Chest3")}),
-    ("xsens", "FBX and MVNX"): Make(names_of("xsens", 1), between={"chest": ("L3", "T12")}),
     ("rokoko", "Newton"): Make(
         names_of("rokoko"), between={"chest": ("Spine2", "Spine3")}, further=ends("{s}ToeTip", WORDS, "Toes")
     ),
     ("vrm", "VRoid"): Make(names_of("vrm"), root="Root", between={"chest": ("J_Bip_C_Chest",)}),
-    ("vrm", "1"): Make(
-        names_of("vrm", 1), between={"chest": ("chest",)}, further=ends("{s}ThumbMetacarpal", ("left", "right"))
-    ),
     ("vrm", "0, facing back"): Make(
         names_of("vrm", 1),
         between={"chest": ("chest",)},
         further=ends("{s}ThumbProximal", ("left", "right")),
         turned_deg=180,
     ),
-    ("optitrack", "Motive"): Make(names_of("optitrack")),
-    ("optitrack", "longer names"): Make(names_of("optitrack", 1)),
     ("unity", "avatar"): Make(names_of("unity"), between={"chest": ("Chest",)}, root="Root"),
-    ("synty", "POLYGON"): Make(
-        names_of("synty"),
-        root="Root",
-        between={"chest": ("Spine_02",)},
-        further=ends("Toes_{s}", LR, "Toes") | ends("Thumb_01_{s}", LR),
-    ),
 }
 """A rig as it is written, by preset and version."""

@@ -1,6 +1,5 @@
 """Features: invertible, free of place and heading, and mirrored as the motion is."""
 
-import math
 from dataclasses import replace
 
 import pytest
@@ -86,20 +85,6 @@ def test_they_are_the_features_of_the_motion_run_backwards(kind):
     torch.testing.assert_close(reversed_features(there), back, atol=1e-9, rtol=0)
     if len(there) > 2:
         assert float((reversed_features(there) - there.flip(0)).abs().max()) > 0.01  # not merely the frames in reverse
-
-
-def test_a_window_needs_nothing_from_outside_itself():
-    """The step of a window's first frame is the truth's from before it, and may be anything."""
-    motion, (first, stop) = WALKS["left"], (20, 61)
-    window = encode(motion)[0][first:stop]
-    wanted = encode(backwards(motion))[0][motion.num_frames - stop : motion.num_frames - first]
-    found = reversed_features(window)
-    torch.testing.assert_close(found[1:], wanted[1:], atol=1e-9, rtol=0)
-    arrival = slice(0, 3)
-    assert torch.equal(found[0, arrival], found[1, arrival])
-    other = window.clone()
-    other[0, arrival] = math.nan
-    assert torch.equal(reversed_features(other), found)
 
 
 TALL = Skeleton(CANONICAL.names, CANONICAL.parents, 1.3 * CANONICAL.offsets)

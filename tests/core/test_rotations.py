@@ -110,13 +110,3 @@ def test_euler_angles_are_scipys_intrinsic_ones(order):
         lambda vector: rotations.to_euler(rotations.rotation_vector_to_matrix(vector), axes),
         torch.randn(5, 3, generator=generator(1), dtype=torch.float64, requires_grad=True),
     )
-
-
-def test_six_numbers_are_a_rotation_whatever_they_are():
-    matrices = rotations.to_matrix(random_quats(50))
-    torch.testing.assert_close(rotations.from_six(rotations.to_six(matrices)), matrices, atol=1e-12, rtol=0)
-    six = torch.randn(20, 6, generator=generator(), dtype=torch.float64)
-    made = rotations.from_six(six)
-    torch.testing.assert_close(made.mT @ made, torch.eye(3).double().expand(20, 3, 3), atol=1e-12, rtol=0)
-    assert float((torch.linalg.det(made) - 1).abs().max()) < 1e-12
-    assert torch.autograd.gradcheck(rotations.from_six, six.requires_grad_(True))

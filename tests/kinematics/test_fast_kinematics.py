@@ -124,12 +124,6 @@ def test_rotation_vectors_of_any_size_have_exact_gradients(size):
     agree(body_of, batch=2, features=features)
 
 
-@pytest.mark.parametrize("shape", [(), (1,), (3,)])
-def test_starts_may_be_shared_or_one_for_each_candidate(shape):
-    xz = 50 * torch.randn(*shape, 2, generator=generator(5)).double()
-    agree(everything_of, place=GroundPose(xz, torch.randn(shape, generator=generator(6)).double()))
-
-
 def test_bones_do_not_lie_in_the_memory_of_the_skeleton():
     """Sent to another process, a tensor moves to shared memory, and where it was is soon written over."""
     skeleton, features = Skeleton(CANONICAL.names, CANONICAL.parents, CANONICAL.offsets.clone()), encode(walk(8))[0]

@@ -8,10 +8,9 @@ from fractions import Fraction
 import numpy as np
 import pytest
 import torch
-from captures import trembling
 from helpers import random_motion, run, walk, walk_through
 
-from mapctl import contacts, curves, metrics
+from mapctl import curves, metrics
 from mapctl.contacts import derive_heel_contacts, detect_contacts
 from mapctl.errors import RequestError
 from mapctl.metrics import body, compute_reference, feet, make_comparable, measure
@@ -124,15 +123,6 @@ def test_penetration_and_float_of_planted_toes():
     assert feet.penetration(found) == pytest.approx(3 * 0.02 / 100, rel=1e-9)
 
 
-def test_what_a_clip_cannot_tell_is_nan():
-    flying = torch.zeros(20, 1, 3, dtype=torch.float64)
-    flying[:, 0, 0] = torch.arange(20)
-    assert math.isnan(feet.contact_speed(feet.ToeMeasurements.of(flying, 30)))
-    got = measure(straight(3))
-    assert math.isnan(got["jitter_m_s3"])
-    assert math.isnan(got["sway_cm"])
-
-
 def test_a_reference_is_mean_and_percentiles_over_clips():
     speeds = np.array([0.5, 1.0, 1.5, 2.0, 1.0])
     clips = [straight(frames, speed=speed) for frames, speed in zip((90, 90, 90, 90, 3), speeds, strict=True)]
@@ -226,39 +216,12 @@ def test_the_longest_time_unsupported_is_that_of_the_definition(slide):
     assert (body.measure_longest_unsupported(toes, hips, 30.0) > 0.5) == (slide > 0.005)
 
 
-def test_a_body_stands_on_the_slowest_low_toe_and_on_none_in_flight():
-    heights = torch.tensor([[0.0, 0.0], [0.0, 0.2], [0.3, 0.2], [0.01, 0.04]])
-    speeds = torch.tensor([[1.0, 0.1], [1.0, 0.1], [1.0, 0.1], [0.7, 0.5]])
-    torch.testing.assert_close(contacts.support_speed(heights, speeds), torch.tensor([0.1, 1.0, 0.0, 0.5]))
-
-
 TREMOR = math.radians(0.3)
 
 
 def told(capsys, *words: object) -> dict:
     assert run("measure", *words, "--json") == 0
     return json.loads(capsys.readouterr().out)
-
-
-def trembling_walk(fps: int) -> Motion:
-    """Ten seconds with noise that is as large in every frame at any rate."""
-    return trembling(walk(10 * fps + 1, fps=fps), TREMOR, seed=fps)
-
-
-def thinned(motion: Motion, step: int) -> Motion:
-    """Every so manieth frame."""
-    return Motion(motion.skeleton, motion.fps / step, motion.root_position[::step], motion.local_quat_xyzw[::step])
-
-
-@pytest.mark.parametrize("fps", [60, 120, 240])
-@pytest.mark.parametrize("folder", [False, True])
-def test_faster_files_are_measured_at_the_rate_of_mocaps_values(fps, folder, tmp_path, capsys):
-    trembling_walk(fps).save(tmp_path / "fast.bvh")
-    values = told(capsys, tmp_path if folder else tmp_path / "fast.bvh")
-    usual = metrics.measure(thinned(trembling_walk(fps), fps // 30))
-    assert values["measures"] == pytest.approx(usual, rel=0.02, abs=0.01)
-    assert metrics.measure(trembling_walk(fps))["jitter_m_s3"] > 3 * usual["jitter_m_s3"]
-    assert values["notes"] == []
 
 
 @pytest.mark.parametrize(("fps", "said"), [(Fraction(30000, 1001), False), (Fraction(24), True), (Fraction(15), True)])

@@ -88,15 +88,6 @@ def test_a_kernel_adds_up_to_one_and_keeps_lines_inside():
     torch.testing.assert_close(gaussian.convolve(LINE, kernel, "nothing")[6:-6], LINE[6:-6])
 
 
-def test_matrix_and_kernel_say_the_same():
-    values = torch.randn(60, 2, 3, generator=generator(), dtype=torch.float64)
-    kernel = gaussian.kernel(1.5, 12)
-    wanted = torch.einsum("ts,sjc->tjc", gaussian.averaging_matrix(60, 1.5, values.dtype), values)
-    torch.testing.assert_close(gaussian.convolve(values, kernel, "nothing")[12:-12], wanted[12:-12])
-    known = gaussian.convolve(torch.ones_like(values), kernel, "nothing")
-    torch.testing.assert_close(gaussian.convolve(values, kernel, "nothing") / known, wanted)
-
-
 def rest(*values: float) -> MinimumJerkTrack:
     return MinimumJerkTrack.rest_at(torch.tensor(values, dtype=torch.float64))
 

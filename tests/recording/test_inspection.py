@@ -116,14 +116,6 @@ def test_the_place_below_a_static_root_is_judged_and_repaired():
     assert torch.equal(repaired.root_position, motion.root_position)
 
 
-@pytest.mark.parametrize("frames", [1, 2, 3, 6])
-def test_short_recordings_break_nothing(frames):
-    motion = on_rig("canonical", 30).slice(0, frames)
-    found = inspect_recording(motion)
-    assert found.seen.shape == (frames, motion.num_joints)
-    assert found.repaired().num_frames == frames
-
-
 def turned(quats, frames, joint, degrees):
     """A joint turned away in some frames."""
     vector = torch.zeros(len(frames), 3, dtype=torch.float64)
@@ -149,11 +141,6 @@ def test_planted_spikes_are_found_and_nothing_else_is(frames, sigma):
     wanted = torch.zeros_like(found)
     wanted[frames, 3] = True
     assert torch.equal(found, wanted)
-
-
-def test_small_spikes_are_found_where_there_is_no_noise_and_left_to_what_treats_noise():
-    assert find_angle_spikes(turned(swaying(100), [50], 2, 8)).nonzero().tolist() == [[50, 2]]
-    assert not find_angle_spikes(turned(shaken(swaying(100), 4 * DEGREE), [50], 2, 8)).any()
 
 
 @pytest.mark.parametrize("fps", [30, 60, 120])

@@ -1,13 +1,10 @@
 """Masks: what of a recording its user says not to believe."""
 
-import math
-
 import pytest
 import torch
 from captures import on_rig, shaken
-from helpers import quat_xyzw, walk
+from helpers import walk
 
-from mapctl import rotations
 from mapctl.errors import FileFormatError, RequestError
 from mapctl.recording import Capture
 from mapctl.recording.masks import ALL, ROOT, Mask, expand_valid_masks, load_masks
@@ -84,19 +81,6 @@ def capture_of(motion, seen=None, seen_root=None):
         sigma=torch.zeros(motion.num_joints),
         sigma_root=0.0,
     )
-
-
-def test_rotation_vectors_near_a_half_turn_stay_continuous_and_mean_the_same():
-    """A joint that sways about 180 degrees: its short rotation vector would jump from one end to the other."""
-    motion = walk(60)
-    quats = motion.local_quat_xyzw.clone()
-    angle = math.pi + 0.5 * torch.sin(torch.arange(60, dtype=torch.float64) / 6)
-    quats[:, 5] = quat_xyzw(angle[:, None] * torch.tensor([0.0, 0.6, 0.8], dtype=torch.float64))
-    quats = rotations.make_sign_continuous(quats)
-    capture = capture_of(type(motion)(motion.skeleton, motion.fps, motion.root_position, quats))
-    assert torch.diff(capture.joints[0, :, 4], dim=0).norm(dim=-1).max() < 0.2
-    back = rotations.from_rotation_vector(capture.joints[0].double())
-    assert ((back * quats[:, 1:]).sum(-1).abs() > 1 - 1e-6).all()
 
 
 @pytest.mark.parametrize("lost", [(20, 30), (0, 4), (55, 60)])

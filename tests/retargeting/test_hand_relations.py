@@ -108,30 +108,6 @@ def test_hands_that_clap_clap(name):
     assert float((after - before)[meet].norm(dim=-1).max()) < 0.012
 
 
-@pytest.mark.parametrize("name", ["long arms", "short arms", "small"])
-def test_crossed_arms_stay_crossed(name):
-    """Each hand on the other arm, where it was along it."""
-    motion = arms_down(standing(), degrees=70)
-    chest = motion.joint_positions()[:, CANONICAL.index("chest")]
-    for side, sign, high in ((0, 1.0, 0.0), (1, -1.0, -0.05)):
-        place = chest + torch.tensor([-sign * 0.15, high, 0.15], dtype=torch.float64)
-        motion = put_palm(motion, side, place, points=(-sign, 0.0, 0.1), elbow=(sign, -0.6, 0.5))
-    done = retarget_motion(motion, body_of(BODIES[name])).motion
-    size = size_of(name)
-    for side in range(2):
-        before, after = _along_arm(motion, side), _along_arm(done, side, size)
-        torch.testing.assert_close(after, size * before, atol=0.02, rtol=0)
-
-
-def _along_arm(motion: Motion, side: int, size: float = 1.0) -> torch.Tensor:
-    """Distance of a palm from the line of the other forearm, and how far along it is, metres."""
-    places, palm = motion.joint_positions(), palms(motion, size)[:, side]
-    elbow, hand = places[:, LOWER[1 - side]], places[:, HANDS[1 - side]]
-    axis = (hand - elbow) / (hand - elbow).norm(dim=-1, keepdim=True)
-    along = ((palm - elbow) * axis).sum(-1)
-    return torch.stack([along, (palm - elbow - along[:, None] * axis).norm(dim=-1)], dim=-1)
-
-
 @pytest.mark.parametrize("name", ["long arms", "big, with short arms"])
 def test_a_hand_comes_to_the_hip_and_leaves_without_a_jump(name):
     share = ease(90, 15, 40) * (1 - ease(90, 55, 80))
