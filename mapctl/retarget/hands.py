@@ -6,7 +6,8 @@ averaged, the nearest counting most; beside them the place that rotations alone 
 is from everything. Places relative to a body's surface are kept in the manner of Molla et al. 2018.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -124,56 +125,36 @@ _IS_ARM, _BESIDE = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class _Segments:
+class _Segments(NamedTuple):
     """The segments of one body in every frame."""
 
-    begin: Float[Tensor, "frames segments 3"]
-    """World position at which each begins, metres."""
+    begin: Float[Tensor, "frames segments 3"]  # world position at which each begins, metres
     end: Float[Tensor, "frames segments 3"]
-    """World position at which each ends, metres."""
-    quat_xyzw: Float[Tensor, "frames segments 4"]
-    """Rotation of each in the world."""
-    widths: Float[Tensor, "segments 2 3"]
-    """Half widths along its own axes at both ends, metres."""
+    quat_xyzw: Float[Tensor, "frames segments 4"]  # rotation of each in the world
+    widths: Float[Tensor, "segments 2 3"]  # half widths along its own axes at both ends, metres
 
 
-@dataclass(frozen=True, eq=False)
-class _Near:
-    """Where points are on each segment: the same place may be found on another body."""
+class _Near(NamedTuple):
+    """Where points are on each segment, along its own axes: the same place may be found on another body."""
 
-    share: Float[Tensor, "frames points segments 1"]
-    """Share of the way along the segment's axis to the place nearest to the point."""
-    aside: Float[Tensor, "frames points segments 3"]
-    """From there to the point, in half widths, along the segment's own axes."""
-    away: Float[Tensor, "frames points segments 3"]
-    """From the surface to the point, metres, along the segment's own axes; 0 within the body."""
-    distance: Float[Tensor, "frames points segments"]
-    """From the surface to the point, metres; negative within the body."""
-    local: Float[Tensor, "frames points segments 3"]
-    """From where the segment begins to the point, metres, along the segment's own axes."""
+    share: Float[Tensor, "frames points segments 1"]  # of the way along the segment to the place nearest to the point
+    aside: Float[Tensor, "frames points segments 3"]  # from there to the point, in half widths
+    away: Float[Tensor, "frames points segments 3"]  # from the surface to the point, metres; 0 within the body
+    distance: Float[Tensor, "frames points segments"]  # the same, metres; negative within the body
+    local: Float[Tensor, "frames points segments 3"]  # from where the segment begins to the point, metres
 
 
-@dataclass(frozen=True, eq=False)
-class _Relations:
-    """What the giver's hands are near; the points of both hands one after another, left first."""
+class _Relations(NamedTuple):
+    """What the giver's hands are near; the points of both hands one after another, left first. Weights are 0 to 1."""
 
-    near: _Near
-    """To the segments of its body."""
-    weight: Float[Tensor, "frames points segments"]
-    """How much each counts, 0 to 1."""
-    touch: Float[Tensor, "frames points segments"]
-    """How much it matters where along a segment a point is, 0 to 1: entirely where it touches."""
-    apart: Float[Tensor, "frames 3"]
-    """From the middle of the left hand to that of the right, metres."""
-    together: Float[Tensor, "frames 1"]
-    """How much that counts, 0 to 1."""
-    floor_height: Float[Tensor, "frames points"]
-    """Height of the points over the floor, metres, less what a hand is thick."""
-    floor_weight: Float[Tensor, "frames points"]
-    """How much that counts, 0 to 1."""
-    planted: Bool[Tensor, "frames points"]
-    """Whether a point stands on the floor."""
+    near: _Near  # to the segments of its body
+    weight: Float[Tensor, "frames points segments"]  # how much each counts
+    touch: Float[Tensor, "frames points segments"]  # how much it matters where along a segment a point is
+    apart: Float[Tensor, "frames 3"]  # from the middle of the left hand to that of the right, metres
+    together: Float[Tensor, "frames 1"]  # how much that counts
+    floor_height: Float[Tensor, "frames points"]  # of the points, metres, less what a hand is thick
+    floor_weight: Float[Tensor, "frames points"]  # how much that counts
+    planted: Bool[Tensor, "frames points"]  # whether a point stands on the floor
 
     def body_strength(self) -> Float[Tensor, "frames 2"]:
         """Return how much hands are bound to body and floor, 0 to 1: about as to what binds them most."""
@@ -237,6 +218,14 @@ def _find_relations(own: Motion, giver: Stance) -> _Relations:
     left, right = points.unflatten(1, (2, -1)).unbind(dim=1)
     between = (left[:, :, None] - right[:, None]).norm(dim=-1).flatten(1).amin(dim=1, keepdim=True)
     height = points[..., 1] - giver.floor - thick
+    # A point stands on the floor that is near it and slow, for a while.
+    planted, settings = torch.zeros_like(height, dtype=torch.bool), contacts.ContactSettings()
+    if len(points) > 1:
+        step = min(len(points) - 1, max(1, round(settings.speed_window * fps)))
+        speed = (points[step:] - points[:-step]).norm(dim=-1) * (fps / step)
+        slow = torch.cat([speed[:1].expand(step, -1), speed]) < _HELD_SPEED
+        shortest = max(1, round(settings.shortest * fps))
+        planted = contacts.remove_short_runs(slow & (height < _TOUCH_METRES), shortest)
     return _Relations(
         near=near,
         weight=weight,
@@ -245,7 +234,7 @@ def _find_relations(own: Motion, giver: Stance) -> _Relations:
         together=gaussian.envelope(_weigh(between - 2 * thick), _FADE_SECONDS, fps),
         floor_height=height,
         floor_weight=gaussian.envelope(_weigh(height), _FADE_SECONDS, fps),
-        planted=_detect_planted(points, height, fps),
+        planted=planted,
     )
 
 
@@ -264,19 +253,6 @@ def _hand_points(motion: Motion, size: float) -> Float[Tensor, "frames points 3"
     turns = motion.joint_rotations()[:, _HANDS, None].expand(-1, -1, len(_POINTS), 4)
     reaching = rotations.rotate(turns, offsets.expand(*turns.shape[:3], 3))
     return (motion.joint_positions()[:, _HANDS, None] + reaching).flatten(1, 2)
-
-
-def _detect_planted(
-    points: Float[Tensor, "frames points 3"], height: Float[Tensor, "frames points"], fps: float
-) -> Bool[Tensor, "frames points"]:
-    """Detect points that stand on the floor: near it and slow, for a while."""
-    if len(points) < 2:
-        return torch.zeros_like(height, dtype=torch.bool)
-    settings = contacts.ContactSettings()
-    step = min(len(points) - 1, max(1, round(settings.speed_window * fps)))
-    speed = (points[step:] - points[:-step]).norm(dim=-1) * (fps / step)
-    slow = torch.cat([speed[:1].expand(step, -1), speed]) < _HELD_SPEED
-    return contacts.remove_short_runs(slow & (height < _TOUCH_METRES), max(1, round(settings.shortest * fps)))
 
 
 def _floor_offsets(
@@ -306,10 +282,13 @@ def _offset_hands(
     `missed` by what hands that are together could not get there."""
     points = _hand_points(moved, _girth(moved.skeleton))
     body = _place_segments(done)
-    toward = _place_nearest(relations.near, body) - points[:, :, None]
+    # The same places on the receiving body: as far along each segment and about it, and as many metres off its surface.
+    near, axis = relations.near, (body.end - body.begin)[:, None]
+    turns = body.quat_xyzw[:, None].expand(*near.share.shape[:3], 4)
+    aside = rotations.rotate(turns, near.aside * _width_at(body, near.share) + near.away)
+    toward = body.begin[:, None] + near.share * axis + aside - points[:, :, None]
     # Points beside a segment may slide along its axis, but not toward its ends, where there is no such direction.
-    share = relations.near.share
-    inside = smootherstep(share / _END_SHARE) * smootherstep((1 - share) / _END_SHARE)
+    inside = smootherstep(near.share / _END_SHARE) * smootherstep((1 - near.share) / _END_SHARE)
     slide = inside * torch.nn.functional.normalize(body.end - body.begin, dim=-1)[:, None]
     along = (1 - relations.touch[..., None]) * (toward * slide).sum(-1, keepdim=True)
     offsets = torch.cat([toward - along * slide, at_floor[:, :, None]], dim=2).unflatten(1, (2, -1)).flatten(2, 3)
@@ -380,15 +359,6 @@ def _find_nearest(points: Float[Tensor, "frames points 3"], body: _Segments) -> 
     away = aside * (1 - 1 / round_off.clamp_min(1))
     depth = (aside.norm(dim=-1) / round_off[..., 0].clamp_min(1e-6)) * (round_off[..., 0] - 1)
     return _Near(share, aside_widths / round_off.clamp_min(1), away, depth, local)
-
-
-def _place_nearest(near: _Near, body: _Segments) -> Float[Tensor, "frames points segments 3"]:
-    """Return world positions of the same places on another body, metres: as far along each segment and about it, and as
-    many metres off its surface."""
-    axis = (body.end - body.begin)[:, None]
-    turns = body.quat_xyzw[:, None].expand(*near.share.shape[:3], 4)
-    aside = rotations.rotate(turns, near.aside * _width_at(body, near.share) + near.away)
-    return body.begin[:, None] + near.share * axis + aside
 
 
 def _width_at(body: _Segments, share: Tensor) -> Float[Tensor, "frames points segments 3"]:

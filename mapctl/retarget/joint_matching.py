@@ -5,7 +5,7 @@ Sides are checked by how the body of a clip is built and bends.
 
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import lru_cache
@@ -136,8 +136,10 @@ def _find_listed_rig(skeleton: Skeleton) -> tuple[Rig | None, dict[str, int]]:
 
 def _match_by_rig(rig: Rig, skeleton: Skeleton) -> dict[str, int]:
     """Match joints by a rig's names, in the version that fits best; spelling and prefixes count where they must."""
-    exact = {name: joint for joint, name in enumerate(skeleton.names)}
-    plain = _index_plain_names(skeleton.names)
+    exact, plain = {name: joint for joint, name in enumerate(skeleton.names)}, dict[str, int]()
+    for spelled in (skeleton.names, without_shared_prefix(skeleton.names)):  # whole names come first
+        for joint, name in enumerate(spelled):
+            plain.setdefault(normalise_name(name), joint)
     listed = {c: (own, *rig.aliases.get(c, ())) for c, own in rig.joints.items()}
     joint_of = {name: exact.get(name, plain.get(normalise_name(name))) for names in listed.values() for name in names}
 
@@ -156,23 +158,14 @@ def _match_by_rig(rig: Rig, skeleton: Skeleton) -> dict[str, int]:
     return best
 
 
-def without_shared_prefix(names: Sequence[str]) -> list[str]:
+@lru_cache(maxsize=8)
+def without_shared_prefix(names: tuple[str, ...]) -> list[str]:
     """Return the names without what most of them begin with, up to a separator: `Skeleton0_Hips` is `Hips`."""
     beginnings = [match[0] for match in map(_BEGINNING.match, names) if match]
     (most, count), *_ = Counter(beginnings).most_common(1) or [("", 0)]
     if count <= max(_MIN_PREFIXED, len(names) / 2):
         return list(names)
-    return without_shared_prefix([name.removeprefix(most) for name in names])
-
-
-@lru_cache(maxsize=8)
-def _index_plain_names(names: tuple[str, ...]) -> dict[str, int]:
-    """Return the joint by normalised name, with and without a prefix that joints share; whole names come first."""
-    found: dict[str, int] = {}
-    for spelled in (names, without_shared_prefix(names)):
-        for joint, name in enumerate(spelled):
-            found.setdefault(normalise_name(name), joint)
-    return found
+    return without_shared_prefix(tuple(name.removeprefix(most) for name in names))
 
 
 def _measure_fit(rig: Rig, found: Mapping[str, int], skeleton: Skeleton, plain: set[str]) -> float:
