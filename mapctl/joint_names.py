@@ -152,17 +152,17 @@ def find_joint(wanted: str, names: Sequence[str], canonical: Callable[[], Mappin
     return None
 
 
-def suggest_joints(wanted: str, names: Sequence[str], roles: Sequence[Role] | None = None) -> list[str]:
-    """Return the few names nearest to a wanted one, the nearest first.
+def describe_nearest(wanted: str, names: Sequence[str], roles: Sequence[Role] | None = None) -> str:
+    """Describe the few names nearest to a wanted one, the nearest first, for the end of a refusal.
 
-    They stay on the side and the limb that it tells, if any name is there. `roles` tell what the names are, else the
-    names themselves do.
+    They stay on the side and the limb that it names, if any name is there. `roles` are those of the names, else the
+    names themselves show them.
     """
-    told = dict(zip(names, map(classify_joint, names) if roles is None else roles, strict=True))
+    role_of = dict(zip(names, map(classify_joint, names) if roles is None else roles, strict=True))
     asked, plain = classify_joint(wanted), normalise_name(wanted)
 
     def kept(fits: Callable[[Role], bool], some: Sequence[str]) -> Sequence[str]:
-        return [name for name in some if fits(told[name])] or some
+        return [name for name in some if fits(role_of[name])] or some
 
     if asked.side is not Side.MIDDLE:
         names = kept(lambda r: r.side is asked.side, names)
@@ -170,12 +170,8 @@ def suggest_joints(wanted: str, names: Sequence[str], roles: Sequence[Role] | No
         if asked.part in limb:
             names = kept(lambda r, limb=limb: r.part in limb, names)
     likeness = {name: SequenceMatcher(None, plain, normalise_name(name)).ratio() for name in names}
-    return sorted(names, key=lambda name: (told[name].part is not asked.part, -likeness[name]))[:_MAX_SUGGESTIONS]
-
-
-def describe_nearest(wanted: str, names: Sequence[str], roles: Sequence[Role] | None = None) -> str:
-    """Describe the nearest names, for the end of a refusal."""
-    first, *others = [*suggest_joints(wanted, names, roles)] or ["none"]
+    nearest = sorted(names, key=lambda name: (role_of[name].part is not asked.part, -likeness[name]))
+    first, *others = nearest[:_MAX_SUGGESTIONS] or ["none"]
     return f"the nearest is {first}" + (f", then {' and '.join(others)}" if others else "")
 
 

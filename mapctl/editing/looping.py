@@ -327,7 +327,12 @@ def close_loop(motion: Motion, rig: Rig | None = None) -> Loop:
     closed = rigged.with_motion(move_by_share(closed, travel, shares[start:][: cycle.frames]))
     planted = find_contacts(rigged.positions("Toes"), rigged.position("hips"), fps)[cycle.start : cycle.stop]
     source = rigged.with_motion(window.slice(start, start + cycle.frames + 1))
-    loop = _restore_root(rigged, _restore_contacts(closed, source, planted, travel), cycle)
+    loop, child = _restore_contacts(closed, source, planted, travel), _carrier(rigged)
+    own = rigged.motion.slice(cycle.start, cycle.stop)
+    away = float((own.root_position - own.root_position[0]).norm(dim=-1).max())
+    if child is not None and away <= _STILL_METRES:  # a root joint that stays in place in the clip stays there
+        place, turn = (each[:1].expand_as(each).clone() for each in (own.root_position, own.local_quat_xyzw[:, 0]))
+        loop = set_root_track(loop, place, turn, [child])
     return Loop(rigged.with_motion(loop).in_file_world(), cycle, travel)
 
 
@@ -349,17 +354,6 @@ def _carry_root(rigged: RiggedMotion, cycle: Cycle, travel: GroundTransform, fir
     place = rotations.rotate_about_y(start.expand(len(turns), 3), turns) + rotations.lift_ground(shifts)
     turned = rotations.multiply(rotations.about_y(turns), turn.expand(len(turns), 4))
     return set_root_track(window, place, turned, [child])
-
-
-def _restore_root(rigged: RiggedMotion, closed: Motion, cycle: Cycle) -> Motion:
-    """Put a root joint that stays in place in the clip back there."""
-    child = _carrier(rigged)
-    own = rigged.motion.slice(cycle.start, cycle.stop)
-    if child is None or float((own.root_position - own.root_position[0]).norm(dim=-1).max()) > _STILL_METRES:
-        return closed
-    frames = cycle.frames
-    place, turn = own.root_position[:1].expand(frames, 3), own.local_quat_xyzw[:1, 0].expand(frames, 4)
-    return set_root_track(closed, place.clone(), turn.clone(), [child])
 
 
 def _close(still: Motion, start: int, frames: int, reach: int, fps: float) -> Motion:

@@ -59,17 +59,14 @@ class GroundTransform:
         return shares * self.turn, torch.stack([place.imag, place.real], dim=-1)
 
 
-def move_over_ground(motion: Motion, turns: Float[Tensor, " frames"], shifts_xz: Float[Tensor, "frames 2"]) -> Motion:
-    """Turn each frame of a motion with Y up about the vertical through the origin (radians), then shift it (metres)."""
+def move_by_share(motion: Motion, transform: GroundTransform, shares: Float[Tensor, " frames"]) -> Motion:
+    """Move each frame of a motion with Y up by a share of a transform: turned about the vertical through the origin,
+    then shifted."""
+    turns, shifts = transform.share(shares)
     local = motion.local_quat_xyzw.clone()
     local[:, 0] = rotations.multiply(rotations.about_y(turns), local[:, 0])
-    place = rotations.rotate_about_y(motion.root_position, turns) + rotations.lift_ground(shifts_xz)
+    place = rotations.rotate_about_y(motion.root_position, turns) + rotations.lift_ground(shifts)
     return replace(motion, root_position=place, local_quat_xyzw=rotations.make_sign_continuous(local))
-
-
-def move_by_share(motion: Motion, transform: GroundTransform, shares: Float[Tensor, " frames"]) -> Motion:
-    """Move each frame of a motion with Y up by a share of a transform."""
-    return move_over_ground(motion, *transform.share(shares))
 
 
 def repeat_over_ground(motion: Motion, transform: GroundTransform, times: int) -> Motion:

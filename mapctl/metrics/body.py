@@ -17,6 +17,7 @@ from mapctl import contacts, rotations
 from mapctl.kinematics import heading_of_matrix
 from mapctl.motion import Motion
 from mapctl.numerics.gaussian import low_pass
+from mapctl.numerics.intervals import true_intervals
 from mapctl.rotations import unwrap_angle
 
 TURN_SECONDS = 0.35
@@ -78,27 +79,17 @@ def measure_peaks(ends: Float[Tensor, "frames ends 3"], hips: Float[Tensor, "fra
     return Peaks(step * fps / 30, change * fps**2)
 
 
-def find_unsupported(
+def measure_longest_unsupported(
     toes: Float[Tensor, "frames feet 3"], hips: Float[Tensor, "frames 3"], fps: float
-) -> Bool[Tensor, " steps"]:
-    """Return by frame but the first whether the hips move over the ground while no toe is planted and the lower one is
-    near its floor: the body slides, it does not fly. World positions in metres; the floor is each toe's own 5th
+) -> float:
+    """Measure the longest time, seconds, for which the hips move over the ground while no toe is planted and the lower
+    one is near its floor: the body slides, it does not fly. World positions in metres; the floor is each toe's own 5th
     percentile."""
     height = (toes[..., 1] - contacts.estimate_floor_heights(toes))[1:]
     speed, pace = (torch.diff(positions[..., ::2], dim=0).norm(dim=-1) * fps for positions in (toes, hips))
     planted = ((height < _LOW) & (speed < _SLOW)).any(dim=1)
-    return ~planted & (height.amin(dim=1) < _NEAR_FLOOR) & (pace > _MOVING_SPEED)
-
-
-def measure_longest_unsupported(
-    toes: Float[Tensor, "frames feet 3"], hips: Float[Tensor, "frames 3"], fps: float
-) -> float:
-    """Measure the longest run of `find_unsupported`, seconds."""
-    longest = run = 0
-    for bad in find_unsupported(toes, hips, fps).tolist():
-        run = run + 1 if bad else 0
-        longest = max(longest, run)
-    return longest / fps
+    slides = ~planted & (height.amin(dim=1) < _NEAR_FLOOR) & (pace > _MOVING_SPEED)
+    return max((stop - start for _, start, stop in true_intervals(slides[:, None])), default=0) / fps
 
 
 _UNIT = 100.0  # cm

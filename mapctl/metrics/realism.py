@@ -301,13 +301,7 @@ def measure_diversity(samples: Sequence[Motion]) -> Diversity:
     positions = torch.stack([canonical_positions(sample) for sample in samples])
     aligned = [transform_to_ground_frame(each, each[:, HIPS, ::2], facing_angle(each)) for each in positions]
     relative = torch.stack([each - each[:, HIPS : HIPS + 1] for each in aligned])
-    return Diversity(*(100.0 * average_pairwise_distance(each) for each in (positions, relative)))
-
-
-def average_pairwise_distance(positions: Float[Tensor, "samples frames joints 3"]) -> float:
-    """Return the mean over pairs of samples, frames and joints of the distance between joints, in the unit of
-    `positions`."""
-    samples, frames, joints, _ = positions.shape
-    # frame by frame, for the distances of a thousand samples at once would need gigabytes
-    total = sum(float(torch.cdist(at, at).sum()) for at in positions.permute(1, 2, 0, 3))
-    return total / (samples * (samples - 1) * frames * joints)
+    # Frame by frame, for the distances of a thousand samples at once would need gigabytes.
+    sums = (sum(float(torch.cdist(at, at).sum()) for at in one.permute(1, 2, 0, 3)) for one in (positions, relative))
+    count, frames, joints, _ = positions.shape
+    return Diversity(*(100.0 * (total / (count * (count - 1) * frames * joints)) for total in sums))

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -27,26 +27,12 @@ _UNDER_WAY_SHARE, _UNDER_WAY_ANGLE = 0.5, math.radians(30)  # of the speed; radi
 _NEAR_SPEED, _NEAR_STILL, _NEAR_ANGLE = 0.15, 0.15, math.radians(10)  # share of the speed; m/s at rest; radians
 
 
-@dataclass(frozen=True, eq=False)
-class LowPassVelocity:
-    """Low-pass velocity of the hips, frame by frame."""
+class _SlowVelocity(NamedTuple):
+    """Slow velocity of the hips over the ground, frame by frame."""
 
     seconds: Float[ndarray, " frames"]
-    """Time of each frame, seconds."""
-    speed: Float[ndarray, " frames"]
-    """Speed over the ground, m/s."""
-    direction: Float[ndarray, " frames"]
-    """Direction of travel, radians about +Y; meaningless where the speed is near 0."""
-
-
-def compute_low_pass_velocity(motion: Motion) -> LowPassVelocity:
-    """Compute the slow velocity of a motion's root over the ground (Gaussian of 0.25 s)."""
-    fps = float(motion.fps)
-    ground = motion.joint_positions()[:, 0, ::2].numpy()
-    velocity = np.gradient(ground, axis=0) * fps
-    velocity = scipy.ndimage.gaussian_filter1d(velocity, _SLOW_SECONDS * fps, axis=0, mode="nearest")
-    seconds = np.arange(len(ground)) / fps
-    return LowPassVelocity(seconds, np.linalg.norm(velocity, axis=-1), np.arctan2(velocity[:, 0], velocity[:, 1]))
+    speed: Float[ndarray, " frames"]  # m/s
+    direction: Float[ndarray, " frames"]  # of travel, radians about +Y; meaningless where the speed is near 0
 
 
 def measure_commands(motion: Motion, track: CommandTrack) -> list[dict[str, float | None]]:
@@ -61,11 +47,14 @@ def measure_commands(motion: Motion, track: CommandTrack) -> list[dict[str, floa
     the least angle between where the head faces and what is looked at; `clearance_cm`, of the nearest joint to an
     obstacle.
     """
-    velocity, rows = compute_low_pass_velocity(motion), []
-    places, fps = motion.joint_positions(), float(motion.fps)
+    places, fps, rows = motion.joint_positions(), float(motion.fps), []
+    ground = places[:, 0, ::2].numpy()
+    slow = np.gradient(ground, axis=0) * fps
+    slow = scipy.ndimage.gaussian_filter1d(slow, _SLOW_SECONDS * fps, axis=0, mode="nearest")
+    seconds, directions = np.arange(len(ground)) / fps, np.arctan2(slow[:, 0], slow[:, 1])
+    velocity = _SlowVelocity(seconds, np.linalg.norm(slow, axis=-1), directions)
     toes = places[:, list(find_feet(motion.skeleton))]
     steps = step_lengths(toes[..., ::2], contacts.detect_contacts(toes, fps), fps).numpy()
-    ground = places[:, 0, ::2].numpy()
     ends = [*track.times[1:], float(velocity.seconds[-1])]
     for began, until, command in zip(track.times, ends, track.commands, strict=True):
         part = (velocity.seconds >= began) & (velocity.seconds <= until)
@@ -104,7 +93,7 @@ def _measure_places(motion: Motion, places: Tensor, frames: ndarray, command: Co
 
 
 def _find_time_reached(
-    velocity: LowPassVelocity, part: ndarray, began: float, command: Command, fps: float
+    velocity: _SlowVelocity, part: ndarray, began: float, command: Command, fps: float
 ) -> float | None:
     near = np.abs(velocity.speed - command.speed) < max(_NEAR_SPEED * command.speed, _NEAR_STILL)
     if command.speed > 0 and command.turning is None:
@@ -116,7 +105,7 @@ def _find_time_reached(
     return None
 
 
-def _find_time_under_way(velocity: LowPassVelocity, part: ndarray, began: float, command: Command) -> float | None:
+def _find_time_under_way(velocity: _SlowVelocity, part: ndarray, began: float, command: Command) -> float | None:
     if command.speed == 0 or command.turning is not None:
         return None
     along = velocity.speed * np.cos(velocity.direction - command.heading)
@@ -126,7 +115,7 @@ def _find_time_under_way(velocity: LowPassVelocity, part: ndarray, began: float,
 
 
 def _measure_steady_errors(
-    velocity: LowPassVelocity, ground: ndarray, frames: ndarray, command: Command, fps: float
+    velocity: _SlowVelocity, ground: ndarray, frames: ndarray, command: Command, fps: float
 ) -> dict[str, float | None]:
     found: dict[str, float | None] = dict.fromkeys(
         ("steady_speed_mps", "steady_heading_error_deg", "steady_turn_deg_s")

@@ -128,21 +128,16 @@ class Inspection:
         quats = choose_continuous_signs(self._held())
         steps = fill_missing(quats.transpose(0, 1), seen.T).transpose(0, 1)
         filled = fill_missing(travel(motion)[None], self.seen_root[None])[0]
-        return replace_travel(replace(motion, local_quat_xyzw=torch.nn.functional.normalize(steps, dim=-1)), filled)
+        motion = replace(motion, local_quat_xyzw=torch.nn.functional.normalize(steps, dim=-1))
+        if joint := motion.travelling_joint:
+            return replace(motion, moving_offsets={**motion.moving_offsets, joint: filled})
+        return replace(motion, root_position=filled)
 
 
 def travel(motion: Motion) -> Float[Tensor, "frames 3"]:
     """Return the position of the joint that travels: the root's, or that of one below it in its parent, metres."""
     joint = motion.travelling_joint
     return motion.moving_offsets[joint] if joint else motion.root_position
-
-
-def replace_travel(motion: Motion, position: Float[Tensor, "frames 3"]) -> Motion:
-    """Return a motion with another position of the joint that travels, metres."""
-    joint = motion.travelling_joint
-    if joint:
-        return replace(motion, moving_offsets={**motion.moving_offsets, joint: position})
-    return replace(motion, root_position=position)
 
 
 def inspect_recording(motion: Motion, masks: Sequence[Mask] = ()) -> Inspection:

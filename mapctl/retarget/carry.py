@@ -317,7 +317,8 @@ def retarget_motion(
         return RetargetedMotion(replace(to_canonical(clip, as_rig(body.rigmap))[0], skeleton=body.skeleton))
     canonical, giver = RiggedCharacter.of(clip, rig)
     found = retarget_canonical(canonical, giver, body, ground=ground)
-    fingers = match_fingers(clip.skeleton, body.rigmap.rig_skeleton)
+    ours, theirs = _list_fingers(body.rigmap.rig_skeleton), _list_fingers(clip.skeleton)
+    fingers = {joint: theirs[finger] for finger, joint in ours.items() if finger in theirs}
     # What the turns of joints do that move, are not matched and lead to no joint that is, is lost.
     led_by = ancestors(clip.skeleton, [*giver.rigmap.joints.values(), *fingers.values()])
     dots = (clip.local_quat_xyzw * clip.local_quat_xyzw[:1]).sum(-1).abs().amin(dim=0).clamp(max=1.0)
@@ -354,12 +355,6 @@ def retarget_canonical(
         hands_missed=Miss.of(hands_off, _HAND_METRES),
     )
     return RetargetedMotion(body.stance.restore_foot_tilt(done), changes)
-
-
-def match_fingers(giver: Skeleton, body: Skeleton) -> dict[int, int]:
-    """Match finger joints by side, finger and place along it: a joint of the giver by joint of the body."""
-    theirs = _list_fingers(giver)
-    return {joint: theirs[finger] for finger, joint in _list_fingers(body).items() if finger in theirs}
 
 
 def _carry_fingers(
