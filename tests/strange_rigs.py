@@ -41,11 +41,7 @@ class Strange:
 def rigged(names: Mapping[str, str], **wishes) -> tuple[Motion, Mapping[str, str]]:
     """A walk on a rig, and its joints."""
     made = make(Make(names, **wishes))
-    return made.motion(person(made_size(wishes), 30)), made.joint
-
-
-def made_size(wishes: Mapping) -> float:
-    return wishes.get("size", 1.0)
+    return made.motion(person(wishes.get("size", 1.0), 30)), made.joint
 
 
 def renamed(motion: Motion, name: Callable[[str], str]) -> Motion:

@@ -181,22 +181,6 @@ def test_toes_rest_on_the_floor_that_their_contacts_show(floor, noise):
     assert not [artefact for artefact in found if artefact.kind == "float"]
 
 
-@pytest.mark.parametrize("floor", [name for name in FLOORS if name != "down the stairs"])
-def test_a_foot_in_the_air_is_listed_whatever_the_floor(floor):
-    """On stairs with a contact or two a step it could as well be a step."""
-    heights, raised = at_distance(FLOORS[floor]), 4
-    heights[raised] += 0.05
-    toes = lifted(heights)
-    foot, start, stop = CONTACTS[raised]
-    (found,) = [
-        artefact
-        for artefact in list_foot_artefacts(TOES, toes, PLANTED, fit_supports(toes, PLANTED))
-        if artefact.kind == "float"
-    ]
-    assert (found.joint, found.start, found.stop) == (TOES[foot], start, stop)
-    assert 3 < found.amount < 6
-
-
 def resting(toes=TOE_POSITIONS, hips=HIPS, noise=NO_NOISE):
     return compute_rest_log_probability(toes, hips, 30.0, noise) > math.log(0.5)
 
@@ -252,12 +236,6 @@ def test_the_phase_is_0_amid_the_stance_and_180_amid_the_swing(period, duty):
     stance, swing = begins + duty * period / 2, begins + (1 + duty) * period / 2
     assert apart(np.interp(stance, frame, angle), 0) < 8
     assert apart(np.interp(swing, frame, angle), 180) < 8
-
-
-@pytest.mark.parametrize("frames", [1, 61])
-@pytest.mark.parametrize("bit", [False, True])
-def test_a_foot_that_only_stands_or_never_stands_has_none(frames, bit):
-    assert not compute_phases(torch.full((frames, 2), bit)).any()
 
 
 def test_standing_before_and_after_steps_has_none_and_it_fades_without_a_leap():

@@ -45,19 +45,6 @@ def test_mirrored_features_are_those_of_the_mirrored_motion(kind):
     torch.testing.assert_close(mirror_features(mirror_features(encode(motion)[0])), encode(motion)[0])
 
 
-def test_a_straight_walk_reads_in_metres_and_radians_a_frame():
-    straight, _ = encode(walk(30))
-    torch.testing.assert_close(
-        LAYOUT.pick(straight, "root_displacement_heading")[:, 0].mean(), torch.tensor(0.0).double(), atol=1e-3, rtol=0
-    )
-    assert float(LAYOUT.pick(straight, "root_displacement_heading")[:, 1].mean()) * 30 == pytest.approx(1.24, abs=0.01)
-    turning, _ = encode(walk(90, turn_rate=0.6))
-    assert float(LAYOUT.pick(turning, "heading_change").mean()) * 30 == pytest.approx(0.6, abs=0.02)
-    bits = LAYOUT.pick(turning, "contacts")
-    assert bool(((bits == 0) | (bits == 1)).all())
-    assert 0.1 < float(bits.mean()) < 0.9
-
-
 def test_motions_that_have_no_features_are_refused():
     with pytest.raises(MapctlError, match="at least two frames"):
         encode(walk(1))

@@ -7,7 +7,7 @@ from fractions import Fraction
 import pytest
 import torch
 
-from mapctl import curves, report
+from mapctl import report
 from mapctl.motion import Motion
 from mapctl.problem.solution import Ledger, LedgerEntry, Outcome, Solution, Status, WindowRecord
 from mapctl.skeleton import CANONICAL
@@ -66,12 +66,3 @@ def test_timing_is_for_each_delivered_frame(solution):
     assert timing["evaluations_per_frame"] == pytest.approx(50 / 34)
     assert (timing["seconds"], timing["windows"], timing["threads"]) == (2.0, 2, torch.get_num_threads())
     assert "late_frames" not in timing
-
-
-def test_progress_is_against_the_wanted_way():
-    """89 steps of 1/30 m are 2.967 m; twice that was wanted."""
-    measures = report.measure_path(glide(), curves.line(length=10), wanted_m=2 * 89 / 30)
-    assert measures["wanted_m"] == pytest.approx(2 * 89 / 30)
-    assert measures["travelled_m"] == pytest.approx(89 / 30, abs=1e-6)
-    assert measures["progress_ratio"] == pytest.approx(0.5, abs=1e-6)
-    assert measures["path_error_max_cm"] == pytest.approx(0, abs=1e-6)

@@ -5,26 +5,12 @@ import torch
 from catalogue import FRAMES, TERMS
 from helpers import generator, walk
 
-from mapctl import curves
-from mapctl.curves import Curve
 from mapctl.features import LAYOUT, GroundPose, encode, integrate_root
 from mapctl.kinematics import fast
 from mapctl.skeleton import CANONICAL, Skeleton
-from mapctl.terms.kernels import find_local_frames
 from mapctl.terms.trial import Trial
 
 PAST = 8
-CLOSED = torch.tensor([[0.0, 0.0], [2.0, 0.0], [2.0, 1.0], [0.0, 1.0], [0.0, 0.0]]).double()
-SPIRAL = torch.linspace(0, 6, 600).double()
-CURVES = {
-    "circle": curves.circle(radius=4.0),
-    "figure-8": curves.figure8(radius=2.0),
-    "line": curves.line(length=1.5),
-    "corners": Curve(curves.from_points(CLOSED).points, closed=True),
-    "small lap": curves.circle(radius=0.08),
-    "in space": curves.from_points(torch.stack([torch.cos(SPIRAL), 0.3 * SPIRAL, torch.sin(SPIRAL)], -1)),
-}
-each_curve = pytest.mark.parametrize("name", CURVES)
 each_term = pytest.mark.parametrize("name", TERMS)
 
 
@@ -131,23 +117,3 @@ def test_bones_do_not_lie_in_the_memory_of_the_skeleton():
     before = fast.compute_joints_and_heels(*place)[0]
     skeleton.offsets.fill_(torch.nan)
     torch.testing.assert_close(fast.compute_joints_and_heels(*place)[0], before, rtol=0, atol=0)
-
-
-def beside(curve, *, count=400, dtype=torch.float64):
-    """Arcs from before the start to beyond the end, and points about a foot away from them."""
-    arcs = torch.linspace(-0.8, curve.length + 0.8, count, dtype=torch.float64)
-    shifts = 0.3 * torch.rand(2, count, curve.dims, generator=generator(12)).double() - 0.15
-    return (curve.point(arcs) + shifts).to(dtype), arcs + 0.2 * torch.rand(count, generator=generator(13)).double()
-
-
-@each_curve
-def test_places_and_axes_are_the_curves_own(name):
-    curve = CURVES[name]
-    points, arcs = beside(curve)
-    found = find_local_frames(curve, points, arcs, reach=0.6)
-    nearest = curve.nearest(points, around=arcs.expand(2, -1), reach=0.6)
-    same = (curve.point(nearest) - found.place).norm(dim=-1) < 1e-8
-    assert float(same.double().mean()) > 0.9  # the rest are about as far from two places
-    torch.testing.assert_close(found.axes[same][:, 1], curve.tangent(nearest)[same], atol=1e-6, rtol=0)
-    left = found.axes[same][:, 0, curve.ground_axes]
-    torch.testing.assert_close(left, curve.left(nearest)[same], atol=1e-6, rtol=0)

@@ -111,19 +111,6 @@ ARM = Limb(*(CANONICAL.index(f"left{part}") for part in ("UpperArm", "LowerArm",
 LEG = Limb(*(CANONICAL.index(f"right{part}") for part in ("UpperLeg", "LowerLeg", "Foot")), (0, 0, 1))
 
 
-@settings(max_examples=10)
-@given(st.integers(0, 10_000))
-def test_limbs_whose_bones_have_their_lengths_come_back_as_all_do(seed):
-    wanted = random_motion(CANONICAL, 4, seed=seed)
-    start = random_motion(CANONICAL, 4, seed=seed + 1)
-    made = solved(wanted.joint_positions(), start.local_quat_xyzw, limbs=(ARM, LEG))
-    away = (made.joint_positions() - wanted.joint_positions()).norm(dim=-1)
-    ends = [ARM.end, LEG.end]
-    # An elbow close to the line has no side to speak of: a hair of anatomy then tells, and moves it by as much.
-    assert away[:, ends].max() < 1e-3
-    assert away.max() < 0.02
-
-
 @pytest.mark.parametrize("limb", [ARM, LEG], ids=["arm", "leg"])
 @pytest.mark.parametrize("share", [0.7])
 def test_a_limb_of_short_bones_that_point_the_wrong_way_bends_as_it_did(limb, share):

@@ -58,18 +58,6 @@ def test_spikes_do_not_upset_it():
     )
 
 
-def test_what_is_masked_does_not_matter():
-    clean = shaken(swaying(400), 2 * DEGREE)
-    seen = all_seen(clean)
-    seen[100:160, 2] = False
-    seen[200:205] = False
-    wild = torch.where(seen[..., None], clean, shaken(clean, 2.0, seed=9))
-    assert torch.equal(estimate_angle_noise(clean, seen), estimate_angle_noise(wild, seen))
-    places = smooth_place(400) + 0.01 * torch.randn(400, 3, generator=generator(), dtype=torch.float64)
-    thrown = torch.where(seen[:, 0, None], places, 100.0)
-    assert estimate_position_noise(places, seen[:, 0]) == estimate_position_noise(thrown, seen[:, 0])
-
-
 def swing(frames: int = 400, joints: int = 3) -> torch.Tensor:
     """Joints that swing by 40 degrees about a bent pose, each at a pace of its own."""
     time = torch.arange(frames, dtype=torch.float64)[:, None] / 30
