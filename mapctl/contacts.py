@@ -5,7 +5,7 @@ Heel contacts, derived from those of the toes and the poses.
 A heel stands where its toe is planted and the foot is flat, and for a moment between its strike and the toe's.
 Detection on heels finds hardly more, so features hold the contacts of toes alone.
 
-Local phases: how far each toe is in its own step, told by when it is planted (Starke et al. 2020).
+Local phases: how far each toe is in its own step, by when it is planted (Starke et al. 2020).
 
 Starke et al. fit a sinusoid to the filtered contacts of each bone around each frame. Here the same signal is made
 analytic: contacts are smoothed, standardised among the frames around, and turned into amplitude and phase by a Hilbert
@@ -180,7 +180,7 @@ def mirror_phases(phases: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"
 
 def reversed_phases(phases: Float[Tensor, "*batch frames 4"]) -> Float[Tensor, "*batch frames 4"]:
     """Return the phases of motion run backwards, frame by frame beside `reversed_features`: phases run the other way,
-    each is told by the frame after, as contacts are, and the first frame repeats the second's."""
+    each is that of the frame after, as contacts are, and the first frame repeats the second's."""
     back = phases.flip(-2) * phases.new_tensor([1.0, -1.0, 1.0, -1.0])
     return torch.cat([back[..., :1, :], back[..., :-1, :]], dim=-2)
 

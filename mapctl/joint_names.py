@@ -113,7 +113,7 @@ def normalise_name(name: str) -> str:
 
 
 def split_side(name: str) -> tuple[Side, str]:
-    """Split a name into the side that it tells and what is left of it: `LeftUpLeg` is left and `UpLeg`."""
+    """Split a name into the side that it names and what is left of it: `LeftUpLeg` is left and `UpLeg`."""
     for side, pattern in _SIDES:
         found = pattern.search(name)
         if found:

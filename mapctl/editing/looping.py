@@ -122,7 +122,7 @@ def correct_toes(
 def _choose_smoothing(toes: Float[Tensor, "frames 2 3"], fps: float) -> float:
     """Choose the standard deviation in frames of the Gaussian that leaves so little of the noise.
 
-    Noise is told by third differences, of which white noise of 1 makes 20 in the square; most frames have little else.
+    Noise is estimated by third differences, of which white noise of 1 makes 20 in the square; most frames have little else.
     Of it a Gaussian of s frames leaves velocities of (4 sqrt(pi) s^3)^-1/2 a frame.
     """
     least, most = (seconds * fps for seconds in _SMOOTH_SECONDS)
@@ -178,7 +178,7 @@ class Cycle:
 def find_cycle(motion: Motion) -> Cycle:
     """Find the cycle of a motion on canonical joints (Y up): of a walk or a run one stride, with both feet's contacts.
 
-    RequestError where none is found, which says what comes nearest.
+    RequestError where none is found, with what comes nearest.
     """
     step = max(1, round(float(motion.fps) / SEARCH_FPS))
     rate, count = float(motion.fps) / step, -(-motion.num_frames // step)

@@ -1,6 +1,6 @@
 """Left and right exchanged, on any rig, through the plane x = 0 of the world (with Y up).
 
-A joint's rotation in the world, as told from its own in the T-pose, becomes the mirror image of its partner's:
+A joint's rotation in the world, against its own in the T-pose, becomes the mirror image of its partner's:
 W' = M W_p R_p^-1 M R, with M the mirror through x = 0 and R the rotations in the T-pose. So the rig keeps its bones,
 fingers and twists turn as their partners did, and mirroring twice gives W again.
 """

@@ -78,7 +78,7 @@ def follow_pace(speed: Float[ndarray, " frames"]) -> Int[ndarray, " frames"]:
     """Follow the pace along a motion's smoothed speed, m/s: the index in PACES of each frame.
 
     A pace lasts until the other bound of a change is passed, so that `count_pace_changes` counts the changes of it;
-    before the first bound that is passed, it is the one that this bound tells.
+    before the first bound that is passed, it is the one that this bound shows.
     """
     goes, runs = (_follow(speed, *bounds) for bounds in ((STANDS, GOES), (WALKS, RUNS)))
     return np.where(runs, 2, goes.astype(int))
@@ -90,7 +90,7 @@ def find_pace(speed: float) -> str:
 
 
 def _follow(speed: Float[ndarray, " frames"], low: float, high: float) -> Bool[ndarray, " frames"]:
-    """Whether it was over `high` since it was last under `low`. Before either, the first of them tells; between both
+    """Whether it was over `high` since it was last under `low`. Before either, the first of them counts; between both
     all along, the mean."""
     passed = np.flatnonzero((speed < low) | (speed > high))
     if len(passed) == 0:

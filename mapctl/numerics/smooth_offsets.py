@@ -1,4 +1,4 @@
-"""The smoothest offsets of some frames: least second differences, each frame held as firmly as its weight says.
+"""The smoothest offsets of some frames: least second differences, each frame held as firmly as its weight.
 
 What a motion misses keys, targets, contacts and seams by is made good by these: `interpolate_offsets` for positions and
 `interpolate_turns` for rotations where the misses are known, `blend_seams_in_positions` and `blend_seams_in_rotations`

@@ -1,7 +1,7 @@
 """Estimation of a recording's noise from the recording alone.
 
 People move slowly beside a camera's noise from frame to frame, so a high difference of a channel is nearly all noise.
-Its median over time says how much, untroubled by spikes and by the moments of a landing.
+Its median over time shows how much, untroubled by spikes and by the moments of a landing.
 
 Signs of quaternions, and rotations averaged over time, under noise so large that neighbouring frames do not tell.
 

@@ -83,7 +83,7 @@ def identify_rig(skeleton: Skeleton, rig: Rig | None = None, *, motion: Motion |
     source = None if motion is None else motion.source
     character = source if isinstance(source, CharacterSource) else None
     if character is not None and rig is None and character.humanoid:
-        rig = Rig("vrm", character.humanoid, about="VRM: the file itself says which joint is which.")
+        rig = Rig("vrm", character.humanoid, about="VRM: the file itself names its joints.")
     found = match(skeleton, rig, motion=motion)
     zero = RigPoses.zero(skeleton, found.joint_of)
     clip = None if motion is None else RigPoses.of(motion, found.joint_of)

@@ -40,7 +40,7 @@ HELPER_NAME = re.compile(
 
 
 class KnownBy(Enum):
-    """What tells which canonical joint a joint is."""
+    """Evidence by which a joint is a canonical one."""
 
     LIST = "list"
     """Its name, which a listed rig or the user's rig names."""
@@ -81,8 +81,8 @@ def match(skeleton: Skeleton, rig: Rig | None = None, *, motion: Motion | None =
     """
     given = rig if rig is not None and rig.joints else None
     chosen, found = _find_listed_rig(skeleton) if given is None else (given, _match_by_rig(given, skeleton))
-    for name in REQUIRED if given is not None else ():
-        if name in given.joints and name not in found:
+    for name in REQUIRED:
+        if given is not None and name in given.joints and name not in found:
             near = describe_nearest(given.joints[name], skeleton.names, classify_joints(skeleton))
             raise RequestError(f"rig {given.name}: no joint {given.joints[name]!r} for {name}; {near}")
     known = dict.fromkeys(found, KnownBy.LIST)
@@ -208,13 +208,13 @@ def _match_by_words(skeleton: Skeleton, hips: int | None) -> dict[str, int]:
         except RequestError:
             return {}
     found = {"hips": hips}
-    told = classify_joints(skeleton)
+    every = classify_joints(skeleton)
     inside = descendants(skeleton, {hips})
-    if skeleton.parents[hips] >= 0 and not any(told[joint].part is Part.UPPER_ARM for joint in inside):
+    if skeleton.parents[hips] >= 0 and not any(every[joint].part is Part.UPPER_ARM for joint in inside):
         inside = descendants(skeleton, {skeleton.parents[hips]})  # a trunk beside the hips, as MMD has it
     roles = [
         r if j in inside and not HELPER_NAME.search(skeleton.names[j]) else Role(Side.MIDDLE, Part.OTHER)
-        for j, r in enumerate(told)
+        for j, r in enumerate(every)
     ]
     for side in (Side.LEFT, Side.RIGHT):
         found |= _match_limb_by_words(roles, side)

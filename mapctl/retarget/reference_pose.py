@@ -138,8 +138,8 @@ def _list_readings(
     # A preset's table is of files as its program writes them; one whose rest pose is another has other joint frames.
     if rig.has_tpose and (stated or rest == "neither" or is_canonical_tpose(zero)):
         # Joints that the table leaves out are as in the rest pose, or unrotated where that is to be the T-pose or none.
-        unrotated = laid_out is None or rig.rest == "tpose"
-        quats = UNROTATED.repeat(CANONICAL.num_joints, 1) if unrotated else laid_out.clone()
+        known = None if rig.rest == "tpose" else laid_out
+        quats = UNROTATED.repeat(CANONICAL.num_joints, 1) if known is None else known.clone()
         for name, axes in rig.tpose.items():
             quats[CANONICAL.index(name)] = rotations.from_matrix(frame_from_axes(axes))
         yield quats, idle, "table"

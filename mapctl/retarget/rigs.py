@@ -95,7 +95,7 @@ def known_rigs() -> tuple[Rig, ...]:
 
 
 def read_rig_toml(path: Path) -> Rig:
-    """Read a rig from a TOML file; FileFormatError says what is wrong with it."""
+    """Read a rig from a TOML file; FileFormatError names what is wrong with it."""
     keys = ", ".join(item.name for item in fields(_RigFile))
     try:
         found = toml.read(path, _RigFile, what="rig file", unknown=lambda _: f"allowed: {keys}")
