@@ -3,6 +3,7 @@
 from dataclasses import replace
 from fractions import Fraction
 from importlib import import_module
+from importlib.util import find_spec
 from os import PathLike
 from pathlib import Path
 from types import ModuleType
@@ -19,28 +20,19 @@ if TYPE_CHECKING:  # readers in a sandbox import this package without torch
 
 USD_WRITTEN = (".usda", ".usdc", ".usd")
 """Endings of USD files that are written."""
-_USD_ENDINGS = (*USD_WRITTEN, ".usdz")
-READERS = {
-    ".bvh": "bvh",
-    ".npz": "npz",
-    ".amc": "acclaim",
-    **dict.fromkeys((".glb", ".gltf", ".vrm", ".vrma"), "gltf"),
-    **dict.fromkeys(_USD_ENDINGS, "usd"),
-    ".fbx": "fbx",
-}
-"""Endings that are read, each with its module of this package, which is imported when it is needed."""
-WRITERS = {
-    ".bvh": "bvh",
-    ".npz": "npz",
-    **dict.fromkeys((".glb", ".vrm", ".vrma"), "gltf"),
-    **dict.fromkeys(USD_WRITTEN, "usd"),
-}
-"""Endings that are written, likewise."""
-CHARACTERS = (".glb", ".gltf", ".vrm", ".vrma", *_USD_ENDINGS, ".fbx")
+_GLTF, _USD = (".glb", ".gltf", ".vrm", ".vrma"), (*USD_WRITTEN, ".usdz")
+CHARACTERS = (*_GLTF, *_USD, ".fbx")
 """Endings of files of characters, that have a rest pose of their own."""
-_MAY_LACK_VALUES = (".bvh", ".npz", ".amc")
+_MAY_LACK_VALUES = {".bvh": "bvh", ".npz": "npz", ".amc": "acclaim"}
+READERS = {**_MAY_LACK_VALUES, **dict.fromkeys(_GLTF, "gltf"), **dict.fromkeys(_USD, "usd"), ".fbx": "fbx"}
+"""Endings that are read, each with its module of this package, which is imported when it is needed."""
 _ONLY_READ = (".fbx", ".gltf", ".usdz", ".amc")
-_UNREADABLE_REASONS = {".asf": "is a skeleton alone: name its motion, a .amc beside it or subject.asf+take.amc"}
+WRITERS = {ending: module for ending, module in READERS.items() if ending not in _ONLY_READ}
+"""Endings that are written, likewise."""
+_NEEDED = {
+    "pxr": "USD needs the package usd-core: pip install 'mapctl[usd]'",
+    "ufbx": "FBX needs the package ufbx: pip install 'mapctl[fbx]'",
+}
 
 
 def load(
@@ -55,35 +47,31 @@ def load(
     FileFormatError says what is wrong with the file, and where: NaN in place of a number, too, which
     `load_with_missing` takes.
     """
-    ending = _check_readable(path)
-    if fps is not None and ending != ".amc":
-        raise RequestError(f"{path}: a {ending} file says its frame rate itself; only that of an .amc is asked for")
-    reader, file = _import_format(READERS[ending]), examples.resolve(path)
-    motion = reader.load(file) if fps is None else reader.load(file, fps=fps)
-    return _finish(motion, path, metres_per_unit)
+    reader, file = _find_reader(path), examples.resolve(path)
+    if fps is None:
+        return _finish(reader.load(file), path, metres_per_unit)
+    if (ending := ending_of(path)) != ".amc":
+        raise RequestError(f"{path}: a {ending} file has a frame rate of its own; only that of an .amc is asked for")
+    return _finish(reader.load(file, fps=fps), path, metres_per_unit)
 
 
 def load_rest(path: str | PathLike[str]) -> "Motion | None":
     """Read one frame of a character's rest pose; None for files that have none but their motion."""
-    ending = _check_readable(path)
-    return _import_format(READERS[ending]).load_rest(path) if ending in CHARACTERS else None
+    reader = _find_reader(path)
+    return reader.load_rest(path) if ending_of(path) in CHARACTERS else None
 
 
 def load_mesh(path: str | PathLike[str]) -> "CharacterMesh":
     """Read the triangles of a character's file, in its rest pose; FileFormatError where it has none."""
-    ending = _check_readable(path)
-    if ending not in CHARACTERS:
+    reader = _find_reader(path)
+    if ending_of(path) not in CHARACTERS:
         raise FileFormatError(path, f"is no character's file; those end as {', '.join(CHARACTERS)}")
-    return _import_format(READERS[ending]).load_mesh(path)
+    return reader.load_mesh(path)
 
 
 def ending_of(path: str | PathLike[str]) -> str:
     """Return a path's ending in lower case, without what it chooses of a character's file."""
     return parse_character_path(examples.resolve(path)).file.suffix.lower()
-
-
-def _import_format(name: str) -> ModuleType:
-    return import_module(f"mapctl.formats.{name}")
 
 
 def load_with_missing(
@@ -94,33 +82,45 @@ def load_with_missing(
     The motion is finite: missing rotations repeat the last known one, missing positions are interpolated linearly.
     FileFormatError where nothing is known.
     """
-    ending = _check_readable(path)
-    if ending not in _MAY_LACK_VALUES:
-        motion = load(path, metres_per_unit=metres_per_unit)
-        return motion, _import_format("missing").MissingValues.none(motion.num_frames, motion.num_joints)
-    motion, missing = _import_format(READERS[ending]).load_with_missing(examples.resolve(path))
-    return _finish(motion, path, metres_per_unit), missing
+    reader = _find_reader(path)
+    if ending_of(path) in _MAY_LACK_VALUES:
+        motion, missing = reader.load_with_missing(examples.resolve(path))
+        return _finish(motion, path, metres_per_unit), missing
+    from mapctl.formats.missing import MissingValues
+
+    motion = load(path, metres_per_unit=metres_per_unit)
+    return motion, MissingValues.none(motion.num_frames, motion.num_joints)
 
 
 def _finish(motion: "Motion", path: str | PathLike[str], metres_per_unit: float | None) -> "Motion":
     """Convert the unit where one is given; mark examples with their licence, which BVH has no place for."""
     motion = replace(motion, licence=examples.LICENCE) if examples.is_example(path) else motion
-    return motion if metres_per_unit is None else _import_format("bvh").convert_unit(motion, metres_per_unit)
+    if metres_per_unit is None:
+        return motion
+    from mapctl.formats.bvh import convert_unit
+
+    return convert_unit(motion, metres_per_unit)
 
 
-def _check_readable(path: str | PathLike[str]) -> str:
-    """Return the ending; FileFormatError unless it is one of `READERS`."""
+def _find_reader(path: str | PathLike[str]) -> ModuleType:
+    """Import the module for an ending; FileFormatError where there is none, or its package is not installed."""
     ending = ending_of(path)
     if ending not in READERS:
-        why = _UNREADABLE_REASONS.get(ending, f"cannot read the ending {ending!r}")
+        asf = "is a skeleton alone: name its motion, a .amc beside it or subject.asf+take.amc"
+        why = asf if ending == ".asf" else f"cannot read the ending {ending!r}"
         raise FileFormatError(path, f"{why}; allowed: {', '.join(READERS)}")
-    return ending
+    try:
+        return import_module(f"mapctl.formats.{READERS[ending]}")
+    except ModuleNotFoundError as error:
+        if error.name not in _NEEDED:
+            raise
+        raise FileFormatError(path, _NEEDED[error.name]) from None
 
 
 def save(motion: "Motion", path: str | PathLike[str]) -> None:
     """Write a motion in a format of `WRITERS`, whole or not at all. RequestError if it cannot be written there."""
     check_ending(path)
-    _import_format(WRITERS[Path(path).suffix.lower()]).save(motion, path)
+    import_module(f"mapctl.formats.{WRITERS[Path(path).suffix.lower()]}").save(motion, path)
 
 
 def check_ending(path: str | PathLike[str]) -> None:
@@ -130,5 +130,5 @@ def check_ending(path: str | PathLike[str]) -> None:
     if ending not in WRITERS:
         why = f"{ending} is read but not written" if ending in _ONLY_READ else f"unknown ending {ending!r}"
         raise RequestError(f"cannot write {path}: {why}; allowed: {', '.join(WRITERS)}")
-    if ending in USD_WRITTEN:
-        _import_format("usd").check_installed(path)
+    if ending in USD_WRITTEN and find_spec("pxr") is None:
+        raise RequestError(f"cannot write {path}: {_NEEDED['pxr']}")

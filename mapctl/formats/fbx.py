@@ -1,85 +1,515 @@
-"""FBX in, by the package ufbx: characters and captures, as rigs and as clips. FBX is not written."""
+"""FBX in, by the package ufbx: characters and captures, as rigs and as clips. FBX is not written.
 
+`read_character` and all below it run in `mapctl.formats.sandbox`, without torch.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from fractions import Fraction
 from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import ufbx
 
-from mapctl.formats.character import (
-    RestFrames,
-    build_frames,
-    build_mesh,
+from mapctl.formats.parts import (
+    GREY,
+    MAX_CORNERS,
+    MAX_JOINTS,
+    FoundCharacter,
+    MeshPart,
+    chain_matrices,
     check_size,
     complete_bind_pose,
-    compose_transforms,
-    describe_source,
-    frame_rate_of,
-    note_animation,
-    place_joints,
-    read_native,
+    decode_picture,
+    decode_srgb,
+    encode_srgb,
+    find_name,
+    make_unique,
+    mean_at_vertices,
+    sample_picture,
+    split_polygons,
+    strongest,
 )
-from mapctl.formats.parts import CharacterPath
-from mapctl.formats.text import warn_once
-from mapctl.mesh.character_mesh import CharacterMesh
-from mapctl.motion import Motion
-from mapctl.skeleton import Skeleton
+from mapctl.formats.sandbox import Refusal
+from mapctl.formats.text import MAX_POSES
+
+if TYPE_CHECKING:
+    from mapctl.mesh.character_mesh import CharacterMesh
+    from mapctl.motion import Motion
+
+Array = np.ndarray
+NEWEST, OLDEST = 7799, 3000
+"""Versions of FBX (7400 is 7.4) that are read."""
+_MAX_ELEMENTS = 2**20
+_BODY_JOINTS = 8
+"""Two trees of at least as many joints, below one node and without a common skin, are two characters."""
+_USUAL_RATE = 30.0
+_EARLY_SHARE = 0.02  # of a frame by which a take may end before it
+_MOVED = ("Lcl Translation", "Lcl Rotation", "Lcl Scaling")
+_kept: list[object] = []
 
 
-def load(path: str | PathLike[str]) -> Motion:
+def load(path: str | PathLike[str]) -> "Motion":
     """Read an animation of an .fbx file; one frame of the rest pose where it has none.
 
     `path` may end as `#ARMATURE`, `#ARMATURE/ANIMATION` or `#/ANIMATION`; by default the file's first animation that
     moves the armature is read, and a file of several armatures is refused, naming them. Joint frames are aligned with
     the world in the rest pose. FileFormatError says what is wrong with the file.
     """
-    chosen, found = _read(path, "motion")
-    frames, skeleton = _read_skeleton(chosen, found)
-    note_animation(chosen, found.animations, found.animation)
-    source = describe_source(chosen, found, frames, frames.names)
-    if found.take is None:
-        return frames.rest_motion(skeleton, source)
-    outer = np.eye(4) + np.zeros((1, 4, 4))
-    for one in np.moveaxis(compose_transforms(chosen.file, found.take.above), 1, 0):
-        outer = outer @ one
-    local = compose_transforms(chosen.file, found.take.local)
-    worlds = place_joints(chosen.file, frames.parents, local, outer)
-    return frames.to_motion(worlds, frame_rate_of(found.take.rate), skeleton, source)
+    from mapctl.formats import character
+
+    return character.load_motion(path, read_character, _place_poses)
 
 
-def load_rest(path: str | PathLike[str]) -> Motion:
+def load_rest(path: str | PathLike[str]) -> "Motion":
     """Read one frame of the rest pose, as `load` reads an animation."""
-    chosen, found = _read(path, "rest")
-    frames, skeleton = _read_skeleton(chosen, found)
-    return frames.rest_motion(skeleton, describe_source(chosen, found, frames, frames.names))
+    from mapctl.formats import character
+
+    return character.load_rest(path, read_character)
 
 
-def load_mesh(path: str | PathLike[str]) -> CharacterMesh:
+def load_mesh(path: str | PathLike[str]) -> "CharacterMesh":
     """Read the mesh of a character: what its skins carry, and what hangs on its joints rigidly. `path` chooses as in
     `load`. FileFormatError where the file has no triangles for the armature, or they are broken."""
-    chosen, found = _read(path, "mesh")
-    return build_mesh(chosen.file, found.armature, found.parts, _read_skeleton(chosen, found)[0])
+    from mapctl.formats import character
+
+    return character.load_mesh(path, read_character)
 
 
-def _read(path: str | PathLike[str], wanted: str):
-    """Return what the path chooses, and the `fbx_scene.FbxCharacter` of it."""
-    needed = "FBX needs the package ufbx: pip install 'mapctl[fbx]'"
-    chosen, found = read_native(path, wanted, reader="fbx_scene", package="ufbx", needed=needed)
-    if found.fault:
-        warn_once(f"{chosen.file}: {found.fault}; its joints and motion are read")
-    return chosen, found
+@dataclass(frozen=True, eq=False)
+class Take:
+    """Poses of an armature at the frames of one rate."""
+
+    rate: float
+    """Frames per second, as the file says."""
+    local: Array
+    """(frames, joints, 10) of each joint in its parent's frame: translation, rotation xyzw, scale."""
+    above: Array
+    """(frames or 1, nodes above the root, 10) likewise, the outermost first."""
 
 
-def _read_skeleton(chosen: CharacterPath, found) -> tuple[RestFrames, Skeleton]:
-    """Read the rest frames: the pose in which skins are bound where bones are as long as the nodes', else the nodes';
-    and the skeleton that is aligned with the world in them."""
-    parents, worlds = tuple(found.parents), found.worlds
-    check_size(chosen.file, worlds)
-    for bound in found.bound:
-        check_size(chosen.file, np.stack(list(bound.values())))
-        complete = complete_bind_pose(parents, bound, found.worlds)
-        if complete is not None:
-            worlds = complete
-            break
-    frames = build_frames(chosen.file, found.armature, found.names, parents, worlds, found.outer)
-    rests = frames.matrices()
-    tips = {joint: (rests[joint] @ np.append(end, 1.0))[:3] for joint, end in found.ends.items()}
-    return frames, frames.skeleton(tips)
+def _place_poses(found: FoundCharacter) -> tuple[Fraction, Array]:
+    """Return frames per second and world matrices (frames, joints, 4, 4)."""
+    from mapctl.formats.character import compose_transforms, frame_rate_of
+
+    outer = np.eye(4) + np.zeros((1, 4, 4))
+    for one in np.moveaxis(compose_transforms(found.poses.above), 1, 0):
+        outer = outer @ one
+    worlds = chain_matrices(found.parents, compose_transforms(found.poses.local), outer)
+    return frame_rate_of(found.poses.rate), worlds
+
+
+def read_character(path: str, *, armature: str | None, animation: str | None, wanted: str) -> FoundCharacter:
+    """Read an armature, and `wanted` besides: `rest` nothing, `motion` its animation, `mesh` its triangles. Refusal
+    says why not.
+
+    The rest pose is the one in which skins are bound where bones are as long as the nodes', else the nodes'.
+    """
+    scene, fault = open_scene(path, with_mesh=wanted == "mesh")
+    armatures = find_armatures(scene)
+    listed = [one.name for one in armatures]
+    own = armatures[find_name(Path(path).name, listed, armature, "armature")]
+    root, names = own.nodes[0], make_unique([node.name or f"node_{node.typed_id}" for node in own.nodes])
+    worlds = np.stack([to_matrix(node.node_to_world) for node in own.nodes])
+    bound = _read_bind_poses(scene, own)
+    check_size(worlds, *(matrix for pose in bound for matrix in pose.values()))
+    complete = (complete_bind_pose(own.parents, pose, worlds) for pose in bound)
+    found = FoundCharacter(
+        armature=own.name,
+        armatures=listed,
+        names=names,
+        nodes=names,
+        parents=own.parents,
+        metres_per_unit=scene.settings.original_unit_meters,
+        worlds=next((pose for pose in complete if pose is not None), worlds),
+        outer=np.eye(4) if root.is_root else to_matrix(above(root).node_to_world),
+        ends={joint: to_matrix(node.node_to_parent)[:3, 3] for joint, node in own.ends.items()},
+        fault=fault,
+    )
+    if wanted == "motion":
+        takes = _name_takes(scene, own)
+        found.animations = {name: end - begin for name, (_, begin, end) in takes.items()}
+        found.animation = next(iter(takes), None) if animation is None else animation
+        if animation is not None and animation not in takes:
+            every = _list_takes(scene)
+            find_name("", list(every), animation, "animation")
+            raise Refusal(f"animation {animation!r} does not move {own.name!r}")
+        if found.animation is not None:
+            found.poses = _sample(scene, found.animation, *takes[found.animation], own)
+    if wanted == "mesh":
+        found.parts = _read_parts(scene, own, Path(path).resolve().parent)
+    return found
+
+
+def open_scene(path: str, *, with_mesh: bool) -> tuple[ufbx.Scene, str]:
+    """Read a file; also return what is wrong with its meshes, empty where nothing is.
+
+    Refusal where it is no FBX, broken (but in its meshes, unless these are asked for), encrypted or of another version.
+    """
+    fault = ""
+    try:
+        scene = _load(path, ignore_embedded=not with_mesh)
+    except Refusal:
+        if with_mesh:
+            raise
+        scene, fault = _load(path, ignore_embedded=True, ignore_geometry=True), "its meshes are broken"
+    version = scene.metadata.version
+    if not OLDEST <= version <= NEWEST:
+        raise Refusal(f"is FBX {version / 1000:g}, read are {OLDEST / 1000:g} to 7.7")
+    count = sum(found.count for found in each(scene.metadata.warnings) if found.type == ufbx.WarningType.INDEX_CLAMPED)
+    if count:
+        fault = f"{count} of its meshes' indices point at nothing, so they may look wrong"
+    if len(scene.elements) > _MAX_ELEMENTS:
+        raise Refusal(f"has {len(scene.elements)} elements, allowed are {_MAX_ELEMENTS}")
+    return scene, fault
+
+
+def _load(path: str, *, ignore_embedded: bool, ignore_geometry: bool = False) -> ufbx.Scene:
+    try:
+        return ufbx.load_file(
+            path,
+            file_format=ufbx.FileFormat.FBX,
+            target_axes=ufbx.axes_right_handed_y_up,
+            target_unit_meters=1.0,
+            space_conversion=ufbx.SpaceConversion.ADJUST_TRANSFORMS,
+            inherit_mode_handling=ufbx.InheritModeHandling.COMPENSATE,
+            index_error_handling=ufbx.IndexErrorHandling.CLAMP,
+            load_external_files=False,
+            ignore_embedded=ignore_embedded,
+            ignore_geometry=ignore_geometry,
+            generate_missing_normals=False,
+            node_depth_limit=1024,
+        )
+    except ufbx.UnsupportedVersionError:
+        raise Refusal("is FBX of a version that is not read; export it as 7.4 or 7.5") from None
+    except ufbx.UnrecognizedFileFormatError:
+        raise Refusal("is no FBX file") from None
+    except ufbx.OutOfMemoryError:
+        raise MemoryError from None
+    except ufbx.UfbxError as error:
+        raise Refusal(f"is no sound FBX file: {str(error).strip() or type(error).__name__}") from None
+
+
+def each(elements: Any) -> list[Any]:
+    """Return a scene's list as Python's, whose items then live as long as the process: ufbx 0.0.5 hands out what it has
+    in lists without counting the reference, so that it would be freed while it is in use."""
+    found = list(elements)
+    _kept.extend(found)
+    return found
+
+
+def walk(node: ufbx.Node) -> Iterator[ufbx.Node]:
+    """Go through a node and all below it, parents first, in the file's order."""
+    waiting = [node]
+    while waiting:
+        one = waiting.pop()
+        yield one
+        waiting += reversed(each(one.children))
+
+
+def above(node: ufbx.Node) -> ufbx.Node:
+    """Return the node above one that is not the scene's root."""
+    found = node.parent
+    assert found is not None
+    return found
+
+
+def line_of(node: ufbx.Node) -> list[ufbx.Node]:
+    """Return a node and all above it but the scene's root."""
+    found = []
+    while not node.is_root:
+        found.append(node)
+        node = above(node)
+    return found
+
+
+def to_matrix(columns: ufbx.Matrix) -> Array:
+    """Return a (4, 4) matrix of ufbx's four columns."""
+    matrix = np.eye(4)
+    matrix[:3] = np.array(columns).T
+    return matrix
+
+
+@dataclass(frozen=True, eq=False)
+class Armature:
+    """The tree of one character's joints."""
+
+    name: str
+    """Name by which it is chosen: of the node above its root, else of the root."""
+    nodes: list[ufbx.Node]
+    """Joints, parents first; the first is the root."""
+    parents: tuple[int, ...]
+    """Index of each one's parent, -1 for the root."""
+    ends: dict[int, ufbx.Node]
+    """Node that is the End Site of a last joint, by that joint's index."""
+
+
+def find_armatures(scene: ufbx.Scene) -> list[Armature]:
+    """Find the armatures of a file, in its order. Refusal where it has none."""
+    bones = _find_bones(scene)
+    if not bones:
+        raise Refusal("has no limb nodes and no skin, so nothing in it says which nodes are a character's joints")
+    found = [_build(scene, group, bones) for group in _group(scene, bones)]
+    names = make_unique([armature.name for armature in found])
+    return [replace(armature, name=name) for name, armature in zip(names, found, strict=True)]
+
+
+def _read_bind_poses(scene: ufbx.Scene, armature: Armature) -> list[dict[int, Array]]:
+    """Return world matrices (4, 4) by joint of the poses that the file says skins are bound in: by its skins, and by
+    its bind poses."""
+    place = {node.typed_id: joint for joint, node in enumerate(armature.nodes)}
+    skins: dict[int, Array] = {}
+    for cluster in each(scene.skin_clusters):
+        if cluster.bone_node is not None and cluster.bone_node.typed_id in place:
+            skins.setdefault(place[cluster.bone_node.typed_id], to_matrix(cluster.bind_to_world))
+    poses: dict[int, Array] = {}
+    for pose in each(scene.poses):
+        for bone in each(pose.bone_poses) if pose.is_bind_pose else ():
+            if bone.bone_node.typed_id in place:
+                poses.setdefault(place[bone.bone_node.typed_id], to_matrix(bone.bone_to_world))
+    return [bound for bound in ({**poses, **skins}, poses) if bound]
+
+
+def _find_bones(scene: ufbx.Scene) -> dict[int, ufbx.Node]:
+    """Return limb nodes and nodes of skins, with what lies between them, by number."""
+    found = {node.typed_id: node for node in each(scene.nodes) if node.bone is not None}
+    for cluster in each(scene.skin_clusters):
+        if cluster.bone_node is not None and not cluster.bone_node.is_root:
+            found[cluster.bone_node.typed_id] = cluster.bone_node
+    for node in list(found.values()):
+        line = line_of(node)
+        last = max((k for k, other in enumerate(line) if other.typed_id in found), default=0)
+        found.update({other.typed_id: other for other in line[:last]})
+    return found
+
+
+def _group(scene: ufbx.Scene, bones: dict[int, ufbx.Node]) -> list[list[ufbx.Node]]:
+    """Return the topmost joints by armature: those that share a skin, or hang on one node and are no two bodies."""
+    tops = [node for node in walk(scene.root_node) if node.typed_id in bones and above(node).typed_id not in bones]
+    top_of = {below.typed_id: k for k, top in enumerate(tops) for below in walk(top)}
+    group = list(range(len(tops)))
+
+    def join(first: int, second: int) -> None:
+        old, new = group[second], group[first]
+        group[:] = [new if one == old else one for one in group]
+
+    for skin in each(scene.skin_deformers):
+        members = [c.bone_node.typed_id for c in each(skin.clusters) if c.bone_node is not None]
+        used = sorted({top_of[number] for number in members if number in top_of})
+        for other in used[1:]:
+            join(used[0], other)
+    sizes = [sum(below.typed_id in bones for below in walk(top)) for top in tops]
+    for first in range(len(tops)):
+        for second in range(first + 1, len(tops)):
+            same = above(tops[first]).typed_id == above(tops[second]).typed_id and not above(tops[first]).is_root
+            if same and min(sizes[first], sizes[second]) < _BODY_JOINTS:
+                join(first, second)
+    return [[top for top, own in zip(tops, group, strict=True) if own == one] for one in dict.fromkeys(group)]
+
+
+def _build(scene: ufbx.Scene, tops: list[ufbx.Node], bones: dict[int, ufbx.Node]) -> Armature:
+    root = tops[0]
+    if len(tops) > 1:  # their deepest common node
+        root = scene.root_node
+        for nodes in zip(*(line_of(top)[::-1] for top in tops), strict=False):
+            if any(node is not nodes[0] for node in nodes):
+                break
+            root = nodes[0]
+    lines = {node.typed_id for top in tops for node in line_of(top)}
+    joints = [node for node in walk(root) if node.typed_id in bones or node.typed_id in lines or node is root]
+    ends = {above(node).typed_id: node for node in joints if node is not root and _is_end(node)}
+    joints = [node for node in joints if node is root or not _is_end(node)]
+    if len(joints) > MAX_JOINTS:
+        raise Refusal(f"has an armature of {len(joints)} joints, allowed are {MAX_JOINTS}")
+    place = {node.typed_id: index for index, node in enumerate(joints)}
+    parents = tuple(-1 if node is root else place[above(node).typed_id] for node in joints)
+    holder = "" if root.is_root or above(root).is_root else above(root).name
+    return Armature(holder or root.name or "armature", joints, parents, {place[k]: node for k, node in ends.items()})
+
+
+def _is_end(node: ufbx.Node) -> bool:
+    """Return whether a node is the tip that exporters add to a last limb: NAME_end, alone below it."""
+    return (
+        node.name.lower().endswith("_end")
+        and len(node.children) == 0
+        and not above(node).is_root
+        and len(above(node).children) == 1
+    )
+
+
+def _list_takes(scene: ufbx.Scene) -> dict[str, ufbx.AnimStack]:
+    stacks = each(scene.anim_stacks)
+    return dict(zip(make_unique([stack.name or f"take_{k}" for k, stack in enumerate(stacks)]), stacks, strict=True))
+
+
+def _name_takes(scene: ufbx.Scene, armature: Armature) -> dict[str, tuple[ufbx.AnimStack, float, float]]:
+    """Return the animations that move the armature or what is above it, with their first and last second, by name."""
+    own = {node.element_id for node in [*armature.nodes, *line_of(armature.nodes[0])]}
+    takes = _list_takes(scene).items()
+    return {name: (stack, *_find_range(stack, own)) for name, stack in takes if _moved_nodes(stack) & own}
+
+
+def _moved_nodes(stack: ufbx.AnimStack) -> set[int]:
+    """Return the elements whose transforms the animation moves."""
+    return {
+        prop.element.element_id
+        for layer in each(stack.layers)
+        for prop in each(layer.anim_props)
+        if prop.prop_name in _MOVED or "Pivot" in prop.prop_name or "Offset" in prop.prop_name
+    }
+
+
+def _sample(scene: ufbx.Scene, name: str, stack: ufbx.AnimStack, begin: float, end: float, armature: Armature) -> Take:
+    outer = line_of(armature.nodes[0])[:0:-1]
+    rate = scene.settings.frames_per_second
+    rate = rate if np.isfinite(rate) and 0.01 <= rate <= 1e5 else _USUAL_RATE
+    if not (np.isfinite(begin) and np.isfinite(end)) or end < begin:
+        raise Refusal(f"animation {name!r} lasts from {begin:g} to {end:g} s")
+    count = np.floor((end - begin) * rate + _EARLY_SHARE) + 1
+    joints = len(armature.nodes) + len(outer)
+    if count * joints > MAX_POSES:
+        raise Refusal(f"{count:.0f} frames of {joints} joints, allowed are {MAX_POSES} in all")
+    times = begin + np.arange(int(count)) / rate
+    moved = _moved_nodes(stack)
+    local = np.stack([_sample_node(stack.anim, node, times, moved) for node in armature.nodes], axis=1)
+    above = np.zeros((1, 0, 10))
+    if outer:
+        above = np.stack([_sample_node(stack.anim, node, times, moved) for node in outer], axis=1)
+    return Take(rate, local, above if {node.element_id for node in outer} & moved else above[:1])
+
+
+def _find_range(stack: ufbx.AnimStack, own: set[int]) -> tuple[float, float]:
+    """Return the first and last second that the animation says, else those of the keys of these elements."""
+    if stack.time_end > stack.time_begin:
+        return stack.time_begin, stack.time_end
+    curves = [
+        curve
+        for layer in each(stack.layers)
+        for prop in each(layer.anim_props)
+        if prop.element.element_id in own
+        for curve in each(prop.anim_value.curves)
+        if curve is not None and len(curve.keyframes)
+    ]
+    times = [time for curve in curves for time in (curve.min_time, curve.max_time)]
+    return min(times, default=0.0), max(times, default=0.0)
+
+
+def _sample_node(anim: ufbx.Anim, node: ufbx.Node, times: Array, moved: set[int]) -> Array:
+    """Return translation, rotation xyzw and scale (times, 10)."""
+    if node.is_root:
+        found = [node.local_transform]
+    else:
+        shown = times if node.element_id in moved else times[:1]
+        found = [ufbx.evaluate_transform(anim, node, time) for time in shown.tolist()]
+    table = np.array([(*one.translation, *one.rotation, *one.scale) for one in found])
+    return table if len(table) == len(times) else np.tile(table, (len(times), 1))
+
+
+def _read_parts(scene: ufbx.Scene, armature: Armature, folder: Path) -> list[MeshPart]:
+    """Read what the armature's skins carry, and what hangs on its joints rigidly; pictures lie in `folder` or below."""
+    place = {node.typed_id: joint for joint, node in enumerate(armature.nodes)}
+    found = []
+    for mesh in each(scene.meshes):
+        if mesh.num_indices > MAX_CORNERS:
+            raise Refusal(f"mesh {mesh.name!r} has {mesh.num_indices} corners, allowed are {MAX_CORNERS}")
+        for node in each(mesh.instances):
+            carriers = _read_carriers(mesh, node, place, armature)
+            if carriers is not None and mesh.num_triangles:
+                found.append(_read_part(mesh, node, carriers, folder))
+    return found
+
+
+def _read_carriers(
+    mesh: ufbx.Mesh, node: ufbx.Node, place: dict[int, int], armature: Armature
+) -> tuple[Array, Array, Array, Array] | None:
+    """Return joints (m,) and matrices (m, 4, 4) from the mesh to their frames, and by vertex indices among them (n, k)
+    and their shares; None where the armature does not carry the mesh."""
+    count = mesh.num_vertices
+    if len(mesh.skin_deformers):
+        skin = each(mesh.skin_deformers)[0]
+        own = [place.get(c.bone_node.typed_id) if c.bone_node is not None else None for c in each(skin.clusters)]
+        if all(joint is None for joint in own):
+            return None
+        to_root = np.linalg.pinv(to_matrix(armature.nodes[0].node_to_world)) @ to_matrix(node.geometry_to_world)
+        matrices = [to_root, *(to_matrix(cluster.geometry_to_bone) for cluster in each(skin.clusters))]
+        rows, shares = _read_weights(skin, count)
+        return np.array([0, *(joint or 0 for joint in own)]), np.stack(matrices), rows, shares
+    above = next((other for other in line_of(node) if other.typed_id in place), None)
+    if above is None:
+        return None
+    matrix = np.linalg.pinv(to_matrix(above.node_to_world)) @ to_matrix(node.geometry_to_world)
+    return np.array([place[above.typed_id]]), matrix[None], np.zeros((count, 1), np.int64), np.ones((count, 1))
+
+
+def _read_weights(skin: ufbx.SkinDeformer, count: int) -> tuple[Array, Array]:
+    """Return by vertex the clusters that carry it, counted from 1, and their shares; 0 is the root's for the others."""
+    vertices, clusters, weights = [], [], []
+    for number, cluster in enumerate(each(skin.clusters)):
+        vertices.append(np.array(cluster.vertices, np.int64).reshape(-1))
+        weights.append(np.array(cluster.weights, np.float64).reshape(-1))
+        clusters.append(np.full(len(vertices[-1]), number + 1))
+    if not vertices:
+        return np.zeros((count, 1), np.int64), np.ones((count, 1))
+    return strongest(np.concatenate(vertices), np.concatenate(clusters), np.concatenate(weights), count)
+
+
+def _read_part(mesh: ufbx.Mesh, node: ufbx.Node, carriers: tuple[Array, Array, Array, Array], folder: Path) -> MeshPart:
+    faces = np.array([(face.index_begin, face.num_indices) for face in mesh.faces], np.int64).reshape(-1, 2)
+    begin, counts = faces.T
+    shift = begin - (np.cumsum(counts) - counts)  # from corners counted face by face to the mesh's own
+    corners, polygon = split_polygons(counts)
+    corners = corners + shift[polygon][:, None]
+    order = np.arange(counts.sum()) + np.repeat(shift, counts)
+    material = np.zeros(mesh.num_indices, np.int64)
+    if len(mesh.face_material) == len(faces):
+        material[order] = np.repeat(np.array(mesh.face_material, np.int64), counts)
+    corner_vertex = np.array(mesh.vertex_indices, np.int64)
+    points = np.array(mesh.vertices, np.float64).reshape(-1, 3)
+    rgba = mean_at_vertices(_corner_colours(mesh, node, material, folder), corner_vertex, len(points))
+    return MeshPart(points, corner_vertex[corners], rgba, *carriers)
+
+
+def _corner_colours(mesh: ufbx.Mesh, node: ufbx.Node, material: Array, folder: Path) -> Array:
+    """Return sRGB and opacity at every corner, (corners, 4): of its `material` (corners,), the material's picture and
+    the vertices' own."""
+    count = mesh.num_indices
+    rgba = np.tile(np.array(GREY), (count, 1))
+    uv = _corner_values(mesh.vertex_uv, count, 2)
+    for number, look in enumerate(each(node.materials) or each(mesh.materials)):
+        here = material == number
+        rgba[here] = _material_colours(look, None if uv is None else uv[here], int(here.sum()), folder)
+    own = _corner_values(mesh.vertex_color, count, 4)
+    if own is not None:
+        rgba = np.column_stack([encode_srgb(decode_srgb(rgba[:, :3]) * own[:, :3].clip(0, 1)), rgba[:, 3]])
+    rgba[:, 3] = 1.0
+    return rgba.clip(0.0, 1.0)
+
+
+def _corner_values(table: ufbx.VertexVec2 | ufbx.VertexVec4, count: int, width: int) -> Array | None:
+    if not table.exists or not len(table.values) or len(table.indices) != count:
+        return None
+    values = np.array(table.values, np.float64).reshape(-1, width)
+    return values[np.array(table.indices, np.int64).clip(0, len(values) - 1)]
+
+
+def _material_colours(look: ufbx.Material, uv: Array | None, count: int, folder: Path) -> Array:
+    maps = look.fbx.diffuse_color if look.fbx.diffuse_color.has_value else look.pbr.base_color
+    factor = look.fbx.diffuse_factor.value_vec4.x if look.fbx.diffuse_factor.has_value else 1.0
+    linear = np.array(maps.value_vec4[:3]) * factor if maps.has_value else np.array(GREY[:3])
+    picture = None if uv is None or maps.texture is None else _read_picture(maps.texture, folder)
+    if picture is None or uv is None:
+        return np.tile(np.append(encode_srgb(linear), 1.0), (count, 1))
+    return sample_picture(picture, np.column_stack([uv[:, 0], 1.0 - uv[:, 1]]))
+
+
+def _read_picture(texture: ufbx.Texture, folder: Path) -> Array | None:
+    """Read the picture within the file, or one in its folder or below; None where it is neither."""
+    if texture.content:
+        return decode_picture(texture.content)
+    for name in (texture.relative_filename, Path(texture.absolute_filename.replace("\\", "/")).name):
+        target = (folder / name.replace("\\", "/").replace("\0", "?")).resolve()
+        if name and target.is_relative_to(folder) and target.is_file():
+            return decode_picture(target.read_bytes())
+    return None

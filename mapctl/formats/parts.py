@@ -1,21 +1,37 @@
-"""Characters and their triangles as files have them: names, carriers, polygons and colours, in arrays without torch."""
+"""Characters as files have them, in arrays without torch: names, matrices, carriers, polygons and colours.
 
+What is wrong with a file is a `Refusal`, which `names_file` and `sandbox.call` turn into FileFormatError.
+"""
+
+import functools
 import io
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
+from mapctl.errors import FileFormatError
 from mapctl.formats.sandbox import Refusal
 
 Array = np.ndarray
-_MAX_NAMED = 8
+P = ParamSpec("P")
+T = TypeVar("T")
+MAX_JOINTS = 4096
+"""Most joints of an armature."""
+MAX_CORNERS = 2**25
+"""Most corners of a mesh's polygons."""
+GREY = (0.8, 0.8, 0.8, 1.0)
+"""Colour of what has none, sRGB and opacity."""
 MOST_CARRIERS = 8
 """Most joints that carry one vertex; weaker ones are left out."""
+_MAX_NAMED = 8
 _MAX_PIXELS = 2**26
+_FARTHEST = 1e6  # metres
+_BONE_SHARE = 0.02  # of a bone's length by which it may differ between bind pose and nodes
 
 
 @dataclass(frozen=True)
@@ -40,6 +56,20 @@ def parse_character_path(path: str | PathLike[str]) -> CharacterPath:
     return CharacterPath(Path(name), armature or None, animation or None)
 
 
+def names_file(read: Callable[P, T]) -> Callable[P, T]:
+    """Have a reader, whose first argument is a path, raise FileFormatError for a Refusal."""
+
+    @functools.wraps(read)
+    def done(*words: P.args, **options: P.kwargs) -> T:
+        try:
+            return read(*words, **options)
+        except Refusal as refusal:
+            assert isinstance(words[0], str | PathLike)
+            raise FileFormatError(parse_character_path(words[0]).file, refusal.args[0]) from None
+
+    return done
+
+
 def make_unique(names: Sequence[str]) -> list[str]:
     """Return the names in order, each later one of several alike with `_2`, `_3`, ..."""
     taken: set[str] = set()
@@ -53,20 +83,17 @@ def make_unique(names: Sequence[str]) -> list[str]:
     return found
 
 
-def find_name(file: str, names: Sequence[str], wanted: str | None, what: str, *, several: bool) -> int:
-    """Return the index of the wanted name, or of the only or first one; `what` is `armature` or `animation`.
+def find_name(file: str, names: Sequence[str], wanted: str | None, what: str) -> int:
+    """Return the index of the wanted name; where none is, of the first `animation`, or of the only `armature`.
 
-    Refusal lists the names where none is the wanted one, or several are there and one must be chosen: FILE#NAME.
+    Refusal lists the names where none is the wanted one, or several armatures are there: FILE#NAME chooses one.
     """
     listed = ", ".join(repr(name) for name in names[:_MAX_NAMED]) + (" ..." if len(names) > _MAX_NAMED else "")
-    example = f"{file}#{names[0] if what == 'armature' else '/' + names[0]}" if names else ""
-    if wanted is not None:
-        if wanted in names:
-            return names.index(wanted)
+    if wanted is not None and wanted not in names:
         raise Refusal(f"has no {what} {wanted!r}; it has {listed or 'none'}")
-    if len(names) > 1 and not several:
-        raise Refusal(f"has {len(names)} {what}s: {listed}; choose one, as {example}")
-    return 0
+    if wanted is None and what == "armature" and len(names) > 1:
+        raise Refusal(f"has {len(names)} armatures: {listed}; choose one, as {file}#{names[0]}")
+    return 0 if wanted is None else names.index(wanted)
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +118,7 @@ class MeshPart:
 
 @dataclass(eq=False, kw_only=True)
 class FoundCharacter:
-    """A character's joints in a file, and what was read of them."""
+    """A character's joints in a file, and what was read of them. The world is in metres, with Y up."""
 
     armature: str
     """Name by which the character is chosen."""
@@ -99,16 +126,114 @@ class FoundCharacter:
     """Names of all in the file."""
     names: list[str]
     """Names of the joints, unique, parents first."""
-    parents: list[int]
-    """Index of each one's parent, -1 where it has none."""
+    nodes: Sequence[int | str]
+    """By joint what the file calls it."""
+    parents: tuple[int, ...]
+    """Index of each one's parent, -1 for the root."""
     metres_per_unit: float
     """Length of the unit that the file declares, metres."""
+    worlds: Array
+    """(joints, 4, 4) world matrices at rest."""
+    outer: Array
+    """(4, 4) what takes the frame that the root is in to the world."""
+    ends: dict[int, Array] = field(default_factory=dict)
+    """(3,) tip of a last joint in its frame, by joint."""
+    fault: str = ""
+    """What is wrong with the meshes; empty where nothing is."""
     animations: dict[str, float] = field(default_factory=dict)
     """Seconds by name of the animations that fit the character; empty unless its motion was read."""
     animation: str | None = None
     """Name of the animation that was read."""
+    poses: Any = None
+    """Its poses, as the format has them."""
     parts: list[MeshPart] = field(default_factory=list)
     """Its triangles; empty unless they were read."""
+
+
+class UnevenScaleError(Refusal):
+    """A matrix stretches by different factors along its axes, mirrors, or shears."""
+
+
+def check_size(*tables: Array) -> None:
+    """Refuse matrices (..., 4, 4) that are not finite and within 1000 km."""
+    for table in tables:
+        if not np.isfinite(table).all() or np.abs(table).max(initial=0.0) > _FARTHEST:
+            raise Refusal("its joints are at positions that are not finite, or larger than 1000 km")
+
+
+def chain_matrices(parents: Sequence[int], local: Array, outer: Array) -> Array:
+    """Return world matrices (..., joints, 4, 4) of local ones; `outer` (4, 4) takes the root's frame to the world.
+    Refusal as of `check_size`."""
+    worlds = np.empty_like(local)
+    with np.errstate(all="ignore"):
+        for joint, parent in enumerate(parents):
+            worlds[..., joint, :, :] = (outer if parent < 0 else worlds[..., parent, :, :]) @ local[..., joint, :, :]
+    check_size(worlds)
+    return worlds
+
+
+def split_scales(parents: Sequence[int], worlds: Array, names: Sequence[str] = ()) -> tuple[Array, Array]:
+    """Return rotations (joints, 3, 3) and scales (joints,) of world matrices (joints, 4, 4).
+
+    UnevenScaleError names a joint that is stretched; but last joints, in whose frames no other is, may mirror.
+    """
+    turns, scales = np.empty((len(parents), 3, 3)), np.empty(len(parents))
+    for joint, matrix in enumerate(worlds):
+        try:
+            turns[joint], scales[joint] = split_scale(matrix, may_mirror=joint not in parents)
+        except UnevenScaleError as error:
+            name = names[joint] if names else joint
+            raise UnevenScaleError(f"joint {name}: {error.args[0]}; apply it and export again") from None
+    return turns, scales
+
+
+def split_scale(matrix: Array, *, may_mirror: bool = False) -> tuple[Array, float]:
+    """Return rotation (3, 3) and scale of a (4, 4) matrix that turns and scales alike along all axes.
+
+    UnevenScaleError where it does not: where it stretches, mirrors or shears by more than a thousandth. One that
+    `may_mirror` has a negative scale where it does.
+    """
+    linear, sign = matrix[:3, :3], 1.0
+    if may_mirror and np.linalg.det(linear) < 0:
+        linear, sign = -linear, -1.0
+    lengths = np.linalg.norm(linear, axis=0)
+    scale = float(np.cbrt(abs(np.linalg.det(linear))))
+    if not scale > 1e-9:
+        raise UnevenScaleError("its scale is zero")
+    if np.linalg.det(linear) < 0:
+        raise UnevenScaleError("its scale is negative, which mirrors")
+    if not np.allclose(lengths, scale, rtol=1e-3) or not np.allclose(
+        linear.T @ linear, scale**2 * np.eye(3), atol=2e-3 * scale**2
+    ):
+        raise UnevenScaleError(f"its scale is not the same along all axes ({', '.join(f'{x:.4g}' for x in lengths)})")
+    return nearest_rotations(linear), sign * scale
+
+
+def nearest_rotations(linear: Array) -> Array:
+    """Return the rotations (..., 3, 3) nearest to matrices (..., 3, 3), by singular values."""
+    left, _, right = np.linalg.svd(linear)
+    flip = np.ones(linear.shape[:-1])
+    flip[..., -1] = np.linalg.det(left @ right)
+    return (left * flip[..., None, :]) @ right
+
+
+def complete_bind_pose(parents: Sequence[int], bound: Mapping[int, Array], worlds: Array) -> Array | None:
+    """Complete the world matrices (4, 4) of a bind pose, by joint, with those of the nodes, (joints, 4, 4), for joints
+    that it leaves out; None unless all bones are as long as the nodes', and joints are scaled like them."""
+    done = np.empty_like(worlds)
+    for joint, parent in enumerate(parents):
+        above = np.eye(4) if parent < 0 else done[parent]
+        own = worlds[joint] if parent < 0 else np.linalg.pinv(worlds[parent]) @ worlds[joint]
+        done[joint] = bound.get(joint, above @ own)
+        if parent >= 0:
+            length, usual = (np.linalg.norm(w[joint][:3, 3] - w[parent][:3, 3]) for w in (done, worlds))
+            if abs(length - usual) > _BONE_SHARE * max(usual, 0.02):
+                return None
+    try:
+        scales = split_scales(parents, done)[1] / split_scales(parents, worlds)[1]
+    except UnevenScaleError:
+        return None
+    return done if np.allclose(scales, 1.0, rtol=1e-2) else None
 
 
 def strongest(vertices: Array, carriers: Array, weights: Array, count: int) -> tuple[Array, Array]:
@@ -120,24 +245,27 @@ def strongest(vertices: Array, carriers: Array, weights: Array, count: int) -> t
     vertices, carriers, weights = vertices[kept], carriers[kept], weights[kept]
     order = np.lexsort((-weights, vertices))
     vertices, carriers, weights = vertices[order], carriers[order], weights[order]
-    first = np.searchsorted(vertices, vertices)
-    rank = np.arange(len(vertices)) - first
+    rank = np.arange(len(vertices)) - np.searchsorted(vertices, vertices)
     width = int(min(rank.max(initial=0) + 1, MOST_CARRIERS))
     rows, shares = np.zeros((count, width), np.int64), np.zeros((count, width))
     near = rank < width
     rows[vertices[near], rank[near]] = carriers[near]
     shares[vertices[near], rank[near]] = weights[near]
-    total = shares.sum(axis=1, keepdims=True)
-    shares[total[:, 0] <= 0, 0] = 1.0
-    return rows, shares / np.where(total > 0, total, 1.0)
+    return rows, share_out(shares)
+
+
+def share_out(weights: Array) -> Array:
+    """Divide weights (n, k) by their sums; a vertex without any is the first carrier's."""
+    total = weights.sum(axis=1, keepdims=True)
+    weights[total[:, 0] <= 0, 0] = 1.0
+    return weights / np.where(total > 0, total, 1.0)
 
 
 def split_polygons(counts: Array, skipped: Array | None = None) -> tuple[Array, Array]:
     """Return triangles (m, 3) as indices of corners, each polygon a fan around its first corner, and (m,) the polygon
     that each is of. `counts` (polygons,) are their numbers of corners; polygons with fewer than 3, and those of
     `skipped` (polygons,), have none."""
-    counts = np.asarray(counts, np.int64)
-    starts = np.concatenate([[0], np.cumsum(counts)[:-1]]) if len(counts) else counts
+    starts = np.cumsum(counts) - counts
     triangles = np.maximum(counts - 2, 0)
     if skipped is not None:
         triangles = np.where(skipped, 0, triangles)

@@ -37,7 +37,7 @@ def test_the_rate_is_120_unless_the_file_or_the_caller_says(tmp_path):
     for wrong in (0, -1, 1e9, float("nan")):
         with pytest.raises(RequestError, match="frame rate"):
             mapctl.load(path, fps=wrong)
-    with pytest.raises(RequestError, match=r"a \.bvh file says its frame rate itself"):
+    with pytest.raises(RequestError, match=r"a \.bvh file has a frame rate of its own"):
         mapctl.load("walk.bvh", fps=30)
 
 

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from mapctl.formats.character import RestFrames, UnevenScaleError, chain_matrices
+from mapctl.formats.character import RestFrames
+from mapctl.formats.parts import UnevenScaleError, chain_matrices
 
 PARENTS = (-1, 0, 1, 1, 3)
 NAMES = ("a", "b", "c", "d", "e")

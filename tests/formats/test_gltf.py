@@ -390,8 +390,8 @@ BROKEN = {
     "non-uniform scale": (lambda t, m: t["nodes"][0].update(scale=[0.01, 0.02, 0.01]), "not the same along all axes"),
     "negative scale": (lambda t, m: t["nodes"][0].update(scale=[-0.01, 0.01, 0.01]), "negative, which mirrors"),
     "no scale": (lambda t, m: t["nodes"][0].update(scale=[0, 0, 0]), "zero"),
-    "draco": (lambda t, m: t.update(extensionsRequired=["KHR_draco_mesh_compression"]), "compressed .Draco"),
-    "meshopt": (lambda t, m: t.update(extensionsRequired=["EXT_meshopt_compression"]), "compressed .meshopt"),
+    "draco": (lambda t, m: t.update(extensionsRequired=["KHR_draco_mesh_compression"]), "compressed .KHR_draco"),
+    "meshopt": (lambda t, m: t.update(extensionsRequired=["EXT_meshopt_compression"]), "compressed .EXT_meshopt"),
     "missing buffer": (lambda t, m: t["buffers"][0].update(byteLength=2**28), "should have 268435456 bytes, there are"),
     "file that is not there": (lambda t, m: t["buffers"][0].update(uri="gone.bin"), "'gone.bin', which is not there"),
     "file elsewhere": (lambda t, m: t["buffers"][0].update(uri="../x.bin"), "'../x.bin', which is not in its folder"),
@@ -404,7 +404,7 @@ BROKEN = {
     "no list": (lambda t, m: t.update(skins=7), "is no sound glTF file"),
     "accessor beyond": (lambda t, m: t["skins"][0].update(inverseBindMatrices=999), r"has no accessors\[999\]"),
     "half a letter": (lambda t, m: t["nodes"][0].update(name="\ud800"), "its JSON cannot be read"),
-    "joint beyond": (lambda t, m: t["skins"][0]["joints"].append(999), "names node 999"),
+    "joint beyond": (lambda t, m: t["skins"][0]["joints"].append(999), "has no nodes.999"),
 }
 
 

@@ -6,6 +6,7 @@ import os
 import resource
 import stat
 from fractions import Fraction
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,6 @@ from helpers import run, tiny_density, walk
 
 from mapctl import formats, report
 from mapctl.errors import WriteError
-from mapctl.formats import usd
 from mapctl.formats.atomic import atomic_path, write_bytes
 from priors import checkpoints
 from priors.checkpoints import write_tensors
@@ -55,7 +55,7 @@ WRITERS = {
     "a.json": lambda path: report.write_report({"values": list(range(9000))}, path),
     "a.safetensors": lambda path: write_tensors(path, TENSORS),
     "model.safetensors": _card,
-} | ({"a.usda": _save, "a.usdc": _save} if usd.is_installed() else {})
+} | ({"a.usda": _save, "a.usdc": _save} if find_spec("pxr") else {})
 
 
 @pytest.fixture(params=WRITERS)
