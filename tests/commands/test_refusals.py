@@ -260,7 +260,7 @@ CASES = {
             "in.obj a.bvh": "cannot read the ending '.obj'; allowed: .bvh, .npz, .amc",
             "in.bvh a.fbx": "cannot write a.fbx: .fbx is read but not written; allowed: .bvh, .npz",
             "in.bvh a.vrm": "a .vrm needs a character",
-            "in.bvh a.npz --fps-in 60": "a .bvh file says its frame rate itself",
+            "in.bvh a.npz --fps-in 60": "a .bvh file has a frame rate of its own",
             "in.bvh a.npz --fps 1/0": "frame rate",
             "in.amc a.npz --fps-in 0": "the frame rate must be 0.01 to 1000",
             "broken.amc a.npz": "broken.amc, line 1: expected the number of the first frame, got 'hello'",
@@ -475,6 +475,6 @@ def test_a_package_that_is_not_installed_is_named(folder, monkeypatch, capsys):
     monkeypatch.setattr("mapctl.commands.shared.outputs.find_spec", lambda name: None)
     assert run("follow", "line:4", "-o", "a.bvh", "--video", "a.mp4") == 2
     assert "pip install 'mapctl[render]'" in capsys.readouterr().err
-    monkeypatch.setattr("mapctl.formats.usd.is_installed", lambda: False)
+    monkeypatch.setattr("mapctl.formats.find_spec", lambda name: None)
     assert run("convert", "gone.bvh", "a.usda") == 2
     assert "USD needs the package usd-core: pip install 'mapctl[usd]'" in capsys.readouterr().err
