@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field
+from tyro.conf import arg
 
 from mapctl import curves, formats
 from mapctl.curves import Curve
@@ -31,8 +32,31 @@ Length = Annotated[float, Field(gt=0, le=100)]
 Coordinate = Annotated[float, Field(ge=-1000, le=1000)]
 
 
-@dataclass(frozen=True)
-class Actor:
+@dataclass(frozen=True, kw_only=True)
+class ShotOptions:
+    """What a table of a scene and the options of a command have in common: one character's walk."""
+
+    speed: Annotated[float, Field(gt=0, le=20)] | Annotated[str, Field(min_length=1)] | None = None
+    """Speed along the curve, m/s, or `ARC:SPEED,ARC:SPEED`; the controller's own if not given."""
+    seconds: Annotated[Seconds | None, arg(metavar="NUMBER")] = None
+    """Duration of the walk, seconds; once along the curve if not given."""
+    seed: Annotated[int, Field(ge=0, lt=2**63), arg(metavar="N")] = 0
+    """Seed of everything random: the same seed gives the same file."""
+    gait: Annotated[str | None, arg(metavar="NAME")] = None
+    """Gait of the motion, of those that the prior knows."""
+    style: Annotated[str | None, arg(metavar="NAME")] = None
+    """Style of the motion, of those that the prior knows."""
+    start: Annotated[str, Field(min_length=1), arg(metavar="walk|stand|CLIP:FRAME")] = "walk"
+    """How it begins: in its stride, standing, or going on from a frame of a motion file, on that file's rig and at its
+    rate; of an actor in the clip's position unless `offset` or `turn_deg` are given."""
+    end: Annotated[str, Field(min_length=1), arg(metavar="walk|stand|CLIP:FRAME")] = "walk"
+    """How it ends: in its stride, standing, or in a frame of a motion file."""
+    loop: bool = False
+    """The last frame leads into the first: once around a closed curve."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Actor(ShotOptions):
     """One character of a scene."""
 
     __pydantic_config__ = STRICT
@@ -41,12 +65,6 @@ class Actor:
     """A built-in shape (`circle:4`) or a CSV or SVG file, relative to the scene file; without one the actor stays."""
     name: Annotated[str, Field(pattern=r"^[\w-]+$")] = ""
     """Used in file names; `actor1`, `actor2`, ... if not given."""
-    speed: Annotated[float, Field(gt=0, le=20)] | Annotated[str, Field(min_length=1)] | None = None
-    """Speed along the curve, m/s, or `ARC:SPEED,ARC:SPEED`; the controller's own if not given."""
-    seconds: Seconds | None = None
-    """Duration of the walk, seconds; once along the curve if not given."""
-    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
-    """Seed of everything random about this actor."""
     colour: str | None = None
     """Torso colour: a name from `mapctl.mesh.colours.ACTORS` or `#rrggbb`; each actor's own if not given."""
     rig: Annotated[str, Field(min_length=1)] | None = None
@@ -56,17 +74,6 @@ class Actor:
     """File of a skinned character that is drawn, relative to the scene file; the mannequin if not given."""
     speed_by_time: tuple[tuple[Seconds0, Annotated[float, Field(ge=0, le=20)]], ...] | None = None
     """Speed along the curve by time, pairs of seconds and m/s, zero allowed; instead of `speed`."""
-    gait: str | None = None
-    """Gait of the motion, of those that the prior knows."""
-    style: str | None = None
-    """Style of the motion, of those that the prior knows."""
-    start: Annotated[str, Field(min_length=1)] = "walk"
-    """How it begins: `walk`, `stand`, or `CLIP:FRAME`, going on from that frame of a motion file, on its rig and at its
-    rate, in its place unless `offset` or `turn_deg` are given."""
-    end: Annotated[str, Field(min_length=1)] = "walk"
-    """How it ends: `walk`, `stand`, or `CLIP:FRAME`, in that frame of a motion file."""
-    loop: bool = False
-    """Whether its last frame leads into its first: once around a closed curve."""
     keys: tuple[ShotKey, ...] = ()
     """What it does on the way, one [[actors.keys]] table each."""
     offset: tuple[Coordinate, Coordinate] | None = None

@@ -33,8 +33,8 @@ from mapctl.errors import MapctlError, RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.intent.steering import Arrival, Command, SteeringLimits
 from mapctl.protocols import Density
-from mapctl.runtime.file_jobs import open_pipe, preload, send_queued, spawn
 from mapctl.runtime.live_protocol import FrameChunk
+from mapctl.runtime.processes import open_pipe, preload, send_queued, spawn
 from mapctl.skeleton import CANONICAL, Skeleton
 
 _ARRIVAL_DISTANCE = 0.15  # metres before the end of a path at which the character stops

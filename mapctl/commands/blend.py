@@ -9,7 +9,7 @@ from tyro.conf import arg
 import priors
 from controllers.inbetweening.blend import LimbTransfer, blend
 from controllers.inbetweening.pipeline import InfillSettings
-from mapctl.commands.shared import inputs, options, outputs, results
+from mapctl.commands.shared import inputs, options, results
 from mapctl.commands.shared.command import ModelCommand, conclude
 from mapctl.commands.shared.options import parse_frame, parse_range
 
@@ -55,8 +55,7 @@ def run(command: Blend) -> int:
     transfer = LimbTransfer(names, start, stop, parse_frame(command.at, fps=float(motion.fps)), margin=command.margin)
     settings = InfillSettings(finish=not command.no_finish)
     done = blend(motion, other, transfer, priors.load_inbetweener(command.inbetweener), settings=settings, rig=rig)
-    outputs.save_motion(done.motion, command.out)
-    results.film_comparison(motion, done.motion, command.video, rig=rig, quiet=command.quiet)
+    results.write_result("blend", command, done, motion, rig=rig)
     if not command.quiet:
         print("\n".join((f"{command.out}: {done.motion.num_frames} frames", *done.notes)))
     return conclude(done.status, strict=command.strict)

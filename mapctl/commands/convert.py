@@ -1,6 +1,6 @@
 """`mapctl convert`: any format to any format, other bones, another frame rate, and edits that everybody needs."""
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from fractions import Fraction
 from pathlib import Path
 from time import perf_counter
@@ -12,15 +12,13 @@ from mapctl import __version__, editing, formats, report, retarget
 from mapctl.commands.shared import folders, inputs, options, outputs
 from mapctl.commands.shared.command import Command
 from mapctl.commands.shared.options import parse_range
-from mapctl.editing import GroundTransform
 from mapctl.editing.rigged_motion import RiggedMotion
 from mapctl.errors import RequestError
 from mapctl.metrics import feet
 from mapctl.motion import Motion
 from mapctl.retarget import as_rig, identify_rig
-from mapctl.retarget.carry import Changes, GroundMode, RiggedCharacter, retarget_motion
+from mapctl.retarget.carry import Changes, RiggedCharacter, retarget_motion
 from mapctl.retarget.rigs import Rig
-from mapctl.runtime.file_jobs import FileJob, FileResult, run_over_processes, try_job
 
 
 @dataclass(frozen=True)
@@ -86,15 +84,11 @@ class Converted:
 
     motion: Motion
     """The motion, on its rig and in its layout."""
-    rig: Rig | None = None
-    """Its rig, as it was identified; None where nobody asked."""
-    lines: tuple[str, ...] = ()
+    lines: tuple[str, ...]
     """What was done to it, for the user."""
-    cycle: GroundTransform | None = None
-    """Travel by cycle, of a loop."""
-    changes: Changes | None = None
+    changes: Changes | None
     """What was changed on the way to another rig."""
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...]
     """The same in sentences, as far as it is worth one."""
 
 
@@ -119,44 +113,58 @@ class Conversion:
         if command.in_place and command.root_motion:
             raise RequestError("--in-place takes the travel out and --root-motion puts it on the root; choose one")
         fps, fps_in = (None if text is None else parse_fps(text) for text in (command.fps, command.fps_in))
-        return Conversion(command, fps, fps_in, inputs.read_rig(command.source_rig, command), read_body(command.rig))
+        body = None if command.rig in (None, "canonical") else inputs.read_rigged(command.rig)
+        return Conversion(command, fps, fps_in, inputs.read_rig(command.source_rig, command), body)
 
     def convert(self, source: Path) -> Converted:
         """Read a file and convert it."""
-        command = self.command
-        done = self._cut(inputs.read_motion(source, self.source_rig, fps=self.fps_in, quiet=command.quiet))
-        if command.rig is not None:
-            done = transfer_to_rig(done.motion, self.body, self.source_rig, ground=command.ground)
-            done = replace(done, lines=tuple(f"note: {note}" for note in done.notes))
-        if self.fps is not None:
-            done = replace(done, motion=done.motion.resample(self.fps))
-        if command.mirror:
-            done = replace(done, motion=editing.mirror(done.motion, done.rig))
-        if command.loop:
-            done = _loop(done)
-        if command.plant_feet:
-            done = _plant_feet(done)
-        if command.in_place:
-            done = replace(done, motion=editing.remove_travel(done.motion, done.rig, done.cycle))
-        if command.root_motion:
-            done = replace(done, motion=editing.move_travel_to_root(done.motion, done.rig, done.cycle))
-        ending = (command.to or command.out.suffix).lstrip(".").lower()
-        if ending == "vrma" and not getattr(done.motion.source, "humanoid", None):  # no other rig is one that it names
-            done = replace(done, motion=retarget.to_canonical(done.motion, done.rig or self.source_rig)[0])
-        return done
-
-    def _cut(self, motion: Motion) -> Converted:
-        """Cut the frames that are asked for, of a rig that the whole clip shows."""
-        command = self.command
-        edited = any((command.mirror, command.loop, command.plant_feet, command.in_place, command.root_motion))
-        rig = self.source_rig
-        if edited and command.rig is None:
+        command, rig, notes = self.command, self.source_rig, list[str]()
+        # Of other files than .amc the rate is in the file.
+        fps_in = self.fps_in if source.suffix.lower() == ".amc" or not command.source.is_dir() else None
+        motion = inputs.read_motion(source, rig, fps=fps_in, quiet=command.quiet)
+        edited = command.mirror or command.loop or command.plant_feet or command.in_place or command.root_motion
+        if edited and command.rig is None:  # before frames are cut, since the whole clip shows the rig
             rig = as_rig(identify_rig(motion.skeleton, rig, motion=motion))
-        if command.frames is None:
-            return Converted(motion, rig)
-        fps, frames = float(motion.fps), motion.num_frames
-        start, stop = parse_range(command.frames, fps=fps, frames=frames, what="range of frames")
-        return Converted(motion.slice(start, stop), rig)
+        if command.frames is not None:
+            fps, frames = float(motion.fps), motion.num_frames
+            motion = motion.slice(*parse_range(command.frames, fps=fps, frames=frames, what="range of frames"))
+        changes, cycle, lines = None, None, list[str]()
+        if command.rig == "canonical":
+            motion, rig = retarget.to_canonical(motion, self.source_rig)[0], retarget.load_rig("canonical")
+        elif self.body is not None:
+            found = retarget_motion(motion, self.body, self.source_rig, ground=command.ground)
+            original = motion if motion.skeleton.matches(self.body.rigmap.rig_skeleton) else None
+            motion = self.body.on_rig(found.motion, original=original, fingers=found.fingers)
+            rig, changes, notes = as_rig(self.body.rigmap), found.changes, list(found.notes)
+            lines = [f"note: {note}" for note in notes]
+        if self.fps is not None:
+            motion = motion.resample(self.fps)
+        if command.mirror:
+            motion = editing.mirror(motion, rig)
+        if command.loop:
+            loop = editing.close_loop(motion, rig)
+            motion, cycle = loop.motion, loop.travel
+            frames = f"{loop.cycle.start}:{loop.cycle.stop}"
+            lines.append(f"loop: frames {frames}, {motion.seconds:.2f} s, travel {cycle.distance:.2f} m")
+        if command.plant_feet:
+            planted = editing.plant_feet(motion, rig, cycle=cycle)
+            lines.append(f"feet: {_describe_feet(motion, rig)} before, {_describe_feet(planted, rig)} after")
+            motion = planted
+        if command.in_place:
+            motion = editing.remove_travel(motion, rig, cycle)
+        if command.root_motion:
+            motion = editing.move_travel_to_root(motion, rig, cycle)
+        ending = (command.to or command.out.suffix).lstrip(".").lower()
+        if ending == "vrma" and not getattr(motion.source, "humanoid", None):  # no other rig is one that it names
+            motion = retarget.to_canonical(motion, rig or self.source_rig)[0]
+        return Converted(motion, tuple(lines), changes, tuple(notes))
+
+    def __call__(self, source: Path, out: Path) -> tuple[int, float]:
+        """Convert one file of a folder and write the result; return its frames and the seconds that it took."""
+        start = perf_counter()
+        motion = self.convert(source).motion
+        formats.save(motion, out)
+        return motion.num_frames, perf_counter() - start
 
 
 def parse_fps(text: str) -> Fraction:
@@ -170,42 +178,6 @@ def parse_fps(text: str) -> Fraction:
     return fps
 
 
-def read_body(rig: str | None) -> RiggedCharacter | None:
-    """Read the body that a --rig option names: of a clip, or a rig by name; None for `canonical` and without one.
-    RequestError for rigs that are not known."""
-    return None if rig in (None, "canonical") else RiggedCharacter.of(*inputs.read_rig_clip(rig))[1]
-
-
-def transfer_to_rig(
-    motion: Motion, body: RiggedCharacter | None, source_rig: Rig | None = None, *, ground: GroundMode = "fit"
-) -> Converted:
-    """Retarget a motion to a body in the layout of its file, or without one to the canonical joints; and note what
-    could not be kept.
-
-    A clip of the same skeleton stays as it is; others get their floor (see mapctl.retarget.carry), with stairs and
-    platforms as `ground` says.
-    """
-    if body is None:
-        return Converted(retarget.to_canonical(motion, source_rig)[0], retarget.load_rig("canonical"))
-    found = retarget_motion(motion, body, source_rig, ground=ground)
-    original = motion if motion.skeleton.matches(body.rigmap.rig_skeleton) else None
-    on_rig = body.on_rig(found.motion, original=original, fingers=found.fingers)
-    return Converted(on_rig, as_rig(body.rigmap), changes=found.changes, notes=found.notes)
-
-
-def _loop(done: Converted) -> Converted:
-    loop = editing.close_loop(done.motion, done.rig)
-    frames, way = f"{loop.cycle.start}:{loop.cycle.stop}", f"{loop.travel.distance:.2f} m"
-    line = f"loop: frames {frames}, {loop.motion.seconds:.2f} s, travel {way}"
-    return replace(done, motion=loop.motion, cycle=loop.travel, lines=(*done.lines, line))
-
-
-def _plant_feet(done: Converted) -> Converted:
-    planted = editing.plant_feet(done.motion, done.rig, cycle=done.cycle)
-    before, after = (_describe_feet(motion, done.rig) for motion in (done.motion, planted))
-    return replace(done, motion=planted, lines=(*done.lines, f"feet: {before} before, {after} after"))
-
-
 def _describe_feet(motion: Motion, rig: Rig | None) -> str:
     toes = feet.ToeMeasurements.of(RiggedMotion.of(motion, rig).positions("Toes"), float(motion.fps))
     return f"planted toes {100 * feet.contact_speed(toes):.1f} cm/s, skate {100 * feet.skate(toes):.1f} cm/s"
@@ -217,66 +189,35 @@ def run(command: Convert) -> int:
         option = "--report" if command.report is not None else "--ground"
         raise RequestError(f"{option} is about motion on another rig; name one by --rig")
     if command.source.is_dir():
-        return run_folder(command)
+        if command.report is not None:
+            raise RequestError("--report is on one file; a folder has none")
+        ending = None if command.to is None else f".{command.to.lower().removeprefix('.')}"
+        if ending is not None:
+            formats.check_ending(f"a{ending}")
+        return folders.run_folder(
+            command.source,
+            command.out,
+            Conversion.of(command),
+            label="converting",
+            done="converted",
+            again=command.again,
+            quiet=command.quiet,
+            processes=command.jobs,
+            ending=ending,
+        )
     for name, idle in (("to", command.to is None), ("again", not command.again), ("jobs", command.jobs == 1)):
         if not idle:
             raise RequestError(f"--{name} is for folders; {command.source} is a file")
     formats.check_ending(command.out)
     outputs.check_files([command.out, *options.collect_paths(command.report)])
     done = Conversion.of(command).convert(command.source)
-    motion = done.motion
-    formats.save(motion, command.out)
-    _write_report(command, done)
+    formats.save(done.motion, command.out)
+    if command.report is not None and done.changes is not None:
+        request = options.describe_request("convert", command)
+        changes = asdict(done.changes) | {"notes": list(done.notes)}
+        report.write_report({"mapctl": __version__, "request": request, "changes": changes}, command.report)
     if not command.quiet:
-        rate = f"{float(motion.fps):.6g} frames a second"
-        print(
-            "\n".join([f"{command.out}: {motion.num_frames} frames, {motion.num_joints} joints, {rate}", *done.lines])
-        )
+        rate = f"{float(done.motion.fps):.6g} frames a second"
+        size = f"{done.motion.num_frames} frames, {done.motion.num_joints} joints"
+        print("\n".join([f"{command.out}: {size}, {rate}", *done.lines]))
     return 0
-
-
-def _write_report(command: Convert, done: Converted) -> None:
-    """Write what was changed on the way to the rig, if a report is requested."""
-    if command.report is None or done.changes is None:
-        return
-    request = options.describe_request("convert", command)
-    changes = asdict(done.changes) | {"notes": list(done.notes)}
-    report.write_report({"mapctl": __version__, "request": request, "changes": changes}, command.report)
-
-
-@dataclass(frozen=True)
-class FileConverter:
-    """Converter of single files, cheap to send to a process."""
-
-    conversion: Conversion
-    """What is to be done with each."""
-
-    def __call__(self, job: FileJob) -> FileResult:
-        """Convert one file and write the result; errors are in what is returned, except DiskFullError."""
-        return try_job(job, self._convert)
-
-    def _convert(self, job: FileJob) -> tuple[int, float]:
-        start = perf_counter()
-        # Of other files than these the rate is in the file.
-        fps_in = self.conversion.fps_in if job.source.suffix.lower() == ".amc" else None
-        motion = replace(self.conversion, fps_in=fps_in).convert(job.source).motion
-        job.out.parent.mkdir(parents=True, exist_ok=True)
-        formats.save(motion, job.out)
-        return motion.num_frames, perf_counter() - start
-
-
-def run_folder(command: Convert) -> int:
-    """Check, convert what is not done yet, list what failed."""
-    if command.report is not None:
-        raise RequestError("--report is on one file; a folder has none")
-    if command.jobs < 1:
-        raise RequestError(f"--jobs must be at least 1, got {command.jobs}")
-    ending = command.to
-    if ending is not None:
-        ending = ending.lower() if ending.startswith(".") else f".{ending.lower()}"
-        formats.check_ending(f"a{ending}")
-    converter = FileConverter(Conversion.of(command))
-    jobs, skipped = folders.collect_jobs(command.source, command.out, again=command.again, ending=ending)
-    ended = run_over_processes(jobs, converter, processes=command.jobs)
-    found = folders.await_results(ended, len(jobs), label="converting", again=command.again, quiet=command.quiet)
-    return folders.conclude(command.out, found, skipped, done="converted", quiet=command.quiet)

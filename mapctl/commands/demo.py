@@ -1,7 +1,7 @@
 """`mapctl demo`: path following on the bundled prior, from nothing to a film."""
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 
 import priors
@@ -10,7 +10,8 @@ from mapctl import report
 from mapctl.commands.shared import inputs, options, outputs
 from mapctl.commands.shared.command import INTERRUPTED, ModelCommand
 from mapctl.commands.shared.outputs import show_progress
-from mapctl.commands.shared.shots import PlayedShot, plan_shot, play_shot
+from mapctl.commands.shared.shots import plan_shot, play_shot
+from mapctl.errors import RequestError
 from scenes.cameras import CameraSettings
 from scenes.film import film
 from scenes.scene_file import Actor
@@ -45,7 +46,12 @@ def run(command: Demo) -> int:
     """
     options.check_seed(command.seed)
     outputs.check_folder(command.out)
-    missing = {ending: outputs.find_missing_render(ending) for ending in ("mp4", "png")}
+    missing = {}
+    for ending, packages in (("mp4", ("av", "PIL")), ("png", ("PIL",))):
+        try:
+            outputs.require_render(*packages, "matplotlib" if find_spec("pyrender") is None else "pyrender")
+        except RequestError as error:
+            missing[ending] = str(error)
     actor, curve = Actor(curve=CURVE, speed=SPEED, seed=command.seed), inputs.read_curve(CURVE, None)
     plan = plan_shot(
         actor, curve, priors.load(command.prior), character=Character(), folder=Path(), options=options.ReadOptions()
@@ -53,30 +59,17 @@ def run(command: Demo) -> int:
     with show_progress("walking", quiet=command.quiet) as progress:
         done = play_shot(plan, progress=progress)
     with outputs.make_folder(command.out) as folder:
-        pictures = () if done.interrupted else (ending for ending, lacking in missing.items() if not lacking)
+        pictures = [e for e in ("mp4", "png") if e not in missing and not done.interrupted]
         files = {ending: folder / f"figure8.{ending}" for ending in ("bvh", "json", *pictures)}
-        _write(command, done, files)
+        outputs.save_motion(done.solution.motion, files["bvh"])
+        request = options.describe_request("demo", command) | {"curve": CURVE, "speed": SPEED}
+        report.write_report(done.report(request), files["json"])
+        if films := [files[ending] for ending in ("mp4", "png") if ending in files]:
+            with show_progress("filming", quiet=command.quiet) as progress:
+                actors = [(done.solution.motion, done.request.curve)]
+                film(actors, films, camera=CameraSettings("fixed"), size=_SIZE, progress=progress)
     if not command.quiet:
         print("\n".join([*done.summary(), f"wrote     {', '.join(map(str, files.values()))}"]))
-        if any(missing.values()):
-            print(f"not made  {_describe_missing(missing)}")
+        if missing:
+            print(f"not made  {', '.join(f'.{ending}' for ending in missing)}: {next(iter(missing.values()))}")
     return INTERRUPTED if done.interrupted else 0
-
-
-def _describe_missing(missing: Mapping[str, Sequence[str]]) -> str:
-    """Describe which films are left out, and what they need."""
-    endings = ", ".join(f".{ending}" for ending, lacking in missing.items() if lacking)
-    packages = list(dict.fromkeys(package for lacking in missing.values() for package in lacking))
-    return f"{endings}: {outputs.describe_missing_render(packages)}"
-
-
-def _write(command: Demo, done: PlayedShot, files: dict[str, Path]) -> None:
-    outputs.save_motion(done.solution.motion, files["bvh"])
-    request = options.describe_request("demo", command) | {"curve": CURVE, "speed": SPEED}
-    report.write_report(done.report(request), files["json"])
-    films = [files[ending] for ending in ("mp4", "png") if ending in files]
-    if not films:
-        return
-    with show_progress("filming", quiet=command.quiet) as progress:
-        actors = [(done.solution.motion, done.request.curve)]
-        film(actors, films, camera=CameraSettings("fixed"), size=_SIZE, progress=progress)

@@ -1,11 +1,10 @@
 """`mapctl denoise`: a noisy capture is denoised, on its own rig."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated
 
 import torch
 from tyro.conf import Positional, arg
@@ -19,68 +18,12 @@ from mapctl.commands.shared import folders, inputs, options, outputs, results
 from mapctl.commands.shared.command import ModelCommand, conclude
 from mapctl.commands.shared.outputs import show_progress
 from mapctl.errors import RequestError
-from mapctl.motion import Motion, join_licences
+from mapctl.motion import join_licences
 from mapctl.protocols import Denoiser, Inbetweener
 from mapctl.recording.masks import load_masks, masks_from_missing
 from mapctl.retarget.rigs import Rig
-from mapctl.runtime.file_jobs import FileJob, FileResult, run_over_cluster, run_over_processes, try_job
 from mapctl.skeleton import CANONICAL
 from priors import weight_sets
-
-
-@dataclass(frozen=True)
-class FileDenoiser:
-    """Denoiser of single files, cheap to send to a process, which loads the network on first use."""
-
-    load: Callable[[], Denoiser]
-    """Loader of the network: `functools.partial(priors.load_denoiser, "denoiser")`."""
-    settings: DenoiseSettings
-    """Settings for all files."""
-    load_inbetweener: Callable[[], Inbetweener] | None = None
-    """Loader of the network that fills what is lost for longer; None leaves that to the denoiser."""
-    rig: Rig | None = None
-    """Rig of all files, where it is not the one that would be recognised."""
-    after: Callable[[FileJob, DenoiseSolution], None] | None = None
-    """Function called with each result, in that process: to write a report."""
-    licence: str = ""
-    """Licence of the results, beside that of each motion; for formats that keep one."""
-    on_read: Callable[[Path, Motion, Rig | None], None] | None = None
-    """Function called with each file, its motion and its rig, in that process: to print what is doubtful."""
-
-    def __call__(self, job: FileJob) -> FileResult:
-        """Denoise one file and write the result; errors are in what is returned, except DiskFullError."""
-        torch.set_num_threads(1)
-        return try_job(job, self._denoise)
-
-    def _denoise(self, job: FileJob) -> tuple[int, float]:
-        unit = None if self.rig is None else self.rig.metres_per_unit
-        motion, missing = formats.load_with_missing(job.source, metres_per_unit=unit)
-        if self.on_read is not None:
-            self.on_read(job.source, motion, self.rig)
-        masks = masks_from_missing(motion, missing)
-        inbetweener = None if self.load_inbetweener is None else _load_once(self.load_inbetweener)
-        denoiser = _load_once(self.load)
-        done = denoise(motion, denoiser, inbetweener=inbetweener, masks=masks, settings=self.settings, rig=self.rig)
-        done = replace(done, motion=replace(done.motion, licence=motion.licence))
-        job.out.parent.mkdir(parents=True, exist_ok=True)
-        if self.after is not None:
-            self.after(job, done)
-        licence = join_licences((self.licence, motion.licence))
-        formats.save(replace(done.motion, licence=licence), job.out)
-        return done.motion.num_frames, done.seconds
-
-
-_Network = TypeVar("_Network", Denoiser, Inbetweener)
-_LOADED: dict[str, Any] = {}  # the denoiser and the in-betweener that this process loaded last
-
-
-def _load_once(load: Callable[[], _Network]) -> _Network:
-    key = repr(load)
-    if key not in _LOADED:
-        if len(_LOADED) > 1:
-            _LOADED.clear()
-        _LOADED[key] = load()
-    return _LOADED[key]
 
 
 @dataclass(frozen=True)
@@ -133,28 +76,32 @@ _DEFAULT_DELAY = 0.2  # seconds
 
 def run(command: Denoise) -> int:
     """Check everything, denoise, write, report."""
+    if command.causal and command.prior is not None:
+        raise RequestError("--causal has no time for a density; leave --prior out")
+    if command.causal and command.inbetweener is not None:
+        raise RequestError("--causal leaves what is lost to the denoiser; leave --inbetweener out")
+    if command.delay is not None and not command.causal:
+        raise RequestError("--delay is how far --causal may look ahead; leave it out, or ask for both")
     if command.source.is_dir():
-        return run_folder(command, read_settings(command))
-    _check(command)
-    done = _run_denoising(command)
-    outputs.save_motion(done.motion, command.out)
-    if command.report is not None:
-        report.write_report(results.build_report("denoise", command, done), command.report)
-    results.film_comparison(done.capture, done.motion, command.video, rig=done.rig, quiet=command.quiet)
-    if not command.quiet:
-        _print_summary(command, done)
-    return conclude(done.status, strict=command.strict)
-
-
-def _check(command: Denoise) -> None:
+        return _run_folder(command)
     for name, idle in (("cluster", command.cluster is None), ("again", not command.again), ("jobs", command.jobs == 1)):
         if not idle:
             raise RequestError(f"--{name} is for folders; {command.source} is a file")
     results.check_destinations(command.out, command.video, command.report, given=(command.source,))
+    done = _denoise_file(command)
+    results.write_result("denoise", command, done, done.capture, rig=done.rig)
+    if not command.quiet:
+        moved, (joint, frame, most) = float(done.correction()[0].mean()), done.find_largest_move()
+        print(
+            f"{command.out}: {done.motion.num_frames} frames at {float(done.motion.fps):.6g} a second; joints moved by"
+            f" {moved:.1f} cm on average, most {joint} in frame {frame}, {most:.1f} cm; {done.frame_ms:.1f} ms a frame"
+        )
+        print("\n".join([*_format_certainty(done), *_format_faults(done), *done.notes, *_format_densities(done)]))
+    return conclude(done.status, strict=command.strict)
 
 
-def _run_denoising(command: Denoise) -> DenoiseSolution:
-    settings, rig = read_settings(command), inputs.read_rig(command.rig, command)
+def _denoise_file(command: Denoise) -> DenoiseSolution:
+    settings, rig = DenoiseSettings(anchor=command.anchor), inputs.read_rig(command.rig, command)
     named_masks = () if command.mask is None else load_masks(command.mask)
     densities = priors.load_choice(command.prior)
     denoiser = priors.load_denoiser(command.denoiser)
@@ -178,30 +125,7 @@ def _run_denoising(command: Denoise) -> DenoiseSolution:
         )
 
 
-def read_settings(command: Denoise) -> DenoiseSettings:
-    """Read the settings from the options; RequestError for numbers that make no sense."""
-    if command.causal and command.prior is not None:
-        raise RequestError("--causal has no time for a density; leave --prior out")
-    if command.causal and command.inbetweener is not None:
-        raise RequestError("--causal leaves what is lost to the denoiser; leave --inbetweener out")
-    if command.delay is not None and not command.causal:
-        raise RequestError("--delay is how far --causal may look ahead; leave it out, or ask for both")
-    return DenoiseSettings(anchor=command.anchor)
-
-
-def _print_summary(command: Denoise, done: DenoiseSolution) -> None:
-    moved, (joint, frame, most) = float(done.correction()[0].mean()), done.find_largest_move()
-    print(
-        f"{command.out}: {done.motion.num_frames} frames at {float(done.motion.fps):.6g} a second; joints moved by"
-        f" {moved:.1f} cm on average, most {joint} in frame {frame}, {most:.1f} cm; {done.frame_ms:.1f} ms a frame"
-    )
-    for line in (*format_certainty(done), *format_faults(done)):
-        print(line)
-    for note in (*done.notes, *format_densities(done)):
-        print(note)
-
-
-def format_certainty(done: DenoiseSolution) -> list[str]:
+def _format_certainty(done: DenoiseSolution) -> list[str]:
     """Format the expected error of the joints' angles, and how far the model's proposal was used."""
     if not any(fault.kind == "noise" for fault in done.faults):
         return []
@@ -212,17 +136,17 @@ def format_certainty(done: DenoiseSolution) -> list[str]:
     return [line + (f", least in {', '.join(rare)}: there the capture corrects it, or is filtered" if rare else "")]
 
 
-def format_faults(done: DenoiseSolution) -> list[str]:
-    """Format the artefacts, a line for each kind."""
-    kinds: dict[str, dict[str, list]] = {}
-    for fault in done.faults:
-        kinds.setdefault(fault.kind, {}).setdefault(fault.joint, []).append(fault)
+def _format_faults(done: DenoiseSolution) -> list[str]:
+    """Format the artefacts, a line for each kind, the worst joints first."""
     lines = []
-    for kind, joints in kinds.items():
-        worst = sorted(joints, key=lambda name: -max(fault.amount for fault in joints[name]))
+    for kind in dict.fromkeys(fault.kind for fault in done.faults):
+        joints: dict[str, list] = {}
+        for fault in done.faults:
+            if fault.kind == kind:
+                joints.setdefault(fault.joint, []).append(fault)
+        worst = sorted(joints.items(), key=lambda item: -max(fault.amount for fault in item[1]))
         named = []
-        for name in worst[:_MAX_NAMED]:
-            found = joints[name]
+        for name, found in worst[:_MAX_NAMED]:
             top = max(found, key=lambda fault: fault.amount)
             amount = f" {top.amount:.1f} {top.unit}" if top.unit else f" {sum(f.stop - f.start for f in found)} frames"
             named.append(f"{name}{amount}" + (f" ({len(found)} times)" if len(found) > 1 else ""))
@@ -231,82 +155,86 @@ def format_faults(done: DenoiseSolution) -> list[str]:
     return lines
 
 
-def format_densities(done: DenoiseSolution) -> list[str]:
+def _format_densities(done: DenoiseSolution) -> list[str]:
     """Format which densities counted, the likelihood under each, and where they were out of their depth."""
-    if not done.density_intervals:
+    parts = done.density_intervals
+    if not parts:
         return []
-    frames = {name: 0 for name in done.density_intervals[0].nats}
-    totals = dict.fromkeys(frames, 0.0)
-    for part in done.density_intervals:
-        frames[part.prior] += part.stop - part.start
-        for name, nats in part.nats.items():
-            totals[name] += nats * (part.stop - part.start)
-    whole = sum(frames.values())
-    nats_by_density = ", ".join(
-        f"{name} {totals[name] / whole:.0f} nats a frame, used in {frames[name]}" for name in frames
-    )
-    lines = [f"prior: {nats_by_density} of {whole} frames"]
-    low_weights = [part for part in done.density_intervals if part.weight < _LOW_WEIGHT]
-    if low_weights:
-        intervals = ", ".join(f"{part.start}:{part.stop}" for part in low_weights[:_MAX_NAMED])
-        rest = len(low_weights) - _MAX_NAMED
-        lines.append(
-            f"prior out of its depth, so that it counts for less than half: frames {intervals}"
-            + (f" and {rest} more windows" if rest > 0 else "")
-        )
+    whole = sum(part.stop - part.start for part in parts)
+    densities = []
+    for name in parts[0].nats:
+        nats = sum(part.nats.get(name, 0.0) * (part.stop - part.start) for part in parts) / whole
+        used = sum(part.stop - part.start for part in parts if part.prior == name)
+        densities.append(f"{name} {nats:.0f} nats a frame, used in {used}")
+    lines = [f"prior: {', '.join(densities)} of {whole} frames"]
+    low = [f"{part.start}:{part.stop}" for part in parts if part.weight < _LOW_WEIGHT]
+    if low:
+        rest = f" and {len(low) - _MAX_NAMED} more windows" if len(low) > _MAX_NAMED else ""
+        intervals = ", ".join(low[:_MAX_NAMED])
+        lines.append(f"prior out of its depth, so that it counts for less than half: frames {intervals}{rest}")
     return lines
 
 
-def run_folder(command: Denoise, settings: DenoiseSettings) -> int:
+def _run_folder(command: Denoise) -> int:
     """Check, denoise what is not done yet, list what failed."""
-    jobs, skipped = collect_jobs(command)
-    priors.load_denoiser(command.denoiser)  # a typing error is reported once, now
-    load = partial(priors.load_denoiser, priors.add_set(command.denoiser))
-    load_inbetweener = partial(priors.load_inbetweener, priors.add_set(command.inbetweener or "transformer"))
-    load_inbetweener()
-    used = dict(weight_sets.find_used_licences())  # what the processes use, and they do not record
-    after = None if command.report is None else ReportWriter(command, command.report, used)
-    licence = outputs.format_used_licences()
-    rig, on_read = inputs.read_rig(command.rig, command), None if command.quiet else inputs.print_doubts
-    file_denoiser = FileDenoiser(load, settings, load_inbetweener, rig, after, licence, on_read)
-    if command.cluster is not None:
-        ended = run_over_cluster(jobs, file_denoiser, address=command.cluster, workers=command.jobs)
-    else:
-        ended = run_over_processes(jobs, file_denoiser, processes=command.jobs)
-    found = folders.await_results(ended, len(jobs), label="denoising", again=command.again, quiet=command.quiet)
-    return folders.conclude(command.out, found, skipped, done="denoised", quiet=command.quiet)
-
-
-def collect_jobs(command: Denoise) -> tuple[list[FileJob], int]:
-    """Collect the jobs, and the number of files done already; RequestError for options that folders do not take."""
     for name in ("mask", "video", "prior", "causal", "strict"):
         if getattr(command, name):
             raise RequestError(f"--{name} is for single files; {command.source} is a folder")
-    if command.jobs < 1:
-        raise RequestError(f"--jobs must be at least 1, got {command.jobs}")
     if command.cluster not in (None, "local") and command.jobs != 1:
         raise RequestError(f"--jobs is for this machine; the cluster at {command.cluster} has workers of its own")
     if command.report is not None:
         outputs.check_folder(command.report)
-    return folders.collect_jobs(command.source, command.out, again=command.again)
+    names = (priors.add_set(command.denoiser), priors.add_set(command.inbetweener or "transformer"))
+    _load(*names)  # a typing error is reported once, now; and what processes use is recorded here
+    return folders.run_folder(
+        command.source,
+        command.out,
+        FileDenoiser(command, *names, inputs.read_rig(command.rig, command), dict(weight_sets.find_used_licences())),
+        label="denoising",
+        done="denoised",
+        again=command.again,
+        quiet=command.quiet,
+        processes=command.jobs,
+        cluster=command.cluster,
+    )
 
 
 @dataclass(frozen=True)
-class ReportWriter:
-    """Writer of a report for each file, in the process that denoised it."""
+class FileDenoiser:
+    """Denoiser of the files of a folder, cheap to send to a process, which loads the networks on first use."""
 
     command: Denoise
     """The command."""
-    folder: Path
-    """Folder of the reports, named as the results."""
-    used: dict[str, str]
+    denoiser: str
+    """Name of the denoiser, with its set of weights."""
+    inbetweener: str
+    """Name of the network that fills what is lost for longer."""
+    rig: Rig | None
+    """Rig of all files, where it is not the one that would be recognised."""
+    licences: dict[str, str]
     """Licences of the models; that of the motion joins them."""
 
-    def __call__(self, job: FileJob, done: DenoiseSolution) -> None:
-        """Write one report."""
-        path = (self.folder / job.out.relative_to(self.command.out)).with_suffix(".json")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        own = done.motion.licence
-        used = self.used | ({str(job.source): weight_sets.shorten_licence(own)} if own else {})
-        told = results.build_report("denoise", self.command, done)
-        report.write_report(told | weight_sets.describe_licences(used), path)
+    def __call__(self, source: Path, out: Path) -> tuple[int, float]:
+        """Denoise one file and write the result and its report; return frames and seconds of compute."""
+        torch.set_num_threads(1)
+        command, unit = self.command, None if self.rig is None else self.rig.metres_per_unit
+        motion, missing = formats.load_with_missing(source, metres_per_unit=unit)
+        if not command.quiet:
+            inputs.print_doubts(source, motion, self.rig)
+        masks, (denoiser, inbetweener) = masks_from_missing(motion, missing), _load(self.denoiser, self.inbetweener)
+        settings = DenoiseSettings(anchor=command.anchor)
+        done = denoise(motion, denoiser, inbetweener=inbetweener, masks=masks, settings=settings, rig=self.rig)
+        own = {str(source): weight_sets.shorten_licence(motion.licence)} if motion.licence else {}
+        if command.report is not None:
+            path = (command.report / out.relative_to(command.out)).with_suffix(".json")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            found = results.build_report("denoise", command, done)
+            report.write_report(found | weight_sets.describe_licences(self.licences | own), path)
+        models = weight_sets.format_licences(weight_sets.shorten_names(self.licences))
+        formats.save(replace(done.motion, licence=join_licences((models, motion.licence))), out)
+        return done.motion.num_frames, done.seconds
+
+
+@cache
+def _load(denoiser: str, inbetweener: str) -> tuple[Denoiser, Inbetweener]:
+    return priors.load_denoiser(denoiser), priors.load_inbetweener(inbetweener)

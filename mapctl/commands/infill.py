@@ -10,13 +10,11 @@ from tyro.conf import UseAppendAction, arg
 import priors
 from controllers.inbetweening.infill import InbetweenSolution, InfillSettings, infill, retraced
 from controllers.inbetweening.proposers import build_inbetweener
-from mapctl import report
-from mapctl.commands.shared import inputs, options, outputs, results
+from mapctl.commands.shared import inputs, options, results
 from mapctl.commands.shared.command import ModelCommand, conclude
 from mapctl.commands.shared.options import parse_ranges
 from mapctl.errors import RequestError
 from mapctl.motion import Motion
-from mapctl.protocols import Inbetweener
 from mapctl.recording.inspection import find_gaps
 from mapctl.recording.masks import ALL, ROOT, Mask
 from mapctl.retarget.rigs import Rig
@@ -61,22 +59,6 @@ class Infill(ModelCommand, options.RigOptions, options.ProposalOptions):
 
 def run(command: Infill) -> int:
     """Check everything, fill, write, report."""
-    _check(command)
-    rig = inputs.read_rig(command.rig, command)
-    motion, marked, has_gaps = inputs.read_motion_with_gaps(command.source, rig, quiet=command.quiet)
-    ways = _parse_ways(command, motion)
-    masks = (*marked, *_parse_masks(command, motion)) or (() if has_gaps or ways else find_gaps(motion))
-    done = _run_infilling(command, motion, masks, ways, rig)
-    outputs.save_motion(done.motion, command.out)
-    if command.report is not None:
-        report.write_report(results.build_report("infill", command, done), command.report)
-    results.film_comparison(motion, done.motion, command.video, rig=rig, quiet=command.quiet)
-    if not command.quiet:
-        _tell(command, done)
-    return conclude(done.status, strict=command.strict)
-
-
-def _check(command: Infill) -> None:
     options.check_seed(command.seed)
     if command.way and command.curve is not None:
         raise RequestError("--way and --curve both say where the hips go; choose one")
@@ -86,21 +68,30 @@ def _check(command: Infill) -> None:
         raise RequestError("--dna says how to move and --curve where; only one of them can be had, leave the other out")
     results.check_proposal(command, prior=command.prior, way=bool(command.way))
     results.check_destinations(command.out, command.video, command.report, given=(command.source,))
-
-
-def _parse_masks(command: Infill, motion: Motion) -> Sequence[Mask]:
-    """Parse the masks of the options; RequestError for impossible ones."""
-    if not command.gap and command.joints is None:
-        return ()
-    gaps = parse_ranges(command.gap, fps=float(motion.fps), frames=motion.num_frames) or [(0, motion.num_frames)]
+    rig = inputs.read_rig(command.rig, command)
+    motion, marked, has_gaps = inputs.read_motion_with_gaps(command.source, rig, quiet=command.quiet)
+    fps, frames = float(motion.fps), motion.num_frames
+    ways = [Mask(ROOT, *way) for way in parse_ranges(command.way, fps=fps, frames=frames, what="way")]
+    gaps = parse_ranges(command.gap, fps=fps, frames=frames) or ([(0, frames)] if command.joints is not None else [])
     names = [ALL] if command.joints is None else [name.strip() for name in command.joints.split(",")]
-    return [Mask(name, start, stop) for start, stop in gaps for name in names]
-
-
-def _parse_ways(command: Infill, motion: Motion) -> Sequence[Mask]:
-    """Parse the frames in which the hips' place is lost; RequestError for impossible ones."""
-    ways = parse_ranges(command.way, fps=float(motion.fps), frames=motion.num_frames, what="way")
-    return [Mask(ROOT, start, stop) for start, stop in ways]
+    masks = (*marked, *(Mask(name, *gap) for gap in gaps for name in names))
+    if not (masks or has_gaps or ways):
+        masks = find_gaps(motion)
+    done = _run_infilling(command, motion, masks, ways, rig)
+    results.write_result("infill", command, done, motion, rig=rig)
+    if not command.quiet:
+        filled = ", ".join(
+            f"{gap['start']}:{gap['stop']} ({gap['joints']} joints)"
+            if gap["joints"]
+            else f"{gap['start']}:{gap['stop']} (the hips' place)"
+            for gap in done.list_gaps()
+        )
+        print(
+            f"{command.out}: {frames} frames at {fps:.6g} a second; filled {filled}; {done.frame_ms:.1f} ms a filled"
+            " frame"
+        )
+        print("".join(f"{note}\n" for note in (*done.notes, *done.gap_notes)), end="")
+    return conclude(done.status, strict=command.strict)
 
 
 def _run_infilling(
@@ -108,13 +99,16 @@ def _run_infilling(
 ) -> InbetweenSolution:
     settings, densities = InfillSettings(finish=not command.no_finish), priors.load_choice(command.prior)
     generator = torch.Generator().manual_seed(command.seed)
-    if ways:
+    inbetweener = None
+    # Where no pose is missing the network that would propose them need not be there.
+    if not ways or any(mask.joint != ROOT for mask in masks):
+        inbetweener = build_inbetweener(command.method, results.load_models(command, prior=command.prior))
+    if ways or inbetweener is None:
         return retraced(
             motion,
             priors.load_path(command.path or "path"),
             (*masks, *ways),
-            # Where no pose is missing the network that would propose them need not be there.
-            inbetweener=_build_inbetweener(command) if any(mask.joint != ROOT for mask in masks) else None,
+            inbetweener=inbetweener,
             settings=settings,
             densities=densities,
             rig=rig,
@@ -122,7 +116,7 @@ def _run_infilling(
         )
     return infill(
         motion,
-        _build_inbetweener(command),
+        inbetweener,
         masks,
         settings=settings,
         densities=densities,
@@ -130,22 +124,3 @@ def _run_infilling(
         curve=None if command.curve is None else inputs.read_curve(command.curve, None),
         generator=generator,
     )
-
-
-def _build_inbetweener(command: Infill) -> Inbetweener:
-    return build_inbetweener(command.method, results.load_models(command, prior=command.prior))
-
-
-def _tell(command: Infill, done: InbetweenSolution) -> None:
-    gaps = ", ".join(
-        f"{gap['start']}:{gap['stop']} ({gap['joints']} joints)"
-        if gap["joints"]
-        else f"{gap['start']}:{gap['stop']} (the hips' place)"
-        for gap in done.list_gaps()
-    )
-    print(
-        f"{command.out}: {done.motion.num_frames} frames at {float(done.motion.fps):.6g} a second; filled {gaps};"
-        f" {done.frame_ms:.1f} ms a filled frame"
-    )
-    for note in (*done.notes, *done.gap_notes):
-        print(note)

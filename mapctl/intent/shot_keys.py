@@ -90,7 +90,7 @@ class ShotKey:
 
 
 @dataclass(frozen=True)
-class _ShotKeyFile:
+class ShotKeyFile:
     """Contents of a key file of a shot."""
 
     __pydantic_config__ = STRICT
@@ -100,21 +100,15 @@ class _ShotKeyFile:
     weights: Literal["free", "full"] | None = None
     """Set of bundled models, where the command gives none; the environment's or the full one if not given."""
 
+    @staticmethod
+    def read(path: str | PathLike[str]) -> "ShotKeyFile":
+        """Read a TOML file of keys; FileFormatError names file and key."""
 
-def read_shot_weights(path: str | PathLike[str]) -> str | None:
-    """Read which set of bundled models a TOML file of keys names, if any; FileFormatError names file and key."""
-    return toml.read(path, _ShotKeyFile, what="key file", unknown=_list_allowed_keys).weights
+        def list_allowed_keys(key: Sequence[int | str]) -> str:
+            return f"allowed: {', '.join(item.name for item in fields(ShotKey if len(key) > 1 else ShotKeyFile))}"
 
-
-def read_shot_keys(path: str | PathLike[str]) -> tuple[ShotKey, ...]:
-    """Read the [[key]] tables of a TOML file; FileFormatError names file and key."""
-    keys = toml.read(path, _ShotKeyFile, what="key file", unknown=_list_allowed_keys).key
-    for number, key in enumerate(keys):
-        if key.fault is not None:
-            raise FileFormatError(path, f"key[{number}].{key.fault}")
-    return keys
-
-
-def _list_allowed_keys(key: Sequence[int | str]) -> str:
-    known = fields(ShotKey if len(key) > 1 else _ShotKeyFile)
-    return f"allowed: {', '.join(item.name for item in known)}"
+        found = toml.read(path, ShotKeyFile, what="key file", unknown=list_allowed_keys)
+        for number, key in enumerate(found.key):
+            if key.fault is not None:
+                raise FileFormatError(path, f"key[{number}].{key.fault}")
+        return found

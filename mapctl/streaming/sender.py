@@ -22,7 +22,7 @@ from pythonosc.osc_message_builder import OscMessageBuilder
 
 from mapctl import kinematics, rotations
 from mapctl.features import PRIOR_FPS
-from mapctl.runtime.file_jobs import send_queued, spawn
+from mapctl.runtime.processes import send_queued, spawn
 from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.streaming.messages import Endpoint, Message
 from mapctl.streaming.post import StreamStatistics, run_post

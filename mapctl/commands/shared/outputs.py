@@ -15,6 +15,8 @@ from typing import Any
 
 from rich import box
 from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+from rich.progress import Progress as ProgressBar
 from rich.table import Table
 
 from mapctl import formats
@@ -39,6 +41,10 @@ def check_files(paths: Sequence[Path], *, given: Sequence[Path] = ()) -> None:
         known.add(real)
 
 
+FILM_SIZE = (1280, 720)
+"""Width and height of films whose size is not asked for, pixels."""
+
+
 def check_film(path: Path, size: tuple[int, int]) -> None:
     """Raise RequestError where a film of this ending or size cannot be made, or its package is missing."""
     from scenes.film import check_outputs
@@ -47,33 +53,11 @@ def check_film(path: Path, size: tuple[int, int]) -> None:
     require_render("av" if path.suffix.lower() == ".mp4" else "PIL")
 
 
-def check_picture(path: Path | None, *, given: Path) -> None:
-    """Raise RequestError where a requested picture cannot be made of a given file, or would be written over it."""
-    if path is None:
-        return
-    if path.suffix.lower() != ".png":
-        raise RequestError(f"--out writes .png, not {path.suffix or 'a file without ending'}")
-    require_render("matplotlib")
-    check_files([path], given=[given])
-
-
-def require_render(package: str) -> None:
+def require_render(*packages: str) -> None:
     """Raise RequestError that names the extra if a package of it is not installed."""
-    if find_spec(package) is None:
-        raise RequestError(describe_missing_render([package]))
-
-
-def find_missing_render(ending: str) -> list[str]:
-    """Find the packages that are not installed of those without which there is no film of this ending, as `png`."""
-    painter = "matplotlib" if find_spec("pyrender") is None else "pyrender"
-    wanted = [*(["av"] if ending == "mp4" else []), "PIL", painter]
-    return [package for package in wanted if find_spec(package) is None]
-
-
-def describe_missing_render(packages: Sequence[str]) -> str:
-    """Say which packages films need, and which extra has them."""
-    noun = "the package" if len(packages) == 1 else "the packages"
-    return f"films need {noun} {', '.join(packages)}: pip install 'mapctl[render]'"
+    if missing := [package for package in packages if find_spec(package) is None]:
+        noun = "the package" if len(missing) == 1 else "the packages"
+        raise RequestError(f"films need {noun} {', '.join(missing)}: pip install 'mapctl[render]'")
 
 
 def check_folder(folder: str | PathLike[str]) -> None:
@@ -106,16 +90,12 @@ def format_used_licences() -> str:
 
 def mark_motion(motion: Motion) -> Motion:
     """Mark a motion with the licences of what was used so far, where anything was."""
-    told = format_used_licences()
-    return replace(motion, licence=told) if told else motion
+    return replace(motion, licence=format_used_licences() or motion.licence)
 
 
 def save_motion(motion: Motion, path: Path) -> None:
     """Write a motion with the licences of what it was made with, in formats that keep them."""
     formats.save(mark_motion(motion), path)
-
-
-NUMBER_FORMAT = "{:.4g}"
 
 
 def print_table(columns: Sequence[str], rows: Sequence[Sequence[object]], *, title: str | None = None) -> None:
@@ -134,7 +114,7 @@ def format_cell(value: object) -> str:
     """One value as a table shows it."""
     if value is None or value != value:
         return "-"
-    return NUMBER_FORMAT.format(value) if isinstance(value, float) else str(value)
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 LINES = "MAPCTL_PROGRESS"
@@ -152,16 +132,8 @@ def show_progress(label: str, *, quiet: bool = False) -> Iterator[Progress | Non
     if quiet or not sys.stderr.isatty():
         yield None
         return
-    from rich import progress
-    from rich.console import Console
-
-    columns = (
-        progress.TextColumn("{task.description}"),
-        progress.BarColumn(),
-        progress.MofNCompleteColumn(),
-        progress.TimeRemainingColumn(),
-    )
-    with progress.Progress(*columns, console=Console(stderr=True), transient=True) as shown:
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with ProgressBar(*columns, console=Console(stderr=True), transient=True) as shown:
         task = shown.add_task(label, total=None)
         yield lambda done, total: shown.update(task, completed=done, total=total)
 
@@ -171,8 +143,7 @@ def _write_lines(label: str) -> Progress:
 
     def write(done: int, total: int) -> None:
         nonlocal last
-        hundredth = 100 * done // max(total, 1)
-        if hundredth != last:
+        if (hundredth := 100 * done // max(total, 1)) != last:
             last = hundredth
             print(f"progress {done}/{total} {label}", file=sys.stderr, flush=True)
 
@@ -190,16 +161,8 @@ def explain_progress(count: int, what: str, then: str = "") -> Iterator[Callable
         nonlocal finished
         finished = number
 
-    def kept() -> tuple[str, ...]:
-        return (f"{finished} of {count} {what} are finished", then) if finished else ()
-
     try:
         yield set_finished
-    except KeyboardInterrupt as stop:
-        raise KeyboardInterrupt(_join_sentences(str(stop), *kept())) from stop
-    except WriteError as error:
-        raise WriteError(_join_sentences(str(error), *kept())) from error
-
-
-def _join_sentences(*parts: str) -> str:
-    return "; ".join(filter(None, parts))
+    except (KeyboardInterrupt, WriteError) as stop:
+        kept = (f"{finished} of {count} {what} are finished", then) if finished else ()
+        raise type(stop)("; ".join(filter(None, (str(stop), *kept)))) from stop

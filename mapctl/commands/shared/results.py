@@ -1,7 +1,7 @@
-"""Shared parts of commands that return a motion: checks, models, report, film."""
+"""Shared parts of commands that return a motion: checks of the request, models, and motion, report and film."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,9 +12,8 @@ from controllers.inbetweening.proposers import AutoInbetweener, ModelLoaders
 from mapctl import formats, metrics, motion_dna
 from mapctl import report as reports
 from mapctl.commands.shared import inputs, options, outputs
-from mapctl.commands.shared.inputs import read_motion
 from mapctl.commands.shared.options import ProposalOptions
-from mapctl.commands.shared.outputs import add_licence, show_progress
+from mapctl.commands.shared.outputs import show_progress
 from mapctl.errors import RequestError
 from mapctl.metrics import make_comparable
 from mapctl.motion import Motion
@@ -26,59 +25,39 @@ from priors.stitcher import Stitcher
 from priors.tweener import Style, Tweener, mix_styles, pick_class
 from scenes.film import film_side_by_side
 
-METHODS = ("auto", "tweener")
-"""Methods that know styles."""
+Examples = Sequence[tuple[str, MotionDna | None]]
+"""Name and poses of each motion file whose style is asked for; without poses the name of a class."""
 
 
-@dataclass(frozen=True, eq=False)
-class Example:
-    """One of the styles that are asked for."""
-
-    name: str
-    """A file, or a class."""
-    dna: MotionDna | None
-    """Poses of the file; None for a class."""
-
-
-def read_dna(command: ProposalOptions) -> tuple[Example, ...]:
+def read_dna(command: ProposalOptions) -> Examples:
     """Read the motion files that --dna names; what is none is a class. RequestError for methods without styles, and for
     files that no poses can be taken of."""
     if command.dna is None:
         return ()
-    if command.method not in METHODS:
+    if command.method not in ("auto", "tweener"):
         raise RequestError(f"--method {command.method} knows no style; leave --dna out or take --method tweener")
     names = [name.strip() for name in command.dna.split(",")]
     if not all(names):
         raise RequestError(f"--dna takes motion files and classes with a comma between two, got {command.dna!r}")
-    return tuple(_read_example(name) for name in names)
+    found: list[tuple[str, MotionDna | None]] = []
+    for name in names:
+        path = Path(name)
+        if not path.is_file() and path.suffix.lower() not in formats.READERS:
+            found.append((name, None))
+            continue
+        motion = inputs.read_motion(path, None, quiet=True)
+        try:
+            found.append((path.name, motion_dna.of(motion)))
+        except RequestError as error:
+            raise RequestError(f"{name} tells no style: {error}") from error
+    return found
 
 
-def _read_example(name: str) -> Example:
-    path = Path(name)
-    if not path.is_file() and path.suffix.lower() not in formats.READERS:
-        return Example(name, None)
-    motion = read_motion(path, None, quiet=True)
-    try:
-        return Example(path.name, motion_dna.of(motion))
-    except RequestError as error:
-        raise RequestError(f"{name} tells no style: {error}") from error
-
-
-def find_styles(tweener: Tweener, examples: Sequence[Example]) -> list[Style]:
-    """Find the style of each example; RequestError for a class that the weights do not know."""
+def find_styles(tweener: Tweener, examples: Examples) -> list[Style]:
+    """Find the style of each example; RequestError for a class that the weights do not have."""
     return [
-        pick_class(tweener.classes, example.name)
-        if example.dna is None
-        else tweener.encode_style(example.dna, example.name)
-        for example in examples
+        pick_class(tweener.classes, name) if dna is None else tweener.encode_style(dna, name) for name, dna in examples
     ]
-
-
-def tell_style(inbetweener: Inbetweener, examples: Sequence[Example]) -> Inbetweener:
-    """Tell a tweener the styles of examples, all together; without any, and anyone else, stays as it is."""
-    if not examples or not isinstance(inbetweener, Tweener):
-        return inbetweener
-    return inbetweener.in_style(mix_styles(find_styles(inbetweener, examples)))
 
 
 def restyle(inbetweener: Inbetweener, style: Style) -> Inbetweener:
@@ -90,15 +69,6 @@ def restyle(inbetweener: Inbetweener, style: Style) -> Inbetweener:
     return inbetweener.in_style(style) if isinstance(inbetweener, Tweener) else inbetweener
 
 
-def find_tweener(inbetweener: Inbetweener) -> Tweener | None:
-    """Find the tweener that an in-betweener is or has."""
-    own = inbetweener.tweener if isinstance(inbetweener, AutoInbetweener) else inbetweener
-    return own if isinstance(own, Tweener) else None
-
-
-_SIZE = (1280, 720)
-
-
 def check_destinations(out: Path, video: Path | None, *others: Path | None, given: Sequence[Path]) -> None:
     """Raise RequestError unless the motion, its film and the other files can be written, none over a given file; leaves
     no trace.
@@ -106,12 +76,12 @@ def check_destinations(out: Path, video: Path | None, *others: Path | None, give
     formats.check_ending(out)
     outputs.check_files(options.collect_paths(out, video, *others), given=given)
     if video is not None:
-        outputs.check_film(video, _SIZE)
+        outputs.check_film(video, outputs.FILM_SIZE)
 
 
 def check_proposal(command: ProposalOptions, *, prior: str | None = None, way: bool | None = None) -> None:
     """Raise RequestError for an unknown method, and for a density or a network that the method does not use. `way`:
-    whether --way asks for the hips' place, of a command that has it."""
+    whether --way asks for the hips' positions, of a command that has it."""
     method = command.method
     proposers.check_method(method)
     if command.stitcher is not None and method not in ("auto", "stitcher"):
@@ -130,16 +100,18 @@ def _is_tweener(inbetweener: str | None) -> bool:
     return inbetweener is not None and priors.find_inbetweener_kind(inbetweener) == "tweener"
 
 
-def load_models(
-    command: ProposalOptions, *, prior: str | None = None, dna: Sequence[Example] | None = None
-) -> ModelLoaders:
+def load_models(command: ProposalOptions, *, prior: str | None = None, dna: Examples | None = None) -> ModelLoaders:
     """Build the loaders of the named models, or of the bundled ones, tweeners in a style if there is one; RequestError
     for a network that is not of the kind that the method asks for, and for classes that are not known. A named tweener
     is, for `auto`, the one that it takes in long gaps.
     """
+    inbetweener, path, is_tweener = command.inbetweener, command.path or "path", _is_tweener(command.inbetweener)
+    examples = read_dna(command) if dna is None else dna
 
-    inbetweener, path, is_tweener = command.inbetweener, command.path, _is_tweener(command.inbetweener)
-    dna = read_dna(command) if dna is None else dna
+    def set_style(network: Inbetweener) -> Inbetweener:
+        if not examples or not isinstance(network, Tweener):
+            return network
+        return network.in_style(mix_styles(find_styles(network, examples)))
 
     def load_network(method: str) -> Inbetweener:
         if method == "infiller" and inbetweener is None:
@@ -149,19 +121,18 @@ def load_models(
         usual = "tweener" if method == "tweener" else "transformer"
         # Of a named tweener `auto` makes its own for long gaps.
         named = None if method == "auto" and is_tweener else inbetweener
-        network = priors.load_inbetweener(named or usual, path or "path")
+        network = priors.load_inbetweener(named or usual, path)
         if isinstance(network, Stitcher):
             raise RequestError(f"{inbetweener} is a stitcher; name it by --stitcher, with --method stitcher")
         kinds = {"infiller": "infiller", "transformer": "pose-transformer", "tweener": "tweener"}
-        wanted = kinds.get(method, network.card.kind)
-        if network.card.kind != wanted:
+        if network.card.kind != kinds.get(method, network.card.kind):
             raise RequestError(f"--method {method} takes no {network.card.kind}; leave it or {inbetweener} out")
-        return tell_style(network, dna)
+        return set_style(network)
 
     def load_tweener() -> Inbetweener | None:
-        if not (is_tweener or dna or path or priors.has_model("tweener")):
+        if not (is_tweener or examples or command.path or priors.has_model("tweener")):
             return None  # the free weights have none, and `auto` does without
-        return tell_style(priors.load_tweener((is_tweener and inbetweener) or "tweener", path or "path"), dna)
+        return set_style(priors.load_tweener((is_tweener and inbetweener) or "tweener", path))
 
     load_densities = partial(priors.load_choice, prior or "auto")
     return ModelLoaders(
@@ -169,16 +140,21 @@ def load_models(
     )
 
 
-def film_comparison(before: Motion, after: Motion, video: Path | None, *, rig: Rig | None, quiet: bool) -> None:
-    """Film both motions side by side, if a film is requested."""
-    if video is None:
-        return
-    with show_progress("filming", quiet=quiet) as progress:
-        film_side_by_side(before, after, video, rig=rig, progress=progress)
+def write_result(
+    name: str, command: Any, solution: Solution, before: Motion, *, rig: Rig | None, more: Mapping[str, Any] = {}
+) -> None:
+    """Write the motion of a command's solution; the report, with `more` entries, and the film of the motion `before`
+    and this one where the command's options ask for them."""
+    outputs.save_motion(solution.motion, command.out)
+    if getattr(command, "report", None) is not None:
+        reports.write_report(build_report(name, command, solution) | more, command.report)
+    if command.video is not None:
+        with show_progress("filming", quiet=command.quiet) as progress:
+            film_side_by_side(before, solution.motion, command.video, rig=rig, progress=progress)
 
 
 def build_report(name: str, command: Any, solution: Solution) -> dict[str, Any]:
     """Build the report on a job whose motion is measured as `mapctl measure` takes it, without a curve."""
     request = {key: value for key, value in options.describe_request(name, command).items() if value is not None}
     comparable = make_comparable(solution.motion, inputs.read_rig(command.rig, command))[0]
-    return add_licence(reports.build_report(solution, request=request, measures=metrics.measure(comparable)))
+    return outputs.add_licence(reports.build_report(solution, request=request, measures=metrics.measure(comparable)))

@@ -1,9 +1,9 @@
 """Shots of actors, planned and solved, with their measures and cost, for follow, run and demo."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from fractions import Fraction
-from functools import cached_property
+from functools import cached_property, reduce
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from torch import Tensor
 
 import priors
 from controllers.common.character import Character
-from controllers.shots.reaching import MetPose, build_rest_pose
+from controllers.shots.reaching import build_rest_pose
 from controllers.shots.request import Arrival, Lead, Look, Others, PoseKey, Reach, ShotRequest
 from controllers.shots.shot import ShotSolution, solve_shot
 from controllers.shots.trajectory import APART_MARGIN, Trajectory, plan_trajectory
@@ -48,7 +48,7 @@ class ShotPlan:
     actor: Actor
     """The actor's table."""
     request: ShotRequest
-    """Its wishes."""
+    """Its constraints and targets."""
     prior: LstmGmmDensity
     """Density of its walks."""
     character: Character
@@ -69,24 +69,54 @@ def plan_shot(
     fps: Fraction | None = None,
 ) -> ShotPlan:
     """Plan an actor's shot; a clip that it goes on from or ends in is read, and gives it its body and its rate.
-    RequestError for wishes that do not fit each other, and for labels that the prior does not know."""
-    body = _Body.of(actor, character, folder, options, prior)
-    character, placed = body.character, actor.offset is not None or actor.turn_deg is not None
-    lead, arrival = None, None
+    RequestError for constraints that do not fit each other, and for labels that the prior does not have."""
+    own, rate, rigged = actor.start_clip or actor.end_clip, Fraction(PRIOR_FPS), None
+    clips: dict[str, Motion] = {}  # on canonical joints with the character's bones
+    if own is not None:
+        clip, rig = read_clip(folder / own[0], options)
+        if character.rigmap is not None and not clip.skeleton.matches(character.rigmap.rig_skeleton):
+            raise RequestError(
+                f"{own[0]} is of another rig than the character; what goes on from a clip or ends in one is on its rig"
+            )
+        canonical, rigged = RiggedCharacter.of(clip, rig)
+        toe_height = float(rigged.stance.toe_height.mean())
+        character = Character(canonical.skeleton, toe_height, rigged.rigmap, rigged.source)
+        rate, clips[own[0]] = clip.fps, canonical
+
+    def read(name: str) -> Motion:
+        nonlocal rigged
+        if name not in clips:
+            clip, rig = read_clip(folder / name, options)
+            if rigged is None:
+                rest = build_rest_pose(prior, character.skeleton, character.toe_rest_height)
+                rigged = RiggedCharacter.of(character.on_rig(rest))[1]
+            try:
+                clips[name] = retarget_motion(clip, rigged, rig).motion
+            except RequestError as error:
+                raise RequestError(f"{name}: {error}") from error
+        return clips[name]
+
+    placed, lead, arrival = actor.offset is not None or actor.turn_deg is not None, None, None
     if actor.start_clip is not None:
-        lead = Lead.of(body.read(actor.start_clip[0]), actor.start_clip[1])
+        lead = Lead.of(read(actor.start_clip[0]), actor.start_clip[1])
         if placed:
             lead = lead.bring_to(curve)
         else:
             curve = lead.bring_curve(curve)
     if actor.end_clip is not None:
-        arrival = Arrival.of(body.read(actor.end_clip[0]), actor.end_clip[1])
+        arrival = Arrival.of(read(actor.end_clip[0]), actor.end_clip[1])
         if lead is None and not placed and not curve.closed:
             curve = arrival.bring_curve(curve)
-    rate = body.rate if fps is None else fps
-    keys = [
-        (key.at_seconds(float(rate)), round(key.within_frames * PRIOR_FPS / float(rate)), key) for key in actor.keys
-    ]
+    rate = fps or rate
+    reaches, looks, poses = list[Reach](), list[Look](), list[PoseKey]()
+    for key in actor.keys:
+        at, within = key.at_seconds(float(rate)), round(key.within_frames * PRIOR_FPS / float(rate))
+        if key.reach:
+            reaches.append(Reach(at, key.reach, key.hold_seconds, key.tolerance, within))
+        if key.look_at is not None:
+            looks.append(Look(at, key.look_at, key.hold_seconds))
+        if key.gives_hips:
+            poses.append(_build_pose_key(key, at, within, read))
     request = ShotRequest(
         curve,
         _read_speed(actor, curve),
@@ -96,11 +126,9 @@ def plan_shot(
         stand_at_end=actor.end == "stand",
         arrival=arrival,
         loop=actor.loop,
-        reaches=tuple(
-            Reach(when, key.reach, key.hold_seconds, key.tolerance, within) for when, within, key in keys if key.reach
-        ),
-        looks=tuple(Look(when, key.look_at, key.hold_seconds) for when, _, key in keys if key.look_at is not None),
-        poses=tuple(_build_pose_key(body, key, when, within) for when, within, key in keys if key.gives_hips),
+        reaches=tuple(reaches),
+        looks=tuple(looks),
+        poses=tuple(poses),
         obstacles=tuple(obstacles),
     )
     labels = [f"{group}={value}" for group, value in (("gait", actor.gait), ("style", actor.style)) if value]
@@ -118,78 +146,15 @@ def _read_speed(actor: Actor, curve: Curve) -> SpeedProfile | TimedSpeed | None:
     return None if actor.speed is None else SpeedProfile.parse(str(actor.speed))
 
 
-def _build_pose_key(body: "_Body", key: ShotKey, seconds: float, within: int) -> PoseKey:
+def _build_pose_key(key: ShotKey, seconds: float, within: int, read: Callable[[str], Motion]) -> PoseKey:
     pose = None
     if key.pose is not None:
-        clip = body.read(key.pose)
+        clip = read(key.pose)
         if key.pose_frame >= clip.num_frames:
             raise RequestError(f"{key.pose} has the frames 0:{clip.num_frames}, and a key wants its {key.pose_frame}")
         pose = clip.slice(key.pose_frame, key.pose_frame + 1)
-    return PoseKey(
-        seconds,
-        pose,
-        key.place,
-        key.height,
-        key.facing_deg,
-        key.joints,
-        key.root_only,
-        key.hold_seconds,
-        key.tolerance,
-        within,
-    )
-
-
-@dataclass(eq=False)
-class _Body:
-    """The character's body, and clips put on it."""
-
-    character: Character
-    """It."""
-    rate: Fraction
-    """Of the motion that is made."""
-    folder: Path
-    """That files are relative to."""
-    options: ReadOptions
-    """How files are read."""
-    prior: LstmGmmDensity
-    """Whose walkers the canonical body stands like."""
-    clips: dict[str, Motion] = field(default_factory=dict)
-    """Clips that were read, on canonical joints with the body's bones, by name."""
-    rigged: RiggedCharacter | None = None
-    """As retargeting takes it, once it is needed."""
-
-    @staticmethod
-    def of(actor: Actor, character: Character, folder: Path, options: ReadOptions, prior: LstmGmmDensity) -> "_Body":
-        """That of the clip that an actor goes on from or ends in, else the character's."""
-        found = _Body(character, Fraction(PRIOR_FPS), folder, options, prior)
-        own = actor.start_clip or actor.end_clip
-        if own is None:
-            return found
-        name = own[0]
-        clip, rig = read_clip(folder / name, options)
-        if character.rigmap is not None and not clip.skeleton.matches(character.rigmap.rig_skeleton):
-            raise RequestError(
-                f"{name} is of another rig than the character; what goes on from a clip or ends in one is on its rig"
-            )
-        canonical, body = RiggedCharacter.of(clip, rig)
-        found.character = Character(canonical.skeleton, float(body.stance.toe_height.mean()), body.rigmap, body.source)
-        found.rate, found.rigged, found.clips[name] = clip.fps, body, canonical
-        return found
-
-    def read(self, name: str) -> Motion:
-        """Return a clip on canonical joints with this body's bones; RequestError, which names it, for one whose joints
-        cannot be identified."""
-        if name not in self.clips:
-            clip, rig = read_clip(self.folder / name, self.options)
-            if self.rigged is None:
-                skeleton, height = self.character.skeleton, self.character.toe_rest_height
-                standing = self.character.on_rig(build_rest_pose(self.prior, skeleton, height))
-                self.rigged = RiggedCharacter.of(standing)[1]
-            try:
-                self.clips[name] = retarget_motion(clip, self.rigged, rig).motion
-            except RequestError as error:
-                raise RequestError(f"{name}: {error}") from error
-        return self.clips[name]
+    same = ("place", "height", "facing_deg", "joints", "root_only", "hold_seconds", "tolerance")
+    return PoseKey(seconds, pose, within_frames=within, **{name: getattr(key, name) for name in same})
 
 
 _BESIDE = 6  # frames after the last
@@ -198,34 +163,24 @@ _BESIDE = 6  # frames after the last
 def resample_shot(solution: ShotSolution, request: ShotRequest, fps: Fraction) -> Motion:
     """Resample a shot's motion, a higher rate by splines: through the frames of a clip that it goes on from or ends in,
     and for a loop through its own, so that its last frame leads into its first at that rate."""
-    motion = solution.motion
-    before, after = request.lead.past if request.lead is not None else None, _find_after(solution, request)
-    frames = round(motion.num_frames * fps / motion.fps) if request.loop else None
-    frames = frames or int((motion.num_frames - 1) * fps / motion.fps) + 1
-    whole = _join([before, motion, after])
+    motion, before, after = solution.motion, None, None
+    frames = int((motion.num_frames - 1) * fps / motion.fps) + 1
+    if request.lead is not None:
+        before = request.lead.past
+    if request.loop:
+        frames, after = round(motion.num_frames * fps / motion.fps) or frames, motion.slice(0, _BESIDE)
+    elif request.arrival is not None:
+        arrival = request.arrival.bring_to(solution.trajectory.curve, float(solution.trajectory.arcs[-1])).motion
+        after = arrival.slice(1, min(arrival.num_frames, 1 + _BESIDE))
     if fps <= motion.fps:
         return _join([motion, after]).resample(fps).slice(0, frames)
-    first = 0 if before is None else before.num_frames
+    whole, first = _join([before, motion, after]), 0 if before is None else before.num_frames
     seconds = (torch.arange(whole.num_frames, dtype=torch.float64) - first) / float(motion.fps)
     return resample_by_splines(whole, seconds, fps=fps, frames=frames)
 
 
-def _find_after(solution: ShotSolution, request: ShotRequest) -> Motion | None:
-    """Find the frames after the last, which is the first of a clip, or leads into the shot's first."""
-    if request.loop:
-        return solution.motion.slice(0, _BESIDE)
-    if request.arrival is None:
-        return None
-    arrival = request.arrival.bring_to(solution.trajectory.curve, float(solution.trajectory.arcs[-1])).motion
-    return arrival.slice(1, min(arrival.num_frames, 1 + _BESIDE))
-
-
 def _join(parts: list[Motion | None]) -> Motion:
-    there = [replace(part, moving_offsets={}) for part in parts if part is not None]
-    whole = there[0]
-    for part in there[1:]:
-        whole = whole.join(part)
-    return whole
+    return reduce(Motion.join, (replace(part, moving_offsets={}) for part in parts if part is not None))
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,9 +209,9 @@ class PlayedShot:
 
     @cached_property
     def measures(self) -> Mapping[str, float]:
-        """Measures of the motion against the way that was planned."""
-        way = self.solution.trajectory
-        return report.measure_path(self.solution.motion, way.curve, wanted_m=float(way.arcs[-1]))
+        """Measures of the motion against the trajectory that was planned."""
+        planned = self.solution.trajectory
+        return report.measure_path(self.solution.motion, planned.curve, wanted_m=float(planned.arcs[-1]))
 
     def report(self, request: Mapping[str, Any]) -> dict[str, Any]:
         """Build the report of this shot; `request` is what the user wrote."""
@@ -352,38 +307,24 @@ def _find_others(
 def stage_actor(
     done: PlayedShot, *, colour: str | None = None, start_seconds: float = 0.0, character: DrawnCharacter | None = None
 ) -> Shot:
-    """Put what an actor did on a stage, and what it was asked for: targets, places to look at, places and facings of
+    """Put what an actor did on a stage, and what it was asked for: targets, points to look at, positions and facings of
     the hips, and whole poses. It is drawn as a character if there is one."""
-    motion = done.solution.motion
+    solution, motion = done.solution, done.solution.motion
+
+    def span(key: Reach | Look) -> tuple[float, float]:
+        return key.seconds, key.seconds + key.hold_seconds
+
+    marks = [Mark(build_target(at), span(reach)) for reach in solution.reaches for at in reach.places.values()]
+    marks += [Mark(build_look_mark(look.place), span(look)) for look in done.request.looks]
+    for met in solution.met:
+        if not met.key.gives_body:
+            heading = float(kinematics.heading(met.wanted.local_quat_xyzw[0, 0])) if met.key.gives_facing else None
+            marks.append(Mark(build_hips_mark(met.wanted.root_position[0, ::2].numpy(), heading), met.seconds))
+    wishes = Wishes(marks, [met.wanted for met in solution.met if met.key.gives_body])
     drawn = None if character is None else character.put_on(motion)
-    return Shot(motion, done.request.curve, colour, start_seconds, _collect_wishes(done), drawn)
-
-
-def print_notes(shots: Sequence[Shot]) -> None:
-    """Print what could not be kept of motions that are drawn on characters."""
-    for note in dict.fromkeys(note for shot in shots if shot.drawn is not None for note in shot.drawn.notes):
-        print(f"note      the character that is drawn: {note}")
+    return Shot(motion, done.request.curve, colour, start_seconds, wishes, drawn)
 
 
 def build_obstacles(done: Sequence[PlayedShot]) -> list[Surface]:
     """Build every obstacle of some actors once."""
     return [build_obstacle(each) for each in dict.fromkeys(each for one in done for each in one.request.obstacles)]
-
-
-def _collect_wishes(done: PlayedShot) -> Wishes:
-    solution = done.solution
-    marks = [
-        Mark(build_target(place), _find_span(reach)) for reach in solution.reaches for place in reach.places.values()
-    ]
-    marks += [Mark(build_look_mark(look.place), _find_span(look)) for look in done.request.looks]
-    marks += [_mark_hips(met) for met in solution.met if not met.key.gives_body]
-    return Wishes(marks, [met.wanted for met in solution.met if met.key.gives_body])
-
-
-def _mark_hips(met: MetPose) -> Mark:
-    heading = float(kinematics.heading(met.wanted.local_quat_xyzw[0, 0])) if met.key.gives_facing else None
-    return Mark(build_hips_mark(met.wanted.root_position[0, ::2].numpy(), heading), met.seconds)
-
-
-def _find_span(key: Reach | Look) -> tuple[float, float]:
-    return key.seconds, key.seconds + key.hold_seconds
