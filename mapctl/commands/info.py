@@ -19,9 +19,7 @@ from mapctl.features import PRIOR_FPS
 from mapctl.formats import bvh
 from mapctl.formats.character import CharacterSource
 from mapctl.formats.units import UNITS
-from mapctl.motion import Motion
-from mapctl.retarget import RigMap
-from mapctl.retarget.doubts import Fit, assess_fit
+from mapctl.retarget.doubts import assess_fit
 from mapctl.skeleton import CANONICAL
 from priors import checkpoints, weight_sets
 from priors.tweener import count_clips
@@ -48,44 +46,44 @@ NOTICE = (
     "The code is MIT. Weights trained on Bandai Namco data are CC BY-NC 4.0, as that data is; the free weights, by"
     " --weights free, may be used for anything."
 )
+_UNITS = {metres: name for name, metres in UNITS.items()}
 
 
 def run(command: Info) -> int:
     """Collect and print."""
-    if command.name is not None and is_clip(command.name):
-        print_clip(Path(command.name), command)
+    if command.name is not None and formats.ending_of(command.name) in formats.READERS:
+        _print_clip(Path(command.name), command)
     elif command.out is not None:
         raise RequestError("--out is a picture of a clip's rig: mapctl info CLIP -o FILE.png")
     elif command.rig is not None or command.unit is not None or command.up is not None:
         raise RequestError("--rig, --unit and --up are of a clip: mapctl info CLIP --rig PRESET|FILE.toml|CLIP")
     elif command.name is not None:
-        print(report.to_json(read_prior_card(command.name)), end="")
-    elif command.json:
+        print(report.to_json(_read_card(command.name)), end="")
+    else:
+        rows = {weights: _list_models(weights) for weights in weight_sets.SETS}
+        current = weight_sets.find_current_set()
+        sets = {
+            name: {
+                "models": [row["name"] for row in models],
+                "megabytes": sum(row["megabytes"] for row in models),
+                "licence": find_strictest(row["licence"] for row in models),
+            }
+            for name, models in rows.items()
+        }
         found = {
-            "priors": list_priors(),
-            "weights": describe_weights(),
-            "installation": describe_installation(),
+            "priors": [row for models in rows.values() for row in models],
+            "weights": {"in_force": current, **sets},
+            "installation": _describe_installation(),
             "notice": NOTICE,
         }
-        print(report.to_json(found), end="")
-    else:
-        _print_tables()
+        if command.json:
+            print(report.to_json(found), end="")
+        else:
+            _print_tables(found, sets, current)
     return 0
 
 
-def _print_tables() -> None:
-    columns = ["prior", "kind", "size", "speeds", "data", "licence of the weights"]
-    rows = [
-        [row["name"], row["kind"], f"{row['megabytes']:.1f} MB", _format_speeds(row), _format_data(row), row["licence"]]
-        for row in list_priors()
-    ]
-    print_table(columns, rows or [["none is bundled", *[None] * (len(columns) - 1)]])
-    print_table(["weights", "models", "size", "licence"], [_format_set(name) for name in weight_sets.SETS])
-    print_table(["installation", ""], [[name, str(value)] for name, value in describe_installation().items()])
-    print(NOTICE)
-
-
-def read_prior_card(name: str) -> dict[str, Any]:
+def _read_card(name: str) -> dict[str, Any]:
     """Read the whole card of a prior, and its path; classes of motion without their vectors, with how many clips each
     is of. CheckpointError if there is none."""
     path = checkpoints.locate(name)
@@ -93,111 +91,89 @@ def read_prior_card(name: str) -> dict[str, Any]:
     return {"file": str(path), **vars(card), "data": count_clips(card.data)}
 
 
-def list_priors() -> list[dict[str, Any]]:
-    """List the bundled priors of all sets in short; those of the default set by their bare names."""
-    return [row for weights in weight_sets.SETS for row in _list_set(weights)]
-
-
-def describe_weights() -> dict[str, Any]:
-    """Describe the sets of weights: which is in force, and of each its models, size and strictest licence."""
-    return {"in_force": weight_sets.find_current_set(), **{name: _describe_set(name) for name in weight_sets.SETS}}
-
-
-def _list_set(weights: str) -> list[dict[str, Any]]:
+def _list_models(weights: str) -> list[dict[str, Any]]:
+    """List the bundled models of a set in short; those of the default set by their bare names."""
     rows = []
     for name in weight_sets.list_models(weights):
-        whole = read_prior_card(f"{weights}/{name}")
-        rows.append(_summarise_prior(name if weights == weight_sets.SETS[0] else f"{weights}/{name}", weights, whole))
+        card = _read_card(f"{weights}/{name}")
+        rows.append(
+            {
+                "name": name if weights == weight_sets.SETS[0] else f"{weights}/{name}",
+                "weights": weights,
+                **{key: card[key] for key in ("kind", "licence", "abilities", "config")},
+                "data": {key: int(card["data"][key]) for key in ("clips", "frames") if key in card["data"]},
+                "megabytes": Path(card["file"]).stat().st_size / 1e6,
+            }
+        )
     return rows
 
 
-def _describe_set(weights: str) -> dict[str, Any]:
-    rows = _list_set(weights)
-    return {
-        "models": [row["name"] for row in rows],
-        "megabytes": sum(row["megabytes"] for row in rows),
-        "licence": find_strictest(row["licence"] for row in rows),
-    }
-
-
-def describe_installation() -> dict[str, Any]:
+def _describe_installation() -> dict[str, Any]:
     """Describe versions, scenes, rendering back end, threads and cores."""
-    threads = {"threads of a solve": 1, "threads of torch": torch.get_num_threads(), "cores": os.cpu_count()}
-    gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else "none"
     return {
         **report.package_versions(),
-        **threads,
-        "GPU": gpu,
+        "threads of a solve": 1,
+        "threads of torch": torch.get_num_threads(),
+        "cores": os.cpu_count(),
+        "GPU": torch.cuda.get_device_name() if torch.cuda.is_available() else "none",
         "rendering": scenes.back_end(),
         "scenes": ", ".join(scenes.list_scenes()),
     }
 
 
-def _summarise_prior(name: str, weights: str, whole: Mapping[str, Any]) -> dict[str, Any]:
-    size = Path(whole["file"]).stat().st_size / 1e6
-    kept = {key: whole[key] for key in ("kind", "licence", "abilities", "config")}
-    data = {key: int(whole["data"][key]) for key in ("clips", "frames") if key in whole["data"]}
-    return {"name": name, "weights": weights, **kept, "data": data, "megabytes": size}
+def _print_tables(found: Mapping[str, Any], sets: Mapping[str, Any], current: str) -> None:
+    rows = []
+    for row in found["priors"]:
+        limits, minutes = row["abilities"], row["data"].get("frames", 0) / PRIOR_FPS / 60
+        speeds = f"{limits['slowest']:.1f} to {limits['fastest']:.1f} m/s" if limits else "-"
+        data = f"{row['data']['clips']:,} clips, {minutes:,.0f} min" if minutes else "-"
+        rows.append([row["name"], row["kind"], f"{row['megabytes']:.1f} MB", speeds, data, row["licence"]])
+    columns = ["prior", "kind", "size", "speeds", "data", "licence of the weights"]
+    print_table(columns, rows or [["none is bundled", *[None] * (len(columns) - 1)]])
+    rows = []
+    for name, one in sets.items():
+        count = len(one["models"])
+        about = [str(count), f"{one['megabytes']:.1f} MB", one["licence"]] if count else ["none is bundled", "-", "-"]
+        rows.append([f"{name} (in force)" if name == current else name, *about])
+    print_table(["weights", "models", "size", "licence"], rows)
+    print_table(["installation", ""], [[name, str(value)] for name, value in found["installation"].items()])
+    print(NOTICE)
 
 
-def _format_data(row: Mapping[str, Any]) -> str:
-    data = row["data"]
-    minutes = data.get("frames", 0) / PRIOR_FPS / 60
-    return f"{data['clips']:,} clips, {minutes:,.0f} min" if minutes else "-"
-
-
-def _format_set(weights: str) -> list[str]:
-    described = _describe_set(weights)
-    name = f"{weights} (in force)" if weights == weight_sets.find_current_set() else weights
-    if not described["models"]:
-        return [name, "none is bundled", "-", "-"]
-    return [name, str(len(described["models"])), f"{described['megabytes']:.1f} MB", described["licence"]]
-
-
-def _format_speeds(row: Mapping[str, Any]) -> str:
-    limits = row["abilities"]
-    return f"{limits['slowest']:.1f} to {limits['fastest']:.1f} m/s" if limits else "-"
-
-
-_LISTS = ("joints", "known_by", "unmapped", "doubts", "fit", "skeletons", "animations")
-
-_UNITS = {metres: name for name, metres in UNITS.items()}
-
-
-def is_clip(name: str) -> bool:
-    """Return whether the name is that of a motion file, by its ending."""
-    return formats.ending_of(name) in formats.READERS
-
-
-def print_clip(path: Path, command: Info) -> None:
+def _print_clip(path: Path, command: Info) -> None:
     """Print a clip's description, and draw it where a picture is asked for.
 
-    RequestError where the rig is not recognised, naming what is missing; what can be told of the clip is printed first.
+    RequestError where the rig is not recognised, naming what is missing; what can be found of the clip is printed
+    first.
     """
-    picture, as_json = command.out, command.json
-    outputs.check_picture(picture, given=path)
+    picture = command.out
+    if picture is not None:
+        if picture.suffix.lower() != ".png":
+            raise RequestError(f"--out writes .png, not {picture.suffix or 'a file without ending'}")
+        outputs.require_render("matplotlib")
+        outputs.check_files([picture], given=[path])
     given = inputs.read_rig(command.rig, command)
     motion = inputs.read_motion(path, given, quiet=True)
+    names = motion.skeleton.names
+    about: dict[str, Any] = {"licence": motion.licence} if motion.licence else {}
+    about |= {
+        "metres_per_unit": bvh.unit_of(motion) or 1.0,
+        "num_joints": motion.num_joints,
+        "frames": motion.num_frames,
+        "fps": float(motion.fps),
+        "seconds": motion.seconds,
+    }
+    if isinstance(motion.source, CharacterSource):
+        about |= _describe_choices(motion.source)
     try:
         rigmap = retarget.to_canonical(motion, given)[1]
     except RequestError as refusal:
-        refused = {"file": str(path), "fit": "refused", "doubts": [str(refusal)], **_describe_file(motion)}
-        _print({**refused, "joints": {}, "unmapped": list(motion.skeleton.names)}, as_json=as_json)
+        refused = {"file": str(path), "fit": "refused", "doubts": [str(refusal)], **about}
+        _print({**refused, "joints": {}, "unmapped": list(names)}, as_json=command.json)
         raise
-    fit = assess_fit(rigmap, motion)
-    _print(describe_clip(path, motion, rigmap, fit), as_json=as_json)
-    if picture is not None:
-        from scenes.rig_picture import plot_rig
-
-        plot_rig(rigmap, motion, fit, title=path.name, path=picture)
-
-
-def describe_clip(path: Path, motion: Motion, rigmap: RigMap, fit: Fit) -> dict[str, Any]:
-    """Describe a clip by name and value, as `mapctl info` prints it."""
-    names = motion.skeleton.names
+    fit, found = assess_fit(rigmap, motion), rigmap.match
     joints = {c: None if j is None else names[j] for c, j in zip(CANONICAL.names, rigmap.joint_of, strict=True)}
-    found = rigmap.match
-    return {
+    described = {
         "file": str(path),
         "rig": rigmap.rig.name,
         "about": rigmap.rig.about,
@@ -209,24 +185,16 @@ def describe_clip(path: Path, motion: Motion, rigmap: RigMap, fit: Fit) -> dict[
         "tpose_from": rigmap.tpose_from,
         "up": rigmap.up,
         "facing": rigmap.facing,
-        **_describe_file(motion),
+        **about,
         "joints": joints,
         "known_by": {c: how.value for c, how in found.known_by.items() if joints[c]},
         "unmapped": list(found.unmapped),
     }
+    _print(described, as_json=command.json)
+    if picture is not None:
+        from scenes.rig_picture import plot_rig
 
-
-def _describe_file(motion: Motion) -> dict[str, Any]:
-    """Describe what is known of a clip without its rig."""
-    return {
-        **({"licence": motion.licence} if motion.licence else {}),
-        "metres_per_unit": bvh.unit_of(motion) or 1.0,
-        "num_joints": motion.num_joints,
-        "frames": motion.num_frames,
-        "fps": float(motion.fps),
-        "seconds": motion.seconds,
-        **(_describe_choices(motion.source) if isinstance(motion.source, CharacterSource) else {}),
-    }
+        plot_rig(rigmap, motion, fit, title=path.name, path=picture)
 
 
 def _describe_choices(source: CharacterSource) -> dict[str, Any]:
@@ -247,24 +215,23 @@ def _print(described: dict[str, Any], *, as_json: bool) -> None:
     if as_json:
         print(report.to_json(described), end="")
         return
-    shown = {key: value for key, value in described.items() if key not in _LISTS}
-    shown["fps"] = f"{described['fps']:.6g}"
-    shown["seconds"] = f"{described['seconds']:.2f}"
-    shown["unit"] = _format_unit(described["metres_per_unit"])
-    if "up" in described:
-        shown["up"] = f"+{described['up']}" if len(described["up"]) == 1 else described["up"]
-    del shown["metres_per_unit"]
+    lists = ("joints", "known_by", "unmapped", "doubts", "fit", "skeletons", "animations", "metres_per_unit")
+    shown, metres = {key: value for key, value in described.items() if key not in lists}, described["metres_per_unit"]
+    shown["fps"], shown["seconds"] = f"{described['fps']:.6g}", f"{described['seconds']:.2f}"
+    shown["unit"] = f"{_UNITS[metres]} ({metres:g} m)" if metres in _UNITS else f"{metres:g} m"
+    if len(described.get("up", "")) == 1:
+        shown["up"] = f"+{described['up']}"
     print_table(["clip", ""], [[key.replace("_", " "), str(value)] for key, value in shown.items()])
     for kind in ("skeletons", "animations"):
-        rows = [
-            [
-                one["name"],
-                f"{one['seconds']:.2f} s" if "seconds" in one else "",
-                "read" if one["read"] else one["choose"],
+        if choices := described.get(kind):
+            rows = [
+                [
+                    one["name"],
+                    f"{one['seconds']:.2f} s" if "seconds" in one else "",
+                    "read" if one["read"] else one["choose"],
+                ]
+                for one in choices
             ]
-            for one in described.get(kind, ())
-        ]
-        if rows:
             print_table([kind, "", "read, or chosen by"], rows)
     if described["joints"]:
         print_table(["canonical", "joint of the rig"], [[c, own] for c, own in described["joints"].items()])
@@ -274,7 +241,3 @@ def _print(described: dict[str, Any], *, as_json: bool) -> None:
         for reason in described["doubts"]:
             print(f"doubtful: {reason}")
         print(inputs.OVERRULE)
-
-
-def _format_unit(metres: float) -> str:
-    return f"{_UNITS[metres]} ({metres:g} m)" if metres in _UNITS else f"{metres:g} m"
