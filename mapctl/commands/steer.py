@@ -33,9 +33,9 @@ from mapctl.commands.shared.outputs import show_progress
 from mapctl.curves.obstacles import Obstacle, measure_clearance
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
-from mapctl.intent.steering import Arrival, CommandTrack, SteeringLimits, read_commands
+from mapctl.intent.steering import CommandTrack, SteeringLimits, read_commands
 from mapctl.metrics.travel import measure_arrivals, measure_commands
-from mapctl.motion import Motion, join_licences
+from mapctl.motion import join_licences
 from mapctl.problem.solution import Outcome, Solution, Status
 from mapctl.terms import FootContact
 from priors.lstm_gmm.density import LstmGmmDensity
@@ -97,75 +97,73 @@ _LAST_COMMAND_SECONDS = 3.0  # seconds for which a script of a single command is
 
 def run(command: Steer) -> int:
     """Check everything, steer, write, report. Ctrl-C ends the script early; the motion so far is written."""
-    _check(command)
-    track = _add_obstacles(_read_track(command.commands), [Obstacle.parse(text) for text in command.avoid])
-    character, prior = read_character(command.rig, command), priors.load(command.prior)
-    track, lowered = track.limit_speed(prior.limits.max_steering_speed)
-    for labels in {wanted.labels for wanted in track.commands if wanted.labels}:
-        prior.conditioned_on(labels)  # unknown labels are refused now
-    stepper = _choose_stepper(command, track)
-    stream = streaming.open_stream(command, [character.skeleton])
-    try:
-        recorder, records, frames = _run_steering(command, prior, track, character, stepper, stream)
-    finally:
-        if stream is not None:
-            stream.close()
-    motion = recorder.motion(frames)
-    outputs.save_motion(character.on_rig(motion), command.out)
-    arrivals = [time for time in track.times[1:] if time < motion.seconds]
-    timing: dict[str, Any] = {**summarise_step_timing(records, arrivals), "peak_memory_mb": report.peak_memory_mb()}
-    if stream is not None:
-        timing["stream"] = asdict(stream.statistics)
-    done = _conclude_steering(motion, recorder, lowered, timing, interrupted=motion.num_frames < frames)
-    refused = [refusal.order for refusal in recorder.refusals]
-    found = _build_report(command, done, track, prior, timing, refused)
-    if command.report is not None:
-        report.write_report(found, command.report)
-    if not command.quiet:
-        files = options.collect_paths(command.out, command.report)
-        streamed = None if stream is None else streaming.summarise(stream)
-        print("\n".join(_format_summary(found, files, streamed)))
-    return conclude(done.status, strict=command.strict)
-
-
-def _check(command: Steer) -> None:
     options.check_seed(command.seed)
-    _limits(command)
+    limits = SteeringLimits(command.acceleration, command.braking, math.radians(command.turn_rate))
     formats.check_ending(command.out)
     outputs.check_files(options.collect_paths(command.out, command.report))
     if command.stream is not None and not command.realtime:
         raise RequestError("--stream goes by the clock, which needs --realtime; give both")
     streaming.check(command)
+    track = _read_track(command)
+    character, prior = read_character(command.rig, command), priors.load(command.prior)
+    track, lowered = track.limit_speed(prior.limits.max_steering_speed)
+    for labels in {wanted.labels for wanted in track.commands if wanted.labels}:
+        prior.conditioned_on(labels)  # unknown labels are refused now
+    stepper: Stepper = steer.step
+    if any(wanted.arrival is not None for wanted in track.commands):
+        stepper = Arriver(priors.load_stitcher(command.stitcher or "stitcher"))
+    elif command.stitcher is not None:
+        raise RequestError("--stitcher makes ways to a place, and the script has no goto_x_m; leave it out")
+    settings = steer.SteerSettings(limits=limits, footing=FootContact(rest_height=character.toe_rest_height))
+    stream = streaming.open_stream(command, [character.skeleton])
+    try:
+        recorder, records, frames = _run_steering(command, prior, track, character, settings, stepper, stream)
+    finally:
+        if stream is not None:
+            stream.close()
+    motion = recorder.motion(frames)
+    outputs.save_motion(character.on_rig(motion), command.out)
+    starts = [time for time in track.times[1:] if time < motion.seconds]
+    timing: dict[str, Any] = {**summarise_step_timing(records, starts), "peak_memory_mb": report.peak_memory_mb()}
+    if stream is not None:
+        timing["stream"] = asdict(stream.statistics)
+    late, sent_late = timing["late_frames"], timing.get("stream", {}).get("late", 0)
+    notes = [*lowered, *(refusal.reason for refusal in recorder.refusals)]
+    notes += [f"{late} frames came after they were due"] if late else []
+    notes += [f"{sent_late} frames were sent late"] if sent_late else []
+    outcome = Outcome.INTERRUPTED if motion.num_frames < frames else Outcome.DONE
+    status = Status(outcome).with_notes(notes, infeasible=bool(notes))
+    done = Solution(motion, status, recorder.ledger, seconds=sum(piece.seconds for piece in recorder.pieces))
+    found = report.build_report(
+        done,
+        request=options.describe_request("steer", command),
+        measures=metrics.measure(motion),
+        seed=command.seed,
+        prior={"name": prior.name, "licence": prior.card.licence, "quality": prior.card.quality},
+        timing=timing,
+    )
+    arrivals = measure_arrivals(motion, track, [refusal.order for refusal in recorder.refusals])
+    found |= {"commands": measure_commands(motion, track)} | ({"arrivals": arrivals} if arrivals else {})
+    if command.report is not None:
+        report.write_report(outputs.add_licence(found), command.report)
+    if not command.quiet:
+        files = options.collect_paths(command.out, command.report)
+        streamed = None if stream is None else streaming.summarise(stream)
+        print("\n".join(_format_summary(found, files, streamed)))
+    return conclude(status, strict=command.strict)
 
 
-def _limits(command: Steer) -> SteeringLimits:
-    return SteeringLimits(command.acceleration, command.braking, math.radians(command.turn_rate))
-
-
-def _read_track(path: Path) -> CommandTrack:
-    """Read the script, and note the licences of the motions whose poses it names."""
-    track = read_commands(path)
+def _read_track(command: Steer) -> CommandTrack:
+    """Read the script, whose commands lead round the obstacles, and note the licences of the motions whose poses it
+    names; RequestError where it begins within an obstacle."""
+    track, obstacles = read_commands(command.commands), tuple(Obstacle.parse(text) for text in command.avoid)
     arrivals = [wanted.arrival for wanted in track.commands if wanted.arrival is not None]
     poses = [arrival.pose for arrival in arrivals if arrival.pose is not None]
-    note_licence(str(path), join_licences(pose.licence for pose in poses))
-    return track
-
-
-def _add_obstacles(track: CommandTrack, obstacles: Sequence[Obstacle]) -> CommandTrack:
-    """Return a track whose commands lead round obstacles; RequestError where one begins within one."""
-    clear = float(measure_clearance(tuple(obstacles), torch.zeros(2, dtype=torch.float64)))
+    note_licence(str(command.commands), join_licences(pose.licence for pose in poses))
+    clear = float(measure_clearance(obstacles, torch.zeros(2, dtype=torch.float64)))
     if clear < 0:
         raise RequestError(f"the character starts at 0,0, {100 * -clear:.0f} cm within an obstacle")
-    return CommandTrack(track.times, tuple(replace(one, obstacles=tuple(obstacles)) for one in track.commands))
-
-
-def _choose_stepper(command: Steer, track: CommandTrack) -> Stepper:
-    """Choose who makes the next frames: with a stitcher where the script has orders to be somewhere."""
-    if any(wanted.arrival is not None for wanted in track.commands):
-        return Arriver(priors.load_stitcher(command.stitcher or "stitcher"))
-    if command.stitcher is not None:
-        raise RequestError("--stitcher makes ways to a place, and the script has no goto_x_m; leave it out")
-    return steer.step
+    return CommandTrack(track.times, tuple(replace(one, obstacles=obstacles) for one in track.commands))
 
 
 def _run_steering(
@@ -173,13 +171,16 @@ def _run_steering(
     prior: LstmGmmDensity,
     track: CommandTrack,
     character: Character,
+    settings: steer.SteerSettings,
     stepper: Stepper,
     stream: "PoseStream | None",
 ) -> tuple[Recorder, list[StepRecord], int]:
+    # A script ends when its last command comes, which says no more than that if it is not the only one; an order to be
+    # somewhere is carried out, and what comes after it shown for a while.
+    by = max((wanted.arrival.by for wanted in track.commands if wanted.arrival is not None), default=0.0)
+    alone = track.times[0] + _LAST_COMMAND_SECONDS if len(track.times) == 1 else 0.0
+    frames = inputs.count_frames(max(track.times[-1], alone, by + _AFTER_SECONDS if by >= track.times[-1] else 0.0))
     first, recorder = track.commands[0], Recorder()
-    frames = inputs.count_frames(_find_end(track))
-    footing = FootContact(rest_height=character.toe_rest_height)
-    settings = steer.SteerSettings(limits=_limits(command), footing=footing)
     generator = torch.Generator().manual_seed(command.seed)
     state, pose = steer.begin(prior, first, generator=generator, settings=settings, skeleton=character.skeleton)
     recorder.show(pose, 0.0)
@@ -189,84 +190,26 @@ def _run_steering(
     with show_progress("steering", quiet=command.quiet) as progress:
         displays: list[Display] = [recorder.show]
         if stream is not None and isinstance(clock, WallClock):
-            displays.append(_StreamDisplay(stream, clock, frames, find_second_zero(clock, state)).show)
+            displays.append(_stream_to(stream, clock, frames, find_second_zero(clock, state)))
             displays[-1](pose, 0.0)
         if progress is not None:
-            displays.append(_ProgressDisplay(progress, frames).show)
+            displays.append(
+                lambda new, due: progress(min(frames, round(due * PRIOR_FPS) + new.motion.num_frames), frames)
+            )
         _, records = drive(state, track.at, displays, frames=frames, clock=clock, stepper=stepper)
     return recorder, records, frames
 
 
-def _find_end(track: CommandTrack) -> float:
-    """Find the second at which a script ends: when its last command comes, which says no more than that if it is not
-    the only one; an order to be somewhere is carried out, and what comes after it shown for a while."""
-    by = max((command.arrival.by for command in track.commands if command.arrival is not None), default=0.0)
-    alone = track.times[0] + _LAST_COMMAND_SECONDS if len(track.times) == 1 else 0.0
-    return max(track.times[-1], alone, by + _AFTER_SECONDS if by >= track.times[-1] else 0.0)
+def _stream_to(stream: "PoseStream", clock: WallClock, frames: int, zero: float) -> Display:
+    """Build the display that has a script's frames sent when they are due; `zero` is the clock's time at second 0."""
 
-
-def _conclude_steering(
-    motion: Motion, recorder: Recorder, lowered: Sequence[str], timing: Mapping[str, Any], *, interrupted: bool
-) -> Solution:
-    """Sum up all steps; lowered commands and late frames make the status infeasible."""
-    late, sent_late = timing["late_frames"], timing.get("stream", {}).get("late", 0)
-    notes = [
-        *lowered,
-        *(refusal.reason for refusal in recorder.refusals),
-        *([f"{late} frames came after they were due"] if late else []),
-        *([f"{sent_late} frames were sent late"] if sent_late else []),
-    ]
-    status = Status(Outcome.INTERRUPTED if interrupted else Outcome.DONE).with_notes(notes, infeasible=bool(notes))
-    return Solution(motion, status, recorder.ledger, seconds=sum(piece.seconds for piece in recorder.pieces))
-
-
-def _build_report(
-    command: Steer,
-    done: Solution,
-    track: CommandTrack,
-    prior: LstmGmmDensity,
-    timing: Mapping[str, Any],
-    refused: Sequence[Arrival],
-) -> dict[str, Any]:
-    card = prior.card
-    found = report.build_report(
-        done,
-        request=options.describe_request("steer", command),
-        measures=metrics.measure(done.motion),
-        seed=command.seed,
-        prior={"name": prior.name, "licence": card.licence, "quality": card.quality},
-        timing=timing,
-    )
-    arrivals = measure_arrivals(done.motion, track, refused)
-    found |= {"commands": measure_commands(done.motion, track)} | ({"arrivals": arrivals} if arrivals else {})
-    return outputs.add_licence(found)
-
-
-@dataclass(frozen=True)
-class _StreamDisplay:
-    """A display that has frames sent when they are due."""
-
-    stream: "PoseStream"
-    clock: WallClock
-    frames: int  # of the script; later ones are not sent
-    zero: float  # the clock's time at the stream's second 0
-
-    def show(self, frames: SteerFrames, due: float) -> None:
-        left = self.frames - round(due * float(frames.motion.fps))
+    def show(new: SteerFrames, due: float) -> None:
+        left = frames - round(due * float(new.motion.fps))
         if left > 0:
-            root, quats = frames.motion.root_position[:left], frames.motion.local_quat_xyzw[:left]
-            self.stream.put(0, self.clock.perf_counter_at(self.zero + due), due, root.numpy(), quats.numpy())
+            root, quats = new.motion.root_position[:left], new.motion.local_quat_xyzw[:left]
+            stream.put(0, clock.perf_counter_at(zero + due), due, root.numpy(), quats.numpy())
 
-
-@dataclass(frozen=True)
-class _ProgressDisplay:
-    """A display that moves a progress bar."""
-
-    progress: Any
-    frames: int
-
-    def show(self, frames: Any, due: float) -> None:
-        self.progress(min(self.frames, round(due * PRIOR_FPS) + frames.motion.num_frames), self.frames)
+    return show
 
 
 def _format_place(row: Mapping[str, Any], name: str, words: str) -> str:
