@@ -22,7 +22,7 @@ WRONG = {
     "empty": ("", "the file is empty"),
     "no outputs": (ACTOR, "outputs: this key is needed"),
     "unknown key": (OUT + "colour = 'red'\n" + ACTOR, "colour: there is no such key; allowed: actors,"),
-    "unknown actor key": (OUT + ACTOR + "vel = 2", "actors[0].vel: there is no such key; allowed: curve,"),
+    "unknown actor key": (OUT + ACTOR + "vel = 2", "actors[0].vel: there is no such key; allowed: speed,"),
     "speed is text": (OUT + ACTOR + "speed = 'fast'", "actors[0].speed: a speed is a number or ARC:SPEED"),
     "negative speed": (OUT + ACTOR + "speed = -1", "actors[0].speed: input should be greater than 0, got -1"),
     "colour": (OUT + ACTOR + "colour = 'reddish'", "actors[0].colour: colour must be #rrggbb or one of"),
