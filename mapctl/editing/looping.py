@@ -122,8 +122,8 @@ def correct_toes(
 def _choose_smoothing(toes: Float[Tensor, "frames 2 3"], fps: float) -> float:
     """Choose the standard deviation in frames of the Gaussian that leaves so little of the noise.
 
-    Noise is estimated by third differences, of which white noise of 1 makes 20 in the square; most frames have little else.
-    Of it a Gaussian of s frames leaves velocities of (4 sqrt(pi) s^3)^-1/2 a frame.
+    Noise is estimated by third differences, of which white noise of 1 makes 20 in the square; most frames have little
+    else. Of it a Gaussian of s frames leaves velocities of (4 sqrt(pi) s^3)^-1/2 a frame.
     """
     least, most = (seconds * fps for seconds in _SMOOTH_SECONDS)
     if len(toes) < _NOISE_FRAMES:

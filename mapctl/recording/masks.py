@@ -40,7 +40,7 @@ class Mask:
 
 
 def load_masks(path: str | PathLike[str]) -> tuple[Mask, ...]:
-    """Read a CSV, its columns in any order; FileFormatError names the line that is wrong. A header alone masks nothing."""
+    """Read a CSV, its columns in any order; FileFormatError names the wrong line. A header alone masks nothing."""
     (line, names), *rows = read_table(path, f"a CSV of the columns {','.join(_COLUMNS)}") or [(1, [])]
     if not set(_COLUMNS) <= set(names) or len(set(names)) < len(names):
         found = shorten(",".join(names)) if names else "nothing"
