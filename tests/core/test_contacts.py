@@ -1,4 +1,4 @@
-"""Contacts: the definition against a plain loop, and what must not change them."""
+"""Contacts of toes and heels, supports below them and local phases, against plain loops and known steps."""
 
 import math
 from itertools import pairwise

@@ -1,4 +1,4 @@
-"""Features: invertible, free of place and heading, and mirrored as the motion is."""
+"""Features and body poses: invertible, free of place and heading, mirrored and reversed; motion DNA."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Names of joints: canonical ones and the rig's own, in any case, and suggestions that stay on their side and limb."""
+"""Names of joints: canonical ones and the rig's own, in any case; side, part and role by name."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""A clip as a loop: no jump where it begins again, however often, on any rig."""
+"""The cycle of a clip, the clip as a loop without a jump, and planted feet that stand still, on any rig."""
 
 import math
 from dataclasses import replace

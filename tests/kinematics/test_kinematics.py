@@ -1,4 +1,4 @@
-"""Forward kinematics against 4x4 matrices multiplied joint by joint."""
+"""Forward kinematics against 4x4 matrices, and inverse kinematics, which leads back."""
 
 import math
 from dataclasses import replace

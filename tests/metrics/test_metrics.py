@@ -1,4 +1,4 @@
-"""Measures against the design's definitions written out anew, and on motions whose measures are known."""
+"""Measures against definitions written out anew, and on motions whose measures are known."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""The smoothest offsets, against the same equations written out."""
+"""The smoothest offsets against the same equations; Gaussian kernels and minimum-jerk motion."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""A recording is looked over: what stands still, what leaps, where its body is."""
+"""A recording is inspected: what leaps, what is held, what is a gap; fast swings and rests are none of it."""
 
 import math
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Masks: what of a recording its user says not to believe."""
+"""Masks: what of a recording its user marks as unreliable; captures, in which that is filled in."""
 
 import pytest
 import torch

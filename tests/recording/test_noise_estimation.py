@@ -1,4 +1,4 @@
-"""How noisy a recording is, told from the recording alone."""
+"""How noisy a recording is, by the recording alone; signs of quaternions under large noise."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Motion on another body: it stands on its floor, planted feet stay, feet are flat, and nothing jumps."""
+"""Motion on another body: it stands on its floor, planted feet stay, nothing jumps; what changed is reported."""
 
 import math
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Any rig to canonical joints and back: the listed ones, and those that nobody listed."""
+"""Any rig to canonical joints and back: listed ones with the trees that programs give them, and others."""
 
 from dataclasses import replace
 
