@@ -8,9 +8,8 @@ limb above. Feet keep their orientation; hands go with the arm.
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 
 import torch
 from jaxtyping import Float
@@ -94,46 +93,22 @@ def find_tpose(
     upright = upright_rotation(up)
     names, still = zero.skeleton.names, (0.0, 0.0, 0.0, 1.0)
     resting = torch.stack([torch.tensor(rig.idle.get(name, still), dtype=torch.float64) for name in names])
-    readings = list(_list_readings(zero, clip, rig, stated, rest, front, up, resting))
-    choose = partial(
-        TPose,
-        upright_quat_xyzw=upright,
-        up=up,
-        facing="unknown" if rest == "neither" else nearest_axis_name(front[2]),
-        rest=rest,
-    )
-    if clip is None:
-        quats, idle, found = (*readings, (_lay_out_tpose(zero, front), resting, "rest pose"))[0]
-        return choose(tpose_quat_xyzw=quats, idle_quat_xyzw=idle, tpose_from=found)
-    anatomy, refused = estimate_frames(clip, upright, own), ""
-    for quats, idle, found in readings:
-        contradicted = anatomy.find_contradictions(quats)
-        doubt = ""
-        if contradicted:
-            names, more = ", ".join([*contradicted][:3]), len(contradicted) - 3
-            named = names + (f" and {more} more" if more > 0 else "")
-            are = f"{'is' if len(contradicted) == 1 else 'are'} {math.degrees(max(contradicted.values())):.0f} degrees"
-            doubt = f"{named} {are} off in the {found} by how the body moves"
-        if stated and (rig.tpose or rig.rest != "auto"):
-            return choose(tpose_quat_xyzw=quats, idle_quat_xyzw=idle, tpose_from=found, tpose_doubt=doubt)
-        if not contradicted.keys() & CORE:
-            doubt = doubt and f"{doubt}, which is followed for the arm"
-            quats = anatomy.correct(quats, contradicted)
-            return choose(tpose_quat_xyzw=quats, idle_quat_xyzw=idle, tpose_from=found, tpose_doubt=doubt)
-        refused = refused or doubt
-    frames = anatomy.correct(torch.zeros(CANONICAL.num_joints, 4, dtype=torch.float64), CANONICAL.names)
-    doubt = refused and f"{refused}, which is followed"
-    if not anatomy.certain.keys() >= {"leftUpperLeg", "rightUpperLeg"}:
-        doubt = "no pose of the file is a T- or A-pose and knees hardly bend: how limbs are twisted is a guess"
-    elif not anatomy.in_quarter_turns:
-        doubt = doubt or "no pose of the file is a T- or A-pose: joint frames are estimated by how the body moves"
-    return choose(tpose_quat_xyzw=frames, idle_quat_xyzw=_mean_locals(clip), tpose_from="motion", tpose_doubt=doubt)
+    faces = "unknown" if rest == "neither" else nearest_axis_name(front[2])
 
+    def choose(quats: Tensor, idle: Tensor, source: str, doubt: str = "") -> TPose:
+        return TPose(
+            tpose_quat_xyzw=quats,
+            idle_quat_xyzw=idle,
+            upright_quat_xyzw=upright,
+            up=up,
+            facing=faces,
+            rest=rest,
+            tpose_from=source,
+            tpose_doubt=doubt,
+        )
 
-def _list_readings(
-    zero: RigPoses, clip: RigPoses | None, rig: Rig, stated: bool, rest: str, front: Tensor, up: str, idle: Tensor
-) -> Iterator[tuple[Tensor, Tensor, str]]:
-    """Yield T-poses by rotations of canonical joints, idle rotations of the rig's, and where they come from."""
+    # Readings: rotations of canonical joints, idle rotations of the rig's, and where they come from.
+    readings: list[tuple[Tensor, Tensor, str]] = []
     laid_out = _lay_out_tpose(zero, front) if rest != "neither" or rig.rest == "straighten" else None
     # A preset's table is of files as its program writes them; one whose rest pose is another has other joint frames.
     if rig.has_tpose and (stated or rest == "neither" or is_canonical_tpose(zero)):
@@ -142,14 +117,37 @@ def _list_readings(
         quats = UNROTATED.repeat(CANONICAL.num_joints, 1) if known is None else known.clone()
         for name, axes in rig.tpose.items():
             quats[CANONICAL.index(name)] = rotations.from_matrix(frame_from_axes(axes))
-        yield quats, idle, "table"
+        readings.append((quats, resting, "table"))
     if laid_out is not None:
-        yield laid_out, idle, "rest pose"
-    if clip is not None and rig.rest in ("auto", "frame0"):
+        readings.append((laid_out, resting, "rest pose"))
+    if clip is None:
+        return choose(*(*readings, (_lay_out_tpose(zero, front), resting, "rest pose"))[0])
+    if rig.rest in ("auto", "frame0"):
         first = replace(clip, positions=clip.positions[:1], orientations=clip.orientations[:1])
         turned = _body_frame(first.left()[0], axis_vector(up))
         if rig.rest == "frame0" or _is_exact_tpose(first, turned):
-            yield _lay_out_tpose(first, turned), _mean_locals(first), "frame 0"
+            readings.append((_lay_out_tpose(first, turned), _mean_locals(first), "frame 0"))
+    anatomy, refused = estimate_frames(clip, upright, own), ""
+    for quats, idle, found in readings:
+        contradicted, doubt = anatomy.find_contradictions(quats), ""
+        if contradicted:
+            listed, more = ", ".join([*contradicted][:3]), len(contradicted) - 3
+            listed += f" and {more} more" if more > 0 else ""
+            are = f"{'is' if len(contradicted) == 1 else 'are'} {math.degrees(max(contradicted.values())):.0f} degrees"
+            doubt = f"{listed} {are} off in the {found} by how the body moves"
+        if stated and (rig.tpose or rig.rest != "auto"):
+            return choose(quats, idle, found, doubt)
+        if not contradicted.keys() & CORE:
+            doubt = doubt and f"{doubt}, which is followed for the arm"
+            return choose(anatomy.correct(quats, contradicted), idle, found, doubt)
+        refused = refused or doubt
+    frames = anatomy.correct(torch.zeros(CANONICAL.num_joints, 4, dtype=torch.float64), CANONICAL.names)
+    doubt = refused and f"{refused}, which is followed"
+    if not anatomy.certain.keys() >= {"leftUpperLeg", "rightUpperLeg"}:
+        doubt = "no pose of the file is a T- or A-pose and knees hardly bend: how limbs are twisted is a guess"
+    elif not anatomy.in_quarter_turns:
+        doubt = doubt or "no pose of the file is a T- or A-pose: joint frames are estimated by how the body moves"
+    return choose(frames, _mean_locals(clip), "motion", doubt)
 
 
 def frame_from_axes(axes: Mapping[str, list[float]]) -> Float[Tensor, "3 3"]:
