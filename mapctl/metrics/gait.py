@@ -1,6 +1,5 @@
 """Paces, and changes of pace: starts, stops, and changes between a walk and a run, by the hips' smoothed speed."""
 
-from dataclasses import astuple, dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -24,28 +23,7 @@ CHANGES = {
     ("walk", "run"): "changes to a run",
     ("run", "walk"): "changes to a walk",
 }
-"""Names of the changes from one pace to the next, by both, in the order of the fields of PaceChanges."""
-
-
-@dataclass(frozen=True)
-class PaceChanges:
-    """How often the pace of one motion changes."""
-
-    starts: int = 0
-    """From under 0.2 to over 0.6 m/s."""
-    stops: int = 0
-    """From over 0.6 to under 0.2 m/s."""
-    to_run: int = 0
-    """From under 1.7 to over 2.1 m/s."""
-    to_walk: int = 0
-    """From over 2.1 to under 1.7 m/s."""
-
-    def __add__(self, other: "PaceChanges") -> "PaceChanges":
-        return PaceChanges(*(one + another for one, another in zip(astuple(self), astuple(other), strict=True)))
-
-    def by_name(self) -> dict[str, int]:
-        """Return how often each of CHANGES happens, by its name."""
-        return dict(zip(CHANGES.values(), astuple(self), strict=True))
+"""Names of the changes from one pace to the next, by both."""
 
 
 def label_pace(pace: str) -> str:
@@ -67,11 +45,12 @@ def measure_speed(ground: Float[ndarray, "frames 2"], fps: float) -> Float[ndarr
     return np.linalg.norm(compute_ground_velocity(ground, fps), axis=1) if len(ground) > 1 else np.zeros(len(ground))
 
 
-def count_pace_changes(speed: Float[ndarray, " frames"]) -> PaceChanges:
-    """Count the changes along a motion's smoothed speed, m/s. Who hesitates without passing both bounds changes
-    nothing."""
+def count_pace_changes(speed: Float[ndarray, " frames"]) -> dict[str, int]:
+    """Count each of CHANGES, by its name, along a motion's smoothed speed, m/s. A hesitation that does not pass both
+    bounds changes nothing."""
     goes, runs = (_follow(speed, *bounds) for bounds in ((STANDS, GOES), (WALKS, RUNS)))
-    return PaceChanges(_count_rises(goes), _count_rises(~goes), _count_rises(runs), _count_rises(~runs))
+    counts = (int(np.count_nonzero(~fast[:-1] & fast[1:])) for fast in (goes, ~goes, runs, ~runs))
+    return dict(zip(CHANGES.values(), counts, strict=True))
 
 
 def follow_pace(speed: Float[ndarray, " frames"]) -> Int[ndarray, " frames"]:
@@ -97,10 +76,6 @@ def _follow(speed: Float[ndarray, " frames"], low: float, high: float) -> Bool[n
         return np.full(len(speed), len(speed) > 0 and float(np.mean(speed)) > (low + high) / 2)
     last = np.searchsorted(passed, np.arange(len(speed)), side="right") - 1
     return (speed > high)[passed[np.maximum(last, 0)]]
-
-
-def _count_rises(fast: Bool[ndarray, " frames"]) -> int:
-    return int(np.count_nonzero(~fast[:-1] & fast[1:]))
 
 
 LONGEST_STEP = 1.0

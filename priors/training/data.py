@@ -24,7 +24,7 @@ from mapctl.errors import FileFormatError, MapctlError, RequestError
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode, integrate_root
 from mapctl.formats import load
 from mapctl.formats.text import read_table
-from mapctl.metrics.gait import PACES, PaceChanges, count_pace_changes, follow_pace, measure_speed
+from mapctl.metrics.gait import CHANGES, PACES, count_pace_changes, follow_pace, measure_speed
 from mapctl.motion import Motion
 from mapctl.retarget import RigMap, identify_rig, rigs
 from mapctl.retarget.carry import RiggedCharacter, retarget_canonical
@@ -499,6 +499,9 @@ def measure_pace_changes(corpus: Corpus) -> dict[str, Any]:
     parts = corpus.integrate_roots()[0].split(list(corpus.lengths))
     speeds = [measure_speed(part.double().numpy(), PRIOR_FPS) for part in parts]
     pace = np.bincount(np.concatenate([follow_pace(speed) for speed in speeds]), minlength=len(PACES))
-    changes = sum((count_pace_changes(speed) for speed in speeds), PaceChanges())
+    changes = [count_pace_changes(speed) for speed in speeds]
     minutes = {name: round(int(count) / PRIOR_FPS / 60, 2) for name, count in zip(PACES, pace, strict=True)}
-    return {"minutes by pace": minutes, **{name: float(count) for name, count in changes.by_name().items()}}
+    return {
+        "minutes by pace": minutes,
+        **{name: float(sum(clip[name] for clip in changes)) for name in CHANGES.values()},
+    }
