@@ -24,46 +24,6 @@ def test_version_is_told(capsys):
 
 
 @pytest.mark.slow
-def test_follow_writes_motion_and_report(walk, prior):
-    motion, report = mapctl.load(walk), json.loads(walk.with_suffix(".json").read_text())
-    assert motion.num_frames == 60
-    assert report["motion"] == {"frames": 60, "fps": 30.0, "seconds": 2.0}
-    assert report["request"]["command"] == "follow"
-    assert report["request"]["curve"] == "circle:3"
-    assert report["prior"]["licence"] == "none, it is made up"
-    assert report["timing"]["threads"] == 1
-
-
-def test_follow_tells_in_short(prior, tmp_path, capsys):
-    out = tmp_path / "walk.bvh"
-    words = ("follow", "line:2", "-o", out, "--prior", prior, "--seconds", 0.4)
-    assert run(*words) == 0
-    told = capsys.readouterr()
-    assert told.err == ""
-    for word in ("cm mean", "ms a frame", "status", str(out)):
-        assert word in told.out
-    assert run(*words, "--quiet") == 0
-    assert capsys.readouterr().out == ""
-
-
-def test_the_curve_is_walked_once_if_no_time_is_given(prior, tmp_path):
-    assert run("follow", "line:1", "-o", tmp_path / "a.npz", "--speed", 1, "--prior", prior) == 0
-    assert mapctl.load(tmp_path / "a.npz").seconds == pytest.approx(1, abs=0.1)
-
-
-@pytest.mark.slow
-def test_same_seed_same_bytes(prior, tmp_path):
-    def written(name: str, seed: int) -> bytes:
-        path = tmp_path / name
-        assert run("follow", "s:2", "-o", path, "--seconds", 0.4, "--seed", seed, "--prior", prior) == 0
-        return path.read_bytes()
-
-    first = written("a.bvh", 5)
-    assert written("b.bvh", 5) == first
-    assert any(written(f"{seed}.bvh", seed) != first for seed in range(5))
-
-
-@pytest.mark.slow
 def test_strict_says_when_not_all_holds(prior, tmp_path, capsys):
     """The made-up prior's data reach 2 m/s."""
     words = ("follow", "line:4", "-o", tmp_path / "a.bvh", "--seconds", 0.4, "--prior", prior)

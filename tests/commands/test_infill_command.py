@@ -8,7 +8,6 @@ from captures import on_rig
 from helpers import run
 from methods import words_of
 from tiny_infiller import save_tiny_infiller
-from tiny_prior import save_tiny_prior
 
 import mapctl
 
@@ -101,27 +100,6 @@ def test_lost_joints_with_and_without_gaps(infill, recording, tmp_path, rig, gap
     assert 1 <= changed <= 6  # of the hand and the lower arm
     if gap:
         assert (before == after).all(axis=1).sum() == 35
-
-
-def test_gaps_at_the_ends_are_said(infill, recording, tmp_path, capsys):
-    words = ["--gap", "0:5", "--gap", "40:45", *words_of("infiller")]
-    assert infill(recording(), "-o", tmp_path / "out.bvh", *words) == 0
-    told = capsys.readouterr().out
-    assert "a gap at the beginning: the motion is extended backwards" in told
-    assert "a gap at the end: the motion is extended" in told
-
-
-@pytest.mark.slow
-def test_a_report_tells_the_request_and_what_was_done(infill, recording, tmp_path):
-    report = tmp_path / "r.json"
-    words = ["--gap", "20:30", "--report", report, "--prior", save_tiny_prior(tmp_path / "prior.safetensors")]
-    assert infill(recording(), "-o", tmp_path / "out.bvh", *words, "--quiet") == 0
-    told = json.loads(report.read_text())
-    assert told["request"]["command"] == "infill"
-    assert (told["request"]["gap"], told["request"]["method"]) == (["20:30"], "auto")
-    assert told["gaps"] == [{"start": 20, "stop": 30, "joints": 22, "root": True}]
-    assert {"mapctl", "versions", "motion", "ledger", "seconds", "frame_ms", "status", "measures"} <= set(told)
-    assert {"footing", "likelihood"} <= set(told["ledger"])
 
 
 def test_frozen_frames_are_found(infill, recording, tmp_path, capsys):

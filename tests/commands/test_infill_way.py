@@ -9,8 +9,6 @@ from helpers import run
 from tiny_infiller import save_tiny_infiller
 from tiny_path import save_tiny_path
 
-import mapctl
-
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory):
@@ -53,9 +51,3 @@ def test_ways_and_gaps_go_together_and_are_told(clip, path, tmp_path, capsys):
     turned = (channels(clip) != channels(out)).sum(axis=1)
     assert turned[20:25].min() > 10
     assert turned[10:20].max() <= 3
-
-
-def test_a_whole_clip_may_be_walked_in_place(clip, path, tmp_path):
-    out = tmp_path / "out.npz"
-    assert run("infill", clip, "-o", out, "--way", "0:60", "--path", path, "--quiet") == 0
-    assert mapctl.load(out).num_frames == 60

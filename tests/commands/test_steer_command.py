@@ -48,15 +48,6 @@ def test_a_script_gives_motion_and_report(steer, tmp_path, capsys):
     assert str(report) in out
 
 
-@pytest.mark.slow
-def test_the_same_seed_gives_the_same_bytes(steer, tmp_path):
-    found = set()
-    for _ in range(2):
-        assert steer(SCRIPT, "--quiet") == 0
-        found.add((tmp_path / "a.bvh").read_bytes())
-    assert len(found) == 1
-
-
 def test_a_script_is_played_against_the_clock(steer, tmp_path):
     assert steer(SCRIPT, "--realtime", "--quiet") == 0
     assert mapctl.load(tmp_path / "a.bvh").num_frames == 15
@@ -97,22 +88,6 @@ def test_a_command_that_the_walk_obeys_is_reached_at_once_and_another_never():
     assert not_obeyed["reached_s"] is None
     assert not_obeyed["under_way_s"] is None
     assert not_obeyed["steady_heading_error_deg"] == pytest.approx(-math.degrees(1.0), abs=2)
-
-
-def test_turning_on_is_measured_as_a_rate():
-    motion = walk(180, turn_rate=0.5)
-    row = measure_commands(motion, CommandTrack((0.0,), (Command(1.2, 0.0, turning=0.5),)))[0]
-    assert row["steady_turn_deg_s"] == pytest.approx(math.degrees(0.5), rel=0.05)
-    assert row["steady_heading_error_deg"] is None
-
-
-@pytest.mark.slow
-def test_a_wanted_step_length_is_in_the_ledger_and_the_report(steer, tmp_path, capsys):
-    script = "time_s,speed_mps,heading_deg,step_m\n0,1.2,0,\n0.2,1.2,0,0.6\n0.5,1.2,0,\n"
-    assert steer(script, "--report", tmp_path / "r.json") == 0
-    told = json.loads((tmp_path / "r.json").read_text())
-    assert [row["step_m"] for row in told["commands"]] == [None, 0.6, None]
-    assert {"travel", "footing", "noise", "steps"} == set(told["ledger"])
 
 
 @pytest.mark.slow

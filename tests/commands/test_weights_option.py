@@ -1,7 +1,6 @@
 """Commands with the free weights alone, as a user types them, and which set of weights is taken."""
 
 import json
-import os
 import shutil
 
 import pytest
@@ -12,18 +11,16 @@ import mapctl
 from priors import weight_sets
 
 NOT_FREE = "CC BY-NC 4.0"
-BUNDLED = weight_sets.list_models("free")  # so that tests see what a user sees without the others
 SCENE = 'outputs = ["a.npz", "a.json"]\n[[actors]]\ncurve = "line:0.5"\n'
 KEYS = 'body = "in.bvh"\n[[key]]\nframe = 0\npose = "in.bvh"\n[[key]]\nframe = 12\npose = "in.bvh"\npose_frame = 12\n'
 
 
 @pytest.fixture(scope="module")
 def saved(tmp_path_factory):
-    """The free set alone, under `free`, and beside it a whole folder of both, under `both`."""
+    """A folder of both sets."""
     folder = tmp_path_factory.mktemp("weights")
-    save_tiny_weights(folder / "alone" / "free", models=BUNDLED)
-    save_tiny_weights(folder / "both", NOT_FREE)
-    save_tiny_weights(folder / "both" / "free")
+    save_tiny_weights(folder, NOT_FREE)
+    save_tiny_weights(folder / "free")
     return folder
 
 
@@ -34,91 +31,21 @@ def work(tmp_path, monkeypatch):
     monkeypatch.setenv("MAPCTL_RENDERER", "stick")
     monkeypatch.delenv(weight_sets.VARIABLE, raising=False)
     walk(40).save(tmp_path / "in.bvh")
-    walk(40, turn_rate=0.3, seed=1).save(tmp_path / "other.bvh")
-    walk(210).save(tmp_path / "long.bvh")
-    (tmp_path / "clips").mkdir()
-    shutil.copy(tmp_path / "in.bvh", tmp_path / "clips" / "one.bvh")
     (tmp_path / "scene.toml").write_text(SCENE)
     (tmp_path / "keys.toml").write_text(KEYS)
-    (tmp_path / "c.csv").write_text("time_s,speed_mps,heading_deg\n0,1.0,0\n0.5,1.0,0\n")
     return tmp_path
-
-
-@pytest.fixture
-def alone(saved, work, monkeypatch):
-    """The free weights without the full ones."""
-    monkeypatch.setenv(weight_sets.FOLDER_VARIABLE, str(saved / "alone"))
-    return work
 
 
 @pytest.fixture
 def both(saved, work, monkeypatch):
     """Both sets, in a folder of their own."""
-    shutil.copytree(saved / "both", work / "weights")
+    shutil.copytree(saved, work / "weights")
     monkeypatch.setenv(weight_sets.FOLDER_VARIABLE, str(work / "weights"))
     return work
 
 
 def licence_of(report):
     return json.loads(report.read_text())["licence"]
-
-
-JOBS = {
-    "follow": ("follow line:1 -o out.npz --report out.json", {"locomotion"}),
-    "follow a shot": ("follow line:1 -o out.npz --end stand --report out.json", {"locomotion", "transformer"}),
-    "run": ("run scene.toml", {"locomotion"}),
-    "generate": ("generate -o made --seconds 0.5 --no-footing --to .npz", {"locomotion"}),
-    "steer": ("steer c.csv -o out.npz --report out.json", {"locomotion"}),
-    "denoise": ("denoise in.bvh -o out.npz --report out.json", {"denoiser", "transformer"}),
-    "denoise with densities": (
-        "denoise in.bvh -o out.npz --prior auto --report out.json",
-        {"denoiser", "general", "locomotion", "transformer"},
-    ),
-    "denoise a folder": ("denoise clips -o clean --jobs 2 --report told", {"denoiser", "transformer"}),
-    "infill": ("infill in.bvh -o out.npz --gap 10:20 --report out.json", {"transformer"}),
-    "infill a long gap": ("infill long.bvh -o out.npz --gap 10:200 --no-finish --report out.json", {"transformer"}),
-    "infill by a stitcher": ("infill in.bvh -o out.npz --gap 10:20 --method stitcher --report out.json", {"stitcher"}),
-    "infill by rollouts": (
-        "infill in.bvh -o out.npz --gap 10:14 --method rollouts --report out.json",
-        {"general", "locomotion"},
-    ),
-    "tween": (
-        "tween in.bvh -o out.npz --keyframes 0,12 --suggest-timing --report out.json",
-        {"keyframe-timing", "transformer"},
-    ),
-    "blend": (
-        "blend in.bvh --from other.bvh --joints leftHand --frames 5:10 --at 15 -o out.npz --no-finish",
-        {"transformer"},
-    ),
-    "chain": ("chain in.bvh other.bvh -o out.npz --piece 10 --gap 9:10 --no-finish", {"transformer"}),
-}
-"""Words by what they do, and the models that they need at least."""
-LONG = {*JOBS} - {"follow", "run", "generate", "denoise", "tween", "chain"}
-CASES = [pytest.param(name, marks=pytest.mark.slow if name in LONG else ()) for name in JOBS]
-OUTPUTS = ("out.npz", "a.npz", "made/generated_000.npz")
-REPORTS = ("out.json", "a.json", "told/one.json")
-
-
-@pytest.mark.parametrize("name", CASES)
-def test_commands_work_with_the_free_weights_alone(alone, capsys, name):
-    words, needed = JOBS[name]
-    assert run(*words.split(), "--weights", "free") == 0
-    told = capsys.readouterr().out.splitlines()
-    (line,) = [line for line in told if line.startswith("licence   ")]
-    assert line.startswith(f"licence   {FREE} (free/")
-    assert all(f"free/{model}" in line for model in needed)
-    assert "CC BY-NC" not in line
-    for motion in map(alone.joinpath, OUTPUTS):
-        if motion.exists():
-            assert mapctl.load(motion).licence.startswith(f"{FREE} (free/")
-            assert "/tmp" not in mapctl.load(motion).licence
-    for report in map(alone.joinpath, REPORTS):
-        if report.exists():
-            licence = licence_of(report)
-            assert licence["strictest"] == FREE
-            assert {f"free/{model}" for model in needed} <= set(licence["models"])
-            assert set(licence["models"].values()) == {FREE}
-    assert weight_sets.VARIABLE not in os.environ
 
 
 def test_what_the_free_set_lacks_is_refused_in_one_line(both, fails):
