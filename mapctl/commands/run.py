@@ -61,7 +61,7 @@ def run(command: RunScene) -> int:
 
 
 def _run_scene(command: RunScene, path: Path, scene: SceneDescription, curves: Sequence[Curve]) -> int:
-    read_body, read_drawn = (functools.cache(read) for read in (read_character, read_drawn_character))
+    read_body, read_drawn = functools.cache(read_character), functools.cache(read_drawn_character)
     prior, plans = priors.load(scene.prior), list[ShotPlan]()
     for actor, curve in zip(scene.actors, curves, strict=True):
         rig = actor.rig and (str(path.parent / actor.rig) if Path(actor.rig).suffix else actor.rig)

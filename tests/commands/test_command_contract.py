@@ -12,7 +12,7 @@ from helpers import run, walk
 from tiny_weights import FREE, save_tiny_weights
 
 import mapctl
-from mapctl.commands import COMMANDS, bench
+from mapctl.commands import bench
 from priors import weight_sets
 
 BUNDLED = weight_sets.list_models("free")  # so that tests see what a user sees without the others
@@ -115,14 +115,6 @@ def test_a_film_is_written_beside_the_motion(here, name):
     pytest.importorskip("PIL")
     assert run(*JOBS[name][0].split(), "--weights", "free", "--quiet", "--video", "v.png") == 0
     assert (here / "v.png").read_bytes().startswith(b"\x89PNG")
-
-
-@pytest.mark.parametrize("name", COMMANDS)
-def test_help_names_the_command_and_its_options(name, capsys):
-    with pytest.raises(SystemExit) as ended:
-        run(name, "--help")
-    assert ended.value.code == 0
-    assert capsys.readouterr().out.startswith(f"usage: mapctl {name}")
 
 
 @pytest.mark.slow

@@ -50,13 +50,6 @@ def test_the_first_variation_is_the_calm_one_and_the_others_are_the_same_however
     assert len({Path(f"many_00{number}.bvh").read_bytes() for number in range(4)}) == 4
 
 
-@pytest.mark.slow
-def test_one_answer_is_the_calm_one_whatever_the_seed(clip):
-    for out, seed in (("a.bvh", 0), ("b.bvh", 5)):
-        assert run("tween", clip, "-o", out, "--keyframes", "0,20", *STITCH, "--seed", seed) == 0
-    assert Path("a.bvh").read_bytes() == Path("b.bvh").read_bytes()
-
-
 def test_infill_and_chain_stitch(clip):
     assert run("infill", clip, "-o", "whole.bvh", "--gap", "10:25", *STITCH, "--report", "whole.json") == 0
     assert json.loads(Path("whole.json").read_text())["gap_notes"] == ["frames 10:25: stitcher"]

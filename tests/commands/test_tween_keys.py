@@ -5,7 +5,6 @@ import re
 from pathlib import Path
 
 import pytest
-import torch
 from captures import on_rig
 from helpers import run, walk
 from methods import words_of
@@ -85,15 +84,6 @@ def test_keys_of_every_kind_are_met_in_the_file(tween, folder, capsys):
     assert hand.tolist() == pytest.approx([0.4, 1.2, 0.8], abs=2e-3)
     assert canonical.root_position[40, ::2].tolist() == pytest.approx([0.3, 1.5], abs=1e-4)
     assert "key_timing" not in told
-
-
-@pytest.mark.slow
-def test_the_unit_of_a_body_is_obeyed_and_doubts_about_poses_are_printed(folder, capsys):
-    keys = folder / "keys" / "keys.toml"
-    assert run("tween", keys, "-o", "a.npz", "--unit", "in", "--method", "slerp") == 0
-    assert f"{folder / 'keys' / 'walk.bvh'}: hips are 2." in capsys.readouterr().err
-    bones = [mapctl.load(path).skeleton.offsets for path in ("a.npz", folder / "keys" / "walk.bvh")]
-    torch.testing.assert_close(bones[0], 2.54 * bones[1])
 
 
 def test_timing_is_suggested_and_the_given_one_made(folder, capsys):

@@ -62,7 +62,7 @@ def run_folder(
     elif processes == 1:
         ended = map(run, left)
     else:
-        ended = Parallel(n_jobs=processes, return_as="generator_unordered")(delayed(run)(job) for job in left)
+        ended = _run_over_processes(left, run, processes)
     results: list[_Result] = []
     counted = explain_progress(len(left), "files", "" if again else "the same command goes on with the others")
     with show_progress(label, quiet=quiet) as progress, counted as finished:
@@ -119,6 +119,10 @@ def _run_job(work: Work, job: tuple[Path, Path]) -> _Result:
         return _Result(source, " ".join(str(error).split()))
     except Exception as error:
         return _Result(source, f"{type(error).__name__}: {' '.join(str(error).split())}")
+
+
+def _run_over_processes(jobs: Sequence[tuple[Path, Path]], run: Callable[..., _Result], count: int) -> Any:
+    return Parallel(n_jobs=count, return_as="generator_unordered")(delayed(run)(job) for job in jobs)
 
 
 def _run_over_cluster(

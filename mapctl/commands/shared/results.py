@@ -147,7 +147,7 @@ def write_result(
     and this one where the command's options ask for them."""
     outputs.save_motion(solution.motion, command.out)
     if getattr(command, "report", None) is not None:
-        reports.write_report(build_report(name, command, solution) | more, command.report)
+        reports.write_report({**build_report(name, command, solution), **more}, command.report)
     if command.video is not None:
         with show_progress("filming", quiet=command.quiet) as progress:
             film_side_by_side(before, solution.motion, command.video, rig=rig, progress=progress)

@@ -1,5 +1,6 @@
-"""What arrives from other programs: messages, nonsense and floods."""
+"""OSC from other programs: where packets go, messages, nonsense and floods, and which of them are orders."""
 
+import math
 import random
 import socket
 import struct
@@ -11,7 +12,85 @@ from pythonosc.udp_client import SimpleUDPClient
 
 from mapctl.errors import RequestError
 from mapctl.streaming.messages import Endpoint, Message
+from mapctl.streaming.orders import Order, keep_latest, read_order
 from mapctl.streaming.receiver import MAX_DATAGRAM_BYTES, OscReceiver
+
+GROUPS = ("gait", "style")
+
+
+def read(address: str, *arguments: object, characters: int = 3) -> Order:
+    return read_order(Message(address, arguments), characters=characters, groups=GROUPS)
+
+
+@pytest.mark.parametrize(
+    ("address", "arguments", "order"),
+    [
+        ("/mapctl/speed", (1.5,), Order(0, "speed", (1.5,))),
+        ("/mapctl/3/heading", (90.0,), Order(2, "heading", (90.0,))),
+        ("/mapctl/stop", (), Order(0, "stop")),
+        ("/mapctl/style", ("old",), Order(0, "style", word="old")),
+        ("/mapctl/2/hand/left", (0.1, 1.2, 3.0), Order(1, "hand/left", (0.1, 1.2, 3.0))),
+        ("/mapctl/place", (1.0, 2.0, 1.5), Order(0, "place", (1.0, 2.0, 1.5))),
+    ],
+)
+def test_orders_are_read(address, arguments, order):
+    assert read(address, *arguments) == order
+
+
+@pytest.mark.parametrize(
+    ("address", "arguments", "said"),
+    [
+        ("/mapctl/sped", (1.0,), "/mapctl/sped is no order; there are /mapctl/ and speed, .*gait, style"),
+        ("/mapctl/4/speed", (1.0,), "no character 4"),
+        ("/mapctl/speed", (), "takes 1 number, not 0"),
+        ("/mapctl/speed", (math.nan,), "takes finite numbers"),
+        ("/mapctl/speed", ("1.5",), "takes finite numbers"),
+        ("/mapctl/hand/left", (1.0, 2.0), "takes no or 3 numbers, not 2"),
+        ("/mapctl/path", (1.0, 2.0, 3.0), "x and z of 2 to 200 points"),
+        ("/mapctl/style", (3.0,), "takes one word"),
+    ],
+)
+def test_others_are_refused_with_what_is_allowed(address, arguments, said):
+    with pytest.raises(RequestError, match=said):
+        read(address, *arguments)
+
+
+def test_the_last_order_of_a_kind_and_character_counts():
+    orders = [
+        read("/mapctl/speed", 1.0),
+        read("/mapctl/2/speed", 3.0),
+        read("/mapctl/stop"),
+        read("/mapctl/speed", 2.0),
+    ]
+    assert keep_latest(orders) == [orders[1], orders[2], orders[3]]
+
+
+@pytest.mark.parametrize(
+    ("text", "host", "port"),
+    [
+        ("39539", "127.0.0.1", 39539),
+        (":39539", "127.0.0.1", 39539),
+        ("192.168.1.20:65535", "192.168.1.20", 65535),
+        ("studio.local:39540", "studio.local", 39540),
+        ("[::1]:39539", "::1", 39539),
+    ],
+)
+def test_a_host_must_be_written_to_be_another_than_this_machine(text, host, port):
+    assert Endpoint.parse(text, option="--stream") == Endpoint(host, port)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "host", "host:", ":0", ":65536", "a:b:1", "::1:5", "1.2.3.4:-5", "x:12e3", "[::1]"]
+)
+def test_anything_else_is_refused(text):
+    with pytest.raises(RequestError, match=r"--listen must be HOST:PORT.*65535"):
+        Endpoint.parse(text, option="--listen")
+
+
+def test_ports_of_further_characters():
+    assert Endpoint("a", 39539).offset(2, option="--stream") == Endpoint("a", 39541)
+    with pytest.raises(RequestError, match="character 3 would be at port 65536"):
+        Endpoint("a", 65534).offset(2, option="--stream")
 
 
 def free_port() -> int:
