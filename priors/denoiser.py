@@ -61,9 +61,10 @@ class DenoiserConfig(NetworkConfig):
 class DenoiserNetwork(nn.Module):
     """Capture in, proposal out; untrained, it smooths."""
 
-    def __init__(self, config: DenoiserConfig):
+    def __init__(self, config: DenoiserConfig, *, bfloat16: bool = False):
+        """Compute convolutions in bfloat16 if so asked; what they are given and give back is not."""
         super().__init__()
-        self.config = config
+        self.config, self.reduced_precision = config, bfloat16
         self.first = nn.Conv1d(_INPUT_CHANNELS, config.width, config.kernel, padding=config.kernel // 2)
         self.blocks = nn.ModuleList(
             _ResidualBlock(config.width, config.kernel, dilation) for dilation in config.dilations
@@ -79,12 +80,14 @@ class DenoiserNetwork(nn.Module):
         """Propose a motion, frames that were not observed at all included."""
         view = _CaptureView(capture)
         inputs = view.inputs()
-        hidden = self.first(inputs.transpose(1, 2))
-        for block in self.blocks:
-            hidden = block(hidden)
-        hidden = hidden.transpose(1, 2)
-        pose, contacts = view.changed(self.last(hidden))
-        return CaptureProposal(pose, contacts, self.spread(hidden.detach()))
+        with torch.autocast(inputs.device.type, torch.bfloat16, enabled=self.reduced_precision):
+            hidden = self.first(inputs.transpose(1, 2))
+            for block in self.blocks:
+                hidden = block(hidden)
+            hidden = hidden.transpose(1, 2)
+            change, spread = self.last(hidden).to(inputs.dtype), self.spread(hidden.detach()).to(inputs.dtype)
+        pose, contacts = view.changed(change)
+        return CaptureProposal(pose, contacts, spread)
 
 
 class _ResidualBlock(nn.Module):

@@ -147,9 +147,10 @@ class InfillerNetwork(nn.Module):
     mean: Tensor
     std: Tensor
 
-    def __init__(self, config: InfillerConfig):
+    def __init__(self, config: InfillerConfig, *, bfloat16: bool = False):
+        """Compute convolutions in bfloat16 if so asked; what they are given and give back is not."""
         super().__init__()
-        self.config = config
+        self.config, self.reduced_precision = config, bfloat16
         self.register_buffer("mean", torch.zeros(_JOINTS, 3))
         self.register_buffer("std", torch.ones(_JOINTS, 3))
         self.keeps_observed = config.architecture == "skips"
@@ -167,9 +168,12 @@ class InfillerNetwork(nn.Module):
         shown = torch.where(image.ever_known[:, None, :, None], image.places, self.mean)
         rows = self._rows(image, shown)
         rows = torch.cat([rows, _encode_masks(image)], dim=-1) if self.keeps_observed else rows
-        out = self.net(rows.transpose(1, 2)).transpose(1, 2)
-        change, contacts = out[..., :_POSITION_ROWS].unflatten(-1, (_JOINTS, 3)) * self.std, out[..., -_CONTACT_ROWS:]
-        contacts = 4 * contacts
+        with torch.autocast(rows.device.type, torch.bfloat16, enabled=self.reduced_precision):
+            out = self.net(rows.transpose(1, 2)).transpose(1, 2).to(rows.dtype)
+        change, contacts = (
+            out[..., :_POSITION_ROWS].unflatten(-1, (_JOINTS, 3)) * self.std,
+            4 * out[..., -_CONTACT_ROWS:],
+        )
         if not self.keeps_observed:
             return ProposedPositions(self.mean + change, contacts)
         return ProposedPositions(torch.where(image.known[..., None], image.places, shown + change), contacts)

@@ -110,9 +110,10 @@ class PathNetwork(nn.Module):
     mean: Tensor
     std: Tensor
 
-    def __init__(self, config: PathConfig):
+    def __init__(self, config: PathConfig, *, bfloat16: bool = False):
+        """Compute convolutions in bfloat16 if so asked; what they are given and give back is not."""
         super().__init__()
-        self.config = config
+        self.config, self.reduced_precision = config, bfloat16
         self.register_buffer("mean", torch.zeros(_JOINTS, 3))
         self.register_buffer("std", torch.ones(_JOINTS, 3))
         outer, inner = config.width, 2 * config.width
@@ -135,7 +136,9 @@ class PathNetwork(nn.Module):
         """Predict the trajectory; 123 to 138 frames on either side are seen."""
         frames = motion.turns.shape[1]
         rows = pad(self._rows(motion).transpose(1, 2), (0, -frames % _STRIDE))
-        out = self.last(self.layers(rows))[..., :frames].transpose(1, 2)
+        with torch.autocast(rows.device.type, torch.bfloat16, enabled=self.reduced_precision):
+            out = self.last(self.layers(rows))
+        out = out[..., :frames].transpose(1, 2).to(rows.dtype)
         steps, height, contacts, shares = out.split([2, 1, 2, len(_ANCHORS) + 1], dim=-1)
         return RootTrajectory(
             _mix_anchored_steps(motion, shares) + _STEP_UNIT * steps,

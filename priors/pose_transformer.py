@@ -98,9 +98,10 @@ class PoseTransformerNetwork(nn.Module):
     std_position: Tensor
     spread_shift: Tensor
 
-    def __init__(self, config: PoseTransformerConfig):
+    def __init__(self, config: PoseTransformerConfig, *, bfloat16: bool = False):
+        """Compute attention and perceptrons in bfloat16 if so asked; what they are given and give back is not."""
         super().__init__()
-        self.config = config
+        self.config, self.reduced_precision = config, bfloat16
         self.register_buffer("mean_quats", torch.tensor([0.0, 0.0, 0.0, 1.0]).expand(_JOINTS, 4).clone())
         self.register_buffer("mean_rotation", torch.zeros(_JOINTS, 6))
         self.register_buffer("std_rotation", torch.ones(_JOINTS, 6))
@@ -140,12 +141,13 @@ class PoseTransformerNetwork(nn.Module):
         """Propose poses with the layers of a stage, which look at the `seen` frames alone."""
         rows = self._encode(motion, shown)
         bones = (motion.offsets - CANONICAL.offsets.to(motion.offsets)).flatten(1) / _BONE_UNIT
-        tokens = stage.embed(rows) + self.bones(bones)[:, None]
-        phases = _rotary_phases(rows.shape[1], self.config.width // self.config.heads, tokens.device)
-        for layer in stage.layers:
-            tokens = layer(tokens, phases, seen)
-        tokens = stage.norm(tokens)
-        out, spread = stage.head(tokens), self.spread(tokens.detach())
+        with torch.autocast(rows.device.type, torch.bfloat16, enabled=self.reduced_precision):
+            tokens = stage.embed(rows) + self.bones(bones)[:, None]
+            phases = _rotary_phases(rows.shape[1], self.config.width // self.config.heads, tokens.device)
+            for layer in stage.layers:
+                tokens = layer(tokens, phases, seen)
+            tokens = stage.norm(tokens)
+            out, spread = stage.head(tokens).float(), self.spread(tokens.detach()).float()
         local = self._decode_rotations(out[..., :_ROTATION_ROWS], shown, motion)
         moved = out[..., _ROTATION_ROWS : _ROTATION_ROWS + 3] * _HIPS_UNIT
         moved = rotations.rotate_about_y(moved, motion.heading)
@@ -244,10 +246,12 @@ class _Layer(nn.Module):
         if self.near is not None:
             tokens = tokens + self.near(tokens.transpose(1, 2)).transpose(1, 2)
         parts = self.split(self.first(tokens)).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
-        query, key, value = parts.unbind()
-        query, key = _rotate_pairs(query, phases), _rotate_pairs(key, phases)
+        query, key, value = parts.float().unbind()
         mask = None if seen is None else seen[:, None, None]
-        mixed = functional.scaled_dot_product_attention(query, key, value, attn_mask=mask)
+        # Attention itself is slower in bfloat16 on a CPU.
+        with torch.autocast(tokens.device.type, enabled=False):
+            query, key = _rotate_pairs(query, phases), _rotate_pairs(key, phases)
+            mixed = functional.scaled_dot_product_attention(query, key, value, attn_mask=mask)
         tokens = tokens + self.join(mixed.transpose(1, 2).flatten(2))
         return tokens + self.perceptron(self.second(tokens))
 

@@ -22,7 +22,8 @@ Departures from what is printed:
 """
 
 import math
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from itertools import pairwise
@@ -62,10 +63,32 @@ class SidedLinear(nn.Module):
         bound = 1 / math.sqrt(inputs)
         self.weight = nn.Parameter(torch.empty(SIDES, inputs, outputs).uniform_(-bound, bound))
         self.bias = nn.Parameter(torch.zeros(SIDES, 1, outputs))
+        self._rounded: Tensor | None = None
 
     def forward(self, x: Float[Tensor, "2 batch inputs"]) -> Float[Tensor, "2 batch outputs"]:
         """Return the outputs of each side."""
-        return torch.baddbmm(self.bias, x, self.weight)
+        if self._rounded is None:
+            return torch.baddbmm(self.bias, x, self.weight)
+        return self.bias + torch.bmm(x.bfloat16(), self._rounded).float()
+
+    @contextmanager
+    def round_weights(self) -> Iterator[None]:
+        """Multiply in bfloat16; weights are rounded once for all frames that are made meanwhile."""
+        self._rounded = self.weight.bfloat16()
+        try:
+            yield
+        finally:
+            self._rounded = None
+
+
+@contextmanager
+def multiply_in_bfloat16(*networks: nn.Module, wanted: bool = True) -> Iterator[None]:
+    """Let all such layers of these networks multiply in bfloat16 meanwhile, if it is wanted."""
+    with ExitStack() as stack:
+        for layer in (layer for network in networks for layer in network.modules()):
+            if wanted and isinstance(layer, SidedLinear):
+                stack.enter_context(layer.round_weights())
+        yield
 
 
 class SidedLayers(nn.Module):

@@ -323,9 +323,10 @@ class GeneratorNetwork(nn.Module):
     mean: Tensor
     std: Tensor
 
-    def __init__(self, config: GeneratorConfig):
+    def __init__(self, config: GeneratorConfig | None = None, *, bfloat16: bool = False):
+        """Compute convolutions in bfloat16 if so asked; what they are given and give back is not."""
         super().__init__()
-        self.config = config
+        self.config, self.reduced_precision = config or GeneratorConfig(), bfloat16
         self.register_buffer("mean", torch.zeros(CANONICAL.num_joints, 3))
         self.register_buffer("std", torch.ones(CANONICAL.num_joints, 3))
         widths, style = self.config.widths, self.config.style
@@ -362,19 +363,21 @@ class GeneratorNetwork(nn.Module):
         """Run the convolutions alone; also returns what each of the residual ones gave."""
         frames, hidden = rows.shape[-1], pad(rows, (0, -rows.shape[-1] % _STRIDE))
         responses: list[Tensor] = []
-        levels = []
-        for layer in self.encoder:
-            levels.append(hidden)
-            hidden = layer(hidden, responses)
-        hidden = torch.cat([hidden, style[..., None].expand(-1, -1, hidden.shape[-1])], dim=1)
-        hidden = self.decoder[0](hidden, responses)
-        for stage in range(_STAGES):
-            for layer in self.decoder[1 + 2 * stage : 3 + 2 * stage]:
+        with torch.autocast(rows.device.type, torch.bfloat16, enabled=self.reduced_precision):
+            levels = []
+            for layer in self.encoder:
+                levels.append(hidden)
                 hidden = layer(hidden, responses)
-            if self.config.skips:
-                hidden = (hidden + self.skips[stage](levels[_STAGES - 1 - stage])) / math.sqrt(2)
-                hidden = hidden + self.styles[stage](style)[..., None]
-        return self.last(hidden)[..., :frames], tuple(responses)
+            hidden = torch.cat([hidden, style[..., None].expand(-1, -1, hidden.shape[-1]).to(hidden)], dim=1)
+            hidden = self.decoder[0](hidden, responses)
+            for stage in range(_STAGES):
+                for layer in self.decoder[1 + 2 * stage : 3 + 2 * stage]:
+                    hidden = layer(hidden, responses)
+                if self.config.skips:
+                    hidden = (hidden + self.skips[stage](levels[_STAGES - 1 - stage])) / math.sqrt(2)
+                    hidden = hidden + self.styles[stage](style)[..., None]
+        # Angles need more than the eight bits of bfloat16, or who stands trembles.
+        return self.last(hidden.to(rows.dtype))[..., :frames], tuple(responses)
 
     def encode_rows(self, image: PositionImage) -> Float[Tensor, "batch frames rows"]:
         """Encode the dense input of section 3.5, seen from the reference, in about unit size."""

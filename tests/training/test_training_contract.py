@@ -184,6 +184,16 @@ def test_a_run_may_begin_with_the_weights_of_another(name, finished, data, tmp_p
     assert all((old[key].float() - new[key].float()).abs().max() < 0.05 for key in shared if "temperature" not in key)
 
 
+@pytest.mark.parametrize("name", list_params(NETWORKS))
+def test_a_step_in_bfloat16_has_the_loss_of_one_in_float32_nearly(name, data, prior, tmp_path):
+    parts, losses = small_settings(name, data, tmp_path, prior).gather(), []
+    for reduced in (False, True):
+        trainer = small_settings(name, data, tmp_path, prior, bfloat16=reduced).make_trainer(parts)
+        losses.append(trainer.train_step()["loss"])
+    assert losses[0] != losses[1]
+    assert losses[0] == pytest.approx(losses[1], rel=0.05, abs=0.05)
+
+
 def test_an_interruption_is_explained_by_the_last_checkpoint(data, tmp_path, monkeypatch, capsys):
     def interrupt(self):
         raise KeyboardInterrupt

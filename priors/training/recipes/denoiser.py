@@ -73,7 +73,7 @@ class DenoiserTrainer(GradientTrainer[DenoiserNetwork]):
         """RequestError where no clip is as long as a window."""
         self.windows = FeatureWindows(corpus, settings.window, evenness=_EVENNESS)
         self.config = settings.find_config()
-        super().__init__(settings, lambda: DenoiserNetwork(self.config))
+        super().__init__(settings, lambda: DenoiserNetwork(self.config, bfloat16=settings.bfloat16))
         self.begin()
 
     def losses(self) -> dict[str, Tensor]:

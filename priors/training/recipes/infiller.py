@@ -79,7 +79,7 @@ class InfillerTrainer(GradientTrainer[InfillerNetwork]):
     def __init__(self, settings: InfillerSettings, corpus: Corpus):
         self.windows = PositionWindows(corpus, frames=settings.window, evenness=_EVENNESS)
         self.config = settings.find_config()
-        super().__init__(settings, lambda: InfillerNetwork(self.config))
+        super().__init__(settings, lambda: InfillerNetwork(self.config, bfloat16=settings.bfloat16))
         mean, std = self.windows.moments()
         self.network.mean.copy_(mean)
         self.network.std.copy_(std.clamp_min(_MIN_STD))

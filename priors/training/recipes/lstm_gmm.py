@@ -355,7 +355,8 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
         inputs, level = self._add_noise(model.normalise(windows[:, :-1]), size)
         memory = model.start_after(windows[:, 0])
         condition = self._make_condition(level, shown)
-        mixture, _ = model(inputs, (memory.hidden, memory.cell), condition=condition)
+        with torch.autocast(windows.device.type, torch.bfloat16, enabled=self.settings.bfloat16):
+            mixture, _ = model(inputs, (memory.hidden, memory.cell), condition=condition)
         target = torch.cat([model.normalise(windows[:, 1:])[..., :size], windows[:, 1:, size:]], dim=-1)
         return mixture.log_prob(target, model.whitening)
 

@@ -72,7 +72,7 @@ class PathTrainer(GradientTrainer[PathNetwork]):
         # A window at the fastest tempo must fit into the longest clip.
         self.longest = min(settings.window, int(int(self.windows.lengths.max()) / (1 + _VARIATION.tempo)) - 1)
         self.config = settings.find_config()
-        super().__init__(settings, lambda: PathNetwork(self.config))
+        super().__init__(settings, lambda: PathNetwork(self.config, bfloat16=settings.bfloat16))
         _set_moments(self.network, self.windows)
         self.begin()
 

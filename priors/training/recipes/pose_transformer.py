@@ -109,7 +109,7 @@ class PoseTransformerTrainer(GradientTrainer[PoseTransformerNetwork]):
         self.windows = PoseWindows(corpus, evenness=_EVENNESS)
         self.longest = min(settings.window, int(self.windows.lengths.max()) * 9 // 10 - 1)
         self.config = settings.find_config()
-        super().__init__(settings, lambda: PoseTransformerNetwork(self.config))
+        super().__init__(settings, lambda: PoseTransformerNetwork(self.config, bfloat16=settings.bfloat16))
         _set_moments(self.network, self.windows)
         self.begin()
 

@@ -34,6 +34,7 @@ from priors.stitcher import (
     StitcherNetwork,
     count_made,
     join_sides,
+    multiply_in_bfloat16,
     walk_sides,
 )
 from priors.training.data import Corpus, Split
@@ -153,7 +154,8 @@ class StitcherTrainer(GradientTrainer[StitcherNetwork]):
         longest = max(_SHORTEST, min(round(longest), self.longest))
         frames = int(torch.randint(_SHORTEST, longest + 1, (), generator=self.generator))
         truth = self.windows.draw(self.settings.batch, frames, _draw_known(self.generator), self.generator)
-        parts, errors = find_stitcher_losses(self.network, self.posterior, truth, self.generator)
+        with multiply_in_bfloat16(self.network, self.posterior, wanted=self.settings.bfloat16):
+            parts, errors = find_stitcher_losses(self.network, self.posterior, truth, self.generator)
         return {"loss": torch.stack([WEIGHTS[name] * value for name, value in parts.items()]).sum(), **errors}
 
     def train_step(self) -> dict[str, float]:
