@@ -8,9 +8,8 @@ from os import PathLike, fspath
 
 from mapctl import formats
 from mapctl.errors import RequestError
-from mapctl.mesh.body import SkinnedBody
 from mapctl.mesh.character_mesh import CharacterMesh
-from mapctl.mesh.mannequin import Mannequin
+from mapctl.mesh.mannequin import Mannequin, SkinnedBody
 from mapctl.mesh.primitives import Array
 from mapctl.motion import Motion
 from mapctl.retarget import as_rig, from_canonical, put_upright, to_canonical

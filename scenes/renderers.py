@@ -20,7 +20,7 @@ import numpy as np
 
 from mapctl.errors import MapctlError, RequestError
 from mapctl.mesh import colours
-from mapctl.mesh.body import Body
+from mapctl.mesh.mannequin import Body
 from mapctl.mesh.primitives import Array, Surface, merge_surfaces, unit
 from scenes.cameras import View
 from scenes.overlays import LIGHT, build_shadow

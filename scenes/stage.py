@@ -14,8 +14,7 @@ from mapctl.curves import Curve
 from mapctl.errors import RequestError
 from mapctl.joint_names import Side
 from mapctl.mesh import colours
-from mapctl.mesh.body import Body
-from mapctl.mesh.mannequin import Mannequin
+from mapctl.mesh.mannequin import Body, Mannequin
 from mapctl.mesh.primitives import Array, Surface, merge_surfaces
 from mapctl.motion import Motion
 from scenes import overlays

@@ -7,8 +7,6 @@ from pathlib import Path
 import numpy as np
 
 from mapctl.formats import bvh
-from mapctl.formats import bvh as layout
-from mapctl.formats import bvh as text
 from mapctl.motion import Motion
 
 GOOD = """HIERARCHY
@@ -38,7 +36,7 @@ Frame Time: 0.0333333
 
 def without(source: Path, out: Path, lost: Sequence[tuple[str, int, int]], *, word: str = "nan") -> Path:
     """The BVH file with a word in place of the values of channels whose label begins so, from a frame up to another."""
-    read = text.read(source)
+    read = bvh.read(source)
     lines = source.read_text().splitlines()
     first = next(number for number, line in enumerate(lines) if line.startswith("Frame Time")) + 1
     rows = [row.split() for row in lines[first:]]
@@ -66,12 +64,12 @@ def with_all_channels(motion: Motion, out: Path, *, seed: int | None = None) -> 
     """The motion as BVH with six channels on every joint, in Euler orders that the seed draws."""
     draw = np.random.default_rng(seed)
     motion.save(out)
-    read = text.read(out)
+    read = bvh.read(out)
     orders = [("Z", "X", "Y") if seed is None else tuple(draw.permutation(list("XYZ"))) for _ in motion.skeleton.names]
-    channels = tuple((*layout.POSITIONS, *(f"{axis}rotation" for axis in order)) for order in orders)
+    channels = tuple((*bvh.POSITIONS, *(f"{axis}rotation" for axis in order)) for order in orders)
     tree = replace(read.hierarchy, channels=channels)
     order = [motion.skeleton.index(name) for name in tree.names]
     places, turns = 100 * bvh.all_translations(motion)[:, order], bvh.as_array(motion.local_quat_xyzw)[:, order]
     values = bvh.channel_values(tree, places, turns)
-    out.write_text(text.compose(tree, read.frame_time, values, decimals=6))
+    out.write_text(bvh.compose(tree, read.frame_time, values, decimals=6))
     return out

@@ -43,7 +43,8 @@ _INCH = 0.0254
 MAX_BONES = 1000
 """Most bones that are read; a body with fingers has about 60."""
 _SECTIONS = frozenset((":version", ":name", ":units", ":documentation", ":root", ":bonedata", ":hierarchy", ":skin"))
-_BONE_KEYS = ("name", "direction", "length", "axis", "dof", "limits", "id", "bodymass", "cofmass")
+_KEYS = ("order", "position", "orientation", "name", "direction", "length", "axis", "dof")
+"""First words of the rows that place a joint."""
 _UNIT_ERROR = 0.01
 """How far a direction's length may be from one: files round to a few digits."""
 
@@ -248,12 +249,40 @@ class _AsfReader:
 
     def read(self, text: str) -> AsfSkeleton:
         sections = self._sections(text)
-        for name in (":root", ":bonedata", ":hierarchy"):
-            if name not in sections:
-                self.fail(f"has no section {name}", text.count("\n") + 1)
-        self._units(sections.get(":units", []))
-        root, position = self._root(sections[":root"])
-        bones = [root, *self._bones(sections[":bonedata"])]
+        for line, words in sections.get(":units", []):
+            key = words[0].lower()
+            if key == "length":
+                self.length = self._numbers((line, words[:2]), 1)[0]  # some add the unit's name
+                if not 1e-3 <= self.length <= 1e3:
+                    self.fail(f"expected a length unit from 0.001 to 1000, got {self.length:g}", line)
+            elif key == "angle":
+                if [word.lower() for word in words[1:]] not in (["deg"], ["rad"]):
+                    self.fail(f"expected angle deg or angle rad, got {shorten(' '.join(words))}", line)
+                self.degrees = words[1].lower() == "deg"
+        root = self._rows(sections[":root"])
+        if "order" not in root or len(root["order"][1]) < 2:
+            self.fail("the root has no order, as TX TY TZ RX RY RZ", sections[":root"][-1][0])
+        line, words = root.get("axis", (0, ["XYZ"]))
+        angles, position = (
+            self._numbers(root[key], 3) if key in root else [0.0, 0.0, 0.0] for key in ("orientation", "position")
+        )
+        axis = self._fixed_axes_quat(angles, words[-1], line)
+        channels = self._channels(root["order"], allowed="tr")
+        bones = [_Bone("root", sections[":root"][0][0], np.zeros(3), axis, channels)]
+        begun: list[Row] = []
+        for line, words in sections[":bonedata"]:
+            key = words[0].lower()
+            if not begun and key != "begin":
+                self.fail(f"expected begin, got {shorten(words[0])}", line)
+            if key == "end":
+                bones.append(self._bone(begun, line))
+                begun = []
+            elif begun and key == "begin":
+                break
+            else:
+                begun.append((line, words))
+        if begun:
+            self.fail(f"the bone of line {begun[0][0]} has no end", begun[-1][0])
         order, parents = self._tree(bones, sections[":hierarchy"])
         place = {bone: number for number, bone in enumerate(order)}
         kept = [bones[bone] for bone in order]
@@ -263,7 +292,7 @@ class _AsfReader:
             ends=np.array([bone.end for bone in kept]),
             axis_quat_xyzw=np.array([bone.axis for bone in kept]),
             channels=tuple(bone.channels for bone in kept),
-            root_position=position,
+            root_position=np.array(position),
             length=self.length,
             degrees=self.degrees,
         )
@@ -275,89 +304,47 @@ class _AsfReader:
         for line, words in rows(text):
             name = words[0].lower()
             if name.startswith(":"):
-                if name not in _SECTIONS:
-                    self.fail(f"unknown section {shorten(words[0])}, allowed: {', '.join(sorted(_SECTIONS))}", line)
-                if name in found:
-                    self.fail(f"a second section {name}", line)
+                if name not in _SECTIONS or name in found:
+                    self.fail(f"expected {', '.join(sorted(_SECTIONS))} once each, got {shorten(words[0])}", line)
                 current = found.setdefault(name, [])
                 words = words[1:]
             if current is None:
                 self.fail(f"expected a section as :version or :root, got {shorten(words[0])}", line)
             if words:
                 current.append((line, words))
+        for name in (":root", ":bonedata", ":hierarchy"):
+            if not found.get(name):
+                self.fail(f"has no section {name}", text.count("\n") + 1)
         return found
 
-    def _units(self, section: Sequence[Row]) -> None:
+    def _rows(self, section: Sequence[Row]) -> dict[str, Row]:
+        """Return rows by their first word, those alone that place a joint."""
+        found: dict[str, Row] = {}
         for line, words in section:
             key = words[0].lower()
-            if key == "length":
-                self.length = self._numbers((line, words[:2]), 1)[0]  # some add the unit's name
-                if not 1e-3 <= self.length <= 1e3:
-                    self.fail(f"expected a length unit from 0.001 to 1000, got {self.length:g}", line)
-            elif key == "angle" and [word.lower() for word in words[1:]] in (["deg"], ["rad"]):
-                self.degrees = words[1].lower() == "deg"
-            elif key != "mass":
-                self.fail(f"expected mass, length, angle deg or angle rad, got {shorten(' '.join(words))}", line)
+            if key in found:
+                self.fail(f"a second {key}", line)
+            if key in _KEYS:
+                found[key] = line, words
+        return found
 
-    def _root(self, section: Sequence[Row]) -> tuple[_Bone, np.ndarray]:
-        """Read the root and its pre-set position."""
-        rows: dict[str, Row] = {}
-        for line, words in section:
-            key = words[0].lower()
-            if key not in ("order", "axis", "position", "orientation") or key in rows:
-                self.fail(f"expected order, axis, position and orientation once each, got {shorten(words[0])}", line)
-            rows[key] = line, words
-        channels = self._channels(rows["order"], allowed="tr") if "order" in rows else ()
-        if not channels:
-            self.fail("the root has no order, as TX TY TZ RX RY RZ", section[-1][0] if section else None)
-        line, words = rows.get("axis", (0, ["XYZ"]))
-        angles = self._numbers(rows["orientation"], 3) if "orientation" in rows else [0.0, 0.0, 0.0]
-        position = self._numbers(rows["position"], 3) if "position" in rows else [0.0, 0.0, 0.0]
-        axis = self._fixed_axes_quat(angles, words[-1], line)
-        return _Bone("root", section[0][0], np.zeros(3), axis, channels), np.array(position)
-
-    def _bones(self, section: Sequence[Row]) -> Iterator[_Bone]:
-        rows: dict[str, Row] | None = None
-        begun, key = 0, ""
-        for line, words in section:
-            before, key = key, words[0].lower()
-            if rows is None:
-                if key != "begin":
-                    self.fail(f"expected begin, got {shorten(words[0])}", line)
-                rows, begun = {}, line
-            elif key == "end":
-                yield self._bone(rows, begun, line)
-                rows = None
-            elif before == "limits" and _is_limit(words[0]):
-                key = before
-            elif key not in _BONE_KEYS or key in rows:
-                self.fail(f"expected {', '.join(_BONE_KEYS)} once each or end, got {shorten(words[0])}", line)
-            else:
-                rows[key] = line, words
-        if rows is not None:
-            self.fail(f"the bone of line {begun} has no end", section[-1][0])
-
-    def _bone(self, rows: dict[str, Row], begun: int, end: int) -> _Bone:
-        lacks = [key for key in ("name", "direction", "length") if key not in rows]
-        if lacks:
-            self.fail(f"the bone of line {begun} has no {' and no '.join(lacks)}", end)
-        line, words = rows["name"]
-        if len(words) != 2:
-            self.fail(f"expected one name, got {shorten(' '.join(words[1:]))}", line)
-        direction, (length,) = np.array(self._numbers(rows["direction"], 3)), self._numbers(rows["length"], 1)
+    def _bone(self, section: Sequence[Row], end: int) -> _Bone:
+        """Read what is between begin and end; masses and limits are passed over."""
+        found, begun = self._rows(section), section[0][0]
+        lacks = [key for key in ("name", "direction", "length") if key not in found]
+        if lacks or len(found["name"][1]) != 2:
+            self.fail(f"the bone of line {begun} has no {' and no '.join(lacks or ['single name'])}", end)
+        direction, (length,) = np.array(self._numbers(found["direction"], 3)), self._numbers(found["length"], 1)
         norm = float(np.linalg.norm(direction))
-        if norm and abs(norm - 1) > _UNIT_ERROR:
-            self.fail(f"expected a direction of length 1, got one of {norm:g}", rows["direction"][0])
-        if length < 0:
-            self.fail(f"expected a length of 0 or more, got {length:g}", rows["length"][0])
+        if length < 0 or (norm and abs(norm - 1) > _UNIT_ERROR):
+            wanted = "expected a direction of length 1 and a length of 0 or more"
+            self.fail(f"{wanted}, got {norm:g} and {length:g}", found["direction"][0])
         axis = np.array([0.0, 0.0, 0.0, 1.0])
-        if "axis" in rows:
-            line, angles = rows["axis"]
-            if len(angles) != 5:
-                self.fail(f"expected three angles and an order as XYZ, got {len(angles) - 1} words", line)
-            axis = self._fixed_axes_quat(self._numbers((line, angles[:4]), 3), angles[4], line)
-        channels = self._channels(rows["dof"], allowed="r") if "dof" in rows else ()
-        return _Bone(words[1], begun, direction * length, axis, channels)
+        if "axis" in found:
+            line, angles = found["axis"]
+            axis = self._fixed_axes_quat(self._numbers((line, angles[:4]), 3), " ".join(angles[4:]), line)
+        channels = self._channels(found["dof"], allowed="r") if "dof" in found else ()
+        return _Bone(found["name"][1][1], begun, direction * length, axis, channels)
 
     def _tree(self, bones: Sequence[_Bone], section: Sequence[Row]) -> tuple[list[int], dict[int, int]]:
         """Sort bones depth first in file order; also return the parent of each. The numbers are those of `bones`.
@@ -418,15 +405,6 @@ class _AsfReader:
             got = shorten(" ".join(words[1:]) or "nothing")
             self.fail(f"expected for {words[0].lower()} {count} of {NUMBER}, got {got}", line)
         return [value for value in values if value is not None]
-
-
-def _is_limit(word: str) -> bool:
-    """Return whether a line holds further limits: it begins with a number, which may be infinite."""
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
 
 
 def read_amc(path: str | PathLike[str], skeleton: AsfSkeleton, *, lossy: bool = False) -> AmcText:

@@ -96,11 +96,7 @@ class Scanner:
     @property
     def line(self) -> int:
         """Line of the last word, from 1."""
-        return self.line_of(self.start)
-
-    def line_of(self, position: int) -> int:
-        """Return the line of a position in the text, from 1."""
-        return self.text.count("\n", 0, position) + 1
+        return self.text.count("\n", 0, self.start) + 1
 
     @staticmethod
     def shown(word: str) -> str:
@@ -352,14 +348,10 @@ def _drop_cut_row(scanner: Scanner, width: int, *, may_end_in_number: bool) -> b
 
 def _iterate_rows(scanner: Scanner) -> Iterator[tuple[int, str]]:
     """Yield line number and text of every row that is not blank."""
-    text, start, line = scanner.text, scanner.stop, scanner.line_of(scanner.stop)
-    while start < len(text):
-        stop = text.find("\n", start)
-        stop = len(text) if stop < 0 else stop
-        row = text[start:stop]
+    first = scanner.text.count("\n", 0, scanner.stop) + 1
+    for line, row in enumerate(scanner.text[scanner.stop :].split("\n"), first):
         if row and not row.isspace():
             yield line, row
-        start, line = stop + 1, line + 1
 
 
 def _find_fault(scanner: Scanner, labels: Sequence[str], *, may_wrap: bool, lossy: bool) -> FileFormatError | None:
@@ -390,6 +382,9 @@ def compose(hierarchy: Hierarchy, frame_time: str, values: np.ndarray, *, decima
 
 
 def _hierarchy_lines(hierarchy: Hierarchy, decimals: int) -> Iterator[str]:
+    def offset_line(offset: Offset) -> str:
+        return " ".join(["OFFSET", *(f"{round(value, decimals) + 0.0:.{decimals}f}" for value in offset)])
+
     open_joints: list[int] = []
     for joint, parent in enumerate(hierarchy.parents):
         while open_joints and open_joints[-1] != parent:
@@ -398,18 +393,14 @@ def _hierarchy_lines(hierarchy: Hierarchy, decimals: int) -> Iterator[str]:
         tab, channels = "\t" * len(open_joints), hierarchy.channels[joint]
         yield f"{tab}{'JOINT' if open_joints else 'ROOT'} {hierarchy.names[joint]}"
         yield f"{tab}{{"
-        yield f"{tab}\t{_offset_line(hierarchy.offsets[joint], decimals)}"
+        yield f"{tab}\t{offset_line(hierarchy.offsets[joint])}"
         yield f"{tab}\t{' '.join(['CHANNELS', str(len(channels)), *channels])}"
         if joint in hierarchy.end_offsets:
-            end = _offset_line(hierarchy.end_offsets[joint], decimals)
+            end = offset_line(hierarchy.end_offsets[joint])
             yield from (f"{tab}\tEnd Site", f"{tab}\t{{", f"{tab}\t\t{end}", f"{tab}\t}}")
         open_joints.append(joint)
     for depth in reversed(range(len(open_joints))):
         yield "\t" * depth + "}"
-
-
-def _offset_line(offset: Sequence[float], decimals: int) -> str:
-    return " ".join(["OFFSET", *(f"{round(value, decimals) + 0.0:.{decimals}f}" for value in offset)])
 
 
 POSITIONS = ("Xposition", "Yposition", "Zposition")
@@ -699,7 +690,10 @@ def choose_layout(motion: Motion, path: str | PathLike[str]) -> BvhLayout:
     ):  # it came in no layout, or its joints are others now
         layout = _default_layout(motion)
     if layout.fps != motion.fps or not layout.frame_time:
-        layout = replace(layout, fps=motion.fps, frame_time=_format_frame_time(motion.fps, path))
+        if not SHORTEST_FRAME <= 1 / motion.fps <= LONGEST_FRAME:
+            allowed = f"{1 / LONGEST_FRAME:g} to {1 / SHORTEST_FRAME:g}"
+            raise RequestError(f"cannot write {path}: {float(motion.fps):g} frames per second, allowed are {allowed}")
+        layout = replace(layout, fps=motion.fps, frame_time=f"{float(1 / motion.fps):.9f}")
     _check_names(layout, path)
     ends = {
         joint: _in_unit(skeleton.end_offsets[name], layout.metres_per_unit)
@@ -738,7 +732,10 @@ def _widen_channels(channels: tuple[str, ...], quat_xyzw: np.ndarray, *, add_pos
 def _default_layout(motion: Motion) -> BvhLayout:
     """Return a layout with root OFFSET 0, joints depth first as BVH nests them (the canonical order is not)."""
     skeleton, moving = motion.skeleton, motion.moving_offsets
-    order, unit = _depth_first(skeleton), _written_unit(motion)
+    order, waiting, unit = [], [0], _written_unit(motion)
+    while waiting:
+        order.append(waiting.pop())
+        waiting += reversed(skeleton.children(order[-1]))
     channels = [(POSITIONS if j == 0 or j in moving else ()) + ROTATIONS for j in order]
     offsets = [_in_unit(skeleton.offsets[j].tolist(), unit) if j else (0.0, 0.0, 0.0) for j in order]
     parents = [order.index(skeleton.parents[j]) if j else -1 for j in order]
@@ -759,24 +756,9 @@ def _written_unit(motion: Motion) -> float:
     return WRITTEN_UNITS[0]
 
 
-def _depth_first(skeleton: Skeleton) -> list[int]:
-    order, waiting = [], [0]
-    while waiting:
-        order.append(waiting.pop())
-        waiting += reversed(skeleton.children(order[-1]))
-    return order
-
-
 def _in_unit(offset: Sequence[float], metres_per_unit: float) -> Offset:
     x, y, z = (value / metres_per_unit for value in offset)
     return x, y, z
-
-
-def _format_frame_time(fps: Fraction, path: str | PathLike[str]) -> str:
-    if not SHORTEST_FRAME <= 1 / fps <= LONGEST_FRAME:
-        allowed = f"{1 / LONGEST_FRAME:g} to {1 / SHORTEST_FRAME:g}"
-        raise RequestError(f"cannot write {path}: {float(fps):g} frames per second, allowed are {allowed}")
-    return f"{float(1 / fps):.9f}"
 
 
 def _check_names(layout: BvhLayout, path: str | PathLike[str]) -> None:

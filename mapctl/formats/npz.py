@@ -111,24 +111,21 @@ def to_arrays(motion: Motion) -> dict[str, np.ndarray]:
 
 
 def _build_motion(arrays: dict[str, np.ndarray]) -> Motion:
-    names, parents = arrays["names"].tolist(), arrays["parents"].tolist()
-    end_names, moving = arrays["end_names"].tolist(), arrays["moving_joints"].tolist()
+    names, end_names, moving = (arrays[key].tolist() for key in ("names", "end_names", "moving_joints"))
     if not set(end_names) <= set(names) or not set(moving) <= set(range(1, len(names))):
         raise MapctlError("end_names and moving_joints must be joints of the skeleton")
-    ends = {name: (x, y, z) for name, (x, y, z) in zip(end_names, arrays["end_offsets"].tolist(), strict=True)}
-    skeleton = Skeleton(tuple(names), tuple(parents), _tensor(arrays["offsets"]), ends)
     if len(set(end_names)) < len(end_names) or len(set(moving)) < len(moving):
         raise MapctlError("end_names and moving_joints must name a joint once")
     fps = Fraction(*arrays["fps"].tolist())
     if not SLOWEST <= fps <= FASTEST:
         raise MapctlError(f"{float(fps):g} frames per second, allowed are {SLOWEST:g} to {FASTEST:g}")
-    tracks = zip(moving, arrays["moving_offsets"], strict=True)
+    ends = {name: (x, y, z) for name, (x, y, z) in zip(end_names, arrays["end_offsets"].tolist(), strict=True)}
     return Motion(
-        skeleton=skeleton,
+        skeleton=Skeleton(tuple(names), tuple(arrays["parents"].tolist()), _tensor(arrays["offsets"]), ends),
         fps=fps,
         root_position=_tensor(arrays["root_position_world"]),
         local_quat_xyzw=_tensor(arrays["local_quat_xyzw"]),
-        moving_offsets={joint: _tensor(track) for joint, track in tracks},
+        moving_offsets={j: _tensor(track) for j, track in zip(moving, arrays["moving_offsets"], strict=True)},
         licence=str(arrays.get(_LICENCE, "")),
     )
 

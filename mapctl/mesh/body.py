@@ -1,19 +1,17 @@
-"""The body of one actor over a whole motion, as whoever paints it sees it."""
+"""The anatomy of one actor over a whole motion, on which bodies are built: hips, head, feet and tips of bones."""
 
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from mapctl import rotations
-from mapctl.errors import MapctlError, RequestError
+from mapctl.errors import RequestError
 from mapctl.joint_names import Part, Role, Side
 from mapctl.joint_roles import classify_joints, find_hips
-from mapctl.mesh.character_mesh import CharacterMesh
-from mapctl.mesh.primitives import Array, Surface, frame_along, unit
+from mapctl.mesh.primitives import Array, frame_along, unit
 from mapctl.motion import Motion
 
 _STANDARD_LEG = 0.80
@@ -183,72 +181,3 @@ def _add_tips(motion: Motion, joints: Array, turns: Array, scale: float) -> Poin
             extra.append((joint, joints[:, joint] + along * _TIP_LENGTHS[part] * scale))
     world = np.concatenate([joints, *(place[:, None] for _, place in extra)], axis=1)
     return Points((*parents, *(j for j, _ in extra)), (*found, *(found[j] for j, _ in extra)), world)
-
-
-@runtime_checkable
-class Body(Protocol):
-    """A mannequin, or a character with a mesh of its own."""
-
-    @property
-    def anatomy(self) -> Anatomy:
-        """Hips, head and soles."""
-        ...
-
-    @property
-    def num_frames(self) -> int:
-        """Frames of the motion."""
-        ...
-
-    @property
-    def seen(self) -> Array:
-        """Positions (frames, n, 3) between which the body is, about, metres; without a root on the floor."""
-        ...
-
-    def surface(self, frame: int) -> Surface:
-        """Return the lit surface in one frame."""
-        ...
-
-    def sticks(self, frame: int) -> tuple[Array, Array, Array]:
-        """Return all bones in one frame: ends (n, 2, 3) and radii (n,) in metres, colours (n, 3) sRGB."""
-        ...
-
-
-class SkinnedBody:
-    """The mesh of a character, moved by its joints; its bones and marks are those of another body in the same place."""
-
-    def __init__(self, mesh: CharacterMesh, motion: Motion, bones: Body):
-        """`motion` is on the joints of the mesh, frame by frame that of `bones`. MapctlError where it is not."""
-        if motion.num_joints != len(mesh.rest) or motion.num_frames != bones.num_frames:
-            found = f"{motion.num_joints} joints and {motion.num_frames} frames"
-            raise MapctlError(f"a mesh of {len(mesh.rest)} joints and {bones.num_frames} frames got {found}")
-        self._mesh, self._bones = mesh, bones
-        self._places = motion.joint_positions().numpy()
-        self._turns = rotations.to_matrix(motion.joint_rotations()).numpy()
-
-    @property
-    def anatomy(self) -> Anatomy:
-        """Hips, head and soles."""
-        return self._bones.anatomy
-
-    @property
-    def num_frames(self) -> int:
-        """Frames of the motion."""
-        return self._bones.num_frames
-
-    @property
-    def seen(self) -> Array:
-        """Positions (frames, n, 3) of its bones, and of the vertices that are outermost at rest, metres."""
-        vertices = self._mesh.vertices
-        outer = np.concatenate([vertices.argmin(axis=0), vertices.argmax(axis=0)])
-        joint = self._mesh.joints[outer, self._mesh.weights[outer].argmax(axis=1)]
-        turned = np.einsum("fnab,nb->fna", self._turns[:, joint], vertices[outer] - self._mesh.rest[joint])
-        return np.concatenate([self._bones.seen, self._places[:, joint] + turned], axis=1)
-
-    def surface(self, frame: int) -> Surface:
-        """Return the mesh in one frame; it is open, as clothes and hair are, and seen from both sides."""
-        vertices, normals = self._mesh.pose(self._places[frame], self._turns[frame])
-        return Surface(vertices, self._mesh.faces, self._mesh.rgba, normals, is_open=True)
-
-    def sticks(self, frame: int) -> tuple[Array, Array, Array]:
-        """Return all bones in one frame: ends (n, 2, 3) and radii (n,) in metres, colours (n, 3) sRGB."""
-        return self._bones.sticks(frame)

@@ -8,8 +8,7 @@ from character_maker import make_character_glb
 from glb_builder import pack_glb
 from helpers import run, walk
 
-from mapctl.mesh.body import SkinnedBody
-from mapctl.mesh.mannequin import Mannequin
+from mapctl.mesh.mannequin import Mannequin, SkinnedBody
 from scenes.stage import Stage
 
 pytestmark = pytest.mark.skipif(any(find_spec(name) is None for name in ("PIL", "av")), reason="needs mapctl[render]")

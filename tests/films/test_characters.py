@@ -14,9 +14,8 @@ from mapctl import formats
 from mapctl.contacts import detect_contacts
 from mapctl.errors import FileFormatError, MapctlError
 from mapctl.mesh import colours
-from mapctl.mesh.body import SkinnedBody
 from mapctl.mesh.character_mesh import CharacterMesh
-from mapctl.mesh.mannequin import Mannequin
+from mapctl.mesh.mannequin import Mannequin, SkinnedBody
 from mapctl.retarget.carry import RiggedCharacter, retarget_motion
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from scenes import renderers

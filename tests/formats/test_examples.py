@@ -6,7 +6,6 @@ import re
 import make_example
 import pytest
 from helpers import run, walk
-from tiny_denoiser import save_tiny_denoiser
 
 import mapctl
 from mapctl.errors import RequestError
@@ -31,18 +30,6 @@ def test_it_is_the_walk_that_its_page_tells_of():
     page = (file.parent / "LICENSE.md").read_text("utf-8")
     assert "free for any use" in page.replace("\n", " ")
     assert {f"{name}.bvh" for name in examples.list_examples()} == set(re.findall(r"^\| `(.+?)`", page, re.M))
-
-
-@pytest.mark.slow
-def test_a_command_takes_it_and_tells_its_licence(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    tiny = save_tiny_denoiser(tmp_path / "tiny.safetensors")
-    assert run("denoise", NAME, "-o", "clean.bvh", "--report", "clean.json", "--denoiser", tiny) == 0
-    assert f"{examples.LICENCE} ({NAME}" in capsys.readouterr().out
-    assert json.loads((tmp_path / "clean.json").read_text())["licence"]["models"][NAME] == examples.LICENCE
-    clean = mapctl.load("clean.bvh")
-    assert clean.num_frames == 240
-    assert clean.skeleton.matches(mapctl.load(NAME).skeleton)
 
 
 def test_other_commands_and_rigs_take_it(tmp_path, capsys):

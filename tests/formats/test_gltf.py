@@ -246,12 +246,6 @@ def test_a_character_may_be_written_over_its_own_file(tmp_path):
     assert not (tmp_path / "late.glb").exists()
 
 
-def test_a_vrm_needs_a_character(tmp_path):
-    with pytest.raises(RequestError, match=r"a \.vrm needs a character"):
-        random_motion(CANONICAL).save(tmp_path / "x.vrm")
-    assert not list(tmp_path.iterdir())
-
-
 EXTENSION = "VRMC_vrm_animation"
 
 

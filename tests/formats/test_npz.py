@@ -68,7 +68,7 @@ CHANGES = {
     ),
     "no rate": ({"fps": np.array([30, 0])}, "does not hold a motion"),
     "not a tree": ({"parents": np.full(21, 3)}, "joint 0 must be the root"),
-    "same names": ({"names": np.array([*CANONICAL.names[:20], "hips"]), "end_names": np.array(["hips"] * 5)}, "unique"),
+    "same names": ({"names": np.array([*CANONICAL.names[:20], "hips"]), "end_names": np.array(["hips"] * 5)}, "a joint once"),
     "stray end": ({"end_names": np.array(["a", "b", "c", "d", "e"])}, "joints of the skeleton"),
     "objects": ({"names": np.array([object()] * 21)}, "not a sound .npz archive"),
 }
@@ -101,8 +101,7 @@ def test_an_archive_that_unpacks_too_large_is_refused_before_it_is(tmp_path, mon
         formats.load(tmp_path / "walk.npz")
 
 
-@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
-def test_an_interrupted_output_leaves_the_old_file_and_nothing_else(error, tmp_path):
+def test_an_interrupted_output_leaves_the_old_file_and_nothing_else(tmp_path):
     path = tmp_path / "report.json"
     write_text(path, "old")
 
@@ -110,9 +109,9 @@ def test_an_interrupted_output_leaves_the_old_file_and_nothing_else(error, tmp_p
         with atomic_path(path) as scratch:
             assert scratch.suffix == ".json"
             scratch.write_text("half")
-            raise error
+            raise KeyboardInterrupt
 
-    with pytest.raises(error):
+    with pytest.raises(KeyboardInterrupt):
         stop()
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]

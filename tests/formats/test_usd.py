@@ -16,7 +16,7 @@ from usd_maker import COLOURS, JOINTS, make_character_usd
 from usd_viewer import UsdViewer, find_faults
 
 from mapctl import cli, formats, rotations
-from mapctl.errors import FileFormatError, RequestError
+from mapctl.errors import FileFormatError
 from mapctl.formats import usd
 from mapctl.mesh.mannequin import build_skin
 from mapctl.retarget import character
@@ -130,19 +130,6 @@ def test_time_codes_become_frames(tmp_path, rate, step, start, fps, frames):
     for frame in range(frames):
         wanted = viewer.joints(start + frame * rate / float(fps))
         np.testing.assert_allclose(motion.joint_positions()[frame], wanted, rtol=0, atol=1e-4)
-
-
-@pytest.mark.slow
-def test_several_are_told_by_name(tmp_path):
-    path = make(tmp_path, "plain", names=("Body", "Horse"), frames=4)
-    with pytest.raises(FileFormatError, match=r"2 armatures: 'Body', 'Horse'; choose one, as hero.usda#Body"):
-        formats.load(path)
-    with pytest.raises(FileFormatError, match="no armature 'Cow'; it has 'Body', 'Horse'"):
-        formats.load(f"{path}#Cow")
-    horse = formats.load(f"{path}#Horse/wild")
-    np.testing.assert_allclose(horse.joint_positions()[2], UsdViewer(path, 1).joints(2), **NEAR)
-    with pytest.raises(FileFormatError, match="no animation 'Run'; it has 'wild'"):
-        formats.load(f"{path}#Horse/Run")
 
 
 def test_composed_stages(tmp_path):
@@ -262,13 +249,6 @@ def test_names_become_paths_of_letters_and_digits():
         "mixamorig_Hips/a_b/F__e",
         "mixamorig_Hips/a_b_3",
     ]
-
-
-def test_a_missing_package_is_named_before_any_work(tmp_path, monkeypatch):
-    monkeypatch.setattr(formats, "find_spec", lambda name: None)
-    with pytest.raises(RequestError, match=r"pip install 'mapctl\[usd\]'"):
-        random_motion(CANONICAL).save(tmp_path / "x.usda")
-    assert not list(tmp_path.iterdir())
 
 
 SCALED = 'float3 xformOp:scale = ({})\nuniform token[] xformOpOrder = ["xformOp:scale"]\nfloat3[] extent'

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers import run, tiny_density, walk
+from helpers import tiny_density, walk
 
 from mapctl import formats, report
 from mapctl.errors import WriteError
@@ -121,13 +121,3 @@ def test_a_card_that_finds_no_room_takes_the_weights_with_it(tmp_path, monkeypat
 
 def _no_space(*words, **options):
     raise OSError(28, "No space left on device")
-
-
-def test_a_command_says_it_in_one_line(tmp_path, prior, monkeypatch, capsys, request):
-    monkeypatch.chdir(tmp_path)
-    request.getfixturevalue("small_disk")
-    assert run("generate", "--seconds", 20, "-o", "new/folder", "--prior", prior, "--no-footing", "--quiet") == 2
-    told = capsys.readouterr()
-    place = Path("new/folder/generated_000.bvh")
-    assert (told.out, told.err) == ("", f"mapctl: cannot write {place}: File too large\n")
-    assert list(tmp_path.iterdir()) == []
