@@ -221,7 +221,7 @@ class NetworkSettings(Settings):
 
     def make_config(self) -> Any:
         """Return the shape of the network that these settings ask for."""
-        config = self.papers if getattr(self, "paper", False) else self.ours
+        config: Any = self.papers if getattr(self, "paper", False) else self.ours
         given = {name: getattr(self, name) for name in self.shape_options if name != "paper"}
         return replace(config, **{name: value for name, value in given.items() if value is not None})
 

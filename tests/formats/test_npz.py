@@ -68,7 +68,10 @@ CHANGES = {
     ),
     "no rate": ({"fps": np.array([30, 0])}, "does not hold a motion"),
     "not a tree": ({"parents": np.full(21, 3)}, "joint 0 must be the root"),
-    "same names": ({"names": np.array([*CANONICAL.names[:20], "hips"]), "end_names": np.array(["hips"] * 5)}, "a joint once"),
+    "same names": (
+        {"names": np.array([*CANONICAL.names[:20], "hips"]), "end_names": np.array(["hips"] * 5)},
+        "a joint once",
+    ),
     "stray end": ({"end_names": np.array(["a", "b", "c", "d", "e"])}, "joints of the skeleton"),
     "objects": ({"names": np.array([object()] * 21)}, "not a sound .npz archive"),
 }

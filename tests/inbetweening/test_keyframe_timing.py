@@ -4,13 +4,11 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers import generator, moved, random_motion, walk
+from helpers import moved, random_motion, walk
 
 import priors
 from controllers.inbetweening import keyframes
-from mapctl.errors import RequestError
 from mapctl.inbetweening.missing import MissingMask, restore_observed
-from mapctl.inbetweening.pose_pairs import PAIR_FEATURES, sample_pose_pairs
 from mapctl.intent.keyframes import Keys
 
 KEYS = Keys((0, 20, 50, 89))
@@ -57,13 +55,3 @@ def test_a_timing_that_nobody_would_take_is_named_with_numbers(metres, verdict):
     assert interval.reason.startswith(verdict)
     assert f"mocap mostly takes {interval.usual[0]} to {interval.usual[1]} frames" in interval.reason
     assert interval.given_speed == pytest.approx(interval.metres * 30 / 31)
-
-
-def test_pairs_are_as_long_as_asked_for_and_clips_that_are_too_short_give_none():
-    pairs = sample_pose_pairs([walk(80), walk(10), walk(40)], generator(), count=5, shortest=0.5, longest=1.0)
-    assert len(pairs.seconds) == 2 * 5
-    assert pairs.seconds.min() >= 0.5
-    assert pairs.seconds.max() <= 1.0
-    assert pairs.features.shape == (10, len(PAIR_FEATURES))
-    with pytest.raises(RequestError, match=r"no clip is longer than 0\.5 s"):
-        sample_pose_pairs([walk(10)], generator(), count=5, shortest=0.5, longest=1.0)

@@ -67,12 +67,3 @@ def test_a_leap_at_the_edges_is_closed(start, stop, fps):
     )
     assert bends > 0.25
     assert closed_bends < 0.2 * bends
-
-
-@pytest.mark.parametrize("frames", [1, 2, 4])
-@pytest.mark.parametrize("whole", [False, True])
-def test_motions_of_a_few_frames_break_nothing(frames, whole):
-    put = gap(0, frames if whole else 1, frames)
-    values = torch.randn(frames, 3, generator=generator(), dtype=torch.float64)
-    assert blend_seams_in_positions(values, put, fps=30.0).isfinite().all()
-    assert blend_seams_in_rotations(swaying(frames, 1), put[:, None], fps=30.0).isfinite().all()

@@ -52,11 +52,10 @@ def still(frames):
     return replace(motion, root_position=motion.root_position[first], local_quat_xyzw=motion.local_quat_xyzw[first])
 
 
-@pytest.mark.parametrize("seconds", [2, 4, 8])
-def test_somebody_who_stands_stays_where_he_is(seconds):
-    motion = still(30 * seconds + 1)
+def test_a_standing_character_stays():
+    motion = still(121)
     wandering = tiny_infiller(drawn=0.05)
-    done = tween(motion, Keys((0, 30 * seconds)), AutoInbetweener(wandering, [tiny_density()]))
+    done = tween(motion, Keys((0, 120)), AutoInbetweener(wandering, [tiny_density()]))
     assert [source.by for source in done.sources] == [STANDING_STILL]
     away = (done.motion.root_position - motion.root_position).norm(dim=-1)
     assert away.max() < 0.02

@@ -55,13 +55,3 @@ def test_known_places_stay_to_the_bit():
     proposed = network(drawn=DRAWN)(image)
     assert torch.equal(proposed.places[known], image.places[known])
     assert (proposed.places != image.places).any()
-
-
-@pytest.mark.parametrize("architecture", ARCHITECTURES)
-def test_a_batch_is_its_members(architecture):
-    first, second = holed(), holed(gaps=((5, 30), (50, 60)), seed=1, turn_rate=-0.5)
-    both = type(first)(*(torch.cat([getattr(first, name), getattr(second, name)]) for name in vars(first)))
-    net = network(drawn=DRAWN, config=of(architecture))
-    together, alone = net(both), net(second)
-    assert torch.allclose(together.places[1:], alone.places, atol=1e-5)
-    assert torch.allclose(together.contacts[1:], alone.contacts, atol=1e-5)

@@ -10,13 +10,11 @@ from tiny_transformer import CONFIG, network, tiny_transformer
 
 from controllers.inbetweening.pipeline import CanonicalClip
 from mapctl import rotations
-from mapctl.inbetweening.effector_targets import EffectorTargets
 from mapctl.inbetweening.missing import MissingMask
 from mapctl.inbetweening.partial_motion import KnownParts
 from mapctl.motion import Motion
 from mapctl.recording.masks import ALL, Mask
 from mapctl.retarget import to_canonical
-from mapctl.skeleton import CANONICAL
 from priors import pose_transformer as module
 from priors.training.recipes.pose_transformer import hide
 from priors.training.windows import PoseWindows, add_targets
@@ -89,21 +87,6 @@ def test_a_gap_longer_than_it_knows_is_left_and_said():
     part = query.motion.slice(30, 31 + module.MAX_GAP_FRAMES)
     assert apart(answer.motion.slice(30, 31 + module.MAX_GAP_FRAMES), part) < 1e-9
     assert apart(answer.motion.slice(15, 20), query.motion.slice(15, 20)) > 0.005
-
-
-def test_a_target_of_a_hand_changes_the_frames_beside_it_too():
-    query = query_of(GAP)
-    hand = CANONICAL.index("leftHand")
-    places = query.motion.joint_positions().clone()
-    places[20, hand] += torch.tensor([0.0, 0.3, 0.1])
-    wanted = torch.zeros(places.shape[:2], dtype=torch.bool)
-    wanted[20, hand] = True
-    told = DRAWN.propose(replace(query, effector_targets=EffectorTargets(places, wanted))).motion
-    free = DRAWN.propose(query).motion
-    moved_by = (told.joint_positions() - free.joint_positions()).norm(dim=-1).amax(dim=1)
-    assert DRAWN.takes_partial_keys
-    assert float(moved_by[[19, 21]].min()) > 1e-4
-    assert float(moved_by[:15].max()) < 1e-9
 
 
 TWO = replace(CONFIG, detail=2)

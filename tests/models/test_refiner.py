@@ -46,13 +46,6 @@ def test_what_is_added_is_bounded_whatever_the_weights(limit):
     assert float(change.abs().median()) > 0.9 * limit  # these weights ask for far more
 
 
-def test_a_trained_one_overrules_contact_bits_and_leaves_them_hard():
-    features = clips()
-    refined = refiner_of(scale=1e4).refine(features)[..., BITS]
-    assert set(refined.unique().tolist()) == {0.0, 1.0}
-    assert not torch.equal(refined, features[..., BITS])
-
-
 @pytest.mark.parametrize("lookahead", [0, 1, 3])
 @pytest.mark.parametrize("changed", [1, 20, 39])
 def test_a_frame_sees_the_past_and_its_look_ahead_but_nothing_later(changed, lookahead):
@@ -124,14 +117,3 @@ def test_they_are_positions_and_velocities_in_the_heading_frame_wherever_the_mot
     assert found.shape == (39, count_channels(JOINTS))
     for place in (GroundPose.origin(), GroundPose(torch.tensor([3.0, -7.0]), torch.tensor(2.5))):
         torch.testing.assert_close(found, by_positions(features, JOINTS, place), atol=1e-9, rtol=0)
-
-
-def test_a_frame_depends_on_itself_and_the_one_before_only():
-    """And of the one before on its pose alone: that it turned or went on to get there shows nowhere."""
-    features = clip()[None]
-    found = compute_end_effectors(features, JOINTS)
-    torch.testing.assert_close(compute_end_effectors(features[:, 17:19], JOINTS)[0, 0], found[0, 17], atol=1e-9, rtol=0)
-    moved = features.clone()
-    for block in ("root_displacement_heading", "heading_change"):
-        moved[:, 0, LAYOUT.slices[block]] += 0.7
-    torch.testing.assert_close(compute_end_effectors(moved, JOINTS), found, atol=1e-9, rtol=0)

@@ -7,7 +7,7 @@ import pytest
 import torch
 from helpers import walk
 from scipy.optimize import least_squares
-from tiny_stitcher import CONFIG, network, tiny_stitcher
+from tiny_stitcher import tiny_stitcher
 
 from controllers.inbetweening.pipeline import CanonicalClip, InfillSettings
 from controllers.inbetweening.proposers import SlerpInbetweener, StitchedInbetweener
@@ -17,7 +17,7 @@ from mapctl.inbetweening.missing import MissingMask
 from mapctl.intent.keyframes import Keys
 from mapctl.recording.masks import ALL, Mask
 from mapctl.retarget import to_canonical
-from priors.stitcher import DrawnLatents, Draws, Joined, count_made, fit_shared, join_sides, see_ends, walk_sides
+from priors.stitcher import Draws, Joined, fit_shared, see_ends
 
 each_length = pytest.mark.parametrize("frames", [2, 3, 4, 5, 8, 15, 24])
 
@@ -44,16 +44,6 @@ def test_untaught_it_interpolates_places_evenly(frames):
     heights = motion.root_position[[10, 10 + frames], 1].float()
     torch.testing.assert_close(joined.root_position[0, :, 1], torch.lerp(*heights, share[:, 0]), atol=1e-5, rtol=0)
     assert float(joined.apart.max()) < 1e-3
-
-
-@each_length
-def test_every_length_is_made(frames):
-    made = count_made(network(CONFIG), frames)
-    ends = bare(walk(60), 11, 10 + frames)
-    drawn = DrawnLatents.sample(CONFIG, 1, made, torch.Generator().manual_seed(1))
-    joined = join_sides(walk_sides(network(CONFIG), ends, frames, drawn))
-    assert joined.quats.shape == (1, frames - 1, 21, 4)
-    assert all(bool(getattr(joined, name).isfinite().all()) for name in ("root_position", "quats", "contacts", "apart"))
 
 
 def test_only_the_poses_of_bare_ends_are_seen():
@@ -122,20 +112,6 @@ def test_gaps_that_are_too_long_or_have_one_end_are_the_others_and_the_rest_stay
     assert (second.by, second.reason) == ("slerp", "longer than the 23 frames that the stitcher fills")
     assert (third.by, third.start, third.stop) == ("slerp", 80, 90)
     assert third.reason.startswith("known in part or on one side alone")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("limbs", [(), ("leftHand",)])
-def test_hands_on_the_way_are_reached(limbs):
-    """Between whole poses the stitcher fills a gap with a hand told in it too."""
-    motion, keys = walk(60), Keys.of([20, 30, 40], limbs=limbs)
-    done = tween(motion, keys, stitched(SlerpInbetweener), settings=RAW)
-    bys = {source.by for source in done.sources if 20 < source.start < 40}
-    assert bys == {"stitcher"}
-    if limbs:
-        hand = motion.skeleton.indices(["leftHand"])
-        off = (done.motion.joint_positions() - motion.joint_positions())[30, hand].norm()
-        assert float(off) < 1e-3
 
 
 def test_what_was_stitched_is_reported():

@@ -7,33 +7,9 @@ import pytest
 import torch
 from helpers import corpus
 
-from mapctl.errors import MapctlError, RequestError
+from mapctl.errors import RequestError
 from mapctl.features import LAYOUT
 from priors.training import data as corpora
-
-
-def test_a_clip_that_cannot_be_used_is_named(tmp_path):
-    # One joint that moves is a motion, but nobody's.
-    head = [
-        "HIERARCHY",
-        "ROOT Ball",
-        "{",
-        "OFFSET 0 0 0",
-        "CHANNELS 3 Xposition Yposition Zposition",
-        "End Site",
-        "{",
-        "OFFSET 0 10 0",
-        "}",
-        "}",
-        "MOTION",
-        "Frames: 2",
-        "Frame Time: 0.033333",
-        "0 0 0",
-        "1 0 0",
-    ]
-    (tmp_path / "odd.bvh").write_text("\n".join(head) + "\n")
-    with pytest.raises(MapctlError, match=r"odd\.bvh: "):
-        corpora.read_corpus(tmp_path, match="", cache=tmp_path / "cache")
 
 
 def test_the_corpus_is_the_features_of_the_clips_and_is_read_once(tmp_path, data, monkeypatch):

@@ -58,10 +58,3 @@ def test_each_combination_of_labels_has_starts_in_proportion_and_none_is_left_ou
         kinds = labels[[data.names.index(name) for name in found.names]]
         assert kinds.sum(0).tolist() == expected
         assert (found.weight @ kinds).tolist() == pytest.approx([9 / 15, 5 / 15, 1 / 15])
-
-
-def test_fewer_starts_than_combinations_go_to_those_with_most_frames():
-    data, labels = walks_and_runs()
-    found = select_initial_states(tiny_network(), data, count=2, generator=generator(), labels=labels)
-    assert labels[[data.names.index(name) for name in found.names]].sum(0).tolist() == [1, 1, 0]
-    assert sorted(found.weight.tolist()) == pytest.approx([6 / 15, 9 / 15])  # by speeds

@@ -9,7 +9,7 @@ from trainable_models import small_settings
 import priors
 from priors.lstm_gmm.density import PACE_LABELS, Labels, read_pace_rates
 from priors.lstm_gmm.network import LstmGmmConfig
-from priors.training.data import Corpus, follow_paces, measure_pace_changes, measure_speeds
+from priors.training.data import Corpus, follow_paces, measure_pace_changes
 from priors.training.recipes.lstm_gmm import DensityTrainer
 
 pytestmark = pytest.mark.usefixtures("small_judgements")
@@ -29,22 +29,6 @@ def trainer(clips, tmp_path):
     known = Labels(("gait=walk",), torch.tensor([[0.0], [1.0], [0.0]])).renamed(names)
     settings = small_settings("lstm-gmm", tmp_path, tmp_path, batch=64, window=WINDOW)
     return DensityTrainer(settings, clips, LstmGmmConfig(width=4, labels=names), known, follow_paces(clips))
-
-
-def test_paces_are_those_of_speeds(clips):
-    ground, _ = clips.integrate_roots()
-    for paces, speeds, places in zip(
-        follow_paces(clips).split(list(clips.lengths)),
-        measure_speeds(clips),
-        ground.split(list(clips.lengths)),
-        strict=True,
-    ):
-        assert len(paces) == len(speeds) == len(places)
-        step = places.diff(dim=0).norm(dim=-1) * 30
-        assert bool((step[5:-5][paces[6:-5] == 0] < 0.6).all())
-        assert bool((step[5:-5][paces[6:-5] == 2] > 1.7).all())
-    one, two, three = (set(part.tolist()) for part in follow_paces(clips).split(list(clips.lengths)))
-    assert (one, two, three) == ({0}, {0, 1}, {1, 2})
 
 
 def test_a_window_is_labelled_by_how_it_ends(trainer, clips, monkeypatch):

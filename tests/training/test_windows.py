@@ -3,7 +3,7 @@
 from fractions import Fraction
 
 import torch
-from helpers import corpus, generator, walks
+from helpers import corpus, walks
 from scipy.spatial.transform import Rotation
 
 from mapctl.features import LAYOUT, GroundPose
@@ -11,7 +11,6 @@ from mapctl.inbetweening.missing import MissingMask, interpolate_missing
 from mapctl.motion import Motion
 from mapctl.pose import decode
 from mapctl.skeleton import CANONICAL
-from priors.training.data import Corpus
 from priors.training.windows import PositionWindows
 
 SWAP = CANONICAL.mirror_partners()
@@ -68,16 +67,6 @@ def test_a_mirrored_window_is_the_window_in_a_mirror():
     wanted = seen_from_the_root(motion)[20:50]
     local = mirrored.places[1] - mirrored.places[1, :, :1] * torch.tensor([1.0, 0.0, 1.0])
     assert (without_heading(local, mirrored.heading[1]) - wanted).norm(dim=-1).max() < 1e-4
-
-
-def test_draws_are_whole_windows_of_long_clips_and_whole_clips_in_windows():
-    windows = PositionWindows(Corpus(("a", "b"), (90, 40), corpus(1, 130).features), frames=60, evenness=1.0)
-    found = windows.draw(100, generator())
-    counts = found.present.sum(dim=1)
-    assert set(counts.tolist()) == {40, 60}
-    begins = found.present[counts == 40].to(torch.uint8).argmax(dim=1)
-    assert begins.min() < 4
-    assert begins.max() > 16
 
 
 def test_the_guess_in_a_gap_is_the_one_that_filling_starts_from():
