@@ -1,6 +1,7 @@
 """`mapctl measure`: the measures of a motion, or of a folder of them, beside those of a reference and of mocap."""
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -14,7 +15,6 @@ from mapctl.commands.shared import inputs, options
 from mapctl.commands.shared.command import ModelCommand
 from mapctl.commands.shared.inputs import read_motion
 from mapctl.commands.shared.outputs import format_cell, print_table, show_progress
-from mapctl.curves.curve import Curve
 from mapctl.errors import CheckpointError, MapctlError, RequestError
 from mapctl.metrics import make_comparable, realism
 from mapctl.motion import Motion
@@ -55,111 +55,10 @@ SETTINGS = realism.RealismSettings()
 """Settings of the classifier of two folders."""
 
 
-@dataclass(frozen=True, eq=False)
-class _MeasuredClip:
-    """One measured file of a folder."""
-
-    path: Path
-    """The file."""
-    motion: Motion
-    """Motion made comparable."""
-    measures: dict[str, float]
-    """Measures by name."""
-    windows: Tensor
-    """Windows, (windows, frames, channels); empty unless read with windows."""
-    notes: list[str]
-    """Notes on what could not be made comparable."""
-
-    @staticmethod
-    def read(path: Path, *, with_windows: bool, rig: Rig | None) -> "_MeasuredClip":
-        """Read and measure a file; MapctlError for what cannot be read, measured or cut."""
-        motion, notes = make_comparable(read_motion(path, rig), rig)
-        windows = realism.cut_windows(realism.canonical_positions(motion)) if with_windows else torch.zeros(0)
-        return _MeasuredClip(path, motion, metrics.measure(motion), windows, [f"{path}: {note}" for note in notes])
-
-
-@dataclass(frozen=True, eq=False)
-class ClipSet:
-    """Every clip below a folder, in the order of their paths."""
-
-    folder: Path
-    """Folder of the clips."""
-    names: list[str]
-    """Path of each clip below the folder."""
-    motions: list[Motion]
-    """Motions on canonical joints and at 30 frames/s at most, so that sets on different rigs compare (see
-    `metrics.comparison`)."""
-    means: dict[str, float]
-    """Mean of each measure over the clips that can give it."""
-    windows: list[Tensor]
-    """Windows of each clip, (windows, frames, channels); none unless read with windows."""
-    skipped: dict[str, str]
-    """Reasons by file that was left out, each a sentence that begins with the file."""
-    notes: tuple[str, ...] = ()
-    """Notes on what could not be made comparable."""
-
-    @staticmethod
-    def read(folder: Path, *, with_windows: bool, rig: Rig | None = None) -> "ClipSet":
-        """Read and measure clips of a rig. A file that cannot be read, measured or cut into windows is left out;
-        RequestError if none can."""
-        paths = sorted(p for p in folder.rglob("*") if p.suffix.lower() in formats.READERS and p.is_file())
-        if not paths:
-            raise RequestError(f"{folder}: no {' or '.join(formats.READERS)} file in this folder or below it")
-        clips: list[_MeasuredClip] = []
-        skipped: dict[str, str] = {}
-        with show_progress(f"reading {folder}") as progress:
-            for number, path in enumerate(paths, start=1):
-                try:
-                    clips.append(_MeasuredClip.read(path, with_windows=with_windows, rig=rig))
-                except MapctlError as error:
-                    skipped[str(path)] = str(error) if str(error).startswith(str(path)) else f"{path}: {error}"
-                if progress is not None:
-                    progress(number, len(paths))
-        if not clips:
-            raise RequestError(f"{folder}: no clip can be measured; {next(iter(skipped.values()))}")
-        return ClipSet(
-            folder,
-            [clip.path.relative_to(folder).as_posix() for clip in clips],
-            [clip.motion for clip in clips],
-            _average_measures([clip.measures for clip in clips]),
-            [clip.windows for clip in clips if with_windows],
-            skipped,
-            tuple(note for clip in clips for note in clip.notes),
-        )
-
-
-def measure_realism(ours: ClipSet, reference: ClipSet) -> realism.Realism:
-    """Measure how well a network distinguishes ours from the reference's; RequestError for too few clips."""
-    fewest = SETTINGS.min_clips
-    for clips in (ours, reference):
-        if len(clips.motions) < fewest:
-            raise RequestError(
-                f"{clips.folder}: {len(clips.motions)} clips; a comparison needs at least {fewest} in each folder"
-                f"{_describe_skipped(clips)} (without --reference a folder of any size is measured)"
-            )
-    generator = torch.Generator().manual_seed(0)
-    with show_progress("telling apart") as progress:
-        return realism.measure_window_realism(
-            ours.windows, reference.windows, generator=generator, settings=SETTINGS, progress=progress
-        )
-
-
-def _describe_skipped(clips: ClipSet) -> str:
-    first = next(iter(clips.skipped.values()), None)
-    return "" if first is None else f", and {len(clips.skipped)} cannot be measured: {first}"
-
-
-def _average_measures(rows: list[dict[str, float]]) -> dict[str, float]:
-    """Average each measure over the clips that can give it, which are not NaN."""
-    return {name: float(torch.tensor([row[name] for row in rows], dtype=torch.float64).nanmean()) for name in rows[0]}
-
-
 def run(command: Measure) -> int:
     """Measure and print."""
     folders = [path.is_dir() for path in options.collect_paths(command.clip, command.reference)]
-    if any(folders):
-        _check_folders(command, all(folders))
-    values = _measure_folders(command) if any(folders) else _measure_clips(command)
+    values = _measure_folders(command) if all(folders) else _measure_clips(command, any(folders))
     if command.json:
         print(report.to_json(values), end="")
     else:
@@ -167,68 +66,116 @@ def run(command: Measure) -> int:
     return 0
 
 
-def _measure_clips(command: Measure) -> dict[str, Any]:
-    curve = _read_curve(command)
+def _measure_clips(command: Measure, mixed: bool) -> dict[str, Any]:
+    if mixed:
+        raise RequestError(f"{command.clip} and {command.reference}: a folder and a clip; name two of one kind")
+    if command.speed is not None and not 0 < command.speed < math.inf:
+        raise RequestError(f"speed must be positive, got {command.speed:g} m/s")
+    if command.curve is None and (command.speed is not None or command.metres_per_unit is not None):
+        raise RequestError("--speed and --metres-per-unit are about a curve; name it with --curve")
+    curve = None if command.curve is None else inputs.read_curve(command.curve, command.metres_per_unit)
     rig = inputs.read_rig(command.rig, command)
     whole = inputs.read_motion(command.clip, rig)
     clip, notes = _make_comparable(whole, command.clip, rig)
-    ours = metrics.measure(clip, curve, speed=command.speed)
-    reference = {}
+    ours, reference = metrics.measure(clip, curve, speed=command.speed), {}
     if command.reference is not None:
         other, more = _make_comparable(inputs.read_motion(command.reference, None), command.reference)
         reference, notes = metrics.measure(other), notes + more
+    try:
+        canonical = retarget.to_canonical(whole, rig)[0]
+        cycle = editing.describe_cycle(canonical, editing.find_cycle(canonical))
+    except RequestError as error:
+        cycle = {"none": str(error).removeprefix("no cycle is found: ")}
     return {
         "clip": str(command.clip),
         "measures": ours,
         "reference": reference,
         "mocap": _read_mocap_values(),
-        "cycle": _measure_cycle(whole, rig),
+        "cycle": cycle,
         "notes": notes,
     }
 
 
-def _measure_cycle(motion: Motion, rig: Rig | None) -> dict[str, Any]:
-    """Describe the cycle of a motion of any rig, at its own rate; else say why there is none."""
-    try:
-        canonical = retarget.to_canonical(motion, rig)[0]
-        return editing.describe_cycle(canonical, editing.find_cycle(canonical))
-    except RequestError as error:
-        return {"none": str(error).removeprefix("no cycle is found: ")}
+@dataclass(frozen=True, eq=False)
+class _ClipSet:
+    """Measured clips of a folder, in the order of their paths."""
 
+    measures: list[dict[str, float]]
+    """Measures of each clip."""
+    windows: list[Tensor]
+    """Windows of each clip, (windows, frames, channels); none unless read with windows."""
+    skipped: dict[str, str]
+    """Reasons by file that was left out, each a sentence that begins with the file."""
+    notes: list[str]
+    """Notes on what could not be made comparable."""
 
-def _read_curve(command: Measure) -> Curve | None:
-    if command.speed is not None and not 0 < command.speed < float("inf"):
-        raise RequestError(f"speed must be positive, got {command.speed:g} m/s")
-    if command.curve is None and (command.speed is not None or command.metres_per_unit is not None):
-        raise RequestError("--speed and --metres-per-unit are about a curve; name it with --curve")
-    return None if command.curve is None else inputs.read_curve(command.curve, command.metres_per_unit)
+    @property
+    def means(self) -> dict[str, float]:
+        """Mean of each measure over the clips that can give it."""
+        names, rows = self.measures[0], self.measures
+        return {name: float(torch.tensor([row[name] for row in rows], dtype=torch.float64).nanmean()) for name in names}
 
-
-def _check_folders(command: Measure, alike: bool) -> None:
-    if not alike:
-        raise RequestError(f"{command.clip} and {command.reference}: a folder and a clip; name two of one kind")
-    if any(option is not None for option in (command.curve, command.speed, command.metres_per_unit)):
-        raise RequestError(f"{command.clip} is a folder; --curve, --speed and --metres-per-unit are for one clip")
+    @staticmethod
+    def read(folder: Path, *, with_windows: bool, rig: Rig | None = None) -> "_ClipSet":
+        """Read and measure clips of a rig. A file that cannot be read, measured or cut into windows is left out;
+        RequestError if none can, and for fewer than a comparison needs."""
+        paths = sorted(p for p in folder.rglob("*") if p.suffix.lower() in formats.READERS and p.is_file())
+        if not paths:
+            raise RequestError(f"{folder}: no {' or '.join(formats.READERS)} file in this folder or below it")
+        found = _ClipSet([], [], {}, [])
+        with show_progress(f"reading {folder}") as progress:
+            for number, path in enumerate(paths, start=1):
+                try:
+                    motion, notes = _make_comparable(read_motion(path, rig), path, rig)
+                    windows = [realism.cut_windows(realism.canonical_positions(motion))] if with_windows else []
+                    found.measures.append(metrics.measure(motion))
+                    found.windows.extend(windows)
+                    found.notes.extend(notes)
+                except MapctlError as error:
+                    found.skipped[str(path)] = str(error) if str(error).startswith(str(path)) else f"{path}: {error}"
+                if progress is not None:
+                    progress(number, len(paths))
+        count, first = len(found.measures), next(iter(found.skipped.values()), None)
+        if not count:
+            raise RequestError(f"{folder}: no clip can be measured; {first}")
+        if with_windows and count < SETTINGS.min_clips:
+            skipped = "" if first is None else f", and {len(found.skipped)} cannot be measured: {first}"
+            raise RequestError(
+                f"{folder}: {count} clips; a comparison needs at least {SETTINGS.min_clips} in each folder{skipped}"
+                " (without --reference a folder of any size is measured)"
+            )
+        return found
 
 
 def _measure_folders(command: Measure) -> dict[str, Any]:
-    compared = command.reference is not None
-    ours = ClipSet.read(command.clip, with_windows=compared, rig=inputs.read_rig(command.rig, command))
-    reference = ClipSet.read(command.reference, with_windows=True) if command.reference is not None else None
-    values = {
+    if any(option is not None for option in (command.curve, command.speed, command.metres_per_unit)):
+        raise RequestError(f"{command.clip} is a folder; --curve, --speed and --metres-per-unit are for one clip")
+    compared, rig = command.reference is not None, inputs.read_rig(command.rig, command)
+    ours = _ClipSet.read(command.clip, with_windows=compared, rig=rig)
+    values: dict[str, Any] = {
         "clip": str(command.clip),
-        "clips": len(ours.motions),
+        "clips": len(ours.measures),
         "measures": ours.means,
-        "reference": {} if reference is None else reference.means,
+        "reference": {},
         "mocap": _read_mocap_values(),
-        "notes": ours.notes + (() if reference is None else reference.notes),
-        "skipped": ours.skipped | ({} if reference is None else reference.skipped),
+        "notes": ours.notes,
+        "skipped": ours.skipped,
     }
-    return values if reference is None else values | _compare_folders(command, ours, reference)
-
-
-def _compare_folders(command: Measure, ours: ClipSet, reference: ClipSet) -> dict[str, Any]:
-    return {"reference_clips": len(reference.motions), "realism": asdict(measure_realism(ours, reference))}
+    if command.reference is None:
+        return values
+    reference = _ClipSet.read(command.reference, with_windows=True)
+    generator = torch.Generator().manual_seed(0)
+    with show_progress("comparing") as progress:
+        compared = realism.measure_window_realism(
+            ours.windows, reference.windows, generator=generator, settings=SETTINGS, progress=progress
+        )
+    return values | {
+        "reference": reference.means,
+        "notes": ours.notes + reference.notes,
+        "skipped": ours.skipped | reference.skipped,
+        "reference_clips": len(reference.measures),
+        "realism": asdict(compared),
+    }
 
 
 def _print_tables(values: Mapping[str, Any]) -> None:
@@ -245,14 +192,9 @@ def _print_tables(values: Mapping[str, Any]) -> None:
         _print_realism(values["realism"])
     if "cycle" in values:
         print(_describe_cycle(values["cycle"]))
-    for line in _shorten([*(f"left out {reason}" for reason in values.get("skipped", {}).values()), *values["notes"]]):
-        print(line)
-
-
-def _shorten(lines: Sequence[str]) -> list[str]:
-    """Shorten a list of lines to the first ones and the number of the others."""
-    more = len(lines) - _MAX_LINES
-    return [*lines[:_MAX_LINES], *([f"and {more} more, which --json lists"] if more > 0 else [])]
+    lines = [*(f"left out {reason}" for reason in values.get("skipped", {}).values()), *values["notes"]]
+    more = [f"and {len(lines) - _MAX_LINES} more, which --json lists"] if len(lines) > _MAX_LINES else []
+    print("".join(f"{line}\n" for line in [*lines[:_MAX_LINES], *more]), end="")
 
 
 def _make_comparable(motion: Motion, path: Path, rig: Rig | None = None) -> tuple[Motion, list[str]]:
