@@ -183,7 +183,7 @@ def split_scales(parents: Sequence[int], worlds: Array, names: Sequence[str] = (
             turns[joint], scales[joint] = split_scale(matrix, may_mirror=joint not in parents)
         except UnevenScaleError as error:
             name = names[joint] if names else joint
-            raise UnevenScaleError(f"joint {name}: {error.args[0]}; apply it and export again") from None
+            raise UnevenScaleError(f"joint {name}: {error.args[0]}") from None
     return turns, scales
 
 
@@ -199,13 +199,14 @@ def split_scale(matrix: Array, *, may_mirror: bool = False) -> tuple[Array, floa
     lengths = np.linalg.norm(linear, axis=0)
     scale = float(np.cbrt(abs(np.linalg.det(linear))))
     if not scale > 1e-9:
-        raise UnevenScaleError("its scale is zero")
+        raise UnevenScaleError("its scale is zero; apply it and export again")
     if np.linalg.det(linear) < 0:
-        raise UnevenScaleError("its scale is negative, which mirrors")
+        raise UnevenScaleError("its scale is negative, which mirrors; apply it and export again")
     if not np.allclose(lengths, scale, rtol=1e-3) or not np.allclose(
         linear.T @ linear, scale**2 * np.eye(3), atol=2e-3 * scale**2
     ):
-        raise UnevenScaleError(f"its scale is not the same along all axes ({', '.join(f'{x:.4g}' for x in lengths)})")
+        sizes = ", ".join(f"{length:.4g}" for length in lengths)
+        raise UnevenScaleError(f"its scale is not the same along all axes ({sizes}); apply it and export again")
     return nearest_rotations(linear), sign * scale
 
 

@@ -11,7 +11,7 @@ from mapctl import rotations
 from mapctl.errors import MapctlError
 from mapctl.joint_names import Part, Side
 from mapctl.mesh import colours
-from mapctl.mesh.body import Anatomy, Foot
+from mapctl.mesh.anatomy import Anatomy, Foot
 from mapctl.mesh.character_mesh import CharacterMesh
 from mapctl.mesh.primitives import Array, RoundedBoxes, Surface, frame_along
 from mapctl.motion import Motion
