@@ -208,6 +208,9 @@ class NetworkSettings(Settings):
     """Let the network compute in bfloat16: faster on a processor or GPU that has it."""
     init: Annotated[str | None, arg(metavar="NAME")] = None
     """Begin with the weights of this model, bundled or trained, and fine-tune them."""
+    init_share: Number = 0.0
+    """Share of the weights of --init in the ones that are written, the rest being the fine-tuned ones': 0.7 keeps most
+    of what the initial model has learnt (Wortsman et al. 2022)."""
     device: Annotated[Literal["auto", "cpu", "cuda"], arg(metavar="auto|cpu|cuda")] = "auto"
     """Where to compute; auto is a GPU with CUDA where there is one."""
     shape: Annotated[NetworkConfig | None, *InPython] = None
@@ -216,6 +219,8 @@ class NetworkSettings(Settings):
     def __post_init__(self):
         super().__post_init__()
         require_at_least(self, 1, "batch", "window")
+        if not 0 <= self.init_share < 1 or (self.init_share and self.init is None):
+            raise RequestError(f"--init-share is from 0 to below 1, and needs --init; got {self.init_share:g}")
         if self.init is not None and any(getattr(self, name, None) for name in self.shape_options):
             raise RequestError("with --init the network is that model's; options of its shape do not apply")
 
@@ -316,6 +321,9 @@ class Trainer(ABC, Generic[Network]):
     def identify(self) -> Row:
         """Return what must not change between a run's parts beside the settings, the network and the clips."""
         return {}
+
+    def finish(self) -> None:
+        """Change the weights once more, before they are measured and written."""
 
     def export(self, parts: Split) -> Export:
         """Return what is written at the end."""
@@ -420,6 +428,14 @@ class GradientTrainer(Trainer[Network]):
         tensors, own = checkpoints.load(checkpoints.locate(self.settings.init))[0], self.network.state_dict()
         return own | {name: value for name, value in tensors.items() if name in own}
 
+    def finish(self) -> None:
+        """Move the weights towards the initial ones, as far as those have a share."""
+        if self.settings.init_share:
+            before = self.read_initial_weights()
+            for name, value in self.exported.state_dict().items():
+                if value.is_floating_point():
+                    value.lerp_(before[name].to(value), self.settings.init_share)
+
 
 class _Losses(nn.Module):
     """The losses of a trainer as the module that DistributedDataParallel runs."""
@@ -518,6 +534,7 @@ def _export(
     """Write the model with its card."""
     for network in trainer.networks().values():
         network.to("cpu")
+    trainer.finish()
     exported, origin = trainer.export(parts), settings.find_origin()
     corpus = parts.whole
     data = {

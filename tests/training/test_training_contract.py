@@ -170,9 +170,9 @@ def test_training_ends_where_validation_no_longer_improves_with_the_best_weights
 
 
 @pytest.mark.parametrize("name", list_params(NETWORKS))
-def test_a_run_may_begin_with_the_weights_of_another(name, finished, data, tmp_path):
+def test_a_run_may_begin_with_the_weights_of_another_and_keep_a_share_of_them(name, finished, data, tmp_path):
     before = finished(name)
-    settings = small_settings(name, data, tmp_path / "run", steps=1, shape=None, init=str(before), learning_rate=1e-5)
+    settings = small_settings(name, data, tmp_path / "run", steps=1, shape=None, init=str(before), init_share=0.999)
     assert settings.split_seed == 1
     train(settings)
     card = checkpoints.read_card(tmp_path / "run" / "model.json")
