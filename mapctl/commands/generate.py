@@ -84,8 +84,10 @@ def run(command: Generate) -> int:
         stream, prior, seconds=command.seconds, start_clip=clip, refiner=refiner, skeleton=character.skeleton
     )
     starts = sample_stratified_starts(prior, command.count, torch.Generator().manual_seed(command.seed))
+    # A seed for each clip; the first ones do not depend on the count.
+    seeds = torch.randint(2**62, (command.count,), generator=torch.Generator().manual_seed(command.seed)).tolist()
     with outputs.make_folder(command.out) as folder, explain_progress(command.count, "clips") as finished:
-        for number, seed in enumerate(_sample_seeds(command)):
+        for number, seed in enumerate(seeds):
             own = settings if settings.start is not None else replace(settings, start=starts[number])
             pieces = draw(generator=torch.Generator().manual_seed(seed), settings=own)
             motions = (outputs.mark_motion(character.on_rig(piece.motion)) for piece in pieces)
@@ -116,12 +118,6 @@ def _check_settings(command: Generate) -> tuple[GenerateSettings, Motion | None]
         return settings, None
     clip, rig = inputs.read_clip(Path(command.start), command)
     return settings, clip if rig is None else to_canonical(clip, rig)[0]
-
-
-def _sample_seeds(command: Generate) -> list[int]:
-    """Sample a seed for each clip; the first ones do not depend on the count."""
-    generator = torch.Generator().manual_seed(command.seed)
-    return torch.randint(2**62, (command.count,), generator=generator).tolist()
 
 
 def _write(command: Generate, pieces: Iterable[Motion], path: Path, frames: int) -> None:
