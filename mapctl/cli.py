@@ -144,8 +144,8 @@ def _shorten_usage_error(box: str) -> str:
     for pattern, plainer in _MESSAGE_REWRITES:
         first = re.sub(pattern, plainer, first)
     # An option that is another command's is like itself.
-    told = (hint.group() for hint in hints if hint.group().rpartition(" ")[2] not in first.split())
-    return ". ".join([first.strip().rstrip("."), *told])
+    shown = (hint.group() for hint in hints if hint.group().rpartition(" ")[2] not in first.split())
+    return ". ".join([first.strip().rstrip("."), *shown])
 
 
 def _describe_missing_package(module: str) -> str:

@@ -56,9 +56,9 @@ class Motion:
         frames, joints = _count(self.num_frames, "frame"), _count(self.num_joints, "joint")
         step = max(1, round(_CHORD_SECONDS * float(self.fps)))
         picked = self._map_frames(lambda values: torch.cat([values[:-1:step], values[-1:]]))
-        way = picked.joint_positions()[:, self.travelling_joint].diff(dim=0).norm(dim=-1).sum()
+        travelled = picked.joint_positions()[:, self.travelling_joint].diff(dim=0).norm(dim=-1).sum()
         seconds = f"{self.seconds:.1f}" if self.seconds >= 1 else f"{self.seconds:.2g}"
-        return f"{frames} at {float(self.fps):.5g} fps ({seconds} s), {joints}, travels {float(way):.1f} m"
+        return f"{frames} at {float(self.fps):.5g} fps ({seconds} s), {joints}, travels {float(travelled):.1f} m"
 
     @property
     def num_frames(self) -> int:

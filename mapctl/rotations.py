@@ -210,8 +210,8 @@ def from_euler(angles: Float[Tensor, "*#batch 3"], axes: Int[Tensor, "*#batch 3"
     row_j = (sa_sb * cc + ca * sc, ca * cc - sa_sb * sc, -sa * cb)
     row_k = (sa * sc - ca_sb * cc, ca_sb * sc + sa * cc, ca * cb)
     along_order = torch.stack([*row_i, *row_j, *row_k], dim=-1)
-    place = axes.argsort(dim=-1)
-    flat, at = torch.broadcast_tensors(along_order, (3 * place[..., :, None] + place[..., None, :]).flatten(-2))
+    rank = axes.argsort(dim=-1)
+    flat, at = torch.broadcast_tensors(along_order, (3 * rank[..., :, None] + rank[..., None, :]).flatten(-2))
     return flat.gather(-1, at).unflatten(-1, (3, 3))
 
 

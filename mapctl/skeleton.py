@@ -38,11 +38,11 @@ class Skeleton:
     def __str__(self) -> str:
         kind = "canonical joints" if self.names == CANONICAL.names else "joint" if self.num_joints == 1 else "joints"
         # The largest extent along an axis with all rotations zero, End Sites included.
-        places = [self.offsets[0]]
+        positions = [self.offsets[0]]
         for joint in range(1, self.num_joints):
-            places.append(places[self.parents[joint]] + self.offsets[joint])
-        ends = [places[self.index(name)] + self.offsets.new_tensor(end) for name, end in self.end_offsets.items()]
-        spread = torch.stack([*places, *ends])
+            positions.append(positions[self.parents[joint]] + self.offsets[joint])
+        ends = [positions[self.index(name)] + self.offsets.new_tensor(end) for name, end in self.end_offsets.items()]
+        spread = torch.stack([*positions, *ends])
         extent = float((spread.amax(dim=0) - spread.amin(dim=0)).max())
         return f"Skeleton: {self.num_joints} {kind}, root {self.names[0]}, {extent:.2f} m across at rest"
 

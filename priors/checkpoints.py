@@ -61,7 +61,7 @@ class _TrainingData(BaseModel):
     holds: dict[str, Any] = {}
     held_out: dict[str, list[str]] = {}
     match: str = ""
-    made: list[str] = []
+    created: list[str] = []
     classes: dict[str, _MotionClass] = {}
 
 
@@ -269,7 +269,7 @@ def _note_card(name: str, path: Path, card: Card) -> None:
     if weights == "free" and card.licence not in weight_sets.FREE:
         raise CheckpointError(f"{known} lies with the free weights, and its licence is {card.licence!r}")
     weight_sets.note_licence(
-        name if weights is None else known, " ".join(card.licence.split()) or weight_sets.NONE_TOLD
+        name if weights is None else known, " ".join(card.licence.split()) or weight_sets.NO_LICENCE
     )
 
 

@@ -135,7 +135,7 @@ class _CaptureView:
         """Encode the capture, and the same smoothed, in units of about one."""
         # How the slow frame of the hips turns and travels, and its height.
         rate = _difference_frames(self.slow_heading[..., None]) / _VELOCITY_UNIT
-        way = rotations.rotate_about_y(_difference_frames(self.slow_root), -self.slow_heading)[..., ::2]
+        step = rotations.rotate_about_y(_difference_frames(self.slow_root), -self.slow_heading)[..., ::2]
         height = (self.slow_root[..., 1:2] - _HIPS_HEIGHT) / ANGLE_UNIT
         # Flags of what was observed, and the sigmas of its noise.
         capture = self.capture
@@ -150,7 +150,7 @@ class _CaptureView:
                 rate,
                 self.off / POSITION_UNIT,
                 _smooth(self.off, _SMOOTHING_SIGMA) / POSITION_UNIT,
-                way / _VELOCITY_UNIT,
+                step / _VELOCITY_UNIT,
                 height,
                 known.to(self.angles),
                 level[:, None].expand(-1, capture.frames, -1),
@@ -167,9 +167,9 @@ class _CaptureView:
         hips = rotations.to_matrix(rotations.about_y(self.turn[..., 0])) @ tilt
         others = rotations.rotation_vector_to_matrix(self.angles[..., 2:].unflatten(-1, (-1, 3)))
         matrices = torch.cat([hips[..., None, :, :], others], dim=-3)
-        places, world = kinematics.chain_matrices(CANONICAL.offsets.to(matrices), CANONICAL.parents, matrices)
-        six, places = rotations.to_six(world).flatten(-2), (places + self.off[..., None, :]).flatten(-2)
-        both = torch.cat([six, places / ANGLE_UNIT], dim=-1)
+        positions, world = kinematics.chain_matrices(CANONICAL.offsets.to(matrices), CANONICAL.parents, matrices)
+        six, positions = rotations.to_six(world).flatten(-2), (positions + self.off[..., None, :]).flatten(-2)
+        both = torch.cat([six, positions / ANGLE_UNIT], dim=-1)
         return [both, _smooth(both, _SMOOTHING_SIGMA)]
 
     def changed(self, change: Float[Tensor, "batch frames outputs"]) -> tuple[BodyPose, Tensor]:

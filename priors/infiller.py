@@ -165,7 +165,7 @@ class InfillerNetwork(nn.Module):
         """Fill an image; ours keeps known positions to the bit, an autoencoder makes all anew (Kaufmann et al. 2020,
         section 4.2)."""
         # Joints that are never known are shown at their mean.
-        shown = torch.where(image.ever_known[:, None, :, None], image.places, self.mean)
+        shown = torch.where(image.ever_known[:, None, :, None], image.positions, self.mean)
         rows = self._rows(image, shown)
         rows = torch.cat([rows, _encode_masks(image)], dim=-1) if self.keeps_observed else rows
         with torch.autocast(rows.device.type, torch.bfloat16, enabled=self.reduced_precision):
@@ -176,18 +176,18 @@ class InfillerNetwork(nn.Module):
         )
         if not self.keeps_observed:
             return ProposedPositions(self.mean + change, contacts)
-        return ProposedPositions(torch.where(image.known[..., None], image.places, shown + change), contacts)
+        return ProposedPositions(torch.where(image.known[..., None], image.positions, shown + change), contacts)
 
     def _rows(self, image: PositionImage, shown: Tensor) -> Float[Tensor, "batch frames rows"]:
         """Encode the image in about unit size; an autoencoder's unknown positions are 0, their mean (section 3.3)."""
-        places = (shown - self.mean) / self.std
+        positions = (shown - self.mean) / self.std
         if not self.keeps_observed:
-            places = places * image.known[..., None]
-        places = places * image.present[..., None, None]
+            positions = positions * image.known[..., None]
+        positions = positions * image.present[..., None, None]
         step = torch.diff(image.ground, dim=1, prepend=image.ground[:, :1])
         step = rotations.rotate_ground(step, -image.heading) / _VELOCITY_UNIT
         turn = torch.diff(image.heading, dim=1, prepend=image.heading[:, :1])[..., None] / _HEADING_UNIT
-        return torch.cat([places.flatten(-2), step, turn, 2 * image.contacts - 1], dim=-1)
+        return torch.cat([positions.flatten(-2), step, turn, 2 * image.contacts - 1], dim=-1)
 
 
 def _encode_masks(image: PositionImage) -> Float[Tensor, "batch frames told"]:
@@ -212,10 +212,10 @@ class ConvInfiller(checkpoints.NetworkModel[InfillerNetwork], PositionInfiller):
     def complete(self, image: PositionImage) -> ProposedPositions:
         """Propose the whole motion, of any length: the mean of the outputs for it and for its mirror image."""
         one, other = self.network(image), self.network(image.mirrored())
-        places = (one.places + mirror_positions(other.places)) / 2
+        positions = (one.positions + mirror_positions(other.positions)) / 2
         contacts = (one.contacts + other.contacts.flip(-1)) / 2
         return ProposedPositions(
-            torch.where(image.known[..., None] & self.network.keeps_observed, image.places, places), contacts
+            torch.where(image.known[..., None] & self.network.keeps_observed, image.positions, positions), contacts
         )
 
 

@@ -82,8 +82,8 @@ def _initialise(conv: nn.Conv1d | nn.ConvTranspose1d, taps: int) -> None:
 
 
 _JOINTS = CANONICAL.num_joints - 1  # all but the hips, from which the others are seen
-_PLACE_ROWS = 3 * _JOINTS
-_ROWS = 2 * _PLACE_ROWS + 2
+_POSITION_ROWS = 3 * _JOINTS
+_ROWS = 2 * _POSITION_ROWS + 2
 _ANCHORS = tuple(CANONICAL.index(side + part) for side in ("left", "right") for part in ("Foot", "Toes"))
 _OUT_ROWS = 2 + 1 + 2 + len(_ANCHORS) + 1
 _STEP_UNIT, _TURN_UNIT, _VELOCITY_UNIT = 0.01, 0.05, 0.03  # metres, radians and metres a frame
@@ -143,7 +143,7 @@ class PathNetwork(nn.Module):
         return RootTrajectory(
             _mix_anchored_steps(motion, shares) + _STEP_UNIT * steps,
             # Of hips whose lower toe stands.
-            TOE_REST_HEIGHT - motion.places[..., list(TOE_JOINTS), 1].amin(dim=-1) + _HEIGHT_UNIT * height[..., 0],
+            TOE_REST_HEIGHT - motion.positions[..., list(TOE_JOINTS), 1].amin(dim=-1) + _HEIGHT_UNIT * height[..., 0],
             _CONTACT_UNIT * contacts,
         )
 
@@ -153,7 +153,7 @@ class PathNetwork(nn.Module):
         The change is a difference of two places that a convolution can take, but in the places' own unit it would be
         lost: millimetres beside decimetres.
         """
-        scaled = ((motion.places[..., 1:, :] - self.mean) / self.std).flatten(-2)
+        scaled = ((motion.positions[..., 1:, :] - self.mean) / self.std).flatten(-2)
         steps = motion.anchored_steps()[..., 1:, :].flatten(-2) / _VELOCITY_UNIT
         turns = motion.turns[..., None] / _TURN_UNIT
         present = motion.present[..., None].to(scaled)

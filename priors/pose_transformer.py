@@ -172,14 +172,14 @@ class PoseTransformerNetwork(nn.Module):
         turn = _difference(motion.heading[..., None]) / _TURN_UNIT
         aim = rotations.rotate_about_y(motion.targets - world[..., list(EFFECTORS), :], -motion.heading[..., None])
         aim = torch.where(known.effectors[..., None], aim / _TARGET_UNIT, 0.0)
-        places = (local - self.mean_position) / self.std_position
+        positions = (local - self.mean_position) / self.std_position
         # Where the hips are and face, seen from the first frame.
         ground, facing = motion.root_position[..., ::2], motion.heading
         travelled = rotations.rotate_ground(ground - ground[:, :1], -facing[:, :1]) / _TRAVEL_UNIT
         turned = (facing - facing[:, :1])[..., None]
         return torch.cat(
             [
-                *(each.flatten(-2) for each in (six, places, step, aim)),
+                *(each.flatten(-2) for each in (six, positions, step, aim)),
                 turn,
                 2 * motion.contacts - 1,
                 known.rotations.float(),
@@ -201,10 +201,10 @@ class PoseTransformerNetwork(nn.Module):
     ) -> Float[Tensor, "batch frames joints 3 3"]:
         """Return local rotations with corrections where they are not known; the hips' in the world."""
         six = rotations.to_six(shown) + out.unflatten(-1, (_JOINTS, 6)) * self.std_rotation
-        made = rotations.from_six(six)
+        generated = rotations.from_six(six)
         known = motion.known.rotations
-        others = torch.where(known[..., 1:, None, None], shown[..., 1:, :, :], made[..., 1:, :, :])
-        tilt, free, faced = made[..., 0, :, :], ~known[..., 0], motion.known.heading
+        others = torch.where(known[..., 1:, None, None], shown[..., 1:, :, :], generated[..., 1:, :, :])
+        tilt, free, faced = generated[..., 0, :, :], ~known[..., 0], motion.known.heading
         # Of hips of which either heading or tilt is known, that is kept, and the other proposed.
         turn = _heading_of(torch.where((free == faced)[..., None, None], tilt, torch.eye(3, device=tilt.device)))
         tilted = _about_y(-turn) @ tilt
@@ -375,7 +375,7 @@ class PoseTransformer(checkpoints.NetworkModel[PoseTransformerNetwork], Inbetwee
             wanted[None],
         )
         if query.effector_targets is not None:
-            targets = (query.effector_targets.places[:, list(EFFECTORS)] / query.scale).float()
+            targets = (query.effector_targets.positions[:, list(EFFECTORS)] / query.scale).float()
             wanted = query.effector_targets.wanted[:, list(EFFECTORS)][None] & ~known.positions[..., list(EFFECTORS)]
             known = replace(known, effectors=wanted)
         toes = body.joint_positions()[:, list(TOE_JOINTS)] / query.scale
@@ -415,7 +415,7 @@ def _move(query: GapQuery, shift: Float[Tensor, " 3"]) -> GapQuery:
     moved = replace(query.motion, root_position=query.motion.root_position + shift)
     targets = query.effector_targets
     if targets is not None:
-        targets = replace(targets, places=targets.places + shift)
+        targets = replace(targets, positions=targets.positions + shift)
     return replace(query, motion=moved, effector_targets=targets)
 
 

@@ -213,7 +213,7 @@ class Situation:
     """Current frames."""
     target: Frame
     """Frames to which they go."""
-    place: Float[Tensor, "2 batch 2"]
+    position: Float[Tensor, "2 batch 2"]
     """Position of the target, seen from the current frame in its heading frame, metres."""
     turn: Float[Tensor, "2 batch"]
     """Difference of the headings, radians in -pi to pi."""
@@ -235,7 +235,7 @@ class Situation:
     def on_arrival(self) -> "Situation":
         """Return the input if the target were reached."""
         nil = torch.zeros_like(self.left)
-        return Situation(self.target, self.target, torch.zeros_like(self.place), nil, nil)
+        return Situation(self.target, self.target, torch.zeros_like(self.position), nil, nil)
 
 
 @dataclass(frozen=True, eq=False)
@@ -307,14 +307,14 @@ class StitcherNetwork(nn.Module):
         super().__init__()
         self.config = config
         last, seen = config.embedding[-1], 3 * config.embedding[-1]
-        told = seen + config.encoder
+        given = seen + config.encoder
         self.state = SidedLayers(_STATE, *config.embedding)
         self.offset = SidedLayers(_OFFSET, *config.embedding)
         self.target = SidedLayers(_STATE, *config.embedding)
         self.encoder = SidedLstm(seen, config.encoder)
         self.now = SidedLayers(config.encoder, config.head, 2 * config.own)
         self.arrived = SidedLayers(config.encoder, config.head, 2 * config.own)
-        self.decoder = SidedLstm(told + config.shared + config.own, config.decoder)
+        self.decoder = SidedLstm(given + config.shared + config.own, config.decoder)
         self.experts = SidedLayers(config.decoder + config.shared, *config.expert, LAYOUT.size, experts=config.experts)
         self.carry = nn.Parameter(torch.zeros(2, SIDES, 1, POSE.stop))
         self.gate = SidedLayers(PHASES, *config.gate, config.experts)
@@ -326,7 +326,7 @@ class StitcherNetwork(nn.Module):
         for layers in (self.experts, self.next_phase, self.now, self.arrived):
             layers.shrink_last(0.1)
         with torch.no_grad():  # few numbers among many: at the usual size they would be learnt to be ignored
-            self.decoder.gates.weight[:, told : told + config.shared + config.own].mul_(4)
+            self.decoder.gates.weight[:, given : given + config.shared + config.own].mul_(4)
         self.register_buffer("mean", torch.zeros(LAYOUT.size))
         self.register_buffer("std", torch.ones(LAYOUT.size))
         self.register_buffer("change", torch.ones(LAYOUT.size))
@@ -338,7 +338,7 @@ class StitcherNetwork(nn.Module):
         """Embed state, offset and target, each with the time to arrival (Eq. 11 and 12)."""
         time = self._wave(now.left)
         pose = (now.target.features - now.now.features)[..., POSE] / self.std[POSE]
-        offset = torch.cat([now.place, now.turn[..., None], pose], dim=-1)
+        offset = torch.cat([now.position, now.turn[..., None], pose], dim=-1)
         parts = (self.state(self._normalise(now.now)), self.offset(offset), self.target(self._normalise(now.target)))
         return torch.cat([part + time for part in parts], dim=-1)
 
@@ -351,7 +351,7 @@ class StitcherNetwork(nn.Module):
 
         return Memory(still(self.config.encoder), still(self.config.decoder), self.first_phase(seen))
 
-    def tell_shared(self, seen: Float[Tensor, "2 batch seen"]) -> Gaussian:
+    def infer_shared(self, seen: Float[Tensor, "2 batch seen"]) -> Gaussian:
         """Tell the distribution of what both sides share, from what they see at first."""
         return Gaussian.of(self.prior(seen.transpose(0, 1).flatten(1)))
 
@@ -378,11 +378,11 @@ class StitcherNetwork(nn.Module):
         after it."""
         output, cell = self.decoder(torch.cat([seen, encoded, latent], dim=-1), memory.decoder)
         share = torch.softmax(self.gate(memory.phase.detach()), dim=-1)
-        made = self.experts(torch.cat([output, latent[..., : self.config.shared]], dim=-1), share)
+        generated = self.experts(torch.cat([output, latent[..., : self.config.shared]], dim=-1), share)
         pace, change = self._lean(now)
-        pace = pace + made[..., PACE] * self.std[PACE]
-        pose = now.now.features[..., POSE] + change + made[..., POSE].clamp(-_CLAMP, _CLAMP) * self.change[POSE]
-        logits = made[..., POSE.stop :]
+        pace = pace + generated[..., PACE] * self.std[PACE]
+        pose = now.now.features[..., POSE] + change + generated[..., POSE].clamp(-_CLAMP, _CLAMP) * self.change[POSE]
+        logits = generated[..., POSE.stop :]
         features = torch.cat([pace, pose, torch.sigmoid(logits)], dim=-1)
         step = self.next_phase(torch.cat([(features.detach() - self.mean) / self.std, memory.phase], dim=-1))
         return features, logits, Memory(encoder, (output, cell), memory.phase + step)
@@ -395,7 +395,7 @@ class StitcherNetwork(nn.Module):
         # None of a bare pose's, and none in the last step to the target.
         share = torch.sigmoid(4 * (self.carry[0] + self.carry[1] * left / self.config.longest))
         kept = now.now.paced[..., None] * share * (1 - 1 / left)
-        pace = torch.cat([now.place, now.turn[..., None]], dim=-1) * even
+        pace = torch.cat([now.position, now.turn[..., None]], dim=-1) * even
         change = (now.target.features - now.now.features)[..., POSE] * even
         return (
             torch.lerp(pace, now.now.features[..., PACE], kept[..., PACE]),
@@ -435,7 +435,7 @@ class PosteriorNetwork(nn.Module):
         )
         self.next = SidedLayers(SEEN_FUTURE * LAYOUT.size + config.encoder, 2 * _WIDTH, 2 * config.own)
 
-    def tell_shared(self, missed: Float[Tensor, "2 batch made size"]) -> Gaussian:
+    def infer_shared(self, missed: Float[Tensor, "2 batch generated size"]) -> Gaussian:
         """Tell it from what the calm answer of both sides misses of the truth, in units of the features' spread.
 
         So it tells what the two ends do not. Over the batch each number's mean has unit variance, so that what is told
@@ -448,7 +448,7 @@ class PosteriorNetwork(nn.Module):
         mean = (mean - mean.mean(dim=0)) / (mean.var(dim=0, correction=0) + 1e-5).sqrt()
         return Gaussian(mean, (_LEAST_SIGMA + (1 - _LEAST_SIGMA) * torch.sigmoid(raw)).log())
 
-    def tell_own(
+    def infer_own(
         self, ahead: Float[Tensor, "2 batch frames size"], encoded: Float[Tensor, "2 batch width"]
     ) -> Gaussian:
         """Tell a frame's from the true frames ahead, normalised, in each side's sense of time."""
@@ -464,19 +464,19 @@ class DrawnLatents:
 
     shared: Float[Tensor, "batch shared"]
     """Standard normal."""
-    slow: Float[Tensor, "2 batch made own"]
+    slow: Float[Tensor, "2 batch generated own"]
     """Of unit variance, slow over frames."""
 
     @staticmethod
-    def calm(config: StitcherConfig, batch: int, made: int) -> "DrawnLatents":
+    def calm(config: StitcherConfig, batch: int, generated: int) -> "DrawnLatents":
         """At the mean."""
-        return DrawnLatents(torch.zeros(batch, config.shared), torch.zeros(2, batch, made, config.own))
+        return DrawnLatents(torch.zeros(batch, config.shared), torch.zeros(2, batch, generated, config.own))
 
     @staticmethod
-    def sample(config: StitcherConfig, batch: int, made: int, generator: torch.Generator) -> "DrawnLatents":
+    def sample(config: StitcherConfig, batch: int, generated: int, generator: torch.Generator) -> "DrawnLatents":
         """Drawn."""
         noise = torch.randn(batch, config.shared, generator=generator)
-        return DrawnLatents(noise, _draw_noise(batch, made, config.own, generator))
+        return DrawnLatents(noise, _draw_noise(batch, generated, config.own, generator))
 
     def still(self, rows: Bool[Tensor, " batch"]) -> "DrawnLatents":
         """Return the same with some rows at the mean."""
@@ -526,7 +526,7 @@ class Ends:
     """Frames up to each side's end, which is the last, in the side's own sense of time."""
     present: Float[Tensor, "2 batch context"]
     """1 where there is such a frame; the last always is, and those before it without a gap."""
-    place: Float[Tensor, "batch 2"]
+    position: Float[Tensor, "batch 2"]
     """Where the second end is over the ground, seen from the first in its heading frame, metres."""
     turn: Float[Tensor, "batch"]
     """By how much its heading is another, radians."""
@@ -559,28 +559,28 @@ class Sides:
 
     frames: int
     """From one pose to the other."""
-    features: Float[Tensor, "sides batch made size"]
+    features: Float[Tensor, "sides batch generated size"]
     """In each side's own sense of time; contacts are probabilities."""
-    logits: Float[Tensor, "sides batch made 2"]
+    logits: Float[Tensor, "sides batch generated 2"]
     """Of the contacts."""
-    place: Float[Tensor, "sides batch made 2"]
+    position: Float[Tensor, "sides batch generated 2"]
     """Of the hips over the ground, metres, seen from the first end."""
-    heading: Float[Tensor, "sides batch made"]
+    heading: Float[Tensor, "sides batch generated"]
     """Of the hips, radians, likewise."""
-    phases: Float[Tensor, "sides batch made 4"]
+    phases: Float[Tensor, "sides batch generated 4"]
     """Of the frames made."""
     at_ends: Float[Tensor, "sides batch 4"]
     """Phases of the ends themselves."""
 
-    def place_joints(self) -> Float[Tensor, "sides batch made joints 3"]:
+    def place_joints(self) -> Float[Tensor, "sides batch generated joints 3"]:
         """Place the joints, metres, seen from the first end."""
         shape = self.features.shape[:2]
         return place_joints(
-            self.features.flatten(0, 1), self.place.flatten(0, 1), self.heading.flatten(0, 1), CANONICAL
+            self.features.flatten(0, 1), self.position.flatten(0, 1), self.heading.flatten(0, 1), CANONICAL
         ).unflatten(0, shape)
 
 
-def count_made(network: StitcherNetwork, frames: int) -> int:
+def count_generated(network: StitcherNetwork, frames: int) -> int:
     """Count the frames that each side of a transition makes: up to the middle and K beyond it, an eighth of the
     transition and 6 at most, which the paper leaves open; one at least is made by both."""
     beyond = min(round(frames / _OVERLAP_SHARE), _MOST_OVERLAP)
@@ -594,11 +594,11 @@ def walk_sides(network: StitcherNetwork, ends: Ends, frames: int, latents: Laten
 
 def walk_stepwise(network: StitcherNetwork, ends: Ends, frames: int, latents: Latents) -> Generator[None, None, Sides]:
     """Walk both sides as `walk_sides`, a frame at a time."""
-    zero = torch.zeros_like(ends.place)
-    end, ends_at = ends.frame(-1), GroundPose(torch.stack([zero, ends.place]), torch.stack([zero[:, 0], ends.turn]))
+    zero = torch.zeros_like(ends.position)
+    end, ends_at = ends.frame(-1), GroundPose(torch.stack([zero, ends.position]), torch.stack([zero[:, 0], ends.turn]))
     memory, shared = yield from _enter(network, ends, ends_at, frames, latents)
     here, at, first_phase, rows = end, ends_at, memory.phase, []
-    for step in range(count_made(network, frames)):
+    for step in range(count_generated(network, frames)):
         # Towards the other side, or towards the far end once they have met.
         left, target, target_at = frames - 2 * step, here, at
         if left < 1:
@@ -629,7 +629,7 @@ def _enter(
         return Situation.of(ends.frame(number), grounds[number], end, at, float(frames + context - 1 - number))
 
     first = network.embed(look(context - 1))
-    shared = latents.share(network.tell_shared(first), first)
+    shared = latents.share(network.infer_shared(first), first)
     memory, before = network.begin(first), torch.zeros_like(ends.present[:, :, 0])
     for number in range(context - 1):
         there = ends.present[:, :, number]
@@ -676,11 +676,13 @@ class Joined:
 
 def join_sides(sides: Sides) -> Joined:
     """Join the sides of a transition of two frames or more."""
-    made = sides.features.shape[2]
-    first, last = sides.frames - made, made  # of the overlap, counted from the first pose
+    generated = sides.features.shape[2]
+    first, last = sides.frames - generated, generated  # of the overlap, counted from the first pose
     if first > last:
         raise ValueError("sides that have no frame in common cannot be joined")
-    bodies = [BodyPose.of_features_at(*each) for each in zip(sides.features, sides.place, sides.heading, strict=True)]
+    bodies = [
+        BodyPose.of_features_at(*each) for each in zip(sides.features, sides.position, sides.heading, strict=True)
+    ]
     seam = (first + last) // 2
     index = [seam - 1, sides.frames - 1 - seam]  # the same frame, as each side counts
     pairs = [body.slice(at, at + 1) for body, at in zip(bodies, index, strict=True)]
@@ -689,7 +691,7 @@ def join_sides(sides: Sides) -> Joined:
     twist = rotations.wrap_angle(pairs[1].heading - pairs[0].heading)[:, 0]
     rows = []
     for side, body in enumerate(bodies):
-        order = torch.arange(made) if side == 0 else torch.arange(made - 1, -1, -1)
+        order = torch.arange(generated) if side == 0 else torch.arange(generated - 1, -1, -1)
         share = ((order + 1) / (sides.frames / 2)).clamp_max(1)
         share = share * share * (3 - 2 * share) * (0.5 if side == 0 else -0.5)  # no leap of speed at either end
         quats = body.local_quat_xyzw[:, order]
@@ -739,12 +741,12 @@ class Draws:
         it is in if it is not there; the next finite one where it is not finite, and None where the whole chunk is not.
         """
         chunk, row = divmod(number, CHUNK)
-        told = b"".join(part.numpy().tobytes() for part in (ends.features, ends.present, ends.place, ends.turn))
-        if (made := self.chunks.get((told, frames, chunk))) is None:
-            made = make(self.seed_chunk(start, chunk), self.temperature)
-            self.chunks[told, frames, chunk] = made
-        good = made.finite.roll(-row).nonzero()
-        return made.row((row + int(good[0])) % CHUNK) if len(good) else None
+        given = b"".join(part.numpy().tobytes() for part in (ends.features, ends.present, ends.position, ends.turn))
+        if (generated := self.chunks.get((given, frames, chunk))) is None:
+            generated = make(self.seed_chunk(start, chunk), self.temperature)
+            self.chunks[given, frames, chunk] = generated
+        good = generated.finite.roll(-row).nonzero()
+        return generated.row((row + int(good[0])) % CHUNK) if len(good) else None
 
 
 _ROUNDS, _DIFFERENCE = 2, 0.25  # the second in standard deviations of the prior
@@ -775,10 +777,10 @@ def fit_shared(
         tried = best + spread * torch.tensor((0.0, *_SHARES))[:, None] * step
         if not bool(tried.isfinite().all()):
             break
-        made = make(tried)
-        energy = measure(made).square().sum(dim=1) + ((tried - centre) / spread).square().sum(dim=1)
-        least = int(torch.where(energy.isfinite() & made.finite, energy, torch.inf).argmin())
-        best, fitted = tried[least], made.row(least)
+        generated = make(tried)
+        energy = measure(generated).square().sum(dim=1) + ((tried - centre) / spread).square().sum(dim=1)
+        least = int(torch.where(energy.isfinite() & generated.finite, energy, torch.inf).argmin())
+        best, fitted = tried[least], generated.row(least)
     return fitted
 
 
@@ -792,10 +794,10 @@ _TRAJECTORY_STRIDE = 6  # frames from one residual of a trajectory to the next
 
 
 @dataclass(frozen=True, eq=False)
-class Wishes:
+class Constraints:
     """Wishes about the frames of one gap, on the canonical skeleton, seen from the pose before it."""
 
-    places: Float[Tensor, "frames joints 3"]
+    positions: Float[Tensor, "frames joints 3"]
     """Positions that joints are to have, metres."""
     wanted: Bool[Tensor, "frames joints"]
     """Whether a joint is to have one."""
@@ -807,12 +809,12 @@ class Wishes:
     """Ground positions that the hips are to follow, metres; they may sway about them."""
 
     @staticmethod
-    def of(query: GapQuery, start: int, stop: int) -> "Wishes | None":
+    def of(query: GapQuery, start: int, stop: int) -> "Constraints | None":
         """See what a query tells between frames that are known on both sides; None where that is nothing."""
         part, targets = slice(start, stop), query.effector_targets
         hips = query.root_only_keys[part]
-        told = query.keep_trajectory or bool(hips.any()) or (targets is not None and bool(targets.wanted[part].any()))
-        if not told:
+        given = query.keep_trajectory or bool(hips.any()) or (targets is not None and bool(targets.wanted[part].any()))
+        if not given:
             return None
         body = query.to_unit_size(query.motion)
         facing = heading(body.local_quat_xyzw[start - 1, 0])
@@ -821,22 +823,22 @@ class Wishes:
         def see(positions: Tensor) -> Tensor:
             return rotations.rotate_about_y(positions - origin, -facing.expand(positions.shape[:-1]))
 
-        places = torch.zeros(stop - start, CANONICAL.num_joints, 3)
-        wanted = torch.zeros(places.shape[:2], dtype=torch.bool)
+        points = torch.zeros(stop - start, CANONICAL.num_joints, 3)
+        wanted = torch.zeros(points.shape[:2], dtype=torch.bool)
         root = see(body.root_position[part]).float()
         if targets is not None:
-            places, wanted = see(targets.places[part] / query.scale).float(), targets.wanted[part].clone()
-        places[:, 0], wanted[:, 0] = root, hips
+            points, wanted = see(targets.positions[part] / query.scale).float(), targets.wanted[part].clone()
+        points[:, 0], wanted[:, 0] = root, hips
         turned = rotations.wrap_angle(heading(body.local_quat_xyzw[part, 0]) - facing).float()
         faced = hips.nonzero()[:, 0]
-        return Wishes(places, wanted, turned[faced], faced, root[:, ::2] if query.keep_trajectory else None)
+        return Constraints(points, wanted, turned[faced], faced, root[:, ::2] if query.keep_trajectory else None)
 
     def measure(self, joined: Joined) -> Float[Tensor, "batch residuals"]:
         """Measure by how much motions miss each wish along each axis, in standard deviations."""
-        places, facing, trajectory = self._measure(joined)
+        points, facing, trajectory = self._measure(joined)
         hands = torch.isin(self.wanted.nonzero()[:, 1], torch.tensor(_HANDS))
         sigma = torch.where(hands, _SIGMA_HAND, _SIGMA)[:, None]
-        parts = (places / sigma, facing / _SIGMA, trajectory / _SIGMA)
+        parts = (points / sigma, facing / _SIGMA, trajectory / _SIGMA)
         return torch.cat([part.flatten(1) for part in parts], dim=1)
 
     def measure_farthest(self, joined: Joined) -> float:
@@ -852,14 +854,14 @@ class Wishes:
 
     def _measure(
         self, joined: Joined
-    ) -> tuple[Float[Tensor, "batch places 3"], Float[Tensor, "batch faced 1"], Float[Tensor, "batch points 2"]]:
+    ) -> tuple[Float[Tensor, "batch points 3"], Float[Tensor, "batch faced 1"], Float[Tensor, "batch points 2"]]:
         """Measure by how much motions miss places, headings and points of the trajectory, metres."""
         root = joined.root_position
         positions, _ = forward_kinematics(CANONICAL.offsets.to(root), CANONICAL.parents, root, joined.quats)
         turned = rotations.wrap_angle(heading(joined.quats[:, self.faced, 0]) - self.facing)
         off = root[:, :0, ::2] if self.trajectory is None else self._follow(root, self.trajectory)
         points = off[:, _TRAJECTORY_STRIDE // 2 :: _TRAJECTORY_STRIDE]
-        return (positions - self.places)[:, self.wanted], _FACING_ARM * turned[..., None], points
+        return (positions - self.positions)[:, self.wanted], _FACING_ARM * turned[..., None], points
 
     @staticmethod
     def _follow(
@@ -929,8 +931,8 @@ class Stitcher(checkpoints.NetworkModel[StitcherNetwork], Inbetweener):
         return self._walk(ends, frames, self._draw_latents(frames, generator, temperature))
 
     def _draw_latents(self, frames: int, generator: torch.Generator, temperature: float) -> DrawnLatents:
-        made = count_made(self.network, frames)
-        return DrawnLatents.sample(self.network.config, CHUNK, made, generator).scale(temperature)
+        generated = count_generated(self.network, frames)
+        return DrawnLatents.sample(self.network.config, CHUNK, generated, generator).scale(temperature)
 
     def _walk(self, ends: Ends, frames: int, latents: DrawnLatents) -> Joined:
         return join_sides(walk_sides(self.network, _repeat(ends, len(latents.shared)), frames, latents))
@@ -938,14 +940,14 @@ class Stitcher(checkpoints.NetworkModel[StitcherNetwork], Inbetweener):
     @torch.no_grad()
     def answer(self, ends: Ends, frames: int) -> Joined:
         """Return the calm answer to pairs of poses: the mean of that to them and that to their mirror image."""
-        config, batch = self.network.config, len(ends.place)
+        config, batch = self.network.config, len(ends.position)
         both = Ends(
             torch.cat([ends.features, mirror_features(ends.features)], dim=1),
             torch.cat([ends.present, ends.present], dim=1),
-            torch.cat([ends.place, ends.place * ends.place.new_tensor([-1.0, 1.0])]),
+            torch.cat([ends.position, ends.position * ends.position.new_tensor([-1.0, 1.0])]),
             torch.cat([ends.turn, -ends.turn]),
         )
-        calm = DrawnLatents.calm(config, 2 * batch, count_made(self.network, frames))
+        calm = DrawnLatents.calm(config, 2 * batch, count_generated(self.network, frames))
         joined = join_sides(walk_sides(self.network, both, frames, calm))
         return _average_mirrored(joined, batch)
 
@@ -954,15 +956,15 @@ class Stitcher(checkpoints.NetworkModel[StitcherNetwork], Inbetweener):
         self,
         before: Float[Tensor, "*batch before size"],
         after: Float[Tensor, "batch after size"],
-        place: Float[Tensor, "batch 2"],
+        position: Float[Tensor, "batch 2"],
         turn: Float[Tensor, " batch"],
         frames: int,
         noise: torch.Generator | None = None,
     ) -> Generator[None, None, Float[Tensor, "batch frames size"]]:
-        """Make, a frame at a time, the ways from the last frame of `before`, of one motion or of each, to the last of
-        `after`, which are run backwards, as features from the next frame on to that one, `frames` later. Seen from the
-        first, it is at `place`, metres, and its heading another by `turn`, radians. All others of these frames say how
-        motion came here and goes on. The ways are the calm ones, or drawn if there is `noise`."""
+        """Generate, a frame at a time, transitions from the last frame of `before`, of one motion or of each, to the
+        last of `after`, run backwards, `frames` later, as features from the next frame to that one. Relative to the
+        first it is at `position`, metres, with its heading turned by `turn`, radians. The other frames of both are
+        context. Transitions are the mean ones, or drawn where there is `noise`."""
         before = before[..., -1 - MAX_CONTEXT :, :].expand(len(after), -1, -1)
         after = after[:, -1 - MAX_CONTEXT :]
         context = max(before.shape[1], after.shape[1])
@@ -971,27 +973,29 @@ class Stitcher(checkpoints.NetworkModel[StitcherNetwork], Inbetweener):
             lead = context - known.shape[1]
             sides.append(torch.cat([known[:, :1].expand(-1, lead, -1), known], dim=1))
             present.append((torch.arange(context) >= lead).float().expand(len(after), -1))
-        ends = Ends(torch.stack(sides), torch.stack(present), place, turn)
-        config, made = self.network.config, count_made(self.network, frames)
-        latents = DrawnLatents.calm(config, len(place), made)
+        ends = Ends(torch.stack(sides), torch.stack(present), position, turn)
+        config, generated = self.network.config, count_generated(self.network, frames)
+        latents = DrawnLatents.calm(config, len(position), generated)
         if noise is not None:
-            latents = DrawnLatents.sample(config, len(place), made, noise).scale(float(self.network.temperature))
+            latents = DrawnLatents.sample(config, len(position), generated, noise).scale(
+                float(self.network.temperature)
+            )
         joined = join_sides((yield from walk_stepwise(self.network, ends, frames, latents)))
-        origin = GroundPose(torch.zeros_like(place), torch.zeros_like(turn))
+        origin = GroundPose(torch.zeros_like(position), torch.zeros_like(turn))
         first, last = (
             BodyPose.of_features_at(known[:, -1:], at.position_xz[:, None], at.heading[:, None])
-            for known, at in ((before, origin), (after, GroundPose(place, turn)))
+            for known, at in ((before, origin), (after, GroundPose(position, turn)))
         )
         root = torch.cat([first.root_position, joined.root_position, last.root_position], dim=1)
         quats = torch.cat([first.local_quat_xyzw, joined.quats, last.local_quat_xyzw], dim=1)
         planted = torch.cat([(joined.contacts > 0).float(), after[:, -1:, LAYOUT.slices["contacts"]]], dim=1)
-        ways = [
+        transitions = [
             encode(Motion(CANONICAL, Fraction(PRIOR_FPS), one.double(), rotations.make_sign_continuous(two.double())))[
                 0
             ][1:]
             for one, two in zip(root, quats, strict=True)
         ]
-        return torch.cat([torch.stack(ways).float()[..., : LAYOUT.continuous], planted], dim=-1)
+        return torch.cat([torch.stack(transitions).float()[..., : LAYOUT.continuous], planted], dim=-1)
 
     @torch.no_grad()
     def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
@@ -1006,16 +1010,21 @@ class Stitcher(checkpoints.NetworkModel[StitcherNetwork], Inbetweener):
         sources = []
         whole = query.hide_partial_keys()
         for start, stop in whole.enclosed_gaps:
-            reason, remark, found, wishes = self._refuse(whole, start, stop), "", None, None
+            reason, remark, found, constraints = self._refuse(whole, start, stop), "", None, None
             if not reason:
-                ends, wishes = see_ends(body, whole.missing.frames, start, stop), Wishes.of(query, start, stop)
-                found = self._find(ends, start, stop) if wishes is None else self._fit(ends, start, stop, wishes)
-            if found is not None and wishes is not None:
-                off = wishes.measure_farthest(found)
+                ends, constraints = (
+                    see_ends(body, whole.missing.frames, start, stop),
+                    Constraints.of(query, start, stop),
+                )
+                found = (
+                    self._find(ends, start, stop) if constraints is None else self._fit(ends, start, stop, constraints)
+                )
+            if found is not None and constraints is not None:
+                off = constraints.measure_farthest(found)
                 remark = f"led by what is told in it, of which it is {100 * query.scale * off:.1f} cm off unbent"
                 if query.keep_trajectory and off > _FARTHEST:
                     reason = f"with steps that stay {query.scale * off:.2f} m off the trajectory"
-                found = None if reason else wishes.lay_along(found)
+                found = None if reason else constraints.lay_along(found)
             parts = [gap for gap in query.enclosed_gaps if start <= gap[0] and gap[1] <= stop] or [(start, stop)]
             if found is None:
                 sources += [GapSource(*gap, INTERPOLATION, reason or _NOT_FINITE) for gap in parts]
@@ -1039,13 +1048,13 @@ class Stitcher(checkpoints.NetworkModel[StitcherNetwork], Inbetweener):
         calm = self.answer(ends, frames)
         return calm if bool(calm.finite.all()) else None
 
-    def _fit(self, ends: Ends, start: int, stop: int, wishes: Wishes) -> Joined | None:
+    def _fit(self, ends: Ends, start: int, stop: int, constraints: Constraints) -> Joined | None:
         """Find the answer that meets the wishes about a gap, near the calm one or near the draw of this number; None
         where it is not finite."""
         frames, draws = stop - start + 1, self.draws
         if draws is None:
             spread = self._pick_temperature(None)
-            around = DrawnLatents.calm(self.network.config, 1, count_made(self.network, frames))
+            around = DrawnLatents.calm(self.network.config, 1, count_generated(self.network, frames))
         else:
             chunk, row = divmod(self.number, CHUNK)
             spread = draws.temperature
@@ -1054,7 +1063,7 @@ class Stitcher(checkpoints.NetworkModel[StitcherNetwork], Inbetweener):
         def make(shared: Float[Tensor, "batch shared"]) -> Joined:
             return self._walk(ends, frames, DrawnLatents(shared, around.slow.expand(-1, len(shared), -1, -1)))
 
-        found = fit_shared(make, wishes.measure, around.shared[0], spread)
+        found = fit_shared(make, constraints.measure, around.shared[0], spread)
         return found if bool(found.finite.all()) else None
 
     def _refuse(self, query: GapQuery, start: int, stop: int) -> str:
@@ -1081,9 +1090,9 @@ def see_ends(body: Motion, missing: Tensor, start: int, stop: int) -> Ends:
         present.append((torch.arange(context) >= lead).float()[None])
     heading = rotations.split_heading(body.local_quat_xyzw[[start - 1, stop], 0])[0]
     away = (body.root_position[stop] - body.root_position[start - 1])[[0, 2]]
-    place = rotations.rotate_ground(away, -heading[0]).float()[None]
+    position = rotations.rotate_ground(away, -heading[0]).float()[None]
     turn = rotations.wrap_angle(heading[1] - heading[0]).float()[None]
-    return Ends(torch.stack(features).float(), torch.stack(present), place, turn)
+    return Ends(torch.stack(features).float(), torch.stack(present), position, turn)
 
 
 def _count_known(missing: Tensor, at: int, step: int) -> int:
@@ -1131,7 +1140,7 @@ def _repeat(ends: Ends, count: int) -> Ends:
     return Ends(
         ends.features.expand(-1, count, -1, -1).contiguous(),
         ends.present.expand(-1, count, -1).contiguous(),
-        ends.place.expand(count, -1).contiguous(),
+        ends.position.expand(count, -1).contiguous(),
         ends.turn.expand(count).contiguous(),
     )
 

@@ -24,7 +24,7 @@ from mapctl import contacts, joint_ranges, kinematics, rotations
 from mapctl.errors import CheckpointError, RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening import GapQuery, PositionImage, Proposal
-from mapctl.inbetweening.effector_targets import LooseKeys, lead_over_places
+from mapctl.inbetweening.effector_targets import LooseKeys, lead_over_positions
 from mapctl.inbetweening.partial_motion import PartialMotion
 from mapctl.inbetweening.query import GapSource
 from mapctl.inbetweening.root_trajectory import TREMBLE_HZ, LocalMotion, lead_over_keys
@@ -52,8 +52,8 @@ _REACH, _REACH_A_SECOND, _LONGEST_REACH = 0.8, 0.3, 2.0
 sharper is the turn for its way. Chosen on captured walks: a turn of 90 degrees takes about 2 s."""
 
 
-def bend_way(
-    way: Float[Tensor, "batch frames 2"],
+def bend_trajectory(
+    trajectory: Float[Tensor, "batch frames 2"],
     facing: Float[Tensor, "batch frames"],
     *,
     placed: Bool[Tensor, "batch frames"],
@@ -70,8 +70,8 @@ def bend_way(
     long = (torch.diff(row) == 0) & (frames > _SHORT * PRIOR_FPS) & whole[:-1] & whole[1:]
     row, start, frames = row[:-1][long], start[:-1][long], frames[long]
     if not len(row):
-        return way, facing
-    first, last, seconds = way[row, start], way[row, start + frames], frames / PRIOR_FPS
+        return trajectory, facing
+    first, last, seconds = trajectory[row, start], trajectory[row, start + frames], frames / PRIOR_FPS
     chord = last - first
     length, towards = chord.norm(dim=-1), torch.atan2(chord[:, 0], chord[:, 1])
     turns = [rotations.wrap_angle(facing[row, at] - towards) for at in (start, start + frames)]
@@ -81,14 +81,14 @@ def bend_way(
     reach = length * (_REACH + _REACH_A_SECOND * frames / PRIOR_FPS).clamp(max=_LONGEST_REACH)
     along = [torch.stack([(towards + turn).sin(), (towards + turn).cos()], dim=-1) * reach[:, None] for turn in turns]
     curves = torch.stack([first, last, *along], dim=1)
-    bent, turned = way.clone(), facing.clone()
+    bent, turned = trajectory.clone(), facing.clone()
     for leg in (share > 0).nonzero()[:, 0].tolist():
         count, inside = int(frames[leg]), (int(row[leg]), slice(int(start[leg]) + 1, int(start[leg] + frames[leg])))
-        place, slope = _walk_evenly(curves[leg], count)
+        position, slope = _walk_evenly(curves[leg], count)
         # Evenly turning headings are unwrapped, and a curve's begin where they do.
         off = torch.atan2(slope[:, 0], slope[:, 1]) - (towards[leg] + turns[0][leg])
         begun = facing[row[leg], start[leg]] + rotations.wrap_angle(off)
-        bent[inside] += share[leg] * (place - way[inside])
+        bent[inside] += share[leg] * (position - trajectory[inside])
         turned[inside] += share[leg] * rotations.wrap_angle(begun - facing[inside])
     return bent, turned
 
@@ -108,11 +108,11 @@ def _walk_evenly(
 def _evaluate(curve: Float[Tensor, "4 2"], parameter: Float[Tensor, " points"]) -> tuple[Tensor, Tensor]:
     """Return points and slopes of a cubic curve from its ends and its tangents there."""
     u = parameter[:, None]
-    place = (2 * u**3 - 3 * u**2 + 1, 3 * u**2 - 2 * u**3, u**3 - 2 * u**2 + u, u**3 - u**2)
+    position = (2 * u**3 - 3 * u**2 + 1, 3 * u**2 - 2 * u**3, u**3 - 2 * u**2 + u, u**3 - u**2)
     slope = (6 * u**2 - 6 * u, 6 * u - 6 * u**2, 3 * u**2 - 4 * u + 1, 3 * u**2 - 2 * u)
     one, other = (
         sum((weight * each for weight, each in zip(weights, curve, strict=True)), torch.zeros_like(u))
-        for weights in (place, slope)
+        for weights in (position, slope)
     )
     return one, other
 
@@ -123,7 +123,7 @@ def _ramp(value: Tensor, none: float, whole: float) -> Tensor:
 
 
 @dataclass(frozen=True, eq=False)
-class ToldParts:
+class GivenParts:
     """What keys tell; a frame that tells nothing is none."""
 
     axes: Bool[Tensor, "batch frames joints 3"]
@@ -136,10 +136,10 @@ class ToldParts:
     to key."""
 
     @staticmethod
-    def whole(known: Bool[Tensor, "batch frames"]) -> "ToldParts":
+    def whole(known: Bool[Tensor, "batch frames"]) -> "GivenParts":
         """Tell the whole poses of some frames."""
         axes = known[..., None, None].expand(*known.shape, CANONICAL.num_joints, 3)
-        return ToldParts(axes, known, torch.full((len(known),), torch.nan))
+        return GivenParts(axes, known, torch.full((len(known),), torch.nan))
 
     @property
     def known(self) -> Bool[Tensor, "batch frames"]:
@@ -152,34 +152,34 @@ class ToldParts:
         return self.axes[..., 0, 0] & self.axes[..., 0, 2]
 
 
-def make_key_image(motion: PartialMotion, told: ToldParts) -> PositionImage:
+def make_key_image(motion: PartialMotion, given: GivenParts) -> PositionImage:
     """Make the image of what is told of some frames; the rest of the motion may hold anything finite."""
-    places = motion.world_poses()[0]
-    ground, heading = lead_reference(motion.root_position[..., ::2], motion.heading, told)
+    positions = motion.world_poses()[0]
+    ground, heading = lead_reference(motion.root_position[..., ::2], motion.heading, given)
     shift = rotations.lift_ground(ground - motion.root_position[..., ::2])
     return PositionImage.of_world(
-        places + shift[:, :, None],
+        positions + shift[:, :, None],
         heading,
-        see_contacts(motion.contacts, told.known),
-        known=told.axes.all(dim=-1),
-        present=torch.ones_like(told.heading),
+        see_contacts(motion.contacts, given.known),
+        known=given.axes.all(dim=-1),
+        present=torch.ones_like(given.heading),
         toes=TOE_JOINTS,
-        known_axes=told.axes,
+        known_axes=given.axes,
     )
 
 
 def lead_reference(
-    ground: Float[Tensor, "batch frames 2"], heading: Float[Tensor, "batch frames"], told: ToldParts
+    ground: Float[Tensor, "batch frames 2"], heading: Float[Tensor, "batch frames"], given: GivenParts
 ) -> tuple[Float[Tensor, "batch frames 2"], Float[Tensor, "batch frames"]]:
-    """Lead the reference (ground, metres; heading, radians) from told place to told place, and from told heading to
-    told heading: as who walks would (`bend_way`) where that is clear, else straight and evenly. Where a sequence tells
-    no heading, it looks along its way."""
-    # What is drawn stands where its hips are, also if only one axis of these is told.
-    shown = told.axes[..., 0, :].any(dim=-1)
-    way, facing = lead_over_places(ground, heading, placed=shown, faced=told.heading)
-    drawn = torch.isfinite(told.view)[:, None]
-    way, facing = bend_way(way, facing, placed=shown, faced=told.heading & ~drawn)
-    return way, torch.where(drawn, torch.nan_to_num(told.view)[:, None], facing)
+    """Lead the reference (ground, metres; heading, radians) from each given position and heading to the next: along a
+    walked trajectory (`bend_trajectory`) where that is clear, else straight and evenly. Without any given heading it
+    faces along its trajectory."""
+    # A drawing stands where its hips are, also if only one axis of these is given.
+    shown = given.axes[..., 0, :].any(dim=-1)
+    trajectory, facing = lead_over_positions(ground, heading, placed=shown, faced=given.heading)
+    drawn = torch.isfinite(given.view)[:, None]
+    trajectory, facing = bend_trajectory(trajectory, facing, placed=shown, faced=given.heading & ~drawn)
+    return trajectory, torch.where(drawn, torch.nan_to_num(given.view)[:, None], facing)
 
 
 def see_contacts(
@@ -204,7 +204,7 @@ class ConstrainedPose:
 
     local_matrix: Float[Tensor, "*batch joints 3 3"]
     """Local rotations; the hips' is that in whatever frame it was told."""
-    places: Float[Tensor, "*batch joints 3"]
+    positions: Float[Tensor, "*batch joints 3"]
     """Joint positions from the hips, metres, in the same frame."""
 
 
@@ -237,10 +237,10 @@ class RangeConstrainedKinematics(nn.Module):
         return ConstrainedPose(local, kinematics.positions_from_matrices(self.skeleton, local))
 
 
-_PLACE_ROWS = 3 * CANONICAL.num_joints
+_POSITION_ROWS = 3 * CANONICAL.num_joints
 _STYLE_ROWS = 3 * (CANONICAL.num_joints - 1)
 _TRAVEL_ROWS, _TIME_ROWS, _CONTACT_ROWS = 3, 2, 2
-INPUT_ROWS = 2 * _PLACE_ROWS + _TRAVEL_ROWS + _TIME_ROWS + _CONTACT_ROWS
+INPUT_ROWS = 2 * _POSITION_ROWS + _TRAVEL_ROWS + _TIME_ROWS + _CONTACT_ROWS
 """Rows of the dense input: nearest known coordinates and how far they are, the reference's velocities, time since and
 until anything is known, contacts."""
 MAX_KEY_FRAMES = 480
@@ -294,7 +294,7 @@ class GeneratedPoses:
         quats = rotations.about_y(image.heading)
         hips = rotations.to_matrix(quats) @ self.pose.local_matrix[..., 0, :, :]
         local = torch.cat([hips[..., None, :, :], self.pose.local_matrix[..., 1:, :, :]], dim=-3)
-        return ConstrainedPose(local, rotations.rotate_about_y(self.pose.places, image.heading[..., None]))
+        return ConstrainedPose(local, rotations.rotate_about_y(self.pose.positions, image.heading[..., None]))
 
 
 class StyleEncoder(nn.Module):
@@ -312,9 +312,9 @@ class StyleEncoder(nn.Module):
             _Affine(style),
         )
 
-    def forward(self, places: Float[Tensor, "batch poses joints 3"]) -> Float[Tensor, "batch style"]:
+    def forward(self, positions: Float[Tensor, "batch poses joints 3"]) -> Float[Tensor, "batch style"]:
         """Encode joint positions from the hips, metres, without the hips' rotation."""
-        return self.layers(places[..., 1:, :].flatten(-2).transpose(1, 2)).mean(dim=-1)
+        return self.layers(positions[..., 1:, :].flatten(-2).transpose(1, 2)).mean(dim=-1)
 
 
 class GeneratorNetwork(nn.Module):
@@ -354,8 +354,8 @@ class GeneratorNetwork(nn.Module):
     def forward(self, image: PositionImage, style: Float[Tensor, "batch style"]) -> GeneratedPoses:
         """Generate poses of every frame of an image, of any length; `style` is what the style encoder gives, or 0."""
         rows = self.encode_rows(image).transpose(1, 2)
-        made, responses = self.generate(rows, style)
-        return GeneratedPoses(self.kinematics(made.transpose(1, 2)), responses)
+        generated, responses = self.generate(rows, style)
+        return GeneratedPoses(self.kinematics(generated.transpose(1, 2)), responses)
 
     def generate(
         self, rows: Float[Tensor, "batch rows frames"], style: Float[Tensor, "batch style"]
@@ -382,13 +382,13 @@ class GeneratorNetwork(nn.Module):
     def encode_rows(self, image: PositionImage) -> Float[Tensor, "batch frames rows"]:
         """Encode the dense input of section 3.5, seen from the reference, in about unit size."""
         copied, away = image.copy_nearest()
-        told = torch.isfinite(away)
-        places = torch.where(told, (copied - self.mean) / self.std, 0.0)
+        given = torch.isfinite(away)
+        positions = torch.where(given, (copied - self.mean) / self.std, 0.0)
         distances, times = _scale_frames(away), _encode_times(image)
         step = torch.diff(image.ground, dim=1, prepend=image.ground[:, :1])
         step = rotations.rotate_ground(step, -image.heading) / _VELOCITY_UNIT
         turn = torch.diff(image.heading, dim=1, prepend=image.heading[:, :1])[..., None] / _HEADING_UNIT
-        parts = [places.flatten(-2), distances.flatten(-2), step, turn, times]
+        parts = [positions.flatten(-2), distances.flatten(-2), step, turn, times]
         rows = torch.cat([*parts, 2 * image.contacts - 1], dim=-1)
         return rows * image.present[..., None].to(rows)
 
@@ -438,7 +438,7 @@ def _encode_times(image: PositionImage) -> Float[Tensor, "batch frames times"]:
     never = ~some.any(dim=1, keepdim=True)
     ago, ahead = frame - last_observed(some), next_observed(some) - frame
     # Before the first known frame the last one is none, and the other way round.
-    times = [torch.where(never | (each < 0), MAX_KEY_FRAMES, each).to(image.places) for each in (ago, ahead)]
+    times = [torch.where(never | (each < 0), MAX_KEY_FRAMES, each).to(image.positions) for each in (ago, ahead)]
     return _scale_frames(torch.stack(times, dim=-1))
 
 
@@ -508,8 +508,8 @@ def find_class(clip: str, labels: str = LABELS) -> str | None:
     if not pattern.groups:
         raise RequestError(f"--labels needs a group as in _([a-z-]+)_, which is the class; got {labels!r}")
     found = pattern.search(clip)
-    told = next((group for group in found.groups() if group), "") if found else ""
-    return told.replace("/", "-") or None
+    given = next((group for group in found.groups() if group), "") if found else ""
+    return given.replace("/", "-") or None
 
 
 @torch.no_grad()
@@ -526,9 +526,9 @@ def encode_classes(encoder: StyleEncoder, classes: Mapping[str, Sequence[MotionD
 def read_classes(card: Card, size: int) -> dict[str, Style]:
     """Read the classes of a card by name, none of an older one; CheckpointError where they are not of this size."""
     styles = {}
-    for name, told in card.data.get(_FIELD, {}).items():
+    for name, given in card.data.get(_FIELD, {}).items():
         try:
-            vector = np.frombuffer(base64.b64decode(told["vector"], validate=True), "<f2").astype(np.float32)
+            vector = np.frombuffer(base64.b64decode(given["vector"], validate=True), "<f2").astype(np.float32)
         except (KeyError, TypeError, ValueError) as error:
             raise CheckpointError(f"the class {name} in the card holds no vector ({error})") from error
         if len(vector) != size or not np.isfinite(vector).all():
@@ -541,7 +541,7 @@ def count_clips(data: Mapping[str, Any]) -> dict[str, Any]:
     """Replace the classes in a card's data by how many clips each was made of, for people to read."""
     if _FIELD not in data:
         return dict(data)
-    return {**data, _FIELD: {name: told["clips"] for name, told in data[_FIELD].items()}}
+    return {**data, _FIELD: {name: given["clips"] for name, given in data[_FIELD].items()}}
 
 
 def pick_class(classes: Mapping[str, Style], name: str) -> Style:
@@ -560,18 +560,18 @@ def show_loose_keys(image: PositionImage, loose: LooseKeys) -> PositionImage:
     """Show places over the ground, over which the reference of an image of one motion leads, and drawings in frames of
     which nothing else is known: from where the first of these is seen the reference then looks back, without turning.
     """
-    axes, places = image.known_axes.clone(), image.places
+    axes, positions = image.known_axes.clone(), image.positions
     axes[0, loose.placed, 0, 0] = axes[0, loose.placed, 0, 2] = True
     seen = loose.see_from_one_side(CANONICAL)
     if seen is None:
         return replace(image, known_axes=axes)
     turned = replace(image, heading=torch.full_like(image.heading, seen.view))
-    places = turned.from_world(image.to_world(places))
+    positions = turned.from_world(image.to_world(positions))
     open_frames = ~image.known[0].any(dim=-1) & loose.drawings
     shown = seen.known & open_frames[:, None, None]
     axes[0] |= shown
-    places = torch.where(shown, seen.places.to(places), places[0])[None]
-    return replace(turned, places=places, known_axes=axes)
+    positions = torch.where(shown, seen.positions.to(positions), positions[0])[None]
+    return replace(turned, positions=positions, known_axes=axes)
 
 
 PART_FRAMES = MAX_KEY_FRAMES // 2
@@ -681,9 +681,9 @@ class Tweener(checkpoints.NetworkModel[GeneratorNetwork], Inbetweener):
         style, or of the keys beside them.
         """
         shown, missing, splits = query.motion, query.missing, find_splits(query)
-        told = self._tell_poses(query, splits)
-        made, origin = self._make(query, told)
-        met = interpolate_turns(made, shown.local_quat_xyzw, ~missing.joints, seconds=_KEY_SECONDS, fps=PRIOR_FPS)
+        given = self._choose_poses(query, splits)
+        generated, origin = self._make(query, given)
+        met = interpolate_turns(generated, shown.local_quat_xyzw, ~missing.joints, seconds=_KEY_SECONDS, fps=PRIOR_FPS)
         quats = torch.where(missing.joints[..., None], met, shown.local_quat_xyzw)
         body = query.to_unit_size(replace(shown, local_quat_xyzw=rotations.make_sign_continuous(quats)))
         body, logits = self._lead(body, query, origin)
@@ -693,39 +693,39 @@ class Tweener(checkpoints.NetworkModel[GeneratorNetwork], Inbetweener):
         known = query.known_positions[:, list(TOE_JOINTS)]
         planted = contacts.to_logits(contacts.detect_contacts(body.joint_positions()[:, list(TOE_JOINTS)], PRIOR_FPS))
         return Proposal(
-            motion, torch.where(known, planted, logits), self.source, tuple(self._tell_splits(query, splits, told))
+            motion, torch.where(known, planted, logits), self.source, tuple(self._describe_splits(query, splits, given))
         )
 
     def _make(
-        self, query: GapQuery, told: Mapping[int, Float[Tensor, "joints 3"]]
+        self, query: GapQuery, given: Mapping[int, Float[Tensor, "joints 3"]]
     ) -> tuple[Float[Tensor, "frames joints 4"], Float[Tensor, " 3"]]:
         """Make rotations of all frames, near what is known and near poses that are given by frame, metres, world; also
         return the origin that these are seen from."""
-        image, origin = _show(query, told)
+        image, origin = _show(query, given)
         style = torch.zeros(self.network.config.style) if self.style is None else self.style.vector
         wide = image.extended(_MARGIN)
-        made, inside = self.network(wide, style[None]), slice(_MARGIN, -_MARGIN)
-        local = made.turn_to_world(wide).local_matrix[0, inside]
+        generated, inside = self.network(wide, style[None]), slice(_MARGIN, -_MARGIN)
+        local = generated.turn_to_world(wide).local_matrix[0, inside]
         return calm_poses(rotations.from_matrix(local.double())), origin
 
-    def _tell_poses(self, query: GapQuery, splits: Sequence[Split]) -> dict[int, Float[Tensor, "joints 3"]]:
+    def _choose_poses(self, query: GapQuery, splits: Sequence[Split]) -> dict[int, Float[Tensor, "joints 3"]]:
         """Choose the poses that split gaps, by frame, at their places in a motion of unit size, metres, world."""
-        told = {}
+        given = {}
         for split in splits:
             own = None if self.style is None else self.style.poses
             poses = show_edges(query, split) if own is None else own
             if len(poses):
                 placed = place_poses(poses, _walk_over(query), split.frames)
-                told |= dict(zip(split.frames, placed, strict=True))
-        return told
+                given |= dict(zip(split.frames, placed, strict=True))
+        return given
 
-    def _tell_splits(
-        self, query: GapQuery, splits: Sequence[Split], told: Mapping[int, Float[Tensor, "joints 3"]]
+    def _describe_splits(
+        self, query: GapQuery, splits: Sequence[Split], given: Mapping[int, Float[Tensor, "joints 3"]]
     ) -> Iterator[GapSource]:
         """Tell which gaps are too long for the network, and when which poses split them."""
         by = "the keys beside it" if self.style is None or self.style.poses is None else "the style"
         for split in splits:
-            times = ", ".join(f"{float(query.seconds[frame]):.1f}" for frame in split.frames if frame in told)
+            times = ", ".join(f"{float(query.seconds[frame]):.1f}" for frame in split.frames if frame in given)
             reason = f"longer than the {MAX_KEY_FRAMES / PRIOR_FPS:.0f} s that the {SOURCE} sees; "
             reason += f"split at {times} s by poses of {by}" if times else "give more keys"
             yield GapSource(split.start, split.stop, self.source, reason)
@@ -743,36 +743,36 @@ class Tweener(checkpoints.NetworkModel[GeneratorNetwork], Inbetweener):
     ) -> tuple[Motion, Float[Tensor, "frames 2"]]:
         """Lead the hips by how the body moves, from known position to known position, at unit size; also return the
         contacts' logits."""
-        way, logits = self._walk(body)
+        trajectory, logits = self._walk(body)
         loose = None if query.loose is None else _shift(query.loose.scaled(1 / query.scale), -origin)
-        led = lead_over_keys(way, body.root_position - origin, query.missing.root, loose)
-        told = ~query.missing.root if loose is None else ~query.missing.root | loose.placed
-        calm = smooth_between(led, told, hertz=TREMBLE_HZ, fps=PRIOR_FPS) + origin
+        led = lead_over_keys(trajectory, body.root_position - origin, query.missing.root, loose)
+        given = ~query.missing.root if loose is None else ~query.missing.root | loose.placed
+        calm = smooth_between(led, given, hertz=TREMBLE_HZ, fps=PRIOR_FPS) + origin
         if query.keep_trajectory:
             calm = torch.cat([body.root_position[:, :1], calm[:, 1:2], body.root_position[:, 2:]], dim=-1)
             return replace(body, root_position=calm), logits
-        made = replace(body, root_position=calm)
+        generated = replace(body, root_position=calm)
         share = torch.sigmoid(logits).double()
-        return keep_feet(made, led + origin - calm, share, query), logits
+        return keep_feet(generated, led + origin - calm, share, query), logits
 
 
-def _show(query: GapQuery, told: Mapping[int, Float[Tensor, "joints 3"]]) -> tuple[PositionImage, Float[Tensor, " 3"]]:
+def _show(query: GapQuery, given: Mapping[int, Float[Tensor, "joints 3"]]) -> tuple[PositionImage, Float[Tensor, " 3"]]:
     """Return the query, and poses that are told by frame, as the network takes it, of unit size and near the origin,
     and where that origin is."""
-    body, known = _walk_over(query), _find_told_joints(query)
+    body, known = _walk_over(query), _find_given_joints(query)
     placed = known[:, 0].nonzero()[:, 0]
     origin = body.root_position[placed[0] if len(placed) else 0] * torch.tensor([1.0, 0.0, 1.0]).double()
-    places = body.joint_positions()
-    planted = contacts.detect_contacts(places[:, list(TOE_JOINTS)], PRIOR_FPS).float()
-    if told:
-        places, known = places.clone(), known.clone()
-        places[list(told)], known[list(told)] = torch.stack(list(told.values())), True
+    positions = body.joint_positions()
+    planted = contacts.detect_contacts(positions[:, list(TOE_JOINTS)], PRIOR_FPS).float()
+    if given:
+        positions, known = positions.clone(), known.clone()
+        positions[list(given)], known[list(given)] = torch.stack(list(given.values())), True
     image = PositionImage.of_world(
-        (places - origin).float()[None],
+        (positions - origin).float()[None],
         heading(body.local_quat_xyzw[:, 0]).float()[None],
         see_contacts(planted[None], known.any(dim=1)[None]),
         known=known[None],
-        present=torch.ones(1, len(places), dtype=torch.bool),
+        present=torch.ones(1, len(positions), dtype=torch.bool),
         toes=TOE_JOINTS,
     )
     return (image if query.loose is None else show_loose_keys(image, query.loose)), origin
@@ -787,19 +787,19 @@ def calm_poses(quats: Float[Tensor, "frames joints 4"]) -> Float[Tensor, "frames
 
 
 def _walk_over(query: GapQuery) -> Motion:
-    """Return the query's motion at unit size, whose hips go through gaps along `bend_way`."""
+    """Return the query's motion at unit size, whose hips go through gaps along `bend_trajectory`."""
     motion = query.to_unit_size(query.motion)
     facing = rotations.unwrap_angle(heading(motion.local_quat_xyzw[:, 0]))
     placed, faced = ~query.missing.root[None], ~query.missing.joints[None, :, 0]
-    way, turned = bend_way(motion.root_position[None, :, ::2], facing[None], placed=placed, faced=faced)
+    trajectory, turned = bend_trajectory(motion.root_position[None, :, ::2], facing[None], placed=placed, faced=faced)
     root, quats = motion.root_position.clone(), motion.local_quat_xyzw.clone()
-    root[:, ::2] = way[0]
+    root[:, ::2] = trajectory[0]
     bent = turned[0] != facing
     quats[bent, 0] = rotations.multiply(rotations.about_y((turned[0] - facing)[bent]), quats[bent, 0])
     return replace(motion, root_position=root, local_quat_xyzw=quats)
 
 
-def _find_told_joints(query: GapQuery) -> Bool[Tensor, "frames joints"]:
+def _find_given_joints(query: GapQuery) -> Bool[Tensor, "frames joints"]:
     """Find the joints whose positions are told: in the world, or about hips of whose whole body the place alone is
     missing."""
     return query.known_positions | ~query.missing.joints.any(dim=1, keepdim=True)

@@ -84,8 +84,8 @@ def find_file(name: str) -> Path | None:
     found = _find_model(weights, model)
     if found is None:
         return None
-    with as_file(_find_folder(weights) / f"{found}{_ENDING}") as place:
-        return place
+    with as_file(_find_folder(weights) / f"{found}{_ENDING}") as path:
+        return path
 
 
 def _find_model(weights: str, model: str) -> str | None:
@@ -138,7 +138,7 @@ FREE = ("free for any use", "CC0 1.0")
 """Licences of models of the free set: nothing is asked of who uses them."""
 OF_DATA = "that of the training data"
 """Licence of trained weights for which none was told."""
-NONE_TOLD = "no licence told"
+NO_LICENCE = "no licence told"
 """Of a model whose card leaves it out: like one that is not known, it is taken for stricter than all."""
 _BY_STRICTNESS = (*FREE, "CC BY 4.0", "CC BY-SA 4.0", "CC BY-NC 4.0", "CC BY-NC-SA 4.0")
 """Known licences, the strictest last. One that is not known is taken for stricter than all, since nobody can tell."""

@@ -124,8 +124,8 @@ def _find_centre(across: Array, depth: Array) -> float:
     """Find the sideways position that has the outermost points of both sides equally far from the middle."""
     depth = np.maximum(depth, 1e-6)
 
-    def lopsided(place: float) -> float:
-        seen = (across - place) / depth
+    def lopsided(position: float) -> float:
+        seen = (across - position) / depth
         return float(seen.max() + seen.min())
 
     return cast(float, scipy.optimize.brentq(lopsided, across.min() - 1e-6, across.max() + 1e-6, xtol=1e-6))

@@ -39,7 +39,7 @@ class DrawnMotion:
     """Triangles of the character."""
     placed: Placed
     """The motion on the character's joints."""
-    place: Callable[[Motion], Placed]
+    convert: Callable[[Motion], Placed]
     """Puts further frames of the same giver on it, as poses that are asked for."""
 
     @property
@@ -55,7 +55,7 @@ class DrawnMotion:
 
     def build_pose(self, pose: Motion, colour: Array) -> SkinnedBody:
         """Build the body in one frame of the giver's skeleton; `colour` as of `build_body`."""
-        return replace(self, placed=self.place(pose)).build_body(pose.fps, colour)
+        return replace(self, placed=self.convert(pose)).build_body(pose.fps, colour)
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,8 +99,8 @@ class DrawnCharacter:
         are retargeted (mapctl.retarget.carry), as by `mapctl convert --rig`. RequestError where the joints of either
         cannot be identified.
         """
-        place = self._choose_conversion(motion)
-        return DrawnMotion(self.mesh, place(motion), place)
+        convert = self._choose_conversion(motion)
+        return DrawnMotion(self.mesh, convert(motion), convert)
 
     def _choose_conversion(self, motion: Motion) -> Callable[[Motion], Placed]:
         if motion.skeleton.matches(self.standing.skeleton, _SAME_BONE):

@@ -21,12 +21,12 @@ _SHADOW_CELLS = 52
 _SHADOW_STRENGTH = 0.5
 
 
-def build_grid(places: Array) -> Surface:
+def build_grid(positions: Array) -> Surface:
     """Build squares of 1 m and lines, every fifth stronger, around positions (n, 2) x, z; they fade with distance.
 
     Where the positions are more than 60 m apart the squares grow to 5 m, 25 m and so on.
     """
-    low, high = places.min(axis=0) - _FADE_END, places.max(axis=0) + _FADE_END
+    low, high = positions.min(axis=0) - _FADE_END, positions.max(axis=0) + _FADE_END
     step = 1.0
     while (high - low).max() / step > _MAX_TILES:
         step *= 5
@@ -40,7 +40,7 @@ def build_grid(places: Array) -> Surface:
     quads, is_tile = np.concatenate([tiles, *lines]), np.arange(len(tiles) + len(strong)) < len(tiles)
     strength = np.concatenate([np.ones(len(tiles)), np.where(strong, 1.0, 0.62)])
     # Colours fade to the background's, opaque, for eight bits of opacity show as rings.
-    distance = scipy.spatial.KDTree(places).query(quads.reshape(-1, 2))[0].reshape(-1, 4)
+    distance = scipy.spatial.KDTree(positions).query(quads.reshape(-1, 2))[0].reshape(-1, 4)
     share = np.clip((_FADE_END - distance) / (_FADE_END - _FADE_START), 0, 1)
     shown = strength[:, None] * share * share * (3 - 2 * share)
     kept = shown.max(axis=1) > 0
@@ -113,23 +113,25 @@ def build_shadow(segments: Array, radii: Array, *, layer: int = 0) -> Surface:
     margin = (radii[:, None] + blur)[..., None]
     low, high = (flat - margin).min(axis=(0, 1)), (flat + margin).max(axis=(0, 1))
     x, z = (np.linspace(a, b, _SHADOW_CELLS, dtype=np.float32) for a, b in zip(low, high, strict=True))
-    places = np.stack(np.meshgrid(x, z, indexing="ij"), axis=-1).reshape(-1, 2)
+    positions = np.stack(np.meshgrid(x, z, indexing="ij"), axis=-1).reshape(-1, 2)
     alpha = _SHADOW_STRENGTH * (
-        1 - _compute_transmittance(places, *(v.astype(np.float32) for v in (flat, blur, radii)))
+        1 - _compute_transmittance(positions, *(v.astype(np.float32) for v in (flat, blur, radii)))
     )
-    rgba = np.concatenate([np.tile(colours.rgb(colours.SHADOW), (len(places), 1)), alpha[:, None]], axis=1)
-    index = np.arange(len(places)).reshape(_SHADOW_CELLS, _SHADOW_CELLS)
+    rgba = np.concatenate([np.tile(colours.rgb(colours.SHADOW), (len(positions), 1)), alpha[:, None]], axis=1)
+    index = np.arange(len(positions)).reshape(_SHADOW_CELLS, _SHADOW_CELLS)
     quads = np.stack([index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]], axis=-1).reshape(-1, 4)
     shown = alpha[quads].max(axis=1) > 0.004
-    return Surface(np.insert(places, 1, SHADOW_HEIGHT + 0.0005 * layer, axis=1), _triangulate_quads(quads[shown]), rgba)
+    return Surface(
+        np.insert(positions, 1, SHADOW_HEIGHT + 0.0005 * layer, axis=1), _triangulate_quads(quads[shown]), rgba
+    )
 
 
-def _compute_transmittance(places: Array, flat: Array, blur: Array, radii: Array) -> Array:
+def _compute_transmittance(positions: Array, flat: Array, blur: Array, radii: Array) -> Array:
     """Compute the share of light that reaches each position (m, 2) past all capsules."""
-    left = np.ones(len(places), dtype=np.float32)
+    left = np.ones(len(positions), dtype=np.float32)
     for (start, stop), soft, radius in zip(flat, blur, radii, strict=True):
         along = stop - start
-        away = places - start
+        away = positions - start
         share = np.clip(away @ along / max(float(along @ along), 1e-9), 0, 1)
         away -= share[:, None] * along
         distance = np.sqrt(np.einsum("ij,ij->i", away, away))
@@ -147,7 +149,7 @@ def _triangulate_quads(quads: Array) -> Array:
 
 _OBSTACLE_COLOUR = "#b9aa9c"
 _HEIGHT, _SHADE = 0.35, 0.82  # metres of an obstacle's walls, and how dark they are beside its top
-_TARGET_RADIUS, _LOOK_RADIUS, _PLACE_RADIUS = 0.035, 0.05, 0.16  # metres
+_TARGET_RADIUS, _LOOK_RADIUS, _HIPS_RADIUS = 0.035, 0.05, 0.16  # metres
 
 
 def build_obstacle(obstacle: Obstacle) -> Surface:
@@ -164,27 +166,27 @@ def build_obstacle(obstacle: Obstacle) -> Surface:
     return merge_surfaces([sides, _make_plain(high, np.concatenate([fan, fan[:, ::-1]]), _OBSTACLE_COLOUR)])
 
 
-def build_target(place: tuple[float, float, float]) -> Surface:
+def build_target(position: tuple[float, float, float]) -> Surface:
     """Build a small ball at a position (x, y, z), metres, that a hand or a foot is to reach."""
     vertices, faces = unit_sphere()
-    return _make_plain(_TARGET_RADIUS * vertices + np.array(place), faces, colours.TARGET)
+    return _make_plain(_TARGET_RADIUS * vertices + np.array(position), faces, colours.TARGET)
 
 
-def build_look_mark(place: tuple[float, float, float]) -> Surface:
+def build_look_mark(position: tuple[float, float, float]) -> Surface:
     """Build a small octahedron at a position to be looked at."""
     axes = np.concatenate([np.eye(3), -np.eye(3)])
     faces = np.array([[x, y, z] for x in (0, 3) for y in (1, 4) for z in (2, 5)])
-    return _make_plain(_LOOK_RADIUS * axes + np.array(place), faces, colours.TARGET)
+    return _make_plain(_LOOK_RADIUS * axes + np.array(position), faces, colours.TARGET)
 
 
-def build_hips_mark(place: Array, heading: float | None) -> Surface:
+def build_hips_mark(position: Array, heading: float | None) -> Surface:
     """Build a disc on the ground where hips are to be, (x, z) metres, with an arrow to where they are to face, radians
     from +Z toward +X; without one where they may face anywhere."""
     rgb = colours.rgb(colours.TARGET)
-    disc = build_discs(place[None], rgb[None], radius=_PLACE_RADIUS)
+    disc = build_discs(position[None], rgb[None], radius=_HIPS_RADIUS)
     if heading is None:
         return disc
-    return merge_surfaces([disc, build_arrow(place, heading, rgb, length=3 * _PLACE_RADIUS)])
+    return merge_surfaces([disc, build_arrow(position, heading, rgb, length=3 * _HIPS_RADIUS)])
 
 
 def _make_plain(vertices: Array, faces: Array, colour: str) -> Surface:

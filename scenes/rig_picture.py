@@ -24,7 +24,7 @@ _LEFT, _RIGHT, _MIDDLE, _UNMATCHED, _DOUBT = "#4c78a8", "#f58518", "#333333", "#
 _MAX_LINES, _MAX_LINE = 5, 112  # reasons under the picture, and characters of a line of them
 _MAX_NAME = 24  # characters of a joint's name
 
-Places = Float[np.ndarray, "joints 3"]
+JointPositions = Float[np.ndarray, "joints 3"]
 """Positions of the rig's own joints, metres: Y up, facing +Z, the hips over the origin."""
 
 
@@ -37,31 +37,31 @@ def plot_rig(rigmap: RigMap, motion: Motion, fit: Fit, *, title: str, path: str 
     figure = Figure(figsize=_SIZE, dpi=_DPI, facecolor="white")
     grid = figure.add_gridspec(1, 4, width_ratios=(5, 1, 1, 1), left=0.01, right=0.99, top=0.9, bottom=0.16)
     views = (("T-pose", tpose, 0), ("from its right", tpose, 2), ("first frame", first, 0), ("middle frame", middle, 0))
-    for column, (name, places, across) in enumerate(views):
+    for column, (name, positions, across) in enumerate(views):
         axes = figure.add_subplot(grid[column])
         axes.set_title(name, fontsize=9.5, color="#555555")
-        _draw_body(axes, rigmap, fit, places[:, [across, 1]], share=0.55 if column else 1.0)
+        _draw_body(axes, rigmap, fit, positions[:, [across, 1]], share=0.55 if column else 1.0)
         if column == 0:
-            _draw_labels(axes, rigmap, fit, places)
+            _draw_labels(axes, rigmap, fit, positions)
     _write(figure, rigmap, fit, title)
     with atomic_path(path) as scratch:
         figure.savefig(scratch, format="png", dpi=_DPI)
 
 
-def _place_frame(rigmap: RigMap, motion: Motion, number: int) -> Places:
+def _place_frame(rigmap: RigMap, motion: Motion, number: int) -> JointPositions:
     """Return the rig's joints in a frame of the clip."""
     picked = motion.slice(number, number + 1)
     canonical = retarget.to_canonical(picked, retarget.as_rig(rigmap))[0]
     return _stand_upright(picked, rigmap, heading=float(kinematics.heading(canonical.local_quat_xyzw[0, 0])))
 
 
-def _stand_upright(motion: Motion, rigmap: RigMap, *, heading: float) -> Places:
-    places = motion.joint_positions()[0]
+def _stand_upright(motion: Motion, rigmap: RigMap, *, heading: float) -> JointPositions:
+    positions = motion.joint_positions()[0]
     upright = rigmap.upright_quat_xyzw
     if upright is not None:
-        places = rotations.rotate(upright.expand(len(places), 4), places)
-    places = places - places[rigmap.joints["hips"]] * places.new_tensor([1.0, 0.0, 1.0])
-    return rotations.rotate_about_y(places, torch.full((len(places),), -heading, dtype=places.dtype)).numpy()
+        positions = rotations.rotate(upright.expand(len(positions), 4), positions)
+    positions = positions - positions[rigmap.joints["hips"]] * positions.new_tensor([1.0, 0.0, 1.0])
+    return rotations.rotate_about_y(positions, torch.full((len(positions),), -heading, dtype=positions.dtype)).numpy()
 
 
 def _colour_of(name: str) -> str:
@@ -102,7 +102,7 @@ def _draw_body(axes: Any, rigmap: RigMap, fit: Fit, flat: Float[np.ndarray, "joi
     axes.set_axis_off()
 
 
-def _draw_labels(axes: Any, rigmap: RigMap, fit: Fit, places: Places) -> None:
+def _draw_labels(axes: Any, rigmap: RigMap, fit: Fit, positions: JointPositions) -> None:
     """Write both names of each canonical joint in a column at either edge, from the highest joint to the lowest, with a
     line to the joint; those of the left arm and leg and of the trunk stand right, as the body is seen."""
     names = rigmap.rig_skeleton.names
@@ -112,7 +112,7 @@ def _draw_labels(axes: Any, rigmap: RigMap, fit: Fit, places: Places) -> None:
             for n, j in rigmap.joints.items()
             if on_right == (n.startswith("left") or n in ("hips", "spine", "chest"))
         ]
-        own.sort(key=lambda pair: (-round(float(places[pair[1], 1]), 2), abs(float(places[pair[1], 0]))))
+        own.sort(key=lambda pair: (-round(float(positions[pair[1], 1]), 2), abs(float(positions[pair[1], 0]))))
         for (name, joint), height in zip(own, np.linspace(0.96, 0.06, len(own)), strict=True):
             numbers = [str(number) for number, doubt in enumerate(fit.doubts, 1) if name in doubt.joints]
             title, short = f"{name} [{', '.join(numbers)}]" if numbers else name, names[joint]
@@ -120,7 +120,7 @@ def _draw_labels(axes: Any, rigmap: RigMap, fit: Fit, places: Places) -> None:
             line = {"arrowstyle": "-", "color": _colour_of(name), "linewidth": 0.7, "alpha": 0.6}
             axes.annotate(
                 f"{title}\n{short}",
-                xy=(places[joint, 0], places[joint, 1]),
+                xy=(positions[joint, 0], positions[joint, 1]),
                 xytext=(0.995 if on_right else 0.005, height),
                 textcoords="axes fraction",
                 ha="right" if on_right else "left",

@@ -39,7 +39,7 @@ class Mark:
 
 
 @dataclass(frozen=True, eq=False)
-class Wishes:
+class Targets:
     """All that an actor is asked for, beside its curve."""
 
     marks: Sequence[Mark] = ()
@@ -59,7 +59,7 @@ class Shot(NamedTuple):
     """Name from `mapctl.mesh.colours.ACTORS` or `#rrggbb`; each actor's own if None."""
     start_seconds: float = 0.0
     """Start of the motion, seconds; until then the actor holds its first pose."""
-    wishes: Wishes = Wishes()
+    targets: Targets = Targets()
     """What the actor is asked for beside the curve."""
     drawn: DrawnMotion | None = None
     """The motion on a character that is drawn with its own mesh; a mannequin is drawn if None."""
@@ -70,7 +70,7 @@ class StagedActor:
     """An actor prepared for a film: its body, and its ribbons, contacts and marks computed once."""
 
     body: Body
-    wish: Surface | None
+    target: Surface | None
     """Ribbon of its curve."""
     trail: Surface
     planted: Array
@@ -104,10 +104,10 @@ class Stage:
         self.fps = Fraction(fps or shots[0].motion.fps).limit_denominator(100_000)
         self.players = [_prepare_actor(shot, k, len(shots), self.fps) for k, shot in enumerate(shots)]
         self.num_frames = max(p.start + p.body.num_frames for p in self.players)
-        self._grid = overlays.build_grid(self._places()[:, [0, 2]])
-        wishes = [player.wish for player in self.players if player.wish is not None]
+        self._grid = overlays.build_grid(self._collect_points()[:, [0, 2]])
+        targets = [player.target for player in self.players if player.target is not None]
         self._veils = [figure for player in self.players for figure in player.poses]
-        self._still = merge_surfaces([self._grid, *wishes, *props])
+        self._still = merge_surfaces([self._grid, *targets, *props])
 
     @property
     def seconds(self) -> float:
@@ -145,15 +145,15 @@ class Stage:
         hips = [p.body.anatomy.hips_world[i] for p, i in zip(self.players, index, strict=True)]
         seen = np.concatenate(bodies, axis=1)
         if settings.kind != "follow":
-            places = [p.wish.vertices for p in self.players if p.wish is not None]
-            still = np.concatenate([seen.reshape(-1, 3), *places])
+            positions = [p.target.vertices for p in self.players if p.target is not None]
+            still = np.concatenate([seen.reshape(-1, 3), *positions])
             seen = still[None]
         return compute_views(settings, seen, np.mean(hips, axis=0), fps=float(self.fps), size=size)
 
-    def _places(self) -> Array:
+    def _collect_points(self) -> Array:
         """Return (n, 3) positions where anything happens, metres, for the grid."""
         paths = [p.body.anatomy.hips_world for p in self.players]
-        return np.concatenate([*paths, *(p.wish.vertices for p in self.players if p.wish is not None)])
+        return np.concatenate([*paths, *(p.target.vertices for p in self.players if p.target is not None)])
 
 
 def _prepare_actor(shot: Shot, number: int, count: int, fps: Fraction) -> StagedActor:
@@ -163,28 +163,28 @@ def _prepare_actor(shot: Shot, number: int, count: int, fps: Fraction) -> Staged
     motion = shot.motion.resample(fps)
     body = Mannequin(motion, colour) if shot.drawn is None else shot.drawn.build_body(fps, colour)
     # One actor has a red curve and a yellow trail as in Wang et al. 2019; among several both have the actor's colour.
-    wish, trod = colours.rgb(colours.TARGET), colours.rgb(colours.TRAIL)
+    target, trod = colours.rgb(colours.TARGET), colours.rgb(colours.TRAIL)
     if count > 1:
-        wish, trod = colours.blend_colours(colour, colours.rgb(colours.BACKGROUND), 0.62), colour
+        target, trod = colours.blend_colours(colour, colours.rgb(colours.BACKGROUND), 0.62), colour
     path = body.anatomy.hips_world[:, [0, 2]]
     balls = [foot.ball for foot in body.anatomy.feet]
     planted = np.zeros((body.num_frames, len(balls)), bool)
     if len(balls) == 2:
         planted = detect_contacts(torch.from_numpy(body.anatomy.points.world[:, balls]), float(fps)).numpy()
     marks = []
-    for mark in shot.wishes.marks:
+    for mark in shot.targets.marks:
         early, late = mark.seconds
         margin = max(0.0, _LEAST_SECONDS - (late - early)) / 2
         first, last = (round((shot.start_seconds + at) * fps) for at in (early - margin, late + margin))
         marks.append((mark.surface, first, last))
     return StagedActor(
         body,
-        None if shot.curve is None else _build_curve_ribbon(shot.curve, wish),
+        None if shot.curve is None else _build_curve_ribbon(shot.curve, target),
         overlays.build_ribbon(path, width=0.05, rgb=trod, height=overlays.TRAIL_HEIGHT),
         planted,
         round(shot.start_seconds * fps),
         marks,
-        _build_figures(shot.wishes.poses, motion, shot.drawn),
+        _build_figures(shot.targets.poses, motion, shot.drawn),
     )
 
 

@@ -112,7 +112,7 @@ class Pair:
     def _angles(self, degrees: np.ndarray) -> np.ndarray:
         return degrees if self.degrees else np.deg2rad(degrees)
 
-    def places(self) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    def positions(self) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
         """Starts and ends of the bones by name, (frames, 3) metres, by the definition."""
         starts, ends, held = {}, {}, {"root": np.zeros(6)} | {bone.name: np.zeros(len(bone.dof)) for bone in self.bones}
         for frame in self.frames:
@@ -196,9 +196,11 @@ def _text(values: np.ndarray) -> str:
 
 def ends_of(motion):
     """Where the End Sites are, (frames, 3) by joint name."""
-    places, turns = motion.joint_positions(), motion.joint_rotations()
+    positions, turns = motion.joint_positions(), motion.joint_rotations()
     return {
-        name: (places[:, j] + rotations.rotate(turns[:, j], places.new_tensor(site).expand(len(places), 3))).numpy()
+        name: (
+            positions[:, j] + rotations.rotate(turns[:, j], positions.new_tensor(site).expand(len(positions), 3))
+        ).numpy()
         for name, site in motion.skeleton.end_offsets.items()
         for j in [motion.skeleton.index(name)]
     }
@@ -206,12 +208,12 @@ def ends_of(motion):
 
 def assert_same_places(motion, told):
     """Joints at the bones' starts, End Sites at the last bones' ends."""
-    starts, ends = told.places()
-    places = motion.joint_positions().numpy()
+    starts, ends = told.positions()
+    positions = motion.joint_positions().numpy()
     assert set(motion.skeleton.names) == set(starts)
     for joint, name in enumerate(motion.skeleton.names):
-        np.testing.assert_allclose(places[:, joint], starts[name], atol=1e-9, err_msg=name)
+        np.testing.assert_allclose(positions[:, joint], starts[name], atol=1e-9, err_msg=name)
     leaves = {bone.name for bone in told.bones} - {bone.parent for bone in told.bones}
     assert set(motion.skeleton.end_offsets) == leaves
-    for name, place in ends_of(motion).items():
-        np.testing.assert_allclose(place, ends[name], atol=1e-9, err_msg=name)
+    for name, position in ends_of(motion).items():
+        np.testing.assert_allclose(position, ends[name], atol=1e-9, err_msg=name)

@@ -103,12 +103,12 @@ def trial(batch=3, *, dtype=torch.float64, past=PAST, disturbed=0.05, seed=0):
     draw = torch.randn(batch, FRAMES, LAYOUT.continuous + 1, generator=generator(seed + 1)).double()
     bits = torch.rand(batch, FRAMES, 2, generator=generator(seed + 2)) < 0.6
     heels = torch.rand(batch, 1 + FRAMES, 2, generator=generator(seed + 3)) < 0.6
-    place = GroundPose(ground[-1].to(dtype), heading[-1].to(dtype))
+    position = GroundPose(ground[-1].to(dtype), heading[-1].to(dtype))
     before = motion.joint_positions()[PAST - past : PAST].to(dtype)
     planted = torch.tensor([True, False])
     return Trial(
         features.to(dtype),
-        place,
+        position,
         contacts=bits,
         noise=draw[..., 1:].to(dtype),
         log_density=30 * draw[..., 0].to(dtype),

@@ -35,12 +35,12 @@ SIDES = (("left", 1.0), ("right", -1.0))
 
 def _tables() -> tuple[dict[str, str], dict[str, Array]]:
     parents = {name: parent for name, (parent, _) in _TRUNK.items()}
-    places = {name: np.array(place) for name, (_, place) in _TRUNK.items()}
+    positions = {name: np.array(position) for name, (_, position) in _TRUNK.items()}
     for side, sign in SIDES:
         for part, (parent, (x, y, z)) in _LIMBS.items():
             parents[side + part] = parent if parent in _TRUNK else side + parent
-            places[side + part] = np.array([sign * x, y, z])
-    return parents, places
+            positions[side + part] = np.array([sign * x, y, z])
+    return parents, positions
 
 
 PARENTS, PLACES = _tables()
@@ -93,11 +93,11 @@ def pose_turns(pose: str) -> dict[str, Rotation]:
 
 def pose_places(turns: Mapping[str, Rotation]) -> dict[str, Array]:
     """Where the joints are, the hips as in the T-pose."""
-    places: dict[str, Array] = {}
+    positions: dict[str, Array] = {}
     for name, parent in PARENTS.items():
         offset = PLACES[name] - (PLACES[parent] if parent else 0.0)
-        places[name] = offset if not parent else places[parent] + turns[parent].apply(offset)
-    return places
+        positions[name] = offset if not parent else positions[parent] + turns[parent].apply(offset)
+    return positions
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,8 +200,8 @@ def _tube(spine: Sequence, joints: Sequence[str], across: Sequence[float], sign:
 
 def _arc(joint: str, sign: float, middle: Array, along: Array) -> float:
     """How far along a tube its joint is."""
-    place = PLACES[joint] * np.array([sign, 1.0, 1.0])
-    return float(along[np.argmin(np.linalg.norm(middle - place, axis=1))])
+    position = PLACES[joint] * np.array([sign, 1.0, 1.0])
+    return float(along[np.argmin(np.linalg.norm(middle - position, axis=1))])
 
 
 def _share(along: Array, starts: Sequence[float], joints: Sequence[str], around: int) -> dict[str, Array]:

@@ -177,8 +177,8 @@ def make_character_glb(
 
     skinned = [j for j in own if leaves == "joints" or j not in ENDS]
     space = outer if bind == "armature" else np.eye(4)
-    turns, places = pose_turns(pose), pose_places(pose_turns(pose))
-    parts = [_bend(part, turns, places, front, size) for part in build_parts(detail)]
+    turns, positions = pose_turns(pose), pose_places(pose_turns(pose))
+    parts = [_bend(part, turns, positions, front, size) for part in build_parts(detail)]
     materials = {name: build.material(name, look, picture) for name, look in looks.items()}
     apart = "trousers" if second_skin else None
     groups = [[p for p in parts if p.name != apart], [p for p in parts if p.name == apart]][: 2 if second_skin else 1]
@@ -223,14 +223,14 @@ def _world_frames(
 ) -> dict[str, Array]:
     """World matrices of the joints' frames in a pose, without scale."""
     turns, frames = pose_turns(pose), bone_frames(along_y=along_y, roll_deg=roll_deg)
-    places = pose_places(turns)
+    positions = pose_places(turns)
     found = {"root": np.eye(4)}
     found["root"][:3, :3] = front.as_matrix()
     for joint in own:
         if joint != "root":
             matrix = np.eye(4)
             matrix[:3, :3] = (front * turns[joint] * frames[joint]).as_matrix()
-            matrix[:3, 3] = size * front.apply(places[joint])
+            matrix[:3, 3] = size * front.apply(positions[joint])
             found[joint] = matrix
     return found
 
@@ -245,11 +245,13 @@ def _scaled(matrix: Array, scale: float) -> Array:
     return found
 
 
-def _bend(part: Part, turns: Mapping[str, Rotation], places: Mapping[str, Array], front: Rotation, size: float) -> Part:
+def _bend(
+    part: Part, turns: Mapping[str, Rotation], positions: Mapping[str, Array], front: Rotation, size: float
+) -> Part:
     """The part in the pose in which it is bound, by its own weights."""
     vertices, normals = np.zeros_like(part.vertices), np.zeros_like(part.normals)
     for joint, share in part.weights.items():
-        vertices += share[:, None] * (turns[joint].apply(part.vertices - PLACES[joint]) + places[joint])
+        vertices += share[:, None] * (turns[joint].apply(part.vertices - PLACES[joint]) + positions[joint])
         normals += share[:, None] * turns[joint].apply(part.normals)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     return Part(part.name, size * front.apply(vertices), front.apply(normals), part.faces, part.uv, part.weights)

@@ -24,7 +24,7 @@ _Z_UP = Rotation.from_euler("x", 90, degrees=True)
 class MadeFbx:
     """What is in the file in truth, in metres and Y up."""
 
-    places: np.ndarray
+    positions: np.ndarray
     """(frames, joints, 3) of the limbs in the first take."""
     bound: np.ndarray
     """(joints, 3) in the pose in which the skin is bound: a T-pose."""
@@ -104,8 +104,8 @@ def _add_person(document, random, name, turn, metres, frames, rate, takes, skin,
     for number, joint in enumerate(JOINTS):
         above = PARENTS[joint]
         frame = bound[above] if above else Rotation.identity()
-        place = turn.apply(PLACES[joint] - (PLACES[above] if above else 0.0)) * size / metres
-        offsets[joint], bound[joint] = frame.inv().apply(place), frame * own[joint]
+        position = turn.apply(PLACES[joint] - (PLACES[above] if above else 0.0)) * size / metres
+        offsets[joint], bound[joint] = frame.inv().apply(position), frame * own[joint]
         values = [
             ("Lcl Translation", offsets[joint]),
             ("PreRotation", _euler(own[joint], "xyz")),
@@ -116,10 +116,10 @@ def _add_person(document, random, name, turn, metres, frames, rate, takes, skin,
         attribute = 'TypeFlags: "Skeleton"'
         document.add("NodeAttribute", f"NodeAttribute::{joint}", "LimbNode", f"\t\t{attribute}", limbs[joint])
     tracks = [_add_take(document, random, take, limbs, offsets, frames, rate) for take in takes]
-    places = _pose(*tracks[0], own, offsets, turn, metres / size) if tracks else np.zeros((0, len(JOINTS), 3))
+    positions = _pose(*tracks[0], own, offsets, turn, metres / size) if tracks else np.zeros((0, len(JOINTS), 3))
     rests = np.array([PLACES[joint] for joint in JOINTS])
     vertices = _add_skin(document, name, limbs, bound, turn, metres, scale[0], only) if skin else np.zeros((0, 3))
-    return MadeFbx(places, rests, vertices)
+    return MadeFbx(positions, rests, vertices)
 
 
 def _euler(turn: Rotation, order: str) -> np.ndarray:
@@ -172,7 +172,7 @@ def _add_take(document, random, take, limbs, offsets, frames, rate):
 def _pose(angles, ways, own, offsets, turn, metres) -> np.ndarray:
     """Where the limbs are, (frames, joints, 3), metres and Y up."""
     frames = len(angles)
-    worlds, places = dict[str, Rotation](), dict[str, np.ndarray]()
+    worlds, positions = dict[str, Rotation](), dict[str, np.ndarray]()
     for number, joint in enumerate(JOINTS):
         order = _ORDERS[number % 6]
         columns = ["xyz".index(axis) for axis in order]
@@ -180,8 +180,8 @@ def _pose(angles, ways, own, offsets, turn, metres) -> np.ndarray:
         above = PARENTS[joint]
         worlds[joint] = worlds[above] * spins if above else spins
         offset = np.tile(offsets[joint], (frames, 1))
-        places[joint] = places[above] + worlds[above].apply(offset) if above else ways
-    stacked = np.stack([places[joint] for joint in JOINTS], axis=1) * metres
+        positions[joint] = positions[above] + worlds[above].apply(offset) if above else ways
+    stacked = np.stack([positions[joint] for joint in JOINTS], axis=1) * metres
     return turn.inv().apply(stacked.reshape(-1, 3)).reshape(stacked.shape)
 
 

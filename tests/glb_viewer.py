@@ -56,12 +56,12 @@ class GlbViewer:
         tracks = {} if animation is None else self._tracks(animation, node, seconds)
         if "matrix" in told and not tracks:
             return np.array(told["matrix"]).reshape(4, 4).T
-        place = tracks.get("translation", told.get("translation", (0, 0, 0)))
+        position = tracks.get("translation", told.get("translation", (0, 0, 0)))
         turn = tracks.get("rotation", told.get("rotation", (0, 0, 0, 1)))
         scale = tracks.get("scale", told.get("scale", (1, 1, 1)))
         matrix = np.eye(4)
         matrix[:3, :3] = Rotation.from_quat(turn).as_matrix() * np.array(scale)
-        matrix[:3, 3] = place
+        matrix[:3, 3] = position
         return matrix
 
     def world(self, node: int, animation: int | None = None, seconds: float = 0.0) -> Array:
@@ -84,8 +84,8 @@ class GlbViewer:
                 points = self.array(at["POSITION"])
                 joints, weights = self.array(at["JOINTS_0"]).astype(int), self.array(at["WEIGHTS_0"])
                 weights = weights / weights.sum(axis=1, keepdims=True)
-                places = np.column_stack([points, np.ones(len(points))])
-                found.append(np.einsum("nk,nkij,nj->ni", weights, matrices[joints], places)[:, :3])
+                positions = np.column_stack([points, np.ones(len(points))])
+                found.append(np.einsum("nk,nkij,nj->ni", weights, matrices[joints], positions)[:, :3])
         return np.concatenate(found)
 
     def _tracks(self, animation: int, node: int, seconds: float) -> dict[str, Array]:

@@ -78,17 +78,17 @@ COMMANDS = {
     "infill joints": "infill walk.bvh -o arm.bvh --gap 5:25 --joints leftLowerArm,leftHand"
     " --inbetweener infiller.safetensors --prior tiny.safetensors",
     "infill along a curve": "infill walk.bvh -o led.bvh --gap 10:30 --curve line:2 --inbetweener infiller.safetensors",
-    "infill by lines": "infill walk.bvh -o lines.bvh --gap 10:22 --method slerp --no-finish",
+    "infill by lines": "infill walk.bvh -o lines.bvh --gap 10:22 --method slerp --no-refine",
     "infill by rollouts": "infill walk.bvh -o rolled.bvh --gap 10:22 --method rollouts"
     " --inbetweener infiller.safetensors --prior tiny.safetensors --seed 2",
     "tween": "tween walk.bvh -o tweened.bvh --keyframes 0,14,29 --inbetweener infiller.safetensors"
     " --report tweened.json",
     "tween file": "tween keys.toml -o keyed.bvh --inbetweener infiller.safetensors --prior tiny.safetensors",
     "tween timing": "tween walk.bvh -o timed.bvh --keyframes 0,14,29 --inbetweener infiller.safetensors"
-    " --suggest-timing --method infiller --no-finish",
+    " --suggest-timing --method infiller --no-refine",
     "tween variations": "tween walk.bvh -o several.bvh --keyframes 0,12 --inbetweener infiller.safetensors"
     " --prior tiny.safetensors --variations 2",
-    "tween slerp": "tween walk.bvh -o slerped.bvh --keyframes 0,14,29 --method slerp --no-finish",
+    "tween slerp": "tween walk.bvh -o slerped.bvh --keyframes 0,14,29 --method slerp --no-refine",
     "blend": "blend walk.bvh --from other.bvh --joints leftHand --frames 5:15 --at 12 -o blended.bvh"
     " --inbetweener infiller.safetensors",
     "chain": "chain walk.bvh other.bvh -o chained.bvh --piece 12 --gap 6:8 --inbetweener infiller.safetensors",

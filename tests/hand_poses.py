@@ -21,18 +21,18 @@ PALM = 0.08
 
 def palms(motion: Motion, size: float = 1.0) -> Float[Tensor, "frames 2 3"]:
     """Where palms are."""
-    places, turns = motion.joint_positions(), motion.joint_rotations()
+    positions, turns = motion.joint_positions(), motion.joint_rotations()
     found = []
     for hand, sign in zip(HANDS, (1, -1), strict=True):
         along = Rotation.from_quat(turns[:, hand].numpy()).apply([sign * size * PALM, 0.0, 0.0])
-        found.append(places[:, hand] + torch.from_numpy(along))
+        found.append(positions[:, hand] + torch.from_numpy(along))
     return torch.stack(found, dim=1)
 
 
 def put_palm(
     motion: Motion,
     side: int,
-    place: Float[Tensor, "frames 3"],
+    position: Float[Tensor, "frames 3"],
     *,
     points: tuple[float, float, float],
     elbow: tuple[float, float, float],
@@ -43,7 +43,7 @@ def put_palm(
     sign, at = (1, -1)[side], motion.joint_positions()[:, UPPER[side]]
     ahead = torch.tensor(points, dtype=torch.float64)
     ahead = ahead / ahead.norm()
-    wrist = place - size * PALM * ahead
+    wrist = position - size * PALM * ahead
     upper, lower = (float(motion.skeleton.offsets[j].norm()) for j in (LOWER[side], HANDS[side]))
     way = wrist - at
     far = way.norm(dim=-1, keepdim=True)

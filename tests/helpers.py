@@ -76,8 +76,8 @@ def walk_through(places_xz, *, headings: float | Tensor = 0.0, fps=30, swing=0.5
         vectors[:, CANONICAL.index(f"{side}UpperLeg"), 0] += sign * swing * torch.sin(2 * math.pi * time)
     quats = rotations.from_rotation_vector(vectors)
     quats[:, 0] = rotations.about_y(torch.as_tensor(headings, dtype=torch.float64).expand(frames))
-    places = torch.as_tensor(places_xz, dtype=torch.float64)
-    root = torch.stack([places[:, 0], torch.full((frames,), 0.87, dtype=torch.float64), places[:, 1]], dim=-1)
+    positions = torch.as_tensor(places_xz, dtype=torch.float64)
+    root = torch.stack([positions[:, 0], torch.full((frames,), 0.87, dtype=torch.float64), positions[:, 1]], dim=-1)
     return Motion(CANONICAL, Fraction(fps), root, quats)
 
 
@@ -231,8 +231,8 @@ def walking_trial(frames: int) -> Trial:
     vectors, start = encode(motion)
     ground, heading = integrate_root(vectors[:2], start)
     bits = torch.zeros(1, frames, 2, dtype=torch.bool)
-    place = GroundPose(ground[-1], heading[-1])
-    return Trial(vectors[None, 2:], place, contacts=bits, before=motion.joint_positions()[:2])
+    position = GroundPose(ground[-1], heading[-1])
+    return Trial(vectors[None, 2:], position, contacts=bits, before=motion.joint_positions()[:2])
 
 
 def noise(batch: int, frames: int, *, seed: int = 0, dtype: torch.dtype = torch.float32) -> Float[Tensor, "b f c"]:

@@ -41,7 +41,7 @@ def without(source: Path, out: Path, lost: Sequence[tuple[str, int, int]], *, wo
     first = next(number for number, line in enumerate(lines) if line.startswith("Frame Time")) + 1
     rows = [row.split() for row in lines[first:]]
     for label, start, stop in lost:
-        columns = [place for place, name in enumerate(read.hierarchy.labels()) if name.startswith(label)]
+        columns = [position for position, name in enumerate(read.hierarchy.labels()) if name.startswith(label)]
         assert columns
         for frame in range(start, stop):
             for column in columns:
@@ -54,8 +54,8 @@ def archive_without(source: Path, out: Path, **lost: tuple[object, ...]) -> Path
     """The npz with NaN at these places of its keys."""
     with np.load(source) as read:
         arrays = dict(read)
-    for key, place in lost.items():
-        arrays[key][place] = np.nan
+    for key, position in lost.items():
+        arrays[key][position] = np.nan
     np.savez(out, allow_pickle=False, **arrays)
     return out
 
@@ -69,7 +69,7 @@ def with_all_channels(motion: Motion, out: Path, *, seed: int | None = None) -> 
     channels = tuple((*bvh.POSITIONS, *(f"{axis}rotation" for axis in order)) for order in orders)
     tree = replace(read.hierarchy, channels=channels)
     order = [motion.skeleton.index(name) for name in tree.names]
-    places, turns = 100 * bvh.all_translations(motion)[:, order], bvh.as_array(motion.local_quat_xyzw)[:, order]
-    values = bvh.channel_values(tree, places, turns)
+    positions, turns = 100 * bvh.all_translations(motion)[:, order], bvh.as_array(motion.local_quat_xyzw)[:, order]
+    values = bvh.channel_values(tree, positions, turns)
     out.write_text(bvh.compose(tree, read.frame_time, values, decimals=6))
     return out

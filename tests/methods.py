@@ -4,16 +4,16 @@ from controllers.inbetweening.pipeline import InfillSettings
 from controllers.inbetweening.proposers import AutoInbetweener, SlerpInbetweener
 from mapctl.protocols import Inbetweener
 
-UNFINISHED = InfillSettings(finish=False)
+UNFINISHED = InfillSettings(refine=False)
 
 
 def by_method(method: str, infiller: Inbetweener) -> tuple[Inbetweener, InfillSettings]:
     """Who proposes, and how it is finished."""
     return {"auto": AutoInbetweener, "infiller": lambda it: it, "slerp": lambda it: SlerpInbetweener()}[method](
         infiller
-    ), InfillSettings(finish=method == "auto")
+    ), InfillSettings(refine=method == "auto")
 
 
 def words_of(method: str) -> list[str]:
     """The options of a method on the command line."""
-    return ["--method", method, *([] if method == "auto" else ["--no-finish"])]
+    return ["--method", method, *([] if method == "auto" else ["--no-refine"])]

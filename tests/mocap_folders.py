@@ -28,8 +28,8 @@ def with_tposes(made: Made, motion: Motion, before: int, after: int) -> Motion:
     root = root.clone()
     root[:, 1] = motion.root_position[:, 1].max()
     quats = torch.cat([still[:before], motion.local_quat_xyzw, still[before:]])
-    places = torch.cat([root[:before], motion.root_position, root[before:]])
-    return made.motion(replace(motion, root_position=places, local_quat_xyzw=quats))
+    positions = torch.cat([root[:before], motion.root_position, root[before:]])
+    return made.motion(replace(motion, root_position=positions, local_quat_xyzw=quats))
 
 
 def write_styles(folder: Path, styles: dict[str, dict[str, tuple[int, int, int]]], *, fps: int = 60) -> Path:

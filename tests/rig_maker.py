@@ -119,9 +119,9 @@ def make(wanted: Make) -> Made:
     # With all rotations zero a joint's own axes are the file's, while its body part is turned as in the rest pose.
     tpose = {c: _along_x(c) if wanted.bones_along_x else _rest(c, wanted).inv() * facing.inv() * upright for c in names}
     frame = {names[c]: tpose[c] for c in names} | ({wanted.root: upright} if wanted.root else {})
-    placed = dict(zip(CANONICAL.names, wanted.size * _places(), strict=True))
+    placed = dict(zip(CANONICAL.names, wanted.size * _positions(), strict=True))
     joints = _parents_first(_joints(wanted, names, placed, frame))
-    order, at = [name for name, _, _ in joints], {name: place for name, _, place in joints}
+    order, at = [name for name, _, _ in joints], {name: position for name, _, position in joints}
     offsets = [torch.zeros(3).double()]
     for name, parent, _ in joints[1:]:
         offsets.append(torch.from_numpy(frame[parent].inv().apply((at[name] - at[parent]).numpy())))
@@ -164,14 +164,14 @@ def _joints(wanted: Make, names: Mapping[str, str], placed: Mapping[str, Tensor]
 
 def _put_between(wanted: Make, c: str, parent: str, joints, placed: Mapping[str, Tensor], frame: dict[str, Rotation]):
     """Put the joints between a canonical joint and the one above it, and return the last of them."""
-    chain, known = wanted.between.get(c, ()), {name: place for name, _, place in joints}
+    chain, known = wanted.between.get(c, ()), {name: position for name, _, position in joints}
     start, stop = known[parent], placed[c]
     for number, name in enumerate(chain):
         shared = sum(name in other for other in wanted.between.values()) > 1
         if name not in known:
-            place = start - torch.tensor([0.0, 0.02, 0.0]).double() if shared else None
+            position = start - torch.tensor([0.0, 0.02, 0.0]).double() if shared else None
             share = (number + 1) / (len(chain) + 1)
-            joints.append((name, parent, start + (stop - start) * share if place is None else place))
+            joints.append((name, parent, start + (stop - start) * share if position is None else position))
             frame[name] = frame[parent]
         parent = name
     return parent
@@ -184,11 +184,11 @@ def person(size: float = 1.0, frames: int = 40) -> Motion:
     return replace(motion, skeleton=skeleton, root_position=motion.root_position * size)
 
 
-def _places() -> Tensor:
-    places = [torch.zeros(3).double()]
+def _positions() -> Tensor:
+    positions = [torch.zeros(3).double()]
     for offset, parent in zip(CANONICAL.offsets[1:], CANONICAL.parents[1:], strict=True):
-        places.append(places[parent] + offset)
-    return torch.stack(places)
+        positions.append(positions[parent] + offset)
+    return torch.stack(positions)
 
 
 def _rest(c: str, wanted: Make) -> Rotation:

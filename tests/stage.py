@@ -42,8 +42,8 @@ class Actor:
     def command(self, command):
         self.heard.append(("command", command))
 
-    def go(self, command, place, within, facing=None):
-        self.heard.append(("go", command, place, within, facing))
+    def go(self, command, position, within, facing=None):
+        self.heard.append(("go", command, position, within, facing))
 
     def aim(self, command):
         self.heard.append(("aim", command))

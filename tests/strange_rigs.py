@@ -38,10 +38,10 @@ class Strange:
     rig: str | None = None
 
 
-def rigged(names: Mapping[str, str], **wishes) -> tuple[Motion, Mapping[str, str]]:
+def rigged(names: Mapping[str, str], **options) -> tuple[Motion, Mapping[str, str]]:
     """A walk on a rig, and its joints."""
-    made = make(Make(names, **wishes))
-    return made.motion(person(wishes.get("size", 1.0), 30)), made.joint
+    made = make(Make(names, **options))
+    return made.motion(person(options.get("size", 1.0), 30)), made.joint
 
 
 def renamed(motion: Motion, name: Callable[[str], str]) -> Motion:

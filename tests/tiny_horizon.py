@@ -38,7 +38,7 @@ def solver(method=METHOD, density=DENSITY, settings=SHORT):
 
 
 def context(committed):
-    return WindowContext(DENSITY, committed.state, committed.place, committed.joints_world, SHORT.frames)
+    return WindowContext(DENSITY, committed.state, committed.ground_pose, committed.joints_world, SHORT.frames)
 
 
 def request(committed, terms, seed=0):

@@ -48,10 +48,10 @@ def save_tiny_infiller(path: Path, *, drawn: float = 0.0, config: InfillerConfig
 
 def shown(motion, known=None, *, present=None, contacts=None):
     """The image of a canonical motion, of which all is known unless said otherwise."""
-    places, frames = motion.joint_positions()[None], motion.num_frames
+    positions, frames = motion.joint_positions()[None], motion.num_frames
     whole = torch.ones(1, frames, CANONICAL.num_joints, dtype=torch.bool)
     return PositionImage.of_world(
-        places,
+        positions,
         kinematics.heading(motion.local_quat_xyzw[:, 0])[None],
         torch.ones(1, frames, 2).double() if contacts is None else contacts,
         known=whole if known is None else known,

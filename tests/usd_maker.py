@@ -88,10 +88,10 @@ def _place(root: UsdSkel.Root, placed: str, unit: float) -> None:
 def _worlds(pose: str, along_y: bool, turn: Rotation, unit: float) -> dict[str, np.ndarray]:
     turns, frames = pose_turns(pose), bone_frames(along_y=along_y, roll_deg=17.0)
     found = {}
-    for name, place in pose_places(turns).items():
+    for name, position in pose_places(turns).items():
         found[name] = np.eye(4)
         found[name][:3, :3] = (turn * turns[name] * frames[name]).as_matrix()
-        found[name][:3, 3] = turn.apply(place) / unit
+        found[name][:3, 3] = turn.apply(position) / unit
     return found
 
 
@@ -123,13 +123,13 @@ def _define_mesh(
 ) -> None:
     """The body in the pose in which it is bound, its parts as subsets with materials of their own."""
     parts, turns = [part for part in build_parts(1) if part.name in only], pose_turns(pose)
-    rests, places = pose_places(pose_turns("T")), pose_places(turns)
+    rests, positions = pose_places(pose_turns("T")), pose_places(turns)
     points, faces, weights = [], [], []
     for part in parts:
         bent = np.zeros_like(part.vertices)
         table = np.zeros((len(part.vertices), len(JOINTS)))
         for name, share in part.weights.items():
-            bent += share[:, None] * (turns[name].apply(part.vertices - rests[name]) + places[name])
+            bent += share[:, None] * (turns[name].apply(part.vertices - rests[name]) + positions[name])
             table[:, JOINTS.index(name)] = share
         faces.append(part.faces + sum(map(len, points)))
         points.append(turn.apply(bent) / unit)
@@ -173,14 +173,14 @@ def _define_animation(
     """Turns about random axes on top of the rest pose, of all joints but the toes, in another order than theirs."""
     random = np.random.default_rng(seed)
     moved = [name for name in JOINTS if "Toes" not in name][::-1]
-    places = [JOINTS.index(name) for name in moved]
+    positions = [JOINTS.index(name) for name in moved]
     rest = [np.array(matrix).T for matrix in skeleton.GetRestTransformsAttr().Get()]
     made = UsdSkel.Animation.Define(stage, f"{skeleton.GetPath()}/wild")
     made.CreateJointsAttr([joint_path(name) for name in moved])
     made.CreateScalesAttr([(1, 1, 1)] * len(moved))
     translations, turns = made.CreateTranslationsAttr(), made.CreateRotationsAttr()
     for time in times.tolist():
-        local = [rest[place] for place in places]
+        local = [rest[position] for position in positions]
         spins = Rotation.from_rotvec(random.uniform(-0.6, 0.6, (len(moved), 3)))
         quats = (Rotation.from_matrix([matrix[:3, :3] for matrix in local]) * spins).as_quat()
         offsets = np.array([matrix[:3, 3] for matrix in local])

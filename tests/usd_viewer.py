@@ -44,9 +44,9 @@ class UsdViewer:
         step = self.stage.GetTimeCodesPerSecond() / fps
         return first + step * np.arange(round((last - first) / step) + 1)
 
-    def _to_world(self, places: np.ndarray, time: float) -> np.ndarray:
+    def _to_world(self, positions: np.ndarray, time: float) -> np.ndarray:
         matrix = np.array(UsdGeom.XformCache(time).GetLocalToWorldTransform(self.skeleton))
-        found = (places @ matrix[:3, :3] + matrix[3, :3]) * UsdGeom.GetStageMetersPerUnit(self.stage)
+        found = (positions @ matrix[:3, :3] + matrix[3, :3]) * UsdGeom.GetStageMetersPerUnit(self.stage)
         if UsdGeom.GetStageUpAxis(self.stage) == "Z":
             return np.stack([found[:, 0], found[:, 2], -found[:, 1]], axis=1)
         return found

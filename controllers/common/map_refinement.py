@@ -135,7 +135,7 @@ def refine(
         if settings.jerk is not None:
             found.append(settings.jerk)
         if targets is not None:
-            found.append(Keyframe(targets.places[part], targets.wanted[part]))
+            found.append(Keyframe(targets.positions[part], targets.wanted[part]))
         return found
 
     ensemble = DensityEnsemble(

@@ -95,7 +95,7 @@ def clean_up_feet(
             if record is not None:
                 record(done)
             yield done.features[-count:]
-            waiting, left, travelled = waiting[count:], left - count, travelled + done.place.position_xz
+            waiting, left, travelled = waiting[count:], left - count, travelled + done.ground_pose.position_xz
             done = _discard_history(done)
     if left > 0:
         raise RequestError(
@@ -136,11 +136,11 @@ def _move_trial(trial: Trial, offset: Float[Tensor, "2"]) -> Trial:
 
 def _discard_history(done: CommittedFrames) -> CommittedFrames:
     """Discard all frames that no later window reads, and move to the origin, where single precision is finest."""
-    here = done.place.position_xz
+    here = done.ground_pose.position_xz
     return replace(
         done.discard_history(MIN_CONTACT_FRAMES),
         joints_world=done.joints_world - rotations.lift_ground(here),
-        place=GroundPose(torch.zeros_like(here), done.place.heading),
+        ground_pose=GroundPose(torch.zeros_like(here), done.ground_pose.heading),
     )
 
 

@@ -41,13 +41,13 @@ def draw_paces(
     time, of the `rates` at which one pace (the first of a key) changes to another (the second), 1/s."""
     pace = first
     while True:
-        ways = {after: rate for (before, after), rate in rates.items() if before == pace and rate > 0}
-        if not ways:
+        changes = {after: rate for (before, after), rate in rates.items() if before == pace and rate > 0}
+        if not changes:
             yield pace, _WITHOUT_END
             continue
-        seconds = float(torch.empty(()).exponential_(sum(ways.values()), generator=generator))
+        seconds = float(torch.empty(()).exponential_(sum(changes.values()), generator=generator))
         yield pace, max(1, round(seconds * PRIOR_FPS))
-        pace = list(ways)[int(torch.multinomial(torch.tensor([*ways.values()]), 1, generator=generator))]
+        pace = list(changes)[int(torch.multinomial(torch.tensor([*changes.values()]), 1, generator=generator))]
 
 
 class PacePlan:

@@ -64,22 +64,22 @@ def fit_drawings(motion: Motion, loose: LooseKeys, *, faced: bool) -> Motion:
     return replace(motion, root_position=root, local_quat_xyzw=quats)
 
 
-def measure_drawing_error(places: Float[Tensor, "joints 3"], loose: LooseKeys, frame: int) -> float:
+def measure_drawing_error(positions: Float[Tensor, "joints 3"], loose: LooseKeys, frame: int) -> float:
     """Measure how far drawn joints are on average from where they are drawn, metres, the drawing moved and scaled to
     the best fit, and all as large as the body is in space: one that folds up to look small is no nearer for it."""
     drawn = loose.drawn[frame]
-    seen = places[drawn].double() @ view_axes(loose.view[frame]).double().mT
+    seen = positions[drawn].double() @ view_axes(loose.view[frame]).double().mT
     sketch = loose.sketch[frame, drawn].double()
     seen, sketch = seen - seen.mean(dim=0), sketch - sketch.mean(dim=0)
     scale = (seen * sketch).sum() / sketch.square().sum().clamp_min(1e-12)
-    body = places[drawn].double()
+    body = positions[drawn].double()
     size = (body - body.mean(dim=0)).norm() / seen.norm().clamp_min(1e-12)
     return float(size * (seen - scale * sketch).norm(dim=-1).mean())
 
 
 def _fit(
     skeleton: Skeleton,
-    made: Float[Tensor, "joints 4"],
+    proposed: Float[Tensor, "joints 4"],
     drawn: list[int],
     target: Float[Tensor, "drawn 2"],
     axes: Float[Tensor, "2 3"],
@@ -87,13 +87,13 @@ def _fit(
 ) -> Float[Tensor, "joints 4"]:
     """Fit one pose, from several headings at once, and return the best: the drawn joints to their targets about their
     mean, metres, seen along the axes to the right and up."""
-    count, joints = _TURNS, len(made)
-    turns = torch.arange(count, dtype=made.dtype) * (2 * math.pi / count)
-    start = made.expand(count, -1, -1).clone()
+    count, joints = _TURNS, len(proposed)
+    turns = torch.arange(count, dtype=proposed.dtype) * (2 * math.pi / count)
+    start = proposed.expand(count, -1, -1).clone()
     start[:, 0] = rotations.multiply(rotations.about_y(turns), start[:, 0])
-    unknowns = torch.zeros(count, 3 * joints + 1, dtype=made.dtype)
+    unknowns = torch.zeros(count, 3 * joints + 1, dtype=proposed.dtype)
     ranges = joint_ranges.load()
-    own = ranges.find_excess(ranges.to_angles(rotations.to_matrix(made[1:])))
+    own = ranges.find_excess(ranges.to_angles(rotations.to_matrix(proposed[1:])))
 
     def energies(rows: Tensor) -> Tensor:
         turn, size = rows[:, :-1].unflatten(1, (joints, 3)), rows[:, -1]
@@ -113,7 +113,7 @@ def _fit(
     found = lbfgs.minimise(lbfgs.differentiate(energies), unknowns, settings=_SEARCH)
     turn = found.x[:, :-1].unflatten(1, (joints, 3))
     quats = rotations.multiply(start, rotations.from_rotation_vector(turn))
-    away = torch.rad2deg(rotations.wrap_angle(heading(quats[:, 0]) - heading(made[:1])))
+    away = torch.rad2deg(rotations.wrap_angle(heading(quats[:, 0]) - heading(proposed[:1])))
     energy = found.energy + (0.5 * (away / _SIGMA_HEADING_DEG).square() if faced else 0.0)
     return quats[int(energy.argmin())]
 
@@ -162,7 +162,7 @@ def collect_effector_targets(keys: Sequence[Key], motion: Motion, rigmap: RigMap
         for name in key.ends:
             limb = effector_joint(name, rigmap)
             wanted[key.frame, limb] = True
-            given = key.places.get(name)
+            given = key.positions.get(name)
             positions[key.frame, limb] = own[key.frame, limb] if given is None else own.new_tensor(given)
     return EffectorTargets(positions, wanted)
 
@@ -179,9 +179,9 @@ def collect_loose_keys(keys: Sequence[Key], motion: Motion, rigmap: RigMap) -> L
             loose.ground[key.frame] = hips[key.frame, ::2]
         if key.drawing is not None:
             loose.view[key.frame] = math.radians(key.drawing.view_deg)
-            for joint, place in resolve_drawing(key.drawing, rigmap).items():
+            for joint, position in resolve_drawing(key.drawing, rigmap).items():
                 loose.drawn[key.frame, joint] = True
-                loose.sketch[key.frame, joint] = loose.sketch.new_tensor(place)
+                loose.sketch[key.frame, joint] = loose.sketch.new_tensor(position)
     return loose
 
 
@@ -190,7 +190,7 @@ def resolve_drawing(drawing: Drawing, rigmap: RigMap) -> dict[int, tuple[float, 
     of these, or that is drawn twice."""
     found: dict[int, tuple[float, float]] = {}
     own = {joint: CANONICAL.index(name) for name, joint in rigmap.joints.items()}
-    for name, place in drawing.places_xy.items():
+    for name, position in drawing.positions_xy.items():
         joint = CANONICAL.names.index(name) if name in CANONICAL.names else None
         if joint is None:
             there = find_joint(name, rigmap.rig_skeleton.names, lambda: rigmap.joints)
@@ -201,7 +201,7 @@ def resolve_drawing(drawing: Drawing, rigmap: RigMap) -> dict[int, tuple[float, 
             raise RequestError(f"no joint {name!r} that could be drawn; {nearest}")
         if joint in found:
             raise RequestError(f"{name!r} is drawn twice, by its own name and by the canonical one")
-        found[joint] = place
+        found[joint] = position
     return found
 
 
@@ -273,7 +273,7 @@ def build_keyframe_clip(
     for number, key in enumerate(request.key):
         frame = request.frame_of(key)
         keys[frame] = _build_key(key, frame, body.rigmap, number)
-        if not (key.needs_pose or key.tells_place):
+        if not (key.needs_pose or key.gives_position):
             continue
         path = key.pose or body_path
         if path not in loaded:

@@ -27,7 +27,7 @@ from mapctl.inbetweening.effector_targets import (
     LooseKeys,
     compute_target_errors,
     estimate_standing_height,
-    lead_over_places,
+    lead_over_positions,
     reach_effector_targets,
 )
 from mapctl.inbetweening.missing import MissingMask, interpolate_missing, restore_observed
@@ -67,7 +67,7 @@ error of a gap."""
 class InfillSettings:
     """Settings of in-betweening."""
 
-    finish: bool = True
+    refine: bool = True
     """Whether MAP refines the proposal; if not it stays as proposed, on rigid bones and with exact keys."""
     refinement: RefinementSettings = field(default_factory=lambda: INFILL_REFINEMENT)
     """Sigmas and search of the MAP stage."""
@@ -159,7 +159,7 @@ def fill(
     the likeliest of `densities` its likelihood; RequestError for terms where it is left out.
     """
     settings, began = settings or InfillSettings(), time.perf_counter()
-    if terms and not settings.finish:
+    if terms and not settings.refine:
         raise RequestError("terms belong to the MAP stage, which is left out")
     generator = generator or torch.Generator().manual_seed(0)
     # The query: the clip at the prior's rate on canonical joints, led along what is asked for.
@@ -185,7 +185,7 @@ def fill(
     unknown = MissingMask(query.missing.joints, unknown_root)
     spread = answer.spread
     trust = None if spread is None else (spread[..., 0] / _USUAL_ERROR).clamp(*_TRUST_RANGE).float()
-    for first, last in _find_windows(unknown.frames) if settings.finish else ():
+    for first, last in _find_windows(unknown.frames) if settings.refine else ():
         part, part_unknown = slice(first, last), unknown.slice(first, last)
         proposal = canonical.slice(first, last)
         refined = refine(
@@ -200,7 +200,7 @@ def fill(
             ),
             settings.refinement,
             densities=densities,
-            targets=None if reached is None else EffectorTargets(reached.places[part], reached.wanted[part]),
+            targets=None if reached is None else EffectorTargets(reached.positions[part], reached.wanted[part]),
             terms=terms,
             first_frame=first,
             trust=None if trust is None else trust[part],
@@ -208,11 +208,11 @@ def fill(
         quats[part] = torch.where(part_unknown.joints[..., None], refined.motion.local_quat_xyzw, quats[part])
         root[part] = torch.where(part_unknown.root[:, None], refined.motion.root_position, root[part])
         ledger, windows = ledger.join(refined.ledger), (*windows, *refined.windows)
-    if settings.finish:
+    if settings.refine:
         canonical = replace(canonical, root_position=root, local_quat_xyzw=quats)
     # The result on the rig: seams, then targets and places to the millimetre.
     done, unreached = _reach_targets(clip, clip.back(canonical, asked), targets)
-    done, abrupt = _meet_places(clip, done, loose), ()
+    done, abrupt = _meet_positions(clip, done, loose), ()
     if targets is None and loose is None and curve is None:
         done, abrupt = take_simpler(done, clip.restore_observed(clip.interpolated), missing)
     notes = (*_note_open_ends(clip, answer, loose), *_note_drawings(canonical, asked), *abrupt)
@@ -297,14 +297,16 @@ class CanonicalClip:
         mask = MissingMask(joints[low] | joints[high], missing.root[low] | missing.root[high])
         return GapQuery(shown, mask, seconds, effector_targets, keep_trajectory, loose)
 
-    def back(self, made: Motion, query: GapQuery) -> Motion:
+    def back(self, generated: Motion, query: GapQuery) -> Motion:
         """Return an answer to the query on the rig, at the clip's rate, with blended seams and what is known to the
         bit. If the answer is the query's own interpolation, return the interpolation on the rig.
         """
         filled = self.interpolated
-        if made is not query.motion or query.keep_trajectory or query.loose is not None:
+        if generated is not query.motion or query.keep_trajectory or query.loose is not None:
             at_prior_rate = self.canonical.fps == PRIOR_FPS
-            own = made if at_prior_rate else transfer_change(self.canonical, query.motion, made, query.seconds)
+            own = (
+                generated if at_prior_rate else transfer_change(self.canonical, query.motion, generated, query.seconds)
+            )
             filled = from_canonical(own, self.rigmap, self.interpolated)
             filled = self._blend_seams(restore_observed(filled, self.interpolated, self.missing))
         return self.restore_observed(filled)
@@ -415,7 +417,7 @@ def _lead_over_ground(clip: CanonicalClip, loose: LooseKeys) -> Motion:
     root, quats = motion.root_position.clone(), motion.local_quat_xyzw.clone()
     ground = torch.where(loose.placed[:, None], loose.ground, root[:, ::2])
     facing = heading(quats[:, 0])
-    led, looked = lead_over_places(
+    led, looked = lead_over_positions(
         ground[None], facing[None], placed=(loose.placed | ~missing_root)[None], faced=~missing_hips[None]
     )
     root[:, ::2] = torch.where(missing_root[:, None], led[0], root[:, ::2])
@@ -438,24 +440,24 @@ def _pose_drawings(query: GapQuery, inbetweener: Inbetweener, generator: torch.G
     quats[drawn], root[drawn, 1] = fitted.local_quat_xyzw[drawn], fitted.root_position[drawn, 1]
     missing = MissingMask(query.missing.joints & ~drawn[:, None], query.missing.root)
     shown = interpolate_missing(replace(query.motion, local_quat_xyzw=quats), missing)
-    places = replace(loose, drawn=torch.zeros_like(loose.drawn))
-    return replace(query, motion=replace(shown, root_position=root), missing=missing, loose=places)
+    positions = replace(loose, drawn=torch.zeros_like(loose.drawn))
+    return replace(query, motion=replace(shown, root_position=root), missing=missing, loose=positions)
 
 
-_PLACE_SECONDS = 0.5  # over which what the hips are moved by fades away from a place
+_POSITION_SECONDS = 0.5  # over which what the hips are moved by fades away from a place
 _REPORTED_ERROR = 0.001  # metres from a target beyond which there is a note
 _REACH_TOLERANCE = 1e-4  # metres from a target within which it is reached
 _MAX_REACH_ATTEMPTS = 6
 
 
-def _meet_places(clip: CanonicalClip, filled: Motion, loose: LooseKeys | None) -> Motion:
+def _meet_positions(clip: CanonicalClip, filled: Motion, loose: LooseKeys | None) -> Motion:
     """Move the hips, smoothly, by the little that resampling and the MAP stage leave them from their places."""
     if loose is None or not bool(loose.placed.any()):
         return filled
     canonical, rigmap = to_canonical(filled, as_rig(clip.rigmap))
     root, free = canonical.root_position.clone(), clip.missing.root
     off = torch.where((loose.placed & free)[:, None], loose.ground - root[:, ::2], 0.0)
-    moved = interpolate_offsets(off, loose.placed | ~free, seconds=_PLACE_SECONDS, fps=float(filled.fps))
+    moved = interpolate_offsets(off, loose.placed | ~free, seconds=_POSITION_SECONDS, fps=float(filled.fps))
     root[:, ::2] += torch.where(free[:, None], moved, 0.0)
     return clip.restore_observed(from_canonical(replace(canonical, root_position=root), rigmap, filled))
 
@@ -476,7 +478,7 @@ def _reach_targets(
         if float(errors.max()) < _REACH_TOLERANCE or float((errors - before).abs().max()) < _REACH_TOLERANCE:
             break
         # Joints that only the rig has offset an effector from its canonical position.
-        aim = EffectorTargets(targets.places + there.joint_positions() - found, targets.wanted)
+        aim = EffectorTargets(targets.positions + there.joint_positions() - found, targets.wanted)
     if float(errors.max()) <= _REPORTED_ERROR:
         return done, ()
     worst = int(errors.argmax())
@@ -526,35 +528,35 @@ def _note_open_ends(clip: CanonicalClip, answer: Proposal, loose: LooseKeys | No
     return tuple(notes)
 
 
-_REPORTED_PLACE_ERROR = 0.03  # metres from where a joint is drawn, on average, beyond which there is a note
+_REPORTED_DRAWING_ERROR = 0.03  # metres from where a joint is drawn, on average, beyond which there is a note
 
 
 def _note_drawings(motion: Motion, query: GapQuery) -> tuple[str, ...]:
     """Note drawings of a query that a motion does not look like."""
     if query.loose is None:
         return ()
-    places, frames = motion.joint_positions(), query.loose.drawings.nonzero()[:, 0].tolist()
-    missed = {frame: measure_drawing_error(places[frame], query.loose, frame) for frame in frames}
+    positions, frames = motion.joint_positions(), query.loose.drawings.nonzero()[:, 0].tolist()
+    missed = {frame: measure_drawing_error(positions[frame], query.loose, frame) for frame in frames}
     return tuple(
         f"at {float(query.seconds[frame]):.2f} s joints stay {100 * error:.0f} cm from where they are drawn, on"
         " average: bones do not look so"
         for frame, error in missed.items()
-        if error > _REPORTED_PLACE_ERROR
+        if error > _REPORTED_DRAWING_ERROR
     )
 
 
 _MOST = 130.0  # m/s^2 of a joint over 1/30 s: one frame in a thousand of mocap's has more
 
 
-def take_simpler(made: Motion, simple: Motion, missing: MissingMask) -> tuple[Motion, tuple[str, ...]]:
+def take_simpler(generated: Motion, simple: Motion, missing: MissingMask) -> tuple[Motion, tuple[str, ...]]:
     """Take the simple answer in gaps whose result, beside the known frames or between them, is accelerated more than
     anything in the clip, than mocap and than the simple one; also return a note of each. Both motions are equal where
     nothing is missing."""
-    lost, step = missing.frames, max(1, round(float(made.fps) / PRIOR_FPS))
-    if made.num_frames < 2 * step + 1 or not bool(lost.any()):
-        return made, ()
+    lost, step = missing.frames, max(1, round(float(generated.fps) / PRIOR_FPS))
+    if generated.num_frames < 2 * step + 1 or not bool(lost.any()):
+        return generated, ()
     known = ~lost.unfold(0, 2 * step + 1, 1).any(dim=-1)
-    bends, simple_bends = _compute_accelerations(made, step), _compute_accelerations(simple, step)
+    bends, simple_bends = _compute_accelerations(generated, step), _compute_accelerations(simple, step)
     limit, poor = max([_MOST, *bends[known].tolist()]), torch.zeros_like(lost)
     notes = []
     for _, start, stop in true_intervals(lost[:, None]):
@@ -566,7 +568,7 @@ def take_simpler(made: Motion, simple: Motion, missing: MissingMask) -> tuple[Mo
                 f"frames {start}:{stop}: interpolation; the result was {strain:.1f} times as abrupt as any capture"
             )
     taken = MissingMask(missing.joints & poor[:, None], missing.root & poor)
-    return restore_observed(simple, made, taken), tuple(notes)
+    return restore_observed(simple, generated, taken), tuple(notes)
 
 
 def _compute_accelerations(motion: Motion, step: int) -> Float[Tensor, " bends"]:

@@ -90,9 +90,9 @@ def propose_through_keys(
         if targets is None or not bool(far.any()):
             return answer, targets
         # The body moves where limbs alone do not reach, and no more than that: it would leave where the network has it.
-        near = EffectorTargets(targets.places, targets.wanted & far[:, None])
+        near = EffectorTargets(targets.positions, targets.wanted & far[:, None])
         answer, reached = _move_body(query, answer, answer.motion, near, far, query)
-        return answer, EffectorTargets(reached.places, targets.wanted)
+        return answer, EffectorTargets(reached.positions, targets.wanted)
     blind = guided = query.hide_partial_keys()
     if bool(query.missing.root.any()):
         first = inbetweener.rough.propose(blind, generator=generator).motion
@@ -134,7 +134,7 @@ def _move_body(
     stray = torch.full(keys.shape, _MIN_ROOT_UNCERTAINTY)
     turning, moving = query.missing.joints, query.missing.root
     posed = reach_targets(posed, targets, turning=turning, moving=moving, stray=stray)[0]
-    reached = torch.where(targets.wanted[..., None], posed.joint_positions(), targets.places)
+    reached = torch.where(targets.wanted[..., None], posed.joint_positions(), targets.positions)
     there = replace(answer, motion=_blend_key_poses(answer.motion, posed, keys, blind))
     return there, EffectorTargets(reached, targets.wanted)
 
@@ -143,7 +143,7 @@ def _find_out_of_reach(motion: Motion, targets: EffectorTargets) -> Bool[Tensor,
     """Find the frames in which a target is farther away than its limb is long."""
     positions, far = motion.joint_positions(), torch.zeros(motion.num_frames, dtype=torch.bool)
     for limb in LIMBS.values():
-        away = (targets.places[:, limb.end] - positions[:, limb.upper]).norm(dim=-1)
+        away = (targets.positions[:, limb.end] - positions[:, limb.upper]).norm(dim=-1)
         far |= targets.wanted[:, limb.end] & (away > _STRETCH_SHARE * limb.length(motion.skeleton))
     return far
 
@@ -158,7 +158,7 @@ def _add_root_targets(query: GapQuery, hips: Bool[Tensor, " frames"]) -> Effecto
     wanted[hips, 0] = True
     if targets is None:
         return EffectorTargets(positions, wanted)
-    positions = torch.where(targets.wanted[..., None], targets.places, positions)
+    positions = torch.where(targets.wanted[..., None], targets.positions, positions)
     return EffectorTargets(positions, wanted | targets.wanted)
 
 
@@ -263,16 +263,19 @@ def _blend_key_poses(body: Motion, posed: Motion, keys: Bool[Tensor, " frames"],
     offset = interpolate_offsets(
         (posed.root_position - body.root_position) * keys[:, None], ~query.missing.root | keys, seconds=trunk, fps=fps
     )
-    made = replace(body, root_position=body.root_position + offset, local_quat_xyzw=quats)
-    goals_made, wanted = made.joint_positions(), torch.zeros(made.num_frames, CANONICAL.num_joints, dtype=torch.bool)
+    generated = replace(body, root_position=body.root_position + offset, local_quat_xyzw=quats)
+    goals_generated, wanted = (
+        generated.joint_positions(),
+        torch.zeros(generated.num_frames, CANONICAL.num_joints, dtype=torch.bool),
+    )
     for foot in _FEET:
         firm = keys | ~query.missing.joints[:, CANONICAL.parents[foot]]
-        goals_made[:, foot] = positions[:, foot] + interpolate_offsets(
+        goals_generated[:, foot] = positions[:, foot] + interpolate_offsets(
             (goals - positions)[:, foot] * keys[:, None], firm, seconds=limb, fps=fps
         )
     # Legs alone: arms that are to reach something would be turned back to where they were.
     turning = query.missing.joints.index_fill(1, torch.tensor(_ARMS), False)
-    return bend_limbs(made, body, goals_made, wanted, turning)
+    return bend_limbs(generated, body, goals_generated, wanted, turning)
 
 
 def _compute_duration(distance: Float[Tensor, "frames parts"], least: float, calm: float) -> float:
@@ -336,7 +339,7 @@ def _complete_stitched(query: GapQuery, stitched: Proposal, propose_rest: Callab
     return replace(rest.take(stitched, gaps), others=tuple(named.values()))
 
 
-_LEAST_WAY = 0.3  # metres from place to place, at the canonical size, that are walked and not stood
+_LEAST_DISTANCE = 0.3  # metres from place to place, at the canonical size, that are walked and not stood
 
 
 def lay_curve(query: GapQuery, fastest: float, ahead: int) -> tuple[Curve, Float[Tensor, " ahead"]] | None:
@@ -344,18 +347,18 @@ def lay_curve(query: GapQuery, fastest: float, ahead: int) -> tuple[Curve, Float
     metres at the canonical size; also return the arcs of the frames and of so many `ahead` of them, metres. None where
     there are others, and where the body would stand, or be faster than `fastest`, m/s."""
     loose = query.loose
-    if loose is None or not query.only_places:
+    if loose is None or not query.only_positions:
         return None
     frames = loose.placed.nonzero()[:, 0]
     if len(frames) < 2 or int(frames[0]) > 0 or int(frames[-1]) < query.motion.num_frames - 1:
         return None
-    places = loose.ground[frames].double() / query.scale
-    ways = torch.diff(places, dim=0).norm(dim=-1)
-    speeds = ways * PRIOR_FPS / torch.diff(frames)
-    if float(ways.min()) < _LEAST_WAY or float(speeds.max()) > fastest:
+    positions = loose.ground[frames].double() / query.scale
+    distances = torch.diff(positions, dim=0).norm(dim=-1)
+    speeds = distances * PRIOR_FPS / torch.diff(frames)
+    if float(distances.min()) < _LEAST_DISTANCE or float(speeds.max()) > fastest:
         return None
-    curve = curves.through(places)
-    at = _find_arcs(curve, places)
+    curve = curves.through(positions)
+    at = _find_arcs(curve, positions)
     if float(torch.diff(at).min()) <= 0:
         return None
     timed = scipy.interpolate.PchipInterpolator(frames.numpy(), at.numpy())
@@ -364,7 +367,7 @@ def lay_curve(query: GapQuery, fastest: float, ahead: int) -> tuple[Curve, Float
     return curve, torch.cat([inside, inside[-1] + speed * torch.arange(1, ahead + 1)])
 
 
-def walk_over_places(
+def walk_over_positions(
     query: GapQuery, densities: Sequence[Density], generator: torch.Generator | None
 ) -> Proposal | None:
     """Propose a walk over places by the first density, that of locomotion; None where it is not one that the density
@@ -394,13 +397,13 @@ def walk_over_places(
     )
 
 
-def _find_arcs(curve: Curve, places: Float[Tensor, "places 2"]) -> Float[Tensor, " places"]:
+def _find_arcs(curve: Curve, positions: Float[Tensor, "positions 2"]) -> Float[Tensor, " positions"]:
     """Find the arcs of the places that a curve leads through, metres."""
     dense = torch.linspace(0, curve.length, max(2, round(100 * curve.length)), dtype=torch.float64)
     points, found, first = curve.ground_point(dense), [], 0
-    for place in places[:-1]:
+    for position in positions[:-1]:
         # A curve that crosses itself comes by twice.
-        away = (points[first:] - place).norm(dim=-1)
+        away = (points[first:] - position).norm(dim=-1)
         near = (away < float(away.min()) + 0.01).nonzero()[0, 0] if len(found) else away.argmin()
         first += int(near)
         found.append(float(dense[first]))
@@ -487,12 +490,14 @@ def insert_rollout(
     contact logits.
     """
     start, stop = gap
-    made = decode(window.trial.features[0], GroundPose(ground_pose.position_xz.double(), ground_pose.heading.double()))
+    generated = decode(
+        window.trial.features[0], GroundPose(ground_pose.position_xz.double(), ground_pose.heading.double())
+    )
     count, planted = stop - start, window.trial.contacts[0]
     root, quats, logits = body.root_position.clone(), body.local_quat_xyzw.clone(), contact_logits.clone()
-    root[start:stop], quats[start:stop] = made.root_position[:count], made.local_quat_xyzw[:count]
-    if count < len(made.root_position):
-        there, here = body.slice(stop, stop + 1), made.slice(count, count + 1)
+    root[start:stop], quats[start:stop] = generated.root_position[:count], generated.local_quat_xyzw[:count]
+    if count < len(generated.root_position):
+        there, here = body.slice(stop, stop + 1), generated.slice(count, count + 1)
         root[start:stop], quats[start:stop] = _arrive(here, there, root[start:stop], quats[start:stop])
     new = torch.zeros(len(root), dtype=torch.bool)
     new[start:stop] = True
@@ -581,7 +586,7 @@ class RolloutInbetweener(Inbetweener):
         gaps in which every attempt jumps, and loose keys but for those that give positions alone, which are walked
         over."""
         if query.loose is not None:
-            walked = walk_over_places(query, self.densities, generator)
+            walked = walk_over_positions(query, self.densities, generator)
             return walked or self.fallback.propose(query, generator=generator)
         base = self.fallback.propose(query, generator=generator)
         if not query.enclosed_gaps:
@@ -628,7 +633,7 @@ class RolloutInbetweener(Inbetweener):
         wanted = known[:frames, None].expand(-1, CANONICAL.num_joints)
         if (targets := query.effector_targets) is not None:
             own = targets.wanted[part][:frames]
-            positions = torch.where(own[..., None], targets.places[part][:frames] / query.scale, positions)
+            positions = torch.where(own[..., None], targets.positions[part][:frames] / query.scale, positions)
             wanted = wanted | own
         arrival = Keyframe(positions.float(), wanted, _SIGMA_ARRIVAL)
         white = torch.randn(frames, LAYOUT.continuous, generator=generator)
@@ -639,7 +644,7 @@ class RolloutInbetweener(Inbetweener):
             frames,
             generator=generator,
         )
-        body, logits = insert_rollout(body, logits, window, committed.place, gap)
+        body, logits = insert_rollout(body, logits, window, committed.ground_pose, gap)
         planted, free = contacts.debounced(logits > 0), torch.zeros(len(logits), dtype=torch.bool)
         free[start:stop] = True
         return hold_planted(body, planted, free=free, rest_height=estimate_rest_height(body, planted)), logits
@@ -677,7 +682,7 @@ def extrapolate_end(query: GapQuery, proposal: Proposal, densities: Sequence[Den
         committed, count = commit_before(body, logits, first, density), min(_LONGEST, stop - first)
         terms = (LatentPrior(_SIGMA_NOISE), _FOOTING)
         window = solver.solve_window(committed, terms, count, generator=torch.Generator())
-        body, logits = insert_rollout(body, logits, window, committed.place, (first, first + count))
+        body, logits = insert_rollout(body, logits, window, committed.ground_pose, (first, first + count))
     source = GapSource(start, stop, f"density {density.name}")
     return replace(proposal, motion=query.to_character(body), contact_logits=logits, others=(*proposal.others, source))
 
@@ -736,7 +741,7 @@ class AutoInbetweener(Inbetweener):
         where that knows such walks.
         """
         if query.loose is not None:
-            walked = walk_over_places(query, self.densities, generator)
+            walked = walk_over_positions(query, self.densities, generator)
             return walked or (self.tweener or self.network).propose(query, generator=generator)
         answer = self.network.propose(query, generator=generator)
         whole = query.hide_partial_keys().enclosed_gaps
@@ -801,11 +806,11 @@ def _is_within(gap: tuple[int, int], gaps: Sequence[tuple[int, int]]) -> bool:
     return any(start <= gap[0] and gap[1] <= stop for start, stop in gaps)
 
 
-def _fill_from(proposal: Proposal, made: Proposal, query: GapQuery, gaps: Sequence[tuple[int, int]]) -> Proposal:
+def _fill_from(proposal: Proposal, generated: Proposal, query: GapQuery, gaps: Sequence[tuple[int, int]]) -> Proposal:
     """Fill gaps as another proposal has them."""
     sources = proposal.attribute(query)
     others = tuple(source for source in sources if _is_within((source.start, source.stop), gaps))
-    return replace(made.take(proposal, gaps), others=(*made.others, *others))
+    return replace(generated.take(proposal, gaps), others=(*generated.others, *others))
 
 
 def _is_standing_still(query: GapQuery, start: int, stop: int) -> bool:
@@ -825,19 +830,19 @@ def _is_standing_still(query: GapQuery, start: int, stop: int) -> bool:
     return apart < _SAME_POSE_DISTANCE and max(speeds) < _AT_REST
 
 
-def _goes_astray(query: GapQuery, made: Proposal, gap: tuple[int, int]) -> bool:
+def _goes_astray(query: GapQuery, generated: Proposal, gap: tuple[int, int]) -> bool:
     """Return whether a proposal takes the hips far from the straight way through a gap."""
     part = slice(*gap)
-    off = (made.motion.root_position - query.motion.root_position)[part, ::2].norm(dim=-1)
+    off = (generated.motion.root_position - query.motion.root_position)[part, ::2].norm(dim=-1)
     return float(off.max()) > _ASTRAY * query.scale
 
 
-def _hold_pose(query: GapQuery, made: Proposal, gap: tuple[int, int]) -> Proposal:
+def _hold_pose(query: GapQuery, generated: Proposal, gap: tuple[int, int]) -> Proposal:
     """Hold the pose, interpolated slowly to the next."""
-    part, logits = slice(*gap), made.contact_logits.clone()
+    part, logits = slice(*gap), generated.contact_logits.clone()
     toes = query.motion.joint_positions()[part, list(TOE_JOINTS), 1]
     logits[part] = contacts.to_logits(toes < toes.amin() + _PLANTED_HEIGHT).to(logits)
-    return _fill_from(Proposal(query.motion, logits, STANDING_STILL), made, query, [gap])
+    return _fill_from(Proposal(query.motion, logits, STANDING_STILL), generated, query, [gap])
 
 
 @dataclass(frozen=True)

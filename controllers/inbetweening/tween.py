@@ -74,7 +74,7 @@ def check_keyframes(
     whole, own = ~missing.frames, rig_joint_positions(motion, rigmap)
     for limb in targets.wanted.any(dim=0).nonzero()[:, 0].tolist():
         wanted, name = targets.wanted[:, limb], motion.skeleton.names[rigmap.joint_of[limb] or 0]
-        ends = torch.where(wanted[:, None], targets.places[:, limb], own[:, limb])
+        ends = torch.where(wanted[:, None], targets.positions[:, limb], own[:, limb])
         for start, stop in _pairs(wanted | whole):
             if not bool(wanted[start] | wanted[stop]):
                 continue
@@ -172,24 +172,26 @@ def keyframe_motion(wanted: Sequence[Key], motion: Motion, rig: Rig | None) -> t
     return canonical, rigmap, shown
 
 
-def measure_keyframe_errors(made: Motion, source: Motion, keys: Keys, rig: Rig | None = None) -> list[dict[str, Any]]:
+def measure_keyframe_errors(
+    generated: Motion, source: Motion, keys: Keys, rig: Rig | None = None
+) -> list[dict[str, Any]]:
     """Measure by key the largest error over joints: of positions, cm, and of rotations, degrees, where it gives any."""
     wanted = keys.checked(source)
     rigmap = keyframe_motion(wanted, source, rig)[1]
     hips = rigmap.joint_of[0]
-    distance = 100 * (made.joint_positions() - source.joint_positions()).norm(dim=-1)
-    rotation = rotations.multiply(rotations.inverse(source.joint_rotations()), made.joint_rotations())
+    distance = 100 * (generated.joint_positions() - source.joint_positions()).norm(dim=-1)
+    rotation = rotations.multiply(rotations.inverse(source.joint_rotations()), generated.joint_rotations())
     angles = torch.rad2deg(rotations.to_rotation_vector(rotation).norm(dim=-1))
     targets = collect_effector_targets(wanted, source, rigmap)
     loose = collect_loose_keys(wanted, source, rigmap)
     known = ~missing_between_keys(wanted, source, rigmap).joints
-    rows, places = [], rig_joint_positions(made, rigmap)
+    rows, positions = [], rig_joint_positions(generated, rigmap)
     # A drawing may have joints that are no more than an End Site on the rig.
-    seen = places if loose is None else to_canonical(made, as_rig(rigmap))[0].joint_positions()
+    seen = positions if loose is None else to_canonical(generated, as_rig(rigmap))[0].joint_positions()
     for key in wanted:
         row: dict[str, Any] = {"frame": key.frame, "what": key.what}
         if key.what == "limbs" and targets is not None:
-            miss = (places[key.frame] - targets.places[key.frame]).norm(dim=-1)
+            miss = (positions[key.frame] - targets.positions[key.frame]).norm(dim=-1)
             rows.append(row | {"missed_cm": 100 * float(miss[targets.wanted[key.frame]].max())})
             continue
         if loose is not None and key.what in ("place", "drawing"):

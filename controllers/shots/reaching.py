@@ -57,24 +57,26 @@ class ReachTargets:
     @staticmethod
     def of(reaches: Sequence[Reach], frames: int) -> "ReachTargets":
         """Collect the targets of all reaches."""
-        places = torch.zeros(frames, CANONICAL.num_joints, 3, dtype=torch.float64)
+        goals = torch.zeros(frames, CANONICAL.num_joints, 3, dtype=torch.float64)
         wanted = torch.zeros(frames, CANONICAL.num_joints, dtype=torch.bool)
         tolerances = torch.zeros(frames, CANONICAL.num_joints, dtype=torch.float64)
         for reach in reaches:
             first = min(round(reach.seconds * PRIOR_FPS), frames - 1)
             held = slice(first, first + round(reach.hold_seconds * PRIOR_FPS) + 1)
-            for name, place in reach.places.items():
-                places[held, CANONICAL.index(name)] = places.new_tensor(place)
+            for name, position in reach.positions.items():
+                goals[held, CANONICAL.index(name)] = goals.new_tensor(position)
                 wanted[held, CANONICAL.index(name)] = True
                 tolerances[held, CANONICAL.index(name)] = reach.tolerance_of(name)
-        return ReachTargets(EffectorTargets(places, wanted), tolerances)
+        return ReachTargets(EffectorTargets(goals, wanted), tolerances)
 
     def relaxed(self, motion: Motion) -> "ReachTargets":
         """Return targets as much nearer to where limbs are anyway as their tolerances allow."""
-        toward = motion.joint_positions() - self.targets.places
+        toward = motion.joint_positions() - self.targets.positions
         far = toward.norm(dim=-1).clamp_min(1e-6)
         share = (_TOLERANCE_SHARE * self.tolerances / far).clamp(max=1.0)
-        return replace(self, targets=replace(self.targets, places=self.targets.places + share[..., None] * toward))
+        return replace(
+            self, targets=replace(self.targets, positions=self.targets.positions + share[..., None] * toward)
+        )
 
     def terms(self, skeleton: Skeleton, first: int, frames: int) -> list[WithinReach]:
         """Build the terms that lead a walk near enough, for frames of the shot; lengths are of the skeleton's size."""
@@ -85,18 +87,20 @@ class ReachTargets:
             if not bool(wanted.any()):
                 continue
             missing = frames - len(wanted)  # look-ahead beyond the shot's end
-            place = torch.cat([self.targets.places[window, limb.end], torch.zeros(missing, 3, dtype=torch.float64)])
+            position = torch.cat(
+                [self.targets.positions[window, limb.end], torch.zeros(missing, 3, dtype=torch.float64)]
+            )
             sought = torch.cat([wanted, wanted.new_zeros(missing)])
-            term = WithinReach(limb.upper, place, sought, EASY_SHARE * limb.length(skeleton))
+            term = WithinReach(limb.upper, position, sought, EASY_SHARE * limb.length(skeleton))
             found.append(replace(term, name=f"{name} within reach"))
         return found
 
     def within_reach(self, motion: Motion) -> "ReachTargets":
         """Return the targets that limbs reach from where a motion comes; of a limb that reaches none of its targets,
         the nearest one, brought as near as the limb reaches."""
-        places, wanted, positions = self.targets.places.clone(), self.targets.wanted.clone(), motion.joint_positions()
+        goals, wanted, positions = self.targets.positions.clone(), self.targets.wanted.clone(), motion.joint_positions()
         for limb in LIMBS.values():
-            away = places[:, limb.end] - positions[:, limb.upper]
+            away = goals[:, limb.end] - positions[:, limb.upper]
             most = STRETCHED_SHARE * limb.length(motion.skeleton) + _LEAN
             far = away.norm(dim=-1)
             for _, first, last in true_intervals(wanted[:, limb.end : limb.end + 1].clone()):
@@ -105,14 +109,14 @@ class ReachTargets:
                     reached[far[first:last].argmin()] = True
                 wanted[first:last, limb.end] = reached
             near = positions[:, limb.upper] + away * (most / far.clamp_min(1e-6)).clamp(max=1.0)[:, None]
-            places[:, limb.end] = near
-        return replace(self, targets=EffectorTargets(places, wanted))
+            goals[:, limb.end] = near
+        return replace(self, targets=EffectorTargets(goals, wanted))
 
     def led_there(self, motion: Motion) -> "ReachTargets":
         """Return targets in all frames around a reach: from where limbs are, smoothly to the target and back, since an
         in-betweener given the target alone goes there at the last moment. Direction and distance from the shoulder
         change by themselves: a straight path may lead through the body."""
-        places, wanted, positions = self.targets.places.clone(), self.targets.wanted.clone(), motion.joint_positions()
+        goals, wanted, positions = self.targets.positions.clone(), self.targets.wanted.clone(), motion.joint_positions()
         frame = torch.arange(len(wanted))
         for name, limb in LIMBS.items():
             reached, out = self.targets.wanted[:, limb.end], find_out(name, positions)
@@ -122,13 +126,13 @@ class ReachTargets:
             for _, first, last in true_intervals(reached[:, None].clone()):
                 away = (first - frame).clamp_min(0) + (frame - last + 1).clamp_min(0)
                 share = smootherstep((1 - away / (AROUND_FRAMES + 1)).to(path))
-                aim = places[frame.clamp(first, last - 1), limb.end] - shoulder
+                aim = goals[frame.clamp(first, last - 1), limb.end] - shoulder
                 aim = bend_within(aim, bones, easy=_BENT_SHARE, most=STRETCHED_SHARE)
                 path = torch.where(share[:, None] > 0, lead_about(path, aim, share, out=out), path)
             near = widen(reached, AROUND_FRAMES)
-            places[:, limb.end] = torch.where(reached[:, None], places[:, limb.end], shoulder + path)
+            goals[:, limb.end] = torch.where(reached[:, None], goals[:, limb.end], shoulder + path)
             wanted[:, limb.end] = near
-        return replace(self, targets=EffectorTargets(places, wanted))
+        return replace(self, targets=EffectorTargets(goals, wanted))
 
     def free_limbs(self, joints: int, posed: Bool[Tensor, " frames"]) -> MissingMask:
         """Return what the in-betweener makes anew: trunk and limb around every reach, but in `posed` frames."""
@@ -152,8 +156,8 @@ def settle_reaches(reaches: Sequence[Reach], motion: Motion) -> tuple[Reach, ...
         hold, at = round(reach.hold_seconds * PRIOR_FPS), round(reach.seconds * PRIOR_FPS)
         first = max(0, at - reach.within_frames)
         last = min(motion.num_frames - 1 - hold, at + reach.within_frames)
-        limbs = [CANONICAL.index(name) for name in reach.places]
-        away = (positions[:, limbs] - positions.new_tensor(list(reach.places.values()))).norm(dim=-1).sum(dim=-1)
+        limbs = [CANONICAL.index(name) for name in reach.positions]
+        away = (positions[:, limbs] - positions.new_tensor(list(reach.positions.values()))).norm(dim=-1).sum(dim=-1)
         best = first + int(away[first : max(first, last) + 1].argmin())
         found.append(replace(reach, seconds=best / PRIOR_FPS))
     return tuple(found)
@@ -176,13 +180,13 @@ def check_reaches(reaches: Sequence[Reach], trajectory: Trajectory, rest: Motion
     positions = rest.joint_positions()[0]
     for reach in reaches:
         frame = min(round(reach.seconds * PRIOR_FPS), len(trajectory.arcs) - 1)
-        on_way = trajectory.curve.ground_point(trajectory.arcs[frame])
-        for name, place in reach.places.items():
+        on_path = trajectory.curve.ground_point(trajectory.arcs[frame])
+        for name, position in reach.positions.items():
             limb = LIMBS[name]
             bones = limb.length(rest.skeleton)
-            target = positions.new_tensor(place)
+            target = positions.new_tensor(position)
             up = float((target[1] - positions[limb.upper, 1]).abs())
-            aside = float((target[::2] - on_way).norm())
+            aside = float((target[::2] - on_path).norm())
             most = bones + (_TIPTOE if target[1] > positions[limb.upper, 1] else _CROUCH)
             if up > most or aside > bones + _STEP_ASIDE:
                 raise RequestError(
@@ -200,8 +204,8 @@ def bend_toward_reaches(trajectory: Trajectory, request: ShotRequest, rest: Moti
     offsets, met = torch.zeros_like(along), []
     for reach in request.reaches:
         arc = trajectory.arcs[min(round(reach.seconds * PRIOR_FPS), len(trajectory.arcs) - 1)]
-        for name, place in reach.places.items():
-            aside = _find_lacking_aside(trajectory, arc, rest, name, place)
+        for name, position in reach.positions.items():
+            aside = _find_lacking_aside(trajectory, arc, rest, name, position)
             if abs(aside) > _LEAST_BEND:
                 met.append(float(arc))
                 reach_length = _BEND_LENGTH * max(1.0, abs(aside) / _USUAL_BEND)
@@ -217,11 +221,13 @@ def bend_toward_reaches(trajectory: Trajectory, request: ShotRequest, rest: Moti
     return trajectory
 
 
-def _find_lacking_aside(trajectory: Trajectory, arc: Tensor, rest: Motion, name: str, place: Sequence[float]) -> float:
+def _find_lacking_aside(
+    trajectory: Trajectory, arc: Tensor, rest: Motion, name: str, position: Sequence[float]
+) -> float:
     """Find how far to the left of the trajectory a limb reaches a target, metres; 0 where it does anyway."""
     limb, positions = LIMBS[name], rest.joint_positions()[0]
     bones = limb.length(rest.skeleton)
-    target = trajectory.curve.points.new_tensor(place)
+    target = trajectory.curve.points.new_tensor(position)
     ground = target[::2] - trajectory.curve.ground_point(arc)
     left, ahead = (
         float(ground @ trajectory.curve.left(arc)),
@@ -255,12 +261,12 @@ def go_down(motion: Motion, reaches: Sequence[Reach], posed: Bool[Tensor, " fram
 def _find_lacking_below(motion: Motion, reach: Reach, frame: int) -> float:
     """Find how much lower the shoulders would have to be for hands to reach their places, metres."""
     positions, lacking = motion.joint_positions(), 0.0
-    for name, place in reach.places.items():
+    for name, position in reach.positions.items():
         if not name.endswith("Hand"):
             continue
         limb = LIMBS[name]
         bones = limb.length(motion.skeleton)
-        away = positions[frame, limb.upper] - positions.new_tensor(place)
+        away = positions[frame, limb.upper] - positions.new_tensor(position)
         room = (EASY_SHARE * bones) ** 2 - float(away[::2].square().sum())
         lacking = max(lacking, float(away[1]) - math.sqrt(max(room, (_STRAIGHT_AHEAD * bones) ** 2)))
     return lacking
@@ -269,10 +275,10 @@ def _find_lacking_below(motion: Motion, reach: Reach, frame: int) -> float:
 def _keep_feet(motion: Motion, before: Motion) -> Motion:
     """Bend legs so that feet are where they were before, and turned as they were; thighs turn as little as it takes."""
     quats = motion.local_quat_xyzw.clone()
-    places, world, feet = motion.joint_positions(), motion.joint_rotations(), before.joint_positions()
+    goals, world, feet = motion.joint_positions(), motion.joint_rotations(), before.joint_positions()
     for name, limb in LIMBS.items():
         if name.endswith("Foot"):
-            aim = feet[:, limb.end] - places[:, limb.upper]
+            aim = feet[:, limb.end] - goals[:, limb.upper]
             offsets = motion.skeleton.offsets.to(aim)
             turned, bent = inverse.reach(limb, world[:, limb.upper], quats[:, limb.lower], aim, offsets)
             above = world[:, CANONICAL.parents[limb.upper]]
@@ -347,8 +353,8 @@ def as_reaches(keys: Sequence[PoseKey], trajectory: Trajectory, found: Motion) -
         if key.joints:
             frame = min(round(key.seconds * PRIOR_FPS), len(trajectory.arcs) - 1)
             positions = _place_pose(found, key, trajectory, frame).joint_positions()[0]
-            places = {name: tuple(positions[CANONICAL.index(name)].tolist()) for name in key.joints}
-            reaches.append(Reach(key.seconds, places, key.hold_seconds, key.tolerance, key.within_frames))
+            goals = {name: tuple(positions[CANONICAL.index(name)].tolist()) for name in key.joints}
+            reaches.append(Reach(key.seconds, goals, key.hold_seconds, key.tolerance, key.within_frames))
     return tuple(reaches)
 
 
@@ -490,7 +496,7 @@ _EYES_LEAD_SECONDS, _APART_SECONDS = 0.25, 1.0
 def turn_heads(motion: Motion, looks: Sequence[Look]) -> Motion:
     """Turn neck and head toward what is looked at, in half a second and back in another."""
     for look in looks:
-        motion = turn_head(motion, _place(look), _ease(motion.num_frames, look))
+        motion = turn_head(motion, _look_target(look), _ease(motion.num_frames, look))
     return motion
 
 
@@ -503,7 +509,7 @@ def look_where_hands_reach(motion: Motion, reaches: Sequence[Reach], looks: Sequ
         busy[max(0, first) : last + 1] = True
     busy = widen(busy, round(_APART_SECONDS * PRIOR_FPS))
     for reach in reaches:
-        hands = [place for name, place in reach.places.items() if name.endswith("Hand")]
+        hands = [position for name, position in reach.positions.items() if name.endswith("Hand")]
         first = max(0.0, reach.seconds - _EYES_LEAD_SECONDS)
         last = reach.seconds + reach.hold_seconds
         if not hands or bool(busy[round(first * PRIOR_FPS) : round(last * PRIOR_FPS) + 1].any()):
@@ -518,11 +524,11 @@ def measure_look_errors(motion: Motion, look: Look) -> Float[Tensor, " frames"]:
     """Measure the angle between where the head faces and what it is to look at, degrees, while it is to look."""
     first = round(look.seconds * PRIOR_FPS)
     held = slice(first, first + round(look.hold_seconds * PRIOR_FPS) + 1)
-    return torch.rad2deg(measure_look_angle(motion, _place(look)))[held]
+    return torch.rad2deg(measure_look_angle(motion, _look_target(look)))[held]
 
 
-def _place(look: Look) -> Float[Tensor, "1 3"]:
-    return torch.tensor([look.place], dtype=torch.float64)
+def _look_target(look: Look) -> Float[Tensor, "1 3"]:
+    return torch.tensor([look.position], dtype=torch.float64)
 
 
 def _ease(frames: int, look: Look) -> Float[Tensor, " frames"]:

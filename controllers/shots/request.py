@@ -33,7 +33,7 @@ STANDING_SPEED = 0.3
 _ASIDE = math.radians(75.0)  # between the hips' heading and the direction of travel
 _STILL_SPEED = 0.3  # m/s of a joint, above which it gestures
 _PAST_FRAMES = 10  # of a clip, before a shot's first frame
-_SAME_PLACE = 0.05  # metres
+_SAME_POSITION = 0.05  # metres
 _APART_SECONDS = 2 / PRIOR_FPS  # between keys that are to differ
 
 
@@ -102,8 +102,8 @@ class Lead:
     def start(self, prior: Density, character: Character) -> MotionStart:
         """Return the density's state at its end, of the prior's size."""
         root = self.motion.root_position / character.scale
-        features, place = encode(replace(self.motion, skeleton=character.unit_skeleton, root_position=root))
-        ground, heading = integrate_root(features, place)
+        features, position = encode(replace(self.motion, skeleton=character.unit_skeleton, root_position=root))
+        ground, heading = integrate_root(features, position)
         observed = features.float()
         state = replay(prior, observed[1:], prior.start_after(observed[:1]))
         return start_from_state(state, GroundPose(ground[-1].float(), heading[-1].float()), character.unit_skeleton)
@@ -163,7 +163,7 @@ class Reach:
 
     seconds: float
     """When, seconds since the first frame."""
-    places: Mapping[str, WorldPosition]
+    positions: Mapping[str, WorldPosition]
     """Targets of canonical hands and feet, world, metres."""
     hold_seconds: float = 0.0
     """For how long."""
@@ -177,8 +177,8 @@ class Reach:
         return self.tolerance.get(name, 0.0) if isinstance(self.tolerance, Mapping) else self.tolerance
 
     def __post_init__(self):
-        unknown = [name for name in self.places if name not in LIMBS]
-        if unknown or not self.places:
+        unknown = [name for name in self.positions if name not in LIMBS]
+        if unknown or not self.positions:
             raise RequestError(f"hands and feet that reach are {', '.join(LIMBS)}; got {', '.join(unknown) or 'none'}")
 
 
@@ -188,7 +188,7 @@ class Look:
 
     seconds: float
     """When, seconds since the first frame."""
-    place: WorldPosition
+    position: WorldPosition
     """Point that it looks at, world, metres."""
     hold_seconds: float = 0.0
     """For how long."""
@@ -335,9 +335,9 @@ class ShotRequest:
                     f"the shot's {self.seconds:g} s"
                 )
         for one, other in combinations(self.reaches, 2):
-            for name in one.places.keys() & other.places.keys():
-                apart = math.dist(one.places[name], other.places[name])
-                if apart > _SAME_PLACE and _are_together(one, other):
+            for name in one.positions.keys() & other.positions.keys():
+                apart = math.dist(one.positions[name], other.positions[name])
+                if apart > _SAME_POSITION and _are_together(one, other):
                     raise RequestError(
                         f"{name} is to be at two places {100 * apart:.0f} cm apart within two frames, "
                         f"at {one.seconds:g} s and at {other.seconds:g} s"
@@ -351,7 +351,9 @@ class ShotRequest:
         """Raise RequestError for an obstacle in which the curve begins or a key lies."""
         x, z = self.curve.ground_point(0.0).tolist()
         points = [("the start", (x, z))]
-        points += [(f"the key at {key.seconds:g} s", (p[0], p[2])) for key in self.reaches for p in key.places.values()]
+        points += [
+            (f"the key at {key.seconds:g} s", (p[0], p[2])) for key in self.reaches for p in key.positions.values()
+        ]
         points += [(f"the key at {key.seconds:g} s", key.place) for key in self.poses if key.place is not None]
         for obstacle in self.obstacles:
             for what, point in points:

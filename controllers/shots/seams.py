@@ -63,7 +63,7 @@ class Filling:
         part, missing = self.motion.slice(first, last), self.missing.slice(first, last)
         if not bool(missing.frames.any()):
             return 0.0
-        done = fill(part, missing, inbetweener, settings=InfillSettings(finish=False))
+        done = fill(part, missing, inbetweener, settings=InfillSettings(refine=False))
         shown = done.motion.slice(max(0, gap[0] - 2), min(done.motion.num_frames, gap[1] + 2))
         peaks = body.measure_peaks(shown.joint_positions()[:, _EFFECTORS], shown.root_position, float(shown.fps))
         return compute_artefact_cost(done.motion, done.contacts, gap) + _ACCELERATION_WEIGHT * peaks.acceleration

@@ -14,6 +14,7 @@ import torch
 
 from controllers.common.character import Character
 from controllers.inbetweening.pipeline import fill
+from controllers.shots.constraints import Constraint, check_constraints, describe_conflicts
 from controllers.shots.reaching import (
     MetPose,
     ReachTargets,
@@ -32,7 +33,6 @@ from controllers.shots.request import Reach, ShotRequest
 from controllers.shots.seams import OVERLAP, arrive, close_loop, fill_frames, go_on, join_pieces, repair_jumps
 from controllers.shots.trajectory import Trajectory, plan_trajectory
 from controllers.shots.walk import FollowSettings, check_path, check_tracking, slows_in_corners, walk_spans
-from controllers.shots.wishes import Wish, check_wishes, describe_conflicts
 from mapctl.curves import Curve
 from mapctl.errors import RequestError
 from mapctl.intent.path import SpeedProfile
@@ -50,7 +50,7 @@ class ShotSolution(Solution):
 
     trajectory: Trajectory
     """The root trajectory that was planned."""
-    wishes: tuple[Wish, ...] = ()
+    constraints: tuple[Constraint, ...] = ()
     """Each wish: asked, got, and the residual."""
     reaches: tuple[Reach, ...] = ()
     """What is reached for, keys' own hands and feet too, at the times at which it was."""
@@ -59,7 +59,7 @@ class ShotSolution(Solution):
 
     def details(self) -> dict:
         """Return the wishes."""
-        return {"wishes": [wish.as_row() for wish in self.wishes]}
+        return {"constraints": [constraint.as_row() for constraint in self.constraints]}
 
 
 def solve_shot(
@@ -119,8 +119,8 @@ def solve_shot(
             notes += check_path(trajectory.curve, trajectory.arcs, character.data_limits(prior.limits))
         notes += check_tracking(motion, trajectory.curve)
     trajectory = trajectory.slice(motion.num_frames)
-    wishes = check_wishes(replace(request, reaches=reaches), trajectory, motion, met)
-    notes += describe_conflicts(wishes, trajectory, motion)
+    constraints = check_constraints(replace(request, reaches=reaches), trajectory, motion, met)
+    notes += describe_conflicts(constraints, trajectory, motion)
     return ShotSolution(
         motion,
         Status(outcome).with_notes(notes, infeasible=bool(notes)),
@@ -129,7 +129,7 @@ def solve_shot(
         walked[0].features if request.walks_only else None,
         time.perf_counter() - began,
         trajectory=trajectory,
-        wishes=wishes,
+        constraints=constraints,
         reaches=reaches,
         met=met,
     )

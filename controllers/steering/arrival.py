@@ -47,12 +47,12 @@ class TransitionMaker(Protocol):
         self,
         before: Float[Tensor, "before size"],
         after: Float[Tensor, "batch after size"],
-        place: Float[Tensor, "batch 2"],
+        position: Float[Tensor, "batch 2"],
         turn: Float[Tensor, " batch"],
         frames: int,
     ) -> Generator[None, None, Float[Tensor, "batch frames size"]]:
         """Generate, a frame at a time, features from the frame after the last of `before` to the last of `after`, which
-        runs backwards and is `frames` later, at `place`, metres, and turned by `turn`, seen from the last of `before`.
+        runs backwards, `frames` later, at `position`, metres, and turned by `turn`, relative to the last of `before`.
         """
         ...
 
@@ -84,14 +84,14 @@ def begin_stitch(
 def commit_frames(state: SteerState, new: Float[Tensor, "frames size"]) -> CommittedFrames:
     """Return what is committed after frames that were not solved: the density's state is advanced over them."""
     committed = state.committed
-    start = GroundPose(committed.place.position_xz.double(), committed.place.heading.double())
+    start = GroundPose(committed.ground_pose.position_xz.double(), committed.ground_pose.heading.double())
     ground, facing = integrate_root(new.double(), start)  # in single precision a long one would miss the target
-    unit = decode(new, committed.place, skeleton=state.character.unit_skeleton)
+    unit = decode(new, committed.ground_pose, skeleton=state.character.unit_skeleton)
     joints = torch.cat([committed.joints_world, unit.joint_positions().to(committed.joints_world)])
     return replace(
         committed,
         state=replay(state.prior, new, committed.state),  # pyright: ignore[reportArgumentType]
-        place=GroundPose(ground[-1].float(), facing[-1].float()),
+        ground_pose=GroundPose(ground[-1].float(), facing[-1].float()),
         features=torch.cat([committed.features, new]),
         joints_world=joints[-_JUDGED_FRAMES:],
         warm_start=committed.warm_start[:0],
@@ -101,8 +101,8 @@ def commit_frames(state: SteerState, new: Float[Tensor, "frames size"]) -> Commi
 
 def needed_speed(state: SteerState, order: Arrival, frames: int) -> float:
     """Return the mean speed that a target needs, m/s of a body of unit size."""
-    here = state.committed.place.position_xz * state.character.scale
-    return math.dist(order.place, here.tolist()) / state.character.scale * PRIOR_FPS / frames
+    here = state.committed.ground_pose.position_xz * state.character.scale
+    return math.dist(order.position, here.tolist()) / state.character.scale * PRIOR_FPS / frames
 
 
 def plan_stitch(
@@ -111,13 +111,13 @@ def plan_stitch(
     """Plan the frames to a target, a frame at a time, in the pose there to which the motion is smoothest."""
     character = state.character
     after = _pose_candidates(state, command, order)
-    here = state.committed.place
-    place = torch.tensor(order.place, dtype=torch.float32) / character.scale
+    here = state.committed.ground_pose
+    position = torch.tensor(order.position, dtype=torch.float32) / character.scale
     facing = order.facing
     if facing is None:
-        away = place - here.position_xz
+        away = position - here.position_xz
         facing = float(here.heading) if float(away.norm()) < _FAR else math.atan2(*away.tolist())
-    seen = rotations.rotate_ground(place - here.position_xz, -here.heading)
+    seen = rotations.rotate_ground(position - here.position_xz, -here.heading)
     turn = rotations.wrap_angle(torch.tensor(facing, dtype=torch.float32) - here.heading)
     count = len(after)
     found = yield from transitions.connect(
@@ -150,7 +150,7 @@ def _measure_roughness(state: SteerState, motions: Float[Tensor, "batch frames s
     """Measure the root mean square acceleration of the joints of motions from where the character is."""
     rough = []
     for features in motions:
-        joints = decode(features, state.committed.place, skeleton=state.character.unit_skeleton).joint_positions()
+        joints = decode(features, state.committed.ground_pose, skeleton=state.character.unit_skeleton).joint_positions()
         whole = torch.cat([state.committed.joints_world[-2:].to(joints), joints])
         rough.append(torch.diff(whole, n=2, dim=0).square().sum(dim=-1).mean().sqrt())
     return torch.stack(rough)
@@ -249,7 +249,7 @@ def _refuse(state: SteerState, order: Arrival) -> Refusal | None:
     if needs <= fastest:
         return None
     away = needs * left
-    where = f"{order.place[0]:.2f}, {order.place[1]:.2f} m, {away:.1f} m away"
+    where = f"{order.position[0]:.2f}, {order.position[1]:.2f} m, {away:.1f} m away"
     needed = f"it needs {needs:.1f} m/s, and {fastest:.1f} m/s is the fastest"
     return Refusal(order, f"an arrival at {where}, in {left:.1f} s is not obeyed: {needed}")
 
@@ -257,8 +257,8 @@ def _refuse(state: SteerState, order: Arrival) -> Refusal | None:
 def _lead_to(state: SteerState, command: Command, order: Arrival, left: int) -> Command:
     """Lead to a far target, at the pace that comes there in time; one that would come too early stands."""
     scale = state.character.scale
-    here = (state.committed.place.position_xz * scale).tolist()
-    away = (order.place[0] - here[0], order.place[1] - here[1])
+    here = (state.committed.ground_pose.position_xz * scale).tolist()
+    away = (order.position[0] - here[0], order.position[1] - here[1])
     speed = math.hypot(*away) * PRIOR_FPS / left
     if speed < _LEAST_SPEED * scale:
         return replace(command, speed=0.0, heading=state.target.facing, facing=None, turning=None, step_length=None)
@@ -270,13 +270,13 @@ def _deliver(state: SteerState, approach: Approach, command: Command) -> tuple[S
     planned, character, committed = approach.planned, state.character, state.committed
     assert planned is not None
     new, rest = planned[: state.settings.commit], planned[state.settings.commit :]
-    unit = decode(new, committed.place, skeleton=character.unit_skeleton)
+    unit = decode(new, committed.ground_pose, skeleton=character.unit_skeleton)
     after = commit_frames(state, new)
-    ahead = decode(rest, after.place, skeleton=character.unit_skeleton).joint_positions() if len(rest) else None
+    ahead = decode(rest, after.ground_pose, skeleton=character.unit_skeleton).joint_positions() if len(rest) else None
     forecast = unit.joint_positions()[:0] if ahead is None else ahead
     motion = character.motion(unit)
     overlay, motion = state.overlay.pose(motion, command, forecast * character.scale)
-    targets = _read_targets(new, committed.place, state.target)
+    targets = _read_targets(new, committed.ground_pose, state.target)
     velocities = torch.tensor([target.velocity for target in targets])
     frames = SteerFrames(
         motion,

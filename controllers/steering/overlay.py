@@ -44,38 +44,38 @@ class PartTrack:
 
     weight: MinimumJerkTrack
     """Share of the way there, 0 to 1."""
-    place: MinimumJerkTrack
+    position: MinimumJerkTrack
     """Place in the world, metres."""
 
     @staticmethod
-    def begin(place: tuple[float, float, float]) -> "PartTrack":
+    def begin(position: tuple[float, float, float]) -> "PartTrack":
         """Begin without a share."""
         zero = torch.zeros(1, dtype=torch.float64)
-        return PartTrack(MinimumJerkTrack.rest_at(zero), MinimumJerkTrack.rest_at(zero.new_tensor(place)))
+        return PartTrack(MinimumJerkTrack.rest_at(zero), MinimumJerkTrack.rest_at(zero.new_tensor(position)))
 
     @property
     def idle(self) -> bool:
         """Whether it has no share, and will have none."""
         return self.weight.resting and float(self.weight.value) == 0.0
 
-    def aim(self, place: tuple[float, float, float] | None, wanted: bool, seconds: float) -> "PartTrack":
+    def aim(self, position: tuple[float, float, float] | None, wanted: bool, seconds: float) -> "PartTrack":
         """Go toward a place if it is wanted, and back if not."""
         found = self
-        if place is not None:
-            goal = self.place.goal.new_tensor(place)
-            way = float((goal - self.place.value).norm())
-            moved = self.place.aim(goal, max(_MOVE_SECONDS, way / _MOVE_SPEED))
-            found = replace(self, place=MinimumJerkTrack.rest_at(goal) if self.idle else moved)
+        if position is not None:
+            goal = self.position.goal.new_tensor(position)
+            distance = float((goal - self.position.value).norm())
+            moved = self.position.aim(goal, max(_MOVE_SECONDS, distance / _MOVE_SPEED))
+            found = replace(self, position=MinimumJerkTrack.rest_at(goal) if self.idle else moved)
         return replace(found, weight=found.weight.aim(found.weight.goal.new_tensor([float(wanted)]), seconds))
 
     def move(self, frames: int) -> tuple["PartTrack", Float[Tensor, " frames"], Float[Tensor, "frames 3"]]:
         """Move on for so many frames; also return share and place in each."""
-        track, weights, places = self, [], []
+        track, weights, positions = self, [], []
         for _ in range(frames):
-            track = PartTrack(track.weight.move(1 / PRIOR_FPS), track.place.move(1 / PRIOR_FPS))
+            track = PartTrack(track.weight.move(1 / PRIOR_FPS), track.position.move(1 / PRIOR_FPS))
             weights.append(track.weight.value)
-            places.append(track.place.value)
-        return track, torch.cat(weights), torch.stack(places)
+            positions.append(track.position.value)
+        return track, torch.cat(weights), torch.stack(positions)
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,12 +105,12 @@ class Overlay:
         joints = torch.cat([walk.joint_positions(), forecast.to(walk.root_position)])
         soon = joints[min(walk.num_frames - 1 + _AHEAD_FRAMES, len(joints) - 1)]
         for name in {*parts, *command.reach} - {_HEAD}:
-            place = command.reach.get(name)
-            part = parts.get(name) or PartTrack.begin(place or (0.0, 0.0, 0.0))
-            on_its_way = bool(part.weight.goal > 0)
-            wanted = place is not None and _is_in_reach(name, place, soon, walk.skeleton, keep=on_its_way)
+            position = command.reach.get(name)
+            part = parts.get(name) or PartTrack.begin(position or (0.0, 0.0, 0.0))
+            moving = bool(part.weight.goal > 0)
+            wanted = position is not None and _is_in_reach(name, position, soon, walk.skeleton, keep=moving)
             if wanted or name in parts:
-                parts[name] = part.aim(place, wanted, _RAISE_SECONDS)
+                parts[name] = part.aim(position, wanted, _RAISE_SECONDS)
         if command.look_at is not None or _HEAD in parts:
             part = parts.get(_HEAD) or PartTrack.begin(command.look_at or (0.0, 0.0, 0.0))
             parts[_HEAD] = part.aim(command.look_at, command.look_at is not None, _TURN_SECONDS)
@@ -118,11 +118,16 @@ class Overlay:
 
 
 def _is_in_reach(
-    name: str, place: tuple[float, float, float], joints: Float[Tensor, "joints 3"], skeleton: Skeleton, *, keep: bool
+    name: str,
+    position: tuple[float, float, float],
+    joints: Float[Tensor, "joints 3"],
+    skeleton: Skeleton,
+    *,
+    keep: bool,
 ) -> bool:
     """Return whether a hand gets to a place from a pose, with a lean of the trunk; one on its way a little farther."""
     limb = LIMBS[name]
-    away = joints.new_tensor(place) - joints[limb.upper]
+    away = joints.new_tensor(position) - joints[limb.upper]
     near = float(away.norm()) < limb.length(skeleton) + _NEAR + _LET_GO * keep
     return near and float(away @ find_out(name, joints[None])[0]) > -_BEHIND * float(away.norm())
 
@@ -131,10 +136,10 @@ def _lean(walk: Motion, arms: Mapping[str, tuple[Tensor, Tensor]]) -> Motion:
     """Turn the trunk toward what arms alone do not reach, about as far as brings the shoulders there: they go there on
     a circle, so that a second lean is needed where the way is long."""
     joints, turn = walk.joint_positions(), torch.zeros(walk.num_frames, 3, dtype=torch.float64)
-    for name, (weight, place) in arms.items():
+    for name, (weight, position) in arms.items():
         limb = LIMBS[name]
         length = limb.length(walk.skeleton)
-        shoulder, away = joints[:, limb.upper] - joints[:, _TRUNK[0]], place - joints[:, limb.upper]
+        shoulder, away = joints[:, limb.upper] - joints[:, _TRUNK[0]], position - joints[:, limb.upper]
         short = (away.norm(dim=-1) - _EASY_SHARE * length).clamp_min(0)
         angle = short**2 / (short + _LEAN_EASE) / shoulder.norm(dim=-1)
         angle = weight * _MOST_LEAN * torch.tanh(angle / _MOST_LEAN)
@@ -152,10 +157,10 @@ def _reach(motion: Motion, arms: Mapping[str, tuple[Tensor, Tensor]]) -> Motion:
     """Bend arms of a motion so that hands are by their shares on the way from where they are to the places."""
     joints, world = motion.joint_positions(), motion.joint_rotations()
     quats = motion.local_quat_xyzw.clone()
-    for name, (weight, place) in arms.items():
+    for name, (weight, position) in arms.items():
         limb, offsets = LIMBS[name], motion.skeleton.offsets.to(joints)
         length = limb.length(motion.skeleton)
-        aim = place.to(joints) - joints[:, limb.upper]
+        aim = position.to(joints) - joints[:, limb.upper]
         aim = bend_within(aim, length, easy=_BENT_SHARE, most=_STRETCHED_SHARE)
         own, out = joints[:, limb.end] - joints[:, limb.upper], find_out(name, joints)
         aim = lead_about(own, aim, weight.to(joints), out=out)

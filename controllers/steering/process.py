@@ -95,14 +95,14 @@ class Autopilot:
         """Hold this command from now on."""
         self._command, self._pursuit, self._goal = command, None, None
 
-    def go(self, command: Command, place: tuple[float, float], within: float, facing: float | None) -> None:
-        """Be at a `place` (x and z, metres) `within` so many seconds from the next step on, `facing` so (radians), and
-        hold the command from then on."""
+    def go(self, command: Command, position: tuple[float, float], within: float, facing: float | None) -> None:
+        """Be at a `position` (x, z, metres) `within` so many seconds from the next step, `facing` a heading (radians),
+        and hold the command from then on."""
         self.command(command)
-        self._goal = Arrival(place, within, facing)
+        self._goal = Arrival(position, within, facing)
 
     def stay(self) -> None:
-        """Go to no place any more."""
+        """Cancel the order to arrive."""
         self._command, self._goal = replace(self._command, arrival=None), None
 
     def aim(self, command: Command) -> None:
@@ -372,14 +372,14 @@ class CharacterProcess:
         """Reach, look and walk round obstacles as this command does; nothing else of it counts, and a path is kept."""
         self._send("aim", command)
 
-    def go(self, command: Command, place: tuple[float, float], within: float, facing: float | None = None) -> None:
-        """Be at a `place` (x and z, metres) `within` so many seconds, `facing` so (radians; None as it comes there), if
-        that is possible, and obey the command from then on; a note has the reason if not. RequestError without
-        `transitions` in the request, and for numbers that are none."""
+    def go(self, command: Command, position: tuple[float, float], within: float, facing: float | None = None) -> None:
+        """Be at a `position` (x, z, metres) `within` so many seconds, `facing` a heading (radians; None is that of the
+        approach), if possible, and obey the command from then on; else a note has the reason. RequestError without
+        `transitions` in the request, and for numbers that are not finite."""
         if self._request.transitions is None:
             raise RequestError("this character has no transitions, which take it to a position")
-        Arrival(place, within, facing)  # so that errors are raised here, not in the process
-        self._send("go", command, place, within, facing)
+        Arrival(position, within, facing)  # so that errors are raised here, not in the process
+        self._send("go", command, position, within, facing)
 
     def pause(self, paused: bool) -> None:
         """Stop the clock, or let it go on."""

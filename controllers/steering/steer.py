@@ -44,25 +44,25 @@ from mapctl.terms import FootContact, KeepClear, LatentPrior, RootVelocity, Step
 _BODY = 0.4  # metres from an obstacle's edge to the hips that pass it
 _LOOK_AHEAD, _LOOK_SECONDS = 0.6, 1.2  # metres, and seconds of walking, in which the way must be clear
 _HEADINGS, _WIDEST = 65, math.radians(140.0)  # directions that are tried, and how far off the commanded one
-_PLACES = 16  # along each
+_SAMPLES = 16  # along each
 _GET_OUT = 0.3  # metres of clearance gained by metre, where it is too near already
 _STAY = 0.5  # share of a change of direction that counts beside the deviation, which keeps the side
 
 
 def lead_around(
-    obstacles: tuple[Obstacle, ...], *, place: tuple[float, float], heading: float, wanted: float, speed: float
+    obstacles: tuple[Obstacle, ...], *, position: tuple[float, float], heading: float, wanted: float, speed: float
 ) -> float:
     """Return the direction of travel, radians, nearest to the `wanted` one that leads clear of obstacles.
 
-    `place` is the position (x and z, metres), `heading` the direction of travel now, `speed` in m/s. Where every
+    `position` is the position (x and z, metres), `heading` the direction of travel now, `speed` in m/s. Where every
     direction is blocked, the clearest.
     """
     if not obstacles or speed <= 0:
         return wanted
     offsets = torch.linspace(-_WIDEST, _WIDEST, _HEADINGS, dtype=torch.float64)
     angles = wanted + offsets
-    along = torch.linspace(0, _LOOK_AHEAD + _LOOK_SECONDS * speed, _PLACES, dtype=torch.float64)
-    start = torch.tensor(place, dtype=torch.float64)
+    along = torch.linspace(0, _LOOK_AHEAD + _LOOK_SECONDS * speed, _SAMPLES, dtype=torch.float64)
+    start = torch.tensor(position, dtype=torch.float64)
     rays = start + along[:, None] * torch.stack([angles.sin(), angles.cos()], dim=-1)[:, None]
     near = float(measure_clearance(obstacles, start))
     lacking = (torch.clamp(near + _GET_OUT * along, max=_BODY) - measure_clearance(obstacles, rays)).amax(dim=1)
@@ -314,7 +314,7 @@ def step(state: SteerState, command: Command, *, seconds: float | None = None) -
         done, _ = _solve_step(restarted, terms, 0.0, free=False)  # the prior's own continuation, which always exists
     new = done.features[-settings.commit :]
     forecast = (done.forecast if done.forecast is not None else done.joints_world[:0]) * character.scale
-    motion = character.motion(decode(new, state.committed.place, skeleton=character.unit_skeleton))
+    motion = character.motion(decode(new, state.committed.ground_pose, skeleton=character.unit_skeleton))
     overlay, motion = state.overlay.pose(motion, asked, forecast)
     record, committed_targets = done.windows[-1], tuple(targets[: settings.commit])
     cut_short = record.outcome == LbfgsStatus.OUT_OF_BUDGET.value and record.evaluations < settings.evaluations
@@ -351,8 +351,8 @@ def _lead_around(state: SteerState, command: Command) -> Command:
     if not command.obstacles or command.turning is not None:
         return command
     x, _, z = (state.committed.joints_world[-1, 0] * state.character.scale).tolist()
-    heading = state.target.heading if state.target.speed > 0 else float(state.committed.place.heading)
-    led = lead_around(command.obstacles, place=(x, z), heading=heading, wanted=command.heading, speed=command.speed)
+    heading = state.target.heading if state.target.speed > 0 else float(state.committed.ground_pose.heading)
+    led = lead_around(command.obstacles, position=(x, z), heading=heading, wanted=command.heading, speed=command.speed)
     return command if led == command.heading else replace(command, heading=led)
 
 
@@ -422,7 +422,7 @@ def _restart_target(state: SteerState) -> SteerState:
 
     A target far ahead of a stuck character (a walk to its side while it stands) guides no search.
     """
-    velocity, facing = _recent_velocity(state), float(state.committed.place.heading)
+    velocity, facing = _recent_velocity(state), float(state.committed.ground_pose.heading)
     speed = float(velocity.norm())
     heading = math.atan2(*velocity.tolist()) if speed > _MIN_TRAVEL_SPEED else facing
     target = SteeringTarget(speed, heading, facing)

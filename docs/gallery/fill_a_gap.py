@@ -23,10 +23,10 @@ arm = ("rightUpperArm", "rightLowerArm", "rightHand")
 lost = [Mask("*", 18, 60), *(Mask(joint, 70, 98) for joint in arm)]
 
 # What a recorder leaves there: a frozen body, and an arm without rotations.
-quats, places = truth.local_quat_xyzw.clone(), truth.root_position.clone()
-quats[18:60], places[18:60] = quats[17], places[17]
+quats, positions = truth.local_quat_xyzw.clone(), truth.root_position.clone()
+quats[18:60], positions[18:60] = quats[17], positions[17]
 quats[70:98, truth.skeleton.indices(arm)] = torch.tensor([0.0, 0.0, 0.0, 1.0]).double()
-broken = replace(truth, local_quat_xyzw=quats, root_position=places)
+broken = replace(truth, local_quat_xyzw=quats, root_position=positions)
 whole = controllers.infill(broken, priors.load_transformer(), lost)
 away = 100 * (whole.motion.joint_positions() - truth.joint_positions()).norm(dim=-1).mean(dim=1)
 print(f"joints are {away[18:60].mean():.1f} cm from the truth in the gap, and {away[:18].max():.1f} cm before it")

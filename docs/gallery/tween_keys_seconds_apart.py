@@ -21,7 +21,7 @@ from scenes.film import film
 prior, line, generator = priors.load("locomotion"), mapctl.curves.line(length=6.0), torch.Generator().manual_seed(1)
 keys = controllers.follow(prior, line, seconds=7.0, speed=0.8, generator=generator).motion
 general, tweener, shots = priors.load("general"), priors.load_tweener(), []
-for place, (name, colour) in enumerate({"raise-up-left": "#4c78a8", "run_masculine": "#e45756"}.items()):
+for position, (name, colour) in enumerate({"raise-up-left": "#4c78a8", "run_masculine": "#e45756"}.items()):
     start = next(k for k, clip in enumerate(general.initial_states.names) if name in clip)
     settings, generator = GenerateSettings(start=start), torch.Generator().manual_seed(2)
     example = controllers.generate(general, seconds=4.0, settings=settings, generator=generator).motion
@@ -29,7 +29,7 @@ for place, (name, colour) in enumerate({"raise-up-left": "#4c78a8", "run_masculi
     made = controllers.tween(keys, Keys((0, keys.num_frames - 1)), styled).motion
     heights = made.joint_positions()[:, made.skeleton.indices(("leftHand", "rightHand")), 1]
     print(f"DNA of {name}: hands are {heights.mean():.2f} m high in the mean, and {heights.max():.2f} m at most")
-    aside = made.root_position + torch.tensor([1.6 * place, 0.0, 0.0])
+    aside = made.root_position + torch.tensor([1.6 * position, 0.0, 0.0])
     shots.append(Shot(replace(made, root_position=aside), colour=colour))
 
 # %%

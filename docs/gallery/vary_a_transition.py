@@ -26,8 +26,8 @@ drawing = stitcher.drawing(seed=1)
 proposers = {"calm": stitcher, **{f"draw {number}": drawing.numbered(number) for number in range(1, 5)}}
 ways = {name: controllers.infill(clip, each, [Mask("*", 22, 60)]).motion for name, each in proposers.items()}
 shots = [
-    Shot(replace(way, root_position=way.root_position + torch.tensor([1.2 * place, 0.0, 0.0])))
-    for place, way in enumerate(ways.values())
+    Shot(replace(way, root_position=way.root_position + torch.tensor([1.2 * position, 0.0, 0.0])))
+    for position, way in enumerate(ways.values())
 ]
 camera = CameraSettings(azimuth_deg=0, elevation_deg=12, fov_deg=18)
 film(shots, "five-ways-side-by-side.webp", camera=camera, size=(480, 200), fps=15)

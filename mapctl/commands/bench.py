@@ -33,7 +33,7 @@ _SPEED = 1.2  # m/s of every walk
 class Bench(ModelCommand):
     """Cost on this machine: energy and gradient of a window, fast path and reference; following a curve; steering."""
 
-    tells_licence: ClassVar[bool] = False
+    prints_licence: ClassVar[bool] = False
 
     prior: options.Name = "locomotion"
     """A bundled prior, or the file or run folder of a trained one."""
@@ -95,7 +95,7 @@ def _time_evaluation(prior: Density, count: int, repeats: int) -> float:
     start = select_initial_state(
         prior, curve, arcs, terms_of, skeleton=CANONICAL, fps=PRIOR_FPS, generator=generator
     ).committed
-    context = WindowContext(prior, start.state, start.place, start.joints_world, frames)
+    context = WindowContext(prior, start.state, start.ground_pose, start.joints_world, frames)
     unknowns = 0.1 * torch.randn(count, frames * LAYOUT.continuous, generator=generator)
     objective = Objective(LatentNoise.from_unknowns(context, unknowns).build, terms_of(1, frames))
     return 1000 * _time_fastest(lambda: objective.energy_and_gradient(unknowns), repeats)

@@ -32,7 +32,7 @@ class Blend(ModelCommand, options.RigOptions):
     """Where the motion goes."""
     margin: options.MaybeNumber = None
     """Seconds before and after in which the limb goes there and back; by its distance if not given."""
-    no_finish: bool = False
+    no_refine: bool = False
     """Leave the proposal as it is, on rigid bones: no MAP stage plants the feet."""
     inbetweener: options.Name = "transformer"
     """A bundled in-betweener, or the file or run folder of a trained one."""
@@ -53,7 +53,7 @@ def run(command: Blend) -> int:
     start, stop = parse_range(command.frames, fps=float(other.fps), frames=other.num_frames, what="range of --frames")
     names = tuple(name.strip() for name in command.joints.split(","))
     transfer = LimbTransfer(names, start, stop, parse_frame(command.at, fps=float(motion.fps)), margin=command.margin)
-    settings = InfillSettings(finish=not command.no_finish)
+    settings = InfillSettings(refine=not command.no_refine)
     done = blend(motion, other, transfer, priors.load_inbetweener(command.inbetweener), settings=settings, rig=rig)
     results.write_result("blend", command, done, motion, rig=rig)
     if not command.quiet:

@@ -50,7 +50,7 @@ def run(command: Chain) -> int:
         [inputs.read_motion(path, rig, quiet=command.quiet) for path in command.clips],
         build_inbetweener(command.method, results.load_models(command)),
         settings=settings,
-        filling=InfillSettings(finish=not command.no_finish),
+        filling=InfillSettings(refine=not command.no_refine),
         rig=rig,
         generator=torch.Generator().manual_seed(command.seed),
     )

@@ -20,7 +20,7 @@ class CompileKernels(ModelCommand):
     """Compile the kernels and keep them on disk, so that the first motion does not wait for it; best after an
     installation."""
 
-    tells_licence: ClassVar[bool] = False
+    prints_licence: ClassVar[bool] = False
 
     quiet: bool = False
     """No summary and no progress bar."""

@@ -97,7 +97,7 @@ def run(command: Infill) -> int:
 def _run_infilling(
     command: Infill, motion: Motion, masks: Sequence[Mask], ways: Sequence[Mask], rig: Rig | None
 ) -> InbetweenSolution:
-    settings, densities = InfillSettings(finish=not command.no_finish), priors.load_choice(command.prior)
+    settings, densities = InfillSettings(refine=not command.no_refine), priors.load_choice(command.prior)
     generator = torch.Generator().manual_seed(command.seed)
     inbetweener = None
     # Where no pose is missing the network that would propose them need not be there.

@@ -30,7 +30,7 @@ from priors.weight_sets import find_strictest
 class Info(ModelCommand, options.RigOptions):
     """Bundled priors with their cards and licences, scenes, versions, rendering back end, threads; or a clip's rig."""
 
-    tells_licence: ClassVar[bool] = False
+    prints_licence: ClassVar[bool] = False
 
     name: Positional[Annotated[str | None, arg(metavar="NAME|CLIP")]] = None
     """A prior whose whole card is printed, as JSON: bundled, a file, or a run folder. Or a clip in

@@ -32,7 +32,7 @@ class Measure(ModelCommand, options.RigOptions):
     folder that cannot be measured are left out and listed.
     """
 
-    tells_licence: ClassVar[bool] = False
+    prints_licence: ClassVar[bool] = False
 
     clip: Positional[Annotated[Path, arg(metavar="CLIP|FOLDER")]]
     """A motion in any format that mapctl reads; or a folder, every one below it."""
@@ -216,7 +216,7 @@ def _describe_cycle(cycle: Mapping[str, Any]) -> str:
 
 
 def _print_realism(realism: Mapping[str, Any]) -> None:
-    counts = f"{realism['made_windows']} and {realism['mocap_windows']} windows of one second"
+    counts = f"{realism['generated_windows']} and {realism['mocap_windows']} windows of one second"
     rows = [
         ["told apart, %", *(100 * realism[name] for name in ("accuracy", "floor_accuracy"))],
         ["Frechet distance", realism["frechet"], realism["floor_frechet"]],

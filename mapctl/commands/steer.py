@@ -90,7 +90,7 @@ class Steer(ModelCommand, options.ReadOptions, streaming.StreamOptions):
     """No summary and no progress bar."""
 
 
-_PLACE_WORDS = {"leftHand": "left hand", "rightHand": "right hand"}
+_HAND_WORDS = {"leftHand": "left hand", "rightHand": "right hand"}
 _AFTER_SECONDS = 1.0  # for which a motion goes on after the last place was reached
 _LAST_COMMAND_SECONDS = 3.0  # seconds for which a script of a single command is played
 
@@ -212,7 +212,7 @@ def _stream_to(stream: "PoseStream", clock: WallClock, frames: int, zero: float)
     return show
 
 
-def _format_place(row: Mapping[str, Any], name: str, words: str) -> str:
+def _format_position(row: Mapping[str, Any], name: str, words: str) -> str:
     """Say how near a hand came to its place, and for how long it was there; nothing where none was wanted."""
     nearest = row.get(f"{name}_nearest_cm")
     if nearest is None:
@@ -227,7 +227,7 @@ def _format_arrival(row: Mapping[str, Any]) -> str:
     turned = "" if facing is None else f", {facing:.2f} degrees off"
     posed = "" if pose is None else f", joints {pose:.1f} cm off the pose"
     where = f"{row['goto_x_m']:g}, {row['goto_z_m']:g} m"
-    return f"{row['by_s']:6.1f} s  at {where}: {row['place_error_cm']:.2f} cm off{turned}{posed}"
+    return f"{row['by_s']:6.1f} s  at {where}: {row['position_error_cm']:.2f} cm off{turned}{posed}"
 
 
 def _format_summary(found: Mapping[str, Any], files: Sequence[Path], streamed: str | None) -> list[str]:
@@ -240,12 +240,12 @@ def _format_summary(found: Mapping[str, Any], files: Sequence[Path], streamed: s
         turned += "" if rate is None else f", turning {rate:.0f} degrees/s"
         turned += "" if row["steady_step_m"] is None else f", steps of {row['steady_step_m']:.2f} m"
         looked = row.get("look_nearest_deg")
-        places = "" if looked is None else f", head {looked:.0f} degrees off what it looks at"
-        places += "".join(_format_place(row, name, words) for name, words in _PLACE_WORDS.items())
+        details = "" if looked is None else f", head {looked:.0f} degrees off what it looks at"
+        details += "".join(_format_position(row, name, words) for name, words in _HAND_WORDS.items())
         turn = row["turn_deg_s"]
         direction = f"to {row['heading_deg']:.0f} degrees" if turn is None else f"turning {turn:.0f} degrees/s"
         lines.append(
-            f"{row['time_s']:6.1f} s  {row['speed_mps']:.2f} m/s {direction}: {reached}{steady}{turned}{places}"
+            f"{row['time_s']:6.1f} s  {row['speed_mps']:.2f} m/s {direction}: {reached}{steady}{turned}{details}"
         )
     lines += [_format_arrival(row) for row in found.get("arrivals", ())]
     cost, latency = found["timing"], found["timing"]["command_latency_s"]

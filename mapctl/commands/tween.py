@@ -94,7 +94,7 @@ def _run_request(command: Tween, request: KeyRequest | None) -> int:
     _check(command, request)
     clip, dna = _read_keyframe_clip(command, request), results.read_dna(command)
     models = results.load_models(command, prior=command.prior, dna=dna)
-    settings, densities = InfillSettings(finish=not command.no_finish), priors.load_choice(command.prior)
+    settings, densities = InfillSettings(refine=not command.no_refine), priors.load_choice(command.prior)
 
     def make(by: Inbetweener, generator: torch.Generator) -> InbetweenSolution:
         return tween(

@@ -72,14 +72,14 @@ def _check_sizes(shape: str, **sizes: float) -> None:
 
 def _join_arcs(*arcs: tuple[float, float], closed: bool) -> Curve:
     """Join circular arcs (signed radius, left positive; angle) smoothly, from the origin along +Z."""
-    place, heading, pieces = np.zeros(2), 0.0, [np.zeros((1, 2))]
+    position, heading, pieces = np.zeros(2), 0.0, [np.zeros((1, 2))]
     for radius, angle in arcs:
         # At least one vertex a degree, so that a tiny circle is round as well.
         count = min(math.ceil(max(abs(radius) * angle / SPACING, math.degrees(angle))), MAX_POINTS // 2)
         turned = heading + np.sign(radius) * np.linspace(0, angle, count + 1)[1:]
         across = radius * np.stack([np.cos(heading) - np.cos(turned), np.sin(turned) - np.sin(heading)], axis=1)
-        pieces.append(place + across)
-        place, heading = pieces[-1][-1], turned[-1]
+        pieces.append(position + across)
+        position, heading = pieces[-1][-1], turned[-1]
     points = np.concatenate(pieces)
     if closed:
         points[-1] = points[0]  # exactly

@@ -63,8 +63,8 @@ def _check_points(points: ndarray | Tensor) -> Float[ndarray, "points dims"]:
     wrong = ~(np.abs(given) <= MAX_LENGTH).all(axis=1)  # catches NaN as well
     if wrong.any():
         first = int(wrong.argmax())
-        place = ", ".join(f"{value:g}" for value in given[first])
-        raise RequestError(f"point {first} of the curve is ({place}), expected numbers up to {MAX_LENGTH:g} m")
+        locate = ", ".join(f"{value:g}" for value in given[first])
+        raise RequestError(f"point {first} of the curve is ({locate}), expected numbers up to {MAX_LENGTH:g} m")
     return given
 
 
@@ -88,10 +88,10 @@ def _thin_points(points: ndarray, spacing: float) -> ndarray:
     """Keep both ends, and of the points in each piece of `spacing` metres the one farthest from its chord."""
     arcs = np.r_[0.0, np.cumsum(_span_lengths(points))]
 
-    def place(at: ndarray) -> ndarray:
+    def locate(at: ndarray) -> ndarray:
         return np.stack([np.interp(at, arcs, axis) for axis in points.T], axis=1)
 
-    bend = np.linalg.norm(points - (place(arcs - spacing) + place(arcs + spacing)) / 2, axis=1)
+    bend = np.linalg.norm(points - (locate(arcs - spacing) + locate(arcs + spacing)) / 2, axis=1)
     bend[[0, -1]] = np.inf
     # The last point has a piece of its own, or it might be dropped in favour of the first.
     piece = np.r_[(arcs[:-1] / spacing).astype(np.int64), np.iinfo(np.int64).max]

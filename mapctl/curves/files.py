@@ -130,15 +130,15 @@ def _read_svg_paths(path: str | PathLike[str]) -> list:
 def _sample_segment(path: str | PathLike[str], segment, metres_per_unit: float) -> ndarray:
     """Sample a straight segment's ends; points at most about 5 mm apart, and 8 at least, along any other."""
 
-    def places(count: int) -> ndarray:
+    def positions(count: int) -> ndarray:
         with np.errstate(all="ignore"):
             at = np.array([segment.point(t) for t in np.linspace(0, 1, count + 1)])
         return np.stack([np.real(at), np.imag(at)], axis=1) * metres_per_unit
 
-    rough = places(1 if type(segment).__name__ == "Line" else 8)
+    rough = positions(1 if type(segment).__name__ == "Line" else 8)
     with np.errstate(all="ignore"):
         length = np.linalg.norm(np.diff(rough, axis=0), axis=1).sum()
     if not (math.isfinite(length) and length <= MAX_LENGTH):
         raise FileFormatError(path, f"a path is {length:.3g} m long, allowed are {MAX_LENGTH:g}")
     wanted = min(math.ceil(length / 0.005), 100_000)
-    return rough if len(rough) == 2 or wanted <= 8 else places(wanted)
+    return rough if len(rough) == 2 or wanted <= 8 else positions(wanted)

@@ -44,12 +44,12 @@ def track_arcs(
     grid = _ArcGrid.of(curve, float(walked[-1]) + reach)
     count = 1 + math.ceil(float(walked[-1]) / grid.step)
     at = np.linspace(0, float(walked[-1]), count)
-    places = np.stack([np.interp(at, walked.numpy(), column) for column in points.numpy().T], axis=-1)
+    positions = np.stack([np.interp(at, walked.numpy(), column) for column in points.numpy().T], axis=-1)
     if start is None:
         first, last = 0, grid.lap
     else:
         first, last = math.floor((start - reach) / grid.step), math.ceil((start + reach) / grid.step)
-    arcs = np.interp(walked.numpy(), at, grid.step * _find_best_arcs(grid, places, first, last + 1))
+    arcs = np.interp(walked.numpy(), at, grid.step * _find_best_arcs(grid, positions, first, last + 1))
     return _refine_arcs(curve, points, torch.from_numpy(arcs), reach)
 
 
@@ -59,7 +59,7 @@ class _ArcGrid:
 
     step: float
     """Arcs, metres."""
-    places: Float[ndarray, "arcs dims"]
+    positions: Float[ndarray, "arcs dims"]
     """Curve position at each arc, metres."""
     first: int
     """Number of the first arc; 0 on a closed curve, whose arcs go round."""
@@ -80,17 +80,17 @@ class _ArcGrid:
 
     def within(self, first: int, stop: int) -> tuple[int, int]:
         """Clip a range of numbers to those that exist."""
-        return (first, stop) if self.closed else (max(first, self.first), min(stop, self.first + len(self.places)))
+        return (first, stop) if self.closed else (max(first, self.first), min(stop, self.first + len(self.positions)))
 
     def squared_distances(self, point: Float[ndarray, " dims"], first: int, stop: int) -> Float[ndarray, " arcs"]:
         """Return squared distances from a position to the arcs first to stop."""
         numbers = np.arange(first - self.first, stop - self.first)
-        near = self.places.take(numbers, axis=0, mode="wrap") if self.closed else self.places[numbers]
+        near = self.positions.take(numbers, axis=0, mode="wrap") if self.closed else self.positions[numbers]
         return np.square(near - point).sum(-1)
 
 
 def _find_best_arcs(
-    grid: _ArcGrid, places: Float[ndarray, "count dims"], first: int, stop: int
+    grid: _ArcGrid, positions: Float[ndarray, "count dims"], first: int, stop: int
 ) -> Float[ndarray, " count"]:
     """Find the numbers of the arcs at the walk's positions; the first is one of first to stop."""
     most = _MAX_PACE_RATIO + 1
@@ -98,16 +98,16 @@ def _find_best_arcs(
     moves = np.arange(most, -most - 1, -1)
     price = np.where(moves > 0, _BACKWARD_COST * moves, 0.0) + 1e-9 * abs(moves)
     first, stop = grid.within(first, stop)
-    cost = grid.squared_distances(places[0], first, stop)
+    cost = grid.squared_distances(positions[0], first, stop)
     cameby: list[tuple[int, ndarray]] = []
-    for place in places[1:]:
+    for position in positions[1:]:
         first, stop, cost = _prune_arcs(first, cost)
         low, high = grid.within(first - most, stop + most)
         padded = np.pad(cost, 2 * most, constant_values=np.inf)[low - first + most : high - first + 3 * most]
         around = np.lib.stride_tricks.sliding_window_view(padded, 2 * most + 1)[:, ::-1] + price
         picked = around.argmin(-1)
         cost = np.take_along_axis(around, picked[:, None], axis=-1)[:, 0]
-        cost = cost + grid.squared_distances(place, low, high)
+        cost = cost + grid.squared_distances(position, low, high)
         cameby.append((low, moves[picked].astype(np.int8)))
         first, stop = low, high
     found = [first + int(cost.argmin())]

@@ -238,10 +238,10 @@ def _describe_frames(motion: Motion, step: int) -> Float[Tensor, "frames joints 
     frames = torch.arange(motion.num_frames)
     before, after = (frames - step).clamp(min=0), (frames + step).clamp(max=motion.num_frames - 1)
     seconds = (after - before).clamp(min=1).double() / float(motion.fps)
-    places = motion.joint_positions()
-    velocity = (places[after] - places[before]) / seconds[:, None, None]
+    positions = motion.joint_positions()
+    velocity = (positions[after] - positions[before]) / seconds[:, None, None]
     below = motion.root_position * motion.root_position.new_tensor([1.0, 0.0, 1.0])
-    seen = rotations.rotate_about_y(places - below[:, None], back)
+    seen = rotations.rotate_about_y(positions - below[:, None], back)
     return torch.cat([seen, _VELOCITY_SECONDS * rotations.rotate_about_y(velocity, back)], dim=-1)
 
 
@@ -315,9 +315,9 @@ def close_loop(motion: Motion, rig: Rig | None = None) -> Loop:
     cycle = find_cycle(rigged.canonical)
     reach = max(1, round(_WINDOW_SECONDS * fps))
     # How the body moves over the ground from the cycle's beginning to its end, all joints and frames around.
-    places = rigged.canonical.joint_positions()
-    back, on = min(reach, cycle.start), min(reach, len(places) - 1 - cycle.stop)
-    around = [places[frame - back : frame + on + 1] for frame in (cycle.start, cycle.stop)]
+    positions = rigged.canonical.joint_positions()
+    back, on = min(reach, cycle.start), min(reach, len(positions) - 1 - cycle.stop)
+    around = [positions[frame - back : frame + on + 1] for frame in (cycle.start, cycle.stop)]
     travel = fit_ground_transform(*around)
     travel = travel if abs(travel.turn) > _STRAIGHT else fit_ground_transform(*around, turning=False)
     first, last = max(0, cycle.start - reach), min(motion.num_frames, cycle.stop + reach + 1)
@@ -331,8 +331,8 @@ def close_loop(motion: Motion, rig: Rig | None = None) -> Loop:
     own = rigged.motion.slice(cycle.start, cycle.stop)
     away = float((own.root_position - own.root_position[0]).norm(dim=-1).max())
     if child is not None and away <= _STILL_METRES:  # a root joint that stays in place in the clip stays there
-        place, turn = (each[:1].expand_as(each).clone() for each in (own.root_position, own.local_quat_xyzw[:, 0]))
-        loop = set_root_track(loop, place, turn, [child])
+        position, turn = (each[:1].expand_as(each).clone() for each in (own.root_position, own.local_quat_xyzw[:, 0]))
+        loop = set_root_track(loop, position, turn, [child])
     return Loop(rigged.with_motion(loop).in_file_world(), cycle, travel)
 
 
@@ -351,9 +351,9 @@ def _carry_root(rigged: RiggedMotion, cycle: Cycle, travel: GroundTransform, fir
         return window
     turns, shifts = travel.share((torch.arange(first, last) - cycle.start).double() / cycle.frames)
     start, turn = rigged.motion.root_position[cycle.start], rigged.motion.local_quat_xyzw[cycle.start, 0]
-    place = rotations.rotate_about_y(start.expand(len(turns), 3), turns) + rotations.lift_ground(shifts)
+    position = rotations.rotate_about_y(start.expand(len(turns), 3), turns) + rotations.lift_ground(shifts)
     turned = rotations.multiply(rotations.about_y(turns), turn.expand(len(turns), 4))
-    return set_root_track(window, place, turned, [child])
+    return set_root_track(window, position, turned, [child])
 
 
 def _close(still: Motion, start: int, frames: int, reach: int, fps: float) -> Motion:

@@ -41,17 +41,17 @@ def pair_joints(rigmap: RigMap) -> list[int | None]:
             found |= {joint: partner, partner: joint}
     local = kinematics.local_from_world(skeleton.parents, rigmap.rest_quat_xyzw[None])
     origin = torch.zeros(1, 3, dtype=torch.float64)
-    places = kinematics.forward_kinematics(skeleton.offsets, skeleton.parents, origin, local)[0][0]
-    places = places - places[joints["hips"]]
+    positions = kinematics.forward_kinematics(skeleton.offsets, skeleton.parents, origin, local)[0][0]
+    positions = positions - positions[joints["hips"]]
     for joint in range(skeleton.num_joints):  # parents come first
         if joint not in found:
-            partner = _pair_by_place(joint, found, skeleton, places)
+            partner = _pair_by_position(joint, found, skeleton, positions)
             found |= {} if partner is None else {joint: partner, partner: joint}
     return [found.get(joint) for joint in range(skeleton.num_joints)]
 
 
-def _pair_by_place(
-    joint: int, found: dict[int, int], skeleton: Skeleton, places: Float[Tensor, "joints 3"]
+def _pair_by_position(
+    joint: int, found: dict[int, int], skeleton: Skeleton, positions: Float[Tensor, "joints 3"]
 ) -> int | None:
     parent = skeleton.parents[joint]
     if parent < 0:
@@ -59,9 +59,9 @@ def _pair_by_place(
     # Of a side in the name no partner was found by that name; what has none and is alone in the middle is its own.
     if parent not in found or split_side(skeleton.names[joint])[0] is not Side.MIDDLE:
         return None
-    mirrored = places[joint] * places.new_tensor([-1.0, 1.0, 1.0])
+    mirrored = positions[joint] * positions.new_tensor([-1.0, 1.0, 1.0])
     free = [other for other in skeleton.children(found[parent]) if other not in found]
-    near = min(((float((places[other] - mirrored).norm()), other) for other in free), default=(_NEAR, joint))
+    near = min(((float((positions[other] - mirrored).norm()), other) for other in free), default=(_NEAR, joint))
     if near[0] < _NEAR:
         return near[1]
     return joint if found[parent] == parent else None
@@ -101,14 +101,14 @@ def _mirror_joints(rigged: RiggedMotion) -> Motion:
     local = kinematics.local_from_world(motion.skeleton.parents, turned)
     alone = [joint for joint, partner in enumerate(partners) if partner is None]
     local[:, alone] = motion.local_quat_xyzw[:, alone]
-    made = replace(
+    flipped = replace(
         motion,
         root_position=motion.root_position * _FLIP,
         local_quat_xyzw=rotations.make_sign_continuous(local),
         moving_offsets=_mirror_offsets(motion, partners, rest),
     )
-    missed = motion.joint_positions()[:, rigged.hips] * _FLIP - made.joint_positions()[:, rigged.hips]
-    return rigged.with_motion(made).shift_hips(missed)
+    missed = motion.joint_positions()[:, rigged.hips] * _FLIP - flipped.joint_positions()[:, rigged.hips]
+    return rigged.with_motion(flipped).shift_hips(missed)
 
 
 def _mirror_offsets(

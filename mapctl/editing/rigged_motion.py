@@ -125,8 +125,8 @@ def place_ankles(rigged: RiggedMotion, ankles: Float[Tensor, "frames 2 3"]) -> M
 def _place_ankle(rigged: RiggedMotion, side: str, target: Float[Tensor, "frames 3"], local: Tensor) -> None:
     """Write the local rotations of one leg into `local`."""
     joints = [rigged.rigmap.joints[side + part] for part in ("UpperLeg", "LowerLeg", "Foot")]
-    places, world = rigged.motion.joint_positions(), rigged.motion.joint_rotations()
-    at, knee, ankle = (places[:, joint] for joint in joints)
+    positions, world = rigged.motion.joint_positions(), rigged.motion.joint_rotations()
+    at, knee, ankle = (positions[:, joint] for joint in joints)
     # The direction in the world in which the knee of a straight leg would bend.
     rest = rigged.rigmap.tpose_quat_xyzw[CANONICAL.index(side + "UpperLeg")]
     swung = rotations.multiply(world[:, joints[0]], rotations.inverse(rest).expand(len(world), 4))
@@ -170,8 +170,8 @@ def _turn_leg(
     along = (upper.square() - lower.square() + far.square()) / (2 * far).clamp_min(_TINY)
     height = (upper.square() - along.square()).clamp_min(0).sqrt()
     added = (height - side.norm(dim=-1)).clamp_min(0)[:, None]
-    way = torch.nn.functional.normalize(side + _FORWARD_SHARE * added * ahead, dim=-1)
-    knee = along[:, None] * axis + height[:, None] * way
+    direction = torch.nn.functional.normalize(side + _FORWARD_SHARE * added * ahead, dim=-1)
+    knee = along[:, None] * axis + height[:, None] * direction
     turn = rotations.multiply(rotations.between_vectors(thigh, knee), swing)
     bent = rotations.rotate(rotations.multiply(turn, rotations.inverse(swing)), shin)
     return turn, rotations.multiply(rotations.between_vectors(bent, far[:, None] * axis - knee), turn)

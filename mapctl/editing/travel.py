@@ -55,8 +55,8 @@ class GroundTransform:
         # (1 - exp(i s a)) / (1 - exp(i a)) without the loss of digits that small angles would bring.
         size = torch.sin(shares * self.turn / 2) / math.sin(self.turn / 2)
         x, z = self.shift_xz
-        place = torch.polar(size.abs(), (shares - 1) * self.turn / 2) * size.sign() * complex(z, x)
-        return shares * self.turn, torch.stack([place.imag, place.real], dim=-1)
+        position = torch.polar(size.abs(), (shares - 1) * self.turn / 2) * size.sign() * complex(z, x)
+        return shares * self.turn, torch.stack([position.imag, position.real], dim=-1)
 
 
 def move_by_share(motion: Motion, transform: GroundTransform, shares: Float[Tensor, " frames"]) -> Motion:
@@ -65,8 +65,8 @@ def move_by_share(motion: Motion, transform: GroundTransform, shares: Float[Tens
     turns, shifts = transform.share(shares)
     local = motion.local_quat_xyzw.clone()
     local[:, 0] = rotations.multiply(rotations.about_y(turns), local[:, 0])
-    place = rotations.rotate_about_y(motion.root_position, turns) + rotations.lift_ground(shifts)
-    return replace(motion, root_position=place, local_quat_xyzw=rotations.make_sign_continuous(local))
+    position = rotations.rotate_about_y(motion.root_position, turns) + rotations.lift_ground(shifts)
+    return replace(motion, root_position=position, local_quat_xyzw=rotations.make_sign_continuous(local))
 
 
 def repeat_over_ground(motion: Motion, transform: GroundTransform, times: int) -> Motion:
@@ -96,19 +96,19 @@ _NAMES = ("root", "motion_root")
 
 
 def set_root_track(
-    motion: Motion, place: Float[Tensor, "frames 3"], turn_xyzw: Float[Tensor, "frames 4"], kept: Sequence[int]
+    motion: Motion, position: Float[Tensor, "frames 3"], turn_xyzw: Float[Tensor, "frames 4"], kept: Sequence[int]
 ) -> Motion:
     """Return a motion whose joint 0 has this position (metres) and rotation (xyzw). Those of its children that are
     `kept` stay where they are in the world, the others go with it."""
-    places, world = motion.joint_positions(), motion.joint_rotations()
+    positions, world = motion.joint_positions(), motion.joint_rotations()
     local, moving = motion.local_quat_xyzw.clone(), dict(motion.moving_offsets)
     local[:, 0], back = turn_xyzw, rotations.inverse(turn_xyzw)
     for child in kept:
         local[:, child] = rotations.multiply(back, world[:, child])
-        moving[child] = rotations.rotate(back, places[:, child] - place)
+        moving[child] = rotations.rotate(back, positions[:, child] - position)
     return replace(
         motion,
-        root_position=place,
+        root_position=position,
         local_quat_xyzw=rotations.make_sign_continuous(local),
         moving_offsets=dict(sorted(moving.items())),
     )

@@ -126,11 +126,11 @@ def _read(path: str | PathLike[str], *, fps: Fraction | float | None, lossy: boo
     missing.check_any_known(take, np.isnan(text.values))
     degrees = asf.degrees if text.degrees is None else text.degrees
     skeleton, unit = _build_skeleton(asf)
-    places = missing.interpolate_nan(_positions(asf, text.values), np.zeros(3))
+    positions = missing.interpolate_nan(_positions(asf, text.values), np.zeros(3))
     motion = Motion(
         skeleton=skeleton,
         fps=Fraction(fps or text.fps or USUAL_FPS).limit_denominator(100_000),
-        root_position=torch.from_numpy((places + asf.root_position) * unit.metres_per_unit),
+        root_position=torch.from_numpy((positions + asf.root_position) * unit.metres_per_unit),
         local_quat_xyzw=_quaternions(asf, missing.hold_last(text.values), degrees=degrees),
         source=unit,
     )
@@ -141,9 +141,9 @@ def _find_missing(asf: AsfSkeleton, lost: np.ndarray) -> MissingValues:
     """Find the missing values by bone; a bone without channels is missing where all channels are."""
     whole = lost.all(axis=1)
     turns = [lost[:, columns].any(axis=1) | whole for _, columns in _columns(asf, "r")]
-    places = np.zeros((len(lost), len(turns)), dtype=bool)
-    places[:, 0] = lost[:, _columns(asf, "t")[0][1]].any(axis=1)
-    return MissingValues(torch.from_numpy(np.stack(turns, axis=1)), torch.from_numpy(places))
+    positions = np.zeros((len(lost), len(turns)), dtype=bool)
+    positions[:, 0] = lost[:, _columns(asf, "t")[0][1]].any(axis=1)
+    return MissingValues(torch.from_numpy(np.stack(turns, axis=1)), torch.from_numpy(positions))
 
 
 def find_paths(path: str | PathLike[str]) -> tuple[Path, Path]:
@@ -189,7 +189,7 @@ def _columns(asf: AsfSkeleton, kind: str) -> list[tuple[tuple[int, ...], list[in
     """Return by bone the axes of its channels of a kind, `t` or `r`, in file order, and their columns."""
     found, start = [], 0
     for channels in asf.channels:
-        wanted = [(channel, start + place) for place, channel in enumerate(channels) if channel[0] == kind]
+        wanted = [(channel, start + number) for number, channel in enumerate(channels) if channel[0] == kind]
         found.append((tuple("xyz".index(channel[1]) for channel, _ in wanted), [column for _, column in wanted]))
         start += len(channels)
     return found
@@ -284,11 +284,11 @@ class _AsfReader:
         if begun:
             self.fail(f"the bone of line {begun[0][0]} has no end", begun[-1][0])
         order, parents = self._tree(bones, sections[":hierarchy"])
-        place = {bone: number for number, bone in enumerate(order)}
+        index_of = {bone: number for number, bone in enumerate(order)}
         kept = [bones[bone] for bone in order]
         return AsfSkeleton(
             names=tuple(bone.name for bone in kept),
-            parents=tuple(place[parents[bone]] if bone else -1 for bone in order),
+            parents=tuple(index_of[parents[bone]] if bone else -1 for bone in order),
             ends=np.array([bone.end for bone in kept]),
             axis_quat_xyzw=np.array([bone.axis for bone in kept]),
             channels=tuple(bone.channels for bone in kept),

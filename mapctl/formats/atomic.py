@@ -71,12 +71,12 @@ def check_writable(path: str | PathLike[str]) -> None:
 
 def check_folder(folder: str | PathLike[str]) -> None:
     """Raise WriteError unless the folder exists and can be written in, or can be made; leave no trace."""
-    place = Path(os.path.realpath(folder))
-    while not place.exists() and place != place.parent:  # a drive that is not there has no parent but itself
-        place = place.parent
-    if not place.is_dir():
-        raise WriteError(f"cannot write to {folder}: {place} is not a folder")
-    check_writable(place / ".mapctl")
+    existing = Path(os.path.realpath(folder))
+    while not existing.exists() and existing != existing.parent:  # a drive that is not there has no parent but itself
+        existing = existing.parent
+    if not existing.is_dir():
+        raise WriteError(f"cannot write to {folder}: {existing} is not a folder")
+    check_writable(existing / ".mapctl")
 
 
 def _write_error(path: str | PathLike[str], error: OSError) -> WriteError:

@@ -359,9 +359,9 @@ def _find_fault(scanner: Scanner, labels: Sequence[str], *, may_wrap: bool, loss
     read = 0
     for line, row in _iterate_rows(scanner):
         words = _DATUM.findall(row)
-        for place, word in enumerate(words, read):
+        for number, word in enumerate(words, read):
             if finite_number(word) is None and not (lossy and missing.is_nan(word)):
-                frame, column = divmod(place, len(labels))
+                frame, column = divmod(number, len(labels))
                 where = f"frame {frame}, column {column + 1} ({labels[column]})"
                 got = f"{shorten(word)}{missing.missing_hint(word)}"
                 return FileFormatError(scanner.path, f"{where}: expected {NUMBER}, got {got}", line)
@@ -502,15 +502,15 @@ def _find_missing(tree: Hierarchy, lost: np.ndarray, moving: Sequence[int]) -> M
     tells the position of a joint that stays still."""
     whole = np.all(lost, axis=1)
     rotations = np.tile(whole[:, None], len(tree.names))
-    places = np.zeros_like(rotations)
-    places[:, 0] = whole
+    positions = np.zeros_like(rotations)
+    positions[:, 0] = whole
     for _, joints, columns in tree.rotation_groups():
         rotations[:, joints] |= lost[:, columns].any(axis=-1)
     for joint, columns in enumerate(tree.position_columns()):
         own = lost[:, list(columns.values())]
         if joint == 0 or joint in moving or own.all(axis=0).any():
-            places[:, joint] |= own.any(axis=1)
-    return MissingValues(torch.from_numpy(rotations), torch.from_numpy(places))
+            positions[:, joint] |= own.any(axis=1)
+    return MissingValues(torch.from_numpy(rotations), torch.from_numpy(positions))
 
 
 def unit_of(motion: Motion) -> float | None:
@@ -634,9 +634,9 @@ def _keep_source_values(
     if own is None or len(own) != len(values):
         return values
     before = _build_motion(layout, _fill_missing(old, own))
-    turns, places = as_array(before.local_quat_xyzw), all_translations(before) / layout.metres_per_unit
+    turns, positions = as_array(before.local_quat_xyzw), all_translations(before) / layout.metres_per_unit
     turned = (turns == quat_xyzw).all(-1) | (turns == -quat_xyzw).all(-1)
-    there = np.all(np.isclose(places, translations, rtol=1e-12, atol=1e-12), axis=-1)
+    there = np.all(np.isclose(positions, translations, rtol=1e-12, atol=1e-12), axis=-1)
     same = [now == then for now, then in zip(tree.channels, old.channels, strict=True)]
     for joint, (now, then) in enumerate(zip(tree.position_columns(), old.position_columns(), strict=True)):
         if same[joint]:

@@ -115,14 +115,14 @@ class RestFrames:
             rotations.from_matrix(turns),
             rotations.inverse(torch.from_numpy(self.quat_xyzw)).expand(*worlds.shape[:2], 4),
         )
-        places = torch.from_numpy(worlds[..., :3, 3].copy())
+        positions = torch.from_numpy(worlds[..., :3, 3].copy())
         local = rotations.make_sign_continuous(kinematics.local_from_world(self.parents, world))
         moving = {}
         for joint, parent in enumerate(self.parents[1:], start=1):
-            offset = rotations.rotate(rotations.inverse(world[:, parent]), places[:, joint] - places[:, parent])
+            offset = rotations.rotate(rotations.inverse(world[:, parent]), positions[:, joint] - positions[:, parent])
             if float((offset - skeleton.offsets[joint]).abs().max()) > STILL_METRES:
                 moving[joint] = offset
-        return Motion(skeleton, fps, places[:, 0], local, moving, source)
+        return Motion(skeleton, fps, positions[:, 0], local, moving, source)
 
     def to_locals(self, motion: Motion) -> tuple[Array, Array]:
         """Return translations (frames, joints, 3) and rotations (frames, joints, 4), xyzw, in the file's frames: of
@@ -132,13 +132,13 @@ class RestFrames:
         world = rotations.multiply(motion.joint_rotations(), rest)
         turn, unit = split_scale(self.outer)
         base = rotations.from_matrix(torch.from_numpy(turn)).expand(frames, 4)
-        origin, places = torch.from_numpy(self.outer[:3, 3].copy()), motion.joint_positions()
-        moved, turned = torch.empty_like(places), torch.empty_like(world)
+        origin, positions = torch.from_numpy(self.outer[:3, 3].copy()), motion.joint_positions()
+        moved, turned = torch.empty_like(positions), torch.empty_like(world)
         for joint, parent in enumerate(self.parents):
             above = base if parent < 0 else world[:, parent]
-            start = origin.expand(frames, 3) if parent < 0 else places[:, parent]
+            start = origin.expand(frames, 3) if parent < 0 else positions[:, parent]
             back, scale = rotations.inverse(above), unit if parent < 0 else self.scales[parent]
-            moved[:, joint] = rotations.rotate(back, places[:, joint] - start) / scale
+            moved[:, joint] = rotations.rotate(back, positions[:, joint] - start) / scale
             turned[:, joint] = rotations.multiply(back, world[:, joint])
         return moved.numpy(), rotations.make_sign_continuous(turned).numpy()
 
@@ -293,18 +293,18 @@ Reader = Callable[..., FoundCharacter]
 
 @names_file
 def load_motion(
-    path: str | PathLike[str], read: Reader, place: Callable[[FoundCharacter], tuple[Fraction, Array]]
+    path: str | PathLike[str], read: Reader, read_poses: Callable[[FoundCharacter], tuple[Fraction, Array]]
 ) -> Motion:
     """Read an animation by native code, in a sandbox; one frame of the rest pose where there is none.
 
     `read` is called with the file, what the path chooses of it and what is `wanted` (`motion`, `rest` or `mesh`);
-    `place` returns frames per second and world matrices (frames, joints, 4, 4) of the poses that it found.
+    `read_poses` returns frames per second and world matrices (frames, joints, 4, 4) of the poses that it found.
     """
     found, frames, source = _read_native(path, read, "motion")
     skeleton = _build_skeleton(found, frames)
     if found.poses is None:
         return frames.rest_motion(skeleton, source)
-    fps, worlds = place(found)
+    fps, worlds = read_poses(found)
     return frames.to_motion(worlds, fps, skeleton, source)
 
 

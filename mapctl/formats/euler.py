@@ -50,8 +50,8 @@ def can_represent(quat_xyzw: np.ndarray, axes: Sequence[int], *, tolerance: floa
     """Return whether rotations about `axes` can represent these (frames, joints, 4), to `tolerance` radians."""
     if len(axes) == 3:
         return True
-    made = to_quat_xyzw(from_quat_xyzw(quat_xyzw, axes), axes)
-    nearest = np.minimum(abs(made - quat_xyzw).max(-1), abs(made + quat_xyzw).max(-1))
+    round_trip = to_quat_xyzw(from_quat_xyzw(quat_xyzw, axes), axes)
+    nearest = np.minimum(abs(round_trip - quat_xyzw).max(-1), abs(round_trip + quat_xyzw).max(-1))
     return bool((2 * nearest <= tolerance).all())
 
 

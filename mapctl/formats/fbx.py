@@ -259,16 +259,16 @@ def find_armatures(scene: ufbx.Scene) -> list[Armature]:
 def _read_bind_poses(scene: ufbx.Scene, armature: Armature) -> list[dict[int, Array]]:
     """Return world matrices (4, 4) by joint of the poses that the file says skins are bound in: by its skins, and by
     its bind poses."""
-    place = {node.typed_id: joint for joint, node in enumerate(armature.nodes)}
+    index_of = {node.typed_id: joint for joint, node in enumerate(armature.nodes)}
     skins: dict[int, Array] = {}
     for cluster in each(scene.skin_clusters):
-        if cluster.bone_node is not None and cluster.bone_node.typed_id in place:
-            skins.setdefault(place[cluster.bone_node.typed_id], to_matrix(cluster.bind_to_world))
+        if cluster.bone_node is not None and cluster.bone_node.typed_id in index_of:
+            skins.setdefault(index_of[cluster.bone_node.typed_id], to_matrix(cluster.bind_to_world))
     poses: dict[int, Array] = {}
     for pose in each(scene.poses):
         for bone in each(pose.bone_poses) if pose.is_bind_pose else ():
-            if bone.bone_node.typed_id in place:
-                poses.setdefault(place[bone.bone_node.typed_id], to_matrix(bone.bone_to_world))
+            if bone.bone_node.typed_id in index_of:
+                poses.setdefault(index_of[bone.bone_node.typed_id], to_matrix(bone.bone_to_world))
     return [bound for bound in ({**poses, **skins}, poses) if bound]
 
 
@@ -323,10 +323,10 @@ def _build(scene: ufbx.Scene, tops: list[ufbx.Node], bones: dict[int, ufbx.Node]
     joints = [node for node in joints if node is root or not _is_end(node)]
     if len(joints) > MAX_JOINTS:
         raise Refusal(f"has an armature of {len(joints)} joints, allowed are {MAX_JOINTS}")
-    place = {node.typed_id: index for index, node in enumerate(joints)}
-    parents = tuple(-1 if node is root else place[above(node).typed_id] for node in joints)
+    index_of = {node.typed_id: index for index, node in enumerate(joints)}
+    parents = tuple(-1 if node is root else index_of[above(node).typed_id] for node in joints)
     holder = "" if root.is_root or above(root).is_root else above(root).name
-    return Armature(holder or root.name or "armature", joints, parents, {place[k]: node for k, node in ends.items()})
+    return Armature(holder or root.name or "armature", joints, parents, {index_of[k]: node for k, node in ends.items()})
 
 
 def _is_end(node: ufbx.Node) -> bool:
@@ -409,38 +409,38 @@ def _sample_node(anim: ufbx.Anim, node: ufbx.Node, times: Array, moved: set[int]
 
 def _read_parts(scene: ufbx.Scene, armature: Armature, folder: Path) -> list[MeshPart]:
     """Read what the armature's skins carry, and what hangs on its joints rigidly; pictures lie in `folder` or below."""
-    place = {node.typed_id: joint for joint, node in enumerate(armature.nodes)}
+    index_of = {node.typed_id: joint for joint, node in enumerate(armature.nodes)}
     found = []
     for mesh in each(scene.meshes):
         if mesh.num_indices > MAX_CORNERS:
             raise Refusal(f"mesh {mesh.name!r} has {mesh.num_indices} corners, allowed are {MAX_CORNERS}")
         for node in each(mesh.instances):
-            carriers = _read_carriers(mesh, node, place, armature)
+            carriers = _read_carriers(mesh, node, index_of, armature)
             if carriers is not None and mesh.num_triangles:
                 found.append(_read_part(mesh, node, carriers, folder))
     return found
 
 
 def _read_carriers(
-    mesh: ufbx.Mesh, node: ufbx.Node, place: dict[int, int], armature: Armature
+    mesh: ufbx.Mesh, node: ufbx.Node, index_of: dict[int, int], armature: Armature
 ) -> tuple[Array, Array, Array, Array] | None:
     """Return joints (m,) and matrices (m, 4, 4) from the mesh to their frames, and by vertex indices among them (n, k)
     and their shares; None where the armature does not carry the mesh."""
     count = mesh.num_vertices
     if len(mesh.skin_deformers):
         skin = each(mesh.skin_deformers)[0]
-        own = [place.get(c.bone_node.typed_id) if c.bone_node is not None else None for c in each(skin.clusters)]
+        own = [index_of.get(c.bone_node.typed_id) if c.bone_node is not None else None for c in each(skin.clusters)]
         if all(joint is None for joint in own):
             return None
         to_root = np.linalg.pinv(to_matrix(armature.nodes[0].node_to_world)) @ to_matrix(node.geometry_to_world)
         matrices = [to_root, *(to_matrix(cluster.geometry_to_bone) for cluster in each(skin.clusters))]
         rows, shares = _read_weights(skin, count)
         return np.array([0, *(joint or 0 for joint in own)]), np.stack(matrices), rows, shares
-    above = next((other for other in line_of(node) if other.typed_id in place), None)
+    above = next((other for other in line_of(node) if other.typed_id in index_of), None)
     if above is None:
         return None
     matrix = np.linalg.pinv(to_matrix(above.node_to_world)) @ to_matrix(node.geometry_to_world)
-    return np.array([place[above.typed_id]]), matrix[None], np.zeros((count, 1), np.int64), np.ones((count, 1))
+    return np.array([index_of[above.typed_id]]), matrix[None], np.zeros((count, 1), np.int64), np.ones((count, 1))
 
 
 def _read_weights(skin: ufbx.SkinDeformer, count: int) -> tuple[Array, Array]:

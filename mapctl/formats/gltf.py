@@ -436,14 +436,14 @@ def _bind_worlds(gltf: Gltf, armature: Armature, worlds: Array, outer: Array) ->
 
     Bind matrices are in the space of the vertices: that of the scene, or that of what is above the root.
     """
-    place = {node: index for index, node in enumerate(armature.nodes)}
+    index_of = {node: index for index, node in enumerate(armature.nodes)}
     bound: dict[int, Array] = {}
     for number in armature.skins:
         inverse = _read_inverse_binds(gltf, number)
         if inverse is None:
             return None
         for node, matrix in zip(gltf.get("skins", number)["joints"], inverse, strict=True):
-            bound.setdefault(place[node], np.linalg.inv(matrix))  # a ValueError where it is singular
+            bound.setdefault(index_of[node], np.linalg.inv(matrix))  # a ValueError where it is singular
     spaces = ({joint: space @ matrix for joint, matrix in bound.items()} for space in (np.eye(4), outer))
     complete = (complete_bind_pose(armature.parents, space, worlds) for space in spaces)
     return next((pose for pose in complete if pose is not None), None)
@@ -473,10 +473,10 @@ def _node_matrix(node: Json) -> Array:
     """Return what takes a node's frame to its parent's, (4, 4)."""
     if node.get("matrix") is not None:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T
-    place, turn, scale = _node_parts(node).values()
+    position, turn, scale = _node_parts(node).values()
     length = np.linalg.norm(turn)
     turn = turn / length if length > 1e-9 else np.array(_AT_REST["rotation"])
-    return compose_matrices(place, turn, scale)
+    return compose_matrices(position, turn, scale)
 
 
 def read_bones(gltf: Gltf) -> dict[str, int]:
@@ -545,14 +545,14 @@ def _build_armature(gltf: Gltf, joints: set[int], skins: list[int], animated: se
     order = [node for node in gltf.walk(moved[-1] if moved else own[0]) if node in wanted]
     if len(order) > MAX_JOINTS:
         raise Refusal(f"an armature has {len(order)} joints, allowed are {MAX_JOINTS}")
-    place = {node: index for index, node in enumerate(order)}
-    parents = tuple(-1 if node == order[0] else place[gltf.parent[node]] for node in order)
+    index_of = {node: index for index, node in enumerate(order)}
+    parents = tuple(-1 if node == order[0] else index_of[gltf.parent[node]] for node in order)
     ends = {}
     for node in order:
         children = nodes[node].get("children", ())
-        tips = [child for child in children if child not in place and nodes[child].get("mesh") is None]
-        if len(tips) == 1 and not any(child in place for child in children):
-            ends[place[node]] = tips[0]
+        tips = [child for child in children if child not in index_of and nodes[child].get("mesh") is None]
+        if len(tips) == 1 and not any(child in index_of for child in children):
+            ends[index_of[node]] = tips[0]
     above = [nodes[k] for k in (gltf.parent.get(order[0]), order[0]) if k is not None]  # exporters name it there
     named = [*(gltf.get("skins", skin) for skin in skins[:1]), *above]
     name = next((str(one["name"]) for one in named if one.get("name")), f"armature_{order[0]}")
@@ -654,36 +654,36 @@ def _sample_tracks(gltf: Gltf, nodes: Sequence[int], tracks: Sequence[Track]) ->
     check_extent(gltf.path, len(times), len(nodes))
     moved = {track.node for track in tracks}
     matrices = np.empty((len(times), len(nodes), 4, 4))
-    for place, node in enumerate(nodes):
+    for number, node in enumerate(nodes):
         own = gltf.get("nodes", node)
         if node not in moved:
-            matrices[:, place] = _node_matrix(own)
+            matrices[:, number] = _node_matrix(own)
             continue
         parts = {path: np.tile(values, (len(times), 1)) for path, values in _node_parts(own).items()}
         parts |= {track.path: track.sample(times) for track in tracks if track.node == node}
         lengths = np.linalg.norm(parts["rotation"], axis=1, keepdims=True)
         turns = np.where(lengths > 1e-9, parts["rotation"] / np.maximum(lengths, 1e-9), _AT_REST["rotation"])
-        matrices[:, place] = compose_matrices(parts["translation"], turns, parts["scale"])
+        matrices[:, number] = compose_matrices(parts["translation"], turns, parts["scale"])
     return fps, matrices
 
 
 def _read_parts(gltf: Gltf, armature: Armature) -> Iterator[MeshPart]:
     """Read what the armature's skins carry, and what hangs on its joints rigidly."""
-    place = {node: joint for joint, node in enumerate(armature.nodes)}
+    index_of = {node: joint for joint, node in enumerate(armature.nodes)}
     for number, node in enumerate(gltf.all("nodes")):
         mesh, skin = node.get("mesh"), node.get("skin")
         if mesh is None:
             continue
         if skin is not None and skin in armature.skins:
-            joints = np.array([place[node] for node in gltf.get("skins", skin)["joints"]])
+            joints = np.array([index_of[node] for node in gltf.get("skins", skin)["joints"]])
             inverse = _read_inverse_binds(gltf, skin)
             matrices = np.tile(np.eye(4), (len(joints), 1, 1)) if inverse is None else inverse
         else:
             line = gltf.line(number)
-            above = next((above for above in line if above in place), None)
+            above = next((above for above in line if above in index_of), None)
             if above is None or skin is not None:
                 continue
-            joints, matrices = np.array([place[above]]), gltf.chain(line[: line.index(above)])[None]
+            joints, matrices = np.array([index_of[above]]), gltf.chain(line[: line.index(above)])[None]
         for k, primitive in enumerate(gltf.get("meshes", mesh).get("primitives", ())):
             what, attributes = f"meshes[{mesh}].primitives[{k}]", primitive["attributes"]
             if primitive.get("mode", 4) not in (_TRIANGLES, _STRIP, _FAN) or "POSITION" not in attributes:
@@ -1065,17 +1065,17 @@ def _select_bones(motion: Motion, bones: Mapping[str, int], path: str | PathLike
         tips = [rest[whole.index(name)] + torch.tensor(end, dtype=rest.dtype) for name, end in ends.items()]
         height = torch.tensor([0.0, float(rest[hips, 1] - torch.stack([*rest, *tips])[:, 1].min()), 0.0])
     offsets = torch.stack([rest[j] - rest[joints[max(p, 0)]] for j, p in zip(joints, parents, strict=True)])
-    world, places = motion.joint_rotations()[:, joints], motion.joint_positions()[:, joints]
+    world, positions = motion.joint_rotations()[:, joints], motion.joint_positions()[:, joints]
     if rest[bones["leftUpperLeg"], 0] < rest[bones["rightUpperLeg"], 0]:  # VRM 0 faces -Z
         flip = torch.tensor([-1.0, 1.0, -1.0], dtype=torch.float64)
-        offsets, places, height = offsets * flip, places * flip, height * flip
+        offsets, positions, height = offsets * flip, positions * flip, height * flip
         ends = {name: (-x, y, -z) for name, (x, y, z) in ends.items()}
         turn = _HALF_TURN.expand_as(world)
         world = rotations.multiply(rotations.multiply(turn, world), rotations.inverse(turn))
     local = rotations.make_sign_continuous(kinematics.local_from_world(tuple(parents), world))
     skeleton = Skeleton(tuple(whole.names[joint] for joint in joints), tuple(parents), offsets, ends)
-    body = Motion(skeleton, motion.fps, places[:, 0].clone(), local, licence=motion.licence)
-    lost = float((body.joint_positions() - places).norm(dim=-1).max())
+    body = Motion(skeleton, motion.fps, positions[:, 0].clone(), local, licence=motion.licence)
+    lost = float((body.joint_positions() - positions).norm(dim=-1).max())
     if lost > _STILL_METRES:
         warn_once(
             f"{path}: only the hips of a .vrma travel; bones whose length changes are up to {100 * lost:.1f} cm off"

@@ -20,7 +20,7 @@ class MissingValues:
 
     rotations: Bool[Tensor, "frames joints"]
     """Missing local rotations; the motion repeats the last known one."""
-    places: Bool[Tensor, "frames joints"]
+    positions: Bool[Tensor, "frames joints"]
     """Missing positions within the parent, of the root in the world; the motion interpolates linearly between known
     ones."""
 

@@ -165,9 +165,9 @@ def _check_shapes(path: str | PathLike[str], arrays: dict[str, np.ndarray], *, l
         if key in _TRACKS and lossy:
             small = small | np.isnan(values)
         if not small.all():
-            place = np.argwhere(~small)[0].tolist()
-            hint = missing.missing_hint(str(values[tuple(place)])) if key in _TRACKS else ""
-            raise FileFormatError(path, f"{key} at {place}: expected {NUMBER}{hint}")
+            index = np.argwhere(~small)[0].tolist()
+            hint = missing.missing_hint(str(values[tuple(index)])) if key in _TRACKS else ""
+            raise FileFormatError(path, f"{key} at {index}: expected {NUMBER}{hint}")
 
 
 def _replace_missing(path: str | PathLike[str], arrays: dict[str, np.ndarray]) -> MissingValues:
@@ -175,11 +175,11 @@ def _replace_missing(path: str | PathLike[str], arrays: dict[str, np.ndarray]) -
     lost: list[np.ndarray] = [np.isnan(arrays[key]) for key in _TRACKS]
     missing.check_any_known(path, np.concatenate([part.ravel() for part in lost]))
     root, turns, moving = lost
-    places = np.zeros_like(turns[:, :, 0])
-    places[:, 0] = root.any(axis=-1)
+    positions = np.zeros_like(turns[:, :, 0])
+    positions[:, 0] = root.any(axis=-1)
     for track, joint in enumerate(arrays["moving_joints"].tolist()):
-        if 0 < joint < places.shape[1]:  # others are refused later
-            places[:, joint] = moving[track].any(axis=-1)
+        if 0 < joint < positions.shape[1]:  # others are refused later
+            positions[:, joint] = moving[track].any(axis=-1)
     if any(part.any() for part in lost):
         whole = np.where(turns.any(axis=-1, keepdims=True), np.nan, arrays["local_quat_xyzw"])
         held = missing.hold_last(whole.reshape(len(whole), -1)).reshape(whole.shape)
@@ -191,7 +191,7 @@ def _replace_missing(path: str | PathLike[str], arrays: dict[str, np.ndarray]) -
             "moving_offsets": np.array(tracks).reshape(moving.shape),
             "root_position_world": missing.interpolate_nan(arrays["root_position_world"], np.zeros(3)),
         }
-    return MissingValues(torch.from_numpy(turns.any(axis=-1)), torch.from_numpy(places))
+    return MissingValues(torch.from_numpy(turns.any(axis=-1)), torch.from_numpy(positions))
 
 
 def _numbers(values: Tensor) -> np.ndarray:

@@ -88,10 +88,10 @@ def hips_to_toes_length(
 
 def longest_chain_length(parents: Sequence[int], lengths: np.ndarray, ends: Mapping[int, float]) -> float:
     """Return the length of the longest chain of bones from the root to a leaf or End Site, in the unit of `lengths`."""
-    way = np.zeros(len(parents))
+    distance = np.zeros(len(parents))
     for joint in range(1, len(parents)):
-        way[joint] = way[parents[joint]] + lengths[joint]
-    return float(max(way[joint] + ends.get(joint, 0.0) for joint in range(len(parents))))
+        distance[joint] = distance[parents[joint]] + lengths[joint]
+    return float(max(distance[joint] + ends.get(joint, 0.0) for joint in range(len(parents))))
 
 
 def _normalise_name(name: str) -> str:

@@ -179,12 +179,12 @@ def read_character(path: str, *, armature: str | None, animation: str | None, wa
         number = find_name(Path(path).name, listed, armature, "armature")
         skeleton = read_skeleton(prims[number])
         outer = world_of(skeleton.prim, _FIRST)
-        place = str(skeleton.prim.GetPath())
+        path = str(skeleton.prim.GetPath())
         found = FoundCharacter(
             armature=listed[number],
             armatures=listed,
             names=make_unique(skeleton.names),
-            nodes=[f"{place}.{joint}" for joint in skeleton.joints],
+            nodes=[f"{path}.{joint}" for joint in skeleton.joints],
             parents=tuple(skeleton.parents),
             metres_per_unit=UsdGeom.GetStageMetersPerUnit(stage),
             worlds=_place_rest(skeleton, outer, stage_to_world(stage)),
@@ -204,7 +204,7 @@ def read_character(path: str, *, armature: str | None, animation: str | None, wa
             found.parts = _read_parts(stage, skeleton, Path(path).resolve().parent)
     except (Tf.ErrorException, UnicodeDecodeError) as error:
         raise Refusal(f"is no sound USD file: {first_reason(error)}") from None
-    return _add_root(found, place) if skeleton.parents.count(-1) > 1 else found
+    return _add_root(found, path) if skeleton.parents.count(-1) > 1 else found
 
 
 def _place_rest(skeleton: "SkeletonPrim", outer: Array, stage: Array) -> Array:
@@ -233,10 +233,10 @@ def _place_rest(skeleton: "SkeletonPrim", outer: Array, stage: Array) -> Array:
     return outer @ bind
 
 
-def _add_root(found: FoundCharacter, place: str) -> FoundCharacter:
+def _add_root(found: FoundCharacter, path: str) -> FoundCharacter:
     """Put a joint above those of a skeleton of several roots."""
-    found.names = make_unique([place.rpartition("/")[2], *found.names])
-    found.nodes = [place, *found.nodes]
+    found.names = make_unique([path.rpartition("/")[2], *found.names])
+    found.nodes = [path, *found.nodes]
     found.parents = (-1, *(parent + 1 for parent in found.parents))
     found.worlds = np.concatenate([found.outer[None], found.worlds])
     found.parts = [replace(part, joints=part.joints + 1) for part in found.parts]
@@ -396,14 +396,14 @@ def read_value(attribute: Usd.Attribute, time: Usd.TimeCode | None = None):
 
 def _find_parents(joints: list[str], where: str) -> list[int]:
     """Return each joint's nearest one above it in its path, which must come before it."""
-    place = {joint: number for number, joint in enumerate(joints)}
-    if len(place) < len(joints):
+    index_of = {joint: number for number, joint in enumerate(joints)}
+    if len(index_of) < len(joints):
         raise Refusal(f"{where} names a joint twice")
     parents = []
     for number, joint in enumerate(joints):
         words = joint.split("/")
         above = ("/".join(words[:length]) for length in range(len(words) - 1, 0, -1))
-        parent = next((place[path] for path in above if path in place), -1)
+        parent = next((index_of[path] for path in above if path in index_of), -1)
         if parent >= number:
             raise Refusal(f"{where}: joint {joint!r} comes before the joint above it")
         parents.append(parent)
@@ -476,9 +476,9 @@ def _sample_joints(
 ) -> Array:
     """Return the skeleton's joints (keys, joints, 10); those that the animation leaves out are at rest."""
     moved = [str(joint) for joint in read_value(animation.GetJointsAttr()) or ()]
-    place = {joint: number for number, joint in enumerate(skeleton.joints)}
-    here = [number for number, joint in enumerate(moved) if joint in place]
-    there = [place[moved[number]] for number in here]
+    index_of = {joint: number for number, joint in enumerate(skeleton.joints)}
+    here = [number for number, joint in enumerate(moved) if joint in index_of]
+    there = [index_of[moved[number]] for number in here]
     if not here:
         raise Refusal(f"{what} moves none of the skeleton's joints")
     local = np.tile(_rest_parts(skeleton), (len(times), 1, 1))
@@ -660,9 +660,9 @@ def _read_mesh(query: UsdSkel.SkinningQuery, skeleton: SkeletonPrim, folder: Pat
 def _read_palette(query: UsdSkel.SkinningQuery, skeleton: SkeletonPrim) -> tuple[Array, Array]:
     """Return joints (m,) of the skeleton in the mesh's order, and what takes the mesh to their frames (m, 4, 4)."""
     order = query.GetJointOrder()
-    place = {joint: number for number, joint in enumerate(skeleton.joints)}
+    index_of = {joint: number for number, joint in enumerate(skeleton.joints)}
     names = skeleton.joints if order is None else [str(joint) for joint in order]
-    joints = np.array([place.get(name, 0) for name in names])
+    joints = np.array([index_of.get(name, 0) for name in names])
     geometry = np.array(query.GetGeomBindTransform() or Gf.Matrix4d(1.0)).T
     bind = skeleton.bind
     if bind is None:
@@ -728,7 +728,7 @@ def save(motion: "Motion", path: str | PathLike[str]) -> None:
         translations=moved,
         rotations=turned,
         scales=scales,
-        places=motion.joint_positions().numpy(),
+        positions=motion.joint_positions().numpy(),
         outer=source.frames.outer,
     )
     folder = str(target.resolve().parent)
@@ -777,7 +777,7 @@ class NewMotion:
     """(frames, joints, 4) xyzw."""
     scales: Array
     """(joints, 3)"""
-    places: Array
+    positions: Array
     """(frames, joints, 3) in the world, metres."""
     outer: Array
     """(4, 4) what takes the skeleton's space to the world, as it was read."""
@@ -792,9 +792,9 @@ def write_character(path: str, *, motion: NewMotion, scratch: str, folder: str) 
         raise Refusal(f"is no sound USD file: {first_reason(error)}") from None
     try:
         _copy_stage(stage, scratch, Path(folder).resolve())
-        made = Usd.Stage.Open(scratch)
-        _add_motion(made, motion)
-        return "" if made.GetRootLayer().Save() else "USD does not say why"
+        edited = Usd.Stage.Open(scratch)
+        _add_motion(edited, motion)
+        return "" if edited.GetRootLayer().Save() else "USD does not say why"
     except (Tf.ErrorException, RuntimeError) as error:
         return first_reason(error)
 
@@ -835,19 +835,19 @@ def _add_motion(stage: Usd.Stage, motion: NewMotion) -> None:
     if replaced is None:
         taken = {child.GetName() for child in skeleton.prim.GetAllChildren()}
         name = _plain_name(motion.stem, taken)
-        made = UsdSkel.Animation.Define(stage, skeleton.prim.GetPath().AppendChild(name))
+        animation = UsdSkel.Animation.Define(stage, skeleton.prim.GetPath().AppendChild(name))
     else:
-        made = UsdSkel.Animation(_as_own(stage, replaced))
-    made.CreateJointsAttr(skeleton.joints)
-    attributes = made.CreateTranslationsAttr(), made.CreateRotationsAttr(), made.CreateScalesAttr()
+        animation = UsdSkel.Animation(_as_own(stage, replaced))
+    animation.CreateJointsAttr(skeleton.joints)
+    attributes = animation.CreateTranslationsAttr(), animation.CreateRotationsAttr(), animation.CreateScalesAttr()
     for attribute in attributes:
         attribute.Clear()
     attributes[2].Set(Vt.Vec3hArray.FromNumpy(np.ascontiguousarray(motion.scales, np.float16)))
     _write_samples(attributes[1], Vt.QuatfArray, turned, codes.tolist())
     _write_samples(attributes[0], Vt.Vec3fArray, moved, codes.tolist())
     binding = UsdSkel.BindingAPI.Apply(skeleton.prim)
-    binding.CreateAnimationSourceRel().SetTargets([made.GetPath()])
-    _set_extent(skeleton.prim, motion.places)
+    binding.CreateAnimationSourceRel().SetTargets([animation.GetPath()])
+    _set_extent(skeleton.prim, motion.positions)
 
 
 def _as_own(stage: Usd.Stage, prim: Usd.Prim) -> Usd.Prim:
@@ -914,14 +914,14 @@ def _write_samples(attribute: Usd.Attribute, kind: type, values: Array, codes: S
         attribute.Set(kind.FromNumpy(value), code)  # USD's quaternions take xyzw, as ours are
 
 
-def _set_extent(prim: Usd.Prim, places: Array) -> None:
+def _set_extent(prim: Usd.Prim, positions: Array) -> None:
     """Set the extent of the SkelRoot that a skeleton is in, if it says one; viewers draw nothing beyond it."""
     while prim and not prim.IsA(UsdSkel.Root):
         prim = prim.GetParent()
     extent = UsdGeom.Boundable(prim).GetExtentAttr() if prim else None
     if not extent or read_value(extent) is None:
         return
-    corners = np.array([places.min(axis=(0, 1)) - _MARGIN, places.max(axis=(0, 1)) + _MARGIN])
+    corners = np.array([positions.min(axis=(0, 1)) - _MARGIN, positions.max(axis=(0, 1)) + _MARGIN])
     grid = np.array(np.meshgrid(*corners.T)).reshape(3, -1)
     back = np.linalg.pinv(world_of(prim, _FIRST))
     own = (back[:3, :3] @ grid + back[:3, 3:]).T
@@ -951,25 +951,25 @@ def _build_stage(motion: "Motion") -> Usd.Stage:
     skeleton.CreateJointNamesAttr(list(motion.skeleton.names))
     offsets = motion.skeleton.offsets.numpy().copy()
     offsets[0] = 0.0
-    for create, places in (
+    for create, positions in (
         (skeleton.CreateBindTransformsAttr, body.rest),
         (skeleton.CreateRestTransformsAttr, offsets),
     ):
-        matrices = np.tile(np.eye(4), (len(places), 1, 1))
-        matrices[:, 3, :3] = places  # USD's vectors are rows, so the translation is the last row
+        matrices = np.tile(np.eye(4), (len(positions), 1, 1))
+        matrices[:, 3, :3] = positions  # USD's vectors are rows, so the translation is the last row
         create(Vt.Matrix4dArray.FromNumpy(matrices))
 
-    made = UsdSkel.Animation.Define(stage, f"{_ROOT}/motion")
-    made.CreateJointsAttr(joints)
-    made.CreateScalesAttr(Vt.Vec3hArray.FromNumpy(np.ones((len(joints), 3), np.float16)))
+    animation = UsdSkel.Animation.Define(stage, f"{_ROOT}/motion")
+    animation.CreateJointsAttr(joints)
+    animation.CreateScalesAttr(Vt.Vec3hArray.FromNumpy(np.ones((len(joints), 3), np.float16)))
     translations, codes = all_translations(motion).astype(np.float32), list(range(motion.num_frames))
     if not motion.moving_offsets and (translations[:, 0] == translations[0, 0]).all():
-        made.CreateTranslationsAttr().Set(Vt.Vec3fArray.FromNumpy(translations[0]))
+        animation.CreateTranslationsAttr().Set(Vt.Vec3fArray.FromNumpy(translations[0]))
     else:
-        _write_samples(made.CreateTranslationsAttr(), Vt.Vec3fArray, translations, codes)
+        _write_samples(animation.CreateTranslationsAttr(), Vt.Vec3fArray, translations, codes)
     turns = as_array(make_sign_continuous(motion.local_quat_xyzw))
-    _write_samples(made.CreateRotationsAttr(), Vt.QuatfArray, turns, codes)
-    UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets([made.GetPath()])
+    _write_samples(animation.CreateRotationsAttr(), Vt.QuatfArray, turns, codes)
+    UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets([animation.GetPath()])
 
     UsdSkel.BindingAPI.Apply(_define_mesh(stage, body)).CreateSkeletonRel().SetTargets([skeleton.GetPath()])
     reach = motion.joint_positions().numpy().reshape(-1, 3)  # viewers frame the character by the extent
@@ -991,22 +991,22 @@ def joint_paths(skeleton: "Skeleton") -> list[str]:
 
 
 def _define_mesh(stage: Usd.Stage, body: "SkinnedBody") -> Usd.Prim:
-    made = UsdGeom.Mesh.Define(stage, f"{_ROOT}/{body.name}")
-    made.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(body.vertices.astype(np.float32)))
-    made.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(body.faces), 3, np.int32)))
-    made.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(body.faces.reshape(-1).astype(np.int32)))
-    made.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(body.normals.astype(np.float32)))
-    made.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
-    made.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-    made.CreateExtentAttr([Gf.Vec3f(*corner.tolist()) for corner in (body.vertices.min(0), body.vertices.max(0))])
-    colour = made.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
+    mesh = UsdGeom.Mesh.Define(stage, f"{_ROOT}/{body.name}")
+    mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(body.vertices.astype(np.float32)))
+    mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(body.faces), 3, np.int32)))
+    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(body.faces.reshape(-1).astype(np.int32)))
+    mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(body.normals.astype(np.float32)))
+    mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+    mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    mesh.CreateExtentAttr([Gf.Vec3f(*corner.tolist()) for corner in (body.vertices.min(0), body.vertices.max(0))])
+    colour = mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
     colour.Set(Vt.Vec3fArray.FromNumpy(body.linear_rgb.astype(np.float32)))
-    binding, width = UsdSkel.BindingAPI.Apply(made.GetPrim()), body.joints.shape[1]
+    binding, width = UsdSkel.BindingAPI.Apply(mesh.GetPrim()), body.joints.shape[1]
     joints, weights = body.joints.reshape(-1).astype(np.int32), body.weights.reshape(-1).astype(np.float32)
     binding.CreateJointIndicesPrimvar(False, width).Set(Vt.IntArray.FromNumpy(joints))
     binding.CreateJointWeightsPrimvar(False, width).Set(Vt.FloatArray.FromNumpy(weights))
     binding.CreateGeomBindTransformAttr(Gf.Matrix4d(1.0))
-    return made.GetPrim()
+    return mesh.GetPrim()
 
 
 def _export(stage: Usd.Stage, scratch: Path) -> None:

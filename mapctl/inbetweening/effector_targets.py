@@ -24,18 +24,21 @@ _NEGLIGIBLE = 1e-12  # metres
 class EffectorTargets:
     """Target positions, by frame and canonical joint; limbs bend to those of `LIMBS`."""
 
-    places: Float[Tensor, "frames joints 3"]
+    positions: Float[Tensor, "frames joints 3"]
     """World positions, metres; anything finite where there is no target."""
     wanted: Bool[Tensor, "frames joints"]
     """Whether a joint has a target in a frame."""
 
     def shown(self, seconds: Float[Tensor, " shown"], *, fps: float) -> "EffectorTargets":
         """Return the targets at other, increasing times: each is moved to the time nearest to its own."""
-        nearest = _find_nearest_times(len(self.places), seconds, fps=fps)
-        joints = self.places.shape[1]
-        positions, wanted = self.places.new_zeros(len(seconds), joints, 3), self.wanted.new_zeros(len(seconds), joints)
+        nearest = _find_nearest_times(len(self.positions), seconds, fps=fps)
+        joints = self.positions.shape[1]
+        positions, wanted = (
+            self.positions.new_zeros(len(seconds), joints, 3),
+            self.wanted.new_zeros(len(seconds), joints),
+        )
         for frame, joint in self.wanted.nonzero().tolist():
-            positions[nearest[frame], joint] = self.places[frame, joint]
+            positions[nearest[frame], joint] = self.positions[frame, joint]
             wanted[nearest[frame], joint] = True
         return EffectorTargets(positions, wanted)
 
@@ -52,7 +55,7 @@ def compute_target_errors(
     positions: Float[Tensor, "frames joints 3"], targets: EffectorTargets
 ) -> Float[Tensor, " frames"]:
     """Compute the largest distance of a joint to its target, by frame, metres."""
-    distances = (positions - targets.places).norm(dim=-1)
+    distances = (positions - targets.positions).norm(dim=-1)
     return (distances * targets.wanted).amax(dim=1)
 
 
@@ -64,7 +67,7 @@ def reach_effector_targets(motion: Motion, targets: EffectorTargets, free: Bool[
         if not bool(wanted.any()):
             continue
         positions = motion.joint_positions().clone()
-        errors = torch.where(wanted[:, None], targets.places[:, limb.end] - positions[:, limb.end], 0.0)
+        errors = torch.where(wanted[:, None], targets.positions[:, limb.end] - positions[:, limb.end], 0.0)
         seconds = max(_MIN_REACH_SECONDS, math.sqrt(float(errors.norm(dim=-1).max()) / _REACH_ACCELERATION))
         offset = smooth_offsets.interpolate_offsets(errors, wanted | ~free, seconds=seconds, fps=float(motion.fps))
         offset = torch.where(free[:, None], offset, 0.0)
@@ -139,7 +142,7 @@ class LooseKeys:
         frames = self.drawings.nonzero()[:, 0].tolist()
         if not frames:
             return None
-        places = torch.zeros(*self.drawn.shape, 3, dtype=torch.float64)
+        positions = torch.zeros(*self.drawn.shape, 3, dtype=torch.float64)
         axes = torch.zeros(*self.drawn.shape, 3, dtype=torch.bool)
         view = float(self.view[frames[0]])
         for frame in frames:
@@ -149,16 +152,19 @@ class LooseKeys:
             cosine = math.cos(float(self.view[frame]) - view)
             # From elsewhere only heights look the same.
             flat = abs(cosine) > math.cos(_SAME_VIEW)
-            places[frame, drawn, 0], places[frame, drawn, 1] = math.copysign(1.0, cosine) * sketch[:, 0], sketch[:, 1]
+            positions[frame, drawn, 0], positions[frame, drawn, 1] = (
+                math.copysign(1.0, cosine) * sketch[:, 0],
+                sketch[:, 1],
+            )
             axes[frame, drawn, 0], axes[frame, drawn, 1] = flat, True
-        return SeenDrawings(places, axes, view)
+        return SeenDrawings(positions, axes, view)
 
 
 @dataclass(frozen=True, eq=False)
 class SeenDrawings:
     """Drawings in metres, seen from one side."""
 
-    places: Float[Tensor, "frames joints 3"]
+    positions: Float[Tensor, "frames joints 3"]
     """To the viewer's right from the hips, up from the floor, and 0."""
     known: Bool[Tensor, "frames joints 3"]
     """Which of these is drawn."""
@@ -166,7 +172,7 @@ class SeenDrawings:
     """Heading from the body to the viewer, radians."""
 
 
-def lead_over_places(
+def lead_over_positions(
     ground: Float[Tensor, "batch frames 2"],
     heading: Float[Tensor, "batch frames"],
     *,
@@ -241,8 +247,8 @@ def _rest_heights(skeleton: Skeleton) -> Float[Tensor, " joints"]:
 
 def _measure_chains(skeleton: Skeleton) -> Float[Tensor, "joints joints"]:
     """Measure the bones between each two joints, metres."""
-    lengths, on_way = skeleton.offsets.norm(dim=-1), torch.zeros(skeleton.num_joints, skeleton.num_joints)
+    lengths, on_chain = skeleton.offsets.norm(dim=-1), torch.zeros(skeleton.num_joints, skeleton.num_joints)
     for joint, parent in enumerate(skeleton.parents[1:], start=1):
-        on_way[joint] = on_way[parent]
-        on_way[joint, joint] = 1.0
-    return ((on_way[:, None] - on_way[None]).abs() * lengths).sum(dim=-1)
+        on_chain[joint] = on_chain[parent]
+        on_chain[joint, joint] = 1.0
+    return ((on_chain[:, None] - on_chain[None]).abs() * lengths).sum(dim=-1)

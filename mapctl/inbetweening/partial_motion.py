@@ -176,15 +176,15 @@ def _reach_targets(motion: PartialMotion) -> PartialMotion:
     rows = known.effectors.flatten(1).any(dim=1)
     if not bool(rows.any()):
         return motion
-    places, matrices = (each[rows] for each in motion.world_poses())
+    positions, matrices = (each[rows] for each in motion.world_poses())
     world, quats, offsets = rotations.from_matrix(matrices), motion.quats[rows].clone(), motion.offsets[rows, None]
     for number, limb in enumerate(LIMBS.values()):
         free = ~known.rotations[rows][..., [limb.upper, limb.lower]].any(dim=-1)
         wanted = known.effectors[rows][..., number] & free
-        error = torch.where(wanted[..., None], motion.targets[rows][..., number, :] - places[..., limb.end, :], 0.0)
+        error = torch.where(wanted[..., None], motion.targets[rows][..., number, :] - positions[..., limb.end, :], 0.0)
         spread = _fade_between(error, wanted | ~free)
         moved = free & (spread.norm(dim=-1) > _NEGLIGIBLE)
-        aim = places[..., limb.end, :] + spread - places[..., limb.upper, :]
+        aim = positions[..., limb.end, :] + spread - positions[..., limb.upper, :]
         turn, bent = inverse.reach(limb, world[..., limb.upper, :], quats[..., limb.lower, :], aim, offsets)
         above = world[..., CANONICAL.parents[limb.upper], :]
         bends = torch.stack([rotations.multiply(rotations.inverse(above), turn), bent], dim=-2)

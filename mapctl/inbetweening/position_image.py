@@ -29,7 +29,7 @@ _PARTNERS = CANONICAL.mirror_partners()
 class PositionImage:
     """A batch of motions of one length, on canonical joints at the prior's rate. Joint 0 is the hips."""
 
-    places: Float[Tensor, "batch frames joints 3"]
+    positions: Float[Tensor, "batch frames joints 3"]
     """Positions relative to the reference, metres; unknown ones are interpolated by slerp of the joints' rotations."""
     contacts: Float[Tensor, "batch frames 2"]
     """Left and right toe planted, 0 or 1; 0.5 where the toe is not known."""
@@ -64,7 +64,7 @@ class PositionImage:
         bits = torch.where(known[..., list(toes)], contacts, 0.5)
         ground, facing = positions_world[..., 0, ::2], rotations.unwrap_angle(heading)
         image = PositionImage(positions_world, bits, axes, present, ground, facing)
-        return replace(image, places=image.from_world(positions_world))
+        return replace(image, positions=image.from_world(positions_world))
 
     def from_world(
         self, positions_world: Float[Tensor, "batch frames joints 3"]
@@ -82,7 +82,7 @@ class PositionImage:
         """Exchange left and right."""
         flip = self.ground.new_tensor([-1.0, 1.0])
         return PositionImage(
-            mirror_positions(self.places),
+            mirror_positions(self.positions),
             self.contacts.flip(-1),
             self.known_axes[..., _PARTNERS, :],
             self.present,
@@ -95,12 +95,12 @@ class PositionImage:
         still there."""
         known = torch.nn.functional.pad(self.known_axes, (0, 0, 0, 0, frames, frames))
         contacts = torch.nn.functional.pad(self.contacts, (0, 0, frames, frames), value=0.5)
-        held = torch.arange(-frames, self.places.shape[1] + frames, device=self.places.device)
-        held = held.clamp(0, self.places.shape[1] - 1)
-        places, present, ground, heading = (
-            each[:, held] for each in (self.places, self.present, self.ground, self.heading)
+        held = torch.arange(-frames, self.positions.shape[1] + frames, device=self.positions.device)
+        held = held.clamp(0, self.positions.shape[1] - 1)
+        positions, present, ground, heading = (
+            each[:, held] for each in (self.positions, self.present, self.ground, self.heading)
         )
-        return PositionImage(places, contacts, known, present, ground, heading)
+        return PositionImage(positions, contacts, known, present, ground, heading)
 
     @property
     def known(self) -> Bool[Tensor, "batch frames joints"]:
@@ -112,14 +112,14 @@ class PositionImage:
         the dense input of Zhou et al. 2020, section 3.5. Coordinates that are never known are 0, infinitely far.
         """
         known = self.known_axes.flatten(2).transpose(1, 2).flatten(0, 1)  # one row for each coordinate of each motion
-        values = self.places.flatten(2).transpose(1, 2).flatten(0, 1)
+        values = self.positions.flatten(2).transpose(1, 2).flatten(0, 1)
         frame = torch.arange(values.shape[1], device=values.device)
         before, after = last_observed(known), next_observed(known)
         nearest = torch.where((frame - before).abs() <= (after - frame).abs(), before, after)
         never = ~known.any(dim=1, keepdim=True)
         copied = torch.where(never, 0.0, values.gather(1, nearest))
         away = torch.where(never, torch.inf, (frame - nearest).abs().to(values))
-        batch, _, *shape = self.places.shape
+        batch, _, *shape = self.positions.shape
         copied, away = (each.unflatten(0, (batch, -1)).transpose(1, 2).unflatten(2, shape) for each in (copied, away))
         return copied, away
 
@@ -133,7 +133,7 @@ class PositionImage:
 class ProposedPositions:
     """Positions that a network proposes for an image."""
 
-    places: Float[Tensor, "batch frames joints 3"]
+    positions: Float[Tensor, "batch frames joints 3"]
     """Positions of all joints relative to the image's reference, metres. Bone lengths are not exact."""
     contacts: Float[Tensor, "batch frames 2"]
     """Contact logits of the left and the right toe."""
@@ -170,7 +170,7 @@ def propose_from_positions(
         toes=TOE_JOINTS,
     )
     answer = complete(image)
-    wanted = image.to_world(_remove_jitter(answer.places, image))[0].double()
+    wanted = image.to_world(_remove_jitter(answer.positions, image))[0].double()
     if query.keep_trajectory:
         wanted = wanted - _estimate_root_drift(wanted[:, 0] - body.root_position, missing.root)[:, None]
     root = torch.where(missing.root[:, None], wanted[:, 0], body.root_position)
@@ -198,11 +198,11 @@ def _remove_jitter(positions: Float[Tensor, "1 frames joints 3"], image: Positio
     """Smooth a network's changes over about a frame, since the errors of its frames are independent. Where the changes
     are tiny they are jitter, and fade to the interpolation; known positions stay.
     """
-    change = (positions - image.places)[0]
+    change = (positions - image.positions)[0]
     smooth = gaussian.convolve(change, gaussian.kernel(_JITTER_SIGMA, 3), "repeated")
     power = gaussian.convolve(smooth.square().sum(dim=-1), gaussian.kernel(_POWER_SIGMA, 3 * _POWER_SIGMA), "repeated")
     smooth = smooth * (power / (power + _MIN_CHANGE**2))[..., None]
-    return torch.where(image.known[..., None], positions, image.places + smooth)
+    return torch.where(image.known[..., None], positions, image.positions + smooth)
 
 
 def _estimate_root_drift(

@@ -26,7 +26,7 @@ TREMBLE_HZ = 7.0
 class LocalMotion:
     """A batch of motions of canonical joints at the prior's rate and of unit size, without where they go."""
 
-    places: Float[Tensor, "batch frames joints 3"]
+    positions: Float[Tensor, "batch frames joints 3"]
     """Joint positions from the hips in the hips' own heading frame, metres."""
     turns: Float[Tensor, "batch frames"]
     """Change of the heading since the frame before, radians; 0 in the first."""
@@ -48,12 +48,12 @@ class LocalMotion:
     def anchored_steps(self) -> Float[Tensor, "batch frames joints 3"]:
         """Return for every joint the step of the hips that would keep it in its place, in the heading frame of the
         frame before, metres; 0 in the first frame."""
-        before = torch.cat([self.places[:, :1], self.places[:, :-1]], dim=1)
-        return before - rotations.rotate_about_y(self.places, self.turns[..., None])
+        before = torch.cat([self.positions[:, :1], self.positions[:, :-1]], dim=1)
+        return before - rotations.rotate_about_y(self.positions, self.turns[..., None])
 
     def mirrored(self) -> "LocalMotion":
         """Exchange left and right."""
-        return LocalMotion(mirror_positions(self.places), -self.turns, self.present)
+        return LocalMotion(mirror_positions(self.positions), -self.turns, self.present)
 
 
 @dataclass(frozen=True, eq=False)

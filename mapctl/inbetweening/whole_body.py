@@ -57,7 +57,7 @@ def reach_targets(
     if not len(frames):
         return body, shifts
     part = replace(body, root_position=body.root_position[frames], local_quat_xyzw=body.local_quat_xyzw[frames])
-    goals, wanted = targets.places[frames], targets.wanted[frames]
+    goals, wanted = targets.positions[frames], targets.wanted[frames]
     # Sigmas of shift (x, z), lean (x, y, z) and the rotations of the trunk; 0 for what may not move.
     step, lean = stray[frames].double()[:, None].expand(-1, 2), torch.full((len(frames), 3), _SIGMA_LEAN).double()
     turn = _SIGMA_ROTATION * turning[frames][:, _TRUNK_JOINTS].double().repeat_interleave(3, dim=1)

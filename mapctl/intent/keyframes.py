@@ -19,24 +19,24 @@ from mapctl.motion import Motion
 WorldPosition = tuple[float, float, float]
 """Position in a world with Y up, metres."""
 _KINDS = ("half", "drawing", "root_only")  # what a key may give instead of a whole pose, one of them
-_NO_PLACE = "no key tells where the hips are: give one a pose, a half, or a place"
+_NO_POSITION = "no key tells where the hips are: give one a pose, a half, or a place"
 
 
 @dataclass(frozen=True)
 class Drawing:
     """A pose as it is seen from one side."""
 
-    places_xy: Mapping[str, tuple[float, float]]
+    positions_xy: Mapping[str, tuple[float, float]]
     """Positions by joint, canonical names or the rig's own: to the viewer's right and up, in any unit."""
     view_deg: float = 0.0
     """Heading from the body to the viewer, degrees: from 0 one sees the face of a body that faces +Z."""
 
     def __post_init__(self):
-        if not self.places_xy:
+        if not self.positions_xy:
             raise RequestError("the drawing has no joints")
-        if not all(math.isfinite(value) for place in self.places_xy.values() for value in place):
+        if not all(math.isfinite(value) for position in self.positions_xy.values() for value in position):
             raise RequestError("the drawing has a joint at a position that is no two finite numbers")
-        if len({(float(x), float(y)) for x, y in self.places_xy.values()}) == 1:
+        if len({(float(x), float(y)) for x, y in self.positions_xy.values()}) == 1:
             raise RequestError("the drawing has all joints at one point")
 
 
@@ -48,7 +48,7 @@ class Key:
     """Frame of the motion."""
     limbs: tuple[str, ...] = ()
     """Joints of the rig, hands and feet, whose positions are all that counts."""
-    places: Mapping[str, WorldPosition] = field(default_factory=dict)
+    positions: Mapping[str, WorldPosition] = field(default_factory=dict)
     """Target positions of such joints in the world, metres, where the motion has them elsewhere."""
     root_only: bool | Literal["place"] = False
     """Whether only position and rotation of the hips count; of "place" only where they are over the ground."""
@@ -62,14 +62,14 @@ class Key:
     def __post_init__(self):
         if fault := _find_kind_fault(self, self.ends):
             raise RequestError(fault)
-        for name, place in self.places.items():
-            if not all(map(math.isfinite, place)):
-                raise RequestError(f"the place of {name} at frame {self.frame} is no three numbers, got {place}")
+        for name, position in self.positions.items():
+            if not all(map(math.isfinite, position)):
+                raise RequestError(f"the place of {name} at frame {self.frame} is no three numbers, got {position}")
 
     @property
     def ends(self) -> tuple[str, ...]:
         """All hands and feet whose positions count, if these are all that counts."""
-        return tuple(dict.fromkeys((*self.limbs, *self.places)))
+        return tuple(dict.fromkeys((*self.limbs, *self.positions)))
 
     @property
     def what(self) -> Literal["pose", "limbs", "root", "place", "half", "drawing"]:
@@ -86,11 +86,11 @@ class Key:
     def shown(self) -> bool:
         """Whether rotations or positions of joints in the motion's own frame count."""
         if self.what == "limbs":
-            return any(name not in self.places for name in self.limbs)
+            return any(name not in self.positions for name in self.limbs)
         return self.what not in ("place", "drawing")
 
     @property
-    def tells_place(self) -> bool:
+    def gives_position(self) -> bool:
         """Whether it gives where the hips are over the ground."""
         return self.placed if self.what == "drawing" else self.what != "limbs"
 
@@ -127,8 +127,8 @@ class Keys:
                 raise RequestError(f"two different keys are at frame {key.frame}")
         if len(found) < 2:
             raise RequestError(f"in-betweening needs at least two keys, got {len(found)}")
-        if not any(key.tells_place for key in found.values()):
-            raise RequestError(_NO_PLACE)
+        if not any(key.gives_position for key in found.values()):
+            raise RequestError(_NO_POSITION)
         return [found[frame] for frame in sorted(found)]
 
 
@@ -184,7 +184,7 @@ class KeyEntry:
         return not self.reach or any(name not in self.reach for name in self.joints)
 
     @property
-    def tells_place(self) -> bool:
+    def gives_position(self) -> bool:
         """Whether it gives where the hips are over the ground."""
         return self.place is not None if self.drawing is not None else not (self.joints or self.reach)
 
@@ -218,8 +218,8 @@ class KeyRequest:
                 raise RequestError(f"key[{number}].seconds: a motion may have {_MOST_FRAMES} frames, got {frame}")
             if (other := frames.index(frame)) < number:
                 raise RequestError(f"key[{number}]: key[{other}] is at frame {frame} already")
-        if not any(key.tells_place for key in self.key):
-            raise RequestError(_NO_PLACE)
+        if not any(key.gives_position for key in self.key):
+            raise RequestError(_NO_POSITION)
         if (first := min(frames)) > 0:
             raise RequestError(
                 f"key[{frames.index(first)}]: the motion begins with its first key, so that is at frame 0; got {first}"
@@ -299,19 +299,19 @@ def read_drawing(path: str | PathLike[str], view_deg: float = 0.0) -> Drawing:
     if sorted(names) != sorted(_COLUMNS):
         found = shorten(",".join(names))
         raise FileFormatError(path, f"found the columns {found}, expected {','.join(_COLUMNS)}, each once", header)
-    places: dict[str, tuple[float, float]] = {}
+    positions: dict[str, tuple[float, float]] = {}
     for number, words in lines[1:]:
         if len(words) != len(names):
             raise FileFormatError(path, f"found {len(words)} values where {len(names)} belong", number)
         row = dict(zip(names, words, strict=True))
-        if not row["joint"] or row["joint"] in places:
+        if not row["joint"] or row["joint"] in positions:
             raise FileFormatError(path, f"each line names a joint, each once, got {shorten(row['joint'])}", number)
         x, y = finite_number(row["x"]), finite_number(row["y"])
         if x is None or y is None:
             axis = "x" if x is None else "y"
             raise FileFormatError(path, f"{axis} must be a finite number, got {shorten(row[axis])}", number)
-        places[row["joint"]] = (x, y)
+        positions[row["joint"]] = (x, y)
     try:
-        return Drawing(places, view_deg)
+        return Drawing(positions, view_deg)
     except RequestError as error:
         raise FileFormatError(path, str(error)) from error

@@ -19,7 +19,7 @@ _MOST_SHIFT = 600
 Coordinate = Annotated[float, Field(ge=-1000, le=1000)]
 Seconds = Annotated[float, Field(ge=0, le=_MOST_SECONDS)]
 Tolerance = Annotated[float, Field(ge=0, le=180)]
-Place = tuple[Coordinate, Coordinate, Coordinate]
+Position = tuple[Coordinate, Coordinate, Coordinate]
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class ShotKey:
     """When, seconds since the first frame; or `frame`."""
     frame: Annotated[int, Field(ge=0, le=_MOST_FRAMES)] | None = None
     """Frame of the motion."""
-    reach: Mapping[str, Place] = field(default_factory=dict)
+    reach: Mapping[str, Position] = field(default_factory=dict)
     """Hands and feet (leftHand, rightHand, leftFoot, rightFoot) and where they are to be, x, y, z, metres."""
     pose: Annotated[str, Field(min_length=1)] | None = None
     """A motion file, relative to the file of the key, of which a frame is the pose."""
@@ -48,7 +48,7 @@ class ShotKey:
     """Hands and feet whose positions in the pose are all that counts of it."""
     root_only: bool = False
     """Whether only position and rotation of the pose's hips count."""
-    look_at: Place | None = None
+    look_at: Position | None = None
     """What the head looks at, x, y, z, metres."""
     hold_seconds: Seconds = 0.0
     """For how long."""

@@ -53,7 +53,7 @@ at 1.2 m/s, planted toes move 1 to 4 cm/s within, 9 for steps of 2.5 m, and for 
 class Arrival:
     """An order to be somewhere at a time."""
 
-    place: tuple[float, float]
+    position: tuple[float, float]
     """Where the hips are to be over the ground, x and z, metres."""
     by: float
     """When, seconds of the stream."""
@@ -63,7 +63,7 @@ class Arrival:
     """Pose there, a canonical motion of one frame; None walks on, or stands where the command's speed is 0."""
 
     def __post_init__(self):
-        if not all(map(math.isfinite, (*self.place, self.by, self.facing or 0.0))):
+        if not all(map(math.isfinite, (*self.position, self.by, self.facing or 0.0))):
             raise RequestError("the place, the time and the facing of an arrival are finite numbers")
 
 
@@ -103,11 +103,11 @@ class Command:
             value = getattr(self, name)
             if value is not None and not math.isfinite(value):
                 raise RequestError(f"a command's {name} must be a finite angle, got {value:g}")
-        for name, place in {**self.reach, **({} if self.look_at is None else {"look_at": self.look_at})}.items():
+        for name, position in {**self.reach, **({} if self.look_at is None else {"look_at": self.look_at})}.items():
             if name not in (*REACHING_HANDS, "look_at"):
                 raise RequestError(f"a command reaches with {' or '.join(REACHING_HANDS)}, not with {name}")
-            if len(place) != 3 or not all(map(math.isfinite, place)):
-                raise RequestError(f"the place for {name} must be three finite numbers of metres, got {place}")
+            if len(position) != 3 or not all(map(math.isfinite, position)):
+                raise RequestError(f"the place for {name} must be three finite numbers of metres, got {position}")
 
     def within(self, fastest: float, *, when: str = "") -> tuple["Command", list[str]]:
         """Limit the command to what can be held: at most `fastest` m/s, steps of STEP_LENGTHS, and angles of one turn.

@@ -95,5 +95,5 @@ def chain_matrices(
         world = (above[:, :, None] * turns[None, :, :, joints]).sum(dim=1)
         positions.append(position)
         worlds.append(world)
-    places, matrices = torch.cat(positions, dim=1)[:, order], torch.cat(worlds, dim=2)[:, :, order]
-    return places.movedim((0, 1), (-1, -2)), matrices.movedim((0, 1, 2), (-2, -1, -3))
+    ordered, matrices = torch.cat(positions, dim=1)[:, order], torch.cat(worlds, dim=2)[:, :, order]
+    return ordered.movedim((0, 1), (-1, -2)), matrices.movedim((0, 1, 2), (-2, -1, -3))

@@ -54,14 +54,14 @@ goes past behind the back would whip from one shoulder to the other."""
 _FORWARD = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 
 
-def turn_head(motion: Motion, places: Float[Tensor, "#frames 3"], weight: Float[Tensor, " frames"]) -> Motion:
+def turn_head(motion: Motion, positions: Float[Tensor, "#frames 3"], weight: Float[Tensor, " frames"]) -> Motion:
     """Turn neck and head toward places in the world, metres, by a share `weight` (0 to 1) in each frame, and by 95
     degrees at most; what is behind is not looked at."""
     chest = CANONICAL.parents[_NECK]
-    behind = _find_turn(motion, chest, places).norm(dim=-1)
+    behind = _find_turn(motion, chest, positions).norm(dim=-1)
     weight = weight * smootherstep(((_LOST - behind) / (_LOST - _LOSING)).clamp(0, 1)).to(weight)
     for joint, share, most in _TURNS:
-        turn = _find_turn(motion, _HEAD, places)
+        turn = _find_turn(motion, _HEAD, positions)
         angle = turn.norm(dim=-1, keepdim=True).clamp_min(1e-9)
         turn = turn * (share * weight[:, None] * angle).clamp(max=most) / angle
         quats = motion.local_quat_xyzw.clone()
@@ -72,13 +72,13 @@ def turn_head(motion: Motion, places: Float[Tensor, "#frames 3"], weight: Float[
     return motion
 
 
-def measure_look_angle(motion: Motion, places: Float[Tensor, "#frames 3"]) -> Float[Tensor, " frames"]:
+def measure_look_angle(motion: Motion, positions: Float[Tensor, "#frames 3"]) -> Float[Tensor, " frames"]:
     """Measure the angle between where the head faces and places in the world, radians."""
-    return _find_turn(motion, _HEAD, places).norm(dim=-1)
+    return _find_turn(motion, _HEAD, positions).norm(dim=-1)
 
 
-def _find_turn(motion: Motion, joint: int, places: Float[Tensor, "#frames 3"]) -> Float[Tensor, "frames 3"]:
+def _find_turn(motion: Motion, joint: int, positions: Float[Tensor, "#frames 3"]) -> Float[Tensor, "frames 3"]:
     """Find the rotation vectors in the world that turn a joint's facing toward places, as the head sees them."""
     facing = rotations.rotate(motion.joint_rotations()[:, joint], _FORWARD.expand(motion.num_frames, 3))
-    wanted = places.to(facing) - motion.joint_positions()[:, _HEAD]
+    wanted = positions.to(facing) - motion.joint_positions()[:, _HEAD]
     return rotations.to_rotation_vector(rotations.between_vectors(facing, wanted))

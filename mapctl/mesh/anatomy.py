@@ -179,5 +179,5 @@ def _add_tips(motion: Motion, joints: Array, turns: Array, scale: float) -> Poin
         elif part in _TIP_LENGTHS and (leaf or part is Part.HEAD):  # eyes and the like do not show the crown
             along = unit(joints[:, joint] - joints[:, parents[joint]])
             extra.append((joint, joints[:, joint] + along * _TIP_LENGTHS[part] * scale))
-    world = np.concatenate([joints, *(place[:, None] for _, place in extra)], axis=1)
+    world = np.concatenate([joints, *(position[:, None] for _, position in extra)], axis=1)
     return Points((*parents, *(j for j, _ in extra)), (*found, *(found[j] for j, _ in extra)), world)

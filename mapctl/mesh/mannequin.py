@@ -269,7 +269,7 @@ class SkinnedBody:
             found = f"{motion.num_joints} joints and {motion.num_frames} frames"
             raise MapctlError(f"a mesh of {len(mesh.rest)} joints and {bones.num_frames} frames got {found}")
         self._mesh, self._bones = mesh, bones
-        self._places = motion.joint_positions().numpy()
+        self._positions = motion.joint_positions().numpy()
         self._turns = rotations.to_matrix(motion.joint_rotations()).numpy()
 
     @property
@@ -289,11 +289,11 @@ class SkinnedBody:
         outer = np.concatenate([vertices.argmin(axis=0), vertices.argmax(axis=0)])
         joint = self._mesh.joints[outer, self._mesh.weights[outer].argmax(axis=1)]
         turned = np.einsum("fnab,nb->fna", self._turns[:, joint], vertices[outer] - self._mesh.rest[joint])
-        return np.concatenate([self._bones.seen, self._places[:, joint] + turned], axis=1)
+        return np.concatenate([self._bones.seen, self._positions[:, joint] + turned], axis=1)
 
     def surface(self, frame: int) -> Surface:
         """Return the mesh in one frame; it is open, as clothes and hair are, and seen from both sides."""
-        vertices, normals = self._mesh.pose(self._places[frame], self._turns[frame])
+        vertices, normals = self._mesh.pose(self._positions[frame], self._turns[frame])
         return Surface(vertices, self._mesh.faces, self._mesh.rgba, normals, is_open=True)
 
     def sticks(self, frame: int) -> tuple[Array, Array, Array]:
@@ -333,10 +333,10 @@ def build_skin(motion: Motion, colour: str = "slate") -> Skin:
     joint = np.concatenate([np.repeat(joints, many) for joints, many in zip(joint_of_box, counts, strict=True)])
     whole = body.surface(0)
     turn = body.anatomy.rotations[0, joint]
-    place = body.anatomy.points.world[0, joint]
+    position = body.anatomy.points.world[0, joint]
     assert whole.normals is not None, "boxes are lit"
     return Skin(
-        vertices=np.einsum("nji,nj->ni", turn, whole.vertices - place),
+        vertices=np.einsum("nji,nj->ni", turn, whole.vertices - position),
         normals=np.einsum("nji,nj->ni", turn, whole.normals),
         faces=whole.faces,
         rgb=whole.rgba[:, :3],

@@ -119,10 +119,10 @@ NOTHING = Liveliness(0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 def see_from_hips(
-    places: Float[Tensor, "*batch frames joints 3"], hips_world_matrix: Float[Tensor, "*batch frames 3 3"]
+    positions: Float[Tensor, "*batch frames joints 3"], hips_world_matrix: Float[Tensor, "*batch frames 3 3"]
 ) -> Float[Tensor, "*batch frames joints 3"]:
     """Return joint places from the hips along the hips' heading, metres."""
-    return rotations.rotate_about_y(places - places[..., :1, :], -heading_of_matrix(hips_world_matrix)[..., None])
+    return rotations.rotate_about_y(positions - positions[..., :1, :], -heading_of_matrix(hips_world_matrix)[..., None])
 
 
 def measure_path_length(motion: Motion) -> float:

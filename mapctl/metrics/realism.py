@@ -73,14 +73,14 @@ class Realism:
     floor_frechet: float
     """Frechet distance between the halves, in the same coordinates without unit; halves are smaller sets, which adds to
     it."""
-    made_windows: int
+    generated_windows: int
     """Number of windows of the generated clips."""
     mocap_windows: int
     """Number of windows of the mocap clips."""
 
 
 def measure_realism(
-    made: Sequence[Motion],
+    generated: Sequence[Motion],
     mocap: Sequence[Motion],
     *,
     generator: torch.Generator,
@@ -90,16 +90,16 @@ def measure_realism(
     """Compare generated clips with mocap, both of any known rig and frame rate; half a minute on one core.
 
     The floor's halves are every other clip of one shuffle that the generator draws: neither style nor length is
-    balanced between them, so a small set's floor scatters around 0.5 from seed to seed. It does not depend on `made`.
+    balanced between them, so a small set's floor scatters around 0.5 from seed to seed; it depends on mocap alone.
     Sets should hold the same kinds of motion, or the network learns to separate the kinds. RequestError for fewer
     than 8 clips in a set, clips shorter than a window (31 frames at 30 fps), and rigs that are not known.
     """
-    sets = [[cut_windows(canonical_positions(clip)) for clip in clips] for clips in (made, mocap)]
+    sets = [[cut_windows(canonical_positions(clip)) for clip in clips] for clips in (generated, mocap)]
     return measure_window_realism(*sets, generator=generator, settings=settings, progress=progress)
 
 
 def measure_window_realism(
-    made: Sequence[Tensor],
+    generated: Sequence[Tensor],
     mocap: Sequence[Tensor],
     *,
     generator: torch.Generator,
@@ -107,8 +107,8 @@ def measure_window_realism(
     progress: Progress | None = None,
 ) -> Realism:
     """Measure realism from `cut_windows` of each clip, (windows, frames, channels); RequestError for too few clips."""
-    if min(len(made), len(mocap)) < settings.min_clips:
-        counts = f"got {len(made)} and {len(mocap)}"
+    if min(len(generated), len(mocap)) < settings.min_clips:
+        counts = f"got {len(generated)} and {len(mocap)}"
         raise RequestError(f"realism needs at least {settings.min_clips} clips of each, made and mocap; {counts}")
     seeds = torch.randint(2**62, (2,), generator=generator).tolist()
     shuffled, ours = (torch.Generator().manual_seed(seed) for seed in seeds)
@@ -123,10 +123,10 @@ def measure_window_realism(
 
     floor, accuracy = (
         compute_held_out_accuracy(*sets, generator=drawn, settings=settings, tick=tick)
-        for sets, drawn in ((halves, shuffled), ((made, mocap), ours))
+        for sets, drawn in ((halves, shuffled), ((generated, mocap), ours))
     )
     basis = Basis.of(torch.cat(list(mocap)), settings.dims)
-    points = [basis.project(torch.cat(list(clips))) for clips in (made, mocap, *halves)]
+    points = [basis.project(torch.cat(list(clips))) for clips in (generated, mocap, *halves)]
     frechet, floor_frechet = frechet_distance(*points[:2]), frechet_distance(*points[2:])
     return Realism(accuracy, floor, frechet, floor_frechet, len(points[0]), len(points[1]))
 

@@ -47,13 +47,13 @@ def measure_commands(motion: Motion, track: CommandTrack) -> list[dict[str, floa
     the least angle between where the head faces and what is looked at; `clearance_cm`, of the nearest joint to an
     obstacle.
     """
-    places, fps, rows = motion.joint_positions(), float(motion.fps), []
-    ground = places[:, 0, ::2].numpy()
+    positions, fps, rows = motion.joint_positions(), float(motion.fps), []
+    ground = positions[:, 0, ::2].numpy()
     slow = np.gradient(ground, axis=0) * fps
     slow = scipy.ndimage.gaussian_filter1d(slow, _SLOW_SECONDS * fps, axis=0, mode="nearest")
     seconds, directions = np.arange(len(ground)) / fps, np.arctan2(slow[:, 0], slow[:, 1])
     velocity = _SlowVelocity(seconds, np.linalg.norm(slow, axis=-1), directions)
-    toes = places[:, list(find_feet(motion.skeleton))]
+    toes = positions[:, list(find_feet(motion.skeleton))]
     steps = step_lengths(toes[..., ::2], contacts.detect_contacts(toes, fps), fps).numpy()
     ends = [*track.times[1:], float(velocity.seconds[-1])]
     for began, until, command in zip(track.times, ends, track.commands, strict=True):
@@ -66,29 +66,29 @@ def measure_commands(motion: Motion, track: CommandTrack) -> list[dict[str, floa
             "heading_deg": math.degrees(command.heading),
         }
         row["reached_s"] = _find_time_reached(velocity, part, began, command, float(motion.fps))
-        row["under_way_s"] = _find_time_under_way(velocity, part, began, command)
+        row["under_way_s"] = _find_travel_time(velocity, part, began, command)
         steady = np.flatnonzero(part & (velocity.seconds >= began + _STEADY_AFTER))
         row |= _measure_steady_errors(velocity, ground, steady, command, float(motion.fps))
         taken = steps[steady][~np.isnan(steps[steady])] if command.step_length is not None else ()
         row |= {"step_m": command.step_length, "steady_step_m": float(np.mean(taken)) if len(taken) else None}
-        rows.append(row | _measure_places(motion, places, np.flatnonzero(part), command))
+        rows.append(row | _measure_positions(motion, positions, np.flatnonzero(part), command))
     return rows
 
 
-def _measure_places(motion: Motion, places: Tensor, frames: ndarray, command: Command) -> dict[str, float | None]:
+def _measure_positions(motion: Motion, positions: Tensor, frames: ndarray, command: Command) -> dict[str, float | None]:
     """Measure what came of the places that a command names, over its frames."""
     found: dict[str, float | None] = {}
     if not len(frames):
         return found
-    for hand, place in command.reach.items():
-        away = (places[frames, motion.skeleton.index(hand)] - places.new_tensor(place)).norm(dim=-1)
+    for hand, position in command.reach.items():
+        away = (positions[frames, motion.skeleton.index(hand)] - positions.new_tensor(position)).norm(dim=-1)
         found[f"{hand}_nearest_cm"] = 100 * float(away.min())
         found[f"{hand}_held_s"] = float((away < _HELD_DISTANCE).sum()) / float(motion.fps)
     if command.look_at is not None:
-        looked = measure_look_angle(motion, places.new_tensor([command.look_at]))[frames]
+        looked = measure_look_angle(motion, positions.new_tensor([command.look_at]))[frames]
         found["look_nearest_deg"] = math.degrees(float(looked.min()))
     if command.obstacles:
-        found["clearance_cm"] = 100 * float(measure_clearance(command.obstacles, places[frames][..., ::2]).min())
+        found["clearance_cm"] = 100 * float(measure_clearance(command.obstacles, positions[frames][..., ::2]).min())
     return found
 
 
@@ -105,7 +105,7 @@ def _find_time_reached(
     return None
 
 
-def _find_time_under_way(velocity: _SlowVelocity, part: ndarray, began: float, command: Command) -> float | None:
+def _find_travel_time(velocity: _SlowVelocity, part: ndarray, began: float, command: Command) -> float | None:
     if command.speed == 0 or command.turning is not None:
         return None
     along = velocity.speed * np.cos(velocity.direction - command.heading)
@@ -138,7 +138,7 @@ def measure_arrivals(
     """Measure a row for each order of a track whose time is within a canonical motion, but for those refused.
 
     Keys: `ordered_s` and `by_s`, seconds; `goto_x_m`, `goto_z_m` and `goto_facing_deg` (None where none was wanted);
-    `frame`, on which it was to be there; `place_error_cm` and `facing_error_deg` of the hips on that frame;
+    `frame`, on which it was to be there; `position_error_cm` and `facing_error_deg` of the hips on that frame;
     `pose_error_cm`, the mean distance of the joints from the wanted pose, both seen from the hips and their facing
     (None where none was wanted).
     """
@@ -155,11 +155,11 @@ def measure_arrivals(
             {
                 "ordered_s": time,
                 "by_s": order.by,
-                "goto_x_m": order.place[0],
-                "goto_z_m": order.place[1],
+                "goto_x_m": order.position[0],
+                "goto_z_m": order.position[1],
                 "goto_facing_deg": None if order.facing is None else math.degrees(order.facing),
                 "frame": frame,
-                "place_error_cm": 100 * math.dist((x, z), order.place),
+                "position_error_cm": 100 * math.dist((x, z), order.position),
                 "facing_error_deg": off,
                 "pose_error_cm": _measure_pose(motion.slice(frame, frame + 1), order),
             }
@@ -170,10 +170,10 @@ def measure_arrivals(
 def _measure_pose(found: Motion, order: Arrival) -> float | None:
     if order.pose is None:
         return None
-    places = []
+    positions = []
     for one in (found, order.pose):
         turn = rotations.about_y(-heading(one.local_quat_xyzw[:, 0]))[:, None]
         joints = one.joint_positions()
-        places.append(rotations.rotate(turn.expand(1, joints.shape[1], 4), joints - joints[:, :1]))
-    scale = float(places[0].norm(dim=-1).mean() / places[1].norm(dim=-1).mean())
-    return 100 * float((places[0] - scale * places[1]).norm(dim=-1).mean())
+        positions.append(rotations.rotate(turn.expand(1, joints.shape[1], 4), joints - joints[:, :1]))
+    scale = float(positions[0].norm(dim=-1).mean() / positions[1].norm(dim=-1).mean())
+    return 100 * float((positions[0] - scale * positions[1]).norm(dim=-1).mean())

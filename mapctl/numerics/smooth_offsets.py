@@ -66,7 +66,7 @@ def interpolate_offsets(
 
 
 def interpolate_turns(
-    made_xyzw: Float[Tensor, "frames joints 4"],
+    current_xyzw: Float[Tensor, "frames joints 4"],
     wanted_xyzw: Float[Tensor, "frames joints 4"],
     firm: Bool[Tensor, "frames joints"],
     *,
@@ -75,14 +75,14 @@ def interpolate_turns(
 ) -> Float[Tensor, "frames joints 4"]:
     """Turn joints, smoothly over the frames around, until they are as wanted in the frames in which they are firm, as
     `interpolate_offsets` does; joints that are never firm stay. `wanted_xyzw` may hold anything finite elsewhere."""
-    off = rotations.to_rotation_vector(rotations.multiply(rotations.inverse(made_xyzw), wanted_xyzw))
+    off = rotations.to_rotation_vector(rotations.multiply(rotations.inverse(current_xyzw), wanted_xyzw))
     offsets = torch.zeros_like(off)
     for pattern in firm.T.unique(dim=0):
         if bool(pattern.any()):
             joints = (pattern == firm.T).all(dim=1)
             solved = interpolate_offsets(off[:, joints].flatten(1), pattern, seconds=seconds, fps=fps)
             offsets[:, joints] = solved.unflatten(1, (-1, 3))
-    return rotations.multiply(made_xyzw, rotations.from_rotation_vector(offsets))
+    return rotations.multiply(current_xyzw, rotations.from_rotation_vector(offsets))
 
 
 def smooth_between(

@@ -59,7 +59,7 @@ class CommittedFrames:
 
     state: DensityState | tuple[DensityState, ...]
     """Density's state after the last frame, batch of one."""
-    place: GroundPose
+    ground_pose: GroundPose
     """Ground pose of the last frame."""
     features: Float[Tensor, "frames size"]
     """Features of the committed frames, physical units; the first may be an initial state that was not solved."""
@@ -97,7 +97,7 @@ class CommittedFrames:
         last = self.features[-1:].clone()
         last[:, : LAYOUT.slices["root_height"].start] = 0  # it is where the last step has led already
         bits = LAYOUT.pick(last, "contacts") > 0.5
-        return Trial(last[None], self.place, contacts=bits[None], skeleton=skeleton).heels_world[0]
+        return Trial(last[None], self.ground_pose, contacts=bits[None], skeleton=skeleton).heels_world[0]
 
     def finite(self, count: int) -> bool:
         """Return whether the last `count` frames and their energies are numbers."""
@@ -170,7 +170,7 @@ class RecedingHorizonSolver:
         context = WindowContext(
             self.density,
             committed.state,
-            committed.place,
+            committed.ground_pose,
             committed.joints_world,
             frames,
             self.skeleton,
@@ -184,13 +184,13 @@ class RecedingHorizonSolver:
     def _commit(self, done: CommittedFrames, window: SolvedWindow, count: int, seconds: float) -> CommittedFrames:
         """Commit the first frames of a window that took so many seconds."""
         features = window.trial.features[0, :count]
-        ground, heading = integrate_root(features, done.place)
+        ground, heading = integrate_root(features, done.ground_pose)
         record = WindowRecord(
             count, seconds, window.evaluations, window.start_energy, window.energy, window.stop_reason, window.choice
         )
         return CommittedFrames(
             state=self.density.advance(done.state, features.unsqueeze(0)),
-            place=GroundPose(ground[-1], heading[-1]),
+            ground_pose=GroundPose(ground[-1], heading[-1]),
             features=torch.cat([done.features, features]),
             joints_world=torch.cat([done.joints_world, window.trial.joints_world[0, :count]])[-self.settings.past :],
             warm_start=window.warm_start[count:],

@@ -37,7 +37,7 @@ class WindowContext:
     """Density, or several of which the solver selects one."""
     state: DensityState | tuple[DensityState, ...]
     """Density's state after the committed frames, batch of one or one row a candidate; a tuple for an ensemble."""
-    place: GroundPose
+    ground_pose: GroundPose
     """Ground pose of the last committed frame."""
     before: Float[Tensor, "past joints 3"]
     """World joint positions of the last committed frames, metres, oldest first."""
@@ -81,7 +81,7 @@ class WindowContext:
         """Build the trial of candidate features, physical units, in this context."""
         return Trial(
             features,
-            self.place,
+            self.ground_pose,
             contacts=contacts,
             noise=noise,
             log_density=log_density,
@@ -158,11 +158,11 @@ class LatentNoise(Parametrisation):
         """See Parametrisation."""
         context, batch = self.context, len(unknowns)
         noise = torch.unflatten(unknowns.detach(), -1, (context.frames, LAYOUT.continuous))
-        if not fast.is_supported(noise, context.place, context.skeleton):
+        if not fast.is_supported(noise, context.ground_pose, context.skeleton):
             return None
         rollout, contacts = self._prepare(batch)
         features, log_density = rollout.roll_out(noise)
-        poses = fast.WorldPoses.compute(features, context.place, context.skeleton)
+        poses = fast.WorldPoses.compute(features, context.ground_pose, context.skeleton)
         trial = context.build_trial(features, contacts, noise, log_density)
         return self._hold_heels(replace(trial, world_poses=poses))
 
@@ -228,7 +228,7 @@ class PoseOffsets(Parametrisation):
     @cached_property
     def _heel_plan(self) -> Trial:
         """The proposal, whose poses determine which heels are planted."""
-        features = self.proposal.features(self.context.place, self.contacts)
+        features = self.proposal.features(self.context.ground_pose, self.contacts)
         return self.context.build_trial(features[None], self.contacts[None])
 
     @cached_property
@@ -240,7 +240,7 @@ class PoseOffsets(Parametrisation):
         white = torch.unflatten(unknowns, -1, self.sigma.shape)
         offset = self.sigma * torch.einsum("ts,bsw->btw", self._smoothing_matrix, white)
         pose = BodyPose.unpack(self.proposal.pack() + offset)
-        features = pose.features(self.context.place, self.contacts)
+        features = pose.features(self.context.ground_pose, self.contacts)
         log_density = None
         if not isinstance(self.context.density, DensityEnsemble):
             log_density = self.context.density.log_prob(features, self.context.expand_state(len(white)))

@@ -277,7 +277,7 @@ class PoseOffsetSolver:
         proposal, contacts = self.proposal.slice(first, stop), self.contacts[first:stop]
         choice = None
         if isinstance(context.density, DensityEnsemble) and context.density.densities:
-            choice, state = context.density.select(proposal.features(context.place, contacts), context.state)
+            choice, state = context.density.select(proposal.features(context.ground_pose, contacts), context.state)
             context = replace(context, density=choice.density, state=state)
             terms = (*terms, Likelihood(self.temperature / choice.weight))
         offsets = PoseOffsets(context, proposal, contacts, self.sigma[first:stop], smooth=self.smooth)

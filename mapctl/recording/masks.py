@@ -65,13 +65,13 @@ def masks_from_missing(motion: Motion, missing: MissingValues) -> tuple[Mask, ..
     position."""
     travels, joints = motion.travelling_joint, missing.rotations.clone()
     below = motion.skeleton.children(0)
-    if travels == 0 and len(below) == 1 and bool(missing.places[:, below[0]].all()):
+    if travels == 0 and len(below) == 1 and bool(missing.positions[:, below[0]].all()):
         travels = below[0]  # hips under a root that stays on the ground: the body's way is not known anywhere
     for joint in motion.moving_offsets:
         if joint != travels:
-            joints[:, joint] |= missing.places[:, joint]
+            joints[:, joint] |= missing.positions[:, joint]
     lost = [Mask(motion.skeleton.names[joint], start, stop) for joint, start, stop in true_intervals(joints)]
-    return (*lost, *(Mask(ROOT, start, stop) for _, start, stop in true_intervals(missing.places[:, travels, None])))
+    return (*lost, *(Mask(ROOT, start, stop) for _, start, stop in true_intervals(missing.positions[:, travels, None])))
 
 
 def expand_valid_masks(motion: Motion, masks: Sequence[Mask]) -> tuple[Tensor, Tensor]:
@@ -143,11 +143,11 @@ def write_back_masked(motion: Motion, clean: Motion, masks: Sequence[Mask]) -> M
     joints, root = joints[:shared], root[:shared]
     if not bool(joints.any() | root.any()):
         return motion
-    quats, place = motion.local_quat_xyzw.clone(), motion.root_position.clone()
+    quats, position = motion.local_quat_xyzw.clone(), motion.root_position.clone()
     quats[:shared] = torch.where(joints[..., None], clean.local_quat_xyzw, quats[:shared])
-    place[:shared] = torch.where(root[:, None], clean.root_position, place[:shared])
+    position[:shared] = torch.where(root[:, None], clean.root_position, position[:shared])
     moving = dict(motion.moving_offsets)
     for joint, values in moving.items():
         kept = torch.where(root[:, None], clean.moving_offsets[joint], values[:shared])
         moving[joint] = torch.cat([kept, values[shared:]])
-    return replace(motion, local_quat_xyzw=quats, root_position=place, moving_offsets=moving)
+    return replace(motion, local_quat_xyzw=quats, root_position=position, moving_offsets=moving)

@@ -105,9 +105,9 @@ def _find_step(turns: Float[Tensor, "steps joints"], seen: Bool[Tensor, "frames 
     return torch.where(rounded, step, 0.0)
 
 
-def estimate_position_noise(places: Float[Tensor, "frames 3"], seen: Bool[Tensor, " frames"]) -> float:
+def estimate_position_noise(positions: Float[Tensor, "frames 3"], seen: Bool[Tensor, " frames"]) -> float:
     """Estimate the white noise of each coordinate, in the positions' unit; 0 for a recording too short."""
-    return float(_estimate_sigma(places[:, None], seen[:, None], differenced=0).nan_to_num(0.0))
+    return float(_estimate_sigma(positions[:, None], seen[:, None], differenced=0).nan_to_num(0.0))
 
 
 def _estimate_sigma(

@@ -219,8 +219,8 @@ def _place_hips(on_rig: Motion, rigmap: RigMap, hips: Tensor, original: Motion |
         missed = hips - on_rig.joint_positions()[:, joint]
         return replace(on_rig, root_position=on_rig.root_position + missed)
     parent = on_rig.skeleton.parents[joint]
-    turn, place = on_rig.joint_rotations()[:, parent], on_rig.joint_positions()[:, parent]
-    offset = rotations.rotate(rotations.inverse(turn), hips - place)
+    turn, position = on_rig.joint_rotations()[:, parent], on_rig.joint_positions()[:, parent]
+    offset = rotations.rotate(rotations.inverse(turn), hips - position)
     return replace(on_rig, moving_offsets={**on_rig.moving_offsets, joint: offset})
 
 

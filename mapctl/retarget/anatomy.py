@@ -638,10 +638,10 @@ def find_second_body(poses: RigPoses, joints: Mapping[str, int]) -> int | None:
     skeleton = poses.skeleton
     near = descendants(skeleton, joints.values()) | ancestors(skeleton, joints.values())
     rest = [joint for joint in range(skeleton.num_joints) if joint not in near]
-    place = {joint: number for number, joint in enumerate([-1, *rest])}
-    parents = (-1, *(place.get(skeleton.parents[joint], 0) for joint in rest))
+    index_of = {joint: number for number, joint in enumerate([-1, *rest])}
+    parents = (-1, *(index_of.get(skeleton.parents[joint], 0) for joint in rest))
     offsets = torch.cat([torch.zeros(1, 3, dtype=skeleton.offsets.dtype), skeleton.offsets[rest]])
-    ends = {name: end for name, end in skeleton.end_offsets.items() if skeleton.index(name) in place}
+    ends = {name: end for name, end in skeleton.end_offsets.items() if skeleton.index(name) in index_of}
     other = match_by_tree(Skeleton(("", *(skeleton.names[j] for j in rest)), parents, offsets, ends))
     if "hips" not in other or other["hips"] == 0:
         return None

@@ -125,7 +125,7 @@ _SMOOTH_SECONDS = 0.05  # seconds over which what hips carry is smoothed
 _STRAIGHT_SHARES = (0.93, 0.985)
 # Of the leg's length, how far down a foot is from which the hips' height begins to matter to it, and matters fully.
 _DOWN_SHARES = (0.5, 0.8)
-_LEAST_SAY = 0.02  # of both legs together, below which the hips' height is left to the trajectory
+_LEAST_INFLUENCE = 0.02  # of both legs together, below which the hips' height is left to the trajectory
 _UP = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
 _SOFT_MARGIN = 0.004  # of the leg, before the most that it may be, over which it gives in
 _HEEL_DEG, _MAX_HEEL_DEG = 10.0, 60.0  # degrees that toes are raised by when a foot is on its heel, and at most
@@ -162,16 +162,16 @@ def find_ground(own: Motion, stance: Stance) -> tuple[list[Spans], Float[Tensor,
 
 def _detect_bearing(own: Motion) -> Bool[Tensor, "frames 2"]:
     """Detect feet that bear the body, at any height: higher than the floor, or on a floor that drifts with the take."""
-    places, fps = own.joint_positions(), float(own.fps)
+    positions, fps = own.joint_positions(), float(own.fps)
     step = max(1, round(_SPEED_SECONDS * fps))
     if own.num_frames <= step:
         return torch.zeros(own.num_frames, 2, dtype=torch.bool)
-    speed = (places[step:, TOES] - places[:-step, TOES]).norm(dim=-1) * (fps / step)
+    speed = (positions[step:, TOES] - positions[:-step, TOES]).norm(dim=-1) * (fps / step)
     before = step // 2  # a frame's speed is that of the time around it
     speed = torch.cat([speed[:1].expand(before, 2), speed, speed[-1:].expand(step - before, 2)])
     forward = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand(own.num_frames, 2, 3)
     slope = rotations.rotate(own.joint_rotations()[:, FEET], forward)[..., 1].abs()
-    bears = places[:, HIP_JOINTS, 1] - places[:, TOES, 1] > _HIPS_SHARE * leg_length(own.skeleton)
+    bears = positions[:, HIP_JOINTS, 1] - positions[:, TOES, 1] > _HIPS_SHARE * leg_length(own.skeleton)
     level = slope < math.sin(math.radians(_LEVEL_DEG))
     still = (speed < _STILL_SPEED) & level & bears
     return contacts.remove_short_runs(still, max(1, round(_STILL_SECONDS * fps)))
@@ -203,9 +203,9 @@ def fit_hips(moved: Motion, ankles: Float[Tensor, "frames 2 3"], stretch: Float[
     short, down = _find_missing_length(moved, ankles, stretch.clamp(max=_MAX_EXTENSION))
     begin, end = _DOWN_SHARES
     bent, straight = _STRAIGHT_SHARES
-    say = smootherstep((stretch - bent) / (straight - bent)) * smootherstep((down - begin) / (end - begin))
-    total = say.sum(dim=-1, keepdim=True)
-    lower = (say * short).sum(dim=-1, keepdim=True) / (total + _LEAST_SAY)
+    influence = smootherstep((stretch - bent) / (straight - bent)) * smootherstep((down - begin) / (end - begin))
+    total = influence.sum(dim=-1, keepdim=True)
+    lower = (influence * short).sum(dim=-1, keepdim=True) / (total + _LEAST_INFLUENCE)
     dip = gaussian.smooth(lower, _HIP_FIT_SECONDS * float(moved.fps))
     return replace(moved, root_position=moved.root_position - dip * _UP)
 
@@ -245,19 +245,19 @@ def _find_ankle_targets(
     over the ground to where the body's rotations bring them, by as much throughout a contact. High over the `ground`
     (metres, in scale) rotations alone count: a kick is a pose, not a position. `raised` is by how much the ground is
     kept higher than in scale, metres."""
-    toes, places = own.joint_positions()[:, TOES], scale * own.joint_positions()[:, FEET]
+    toes, positions = own.joint_positions()[:, TOES], scale * own.joint_positions()[:, FEET]
     aside = (moved.joint_positions()[:, TOES] - scale * toes)[..., ::2]
     for k, of_foot in enumerate(spans):
         if of_foot:
-            places[:, k, ::2] += hold_through(of_foot, mean_by_span(aside[:, k], of_foot), len(toes))
+            positions[:, k, ::2] += hold_through(of_foot, mean_by_span(aside[:, k], of_foot), len(toes))
         else:
-            places[:, k, ::2] += gaussian.smooth(aside[:, k], _FREE_SECONDS * float(own.fps))
+            positions[:, k, ::2] += gaussian.smooth(aside[:, k], _FREE_SECONDS * float(own.fps))
     over = scale * (toes[..., 1] - giver.floor - giver.flat_height)
     lifted = torch.where(over < 0, MAX_TOE_SINK * torch.expm1(over / MAX_TOE_SINK) - over, 0.0)
-    places[..., 1] += (1 - scale) * giver.floor + body.standing_height - scale * giver.flat_height + lifted + raised
+    positions[..., 1] += (1 - scale) * giver.floor + body.standing_height - scale * giver.flat_height + lifted + raised
     share = (over - ground) / leg_length(moved.skeleton)
     high = smootherstep((share - _LOW_SHARE) / _HIGH_SHARE)[..., None]
-    return torch.lerp(places + _foot_length_offset(own, moved, scale), moved.joint_positions()[:, FEET], high)
+    return torch.lerp(positions + _foot_length_offset(own, moved, scale), moved.joint_positions()[:, FEET], high)
 
 
 def _foot_length_offset(own: Motion, moved: Motion, scale: float) -> Float[Tensor, "frames 2 3"]:
@@ -280,15 +280,15 @@ def _foot_length_offset(own: Motion, moved: Motion, scale: float) -> Float[Tenso
 
 def reach_ankle_targets(moved: Motion, ankles: Float[Tensor, "frames 2 3"]) -> Motion:
     """Bend and rotate legs so that ankles reach their targets; feet keep their orientation in the world."""
-    places, world = moved.joint_positions().clone(), moved.joint_rotations()
-    at, most = places[:, HIP_JOINTS], _MAX_EXTENSION * limb_lengths(moved.skeleton, LEGS)
+    positions, world = moved.joint_positions().clone(), moved.joint_rotations()
+    at, most = positions[:, HIP_JOINTS], _MAX_EXTENSION * limb_lengths(moved.skeleton, LEGS)
     to_ankles = ankles - at
     far = to_ankles.norm(dim=-1)
-    places[:, FEET] = at + to_ankles * (soft_clamp(far, most, _SOFT_MARGIN) / far.clamp_min(1e-9))[..., None]
-    free = torch.zeros(places.shape[:2], dtype=torch.bool)
+    positions[:, FEET] = at + to_ankles * (soft_clamp(far, most, _SOFT_MARGIN) / far.clamp_min(1e-9))[..., None]
+    free = torch.zeros(positions.shape[:2], dtype=torch.bool)
     free[:, [*HIP_JOINTS, *SHINS]] = True
     local = inverse.solve_inverse_kinematics(
-        places, moved.local_quat_xyzw, moved.skeleton, free=free, root_position=moved.root_position, limbs=LEGS
+        positions, moved.local_quat_xyzw, moved.skeleton, free=free, root_position=moved.root_position, limbs=LEGS
     )
     turned = replace(moved, local_quat_xyzw=local).joint_rotations().clone()
     turned[:, [*FEET, *TOES]] = world[:, [*FEET, *TOES]]

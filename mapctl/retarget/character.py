@@ -223,11 +223,11 @@ class RiggedCharacter:
         Joints that are not canonical turn as those of the `original`, of the same rig, or rest without one, but for
         `fingers`: local rotations (xyzw) by joint of the rig, none of which carries a canonical joint.
         """
-        made = from_canonical(motion, self.rigmap, original)
-        local = made.local_quat_xyzw.clone()
+        on_rig = from_canonical(motion, self.rigmap, original)
+        local = on_rig.local_quat_xyzw.clone()
         for joint, turns in (fingers or {}).items():
             local[:, joint] = rotations.make_sign_continuous(turns)
-        return replace(made, local_quat_xyzw=local, source=self.source)
+        return replace(on_rig, local_quat_xyzw=local, source=self.source)
 
 
 def limb_lengths(skeleton: Skeleton, limbs: Sequence[Limb]) -> Float[Tensor, " limbs"]:
@@ -237,8 +237,8 @@ def limb_lengths(skeleton: Skeleton, limbs: Sequence[Limb]) -> Float[Tensor, " l
 
 def limb_extension(own: Motion, limbs: Sequence[Limb]) -> Float[Tensor, "frames limbs"]:
     """Return how straight limbs are: from the first joint to the effector over both bones' length."""
-    places = own.joint_positions()
-    reach = places[:, [limb.end for limb in limbs]] - places[:, [limb.upper for limb in limbs]]
+    positions = own.joint_positions()
+    reach = positions[:, [limb.end for limb in limbs]] - positions[:, [limb.upper for limb in limbs]]
     return reach.norm(dim=-1) / limb_lengths(own.skeleton, limbs)
 
 
@@ -269,7 +269,7 @@ def _build_skeleton(rig: Rig) -> Skeleton:
     """Build the joints that the rig names, depth first, as files nest them."""
     names = CANONICAL.names
     spine, chest = CANONICAL.index("spine"), CANONICAL.index("chest")
-    places, frames = dict(enumerate(RigPoses.zero(CANONICAL).positions[0])), dict[int, Tensor]()
+    positions, frames = dict(enumerate(RigPoses.zero(CANONICAL).positions[0])), dict[int, Tensor]()
     own, above, order = dict[int, str](), dict[int, int](), list[int]()
 
     def add(joint: int, name: str, parent: int) -> int:
@@ -281,7 +281,7 @@ def _build_skeleton(rig: Rig) -> Skeleton:
         if joint == chest and parent == spine and names[chest] in rig.joints:
             for number, name in enumerate(rig.trunk, start=1):
                 between = add(CANONICAL.num_joints + number, name, parent)
-                places[between] = torch.lerp(places[spine], places[chest], number / (len(rig.trunk) + 1))
+                positions[between] = torch.lerp(positions[spine], positions[chest], number / (len(rig.trunk) + 1))
                 frames[between], parent = frames[spine], between
         if names[joint] in rig.joints:
             axes = rig.tpose.get(names[joint])
@@ -293,13 +293,17 @@ def _build_skeleton(rig: Rig) -> Skeleton:
     # Joints that no table has are along the file's axes.
     unnamed = torch.eye(3, dtype=torch.float64) if rig.tpose else _file_to_world(rig)
     visit(0, -1)
-    offsets = [places[0] if (p := above[j]) < 0 else frames[p].T @ (places[j] - places[p]) for j in order]
+    offsets = [positions[0] if (p := above[j]) < 0 else frames[p].T @ (positions[j] - positions[p]) for j in order]
     tips: dict[str, tuple[float, float, float]] = {}
     for joint, name in own.items():
         below = CANONICAL.children(joint) if joint < CANONICAL.num_joints else [chest]
         if any(names[child] in rig.joints for child in below):
             continue
-        end = places[below[0]] - places[joint] if below else torch.tensor(CANONICAL.end_offsets[names[joint]]).double()
+        end = (
+            positions[below[0]] - positions[joint]
+            if below
+            else torch.tensor(CANONICAL.end_offsets[names[joint]]).double()
+        )
         x, y, z = (frames[joint].T @ end).tolist()
         tips[name] = (x, y, z)
     parents = tuple(order.index(above[joint]) if above[joint] >= 0 else -1 for joint in order)

@@ -165,7 +165,7 @@ def _check_names(rigmap: RigMap) -> Iterator[Doubt]:
     partners, on one side only."""
     joints, known, names = rigmap.joints, rigmap.match.known_by, rigmap.rig_skeleton.names
     quoted = {name: _quote(rigmap, joint) for name, joint in joints.items()}
-    placed = [name for name, how in known.items() if how is KnownBy.PLACE]
+    placed = [name for name, how in known.items() if how is KnownBy.POSITION]
     if len(placed) <= _MAX_LISTED:
         for name in placed:
             yield Doubt(f"{name} is known by its position alone (joint {quoted[name]})", (name,))

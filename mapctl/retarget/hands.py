@@ -30,7 +30,7 @@ _MERGE_METRES = 0.06  # metres that such contacts are apart at most
 
 
 def merge_contacts(
-    touching: Bool[Tensor, "frames points"], places: Float[Tensor, "frames points 3"], fps: float
+    touching: Bool[Tensor, "frames points"], positions: Float[Tensor, "frames points 3"], fps: float
 ) -> list[Spans]:
     """Return by point the spans in which it touches, merged where noise alone parts them: soon after each other, and
     at one place over the ground, metres."""
@@ -38,7 +38,7 @@ def merge_contacts(
     for point, start, stop in true_intervals(touching):
         spans = found[point]
         near = bool(spans) and start - spans[-1][1] < _MERGE_SECONDS * fps
-        if near and float((places[start, point] - places[spans[-1][1] - 1, point])[::2].norm()) < _MERGE_METRES:
+        if near and float((positions[start, point] - positions[spans[-1][1] - 1, point])[::2].norm()) < _MERGE_METRES:
             spans[-1] = (spans[-1][0], stop)
         else:
             spans.append((start, stop))
@@ -158,8 +158,8 @@ class _Relations(NamedTuple):
 
     def body_strength(self) -> Float[Tensor, "frames 2"]:
         """Return how much hands are bound to body and floor, 0 to 1: about as to what binds them most."""
-        weight, say = self.by_hand()
-        return (say * weight).sum(dim=-1) / say.sum(dim=-1).clamp_min(1e-9)
+        weight, influence = self.by_hand()
+        return (influence * weight).sum(dim=-1) / influence.sum(dim=-1).clamp_min(1e-9)
 
     def by_hand(self) -> tuple[Float[Tensor, "frames 2 relations"], Float[Tensor, "frames 2 relations"]]:
         """Return by hand the weights of its points' relations to segments and floor, and what say each has among
@@ -202,8 +202,8 @@ def _find_relations(own: Motion, giver: Stance) -> _Relations:
     near = _find_nearest(points, _place_segments(own))
     # No hand is bound to its own arm, and hardly to trunk and thigh while the arm is straight and hangs.
     straight = (limb_extension(own, ARMS) - _HANGS_FROM) / (_HANGS_TO - _HANGS_FROM)
-    say = (1 - smootherstep(straight)[..., None] * _BESIDE.double()) * (~_IS_ARM).double()
-    say = say.repeat_interleave(len(_POINTS), dim=1)
+    influence = (1 - smootherstep(straight)[..., None] * _BESIDE.double()) * (~_IS_ARM).double()
+    influence = influence.repeat_interleave(len(_POINTS), dim=1)
     # A hand that swings past a segment is not put there.
     stays = torch.ones_like(near.distance)
     if len(points) > 1:
@@ -212,7 +212,9 @@ def _find_relations(own: Motion, giver: Stance) -> _Relations:
         stays = 1 - smootherstep((smooth - _SLOW_SPEED) / (_FAST_SPEED - _SLOW_SPEED))
     far = torch.lerp(stays.new_tensor(_SLIDE_METRES), stays.new_tensor(_FAR_METRES), stays)
     weight, touch = (
-        gaussian.envelope((say * _weigh(near.distance - thick, reach)).flatten(1), _FADE_SECONDS, fps).view_as(stays)
+        gaussian.envelope((influence * _weigh(near.distance - thick, reach)).flatten(1), _FADE_SECONDS, fps).view_as(
+            stays
+        )
         for reach in (far, _SLIDE_METRES)
     )
     left, right = points.unflatten(1, (2, -1)).unbind(dim=1)
@@ -292,9 +294,9 @@ def _offset_hands(
     slide = inside * torch.nn.functional.normalize(body.end - body.begin, dim=-1)[:, None]
     along = (1 - relations.touch[..., None]) * (toward * slide).sum(-1, keepdim=True)
     offsets = torch.cat([toward - along * slide, at_floor[:, :, None]], dim=2).unflatten(1, (2, -1)).flatten(2, 3)
-    weight, say = relations.by_hand()
-    total = say.sum(dim=-1, keepdim=True).clamp_min(1e-9)
-    offset = ((say * weight)[..., None] * offsets).sum(dim=2) / total + missed
+    weight, influence = relations.by_hand()
+    total = influence.sum(dim=-1, keepdim=True).clamp_min(1e-9)
+    offset = ((influence * weight)[..., None] * offsets).sum(dim=2) / total + missed
     middle = points.unflatten(1, (2, -1)).mean(dim=2) + offset
     missing = relations.together * (relations.apart - (middle[:, 1] - middle[:, 0]))
     # A hand that touches the body stays there; the other comes to it.
@@ -311,10 +313,10 @@ def _reach(
 ) -> Motion:
     """Bend arms so that hands are moved by an offset, as far as that is in reach without arms that are straighter than
     `straight`, or than most; where relations are weak, hardly."""
-    places, world = moved.joint_positions(), moved.joint_rotations()
+    positions, world = moved.joint_positions(), moved.joint_rotations()
     ease, turned = smootherstep(strength / _EASE_WEIGHT), world.clone()
     for k, arm in enumerate(ARMS):
-        to_hand = places[:, arm.end] - places[:, arm.upper]
+        to_hand = positions[:, arm.end] - positions[:, arm.upper]
         most = straight[:, k, None].clamp(_FREE_EXTENSION, _MOST_EXTENSION) * arm.length(moved.skeleton)
         wanted = to_hand + offset[:, k]
         was, far = to_hand.norm(dim=-1, keepdim=True), wanted.norm(dim=-1, keepdim=True)
@@ -337,9 +339,9 @@ def _girth(skeleton: Skeleton) -> float:
 
 def _place_segments(motion: Motion) -> _Segments:
     """Place the segments of a body in every frame of a motion of canonical joints."""
-    size, places, turns = _girth(motion.skeleton), motion.joint_positions(), motion.joint_rotations()
-    begin, end = places[:, _STARTS], places[:, _STOPS].clone()
-    tip = (size * torch.tensor(_HEAD_TIP, dtype=torch.float64)).expand(len(places), 3)
+    size, positions, turns = _girth(motion.skeleton), motion.joint_positions(), motion.joint_rotations()
+    begin, end = positions[:, _STARTS], positions[:, _STOPS].clone()
+    tip = (size * torch.tensor(_HEAD_TIP, dtype=torch.float64)).expand(len(positions), 3)
     skull = len(_TRUNK) - 1
     end[:, skull] = begin[:, skull] + rotations.rotate(turns[:, _STARTS[skull]], tip)
     return _Segments(begin, end, turns[:, _STARTS], size * _WIDTHS)
@@ -348,11 +350,11 @@ def _place_segments(motion: Motion) -> _Segments:
 def _find_nearest(points: Float[Tensor, "frames points 3"], body: _Segments) -> _Near:
     """Find where points are on each segment of a body."""
     axis = (body.end - body.begin)[:, None]
-    way = points[:, :, None] - body.begin[:, None]
-    share = (way * axis).sum(-1, keepdim=True) / axis.square().sum(-1, keepdim=True).clamp_min(1e-9)
+    offset = points[:, :, None] - body.begin[:, None]
+    share = (offset * axis).sum(-1, keepdim=True) / axis.square().sum(-1, keepdim=True).clamp_min(1e-9)
     share = share.clamp(0, 1)
     turns = rotations.inverse(body.quat_xyzw)[:, None].expand(*share.shape[:3], 4)
-    local = rotations.rotate(turns, way)
+    local = rotations.rotate(turns, offset)
     aside = local - rotations.rotate(turns, share * axis)
     aside_widths = aside / _width_at(body, share)
     round_off = aside_widths.norm(dim=-1, keepdim=True)

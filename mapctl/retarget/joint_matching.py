@@ -46,11 +46,11 @@ class KnownBy(Enum):
     """Its name, which a listed rig or the user's rig names."""
     WORDS = "words"
     """The words of its name: a side and a body part."""
-    PLACE = "place"
+    POSITION = "position"
     """Its place in the tree and the lengths of the bones alone."""
 
 
-_CREDIT = {KnownBy.LIST: 1.0, KnownBy.WORDS: 1.0, KnownBy.PLACE: 0.7}
+_CREDIT = {KnownBy.LIST: 1.0, KnownBy.WORDS: 1.0, KnownBy.POSITION: 0.7}
 
 
 @dataclass(frozen=True)
@@ -191,12 +191,12 @@ def _complete_match(
             found.setdefault(name, joint)
     known = {name: KnownBy.LIST if name in given else KnownBy.WORDS for name in found}
     beside = find_by_other_side(skeleton, found)
-    found, known = found | beside, known | dict.fromkeys(beside, KnownBy.PLACE)
+    found, known = found | beside, known | dict.fromkeys(beside, KnownBy.POSITION)
     by_tree = _assign_sides(match_by_tree(skeleton), classify_joints(skeleton), skeleton, motion)
     for name, joint in by_tree.items():
         helper = HELPER_NAME.search(skeleton.names[joint])
         if name not in found and joint not in found.values() and not helper:
-            found[name], known[name] = joint, KnownBy.PLACE
+            found[name], known[name] = joint, KnownBy.POSITION
     return found, known
 
 

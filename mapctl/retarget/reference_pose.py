@@ -267,19 +267,21 @@ def measure_bones(skeleton: Skeleton, joint_of: JointOf, tpose: TPose) -> Skelet
     A joint that the rig lacks is put where the End Site of the joint above is, between its neighbours, or, at the end
     of a limb, as far on as the canonical one in scale.
     """
-    turn, place = rest_rotations(skeleton, joint_of, tpose), [torch.zeros(3, dtype=torch.float64)]
+    turn, joint_positions = rest_rotations(skeleton, joint_of, tpose), [torch.zeros(3, dtype=torch.float64)]
     for joint, parent in enumerate(skeleton.parents[1:], start=1):
-        place.append(place[parent] + rotations.rotate(turn[parent], skeleton.offsets[joint]))
+        joint_positions.append(joint_positions[parent] + rotations.rotate(turn[parent], skeleton.offsets[joint]))
     ends = {}
     for name, site in skeleton.end_offsets.items():
         joint = skeleton.index(name)
         ends[joint] = rotations.rotate(turn[joint], torch.tensor(site, dtype=torch.float64))
-    known = {c: place[joint] for c, joint in enumerate(joint_of) if joint is not None}
+    known = {c: joint_positions[joint] for c, joint in enumerate(joint_of) if joint is not None}
     spots: list[Tensor] = []
     for c in range(CANONICAL.num_joints):
         spots.append(known[c] if c in known else _estimate_position(c, joint_of, spots, known, ends))
-    places = torch.stack(spots)
-    offsets = torch.cat([torch.zeros(1, 3, dtype=torch.float64), places[1:] - places[list(CANONICAL.parents[1:])]])
+    positions = torch.stack(spots)
+    offsets = torch.cat(
+        [torch.zeros(1, 3, dtype=torch.float64), positions[1:] - positions[list(CANONICAL.parents[1:])]]
+    )
     tips = {}
     for c, joint in enumerate(joint_of):
         if joint in ends and not CANONICAL.children(c):

@@ -75,7 +75,7 @@ class LiveCharacter(Protocol):
         """Reach, look and walk round obstacles as in this command; nothing else of it counts, and a path is kept."""
         ...
 
-    def go(self, command: Command, place: tuple[float, float], within: float, facing: float | None = None) -> None:
+    def go(self, command: Command, position: tuple[float, float], within: float, facing: float | None = None) -> None:
         """Be at a place (x and z, metres) in so many seconds, facing so (radians; None as it comes there), if that is
         possible, and obey the command from then on; a note gives the reason if not."""
         ...

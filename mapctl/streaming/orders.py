@@ -32,7 +32,7 @@ NUMBERS: Mapping[str, Sequence[int]] = {
     "stop": (0,),
     **dict.fromkeys(HANDS, (0, 3)),
     "look": (0, 3),
-    "place": (2, 3, 4),
+    "goto": (2, 3, 4),
     "path": range(4, 2 * _MAX_PATH_POINTS + 1, 2),
     "disc": (0, 3),
     "pause": (0, 1),

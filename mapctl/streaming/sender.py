@@ -34,7 +34,7 @@ BONE_NAMES = tuple(name[0].upper() + name[1:] for name in CANONICAL.names)
 _AVAILABLE = (1, 3, 0)  # a model is loaded, calibrated, in the normal mode
 _ROOT_NAME = "root"
 _TRANSFORM_NUMBERS = 7  # three of a place, four of a rotation
-_MIRROR_PLACE, _MIRROR_QUAT = np.array([-1.0, 1.0, 1.0]), np.array([1.0, -1.0, -1.0, 1.0])
+_MIRROR_POSITION, _MIRROR_QUAT = np.array([-1.0, 1.0, 1.0]), np.array([1.0, -1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,10 +78,10 @@ def encode_frame(
     with `root_travels` the root is on the ground below the hips. The time comes last: it ends the frame.
     """
     ground = position * (1.0, 0.0, 1.0) if root_travels else np.zeros(3)
-    places = skeleton.offsets.numpy().copy()
-    places[0] = position - ground
-    values = np.concatenate([places * _MIRROR_PLACE, quats_xyzw * _MIRROR_QUAT], axis=-1)
-    root = (*(ground * _MIRROR_PLACE).tolist(), 0.0, 0.0, 0.0, 1.0)
+    positions = skeleton.offsets.numpy().copy()
+    positions[0] = position - ground
+    values = np.concatenate([positions * _MIRROR_POSITION, quats_xyzw * _MIRROR_QUAT], axis=-1)
+    root = (*(ground * _MIRROR_POSITION).tolist(), 0.0, 0.0, 0.0, 1.0)
     bones = [Message(BONE, (name, *row)) for name, row in zip(BONE_NAMES, values.tolist(), strict=True)]
     return [Message(ROOT, (_ROOT_NAME, *root)), *bones, Message(OK, _AVAILABLE), Message(TIME, (float(seconds),))]
 
@@ -118,7 +118,7 @@ def _read_transform(arguments: tuple[object, ...]) -> tuple[str, Float[ndarray, 
     if not name or not isinstance(name[0], str) or len(numbers) < _TRANSFORM_NUMBERS or not _are_numbers(numbers):
         return None
     values = np.array(numbers, dtype=np.float64)
-    return name[0], np.concatenate([values[:3] * _MIRROR_PLACE, values[3:] * _MIRROR_QUAT])
+    return name[0], np.concatenate([values[:3] * _MIRROR_POSITION, values[3:] * _MIRROR_QUAT])
 
 
 def _are_numbers(values: tuple[object, ...]) -> bool:

@@ -71,7 +71,7 @@ class WithinReach:
 
     shoulder: int
     """Index of the canonical joint from which the limb reaches."""
-    place: Float[Tensor, "frames 3"]
+    position: Float[Tensor, "frames 3"]
     """Target in each frame of the window, world, metres; anything finite where there is none."""
     wanted: Bool[Tensor, " frames"]
     """Whether there is a target in a frame."""
@@ -91,5 +91,5 @@ class WithinReach:
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Return the distance beyond reach, metres; 0 where the limb reaches."""
-        away = trial.joints_world[..., self.shoulder, :] - self.place.to(trial.features)
+        away = trial.joints_world[..., self.shoulder, :] - self.position.to(trial.features)
         return (length(away) - self.reach).clamp_min(0) * self.wanted

@@ -261,13 +261,13 @@ def find_segment(curve, arc):
 
 
 @inner
-def evaluate_position(curve, arc, place):
+def evaluate_position(curve, arc, position):
     """Evaluate the position on the curve at an arc: straight on beyond open ends."""
     segment = find_segment(curve, arc)
     lap, index = segment // len(curve.directions), segment % len(curve.directions)
     along = arc - lap * curve.length - curve.knots[index]
-    for k in range(len(place)):
-        place[k] = curve.corners[index, k] + along * curve.directions[index, k]
+    for k in range(len(position)):
+        position[k] = curve.corners[index, k] + along * curve.directions[index, k]
 
 
 @inner
@@ -324,24 +324,24 @@ def evaluate_axes(curve, arc, ahead, behind, axes):
 
 
 @entry
-def fill_local_frames(curve, points, around, reach, places, axes, straightened):
+def fill_local_frames(curve, points, around, reach, positions, axes, straightened):
     """Fill local frames of points (batch, frames, dims) near arcs `around` (frames); see `local_frame.LocalFrame`."""
     if curve.closed:
         reach = min(reach, 0.5 * curve.length)  # a lap has every position once
     dims = points.shape[2]
-    place, frame, scratch = np.empty(dims), np.empty((dims, dims)), np.empty((2, dims))
+    position, frame, scratch = np.empty(dims), np.empty((dims, dims)), np.empty((2, dims))
     for b in range(len(points)):
         for t in range(len(around)):
             arc = math.nan
             if abs(around[t]) < _ARC_LIMIT:
                 arc = find_nearest_arc(curve, points[b, t], around[t], reach)
                 arc = arc if math.isfinite(arc) else around[t]
-                evaluate_position(curve, arc, place)
+                evaluate_position(curve, arc, position)
                 evaluate_axes(curve, arc, scratch[0], scratch[1], frame)
             for k in range(dims):
                 known = math.isfinite(arc)
-                places[b, t, k] = place[k] if known else math.nan
-                straightened[b, t, k] = place[k] + (around[t] - arc) * frame[1, k] if known else math.nan
+                positions[b, t, k] = position[k] if known else math.nan
+                straightened[b, t, k] = position[k] + (around[t] - arc) * frame[1, k] if known else math.nan
                 for row in range(dims):
                     axes[b, t, row, k] = frame[row, k] if known else math.nan
 
@@ -350,7 +350,7 @@ def fill_local_frames(curve, points, around, reach, places, axes, straightened):
 class LocalFrame:
     """The curve near each point; constants, without gradient."""
 
-    place: Float[Tensor, "batch frames dims"]
+    position: Float[Tensor, "batch frames dims"]
     """Nearest position on the curve, metres."""
     axes: Float[Tensor, "batch frames dims dims"]
     """Unit rows: left on the ground, forward; in space a third, upward less what of it lies along the slope."""
@@ -377,7 +377,7 @@ def find_local_frames(
     arcs = around.detach().double().contiguous().numpy()
     known = points.detach().contiguous()
     near = LocalFrame(torch.empty_like(known), known.new_empty(*known.shape, curve.dims), torch.empty_like(known))
-    filled = (near.place.numpy(), near.axes.numpy(), near.tangent_extension.numpy())
+    filled = (near.position.numpy(), near.axes.numpy(), near.tangent_extension.numpy())
     fill_local_frames(_build_tables(curve), known.numpy(), arcs, reach, *filled)
     return near
 

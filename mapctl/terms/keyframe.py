@@ -13,7 +13,7 @@ from mapctl.terms.trial import Trial
 class Keyframe:
     """Joints are at target positions in the world. Whole poses that are given need no term: they are no unknowns."""
 
-    places: Float[Tensor, "frames joints 3"]
+    positions: Float[Tensor, "frames joints 3"]
     """Target positions in the world, metres; anything finite where there is no target."""
     wanted: Bool[Tensor, "frames joints"]
     """Whether a joint has a target in a frame."""
@@ -32,5 +32,5 @@ class Keyframe:
 
     def _squares(self, trial: Trial) -> Float[Tensor, "batch frames joints"]:
         """Squared distances, m^2."""
-        error = trial.joints_world - self.places.to(trial.features)
+        error = trial.joints_world - self.positions.to(trial.features)
         return error.square().sum(-1) * self.wanted

@@ -77,7 +77,7 @@ class Path:
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Return the distance to the curve, metres."""
         positions = self._positions(trial)
-        return length(positions - self._nearest_frame(positions).place)
+        return length(positions - self._nearest_frame(positions).position)
 
     def _positions(self, trial: Trial) -> Float[Tensor, "batch frames dims"]:
         if self.joint == "hips" and self.curve.dims == 2:  # no need of the whole body's kinematics
@@ -115,7 +115,7 @@ class Path:
         around = self.arcs[0] - step * torch.arange(len(past), 0, -1)
         positions = self._select_axes(past)
         near = find_local_frames(self.curve, positions[None], around, reach=_REACH)
-        return ((positions - near.place[0]) * near.axes[0, :, 0]).sum(-1)
+        return ((positions - near.position[0]) * near.axes[0, :, 0]).sum(-1)
 
 
 @lru_cache(maxsize=8)

@@ -218,15 +218,15 @@ class LstmGmmDensity(checkpoints.LoadedModel, Density[LstmState]):
 
     def conditioned_like_clip(self, name: str) -> "LstmGmmDensity":
         """Return the density given the labels that a clip's path tells, of those that it knows."""
-        told = read_clip_labels(name, self.card.data.get("labels", ""))
-        known = sorted(told & {*self.reference.config.labels})
+        given = read_clip_labels(name, self.card.data.get("labels", ""))
+        known = sorted(given & {*self.reference.config.labels})
         return self._with_network(self.reference.conditioned_on(known))
 
     @property
     def pace_rates(self) -> dict[tuple[str, str], float]:
         """Changes of pace a second in its data, by the pace before and after, if paces are labels of it."""
-        held, told = self.card.data.get("holds", {}), {*PACE_LABELS} <= {*self.reference.config.labels}
-        return read_pace_rates(held) if told and "minutes by pace" in held else {}
+        held, given = self.card.data.get("holds", {}), {*PACE_LABELS} <= {*self.reference.config.labels}
+        return read_pace_rates(held) if given and "minutes by pace" in held else {}
 
     def with_observation_noise(self, sigma: Float[Tensor, " continuous"]) -> "LstmGmmDensity":
         """Return the density of motion observed with errors of this sigma (physical units); see `LstmGmm`."""

@@ -114,7 +114,7 @@ class MixtureConstants(NamedTuple):
     """(Z,) of the features, physical units."""
     std: Array
     """(Z,), physical units; 1 where padded."""
-    mixing: Array
+    cholesky: Array
     """(components, C, C): what correlates each component's Gaussian values; ones on the diagonal where nothing does."""
 
 
@@ -168,7 +168,7 @@ def pack_constants(model: LstmGmm) -> MixtureConstants:
     mean[: model.layout.size], std[: model.layout.size] = _to_numpy(model.mean), _to_numpy(model.std)
     low, high = np.float32(config.min_log_sigma), np.float32(config.max_log_sigma)
     alone = torch.eye(size).repeat(config.components, 1, 1)
-    mixing = np.ascontiguousarray(_to_numpy(alone if model.mixing is None else model.mixing))
+    cholesky = np.ascontiguousarray(_to_numpy(alone if model.cholesky is None else model.cholesky))
     return MixtureConstants(
         size,
         rows,
@@ -180,7 +180,7 @@ def pack_constants(model: LstmGmm) -> MixtureConstants:
         high,
         mean,
         std,
-        mixing,
+        cholesky,
     )
 
 
@@ -496,10 +496,10 @@ def discrete_density(settings, count, head, component, contacts):
 
 
 @_inner
-def compose_gaussian(settings, head, before, noise, after, mixing):
+def compose_gaussian(settings, head, before, noise, after, cholesky):
     """The next frame's Gaussian values and their log density; the head's rows become sigma and slope.
 
-    `mixing` is the component's (C, C) triangle; it leaves volumes, and so densities, as they are.
+    `cholesky` is the component's (C, C) triangle; it leaves volumes, and so densities, as they are.
     """
     size = settings.continuous
     means, rows = head[:size], head[settings.log_sigma : settings.log_sigma + size]
@@ -515,7 +515,7 @@ def compose_gaussian(settings, head, before, noise, after, mixing):
         rows[j] = _FOUR * share * (_ONE - share)
         density -= log_sigma + _HALF * noise[j] * noise[j]
     for j in range(size):
-        row, total = mixing[j], _ZERO
+        row, total = cholesky[j], _ZERO
         for i in range(size):
             total += row[i] * means[i] * noise[i]
         after[j] += total
@@ -538,7 +538,7 @@ def compose(weights, biases, settings, tape, now, after, noise, choices, t, sour
         affine(weights.head[k, :shared], biases.head[k, :shared], hidden[b : b + 1], head[b : b + 1])
         discrete = discrete_density(settings, count, head[b], k, choices.contacts[b, t])
         continuous = compose_gaussian(
-            settings, head[b], tape.frame[now, b], noise[b, t], following[b], settings.mixing[k]
+            settings, head[b], tape.frame[now, b], noise[b, t], following[b], settings.cholesky[k]
         )
         density[b, t] = discrete + continuous
         for j in range(size):
@@ -586,11 +586,11 @@ def compose_pullback(settings, tape, noise, component, t, d_feature, d_density, 
         n, dn, df, up = noise[b, t], d_noise[b, t], d_feature[b, t], d_density[b, t]
         for j in range(size):
             d_rows[j] = gradient[j] + df[j] * settings.std[j]
-        mixing = settings.mixing[component[b, t]]
+        cholesky = settings.cholesky[component[b, t]]
         for i in range(size):
             d_spread[i] = _ZERO
         for j in range(size):
-            row, pulled = mixing[j], d_rows[j]
+            row, pulled = cholesky[j], d_rows[j]
             for i in range(size):
                 d_spread[i] += row[i] * pulled
         for j in range(size):

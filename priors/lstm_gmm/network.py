@@ -66,13 +66,13 @@ class Planting:
         size = LAYOUT.continuous
         base = torch.cat([mean, sample[:, size:]], dim=-1)
         still = torch.cat([torch.zeros_like(before[:, :3]), before[:, 3:]], dim=-1)  # where the frame comes from
-        places = _place_toes(torch.cat([base[:, None] + _CHANGES.to(base), still[:, None]], dim=1))
-        places, stood = places[:, :-1], places[:, -1]
+        positions = _place_toes(torch.cat([base[:, None] + _CHANGES.to(base), still[:, None]], dim=1))
+        positions, stood = positions[:, :-1], positions[:, -1]
         told = planted[..., None].expand(-1, -1, 3).flatten(1)
         jacobian = factor.new_zeros(len(sample), 6, size)
-        jacobian[..., _MOVING] = ((places[:, 1:] - places[:, :1]) / _CHANGE).transpose(1, 2)
+        jacobian[..., _MOVING] = ((positions[:, 1:] - positions[:, :1]) / _CHANGE).transpose(1, 2)
         jacobian = torch.where(told[..., None], jacobian, 0.0)
-        step = places[:, 0] - stood + torch.einsum("bij,bj->bi", jacobian, sample[:, :size] - mean)
+        step = positions[:, 0] - stood + torch.einsum("bij,bj->bi", jacobian, sample[:, :size] - mean)
         spread = jacobian @ factor  # of the steps, along the Gaussian's own axes
         covariance = spread @ spread.mT + sigma**2 * torch.eye(6).to(spread)
         miss = torch.where(told, error.flatten(1) - step, 0.0)
@@ -83,8 +83,8 @@ class Planting:
 def _place_toes(features: Float[Tensor, "batch variants size"]) -> Float[Tensor, "batch variants 6"]:
     """Places of both toes after one frame from the origin, metres."""
     ground, heading = LAYOUT.pick(features, "root_displacement_heading"), LAYOUT.pick(features, "heading_change")
-    places = place_joints(features, ground.contiguous(), heading[..., 0].contiguous(), CANONICAL)
-    return places[:, :, list(TOE_JOINTS)].flatten(2)
+    positions = place_joints(features, ground.contiguous(), heading[..., 0].contiguous(), CANONICAL)
+    return positions[:, :, list(TOE_JOINTS)].flatten(2)
 
 
 NOISE_UNIT = 0.1
@@ -154,18 +154,18 @@ class Mixture:
     def log_prob(
         self,
         target: Float[Tensor, "*batch size"],
-        whitening: Float[Tensor, "components continuous continuous"] | None,
+        inverse_cholesky: Float[Tensor, "components continuous continuous"] | None,
         blur: Float[Tensor, "components continuous"] | None = None,
     ) -> Float[Tensor, "*batch"]:
         """Eq. 8 without its sign, plus the contact bits; the target is normalised, its bits are 0 or 1.
 
-        `whitening` holds each component's unit lower triangular factor, which leaves volumes as they are; `blur` is
-        added to the variances of the values that it makes independent.
+        `inverse_cholesky` is each component's inverse Cholesky factor, unit lower triangular, with determinant 1;
+        `blur` is added to the variances of the decorrelated values.
         """
         continuous, bits = target[..., : self.mean.shape[-1]], target[..., self.mean.shape[-1] :]
         error = continuous.unsqueeze(-2) - self.mean
-        if whitening is not None:
-            error = torch.einsum("kij,...kj->...ki", whitening, error)
+        if inverse_cholesky is not None:
+            error = torch.einsum("kij,...kj->...ki", inverse_cholesky, error)
         log_sigma = self.log_sigma if blur is None else 0.5 * torch.log(torch.exp(2 * self.log_sigma) + blur)
         error = error * torch.exp(-log_sigma)
         each = -0.5 * (error**2).sum(-1) - log_sigma.sum(-1) - 0.5 * math.log(2 * math.pi) * error.shape[-1]
@@ -203,19 +203,19 @@ class LstmGmm(nn.Module):
         self.correlation = nn.Parameter(torch.zeros(square)) if config.correlated else None
 
     @property
-    def whitening(self) -> Float[Tensor, "components continuous continuous"] | None:
+    def inverse_cholesky(self) -> Float[Tensor, "components continuous continuous"] | None:
         """Unit lower triangular factor of each component: it takes the values' correlation away."""
         if self.correlation is None:
             return None
         return torch.tril(self.correlation, -1) + torch.eye(self.layout.continuous).to(self.correlation)
 
     @property
-    def mixing(self) -> Float[Tensor, "components continuous continuous"] | None:
-        """Inverse of `whitening`: it makes independent values correlated."""
-        if (whitening := self.whitening) is None:
+    def cholesky(self) -> Float[Tensor, "components continuous continuous"] | None:
+        """Inverse of `inverse_cholesky`: it makes independent values correlated."""
+        if (inverse_cholesky := self.inverse_cholesky) is None:
             return None
-        unit = torch.eye(self.layout.continuous).to(whitening).expand_as(whitening)
-        return torch.linalg.solve_triangular(whitening, unit, upper=False, unitriangular=True)
+        unit = torch.eye(self.layout.continuous).to(inverse_cholesky).expand_as(inverse_cholesky)
+        return torch.linalg.solve_triangular(inverse_cholesky, unit, upper=False, unitriangular=True)
 
     def conditioned_on(self, labels: Iterable[str]) -> "LstmGmm":
         """Return a copy conditioned on these labels, whose weights are this network's; its inputs are taken to be
@@ -256,8 +256,8 @@ class LstmGmm(nn.Module):
         """
         model, size = self._copy_with_same_weights(), self.layout.continuous
         variance = (sigma.to(self.std) / self.std[:size]).square().expand(self.config.components, size)
-        if (whitening := self.whitening) is not None:
-            variance = torch.einsum("kij,kj->ki", whitening.detach().square(), variance)
+        if (inverse_cholesky := self.inverse_cholesky) is not None:
+            variance = torch.einsum("kij,kj->ki", inverse_cholesky.detach().square(), variance)
         model.blur = variance.clone()
         return model
 
@@ -314,7 +314,7 @@ class LstmGmm(nn.Module):
         given = features if inputs is None else inputs
         before = torch.cat([state.last_frame.unsqueeze(1), given[:, :-1]], dim=1)
         mixture, _ = self(self.normalise(before), (state.hidden, state.cell))
-        return mixture.log_prob(self._target(features), self.whitening, self.blur)
+        return mixture.log_prob(self._target(features), self.inverse_cholesky, self.blur)
 
     def advance(
         self,
@@ -355,7 +355,7 @@ class LstmGmm(nn.Module):
         condition: Float[Tensor, "batch conditions"] | None = None,
     ) -> tuple[Float[Tensor, "batch frames size"], LstmState]:
         """`sample`, differentiable in the weights for the components and bits that were drawn."""
-        drawn, device, mixing = [], self.mean.device, self.mixing
+        drawn, device, cholesky = [], self.mean.device, self.cholesky
         there, size = generator.device, self.layout.continuous
         for _ in range(frames):
             mixture, state = self._step(state, condition)
@@ -364,9 +364,9 @@ class LstmGmm(nn.Module):
             noise = temperature * torch.randn(len(weights), size, generator=generator, device=there).to(device)
             planted = torch.sigmoid(mixture.contact_logit.detach())  # probability
             bits = torch.rand(planted.shape, generator=generator, device=there).to(device) < planted
-            frame, _ = self._compose(mixture, component, noise, bits, mixing)
+            frame, _ = self._compose(mixture, component, noise, bits, cholesky)
             if planting is not None:
-                gaussian = self._find_gaussian(mixture, component, mixing, temperature)
+                gaussian = self._find_gaussian(mixture, component, cholesky, temperature)
                 frame = planting.condition(state.last_frame, frame, *gaussian, generator)
             state = LstmState(frame, state.hidden, state.cell)
             drawn.append(frame)
@@ -376,12 +376,12 @@ class LstmGmm(nn.Module):
         """The likeliest component and contact bits of each frame along the rollout that the noise gives."""
         components, contacts = [], []
         with torch.no_grad():
-            mixing = self.mixing
+            cholesky = self.cholesky
             for step in noise.unbind(1):
                 mixture, state = self._step(state)
                 components.append(mixture.log_weight.argmax(-1))
                 contacts.append(mixture.contact_logit > 0)
-                frame, _ = self._compose(mixture, components[-1], step, contacts[-1], mixing)
+                frame, _ = self._compose(mixture, components[-1], step, contacts[-1], cholesky)
                 state = LstmState(frame, state.hidden, state.cell)
         return DiscreteChoices(torch.stack(components, 1), torch.stack(contacts, 1))
 
@@ -390,13 +390,13 @@ class LstmGmm(nn.Module):
     ) -> tuple[Float[Tensor, "batch frames size"], Float[Tensor, "batch frames"]]:
         """Features x = mu_k + R_k sigma_k noise under the plan, and each frame's log density under component k.
 
-        R is `mixing`. Differentiable by back-propagation through time: the specification that the fast path is tested
+        R is `cholesky`. Differentiable by back-propagation through time: the specification that the fast path is tested
         against.
         """
-        frames, densities, mixing = [], [], self.mixing
+        frames, densities, cholesky = [], [], self.cholesky
         for t, step in enumerate(noise.unbind(1)):
             mixture, state = self._step(state)
-            frame, density = self._compose(mixture, plan.component[:, t], step, plan.contacts[:, t], mixing)
+            frame, density = self._compose(mixture, plan.component[:, t], step, plan.contacts[:, t], cholesky)
             state = LstmState(frame, state.hidden, state.cell)
             frames.append(frame)
             densities.append(density)
@@ -411,8 +411,8 @@ class LstmGmm(nn.Module):
             before = torch.cat([state.last_frame.unsqueeze(1), features[:, :-1]], dim=1)
             mixture, _ = self(self.normalise(before), (state.hidden, state.cell))
             error = self._target(features)[..., : self.layout.continuous].unsqueeze(-2) - mixture.mean
-            if (whitening := self.whitening) is not None:
-                error = torch.einsum("kij,...kj->...ki", whitening, error)
+            if (inverse_cholesky := self.inverse_cholesky) is not None:
+                error = torch.einsum("kij,...kj->...ki", inverse_cholesky, error)
             noise = error * torch.exp(-mixture.log_sigma)
             each = mixture.log_weight - mixture.log_sigma.sum(-1) - 0.5 * noise.square().sum(-1)
             component = each.argmax(-1)
@@ -432,15 +432,15 @@ class LstmGmm(nn.Module):
         component: Int[Tensor, " batch"],
         noise: Float[Tensor, "batch continuous"],
         contacts: Bool[Tensor, "batch 2"],
-        mixing: Tensor | None,
+        cholesky: Tensor | None,
     ) -> tuple[Float[Tensor, "batch size"], Float[Tensor, " batch"]]:
         """One frame (physical units) of the chosen component and bits, and its log density."""
         row = torch.arange(len(component))
         mean, log_sigma = mixture.mean[row, component], mixture.log_sigma[row, component]
         size = self.layout.continuous
         spread = torch.exp(log_sigma) * noise
-        if mixing is not None:
-            spread = torch.einsum("bij,bj->bi", mixing[component], spread)
+        if cholesky is not None:
+            spread = torch.einsum("bij,bj->bi", cholesky[component], spread)
         continuous = (mean + spread) * self.std[:size] + self.mean[:size]
         density = mixture.log_weight[row, component] - log_sigma.sum(-1) - 0.5 * (noise**2).sum(-1)
         density = density - 0.5 * math.log(2 * math.pi) * size
@@ -449,12 +449,12 @@ class LstmGmm(nn.Module):
         return torch.cat([continuous, contacts.to(continuous.dtype)], dim=-1), density
 
     def _find_gaussian(
-        self, mixture: Mixture, component: Int[Tensor, " batch"], mixing: Tensor | None, temperature: float
+        self, mixture: Mixture, component: Int[Tensor, " batch"], cholesky: Tensor | None, temperature: float
     ) -> tuple[Float[Tensor, "batch continuous"], Float[Tensor, "batch continuous continuous"]]:
         """Mean of the chosen components and a factor of their covariance, physical units."""
         row, size = torch.arange(len(component)), self.layout.continuous
         sigma = temperature * torch.exp(mixture.log_sigma[row, component])
-        factor = torch.diag_embed(sigma) if mixing is None else mixing[component] * sigma[:, None]
+        factor = torch.diag_embed(sigma) if cholesky is None else cholesky[component] * sigma[:, None]
         mean = mixture.mean[row, component] * self.std[:size] + self.mean[:size]
         return mean, self.std[:size, None] * factor
 

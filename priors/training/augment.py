@@ -131,7 +131,7 @@ def corrupt(clean: Capture, generator: torch.Generator) -> Capture:
     noise = _sample_noise(draw)
     spikes = _sample_spikes(draw)
     quats = torch.cat([clean.hips[:, :, None], rotations.from_rotation_vector(clean.joints)], dim=2)
-    quats, root = _perturb_places(quats, clean.root, noise, draw)
+    quats, root = _perturb_positions(quats, clean.root, noise, draw)
     angles = _correlate_in_time(draw.normal(draw.frames, _JOINTS, 3), noise.stays) * noise.angle[:, None, :, None]
     quats = rotations.multiply(quats, rotations.from_rotation_vector(_turn_axes(angles + spikes, draw)))
     root = root + draw.normal(draw.frames, 3) * noise.root[:, None, None]
@@ -157,7 +157,7 @@ class _Noise:
     """Of each of a joint's angles, radians; 0 where positions are noisy."""
     root: Float[Tensor, " batch"]
     """Of each coordinate of the hips, metres; 0 where positions are noisy."""
-    place: Float[Tensor, " batch"]
+    position: Float[Tensor, " batch"]
     """Of each coordinate of every joint's position, metres; 0 where angles are noisy."""
     stays: Float[Tensor, " batch"]
     """Share of the noise that comes from the frame before."""
@@ -184,17 +184,19 @@ def _sample_noise(draw: Draws) -> _Noise:
     uneven = torch.where(draw.uniform(1) < 0.5, _UNEVEN, 0.0) * draw.normal(_JOINTS)
     root = draw.log_uniform(*_ROOT_CM) / 100 * (draw.uniform() > _CLEAN)
     marked = draw.uniform() < _MARKERS
-    place = torch.where(marked, draw.log_uniform(*_MARKER_CM) / 100, 0.0)
+    position = torch.where(marked, draw.log_uniform(*_MARKER_CM) / 100, 0.0)
     angle, root = torch.where(marked[:, None], 0.0, angle * torch.exp(uneven)), torch.where(marked, 0.0, root)
     stays = torch.where(draw.uniform() < _CORRELATED, _LASTING * draw.uniform(), 0.0)
     share = torch.where(draw.uniform() < _UNDERESTIMATED, _estimated_share(stays), 1.0)
-    given_angle = torch.where(marked[:, None], _angles_of_places(place), angle)
-    return _Noise(angle, root, place, stays, share[:, None] * given_angle, torch.where(marked, share * place, root))
+    given_angle = torch.where(marked[:, None], _angles_of_positions(position), angle)
+    return _Noise(
+        angle, root, position, stays, share[:, None] * given_angle, torch.where(marked, share * position, root)
+    )
 
 
-def _angles_of_places(place: Float[Tensor, " batch"]) -> Float[Tensor, "batch joints"]:
+def _angles_of_positions(position: Float[Tensor, " batch"]) -> Float[Tensor, "batch joints"]:
     """Noise of a joint's angles about its parent where both bones point from one noisy position to another, radians."""
-    own = (math.sqrt(2) * place[:, None] / _bone_lengths().to(place)).clamp(max=_MAX_NOISE_RAD)
+    own = (math.sqrt(2) * position[:, None] / _bone_lengths().to(position)).clamp(max=_MAX_NOISE_RAD)
     own = own * torch.tensor([bool(CANONICAL.children(joint)) for joint in range(_JOINTS)])
     above = own[:, [max(0, parent) for parent in CANONICAL.parents]].clone()
     above[:, 0] = 0.0
@@ -210,22 +212,22 @@ def _estimated_share(stays: Float[Tensor, " batch"]) -> Float[Tensor, " batch"]:
     return (power / weights.square().sum()).sqrt()
 
 
-def _perturb_places(
+def _perturb_positions(
     quats: Float[Tensor, "batch frames joints 4"], root: Float[Tensor, "batch frames 3"], noise: _Noise, draw: Draws
 ) -> tuple[Tensor, Tensor]:
     """Turn the bones of windows whose positions are noisy from each noisy joint to the first one below, and move the
     hips by their own noise."""
-    rows = noise.place.nonzero()[:, 0]
+    rows = noise.position.nonzero()[:, 0]
     if len(rows) == 0:
         return quats, root
     white = torch.randn(len(rows), draw.frames, _JOINTS, 3, generator=draw.generator)
-    moved = _correlate_in_time(white, noise.stays[rows]) * noise.place[rows, None, None, None]
+    moved = _correlate_in_time(white, noise.stays[rows]) * noise.position[rows, None, None, None]
     matrices = rotations.to_matrix(quats[rows])
-    places, world = chain_matrices(CANONICAL.offsets.to(matrices), CANONICAL.parents, matrices)
+    positions, world = chain_matrices(CANONICAL.offsets.to(matrices), CANONICAL.parents, matrices)
     world = world.clone()
     for joint in range(_JOINTS):
         if below := CANONICAL.children(joint):
-            bone = places[..., below[0], :] - places[..., joint, :]
+            bone = positions[..., below[0], :] - positions[..., joint, :]
             turn = rotations.between_vectors(bone, bone + moved[..., below[0], :] - moved[..., joint, :])
             world[..., joint, :, :] = rotations.to_matrix(turn) @ world[..., joint, :, :]
     above = world[..., [max(0, parent) for parent in CANONICAL.parents], :, :]
@@ -327,9 +329,9 @@ def change_strides(motion: Motion, factor: float) -> Motion:
     """
     if factor == 1:
         return motion  # legs as straight as can be would bend a little
-    places, scale = motion.joint_positions(), motion.root_position.new_tensor([factor, 1.0, factor])
+    positions, scale = motion.joint_positions(), motion.root_position.new_tensor([factor, 1.0, factor])
     # From the toe joints on, which stand while the heel rises.
-    ankles = scale * places[:, TOES] + places[:, FEET] - places[:, TOES]
+    ankles = scale * positions[:, TOES] + positions[:, FEET] - positions[:, TOES]
     stretch = limb_extension(motion, LEGS)
     moved = replace(motion, root_position=scale * motion.root_position)
     moved = lower_hips(fit_hips(moved, ankles, stretch), ankles, stretch)

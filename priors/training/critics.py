@@ -88,7 +88,7 @@ def run_free(
     *,
     least: int = 0,
     condition: Float[Tensor, "batch conditions"] | None = None,
-) -> tuple[Float[Tensor, "runs made size"], Float[Tensor, "runs real size"]]:
+) -> tuple[Float[Tensor, "runs generated size"], Float[Tensor, "runs real size"]]:
     """Return free runs that begin with windows, of at least so many frames, and how the windows go on; each after the
     few frames that differences take their past from. The runs are differentiable in the network's weights.
     `condition` is given to the network for each window, as in its `forward`.
@@ -106,19 +106,21 @@ def run_free(
     if away > 0:
         wandered, state = model.sample(state, away, generator, condition=condition)
         past = torch.cat([past, wandered], 1)
-    made, _ = model.draw(state, max(frames, least), generator, condition=condition)
+    generated, _ = model.draw(state, max(frames, least), generator, condition=condition)
     real = windows[:, context - PAST_FRAMES : context + frames]
-    return torch.cat([past[:, -PAST_FRAMES:], made], 1), real
+    return torch.cat([past[:, -PAST_FRAMES:], generated], 1), real
 
 
 def moment_loss(
-    made: Float[Tensor, "batch frames size"], real: Float[Tensor, "batch frames size"], weights: MomentWeights
+    generated: Float[Tensor, "batch frames size"], real: Float[Tensor, "batch frames size"], weights: MomentWeights
 ) -> Tensor:
     """Weighted squared log ratios of the moments; the first frames give differences their past and do not count."""
-    ours, theirs = _Moments.of(made), _Moments.of(real)
+    ours, theirs = _Moments.of(generated), _Moments.of(real)
     # Feet may be stiller than mocap's, not looser.
     feet = sum(_log_ratio(a, b).clamp(min=0).square() for a, b in zip(ours.feet, theirs.feet, strict=True))
-    pace = torch.stack([_log_ratio(made_, real_).mean() for made_, real_ in _pair_by_pace(ours.pace, theirs.pace)])
+    pace = torch.stack(
+        [_log_ratio(generated_, real_).mean() for generated_, real_ in _pair_by_pace(ours.pace, theirs.pace)]
+    )
     return (
         weights.feet * feet
         + weights.jerk * _log_ratio(ours.jerk, theirs.jerk).square().mean()
@@ -207,15 +209,15 @@ class FreeRunJudge:
         self.optimiser = torch.optim.Adam(self.network.parameters(), lr=_RATE, betas=(0.5, 0.99))
         self.history: HistoryBuffer | None = None
 
-    def fill(self, made: Float[Tensor, "history frames size"]) -> None:
+    def fill(self, generated: Float[Tensor, "history frames size"]) -> None:
         """Begin to keep free runs for the critic to learn from, with these."""
-        self.history = HistoryBuffer(self._show_end(made))
+        self.history = HistoryBuffer(self._show_end(generated))
 
-    def score(self, made: Float[Tensor, "batch frames size"], generator: torch.Generator) -> Tensor:
+    def score(self, generated: Float[Tensor, "batch frames size"], generator: torch.Generator) -> Tensor:
         """Return the density's loss, whose gradient goes into what generated the motion; and keep the free runs in
         place of earlier ones."""
         assert self.history is not None
-        shown = self._show_end(made)
+        shown = self._show_end(generated)
         self.history.keep(shown.detach(), generator)
         return compute_generator_loss(self.network(shown))
 
@@ -229,23 +231,23 @@ class FreeRunJudge:
         assert self.history is not None
         count = _BATCH
         real = self._show_captured(count, generator)
-        for_real, for_made = self.network(real), self.network(self.history.draw(count, generator))
-        loss = compute_critic_loss(for_real, for_made)
+        for_real, for_generated = self.network(real), self.network(self.history.draw(count, generator))
+        loss = compute_critic_loss(for_real, for_generated)
         total = loss + _PENALTY * compute_gradient_penalty(self.network, real)
         self.optimiser.zero_grad(set_to_none=True)
         total.backward()
         if not math.isfinite(float(total.detach())):
             raise make_divergence_error(step, f"the loss of the critic is {float(total.detach())}")
         self.optimiser.step()
-        right = torch.cat([for_real > 0, for_made < 0]).float().mean()
+        right = torch.cat([for_real > 0, for_generated < 0]).float().mean()
         return {"critic": float(loss.detach()), "accuracy": float(right)}
 
     def _show_captured(self, count: int, generator: torch.Generator) -> Float[Tensor, "count seen rows"]:
         return show(self.windows.draw(count, generator).features[:, : SEEN_FRAMES + 1])
 
-    def _show_end(self, made: Float[Tensor, "batch frames size"]) -> Float[Tensor, "batch seen rows"]:
+    def _show_end(self, generated: Float[Tensor, "batch frames size"]) -> Float[Tensor, "batch seen rows"]:
         """Show the last frames of free runs: they are farthest from mocap."""
-        return show(made[:, -SEEN_FRAMES - 1 :])
+        return show(generated[:, -SEEN_FRAMES - 1 :])
 
 
 class FreeRunCritic(nn.Module):
@@ -293,14 +295,14 @@ def show(features: Float[Tensor, "batch frames size"]) -> Float[Tensor, "batch f
     return torch.cat([about.flatten(2), velocity.flatten(2), hips], dim=-1)
 
 
-def compute_critic_loss(real: Float[Tensor, " batch"], made: Float[Tensor, " others"]) -> Tensor:
+def compute_critic_loss(real: Float[Tensor, " batch"], generated: Float[Tensor, " others"]) -> Tensor:
     """Cross entropy of both answers in nats; 1.39 where nothing is known (Goodfellow et al. 2014, Eq. 1)."""
-    return softplus(-real).mean() + softplus(made).mean()
+    return softplus(-real).mean() + softplus(generated).mean()
 
 
-def compute_generator_loss(made: Float[Tensor, " batch"]) -> Tensor:
+def compute_generator_loss(generated: Float[Tensor, " batch"]) -> Tensor:
     """Negative log probability that what was made is taken for captured (Goodfellow et al. 2014, section 3)."""
-    return softplus(-made).mean()
+    return softplus(-generated).mean()
 
 
 def compute_gradient_penalty(critic: FreeRunCritic, real: Float[Tensor, "batch frames rows"]) -> Tensor:

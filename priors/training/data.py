@@ -414,14 +414,14 @@ def find_floor_slope(motion: Motion) -> Float[Tensor, "2"]:
     none = torch.zeros(2, dtype=torch.float64)
     if int(still.sum()) < _FEW:
         return none
-    places, which = toes[1:][still], still.nonzero()[:, 1]
-    slope, rough = _fit_plane(places, which == 0)
+    positions, which = toes[1:][still], still.nonzero()[:, 1]
+    slope, rough = _fit_plane(positions, which == 0)
     return slope if rough < _ROUGH and float(slope.norm()) < STEEPEST else none
 
 
-def _fit_plane(places: Float[Tensor, "points 3"], left: Bool[Tensor, " points"]) -> tuple[Float[Tensor, "2"], float]:
+def _fit_plane(positions: Float[Tensor, "points 3"], left: Bool[Tensor, " points"]) -> tuple[Float[Tensor, "2"], float]:
     """Slope along x and z, and the weighted rms distance from the plane, metres."""
-    ground, height = places[:, ::2] - places[:, ::2].mean(dim=0), places[:, 1]
+    ground, height = positions[:, ::2] - positions[:, ::2].mean(dim=0), positions[:, 1]
     known = torch.cat([left[:, None], ~left[:, None], ground], dim=1).double()
     usual = torch.diag(torch.tensor([1e-9, 1e-9, 1.0, 1.0], dtype=torch.float64)) * (_NEAR / _USUAL) ** 2
     weight = torch.ones_like(height)

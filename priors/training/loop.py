@@ -61,7 +61,7 @@ InPython = (Fixed, Suppress)
 """Annotates settings that are no options of the command line."""
 
 Network = TypeVar("Network", bound=nn.Module)
-Made = TypeVar("Made")
+Built = TypeVar("Built")
 Row = dict[str, Any]
 """Losses of a step, or measures of held-out clips; in a curve None replaces what is not finite."""
 
@@ -681,7 +681,7 @@ def _join_processes(settings: Settings) -> Iterator[None]:
         distributed.destroy_process_group()
 
 
-def _read_in_turn(read: Callable[[], Made]) -> Made:
+def _read_in_turn(read: Callable[[], Built]) -> Built:
     """Read in the first process, then in the others, which find its cache."""
     found = read() if is_main() else None
     if count_processes()[1] > 1:
@@ -717,7 +717,7 @@ def make_adam(weights: Iterable[nn.Parameter], learning_rate: float) -> torch.op
     return torch.optim.AdamW(weights, lr=learning_rate, weight_decay=1e-4)
 
 
-def draw_weights(make: Callable[[], Made], seed: int) -> Made:
+def draw_weights(make: Callable[[], Built], seed: int) -> Built:
     """Return what `make` builds with torch's global generator, seeded, whose own numbers are left alone. It is built on
     the processor, so that it is the same whatever device it is then moved to."""
     with use_device("cpu"), torch.random.fork_rng(devices=[]):

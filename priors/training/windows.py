@@ -131,7 +131,7 @@ def _thin_standing(
 class Window:
     """A batch of whole motions."""
 
-    places: Float[Tensor, "batch frames joints 3"]
+    positions: Float[Tensor, "batch frames joints 3"]
     """World, metres, on canonical bones."""
     quats: Float[Tensor, "batch frames joints 4"]
     """Local rotations, xyzw."""
@@ -145,9 +145,9 @@ class Window:
     def image(self, known: Bool[Tensor, "batch frames joints"]) -> PositionImage:
         """With gaps, in which the guess is slerp's."""
         known = known & self.present[..., None]
-        places = interpolate_positions(self.places, self.quats, known)
+        positions = interpolate_positions(self.positions, self.quats, known)
         return PositionImage.of_world(
-            places,
+            positions,
             interpolate_heading(self.heading, known),
             self.contacts,
             known=known,
@@ -200,12 +200,12 @@ class PositionWindows:
         local = torch.where(mirrored[:, None, None, None], local[:, :, self.mirror_joints], local) * flip[:, :, None]
         contacts = torch.where(mirrored[:, None, None], contacts.flip(-1), contacts)
         heading, ground = heading * side, ground * flip[..., ::2]
-        places = rotations.rotate_about_y(local, heading[..., None]) + rotations.lift_ground(ground)[:, :, None]
+        positions = rotations.rotate_about_y(local, heading[..., None]) + rotations.lift_ground(ground)[:, :, None]
         quats = self.quats[index]
         over = quats[:, :, self.mirror_joints] * quats.new_tensor([1.0, -1.0, -1.0, 1.0])
         quats = torch.where(mirrored[:, None, None, None], over, quats)
         quats[:, :, 0] = rotations.multiply(rotations.about_y(heading), quats[:, :, 0])
-        return Window(places, quats, heading, contacts, present)
+        return Window(positions, quats, heading, contacts, present)
 
 
 _WIDE = {"UpperArm": 0.6, "LowerArm": 0.5, "UpperLeg": 0.5, "LowerLeg": 0.5}

@@ -35,7 +35,7 @@ class RemoteCommands:
             except RequestError as error:
                 notes.append(str(error))
         # What steers comes first, then where to go, which keeps the new speed.
-        for order in sorted(keep_latest(found), key=lambda order: order.name in ("place", "path")):
+        for order in sorted(keep_latest(found), key=lambda order: order.name in ("goto", "path")):
             try:
                 notes += self._act(characters[order.character], order)
             except MapctlError as error:
@@ -60,7 +60,7 @@ class RemoteCommands:
                 app.set_disc(_read_disc(numbers))
             case "path":
                 app.walk(character, _read_points(numbers))
-            case "place":
+            case "goto":
                 asked = numbers[2] if len(numbers) > 2 else _DEFAULT_WITHIN
                 facing = math.radians(math.remainder(numbers[3], 360)) if len(numbers) > 3 else None
                 within = min(WITHIN[1], max(WITHIN[0], asked))

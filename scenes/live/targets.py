@@ -77,8 +77,8 @@ class LiveTargets:
         """Put a disc of a radius, metres, where there is one already or ahead of the chosen character; None removes
         it."""
         x, z = self._chosen().position + _DISC_AHEAD * self._axes()[0]
-        place = self.obstacles[0].place if self.obstacles else (float(x), float(z))
-        self.set_disc(None if radius is None else Obstacle(place, radius))
+        position = self.obstacles[0].place if self.obstacles else (float(x), float(z))
+        self.set_disc(None if radius is None else Obstacle(position, radius))
 
     def move_disc(self, point: Point) -> None:
         """Move the disc, metres."""

@@ -114,7 +114,7 @@ def measure_error(truth: Motion, other: Motion, frames: slice = slice(None)) -> 
 
 def seeded(*numbers: int) -> torch.Generator:
     """Return a generator that is seeded by numbers."""
-    return torch.Generator().manual_seed(sum(1_000_003**place * number for place, number in enumerate(numbers)))
+    return torch.Generator().manual_seed(sum(1_000_003**position * number for position, number in enumerate(numbers)))
 
 
 def map_motion(motion: Motion, change: Callable[[Tensor], Float[Tensor, "frames *values"]]) -> Motion:

@@ -69,9 +69,9 @@ def _blend(motion: Motion, start: int, stop: int, share: Tensor, root: Callable[
 def list_methods(model: str, peer: str) -> dict[str, Method]:
     """List methods by name."""
 
-    def by(name: str, finish: bool) -> Method:
+    def by(name: str, refine: bool) -> Method:
         inbetweener = priors.load_inbetweener(name)
-        settings = controllers.InfillSettings(finish=finish)
+        settings = controllers.InfillSettings(refine=refine)
         return lambda motion, start, stop: (
             controllers.infill(motion, inbetweener, [Mask(ALL, start, stop)], settings=settings).motion
         )
@@ -111,19 +111,19 @@ def measure_lafan(circles: list[Circle], methods: Mapping[str, Method], most: in
                     shown, _, gap = next(iter(done.values()))
                     done = {"truth": (shown, shown, gap), **done}
                     for name, (_, made, _) in done.items():
-                        places, quats = see_from_past(made, shown)
-                        each = places[gap], quats[gap], measure_error(shown, made, gap), clip.name
+                        positions, quats = see_from_past(made, shown)
+                        each = positions[gap], quats[gap], measure_error(shown, made, gap), clip.name
                         filled.setdefault(name, []).append(each)
             if not filled:
                 continue
-            places, quats = (torch.stack([each[part] for each in filled["truth"]]) for part in (0, 1))
-            std = places.flatten(0, 1).std(dim=0).clamp_min(1e-6)
+            positions, quats = (torch.stack([each[part] for each in filled["truth"]]) for part in (0, 1))
+            std = positions.flatten(0, 1).std(dim=0).clamp_min(1e-6)
             for name in methods:
                 made, made_quats = (torch.stack([each[part] for each in filled[name]]) for part in (0, 1))
                 worst, clip = max((each[2], each[3]) for each in filled[name])
                 rows.append(
                     {"clips of": circle.name, "frames": frames, "method": name, "windows": len(made)}
-                    | {"L2P": compute_l2p(made, places, std), "L2Q": compute_l2q(made_quats, quats)}
+                    | {"L2P": compute_l2p(made, positions, std), "L2Q": compute_l2q(made_quats, quats)}
                     | {"NPSS": compute_npss(made_quats, quats), "worst, cm": worst, "worst clip": clip}
                 )
     return rows
@@ -135,10 +135,10 @@ def see_from_past(motion: Motion, shown: Motion) -> tuple[Float[Tensor, "frames 
     left, right = (shown.joint_positions()[here, leg] for leg in find_upper_legs(shown.skeleton))
     heading = facing(left[None], right[None])
     origin = shown.joint_positions()[here, hips] * torch.tensor([1.0, 0.0, 1.0])
-    places = rotations.rotate_about_y(motion.joint_positions() - origin, -heading[:, None])
+    positions = rotations.rotate_about_y(motion.joint_positions() - origin, -heading[:, None])
     turn = rotations.from_rotation_vector(torch.tensor([0.0, 1.0, 0.0]).double() * -heading)
     quats = motion.joint_rotations()
-    return places, rotations.multiply(turn.expand_as(quats), quats)
+    return positions, rotations.multiply(turn.expand_as(quats), quats)
 
 
 def compute_l2p(made: Tensor, truth: Tensor, std: Float[Tensor, "joints 3"]) -> float:

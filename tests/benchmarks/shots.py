@@ -102,7 +102,7 @@ def summarise(kind: str, shots: Sequence[ShotSolution | None]) -> Row:
     """Summarise shots; None was refused."""
     solved = [shot for shot in shots if shot is not None]
     looks = [look_at(shot.motion) for shot in solved]
-    held = [wish.holds for shot in solved for wish in shot.wishes]
+    held = [constraint.holds for shot in solved for constraint in shot.constraints]
     # A body that glides plants no toe: NaN is within no limit.
     faults = [
         shot.status.ok and not (look["fastest end, m/s"] <= FASTEST and look["planted toes, cm/s"] <= SLIDING)

@@ -34,14 +34,16 @@ SIDE = {
 def add_mixamo(*, imported: bool = False, seed: int = 0):
     """A Mixamo-named armature whose bones have any roll and rotation mode; as imported it is in centimetres, turned and
     scaled like armatures of FBX files."""
-    rows = {f"mixamorig:{name}": (p and f"mixamorig:{p}", place) for name, (p, place) in MIXAMO.items()}
+    rows = {f"mixamorig:{name}": (p and f"mixamorig:{p}", position) for name, (p, position) in MIXAMO.items()}
     for side, sign in (("Left", 1), ("Right", -1)):
         for name, (parent, (x, y, z)) in SIDE.items():
             above = parent if parent in MIXAMO else side + parent
             rows[f"mixamorig:{side}{name}"] = (f"mixamorig:{above}", (sign * x, y, z))
     # The armature's own space: Y up in centimetres where it is imported.
     own = Matrix.Rotation(math.radians(-90), 4, "X") @ Matrix.Scale(100, 4) if imported else Matrix.Identity(4)
-    armature = _add_armature("mixamo", {name: (p, own @ Vector(place)) for name, (p, place) in rows.items()}, seed)
+    armature = _add_armature(
+        "mixamo", {name: (p, own @ Vector(position)) for name, (p, position) in rows.items()}, seed
+    )
     if imported:
         armature.rotation_euler = Euler((math.radians(90), 0, 0))
         armature.scale = (0.01, 0.01, 0.01)
@@ -60,7 +62,7 @@ def _add_armature(name: str, rows: dict, seed: int):
     bpy.ops.object.mode_set(mode="EDIT")
     for bone, (parent, head) in rows.items():
         made = armature.data.edit_bones.new(bone)
-        children = [place for above, place in rows.values() if above == bone]
+        children = [position for above, position in rows.values() if above == bone]
         made.head = head
         made.tail = children[0] if children else head + (head - rows[parent][1]) * 0.5
         made.roll = rng.uniform(-math.pi, math.pi)
@@ -120,7 +122,7 @@ def add_noise(armature, degrees: float, seed: int = 0) -> None:
             curve.update()
 
 
-def animate(armature, seed: int = 1, places: tuple[str, ...] = ()) -> None:
+def animate(armature, seed: int = 1, positions: tuple[str, ...] = ()) -> None:
     """Key every bone at three frames, and some bones' places."""
     rng = np.random.default_rng(seed)
     for frame in (1, 6, 12):
@@ -129,7 +131,7 @@ def animate(armature, seed: int = 1, places: tuple[str, ...] = ()) -> None:
             path = channel.get(bone.rotation_mode, "rotation_euler")
             setattr(bone, path, np.array(getattr(bone, path)) + rng.normal(size=len(getattr(bone, path))) * 0.4)
             bone.keyframe_insert(path, frame=frame)
-            if bone.name in places:
+            if bone.name in positions:
                 bone.location = rng.normal(size=3) * 0.2 / armature.scale[0]
                 bone.keyframe_insert("location", frame=frame)
 

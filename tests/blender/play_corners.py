@@ -30,15 +30,15 @@ def play_echoes() -> None:
     blender_stage.use("echo")
     blender_stage.clear()
     armature = armatures.add_mixamo(imported=True)
-    armatures.animate(armature, places=("mixamorig:Hips",))
+    armatures.animate(armature, positions=("mixamorig:Hips",))
     facts["apart"]["imported"] = apart(armature, bpy.ops.mapctl.clean_up)
 
     blender_stage.clear()
     armature = armatures.add_mixamo()
-    armatures.animate(armature, places=("mixamorig:Hips",))
+    armatures.animate(armature, positions=("mixamorig:Hips",))
     armature.location, armature.rotation_euler = (3, 1, 0.5), (0.1, 0.2, 2.0)
-    for frame, place in ((1, (0, 0, 0)), (12, (5, -2, 1))):
-        armature.location = place
+    for frame, position in ((1, (0, 0, 0)), (12, (5, -2, 1))):
+        armature.location = position
         armature.keyframe_insert("location", frame=frame)
         armature.pose.bones[0]["mood"] = float(frame)
         armature.pose.bones[0].keyframe_insert('["mood"]', frame=frame)
@@ -61,7 +61,7 @@ def play_echoes() -> None:
     spine, arm, leg = (armature.data.bones[f"mixamorig:{name}"] for name in ("Spine2", "LeftArm", "LeftUpLeg"))
     spine.use_inherit_rotation = False
     arm.use_local_location = False
-    armatures.animate(armature, places=("mixamorig:LeftUpLeg", "mixamorig:Hips"))
+    armatures.animate(armature, positions=("mixamorig:LeftUpLeg", "mixamorig:Hips"))
     facts["apart"]["bones that do not follow"] = apart(armature, bpy.ops.mapctl.clean_up)
     facts["travelling"] = sorted(
         {c.data_path.split('"')[1] for c in armatures.curves_of(armature) if c.data_path.endswith("location")}
@@ -189,8 +189,8 @@ def play_walks() -> None:
     armature, drawn = armatures.add_mixamo(imported=True), armatures.add_curve(cyclic=True, height=0.4)
     holder = bpy.data.objects.new("holder", None)
     bpy.context.collection.objects.link(holder)
-    for frame, place in ((1, (0, 0, 0)), (12, (2, 1, 1))):
-        holder.location = place
+    for frame, position in ((1, (0, 0, 0)), (12, (2, 1, 1))):
+        holder.location = position
         holder.keyframe_insert("location", frame=frame)
     armature.parent = holder
     armature.pose.bones["mixamorig:LeftUpLeg"].location = (3, 4, 5)

@@ -19,13 +19,13 @@ armature = next(thing for thing in bpy.data.objects if thing.type == "ARMATURE")
 for track in armature.animation_data.nla_tracks:
     track.mute = True
 armature.animation_data.action = next(one for one in bpy.data.actions if one.name.startswith(action))
-places = np.empty((int(frames), len(armature.pose.bones), 3))
+positions = np.empty((int(frames), len(armature.pose.bones), 3))
 meshes = [thing for thing in bpy.data.objects if thing.type == "MESH" and thing.find_armature() == armature]
 lowest = np.empty(int(frames))
 for frame in range(int(frames)):
     bpy.context.scene.frame_set(frame)
     for joint, bone in enumerate(armature.pose.bones):
-        places[frame, joint] = (armature.matrix_world @ bone.matrix).translation
+        positions[frame, joint] = (armature.matrix_world @ bone.matrix).translation
     drawn = bpy.context.evaluated_depsgraph_get()
     heights = [
         (thing.matrix_world @ vertex.co).z for thing in meshes for vertex in thing.evaluated_get(drawn).data.vertices
@@ -35,6 +35,6 @@ facts = {"joints": [bone.name for bone in armature.pose.bones], "actions": [one.
 facts["morphs"] = [key.name for thing in meshes if thing.data.shape_keys for key in thing.data.shape_keys.key_blocks]
 facts["materials"] = sorted({slot.name for thing in meshes for slot in thing.material_slots})
 Path(folder, "facts.json").write_text(json.dumps(facts))
-np.savez(Path(folder, "arrays.npz"), places=places, lowest=lowest)
+np.savez(Path(folder, "arrays.npz"), positions=positions, lowest=lowest)
 sys.stdout.flush()
 os._exit(0)

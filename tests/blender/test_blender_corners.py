@@ -59,8 +59,8 @@ def test_rigs_animated_by_ik_keep_hands_and_feet_where_they_were(facts):
 
 def test_walk_is_asked_for_as_the_options_say(facts):
     words = ["follow", "curve.csv", "--rig", "character.npz", "-o", "walk.npz", "--seed", "3"]
-    wishes = ["--speed", "1.5", "--seconds", "2.5", "--style", "proud", "--fps", "30"]
-    assert facts["words"] == words + wishes
+    requests = ["--speed", "1.5", "--seconds", "2.5", "--style", "proud", "--fps", "30"]
+    assert facts["words"] == words + requests
 
 
 def test_curves_are_sampled_in_the_world(facts):

@@ -52,7 +52,7 @@ def joints(file, names) -> np.ndarray:
 def shown(arrays, stage, names, file) -> np.ndarray:
     """What Blender showed of those joints that a motion file has."""
     own = mapctl.load(file).skeleton.names
-    return arrays[stage][:, [place for place, name in enumerate(names) if name in own]]
+    return arrays[stage][:, [position for position, name in enumerate(names) if name in own]]
 
 
 def test_each_operator_ends_well(played):

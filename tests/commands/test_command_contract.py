@@ -31,7 +31,7 @@ JOBS = {
     ),
     "denoise a folder": ("denoise clips -o clean --jobs 2 --report told --again", {"denoiser", "transformer"}),
     "infill": ("infill in.bvh -o out.npz --gap 10:20 --report out.json", {"transformer"}),
-    "infill a long gap": ("infill long.bvh -o out.npz --gap 10:200 --no-finish --report out.json", {"transformer"}),
+    "infill a long gap": ("infill long.bvh -o out.npz --gap 10:200 --no-refine --report out.json", {"transformer"}),
     "infill by a stitcher": ("infill in.bvh -o out.npz --gap 10:20 --method stitcher --report out.json", {"stitcher"}),
     "infill by rollouts": (
         "infill in.bvh -o out.npz --gap 10:14 --method rollouts --report out.json",
@@ -42,10 +42,10 @@ JOBS = {
         {"keyframe-timing", "transformer"},
     ),
     "blend": (
-        "blend in.bvh --from other.bvh --joints leftHand --frames 5:10 --at 15 -o out.npz --no-finish",
+        "blend in.bvh --from other.bvh --joints leftHand --frames 5:10 --at 15 -o out.npz --no-refine",
         {"transformer"},
     ),
-    "chain": ("chain in.bvh other.bvh -o out.npz --piece 10 --gap 9:10 --no-finish", {"transformer"}),
+    "chain": ("chain in.bvh other.bvh -o out.npz --piece 10 --gap 9:10 --no-refine", {"transformer"}),
 }
 """Words by what they do, and the models that they need at least."""
 QUICK = {"follow", "run", "steer", "denoise", "chain"}

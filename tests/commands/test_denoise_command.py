@@ -68,12 +68,12 @@ def test_causal_is_said(denoise, recording, tmp_path, capsys):
 @pytest.fixture
 def folder(tmp_path):
     """Two captures of which one lies deeper, and a file that is none."""
-    place = tmp_path / "in"
-    (place / "deep").mkdir(parents=True)
-    noisy(on_rig("bandai", 20)).save(place / "a.bvh")
-    noisy(on_rig("daz", 20)).save(place / "deep" / "b.bvh")
-    (place / "deep" / "notes.txt").write_text("no motion")
-    return place
+    position = tmp_path / "in"
+    (position / "deep").mkdir(parents=True)
+    noisy(on_rig("bandai", 20)).save(position / "a.bvh")
+    noisy(on_rig("daz", 20)).save(position / "deep" / "b.bvh")
+    (position / "deep" / "notes.txt").write_text("no motion")
+    return position
 
 
 @pytest.mark.slow

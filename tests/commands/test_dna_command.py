@@ -18,7 +18,7 @@ def models(tmp_path_factory):
     folder = tmp_path_factory.mktemp("models")
     predictor = save_tiny_path(folder / "path.safetensors")
     trained = save_tiny_tweener(folder / "tweener.safetensors", str(predictor), ("walk", "wave-left-hand"))
-    return ["--method", "tweener", "--inbetweener", trained, "--path", predictor, "--no-finish"]
+    return ["--method", "tweener", "--inbetweener", trained, "--path", predictor, "--no-refine"]
 
 
 @pytest.fixture(scope="module")

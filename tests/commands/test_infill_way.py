@@ -28,7 +28,7 @@ def channels(file):
     return np.array([row.split() for row in rows], dtype=float)
 
 
-@pytest.mark.parametrize("finish", [[], ["--no-finish"]], ids=["map", "raw"])
+@pytest.mark.parametrize("finish", [[], ["--no-refine"]], ids=["map", "raw"])
 def test_only_the_hips_place_changes_and_only_there(clip, path, tmp_path, finish):
     out = tmp_path / "out.bvh"
     words = ["--way", "10:20", "--way", "1s:1.5s", "--path", path, "--quiet", *finish]
@@ -44,7 +44,7 @@ def test_ways_and_gaps_go_together_and_are_told(clip, path, tmp_path, capsys):
     infiller = save_tiny_infiller(tmp_path / "infiller.safetensors", drawn=0.2)
     report, out = tmp_path / "r.json", tmp_path / "out.bvh"
     words = ["--way", "10:40", "--gap", "20:25", "--path", path, "--method", "infiller", "--inbetweener", infiller]
-    assert run("infill", clip, "-o", out, *words, "--report", report, "--no-finish") == 0
+    assert run("infill", clip, "-o", out, *words, "--report", report, "--no-refine") == 0
     assert "10:40" in capsys.readouterr().out
     (gap,) = json.loads(report.read_text())["gaps"]
     assert (gap["start"], gap["stop"], gap["root"]) == (10, 40, True)

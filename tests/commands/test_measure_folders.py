@@ -22,8 +22,8 @@ def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("made")
     (folder / "below").mkdir()
     for k in range(5):
-        place = folder / "below" / f"{k}.NPZ" if k % 2 else folder / f"{k}.bvh"
-        walk(95, cadence=0.8 + 0.05 * k, seed=k).save(place)
+        position = folder / "below" / f"{k}.NPZ" if k % 2 else folder / f"{k}.bvh"
+        walk(95, cadence=0.8 + 0.05 * k, seed=k).save(position)
     (folder / "notes.txt").write_text("not a clip")
     return folder
 
@@ -69,7 +69,7 @@ def test_two_folders_are_compared(made, mocap, capsys):
     assert values["reference"].keys() == values["measures"].keys()
     assert set(values["realism"]) == set(realism.Realism.__dataclass_fields__)
     assert 0 <= values["realism"]["accuracy"] <= 1
-    assert (values["realism"]["made_windows"], values["realism"]["mocap_windows"]) == (5 * 7, 4 * 7)
+    assert (values["realism"]["generated_windows"], values["realism"]["mocap_windows"]) == (5 * 7, 4 * 7)
 
 
 @pytest.mark.slow
@@ -113,4 +113,4 @@ def test_a_clip_too_short_for_a_window_does_not_end_the_comparison(mocap, tmp_pa
     values = told(capsys, tmp_path, "--reference", mocap)
     assert (values["clips"], len(values["skipped"])) == (5, 3)
     assert "19 frames at 30 fps; a window needs at least 31" in values["skipped"][str(tmp_path / "short.bvh")]
-    assert values["realism"]["made_windows"] == 5 * 7
+    assert values["realism"]["generated_windows"] == 5 * 7

@@ -128,8 +128,8 @@ KEYED = "tween {}.keys.toml -o a.bvh --method slerp"
 DENOISE = f"denoise {IN} --denoiser denoiser.safetensors"
 CLEAN = "denoise takes -o out --denoiser denoiser.safetensors"
 WAY = f"infill {IN} --method slerp --path path.safetensors"
-STYLE = f"{IN} --method tweener --inbetweener tweener.safetensors --path path.safetensors --no-finish"
-STITCH = f"tween {IN} --method stitcher --stitcher stitcher.safetensors --no-finish"
+STYLE = f"{IN} --method tweener --inbetweener tweener.safetensors --path path.safetensors --no-refine"
+STITCH = f"tween {IN} --method stitcher --stitcher stitcher.safetensors --no-refine"
 FOLLOW = "follow line:2 -o a.bvh --prior prior.safetensors"
 GENERATE = "generate -o gen --seconds 1 --prior prior.safetensors"
 STEER = "steer {}.steer.csv -o a.bvh --prior prior.safetensors"
@@ -329,7 +329,7 @@ CASES = {
     f"{INFILL} --joints 'root position'": "leave nothing of the motion's 45 frames",
     f"{INFILL} --joints Hand_L --curve line:4": "the hips follow a curve where",
     f"{INFILL} --gap 5:9 --method best": "there is no --method best; there are auto",
-    f"{INFILL} --gap 5:9 --method infiller --no-finish --prior general": "leave --prior out",
+    f"{INFILL} --gap 5:9 --method infiller --no-refine --prior general": "leave --prior out",
     f"infill {IN} --gap 5:9 --method slerp --curve line:4": "--curve needs",
     f"infill {IN} --gap 5:9 --method slerp --dna in.bvh": "--method slerp knows no style",
     f"infill {IN} --gap 5:9 --dna in.bvh --curve line:4": "--dna says how to move and --curve where",
@@ -347,7 +347,7 @@ CASES = {
     f"{TWEEN} 0,9,20 --joints Hnad_L": "no hand or foot 'Hnad_L'; the",
     f"{TWEEN} 0,9 --joints Hand_L --root-only": "choose one",
     f"{TWEEN} 0,9 --joints Hand_L": "--joints is about keys between",
-    f"{TWEEN} 0,9 --method infiller --no-finish --prior x": "leave --prior out",
+    f"{TWEEN} 0,9 --method infiller --no-refine --prior x": "leave --prior out",
     f"{TWEEN} 0,9 --method infiller --dna in.bvh": "leave --dna out",
     f"{TWEEN} 0,9 --method tweener": "--method tweener takes no infiller",
     f"{TWEEN} 0,9 --path x": "--path predicts the hips' place",

@@ -81,7 +81,7 @@ def test_info_prints_every_doubt_and_other_commands_the_first_once(odd, tmp_path
     assert run("info", odd, "--json") == 0
     told = json.loads(capsys.readouterr().out)
     assert (told["fit"], told["doubts"]) == ("doubtful", [reason])
-    assert told["known_by"]["leftHand"] == "place"
+    assert told["known_by"]["leftHand"] == "position"
     assert run("convert", odd, tmp_path / "a.bvh", "--quiet") == 0
     assert capsys.readouterr().err == ""
     for _ in range(2):
@@ -211,7 +211,7 @@ def test_twice_the_legs_make_twice_the_way():
         generator=generator(),
     )
     assert large.motion.skeleton is double
-    places = large.motion.joint_positions() / 2
-    torch.testing.assert_close(places, small.motion.joint_positions(), atol=0.02, rtol=0)
+    positions = large.motion.joint_positions() / 2
+    torch.testing.assert_close(positions, small.motion.joint_positions(), atol=0.02, rtol=0)
     residuals = [{entry.name: float(entry.residual.mean()) for entry in done.ledger.entries} for done in (small, large)]
     assert residuals[1]["path"] == pytest.approx(2 * residuals[0]["path"], rel=0.1)

@@ -95,11 +95,11 @@ def rigs(walked, tmp_path_factory):
 def foot_pitches(motion: Motion) -> np.ndarray:
     """Slope of the line from ankle to toe joint, degrees, of the left and right foot, while it lies flat."""
     canonical, _ = retarget.to_canonical(motion)
-    places = canonical.joint_positions()
-    planted = contacts.detect_contacts(places[:, _TOES], canonical.fps)
+    positions = canonical.joint_positions()
+    planted = contacts.detect_contacts(positions[:, _TOES], canonical.fps)
     found = []
     for side in range(2):
-        ankle, toe = places[:, _FEET[side]], places[:, _TOES[side]]
+        ankle, toe = positions[:, _FEET[side]], positions[:, _TOES[side]]
         low = ankle[:, 1] < torch.quantile(ankle[planted[:, side], 1], 0.1) + 0.01
         along = (toe - ankle)[planted[:, side] & low]
         found.append(float(torch.rad2deg(torch.atan2(along[:, 1], along[:, ::2].norm(dim=-1))).median()))

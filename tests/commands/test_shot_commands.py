@@ -49,9 +49,11 @@ def test_follow_starts_and_ends_standing_and_tells_every_wish(keys, tmp_path, ca
     assert float(motion.fps) == pytest.approx(60, abs=1e-3)
     assert set(motion.skeleton.names) == set(CANONICAL.names)
     found = json.loads(report.read_text())
-    names = {wish["wish"].split(" at")[0] for wish in found["wishes"]}
+    names = {constraint["constraint"].split(" at")[0] for constraint in found["constraints"]}
     assert names == {"path", "progress", "obstacles", "look", "stand"}
-    assert all({"asked", "got", "residual", "unit", "holds"} <= wish.keys() for wish in found["wishes"])
+    assert all(
+        {"asked", "got", "residual", "unit", "holds"} <= constraint.keys() for constraint in found["constraints"]
+    )
 
 
 @pytest.mark.slow
@@ -69,7 +71,7 @@ def test_a_scene_goes_on_from_a_clip_on_its_rig_and_keeps_apart(tmp_path):
     miss = (made.joint_positions()[0] - clip.joint_positions()[60]).norm(dim=-1)
     assert float(miss.max()) < 0.01
     report = json.loads((tmp_path / "out" / "a.json").read_text())
-    assert [wish["wish"] for wish in report["actors"]["by"]["wishes"]] == [
+    assert [constraint["constraint"] for constraint in report["actors"]["by"]["constraints"]] == [
         "path",
         "progress",
         "obstacles",
@@ -91,7 +93,7 @@ def test_a_shot_holds_a_pose_of_another_rig_and_ends_in_a_clip(tmp_path):
     assert made.skeleton.names == clip.skeleton.names
     assert float((made.joint_positions()[-1] - clip.joint_positions()[40]).norm(dim=-1).max()) < 0.01
     found = json.loads(report.read_text())
-    pose = next(wish for wish in found["wishes"] if wish["wish"].startswith("pose at"))
+    pose = next(constraint for constraint in found["constraints"] if constraint["constraint"].startswith("pose at"))
     assert pose["holds"]
     assert pose["got"] < 0.1
 
@@ -100,6 +102,6 @@ def test_a_shot_holds_a_pose_of_another_rig_and_ends_in_a_clip(tmp_path):
 def test_a_loop_leads_into_its_first_frame_at_any_rate(tmp_path):
     out = tmp_path / "a.bvh"
     assert run("follow", "circle:0.8", "-o", out, "--loop", "--fps", 100) == 0
-    places = mapctl.load(out).joint_positions()
-    steps = torch.diff(torch.cat([places, places[:1]]), dim=0).norm(dim=-1).amax(dim=1)
+    positions = mapctl.load(out).joint_positions()
+    steps = torch.diff(torch.cat([positions, positions[:1]]), dim=0).norm(dim=-1).amax(dim=1)
     assert float(steps[-1]) < 1.2 * float(steps[:-1].max())

@@ -115,7 +115,7 @@ def test_a_place_is_reached_in_time_and_told(steer, tmp_path, capsys):
     assert steer(script, "--report", tmp_path / "r.json", "--stitcher", stitcher) == 0
     (row,) = json.loads((tmp_path / "r.json").read_text())["arrivals"]
     assert row["frame"] == 27
-    assert row["place_error_cm"] < 0.1
+    assert row["position_error_cm"] < 0.1
     assert row["facing_error_deg"] < 0.1
     assert row["pose_error_cm"] < 0.1
     assert mapctl.load(tmp_path / "a.bvh").num_frames >= 27 + 30

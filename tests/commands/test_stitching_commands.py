@@ -22,7 +22,7 @@ def clip(tmp_path, monkeypatch):
     return "clip.bvh"
 
 
-STITCH = ("--method", "stitcher", "--stitcher", "own.safetensors", "--no-finish", "--quiet")
+STITCH = ("--method", "stitcher", "--stitcher", "own.safetensors", "--no-refine", "--quiet")
 
 
 @pytest.mark.slow
@@ -40,7 +40,7 @@ def test_one_transition_and_its_report(clip):
 @pytest.mark.slow
 def test_the_first_variation_is_the_calm_one_and_the_others_are_the_same_however_many(clip):
     words = ("tween", clip, "--keyframes", "0,20", *STITCH, "--prior", "prior.safetensors", "--seed", "3")
-    words = tuple(word for word in words if word != "--no-finish")
+    words = tuple(word for word in words if word != "--no-refine")
     for out, count in (("few.bvh", 2), ("many.bvh", 4)):
         assert run(*words, "-o", out, "--variations", count) == 0
     assert run(*words[:-2], "-o", "one.bvh") == 0
@@ -67,7 +67,7 @@ def test_a_gap_that_is_too_long_is_anothers_and_the_note_says_so(clip, capsys):
 
 @pytest.mark.slow
 def test_auto_stitches_where_a_hand_is_told(clip, capsys):
-    words = ("tween", clip, "-o", "one.bvh", "--no-finish", "--stitcher", "own.safetensors", "--joints", "leftHand")
+    words = ("tween", clip, "-o", "one.bvh", "--no-refine", "--stitcher", "own.safetensors", "--joints", "leftHand")
     assert run(*words, "--keyframes", "0,10,20") == 0
     assert "frames 1:20: stitcher, led by what is told in it" in capsys.readouterr().out
     assert run(*words, "--keyframes", "0,10,30") == 0

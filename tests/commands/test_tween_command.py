@@ -58,7 +58,7 @@ def test_a_tweener_meets_keys_in_a_style_of_another_rig_s_clip(source, tmp_path)
     for name, words in (("plain", []), ("styled", ["--dna", tmp_path / "style.bvh"])):
         out = tmp_path / f"{name}.bvh"
         models = ["--inbetweener", trained, "--path", predictor]
-        given = [source, "-o", out, "--keyframes", "0,44", "--method", "tweener", "--no-finish", "--quiet"]
+        given = [source, "-o", out, "--keyframes", "0,44", "--method", "tweener", "--no-refine", "--quiet"]
         assert run("tween", *given, *models, *words) == 0
         assert away_cm(source, out, (0, 44)) < 1e-4
         made.append(out.read_bytes())

@@ -138,7 +138,7 @@ def test_keys_that_are_not_whole_are_met_in_the_file(models, folder, method):
     """The first of them tells but a place."""
     (folder / "keys" / "keys.toml").write_text(PARTS)
     (folder / "keys" / "pose.csv").write_text(DRAWING)
-    more = ["--method", "tweener", "--no-finish"] if method == "tweener" else models["auto"]
+    more = ["--method", "tweener", "--no-refine"] if method == "tweener" else models["auto"]
     words = [folder / "keys" / "keys.toml", "-o", "out.bvh", "--report", "r.json", "--quiet"]
     assert run("tween", *words, *more) == 0
     first, drawn, half = json.loads(Path("r.json").read_text())["keys"]

@@ -33,9 +33,9 @@ def test_decoding_gives_the_motion_back(kind):
 def test_features_know_neither_place_nor_heading(kind, turn):
     motion = MOTIONS[kind]
     here, start = encode(motion)
-    there, place = encode(moved(motion, turn=turn, shift=(5.0, -3.0)))
+    there, position = encode(moved(motion, turn=turn, shift=(5.0, -3.0)))
     torch.testing.assert_close(there, here, atol=1e-9, rtol=0)
-    assert float(rotations.wrap_angle(place.heading - start.heading - turn).abs()) < 1e-9
+    assert float(rotations.wrap_angle(position.heading - start.heading - turn).abs()) < 1e-9
 
 
 @each_motion

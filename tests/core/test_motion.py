@@ -60,8 +60,8 @@ def test_a_mirror_image_has_every_joint_on_the_other_side():
     motion = random_motion(Skeleton(CANONICAL.names, CANONICAL.parents, bones))
     image = motion.mirror()
     for name, other in (("hips", "hips"), ("head", "head"), ("leftHand", "rightHand"), ("rightToes", "leftToes")):
-        place = motion.joint_positions()[:, CANONICAL.index(name)] * torch.tensor([-1.0, 1, 1])
-        torch.testing.assert_close(image.joint_positions()[:, CANONICAL.index(other)], place, atol=1e-9, rtol=0)
+        position = motion.joint_positions()[:, CANONICAL.index(name)] * torch.tensor([-1.0, 1, 1])
+        torch.testing.assert_close(image.joint_positions()[:, CANONICAL.index(other)], position, atol=1e-9, rtol=0)
 
 
 @pytest.mark.parametrize("name", ["Toes_R", "Hand_L", "mixamorig:LeftUpLeg", "Bip01 R Thigh", "footleft"])

@@ -45,8 +45,8 @@ def made(curve, *, laps=1.0, sway=0.03, speed=1.3, fps=FPS, seed=0):
 @pytest.mark.parametrize("fps", [30, 120])
 def test_arcs_are_those_that_the_walk_was_made_from(name, fps):
     curve = CURVES[name]
-    arcs, _, places = made(curve, laps=LAPS.get(name, 1.0), fps=fps)
-    found = track_arcs(curve, places)
+    arcs, _, positions = made(curve, laps=LAPS.get(name, 1.0), fps=fps)
+    found = track_arcs(curve, positions)
     assert float((found - arcs).abs().max()) < 0.12  # near a tip the other leg is as near
     assert float((found - arcs).abs().median()) < 0.005
     assert float(found[-1] - found[0]) == pytest.approx(float(arcs[-1]), abs=0.12)
@@ -55,8 +55,8 @@ def test_arcs_are_those_that_the_walk_was_made_from(name, fps):
 @pytest.mark.parametrize("name", CURVES)
 def test_progress_and_path_error_are_the_walks_own(name):
     curve = CURVES[name]
-    arcs, offset, places = made(curve, laps=LAPS.get(name, 1.0))
-    got = measure(walk_through(places, fps=FPS), curve, speed=1.3)
+    arcs, offset, positions = made(curve, laps=LAPS.get(name, 1.0))
+    got = measure(walk_through(positions, fps=FPS), curve, speed=1.3)
     assert got["travelled_m"] == pytest.approx(float(arcs[-1]), rel=0.02)
     assert got["progress_ratio"] == pytest.approx(1, abs=0.03)
     own = 100 * offset.abs()

@@ -81,13 +81,13 @@ def test_any_drawing_keeps_its_points_its_length_and_its_nearest_places(seed, di
     assert curve.points.diff(dim=0).norm(dim=-1).max() <= 0.010001
     for point in drawn:
         assert np.linalg.norm(curve.points.numpy() - point, axis=1).min() < 1e-9
-    places = rng.normal(size=(30, dims)) * 3
-    distance, arc = brute_force(places, drawn)
-    found = curve.nearest(torch.tensor(places))
-    gap = (curve.point(found) - torch.tensor(places)).norm(dim=-1).numpy()
+    positions = rng.normal(size=(30, dims)) * 3
+    distance, arc = brute_force(positions, drawn)
+    found = curve.nearest(torch.tensor(positions))
+    gap = (curve.point(found) - torch.tensor(positions)).norm(dim=-1).numpy()
     np.testing.assert_allclose(gap, distance, atol=2e-5)
-    local = curve.nearest(torch.tensor(places), around=torch.tensor(arc) + 0.1, reach=0.3)
-    gap = (curve.point(local) - torch.tensor(places)).norm(dim=-1).numpy()
+    local = curve.nearest(torch.tensor(positions), around=torch.tensor(arc) + 0.1, reach=0.3)
+    gap = (curve.point(local) - torch.tensor(positions)).norm(dim=-1).numpy()
     inside = (arc > 0.5) & (arc < curve.length - 0.5)  # else the search meets the straight extension
     np.testing.assert_allclose(gap[inside], distance[inside], atol=1e-4)
     assert (gap <= distance + 1e-4).all()
@@ -98,15 +98,15 @@ def test_gradients_of_places_and_of_searches():
     arcs = torch.tensor([-0.5, 1.2345, 3.3, 40.0], dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(curve.point, arcs)
     assert torch.autograd.gradcheck(curve.tangent, arcs)
-    places = (curve.point(arcs) + torch.tensor([0.1, -0.03])).detach().requires_grad_()
+    positions = (curve.point(arcs) + torch.tensor([0.1, -0.03])).detach().requires_grad_()
 
     def offset(at):
         return curve.signed_offset(at, curve.nearest(at, around=arcs.detach()))
 
-    numeric = torch.autograd.functional.jacobian(offset, places).sum(1)
+    numeric = torch.autograd.functional.jacobian(offset, positions).sum(1)
     # The sideways offset grows by one to the left whatever the search does.
     torch.testing.assert_close(
-        (numeric * curve.left(curve.nearest(places, around=arcs))).sum(-1), torch.ones(4).double(), rtol=0, atol=0.02
+        (numeric * curve.left(curve.nearest(positions, around=arcs))).sum(-1), torch.ones(4).double(), rtol=0, atol=0.02
     )
 
 

@@ -35,8 +35,8 @@ def five(motion, loop):
 
 def peaks(motion) -> list[float]:
     """The largest step from frame to frame, metres, and acceleration, m/s^2, of any joint."""
-    places = motion.joint_positions()
-    return [float(places.diff(n=n, dim=0).norm(dim=-1).max()) * float(motion.fps) ** (2 * n - 2) for n in (1, 2)]
+    positions = motion.joint_positions()
+    return [float(positions.diff(n=n, dim=0).norm(dim=-1).max()) * float(motion.fps) ** (2 * n - 2) for n in (1, 2)]
 
 
 @pytest.mark.parametrize(("fps", "turn_rate"), [(30, 0.5), (120, 0.0)])
@@ -69,11 +69,11 @@ def test_a_root_joint_that_stays_in_place_stays_and_the_body_goes_as_without_one
     walked = uneven(turn_rate=1.0)
     motion = make(replace(RIGS["root on the ground"], extras=False)).motion(walked)
     hips = motion.skeleton.index("Hips")
-    places = motion.joint_positions()[:, hips]
+    positions = motion.joint_positions()[:, hips]
     local = motion.local_quat_xyzw.clone()
     local[:, 0] = torch.tensor([0.0, 0.0, 0.0, 1.0]).double()
     local[:, hips] = motion.joint_rotations()[:, hips]
-    fixed = replace(motion, root_position=0 * places, local_quat_xyzw=local, moving_offsets={hips: places})
+    fixed = replace(motion, root_position=0 * positions, local_quat_xyzw=local, moving_offsets={hips: positions})
     loop, alone = editing.close_loop(fixed), editing.close_loop(walked)
     assert float(loop.motion.root_position.abs().max()) < 1e-12
     torch.testing.assert_close(loop.motion.local_quat_xyzw[:, 0], local[: loop.motion.num_frames, 0])

@@ -10,13 +10,13 @@ from scenes import renderers
 from scenes.cameras import CameraSettings
 from scenes.overlays import build_target
 from scenes.renderers import Content, select_painter
-from scenes.stage import Mark, Shot, Stage, Wishes
+from scenes.stage import Mark, Shot, Stage, Targets
 
 
 def test_a_mark_is_strong_at_its_time_and_faint_at_others():
     target = build_target((0.4, 1.2, 1.0))
     momentary, held = Mark(target, (1.0, 1.0)), Mark(target, (1.5, 2.5))
-    stage = Stage([Shot(walk(48, fps=12), start_seconds=1.0, wishes=Wishes([momentary, held]))])
+    stage = Stage([Shot(walk(48, fps=12), start_seconds=1.0, targets=Targets([momentary, held]))])
 
     def opacities(seconds: float) -> list[float]:
         return [float(surface.rgba[0, 3]) for surface in stage.content(round(12 * seconds)).ground[-2:]]
@@ -42,7 +42,7 @@ def test_one_sees_through_a_pose_and_it_covers_the_actor_who_is_in_it(renderer):
         pytest.skip("no OpenGL without a window here")
     motion = walk(6, speed=0.0)
     beside = moved(motion.slice(2, 3), turn=0.0, shift=(0.7, 0.0))
-    stage = Stage([Shot(motion, wishes=Wishes(poses=[beside, motion.slice(2, 3)]))])
+    stage = Stage([Shot(motion, targets=Targets(poses=[beside, motion.slice(2, 3)]))])
     content = stage.content(2)
     assert len(content.veils) == 2
     view = stage.views(CameraSettings(azimuth_deg=0.0, elevation_deg=5.0, zoom=0.5), (160, 160))[0]
@@ -51,8 +51,8 @@ def test_one_sees_through_a_pose_and_it_covers_the_actor_who_is_in_it(renderer):
     changed = np.abs(seen - plain).max(axis=2) > 8
     red = colours.rgb(colours.TARGET) @ [1, -0.5, -0.5]
     assert (seen - plain)[changed].mean(axis=0) @ [1, -0.5, -0.5] / 255 > 0.1 * red
-    for place in (view.project(np.array([[0.7, 1.2, 0.0]])), view.project(np.array([[0.0, 1.2, 0.0]]))):
-        column, row = np.rint(place[0, :2]).astype(int)
+    for position in (view.project(np.array([[0.7, 1.2, 0.0]])), view.project(np.array([[0.0, 1.2, 0.0]]))):
+        column, row = np.rint(position[0, :2]).astype(int)
         around = changed[row - 4 : row + 5, column - 4 : column + 5]
         assert around.mean() > 0.7
         assert np.abs(seen[row, column] - 255 * colours.rgb(colours.TARGET)).max() > 30, "not opaque"

@@ -122,7 +122,7 @@ ASF = {
 
 @pytest.mark.parametrize("case", ASF)
 def test_a_broken_skeleton_is_refused_with_its_place(case, tmp_path):
-    old, new, place, words = ASF[case]
+    old, new, position, words = ASF[case]
     path = pair(2, seed=7).write(tmp_path)
     asf = path.with_suffix(".asf")
     assert old in asf.read_text()
@@ -130,8 +130,8 @@ def test_a_broken_skeleton_is_refused_with_its_place(case, tmp_path):
     asf.write_text(text)
     with pytest.raises(FileFormatError, match=words) as caught:
         mapctl.load(path)
-    if place is not None:
-        assert caught.value.line == text.count("\n", 0, text.index(place)) + 1
+    if position is not None:
+        assert caught.value.line == text.count("\n", 0, text.index(position)) + 1
     assert str(caught.value).startswith(f"{asf}, line {caught.value.line}: ")
 
 

@@ -50,28 +50,28 @@ Frame Time: 0.0333333
 
 def world(tree, values):
     """World positions (frames, joints, 3) and matrices, straight from the definition of the channels."""
-    places, turns = (np.zeros((len(values), len(tree.names), 3)), np.zeros((len(values), len(tree.names), 3, 3)))
+    positions, turns = (np.zeros((len(values), len(tree.names), 3)), np.zeros((len(values), len(tree.names), 3, 3)))
     for frame, row in enumerate(values):
         numbers = iter(row)
         for joint, parent in enumerate(tree.parents):
-            place, rotation = np.array(tree.offsets[joint]), np.eye(3)
+            position, rotation = np.array(tree.offsets[joint]), np.eye(3)
             for channel in tree.channels[joint]:
                 axis, value = AXES.index(channel[0]), next(numbers)
                 if channel.endswith("position"):
-                    place[axis] = value
+                    position[axis] = value
                 else:
                     rotation = rotation @ turn(axis, value)
-            up_place, up_turn = (places[frame, parent], turns[frame, parent]) if joint else (0, np.eye(3))
-            places[frame, joint], turns[frame, joint] = up_place + up_turn @ place, up_turn @ rotation
-    return places, turns
+            up_place, up_turn = (positions[frame, parent], turns[frame, parent]) if joint else (0, np.eye(3))
+            positions[frame, joint], turns[frame, joint] = up_place + up_turn @ position, up_turn @ rotation
+    return positions, turns
 
 
-def agrees(path, places, turns, scale):
+def agrees(path, positions, turns, scale):
     """Within 0.01 mm and 0.001 degree, as files of 6 decimals allow."""
     motion = bvh.load(path)
     found = rotations.to_matrix(motion.joint_rotations()).numpy()
     angle = np.degrees(2 * np.arcsin(np.linalg.norm(found - turns, axis=(-1, -2)) / np.sqrt(8)))
-    assert np.abs(motion.joint_positions().numpy() - places * scale).max() < 1e-5
+    assert np.abs(motion.joint_positions().numpy() - positions * scale).max() < 1e-5
     assert angle.max() < 1e-3
     return motion
 
@@ -118,10 +118,10 @@ def test_any_layout_is_read_as_defined_and_written_back_as_it_came(tmp_path_fact
     folder = tmp_path_factory.mktemp("layout")
     first, second, third = (folder / f"{name}.bvh" for name in ("first", "second", "third"))
     first.write_text(bvh.compose(tree, "0.0333333", values, decimals=6))
-    places, turns = world(tree, values)
-    motion = agrees(first, places, turns, bvh.load(first).source.metres_per_unit)
+    positions, turns = world(tree, values)
+    motion = agrees(first, positions, turns, bvh.load(first).source.metres_per_unit)
     motion.save(second)
-    again = agrees(second, places, turns, motion.source.metres_per_unit)
+    again = agrees(second, positions, turns, motion.source.metres_per_unit)
     assert again.source.hierarchy.channels == tree.channels
     assert again.source.frame_time == "0.0333333"
     again.save(third)

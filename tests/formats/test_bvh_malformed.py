@@ -99,7 +99,7 @@ def test_a_cut_row_may_hold_nan(tmp_path):
     path.write_text(swap("2 91 4", "nan 91 4").replace("3 92", "nan 92")[:-9])
     motion, lost = formats.load_with_missing(path)
     assert motion.num_frames == 2
-    assert lost.places[:, 0].tolist() == [False, True]
+    assert lost.positions[:, 0].tolist() == [False, True]
 
 
 BYTES = {

@@ -42,7 +42,7 @@ def test_a_clip_is_where_fbx_has_it(kind, tmp_path):
     motion = formats.load(tmp_path / "a.fbx")
     assert (motion.fps, motion.num_frames) == (KINDS[kind].get("rate", 30), 6)
     assert motion.source.animation == "Take 001"
-    np.testing.assert_allclose(in_order(motion), made.places, **NEAR)
+    np.testing.assert_allclose(in_order(motion), made.positions, **NEAR)
     assert not motion.moving_offsets
 
 
@@ -112,7 +112,7 @@ def test_indices_of_a_mesh_that_point_at_nothing_are_one_warning(tmp_path, capsy
     count = int(found[1])
     layer = layer.replace("COUNT", str(count)).replace("INDICES", ",".join(["-1", *["0"] * (count - 1)]))
     path.write_text(path.read_text().replace(found[0], f"{found[0].rstrip()}{layer}\n"))
-    np.testing.assert_allclose(in_order(formats.load(path)), made.places, **NEAR)
+    np.testing.assert_allclose(in_order(formats.load(path)), made.positions, **NEAR)
     err = capsys.readouterr().err
     assert err.count("\n") == 1
     assert f"{path}: 1 of its meshes' indices point at nothing" in err
@@ -123,7 +123,7 @@ def test_motion_is_read_where_a_mesh_is_broken(tmp_path, capsys):
     path = tmp_path / "a.fbx"
     made = make_fbx(path)
     path.write_text(re.sub(r"(Vertices: \*\d+ \{\s*a: )[^,]*,", r"\1", path.read_text(), count=1))
-    np.testing.assert_allclose(in_order(formats.load(path)), made.places, **NEAR)
+    np.testing.assert_allclose(in_order(formats.load(path)), made.positions, **NEAR)
     assert capsys.readouterr().err == f"mapctl: {path}: its meshes are broken; its joints and motion are read\n"
     with pytest.raises(FileFormatError, match="is no sound FBX file"):
         formats.load_mesh(path)

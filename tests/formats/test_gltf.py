@@ -134,8 +134,8 @@ def test_animations_are_read(kind, interpolation, tmp_path):
     for frame in range(0, 31, 6):
         for name, node in zip(made.names, made.nodes, strict=True):
             if name in motion.skeleton.names:
-                place = motion.joint_positions()[frame, motion.skeleton.index(name)].numpy()
-                np.testing.assert_allclose(place, viewer.world(node, number, frame / 30)[:3, 3], rtol=0, atol=5e-6)
+                position = motion.joint_positions()[frame, motion.skeleton.index(name)].numpy()
+                np.testing.assert_allclose(position, viewer.world(node, number, frame / 30)[:3, 3], rtol=0, atol=5e-6)
     other = formats.load(f"{made.path}#/other")
     assert float((other.joint_positions() - motion.joint_positions()).abs().max()) > 0.01
     assert isinstance(other.source, CharacterSource)
@@ -201,8 +201,8 @@ def test_a_motion_is_added_and_all_else_stays(kind, tmp_path):
         for name in motion.skeleton.names:
             joint = motion.skeleton.index(name)
             node = int(motion.source.nodes[joint])
-            place = motion.joint_positions()[frame, joint].numpy()
-            np.testing.assert_allclose(viewer.world(node, 0, frame / 30)[:3, 3], place, rtol=0, atol=1e-5)
+            position = motion.joint_positions()[frame, joint].numpy()
+            np.testing.assert_allclose(viewer.world(node, 0, frame / 30)[:3, 3], position, rtol=0, atol=1e-5)
     again = formats.load(out)
     np.testing.assert_allclose(again.joint_positions().numpy(), motion.joint_positions().numpy(), rtol=0, atol=1e-5)
 
@@ -212,8 +212,8 @@ def test_a_vrm_rests_as_its_nodes_stand(tmp_path):
     rest, viewer = formats.load_rest(made.path), GlbViewer(made.path)
     for name, node in zip(made.names, made.nodes, strict=True):
         if name in rest.skeleton.names:
-            place = rest.joint_positions()[0, rest.skeleton.index(name)].numpy()
-            np.testing.assert_allclose(place, viewer.world(node)[:3, 3], **POSITIONS)
+            position = rest.joint_positions()[0, rest.skeleton.index(name)].numpy()
+            np.testing.assert_allclose(position, viewer.world(node)[:3, 3], **POSITIONS)
 
 
 def test_one_animation_is_replaced_where_it_was_the_one(tmp_path):
@@ -376,7 +376,7 @@ def test_a_vrma_is_as_its_specification_says(kind, tmp_path):
     assert not any("scale" in node or "rotation" in node for node in tree["nodes"])
     viewer = GlbViewer(out)
     at = {bone: viewer.world(node)[:3, 3] for bone, node in bones.items()}
-    assert min(place[1] for place in at.values()) > -1e-6
+    assert min(position[1] for position in at.values()) > -1e-6
     for side, sign in zip(SIDES, (1, -1), strict=True):
         assert sign * at[f"{side}UpperLeg"][0] > 0.03
         for inner, outer in pairwise(f"{side}{part}" for part in ("UpperArm", "LowerArm", "Hand")):
@@ -394,12 +394,12 @@ def test_the_mannequin_moves_as_the_motion(tmp_path):
     motion = random_motion(CANONICAL, 12, seed=4)
     motion.save(tmp_path / "a.glb")
     viewer, body = GlbViewer(tmp_path / "a.glb"), build_skin(motion)
-    matrices, places = rotations.to_matrix(motion.joint_rotations()).numpy(), motion.joint_positions().numpy()
+    matrices, positions = rotations.to_matrix(motion.joint_rotations()).numpy(), motion.joint_positions().numpy()
     for frame in (0, 7, 11):
         for joint, name in enumerate(CANONICAL.names):
             world = viewer.world(viewer.node(name), 0, frame / 30)
-            np.testing.assert_allclose(world[:3, 3], places[frame, joint], atol=2e-6)
-        expected = np.einsum("nij,nj->ni", matrices[frame, body.joint], body.vertices) + places[frame, body.joint]
+            np.testing.assert_allclose(world[:3, 3], positions[frame, joint], atol=2e-6)
+        expected = np.einsum("nij,nj->ni", matrices[frame, body.joint], body.vertices) + positions[frame, body.joint]
         np.testing.assert_allclose(viewer.skinned(0, frame / 30), expected, atol=5e-6)
 
 

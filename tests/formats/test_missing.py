@@ -85,12 +85,12 @@ def test_nan_in_an_archive(tmp_path, key):
     motion = on_rig("bandai", 12)
     motion.save(tmp_path / "in.npz")
     hips = motion.skeleton.names.index("Hips")
-    place = {
+    position = {
         "local_quat_xyzw": (slice(3, 5), hips, 0),
         "root_position_world": (slice(3, 5), 2),
         "moving_offsets": (0, slice(3, 5), 1),
     }[key]
-    lossy = archive_without(tmp_path / "in.npz", tmp_path / "lossy.npz", **{key: place})
+    lossy = archive_without(tmp_path / "in.npz", tmp_path / "lossy.npz", **{key: position})
     with pytest.raises(FileFormatError, match=rf"{key} at \[.*\]: .*; `mapctl infill` fills in what is lost"):
         mapctl.load(lossy)
     read, missing = formats.load_with_missing(lossy)

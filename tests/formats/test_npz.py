@@ -123,16 +123,16 @@ def test_an_interrupted_output_leaves_the_old_file_and_nothing_else(tmp_path):
 def test_places_that_cannot_be_written_are_named(tmp_path):
     (tmp_path / "file").write_text("x")
     (tmp_path / "folder.bvh").mkdir()
-    places = {
+    positions = {
         "missing/out.bvh": "does not exist",
         "file/out.bvh": "does not exist",
         "folder.bvh": "is a folder",
         "x" * 300 + ".bvh": "cannot write",
     }
-    for place, words in places.items():
+    for position, words in positions.items():
         for attempt in (check_writable, lambda path: write_text(path, "x"), example().save):
             with pytest.raises(RequestError, match=words):
-                attempt(tmp_path / place)
+                attempt(tmp_path / position)
     with pytest.raises(RequestError, match="not a regular file"):
         write_text(os.devnull, "x")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "folder.bvh"]

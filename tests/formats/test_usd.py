@@ -66,11 +66,11 @@ def assert_same(motion, viewer, first=0):
 
 
 def skinned(mesh, motion, frame):
-    places, turns = (
+    positions, turns = (
         motion.joint_positions()[frame].numpy(),
         rotations.to_matrix(motion.joint_rotations()[frame]).numpy(),
     )
-    return mesh.pose(places, turns)[0]
+    return mesh.pose(positions, turns)[0]
 
 
 def follow_up(path):
@@ -230,10 +230,10 @@ def test_the_mannequin_moves_as_the_motion(tmp_path, ending):
     motion.save(tmp_path / f"walk{ending}")
     viewer, body = UsdViewer(tmp_path / f"walk{ending}"), build_skin(motion)
     assert viewer.query.GetTopology().GetParentIndices() == list(CANONICAL.parents)
-    matrices, places = rotations.to_matrix(motion.joint_rotations()).numpy(), motion.joint_positions().numpy()
+    matrices, positions = rotations.to_matrix(motion.joint_rotations()).numpy(), motion.joint_positions().numpy()
     for frame in (0, 7, 11):
-        np.testing.assert_allclose(viewer.joints(frame), places[frame], atol=2e-6)
-        expected = np.einsum("nij,nj->ni", matrices[frame, body.joint], body.vertices) + places[frame, body.joint]
+        np.testing.assert_allclose(viewer.joints(frame), positions[frame], atol=2e-6)
+        expected = np.einsum("nij,nj->ni", matrices[frame, body.joint], body.vertices) + positions[frame, body.joint]
         np.testing.assert_allclose(viewer.vertices(frame), expected, atol=5e-6)
     assert find_faults(tmp_path / f"walk{ending}") == []
 

@@ -94,13 +94,13 @@ class Oracle(PositionInfiller):
         """The true places; where there is a moment more than at 30 a second it is that of the very end."""
         own = retarget.to_canonical(self.truth)[0]
         canonical = own.resample(30)
-        if image.places.shape[1] > canonical.num_frames:
+        if image.positions.shape[1] > canonical.num_frames:
             end = own.slice(own.num_frames - 1, own.num_frames)
             canonical = canonical.join(replace(end, fps=canonical.fps))
         scale = leg_length(canonical.skeleton) / leg_length(CANONICAL)
         body = Motion(CANONICAL, canonical.fps, canonical.root_position / scale, canonical.local_quat_xyzw)
-        places = body.joint_positions().float()[None]
-        return ProposedPositions(image.from_world(places), torch.zeros(1, places.shape[1], 2))
+        positions = body.joint_positions().float()[None]
+        return ProposedPositions(image.from_world(positions), torch.zeros(1, positions.shape[1], 2))
 
 
 @pytest.mark.parametrize(("rig", "fps"), [("bandai", 30), ("daz", 60)])

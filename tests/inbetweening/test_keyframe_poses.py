@@ -92,8 +92,8 @@ def test_every_kind_of_key_is_met_in_one_motion(poses, rig):
     assert max(row["missed_cm"] for row in rows) < 0.1
     assert done.notes == ()
     canonical, there = retarget.to_canonical(done.motion, found.rig)
-    places = retarget.rig_joint_positions(done.motion, there)
-    assert places[7, canonical.skeleton.index("leftHand")].tolist() == pytest.approx([0.4, 1.2, 0.5], abs=1e-3)
+    positions = retarget.rig_joint_positions(done.motion, there)
+    assert positions[7, canonical.skeleton.index("leftHand")].tolist() == pytest.approx([0.4, 1.2, 0.5], abs=1e-3)
     assert canonical.root_position[19, ::2].tolist() == pytest.approx([0.1, 0.6], abs=1e-6)
 
 

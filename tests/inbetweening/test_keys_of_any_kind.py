@@ -22,7 +22,7 @@ from mapctl.retarget import to_canonical
 from mapctl.skeleton import CANONICAL
 
 RATES = [("canonical", 30), ("bandai", 30), ("daz", 120)]
-PLACE = {"root_only": "place"}
+POSITION = {"root_only": "place"}
 
 
 def frames_of(fps):
@@ -32,8 +32,10 @@ def frames_of(fps):
 def drawing_of(canonical, frame, *, view_deg, names=CANONICAL.names, unit=100.0):
     """What somebody draws who sees the pose from there, in centimetres from anywhere."""
     seen = canonical.joint_positions()[frame] @ view_axes(torch.tensor(math.radians(view_deg)).double()).mT
-    places = {name: tuple((unit * seen[CANONICAL.index(name)] + torch.tensor([7.0, -3.0])).tolist()) for name in names}
-    return Drawing(places, view_deg)
+    positions = {
+        name: tuple((unit * seen[CANONICAL.index(name)] + torch.tensor([7.0, -3.0])).tolist()) for name in names
+    }
+    return Drawing(positions, view_deg)
 
 
 def spoilt(motion, missing, *, off=0.3):
@@ -73,7 +75,7 @@ def test_a_half_is_met_to_the_bit_and_the_other_does_not_count(rig, fps, half):
 @pytest.mark.parametrize(("rig", "fps", "method"), [*((*rate, "infiller") for rate in RATES), ("daz", 120, "slerp")])
 def test_places_alone_are_met_and_nothing_else_of_the_motion_counts(rig, fps, method):
     motion = on_rig(rig, round(1.5 * fps), fps=fps)
-    keys = Keys(tuple(Key(frame, **PLACE) for frame in frames_of(fps)))
+    keys = Keys(tuple(Key(frame, **POSITION) for frame in frames_of(fps)))
     by, settings = by_method(method, tiny_tweener() if method == "infiller" else tiny_infiller(drawn=0.02))
     made = tween(motion, keys, by, settings=settings)
     rows = measure_keyframe_errors(made.motion, motion, keys)

@@ -42,24 +42,24 @@ RATES = [("canonical", 30), ("bandai", 30), ("daz", 120), ("canonical", 24)]
 
 
 @pytest.mark.parametrize(
-    ("rig", "fps", "place"),
+    ("rig", "fps", "position"),
     [
         case if case in QUICK else pytest.param(*case, marks=pytest.mark.slow)
-        for place in (HIGH, LOW)
-        for case in ((*rig, place) for rig in RATES)
+        for position in (HIGH, LOW)
+        for case in ((*rig, position) for rig in RATES)
     ],
 )
-def test_a_hand_told_at_one_frame_goes_there_and_back(rig, fps, place):
+def test_a_hand_told_at_one_frame_goes_there_and_back(rig, fps, position):
     """No faster than 1.9 times the distance over the time of a smooth reach, and as calmly."""
     motion = on_rig(rig, 3 * fps, fps=fps)
     scale = float(to_canonical(motion)[0].root_position[0, 1]) / 0.95
     there = to_canonical(motion)[0].root_position[3 * fps // 2] * torch.tensor([1.0, 0.0, 1.0])
-    place = tuple((there + scale * torch.tensor(place).double()).tolist())
-    hand = Key(3 * fps // 2, places={HANDS[rig]: place})
+    position = tuple((there + scale * torch.tensor(position).double()).tolist())
+    hand = Key(3 * fps // 2, positions={HANDS[rig]: position})
     done = asked(motion, (0, hand, 3 * fps - 1))
     at = to_canonical(done.motion)[0].joint_positions()[hand.frame, CANONICAL.index("leftHand")]
     if rig != "daz":  # whose fingers' parents carry the hand elsewhere than on canonical joints
-        assert (at - torch.tensor(place).double()).norm() < 0.002
+        assert (at - torch.tensor(position).double()).norm() < 0.002
     step, acceleration = peaks_of(done.motion)
     assert step < 0.15
     assert acceleration < 60
@@ -88,20 +88,20 @@ class Told(LinearInbetweener):
 def test_the_body_moves_for_a_hand_only_where_its_arm_does_not_reach(share, moves):
     motion, at, limb = walk(60), 30, LIMBS["leftHand"]
     shoulder = motion.joint_positions()[at, limb.upper]
-    places, wanted = torch.zeros(60, CANONICAL.num_joints, 3).double(), torch.zeros(60, CANONICAL.num_joints) > 0
+    positions, wanted = torch.zeros(60, CANONICAL.num_joints, 3).double(), torch.zeros(60, CANONICAL.num_joints) > 0
     direction = torch.nn.functional.normalize(torch.tensor([0.4, 0.0, 1.0]).double(), dim=0)
-    places[at, limb.end], wanted[at, limb.end] = shoulder + share * limb.length(CANONICAL) * direction, True
+    positions[at, limb.end], wanted[at, limb.end] = shoulder + share * limb.length(CANONICAL) * direction, True
     missing = torch.zeros(60, dtype=torch.bool)
     missing[15:45] = True
     mask = MissingMask.of_frames(missing, CANONICAL.num_joints)
-    query = GapQuery(motion, mask, torch.arange(60) / 30.0, EffectorTargets(places, wanted))
+    query = GapQuery(motion, mask, torch.arange(60) / 30.0, EffectorTargets(positions, wanted))
     made, targets = propose_through_keys(query, Told(), torch.Generator())
     freely = Told().propose(query).motion
     hips = (made.motion.root_position - freely.root_position).norm(dim=-1)
     assert bool(hips[at] > 0.01) == moves
     assert targets is not None
     assert torch.equal(targets.wanted, wanted)
-    away = (targets.places[at, limb.end] - made.motion.joint_positions()[at, limb.upper]).norm()
+    away = (targets.positions[at, limb.end] - made.motion.joint_positions()[at, limb.upper]).norm()
     assert float(away) <= limb.length(CANONICAL)
     if not moves:
         assert torch.equal(made.motion.local_quat_xyzw, freely.local_quat_xyzw)

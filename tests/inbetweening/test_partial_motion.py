@@ -66,17 +66,17 @@ def test_unknown_limbs_bend_to_their_targets_and_known_ones_do_not():
     told[0, 17, hand] = told[0, 5, foot] = True
     motion = partial_motion(replace(gap(), effectors=told))
     plain = interpolate_partial_motion(replace(motion, known=gap()), MEAN, 0.9)
-    places, limb = world_positions(plain), LIMBS["leftHand"]
-    place = places[0, 17, limb.upper] + torch.tensor([0.1, 0.2, 0.3])
-    motion.targets[0, 17, hand], motion.targets[0, 5, foot] = place, 5.0
+    positions, limb = world_positions(plain), LIMBS["leftHand"]
+    position = positions[0, 17, limb.upper] + torch.tensor([0.1, 0.2, 0.3])
+    motion.targets[0, 17, hand], motion.targets[0, 5, foot] = position, 5.0
     made = world_positions(interpolate_partial_motion(motion, MEAN, 0.9))
-    torch.testing.assert_close(made[0, 17, limb.end].float(), place.float(), atol=2e-3, rtol=0)
-    off = (made - places)[0, :, limb.end].norm(dim=-1)
+    torch.testing.assert_close(made[0, 17, limb.end].float(), position.float(), atol=2e-3, rtol=0)
+    off = (made - positions)[0, :, limb.end].norm(dim=-1)
     assert 0 < float(off[11]) < float(off[14]) < float(off[17])
     assert float(torch.diff(off).abs().max()) < 0.4 * float(off[17]), "there and back"
     others = torch.ones(FRAMES, CANONICAL.num_joints, dtype=torch.bool)
     others[10:25, [limb.lower, limb.end]] = False
-    torch.testing.assert_close(made[0][others], places[0][others], atol=1e-9, rtol=0)
+    torch.testing.assert_close(made[0][others], positions[0][others], atol=1e-9, rtol=0)
 
 
 def test_a_mirrored_motion_has_mirrored_places():
@@ -103,7 +103,7 @@ masks = st.builds(drawn_masks, st.integers(0, 1000), st.sampled_from([0.05, 0.3,
 def test_known_places_come_back_and_the_way_back_is_the_way_there(known):
     motion = walk(FRAMES, turn_rate=2.0)
     image, wanted = shown(motion, known), motion.joint_positions()[None]
-    assert (image.to_world(image.places) - wanted)[known].abs().max() < 1e-12
+    assert (image.to_world(image.positions) - wanted)[known].abs().max() < 1e-12
     assert torch.allclose(image.to_world(image.from_world(wanted)), wanted, atol=1e-12)
 
 
@@ -112,7 +112,7 @@ def test_known_places_come_back_and_the_way_back_is_the_way_there(known):
 def test_it_does_not_matter_where_the_motion_stands_and_faces(known, turn, shift):
     motion = walk(FRAMES, turn_rate=2.0)
     here, there = shown(motion, known), shown(moved(motion, turn=turn, shift=shift), known)
-    assert torch.allclose(here.places, there.places, atol=1e-9)
+    assert torch.allclose(here.positions, there.positions, atol=1e-9)
     assert torch.equal(here.contacts, there.contacts)
     apart = rotations.wrap_angle(there.heading - here.heading - turn)
     assert apart.abs().max() < 1e-9

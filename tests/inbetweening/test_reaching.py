@@ -17,12 +17,12 @@ HAIR = 1e-4
 
 def at(motion, wanted):
     """Targets by (frame, limb) to place."""
-    places = torch.zeros(motion.num_frames, JOINTS, 3).double()
+    positions = torch.zeros(motion.num_frames, JOINTS, 3).double()
     mask = torch.zeros(motion.num_frames, JOINTS, dtype=torch.bool)
-    for (frame, limb), place in wanted.items():
-        places[frame, CANONICAL.index(limb)] = place
+    for (frame, limb), position in wanted.items():
+        positions[frame, CANONICAL.index(limb)] = position
         mask[frame, CANONICAL.index(limb)] = True
-    return EffectorTargets(places, mask)
+    return EffectorTargets(positions, mask)
 
 
 def place_of(motion, frame, joint):
@@ -33,9 +33,9 @@ def nearer(motion, frame, limb, share=0.15, aside=0.05):
     """A place in reach: toward where the limb begins, and somewhat aside."""
     begins, ends = place_of(motion, frame, CANONICAL.names[LIMBS[limb].upper]), place_of(motion, frame, limb)
     aside = aside * torch.randn(3, generator=generator(frame)).double()
-    place = ends + share * (begins - ends) + aside
+    position = ends + share * (begins - ends) + aside
     length = CANONICAL.offsets[[LIMBS[limb].lower, LIMBS[limb].end]].norm(dim=-1).sum()
-    return begins + (place - begins) * min(1.0, 0.98 * float(length) / float((place - begins).norm()))
+    return begins + (position - begins) * min(1.0, 0.98 * float(length) / float((position - begins).norm()))
 
 
 def all_free(motion):
@@ -44,8 +44,8 @@ def all_free(motion):
 
 def lengths(motion):
     """Of every bone in every frame."""
-    places = motion.joint_positions()
-    return (places[:, 1:] - places[:, list(CANONICAL.parents[1:])]).norm(dim=-1)
+    positions = motion.joint_positions()
+    return (positions[:, 1:] - positions[:, list(CANONICAL.parents[1:])]).norm(dim=-1)
 
 
 def standing(**angles):
@@ -112,11 +112,11 @@ HAND, SHOULDER = CANONICAL.index("leftHand"), CANONICAL.index("leftUpperArm")
 FEET = [CANONICAL.index(name) for name in ("leftFoot", "rightFoot", "leftToes", "rightToes")]
 
 
-def asked(motion, frame, joint, place):
-    places = motion.joint_positions().clone()
+def asked(motion, frame, joint, position):
+    positions = motion.joint_positions().clone()
     wanted = torch.zeros(motion.num_frames, JOINTS, dtype=torch.bool)
-    places[frame, joint], wanted[frame, joint] = place, True
-    return EffectorTargets(places, wanted)
+    positions[frame, joint], wanted[frame, joint] = position, True
+    return EffectorTargets(positions, wanted)
 
 
 def reach(motion, targets, *, stray=0.0, turning=None, moving=None):
@@ -144,11 +144,11 @@ def beside(motion, frame, *, ahead=0.0, aside=0.0, up=0.0):
 )
 def test_a_hand_gets_there_and_standing_feet_stay(where):
     motion = walk(5, cadence=0.0)
-    place = beside(motion, 2, **where)
-    made, shift = reach(motion, asked(motion, 2, HAND, place))
-    places, before = made.joint_positions(), motion.joint_positions()
-    assert (places[2, HAND] - place).norm() < 0.005
-    assert (places[2, FEET] - before[2, FEET]).norm(dim=-1).max() < 0.02  # at most a heel comes up for what is high
+    position = beside(motion, 2, **where)
+    made, shift = reach(motion, asked(motion, 2, HAND, position))
+    positions, before = made.joint_positions(), motion.joint_positions()
+    assert (positions[2, HAND] - position).norm() < 0.005
+    assert (positions[2, FEET] - before[2, FEET]).norm(dim=-1).max() < 0.02  # at most a heel comes up for what is high
     assert shift.norm() < 1e-6
     others = [0, 1, 3, 4]
     assert torch.equal(made.local_quat_xyzw[others], motion.local_quat_xyzw[others])

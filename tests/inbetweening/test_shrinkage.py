@@ -47,7 +47,7 @@ class Guess(Inbetweener):
 
 def fill(motion, inbetweener, *masks):
     """Frames are refined by no MAP stage, so that what is seen is the shrinkage."""
-    return infill(motion, inbetweener, list(masks), settings=InfillSettings(finish=False))
+    return infill(motion, inbetweener, list(masks), settings=InfillSettings(refine=False))
 
 
 def error(made, truth, frames):

@@ -71,12 +71,12 @@ def test_every_variation_meets_the_keys_to_the_bit_and_no_two_are_the_same(prior
     motion = on_rig(rig, FEW_FRAMES * fps // 30, fps=fps)
     keys = [key * fps // 30 for key in FEW_KEYS]
     found = asked(motion, prior, keys=tuple(keys))
-    places = [one.solution.motion.joint_positions() for one in found.each]
+    positions = [one.solution.motion.joint_positions() for one in found.each]
     for one in found.each:
         made = one.solution.motion
         assert torch.equal(made.local_quat_xyzw[keys], motion.local_quat_xyzw[keys])
         assert torch.equal(made.root_position[keys], motion.root_position[keys])
-    apart = [float((places[i] - places[j]).norm(dim=-1).max()) for i in range(3) for j in range(i)]
+    apart = [float((positions[i] - positions[j]).norm(dim=-1).max()) for i in range(3) for j in range(i)]
     assert min(apart) > 0.002  # gaps are a third of a second
     assert found.diversity.world_cm > 0.1
     assert all(torch.isfinite(torch.tensor(one.energy)) for one in found.each)

@@ -9,17 +9,17 @@ import torch
 from controllers.steering.steer import lead_around
 from mapctl.curves.obstacles import Obstacle, measure_clearance
 
-AHEAD = dict(place=(0.0, 0.0), heading=0.0, wanted=0.0, speed=1.2)
+AHEAD = dict(position=(0.0, 0.0), heading=0.0, wanted=0.0, speed=1.2)
 
 
 def walked(obstacles, wanted=0.0, *, frames=240, speed=1.2, at=(0.0, 0.0)):
     """Places of a point that goes where it is led, turning at most 2.5 rad/s."""
-    place, heading, found = np.array(at), wanted, []
+    position, heading, found = np.array(at), wanted, []
     for _ in range(frames):
-        led = lead_around(obstacles, place=tuple(place), heading=heading, wanted=wanted, speed=speed)
+        led = lead_around(obstacles, position=tuple(position), heading=heading, wanted=wanted, speed=speed)
         heading += np.clip(math.remainder(led - heading, 2 * math.pi), -2.5 / 30, 2.5 / 30)
-        place = place + speed / 30 * np.array([math.sin(heading), math.cos(heading)])
-        found.append(place)
+        position = position + speed / 30 * np.array([math.sin(heading), math.cos(heading)])
+        found.append(position)
     return np.array(found)
 
 
@@ -43,5 +43,5 @@ def test_a_point_gets_past_and_goes_on_as_wanted(obstacles):
 def test_who_is_on_the_way_past_one_side_is_led_past_it():
     ahead = (Obstacle((0.0, 2.0), 0.5),)
     for heading in (0.5, -0.5):
-        led = lead_around(ahead, place=(0.0, 0.0), heading=heading, wanted=0.0, speed=1.2)
+        led = lead_around(ahead, position=(0.0, 0.0), heading=heading, wanted=0.0, speed=1.2)
         assert led * heading > 0

@@ -18,14 +18,14 @@ SPEEDS = st.floats(0, 5)
 def test_a_wish_comes_to_the_command_within_the_limits_and_by_the_short_way(heading, wanted, speed, asked):
     limits, command = SteeringLimits(acceleration=2, braking=3, turn_rate=2.5), Command(asked, wanted)
     wish = SteeringTarget(speed, heading, heading)
-    wishes = [wish, *wish.ahead(command, limits, frames=90, fps=30)]
-    for before, after in pairwise(wishes):
+    requests = [wish, *wish.ahead(command, limits, frames=90, fps=30)]
+    for before, after in pairwise(requests):
         assert -3 / 30 - 1e-9 <= after.speed - before.speed <= 2 / 30 + 1e-9
         assert abs(after.heading - before.heading) <= 2.5 / 30 + 1e-9
         assert after.speed >= 0
-    assert wishes[-1].speed == pytest.approx(asked)
-    assert math.remainder(wishes[-1].heading - wanted, 2 * math.pi) == pytest.approx(0, abs=1e-6)
-    assert abs(wishes[-1].heading - heading) <= math.pi + 1e-6
+    assert requests[-1].speed == pytest.approx(asked)
+    assert math.remainder(requests[-1].heading - wanted, 2 * math.pi) == pytest.approx(0, abs=1e-6)
+    assert abs(requests[-1].heading - heading) <= math.pi + 1e-6
 
 
 HAND = "left_hand_x,left_hand_y,left_hand_z"

@@ -162,8 +162,8 @@ def test_frames_in_which_everything_is_masked_are_filled_in(rig):
         )
     assert error_cm(truth, wild) > 10
     done = cleaned(wild, masks=[Mask(ALL, 60, 66)])
-    places = (done.motion.joint_positions() - truth.joint_positions()).norm(dim=-1).mean(dim=-1)
-    assert places[60:66].max() < 0.15
+    positions = (done.motion.joint_positions() - truth.joint_positions()).norm(dim=-1).mean(dim=-1)
+    assert positions[60:66].max() < 0.15
     assert {fault.kind for fault in done.faults if fault.start == 60} >= {"dropout"}
 
 

@@ -31,8 +31,8 @@ HILL = torch.stack(
 ).double()
 
 
-def follow(curve, *, seed=0, **wishes):
-    return controllers.follow(DENSITY, curve, generator=generator(seed), **{"settings": QUICK, **wishes})
+def follow(curve, *, seed=0, **options):
+    return controllers.follow(DENSITY, curve, generator=generator(seed), **{"settings": QUICK, **options})
 
 
 @pytest.mark.parametrize(
@@ -92,7 +92,7 @@ def test_a_deadline_returns_what_there_is_and_says_so():
 
 
 @pytest.mark.parametrize(
-    ("wishes", "message"),
+    ("options", "message"),
     [
         ({"speed": -1.0}, "speed must be positive, got -1 m/s"),
         ({"speed": math.nan}, "speed must be positive, got nan m/s"),
@@ -102,9 +102,9 @@ def test_a_deadline_returns_what_there_is_and_says_so():
         ({"speed": SpeedProfile((0.0, 1.0), (1e-9, 1e-9))}, "more than the 3600000 allowed"),
     ],
 )
-def test_wishes_that_make_no_sense_are_refused(wishes, message):
+def test_wishes_that_make_no_sense_are_refused(options, message):
     with pytest.raises(RequestError, match=message):
-        follow(curves.circle(radius=2), **wishes)
+        follow(curves.circle(radius=2), **options)
 
 
 def test_a_speed_beyond_the_data_is_named_with_both_numbers():

@@ -40,8 +40,8 @@ def short_pieces(monkeypatch):
     monkeypatch.setattr(sys.modules["controllers.generation.generate"], "_CHUNK", 50)
 
 
-def made(seconds=1.0, *, seed=0, settings=RAW, **wishes):
-    return generate(DENSITY, seconds=seconds, generator=generator(seed), settings=settings, **wishes).motion
+def made(seconds=1.0, *, seed=0, settings=RAW, **options):
+    return generate(DENSITY, seconds=seconds, generator=generator(seed), settings=settings, **options).motion
 
 
 @pytest.mark.parametrize(("seconds", "frames"), [(0.5, 15), (0.001, 2), (1.51, 45)])
@@ -100,10 +100,10 @@ def test_it_continues_where_a_clip_ends(rig):
 def test_a_clip_warms_up_the_memory():
     clip = walk(40)
     motion = made(0.2, start_clip=clip, settings=replace(RAW, temperature=0.0))
-    features, place = encode(clip)
+    features, position = encode(clip)
     state = DENSITY.advance(DENSITY.start_after(features[:1].float()), features[None, 1:].float())
     drawn, _ = DENSITY.sample(state, 6, generator(0), temperature=0.0)
-    expected = decode(torch.cat([features, drawn[0].double()]), place)
+    expected = decode(torch.cat([features, drawn[0].double()]), position)
     torch.testing.assert_close(motion.joint_positions(), expected.joint_positions()[40:], atol=1e-5, rtol=0)
 
 

@@ -122,17 +122,17 @@ def test_keys_that_make_no_sense_are_refused(make, said):
 
 def test_a_rough_reach_asks_for_less(walked):
     hand = walked.joint_positions()[60, CANONICAL.index("leftHand")]
-    place = hand + torch.tensor([0.3, 0.0, 0.0])
-    told = {"leftHand": tuple(place.tolist())}
+    position = hand + torch.tensor([0.3, 0.0, 0.0])
+    told = {"leftHand": tuple(position.tolist())}
 
     def relaxed(tolerance) -> torch.Tensor:
         targets = ReachTargets.of((Reach(2.0, told, 0.0, tolerance),), walked.num_frames)
-        return targets.relaxed(walked).targets.places[60, CANONICAL.index("leftHand")]
+        return targets.relaxed(walked).targets.positions[60, CANONICAL.index("leftHand")]
 
-    torch.testing.assert_close(relaxed(0.0), place)
-    assert 0.07 < float((relaxed(0.1) - place).norm()) < 0.1
+    torch.testing.assert_close(relaxed(0.0), position)
+    assert 0.07 < float((relaxed(0.1) - position).norm()) < 0.1
     torch.testing.assert_close(relaxed({"leftHand": 0.1}), relaxed(0.1))
-    torch.testing.assert_close(relaxed({"rightHand": 0.1}), place)
+    torch.testing.assert_close(relaxed({"rightHand": 0.1}), position)
     torch.testing.assert_close(relaxed(0.5), hand, atol=1e-6, rtol=0)
 
 

@@ -84,7 +84,7 @@ def test_a_way_past_somebody_who_comes_the_other_way_keeps_apart_when_they_meet(
 
 
 @pytest.mark.parametrize(
-    ("wishes", "said"),
+    ("options", "message"),
     [
         ({"speed": TimedSpeed((0.0,), (1.0,))}, "need the shot's seconds"),
         ({"obstacles": (Obstacle((0.1, 0.0), 0.5),)}, "the start is within the obstacle"),
@@ -96,14 +96,16 @@ def test_a_way_past_somebody_who_comes_the_other_way_keeps_apart_when_they_meet(
         ({"seconds": 2.0, "looks": (Look(2.5, (0, 1, 1)),)}, "not within the shot's 2 s"),
     ],
 )
-def test_wishes_that_make_no_sense_are_refused(wishes, said):
-    with pytest.raises(RequestError, match=said):
-        ShotRequest(LINE, **wishes)
+def test_wishes_that_make_no_sense_are_refused(options, message):
+    with pytest.raises(RequestError, match=message):
+        ShotRequest(LINE, **options)
 
 
-@pytest.mark.parametrize("place", [(0.3, 2.6, 1.0), (2.6, 1.2, 1.2), (0.0, 1.2, 12.0)], ids=["high", "aside", "ahead"])
-def test_what_no_arm_reaches_is_refused_with_its_distance(place):
-    request = ShotRequest(LINE, seconds=2.0, reaches=(Reach(1.0, {"leftHand": place}),))
+@pytest.mark.parametrize(
+    "position", [(0.3, 2.6, 1.0), (2.6, 1.2, 1.2), (0.0, 1.2, 12.0)], ids=["high", "aside", "ahead"]
+)
+def test_what_no_arm_reaches_is_refused_with_its_distance(position):
+    request = ShotRequest(LINE, seconds=2.0, reaches=(Reach(1.0, {"leftHand": position}),))
     with pytest.raises(RequestError, match=r"leftHand at 1 s is to be \d"):
         solve_shot(priors.load("locomotion"), priors.load_inbetweener(), request)
 
@@ -129,12 +131,12 @@ def test_a_curve_is_brought_to_a_lead_or_the_lead_to_the_curve():
 
 def test_the_rest_pose_stands_on_both_feet_and_faces_forward():
     pose = build_rest_pose(priors.load("locomotion"), CANONICAL, TOE_REST_HEIGHT)
-    places = pose.joint_positions()[0]
-    toes = places[list(CANONICAL.indices(TOES))]
+    positions = pose.joint_positions()[0]
+    toes = positions[list(CANONICAL.indices(TOES))]
     torch.testing.assert_close(toes[:, 1], torch.full((2,), TOE_REST_HEIGHT).double(), atol=1e-3, rtol=0)
     assert 0.12 < float((toes[0] - toes[1]).norm()) < 0.4
-    assert float(places[CANONICAL.index("head"), 1]) > 1.3
-    hands = places[list(CANONICAL.indices(("leftHand", "rightHand")))]
+    assert float(positions[CANONICAL.index("head"), 1]) > 1.3
+    hands = positions[list(CANONICAL.indices(("leftHand", "rightHand")))]
     assert bool((hands[:, 1] < 1.0).all())
     assert float(hands[0, 0]) == pytest.approx(-float(hands[1, 0]), abs=1e-6)
 
@@ -172,21 +174,27 @@ def shot():
 def test_all_wishes_of_a_shot_hold(shot):
     _, done = shot
     assert done.status.ok, done.status.text
-    assert {wish.name.split(" at")[0] for wish in done.wishes} >= {"path", "rightHand", "look", "obstacles", "stand"}
-    assert all(wish.holds and wish.residual == 0 for wish in done.wishes)
+    assert {constraint.name.split(" at")[0] for constraint in done.constraints} >= {
+        "path",
+        "rightHand",
+        "look",
+        "obstacles",
+        "stand",
+    }
+    assert all(constraint.holds and constraint.residual == 0 for constraint in done.constraints)
 
 
 def test_the_motion_of_a_shot_does_what_its_wishes_say(shot):
     request, done = shot
-    places = done.motion.joint_positions()
-    miss = places[69, CANONICAL.index("rightHand")] - torch.tensor([-0.45, 1.2, 1.5]).double()
+    positions = done.motion.joint_positions()
+    miss = positions[69, CANONICAL.index("rightHand")] - torch.tensor([-0.45, 1.2, 1.5]).double()
     assert float(miss.norm()) < 0.01
-    assert float(measure_clearance(request.obstacles, places[..., ::2]).amin()) > 0
-    toes = places[:, list(CANONICAL.indices(TOES))]
+    assert float(measure_clearance(request.obstacles, positions[..., ::2]).amin()) > 0
+    toes = positions[:, list(CANONICAL.indices(TOES))]
     for part in (slice(0, 12), slice(-24, None)):
         assert float(toes[part].diff(dim=0).norm(dim=-1).mean()) * 30 < 0.02
         assert float((toes[part][:, 0] - toes[part][:, 1]).norm(dim=-1).max()) < 0.45
-    torch.testing.assert_close(places[-1, 0, ::2], torch.tensor([0.0, 3.6]).double(), atol=0.08, rtol=0)
+    torch.testing.assert_close(positions[-1, 0, ::2], torch.tensor([0.0, 3.6]).double(), atol=0.08, rtol=0)
 
 
 def test_nothing_jumps_in_a_shot(shot):
@@ -204,7 +212,7 @@ def test_who_reaches_far_aside_leaves_the_way_for_it_and_is_told():
     done = solve_shot(
         prior, priors.load_inbetweener(), ShotRequest(curves.line(length=6), seconds=4.0, reaches=(reach,))
     )
-    by_name = {wish.name.split(" at")[0]: wish for wish in done.wishes}
+    by_name = {constraint.name.split(" at")[0]: constraint for constraint in done.constraints}
     assert by_name["leftHand"].holds
     assert by_name["path"].holds, "away from the reach"
     hips = done.motion.root_position[:, 0]
@@ -230,10 +238,10 @@ def test_who_goes_on_from_a_gesture_comes_to_rest_without_a_jolt():
     assert lead.gestures
     curve = lead.bring_curve(LINE)
     done = solve_shot(prior, priors.load_inbetweener(), ShotRequest(curve, seconds=2.0, lead=lead))
-    places = torch.cat([clip.slice(0, 28).joint_positions(), done.motion.joint_positions()])
-    bent = torch.diff(places, n=2, dim=0).norm(dim=-1).amax(dim=1) * fps**2
+    positions = torch.cat([clip.slice(0, 28).joint_positions(), done.motion.joint_positions()])
+    bent = torch.diff(positions, n=2, dim=0).norm(dim=-1).amax(dim=1) * fps**2
     assert float(bent[24:32].max()) < 1.2 * max(float(bent[:24].max()), float(bent[40:].max()))
-    moved = torch.diff(places[28:36], dim=0).norm(dim=-1).amax() * fps
+    moved = torch.diff(positions[28:36], dim=0).norm(dim=-1).amax() * fps
     assert float(moved) > 0.5, "it does not freeze"
 
 

@@ -24,7 +24,7 @@ def reference(monkeypatch):
     return switch
 
 
-def trial(batch=3, *, features=None, place=None, skeleton=CANONICAL, dtype=torch.float32):
+def trial(batch=3, *, features=None, position=None, skeleton=CANONICAL, dtype=torch.float32):
     """Disturbed windows of a walk, with the walk before them; features are a leaf that gradients reach."""
     motion = walk(PAST + FRAMES, turn_rate=0.2)
     vectors, start = encode(motion)
@@ -32,12 +32,12 @@ def trial(batch=3, *, features=None, place=None, skeleton=CANONICAL, dtype=torch
     if features is None:
         noise = torch.randn(batch, FRAMES, LAYOUT.size, generator=generator(0)).double()
         features = vectors[PAST:] + 0.05 * vectors.std(0) * noise
-    place = place or GroundPose(ground[-1], heading[-1])
+    position = position or GroundPose(ground[-1], heading[-1])
     draw = torch.randn(batch, FRAMES, LAYOUT.continuous + 1, generator=generator(1))
     bits = torch.rand(batch, FRAMES, 2, generator=generator(2)) < 0.6
     return Trial(
         features.to(dtype).requires_grad_(),
-        GroundPose(place.position_xz.to(dtype), place.heading.to(dtype)),
+        GroundPose(position.position_xz.to(dtype), position.heading.to(dtype)),
         contacts=bits,
         noise=draw[..., 1:].to(dtype),
         log_density=draw[..., 0].to(dtype),
@@ -75,9 +75,9 @@ def value_and_gradient(whole, part):
     return value.detach(), torch.autograd.grad((value * weights).sum(), whole.features)[0]
 
 
-def agree(part, **wishes):
+def agree(part, **options):
     """The compiled float32 answers lie close to the torch code's in float64."""
-    quick, exact = trial(**wishes), trial(**wishes, dtype=torch.float64)
+    quick, exact = trial(**options), trial(**options, dtype=torch.float64)
     assert quick._use_kernels
     assert not exact._use_kernels
     for found, expected in zip(value_and_gradient(quick, part), value_and_gradient(exact, part), strict=True):
@@ -113,7 +113,7 @@ def test_rotation_vectors_of_any_size_have_exact_gradients(size):
 def test_bones_do_not_lie_in_the_memory_of_the_skeleton():
     """Sent to another process, a tensor moves to shared memory, and where it was is soon written over."""
     skeleton, features = Skeleton(CANONICAL.names, CANONICAL.parents, CANONICAL.offsets.clone()), encode(walk(8))[0]
-    place = (features[None].float(), torch.zeros(1, 8, 2), torch.zeros(1, 8), skeleton)
-    before = fast.compute_joints_and_heels(*place)[0]
+    position = (features[None].float(), torch.zeros(1, 8, 2), torch.zeros(1, 8), skeleton)
+    before = fast.compute_joints_and_heels(*position)[0]
     skeleton.offsets.fill_(torch.nan)
-    torch.testing.assert_close(fast.compute_joints_and_heels(*place)[0], before, rtol=0, atol=0)
+    torch.testing.assert_close(fast.compute_joints_and_heels(*position)[0], before, rtol=0, atol=0)

@@ -46,9 +46,9 @@ def test_positions_and_rotations_are_the_product_of_transforms(skeleton):
 def test_positions_from_matrices_agree_with_quaternions(skeleton):
     motion = random_motion(skeleton, 6)
     matrices = rotations.to_matrix(motion.local_quat_xyzw).reshape(2, 3, -1, 3, 3)
-    places = kinematics.positions_from_matrices(skeleton, matrices).flatten(0, 1)
+    positions = kinematics.positions_from_matrices(skeleton, matrices).flatten(0, 1)
     expected = motion.joint_positions() - motion.root_position[:, None]
-    torch.testing.assert_close(places, expected, atol=1e-9, rtol=0)
+    torch.testing.assert_close(positions, expected, atol=1e-9, rtol=0)
 
 
 @pytest.mark.parametrize("degrees", [45, -135])
@@ -63,8 +63,10 @@ def test_heading_is_the_direction_that_the_hips_face(degrees):
 
 def test_the_canonical_skeleton_stands_as_the_conventions_say():
     identity = torch.tensor([0.0, 0, 0, 1]).double().expand(CANONICAL.num_joints, 4)
-    places, _ = kinematics.forward_kinematics(CANONICAL.offsets, CANONICAL.parents, torch.zeros(3).double(), identity)
-    at = dict(zip(CANONICAL.names, places, strict=True))
+    positions, _ = kinematics.forward_kinematics(
+        CANONICAL.offsets, CANONICAL.parents, torch.zeros(3).double(), identity
+    )
+    at = dict(zip(CANONICAL.names, positions, strict=True))
     assert CANONICAL.num_joints == 21
     assert at["leftHand"][0] > 0.5 > -0.5 > at["rightHand"][0]
     assert at["leftToes"][2] > at["leftFoot"][2]
@@ -91,10 +93,10 @@ def test_trees_that_are_none_are_refused(names, parents, rows):
 SKELETONS = {"canonical": CANONICAL, "bandai": bandai_skeleton(), "daz": cmu_skeleton()}
 
 
-def solved(places, start, skeleton=CANONICAL, **options):
+def solved(positions, start, skeleton=CANONICAL, **options):
     """The solution as a motion."""
-    quats = inverse.solve_inverse_kinematics(places, start, skeleton, **options)
-    root = options.get("root_position", places[:, 0])
+    quats = inverse.solve_inverse_kinematics(positions, start, skeleton, **options)
+    root = options.get("root_position", positions[:, 0])
     return Motion(skeleton, walk(2).fps, root, quats)
 
 
@@ -120,10 +122,10 @@ def test_a_limb_of_short_bones_that_point_the_wrong_way_bends_as_it_did(limb, sh
         quats = motion.local_quat_xyzw.clone()
         quats[:, limb.lower] = quat_xyzw(torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)).expand(40, 4)
         motion = replace(motion, local_quat_xyzw=quats)
-    places = motion.joint_positions()
-    shoulder, elbow, hand = places[:, limb.upper], places[:, limb.lower], places[:, limb.end]
+    positions = motion.joint_positions()
+    shoulder, elbow, hand = positions[:, limb.upper], positions[:, limb.lower], positions[:, limb.end]
     bend = elbow - shoulder - _along(elbow - shoulder, hand - shoulder)
-    wrong = places.clone()
+    wrong = positions.clone()
     # The elbow on the other side of the line from the shoulder to the hand, and nearer to it.
     wrong[:, limb.lower] = elbow - (1 + share) * bend
     close = shoulder + 0.8 * (hand - shoulder)
@@ -156,10 +158,10 @@ def chain(*offsets):
 def test_straight_limbs_and_opposite_directions_give_something_finite(direction):
     limb = chain((0.0, 1.0, 0.0), (0.0, 1.0, 0.0), (0.0, 1.0, 0.0))
     aim = torch.tensor(direction).double()
-    places = (torch.arange(4)[:, None] * aim)[None]
+    positions = (torch.arange(4)[:, None] * aim)[None]
     still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).expand(1, 4, 4)
-    made = solved(places, still, limb)
+    made = solved(positions, still, limb)
     assert made.local_quat_xyzw.isfinite().all()
     assert torch.allclose(made.local_quat_xyzw.norm(dim=-1), torch.ones(1, 4).double())
     if aim.any():
-        assert torch.allclose(made.joint_positions(), places, atol=1e-7)
+        assert torch.allclose(made.joint_positions(), positions, atol=1e-7)

@@ -60,8 +60,8 @@ def definitions(positions, hips, toes, fps):
 @pytest.mark.parametrize("seed", range(4))
 def test_measures_are_those_of_the_design(seed):
     rng = np.random.default_rng(seed)
-    places = np.cumsum(rng.normal(size=(120, 2)) * 0.003 + [0.0, 0.004], axis=0)
-    clip = walk_through(places, swing=0.15, wobble=0.004, seed=seed)
+    positions = np.cumsum(rng.normal(size=(120, 2)) * 0.003 + [0.0, 0.004], axis=0)
+    clip = walk_through(positions, swing=0.15, wobble=0.004, seed=seed)
     expected = definitions(clip.joint_positions().numpy(), 0, TOES, 30)
     assert 0 < expected["planted_share"] < 1
     got = measure(clip)
@@ -83,8 +83,8 @@ def test_sway_is_what_a_slow_gaussian_leaves():
 def test_path_error_is_the_distance_to_the_curve():
     angle = np.linspace(0, 3, 200)
     radius = 2 + 0.05 * np.cos(3 * angle)
-    places = np.stack([2 - radius * np.cos(angle), radius * np.sin(angle)], axis=1)
-    got = measure(walk_through(places, headings=angle), curves.circle(radius=2.0))
+    positions = np.stack([2 - radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+    got = measure(walk_through(positions, headings=angle), curves.circle(radius=2.0))
     expected = 100 * np.abs(radius - 2)
     assert got["path_error_mean_cm"] == pytest.approx(expected.mean(), abs=0.001)
     assert got["path_error_p95_cm"] == pytest.approx(np.percentile(expected, 95), abs=0.001)
@@ -130,7 +130,7 @@ def test_heels_are_measured_by_their_definition():
     toes = clip.joint_positions()[:, TOES]
     drops = torch.tensor(find_heel_drops(feet.level_feet(clip).skeleton))
     planted = derive_heel_contacts(detect_contacts(toes, 30), toes, heels, drops, 30.0).numpy()
-    places, forward = heels[..., ::2].numpy(), (toes - heels)[..., ::2].numpy()
+    positions, forward = heels[..., ::2].numpy(), (toes - heels)[..., ::2].numpy()
     speeds, turns, slides = [], [], []
     for side in range(2):
         start = None
@@ -138,10 +138,10 @@ def test_heels_are_measured_by_their_definition():
             if not planted[t, side]:
                 start = None
                 continue
-            start = places[t, side] if start is None else start
-            slides.append(np.hypot(*(places[t, side] - start)))
+            start = positions[t, side] if start is None else start
+            slides.append(np.hypot(*(positions[t, side] - start)))
             if t and planted[t - 1, side]:
-                speeds.append(np.hypot(*(places[t, side] - places[t - 1, side])) * 30)
+                speeds.append(np.hypot(*(positions[t, side] - positions[t - 1, side])) * 30)
                 was, now = (math.atan2(*forward[k, side]) for k in (t - 1, t))
                 turns.append(abs(math.remainder(now - was, 2 * math.pi)) * 30)
     assert got["heel_contact_speed_cm_s"] == pytest.approx(100 * np.mean(speeds))
@@ -159,15 +159,15 @@ HANDS = [CANONICAL.index(name) for name in ("leftHand", "rightHand")]
 @pytest.mark.parametrize("fps", [30, 60])
 def test_a_jump_of_one_frame_is_the_largest_step_whatever_the_body_does(fps):
     motion = walk(2 * fps, fps=fps)
-    places = motion.joint_positions()
-    ends = places[:, HANDS].clone()
-    calm = body.measure_peaks(ends, places[:, 0], fps)
+    positions = motion.joint_positions()
+    ends = positions[:, HANDS].clone()
+    calm = body.measure_peaks(ends, positions[:, 0], fps)
     ends[fps, 0] += torch.tensor([0.0, 0.6, 0.0]).double()
-    peaks = body.measure_peaks(ends, places[:, 0], fps)
+    peaks = body.measure_peaks(ends, positions[:, 0], fps)
     assert peaks.step == pytest.approx(0.6 * fps / 30, abs=calm.step)
     assert peaks.acceleration == pytest.approx(1.2 * fps**2, abs=calm.acceleration)
     shifted = body.measure_peaks(
-        ends + torch.arange(2 * fps)[:, None, None], places[:, 0] + torch.arange(2 * fps)[:, None], fps
+        ends + torch.arange(2 * fps)[:, None, None], positions[:, 0] + torch.arange(2 * fps)[:, None], fps
     )
     assert shifted == pytest.approx(peaks)
 

@@ -87,7 +87,7 @@ def test_two_sets_of_one_kind_cannot_be_told_apart_and_trembling_can():
     assert other.accuracy > 0.9
     assert other.frechet > same.frechet
     assert (other.floor_accuracy, other.floor_frechet) == (same.floor_accuracy, same.floor_frechet)
-    assert (same.made_windows, same.mocap_windows) == (24 * 4, 24 * 4)
+    assert (same.generated_windows, same.mocap_windows) == (24 * 4, 24 * 4)
 
 
 @pytest.mark.slow

@@ -48,8 +48,8 @@ def errors(cleaned, truth):
 def test_untrained_it_smooths():
     noisy, truth = capture(degrees=5, centimetres=3), capture()
     cleaned = network()(noisy)
-    place, angle = errors(cleaned, truth)
-    assert place < 0.6 * 3
+    position, angle = errors(cleaned, truth)
+    assert position < 0.6 * 3
     assert angle < 0.6 * 5
     assert float(torch.rad2deg((cleaned.pose.heading - truth.heading).square().mean().sqrt())) < 0.6 * 5
 
@@ -59,8 +59,8 @@ def test_without_noise_what_was_seen_is_what_comes_back(drawn):
     """Whatever the weights are."""
     seen = capture()
     cleaned = network(drawn=drawn)(seen)
-    place, angle = errors(cleaned, seen)
-    assert place < 1e-3
+    position, angle = errors(cleaned, seen)
+    assert position < 1e-3
     assert angle < 1e-3
     assert torch.allclose(cleaned.pose.heading, seen.heading, atol=1e-5)
 

@@ -24,7 +24,7 @@ def holed(frames=60, *, gaps=((20, 40),), turn_rate=0.8, seed=0, motion=None):
 
 
 def single(image):
-    floats = {name: getattr(image, name).float() for name in ("places", "contacts", "ground", "heading")}
+    floats = {name: getattr(image, name).float() for name in ("positions", "contacts", "ground", "heading")}
     return replace(image, **floats)
 
 
@@ -35,7 +35,7 @@ def of(architecture):
 def test_untrained_it_draws_straight_lines():
     image = holed()
     proposed = network()(image)
-    assert torch.equal(proposed.places, image.places)
+    assert torch.equal(proposed.positions, image.positions)
     assert not proposed.contacts.any()
 
 
@@ -44,14 +44,14 @@ def test_untrained_it_draws_straight_lines():
 def test_any_length_comes_back_as_it_is(architecture, frames):
     image = holed(frames, gaps=((frames // 2, frames // 2 + 1),) if frames > 1 else ())
     proposed = network(drawn=DRAWN, config=of(architecture))(image)
-    assert proposed.places.shape == (1, frames, JOINTS, 3)
+    assert proposed.positions.shape == (1, frames, JOINTS, 3)
     assert proposed.contacts.shape == (1, frames, 2)
-    assert proposed.places.isfinite().all()
+    assert proposed.positions.isfinite().all()
 
 
 def test_known_places_stay_to_the_bit():
     known = torch.rand(1, 60, JOINTS, generator=generator()) < 0.6
     image = single(shown(walk(60), known))
     proposed = network(drawn=DRAWN)(image)
-    assert torch.equal(proposed.places[known], image.places[known])
-    assert (proposed.places != image.places).any()
+    assert torch.equal(proposed.positions[known], image.positions[known])
+    assert (proposed.positions != image.positions).any()

@@ -57,11 +57,11 @@ def test_the_density_is_a_mixture_of_normals_times_two_bernoullis(kind):
     network, frames = NETWORKS[kind], clip()
     state = warm(network)
     mixture = mixture_of(network, state, frames)
-    mixing = torch.eye(SIZE).double().expand(network.config.components, -1, -1)
-    if network.whitening is not None:
-        mixing = torch.linalg.inv(network.whitening)
-        torch.testing.assert_close(network.mixing, mixing)
-    normals = MultivariateNormal(mixture.mean, scale_tril=mixing * mixture.log_sigma.exp().unsqueeze(-2))
+    cholesky = torch.eye(SIZE).double().expand(network.config.components, -1, -1)
+    if network.inverse_cholesky is not None:
+        cholesky = torch.linalg.inv(network.inverse_cholesky)
+        torch.testing.assert_close(network.cholesky, cholesky)
+    normals = MultivariateNormal(mixture.mean, scale_tril=cholesky * mixture.log_sigma.exp().unsqueeze(-2))
     poses = MixtureSameFamily(Categorical(logits=mixture.log_weight), normals)
     bits = Independent(Bernoulli(logits=mixture.contact_logit), 1)
     expected = poses.log_prob(network.normalise(frames)[..., :SIZE]) + bits.log_prob(frames[..., SIZE:])
@@ -113,8 +113,8 @@ def test_draws_follow_the_mixture(kind):
     weight = mixture.log_weight[0, 0].exp()[:, None]
     mean = (weight * mixture.mean[0, 0]).sum(0)
     variance = (2 * mixture.log_sigma[0, 0]).exp()
-    if network.mixing is not None:
-        variance = (network.mixing**2 @ variance.unsqueeze(-1))[..., 0]
+    if network.cholesky is not None:
+        variance = (network.cholesky**2 @ variance.unsqueeze(-1))[..., 0]
     second = (weight * (mixture.mean[0, 0] ** 2 + variance)).sum(0)
     error = (second - mean**2).sqrt() / count**0.5
     values = network.normalise(drawn)[:, 0]

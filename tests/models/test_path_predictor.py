@@ -53,12 +53,14 @@ def test_a_mirrored_walk_goes_the_mirrored_way():
 
 def test_absent_frames_are_as_if_there_were_nothing():
     seen = local_motion(60)
-    wild = seen.places.clone()
+    wild = seen.positions.clone()
     wild[:, 40:] = 9.0
     present = seen.present.clone()
     present[:, 40:] = False
     network = tiny_path.network()
-    one, other = (outputs(network(LocalMotion(places, seen.turns, present)))[:, :40] for places in (seen.places, wild))
+    one, other = (
+        outputs(network(LocalMotion(positions, seen.turns, present)))[:, :40] for positions in (seen.positions, wild)
+    )
     torch.testing.assert_close(one, other, atol=1e-6, rtol=0)
 
 

@@ -108,8 +108,8 @@ def test_untrained_both_stages_interpolate_and_what_is_known_stays():
     untrained = network(config=TWO)
     shown = hide(untrained, hidden)
     proposed = untrained(shown)
-    places, guess = proposed.poses(hidden.offsets)[0], shown.world_poses()[0]
-    torch.testing.assert_close(places, guess, atol=1e-4, rtol=0)
+    positions, guess = proposed.poses(hidden.offsets)[0], shown.world_poses()[0]
+    torch.testing.assert_close(positions, guess, atol=1e-4, rtol=0)
     torch.testing.assert_close(proposed.rough.poses(hidden.offsets)[0], guess, atol=1e-4, rtol=0)
     drawn = network(drawn=0.2, config=TWO)
     made = drawn(hide(drawn, hidden))

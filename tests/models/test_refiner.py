@@ -115,5 +115,5 @@ def test_they_are_positions_and_velocities_in_the_heading_frame_wherever_the_mot
     features = clip(number=number)
     found = compute_end_effectors(features[None], JOINTS)[0]
     assert found.shape == (39, count_channels(JOINTS))
-    for place in (GroundPose.origin(), GroundPose(torch.tensor([3.0, -7.0]), torch.tensor(2.5))):
-        torch.testing.assert_close(found, by_positions(features, JOINTS, place), atol=1e-9, rtol=0)
+    for position in (GroundPose.origin(), GroundPose(torch.tensor([3.0, -7.0]), torch.tensor(2.5))):
+        torch.testing.assert_close(found, by_positions(features, JOINTS, position), atol=1e-9, rtol=0)

@@ -90,7 +90,7 @@ def test_an_answer_that_is_not_finite_is_left_to_another():
     assert (source.by, source.reason) == ("interpolation", "nothing finite came of it")
 
 
-RAW = InfillSettings(finish=False)
+RAW = InfillSettings(refine=False)
 
 
 def never():
@@ -129,16 +129,16 @@ GAP = slice(21, 40)
 def wishing(motion, frame, limb, offset):
     """A query that wants a limb elsewhere in a frame."""
     joint = motion.skeleton.index(limb)
-    places = motion.joint_positions().clone()
-    places[frame, joint] += torch.tensor(offset).double()
-    wanted = torch.zeros(places.shape[:2], dtype=torch.bool)
+    positions = motion.joint_positions().clone()
+    positions[frame, joint] += torch.tensor(offset).double()
+    wanted = torch.zeros(positions.shape[:2], dtype=torch.bool)
     wanted[frame, joint] = True
-    return replace(query_of(motion, (GAP.start, GAP.stop)), effector_targets=EffectorTargets(places, wanted))
+    return replace(query_of(motion, (GAP.start, GAP.stop)), effector_targets=EffectorTargets(positions, wanted))
 
 
 def miss(query, motion):
     targets = query.effector_targets
-    return float((motion.joint_positions() - targets.places).norm(dim=-1)[targets.wanted].max())
+    return float((motion.joint_positions() - targets.positions).norm(dim=-1)[targets.wanted].max())
 
 
 @pytest.mark.parametrize("spread", [0.7, 1.5])

@@ -66,8 +66,8 @@ def test_keys_stay_to_the_bit_and_are_approached_smoothly():
     assert torch.equal(made.root_position[known], shown.root_position[known])
     same = (made.local_quat_xyzw * shown.local_quat_xyzw).sum(dim=-1).abs()
     assert float((1 - same[known]).max()) < 1e-12
-    places = made.joint_positions() - made.root_position[:, None]
-    step = torch.diff(places, dim=0).norm(dim=-1).mean(dim=-1)
+    positions = made.joint_positions() - made.root_position[:, None]
+    step = torch.diff(positions, dim=0).norm(dim=-1).mean(dim=-1)
     beside = step[[0, 59, 60, 118]]
     assert float(beside.max()) < 3 * float(step.median())
 
@@ -266,8 +266,8 @@ def image_of(motion, keys, *, present=None, known_axes=None):
     """Whole poses are known at the keys."""
     known = torch.zeros(1, motion.num_frames, 21, dtype=torch.bool)
     known[:, list(keys)] = True
-    places, facing = motion.joint_positions().float()[None], heading(motion.local_quat_xyzw[:, 0]).float()[None]
-    between = interpolate_positions(places, motion.local_quat_xyzw.float()[None], known)
+    positions, facing = motion.joint_positions().float()[None], heading(motion.local_quat_xyzw[:, 0]).float()[None]
+    between = interpolate_positions(positions, motion.local_quat_xyzw.float()[None], known)
     return PositionImage.of_world(
         between,
         interpolate_heading(facing, known),
@@ -300,7 +300,7 @@ def test_the_style_changes_the_answer_and_does_not_depend_on_the_order_of_its_po
     hips = poses.clone()
     hips[..., 0, :] += 1.0
     torch.testing.assert_close(found, encoder(hips))
-    apart = made(image, found.detach()).pose.places - made(image, -found.detach()).pose.places
+    apart = made(image, found.detach()).pose.positions - made(image, -found.detach()).pose.positions
     assert float(apart.abs().max()) > 1e-3
 
 
@@ -322,8 +322,8 @@ def test_coordinates_are_known_one_by_one():
     image = image_of(motion, (2,), known_axes=axes)
     copied, away = image.copy_nearest()
     assert away[0, 20, hand].tolist() == [0, 0, 18]
-    assert torch.equal(copied[0, 25, hand, :2], image.places[0, 20, hand, :2])
-    assert torch.equal(copied[0, 25, hand, 2], image.places[0, 2, hand, 2])
+    assert torch.equal(copied[0, 25, hand, :2], image.positions[0, 20, hand, :2])
+    assert torch.equal(copied[0, 25, hand, 2], image.positions[0, 2, hand, 2])
     assert not image.known[0, 20].any()
     assert image.mirrored().known_axes[0, 20, CANONICAL.index("rightHand")].tolist() == [True, True, False]
 
@@ -344,5 +344,5 @@ def test_whatever_goes_in_a_body_within_its_ranges_comes_out(layer, spread):
     assert float(joint_ranges.load().find_excess(angles).max()) < 1e-5
     unit = pose.local_matrix.mT @ pose.local_matrix
     torch.testing.assert_close(unit, torch.eye(3).double().expand_as(unit), atol=1e-5, rtol=0)
-    lengths = (pose.places[..., 1:, :] - pose.places[..., list(CANONICAL.parents[1:]), :]).norm(dim=-1)
+    lengths = (pose.positions[..., 1:, :] - pose.positions[..., list(CANONICAL.parents[1:]), :]).norm(dim=-1)
     torch.testing.assert_close(lengths, CANONICAL.offsets[1:].norm(dim=-1).expand_as(lengths), atol=1e-6, rtol=0)

@@ -66,12 +66,19 @@ def context(density):
     motion = walk(PAST + FRAMES, turn_rate=0.2)
     vectors, start = encode(motion)
     ground, heading = integrate_root(vectors[:PAST], start)
-    place = type(start)(ground[-1].float(), heading[-1].float())
+    position = type(start)(ground[-1].float(), heading[-1].float())
     before = motion.joint_positions()[:PAST].float()
     kind = density.initial_states.state.last_frame.dtype
     state = density.start_after(vectors[PAST - 1 : PAST].to(kind))
     return WindowContext(
-        density, state, place, before, FRAMES, CANONICAL, contacts_before=torch.tensor([True, False]), first_frame=PAST
+        density,
+        state,
+        position,
+        before,
+        FRAMES,
+        CANONICAL,
+        contacts_before=torch.tensor([True, False]),
+        first_frame=PAST,
     )
 
 
@@ -114,7 +121,10 @@ def test_a_density_without_kernels_is_differentiated_by_hand_but_for_its_rollout
 def test_double_precision_is_left_to_autograd():
     noise = 0.5 * torch.randn(1, FRAMES * LAYOUT.continuous, generator=generator(1), dtype=torch.float64)
     base = context(DENSITIES["several"])
-    exact = replace(base, place=type(base.place)(base.place.position_xz.double(), base.place.heading.double()))
+    exact = replace(
+        base,
+        ground_pose=type(base.ground_pose)(base.ground_pose.position_xz.double(), base.ground_pose.heading.double()),
+    )
     unknowns = LatentNoise.from_unknowns(exact, noise)
     assert unknowns.build_detached(noise) is None
     energy, gradient = Objective.of(unknowns, [LatentPrior(), TERMS["footing"]]).energy_and_gradient(noise)

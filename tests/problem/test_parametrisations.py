@@ -25,8 +25,8 @@ def context(density):
     """After some frames of a walk, facing anywhere."""
     seen = corpus().clips()[0][None, :30].double()
     state = density.advance(density.start_after(seen[:, 0]), seen[:, 1:])
-    place = GroundPose(torch.tensor([1.0, -2.0]).double(), torch.tensor(0.8).double())
-    return WindowContext(density, state, place, walk(10).joint_positions(), FRAMES)
+    position = GroundPose(torch.tensor([1.0, -2.0]).double(), torch.tensor(0.8).double())
+    return WindowContext(density, state, position, walk(10).joint_positions(), FRAMES)
 
 
 DENSITY = excited()
@@ -47,7 +47,7 @@ def test_latents_build_the_rollout_of_their_plan():
     torch.testing.assert_close((trial.features, trial.log_density), (features, density))
     torch.testing.assert_close(trial.noise, draws)
     assert torch.equal(trial.contacts, LAYOUT.pick(features, "contacts") > 0.5)
-    assert trial.start is CONTEXT.place
+    assert trial.start is CONTEXT.ground_pose
     assert trial.before is CONTEXT.before
 
 
@@ -69,7 +69,7 @@ def test_the_ledger_adds_up_to_the_energy_and_names_every_term():
 def offsets():
     """Offsets about a stretch of a walk."""
     features = corpus().clips()[0][None, 30 : 30 + FRAMES].double()
-    pose = BodyPose.of_features(features[0], CONTEXT.place)
+    pose = BodyPose.of_features(features[0], CONTEXT.ground_pose)
     bits = LAYOUT.pick(features[0], "contacts") > 0.5
     return PoseOffsets(CONTEXT, pose, bits, torch.full(pose.pack().shape, 0.03, dtype=torch.float64))
 
@@ -94,7 +94,7 @@ def test_every_parametrisation_keeps_its_contract(name):
     points = begin + 0.3 * torch.randn(3, begin.shape[1], generator=generator(4), dtype=torch.float64)
     trial = unknowns.build(points)
     assert trial.features.shape == (3, FRAMES, LAYOUT.size)
-    assert (trial.start, trial.before) == (CONTEXT.place, CONTEXT.before)
+    assert (trial.start, trial.before) == (CONTEXT.ground_pose, CONTEXT.before)
     alone = unknowns.build(points[1:2])
     torch.testing.assert_close(alone.features[0], trial.features[1])
     torch.testing.assert_close(alone.log_density[0], trial.log_density[1])

@@ -53,8 +53,8 @@ def test_windows_join_without_a_seam():
     assert len(done.features) == 21
     assert [record.frames for record in done.windows] == [6, 6, 6, 2]
     begun = BEGUN
-    ground, heading = integrate_root(done.features[1:], begun.place)
-    torch.testing.assert_close((done.place.position_xz, done.place.heading), (ground[-1], heading[-1]))
+    ground, heading = integrate_root(done.features[1:], begun.ground_pose)
+    torch.testing.assert_close((done.ground_pose.position_xz, done.ground_pose.heading), (ground[-1], heading[-1]))
     expected = DENSITY.advance(begun.state, done.features[None, 1:])
     for part in ("last_frame", "hidden", "cell"):
         torch.testing.assert_close(getattr(done.state, part), getattr(expected, part))
@@ -132,7 +132,7 @@ def test_a_density_that_breaks_down_ends_the_solve_with_the_finite_frames(after)
     done, outcome = solve(20, density=broken(after))
     assert outcome is Outcome.NOT_FINITE
     assert len(done.features) == 1 + 6 * after
-    for values in (done.features, done.state.hidden, done.joints_world, done.place.position_xz):
+    for values in (done.features, done.state.hidden, done.joints_world, done.ground_pose.position_xz):
         assert bool(torch.isfinite(values).all())
     assert all(len(entry.energy) == 6 * after for entry in done.ledger.entries)
 
@@ -176,7 +176,7 @@ def test_a_window_knows_the_heels_of_the_frame_before():
     last = decode(done.features, GroundPose.origin())
     feet = last.skeleton.indices(FEET)
     wanted = locate_heels(last)[-1] - last.joint_positions()[-1, feet]
-    turn = done.place.heading.double() - heading(last.local_quat_xyzw[-1, 0])
+    turn = done.ground_pose.heading.double() - heading(last.local_quat_xyzw[-1, 0])
     wanted = rotations.rotate(rotations.about_y(turn).expand(2, 4), wanted)
     torch.testing.assert_close(heels.double() - done.joints_world[-1, feet].double(), wanted, atol=1e-5, rtol=0)
     assert len(replace(done, features=done.features[:0]).locate_heels(CANONICAL)) == 0

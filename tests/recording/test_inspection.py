@@ -129,8 +129,8 @@ def find_angle_spikes(quats):
     return inspection.find_angle_spikes(quats, torch.ones(quats.shape[:2], dtype=torch.bool))
 
 
-def find_position_spikes(places):
-    return inspection.find_position_spikes(places, torch.ones(len(places), dtype=torch.bool))
+def find_position_spikes(positions):
+    return inspection.find_position_spikes(positions, torch.ones(len(positions), dtype=torch.bool))
 
 
 @pytest.mark.parametrize("frames", [[40], [40, 41], [2], [97], [0], [99]], ids=str)
@@ -155,12 +155,12 @@ def test_a_fast_swing_and_its_turning_point_are_no_spikes(fps):
 
 def test_leaps_of_a_place_are_found_and_a_sprint_is_not():
     time = torch.arange(120, dtype=torch.float64) / 30
-    place = torch.stack([8 * time, 0.9 + 0 * time, 0 * time], dim=-1)
-    assert not find_position_spikes(place).any()
-    place[[30, 70, 71]] += torch.tensor([0.0, 1.5, 0.0])
-    assert find_position_spikes(place).nonzero()[:, 0].tolist() == [30, 70, 71]
-    noise = 0.5 * torch.randn(place.shape, generator=generator(3), dtype=torch.float64)
-    assert not find_position_spikes(place.double() + noise).any()  # as large as this noise is
+    position = torch.stack([8 * time, 0.9 + 0 * time, 0 * time], dim=-1)
+    assert not find_position_spikes(position).any()
+    position[[30, 70, 71]] += torch.tensor([0.0, 1.5, 0.0])
+    assert find_position_spikes(position).nonzero()[:, 0].tolist() == [30, 70, 71]
+    noise = 0.5 * torch.randn(position.shape, generator=generator(3), dtype=torch.float64)
+    assert not find_position_spikes(position.double() + noise).any()  # as large as this noise is
 
 
 @pytest.mark.parametrize("end", [0, -1])

@@ -33,8 +33,8 @@ def test_white_noise_of_angles_is_told(degrees, fps):
 
 @pytest.mark.parametrize("centimetres", [0.1, 1, 5])
 def test_white_noise_of_places_is_told(centimetres):
-    places = smooth_place(800)
-    noisy = places + centimetres / 100 * torch.randn(800, 3, generator=generator(), dtype=torch.float64)
+    positions = smooth_place(800)
+    noisy = positions + centimetres / 100 * torch.randn(800, 3, generator=generator(), dtype=torch.float64)
     seen = torch.ones(800, dtype=torch.bool)
     assert 100 * estimate_position_noise(noisy, seen) == pytest.approx(centimetres, rel=0.12)
 

@@ -118,9 +118,9 @@ def test_hips_follow_the_feet_of_straight_legs_both_ways(lower):
     ankles = {}
     for upright in (0.995, 0.85):
         clip = Performer(upright=upright).stands() if upright > 0.9 else crouching()
-        places = clip.joint_positions()[:, FEET].clone()
-        places[..., 1] -= lower
-        fitted = fit_hips(clip, places, limb_extension(clip, LEGS))
+        positions = clip.joint_positions()[:, FEET].clone()
+        positions[..., 1] -= lower
+        fitted = fit_hips(clip, positions, limb_extension(clip, LEGS))
         ankles[upright] = float((clip.root_position - fitted.root_position)[:, 1].mean())
     assert ankles[0.995] == pytest.approx(lower, abs=0.002)
     assert ankles[0.85] == pytest.approx(0.0, abs=0.002)
@@ -170,8 +170,8 @@ def test_a_person_of_a_rig_has_flat_feet_and_the_clips_floor(tmp_path):
     torch.testing.assert_close(slope, foot_pitch_deg(own), atol=1.5, rtol=0)
     still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).expand(1, CANONICAL.num_joints, 4)
     flat = Motion(person.skeleton, own.fps, torch.zeros(1, 3, dtype=torch.float64), still)
-    places = retarget.to_canonical(person.on_rig(flat))[0].joint_positions()[0]
-    down = places[TOES] - places[FEET]
+    positions = retarget.to_canonical(person.on_rig(flat))[0].joint_positions()[0]
+    down = positions[TOES] - positions[FEET]
     slope = torch.rad2deg(torch.atan2(down[:, 1], down[:, 2]))
     torch.testing.assert_close(slope, foot_pitch_deg(own), atol=1.5, rtol=0)
 

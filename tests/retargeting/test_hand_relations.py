@@ -53,20 +53,20 @@ def size_of(name: str) -> float:
 def at_hip(motion: Motion, side: int = 1, *, share: float | torch.Tensor = 1.0) -> Motion:
     """The palm at the side of the hips, the elbow out."""
     sign = (1, -1)[side]
-    place = motion.joint_positions()[:, HIPS] + torch.tensor([0.135 * sign, 0.10, 0.02], dtype=torch.float64)
+    position = motion.joint_positions()[:, HIPS] + torch.tensor([0.135 * sign, 0.10, 0.02], dtype=torch.float64)
     off = torch.tensor([0.25 * sign, -0.05, 0.12], dtype=torch.float64)
-    return put_palm(motion, side, place + (1 - share) * off, points=(-sign * 0.4, -0.6, 0.6), elbow=(sign, 0, -0.4))
+    return put_palm(motion, side, position + (1 - share) * off, points=(-sign * 0.4, -0.6, 0.6), elbow=(sign, 0, -0.4))
 
 
 def at_head(motion: Motion) -> Motion:
     """The right palm on the side of the head."""
-    place = motion.joint_positions()[:, HEAD] + torch.tensor([-0.10, 0.06, 0.0], dtype=torch.float64)
-    return put_palm(motion, 1, place, points=(0.2, 1.0, 0.1), elbow=(-1, -0.5, 0.3))
+    position = motion.joint_positions()[:, HEAD] + torch.tensor([-0.10, 0.06, 0.0], dtype=torch.float64)
+    return put_palm(motion, 1, position, points=(0.2, 1.0, 0.1), elbow=(-1, -0.5, 0.3))
 
 
 def on_chest(motion: Motion) -> Motion:
-    place = motion.joint_positions()[:, CANONICAL.index("chest")] + torch.tensor([0.02, 0.06, 0.115]).double()
-    return put_palm(motion, 1, place, points=(1.0, 0.1, 0.0), elbow=(-1, -0.6, 0.0))
+    position = motion.joint_positions()[:, CANONICAL.index("chest")] + torch.tensor([0.02, 0.06, 0.115]).double()
+    return put_palm(motion, 1, position, points=(1.0, 0.1, 0.0), elbow=(-1, -0.6, 0.0))
 
 
 POSES = {"hip": (at_hip, HIPS), "head": (at_head, HEAD), "chest": (on_chest, CANONICAL.index("chest"))}
@@ -91,8 +91,8 @@ def clapping(frames: int = 90) -> Motion:
     apart = 0.03 + 0.16 * torch.sin(torch.pi * torch.arange(frames, dtype=torch.float64) / 30) ** 2
     chest = motion.joint_positions()[:, CANONICAL.index("chest")]
     for side, sign in ((0, 1.0), (1, -1.0)):
-        place = chest + torch.stack([sign * apart, 0 * apart + 0.02, 0 * apart + 0.33], dim=-1)
-        motion = put_palm(motion, side, place, points=(0.0, 0.6, 1.0), elbow=(sign, -1, 0))
+        position = chest + torch.stack([sign * apart, 0 * apart + 0.02, 0 * apart + 0.33], dim=-1)
+        motion = put_palm(motion, side, position, points=(0.0, 0.6, 1.0), elbow=(sign, -1, 0))
     return motion
 
 
@@ -143,8 +143,8 @@ def on_all_fours(frames: int = FRAMES) -> Motion:
     root[:, 1], root[:, 2] = 0.46, sway
     motion = replace(motion, local_quat_xyzw=local, root_position=root)
     for side, sign in ((0, 1.0), (1, -1.0)):
-        place = torch.tensor([sign * 0.16, 0.03, 0.55], dtype=torch.float64).expand(frames, 3)
-        motion = put_palm(motion, side, place, points=(0.0, 0.0, 1.0), elbow=(sign, 0.2, -0.3))
+        position = torch.tensor([sign * 0.16, 0.03, 0.55], dtype=torch.float64).expand(frames, 3)
+        motion = put_palm(motion, side, position, points=(0.0, 0.0, 1.0), elbow=(sign, 0.2, -0.3))
     return motion
 
 

@@ -101,8 +101,8 @@ def test_what_a_rig_may_lack(preset, gone):
     assert_returns(motion, canonical, rigmap)
     for c, joint in enumerate(rigmap.joint_of):
         if joint is not None:
-            places = canonical.joint_positions()[:, c], motion.joint_positions()[:, joint]
-            torch.testing.assert_close(*places, atol=1e-8, rtol=0)
+            positions = canonical.joint_positions()[:, c], motion.joint_positions()[:, joint]
+            torch.testing.assert_close(*positions, atol=1e-8, rtol=0)
     # What is put in lies about where it would be.
     lengths = rigmap.skeleton.offsets[1:].norm(dim=-1)
     assert float(lengths.min()) > 0.01
@@ -230,8 +230,8 @@ def test_a_rig_as_a_program_writes_it_is_known_and_comes_back(preset, version, a
     turned = turn_between(canonical.joint_rotations()[:, known], wanted.joint_rotations()[:, known])
     assert np.rad2deg(turned) < 0.01
     # Twists in the chain move no joint of a limb: hands and feet are where they are in truth.
-    places = canonical.joint_positions()[:, known], wanted.joint_positions()[:, known]
-    torch.testing.assert_close(*places, atol=1e-6, rtol=0)
+    positions = canonical.joint_positions()[:, known], wanted.joint_positions()[:, known]
+    torch.testing.assert_close(*positions, atol=1e-6, rtol=0)
     back = retarget.from_canonical(canonical, rigmap, motion)
     assert turn_between(back.local_quat_xyzw, motion.local_quat_xyzw) < 1e-6
     torch.testing.assert_close(back.joint_positions(), motion.joint_positions(), atol=1e-8, rtol=0)

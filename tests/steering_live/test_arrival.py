@@ -42,14 +42,14 @@ def test_a_near_place_is_reached_on_the_frame(facing):
     recorder, track = play((0.2, Arrival((0.5, 0.4), 0.9, facing)))
     row = errors(recorder, track)
     assert row["frame"] == 27
-    assert row["place_error_cm"] < 0.1
+    assert row["position_error_cm"] < 0.1
     assert facing is None or row["facing_error_deg"] < 0.1
 
 
 @pytest.mark.slow
 def test_a_far_place_is_walked_to_first_and_steered_from_there():
     recorder, track = play((0.2, Arrival((0.3, 1.5), 2.0, 0.5)), frames=80)
-    assert errors(recorder, track)["place_error_cm"] < 0.1
+    assert errors(recorder, track)["position_error_cm"] < 0.1
     searched = [piece.evaluations > 0 for piece in recorder.pieces[1:]]
     assert searched[:3] == [True, True, True]  # walked
     assert not all(searched[3:20])  # stitched
@@ -64,7 +64,7 @@ def test_a_pose_is_taken():
     recorder, track = play((0.2, Arrival((0.2, 0.3), 0.9, 0.3, pose)))
     row = errors(recorder, track)
     assert row["pose_error_cm"] < 0.1
-    assert row["place_error_cm"] < 0.1
+    assert row["position_error_cm"] < 0.1
 
 
 @pytest.mark.slow
@@ -102,11 +102,11 @@ def test_a_new_order_on_the_way_plays_what_was_planned_meanwhile():
     for _ in range(2):
         state, _ = ARRIVER(state, first)
     on, undisturbed = ARRIVER(state, first)
-    place = (0.1, 0.7)
-    second = replace(AHEAD, arrival=Arrival(place, state.frames / PRIOR_FPS + 0.7))
+    position = (0.1, 0.7)
+    second = replace(AHEAD, arrival=Arrival(position, state.frames / PRIOR_FPS + 0.7))
     now, frames = ARRIVER(state, second)
     assert torch.equal(frames.motion.root_position, undisturbed.motion.root_position)
     while now.approach.rest is not None or len(now.approach.planned):
         now, frames = ARRIVER(now, second)
-    assert math.dist(frames.motion.root_position[-1, ::2].tolist(), place) < 1e-3
+    assert math.dist(frames.motion.root_position[-1, ::2].tolist(), position) < 1e-3
     assert on.frames < now.frames

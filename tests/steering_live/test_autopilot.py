@@ -53,7 +53,7 @@ def test_an_order_to_be_somewhere_counts_its_seconds_from_the_next_step_and_stay
     pilot = Autopilot(Command(1.0, 0.0), SteeringLimits())
     pilot.go(Command(0.5, 0.2), (1.0, 2.0), 1.5, 0.3)
     command = pilot.at(4.0)
-    assert (command.speed, command.arrival.place, command.arrival.by) == (0.5, (1.0, 2.0), 5.5)
+    assert (command.speed, command.arrival.position, command.arrival.by) == (0.5, (1.0, 2.0), 5.5)
     assert pilot.at(4.1).arrival is command.arrival
     pilot.aim(Command(0.0, 0.0, look_at=(1.0, 1.0, 1.0)))
     assert pilot.at(4.2).arrival is command.arrival

@@ -63,7 +63,7 @@ class Scene(viser.SceneApi):
     ):
         assert (side, skin_weights.shape) == ("double", (len(vertices), len(bone_positions)))
         np.testing.assert_allclose(skin_weights.sum(axis=1), 1, atol=1e-6)
-        bones = [Bone(place, turn) for place, turn in zip(bone_positions, bone_wxyzs, strict=True)]
+        bones = [Bone(position, turn) for position, turn in zip(bone_positions, bone_wxyzs, strict=True)]
         self.sent.append(SentMesh(vertices, faces, skin_weights, bone_positions, color, opacity, bones))
         return self.sent[-1]
 

@@ -45,9 +45,9 @@ def near(motion: Motion, hand: str, away: tuple[float, float, float]) -> tuple[f
     return x, y, z
 
 
-def misses(motion: Motion, hand: str, place) -> torch.Tensor:
+def misses(motion: Motion, hand: str, position) -> torch.Tensor:
     at = motion.joint_positions()[:, CANONICAL.index(hand)]
-    return (at - at.new_tensor(place)).norm(dim=-1)
+    return (at - at.new_tensor(position)).norm(dim=-1)
 
 
 @pytest.mark.slow
@@ -55,10 +55,10 @@ def misses(motion: Motion, hand: str, place) -> torch.Tensor:
 @pytest.mark.parametrize("away", [(0.05, -0.1, 0.4), (0.3, 0.25, 0.1), (0.0, -0.3, 0.3), (-0.1, 0.1, 0.45)])
 def test_a_hand_comes_to_its_place_stays_and_goes_back(hand, away):
     motion = standing(4.0)
-    place = near(motion, hand, away if hand == "leftHand" else (-away[0], *away[1:]))
-    told = Command(0.0, 0.0, reach={hand: place})
+    position = near(motion, hand, away if hand == "leftHand" else (-away[0], *away[1:]))
+    told = Command(0.0, 0.0, reach={hand: position})
     found = steered(motion, lambda seconds: told if 0.5 <= seconds < 2.0 else Command(0.0, 0.0))
-    missed = misses(found, hand, place)
+    missed = misses(found, hand, position)
     assert float(missed[40:60].max()) < 0.005
     np.testing.assert_array_equal(found.local_quat_xyzw[:15], motion.local_quat_xyzw[:15])
     np.testing.assert_allclose(found.joint_positions()[-20:], motion.slice(0, 120).joint_positions()[-20:], atol=1e-9)
@@ -69,8 +69,8 @@ def test_a_hand_comes_to_its_place_stays_and_goes_back(hand, away):
 def test_what_is_far_or_behind_is_left_alone():
     motion = standing(2.0)
     for away in ((0.0, 0.0, 1.6), (0.0, -0.1, -0.45)):
-        place = near(motion, "leftHand", away)
-        found = steered(motion, lambda seconds, place=place: Command(0.0, 0.0, reach={"leftHand": place}))
+        position = near(motion, "leftHand", away)
+        found = steered(motion, lambda seconds, position=position: Command(0.0, 0.0, reach={"leftHand": position}))
         np.testing.assert_allclose(found.joint_positions(), motion.joint_positions(), atol=1e-9)
 
 
@@ -83,9 +83,9 @@ def test_places_that_are_dragged_make_no_hand_jump():
     commands = {}
     for number in range(80):
         around = joints[min(239, 3 * number), CANONICAL.index("chest")]
-        place = tuple((around.numpy() + generator.uniform(-0.9, 0.9, 3)).tolist())
-        hands = {("leftHand", "rightHand")[generator.integers(2)]: place} if generator.random() < 0.8 else {}
-        commands[number] = Command(1.2, 0.0, reach=hands, look_at=place if generator.random() < 0.8 else None)
+        position = tuple((around.numpy() + generator.uniform(-0.9, 0.9, 3)).tolist())
+        hands = {("leftHand", "rightHand")[generator.integers(2)]: position} if generator.random() < 0.8 else {}
+        commands[number] = Command(1.2, 0.0, reach=hands, look_at=position if generator.random() < 0.8 else None)
     found = steered(motion, lambda seconds: commands[round(seconds * 10)])
     hands = found.joint_positions()[:, CANONICAL.indices(("leftHand", "rightHand", "head"))]
     speed, bend = (torch.diff(hands, n=n, dim=0).norm(dim=-1) * 30**n for n in (1, 2))

@@ -48,11 +48,11 @@ def test_a_hand_goes_to_what_is_aimed_at(remote):
     remote.reset()
     last = collected(remote, 1.0)[-1].motion(remote.skeleton).joint_positions()[-1]
     hand, shoulder = (remote.skeleton.index(name) for name in ("leftHand", "leftUpperArm"))
-    place = tuple((last[shoulder] + last.new_tensor([0.3, 0.2, 0.1])).tolist())
-    remote.aim(Command(0.0, 0.0, reach={"leftHand": place}))
+    position = tuple((last[shoulder] + last.new_tensor([0.3, 0.2, 0.1])).tolist())
+    remote.aim(Command(0.0, 0.0, reach={"leftHand": position}))
     pieces = collected(remote, 2.0)
     away = [
-        float((piece.motion(remote.skeleton).joint_positions()[-1, hand] - last.new_tensor(place)).norm())
+        float((piece.motion(remote.skeleton).joint_positions()[-1, hand] - last.new_tensor(position)).norm())
         for piece in pieces
     ]
     assert min(away) < 0.5 * away[0]

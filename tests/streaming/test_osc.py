@@ -30,7 +30,7 @@ def read(address: str, *arguments: object, characters: int = 3) -> Order:
         ("/mapctl/stop", (), Order(0, "stop")),
         ("/mapctl/style", ("old",), Order(0, "style", word="old")),
         ("/mapctl/2/hand/left", (0.1, 1.2, 3.0), Order(1, "hand/left", (0.1, 1.2, 3.0))),
-        ("/mapctl/place", (1.0, 2.0, 1.5), Order(0, "place", (1.0, 2.0, 1.5))),
+        ("/mapctl/goto", (1.0, 2.0, 1.5), Order(0, "goto", (1.0, 2.0, 1.5))),
     ],
 )
 def test_orders_are_read(address, arguments, order):

@@ -97,13 +97,13 @@ def test_hands_reach_together_and_let_go_alone(stage):
 
 def test_places_and_paths_are_gone_to_after_what_else_came(stage):
     _, actors, _, send = stage
-    send(("place", 1.0, 2.0), ("speed", 0.0))
+    send(("goto", 1.0, 2.0), ("speed", 0.0))
     assert words(actors[0]) == ["command", "go"]
-    _, command, place, within, facing = actors[0].heard[-1]
-    assert (command.speed, place, within, facing) == (0.0, (1.0, 2.0), 2.0, None)
-    send(("2/place", -1.0, 3.0, 1.5, 450.0))
+    _, command, position, within, facing = actors[0].heard[-1]
+    assert (command.speed, position, within, facing) == (0.0, (1.0, 2.0), 2.0, None)
+    send(("2/goto", -1.0, 3.0, 1.5, 450.0))
     assert actors[1].heard[-1][2:] == ((-1.0, 3.0), 1.5, pytest.approx(math.pi / 2))
-    send(("place", 1.0, 2.0, 99.0))
+    send(("goto", 1.0, 2.0, 99.0))
     assert actors[0].heard[-1][3] == 10.0
     send(("path", 0.0, 0.0, 1.0, 1.0, 2.0, 1.0))
     assert actors[0].heard[-1] == ("walk", [(0.0, 0.0), (1.0, 1.0), (2.0, 1.0)], 1.2)
@@ -144,8 +144,8 @@ def test_every_frame_goes_to_the_stream_too(stage):
     [
         ("hand/left", 1e6, 0.0, 0.0),
         ("look", 0.0, -1e300, 0.0),
-        ("place", 1e5, 0.0),
-        ("place", 0.0, math.nan),
+        ("goto", 1e5, 0.0),
+        ("goto", 0.0, math.nan),
         ("path", 0.0, 0.0, 0.0, 1e9),
         ("path", 0.0, 0.0, 1.0),
         ("disc", 0.0, 1.0, 5.0),

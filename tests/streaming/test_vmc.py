@@ -79,11 +79,11 @@ def test_a_left_handed_program_rebuilds_the_body(seed):
     local = {m.arguments[0]: m.arguments[1:] for m in sent_over(messages) if m.address == sender.BONE}
 
     def world(name):
-        place, turn = np.array(local[name][:3]), Rotation.from_quat(local[name][3:])
+        position, turn = np.array(local[name][:3]), Rotation.from_quat(local[name][3:])
         if name == "Hips":
-            return place, turn
+            return position, turn
         at, above = world(PARENTS[name])
-        return at + above.apply(place), above * turn
+        return at + above.apply(position), above * turn
 
     for joint, name in enumerate(sender.BONE_NAMES):
         np.testing.assert_allclose(FLIP @ world(name)[0], motion.joint_positions()[0, joint], atol=3e-6)
@@ -100,10 +100,10 @@ def test_the_t_pose_has_no_rotation_and_its_left_hand_at_minus_x():
 
 def test_hips_travel_or_the_root_does():
     motion = walk(60, turn_rate=0.5)
-    place, quats = motion.root_position[50].numpy(), motion.local_quat_xyzw[50].numpy()
-    by_hips = sender.encode_frame(CANONICAL, place, quats, 0.0)
-    by_root = sender.encode_frame(CANONICAL, place, quats, 0.0, root_travels=True)
-    mirrored = FLIP @ place
+    position, quats = motion.root_position[50].numpy(), motion.local_quat_xyzw[50].numpy()
+    by_hips = sender.encode_frame(CANONICAL, position, quats, 0.0)
+    by_root = sender.encode_frame(CANONICAL, position, quats, 0.0, root_travels=True)
+    mirrored = FLIP @ position
     assert by_hips[0] == Message(sender.ROOT, ("root", *np.zeros(3) * [-1, 1, 1], 0.0, 0.0, 0.0, 1.0))
     np.testing.assert_allclose(by_hips[1].arguments[1:4], mirrored)
     np.testing.assert_allclose(by_root[0].arguments[1:4], mirrored * [1, 0, 1])

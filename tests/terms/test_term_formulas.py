@@ -49,12 +49,12 @@ def short_walk():
 
 def beside(short_walk, *wanted, sigma=0.002):
     """Wants joints so far from where they are: frame, joint and offset."""
-    places = short_walk.joints_world[0].clone()
-    mask = torch.zeros(places.shape[:2], dtype=torch.bool)
+    positions = short_walk.joints_world[0].clone()
+    mask = torch.zeros(positions.shape[:2], dtype=torch.bool)
     for frame, joint, offset in wanted:
-        places[frame, joint] += torch.tensor(offset).double()
+        positions[frame, joint] += torch.tensor(offset).double()
         mask[frame, joint] = True
-    return Keyframe(places, mask, sigma)
+    return Keyframe(positions, mask, sigma)
 
 
 def test_the_residual_is_the_distance_and_nothing_where_nothing_is_wanted(short_walk):
@@ -74,9 +74,9 @@ TARGET = encode(walk(20, turn_rate=0.3))[0]
 
 
 def placed(features: torch.Tensor, *, heading: float = 0.0) -> Trial:
-    place = GroundPose(torch.tensor([2.0, -1.0]).double(), torch.tensor(heading).double())
+    position = GroundPose(torch.tensor([2.0, -1.0]).double(), torch.tensor(heading).double())
     bits = LAYOUT.pick(features, "contacts") > 0.5
-    return Trial(features[None], place, contacts=bits[None], before=torch.zeros(0, 21, 3).double())
+    return Trial(features[None], position, contacts=bits[None], before=torch.zeros(0, 21, 3).double())
 
 
 @pytest.mark.parametrize("heading", [0.0, 2.0, -7.0])
@@ -123,9 +123,9 @@ def gliding(speed: float, direction: float, *, facing: float = 0.0) -> Trial:
     back = -step * torch.arange(PAST - 1, -1, -1)
     before[..., 0] = (back * math.sin(direction))[:, None]
     before[..., 2] = (back * math.cos(direction))[:, None]
-    place = GroundPose(torch.zeros(2, dtype=torch.float64), torch.tensor(facing, dtype=torch.float64))
+    position = GroundPose(torch.zeros(2, dtype=torch.float64), torch.tensor(facing, dtype=torch.float64))
     bits = torch.zeros(1, FRAMES, 2, dtype=torch.bool)
-    return Trial(features, place, contacts=bits, before=before)
+    return Trial(features, position, contacts=bits, before=before)
 
 
 def wanting(speed: float, direction: float, **more) -> RootVelocity:

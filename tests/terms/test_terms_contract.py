@@ -93,8 +93,8 @@ def test_the_gradient_is_finite_where_nothing_is_wrong(name):
 
 def moved_obstacle(obstacle, turn, shift):
     """The obstacle where the scene is turned and moved."""
-    place = rotate_ground(torch.tensor(obstacle.place).double(), torch.tensor(turn).double())
-    x, z = (place + torch.tensor(shift).double()).tolist()
+    position = rotate_ground(torch.tensor(obstacle.place).double(), torch.tensor(turn).double())
+    x, z = (position + torch.tensor(shift).double()).tolist()
     return replace(obstacle, place=(x, z), turn_deg=obstacle.turn_deg + math.degrees(turn))
 
 
@@ -102,14 +102,14 @@ def moved_obstacle(obstacle, turn, shift):
 def test_moving_the_whole_scene_changes_nothing(name):
     here, term, shift, turn = trial(), TERMS[name], (3.0, -2.0), -2.5
     angle = torch.tensor(turn, dtype=torch.float64)
-    place = GroundPose(
+    position = GroundPose(
         rotate_ground(here.start.position_xz, angle) + torch.tensor(shift).double(), here.start.heading + turn
     )
     before, heels = here.before.clone(), here.heels_before.clone()
     for points in (before, heels):
         turned = rotate_ground(points[..., ::2], angle.expand(points.shape[:-1]))
         points[..., ::2] = turned + torch.tensor(shift).double()
-    there = replace(here, start=place, before=before, heels_before=heels)
+    there = replace(here, start=position, before=before, heels_before=heels)
     names = {field.name for field in fields(term)}
     if "curve" in names:
         term = replace(term, curve=moved_curve(term.curve, turn, shift))
@@ -119,14 +119,14 @@ def test_moving_the_whole_scene_changes_nothing(name):
             for name in ("velocities", "velocities_before")
         }
         term = replace(term, facing=None if term.facing is None else term.facing + turn, **turned)
-    if "places" in names:
-        places = term.places.clone()
-        turned = rotate_ground(places[..., ::2], angle.expand(places.shape[:-1]))
-        places[..., ::2] = turned + torch.tensor(shift).double()
-        term = replace(term, places=places)
-    if "place" in names:
-        place = rotate_ground(term.place[..., ::2], angle.expand(FRAMES)) + torch.tensor(shift).double()
-        term = replace(term, place=torch.stack([place[..., 0], term.place[..., 1], place[..., 1]], dim=-1))
+    if "positions" in names:
+        positions = term.positions.clone()
+        turned = rotate_ground(positions[..., ::2], angle.expand(positions.shape[:-1]))
+        positions[..., ::2] = turned + torch.tensor(shift).double()
+        term = replace(term, positions=positions)
+    if "position" in names:
+        position = rotate_ground(term.position[..., ::2], angle.expand(FRAMES)) + torch.tensor(shift).double()
+        term = replace(term, position=torch.stack([position[..., 0], term.position[..., 1], position[..., 1]], dim=-1))
     if "others" in names:
         others = rotate_ground(term.others, angle.expand(term.others.shape[:-1]))
         term = replace(term, others=others + torch.tensor(shift).double())
@@ -164,9 +164,9 @@ def test_a_planted_toe_pays_for_speed_and_height_as_its_sigmas_say():
     planted = torch.ones_like(whole.contacts)
     resting = replace(whole, contacts=planted, contacts_before=planted[0, 0])
     toes = [CANONICAL.index("leftToes"), CANONICAL.index("rightToes")]
-    places = torch.cat([whole.before[-1:, toes], whole.joints_world[0][:, toes]])
-    speed = (places[1:, :, ::2] - places[:-1, :, ::2]).norm(dim=-1) * 30
-    above = places[1:, :, 1] - TOE_REST_HEIGHT
+    positions = torch.cat([whole.before[-1:, toes], whole.joints_world[0][:, toes]])
+    speed = (positions[1:, :, ::2] - positions[:-1, :, ::2]).norm(dim=-1) * 30
+    above = positions[1:, :, 1] - TOE_REST_HEIGHT
     expected = 0.5 * ((speed / 0.03) ** 2 + (above / 0.01) ** 2 + (above.clamp(max=0) / 0.005) ** 2).sum(-1)
     term = FootContact(heels=None)
     torch.testing.assert_close(term(resting)[0], expected, rtol=1e-4, atol=1e-4)
@@ -183,10 +183,10 @@ def test_a_planted_heel_pays_for_speed_and_height_as_its_sigmas_say(past):
     resting = replace(whole, heel_contacts=planted)
     term, toes = FootContact(heels=HeelSigmas(0.2, 0.05, 0.02)), FootContact(heels=None)
     heels = locate_heels(walk(PAST + FRAMES, turn_rate=0.2))
-    places = heels[PAST - 1 :] if past else heels[[PAST, *range(PAST, PAST + FRAMES)]]
-    torch.testing.assert_close(whole.heels_world[0], places[1:], atol=1e-9, rtol=0)
-    speed = (places[1:, :, ::2] - places[:-1, :, ::2]).norm(dim=-1) * 30
-    above = places[1:, :, 1] - (TOE_REST_HEIGHT - 0.0201)
+    positions = heels[PAST - 1 :] if past else heels[[PAST, *range(PAST, PAST + FRAMES)]]
+    torch.testing.assert_close(whole.heels_world[0], positions[1:], atol=1e-9, rtol=0)
+    speed = (positions[1:, :, ::2] - positions[:-1, :, ::2]).norm(dim=-1) * 30
+    above = positions[1:, :, 1] - (TOE_REST_HEIGHT - 0.0201)
     held = 4 * torch.log1p(0.5 * ((speed / 0.2) ** 2 + (above / 0.05) ** 2) / 4)
     expected = (held + 0.5 * (above.clamp(max=0) / 0.02) ** 2).sum(-1)
     torch.testing.assert_close((term(resting) - toes(resting))[0], expected, rtol=1e-4, atol=1e-4)
@@ -223,8 +223,8 @@ def test_a_toe_pays_for_acceleration_beyond_what_is_free(past):
     whole = trial(1, disturbed=0.02, past=past)
     hard, free = FootContact(heels=None, landing=LandingSigmas(20.0, 5.0)), FootContact(heels=None, landing=None)
     toes = [CANONICAL.index("leftToes"), CANONICAL.index("rightToes")]
-    places = torch.cat([whole.before[-2:, toes], whole.joints_world[0][:, toes]])
-    sizes = (places[2:] - 2 * places[1:-1] + places[:-2]).norm(dim=-1) * 30**2
+    positions = torch.cat([whole.before[-2:, toes], whole.joints_world[0][:, toes]])
+    sizes = (positions[2:] - 2 * positions[1:-1] + positions[:-2]).norm(dim=-1) * 30**2
     expected = torch.zeros(FRAMES, dtype=torch.float64)
     expected[FRAMES - len(sizes) :] = 0.5 * (((sizes - 20).clamp(min=0) / 5) ** 2).sum(-1)
     assert float(expected.max()) > 1, "some are harder than what is free"

@@ -35,8 +35,8 @@ def windows(corpus):
 
 def decoded(features):
     """World positions of joints on canonical bones, planted toes, and the features."""
-    places = BodyPose.of_features(features.double(), GroundPose.origin(torch.float64)).joints_world()
-    return places, places[:, list(TOE_JOINTS)], features[:, LAYOUT.slices["contacts"]] > 0.5
+    positions = BodyPose.of_features(features.double(), GroundPose.origin(torch.float64)).joints_world()
+    return positions, positions[:, list(TOE_JOINTS)], features[:, LAYOUT.slices["contacts"]] > 0.5
 
 
 def slide(toes, planted):

@@ -187,7 +187,7 @@ def test_an_infiller_answers_for_what_it_changes(architecture):
     network = tiny_infiller.network(config=replace(tiny_infiller.CONFIG, architecture=architecture))
     parts = compute_infiller_losses(network, window, everything)
     assert parts["error_cm"] == 0
-    assert (parts["place"] == 0) == (architecture == "skips")
+    assert (parts["position"] == 0) == (architecture == "skips")
 
 
 class TrueTrajectory(PathNetwork):
@@ -217,12 +217,12 @@ def test_a_path_costs_what_its_steps_sum_up_to_over_every_span_and_its_height():
 def test_a_transformer_that_is_untrained_errs_as_interpolation_does_and_a_true_answer_costs_nothing():
     truth = add_targets(PoseWindows(corpus(2, 60), evenness=0.0).draw(4, 40, generator()))
     parts = compute_losses(tiny_transformer.network(), truth, truth)
-    assert all(parts[name] < 1e-2 for name in ("places_cm", "pace_cm", "turns"))
+    assert all(parts[name] < 1e-2 for name in ("positions_cm", "pace_cm", "turns"))
     hidden = with_gap(truth, 10, 25)
     shown = hide(tiny_transformer.network(), hidden)
     apart = (shown.world_poses()[0] - truth.world_poses()[0])[:, 10:25].norm(dim=-1)
     parts = compute_losses(tiny_transformer.network(), truth, hidden)
-    assert float(parts["places_cm"]) == pytest.approx(100 * float(apart.mean()), rel=1e-3)
+    assert float(parts["positions_cm"]) == pytest.approx(100 * float(apart.mean()), rel=1e-3)
 
 
 @pytest.mark.parametrize("frames", [8, 40])
@@ -233,8 +233,8 @@ def test_parts_that_stay_known_are_the_motions_own(frames):
     assert bool((known.rotations | known.root[..., None]).any(dim=2).any(dim=1).all())
     assert float((~known.everything).any(dim=1).float().mean()) > 0.97
     assert not bool((known.effectors & known.positions[..., list(EFFECTORS)]).any())
-    places = truth.world_poses()[0][..., list(EFFECTORS), :]
-    torch.testing.assert_close(shown.targets[known.effectors], places[known.effectors], atol=1e-5, rtol=0)
+    positions = truth.world_poses()[0][..., list(EFFECTORS), :]
+    torch.testing.assert_close(shown.targets[known.effectors], positions[known.effectors], atol=1e-5, rtol=0)
     assert float((shown.root_position - truth.root_position).norm(dim=-1)[~known.path].max()) == 0
 
 
@@ -267,11 +267,11 @@ def tweener_losses(sequences, windows, turned=0.0):
 def test_a_tweener_pays_for_what_is_off_between_keys_of_one_clip(windows):
     sequences = draw_windows(windows, 3, 100, progress=1.0, generator=generator(), partial=False)
     found = tweener_losses(sequences, windows)
-    assert all(float(found[name]) < 0.02 for name in ("places_cm", "pace_cm", "feet_cm", "keys_cm", "turns"))
+    assert all(float(found[name]) < 0.02 for name in ("positions_cm", "pace_cm", "feet_cm", "keys_cm", "turns"))
     turned = tweener_losses(sequences, windows, turned=0.1)
-    places = kinematics.positions_from_matrices(CANONICAL, sequences.motion.local_matrices())
-    radius = places[..., ::2].norm(dim=-1).mean()
-    assert float(turned["places_cm"]) == pytest.approx(100 * 2 * float(radius) * 0.05, rel=0.1)
+    positions = kinematics.positions_from_matrices(CANONICAL, sequences.motion.local_matrices())
+    radius = positions[..., ::2].norm(dim=-1).mean()
+    assert float(turned["positions_cm"]) == pytest.approx(100 * 2 * float(radius) * 0.05, rel=0.1)
 
 
 def test_between_keys_of_different_clips_nothing_but_keys_counts(windows):

@@ -11,8 +11,8 @@ from priors import tweener
 FRAMES = 193
 
 
-def bend_way(way, facing, told):
-    return tweener.bend_way(way, facing, placed=told, faced=told)
+def bend_trajectory(way, facing, told):
+    return tweener.bend_trajectory(way, facing, placed=told, faced=told)
 
 
 def lead(displacement, first, last, frames=FRAMES, turn=0.0):
@@ -26,7 +26,7 @@ def lead(displacement, first, last, frames=FRAMES, turn=0.0):
 
 
 def test_who_walks_round_a_corner_leaves_along_one_heading_and_comes_along_the_other():
-    way, facing = bend_way(*lead((4.0, 4.0), 0.0, 90.0))
+    way, facing = bend_trajectory(*lead((4.0, 4.0), 0.0, 90.0))
     degrees = torch.rad2deg(facing[0])
     assert degrees[:32].abs().max() < 15
     assert (degrees[-32:] - 90).abs().max() < 15
@@ -50,19 +50,19 @@ def test_who_walks_round_a_corner_leaves_along_one_heading_and_comes_along_the_o
 )
 def test_the_way_stays_straight_for_who_does_not_walk_ahead_or_has_no_time(displacement, first, last, frames):
     way, facing, told = lead(displacement, first, last, frames)
-    bent, turned = bend_way(way, facing, told)
+    bent, turned = bend_trajectory(way, facing, told)
     assert torch.equal(bent, way)
     assert torch.equal(turned, facing)
 
 
 def test_what_is_told_stays_and_a_way_turned_elsewhere_is_the_same_one():
     way, facing, told = lead((3.0, 5.0), -10.0, 60.0)
-    bent, turned = bend_way(way, facing, told)
+    bent, turned = bend_trajectory(way, facing, told)
     assert torch.equal(bent[told], way[told])
     assert torch.equal(turned[told], facing[told])
     assert (bent - way).norm(dim=-1).max() > 0.1
     for turn in (1.0, 3.0, -2.5):
-        other, facing_other = bend_way(*lead((3.0, 5.0), -10.0, 60.0, turn=turn))
+        other, facing_other = bend_trajectory(*lead((3.0, 5.0), -10.0, 60.0, turn=turn))
         wanted = rotations.rotate_ground(bent, torch.tensor(turn).double().expand(1, FRAMES))
         assert torch.allclose(other, wanted, atol=1e-9)
         assert torch.allclose(facing_other, turned + turn, atol=1e-9)

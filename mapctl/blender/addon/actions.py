@@ -98,16 +98,16 @@ def _find_slot(armature: bpy.types.Object):
 
 def list_keys(armature: bpy.types.Object) -> dict[int, bool]:
     """List the frames in which bones have keys, and whether one of them is not a generated key."""
-    made, frames = number_type(generated=True), {}
+    generated, frames = number_type(generated=True), {}
     for curve in list_curves(armature):
         if not curve.data_path.startswith("pose.bones["):
             continue
         keys = curve.keyframe_points
-        places, kinds = np.empty(2 * len(keys), dtype=np.float32), np.empty(len(keys), dtype=np.int32)
-        keys.foreach_get("co", places)
+        positions, kinds = np.empty(2 * len(keys), dtype=np.float32), np.empty(len(keys), dtype=np.int32)
+        keys.foreach_get("co", positions)
         keys.foreach_get("type", kinds)
-        for frame, kind in zip(np.rint(places[::2]).astype(int).tolist(), kinds.tolist(), strict=True):
-            frames[frame] = frames.get(frame, False) or kind != made
+        for frame, kind in zip(np.rint(positions[::2]).astype(int).tolist(), kinds.tolist(), strict=True):
+            frames[frame] = frames.get(frame, False) or kind != generated
     return dict(sorted(frames.items()))
 
 
@@ -127,14 +127,14 @@ def set_constant(armature: bpy.types.Object, path: str, value: float, frame: int
     curves.new(path).keyframe_points.insert(frame, value)
 
 
-def write_channel(armature: bpy.types.Object, channel: Channel, frames: range, made: np.ndarray) -> None:
-    """Write a key for every frame, linear between them, generated ones where `made` (frames,) is true."""
+def write_channel(armature: bpy.types.Object, channel: Channel, frames: range, generated: np.ndarray) -> None:
+    """Write a key for every frame, linear between them, generated ones where `generated` (frames,) is true."""
     holder = open_curves(armature)
     for index, values in enumerate(channel.values.T):
         curve = holder.fcurves.new(channel.path, index=index)
         curve.group = holder.groups.get(channel.group) or holder.groups.new(channel.group)
         curve.keyframe_points.add(len(frames))
-        for name, numbers in _make_keys(np.arange(frames.start, frames.stop), values, made).items():
+        for name, numbers in _make_keys(np.arange(frames.start, frames.stop), values, generated).items():
             curve.keyframe_points.foreach_set(name, numbers)
         curve.update()
 
@@ -146,10 +146,10 @@ def number_type(*, generated: bool) -> int:
     return items[name].value
 
 
-def _make_keys(frames: np.ndarray, values: np.ndarray, made: np.ndarray) -> dict[str, np.ndarray]:
+def _make_keys(frames: np.ndarray, values: np.ndarray, generated: np.ndarray) -> dict[str, np.ndarray]:
     """Make linear keys, as Blender's own properties of a key want them."""
     linear = bpy.types.Keyframe.bl_rna.properties["interpolation"].enum_items["LINEAR"].value
-    kinds = np.where(made, number_type(generated=True), number_type(generated=False))
+    kinds = np.where(generated, number_type(generated=True), number_type(generated=False))
     return {
         "co": np.stack([frames, values], axis=-1).astype(np.float32).ravel(),
         "interpolation": np.full(len(frames), linear, dtype=np.int32),

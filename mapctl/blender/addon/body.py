@@ -60,9 +60,9 @@ class Body:
     rig_toml: str = ""
     """A rig file with names of the joints; nothing where mapctl recognises them itself."""
 
-    def to_world(self, places: np.ndarray) -> np.ndarray:
+    def to_world(self, positions: np.ndarray) -> np.ndarray:
         """Convert places (..., 3) in the armature's space to mapctl's, with the armature at the origin."""
-        return places @ self.frame[:3, :3].T
+        return positions @ self.frame[:3, :3].T
 
 
 def measure_world(armature: bpy.types.Object, scene: bpy.types.Scene) -> np.ndarray:
@@ -142,9 +142,9 @@ def sample_motion(
     moved = poses @ np.linalg.inv(body.rests)
     basis = orthonormalise(worlds[:, None, :3, :3])
     rotations = basis @ orthonormalise(moved[..., :3, :3]) @ transpose(orthonormalise(body.frame[:3, :3]))
-    places = np.einsum("fjab,jb->fja", worlds[:, None] @ moved, add_one(body.heads))[..., :3]
+    positions = np.einsum("fjab,jb->fja", worlds[:, None] @ moved, add_one(body.heads))[..., :3]
     return WorldMotion(
-        body.names, body.parents, body.to_world(body.heads), measure_fps(scene), rotations, places
+        body.names, body.parents, body.to_world(body.heads), measure_fps(scene), rotations, positions
     ), worlds
 
 
@@ -180,9 +180,9 @@ def to_armature(motion: WorldMotion, body: Body, worlds: np.ndarray) -> np.ndarr
     return np.linalg.inv(worlds)[:, None] @ moved @ body.frame
 
 
-def add_one(places: np.ndarray) -> np.ndarray:
+def add_one(positions: np.ndarray) -> np.ndarray:
     """Append the 1 of homogeneous coordinates."""
-    return np.concatenate([places, np.ones((*places.shape[:-1], 1))], axis=-1)
+    return np.concatenate([positions, np.ones((*positions.shape[:-1], 1))], axis=-1)
 
 
 _MOST_PASSES = 8
@@ -256,9 +256,9 @@ def solve_controls(
 def _read_moved(armature: bpy.types.Object, body: Body) -> np.ndarray:
     """Read what moves each joint from its rest now, without scale, (joints, 4, 4)."""
     moved = read_poses(armature, body.bones) @ np.linalg.inv(body.rests)
-    places = np.einsum("jab,jb->ja", moved, add_one(body.heads))[:, :3]
+    positions = np.einsum("jab,jb->ja", moved, add_one(body.heads))[:, :3]
     moved[:, :3, :3] = orthonormalise(moved[:, :3, :3])
-    moved[:, :3, 3] = places - (moved[:, :3, :3] @ body.heads[..., None])[..., 0]
+    moved[:, :3, 3] = positions - (moved[:, :3, :3] @ body.heads[..., None])[..., 0]
     return moved
 
 

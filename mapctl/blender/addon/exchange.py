@@ -93,7 +93,7 @@ def write(motion: WorldMotion, path: Path, ends: dict[str, np.ndarray], movable:
     apart = np.einsum("fjab,fjb->fja", turned_back, motion.positions - motion.positions[:, up])
     stretched = np.abs(apart - offsets).max(axis=(0, 2)) > _RIGID
     moving = [joint for joint in range(1, len(parents)) if joint in movable and stretched[joint]]
-    end_offsets = [place - motion.rest[motion.names.index(name)] for name, place in ends.items()]
+    end_offsets = [end - motion.rest[motion.names.index(name)] for name, end in ends.items()]
     np.savez(
         path,
         format=np.array(FORMAT),

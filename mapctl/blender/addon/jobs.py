@@ -87,7 +87,7 @@ class Result:
     """What moves the joints from their rest in the armature's space, (frames, joints, 4, 4)."""
     travelling: frozenset[int]
     """Joints that travel within their parent."""
-    made: np.ndarray
+    generated: np.ndarray
     """Which frames have generated keys, (frames,)."""
     name: str
     """Name of the new action."""
@@ -104,7 +104,7 @@ def make_action(at: Scene, result: Result) -> Generator[Step, None, tuple[str, .
             actions.copy_action(at.armature, result.name)
         keys = yield from _find_keys(at, result)
         for channel in list_channels(at.armature, keys):
-            actions.write_channel(at.armature, channel, result.frames, result.made)
+            actions.write_channel(at.armature, channel, result.frames, result.generated)
         _reset_unkeyed(at.armature, keys)
         return (yield from _compare(at, result))
 
@@ -179,8 +179,8 @@ def _restored_pose(at: Scene, switches: Mapping[str, str]) -> Iterator[None]:
 
     def restore() -> None:
         actions.assign_action(armature, old, slot)
-        for made in set(bpy.data.actions) - known:
-            bpy.data.actions.remove(made)
+        for action in set(bpy.data.actions) - known:
+            bpy.data.actions.remove(action)
         for name, basis in before.items():
             bones[name].matrix_basis = basis
         for bone, value in switched.items():
@@ -202,13 +202,13 @@ def walk_along(at: Scene, drawn: bpy.types.Object, options: Sequence[str]) -> Jo
     """Let the character walk along a curve, from the scene's first frame on; `options` are those of `mapctl follow`."""
     body, points = take_body(at), sample_curve(drawn, at.scene)
     height = float(np.median(points[:, 1]))
-    made, travelling, lines = yield from _ask_for_walk(at, body, points, options)
-    made = replace(made, positions=made.positions + np.array([0.0, height, 0.0]))
+    walk, travelling, lines = yield from _ask_for_walk(at, body, points, options)
+    walk = replace(walk, positions=walk.positions + np.array([0.0, height, 0.0]))
     first = at.scene.frame_preview_start if at.scene.use_preview_range else at.scene.frame_start
-    frames = range(first, first + len(made.positions))
+    frames = range(first, first + len(walk.positions))
     with restored_scene(at):
         worlds = yield from sample_worlds(at.armature, at.scene, frames)
-        moved = to_armature(made, body, worlds)
+        moved = to_armature(walk, body, worlds)
         plain = np.zeros(len(frames), dtype=bool)
         name = f"{at.armature.name} along {drawn.name}"
         warnings = yield from make_action(at, Result(body, frames, moved, travelling, plain, name, fresh=True))
@@ -229,19 +229,19 @@ def _ask_for_walk(
         np.savetxt(folder / "curve.csv", points[:, ::2], fmt="%.6f", delimiter=",", header="x,z", comments="")
         words = ["follow", "curve.csv", "--rig", "character.npz", "-o", "walk.npz", *options]
         lines = yield from run_command([*at.command, *words], folder, "walking")
-        made, travelling = exchange.read(folder / "walk.npz")
-        if made.fps != fps:  # resampling takes a moment, solving at another rate than the priors' takes long
+        walk, travelling = exchange.read(folder / "walk.npz")
+        if walk.fps != fps:  # resampling takes a moment, solving at another rate than the priors' takes long
             words = ["convert", "walk.npz", "resampled.npz", "--fps", str(fps)]
             yield from run_command([*at.command, *words], folder, "resampling")
-            made, travelling = exchange.read(folder / "resampled.npz")
-    return made, travelling, lines
+            walk, travelling = exchange.read(folder / "resampled.npz")
+    return walk, travelling, lines
 
 
 def clean_up(at: Scene, frames: range, *, anchor: bool) -> Job:
     """Denoise the action in these frames."""
     words = ["denoise", "IN", "-o", "OUT", *(["--anchor"] if anchor else [])]
-    made = np.zeros(len(frames), dtype=bool)
-    return (yield from _edit(at, frames, words, made, "clean", "cleaning up"))
+    generated = np.zeros(len(frames), dtype=bool)
+    return (yield from _edit(at, frames, words, generated, "clean", "cleaning up"))
 
 
 def fill_gap(at: Scene, frames: range, gap: range, joints: Sequence[str]) -> Job:
@@ -251,8 +251,8 @@ def fill_gap(at: Scene, frames: range, gap: range, joints: Sequence[str]) -> Job
         raise AddonError(f"the gap {asked} is not within the action's frames {own}")
     words = ["infill", "IN", "-o", "OUT", "--gap", f"{gap.start - frames.start}:{gap.stop - frames.start}"]
     words += ["--joints", ",".join(joints)] if joints else []
-    made = np.array([frame in gap for frame in frames])
-    return (yield from _edit(at, frames, words, made, "filled", "filling the gap"))
+    generated = np.array([frame in gap for frame in frames])
+    return (yield from _edit(at, frames, words, generated, "filled", "filling the gap"))
 
 
 def fill_between_keys(at: Scene, keyed: Sequence[int]) -> Job:
@@ -263,8 +263,8 @@ def fill_between_keys(at: Scene, keyed: Sequence[int]) -> Job:
         raise AddonError(f"every frame from {keyed[0]} to {keyed[-1]} has keys: there is nothing in between")
     frames = range(keyed[0], keyed[-1] + 1)
     words = ["tween", "IN", "-o", "OUT", "--keyframes", ",".join(str(frame - frames.start) for frame in keyed)]
-    made = np.array([frame not in keyed for frame in frames])
-    return (yield from _edit(at, frames, words, made, "in-between", "in-betweening"))
+    generated = np.array([frame not in keyed for frame in frames])
+    return (yield from _edit(at, frames, words, generated, "in-between", "in-betweening"))
 
 
 def take_body(at: Scene) -> Body:
@@ -291,7 +291,7 @@ def name_joints(at: Scene, bones: Sequence[str]) -> list[str]:
     return found
 
 
-def _edit(at: Scene, frames: range, words: Sequence[str], made: np.ndarray, suffix: str, label: str) -> Job:
+def _edit(at: Scene, frames: range, words: Sequence[str], generated: np.ndarray, suffix: str, label: str) -> Job:
     """Send the action to a command of mapctl, and make a new one of what comes back."""
     body, old = take_body(at), actions.find_action(at.armature)
     with restored_scene(at), tempfile.TemporaryDirectory(prefix="mapctl-") as temporary:
@@ -299,25 +299,25 @@ def _edit(at: Scene, frames: range, words: Sequence[str], made: np.ndarray, suff
         with rigify.keep_lengths(at.armature):
             motion, worlds = yield from sample_motion(at.armature, body, at.scene, frames)
         exchange.write(motion, folder / "given.npz", _place_ends(body), body.movable)
-        names = {"IN": "given.npz", "OUT": "made.npz"}
+        names = {"IN": "given.npz", "OUT": "result.npz"}
         rig = []
         if body.rig_toml:
             (folder / "rigify.toml").write_text(body.rig_toml, encoding="utf-8")
             rig = ["--rig", "rigify.toml"]
         lines = yield from run_command([*at.command, *(names.get(word, word) for word in words), *rig], folder, label)
-        answer, travelling = exchange.read(folder / "made.npz")
+        answer, travelling = exchange.read(folder / "result.npz")
         if len(answer.positions) != len(frames):
             raise AddonError(f"mapctl answered with {len(answer.positions)} frames where {len(frames)} were asked for")
         moved = to_armature(answer, body, worlds)
         name = f"{old.name} {suffix}"
-        warnings = yield from make_action(at, Result(body, frames, moved, travelling, made, name, fresh=False))
+        warnings = yield from make_action(at, Result(body, frames, moved, travelling, generated, name, fresh=False))
     counted = f"frame 0 in mapctl's lines is frame {frames.start} of the scene"
     return (counted, *_shorten(lines)), warnings
 
 
 def _shorten(lines: Sequence[str]) -> tuple[str, ...]:
     """Leave the names of temporary files out of mapctl's lines."""
-    return tuple(line.removeprefix("made.npz: ") for line in lines if not line.startswith("wrote "))
+    return tuple(line.removeprefix("result.npz: ") for line in lines if not line.startswith("wrote "))
 
 
 def _place_ends(body: Body) -> dict[str, np.ndarray]:

@@ -86,7 +86,7 @@ def take_controls(armature: bpy.types.Object, scene: bpy.types.Scene) -> Body:
         raise AddonError(
             f"{armature.name}: only rigs of Rigify's human metarigs are known, and {missing[0]} is missing"
         )
-    number = {joint: place for place, (joint, *_) in enumerate(rows)}
+    number = {joint: index for index, (joint, *_) in enumerate(rows)}
     shown = [row[1] for row in rows]
     return Body(
         names=tuple(names),

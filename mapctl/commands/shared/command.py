@@ -58,7 +58,7 @@ class Command:
 class ModelCommand(Command):
     """Base of the options of commands that take bundled models."""
 
-    tells_licence: ClassVar[bool] = True
+    prints_licence: ClassVar[bool] = True
     """Whether a line says under which licence the result was made: not where others read standard output."""
 
     weights: options.MaybeWeights = None
@@ -72,6 +72,6 @@ class ModelCommand(Command):
         with weight_sets.use_weights(self.weights), weight_sets.record_licences() as used:
             weight_sets.find_current_set()  # an impossible one is refused now
             status = super().run()
-        if used and self.tells_licence and not getattr(self, "quiet", False):
+        if used and self.prints_licence and not getattr(self, "quiet", False):
             print(f"licence   {weight_sets.format_licences(used)}")
         return status

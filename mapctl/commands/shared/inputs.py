@@ -88,7 +88,7 @@ def read_motion_with_gaps(path: Path, rig: Rig | None, *, quiet: bool) -> tuple[
     """Read a motion in which missing values may be NaN; also return their masks, and whether there are any."""
     motion, missing = formats.load_with_missing(path, metres_per_unit=None if rig is None else rig.metres_per_unit)
     _report_reading(path, motion, rig, quiet=quiet)
-    return motion, masks_from_missing(motion, missing), bool(missing.rotations.any() or missing.places.any())
+    return motion, masks_from_missing(motion, missing), bool(missing.rotations.any() or missing.positions.any())
 
 
 def _report_reading(path: Path, motion: Motion, rig: Rig | None, *, quiet: bool) -> None:

@@ -69,7 +69,7 @@ class ProposalOptions:
     dna: Annotated[str | None, arg(metavar="CLIP|NAME,...")] = None
     """Motion files of any known rig, or classes that `mapctl info tweener` lists, whose style the tweener takes: in all
     gaps with --method tweener, in those of 2 s and more between whole poses with auto. Several are mixed."""
-    no_finish: bool = False
+    no_refine: bool = False
     """Leave the proposal as it is, on rigid bones and with exact keys: no MAP stage plants the feet."""
     inbetweener: MaybeName = None
     """The file or run folder of a trained transformer, infiller or tweener; the bundled one if not given. With auto a

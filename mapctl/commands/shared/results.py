@@ -86,8 +86,8 @@ def check_proposal(command: ProposalOptions, *, prior: str | None = None, way: b
     proposers.check_method(method)
     if command.stitcher is not None and method not in ("auto", "stitcher"):
         raise RequestError(f"--method {method} stitches nothing; leave --stitcher out or take --method stitcher")
-    if prior is not None and command.no_finish and method not in ("auto", "rollouts"):
-        raise RequestError(f"--method {method} --no-finish has no MAP stage for a density; leave --prior out")
+    if prior is not None and command.no_refine and method not in ("auto", "rollouts"):
+        raise RequestError(f"--method {method} --no-refine has no MAP stage for a density; leave --prior out")
     if command.inbetweener is not None and method == "slerp":
         raise RequestError("--method slerp knows no network; leave --inbetweener out")
     takes_path = method == "tweener" or (method == "auto" and _is_tweener(command.inbetweener))

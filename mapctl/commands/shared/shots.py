@@ -38,7 +38,7 @@ from priors.lstm_gmm.density import LstmGmmDensity
 from scenes.drawn_character import DrawnCharacter
 from scenes.overlays import build_hips_mark, build_look_mark, build_obstacle, build_target
 from scenes.scene_file import Actor
-from scenes.stage import Mark, Shot, Wishes
+from scenes.stage import Mark, Shot, Targets
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,16 +226,17 @@ class PlayedShot:
         m = {name: "-" if value != value else f"{value:.1f}" for name, value in self.measures.items()}
         cost = report.summarise_timing(self.solution.windows, seconds=self.solution.seconds)
         motion, speed, planted = self.solution.motion, self.measures["speed_m_s"], self.measures["planted_share"]
-        wishes = [
-            f"wish      {wish.name} ({wish.asked}): {wish.got:.1f} {wish.unit}" + ("" if wish.holds else ", NOT HELD")
-            for wish in self.solution.wishes
+        constraints = [
+            f"constraint {constraint.name} ({constraint.asked}): {constraint.got:.1f} {constraint.unit}"
+            + ("" if constraint.holds else ", NOT HELD")
+            for constraint in self.solution.constraints
         ]
         return [
             f"motion    {motion.num_frames} frames, {motion.seconds:.1f} s, {speed:.2f} m/s",
             f"path      error {m['path_error_mean_cm']} cm mean, {m['path_error_max_cm']} max; sway {m['sway_cm']} cm",
             f"progress  {m['travelled_m']} of {m['wanted_m']} m",
             f"feet      planted {planted:.0%} of the time, then moving {m['contact_speed_cm_s']} cm/s",
-            *wishes,
+            *constraints,
             f"cost      {cost['frame_ms_p50']:.1f} ms a frame (p99 {cost['frame_ms_p99']:.1f}), "
             f"{cost['evaluations_per_frame']:.1f} evaluations a frame, threads: {cost['threads']}",
             f"status    {self.solution.status.text}",
@@ -274,14 +275,14 @@ def let_others_pass(plans: Sequence[ShotPlan], keep_apart: float) -> list[ShotPl
     given, tracks = list(plans), list[tuple[ShotPlan, Float[Tensor, "frames 2"]]]()
     for plan in plans:
         others = _find_others(plan, tracks, keep_apart) if tracks else None
-        way = plan_trajectory(replace(plan.request, others=others))
-        if way.blocked and others is not None:
+        planned = plan_trajectory(replace(plan.request, others=others))
+        if planned.blocked and others is not None:
             alone = plan_trajectory(plan.request)
             if not alone.blocked:
                 room = _find_others(given[0], [(plan, _walk_along(alone))], (keep_apart - APART_MARGIN) / 2)
                 given[0] = replace(given[0], request=replace(given[0].request, others=replace(room, courtesy=True)))
-                way = alone
-        tracks.append((plan, _walk_along(way)))
+                planned = alone
+        tracks.append((plan, _walk_along(planned)))
     return given
 
 
@@ -314,15 +315,15 @@ def stage_actor(
     def span(key: Reach | Look) -> tuple[float, float]:
         return key.seconds, key.seconds + key.hold_seconds
 
-    marks = [Mark(build_target(at), span(reach)) for reach in solution.reaches for at in reach.places.values()]
-    marks += [Mark(build_look_mark(look.place), span(look)) for look in done.request.looks]
+    marks = [Mark(build_target(at), span(reach)) for reach in solution.reaches for at in reach.positions.values()]
+    marks += [Mark(build_look_mark(look.position), span(look)) for look in done.request.looks]
     for met in solution.met:
         if not met.key.gives_body:
             heading = float(kinematics.heading(met.wanted.local_quat_xyzw[0, 0])) if met.key.gives_facing else None
             marks.append(Mark(build_hips_mark(met.wanted.root_position[0, ::2].numpy(), heading), met.seconds))
-    wishes = Wishes(marks, [met.wanted for met in solution.met if met.key.gives_body])
+    targets = Targets(marks, [met.wanted for met in solution.met if met.key.gives_body])
     drawn = None if character is None else character.put_on(motion)
-    return Shot(motion, done.request.curve, colour, start_seconds, wishes, drawn)
+    return Shot(motion, done.request.curve, colour, start_seconds, targets, drawn)
 
 
 def build_obstacles(done: Sequence[PlayedShot]) -> list[Surface]:

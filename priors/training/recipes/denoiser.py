@@ -135,17 +135,17 @@ def compute_denoiser_losses(network: DenoiserNetwork, windows: Tensor, generator
     angles = _pack_angles(clean)
     bits = LAYOUT.pick(windows, "contacts")
     wanted, got = BodyPose.unpack(_pack(clean)).joints_world(), cleaned.pose.joints_world()
-    place = 100 * _smooth_norm(got - wanted).mean()
+    position_error = 100 * _smooth_norm(got - wanted).mean()
     slip = 100 * _smooth_norm(torch.diff(got - wanted, dim=1))
     planted = bits[:, 1:] * bits[:, :-1]
     feet = (slip[..., _TOES] * planted).sum() / planted.sum().clamp_min(1)
     turned = (cleaned.pose.angles - angles).abs().mean()
     contacts = cross_entropy(cleaned.contact_logits.float(), bits)
-    loss = place + _PACE * slip.mean() + _FEET * feet + _ANGLES * turned + _CONTACTS * contacts
+    loss = position_error + _PACE * slip.mean() + _FEET * feet + _ANGLES * turned + _CONTACTS * contacts
     spread = _compute_spread_loss(cleaned, _pack(clean))
     return {
         "loss": loss + _SPREAD * spread,
-        "error_cm": place,
+        "error_cm": position_error,
         "feet_cm_frame": feet,
         "angles_deg": torch.rad2deg(turned),
         "contacts_nats": contacts,

@@ -102,9 +102,9 @@ class InfillerTrainer(GradientTrainer[InfillerNetwork]):
             known = window.present[..., None].expand(-1, -1, CANONICAL.num_joints).clone()
             known[:, middle : middle + gap] = False
             lacking, image = window.present[..., None] & ~known, window.image(known)
-            wanted = image.from_world(window.places)
-            for name, places in (("error", self.network(image).places), ("guess", image.places)):
-                wrong = 100 * (places - wanted)
+            wanted = image.from_world(window.positions)
+            for name, positions in (("error", self.network(image).positions), ("guess", image.positions)):
+                wrong = 100 * (positions - wanted)
                 wrong = (wrong - wrong[..., :1, :]).norm(dim=-1) * lacking
                 row[f"{name}_{gap}_cm"] = float(wrong.sum() / lacking.sum())
         return row
@@ -124,26 +124,26 @@ def compute_infiller_losses(network: InfillerNetwork, window: Window, known: Ten
     network learns to fidget where a body stands still.
     """
     image = window.image(known)
-    wanted = image.from_world(window.places)
+    wanted = image.from_world(window.positions)
     proposed = network(image)
     lacking = window.present[..., None] & ~known
-    made = lacking if network.keeps_observed else window.present[..., None].expand_as(known)
-    wrong = 100 * (proposed.places - wanted)
-    weight = _weigh_windows(image.places, wanted, lacking) / (3 * made.sum(dim=(1, 2)).clamp_min(1))
-    place = (weight * (wrong.abs().sum(-1) * made).sum(dim=(1, 2))).mean()
+    filled = lacking if network.keeps_observed else window.present[..., None].expand_as(known)
+    wrong = 100 * (proposed.positions - wanted)
+    weight = _weigh_windows(image.positions, wanted, lacking) / (3 * filled.sum(dim=(1, 2)).clamp_min(1))
+    miss = (weight * (wrong.abs().sum(-1) * filled).sum(dim=(1, 2))).mean()
     pairs = window.present[:, 1:] & window.present[:, :-1]
     slip = torch.diff(wrong, dim=1) * pairs[..., None, None]
     pace = (weight * slip.abs().sum(dim=(1, 2, 3))).mean()
     planted = window.contacts[:, 1:] * window.contacts[:, :-1]
     feet = (slip[..., list(TOE_JOINTS), :].abs().sum(-1) * planted).sum() / planted.sum().clamp_min(1)
-    unsure = made[..., list(TOE_JOINTS)]
+    unsure = filled[..., list(TOE_JOINTS)]
     guessed = cross_entropy(proposed.contacts, window.contacts, reduction="none")
     contacts = (guessed * unsure).sum() / unsure.sum().clamp_min(1)
-    loss = place + _PACE * pace + _FEET * feet + _CONTACTS * contacts
+    loss = miss + _PACE * pace + _FEET * feet + _CONTACTS * contacts
     error = ((wrong - wrong[..., :1, :]).norm(dim=-1).detach() * lacking).sum() / lacking.sum().clamp_min(1)
     return {
         "loss": loss,
-        "place": place,
+        "position": miss,
         "pace": pace,
         "feet_cm_frame": feet,
         "contacts_nats": contacts,

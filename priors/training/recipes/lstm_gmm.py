@@ -313,11 +313,11 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
     def _add_free_run_gradients(self, judge: FreeRunJudge | None) -> None:
         """Add the gradient of the free runs' mismatch, and that of the critic's loss where it has joined, each clipped
         on its own: no loss drowns another."""
-        made, real = self._run_free(*self._latest)
-        moments = moment_loss(made[:, : real.shape[1]], real, FREE_RUN_MOMENTS)
+        generated, real = self._run_free(*self._latest)
+        moments = moment_loss(generated[:, : real.shape[1]], real, FREE_RUN_MOMENTS)
         self._add_gradient(moments, retain_graph=judge is not None)
         if judge is not None:
-            self._add_gradient(judge.score(made, self.generator))
+            self._add_gradient(judge.score(generated, self.generator))
 
     def _add_gradient(self, loss: Tensor, *, retain_graph: bool = False) -> None:
         parameters, processes = [p for p in self.network.parameters() if p.requires_grad], count_processes()[1]
@@ -358,7 +358,7 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
         with torch.autocast(windows.device.type, torch.bfloat16, enabled=self.settings.bfloat16):
             mixture, _ = model(inputs, (memory.hidden, memory.cell), condition=condition)
         target = torch.cat([model.normalise(windows[:, 1:])[..., :size], windows[:, 1:, size:]], dim=-1)
-        return mixture.log_prob(target, model.whitening)
+        return mixture.log_prob(target, model.inverse_cholesky)
 
     def _make_condition(self, level: Float[Tensor, "batch 1"], shown: Tensor) -> Float[Tensor, "batch conditions"]:
         """Return the network's condition: the level of its input's noise where it takes it, and labels."""

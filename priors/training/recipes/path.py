@@ -134,6 +134,6 @@ def _set_moments(network: PathNetwork, windows: PoseWindows) -> None:
     """Set means and spreads of the positions that the network sees, of motion and its mirror image."""
     batch = windows.draw(4000, 4, make_generator(0))
     seen = LocalMotion.of_world(batch.world_poses()[0], batch.heading)
-    places = torch.cat([seen.places, seen.mirrored().places])[..., 1:, :].flatten(0, 1)
-    network.mean.copy_(places.mean(dim=0))
-    network.std.copy_(places.std(dim=0).clamp_min(_MIN_STD))
+    positions = torch.cat([seen.positions, seen.mirrored().positions])[..., 1:, :].flatten(0, 1)
+    network.mean.copy_(positions.mean(dim=0))
+    network.std.copy_(positions.std(dim=0).clamp_min(_MIN_STD))

@@ -42,7 +42,7 @@ _JOINTS = CANONICAL.num_joints
 _TRUNK = CANONICAL.indices(("spine", "chest", "neck", "head"))
 
 # Weights of the loss.
-_PLACES = 10.0  # of the mean distance of joints from their true positions, metres
+_POSITIONS = 10.0  # of the mean distance of joints from their true positions, metres
 _HARM = 10.0  # of the metres by which joints are farther from there than interpolation puts them
 _PACE = 20.0  # of the error of joints' steps, metres a frame
 _TURNS = 1.0  # of the error of world rotations: norm of the difference of matrices
@@ -214,10 +214,10 @@ def measure_error(network: PoseTransformerNetwork, truth: PartialMotion, known: 
     """Measure the mean distance of unknown joints from the truth, cm, and as a share of the interpolation's."""
     shown = hide(network, replace(truth, known=known))
     unknown = ~known.positions
-    places = truth.world_poses()[0]
+    positions = truth.world_poses()[0]
     errors = [
-        float(((made - places).norm(dim=-1) * unknown).sum() / unknown.sum())
-        for made in (network(shown).poses(truth.offsets)[0], shown.world_poses()[0])
+        float(((generated - positions).norm(dim=-1) * unknown).sum() / unknown.sum())
+        for generated in (network(shown).poses(truth.offsets)[0], shown.world_poses()[0])
     ]
     return 100 * errors[0], errors[0] / errors[1]
 
@@ -243,17 +243,17 @@ def _compare(
     known = shown.known
     wanted, wanted_world = truth.world_poses()
     guess = shown.world_poses()[0]
-    made, made_world = proposed.poses(truth.offsets)
+    generated, generated_world = proposed.poses(truth.offsets)
     unknown, turned = ~known.positions, ~known.world_rotations
     count = unknown.sum(dim=(1, 2)).clamp_min(1)
     weight = _weigh_windows((guess - wanted).norm(dim=-1), unknown)
-    wrong = made - wanted
+    wrong = generated - wanted
     distance = _length(wrong)
-    places = (distance * unknown).sum(dim=(1, 2)) / count
+    positions = (distance * unknown).sum(dim=(1, 2)) / count
     slip = torch.diff(wrong, dim=1)
     slipping = unknown[:, 1:] | unknown[:, :-1]
     pace = (_length(slip) * slipping).sum(dim=(1, 2)) / count
-    twist = _length((made_world - wanted_world).flatten(-2))
+    twist = _length((generated_world - wanted_world).flatten(-2))
     turns = (twist * turned).sum(dim=(1, 2)) / turned.sum(dim=(1, 2)).clamp_min(1)
     lost = unknown[..., 0]
     hips = (distance[..., 0] * lost).sum(dim=1) / lost.sum(dim=1).clamp_min(1)
@@ -265,13 +265,13 @@ def _compare(
     contacts = (nats * unsure).sum() / unsure.sum().clamp_min(1)
     spread = _quantile_loss(proposed, distance.detach(), unknown)
     simple = ((guess - wanted).norm(dim=-1) * unknown).sum(dim=(1, 2)) / count
-    harm = (places - simple).clamp_min(0.0)
-    terms = _PLACES * places + _HARM * harm + _PACE * pace + _TURNS * turns + _HIPS * hips + _FEET * feet
+    harm = (positions - simple).clamp_min(0.0)
+    terms = _POSITIONS * positions + _HARM * harm + _PACE * pace + _TURNS * turns + _HIPS * hips + _FEET * feet
     loss = (weight * terms).mean() + _CONTACTS * contacts + spread_weight * spread
     return {
         "loss": loss,
-        "places_cm": 100 * places.mean(),
-        "share": (places / simple.clamp_min(1e-3)).mean(),
+        "positions_cm": 100 * positions.mean(),
+        "share": (positions / simple.clamp_min(1e-3)).mean(),
         "worse": (harm > 0.0015 + 0.05 * simple).float().mean(),
         "pace_cm": 100 * pace.mean(),
         "turns": turns.mean(),
@@ -311,11 +311,11 @@ def _set_moments(network: PoseTransformerNetwork, windows: PoseWindows) -> None:
     network.mean_rotation.copy_(six.mean(dim=0))
     network.std_rotation.copy_(six.std(dim=0).clamp_min(_MIN_STD_ROTATION))
     ahead = [replace(each, heading=torch.zeros_like(each.heading)) for each in both]
-    places = torch.cat([each.world_poses()[0] for each in ahead])
-    ground = torch.cat([each.root_position for each in both]) * places.new_tensor([1.0, 0.0, 1.0])
-    places = (places - ground[..., None, :]).flatten(0, 1)
-    network.mean_position.copy_(places.mean(dim=0))
-    network.std_position.copy_(places.std(dim=0).clamp_min(_MIN_STD_POSITION))
+    positions = torch.cat([each.world_poses()[0] for each in ahead])
+    ground = torch.cat([each.root_position for each in both]) * positions.new_tensor([1.0, 0.0, 1.0])
+    positions = (positions - ground[..., None, :]).flatten(0, 1)
+    network.mean_position.copy_(positions.mean(dim=0))
+    network.std_position.copy_(positions.std(dim=0).clamp_min(_MIN_STD_POSITION))
 
 
 def sample_known_parts(motion: PartialMotion, generator: torch.Generator) -> PartialMotion:

@@ -240,9 +240,9 @@ class AdversarialTrainer(Trainer[RefinerNetwork]):
         """One update of the critic (Eq. 10) on captured windows, fresh refined ones and kept ones."""
         with torch.no_grad():
             fresh, _ = self.refiner(self._draw(self.raw))
-        made = self.history.mix(fresh, self.generator)
-        odds = self.critic(torch.cat([self._draw(self.captured), made]))
-        truth = torch.cat([torch.ones(len(odds) - len(made)), torch.zeros(len(made))])
+        generated = self.history.mix(fresh, self.generator)
+        odds = self.critic(torch.cat([self._draw(self.captured), generated]))
+        truth = torch.cat([torch.ones(len(odds) - len(generated)), torch.zeros(len(generated))])
         loss = cross_entropy(odds, truth[:, None].expand_as(odds))
         right = ((odds.mean(1) > 0) == (truth > 0.5)).float().mean()
         self._step(self.critic_optimiser, self.critic, loss)
@@ -344,10 +344,10 @@ class RefinerEvaluator:
             if self.mocap[name] > 0
         }
         if min(len(refined), len(self.windows)) >= self.settings.min_clips:
-            made = [cut_windows(canonical_positions(decode(clip, GroundPose.origin()))) for clip in refined]
+            generated = [cut_windows(canonical_positions(decode(clip, GroundPose.origin()))) for clip in refined]
             seeded = torch.Generator().manual_seed(0)
             row["classifier_accuracy"] = compute_held_out_accuracy(
-                made, self.windows, generator=seeded, settings=self.settings
+                generated, self.windows, generator=seeded, settings=self.settings
             )
         return row
 

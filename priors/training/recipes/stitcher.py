@@ -32,7 +32,7 @@ from priors.stitcher import (
     Sides,
     StitcherConfig,
     StitcherNetwork,
-    count_made,
+    count_generated,
     join_sides,
     multiply_in_bfloat16,
     walk_sides,
@@ -66,7 +66,7 @@ SHARES = {"informed": 0.4, "calm": 0.3, "nearest": 0.2}
 several draws from the prior that comes nearest to the truth (the variety loss of Gupta et al. 2018, "Social GAN"). The
 rest has draws from the prior, which have only to meet."""
 WEIGHTS = {
-    "places": 10.0,  # mean distance of joints from their true positions, metres (the paper's FK loss, Eq. 7)
+    "positions": 10.0,  # mean distance of joints from their true positions, metres (the paper's FK loss, Eq. 7)
     "pace": 20.0,  # error of joints' steps, metres a frame
     "state": 0.5,  # absolute error of steps, turns and poses, in units of their spread (Eq. 6)
     "contacts": 0.1,  # cross entropy of the contacts, nats
@@ -224,9 +224,11 @@ class Transition:
             rows = features[:, at - count : at + 1]
             sides.append(torch.cat([rows[:, :1].expand(-1, context - 1 - count, -1), rows], dim=1))
             present.append((torch.arange(context) >= context - 1 - count).float())
-        place, turn = self.integrate()
+        position, turn = self.integrate()
         batch = len(self.features)
-        return Ends(torch.stack(sides), torch.stack(present)[:, None].expand(-1, batch, -1), place[:, -1], turn[:, -1])
+        return Ends(
+            torch.stack(sides), torch.stack(present)[:, None].expand(-1, batch, -1), position[:, -1], turn[:, -1]
+        )
 
     def integrate(self) -> tuple[Float[Tensor, "batch frames 2"], Float[Tensor, "batch frames"]]:
         """Return ground positions and headings of the frames between and of the second pose, seen from the first."""
@@ -238,11 +240,11 @@ class Transition:
         back = reversed_features(self.features)[:, first : first + self.frames]
         return torch.stack([self.features[:, self.between], back])
 
-    def place_joints(self, made: int) -> Float[Tensor, "2 batch made joints 3"]:
+    def place_joints(self, generated: int) -> Float[Tensor, "2 batch generated joints 3"]:
         """Place the joints of the frames that each side is to make first, metres, seen from the first pose."""
         ground, heading = self.integrate()
-        places = place_joints(self.features[:, self.between], ground, heading, CANONICAL)
-        return torch.stack([places[:, :made], places[:, :-1].flip(1)[:, :made]])
+        positions = place_joints(self.features[:, self.between], ground, heading, CANONICAL)
+        return torch.stack([positions[:, :generated], positions[:, :-1].flip(1)[:, :generated]])
 
     def true_phases(self) -> Float[Tensor, "2 batch frames 4"]:
         """Phases of each end and of all frames up to the last before the other end, in the sides' senses of time."""
@@ -295,7 +297,7 @@ class TaughtLatents:
     """Sees the truth."""
     truth: Float[Tensor, "2 batch frames size"]
     """Normalised features from each end's next frame to the other end."""
-    missed: Float[Tensor, "2 informed made size"]
+    missed: Float[Tensor, "2 informed generated size"]
     """What the calm answer misses of it, in the first rows, which are given the posterior's."""
     noise: DrawnLatents
     """Of all rows; zeros at the mean."""
@@ -310,7 +312,7 @@ class TaughtLatents:
         if not count:
             self.nats.append(self.noise.shared[:0])
             return self.noise.share(prior, seen)
-        found = self.posterior.tell_shared(self.missed)
+        found = self.posterior.infer_shared(self.missed)
         self.cost = found.diverge(Gaussian(torch.zeros_like(found.mean), torch.zeros_like(found.mean)))
         # Held to a prior that sees the ends, the posterior would learn to encode nothing but these.
         self.nats.append(found.detach().diverge(prior.row(slice(count))))
@@ -321,7 +323,7 @@ class TaughtLatents:
         """A frame's, of both sides."""
         last = self.truth.shape[2] - 1
         ahead = [min(step + number, last) for number in range(SEEN_FUTURE)]
-        found = self.posterior.tell_own(self.truth[:, :, ahead], encoded)
+        found = self.posterior.infer_own(self.truth[:, :, ahead], encoded)
         self.nats.append(found.diverge(prior).mean(dim=0))
         noise = self.noise.slow[:, :, step]
         informed = torch.arange(noise.shape[1]) < self.missed.shape[1]
@@ -338,29 +340,29 @@ class TaughtLatents:
 
 
 @torch.no_grad()
-def miss_calmly(network: StitcherNetwork, truth: Transition) -> Float[Tensor, "2 batch made size"]:
+def miss_calmly(network: StitcherNetwork, truth: Transition) -> Float[Tensor, "2 batch generated size"]:
     """Return what the calm answer to the ends of transitions misses of the truth, in units of the features' spread."""
-    count, made = len(truth.features), count_made(network, truth.frames)
+    count, generated = len(truth.features), count_generated(network, truth.frames)
     if not count:
-        return network.mean.new_zeros(2, 0, made, len(network.mean))
-    calm = DrawnLatents.calm(network.config, count, made)
+        return network.mean.new_zeros(2, 0, generated, len(network.mean))
+    calm = DrawnLatents.calm(network.config, count, generated)
     found = walk_sides(network, truth.ends(), truth.frames, calm).features
-    return (truth.truth()[:, :, :made] - found) / network.std
+    return (truth.truth()[:, :, :generated] - found) / network.std
 
 
 @torch.no_grad()
 def sample_nearest(network: StitcherNetwork, truth: Transition, generator: torch.Generator) -> DrawnLatents:
     """Sample several latents for each of some transitions, and return those whose answers have joints nearest to the
     truth."""
-    count, made = len(truth.features), count_made(network, truth.frames)
+    count, generated = len(truth.features), count_generated(network, truth.frames)
     tries = TRIES if count else 0
     every = torch.arange(count).repeat(tries)
-    noise = DrawnLatents.sample(network.config, len(every), made, generator)
+    noise = DrawnLatents.sample(network.config, len(every), generated, generator)
     if not tries:
         return noise
     repeated = truth.rows(every)
     sides = walk_sides(network, repeated.ends(), truth.frames, noise)
-    away = (sides.place_joints() - repeated.place_joints(made)).norm(dim=-1)
+    away = (sides.place_joints() - repeated.place_joints(generated)).norm(dim=-1)
     best = away.mean(dim=(0, 2, 3)).unflatten(0, (tries, count)).argmin(dim=0)
     return noise.rows(best * count + torch.arange(count))
 
@@ -372,7 +374,7 @@ def find_stitcher_losses(
     batch = len(truth.features)
     informed, calm, compared = (round(batch * share) for share in itertools.accumulate(SHARES.values()))
     row = torch.arange(batch)
-    noise = DrawnLatents.sample(network.config, batch, count_made(network, truth.frames), generator)
+    noise = DrawnLatents.sample(network.config, batch, count_generated(network, truth.frames), generator)
     noise = noise.still((row >= informed) & (row < calm))
     nearest = row[calm:compared]
     noise = noise.put(nearest, sample_nearest(network, truth.rows(nearest), generator))
@@ -382,7 +384,7 @@ def find_stitcher_losses(
     parts, distance, slip = _compare(network, truth, sides, compared)
     parts |= latents.diverge()
     errors = {
-        "places_cm": 100 * distance[:, :informed].mean() if informed else torch.zeros(()),
+        "positions_cm": 100 * distance[:, :informed].mean() if informed else torch.zeros(()),
         "calm_cm": 100 * distance[:, informed:calm].mean() if calm > informed else torch.zeros(()),
         "nearest_cm": 100 * distance[:, calm:].mean() if compared > calm else torch.zeros(()),
         "pace_cm": 100 * slip.mean(),
@@ -399,39 +401,45 @@ def find_stitcher_losses(
 
 def _compare(
     network: StitcherNetwork, truth: Transition, sides: Sides, compared: int
-) -> tuple[dict[str, Tensor], Float[Tensor, "sides compared made joints"], Float[Tensor, "sides compared made joints"]]:
+) -> tuple[
+    dict[str, Tensor],
+    Float[Tensor, "sides compared generated joints"],
+    Float[Tensor, "sides compared generated joints"],
+]:
     """Compare the first rows with the truth, and let all of them meet and stand; also return the distances of joints
     from their true places, and the errors of their steps, metres."""
-    made = sides.features.shape[2]
-    true, places = truth.truth()[:, :compared, :made], sides.place_joints()
+    generated = sides.features.shape[2]
+    true, positions = truth.truth()[:, :compared, :generated], sides.place_joints()
     # Windows that interpolation nearly solves count for more, or the network learns to fidget where bodies stand still.
     ease = weigh_windows(truth)[:compared]
-    wrong = places[:, :compared] - truth.place_joints(made)[:, :compared]
+    wrong = positions[:, :compared] - truth.place_joints(generated)[:, :compared]
     distance = _measure_length(wrong)
     slip = _measure_length(torch.diff(wrong, dim=2, prepend=torch.zeros_like(wrong[:, :, :1])))
     off = ((sides.features[:, :compared] - true) / network.std).abs()
-    steps = _measure_length(torch.diff(places[..., list(TOE_JOINTS), :], dim=2))
+    steps = _measure_length(torch.diff(positions[..., list(TOE_JOINTS), :], dim=2))
     # A draw is compared with no truth: toes that its own sides call planted are to stand.
     stand = torch.cat([true[..., POSE.stop :], sides.features[:, compared:, :, POSE.stop :].detach()], dim=1)
     planted = stand[:, :, 1:] * stand[:, :, :-1]
-    phases = torch.cat([sides.at_ends[:, :, None], sides.phases[:, :, : made - 1]], dim=2)[:, :compared]
+    phases = torch.cat([sides.at_ends[:, :, None], sides.phases[:, :, : generated - 1]], dim=2)[:, :compared]
     parts = {
-        "places": (ease * distance.mean(dim=(0, 2, 3))).mean(),
+        "positions": (ease * distance.mean(dim=(0, 2, 3))).mean(),
         "pace": (ease * slip.mean(dim=(0, 2, 3))).mean(),
         "state": (ease * (off[..., PACE].mean(dim=-1) + off[..., POSE].mean(dim=-1)).mean(dim=(0, 2))).mean(),
         "contacts": cross_entropy(sides.logits[:, :compared], true[..., POSE.stop :]),
         "feet": (steps * planted).sum() / planted.sum().clamp_min(1),
-        "stitching": measure_apart(places, truth.frames).mean(),
-        "phase": (phases - truth.true_phases()[:, :compared, :made]).abs().mean(),
+        "stitching": measure_apart(positions, truth.frames).mean(),
+        "phase": (phases - truth.true_phases()[:, :compared, :generated]).abs().mean(),
     }
     return parts, distance, slip
 
 
-def measure_apart(places: Float[Tensor, "2 batch made joints 3"], frames: int) -> Float[Tensor, "batch overlap"]:
+def measure_apart(
+    positions: Float[Tensor, "2 batch generated joints 3"], frames: int
+) -> Float[Tensor, "batch overlap"]:
     """Measure the mean distance of the sides' joints in the frames that both made, metres."""
-    made = places.shape[2]
-    first = frames - made
-    return _measure_length(places[0, :, first - 1 :] - places[1, :, first - 1 :].flip(1)).mean(dim=-1)
+    generated = positions.shape[2]
+    first = frames - generated
+    return _measure_length(positions[0, :, first - 1 :] - positions[1, :, first - 1 :].flip(1)).mean(dim=-1)
 
 
 @torch.no_grad()
@@ -485,8 +493,8 @@ def calibrate_temperature(network: StitcherNetwork, windows: TransitionWindows) 
         truth = windows.draw(_WINDOWS, gap + 1, Known(), make_generator(gap))
         true = interpolate(truth)[0].joints_world()[:, :-1]
         unit = (place_answers(network, truth) - true).norm(dim=-1).mean()
-        generator, batch, made = make_generator(0), len(truth.features), count_made(network, truth.frames)
-        draws = [DrawnLatents.sample(network.config, batch, made, generator) for _ in range(_DRAWS)]
+        generator, batch, generated = make_generator(0), len(truth.features), count_generated(network, truth.frames)
+        draws = [DrawnLatents.sample(network.config, batch, generated, generator) for _ in range(_DRAWS)]
         for number, temperature in enumerate(TEMPERATURES):
             placed = torch.stack([place_answers(network, truth, each.scale(temperature)) for each in draws])
             scores[number] += (placed - true).norm(dim=-1).mean(dim=(2, 3)).amin(dim=0).mean() / unit
@@ -498,7 +506,7 @@ def place_answers(
 ) -> Float[Tensor, "batch frames joints 3"]:
     """Return the joints' positions, metres, seen from the first pose, that a stitcher puts between the ends of
     transitions; with latents at their mean unless others are given."""
-    calm = DrawnLatents.calm(network.config, len(truth.features), count_made(network, truth.frames))
+    calm = DrawnLatents.calm(network.config, len(truth.features), count_generated(network, truth.frames))
     joined = join_sides(walk_sides(network, truth.ends(), truth.frames, latents or calm))
     offsets = CANONICAL.offsets.to(joined.quats)
     return forward_kinematics(offsets, CANONICAL.parents, joined.root_position, joined.quats)[0]

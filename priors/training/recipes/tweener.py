@@ -50,7 +50,7 @@ from priors.tweener import (
     PAPER,
     GeneratorConfig,
     GeneratorNetwork,
-    ToldParts,
+    GivenParts,
     encode_classes,
     find_class,
     make_key_image,
@@ -61,7 +61,7 @@ _JOINTS = CANONICAL.num_joints
 _LEGS = frozenset(j for j, name in enumerate(CANONICAL.names) if name.endswith(("Leg", "Foot", "Toes")))
 
 WEIGHTS = {
-    "places": 10.0,  # distance of joints from their true positions, seen from the hips, metres
+    "positions": 10.0,  # distance of joints from their true positions, seen from the hips, metres
     "turns": 1.0,  # error of local rotations: norm of the difference of matrices
     "pace": 20.0,  # error of the joints' steps, metres a frame
     "activity": 20.0,  # error of joints' mean speed and acceleration over a second, metres a frame (and frame)
@@ -75,7 +75,7 @@ WEIGHTS = {
     "regularisation": 0.05,  # batch regularisation (Eq. 9)
 }
 """Weights of the losses."""
-_METRES = ("places", "pace", "activity", "feet", "keys", "path", "root", "style", "dwell")
+_METRES = ("positions", "pace", "activity", "feet", "keys", "path", "root", "style", "dwell")
 _HALF = 60.0  # frames from the nearest key at which what a performer did counts half
 _DWELL = 5  # frames for which a pose of the style must be near: none flashes up
 _PATH_SPANS = (1, 8, 32, 96)
@@ -102,7 +102,11 @@ _SPLICED_FROM = 90  # frames of the shortest gap with a splice, 3 s
 _RUNS, _RUN = 0.4, 12  # share of keys that are several frames, a pose and its pace, and their most frames
 _OPEN_ENDS = 0.1  # share of sequences that begin, and as many that end, without a key
 _SPEED = 1.5  # m/s, below which the hips travel where clips are spliced
-_HALVES, _PLACES, _DRAWINGS = 0.1, 0.1, 0.1  # shares with keys of parts of a body, of ground positions, and drawings
+_HALVES, _POSITION_KEYS, _DRAWINGS = (
+    0.1,
+    0.1,
+    0.1,
+)  # shares with keys of parts of a body, of ground positions, and drawings
 
 # Validation.
 _VALIDATED_FRAMES = 192  # of the gap that is validated, 6.4 s; of shorter clips all but the ends
@@ -116,7 +120,7 @@ class KeySequences:
 
     motion: PartialMotion
     """Poses by frame; between keys of different clips they are anything finite."""
-    told: ToldParts
+    given: GivenParts
     """What is known of the frames that are keys."""
     truthful: Bool[Tensor, "batch frames"]
     """Whether the poses between the keys are a performer's."""
@@ -128,7 +132,7 @@ class KeySequences:
     @property
     def known(self) -> Bool[Tensor, "batch frames"]:
         """Whether a frame is a key."""
-        return self.told.known
+        return self.given.known
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -240,10 +244,10 @@ def find_longest_gap(progress: float) -> float:
 
 def choose_parts(
     known: Bool[Tensor, "batch frames"], heading: Float[Tensor, "batch frames"], partial: bool, rolls: Iterator[float]
-) -> ToldParts:
+) -> GivenParts:
     """Choose what is known in frames that are keys, of motions with these headings, radians: of most sequences all of
     the pose, and of all of them unless `partial`."""
-    whole = ToldParts.whole(known)
+    whole = GivenParts.whole(known)
     axes, faced, view = whole.axes.clone(), whole.heading.clone(), whole.view.clone()
     for row in range(len(known)):
         kind = next(rolls)
@@ -253,18 +257,18 @@ def choose_parts(
         if partial and kind < _HALVES:
             for run in runs:
                 axes[row, run] = _draw_part(rolls)[:, None]
-        elif partial and kind < _HALVES + _PLACES:
+        elif partial and kind < _HALVES + _POSITION_KEYS:
             kept = 0.4 * (next(rolls) < 0.6)
             for run in runs:
                 if next(rolls) >= kept:
-                    axes[row, run], faced[row, run] = _PLACE, False
-        elif partial and kind < _HALVES + _PLACES + _DRAWINGS:
+                    axes[row, run], faced[row, run] = _GROUND_POSITION, False
+        elif partial and kind < _HALVES + _POSITION_KEYS + _DRAWINGS:
             view[row] = _draw_view(float(heading[row, runs[0].start]), rolls)
             for run in runs:
                 if next(rolls) < 0.75:
                     axes[row, run], faced[row, run] = False, False
                     axes[row, run.start] = _draw_drawing(rolls)
-    return ToldParts(axes, faced, view)
+    return GivenParts(axes, faced, view)
 
 
 def _see_joints(turning: Iterable[int]) -> Bool[Tensor, " joints"]:
@@ -277,8 +281,8 @@ def _see_joints(turning: Iterable[int]) -> Bool[Tensor, " joints"]:
 
 _UPPER, _LOWER = (_see_joints({0, *part}) for part in (set(range(_JOINTS)) - _LEGS, _LEGS))
 _HIPS = _see_joints({0})
-_PLACE = torch.zeros(_JOINTS, 3, dtype=torch.bool)
-_PLACE[0, ::2] = True
+_GROUND_POSITION = torch.zeros(_JOINTS, 3, dtype=torch.bool)
+_GROUND_POSITION[0, ::2] = True
 
 
 def _draw_part(rolls: Iterator[float]) -> Bool[Tensor, " joints"]:
@@ -396,10 +400,10 @@ def _leave(windows: PoseWindows, part: _Part, gap: int, rolls: Iterator[float], 
     """Go on with another clip after so many frames, at a distance that is proportional to them."""
     new, last = _begin(windows, rolls, generator), part.stop - 1
     before = windows.starts[part.clip] + part.time_at(last)
-    place = rotations.rotate_ground(windows.ground[before], torch.tensor(part.turn)) + part.shift
-    way = gap / 30 * _SPEED * next(rolls)
+    position = rotations.rotate_ground(windows.ground[before], torch.tensor(part.turn)) + part.shift
+    travelled = gap / 30 * _SPEED * next(rolls)
     towards = 2 * math.pi * next(rolls)
-    shift = new.shift + place + way * torch.tensor([math.sin(towards), math.cos(towards)])
+    shift = new.shift + position + travelled * torch.tensor([math.sin(towards), math.cos(towards)])
     start = last + gap
     return replace(new, start=start, key=start, stop=start + new.stop, truthful_from=start, shift=shift)
 
@@ -457,10 +461,10 @@ def _finish(
 
 
 def see_without_root(
-    places: Float[Tensor, "*batch joints 3"], hips_world_matrix: Float[Tensor, "*batch 3 3"]
+    positions: Float[Tensor, "*batch joints 3"], hips_world_matrix: Float[Tensor, "*batch 3 3"]
 ) -> Float[Tensor, "*batch joints 3"]:
     """Return positions from the hips without the hips' rotation."""
-    return places @ hips_world_matrix
+    return positions @ hips_world_matrix
 
 
 def compute_tweener_losses(
@@ -476,33 +480,33 @@ def compute_tweener_losses(
     more other motions would do as well.
     """
     motion, known = sequences.motion, sequences.known
-    image = make_key_image(motion, sequences.told)
-    made_poses = network(image, network.style(style_poses) * styled[:, None])
-    made = made_poses.turn_to_world(image)
-    wanted = image.places - image.places[..., :1, :]  # seen from the hips, as what is made
+    image = make_key_image(motion, sequences.given)
+    generated_poses = network(image, network.style(style_poses) * styled[:, None])
+    generated = generated_poses.turn_to_world(image)
+    wanted = image.positions - image.positions[..., :1, :]  # seen from the hips, as what is made
     local = motion.local_matrices()
     weight = _weigh_frames(known) * sequences.truthful
-    shown = _Errors(made_poses.pose.places, wanted)
-    heading = kinematics.heading_of_matrix(made.local_matrix[..., 0, :, :])
+    shown = _Errors(generated_poses.pose.positions, wanted)
+    heading = kinematics.heading_of_matrix(generated.local_matrix[..., 0, :, :])
     some = slice(0, -(-len(known) // _SOME))
-    turned = _length((made.local_matrix[some] - local[some]).flatten(-2)).mean(dim=-1)
-    whole = sequences.told.axes[some].flatten(2).all(dim=-1).float()
+    turned = _length((generated.local_matrix[some] - local[some]).flatten(-2)).mean(dim=-1)
+    whole = sequences.given.axes[some].flatten(2).all(dim=-1).float()
     terms = {
-        "places": shown.places(weight),
+        "positions": shown.positions(weight),
         "turns": _average(turned, weight[some]),
         "pace": shown.pace(_between(weight)),
         "activity": shown.activity(sequences.truthful),
         "feet": shown.feet(motion, _between(weight)),
-        "keys": shown.keys(sequences.told) + 0.1 * _average(turned, whole),
+        "keys": shown.keys(sequences.given) + 0.1 * _average(turned, whole),
     }
-    trajectory = path(LocalMotion.of_world(made.places[some], heading[some]))
-    way = trajectory.integrate(heading[some])
-    terms |= _compute_path_terms(trajectory, way, sequences, some)
-    without_root = see_without_root(made.places, made.local_matrix[..., 0, :, :])
+    trajectory = path(LocalMotion.of_world(generated.positions[some], heading[some]))
+    travelled = trajectory.integrate(heading[some])
+    terms |= _compute_path_terms(trajectory, travelled, sequences, some)
+    without_root = see_without_root(generated.positions, generated.local_matrix[..., 0, :, :])
     apart = torch.cdist(style_poses.flatten(-2), without_root.flatten(-2)) / len(CANONICAL.names) ** 0.5
     terms["style"] = _compute_style_error(apart, styled)
     terms["dwell"] = _compute_dwell_error(apart, known, styled)
-    terms["regularisation"] = regularise_batch(tuple(each[some] for each in made_poses.responses))
+    terms["regularisation"] = regularise_batch(tuple(each[some] for each in generated_poses.responses))
     loss = torch.stack([WEIGHTS[name] * value for name, value in terms.items()]).sum()
     shown_cm = {f"{name}_cm": 100 * terms[name] for name in _METRES}
     return {"loss": loss, **shown_cm, **{name: terms[name] for name in ("turns", "contacts", "regularisation")}}
@@ -511,12 +515,14 @@ def compute_tweener_losses(
 class _Errors:
     """Errors of places, seen from the hips along the reference, weighed by frame."""
 
-    def __init__(self, made: Float[Tensor, "batch frames joints 3"], wanted: Float[Tensor, "batch frames joints 3"]):
-        self.off = made - wanted
-        self.made_steps, self.wanted_steps = torch.diff(made, dim=1), torch.diff(wanted, dim=1)
-        self.off_steps = self.made_steps - self.wanted_steps
+    def __init__(
+        self, generated: Float[Tensor, "batch frames joints 3"], wanted: Float[Tensor, "batch frames joints 3"]
+    ):
+        self.off = generated - wanted
+        self.generated_steps, self.wanted_steps = torch.diff(generated, dim=1), torch.diff(wanted, dim=1)
+        self.off_steps = self.generated_steps - self.wanted_steps
 
-    def places(self, weight: Tensor) -> Tensor:
+    def positions(self, weight: Tensor) -> Tensor:
         return _average(_length(self.off).mean(dim=-1), weight)
 
     def pace(self, weight: Tensor) -> Tensor:
@@ -528,16 +534,18 @@ class _Errors:
             return self.off.new_zeros(())
         error = self.off.new_zeros(())
         for times in (0, 1):
-            made, wanted = (_length(torch.diff(each, n=times, dim=1)) for each in (self.made_steps, self.wanted_steps))
+            generated, wanted = (
+                _length(torch.diff(each, n=times, dim=1)) for each in (self.generated_steps, self.wanted_steps)
+            )
             counts = _average_seconds(truthful[:, 1 + times :, None].float())[..., 0] > 0.999
-            off = (_average_seconds(made) - _average_seconds(wanted)).abs().mean(dim=-1)
+            off = (_average_seconds(generated) - _average_seconds(wanted)).abs().mean(dim=-1)
             error = error + _average(off, counts)
         return error
 
-    def keys(self, told: ToldParts) -> Tensor:
+    def keys(self, given: GivenParts) -> Tensor:
         """Compare the coordinates that are known at keys, of joints but the hips, from which they are seen."""
-        joints = told.axes[..., 1:, :].any(dim=-1).float()
-        return _average(_length((self.off * told.axes)[..., 1:, :]), joints)
+        joints = given.axes[..., 1:, :].any(dim=-1).float()
+        return _average(_length((self.off * given.axes)[..., 1:, :]), joints)
 
     def feet(self, motion: PartialMotion, weight: Tensor) -> Tensor:
         planted = motion.contacts[:, 1:] * motion.contacts[:, :-1]
@@ -545,7 +553,7 @@ class _Errors:
 
 
 def _compute_path_terms(
-    trajectory: RootTrajectory, made: Tensor, sequences: KeySequences, some: slice
+    trajectory: RootTrajectory, generated: Tensor, sequences: KeySequences, some: slice
 ) -> dict[str, Tensor]:
     """Errors of where the hips of some sequences go, as the path predictor sees it, metres, and of contacts, nats."""
     motion, known, truthful = sequences.motion, sequences.known[some], sequences.truthful[some]
@@ -554,11 +562,11 @@ def _compute_path_terms(
     errors = []
     for span in [span for span in _PATH_SPANS if span < steps.shape[1]]:
         whole = steps.unfold(1, span + 1, 1).amin(dim=-1)
-        errors.append(_average(compute_displacement_errors(made[..., ::2], hips[..., ::2], span), whole))
-    height = _average((made[..., 1] - hips[..., 1]).abs(), steps)
-    placed = sequences.told.placed[some].float()
+        errors.append(_average(compute_displacement_errors(generated[..., ::2], hips[..., ::2], span), whole))
+    height = _average((generated[..., 1] - hips[..., 1]).abs(), steps)
+    placed = sequences.given.placed[some].float()
     share = placed / placed.sum(dim=1, keepdim=True).clamp_min(1)
-    off = (made - hips)[..., ::2]
+    off = (generated - hips)[..., ::2]
     off = off - (off * share[..., None]).sum(dim=1, keepdim=True)
     nats = cross_entropy(trajectory.contacts, contacts, reduction="none").mean(dim=-1)
     return {
@@ -621,9 +629,9 @@ def _set_moments(network: GeneratorNetwork, windows: PoseWindows) -> None:
     local = batch.local_matrices()
     seen = see_from_hips(kinematics.positions_from_matrices(CANONICAL, local), local[..., 0, :, :])
     seen = seen + batch.root_position[..., None, :] * torch.tensor([0.0, 1.0, 0.0])
-    places = torch.cat([seen, mirror_positions(seen)]).flatten(0, 1)
-    network.mean.copy_(places.mean(dim=0))
-    network.std.copy_(places.std(dim=0).clamp_min(_MIN_STD))
+    positions = torch.cat([seen, mirror_positions(seen)]).flatten(0, 1)
+    network.mean.copy_(positions.mean(dim=0))
+    network.std.copy_(positions.std(dim=0).clamp_min(_MIN_STD))
 
 
 def draw_style_poses(
@@ -667,13 +675,13 @@ def _measure_clips(network: GeneratorNetwork, windows: PoseWindows, clips: Seque
         motion = windows.at(torch.tensor([number]), torch.zeros(1, dtype=torch.long), frames, torch.ones(1))
         for name, found in measure_gap(network, motion).items():
             sums[name] += found
-    made, slerp, true = (sums[name] for name in ("made", "slerp", "true"))
+    generated, slerp, true = (sums[name] for name in ("made", "slerp", "true"))
     return {
-        "error_cm": made.error / made.count,
+        "error_cm": generated.error / generated.count,
         "slerp_cm": slerp.error / slerp.count,
-        "speed": made.speed / true.speed,
-        "spread": made.spread / true.spread,
-        "jerk": made.jerk / true.jerk,
+        "speed": generated.speed / true.speed,
+        "spread": generated.spread / true.spread,
+        "jerk": generated.jerk / true.jerk,
     }
 
 
@@ -682,14 +690,14 @@ def measure_gap(network: GeneratorNetwork, motion: PartialMotion) -> dict[str, L
     """Measure what is made between the first and the last pose of one motion, beside slerp and the truth."""
     known = torch.zeros(motion.heading.shape, dtype=torch.bool)
     known[:, [0, -1]] = True
-    image = make_key_image(motion, ToldParts.whole(known))
-    made = network(image, torch.zeros(1, network.config.style)).turn_to_world(image)
+    image = make_key_image(motion, GivenParts.whole(known))
+    generated = network(image, torch.zeros(1, network.config.style)).turn_to_world(image)
     local = motion.local_matrices()
     true = see_from_hips(kinematics.positions_from_matrices(CANONICAL, local), local[..., 0, :, :])[0]
     shown = replace(motion, known=KnownParts.whole(known))
     guess = interpolate_partial_motion(shown, motion.quats[0, 0], 0.0).local_matrices()
     slerp = see_from_hips(kinematics.positions_from_matrices(CANONICAL, guess), guess[..., 0, :, :])[0]
-    mine = see_from_hips(made.places, made.local_matrix[..., 0, :, :])[0]
+    mine = see_from_hips(generated.positions, generated.local_matrix[..., 0, :, :])[0]
     inside = ~known[0]
     return {
         name: measure_liveliness(seen, true, inside)

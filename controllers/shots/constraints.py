@@ -28,7 +28,7 @@ _CONFLICT_FRAMES = 20  # before and after a wish, in which others are against it
 
 
 @dataclass(frozen=True)
-class Wish:
+class Constraint:
     """One wish of a shot."""
 
     name: str
@@ -61,12 +61,12 @@ class Wish:
     def as_row(self) -> dict[str, Any]:
         """Return the wish as a report shows it."""
         names = ("asked", "got", "unit", "residual", "holds", "remedy", "seconds")
-        return {"wish": self.name, **{name: getattr(self, name) for name in names}}
+        return {"constraint": self.name, **{name: getattr(self, name) for name in names}}
 
 
-def check_wishes(
+def check_constraints(
     request: ShotRequest, trajectory: Trajectory, motion: Motion, met: Sequence[MetPose] = ()
-) -> tuple[Wish, ...]:
+) -> tuple[Constraint, ...]:
     """Measure every wish of a request on its motion, at PRIOR_FPS; poses as they were met."""
     positions = motion.joint_positions()
     hips = positions[:, 0, ::2]
@@ -74,48 +74,48 @@ def check_wishes(
     off = _measure_offsets(trajectory, positions[:, 0])[away]
     behind = (hips - trajectory.curve.ground_point(trajectory.arcs)).norm(dim=-1)[away]
     found = [
-        Wish("path", "on the curve", 100 * float(off.mean()), _PATH_CM, "cm"),
-        Wish("progress", "on time", 100 * float(behind.max()), _PROGRESS_CM, "cm"),
+        Constraint("path", "on the curve", 100 * float(off.mean()), _PATH_CM, "cm"),
+        Constraint("progress", "on time", 100 * float(behind.max()), _PROGRESS_CM, "cm"),
     ]
     if request.loop:
         steps = torch.diff(torch.cat([positions, positions[:1]]), dim=0).norm(dim=-1).amax(dim=1) * PRIOR_FPS
         most = _SEAM_RATIO * float(steps[:-1].max())
-        found.append(Wish("loop", "last frame leads into the first", float(steps[-1]), most, "m/s"))
+        found.append(Constraint("loop", "last frame leads into the first", float(steps[-1]), most, "m/s"))
     for reach in request.reaches:
         targets = ReachTargets.of((reach,), motion.num_frames).targets
         miss = 100 * float(compute_target_errors(positions, targets).max())
-        name = f"{', '.join(reach.places)} at {round(reach.seconds, 2):g} s"
-        limit = max(_REACH_CM, 100 * max(map(reach.tolerance_of, reach.places)))
+        name = f"{', '.join(reach.positions)} at {round(reach.seconds, 2):g} s"
+        limit = max(_REACH_CM, 100 * max(map(reach.tolerance_of, reach.positions)))
         remedy = _find_remedy(reach, motion) if miss > limit else ""
-        found.append(Wish(name, _held(reach), miss, limit, "cm", remedy=remedy, seconds=_span(reach)))
+        found.append(Constraint(name, _held(reach), miss, limit, "cm", remedy=remedy, seconds=_span(reach)))
     found += [_check_pose(one, motion) for one in met]
     for look in request.looks:
         worst = float(measure_look_errors(motion, look).max())
         name = f"look at {round(look.seconds, 2):g} s"
-        found.append(Wish(name, "straight", worst, _LOOK_DEG, "degrees", seconds=_span(look)))
+        found.append(Constraint(name, "straight", worst, _LOOK_DEG, "degrees", seconds=_span(look)))
     if request.obstacles:
         clear = 100 * float(measure_clearance(request.obstacles, positions[..., ::2]).amin())
-        found.append(Wish("obstacles", "no joint within", clear, 0.0, "cm", at_least=True))
+        found.append(Constraint("obstacles", "no joint within", clear, 0.0, "cm", at_least=True))
     if request.others is not None and not request.others.courtesy:
         apart = 100 * float((hips[None] - request.others.at(torch.arange(len(hips)))).norm(dim=-1).amin())
         asked = f"{request.others.distance:g} m"
-        found.append(Wish("keep apart", asked, apart, 100 * request.others.distance - 1.0, "cm", at_least=True))
+        found.append(Constraint("keep apart", asked, apart, 100 * request.others.distance - 1.0, "cm", at_least=True))
     speeds, last = 100 * torch.diff(hips, dim=0).norm(dim=-1) * PRIOR_FPS, (motion.num_frames - 1) / PRIOR_FPS
     ends = {"start": (request.stand_at_start, slice(_STILL_AT_START), (0.0, _STILL_AT_START / PRIOR_FPS))}
     ends["end"] = (request.stand_at_end, slice(-_STILL_AT_END, None), (last - _STILL_AT_END / PRIOR_FPS, last))
     for end, (stands, frames, seconds) in ends.items():
         if stands:
             moved = float(speeds[frames].mean())
-            found.append(Wish(f"stand at the {end}", "still", moved, _STILL_CM_S, "cm/s", seconds=seconds))
+            found.append(Constraint(f"stand at the {end}", "still", moved, _STILL_CM_S, "cm/s", seconds=seconds))
     return tuple(found)
 
 
-def describe_conflicts(wishes: Sequence[Wish], trajectory: Trajectory, motion: Motion) -> list[str]:
+def describe_conflicts(constraints: Sequence[Constraint], trajectory: Trajectory, motion: Motion) -> list[str]:
     """Describe every wish that does not hold: by how much, which others do not hold at that time, and what would settle
     it."""
     sentences, offsets = [], _measure_offsets(trajectory, motion.root_position)
-    for one in (wish for wish in wishes if not wish.holds):
-        rivals = [other for other in wishes if other is not one and not other.holds and _overlap(one, other)]
+    for one in (constraint for constraint in constraints if not constraint.holds):
+        rivals = [other for other in constraints if other is not one and not other.holds and _overlap(one, other)]
         against = [f"{other.name}, {other.residual:.1f} {other.unit} short" for other in rivals]
         if one.seconds is not None:
             first, last = (round(second * PRIOR_FPS) for second in one.seconds)
@@ -128,7 +128,7 @@ def describe_conflicts(wishes: Sequence[Wish], trajectory: Trajectory, motion: M
     return sentences
 
 
-def _overlap(one: Wish, other: Wish) -> bool:
+def _overlap(one: Constraint, other: Constraint) -> bool:
     """Return whether two wishes are at one time."""
     if one.seconds is None or other.seconds is None:
         return True
@@ -144,24 +144,24 @@ def _held(key: Reach | PoseKey) -> str:
     return f"held {key.hold_seconds:g} s" if key.hold_seconds else "there"
 
 
-def _check_pose(met: MetPose, motion: Motion) -> Wish:
+def _check_pose(met: MetPose, motion: Motion) -> Constraint:
     """Measure by how much a key is missed."""
     metres, degrees = measure_pose_error(motion, met)
     key = met.key
     if key.gives_facing_alone:
         name = f"facing {key.facing_deg:g} degrees at {key.seconds:.2f} s"
-        return Wish(name, _held(key), degrees, max(_FACING_DEG, key.most), "degrees", seconds=_span(key))
+        return Constraint(name, _held(key), degrees, max(_FACING_DEG, key.most), "degrees", seconds=_span(key))
     name = f"{'pose' if key.gives_body else 'hips'} at {key.seconds:.2f} s"
-    return Wish(name, _held(key), 100 * metres, max(_POSE_CM, 100 * key.most), "cm", seconds=_span(key))
+    return Constraint(name, _held(key), 100 * metres, max(_POSE_CM, 100 * key.most), "cm", seconds=_span(key))
 
 
 def _find_remedy(reach: Reach, motion: Motion) -> str:
     """Find when the character comes within reach of the place, or by how much nearer it would have to be; nothing where
     it is within reach at the wanted time, and something else is in the way."""
     lacking = torch.zeros(motion.num_frames, dtype=torch.float64)
-    for name, place in reach.places.items():
+    for name, position in reach.positions.items():
         limb = LIMBS[name]
-        away = motion.joint_positions()[:, limb.upper] - motion.root_position.new_tensor(place)
+        away = motion.joint_positions()[:, limb.upper] - motion.root_position.new_tensor(position)
         lacking = torch.maximum(lacking, away.norm(dim=-1) - STRETCHED_SHARE * limb.length(motion.skeleton))
     wanted = reach.seconds * PRIOR_FPS
     within = (lacking <= 0).nonzero()[:, 0]
