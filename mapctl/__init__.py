@@ -1,4 +1,5 @@
-"""mapctl: human motion by optimisation. A learned prior says what is natural, terms say what is wanted."""
+"""mapctl: human motion by optimisation. A learned prior scores how natural a motion is, weighted terms how well it
+meets the request."""
 
 from importlib import import_module
 from typing import TYPE_CHECKING

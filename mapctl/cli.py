@@ -50,7 +50,7 @@ _MESSAGE_REWRITES = (
     (r" Arguments are applied to .*", ""),
     (r" or misplaced options", " options"),
 )
-"""What Python and tyro say, and what people understand."""
+"""Messages of Python and tyro, and those shown instead."""
 STYLE = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
 
 
@@ -128,7 +128,7 @@ def _subcommand(name: str, kind: type) -> Any:
 
 
 def _shorten_usage_error(box: str) -> str:
-    """What tyro explains in a box of many lines, in one: its first paragraph, and a hint if there is one.
+    """Return tyro's boxed message as one line: its first paragraph, and a hint if there is one.
 
     The box has a title line, and rules between its paragraphs; colours where standard output is a terminal.
     """
@@ -182,7 +182,7 @@ def _print_error(message: str, status: int) -> int:
 
 
 def _report_interruption(received: Sequence[int], kept: str) -> int:
-    """Say that work was ended, and what there is of it; without a signal it was Ctrl-C."""
+    """Report that work was interrupted, and the results kept; without a signal it was Ctrl-C."""
     number = received[-1] if received else signal.SIGINT
     how = "interrupted" if number == signal.SIGINT else "terminated"
     return _print_error("; ".join(filter(None, (how, kept))), SIGNALLED + number)

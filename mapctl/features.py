@@ -175,7 +175,7 @@ def reversed_features(features: Float[Tensor, "*batch frames size"]) -> Float[Te
     turn that are returned.
 
     Equal to `encode` of the reversed motion but for contacts, now and then, at the frame where one begins or ends: how
-    low a toe is belongs to the frame, how slow it is to the way there, and features hold only whether it is both. For
+    low a toe is belongs to the frame, how slow it is to the step there, and features hold only whether it is both. For
     the side that walks back from the target (Ren et al. 2024, section 3.2). Raises MapctlError for fewer than two
     frames.
     """

@@ -12,7 +12,7 @@ from mapctl.errors import RequestError
 _MAX_SUGGESTIONS = 3  # names in a refusal
 
 
-# Beginnings that say which program made the rig rather than what the joint is.
+# Prefixes that name the program that wrote the rig, not the joint.
 _PREFIX = re.compile(r"^(.*[:|]|mixamorig\d*[ _]*|bip\d+[ _]+|j_bip_(c_)?|(joint|def|org)[ _-]+)", re.IGNORECASE)
 
 

@@ -33,7 +33,7 @@ class Motion:
     moving_offsets: Mapping[int, Float[Tensor, "frames 3"]] = field(default_factory=dict)
     """Joints below the root whose offset is animated, as Hips under a static root; metres."""
     source: object | None = None
-    """What a format needs to write the file back as it came (channel layout, unit); formats own its meaning."""
+    """Layout that a format needs to write the file back as it came (channels, unit); formats define it."""
     licence: str = ""
     """Licence under which it may be used, with what it comes from, where that is known; some formats keep it."""
 
@@ -52,7 +52,8 @@ class Motion:
         return f"<{self}>"
 
     def describe(self) -> str:
-        """Describe frames, rate, duration, joints, and the way of the body in chords of half a second, in one line."""
+        """Describe frames, rate, duration, joints, and the distance travelled in chords of half a second, in one
+        line."""
         frames, joints = _count(self.num_frames, "frame"), _count(self.num_joints, "joint")
         step = max(1, round(_CHORD_SECONDS * float(self.fps)))
         picked = self._map_frames(lambda values: torch.cat([values[:-1:step], values[-1:]]))

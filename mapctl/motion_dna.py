@@ -27,13 +27,13 @@ class MotionDna:
     """Representative poses, in no order."""
 
     poses: Float[Tensor, "poses joints 3"]
-    """Places of canonical joints from the hips without the hips' rotation, metres, on canonical bones."""
+    """Positions of canonical joints from the hips without the hips' rotation, metres, on canonical bones."""
 
 
 def of(motion: Motion, count: int = POSES, *, rig: Rig | None = None) -> MotionDna:
     """Take poses of a motion on any known rig: frames in which joints turn fastest, apart in time (appendix D).
 
-    RequestError for less than one pose, for a motion without frames, and for a rig that nobody knows.
+    RequestError for less than one pose, for a motion without frames, and for an unknown rig.
     """
     if count < 1:
         raise RequestError(f"motion DNA needs at least one pose, got {count}")

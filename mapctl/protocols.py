@@ -250,7 +250,7 @@ class Density(Protocol[State]):
         self, state: State, frames: int, generator: torch.Generator, *, temperature: float = 1.0, sigma_speed: float
     ) -> tuple[Float[Tensor, "batch frames size"], State]:
         """Draw frames as `sample`, `temperature` a factor of the noise, given that toes stand where their contact bits
-        say so: their speed is zero with an error of `sigma_speed`, m/s, in each coordinate. Default: `sample`."""
+        are 1: their speed is zero with an error of `sigma_speed`, m/s, in each coordinate. Default: `sample`."""
         return self.sample(state, frames, generator, temperature=temperature)
 
     def infer_state(self, features: Float[Tensor, "frames size"]) -> State:
@@ -291,7 +291,7 @@ class Density(Protocol[State]):
         """Return the density given labels of its data (`run`, `style=active`) beside those it is given already, with
         initial states to match; RequestError for a label that it does not know. Default: refuse all."""
         if labels:
-            raise RequestError(f"the prior {self.name!r} knows no label {labels[0]!r}, it has none")
+            raise RequestError(f"the prior {self.name!r} has no label {labels[0]!r}, nor any other")
         return self
 
     def conditioned_like_start(self, start: int) -> "Density[State]":

@@ -74,7 +74,7 @@ def load_choice(name: str | None) -> "list[LstmGmmDensity]":
 
 def _list_auto() -> list[str]:
     there = weight_sets.list_models()
-    return [name for name in AUTO if name in there] or list(AUTO)  # to load what is not there says so
+    return [name for name in AUTO if name in there] or list(AUTO)  # loading a missing one raises the error
 
 
 def load_refiner(name: str) -> "LstmRefiner":
@@ -127,7 +127,8 @@ def load_tweener(name: str = "tweener", path: str = "path") -> "Tweener":
 
 
 def load_stitcher(name: str = "stitcher") -> "Stitcher":
-    """Load the bundled stitcher, which fills short gaps in many ways, or a trained one by its file or run folder."""
+    """Load the bundled stitcher, which fills short gaps in several variations, or a trained one by its file or run
+    folder."""
     return _import_model("Stitcher").load(name)
 
 

@@ -38,7 +38,7 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], *, metadata: Mappin
         try:
             save_file(contiguous, scratch, metadata=dict(metadata) if metadata else None)
         except SafetensorError as error:
-            # The library's own kind of error, which says in words what the system's says by number.
+            # The library's own kind of error, with the system's error number in words.
             found = _SYSTEM_ERROR.search(str(error))
             raise OSError(int(found[1]), os.strerror(int(found[1]))) if found else OSError(str(error)) from error
 
@@ -52,7 +52,7 @@ class _MotionClass(BaseModel):
 
 
 class _TrainingData(BaseModel):
-    """What is read again of a card's `data`; the rest is for people."""
+    """Keys of a card's `data` that are read again; the others are documentation."""
 
     model_config = ConfigDict(strict=True)
 
@@ -237,7 +237,7 @@ def read_card(path: Path) -> Card:
 def locate(name: str) -> Path:
     """Locate the safetensors file of a bundled name, of a path, or of a training run's folder.
 
-    A bundled name is one of the set of weights in force, unless it says its set (see `weight_sets`), whatever lies in
+    A bundled name is one of the set of weights in force, unless it names its set (see `weight_sets`), whatever lies in
     the current folder; CheckpointError where that set has no such model, though another one may.
     """
     path = Path(name)
@@ -252,12 +252,12 @@ def locate(name: str) -> Path:
 
 
 def compute_hash(name: str) -> str:
-    """Compute a short hash of a model's weights, by which those that were made with it name it."""
+    """Compute a short hash of a model's weights, by which other models refer to it."""
     return sha256(locate(name).read_bytes()).hexdigest()[:12]
 
 
 def note_use(name: str) -> None:
-    """Note the licence of a model that somebody else loads, as a process; CheckpointError if there is none."""
+    """Note the licence of a model that another process loads; CheckpointError if there is none."""
     path = locate(name)
     _note_card(name, path, read_card(path.with_suffix(".json")))
 
@@ -286,7 +286,7 @@ class NetworkConfig:
     """Entries of cards that are no choice: the only value that each may have."""
 
     def as_card(self) -> dict[str, Any]:
-        """Convert to a card's JSON, which knows no tuples."""
+        """Convert to a card's JSON, which has no tuples."""
         return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()}
 
     @classmethod

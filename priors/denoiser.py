@@ -26,9 +26,9 @@ from priors.checkpoints import NetworkConfig
 
 _NON_ROOT_JOINTS = CANONICAL.num_joints - 1
 _ANGLE_CHANNELS = 2 + 3 * _NON_ROOT_JOINTS  # tilt and rotation vectors
-_WORLD_CHANNELS = 2 * (6 + 3) * CANONICAL.num_joints  # world rotations and places, observed and smoothed
+_WORLD_CHANNELS = 2 * (6 + 3) * CANONICAL.num_joints  # world rotations and positions, observed and smoothed
 _INPUT_CHANNELS = 2 * _ANGLE_CHANNELS + 2 + 1 + 6 + 3 + 2 * (CANONICAL.num_joints + 1) + _WORLD_CHANNELS
-_OUTPUT_BLOCKS = (_ANGLE_CHANNELS, 1, 3, 2)  # angles, turn, place beside the slow one, contacts
+_OUTPUT_BLOCKS = (_ANGLE_CHANNELS, 1, 3, 2)  # angles, turn, position beside the slow one, contacts
 
 _SMOOTHING_SIGMA, _REFERENCE_SIGMA = 2.0, 6.0  # frames, sigma: of the proposal's start, and of the frame of reference
 _NEGLIGIBLE_SIGMA, _NEGLIGIBLE_SIGMA_ROOT = 0.0044, 0.001  # radians and metres: noise that is as often true motion
@@ -160,8 +160,8 @@ class _CaptureView:
         )
 
     def _world(self) -> list[Float[Tensor, "batch frames inputs"]]:
-        """Encode the world rotations and places of all joints in the slow frame of the hips: noise of places, which
-        makes a joint's angles err against its parent's, is independent there, and feet that slide can be seen."""
+        """Encode the world rotations and positions of all joints in the slow frame of the hips: noise of positions,
+        which makes a joint's angles err against its parent's, is independent there, and feet that slide can be seen."""
         x, z = self.angles[..., :2].unbind(dim=-1)
         tilt = rotations.rotation_vector_to_matrix(torch.stack([x, torch.zeros_like(x), z], dim=-1))
         hips = rotations.to_matrix(rotations.about_y(self.turn[..., 0])) @ tilt

@@ -190,7 +190,7 @@ class InfillerNetwork(nn.Module):
         return torch.cat([positions.flatten(-2), step, turn, 2 * image.contacts - 1], dim=-1)
 
 
-def _encode_masks(image: PositionImage) -> Float[Tensor, "batch frames told"]:
+def _encode_masks(image: PositionImage) -> Float[Tensor, "batch frames given"]:
     """Encode which joints are known, and how many frames ago and ahead any is."""
     some = image.known.any(dim=-1)
     far = torch.stack([_count_frames_since(some), _count_frames_since(some.flip(1)).flip(1)], dim=-1)

@@ -20,7 +20,7 @@ class KeyframeTimingConfig(NetworkConfig):
     """Shape of the regression."""
 
     features: tuple[str, ...] = PAIR_FEATURES
-    """What is looked at of a pair of poses."""
+    """Features of a pair of poses."""
     shortest: float = 0.25
     """Seconds that are said at least, and that the pairs of the fit are apart."""
     longest: float = 4.0
@@ -40,7 +40,7 @@ class KeyframeTimingNetwork(nn.Module):
     ratios: Float[Tensor, "2 2"]
 
     def __init__(self, config: KeyframeTimingConfig):
-        """Unfitted, it says a second for everything."""
+        """Unfitted, it predicts one second for every pair."""
         super().__init__()
         self.config = config
         self.register_buffer("weights", torch.zeros(len(config.features)))

@@ -1,5 +1,5 @@
-"""The path predictor: a convolutional network that tells the hips' trajectory from the body's motion (Zhou et al. 2020,
-section 3.4 and table 5).
+"""The path predictor: a convolutional network that predicts the hips' trajectory from the body's motion (Zhou et al.
+2020, section 3.4 and table 5).
 """
 
 import math
@@ -148,10 +148,10 @@ class PathNetwork(nn.Module):
         )
 
     def _rows(self, motion: LocalMotion) -> Float[Tensor, "batch frames rows"]:
-        """Encode the body in about unit size: places and how they change, heading change, and where frames are.
+        """Encode the body in about unit size: positions and how they change, heading change, and where frames are.
 
-        The change is a difference of two places that a convolution can take, but in the places' own unit it would be
-        lost: millimetres beside decimetres.
+        The change is a difference of two positions that a convolution can take, but in the positions' own unit it would
+        be lost: millimetres beside decimetres.
         """
         scaled = ((motion.positions[..., 1:, :] - self.mean) / self.std).flatten(-2)
         steps = motion.anchored_steps()[..., 1:, :].flatten(-2) / _VELOCITY_UNIT
@@ -163,7 +163,7 @@ class PathNetwork(nn.Module):
 def _mix_anchored_steps(motion: LocalMotion, shares: Float[Tensor, "batch frames shares"]) -> Tensor:
     """Mix the steps that would keep each foot and toe in its place, and none, by logits.
 
-    Who stands is still to the millimetre so, without any weight having learnt it.
+    A standing character so stays still to the millimetre, whatever the weights.
     """
     steps = motion.anchored_steps()[..., list(_ANCHORS), ::2]
     return (torch.softmax(shares, dim=-1)[..., :-1, None] * steps).sum(dim=-2)

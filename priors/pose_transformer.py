@@ -1,9 +1,9 @@
 """The pose transformer: a network that corrects the interpolation of a partly known motion, in rotations.
 
-Every frame is a token. A token tells the interpolated pose, seen from the interpolated hips (over the ground, along the
+Every frame is a token. A token holds the interpolated pose, seen from the interpolated hips (over the ground, along the
 heading), so the answer turns and moves with its input; what of it is known; and how far the known frames are. The
 output is added to the interpolation where that is not known: six numbers for each joint's rotation (Zhou et al. 2019),
-the hips' place, and two contacts. Bones are rigid by construction.
+the hips' position, and two contacts. Bones are rigid by construction.
 """
 
 import math
@@ -57,8 +57,8 @@ class PoseTransformerConfig(NetworkConfig):
     """Frames of each layer's convolution, one number at a time, before its attention; odd, 0 for none."""
     detail: int = 0
     """Layers of attention of a second stage, which corrects what the first proposes; the attention of the first is then
-    to frames alone in which a rotation, the hips' place or a target is known (context and detail transformer of Qin et
-    al. 2022, here with this network's tokens, rotary positions and losses). 0 for none."""
+    to frames alone in which a rotation, the hips' position or a target is known (context and detail transformer of Qin
+    et al. 2022, here with this network's tokens, rotary positions and losses). 0 for none."""
 
     def __post_init__(self):
         if min(self.width, self.layers, self.heads) < 1 or self.width % (2 * self.heads):
@@ -80,7 +80,7 @@ class ProposedPoses:
     log_spread: Float[Tensor, "batch frames joints 2"]
     """Logarithm of the distance, metres, within which a joint's true position lies with the chances QUANTILES."""
     rough: "ProposedPoses | None" = None
-    """What the first of two stages proposed."""
+    """Proposal of the first of two stages."""
 
     def poses(self, offsets: Float[Tensor, "batch joints 3"]) -> tuple[Tensor, Tensor]:
         """Return world positions, metres, and world rotation matrices of all joints on these bones."""
@@ -305,7 +305,7 @@ def _encode_distance(known: Bool[Tensor, "batch frames"]) -> Float[Tensor, "batc
 SOURCE = "transformer"
 """Name of the in-betweener in notes."""
 MAX_GAP_FRAMES = 240
-"""Frames of the longest gap that it fills; longer ones it leaves interpolated, and says so. Windows of training have up
+"""Frames of the longest gap that it fills; longer ones it leaves interpolated, with a note. Windows of training have up
 to 200 frames; beyond 240 the hips stray farther than a tweener's."""
 _CONTEXT = 24  # frames on either side of what is unknown that the network sees
 _MAX_WINDOW, _OVERLAP = 240, 60  # frames of the longest window that no gap asks for, and that two windows share
@@ -318,7 +318,7 @@ class PoseTransformer(checkpoints.NetworkModel[PoseTransformerNetwork], Inbetwee
 
     @property
     def takes_partial_keys(self) -> bool:
-        """It is told places of hands, feet and hips in single frames."""
+        """It is conditioned on positions of hands, feet and hips in single frames."""
         return True
 
     @torch.no_grad()
@@ -434,7 +434,7 @@ def _lay_windows(unknown: Bool[Tensor, " frames"], longest: int) -> Iterator[tup
 
 
 def _find_silent_gaps(query: GapQuery) -> list[tuple[int, int]]:
-    """Return first frames and one past the last of gaps in which nothing is told."""
+    """Return first frames and one past the last of gaps in which nothing is given."""
     silent = query.nothing_known
     if query.effector_targets is not None:
         silent = silent & ~query.effector_targets.wanted.any(dim=1)

@@ -4,7 +4,7 @@ Eq. 11).
 State and end effectors through a layer, an LSTM and a layer give what is added to the state. Two departures: the first
 layer also sees some frames ahead, since tremble cannot be distinguished from motion without what follows; and the
 residual is bounded, so that no input can make it explode. Contact bits are in its input and in its output (section
-4.3). End effectors are in the input because the density's features say little of where hands and feet end up, and that
+4.3). End effectors are in the input because the density's features hold little of where hands and feet end up, and that
 is where a viewer looks (section 4.2.1).
 """
 

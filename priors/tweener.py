@@ -49,7 +49,7 @@ _ASIDE, _AHEAD = math.radians(90.0), math.radians(70.0)  # between a key's headi
 _SWAYS, _TURNS = math.radians(10.0), math.radians(25.0)  # of that angle again: hips sway with every step
 _REACH, _REACH_A_SECOND, _LONGEST_REACH = 0.8, 0.3, 2.0
 """Length of the tangents over the distance of the keys, at first and more by the second: the longer there is time, the
-sharper is the turn for its way. Chosen on captured walks: a turn of 90 degrees takes about 2 s."""
+sharper is the turn for its distance. Chosen on captured walks: a turn of 90 degrees takes about 2 s."""
 
 
 def bend_trajectory(
@@ -124,13 +124,13 @@ def _ramp(value: Tensor, none: float, whole: float) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class GivenParts:
-    """What keys tell; a frame that tells nothing is none."""
+    """Known parts of keys; a frame without any is no key."""
 
     axes: Bool[Tensor, "batch frames joints 3"]
-    """Which coordinates of joints are told, in the reference's axes. Of the hips x and z are their place on the ground;
+    """Whether a coordinate of a joint is given, in the reference's axes. The hips' x and z are their ground position;
     coordinates of the others are seen from there, heights from the floor."""
     heading: Bool[Tensor, "batch frames"]
-    """Whether the hips' heading is told."""
+    """Whether the hips' heading is given."""
     view: Float[Tensor, " batch"]
     """Heading of a reference that does not turn, radians, for what is drawn from one side; NaN where it leads from key
     to key."""
@@ -143,17 +143,17 @@ class GivenParts:
 
     @property
     def known(self) -> Bool[Tensor, "batch frames"]:
-        """Frames in which anything is told."""
+        """Frames in which anything is given."""
         return self.axes.flatten(2).any(dim=-1)
 
     @property
     def placed(self) -> Bool[Tensor, "batch frames"]:
-        """Frames in which the hips' place on the ground is told."""
+        """Frames in which the hips' ground position is given."""
         return self.axes[..., 0, 0] & self.axes[..., 0, 2]
 
 
 def make_key_image(motion: PartialMotion, given: GivenParts) -> PositionImage:
-    """Make the image of what is told of some frames; the rest of the motion may hold anything finite."""
+    """Return the image of the given parts of some frames; the rest of the motion may hold anything finite."""
     positions = motion.world_poses()[0]
     ground, heading = lead_reference(motion.root_position[..., ::2], motion.heading, given)
     shift = rotations.lift_ground(ground - motion.root_position[..., ::2])
@@ -203,7 +203,7 @@ class ConstrainedPose:
     """Poses within the ranges of the joints."""
 
     local_matrix: Float[Tensor, "*batch joints 3 3"]
-    """Local rotations; the hips' is that in whatever frame it was told."""
+    """Local rotations; the hips' is in the frame in which it was given."""
     positions: Float[Tensor, "*batch joints 3"]
     """Joint positions from the hips, metres, in the same frame."""
 
@@ -221,7 +221,7 @@ class RangeConstrainedKinematics(nn.Module):
         super().__init__()
         ranges = joint_ranges.load() if ranges is None else ranges
         self.skeleton = skeleton
-        # They are the code's, not learnt: weights do not hold them, a card tells which they were.
+        # They are the code's, not learnt: weights do not hold them, the card lists them.
         for name in ("axes", "mid_matrix", "low", "high"):
             values = getattr(ranges, name)
             values = values.float() if values.is_floating_point() else values
@@ -285,12 +285,12 @@ class GeneratedPoses:
     """Poses that the generator proposes."""
 
     pose: ConstrainedPose
-    """Rotations and places from the hips, seen along the reference's heading."""
+    """Rotations and positions from the hips, seen along the reference's heading."""
     responses: tuple[Tensor, ...]
-    """What its convolutions gave, for batch regularisation."""
+    """Outputs of its convolutions, for batch regularisation."""
 
     def turn_to_world(self, image: PositionImage) -> ConstrainedPose:
-        """Turn the poses from along the reference of the image that they were made for to the world's axes."""
+        """Turn the poses from along the reference of their image to the world's axes."""
         quats = rotations.about_y(image.heading)
         hips = rotations.to_matrix(quats) @ self.pose.local_matrix[..., 0, :, :]
         local = torch.cat([hips[..., None, :, :], self.pose.local_matrix[..., 1:, :, :]], dim=-3)
@@ -376,7 +376,7 @@ class GeneratorNetwork(nn.Module):
                 if self.config.skips:
                     hidden = (hidden + self.skips[stage](levels[_STAGES - 1 - stage])) / math.sqrt(2)
                     hidden = hidden + self.styles[stage](style)[..., None]
-        # Angles need more than the eight bits of bfloat16, or who stands trembles.
+        # Angles need more than the eight bits of bfloat16, or a standing character trembles.
         return self.last(hidden.to(rows.dtype))[..., :frames], tuple(responses)
 
     def encode_rows(self, image: PositionImage) -> Float[Tensor, "batch frames rows"]:
@@ -453,9 +453,9 @@ class Style:
     """How to move."""
 
     name: str
-    """What it is of, for notes: files or classes."""
+    """Its source, for notes: files or classes."""
     vector: Float[Tensor, " style"]
-    """What the style encoder makes of it."""
+    """Its encoding by the style encoder."""
     poses: Float[Tensor, "poses joints 3"] | None = None
     """Poses of it, as `MotionDna` holds them; None for a class."""
 
@@ -538,7 +538,7 @@ def read_classes(card: Card, size: int) -> dict[str, Style]:
 
 
 def count_clips(data: Mapping[str, Any]) -> dict[str, Any]:
-    """Replace the classes in a card's data by how many clips each was made of, for people to read."""
+    """Replace the classes in a card's data by the number of clips of each, for people to read."""
     if _FIELD not in data:
         return dict(data)
     return {**data, _FIELD: {name: given["clips"] for name, given in data[_FIELD].items()}}
@@ -557,7 +557,7 @@ def pick_class(classes: Mapping[str, Style], name: str) -> Style:
 
 
 def show_loose_keys(image: PositionImage, loose: LooseKeys) -> PositionImage:
-    """Show places over the ground, over which the reference of an image of one motion leads, and drawings in frames of
+    """Show ground positions, over which the reference of an image of one motion leads, and drawings in frames of
     which nothing else is known: from where the first of these is seen the reference then looks back, without turning.
     """
     axes, positions = image.known_axes.clone(), image.positions
@@ -632,8 +632,8 @@ _MARGIN = 4
 """Frames that the network also answers for before the first frame and after the last: where its convolutions end, its
 poses jump, and keys stand there."""
 _FLICKER_HZ, _FLICKER_SHARE = 14.0, 0.5
-"""Frequency of which half is taken from made rotations, and how far they follow: faster than 8 Hz they change more than
-mocap's, and slower less."""
+"""Frequency of which half is taken from generated rotations, and how far they follow: faster than 8 Hz they change more
+than mocap's, and slower less."""
 _KEY_SECONDS = 0.5  # over which what a key was missed by fades away from it
 
 
@@ -650,7 +650,7 @@ class Tweener(checkpoints.NetworkModel[GeneratorNetwork], Inbetweener):
 
     @property
     def has_style(self) -> bool:
-        """Whether it was told how to move."""
+        """Whether a style conditions it."""
         return self.style is not None
 
     @property
@@ -663,7 +663,7 @@ class Tweener(checkpoints.NetworkModel[GeneratorNetwork], Inbetweener):
         return self.in_style(self.encode_style(dna))
 
     def in_style(self, style: Style) -> "Tweener":
-        """Return the in-betweener that moves in a style: one of `classes`, or what `encode_style` made."""
+        """Return the in-betweener that moves in a style: one of `classes`, or the result of `encode_style`."""
         return replace(self, style=style)
 
     @torch.no_grad()
@@ -675,10 +675,10 @@ class Tweener(checkpoints.NetworkModel[GeneratorNetwork], Inbetweener):
     def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
         """Propose poses of the whole motion at once, and lead the hips by them, without sampling.
 
-        What keys were missed by is made good by the smoothest offsets of joints' rotations; what the way misses a known
-        place by is spread in proportion to the way walked; hips do not tremble, and legs bend so that feet which stand
-        stay there. Effector targets are ignored. Gaps that are longer than the network sees are split by poses of the
-        style, or of the keys beside them.
+        Errors at keys are removed by the smoothest offsets of joints' rotations; the trajectory's error at a known
+        position is spread in proportion to the distance walked; hips do not tremble, and legs bend so that feet which
+        stand stay there. Effector targets are ignored. Gaps that are longer than the network sees are split by poses of
+        the style, or of the keys beside them.
         """
         shown, missing, splits = query.motion, query.missing, find_splits(query)
         given = self._choose_poses(query, splits)
@@ -709,7 +709,7 @@ class Tweener(checkpoints.NetworkModel[GeneratorNetwork], Inbetweener):
         return calm_poses(rotations.from_matrix(local.double())), origin
 
     def _choose_poses(self, query: GapQuery, splits: Sequence[Split]) -> dict[int, Float[Tensor, "joints 3"]]:
-        """Choose the poses that split gaps, by frame, at their places in a motion of unit size, metres, world."""
+        """Choose the poses that split gaps, by frame, at their positions in a motion of unit size, metres, world."""
         given = {}
         for split in splits:
             own = None if self.style is None else self.style.poses
@@ -757,7 +757,7 @@ class Tweener(checkpoints.NetworkModel[GeneratorNetwork], Inbetweener):
 
 
 def _show(query: GapQuery, given: Mapping[int, Float[Tensor, "joints 3"]]) -> tuple[PositionImage, Float[Tensor, " 3"]]:
-    """Return the query, and poses that are told by frame, as the network takes it, of unit size and near the origin,
+    """Return the query, and poses given by frame, as the network takes it, of unit size and near the origin,
     and where that origin is."""
     body, known = _walk_over(query), _find_given_joints(query)
     placed = known[:, 0].nonzero()[:, 0]
@@ -800,8 +800,8 @@ def _walk_over(query: GapQuery) -> Motion:
 
 
 def _find_given_joints(query: GapQuery) -> Bool[Tensor, "frames joints"]:
-    """Find the joints whose positions are told: in the world, or about hips of whose whole body the place alone is
-    missing."""
+    """Find the joints whose positions are given: in the world, or about hips of whose whole body the ground position
+    alone is missing."""
     return query.known_positions | ~query.missing.joints.any(dim=1, keepdim=True)
 
 

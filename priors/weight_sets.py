@@ -71,7 +71,7 @@ def split_name(name: str) -> tuple[str, str]:
 
 
 def means_bundled(name: str) -> bool:
-    """Return whether a name means a bundled model and no file or folder of that name: it says its set, or is that of a
+    """Return whether a name means a bundled model and no file or folder of that name: it names its set, or is that of a
     model of the set in force. A folder of one's own is then `./locomotion`."""
     weights, model = split_name(name)
     return any(_find_model(each, model) for each in ((weights,) if model == name else SETS))
@@ -135,13 +135,13 @@ def _find_folder(weights: str) -> Traversable:
 
 
 FREE = ("free for any use", "CC0 1.0")
-"""Licences of models of the free set: nothing is asked of who uses them."""
+"""Licences of models of the free set, which ask nothing of their users."""
 OF_DATA = "that of the training data"
-"""Licence of trained weights for which none was told."""
-NO_LICENCE = "no licence told"
-"""Of a model whose card leaves it out: like one that is not known, it is taken for stricter than all."""
+"""Licence of trained weights for which none was given."""
+NO_LICENCE = "no licence given"
+"""Licence of a model whose card has none: like an unknown one, it counts as the strictest."""
 _BY_STRICTNESS = (*FREE, "CC BY 4.0", "CC BY-SA 4.0", "CC BY-NC 4.0", "CC BY-NC-SA 4.0")
-"""Known licences, the strictest last. One that is not known is taken for stricter than all, since nobody can tell."""
+"""Known licences, the strictest last. An unknown one counts as the strictest."""
 Licences = Mapping[str, str]
 """Licence by the name of the model, or of the motion that was given."""
 
@@ -161,7 +161,7 @@ def record_licences() -> Iterator[Licences]:
 
 
 def note_licence(name: str, licence: str) -> None:
-    """Note that something of this name and licence is used, where somebody records that; nothing without a licence."""
+    """Add this name and licence to the records in progress, if any; nothing without a licence."""
     for recording in _recordings if licence else ():
         recording[name] = shorten_licence(licence)
 
@@ -172,7 +172,7 @@ def shorten_licence(licence: str) -> str:
 
 
 def find_used_licences() -> Licences:
-    """Find what the innermost record holds so far; nothing where nobody records."""
+    """Return the innermost record so far; empty without one."""
     return dict(_recordings[-1]) if _recordings else {}
 
 

@@ -28,7 +28,7 @@ class Placed:
     bones: Motion
     """The same on joints that are recognised: canonical ones, or the file's where they are all that is known."""
     notes: tuple[str, ...] = ()
-    """What could not be kept."""
+    """Parts of the motion that could not be kept."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,7 @@ class DrawnMotion:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What of the motion could not be kept, one sentence each."""
+        """Parts of the motion that could not be kept, one sentence each."""
         return self.placed.notes
 
     def build_body(self, fps: Fraction, colour: Array) -> SkinnedBody:

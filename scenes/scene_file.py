@@ -1,4 +1,4 @@
-"""Scene files: who walks along what, how it is filmed and where it goes. TOML, checked before any work."""
+"""Scene files: actors and their curves, cameras and outputs. TOML, checked before any work."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -24,7 +24,7 @@ from scenes.cameras import CameraSettings
 _FILMS, _MOTIONS, _REPORTS = (".mp4", ".gif", ".webp", ".png"), tuple(formats.WRITERS), (".json",)
 _ENDINGS = (*_FILMS, *_MOTIONS, *_REPORTS)
 _MAX_SECONDS = 3600.0
-_STAY = "line:1"  # of an actor without a curve, who stands at its beginning
+_STAY = "line:1"  # of an actor without a curve, which stands at its beginning
 
 Seconds = Annotated[float, Field(gt=0, le=_MAX_SECONDS)]
 Seconds0 = Annotated[float, Field(ge=0, le=_MAX_SECONDS)]
@@ -34,7 +34,7 @@ Coordinate = Annotated[float, Field(ge=-1000, le=1000)]
 
 @dataclass(frozen=True, kw_only=True)
 class ShotOptions:
-    """What a table of a scene and the options of a command have in common: one character's walk."""
+    """Options shared by a scene's table of an actor and the command `follow`: one character's walk."""
 
     speed: Annotated[float, Field(gt=0, le=20)] | Annotated[str, Field(min_length=1)] | None = None
     """Speed along the curve, m/s, or `ARC:SPEED,ARC:SPEED`; the controller's own if not given."""
@@ -43,9 +43,9 @@ class ShotOptions:
     seed: Annotated[int, Field(ge=0, lt=2**63), arg(metavar="N")] = 0
     """Seed of everything random: the same seed gives the same file."""
     gait: Annotated[str | None, arg(metavar="NAME")] = None
-    """Gait of the motion, of those that the prior knows."""
+    """Gait of the motion, one of the prior's."""
     style: Annotated[str | None, arg(metavar="NAME")] = None
-    """Style of the motion, of those that the prior knows."""
+    """Style of the motion, one of the prior's."""
     start: Annotated[str, Field(min_length=1), arg(metavar="walk|stand|CLIP:FRAME")] = "walk"
     """How it begins: in its stride, standing, or going on from a frame of a motion file, on that file's rig and at its
     rate; of an actor in the clip's position unless `offset` or `turn_deg` are given."""
@@ -75,7 +75,7 @@ class Actor(ShotOptions):
     speed_by_time: tuple[tuple[Seconds0, Annotated[float, Field(ge=0, le=20)]], ...] | None = None
     """Speed along the curve by time, pairs of seconds and m/s, zero allowed; instead of `speed`."""
     keys: tuple[ShotKey, ...] = ()
-    """What it does on the way, one [[actors.keys]] table each."""
+    """Keyframes along the walk, one [[actors.keys]] table each."""
     offset: tuple[Coordinate, Coordinate] | None = None
     """Position of the curve's origin, x and z, metres; the world's origin if not given."""
     turn_deg: Annotated[float, Field(ge=-360, le=360)] | None = None
@@ -153,9 +153,9 @@ class SceneDescription:
     prior: str = "locomotion"
     """Bundled or trained prior that moves the actors."""
     weights: Literal["free", "full"] | None = None
-    """Set of bundled models, where the command does not tell; the environment's or the full one if not given."""
+    """Set of bundled models, where the command does not name one; the environment's or the full one if not given."""
     obstacles: tuple[SceneObstacle, ...] = ()
-    """What all actors walk around, one [[obstacles]] table each."""
+    """Obstacles that all actors walk around, one [[obstacles]] table each."""
     keep_apart: Annotated[float, Field(gt=0, le=10)] | None = None
     """Least distance of the actors' hips, metres; any if not given."""
     camera: CameraSettings = field(default_factory=CameraSettings)

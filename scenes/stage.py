@@ -60,7 +60,7 @@ class Shot(NamedTuple):
     start_seconds: float = 0.0
     """Start of the motion, seconds; until then the actor holds its first pose."""
     targets: Targets = Targets()
-    """What the actor is asked for beside the curve."""
+    """Targets of the actor beside the curve."""
     drawn: DrawnMotion | None = None
     """The motion on a character that is drawn with its own mesh; a mannequin is drawn if None."""
 

@@ -45,7 +45,7 @@ class RefinementSettings:
     """Contact term; toes rest on the supports that the contacts show. Loose, since mocap's planted toes move by 6
     cm/s."""
     jerk: Jerk | None = None
-    """Jerk term, over as many frames of each window as it says; None leaves it out."""
+    """Jerk term, over its number of frames of each window; None leaves it out."""
     clearance: Clearance | None = None
     """Clearance term of swinging toes that were not observed; None leaves it out."""
     clearance_ramp: float = 8.0
@@ -61,8 +61,8 @@ class RefinementSettings:
     smooth: float = 2.0
     """Frames (sigma) over which a correction is smoothed."""
     temperature: float = 8.0
-    """Temperature of a density's likelihood, if there is one; above 1 it counts less, since the proposal knows the data
-    too."""
+    """Temperature of a density's likelihood, if there is one; above 1 it counts less, since the proposal has seen the
+    data too."""
     frames: int = 96
     """Frames of a window."""
     ahead: int = 24

@@ -120,9 +120,7 @@ class CausalDenoiser:
         """Return the notes of a pass, only the first one's, and a note on frames that were due too early."""
         assert self._past is not None
         if self._past.num_frames < MIN_DENOISE_FRAMES:
-            few = (
-                f"frames {self._delivered}:{due} were due before noise could be told from motion: they were not changed"
-            )
+            few = f"frames {self._delivered}:{due} were due before noise could be estimated: they were not changed"
             return (few,)
         return done.notes if self._delivered == 0 else ()
 

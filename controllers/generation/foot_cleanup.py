@@ -1,4 +1,4 @@
-"""Foot clean-up of a generated motion: feet are planted where its own contact labels say so (Wang et al. 2019, section
+"""Foot clean-up of a generated motion: feet are planted where its own contact labels are 1 (Wang et al. 2019, section
 4.3).
 
 A receding-horizon MAP over the motion's latent noise: the latent prior removes jitter, the contact term removes foot

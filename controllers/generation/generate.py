@@ -1,7 +1,7 @@
 """Random generation of any length (Wang et al. 2019, sections 4.1.4, 4.2.3, 4.3 and 5.1).
 
 The prior is sampled frame after frame, a refiner makes the samples look captured, and a foot clean-up plants feet where
-the motion's own contact labels say so. All three work piece by piece.
+the motion's own contact labels are 1. All three work piece by piece.
 """
 
 import time
@@ -68,7 +68,7 @@ class PacePlan:
 
     def condition(self, longest: int) -> tuple[Density, int]:
         """Return the prior conditioned on the next pace, and for how many frames, at most `longest`, to sample it."""
-        conditioned = self._conditioned.setdefault(self._pace, [self._prior])  # as often as their index says
+        conditioned = self._conditioned.setdefault(self._pace, [self._prior])  # as many as their index
         while len(conditioned) <= self._emphasis:
             conditioned.append(conditioned[-1].conditioned_on([label_pace(self._pace)]))
         return conditioned[self._emphasis], min(self._left, longest, _LOOK)
@@ -228,7 +228,7 @@ def generate(
 
 @dataclass(frozen=True)
 class Beginning:
-    """What generation goes on from."""
+    """State from which generation continues."""
 
     prior: Density
     """The prior, conditioned on the labels of the initial state's clip if requested."""

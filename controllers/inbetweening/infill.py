@@ -78,7 +78,7 @@ def infill(
     curve: Curve | None = None,
     generator: torch.Generator | None = None,
 ) -> InbetweenSolution:
-    """Fill what the masks say is missing. RequestError for masks that do not fit.
+    """Fill the masked joints and frames. RequestError for masks that do not fit.
 
     Values within a gap are ignored. A gap at the motion's beginning or end is extrapolated. Along a `curve` the hips go
     while they are missing; the in-betweener's rough one then proposes, since others leave it. Of `densities` the
@@ -115,7 +115,7 @@ def retraced(
     rig: Rig | None = None,
     generator: torch.Generator | None = None,
 ) -> InbetweenSolution:
-    """Predict where the hips go while the masks say that their position is lost (`ROOT`); known frames stay to the bit.
+    """Predict the hips' trajectory where masks mark it as lost (`ROOT`); known frames stay to the bit.
 
     Masks of joints and of everything are gaps, which the `inbetweener` fills first; where both meet, the trajectory
     goes by the filled poses. Where no position is known at all the trajectory begins over the origin. RequestError for

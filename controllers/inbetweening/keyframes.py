@@ -51,7 +51,7 @@ _SEARCH = LbfgsSettings(max_iterations=80, relative_energy_tolerance=1e-5)
 
 
 def fit_drawings(motion: Motion, loose: LooseKeys, *, faced: bool) -> Motion:
-    """Turn the joints of a canonical motion, in frames with drawings, until they look as drawn; `faced` says whether
+    """Turn the joints of a canonical motion, in frames with drawings, until they look as drawn; `faced` is whether
     its headings are more than a guess. The lower foot then stands on the floor."""
     root, quats, skeleton = motion.root_position.clone(), motion.local_quat_xyzw.clone(), motion.skeleton
     for frame in loose.drawings.nonzero()[:, 0].tolist():
@@ -168,7 +168,7 @@ def collect_effector_targets(keys: Sequence[Key], motion: Motion, rigmap: RigMap
 
 
 def collect_loose_keys(keys: Sequence[Key], motion: Motion, rigmap: RigMap) -> LooseKeys | None:
-    """Collect places over the ground and drawings of keys; None where no key tells either. RequestError for drawn
+    """Collect ground positions and drawings of keys; None where no key has either. RequestError for drawn
     joints that the rig has not, or has twice."""
     if all(key.what not in ("place", "drawing") for key in keys):
         return None
@@ -186,8 +186,8 @@ def collect_loose_keys(keys: Sequence[Key], motion: Motion, rigmap: RigMap) -> L
 
 
 def resolve_drawing(drawing: Drawing, rigmap: RigMap) -> dict[int, tuple[float, float]]:
-    """Return the places of a drawing by canonical joint; RequestError, with the nearest name, for a joint that is none
-    of these, or that is drawn twice."""
+    """Return the positions of a drawing by canonical joint; RequestError, with the nearest name, for a joint that is
+    none of these, or that is drawn twice."""
     found: dict[int, tuple[float, float]] = {}
     own = {joint: CANONICAL.index(name) for name, joint in rigmap.joints.items()}
     for name, position in drawing.positions_xy.items():

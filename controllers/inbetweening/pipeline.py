@@ -86,7 +86,7 @@ class InbetweenSolution(Solution):
     sources: tuple[GapSource, ...] = ()
     """Proposer of the motion in each gap in which nothing was known."""
     proposal_seconds: float = 0.0
-    """Of `seconds`, those in which the in-betweener proposed."""
+    """The part of `seconds` spent on the in-betweener's proposal."""
     gap_notes: tuple[str, ...] = ()
     """A note on each of these gaps: proposer, error estimate, remarks."""
 
@@ -109,7 +109,7 @@ class InbetweenSolution(Solution):
         ]
 
     def details(self) -> dict[str, Any]:
-        """Return gaps, who filled them, contacts at PRIOR_FPS, and compute of each filled frame.
+        """Return gaps with their sources, contacts at PRIOR_FPS, and compute of each filled frame.
 
         `sides_apart_cm` is the farthest at which two sides met, if any did; `fallback` lists gaps, in frames at
         PRIOR_FPS, that were not the in-betweener's that was asked for.
@@ -154,7 +154,7 @@ def fill(
 ) -> InbetweenSolution:
     """Fill missing values of a motion.
 
-    `targets` are positions of the rig's hands and feet in frames in which they are missing, `loose` places over the
+    `targets` are positions of the rig's hands and feet in frames in which they are missing, `loose` positions over the
     ground and drawings in such frames; the hips follow `curve` while they are missing. The MAP stage adds `terms`, and
     the likeliest of `densities` its likelihood; RequestError for terms where it is left out.
     """
@@ -210,7 +210,7 @@ def fill(
         ledger, windows = ledger.join(refined.ledger), (*windows, *refined.windows)
     if settings.refine:
         canonical = replace(canonical, root_position=root, local_quat_xyzw=quats)
-    # The result on the rig: seams, then targets and places to the millimetre.
+    # The result on the rig: seams, then targets and positions to the millimetre.
     done, unreached = _reach_targets(clip, clip.back(canonical, asked), targets)
     done, abrupt = _meet_positions(clip, done, loose), ()
     if targets is None and loose is None and curve is None:
@@ -410,8 +410,8 @@ def _lead_along_curve(motion: Motion, missing: Bool[Tensor, " frames"], curve: C
 
 
 def _lead_over_ground(clip: CanonicalClip, loose: LooseKeys) -> Motion:
-    """Lead the canonical hips over the places of loose keys where their position is missing, and turn them along that
-    trajectory where no frame gives their rotation. At a height that no frame gives they stand."""
+    """Lead the canonical hips over the positions of loose keys where their position is missing, and turn them along
+    that trajectory where no frame gives their rotation. At a height that no frame gives they stand."""
     motion, missing_root, hips = clip.canonical, clip.missing.root, clip.rigmap.joint_of[0]
     missing_hips = missing_root if hips is None else clip.missing.joints[:, hips]
     root, quats = motion.root_position.clone(), motion.local_quat_xyzw.clone()
@@ -429,8 +429,8 @@ def _lead_over_ground(clip: CanonicalClip, loose: LooseKeys) -> Motion:
 
 
 def _pose_drawings(query: GapQuery, inbetweener: Inbetweener, generator: torch.Generator) -> GapQuery:
-    """Return a query that has poses instead of drawings, fitted about what an in-betweener proposes; their place stays
-    open where it is not given."""
+    """Return a query that has poses instead of drawings, fitted about what an in-betweener proposes; their position
+    stays open where it is not given."""
     loose = query.loose
     if loose is None or not bool(loose.drawn.any()):
         return query
@@ -444,14 +444,14 @@ def _pose_drawings(query: GapQuery, inbetweener: Inbetweener, generator: torch.G
     return replace(query, motion=replace(shown, root_position=root), missing=missing, loose=positions)
 
 
-_POSITION_SECONDS = 0.5  # over which what the hips are moved by fades away from a place
+_POSITION_SECONDS = 0.5  # over which what the hips are moved by fades away from a position
 _REPORTED_ERROR = 0.001  # metres from a target beyond which there is a note
 _REACH_TOLERANCE = 1e-4  # metres from a target within which it is reached
 _MAX_REACH_ATTEMPTS = 6
 
 
 def _meet_positions(clip: CanonicalClip, filled: Motion, loose: LooseKeys | None) -> Motion:
-    """Move the hips, smoothly, by the little that resampling and the MAP stage leave them from their places."""
+    """Move the hips, smoothly, by the little that resampling and the MAP stage leave them from their positions."""
     if loose is None or not bool(loose.placed.any()):
         return filled
     canonical, rigmap = to_canonical(filled, as_rig(clip.rigmap))

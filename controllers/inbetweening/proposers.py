@@ -297,7 +297,7 @@ class StitchedInbetweener(Inbetweener):
     another one."""
 
     stitcher: Inbetweener
-    """In-betweener that leaves interpolated what it cannot fill, and says why."""
+    """In-betweener that leaves interpolated what it cannot fill, with the reason in its proposal."""
     load_fallback: Callable[[], Inbetweener]
     """Loader of the in-betweener for the rest, called where there is some."""
 
@@ -308,7 +308,7 @@ class StitchedInbetweener(Inbetweener):
 
     def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
         """Propose for each gap the stitcher's motion, bent to its partial keys; gaps that it leaves are the other's,
-        and the proposal says why."""
+        with the reason in the proposal."""
 
         def propose_rest() -> Proposal:
             fallback = self.load_fallback()
@@ -339,13 +339,13 @@ def _complete_stitched(query: GapQuery, stitched: Proposal, propose_rest: Callab
     return replace(rest.take(stitched, gaps), others=tuple(named.values()))
 
 
-_LEAST_DISTANCE = 0.3  # metres from place to place, at the canonical size, that are walked and not stood
+_LEAST_DISTANCE = 0.3  # metres from position to position, at the canonical size, that are walked and not stood
 
 
 def lay_curve(query: GapQuery, fastest: float, ahead: int) -> tuple[Curve, Float[Tensor, " ahead"]] | None:
-    """Lay a curve through the places of a query of which they are all that is given, from its first frame to its last,
-    metres at the canonical size; also return the arcs of the frames and of so many `ahead` of them, metres. None where
-    there are others, and where the body would stand, or be faster than `fastest`, m/s."""
+    """Lay a curve through the positions of a query of which they are all that is given, from its first frame to its
+    last, metres at the canonical size; also return the arcs of the frames and of so many `ahead` of them, metres. None
+    where there are others, and where the body would stand, or be faster than `fastest`, m/s."""
     loose = query.loose
     if loose is None or not query.only_positions:
         return None
@@ -370,7 +370,7 @@ def lay_curve(query: GapQuery, fastest: float, ahead: int) -> tuple[Curve, Float
 def walk_over_positions(
     query: GapQuery, densities: Sequence[Density], generator: torch.Generator | None
 ) -> Proposal | None:
-    """Propose a walk over places by the first density, that of locomotion; None where it is not one that the density
+    """Propose a walk over positions by the first density, that of locomotion; None where it is not one that the density
     knows (see `lay_curve`)."""
     settings = FollowSettings()
     laid = lay_curve(query, densities[0].limits.fastest, settings.window.frames) if densities else None
@@ -393,12 +393,12 @@ def walk_over_positions(
         replace(query.motion, root_position=root, local_quat_xyzw=motion.local_quat_xyzw),
         contacts.to_logits(planted),
         source,
-        (GapSource(0, frames, source, "along a curve through the places, which are all that keys tell"),),
+        (GapSource(0, frames, source, "along a curve through the positions, which are all that keys give"),),
     )
 
 
 def _find_arcs(curve: Curve, positions: Float[Tensor, "positions 2"]) -> Float[Tensor, " positions"]:
-    """Find the arcs of the places that a curve leads through, metres."""
+    """Find the arcs of the positions that a curve leads through, metres."""
     dense = torch.linspace(0, curve.length, max(2, round(100 * curve.length)), dtype=torch.float64)
     points, found, first = curve.ground_point(dense), [], 0
     for position in positions[:-1]:
@@ -692,7 +692,7 @@ STANDING_STILL = "standing still"
 _PLANTED_HEIGHT = 0.025  # metres above the lowest toe
 _LIVELY = 0.5
 """Path of the joints seen from the hips, over that of the tweener, from which on a long gap without keys in it is the
-network's all the same: walks it fills better, where it knows nothing it hardly moves."""
+network's all the same: walks it fills better, and outside its training data it hardly moves."""
 _STYLED = 60  # frames of the shortest gap that is a tweener's that was given a style: in less there is no room for one
 _STITCHED = 60  # frames of the longest gap between whole poses, with partial keys in it, that is a stitcher's
 _HELD = 46  # frames of the shortest gap in which a pose is held
@@ -710,7 +710,7 @@ class AutoInbetweener(Inbetweener):
     network: Inbetweener
     """In-betweener that proposes first, and fills gaps in which something is known."""
     densities: Sequence[Density] = ()
-    """Densities for the end, and for walks over places; without any both are the network's or the tweener's."""
+    """Densities for the end, and for walks over positions; without any both are the network's or the tweener's."""
     long: int = 181
     """Frames of the shortest gap between whole poses, with partial keys in it or none, that can be a tweener's."""
     tweener: Inbetweener | None = None
@@ -738,7 +738,7 @@ class AutoInbetweener(Inbetweener):
         """Propose for each gap what its length and the poses beside it ask for.
 
         Loose keys are the tweener's, if there is one; keys that give positions alone are walked over by a density
-        where that knows such walks.
+        where its training data hold such walks.
         """
         if query.loose is not None:
             walked = walk_over_positions(query, self.densities, generator)
@@ -831,7 +831,7 @@ def _is_standing_still(query: GapQuery, start: int, stop: int) -> bool:
 
 
 def _goes_astray(query: GapQuery, generated: Proposal, gap: tuple[int, int]) -> bool:
-    """Return whether a proposal takes the hips far from the straight way through a gap."""
+    """Return whether a proposal takes the hips far from the straight line through a gap."""
     part = slice(*gap)
     off = (generated.motion.root_position - query.motion.root_position)[part, ::2].norm(dim=-1)
     return float(off.max()) > _ASTRAY * query.scale

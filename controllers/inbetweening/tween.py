@@ -48,7 +48,7 @@ def check_keyframes(
     loose: LooseKeys | None = None,
 ) -> tuple[str, ...]:
     """Note neighbouring keys between which even the shortest path is too fast: by position of the hips (metres), by
-    rotation of the joints that both give, or by effector targets. Places of loose keys count over the ground.
+    rotation of the joints that both give, or by effector targets. Positions of loose keys count over the ground.
 
     The motion is valid where it is not missing, on its rig and on canonical joints.
     """

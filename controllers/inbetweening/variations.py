@@ -91,7 +91,7 @@ class Source:
     draw: Callable[[int, torch.Generator], Inbetweener]
     """Draws the in-betweener of the variation of this number among those drawn."""
     room: str
-    """What two keys need for a choice between them, as in `room for a style`."""
+    """Condition on the time between two keys for a choice, as in `room for a style`."""
 
 
 @dataclass(frozen=True, eq=False)

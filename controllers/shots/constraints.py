@@ -34,9 +34,9 @@ class Constraint:
     name: str
     """Name of the wish, with its time."""
     asked: str
-    """What was asked, in numbers."""
+    """Requested value, in words and numbers."""
     got: float
-    """What it came to, in `unit`."""
+    """Value reached, in `unit`."""
     limit: float
     """Value beyond which it does not hold, in `unit`."""
     unit: str
@@ -44,7 +44,7 @@ class Constraint:
     at_least: bool = False
     """Whether `limit` is a least value; else a largest one."""
     remedy: str = ""
-    """What would let it hold; empty where it does, or where nothing is known to."""
+    """A change of the request with which it would hold; empty where it holds, or none is known."""
     seconds: tuple[float, float] | None = None
     """Start and end, seconds since the first frame; None is throughout."""
 
@@ -156,8 +156,8 @@ def _check_pose(met: MetPose, motion: Motion) -> Constraint:
 
 
 def _find_remedy(reach: Reach, motion: Motion) -> str:
-    """Find when the character comes within reach of the place, or by how much nearer it would have to be; nothing where
-    it is within reach at the wanted time, and something else is in the way."""
+    """Find when the character comes within reach of the position, or by how much nearer it would have to be; nothing
+    where it is within reach at the wanted time, and another constraint prevents it."""
     lacking = torch.zeros(motion.num_frames, dtype=torch.float64)
     for name, position in reach.positions.items():
         limb = LIMBS[name]

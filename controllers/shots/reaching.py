@@ -168,7 +168,7 @@ _STEP_ASIDE = 1.2  # metres between the trajectory and a body that leans and lea
 _BEND_LENGTH, _BEND_STEP = 1.2, 0.05  # metres of arc over which it bends toward a reach, and between its offsets
 _LEAST_BEND, _USUAL_BEND, _MOST_BEND = 0.1, 0.5, 0.9
 """Metres aside: less is left to the walk, more takes longer, more still is another trajectory."""
-_BEND_SHARES = (1.0, 0.7, 0.4)  # of a bend that are tried, where an obstacle is in the way of all of it
+_BEND_SHARES = (1.0, 0.7, 0.4)  # of a bend that are tried, where an obstacle blocks all of it
 _STRAIGHT_AHEAD = 0.6  # of a limb's length that it reaches down beside whatever it reaches aside
 _LEAST_CROUCH, _MOST_CROUCH, _POSED_FRAMES = 0.03, 0.3, 15  # metres down; frames beside a pose that is kept
 _BODY = 0.25  # metres from the hips to an obstacle's edge
@@ -259,7 +259,7 @@ def go_down(motion: Motion, reaches: Sequence[Reach], posed: Bool[Tensor, " fram
 
 
 def _find_lacking_below(motion: Motion, reach: Reach, frame: int) -> float:
-    """Find how much lower the shoulders would have to be for hands to reach their places, metres."""
+    """Find how much lower the shoulders would have to be for hands to reach their positions, metres."""
     positions, lacking = motion.joint_positions(), 0.0
     for name, position in reach.positions.items():
         if not name.endswith("Hand"):
@@ -293,7 +293,7 @@ _WIDTHS = (10, 16, 24, 36)  # frames on either side of a key that are tried
 _MOST_WIDTH = 75
 _POSE_TOLERANCE_SHARE = 0.95  # of a tolerance that is used
 _MOST_EASINGS = 8
-_HIPS_SPEED, _JOINT_SPEED, _TURN_RATE = 1.3, 2.0, 2.5  # m/s, m/s about the hips, rad/s: at most, on the way to a key
+_HIPS_SPEED, _JOINT_SPEED, _TURN_RATE = 1.3, 2.0, 2.5  # m/s, m/s about the hips, rad/s: at most, towards a key
 
 
 @dataclass(frozen=True, eq=False)
@@ -489,7 +489,7 @@ def _build_filling(
 
 
 _EASE_SECONDS = 0.5  # in which the head turns there, and back
-_GLANCE_SHARE = 0.7  # of the way that the head goes toward what a hand reaches for: eyes do the rest
+_GLANCE_SHARE = 0.7  # of the turn of the head toward what a hand reaches for: eyes do the rest
 _EYES_LEAD_SECONDS, _APART_SECONDS = 0.25, 1.0
 
 
@@ -501,7 +501,7 @@ def turn_heads(motion: Motion, looks: Sequence[Look]) -> Motion:
 
 
 def look_where_hands_reach(motion: Motion, reaches: Sequence[Reach], looks: Sequence[Look], posed: Tensor) -> Motion:
-    """Turn the head part of the way toward what hands reach for, as people do who see what they take; not within a
+    """Turn the head partly toward what hands reach for, as people look at what they take; not within a
     second of what is looked at anyway, nor of frames that are `posed`."""
     busy = posed.clone()
     for look in looks:
@@ -547,7 +547,7 @@ _SPREAD_DEG = 3.0  # of each thigh sideways, undone at the foot
 def build_rest_pose(density: Density, skeleton: Skeleton, toe_height: float) -> Motion:
     """Build one frame that stands at the origin and faces +Z, toes at `toe_height` metres.
 
-    The trunk and the arms are the mean, over both sides, of the density's initial states: people who walk carry their
+    The trunk and the arms are the mean, over both sides, of the density's initial states: walking people carry their
     arms much as they do when they stand.
     """
     states = decode(density.initial_states.state.last_frame, GroundPose.origin(), skeleton=skeleton)

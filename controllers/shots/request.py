@@ -267,12 +267,12 @@ class Others:
 
 @dataclass(frozen=True, eq=False)
 class ShotRequest:
-    """What one character is asked to do."""
+    """Request for one character."""
 
     curve: Curve
     """Curve to walk, world, metres."""
     speed: SpeedProfile | TimedSpeed | None = None
-    """Speed along it; None is USUAL_SPEED, and less in corners that turn faster than people who walk do."""
+    """Speed along it; None is USUAL_SPEED, and less in corners that turn faster than walking people do."""
     seconds: float | None = None
     """Duration, seconds; None walks the curve once."""
     lead: Lead | None = None
@@ -339,7 +339,7 @@ class ShotRequest:
                 apart = math.dist(one.positions[name], other.positions[name])
                 if apart > _SAME_POSITION and _are_together(one, other):
                     raise RequestError(
-                        f"{name} is to be at two places {100 * apart:.0f} cm apart within two frames, "
+                        f"{name} is to be at two positions {100 * apart:.0f} cm apart within two frames, "
                         f"at {one.seconds:g} s and at {other.seconds:g} s"
                     )
         for one, other in combinations(self.poses, 2):

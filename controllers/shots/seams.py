@@ -1,4 +1,4 @@
-"""What the in-betweener generates in a walked motion: transitions between its spans, seams of loops and clips, jumps.
+"""In-betweening within a walked motion: transitions between its spans, seams of loops and clips, jumps.
 
 Where a transition lies is a choice with several basins: a few frames earlier another foot is in the air. A grid is
 tried, and the proposal with the least visible artefacts is taken.

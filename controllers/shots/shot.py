@@ -53,7 +53,7 @@ class ShotSolution(Solution):
     constraints: tuple[Constraint, ...] = ()
     """Each wish: asked, got, and the residual."""
     reaches: tuple[Reach, ...] = ()
-    """What is reached for, keys' own hands and feet too, at the times at which it was."""
+    """Reaches at the times at which they were met, those of keys' hands and feet included."""
     met: tuple[MetPose, ...] = ()
     """Keys of poses, positions and facings, as they were met."""
 
@@ -77,7 +77,7 @@ def solve_shot(
     """Generate a motion in which all of the request holds, at PRIOR_FPS, on the canonical joints of `skeleton`.
 
     Where nothing but a walk is requested, no `inbetweener` is needed, and after `deadline_seconds` of wall clock, and
-    at Ctrl-C, the solution so far is returned and the status says so. `terms` are the caller's own, in every window of
+    at Ctrl-C, the solution so far is returned, with that status. `terms` are the caller's own, in every window of
     the walks; they see the character at its own size and the time since the first frame. On another `skeleton`
     strides are as long as its legs, and the toes' rest height is that of the settings' footing. Wishes that do not hold
     are named with numbers in the status, which is then infeasible.

@@ -234,7 +234,7 @@ class Trajectory:
     aside: Float[Tensor, " frames"]
     """Distance of the curve from the unbent one, metres."""
     note: str | None = None
-    """What was changed about the request, or why it cannot hold."""
+    """Changes to the request, or the reason why it cannot hold."""
     blocked: bool = False
     """Whether no path leads around the obstacles and past the others."""
 
@@ -272,7 +272,7 @@ def plan_trajectory(request: ShotRequest) -> Trajectory:
 
     offsets = find_detour(request.curve, clearance)
     if offsets is None:
-        return replace(plain, note="no way leads around the obstacles and past the others", blocked=True)
+        return replace(plain, note="no path leads around the obstacles and past the others", blocked=True)
     return _plan_along(request, apply_detour(request.curve, offsets))
 
 

@@ -47,7 +47,7 @@ class FollowSettings:
     """Contact term."""
     noise: LatentPrior = field(default_factory=lambda: LatentPrior(sigma=3.0))
     """Prior on the latent noise of the rollout. A well trained prior's own standard deviation is small: at sigma 2 the
-    same walk follows its path less well; at sigma 4 the prior of the free set is led where it knows nothing."""
+    same walk follows its path less well; at sigma 4 the prior of the free set is led outside its training data."""
     window: HorizonSettings = field(default_factory=HorizonSettings)
     """Lengths of the receding horizon."""
     method: SingleWindowSolver = field(default_factory=LatentNoiseSolver)

@@ -29,8 +29,8 @@ from mapctl.runtime.stepwise import StepwiseWork
 LEAST_FRAMES = 4
 """Frames of the shortest stitched trajectory."""
 _FAR = 0.3  # metres beyond which the direction to a target is the facing there
-_CANDIDATES = 4  # moments of the prior that are tried at the place
-_AFTER = 10  # frames of the prior's own continuation that say how motion goes on from there
+_CANDIDATES = 4  # moments of the prior that are tried at the position
+_AFTER = 10  # frames of the prior's own continuation, as context of how motion goes on from there
 _JUDGED_FRAMES = 60  # that are kept for terms that look back
 
 
@@ -127,7 +127,7 @@ def plan_stitch(
 
 
 def _pose_candidates(state: SteerState, command: Command, order: Arrival) -> Float[Tensor, "batch after size"]:
-    """Frames at the place run backwards, the pose there last: the given pose alone, or moments of the prior and how
+    """Frames at the position run backwards, the pose there last: the given pose alone, or moments of the prior and how
     motion goes on from them."""
     if order.pose is not None:
         pose = order.pose
@@ -210,13 +210,13 @@ class Arriver:
     def _set_out(
         self, state: SteerState, approach: Approach, command: Command, left: int
     ) -> tuple[SteerState, SteerFrames, StepwiseWork[Tensor]] | None:
-        """Solve a step towards the place, so that the order is seen at once, and return it with the work of the way
-        from its end; None where that leaves too little time for the rest of the way."""
+        """Solve a step towards the position, so that the order is seen at once, and return it with the work on the
+        approach from its end; None where that leaves too little time for the approach."""
         order, settings = command.arrival, state.settings
         assert order is not None
         if (rest := left - settings.commit) < LEAST_FRAMES:
             return None
-        # In few evaluations, so that there is time for the way, and always as many, so that it is always the same.
+        # In few evaluations, so that there is time for the approach, and always as many, so that it is always the same.
         quick = replace(settings, evaluations=settings.least_evaluations or 1)
         led = _lead_to(state, replace(command, arrival=None), order, left)
         there, frames = step(replace(state, settings=quick), led)

@@ -2,7 +2,7 @@
 
 The density has no reaches, so they are no terms of its windows: arms, trunk and head are turned in the frames that it
 delivers, and the next step goes on from the walk alone. A hand moves toward its target while that can be reached within
-half a second by the forecast, and lets it go behind the character. Both ways are of minimum jerk.
+half a second by the forecast, and lets it go behind the character. Both motions are of minimum jerk.
 """
 
 from collections.abc import Mapping
@@ -22,28 +22,28 @@ from mapctl.motion import Motion
 from mapctl.numerics.easing import MinimumJerkTrack, smootherstep
 from mapctl.skeleton import CANONICAL, LIMBS, Skeleton
 
-_RAISE_SECONDS = 0.7  # in which a hand goes to its place, and back
+_RAISE_SECONDS = 0.7  # in which a hand goes to its position, and back
 _TURN_SECONDS = 0.5  # in which a head turns there, and back
-_MOVE_SECONDS, _MOVE_SPEED = 0.5, 1.2  # least time in which a hand follows a place that moved, and its mean speed, m/s
-_AHEAD_FRAMES = 15  # of the forecast, after which a place must be in reach
+_MOVE_SECONDS, _MOVE_SPEED = (0.5, 1.2)  # least time in which a hand follows a moved target, and its mean speed, m/s
+_AHEAD_FRAMES = 15  # of the forecast, after which a position must be in reach
 _NEAR = 0.45  # metres beyond the arm at which a hand sets out, to reach with a lean or to point there
 _LET_GO = 0.1  # metres farther than that, at which a hand lets go
 _BEHIND = 0.45  # cosine below zero of the angle to a shoulder's front beyond which nothing is reached
 _EASY_SHARE = 0.85  # of an arm's length, beyond which the trunk leans
 _BENT_SHARE, _STRETCHED_SHARE = 0.95, 0.99  # of it, between which an arm gives up reaching exactly
-_MOST_LEAN = 0.4  # radians that the trunk turns toward a place, twice
+_MOST_LEAN = 0.4  # radians that the trunk turns toward a position, twice
 _LEAN_EASE = 0.03  # metres out of reach, up to which the trunk hardly moves
-_BEGUN_SHARE = 0.15  # of the way, in which an elbow comes to where inverse kinematics has it
+_BEGUN_SHARE = 0.15  # of the motion, in which an elbow comes to where inverse kinematics has it
 _TRUNK = CANONICAL.indices(("spine", "chest"))
 _HEAD = "head"
 
 
 @dataclass(frozen=True, eq=False)
 class PartTrack:
-    """How far a hand or the head is on its way to a place, and where that is."""
+    """Progress of a hand or the head towards a position, and that position."""
 
     weight: MinimumJerkTrack
-    """Share of the way there, 0 to 1."""
+    """Share of the distance, 0 to 1."""
     position: MinimumJerkTrack
     """Place in the world, metres."""
 
@@ -59,7 +59,7 @@ class PartTrack:
         return self.weight.resting and float(self.weight.value) == 0.0
 
     def aim(self, position: tuple[float, float, float] | None, wanted: bool, seconds: float) -> "PartTrack":
-        """Go toward a place if it is wanted, and back if not."""
+        """Go toward a position if it is wanted, and back if not."""
         found = self
         if position is not None:
             goal = self.position.goal.new_tensor(position)
@@ -69,7 +69,7 @@ class PartTrack:
         return replace(found, weight=found.weight.aim(found.weight.goal.new_tensor([float(wanted)]), seconds))
 
     def move(self, frames: int) -> tuple["PartTrack", Float[Tensor, " frames"], Float[Tensor, "frames 3"]]:
-        """Move on for so many frames; also return share and place in each."""
+        """Move on for so many frames; also return share and position in each."""
         track, weights, positions = self, [], []
         for _ in range(frames):
             track = PartTrack(track.weight.move(1 / PRIOR_FPS), track.position.move(1 / PRIOR_FPS))
@@ -80,7 +80,7 @@ class PartTrack:
 
 @dataclass(frozen=True, eq=False)
 class Overlay:
-    """What hands and head are doing beside the walk; `pose` gives the frames and the next overlay."""
+    """Motion of hands and head on top of the walk; `pose` returns the frames and the next overlay."""
 
     parts: Mapping[str, PartTrack] = field(default_factory=dict)
     """Tracks by `leftHand`, `rightHand` and `head`, of those that are not idle."""
@@ -125,7 +125,8 @@ def _is_in_reach(
     *,
     keep: bool,
 ) -> bool:
-    """Return whether a hand gets to a place from a pose, with a lean of the trunk; one on its way a little farther."""
+    """Return whether a hand gets to a position from a pose, with a lean of the trunk; one already moving a little
+    farther."""
     limb = LIMBS[name]
     away = joints.new_tensor(position) - joints[limb.upper]
     near = float(away.norm()) < limb.length(skeleton) + _NEAR + _LET_GO * keep
@@ -134,7 +135,7 @@ def _is_in_reach(
 
 def _lean(walk: Motion, arms: Mapping[str, tuple[Tensor, Tensor]]) -> Motion:
     """Turn the trunk toward what arms alone do not reach, about as far as brings the shoulders there: they go there on
-    a circle, so that a second lean is needed where the way is long."""
+    a circle, so that a second lean is needed over long distances."""
     joints, turn = walk.joint_positions(), torch.zeros(walk.num_frames, 3, dtype=torch.float64)
     for name, (weight, position) in arms.items():
         limb = LIMBS[name]
@@ -154,7 +155,7 @@ def _lean(walk: Motion, arms: Mapping[str, tuple[Tensor, Tensor]]) -> Motion:
 
 
 def _reach(motion: Motion, arms: Mapping[str, tuple[Tensor, Tensor]]) -> Motion:
-    """Bend arms of a motion so that hands are by their shares on the way from where they are to the places."""
+    """Bend arms of a motion so that hands go by their shares from where they are to the positions."""
     joints, world = motion.joint_positions(), motion.joint_rotations()
     quats = motion.local_quat_xyzw.clone()
     for name, (weight, position) in arms.items():

@@ -42,7 +42,7 @@ from mapctl.solver.lbfgs import LbfgsSettings, LbfgsStatus
 from mapctl.terms import FootContact, KeepClear, LatentPrior, RootVelocity, StepLength, Term
 
 _BODY = 0.4  # metres from an obstacle's edge to the hips that pass it
-_LOOK_AHEAD, _LOOK_SECONDS = 0.6, 1.2  # metres, and seconds of walking, in which the way must be clear
+_LOOK_AHEAD, _LOOK_SECONDS = 0.6, 1.2  # metres, and seconds of walking, in which the path must be clear
 _HEADINGS, _WIDEST = 65, math.radians(140.0)  # directions that are tried, and how far off the commanded one
 _SAMPLES = 16  # along each
 _GET_OUT = 0.3  # metres of clearance gained by metre, where it is too near already
@@ -209,9 +209,9 @@ class SteerState:
     terms: tuple[Term, ...] = ()
     """The caller's own terms, for the prior's size."""
     overlay: Overlay = field(default_factory=Overlay)
-    """What hands and head are doing beside the walk."""
+    """Motion of hands and head on top of the walk."""
     cost: StepCost = field(default_factory=StepCost)
-    """What steps have cost lately."""
+    """Cost of recent steps."""
     approach: Approach | None = None
     """Last order to be somewhere, and how far it is carried out (`controllers.steering.arrival`)."""
 

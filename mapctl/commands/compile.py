@@ -27,7 +27,7 @@ class CompileKernels(ModelCommand):
 
 
 def run(command: CompileKernels) -> int:
-    """Move a character for a moment in every way that has kernels of its own, which compiles those not yet on disk."""
+    """Run every job that has kernels of its own for a moment, which compiles those not yet on disk."""
     start = time.perf_counter()
     with show_progress("trying kernels", quiet=command.quiet):
         _use_kernels()

@@ -46,10 +46,10 @@ class Convert(Command, options.ReadOptions):
     character has its floor and planted feet, in the clip's layout; or a rig by name or TOML file, whose joints
     get the bones of the canonical body."""
     ground: Literal["fit", "keep"] = "fit"
-    """Of what feet stand on, as stairs and platforms, on the skeleton of another rig: `fit` scales its height with the
+    """Supports such as stairs and platforms, on the skeleton of another rig: `fit` scales their height with the
     legs, `keep` keeps it in metres."""
     report: options.MaybeFile = None
-    """Where to write what was changed on the way to the rig, as JSON: scale, travel, hips, feet and hands that do not
+    """Report of the changes in retargeting, as JSON: scale, travel, hips, feet and hands that do not
     get where they should."""
     source_rig: options.MaybeRig = None
     """The rig of IN, where it is not the one that would be recognised; see `mapctl info IN`."""
@@ -85,9 +85,9 @@ class Converted:
     motion: Motion
     """The motion, on its rig and in its layout."""
     lines: tuple[str, ...]
-    """What was done to it, for the user."""
+    """Edits applied, one sentence each."""
     changes: Changes | None
-    """What was changed on the way to another rig."""
+    """Changes in retargeting to another rig."""
     notes: tuple[str, ...]
     """The same in sentences, as far as it is worth one."""
 

@@ -25,7 +25,7 @@ class Demo(ModelCommand):
     """
 
     out: options.OutFolder = Path("demo-out")
-    """Folder for figure8.bvh, .mp4, .png and .json; made if it does not exist."""
+    """Folder for figure8.bvh, .mp4, .png and .json; created if it does not exist."""
     prior: options.Name = "locomotion"
     """A bundled prior, or the file or run folder of a trained one."""
     seed: options.Count = 0
@@ -39,8 +39,8 @@ _SIZE = (960, 540)
 
 
 def run(command: Demo) -> int:
-    """Walk, write, film, report. Without OpenGL the film shows stick figures and says what is missing; what needs
-    packages that are not installed is left out, and a line says so.
+    """Walk, write, film, report. Without OpenGL the film shows stick figures and a note on what is missing; what needs
+    packages that are not installed is left out, with a note.
 
     Ctrl-C ends the walk; the motion so far is written, without a film.
     """
@@ -71,5 +71,5 @@ def run(command: Demo) -> int:
     if not command.quiet:
         print("\n".join([*done.summary(), f"wrote     {', '.join(map(str, files.values()))}"]))
         if missing:
-            print(f"not made  {', '.join(f'.{ending}' for ending in missing)}: {next(iter(missing.values()))}")
+            print(f"missing   {', '.join(f'.{ending}' for ending in missing)}: {next(iter(missing.values()))}")
     return INTERRUPTED if done.interrupted else 0

@@ -31,7 +31,7 @@ class FollowCurve(ModelCommand, options.ReadOptions, ShotOptions):
     """Where the motion goes: .bvh, .npz, .glb or .usda."""
     speed: options.MaybeSpeed = None
     """Speed along the curve: a number, or 0:1.0,5:2.5 for 1 m/s at the start rising to 2.5 m/s at 5 m; 1.2 if it is not
-    given, and less in corners that turn faster than people who walk do."""
+    given, and less in corners that turn faster than walking people do."""
     prior: options.Name = "locomotion"
     """A bundled prior, or the file or run folder of a trained one."""
     rig: options.OutRig = "canonical"

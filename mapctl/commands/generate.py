@@ -30,7 +30,7 @@ class Generate(ModelCommand, options.ReadOptions):
     """Motion sampled from a prior, of any length: OUT/generated_000.bvh, generated_001.bvh, ..."""
 
     out: options.OutFolder
-    """Folder for the clips; made if it does not exist."""
+    """Folder for the clips; created if it does not exist."""
     seconds: options.Number
     """Length of each clip."""
     count: options.Count = 1
@@ -47,13 +47,13 @@ class Generate(ModelCommand, options.ReadOptions):
     style: Annotated[str | None, arg(metavar="NAME,NAME")] = None
     """Gait, style and pace by the names of the prior's data, such as run or elderly,walk; `none` leaves the prior
     unconditioned. If not given, gait and style are those of the clip that it begins from. Unless a pace is named, a
-    prior that knows paces is told one after the other."""
+    prior that is conditioned on paces is given one after the other."""
     refiner: options.MaybeName = None
     """A refiner between samples and foot clean-up: a bundled one, the file or run folder of a trained one, or auto, the
-    prior's own. None if not given: refined samples are told from mocap more often."""
+    prior's own. None if not given: a classifier separates refined samples from mocap more often."""
     no_footing: bool = False
     """Leave out the foot clean-up. Without a refiner, each frame is then sampled given that toes stand where its
-    contact bits say so: feet slide about as mocap's do, and it is faster."""
+    contact bits are 1: feet slide about as mocap's do, and it is faster."""
     rig: options.OutRig = "canonical"
     """Body that moves: the canonical one, or that of a clip, on whose rig the motion is then written; or a rig by name
     or TOML file, whose joints get the canonical bones."""

@@ -33,9 +33,9 @@ class Infill(ModelCommand, options.RigOptions, options.ProposalOptions):
     What is nan in IN is missing as well; where nothing is, and there are no gaps and joints, frozen and leaping frames
     are detected."""
     way: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="A:B")] = ()
-    """Frames from A up to B (exclusive), or seconds, in which the place of the hips is lost and told by how the body
-    moves: treadmills, drifting sensors, poses from video. May be given several times, alone or with gaps, whose poses
-    are filled first; all frames may be lost so."""
+    """Frames from A up to B (exclusive), or seconds, in which the position of the hips is lost and predicted from how
+    the body moves: treadmills, drifting sensors, poses from video. May be given several times, alone or with gaps,
+    whose poses are filled first; all frames may be lost so."""
     joints: Annotated[str | None, arg(metavar="NAME,NAME")] = None
     """Only these joints are missing, canonical names or the rig's own: in the gaps, or throughout if there are none."""
     curve: options.MaybeCurve = None
@@ -61,11 +61,11 @@ def run(command: Infill) -> int:
     """Check everything, fill, write, report."""
     options.check_seed(command.seed)
     if command.way and command.curve is not None:
-        raise RequestError("--way and --curve both say where the hips go; choose one")
+        raise RequestError("--way and --curve both give the hips' trajectory; choose one")
     if command.curve is not None and command.method in ("slerp", "rollouts"):
         raise RequestError(f"--curve needs the steps that a network makes; leave --method {command.method} out")
     if command.curve is not None and command.dna is not None:
-        raise RequestError("--dna says how to move and --curve where; only one of them can be had, leave the other out")
+        raise RequestError("--dna gives a style and --curve a trajectory; leave one of them out")
     results.check_proposal(command, prior=command.prior, way=bool(command.way))
     results.check_destinations(command.out, command.video, command.report, given=(command.source,))
     rig = inputs.read_rig(command.rig, command)
@@ -83,7 +83,7 @@ def run(command: Infill) -> int:
         filled = ", ".join(
             f"{gap['start']}:{gap['stop']} ({gap['joints']} joints)"
             if gap["joints"]
-            else f"{gap['start']}:{gap['stop']} (the hips' place)"
+            else f"{gap['start']}:{gap['stop']} (the hips' position)"
             for gap in done.list_gaps()
         )
         print(

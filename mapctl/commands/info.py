@@ -237,7 +237,7 @@ def _print(described: dict[str, Any], *, as_json: bool) -> None:
         print_table(["canonical", "joint of the rig"], [[c, own] for c, own in described["joints"].items()])
     print(f"not canonical ({len(described['unmapped'])}): {', '.join(described['unmapped']) or 'none'}")
     print(f"fit: {described['fit']}")
-    if described["fit"] == "doubtful":  # why a rig is refused, standard error says
+    if described["fit"] == "doubtful":  # the reason why a rig is refused is on standard error
         for reason in described["doubts"]:
             print(f"doubtful: {reason}")
         print(inputs.OVERRULE)

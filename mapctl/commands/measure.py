@@ -28,7 +28,7 @@ class Measure(ModelCommand, options.RigOptions):
 
     Of a clip also its cycle, of a walk or a run one stride, or that it has none.
     All are measured as mocap's values were: on canonical joints with Y up, at 30 frames a second if there are more. Of
-    a folder the means over its clips; beside a folder of mocap also whether the two can be told apart. Clips of a
+    a folder the means over its clips; beside a folder of mocap also how well a classifier separates the two. Clips of a
     folder that cannot be measured are left out and listed.
     """
 
@@ -37,7 +37,7 @@ class Measure(ModelCommand, options.RigOptions):
     clip: Positional[Annotated[Path, arg(metavar="CLIP|FOLDER")]]
     """A motion in any format that mapctl reads; or a folder, every one below it."""
     reference: Annotated[Path | None, arg(metavar="CLIP|FOLDER")] = None
-    """Another clip to print beside it; or for a folder another, unseen mocap say: adds realism."""
+    """Another clip to print beside it; or for a folder another, for example unseen mocap: adds realism."""
     curve: options.MaybeCurve = None
     """Curve that it was to follow: circle:4, a CSV, an SVG (see `mapctl follow --help`)."""
     speed: options.MaybeNumber = None
@@ -107,7 +107,7 @@ class _ClipSet:
     skipped: dict[str, str]
     """Reasons by file that was left out, each a sentence that begins with the file."""
     notes: list[str]
-    """Notes on what could not be made comparable."""
+    """Notes on measures that could not be made comparable."""
 
     @property
     def means(self) -> dict[str, float]:
@@ -198,7 +198,7 @@ def _print_tables(values: Mapping[str, Any]) -> None:
 
 
 def _make_comparable(motion: Motion, path: Path, rig: Rig | None = None) -> tuple[Motion, list[str]]:
-    """Make a clip as mocap's values were measured, and note what could not be made so."""
+    """Convert a clip to the rate and rig of mocap's reference values, and note what could not be converted."""
     comparable, notes = make_comparable(motion, rig)
     return comparable, [f"{path}: {note}" for note in notes]
 
@@ -218,11 +218,11 @@ def _describe_cycle(cycle: Mapping[str, Any]) -> str:
 def _print_realism(realism: Mapping[str, Any]) -> None:
     counts = f"{realism['generated_windows']} and {realism['mocap_windows']} windows of one second"
     rows = [
-        ["told apart, %", *(100 * realism[name] for name in ("accuracy", "floor_accuracy"))],
+        ["classifier accuracy, %", *(100 * realism[name] for name in ("accuracy", "floor_accuracy"))],
         ["Frechet distance", realism["frechet"], realism["floor_frechet"]],
     ]
     columns = ["realism", "ours against the reference", "halves of the reference (floor)"]
-    print_table(columns, rows, title=f"{counts}; 50 % cannot be told apart")
+    print_table(columns, rows, title=f"{counts}; 50 % is chance")
 
 
 def _read_mocap_values() -> Mapping[str, Any]:

@@ -39,7 +39,7 @@ class RunScene(ModelCommand, options.ReadOptions):
     scene: Positional[Annotated[str, arg(metavar="SCENE.toml")]]
     """The scene file, or the name of a scene that comes with mapctl (`mapctl info` lists them)."""
     out: options.OutFolder = Path()
-    """Folder for the scene's outputs; made if it does not exist."""
+    """Folder for the scene's outputs; created if it does not exist."""
     rig: options.OutRig = "canonical"
     """Body of the actors whose `rig` the scene file does not give: the canonical one, or that of a clip, on whose rig
     they are written; or a rig by name or TOML file, whose joints get the canonical bones."""

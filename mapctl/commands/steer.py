@@ -53,20 +53,20 @@ class Steer(ModelCommand, options.ReadOptions, streaming.StreamOptions):
 
     commands: Positional[Annotated[Path, arg(metavar="COMMANDS.csv")]]
     """CSV with the columns time_s, speed_mps, heading_deg (0 is +Z, 90 is +X); and, where wanted, facing_deg for
-    strafing, turn_deg_s to turn continuously, step_m for a step length, gait and style as the prior knows them,
+    strafing, turn_deg_s to turn continuously, step_m for a step length, gait and style of the prior,
     left_hand_x, left_hand_y, left_hand_z (and right_hand_, look_) for a place in metres that a hand reaches or that is
-    looked at. goto_x_m, goto_z_m, within_s, and where wanted goto_facing_deg and pose (FILE:FRAME), say where the hips
+    looked at. goto_x_m, goto_z_m, within_s, and where wanted goto_facing_deg and pose (FILE:FRAME), give where the hips
     are to be first, and within how many seconds: the rest of the line holds from then on. The last line's time is the
-    end, or a second after the last place is reached."""
+    end, or a second after the last position is reached."""
     out: options.OutFile
     """Where the motion goes: .bvh, .npz, .glb or .usda."""
     realtime: bool = False
     """Play against the wall clock: every step has a deadline and brings the best found by then. On a machine that
-    cannot keep up the script's time runs slower than the clock's, and the summary says so."""
+    cannot keep up the script's time runs slower than the clock's, which the summary reports."""
     prior: options.Name = "locomotion-live"
     """A bundled prior, or the file or run folder of a trained one."""
     stitcher: options.MaybeName = None
-    """For goto_x_m: the file or run folder of a trained stitcher, which makes the end of the way; the bundled one if
+    """For goto_x_m: the file or run folder of a trained stitcher, which generates the approach; the bundled one if
     not given."""
     rig: options.OutRig = "canonical"
     """Body that moves: the canonical one, or that of a clip, on whose rig the motion is then written; or a rig by name
@@ -91,7 +91,7 @@ class Steer(ModelCommand, options.ReadOptions, streaming.StreamOptions):
 
 
 _HAND_WORDS = {"leftHand": "left hand", "rightHand": "right hand"}
-_AFTER_SECONDS = 1.0  # for which a motion goes on after the last place was reached
+_AFTER_SECONDS = 1.0  # for which a motion goes on after the last position was reached
 _LAST_COMMAND_SECONDS = 3.0  # seconds for which a script of a single command is played
 
 
@@ -113,7 +113,7 @@ def run(command: Steer) -> int:
     if any(wanted.arrival is not None for wanted in track.commands):
         stepper = Arriver(priors.load_stitcher(command.stitcher or "stitcher"))
     elif command.stitcher is not None:
-        raise RequestError("--stitcher makes ways to a place, and the script has no goto_x_m; leave it out")
+        raise RequestError("--stitcher is for goto_x_m, which the script does not have; leave it out")
     settings = steer.SteerSettings(limits=limits, footing=FootContact(rest_height=character.toe_rest_height))
     stream = streaming.open_stream(command, [character.skeleton])
     try:
@@ -175,7 +175,7 @@ def _run_steering(
     stepper: Stepper,
     stream: "PoseStream | None",
 ) -> tuple[Recorder, list[StepRecord], int]:
-    # A script ends when its last command comes, which says no more than that if it is not the only one; an order to be
+    # A script ends when its last command comes, which only marks the end if it is not the only one; an order to be
     # somewhere is carried out, and what comes after it shown for a while.
     by = max((wanted.arrival.by for wanted in track.commands if wanted.arrival is not None), default=0.0)
     alone = track.times[0] + _LAST_COMMAND_SECONDS if len(track.times) == 1 else 0.0
@@ -213,7 +213,7 @@ def _stream_to(stream: "PoseStream", clock: WallClock, frames: int, zero: float)
 
 
 def _format_position(row: Mapping[str, Any], name: str, words: str) -> str:
-    """Say how near a hand came to its place, and for how long it was there; nothing where none was wanted."""
+    """Format how near a hand came to its target, and for how long it was there; empty without a target."""
     nearest = row.get(f"{name}_nearest_cm")
     if nearest is None:
         return ""
@@ -222,7 +222,7 @@ def _format_position(row: Mapping[str, Any], name: str, words: str) -> str:
 
 
 def _format_arrival(row: Mapping[str, Any]) -> str:
-    """Say how near a place was reached, and its facing and pose where they were wanted."""
+    """Format how near a position was reached, and the errors of facing and pose where they were given."""
     facing, pose = row["facing_error_deg"], row["pose_error_cm"]
     turned = "" if facing is None else f", {facing:.2f} degrees off"
     posed = "" if pose is None else f", joints {pose:.1f} cm off the pose"

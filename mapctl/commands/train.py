@@ -36,7 +36,7 @@ class _Kinds(Mapping[str, type]):
 
 
 KINDS = _Kinds()
-"""What `mapctl train` takes, by its name."""
+"""Trainable models by their name in `mapctl train`."""
 
 
 @dataclass(frozen=True)

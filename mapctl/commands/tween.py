@@ -134,9 +134,9 @@ def _check(command: Tween, request: KeyRequest | None) -> None:
     kinds = {"--keyframes": command.keyframes, "--joints": command.joints, "--root-only": command.root_only or None}
     unused = [name for name, value in kinds.items() if value is not None]
     if request is not None and unused:
-        raise RequestError(f"{unused[0]} is for motion files; {command.source} says itself what its keys are")
+        raise RequestError(f"{unused[0]} is for motion files; {command.source} holds its own keys")
     if request is None and command.keyframes is None:
-        raise RequestError("of a motion file, --keyframes says which frames are keys (see mapctl tween --help)")
+        raise RequestError("a motion file needs --keyframes, its frames that are keys (see mapctl tween --help)")
     if not 1 <= command.variations <= _MAX_VARIATIONS:
         raise RequestError(f"--variations must be 1 to {_MAX_VARIATIONS}, got {command.variations}")
     given, several = [command.source, *map(Path, () if request is None else request.files)], command.variations > 1
@@ -149,9 +149,9 @@ def _check(command: Tween, request: KeyRequest | None) -> None:
         results.check_destinations(command.out, command.video, command.report, given=given)
         return
     if command.method == "slerp":
-        raise RequestError("--method slerp knows one answer only; leave --variations out")
+        raise RequestError("--method slerp has one answer only; leave --variations out")
     if command.suggest_timing:
-        raise RequestError("--suggest-timing tells of one answer; leave --variations out")
+        raise RequestError("--suggest-timing is for one answer; leave --variations out")
     if command.video is not None and command.video.suffix.lower() != ".png":
         raise RequestError("--video of several answers is a .png of stills; film OUT_000 by `mapctl render`")
     first, *others = _number_paths(command)
@@ -248,7 +248,7 @@ def _choose_source(command: Tween, first: Inbetweener, dna: results.Examples) ->
         return None
     styles = results.find_styles(tweener, dna) or list(tweener.classes.values())
     if not styles:
-        raise RequestError(f"{tweener.name} knows no classes of motion to draw variations from; name clips by --dna")
+        raise RequestError(f"{tweener.name} has no classes of motion to draw variations from; name clips by --dna")
     order = torch.randperm(len(styles), generator=torch.Generator().manual_seed(command.seed)).tolist()
 
     def draw(number: int, draws: torch.Generator) -> Inbetweener:

@@ -41,7 +41,7 @@ _NOISE_FRAMES = 12  # frames from which noise is estimated
 _NOISE_SPEED = 0.04  # m/s that noise of toes makes once they are smoothed, before contacts are looked for
 _SMOOTH_SECONDS = (0.04, 0.15)  # least and greatest standard deviation of that Gaussian
 _MERGE_SECONDS, _MERGE_METRES = 0.15, 0.06  # contacts at one position with less than these between them are one
-_ROLL_METRES = 0.005  # over its usual height in a contact, from which a planted toe is on its way down or up
+_ROLL_METRES = 0.005  # over its usual height in a contact, from which a planted toe is moving down or up
 _STEP_FADE_SECONDS = (
     0.12  # over which a foot comes to its position and leaves it: a swing foot is moved as little as that
 )
@@ -308,7 +308,7 @@ class Loop:
 def close_loop(motion: Motion, rig: Rig | None = None) -> Loop:
     """Find the cycle of a motion, cut to it, and close it, on the motion's own rig and in its layout.
 
-    Of a walk or a run it is one stride; one that turns by up to 6 degrees is made straight. `rig` wins over what would
+    Of a walk or a run it is one stride; one that turns by up to 6 degrees is straightened. `rig` wins over what would
     be recognised. RequestError where its joints cannot be identified, and where no cycle is found.
     """
     rigged, fps = RiggedMotion.of(motion, rig), float(motion.fps)
@@ -407,7 +407,7 @@ def _spread(apart: Float[Tensor, "window width"], at: int, frames: int, fps: flo
 def _restore_contacts(
     closed: RiggedMotion, source: RiggedMotion, planted: Bool[Tensor, "frames 2"], travel: GroundTransform
 ) -> Motion:
-    """Take out of planted feet by what closing the cycle made them drift; over the seam too. `source` are the same
+    """Remove from planted feet the drift that closing the cycle adds; over the seam too. `source` are the same
     frames before, and one more."""
     if not bool(planted.any()):
         return closed.motion

@@ -27,7 +27,7 @@ def pair_joints(rigmap: RigMap) -> list[int | None]:
     a side but no partner, as a prop in one hand.
 
     Canonical joints are paired as such. Others are paired by their names without left and right, as
-    `mapctl.joint_names` knows these, else by their places in the T-pose below joints that are paired.
+    `mapctl.joint_names` has these, else by their positions in the T-pose below joints that are paired.
     """
     skeleton, joints = rigmap.rig_skeleton, rigmap.joints
     found = {joint: joints[other] for name, joint in joints.items() if (other := mirror_name(name)) in joints}
@@ -70,16 +70,16 @@ def _pair_by_position(
 # A reflection through x = 0 keeps rotation about x and reverses rotation about y and z.
 _FLIP = torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)
 _FLIP_XYZW = torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64)
-_OFF_METRES = 0.001  # metres by which toes may be off before legs bring them to their places
+_OFF_METRES = 0.001  # metres by which toes may be off before legs bring them to their positions
 
 
 def mirror(motion: Motion, rig: Rig | None = None) -> Motion:
     """Exchange left and right through the plane x = 0 of the world, on the motion's own rig and in its layout.
 
     Bones stay those of the rig. Where toes would be off by more than a millimetre because bones differ from side to
-    side, legs bring them to the mirror image of their partners' places, so that contacts stay. Joints with a side but
-    without a partner keep their own rotations. `rig` wins over what would be recognised; RequestError where the rig's
-    joints cannot be identified.
+    side, legs bring them to the mirror image of their partners' positions, so that contacts stay. Joints with a side
+    but without a partner keep their own rotations. `rig` wins over what would be recognised; RequestError where the
+    rig's joints cannot be identified.
     """
     rigged = RiggedMotion.of(motion, rig)
     mirrored = rigged.with_motion(_mirror_joints(rigged))
@@ -91,8 +91,8 @@ def mirror(motion: Motion, rig: Rig | None = None) -> Motion:
 
 
 def _mirror_joints(rigged: RiggedMotion) -> Motion:
-    """Mirror all rotations, travelling joints and the place of the hips. Joints without a partner keep their own local
-    rotation."""
+    """Mirror all rotations, travelling joints and the position of the hips. Joints without a partner keep their own
+    local rotation."""
     motion, partners, rest = rigged.motion, pair_joints(rigged.rigmap), rigged.rigmap.rest_quat_xyzw
     world = motion.joint_rotations()
     index = torch.tensor([joint if partner is None else partner for joint, partner in enumerate(partners)])
@@ -114,7 +114,7 @@ def _mirror_joints(rigged: RiggedMotion) -> Motion:
 def _mirror_offsets(
     motion: Motion, partners: list[int | None], rest: Float[Tensor, "joints 4"]
 ) -> dict[int, Float[Tensor, "frames 3"]]:
-    """Mirror what joints travel within their parents: how far each is from its place at rest, as its partner was."""
+    """Mirror what joints travel within their parents: how far each is from its position at rest, as its partner was."""
     found = {}
     for joint, partner in enumerate(partners):
         source = joint if partner is None else partner

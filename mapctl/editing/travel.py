@@ -1,12 +1,12 @@
 """Travel over the ground taken out of a motion, or put on a root joint above the hips.
 
-Travel is the slow part of the hips' way over the ground: a Gaussian takes sway and the rise and fall of speed with each
+Travel is the slow part of the root trajectory: a Gaussian takes sway and the rise and fall of speed with each
 step out of it, and these stay with the hips. Of a loop it is the same share of the cycle's travel in every frame, so
 that what is left repeats exactly.
 
 Rigid transforms of the ground: a turn about the vertical, then a shift; and shares of one, as of a cycle's travel.
 
-A place on the ground is the complex number z + ix, so that turning by an angle is multiplying by exp(i angle).
+A position on the ground is the complex number z + ix, so that turning by an angle is multiplying by exp(i angle).
 """
 
 import cmath

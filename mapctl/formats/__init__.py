@@ -42,10 +42,10 @@ def load(
 
     Of a character's file it is an animation, or one frame of the rest pose where there is none; `hero.glb#ARMATURE`,
     `hero.glb#ARMATURE/ANIMATION` and `hero.glb#/ANIMATION` choose where there are several. `fps` is frames per second
-    of an .amc, which does not say; RequestError with the others, which do. `metres_per_unit` wins over what is found
-    by the size of the body, and over what the file declares. `example:NAME` is a motion that mapctl brings along.
-    FileFormatError says what is wrong with the file, and where: NaN in place of a number, too, which
-    `load_with_missing` takes.
+    of an .amc, which does not state it; RequestError with the others, which do. `metres_per_unit` wins over what is
+    found by the size of the body, and over what the file declares. `example:NAME` is a motion that mapctl brings along.
+    FileFormatError names the fault of the file, and where: NaN in place of a number, too, which `load_with_missing`
+    takes.
     """
     reader, file = _find_reader(path), examples.resolve(path)
     if fps is None:

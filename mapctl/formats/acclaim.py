@@ -37,7 +37,7 @@ from mapctl.motion import Motion
 from mapctl.skeleton import Skeleton
 
 USUAL_FPS = Fraction(120)
-"""Frames per second of a file that does not say: those of the CMU database."""
+"""Frames per second of a file that does not state them: those of the CMU database."""
 _INCH = 0.0254
 """Metres."""
 MAX_BONES = 1000
@@ -75,7 +75,7 @@ class AsfSkeleton:
     axis_quat_xyzw: np.ndarray
     """(bones, 4) rotation of the frame that a bone's angles are about, at rest; for the root its pre-set rotation."""
     channels: tuple[tuple[str, ...], ...]
-    """What an AMC line holds of each bone, as `tx` or `rz`; empty for a bone that never rotates."""
+    """Channels of each bone in an AMC line, as `tx` or `rz`; empty for a bone that never rotates."""
     root_position: np.ndarray
     """(3,) added to the root's position in every frame, file unit."""
     length: float
@@ -91,17 +91,17 @@ class AmcText:
     values: np.ndarray
     """(frames, channels) in the order of the skeleton's bones and channels, file units."""
     degrees: bool | None
-    """Whether angles are in degrees; None where the file does not say."""
+    """Whether angles are in degrees; None where the file does not state it."""
     fps: Fraction | None
-    """Frames per second; None where the file does not say, as most do not."""
+    """Frames per second; None where the file does not state them, as most do not."""
 
 
 def load(path: str | PathLike[str], *, fps: Fraction | float | None = None) -> Motion:
     """Read `take.amc` with the skeleton beside it, or `subject.asf+take.amc`.
 
     Without a name the skeleton is the .asf of the same stem, else the only one in the folder. `fps` is frames per
-    second, over what the file says; else `USUAL_FPS`. Lengths are in metres by the ASF's `length`, or where that is 1
-    by the size of the body. FileFormatError says what is wrong, in which line.
+    second, over those of the file; else `USUAL_FPS`. Lengths are in metres by the ASF's `length`, or where that is 1
+    by the size of the body. FileFormatError names the fault and its line.
     """
     return _read(path, fps=fps, lossy=False)[0]
 
@@ -429,7 +429,7 @@ def read_amc(path: str | PathLike[str], skeleton: AsfSkeleton, *, lossy: bool = 
             fail(f"frame {number} has no line for the root", begun)
         if full and seen != expected:
             bone = shorten(skeleton.names[min(seen ^ expected)])
-            fail(f"not every frame up to {number} holds {bone}, but the file says it is fully specified", begun)
+            fail(f"not every frame up to {number} holds {bone}, but the file is declared fully specified", begun)
         values.extend(row)
 
     for line, words in rows(decode(path, read_bytes(path), "AMC text")[0]):

@@ -19,7 +19,7 @@ def atomic_path(path: str | PathLike[str]) -> Iterator[Path]:
 
     Whatever ends the block early (an error, a full disk, Ctrl-C) removes the scratch file and leaves an older `path`
     alone. The file has the permissions of the one that it replaces, a new one those that the umask allows, whoever
-    wrote the scratch file. WriteError if the place cannot be written, before the block runs where that can be known.
+    wrote the scratch file. WriteError if the folder cannot be written, before the block runs where that can be known.
     """
     target = Path(os.path.realpath(path))
     scratch = target.with_name(f".{secrets.token_hex(4)}{target.suffix}")

@@ -410,14 +410,14 @@ WRITTEN_UNITS = (0.01, 1.0, 0.001)
 """Units of motions that came in no layout, metres: the first in which the reader finds the body's size. Of the largest
 and the smallest unit one is right for every size."""
 STILL_METRES = 1e-6
-"""What varies less than this needs no position channel."""
+"""Variation below which a joint needs no position channel."""
 STILL_SHARE = 1e-6
 """A joint whose offset varies by less than this part of the body's reach stays still; files round to 1e-7."""
 
 
 @dataclass(frozen=True, eq=False)
 class BvhLayout(FileUnit):
-    """What `Motion.source` keeps of a BVH file, so that it is written as it came."""
+    """Layout of a BVH file in `Motion.source`, so that it is written as it came."""
 
     hierarchy: Hierarchy
     """Joints with their channels and OFFSET lines, in the file's unit."""
@@ -440,7 +440,7 @@ def load(path: str | PathLike[str]) -> Motion:
     """Read a BVH file of any Euler order, with 0 to 6 channels a joint, in any of the units of `units`.
 
     The root's translation is `root_position` and its offset in the skeleton is zero. Another joint's
-    translation is its offset where it stays still, else `moving_offsets`. FileFormatError says what is
+    translation is its offset where it stays still, else `moving_offsets`. FileFormatError names what is
     wrong, in which line.
     """
     return _read(read(path))[0]
@@ -499,7 +499,7 @@ def _fill_missing(tree: Hierarchy, values: np.ndarray) -> np.ndarray:
 
 def _find_missing(tree: Hierarchy, lost: np.ndarray, moving: Sequence[int]) -> MissingValues:
     """Find the missing values by joint; a joint without channels is missing where all channels are. One known frame
-    tells the position of a joint that stays still."""
+    determines the position of a joint that stays still."""
     whole = np.all(lost, axis=1)
     rotations = np.tile(whole[:, None], len(tree.names))
     positions = np.zeros_like(rotations)

@@ -35,7 +35,7 @@ Array = np.ndarray
 STILL_METRES = 1e-5
 """A joint whose offset varies by less stays still; files of 32-bit numbers round to 1e-7 of a body."""
 NEW_NODE = -1
-"""What stands for the node of a joint that the file is yet to get."""
+"""Placeholder for the node of a joint that is yet to be added to the file."""
 _DEFAULT_FPS = Fraction(30)
 _UNEVEN_SHARE = 0.02  # of a frame that a key may lie beside it
 _FARTHEST = 1e6  # metres
@@ -195,7 +195,7 @@ def _find_rate(keys: np.ndarray) -> Fraction:
 
 
 def frame_rate_of(rate: float) -> Fraction:
-    """Return the exact frame rate behind one that a file says as a floating-point number: 29.97 is 30000/1001."""
+    """Return the exact frame rate behind a rounded floating-point one: 29.97 is 30000/1001."""
     near = frame_rate(f"{1.0 / rate:.6f}") if 0.01 < rate < 1e4 else Fraction(rate)
     return near if abs(float(near) / rate - 1.0) < 1e-5 else Fraction(rate).limit_denominator(10_000)
 
@@ -219,7 +219,7 @@ class CharacterSource:
     metres_per_unit: float = 1.0
     """Length of the unit that the file declares, metres."""
     humanoid: Mapping[str, str] = field(default_factory=dict)
-    """Joint name by canonical name, where the file itself says which is which (VRM)."""
+    """Joint name by canonical name, where the file itself maps them (VRM)."""
     armatures: Sequence[str] = ()
     """Names of all armatures in the file."""
     animations: Mapping[str, float] = field(default_factory=dict)
@@ -374,7 +374,7 @@ class SkinnedBody:
     """A body in its skeleton's rest pose: no joint is turned and the root is at the origin."""
 
     name: str
-    """What it is: the mannequin, or a character's own mesh."""
+    """Name of the mesh: the mannequin, or a character's own."""
     rest: Array
     """(joints, 3) joints, metres."""
     vertices: Array

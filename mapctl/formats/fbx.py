@@ -56,7 +56,7 @@ def load(path: str | PathLike[str]) -> "Motion":
 
     `path` may end as `#ARMATURE`, `#ARMATURE/ANIMATION` or `#/ANIMATION`; by default the file's first animation that
     moves the armature is read, and a file of several armatures is refused, naming them. Joint frames are aligned with
-    the world in the rest pose. FileFormatError says what is wrong with the file.
+    the world in the rest pose. FileFormatError names the fault of the file.
     """
     from mapctl.formats import character
 
@@ -83,7 +83,7 @@ class Take:
     """Poses of an armature at the frames of one rate."""
 
     rate: float
-    """Frames per second, as the file says."""
+    """Frames per second of the file."""
     local: Array
     """(frames, joints, 10) of each joint in its parent's frame: translation, rotation xyzw, scale."""
     above: Array
@@ -103,7 +103,7 @@ def _place_poses(found: FoundCharacter) -> tuple[Fraction, Array]:
 
 def read_character(path: str, *, armature: str | None, animation: str | None, wanted: str) -> FoundCharacter:
     """Read an armature, and `wanted` besides: `rest` nothing, `motion` its animation, `mesh` its triangles. Refusal
-    says why not.
+    gives the reason.
 
     The rest pose is the one in which skins are bound where bones are as long as the nodes', else the nodes'.
     """
@@ -250,14 +250,14 @@ def find_armatures(scene: ufbx.Scene) -> list[Armature]:
     """Find the armatures of a file, in its order. Refusal where it has none."""
     bones = _find_bones(scene)
     if not bones:
-        raise Refusal("has no limb nodes and no skin, so nothing in it says which nodes are a character's joints")
+        raise Refusal("has no limb nodes and no skin, so nothing in it marks nodes as a character's joints")
     found = [_build(scene, group, bones) for group in _group(scene, bones)]
     names = make_unique([armature.name for armature in found])
     return [replace(armature, name=name) for name, armature in zip(names, found, strict=True)]
 
 
 def _read_bind_poses(scene: ufbx.Scene, armature: Armature) -> list[dict[int, Array]]:
-    """Return world matrices (4, 4) by joint of the poses that the file says skins are bound in: by its skins, and by
+    """Return world matrices (4, 4) by joint of the bind poses of the file: by its skins, and by
     its bind poses."""
     index_of = {node.typed_id: joint for joint, node in enumerate(armature.nodes)}
     skins: dict[int, Array] = {}
@@ -381,7 +381,7 @@ def _sample(scene: ufbx.Scene, name: str, stack: ufbx.AnimStack, begin: float, e
 
 
 def _find_range(stack: ufbx.AnimStack, own: set[int]) -> tuple[float, float]:
-    """Return the first and last second that the animation says, else those of the keys of these elements."""
+    """Return the first and last second of the animation, else those of the keys of these elements."""
     if stack.time_end > stack.time_begin:
         return stack.time_begin, stack.time_end
     curves = [

@@ -115,7 +115,7 @@ def load(path: str | PathLike[str]) -> Motion:
 
     `path` may end as `#ARMATURE`, `#ARMATURE/ANIMATION` or `#/ANIMATION`; by default the file's first animation that
     moves the armature is read, and a file of several armatures is refused, naming them. Joint frames are aligned with
-    the world in the rest pose. FileFormatError says what is wrong with the file.
+    the world in the rest pose. FileFormatError names the fault of the file.
     """
     chosen, gltf, armature, found = _open_character(path)
     names, wanted = _name_animations(gltf), range(len(gltf.all("animations")))
@@ -228,7 +228,7 @@ class Gltf:
 
 
 def read_file(path: str | PathLike[str]) -> Gltf:
-    """Read a glTF file. Refusal or FileFormatError says what is wrong with it: also compression that is not read here,
+    """Read a glTF file. Refusal or FileFormatError names its fault: also compression that is not read here,
     and other files that are not there or lie outside its folder."""
     file = Path(path)
     raw = read_bytes(file)
@@ -262,7 +262,7 @@ def _split_chunks(whole: bytes) -> tuple[bytes, bytes]:
     if version != 2:
         raise Refusal(f"is glTF {version}, expected 2.0")
     if length > len(whole):
-        raise Refusal(f"is cut off: it says {length} bytes and has {len(whole)}")
+        raise Refusal(f"is cut off: it declares {length} bytes and has {len(whole)}")
     chunks: list[tuple[bytes, bytes]] = []
     at = _HEADER.size
     while at + _CHUNK.size <= length and len(chunks) < 2:
@@ -391,7 +391,7 @@ class Armature:
 
 def _open_character(path: str | PathLike[str]) -> tuple[CharacterPath, Gltf, Armature, FoundCharacter]:
     """Read a file, choose its armature and find its rest pose: the one in which the skins are bound where all of them
-    say one and bones are as long as the nodes' (VRM files: always the nodes'); else the nodes'."""
+    hold one and bones are as long as the nodes' (VRM files: always the nodes'); else the nodes'."""
     chosen = parse_character_path(path)
     gltf = read_file(chosen.file)
     armatures = find_armatures(gltf)
@@ -491,7 +491,7 @@ def read_bones(gltf: Gltf) -> dict[str, int]:
 
 
 def find_armatures(gltf: Gltf) -> list[Armature]:
-    """Find the armatures of a file; Refusal where nothing says which nodes are joints, or they are no tree."""
+    """Find the armatures of a file; Refusal where nothing marks nodes as joints, or they are no tree."""
     skins, groups = gltf.all("skins"), list[tuple[set[int], list[int]]]()
     targets = [c["target"] for animation in gltf.all("animations") for c in animation.get("channels", ())]
     animated = {t["node"] for t in targets if t.get("node") is not None and t["path"] != "weights"}
@@ -525,7 +525,7 @@ def _find_bare_joints(gltf: Gltf, animated: set[int]) -> list[set[int]]:
     if bones:
         return [bones]
     if not animated:
-        raise Refusal("has no skin, no humanoid and no animation, so nothing says which nodes are a character's joints")
+        raise Refusal("has no skin, no humanoid and no animation, so nothing in it marks nodes as a character's joints")
     tops: dict[int, list[int]] = {}
     for node in sorted(animated):
         tops.setdefault(gltf.line(node)[-1], []).append(node)
@@ -1037,7 +1037,7 @@ def _save_bones(motion: Motion, path: str | PathLike[str]) -> None:
 
 
 def _find_bones(motion: Motion) -> dict[str, int]:
-    """Return the joint of each bone, by VRM 1's name; empty where nothing says which is which."""
+    """Return the joint of each bone, by VRM 1's name; empty without a humanoid."""
     source = motion.source
     if not isinstance(source, CharacterSource) or not source.humanoid or not source.holds(motion):
         return {name: j for j, name in enumerate(CANONICAL.names)} if motion.skeleton.names == CANONICAL.names else {}
@@ -1084,7 +1084,7 @@ def _select_bones(motion: Motion, bones: Mapping[str, int], path: str | PathLike
 
 
 def _nearest_above(skeleton: Skeleton, joint: int, joints: list[int]) -> int:
-    """Return the place among `joints` of the nearest of them above a joint; the first, the hips, where none is."""
+    """Return the position among `joints` of the nearest of them above a joint; the first, the hips, where none is."""
     above = skeleton.parents[joint]
     while above >= 0 and above not in joints:
         above = skeleton.parents[above]

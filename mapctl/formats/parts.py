@@ -139,7 +139,7 @@ class FoundCharacter:
     ends: dict[int, Array] = field(default_factory=dict)
     """(3,) tip of a last joint in its frame, by joint."""
     fault: str = ""
-    """What is wrong with the meshes; empty where nothing is."""
+    """Fault of the meshes; empty without one."""
     animations: dict[str, float] = field(default_factory=dict)
     """Seconds by name of the animations that fit the character; empty unless its motion was read."""
     animation: str | None = None
@@ -313,8 +313,8 @@ def decode_picture(data: bytes) -> Array | None:
 
 
 def sample_picture(picture: Array, where: Array) -> Array:
-    """Return the picture's colours (n, 4), sRGB and opacity, 0 to 1, at places (n, 2): from its upper left corner, 1 at
-    the other sides, and repeated beyond."""
+    """Return the picture's colours (n, 4), sRGB and opacity, 0 to 1, at positions (n, 2): from its upper left corner, 1
+    at the other sides, and repeated beyond."""
     height, width = picture.shape[:2]
     column = np.floor(np.mod(where[:, 0], 1.0) * width).astype(int).clip(0, width - 1)
     row = np.floor(np.mod(where[:, 1], 1.0) * height).astype(int).clip(0, height - 1)

@@ -1,4 +1,4 @@
-"""What every reader needs first: the bytes of an ordinary file, its text and numbers, or one clear line why not."""
+"""First steps of every reader: the bytes of an ordinary file, its text and numbers, or one clear line why not."""
 
 import csv
 import io
@@ -63,7 +63,7 @@ def one_line(error: Exception | str, limit: int = 160) -> str:
 
 @lru_cache(maxsize=256)
 def warn_once(message: str) -> None:
-    """Log one line on standard error on what was read otherwise than the file says; once."""
+    """Log one line on standard error on what was read otherwise than declared in the file; once."""
     print(f"mapctl: {message}", file=sys.stderr)
 
 
@@ -87,7 +87,7 @@ def decode(path: str | PathLike[str], raw: bytes, expected: str) -> tuple[str, s
 def read_table(path: str | PathLike[str], expected: str) -> list[tuple[int, list[str]]]:
     """Read the rows of a CSV that hold anything, each with its line, values without outer blanks.
 
-    `expected` says what the table should be, for messages. FileFormatError for what is no table of text.
+    `expected` describes the table, for messages. FileFormatError for what is no table of text.
     """
     text, encoding = decode(path, read_bytes(path), expected)
     if encoding != "utf-8":
@@ -109,7 +109,7 @@ def check_extent(path: str | PathLike[str], frames: int, joints: int) -> None:
 
 
 def finite_number(word: str) -> float | None:
-    """Return the number a word says, or None if it is none, not finite or absurd; `1_000` is none in a file."""
+    """Return the number in a word, or None if it is none, not finite or absurd; `1_000` is none in a file."""
     try:
         value = float(word)
     except ValueError:

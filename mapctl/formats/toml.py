@@ -27,7 +27,7 @@ T = TypeVar("T")
 
 def read(path: str | PathLike[str], kind: type[T], *, what: str, unknown: Callable[[Sequence[int | str]], str]) -> T:
     """Read the file as a `kind`, as in "a scene file is ...". FileFormatError names file and key, as in
-    `key[1].facing_deg: ...`, in one line; `unknown` says which keys are allowed where one is not known. What `kind`
+    `key[1].facing_deg: ...`, in one line; `unknown` lists the allowed keys where one is not known. What `kind`
     itself raises passes."""
     table = _parse_toml(path, what)
     try:

@@ -125,7 +125,7 @@ def frame_rate(frame_time: str) -> Fraction:
     """
     printed = Decimal(frame_time)
     seconds, exact = float(printed), 1 / Fraction(printed)
-    # One digit says too little to second-guess, and a whole rate needs no help.
+    # One digit is too little to second-guess, and a whole rate needs no help.
     if len(printed.normalize().as_tuple().digits) < 2 or exact.denominator == 1:
         return exact
     unit = 10.0 ** int(printed.as_tuple().exponent)

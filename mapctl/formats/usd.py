@@ -74,7 +74,7 @@ def load(path: str | PathLike[str]) -> "Motion":
     is bound to it.
 
     `path` may end as `#SKELETON`, `#SKELETON/ANIMATION` or `#/ANIMATION`; a file of several skeletons is refused,
-    naming them. Joint frames are aligned with the world in the rest pose. FileFormatError says what is wrong with the
+    naming them. Joint frames are aligned with the world in the rest pose. FileFormatError names the fault of the
     file.
     """
     from mapctl.formats import character
@@ -171,8 +171,8 @@ def interpolate(keys: Array, values: Array, times: Array) -> Array:
 
 
 def read_character(path: str, *, armature: str | None, animation: str | None, wanted: str) -> FoundCharacter:
-    """Read a skeleton, and `wanted` besides: `rest` nothing, `motion` its animation, `mesh` its triangles. Refusal says
-    why not."""
+    """Read a skeleton, and `wanted` besides: `rest` nothing, `motion` its animation, `mesh` its triangles. Refusal
+    names why not."""
     try:
         stage = open_stage(path)
         listed, prims = find_skeletons(stage)
@@ -211,8 +211,8 @@ def _place_rest(skeleton: "SkeletonPrim", outer: Array, stage: Array) -> Array:
     """Return the world matrices (joints, 4, 4) of the pose in which skins are bound, else of that of joints that
     nothing moves. `outer` and `stage` take the skeleton's and the stage's space to the world.
 
-    UsdSkel says the former in the world of the time of binding, and skins as if that were the skeleton's space; it is
-    taken for the space in which bones are as long as in the latter.
+    UsdSkel defines the former in the world of the time of binding, and skins as if that were the skeleton's space; it
+    is taken for the space in which bones are as long as in the latter.
     """
     bind, rest, parents = skeleton.bind, skeleton.rest, skeleton.parents
     check_size(outer, *(table for table in (bind, rest) if table is not None))
@@ -333,16 +333,16 @@ class SkeletonPrim:
     parents: list[int]
     """Index of each joint's parent, -1 where it has none."""
     bind: Array | None
-    """(joints, 4, 4) of the pose in which skins are bound, in the skeleton's space; None where it says none."""
+    """(joints, 4, 4) of the pose in which skins are bound, in the skeleton's space; None where it has none."""
     rest: Array | None
-    """(joints, 4, 4) of the pose of joints that nothing moves, in their parents' frames; None where it says none."""
+    """(joints, 4, 4) of the pose of joints that nothing moves, in their parents' frames; None where it has none."""
 
 
 def find_skeletons(stage: Usd.Stage) -> tuple[list[str], list[Usd.Prim]]:
     """Find the skeletons of a stage, those in instances too, with unique names. Refusal where there is none."""
     prims = [prim for prim in walk(stage) if prim.IsA(UsdSkel.Skeleton)]
     if not prims:
-        raise Refusal("has no Skeleton (UsdSkel), so nothing in it says what a character's joints are")
+        raise Refusal("has no Skeleton (UsdSkel), so nothing in it marks a character's joints")
     return make_unique([prim.GetName() for prim in prims]), prims
 
 
@@ -497,7 +497,7 @@ def _sample_joints(
 
 def _rest_parts(skeleton: SkeletonPrim) -> Array:
     """Return translation, rotation xyzw and scale (joints, 10) of the pose of joints that nothing moves: that which the
-    skeleton says, else the one in which skins are bound."""
+    skeleton has, else the one in which skins are bound."""
     matrices = skeleton.rest
     if matrices is None:
         assert skeleton.bind is not None
@@ -794,7 +794,7 @@ def write_character(path: str, *, motion: NewMotion, scratch: str, folder: str) 
         _copy_stage(stage, scratch, Path(folder).resolve())
         edited = Usd.Stage.Open(scratch)
         _add_motion(edited, motion)
-        return "" if edited.GetRootLayer().Save() else "USD does not say why"
+        return "" if edited.GetRootLayer().Save() else "USD gives no reason"
     except (Tf.ErrorException, RuntimeError) as error:
         return first_reason(error)
 
@@ -915,7 +915,7 @@ def _write_samples(attribute: Usd.Attribute, kind: type, values: Array, codes: S
 
 
 def _set_extent(prim: Usd.Prim, positions: Array) -> None:
-    """Set the extent of the SkelRoot that a skeleton is in, if it says one; viewers draw nothing beyond it."""
+    """Set the extent of the SkelRoot that a skeleton is in, if it has one; viewers draw nothing beyond it."""
     while prim and not prim.IsA(UsdSkel.Root):
         prim = prim.GetParent()
     extent = UsdGeom.Boundable(prim).GetExtentAttr() if prim else None
@@ -1019,4 +1019,4 @@ def _export(stage: Usd.Stage, scratch: Path) -> None:
         number = next((number for number in (errno.ENOSPC, errno.EDQUOT) if os.strerror(number) == reason), None)
         raise OSError(number, reason) from error
     if not written:
-        raise OSError("USD does not say why")
+        raise OSError("USD gives no reason")

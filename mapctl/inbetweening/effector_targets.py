@@ -89,17 +89,17 @@ _REST_HEIGHTS = {
     if name.endswith(("Foot", "Toes"))
 }
 _SAME_VIEW = math.radians(1.0)
-_LEAST_LINE = 1e-3  # metres: a shorter way has no direction
+_LEAST_LINE = 1e-3  # metres: a shorter line has no direction
 
 
 @dataclass(frozen=True, eq=False)
 class LooseKeys:
-    """Places over the ground and drawings, by frame."""
+    """Ground positions and drawings, by frame."""
 
     placed: Bool[Tensor, " frames"]
-    """Whether the hips' place over the ground is given by itself."""
+    """Whether the hips' ground position is given by itself."""
     ground: Float[Tensor, "frames 2"]
-    """That place (x, z), world, metres; anything finite where there is none."""
+    """That position (x, z), world, metres; anything finite where there is none."""
     drawn: Bool[Tensor, "frames joints"]
     """Whether a canonical joint is drawn."""
     sketch: Float[Tensor, "frames joints 2"]
@@ -138,7 +138,7 @@ class LooseKeys:
         return replace(self, ground=self.ground * factor)
 
     def see_from_one_side(self, skeleton: Skeleton) -> "SeenDrawings | None":
-        """Return all drawings as seen by who sees the first of them, by a body with these bones; None without any."""
+        """Return all drawings from the view of the first, for a body with these bones; None without any."""
         frames = self.drawings.nonzero()[:, 0].tolist()
         if not frames:
             return None
@@ -179,9 +179,9 @@ def lead_over_positions(
     placed: Bool[Tensor, "batch frames"],
     faced: Bool[Tensor, "batch frames"],
 ) -> tuple[Float[Tensor, "batch frames 2"], Float[Tensor, "batch frames"]]:
-    """Lead ground (metres) and heading (radians) straight from one given place to the next, and from one given heading
-    to the next. Where no heading of a motion is given it looks along its path: at a place between both lines that meet
-    there, and from place to place evenly."""
+    """Lead ground (metres) and heading (radians) straight from one given position to the next, and from one given
+    heading to the next. Where no heading of a motion is given it looks along its path: at a position between both lines
+    that meet there, and from position to position evenly."""
     path = fill_missing(ground, placed)
     line = torch.nn.functional.normalize(torch.diff(path, dim=1), dim=-1)
     none = torch.zeros_like(path[:, :1])

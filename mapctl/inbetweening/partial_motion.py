@@ -1,7 +1,7 @@
 """Partial motions: what is known of a motion by joint, by frame and by kind, and an interpolation of the rest.
 
 Known are rotations joint by joint; the position of the hips on the ground, their height and their heading, each for
-itself; a rough path of the hips; and places of hands and feet in single frames. So lost joints, gaps, and keys that
+itself; a rough path of the hips; and positions of hands and feet in single frames. So lost joints, gaps, and keys that
 tell a part are one question to a network.
 """
 
@@ -27,7 +27,7 @@ _EFFECTOR_PARTNERS = [EFFECTORS.index(CANONICAL.index(mirror_name(CANONICAL.name
 
 @dataclass(frozen=True, eq=False)
 class KnownParts:
-    """What is known of a batch of motions."""
+    """Known parts of a batch of motions."""
 
     rotations: Bool[Tensor, "batch frames joints"]
     """Local rotations by joint; the hips' is their tilt without their heading."""
@@ -99,7 +99,7 @@ class PartialMotion:
     offsets: Float[Tensor, "batch joints 3"]
     """Bones: each joint in its parent's frame, metres, of a body whose legs are as long as the canonical ones."""
     known: KnownParts
-    """What is known."""
+    """The known parts."""
 
     def local_matrices(self) -> Float[Tensor, "batch frames joints 3 3"]:
         """Return local rotation matrices; the hips' is their world rotation."""

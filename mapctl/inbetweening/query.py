@@ -35,7 +35,7 @@ class GapQuery:
     keep_trajectory: bool = False
     """Whether the root of `motion` shows the requested trajectory where it is missing; it may sway about that."""
     loose: LooseKeys | None = None
-    """Places over the ground and drawings in frames that are missing; `motion` leads over the places, and looks along
+    """Ground positions and drawings in frames that are missing; `motion` leads over the positions, and looks along
     them where no heading is known."""
 
     @property
@@ -109,7 +109,7 @@ class GapSource:
     apart: float | None = None
     """Mean distance of joints, metres, at which two sides met that were then joined; None of what has no sides."""
     remark: str = ""
-    """What else is to be said of the gap; empty where there is nothing."""
+    """Remark on the gap; empty without one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +130,7 @@ class Proposal:
 
     def take(self, other: "Proposal", gaps: Sequence[tuple[int, int]]) -> "Proposal":
         """Return this proposal with the motion and contacts that another one has in some gaps, first frames and one
-        past the last; who made what is not changed."""
+        past the last; the sources stay."""
         root, quats = self.motion.root_position.clone(), self.motion.local_quat_xyzw.clone()
         logits = self.contact_logits.clone()
         for start, stop in gaps:

@@ -2,8 +2,8 @@
 
 A predicted trajectory of the hips, led through the positions that are known.
 
-What the prediction misses the next known position by is spread in proportion to the way walked: who stands does not
-slide, and who walks takes steps that are a little longer, shorter or aside.
+What the prediction misses the next known position by is spread in proportion to the distance walked: a standing
+character does not slide, and a walking one takes steps that are a little longer, shorter or aside.
 """
 
 from dataclasses import dataclass
@@ -118,7 +118,7 @@ def lead_over_keys(
     lost: Bool[Tensor, " frames"],
     loose: LooseKeys | None,
 ) -> Float[Tensor, "frames 3"]:
-    """Close a path as `close_path` does, over places of loose keys too, which tell no height."""
+    """Close a path as `close_path` does, over positions of loose keys too, which have no height."""
     path = close_path(predicted, known, lost)
     if loose is None or not bool(loose.placed.any()):
         return path

@@ -19,7 +19,7 @@ from mapctl.motion import Motion
 WorldPosition = tuple[float, float, float]
 """Position in a world with Y up, metres."""
 _KINDS = ("half", "drawing", "root_only")  # what a key may give instead of a whole pose, one of them
-_NO_POSITION = "no key tells where the hips are: give one a pose, a half, or a place"
+_NO_POSITION = "no key gives the position of the hips: give one a pose, a half, or a place"
 
 
 @dataclass(frozen=True)
@@ -55,16 +55,16 @@ class Key:
     half: Literal["upper", "lower"] | None = None
     """Half of the body that counts, with the hips; the other is generated."""
     drawing: Drawing | None = None
-    """What the pose looks like from one side; the motion's own frame does not count."""
+    """Drawing of the pose from one side, in place of the motion's own frame."""
     placed: bool = False
-    """Whether with a drawing the place of the motion's hips over the ground counts."""
+    """Whether with a drawing the position of the motion's hips over the ground counts."""
 
     def __post_init__(self):
         if fault := _find_kind_fault(self, self.ends):
             raise RequestError(fault)
         for name, position in self.positions.items():
             if not all(map(math.isfinite, position)):
-                raise RequestError(f"the place of {name} at frame {self.frame} is no three numbers, got {position}")
+                raise RequestError(f"the position of {name} at frame {self.frame} is no three numbers, got {position}")
 
     @property
     def ends(self) -> tuple[str, ...]:
@@ -73,7 +73,7 @@ class Key:
 
     @property
     def what(self) -> Literal["pose", "limbs", "root", "place", "half", "drawing"]:
-        """What of the frame counts."""
+        """The part of the frame that counts."""
         if self.ends:
             return "limbs"
         if self.drawing is not None:
@@ -117,7 +117,7 @@ class Keys:
 
     def checked(self, motion: Motion) -> list[Key]:
         """Sort keys by time, each once; RequestError for frames that the motion has not, for two keys that differ at
-        one frame, for fewer than two, and where none gives the hips' place."""
+        one frame, for fewer than two, and where none gives the hips' position."""
         found: dict[int, Key] = {}
         for one in self.each:
             key = Key(one) if isinstance(one, int) else one
@@ -263,7 +263,7 @@ def _find_kind_fault(key: Key | KeyEntry, ends: Sequence[str]) -> str | None:
         return f'root_only: it is true, false or "place", got "{key.root_only}"'
     if len(kinds) > 1:
         return f"{kinds[0]}: {' and '.join(kinds)} are {len(kinds)} kinds of keys; choose one"
-    return f"{kinds[0]}: a key tells {kinds[0]} or hands and feet; choose one" if kinds and ends else None
+    return f"{kinds[0]}: a key gives {kinds[0]} or hands and feet; choose one" if kinds and ends else None
 
 
 def _find_fault(key: KeyEntry, body: str | None) -> str | None:
@@ -271,11 +271,11 @@ def _find_fault(key: KeyEntry, body: str | None) -> str | None:
     if (key.frame is None) == (key.seconds is None):
         return "frame: a key is at a frame or at seconds, one of them"
     if key.pose_frame is not None and key.pose_seconds is not None:
-        return "pose_frame: a pose is told by pose_frame or by pose_seconds, not by both"
+        return "pose_frame: a pose is given by pose_frame or by pose_seconds, not by both"
     if fault := _find_kind_fault(key, (*key.joints, *key.reach)):
         return fault
     if key.view_deg is not None and key.drawing is None:
-        return "view_deg: it says from where a drawing is seen, and there is none"
+        return "view_deg: it is the view of a drawing, and there is none"
     idle = [name for name in _POSE_FIELDS if getattr(key, name) is not None]
     if key.drawing is not None or key.root_only == "place":
         idle = [name for name in idle if name in ("height", "facing_deg") or (name != "place" and not key.needs_pose)]

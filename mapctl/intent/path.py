@@ -178,7 +178,7 @@ def integrate_speeds(speeds: Float[Tensor, " frames"], fps: float) -> Float[Tens
 _STEP = 0.05  # metres between the arcs that are looked at
 _AHEAD = 0.35  # metres before and after an arc over which the direction changes: half a step
 _TURN_RATE = 1.55  # rad/s at which one turns a corner without leaving it by more than a few centimetres
-_SLOWEST = 0.7  # m/s, to which corners slow one down at most: who is slower hardly walks
+_SLOWEST = 0.7  # m/s, to which corners slow a walk down at most: slower is hardly walking
 _REVERSAL_STEP = 0.02  # metres before and after an arc, over which a reversal turns
 _REVERSAL_ANGLE = math.radians(110.0)  # from which on a corner is turned on the spot
 _BRAKING = 0.9  # m/s^2, before a corner and after it
@@ -186,7 +186,7 @@ _BRAKING = 0.9  # m/s^2, before a corner and after it
 
 def walk_at_ease(curve: Curve) -> SpeedProfile:
     """Return the speeds of a walk for which none is given: USUAL_SPEED, and lower before and in corners that turn
-    faster than people who walk do."""
+    faster than walking people do."""
     profile = SpeedProfile.constant(USUAL_SPEED)
     count = max(2, round(curve.length / _STEP) + 1)
     arcs = torch.linspace(0, curve.length, count, dtype=torch.float64)
@@ -204,7 +204,7 @@ def walk_at_ease(curve: Curve) -> SpeedProfile:
 
 
 def find_reversals(curve: Curve) -> list[float]:
-    """Find the arcs, metres, at which a curve goes back the way it came: who walks it turns on the spot there."""
+    """Find the arcs, metres, at which a curve reverses: a character turns on the spot there."""
     count = max(2, round(curve.length / _REVERSAL_STEP) + 1)
     arcs = torch.linspace(0, curve.length, count, dtype=torch.float64)[2:-2]
     turned = rotations.wrap_angle(_heading(curve, arcs + _REVERSAL_STEP) - _heading(curve, arcs - _REVERSAL_STEP)).abs()

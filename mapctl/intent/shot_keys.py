@@ -24,7 +24,7 @@ Position = tuple[Coordinate, Coordinate, Coordinate]
 
 @dataclass(frozen=True)
 class ShotKey:
-    """What a character does at a time, or for a while."""
+    """A keyframe of a shot: a reach, a look or a pose at a time, or held."""
 
     __pydantic_config__ = STRICT
 
@@ -49,7 +49,7 @@ class ShotKey:
     root_only: bool = False
     """Whether only position and rotation of the pose's hips count."""
     look_at: Position | None = None
-    """What the head looks at, x, y, z, metres."""
+    """Target of the gaze, x, y, z, metres."""
     hold_seconds: Seconds = 0.0
     """For how long."""
     tolerance: Tolerance | Mapping[str, Tolerance] = 0.0
@@ -76,7 +76,7 @@ class ShotKey:
             if unknown := [limb for limb in given if limb not in LIMBS]:
                 return f"{name}.{unknown[0]}: hands and feet are {', '.join(LIMBS)}"
         if unused := [limb for limb in tolerated if limb not in {*self.reach, *self.joints}]:
-            return f"tolerance.{unused[0]}: the key gives no place of it"
+            return f"tolerance.{unused[0]}: the key has no position for it"
         return None
 
     @property

@@ -1,8 +1,9 @@
 """Steering: commands over time, and the targets that follow them at a limited rate (Wang et al. 2019, section 5.3).
 
 Steering scripts: CSV files of time_s, speed_mps, heading_deg and, optionally, facing_deg, turn_deg_s, step_m, gait,
-style, and places in the world as three columns each: left_hand_x, left_hand_y, left_hand_z, right_hand_x, ..., look_z;
-and where to be before the rest of a line holds: goto_x_m, goto_z_m, goto_facing_deg, within_s and pose (FILE:FRAME).
+style, and positions in the world as three columns each: left_hand_x, left_hand_y, left_hand_z, right_hand_x, ...,
+look_z; and where to be before the rest of a line holds: goto_x_m, goto_z_m, goto_facing_deg, within_s and pose
+(FILE:FRAME).
 
 A line that leaves an optional column empty faces where it goes, goes straight, has a free step length, gives the prior
 no label, and reaches for nothing and looks at nothing in particular.
@@ -58,13 +59,13 @@ class Arrival:
     by: float
     """When, seconds of the stream."""
     facing: float | None = None
-    """Facing of the hips there, radians; None faces where it came from another place, or as it did."""
+    """Facing of the hips there, radians; None faces where it came from another position, or as it did."""
     pose: Motion | None = None
     """Pose there, a canonical motion of one frame; None walks on, or stands where the command's speed is 0."""
 
     def __post_init__(self):
         if not all(map(math.isfinite, (*self.position, self.by, self.facing or 0.0))):
-            raise RequestError("the place, the time and the facing of an arrival are finite numbers")
+            raise RequestError("the position, the time and the facing of an arrival are finite numbers")
 
 
 @dataclass(frozen=True)
@@ -86,7 +87,7 @@ class Command:
     """Labels of the prior that hold (a gait, a style: `run`, `elderly`); none leaves the motion to the other targets.
     """
     reach: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
-    """Places in the world that hands are to reach while they come past, metres, by REACHING_HANDS."""
+    """Positions in the world that hands are to reach while they come past, metres, by REACHING_HANDS."""
     look_at: tuple[float, float, float] | None = None
     """Place in the world that is to be looked at, metres."""
     obstacles: tuple[Obstacle, ...] = ()
@@ -107,7 +108,7 @@ class Command:
             if name not in (*REACHING_HANDS, "look_at"):
                 raise RequestError(f"a command reaches with {' or '.join(REACHING_HANDS)}, not with {name}")
             if len(position) != 3 or not all(map(math.isfinite, position)):
-                raise RequestError(f"the place for {name} must be three finite numbers of metres, got {position}")
+                raise RequestError(f"the position for {name} must be three finite numbers of metres, got {position}")
 
     def within(self, fastest: float, *, when: str = "") -> tuple["Command", list[str]]:
         """Limit the command to what can be held: at most `fastest` m/s, steps of STEP_LENGTHS, and angles of one turn.

@@ -194,8 +194,8 @@ def _align_bend_plane(
     return rotations.multiply(rotations.from_rotation_vector(axis * (angle * weight)[:, None]), turn)
 
 
-_DETOUR = 0.8  # share of the way out that a turn between opposite directions takes
-_OWN_SIDE = 0.5  # of the way out that leads to a limb's own side, where 1 leads ahead
+_DETOUR = 0.8  # share of the turn outwards that a turn between opposite directions takes
+_OWN_SIDE = 0.5  # of the turn outwards that leads to a limb's own side, where 1 leads ahead
 
 
 def find_out(name: str, joints: Float[Tensor, "frames joints 3"]) -> Float[Tensor, "frames 3"]:
@@ -227,8 +227,8 @@ def lead_about(
     out: Float[Tensor, "frames 3"],
 ) -> Float[Tensor, "frames 3"]:
     """Turn one vector toward another by a share, its length by the same share; by way of `out`, a unit vector that
-    leads away from the body, the more the two differ: a straight turn from a hand at one's side to a place overhead has
-    no direction of its own, and flips."""
+    leads away from the body, the more the two differ: a straight turn from a hand at one's side to a position overhead
+    has no direction of its own, and flips."""
     lengths = [vector.norm(dim=-1, keepdim=True).clamp_min(1e-6) for vector in (one, other)]
     begin, end = one / lengths[0], other / lengths[1]
     apart = (1 - (begin * end).sum(-1, keepdim=True)) / 2

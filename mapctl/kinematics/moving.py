@@ -23,7 +23,7 @@ def rotate_about_vertical(motion: Motion, angle: Float[Tensor, "*frames"] | floa
 
 
 def move_to(motion: Motion, ground_xz: Float[Tensor, "2"], *, frame: int = 0) -> Motion:
-    """Move a motion over the ground so that its root is at a place, x and z in metres, in one of its frames."""
+    """Move a motion over the ground so that its root is at a position, x and z in metres, in one of its frames."""
     offset = rotations.lift_ground(ground_xz.to(motion.root_position) - motion.root_position[frame, ::2])
     return replace(motion, root_position=motion.root_position + offset)
 
@@ -37,7 +37,7 @@ def measure_travel(motion: Motion) -> tuple[float, float]:
 def bring_curve_points(
     points: Float[Tensor, "points dims"], pivot: Float[Tensor, " dims"], angle: float, ground_xz: Float[Tensor, "2"]
 ) -> Float[Tensor, "points dims"]:
-    """Rotate points (x, z or x, y, z) about the vertical through a pivot, radians, and move that to a place."""
+    """Rotate points (x, z or x, y, z) about the vertical through a pivot, radians, and move that to a position."""
     ground = slice(0, None, points.shape[1] - 1)
     turn = points.new_tensor([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
     found = points.clone()
@@ -49,13 +49,13 @@ _NECK, _HEAD = CANONICAL.indices(("neck", "head"))
 _TURNS = ((_NECK, 0.45, math.radians(40.0)), (_HEAD, 1.0, math.radians(55.0)))
 """Joints that turn, one after the other: the share of what is then left, and the most that each turns."""
 _LOSING, _LOST = math.radians(115.0), math.radians(150.0)
-"""Angles off the trunk's facing from which on a place is looked at less, and no more: a head that turned after what
+"""Angles off the trunk's facing from which on a position is looked at less, and no more: a head that turned after what
 goes past behind the back would whip from one shoulder to the other."""
 _FORWARD = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 
 
 def turn_head(motion: Motion, positions: Float[Tensor, "#frames 3"], weight: Float[Tensor, " frames"]) -> Motion:
-    """Turn neck and head toward places in the world, metres, by a share `weight` (0 to 1) in each frame, and by 95
+    """Turn neck and head toward positions in the world, metres, by a share `weight` (0 to 1) in each frame, and by 95
     degrees at most; what is behind is not looked at."""
     chest = CANONICAL.parents[_NECK]
     behind = _find_turn(motion, chest, positions).norm(dim=-1)
@@ -73,12 +73,12 @@ def turn_head(motion: Motion, positions: Float[Tensor, "#frames 3"], weight: Flo
 
 
 def measure_look_angle(motion: Motion, positions: Float[Tensor, "#frames 3"]) -> Float[Tensor, " frames"]:
-    """Measure the angle between where the head faces and places in the world, radians."""
+    """Measure the angle between where the head faces and positions in the world, radians."""
     return _find_turn(motion, _HEAD, positions).norm(dim=-1)
 
 
 def _find_turn(motion: Motion, joint: int, positions: Float[Tensor, "#frames 3"]) -> Float[Tensor, "frames 3"]:
-    """Find the rotation vectors in the world that turn a joint's facing toward places, as the head sees them."""
+    """Find the rotation vectors in the world that turn a joint's facing toward positions, as the head sees them."""
     facing = rotations.rotate(motion.joint_rotations()[:, joint], _FORWARD.expand(motion.num_frames, 3))
     wanted = positions.to(facing) - motion.joint_positions()[:, _HEAD]
     return rotations.to_rotation_vector(rotations.between_vectors(facing, wanted))

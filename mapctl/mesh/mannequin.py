@@ -302,7 +302,7 @@ class SkinnedBody:
 
 
 Body = Mannequin | SkinnedBody
-"""What is drawn of an actor."""
+"""Body drawn for an actor."""
 
 
 @dataclass(frozen=True, eq=False)

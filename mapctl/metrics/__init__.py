@@ -130,7 +130,7 @@ def _summarise_errors(name: str, error: Float[Tensor, "frames"]) -> dict[str, fl
 
 
 class MeasureStatistics(NamedTuple):
-    """What a set of clips shows of one measure."""
+    """Spread of one measure over a set of clips."""
 
     mean: float
     """Mean over the clips, in the measure's unit."""
@@ -163,7 +163,7 @@ def make_comparable(motion: Motion, rig: Rig | None = None) -> tuple[Motion, tup
     """Convert a motion to what reference values of mocap were measured on: canonical joints, Y up, 30 frames a second.
 
     Frames are left out of faster motions; slower ones stay, since nothing is known between their frames. Sentences tell
-    what could not be made so: a rig that is not known stays as it is in the file. `rig` wins over what would be
+    what could not be converted: a rig that is not known stays as it is in the file. `rig` wins over what would be
     recognised.
     """
     notes: tuple[str, ...] = ()

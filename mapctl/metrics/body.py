@@ -102,7 +102,7 @@ class Liveliness:
     count: float
     """Frames times joints that were summed over."""
     error: float
-    """Distances from the true places, cm."""
+    """Distances from the true positions, cm."""
     speed: float
     """Changes from frame to frame, cm."""
     spread: float
@@ -121,7 +121,7 @@ NOTHING = Liveliness(0.0, 0.0, 0.0, 0.0, 0.0)
 def see_from_hips(
     positions: Float[Tensor, "*batch frames joints 3"], hips_world_matrix: Float[Tensor, "*batch frames 3 3"]
 ) -> Float[Tensor, "*batch frames joints 3"]:
-    """Return joint places from the hips along the hips' heading, metres."""
+    """Return joint positions from the hips along the hips' heading, metres."""
     return rotations.rotate_about_y(positions - positions[..., :1, :], -heading_of_matrix(hips_world_matrix)[..., None])
 
 

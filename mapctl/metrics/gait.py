@@ -16,7 +16,7 @@ WALKS, RUNS = 1.7, 2.1
 """Speeds between which a change of gait leads, m/s."""
 
 PACES = "stand", "walk", "run"
-"""Paces from slow to fast; who goes and does not run walks."""
+"""Paces from slow to fast; moving without running is a walk."""
 CHANGES = {
     ("stand", "walk"): "starts",
     ("walk", "stand"): "stops",
@@ -34,7 +34,7 @@ def label_pace(pace: str) -> str:
 def compute_ground_velocity(ground: Float[ndarray, "frames 2"], fps: float) -> Float[ndarray, "frames 2"]:
     """Compute the velocity of the hips over the ground, m/s, from their x and z in metres, without the sway within a
     stride; of at least two frames."""
-    # Velocities are smoothed rather than places: who runs at a clip's end does not stay there.
+    # Velocities are smoothed rather than positions: a run at a clip's end does not stop there.
     velocity = np.gradient(ground, 1 / fps, axis=0)
     return gaussian_filter1d(velocity, _SMOOTH_SECONDS * fps, axis=0, mode="nearest")
 

@@ -109,7 +109,7 @@ def measure_window_realism(
     """Measure realism from `cut_windows` of each clip, (windows, frames, channels); RequestError for too few clips."""
     if min(len(generated), len(mocap)) < settings.min_clips:
         counts = f"got {len(generated)} and {len(mocap)}"
-        raise RequestError(f"realism needs at least {settings.min_clips} clips of each, made and mocap; {counts}")
+        raise RequestError(f"realism needs at least {settings.min_clips} clips of each, generated and mocap; {counts}")
     seeds = torch.randint(2**62, (2,), generator=generator).tolist()
     shuffled, ours = (torch.Generator().manual_seed(seed) for seed in seeds)
     order = torch.randperm(len(mocap), generator=shuffled).tolist()

@@ -20,7 +20,7 @@ from mapctl.metrics.gait import step_lengths
 from mapctl.motion import Motion
 
 _SLOW_SECONDS = 0.25  # a Gaussian that removes a stride's own rise and fall of speed
-_HELD_DISTANCE = 0.01  # metres from its place within which a hand is there
+_HELD_DISTANCE = 0.01  # metres from its position within which a hand is there
 _STEADY_AFTER = 2.0  # seconds: from then on a command counts as obeyed or not
 _HOLD_SECONDS = 0.4  # seconds for which a command must hold to count as reached
 _UNDER_WAY_SHARE, _UNDER_WAY_ANGLE = 0.5, math.radians(30)  # of the speed; radians off the direction
@@ -76,7 +76,7 @@ def measure_commands(motion: Motion, track: CommandTrack) -> list[dict[str, floa
 
 
 def _measure_positions(motion: Motion, positions: Tensor, frames: ndarray, command: Command) -> dict[str, float | None]:
-    """Measure what came of the places that a command names, over its frames."""
+    """Measure what came of the positions that a command names, over its frames."""
     found: dict[str, float | None] = {}
     if not len(frames):
         return found

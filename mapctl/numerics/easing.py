@@ -15,7 +15,7 @@ def smootherstep(share: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
 
 @dataclass(frozen=True, eq=False)
 class MinimumJerkTrack:
-    """A point on its way to a goal, with no jump in place, velocity or acceleration when the goal changes."""
+    """A point moving to a goal, with no jump in place, velocity or acceleration when the goal changes."""
 
     value: Float[Tensor, " size"]
     """Where it is."""

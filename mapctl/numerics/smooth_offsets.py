@@ -1,6 +1,6 @@
 """The smoothest offsets of some frames: least second differences, each frame held as firmly as its weight.
 
-What a motion misses keys, targets, contacts and seams by is made good by these: `interpolate_offsets` for positions and
+Errors of a motion at keys, targets, contacts and seams are removed by these: `interpolate_offsets` for positions and
 `interpolate_turns` for rotations where the misses are known, `blend_seams_in_positions` and `blend_seams_in_rotations`
 where new frames meet known ones. The trajectory over the ground is closed otherwise (`root_trajectory.close_path`):
 there the smoothest offsets would make standing bodies slide.

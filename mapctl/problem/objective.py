@@ -3,7 +3,7 @@ Eq. 19).
 
 The torch form is the specification: a rollout and energies on the trial's quantities, differentiated by autograd. The
 terms of following and steering have gradients of their own, which reach the unknowns by the parametrisation's adjoint;
-other terms join them by autograd on the trial. Nothing here knows a network, and no network knows a term.
+other terms join them by autograd on the trial. Terms and networks do not depend on each other.
 """
 
 from abc import abstractmethod

@@ -55,7 +55,7 @@ class HorizonSettings:
 
 @dataclass(frozen=True, eq=False)
 class CommittedFrames:
-    """What is fixed so far, and the warm start of the next window."""
+    """Committed frames so far, and the warm start of the next window."""
 
     state: DensityState | tuple[DensityState, ...]
     """Density's state after the last frame, batch of one."""

@@ -1,4 +1,5 @@
-"""What a solve returns: the motion, a status whose text is the message, and the ledger of energies and residuals."""
+"""Solution of a MAP problem: the motion, a status whose text is the message, and the ledger of energies and
+residuals."""
 
 import builtins
 from collections.abc import Sequence
@@ -87,19 +88,19 @@ class Outcome(Enum):
     DONE = "done"
     BUDGET = "stopped at its budget"
     INTERRUPTED = "interrupted; what was solved until then is kept"
-    INFEASIBLE = "the wishes cannot all hold"
-    OUT_OF_DEPTH = "outside what the model knows"
+    INFEASIBLE = "the constraints cannot all hold"
+    OUT_OF_DEPTH = "outside the model's training data"
     NOT_FINITE = "stopped where the energy was not finite; the best finite motion is returned"
 
 
 @dataclass(frozen=True)
 class Status:
-    """Outcome and, where there is more to say, sentences with numbers."""
+    """Outcome and, where needed, sentences with numbers."""
 
     outcome: Outcome
     """How the solve ended."""
     notes: tuple[str, ...] = ()
-    """What could not hold, or was assumed; one sentence each."""
+    """Constraints that could not hold, and assumptions; one sentence each."""
 
     @property
     def text(self) -> str:
@@ -112,14 +113,14 @@ class Status:
         return self.outcome is Outcome.DONE
 
     def with_notes(self, notes: Sequence[str], *, infeasible: bool = False) -> "Status":
-        """Return the status with more to say; `infeasible` marks wishes that cannot hold."""
+        """Return the status with further sentences; `infeasible` marks constraints that cannot hold."""
         outcome = Outcome.INFEASIBLE if infeasible and self.ok else self.outcome
         return replace(self, outcome=outcome, notes=(*self.notes, *notes))
 
 
 @dataclass(frozen=True)
 class WindowRecord:
-    """What one window cost."""
+    """Cost of one window."""
 
     frames: int
     """Frames it committed."""
@@ -164,7 +165,7 @@ class Solution:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What the user should know, one sentence each."""
+        """Remarks for the user, one sentence each."""
         return self.status.notes
 
     def details(self) -> dict[str, Any]:

@@ -31,7 +31,7 @@ from mapctl.terms.trial import Trial
 
 @dataclass(frozen=True, eq=False)
 class WindowContext:
-    """What comes before a window, as far as its frames depend on it."""
+    """Context before a window, as far as its frames depend on it."""
 
     density: AnyDensity | DensityEnsemble
     """Density, or several of which the solver selects one."""
@@ -99,11 +99,11 @@ class WindowRequest:
     """One window to solve."""
 
     context: WindowContext
-    """What is known before the window."""
+    """Context before the window."""
     terms: Sequence[Term]
     """Terms whose energies are summed over the window's frames."""
     warm_start: Float[Tensor, "ahead width"]
-    """What the last window found for the first of these frames (see `Parametrisation.warm_start`); none at the start.
+    """Result of the last window for the first of these frames (see `Parametrisation.warm_start`); none at the start.
     """
     generator: torch.Generator
     """Source of all random draws."""
@@ -116,7 +116,7 @@ class LatentNoise(Parametrisation):
     """Unknowns are the standard normal numbers d of a rollout, one batch row a candidate."""
 
     context: WindowContext
-    """What is known before the window."""
+    """Context before the window."""
     plan: DiscreteChoices
     """Components and contact bits of each frame."""
     prepared: PreparedRollout | None = None
@@ -215,7 +215,7 @@ class PoseOffsets(Parametrisation):
     """Unknowns are offsets about a proposal's root position, heading and angles, one batch row a candidate."""
 
     context: WindowContext
-    """What is known before the window. A single density scores the motion with teacher forcing (Eq. 15)."""
+    """Context before the window. A single density scores the motion with teacher forcing (Eq. 15)."""
     proposal: BodyPose
     """Proposed poses of the window's frames, unbatched."""
     contacts: Bool[Tensor, "frames 2"]

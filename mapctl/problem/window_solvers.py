@@ -120,7 +120,7 @@ class SolvedWindow:
     trial: Trial
     """Motion found: batch of one, detached."""
     warm_start: Float[Tensor, "frames width"]
-    """What the next window may start from, by frame (see `Parametrisation.warm_start`)."""
+    """Warm start of the next window, by frame (see `Parametrisation.warm_start`)."""
     ledger: Ledger
     """Energy and residual by term and frame."""
     evaluations: int
@@ -187,7 +187,7 @@ class LatentNoiseSolver:
 class GuidedNoiseSolver:
     """L-BFGS over the latent noise of a given motion, whose components and contact bits are kept.
 
-    For a motion that is to be changed a little; the terms say what of it.
+    For a motion that is to be changed a little, by its terms.
     """
 
     guide: Float[Tensor, "frames size"]

@@ -3,8 +3,8 @@ the capture bears it out.
 
 The residual between capture and proposal is noise of known power and the proposal's error. Candidates for the true
 motion are the proposal itself, the proposal with its residual smoothed (where it is wrong slowly), and the capture
-alone, smoothed (where it knows nothing). Stein's unbiased estimate of the risk (Stein 1981) weighs them, joint by joint
-and moment by moment, without any knowledge of the truth. The smoother minimises the squared distance to what was
+alone, smoothed (outside its training data). Stein's unbiased estimate of the risk (Stein 1981) weighs them, joint by
+joint and moment by moment, without any knowledge of the truth. The smoother minimises the squared distance to what was
 observed and squared third differences (Whittaker 1923; Eilers 2003): for a stationary signal a Butterworth filter of
 third order run forwards and backwards, but with ends and gaps of its own.
 """
@@ -157,7 +157,7 @@ def _estimate(
     for hertz, smooth in zip(_list_cutoffs(fps), alone, strict=True):
         # Averaged as the change is, or the outermost frame, which a smoother follows most, were the proposal's alone.
         own = _average(_weigh_own(len(residual), hertz, fps)[:, None], ones[:, :1], fps, seconds)
-        # In a gap a smoother knows little: of the frames that it sees, how many are observed.
+        # In a gap a smoother has little evidence: of the frames that it sees, how many are observed.
         shown = _average(weights, ones, fps, 1 / (4 * math.pi * hertz))
         own = _require_seen(own, shown, holds_proposal)
         back = [smooth_columns(residual * weights[..., None], weights, hertz, fps)] if holds_proposal else []

@@ -162,9 +162,7 @@ def find_gaps(motion: Motion) -> tuple[Mask, ...]:
     names = (ALL, *motion.skeleton.names, ROOT)
     masks = tuple(Mask(names[column], start, stop) for column, start, stop in true_intervals(columns))
     if not masks:
-        raise RequestError(
-            "no frame is frozen and none leaps: say which frames are missing (--gap A:B) or which joints"
-        )
+        raise RequestError("no frame is frozen and none leaps: give the missing frames (--gap A:B) or joints")
     return masks
 
 

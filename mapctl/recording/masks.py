@@ -136,7 +136,7 @@ def trim_masks_before(masks: Sequence[Mask], frame: int) -> tuple[Mask, ...]:
 def write_back_masked(motion: Motion, clean: Motion, masks: Sequence[Mask]) -> Motion:
     """Return the motion with what is masked of its first frames taken from a clean version of them.
 
-    So that a joint which is lost for long is known by what was made of it before.
+    So that a joint which is lost for long is known by its earlier estimate.
     """
     shared = clean.num_frames
     joints, root = expand_masks(motion, masks)

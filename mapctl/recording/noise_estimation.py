@@ -7,7 +7,7 @@ Signs of quaternions, and rotations averaged over time, under noise so large tha
 
 A quaternion and its negative are one rotation. Signs are usually chosen so that neighbouring frames lie in one half of
 the sphere, which fails where noise turns a joint by more than half a turn from one frame to the next: all frames after
-it then have the other sign, and a filter that goes over the place finds a rotation that is neither.
+it then have the other sign, and a filter across the flip finds a rotation that is neither.
 """
 
 import math

@@ -135,7 +135,7 @@ axes of real rigs are up to 53 degrees off their T-pose's (MakeHuman's knees, Mo
 CORE = ("hips", "chest", *(side + part for side in ("left", "right") for part in ("UpperLeg", "LowerLeg")))
 """Joints that positions and knees determine beyond doubt: a T-pose that contradicts one of them is none."""
 _ARM = ("Shoulder", "UpperArm", "LowerArm", "Hand")
-# Knees of people who stand are up to 7 degrees past straight, which shows no hinge axis.
+# Knees of standing people are up to 7 degrees past straight, which shows no hinge axis.
 _MIN_BEND = 0.15  # mean sine of the angle at a knee or elbow from which its hinge axis is known
 _HEAD_UP = 0.5  # least mean cosine between the chest's up axis and a head's End Site that is the top of the head
 _HINGE_SHARE = 0.7  # of all bending that is about the hinge axis, from which there is one

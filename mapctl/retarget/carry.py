@@ -70,7 +70,7 @@ class Miss:
 
 @dataclass(frozen=True)
 class Changes:
-    """What retargeting changed, beside bones."""
+    """Changes by retargeting, beside bones."""
 
     scale: float = 1.0
     """Length of the body's legs over the giver's."""
@@ -91,7 +91,7 @@ class RetargetedMotion:
     motion: Motion
     """On canonical joints, with the bones of the body."""
     changes: Changes = Changes()
-    """What was changed."""
+    """The changes."""
     fingers: Mapping[int, Float[Tensor, "frames 4"]] = field(default_factory=dict)
     """Local rotations (xyzw) of the body's finger joints that turn as the giver's, by joint of its rig."""
 
@@ -132,7 +132,7 @@ _HEEL_DEG, _MAX_HEEL_DEG = 10.0, 60.0  # degrees that toes are raised by when a 
 # Heights over the ground, of the leg: from the first on rotations count, from the second on they alone do.
 _LOW_SHARE, _HIGH_SHARE = 0.1, 0.35
 _FREE_SECONDS = 0.25  # seconds over which the shift of feet that never stand is smoothed
-# Who stands higher than the floor stands still on a level foot for a while, with the hips well over it.
+# Standing above the floor means a still, level foot for a while, with the hips well over it.
 _RAISED_METRES = 0.05  # metres over the floor from which the ground is no floor
 _STILL_SPEED, _STILL_SECONDS = 0.3, 0.2  # m/s in space below which a toe is still, and for how long
 _SPEED_SECONDS = 0.1  # seconds over which that speed is the mean, or a capture's noise looks like motion

@@ -34,7 +34,7 @@ HIP_JOINTS, SHINS, FEET, TOES = (
     [CANONICAL.index(side + part) for side in SIDES] for part in ("UpperLeg", "LowerLeg", "Foot", "Toes")
 )
 _MAX_FLOOR_OFFSET = 0.15  # of the leg: where toes rest further from 0, the floor is not at 0
-_MIN_FLOOR_OFFSET = 0.03  # metres that toes rest higher than bones say, which no toe joint's own height explains
+_MIN_FLOOR_OFFSET = 0.03  # metres that toes rest higher than by the bones, which no toe joint's own height explains
 MAX_TOE_SINK = 0.008
 """How far toe joints of a moving foot go under the height at which they rest at most, metres."""
 _MAX_TOE_DIFFERENCE = 0.05  # of the leg: of toes that rest further apart, one is held up all the time
@@ -60,8 +60,8 @@ class Stance:
     floor: float = 0.0
     """Height of the clip's floor, metres: 0, but where all of it is above or below, as on a platform."""
     toe_offset: float = 0.0
-    """How much higher toes rest in the clip than bones alone say, metres, mean of both; what `floor` has is not in
-    it."""
+    """Height at which toes rest in the clip above that of the bones alone, metres, mean of both; without `floor`, which
+    is not in it."""
 
     @property
     def standing_height(self) -> Float[Tensor, "2"]:

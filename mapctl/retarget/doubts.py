@@ -1,4 +1,4 @@
-"""What is doubtful about how a rig was understood: each reason in a sentence, with the joints that it is about.
+"""Doubts about the identification of a rig: each reason in a sentence, with its joints.
 
 Names, tree and bones are to be those of one two-legged person, and the T-pose is to agree with the clip.
 """
@@ -73,7 +73,7 @@ class Fit:
     """Whether a rig's understanding can be relied on."""
 
     doubts: tuple[Doubt, ...]
-    """What is doubtful, the gravest first; empty for a sure fit."""
+    """Doubts, the gravest first; empty for a sure fit."""
 
     @property
     def verdict(self) -> str:
@@ -208,7 +208,7 @@ def _check_names(rigmap: RigMap) -> Iterator[Doubt]:
 
 def _find_version(rigmap: RigMap, name: str) -> int | None:
     """Return the version of the rig's list that has the name of a joint, or one more than any where words show it;
-    None where it is spelled otherwise or known by its place."""
+    None where it is spelled otherwise or known by its position."""
     rig, how = rigmap.rig, rigmap.match.known_by.get(name)
     listed = (rig.joints.get(name), *rig.aliases.get(name, ()))
     if how is KnownBy.WORDS and name in rig.joints:

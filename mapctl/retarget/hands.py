@@ -2,8 +2,8 @@
 
 A body is rounded segments between joints, a hand two points, palm and finger tips. For each segment of the giver's body
 that a point is near, the same place on the receiving body is where that point should be, and all these places are
-averaged, the nearest counting most; beside them the place that rotations alone lead to, the more the farther the hand
-is from everything. Places relative to a body's surface are kept in the manner of Molla et al. 2018.
+averaged, the nearest counting most; beside them the position that rotations alone lead to, the more the farther the
+hand is from everything. Positions relative to a body's surface are kept in the manner of Molla et al. 2018.
 """
 
 from dataclasses import replace
@@ -33,7 +33,7 @@ def merge_contacts(
     touching: Bool[Tensor, "frames points"], positions: Float[Tensor, "frames points 3"], fps: float
 ) -> list[Spans]:
     """Return by point the spans in which it touches, merged where noise alone parts them: soon after each other, and
-    at one place over the ground, metres."""
+    at one ground position, metres."""
     found: list[Spans] = [[] for _ in range(touching.shape[1])]
     for point, start, stop in true_intervals(touching):
         spans = found[point]
@@ -137,7 +137,7 @@ class _Segments(NamedTuple):
 class _Near(NamedTuple):
     """Where points are on each segment, along its own axes: the same place may be found on another body."""
 
-    share: Float[Tensor, "frames points segments 1"]  # of the way along the segment to the place nearest to the point
+    share: Float[Tensor, "frames points segments 1"]  # along the segment to the position nearest to the point
     aside: Float[Tensor, "frames points segments 3"]  # from there to the point, in half widths
     away: Float[Tensor, "frames points segments 3"]  # from the surface to the point, metres; 0 within the body
     distance: Float[Tensor, "frames points segments"]  # the same, metres; negative within the body
@@ -145,7 +145,7 @@ class _Near(NamedTuple):
 
 
 class _Relations(NamedTuple):
-    """What the giver's hands are near; the points of both hands one after another, left first. Weights are 0 to 1."""
+    """Surfaces near the source's hands; the points of both hands one after another, left first. Weights are 0 to 1."""
 
     near: _Near  # to the segments of its body
     weight: Float[Tensor, "frames points segments"]  # how much each counts
@@ -162,7 +162,7 @@ class _Relations(NamedTuple):
         return (influence * weight).sum(dim=-1) / influence.sum(dim=-1).clamp_min(1e-9)
 
     def by_hand(self) -> tuple[Float[Tensor, "frames 2 relations"], Float[Tensor, "frames 2 relations"]]:
-        """Return by hand the weights of its points' relations to segments and floor, and what say each has among
+        """Return by hand the weights of its points' relations to segments and floor, and the influence of each among
         them: the nearest by far the most."""
         weight = torch.cat([self.weight, self.floor_weight[..., None]], dim=2).unflatten(1, (2, -1)).flatten(2)
         return weight, weight / (1 - weight + _SHARPNESS)

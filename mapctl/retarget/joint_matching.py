@@ -47,7 +47,7 @@ class KnownBy(Enum):
     WORDS = "words"
     """The words of its name: a side and a body part."""
     POSITION = "position"
-    """Its place in the tree and the lengths of the bones alone."""
+    """Position in the tree and lengths of the bones alone."""
 
 
 _CREDIT = {KnownBy.LIST: 1.0, KnownBy.WORDS: 1.0, KnownBy.POSITION: 0.7}
@@ -70,7 +70,7 @@ class Match:
     sides_exchanged: bool = False
     """Whether joints named left are on the right."""
     known_by: Mapping[str, KnownBy] = field(default_factory=dict)
-    """What each canonical joint that the rig has is known by."""
+    """Evidence for each canonical joint that the rig has."""
 
 
 def match(skeleton: Skeleton, rig: Rig | None = None, *, motion: Motion | None = None) -> Match:

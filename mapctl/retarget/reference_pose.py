@@ -57,7 +57,7 @@ class TPose:
     facing: str
     """Axis of the file that the pose with all rotations zero faces; `unknown` where it is along none."""
     rest: str
-    """What the pose with all rotations zero is: T, A or neither."""
+    """Kind of the pose with all rotations zero: T, A or neither."""
     tpose_from: str
     """Where the T-pose was found: table, rest pose, frame 0, or motion."""
     tpose_doubt: str = ""

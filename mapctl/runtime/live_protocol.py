@@ -1,4 +1,4 @@
-"""The protocol between a character that is steered live and its viewer; neither knows the other."""
+"""Protocol between a character that is steered live and its viewer; neither imports the other."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -76,8 +76,8 @@ class LiveCharacter(Protocol):
         ...
 
     def go(self, command: Command, position: tuple[float, float], within: float, facing: float | None = None) -> None:
-        """Be at a place (x and z, metres) in so many seconds, facing so (radians; None as it comes there), if that is
-        possible, and obey the command from then on; a note gives the reason if not."""
+        """Be at a position (x and z, metres) in so many seconds, facing so (radians; None as it comes there), if that
+        is possible, and obey the command from then on; a note gives the reason if not."""
         ...
 
     def pause(self, paused: bool) -> None:

@@ -35,9 +35,9 @@ class SwarmSettings:
     inertia: float = 0.7298
     """Share of its velocity a particle keeps."""
     cognitive: float = 1.4962
-    """Pull toward the particle's own best point: largest factor of the way there, each iteration."""
+    """Pull toward the particle's own best point: largest factor of the difference, each iteration."""
     social: float = 1.4962
-    """Pull toward the best point of all: largest factor of the way there, each iteration."""
+    """Pull toward the best point of all: largest factor of the difference, each iteration."""
 
 
 @dataclass(frozen=True, eq=False)

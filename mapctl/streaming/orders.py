@@ -48,7 +48,7 @@ class Order:
     character: int
     """Index of the character, from 0."""
     name: str
-    """What is ordered, as `speed` or `hand/left`, or a group of labels, as `style`."""
+    """Name of the order, as `speed` or `hand/left`, or a group of labels, as `style`."""
     numbers: tuple[float, ...] = ()
     """Its numbers, finite."""
     word: str | None = None
@@ -56,7 +56,7 @@ class Order:
 
 
 def read_order(message: Message, *, characters: int, groups: Iterable[str]) -> Order:
-    """Read an order for one of so many characters. RequestError says what is wrong with it.
+    """Read an order for one of so many characters. RequestError names its fault.
 
     `groups` are the groups of labels that there are, as `gait` and `style`; each is an order that takes a word.
     """

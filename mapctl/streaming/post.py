@@ -17,7 +17,7 @@ _MAX_WAITING = 3000  # frames that wait: beyond them the oldest is dropped
 
 @dataclass(frozen=True)
 class StreamStatistics:
-    """What was sent, of all characters."""
+    """Messages sent, of all characters."""
 
     frames_sent: int = 0
     """Frames sent."""

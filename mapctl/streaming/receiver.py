@@ -37,7 +37,7 @@ class OscReceiver:
         self.dropped = 0
         """Number of packets that were no messages, so far."""
         self.fault = ""
-        """What was wrong with the last of them."""
+        """Fault of the last of them."""
         logging.getLogger().addFilter(_is_from_elsewhere)
 
     def poll(self) -> list[Message]:
@@ -62,7 +62,7 @@ class OscReceiver:
                 datagram = self._socket.recv(MAX_DATAGRAM_BYTES + 1)
             except BlockingIOError:
                 break
-            except OSError:  # Windows tells here that nobody received what was sent
+            except OSError:  # Windows reports here that nothing received the last message
                 continue
             if len(datagram) > MAX_DATAGRAM_BYTES:
                 self._drop(f"a packet of more than {MAX_DATAGRAM_BYTES} bytes")

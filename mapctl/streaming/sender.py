@@ -33,7 +33,7 @@ BONE_NAMES = tuple(name[0].upper() + name[1:] for name in CANONICAL.names)
 """Names of the canonical joints in Unity, in their order. There is no UpperChest: the neck hangs from the chest."""
 _AVAILABLE = (1, 3, 0)  # a model is loaded, calibrated, in the normal mode
 _ROOT_NAME = "root"
-_TRANSFORM_NUMBERS = 7  # three of a place, four of a rotation
+_TRANSFORM_NUMBERS = 7  # three of a position, four of a rotation
 _MIRROR_POSITION, _MIRROR_QUAT = np.array([-1.0, 1.0, 1.0]), np.array([1.0, -1.0, -1.0, 1.0])
 
 
@@ -113,7 +113,7 @@ class FrameAssembler:
 
 
 def _read_transform(arguments: tuple[object, ...]) -> tuple[str, Float[ndarray, "7"]] | None:
-    """Return name, place and rotation in canonical axes; what comes after them, as in version 2.1, means nothing."""
+    """Return name, position and rotation in canonical axes; what comes after them, as in version 2.1, means nothing."""
     name, numbers = arguments[:1], arguments[1 : 1 + _TRANSFORM_NUMBERS]
     if not name or not isinstance(name[0], str) or len(numbers) < _TRANSFORM_NUMBERS or not _are_numbers(numbers):
         return None
@@ -158,7 +158,7 @@ class PoseStream:
         receivers = [(address, one.port) for one in self.endpoints]
         self._skeletons, self._root_travels, self._delay = list(skeletons), root_travels, delay
         self.statistics = StreamStatistics()
-        """What was sent; known after `close`."""
+        """Summary of the messages sent; known after `close`."""
         self._ours, theirs = multiprocessing.Pipe()
         self._process = spawn(run_post, theirs, int(family), receivers, LATE_SECONDS)
         theirs.close()

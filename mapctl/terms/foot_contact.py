@@ -35,7 +35,7 @@ class HeelSigmas:
 @dataclass(frozen=True)
 class LandingSigmas:
     """How hard toes may be accelerated. Contacts are fixed while a window is solved, and hold a toe from the second of
-    its frames on: without this the first may be anywhere, and a foot can snap to its place within one frame."""
+    its frames on: without this the first may be anywhere, and a foot can snap to its position within one frame."""
 
     free: float = 70.0
     """Acceleration of a toe that costs nothing, m/s^2. With it the largest of hands and toes relative to the hips is 39

@@ -161,7 +161,7 @@ def add_facing(heading, facing, sigma, energy, d_heading):
 
 @inner
 def shrink(value, free):
-    """What of a value is beyond what is free."""
+    """Return the excess of a value over its dead zone."""
     return value - free if value > free else (value + free if value < -free else 0.0)
 
 

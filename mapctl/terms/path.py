@@ -122,8 +122,8 @@ class Path:
 def _build_offset_smoother(
     path: Path, before: Float[Tensor, "past joints 3"], joint: int, sigma_frames: float, dtype: torch.dtype
 ) -> tuple[Float[Tensor, " frames"], Float[Tensor, "frames frames"]]:
-    """What the frames before a window add to its smoothed offsets, and the matrix that smooths its own; the same at
-    every evaluation of a window. Keys are compared by identity."""
+    """Contribution of the frames before a window to its smoothed offsets, and the matrix that smooths its own; the same
+    at every evaluation of a window. Keys are compared by identity."""
     past = before[-round(3 * sigma_frames) :, joint].detach().to(dtype)
     weights = gaussian.averaging_matrix(len(past) + len(path.arcs), sigma_frames, dtype)[len(past) :].T.contiguous()
     known = path.past_sideways_offsets(past) @ weights[: len(past)] if len(past) else weights.new_zeros(len(path.arcs))

@@ -93,7 +93,8 @@ class RootVelocity:
 def _build_velocity_smoother(
     term: RootVelocity, before: Float[Tensor, "past joints 3"], fps: float, dtype: torch.dtype
 ) -> tuple[Float[Tensor, "frames 2"], Float[Tensor, "frames frames"]]:
-    """What the frames before a window add to its low-pass velocity error, and the matrix that smooths its own."""
+    """Contribution of the frames before a window to its low-pass velocity error, and the matrix that smooths its
+    own."""
     steps = torch.diff(before[:, 0, ::2].to(dtype), dim=0) * fps
     sigma_frames = term.slow_seconds * fps
     past = min(len(steps), len(term.velocities_before), round(3 * sigma_frames))

@@ -40,8 +40,8 @@ class Trial:
     heel_contacts: Bool[Tensor, "batch steps 2"] | None = None
     """Left and right heel planted in the frame before the window and in each of its frames; None: by `heel_plan`."""
     heel_plan: "Trial | None" = None
-    """Trial of one candidate, or of as many, whose poses say which heels are planted, so that they do not change during
-    a solve; None: these very poses do."""
+    """Trial of one candidate, or of as many, whose poses determine which heels are planted, so that they do not change
+    during a solve; None: these very poses do."""
     skeleton: Skeleton = CANONICAL
     """Bones of the character."""
     fps: float = float(PRIOR_FPS)

@@ -51,7 +51,7 @@ class Labels:
         return [self.names.index(other) if other in self.names else i for i, other in enumerate(swapped)]
 
     def renamed(self, names: tuple[str, ...]) -> "Labels":
-        """Return the clips under other labels; a label that only one of both knows holds for none."""
+        """Return the clips under other labels; a label of only one of both holds for no clip."""
         held = torch.zeros(len(self.held), len(names))
         for column, name in enumerate(names):
             if name in self.names:
@@ -60,7 +60,7 @@ class Labels:
 
 
 def read_clip_labels(clip: str, pattern: str) -> set[str]:
-    """Read the labels that one clip's name tells; none where the pattern is empty or is not found in it."""
+    """Parse the labels in one clip's name; none where the pattern is empty or does not match."""
     return _parse_match(re.search(pattern, clip)) if pattern else set()
 
 
@@ -95,7 +95,7 @@ PACE_LABELS = tuple(map(label_pace, PACES))
 
 
 def read_pace_rates(holds: Mapping[str, Any]) -> dict[tuple[str, str], float]:
-    """Read changes a second from one pace to another, by both paces, from what a card says that its clips hold. None of
+    """Read changes a second from one pace to another, by both paces, from what a card lists of its clips. None of
     a pace that they hold for less than the 0.3 s to which a card rounds."""
     minutes = holds["minutes by pace"]
     return {
@@ -217,7 +217,7 @@ class LstmGmmDensity(checkpoints.LoadedModel, Density[LstmState]):
         return self.conditioned_like_clip(self.initial_states.names[start])
 
     def conditioned_like_clip(self, name: str) -> "LstmGmmDensity":
-        """Return the density given the labels that a clip's path tells, of those that it knows."""
+        """Return the density conditioned on the labels in a clip's path, of those that it has."""
         given = read_clip_labels(name, self.card.data.get("labels", ""))
         known = sorted(given & {*self.reference.config.labels})
         return self._with_network(self.reference.conditioned_on(known))
@@ -240,23 +240,23 @@ class LstmGmmDensity(checkpoints.LoadedModel, Density[LstmState]):
         return float(self.card.quality.get("windows", {}).get("p2", -math.inf))
 
     def _with_network(self, network: LstmGmm) -> "LstmGmmDensity":
-        """Return this with a copy of its network that was made from it."""
+        """Return this with a copy of its network."""
         return replace(self, reference=network, unconditioned=self.unconditioned or self)
 
     def _label(self, name: str) -> str:
         """Find the label `group=value` of a name, which may be the value alone; RequestError unless there is one."""
         found = [label for label in self.reference.config.labels if name in (label, label.split("=", 1)[-1])]
         if len(found) > 1:
-            raise RequestError(f"the prior {self.name!r} knows several labels {name!r}; choose {' or '.join(found)}")
+            raise RequestError(f"the prior {self.name!r} has several labels {name!r}; choose {' or '.join(found)}")
         if found:
             return found[0]
         if not self.labels:
-            raise RequestError(f"the prior {self.name!r} knows no label {name!r}, it has none")
+            raise RequestError(f"the prior {self.name!r} has no label {name!r}, nor any other")
         group, equals, value = name.partition("=")
         if not equals or group not in self.labels:
             group, value = " or ".join(self.labels), name
         values = "; ".join(f"{kind}: {', '.join(values)}" for kind, values in self.labels.items())
-        raise RequestError(f"the prior {self.name!r} knows no {group} {value!r}, only {values}")
+        raise RequestError(f"the prior {self.name!r} has no {group} {value!r}, only {values}")
 
     def start_after(self, last_frame: Float[Tensor, "batch size"]) -> LstmState:
         """Return a state with empty memory after one frame."""
@@ -273,7 +273,7 @@ class LstmGmmDensity(checkpoints.LoadedModel, Density[LstmState]):
         *,
         inputs: Float[Tensor, "batch frames size"] | None = None,
     ) -> Float[Tensor, "batch frames"]:
-        """Compute the log density of each frame given those before it, nats, as `Density.log_prob` says."""
+        """Compute the log density of each frame given those before it, nats (see `Density.log_prob`)."""
         return self.reference.log_prob(features, state, inputs=inputs)
 
     def advance(self, state: LstmState, committed: Float[Tensor, "batch frames size"]) -> LstmState:

@@ -662,7 +662,7 @@ def backward(
 
 @dataclass(frozen=True, eq=False)
 class _KernelPass:
-    """What one pass of the kernels leaves behind; rows beyond the batch are padding."""
+    """Activations that one forward pass keeps for the backward pass; rows beyond the batch are padding."""
 
     tape: Tape
     noise: Array

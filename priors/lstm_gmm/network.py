@@ -7,7 +7,7 @@ Gaussian is correlated, by a unit triangular factor of its own, since a planted 
 hips; and the level of the noise on the input is an input too, so that predictions from clean input are not as wide as
 from noisy input. It can also be conditioned on labels of the data (gait, style).
 
-Frames given that toes stand where the contact bits say so: each Gaussian conditioned on its planted toes' steps.
+Frames given that toes stand where the contact bits are 1: each Gaussian conditioned on its planted toes' steps.
 
 A Gaussian whose correlations are the same in every pose cannot know how the legs make up for the hips in this one, so
 its samples slide. Given a toe's step over the floor and up, observed as zero with an error, it stays a Gaussian:
@@ -68,20 +68,20 @@ class Planting:
         still = torch.cat([torch.zeros_like(before[:, :3]), before[:, 3:]], dim=-1)  # where the frame comes from
         positions = _place_toes(torch.cat([base[:, None] + _CHANGES.to(base), still[:, None]], dim=1))
         positions, stood = positions[:, :-1], positions[:, -1]
-        told = planted[..., None].expand(-1, -1, 3).flatten(1)
+        given = planted[..., None].expand(-1, -1, 3).flatten(1)
         jacobian = factor.new_zeros(len(sample), 6, size)
         jacobian[..., _MOVING] = ((positions[:, 1:] - positions[:, :1]) / _CHANGE).transpose(1, 2)
-        jacobian = torch.where(told[..., None], jacobian, 0.0)
+        jacobian = torch.where(given[..., None], jacobian, 0.0)
         step = positions[:, 0] - stood + torch.einsum("bij,bj->bi", jacobian, sample[:, :size] - mean)
         spread = jacobian @ factor  # of the steps, along the Gaussian's own axes
         covariance = spread @ spread.mT + sigma**2 * torch.eye(6).to(spread)
-        miss = torch.where(told, error.flatten(1) - step, 0.0)
+        miss = torch.where(given, error.flatten(1) - step, 0.0)
         change = factor @ (spread.mT @ torch.linalg.solve(covariance, miss[..., None]))
         return torch.cat([sample[:, :size] + change[..., 0], sample[:, size:]], dim=-1)
 
 
 def _place_toes(features: Float[Tensor, "batch variants size"]) -> Float[Tensor, "batch variants 6"]:
-    """Places of both toes after one frame from the origin, metres."""
+    """Positions of both toes after one frame from the origin, metres."""
     ground, heading = LAYOUT.pick(features, "root_displacement_heading"), LAYOUT.pick(features, "heading_change")
     positions = place_joints(features, ground.contiguous(), heading[..., 0].contiguous(), CANONICAL)
     return positions[:, :, list(TOE_JOINTS)].flatten(2)
@@ -226,9 +226,7 @@ class LstmGmm(nn.Module):
         labels, model = tuple(labels), self._copy_with_same_weights()
         for label in labels:
             if label not in self.config.labels:
-                raise RequestError(
-                    f"the prior knows no label {label!r}, only {', '.join(self.config.labels) or 'none'}"
-                )
+                raise RequestError(f"the prior has no label {label!r}, only {', '.join(self.config.labels) or 'none'}")
         if labels and self.condition is not None and model.fc1.bias is not None:
             known = torch.zeros(self.condition.in_features)
             known[[int(self.config.knows_noise) + self.config.labels.index(label) for label in labels]] = 1
@@ -340,7 +338,7 @@ class LstmGmm(nn.Module):
         condition: Float[Tensor, "batch conditions"] | None = None,
     ) -> tuple[Float[Tensor, "batch frames size"], LstmState]:
         """Draw frames one after the other (section 4.1.4); temperature scales the Gaussians' sigmas, with `planting`
-        each frame is drawn given that toes stand where its bits say so, and `condition` is as in `forward`."""
+        each frame is drawn given that toes stand where its bits are 1, and `condition` is as in `forward`."""
         with torch.no_grad():
             return self.draw(state, frames, generator, temperature=temperature, planting=planting, condition=condition)
 

@@ -154,11 +154,11 @@ class _Noise:
     """How noisy each window of a batch is."""
 
     angle: Float[Tensor, "batch joints"]
-    """Of each of a joint's angles, radians; 0 where positions are noisy."""
+    """Sigma of each of a joint's angles, radians; 0 where positions are noisy."""
     root: Float[Tensor, " batch"]
-    """Of each coordinate of the hips, metres; 0 where positions are noisy."""
+    """Sigma of each coordinate of the hips, metres; 0 where positions are noisy."""
     position: Float[Tensor, " batch"]
-    """Of each coordinate of every joint's position, metres; 0 where angles are noisy."""
+    """Sigma of each coordinate of every joint's position, metres; 0 where angles are noisy."""
     stays: Float[Tensor, " batch"]
     """Share of the noise that comes from the frame before."""
     given_angle: Float[Tensor, "batch joints"]
@@ -204,7 +204,7 @@ def _angles_of_positions(position: Float[Tensor, " batch"]) -> Float[Tensor, "ba
 
 
 def _estimated_share(stays: Float[Tensor, " batch"]) -> Float[Tensor, " batch"]:
-    """What an estimate from fourth differences makes of noise of which so much stays from frame to frame, as a share of
+    """Return the estimate from fourth differences of noise that is correlated from frame to frame, as a share of
     its spread: 1 for white noise (`mapctl.recording.noise_estimation`)."""
     weights = torch.tensor([1.0, -4.0, 6.0, -4.0, 1.0])
     apart = (torch.arange(5)[:, None] - torch.arange(5)).abs()

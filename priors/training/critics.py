@@ -1,4 +1,4 @@
-"""What critics and free runs say about generated motion, as the density's and the refiner's recipes use it.
+"""Critics of generated motion and statistics of free runs, for the recipes of the density and the refiner.
 
 Moments hold what the last frames of a free run show of feet, jerk, pace and spread to what the same clips show: a
 density of good likelihood, sampled for long, slides on its feet and trembles. Moments hold each number, not how they go
@@ -133,7 +133,7 @@ def moment_loss(
 
 @dataclass(frozen=True, eq=False)
 class _Moments:
-    """What a batch of windows shows; each with a floor that keeps logarithms of stillness finite."""
+    """Moments of a batch of windows; each with a floor that keeps logarithms of stillness finite."""
 
     feet: tuple[Tensor, Tensor]
     """Mean squared horizontal speed (m^2/s^2) and height error (m^2) of planted toes."""
@@ -301,7 +301,8 @@ def compute_critic_loss(real: Float[Tensor, " batch"], generated: Float[Tensor, 
 
 
 def compute_generator_loss(generated: Float[Tensor, " batch"]) -> Tensor:
-    """Negative log probability that what was made is taken for captured (Goodfellow et al. 2014, section 3)."""
+    """Negative log probability that a generated window is classified as captured (Goodfellow et al. 2014, section
+    3)."""
     return softplus(-generated).mean()
 
 

@@ -42,7 +42,7 @@ from priors.weight_sets import OF_DATA, name_for_records
 CHECKPOINT, LOSSES, EVENTS = "checkpoint.safetensors", "losses.csv", "tensorboard"
 """Files and folder of a run folder."""
 TRAINING, VALIDATION = "training", "validation"
-"""What the column `part` of LOSSES holds: mean losses since the last report, or measures of held-out clips."""
+"""Values of the column `part` of LOSSES: mean losses since the last report, or measures of held-out clips."""
 _FIRST_LINE_SECONDS, _LINE_SECONDS = 5.0, 30.0  # to the first line on the losses, and from line to line
 _WARM_UP_SHARE = 0.05  # share of the steps in which the learning rate rises
 _MAX_GRADIENT_NORM = 1.0
@@ -262,12 +262,12 @@ class NetworkSettings(Settings):
 
 @dataclass
 class Export:
-    """What a finished run writes, beside what every card holds."""
+    """Weights and facts that a finished run writes, beside those of every card."""
 
     tensors: Mapping[str, Tensor]
     """Weights, by name."""
     data: Row = field(default_factory=dict)
-    """What it was trained on, for the card."""
+    """Description of its training data, for the card."""
     quality: Row = field(default_factory=dict)
     """Measures, for the card."""
     abilities: dict[str, float] = field(default_factory=dict)
@@ -298,7 +298,7 @@ class Trainer(ABC, Generic[Network]):
 
     @abstractmethod
     def score(self, row: Row) -> float:
-        """Return the one number among measures of held-out clips that says how good a model is, smaller where it is
+        """Return the one number among measures of held-out clips by which models are ranked, smaller where it is
         better; NaN without one."""
 
     @property

@@ -28,7 +28,7 @@ _FLOOR, _LINE, _BRAND = "#dfe4eb", "#b9c2ce", (38, 98, 184)
 
 
 class CameraMode(Enum):
-    """What the camera does as the chosen character moves."""
+    """Behaviour of the camera as the chosen character moves."""
 
     CHASE = "chase: turns with the character"
     FOLLOW = "follow: does not turn"

@@ -25,7 +25,7 @@ _UNITS = {"speed": "m/s", "step_length": "m", "heading": "degrees", "facing": "d
 
 @dataclass(frozen=True)
 class SteeringInputs:
-    """What one character is asked for, as the panel shows it."""
+    """Request of one character, as the panel shows it."""
 
     speed: float = 1.2
     """Speed, m/s."""
@@ -115,7 +115,7 @@ ACTIONS = {
     "KeyN": "next character",
     "KeyH": "show or hide this list",
 }
-"""What a key does when it is pressed, by KeyboardEvent.code."""
+"""Action of a pressed key, by KeyboardEvent.code."""
 DIRECTIONS = {
     **dict.fromkeys(("KeyW", "ArrowUp"), (0.0, 1.0)),
     **dict.fromkeys(("KeyS", "ArrowDown"), (0.0, -1.0)),

@@ -35,7 +35,7 @@ _Share = Annotated[float, pydantic.Field(ge=-1.5, le=1.5, allow_inf_nan=False)]
 
 
 class PageState(pydantic.BaseModel, frozen=True, extra="forbid"):
-    """What is held on a page; its script sends all of it whenever it changes."""
+    """Keys and buttons held on a page; its script sends all of them whenever one changes."""
 
     keys: Annotated[frozenset[str], pydantic.Field(max_length=16)] = frozenset()
     """Held keys, as KeyboardEvent.code names them."""

@@ -1,4 +1,4 @@
-"""What users drag: a target that hands reach and the head looks at, and a disc that all characters walk round."""
+"""Handles that users drag: a target for hands and gaze, and a disc that all characters walk round."""
 
 import math
 from collections.abc import Callable, Sequence

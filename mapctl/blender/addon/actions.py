@@ -112,7 +112,7 @@ def list_keys(armature: bpy.types.Object) -> dict[int, bool]:
 
 
 def clear_bones(armature: bpy.types.Object, bones: Iterable[str]) -> None:
-    """Remove the curves of the bones' places, rotations and scales."""
+    """Remove the curves of the bones' positions, rotations and scales."""
     owned = {name_channel(bone, attribute) for bone in bones for attribute in _CHANNELS}
     curves = open_curves(armature).fcurves
     for curve in [curve for curve in curves if curve.data_path in owned]:

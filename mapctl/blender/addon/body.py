@@ -50,18 +50,19 @@ class Body:
     ends: dict[str, np.ndarray]
     """Tails of last bones in the armature's space, by joint."""
     frame: np.ndarray
-    """From the armature's space to mapctl's axes and metres as it is turned and scaled, without its place, (4, 4)."""
+    """From the armature's space to mapctl's axes and metres as it is turned and scaled, without its position, (4,
+    4)."""
     movable: frozenset[int] = frozenset()
     """Joints that may travel within their parent."""
     controls: tuple[Control, ...] = ()
-    """What is keyed of a generated rig; where there are none, `bones` are."""
+    """Controls that are keyed on a generated rig; without any, `bones` are keyed."""
     switches: dict[str, str] = field(default_factory=dict)
     """Custom property of a bone of a generated rig that is keyed to 1, by bone."""
     rig_toml: str = ""
     """A rig file with names of the joints; nothing where mapctl recognises them itself."""
 
     def to_world(self, positions: np.ndarray) -> np.ndarray:
-        """Convert places (..., 3) in the armature's space to mapctl's, with the armature at the origin."""
+        """Convert positions (..., 3) in the armature's space to mapctl's, with the armature at the origin."""
         return positions @ self.frame[:3, :3].T
 
 
@@ -80,7 +81,7 @@ def measure_world(armature: bpy.types.Object, scene: bpy.types.Scene) -> np.ndar
 
 
 def measure_frame(armature: bpy.types.Object, scene: bpy.types.Scene) -> np.ndarray:
-    """Measure the same without the armature's place."""
+    """Measure the same without the armature's position."""
     turned = measure_world(armature, scene)
     turned[:3, 3] = 0.0
     return turned
@@ -158,7 +159,7 @@ def sample_worlds(
     for number, frame in enumerate(frames):
         scene.frame_set(frame)
         worlds[number] = measure_world(armature, scene)
-        yield Step("reading the armature's place", number + 1, len(frames))
+        yield Step("reading the armature's position", number + 1, len(frames))
     return worlds
 
 
@@ -170,7 +171,7 @@ def read_poses(armature: bpy.types.Object, bones: tuple[str, ...]) -> np.ndarray
 
 def to_armature(motion: WorldMotion, body: Body, worlds: np.ndarray) -> np.ndarray:
     """Convert a motion of the body to what moves each joint from its rest in the armature's space, (frames, joints, 4,
-    4): rotations and places, no scale."""
+    4): rotations and positions, no scale."""
     order = [motion.names.index(name) for name in body.names]
     rotations, rest = motion.rotations[:, order], body.to_world(body.heads)
     moved = np.zeros((len(rotations), len(order), 4, 4))
@@ -191,7 +192,7 @@ _CLOSE = 1e-6  # of the body's size, and radians: where controls are as they sho
 
 @dataclass(frozen=True, eq=False)
 class Keys:
-    """What a bone is keyed with."""
+    """F-curves with which a bone is keyed."""
 
     bone: str
     """Name of the bone."""

@@ -24,8 +24,8 @@ class WalkProperties:
 
     speed: FloatProperty(name="Speed", description="Metres a second; 0 for the usual speed", min=0, soft_max=4)
     seconds: FloatProperty(name="Seconds", description="Duration; 0 for once along the curve", min=0, soft_max=120)
-    gait: StringProperty(name="Gait", description="Gait that mapctl knows, as walk or run; empty for any")
-    style: StringProperty(name="Style", description="Style that mapctl knows; empty for any")
+    gait: StringProperty(name="Gait", description="Gait of the prior, as walk or run; empty for any")
+    style: StringProperty(name="Style", description="Style of the prior; empty for any")
     seed: IntProperty(name="Seed", description="Another seed is another walk", min=0)
 
 
@@ -79,7 +79,7 @@ _SHOWN_LINES = 8
 
 
 class Report:
-    """What the panel shows: of a job that runs, or of the last one."""
+    """State of the running job, or of the last one, as the panel shows it."""
 
     step: Step | None = None
     """How far the job that runs is; None while none runs."""

@@ -20,7 +20,7 @@ class Step(NamedTuple):
     """How far a job is."""
 
     label: str
-    """What is being done."""
+    """Label of the step."""
     done: int = 0
     """Work done."""
     total: int = 0

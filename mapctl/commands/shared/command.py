@@ -1,4 +1,4 @@
-"""What all sub-commands share: threads, exit statuses, weights and the licence of the result."""
+"""Base of all sub-commands: threads, exit statuses, weights and the licence of the result."""
 
 import gc
 import os
@@ -59,11 +59,11 @@ class ModelCommand(Command):
     """Base of the options of commands that take bundled models."""
 
     prints_licence: ClassVar[bool] = True
-    """Whether a line says under which licence the result was made: not where others read standard output."""
+    """Whether a line states the licence of the result: not where programs read standard output."""
 
     weights: options.MaybeWeights = None
     """Set of bundled models: full, or free, whose results may be used for anything. If not given, that of the file of
-    the request, where it says one, else of the environment variable MAPCTL_WEIGHTS, else full."""
+    the request, where it has one, else of the environment variable MAPCTL_WEIGHTS, else full."""
 
     def run(self) -> int:
         """Do the work with these weights, and tell the licence of its result."""

@@ -60,11 +60,11 @@ class ProposalOptions:
     """Options on how in-betweens are proposed."""
 
     method: Annotated[str, arg(metavar="auto|transformer|infiller|tweener|stitcher|rollouts|slerp")] = "auto"
-    """Method that proposes. auto: the transformer, the stitcher where hands, feet or hips are told in up to 2 s, the
+    """Method that proposes. auto: the transformer, the stitcher where hands, feet or hips are given in up to 2 s, the
     tweener, if the set of weights has one, through gaps of more than 8 s and those of more than 6 s in which the
     transformer hardly moves, or a held pose where the body stands still; a note on each gap names it. transformer,
     infiller, tweener: that network alone. stitcher: gaps of up to 2 s between whole poses from both sides, led by
-    hands, feet, hips or a trajectory told in them. rollouts: a density's rollouts, wherever nothing is known. slerp:
+    hands, feet, hips or a trajectory given in them. rollouts: a density's rollouts, wherever nothing is known. slerp:
     interpolation."""
     dna: Annotated[str | None, arg(metavar="CLIP|NAME,...")] = None
     """Motion files of any known rig, or classes that `mapctl info tweener` lists, whose style the tweener takes: in all

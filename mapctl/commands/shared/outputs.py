@@ -1,4 +1,4 @@
-"""What commands write: checks of files before any long work, tables on standard output, and progress.
+"""Outputs of commands: checks of files before any long work, tables on standard output, and progress.
 
 Progress is a bar on a terminal, lines for a program that asks for them, and nothing in a pipe.
 """
@@ -35,7 +35,7 @@ def check_files(paths: Sequence[Path], *, given: Sequence[Path] = ()) -> None:
         atomic.check_writable(path)
         real = os.path.realpath(path)
         if real in sources:
-            raise RequestError(f"{path} would be written over what it is made from; choose another name")
+            raise RequestError(f"{path} would overwrite its own source; choose another name")
         if real in known:
             raise RequestError(f"{path} is asked for twice; every output needs a file of its own")
         known.add(real)
@@ -94,7 +94,7 @@ def mark_motion(motion: Motion) -> Motion:
 
 
 def save_motion(motion: Motion, path: Path) -> None:
-    """Write a motion with the licences of what it was made with, in formats that keep them."""
+    """Write a motion with the licences of the models used, in formats that keep them."""
     formats.save(mark_motion(motion), path)
 
 

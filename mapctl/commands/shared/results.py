@@ -35,7 +35,7 @@ def read_dna(command: ProposalOptions) -> Examples:
     if command.dna is None:
         return ()
     if command.method not in ("auto", "tweener"):
-        raise RequestError(f"--method {command.method} knows no style; leave --dna out or take --method tweener")
+        raise RequestError(f"--method {command.method} takes no style; leave --dna out or take --method tweener")
     names = [name.strip() for name in command.dna.split(",")]
     if not all(names):
         raise RequestError(f"--dna takes motion files and classes with a comma between two, got {command.dna!r}")
@@ -49,7 +49,7 @@ def read_dna(command: ProposalOptions) -> Examples:
         try:
             found.append((path.name, motion_dna.of(motion)))
         except RequestError as error:
-            raise RequestError(f"{name} tells no style: {error}") from error
+            raise RequestError(f"{name} gives no style: {error}") from error
     return found
 
 
@@ -89,11 +89,11 @@ def check_proposal(command: ProposalOptions, *, prior: str | None = None, way: b
     if prior is not None and command.no_refine and method not in ("auto", "rollouts"):
         raise RequestError(f"--method {method} --no-refine has no MAP stage for a density; leave --prior out")
     if command.inbetweener is not None and method == "slerp":
-        raise RequestError("--method slerp knows no network; leave --inbetweener out")
+        raise RequestError("--method slerp uses no network; leave --inbetweener out")
     takes_path = method == "tweener" or (method == "auto" and _is_tweener(command.inbetweener))
     if command.path is not None and not takes_path and not way:
         users = "--method tweener" if way is None else "--way and for --method tweener"
-        raise RequestError(f"--path predicts the hips' place for {users}; leave it out")
+        raise RequestError(f"--path predicts the hips' position for {users}; leave it out")
 
 
 def _is_tweener(inbetweener: str | None) -> bool:
@@ -116,7 +116,7 @@ def load_models(command: ProposalOptions, *, prior: str | None = None, dna: Exam
     def load_network(method: str) -> Inbetweener:
         if method == "infiller" and inbetweener is None:
             raise RequestError(
-                "no infiller is bundled; name one that `mapctl train infiller` made by --inbetweener RUN"
+                "no infiller is bundled; name one that `mapctl train infiller` trained by --inbetweener RUN"
             )
         usual = "tweener" if method == "tweener" else "transformer"
         # Of a named tweener `auto` makes its own for long gaps.

@@ -43,7 +43,7 @@ from scenes.stage import Mark, Shot, Targets
 
 @dataclass(frozen=True, eq=False)
 class ShotPlan:
-    """What an actor is asked to do, and on what body."""
+    """An actor's request, and the body that plays it."""
 
     actor: Actor
     """The actor's table."""
@@ -188,9 +188,9 @@ class PlayedShot:
     """A solved shot of one actor."""
 
     plan: ShotPlan
-    """What was asked."""
+    """The request."""
     solution: ShotSolution
-    """What came of it, on canonical joints at PRIOR_FPS."""
+    """Its solution, on canonical joints at PRIOR_FPS."""
 
     @property
     def request(self) -> ShotRequest:
@@ -270,8 +270,8 @@ def play_shot(
 
 
 def let_others_pass(plans: Sequence[ShotPlan], keep_apart: float) -> list[ShotPlan]:
-    """Return plans in which who is solved first leaves room for later ones that would find no way past: each gives way
-    by half. Somebody who has to keep apart from earlier ones does not make room for later ones too."""
+    """Return plans in which actors solved first leave room for later ones that would find no path past: each yields
+    by half. An actor that keeps apart from earlier ones does not make room for later ones too."""
     given, tracks = list(plans), list[tuple[ShotPlan, Float[Tensor, "frames 2"]]]()
     for plan in plans:
         others = _find_others(plan, tracks, keep_apart) if tracks else None
@@ -293,8 +293,8 @@ def _walk_along(trajectory: Trajectory) -> Float[Tensor, "frames 2"]:
 def _find_others(
     plan: ShotPlan, tracks: Sequence[tuple[ShotPlan, Float[Tensor, "frames 2"]]], distance: float
 ) -> Others:
-    """Collect the others' hips from the actor's first frame on; who has not begun stands in the first pose, who has
-    ended in the last."""
+    """Collect the others' hips from the actor's first frame on; one that has not begun stands in its first pose, one
+    that has ended in the last."""
     hips = []
     longest = max(len(track) for _, track in tracks)
     for one, track in tracks:

@@ -34,7 +34,7 @@ class StreamOptions:
 def check(command: StreamOptions, listen: str | None = None, *, characters: int = 1) -> None:
     """Raise RequestError for endpoints that cannot be, unknown hosts, ports that meet, or a missing package."""
     if command.stream_root and command.stream is None:
-        raise RequestError(f"--stream-root says how {_STREAM} is sent; give both")
+        raise RequestError(f"--stream-root is an option of {_STREAM}; give both")
     if not 0 <= command.stream_delay <= _MAX_DELAY:
         raise RequestError(f"--stream-delay must be 0 to {_MAX_DELAY:g} seconds, got {command.stream_delay:g}")
     targets: list[Endpoint] = []

@@ -119,7 +119,7 @@ def compute_infiller_losses(network: InfillerNetwork, window: Window, known: Ten
     """The loss, and in plain units the errors it is made of.
 
     L1 over the whole motion (Kaufmann et al. 2020, section 3.3), window by window divided by the number of coordinates
-    that had to be made: two joints that are lost count as much as a gap. A network that keeps what is known is so
+    that had to be filled: two joints that are lost count as much as a gap. A network that keeps what is known is so
     judged on what is not, an autoencoder on everything. A window in which the guess would do counts for more, or a
     network learns to fidget where a body stands still.
     """

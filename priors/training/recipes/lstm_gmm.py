@@ -530,7 +530,7 @@ def measure_free_runs(
 
 
 def _measure_mocap(parts: Split) -> dict[str, dict[str, float]]:
-    """What the clips kept from training show in every measure: mean, 2nd and 98th percentile (NaN left out)."""
+    """Measure the held-out clips: mean, 2nd and 98th percentile of every measure (NaN left out)."""
     held = [decode(clip, GroundPose.origin()) for part in (parts.validation, parts.test) for clip in part.clips()]
     table = {name: spread._asdict() for name, spread in compute_reference(held).items()}
     return {name: row for name, row in table.items() if not math.isnan(row["mean"])}

@@ -171,8 +171,8 @@ class PoseTransformerTrainer(GradientTrainer[PoseTransformerNetwork]):
 
 @torch.no_grad()
 def calibrate_spread(trainer: PoseTransformerTrainer, corpus: Corpus) -> None:
-    """Shift the spreads' logarithms so that over unseen windows, in varied poses, as many errors lie within them as
-    they say."""
+    """Shift the spreads' logarithms so that over unseen windows, in varied poses, the nominal share of errors lies
+    within them."""
     over = _measure_spread(trainer, corpus, seed=1)
     shift = [float(each.quantile(share)) for share, each in zip(QUANTILES, over, strict=True)]
     trainer.network.spread_shift += torch.tensor(shift)

@@ -81,7 +81,7 @@ WEIGHTS = {
 VALIDATED_GAPS = (5, 15, 30, 45)
 """Frames between the two poses."""
 TEMPERATURES = (0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0, 2.25, 2.5, 2.75, 3.0)
-"""Of draws, that are tried."""
+"""Temperatures of draws that are tried."""
 _WINDOWS, _DRAWS = 96, 8
 _AS_NEAR = 1.01  # of the least error of the best draw
 
@@ -182,7 +182,7 @@ class StitcherTrainer(GradientTrainer[StitcherNetwork]):
 
 
 class Known(NamedTuple):
-    """What is known of the ends of a transition."""
+    """Known ends of a transition."""
 
     before: int = 0
     """Frames before the first pose."""
@@ -197,13 +197,13 @@ class Transition:
     features: Float[Tensor, "batch window size"]
     """Forwards, from the first frame known before to the last one known after."""
     phases: Float[Tensor, "batch window 4"]
-    """Of both toes."""
+    """Phases of both toes."""
     frames: int
     """From one pose to the other."""
     lead: int
     """Frames of the window before the first pose."""
     known: Known
-    """What is known."""
+    """Whether a frame is known."""
 
     @property
     def between(self) -> slice:
@@ -215,7 +215,7 @@ class Transition:
         return replace(self, features=self.features[index], phases=self.phases[index])
 
     def ends(self) -> Ends:
-        """What a stitcher is given."""
+        """Return the input of a stitcher."""
         known, back = self.known, reversed_features(self.features)
         context = 1 + max(known.before, known.after)
         last = self.features.shape[1] - 1 - self.lead - self.frames  # the second pose, counted backwards
@@ -298,16 +298,16 @@ class TaughtLatents:
     truth: Float[Tensor, "2 batch frames size"]
     """Normalised features from each end's next frame to the other end."""
     missed: Float[Tensor, "2 informed generated size"]
-    """What the calm answer misses of it, in the first rows, which are given the posterior's."""
+    """Error of the mean answer, in the first rows, whose latents are the posterior's."""
     noise: DrawnLatents
-    """Of all rows; zeros at the mean."""
+    """Noise of all rows; zeros at the mean."""
     nats: list[Tensor] = field(default_factory=list)
     """Divergences from the prior by row and dimension, the transition's first and then those of frames."""
     cost: Tensor = field(default_factory=lambda: torch.zeros(()))
     """The transition's divergence from a standard normal distribution, by row and dimension."""
 
     def share(self, prior: Gaussian, seen: Float[Tensor, "2 batch seen"]) -> Float[Tensor, "batch shared"]:
-        """What both sides share over the transition."""
+        """Latent that both sides share over the transition."""
         count = self.missed.shape[1]
         if not count:
             self.nats.append(self.noise.shared[:0])
@@ -407,7 +407,7 @@ def _compare(
     Float[Tensor, "sides compared generated joints"],
 ]:
     """Compare the first rows with the truth, and let all of them meet and stand; also return the distances of joints
-    from their true places, and the errors of their steps, metres."""
+    from their true positions, and the errors of their steps, metres."""
     generated = sides.features.shape[2]
     true, positions = truth.truth()[:, :compared, :generated], sides.place_joints()
     # Windows that interpolation nearly solves count for more, or the network learns to fidget where bodies stand still.
@@ -436,7 +436,7 @@ def _compare(
 def measure_apart(
     positions: Float[Tensor, "2 batch generated joints 3"], frames: int
 ) -> Float[Tensor, "batch overlap"]:
-    """Measure the mean distance of the sides' joints in the frames that both made, metres."""
+    """Measure the mean distance of the sides' joints in the frames that both generated, metres."""
     generated = positions.shape[2]
     first = frames - generated
     return _measure_length(positions[0, :, first - 1 :] - positions[1, :, first - 1 :].flip(1)).mean(dim=-1)

@@ -121,7 +121,7 @@ class KeySequences:
     motion: PartialMotion
     """Poses by frame; between keys of different clips they are anything finite."""
     given: GivenParts
-    """What is known of the frames that are keys."""
+    """Known parts of the frames that are keys."""
     truthful: Bool[Tensor, "batch frames"]
     """Whether the poses between the keys are a performer's."""
     clip: Int[Tensor, "batch frames"]
@@ -483,7 +483,7 @@ def compute_tweener_losses(
     image = make_key_image(motion, sequences.given)
     generated_poses = network(image, network.style(style_poses) * styled[:, None])
     generated = generated_poses.turn_to_world(image)
-    wanted = image.positions - image.positions[..., :1, :]  # seen from the hips, as what is made
+    wanted = image.positions - image.positions[..., :1, :]  # seen from the hips, as the generated poses
     local = motion.local_matrices()
     weight = _weigh_frames(known) * sequences.truthful
     shown = _Errors(generated_poses.pose.positions, wanted)
@@ -513,7 +513,7 @@ def compute_tweener_losses(
 
 
 class _Errors:
-    """Errors of places, seen from the hips along the reference, weighed by frame."""
+    """Errors of positions, seen from the hips along the reference, weighed by frame."""
 
     def __init__(
         self, generated: Float[Tensor, "batch frames joints 3"], wanted: Float[Tensor, "batch frames joints 3"]
@@ -577,7 +577,7 @@ def _compute_path_terms(
 
 
 def _compute_style_error(apart: Float[Tensor, "batch poses frames"], counts: Bool[Tensor, " batch"]) -> Tensor:
-    """How far the style's poses are from the nearest that are made and kept for some frames (Eq. 11), metres."""
+    """How far the style's poses are from the nearest generated ones that are held for some frames (Eq. 11), metres."""
     nearest = avg_pool1d(apart, _DWELL, stride=1).amin(dim=-1)
     return _average(nearest.mean(dim=-1), counts.float())
 
@@ -669,13 +669,13 @@ def measure_kinds(network: GeneratorNetwork, corpus: Corpus) -> dict[str, Any]:
 
 
 def _measure_clips(network: GeneratorNetwork, windows: PoseWindows, clips: Sequence[int]) -> dict[str, float]:
-    sums = {"made": NOTHING, "slerp": NOTHING, "true": NOTHING}
+    sums = {"generated": NOTHING, "slerp": NOTHING, "true": NOTHING}
     for number in clips[:_VALIDATED_OF_KIND]:
         frames = min(_VALIDATED_FRAMES + 2, int(windows.lengths[number]))
         motion = windows.at(torch.tensor([number]), torch.zeros(1, dtype=torch.long), frames, torch.ones(1))
         for name, found in measure_gap(network, motion).items():
             sums[name] += found
-    generated, slerp, true = (sums[name] for name in ("made", "slerp", "true"))
+    generated, slerp, true = (sums[name] for name in ("generated", "slerp", "true"))
     return {
         "error_cm": generated.error / generated.count,
         "slerp_cm": slerp.error / slerp.count,
@@ -687,7 +687,7 @@ def _measure_clips(network: GeneratorNetwork, windows: PoseWindows, clips: Seque
 
 @torch.no_grad()
 def measure_gap(network: GeneratorNetwork, motion: PartialMotion) -> dict[str, Liveliness]:
-    """Measure what is made between the first and the last pose of one motion, beside slerp and the truth."""
+    """Measure the motion generated between the first and the last pose of one motion, beside slerp and the truth."""
     known = torch.zeros(motion.heading.shape, dtype=torch.bool)
     known[:, [0, -1]] = True
     image = make_key_image(motion, GivenParts.whole(known))
@@ -701,7 +701,7 @@ def measure_gap(network: GeneratorNetwork, motion: PartialMotion) -> dict[str, L
     inside = ~known[0]
     return {
         name: measure_liveliness(seen, true, inside)
-        for name, seen in (("made", mine), ("slerp", slerp), ("true", true))
+        for name, seen in (("generated", mine), ("slerp", slerp), ("true", true))
     }
 
 
