@@ -3,7 +3,7 @@ Direct a shot
 =============
 
 A shot has several requests that hold at once: here to set off from a stand, touch a ball with the left hand in passing,
-walk round a pillar that stands in the way, and come to a stop.
+walk round a pillar on the path, and come to a stop.
 """
 
 import mapctl
@@ -33,7 +33,7 @@ for constraint in shot.constraints:
     print(f"{constraint.name} ({constraint.asked}): {constraint.got:.1f} {constraint.unit}")
 
 # %%
-# The way (red) is led round the pillar before anything is walked. The ball shines while it is to be touched.
+# The trajectory (red) is led round the pillar before anything is walked. The ball shines while it is to be touched.
 
 actor = Shot(shot.motion, shot.trajectory.curve, targets=Targets([Mark(build_target(ball), (2.2, 2.4))]))
 camera, props = CameraSettings(azimuth_deg=65), [build_obstacle(pillar)]

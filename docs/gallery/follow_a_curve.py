@@ -2,7 +2,7 @@
 Walk along a curve
 ==================
 
-The headline job: draw a curve, and a character walks along it. A learned prior knows how people walk; the solver finds
+The headline job: draw a curve, and a character walks along it. A learned prior scores how people walk; the solver finds
 a likely walk that stays on the curve at the speed asked for, with feet that stand while they carry weight.
 """
 

@@ -2,7 +2,7 @@
 Steer from a loop
 =================
 
-In a game or on a robot nobody knows what comes next. A step of steering makes the next three frames for the command
+In a game or on a robot the next command is unknown. A step of steering makes the next three frames for the command
 that holds now; `drive` is the loop around it, which asks a source for commands and hands the frames to displays.
 """
 

@@ -26,11 +26,11 @@ for position, (name, colour) in enumerate({"raise-up-left": "#4c78a8", "run_masc
     settings, generator = GenerateSettings(start=start), torch.Generator().manual_seed(2)
     example = controllers.generate(general, seconds=4.0, settings=settings, generator=generator).motion
     styled = tweener.styled(mapctl.motion_dna.of(example, count=8))
-    made = controllers.tween(keys, Keys((0, keys.num_frames - 1)), styled).motion
-    heights = made.joint_positions()[:, made.skeleton.indices(("leftHand", "rightHand")), 1]
+    generated = controllers.tween(keys, Keys((0, keys.num_frames - 1)), styled).motion
+    heights = generated.joint_positions()[:, generated.skeleton.indices(("leftHand", "rightHand")), 1]
     print(f"DNA of {name}: hands are {heights.mean():.2f} m high in the mean, and {heights.max():.2f} m at most")
-    aside = made.root_position + torch.tensor([1.6 * position, 0.0, 0.0])
-    shots.append(Shot(replace(made, root_position=aside), colour=colour))
+    aside = generated.root_position + torch.tensor([1.6 * position, 0.0, 0.0])
+    shots.append(Shot(replace(generated, root_position=aside), colour=colour))
 
 # %%
 # The first and the last pose are the same, to the bit. Blue walks with raised hands, red like a runner.

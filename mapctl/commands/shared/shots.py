@@ -227,7 +227,7 @@ class PlayedShot:
         cost = report.summarise_timing(self.solution.windows, seconds=self.solution.seconds)
         motion, speed, planted = self.solution.motion, self.measures["speed_m_s"], self.measures["planted_share"]
         constraints = [
-            f"constraint {constraint.name} ({constraint.asked}): {constraint.got:.1f} {constraint.unit}"
+            f"request   {constraint.name} ({constraint.asked}): {constraint.got:.1f} {constraint.unit}"
             + ("" if constraint.holds else ", NOT HELD")
             for constraint in self.solution.constraints
         ]
