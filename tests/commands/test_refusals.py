@@ -134,7 +134,7 @@ FOLLOW = "follow line:2 -o a.bvh --prior prior.safetensors"
 GENERATE = "generate -o gen --seconds 1 --prior prior.safetensors"
 STEER = "steer {}.steer.csv -o a.bvh --prior prior.safetensors"
 TRAIN = "train refiner --data . -o run"
-OVER = "would be written over what it is made from"
+OVER = "would overwrite its own source"
 
 CASES = {
     "": "mapctl --help",
@@ -167,7 +167,7 @@ CASES = {
     f"{FOLLOW} --start sitting": "--start: expected walk, stand or CLIP:FRAME",
     f"{FOLLOW} --end gone.bvh:3": "gone.bvh",
     f"{FOLLOW} --loop": "a loop needs a closed curve",
-    "follow line:2 -o a.bvh --style sad": "knows no style 'sad', only",
+    "follow line:2 -o a.bvh --style sad": "has no style 'sad', only",
     f"{FOLLOW} --keys gone.toml": "gone.toml",
     f"{FOLLOW} --keys near.shot.toml --avoid 1,1,0.3": "within the obstacle at 1, 1",
     **{
@@ -179,7 +179,7 @@ CASES = {
             "misspelt": "key[0].look: there is no such key; allowed: seconds",
             "no-pose": "key[0].pose_frame: this is of a pose",
             "gone": "gone.bvh",
-            "tolerance": "gives no place",
+            "tolerance": "has no position for it",
             "together": "within two frames",
             "late": "not within",
             "far": "leftHand at 1 s is to be",
@@ -215,7 +215,7 @@ CASES = {
     f"denoise {IN} --denoiser prior.safetensors": "a lstm-gmm is no denoiser",
     f"infill {IN} --gap 5:9 --inbetweener prior.safetensors": "a lstm-gmm is no in-betweener",
     f"tween {IN} --keyframes 0,9 --inbetweener nobody": "no prior 'nobody'",
-    f"infill {IN} --gap 5:9 --method slerp --inbetweener infiller": "--method slerp knows no network",
+    f"infill {IN} --gap 5:9 --method slerp --inbetweener infiller": "--method slerp uses no network",
     f"{DENOISE} --prior nobody": "no prior 'nobody'",
     # generate and steer
     "generate -o gen --seconds 0": "seconds must be positive",
@@ -224,13 +224,13 @@ CASES = {
     f"{GENERATE} --temperature -1": "temperature",
     f"{GENERATE} --start 8": "0 to 7",
     f"{GENERATE} --start cut.bvh": "cut.bvh",
-    "generate -o gen --seconds 1 --style swim": "knows no gait or style 'swim'",
+    "generate -o gen --seconds 1 --style swim": "has no gait or style 'swim'",
     f"{GENERATE} --refiner nobody": "no prior 'nobody'",
     f"{GENERATE} --refiner prior.safetensors": "a lstm-gmm is no refiner",
     "steer gone.csv -o a.bvh": "gone.csv",
     f"{STEER.format('good')} --turn-rate -3": "turn_rate must be positive",
     f"{STEER.format('good')} --avoid 0.1,0,0.5": "40 cm within an obstacle",
-    f"{STEER.format('good')} --stitcher stitcher": "--stitcher makes ways to a place, and the script has no goto_x_m",
+    f"{STEER.format('good')} --stitcher stitcher": "--stitcher is for goto_x_m, which the script does not have",
     **{
         STEER.format(kind): said
         for kind, said in {
@@ -317,7 +317,7 @@ CASES = {
     "denoise takes -o out --denoiser prior.safetensors": "a lstm-gmm is no denoiser",
     "denoise empty -o out": "below empty",
     # infill
-    INFILL: "say which frames are missing (--gap A:B) or which joints",
+    INFILL: "give the missing frames (--gap A:B) or joints",
     f"{INFILL} --gap 5:12 --gap 11:20": "the gaps 5:12 and 11:20 overlap; make them one",
     f"{INFILL} --gap 40:46": "within the motion's frames 0:45",
     f"{INFILL} --gap 9:5": "must begin before it ends",
@@ -331,13 +331,13 @@ CASES = {
     f"{INFILL} --gap 5:9 --method best": "there is no --method best; there are auto",
     f"{INFILL} --gap 5:9 --method infiller --no-refine --prior general": "leave --prior out",
     f"infill {IN} --gap 5:9 --method slerp --curve line:4": "--curve needs",
-    f"infill {IN} --gap 5:9 --method slerp --dna in.bvh": "--method slerp knows no style",
-    f"infill {IN} --gap 5:9 --dna in.bvh --curve line:4": "--dna says how to move and --curve where",
+    f"infill {IN} --gap 5:9 --method slerp --dna in.bvh": "--method slerp takes no style",
+    f"infill {IN} --gap 5:9 --dna in.bvh --curve line:4": "--dna gives a style and --curve a trajectory",
     f"{WAY} --way 10:61": "the way 10:61 must begin before it ends, within the motion's frames 0:45",
     f"{WAY} --way 5:20 --way 10:30": "the ways 5:20 and 10:30 overlap",
     f"{WAY} --way 0:45 --gap 10:20": "lost over all frames of a motion whose joints are lost as well",
-    f"{WAY} --way 5:20 --curve line:3": "--way and --curve both say where the hips go",
-    f"{WAY} --gap 5:20": "--path predicts the hips' place for --way and for --method tweener",
+    f"{WAY} --way 5:20 --curve line:3": "--way and --curve both give the hips' trajectory",
+    f"{WAY} --gap 5:20": "--path predicts the hips' position for --way and for --method tweener",
     f"infill {IN} --way 5:20 --method slerp --path denoiser.safetensors": "a denoiser is no path",
     # tween
     f"tween {IN}": "--keyframes",
@@ -350,7 +350,7 @@ CASES = {
     f"{TWEEN} 0,9 --method infiller --no-refine --prior x": "leave --prior out",
     f"{TWEEN} 0,9 --method infiller --dna in.bvh": "leave --dna out",
     f"{TWEEN} 0,9 --method tweener": "--method tweener takes no infiller",
-    f"{TWEEN} 0,9 --path x": "--path predicts the hips' place",
+    f"{TWEEN} 0,9 --path x": "--path predicts the hips' position",
     f"{TWEEN} 0,9 --method transformer --stitcher stitcher.safetensors": "--method transformer stitches nothing",
     f"tween {IN} --keyframes 0,9 --inbetweener stitcher.safetensors": "is a stitcher; name it by --stitcher",
     f"{STITCH} --keyframes 0,9 --prior prior.safetensors": "no MAP stage for a density",
@@ -361,10 +361,10 @@ CASES = {
             "wavelefthand": "the nearest class is wave-left-hand",
             "no.bvh": "no.bvh: no such file",
             "in.bvh,,walk": "with a comma between two",
-            "odd.bvh": "odd.bvh tells no style: the rig is not recognised",
+            "odd.bvh": "odd.bvh gives no style: the rig is not recognised",
         }.items()
     },
-    "chain in.bvh other.bvh -o a.bvh --method rollouts --dna in.bvh": "--method rollouts knows no style",
+    "chain in.bvh other.bvh -o a.bvh --method rollouts --dna in.bvh": "--method rollouts takes no style",
     **{
         KEYED.format(kind): said
         for kind, said in {

@@ -63,7 +63,7 @@ def test_turning_and_labels_are_said_and_what_the_prior_does_not_know_is_refused
     assert "turning 30 degrees/s" in capsys.readouterr().out
     (tmp_path / "a.bvh").unlink()
     assert steer(script.format("swim")) == 2
-    assert "knows no label 'swim', it has none" in capsys.readouterr().err
+    assert "has no label 'swim', nor any other" in capsys.readouterr().err
     assert not (tmp_path / "a.bvh").exists()
 
 

@@ -174,7 +174,7 @@ def test_keys_may_be_one_frame_apart(fps, keys):
         (Keys((0, 45)), "the key 45 is not one of the motion's frames 0:45"),
         (Keys.of((0, 20, 44), limbs=("Hnad_L",)), "no hand or foot 'Hnad_L'; the nearest is Hand_L"),
         (Keys((0, 20, Key(20, limbs=("Hand_L",)), 44)), "two different keys are at frame 20"),
-        (Keys((Key(0, limbs=("Foot_R",)), Key(44, limbs=("Hand_L",)))), "no key tells where the hips are"),
+        (Keys((Key(0, limbs=("Foot_R",)), Key(44, limbs=("Hand_L",)))), "no key gives the position of the hips"),
         (
             Keys((0, Key(44, drawing=Drawing({"hips": (0, 0), "haed": (0, 1)})))),
             "no joint 'haed' .*the nearest is Head",

@@ -52,11 +52,11 @@ def test_all_keys_of_a_table_are_read(tmp_path):
         (TWO.replace("frame = 30", ""), "key[1].frame: a key is at a frame or at seconds, one of them"),
         (
             f"{TWO}pose_frame = 1\npose_seconds = 0.1",
-            "key[1].pose_frame: a pose is told by pose_frame or by pose_seconds",
+            "key[1].pose_frame: a pose is given by pose_frame or by pose_seconds",
         ),
         (f"{TWO}place = [1, nan]", "key[1].place[1]: "),
         (f'{TWO}root_only = "plaec"', 'key[1].root_only: it is true, false or "place", got "plaec"'),
-        (f"{TWO}view_deg = 90", "key[1].view_deg: it says from where a drawing is seen, and there is none"),
+        (f"{TWO}view_deg = 90", "key[1].view_deg: it is the view of a drawing, and there is none"),
         (f"fps = nan\n{TWO}", "fps: "),
         (f"{TWO}]", "not TOML: "),
     ],

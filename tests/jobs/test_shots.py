@@ -91,7 +91,7 @@ def test_a_way_past_somebody_who_comes_the_other_way_keeps_apart_when_they_meet(
         ({"seconds": 2.0, "reaches": (Reach(1.9, {"leftHand": (0, 1, 1)}, 0.3),)}, "not within the shot's 2 s"),
         (
             {"reaches": (Reach(1.0, {"leftHand": (0.3, 1, 1)}), Reach(1.05, {"leftHand": (0.3, 1.4, 1)}))},
-            "two places 40 cm apart within two frames",
+            "two positions 40 cm apart within two frames",
         ),
         ({"seconds": 2.0, "looks": (Look(2.5, (0, 1, 1)),)}, "not within the shot's 2 s"),
     ],

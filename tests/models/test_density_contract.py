@@ -173,7 +173,7 @@ def test_the_state_before_a_motion_is_found(density):
 @each_density
 def test_what_has_no_labels_takes_none(density):
     assert not density.labels
-    with pytest.raises(RequestError, match="knows no"):
+    with pytest.raises(RequestError, match="has no"):
         density.conditioned_on(["run"])
     frames = clip(density)
     for other in (density.conditioned_on([]), density.conditioned_like_start(0)):

@@ -220,5 +220,5 @@ def test_a_leap_of_a_joint_is_found(rig):
     ids=["whole", "rest", "stand"],
 )
 def test_where_nothing_is_wrong_one_is_asked_to_say_what_is(rig, spoil):
-    with pytest.raises(RequestError, match=r"say which frames are missing \(--gap A:B\) or which joints"):
+    with pytest.raises(RequestError, match=r"give the missing frames \(--gap A:B\) or joints"):
         find_gaps(spoil(on_rig(rig, 90)))

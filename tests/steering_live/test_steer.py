@@ -86,7 +86,7 @@ def test_a_command_tells_the_prior_for_as_long_as_it_holds(tmp_path):
     _, unsaid = steer.step(state, AHEAD)
     assert not torch.equal(said.motion.local_quat_xyzw, unsaid.motion.local_quat_xyzw)
     assert after.prior is prior, "what was told is not carried on"
-    with pytest.raises(RequestError, match="knows no gait or style 'swim'"):
+    with pytest.raises(RequestError, match="has no gait or style 'swim'"):
         steer.step(state, replace(AHEAD, labels=("swim",)))
 
 

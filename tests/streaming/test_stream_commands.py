@@ -78,7 +78,7 @@ def other():
         (("--realtime", "--stream", "host"), "--stream must be HOST:PORT"),
         (("--realtime", "--stream", ":99999"), "--stream must be HOST:PORT"),
         (("--realtime", "--stream", "no such.host:1"), "the host 'no such.host' is not known"),
-        (("--realtime", "--stream-root"), "--stream-root says how --stream is sent"),
+        (("--realtime", "--stream-root"), "--stream-root is an option of --stream"),
         (("--realtime", "--stream", "1", "--stream-delay", "-1"), "--stream-delay must be 0 to 5 seconds, got -1"),
         (("--realtime", "--stream", "1", "--stream-delay", "nan"), "--stream-delay must be 0 to 5 seconds"),
     ],
