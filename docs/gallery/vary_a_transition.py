@@ -17,7 +17,7 @@ from mapctl.recording.masks import Mask
 from scenes import CameraSettings, Shot
 from scenes.film import draw_strips_to, film
 
-# Both hands are raised: a sample of the prior of everyday motion. Frames 22 to 59 are generated anew, in five variations.
+# Both hands are raised: a sample of the prior of everyday motion. Frames 22 to 59 are generated anew, five times.
 general, stitcher = priors.load("general"), priors.load_stitcher()
 start = next(k for k, clip in enumerate(general.initial_states.names) if "raise-up-left" in clip)
 settings, generator = GenerateSettings(start=start), torch.Generator().manual_seed(2)
@@ -35,4 +35,5 @@ film(shots, "five-variations-side-by-side.webp", camera=camera, size=(480, 200),
 # %%
 # The same in stills: all begin and end alike, to the bit.
 
-draw_strips_to([(name, each.slice(21, 61)) for name, each in variations.items()], "five-variations-in-stills.png", size=(900, 500))
+stills = [(name, each.slice(21, 61)) for name, each in variations.items()]
+draw_strips_to(stills, "five-variations-in-stills.png", size=(900, 500))

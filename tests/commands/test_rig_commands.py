@@ -1,10 +1,15 @@
-"""What the commands do with rigs: tell them, take them from a file, and put motion on them."""
+"""Rigs by commands: found and given ones, units, and every command on every kind of file a character comes in."""
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from importlib import import_module
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from character_maker import make_character_glb
+from fbx_maker import make_fbx
 from helpers import bandai_skeleton, generator, run, tiny_density
 from PIL import Image
 from rig_maker import Make, make, names_of, person
@@ -12,10 +17,15 @@ from strange_rigs import CASES
 
 import controllers
 import mapctl
+import priors
+from controllers.shots.shot import follow
 from controllers.shots.walk import FollowSettings
-from mapctl import curves, retarget
+from mapctl import contacts, curves, formats, retarget
+from mapctl.commands.shared import inputs
+from mapctl.motion import Motion
 from mapctl.problem.receding_horizon import HorizonSettings
 from mapctl.problem.window_solvers import LatentNoiseSolver
+from mapctl.retarget.carry import RiggedCharacter, retarget_motion
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, Skeleton
 from mapctl.solver.budget import Budget
 from mapctl.terms import FootContact
@@ -215,3 +225,185 @@ def test_twice_the_legs_make_twice_the_way():
     torch.testing.assert_close(positions, small.motion.joint_positions(), atol=0.02, rtol=0)
     residuals = [{entry.name: float(entry.residual.mean()) for entry in done.ledger.entries} for done in (small, large)]
     assert residuals[1]["path"] == pytest.approx(2 * residuals[0]["path"], rel=0.1)
+
+
+@pytest.fixture(scope="module")
+def zup_clip(tmp_path_factory):
+    """A walk on a Z-up rig in centimetres."""
+    path = tmp_path_factory.mktemp("rig") / "walk.bvh"
+    make(Make(names_of("mixamo"), zup=True, arms_down_deg=40, root="Reference")).motion(person(1.0, 45)).save(path)
+    return path
+
+
+def test_a_body_that_travels_faster_than_people_do_has_a_doubtful_unit(zup_clip, tmp_path, capsys):
+    motion = mapctl.load(zup_clip)
+    travel = torch.zeros_like(motion.root_position)
+    travel[:, 1] = torch.arange(motion.num_frames) * 24.0 / float(motion.fps)
+    replace(motion, root_position=motion.root_position + travel).save(tmp_path / "fast.bvh")
+    assert run("info", tmp_path / "fast.bvh", "--json") == 0
+    assert "m/s for a second: the unit may be wrong" in json.loads(capsys.readouterr().out)["doubts"][0]
+
+
+@pytest.mark.parametrize("unit", ["in", "0.0254"])
+def test_a_given_unit_is_obeyed_by_every_command(zup_clip, unit, tmp_path, capsys):
+    assert run("convert", zup_clip, tmp_path / "out.npz", "--unit", unit) == 0
+    own, converted = mapctl.load(zup_clip), mapctl.load(tmp_path / "out.npz")
+    torch.testing.assert_close(converted.root_position, own.root_position * 2.54)
+    assert run("convert", tmp_path / "out.npz", tmp_path / "again.npz", "--unit", unit) == 0  # whose metres are inches
+    torch.testing.assert_close(mapctl.load(tmp_path / "again.npz").root_position, 0.0254 * converted.root_position)
+    capsys.readouterr()
+    heights = []
+    for options in ((), ("--unit", unit)):
+        assert run("measure", zup_clip, "--json", *options) == 0
+        heights.append(json.loads(capsys.readouterr().out)["measures"]["hips_height_m"])
+    assert heights[1] == pytest.approx(2.54 * heights[0], rel=1e-3)
+    assert run("convert", zup_clip, tmp_path / "out.npz", "--unit", "ell") == 2
+    assert "a unit is m, dm, cm, mm, in or metres per unit, got 'ell'" in capsys.readouterr().err
+
+
+def test_a_given_up_axis_is_obeyed(zup_clip, capsys):
+    assert run("info", zup_clip, "--json", "--up", "-x") == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["up"], told["rig"], len(told["joints"])) == ("-x", "mixamo", 21)  # its joints are recognised as before
+
+
+def test_the_unit_is_that_of_a_body_too(zup_clip, prior, tmp_path):
+    words = ("--seconds", 0.4, "--prior", prior, "--no-footing", "--quiet", "--to", ".npz")
+    assert run("generate", "-o", tmp_path, *words, "--rig", zup_clip, "--unit", "in") == 0
+    bones = [mapctl.load(path).skeleton.offsets for path in (tmp_path / "generated_000.npz", zup_clip)]
+    torch.testing.assert_close(bones[0][1:], 2.54 * bones[1][1:], atol=1e-4, rtol=0)
+
+
+_FEET, _TOES = ([CANONICAL.index(side + part) for side in ("left", "right")] for part in ("Foot", "Toes"))
+_BVH = {
+    "bandai-namco.bvh": Make(names_of("bandai-namco"), root="joint_Root"),
+    "cmu-daz.bvh": Make(names_of("cmu-daz"), size=1.1),
+    "cmu-asf.bvh": Make(names_of("cmu-asf"), bones_along_x=True, size=0.95),
+    "lafan1.bvh": Make(names_of("lafan1"), bones_along_x=True),
+    "mixamo.bvh": Make(names_of("mixamo"), arms_down_deg=45, zup=True),
+    "iclone.bvh": Make(names_of("iclone"), arms_down_deg=30, size=1.2),
+}
+_CHARACTERS = {
+    "mixamo.glb": {"pose": "A", "leaves": "joints"},
+    "unreal.glb": {"names": "unreal", "root": "root", "pose": "A", "size": 1.2},
+    "vroid.vrm": {"names": "vrm", "armature_scale": 1.0, "zup_armature": False, "size": 0.85},
+    "old.vrm": {"names": "vrm0", "armature_scale": 1.0, "zup_armature": False},
+}
+RIGS = (*_BVH, *_CHARACTERS, "body.usda", "limbs.fbx")
+COMMANDS = ("follow", "generate", "steer", "convert", "denoise", "infill", "tween")
+
+
+@dataclass(frozen=True)
+class Rig:
+    """A rig's file, and a walk on it in a file of the same kind."""
+
+    file: Path
+    clip: Path
+    body: RiggedCharacter
+
+
+@pytest.fixture(scope="module")
+def walked() -> Motion:
+    """Three seconds of the bundled prior's walking, straight and round a bend."""
+    generator = torch.Generator().manual_seed(1)
+    return follow(priors.load("locomotion"), curves.circle(radius=3.0), seconds=3, generator=generator).motion
+
+
+@pytest.fixture(scope="module")
+def rigs(walked, tmp_path_factory):
+    """Each rig's files, made when they are asked for."""
+    made: dict[str, Rig] = {}
+
+    def find(name: str) -> Rig:
+        if name not in made:
+            folder = tmp_path_factory.mktemp(name.replace(".", "-"))
+            file = clip = folder / name
+            if name == "body.usda":
+                pytest.importorskip("pxr")
+                make_character_usd = import_module("usd_maker").make_character_usd
+                make_character_usd(file, up="Z", unit=0.01)
+                clip = folder / "walk.usda"
+            elif name == "limbs.fbx":
+                pytest.importorskip("ufbx")
+                make_fbx(file, z_up=True)
+                clip = folder / "walk.glb"
+            elif name in _BVH:
+                sized = replace(walked, root_position=walked.root_position * _BVH[name].size)
+                make(_BVH[name]).motion(sized).save(file)
+            else:
+                make_character_glb(file, **_CHARACTERS[name])
+                clip = folder / f"walk-{name}"
+            body = RiggedCharacter.of(*inputs.read_rig_clip(str(file)))[1]
+            if clip != file:
+                body.on_rig(retarget_motion(walked, body).motion).save(clip)
+            made[name] = Rig(file, clip, body)
+        return made[name]
+
+    return find
+
+
+def foot_pitches(motion: Motion) -> np.ndarray:
+    """Slope of the line from ankle to toe joint, degrees, of the left and right foot, while it lies flat."""
+    canonical, _ = retarget.to_canonical(motion)
+    positions = canonical.joint_positions()
+    planted = contacts.detect_contacts(positions[:, _TOES], canonical.fps)
+    found = []
+    for side in range(2):
+        ankle, toe = positions[:, _FEET[side]], positions[:, _TOES[side]]
+        low = ankle[:, 1] < torch.quantile(ankle[planted[:, side], 1], 0.1) + 0.01
+        along = (toe - ankle)[planted[:, side] & low]
+        found.append(float(torch.rad2deg(torch.atan2(along[:, 1], along[:, ::2].norm(dim=-1))).median()))
+    return np.array(found)
+
+
+def standing_pitches(rig: Rig) -> np.ndarray:
+    """The same in the pose in which a character stands, or as it lies in the rig's own clip."""
+    if formats.load_rest(rig.file) is None:
+        return foot_pitches(mapctl.load(rig.file))
+    canonical, _ = retarget.to_canonical(inputs.read_rig_clip(str(rig.file))[0])
+    along = canonical.joint_positions()[0, _TOES] - canonical.joint_positions()[0, _FEET]
+    return torch.rad2deg(torch.atan2(along[:, 1], along[:, ::2].norm(dim=-1))).numpy()
+
+
+def words_on(command: str, rig: Rig, out: Path, walked: Motion) -> list[object]:
+    """A command on a rig that writes `out`."""
+    folder = out.parent
+    if command == "convert":
+        walked.save(folder / "walked.npz")
+    if command == "steer":
+        (folder / "orders.csv").write_text("time_s,speed_mps,heading_deg\n0,1.2,0\n1.5,1.2,40\n3,1.2,40\n")
+    return {
+        "follow": ["follow", "circle:3", "-o", out, "--seconds", "3", "--rig", rig.file, "--quiet"],
+        "generate": ["generate", "-o", folder, "--seconds", "3", "--rig", rig.file, "--to", out.suffix, "--quiet"],
+        "steer": ["steer", folder / "orders.csv", "-o", out, "--rig", rig.file, "--quiet"],
+        "convert": ["convert", folder / "walked.npz", out, "--rig", rig.file],
+        "denoise": ["denoise", rig.clip, "-o", out],
+        "infill": ["infill", rig.clip, "-o", out, "--gap", "30:55"],
+        "tween": ["tween", rig.clip, "-o", out, "--keyframes", "0,15,30,45,60,75,89"],
+    }[command]
+
+
+def cells():
+    """All rigs by all commands; quick ones on the diagonal."""
+    for row, rig in enumerate(RIGS):
+        for column, command in enumerate(COMMANDS):
+            quick = column == row % len(COMMANDS)
+            yield pytest.param(rig, command, marks=() if quick else pytest.mark.slow, id=f"{rig}-{command}")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "command"), [*cells()])
+def test_every_command_on_every_rig(name, command, rigs, walked, tmp_path, capsys):
+    rig = rigs(name)
+    out = tmp_path / f"out{rig.clip.suffix}"  # an FBX character comes back as .glb, with its mesh
+    assert run(*words_on(command, rig, out, walked)) == 0, capsys.readouterr().err
+    made = mapctl.load(tmp_path / f"generated_000{out.suffix}" if command == "generate" else out)
+    expected = rig.body.rigmap.rig_skeleton
+    assert (made.skeleton.names, made.skeleton.parents) == (expected.names, expected.parents)
+    assert made.num_frames >= 89
+    np.testing.assert_allclose(foot_pitches(made), standing_pitches(rig), atol=5.0)
+    toes = retarget.to_canonical(made)[0].joint_positions()[:, _TOES, 1]
+    low = torch.quantile(toes, 0.05, dim=0)
+    torch.testing.assert_close(low, rig.body.stance.toe_height, atol=0.015, rtol=0)
+    steps = made.joint_positions().diff(dim=0).norm(dim=-1)
+    assert float(steps.max()) * float(made.fps) < 9.0

@@ -1,17 +1,30 @@
-"""What a motion lacks, and lines across it."""
+"""What a motion lacks, as queries at 30 fps see it, and how it is interpolated."""
 
+import math
 from dataclasses import replace
 
 import pytest
 import torch
 from captures import apart_deg, on_rig
-from helpers import walk
+from helpers import generator, moved, walk
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
+from tiny_infiller import shown
 
-from mapctl import retarget
+from controllers.inbetweening.pipeline import CanonicalClip
+from mapctl import retarget, rotations
 from mapctl.errors import RequestError
 from mapctl.inbetweening.missing import MissingMask, interpolate_missing
+from mapctl.inbetweening.partial_motion import (
+    EFFECTORS,
+    KnownParts,
+    PartialMotion,
+    interpolate_partial_motion,
+    mirror_quats,
+)
 from mapctl.recording.masks import ALL, ROOT, Mask
+from mapctl.skeleton import CANONICAL, LIMBS
 
 
 def lost_of(motion, *masks):
@@ -40,8 +53,8 @@ def test_a_gap_between_single_frames_is_crossed_by_slerp_and_straight_lines(rig,
     pairs = [(made.root_position, motion.root_position)]
     pairs += [(made.moving_offsets[joint], values) for joint, values in motion.moving_offsets.items()]
     weight = (torch.arange(start, stop).double() - (start - 1))[:, None] / (stop - start + 1)
-    for found, given in pairs:
-        line = (1 - weight) * given[start - 1] + weight * given[stop]
+    for found, ends in pairs:
+        line = (1 - weight) * ends[start - 1] + weight * ends[stop]
         assert torch.allclose(found[start:stop], line, atol=1e-12)
 
 
@@ -118,3 +131,160 @@ def test_a_lost_place_takes_the_rotation_that_put_it_there_along(joint, taken):
 def test_what_cannot_be_is_refused(masks, message):
     with pytest.raises(RequestError, match=message):
         lost_of(on_rig("canonical", 30), *masks)
+
+
+def keyed(motion, keys, *, hips=()):
+    """All is lost but whole poses, and the hips alone in some frames."""
+    free = torch.ones(motion.num_frames, dtype=torch.bool)
+    free[list(keys)] = False
+    joints, root = free[:, None].expand(-1, motion.num_joints).clone(), free.clone()
+    joints[list(hips), 0] = False
+    root[list(hips)] = False
+    return MissingMask(joints, root)
+
+
+def gap_of(motion, lost):
+    """A canonical motion is shown as it is, whatever stands where it is lost."""
+    clip = CanonicalClip.of(motion, lost)
+    return replace(clip, canonical=motion).query()
+
+
+def known(gap):
+    """Moments of which nothing is lost."""
+    return (~gap.missing.frames).nonzero()[:, 0].tolist()
+
+
+@pytest.mark.parametrize(("fps", "spare"), [(10, 0), (24, 3), (50, 0), (120, 3)])
+def test_times_rise_and_reach_the_end(fps, spare):
+    motion = walk(fps + spare, fps=fps)
+    gap = gap_of(motion, keyed(motion, (0, motion.num_frames - 1)))
+    steps = torch.diff(gap.seconds)
+    assert len(gap.seconds) == gap.motion.num_frames == len(gap.missing.joints) == len(gap.missing.root)
+    assert 0.4 / 30 < steps.min() <= steps.max() < 1.6 / 30
+    assert gap.seconds[0] == 0
+    assert gap.seconds[-1] * fps == pytest.approx(motion.num_frames - 1)
+    assert known(gap) == [0, gap.motion.num_frames - 1]
+
+
+@pytest.mark.parametrize("fps", [10, 24, 50, 120])
+def test_a_key_at_any_frame_is_one_moment_with_its_own_pose_and_time(fps):
+    motion = walk(fps, fps=fps, turn_rate=0.5)
+    for key in range(2 * max(1, fps // 30), fps - 2 * max(1, fps // 30), 1 + fps // 4):
+        gap = gap_of(motion, keyed(motion, (0, key, fps - 1)))
+        assert (torch.diff(gap.seconds) > 0).all()
+        _, moment, _ = known(gap)
+        assert gap.seconds[moment] * fps == pytest.approx(key)
+        assert torch.equal(gap.motion.root_position[moment], motion.root_position[key])
+        assert apart_deg(gap.motion.local_quat_xyzw[moment], motion.local_quat_xyzw[key]).max() < 1e-5
+        assert not gap.missing.root[moment]
+        assert gap.known_positions[moment].all()
+
+
+def test_a_place_is_known_only_with_all_that_carries_it():
+    motion = walk(30)
+    _, rigmap = retarget.to_canonical(motion)
+    gap = gap_of(motion, MissingMask.of_masks(motion, [Mask(ROOT, 5, 9)], rigmap))
+    assert not gap.known_positions[5:9].any()
+    assert gap.known_positions[9:].all()
+    gap = gap_of(motion, MissingMask.of_masks(motion, [Mask("chest", 5, 9)], rigmap))
+    unknown = {CANONICAL.names[joint] for joint in (~gap.known_positions[6]).nonzero()[:, 0].tolist()}
+    assert {"head", "leftHand", "neck"} <= unknown
+    assert not unknown & {"hips", "leftFoot", "rightToes"}
+
+
+FRAMES = 40
+MEAN = torch.nn.functional.normalize(
+    torch.randn(CANONICAL.num_joints, 4, generator=torch.Generator().manual_seed(5)), dim=-1
+)
+
+
+def partial_motion(known, seed=0):
+    """A made motion, facing anywhere, and numbers that mean nothing where it is not known."""
+    motion = on_rig("canonical", FRAMES)
+    heading, tilt = rotations.split_heading(motion.local_quat_xyzw[:, 0])
+    quats = torch.cat([tilt[:, None], motion.local_quat_xyzw[:, 1:]], dim=1)[None]
+    garbage = torch.nn.functional.normalize(
+        torch.randn(quats.shape, generator=torch.Generator().manual_seed(seed)).double(), dim=-1
+    )
+    quats = torch.where(known.rotations[..., None], quats, garbage)
+    root = torch.where(known.root[..., None], motion.root_position[None], 9.0 + seed)
+    heading = torch.where(known.heading, rotations.unwrap_angle(heading)[None], 50.0 * seed)
+    targets = torch.zeros(1, FRAMES, len(EFFECTORS), 3)
+    offsets = CANONICAL.offsets[None]
+    return PartialMotion(root, heading, quats, torch.full((1, FRAMES, 2), 0.5), targets, offsets, known)
+
+
+def world_positions(motion):
+    return motion.world_poses()[0]
+
+
+def gap(start=10, stop=25):
+    known = torch.ones(1, FRAMES, dtype=torch.bool)
+    known[:, start:stop] = False
+    return KnownParts.whole(known)
+
+
+def test_unknown_values_do_not_matter_and_known_ones_stay():
+    one, other = (interpolate_partial_motion(partial_motion(gap(), seed), MEAN, 0.9) for seed in (1, 2))
+    torch.testing.assert_close(world_positions(one), world_positions(other), atol=1e-9, rtol=0)
+    known = partial_motion(gap()).known.positions
+    truth = on_rig("canonical", FRAMES).joint_positions()[None]
+    torch.testing.assert_close(world_positions(one)[known], truth[known], atol=1e-9, rtol=0)
+
+
+def test_unknown_limbs_bend_to_their_targets_and_known_ones_do_not():
+    told = torch.zeros(1, FRAMES, len(EFFECTORS), dtype=torch.bool)
+    hand, foot = EFFECTORS.index(CANONICAL.index("leftHand")), EFFECTORS.index(CANONICAL.index("rightFoot"))
+    told[0, 17, hand] = told[0, 5, foot] = True
+    motion = partial_motion(replace(gap(), effectors=told))
+    plain = interpolate_partial_motion(replace(motion, known=gap()), MEAN, 0.9)
+    positions, limb = world_positions(plain), LIMBS["leftHand"]
+    position = positions[0, 17, limb.upper] + torch.tensor([0.1, 0.2, 0.3])
+    motion.targets[0, 17, hand], motion.targets[0, 5, foot] = position, 5.0
+    made = world_positions(interpolate_partial_motion(motion, MEAN, 0.9))
+    torch.testing.assert_close(made[0, 17, limb.end].float(), position.float(), atol=2e-3, rtol=0)
+    off = (made - positions)[0, :, limb.end].norm(dim=-1)
+    assert 0 < float(off[11]) < float(off[14]) < float(off[17])
+    assert float(torch.diff(off).abs().max()) < 0.4 * float(off[17]), "there and back"
+    others = torch.ones(FRAMES, CANONICAL.num_joints, dtype=torch.bool)
+    others[10:25, [limb.lower, limb.end]] = False
+    torch.testing.assert_close(made[0][others], positions[0][others], atol=1e-9, rtol=0)
+
+
+def test_a_mirrored_motion_has_mirrored_places():
+    motion = partial_motion(KnownParts.whole(torch.ones(1, FRAMES, dtype=torch.bool)))
+    flipped = world_positions(motion)[..., CANONICAL.mirror_partners(), :] * torch.tensor([-1.0, 1.0, 1.0])
+    torch.testing.assert_close(world_positions(motion.mirrored()), flipped, atol=1e-9, rtol=0)
+    torch.testing.assert_close(mirror_quats(mirror_quats(motion.quats)), motion.quats)
+
+
+def drawn_masks(seed, share):
+    """Of frames, and of joints in them."""
+    draw = generator(seed)
+    whole = torch.rand(1, FRAMES, 1, generator=draw) < share
+    known = whole & (torch.rand(1, FRAMES, CANONICAL.num_joints, generator=draw) < 0.8)
+    known[:, 4 + seed % 30, 0] = True  # without any known root there is no place to see the rest from
+    return known
+
+
+masks = st.builds(drawn_masks, st.integers(0, 1000), st.sampled_from([0.05, 0.3, 0.9]))
+
+
+@settings(max_examples=10)
+@given(masks)
+def test_known_places_come_back_and_the_way_back_is_the_way_there(known):
+    motion = walk(FRAMES, turn_rate=2.0)
+    image, wanted = shown(motion, known), motion.joint_positions()[None]
+    assert (image.to_world(image.positions) - wanted)[known].abs().max() < 1e-12
+    assert torch.allclose(image.to_world(image.from_world(wanted)), wanted, atol=1e-12)
+
+
+@settings(max_examples=10)
+@given(masks, st.floats(-math.pi, math.pi), st.tuples(st.floats(-9, 9), st.floats(-9, 9)))
+def test_it_does_not_matter_where_the_motion_stands_and_faces(known, turn, shift):
+    motion = walk(FRAMES, turn_rate=2.0)
+    here, there = shown(motion, known), shown(moved(motion, turn=turn, shift=shift), known)
+    assert torch.allclose(here.positions, there.positions, atol=1e-9)
+    assert torch.equal(here.contacts, there.contacts)
+    apart = rotations.wrap_angle(there.heading - here.heading - turn)
+    assert apart.abs().max() < 1e-9
