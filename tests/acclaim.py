@@ -142,15 +142,15 @@ class Pair:
 
 def fixed(degrees: np.ndarray, order: str) -> np.ndarray:
     """Matrix of turns by `degrees` (about x, y, z) about fixed axes, the first of `order` first."""
-    made = np.eye(3)
+    result = np.eye(3)
     for axis in order:
         k = "xyz".index(axis)
         cos, sin = np.cos(np.deg2rad(degrees[k])), np.sin(np.deg2rad(degrees[k]))
         turn = np.eye(3)
         i, j = (k + 1) % 3, (k + 2) % 3
         turn[i, i], turn[j, j], turn[i, j], turn[j, i] = cos, cos, -sin, sin
-        made = turn @ made
-    return made
+        result = turn @ result
+    return result
 
 
 def pair(frames: int = 4, *, seed: int = 0, missing: float = 0.0, **changes) -> Pair:
@@ -164,8 +164,8 @@ def pair(frames: int = 4, *, seed: int = 0, missing: float = 0.0, **changes) -> 
         frame = {"root": np.concatenate([random.normal(0, 10, 3), random.uniform(-180, 180, 3)])}
         frame |= {b.name: random.uniform(-70, 70, len(b.dof)) for b in moving if random.random() >= missing}
         taken.append(frame)
-    made = Pair(bones, root_order, tuple(taken), full=missing == 0)
-    return replace(made, **changes)
+    result = Pair(bones, root_order, tuple(taken), full=missing == 0)
+    return replace(result, **changes)
 
 
 def _person(random: np.random.Generator) -> tuple[Bone, ...]:
@@ -206,14 +206,14 @@ def ends_of(motion):
     }
 
 
-def assert_same_places(motion, told):
+def assert_same_places(motion, given):
     """Joints at the bones' starts, End Sites at the last bones' ends."""
-    starts, ends = told.positions()
+    starts, ends = given.positions()
     positions = motion.joint_positions().numpy()
     assert set(motion.skeleton.names) == set(starts)
     for joint, name in enumerate(motion.skeleton.names):
         np.testing.assert_allclose(positions[:, joint], starts[name], atol=1e-9, err_msg=name)
-    leaves = {bone.name for bone in told.bones} - {bone.parent for bone in told.bones}
+    leaves = {bone.name for bone in given.bones} - {bone.parent for bone in given.bones}
     assert set(motion.skeleton.end_offsets) == leaves
     for name, position in ends_of(motion).items():
         np.testing.assert_allclose(position, ends[name], atol=1e-9, err_msg=name)

@@ -144,7 +144,7 @@ DENSITIES: dict[str, Density] = {
     "toy": toy_density(torch.float64),
 }
 """LSTM-GMM of one Gaussian, of several, and the paper's variant (absolute frames, diagonal Gaussians), on the reference
-path; the second on the fast path; one that knows only `mapctl.protocols`; and one that tells its mean only."""
+path; the second on the fast path; one that knows only `mapctl.protocols`; and one that returns its mean only."""
 
 NETWORKS: dict[str, LstmGmm] = {
     kind: density.reference

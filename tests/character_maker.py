@@ -161,7 +161,7 @@ def make_character_glb(
     front = Rotation.from_euler("y", 180 if names == "vrm0" else 0, degrees=True)
     own = [*(["root"] if root else []), *(j for j in PARENTS if leaves != "none" or j not in ENDS)]
     parents = {j: PARENTS.get(j, "") or ("root" if root and j != "root" else "") for j in own}
-    told = name_joints(names) | ({"root": root} if root else {})
+    given = name_joints(names) | ({"root": root} if root else {})
     bound = _world_frames(pose, own, front, size, bones_along_y, roll_deg)
     posed = bound if node_pose is None else _world_frames(node_pose, own, front, size, bones_along_y, roll_deg)
 
@@ -173,7 +173,7 @@ def make_character_glb(
         local[:3, :3] = Rotation.from_matrix(without_scale(local[:3, :3])).as_matrix()
         if parents[joint]:
             local[:3, 3] = above[:3, :3].T @ (posed[joint][:3, 3] - above[:3, 3]) / armature_scale
-        build.node(told[joint], build.at.get(parents[joint], top), local, key=joint, matrix=matrices)
+        build.node(given[joint], build.at.get(parents[joint], top), local, key=joint, matrix=matrices)
 
     skinned = [j for j in own if leaves == "joints" or j not in ENDS]
     space = outer if bind == "armature" else np.eye(4)
@@ -205,8 +205,8 @@ def make_character_glb(
     return MadeCharacter(
         path=build.path,
         tree=build.tree,
-        joint={j: told[j] for j in own if j != "root"},
-        names=tuple(told[j] for j in own),
+        joint={j: given[j] for j in own if j != "root"},
+        names=tuple(given[j] for j in own),
         nodes=tuple(build.at[j] for j in own),
         positions=np.stack([bound[j][:3, 3] for j in own]),
         rotations=np.stack([bound[j][:3, :3] for j in own]),

@@ -41,7 +41,7 @@ def _parts(hint) -> Iterator:
 def _jaxtyped(whole, function=None, *, typechecker):
     """jaxtyping's decorator at a fraction of its cost: it would check arguments before a call and again after it.
 
-    Here beartype checks once, within a scope of jaxtyping for the dimensions, and alone where no shape is told. Two
+    Here beartype checks once, within a scope of jaxtyping for the dimensions, and alone where no shape is given. Two
     kinds are left to jaxtyping: names in quotes, since it passes over those that exist for type checkers alone, and
     generators, which beartype checks when they begin, outside of their scope.
     """
@@ -114,7 +114,7 @@ def small_judgements() -> Iterator[None]:
 
 @pytest.fixture
 def actors() -> list:
-    """Two characters that note what they are told."""
+    """Two characters that note their commands."""
     from stage import Actor
 
     return [Actor(), Actor()]
@@ -125,8 +125,8 @@ def show(actors) -> Iterator:
     """The live viewer with those two on its stage; it has to close both."""
     from stage import live_app
 
-    with live_app(actors) as made:
-        yield made
+    with live_app(actors) as result:
+        yield result
     assert all(actor.heard[-1] == ("close",) for actor in actors)
 
 
@@ -142,13 +142,13 @@ def fails(tmp_path, capsys, monkeypatch):
     def check(*words: object) -> str:
         before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
         status = run(*words)
-        told = capsys.readouterr()
+        printed = capsys.readouterr()
         assert status == 2
-        assert told.out == ""
-        assert told.err.startswith("mapctl: ")
-        assert told.err.count("\n") == 1
+        assert printed.out == ""
+        assert printed.err.startswith("mapctl: ")
+        assert printed.err.count("\n") == 1
         assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
-        return told.err
+        return printed.err
 
     return check
 

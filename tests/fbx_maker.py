@@ -69,7 +69,7 @@ def make_fbx(
     nodes stand otherwise than in the pose in which the skin is bound."""
     random, document = np.random.default_rng(seed), _Document()
     turn = _Z_UP if z_up else Rotation.identity()
-    made = [
+    result = [
         _add_person(document, random, n, turn, 0.01 * unit_cm, frames, rate, takes, skin, scale, parts, posed)
         for n in names
     ]
@@ -84,7 +84,7 @@ def make_fbx(
     text = [*head, "Objects:  {", *document.objects, "}", "Connections:  {", *document.links, "}", ""]
     with open(path, "w", encoding="utf-8") as opened:  # noqa: PTH123 - any path-like
         opened.write("\n".join(text))
-    return made[0]
+    return result[0]
 
 
 def _axes(z_up: bool) -> dict[str, int]:
@@ -133,8 +133,8 @@ def _properties(*values, order: int = 0) -> str:
     lines = ["\t\tVersion: 232", "\t\tProperties70:  {"]
     lines += [f'\t\t\tP: "RotationActive", "bool", "", "",1\n\t\t\tP: "RotationOrder", "enum", "", "",{order}']
     for name, numbers in values:
-        told = '", "'.join(kinds.get(name, (name, "", "A")))
-        lines.append(f'\t\t\tP: "{name}", "{told}",{_list(numbers)}')
+        given = '", "'.join(kinds.get(name, (name, "", "A")))
+        lines.append(f'\t\t\tP: "{name}", "{given}",{_list(numbers)}')
     return "\n".join([*lines, "\t\t}"])
 
 

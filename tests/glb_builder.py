@@ -81,9 +81,9 @@ class GlbBuilder:
         return number
 
     def skin(self, name: str, joints: Sequence[str], inverse: Array) -> int:
-        told = {"name": name, "joints": [self.at[j] for j in joints], "skeleton": self.at[joints[0]]}
-        told["inverseBindMatrices"] = self.array(inverse.transpose(0, 2, 1).reshape(-1, 16))
-        self.tree["skins"].append(told)
+        given = {"name": name, "joints": [self.at[j] for j in joints], "skeleton": self.at[joints[0]]}
+        given["inverseBindMatrices"] = self.array(inverse.transpose(0, 2, 1).reshape(-1, 16))
+        self.tree["skins"].append(given)
         return len(self.tree["skins"]) - 1
 
     def material(self, name: str, look: Look, picture: Array | None) -> int:
@@ -108,7 +108,7 @@ class GlbBuilder:
         morphs: int,
         compact: bool,
     ) -> int:
-        made = []
+        result = []
         for part in parts:
             index, share = _pack_weights(part, joints)
             local = part.vertices @ space[:3, :3].T + space[:3, 3]
@@ -129,11 +129,11 @@ class GlbBuilder:
             if morphs:
                 bulges = [0.02 * (k + 1) * turned for k in range(morphs)]
                 primitive["targets"] = [{"POSITION": self.array(bulge)} for bulge in bulges]
-            made.append(primitive)
-        told: dict[str, Any] = {"name": f"mesh{len(self.tree['meshes'])}", "primitives": made}
+            result.append(primitive)
+        given: dict[str, Any] = {"name": f"mesh{len(self.tree['meshes'])}", "primitives": result}
         if morphs:
-            told |= {"weights": [0.0] * morphs, "extras": {"targetNames": [f"bulge{k}" for k in range(morphs)]}}
-        self.tree["meshes"].append(told)
+            given |= {"weights": [0.0] * morphs, "extras": {"targetNames": [f"bulge{k}" for k in range(morphs)]}}
+        self.tree["meshes"].append(given)
         return len(self.tree["meshes"]) - 1
 
     def animation(
@@ -141,15 +141,15 @@ class GlbBuilder:
     ) -> None:
         """A walk of a metre: arms and legs swing about their bodies' X axis, the root travels."""
         times = np.arange(frames) / 30
-        clock, told = self.array(times), {"name": name, "channels": list[Any](), "samplers": list[Any]()}
+        clock, given = self.array(times), {"name": name, "channels": list[Any](), "samplers": list[Any]()}
 
         def add(node: int, path: str, values: Array) -> None:
             if kind == "CUBICSPLINE":
                 slope = np.gradient(values, times, axis=0)
                 values = np.stack([slope, values, slope], axis=1).reshape(-1, values.shape[1])
             output = self.array(values if path != "weights" else values.reshape(-1, 1))
-            told["channels"].append({"sampler": len(told["samplers"]), "target": {"node": node, "path": path}})
-            told["samplers"].append({"input": clock, "output": output, "interpolation": kind})
+            given["channels"].append({"sampler": len(given["samplers"]), "target": {"node": node, "path": path}})
+            given["samplers"].append({"input": clock, "output": output, "interpolation": kind})
 
         top = self.at[own[0]]
         axes = self._outer_axes()
@@ -168,7 +168,7 @@ class GlbBuilder:
         body = next(k for k, node in enumerate(self.tree["nodes"]) if "mesh" in node)
         if morphs:
             add(body, "weights", np.tile(0.5 - 0.5 * np.cos(2 * np.pi * times)[:, None], (1, morphs)))
-        self.tree.setdefault("animations", []).append(told)
+        self.tree.setdefault("animations", []).append(given)
 
     def _outer_axes(self) -> Array:
         return Rotation.from_quat(_parts_of(self.tree["nodes"][0])[1]).as_matrix()

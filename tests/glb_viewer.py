@@ -52,13 +52,13 @@ class GlbViewer:
 
     def local(self, node: int, animation: int | None = None, seconds: float = 0.0) -> Array:
         """What takes a node's frame to its parent's, (4, 4), as the file stands or at a time of an animation."""
-        told = self.nodes[node]
+        given = self.nodes[node]
         tracks = {} if animation is None else self._tracks(animation, node, seconds)
-        if "matrix" in told and not tracks:
-            return np.array(told["matrix"]).reshape(4, 4).T
-        position = tracks.get("translation", told.get("translation", (0, 0, 0)))
-        turn = tracks.get("rotation", told.get("rotation", (0, 0, 0, 1)))
-        scale = tracks.get("scale", told.get("scale", (1, 1, 1)))
+        if "matrix" in given and not tracks:
+            return np.array(given["matrix"]).reshape(4, 4).T
+        position = tracks.get("translation", given.get("translation", (0, 0, 0)))
+        turn = tracks.get("rotation", given.get("rotation", (0, 0, 0, 1)))
+        scale = tracks.get("scale", given.get("scale", (1, 1, 1)))
         matrix = np.eye(4)
         matrix[:3, :3] = Rotation.from_quat(turn).as_matrix() * np.array(scale)
         matrix[:3, 3] = position
@@ -72,14 +72,14 @@ class GlbViewer:
     def skinned(self, animation: int | None = None, seconds: float = 0.0) -> Array:
         """(n, 3) vertices of all skinned primitives, nodes in their order: linear blend skinning, morphs left out."""
         found = []
-        for told in self.nodes:
-            if "mesh" not in told or "skin" not in told:
+        for given in self.nodes:
+            if "mesh" not in given or "skin" not in given:
                 continue
-            skin = self.tree["skins"][told["skin"]]
+            skin = self.tree["skins"][given["skin"]]
             inverse = self.array(skin["inverseBindMatrices"]).reshape(-1, 4, 4).transpose(0, 2, 1)
             worlds = [self.world(joint, animation, seconds) for joint in skin["joints"]]
             matrices = np.stack([world @ own for world, own in zip(worlds, inverse, strict=True)])
-            for primitive in self.tree["meshes"][told["mesh"]]["primitives"]:
+            for primitive in self.tree["meshes"][given["mesh"]]["primitives"]:
                 at = primitive["attributes"]
                 points = self.array(at["POSITION"])
                 joints, weights = self.array(at["JOINTS_0"]).astype(int), self.array(at["WEIGHTS_0"])
@@ -89,10 +89,10 @@ class GlbViewer:
         return np.concatenate(found)
 
     def _tracks(self, animation: int, node: int, seconds: float) -> dict[str, Array]:
-        told, found = self.tree["animations"][animation], {}
-        for channel in told["channels"]:
+        given, found = self.tree["animations"][animation], {}
+        for channel in given["channels"]:
             if channel["target"].get("node") == node and channel["target"]["path"] != "weights":
-                sampler = told["samplers"][channel["sampler"]]
+                sampler = given["samplers"][channel["sampler"]]
                 times, values = self.array(sampler["input"])[:, 0], self.array(sampler["output"])
                 kind, path = sampler.get("interpolation", "LINEAR"), channel["target"]["path"]
                 found[path] = _sample(times, values, seconds, kind, turns=path == "rotation")

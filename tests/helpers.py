@@ -45,8 +45,8 @@ def quat_xyzw(rotation_vectors: Tensor) -> Tensor:
 
 def walk(frames: int = 90, *, turn_rate: float = 0.0, cadence: float = CADENCE, seed: int = 0, fps: int = 30) -> Motion:
     """A procedural walk: legs and arms swing, knees lift, the lower toe is on the floor."""
-    made = _walk(frames, turn_rate, cadence, seed, fps)
-    return replace(made, root_position=made.root_position.clone(), local_quat_xyzw=made.local_quat_xyzw.clone())
+    result = _walk(frames, turn_rate, cadence, seed, fps)
+    return replace(result, root_position=result.root_position.clone(), local_quat_xyzw=result.local_quat_xyzw.clone())
 
 
 @cache

@@ -13,5 +13,5 @@ class LinearInbetweener(Inbetweener):
         motion, missing = query.motion, query.missing
         root = fill_missing(motion.root_position[None], ~missing.root[None])[0]
         turns = fill_missing(motion.local_quat_xyzw.transpose(0, 1), ~missing.joints.T).transpose(0, 1)
-        made = Motion(motion.skeleton, motion.fps, root, torch.nn.functional.normalize(turns, dim=-1))
-        return Proposal(made, torch.zeros(motion.num_frames, 2), "linear")
+        result = Motion(motion.skeleton, motion.fps, root, torch.nn.functional.normalize(turns, dim=-1))
+        return Proposal(result, torch.zeros(motion.num_frames, 2), "linear")

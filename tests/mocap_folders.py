@@ -5,7 +5,7 @@ from pathlib import Path
 
 import torch
 from helpers import walk
-from rig_maker import Made, Make, make, names_of
+from rig_maker import Generated, Make, make, names_of
 
 from mapctl.motion import Motion
 
@@ -20,7 +20,7 @@ STYLE_HEAD = (
 KINDS = [word.removesuffix("_START") for word in STYLE_HEAD.split(",") if word.endswith("_START")]
 
 
-def with_tposes(made: Made, motion: Motion, before: int, after: int) -> Motion:
+def with_tposes(result: Generated, motion: Motion, before: int, after: int) -> Motion:
     """The motion on this rig between so many frames of a T-pose in its first and its last place."""
     still = torch.zeros(before + after, motion.skeleton.num_joints, 4, dtype=torch.float64)
     still[..., 3] = 1
@@ -29,13 +29,13 @@ def with_tposes(made: Made, motion: Motion, before: int, after: int) -> Motion:
     root[:, 1] = motion.root_position[:, 1].max()
     quats = torch.cat([still[:before], motion.local_quat_xyzw, still[before:]])
     positions = torch.cat([root[:before], motion.root_position, root[before:]])
-    return made.motion(replace(motion, root_position=positions, local_quat_xyzw=quats))
+    return result.motion(replace(motion, root_position=positions, local_quat_xyzw=quats))
 
 
 def write_styles(folder: Path, styles: dict[str, dict[str, tuple[int, int, int]]], *, fps: int = 60) -> Path:
     """Styles with their clips, each of so many frames of a T-pose before, of a walk, and of a T-pose after; and the
     table that says so."""
-    made, lines = make(STYLE_RIG), [STYLE_HEAD]
+    result, lines = make(STYLE_RIG), [STYLE_HEAD]
     for number, (style, clips) in enumerate(styles.items()):
         (folder / style).mkdir(parents=True)
         cells = [style]
@@ -45,7 +45,7 @@ def write_styles(folder: Path, styles: dict[str, dict[str, tuple[int, int, int]]
                 continue
             before, frames, after = clips[kind]
             motion = walk(frames, turn_rate=0.2 * number, seed=number, fps=fps)
-            with_tposes(made, motion, before, after).save(folder / style / f"{style}_{kind}.bvh")
+            with_tposes(result, motion, before, after).save(folder / style / f"{style}_{kind}.bvh")
             cells += [str(before), str(before + frames)]
         lines.append(",".join(cells))
     (folder / "Frame_Cuts.csv").write_text("\r\n".join(lines) + "\r\n")

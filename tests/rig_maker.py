@@ -51,7 +51,7 @@ class Make:
 
 
 @dataclass(frozen=True, eq=False)
-class Made:
+class Generated:
     """A rig, and what it is in truth."""
 
     skeleton: Skeleton
@@ -111,7 +111,7 @@ def versions_of(preset: str) -> int:
     return 1 + max(len(rig.aliases.get(c, ())) for c in ("hips", "leftUpperArm", "leftFoot"))
 
 
-def make(wanted: Make) -> Made:
+def make(wanted: Make) -> Generated:
     """The rig that is wanted, with the truth about its T-pose."""
     upright = Rotation.from_euler("x", -90, degrees=True) if wanted.zup else Rotation.identity()
     facing = Rotation.from_euler("y", wanted.turned_deg, degrees=True)
@@ -130,7 +130,9 @@ def make(wanted: Make) -> Made:
     if wanted.end_sites:
         ends = {names[c]: tuple(frame[names[c]].inv().apply(tip.numpy()).tolist()) for c, tip in _tips(names, placed)}
     skeleton = Skeleton(tuple(order), parents, torch.stack(offsets), ends)
-    return Made(skeleton, tpose, upright, names, frozenset(name for chain in wanted.between.values() for name in chain))
+    return Generated(
+        skeleton, tpose, upright, names, frozenset(name for chain in wanted.between.values() for name in chain)
+    )
 
 
 def _tips(names: Mapping[str, str], placed: Mapping[str, Tensor]):
@@ -178,7 +180,7 @@ def _put_between(wanted: Make, c: str, parent: str, joints, placed: Mapping[str,
 
 
 def person(size: float = 1.0, frames: int = 40) -> Motion:
-    """A canonical walk of somebody of this size."""
+    """A canonical walk of a body of this size."""
     motion = walk(frames)
     skeleton = replace(motion.skeleton, offsets=motion.skeleton.offsets * size, end_offsets={})
     return replace(motion, skeleton=skeleton, root_position=motion.root_position * size)

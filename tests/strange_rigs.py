@@ -40,8 +40,8 @@ class Strange:
 
 def rigged(names: Mapping[str, str], **options) -> tuple[Motion, Mapping[str, str]]:
     """A walk on a rig, and its joints."""
-    made = make(Make(names, **options))
-    return made.motion(person(options.get("size", 1.0), 30)), made.joint
+    result = make(Make(names, **options))
+    return result.motion(person(options.get("size", 1.0), 30)), result.joint
 
 
 def renamed(motion: Motion, name: Callable[[str], str]) -> Motion:

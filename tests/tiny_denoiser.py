@@ -22,12 +22,12 @@ def network(*, drawn: float = 0.0, seed: int = 0, config: DenoiserConfig = CONFI
     """Weights of the last layers are drawn with this spread; untrained they are nil."""
     with torch.random.fork_rng():
         torch.manual_seed(seed)
-        made = DenoiserNetwork(config)
+        result = DenoiserNetwork(config)
         if drawn:
-            for layer in (made.last, *(block.across for block in made.blocks)):
+            for layer in (result.last, *(block.across for block in result.blocks)):
                 for parameter in layer.parameters():
                     torch.nn.init.normal_(parameter, std=drawn)
-    return made.eval().requires_grad_(False)
+    return result.eval().requires_grad_(False)
 
 
 def card() -> checkpoints.Card:

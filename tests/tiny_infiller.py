@@ -19,12 +19,12 @@ def network(*, drawn: float = 0.0, seed: int = 0, config: InfillerConfig = CONFI
     """Layers that are nil untrained are drawn with this spread."""
     with torch.random.fork_rng():
         torch.manual_seed(seed)
-        made = InfillerNetwork(config)
-        for parameter in made.parameters():
+        result = InfillerNetwork(config)
+        for parameter in result.parameters():
             if drawn and not parameter.any():
                 torch.nn.init.normal_(parameter, std=drawn)
-    made.std.fill_(_SPREAD)
-    return made.eval().requires_grad_(False)
+    result.std.fill_(_SPREAD)
+    return result.eval().requires_grad_(False)
 
 
 def card(config: InfillerConfig = CONFIG) -> checkpoints.Card:

@@ -1,4 +1,4 @@
-"""Path predictors for tests: one of a few kilobytes with drawn weights, and one that is told the answer."""
+"""Path predictors for tests: one of a few kilobytes with drawn weights, and one that is given the answer."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -51,7 +51,7 @@ class ToldPath(PathPredictor):
     """Answers with the steps of a canonical motion at the prior's rate, as it is or longer."""
 
     truth: Motion
-    """Motion whose trajectory it tells."""
+    """Motion whose trajectory it predicts."""
     stretch: float = 1.0
     """Ratio of its steps to the true ones."""
 

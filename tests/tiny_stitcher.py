@@ -27,11 +27,11 @@ def network(config: StitcherConfig = CONFIG, *, drawn: float = 0.3, seed: int = 
     """Drawn with the seed; makes so much of its own beside the interpolation."""
     with torch.random.fork_rng():
         torch.manual_seed(seed)
-        made = StitcherNetwork(config)
-    made.experts.shrink_last(10 * drawn)
-    made.change[:], made.std[:] = 0.03, 0.3
-    made.std[LAYOUT.slices["root_displacement_heading"]] = made.std[LAYOUT.slices["heading_change"]] = 0.02
-    return made.eval().requires_grad_(False)
+        result = StitcherNetwork(config)
+    result.experts.shrink_last(10 * drawn)
+    result.change[:], result.std[:] = 0.03, 0.3
+    result.std[LAYOUT.slices["root_displacement_heading"]] = result.std[LAYOUT.slices["heading_change"]] = 0.02
+    return result.eval().requires_grad_(False)
 
 
 def card(config: StitcherConfig = CONFIG) -> checkpoints.Card:

@@ -14,13 +14,13 @@ def network(*, drawn: float = 0.0, seed: int = 0, config: PoseTransformerConfig 
     """Weights that are nil untrained are drawn with this spread."""
     with torch.random.fork_rng():
         torch.manual_seed(seed)
-        made = PoseTransformerNetwork(config)
-        for parameter in made.head.parameters():
+        result = PoseTransformerNetwork(config)
+        for parameter in result.head.parameters():
             if drawn:
                 torch.nn.init.normal_(parameter, std=drawn)
-    made.std_rotation.fill_(0.3)
-    made.mean_position[0, 1] = 0.9
-    return made.eval().requires_grad_(False)
+    result.std_rotation.fill_(0.3)
+    result.mean_position[0, 1] = 0.9
+    return result.eval().requires_grad_(False)
 
 
 def card(config: PoseTransformerConfig = CONFIG) -> checkpoints.Card:

@@ -20,9 +20,9 @@ def network(*, seed: int = 0, drawn: float = 0.05) -> GeneratorNetwork:
     """With weights of this seed; those of the last layer are drawn with this spread."""
     with torch.random.fork_rng():
         torch.manual_seed(seed)
-        made = GeneratorNetwork(CONFIG)
-        torch.nn.init.normal_(made.last.weight, std=drawn)
-    return made.eval().requires_grad_(False)
+        result = GeneratorNetwork(CONFIG)
+        torch.nn.init.normal_(result.last.weight, std=drawn)
+    return result.eval().requires_grad_(False)
 
 
 def card(

@@ -104,11 +104,11 @@ def _define_skeleton(
 ) -> UsdSkel.Skeleton:
     bound, rest = (_worlds(pose, along_y, turn, unit) for pose in poses)
     local = [np.linalg.inv(rest[PARENTS[name]]) @ rest[name] if PARENTS[name] else rest[name] for name in JOINTS]
-    made = UsdSkel.Skeleton.Define(stage, path)
-    made.CreateJointsAttr([joint_path(name) for name in JOINTS])
-    made.CreateBindTransformsAttr(_matrices([bound[name] for name in JOINTS]))
-    made.CreateRestTransformsAttr(_matrices(local))
-    return made
+    result = UsdSkel.Skeleton.Define(stage, path)
+    result.CreateJointsAttr([joint_path(name) for name in JOINTS])
+    result.CreateBindTransformsAttr(_matrices([bound[name] for name in JOINTS]))
+    result.CreateRestTransformsAttr(_matrices(local))
+    return result
 
 
 def _define_mesh(
@@ -134,24 +134,24 @@ def _define_mesh(
         faces.append(part.faces + sum(map(len, points)))
         points.append(turn.apply(bent) / unit)
         weights.append(table)
-    made = UsdGeom.Mesh.Define(stage, f"{root.GetPath()}/mesh")
+    result = UsdGeom.Mesh.Define(stage, f"{root.GetPath()}/mesh")
     vertices = np.concatenate(points).astype(np.float32)
-    made.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(vertices))
-    made.CreateFaceVertexCountsAttr([3] * sum(map(len, faces)))
-    made.CreateFaceVertexIndicesAttr(np.concatenate(faces).reshape(-1).tolist())
+    result.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(vertices))
+    result.CreateFaceVertexCountsAttr([3] * sum(map(len, faces)))
+    result.CreateFaceVertexIndicesAttr(np.concatenate(faces).reshape(-1).tolist())
     table = np.concatenate(weights)
     order = np.argsort(-table, axis=1)[:, :4]
-    binding = UsdSkel.BindingAPI.Apply(made.GetPrim())
+    binding = UsdSkel.BindingAPI.Apply(result.GetPrim())
     binding.CreateSkeletonRel().SetTargets([skeleton.GetPath()])
     binding.CreateJointIndicesPrimvar(False, 4).Set(order.reshape(-1).tolist())
     binding.CreateJointWeightsPrimvar(False, 4).Set(np.take_along_axis(table, order, 1).reshape(-1).tolist())
     binding.CreateGeomBindTransformAttr(Gf.Matrix4d(1.0))
     starts = np.cumsum([0, *map(len, faces)])
     for part, first, last in zip(parts, starts, starts[1:], strict=False):
-        subset = UsdGeom.Subset.CreateGeomSubset(made, part.name, "face", list(range(first, last)), "materialBind")
+        subset = UsdGeom.Subset.CreateGeomSubset(result, part.name, "face", list(range(first, last)), "materialBind")
         _bind_material(stage, f"{root.GetPath()}/{part.name}_look", subset.GetPrim(), COLOURS[part.name])
     if blend_shape:
-        shape = UsdSkel.BlendShape.Define(stage, f"{made.GetPath()}/smile")
+        shape = UsdSkel.BlendShape.Define(stage, f"{result.GetPath()}/smile")
         shape.CreateOffsetsAttr([(0.0, 0.01 / unit, 0.0)])
         shape.CreatePointIndicesAttr([0])
         binding.CreateBlendShapesAttr(["smile"])
@@ -175,10 +175,10 @@ def _define_animation(
     moved = [name for name in JOINTS if "Toes" not in name][::-1]
     positions = [JOINTS.index(name) for name in moved]
     rest = [np.array(matrix).T for matrix in skeleton.GetRestTransformsAttr().Get()]
-    made = UsdSkel.Animation.Define(stage, f"{skeleton.GetPath()}/wild")
-    made.CreateJointsAttr([joint_path(name) for name in moved])
-    made.CreateScalesAttr([(1, 1, 1)] * len(moved))
-    translations, turns = made.CreateTranslationsAttr(), made.CreateRotationsAttr()
+    result = UsdSkel.Animation.Define(stage, f"{skeleton.GetPath()}/wild")
+    result.CreateJointsAttr([joint_path(name) for name in moved])
+    result.CreateScalesAttr([(1, 1, 1)] * len(moved))
+    translations, turns = result.CreateTranslationsAttr(), result.CreateRotationsAttr()
     for time in times.tolist():
         local = [rest[position] for position in positions]
         spins = Rotation.from_rotvec(random.uniform(-0.6, 0.6, (len(moved), 3)))
@@ -188,7 +188,7 @@ def _define_animation(
         translations.Set(Vt.Vec3fArray.FromNumpy(offsets.astype(np.float32)), time)
         turns.Set(Vt.QuatfArray.FromNumpy(quats.astype(np.float32)), time)
     if blend_shape:
-        made.CreateBlendShapesAttr(["smile"])
+        result.CreateBlendShapesAttr(["smile"])
         for time in times.tolist():
-            made.CreateBlendShapeWeightsAttr().Set([float(random.random())], time)
-    UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets([made.GetPath()])
+            result.CreateBlendShapeWeightsAttr().Set([float(random.random())], time)
+    UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets([result.GetPath()])

@@ -55,6 +55,6 @@ class UsdViewer:
 def find_faults(path: str | PathLike[str]) -> list[str]:
     """What the validators that usdchecker runs say of a file, each once."""
     registry = UsdValidation.ValidationRegistry()
-    names = [told.name for told in registry.GetAllValidatorMetadata() if not told.isSuite]
+    names = [given.name for given in registry.GetAllValidatorMetadata() if not given.isSuite]
     context = UsdValidation.ValidationContext([registry.GetOrLoadValidatorByName(name) for name in names])
     return sorted({error.GetName() for error in context.Validate(Usd.Stage.Open(str(path)))})

@@ -1,4 +1,4 @@
-"""Generated motion beside the clips of a folder: how well a small classifier tells them apart, Frechet distance, feet.
+"""Generated motion beside the clips of a folder: how well a small classifier separates them, Frechet distance, feet.
 
 `--model` is a density, `--refiner` a refiner of its samples, `--count` the number of clips of either side, of
 `--seconds`, `--steps` those of the classifier's training. An accuracy of 50 % is perfect;
@@ -58,15 +58,15 @@ def main(words: list[str] | None = None) -> None:
         "planted samples": replace(bare, sigma_planted=SIGMA_PLANTED),
         "mapctl generate": usual,
     }
-    made = {name: generate_clips(prior, settings, None, given) for name, settings in variants.items()}
+    result = {name: generate_clips(prior, settings, None, given) for name, settings in variants.items()}
     if given.refiner:
-        made["refined"] = generate_clips(prior, usual, priors.load_refiner(given.refiner), given)
+        result["refined"] = generate_clips(prior, usual, priors.load_refiner(given.refiner), given)
     settings = RealismSettings(steps=given.steps)
     rows: list[Row] = []
     for circle in circles:
         clips = [clip.motion for clip in circle.clips]
         rows.append(describe("the clips themselves", circle.name, clips) if clips else {"clips of": circle.name})
-        for name, motions in made.items():
+        for name, motions in result.items():
             row = describe(name, circle.name, motions)
             try:
                 found = measure_realism(motions, clips, generator=seeded(given.seed), settings=settings)

@@ -110,20 +110,20 @@ def measure_lafan(circles: list[Circle], methods: Mapping[str, Method], most: in
                         break
                     shown, _, gap = next(iter(done.values()))
                     done = {"truth": (shown, shown, gap), **done}
-                    for name, (_, made, _) in done.items():
-                        positions, quats = see_from_past(made, shown)
-                        each = positions[gap], quats[gap], measure_error(shown, made, gap), clip.name
+                    for name, (_, result, _) in done.items():
+                        positions, quats = see_from_past(result, shown)
+                        each = positions[gap], quats[gap], measure_error(shown, result, gap), clip.name
                         filled.setdefault(name, []).append(each)
             if not filled:
                 continue
             positions, quats = (torch.stack([each[part] for each in filled["truth"]]) for part in (0, 1))
             std = positions.flatten(0, 1).std(dim=0).clamp_min(1e-6)
             for name in methods:
-                made, made_quats = (torch.stack([each[part] for each in filled[name]]) for part in (0, 1))
+                result, made_quats = (torch.stack([each[part] for each in filled[name]]) for part in (0, 1))
                 worst, clip = max((each[2], each[3]) for each in filled[name])
                 rows.append(
-                    {"clips of": circle.name, "frames": frames, "method": name, "windows": len(made)}
-                    | {"L2P": compute_l2p(made, positions, std), "L2Q": compute_l2q(made_quats, quats)}
+                    {"clips of": circle.name, "frames": frames, "method": name, "windows": len(result)}
+                    | {"L2P": compute_l2p(result, positions, std), "L2Q": compute_l2q(made_quats, quats)}
                     | {"NPSS": compute_npss(made_quats, quats), "worst, cm": worst, "worst clip": clip}
                 )
     return rows
@@ -141,17 +141,17 @@ def see_from_past(motion: Motion, shown: Motion) -> tuple[Float[Tensor, "frames 
     return positions, rotations.multiply(turn.expand_as(quats), quats)
 
 
-def compute_l2p(made: Tensor, truth: Tensor, std: Float[Tensor, "joints 3"]) -> float:
+def compute_l2p(result: Tensor, truth: Tensor, std: Float[Tensor, "joints 3"]) -> float:
     """Return the mean length of the error of all coordinates of a frame, in units of their standard deviations."""
-    return float(((made - truth) / std).flatten(-2).norm(dim=-1).mean())
+    return float(((result - truth) / std).flatten(-2).norm(dim=-1).mean())
 
 
-def compute_l2q(made: Tensor, truth: Float[Tensor, "windows frames joints 4"]) -> float:
+def compute_l2q(result: Tensor, truth: Float[Tensor, "windows frames joints 4"]) -> float:
     """Return the mean length of the error of all world quaternions of a frame, whose signs are nearest the truth's."""
-    return float((align_signs(made, truth) - truth).flatten(-2).norm(dim=-1).mean())
+    return float((align_signs(result, truth) - truth).flatten(-2).norm(dim=-1).mean())
 
 
-def compute_npss(made: Tensor, truth: Float[Tensor, "windows frames joints 4"]) -> float:
+def compute_npss(result: Tensor, truth: Float[Tensor, "windows frames joints 4"]) -> float:
     """Return the normalised power spectrum similarity of world quaternions (Gopalakrishnan et al. 2019), 0 at best.
 
     The spectrum is the squared real part of the transform over frames, as in LaFAN1's code; its cumulated shares are
@@ -159,7 +159,7 @@ def compute_npss(made: Tensor, truth: Float[Tensor, "windows frames joints 4"]) 
     """
     flips = torch.where((truth[:, 1:] * truth[:, :-1]).sum(dim=-1, keepdim=True) < 0, -1.0, 1.0)
     truth = torch.cat([truth[:, :1], truth[:, 1:] * flips.cumprod(dim=1)], dim=1)
-    spectra = [torch.fft.fft(x.flatten(-2).double(), dim=1).real.square() for x in (truth, align_signs(made, truth))]
+    spectra = [torch.fft.fft(x.flatten(-2).double(), dim=1).real.square() for x in (truth, align_signs(result, truth))]
     power = spectra[0].sum(dim=1)
     shares = [each / each.sum(dim=1, keepdim=True).clamp_min(1e-30) for each in spectra]
     distance = (shares[0].cumsum(dim=1) - shares[1].cumsum(dim=1)).abs().sum(dim=1)
@@ -167,9 +167,9 @@ def compute_npss(made: Tensor, truth: Float[Tensor, "windows frames joints 4"]) 
     return float((distance * weight).sum() / weight.sum())
 
 
-def align_signs(made: Float[Tensor, "*batch 4"], truth: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
+def align_signs(result: Float[Tensor, "*batch 4"], truth: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
     """Return the same rotations by the quaternions nearest to the truth's."""
-    return torch.where((made * truth).sum(dim=-1, keepdim=True) < 0, -made, made)
+    return torch.where((result * truth).sum(dim=-1, keepdim=True) < 0, -result, result)
 
 
 def main(words: list[str] | None = None) -> None:

@@ -61,14 +61,14 @@ def _add_armature(name: str, rows: dict, seed: int):
     _activate(armature)
     bpy.ops.object.mode_set(mode="EDIT")
     for bone, (parent, head) in rows.items():
-        made = armature.data.edit_bones.new(bone)
+        result = armature.data.edit_bones.new(bone)
         children = [position for above, position in rows.values() if above == bone]
-        made.head = head
-        made.tail = children[0] if children else head + (head - rows[parent][1]) * 0.5
-        made.roll = rng.uniform(-math.pi, math.pi)
+        result.head = head
+        result.tail = children[0] if children else head + (head - rows[parent][1]) * 0.5
+        result.roll = rng.uniform(-math.pi, math.pi)
         if parent is not None:
-            made.parent = armature.data.edit_bones[parent]
-            made.use_connect = (made.parent.tail - made.head).length < 1e-6
+            result.parent = armature.data.edit_bones[parent]
+            result.use_connect = (result.parent.tail - result.head).length < 1e-6
     bpy.ops.object.mode_set(mode="OBJECT")
     return armature
 

@@ -63,8 +63,8 @@ def state() -> list:
     ]
 
 
-def told() -> tuple[str, ...]:
-    """What the panel tells."""
+def printed() -> tuple[str, ...]:
+    """What the panel shows."""
     return tuple(module("interface").Report.lines)
 
 

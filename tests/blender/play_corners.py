@@ -76,7 +76,7 @@ def play_echoes() -> None:
     pull.target.location = (0.8, 0.5, 1.9)
     bpy.context.collection.objects.link(pull.target)
     facts["apart"]["arm that is stretched"] = apart(armature, bpy.ops.mapctl.clean_up)
-    facts["stretched told"] = blender_stage.told()
+    facts["stretched printed"] = blender_stage.printed()
 
     clear_and_spin()
 
@@ -137,7 +137,7 @@ def play_generated() -> None:
     bones = [*trunk, *(f"DEF-{limb}.{side}" for limb in limbs for side in "LR")]
     facts["ended early"] = [end_at("setting the controls", 3), end_at("checking", 0)]
     facts["apart"]["generated rig by IK"] = apart(rig, bpy.ops.mapctl.clean_up, bones)
-    facts["generated told"] = blender_stage.told()
+    facts["generated printed"] = blender_stage.printed()
     facts["turned"] = turn_of(rig, bones)
 
     facts["stretch is back"] = max(bone.ik_stretch for bone in rig.pose.bones)
@@ -234,7 +234,7 @@ def play_generated_walk() -> None:
     drawn.data.splines[0].bezier_points[0].co.z += 0.5
     bpy.context.scene.frame_end = 3
     assert bpy.ops.mapctl.walk() == {"FINISHED"}
-    facts["not level"] = [blender_stage.told()[0], bpy.context.scene.frame_end]
+    facts["not level"] = [blender_stage.printed()[0], bpy.context.scene.frame_end]
 
 
 def end_walk_early(drawn) -> str:
@@ -256,15 +256,15 @@ def walked_joints(armature, first: int) -> np.ndarray:
 
 
 def expect(name: str, run, **options) -> None:
-    """Note what the interface tells of an operator that cannot do its work, and that nothing was changed."""
+    """Note what the interface reports of an operator that cannot do its work, and that nothing was changed."""
     bpy.context.scene.frame_set(bpy.context.scene.frame_current)
     before = blender_stage.state()
     try:
         facts["errors"][name] = [str(run(**options)), ""]
     except RuntimeError as error:
-        told = blender_stage.told()[0]
+        printed = blender_stage.printed()[0]
         same = blender_stage.state() == before and blender_stage.module("interface").Report.failed
-        facts["errors"][name] = [told if told in str(error) else str(error), "unchanged" if same else "changed"]
+        facts["errors"][name] = [printed if printed in str(error) else str(error), "unchanged" if same else "changed"]
 
 
 def play_errors() -> None:

@@ -35,7 +35,7 @@ def start_modal(mode: str):
     blender_stage.use(mode)
     operators = blender_stage.module("interface")
     window, notes = make_window()
-    told: list = []
+    printed: list = []
     context = SimpleNamespace(
         window_manager=window,
         window=None,
@@ -53,11 +53,11 @@ def start_modal(mode: str):
         prepare = operators.MAPCTL_OT_clean_up.prepare
 
         def report(self, kind, text):
-            told.append((sorted(kind), text))
+            printed.append((sorted(kind), text))
 
     pressed = Pressed()
     assert pressed.start(context) == {"RUNNING_MODAL"}
-    return pressed, context, notes, told
+    return pressed, context, notes, printed
 
 
 def play_modal() -> None:
@@ -68,7 +68,7 @@ def play_modal() -> None:
     armatures.select(armature)
     bpy.context.scene.frame_set(1)
     before = blender_stage.state()
-    pressed, context, notes, told = start_modal("sleep")
+    pressed, context, notes, printed = start_modal("sleep")
     timer, escape, key = (SimpleNamespace(type=kind) for kind in ("TIMER", "ESC", "A"))
     process = blender_stage.FOLDER / "process.txt"
     seen = {blender_stage.module("interface").Report.step.describe()}
@@ -88,19 +88,19 @@ def play_modal() -> None:
         "folder": Path(folder).exists(),
         "unchanged": blender_stage.state() == before,
         "notes": [note for note in notes if note in ("begin", "end", "timer", "handler", None)],
-        "told": blender_stage.told(),
+        "printed": blender_stage.printed(),
         "step": blender_stage.module("interface").Report.step is None,
     }
-    pressed, context, notes, told = start_modal("echo")
+    pressed, context, notes, printed = start_modal("echo")
     answer = {"RUNNING_MODAL"}
     while answer == {"RUNNING_MODAL"}:
         answer = pressed.modal(context, timer)
-    facts["modal end"] = [sorted(answer), told, notes[-3:]]
-    pressed, context, notes, told = start_modal("fail")
+    facts["modal end"] = [sorted(answer), printed, notes[-3:]]
+    pressed, context, notes, printed = start_modal("fail")
     answer = {"RUNNING_MODAL"}
     while answer == {"RUNNING_MODAL"}:
         answer = pressed.modal(context, timer)
-    facts["modal failure"] = [sorted(answer), told]
+    facts["modal failure"] = [sorted(answer), printed]
 
 
 def is_running(number: int) -> bool:

@@ -46,7 +46,7 @@ def main() -> None:
         before.get(name, lambda: None)()
         joints = names_of(armature)
         arrays[f"{name} before"] = armatures.joints_of(armature, joints, FRAMES) if name != "walk" else np.zeros(0)
-        facts["stages"][name] = {"status": list(run()), "told": blender_stage.told(), **describe(armature)}
+        facts["stages"][name] = {"status": list(run()), "printed": blender_stage.printed(), **describe(armature)}
         arrays[name] = armatures.joints_of(armature, joints, range(1, 1 + count(armature)))
     facts |= {"joints": joints, "frame": scene.frame_current, "end": scene.frame_end}
     facts["actions"] = [(each.name, each.use_fake_user) for each in bpy.data.actions]

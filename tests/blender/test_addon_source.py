@@ -122,7 +122,9 @@ def test_mapctl_is_found_by_path_by_preference_and_by_python(source, tmp_path, m
     assert process.find_command("") == (str(found / "mapctl"),)
 
 
-@pytest.mark.parametrize(("said", "told"), [("mapctl 0.0.12", "too old"), ("other 1.0", "does not answer like mapctl")])
-def test_other_programs_are_refused(source, tmp_path, said, told):
-    with pytest.raises(source("process").AddonError, match=told):
+@pytest.mark.parametrize(
+    ("said", "printed"), [("mapctl 0.0.12", "too old"), ("other 1.0", "does not answer like mapctl")]
+)
+def test_other_programs_are_refused(source, tmp_path, said, printed):
+    with pytest.raises(source("process").AddonError, match=printed):
         source("process").find_command(write_program(tmp_path, f"print('{said}')"))

@@ -1,4 +1,4 @@
-"""The add-on in Blender: any armature comes back as it was, errors are told, undo leaves no trace."""
+"""The add-on in Blender: any armature comes back as it was, errors are reported, undo leaves no trace."""
 
 import numpy as np
 import pytest
@@ -45,9 +45,9 @@ def test_bones_that_travel_keep_their_places(facts):
 
 def test_what_constraints_keep_from_its_place_is_told(facts):
     assert facts["apart"]["arm that is stretched"] < CLOSE, "constraints still hold"
-    assert "mixamorig:Left" in facts["stretched told"][0]
-    assert " cm off: constraints" in facts["stretched told"][0]
-    assert facts["stretched told"][1:] == ["frame 0 in mapctl's lines is frame 1 of the scene", "echoed"]
+    assert "mixamorig:Left" in facts["stretched printed"][0]
+    assert " cm off: constraints" in facts["stretched printed"][0]
+    assert facts["stretched printed"][1:] == ["frame 0 in mapctl's lines is frame 1 of the scene", "echoed"]
 
 
 def test_rigs_animated_by_ik_keep_hands_and_feet_where_they_were(facts):
@@ -85,8 +85,8 @@ def test_walks_start_from_a_clean_pose(facts, kind, file, height):
 
 
 def test_curves_that_are_not_level_are_told_and_the_scene_is_long_enough(facts):
-    told, end = facts["not level"]
-    assert told.endswith("is not level: the character walks at its median height")
+    printed, end = facts["not level"]
+    assert printed.endswith("is not level: the character walks at its median height")
     assert end == 12
 
 
@@ -122,8 +122,8 @@ ERRORS = {
 
 def test_errors_are_shown_and_nothing_is_changed(facts):
     assert facts["errors"].keys() == ERRORS.keys()
-    for name, (told, changed) in facts["errors"].items():
-        assert ERRORS[name] in told
+    for name, (printed, changed) in facts["errors"].items():
+        assert ERRORS[name] in printed
         assert changed == "unchanged"
 
 

@@ -33,14 +33,14 @@ def test_only_the_view_can_be_used_while_a_job_runs(facts):
 def test_esc_ends_the_process_and_leaves_no_trace(facts):
     cancelled = facts["cancelled"]
     assert cancelled["notes"] == ["begin", "handler", "timer", "end", None]
-    assert cancelled["told"] == ["cancelled: nothing was changed"]
+    assert cancelled["printed"] == ["cancelled: nothing was changed"]
     assert [cancelled[name] for name in ("ended", "folder", "unchanged", "step")] == [True, False, True, True]
 
 
 def test_jobs_end_by_themselves_in_the_interface(facts):
-    answer, told, notes = facts["modal end"]
+    answer, printed, notes = facts["modal end"]
     assert answer == ["FINISHED"]
-    assert told == [[["INFO"], "new action: mixamoAction clean"]]
+    assert printed == [[["INFO"], "new action: mixamoAction clean"]]
     assert notes == ["timer", "end", None]
     assert facts["modal failure"] == [["CANCELLED"], [[["ERROR"], "nobody walks here"]]]
 

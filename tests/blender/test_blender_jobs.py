@@ -60,7 +60,7 @@ def test_each_operator_ends_well(played):
     assert list(facts["stages"])[:4] == ["walk", "clean", "filled", "tweened"]
     assert {tuple(stage["status"]) for stage in facts["stages"].values()} == {("FINISHED",)}
     for stage in facts["stages"].values():
-        assert not [line for line in stage["told"] if " off: " in line]
+        assert not [line for line in stage["printed"] if " off: " in line]
 
 
 def test_the_walk_is_the_one_of_the_command_line(played):
@@ -99,8 +99,8 @@ def test_what_comes_back_is_what_blender_shows(played):
     _, _, kept, facts, arrays = played
     for command, stage in last_stages(facts).items():
         file = kept / command / "made.npz"
-        made = joints(file, facts["joints"])
-        assert np.abs(shown(arrays, stage, facts["joints"], file)[: len(made)] - made).max() < CLOSE
+        result = joints(file, facts["joints"])
+        assert np.abs(shown(arrays, stage, facts["joints"], file)[: len(result)] - result).max() < CLOSE
 
 
 def test_outside_of_a_gap_nothing_moves(played):

@@ -53,11 +53,11 @@ def test_render_shows_it_and_a_mannequin_without(hero, staged, tmp_path, caplog)
 
 @pytest.mark.slow
 def test_render_takes_a_characters_own_motion_as_it_is(staged, tmp_path):
-    made = make_character_glb(tmp_path / "two.glb", animations=("walk", "run"), frames=13)
+    result = make_character_glb(tmp_path / "two.glb", animations=("walk", "run"), frames=13)
     out = tmp_path / "x.png"
     for choice in ("", "#/run", "#Armature_skin/run"):
-        source = f"{made.path}{choice}"
-        assert run("render", source, "-o", out, "--character", made.path, "--size", "96x64", "--quiet") == 0
+        source = f"{result.path}{choice}"
+        assert run("render", source, "-o", out, "--character", result.path, "--size", "96x64", "--quiet") == 0
     first, *others = [stage.players[0].body.surface(7).vertices for stage in staged]
     assert np.abs(first - others[0]).max() > 0.02, "another animation"
     np.testing.assert_array_equal(*others)

@@ -84,14 +84,16 @@ def test_convert_changes_the_rig(walk, tmp_path, rig):
 def test_measure_prints_json_and_a_table(walk, capsys):
     words = ("measure", walk, "--curve", "circle:3", "--speed", 1.2, "--reference", walk)
     assert run(*words, "--json") == 0
-    told = json.loads(capsys.readouterr().out)
+    printed = json.loads(capsys.readouterr().out)
     report = json.loads(walk.with_suffix(".json").read_text())
-    assert told["measures"]["path_error_mean_cm"] == pytest.approx(report["measures"]["path_error_mean_cm"], abs=0.01)
-    assert told["reference"]["speed_m_s"] == told["measures"]["speed_m_s"]
-    assert {"mean", "p2", "p98"} == set(told["mocap"]["sway_cm"])
+    assert printed["measures"]["path_error_mean_cm"] == pytest.approx(
+        report["measures"]["path_error_mean_cm"], abs=0.01
+    )
+    assert printed["reference"]["speed_m_s"] == printed["measures"]["speed_m_s"]
+    assert {"mean", "p2", "p98"} == set(printed["mocap"]["sway_cm"])
     assert run(*words) == 0
     table = capsys.readouterr().out
-    assert all(name in table for name in told["measures"])
+    assert all(name in table for name in printed["measures"])
 
 
 @pytest.mark.slow
@@ -132,9 +134,9 @@ def test_demo_leaves_four_files(prior, tmp_path, monkeypatch):
 
 def test_info_names_what_is_here(prior, capsys):
     assert run("info") == 0
-    told = capsys.readouterr().out
+    printed = capsys.readouterr().out
     for word in (mapctl.__version__, "CC BY-NC 4.0", "rendering", "threads", "torch"):
-        assert word in told
+        assert word in printed
     assert run("info", prior) == 0
     assert json.loads(capsys.readouterr().out)["kind"] == "lstm-gmm"
 
@@ -161,10 +163,10 @@ def test_an_interrupted_walk_is_written_as_far_as_it_was_solved(prior, tmp_path,
     files = {name: tmp_path / f"walk.{name}" for name in ("bvh", "json", "mp4")}
     words = ("-o", files["bvh"], "--report", files["json"], "--video", files["mp4"], "--prior", prior)
     assert run("follow", "circle:3", "--seconds", 4, *words) == 130
-    told = capsys.readouterr()
-    assert "status    interrupted; what was solved until then is kept" in told.out
-    assert "walk.mp4" not in told.out
-    assert told.err == "mapctl: interrupted; what was solved until then is written\n"
+    printed = capsys.readouterr()
+    assert "status    interrupted; what was solved until then is kept" in printed.out
+    assert "walk.mp4" not in printed.out
+    assert printed.err == "mapctl: interrupted; what was solved until then is written\n"
     assert {file.name for file in tmp_path.iterdir()} == {"walk.bvh", "walk.json"}
     assert mapctl.load(files["bvh"]).num_frames == 35
     report = json.loads(files["json"].read_text())
@@ -210,8 +212,8 @@ def test_interruption_leaves_nothing_half_done(prior, tmp_path, number, said):
     time.sleep(0.5)  # by then it samples
     process.send_signal(number)
     process.send_signal(number)  # `timeout` sends it twice
-    _, told = _ended(process)
-    assert (process.returncode, told) == said
+    _, printed = _ended(process)
+    assert (process.returncode, printed) == said
     assert list(tmp_path.iterdir()) == []
 
 
@@ -221,12 +223,12 @@ def test_a_walk_interrupted_from_outside_leaves_a_whole_file_or_none(prior, tmp_
     process = _started(words)
     time.sleep(5)
     process.send_signal(signal.SIGTERM)
-    _, told = _ended(process)
+    _, printed = _ended(process)
     assert process.returncode == 143
-    assert "Traceback" not in told
-    assert told.startswith("mapctl: terminated")
+    assert "Traceback" not in printed
+    assert printed.startswith("mapctl: terminated")
     written = (tmp_path / "walk.bvh").exists()
-    assert written == ("what was solved until then is written" in told)
+    assert written == ("what was solved until then is written" in printed)
     assert not written or 2 < mapctl.load(tmp_path / "walk.bvh").num_frames < 90_000
 
 
@@ -258,7 +260,7 @@ def paced_prior(tmp_path_factory):
 
 
 @pytest.mark.parametrize(
-    ("style", "told", "like_start"),
+    ("style", "paced", "like_start"),
     [
         (None, True, True),
         ("elderly", True, False),
@@ -267,7 +269,7 @@ def paced_prior(tmp_path_factory):
         ("none", False, False),
     ],
 )
-def test_paces_are_told_unless_one_is_named(tmp_path, paced_prior, monkeypatch, style, told, like_start):
+def test_paces_are_told_unless_one_is_named(tmp_path, paced_prior, monkeypatch, style, paced, like_start):
     class Asked(Exception):
         """Generation has begun."""
 
@@ -278,4 +280,4 @@ def test_paces_are_told_unless_one_is_named(tmp_path, paced_prior, monkeypatch, 
     words = () if style is None else ("--style", style)
     with pytest.raises(Asked) as asked:
         run("generate", "-o", tmp_path / "out", "--seconds", 1, "--prior", paced_prior, *words)
-    assert asked.value.args == (told, like_start)
+    assert asked.value.args == (paced, like_start)

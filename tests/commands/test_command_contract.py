@@ -29,7 +29,7 @@ JOBS = {
         "denoise in.bvh -o out.npz --prior auto --report out.json",
         {"denoiser", "general", "locomotion", "transformer"},
     ),
-    "denoise a folder": ("denoise clips -o clean --jobs 2 --report told --again", {"denoiser", "transformer"}),
+    "denoise a folder": ("denoise clips -o clean --jobs 2 --report reports --again", {"denoiser", "transformer"}),
     "infill": ("infill in.bvh -o out.npz --gap 10:20 --report out.json", {"transformer"}),
     "infill a long gap": ("infill long.bvh -o out.npz --gap 10:200 --no-refine --report out.json", {"transformer"}),
     "infill by a stitcher": ("infill in.bvh -o out.npz --gap 10:20 --method stitcher --report out.json", {"stitcher"}),
@@ -51,7 +51,7 @@ JOBS = {
 QUICK = {"follow", "run", "steer", "denoise", "chain"}
 CASES = [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in JOBS]
 MOTIONS = ("out.npz", "a.npz", "made/generated_000.npz", "clean/one.bvh")
-REPORTS = ("out.json", "a.json", "told/one.json")
+REPORTS = ("out.json", "a.json", "reports/one.json")
 
 
 @pytest.fixture(scope="module")
@@ -87,8 +87,8 @@ def written(folder: Path, names: tuple[str, ...]) -> list[Path]:
 def test_a_command_writes_what_it_names_under_its_licence_and_twice_the_same(here, capsys, name):
     words, needed = JOBS[name]
     assert run(*words.split(), "--weights", "free") == 0
-    told = capsys.readouterr().out.splitlines()
-    (line,) = [line for line in told if line.startswith("licence   ")]
+    printed = capsys.readouterr().out.splitlines()
+    (line,) = [line for line in printed if line.startswith("licence   ")]
     assert line.startswith(f"licence   {FREE} (free/")
     assert all(f"free/{model}" in line for model in needed)
     (motion,) = written(here, MOTIONS)

@@ -76,19 +76,19 @@ def every_format(folder, tmp_path, monkeypatch):
 def test_any_format_to_any_format(every_format, capsys, source, ending):
     if ending == ".vrma" and source not in (".vrm", ".vrma"):
         assert run("convert", f"in{source}", "out.vrma") == 0
-        made, wanted = mapctl.load("out.vrma"), retarget.to_canonical(mapctl.load(f"in{source}"))[0]
-        at = [made.skeleton.index(name) for name in wanted.skeleton.names]
-        np.testing.assert_allclose(made.joint_positions()[:, at], wanted.joint_positions(), atol=5e-6)
+        result, wanted = mapctl.load("out.vrma"), retarget.to_canonical(mapctl.load(f"in{source}"))[0]
+        at = [result.skeleton.index(name) for name in wanted.skeleton.names]
+        np.testing.assert_allclose(result.joint_positions()[:, at], wanted.joint_positions(), atol=5e-6)
         return
     if ending == ".vrm" and source != ".vrm":
         assert run("convert", f"in{source}", "out.vrm") == 2
         assert "a .vrm needs a character" in capsys.readouterr().err
         return
     assert run("convert", f"in{source}", f"out{ending}") == 0
-    told = capsys.readouterr()
+    printed = capsys.readouterr()
     motion = mapctl.load(f"in{source}")
-    assert told.err == "" or source == ".amc"  # whose random angles are doubtful
-    assert told.out.startswith(
+    assert printed.err == "" or source == ".amc"  # whose random angles are doubtful
+    assert printed.out.startswith(
         f"out{ending}: 6 frames, {motion.num_joints} joints, {float(motion.fps):g} frames a second"
     )
     again = mapctl.load(f"out{ending}")
@@ -126,9 +126,9 @@ def test_frames_are_picked_before_the_rate_is_changed(every_format):
     "words", ["--rig canonical", "--rig mixamo", "--root-motion", "--fps 20", "--mirror", "--in-place"]
 )
 def test_a_licence_outlives_what_is_done_to_the_motion(every_format, words):
-    formats.save(replace(walk(40), licence="CC BY 4.0 (somebody)"), "given.npz")
+    formats.save(replace(walk(40), licence="CC BY 4.0 (a studio)"), "given.npz")
     assert run("convert", "given.npz", "out.npz", *words.split()) == 0
-    assert mapctl.load("out.npz").licence == "CC BY 4.0 (somebody)"
+    assert mapctl.load("out.npz").licence == "CC BY 4.0 (a studio)"
 
 
 ALL = ("--mirror", "--loop", "--plant-feet")
@@ -152,11 +152,11 @@ def here(tmp_path, monkeypatch):
 @pytest.mark.parametrize("chosen", EDITS, ids=" ".join)
 def test_all_go_together(here, capsys, chosen):
     assert run("convert", "in.bvh", "out.bvh", *chosen) == 0
-    told, motion = capsys.readouterr(), mapctl.load("out.bvh")
-    assert told.err == ""
+    printed, motion = capsys.readouterr(), mapctl.load("out.bvh")
+    assert printed.err == ""
     assert motion.num_frames == (30 if "--loop" in chosen else 90)
     assert motion.skeleton.names[0] == ("root" if "--root-motion" in chosen else "hips")
-    assert ("loop: frames" in told.out, "feet: planted toes" in told.out) == (
+    assert ("loop: frames" in printed.out, "feet: planted toes" in printed.out) == (
         "--loop" in chosen,
         "--plant-feet" in chosen,
     )
@@ -195,9 +195,9 @@ def test_a_clip_that_fails_stops_no_other_one(here, capsys):
     Path("takes/0.bvh").write_text("HIERARCHY\nnonsense")
     walk(5).save("takes/short.bvh")
     assert run("convert", "takes", "out", "--loop") == 3
-    told = capsys.readouterr().out.splitlines()
-    assert "failed: takes/0.bvh, line 2" in told[1]
-    assert any(line.startswith("failed: takes/short.bvh: no cycle is found") for line in told)
+    printed = capsys.readouterr().out.splitlines()
+    assert "failed: takes/0.bvh, line 2" in printed[1]
+    assert any(line.startswith("failed: takes/short.bvh: no cycle is found") for line in printed)
     assert not list(Path("out").rglob("0.*"))
 
 

@@ -34,16 +34,16 @@ def denoise(tiny):
 def test_a_file_comes_back_clean(denoise, recording, tmp_path, capsys):
     out = tmp_path / "out.bvh"
     assert denoise(recording, "-o", out) == 0
-    told = capsys.readouterr()
+    printed = capsys.readouterr()
     on_rig("bandai", 40).save(tmp_path / "truth.bvh")
     before, after, truth = map(mapctl.load, (recording, out, tmp_path / "truth.bvh"))
     assert after.skeleton.matches(before.skeleton)
     assert (after.num_frames, after.fps) == (before.num_frames, before.fps)
     assert error_cm(truth, after) < 0.9 * error_cm(truth, before)
-    assert f"{out}: 40 frames at 30 a second" in told.out
-    assert "noise: " in told.out
-    assert "and 15 more joints" in told.out
-    assert told.err == ""
+    assert f"{out}: 40 frames at 30 a second" in printed.out
+    assert "noise: " in printed.out
+    assert "and 15 more joints" in printed.out
+    assert printed.err == ""
 
 
 def test_report_and_mask(denoise, recording, tmp_path):
@@ -51,10 +51,12 @@ def test_report_and_mask(denoise, recording, tmp_path):
     report = tmp_path / "r.json"
     words = ["--mask", tmp_path / "m.csv", "--report", report, "--quiet"]
     assert denoise(recording, "-o", tmp_path / "out.bvh", *words) == 0
-    told = json.loads(report.read_text())
-    assert told["request"]["command"] == "denoise"
-    assert {"faults", "correction_cm", "contacts", "ledger", "fallback", "measures", "versions", "status"} <= set(told)
-    lost = {(f["joint"], f["start"], f["stop"]) for f in told["faults"] if f["kind"] == "dropout"}
+    printed = json.loads(report.read_text())
+    assert printed["request"]["command"] == "denoise"
+    assert {"faults", "correction_cm", "contacts", "ledger", "fallback", "measures", "versions", "status"} <= set(
+        printed
+    )
+    lost = {(f["joint"], f["start"], f["stop"]) for f in printed["faults"] if f["kind"] == "dropout"}
     assert {("Hand_L", 10, 14), ("Hand_L", 30, 31), ("Hips", 30, 31)} <= lost
 
 
@@ -92,8 +94,8 @@ def test_what_is_there_is_not_done_again_unless_asked_for(denoise, folder, tmp_p
     (out / "deep").mkdir(parents=True)
     (out / "deep" / "b.bvh").write_text("done before")
     assert denoise(folder, "-o", out) == 0
-    assert "1 denoised" in (told := capsys.readouterr().out)
-    assert "1 there already, 0 failed" in told
+    assert "1 denoised" in (printed := capsys.readouterr().out)
+    assert "1 there already, 0 failed" in printed
     assert (out / "deep" / "b.bvh").read_text() == "done before"
     assert denoise(folder, "-o", out, "--again", "--quiet") == 0
     assert mapctl.load(out / "deep" / "b.bvh").num_frames == 20
@@ -104,11 +106,11 @@ def test_failures_are_listed_and_stop_no_other_file(denoise, folder, tmp_path, c
     (folder / "0-broken.bvh").write_text("HIERARCHY\nnonsense")
     walk(20).save(folder / "c.npz")
     assert denoise(folder, "-o", tmp_path / "out") == 3
-    told = capsys.readouterr().out
-    assert "3 denoised, " in told
-    assert "1 failed" in told
-    assert told.count("failed: ") == 1
-    assert "0-broken.bvh" in told
+    printed = capsys.readouterr().out
+    assert "3 denoised, " in printed
+    assert "1 failed" in printed
+    assert printed.count("failed: ") == 1
+    assert "0-broken.bvh" in printed
     assert (tmp_path / "out" / "a.bvh").exists()
     assert (tmp_path / "out" / "c.npz").exists()
     assert not (tmp_path / "out" / "0-broken.bvh").exists()
@@ -126,8 +128,8 @@ def test_an_interrupted_folder_says_what_is_done_and_goes_on(denoise, folder, tm
     with monkeypatch.context() as patch:
         patch.setattr(formats, "save", interrupted)
         assert denoise(folder, "-o", out) == 130
-    told = capsys.readouterr().err
-    assert told == "mapctl: interrupted; 1 of 2 files are finished; the same command goes on with the others\n"
+    printed = capsys.readouterr().err
+    assert printed == "mapctl: interrupted; 1 of 2 files are finished; the same command goes on with the others\n"
     assert denoise(folder, "-o", out) == 0
     assert ", 1 there already" in capsys.readouterr().out
 

@@ -50,7 +50,7 @@ def test_every_job_takes_files_and_classes(here, models, capsys, job):
         words = ["--dna", dna] if dna else []
         assert run(job, *JOBS[job], *models, *words) == 0
         found[dna] = Path("out.bvh").read_bytes()
-        told = capsys.readouterr().out
+        printed = capsys.readouterr().out
         named = dna.replace(", ", " and ")
-        assert (f": tweener in the style of {named}" if dna else ": tweener") in told
+        assert (f": tweener in the style of {named}" if dna else ": tweener") in printed
     assert len(set(found.values())) == 4

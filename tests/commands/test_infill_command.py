@@ -25,13 +25,13 @@ def tiny(tmp_path_factory):
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
     """Files of walks by rig and rate, 1.5 seconds each."""
-    folder, made = tmp_path_factory.mktemp("recording"), {}
+    folder, result = tmp_path_factory.mktemp("recording"), {}
 
     def of(rig="bandai", fps=30):
-        if (rig, fps) not in made:
-            made[rig, fps] = folder / f"{rig}-{fps}.bvh"
-            on_rig(rig, round(1.5 * fps), fps=fps).save(made[rig, fps])
-        return made[rig, fps]
+        if (rig, fps) not in result:
+            result[rig, fps] = folder / f"{rig}-{fps}.bvh"
+            on_rig(rig, round(1.5 * fps), fps=fps).save(result[rig, fps])
+        return result[rig, fps]
 
     return of
 
@@ -47,7 +47,7 @@ def rows(path):
     return path.read_text().split("Frame Time")[1].splitlines()[1:]
 
 
-def spoilt(source, out, *gaps):
+def corrupted(source, out, *gaps):
     """The file with nonsense in the gaps."""
     lines, draw = source.read_text().splitlines(), np.random.default_rng(0)
     first = next(number for number, line in enumerate(lines) if line.startswith("Frame Time")) + 1
@@ -73,7 +73,7 @@ def test_outside_the_gap_every_channel_is_as_it_was(infill, recording, tmp_path,
 @pytest.mark.parametrize(("rig", "method"), [("bandai", "auto"), ("daz", "infiller")])
 def test_what_stands_in_the_gap_does_not_matter(infill, recording, tmp_path, rig, method):
     found, gaps = set(), ((10, 15), (22, 30))
-    wild = spoilt(recording(rig), tmp_path / "wild.bvh", *gaps)
+    wild = corrupted(recording(rig), tmp_path / "wild.bvh", *gaps)
     words = [word for gap in gaps for word in ("--gap", "{}:{}".format(*gap))]
     for source in (recording(rig), wild):
         assert infill(source, "-o", tmp_path / "out.bvh", *words, *words_of(method), "--quiet") == 0
@@ -84,9 +84,9 @@ def test_what_stands_in_the_gap_does_not_matter(infill, recording, tmp_path, rig
 def test_several_gaps_in_frames_and_seconds_are_told(infill, recording, tmp_path, capsys):
     out = tmp_path / "out.npz"
     assert infill(recording(), "-o", out, "--gap", "1s:1.2s", "--gap", "10:15", *words_of("infiller")) == 0
-    told = capsys.readouterr()
-    assert f"{out}: 45 frames at 30 a second; filled 10:15 (22 joints), 30:36 (22 joints);" in told.out
-    assert told.err == ""
+    printed = capsys.readouterr()
+    assert f"{out}: 45 frames at 30 a second; filled 10:15 (22 joints), 30:36 (22 joints);" in printed.out
+    assert printed.err == ""
     assert mapctl.load(out).num_frames == 45
 
 
@@ -120,12 +120,12 @@ NAMES = {"canonical": ("leftHand", "rightLowerLeg"), "bandai": ("Hand_L", "Lower
 def infilled(tiny, tmp_path):
     """Runs the command, which must do; returns the text of what it writes."""
 
-    def made(source, *words, method="infiller"):
+    def result(source, *words, method="infiller"):
         asked = () if method == "slerp" else ("--inbetweener", tiny)
         assert run("infill", source, "-o", tmp_path / "out.bvh", *words, *words_of(method), *asked, "--quiet") == 0
         return (tmp_path / "out.bvh").read_text()
 
-    return made
+    return result
 
 
 @pytest.fixture
@@ -183,10 +183,10 @@ def test_an_archive_with_nan_is_filled(infilled, tmp_path):
 def test_where_nothing_is_left_it_is_said(tiny, clip, tmp_path, capsys, lost, said):
     lossy = without(clip("bandai"), tmp_path / "lossy.bvh", lost)
     assert run("infill", lossy, "-o", tmp_path / "out.bvh", "--inbetweener", tiny) == 2
-    told = capsys.readouterr()
-    assert told.err.startswith("mapctl: ")
-    assert told.err.count("\n") == 1
-    assert said in told.err
+    printed = capsys.readouterr()
+    assert printed.err.startswith("mapctl: ")
+    assert printed.err.count("\n") == 1
+    assert said in printed.err
     assert not (tmp_path / "out.bvh").exists()
 
 
@@ -203,8 +203,8 @@ def test_denoising_believes_no_nan(clip, tmp_path, many):
     assert run("denoise", source, "-o", tmp_path / "asked.bvh", "--mask", tmp_path / "mask.csv", *words) == 0
     given, out = (folder, tmp_path / "clean") if many else (lossy, tmp_path / "out.bvh")
     assert run("denoise", given, "-o", out, *words) == 0
-    made = [mapctl.load(path) for path in (tmp_path / "asked.bvh", out / "lossy.bvh" if many else out)]
-    assert (made[0].joint_positions() - made[1].joint_positions()).abs().max() < 1e-6
+    result = [mapctl.load(path) for path in (tmp_path / "asked.bvh", out / "lossy.bvh" if many else out)]
+    assert (result[0].joint_positions() - result[1].joint_positions()).abs().max() < 1e-6
 
 
 @pytest.fixture(scope="module")

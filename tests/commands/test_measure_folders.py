@@ -17,9 +17,9 @@ def quick(monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory):
+def result(tmp_path_factory):
     """Five clips, two of them in a folder below and in the other format."""
-    folder = tmp_path_factory.mktemp("made")
+    folder = tmp_path_factory.mktemp("generated")
     (folder / "below").mkdir()
     for k in range(5):
         position = folder / "below" / f"{k}.NPZ" if k % 2 else folder / f"{k}.bvh"
@@ -43,28 +43,28 @@ def run(*words: object) -> int:
     return cli.main(["measure", *map(str, words)])
 
 
-def told(capsys, *words: object) -> dict:
+def printed(capsys, *words: object) -> dict:
     assert run(*words, "--json") == 0
     return json.loads(capsys.readouterr().out)
 
 
 @pytest.mark.slow
-def test_a_folder_shows_the_means_of_its_clips(made, capsys):
-    values = told(capsys, made)
+def test_a_folder_shows_the_means_of_its_clips(result, capsys):
+    values = printed(capsys, result)
     rows = [metrics.measure(walk(95, cadence=0.8 + 0.05 * k, seed=k)) for k in range(5)]
     assert values["clips"] == 5
     assert values["measures"].keys() == rows[0].keys()
     for name in ("speed_m_s", "skate_cm_s", "jitter_m_s3"):
         assert values["measures"][name] == pytest.approx(sum(row[name] for row in rows) / 5, rel=1e-3)
     assert "realism" not in values
-    assert run(made) == 0
+    assert run(result) == 0
     table = capsys.readouterr().out
     assert "means over 5 clips" in table
     assert all(name in table for name in rows[0])
 
 
-def test_two_folders_are_compared(made, mocap, capsys):
-    values = told(capsys, made, "--reference", mocap)
+def test_two_folders_are_compared(result, mocap, capsys):
+    values = printed(capsys, result, "--reference", mocap)
     assert (values["clips"], values["reference_clips"]) == (5, 4)
     assert values["reference"].keys() == values["measures"].keys()
     assert set(values["realism"]) == set(realism.Realism.__dataclass_fields__)
@@ -73,13 +73,13 @@ def test_two_folders_are_compared(made, mocap, capsys):
 
 
 @pytest.mark.slow
-def test_rigs_do_not_matter(made, tmp_path, capsys):
+def test_rigs_do_not_matter(result, tmp_path, capsys):
     """The same walks on another rig have the same measures, jitter of every joint too."""
     rigmap = retarget.identify_rig(bandai_skeleton())
     for k in range(5):
         clip = walk(95, cadence=0.8 + 0.05 * k, seed=k)
         retarget.from_canonical(clip, rigmap).save(tmp_path / f"{k}.bvh")
-    ours, theirs = told(capsys, made)["measures"], told(capsys, tmp_path)["measures"]
+    ours, theirs = printed(capsys, result)["measures"], printed(capsys, tmp_path)["measures"]
     assert ours == pytest.approx(theirs, rel=1e-2, abs=1e-3)
 
 
@@ -94,7 +94,7 @@ def bad_clips(folder):
 def test_clips_that_cannot_be_measured_are_left_out_and_listed(tmp_path, capsys):
     why = bad_clips(tmp_path)
     walk(40).save(tmp_path / "a.bvh")
-    values = told(capsys, tmp_path)
+    values = printed(capsys, tmp_path)
     assert values["clips"] == 2  # for means 19 frames will do
     assert values["skipped"].keys() == why.keys()
     for path, reason in values["skipped"].items():
@@ -110,7 +110,7 @@ def test_a_clip_too_short_for_a_window_does_not_end_the_comparison(mocap, tmp_pa
     for k in range(5):
         walk(95, cadence=0.8 + 0.05 * k, seed=k).save(tmp_path / f"{k}.bvh")
     bad_clips(tmp_path)
-    values = told(capsys, tmp_path, "--reference", mocap)
+    values = printed(capsys, tmp_path, "--reference", mocap)
     assert (values["clips"], len(values["skipped"])) == (5, 3)
     assert "19 frames at 30 fps; a window needs at least 31" in values["skipped"][str(tmp_path / "short.bvh")]
     assert values["realism"]["generated_windows"] == 5 * 7

@@ -39,21 +39,21 @@ SIZE = 1.3
 
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory):
-    """Somebody tall, on a Z-up rig whose root travels and whose rest pose is an A."""
-    made = make(Make(names_of("mixamo"), size=SIZE, zup=True, arms_down_deg=40, root="Reference"))
+    """A tall performer, on a Z-up rig whose root travels and whose rest pose is an A."""
+    result = make(Make(names_of("mixamo"), size=SIZE, zup=True, arms_down_deg=40, root="Reference"))
     path = tmp_path_factory.mktemp("rig") / "tall.bvh"
-    made.motion(person(SIZE, 45)).save(path)
+    result.motion(person(SIZE, 45)).save(path)
     return path
 
 
 def test_info_tells_a_clips_rig(clip, capsys):
     assert run("info", clip, "--json") == 0
-    told = json.loads(capsys.readouterr().out)
-    assert (told["rig"], told["up"], told["facing"], told["rest_pose"]) == ("mixamo", "z", "-y", "A")
-    assert (told["frames"], told["fps"], told["metres_per_unit"]) == (45, 30, 0.01)
-    assert told["score"] == 1
-    assert told["joints"]["leftUpperLeg"] == "mixamorig:LeftUpLeg"
-    assert "Prop_sword" in told["unmapped"]
+    printed = json.loads(capsys.readouterr().out)
+    assert (printed["rig"], printed["up"], printed["facing"], printed["rest_pose"]) == ("mixamo", "z", "-y", "A")
+    assert (printed["frames"], printed["fps"], printed["metres_per_unit"]) == (45, 30, 0.01)
+    assert printed["score"] == 1
+    assert printed["joints"]["leftUpperLeg"] == "mixamorig:LeftUpLeg"
+    assert "Prop_sword" in printed["unmapped"]
     assert run("info", clip) == 0
     shown = capsys.readouterr().out
     assert all(word in shown for word in ("mixamo", "centimetres", "+z", "1.50", "mixamorig:LeftUpLeg", "Prop_sword"))
@@ -68,14 +68,14 @@ def test_info_tells_a_sure_fit_and_draws_it(clip, tmp_path, capsys):
         colours = {colour for _, colour in picture.convert("RGB").getcolors(1 << 20)}
     assert {(0x4C, 0x78, 0xA8), (0xF5, 0x85, 0x18), (0x33, 0x33, 0x33)} <= colours  # left, right and middle
     assert run("info", clip, "--json") == 0
-    told = json.loads(capsys.readouterr().out)
-    assert (told["fit"], told["doubts"]) == ("sure", [])
-    assert set(told["known_by"].values()) == {"list"}
+    printed = json.loads(capsys.readouterr().out)
+    assert (printed["fit"], printed["doubts"]) == ("sure", [])
+    assert set(printed["known_by"].values()) == {"list"}
 
 
 @pytest.fixture
 def odd(tmp_path):
-    """A rig of which one joint has no name that tells anything."""
+    """A rig of which one joint has no telling name."""
     path = tmp_path / "odd.bvh"
     make(Make(names_of("mixamo") | {"leftHand": "a17"}, arms_down_deg=40)).motion(person(1.0, 20)).save(path)
     return path
@@ -89,9 +89,9 @@ def test_info_prints_every_doubt_and_other_commands_the_first_once(odd, tmp_path
     assert f"fit: doubtful\ndoubtful: {reason}\n{overrule}\n" in capsys.readouterr().out
     assert (tmp_path / "odd.png").stat().st_size > 10_000
     assert run("info", odd, "--json") == 0
-    told = json.loads(capsys.readouterr().out)
-    assert (told["fit"], told["doubts"]) == ("doubtful", [reason])
-    assert told["known_by"]["leftHand"] == "position"
+    printed = json.loads(capsys.readouterr().out)
+    assert (printed["fit"], printed["doubts"]) == ("doubtful", [reason])
+    assert printed["known_by"]["leftHand"] == "position"
     assert run("convert", odd, tmp_path / "a.bvh", "--quiet") == 0
     assert capsys.readouterr().err == ""
     for _ in range(2):
@@ -102,23 +102,23 @@ def test_info_prints_every_doubt_and_other_commands_the_first_once(odd, tmp_path
 def test_info_tells_of_a_refused_clip_what_can_be_told(tmp_path, capsys):
     CASES["a dog with a person's names"].motion.save(tmp_path / "dog.bvh")
     assert run("info", tmp_path / "dog.bvh", "-o", tmp_path / "dog.png") == 2
-    told = capsys.readouterr()
-    assert told.err.count("\n") == 1
-    assert "on four legs" in told.err
-    assert all(word in told.out for word in ("fit: refused", "LeftForeArm", "frames"))
+    printed = capsys.readouterr()
+    assert printed.err.count("\n") == 1
+    assert "on four legs" in printed.err
+    assert all(word in printed.out for word in ("fit: refused", "LeftForeArm", "frames"))
     assert not (tmp_path / "dog.png").exists()
     assert run("info", tmp_path / "dog.bvh", "--json") == 2
-    told = json.loads(capsys.readouterr().out)
-    assert (told["fit"], told["joints"], told["frames"]) == ("refused", {}, 12)
-    assert "on four legs" in told["doubts"][0]
+    printed = json.loads(capsys.readouterr().out)
+    assert (printed["fit"], printed["joints"], printed["frames"]) == ("refused", {}, 12)
+    assert "on four legs" in printed["doubts"][0]
     assert run("convert", tmp_path / "dog.bvh", tmp_path / "a.bvh", "--rig", "canonical") == 2
 
 
 def test_a_rig_that_is_given_wins(clip, tmp_path, capsys):
     (tmp_path / "mine.toml").write_text('unit = "in"\nup = "y"\n[joints]\nhips = "mixamorig:Hips"\n')
     assert run("info", clip, "--json", "--rig", tmp_path / "mine.toml") == 0
-    told = json.loads(capsys.readouterr().out)
-    assert (told["rig"], told["up"], told["metres_per_unit"]) == ("mine", "y", 0.0254)
+    printed = json.loads(capsys.readouterr().out)
+    assert (printed["rig"], printed["up"], printed["metres_per_unit"]) == ("mine", "y", 0.0254)
     assert run("convert", clip, tmp_path / "a.bvh", "--rig", "canonical", "--source-rig", tmp_path / "mine.toml") == 0
     assert set(mapctl.load(tmp_path / "a.bvh").skeleton.names) == set(CANONICAL.names)
     assert run("info", clip, "--rig", clip) == 0
@@ -151,9 +151,9 @@ def test_rigs_by_name_or_file_get_the_canonical_bones(job, told_rig, prior, tmp_
     quiet = () if job == "convert" else ("--quiet",)
     assert run(job, *jobs[job], "--rig", told_rig, *quiet) == 0
     rig = retarget.load_rig(told_rig)
-    made = mapctl.load(tmp_path / ("generated_000.bvh" if job == "generate" else "a.bvh"))
-    assert set(made.skeleton.names) == {*rig.joints.values(), *rig.trunk}
-    canonical, rigmap = retarget.to_canonical(made, rig)
+    result = mapctl.load(tmp_path / ("generated_000.bvh" if job == "generate" else "a.bvh"))
+    assert set(result.skeleton.names) == {*rig.joints.values(), *rig.trunk}
+    canonical, rigmap = retarget.to_canonical(result, rig)
     own = [joint for joint in range(1, CANONICAL.num_joints) if CANONICAL.names[joint] in rig.joints]
     lengths = CANONICAL.offsets.norm(dim=-1)
     lower = [CANONICAL.index(side + "LowerLeg") for side in ("left", "right")]
@@ -191,11 +191,11 @@ def words_of(folder, prior):
 def test_motion_is_written_on_the_clips_rig(job, clip, prior, tmp_path):
     out, words = tmp_path / "a.bvh", words_of(tmp_path, prior)[job]
     assert run(job, *words, "--rig", clip, "--quiet") == 0
-    made = mapctl.load(tmp_path / "generated_000.bvh" if job == "generate" else out)
+    result = mapctl.load(tmp_path / "generated_000.bvh" if job == "generate" else out)
     rig = mapctl.load(clip)
-    assert made.num_frames == 12
-    assert made.skeleton.matches(rig.skeleton, 1e-4)
-    canonical, rigmap = retarget.to_canonical(made)
+    assert result.num_frames == 12
+    assert result.skeleton.matches(rig.skeleton, 1e-4)
+    canonical, rigmap = retarget.to_canonical(result)
     assert rigmap.up == "z"
     assert 0.8 < float(canonical.root_position[:, 1].mean()) / SIZE < 1.0
 
@@ -263,8 +263,12 @@ def test_a_given_unit_is_obeyed_by_every_command(zup_clip, unit, tmp_path, capsy
 
 def test_a_given_up_axis_is_obeyed(zup_clip, capsys):
     assert run("info", zup_clip, "--json", "--up", "-x") == 0
-    told = json.loads(capsys.readouterr().out)
-    assert (told["up"], told["rig"], len(told["joints"])) == ("-x", "mixamo", 21)  # its joints are recognised as before
+    printed = json.loads(capsys.readouterr().out)
+    assert (printed["up"], printed["rig"], len(printed["joints"])) == (
+        "-x",
+        "mixamo",
+        21,
+    )  # its joints are recognised as before
 
 
 def test_the_unit_is_that_of_a_body_too(zup_clip, prior, tmp_path):
@@ -312,10 +316,10 @@ def walked() -> Motion:
 @pytest.fixture(scope="module")
 def rigs(walked, tmp_path_factory):
     """Each rig's files, made when they are asked for."""
-    made: dict[str, Rig] = {}
+    result: dict[str, Rig] = {}
 
     def find(name: str) -> Rig:
-        if name not in made:
+        if name not in result:
             folder = tmp_path_factory.mktemp(name.replace(".", "-"))
             file = clip = folder / name
             if name == "body.usda":
@@ -336,8 +340,8 @@ def rigs(walked, tmp_path_factory):
             body = RiggedCharacter.of(*inputs.read_rig_clip(str(file)))[1]
             if clip != file:
                 body.on_rig(retarget_motion(walked, body).motion).save(clip)
-            made[name] = Rig(file, clip, body)
-        return made[name]
+            result[name] = Rig(file, clip, body)
+        return result[name]
 
     return find
 
@@ -397,13 +401,13 @@ def test_every_command_on_every_rig(name, command, rigs, walked, tmp_path, capsy
     rig = rigs(name)
     out = tmp_path / f"out{rig.clip.suffix}"  # an FBX character comes back as .glb, with its mesh
     assert run(*words_on(command, rig, out, walked)) == 0, capsys.readouterr().err
-    made = mapctl.load(tmp_path / f"generated_000{out.suffix}" if command == "generate" else out)
+    result = mapctl.load(tmp_path / f"generated_000{out.suffix}" if command == "generate" else out)
     expected = rig.body.rigmap.rig_skeleton
-    assert (made.skeleton.names, made.skeleton.parents) == (expected.names, expected.parents)
-    assert made.num_frames >= 89
-    np.testing.assert_allclose(foot_pitches(made), standing_pitches(rig), atol=5.0)
-    toes = retarget.to_canonical(made)[0].joint_positions()[:, _TOES, 1]
+    assert (result.skeleton.names, result.skeleton.parents) == (expected.names, expected.parents)
+    assert result.num_frames >= 89
+    np.testing.assert_allclose(foot_pitches(result), standing_pitches(rig), atol=5.0)
+    toes = retarget.to_canonical(result)[0].joint_positions()[:, _TOES, 1]
     low = torch.quantile(toes, 0.05, dim=0)
     torch.testing.assert_close(low, rig.body.stance.toe_height, atol=0.015, rtol=0)
-    steps = made.joint_positions().diff(dim=0).norm(dim=-1)
-    assert float(steps.max()) * float(made.fps) < 9.0
+    steps = result.joint_positions().diff(dim=0).norm(dim=-1)
+    assert float(steps.max()) * float(result.fps) < 9.0

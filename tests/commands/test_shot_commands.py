@@ -66,9 +66,9 @@ def test_a_scene_goes_on_from_a_clip_on_its_rig_and_keeps_apart(tmp_path):
         "[[obstacles]]\nplace = [8, 8]\nsize = [1, 2]\n"
     )
     assert run("run", tmp_path / "scene.toml", "-o", tmp_path / "out", "--quiet") in (0, 3)
-    made, clip = mapctl.load(tmp_path / "out" / "a-on.bvh"), mapctl.load(tmp_path / "clip.bvh")
-    assert made.skeleton.names == clip.skeleton.names
-    miss = (made.joint_positions()[0] - clip.joint_positions()[60]).norm(dim=-1)
+    result, clip = mapctl.load(tmp_path / "out" / "a-on.bvh"), mapctl.load(tmp_path / "clip.bvh")
+    assert result.skeleton.names == clip.skeleton.names
+    miss = (result.joint_positions()[0] - clip.joint_positions()[60]).norm(dim=-1)
     assert float(miss.max()) < 0.01
     report = json.loads((tmp_path / "out" / "a.json").read_text())
     assert [constraint["constraint"] for constraint in report["actors"]["by"]["constraints"]] == [
@@ -89,9 +89,9 @@ def test_a_shot_holds_a_pose_of_another_rig_and_ends_in_a_clip(tmp_path):
     words = ["--end", f"{tmp_path / 'clip.bvh'}:40", "--keys", tmp_path / "keys.toml"]
     out, report = tmp_path / "a.bvh", tmp_path / "a.json"
     assert run("follow", "line:2.4", "-o", out, "--report", report, *words) == 0
-    made, clip = mapctl.load(out), mapctl.load(tmp_path / "clip.bvh")
-    assert made.skeleton.names == clip.skeleton.names
-    assert float((made.joint_positions()[-1] - clip.joint_positions()[40]).norm(dim=-1).max()) < 0.01
+    result, clip = mapctl.load(out), mapctl.load(tmp_path / "clip.bvh")
+    assert result.skeleton.names == clip.skeleton.names
+    assert float((result.joint_positions()[-1] - clip.joint_positions()[40]).norm(dim=-1).max()) < 0.01
     found = json.loads(report.read_text())
     pose = next(constraint for constraint in found["constraints"] if constraint["constraint"].startswith("pose at"))
     assert pose["holds"]

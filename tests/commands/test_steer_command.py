@@ -36,13 +36,13 @@ def test_a_script_gives_motion_and_report(steer, tmp_path, capsys):
     report = tmp_path / "r.json"
     assert steer(SCRIPT, "--report", report, "--seed", 3) == 0
     assert mapctl.load(tmp_path / "a.bvh").num_frames == 15
-    told = json.loads(report.read_text())
-    assert [row["heading_deg"] for row in told["commands"]] == pytest.approx([0, 40, 40])
-    timing = told["timing"]
+    printed = json.loads(report.read_text())
+    assert [row["heading_deg"] for row in printed["commands"]] == pytest.approx([0, 40, 40])
+    timing = printed["timing"]
     assert timing["late_frames"] == 0
     assert timing["command_latency_s"] <= 0.2
     assert {"frame_ms_p50", "frame_ms_p99", "evaluations_per_frame", "threads"} <= set(timing)
-    assert {"travel", "footing", "noise"} == set(told["ledger"])
+    assert {"travel", "footing", "noise"} == set(printed["ledger"])
     out = capsys.readouterr().out
     assert "1.00 m/s to 40 degrees" in out
     assert str(report) in out
@@ -110,7 +110,7 @@ GOTO = "time_s,speed_mps,heading_deg,goto_x_m,goto_z_m,within_s,goto_facing_deg,
 
 def test_a_place_is_reached_in_time_and_told(steer, tmp_path, capsys):
     stitcher = save_tiny_stitcher(tmp_path / "stitch.safetensors")
-    replace(walk(10), licence="CC BY 4.0 (somebody)").save(tmp_path / "pose.npz")
+    replace(walk(10), licence="CC BY 4.0 (a studio)").save(tmp_path / "pose.npz")
     script = GOTO + "0.2,1.0,40,0.3,0.4,0.7,20,pose.npz:7\n"
     assert steer(script, "--report", tmp_path / "r.json", "--stitcher", stitcher) == 0
     (row,) = json.loads((tmp_path / "r.json").read_text())["arrivals"]
@@ -119,9 +119,9 @@ def test_a_place_is_reached_in_time_and_told(steer, tmp_path, capsys):
     assert row["facing_error_deg"] < 0.1
     assert row["pose_error_cm"] < 0.1
     assert mapctl.load(tmp_path / "a.bvh").num_frames >= 27 + 30
-    told = capsys.readouterr().out
-    assert "0.9 s  at 0.3, 0.4 m: 0.00 cm off, 0.00 degrees off, joints 0.0 cm off the pose" in told
-    assert re.search(r"^licence .*; CC BY 4\.0 \(\S+\.csv\)$", told, re.MULTILINE)
+    printed = capsys.readouterr().out
+    assert "0.9 s  at 0.3, 0.4 m: 0.00 cm off, 0.00 degrees off, joints 0.0 cm off the pose" in printed
+    assert re.search(r"^licence .*; CC BY 4\.0 \(\S+\.csv\)$", printed, re.MULTILINE)
 
 
 @pytest.mark.slow

@@ -32,9 +32,9 @@ def test_one_transition_and_its_report(clip):
     assert report["fallback"] == []
     assert report["sides_apart_cm"] > 0
     assert report["gap_notes"] == ["frames 1:20, 21:39: stitcher"]
-    made, given = (formats.load(name) for name in ("one.bvh", clip))
-    torch.testing.assert_close(made.root_position[[0, 20, 39]], given.root_position[[0, 20, 39]], atol=1e-6, rtol=0)
-    assert float((made.root_position - given.root_position)[1:20].norm(dim=-1).max()) > 1e-4
+    result, given = (formats.load(name) for name in ("one.bvh", clip))
+    torch.testing.assert_close(result.root_position[[0, 20, 39]], given.root_position[[0, 20, 39]], atol=1e-6, rtol=0)
+    assert float((result.root_position - given.root_position)[1:20].norm(dim=-1).max()) > 1e-4
 
 
 @pytest.mark.slow
@@ -60,17 +60,17 @@ def test_infill_and_chain_stitch(clip):
 def test_a_gap_that_is_too_long_is_anothers_and_the_note_says_so(clip, capsys):
     words = ("tween", clip, "-o", "one.bvh", "--keyframes", "0,30", *STITCH)
     assert run(*(word for word in words if word != "--quiet")) == 0
-    told = capsys.readouterr().out
-    assert "frames 1:30: transformer" in told
-    assert "longer than the 23 frames that the stitcher fills" in told
+    printed = capsys.readouterr().out
+    assert "frames 1:30: transformer" in printed
+    assert "longer than the 23 frames that the stitcher fills" in printed
 
 
 @pytest.mark.slow
 def test_auto_stitches_where_a_hand_is_told(clip, capsys):
     words = ("tween", clip, "-o", "one.bvh", "--no-refine", "--stitcher", "own.safetensors", "--joints", "leftHand")
     assert run(*words, "--keyframes", "0,10,20") == 0
-    assert "frames 1:20: stitcher, led by what is told in it" in capsys.readouterr().out
+    assert "frames 1:20: stitcher, led by the constraints in it" in capsys.readouterr().out
     assert run(*words, "--keyframes", "0,10,30") == 0
-    told = capsys.readouterr().out
-    assert "frames 1:30: transformer" in told
-    assert "longer than the 23 frames that the stitcher fills" in told
+    printed = capsys.readouterr().out
+    assert "frames 1:30: transformer" in printed
+    assert "longer than the 23 frames that the stitcher fills" in printed

@@ -54,15 +54,15 @@ def test_a_tweener_meets_keys_in_a_style_of_another_rig_s_clip(source, tmp_path)
     predictor = save_tiny_path(tmp_path / "path.safetensors")
     trained = save_tiny_tweener(tmp_path / "tweener.safetensors", str(predictor))
     on_rig("daz", 60).save(tmp_path / "style.bvh")
-    made = []
+    result = []
     for name, words in (("plain", []), ("styled", ["--dna", tmp_path / "style.bvh"])):
         out = tmp_path / f"{name}.bvh"
         models = ["--inbetweener", trained, "--path", predictor]
         given = [source, "-o", out, "--keyframes", "0,44", "--method", "tweener", "--no-refine", "--quiet"]
         assert run("tween", *given, *models, *words) == 0
         assert away_cm(source, out, (0, 44)) < 1e-4
-        made.append(out.read_bytes())
-    assert made[0] != made[1]
+        result.append(out.read_bytes())
+    assert result[0] != result[1]
 
 
 @pytest.mark.slow
@@ -73,14 +73,14 @@ def test_frames_keys_and_notes_are_told(tween, source, tmp_path, capsys):
     motion.save(tmp_path / "leaping.bvh")
     words = ["--keyframes", "0,20,21,44", *words_of("infiller")]
     assert tween(tmp_path / "leaping.bvh", "-o", tmp_path / "out.bvh", *words) == 0
-    told = capsys.readouterr()
-    first, note, gaps, licence = told.out.splitlines()
+    printed = capsys.readouterr()
+    first, note, gaps, licence = printed.out.splitlines()
     assert first.startswith(f"{tmp_path / 'out.bvh'}: 45 frames through 4 keys; ")
     assert note.startswith("the hips need ")
     assert note.endswith(" m/s between frames 20 and 21, faster than anyone runs")
     assert gaps == "frames 1:20, 22:44: infiller"
     assert licence.startswith("licence   none, it is made up (")
-    assert told.err == ""
+    assert printed.err == ""
     assert tween(tmp_path / "leaping.bvh", "-o", tmp_path / "out.bvh", *words, "--strict", "--quiet") == 3
 
 
@@ -92,11 +92,16 @@ def test_a_report_tells_every_key_and_how_far_it_is_missed(tween, source, tmp_pa
     report = tmp_path / "r.json"
     words = [*words, "--keyframes", "0,16,33,44", *words_of("infiller"), "--report", report, "--quiet"]
     assert tween(source, "-o", tmp_path / "out.bvh", *words) == 0
-    told = json.loads(report.read_text())
-    assert [(row["frame"], row["what"]) for row in told["keys"]] == [(0, "pose"), (16, what), (33, what), (44, "pose")]
-    assert all(row["missed_cm"] < 0.1 for row in told["keys"])
-    assert all(row.get("missed_deg", 0) < 1e-4 for row in told["keys"])
-    assert told["request"]["command"] == "tween"
-    assert (told["request"]["keyframes"], told["request"]["method"]) == ("0,16,33,44", "infiller")
-    assert {"mapctl", "versions", "motion", "gaps", "ledger", "seconds", "frame_ms", "status"} <= set(told)
-    assert "skate_cm_s" in told["measures"]
+    printed = json.loads(report.read_text())
+    assert [(row["frame"], row["what"]) for row in printed["keys"]] == [
+        (0, "pose"),
+        (16, what),
+        (33, what),
+        (44, "pose"),
+    ]
+    assert all(row["missed_cm"] < 0.1 for row in printed["keys"])
+    assert all(row.get("missed_deg", 0) < 1e-4 for row in printed["keys"])
+    assert printed["request"]["command"] == "tween"
+    assert (printed["request"]["keyframes"], printed["request"]["method"]) == ("0,16,33,44", "infiller")
+    assert {"mapctl", "versions", "motion", "gaps", "ledger", "seconds", "frame_ms", "status"} <= set(printed)
+    assert "skate_cm_s" in printed["measures"]

@@ -67,23 +67,23 @@ def test_keys_of_every_kind_are_met_in_the_file(tween, folder, capsys):
     words = [folder / "keys" / "keys.toml", "-o", "out.bvh", "--report", "r.json"]
     assert tween(*words) == 0
     assert capsys.readouterr().out.startswith("out.bvh: 41 frames through 4 keys; ")
-    made = mapctl.load("out.bvh")
-    assert (made.num_frames, float(made.fps)) == (41, 30)
-    assert made.skeleton.names == mapctl.load(folder / "keys" / "walk.bvh").skeleton.names
-    assert made.root_position.isfinite().all()
-    told = json.loads(Path("r.json").read_text())
-    assert [(row["frame"], row["what"]) for row in told["keys"]] == [
+    result = mapctl.load("out.bvh")
+    assert (result.num_frames, float(result.fps)) == (41, 30)
+    assert result.skeleton.names == mapctl.load(folder / "keys" / "walk.bvh").skeleton.names
+    assert result.root_position.isfinite().all()
+    printed = json.loads(Path("r.json").read_text())
+    assert [(row["frame"], row["what"]) for row in printed["keys"]] == [
         (0, "pose"),
         (15, "limbs"),
         (22, "root"),
         (40, "pose"),
     ]
-    assert all(row["missed_cm"] < 0.1 for row in told["keys"])
-    canonical = retarget.to_canonical(made)[0]
+    assert all(row["missed_cm"] < 0.1 for row in printed["keys"])
+    canonical = retarget.to_canonical(result)[0]
     hand = canonical.joint_positions()[15, canonical.skeleton.index("leftHand")]
     assert hand.tolist() == pytest.approx([0.4, 1.2, 0.8], abs=2e-3)
     assert canonical.root_position[40, ::2].tolist() == pytest.approx([0.3, 1.5], abs=1e-4)
-    assert "key_timing" not in told
+    assert "key_timing" not in printed
 
 
 def test_timing_is_suggested_and_the_given_one_made(folder, capsys):
@@ -94,14 +94,15 @@ def test_timing_is_suggested_and_the_given_one_made(folder, capsys):
     (row,) = json.loads(Path("r.json").read_text())["key_timing"]
     assert (row["start"], row["stop"], row["given"]) == (0, 40, 40)
     assert row["usual"][0] <= row["suggested"] <= row["usual"][1]
-    told = capsys.readouterr().out
-    assert re.search(rf"\b0 +40 +40 +{row['suggested']} +\w+", told)
-    assert "m/s" in told
+    printed = capsys.readouterr().out
+    assert re.search(rf"\b0 +40 +40 +{row['suggested']} +\w+", printed)
+    assert "m/s" in printed
 
 
 @pytest.mark.parametrize("method", ["slerp", *(pytest.param(m, marks=pytest.mark.slow) for m in ("auto", "bundled"))])
 def test_the_example_runs_on_a_clip_of_its_name(models, tiny, folder, method):
-    """The clip that it names is made by the command that it tells; of the bundled densities the default ones roll."""
+    """The clip that it names is written by the command that it names; of the bundled densities the default ones
+    roll."""
     text = (DOCS / "keys.toml").read_text()
     (named,) = set(re.findall(r'"([\w/]+\.bvh)"', text))
     clip = folder / "keys" / named
@@ -111,8 +112,8 @@ def test_the_example_runs_on_a_clip_of_its_name(models, tiny, folder, method):
     words = (folder / "keys" / "example.toml", "-o", "out.bvh", "--report", "r.json", "--quiet")
     more = ["--inbetweener", tiny] if method == "bundled" else ["--method", method, *models[method]]
     assert run("tween", *words, *more) == 0
-    told = json.loads(Path("r.json").read_text())
-    assert {row["what"] for row in told["keys"]} == {"pose", "limbs", "root"}
+    printed = json.loads(Path("r.json").read_text())
+    assert {row["what"] for row in printed["keys"]} == {"pose", "limbs", "root"}
 
 
 PARTS = """
@@ -135,7 +136,7 @@ DRAWING = "joint,x,y\nHips,3,98\nHead,4,160\nHand_L,30,130\nrightHand,0,80\nFoot
 
 @pytest.mark.parametrize("method", ["tweener", pytest.param("auto", marks=pytest.mark.slow)])
 def test_keys_that_are_not_whole_are_met_in_the_file(models, folder, method):
-    """The first of them tells but a place."""
+    """The first of them has but a position."""
     (folder / "keys" / "keys.toml").write_text(PARTS)
     (folder / "keys" / "pose.csv").write_text(DRAWING)
     more = ["--method", "tweener", "--no-refine"] if method == "tweener" else models["auto"]
@@ -146,8 +147,8 @@ def test_keys_that_are_not_whole_are_met_in_the_file(models, folder, method):
     assert first["missed_cm"] < 0.1
     assert half["missed_cm"] < 0.1
     assert drawn["drawn_cm"] < 3
-    made, walked = mapctl.load("out.bvh"), mapctl.load(folder / "keys" / "walk.bvh")
-    canonical = [retarget.to_canonical(each)[0] for each in (made, walked)]
+    result, walked = mapctl.load("out.bvh"), mapctl.load(folder / "keys" / "walk.bvh")
+    canonical = [retarget.to_canonical(each)[0] for each in (result, walked)]
     assert canonical[0].root_position[0, ::2].tolist() == pytest.approx([0, 0], abs=1e-4)
     legs = [number for number, name in enumerate(canonical[0].skeleton.names) if "Leg" in name]
     turns = [each.local_quat_xyzw[40, legs] for each in canonical]

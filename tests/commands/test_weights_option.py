@@ -80,9 +80,9 @@ def test_weights_that_do_not_exist_are_refused_in_one_line(both, fails, monkeypa
     words = ("follow", "line:1", "-o", "out.bvh")
     assert "must be free or full, got 'libre'" in fails(*words, "--weights", "libre")
     (both / "scene.toml").write_text(f'weights = "libre"\n{SCENE}')
-    told = fails("run", "scene.toml")
-    assert "scene.toml" in told
-    assert "weights" in told
+    printed = fails("run", "scene.toml")
+    assert "scene.toml" in printed
+    assert "weights" in printed
     (both / "keys.toml").write_text(f'weights = "libre"\n{KEYS}')
     assert "weights" in fails("tween", "keys.toml", "-o", "out.bvh")
     (both / "shot.toml").write_text('weights = "libre"\n[[key]]\nseconds = 0.5\nlook_at = [0.0, 1.5, 3.0]\n')
@@ -94,8 +94,8 @@ def test_weights_that_do_not_exist_are_refused_in_one_line(both, fails, monkeypa
 def test_the_strictest_of_all_models_is_the_licence(both, capsys):
     assert run("denoise", "in.bvh", "-o", "out.glb", "--denoiser", "free/denoiser", "--report", "out.json") == 0
     assert f"licence   {NOT_FREE} (transformer); {FREE} (free/denoiser)" in capsys.readouterr().out
-    told = licence_of(both / "out.json")
-    assert told == {"strictest": NOT_FREE, "models": {"free/denoiser": FREE, "transformer": NOT_FREE}}
+    printed = licence_of(both / "out.json")
+    assert printed == {"strictest": NOT_FREE, "models": {"free/denoiser": FREE, "transformer": NOT_FREE}}
 
 
 @pytest.mark.parametrize("ending", ["npz", "glb"])
@@ -113,14 +113,14 @@ def test_a_motion_keeps_its_licence_from_file_to_file(both, capsys, ending):
 
 def test_info_lists_both_sets(both, capsys):
     assert run("info", "--json", "--weights", "free") == 0
-    told = json.loads(capsys.readouterr().out)
-    names = [row["name"] for row in told["priors"]]
+    printed = json.loads(capsys.readouterr().out)
+    names = [row["name"] for row in printed["priors"]]
     assert "locomotion" in names
     assert "free/locomotion" in names
-    assert told["weights"]["in_force"] == "free"
-    assert told["weights"]["free"]["licence"] == FREE
-    assert told["weights"]["full"]["licence"] == NOT_FREE
-    assert told["weights"]["free"]["models"] == [name for name in names if name.startswith("free/")]
+    assert printed["weights"]["in_force"] == "free"
+    assert printed["weights"]["free"]["licence"] == FREE
+    assert printed["weights"]["full"]["licence"] == NOT_FREE
+    assert printed["weights"]["free"]["models"] == [name for name in names if name.startswith("free/")]
     assert run("info") == 0
     table = capsys.readouterr().out
     assert "free/locomotion" in table

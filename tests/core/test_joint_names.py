@@ -49,7 +49,7 @@ def test_own_names_as_written_come_first():
         find_joint("HAND", names)
 
 
-# hips, left and right upper leg, left and right toe; the order in a file varies and tells nothing.
+# hips, left and right upper leg, left and right toe; the order in a file varies and is no evidence.
 RIGS = {
     "canonical": "hips leftUpperLeg rightUpperLeg leftToes rightToes",
     "bandai": "Hips UpperLeg_L UpperLeg_R Toes_L Toes_R",

@@ -36,26 +36,26 @@ def solution() -> Solution:
 
 
 def test_everything_is_in_it(solution):
-    made = report.build_report(
+    result = report.build_report(
         solution,
         request={"curve": "line:4"},
         seed=3,
         measures={"sway_cm": math.nan},
         prior={"name": "tiny", "licence": "none", "quality": {"mocap": {"sway_cm": {"mean": 1.9}}}},
     )
-    made = json.loads(report.to_json(made))
-    assert made["request"] == {"curve": "line:4"}
-    assert made["seed"] == 3
-    assert made["prior"] == {"name": "tiny", "licence": "none"}
-    assert made["status"]["notes"] == ["too fast"]
-    assert made["status"]["ok"] is False
-    assert "too fast" in made["status"]["text"]
-    assert made["motion"] == {"frames": FRAMES, "fps": 30.0, "seconds": 3.0}
-    assert made["ledger"]["path"]["energy_nats"] == FRAMES
-    assert made["ledger"]["path"]["residual_max"] == 1
-    assert made["measures"] == {"sway_cm": None}
-    assert made["mocap"] == {"sway_cm": {"mean": 1.9}}
-    assert {"mapctl", "python", "torch", "numpy", "platform"} <= made["versions"].keys()
+    result = json.loads(report.to_json(result))
+    assert result["request"] == {"curve": "line:4"}
+    assert result["seed"] == 3
+    assert result["prior"] == {"name": "tiny", "licence": "none"}
+    assert result["status"]["notes"] == ["too fast"]
+    assert result["status"]["ok"] is False
+    assert "too fast" in result["status"]["text"]
+    assert result["motion"] == {"frames": FRAMES, "fps": 30.0, "seconds": 3.0}
+    assert result["ledger"]["path"]["energy_nats"] == FRAMES
+    assert result["ledger"]["path"]["residual_max"] == 1
+    assert result["measures"] == {"sway_cm": None}
+    assert result["mocap"] == {"sway_cm": {"mean": 1.9}}
+    assert {"mapctl", "python", "torch", "numpy", "platform"} <= result["versions"].keys()
 
 
 def test_timing_is_for_each_delivered_frame(solution):

@@ -32,7 +32,7 @@ CURVES = {
 LAPS = {"circle": 2.4, "figure8": 2.4}
 
 
-def made(curve, *, laps=1.0, sway=0.03, speed=1.3, fps=FPS, seed=0):
+def result(curve, *, laps=1.0, sway=0.03, speed=1.3, fps=FPS, seed=0):
     """Arcs that go on evenly, and places beside them: hips that sway."""
     length = laps * curve.length
     arcs = torch.linspace(0, length, round(length / speed * fps), dtype=torch.float64)
@@ -45,7 +45,7 @@ def made(curve, *, laps=1.0, sway=0.03, speed=1.3, fps=FPS, seed=0):
 @pytest.mark.parametrize("fps", [30, 120])
 def test_arcs_are_those_that_the_walk_was_made_from(name, fps):
     curve = CURVES[name]
-    arcs, _, positions = made(curve, laps=LAPS.get(name, 1.0), fps=fps)
+    arcs, _, positions = result(curve, laps=LAPS.get(name, 1.0), fps=fps)
     found = track_arcs(curve, positions)
     assert float((found - arcs).abs().max()) < 0.12  # near a tip the other leg is as near
     assert float((found - arcs).abs().median()) < 0.005
@@ -55,7 +55,7 @@ def test_arcs_are_those_that_the_walk_was_made_from(name, fps):
 @pytest.mark.parametrize("name", CURVES)
 def test_progress_and_path_error_are_the_walks_own(name):
     curve = CURVES[name]
-    arcs, offset, positions = made(curve, laps=LAPS.get(name, 1.0))
+    arcs, offset, positions = result(curve, laps=LAPS.get(name, 1.0))
     got = measure(walk_through(positions, fps=FPS), curve, speed=1.3)
     assert got["travelled_m"] == pytest.approx(float(arcs[-1]), rel=0.02)
     assert got["progress_ratio"] == pytest.approx(1, abs=0.03)

@@ -107,13 +107,13 @@ def stand(frames: int):
 def test_a_walk_has_one_stride(fps, cadence):
     motion = walk(4 * fps, cadence=cadence, fps=fps)
     cycle = editing.find_cycle(motion)
-    told = editing.describe_cycle(motion, cycle)
+    given = editing.describe_cycle(motion, cycle)
     assert cycle.is_gait
-    assert told["seconds"] == pytest.approx(1 / cadence, abs=0.6 / fps + 1e-9)
-    assert told["steps_per_minute"] == pytest.approx(120 * cadence, rel=0.04)
+    assert given["seconds"] == pytest.approx(1 / cadence, abs=0.6 / fps + 1e-9)
+    assert given["steps_per_minute"] == pytest.approx(120 * cadence, rel=0.04)
     travelled = motion.root_position[cycle.stop] - motion.root_position[cycle.start]
-    assert told["stride_m"] == pytest.approx(float(travelled[2]), abs=0.01)
-    assert told["mismatch_cm"] < 3
+    assert given["stride_m"] == pytest.approx(float(travelled[2]), abs=0.01)
+    assert given["mismatch_cm"] < 3
 
 
 def test_a_body_on_the_spot_has_a_cycle_that_is_no_gait():

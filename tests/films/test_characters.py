@@ -49,7 +49,7 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def made(folder):
+def result(folder):
     return {
         name: make_character_glb(folder / f"{name}.{'vrm' if name == 'vrm' else 'glb'}", animations=("walk",), **make)
         for name, make in MAKES.items()
@@ -57,8 +57,8 @@ def made(folder):
 
 
 @pytest.fixture(scope="module")
-def hero(made):
-    return DrawnCharacter.load(made["mixamo"].path)
+def hero(result):
+    return DrawnCharacter.load(result["mixamo"].path)
 
 
 def vertices_of(body, frame: int) -> np.ndarray:
@@ -67,8 +67,8 @@ def vertices_of(body, frame: int) -> np.ndarray:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", MAKES)
-def test_a_character_in_its_own_motion_is_where_its_file_has_it(made, name):
-    path, viewer = made[name].path, GlbViewer(made[name].path)
+def test_a_character_in_its_own_motion_is_where_its_file_has_it(result, name):
+    path, viewer = result[name].path, GlbViewer(result[name].path)
     motion = formats.load(path)
     drawn = DrawnCharacter.load(path).put_on(motion)
     assert drawn.notes == ()
@@ -81,8 +81,8 @@ def test_a_character_in_its_own_motion_is_where_its_file_has_it(made, name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", MAKES)
-def test_any_motion_is_put_on_it_as_convert_does(made, name, tmp_path):
-    path, clip = made[name].path, long_walk(45)
+def test_any_motion_is_put_on_it_as_convert_does(result, name, tmp_path):
+    path, clip = result[name].path, long_walk(45)
     drawn = DrawnCharacter.load(path).put_on(clip)
     written = tmp_path / f"walk{path.suffix}"
     drawn.placed.motion.save(written)
@@ -97,9 +97,9 @@ def test_any_motion_is_put_on_it_as_convert_does(made, name, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", MAKES)
-def test_its_soles_are_on_the_floor_while_feet_are_planted(made, name):
+def test_its_soles_are_on_the_floor_while_feet_are_planted(result, name):
     clip = long_walk(90)
-    body = DrawnCharacter.load(made[name].path).put_on(clip).build_body(clip.fps, GREY)
+    body = DrawnCharacter.load(result[name].path).put_on(clip).build_body(clip.fps, GREY)
     lowest = np.array([vertices_of(body, frame)[:, 1].min() for frame in range(90)])
     assert lowest.min() > -0.03
     planted = detect_contacts(clip.joint_positions()[:, TOE_JOINTS], 30).any(dim=1).numpy()
@@ -128,9 +128,9 @@ def test_what_is_no_character_is_refused(tmp_path):
 
 @pytest.mark.slow
 def test_all_of_a_character_is_in_view(folder):
-    made = make_character_glb(folder / "hat.glb", hat=True)
+    result = make_character_glb(folder / "hat.glb", hat=True)
     motion = walk(12)
-    drawn = DrawnCharacter.load(made.path).put_on(motion)
+    drawn = DrawnCharacter.load(result.path).put_on(motion)
     stage = Stage([Shot(motion, drawn=drawn)])
     body = stage.players[0].body
     top = vertices_of(body, 6)[:, 1].max()

@@ -1,4 +1,4 @@
-"""Films: every frame arrives at its time, left and right can be told, and nothing is left half done."""
+"""Films: every frame arrives at its time, left and right differ, and nothing is left half done."""
 
 import logging
 from fractions import Fraction

@@ -1,4 +1,4 @@
-"""ASF and AMC in: bones where the definition puts them; files found, units and rates told, faults named by line."""
+"""ASF and AMC in: bones where the definition puts them; files found, units and rates read, faults named by line."""
 
 from dataclasses import replace
 from fractions import Fraction
@@ -14,16 +14,16 @@ from mapctl.errors import FileFormatError, RequestError
 @pytest.mark.parametrize(("seed", "degrees", "missing"), [(0, True, 0.0), (1, False, 0.4), (2, True, 0.4)])
 def test_bones_are_where_the_definition_puts_them(tmp_path, seed, degrees, missing):
     turned = {"orientation": np.array([20.0, -30, 40]), "position": np.array([1.0, 2, 3])} if seed % 2 else {}
-    told = pair(seed=seed, degrees=degrees, missing=missing, **turned)
-    assert_same_places(mapctl.load(told.write(tmp_path)), told)
+    given = pair(seed=seed, degrees=degrees, missing=missing, **turned)
+    assert_same_places(mapctl.load(given.write(tmp_path)), given)
 
 
 def test_bones_that_a_take_never_names_rest(tmp_path):
-    told = pair(3, seed=5)
-    frames = tuple({name: v for name, v in frame.items() if name != "head"} for frame in told.frames)
-    told = replace(told, frames=frames)
-    assert told.full
-    assert_same_places(mapctl.load(told.write(tmp_path)), told)
+    given = pair(3, seed=5)
+    frames = tuple({name: v for name, v in frame.items() if name != "head"} for frame in given.frames)
+    given = replace(given, frames=frames)
+    assert given.full
+    assert_same_places(mapctl.load(given.write(tmp_path)), given)
 
 
 def test_the_rate_is_120_unless_the_file_or_the_caller_says(tmp_path):
@@ -44,22 +44,22 @@ def test_the_rate_is_120_unless_the_file_or_the_caller_says(tmp_path):
 @pytest.mark.parametrize(("length", "scale"), [(0.45, 1.0), (1.0, 1.0), (2.54, 0.45 / 2.54)])
 def test_lengths_are_told_by_the_file_or_else_by_the_body(tmp_path, length, scale):
     """`length 1` says nothing: the leg is of a person in the CMU unit, so that it is."""
-    told = pair(1)
-    usual = mapctl.load(told.write(tmp_path)).skeleton.offsets
-    other = mapctl.load(replace(told, length=length).write(tmp_path)).skeleton.offsets
+    given = pair(1)
+    usual = mapctl.load(given.write(tmp_path)).skeleton.offsets
+    other = mapctl.load(replace(given, length=length).write(tmp_path)).skeleton.offsets
     np.testing.assert_allclose(other, usual * scale, rtol=1e-4)
 
 
 def test_angles_are_in_the_unit_of_the_take_else_of_the_skeleton(tmp_path):
-    told = pair(2, degrees=False)
-    path = told.write(tmp_path)
+    given = pair(2, degrees=False)
+    path = given.write(tmp_path)
     path.write_text(path.read_text().replace(":RADIANS\n", ""))
-    assert_same_places(mapctl.load(path), told)
+    assert_same_places(mapctl.load(path), given)
 
 
 def test_files_are_read_whatever_their_blanks_case_and_line_ends(tmp_path):
-    told = pair(2)
-    path = told.write(tmp_path)
+    given = pair(2)
+    path = given.write(tmp_path)
     plain = mapctl.load(path).joint_positions()
     for file in (path, path.with_suffix(".asf")):
         text = file.read_text().replace("begin", "BEGIN").replace("direction ", "direction\t").replace(":root", ":ROOT")

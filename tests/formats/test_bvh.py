@@ -298,9 +298,9 @@ def test_two_joints_of_one_name_are_read_the_second_by_a_name_of_its_own(tmp_pat
     path.write_text(PLAIN.replace("JOINT leftFoot", "JOINT hips"))
     motion = formats.load(path)
     assert motion.skeleton.names == ("hips", "leftUpperLeg", "hips_2")
-    told = capsys.readouterr().err
-    assert told.count("\n") == 1
-    assert "twice.bvh: names must be unique, so it reads the joint 'hips' of line 10 as 'hips_2'" in told
+    given = capsys.readouterr().err
+    assert given.count("\n") == 1
+    assert "twice.bvh: names must be unique, so it reads the joint 'hips' of line 10 as 'hips_2'" in given
     plain = tmp_path / "plain.bvh"
     plain.write_text(PLAIN)
     assert torch.equal(motion.joint_positions(), formats.load(plain).joint_positions())

@@ -16,7 +16,7 @@ NAMES = ("a", "b", "c", "d", "e")
 
 
 def random_matrices(random: np.random.Generator, *shape: int, scale: bool = True) -> np.ndarray:
-    """Turned, moved and (unless told otherwise) scaled."""
+    """Turned, moved and (by default) scaled."""
     turns = Rotation.random(int(np.prod(shape)), rng=random).as_matrix().reshape(*shape, 3, 3)
     matrices = np.zeros((*shape, 4, 4))
     matrices[..., :3, :3] = turns * (random.uniform(0.5, 2.0, (*shape, 1, 1)) if scale else 1.0)
@@ -96,7 +96,7 @@ def test_a_last_joint_may_mirror(mirror):
     rest[4], moved[:, 4] = rest[4] @ scaled, moved[:, 4] @ scaled
     found = RestFrames.of(NAMES, PARENTS, rest, frames.outer)
     np.testing.assert_allclose(found.matrices(), rest, atol=1e-12)
-    told, wanted = (f.to_motion(w, Fraction(30), f.skeleton({}), None) for f, w in ((found, moved), (frames, worlds)))
-    np.testing.assert_allclose(told.joint_positions(), wanted.joint_positions(), atol=1e-12)
-    same = (told.joint_rotations() * wanted.joint_rotations()).sum(-1).abs()
+    given, wanted = (f.to_motion(w, Fraction(30), f.skeleton({}), None) for f, w in ((found, moved), (frames, worlds)))
+    np.testing.assert_allclose(given.joint_positions(), wanted.joint_positions(), atol=1e-12)
+    same = (given.joint_rotations() * wanted.joint_rotations()).sum(-1).abs()
     np.testing.assert_allclose(same, 1.0, atol=1e-12)

@@ -38,20 +38,20 @@ def in_order(motion):
 
 
 def test_a_clip_is_where_fbx_has_it(kind, tmp_path):
-    made = make_fbx(tmp_path / "a.fbx", **KINDS[kind])
+    result = make_fbx(tmp_path / "a.fbx", **KINDS[kind])
     motion = formats.load(tmp_path / "a.fbx")
     assert (motion.fps, motion.num_frames) == (KINDS[kind].get("rate", 30), 6)
     assert motion.source.animation == "Take 001"
-    np.testing.assert_allclose(in_order(motion), made.positions, **NEAR)
+    np.testing.assert_allclose(in_order(motion), result.positions, **NEAR)
     assert not motion.moving_offsets
 
 
 def test_the_rest_pose_is_that_of_the_skin(kind, tmp_path):
-    made = make_fbx(tmp_path / "a.fbx", **KINDS[kind])
-    np.testing.assert_allclose(in_order(formats.load_rest(tmp_path / "a.fbx"))[0], made.bound, **NEAR)
+    result = make_fbx(tmp_path / "a.fbx", **KINDS[kind])
+    np.testing.assert_allclose(in_order(formats.load_rest(tmp_path / "a.fbx"))[0], result.bound, **NEAR)
     if KINDS[kind].get("skin", True):
         mesh = formats.load_mesh(tmp_path / "a.fbx")
-        np.testing.assert_allclose(mesh.vertices, made.vertices, **NEAR)
+        np.testing.assert_allclose(mesh.vertices, result.vertices, **NEAR)
         np.testing.assert_allclose(mesh.weights.sum(axis=1), 1.0)
     else:
         with pytest.raises(FileFormatError, match="'Armature' carries no triangles"):
@@ -91,7 +91,7 @@ def test_without_takes_it_is_the_rest_pose(tmp_path):
 def test_indices_of_a_mesh_that_point_at_nothing_are_one_warning(tmp_path, capsys):
     """As 3ds Max writes them: -1 for corners without a texture coordinate."""
     path = tmp_path / "a.fbx"
-    made = make_fbx(path)
+    result = make_fbx(path)
     layer = """
         LayerElementUV: 0 {
             MappingInformationType: "ByPolygonVertex"
@@ -112,18 +112,18 @@ def test_indices_of_a_mesh_that_point_at_nothing_are_one_warning(tmp_path, capsy
     count = int(found[1])
     layer = layer.replace("COUNT", str(count)).replace("INDICES", ",".join(["-1", *["0"] * (count - 1)]))
     path.write_text(path.read_text().replace(found[0], f"{found[0].rstrip()}{layer}\n"))
-    np.testing.assert_allclose(in_order(formats.load(path)), made.positions, **NEAR)
+    np.testing.assert_allclose(in_order(formats.load(path)), result.positions, **NEAR)
     err = capsys.readouterr().err
     assert err.count("\n") == 1
     assert f"{path}: 1 of its meshes' indices point at nothing" in err
-    np.testing.assert_allclose(formats.load_mesh(path).vertices, made.vertices, **NEAR)
+    np.testing.assert_allclose(formats.load_mesh(path).vertices, result.vertices, **NEAR)
 
 
 def test_motion_is_read_where_a_mesh_is_broken(tmp_path, capsys):
     path = tmp_path / "a.fbx"
-    made = make_fbx(path)
+    result = make_fbx(path)
     path.write_text(re.sub(r"(Vertices: \*\d+ \{\s*a: )[^,]*,", r"\1", path.read_text(), count=1))
-    np.testing.assert_allclose(in_order(formats.load(path)), made.positions, **NEAR)
+    np.testing.assert_allclose(in_order(formats.load(path)), result.positions, **NEAR)
     assert capsys.readouterr().err == f"mapctl: {path}: its meshes are broken; its joints and motion are read\n"
     with pytest.raises(FileFormatError, match="is no sound FBX file"):
         formats.load_mesh(path)
@@ -154,10 +154,10 @@ def test_bad_files_are_refused_in_one_line(fault, tmp_path, capfd):
     pattern, instead, words = BAD[fault]
     path.write_text(re.sub(pattern, instead, path.read_text(), count=1, flags=re.DOTALL))
     assert cli.main(["convert", str(path), str(tmp_path / "out.bvh")]) == 2
-    told = capfd.readouterr()
-    assert told.err.count("\n") == 1, told.err
-    assert words in told.err
-    assert not told.out
+    given = capfd.readouterr()
+    assert given.err.count("\n") == 1, given.err
+    assert words in given.err
+    assert not given.out
     assert not (tmp_path / "out.bvh").exists()
 
 

@@ -46,10 +46,10 @@ def make(folder, kind, **more):
     return make_character_glb(folder / f"hero{ending}", **(KINDS[kind] | more))
 
 
-def walk_of(made):
+def walk_of(result):
     """The animation's joints and skinned vertices over its frames, by the viewer."""
-    viewer = GlbViewer(made.path)
-    number = viewer.animation(made.animations[0])
+    viewer = GlbViewer(result.path)
+    number = viewer.animation(result.animations[0])
     return viewer, number
 
 
@@ -84,20 +84,20 @@ def edit_glb(path: Path, change: Callable[[Any], object]) -> None:
 
 
 def test_the_rest_pose_is_the_bound_one(kind, tmp_path):
-    made = make(tmp_path, kind)
-    rest = formats.load_rest(made.path)
-    at = [rest.skeleton.index(name) for name in made.names if name in rest.skeleton.names]
-    told = [k for k, name in enumerate(made.names) if name in rest.skeleton.names]
-    assert len(told) >= 22
-    np.testing.assert_allclose(rest.joint_positions()[0, at].numpy(), made.positions[told], **POSITIONS)
+    result = make(tmp_path, kind)
+    rest = formats.load_rest(result.path)
+    at = [rest.skeleton.index(name) for name in result.names if name in rest.skeleton.names]
+    given = [k for k, name in enumerate(result.names) if name in rest.skeleton.names]
+    assert len(given) >= 22
+    np.testing.assert_allclose(rest.joint_positions()[0, at].numpy(), result.positions[given], **POSITIONS)
     assert float(rest.local_quat_xyzw[..., 3].abs().min()) == pytest.approx(1.0)
 
 
 def test_joints_are_recognised(kind, tmp_path):
-    made = make(tmp_path, kind)
-    rest = formats.load_rest(made.path)
+    result = make(tmp_path, kind)
+    rest = formats.load_rest(result.path)
     canonical, rigmap = retarget.to_canonical(rest)
-    wanted = {joint: name for joint, name in made.joint.items() if joint in CANONICAL.names}
+    wanted = {joint: name for joint, name in result.joint.items() if joint in CANONICAL.names}
     assert rigmap.joint_names == wanted
     assert rigmap.up == "y"
     assert rigmap.facing == ("-z" if kind == "vrm0" else "z")
@@ -108,11 +108,11 @@ def test_joints_are_recognised(kind, tmp_path):
 
 
 def test_meshes_are_where_a_viewer_draws_them(kind, tmp_path):
-    made = make(tmp_path, kind, animations=("walk",))
-    motion, mesh = formats.load(made.path), formats.load_mesh(made.path)
-    viewer, number = walk_of(made)
-    skinned = len(made.vertices)
-    np.testing.assert_allclose(mesh.vertices[:skinned], made.vertices, rtol=0, atol=1e-5)
+    result = make(tmp_path, kind, animations=("walk",))
+    motion, mesh = formats.load(result.path), formats.load_mesh(result.path)
+    viewer, number = walk_of(result)
+    skinned = len(result.vertices)
+    np.testing.assert_allclose(mesh.vertices[:skinned], result.vertices, rtol=0, atol=1e-5)
     np.testing.assert_allclose(mesh.weights.sum(axis=1), 1.0, atol=1e-9)
     assert len(mesh.vertices) == skinned + (8 if KINDS[kind].get("hat") else 0)
     for frame in (0, 11, motion.num_frames - 1):
@@ -127,16 +127,16 @@ def test_meshes_are_where_a_viewer_draws_them(kind, tmp_path):
 @pytest.mark.parametrize("interpolation", ["LINEAR", "STEP", "CUBICSPLINE"])
 @pytest.mark.parametrize("kind", ["posed-nodes"])
 def test_animations_are_read(kind, interpolation, tmp_path):
-    made = make(tmp_path, kind, animations=("walk", "other"), interpolation=interpolation)
-    motion = formats.load(made.path)
-    viewer, number = walk_of(made)
+    result = make(tmp_path, kind, animations=("walk", "other"), interpolation=interpolation)
+    motion = formats.load(result.path)
+    viewer, number = walk_of(result)
     assert (motion.fps, motion.num_frames) == (30, 31)
     for frame in range(0, 31, 6):
-        for name, node in zip(made.names, made.nodes, strict=True):
+        for name, node in zip(result.names, result.nodes, strict=True):
             if name in motion.skeleton.names:
                 position = motion.joint_positions()[frame, motion.skeleton.index(name)].numpy()
                 np.testing.assert_allclose(position, viewer.world(node, number, frame / 30)[:3, 3], rtol=0, atol=5e-6)
-    other = formats.load(f"{made.path}#/other")
+    other = formats.load(f"{result.path}#/other")
     assert float((other.joint_positions() - motion.joint_positions()).abs().max()) > 0.01
     assert isinstance(other.source, CharacterSource)
     assert other.source.animation == "other"
@@ -144,15 +144,15 @@ def test_animations_are_read(kind, interpolation, tmp_path):
 
 @pytest.mark.parametrize("mirror", [(1, 1, -1)])
 def test_a_last_joint_that_mirrors_is_read_and_written(mirror, tmp_path):
-    made = make(tmp_path, "metres", animations=("walk",), leaves="none")
-    plain, toes = formats.load(made.path), made.nodes[made.names.index(made.joint["leftToes"])]
-    edit_glb(made.path, lambda tree: tree["nodes"][toes].update(scale=list(mirror)))
-    motion = formats.load(made.path)
+    result = make(tmp_path, "metres", animations=("walk",), leaves="none")
+    plain, toes = formats.load(result.path), result.nodes[result.names.index(result.joint["leftToes"])]
+    edit_glb(result.path, lambda tree: tree["nodes"][toes].update(scale=list(mirror)))
+    motion = formats.load(result.path)
     torch.testing.assert_close(motion.joint_positions(), plain.joint_positions(), rtol=0, atol=1e-6)
     same = (motion.joint_rotations() * plain.joint_rotations()).sum(-1).abs()
     torch.testing.assert_close(same, torch.ones_like(same), rtol=0, atol=1e-6)
     motion.save(tmp_path / "new.glb")
-    old, new = GlbViewer(made.path), GlbViewer(tmp_path / "new.glb")
+    old, new = GlbViewer(result.path), GlbViewer(tmp_path / "new.glb")
     for frame in (0, 11, 30):
         np.testing.assert_allclose(new.world(toes, 0, frame / 30), old.world(toes, 0, frame / 30), atol=1e-5)
 
@@ -170,9 +170,9 @@ def test_of_several_animations_the_one_that_is_read_is_named(tmp_path, capsys):
     assert capsys.readouterr().err == ""
 
 
-def follow_up(made, frames=20):
+def follow_up(result, frames=20):
     """A walk on the character that was made."""
-    body = RiggedCharacter.of(character.load_standing_character(made.path))[1]
+    body = RiggedCharacter.of(character.load_standing_character(result.path))[1]
     return body.on_rig(retarget_motion(walk(frames), body).motion)
 
 
@@ -185,11 +185,11 @@ def without_additions(tree):
 
 @pytest.mark.slow
 def test_a_motion_is_added_and_all_else_stays(kind, tmp_path):
-    made = make(tmp_path, kind, animations=("walk",))
-    motion = follow_up(made)
-    out = tmp_path / f"new{made.path.suffix}"
+    result = make(tmp_path, kind, animations=("walk",))
+    motion = follow_up(result)
+    out = tmp_path / f"new{result.path.suffix}"
     motion.save(out)
-    (old, before), (new, after) = split_glb(made.path.read_bytes()), split_glb(out.read_bytes())
+    (old, before), (new, after) = split_glb(result.path.read_bytes()), split_glb(out.read_bytes())
     assert after[: len(before)] == before
     if not KINDS[kind].get("matrices"):
         assert without_additions(old) == without_additions(new)
@@ -208,17 +208,17 @@ def test_a_motion_is_added_and_all_else_stays(kind, tmp_path):
 
 
 def test_a_vrm_rests_as_its_nodes_stand(tmp_path):
-    made = make(tmp_path, "vrm", pose="bent", node_pose="T")
-    rest, viewer = formats.load_rest(made.path), GlbViewer(made.path)
-    for name, node in zip(made.names, made.nodes, strict=True):
+    result = make(tmp_path, "vrm", pose="bent", node_pose="T")
+    rest, viewer = formats.load_rest(result.path), GlbViewer(result.path)
+    for name, node in zip(result.names, result.nodes, strict=True):
         if name in rest.skeleton.names:
             position = rest.joint_positions()[0, rest.skeleton.index(name)].numpy()
             np.testing.assert_allclose(position, viewer.world(node)[:3, 3], **POSITIONS)
 
 
 def test_one_animation_is_replaced_where_it_was_the_one(tmp_path):
-    made = make(tmp_path, "mixamo", animations=("walk", "wave"))
-    motion = mapctl.load(f"{made.path}#/wave").slice(3, 20)
+    result = make(tmp_path, "mixamo", animations=("walk", "wave"))
+    motion = mapctl.load(f"{result.path}#/wave").slice(3, 20)
     motion.save(tmp_path / "cut.glb")
     tree, _ = split_glb((tmp_path / "cut.glb").read_bytes())
     assert [animation["name"] for animation in tree["animations"]] == ["cut", "walk"]
@@ -228,10 +228,10 @@ def test_one_animation_is_replaced_where_it_was_the_one(tmp_path):
 
 @pytest.mark.parametrize("kind", ["matrices", "vrm"])
 def test_a_root_joint_is_added_to_the_character(kind, tmp_path):
-    made = make(tmp_path, kind, animations=() if kind == "matrices" else ("walk",))
-    motion = follow_up(made)
+    result = make(tmp_path, kind, animations=() if kind == "matrices" else ("walk",))
+    motion = follow_up(result)
     rooted = editing.move_travel_to_root(motion)
-    out = tmp_path / f"rooted{made.path.suffix}"
+    out = tmp_path / f"rooted{result.path.suffix}"
     rooted.save(out)
     again = formats.load(out)
     assert again.skeleton.names == rooted.skeleton.names == ("root", *motion.skeleton.names)
@@ -239,18 +239,18 @@ def test_a_root_joint_is_added_to_the_character(kind, tmp_path):
         again.joint_positions()[:, 1:].numpy(), motion.joint_positions().numpy(), rtol=0, atol=2e-5
     )
     np.testing.assert_allclose(again.joint_positions()[:, 0].numpy(), rooted.joint_positions()[:, 0].numpy(), atol=2e-5)
-    viewer, old = GlbViewer(out), GlbViewer(made.path)
+    viewer, old = GlbViewer(out), GlbViewer(result.path)
     assert len(viewer.nodes) == len(old.nodes) + 1
     np.testing.assert_allclose(viewer.skinned(), old.skinned(), atol=1e-6)  # the character as it stands is the same
     turns = rotations.to_matrix(motion.joint_rotations()[7]).numpy()
-    wanted, _ = formats.load_mesh(made.path).pose(motion.joint_positions()[7].numpy(), turns)
-    np.testing.assert_allclose(viewer.skinned(0, 7 / 30), wanted[: len(made.vertices)], rtol=0, atol=2e-5)
+    wanted, _ = formats.load_mesh(result.path).pose(motion.joint_positions()[7].numpy(), turns)
+    np.testing.assert_allclose(viewer.skinned(0, 7 / 30), wanted[: len(result.vertices)], rtol=0, atol=2e-5)
 
 
 def test_other_files_are_put_into_the_one(tmp_path):
     (tmp_path / "in").mkdir()
-    made = make_character_glb(tmp_path / "in" / "hero.gltf")
-    motion = follow_up(made)
+    result = make_character_glb(tmp_path / "in" / "hero.gltf")
+    motion = follow_up(result)
     motion.save(tmp_path / "out.glb")
     shutil.rmtree(tmp_path / "in")
     tree, binary = split_glb((tmp_path / "out.glb").read_bytes())
@@ -258,16 +258,16 @@ def test_other_files_are_put_into_the_one(tmp_path):
     view = tree["bufferViews"][tree["images"][0]["bufferView"]]
     assert binary[view["byteOffset"] :][:4] == b"\x89PNG"
     mesh = formats.load_mesh(tmp_path / "out.glb")
-    assert len(mesh.vertices) == len(made.vertices)
+    assert len(mesh.vertices) == len(result.vertices)
     assert len(np.unique(mesh.rgba.round(2), axis=0)) > 3
 
 
 def test_a_character_may_be_written_over_its_own_file(tmp_path):
-    made = make(tmp_path, "mixamo")
-    motion = follow_up(made)
-    motion.save(made.path)
+    result = make(tmp_path, "mixamo")
+    motion = follow_up(result)
+    motion.save(result.path)
     np.testing.assert_allclose(
-        formats.load(made.path).joint_positions().numpy(), motion.joint_positions().numpy(), rtol=0, atol=1e-5
+        formats.load(result.path).joint_positions().numpy(), motion.joint_positions().numpy(), rtol=0, atol=1e-5
     )
     with pytest.raises(RequestError, match="has changed since it was read"):
         motion.save(tmp_path / "late.glb")
@@ -311,10 +311,10 @@ def places_of(motion, names):
 
 @pytest.mark.parametrize("kind", ["vrm", "vrm0", "mixamo", "unreal", "vrma"])
 def test_files_without_a_skin_are_read(kind, tmp_path):
-    made = make_animated(tmp_path, "vrm" if kind == "vrma" else kind, leaves="nodes")
-    whole = formats.load(made.path)
-    strip(made.path)
-    path = made.path
+    result = make_animated(tmp_path, "vrm" if kind == "vrma" else kind, leaves="nodes")
+    whole = formats.load(result.path)
+    strip(result.path)
+    path = result.path
     if kind == "vrma":
         edit_glb(path, lambda tree: tree.update(extensions={EXTENSION: tree["extensions"]["VRMC_vrm"]}))
         path = path.rename(tmp_path / "hero.vrma")
@@ -328,10 +328,10 @@ def test_files_without_a_skin_are_read(kind, tmp_path):
 
 
 def test_a_bare_file_without_an_animation_is_refused(tmp_path):
-    made = make_animated(tmp_path, "mixamo", animations=())
-    strip(made.path)
+    result = make_animated(tmp_path, "mixamo", animations=())
+    strip(result.path)
     with pytest.raises(FileFormatError, match="has no skin, no humanoid and no animation"):
-        formats.load(made.path)
+        formats.load(result.path)
 
 
 @pytest.mark.parametrize("kind", ["canonical", "vrm", "vrm0"])
@@ -403,8 +403,8 @@ def test_the_mannequin_moves_as_the_motion(tmp_path):
         np.testing.assert_allclose(viewer.skinned(0, frame / 30), expected, atol=5e-6)
 
 
-def hips_of(made):
-    return made.nodes[made.names.index("mixamorig:Hips")]
+def hips_of(result):
+    return result.nodes[result.names.index("mixamorig:Hips")]
 
 
 BROKEN = {
@@ -432,29 +432,29 @@ BROKEN = {
 
 @pytest.mark.parametrize("fault", BROKEN)
 def test_faults_are_told_in_a_line(fault, tmp_path):
-    made = make(tmp_path, "mixamo")
-    change, told = BROKEN[fault]
-    edit_glb(made.path, lambda tree: change(tree, made))
-    with pytest.raises(FileFormatError, match=told) as caught:
-        formats.load(made.path)
+    result = make(tmp_path, "mixamo")
+    change, given = BROKEN[fault]
+    edit_glb(result.path, lambda tree: change(tree, result))
+    with pytest.raises(FileFormatError, match=given) as caught:
+        formats.load(result.path)
     assert "\n" not in str(caught.value)
-    assert str(made.path) in str(caught.value)
+    assert str(result.path) in str(caught.value)
 
 
 def test_neighbours_within_the_folder_are_read(tmp_path):
-    made = make_character_glb(tmp_path / "hero.gltf")
+    result = make_character_glb(tmp_path / "hero.gltf")
     (tmp_path / "below").mkdir()
-    tree = json.loads(made.path.read_text())
+    tree = json.loads(result.path.read_text())
     name = tree["buffers"][0]["uri"]
     (tmp_path / name).rename(tmp_path / "below" / "the data.bin")
     tree["buffers"][0]["uri"] = "below/the%20data.bin"
-    made.path.write_text(json.dumps(tree))
-    assert formats.load_rest(made.path).num_joints > 20
+    result.path.write_text(json.dumps(tree))
+    assert formats.load_rest(result.path).num_joints > 20
     link = tmp_path / "out.bin"
     outside = tmp_path.parent / f"{tmp_path.name}.bin"
     shutil.move(tmp_path / "below" / "the data.bin", outside)
     link.symlink_to(outside)
     tree["buffers"][0]["uri"] = "out.bin"
-    made.path.write_text(json.dumps(tree))
+    result.path.write_text(json.dumps(tree))
     with pytest.raises(FileFormatError, match="not in its folder"):
-        formats.load(made.path)
+        formats.load(result.path)

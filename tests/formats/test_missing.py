@@ -101,9 +101,9 @@ def test_nan_in_an_archive(tmp_path, key):
 
 
 def test_nan_in_a_take_of_acclaim(tmp_path):
-    made = pair(6)
-    (tmp_path / "a.asf").write_text(made.asf())
-    text = made.amc()
+    result = pair(6)
+    (tmp_path / "a.asf").write_text(result.asf())
+    text = result.amc()
     (tmp_path / "a.amc").write_text(text)
     whole = mapctl.load(tmp_path / "a.amc")
     bone = next(line.split()[0] for line in text.splitlines() if line.split()[0].endswith("humerus"))

@@ -283,10 +283,10 @@ def test_one_line_says_what(fault, tmp_path, capfd):
     (tmp_path.parent / "out.usda").write_text("#usda 1.0\n")
     out = tmp_path / "out.bvh"
     assert cli.main(["convert", str(path), str(out)]) == 2
-    told = capfd.readouterr()
-    assert told.err.count("\n") == 1, told.err
-    assert words in told.err
-    assert not told.out
+    given = capfd.readouterr()
+    assert given.err.count("\n") == 1, given.err
+    assert words in given.err
+    assert not given.out
     assert not out.exists()
 
 

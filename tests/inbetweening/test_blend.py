@@ -23,7 +23,8 @@ HAND, ARM = CANONICAL.index("leftHand"), CANONICAL.index("leftUpperArm")
 
 
 def waving(fps: int, seconds: float = 4.0) -> Motion:
-    """Somebody who stands and lowers the left arm evenly by a radian a second from the T-pose: its angle tells when."""
+    """A standing performer who lowers the left arm evenly by a radian a second from the T-pose: its angle is the
+    time."""
     frames = round(fps * seconds)
     angle = -torch.arange(frames, dtype=torch.float64) / fps
     quats = torch.zeros(frames, CANONICAL.num_joints, 4, dtype=torch.float64)
@@ -63,9 +64,9 @@ def test_a_borrowed_limb_goes_there_and_comes_back_as_bodies_do(fps, margin):
         tiny_infiller(),
         settings=UNFINISHED,
     )
-    own, theirs, made = peaks_of(motion), peaks_of(source), peaks_of(done.motion)
-    assert made.step < max(1.3 * max(own.step, theirs.step), 0.17)
-    assert made.acceleration < max(1.5 * max(own.acceleration, theirs.acceleration), 60)
+    own, theirs, result = peaks_of(motion), peaks_of(source), peaks_of(done.motion)
+    assert result.step < max(1.3 * max(own.step, theirs.step), 0.17)
+    assert result.acceleration < max(1.5 * max(own.acceleration, theirs.acceleration), 60)
     assert not any("takes" in note for note in done.notes)
 
 
@@ -78,7 +79,7 @@ def own_walk() -> Motion:
 
 
 def others_walk() -> Motion:
-    """On another rig, of somebody tall whose toes are below the floor."""
+    """On another rig, of a tall body whose toes are below the floor."""
     return make(Make(names_of("mixamo"), size=1.2, extras=False)).motion(OTHER.walks())
 
 

@@ -37,15 +37,15 @@ def lost_of(motion, masks):
     return MissingMask.of_masks(motion, masks, retarget.to_canonical(motion)[1])
 
 
-def assert_known_stays(motion, made, masks):
+def assert_known_stays(motion, result, masks):
     lost = lost_of(motion, masks)
-    assert (made.num_frames, made.fps, made.skeleton) == (motion.num_frames, motion.fps, motion.skeleton)
-    assert torch.equal(made.local_quat_xyzw[~lost.joints], motion.local_quat_xyzw[~lost.joints])
-    assert torch.equal(made.root_position[~lost.root], motion.root_position[~lost.root])
-    assert made.moving_offsets.keys() == motion.moving_offsets.keys()
+    assert (result.num_frames, result.fps, result.skeleton) == (motion.num_frames, motion.fps, motion.skeleton)
+    assert torch.equal(result.local_quat_xyzw[~lost.joints], motion.local_quat_xyzw[~lost.joints])
+    assert torch.equal(result.root_position[~lost.root], motion.root_position[~lost.root])
+    assert result.moving_offsets.keys() == motion.moving_offsets.keys()
     for joint, values in motion.moving_offsets.items():
-        assert torch.equal(made.moving_offsets[joint][~lost.root], values[~lost.root])
-    assert made.joint_positions().isfinite().all()
+        assert torch.equal(result.moving_offsets[joint][~lost.root], values[~lost.root])
+    assert result.joint_positions().isfinite().all()
 
 
 def same(first, second):
@@ -60,10 +60,10 @@ def same(first, second):
 def test_known_frames_stay_to_the_bit_and_the_gap_is_filled_with_something(rig, fps, method):
     motion = on_rig(rig, 2 * fps, fps=fps)
     mask = seconds(motion, 0.7, 1.2)
-    made = filled(motion, mask, method=method).motion
-    assert_known_stays(motion, made, [mask])
+    result = filled(motion, mask, method=method).motion
+    assert_known_stays(motion, result, [mask])
     gap = slice(mask.start, mask.stop)
-    assert (made.joint_positions()[gap] - motion.joint_positions()[gap]).norm(dim=-1).mean() > 0.002
+    assert (result.joint_positions()[gap] - motion.joint_positions()[gap]).norm(dim=-1).mean() > 0.002
 
 
 @pytest.mark.parametrize(
@@ -79,9 +79,9 @@ def test_what_stands_in_the_gap_does_not_matter(rig, method):
     masks = [Mask(ALL, 15, 25), Mask(motion.skeleton.names[8], 30, 40)]
     wild = random_motion(motion.skeleton, 45, seed=3)
     wild = replace(wild, moving_offsets={joint: wild.root_position for joint in motion.moving_offsets})
-    spoilt = restore_observed(wild, motion, lost_of(motion, masks))
-    assert not same(spoilt, motion)
-    assert same(*(filled(given, *masks, method=method).motion for given in (motion, spoilt)))
+    corrupted = restore_observed(wild, motion, lost_of(motion, masks))
+    assert not same(corrupted, motion)
+    assert same(*(filled(given, *masks, method=method).motion for given in (motion, corrupted)))
 
 
 @dataclass(frozen=True)
@@ -107,13 +107,13 @@ class Oracle(PositionInfiller):
 def test_a_true_proposal_gives_the_true_motion_back(rig, fps):
     motion = on_rig(rig, 3 * fps, fps=fps)
     masks = [seconds(motion, 0.8, 1.4), seconds(motion, 2.0, 2.03 + 1 / fps)]
-    made, lines = (
+    result, lines = (
         filled(motion, *masks, method=method, infiller=Oracle(motion)).motion for method in ("infiller", "slerp")
     )
     # Places do not tell how a collarbone or a shin is turned about itself, and a rig's joints beside them show it.
-    assert error_cm(made, motion) < 0.3 * error_cm(lines, motion)
+    assert error_cm(result, motion) < 0.3 * error_cm(lines, motion)
     frames = lost_of(motion, masks).frames
-    off = (made.joint_positions() - motion.joint_positions())[frames].norm(dim=-1)
+    off = (result.joint_positions() - motion.joint_positions())[frames].norm(dim=-1)
     assert off.mean() < 0.01
 
 
@@ -127,8 +127,8 @@ def test_a_larger_performer_is_shown_as_one_of_the_networks_size(rig):
         root_position=1.25 * small.root_position,
         moving_offsets={joint: 1.25 * values for joint, values in small.moving_offsets.items()},
     )
-    made, unscaled = (filled(each, Mask(ALL, 20, 40), infiller=Oracle(small)).motion for each in (motion, small))
-    assert (made.joint_positions() - 1.25 * unscaled.joint_positions()).norm(dim=-1).max() < 0.005
+    result, unscaled = (filled(each, Mask(ALL, 20, 40), infiller=Oracle(small)).motion for each in (motion, small))
+    assert (result.joint_positions() - 1.25 * unscaled.joint_positions()).norm(dim=-1).max() < 0.005
 
 
 @pytest.mark.parametrize("rig", RIGS[1:])
@@ -136,10 +136,10 @@ def test_lost_joints_are_filled_and_no_other(rig):
     motion = on_rig(rig, 45)
     hand = {"canonical": "leftHand", "bandai": "Hand_L", "daz": "lHand"}[rig]
     for mask in (Mask(hand, 0, 45), Mask(hand, 10, 30)):
-        made = filled(motion, mask)
-        assert_known_stays(motion, made.motion, [mask])
-        assert made.notes == ()
-        moved = (made.motion.local_quat_xyzw != motion.local_quat_xyzw).any(dim=-1).any(dim=0)
+        result = filled(motion, mask)
+        assert_known_stays(motion, result.motion, [mask])
+        assert result.notes == ()
+        moved = (result.motion.local_quat_xyzw != motion.local_quat_xyzw).any(dim=-1).any(dim=0)
         assert 1 <= int(moved.sum()) <= 2
 
 

@@ -24,11 +24,13 @@ RIGS = ("canonical", "bandai", "daz")
 def poses(tmp_path_factory):
     """A walk on every rig, and on one whose world has Z up: paths by name."""
     folder = tmp_path_factory.mktemp("poses")
-    made = {rig: on_rig(rig, 45) for rig in RIGS}
-    made["zup"] = make(Make(names_of("ue4"), bones_along_x=True, zup=True, root="root")).motion(on_rig("canonical", 45))
-    for rig, motion in made.items():
+    result = {rig: on_rig(rig, 45) for rig in RIGS}
+    result["zup"] = make(Make(names_of("ue4"), bones_along_x=True, zup=True, root="root")).motion(
+        on_rig("canonical", 45)
+    )
+    for rig, motion in result.items():
         motion.save(folder / f"{rig}.npz")
-    return {rig: str(folder / f"{rig}.npz") for rig in made}
+    return {rig: str(folder / f"{rig}.npz") for rig in result}
 
 
 def first_and_last(pose, *, frames=30):

@@ -30,7 +30,7 @@ def frames_of(fps):
 
 
 def drawing_of(canonical, frame, *, view_deg, names=CANONICAL.names, unit=100.0):
-    """What somebody draws who sees the pose from there, in centimetres from anywhere."""
+    """A drawing of the pose from there, in centimetres from anywhere."""
     seen = canonical.joint_positions()[frame] @ view_axes(torch.tensor(math.radians(view_deg)).double()).mT
     positions = {
         name: tuple((unit * seen[CANONICAL.index(name)] + torch.tensor([7.0, -3.0])).tolist()) for name in names
@@ -38,7 +38,7 @@ def drawing_of(canonical, frame, *, view_deg, names=CANONICAL.names, unit=100.0)
     return Drawing(positions, view_deg)
 
 
-def spoilt(motion, missing, *, off=0.3):
+def corrupted(motion, missing, *, off=0.3):
     """The motion with other values wherever they do not count."""
     turn = rotations.from_rotation_vector(torch.full((*motion.local_quat_xyzw.shape[:2], 3), off).double())
     moving = {joint: values + off for joint, values in motion.moving_offsets.items()}
@@ -59,16 +59,16 @@ def test_a_half_is_met_to_the_bit_and_the_other_does_not_count(rig, fps, half):
     keys = Keys(tuple(Key(frame, half=half) for frame in frames_of(fps)))
     rigmap = to_canonical(motion)[1]
     missing = missing_between_keys(keys.checked(motion), motion, rigmap)
-    told = {name for name, own in rigmap.joints.items() if not missing.joints[0, own]}
+    given = {name for name, own in rigmap.joints.items() if not missing.joints[0, own]}
     legs = {name for name in rigmap.joints if name.endswith(("Leg", "Foot", "Toes"))}
-    assert told == ((set(rigmap.joints) - legs) if half == "upper" else {"hips", *legs})
-    made = tween(motion, keys, tiny_tweener(), settings=UNFINISHED)
+    assert given == ((set(rigmap.joints) - legs) if half == "upper" else {"hips", *legs})
+    result = tween(motion, keys, tiny_tweener(), settings=UNFINISHED)
     known = ~missing.joints
-    assert torch.equal(made.motion.local_quat_xyzw[known], motion.local_quat_xyzw[known])
-    assert torch.equal(made.motion.root_position[~missing.root], motion.root_position[~missing.root])
-    assert all(row["missed_cm"] < 1e-6 for row in measure_keyframe_errors(made.motion, motion, keys))
-    again = tween(spoilt(motion, missing), keys, tiny_tweener(), settings=UNFINISHED)
-    assert torch.equal(made.motion.local_quat_xyzw, again.motion.local_quat_xyzw)
+    assert torch.equal(result.motion.local_quat_xyzw[known], motion.local_quat_xyzw[known])
+    assert torch.equal(result.motion.root_position[~missing.root], motion.root_position[~missing.root])
+    assert all(row["missed_cm"] < 1e-6 for row in measure_keyframe_errors(result.motion, motion, keys))
+    again = tween(corrupted(motion, missing), keys, tiny_tweener(), settings=UNFINISHED)
+    assert torch.equal(result.motion.local_quat_xyzw, again.motion.local_quat_xyzw)
 
 
 @pytest.mark.slow
@@ -77,12 +77,12 @@ def test_places_alone_are_met_and_nothing_else_of_the_motion_counts(rig, fps, me
     motion = on_rig(rig, round(1.5 * fps), fps=fps)
     keys = Keys(tuple(Key(frame, **POSITION) for frame in frames_of(fps)))
     by, settings = by_method(method, tiny_tweener() if method == "infiller" else tiny_infiller(drawn=0.02))
-    made = tween(motion, keys, by, settings=settings)
-    rows = measure_keyframe_errors(made.motion, motion, keys)
+    result = tween(motion, keys, by, settings=settings)
+    rows = measure_keyframe_errors(result.motion, motion, keys)
     assert [row["what"] for row in rows] == ["place"] * 4
     assert all(row["missed_cm"] < 1e-6 for row in rows)
-    assert made.notes == ()
-    canonical = to_canonical(made.motion)[0]
+    assert result.notes == ()
+    canonical = to_canonical(result.motion)[0]
     way = torch.diff(to_canonical(motion)[0].root_position[[0, -1], ::2], dim=0)[0]
     facing = heading(canonical.local_quat_xyzw[:, 0])
     if method == "slerp":  # the others' poses are made up
@@ -112,8 +112,8 @@ def test_drawn_keys_are_met_as_nearly_as_bones_allow(rig, fps):
             Key(last, drawing=drawing_of(canonical, last, view_deg=110, names=torso)),
         )
     )
-    made = tween(motion, keys, tiny_tweener(), settings=UNFINISHED)
-    rows = measure_keyframe_errors(made.motion, motion, keys)
+    result = tween(motion, keys, tiny_tweener(), settings=UNFINISHED)
+    rows = measure_keyframe_errors(result.motion, motion, keys)
     assert [row["what"] for row in rows] == ["drawing", "drawing"]
     assert max(row["drawn_cm"] for row in rows) < 3
     assert rows[0]["missed_cm"] < 1e-6

@@ -47,11 +47,11 @@ def test_a_gap_between_single_frames_is_crossed_by_slerp_and_straight_lines(rig,
     motion = on_rig(rig, 50)
     lost = torch.ones(50, dtype=torch.bool)
     lost[[start - 1, stop]] = False
-    made = interpolate_missing(motion, MissingMask.of_frames(lost, motion.num_joints))
+    result = interpolate_missing(motion, MissingMask.of_frames(lost, motion.num_joints))
     wanted = interpolated(motion.local_quat_xyzw, start, stop)
-    assert apart_deg(made.local_quat_xyzw[start:stop], wanted).max() < 1e-5
-    pairs = [(made.root_position, motion.root_position)]
-    pairs += [(made.moving_offsets[joint], values) for joint, values in motion.moving_offsets.items()]
+    assert apart_deg(result.local_quat_xyzw[start:stop], wanted).max() < 1e-5
+    pairs = [(result.root_position, motion.root_position)]
+    pairs += [(result.moving_offsets[joint], values) for joint, values in motion.moving_offsets.items()]
     weight = (torch.arange(start, stop).double() - (start - 1))[:, None] / (stop - start + 1)
     for found, ends in pairs:
         line = (1 - weight) * ends[start - 1] + weight * ends[stop]
@@ -77,7 +77,7 @@ def test_a_short_gap_goes_on_at_the_velocities_beside_it(fps, after, left):
     start = stop = motion.num_frames // 3
     stop += round(0.2 * fps)
     motion = motion.slice(0, stop + after)
-    truth, made = motion.joint_positions(), interpolate_missing(motion, lost_of(motion, Mask(ALL, start, stop)))
+    truth, result = motion.joint_positions(), interpolate_missing(motion, lost_of(motion, Mask(ALL, start, stop)))
     lost = torch.ones(stop + after, dtype=torch.bool)
     lost[[start - 1, stop]] = False
     straight = interpolate_missing(motion, MissingMask.of_frames(lost, motion.num_joints))
@@ -85,8 +85,8 @@ def test_a_short_gap_goes_on_at_the_velocities_beside_it(fps, after, left):
     def error(found):
         return (found.joint_positions() - truth)[start:stop].norm(dim=-1).mean()
 
-    assert error(made) < left * error(straight)
-    seam = torch.diff(made.joint_positions()[start - 2 : start + 1], n=2, dim=0).norm(dim=-1).max()
+    assert error(result) < left * error(straight)
+    seam = torch.diff(result.joint_positions()[start - 2 : start + 1], n=2, dim=0).norm(dim=-1).max()
     assert seam < 0.5 * torch.diff(straight.joint_positions()[start - 1 : start + 1], dim=0).norm(dim=-1).max()
 
 
@@ -233,22 +233,22 @@ def test_unknown_values_do_not_matter_and_known_ones_stay():
 
 
 def test_unknown_limbs_bend_to_their_targets_and_known_ones_do_not():
-    told = torch.zeros(1, FRAMES, len(EFFECTORS), dtype=torch.bool)
+    given = torch.zeros(1, FRAMES, len(EFFECTORS), dtype=torch.bool)
     hand, foot = EFFECTORS.index(CANONICAL.index("leftHand")), EFFECTORS.index(CANONICAL.index("rightFoot"))
-    told[0, 17, hand] = told[0, 5, foot] = True
-    motion = partial_motion(replace(gap(), effectors=told))
+    given[0, 17, hand] = given[0, 5, foot] = True
+    motion = partial_motion(replace(gap(), effectors=given))
     plain = interpolate_partial_motion(replace(motion, known=gap()), MEAN, 0.9)
     positions, limb = world_positions(plain), LIMBS["leftHand"]
     position = positions[0, 17, limb.upper] + torch.tensor([0.1, 0.2, 0.3])
     motion.targets[0, 17, hand], motion.targets[0, 5, foot] = position, 5.0
-    made = world_positions(interpolate_partial_motion(motion, MEAN, 0.9))
-    torch.testing.assert_close(made[0, 17, limb.end].float(), position.float(), atol=2e-3, rtol=0)
-    off = (made - positions)[0, :, limb.end].norm(dim=-1)
+    result = world_positions(interpolate_partial_motion(motion, MEAN, 0.9))
+    torch.testing.assert_close(result[0, 17, limb.end].float(), position.float(), atol=2e-3, rtol=0)
+    off = (result - positions)[0, :, limb.end].norm(dim=-1)
     assert 0 < float(off[11]) < float(off[14]) < float(off[17])
     assert float(torch.diff(off).abs().max()) < 0.4 * float(off[17]), "there and back"
     others = torch.ones(FRAMES, CANONICAL.num_joints, dtype=torch.bool)
     others[10:25, [limb.lower, limb.end]] = False
-    torch.testing.assert_close(made[0][others], positions[0][others], atol=1e-9, rtol=0)
+    torch.testing.assert_close(result[0][others], positions[0][others], atol=1e-9, rtol=0)
 
 
 def test_a_mirrored_motion_has_mirrored_places():

@@ -1,6 +1,6 @@
 """Keys that tell a part: met, and the body goes there and comes back as bodies do, at any rate and on any rig.
 
-A network that is told one place in one frame answers with that place there and with its mean beside it; the tiny
+A network given one position in one frame answers with that position there and with its mean beside it; the tiny
 infiller (untrained: straight lines) does just that, so that a jump would show.
 """
 
@@ -76,7 +76,7 @@ def test_hips_told_at_one_frame_do_not_swing_the_body(fps, turn):
     assert (done.motion.root_position - motion.root_position)[4 * fps // 3].norm() < 1e-9
 
 
-class Told(LinearInbetweener):
+class Conditioned(LinearInbetweener):
     """One that takes hands and feet in single frames into account, as far as it says."""
 
     @property
@@ -95,13 +95,13 @@ def test_the_body_moves_for_a_hand_only_where_its_arm_does_not_reach(share, move
     missing[15:45] = True
     mask = MissingMask.of_frames(missing, CANONICAL.num_joints)
     query = GapQuery(motion, mask, torch.arange(60) / 30.0, EffectorTargets(positions, wanted))
-    made, targets = propose_through_keys(query, Told(), torch.Generator())
-    freely = Told().propose(query).motion
-    hips = (made.motion.root_position - freely.root_position).norm(dim=-1)
+    result, targets = propose_through_keys(query, Conditioned(), torch.Generator())
+    freely = Conditioned().propose(query).motion
+    hips = (result.motion.root_position - freely.root_position).norm(dim=-1)
     assert bool(hips[at] > 0.01) == moves
     assert targets is not None
     assert torch.equal(targets.wanted, wanted)
-    away = (targets.positions[at, limb.end] - made.motion.joint_positions()[at, limb.upper]).norm()
+    away = (targets.positions[at, limb.end] - result.motion.joint_positions()[at, limb.upper]).norm()
     assert float(away) <= limb.length(CANONICAL)
     if not moves:
-        assert torch.equal(made.motion.local_quat_xyzw, freely.local_quat_xyzw)
+        assert torch.equal(result.motion.local_quat_xyzw, freely.local_quat_xyzw)

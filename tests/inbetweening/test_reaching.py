@@ -65,20 +65,20 @@ def test_places_in_reach_are_met_and_bones_stay_rigid(limb, fps):
     frames = (fps // 2, fps, fps + fps // 3)
     targets = at(motion, {(frame, limb): nearer(motion, frame, limb) for frame in frames})
     assert compute_target_errors(motion.joint_positions(), targets).max() > 0.03
-    made = reach_effector_targets(motion, targets, all_free(motion))
-    assert compute_target_errors(made.joint_positions(), targets).max() < HAIR
-    assert (lengths(made) - lengths(motion)).abs().max() < 1e-12
+    result = reach_effector_targets(motion, targets, all_free(motion))
+    assert compute_target_errors(result.joint_positions(), targets).max() < HAIR
+    assert (lengths(result) - lengths(motion)).abs().max() < 1e-12
 
 
 @pytest.mark.parametrize("limb", LIMBS)
 def test_only_the_limb_turns_and_only_where_it_is_free(limb):
     motion, free = walk(60), torch.zeros(60, dtype=torch.bool)
     free[20:40] = True
-    made = reach_effector_targets(motion, at(motion, {(30, limb): nearer(motion, 30, limb)}), free)
-    turned = (made.local_quat_xyzw != motion.local_quat_xyzw).any(dim=-1)
+    result = reach_effector_targets(motion, at(motion, {(30, limb): nearer(motion, 30, limb)}), free)
+    turned = (result.local_quat_xyzw != motion.local_quat_xyzw).any(dim=-1)
     assert set(turned.any(dim=0).nonzero()[:, 0].tolist()) == {LIMBS[limb].upper, LIMBS[limb].lower}
-    assert torch.equal(made.local_quat_xyzw[~free], motion.local_quat_xyzw[~free])
-    assert torch.equal(made.root_position, motion.root_position)
+    assert torch.equal(result.local_quat_xyzw[~free], motion.local_quat_xyzw[~free])
+    assert torch.equal(result.root_position, motion.root_position)
 
 
 @pytest.mark.parametrize("limb", LIMBS)
@@ -88,9 +88,9 @@ def test_out_of_reach_the_limb_is_straight_and_points_there_and_is_said_to_miss(
     length = float(lengths(motion)[15, [LIMBS[limb].lower - 1, LIMBS[limb].end - 1]].sum())
     way = torch.nn.functional.normalize(ends - begins + torch.tensor([0.1, 0.05, 0.1]).double(), dim=-1)
     targets = at(motion, {(15, limb): begins + (length + 0.3) * way})
-    made = reach_effector_targets(motion, targets, all_free(motion)).joint_positions()
-    assert (made[15, CANONICAL.index(limb)] - (begins + length * way)).norm() < 2 * HAIR
-    wrong = compute_target_errors(made, targets)
+    result = reach_effector_targets(motion, targets, all_free(motion)).joint_positions()
+    assert (result[15, CANONICAL.index(limb)] - (begins + length * way)).norm() < 2 * HAIR
+    wrong = compute_target_errors(result, targets)
     assert wrong[15] == pytest.approx(0.3, abs=2 * HAIR)
     assert wrong[:15].max() == wrong[16:].max() == 0
 
@@ -100,8 +100,8 @@ def test_straight_limbs_bend_knees_forward_and_elbows_back(limb, forward):
     motion = standing()
     upper, lower = (CANONICAL.names[joint] for joint in (LIMBS[limb].upper, LIMBS[limb].lower))
     begins, ends = place_of(motion, 15, upper), place_of(motion, 15, limb)
-    made = reach_effector_targets(motion, at(motion, {(15, limb): ends + 0.2 * (begins - ends)}), all_free(motion))
-    bent = place_of(made, 15, lower) - begins
+    result = reach_effector_targets(motion, at(motion, {(15, limb): ends + 0.2 * (begins - ends)}), all_free(motion))
+    bent = place_of(result, 15, lower) - begins
     axis = torch.nn.functional.normalize(ends - begins, dim=-1)
     across = bent - (bent @ axis) * axis
     assert float(across[2]) * forward > 0.05
@@ -127,7 +127,7 @@ def reach(motion, targets, *, stray=0.0, turning=None, moving=None):
 
 
 def beside(motion, frame, *, ahead=0.0, aside=0.0, up=0.0):
-    """A place seen from the left shoulder of somebody who faces +Z, metres."""
+    """A place seen from the left shoulder of a body that faces +Z, metres."""
     return motion.joint_positions()[frame, SHOULDER] + torch.tensor([aside, up, ahead]).double()
 
 
@@ -145,21 +145,21 @@ def beside(motion, frame, *, ahead=0.0, aside=0.0, up=0.0):
 def test_a_hand_gets_there_and_standing_feet_stay(where):
     motion = walk(5, cadence=0.0)
     position = beside(motion, 2, **where)
-    made, shift = reach(motion, asked(motion, 2, HAND, position))
-    positions, before = made.joint_positions(), motion.joint_positions()
+    result, shift = reach(motion, asked(motion, 2, HAND, position))
+    positions, before = result.joint_positions(), motion.joint_positions()
     assert (positions[2, HAND] - position).norm() < 0.005
     assert (positions[2, FEET] - before[2, FEET]).norm(dim=-1).max() < 0.02  # at most a heel comes up for what is high
     assert shift.norm() < 1e-6
     others = [0, 1, 3, 4]
-    assert torch.equal(made.local_quat_xyzw[others], motion.local_quat_xyzw[others])
+    assert torch.equal(result.local_quat_xyzw[others], motion.local_quat_xyzw[others])
 
 
 def test_somebody_on_the_way_is_rather_a_little_further_than_stretched():
     motion = walk(3, cadence=0.0)
     targets = asked(motion, 1, HAND, beside(motion, 1, ahead=0.9))
-    made, shift = reach(motion, targets, stray=0.5)
+    result, shift = reach(motion, targets, stray=0.5)
     assert shift[1, 2] > 0.3
-    feet = (made.joint_positions() - motion.joint_positions())[1, FEET]
+    feet = (result.joint_positions() - motion.joint_positions())[1, FEET]
     torch.testing.assert_close(feet, shift[1].expand_as(feet), atol=1e-3, rtol=0)
 
 
@@ -168,12 +168,12 @@ def test_what_may_not_move_does_not_and_bones_keep_their_lengths():
     targets = asked(motion, 2, HAND, beside(motion, 2, ahead=0.6))
     turning = torch.zeros(5, JOINTS, dtype=torch.bool)
     turning[:, [SHOULDER, CANONICAL.index("leftLowerArm")]] = True
-    made, _ = reach(motion, targets, turning=turning, moving=torch.zeros(5, dtype=torch.bool))
+    result, _ = reach(motion, targets, turning=turning, moving=torch.zeros(5, dtype=torch.bool))
     kept = ~turning[0]
-    assert torch.equal(made.local_quat_xyzw[:, kept], motion.local_quat_xyzw[:, kept])
-    assert torch.equal(made.root_position, motion.root_position)
+    assert torch.equal(result.local_quat_xyzw[:, kept], motion.local_quat_xyzw[:, kept])
+    assert torch.equal(result.root_position, motion.root_position)
     bones = [
         (each[:, 1:] - each[:, list(CANONICAL.parents[1:])]).norm(dim=-1)
-        for each in (made.joint_positions(), motion.joint_positions())
+        for each in (result.joint_positions(), motion.joint_positions())
     ]
     torch.testing.assert_close(*bones, atol=1e-9, rtol=0)

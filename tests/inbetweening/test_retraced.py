@@ -1,4 +1,5 @@
-"""The hips' way where it is lost: told by the body, led to the next known place, all else to the bit."""
+"""The root trajectory where it is lost: predicted from the body, led to the next known position, all else to the
+bit."""
 
 from dataclasses import replace
 

@@ -82,10 +82,10 @@ def test_planted_toes_are_held_and_what_is_known_stays():
     motion = replace(motion, root_position=motion.root_position + sliding)
     free = torch.ones(60, dtype=torch.bool)
     free[:12] = False
-    made = hold_planted(motion, stands, free=free, rest_height=torch.full((motion.num_frames, 2), 0.0425))
-    speeds = [each.joint_positions()[:, TOES].diff(dim=0).norm(dim=-1) for each in (motion, made)]
+    result = hold_planted(motion, stands, free=free, rest_height=torch.full((motion.num_frames, 2), 0.0425))
+    speeds = [each.joint_positions()[:, TOES].diff(dim=0).norm(dim=-1) for each in (motion, result)]
     held = (stands[1:] & stands[:-1])[12:]
     assert speeds[0][12:][held].mean() > 0.005
     assert speeds[1][12:][held].mean() < 0.002  # where legs are stretched, toes go along a little
-    assert torch.equal(made.local_quat_xyzw[:12], motion.local_quat_xyzw[:12])
-    assert torch.equal(made.root_position, motion.root_position)
+    assert torch.equal(result.local_quat_xyzw[:12], motion.local_quat_xyzw[:12])
+    assert torch.equal(result.root_position, motion.root_position)

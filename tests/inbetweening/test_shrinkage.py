@@ -40,9 +40,9 @@ class Guess(Inbetweener):
         quats = rotations.multiply(motion.local_quat_xyzw, rotations.from_rotation_vector(turn))
         quats = torch.where(query.missing.joints[..., None], quats, query.motion.local_quat_xyzw)
         root = torch.where(query.missing.root[:, None], motion.root_position, query.motion.root_position)
-        made = replace(query.motion, local_quat_xyzw=quats, root_position=root)
+        result = replace(query.motion, local_quat_xyzw=quats, root_position=root)
         spread = torch.full((motion.num_frames, motion.num_joints, 2), self.claim)
-        return Proposal(made, estimate_contact_logits(made), "guess", spread=spread)
+        return Proposal(result, estimate_contact_logits(result), "guess", spread=spread)
 
 
 def fill(motion, inbetweener, *masks):
@@ -50,8 +50,8 @@ def fill(motion, inbetweener, *masks):
     return infill(motion, inbetweener, list(masks), settings=InfillSettings(refine=False))
 
 
-def error(made, truth, frames):
-    return float((made.joint_positions() - truth.joint_positions())[frames].norm(dim=-1).mean())
+def error(result, truth, frames):
+    return float((result.joint_positions() - truth.joint_positions())[frames].norm(dim=-1).mean())
 
 
 def straight(motion, *masks):
@@ -66,20 +66,20 @@ def straight(motion, *masks):
 def test_a_network_that_is_wrong_is_outweighed_whatever_it_claims(start, stop, frames, claim):
     """Where it was tested. With 10 frames before and one after as well as within a long clip."""
     motion = walk(frames)
-    made = fill(motion, Guess(motion, wrong=0.8, claim=claim), Mask(ALL, start, stop))
+    result = fill(motion, Guess(motion, wrong=0.8, claim=claim), Mask(ALL, start, stop))
     simple = error(straight(motion, Mask(ALL, start, stop)), motion, slice(start, stop))
-    assert error(made.motion, motion, slice(start, stop)) < 1.05 * simple + 0.0015
-    (note,) = made.gap_notes
+    assert error(result.motion, motion, slice(start, stop)) < 1.05 * simple + 0.0015
+    (note,) = result.gap_notes
     assert "interpolation: the motion is unfamiliar to the guess" in note
 
 
 @pytest.mark.parametrize(("start", "stop", "frames"), [(40, 55, 100), (10, 25, 26)])
 def test_a_network_that_is_right_is_followed(start, stop, frames):
     motion = walk(frames)
-    made = fill(motion, Guess(motion, wrong=0.0, claim=0.01), Mask(ALL, start, stop))
+    result = fill(motion, Guess(motion, wrong=0.0, claim=0.01), Mask(ALL, start, stop))
     simple = error(straight(motion, Mask(ALL, start, stop)), motion, slice(start, stop))
-    assert error(made.motion, motion, slice(start, stop)) < 0.15 * simple
-    assert "unfamiliar" not in made.gap_notes[0]
+    assert error(result.motion, motion, slice(start, stop)) < 0.15 * simple
+    assert "unfamiliar" not in result.gap_notes[0]
 
 
 @pytest.mark.parametrize("fps", [30, 60])
@@ -91,15 +91,15 @@ def test_a_lost_arm_that_both_ends_hold_still_does_not_drop(fps):
     motion = replace(motion, local_quat_xyzw=quats)
     gap = slice(round(1.5 * fps), round(2.5 * fps))
     masks = [Mask(name, gap.start, gap.stop) for name in ("leftUpperArm", "leftLowerArm", "leftHand")]
-    made = fill(motion, Guess(motion, wrong=1.0, claim=0.02), *masks)
-    assert 100 * error(made.motion, motion, gap) < 0.5
+    result = fill(motion, Guess(motion, wrong=1.0, claim=0.02), *masks)
+    assert 100 * error(result.motion, motion, gap) < 0.5
 
 
 def test_bare_poses_are_no_evidence_against_the_network():
     motion, lost = walk(61), Mask(ALL, 1, 60)
-    made = fill(motion, Guess(motion, 0.0, 5.0), lost)
+    result = fill(motion, Guess(motion, 0.0, 5.0), lost)
     simple = error(straight(motion, lost), motion, slice(1, 60))
-    assert error(made.motion, motion, slice(1, 60)) < 0.05 * simple
+    assert error(result.motion, motion, slice(1, 60)) < 0.05 * simple
 
 
 @pytest.mark.parametrize(("leap", "taken"), [(0.5, True), (0.02, False)])
@@ -112,8 +112,8 @@ def test_an_answer_that_leaps_where_the_clip_does_not_is_not_taken(at, leap, tak
     root[at:55, 1] += leap
     missing = MissingMask.of_frames(lost, motion.num_joints)
     simple = interpolate_missing(motion, missing)
-    made, notes = take_simpler(replace(motion, root_position=root), simple, missing)
+    result, notes = take_simpler(replace(motion, root_position=root), simple, missing)
     wanted = simple.root_position if taken else root
-    assert torch.allclose(made.root_position[lost], wanted[lost])
-    assert torch.equal(made.root_position[~lost], motion.root_position[~lost])
+    assert torch.allclose(result.root_position[lost], wanted[lost])
+    assert torch.equal(result.root_position[~lost], motion.root_position[~lost])
     assert bool(notes) == taken

@@ -21,9 +21,9 @@ LIMBS = {"canonical": ("leftHand", "rightFoot"), "bandai": ("Hand_L", "Foot_R"),
 HIPS = {"canonical": "hips", "bandai": "Hips", "daz": "hip"}
 
 
-def made_of(motion, frames, *, method="infiller", drawn=0.02, **told):
+def made_of(motion, frames, *, method="infiller", drawn=0.02, **given):
     inbetweener, settings = by_method(method, tiny_infiller(drawn=drawn))
-    return tween(motion, Keys.of(tuple(frames), **told), inbetweener, settings=settings)
+    return tween(motion, Keys.of(tuple(frames), **given), inbetweener, settings=settings)
 
 
 def frames_of(fps):
@@ -37,22 +37,22 @@ def keyed(motion, frames):
     return MissingMask(free[:, None].expand(-1, motion.num_joints).clone(), free)
 
 
-def spoilt(motion, frames):
+def corrupted(motion, frames):
     """Nonsense between the keys."""
     wild = random_motion(motion.skeleton, motion.num_frames, seed=3)
     wild = replace(wild, moving_offsets={joint: wild.root_position for joint in motion.moving_offsets})
     return restore_observed(wild, motion, keyed(motion, frames))
 
 
-def assert_met(made, motion, frames):
+def assert_met(result, motion, frames):
     """To the bit."""
     frames = list(frames)
-    assert (made.num_frames, made.fps, made.skeleton) == (motion.num_frames, motion.fps, motion.skeleton)
-    assert torch.equal(made.local_quat_xyzw[frames], motion.local_quat_xyzw[frames])
-    assert torch.equal(made.root_position[frames], motion.root_position[frames])
+    assert (result.num_frames, result.fps, result.skeleton) == (motion.num_frames, motion.fps, motion.skeleton)
+    assert torch.equal(result.local_quat_xyzw[frames], motion.local_quat_xyzw[frames])
+    assert torch.equal(result.root_position[frames], motion.root_position[frames])
     for joint, values in motion.moving_offsets.items():
-        assert torch.equal(made.moving_offsets[joint][frames], values[frames])
-    assert made.joint_positions().isfinite().all()
+        assert torch.equal(result.moving_offsets[joint][frames], values[frames])
+    assert result.joint_positions().isfinite().all()
 
 
 def same(first, second):
@@ -60,9 +60,9 @@ def same(first, second):
     return quats and torch.equal(first.joint_positions(), second.joint_positions())
 
 
-def missed_cm(made, motion, frame, names):
+def missed_cm(result, motion, frame, names):
     joints = [motion.skeleton.index(name) for name in names]
-    return 100 * float((made.joint_positions() - motion.joint_positions())[frame, joints].norm(dim=-1).max())
+    return 100 * float((result.joint_positions() - motion.joint_positions())[frame, joints].norm(dim=-1).max())
 
 
 @pytest.mark.parametrize(
@@ -71,26 +71,26 @@ def missed_cm(made, motion, frame, names):
 )
 def test_poses_that_are_keys_are_met_to_the_bit(rig, fps, method):
     motion = on_rig(rig, round(1.5 * fps), fps=fps)
-    made = made_of(motion, frames_of(fps), method=method).motion
-    assert_met(made, motion, frames_of(fps))
-    apart = (made.joint_positions() - motion.joint_positions()).norm(dim=-1).amax(dim=1)
+    result = made_of(motion, frames_of(fps), method=method).motion
+    assert_met(result, motion, frames_of(fps))
+    apart = (result.joint_positions() - motion.joint_positions()).norm(dim=-1).amax(dim=1)
     assert (apart > 1e-4).sum() > motion.num_frames // 2
 
 
 @pytest.mark.parametrize(
-    ("rig", "method", "told"),
+    ("rig", "method", "given"),
     [
         ("canonical", "infiller", {}),
         ("daz", "slerp", {"limbs": True}),
         pytest.param("bandai", "auto", {"limbs": True}, marks=pytest.mark.slow),
     ],
 )
-def test_other_frames_change_nothing(rig, method, told):
+def test_other_frames_change_nothing(rig, method, given):
     motion, frames = on_rig(rig, 45), frames_of(30)
-    told = {"limbs": LIMBS[rig]} if "limbs" in told else told
-    other = spoilt(motion, frames)
+    given = {"limbs": LIMBS[rig]} if "limbs" in given else given
+    other = corrupted(motion, frames)
     assert not same(motion, other)
-    assert same(*(made_of(each, frames, method=method, **told).motion for each in (motion, other)))
+    assert same(*(made_of(each, frames, method=method, **given).motion for each in (motion, other)))
 
 
 @pytest.mark.slow
@@ -98,10 +98,10 @@ def test_on_a_rig_that_only_poses_tell_other_frames_change_nothing_either():
     """Its T-pose is found from the keys; joints that only it has carry hands elsewhere, and these are met all the
     same.
     """
-    made = make(Make(names_of("ue4"), bones_along_x=True, zup=True, root="root"))
-    motion, frames = made.motion(walk(45, turn_rate=0.3)), (0, 11, 30, 44)
-    limbs = (made.joint["leftHand"],)
-    first, second = (made_of(each, frames, method="slerp", limbs=limbs) for each in (motion, spoilt(motion, frames)))
+    result = make(Make(names_of("ue4"), bones_along_x=True, zup=True, root="root"))
+    motion, frames = result.motion(walk(45, turn_rate=0.3)), (0, 11, 30, 44)
+    limbs = (result.joint["leftHand"],)
+    first, second = (made_of(each, frames, method="slerp", limbs=limbs) for each in (motion, corrupted(motion, frames)))
     assert same(first.motion, second.motion)
     assert max(missed_cm(first.motion, motion, frame, limbs) for frame in (11, 30)) < 0.1
     assert first.notes == ()
@@ -138,12 +138,12 @@ def test_a_hand_whose_place_is_out_of_reach_is_said_to_miss_it():
 @pytest.mark.parametrize(("rig", "fps", "method"), [("daz", 60, "infiller"), ("bandai", 30, "auto")])
 def test_the_place_and_rotation_of_the_hips_are_met_to_the_bit(rig, fps, method):
     motion, frames = on_rig(rig, round(1.5 * fps), fps=fps), frames_of(fps)
-    made = made_of(motion, frames, method=method, root_only=True).motion
-    assert_met(made, motion, [frames[0], frames[-1]])
+    result = made_of(motion, frames, method=method, root_only=True).motion
+    assert_met(result, motion, [frames[0], frames[-1]])
     hips, between = motion.skeleton.index(HIPS[rig]), list(frames[1:-1])
-    assert torch.equal(made.joint_positions()[between, hips], motion.joint_positions()[between, hips])
-    assert torch.equal(made.joint_rotations()[between, hips], motion.joint_rotations()[between, hips])
-    assert not torch.equal(made.local_quat_xyzw[between], motion.local_quat_xyzw[between])
+    assert torch.equal(result.joint_positions()[between, hips], motion.joint_positions()[between, hips])
+    assert torch.equal(result.joint_rotations()[between, hips], motion.joint_rotations()[between, hips])
+    assert not torch.equal(result.local_quat_xyzw[between], motion.local_quat_xyzw[between])
 
 
 @pytest.mark.parametrize(("fps", "aside"), [(24, 1), (120, 2)])
@@ -153,11 +153,11 @@ def test_hips_that_are_keys_between_two_moments_do_not_leap(fps, aside):
     """
     motion = walk(2 * fps, fps=fps, turn_rate=1.5)
     frames = (0, fps // 2 + aside, fps + fps // 3 + aside, 2 * fps - 1)
-    made = made_of(motion, frames, drawn=0.0, root_only=True).motion
+    result = made_of(motion, frames, drawn=0.0, root_only=True).motion
     lines = interpolate_missing(motion, keyed(motion, frames))
-    off, straight_off = ((each.root_position - motion.root_position).norm(dim=-1).max() for each in (made, lines))
+    off, straight_off = ((each.root_position - motion.root_position).norm(dim=-1).max() for each in (result, lines))
     assert off < straight_off + 0.02
-    step, own = (torch.diff(each.root_position, dim=0).norm(dim=-1).max() for each in (made, motion))
+    step, own = (torch.diff(each.root_position, dim=0).norm(dim=-1).max() for each in (result, motion))
     assert step < 1.35 * own
 
 
@@ -191,16 +191,16 @@ def test_keys_that_cannot_be_are_refused(keys, message):
 
 
 @pytest.mark.parametrize(
-    ("joint", "told", "said"),
+    ("joint", "given", "said"),
     [("UpperArm_L", {}, True), ("UpperArm_L", {"root_only": True}, False), ("Hips", {"root_only": True}, True)],
 )
-def test_neighbouring_keys_that_no_joint_could_join_are_named_with_numbers(joint, told, said):
+def test_neighbouring_keys_that_no_joint_could_join_are_named_with_numbers(joint, given, said):
     motion = on_rig("bandai", 45)
     half, quats = torch.tensor(0.75).double(), motion.local_quat_xyzw.clone()
     turn = torch.stack([torch.sin(half), half * 0, half * 0, torch.cos(half)])
     index = motion.skeleton.index(joint)
     quats[20, index] = torch.tensor([0.0, 0.0, 0.0, 1.0]).double()
     quats[21, index] = turn
-    done = made_of(replace(motion, local_quat_xyzw=quats), (0, 20, 21, 44), **told)
+    done = made_of(replace(motion, local_quat_xyzw=quats), (0, 20, 21, 44), **given)
     expected = (f"{joint} needs 45 rad/s between frames 20 and 21, faster than joints turn",)
     assert tuple(note for note in done.notes if "as abrupt as" not in note) == (expected if said else ())

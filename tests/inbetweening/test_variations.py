@@ -59,8 +59,8 @@ def making(motion, keys):
     return lambda inbetweener, draws: tween(motion, keys, inbetweener, settings=FEW, generator=draws)
 
 
-def asked(motion, prior, *, count=3, seed=0, keys=KEYS, rolling=QUICK, **told):
-    make, rollouts = making(motion, Keys.of(keys, **told)), RolloutInbetweener([prior], INFILLER, rolling)
+def asked(motion, prior, *, count=3, seed=0, keys=KEYS, rolling=QUICK, **given):
+    make, rollouts = making(motion, Keys.of(keys, **given)), RolloutInbetweener([prior], INFILLER, rolling)
     first = AutoInbetweener(INFILLER, [prior])
     refinement = FEW.refinement
     return sample_variations(make, first, rollouts, count, generator=generator(seed), refinement=refinement)
@@ -73,9 +73,9 @@ def test_every_variation_meets_the_keys_to_the_bit_and_no_two_are_the_same(prior
     found = asked(motion, prior, keys=tuple(keys))
     positions = [one.solution.motion.joint_positions() for one in found.each]
     for one in found.each:
-        made = one.solution.motion
-        assert torch.equal(made.local_quat_xyzw[keys], motion.local_quat_xyzw[keys])
-        assert torch.equal(made.root_position[keys], motion.root_position[keys])
+        result = one.solution.motion
+        assert torch.equal(result.local_quat_xyzw[keys], motion.local_quat_xyzw[keys])
+        assert torch.equal(result.root_position[keys], motion.root_position[keys])
     apart = [float((positions[i] - positions[j]).norm(dim=-1).max()) for i in range(3) for j in range(i)]
     assert min(apart) > 0.002  # gaps are a third of a second
     assert found.diversity.world_cm > 0.1
@@ -90,14 +90,14 @@ def test_a_rollout_changes_nothing_that_is_known_or_has_no_end():
     gap = CanonicalClip.of(motion, missing).query()
     logits = SlerpInbetweener().propose(gap).contact_logits
     answer = RolloutInbetweener([tiny_density()], SlerpInbetweener(), QUICK).propose(gap, generator=generator(0))
-    made, bits = answer.motion, answer.contact_logits
+    result, bits = answer.motion, answer.contact_logits
     assert [(source.start, source.stop) for source in answer.attribute(gap)] == [(20, 30)]
     same = torch.ones(FRAMES, dtype=torch.bool)
     same[20:30] = False
-    torch.testing.assert_close(made.root_position[same], gap.motion.root_position[same])
-    torch.testing.assert_close(made.local_quat_xyzw[same], gap.motion.local_quat_xyzw[same])
+    torch.testing.assert_close(result.root_position[same], gap.motion.root_position[same])
+    torch.testing.assert_close(result.local_quat_xyzw[same], gap.motion.local_quat_xyzw[same])
     assert torch.equal(bits[same], logits[same])
-    assert float((made.root_position - gap.motion.root_position)[20:30].norm(dim=-1).max()) > 1e-4
+    assert float((result.root_position - gap.motion.root_position)[20:30].norm(dim=-1).max()) > 1e-4
 
 
 def test_a_gap_in_which_every_rollout_jumps_is_left_to_the_fallback():
@@ -116,23 +116,23 @@ def test_a_gap_in_which_every_rollout_jumps_is_left_to_the_fallback():
 @pytest.mark.parametrize("frames", [(30, 45), pytest.param((8, 45), marks=pytest.mark.slow)])
 def test_an_end_is_extended_by_a_density_and_a_beginning_never(prior, frames):
     motion, masks = on_rig("bandai", FRAMES), [Mask("*", 0, 2), Mask("*", *frames)]
-    plain, made, again = (
+    plain, result, again = (
         infill(motion, inbetweener, masks, settings=UNFINISHED)
         for inbetweener in (INFILLER, *[AutoInbetweener(INFILLER, [prior])] * 2)
     )
-    known = ~made.missing.frames
-    for one in (plain, made):
+    known = ~result.missing.frames
+    for one in (plain, result):
         assert torch.equal(one.motion.local_quat_xyzw[known], motion.local_quat_xyzw[known])
         assert bool(one.motion.joint_positions().isfinite().all())
-    apart = (made.motion.joint_positions() - plain.motion.joint_positions()).norm(dim=-1).amax(dim=-1)
+    apart = (result.motion.joint_positions() - plain.motion.joint_positions()).norm(dim=-1).amax(dim=-1)
     assert float(apart[:2].max()) < 1e-3
     assert float(apart[frames[0] + 3 :].min()) > 1e-4
-    assert [note.split(",")[0].rpartition("extended ")[2] for note in made.notes] == [
+    assert [note.split(",")[0].rpartition("extended ")[2] for note in result.notes] == [
         "backwards by infiller",
         f"by density {prior.name}",
     ]
     assert plain.notes[1].split(",")[0].endswith("extended by infiller")
-    assert torch.equal(again.motion.local_quat_xyzw, made.motion.local_quat_xyzw)
+    assert torch.equal(again.motion.local_quat_xyzw, result.motion.local_quat_xyzw)
 
 
 @pytest.mark.slow

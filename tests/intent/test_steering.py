@@ -113,9 +113,9 @@ def test_turning_gait_and_style_may_be_left_empty(read):
     ],
 )
 def test_bad_files_are_named_with_their_line(read, text, line, message):
-    with pytest.raises(FileFormatError, match=message) as told:
+    with pytest.raises(FileFormatError, match=message) as given:
         read(text)
-    assert told.value.line == line
+    assert given.value.line == line
 
 
 def test_places_hold_for_their_line_alone(read):

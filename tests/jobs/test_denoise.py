@@ -318,8 +318,8 @@ class Marking(Inbetweener):
         quats = torch.zeros_like(query.motion.local_quat_xyzw)
         quats[..., 0] = 1.0
         lifted = query.motion.root_position + torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
-        made = replace(query.motion, root_position=lifted, local_quat_xyzw=quats)
-        return Proposal(made, torch.zeros(made.num_frames, 2), "marking")
+        result = replace(query.motion, root_position=lifted, local_quat_xyzw=quats)
+        return Proposal(result, torch.zeros(result.num_frames, 2), "marking")
 
 
 def capture_of(motion, *, joints=(), start=0, stop=0, root=False):

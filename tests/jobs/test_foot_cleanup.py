@@ -42,9 +42,9 @@ def toe_speed(features: torch.Tensor) -> float:
 
 @pytest.mark.parametrize("frames", [5, 12, 19])
 def test_it_gives_as_many_frames_as_are_asked_for(frames):
-    made = finished([clip()[1:]], frames)
-    assert made.shape == (frames, LAYOUT.size)
-    assert bool(torch.isfinite(made).all())
+    result = finished([clip()[1:]], frames)
+    assert result.shape == (frames, LAYOUT.size)
+    assert bool(torch.isfinite(result).all())
 
 
 def test_planted_toes_slow_down_and_the_motion_stays_what_it_was():

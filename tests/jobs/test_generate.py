@@ -40,13 +40,13 @@ def short_pieces(monkeypatch):
     monkeypatch.setattr(sys.modules["controllers.generation.generate"], "_CHUNK", 50)
 
 
-def made(seconds=1.0, *, seed=0, settings=RAW, **options):
+def result(seconds=1.0, *, seed=0, settings=RAW, **options):
     return generate(DENSITY, seconds=seconds, generator=generator(seed), settings=settings, **options).motion
 
 
 @pytest.mark.parametrize(("seconds", "frames"), [(0.5, 15), (0.001, 2), (1.51, 45)])
 def test_it_is_as_long_as_asked(seconds, frames):
-    motion = made(seconds)
+    motion = result(seconds)
     assert (motion.num_frames, motion.fps) == (frames, 30)
     assert motion.skeleton is CANONICAL
     assert bool(torch.isfinite(motion.joint_positions()).all())
@@ -54,11 +54,11 @@ def test_it_is_as_long_as_asked(seconds, frames):
 
 @pytest.mark.slow
 def test_pieces_join_to_the_motion_sampled_in_one_go(monkeypatch):
-    whole = made(2.0, seed=5)
+    whole = result(2.0, seed=5)
     monkeypatch.setattr(sys.modules["controllers.generation.generate"], "_CHUNK", 13)
     pieces = list(stream(DENSITY, seconds=2.0, generator=generator(5), settings=RAW))
     assert [piece.motion.num_frames for piece in pieces] == [13, 13, 13, 13, 8]
-    joined = made(2.0, seed=5)
+    joined = result(2.0, seed=5)
     torch.testing.assert_close(joined.joint_positions(), whole.joint_positions(), atol=1e-6, rtol=0)
     assert turn_between(joined.local_quat_xyzw, whole.local_quat_xyzw) < 1e-6
     dots = (joined.local_quat_xyzw[1:] * joined.local_quat_xyzw[:-1]).sum(-1)
@@ -66,7 +66,7 @@ def test_pieces_join_to_the_motion_sampled_in_one_go(monkeypatch):
 
 
 def test_it_is_what_the_prior_samples_from_the_chosen_start():
-    motion = made(0.5, seed=3, settings=replace(RAW, start=2, temperature=0.5))
+    motion = result(0.5, seed=3, settings=replace(RAW, start=2, temperature=0.5))
     draws = generator(3)
     torch.multinomial(DENSITY.initial_states.weight, 1, generator=draws)
     state = DENSITY.initial_states.state.pick(torch.tensor([2]))
@@ -90,7 +90,7 @@ def test_it_continues_where_a_clip_ends(rig):
     if rig == "bandai":
         clip = retarget.from_canonical(clip, retarget.identify_rig(bandai_skeleton()))
     end = retarget.to_canonical(clip)[0]
-    motion = made(start_clip=clip)
+    motion = result(start_clip=clip)
     step = motion.root_position[0] - end.root_position[-1]
     assert 0.005 < float(step[::2].norm()) < 0.1
     turned = float(heading(motion.local_quat_xyzw[0, 0])) - float(heading(end.local_quat_xyzw[-1, 0]))
@@ -99,7 +99,7 @@ def test_it_continues_where_a_clip_ends(rig):
 
 def test_a_clip_warms_up_the_memory():
     clip = walk(40)
-    motion = made(0.2, start_clip=clip, settings=replace(RAW, temperature=0.0))
+    motion = result(0.2, start_clip=clip, settings=replace(RAW, temperature=0.0))
     features, position = encode(clip)
     state = DENSITY.advance(DENSITY.start_after(features[:1].float()), features[None, 1:].float())
     drawn, _ = DENSITY.sample(state, 6, generator(0), temperature=0.0)
@@ -124,7 +124,7 @@ class Raised:
 
 @pytest.mark.slow
 def test_a_refiner_comes_before_the_motion_is_decoded():
-    plain, lifted = made(), made(refiner=Raised())
+    plain, lifted = result(), result(refiner=Raised())
     assert lifted.num_frames == plain.num_frames
     torch.testing.assert_close(lifted.root_position[:, 1], plain.root_position[:, 1] + 0.1, atol=1e-5, rtol=0)
 
@@ -143,8 +143,8 @@ RATES = {("stand", "walk"): 0.1, ("walk", "stand"): 0.05, ("walk", "run"): 0.15,
 
 
 @dataclass(frozen=True, eq=False)
-class Told(ToyDensity):
-    """Takes a pace on that it is told often enough; its frames hold the number of the pace and how often it was."""
+class Conditioned(ToyDensity):
+    """Takes on a pace that conditions it often enough; its frames hold the number of the pace and how often it was."""
 
     pace: int = 0
     times: int = 0
@@ -175,17 +175,17 @@ class Told(ToyDensity):
 
 PACE, TIMES = LAYOUT.continuous - 1, LAYOUT.continuous - 2
 TOY = toy_density()
-TOLD = Told(TOY.initial_states, TOY.mean, TOY.sigma)
+PACED = Conditioned(TOY.initial_states, TOY.mean, TOY.sigma)
 STANDS = LastFrameState(torch.zeros(1, LAYOUT.size))
 
 
-def begin(prior=TOLD, speed=0.0) -> Beginning:
+def begin(prior=PACED, speed=0.0) -> Beginning:
     """Who stands, or goes at this speed, m/s."""
     return Beginning(prior, STANDS, GroundPose.origin(torch.float64), speed)
 
 
-def sample_told(prior, settings=None, *, speed=0.0, seed=0, **longest):
-    """Pieces of a motion that is told paces, without end."""
+def sample_paced(prior, settings=None, *, speed=0.0, seed=0, **longest):
+    """Pieces of a motion conditioned on paces, without end."""
     drawn = generator(seed)
     paces = plan_paces(prior, speed, drawn)
     return sample_pieces(begin(prior, speed), drawn, settings, paces=paces, **longest)
@@ -193,7 +193,7 @@ def sample_told(prior, settings=None, *, speed=0.0, seed=0, **longest):
 
 def sample(prior, pieces, **options):
     """So many pieces, joined."""
-    return torch.cat(list(islice(sample_told(prior, **options), pieces)))
+    return torch.cat(list(islice(sample_paced(prior, **options), pieces)))
 
 
 def test_paces_last_as_long_as_the_rates_say():
@@ -215,7 +215,7 @@ def test_paces_last_as_long_as_the_rates_say():
 def test_each_piece_is_sampled_given_its_pace():
     plan = list(islice(draw_paces(RATES, "stand", generator(5)), 12))
     frames = sum(count for _, count in plan)
-    pieces = list(islice(sample_told(TOLD, seed=5, longest=15), 2000))
+    pieces = list(islice(sample_paced(PACED, seed=5, longest=15), 2000))
     assert max(map(len, pieces)) <= 15
     numbers = {"stand": 1.0, "walk": 2.0, "run": 3.0}
     expected = torch.cat([torch.full((count,), numbers[pace]) for pace, count in plan])
@@ -226,7 +226,7 @@ def test_each_piece_is_sampled_given_its_pace():
 
 
 def test_what_is_not_taken_on_is_told_more_emphatically_and_then_no_more():
-    slow = replace(TOLD, needed=3, rates={("stand", "walk"): 5.0})
+    slow = replace(PACED, needed=3, rates={("stand", "walk"): 5.0})
     sampled = sample(slow, 12)
     after = sampled[sampled[:, PACE] == 2]
     assert after[:80:20, TIMES].tolist() == [1.0, 2.0, 3.0, 1.0]
@@ -234,12 +234,12 @@ def test_what_is_not_taken_on_is_told_more_emphatically_and_then_no_more():
     assert float(sample(replace(slow, needed=99), 30)[:, TIMES].max()) == 4
     runs = {("walk", "run"): 5.0}
     ran = sample(replace(slow, needed=99, rates=runs), 30, speed=1.2)
-    assert float(ran[ran[:, PACE] == 3, TIMES].max()) == 2, "a run that is told more often flings its legs"
+    assert float(ran[ran[:, PACE] == 3, TIMES].max()) == 2, "a run conditioned more often flings its legs"
 
 
 def test_the_first_pace_is_that_of_the_start():
     for speed, pace in ((0.1, 1), (1.2, 2), (3.0, 3)):
-        assert float(sample(TOLD, 1, speed=speed)[0, PACE]) == pace
+        assert float(sample(PACED, 1, speed=speed)[0, PACE]) == pace
     still = replace(tiny_density(), use_fast=False)
     slow_to_fast = replace(
         still, initial_states=replace(still.initial_states, speed=torch.tensor([0.1, 1.0, 2.0, 3.0]))

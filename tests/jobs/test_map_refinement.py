@@ -36,7 +36,7 @@ def standing_still(frames=60, *, drift=0.0):
     return Motion(CANONICAL, pose.fps, root, pose.local_quat_xyzw.expand(frames, -1, -1).clone())
 
 
-def told(motion, *, degrees=3.0, centimetres=2.0):
+def capture_of(motion, *, degrees=3.0, centimetres=2.0):
     """A capture of it, everything seen."""
     seen = torch.ones(motion.num_frames, CANONICAL.num_joints, dtype=torch.bool)
     sigma = torch.full((CANONICAL.num_joints,), math.radians(degrees))
@@ -72,7 +72,7 @@ def test_unknowns_of_unit_variance_move_poses_by_their_sigma_and_smoothly():
 
 def test_planted_toes_that_slide_slow_down_and_joints_stay_near():
     motion = standing_still(60, drift=0.2)
-    stood = refine(motion, odds(motion), told(motion), QUICK)
+    stood = refine(motion, odds(motion), capture_of(motion), QUICK)
     before, after = speeds(motion), speeds(stood.motion)
     assert after[2:].mean() < 0.6 * before[2:].mean()
     assert (stood.motion.joint_positions() - motion.joint_positions()).norm(dim=-1).mean() < 0.15
@@ -81,13 +81,13 @@ def test_planted_toes_that_slide_slow_down_and_joints_stay_near():
 
 def test_a_capture_without_noise_stays_but_for_half_millimetres():
     motion = walk(60)
-    stood = refine(motion, odds(motion), told(motion, degrees=0.0, centimetres=0.0), QUICK)
+    stood = refine(motion, odds(motion), capture_of(motion, degrees=0.0, centimetres=0.0), QUICK)
     assert (stood.motion.joint_positions() - motion.joint_positions()).norm(dim=-1).max() < 0.005
 
 
 def test_what_was_not_seen_moves_before_what_was():
     motion = standing_still(40, drift=0.2)
-    capture = told(motion, degrees=0.5, centimetres=0.1)
+    capture = capture_of(motion, degrees=0.5, centimetres=0.1)
     lost = replace(capture, seen_root=torch.zeros(1, 40, dtype=torch.bool))
     held, free = (speeds(refine(motion, odds(motion), given, QUICK).motion)[2:].mean() for given in (capture, lost))
     assert free < 0.5 * held
@@ -100,7 +100,7 @@ def test_a_density_counts_less_in_windows_that_are_out_of_its_depth():
     shallow = replace(deep, card=replace(deep.card, quality={"windows": {"p2": 1e5}}))
     found = {}
     for density in (deep, shallow):
-        stood = refine(motion, odds(motion), told(motion), settings, densities=[density])
+        stood = refine(motion, odds(motion), capture_of(motion), settings, densities=[density])
         assert [(part.start, part.stop) for part in stood.density_intervals] == [(0, 20), (20, 50)]
         (entry,) = (entry for entry in stood.ledger.entries if entry.name == "likelihood")
         scale = torch.cat([torch.full((part.stop - part.start,), part.weight) for part in stood.density_intervals])
@@ -115,7 +115,7 @@ def test_every_frame_comes_back_once_whatever_the_windows(monkeypatch):
     motion = walk(70, turn_rate=0.6)
     for frames, ahead in ((96, 24), (70, 8), (20, 8), (33, 1)):
         settings = replace(QUICK, frames=frames, ahead=ahead, budget=Budget(evaluations=2))
-        stood = refine(motion, odds(motion, -5.0, -5.0), told(motion), settings)
+        stood = refine(motion, odds(motion, -5.0, -5.0), capture_of(motion), settings)
         assert stood.motion.num_frames == len(stood.contacts) == 70
         assert (stood.motion.joint_positions() - motion.joint_positions()).norm(dim=-1).max() < 0.03
         assert all(len(entry.energy) == 70 for entry in stood.ledger.entries)
@@ -125,7 +125,7 @@ def test_windows_meet_without_a_jump():
     """A slide that many windows work on: the hips' accelerations where two meet are as elsewhere."""
     motion = standing_still(120, drift=0.2)
     settings = replace(QUICK, frames=40, ahead=16)
-    out = refine(motion, odds(motion), told(motion), settings).motion
+    out = refine(motion, odds(motion), capture_of(motion), settings).motion
     jump = torch.diff(out.joint_positions(), n=2, dim=0).norm(dim=-1).amax(dim=-1)
     seams = torch.zeros(len(jump), dtype=torch.bool)
     for seam in (24, 48, 72):
@@ -144,7 +144,7 @@ def test_a_window_without_a_finite_solution_is_left_as_proposed(monkeypatch):
         return replace(result, x=torch.full_like(result.x, math.nan), energy=torch.full_like(result.energy, math.nan))
 
     monkeypatch.setattr(window_solvers, "minimise", lost)
-    stood = refine(motion, odds(motion), told(motion), replace(QUICK, frames=30, ahead=10))
+    stood = refine(motion, odds(motion), capture_of(motion), replace(QUICK, frames=30, ahead=10))
     assert stood.motion.num_frames == 50
     assert (stood.motion.joint_positions() - motion.joint_positions()).norm(dim=-1).max() < 1e-4
 
@@ -152,7 +152,7 @@ def test_a_window_without_a_finite_solution_is_left_as_proposed(monkeypatch):
 @pytest.mark.parametrize("frames", [1, 2, 3])
 def test_short_proposals_break_nothing(frames):
     motion = walk(frames)
-    stood = refine(motion, odds(motion), told(motion), QUICK)
+    stood = refine(motion, odds(motion), capture_of(motion), QUICK)
     assert stood.motion.num_frames == frames
     assert (stood.motion.joint_positions() - motion.joint_positions()).norm(dim=-1).max() < 0.1
 
@@ -172,7 +172,7 @@ def test_a_body_that_lies_stays_however_sure_the_contacts():
     quats = motion.local_quat_xyzw.clone()
     quats[:, 0] = rotations.multiply(down, quats[:, 0])
     lying = replace(motion, root_position=rotations.rotate(down, motion.root_position), local_quat_xyzw=quats)
-    stood = refine(lying, odds(motion), told(motion), QUICK)
+    stood = refine(lying, odds(motion), capture_of(motion), QUICK)
     assert not stood.contacts.any()
     assert (stood.motion.joint_positions() - lying.joint_positions()).norm(dim=-1).max() < 0.002
 
@@ -182,7 +182,7 @@ def test_feet_stay_on_the_box_that_they_rest_on():
     motion = standing_still(90, drift=0.05)
     rise = 0.48 * ((torch.arange(90) - 40) / 15).clamp(0, 1).double()
     motion = replace(motion, root_position=motion.root_position + rise[:, None] * torch.tensor([0.0, 1.0, 0.0]))
-    stood = refine(motion, odds(motion), told(motion), QUICK)
+    stood = refine(motion, odds(motion), capture_of(motion), QUICK)
     assert stood.contacts[:38].all()
     assert stood.contacts[58:].all()
     assert not stood.contacts[43:54].any()
@@ -194,7 +194,7 @@ def test_feet_stay_on_the_box_that_they_rest_on():
 
 def test_toes_that_slide_unseen_are_lifted_and_those_that_were_seen_are_not():
     motion = standing_still(drift=1.5)
-    capture = told(motion, degrees=0.0, centimetres=0.0)
+    capture = capture_of(motion, degrees=0.0, centimetres=0.0)
     seen = torch.ones(60, dtype=torch.bool)
     seen[15:45] = False
     capture = replace(capture, seen=seen[None, :, None].expand_as(capture.seen), seen_root=seen[None])

@@ -71,33 +71,33 @@ def crouched() -> Motion:
     ids=["pose", "held and turned", "place", "facing", "height", "hips"],
 )
 def test_a_key_is_met_exactly_and_the_rest_of_the_shot_stays(key, walked, trajectory, inbetweener):
-    made, (met,) = meet_poses(walked, (key,), trajectory, inbetweener)
-    metres, degrees = measure_pose_error(made, met)
+    result, (met,) = meet_poses(walked, (key,), trajectory, inbetweener)
+    metres, degrees = measure_pose_error(result, met)
     if key.gives_facing_alone:
         assert degrees < 0.1
     else:
         assert metres < 0.001
     if key.facing_deg is not None:
-        there = float(torch.rad2deg(kinematics.heading(made.local_quat_xyzw[60:61, 0])))
+        there = float(torch.rad2deg(kinematics.heading(result.local_quat_xyzw[60:61, 0])))
         assert there == pytest.approx(key.facing_deg, abs=0.1)
     if key.place is not None:
-        torch.testing.assert_close(made.root_position[60, ::2], torch.tensor(key.place).double(), atol=1e-3, rtol=0)
+        torch.testing.assert_close(result.root_position[60, ::2], torch.tensor(key.place).double(), atol=1e-3, rtol=0)
     if key.height is not None:
-        assert float(made.root_position[60, 1]) == pytest.approx(0.8, abs=1e-3)
-    torch.testing.assert_close(made.root_position[:20], walked.root_position[:20])
-    torch.testing.assert_close(made.local_quat_xyzw[-15:], walked.local_quat_xyzw[-15:])
-    peaks = body.measure_peaks(made.joint_positions()[:, ENDS], made.root_position, 30.0)
+        assert float(result.root_position[60, 1]) == pytest.approx(0.8, abs=1e-3)
+    torch.testing.assert_close(result.root_position[:20], walked.root_position[:20])
+    torch.testing.assert_close(result.local_quat_xyzw[-15:], walked.local_quat_xyzw[-15:])
+    peaks = body.measure_peaks(result.joint_positions()[:, ENDS], result.root_position, 30.0)
     assert peaks.step * 30 < 5.5
 
 
 @pytest.mark.slow
 def test_a_rough_key_may_be_missed_by_its_tolerance_and_no_more(walked, trajectory, inbetweener):
     key = PoseKey(2.0, crouched(), tolerance=0.12)
-    made, (met,) = meet_poses(walked, (key,), trajectory, inbetweener)
-    assert 0.01 < measure_pose_error(made, met)[0] <= 0.12
+    result, (met,) = meet_poses(walked, (key,), trajectory, inbetweener)
+    assert 0.01 < measure_pose_error(result, met)[0] <= 0.12
     facing = PoseKey(2.0, facing_deg=60.0, tolerance=20.0)
-    made, (met,) = meet_poses(walked, (facing,), trajectory, inbetweener)
-    assert 10 < measure_pose_error(made, met)[1] <= 20
+    result, (met,) = meet_poses(walked, (facing,), trajectory, inbetweener)
+    assert 10 < measure_pose_error(result, met)[1] <= 20
 
 
 @pytest.mark.parametrize(
@@ -123,10 +123,10 @@ def test_keys_that_make_no_sense_are_refused(make, said):
 def test_a_rough_reach_asks_for_less(walked):
     hand = walked.joint_positions()[60, CANONICAL.index("leftHand")]
     position = hand + torch.tensor([0.3, 0.0, 0.0])
-    told = {"leftHand": tuple(position.tolist())}
+    given = {"leftHand": tuple(position.tolist())}
 
     def relaxed(tolerance) -> torch.Tensor:
-        targets = ReachTargets.of((Reach(2.0, told, 0.0, tolerance),), walked.num_frames)
+        targets = ReachTargets.of((Reach(2.0, given, 0.0, tolerance),), walked.num_frames)
         return targets.relaxed(walked).targets.positions[60, CANONICAL.index("leftHand")]
 
     torch.testing.assert_close(relaxed(0.0), position)
@@ -141,11 +141,11 @@ def test_hips_go_down_for_what_is_low_and_feet_stay_where_they_were(walked):
     shoulder = walked.joint_positions()[60, CANONICAL.index("leftUpperArm")]
     low = shoulder + torch.tensor([0.15, -0.65, 0.1])
     reach, nobody = Reach(2.0, {"leftHand": tuple(low.tolist())}, 0.2), torch.zeros(walked.num_frames, dtype=torch.bool)
-    made = go_down(walked, (reach,), nobody)
-    dropped = (walked.root_position - made.root_position)[:, 1]
+    result = go_down(walked, (reach,), nobody)
+    dropped = (walked.root_position - result.root_position)[:, 1]
     assert 0.1 < float(dropped[60]) < 0.31
     assert float(dropped[[20, -15]].abs().max()) == 0
-    torch.testing.assert_close(made.joint_positions()[:, feet], walked.joint_positions()[:, feet], atol=1e-3, rtol=0)
+    torch.testing.assert_close(result.joint_positions()[:, feet], walked.joint_positions()[:, feet], atol=1e-3, rtol=0)
     posed = nobody.clone()
     posed[70] = True
     assert torch.equal(go_down(walked, (reach,), posed).root_position, walked.root_position)
@@ -159,13 +159,13 @@ def test_hips_go_down_for_what_is_low_and_feet_stay_where_they_were(walked):
 @pytest.mark.slow
 def test_a_shot_ends_in_a_clips_frame_and_moves_as_the_clip_does(walked, inbetweener):
     arrival = Arrival.of(walk(120, turn_rate=0.4), 70).bring_to(LINE, 3.9)
-    made = arrive(walked, arrival, inbetweener)
-    assert made.num_frames == walked.num_frames
-    torch.testing.assert_close(made.joint_positions()[-1], arrival.motion.joint_positions()[0], atol=1e-6, rtol=0)
-    ahead = torch.cat([made.joint_positions(), arrival.motion.joint_positions()[1:3]])
+    result = arrive(walked, arrival, inbetweener)
+    assert result.num_frames == walked.num_frames
+    torch.testing.assert_close(result.joint_positions()[-1], arrival.motion.joint_positions()[0], atol=1e-6, rtol=0)
+    ahead = torch.cat([result.joint_positions(), arrival.motion.joint_positions()[1:3]])
     peaks = body.measure_peaks(ahead[-30:, ENDS], ahead[-30:, 0], 30.0)
     assert peaks.step * 30 < 5.5
-    torch.testing.assert_close(made.root_position[:60], walked.root_position[:60])
+    torch.testing.assert_close(result.root_position[:60], walked.root_position[:60])
 
 
 @pytest.mark.slow
@@ -173,13 +173,13 @@ def test_a_loop_leads_from_its_last_frame_into_its_first(inbetweener):
     """One lap of a walk whose stride does not divide it."""
     frames = 127
     long = walk(frames + OVERLAP, turn_rate=2 * math.pi / (frames / 30))
-    made = close_loop(long, frames, inbetweener)
-    assert made.num_frames == frames
+    result = close_loop(long, frames, inbetweener)
+    assert result.num_frames == frames
 
     def hardest(motion: Motion) -> float:
         twice = torch.cat([motion.joint_positions(), motion.joint_positions()])
         return 900 * float(torch.diff(twice, n=2, dim=0).norm(dim=-1)[:, ENDS].max())
 
     # A lap that is cut off has 197 m/s^2 where it begins again; laps put together without one made anew have 116.
-    assert hardest(made) < 35 < 100 < hardest(long.slice(0, frames))
-    torch.testing.assert_close(made.root_position[60:], long.root_position[60:frames])
+    assert hardest(result) < 35 < 100 < hardest(long.slice(0, frames))
+    torch.testing.assert_close(result.root_position[60:], long.root_position[60:frames])

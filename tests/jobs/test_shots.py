@@ -306,12 +306,12 @@ def jumping():
 
 def test_a_jump_is_made_anew_and_other_frames_stay(jumping):
     assert find_jumps(jumping).nonzero()[:, 0].tolist() == [AT - 1]
-    made = repair_jumps(jumping, LinearInbetweener())
-    assert not bool(find_jumps(made).any())
+    result = repair_jumps(jumping, LinearInbetweener())
+    assert not bool(find_jumps(result).any())
     others = torch.tensor([*range(AT - 7), *range(AT + 7, 80)])
-    assert torch.equal(made.root_position[others], jumping.root_position[others])
-    assert torch.equal(made.local_quat_xyzw[others], jumping.local_quat_xyzw[others])
-    moved = (made.joint_positions() - jumping.joint_positions())[AT - 1 : AT + 1].norm(dim=-1)
+    assert torch.equal(result.root_position[others], jumping.root_position[others])
+    assert torch.equal(result.local_quat_xyzw[others], jumping.local_quat_xyzw[others])
+    moved = (result.joint_positions() - jumping.joint_positions())[AT - 1 : AT + 1].norm(dim=-1)
     assert float(moved.max()) > 0.05
 
 

@@ -105,8 +105,8 @@ def solved(positions, start, skeleton=CANONICAL, **options):
 def test_any_pose_comes_back_from_its_places_whatever_one_starts_from(rig, seed):
     wanted = random_motion(SKELETONS[rig], 4, seed=seed)
     start = random_motion(SKELETONS[rig], 4, seed=seed + 1)
-    made = solved(wanted.joint_positions(), start.local_quat_xyzw, SKELETONS[rig])
-    assert (made.joint_positions() - wanted.joint_positions()).norm(dim=-1).max() < 1e-9
+    result = solved(wanted.joint_positions(), start.local_quat_xyzw, SKELETONS[rig])
+    assert (result.joint_positions() - wanted.joint_positions()).norm(dim=-1).max() < 1e-9
 
 
 ARM = Limb(*(CANONICAL.index(f"left{part}") for part in ("UpperArm", "LowerArm", "Hand")), (0, 0, -1))
@@ -131,9 +131,9 @@ def test_a_limb_of_short_bones_that_point_the_wrong_way_bends_as_it_did(limb, sh
     close = shoulder + 0.8 * (hand - shoulder)
     wrong[:, limb.end] = close
     wrong[:, limb.lower] = close + share * (wrong[:, limb.lower] - close)
-    made = solved(wrong, motion.local_quat_xyzw, limbs=(limb,)).joint_positions()
-    assert (made[:, limb.end] - close).norm(dim=-1).max() < 1e-9
-    now = made[:, limb.lower] - shoulder
+    result = solved(wrong, motion.local_quat_xyzw, limbs=(limb,)).joint_positions()
+    assert (result[:, limb.end] - close).norm(dim=-1).max() < 1e-9
+    now = result[:, limb.lower] - shoulder
     now = now - _along(now, close - shoulder)
     bent = bend.norm(dim=-1) > 0.02
     assert bent.any()
@@ -160,8 +160,8 @@ def test_straight_limbs_and_opposite_directions_give_something_finite(direction)
     aim = torch.tensor(direction).double()
     positions = (torch.arange(4)[:, None] * aim)[None]
     still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).expand(1, 4, 4)
-    made = solved(positions, still, limb)
-    assert made.local_quat_xyzw.isfinite().all()
-    assert torch.allclose(made.local_quat_xyzw.norm(dim=-1), torch.ones(1, 4).double())
+    result = solved(positions, still, limb)
+    assert result.local_quat_xyzw.isfinite().all()
+    assert torch.allclose(result.local_quat_xyzw.norm(dim=-1), torch.ones(1, 4).double())
     if aim.any():
-        assert torch.allclose(made.joint_positions(), positions, atol=1e-7)
+        assert torch.allclose(result.joint_positions(), positions, atol=1e-7)

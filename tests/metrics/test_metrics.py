@@ -200,7 +200,7 @@ def test_the_longest_time_unsupported_is_that_of_the_definition(slide):
 TREMOR = math.radians(0.3)
 
 
-def told(capsys, *words: object) -> dict:
+def given(capsys, *words: object) -> dict:
     assert run("measure", *words, "--json") == 0
     return json.loads(capsys.readouterr().out)
 
@@ -223,7 +223,7 @@ def unknown() -> Motion:
 
 def test_what_is_not_known_of_a_rig_is_said_in_one_line(tmp_path, capsys):
     unknown().save(tmp_path / "a.bvh")
-    values = told(capsys, tmp_path / "a.bvh")
+    values = given(capsys, tmp_path / "a.bvh")
     assert values["notes"] == [f"{tmp_path / 'a.bvh'}: {UNKNOWN_RIG_NOTE}"]
     assert values["measures"]["jitter_m_s3"] == pytest.approx(metrics.measure(unknown())["jitter_m_s3"], rel=1e-3)
     assert run("measure", tmp_path / "a.bvh") == 0

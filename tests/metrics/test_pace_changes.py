@@ -41,7 +41,7 @@ def test_sway_within_a_stride_is_no_change(fps):
         ([1.2, 0.4, 0.0, 0.4, 1.2], [1, 1, 0, 0, 1]),  # who slows down walks until he stands
         ([1.2, 1.9, 2.5, 1.9, 1.2], [1, 1, 2, 2, 1]),
         ([3.0, 0.0], [2, 0]),
-        ([0.4, 0.0, 1.2], [0, 0, 1]),  # before the first bound, what it tells
+        ([0.4, 0.0, 1.2], [0, 0, 1]),  # before the first bound, as it is
         ([0.4, 1.2], [1, 1]),
         ([0.45], [1]),
         ([0.3], [0]),

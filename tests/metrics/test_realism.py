@@ -80,7 +80,7 @@ def test_two_sets_of_one_kind_cannot_be_told_apart_and_trembling_can():
     mocap, alike = clip_set(24), clip_set(24, seed=1)
     shaky = [trembling(clip, 0.03, seed=k) for k, clip in enumerate(alike)]
     same, other = (
-        realism.measure_realism(made, mocap, generator=generator(4), settings=QUICK) for made in (alike, shaky)
+        realism.measure_realism(result, mocap, generator=generator(4), settings=QUICK) for result in (alike, shaky)
     )
     assert 0.2 < same.accuracy < 0.8
     assert 0.2 < same.floor_accuracy < 0.8
@@ -134,6 +134,6 @@ def test_step_lengths_go_from_foot_to_other_foot():
     toes = torch.zeros(60, 2, 2, dtype=torch.float64)
     toes[14, 1], toes[22, 1], toes[28, 0] = (torch.tensor(at).double() for at in ([0.3, 0.4], [0.0, 1.0], [0.0, 1.7]))
     lengths = gait.step_lengths(toes, planted, 30.0)
-    told = {int(frame): float(lengths[frame]) for frame in (~lengths.isnan()).nonzero()[:, 0]}
+    given = {int(frame): float(lengths[frame]) for frame in (~lengths.isnan()).nonzero()[:, 0]}
     # 22 sets the same foot down again; 59 is a second and more after the touch-down before it
-    assert told == pytest.approx({14: 0.5, 28: 0.7})
+    assert given == pytest.approx({14: 0.5, 28: 0.7})

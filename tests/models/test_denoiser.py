@@ -69,8 +69,8 @@ def test_little_noise_changes_little():
     clean = capture()
     changes = []
     for degrees in (0.01, 0.1, 1.0):
-        told = replace(clean, sigma=clean.sigma + degrees * DEGREE)
-        changes.append(errors(network(drawn=0.3)(told), clean)[1])
+        given = replace(clean, sigma=clean.sigma + degrees * DEGREE)
+        changes.append(errors(network(drawn=0.3)(given), clean)[1])
     assert changes[0] < 0.1 * changes[1] < 0.1 * changes[2]
 
 

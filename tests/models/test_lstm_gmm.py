@@ -189,9 +189,9 @@ def frames_of_planting():
 @pytest.fixture(scope="module")
 def factor():
     """Of a covariance whose values depend on each other."""
-    made = 0.01 * torch.randn(SIZE, SIZE, generator=generator(1)) / SIZE**0.5 + 0.004 * torch.eye(SIZE)
-    made[:2] *= 0.3
-    return made
+    result = 0.01 * torch.randn(SIZE, SIZE, generator=generator(1)) / SIZE**0.5 + 0.004 * torch.eye(SIZE)
+    result[:2] *= 0.3
+    return result
 
 
 def condition(before, mean, factor, *, bits=(1.0, 1.0), count=1, seed=0):
@@ -280,10 +280,10 @@ def test_a_copy_that_was_told_is_the_network_under_that_condition():
     memory = network.start_after(inputs[:, 0])
     condition = torch.tensor([[0.0, 0.0, 1.0]])  # clean; not running; old
     expected, _ = network(inputs, (memory.hidden, memory.cell), condition=condition)
-    untold, _ = network(inputs, (memory.hidden, memory.cell))
+    unlabelled, _ = network(inputs, (memory.hidden, memory.cell))
     old, _ = network.conditioned_on(["style=old"])(inputs, (memory.hidden, memory.cell))
     torch.testing.assert_close(old.mean, expected.mean)
-    assert not torch.allclose(untold.mean, expected.mean)
+    assert not torch.allclose(unlabelled.mean, expected.mean)
     with pytest.raises(RequestError, match="no label 'style=new', only gait=run, style=old"):
         network.conditioned_on(["style=new"])
 
@@ -293,10 +293,10 @@ def test_half_of_the_windows_are_shown_no_label(tmp_path):
     known = density.Labels(("gait=walk", "style=old"), torch.tensor([[1.0, 1.0]] * 5))
     settings = small_settings("lstm-gmm", tmp_path, tmp_path, batch=2000, window=6)
     trainer = DensityTrainer(settings, data, LstmGmmConfig(width=8, components=1, labels=known.names), known)
-    _, told = trainer.draw_windows()
-    silent = float((told.sum(-1) == 0).double().mean())
+    _, given = trainer.draw_windows()
+    silent = float((given.sum(-1) == 0).double().mean())
     assert pytest.approx(silent, abs=0.04) == 0.5 + 0.5 * 0.09
-    assert {tuple(row) for row in told.tolist()} == {(0, 0), (1, 0), (0, 1), (1, 1)}
+    assert {tuple(row) for row in given.tolist()} == {(0, 0), (1, 0), (0, 1), (1, 1)}
 
 
 def labelled_density() -> LstmGmmDensity:
@@ -317,8 +317,8 @@ def test_a_told_density_begins_where_the_labels_hold():
     assert len(density.conditioned_on([]).initial_states.names) == 4
     state, noise = density.initial_states.state.pick(torch.tensor([0])), torch.zeros(1, 3, 66)
     plan = density.plan(state, noise)
-    told, untold = (some.rollout(state, noise, plan)[0] for some in (old_runner, density))
-    assert not torch.allclose(told, untold)
+    given, unlabelled = (some.rollout(state, noise, plan)[0] for some in (old_runner, density))
+    assert not torch.allclose(given, unlabelled)
 
 
 def test_a_density_is_told_what_a_clips_path_tells_of_the_labels_that_it_knows():
@@ -326,7 +326,7 @@ def test_a_density_is_told_what_a_clips_path_tells_of_the_labels_that_it_knows()
     state, noise = density.initial_states.state.pick(torch.tensor([0])), torch.zeros(1, 3, 66)
     plan = density.plan(state, noise)
 
-    for name, told in (("set/b_run_old_9.bvh", ["run", "old"]), ("set/b_walk_old_9.bvh", ["old"]), ("other.bvh", [])):
-        like, on = density.conditioned_like_clip(name), density.conditioned_on(told)
+    for name, given in (("set/b_run_old_9.bvh", ["run", "old"]), ("set/b_walk_old_9.bvh", ["old"]), ("other.bvh", [])):
+        like, on = density.conditioned_like_clip(name), density.conditioned_on(given)
         assert torch.allclose(like.rollout(state, noise, plan)[0], on.rollout(state, noise, plan)[0])
         assert like.initial_states.names == density.initial_states.names

@@ -60,10 +60,10 @@ def test_untrained_it_interpolates_and_drawn_it_does_not(masks):
 
 def test_what_is_known_keeps_the_query_s_numbers():
     query = query_of(ARM)
-    made = DRAWN.propose(query).motion
-    assert torch.equal(made.root_position, query.motion.root_position)
+    result = DRAWN.propose(query).motion
+    assert torch.equal(result.root_position, query.motion.root_position)
     known = ~query.missing.joints
-    turn = rotations.multiply(rotations.inverse(query.motion.local_quat_xyzw), made.local_quat_xyzw)
+    turn = rotations.multiply(rotations.inverse(query.motion.local_quat_xyzw), result.local_quat_xyzw)
     assert float(rotations.to_rotation_vector(turn).norm(dim=-1)[known].max()) < 1e-6
 
 
@@ -98,9 +98,9 @@ def windows(count=3, frames=30):
 
 
 def with_gap(motion, start, stop):
-    told = torch.ones(motion.heading.shape, dtype=torch.bool)
-    told[:, start:stop] = False
-    return replace(motion, known=KnownParts.whole(told))
+    given = torch.ones(motion.heading.shape, dtype=torch.bool)
+    given[:, start:stop] = False
+    return replace(motion, known=KnownParts.whole(given))
 
 
 def test_untrained_both_stages_interpolate_and_what_is_known_stays():
@@ -112,10 +112,10 @@ def test_untrained_both_stages_interpolate_and_what_is_known_stays():
     torch.testing.assert_close(positions, guess, atol=1e-4, rtol=0)
     torch.testing.assert_close(proposed.rough.poses(hidden.offsets)[0], guess, atol=1e-4, rtol=0)
     drawn = network(drawn=0.2, config=TWO)
-    made = drawn(hide(drawn, hidden))
+    result = drawn(hide(drawn, hidden))
     truth = hidden.world_poses()[0]
-    torch.testing.assert_close(made.poses(hidden.offsets)[0][:, :10], truth[:, :10], atol=1e-4, rtol=0)
-    assert float((made.poses(hidden.offsets)[0] - truth)[:, 10:20].norm(dim=-1).mean()) > 0.02
+    torch.testing.assert_close(result.poses(hidden.offsets)[0][:, :10], truth[:, :10], atol=1e-4, rtol=0)
+    assert float((result.poses(hidden.offsets)[0] - truth)[:, 10:20].norm(dim=-1).mean()) > 0.02
 
 
 def with_tilt_alone(motion):
@@ -130,11 +130,11 @@ def with_tilt_alone(motion):
 def test_the_second_stage_adds_to_what_the_first_proposes(hide_parts):
     hidden = hide_parts(windows())
     # The first stage's head is drawn; the second's is still nil.
-    made = network(drawn=0.2, config=TWO)
-    proposed = made(hide(made, hidden))
+    result = network(drawn=0.2, config=TWO)
+    proposed = result(hide(result, hidden))
     torch.testing.assert_close(proposed.local_matrix, proposed.rough.local_matrix, atol=1e-5, rtol=0)
     torch.testing.assert_close(proposed.root_position, proposed.rough.root_position)
-    torch.nn.init.normal_(made.detail.head.weight, std=0.2)
-    corrected = made(hide(made, hidden))
+    torch.nn.init.normal_(result.detail.head.weight, std=0.2)
+    corrected = result(hide(result, hidden))
     torch.testing.assert_close(corrected.rough.local_matrix, proposed.rough.local_matrix)
     assert float((corrected.local_matrix - proposed.local_matrix)[:, 10:20].abs().max()) > 0.01

@@ -70,17 +70,17 @@ def test_the_first_draws_do_not_depend_on_the_count_and_differ():
 
 
 def test_draws_that_are_not_finite_are_dropped_and_counted():
-    made = tiny_stitcher().draw(bare(walk(60), 11, 30), 20, count=8, generator=torch.Generator().manual_seed(3))
-    made.root_position[[2, 3]] = torch.nan
+    result = tiny_stitcher().draw(bare(walk(60), 11, 30), 20, count=8, generator=torch.Generator().manual_seed(3))
+    result.root_position[[2, 3]] = torch.nan
     draws = Draws(0)
 
     def pick(number):
-        return draws.pick(bare(walk(60), 11, 30), 11, 20, number, lambda noise, heat: made)
+        return draws.pick(bare(walk(60), 11, 30), 11, 20, number, lambda noise, heat: result)
 
-    assert torch.equal(pick(2).quats, made.quats[4:5])
-    assert torch.equal(pick(1).quats, made.quats[1:2])
-    made.root_position[:] = torch.nan
-    assert Draws(0).pick(bare(walk(60), 11, 30), 11, 20, 0, lambda noise, heat: made) is None
+    assert torch.equal(pick(2).quats, result.quats[4:5])
+    assert torch.equal(pick(1).quats, result.quats[1:2])
+    result.root_position[:] = torch.nan
+    assert Draws(0).pick(bare(walk(60), 11, 30), 11, 20, 0, lambda noise, heat: result) is None
 
 
 def test_an_answer_that_is_not_finite_is_left_to_another():
@@ -103,11 +103,11 @@ def stitched(load=never):
 
 def test_gaps_that_are_too_long_or_have_one_end_are_the_others_and_the_rest_stays_stitched():
     query = query_of(walk(90), (10, 25), (40, 70), (80, 90))
-    made, alone = stitched(SlerpInbetweener).propose(query), tiny_stitcher().propose(query)
-    assert torch.equal(made.motion.local_quat_xyzw[10:25], alone.motion.local_quat_xyzw[10:25])
+    result, alone = stitched(SlerpInbetweener).propose(query), tiny_stitcher().propose(query)
+    assert torch.equal(result.motion.local_quat_xyzw[10:25], alone.motion.local_quat_xyzw[10:25])
     slerp = SlerpInbetweener().propose(query).motion
-    assert torch.equal(made.motion.local_quat_xyzw[40:], slerp.local_quat_xyzw[40:])
-    first, second, third = made.attribute(query)
+    assert torch.equal(result.motion.local_quat_xyzw[40:], slerp.local_quat_xyzw[40:])
+    first, second, third = result.attribute(query)
     assert (first.by, first.reason) == ("stitcher", "")
     assert (second.by, second.reason) == ("slerp", "longer than the 23 frames that the stitcher fills")
     assert (third.by, third.start, third.stop) == ("slerp", 80, 90)
@@ -116,11 +116,11 @@ def test_gaps_that_are_too_long_or_have_one_end_are_the_others_and_the_rest_stay
 
 def test_what_was_stitched_is_reported():
     done = tween(walk(60), Keys.of([0, 20, 59]), stitched(SlerpInbetweener), settings=RAW)
-    told = done.details()
-    assert 0 <= told["sides_apart_cm"] < 100
-    assert [(row["by"], row["start"], row["stop"]) for row in told["fallback"]] == [("slerp", 21, 59)]
-    assert told["timing"]["draw_ms"] > 0
-    assert told["timing"]["finish_ms"] > 0
+    given = done.details()
+    assert 0 <= given["sides_apart_cm"] < 100
+    assert [(row["by"], row["start"], row["stop"]) for row in given["fallback"]] == [("slerp", 21, 59)]
+    assert given["timing"]["draw_ms"] > 0
+    assert given["timing"]["finish_ms"] > 0
 
 
 GAP = slice(21, 40)
@@ -155,11 +155,11 @@ def test_the_fit_is_that_of_least_squares(spread):
         root = torch.nn.functional.pad(codes[..., None], (0, 2)).float()
         return Joined(root, torch.zeros(len(codes), 4, 21, 4), torch.zeros(len(codes), 4, 2), torch.zeros(len(codes)))
 
-    def read(made):
-        return made.root_position[..., 0].double().numpy()
+    def read(result):
+        return result.root_position[..., 0].double().numpy()
 
-    def measure(made):
-        return torch.as_tensor(residuals(read(made))).float()
+    def measure(result):
+        return torch.as_tensor(residuals(read(result))).float()
 
     def energy(codes):
         return np.square(residuals(codes)).sum() + np.square((codes - centre) / spread).sum()
@@ -201,8 +201,8 @@ def test_a_trajectory_is_followed_and_one_that_is_far_is_the_others():
         root = query.motion.root_position.clone()
         root[GAP, 0] += scale * bow
         led = replace(query, motion=replace(query.motion, root_position=root), keep_trajectory=True)
-        made = StitchedInbetweener(tiny_stitcher(), SlerpInbetweener).propose(led)
-        assert [source.by for source in made.attribute(led)] == [by]
-        assert float((made.motion.root_position - root)[GAP, ::2].norm(dim=-1).mean()) < 0.03
-    (source,) = made.attribute(led)
+        result = StitchedInbetweener(tiny_stitcher(), SlerpInbetweener).propose(led)
+        assert [source.by for source in result.attribute(led)] == [by]
+        assert float((result.motion.root_position - root)[GAP, ::2].norm(dim=-1).mean()) < 0.03
+    (source,) = result.attribute(led)
     assert "off the trajectory" in source.reason

@@ -62,11 +62,11 @@ def standing(frames):
 def test_keys_stay_to_the_bit_and_are_approached_smoothly():
     query = query_of(walk(120), (1, 60), (61, 119))
     known, shown = ~query.missing.frames, query.motion
-    made = tiny_tweener().propose(query).motion
-    assert torch.equal(made.root_position[known], shown.root_position[known])
-    same = (made.local_quat_xyzw * shown.local_quat_xyzw).sum(dim=-1).abs()
+    result = tiny_tweener().propose(query).motion
+    assert torch.equal(result.root_position[known], shown.root_position[known])
+    same = (result.local_quat_xyzw * shown.local_quat_xyzw).sum(dim=-1).abs()
     assert float((1 - same[known]).max()) < 1e-12
-    positions = made.joint_positions() - made.root_position[:, None]
+    positions = result.joint_positions() - result.root_position[:, None]
     step = torch.diff(positions, dim=0).norm(dim=-1).mean(dim=-1)
     beside = step[[0, 59, 60, 118]]
     assert float(beside.max()) < 3 * float(step.median())
@@ -78,11 +78,11 @@ def test_hips_that_tremble_are_led_calmly():
     shaken = replace(motion, root_position=motion.root_position + 0.01 * (-1.0) ** torch.arange(100)[:, None])
     query = query_of(motion, (1, 99))
     calm, trembling = (
-        torch.diff(tiny_tweener(path=ToldPath(told)).propose(query).motion.root_position, n=3, dim=0)[10:-10].norm()
-        for told in (motion, shaken)
+        torch.diff(tiny_tweener(path=ToldPath(given)).propose(query).motion.root_position, n=3, dim=0)[10:-10].norm()
+        for given in (motion, shaken)
     )
-    told = torch.diff(shaken.root_position, n=3, dim=0)[10:-10].norm()
-    assert float(trembling) < 0.4 * float(told)
+    given = torch.diff(shaken.root_position, n=3, dim=0)[10:-10].norm()
+    assert float(trembling) < 0.4 * float(given)
     assert float(calm) < float(trembling)
 
 
@@ -90,10 +90,10 @@ def test_hips_go_where_the_path_predictor_sees_them_go_and_arrive():
     motion = walk(100)
     query = query_of(motion, (1, 99))
     for stretch in (1.0, 1.3):
-        made = tiny_tweener(path=ToldPath(motion, stretch)).propose(query).motion
-        away = (made.root_position - motion.root_position)[:, ::2].norm(dim=-1)
+        result = tiny_tweener(path=ToldPath(motion, stretch)).propose(query).motion
+        away = (result.root_position - motion.root_position)[:, ::2].norm(dim=-1)
         assert float(away.max()) < 0.1  # the made body faces elsewhere than the walk's
-        steps = torch.diff(made.root_position[:, 2])
+        steps = torch.diff(result.root_position[:, 2])
         assert float(steps.min()) > 0
 
 
@@ -130,23 +130,23 @@ def test_a_class_of_the_card_is_a_style_without_poses():
     classes = read_classes(card, tiny.CONFIG.style)
     assert set(classes) == {"walk", "dance-on"}
     plain, query = tiny_tweener(), query_of(walk(120), (1, 119))
-    made = [plain.in_style(style).propose(query).motion for style in classes.values()]
-    assert float(furthest(*made)[30:90].max()) > 1e-4
+    result = [plain.in_style(style).propose(query).motion for style in classes.values()]
+    assert float(furthest(*result)[30:90].max()) > 1e-4
     assert all(style.poses is None for style in classes.values())
 
 
 @pytest.mark.slow
 def test_a_long_gap_is_split_by_poses_of_the_style_or_of_the_keys_and_a_note_says_so():
     query, plain = query_of(walk(600), (10, 580)), tiny_tweener()
-    made = {}
+    result = {}
     for tweener, by in ((plain, "the keys beside it"), (plain.styled(FAST), "the style")):
         answer = tweener.propose(query)
         (source,) = answer.attribute(query)
         assert (source.start, source.stop) == (10, 580)
         assert source.reason == f"longer than the 16 s that the tweener sees; split at 6.7, 13.0 s by poses of {by}"
-        made[by] = answer.motion
+        result[by] = answer.motion
     nothing = replace(plain, style=Style("nothing", plain.encode_style(FAST).vector))
-    assert float(furthest(made["the style"], nothing.propose(query).motion)[150:450].max()) > 1e-3
+    assert float(furthest(result["the style"], nothing.propose(query).motion)[150:450].max()) > 1e-3
     short = query_of(walk(120), (10, 100))
     assert not plain.propose(short).attribute(short)[0].reason
 
@@ -213,8 +213,8 @@ def test_the_class_of_a_clip_is_in_its_name(clip, name):
 
 
 def test_vectors_are_means_over_clips_and_come_back_from_the_card():
-    encoder, made = tiny.network().style, corpus(3, 90)
-    members = collect_dna(made, r"walk-([01])")
+    encoder, result = tiny.network().style, corpus(3, 90)
+    members = collect_dna(result, r"walk-([01])")
     assert {name: len(each) for name, each in members.items()} == {"0": 1, "1": 1}
     other = MotionDna(torch.randn(4, 21, 3, generator=generator()))
     two = {"both": [members["0"][0], other], "one": members["0"]}
@@ -227,7 +227,7 @@ def test_vectors_are_means_over_clips_and_come_back_from_the_card():
     torch.testing.assert_close(classes["both"].vector, (each[0] + each[1]) / 2, atol=2e-3, rtol=2e-3)
     torch.testing.assert_close(classes["one"].vector, each[0], atol=2e-3, rtol=2e-3)
     assert count_clips(card.data)["classes"] == {"both": 2, "one": 1}
-    assert compute_classes(tiny.network(), made)["classes"]["walk"]["clips"] == 3
+    assert compute_classes(tiny.network(), result)["classes"]["walk"]["clips"] == 3
 
 
 @pytest.mark.parametrize("vector", ["%%%", "AAAA", None, "AHwAfAB8AHwAfA=="])
@@ -253,9 +253,9 @@ SMALL = GeneratorConfig((8, 8, 8, 12, 12, 12), (12, 12, 8, 8, 8, 8), style=5)
 def network(config=SMALL, seed=0):
     with torch.random.fork_rng():
         torch.manual_seed(seed)
-        made = GeneratorNetwork(config)
-        torch.nn.init.normal_(made.last.weight, std=0.05)
-    return made.eval().requires_grad_(False)
+        result = GeneratorNetwork(config)
+        torch.nn.init.normal_(result.last.weight, std=0.05)
+    return result.eval().requires_grad_(False)
 
 
 def count(module):
@@ -292,7 +292,7 @@ def test_weights_are_as_many_as_may_be_bundled_and_as_in_the_paper():
 
 
 def test_the_style_changes_the_answer_and_does_not_depend_on_the_order_of_its_poses():
-    made, image = network(), image_of(walk(70), (0, 69))
+    result, image = network(), image_of(walk(70), (0, 69))
     encoder = StyleEncoder(5)
     poses = torch.randn(1, 6, 21, 3, generator=generator())
     found = encoder(poses)
@@ -300,7 +300,7 @@ def test_the_style_changes_the_answer_and_does_not_depend_on_the_order_of_its_po
     hips = poses.clone()
     hips[..., 0, :] += 1.0
     torch.testing.assert_close(found, encoder(hips))
-    apart = made(image, found.detach()).pose.positions - made(image, -found.detach()).pose.positions
+    apart = result(image, found.detach()).pose.positions - result(image, -found.detach()).pose.positions
     assert float(apart.abs().max()) > 1e-3
 
 
@@ -315,7 +315,7 @@ def test_batch_regularisation_is_nil_for_unit_responses_and_grows_with_mean_and_
 
 
 def test_coordinates_are_known_one_by_one():
-    """A drawing of a hand from the front: its depth is told by the key before."""
+    """A drawing of a hand from the front: its depth is that of the key before."""
     motion, hand = walk(30), CANONICAL.index("leftHand")
     axes = torch.zeros(1, 30, 21, 3, dtype=torch.bool)
     axes[0, 20, hand, :2] = True

@@ -36,16 +36,16 @@ def tremble(hertz, frames=240, fps=30.0):
 def test_of_a_tremble_half_is_left_and_nearly_all_of_what_is_slower():
     free = torch.zeros(240, dtype=torch.bool)
     for hertz, least, most in ((7.0, 0.45, 0.55), (14.0, 0.0, 0.3), (1.0, 0.99, 1.001)):
-        made = smooth_between(tremble(hertz), free, hertz=7.0, fps=30.0)[40:-40]
-        assert least < float(made.std() / tremble(hertz)[40:-40].std()) < most
+        result = smooth_between(tremble(hertz), free, hertz=7.0, fps=30.0)[40:-40]
+        assert least < float(result.std() / tremble(hertz)[40:-40].std()) < most
 
 
 def test_what_is_held_stays_to_the_bit_and_a_straight_line_to_rounding():
     values, held = tremble(9.0), torch.zeros(240, dtype=torch.bool)
     held[[0, 77, 78, 239]] = True
-    made = smooth_between(values, held, hertz=7.0, fps=30.0)
-    assert torch.equal(made[held], values[held])
-    assert float((made - values)[~held].abs().mean()) > 0.1
+    result = smooth_between(values, held, hertz=7.0, fps=30.0)
+    assert torch.equal(result[held], values[held])
+    assert float((result - values)[~held].abs().mean()) > 0.1
     line = torch.linspace(-3.0, 4.0, 50).double()[:, None]
     torch.testing.assert_close(smooth_between(line, held[:50], hertz=3.0, fps=30.0), line)
     assert torch.equal(smooth_between(line[:2], held[1:3], hertz=3.0, fps=30.0), line[:2])
@@ -64,16 +64,16 @@ def test_offsets_that_do_not_fade_are_the_cubic_that_leaves_and_arrives_at_rest(
 
 
 def test_joints_turn_until_they_are_as_wanted_and_no_further():
-    made = rotations.from_rotation_vector(torch.randn(200, 3, 3, generator=generator()).double())
+    result = rotations.from_rotation_vector(torch.randn(200, 3, 3, generator=generator()).double())
     wanted = rotations.from_rotation_vector(torch.randn(200, 3, 3, generator=generator(1)).double())
     firm = torch.zeros(200, 3, dtype=torch.bool)
     firm[[20, 100], 0] = True
     firm[100, 1] = True
-    found = interpolate_turns(made, wanted, firm, seconds=0.3, fps=30.0)
+    found = interpolate_turns(result, wanted, firm, seconds=0.3, fps=30.0)
     same = (found * wanted).sum(dim=-1).abs()
     assert float((1 - same[firm]).max()) < 1e-12
-    assert torch.equal(found[:, 2], made[:, 2])  # never firm
-    turned = rotations.to_rotation_vector(rotations.multiply(rotations.inverse(made), found)).norm(dim=-1)
+    assert torch.equal(found[:, 2], result[:, 2])  # never firm
+    turned = rotations.to_rotation_vector(rotations.multiply(rotations.inverse(result), found)).norm(dim=-1)
     assert float(turned[20, 1]) < 0.1 < float(turned[20, 0])  # a joint is not led by another's keys
     assert float(turned[180:].max()) < 0.03  # and far from keys none is
     assert float(torch.diff(turned[15:26, 0]).abs().max()) < 0.2 * float(turned[20, 0])

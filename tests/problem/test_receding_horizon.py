@@ -64,11 +64,11 @@ def test_windows_join_without_a_seam():
 
 
 def test_every_window_keeps_its_budget_and_progress_is_told():
-    told = []
-    done, _ = solve(20, progress=lambda now, total: told.append((now, total)))
+    given = []
+    done, _ = solve(20, progress=lambda now, total: given.append((now, total)))
     assert all(record.evaluations <= 12 for record in done.windows)
     assert all(record.energy <= record.start_energy for record in done.windows)
-    assert told == [(7, 20), (13, 20), (19, 20), (20, 20)]
+    assert given == [(7, 20), (13, 20), (19, 20), (20, 20)]
 
 
 def test_a_deadline_reaches_into_a_window():

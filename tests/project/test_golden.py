@@ -26,11 +26,11 @@ ALL = [pytest.param(name, marks=pytest.mark.slow if name in LONG else ()) for na
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """Small models and inputs, and what each command leaves for those after it."""
-    made = tmp_path_factory.mktemp("golden")
+    result = tmp_path_factory.mktemp("golden")
     with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(made)
+        patch.chdir(result)
         golden.prepare(golden.Path())
-    return made
+    return result
 
 
 @pytest.mark.parametrize("command", ALL)

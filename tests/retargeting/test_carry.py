@@ -127,7 +127,7 @@ def test_hips_follow_the_feet_of_straight_legs_both_ways(lower):
 
 
 def crouching() -> Motion:
-    """Somebody who stands still on bent knees."""
+    """A body that stands still on bent knees."""
     bent = torch.full((60,), 1.0, dtype=torch.float64)
     turned = {joint: sign * bent for joints, sign in ((HIPJOINTS, -0.5), (KNEES, 1.0)) for joint in joints}
     return USUAL.stands(turned=turned)
@@ -178,21 +178,23 @@ def test_a_person_of_a_rig_has_flat_feet_and_the_clips_floor(tmp_path):
 
 def _lafan_like(frames: int = 90) -> Motion:
     """LaFAN1's names and zero pose, every bone along x, on a performer whose feet are flatter than in its table."""
-    made = make(Make(names_of("lafan1"), bones_along_x=True, extras=False))
+    result = make(Make(names_of("lafan1"), bones_along_x=True, extras=False))
     canonical = FLAT.walks(frames)
-    motion = made.motion(canonical)
+    motion = result.motion(canonical)
     slope = math.atan2(0.0749, 0.0906) - math.atan2(-FLAT.foot[0], FLAT.foot[1])
     up = quat_xyzw(torch.tensor([0.0, 0.0, slope], dtype=torch.float64)).expand(frames, 4)  # across the foot
-    local, offsets = motion.local_quat_xyzw.clone(), made.skeleton.offsets.clone()
+    local, offsets = motion.local_quat_xyzw.clone(), result.skeleton.offsets.clone()
     for k, side in enumerate(("Left", "Right")):
-        foot, toe = (made.skeleton.index(side + part) for part in ("Foot", "Toe"))
+        foot, toe = (result.skeleton.index(side + part) for part in ("Foot", "Toe"))
         local[:, foot] = rotations.multiply(local[:, foot], up)
         local[:, toe] = rotations.multiply(rotations.inverse(up), local[:, toe])
         for part, joint in (("Leg", KNEES[k]), ("Foot", FEET[k]), ("Toe", TOES[k])):
-            own = made.skeleton.index(side + part)
+            own = result.skeleton.index(side + part)
             offsets[own] = offsets[own] / offsets[own].norm() * canonical.skeleton.offsets[joint].norm()
     hips = canonical.root_position
-    return replace(motion, skeleton=replace(made.skeleton, offsets=offsets), root_position=hips, local_quat_xyzw=local)
+    return replace(
+        motion, skeleton=replace(result.skeleton, offsets=offsets), root_position=hips, local_quat_xyzw=local
+    )
 
 
 MIXAMO, UE5 = (make(Make(names_of(name), arms_down_deg=down)) for name, down in (("mixamo", 0.0), ("ue5", 45.0)))
@@ -222,11 +224,11 @@ def test_joints_that_move_and_have_no_counterpart_are_named():
 def test_fingers_turn_as_the_givers_in_the_tposes_frames():
     clip, body = MIXAMO.motion(walk(40)), RiggedCharacter.of(UE5.motion(walk(40)))[1]
     found = retarget_motion(clip, body)
-    made = body.on_rig(found.motion, fingers=found.fingers)
+    result = body.on_rig(found.motion, fingers=found.fingers)
     for name in FINGERS:
         hand = ("left" if name.startswith("L") else "right") + "Hand"
         added = []
-        for motion, rig in ((clip, MIXAMO), (made, UE5)):
+        for motion, rig in ((clip, MIXAMO), (result, UE5)):
             frame = rig.tpose[hand]
             turn = Rotation.from_quat(motion.local_quat_xyzw[:, motion.skeleton.index(name)].numpy())
             added.append(frame * turn * frame.inv())
@@ -239,7 +241,7 @@ OTHERS = {"small": Performer(size=0.8, toe_height=0.03), "tall": Performer(size=
 
 
 def climb() -> tuple[Motion, RiggedCharacter]:
-    """Up a stair from the floor, after a while on the floor that tells how high toes rest."""
+    """Up a stair from the floor, after a while on the floor that shows how high toes rest."""
     return CLIMBS.walks(100), Performer().body()
 
 

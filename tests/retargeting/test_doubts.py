@@ -52,10 +52,10 @@ LOST = [(tree, name) for tree, name in LOST if name in TREES[tree].names]
 @pytest.mark.parametrize(("tree", "name"), LOST, ids=str)
 def test_a_rig_of_which_a_joint_lost_its_name_is_never_understood_wrongly_and_surely(tree, name):
     wish = replace(TREES[tree], names={**TREES[tree].names, name: "a17"}, extras=False, arms_down_deg=30)
-    made = make(wish)
-    verdict, _, rigmap = judge(made.motion(person(1.0, 30)))
+    result = make(wish)
+    verdict, _, rigmap = judge(result.motion(person(1.0, 30)))
     if verdict == SURE:
-        assert rigmap.joint_names == {c: own for c, own in made.joint.items() if c in rigmap.joint_names}
+        assert rigmap.joint_names == {c: own for c, own in result.joint.items() if c in rigmap.joint_names}
 
 
 @pytest.mark.parametrize("name", ["leftLowerArm", "leftFoot", "leftShoulder"])
@@ -74,18 +74,18 @@ def test_no_listed_rig_is_doubtful(preset):
 
 
 def test_a_clip_without_bent_knees_leaves_the_twist_of_limbs_open():
-    made = make(Make(names_of("mixamo"), bones_along_x=True))
+    result = make(Make(names_of("mixamo"), bones_along_x=True))
     stiff = replace(person(1.0, 20), local_quat_xyzw=torch.tensor([0.0, 0, 0, 1]).double().expand(20, 21, 4).clone())
     drop = replace(stiff, local_quat_xyzw=stiff.local_quat_xyzw)
     arms = [CANONICAL.index(side + "UpperArm") for side in ("left", "right")]
     for arm, sign in zip(arms, (-1.0, 1.0), strict=True):  # hanging, so that the clip does not begin with a T-pose
         drop.local_quat_xyzw[:, arm] = torch.tensor([0.0, 0.0, sign * 0.6, 0.8]).double()
-    verdict, why, _ = judge(made.motion(drop))
+    verdict, why, _ = judge(result.motion(drop))
     assert (verdict, "knees hardly bend" in why) == (DOUBTFUL, True)
     bent = person(1.0, 20)
     for knee in (CANONICAL.index("leftLowerLeg"), CANONICAL.index("rightLowerLeg")):
         bent.local_quat_xyzw[:, knee] = torch.tensor([0.2, 0.0, 0.0, 0.96**0.5]).double()
-    assert judge(made.motion(bent))[0] == SURE
+    assert judge(result.motion(bent))[0] == SURE
 
 
 def test_somebody_who_lies_or_crawls_is_a_person_all_the_same_and_it_is_said():

@@ -24,7 +24,7 @@ def standing(frames: int = FRAMES) -> Motion:
 
 
 def body_of(skeleton: Skeleton) -> RiggedCharacter:
-    """Somebody who stands on the floor with these bones."""
+    """A body that stands on the floor with these bones."""
     rigmap = identify_rig(skeleton)
     return RiggedCharacter(rigmap, Stance.at_rest(skeleton))
 
@@ -162,9 +162,9 @@ def test_arms_that_are_too_short_get_as_near_as_they_can_and_say_so():
     share = ease(90, 15, 40) * (1 - ease(90, 50, 75))
     clip = at_hip(arms_down(standing(90)), share=share)
     done = retarget_motion(clip, body_of(bones(arms=0.55)))
-    told = [note for note in done.notes if note.startswith("the arms are too short")]
-    assert len(told) == 1
-    assert "cm off (frame " in told[0]
+    given = [note for note in done.notes if note.startswith("the arms are too short")]
+    assert len(given) == 1
+    assert "cm off (frame " in given[0]
     miss = done.changes.hands_missed
     assert 0.01 < miss.metres < 0.3
     assert 0 < miss.frames < 90

@@ -39,11 +39,13 @@ def assert_returns(motion, canonical, rigmap):
     assert back.moving_offsets.keys() == motion.moving_offsets.keys()
 
 
-def assert_understood(made, wanted, canonical, rigmap, *, degrees=2.0):
+def assert_understood(result, wanted, canonical, rigmap, *, degrees=2.0):
     """The right joints, turned as they are in truth, and the hips where they are."""
-    names = {c: made.skeleton.names[j] for c, j in zip(CANONICAL.names, rigmap.joint_of, strict=True) if j is not None}
-    assert names == dict(made.joint)
-    known = [CANONICAL.index(name) for name in made.joint]
+    names = {
+        c: result.skeleton.names[j] for c, j in zip(CANONICAL.names, rigmap.joint_of, strict=True) if j is not None
+    }
+    assert names == dict(result.joint)
+    known = [CANONICAL.index(name) for name in result.joint]
     turned = turn_between(canonical.joint_rotations()[:, known], wanted.joint_rotations()[:, known])
     assert np.rad2deg(turned) < degrees
     torch.testing.assert_close(canonical.root_position, wanted.root_position, atol=1e-6, rtol=0)
@@ -51,9 +53,9 @@ def assert_understood(made, wanted, canonical, rigmap, *, degrees=2.0):
 
 def converted(wish, *, frames=40):
     """A rig as wished, a walk on it, what of it comes out, and the walk itself."""
-    made, wanted = make(wish), person(wish.size, frames)
-    motion = made.motion(wanted)
-    return made, wanted, motion, *retarget.to_canonical(motion)
+    result, wanted = make(wish), person(wish.size, frames)
+    motion = result.motion(wanted)
+    return result, wanted, motion, *retarget.to_canonical(motion)
 
 
 # LaFAN1's axes along its bones are known (its table), and are not those of the bodies that are built here.
@@ -65,29 +67,29 @@ EVERY_PRESET = [
 
 @pytest.mark.parametrize(("preset", "version", "rest"), EVERY_PRESET)
 def test_every_preset_there_and_back(preset, version, rest):
-    made, wanted, motion, canonical, rigmap = converted(replace(RESTS[rest], names=names_of(preset, version)))
+    result, wanted, motion, canonical, rigmap = converted(replace(RESTS[rest], names=names_of(preset, version)))
     assert rigmap.rig.name == ("ue5" if preset == "metahuman" else preset)  # which further joints tell apart
     assert rigmap.match.score > 0.9
-    assert_understood(made, wanted, canonical, rigmap)
+    assert_understood(result, wanted, canonical, rigmap)
     assert_returns(motion, canonical, rigmap)
 
 
 @pytest.mark.parametrize("rest", RESTS)
 @pytest.mark.parametrize(("names", "least"), [(INVENTED, 0.75), (NONSENSE, MIN_SCORE)], ids=["invented", "nonsense"])
 def test_a_rig_that_nobody_listed(names, least, rest):
-    made, wanted, motion, canonical, rigmap = converted(replace(RESTS[rest], names=names))
+    result, wanted, motion, canonical, rigmap = converted(replace(RESTS[rest], names=names))
     assert least < rigmap.match.score <= 1
-    assert_understood(made, wanted, canonical, rigmap)
+    assert_understood(result, wanted, canonical, rigmap)
     assert_returns(motion, canonical, rigmap)
-    assert set(rigmap.match.unmapped) == set(made.skeleton.names) - set(names.values())
+    assert set(rigmap.match.unmapped) == set(result.skeleton.names) - set(names.values())
 
 
 @pytest.mark.parametrize("along", [False, True], ids=["T", "no pose"])
 @pytest.mark.parametrize("preset", ["mixamo", "ue4", "cmu-daz", "bandai-namco"])
 def test_left_is_where_the_left_is_not_what_is_called_so(preset, along):
-    made, wanted, motion, canonical, rigmap = converted(Make(names_of(preset), swapped=True, bones_along_x=along))
+    result, wanted, motion, canonical, rigmap = converted(Make(names_of(preset), swapped=True, bones_along_x=along))
     assert rigmap.match.sides_exchanged
-    assert_understood(made, wanted, canonical, rigmap)
+    assert_understood(result, wanted, canonical, rigmap)
     assert_returns(motion, canonical, rigmap)
 
 
@@ -96,8 +98,8 @@ def test_left_is_where_the_left_is_not_what_is_called_so(preset, along):
 def test_what_a_rig_may_lack(preset, gone):
     lacking = gone.split()
     names = {c: own for c, own in names_of(preset).items() if not c.endswith(tuple(lacking))}
-    made, wanted, motion, canonical, rigmap = converted(Make(names, extras=False))
-    assert_understood(made, wanted, canonical, rigmap)
+    result, wanted, motion, canonical, rigmap = converted(Make(names, extras=False))
+    assert_understood(result, wanted, canonical, rigmap)
     assert_returns(motion, canonical, rigmap)
     for c, joint in enumerate(rigmap.joint_of):
         if joint is not None:
@@ -117,21 +119,21 @@ def test_a_horse_is_refused():
 
 
 def test_a_clip_that_begins_with_a_t_pose_shows_what_its_zero_pose_does_not():
-    """A rig whose joints are turned at random: only the first frame tells how."""
-    made, wanted = make(Make(names_of("xsens"), extras=False)), person(1.0, 30)
-    frames = Rotation.random(made.skeleton.num_joints, rng=3)
-    turned = dict(zip(made.skeleton.names, frames, strict=True))
-    offsets = [made.skeleton.offsets[0]] + [
-        torch.from_numpy(frames[p].inv().apply(made.skeleton.offsets[j].numpy()))
-        for j, p in enumerate(made.skeleton.parents)
+    """A rig whose joints are turned at random: only the first frame shows how."""
+    result, wanted = make(Make(names_of("xsens"), extras=False)), person(1.0, 30)
+    frames = Rotation.random(result.skeleton.num_joints, rng=3)
+    turned = dict(zip(result.skeleton.names, frames, strict=True))
+    offsets = [result.skeleton.offsets[0]] + [
+        torch.from_numpy(frames[p].inv().apply(result.skeleton.offsets[j].numpy()))
+        for j, p in enumerate(result.skeleton.parents)
         if p >= 0
     ]
     still = torch.tensor([0.0, 0, 0, 1]).double().expand(1, 21, 4)
     begins = replace(wanted, root_position=wanted.root_position[:1], local_quat_xyzw=still).join(wanted)
     strange = replace(
-        made,
-        skeleton=replace(made.skeleton, offsets=torch.stack(offsets), end_offsets={}),
-        tpose={c: turned[own] for c, own in made.joint.items()},
+        result,
+        skeleton=replace(result.skeleton, offsets=torch.stack(offsets), end_offsets={}),
+        tpose={c: turned[own] for c, own in result.joint.items()},
     )
     motion = strange.motion(begins)
     canonical, rigmap = retarget.to_canonical(motion)
@@ -172,14 +174,14 @@ spine = "belly"
 
 
 def test_a_toml_file_wins(tmp_path):
-    made, wanted, motion, *_ = converted(Make(INVENTED, zup=True, arms_down_deg=20))
+    result, wanted, motion, *_ = converted(Make(INVENTED, zup=True, arms_down_deg=20))
     path = tmp_path / "ours.toml"
     path.write_text(TOML.format(up="z", rest="straighten", facing="-y", unit="cm"))
     rig = retarget.load_rig(path)
     assert (rig.name, rig.up, rig.metres_per_unit) == ("ours", "z", 0.01)
     canonical, rigmap = retarget.to_canonical(motion, rig)
     assert rigmap.rig is rig
-    assert_understood(made, wanted, canonical, rigmap)
+    assert_understood(result, wanted, canonical, rigmap)
     path.write_text(TOML.format(up="y", rest="tpose", facing="auto", unit="m"))
     canonical, rigmap = retarget.to_canonical(motion, retarget.load_rig(path))
     assert (rigmap.up, rigmap.tpose_from) == ("y", "table")
@@ -215,18 +217,18 @@ def test_the_static_root_of_an_original_stays():
 @pytest.mark.parametrize(("preset", "version", "arms"), [(*tree, 40 * (k % 2)) for k, tree in enumerate(TREES)])
 def test_a_rig_as_a_program_writes_it_is_known_and_comes_back(preset, version, arms):
     wish = replace(TREES[preset, version], arms_down_deg=arms, extras=False)
-    made, wanted = make(wish), person(1.0, 30)
-    motion = made.motion(wanted)
+    result, wanted = make(wish), person(1.0, 30)
+    motion = result.motion(wanted)
     canonical, rigmap = retarget.to_canonical(motion)
-    absent = CANONICAL.num_joints - len(made.joint)
+    absent = CANONICAL.num_joints - len(result.joint)
     assert rigmap.rig.name == preset
     assert rigmap.match.score == pytest.approx(1.0 - 0.6 * absent / CANONICAL.num_joints)
-    assert rigmap.joint_names == dict(made.joint)
+    assert rigmap.joint_names == dict(result.joint)
     assert (rigmap.rest, rigmap.up) == ("T" if arms == 0 else "A", "z" if wish.zup else "y")
     facing = {(False, 0): "z", (False, 180): "-z", (True, 0): "-y"}[wish.zup, wish.turned_deg]
     assert rigmap.facing == facing
     assert assess_fit(rigmap, motion).doubts == ()
-    known = [CANONICAL.index(name) for name in made.joint]
+    known = [CANONICAL.index(name) for name in result.joint]
     turned = turn_between(canonical.joint_rotations()[:, known], wanted.joint_rotations()[:, known])
     assert np.rad2deg(turned) < 0.01
     # Twists in the chain move no joint of a limb: hands and feet are where they are in truth.
@@ -251,7 +253,7 @@ def test_of_rigs_that_share_names_the_chest_is_what_the_arms_hang_from(trunk, ch
     names = names_of("mixamo", 1) | {"chest": trunk[-1]} if chest else names_of("mixamo", 1)
     if chest is None:
         del names["chest"]
-    made = make(Make(names, between={"chest": trunk[1:-1]} if chest else {}, extras=False))
-    found = retarget.identify_rig(made.skeleton).joint_names
+    result = make(Make(names, between={"chest": trunk[1:-1]} if chest else {}, extras=False))
+    found = retarget.identify_rig(result.skeleton).joint_names
     assert found.get("chest") == chest
     assert found["spine"] == "Spine"

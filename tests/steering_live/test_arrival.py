@@ -70,10 +70,10 @@ def test_a_pose_is_taken():
 @pytest.mark.slow
 def test_what_nobody_can_is_refused_once_with_numbers_and_changes_nothing():
     recorder, track = play((0.2, Arrival((50.0, 0.0), 0.9)), (0.5, Arrival((0.0, 0.0), 0.5)))
-    told = [refusal.reason for refusal in recorder.refusals]
-    assert len(told) == 2
-    assert "50.0 m away, in 0.6 s is not obeyed: it needs 8" in told[0]
-    assert "the shortest takes" in told[1]
+    printed = [refusal.reason for refusal in recorder.refusals]
+    assert len(printed) == 2
+    assert "50.0 m away, in 0.6 s is not obeyed: it needs 8" in printed[0]
+    assert "the shortest takes" in printed[1]
     assert measure_arrivals(recorder.motion(), track, [refusal.order for refusal in recorder.refusals]) == []
     plain, _ = play()
     assert torch.equal(recorder.motion().root_position, plain.motion().root_position)

@@ -42,7 +42,7 @@ def test_a_path_is_walked_braked_for_and_stood_at():
     for step in range(51):
         at_place(pilot, 0.0, 0.1 * step)
         speeds.append(pilot.at(0.0).speed)
-        assert pilot.at(0.0).labels == ("elderly",), "the path tells what the command told"
+        assert pilot.at(0.0).labels == ("elderly",), "the labels of the command stay"
     assert speeds[0] == 1.4
     assert all(b <= a + 1e-9 for a, b in pairwise(speeds))
     assert speeds[-1] == 0.0

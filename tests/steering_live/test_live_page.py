@@ -61,9 +61,9 @@ def channel():
 
 @pytest.fixture(scope="module")
 def server(channel):
-    made = open_server(8490, channel)
-    yield made
-    made.stop()
+    result = open_server(8490, channel)
+    yield result
+    result.stop()
 
 
 def test_a_foreign_page_gets_neither_a_socket_nor_the_page(server):

@@ -1,4 +1,4 @@
-"""Hands that reach and heads that look while somebody is steered."""
+"""Hands that reach and heads that look while a character is steered."""
 
 from dataclasses import replace
 
@@ -28,7 +28,7 @@ def steered(motion: Motion, command_at) -> Motion:
 
 
 def standing(seconds: float) -> Motion:
-    """Somebody who does not move, with arms that hang."""
+    """A character that does not move, with arms that hang."""
     pose = walk(2).slice(0, 1)
     count = round(seconds * 30)
     return replace(
@@ -56,8 +56,8 @@ def misses(motion: Motion, hand: str, position) -> torch.Tensor:
 def test_a_hand_comes_to_its_place_stays_and_goes_back(hand, away):
     motion = standing(4.0)
     position = near(motion, hand, away if hand == "leftHand" else (-away[0], *away[1:]))
-    told = Command(0.0, 0.0, reach={hand: position})
-    found = steered(motion, lambda seconds: told if 0.5 <= seconds < 2.0 else Command(0.0, 0.0))
+    printed = Command(0.0, 0.0, reach={hand: position})
+    found = steered(motion, lambda seconds: printed if 0.5 <= seconds < 2.0 else Command(0.0, 0.0))
     missed = misses(found, hand, position)
     assert float(missed[40:60].max()) < 0.005
     np.testing.assert_array_equal(found.local_quat_xyzw[:15], motion.local_quat_xyzw[:15])

@@ -27,11 +27,11 @@ def load(tmp_path_factory):
 def remote(load, tmp_path_factory):
     stitcher = save_tiny_stitcher(tmp_path_factory.mktemp("s") / "tiny.safetensors")
     transitions = functools.partial(priors.load_stitcher, str(stitcher))
-    made = CharacterProcess(CharacterRequest(load, Command(1.2, 0.0), at=(3.0, -1.0), transitions=transitions))
-    made.wait()
-    yield made
-    made.close()
-    made.close()
+    result = CharacterProcess(CharacterRequest(load, Command(1.2, 0.0), at=(3.0, -1.0), transitions=transitions))
+    result.wait()
+    yield result
+    result.close()
+    result.close()
 
 
 def collected(remote, seconds):

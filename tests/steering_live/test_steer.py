@@ -81,11 +81,11 @@ def test_motion_that_is_not_finite_is_replaced_by_the_priors_own():
 def test_a_command_tells_the_prior_for_as_long_as_it_holds(tmp_path):
     prior = priors.load(str(save_tiny_prior(tmp_path / "p.safetensors", labels=("gait=run", "style=active"))))
     state, _ = steer.begin(prior, AHEAD, generator=generator(), settings=QUICK)
-    told = replace(AHEAD, labels=("run", "active"))
-    after, said = steer.step(state, told)
+    printed = replace(AHEAD, labels=("run", "active"))
+    after, said = steer.step(state, printed)
     _, unsaid = steer.step(state, AHEAD)
     assert not torch.equal(said.motion.local_quat_xyzw, unsaid.motion.local_quat_xyzw)
-    assert after.prior is prior, "what was told is not carried on"
+    assert after.prior is prior, "conditions are not carried on"
     with pytest.raises(RequestError, match="has no gait or style 'swim'"):
         steer.step(state, replace(AHEAD, labels=("swim",)))
 

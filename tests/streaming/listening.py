@@ -15,15 +15,15 @@ from mapctl.streaming.sender import FrameAssembler, VmcFrame
 def free_ports(count: int) -> int:
     """The first of so many ports that follow each other and are free."""
     for base in range(43000, 60000, 50):
-        made = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(count)]
+        result = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(count)]
         try:
-            for k, one in enumerate(made):
+            for k, one in enumerate(result):
                 one.bind(("127.0.0.1", base + k))
             return base
         except OSError:
             continue
         finally:
-            for one in made:
+            for one in result:
                 one.close()
     raise AssertionError("no free ports")
 
@@ -80,8 +80,8 @@ class Engine:
 @contextmanager
 def engine(port: int) -> Iterator[Engine]:
     """An engine at a port."""
-    made = Engine(port)
+    result = Engine(port)
     try:
-        yield made
+        yield result
     finally:
-        made.close()
+        result.close()

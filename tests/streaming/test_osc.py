@@ -101,15 +101,15 @@ def free_port() -> int:
 
 @pytest.fixture
 def receiver():
-    with closing(OscReceiver(Endpoint("127.0.0.1", free_port()))) as made:
-        yield made
+    with closing(OscReceiver(Endpoint("127.0.0.1", free_port()))) as result:
+        yield result
 
 
 @pytest.fixture
 def sender(receiver):
     """Sends bytes to the receiver."""
-    with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as made:
-        yield lambda packet: made.sendto(packet, ("127.0.0.1", receiver.endpoint.port))
+    with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as result:
+        yield lambda packet: result.sendto(packet, ("127.0.0.1", receiver.endpoint.port))
 
 
 def test_messages_arrive_in_order_and_nothing_waits(receiver):
@@ -136,18 +136,27 @@ def nonsense(count: int) -> list[bytes]:
     draw = random.Random(7)
     good = b"/mapctl/speed\0\0\0,f\0\0" + struct.pack(">f", 1.0)
     bundle = b"#bundle\0" + struct.pack(">QI", 1, len(good)) + good
-    made = [b"", b"/", b"/\0\0\0", b"#bundle\0", b"\xff" * 30, good[:-2], b"/a\0\0,zqx\0\0\0\0", b"/a\0\0,[[[\0\0\0\0"]
-    made += [b"#bundle\0" + struct.pack(">Qi", 1, size) for size in (-1, -(2**31), 2**31 - 1, 0)]
+    result = [
+        b"",
+        b"/",
+        b"/\0\0\0",
+        b"#bundle\0",
+        b"\xff" * 30,
+        good[:-2],
+        b"/a\0\0,zqx\0\0\0\0",
+        b"/a\0\0,[[[\0\0\0\0",
+    ]
+    result += [b"#bundle\0" + struct.pack(">Qi", 1, size) for size in (-1, -(2**31), 2**31 - 1, 0)]
     deep = good
     for _ in range(150):
         deep = b"#bundle\0" + struct.pack(">QI", 1, len(deep)) + deep
-    made += [deep, b"/a\0\0,b\0\0" + struct.pack(">i", -5), b"/\xc3\x28\0,s\0\0\xc3\x28\0\0"]
+    result += [deep, b"/a\0\0,b\0\0" + struct.pack(">i", -5), b"/\xc3\x28\0,s\0\0\xc3\x28\0\0"]
     for _ in range(count):
         packet = bytearray(draw.choice((good, bundle)))
         for _ in range(draw.randint(1, 8)):
             packet[draw.randrange(len(packet))] = draw.randrange(256)
-        made += [bytes(packet), draw.randbytes(draw.randrange(200)), bytes(packet[: draw.randrange(len(packet))])]
-    return made
+        result += [bytes(packet), draw.randbytes(draw.randrange(200)), bytes(packet[: draw.randrange(len(packet))])]
+    return result
 
 
 def test_nonsense_is_counted_and_changes_nothing(receiver, sender, capfd):

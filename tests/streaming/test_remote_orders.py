@@ -54,8 +54,8 @@ def staged():
 
 @pytest.fixture
 def stage():
-    with staged() as made:
-        yield made
+    with staged() as result:
+        yield result
 
 
 def words(actor: Actor) -> list[str]:

@@ -21,14 +21,14 @@ ALLOWED = 1.0  # seconds by which a busy machine may be late; how late a quiet o
 def open_ports(count: int, stack: ExitStack) -> list[socket.socket]:
     """Sockets at ports that follow each other."""
     for base in range(42000, 60000, 50):
-        made = [stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(count)]
+        result = [stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(count)]
         try:
-            for k, one in enumerate(made):
+            for k, one in enumerate(result):
                 one.bind(("127.0.0.1", base + k))
                 one.settimeout(5.0)
         except OSError:
             continue
-        return made
+        return result
     raise AssertionError("no free ports")
 
 
@@ -41,10 +41,10 @@ def ports():
 @pytest.fixture
 def stream(ports):
     """To both ports, without delay; whoever uses it closes it."""
-    made = PoseStream(Endpoint("127.0.0.1", ports[0].getsockname()[1]), [CANONICAL] * 2, delay=0.0)
-    yield made
-    if made._process.is_alive():
-        made.close()
+    result = PoseStream(Endpoint("127.0.0.1", ports[0].getsockname()[1]), [CANONICAL] * 2, delay=0.0)
+    yield result
+    if result._process.is_alive():
+        result.close()
 
 
 def received(port: socket.socket, count: int) -> list[tuple[float, VmcFrame]]:

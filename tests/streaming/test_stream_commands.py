@@ -100,10 +100,10 @@ def test_characters_obey_what_comes_over_osc_and_their_poses_go_out(prior, tmp_p
     def start(command, drawn):
         load = functools.partial(priors.load, prior)
         requests = [CharacterRequest(load, Command(1.2, 0.0), at=(3.0 * k, 0.0), transitions=stitcher) for k in (0, 1)]
-        made = [CharacterProcess(request) for request in requests]
-        for one in made:
+        result = [CharacterProcess(request) for request in requests]
+        for one in result:
             one.wait()
-        return made
+        return result
 
     ports, listen = free_ports(2), free_ports(3) + 2
     hand, shoulder = CANONICAL.index("leftHand"), CANONICAL.index("leftUpperArm")

@@ -13,7 +13,7 @@ from mapctl.terms import LatentPrior
 
 @dataclass(frozen=True)
 class Own:
-    """Gives what it is told to, of the noise."""
+    """Return the given value, of the noise."""
 
     energy: object
     off: object = staticmethod(lambda noise: noise.sum(-1))
@@ -57,10 +57,10 @@ def fine(noise):
 
 @pytest.mark.parametrize("name", SHAPES)
 def test_a_wrong_shape_is_named_with_the_one_expected(name):
-    wrong, told = SHAPES[name]
-    with pytest.raises(RequestError, match=f"the energy of the term 'own' has .*{told}.*expected.*\\[2, 12\\]"):
+    wrong, given = SHAPES[name]
+    with pytest.raises(RequestError, match=f"the energy of the term 'own' has .*{given}.*expected.*\\[2, 12\\]"):
         objective(Own(wrong)).energy_and_gradient(START)
-    with pytest.raises(RequestError, match=f"the residual of the term 'own' has .*{told}"):
+    with pytest.raises(RequestError, match=f"the residual of the term 'own' has .*{given}"):
         objective(Own(fine, wrong)).build_ledger(BASE)
 
 

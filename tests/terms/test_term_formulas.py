@@ -102,8 +102,8 @@ def test_the_way_is_counted_from_the_windows_beginning():
 def test_a_pose_costs_the_mean_square_of_its_joints():
     features = moved("joint_rotations", 0.2, column=3 * 9 + 1)
     term = MotionTracking(TARGET, sigma_pose=0.02, effective_joints=5.0)
-    made, wanted = (placed(f).joints_world - placed(f).joints_world[:, :, :1] for f in (features, TARGET))
-    squares = (made - wanted).square().sum(-1).mean(-1)
+    result, wanted = (placed(f).joints_world - placed(f).joints_world[:, :, :1] for f in (features, TARGET))
+    squares = (result - wanted).square().sum(-1).mean(-1)
     torch.testing.assert_close(term(placed(features)), 0.5 * 5.0 * squares / 0.02**2)
     torch.testing.assert_close(term.residual(placed(features)), squares.sqrt())
     assert float(squares.max()) > 0

@@ -499,8 +499,8 @@ def test_a_density_that_is_trained_so_knows_paces(tmp_path, capfd):
     assert prior.pace_rates == read_pace_rates(prior.card.data["holds"])
     starts = prior.conditioned_on(["walk"]).initial_states
     assert bool((starts.speed > 0.4).all())
-    told = prior.conditioned_on(["pace=run"]).reference.fc1.bias
-    assert not torch.equal(told, prior.reference.fc1.bias)
+    given = prior.conditioned_on(["pace=run"]).reference.fc1.bias
+    assert not torch.equal(given, prior.reference.fc1.bias)
     # A run that goes on with it has its labels, and one that begins without them is refused.
     more = ("--data", data, "--match", "", "--steps", 1, "--batch", 4, "--window", 12)
     for out, words in (("on", ("--label-pace",)), ("unasked", ())):

@@ -11,8 +11,8 @@ from priors import tweener
 FRAMES = 193
 
 
-def bend_trajectory(way, facing, told):
-    return tweener.bend_trajectory(way, facing, placed=told, faced=told)
+def bend_trajectory(way, facing, given):
+    return tweener.bend_trajectory(way, facing, placed=given, faced=given)
 
 
 def lead(displacement, first, last, frames=FRAMES, turn=0.0):
@@ -20,9 +20,9 @@ def lead(displacement, first, last, frames=FRAMES, turn=0.0):
     share = torch.linspace(0, 1, frames).double()[None]
     headings = torch.deg2rad(first + (last - first) * share) + turn
     end = rotations.rotate_ground(torch.tensor(displacement).double(), torch.tensor(turn).double())
-    told = torch.zeros(1, frames, dtype=torch.bool)
-    told[:, [0, -1]] = True
-    return share[..., None] * end, headings, told
+    given = torch.zeros(1, frames, dtype=torch.bool)
+    given[:, [0, -1]] = True
+    return share[..., None] * end, headings, given
 
 
 def test_who_walks_round_a_corner_leaves_along_one_heading_and_comes_along_the_other():
@@ -49,17 +49,17 @@ def test_who_walks_round_a_corner_leaves_along_one_heading_and_comes_along_the_o
     ],
 )
 def test_the_way_stays_straight_for_who_does_not_walk_ahead_or_has_no_time(displacement, first, last, frames):
-    way, facing, told = lead(displacement, first, last, frames)
-    bent, turned = bend_trajectory(way, facing, told)
+    way, facing, given = lead(displacement, first, last, frames)
+    bent, turned = bend_trajectory(way, facing, given)
     assert torch.equal(bent, way)
     assert torch.equal(turned, facing)
 
 
 def test_what_is_told_stays_and_a_way_turned_elsewhere_is_the_same_one():
-    way, facing, told = lead((3.0, 5.0), -10.0, 60.0)
-    bent, turned = bend_trajectory(way, facing, told)
-    assert torch.equal(bent[told], way[told])
-    assert torch.equal(turned[told], facing[told])
+    way, facing, given = lead((3.0, 5.0), -10.0, 60.0)
+    bent, turned = bend_trajectory(way, facing, given)
+    assert torch.equal(bent[given], way[given])
+    assert torch.equal(turned[given], facing[given])
     assert (bent - way).norm(dim=-1).max() > 0.1
     for turn in (1.0, 3.0, -2.5):
         other, facing_other = bend_trajectory(*lead((3.0, 5.0), -10.0, 60.0, turn=turn))
