@@ -40,7 +40,7 @@ class DrawnMotion:
     placed: Placed
     """The motion on the character's joints."""
     convert: Callable[[Motion], Placed]
-    """Puts further frames of the same giver on it, as poses that are asked for."""
+    """Puts further frames of the same source on it, as poses that are asked for."""
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -54,7 +54,7 @@ class DrawnMotion:
         return SkinnedBody(self.mesh, self.placed.motion.resample(fps), Mannequin(bones, colour))
 
     def build_pose(self, pose: Motion, colour: Array) -> SkinnedBody:
-        """Build the body in one frame of the giver's skeleton; `colour` as of `build_body`."""
+        """Build the body in one frame of the source's skeleton; `colour` as of `build_body`."""
         return replace(self, placed=self.convert(pose)).build_body(pose.fps, colour)
 
 
@@ -108,10 +108,10 @@ class DrawnCharacter:
         for rigmap in (self.body.leveled_map, self.body.rigmap):
             if motion.skeleton.matches(rigmap.skeleton, _SAME_BONE):
                 return lambda own: Placed(replace(from_canonical(own, rigmap), source=self.standing.source), own)
-        giver = RiggedCharacter.of(motion)[1]
+        source = RiggedCharacter.of(motion)[1]
 
         def retarget(part: Motion) -> Placed:
-            done = retarget_canonical(to_canonical(part, as_rig(giver.rigmap))[0], giver, self.body)
+            done = retarget_canonical(to_canonical(part, as_rig(source.rigmap))[0], source, self.body)
             return Placed(self.body.on_rig(done.motion), done.motion, done.notes)
 
         return retarget

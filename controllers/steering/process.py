@@ -180,7 +180,7 @@ class ProcessClock(WallClock):
 
     def __init__(self, connection: Connection, pilot: Autopilot, prior: Density):
         self._connection, self._pilot, self._prior = connection, pilot, prior
-        self.again = False
+        self.restart = False
         self._began = 0.0  # time of the stream's second 0
         self._behind = 0.0  # seconds by which the clock is behind time.perf_counter: pauses, and what was held
         self._paused_at: float | None = None  # value of time.perf_counter
@@ -219,7 +219,7 @@ class ProcessClock(WallClock):
 
     def begin(self, state: steer.SteerState, frames: SteerFrames) -> None:
         """Show the first pose, and start the stream's seconds there."""
-        self.again = False
+        self.restart = False
         self._began = find_second_zero(self, state)
         self.show(frames, 0.0)
 
@@ -243,7 +243,7 @@ class ProcessClock(WallClock):
 
     def _execute_order(self, word: str, *content: Any) -> None:
         if word == "reset":
-            self.again = True
+            self.restart = True
         elif word == "pause":
             self._pause(*content)
         elif word == "aim":
@@ -295,7 +295,7 @@ def _run_character(connection: Connection, request: CharacterRequest) -> None:
         _wait_for_turn(request.settings.commit / PRIOR_FPS)
         clock.begin(state, pose)
         for _ in iterate_steps(state, pilot.at, [clock.show], clock=clock, stepper=stepper):
-            if clock.again:
+            if clock.restart:
                 break
         pilot.stay()
         first = pilot.at(clock.now())
@@ -350,7 +350,7 @@ class CharacterProcess:
         self._start()
 
     def wait(self) -> None:
-        """Wait until it walks. RequestError where its prior cannot be loaded, or does not know its labels."""
+        """Wait until it walks. RequestError where its prior cannot be loaded, or does not have its labels."""
         if not self._ready.wait(_READY_SECONDS):
             self._failed = self._failed or "a character's process did not start"
         if self._failed:

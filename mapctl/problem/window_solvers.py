@@ -1,8 +1,8 @@
 """Solvers of one window: a start, a parametrisation of its frames, and L-BFGS over the unknowns.
 
-The search over a rollout's noise starts at the last window's noise, the best of random draws, or a particle swarm. A
-swarm over all the noise of a window (34 x 66 numbers) gained nothing over zero noise: it searches a few numbers that
-steer, noise at a few knots in time, linear in between.
+The search over a rollout's noise starts at the last window's noise, the best of random draws, or a particle swarm over
+a few numbers that steer: noise at a few knots in time, linear in between. All the noise of a window (34 x 66 numbers)
+is too many dimensions for a swarm.
 """
 
 from collections.abc import Callable, Sequence

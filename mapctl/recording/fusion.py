@@ -1,8 +1,7 @@
-"""Fusion of a capture and a model's proposal: as near to the capture as its noise allows, as near to the proposal as
-the capture bears it out.
+"""Fusion of a capture and a model's proposal by Stein's unbiased risk estimate.
 
 The residual between capture and proposal is noise of known power and the proposal's error. Candidates for the true
-motion are the proposal itself, the proposal with its residual smoothed (where it is wrong slowly), and the capture
+motion are the proposal itself, the proposal with its residual smoothed (where its error is slow), and the capture
 alone, smoothed (outside its training data). Stein's unbiased estimate of the risk (Stein 1981) weighs them, joint by
 joint and moment by moment, without any knowledge of the truth. The smoother minimises the squared distance to what was
 observed and squared third differences (Whittaker 1923; Eilers 2003): for a stationary signal a Butterworth filter of
@@ -31,10 +30,10 @@ from mapctl.recording.noise_estimation import choose_continuous_signs
 _ORDER = 3  # of the differences that the smoother penalises
 _HERTZ = (0.7, 1.0, 1.5, 2.0, 3.0, 4.5, 6.5, 10.0, 15.0, 22.0, 33.0)  # half-power frequencies of the smoothers
 _SCALES = ((1.33, 1.5), (0.25, 3.0))
-"""Seconds (sigma) over which a risk is averaged, of a style first and then of a kick, and how many of the risk's
-standard errors a candidate beside the proposal must gain: there are many more moments in which to be wrong."""
-_SELECTION = 1.0  # of the noise that such a candidate keeps, counted once more, since it is the best of many
-_TEMPERATURE = 0.06  # of the noise's power: candidates that are as good as equal are averaged
+"""Seconds (sigma) over which a risk is averaged, for slow errors first and then for transients, and the number of the
+risk's standard errors that a candidate beside the proposal must gain: short averages are wrong more often."""
+_SELECTION = 1.0  # of the leverage of such a candidate, counted once more, since it is the best of many
+_TEMPERATURE = 0.06  # of the noise's power: candidates of about equal risk are averaged
 _LEAST_SEEN = 0.1  # of the frames that a smoother averages
 _LEAST_WEIGHT = 1e-9  # of an unobserved frame, so that the system of a column without any has a solution
 
@@ -46,7 +45,7 @@ class Fused:
     values: Float[Tensor, "frames columns width"]
     """Quaternions (xyzw), or positions in metres."""
     share: Float[Tensor, "frames columns"]
-    """Weight of the proposal itself: 1 where the capture bears it out, 0 where the capture corrects or replaces it."""
+    """Weight of the proposal itself: 1 where the capture supports it, 0 where the capture corrects or replaces it."""
     error: Float[Tensor, "frames columns"]
     """Estimated error: standard deviation of each of the three numbers, radians or metres."""
 
@@ -66,12 +65,12 @@ def fuse_rotations(
     smooth = [torch.nn.functional.normalize(each, dim=-1) for each in smooth]
     about = smooth[0] if proposal is None else proposal
 
-    def move(about: Tensor, scale: tuple[float, float], held: bool) -> tuple[Tensor, Tensor, Tensor]:
+    def fuse_about(about: Tensor, scale: tuple[float, float], held: bool) -> tuple[Tensor, Tensor, Tensor]:
         residual, others = _relative_vector(about, capture), [_relative_vector(about, each) for each in smooth]
         vector, share, error = _estimate(residual, others, weights, sigma, fps, scale, holds_proposal=held)
         return rotations.multiply(about, rotations.from_rotation_vector(vector)), share, error
 
-    return _fuse(move, about, held=proposal is not None)
+    return _fuse(fuse_about, about, held=proposal is not None)
 
 
 def fuse_positions(
@@ -88,23 +87,26 @@ def fuse_positions(
     about = smooth[0] if proposal is None else proposal[:, None]
     level = torch.tensor([sigma], dtype=torch.float64)
 
-    def move(about: Tensor, scale: tuple[float, float], held: bool) -> tuple[Tensor, Tensor, Tensor]:
+    def fuse_about(about: Tensor, scale: tuple[float, float], held: bool) -> tuple[Tensor, Tensor, Tensor]:
         others = [each - about for each in smooth]
         vector, share, error = _estimate(
             capture[:, None] - about, others, weights, level, fps, scale, holds_proposal=held
         )
         return about + vector, share, error
 
-    return _fuse(move, about, held=proposal is not None)
+    return _fuse(fuse_about, about, held=proposal is not None)
 
 
 def _fuse(
-    move: Callable[[Tensor, tuple[float, float], bool], tuple[Tensor, Tensor, Tensor]], about: Tensor, *, held: bool
+    fuse_about: Callable[[Tensor, tuple[float, float], bool], tuple[Tensor, Tensor, Tensor]],
+    about: Tensor,
+    *,
+    held: bool,
 ) -> Fused:
-    """Fuse over seconds first, then over moments about that: what the capture shows of a kick alone is seen there. The
-    error is that of the first: beside what follows the capture, the capture seems to have less noise."""
-    about, share, error = move(about, _SCALES[0], held)
-    about, again, _ = move(about, _SCALES[1], True)
+    """Fuse over seconds first, then over moments about that result, which keeps transients of the capture alone. The
+    error is that of the first: near a result that follows the capture, the noise is underestimated."""
+    about, share, error = fuse_about(about, _SCALES[0], held)
+    about, again, _ = fuse_about(about, _SCALES[1], True)
     return Fused(about, share * again, error)
 
 
@@ -135,7 +137,7 @@ def measure_kept_noise(hertz: float, fps: float) -> float:
 
 def _estimate(
     residual: Float[Tensor, "frames columns 3"],
-    alone: list[Float[Tensor, "frames columns 3"]],
+    smoothed: list[Float[Tensor, "frames columns 3"]],
     weights: Float[Tensor, "frames columns"],
     sigma: Float[Tensor, " columns"],
     fps: float,
@@ -145,36 +147,40 @@ def _estimate(
 ) -> tuple[Float[Tensor, "frames columns 3"], Float[Tensor, "frames columns"], Float[Tensor, "frames columns"]]:
     """Estimate the truth beside the proposal; also the weight of the proposal itself, and the estimated error.
 
-    `residual` is the capture beside the proposal, `alone` the smoothed capture beside it; risks are averaged over
+    `residual` is the capture beside the proposal, `smoothed` the smoothed capture beside it; risks are averaged over
     a time that `scale` gives.
     """
     seconds, caution = scale
     power = (3 * sigma.square()).clamp_min(1e-12)
     ones = torch.ones_like(weights)
     near = _average(weights, ones, fps, seconds).clamp_min(_LEAST_WEIGHT)
-    # The last is the capture itself: what no smoother can follow, as a kick, is no noise.
-    candidates, owns = [residual], [_require_seen(ones, weights, holds_proposal)]
-    for hertz, smooth in zip(_list_cutoffs(fps), alone, strict=True):
-        # Averaged as the change is, or the outermost frame, which a smoother follows most, were the proposal's alone.
-        own = _average(_weigh_own(len(residual), hertz, fps)[:, None], ones[:, :1], fps, seconds)
+    # The last is the capture itself: a transient that no smoother can follow is no noise.
+    candidates, leverages = [residual], [_require_seen(ones, weights, holds_proposal)]
+    for hertz, smooth in zip(_list_cutoffs(fps), smoothed, strict=True):
+        # Averaged like the changes, or the outermost frame, where leverage is largest, would be the proposal's alone.
+        leverage = _average(_compute_leverage(len(residual), hertz, fps)[:, None], ones[:, :1], fps, seconds)
         # In a gap a smoother has little evidence: of the frames that it sees, how many are observed.
         shown = _average(weights, ones, fps, 1 / (4 * math.pi * hertz))
-        own = _require_seen(own, shown, holds_proposal)
+        leverage = _require_seen(leverage, shown, holds_proposal)
         back = [smooth_columns(residual * weights[..., None], weights, hertz, fps)] if holds_proposal else []
-        candidates, owns = [*back, smooth, *candidates], [*[own] * len(back), own, *owns]
+        candidates, leverages = [*back, smooth, *candidates], [*[leverage] * len(back), leverage, *leverages]
     # Risks differ by what is slower than the prior's rate alone: a faster camera has more frames of the same.
     finer = max(1.0, fps / PRIOR_FPS)
     frames = min(len(residual), 2 * math.sqrt(math.pi) * seconds * fps) / finer
     doubt = caution * math.sqrt(2 / (3 * frames)) / finer
-    penalties = [_SELECTION * own + doubt for own in owns]
+    penalties = [_SELECTION * leverage + doubt for leverage in leverages]
     if not holds_proposal:
-        penalties = [torch.zeros_like(own) for own in owns]
+        penalties = [torch.zeros_like(leverage) for leverage in leverages]
     else:
         nothing = torch.zeros_like(ones)
-        candidates, owns, penalties = [torch.zeros_like(residual), *candidates], [nothing, *owns], [nothing, *penalties]
+        candidates, leverages, penalties = (
+            [torch.zeros_like(residual), *candidates],
+            [nothing, *leverages],
+            [nothing, *penalties],
+        )
     changes = [(candidate - residual).square().sum(dim=-1) * weights for candidate in candidates]
     risks = torch.stack([_average(change, near, fps, seconds) for change in changes]) / power
-    risks = risks + 2 * torch.stack(owns) - 1
+    risks = risks + 2 * torch.stack(leverages) - 1
     share = torch.softmax(-(risks + torch.stack(penalties)) * finer / _TEMPERATURE, dim=0)
     vector = (share[..., None] * torch.stack(candidates)).sum(dim=0)
     error = sigma * torch.where(share > 0, share * risks, 0.0).sum(dim=0).clamp(0.0, 1.0).sqrt()
@@ -198,10 +204,10 @@ def _average(
     return gaussian.convolve(values, taps, "nothing") / ones / weight
 
 
-def _require_seen(own: Tensor, seen: Float[Tensor, "frames columns"], holds_proposal: bool) -> Tensor:
-    """Raise the noise that a smoother keeps where it sees few frames; where it sees hardly any, in a long gap, only a
+def _require_seen(leverage: Tensor, seen: Float[Tensor, "frames columns"], holds_proposal: bool) -> Tensor:
+    """Raise the leverage of a smoother where it sees few frames; where it sees hardly any, in a long gap, only a
     proposal remains, if there is one."""
-    raised = own / seen.clamp_min(_LEAST_SEEN)
+    raised = leverage / seen.clamp_min(_LEAST_SEEN)
     return raised.masked_fill(seen < _LEAST_SEEN, math.inf) if holds_proposal else raised
 
 
@@ -217,18 +223,18 @@ def _difference_bands(frames: int) -> Float[np.ndarray, "bands frames"]:
 
 
 @lru_cache(maxsize=64)
-def _weigh_own(frames: int, hertz: float, fps: float) -> Float[Tensor, " frames"]:
-    """Return how much a frame counts in its own smoothed value, which is most at the ends: the diagonal of the
-    smoother's matrix, whose middle is the same in all long captures."""
+def _compute_leverage(frames: int, hertz: float, fps: float) -> Float[Tensor, " frames"]:
+    """Compute the leverage of each frame, its weight in its own smoothed value, largest at the ends: the diagonal of
+    the smoother's matrix, whose middle is the same in all long captures."""
     side = min(frames, math.ceil(3 * fps / hertz))
     every = torch.eye(side, dtype=torch.float64)[:, None]
     diagonal = smooth_columns(every, torch.ones(side, 1, dtype=torch.float64), hertz, fps)[:, 0].diagonal()
     if side == frames:
         return diagonal
     half = side // 2
-    own = diagonal[half].repeat(frames)
-    own[:half], own[frames - half :] = diagonal[:half], diagonal[side - half :]
-    return own
+    leverage = diagonal[half].repeat(frames)
+    leverage[:half], leverage[frames - half :] = diagonal[:half], diagonal[side - half :]
+    return leverage
 
 
 def _relative_vector(start: Tensor, stop: Tensor) -> Float[Tensor, "frames columns 3"]:

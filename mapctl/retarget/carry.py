@@ -1,11 +1,11 @@
 """Retargeting: motion of one performer on the bones of another, with the same contacts.
 
-Rotations stay, but of legs, and of arms whose hands are near something. Hips follow the giver's trajectory in scale, as
-high as legs and ground ask for; each toe joint is as high over its own rest height as the giver's over his, in scale,
-and a planted foot moves as little as the giver's. Hands near the body, each other or the floor are brought where they
-were relative to these. Two-bone inverse kinematics brings legs and arms there. (The footsteps are kept as in Gleicher
-1998, but joint by joint instead of by spacetime optimisation.) What feet stand on is the floor, or what is higher, as
-stairs and platforms.
+Rotations stay, but of legs, and of arms whose hands are near something. Hips follow the source's trajectory in scale,
+as high as legs and ground ask for; each toe joint is as high over its own rest height as the source's over his, in
+scale, and a planted foot moves as little as the source's. Hands near the body, each other or the floor are brought
+where they were relative to these. Two-bone inverse kinematics brings legs and arms there. (The footsteps are kept as in
+Gleicher 1998, but joint by joint instead of by spacetime optimisation.) What feet stand on is the floor, or what is
+higher, as stairs and platforms.
 """
 
 import math
@@ -73,7 +73,7 @@ class Changes:
     """Changes by retargeting, beside bones."""
 
     scale: float = 1.0
-    """Length of the body's legs over the giver's."""
+    """Length of the body's legs over the source's."""
     hips_lowered_m: float = 0.0
     """How much lower the hips are at most than in scale, metres, for legs that are too short."""
     feet_missed: Miss = Miss()
@@ -81,7 +81,7 @@ class Changes:
     hands_missed: Miss = Miss()
     """Hands that are near something against their targets."""
     unmatched_joints: tuple[str, ...] = ()
-    """Joints of the giver that move and have no counterpart."""
+    """Joints of the source that move and have no counterpart."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +93,7 @@ class RetargetedMotion:
     changes: Changes = Changes()
     """The changes."""
     fingers: Mapping[int, Float[Tensor, "frames 4"]] = field(default_factory=dict)
-    """Local rotations (xyzw) of the body's finger joints that turn as the giver's, by joint of its rig."""
+    """Local rotations (xyzw) of the body's finger joints that turn as the source's, by joint of its rig."""
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -116,7 +116,7 @@ class RetargetedMotion:
         return tuple(found)
 
 
-_FREE_EXTENSION = 0.985  # of the leg: a leg may be that straight, whatever the giver's is
+_FREE_EXTENSION = 0.985  # of the leg: a leg may be that straight, whatever the source's is
 _MAX_EXTENSION = 0.9995  # of the leg: how straight one may be at most
 _HIP_FIT_SECONDS = 0.06  # seconds over which the height of hips is smoothed
 _HIP_DROP_SECONDS = 0.12  # seconds over which hips go down for a leg that is too short, and up again
@@ -178,9 +178,9 @@ def _detect_bearing(own: Motion) -> Bool[Tensor, "frames 2"]:
 
 
 def _transfer_root(
-    own: Motion, giver: RiggedCharacter, body: RiggedCharacter, scale: float, raised: Float[Tensor, " frames"]
+    own: Motion, source: RiggedCharacter, body: RiggedCharacter, scale: float, raised: Float[Tensor, " frames"]
 ) -> Motion:
-    """Put the giver's rotations on the body's bones. The middle between the thighs follows its trajectory in scale, as
+    """Put the source's rotations on the body's bones. The middle between the thighs follows its trajectory in scale, as
     much higher as ankles, floor and `raised` (metres, by what the ground is kept higher than in scale) ask for."""
     to_thighs = body.leveled.offsets[HIP_JOINTS].mean(0) - scale * own.skeleton.offsets[HIP_JOINTS].mean(0)
     turns = own.joint_rotations()[:, 0]
@@ -190,13 +190,13 @@ def _transfer_root(
     )
     # Ankles over the floor while feet lie flat, mean of both.
     ankle = (body.stance.standing_height - body.leveled.offsets[TOES, 1]).mean()
-    others = (giver.stance.flat_height - own.skeleton.offsets[TOES, 1]).mean()
-    rise = _UP * (ankle - scale * others + (1 - scale) * giver.stance.floor + raised)[:, None]
+    others = (source.stance.flat_height - own.skeleton.offsets[TOES, 1]).mean()
+    rise = _UP * (ankle - scale * others + (1 - scale) * source.stance.floor + raised)[:, None]
     return replace(own, skeleton=body.leveled, root_position=scale * own.root_position + rise - aside, source=None)
 
 
 def fit_hips(moved: Motion, ankles: Float[Tensor, "frames 2 3"], stretch: Float[Tensor, "frames 2"]) -> Motion:
-    """Raise or lower hips smoothly until legs that reach the ankles' targets are as straight as the giver's.
+    """Raise or lower hips smoothly until legs that reach the ankles' targets are as straight as the source's.
 
     This has an inverse, so that a clip that goes to another body and back has its hips where they were.
     """
@@ -211,7 +211,7 @@ def fit_hips(moved: Motion, ankles: Float[Tensor, "frames 2 3"], stretch: Float[
 
 
 def lower_hips(moved: Motion, ankles: Float[Tensor, "frames 2 3"], stretch: Float[Tensor, "frames 2"]) -> Motion:
-    """Lower hips smoothly until legs reach the ankles' targets no straighter than the giver's, or than most."""
+    """Lower hips smoothly until legs reach the ankles' targets no straighter than the source's, or than most."""
     short, down = _find_missing_length(moved, ankles, stretch.clamp(_FREE_EXTENSION, _MAX_EXTENSION))
     # A leg that points sideways or up is not helped by lower hips.
     short = torch.where(down > _DOWN_SHARES[0], short.clamp_min(0), 0.0).amax(dim=-1, keepdim=True)
@@ -233,7 +233,7 @@ def _find_missing_length(
 def _find_ankle_targets(
     own: Motion,
     moved: Motion,
-    giver: Stance,
+    source: Stance,
     body: Stance,
     spans: list[Spans],
     ground: Float[Tensor, "frames 2"],
@@ -241,10 +241,10 @@ def _find_ankle_targets(
     *,
     scale: float,
 ) -> Float[Tensor, "frames 2 3"]:
-    """Return target ankle positions, metres: toe joints as the giver's in scale, over their own rest heights, and moved
-    over the ground to where the body's rotations bring them, by as much throughout a contact. High over the `ground`
-    (metres, in scale) rotations alone count: a kick is a pose, not a position. `raised` is by how much the ground is
-    kept higher than in scale, metres."""
+    """Return target ankle positions, metres: toe joints as the source's in scale, over their own rest heights, and
+    moved over the ground to where the body's rotations bring them, by as much throughout a contact. High over the
+    `ground` (metres, in scale) rotations alone count: a kick is a pose, not a position. `raised` is by how much the
+    ground is kept higher than in scale, metres."""
     toes, positions = own.joint_positions()[:, TOES], scale * own.joint_positions()[:, FEET]
     aside = (moved.joint_positions()[:, TOES] - scale * toes)[..., ::2]
     for k, of_foot in enumerate(spans):
@@ -252,19 +252,21 @@ def _find_ankle_targets(
             positions[:, k, ::2] += hold_through(of_foot, mean_by_span(aside[:, k], of_foot), len(toes))
         else:
             positions[:, k, ::2] += gaussian.smooth(aside[:, k], _FREE_SECONDS * float(own.fps))
-    over = scale * (toes[..., 1] - giver.floor - giver.flat_height)
+    over = scale * (toes[..., 1] - source.floor - source.flat_height)
     lifted = torch.where(over < 0, MAX_TOE_SINK * torch.expm1(over / MAX_TOE_SINK) - over, 0.0)
-    positions[..., 1] += (1 - scale) * giver.floor + body.standing_height - scale * giver.flat_height + lifted + raised
+    positions[..., 1] += (
+        (1 - scale) * source.floor + body.standing_height - scale * source.flat_height + lifted + raised
+    )
     share = (over - ground) / leg_length(moved.skeleton)
     high = smootherstep((share - _LOW_SHARE) / _HIGH_SHARE)[..., None]
     return torch.lerp(positions + _foot_length_offset(own, moved, scale), moved.joint_positions()[:, FEET], high)
 
 
 def _foot_length_offset(own: Motion, moved: Motion, scale: float) -> Float[Tensor, "frames 2 3"]:
-    """Return the offset of the ankle from where it would be if the foot were the giver's in scale, metres.
+    """Return the offset of the ankle from where it would be if the foot were the source's in scale, metres.
 
     A foot whose heel is raised pivots on its toes, one whose toes are raised on its heel, right below the ankle: then
-    the ankle follows the giver's trajectory, as if the foot were flat.
+    the ankle follows the source's trajectory, as if the foot were flat.
     """
     longer = (scale * own.skeleton.offsets - moved.skeleton.offsets)[TOES].expand(own.num_frames, 2, 3)
     turns = own.joint_rotations()[:, FEET]
@@ -315,39 +317,39 @@ def retarget_motion(
     """
     if clip.skeleton.matches(body.rigmap.rig_skeleton):
         return RetargetedMotion(replace(to_canonical(clip, as_rig(body.rigmap))[0], skeleton=body.skeleton))
-    canonical, giver = RiggedCharacter.of(clip, rig)
-    found = retarget_canonical(canonical, giver, body, ground=ground)
+    canonical, source = RiggedCharacter.of(clip, rig)
+    found = retarget_canonical(canonical, source, body, ground=ground)
     ours, theirs = _list_fingers(body.rigmap.rig_skeleton), _list_fingers(clip.skeleton)
     fingers = {joint: theirs[finger] for finger, joint in ours.items() if finger in theirs}
     # What the turns of joints do that move, are not matched and lead to no joint that is, is lost.
-    led_by = ancestors(clip.skeleton, [*giver.rigmap.joints.values(), *fingers.values()])
+    led_by = ancestors(clip.skeleton, [*source.rigmap.joints.values(), *fingers.values()])
     dots = (clip.local_quat_xyzw * clip.local_quat_xyzw[:1]).sum(-1).abs().amin(dim=0).clamp(max=1.0)
     moves = 2 * torch.acos(dots) > _MOVES_RADIANS
     lost = tuple(name for j, name in enumerate(clip.skeleton.names) if j not in led_by and bool(moves[j]))
-    carried = _carry_fingers(clip, giver.rigmap, body.rigmap, fingers)
+    carried = _carry_fingers(clip, source.rigmap, body.rigmap, fingers)
     return replace(found, changes=replace(found.changes, unmatched_joints=lost), fingers=carried)
 
 
 def retarget_canonical(
-    motion: Motion, giver: RiggedCharacter, body: RiggedCharacter, *, ground: GroundMode = "fit"
+    motion: Motion, source: RiggedCharacter, body: RiggedCharacter, *, ground: GroundMode = "fit"
 ) -> RetargetedMotion:
-    """Retarget a motion (canonical joints, any part of a clip) whose giver is known. RequestError for another `ground`
+    """Retarget a motion (canonical joints, any part of a clip) whose source is known. RequestError for another `ground`
     than those of `GroundMode`."""
     if ground not in get_args(GroundMode):
         raise RequestError(f"the ground is one of {', '.join(get_args(GroundMode))}, got {ground!r}")
-    giver = replace(giver, stance=giver.stance.keep_floor()) if ground == "keep" else giver
-    own = giver.stance.leveled(motion)
+    source = replace(source, stance=source.stance.keep_floor()) if ground == "keep" else source
+    own = source.stance.leveled(motion)
     scale = leg_length(body.leveled) / leg_length(own.skeleton)
-    spans, height = find_ground(own, giver.stance)
+    spans, height = find_ground(own, source.stance)
     higher = 1 - scale if ground == "keep" else 0.0
     under_hips = gaussian.smooth(height.mean(dim=1, keepdim=True), _BODY_SECONDS * float(own.fps))[:, 0]
-    moved = _transfer_root(own, giver, body, scale, higher * under_hips)
+    moved = _transfer_root(own, source, body, scale, higher * under_hips)
     grounds = scale * height, higher * height
-    ankles = _find_ankle_targets(own, moved, giver.stance, body.stance, spans, *grounds, scale=scale)
+    ankles = _find_ankle_targets(own, moved, source.stance, body.stance, spans, *grounds, scale=scale)
     straight = limb_extension(own, LEGS)
     lowered = lower_hips(fit_hips(moved, ankles, straight), ankles, straight)
     standing = reach_ankle_targets(lowered, ankles)
-    done, hands_off = keep_hand_relations(own, standing, giver.stance, scale=scale)
+    done, hands_off = keep_hand_relations(own, standing, source.stance, scale=scale)
     changes = Changes(
         scale=leg_length(done.skeleton) / leg_length(motion.skeleton),
         hips_lowered_m=max(0.0, float((moved.root_position - lowered.root_position)[:, 1].max())),
@@ -358,15 +360,15 @@ def retarget_canonical(
 
 
 def _carry_fingers(
-    clip: Motion, giver: RigMap, body: RigMap, pairs: Mapping[int, int]
+    clip: Motion, source: RigMap, body: RigMap, pairs: Mapping[int, int]
 ) -> Mapping[int, Float[Tensor, "frames 4"]]:
-    """Return the local rotations (xyzw) of the body's finger joints that turn as the giver's do, by joint of its rig;
+    """Return the local rotations (xyzw) of the body's finger joints that turn as the source's do, by joint of its rig;
     in the T-poses of both rigs, fingers are taken to point along the same direction."""
-    ours, theirs = body.rest_quat_xyzw, giver.rest_quat_xyzw
+    ours, theirs = body.rest_quat_xyzw, source.rest_quat_xyzw
     found = {}
     for joint, other in pairs.items():
-        rest, their_rest = ours[body.rig_skeleton.parents[joint]], theirs[giver.rig_skeleton.parents[other]]
-        idle, their_idle = body.idle_quat_xyzw[joint], giver.idle_quat_xyzw[other]
+        rest, their_rest = ours[body.rig_skeleton.parents[joint]], theirs[source.rig_skeleton.parents[other]]
+        idle, their_idle = body.idle_quat_xyzw[joint], source.idle_quat_xyzw[other]
         # From the parent's frame in one T-pose to that in the other; each rotation is what it adds to rest.
         turn = rotations.multiply(rotations.inverse(rest), their_rest).expand(clip.num_frames, 4)
         added = rotations.multiply(clip.local_quat_xyzw[:, other], rotations.inverse(their_idle).expand_as(turn))

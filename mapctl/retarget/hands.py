@@ -1,7 +1,7 @@
 """Hands near the body, each other or the floor: where they are relative to these is kept on other bones.
 
-A body is rounded segments between joints, a hand two points, palm and finger tips. For each segment of the giver's body
-that a point is near, the same place on the receiving body is where that point should be, and all these places are
+A body is rounded segments between joints, a hand two points, palm and finger tips. For each segment of the source's
+body that a point is near, the same place on the receiving body is where that point should be, and all these places are
 averaged, the nearest counting most; beside them the position that rotations alone lead to, the more the farther the
 hand is from everything. Positions relative to a body's surface are kept in the manner of Molla et al. 2018.
 """
@@ -85,7 +85,7 @@ _SPEED_SECONDS = 0.1  # seconds over which that speed is smoothed
 _SHARPNESS = 0.05  # how much less a segment counts that is a little farther than the nearest
 _ROUNDS = 3  # times that hands are placed, since each arm is something that the other hand is near
 _EASE_WEIGHT = 0.02  # strength from which the arm is solved for entirely
-# Of the arm: how straight one may be whatever the giver's is, and at most.
+# Of the arm: how straight one may be whatever the source's is, and at most.
 _FREE_EXTENSION, _MOST_EXTENSION = 0.98, 0.998
 _SOFT_MARGIN = 0.06  # of the arm, before the most that it may be, over which it gives in
 _HELD_SPEED = 0.25  # m/s below which a hand on the floor stands on it
@@ -169,24 +169,24 @@ class _Relations(NamedTuple):
 
 
 def keep_hand_relations(
-    own: Motion, moved: Motion, giver: Stance, *, scale: float
+    own: Motion, moved: Motion, source: Stance, *, scale: float
 ) -> tuple[Motion, Float[Tensor, "frames 2"]]:
-    """Bring hands to where the giver's are relative to body, each other and floor, as far as arms allow; also return by
-    how much those that touch something miss it, metres.
+    """Bring hands to where the source's are relative to body, each other and floor, as far as arms allow; also return
+    by how much those that touch something miss it, metres.
 
-    Both are motions of canonical joints, `own` the giver's, `moved` with its rotations but of legs on other bones.
+    Both are motions of canonical joints, `own` the source's, `moved` with its rotations but of legs on other bones.
     Hands keep their orientation in the world, and elbows go on pointing where they did.
     """
-    relations = _find_relations(own, giver)
+    relations = _find_relations(own, source)
     strength = 1 - (1 - relations.body_strength()) * (1 - relations.together)
     if not bool((strength > 0).any()):
         return moved, torch.zeros(own.num_frames, 2, dtype=torch.float64)
-    at_floor = _floor_offsets(own, moved, relations, giver, scale=scale)
+    at_floor = _floor_offsets(own, moved, relations, source, scale=scale)
     straight = limb_extension(own, ARMS)
     done, before = moved, moved.joint_positions()[:, _HANDS]
     offset = missed = torch.zeros_like(before)
     for _ in range(_ROUNDS):
-        # Where one of two hands that are together does not get, the other comes to where it does.
+        # If one of two hands that are together falls short, the other comes to it.
         offset = _offset_hands(relations, moved, done, at_floor, relations.together[..., None] * missed)
         done = _reach(moved, offset, strength, straight)
         missed = missed + done.joint_positions()[:, _HANDS] - (before + offset)
@@ -196,7 +196,7 @@ def keep_hand_relations(
     return done, torch.where(touches, errors, 0.0)
 
 
-def _find_relations(own: Motion, giver: Stance) -> _Relations:
+def _find_relations(own: Motion, source: Stance) -> _Relations:
     size, fps = _girth(own.skeleton), float(own.fps)
     points, thick = _hand_points(own, size), size * _PALM_THICKNESS
     near = _find_nearest(points, _place_segments(own))
@@ -219,7 +219,7 @@ def _find_relations(own: Motion, giver: Stance) -> _Relations:
     )
     left, right = points.unflatten(1, (2, -1)).unbind(dim=1)
     between = (left[:, :, None] - right[:, None]).norm(dim=-1).flatten(1).amin(dim=1, keepdim=True)
-    height = points[..., 1] - giver.floor - thick
+    height = points[..., 1] - source.floor - thick
     # A point stands on the floor that is near it and slow, for a while.
     planted, settings = torch.zeros_like(height, dtype=torch.bool), contacts.ContactSettings()
     if len(points) > 1:
@@ -258,14 +258,14 @@ def _hand_points(motion: Motion, size: float) -> Float[Tensor, "frames points 3"
 
 
 def _floor_offsets(
-    own: Motion, moved: Motion, relations: _Relations, giver: Stance, *, scale: float
+    own: Motion, moved: Motion, relations: _Relations, source: Stance, *, scale: float
 ) -> Float[Tensor, "frames points 3"]:
-    """Return offsets that bring points as high over the floor as the giver's, metres, and hold over the ground what
+    """Return offsets that bring points as high over the floor as the source's, metres, and hold over the ground what
     stands on it."""
     size = _girth(moved.skeleton)
     points, given = _hand_points(moved, size), scale * _hand_points(own, _girth(own.skeleton))
     offsets = torch.zeros_like(points)
-    offsets[..., 1] = relations.floor_height + giver.floor + size * _PALM_THICKNESS - points[..., 1]
+    offsets[..., 1] = relations.floor_height + source.floor + size * _PALM_THICKNESS - points[..., 1]
     for k, spans in enumerate(merge_contacts(relations.planted, given, float(own.fps))):
         if spans:
             shift = (points - given)[:, k, ::2]

@@ -1,7 +1,7 @@
 """Orders that programs send over OSC: `/mapctl/NAME` for the first character, `/mapctl/2/NAME` for the second.
 
-This is the syntax alone: which orders there are, and how many numbers or words each takes. What an order means, and the
-limits of its numbers, belong to whoever obeys it.
+Syntax alone: names of orders, and how many numbers or words each takes. Their meaning and the limits of their numbers
+are in `scenes.live.remote`.
 """
 
 import math
@@ -38,7 +38,7 @@ NUMBERS: Mapping[str, Sequence[int]] = {
     "pause": (0, 1),
     "reset": (0,),
 }
-"""How many numbers each order takes; orders that take none of several let go of what was asked for before."""
+"""Counts of numbers that each order takes; an order without its optional numbers cancels the earlier one."""
 
 
 @dataclass(frozen=True)

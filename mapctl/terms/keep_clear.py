@@ -28,13 +28,13 @@ class KeepClear:
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Return the energies of the joints that reach farthest from the body, nats."""
-        return 0.5 * (self._trespass(trial) / self.sigma).square().sum(-1)
+        return 0.5 * (self._measure_intrusion(trial) / self.sigma).square().sum(-1)
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Return the distance by which the joint that is nearest to an obstacle is nearer than the margin, metres."""
-        return self._trespass(trial).amax(-1)
+        return self._measure_intrusion(trial).amax(-1)
 
-    def _trespass(self, trial: Trial) -> Float[Tensor, "batch frames joints"]:
+    def _measure_intrusion(self, trial: Trial) -> Float[Tensor, "batch frames joints"]:
         ground = trial.joints_world[..., list(_WIDEST), ::2]
         return (self.margin - measure_clearance(self.obstacles, ground)).clamp_min(0)
 
@@ -48,19 +48,19 @@ class KeepApart:
     distance: float
     """Least distance of hips, metres."""
     sigma: float = 0.02
-    """Standard deviation of the distance that is lacking, metres."""
+    """Standard deviation of the shortfall of that distance, metres."""
     name: str = "apart"
     unit: str = "m"
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Return the energies, nats, summed over the others."""
-        return 0.5 * (self._lacking(trial) / self.sigma).square().sum(1)
+        return 0.5 * (self._measure_shortfall(trial) / self.sigma).square().sum(1)
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Return the distance that is lacking to the nearest other, metres."""
-        return self._lacking(trial).amax(1)
+        """Return the largest shortfall of the distance to another, metres."""
+        return self._measure_shortfall(trial).amax(1)
 
-    def _lacking(self, trial: Trial) -> Float[Tensor, "batch others frames"]:
+    def _measure_shortfall(self, trial: Trial) -> Float[Tensor, "batch others frames"]:
         away = trial.root_xz_world[:, None] - self.others.to(trial.features)
         return (self.distance - length(away)).clamp_min(0)
 
@@ -78,16 +78,16 @@ class WithinReach:
     reach: float
     """Distance that the limb reaches without strain, metres."""
     sigma: float = 0.02
-    """Standard deviation of the distance that it would have to be longer, metres."""
+    """Standard deviation of the distance beyond reach, metres."""
     robust: float = 0.1
-    """Such distance beyond which the energy rises linearly, metres: what is out of reach is worth no lunge."""
+    """Distance beyond reach from which the energy rises linearly, metres, so that no target causes a lunge."""
     name: str = "within reach"
     unit: str = "m"
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Return the energies, nats."""
-        lacking = self.residual(trial) / self.robust
-        return (self.robust / self.sigma) ** 2 * ((1 + lacking.square()).sqrt() - 1)
+        shortfall = self.residual(trial) / self.robust
+        return (self.robust / self.sigma) ** 2 * ((1 + shortfall.square()).sqrt() - 1)
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Return the distance beyond reach, metres; 0 where the limb reaches."""

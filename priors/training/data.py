@@ -134,9 +134,9 @@ def split_corpus(corpus: Corpus, seed: int) -> Split:
         )
     for part, own in zip(parts, long, strict=True):
         if not own:
-            giver = max(range(len(parts)), key=lambda number: len(long[number]))
-            taken = long[giver].pop(0)
-            parts[giver][parts[giver].index(taken)] = part[0]
+            donor = max(range(len(parts)), key=lambda number: len(long[number]))
+            taken = long[donor].pop(0)
+            parts[donor][parts[donor].index(taken)] = part[0]
             part[0] = taken
     return Split(corpus, *(corpus.subset(sorted(part)) for part in parts))
 
@@ -399,8 +399,8 @@ def stand_on_canonical(motion: Motion, rigmap: RigMap) -> Motion:
     the scale of the legs (see `mapctl.retarget.carry`).
     """
     leveled = _put_on_floor(turn_level(motion, find_floor_slope(motion)))
-    giver = RiggedCharacter(rigmap, Stance.of(leveled, rigmap))
-    return retarget_canonical(leveled, giver, _canonical_body()).motion
+    source = RiggedCharacter(rigmap, Stance.of(leveled, rigmap))
+    return retarget_canonical(leveled, source, _canonical_body()).motion
 
 
 def find_floor_slope(motion: Motion) -> Float[Tensor, "2"]:

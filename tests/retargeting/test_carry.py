@@ -65,9 +65,9 @@ def foot_pitch_deg(motion: Motion) -> torch.Tensor:
     return torch.stack([pitch[flat[:, k], k].median() for k in range(2)])
 
 
-@pytest.mark.parametrize(("giver", "body", "fps"), [(*pair, 30) for pair in PAIRS] + [(*PAIRS[2], 120)])
-def test_who_carries_a_walk_stands_as_in_its_own(giver, body, fps):
-    clip, own = performer(giver).walks(90 * fps // 30, fps), performer(body).walks()
+@pytest.mark.parametrize(("source", "body", "fps"), [(*pair, 30) for pair in PAIRS] + [(*PAIRS[2], 120)])
+def test_who_carries_a_walk_stands_as_in_its_own(source, body, fps):
+    clip, own = performer(source).walks(90 * fps // 30, fps), performer(body).walks()
     done = retarget_motion(clip, RiggedCharacter.of(own)[1])
     assert done.notes == ()
     torch.testing.assert_close(low_toes(done.motion), low_toes(own), atol=0.008, rtol=0)
@@ -80,10 +80,10 @@ def test_who_carries_a_walk_stands_as_in_its_own(giver, body, fps):
     )
 
 
-@pytest.mark.parametrize(("giver", "body"), PAIRS)
-def test_nothing_moves_or_turns_faster_than_it_did(giver, body):
+@pytest.mark.parametrize(("source", "body"), PAIRS)
+def test_nothing_moves_or_turns_faster_than_it_did(source, body):
     """The worst frame of every joint of the legs, in scale."""
-    clip, own = performer(giver).walks(), performer(body).walks()
+    clip, own = performer(source).walks(), performer(body).walks()
     done = retarget_motion(clip, RiggedCharacter.of(own)[1]).motion
     scale = leg_length(own.skeleton) / leg_length(clip.skeleton)
     legs = [j for j, name in enumerate(CANONICAL.names) if name.endswith(("hips", "Leg", "Foot", "Toes"))]
@@ -100,10 +100,10 @@ def test_a_clip_of_the_bodys_own_skeleton_stays_to_the_bit():
     torch.testing.assert_close(done.local_quat_xyzw, lifted.local_quat_xyzw, atol=1e-12, rtol=0)
 
 
-@pytest.mark.parametrize(("giver", "body"), PAIRS)
-def test_there_and_back_is_where_one_was(giver, body):
+@pytest.mark.parametrize(("source", "body"), PAIRS)
+def test_there_and_back_is_where_one_was(source, body):
     """Every joint of a walk within 1 cm on the mean of its frames, and hips, hands and toes always."""
-    clip, other = arms_down(performer(giver).walks()), performer(body).body()
+    clip, other = arms_down(performer(source).walks()), performer(body).body()
     there = retarget_motion(clip, other).motion
     back = retarget_motion(there, RiggedCharacter.of(clip)[1]).motion
     away = (back.joint_positions() - clip.joint_positions()).norm(dim=-1)
@@ -254,9 +254,9 @@ def stands(motion: Motion, clip: Motion) -> torch.Tensor:
 @pytest.mark.parametrize("mode", ["fit", "keep"])
 @pytest.mark.parametrize("name", OTHERS)
 def test_steps_are_as_high_as_asked(mode: GroundMode, name):
-    clip, giver = climb()
+    clip, source = climb()
     body = OTHERS[name].body()
-    done = retarget_canonical(clip, giver, body, ground=mode)
+    done = retarget_canonical(clip, source, body, ground=mode)
     scale = leg_length(body.leveled) / leg_length(clip.skeleton)
     factor = scale if mode == "fit" else 1.0
     over = stands(clip, clip) - Performer().toe_height

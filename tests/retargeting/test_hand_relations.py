@@ -1,4 +1,4 @@
-"""Hands on another body: at its hips, head, knees and arms, at each other and on the floor as the giver's."""
+"""Hands on another body: at its hips, head, knees and arms, at each other and on the floor as the source's."""
 
 import math
 from dataclasses import replace
@@ -75,7 +75,7 @@ POSES = {"hip": (at_hip, HIPS), "head": (at_head, HEAD), "chest": (on_chest, CAN
 @pytest.mark.parametrize("pose", POSES)
 @pytest.mark.parametrize("name", ["short arms", "wide shoulders", "small"])
 def test_a_hand_is_where_it_was_on_the_body(pose, name):
-    """Relative to what it touches, in scale; where it only turns as the giver's it is centimetres off."""
+    """Relative to what it touches, in scale; where it only turns as the source's it is centimetres off."""
     make, anchor = POSES[pose]
     clip, body = make(arms_down(standing())), body_of(BODIES[name])
     done = retarget_motion(clip, body)

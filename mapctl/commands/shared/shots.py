@@ -68,7 +68,7 @@ def plan_shot(
     obstacles: Sequence[Obstacle] = (),
     fps: Fraction | None = None,
 ) -> ShotPlan:
-    """Plan an actor's shot; a clip that it goes on from or ends in is read, and gives it its body and its rate.
+    """Plan an actor's shot; a clip from which it continues or in which it ends determines its body and its rate.
     RequestError for constraints that do not fit each other, and for labels that the prior does not have."""
     own, rate, rigged = actor.start_clip or actor.end_clip, Fraction(PRIOR_FPS), None
     clips: dict[str, Motion] = {}  # on canonical joints with the character's bones
@@ -76,7 +76,7 @@ def plan_shot(
         clip, rig = read_clip(folder / own[0], options)
         if character.rigmap is not None and not clip.skeleton.matches(character.rigmap.rig_skeleton):
             raise RequestError(
-                f"{own[0]} is of another rig than the character; what goes on from a clip or ends in one is on its rig"
+                f"{own[0]} is of another rig than the character; a shot from or into a clip is on the rig of the clip"
             )
         canonical, rigged = RiggedCharacter.of(clip, rig)
         toe_height = float(rigged.stance.toe_height.mean())
@@ -161,8 +161,8 @@ _BESIDE = 6  # frames after the last
 
 
 def resample_shot(solution: ShotSolution, request: ShotRequest, fps: Fraction) -> Motion:
-    """Resample a shot's motion, a higher rate by splines: through the frames of a clip that it goes on from or ends in,
-    and for a loop through its own, so that its last frame leads into its first at that rate."""
+    """Resample a shot's motion, a higher rate by splines: through the frames of a clip from which it continues or in
+    which it ends, and for a loop through its own, so that its last frame leads into its first at that rate."""
     motion, before, after = solution.motion, None, None
     frames = int((motion.num_frames - 1) * fps / motion.fps) + 1
     if request.lead is not None:
@@ -308,7 +308,7 @@ def _find_others(
 def stage_actor(
     done: PlayedShot, *, colour: str | None = None, start_seconds: float = 0.0, character: DrawnCharacter | None = None
 ) -> Shot:
-    """Put what an actor did on a stage, and what it was asked for: targets, points to look at, positions and facings of
+    """Return an actor's motion and its targets for the stage: reaches, points to look at, positions and facings of
     the hips, and whole poses. It is drawn as a character if there is one."""
     solution, motion = done.solution, done.solution.motion
 
