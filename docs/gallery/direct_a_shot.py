@@ -33,7 +33,7 @@ for constraint in shot.constraints:
     print(f"{constraint.name} ({constraint.asked}): {constraint.got:.1f} {constraint.unit}")
 
 # %%
-# The trajectory (red) is led round the pillar before anything is walked. The ball shines while it is to be touched.
+# The planned path (red) leads round the pillar. The ball shines while it is a target.
 
 actor = Shot(shot.motion, shot.trajectory.curve, targets=Targets([Mark(build_target(ball), (2.2, 2.4))]))
 camera, props = CameraSettings(azimuth_deg=65), [build_obstacle(pillar)]

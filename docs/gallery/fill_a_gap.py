@@ -2,8 +2,8 @@
 Fill a gap, and a lost arm
 ==========================
 
-A capture lost everything for a while, and later the right arm: `infill` makes both anew, and leaves what is known as it
-was, to the bit.
+A capture lost everything for a while, and later the right arm: `infill` generates both, and leaves known values
+unchanged, to the bit.
 """
 
 from dataclasses import replace

@@ -2,8 +2,8 @@
 Walk along a curve
 ==================
 
-The headline job: draw a curve, and a character walks along it. A learned prior scores how people walk; the solver finds
-a likely walk that stays on the curve at the speed asked for, with feet that stand while they carry weight.
+Draw a curve, and a character walks along it. A learned prior scores how natural the walk is; the solver finds a likely
+walk on the curve at the requested speed, with planted feet.
 """
 
 import torch
@@ -20,7 +20,7 @@ walk = controllers.follow(prior, curve, speed=1.2, generator=torch.Generator().m
 print(f"{walk.motion.seconds:.1f} s along {curve.length:.1f} m: {walk.status.text}")
 
 # %%
-# The red band is what was asked for, the yellow line where the hips went. A ring shows a foot that is planted.
+# The red band is the curve, the yellow line the root trajectory. A ring shows a foot that is planted.
 
 camera = CameraSettings(azimuth_deg=-20)
 film([Shot(walk.motion, curve)], "walk-along-a-curve.webp", camera=camera, size=(480, 270), fps=15)

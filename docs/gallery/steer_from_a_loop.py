@@ -2,8 +2,8 @@
 Steer from a loop
 =================
 
-In a game or on a robot the next command is unknown. A step of steering makes the next three frames for the command
-that holds now; `drive` is the loop around it, which asks a source for commands and hands the frames to displays.
+In a game or on a robot, commands arrive at run time. A step of steering computes the next three frames under the
+present command; `drive` is the loop around it, which polls a source for commands and sends frames to displays.
 """
 
 import math

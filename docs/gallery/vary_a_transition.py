@@ -2,8 +2,8 @@
 Vary the transition between two poses
 =================================
 
-There is more than one transition between two poses. The stitcher walks from both at once until its two sides meet: it
-has one calm answer, and as many others as are asked for.
+Many motions lead from one pose to the next. The stitcher generates from both poses until its two sides meet: one mean
+motion, and any number of samples.
 """
 
 from dataclasses import replace

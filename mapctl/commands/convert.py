@@ -30,7 +30,7 @@ class Convert(Command, options.ReadOptions):
     """
 
     source: Positional[Annotated[Path, arg(metavar="IN|FOLDER")]]
-    """.bvh, .npz, .recording, or .amc: its skeleton is the .asf of the same name, else the only one in the folder, else
+    """.bvh, .npz, or .amc: its skeleton is the .asf of the same name, else the only one in the folder, else
     named as in subject.asf+take.amc. Of a character (.glb, .gltf, .vrm, .vrma, .usda, .usdc, .usd, .usdz, .fbx) its
     first animation, else one frame of its rest pose; hero.glb#ARMATURE, hero.glb#ARMATURE/ANIMATION and
     hero.glb#/ANIMATION choose others. Or a folder, every motion below it."""

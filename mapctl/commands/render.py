@@ -23,7 +23,7 @@ class Render(Command, options.RigOptions):
     """Film a motion: MP4, GIF, or a PNG contact sheet. Files of known rigs that have Z up are put upright."""
 
     source: options.InFile
-    """.bvh, .npz, .recording, .amc with its .asf beside it, or a character's file (see `mapctl convert --help`)."""
+    """.bvh, .npz, .amc with its .asf beside it, or a character's file (see `mapctl convert --help`)."""
     out: options.OutFile
     """.mp4, .gif, .webp or .png."""
     curve: options.MaybeCurve = None
