@@ -56,7 +56,7 @@ class Pair:
     root_order: str
     """Axes of the root's turns."""
     frames: tuple[dict[str, np.ndarray], ...]
-    """Of each frame the values of the bones that it holds, degrees and file units."""
+    """Values of each frame by the bones that it holds, degrees and file units."""
     degrees: bool = True
     orientation: np.ndarray = field(default_factory=lambda: np.zeros(3))
     position: np.ndarray = field(default_factory=lambda: np.zeros(3))

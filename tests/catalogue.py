@@ -53,7 +53,7 @@ from priors.lstm_gmm.density import LstmGmmDensity
 from priors.lstm_gmm.network import LstmGmm
 
 FRAMES = 12
-"""Of the windows that the terms are tried on."""
+"""Frames of the windows on which terms are tried."""
 
 PAST = 8
 """Frames before them."""

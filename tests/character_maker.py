@@ -95,7 +95,7 @@ class MadeCharacter:
     joint: Mapping[str, str]
     """The file's joint name by that of character_body (canonical names, and spine1, Finger, ...End)."""
     names: tuple[str, ...]
-    """Of the joints, parents first."""
+    """Names of the joints, parents first."""
     nodes: tuple[int, ...]
     """Their nodes."""
     positions: Array
@@ -107,7 +107,7 @@ class MadeCharacter:
     faces: Array
     """(m, 3) of them."""
     parts: tuple[Part, ...]
-    """Of which body; their weights, pictures' places and triangles are the file's."""
+    """Parts of a body, with the file's weights, texture coordinates and triangles."""
     size: float
     """Factor on the body of character_body."""
     animations: tuple[str, ...] = field(default=())

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 JOINTS = tuple(name for name in PARENTS if name not in ENDS)
 """The limbs, parents first."""
 TICKS = 46_186_158_000
-"""Of FBX's clock in a second."""
+"""Ticks of FBX's clock in a second."""
 _ORDERS = ("xyz", "xzy", "yzx", "yxz", "zxy", "zyx")
 _RATES = {24: 11, 25: 10, 30: 6, 60: 3, 120: 1}
 _Z_UP = Rotation.from_euler("x", 90, degrees=True)
@@ -22,7 +22,7 @@ _Z_UP = Rotation.from_euler("x", 90, degrees=True)
 
 @dataclass(frozen=True, eq=False)
 class MadeFbx:
-    """What is in the file in truth, in metres and Y up."""
+    """Truth of the file, in metres and Y up."""
 
     positions: np.ndarray
     """(frames, joints, 3) of the limbs in the first take."""

@@ -51,7 +51,7 @@ class GlbViewer:
         return found
 
     def local(self, node: int, animation: int | None = None, seconds: float = 0.0) -> Array:
-        """What takes a node's frame to its parent's, (4, 4), as the file stands or at a time of an animation."""
+        """Matrix from a node's frame to its parent's, (4, 4), as the file stands or at a time of an animation."""
         given = self.nodes[node]
         tracks = {} if animation is None else self._tracks(animation, node, seconds)
         if "matrix" in given and not tracks:
@@ -65,7 +65,7 @@ class GlbViewer:
         return matrix
 
     def world(self, node: int, animation: int | None = None, seconds: float = 0.0) -> Array:
-        """What takes a node's frame to the scene, (4, 4)."""
+        """Matrix from a node's frame to the scene, (4, 4)."""
         own = self.local(node, animation, seconds)
         return self.world(self.parent[node], animation, seconds) @ own if node in self.parent else own
 

@@ -149,8 +149,8 @@ def prepare(folder: Path) -> None:
 
 
 def kind_of_machine() -> str:
-    """What bits depend on: processor, instruction sets, libraries, and how these add: two processors of one name, whose
-    caches are shared otherwise, may not add in the same order."""
+    """Describe the machine as far as bits depend on it: processor, instruction sets, libraries, and how these add: two
+    processors of one name, whose caches are shared otherwise, may not add in the same order."""
     processor = llvmlite.binding.get_host_cpu_name()
     versions = f"torch {torch.__version__}, numpy {numpy.__version__}, numba {numba.__version__}"
     return f"{processor}, {torch.backends.cpu.get_cpu_capability()}, {versions}, sums {_hash_sums()}"
@@ -235,7 +235,7 @@ def _without_times(text: str) -> str:
 
 
 def differences(found: dict[str, dict], golden: dict[str, dict], *, to_the_bit: bool) -> list[str]:
-    """What one command's files differ by, a line each."""
+    """List the differences of one command's files, a line each."""
     faults = [f"{name}: not made" for name in golden.keys() - found.keys()]
     faults += [f"{name}: new" for name in found.keys() - golden.keys()]
     for name in sorted(found.keys() & golden.keys()):

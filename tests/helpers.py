@@ -251,7 +251,7 @@ def run(*words: object) -> int:
 
 
 class Killed(Exception):
-    """What ends a training run between two steps."""
+    """Exception that ends a training run between two steps."""
 
 
 @contextmanager

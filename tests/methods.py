@@ -8,7 +8,7 @@ UNFINISHED = InfillSettings(refine=False)
 
 
 def by_method(method: str, infiller: Inbetweener) -> tuple[Inbetweener, InfillSettings]:
-    """Who proposes, and how it is finished."""
+    """Return the in-betweener and the settings of a method."""
     return {"auto": AutoInbetweener, "infiller": lambda it: it, "slerp": lambda it: SlerpInbetweener()}[method](
         infiller
     ), InfillSettings(refine=method == "auto")

@@ -20,7 +20,7 @@ class Block:
 
     page: str
     number: int
-    """Of those of its language on its page, from 0."""
+    """Index among the blocks of its language on its page."""
     language: str
     text: str
 

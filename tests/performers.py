@@ -25,12 +25,12 @@ _HEEL, _TOE = 0.6, -0.25  # radians that the foot points down as it leaves the f
 
 @dataclass(frozen=True)
 class Performer:
-    """Whose bones."""
+    """Rig of the bones."""
 
     size: float = 1.0
-    """Of the canonical body."""
+    """Size over that of the canonical body."""
     leg: float = 1.0
-    """Of the legs' share in it."""
+    """Length of the legs over that of the canonical body."""
     droop_deg: float = 0.0
     """By how much the feet of the T-pose point down."""
     toe_height: float = TOE_REST_HEIGHT

@@ -19,14 +19,14 @@ _SIDES = (("left", 1.0), ("right", -1.0))
 
 @dataclass(frozen=True)
 class Make:
-    """What rig is wanted."""
+    """Settings of a rig to build."""
 
     names: Mapping[str, str]
     """Canonical joint to the rig's name; joints that are not named are left out."""
     size: float = 1.0
-    """Of the canonical body."""
+    """Size over that of the canonical body."""
     arms_down_deg: float = 0.0
-    """Of the rest pose: 0 is a T-pose."""
+    """Angle of the arms in the rest pose: 0 is a T-pose."""
     bones_along_x: bool = False
     """A rest pose that is none, every bone along its joint's x axis."""
     zup: bool = False
@@ -36,7 +36,7 @@ class Make:
     extras: bool = True
     """Joints that the canonical skeleton lacks: spine, twist, fingers, a prop."""
     root: str | None = None
-    """Of a joint on the ground above the hips."""
+    """Name of a joint on the ground above the hips."""
     end_sites: bool = True
     """Whether feet and hands without further joints end in End Sites."""
     swapped: bool = False

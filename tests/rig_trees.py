@@ -4,7 +4,7 @@ from rig_maker import Make, names_of
 
 
 def both(text: str, sides: tuple[str, str]) -> dict[str, tuple[str, ...]]:
-    """What lies between, of both sides: `UpperLeg: hip{s} pelvis{s}; LowerLeg: knee{s}`."""
+    """Joints between, of both sides: `UpperLeg: hip{s} pelvis{s}; LowerLeg: knee{s}`."""
     found = {}
     for side, mark in zip(("left", "right"), sides, strict=True):
         for entry in text.split(";"):

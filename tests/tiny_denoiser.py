@@ -14,7 +14,7 @@ from priors.denoiser import ConvDenoiser, DenoiserConfig, DenoiserNetwork
 QUICK = DenoiseSettings(
     refinement=RefinementSettings(lbfgs=LbfgsSettings(max_iterations=4), budget=Budget(evaluations=4))
 )
-"""Of a denoising that searches little."""
+"""Settings of a denoising that searches little."""
 CONFIG = DenoiserConfig(width=8, dilations=(1, 2))
 
 
@@ -31,7 +31,7 @@ def network(*, drawn: float = 0.0, seed: int = 0, config: DenoiserConfig = CONFI
 
 
 def card() -> checkpoints.Card:
-    """Of the tiny denoiser."""
+    """Card of the tiny denoiser."""
     return checkpoints.Card(
         "denoiser", CONFIG.as_card(), licence="none, it is made up", **checkpoints.Card.layout_fields()
     )

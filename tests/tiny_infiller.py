@@ -28,7 +28,7 @@ def network(*, drawn: float = 0.0, seed: int = 0, config: InfillerConfig = CONFI
 
 
 def card(config: InfillerConfig = CONFIG) -> checkpoints.Card:
-    """Of the tiny infiller."""
+    """Card of the tiny infiller."""
     return checkpoints.Card(
         "infiller", config.as_card(), licence="none, it is made up", **checkpoints.Card.layout_fields()
     )

@@ -24,7 +24,7 @@ def network(config: PathConfig = CONFIG, *, seed: int = 0) -> PathNetwork:
 
 
 def card(held_out: dict[str, list[str]] | None = None) -> checkpoints.Card:
-    """Of the tiny path predictor."""
+    """Card of the tiny path predictor."""
     return checkpoints.Card(
         "path",
         CONFIG.as_card(),

@@ -35,7 +35,7 @@ def network(config: StitcherConfig = CONFIG, *, drawn: float = 0.3, seed: int = 
 
 
 def card(config: StitcherConfig = CONFIG) -> checkpoints.Card:
-    """Of such weights."""
+    """Card of such weights."""
     return checkpoints.Card(
         kind="stitcher",
         config=config.as_card(),

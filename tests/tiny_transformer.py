@@ -24,7 +24,7 @@ def network(*, drawn: float = 0.0, seed: int = 0, config: PoseTransformerConfig 
 
 
 def card(config: PoseTransformerConfig = CONFIG) -> checkpoints.Card:
-    """Of the tiny transformer."""
+    """Card of the tiny transformer."""
     return checkpoints.Card(
         "pose-transformer", config.as_card(), licence="none, it is made up", **checkpoints.Card.layout_fields()
     )

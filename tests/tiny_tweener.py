@@ -28,7 +28,7 @@ def network(*, seed: int = 0, drawn: float = 0.05) -> GeneratorNetwork:
 def card(
     path: str = "", classes: Sequence[str] = (), held_out: Mapping[str, Sequence[str]] | None = None
 ) -> checkpoints.Card:
-    """Of the tiny tweener, which was trained with the path predictor of this hash and knows made-up classes."""
+    """Card of the tiny tweener, trained with the path predictor of this hash, with invented classes."""
     members = {name: [MotionDna(_draw_poses(name))] for name in classes}
     return checkpoints.Card(
         "tweener",

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 JOINTS = tuple(name for name in PARENTS if name not in ENDS)
 """The skeleton's joints, parents first."""
 COLOURS = {"shirt": (1.0, 0.5, 0.0), "skin": (0.6, 0.35, 0.25), "trousers": (0.1, 0.15, 0.4), "shoes": (0.0, 0.0, 0.0)}
-"""Of the materials by part, in proportion to light."""
+"""Colours of the materials by part, linear."""
 
 
 def joint_path(name: str) -> str:

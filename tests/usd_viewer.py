@@ -53,7 +53,7 @@ class UsdViewer:
 
 
 def find_faults(path: str | PathLike[str]) -> list[str]:
-    """What the validators that usdchecker runs say of a file, each once."""
+    """Messages of usdchecker's validators on a file, each once."""
     registry = UsdValidation.ValidationRegistry()
     names = [given.name for given in registry.GetAllValidatorMetadata() if not given.isSuite]
     context = UsdValidation.ValidationContext([registry.GetOrLoadValidatorByName(name) for name in names])

@@ -31,7 +31,7 @@ _FEET = CANONICAL.indices(("leftFoot", "rightFoot"))
 
 @dataclass(frozen=True)
 class MotionMatchingSettings:
-    """What is compared, how often, and how jumps fade."""
+    """Settings of the search: features, interval, and decay of jumps."""
 
     every: float = 0.2
     """Seconds between searches."""
@@ -50,7 +50,7 @@ class MotionMatchingSettings:
     trajectory_directions: float = 1.5
     """Weight of the headings ahead."""
     starts: int = 20
-    """Of so many frames that suit the curve's beginning best, one is drawn to begin with."""
+    """Number of the best matching first frames, of which one is drawn."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,16 +60,16 @@ class MotionDatabase:
     features: Float[ndarray, "frames size"]
     """Frames of all clips in `mapctl.features.LAYOUT`."""
     columns: Float[ndarray, "frames columns"]
-    """What frames are compared by, each group in units of its spread and times its weight; what is ahead means nothing
-    where a clip ends sooner."""
+    """Features by which frames are compared, each group in units of its spread and times its weight; what is ahead
+    means nothing where a clip ends sooner."""
     candidates: ndarray
     """Frames that may be jumped to, (candidates,)."""
     scale: Float[ndarray, " columns"]
-    """What a column of world units is multiplied by."""
+    """Weight of each column, from world units."""
     last: ndarray
     """Last frame of each frame's clip, (frames,)."""
     settings: MotionMatchingSettings
-    """What the columns were built by."""
+    """Builder of the columns."""
 
     @staticmethod
     def of(
@@ -135,7 +135,7 @@ def follow_by_matching(
 
 @dataclass(frozen=True, eq=False)
 class _Fading:
-    """What is left of the last jump: a critically damped spring from the old motion to the new one."""
+    """Offset left from the last jump: a critically damped spring from the old motion to the new one."""
 
     jumped: Float[ndarray, " continuous"]
     """Old values less new ones at the jump."""

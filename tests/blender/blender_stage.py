@@ -64,7 +64,7 @@ def state() -> list:
 
 
 def printed() -> tuple[str, ...]:
-    """What the panel shows."""
+    """Return the lines of the panel."""
     return tuple(module("interface").Report.lines)
 
 

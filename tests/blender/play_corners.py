@@ -1,4 +1,4 @@
-"""What is hard about armatures, what users do wrong, and undo; mapctl itself is a stub.
+"""Difficult armatures, mistakes of users, and undo; mapctl itself is a stub.
 
 python play_corners.py FOLDER PYTHON
 """
@@ -26,7 +26,7 @@ def apart(armature, run, bones: list[str] | None = None) -> float:
 
 
 def play_echoes() -> None:
-    """What comes back as it was sent leaves every armature as it was."""
+    """A motion that comes back unchanged leaves every armature as it was."""
     blender_stage.use("echo")
     blender_stage.clear()
     armature = armatures.add_mixamo(imported=True)
@@ -268,7 +268,7 @@ def expect(name: str, run, **options) -> None:
 
 
 def play_errors() -> None:
-    """What users do wrong."""
+    """Mistakes of users."""
     blender_stage.clear()
     walk, clean_up = bpy.ops.mapctl.walk, bpy.ops.mapctl.clean_up
     armature = armatures.add_mixamo()

@@ -17,7 +17,7 @@ facts: dict = {}
 
 
 def make_window():
-    """What an operator asks of Blender's windows."""
+    """Stub of Blender's window manager."""
     notes: list = []
     window = SimpleNamespace(
         progress_begin=lambda *_: notes.append("begin"),
@@ -113,7 +113,7 @@ def is_running(number: int) -> bool:
 
 
 class Layout:
-    """What a panel asks of Blender's layout; what it draws is noted."""
+    """Stub of Blender's layout that notes what is drawn."""
 
     def __init__(self, drawn: list):
         self.drawn = drawn
@@ -139,7 +139,7 @@ class Layout:
 
 
 def draw_panel() -> list[str]:
-    """What the panel shows now."""
+    """Return the text of the panel."""
     drawn: list[str] = []
     panel = blender_stage.module("interface").MAPCTL_PT_sidebar
     standing = SimpleNamespace(layout=Layout(drawn))
@@ -149,7 +149,7 @@ def draw_panel() -> list[str]:
 
 
 def check_manifest() -> str:
-    """What Blender's own tool says of the zip."""
+    """Validate the zip by Blender's own tool."""
     tool = Path(bpy.utils.system_resource("SCRIPTS")) / "addons_core" / "bl_pkg" / "cli" / "blender_ext.py"
     command = [sys.executable, str(tool), "validate", str(blender_stage.FOLDER / "addon.zip")]
     return subprocess.run(command, capture_output=True, text=True).stdout

@@ -84,7 +84,7 @@ def thin(armature) -> None:
 
 
 def describe(armature) -> dict:
-    """What its action is like: its name, the greatest step of curves by kind, keyed bones, kinds of keys."""
+    """Describe its action: its name, the greatest step of curves by kind, keyed bones, kinds of keys."""
     curves = armatures.curves_of(armature)
     steps: dict[str, float] = {}
     for curve in curves:

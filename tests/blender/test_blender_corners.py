@@ -14,7 +14,7 @@ CLOSE = 2e-6  # metres
 
 @pytest.fixture(scope="module")
 def facts(tmp_path_factory) -> dict:
-    """What was seen in Blender."""
+    """Facts noted in Blender."""
     folder = tmp_path_factory.mktemp("corners")
     (folder / "addon.zip").write_bytes(build_addon_zip())
     found, walked = run_in_blender("play_corners.py", folder)

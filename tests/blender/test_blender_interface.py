@@ -10,7 +10,7 @@ pytestmark = needs_blender
 
 @pytest.fixture(scope="module")
 def facts(tmp_path_factory) -> dict:
-    """What was seen in Blender."""
+    """Facts noted in Blender."""
     folder = tmp_path_factory.mktemp("interface")
     (folder / "addon.zip").write_bytes(build_addon_zip())
     return run_in_blender("play_interface.py", folder)[0]

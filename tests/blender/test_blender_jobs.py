@@ -25,7 +25,7 @@ KINDS = [
 
 @pytest.fixture(scope="module", params=KINDS)
 def played(request, tmp_path_factory):
-    """What Blender showed after every operator, and the folder with the files that were exchanged."""
+    """Facts noted in Blender after every operator, and the folder with the files that were exchanged."""
     kind, small, fps, stages = request.param
     folder = tmp_path_factory.mktemp("blender")
     (folder / "kept").mkdir()
@@ -50,7 +50,7 @@ def joints(file, names) -> np.ndarray:
 
 
 def shown(arrays, stage, names, file) -> np.ndarray:
-    """What Blender showed of those joints that a motion file has."""
+    """World positions in Blender of the joints of a motion file."""
     own = mapctl.load(file).skeleton.names
     return arrays[stage][:, [position for position, name in enumerate(names) if name in own]]
 

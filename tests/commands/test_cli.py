@@ -188,7 +188,7 @@ def _started(words) -> subprocess.Popen[str]:
 
 
 def _ended(process: subprocess.Popen[str]) -> tuple[str, str]:
-    """What it said in the end; it is killed if it does not end."""
+    """Return the last output of a process; it is killed if it does not end."""
     try:
         return process.communicate(timeout=60)
     except subprocess.TimeoutExpired:

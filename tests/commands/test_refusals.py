@@ -402,7 +402,7 @@ CASES = {
     f"{TRAIN} --width 0": "Unrecognized options: --width",
     "live --character hero.glb --character hero.glb": "--character is given 2 times for 1 of --characters",
 }
-"""What a user types, and what the line has in it."""
+"""Command lines, and a part of the message of each."""
 
 
 @pytest.fixture(scope="module")

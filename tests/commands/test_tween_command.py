@@ -35,7 +35,7 @@ def tween(tiny):
 
 
 def away_cm(source, out, frames):
-    """Of the worst joint in these frames."""
+    """Measure the worst joint in these frames."""
     first, second = (mapctl.load(path).joint_positions()[list(frames)] for path in (source, out))
     return 100 * float((first - second).norm(dim=-1).max())
 

@@ -1,4 +1,4 @@
-"""What actors are asked for, in films: marks are strong at their time, poses are bodies that one sees through."""
+"""Targets of actors in films: marks are strong at their time, poses are bodies that one sees through."""
 
 import numpy as np
 import pytest

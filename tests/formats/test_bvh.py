@@ -313,7 +313,7 @@ def test_two_joints_of_one_name_are_read_the_second_by_a_name_of_its_own(tmp_pat
 
 
 def written_angles(quat, order, tmp_path):
-    """What is written in the three channels of a single joint, degrees."""
+    """Angles written in the three channels of a single joint, degrees."""
     tree = text.Hierarchy(("only",), (-1,), ((0.0,) * 3,), (tuple(AXES[a] + "rotation" for a in order),), {})
     (tmp_path / "in.bvh").write_text(text.compose(tree, "0.01", np.zeros((1, 3)), decimals=6))
     source = bvh.load(tmp_path / "in.bvh")

@@ -1,4 +1,5 @@
-"""What holds of every format: what is written is read back, what is broken is refused in a line or read as a motion."""
+"""Contract of every format: motions are read back as written, broken files are refused in a line or read as a
+motion."""
 
 import re
 from importlib.util import find_spec

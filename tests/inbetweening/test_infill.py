@@ -119,7 +119,7 @@ def test_a_true_proposal_gives_the_true_motion_back(rig, fps):
 
 @pytest.mark.parametrize("rig", ["daz"])
 def test_a_larger_performer_is_shown_as_one_of_the_networks_size(rig):
-    """What is proposed is scaled back: places by the legs, while rotations are the same."""
+    """Proposed positions are scaled back by the legs, rotations stay."""
     small = on_rig(rig, 60)
     motion = replace(
         small,

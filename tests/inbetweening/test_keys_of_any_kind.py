@@ -90,7 +90,8 @@ def test_places_alone_are_met_and_nothing_else_of_the_motion_counts(rig, fps, me
 
 
 def test_a_viewer_in_front_sees_the_left_hand_on_the_right():
-    """Who faces +Z has the left hand toward +X; seen from behind it is on the left, from his left side nearer."""
+    """A body that faces +Z has the left hand toward +X; seen from behind it is on the left, from his left side
+    nearer."""
     left = torch.tensor([1.0, 0.3, 0.0])
     for view, right in ((0, 1.0), (180, -1.0), (90, 0.0), (-90, 0.0)):
         seen = view_axes(torch.tensor(math.radians(view))) @ left

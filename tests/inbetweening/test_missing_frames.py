@@ -1,4 +1,4 @@
-"""What a motion lacks, as queries at 30 fps see it, and how it is interpolated."""
+"""Missing frames and joints in queries at 30 fps, and their interpolation."""
 
 import math
 from dataclasses import replace
@@ -72,7 +72,7 @@ def swung(seconds, fps):
 
 @pytest.mark.parametrize(("fps", "after", "left"), [(30, 1, 0.7), (120, 10, 0.35)])
 def test_a_short_gap_goes_on_at_the_velocities_beside_it(fps, after, left):
-    """Of what slerp misses; with one frame after the gap only the velocity before it is known."""
+    """Errors of slerp; with one frame after the gap only the velocity before it is known."""
     motion = swung(1.5, fps)
     start = stop = motion.num_frames // 3
     stop += round(0.2 * fps)
@@ -91,7 +91,7 @@ def test_a_short_gap_goes_on_at_the_velocities_beside_it(fps, after, left):
 
 
 def names_of(motion, lost):
-    """Of joints that are lost in any frame."""
+    """Joints that are lost in any frame."""
     return {name for name, gone in zip(motion.skeleton.names, lost.joints.any(dim=0).tolist(), strict=True) if gone}
 
 
@@ -259,7 +259,7 @@ def test_a_mirrored_motion_has_mirrored_places():
 
 
 def drawn_masks(seed, share):
-    """Of frames, and of joints in them."""
+    """Numbers of frames and of joints."""
     draw = generator(seed)
     whole = torch.rand(1, FRAMES, 1, generator=draw) < share
     known = whole & (torch.rand(1, FRAMES, CANONICAL.num_joints, generator=draw) < 0.8)

@@ -43,7 +43,7 @@ def all_free(motion):
 
 
 def lengths(motion):
-    """Of every bone in every frame."""
+    """Lengths of every bone in every frame."""
     positions = motion.joint_positions()
     return (positions[:, 1:] - positions[:, list(CANONICAL.parents[1:])]).norm(dim=-1)
 

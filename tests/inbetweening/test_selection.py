@@ -1,4 +1,4 @@
-"""Who fills a gap: the network, whatever it slides, and nobody where one stands and it would wander off."""
+"""Choice of a proposer: the network, whatever it slides, and a held pose where the character stands off."""
 
 from dataclasses import replace
 

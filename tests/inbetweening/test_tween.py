@@ -27,7 +27,7 @@ def made_of(motion, frames, *, method="infiller", drawn=0.02, **given):
 
 
 def frames_of(fps):
-    """Of keys in 1.5 seconds: neither evenly spread nor on the prior's moments."""
+    """Frames of keys in 1.5 seconds: neither evenly spread nor on the prior's moments."""
     return 0, fps // 2 + 1, fps + 3, round(1.5 * fps) - 1
 
 

@@ -107,7 +107,7 @@ def test_offsets_that_vary_only_by_noise_are_held_and_stretching_ones_stay(kind)
 
 
 def test_a_network_that_is_wrong_does_little_harm():
-    """What it leaves out of the capture goes back in."""
+    """Channels that the proposal leaves out of the capture are restored."""
     truth = on_rig("bandai", 150)
     given = noisy(truth, 6.0)
     done = denoise(given, tiny_denoiser(drawn=0.5), settings=QUICK)

@@ -26,7 +26,7 @@ def stream(causal=None):
 
 
 def pushed(motion: Motion, at_once: int = 1, causal=None):
-    """What each push gave, and how many frames had come by then; the last is what finish gave."""
+    """Results of each push with the number of frames so far; the last is that of finish."""
     source, given = stream(causal), []
     for first in range(0, motion.num_frames, at_once):
         stop = min(first + at_once, motion.num_frames)

@@ -180,7 +180,7 @@ STANDS = LastFrameState(torch.zeros(1, LAYOUT.size))
 
 
 def begin(prior=PACED, speed=0.0) -> Beginning:
-    """Who stands, or goes at this speed, m/s."""
+    """Beginning of a standing character, or one at this speed, m/s."""
     return Beginning(prior, STANDS, GroundPose.origin(torch.float64), speed)
 
 

@@ -48,7 +48,7 @@ def odds(motion, left=5.0, right=5.0):
 
 
 def speeds(motion):
-    """Of the toes over the ground, m/s (frames - 1, 2)."""
+    """Speeds of the toes over the ground, m/s (frames - 1, 2)."""
     toes = motion.joint_positions()[:, TOE][..., ::2]
     return torch.diff(toes, dim=0).norm(dim=-1) * PRIOR_FPS
 

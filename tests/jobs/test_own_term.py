@@ -88,7 +88,7 @@ JOBS = {
 
 
 def height_of(done, frame):
-    """Of the left hand, metres."""
+    """Height of the left hand, metres."""
     motion = retarget.to_canonical(done.motion)[0].resample(30)
     return float(motion.joint_positions()[frame, CANONICAL.index("leftHand"), 1])
 

@@ -1,4 +1,4 @@
-"""What every density promises (see mapctl.protocols.Density), whatever it is made of."""
+"""Contract of every density (see mapctl.protocols.Density)."""
 
 import math
 

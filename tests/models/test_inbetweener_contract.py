@@ -1,4 +1,4 @@
-"""What every in-betweener keeps to, whoever wrote it."""
+"""Contract of every in-betweener."""
 
 from dataclasses import replace
 
@@ -84,7 +84,7 @@ def test_the_answer_to_the_mirror_image_is_the_mirror_image(kind, what):
 
 @pytest.mark.parametrize("kind", INBETWEENERS)
 def test_a_larger_body_moves_alike(kind):
-    """What is asked is asked at the size that models know, whatever the performer's."""
+    """Queries have the canonical size, whatever the performer's."""
     query = query_of(MASKS["a gap"], "daz")
     answer = INBETWEENERS[kind].propose(query)
     assert answer.motion.skeleton is query.motion.skeleton

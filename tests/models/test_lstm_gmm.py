@@ -132,7 +132,7 @@ def test_long_free_runs_stay_finite():
 
 @cache
 def tiny():
-    """Of weights so large that what it remembers makes a difference."""
+    """A density of weights so large that its memory matters."""
     density = tiny_density(width=12)
     for layer in (density.reference.fc3, density.reference.out):
         layer.weight.mul_(4)
@@ -149,7 +149,7 @@ def nats(state, features):
 
 
 def prior(state):
-    """Of the memory, by the mean and spread of the known ones."""
+    """Distance of the memory, by the mean and spread of the known ones."""
     known = tiny().initial_states.state
     total = 0.0
     for mine, theirs in ((state.hidden, known.hidden), (state.cell, known.cell)):
@@ -188,7 +188,7 @@ def frames_of_planting():
 
 @pytest.fixture(scope="module")
 def factor():
-    """Of a covariance whose values depend on each other."""
+    """A network of correlated components."""
     result = 0.01 * torch.randn(SIZE, SIZE, generator=generator(1)) / SIZE**0.5 + 0.004 * torch.eye(SIZE)
     result[:2] *= 0.3
     return result

@@ -119,7 +119,7 @@ def test_untrained_both_stages_interpolate_and_what_is_known_stays():
 
 
 def with_tilt_alone(motion):
-    """Of hips in a gap the tilt is known, and not the heading."""
+    """The tilt of hips in a gap is known, not their heading."""
     hidden = with_gap(motion, 10, 20)
     rotations = hidden.known.rotations.clone()
     rotations[:, 10:20, 0] = True

@@ -19,7 +19,7 @@ class Flat(ToyDensity):
 
     name: str = "flat"
     nats: float = 0.0
-    """Of a frame, normalised units."""
+    """Standard deviation of a frame, normalised units."""
     std: float = 1.0
     usual: float = 0.0
 
@@ -68,7 +68,7 @@ def test_the_weight_falls_with_what_is_lacking(lacking, weight):
 
 
 def test_a_blurred_density_is_that_of_a_sum():
-    """Of one Gaussian with independent values: its variances and those of the errors add up."""
+    """One Gaussian with independent values: its variances and those of the errors add up."""
     density = tiny_density(components=1)
     features = encode(walk(12))[0].float()[None]
     state, spread = density.start_after(features[:, 0]), 3 * density_selection.proposal_sigma()

@@ -50,14 +50,14 @@ def low_toes(motion: Motion) -> torch.Tensor:
 
 
 def planted_speed(motion: Motion) -> float:
-    """Of toes over the ground, m/s."""
+    """Speeds of toes over the ground, m/s."""
     toes = motion.joint_positions()[:, TOES]
     stands = contacts.detect_contacts(toes, motion.fps)[1:]
     return float((toes.diff(dim=0)[..., ::2].norm(dim=-1) * float(motion.fps))[stands].mean())
 
 
 def foot_pitch_deg(motion: Motion) -> torch.Tensor:
-    """Of the bones from ankles to toe joints, while these stand and the ankles are at their lowest."""
+    """Slope of the bones from ankles to toe joints, while these stand and the ankles are at their lowest."""
     ankles, toes = motion.joint_positions()[:, FEET], motion.joint_positions()[:, TOES]
     way = toes - ankles
     flat = contacts.detect_contacts(toes, motion.fps) & (ankles[..., 1] < ankles[..., 1].quantile(0.1, dim=0) + 0.005)
@@ -157,7 +157,7 @@ def test_a_table_that_lays_feet_as_anothers_is_put_right():
 
 
 def test_a_person_of_a_rig_has_flat_feet_and_the_clips_floor(tmp_path):
-    """What `follow`, `generate`, `steer` and `run` take from a clip: also where its toes lie below zero."""
+    """Body that `follow`, `generate`, `steer` and `run` take from a clip: also where its toes lie below zero."""
     clip = replace(_lafan_like(), source=None)
     clip = replace(clip, root_position=clip.root_position - torch.tensor([0.0, 0.04, 0.0]).double())
     clip.save(tmp_path / "rig.bvh")

@@ -1,4 +1,4 @@
-"""What is doubtful about how a rig is understood: never a wrong match that is sure, and no doubt about the listed."""
+"""Doubts about a rig: never a wrong match that is sure, and no doubt about the listed."""
 
 import math
 from dataclasses import replace

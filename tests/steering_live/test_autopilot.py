@@ -1,4 +1,4 @@
-"""Who drives: the last command, or a drawn path until it ends."""
+"""Source of commands: the last command, or a drawn path until it ends."""
 
 from itertools import pairwise
 

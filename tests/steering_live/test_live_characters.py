@@ -33,7 +33,7 @@ class Bone:
 
 @dataclass
 class SentMesh:
-    """What a browser has of a skinned mesh, and where it draws it: linear blend skinning by its four main bones."""
+    """Skinned mesh as a browser draws it: linear blend skinning by its four main bones."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -100,7 +100,7 @@ def test_the_browser_draws_the_mesh_where_films_do(hero):
 
 
 def recorded(look: CharacterLook, skeleton, frames: int) -> Motion:
-    """What is recorded of so many frames that were delivered on these bones."""
+    """Recording of so many frames delivered on these bones."""
     character = ShownCharacter.__new__(ShownCharacter)
     character.character, character.look = SimpleNamespace(skeleton=skeleton), look
     return join_chunks(character, [delivered(first) for first in range(0, frames, 3)])

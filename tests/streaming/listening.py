@@ -29,7 +29,7 @@ def free_ports(count: int) -> int:
 
 
 class Engine:
-    """What listens at a port, on a thread."""
+    """Listener at a port, on a thread."""
 
     def __init__(self, port: int):
         self.frames: list[VmcFrame] = []
@@ -68,7 +68,7 @@ class Engine:
             time.sleep(0.01)
 
     def joints(self) -> np.ndarray:
-        """Of all frames (frames, joints, 3)."""
+        """Positions of all frames (frames, joints, 3)."""
         return np.array([frame.joint_positions() for frame in self.frames])
 
     def lateness(self) -> np.ndarray:

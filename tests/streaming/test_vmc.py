@@ -49,7 +49,7 @@ def frame(seed: int):
 
 
 def sent_over(messages):
-    """What arrives of messages that are packed, as 32-bit numbers."""
+    """Messages after packing, as 32-bit numbers."""
     return [message for packet in pack(messages) for message in read_messages(packet)]
 
 

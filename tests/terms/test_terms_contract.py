@@ -1,4 +1,4 @@
-"""What every term must keep: the contract that the objective, the solver and the ledger rest on."""
+"""Contract of every term that the objective, the solver and the ledger rest on."""
 
 import math
 from dataclasses import fields, replace

@@ -1,4 +1,4 @@
-"""What recipes are made of, against independent formulas: losses of a true answer, what is hidden, and critics."""
+"""Parts of recipes, against independent formulas: losses of a true answer, masks, and critics."""
 
 import math
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""What holds for any trainable model: it trains from its command, resumes, stops early, refuses what does not fit, and
+"""Contract of any trainable model: it trains from its command, resumes, stops early, refuses what does not fit, and
 leaves a loadable model with its card. Models are trained on five synthetic clips, for six steps.
 """
 

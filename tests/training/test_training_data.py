@@ -304,7 +304,7 @@ def test_a_table_of_styles_lists_which_clips_there_are(tmp_path):
 
 
 SMALL = Performer(size=0.9, toe_height=-0.03)
-"""Whose toes rest under the floor of the file."""
+"""Clip with toes under the floor of the file."""
 
 
 def sloping(motion: Motion, along_x: float, along_z: float) -> Motion:
@@ -451,7 +451,7 @@ WINDOW = 20
 
 @pytest.fixture(scope="module")
 def clips() -> Corpus:
-    """Who stands, who sets off and stops again, and who runs after a walk."""
+    """A stand, a start with a stop, and a run after a walk."""
     parts = [go_at(0.0, seconds=4), go_at(0.0, 1.2, 0.0, seconds=3), go_at(1.2, 3.0, seconds=3)]
     return Corpus(("a", "b_walk", "c"), tuple(map(len, parts)), torch.cat(parts))
 
