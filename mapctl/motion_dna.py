@@ -17,7 +17,7 @@ from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import CANONICAL
 
 POSES = 8
-"""Poses that are taken of a motion unless another number is asked for."""
+"""Poses that are taken of a motion unless another number is requested."""
 _APART = PRIOR_FPS // 2  # frames between two of them, in a motion that is long enough
 _LEAP = 3.0  # times as far as in any other frame: from the T-pose before a take to its first frame
 

@@ -168,7 +168,7 @@ class Density(Protocol[State]):
     """
 
     name: str
-    """Name by which it was asked for, for reports; different among the densities of one problem."""
+    """Name by which it was requested, for reports; different among the densities of one problem."""
     limits: DataLimits
     """Speeds and turning that its training data show."""
     initial_states: InitialStates[State]

@@ -111,7 +111,7 @@ class LoadedModel:
     """A model with its name and card, which print as one line: the network's weights would fill pages."""
 
     name: str
-    """Name, file or run folder by which it was asked for."""
+    """Name, file or run folder by which it was requested."""
     card: Card
     """Card of the weights."""
 
@@ -127,7 +127,7 @@ class NetworkModel(LoadedModel, Generic[N]):
     """A trained network with its name and card."""
 
     name: str
-    """Name, file or run folder by which it was asked for."""
+    """Name, file or run folder by which it was requested."""
     network: N
     """Network with its weights, in evaluation mode."""
     card: Card

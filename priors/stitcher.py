@@ -721,7 +721,7 @@ _LARGEST_SEED = 2**63
 
 @dataclass(eq=False)
 class Draws:
-    """Answers that are drawn, to as many pairs of poses as are asked for."""
+    """Answers that are drawn, to as many pairs of poses as are requested."""
 
     seed: int
     """Seed of the noise; each pair of poses has noise of its own."""

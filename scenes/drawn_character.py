@@ -40,7 +40,7 @@ class DrawnMotion:
     placed: Placed
     """The motion on the character's joints."""
     convert: Callable[[Motion], Placed]
-    """Puts further frames of the same source on it, as poses that are asked for."""
+    """Puts further frames of the same source on it, as poses that are requested."""
 
     @property
     def notes(self) -> tuple[str, ...]:

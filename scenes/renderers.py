@@ -222,7 +222,7 @@ def _open_graphics() -> tuple[ModuleType, Any]:
 
 RendererName = Literal["auto", "egl", "stick"]
 RENDERER_VARIABLE = "MAPCTL_RENDERER"
-"""Environment variable with the renderer where none is asked for."""
+"""Environment variable with the renderer where none is requested."""
 
 _ADVICE = "For shaded bodies: pip install 'mapctl[render]', and on Debian apt-get install libegl1 libgl1-mesa-dri"
 _log = logging.getLogger("mapctl.scenes")

@@ -47,8 +47,8 @@ class ShotOptions:
     style: Annotated[str | None, arg(metavar="NAME")] = None
     """Style of the motion, one of the prior's."""
     start: Annotated[str, Field(min_length=1), arg(metavar="walk|stand|CLIP:FRAME")] = "walk"
-    """How it begins: in its stride, standing, or going on from a frame of a motion file, on that file's rig and at its
-    rate; of an actor in the clip's position unless `offset` or `turn_deg` are given."""
+    """How it begins: in its stride, standing, or continuing from a frame of a motion file, on that file's rig and at
+    its rate; of an actor in the clip's position unless `offset` or `turn_deg` are given."""
     end: Annotated[str, Field(min_length=1), arg(metavar="walk|stand|CLIP:FRAME")] = "walk"
     """How it ends: in its stride, standing, or in a frame of a motion file."""
     loop: bool = False
@@ -85,7 +85,7 @@ class Actor(ShotOptions):
 
     @property
     def start_clip(self) -> tuple[str, int] | None:
-        """The clip that it goes on from, and the frame; None where it begins by itself."""
+        """The clip that it continues from, and the frame; None where it begins by itself."""
         return _parse_clip_frame(self.start)
 
     @property

@@ -1,4 +1,4 @@
-"""Actors of a film, what they are asked for, and marks on the ground, frame by frame."""
+"""Actors of a film, what they are requested, and marks on the ground, frame by frame."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -23,9 +23,9 @@ from scenes.drawn_character import DrawnMotion
 from scenes.renderers import Content, Figure
 
 _RIBBON_STEP = 0.06
-_LEAST_SECONDS = 0.3  # for which what is asked for at one moment is shown strongly
+_LEAST_SECONDS = 0.3  # for which what is requested at one moment is shown strongly
 _FAINT = 0.25  # opacity of marks before and after their time
-_TINT, _SHELL = 0.75, 0.012  # share of the colour of all that is asked for in a pose's; metres around its body
+_TINT, _SHELL = 0.75, 0.012  # share of the colour of all that is requested in a pose's; metres around its body
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,12 +35,12 @@ class Mark:
     surface: Surface
     """Its shape and its colours."""
     seconds: tuple[float, float]
-    """From when to when it is asked for, seconds since the actor's first frame."""
+    """From when to when it is requested, seconds since the actor's first frame."""
 
 
 @dataclass(frozen=True, eq=False)
 class Targets:
-    """All that an actor is asked for, beside its curve."""
+    """All that an actor is requested, beside its curve."""
 
     marks: Sequence[Mark] = ()
     """Marks in the world."""
@@ -78,16 +78,16 @@ class StagedActor:
     start: int
     """Film frame of the motion's first frame."""
     marks: Sequence[tuple[Surface, int, int]]
-    """Shapes, and the film's first and last frame in which they are asked for."""
+    """Shapes, and the film's first and last frame in which they are requested."""
     poses: Sequence[Figure]
-    """Bodies in the poses that are asked for."""
+    """Bodies in the poses that are requested."""
 
     def frame(self, film_frame: int) -> int:
         """Return the motion's frame at a film's; the first before it starts and the last after it ends."""
         return min(max(film_frame - self.start, 0), self.body.num_frames - 1)
 
     def marks_at(self, film_frame: int) -> list[Surface]:
-        """Return the marks in a frame of the film: strong while they are asked for, faint before and after."""
+        """Return the marks in a frame of the film: strong while they are requested, faint before and after."""
         faint = np.array([1.0, 1.0, 1.0, _FAINT])
         return [
             mark if first <= film_frame <= last else replace(mark, rgba=mark.rgba * faint)
@@ -125,7 +125,7 @@ class Stage:
 
     def compose_ghosts(self, film_frames: Sequence[int]) -> Content:
         """Compose all actors at several times in one picture, earlier ones paler, with the whole trails and all that
-        they are asked for."""
+        they are requested."""
         fades = np.linspace(0.62, 0.0, len(film_frames)) if len(film_frames) > 1 else [0.0]
         moments = list(zip(film_frames, fades, strict=True))
         figures = [

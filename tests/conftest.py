@@ -27,7 +27,7 @@ hypothesis.settings.load_profile("mapctl")
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("mapctl", "priors", "controllers", "scenes")
 
-# An int where a float is asked for is fine, as PEP 484 says. One error for all that does not fit, a TypeError.
+# An int where a float is requested is fine, as PEP 484 says. One error for all that does not fit, a TypeError.
 checked = beartype(conf=BeartypeConf(is_pep484_tower=True, violation_type=TypeCheckError))
 
 

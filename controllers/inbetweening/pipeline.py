@@ -112,7 +112,7 @@ class InbetweenSolution(Solution):
         """Return gaps with their sources, contacts at PRIOR_FPS, and compute of each filled frame.
 
         `sides_apart_cm` is the farthest at which two sides met, if any did; `fallback` lists gaps, in frames at
-        PRIOR_FPS, that were not the in-betweener's that was asked for.
+        PRIOR_FPS, that were not the in-betweener's that was requested.
         """
         apart = [100 * source.apart for source in self.sources if source.apart is not None]
         return {
@@ -162,7 +162,7 @@ def fill(
     if terms and not settings.refine:
         raise RequestError("terms belong to the MAP stage, which is left out")
     generator = generator or torch.Generator().manual_seed(0)
-    # The query: the clip at the prior's rate on canonical joints, led along what is asked for.
+    # The query: the clip at the prior's rate on canonical joints, led along what is requested.
     clip = CanonicalClip.of(motion, missing, rig)
     if curve is not None:
         clip = replace(clip, canonical=_lead_along_curve(clip.canonical, missing.root, curve))

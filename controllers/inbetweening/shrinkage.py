@@ -128,7 +128,7 @@ class _View:
 
 
 def _find_gaps(proposal: Proposal, query: GapQuery) -> list[_Frames]:
-    """Find the gaps between known frames that are the proposer's own, without parts that are asked for in them."""
+    """Find the gaps between known frames that are the proposer's own, without parts that are requested in them."""
     if query.keep_trajectory or query.loose is not None:
         return []
     missing, asked = query.missing.frames, query.missing.root & ~query.nothing_known

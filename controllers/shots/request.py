@@ -49,7 +49,7 @@ class Lead:
         """Take the frames up to one of a clip, at its own rate; RequestError for a frame that it does not have, and
         for its first two, before which nothing shows how it moves."""
         if not 2 <= frame < canonical.num_frames:
-            raise RequestError(f"the clip's frames to go on from are 2:{canonical.num_frames}, got {frame}")
+            raise RequestError(f"the clip's frames to continue from are 2:{canonical.num_frames}, got {frame}")
         # Resampling keeps the first frame, so backwards it keeps the last.
         backwards = _reverse(canonical.slice(0, frame + 1)).resample(PRIOR_FPS)
         return Lead(_reverse(backwards.slice(0, min(backwards.num_frames, _MEMORY_FRAMES))))
@@ -276,7 +276,7 @@ class ShotRequest:
     seconds: float | None = None
     """Duration, seconds; None walks the curve once."""
     lead: Lead | None = None
-    """A clip to go on from, which ends where the curve begins; None begins anew."""
+    """A clip to continue from, which ends where the curve begins; None begins anew."""
     stand_at_start: bool = False
     """Whether it begins standing at ease; if not it begins in its stride."""
     stand_at_end: bool = False
@@ -307,7 +307,7 @@ class ShotRequest:
 
     @property
     def begins_standing(self) -> bool:
-        """Whether it begins standing: at ease, or as the clip does that it goes on from."""
+        """Whether it begins standing: at ease, or as the clip does that it continues from."""
         return self.stand_at_start or (self.lead is not None and self.lead.stands)
 
     @property
@@ -320,7 +320,7 @@ class ShotRequest:
         ends = self.begins_standing or self.ends_standing or self.lead is not None or self.arrival is not None
         faults = {
             "speeds by time need the shot's seconds": self.seconds is None and timed,
-            "a shot goes on from a clip or begins standing, not both": self.lead is not None and self.stand_at_start,
+            "a shot continues from a clip or begins standing, not both": self.lead is not None and self.stand_at_start,
             "a shot ends in a clip or standing, not both": self.arrival is not None and self.stand_at_end,
             "a loop needs a closed curve, and this one is open": self.loop and not self.curve.closed,
             "a loop is walked once around, in its stride: without start, end, seconds, speeds by time": self.loop

@@ -158,8 +158,8 @@ _REST, _SOON = 24, 45  # frames in which limbs come to rest, or until the first 
 
 
 def go_on(motion: Motion, missing: Bool[Tensor, " frames"], lead: Lead, inbetweener: Inbetweener) -> Motion:
-    """Generate the missing frames of a shot that goes on from a clip; where that ends in a gesture, limbs come to rest
-    until the first step, by the motion of the clip's last frames."""
+    """Generate the missing frames of a shot that continues from a clip; where that ends in a gesture, limbs come to
+    rest until the first step, by the motion of the clip's last frames."""
     if not lead.gestures:
         return fill_frames(motion, missing, inbetweener)
     first = next(((start, stop) for _, start, stop in true_intervals(missing[:, None].clone())), None)

@@ -138,7 +138,7 @@ def solve_shot(
 def _finish_ends(
     motion: Motion, missing: torch.Tensor, request: ShotRequest, trajectory: Trajectory, inbetweener: Inbetweener
 ) -> Motion:
-    """Generate the missing frames, and let the motion go on from, end in, or come round to what is requested."""
+    """Generate the missing frames, and let the motion continue from, end in, or come round to what is requested."""
     past = None
     if request.lead is not None:
         motion, past = go_on(motion, missing, request.lead, inbetweener), request.lead.past

@@ -30,7 +30,7 @@ LEAST_FRAMES = 4
 """Frames of the shortest stitched trajectory."""
 _FAR = 0.3  # metres beyond which the direction to a target is the facing there
 _CANDIDATES = 4  # moments of the prior that are tried at the position
-_AFTER = 10  # frames of the prior's own continuation, as context of how motion goes on from there
+_AFTER = 10  # frames of the prior's own continuation, as context of how motion continues from there
 _JUDGED_FRAMES = 60  # that are kept for terms that look back
 
 
@@ -128,7 +128,7 @@ def plan_stitch(
 
 def _pose_candidates(state: SteerState, command: Command, order: Arrival) -> Float[Tensor, "batch after size"]:
     """Frames at the position run backwards, the pose there last: the given pose alone, or moments of the prior and how
-    motion goes on from them."""
+    motion continues from them."""
     if order.pose is not None:
         pose = order.pose
         still = Motion(
@@ -300,7 +300,7 @@ def _deliver(state: SteerState, approach: Approach, command: Command) -> tuple[S
 
 
 def _read_targets(features: Tensor, start: GroundPose, before: SteeringTarget) -> list[SteeringTarget]:
-    """Read the targets that frames meet, so that steering goes on from their pace."""
+    """Read the targets that frames meet, so that steering continues from their pace."""
     targets, heading, travel = [], float(start.heading), before.heading
     for row in features:
         step_xz = rotations.rotate_ground(LAYOUT.pick(row, "root_displacement_heading"), torch.tensor(heading))

@@ -1,8 +1,8 @@
 """Hands that reach and heads that look, live, on top of a steered walk: pose offsets with limited acceleration.
 
 The density has no reaches, so they are no terms of its windows: arms, trunk and head are turned in the frames that it
-delivers, and the next step goes on from the walk alone. A hand moves toward its target while that can be reached within
-half a second by the forecast, and lets it go behind the character. Both motions are of minimum jerk.
+delivers, and the next step continues from the walk alone. A hand moves toward its target while that can be reached
+within half a second by the forecast, and lets it go behind the character. Both motions are of minimum jerk.
 """
 
 from collections.abc import Mapping

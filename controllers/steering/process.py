@@ -88,7 +88,7 @@ class Autopilot:
         """Begin with a command; `limits` determine how soon to brake before the end of a path."""
         self._command, self._limits = command, limits
         self._pursuit: PurePursuit | None = None
-        self._goal: Arrival | None = None  # its time counted from when it is asked for
+        self._goal: Arrival | None = None  # its time counted from when it is requested
         self._last: SteerFrames | None = None
 
     def command(self, command: Command) -> None:

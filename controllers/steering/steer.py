@@ -73,7 +73,7 @@ def lead_around(
 
 
 KEPT_FRAMES = 11
-"""Last frames whose features are kept: an arrival goes on from them."""
+"""Last frames whose features are kept: an arrival continues from them."""
 _PAST_TARGET_FRAMES = 60  # past targets that are kept: more than the root velocity term looks back on
 _RECENT_FRAMES = 15  # frames, half a second, over which the velocity error is measured
 _MIN_TRAVEL_SPEED = 0.3  # m/s below which the velocity has no direction

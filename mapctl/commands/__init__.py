@@ -20,7 +20,7 @@ class Runnable(Protocol):
 
 COMMANDS = {
     "demo": ("Demo", "A character walks a figure of eight: motion, film, contact sheet and report."),
-    "follow": ("FollowCurve", "A character walks a curve: motion and, if asked for, a film and a report."),
+    "follow": ("FollowCurve", "A character walks a curve: motion and, if requested, a film and a report."),
     "run": ("RunScene", "A scripted scene of several actors, from a TOML file or a ready one by name."),
     "generate": ("Generate", "Motion sampled from a prior, of any length."),
     "steer": ("Steer", "A character follows a script of speeds and directions, as in live steering."),

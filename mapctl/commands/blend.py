@@ -29,7 +29,7 @@ class Blend(ModelCommand, options.RigOptions):
     at: Annotated[str, arg(metavar="FRAME")]
     """First frame in IN, or seconds as in 1.5s."""
     out: options.OutFile
-    """Where the motion goes."""
+    """Output file."""
     margin: options.MaybeNumber = None
     """Seconds before and after in which the limb goes there and back; by its distance if not given."""
     no_refine: bool = False

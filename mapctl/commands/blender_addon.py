@@ -52,7 +52,7 @@ class BlenderAddon(Command):
     """Write the add-on for Blender 4.2 and later, installed there by Preferences > Add-ons > Install from Disk."""
 
     out: Annotated[Path, arg(aliases=["-o"], metavar="FILE.zip")]
-    """Where the zip goes."""
+    """Output file."""
 
 
 def run(command: BlenderAddon) -> int:

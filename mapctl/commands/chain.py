@@ -26,7 +26,7 @@ class Chain(ModelCommand, options.RigOptions, options.ProposalOptions):
     clips: tyro.conf.Positional[Annotated[tuple[Path, ...], arg(metavar="CLIP CLIP ...")]]
     """Motion files, of any known rigs."""
     out: options.OutFile
-    """Where the motion goes, at 30 frames a second."""
+    """Output file, at 30 frames a second."""
     piece: options.Count = 40
     """Frames of a piece, from the middle of every clip."""
     gap: Annotated[str, arg(metavar="A:B")] = "50:100"

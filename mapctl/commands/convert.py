@@ -26,7 +26,7 @@ class Convert(Command, options.ReadOptions):
     """Write a motion, or a folder of them, in another format, on another skeleton or at another frame rate, or some
     frames of it; mirrored, with planted feet, as a loop, in place, or with its travel on the root joint.
 
-    What is asked for is done in this order: frames, rig, frame rate, mirror, loop, feet, travel.
+    The edits are applied in this order: frames, rig, frame rate, mirror, loop, feet, travel.
     """
 
     source: Positional[Annotated[Path, arg(metavar="IN|FOLDER")]]

@@ -33,7 +33,7 @@ class Denoise(ModelCommand, options.RigOptions):
     source: Positional[Annotated[Path, arg(metavar="IN|FOLDER")]]
     """A motion file, or `example:noisy-walk`, which mapctl brings along; or a folder, every motion below it."""
     out: Annotated[Path, arg(aliases=["-o"], metavar="OUT|FOLDER")]
-    """Where the clean motion goes; of a folder, another one, which gets the same names."""
+    """Output file; of a folder, another folder, for files of the same names."""
     mask: options.MaybeFile = None
     """CSV with the columns joint, start, stop: frames (from 0, stop exclusive) in which a joint of the rig is missing.
     `*` is everything, `root position` the body's position. What is nan in IN is missing too."""

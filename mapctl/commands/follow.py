@@ -23,12 +23,12 @@ from scenes.scene_file import Actor, ShotOptions
 
 @dataclass(frozen=True, kw_only=True)
 class FollowCurve(ModelCommand, options.ReadOptions, ShotOptions):
-    """A character walks a curve: BVH and, if asked for, a film and a report."""
+    """A character walks a curve: BVH and, if requested, a film and a report."""
 
     curve: Positional[options.CurveText]
     """circle:4, figure8:2, s:6, line:10, wave:1x8 (metres), a CSV file of x,z or x,y,z, or an SVG file."""
     out: options.OutFile
-    """Where the motion goes: .bvh, .npz, .glb or .usda."""
+    """Output file: .bvh, .npz, .glb or .usda."""
     speed: options.MaybeSpeed = None
     """Speed along the curve: a number, or 0:1.0,5:2.5 for 1 m/s at the start rising to 2.5 m/s at 5 m; 1.2 if it is not
     given, and less in corners that turn faster than walking people do."""
@@ -42,7 +42,7 @@ class FollowCurve(ModelCommand, options.ReadOptions, ShotOptions):
     avoid: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="X,Z,RADIUS")] = ()
     """A disc on the ground to walk around, metres; may be given several times."""
     fps: options.MaybeNumber = None
-    """Frame rate of the motion; 30, or that of the clip it goes on from, if not given."""
+    """Frame rate of the motion; 30, or that of the clip it continues from, if not given."""
     video: options.MaybeFile = None
     """Film of the walk: .mp4, .gif, .webp or .png (contact sheet)."""
     report: options.MaybeFile = None

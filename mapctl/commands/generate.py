@@ -41,7 +41,7 @@ class Generate(ModelCommand, options.ReadOptions):
     temperature: options.Number = 1.0
     """Temperature of the samples, 0 to 2: 0 is the prior's mean, 1 the prior itself."""
     start: Annotated[str | None, arg(metavar="CLIP|INDEX")] = None
-    """A clip (.bvh, .npz, .amc) to go on from, or the index of an initial state for all; sampled if not given."""
+    """A clip (.bvh, .npz, .amc) to continue from, or the index of an initial state for all; sampled if not given."""
     prior: options.Name = "locomotion"
     """A bundled prior, or the file or run folder of a trained one."""
     style: Annotated[str | None, arg(metavar="NAME,NAME")] = None

@@ -27,7 +27,7 @@ class Infill(ModelCommand, options.RigOptions, options.ProposalOptions):
     source: options.InFile
     """A motion file."""
     out: options.OutFile
-    """Where the filled motion goes."""
+    """Output file."""
     gap: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="A:B")] = ()
     """Frames from A up to B (exclusive), or seconds as in 2s:4s; may be given several times. Their values are ignored.
     What is nan in IN is missing as well; where nothing is, and there are no gaps and joints, frozen and leaping frames

@@ -141,7 +141,7 @@ def _print_tables(found: Mapping[str, Any], sets: Mapping[str, Any], current: st
 
 
 def _print_clip(path: Path, command: Info) -> None:
-    """Print a clip's description, and draw it where a picture is asked for.
+    """Print a clip's description, and draw it where a picture is requested.
 
     RequestError where the rig is not recognised, naming what is missing; what can be found of the clip is printed
     first.

@@ -59,7 +59,7 @@ class Steer(ModelCommand, options.ReadOptions, streaming.StreamOptions):
     are to be first, and within how many seconds: the rest of the line holds from then on. The last line's time is the
     end, or a second after the last position is reached."""
     out: options.OutFile
-    """Where the motion goes: .bvh, .npz, .glb or .usda."""
+    """Output file: .bvh, .npz, .glb or .usda."""
     realtime: bool = False
     """Play against the wall clock: every step has a deadline and brings the best found by then. On a machine that
     cannot keep up the script's time runs slower than the clock's, which the summary reports."""

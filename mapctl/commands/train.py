@@ -41,4 +41,4 @@ KINDS = _Kinds()
 
 @dataclass(frozen=True)
 class Train:
-    """Train a model on a folder of BVH; an interrupted run goes on from its last checkpoint."""
+    """Train a model on a folder of BVH; an interrupted run continues from its last checkpoint."""

@@ -45,7 +45,7 @@ class Tween(ModelCommand, options.RigOptions, options.ProposalOptions):
     = true or "place" where not all of it counts; or a drawing (a CSV of joint,x,y) and view_deg
     (docs/guides/keyframes.md)."""
     out: options.OutFile
-    """Where the motion goes: as long as IN, or until the last key."""
+    """Output file: as long as IN, or until the last key."""
     keyframes: Annotated[str | None, arg(metavar="F,F,...")] = None
     """Keyframes of a motion file, or seconds as in 1.5s; the first and the last one are whole poses."""
     joints: Annotated[str | None, arg(metavar="NAME,NAME")] = None
@@ -143,7 +143,7 @@ def _check(command: Tween, request: KeyRequest | None) -> None:
     # Variations are rollouts of a density with every method.
     results.check_proposal(command, prior=None if several else command.prior)
     if not several:
-        # Of the stitcher, whose draws are asked for by number, one answer is the calm one whatever the seed.
+        # Of the stitcher, whose draws are requested by number, one answer is the calm one whatever the seed.
         if command.seed and command.method not in ("rollouts", "stitcher"):
             raise RequestError("--seed is of what is drawn, and nothing is; ask for --variations or --method rollouts")
         results.check_destinations(command.out, command.video, command.report, given=given)
@@ -234,7 +234,7 @@ def _run_variations(
 
 
 def _choose_source(command: Tween, first: Inbetweener, dna: results.Examples) -> Source | None:
-    """Choose what variations are drawn from: the stitcher, if it is one that was asked for, or styles, of those that
+    """Choose what variations are drawn from: the stitcher, if it is one that was requested, or styles, of those that
     --dna names or of the classes that the tweener has; None for methods whose variations are rollouts. RequestError
     where there is nothing to draw from."""
     if isinstance(first, StitchedInbetweener) and isinstance(first.stitcher, Stitcher):

@@ -51,7 +51,7 @@ def load(
     if fps is None:
         return _finish(reader.load(file), path, metres_per_unit)
     if (ending := ending_of(path)) != ".amc":
-        raise RequestError(f"{path}: a {ending} file has a frame rate of its own; only that of an .amc is asked for")
+        raise RequestError(f"{path}: a {ending} file has a frame rate of its own; only that of an .amc is requested")
     return _finish(reader.load(file, fps=fps), path, metres_per_unit)
 
 

@@ -223,7 +223,7 @@ class CharacterSource:
     armatures: Sequence[str] = ()
     """Names of all armatures in the file."""
     animations: Mapping[str, float] = field(default_factory=dict)
-    """Seconds by name of the file's animations of this armature; empty where its rest pose was asked for."""
+    """Seconds by name of the file's animations of this armature; empty where its rest pose was requested."""
 
     @staticmethod
     def of(chosen: CharacterPath, found: FoundCharacter, frames: RestFrames) -> "CharacterSource":

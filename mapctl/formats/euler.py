@@ -58,9 +58,9 @@ def can_represent(quat_xyzw: np.ndarray, axes: Sequence[int], *, tolerance: floa
 def keep_source_angles(path: np.ndarray, source: np.ndarray, same: np.ndarray, axes: Sequence[int]) -> np.ndarray:
     """Return degrees (frames, channels): the source's own in the frames that are the `same`, the path's in others.
 
-    These go on from the source's angles before them, at the beginning to those after them, without a jump. Where they
-    do not lead to the source's angles after them but a whole turn away, or to the other of two equal solutions, the
-    step is there: no angles of these rotations lead from the one to the other.
+    These continue from the source's angles before them, at the beginning to those after them, without a jump. Where
+    they do not lead to the source's angles after them but a whole turn away, or to the other of two equal solutions,
+    the step is there: no angles of these rotations lead from the one to the other.
     """
     done = np.where(same[:, None], source, path)
     edges = np.flatnonzero(np.diff(~same, prepend=False, append=False))

@@ -146,7 +146,7 @@ def read_character(path: str, *, armature: str | None, animation: str | None, wa
 def open_scene(path: str, *, with_mesh: bool) -> tuple[ufbx.Scene, str]:
     """Read a file; also return what is wrong with its meshes, empty where nothing is.
 
-    Refusal where it is no FBX, broken (but in its meshes, unless these are asked for), encrypted or of another version.
+    Refusal where it is no FBX, broken (but in its meshes, unless these are requested), encrypted or of another version.
     """
     fault = ""
     try:

@@ -53,7 +53,7 @@ _KEYS = {
 _LICENCE = "licence"
 """Key that may be missing."""
 _TRACKS = ("root_position_world", "local_quat_xyzw", "moving_offsets")
-"""Keys that change from frame to frame, and may hold NaN where a lossy reading is asked for."""
+"""Keys that change from frame to frame, and may hold NaN where a lossy reading is requested."""
 
 
 def load(path: str | PathLike[str]) -> Motion:

@@ -16,7 +16,7 @@ from mapctl.errors import RequestError
 from mapctl.numerics.intervals import true_intervals
 
 USUAL_SPEED = 1.2
-"""m/s, of walks that are asked for without a speed."""
+"""m/s, of walks that are requested without a speed."""
 _SUBSTEPS = 10  # integration steps a frame
 
 

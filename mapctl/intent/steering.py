@@ -46,7 +46,7 @@ class SteeringLimits:
 REACHING_HANDS = ("leftHand", "rightHand")
 """Joints that live targets may be given for."""
 STEP_LENGTHS = (0.3, 1.2)
-"""Shortest and longest step that can be asked for, metres. Beyond them feet slide to meet the target and speed is lost:
+"""Shortest and longest step that can be requested, metres. Beyond them feet slide to meet the target and speed is lost:
 at 1.2 m/s, planted toes move 1 to 4 cm/s within, 9 for steps of 2.5 m, and for 99 m the whole body slides at 9 m/s."""
 
 

@@ -143,7 +143,7 @@ class LstmGmmDensity(checkpoints.LoadedModel, Density[LstmState]):
     """The network as a density; rollouts take the fast path unless `use_fast` is off."""
 
     name: str
-    """Name, file or run folder by which it was asked for."""
+    """Name, file or run folder by which it was requested."""
     reference: LstmGmm
     """The torch network: specification of the fast path, and the only path on a GPU."""
     initial_states: InitialStates[LstmState]

@@ -89,7 +89,7 @@ class LiveApp:
 
     @property
     def url(self) -> str:
-        """Address of the page; the port is another than asked for if that one was taken."""
+        """Address of the page; the port is another than requested if that one was taken."""
         return f"http://{HOST}:{self.server.get_port()}"
 
     def run(self, stop: Callable[[], bool] = lambda: False) -> None:

@@ -1,4 +1,4 @@
-"""Inputs of one character: what it is asked for and its limits, and the held keys and sticks that change it."""
+"""Inputs of one character: what it is requested and its limits, and the held keys and sticks that change it."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence, Set
@@ -187,7 +187,7 @@ class Driving:
         self.steer(speed, heading)
 
     def _read(self, page: PageState) -> tuple[tuple[float, float], float] | None:
-        """Return direction and speed that a page asks for; None where it asks for none."""
+        """Return direction and speed that a page asks for; None where it requests none."""
         run_speed = max(self.walk_speed, 0.75 * self.fastest)
         if page.stick is not None:
             right, down, trigger = page.stick

@@ -315,7 +315,7 @@ def walked() -> Motion:
 
 @pytest.fixture(scope="module")
 def rigs(walked, tmp_path_factory):
-    """Each rig's files, made when they are asked for."""
+    """Each rig's files, made when they are requested."""
     result: dict[str, Rig] = {}
 
     def find(name: str) -> Rig:

@@ -105,7 +105,7 @@ class JobOperator:
         return Report.step is None
 
     def prepare(self, context: bpy.types.Context, at: jobs.Scene) -> jobs.Job:
-        """Check what is asked for and begin the job; AddonError where it cannot be done."""
+        """Check what is requested and begin the job; AddonError where it cannot be done."""
         raise NotImplementedError
 
     def execute(self, context: bpy.types.Context) -> set[str]:
@@ -253,7 +253,7 @@ class MAPCTL_OT_fill_gap(JobOperator, GapProperties, bpy.types.Operator):
     bl_label = "Fill Gap"
 
     def prepare(self, context: bpy.types.Context, at: jobs.Scene) -> jobs.Job:
-        """Find the gap, and the joints if only some are asked for."""
+        """Find the gap, and the joints if only some are requested."""
         selected = [bone.name for bone in context.selected_pose_bones or ()] if self.selected else []
         joints = jobs.name_joints(at, selected) if self.selected else []
         return jobs.fill_gap(at, find_frames(at), range(self.first, self.last + 1), joints)

@@ -307,7 +307,7 @@ def _edit(at: Scene, frames: range, words: Sequence[str], generated: np.ndarray,
         lines = yield from run_command([*at.command, *(names.get(word, word) for word in words), *rig], folder, label)
         answer, travelling = exchange.read(folder / "result.npz")
         if len(answer.positions) != len(frames):
-            raise AddonError(f"mapctl answered with {len(answer.positions)} frames where {len(frames)} were asked for")
+            raise AddonError(f"mapctl answered with {len(answer.positions)} frames where {len(frames)} were requested")
         moved = to_armature(answer, body, worlds)
         name = f"{old.name} {suffix}"
         warnings = yield from make_action(at, Result(body, frames, moved, travelling, generated, name, fresh=False))

@@ -1,6 +1,6 @@
 """Outputs of commands: checks of files before any long work, tables on standard output, and progress.
 
-Progress is a bar on a terminal, lines for a program that asks for them, and nothing in a pipe.
+Progress is a bar on a terminal, lines for a program that requests them, and nothing in a pipe.
 """
 
 import os
@@ -37,12 +37,12 @@ def check_files(paths: Sequence[Path], *, given: Sequence[Path] = ()) -> None:
         if real in sources:
             raise RequestError(f"{path} would overwrite its own source; choose another name")
         if real in known:
-            raise RequestError(f"{path} is asked for twice; every output needs a file of its own")
+            raise RequestError(f"{path} is requested twice; every output needs a file of its own")
         known.add(real)
 
 
 FILM_SIZE = (1280, 720)
-"""Width and height of films whose size is not asked for, pixels."""
+"""Width and height of films whose size is not requested, pixels."""
 
 
 def check_film(path: Path, size: tuple[int, int]) -> None:
@@ -118,7 +118,7 @@ def format_cell(value: object) -> str:
 
 
 LINES = "MAPCTL_PROGRESS"
-"""Environment variable that asks for lines `progress DONE/TOTAL LABEL` on standard error."""
+"""Environment variable that requests lines `progress DONE/TOTAL LABEL` on standard error."""
 
 
 @contextmanager

@@ -26,7 +26,7 @@ from priors.tweener import Style, Tweener, mix_styles, pick_class
 from scenes.film import film_side_by_side
 
 Examples = Sequence[tuple[str, MotionDna | None]]
-"""Name and poses of each motion file whose style is asked for; without poses the name of a class."""
+"""Name and poses of each motion file whose style is requested; without poses the name of a class."""
 
 
 def read_dna(command: ProposalOptions) -> Examples:

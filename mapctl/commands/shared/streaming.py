@@ -51,7 +51,7 @@ def check(command: StreamOptions, listen: str | None = None, *, characters: int 
 
 
 def open_stream(command: StreamOptions, skeletons: Sequence[Skeleton]) -> "PoseStream | None":
-    """Open the stream of characters with these bones; None where none is asked for."""
+    """Open the stream of characters with these bones; None where none is requested."""
     if command.stream is None:
         return None
     from mapctl.streaming.sender import PoseStream
@@ -61,7 +61,7 @@ def open_stream(command: StreamOptions, skeletons: Sequence[Skeleton]) -> "PoseS
 
 
 def open_receiver(text: str | None) -> "OscReceiver | None":
-    """Open the source of orders; None where none is asked for. RequestError where its port is taken."""
+    """Open the source of orders; None where none is requested. RequestError where its port is taken."""
     if text is None:
         return None
     from mapctl.streaming.receiver import OscReceiver
